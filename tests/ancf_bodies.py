@@ -92,7 +92,7 @@ def finalize(b):
 
 
 @functools.cache
-def plain(name):
+def to_json(name):
     b, body = scene(name)
     return body, finalize(b)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from warpfea.kernels.terms.contact_data import RECORD
+from warpfea.kernels.terms.contact_structs import RECORD
 
 import warpfea as wf
 from warpfea.model.contact_points import contact_points

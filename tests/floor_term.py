@@ -10,11 +10,11 @@ from typing import ClassVar
 
 import numpy as np
 import warp as wp
-from warpfea.kernels.common.entries import add_block_function
+from warpfea.kernels.common.block_entries import add_block_function
 from warpfea.kernels.common.structs import pattern_struct, topology_struct
 from warpfea.kernels.common.traits import Traits
 from warpfea.kernels.common.types import kernel_module, precision
-from warpfea.kernels.solvers.control import control_struct
+from warpfea.kernels.solvers.newton_control import control_struct
 
 from warpfea.terms.term import LOSS, STORED, Column, FieldSpec, Term
 
@@ -103,7 +103,7 @@ def floor_kernels(dtype):
             wp.atomic_min(newton.limit, world, wp.max(f64(room / fall), f64(1.0e-3)))
 
     @wp.kernel(module=module)
-    def book(
+    def energy_increments(
         slot: wp.array(dtype=wp.int32), height: wp.array(dtype=T), k: T, kt: T, u: wp.array2d(dtype=vec3),
         anchor: wp.array2d(dtype=vec3), stuck: wp.array2d(dtype=wp.int32), accepted: wp.array(dtype=wp.int32),
         rows: wp.array3d(dtype=f64),
@@ -139,7 +139,7 @@ def floor_kernels(dtype):
             stuck[world, item] = 1
             anchor[world, item] = x
 
-    kernels = (force, product, diagonal, add, limit, book, commit)
+    kernels = (force, product, diagonal, add, limit, energy_increments, commit)
     return types.SimpleNamespace(module=module, **{kernel.key.rsplit("__", 1)[-1]: kernel for kernel in kernels})
 
 
@@ -166,66 +166,68 @@ class Floor(Term):
         self.slot, self.height = m.array("floor", slots, wp.int32), m.array("floor", self.height_host, m.types.T)
         self.connectivity, self.rows = [slots[:, None]], len(slots)
 
-    def hold(self, free):
+    def mark_constrained(self, free):
         free[:] = 0.0
 
     def hash(self, h):
         h.update(f"{self.k} {self.kt} {self.depth}".encode())
 
-    def register(self, at):
-        at.state.register("floor_anchor", self.model.types.vec3, (len(self.slots),))
-        at.state.register("floor_stuck", wp.int32, (len(self.slots),))
+    def register(self, ctx):
+        ctx.state.register("floor_anchor", self.model.types.vec3, (len(self.slots),))
+        ctx.state.register("floor_stuck", wp.int32, (len(self.slots),))
 
-    def allocate(self, work, at):
+    def allocate(self, work, ctx):
         stiffness = work.array("floor stiffness", self.dim, self.model.types.vec3)
-        at.scratch[self.name] = stiffness, work.array("floor rows", (2, *self.dim), wp.float64)
+        ctx.scratch[self.name] = stiffness, work.array("floor rows", (2, *self.dim), wp.float64)
 
-    def modules(self, at):
+    def modules(self, ctx):
         return {self.kernels.module}
 
-    def force(self, at, active):
-        w, s = at.work, at.state
+    def force(self, ctx, active):
+        w, s = ctx.work, ctx.state
         args = [self.slot, self.height, self.k, self.kt, w.u, s.floor_anchor, s.floor_stuck, active, self.offset]
-        args += [w.pool_force, at.scratch[self.name][0], w.rows_of(self)]
-        with at.launch.part("floor"):
-            at.launch(self.kernels.force, self.dim, args)
+        args += [w.pool_force, ctx.scratch[self.name][0], w.rows_of(self)]
+        with ctx.launch.part("floor"):
+            ctx.launch(self.kernels.force, self.dim, args)
 
     prepare = force
 
-    def aim(self, at, active):
-        w = at.work
-        at.launch(self.kernels.limit, self.dim, [self.slot, self.height, self.depth, w.u, w.direction, w.newton])
+    def process_direction(self, ctx, active):
+        w = ctx.work
+        ctx.launch(self.kernels.limit, self.dim, [self.slot, self.height, self.depth, w.u, w.direction, w.newton])
 
-    def product(self, at, p, active):
-        args = [self.slot, at.scratch[self.name][0], p, active, self.offset, at.work.pool_product]
-        at.launch(self.kernels.product, self.dim, args)
+    def product(self, ctx, p, active):
+        args = [self.slot, ctx.scratch[self.name][0], p, active, self.offset, ctx.work.pool_product]
+        ctx.launch(self.kernels.product, self.dim, args)
 
-    def diagonal(self, at, active):
-        at.launch(self.kernels.diagonal, self.dim, [at.scratch[self.name][0], active, self.offset, at.work.pool_block])
+    def diagonal(self, ctx, active):
+        ctx.launch(
+            self.kernels.diagonal, self.dim, [ctx.scratch[self.name][0], active, self.offset, ctx.work.pool_block]
+        )
 
-    def keep(self, at):
-        return [("floor", at.scratch[self.name][0])]
+    def cached_inputs(self, ctx):
+        return [("floor", ctx.scratch[self.name][0])]
 
-    def reserve(self, at, matrix, *, projected):
+    def allocate_blocks(self, ctx, matrix, *, projected):
         self.entry = self.model.array("floor", matrix.pattern.find(self.slots, self.slots), wp.int32)
 
-    def blocks(self, at, matrix, kept, dq_dv, active, out, *, projected):
+    def blocks(self, ctx, matrix, kept, dq_dv, active, out, *, projected):
         args = [self.model.topology, matrix.pattern.data, self.entry, *kept, dq_dv, active, out]
-        at.launch(self.kernels.add, self.dim, args)
+        ctx.launch(self.kernels.add, self.dim, args)
 
-    def book(self, at, accepted):
-        w, s, rows = at.work, at.state, at.scratch[self.name][1]
+    def energy_increments(self, ctx, accepted):
+        w, s, rows = ctx.work, ctx.state, ctx.scratch[self.name][1]
         args = [self.slot, self.height, self.k, self.kt, w.u, s.floor_anchor, s.floor_stuck, accepted, rows]
-        at.launch(self.kernels.book, self.dim, args)
+        ctx.launch(self.kernels.energy_increments, self.dim, args)
         return rows
 
-    def commit(self, at, accepted):
-        s = at.state
-        args = [self.slot, self.height, at.work.u, accepted, s.floor_anchor, s.floor_stuck]
-        at.launch(self.kernels.commit, self.dim, args)
+    def commit(self, ctx, accepted):
+        s = ctx.state
+        args = [self.slot, self.height, ctx.work.u, accepted, s.floor_anchor, s.floor_stuck]
+        ctx.launch(self.kernels.commit, self.dim, args)
 
-    def measure(self, at):
-        u, s = at.state.displacement.numpy().astype(float)[:, self.slots], at.state
+    def stored_energy(self, ctx):
+        u, s = ctx.state.displacement.numpy().astype(float)[:, self.slots], ctx.state
         gap = np.minimum(self.height_host + u[:, :, 2], 0.0)
         slip = np.linalg.norm((u - s.floor_anchor.numpy())[:, :, :2], axis=2) * s.floor_stuck.numpy()
         return {"floor_stored": 0.5 * (self.k * gap**2 + self.kt * slip**2).sum(axis=1)}

@@ -22,7 +22,7 @@ def prepare(model, operator):
     _assign(model, w.u, scale[:, None] * _random(model, 1))
     w.step.dq_dv.fill_(DT)
     w.step.mass_factor.fill_(1.0 / DT)
-    residual.take(wp.ones(model.worlds, dtype=wp.int32, device=model.device))
+    residual.assemble_matrix(wp.ones(model.worlds, dtype=wp.int32, device=model.device))
     return sim, residual
 
 

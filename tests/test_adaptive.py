@@ -11,12 +11,12 @@ import warp as wp
 
 import warpfea as wf
 from warpfea.cli import main
-from warpfea.laws import time_law
 from warpfea.simulation.checkpoint import Checkpoint
-from warpfea.simulation.instants import Instants
 from warpfea.simulation.integrators import Integrator
 from warpfea.simulation.integrators.backward_euler import BACKWARD_EULER
 from warpfea.simulation.integrators.bdf2 import bdf2, bdf2_error
+from warpfea.simulation.sync_times import SyncTimes
+from warpfea.time_laws import time_law
 
 RESULT = pathlib.Path(__file__).resolve().parent / "results" / "adaptive_cpu.json"
 SCHEMES = ("backward_euler", "bdf2")
@@ -104,15 +104,15 @@ def test_means_are_those_of_the_rates(integrator):
     h, count = 1e-4, 30
     sim = auto(bar(), 1e-1, integrator=integrator, interval=h, horizon=1e-2)
     v = [sim.state.velocity.numpy()[0].copy()]
-    mean, seen, pace = np.zeros_like(v[0]), 0, None
+    mean, seen, mean_step = np.zeros_like(v[0]), 0, None
     for _ in range(count):
         sim.step()
         v.append(sim.state.velocity.numpy()[0].copy())
         assert sim.totals["substeps"][0] == len(v) - 1
         order = 1 if integrator == "backward_euler" else 2
-        pace = 0.125 * 1e-2 * 0.1 ** (1.0 / order) if pace is None else pace
-        span = max(h, 0.125 * pace)
-        pace += (h - pace) / 256.0
+        mean_step = 0.125 * 1e-2 * 0.1 ** (1.0 / order) if mean_step is None else mean_step
+        span = max(h, 0.125 * mean_step)
+        mean_step += (h - mean_step) / 256.0
         if integrator == "backward_euler":
             rate = 0.5 * h * (v[-1] - v[-2]) / span
         elif len(v) == 2:
@@ -129,14 +129,14 @@ def test_means_are_those_of_the_rates(integrator):
 
 def test_a_vibration_smaller_than_the_error_is_not_resolved():
     """A box in slow rotation with an axial vibration of a tenth of the error asked for, 64 periods of it."""
-    error, end, spin, pace = 1e-3, 0.4, 2.0, np.pi * np.sqrt(1e8 / 1000.0)
+    error, end, spin, mean_step = 1e-3, 0.4, 2.0, np.pi * np.sqrt(1e8 / 1000.0)
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     law = wf.SVK(E=1e8, nu=0.3, density=1000.0)
     body = b.add_solid(wf.mesh.box((1, 0.2, 0.2), cells=(2, 1, 1)), material=law)
 
     def velocity(X):
         x, z = X[:, 0] - 0.5, X[:, 2] - 0.1
-        return np.column_stack([-0.1 * error * pace * np.cos(np.pi * X[:, 0]) - spin * z, 0.0 * x, spin * x])
+        return np.column_stack([-0.1 * error * mean_step * np.cos(np.pi * X[:, 0]) - spin * z, 0.0 * x, spin * x])
 
     b.set_initial(body, velocity=velocity)
     model = b.finalize(device="cpu")
@@ -147,7 +147,7 @@ def test_a_vibration_smaller_than_the_error_is_not_resolved():
     x, y, z = (start - [0.5, 0.1, 0.1]).T
     turned = np.column_stack([c * x - s * z, y, s * x + c * z]) + [0.5, 0.1, 0.1]
     assert np.linalg.norm(sim.positions(body)[0] - turned, axis=1).max() <= 2.0 * error * model.size
-    assert sim.totals["substeps"][0] < 3 * pace * end / (2.0 * np.pi)  # 7 in each period where every rate is held
+    assert sim.totals["substeps"][0] < 3 * mean_step * end / (2.0 * np.pi)  # 7 in each period where every rate is held
 
 
 @pytest.mark.parametrize("integrator", SCHEMES)
@@ -227,8 +227,8 @@ def test_kinks_of_tables_are_instants_and_samples_of_curves_are_not():
     t = np.linspace(0.0, 1.0, 201)
     smooth = time_law((t, np.column_stack([np.sin(20.0 * t), 0 * t, 0 * t])), "curve")
     ramp = time_law(([0.0, 0.1, 0.100001, 5.0], [(0, 0, 0), (0, 0, 0), (1, 0, 0), (1, 0, 0)]), "ramp")
-    assert Instants([smooth], 1.0, 1.0).kinks.tolist() == [0.0, 1.0]  # where it begins and ends
-    assert Instants([ramp, time_law((1, 0, 0), "constant")], 1.0, 1.0).kinks.tolist() == [0.1, 0.100001]
+    assert SyncTimes([smooth], 1.0, 1.0).kinks.tolist() == [0.0, 1.0]  # where it begins and ends
+    assert SyncTimes([ramp, time_law((1, 0, 0), "constant")], 1.0, 1.0).kinks.tolist() == [0.1, 0.100001]
 
 
 def test_a_short_pulse_is_seen_beside_a_jump():
@@ -237,7 +237,7 @@ def test_a_short_pulse_is_seen_beside_a_jump():
     times = [0.0, start, start + half, start + 2 * half, 0.5, 0.5 + 1e-7, 1.0]
     load = np.outer([0, 0, 1e5, 0, 0, 1e5, 1e5], [1.0, 0, 0])
     law = time_law((times, load), "pull")
-    assert set(times[1:4]) <= set(Instants([law], 1.0, 1.0).kinks)
+    assert set(times[1:4]) <= set(SyncTimes([law], 1.0, 1.0).kinks)
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     body = b.add_solid(wf.mesh.box((1, 1, 1), cells=(1, 1, 1)), material=LAW)
     b.add_traction(body.surface("x+"), (times, load))
@@ -281,14 +281,14 @@ def test_instants_are_intervals_frames_moments_and_the_end():
         rate = 30.0
         moments = (0.0101,)
 
-    instants = Instants([], None, None)
-    instants.follow([Frames()])
-    instants.settle(0.0, 0.1)
-    assert (1.0 / 30.0 / instants.interval) % 1.0 == pytest.approx(0.0, abs=1e-12)
-    count = instants.count(0.0, 0.1)
+    sync_times = SyncTimes([], None, None)
+    sync_times.add_outputs([Frames()])
+    sync_times.set_defaults(0.0, 0.1)
+    assert (1.0 / 30.0 / sync_times.interval) % 1.0 == pytest.approx(0.0, abs=1e-12)
+    count = sync_times.count(0.0, 0.1)
     times = [0.0]
     while times[-1] < 0.1 - 1e-12:
-        times.append(instants.after(times[-1]))
+        times.append(sync_times.next_after(times[-1]))
     assert len(times) == count + 1
     for due in (0.0101, 1.0 / 30.0, 2.0 / 30.0, 0.1):
         assert np.abs(np.array(times) - due).min() < 1e-15
@@ -296,11 +296,11 @@ def test_instants_are_intervals_frames_moments_and_the_end():
 
 
 def test_a_whole_interval_has_always_the_same_bits():
-    instants = Instants([], 0.01, 1.0)
-    instants.settle(0.0)
+    sync_times = SyncTimes([], 0.01, 1.0)
+    sync_times.set_defaults(0.0)
     time, spans = np.zeros(1), set()
     for _ in range(300):
-        span = instants.spans(time)
+        span = sync_times.time_to_next(time)
         spans.add(float(span[0]))
         time = time + span
     assert spans == {0.01}
@@ -333,9 +333,9 @@ def test_bad_input_is_refused_by_name(options, text):
 
 
 def test_schemes_without_an_estimate_are_refused():
-    plain = Integrator("plain", BACKWARD_EULER.coefficients, order=1)
+    to_json = Integrator("plain", BACKWARD_EULER.coefficients, order=1)
     with pytest.raises(wf.ModelError, match="'plain' has no estimate of its error; there are backward_euler, bdf2"):
-        auto(integrator=plain)
+        auto(integrator=to_json)
 
 
 @pytest.mark.parametrize("integrator", ["energy_momentum", wf.GeneralizedAlpha(rho_inf=0.8)])

@@ -20,17 +20,17 @@ from ancf_bodies import (
     affine,
     finalize,
     placed,
-    plain,
     rotation,
     scene,
     state_of,
     tets,
+    to_json,
     turned,
 )
 
 import warpfea as wf
 from warpfea.model import assembly
-from warpfea.terms.followers import Followers
+from warpfea.terms.follower_loads import Followers
 
 FLAT = [name for name in BODIES if name not in ("arc", "roof", "ball")]
 SIDES = ("beam", "arc", "plate", "roof", "ENMC", "ball", "H3843")
@@ -74,7 +74,7 @@ def test_named_surfaces(name):
 
 def test_surfaces_by_predicate_and_rows():
     for name in ("beam", "plate"):
-        body, _ = plain(name)
+        body, _ = to_json(name)
         every = body.surface(lambda X: np.ones(len(X), bool))
         assert len(every) == {"beam": 2 + 4 * 3, "plate": 2 * 4 + 8}[name]
         half = body.surface(lambda X: (X - SHIFT) @ TURN[:, 0] > 0.999)
@@ -97,7 +97,7 @@ def follower_product(model, state, direction):
 
 def _launched(model, state, what, *fields):
     terms, vec3 = model.terms, model.types.vec3
-    values = np.array([law.values[-1] for law in terms.laws.laws])[None]
+    values = np.array([law.values[-1] for law in terms.time_laws.laws])[None]
     values = wp.array(values, dtype=wp.vec3d, device="cpu")
     active = wp.ones(1, dtype=wp.int32, device="cpu")
     out = wp.zeros((1, terms.side_entries), dtype=vec3, device="cpu")

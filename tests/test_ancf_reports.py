@@ -21,12 +21,12 @@ from ancf_bodies import (
     finalize,
     hexes,
     placed,
-    plain,
     radial,
     rotation,
     scene,
     state_of,
     tets,
+    to_json,
 )
 
 import warpfea as wf
@@ -61,7 +61,7 @@ def test_initial_velocity(name):
 def test_a_spin_has_no_strain_rate(name):
     damped = replace(SVK, damping=wf.KelvinVoigt(eta=1e3, lambda_v=1e3, form="rate"))
     b = wf.ModelBuilder(gravity=(0, 0, 0))
-    source, _ = plain(name)
+    source, _ = to_json(name)
     make = {"ENMC": ("ENMC", tets("ENMC")), "FN": ("FN", tets("FN")), "H3843": ("H3843", hexes())}.get(name)
     if name == "arc":
         body = add_beam(arc, lambda s: TURN @ radial(s), material=damped, b=b)
@@ -131,7 +131,7 @@ VOLUMES = {"beam": 0.015, "arc": 1.5 * 0.015, "plate": 0.08, "roof": 0.1, "ENMC"
 @pytest.mark.parametrize("name", BODIES)
 def test_skin_and_drawing(name):
     """The skin is closed, looks outward and encloses the volume; the drawn cells fill it."""
-    body, _ = plain(name)
+    body, _ = to_json(name)
     volume = VOLUMES.get(name.split()[0]) or body.mesh.volume() if name != "ball" else ball().volume()
     skin = body.skin
     points = reference_points(body, skin.slot_weights)
@@ -157,7 +157,7 @@ def test_skin_and_drawing(name):
     cells = wf.mesh.Mesh(reference_points(body, drawing.slot_weights), drawing.cells, drawing.cell_type)
     assert cells.volumes().min() > 0
     assert cells.volume() == pytest.approx(volume, rel={"ball": 1e-12, "H3843": 1e-12}.get(name, tolerance))
-    assert np.bincount(drawing.element).min() == len(body.family.lattice.cells)
+    assert np.bincount(drawing.element).min() == len(body.family.vtk_subdivision.cells)
     for weights in (skin.node_weights, drawing.node_weights):  # fields of 1 stay 1
         np.testing.assert_allclose(weights @ np.ones(weights.shape[1]), 1.0, rtol=1e-12)
 
@@ -169,7 +169,7 @@ def test_uniform_stress(name):
     "tied" leaves out the transverse shear, which vanishes at a shell's faces and a beam's edges: there is none here. On
     curved axes the parts of the law have axes that turn, and add up but for the error of their interpolation.
     """
-    body, model = plain(name)
+    body, model = to_json(name)
     plane = np.array([[1.1, 0.2, 0], [0.2, 0.9, 0], [0, 0, 1.2]])
     stretch = {
         "plate": TURN @ plane @ TURN.T,

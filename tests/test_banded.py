@@ -11,7 +11,7 @@ from warpfea.kernels.solvers.band import BLOCK
 import warpfea as wf
 from warpfea.builder.scene import find
 from warpfea.simulation.checkpoint import save_checkpoint
-from warpfea.solvers.band import WIDEST, Band, find_band
+from warpfea.solvers.band import MAX_AUTO_WIDTH, Band, find_band
 from warpfea.solvers.preconditioner import choose
 from warpfea.studies.bench.problems import PROBLEMS
 
@@ -184,10 +184,10 @@ def test_wider_bands_are_kept_for_longer():
     def band(width):
         return Band(wp.zeros(0, dtype=wp.int32), wp.zeros(0, dtype=wp.int32), 100, width)
 
-    costs = [band(width).rebuild_cost for width in (5, 20, WIDEST)]
+    costs = [band(width).rebuild_cost for width in (5, 20, MAX_AUTO_WIDTH)]
     assert costs[2] > 2.0 * costs[0]
-    assert band(5).quick
-    assert not band(WIDEST).quick
+    assert band(5).cheap
+    assert not band(MAX_AUTO_WIDTH).cheap
 
 
 @pytest.mark.parametrize("links", [10, 40])
@@ -277,7 +277,7 @@ def test_what_another_preconditioner_remembers_is_not_taken_over(tmp_path):
 
 
 def test_factors_that_could_not_be_addressed_are_refused(monkeypatch):
-    monkeypatch.setattr("warpfea.solvers.band.LARGEST", 10000)
+    monkeypatch.setattr("warpfea.solvers.band.MAX_FACTOR_BYTES", 10000)
     with pytest.raises(wf.ModelError, match=r"'banded': the factors of \d+ slots in a band of 68 unknowns take"):
         simulation(PROBLEMS["bar"].build((12, 1, 1)), preconditioner="banded")
     assert kind(simulation(PROBLEMS["bar"].build((12, 1, 1)))) == "two-level"

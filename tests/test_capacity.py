@@ -28,7 +28,7 @@ def taken(worlds, **options):
 def test_what_fits_is_told_and_does(options, monkeypatch):
     monkeypatch.setattr(assembled, "CHUNK", 2)
     room = (taken(7, **options) + taken(8, **options)) // 2
-    monkeypatch.setattr(capacity, "free_bytes", lambda device: int(room / (1.0 - capacity.KEPT)) + 1)
+    monkeypatch.setattr(capacity, "free_bytes", lambda device: int(room / (1.0 - capacity.RESERVED_FRACTION)) + 1)
     text = r"bytes per world, and cpu has .*free; maximum: 7 worlds; take fewer worlds, a coarser mesh"
     with pytest.raises(wf.CapacityError, match=text) as refused:
         wf.Simulation(build(9, contact=True), dt=1e-3, **options)

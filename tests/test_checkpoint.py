@@ -207,6 +207,9 @@ def test_a_checkpoint_that_does_not_fit_is_refused(small, options, integrator, w
     assert sim.steps == 1
 
 
+SCHEMAS = {"schema": 9, "first schema": 1, "second schema": 2}
+
+
 def damaged(path, tmp_path, how):
     file = tmp_path / "bad.npz"
     data = path.read_bytes()
@@ -232,10 +235,8 @@ def damaged(path, tmp_path, how):
             del arrays["total.pcg"]
         elif how == "shape":
             arrays["state.velocity"] = arrays["state.velocity"][:, :-1]
-        elif how in ("schema", "old schema"):
-            text = (
-                arrays["meta"].tobytes().replace(b'"schema": 2', b'"schema": 9' if how == "schema" else b'"schema": 1')
-            )
+        elif how in SCHEMAS:
+            text = arrays["meta"].tobytes().replace(b'"schema": 3', b'"schema": %d' % SCHEMAS[how])
             arrays["meta"] = np.frombuffer(text, dtype=np.uint8)
         np.savez(file, **arrays)
     return file
@@ -254,7 +255,8 @@ def damaged(path, tmp_path, how):
         ("no totals", "totals"),
         ("shape", "velocity"),
         ("schema", "schema 9"),
-        ("old schema", "older version"),
+        ("first schema", "an older version of warpfea (schema 1;"),
+        ("second schema", "an older version of warpfea (schema 2;"),
     ],
 )
 def test_a_damaged_checkpoint_is_refused(small, tmp_path, how, word):

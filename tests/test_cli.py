@@ -12,7 +12,7 @@ from cli_runs import SHORT, SVK, files, run, working_folder
 import warpfea as wf
 from warpfea.base.errors import UsageError
 from warpfea.builder.scene import find
-from warpfea.cli.part import parse_material
+from warpfea.cli.mesh_scene import parse_material
 from warpfea.cli.summary import KEYS
 from warpfea.outputs.usd import validate_usd
 

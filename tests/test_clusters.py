@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 from product_state import DT, apply, prepare
-from warpfea.kernels.elements.cluster import cluster_size, slot_capacity, table_layout
+from warpfea.kernels.elements.element_clusters import cluster_size, slot_capacity, table_layout
 
 import warpfea as wf
 from warpfea.solvers.clusters import cluster_tables

@@ -8,13 +8,13 @@ import warp as wp
 from validation.conservation import LAWS
 from warpfea.kernels.common.types import kernel_module, precision
 from warpfea.kernels.elements import materials
-from warpfea.kernels.elements.conserving import conserving_law
+from warpfea.kernels.elements.energy_momentum import energy_momentum_law
 
 
 @functools.cache
 def stress_kernel(name, dtype):
     """A kernel that evaluates the functions of a conserving law at one point per thread."""
-    law, p = conserving_law(name, dtype), precision(dtype)
+    law, p = energy_momentum_law(name, dtype), precision(dtype)
     coef = wp.types.vector(length=materials.NCOEF, dtype=p.T)
 
     @wp.kernel(module=kernel_module(f"test_conserving_{name}_{dtype}"))
@@ -118,7 +118,9 @@ def law_stress(name, G):
     coef = wp.types.vector(length=materials.NCOEF, dtype=p.T)
 
     @wp.kernel(module=kernel_module(f"test_conserving_plain_{name}"))
-    def plain(c: wp.array(dtype=coef), G: wp.array(dtype=p.mat33), W: wp.array(dtype=p.T), P: wp.array(dtype=p.mat33)):
+    def to_json(
+        c: wp.array(dtype=coef), G: wp.array(dtype=p.mat33), W: wp.array(dtype=p.T), P: wp.array(dtype=p.mat33)
+    ):
         k = wp.tid()
         W[k] = law.energy(G[k], c[0])
         P[k] = law.stress(G[k], c[0])
@@ -128,7 +130,7 @@ def law_stress(name, G):
     c[0, : len(own)] = own
     ins = [wp.array(x, dtype=kind, device="cpu") for x, kind in ((c, coef), (G, p.mat33))]
     outs = [wp.zeros(len(G), dtype=kind, device="cpu") for kind in (p.T, p.mat33)]
-    wp.launch(plain, dim=len(G), inputs=ins + outs, device="cpu")
+    wp.launch(to_json, dim=len(G), inputs=ins + outs, device="cpu")
     return [x.numpy() for x in outs]
 
 

@@ -34,7 +34,7 @@ def test_a_reset_leaves_overlaps_of_other_worlds():
     before = sim.state.contact_overlap.numpy()
     sim.reset([True, False])
     np.testing.assert_array_equal(sim.state.contact_overlap.numpy(), before)
-    assert sim.state.contact_born.numpy().tolist() == [0.0, 0.0]
+    assert sim.state.contact_overlap_time.numpy().tolist() == [0.0, 0.0]
 
 
 def test_an_overlap_that_has_decayed_in_statics_stays_so():
@@ -152,7 +152,7 @@ def test_jaws_closed_by_controls_in_four_worlds_equal_single_runs(device, dtype)
             places += [(0.0, 0.0, value)] * 2
         alone = wf.Simulation(resting(path=(times, places), device=device, dtype=dtype)[1], dt=h)
         alone.step(steps)
-        for name in ("displacement", "velocity", "ledger", "contact_spring", "contact_place"):
+        for name in ("displacement", "velocity", "ledger", "contact_spring", "contact_position"):
             a, b = getattr(alone.state, name).numpy()[0], getattr(together.state, name).numpy()[world]
             np.testing.assert_array_equal(a, b, err_msg=name)
     assert together.contact_record("pad").normal_force.max() > 1.0

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import warpfea as wf
-from warpfea.outputs.frames import Surface
+from warpfea.outputs.frames import DrawnSurface
 from warpfea.outputs.obstacles import Obstacles
 from warpfea.outputs.render import render_usd
 
@@ -232,7 +232,7 @@ def test_tilted_planes_of_many_worlds_do_not_cover_other_worlds():
     b = wf.ModelBuilder()
     block = b.add_solid(wf.mesh.box((0.1, 0.1, 0.1), cells=(1, 1, 1)), material=RUBBER)
     b.add_contact(block, b.add_collider(wf.HalfSpace((0.3, 0, 1), -0.2)))
-    one, four = (Surface(wf.Simulation(b.finalize(device="cpu", worlds=n), dt=1e-3)) for n in (1, 4))
+    one, four = (DrawnSurface(wf.Simulation(b.finalize(device="cpu", worlds=n), dt=1e-3)) for n in (1, 4))
 
     def width(surface):
         square = surface.obstacles.all[0].points[0]

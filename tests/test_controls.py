@@ -8,7 +8,7 @@ import warpfea as wf
 from warpfea.terms.term import Term
 
 H = 1.0 / 128.0  # exact in binary, so that the samples of a law are met exactly
-VALUES = np.array([0.25, 0.75, -0.5, 0.125])
+JOINT_VALUES = np.array([0.25, 0.75, -0.5, 0.125])
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
 RUBBER = wf.SVK(E=1e6, nu=0.3, density=1000.0)
 
@@ -70,7 +70,7 @@ def simulation(kind, law, worlds=1, dtype="float64", device="cpu", **options):
 def paths(kind, worlds=4, steps=4):
     """(steps, worlds, size): no world is driven as another."""
     scale = np.atleast_1d(KINDS[kind][2])
-    shape = VALUES[:steps, None] * np.linspace(1.0, -0.5, worlds)
+    shape = JOINT_VALUES[:steps, None] * np.linspace(1.0, -0.5, worlds)
     return shape[:, :, None] * scale
 
 
@@ -153,7 +153,7 @@ def test_one_control_may_drive_several_things():
         b.drive(one.nodes("x+"), displacement=wf.Control("grip", 3))
         b.add_traction(one.surface("z+"), grip)
     model = b.finalize(device="cpu")
-    assert model.terms.laws.count == 1
+    assert model.terms.time_laws.count == 1
     sim = wf.Simulation(model, dt=H)
     sim.controls["grip"][:] = (0.01, 0.0, 0.02)
     sim.step(2)
@@ -282,10 +282,10 @@ def count_calls(patch, calls, names):
     counts = dict.fromkeys(names, 0)
     calls.append(counts)
 
-    def counting(name, plain):
+    def counting(name, to_json):
         def counted(*args, **options):
             counts[name] += 1
-            return plain(*args, **options)
+            return to_json(*args, **options)
 
         return counted
 
@@ -300,7 +300,7 @@ def test_a_step_is_the_same_recorded_graph_and_reads_nothing_more(monkeypatch, d
     for law, sim in sims.items():
         stepper = sim.stepper
         sim.step()
-        before = stepper.graph, stepper.launch.launches, stepper.work.law_value.ptr
+        before = stepper.graph, stepper.launch.launches, stepper.work.time_law_values.ptr
         with monkeypatch.context() as m:
             count_calls(m, calls, ("numpy", "assign", "__init__"))
             sim.step()
@@ -308,7 +308,7 @@ def test_a_step_is_the_same_recorded_graph_and_reads_nothing_more(monkeypatch, d
             sim.controls["c"][:] = 300.0
             sim.step()
         assert stepper.graph is not None
-        assert before == (stepper.graph, stepper.launch.launches, stepper.work.law_value.ptr)
+        assert before == (stepper.graph, stepper.launch.launches, stepper.work.time_law_values.ptr)
     with_control, without = calls
     assert with_control == without
     assert np.abs(next(iter(sims.values())).state.displacement.numpy()).max() > 1e-7
@@ -455,7 +455,7 @@ def test_a_term_may_not_take_the_array_of_a_control():
 
 def test_equal_controls_may_meet_on_a_component():
     model = twice(wf.Control("jaw", 3), wf.Control("jaw", 3))
-    assert list(model.terms.laws.controls) == ["jaw"]
+    assert list(model.terms.time_laws.controls) == ["jaw"]
 
 
 def test_an_open_joint_is_told_at_the_start():

@@ -80,7 +80,7 @@ def test_all_of_H_is_factorised(operator):
     work.newton.active.fill_(1)
     work.newton.iterations.zero_()
     newton.residual.evaluate(active)
-    newton.residual.take(active)
+    newton.residual.assemble_matrix(active)
     newton.direct._assemble(active, newton.direct.value, projected=False)
     matrix = newton.direct.assembled.matrix(newton.direct.value)
     v = np.random.default_rng(0).normal(size=(model.slots, 3)) * model.free_host
@@ -130,7 +130,7 @@ def test_a_column_beyond_its_critical_load(data, monkeypatch):
     from warpfea.solvers.direct import Direct
 
     uphill = []
-    retreat = Direct._retreat
+    retreat = Direct._factorise_positive
     monkeypatch.setattr(Direct, "_retreat", lambda self, world: (uphill.append(world), retreat(self, world)))
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     column = b.add_beam(

@@ -55,7 +55,7 @@ def errors_of_operator(family, law, operator, integrator="energy_momentum"):
         h = 1e-4
         numeric = (residual_at(sim, v + h * p) - residual_at(sim, v - h * p)) / (2 * h)
         residual_at(sim, v)
-        residual.take(active)
+        residual.assemble_matrix(active)
         w.p.assign(p[None])
         residual.product(w.p, w.Hp, active)
         H = w.Hp.numpy()[0]

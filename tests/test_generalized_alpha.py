@@ -8,8 +8,8 @@ from pairwise import covering
 
 import warpfea as wf
 from warpfea.simulation import integrators
-from warpfea.simulation.kinks import jumps, kinks
-from warpfea.simulation.opening import constraint_rates
+from warpfea.simulation.consistent_initial_conditions import constraint_rates
+from warpfea.simulation.discontinuities import jumps, kinks
 
 RADII = (0.0, 0.5, 0.8, 1.0)
 EXACT = wf.NewtonPCG(tol=1e-12)
@@ -70,12 +70,12 @@ def test_a_step_damps_a_mode_as_theory_says(mode, rho, turn):
     measured = []
     for k, size in enumerate((1.0, omega, omega**2)):  # of q, v, a
         sim = wf.Simulation(model, dt=h, integrator=wf.GeneralizedAlpha(rho_inf=rho), solver=solver)
-        sim.stepper.opening.prepare(h)
+        sim.stepper.initial_conditions.prepare(h)
         arrays = (sim.state.displacement, sim.state.velocity, sim.state.algorithmic_acceleration)
         arrays[k].assign((small * size * shape)[None])
         sim.state.acceleration.assign((-(omega**2) * small * shape)[None] if k == 0 else np.zeros((1, *shape.shape)))
         sim.step()
-        assert sim.stepper.opening.count == 1
+        assert sim.stepper.initial_conditions.count == 1
         measured.append(modal(sim, shape, M) / (small * size))
     A, scale = amplification(rho, omega, h), np.array([1.0, omega, omega**2])
     B = A * scale[None, :] / scale[:, None]
@@ -338,7 +338,7 @@ def test_the_start_is_in_equilibrium_and_obeys_the_joints():
     model, state = double_pendulum()
     before = state.velocity.numpy().copy()
     sim = wf.Simulation(model, state, dt=1e-4, integrator="generalized_alpha")
-    sim.stepper.opening.prepare(sim.dt)
+    sim.stepper.initial_conditions.prepare(sim.dt)
     assert np.abs(state.velocity.numpy() - before).max() < 1e-5  # of h^2 w', and the velocities were consistent
     w = state.acceleration.numpy()[0].ravel()
     J = model.terms.constraints.jacobian(model.state(), 0).toarray()
@@ -369,7 +369,7 @@ def test_velocities_that_joints_forbid_are_taken_in_the_first_step():
     b, bodies, _ = links(1, gravity=(0, 0, 0), drive=([0.0, 1.0], [0.0, 3.0]))
     model = b.finalize(device="cpu")
     sim = wf.Simulation(model, dt=1e-4, integrator="generalized_alpha", solver=EXACT)
-    sim.stepper.opening.prepare(sim.dt)
+    sim.stepper.initial_conditions.prepare(sim.dt)
     still, laws = np.zeros((model.slots, 3)), np.zeros((3, 1, 3))
     laws[1, 0, 0] = 3.0
     rates = constraint_rates(model.constraints, still, sim.state.velocity.numpy()[0], laws)[1]
@@ -394,7 +394,7 @@ def test_a_state_that_another_scheme_advanced_begins_anew():
     for start in (state, fresh):
         sim = wf.Simulation(model, start, dt=1e-3, integrator="generalized_alpha", solver=EXACT)
         sim.step(2)
-        assert sim.stepper.opening.count == 1
+        assert sim.stepper.initial_conditions.count == 1
         found.append(sim.state.displacement.numpy())
     assert np.abs(found[0] - found[1]).max() < 1e-12 * np.abs(found[0]).max()
 
@@ -442,7 +442,7 @@ def test_order_across_a_kink(load):
     for h in (2e-4, 1e-4, 1.25e-5):
         sim = wf.Simulation(model, dt=h, integrator="generalized_alpha", solver=EXACT)
         sim.step(round(3 * JUMP / h))
-        assert sim.stepper.opening.count == 2
+        assert sim.stepper.initial_conditions.count == 2
         ends.append(np.concatenate([sim.probe("tip").displacement[0, -1], 1e-2 * sim.probe("tip").velocity[0, -1]]))
         if not load:  # exactly as driven, without an oscillation
             k = round(JUMP / h)

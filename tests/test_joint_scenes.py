@@ -14,7 +14,7 @@ from scene_runs import scene_simulation
 
 import warpfea as wf
 from warpfea.builder.scene import find
-from warpfea.cli.summary import KEYS, MANY
+from warpfea.cli.summary import KEYS, MAX_ROWS
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 SMALL = {
@@ -162,14 +162,14 @@ def test_summary_has_a_row_for_each_joint(capfd, tmp_path):
 
 
 def test_summary_lists_the_worst_of_many_joints(capfd):
-    links = ("--set", f"links={MANY}", "--device", "cpu")
+    links = ("--set", f"links={MAX_ROWS}", "--device", "cpu")
     code, out, _ = run(capfd, "run", "chain", *links, "--t-end", "0.02")
     assert code == 0
     rows = [line for line in out.splitlines() if line.startswith("joint ")]
-    assert 1 < len(rows) < MANY
+    assert 1 < len(rows) < MAX_ROWS
     values = [float(re.search(r"violation (\S+) m", line)[1]) for line in rows]
     assert values == sorted(values, reverse=True)
-    assert f"{MANY + 1} joints; largest violations shown" in out
+    assert f"{MAX_ROWS + 1} joints; largest violations shown" in out
     code, out, _ = run(capfd, "info", "chain", *links)
     assert code == 0
     assert "12 revolute (60 equations), 1 spherical (3 equations)" in out

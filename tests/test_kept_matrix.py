@@ -46,7 +46,7 @@ def test_a_run_from_any_step_is_the_same(damping):
     sim = box(damping=damping, solver=solver)
     states = []
     for _ in range(12):
-        states.append(sim.state.like())
+        states.append(sim.state.copy())
         sim.step()
     end = bits(sim)
     for k in (1, 4, 7, 11):
@@ -61,7 +61,7 @@ def test_a_run_goes_on_the_same_where_kept_matrices_serve_badly():
     sim = box(spin=15.0, clamp=False)
     states, paces = [], []
     for _ in range(25):
-        states.append(sim.state.like())
+        states.append(sim.state.copy())
         sim.step()
         paces.append(sim.state.numpy()["operator"][0, 5])
     assert len(set(paces)) > 10
@@ -80,7 +80,7 @@ def test_a_refused_step_leaves_no_trace():
     )
     for sim in (good, tried):
         sim.step(4)
-    before = tried.state.like()
+    before = tried.state.copy()
     tried.dt = 1e2
     with pytest.raises(wf.ConvergenceError):
         tried.step()
@@ -119,7 +119,7 @@ def test_states_go_on_with_another_solver():
     for options in ({}, {"operator": "elements"}, {"preconditioner": "block-jacobi"}, {"linear": "direct"}):
         other = box(solver=wf.NewtonPCG(tol=1e-10, **options))
         other.state.load(sim.state.numpy())
-        other.stepper.forget()
+        other.stepper.invalidate()
         other.step(5)
         tip = other.probe("tip").displacement[0, -1]
         expected = tip if expected is None else expected

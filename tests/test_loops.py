@@ -167,7 +167,7 @@ def test_steps_that_are_not_read_are_the_same(dtype):
     model = cubes(2, dtype)
     loud = wf.Simulation(model, dt=DT, on_failure="freeze", ledger=False)
     quiet = wf.Simulation(model, dt=DT, **QUIET)
-    assert (loud.quiet, quiet.quiet) == (False, True)
+    assert (loud.asynchronous, quiet.asynchronous) == (False, True)
     loud.step(30)
     for count in (1, 9, 20):
         report = quiet.step(count)
@@ -233,16 +233,16 @@ def test_resets_with_every_solver(solver):
 def check_reset(build, kind, dtype="float64", device="cpu", **options):
     """Worlds that are reset have the bits of a new run, and the others those of a run without resets."""
     model, options = build(4, dtype, device), QUIET | options
-    sim, plain = (wf.Simulation(model, dt=DT, **options) for _ in range(2))
-    for s in (sim, plain):
+    sim, to_json = (wf.Simulation(model, dt=DT, **options) for _ in range(2))
+    for s in (sim, to_json):
         s.step(25)
     sim.reset(flags(1, 2, dtype=kind, device=device))
     fresh = wf.Simulation(build(1, dtype, device), dt=DT, **options)
     assert same(values(sim, 1), values(fresh))
-    for s in (sim, plain, fresh):
+    for s in (sim, to_json, fresh):
         s.step(25)
     for world in range(4):
-        assert same(values(sim, world), values(fresh if world in (1, 2) else plain, 0 if world in (1, 2) else world))
+        assert same(values(sim, world), values(fresh if world in (1, 2) else to_json, 0 if world in (1, 2) else world))
 
 
 def test_what_is_done_is_reset_by_its_status():
@@ -271,8 +271,8 @@ def test_a_reset_follows_parameters_that_were_set(ledger, between):
     for model in models:
         model.set_parameter("bar.E", 1e6 if model.worlds == 3 else 3e6)
     models[2].set_gravity(g[1])
-    sim, plain, fresh = (wf.Simulation(model, dt=DT, **options) for model in models)
-    for s, model in ((sim, models[0]), (plain, models[1])):
+    sim, to_json, fresh = (wf.Simulation(model, dt=DT, **options) for model in models)
+    for s, model in ((sim, models[0]), (to_json, models[1])):
         s.step(3)
         if s is sim:
             s.reset(flags(of=3))
@@ -282,11 +282,11 @@ def test_a_reset_follows_parameters_that_were_set(ledger, between):
             s.step(between)
     sim.reset(flags(1, of=3))
     assert same(values(sim, 1), values(fresh))
-    for s in (sim, plain, fresh):
+    for s in (sim, to_json, fresh):
         s.step(10)
     assert same(values(sim, 1), values(fresh))
     for world in (0, 2):
-        assert same(values(sim, world), values(plain, world))
+        assert same(values(sim, world), values(to_json, world))
 
 
 def test_a_reset_that_is_refused_leaves_nothing_behind():
@@ -309,19 +309,19 @@ def test_a_reset_that_is_refused_leaves_nothing_behind():
 
 @pytest.mark.parametrize("bad", [0.0, -1e-3, np.nan, np.inf])
 def test_a_bad_step_on_the_device_fails_its_world_alone(bad):
-    sim, plain = wf.Simulation(cubes(2), dt=DT, **QUIET), wf.Simulation(cubes(), dt=DT, **QUIET)
+    sim, to_json = wf.Simulation(cubes(2), dt=DT, **QUIET), wf.Simulation(cubes(), dt=DT, **QUIET)
     sim.dt = wp.array([DT, bad], dtype=wp.float64, device="cpu")
-    for s in (sim, plain):
+    for s in (sim, to_json):
         s.step(20)
     assert sim.status.tolist() == [0, 1]
     assert sim.time[1] == 0.0
-    assert same(values(sim, 0), values(plain))
+    assert same(values(sim, 0), values(to_json))
 
 
 def test_a_reset_to_a_state_that_was_kept():
     sim = wf.Simulation(cubes(4), dt=DT, **QUIET)
     sim.step(20)
-    kept = sim.state.like()
+    kept = sim.state.copy()
     sim.step(10)
     ahead = [values(sim, world) for world in range(4)]
     sim.reset(flags(0, 3), kept)
@@ -402,7 +402,7 @@ def test_worlds_of_every_kind_equal_their_own_runs(dtype, device):
     sim = start(cubes(6, dtype, device), everyone)
     graph = sim.stepper.graph
     sim.step(10)
-    back = sim.state.like()
+    back = sim.state.copy()
     sim.step(15)
     sim.reset(flags(4, of=6, device=device), back)
     sim.step(15)

@@ -12,9 +12,9 @@ from cli_runs import run as command
 
 import warpfea as wf
 from warpfea.base.errors import OutputError, UsageError
-from warpfea.cli.part import _load
+from warpfea.cli.mesh_scene import _load
 from warpfea.cli.summary import human, summarize
-from warpfea.outputs import reel, usd
+from warpfea.outputs import animation, usd
 from warpfea.outputs.frames import time_of
 from warpfea.outputs.usd import validate_usd
 
@@ -205,13 +205,13 @@ def test_usd_speaks_our_words(tmp_path, monkeypatch):
 def labels(monkeypatch):
     """Collects what is written under pictures."""
     seen = []
-    label = reel.label
+    label = animation.label
 
     def note(image, time, bar):
         seen.append(time)
         return label(image, time, bar)
 
-    monkeypatch.setattr(reel, "label", note)
+    monkeypatch.setattr(animation, "label", note)
     return seen
 
 

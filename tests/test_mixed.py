@@ -40,7 +40,7 @@ def placed(sim: wf.Simulation, mixed: int, amount: float = 0.02) -> np.ndarray:
     w.u.assign(now.astype(kind))
     w.step.dq_dv.fill_(1.0)
     w.step.mass_factor.zero_()
-    w.newton.mixed.fill_(mixed)
+    w.newton.predicted_stress.fill_(mixed)
     return rng.standard_normal(shape) * free
 
 
@@ -49,7 +49,7 @@ def product(sim: wf.Simulation, direction: np.ndarray) -> np.ndarray:
     w, residual = sim.stepper.work, sim.stepper.newton.residual
     on = wp.ones(1, dtype=wp.int32, device=sim.model.device)
     w.p.assign(direction.astype(w.p.numpy().dtype))
-    residual.take(on)
+    residual.assemble_matrix(on)
     residual.product(w.p, w.Hp, on)
     return w.Hp.numpy().astype(float) * sim.model.free_host
 
@@ -63,7 +63,7 @@ def test_matrix_and_elements_agree(kind: str, mixed: int) -> None:
         sim = static(kind, operator)
         p = placed(sim, mixed)
         results[operator] = product(sim, p)
-        sim.stepper.work.newton.mixed.zero_()
+        sim.stepper.work.newton.predicted_stress.zero_()
         results[operator, "plain"] = product(sim, p)
     size = np.abs(results["matrix"]).max()
     np.testing.assert_allclose(results["elements"], results["matrix"], atol=1e-12 * size)
@@ -80,9 +80,9 @@ def test_stress_is_that_of_the_linear_prediction(kind: str) -> None:
     difference = []
     for part in (1.0, 0.5):
         w.base.assign(now - part * (now - before))
-        w.newton.mixed.fill_(1)
+        w.newton.predicted_stress.fill_(1)
         mixed = product(sim, p)
-        w.newton.mixed.zero_()
+        w.newton.predicted_stress.zero_()
         difference.append(np.sum(p * (mixed - product(sim, p))))
     assert difference[0] / difference[1] == pytest.approx(4.0, rel=0.05)
 
@@ -102,9 +102,9 @@ def test_positive_matrix_has_no_negative_curvature(kind: str) -> None:
         array.assign(squeezed.astype(array.numpy().dtype))
     lowest = {}
     for mixed in (2, 0):
-        w.newton.mixed.fill_(mixed)
+        w.newton.predicted_stress.fill_(mixed)
         residual = sim.stepper.newton.residual
-        residual.take(wp.ones(1, dtype=wp.int32))
+        residual.assemble_matrix(wp.ones(1, dtype=wp.int32))
         dense = residual.assembled.matrix(residual.matrix).toarray()
         values = np.linalg.eigvalsh(0.5 * (dense + dense.T))
         lowest[mixed] = values[0] / values[-1]

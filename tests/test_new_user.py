@@ -15,7 +15,7 @@ import pytest
 import warp as wp
 
 import warpfea as wf
-from warpfea.base.worlds import chosen_worlds
+from warpfea.base.worlds import worlds_mask
 from warpfea.cli import main
 from warpfea.simulation.reports import ContactRecord, JointRecord
 
@@ -161,7 +161,7 @@ def test_the_command_line_says_what_to_write(tmp_path, monkeypatch, capfd, words
     ],
 )
 def test_worlds_by_flags_or_numbers(worlds, mask, chosen):
-    assert np.flatnonzero(chosen_worlds("reset", mask, worlds)).tolist() == list(chosen)
+    assert np.flatnonzero(worlds_mask("reset", mask, worlds)).tolist() == list(chosen)
 
 
 @pytest.mark.parametrize(
@@ -178,7 +178,7 @@ def test_worlds_by_flags_or_numbers(worlds, mask, chosen):
 )
 def test_worlds_that_may_be_either_are_refused(worlds, mask, text):
     with pytest.raises(wf.ModelError, match=rf"^reset: mask = .*{text}"):
-        chosen_worlds("reset", mask, worlds)
+        worlds_mask("reset", mask, worlds)
 
 
 def test_reset_takes_numbers_of_worlds():

@@ -46,8 +46,8 @@ def watch(sim, after):
     solve = loop.pcg.solve
 
     def anew(active):
-        loop.residual.take(active)
-        loop.preconditioner.renew(active)
+        loop.residual.assemble_matrix(active)
+        loop.preconditioner.discard(active)
         solve(active)
         after(loop)
 
@@ -68,7 +68,7 @@ def test_iterations_do_not_grow_with_the_stack(kind):
 
 
 def test_without_the_motions_they_do(monkeypatch):
-    monkeypatch.setattr(twolevel, "motion_bodies", lambda model: {})
+    monkeypatch.setattr(twolevel, "mode_bodies", lambda model: {})
     few, many = (iterations(stack(n, 1e8), "banded") for n in (5, 20))
     assert many > 1.5 * few
 
@@ -96,13 +96,15 @@ def motions_of(model, u, bodies):
 
 def system(loop):
     """H that the preconditioner is made from, with what couples the bodies, from the points one by one."""
-    model, at = loop.model, loop.residual.at
+    model, at = loop.model, loop.residual.ctx
     pre, graph = loop.preconditioner, loop.preconditioner.assembled.pattern.graph
     shape = (3 * model.slots,) * 2
     own = sp.bsr_matrix((pre.value.numpy()[0], graph.indices, graph.indptr), shape=shape).toarray()
     term = model.terms.find(Pairs)
     touching, attempt = at.scratch["pairs"]["touching"], at.scratch["pairs"]["attempt"]
-    stiffness, listed, weight = (x.numpy()[0] for x in (attempt.stiffness, touching.listed, touching.weight))
+    stiffness, listed, weight = (
+        x.numpy()[0] for x in (attempt.stiffness, touching.listed_facet, touching.shape_values)
+    )
     cross = np.zeros(shape)
     for group in term.tables.groups:
         functions = group.data.shape.numpy()
@@ -141,7 +143,7 @@ def test_the_correction_is_that_of_the_coupled_motions(element, held):
         wanted = R @ np.linalg.solve(R.T @ (own + cross) @ R, R.T @ r.ravel())
         z = wp.zeros((1, model.slots), dtype=model.types.vec3, device="cpu")
         given = wp.array(r[None], dtype=model.types.vec3, device="cpu")
-        loop.preconditioner.motions.apply(given, z, wp.ones(1, dtype=wp.int32, device="cpu"))
+        loop.preconditioner.body_modes.apply(given, z, wp.ones(1, dtype=wp.int32, device="cpu"))
         error = np.abs(z.numpy()[0].ravel() - wanted).max() / np.abs(wanted).max()
         weight = np.abs(R.T @ cross @ R).max() / np.abs(R.T @ own @ R).max()
         found.append((error, weight))
@@ -155,9 +157,9 @@ def test_the_correction_is_that_of_the_coupled_motions(element, held):
 
 def test_bodies_that_touch_no_free_one_have_no_motions():
     model = stack(1, 1e6)
-    assert twolevel.motion_bodies(model) == {}
-    assert simulation(model, "banded").stepper.newton.preconditioner.motions is None
-    assert twolevel.motion_bodies(stack(2, 1e6, foreign=True)) == {1: 0, 2: 1}
+    assert twolevel.mode_bodies(model) == {}
+    assert simulation(model, "banded").stepper.newton.preconditioner.body_modes is None
+    assert twolevel.mode_bodies(stack(2, 1e6, foreign=True)) == {1: 0, 2: 1}
 
 
 @pytest.mark.parametrize("kind", ["banded", "two-level"])

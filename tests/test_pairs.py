@@ -150,7 +150,7 @@ def test_worlds_are_their_own_runs(dtype):
     together = launched(velocities, dtype)
     together.step(12)
     all_of = arrays(together)
-    pushed = [np.abs(all_of["state.pairs_seat"][w]).max() > 0 for w in range(3)]
+    pushed = [np.abs(all_of["state.pairs_facet"][w]).max() > 0 for w in range(3)]
     assert pushed == [True, True, False]
     for w, velocity in enumerate(velocities):
         alone = launched([velocity], dtype)
@@ -164,7 +164,7 @@ def test_a_resumed_run_has_the_same_bits(law, tmp_path):
     whole, first, second = (wf.Simulation(thrown("T4", "slave", **LAWS[law])[0], dt=DT) for _ in range(3))
     whole.step(25)
     first.run(0.01, outputs=[wf.Checkpoint(tmp_path / "pair.npz", every=10)])
-    assert np.abs(arrays(first)["state.pairs_seat"]).max() > 0
+    assert np.abs(arrays(first)["state.pairs_facet"]).max() > 0
     second.resume(tmp_path / "pair.npz")
     second.step(15)
     for name, values in arrays(whole).items():

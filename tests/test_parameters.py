@@ -10,7 +10,7 @@ import warpfea as wf
 
 E, NU, ETA = np.array([1e6, 2.1e6, 0.7e6]), np.array([0.3, 0.45, 0.2]), np.array([30.0, 0.0, 77.0])
 RHO = np.array([1100.0, 2530.0, 870.0])
-VALUES = {"E": E, "nu": NU, "eta": ETA, "density": RHO}
+JOINT_VALUES = {"E": E, "nu": NU, "eta": ETA, "density": RHO}
 SVK, NEO, RIVLIN = wf.SVK.from_E_nu, wf.NeoHookean.from_E_nu, wf.MooneyRivlin.from_E_nu
 
 
@@ -58,10 +58,10 @@ def model(add, law, worlds=1, dtype="float64", gravity=(0.0, 3.0, -9.81)):
     return b.finalize(device="cpu", worlds=worlds, dtype=dtype)
 
 
-def varied(add, worlds=3, names=tuple(VALUES), dtype="float64", **law):
+def varied(add, worlds=3, names=tuple(JOINT_VALUES), dtype="float64", **law):
     out = model(add, material(**law), worlds, dtype)
     for name in names:
-        out.set_parameter(f"body.{name}", VALUES[name])
+        out.set_parameter(f"body.{name}", JOINT_VALUES[name])
     return out
 
 
@@ -84,10 +84,10 @@ CASES = {
 }
 
 
-def alone_with(case, world, dtype="float64", names=tuple(VALUES)):
+def alone_with(case, world, dtype="float64", names=tuple(JOINT_VALUES)):
     """One world, built with the values of a world; a tied beam has them set, as E/mu in it may round another way."""
     add, law = CASES[case]
-    values = {name: VALUES[name][world] for name in names}
+    values = {name: JOINT_VALUES[name][world] for name in names}
     if case != "3243":
         return model(add, material(**values, **law), dtype=dtype)
     out = model(add, material(**law), dtype=dtype)
@@ -362,7 +362,7 @@ def test_a_change_in_a_run_reaches_the_chosen_worlds_alone(case):
     }
     many = run(3, (None, new), wp.array([False, True, True], dtype=wp.bool, device="cpu"))
     for world in range(3):
-        first = {name: values[world] for name, values in VALUES.items()}
+        first = {name: values[world] for name, values in JOINT_VALUES.items()}
         second = (
             {"E": (5e6, 3e5)[world - 1], "nu": (0.1, 0.33)[world - 1], "eta": 5.0, "density": 700.0} if world else {}
         )
@@ -392,14 +392,14 @@ def test_reset_takes_the_values_there_are():
 
 def test_what_no_world_varies_costs_nothing():
     add, law = CASES["3443"]
-    plain, many = model(add, material(**law), worlds=3), varied(add, names=("E",))
-    assert all(block.data.coefficients.shape[0] == 1 for block in plain.blocks)
-    size = np.dtype(float).itemsize * plain.coefficients.size
-    assert many.bytes["materials"] - plain.bytes["materials"] == 2 * size
-    assert many.bytes["elements"] == plain.bytes["elements"]
-    assert many.info()["kernels"] == plain.info()["kernels"]
+    to_json, many = model(add, material(**law), worlds=3), varied(add, names=("E",))
+    assert all(block.data.coefficients.shape[0] == 1 for block in to_json.blocks)
+    size = np.dtype(float).itemsize * to_json.coefficients.size
+    assert many.bytes["materials"] - to_json.bytes["materials"] == 2 * size
+    assert many.bytes["elements"] == to_json.bytes["elements"]
+    assert many.info()["kernels"] == to_json.info()["kernels"]
     coupled = varied(add, names=("nu",))
-    assert coupled.bytes["elements"] > plain.bytes["elements"]
+    assert coupled.bytes["elements"] > to_json.bytes["elements"]
 
 
 BAD = {

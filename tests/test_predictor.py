@@ -85,7 +85,7 @@ def test_the_best_order_is_that_of_the_smallest_error():
         for k, array in enumerate((w.v, sim.state.velocity, *predictor.past)):
             array.assign(velocity(3.0 - k))
         predictor.control.count.fill_(2)
-        predictor.commit()
+        predictor.update_history()
         assert next_order(sim) == expected
         np.testing.assert_array_equal(predictor.past[0].numpy(), sim.state.velocity.numpy())
 

@@ -255,7 +255,7 @@ def test_ctrl_c_gives_up_one_output_and_finishes_the_others(tmp_path, monkeypatc
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("warpfea.outputs.reel.Reel.save_png", interrupted)
+    monkeypatch.setattr("warpfea.outputs.animation.Animation.save_png", interrupted)
     with pytest.raises(KeyboardInterrupt):
         simulation().run(3 * DT, outputs=[png, *[out for out, _ in made.values()]])
     for _, other in made.values():

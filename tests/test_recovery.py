@@ -118,8 +118,8 @@ def test_partly_done_step_is_taken_back(worlds):
     state = model.state()
     dummy = state.register("dummy", wp.float64, (2,), 3.0)
     sim = wf.Simulation(model, state, dt=1e-2, solver=wf.NewtonPCG(max_halvings=3), integrator="bdf2", capture=False)
-    commit = sim.stepper._book
-    sim.stepper._book = lambda: (commit(), dummy.fill_(4.0))
+    commit = sim.stepper._update_ledger
+    sim.stepper._update_ledger = lambda: (commit(), dummy.fill_(4.0))
     before = bits(sim.state)
     if worlds == 2:  # the second world is at rest at another time, when the load is gone
         time = state.time.numpy()

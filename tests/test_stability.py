@@ -127,7 +127,7 @@ def test_what_is_said_of_it():
 
 
 def test_it_can_be_left_out(monkeypatch):
-    monkeypatch.setattr(statics, "judge_stability", None)
+    monkeypatch.setattr(statics, "check_stability", None)
     model, _ = column(1.1)
     found = wf.solve_static(model, unstable="ignore")
     assert found.report.stable is None
@@ -226,7 +226,7 @@ def test_what_can_be_known(make, stable, reason):
 
 
 def test_large_models_in_single_precision_are_judged_on_demand(monkeypatch):
-    monkeypatch.setattr(stability, "TWIN_SLOTS", 1)
+    monkeypatch.setattr(stability, "FLOAT64_SLOTS", 1)
     model, _ = column(1.01, "float32")
     found = wf.solve_static(model)
     assert found.report.stable.tolist() == [None]
@@ -241,19 +241,19 @@ def test_the_search_takes_no_more_than_a_share_of_the_solve(monkeypatch):
     found = wf.solve_static(model)
     most = max(2, int(0.3 * found.pcg[0]))
     assert found.stability.iterations[0] <= most
-    monkeypatch.setattr(stability, "SHARE", 0.0)
+    monkeypatch.setattr(stability, "SOLVE_FACTOR", 0.0)
     assert wf.solve_static(model).stability.reasons[0].startswith("not resolved in 2 iterations; unstable='refuse'")
     assert wf.solve_static(model, unstable="refuse").report.stable.tolist() == [True]
 
 
 def test_the_sign_of_rounding_is_not_told(monkeypatch):
-    monkeypatch.setattr(stability, "ROUNDING", 1e12)
+    monkeypatch.setattr(stability, "CURVATURE_ROUNDINGS", 1e12)
     model, _ = column(1.1)
     assert wf.solve_static(model).report.stable.tolist() == [None]
 
 
 def test_a_change_by_rounding_the_state_is_not_told(monkeypatch):
-    monkeypatch.setattr(stability, "NOISE", 1e15)
+    monkeypatch.setattr(stability, "ROUNDOFF_CHANGES", 1e15)
     model, _ = column(0.9, "float32", across=1e-5)
     found = wf.solve_static(model)
     assert found.report.stable.tolist() == [None]
@@ -263,7 +263,7 @@ def test_a_change_by_rounding_the_state_is_not_told(monkeypatch):
 @pytest.mark.parametrize(("slender", "twins"), [(False, 0), (True, 1)])
 def test_only_slender_models_in_single_precision_are_judged_in_double(slender, twins, monkeypatch):
     """Where float32 itself has curvatures far above rounding there is no twin in float64: fails on 51a4e5d."""
-    made, twin = [], stability._twin
+    made, twin = [], stability._float64_copy
     monkeypatch.setattr(stability, "_twin", lambda sim: made.append(sim) or twin(sim))
     if slender:
         model, _ = column(0.9, "float32")

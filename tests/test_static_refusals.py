@@ -82,8 +82,8 @@ def test_newton_iterations_count_as_work():
         wf.solve_static(b.finalize(device="cpu"), stabilise=True, solver=solver)
     spent = int(str(caught.value).split(" Newton iterations")[0].rsplit(" ", 1)[1])
     assert 100 <= spent <= 100 + 4 * 50
-    assert wf.NewtonPCG().most_newton(True) == 2000
-    assert wf.NewtonPCG().most_newton(False) == 10_000
+    assert wf.NewtonPCG().newton_budget(True) == 2000
+    assert wf.NewtonPCG().newton_budget(False) == 10_000
 
 
 def test_the_last_report_outlives_a_refusal_that_was_caught():

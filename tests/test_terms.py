@@ -35,9 +35,9 @@ def poised(device="cpu", dtype="float64", **options):
     model, _ = block_on_floor(device, dtype, height=-2e-2)
     sim = wf.Simulation(model, dt=1e-3, **options)
     rng = np.random.default_rng(1)
-    at, term = sim.stepper.at, model.terms.find(Floor)
-    at.state.floor_stuck.assign(rng.integers(0, 2, term.dim))
-    at.state.floor_anchor.assign(rng.normal(scale=1e-3, size=(*term.dim, 3)))
+    ctx, term = sim.stepper.ctx, model.terms.find(Floor)
+    ctx.state.floor_stuck.assign(rng.integers(0, 2, term.dim))
+    ctx.state.floor_anchor.assign(rng.normal(scale=1e-3, size=(*term.dim, 3)))
     w = sim.stepper.work
     w.u.assign(rng.normal(scale=1e-3, size=(1, model.slots, 3)))
     w.step.dq_dv.fill_(1e-3)
@@ -46,22 +46,22 @@ def poised(device="cpu", dtype="float64", **options):
 
 
 def energy_at(sim, term, active, u):
-    at = sim.stepper.at
-    at.work.u.assign(u[None])
-    term.force(at, active)
-    return at.work.rows_of(term).numpy()[0].sum()
+    ctx = sim.stepper.ctx
+    ctx.work.u.assign(u[None])
+    term.force(ctx, active)
+    return ctx.work.rows_of(term).numpy()[0].sum()
 
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_forces_are_differences_of_the_energy(device):
     sim, term, active = poised(device)
-    at = sim.stepper.at
-    u = at.work.u.numpy()[0].copy()
+    ctx = sim.stepper.ctx
+    u = ctx.work.u.numpy()[0].copy()
     rng = np.random.default_rng(2)
     d = rng.normal(size=u.shape)
     high, low = (energy_at(sim, term, active, u + s * 1e-7 * d) for s in (1.0, -1.0))
     energy_at(sim, term, active, u)
-    force = at.work.pool_force.numpy()[0]
+    force = ctx.work.pool_force.numpy()[0]
     assert np.abs(force).max() > 1.0
     slope = (force * d[term.slots]).sum()
     assert slope == pytest.approx((high - low) / 2e-7, rel=1e-6)
@@ -71,8 +71,8 @@ def test_forces_are_differences_of_the_energy(device):
 def test_product_is_the_difference_of_the_force(device):
     """Through the operator of the solver: elements, mass and the term."""
     sim, term, active = poised(device, solver=wf.NewtonPCG(operator="elements"))
-    at, residual = sim.stepper.at, sim.stepper.newton.residual
-    w, u = at.work, at.work.u.numpy()[0].copy()
+    ctx, residual = sim.stepper.ctx, sim.stepper.newton.residual
+    w, u = ctx.work, ctx.work.u.numpy()[0].copy()
     p = np.random.default_rng(3).normal(size=u.shape)
 
     def gradient(x):
@@ -133,7 +133,7 @@ def test_ledger_closes(device, integrator):
         lost.append(e["floor_lost"][0])
     assert max(stored) > 1e-3
     assert stored[-1] == pytest.approx(
-        sim.model.terms.find(Floor).measure(sim.stepper.at)["floor_stored"][0], abs=1e-12
+        sim.model.terms.find(Floor).stored_energy(sim.stepper.ctx)["floor_stored"][0], abs=1e-12
     )
     assert np.all(np.diff(lost) >= 0.0)
     assert lost[-1] > 1e-6  # points have left
@@ -146,14 +146,14 @@ def test_ledger_closes(device, integrator):
 def test_the_ledger_shows_a_wrong_force(monkeypatch):
     """Energy that the force does not derive from has nowhere to go but into the integrator's column."""
     right = bounced(block_on_floor()[0], steps=6).energies()
-    book = Floor.book
+    energy_increments = Floor.energy_increments
 
-    def tripled(self, at, accepted):
-        rows = book(self, at, accepted)
+    def tripled(self, ctx, accepted):
+        rows = energy_increments(self, ctx, accepted)
         rows.assign(3.0 * rows.numpy())
         return rows
 
-    monkeypatch.setattr(Floor, "book", tripled)
+    monkeypatch.setattr(Floor, "energy_increments", tripled)
     got = bounced(block_on_floor()[0], steps=6, capture=False).energies()
     amiss = 2.0 * (right["floor_stored"][0] + right["floor_lost"][0])
     assert amiss > 1e-4
@@ -182,7 +182,7 @@ def test_a_rejected_step_leaves_the_history():
     model = block_on_floor()[0]
     sim = stuck_state(model)
     before = sim.state.numpy()
-    hard = wf.Simulation(model, sim.state.like(), dt=1e-2, solver=wf.NewtonPCG(max_newton=1, max_halvings=2, tol=1e-12))
+    hard = wf.Simulation(model, sim.state.copy(), dt=1e-2, solver=wf.NewtonPCG(max_newton=1, max_halvings=2, tol=1e-12))
     with pytest.raises(wf.ConvergenceError):
         hard.step()
     after = hard.state.numpy()
@@ -196,7 +196,7 @@ def test_halved_steps_are_short_steps():
     long, short = (stuck_state(model, dt=5e-4) for _ in range(2))
     for most in range(2, 12):  # the fewest iterations that the half steps need are too few for the whole
         halved = wf.Simulation(
-            model, long.state.like(), dt=1.6e-2, solver=wf.NewtonPCG(max_newton=most, max_halvings=1, tol=1e-12)
+            model, long.state.copy(), dt=1.6e-2, solver=wf.NewtonPCG(max_newton=most, max_halvings=1, tol=1e-12)
         )
         try:
             halved.step()
@@ -204,7 +204,7 @@ def test_halved_steps_are_short_steps():
             continue
         break
     assert halved.last.halvings[0] == 1
-    halves = wf.Simulation(model, short.state.like(), dt=8e-3, solver=wf.NewtonPCG(tol=1e-12))
+    halves = wf.Simulation(model, short.state.copy(), dt=8e-3, solver=wf.NewtonPCG(tol=1e-12))
     halves.step(2)
     for name in ("displacement", "velocity", "floor_anchor", "ledger"):
         a, b = halved.state.numpy()[name], halves.state.numpy()[name]
@@ -272,8 +272,8 @@ def test_what_the_model_tells_of_it():
     with pytest.raises(wf.ModelError, match="floor_gap"):
         sim.field("nothing", box)
     assert {"floor stiffness", "floor rows"} <= {name.partition(".")[2] for name in sim.bytes()}
-    plain = wf.ModelBuilder()
-    plain.add_solid(wf.mesh.box((1, 1, 1), cells=(1, 1, 1)), material=wf.SVK(E=1e6, nu=0.3, density=1.0))
-    assert "floor" not in plain.finalize(device="cpu").info()["features"]
+    to_json = wf.ModelBuilder()
+    to_json.add_solid(wf.mesh.box((1, 1, 1), cells=(1, 1, 1)), material=wf.SVK(E=1e6, nu=0.3, density=1.0))
+    assert "floor" not in to_json.finalize(device="cpu").info()["features"]
     with pytest.raises(wf.ModelError, match="add_term"):
-        plain.add_term(3)
+        to_json.add_term(3)

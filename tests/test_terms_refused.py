@@ -40,7 +40,9 @@ def connected(change):
 
 
 def booking(change):
-    return kind(book=lambda self, at, accepted: change(self, Floor.book(self, at, accepted)))
+    return kind(
+        energy_increments=lambda self, ctx, accepted: change(self, Floor.energy_increments(self, ctx, accepted))
+    )
 
 
 def declaring(**traits):
@@ -52,7 +54,7 @@ def declaring(**traits):
 
 
 def measuring(change):
-    return kind(measure=lambda self, at: change(Floor.measure(self, at)))
+    return kind(stored_energy=lambda self, ctx: change(Floor.stored_energy(self, ctx)))
 
 
 ODD = {
@@ -62,15 +64,15 @@ ODD = {
     "fractions": (connected(lambda t: [t.slots[:, None].astype(float)]), r"array of ints.*got float64"),
     "a bare array": (connected(lambda t: t.slots[:, None]), "must be a list of arrays"),
     "no entries": (connected(lambda t: []), "declares the trait 'pooled', but it sets no connectivity"),
-    "constraint's traits": (declaring(gated=True), "'gated', which belongs to constraints"),
+    "constraint's traits": (declaring(has_constraints=True), "'has_constraints', which belongs to constraints"),
     "tangent of a potential": (declaring(tangent=True), "'tangent', but its potential is True"),
     "kind of column": (kind(columns=(Column("x", 17),)), "kind 17 is none of STORED"),
     "column without a name": (kind(columns=(Column("", STORED),)), "STORED needs a name"),
     "column of the ledger": (kind(columns=(Column("kinetic", LOSS),)), "the ledger has a column"),
     "work by another name": (kind(columns=(Column("pushing", WORK),)), "name columns of work work_"),
     "column twice": (kind(columns=(Column("a", STORED), Column("a", LOSS))), "energy column 'a' is written twice"),
-    "no measure": (kind(measure=Term.measure), "override measure"),
-    "no book": (kind(book=Term.book), "does not override book"),
+    "no measure": (kind(stored_energy=Term.stored_energy), "override stored_energy"),
+    "no book": (kind(energy_increments=Term.energy_increments), "does not override energy_increments"),
     "no name": (kind(name=None), "Odd: `name` must be a text"),
     "field of every model": (kind(fields={"von_mises": FieldSpec("x", "m")}), "a field 'von_mises' is taken"),
     "part of every model": (kind(parts={"vectors": "x"}), "a part of profiles 'vectors' is taken"),
@@ -91,12 +93,12 @@ LATER = {
     "too few rows": (booking(lambda t, rows: rows[:1]), r"returned float64\[1, 1, 225\]"),
     "single precision": (booking(lambda t, rows: wp.zeros(rows.shape, dtype=wp.float32)), r"returned float32"),
     "rows on the host": (booking(lambda t, rows: rows.numpy()), "returned ndarray"),
-    "too long rows": (booking(lambda t, rows: wp.zeros((2, 1, 40000), dtype=wp.float64)), "build sets booked_rows"),
+    "too long rows": (booking(lambda t, rows: wp.zeros((2, 1, 40000), dtype=wp.float64)), "build sets increment_rows"),
     "another column measured": (measuring(lambda found: {"nope": found["floor_stored"]}), r"gave \['nope'\]"),
     "one number measured": (measuring(lambda found: {"floor_stored": 1.0}), r"expected \(1,\)"),
     "nothing measured": (measuring(lambda found: None), "None"),
     "the state's own array": (
-        kind(register=lambda self, at: at.state.register("displacement", self.model.types.vec3, (self.model.slots,))),
+        kind(register=lambda self, ctx: ctx.state.register("displacement", self.model.types.vec3, (self.model.slots,))),
         "'displacement' is that of the state itself",
     ),
 }  # fmt: skip
@@ -116,7 +118,7 @@ def test_two_terms_keep_out_of_each_others_way():
     with pytest.raises(wf.ModelError, match="energy column 'floor_stored' is written twice"):
         model_with(Floor, kind(name="second"))
     other = dict(name="second", columns=(Column("more", STORED), Column("lost", LOSS)), fields={}, parts={})
-    other["measure"] = lambda self, at: {"more": Floor.measure(self, at)["floor_stored"]}
+    other["stored_energy"] = lambda self, ctx: {"more": Floor.stored_energy(self, ctx)["floor_stored"]}
     with pytest.raises(wf.ModelError, match=r"'second': the state's array 'floor_anchor' is that of term 'floor'"):
         wf.Simulation(model_with(Floor, kind(**other)), dt=1e-3)
 
@@ -133,14 +135,14 @@ def test_a_sample_of_another_shape_is_refused():
 def test_booked_rows_may_be_longer_than_anything_else():
     def build(self, laws):
         Floor.build(self, laws)
-        self.booked_rows = 100_000
+        self.increment_rows = 100_000
 
-    def book(self, at, accepted):
-        rows = wp.zeros((2, 1, self.booked_rows), dtype=wp.float64)
+    def energy_increments(self, ctx, accepted):
+        rows = wp.zeros((2, 1, self.increment_rows), dtype=wp.float64)
         rows[1].fill_(1e-6)
         return rows
 
-    sim = wf.Simulation(model_with(kind(build=build, book=book)), dt=1e-3)
+    sim = wf.Simulation(model_with(kind(build=build, energy_increments=energy_increments)), dt=1e-3)
     sim.step()
     assert sim.energies()["floor_lost"][0] == pytest.approx(0.1, rel=1e-12)
 
@@ -148,7 +150,7 @@ def test_booked_rows_may_be_longer_than_anything_else():
 @pytest.mark.parametrize("limit", [0.0, -1.0, np.nan])
 @pytest.mark.parametrize("solver", [wf.NewtonPCG(max_halvings=2), wf.Jacobi(max_halvings=2)])
 def test_a_term_that_allows_no_step_is_told(limit, solver):
-    odd = kind(aim=lambda self, at, active: at.work.newton.limit.fill_(limit))
+    odd = kind(process_direction=lambda self, ctx, active: ctx.work.newton.limit.fill_(limit))
     sim = wf.Simulation(model_with(odd, height=-2e-3), dt=1e-3, solver=solver)
     before = sim.state.numpy()
     with pytest.raises(wf.ConvergenceError, match="a term allowed no step"):
@@ -158,7 +160,7 @@ def test_a_term_that_allows_no_step_is_told(limit, solver):
 
 def test_jacobi_keeps_to_the_limit():
     """No node moves by more than a tenth of what the descent asks for: it gets less far in the same iterations."""
-    odd = kind(aim=lambda self, at, active: at.work.newton.limit.fill_(0.1))
+    odd = kind(process_direction=lambda self, ctx, active: ctx.work.newton.limit.fill_(0.1))
     left = [
         wf.Simulation(model_with(make, height=-2e-3), dt=1e-3, solver=wf.Jacobi(iterations=3)).step().residual[0]
         for make in (Floor, odd)
@@ -167,9 +169,9 @@ def test_jacobi_keeps_to_the_limit():
 
 
 def test_what_holds_a_body_is_found_from_its_slots():
-    """Without `hold` the correction by translations is left out where a tangent touches a component."""
-    free = kind(hold=lambda self, free: None)
-    default = kind(hold=Term.hold)
+    """Without `mark_constrained` the correction by translations is left out where a tangent touches a component."""
+    free = kind(mark_constrained=lambda self, free: None)
+    default = kind(mark_constrained=Term.mark_constrained)
     counts = []
     for make in (default, free):
         sim = wf.Simulation(model_with(make), dt=1e-3)
@@ -191,7 +193,7 @@ def test_checkpoints_know_the_term(tmp_path):
 
 def test_terms_start_where_the_state_is_set(tmp_path):
     calls = []
-    odd = kind(start=lambda self, at, active: calls.append(active.numpy().tolist()), hash=Term.hash)
+    odd = kind(start=lambda self, ctx, active: calls.append(active.numpy().tolist()), hash=Term.hash)
     sim = wf.Simulation(model_with(odd, worlds=2), dt=1e-3)
     sim.step()
     sim.reset([True, False])
@@ -207,7 +209,7 @@ def test_a_squeezed_body_has_a_force_scale():
         def __init__(self, model):
             super().__init__(model, k=0.0)
 
-        def commit(self, at, accepted):
+        def commit(self, ctx, accepted):
             pass
 
     model = model_with(Squeeze, gravity=(0, 0, 0), velocity=(0, 0, 0), damping=wf.KelvinVoigt(eta=3e3, lambda_v=0.0))
@@ -239,7 +241,7 @@ def drag_kernels(dtype):
             out[world, offset + item] = -c * v[world, slot[item]]
 
     @wp.kernel(module=module)
-    def book(
+    def energy_increments(
         slot: wp.array(dtype=wp.int32), c: T, v: wp.array2d(dtype=vec3), u: wp.array2d(dtype=vec3),
         before: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), rows: wp.array3d(dtype=wp.float64),
     ):  # fmt: skip
@@ -248,7 +250,7 @@ def drag_kernels(dtype):
             k = slot[item]
             rows[0, world, item] = wp.float64(c * wp.dot(v[world, k], u[world, k] - before[world, k]))
 
-    return types.SimpleNamespace(module=module, force=force, book=book)
+    return types.SimpleNamespace(module=module, force=force, energy_increments=energy_increments)
 
 
 class Drag(Term):
@@ -268,19 +270,23 @@ class Drag(Term):
         self.slot, self.connectivity = self.model.array("drag", slots, wp.int32), [slots[:, None]]
         self.dim = (self.model.worlds, len(slots))
 
-    def allocate(self, work, at):
-        at.scratch[self.name] = work.array("drag rows", (1, *self.dim), wp.float64)
+    def allocate(self, work, ctx):
+        ctx.scratch[self.name] = work.array("drag rows", (1, *self.dim), wp.float64)
 
-    def modules(self, at):
+    def modules(self, ctx):
         return {self.kernels.module}
 
-    def force(self, at, active):
-        args = [self.slot, 0.05, at.work.v, active, self.offset, at.work.nonpotential_contribution]
-        at.launch(self.kernels.force, self.dim, args)
+    def force(self, ctx, active):
+        args = [self.slot, 0.05, ctx.work.v, active, self.offset, ctx.work.nonpotential_contribution]
+        ctx.launch(self.kernels.force, self.dim, args)
 
-    def book(self, at, accepted):
-        rows, w = at.scratch[self.name], at.work
-        at.launch(self.kernels.book, self.dim, [self.slot, 0.05, w.v, w.u, at.state.displacement, accepted, rows])
+    def energy_increments(self, ctx, accepted):
+        rows, w = ctx.scratch[self.name], ctx.work
+        ctx.launch(
+            self.kernels.energy_increments,
+            self.dim,
+            [self.slot, 0.05, w.v, w.u, ctx.state.displacement, accepted, rows],
+        )
         return rows
 
 

@@ -33,7 +33,7 @@ def on(sim):
 def product(sim, p):
     work, residual = sim.stepper.work, sim.stepper.newton.residual
     work.p.assign(p.reshape(work.p.numpy().shape))
-    residual.take(on(sim))
+    residual.assemble_matrix(on(sim))
     residual.product(work.p, work.Hp, on(sim))
     return work.Hp.numpy()[0].ravel().astype(float)
 
@@ -147,7 +147,7 @@ def test_mortons_curve_keeps_neighbours_together():
 def test_large_bodies_are_numbered_by_place_and_report_in_file_order(monkeypatch):
     ends = []
     for limit in (10**9, 0):
-        monkeypatch.setattr("warpfea.model.discretisation.LARGE", limit)
+        monkeypatch.setattr("warpfea.model.discretisation.ORDERED_NODES", limit)
         b = bar(1000)
         model = b.finalize(device="cpu")
         sim = wf.Simulation(model, dt=1e-3, solver=wf.NewtonPCG(tol=1e-11))
@@ -239,7 +239,7 @@ def test_a_small_model_is_inverted_as_a_whole(scene):
     sim = simulation(SCENES[scene]())
     assert sim.stepper.newton.preconditioner.levels[0].dense
     free = sim.model.free_host.ravel() > 0
-    place = sim.stepper.newton.preconditioner.reuse.place
+    place = sim.stepper.newton.preconditioner.reuse.linearisation_point
     sim.stepper.work.u.assign(place)
     H = assembled(sim, projected=True).toarray()[free][:, free]
     B = dense_apply(sim)[free][:, free]
@@ -265,7 +265,7 @@ def test_tiles_and_coarse_space_against_numpy(name, size):
     assert below.dense
     model = sim.model
     free = model.free_host.ravel()
-    sim.stepper.work.u.assign(pre.reuse.place)
+    sim.stepper.work.u.assign(pre.reuse.linearisation_point)
     H = assembled(sim, projected=True)
     # any affine motion of the whole body is one of the coarse space: it moves gradient slots by B E
     P = coarse_functions(sim)

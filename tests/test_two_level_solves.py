@@ -61,7 +61,7 @@ def test_it_is_kept_while_it_serves_and_made_anew_when_it_does_not():
 def test_a_run_from_its_middle_makes_it_where_it_was_made():
     one = spinner(operator="matrix")
     one.step(13)
-    middle = one.state.like()
+    middle = one.state.copy()
     assert np.abs(middle.preconditioner_displacement.numpy()).max() > 0.0
     one.step(12)
     other = spinner(operator="matrix")

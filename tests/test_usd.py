@@ -10,7 +10,7 @@ from stub_simulation import StubSim, drive, left_over
 
 from warpfea.base.errors import ModelError, OutputError
 from warpfea.outputs.colormap import map_colors
-from warpfea.outputs.frames import Surface
+from warpfea.outputs.frames import DrawnSurface
 from warpfea.outputs.render import PNGWriter, render_usd
 from warpfea.outputs.usd import USDWriter, validate_usd
 
@@ -25,7 +25,7 @@ def usd_run(tmp_path_factory):
     seen = []
     writer = USDWriter(path, fps=30, fields=["von_mises", "displacement"])
     drive(sim, writer, 50, lambda s: seen.append((s.time[0], [s.skin_points(b) for b in s.bodies])))
-    return SimpleNamespace(path=path, sim=sim, seen=seen, offsets=Surface(StubSim()).offsets)
+    return SimpleNamespace(path=path, sim=sim, seen=seen, offsets=DrawnSurface(StubSim()).offsets)
 
 
 def meshes_of(stage):

@@ -74,7 +74,7 @@ def test_a_drive_that_jumps_at_the_start(options, told):
     if options.get("drive", (0.1, 0, 0)) != (0.1, 0, 0):
         return  # statics ends at other values
     result = silent(lambda: wf.solve_static(model, load_steps=1))
-    silent(lambda: wf.Simulation(model, result.state.like(), dt=1e-3))  # it is there already
+    silent(lambda: wf.Simulation(model, result.state.copy(), dt=1e-3))  # it is there already
 
 
 def test_a_drive_that_begins_where_its_nodes_are():
@@ -144,7 +144,7 @@ def test_steel_in_grams_per_cubic_centimetre():
 def test_no_scene_is_warned_of(name):
     scene = find(name)
     model = silent(lambda: scene().finalize(device="cpu"))
-    for law in model.terms.laws.laws:
+    for law in model.terms.time_laws.laws:
         ended = len(law.times) > 1 and law.times[-1] < scene.t_end
         assert not ended or np.array_equal(law.values[-1], law.values[-2]), law.name
 

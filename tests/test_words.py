@@ -1,6 +1,9 @@
 """Everything that others call or read says what it is: docstrings of device code and of the public host code."""
 
 import ast
+import collections
+import csv
+import functools
 import pathlib
 
 import pytest
@@ -10,6 +13,13 @@ DEVICE = {"wp.func", "wp.func_native", "wp.kernel"}
 RENAMED = ("pushed", "massive", "lagged", "guess")
 """Words for which the code has terms of the field: nonpotential, with_mass, reused, predictor."""
 
+OPENINGS = 3
+"""Docstrings that open with What, Where, Whether or How instead of the standard noun or verb: the goal is 0."""
+FORMER = ROOT / "tests" / "data" / "renames.csv"
+"""kind, old, new, where: former names, which may not come back in the folders named, and former files."""
+FORMER_TOLD = ("warpfea/terms/renamed.py",)
+"""Files that name former names to refuse them."""
+
 # to be done: this set may only shrink
 WITHOUT: set[str] = set()
 
@@ -18,6 +28,7 @@ def files(folder):
     return sorted(ROOT.joinpath(folder).rglob("*.py"))
 
 
+@functools.cache
 def parsed(path):
     return ast.parse(path.read_text(encoding="utf-8"))
 
@@ -131,3 +142,66 @@ def test_names_are_terms_of_the_field(folder):
     chosen = [path for path in files(folder) if "studies" not in path.parts]
     used = {n for path in chosen for n in names(parsed(path)) if set(n.lower().split("_")) & {*RENAMED, "lag"}}
     assert not used, f"names to replace: {', '.join(sorted(used))}"
+
+
+def identifiers(tree):
+    """All names in a module: of variables, attributes, arguments, keywords, functions, classes."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Name):
+            yield node.id
+        elif isinstance(node, ast.Attribute):
+            yield node.attr
+        elif isinstance(node, (ast.FunctionDef, ast.ClassDef)):
+            yield node.name
+        elif isinstance(node, (ast.arg, ast.keyword)) and node.arg:
+            yield node.arg
+        elif isinstance(node, ast.alias):
+            yield node.asname or node.name
+
+
+@functools.cache
+def former():
+    """Rows of FORMER."""
+    with open(FORMER, newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_former_names_do_not_come_back():
+    banned = collections.defaultdict(dict)
+    for row in former():
+        for folder in filter(None, row["where"].split(";")):
+            banned[folder][row["old"]] = row["new"]
+    found = set()
+    for path in (path for folder in ("kernels", "warpfea", "scenes") for path in files(folder)):
+        here = path.relative_to(ROOT)
+        names = banned["/".join(here.parts[:-1][:2])]
+        if names and here.as_posix() not in FORMER_TOLD:
+            found |= {f"{here.as_posix()}: {n} is {names[n]} now" for n in {*identifiers(parsed(path))} & names.keys()}
+    assert not found, "; ".join(sorted(found))
+
+
+def test_former_files_do_not_come_back():
+    back = [row["old"] for row in former() if row["kind"] == "file" and (ROOT / row["old"]).exists()]
+    assert not back, f"files by a former name: {', '.join(back)}"
+
+
+def opening(text):
+    """The first word of a docstring."""
+    return text.split(maxsplit=1)[0].strip(":,.;") if text.strip() else ""
+
+
+def openings(tree):
+    """Lines of docstrings of a module, also of attributes, that open with a question word."""
+    for node in ast.walk(tree):
+        for item in node.body if isinstance(getattr(node, "body", None), list) else ():
+            text = item.value.value if isinstance(item, ast.Expr) and isinstance(item.value, ast.Constant) else ""
+            if isinstance(text, str) and opening(text) in ("What", "Where", "Whether", "How"):
+                yield item.lineno
+
+
+def test_docstrings_open_with_the_standard_noun_or_verb():
+    found = []
+    for folder in ("kernels", "warpfea", "scenes", "tests/validation"):
+        for path in files(folder):
+            found += [f"{path.relative_to(ROOT).as_posix()}:{line}" for line in openings(parsed(path))]
+    assert len(found) <= OPENINGS, f"{len(found)} docstrings open with a question word: {', '.join(found[:40])}"

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import warp as wp
 from warpfea.kernels.terms.contact_colliders import collider_functions
-from warpfea.kernels.terms.contact_data import contact_struct
+from warpfea.kernels.terms.contact_structs import contact_struct
 
 import warpfea as wf
 from warpfea.base.launch import Launcher

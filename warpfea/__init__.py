@@ -32,7 +32,6 @@ from .builder.joints import GROUND  # noqa: E402
 from .builder.reference import Reference  # noqa: E402
 from .builder.scene import scene  # noqa: E402
 from .elements.sections import Rectangle  # noqa: E402
-from .laws import Control  # noqa: E402
 from .materials import SVK, KelvinVoigt, MooneyRivlin, NeoHookean  # noqa: E402
 from .model.bodies import Body  # noqa: E402
 from .model.description import Rotation  # noqa: E402
@@ -51,6 +50,7 @@ from .simulation.observations import Observations  # noqa: E402
 from .simulation.simulation import Simulation, StepReport  # noqa: E402
 from .simulation.statics import solve_static  # noqa: E402
 from .solvers import Jacobi, NewtonPCG  # noqa: E402
+from .time_laws import Control  # noqa: E402
 
 __all__ = [
     "GROUND",

@@ -24,7 +24,7 @@ from .builder.joints import GROUND as GROUND
 from .builder.reference import Reference as Reference
 from .builder.scene import scene as scene
 from .elements.sections import Rectangle as Rectangle
-from .laws import Control as Control
+from .time_laws import Control as Control
 from .materials import SVK as SVK, KelvinVoigt as KelvinVoigt, MooneyRivlin as MooneyRivlin, NeoHookean as NeoHookean
 from .model.bodies import Body as Body
 from .model.description import Rotation as Rotation

@@ -11,10 +11,10 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from .base.brief import brief_repr
 from .base.checks import number_hint
 from .base.errors import ModelError
 from .base.names import did_you_mean
+from .base.short_repr import use_short_repr
 
 __all__ = ["SVK", "KelvinVoigt", "Material", "MooneyRivlin", "NeoHookean"]
 
@@ -116,7 +116,7 @@ class Material:
     density: Any = field(default=None, kw_only=True)
     damping: KelvinVoigt | None = field(default=None, kw_only=True)
 
-    __repr__ = brief_repr
+    __repr__ = use_short_repr
 
     def __new__(cls, *values: Any, **options: Any) -> Self:
         """ModelError for unknown arguments of a law; suggests from_E_nu if E or nu is given."""

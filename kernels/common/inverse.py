@@ -19,8 +19,8 @@ def inverse_function(dtype: str):
     T, vec3, mat33 = p.T, p.vec3, p.mat33
 
     @wp.func
-    def positive_inverse(A: mat33, least: T) -> mat33:
-        """A^-1 if the leading minors of A are safely positive, else the inverse of |diag A|, at least `least`.
+    def positive_inverse(A: mat33, min_diagonal: T) -> mat33:
+        """A^-1 if the leading minors of A are safely positive, else the inverse of |diag A|, at least `min_diagonal`.
 
         For A of order 1, whose minors neither overflow nor vanish.
         """
@@ -33,11 +33,11 @@ def inverse_function(dtype: str):
             return wp.inverse(A)
         B = mat33()
         for k in range(3):
-            B[k, k] = T(1.0) / wp.max(wp.abs(A[k, k]), wp.max(least, tol * wp.abs(size)))
+            B[k, k] = T(1.0) / wp.max(wp.abs(A[k, k]), wp.max(min_diagonal, tol * wp.abs(size)))
         return B
 
     @wp.func
-    def free_inverse(A: mat33, least: T, free: vec3) -> mat33:
+    def free_inverse(A: mat33, min_diagonal: T, free: vec3) -> mat33:
         """Inverse of A on the components where `free` is 1; rows and columns of prescribed components are zero."""
         scale = T(1.0e-30)
         for i in range(3):
@@ -49,7 +49,7 @@ def inverse_function(dtype: str):
                 M[i, j] = s * A[i, j] * free[i] * free[j]
             if free[i] == T(0.0):
                 M[i, i] = wp.max(s * wp.abs(A[i, i]), T(1.0e-30))
-        B = positive_inverse(M, s * least)
+        B = positive_inverse(M, s * min_diagonal)
         for i in range(3):
             for j in range(3):
                 B[i, j] = s * B[i, j] * free[i] * free[j]

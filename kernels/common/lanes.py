@@ -7,7 +7,7 @@ import warp as wp
 
 from .types import precision
 
-__all__ = ["WARP", "block_memory", "lane_functions", "warp_low"]
+__all__ = ["WARP", "block_memory", "lane_functions", "warp_minimum"]
 
 WARP = 32
 """Threads of a warp."""
@@ -64,7 +64,7 @@ def lane_sum_float32(x: wp.float32, lanes: int) -> wp.float32:
     return x;
     """
 )
-def warp_low(x: wp.float64, world: int) -> wp.float64:
+def warp_minimum(x: wp.float64, world: int) -> wp.float64:
     """Smallest x of a warp, in its first thread and 1e300 in others, if all are of one world; else x itself.
 
     For an atomic minimum, which in double precision is a loop that serialises the threads of a world.

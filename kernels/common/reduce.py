@@ -8,11 +8,11 @@ import warp as wp
 from .lanes import lane_sum_float64
 from .types import kernel_module
 
-__all__ = ["CHUNK", "SHORT", "reduce_kernels"]
+__all__ = ["CHUNK", "WARP_ROW", "reduce_kernels"]
 
 TILE = 1024
 """Numbers summed at once by a block."""
-SHORT = 512
+WARP_ROW = 512
 """Rows up to this length are summed by a warp, which leaves room for many worlds (4096 worlds on an H200, rows of 67: 5
 us for 48)."""
 CHUNK = 16384

@@ -36,7 +36,7 @@ def topology_struct(dtype: str):
         mass_column: wp.array(dtype=wp.int32)
         mass_value: wp.array2d(dtype=T)  # [world or 0, entry] kg
         free: wp.array(dtype=vec3)  # [slot] 1 where a component is an unknown, 0 where prescribed
-        held: wp.array(dtype=wp.uint8)  # [slot] bit k is set if component k is prescribed: `free` in one byte
+        prescribed: wp.array(dtype=wp.uint8)  # [slot] bit k is set if component k is prescribed: `free` in one byte
         pool_start: wp.array(dtype=wp.int32)  # [slot + 1] of the pool of terms; with pooled terms
         pool_entry: wp.array(dtype=wp.int32)  # indices into the pool
 
@@ -69,7 +69,7 @@ def balance_struct(dtype: str):
         dead: wp.array2d(dtype=vec3)  # loads independent of the iterate, and the sum of their magnitudes
         dead_magnitude: wp.array2d(dtype=vec3)
         nonpotential: wp.array2d(dtype=vec3)  # non-conservative forces, and their values frozen in a line search
-        nonpotential_held: wp.array2d(dtype=vec3)
+        nonpotential_frozen: wp.array2d(dtype=vec3)
         direction: wp.array2d(dtype=vec3)  # p, search direction
         diagonal: wp.array2d(dtype=vec3)  # D, the diagonal of H, which weights the norms
         inertia: wp.array2d(dtype=vec3)

@@ -23,11 +23,11 @@ class Traits(NamedTuple):
     nonpotential: bool = False
     tangent: bool = False
     pooled: bool = False
-    ties: bool = False
+    constraint_rows: bool = False
     stored: bool = False
-    gated: bool = False
+    has_constraints: bool = False
     limited: bool = False
-    walls: bool = False
+    unilateral: bool = False
     midpoint: bool = False
 
     def suffix(self, *names: str) -> str:

@@ -5,9 +5,9 @@ import types as _types
 
 import warp as wp
 
-__all__ = ["SMALL", "kernel_module", "precision"]
+__all__ = ["SHORT_UNROLL", "kernel_module", "precision"]
 
-SMALL = 4
+SHORT_UNROLL = 4
 """`max_unroll` of modules with short loops over components: unrolled they index registers, not memory."""
 
 

@@ -8,7 +8,7 @@ import types as _types
 
 import warp as wp
 
-from ..common.lanes import lane_functions, warp_low
+from ..common.lanes import lane_functions, warp_minimum
 from ..common.types import kernel_module
 from . import materials
 from .matrix import matrix_kernels, stage_name
@@ -39,7 +39,7 @@ def element_kernels(
         affine: straight elements with parent gradients and one J0 each; False: a table of h_i per element and point.
         damping: None, "incremental", "rate" or "explicit" (Kelvin-Voigt forms).
         framed: the law has axes of its own at each point, `block.frame`.
-        midpoint: conserving scheme, see `point_functions` and kernels/elements/conserving.py; u is that at the
+        midpoint: conserving scheme, see `point_functions` and kernels/elements/energy_momentum.py; u is that at the
             midpoint of the step and v half of the change of u. Energies and J are those at its end.
         dissipative: its dissipative form.
     """
@@ -92,7 +92,7 @@ def element_kernels(
         for point in range(lane, block.gradient.shape[0], lanes):
             G = fn.gradient_of(block, U, point, elem)
             w = fn.weight_of(block, point, elem)
-            local = fn.into_axes(block, G, point, elem)
+            local = fn.to_material_axes(block, G, point, elem)
             Fdot = fn.velocity_gradient(block, V, point, elem)
             P = mat33()
             if wp.static(midpoint):
@@ -109,21 +109,21 @@ def element_kernels(
                 S = t.isotropic(rate, c[LAMBDA_V], c[ETA])
                 P = P + S + local * S
                 psi_v += T(0.5) * dq * w * wp.ddot(S, rate)
-            f = fn.scatter(block, f, fn.out_of_axes(block, P, point, elem), point, elem)
+            f = fn.scatter(block, f, fn.to_body_axes(block, P, point, elem), point, elem)
         for i in range(NS):
             f[i] = lane_sum(f[i], lanes)
         stored = row_sum(wp.float64(psi), lanes)
         lost = row_sum(wp.float64(psi_v), lanes)
         low = wp.float64(J_low)
         if wp.static(needs_J):
-            lowest = warp_low(low, world)
+            lowest = warp_minimum(low, world)
             if lowest < domain_J[world]:
                 wp.atomic_min(domain_J, world, lowest)
             if wp.static(not constant):
                 if wp.static(midpoint):
                     U = U + V
                 low = wp.min(low, wp.float64(fn.vertex_jacobian(block, U, elem)))
-        low = warp_low(low, world)
+        low = warp_minimum(low, world)
         if low < min_J[world]:
             wp.atomic_min(min_J, world, low)
         if lane == 0 and index < block.count * lanes:
@@ -132,7 +132,7 @@ def element_kernels(
             energy[1, world, block.element_offset + elem] = lost
 
     @wp.kernel(module=module)
-    def turned_over(
+    def inverted_elements(
         block: Block,
         before: wp.array2d(dtype=vec3),
         u: wp.array2d(dtype=vec3),
@@ -151,7 +151,7 @@ def element_kernels(
                     turned[world] = 1
 
     @wp.kernel(module=module)
-    def largest_turn(
+    def largest_gradient(
         block: Block,
         direction: wp.array2d(dtype=vec3),
         active: wp.array(dtype=wp.int32),
@@ -224,23 +224,23 @@ def element_kernels(
                 K = mat33()
                 if wp.static(framed):
                     R = block.frame[point, elem]
-                    K = fn.out_of_axes(
-                        block, m.block(fn.into_axes(block, G, point, elem), wp.transpose(R) * a, c), point, elem
+                    K = fn.to_body_axes(
+                        block, m.block(fn.to_material_axes(block, G, point, elem), wp.transpose(R) * a, c), point, elem
                     )
                 else:
                     K = m.block(G, a, c)
                 if wp.static(dissipative):
-                    K = fn.hardening(block) * K
+                    K = fn.dissipation_factor(block) * K
                 if wp.static(damping == "incremental" or damping == "rate"):
                     K = K + viscous.block(mat33() + G, a, cv)
                 entry = block.contribution_offset + i * block.count + elem
-                contribution[world, entry] = contribution[world, entry] + w * fn.pack(K)
+                contribution[world, entry] = contribution[world, entry] + w * fn.to_voigt(K)
 
     return _types.SimpleNamespace(
         module=module,
         internal_force=internal_force,
-        turned_over=turned_over,
-        largest_turn=largest_turn,
+        inverted_elements=inverted_elements,
+        largest_gradient=largest_gradient,
         tangent_product=tangent_product,
         diagonal_blocks=diagonal_blocks,
         **vars(matrix_kernels(dtype, law, slots, affine, damping, framed, midpoint, dissipative)),

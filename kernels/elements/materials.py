@@ -337,7 +337,7 @@ LAWS = {"orthotropic": orthotropic, "svk": svk, "mooney_rivlin": mooney_rivlin, 
 """Device laws by name. A new law is one entry here and one class in warpfea/materials.py."""
 
 
-ANY_J = ("svk", "orthotropic", "assumed_strain")
+DEFINED_FOR_ANY_J = ("svk", "orthotropic", "assumed_strain")
 """Laws defined for any F; the others need J > 0."""
 
 

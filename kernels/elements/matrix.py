@@ -16,7 +16,7 @@ from .points import point_functions
 
 __all__ = ["UNROLL", "matrix_kernels", "panels_of", "row_of", "rows_type", "stage_name"]
 
-WIDEST = 8
+MAX_PANEL_SLOTS = 8
 """Maximum number of slots of a panel: eight 64-bit numbers fill the widest vector registers."""
 UNROLL = 9
 """`max_unroll` of modules that process panels: with the loops over components unrolled, those over slots vectorise."""
@@ -24,7 +24,7 @@ UNROLL = 9
 
 def panels_of(slots: int) -> tuple[int, int, int]:
     """Number of panels, slots per panel, and total rows: a panel has a row for each slot up to its last one."""
-    panels = -(-slots // WIDEST)
+    panels = -(-slots // MAX_PANEL_SLOTS)
     width = -(-slots // panels)
     return panels, width, width * panels * (panels - 1) // 2 + slots
 
@@ -79,7 +79,7 @@ def matrix_kernels(
         U: Local,
         V: Local,
         step: Local,
-        mixed: int,
+        use_prediction: int,
         history: wp.array2d(dtype=sym6),
         dq_dv: wp.float64,
         c: coef,
@@ -91,13 +91,13 @@ def matrix_kernels(
         """F with columns along the law's axes, and the second Piola-Kirchhoff stress S there, Pa.
 
         `form` 0: S with its viscous part; 1: without it, and with compression removed. For laws that need J > 0, S is
-        the viscous part alone; their elastic tangent comes entirely from `increment` or `stand_in`. `mixed` 1: S is
-        that of the linear prediction (mixed integration points, Magisano, Leonetti and Garcea 2017), `step` the last
-        change of the slots, m; see `foreseen`. `mixed` 2: without compression, as with `form` 1, but with the viscous
-        part.
+        the viscous part alone; their elastic tangent comes entirely from `increment` or `spd_tangent`. `use_prediction`
+        1: S is that of the linear prediction (mixed integration points, Magisano, Leonetti and Garcea 2017), `step` the
+        last change of the slots, m; see `predicted_stress`. `use_prediction` 2: without compression, as with `form` 1,
+        but with the viscous part.
         """
         G = fn.gradient_of(block, U, point, elem)
-        local = fn.into_axes(block, G, point, elem)
+        local = fn.to_material_axes(block, G, point, elem)
         F = t.identity() + G
         S = mat33()
         if wp.static(midpoint):
@@ -107,21 +107,21 @@ def matrix_kernels(
             if wp.static(midpoint):
                 if form == 1:
                     S = m.stiffness(t.green(local), c)
-                    S += fn.compression(S) * t.identity()
+                    S += fn.max_compression(S) * t.identity()
             else:
                 S = m.stiffness(t.green(local), c)
                 if form == 1:
-                    S += fn.compression(S) * t.identity()
+                    S += fn.max_compression(S) * t.identity()
         if wp.static(damping == "incremental" or damping == "rate"):
             if form == 0:
                 Fdot = fn.velocity_gradient(block, V, point, elem)
                 rate = fn.strain_rate(block, local, Fdot, history, T(dq_dv), world, point, elem)
                 S += t.isotropic(rate, c[LAMBDA_V], c[ETA])
-        if mixed == 2 and form == 0:
-            S += fn.compression(S) * t.identity()
-        elif mixed == 1 and form == 0:
-            ahead = fn.into_axes(block, fn.gradient_of(block, step, point, elem), point, elem)
-            S += fn.foreseen(local, ahead, c, T(dq_dv))
+        if use_prediction == 2 and form == 0:
+            S += fn.max_compression(S) * t.identity()
+        elif use_prediction == 1 and form == 0:
+            ahead = fn.to_material_axes(block, fn.gradient_of(block, step, point, elem), point, elem)
+            S += fn.predicted_stress(local, ahead, c, T(dq_dv))
         if wp.static(framed):
             F = F * block.frame[point, elem]
         return F, S
@@ -143,18 +143,18 @@ def matrix_kernels(
             return Local()
 
     @wp.func
-    def last_step(
+    def last_change(
         block: Block,
         v: wp.array2d(dtype=vec3),
         base: wp.array2d(dtype=vec3),
-        mixed: int,
+        use_prediction: int,
         dq_dv: wp.float64,
         world: int,
         elem: int,
     ) -> Local:
         """Change of an element's slots in the last iteration, m; zeros unless requested."""
         step = Local()
-        if mixed == 1:
+        if use_prediction == 1:
             step = T(dq_dv) * (fn.load(block, v, world, elem) - fn.load(block, base, world, elem))
         return step
 
@@ -164,7 +164,7 @@ def matrix_kernels(
         u: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
         base: wp.array2d(dtype=vec3),
-        mixed: wp.array(dtype=wp.int32),
+        use_prediction: wp.array(dtype=wp.int32),
         history: wp.array2d(dtype=sym6),
         dq_dv: wp.array(dtype=wp.float64),
         form: int,
@@ -174,15 +174,15 @@ def matrix_kernels(
         """F and S of `point_state`, common to all columns of an element's matrix: [world, 5 point + row, elem].
 
         Rows 0 to 2 are those of F, row 3 is the diagonal of S, row 4 its components (23, 13, 12). `form`: see
-        `element_matrix`; `base`: v at the previous iterate, for worlds with `mixed`.
+        `element_matrix`; `base`: v at the previous iterate, for worlds with `use_prediction`.
         """
         world, point, elem = wp.tid()
         if active[world] == 0:
             return
         U, V = fn.load(block, u, world, elem), velocities(block, v, world, elem)
         c = fn.coefficients(block, world, elem)
-        step = last_step(block, v, base, mixed[world], dq_dv[world], world, elem)
-        F, S = point_state(block, U, V, step, mixed[world], history, dq_dv[world], c, form, world, point, elem)
+        step = last_change(block, v, base, use_prediction[world], dq_dv[world], world, elem)
+        F, S = point_state(block, U, V, step, use_prediction[world], history, dq_dv[world], c, form, world, point, elem)
         for i in range(3):
             lines[world, 5 * point + i, elem] = F[i]
         lines[world, 5 * point + 3, elem] = vec3(S[0, 0], S[1, 1], S[2, 2])
@@ -193,7 +193,7 @@ def matrix_kernels(
         block: Block,
         dq_dv: wp.array(dtype=wp.float64),
         lines: wp.array3d(dtype=vec3),
-        mixed: wp.array(dtype=wp.int32),
+        use_prediction: wp.array(dtype=wp.int32),
         form: int,
         add: int,
         active: wp.array(dtype=wp.int32),
@@ -203,7 +203,7 @@ def matrix_kernels(
 
         Args:
             form: 0: K. 1: positive semi-definite at each point: without compression and viscous stress in the
-                geometric part, and with `stand_in` for laws that need J > 0; a function of u alone.
+                geometric part, and with `spd_tangent` for laws that need J > 0; a function of u alone.
             add: 1: add to `matrix`, which holds K of another part of the energy.
         """
         world, index = wp.tid()
@@ -238,15 +238,15 @@ def matrix_kernels(
             if wp.static(not needs_J):
                 dS = m.stiffness(B, c)
                 if wp.static(dissipative):
-                    dS = fn.hardening(block) * dS
+                    dS = fn.dissipation_factor(block) * dS
                 if wp.static(damping == "incremental" or damping == "rate"):
                     dS += t.isotropic(B, cv[0], cv[1])
                 dP += F * dS
             else:
                 if wp.static(damping == "incremental" or damping == "rate"):
                     dP += F * t.isotropic(B, cv[0], cv[1])
-                if form == 1 or mixed[world] == 2:
-                    dP += fn.stand_in(F, wp.outer(unit, h), c)
+                if form == 1 or use_prediction[world] == 2:
+                    dP += fn.spd_tangent(F, wp.outer(unit, h), c)
                 else:
                     dP += elastic(block, F, wp.outer(unit, h), c)
             if wp.static(framed):
@@ -310,7 +310,7 @@ def matrix_kernels(
                     dF[j, l] = w
                     dP = mat33()
                     if positive:
-                        dP = fn.stand_in(F, dF, c)
+                        dP = fn.spd_tangent(F, dF, c)
                     else:
                         dP = elastic(block, F, dF, c)
                     for i in range(3):
@@ -324,7 +324,7 @@ def matrix_kernels(
         u: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
         base: wp.array2d(dtype=vec3),
-        mixed: wp.array(dtype=wp.int32),
+        use_prediction: wp.array(dtype=wp.int32),
         history: wp.array2d(dtype=sym6),
         dq_dv: wp.array(dtype=wp.float64),
         form: int,
@@ -349,17 +349,19 @@ def matrix_kernels(
         if wp.static(not needs_J):
             moduli = m.moduli(c)
             if wp.static(dissipative):
-                moduli = fn.hardening(block) * moduli
+                moduli = fn.dissipation_factor(block) * moduli
         if wp.static(damping == "incremental" or damping == "rate"):
             moduli += t.isotropic_moduli(cv[0], cv[1])
         U, V = fn.load(block, u, world, elem), velocities(block, v, world, elem)
-        step = last_step(block, v, base, mixed[world], dq_dv[world], world, elem)
+        step = last_change(block, v, base, use_prediction[world], dq_dv[world], world, elem)
         if add == 0:
             for k in range(matrix.shape[2]):
                 matrix[world, elem, k] = Rows()
         h, H = Local(), Slots()
         for point in range(block.gradient.shape[0]):
-            F, S = point_state(block, U, V, step, mixed[world], history, dq_dv[world], c, form, world, point, elem)
+            F, S = point_state(
+                block, U, V, step, use_prediction[world], history, dq_dv[world], c, form, world, point, elem
+            )
             into = t.identity()
             if wp.static(framed):
                 into = wp.transpose(block.frame[point, elem])
@@ -375,7 +377,7 @@ def matrix_kernels(
                 for l in range(3):
                     H[3 * (a / P) + l, a % P] = h[a][l]
             w = fn.tangent_weight(block, point, elem)
-            A = elasticity(block, F, S, moduli, c, form == 1 or mixed[world] == 2, w)
+            A = elasticity(block, F, S, moduli, c, form == 1 or use_prediction[world] == 2, w)
             for panel in range((block.conn.shape[0] + P - 1) / P):  # PANELS, but not unrolled
                 D = Products()
                 for i in range(9):

@@ -43,11 +43,13 @@ def output_kernels(fn: _types.SimpleNamespace, name: str, points: int) -> _types
             return
         U0 = fn.load(block, u0, world, elem)
         for point in range(NQ):
-            E = T(a0[world]) * t.green(fn.into_axes(block, fn.gradient_of(block, U0, point, elem), point, elem))
+            E = T(a0[world]) * t.green(fn.to_material_axes(block, fn.gradient_of(block, U0, point, elem), point, elem))
             if a1[world] != wp.float64(0.0):
                 U1 = fn.load(block, u1, world, elem)
-                E = E - T(a1[world]) * t.green(fn.into_axes(block, fn.gradient_of(block, U1, point, elem), point, elem))
-            history[world, fn.history_index(block, point, elem)] = fn.pack(E)
+                E = E - T(a1[world]) * t.green(
+                    fn.to_material_axes(block, fn.gradient_of(block, U1, point, elem), point, elem)
+                )
+            history[world, fn.history_index(block, point, elem)] = fn.to_voigt(E)
 
     @wp.kernel(module=moving_module)
     def moving_history(
@@ -69,12 +71,14 @@ def output_kernels(fn: _types.SimpleNamespace, name: str, points: int) -> _types
         V = fn.load(block, v, world, elem)
         A = fn.load(block, a, world, elem)
         for point in range(NQ):
-            G = fn.into_axes(block, fn.gradient_of(block, U, point, elem), point, elem)
-            D = fn.into_axes(block, fn.gradient_of(block, V, point, elem), point, elem)
+            G = fn.to_material_axes(block, fn.gradient_of(block, U, point, elem), point, elem)
+            D = fn.to_material_axes(block, fn.gradient_of(block, V, point, elem), point, elem)
             F = wp.transpose(t.identity() + G)
-            bend = wp.transpose(D) * D + F * fn.into_axes(block, fn.gradient_of(block, A, point, elem), point, elem)
+            bend = wp.transpose(D) * D + F * fn.to_material_axes(
+                block, fn.gradient_of(block, A, point, elem), point, elem
+            )
             E = t.green(G) + T(b[world]) * t.sym(F * D) + T(q_a[world]) * t.sym(bend)
-            history[world, fn.history_index(block, point, elem)] = fn.pack(E)
+            history[world, fn.history_index(block, point, elem)] = fn.to_voigt(E)
 
     @wp.kernel(module=viscous_module)
     def viscous_force(
@@ -118,8 +122,8 @@ def output_kernels(fn: _types.SimpleNamespace, name: str, points: int) -> _types
         for point in range(NQ):
             G = fn.gradient_of(block, U, point, elem)
             J = T(1.0) + t.volume_change(G)
-            P = fn.out_of_axes(block, m.stress(fn.into_axes(block, G, point, elem), c), point, elem)
-            stress[world, point, elem] = fn.pack((T(1.0) / J) * (P + P * wp.transpose(G)))
+            P = fn.to_body_axes(block, m.stress(fn.to_material_axes(block, G, point, elem), c), point, elem)
+            stress[world, point, elem] = fn.to_voigt((T(1.0) / J) * (P + P * wp.transpose(G)))
             jacobian[world, point, elem] = J
 
     return _types.SimpleNamespace(

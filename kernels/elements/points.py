@@ -12,8 +12,8 @@ import warp as wp
 
 from ..common.types import precision
 from . import materials
-from .conserving import conserving_law
-from .load import load_functions, local_type
+from .element_slots import load_functions, local_type
+from .energy_momentum import energy_momentum_law
 
 __all__ = ["block_struct", "point_functions"]
 
@@ -47,7 +47,7 @@ def block_struct(dtype: str, dissipative: bool = False):
         history_offset: wp.int32
         count: wp.int32  # elements
         if dissipative:
-            dissipation: T  # chi of kernels/elements/conserving.py
+            dissipation: T  # chi of kernels/elements/energy_momentum.py
 
     return ElementBlock
 
@@ -74,14 +74,14 @@ def point_functions(
     T, mat33, sym6 = p.T, p.mat33, p.sym
     t = materials.tensors(dtype)
     m = materials.law(law, dtype)
-    mean = conserving_law(law, dtype)
+    mean = energy_momentum_law(law, dtype)
     uses_v = midpoint or damping == "rate"
     Block = block_struct(dtype, dissipative)
     NCOEF = materials.NCOEF
     coef = wp.types.vector(length=NCOEF, dtype=T)
     Local = local_type(dtype, slots)
     load, store = load_functions(dtype, slots, Block)
-    NS, needs_J = slots, law not in materials.ANY_J
+    NS, needs_J = slots, law not in materials.DEFINED_FOR_ANY_J
     ETA, LAMBDA_V = materials.ETA, materials.LAMBDA_V
 
     @wp.func
@@ -155,17 +155,17 @@ def point_functions(
         return out
 
     @wp.func
-    def pack(A: mat33) -> sym6:
+    def to_voigt(A: mat33) -> sym6:
         """A symmetric tensor in Voigt order (xx, yy, zz, yz, xz, xy)."""
         return sym6(A[0, 0], A[1, 1], A[2, 2], A[1, 2], A[0, 2], A[0, 1])
 
     @wp.func
-    def unpack(a: sym6) -> mat33:
+    def from_voigt(a: sym6) -> mat33:
         """Tensor with the components a in Voigt order."""
         return mat33(a[0], a[5], a[4], a[5], a[1], a[3], a[4], a[3], a[2])
 
     @wp.func
-    def into_axes(block: Block, A: mat33, point: int, elem: int) -> mat33:
+    def to_material_axes(block: Block, A: mat33, point: int, elem: int) -> mat33:
         """R^T A R: from the body's axes into those of the law, if framed."""
         if wp.static(framed):
             R = block.frame[point, elem]
@@ -174,7 +174,7 @@ def point_functions(
             return A
 
     @wp.func
-    def out_of_axes(block: Block, A: mat33, point: int, elem: int) -> mat33:
+    def to_body_axes(block: Block, A: mat33, point: int, elem: int) -> mat33:
         """R A R^T: from the law's axes into those of the body, if framed."""
         if wp.static(framed):
             R = block.frame[point, elem]
@@ -191,7 +191,7 @@ def point_functions(
     def velocity_gradient(block: Block, V: Local, point: int, elem: int) -> mat33:
         """Fdot in the law's axes (1/s) for damping of the form "rate", Eq. (60); `midpoint`: half of dF; else zero."""
         if wp.static(uses_v):
-            return into_axes(block, gradient_of(block, V, point, elem), point, elem)
+            return to_material_axes(block, gradient_of(block, V, point, elem), point, elem)
         else:
             return mat33()
 
@@ -205,7 +205,7 @@ def point_functions(
         `midpoint`: (E1 - E0)/h, h = 2 dq, which is Eq. (58) with the mean Fdot.
         """
         if wp.static(damping == "incremental"):
-            past = unpack(history[world, history_index(block, point, elem)])
+            past = from_voigt(history[world, history_index(block, point, elem)])
             return (T(1.0) / dq) * (t.green(G) - past)
         elif wp.static(midpoint):
             return (T(1.0) / dq) * t.sym(Fdot + wp.transpose(G) * Fdot)
@@ -230,7 +230,7 @@ def point_functions(
 
     @wp.func
     def step_stress(block: Block, G: mat33, D: mat33, c: coef) -> mat33:
-        """S of a midpoint step, Pa: that of kernels/elements/conserving.py with its dissipation."""
+        """S of a midpoint step, Pa: that of kernels/elements/energy_momentum.py with its dissipation."""
         S = mean.mean_stress(G, D, c)
         if wp.static(dissipative):
             S += block.dissipation * mean.rest_increment(t.sym(D + wp.transpose(G) * D), c)
@@ -253,7 +253,7 @@ def point_functions(
             return m.stiffness(t.green(G), c)
 
     @wp.func
-    def hardening(block: Block) -> T:
+    def dissipation_factor(block: Block) -> T:
         """Factor of the dissipation of a midpoint step on moduli in a matrix."""
         if wp.static(dissipative):
             return T(1.0) + block.dissipation
@@ -261,7 +261,7 @@ def point_functions(
             return T(1.0)
 
     @wp.func
-    def foreseen(G: mat33, dG: mat33, c: coef, dq: T) -> mat33:
+    def predicted_stress(G: mat33, dG: mat33, c: coef, dq: T) -> mat33:
         """Linear prediction of S from the previous iterate, G - dG, minus S at G, Pa; both in the law's axes.
 
         For stresses linear in E it is -C : (dG^T dG)/2, the neglected second-order strain; for other laws S + dS - S(G)
@@ -280,7 +280,7 @@ def point_functions(
         return change
 
     @wp.func
-    def compression(S: mat33) -> T:
+    def max_compression(S: mat33) -> T:
         """Upper bound (Gershgorin) of the largest compressive principal value of S, Pa; 0 in tension."""
         low = T(0.0)
         for i in range(3):
@@ -288,7 +288,7 @@ def point_functions(
         return low
 
     @wp.func
-    def stand_in(F: mat33, dF: mat33, c: coef) -> mat33:
+    def spd_tangent(F: mat33, dF: mat33, c: coef) -> mat33:
         """Positive definite dP for laws with an indefinite tangent far from rest: A C0 : sym(A^T dF).
 
         C0 is the stiffness at rest, with c = (mu10, k, mu01), mu = 2 (mu10 + mu01) and lambda = k - 2 mu / 3; A is F
@@ -316,8 +316,8 @@ def point_functions(
 
         `form` 2, for midpoint schemes: with the stress at the start of the step in the geometric part.
         """
-        local = into_axes(block, G, point, elem)
-        change = into_axes(block, dG, point, elem)
+        local = to_material_axes(block, G, point, elem)
+        change = to_material_axes(block, dG, point, elem)
         dP = mat33()
         along = t.identity() + local
         if wp.static(midpoint):
@@ -341,7 +341,7 @@ def point_functions(
             dP = dP + change * S + F * dS
         if wp.static(midpoint):
             dP = T(0.5) * dP
-        return out_of_axes(block, dP, point, elem)
+        return to_body_axes(block, dP, point, elem)
 
     @wp.func
     def tangent_force(
@@ -374,10 +374,10 @@ def point_functions(
         framed=framed, needs_J=needs_J, midpoint=midpoint, uses_v=uses_v, mean=mean, tangent_weight=tangent_weight,
         coefficients=coefficients, damping_coefficients=damping_coefficients, load=load, store=store,
         inverse_jacobian=inverse_jacobian, gradient_of=gradient_of,
-        weight_of=weight_of, scatter=scatter, pack=pack, unpack=unpack,
-        into_axes=into_axes, out_of_axes=out_of_axes, history_index=history_index, velocity_gradient=velocity_gradient,
-        strain_rate=strain_rate, vertex_jacobian=vertex_jacobian, point_increment=point_increment,
-        foreseen=foreseen, compression=compression, stand_in=stand_in, step_stress=step_stress,
-        step_increment=step_increment, hardening=hardening,
-        tangent_force=tangent_force,
+        weight_of=weight_of, scatter=scatter, to_voigt=to_voigt, from_voigt=from_voigt,
+        to_material_axes=to_material_axes, to_body_axes=to_body_axes, history_index=history_index,
+        velocity_gradient=velocity_gradient, strain_rate=strain_rate, vertex_jacobian=vertex_jacobian,
+        point_increment=point_increment, predicted_stress=predicted_stress, max_compression=max_compression,
+        spd_tangent=spd_tangent, step_stress=step_stress, step_increment=step_increment,
+        dissipation_factor=dissipation_factor, tangent_force=tangent_force,
     )  # fmt: skip

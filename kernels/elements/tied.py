@@ -11,7 +11,7 @@ import types as _types
 import warp as wp
 
 from ..common.types import kernel_module, precision
-from .load import load_functions
+from .element_slots import load_functions
 from .matrix import UNROLL, panels_of, row_of, rows_type, stage_name
 from .tied_block import coupling_function, shear_functions, tied_struct
 
@@ -37,7 +37,7 @@ def tied_kernels(
         midpoint: conserving scheme: u is that at the midpoint of the step, v half of the change of u; the shears in
         forces
             and products are the mean of those at both ends, and the energy is that at the end.
-        dissipative: with (chi/2) of the shears' change added to the mean, see kernels/elements/conserving.py.
+        dissipative: with (chi/2) of the shears' change added to the mean, see kernels/elements/energy_momentum.py.
         worlds: A differs between worlds, stored side by side.
     """
     p = precision(dtype)
@@ -49,8 +49,8 @@ def tied_kernels(
     coupled = coupling_function(dtype, worlds, dissipative)
     shears = shear_functions(dtype, slots, ties, dissipative)
     Local, Ties, TieVectors = shears.Local, shears.Ties, shears.TieVectors
-    line, kinematics = shears.line, shears.kinematics
-    foreseen, step_shears = shears.foreseen, shears.step_shears
+    directional_derivative, kinematics = shears.directional_derivative, shears.kinematics
+    predicted_shears, step_shears = shears.predicted_shears, shears.step_shears
     load, store = load_functions(dtype, slots, Block)
     NS, NT, W = slots, ties, width
     PANELS, P, _ = panels_of(NS)
@@ -61,10 +61,10 @@ def tied_kernels(
     Changes = wp.types.matrix(shape=(3 * NT * PANELS, P), dtype=T)
     Products = wp.types.matrix(shape=(3 * NT, P), dtype=T)
     rows_module = kernel_module(f"{name}_rows", max_unroll=UNROLL)
-    mixed_module = kernel_module(f"{name}_mixed")
+    prediction_module = kernel_module(f"{name}_mixed")
 
     @wp.func
-    def half(x: T) -> T:
+    def end_factor(x: T) -> T:
         """Half of a stiffness with `midpoint`: midpoint values move by half of the end's change."""
         if wp.static(midpoint):
             return T(0.5) * x
@@ -72,12 +72,12 @@ def tied_kernels(
             return x
 
     @wp.func
-    def slope(block: Block, mu: T) -> T:
-        """Modulus in a matrix: `half`, times (1 + chi) in a dissipative step."""
+    def matrix_modulus(block: Block, mu: T) -> T:
+        """Modulus in a matrix: `end_factor`, times (1 + chi) in a dissipative step."""
         if wp.static(dissipative):
-            return (T(1.0) + block.dissipation) * half(mu)
+            return (T(1.0) + block.dissipation) * end_factor(mu)
         else:
-            return half(mu)
+            return end_factor(mu)
 
     @wp.func
     def stresses(block: Block, e: Ties, world: int, elem: int) -> Ties:
@@ -105,17 +105,19 @@ def tied_kernels(
             a = x1[t]
             d = x2[t]
             if wp.static(midpoint):
-                a += line(block.first, D, t, elem)
-                d += line(block.second, D, t, elem)
-            de[t] = wp.dot(a, line(block.second, P, t, elem)) + wp.dot(d, line(block.first, P, t, elem))
+                a += directional_derivative(block.first, D, t, elem)
+                d += directional_derivative(block.second, D, t, elem)
+            de[t] = wp.dot(a, directional_derivative(block.second, P, t, elem)) + wp.dot(
+                d, directional_derivative(block.first, P, t, elem)
+            )
             if wp.static(dissipative):
                 de[t] = (T(1.0) + block.dissipation) * de[t]
         s = stresses(block, e, world, elem)
         ds = stresses(block, de, world, elem)
         f = Local()
         for t in range(NT):
-            da = ds[t] * x1[t] + s[t] * line(block.first, P, t, elem)
-            dd = ds[t] * x2[t] + s[t] * line(block.second, P, t, elem)
+            da = ds[t] * x1[t] + s[t] * directional_derivative(block.first, P, t, elem)
+            dd = ds[t] * x2[t] + s[t] * directional_derivative(block.second, P, t, elem)
             for i in range(NS):
                 f[i] = f[i] + block.first[t, i, elem] * dd + block.second[t, i, elem] * da
         if wp.static(midpoint):
@@ -124,18 +126,10 @@ def tied_kernels(
 
     @wp.kernel(module=module)
     def internal_force(
-        block: Block,
-        u: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        history: wp.array2d(dtype=sym6),
-        dq_dv: wp.array(dtype=wp.float64),
-        active: wp.array(dtype=wp.int32),
-        lanes: int,
-        contribution: wp.array2d(dtype=vec3),
-        energy: wp.array3d(dtype=wp.float64),
-        min_J: wp.array(dtype=wp.float64),
-        domain_J: wp.array(dtype=wp.float64),
-    ):
+        block: Block, u: wp.array2d(dtype=vec3), v: wp.array2d(dtype=vec3), history: wp.array2d(dtype=sym6), dq_dv:
+        wp.array(dtype=wp.float64), active: wp.array(dtype=wp.int32), lanes: int, contribution: wp.array2d(dtype=vec3),
+        energy: wp.array3d(dtype=wp.float64), min_J: wp.array(dtype=wp.float64), domain_J: wp.array(dtype=wp.float64),
+    ):  # fmt: skip
         """f_i = sum_t s_t (first_ti x_b + second_ti x_a), N, and the energy e.s/2, J; one thread per element."""
         world, elem = wp.tid()
         if active[world] == 0 or elem >= block.count:
@@ -188,29 +182,30 @@ def tied_kernels(
                 e = step_shears(block, x1, x2, D, e, elem)
         store(block, tangent_force(block, P, D, x1, x2, e, world, elem), world, elem, contribution)
 
-    @wp.kernel(module=mixed_module)
-    def mixed_product(
+    @wp.kernel(module=prediction_module)
+    def predicted_stress_product(
         block: Block,
         u: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
         base: wp.array2d(dtype=vec3),
-        mixed: wp.array(dtype=wp.int32),
+        use_prediction: wp.array(dtype=wp.int32),
         history: wp.array2d(dtype=sym6),
         dq_dv: wp.array(dtype=wp.float64),
         active: wp.array(dtype=wp.int32),
         direction: wp.array2d(dtype=vec3),
         contribution: wp.array2d(dtype=vec3),
     ):
-        """`tangent_product` with the shear stress of the linear prediction; see kernels/elements/mixed.py."""
+        """`tangent_product` with the shear stress of the linear prediction; see
+        kernels/elements/predicted_stress.py."""
         world, elem = wp.tid()
         if active[world] == 0:
             return
         U = load(block, u, world, elem)
         x1, x2, e = kinematics(block, U, elem)
-        if mixed[world] == 1:
+        if use_prediction[world] == 1:
             change = load(block, v, world, elem) - load(block, base, world, elem)
-            e = foreseen(block, T(dq_dv[world]) * change, e, elem)
-        if mixed[world] == 2:
+            e = predicted_shears(block, T(dq_dv[world]) * change, e, elem)
+        if use_prediction[world] == 2:
             e = Ties()
         P = load(block, direction, world, elem)
         store(block, tangent_force(block, P, Local(), x1, x2, e, world, elem), world, elem, contribution)
@@ -232,8 +227,8 @@ def tied_kernels(
         for i in range(NS):
             b = TieVectors()
             for t in range(NT):
-                a = block.X_first[t, elem] + line(block.first, U, t, elem)
-                d = block.X_second[t, elem] + line(block.second, U, t, elem)
+                a = block.X_first[t, elem] + directional_derivative(block.first, U, t, elem)
+                d = block.X_second[t, elem] + directional_derivative(block.second, U, t, elem)
                 b[t] = block.first[t, i, elem] * d + block.second[t, i, elem] * a
             K = mat33()
             for t in range(NT):
@@ -243,7 +238,9 @@ def tied_kernels(
                     row += coupled(block, t, k, world, elem) * b[first + k]
                 K += wp.outer(b[t], row)
             entry = block.contribution_offset + i * block.count + elem
-            contribution[world, entry] = slope(block, mu) * sym6(K[0, 0], K[1, 1], K[2, 2], K[1, 2], K[0, 2], K[0, 1])
+            contribution[world, entry] = matrix_modulus(block, mu) * sym6(
+                K[0, 0], K[1, 1], K[2, 2], K[1, 2], K[0, 2], K[0, 1]
+            )
 
     @wp.kernel(module=matrix_module)
     def prepare_matrix(
@@ -251,7 +248,7 @@ def tied_kernels(
         u: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
         base: wp.array2d(dtype=vec3),
-        mixed: wp.array(dtype=wp.int32),
+        use_prediction: wp.array(dtype=wp.int32),
         history: wp.array2d(dtype=sym6),
         dq_dv: wp.array(dtype=wp.float64),
         form: int,
@@ -277,15 +274,18 @@ def tied_kernels(
         shear = wp.dot(block.X_first[tie, elem], dd) + wp.dot(da, d)
         if wp.static(midpoint):
             D = load(block, v, world, elem)
-            half_a = line(block.first, D, tie, elem)
-            half_d = line(block.second, D, tie, elem)
+            half_a = directional_derivative(block.first, D, tie, elem)
+            half_d = directional_derivative(block.second, D, tie, elem)
             shear += wp.dot(half_a, half_d)
             if wp.static(dissipative):
                 shear += block.dissipation * (wp.dot(a, half_d) + wp.dot(d, half_a))
-        if mixed[world] == 1:
+        if use_prediction[world] == 1:
             change = load(block, v, world, elem) - load(block, base, world, elem)
             factor = T(dq_dv[world]) * T(dq_dv[world])
-            shear -= factor * wp.dot(line(block.first, change, tie, elem), line(block.second, change, tie, elem))
+            shear -= factor * wp.dot(
+                directional_derivative(block.first, change, tie, elem),
+                directional_derivative(block.second, change, tie, elem),
+            )
         lines[world, tie, elem] = a
         lines[world, NT + tie, elem] = d
         lines[world, 2 * NT + tie, elem] = vec3(shear, T(0.0), T(0.0))
@@ -293,7 +293,7 @@ def tied_kernels(
     @wp.kernel(module=matrix_module)
     def prepare_stress(
         block: Block,
-        mixed: wp.array(dtype=wp.int32),
+        use_prediction: wp.array(dtype=wp.int32),
         active: wp.array(dtype=wp.int32),
         lines: wp.array3d(dtype=vec3),
     ):
@@ -306,16 +306,16 @@ def tied_kernels(
         for k in range(W):
             s += coupled(block, tie, k, world, elem) * lines[world, 2 * NT + first + k, elem][0]
         mu = block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0]
-        if mixed[world] == 2:
+        if use_prediction[world] == 2:
             mu = T(0.0)  # no geometric part
-        lines[world, 3 * NT + tie, elem] = vec3(half(mu) * s, T(0.0), T(0.0))
+        lines[world, 3 * NT + tie, elem] = vec3(end_factor(mu) * s, T(0.0), T(0.0))
 
     @wp.kernel(module=matrix_module)
     def element_matrix(
         block: Block,
         dq_dv: wp.array(dtype=wp.float64),
         lines: wp.array3d(dtype=vec3),
-        mixed: wp.array(dtype=wp.int32),
+        use_prediction: wp.array(dtype=wp.int32),
         form: int,
         add: int,
         active: wp.array(dtype=wp.int32),
@@ -329,7 +329,7 @@ def tied_kernels(
         elem = index % block.count
         b = column / 3
         axis = column % 3
-        mu = slope(block, block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0])
+        mu = matrix_modulus(block, block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0])
         unit = vec3()
         unit[axis] = T(1.0)
         change = Ties()
@@ -365,7 +365,7 @@ def tied_kernels(
         u: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
         base: wp.array2d(dtype=vec3),
-        mixed: wp.array(dtype=wp.int32),
+        use_prediction: wp.array(dtype=wp.int32),
         history: wp.array2d(dtype=sym6),
         dq_dv: wp.array(dtype=wp.float64),
         form: int,
@@ -377,7 +377,7 @@ def tied_kernels(
         world, elem = wp.tid()
         if active[world] == 0:
             return
-        mu = slope(block, block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0])
+        mu = matrix_modulus(block, block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0])
         U = load(block, u, world, elem)
         x1, x2, e = kinematics(block, U, elem)
         first, second, B = Slots(), Slots(), Changes()
@@ -392,13 +392,13 @@ def tied_kernels(
                 second[row, a % P] = s
                 for i in range(3):
                     B[3 * row + i, a % P] = f * d2[i] + s * d1[i]
-        if mixed[world] == 1:
+        if use_prediction[world] == 1:
             change = load(block, v, world, elem) - load(block, base, world, elem)
-            e = foreseen(block, T(dq_dv[world]) * change, e, elem)
+            e = predicted_shears(block, T(dq_dv[world]) * change, e, elem)
         stress = Ties()
         if wp.static(midpoint):
             e = step_shears(block, x1, x2, load(block, v, world, elem), e, elem)
-        if form != 1 and mixed[world] != 2:
+        if form != 1 and use_prediction[world] != 2:
             stress = stresses(block, e, world, elem)
         if add == 0:
             for k in range(matrix.shape[2]):
@@ -428,7 +428,7 @@ def tied_kernels(
                             c = B[3 * (row + o) + i, n]
                             for j in range(3):
                                 R[3 * i + j] = R[3 * i + j] + c * AB[3 * t + j]
-                        G = half(stress[t]) * (
+                        G = end_factor(stress[t]) * (
                             second[row + o, n] * first[NT * panel + t] + first[row + o, n] * second[NT * panel + t]
                         )
                         for i in range(3):
@@ -443,6 +443,6 @@ def tied_kernels(
         element_matrix=element_matrix,
         internal_force=internal_force,
         tangent_product=tangent_product,
-        mixed_product=mixed_product,
+        predicted_stress_product=predicted_stress_product,
         diagonal_blocks=diagonal_blocks,
     )

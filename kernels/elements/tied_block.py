@@ -6,7 +6,7 @@ import types as _types
 import warp as wp
 
 from ..common.types import precision
-from .load import local_type
+from .element_slots import local_type
 
 __all__ = ["coupling_function", "shear_functions", "tied_struct"]
 
@@ -33,7 +33,7 @@ def tied_struct(dtype: str, dissipative: bool = False):
         history_offset: wp.int32
         count: wp.int32
         if dissipative:
-            dissipation: T  # chi of kernels/elements/conserving.py
+            dissipation: T  # chi of kernels/elements/energy_momentum.py
 
     return TiedBlock
 
@@ -65,7 +65,7 @@ def shear_functions(dtype: str, slots: int, ties: int, dissipative: bool = False
     NS, NT = slots, ties
 
     @wp.func
-    def line(table: wp.array3d(dtype=T), U: Local, tie: int, elem: int) -> vec3:
+    def directional_derivative(table: wp.array3d(dtype=T), U: Local, tie: int, elem: int) -> vec3:
         """sum_i s_i,a u_i at a tie, with `table` the derivatives along one direction: contribution of U to x_a, m."""
         out = vec3()
         for i in range(NS):
@@ -78,19 +78,21 @@ def shear_functions(dtype: str, slots: int, ties: int, dissipative: bool = False
         first, second = TieVectors(), TieVectors()
         e = Ties()
         for t in range(NT):
-            a = line(block.first, U, t, elem)
-            d = line(block.second, U, t, elem)
+            a = directional_derivative(block.first, U, t, elem)
+            d = directional_derivative(block.second, U, t, elem)
             first[t] = block.X_first[t, elem] + a
             second[t] = block.X_second[t, elem] + d
             e[t] = wp.dot(block.X_first[t, elem], d) + wp.dot(a, second[t])
         return first, second, e
 
     @wp.func
-    def foreseen(block: Block, step: Local, e: Ties, elem: int) -> Ties:
+    def predicted_shears(block: Block, step: Local, e: Ties, elem: int) -> Ties:
         """Shears of the linear prediction from the previous iterate, m^2; `step`: the last change of the slots, m."""
         out = e
         for t in range(NT):
-            out[t] = out[t] - wp.dot(line(block.first, step, t, elem), line(block.second, step, t, elem))
+            out[t] = out[t] - wp.dot(
+                directional_derivative(block.first, step, t, elem), directional_derivative(block.second, step, t, elem)
+            )
         return out
 
     @wp.func
@@ -98,7 +100,9 @@ def shear_functions(dtype: str, slots: int, ties: int, dissipative: bool = False
         """Mean of the shears at both ends of a step, m^2, from the midpoint shears e and the slots' half change D."""
         out = e
         for t in range(NT):
-            out[t] = out[t] + wp.dot(line(block.first, D, t, elem), line(block.second, D, t, elem))
+            out[t] = out[t] + wp.dot(
+                directional_derivative(block.first, D, t, elem), directional_derivative(block.second, D, t, elem)
+            )
         return out
 
     @wp.func
@@ -107,11 +111,13 @@ def shear_functions(dtype: str, slots: int, ties: int, dissipative: bool = False
         out = mean_shears(block, D, e, elem)
         if wp.static(dissipative):
             for t in range(NT):
-                change = wp.dot(x1[t], line(block.second, D, t, elem)) + wp.dot(x2[t], line(block.first, D, t, elem))
+                change = wp.dot(x1[t], directional_derivative(block.second, D, t, elem)) + wp.dot(
+                    x2[t], directional_derivative(block.first, D, t, elem)
+                )
                 out[t] = out[t] + block.dissipation * change
         return out
 
     return _types.SimpleNamespace(
-        Local=Local, Ties=Ties, TieVectors=TieVectors, line=line, kinematics=kinematics, foreseen=foreseen,
-        step_shears=step_shears,
+        Local=Local, Ties=Ties, TieVectors=TieVectors, directional_derivative=directional_derivative,
+        kinematics=kinematics, predicted_shears=predicted_shears, step_shears=step_shears,
     )  # fmt: skip

@@ -20,7 +20,7 @@ import types as _types
 
 import warp as wp
 
-from .cluster import DIRECTION, U, V
+from .element_clusters import DIRECTION, U, V
 
 __all__ = ["vertex_product"]
 
@@ -38,7 +38,7 @@ SPOKES = tuple(
     asm volatile("" ::: "memory");
     #endif
 """)
-def forget():
+def reload_barrier():
     """Discard values held in registers: fewer registers let more blocks run at once."""
 
 
@@ -48,7 +48,7 @@ def vertex_product(points: int, fn: _types.SimpleNamespace, shared: _types.Simpl
     Args:
         points: 4, one for each vertex, or 5, the centroid before them.
         fn: functions of points.py.
-        shared: functions of kernels/elements/cluster.py.
+        shared: functions of kernels/elements/element_clusters.py.
     """
     p, rate = fn.types, fn.uses_v
     T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
@@ -63,7 +63,7 @@ def vertex_product(points: int, fn: _types.SimpleNamespace, shared: _types.Simpl
     FIRST = points - 4
 
     @wp.func
-    def spokes(pool: Pool, field: int, at: int, e: wp.vec4i) -> mat33:
+    def edge_sum(pool: Pool, field: int, at: int, e: wp.vec4i) -> mat33:
         """sum_b u_e(b) dL_b^T of a field: E_v with e = e(v, .), C with the corners."""
         o = fetch(pool, field, e[0], at)
         return wp.matrix_from_cols(
@@ -84,7 +84,7 @@ def vertex_product(points: int, fn: _types.SimpleNamespace, shared: _types.Simpl
     def common(pool: Pool, field: int, at: int, s: T) -> mat33:
         """H = (1 - s) S - s C of a field, common to all four vertices."""
         S = central(pool, field, at)
-        return S - s * (S + spokes(pool, field, at, wp.vec4i(0, 1, 2, 3)))
+        return S - s * (S + edge_sum(pool, field, at, wp.vec4i(0, 1, 2, 3)))
 
     @wp.func
     def column(Q: mat33, b: int) -> vec3:
@@ -150,15 +150,15 @@ def vertex_product(points: int, fn: _types.SimpleNamespace, shared: _types.Simpl
             rate_H = common(pool, V, at, s)
         B = mat33()
         for k in range(4):
-            forget()
+            reload_barrier()
             point = FIRST + k
             e = wp.static(SPOKES[k])
             J0_inv = inverse_jacobian(block, elem)
-            G = (H + T(4.0) * s * spokes(pool, U, at, e)) * J0_inv
-            dG = (dH + T(4.0) * s * spokes(pool, DIRECTION, at, e)) * J0_inv
+            G = (H + T(4.0) * s * edge_sum(pool, U, at, e)) * J0_inv
+            dG = (dH + T(4.0) * s * edge_sum(pool, DIRECTION, at, e)) * J0_inv
             Fdot = mat33()
             if wp.static(rate):
-                Fdot = (rate_H + T(4.0) * s * spokes(pool, V, at, e)) * J0_inv
+                Fdot = (rate_H + T(4.0) * s * edge_sum(pool, V, at, e)) * J0_inv
             dP = point_increment(block, G, dG, Fdot, history, c, dq, form, world, point, elem)
             w = T(4.0) * dq * s * block.weight[point, 0] * block.det_J0[elem]
             Q = w * dP * wp.transpose(J0_inv)
@@ -168,7 +168,7 @@ def vertex_product(points: int, fn: _types.SimpleNamespace, shared: _types.Simpl
                     add_force(pool, wp.static(SPOKES[k][b]), at, column(Q, b))
                 else:
                     set_force(pool, wp.static(SPOKES[k][b]), at, column(Q, b))
-        forget()
+        reload_barrier()
         R = (T(1.0) / s - T(1.0)) * B
         if wp.static(FIRST == 1):
             G = central(pool, U, at) * inverse_jacobian(block, elem)

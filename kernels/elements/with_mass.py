@@ -1,11 +1,11 @@
-"""Product (c_M M + (dq/dv) K) p of straight elements, mass included; see kernels/elements/cluster.py."""
+"""Product (c_M M + (dq/dv) K) p of straight elements, mass included; see kernels/elements/element_clusters.py."""
 
 import functools
 
 import warp as wp
 
 from ..common.types import kernel_module
-from .cluster import DIRECTION, U, V, cluster_functions
+from .element_clusters import DIRECTION, U, V, cluster_functions
 from .matrix import stage_name
 from .points import point_functions
 from .vertex import vertex_product

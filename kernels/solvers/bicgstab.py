@@ -12,7 +12,7 @@ import types as _types
 import warp as wp
 
 from ..common.types import kernel_module, precision
-from .control import control_struct
+from .newton_control import control_struct
 from .pcg import forcing_functions, pcg_struct
 
 __all__ = ["BICGSTAB_ROWS", "bicgstab_kernels", "bicgstab_struct"]
@@ -53,15 +53,15 @@ def bicgstab_struct():
 
 
 @functools.cache
-def bicgstab_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
-    """Kernels in one precision; `gated`: with constraints, see Traits."""
+def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNamespace:
+    """Kernels in one precision; `has_constraints`: with constraints, see Traits."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
     f64 = wp.float64
     Newton, Control, Recursion = control_struct(), pcg_struct(), bicgstab_struct()
-    forcing = forcing_functions(gated)
+    forcing = forcing_functions(has_constraints)
     forced, least_norm = forcing.forced, forcing.least_norm
-    module = kernel_module(f"bicgstab_{dtype}{'_gated' if gated else ''}")
+    module = kernel_module(f"bicgstab_{dtype}{'_gated' if has_constraints else ''}")
 
     @wp.func
     def has_work(ctl: Control, world: int) -> bool:
@@ -79,21 +79,21 @@ def bicgstab_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
         ctl.norm[world] = norm
         ctl.first_norm[world] = norm
         ctl.iterations[world] = 0
-        ctl.negative[world] = 0
+        ctl.negative_curvature[world] = 0
         bi.rho[world] = ctl.sums[0, world]
         bi.best[world] = norm
         bi.mark[world] = norm
         bi.since[world] = 0
         ctl.target[world] = forced(newton, world, norm)
-        if newton.strict[world] != 0:
+        if newton.estimate_error[world] != 0:
             ctl.target[world] = f64(STRICT) * norm
-        elif newton.relative[world] > f64(FAR) and newton.fixed_forcing == 0:
+        elif newton.relative_residual[world] > f64(FAR) and newton.fixed_forcing == 0:
             ctl.target[world] = wp.max(f64(CLOSE) * norm, least_norm(newton, world))
         if norm > ctl.target[world] and ctl.max_iterations > 0 and wp.isfinite(norm) and bi.rho[world] != f64(0.0):
-            ctl.active[world] = wp.where(newton.relative[world] > f64(FAR), 2, 1)
+            ctl.active[world] = wp.where(newton.relative_residual[world] > f64(FAR), 2, 1)
             wp.atomic_max(ctl.any_active, 0, 1)
-        elif newton.strict[world] != 0:
-            ctl.negative[world] = 1  # no error estimate
+        elif newton.estimate_error[world] != 0:
+            ctl.negative_curvature[world] = 1  # no error estimate
 
     @wp.kernel(module=module)
     def first_direction(
@@ -129,7 +129,7 @@ def bicgstab_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
         if not wp.isfinite(alpha):
             ctl.active[world] = 0
             if ctl.iterations[world] == 1:
-                ctl.negative[world] = 1
+                ctl.negative_curvature[world] = 1
 
     @wp.kernel(module=module)
     def first_step(
@@ -255,8 +255,8 @@ def bicgstab_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
         if first != 0 and ctl.norm[world] > ctl.target[world] and has_work(ctl, world):
             bi.again[world] = 1
             wp.atomic_max(bi.any_again, 0, 1)
-        elif newton.strict[world] != 0 and not ctl.norm[world] <= f64(FOUND) * ctl.first_norm[world]:
-            ctl.negative[world] = 1
+        elif newton.estimate_error[world] != 0 and not ctl.norm[world] <= f64(FOUND) * ctl.first_norm[world]:
+            ctl.negative_curvature[world] = 1
 
     @wp.kernel(module=module)
     def begin_again(newton: Newton, ctl: Control, bi: Recursion):
@@ -266,7 +266,7 @@ def bicgstab_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
             bi.rho[world] = ctl.sums[0, world]
             bi.mark[world] = bi.best[world]
             bi.since[world] = 0
-            ctl.active[world] = wp.where(newton.relative[world] > f64(FAR), 2, 1)
+            ctl.active[world] = wp.where(newton.relative_residual[world] > f64(FAR), 2, 1)
             wp.atomic_max(ctl.any_active, 0, 1)
 
     @wp.kernel(module=module)

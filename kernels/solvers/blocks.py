@@ -10,7 +10,7 @@ import warp as wp
 
 from ..common.inverse import inverse_function
 from ..common.structs import pattern_struct, topology_struct
-from ..common.types import SMALL, kernel_module, precision
+from ..common.types import SHORT_UNROLL, kernel_module, precision
 from ..elements.matrix import panels_of, row_of
 
 __all__ = ["assembly_kernels", "block_kernels"]
@@ -29,7 +29,7 @@ def assembly_kernels(dtype: str, slots: int, rows: bool) -> _types.SimpleNamespa
     _, P, ROWS = panels_of(slots)
     PLACES = P * ROWS if rows else NS * (NS + 1) // 2
     Number = T if rows else vec3
-    module = kernel_module(f"assembly_{dtype}_{slots}{'_rows' if rows else ''}", max_unroll=SMALL)
+    module = kernel_module(f"assembly_{dtype}_{slots}{'_rows' if rows else ''}", max_unroll=SHORT_UNROLL)
 
     @wp.func
     def place(low: int, high: int) -> int:
@@ -144,7 +144,7 @@ def block_kernels(dtype: str) -> _types.SimpleNamespace:
     Topology = topology_struct(dtype)
     Pattern = pattern_struct()
     free_inverse = inverse_function(dtype)
-    module = kernel_module(f"blocks_{dtype}", max_unroll=SMALL)
+    module = kernel_module(f"blocks_{dtype}", max_unroll=SHORT_UNROLL)
 
     @wp.kernel(module=module)
     def take_diagonal(

@@ -5,7 +5,7 @@ import types as _types
 
 import warp as wp
 
-from ..common.entries import add_block_function
+from ..common.block_entries import add_block_function
 from ..common.lanes import lane_functions
 from ..common.structs import pattern_struct, topology_struct
 from ..common.types import kernel_module, precision

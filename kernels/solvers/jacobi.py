@@ -11,9 +11,9 @@ import warp as wp
 
 from ..common.traits import Traits
 from ..common.types import kernel_module, precision
-from .control import FAIL_CONSTRAINT, FAIL_GROWTH, FAIL_JACOBIAN, FAIL_LIMIT, FAIL_NAN, control_struct
-from .judging import judging_functions
+from .convergence import judging_functions
 from .newton import newton_kernels
+from .newton_control import FAIL_CONSTRAINT, FAIL_GROWTH, FAIL_JACOBIAN, FAIL_LIMIT, FAIL_NAN, control_struct
 from .pcg import pcg_struct
 
 __all__ = ["PAIRS", "jacobi_kernels", "jacobi_struct"]
@@ -53,15 +53,15 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
     f64 = wp.float64
     Newton, PCG, Jacobi = control_struct(), pcg_struct(), jacobi_struct()
     shared = newton_kernels(traits)
-    measure, record, accept = shared.measure, shared.record, shared.accept
-    closure = judging_functions(traits).closure
+    evaluate_norms, record_residual, accept = shared.evaluate_norms, shared.record_residual, shared.accept
+    allowed_violation = judging_functions(traits).allowed_violation
     paired = acceleration in ("secants", "anderson")
-    module = kernel_module(f"jacobi_{dtype}_{acceleration}{traits.suffix('stored', 'gated', 'limited')}")
+    module = kernel_module(f"jacobi_{dtype}_{acceleration}{traits.suffix('stored', 'has_constraints', 'limited')}")
 
     @wp.func
-    def settle(ctl: Newton, jac: Jacobi, world: int):
+    def check_convergence(ctl: Newton, jac: Jacobi, world: int):
         """End a world's iterations on convergence, failure or at the iteration limit."""
-        record(ctl, world)
+        record_residual(ctl, world)
         finite = wp.isfinite(ctl.norm[world]) and wp.isfinite(ctl.elem_sums[0, world])
         if wp.static(traits.stored):
             finite = finite and wp.isfinite(ctl.term_sums[0, world])
@@ -77,14 +77,14 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
         elif barred:
             ctl.active[world] = 0
             ctl.failed[world] = FAIL_LIMIT
-        elif ctl.excess[world] <= f64(1.0):
+        elif ctl.convergence_ratio[world] <= f64(1.0):
             accept(ctl, world)
         elif ctl.iterations[world] >= ctl.max_iterations:
             ctl.active[world] = 0
             if ctl.norm[world] > jac.growth * jac.first_norm[world]:
                 ctl.failed[world] = FAIL_GROWTH
-            if wp.static(traits.gated):
-                if ctl.open[world] * closure(ctl, world, ctl.constraint_tol) > jac.gap:
+            if wp.static(traits.has_constraints):
+                if ctl.violation_ratio[world] * allowed_violation(ctl, world, ctl.constraint_tol) > jac.gap:
                     ctl.failed[world] = FAIL_CONSTRAINT
             if ctl.failed[world] == 0:
                 ctl.rough[world] = 1
@@ -96,21 +96,21 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
         world = wp.tid()
         if ctl.active[world] == 0:
             return
-        measure(ctl, world)
+        evaluate_norms(ctl, world)
         jac.first_norm[world] = ctl.norm[world]
         ctl.alpha[world] = f64(1.0)
-        settle(ctl, jac, world)
+        check_convergence(ctl, jac, world)
 
     @wp.kernel(module=module)
-    def judge(ctl: Newton, jac: Jacobi):
+    def check_iterate(ctl: Newton, jac: Jacobi):
         """Evaluate the norms of an iterate, count it, and test convergence."""
         world = wp.tid()
         if ctl.active[world] == 0:
             return
-        measure(ctl, world)
+        evaluate_norms(ctl, world)
         ctl.iterations[world] = ctl.iterations[world] + 1
         ctl.total_iterations[world] = ctl.total_iterations[world] + 1
-        settle(ctl, jac, world)
+        check_convergence(ctl, jac, world)
 
     @wp.func
     def pair_of(k: int, age: int) -> int:
@@ -118,7 +118,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
         return (k - 1 - age) % PAIRS
 
     @wp.kernel(module=module)
-    def remember(
+    def store_pair(
         ctl: Newton,
         gradient: wp.array2d(dtype=vec3),
         free: wp.array(dtype=vec3),
@@ -194,7 +194,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
             jac.rho[world] = new
 
     @wp.kernel(module=module)
-    def shares(ctl: Newton, jac: Jacobi):
+    def solve_gram(ctl: Newton, jac: Jacobi):
         """Coefficient gamma of each pair in the move: G gamma = S^T r, G = S^T Y, by Cholesky with the newest pair
         first."""
         world = wp.tid()
@@ -287,7 +287,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
             move[world, slot] = a
 
     @wp.kernel(module=module)
-    def momentum_left(
+    def remaining_momentum(
         ctl: Newton,
         mass_factor: wp.array(dtype=f64),
         lumped: wp.array2d(dtype=T),
@@ -314,7 +314,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
             v[world, slot] = v[world, slot] + move[world, slot]
 
     @wp.kernel(module=module)
-    def tell(ctl: Newton, jac: Jacobi, pcg: PCG, running: wp.array(dtype=wp.int32)):
+    def report_cost(ctl: Newton, jac: Jacobi, pcg: PCG, running: wp.array(dtype=wp.int32)):
         """Report cost and gain of the attempt to the rule of kernels/solvers/reuse.py; flag the worlds that
         iterated."""
         world = wp.tid()
@@ -328,15 +328,15 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
     return _types.SimpleNamespace(
         module=module,
         begin=begin,
-        judge=judge,
-        remember=remember,
+        check_iterate=check_iterate,
+        store_pair=store_pair,
         recursion=recursion,
-        shares=shares,
+        solve_gram=solve_gram,
         project=project,
         conjugate_rows=conjugate_rows,
         conjugate=conjugate,
         combine=combine,
-        momentum_left=momentum_left,
+        remaining_momentum=remaining_momentum,
         advance=advance,
-        tell=tell,
+        report_cost=report_cost,
     )

@@ -12,7 +12,7 @@ import warp as wp
 
 from ..common.lanes import lane_functions
 from ..common.structs import pattern_struct
-from ..common.types import SMALL, kernel_module, precision
+from ..common.types import SHORT_UNROLL, kernel_module, precision
 
 __all__ = ["LANES", "TILE", "TILE_SLOTS", "level_kernels", "level_struct"]
 
@@ -57,7 +57,7 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
     Pattern = pattern_struct()
     lanes_of = lane_functions(dtype)
     lane_sum, row_sum, scalar_sum = lanes_of.lane_sum, lanes_of.row_sum, lanes_of.scalar_sum
-    module = kernel_module(f"levels_{dtype}{'_' + storage if scaled else ''}", max_unroll=SMALL)
+    module = kernel_module(f"levels_{dtype}{'_' + storage if scaled else ''}", max_unroll=SHORT_UNROLL)
 
     @wp.kernel(module=module)
     def smooth(

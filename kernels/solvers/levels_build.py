@@ -10,7 +10,7 @@ import warp as wp
 
 from ..common.lanes import block_memory, lane_functions
 from ..common.structs import pattern_struct
-from ..common.types import SMALL, kernel_module, precision
+from ..common.types import SHORT_UNROLL, kernel_module, precision
 from .levels import TILE, level_struct
 
 __all__ = ["FACTOR_LANES", "build_kernels"]
@@ -44,7 +44,7 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
     NEGLIGIBLE = {"float64": 1.0e-12, "float32": 1.0e-5}[storage]
     # the fraction for a factorisation, which also accepts near-mechanisms
     LEAST_PIVOT = {"float64": 1.0e-14, "float32": 3.0e-7}[dtype]
-    module = kernel_module(f"levels_build_{dtype}{'_' + storage if storage != dtype else ''}", max_unroll=SMALL)
+    module = kernel_module(f"levels_build_{dtype}{'_' + storage if storage != dtype else ''}", max_unroll=SHORT_UNROLL)
 
     @wp.kernel(module=module)
     def fill_tiles(

@@ -10,7 +10,7 @@ import warp as wp
 
 from ..common.lanes import lane_functions
 from ..common.types import kernel_module, precision
-from .control import control_struct
+from .newton_control import control_struct
 
 __all__ = ["LANES", "forcing_functions", "groups_struct", "pcg_kernels", "pcg_struct"]
 
@@ -43,11 +43,13 @@ def pcg_struct():
         sums: wp.array2d(dtype=wp.float64)  # r.z and r.D^-1 r
         curvature: wp.array2d(dtype=wp.float64)  # p.Hp
         any_active: wp.array(dtype=wp.int32)
-        strict: wp.array(dtype=wp.int32)  # 1: the solve continues until its energy converges, for an error estimate
+        estimate_error: wp.array(
+            dtype=wp.int32
+        )  # 1: the solve continues until its energy converges, for an error estimate
         energy: wp.array(dtype=wp.float64)  # that energy, sum of alpha r.z, and its value at the last check
         seen: wp.array(dtype=wp.float64)
-        negative: wp.array(dtype=wp.int32)  # the solve met a direction without positive curvature
-        unsolved: wp.array(dtype=wp.int32)  # the last solve ended at max_iterations
+        negative_curvature: wp.array(dtype=wp.int32)  # the solve met a direction without positive curvature
+        pcg_unconverged: wp.array(dtype=wp.int32)  # the last solve ended at max_iterations
         exact: wp.array(dtype=wp.int32)  # the preconditioner is the inverse of the operator, up to rounding
         taken: wp.array(dtype=wp.int32)  # 1: its z is the solution
         flip: wp.array(dtype=wp.int32)  # 1: directions of negative curvature are followed, by its absolute value
@@ -77,21 +79,21 @@ def groups_struct(dtype: str):
 
 
 @functools.cache
-def forcing_functions(gated: bool) -> _types.SimpleNamespace:
-    """Target norms of linear solves, Eisenstat and Walker (1996); `gated`: with constraints, see Traits."""
+def forcing_functions(has_constraints: bool) -> _types.SimpleNamespace:
+    """Target norms of linear solves, Eisenstat and Walker (1996); `has_constraints`: with constraints, see Traits."""
     f64 = wp.float64
     Newton = control_struct()
 
     @wp.func
     def least_norm(newton: Newton, world: int) -> f64:
         """Fraction of the accepted residual norm: a smaller residual of the solve gains nothing."""
-        least = f64(0.1) * newton.solve_accept[world]
-        if wp.static(gated):
+        least = f64(0.1) * newton.unconverged_tol[world]
+        if wp.static(has_constraints):
             # the solve also yields the constraint forces: the residual across constraints is their error
             least = f64(TIGHTER) * least
             if newton.classical == 0:
                 # a loose force tolerance must not leave constraints violated
-                least = least / wp.max(f64(10.0) * newton.open[world], f64(1.0))
+                least = least / wp.max(f64(10.0) * newton.violation_ratio[world], f64(1.0))
         return least
 
     @wp.func
@@ -99,10 +101,10 @@ def forcing_functions(gated: bool) -> _types.SimpleNamespace:
         """Forcing term times the residual, |r| = norm at the start, and at least `least_norm`."""
         if newton.fixed_forcing != 0:
             return newton.forcing[world] * norm
-        goal = newton.forcing[world] * newton.solve_norm[world]
-        if wp.static(gated):
+        goal = newton.forcing[world] * newton.unconverged_norm[world]
+        if wp.static(has_constraints):
             # with balanced forces the remaining constraint violation may still require a step
-            goal = newton.forcing[world] * wp.min(newton.solve_norm[world], norm)
+            goal = newton.forcing[world] * wp.min(newton.unconverged_norm[world], norm)
             if newton.classical == 0:
                 goal = f64(TIGHTER) * goal
         return wp.max(goal, least_norm(newton, world))
@@ -111,16 +113,16 @@ def forcing_functions(gated: bool) -> _types.SimpleNamespace:
 
 
 @functools.cache
-def pcg_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
-    """Kernels of the linear solver in one precision; `gated`: with constraints, see Traits."""
+def pcg_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNamespace:
+    """Kernels of the linear solver in one precision; `has_constraints`: with constraints, see Traits."""
     p = precision(dtype)
     T, vec3, mat33 = p.T, p.vec3, p.mat33
     f64 = wp.float64
     Newton = control_struct()
     Control = pcg_struct()
     Groups = groups_struct(dtype)
-    row_sum, forced = lane_functions(dtype).row_sum, forcing_functions(gated).forced
-    module = kernel_module(f"pcg_{dtype}{'_gated' if gated else ''}")
+    row_sum, forced = lane_functions(dtype).row_sum, forcing_functions(has_constraints).forced
+    module = kernel_module(f"pcg_{dtype}{'_gated' if has_constraints else ''}")
 
     @wp.kernel(module=module)
     def start(
@@ -145,7 +147,7 @@ def pcg_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
     ):
         """r = 0 on converged components of the model: the solve for the others must not move them."""
         world, slot = wp.tid()
-        if active[world] != 0 and newton.quiet[world, of_slot[slot]] != 0:
+        if active[world] != 0 and newton.component_converged[world, of_slot[slot]] != 0:
             r[world, slot] = vec3()
 
     @wp.kernel(module=module)
@@ -190,24 +192,28 @@ def pcg_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
         ctl.norm[world] = norm
         ctl.first_norm[world] = norm
         ctl.iterations[world] = 0
-        ctl.negative[world] = 0
+        ctl.negative_curvature[world] = 0
         ctl.flip[world] = 1 - newton.linear_stress
-        strict = newton.strict[world] != 0
+        estimate_error = newton.estimate_error[world] != 0
         # a linear prediction must also cover the whole step; other laws are not linear that far
-        whole = newton.mixed[world] == 1 and newton.linear_stress != 0
-        ctl.strict[world] = wp.where(strict or whole, 1, 0)
-        if not strict:
-            ctl.unsolved[world] = 0
+        whole = newton.predicted_stress[world] == 1 and newton.linear_stress != 0
+        ctl.estimate_error[world] = wp.where(estimate_error or whole, 1, 0)
+        if not estimate_error:
+            ctl.pcg_unconverged[world] = 0
         ctl.energy[world] = f64(0.0)
         ctl.seen[world] = f64(0.0)
         ctl.target[world] = forced(newton, world, norm)
-        if ctl.strict[world] != 0:
+        if ctl.estimate_error[world] != 0:
             # round-off in the residual hides the smooth error: its norm is no stopping criterion
             ctl.target[world] = f64(0.0)
         if ctl.total[world] >= ctl.max_work:
             return  # the step is given up, see `begin_search`
         if norm > ctl.target[world] and rz > f64(0.0) and ctl.max_iterations > 0:
-            checked = newton.iterations[world] >= TRUSTED or newton.mixed[world] != 0 or ctl.strict[world] != 0
+            checked = (
+                newton.iterations[world] >= TRUSTED
+                or newton.predicted_stress[world] != 0
+                or ctl.estimate_error[world] != 0
+            )
             if ctl.exact[world] != 0 and not checked:
                 ctl.taken[world] = 1
                 ctl.norm[world] = f64(0.0)
@@ -216,8 +222,8 @@ def pcg_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
             else:
                 ctl.active[world] = 1
                 wp.atomic_max(ctl.any_active, 0, 1)
-        elif strict:
-            ctl.negative[world] = 1  # no error estimate with an indefinite preconditioner
+        elif estimate_error:
+            ctl.negative_curvature[world] = 1  # no error estimate with an indefinite preconditioner
 
     @wp.kernel(module=module)
     def first_direction(
@@ -281,15 +287,15 @@ def pcg_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
             ctl.iterations[world] = count
             ctl.total[world] = ctl.total[world] + 1
             more = norm > ctl.target[world] and count < ctl.max_iterations and ctl.total[world] < ctl.max_work
-            if ctl.strict[world] != 0 and count % STRICT_CHECK == 0:
+            if ctl.estimate_error[world] != 0 and count % STRICT_CHECK == 0:
                 energy = ctl.energy[world]
                 more = more and energy - ctl.seen[world] > f64(STRICT_GAIN) * energy
                 ctl.seen[world] = energy
-            cut = ctl.strict[world] != 0 and count >= ctl.max_iterations
+            cut = ctl.estimate_error[world] != 0 and count >= ctl.max_iterations
             if count >= ctl.max_iterations and norm > ctl.target[world]:
-                ctl.unsolved[world] = 1
+                ctl.pcg_unconverged[world] = 1
             if cut or not (pHp > f64(0.0) and rz >= f64(0.0)):
-                ctl.negative[world] = 1
+                ctl.negative_curvature[world] = 1
             if more and pHp > f64(0.0) and wp.isfinite(pHp) and rz > f64(0.0) and wp.isfinite(rz):
                 wp.atomic_max(ctl.any_active, 0, 1)
             else:

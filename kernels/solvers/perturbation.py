@@ -11,7 +11,7 @@ import warp as wp
 
 from ..common.structs import mass_function, topology_struct
 from ..common.types import kernel_module, precision
-from .control import control_struct
+from .newton_control import control_struct
 
 __all__ = ["SAMPLES", "SCATTER", "perturbation_kernels"]
 
@@ -39,7 +39,7 @@ def perturbation_kernels(dtype: str) -> _types.SimpleNamespace:
     ):
         """Flag the worlds whose next solve estimates the error; clear both sums there."""
         world, slot = wp.tid()
-        asks = ctl.active[world] != 0 and ctl.strict[world] == 1  # finished worlds keep their positions
+        asks = ctl.active[world] != 0 and ctl.estimate_error[world] == 1  # finished worlds keep their positions
         if slot == 0:
             flags[world] = wp.where(asks, 1, 0)
         if asks:

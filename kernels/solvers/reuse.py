@@ -13,18 +13,18 @@ import warp as wp
 
 from ..common.types import precision
 from .blocks import block_kernels
-from .control import control_struct
+from .newton_control import control_struct
 from .pcg import pcg_struct
 
 __all__ = ["reuse_kernels", "reuse_struct"]
 
-DECADES = 3.0
+NEWTON_DECADES = 3.0
 """Expected residual reduction of a Newton iteration with a new matrix, in decades."""
-FADE = 0.8
-"""Factor on `pace` when a step begins with a new matrix: the rule retries an old matrix after some steps."""
-AGEING = 0.25
+RETRY_FACTOR = 0.8
+"""Factor on `reduction` when a step begins with a new matrix: the rule retries an old matrix after some steps."""
+DIAGONAL_AGEING = 0.25
 """Increment of `excess` per solve if only D, which weights the norms, is kept."""
-SHARE = 0.3
+FORCING_FACTOR = 0.3
 """Relative tolerance of a linear solve with a reused matrix, over the reduction by the last Newton iteration."""
 
 
@@ -35,16 +35,20 @@ def reuse_struct():
     @wp.struct
     class ReuseControl:
         build: wp.array(dtype=wp.int32)  # build the object now
-        moved: wp.array(dtype=wp.int32)  # 1: build it at this iterate; 0: at its old linearisation point
-        changed: wp.array(dtype=wp.int32)  # the linearisation point has changed since it was stored in the state
+        rebuilt_here: wp.array(dtype=wp.int32)  # 1: build it at this iterate; 0: at its old linearisation point
+        point_changed: wp.array(dtype=wp.int32)  # the linearisation point has changed since it was stored in the state
         stale: wp.array(dtype=wp.int32)  # 1: the object is not the state's; 2: nor is it, but its counts are
-        due: wp.array(dtype=wp.int32)  # rebuild it at the next solve
+        rebuild_due: wp.array(dtype=wp.int32)  # rebuild it at the next solve
         mass_factor: wp.array(dtype=wp.float64)  # c_M and dq/dv of the object; negative: never built
         dq_dv: wp.array(dtype=wp.float64)
-        rate: wp.array(dtype=wp.float64)  # iterations of its first solve (per decade) or step; 0: not yet known
-        excess: wp.array(dtype=wp.float64)  # iterations beyond that rate since its first solve
+        baseline_iterations: wp.array(
+            dtype=wp.float64
+        )  # iterations of its first solve (per decade) or step; 0: not yet known
+        extra_iterations: wp.array(dtype=wp.float64)  # iterations beyond that rate since its first solve
         made_at: wp.array(dtype=wp.int32)  # matrix: Newton iteration of this attempt that built it; -1: kept
-        pace: wp.array(dtype=wp.float64)  # reduction of the residual by a step's first iteration with a kept matrix
+        first_reduction: wp.array(
+            dtype=wp.float64
+        )  # reduction of the residual by a step's first iteration with a kept matrix
         kept: wp.array2d(dtype=wp.float64)  # in the state: due, mass_factor, dq_dv, rate, excess, pace
         limit: wp.float64  # excess at which a rebuild pays
         any_build: wp.array(dtype=wp.int32)
@@ -63,15 +67,15 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
     module = block_kernels(dtype).module  # shared with the kernels of the matrices, to compile one module less
 
     @wp.func
-    def recall(reuse: Reuse, world: int):
+    def restore_counts(reuse: Reuse, world: int):
         """Restore the counts from the state, once, after the state was set externally (reset, checkpoint)."""
         if reuse.stale[world] == 1:
-            reuse.due[world] = int(reuse.kept[world, 0])
+            reuse.rebuild_due[world] = int(reuse.kept[world, 0])
             reuse.mass_factor[world] = reuse.kept[world, 1]
             reuse.dq_dv[world] = reuse.kept[world, 2]
-            reuse.rate[world] = reuse.kept[world, 3]
-            reuse.excess[world] = reuse.kept[world, 4]
-            reuse.pace[world] = reuse.kept[world, 5]
+            reuse.baseline_iterations[world] = reuse.kept[world, 3]
+            reuse.extra_iterations[world] = reuse.kept[world, 4]
+            reuse.first_reduction[world] = reuse.kept[world, 5]
             reuse.stale[world] = 2
 
     @wp.func
@@ -80,7 +84,7 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
         return -wp.log10(wp.max(reduction, f64(1.0e-30)))
 
     @wp.kernel(module=module)
-    def decide(
+    def decide_rebuild(
         reuse: Reuse,
         newton: Newton,
         mass_factor: wp.array(dtype=f64),
@@ -91,76 +95,76 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
         changed."""
         world = wp.tid()
         reuse.build[world] = 0
-        reuse.moved[world] = 0
+        reuse.rebuilt_here[world] = 0
         if active[world] == 0:
             return
-        recall(reuse, world)
+        restore_counts(reuse, world)
         same = reuse.mass_factor[world] == mass_factor[world] and reuse.dq_dv[world] == dq_dv[world]
-        if reuse.due[world] != 0 or not same:
-            reuse.moved[world] = 1
-            reuse.changed[world] = 1
-            reuse.due[world] = 0
+        if reuse.rebuild_due[world] != 0 or not same:
+            reuse.rebuilt_here[world] = 1
+            reuse.point_changed[world] = 1
+            reuse.rebuild_due[world] = 0
             reuse.mass_factor[world] = mass_factor[world]
             reuse.dq_dv[world] = dq_dv[world]
-            reuse.rate[world] = f64(0.0)
-            reuse.excess[world] = f64(0.0)
+            reuse.baseline_iterations[world] = f64(0.0)
+            reuse.extra_iterations[world] = f64(0.0)
             reuse.made_at[world] = newton.iterations[world]
-        if reuse.moved[world] != 0 or reuse.stale[world] != 0:
+        if reuse.rebuilt_here[world] != 0 or reuse.stale[world] != 0:
             reuse.build[world] = 1
             wp.atomic_max(reuse.any_build, 0, 1)
 
     @wp.kernel(module=module)
-    def judge_matrix(reuse: Reuse, newton: Newton, keep: int):
+    def check_matrix_reuse(reuse: Reuse, newton: Newton, keep: int):
         """Before a solve: decide whether the matrix of this iterate would save enough Newton iterations.
 
         The number of remaining iterations with the present matrix is estimated from its gain per iteration: that of the
-        last one or, at the start of a step, of the first one of the last step that began with a kept matrix (`pace`,
-        which fades). `keep`: 1: the matrix may be kept within a step; 2: from step to step.
+        last one or, at the start of a step, of the first one of the last step that began with a kept matrix
+        (`reduction`, which fades). `keep`: 1: the matrix may be kept within a step; 2: from step to step.
         """
         world = wp.tid()
         if newton.active[world] == 0:
             return
         if keep == 2:
-            recall(reuse, world)
+            restore_counts(reuse, world)
         k = newton.iterations[world]
-        need = wp.log10(wp.max(newton.excess[world], f64(1.0)))
-        fresh = wp.max(need / f64(DECADES), f64(1.0))
-        if newton.strict[world] != 0 or newton.mixed[world] != 0:
-            reuse.due[world] = 1
+        need = wp.log10(wp.max(newton.convergence_ratio[world], f64(1.0)))
+        fresh = wp.max(need / f64(NEWTON_DECADES), f64(1.0))
+        if newton.estimate_error[world] != 0 or newton.predicted_stress[world] != 0:
+            reuse.rebuild_due[world] = 1
         if newton.reused[world] == 2:
-            reuse.due[world] = 1
+            reuse.rebuild_due[world] = 1
             if k == 0:
-                reuse.pace[world] = f64(1.0)
+                reuse.first_reduction[world] = f64(1.0)
             return
         if k == 0:
             reuse.made_at[world] = -1
             if keep < 2:
-                reuse.due[world] = 1
+                reuse.rebuild_due[world] = 1
                 reuse.stale[world] = 0  # the state holds no matrix
                 return
-            if need > gain(reuse.pace[world]) * (fresh + reuse.limit):
-                reuse.due[world] = 1
-                reuse.pace[world] = f64(FADE) * reuse.pace[world]
+            if need > gain(reuse.first_reduction[world]) * (fresh + reuse.limit):
+                reuse.rebuild_due[world] = 1
+                reuse.first_reduction[world] = f64(RETRY_FACTOR) * reuse.first_reduction[world]
             return
         slow = need > gain(newton.reduction[world]) * (fresh + reuse.limit)
         late = 3 * k >= newton.max_iterations
         if newton.alpha[world] != f64(1.0) or slow or late:
-            reuse.due[world] = 1
+            reuse.rebuild_due[world] = 1
 
     @wp.kernel(module=module)
-    def loosen(reuse: Reuse, newton: Newton):
+    def loosen_tolerance(reuse: Reuse, newton: Newton):
         """Loosen the tolerance of a solve with a reused matrix to the expected gain of an iteration."""
         world = wp.tid()
-        newton.reused[world] = 1 - reuse.moved[world]
+        newton.reused[world] = 1 - reuse.rebuilt_here[world]
         if newton.active[world] == 0:
             return
-        pace = reuse.pace[world]
+        reduction = reuse.first_reduction[world]
         if newton.iterations[world] > 0:
-            pace = newton.reduction[world]
+            reduction = newton.reduction[world]
             if newton.iterations[world] == 1 and reuse.made_at[world] == -1:
-                reuse.pace[world] = pace
-        if reuse.moved[world] == 0 and newton.fixed_forcing == 0:
-            newton.forcing[world] = wp.max(newton.forcing[world], wp.min(f64(SHARE) * pace, f64(0.1)))
+                reuse.first_reduction[world] = reduction
+        if reuse.rebuilt_here[world] == 0 and newton.fixed_forcing == 0:
+            newton.forcing[world] = wp.max(newton.forcing[world], wp.min(f64(FORCING_FACTOR) * reduction, f64(0.1)))
 
     @wp.kernel(module=module)
     def count_step(reuse: Reuse, newton: Newton, accepted: wp.array(dtype=wp.int32)):
@@ -168,20 +172,22 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
         world = wp.tid()
         if accepted[world] == 0 or reuse.stale[world] != 0:
             return
-        if newton.mixed[world] != 0:
-            reuse.due[world] = 1  # the state lacks its linearisation point
+        if newton.predicted_stress[world] != 0:
+            reuse.rebuild_due[world] = 1  # the state lacks its linearisation point
         made_at = wp.max(reuse.made_at[world], 0)
         # a step that rebuilt it midway began with another matrix: count one more iteration
         count = f64(newton.iterations[world] - made_at + wp.min(made_at, 1))
-        if reuse.rate[world] == f64(0.0):
-            reuse.rate[world] = wp.max(count, f64(1.0))
+        if reuse.baseline_iterations[world] == f64(0.0):
+            reuse.baseline_iterations[world] = wp.max(count, f64(1.0))
         else:
-            reuse.excess[world] = reuse.excess[world] + wp.max(count - reuse.rate[world], f64(0.0))
-            if reuse.excess[world] > reuse.limit:
-                reuse.due[world] = 1
+            reuse.extra_iterations[world] = reuse.extra_iterations[world] + wp.max(
+                count - reuse.baseline_iterations[world], f64(0.0)
+            )
+            if reuse.extra_iterations[world] > reuse.limit:
+                reuse.rebuild_due[world] = 1
 
     @wp.kernel(module=module)
-    def judge(reuse: Reuse, newton: Newton, pcg: PCG, follows: int):
+    def count_solve(reuse: Reuse, newton: Newton, pcg: PCG, follows: int):
         """After a solve: count its iterations beyond those of the first solve with this preconditioner.
 
         `follows`: the preconditioner is always rebuilt with the operator's matrix, and only D is kept.
@@ -193,72 +199,74 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
         gained = wp.max(pcg.first_norm[world] / wp.max(pcg.norm[world], f64(1.0e-300)), f64(2.0))
         decades = wp.log10(gained)
         if follows != 0:
-            reuse.excess[world] = reuse.excess[world] + f64(AGEING)
-        elif reuse.rate[world] == f64(0.0):
-            reuse.rate[world] = count / decades
+            reuse.extra_iterations[world] = reuse.extra_iterations[world] + f64(DIAGONAL_AGEING)
+        elif reuse.baseline_iterations[world] == f64(0.0):
+            reuse.baseline_iterations[world] = count / decades
         else:
-            reuse.excess[world] = reuse.excess[world] + wp.max(count - reuse.rate[world] * decades - f64(1.0), f64(0.0))
-        if reuse.excess[world] > reuse.limit:
-            reuse.due[world] = 1
+            reuse.extra_iterations[world] = reuse.extra_iterations[world] + wp.max(
+                count - reuse.baseline_iterations[world] * decades - f64(1.0), f64(0.0)
+            )
+        if reuse.extra_iterations[world] > reuse.limit:
+            reuse.rebuild_due[world] = 1
 
     @wp.kernel(module=module)
-    def commit(reuse: Reuse, accepted: wp.array(dtype=wp.int32)):
+    def store_counts(reuse: Reuse, accepted: wp.array(dtype=wp.int32)):
         """After an accepted step: store the counts in the state, unless there was no solve."""
         world = wp.tid()
         if accepted[world] == 0 or reuse.stale[world] != 0:
             return
-        reuse.changed[world] = 0
-        reuse.kept[world, 0] = f64(reuse.due[world])
+        reuse.point_changed[world] = 0
+        reuse.kept[world, 0] = f64(reuse.rebuild_due[world])
         reuse.kept[world, 1] = reuse.mass_factor[world]
         reuse.kept[world, 2] = reuse.dq_dv[world]
-        reuse.kept[world, 3] = reuse.rate[world]
-        reuse.kept[world, 4] = reuse.excess[world]
-        reuse.kept[world, 5] = reuse.pace[world]
+        reuse.kept[world, 3] = reuse.baseline_iterations[world]
+        reuse.kept[world, 4] = reuse.extra_iterations[world]
+        reuse.kept[world, 5] = reuse.first_reduction[world]
 
     @wp.kernel(module=module)
-    def mark(flags: wp.array(dtype=wp.int32), reuse: Reuse):
+    def mark_stale(flags: wp.array(dtype=wp.int32), reuse: Reuse):
         """Flag the worlds whose state was set externally."""
         world = wp.tid()
         if flags[world] != 0:
             reuse.stale[world] = 1
 
     @wp.kernel(module=module)
-    def renew(flags: wp.array(dtype=wp.int32), reuse: Reuse):
+    def request_rebuild(flags: wp.array(dtype=wp.int32), reuse: Reuse):
         """Request a rebuild before the next solve in the flagged worlds."""
         world = wp.tid()
         if flags[world] != 0:
-            reuse.due[world] = 1
+            reuse.rebuild_due[world] = 1
 
     @wp.func
-    def which(reuse: Reuse, accepted: wp.array(dtype=wp.int32), world: int) -> int:
+    def copy_direction(reuse: Reuse, accepted: wp.array(dtype=wp.int32), world: int) -> int:
         """Copy direction: 1: iterate to linearisation point; 2: state to linearisation point; 3: linearisation point to
         state; 0: none.
 
         1 and 2 come before a solve, 3 after a step with the flags `accepted` (else an empty array).
         """
         if accepted.shape[0] > 0:
-            return wp.where(accepted[world] != 0 and reuse.changed[world] != 0 and reuse.stale[world] == 0, 3, 0)
-        if reuse.moved[world] != 0:
+            return wp.where(accepted[world] != 0 and reuse.point_changed[world] != 0 and reuse.stale[world] == 0, 3, 0)
+        if reuse.rebuilt_here[world] != 0:
             return 1
         return wp.where(reuse.stale[world] != 0, 2, 0)
 
     @wp.kernel(module=module)
-    def carry_places(
+    def carry_points(
         reuse: Reuse,
         accepted: wp.array(dtype=wp.int32),
         u: wp.array2d(dtype=vec3),
         kept: wp.array2d(dtype=vec3),
-        place: wp.array2d(dtype=vec3),
+        linearisation_point: wp.array2d(dtype=vec3),
     ):
-        """Copy the displacements of the linearisation point, see `which`."""
+        """Copy the displacements of the linearisation point, see `copy_direction`."""
         world, slot = wp.tid()
-        to = which(reuse, accepted, world)
+        to = copy_direction(reuse, accepted, world)
         if to == 1:
-            place[world, slot] = u[world, slot]
+            linearisation_point[world, slot] = u[world, slot]
         elif to == 2:
-            place[world, slot] = kept[world, slot]
+            linearisation_point[world, slot] = kept[world, slot]
         elif to == 3:
-            kept[world, slot] = place[world, slot]
+            kept[world, slot] = linearisation_point[world, slot]
 
     @wp.kernel(module=module)
     def carry_words(
@@ -266,17 +274,17 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
         accepted: wp.array(dtype=wp.int32),
         live: wp.array2d(dtype=wp.uint32),
         kept: wp.array2d(dtype=wp.uint32),
-        place: wp.array2d(dtype=wp.uint32),
+        linearisation_point: wp.array2d(dtype=wp.uint32),
     ):
-        """`carry_places` for an array of a term, as [world, 32-bit word]."""
+        """`carry_points` for an array of a term, as [world, 32-bit word]."""
         world, word = wp.tid()
-        to = which(reuse, accepted, world)
+        to = copy_direction(reuse, accepted, world)
         if to == 1:
-            place[world, word] = live[world, word]
+            linearisation_point[world, word] = live[world, word]
         elif to == 2:
-            place[world, word] = kept[world, word]
+            linearisation_point[world, word] = kept[world, word]
         elif to == 3:
-            kept[world, word] = place[world, word]
+            kept[world, word] = linearisation_point[world, word]
 
     @wp.kernel(module=module)
     def carry_rows(
@@ -286,29 +294,29 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
         stiffness: wp.array2d(dtype=f64),
         kept_gradient: wp.array2d(dtype=wp.vec3d),
         kept_stiffness: wp.array2d(dtype=f64),
-        place_gradient: wp.array2d(dtype=wp.vec3d),
-        place_stiffness: wp.array2d(dtype=f64),
+        point_gradient: wp.array2d(dtype=wp.vec3d),
+        point_stiffness: wp.array2d(dtype=f64),
     ):
-        """`carry_places` for the rows of constraints of the object."""
+        """`carry_points` for the rows of constraints of the object."""
         world, row = wp.tid()
-        to = which(reuse, accepted, world)
+        to = copy_direction(reuse, accepted, world)
         if to == 1:
-            place_stiffness[world, row] = stiffness[world, row]
+            point_stiffness[world, row] = stiffness[world, row]
         elif to == 2:
-            place_stiffness[world, row] = kept_stiffness[world, row]
+            point_stiffness[world, row] = kept_stiffness[world, row]
         elif to == 3:
-            kept_stiffness[world, row] = place_stiffness[world, row]
+            kept_stiffness[world, row] = point_stiffness[world, row]
         for side in range(3):
             k = 3 * row + side
             if to == 1:
-                place_gradient[world, k] = gradient[world, k]
+                point_gradient[world, k] = gradient[world, k]
             elif to == 2:
-                place_gradient[world, k] = kept_gradient[world, k]
+                point_gradient[world, k] = kept_gradient[world, k]
             elif to == 3:
-                kept_gradient[world, k] = place_gradient[world, k]
+                kept_gradient[world, k] = point_gradient[world, k]
 
     @wp.kernel(module=module)
-    def made(reuse: Reuse):
+    def mark_built(reuse: Reuse):
         """Clear `stale` in the worlds that have built the object."""
         world = wp.tid()
         if reuse.build[world] != 0:
@@ -316,16 +324,16 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
 
     return _types.SimpleNamespace(
         module=module,
-        decide=decide,
-        judge=judge,
-        judge_matrix=judge_matrix,
+        decide_rebuild=decide_rebuild,
+        count_solve=count_solve,
+        check_matrix_reuse=check_matrix_reuse,
         count_step=count_step,
-        loosen=loosen,
-        commit=commit,
-        mark=mark,
-        made=made,
-        renew=renew,
-        carry_places=carry_places,
+        loosen_tolerance=loosen_tolerance,
+        store_counts=store_counts,
+        mark_stale=mark_stale,
+        mark_built=mark_built,
+        request_rebuild=request_rebuild,
+        carry_points=carry_points,
         carry_rows=carry_rows,
         carry_words=carry_words,
     )

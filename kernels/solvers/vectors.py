@@ -6,20 +6,20 @@ import types as _types
 import warp as wp
 
 from ..common.types import precision
-from .control import FLOOR_LANES, GROUP_ROWS, LANES, control_struct
+from .newton_control import FLOOR_LANES, GROUP_ROWS, LANES, control_struct
 from .pcg import pcg_kernels
 
 __all__ = ["vector_kernels"]
 
 
 @functools.cache
-def vector_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
+def vector_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNamespace:
     """Kernels in one precision of the vectors, in the module of `pcg_kernels`, which every solver loads."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
     f64 = wp.float64
     Control = control_struct()
-    module = pcg_kernels(dtype, gated).module
+    module = pcg_kernels(dtype, has_constraints).module
 
     @wp.kernel(module=module)
     def norm_partial(
@@ -82,7 +82,7 @@ def vector_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
         """v = base + alpha p, or the best iterate if that is to be restored."""
         world, slot = wp.tid()
         if ctl.searching[world] != 0:
-            if ctl.restoring[world] != 0:
+            if ctl.restore_best[world] != 0:
                 v[world, slot] = best[world, slot]
             else:
                 v[world, slot] = base[world, slot] + T(ctl.alpha[world]) * direction[world, slot]
@@ -97,7 +97,7 @@ def vector_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
         """base = v; before that, best iterate = base in the marked worlds."""
         world, slot = wp.tid()
         if ctl.active[world] != 0:
-            if ctl.mark[world] != 0:
+            if ctl.store_best[world] != 0:
                 best[world, slot] = base[world, slot]
             base[world, slot] = v[world, slot]
 
@@ -119,7 +119,7 @@ def vector_kernels(dtype: str, gated: bool = False) -> _types.SimpleNamespace:
     ):
         """Strided partial sums of FLOOR_ROWS over the slots and elements of a part; empty lists: all."""
         world, part, lane = wp.tid()
-        if ctl.strict[world] != 2:
+        if ctl.estimate_error[world] != 2:
             return
         work, kinetic, strain = f64(0.0), f64(0.0), f64(0.0)
         step, size, speed = f64(0.0), f64(0.0), f64(0.0)

@@ -1,7 +1,7 @@
 """Step size control by an estimate of the local position error of a substep.
 
-The error e of a substep h, a vector at each slot, gives the rate r = e / max(h, SPREAD pace), with `pace` the running
-mean of the accepted step sizes, and updates the slot's running mean m of the rates. The substep is accepted if
+The error e of a substep h, a vector at each slot, gives the rate r = e / max(h, SPREAD pace), with `mean_step` the
+running mean of the accepted step sizes, and updates the slot's running mean m of the rates. The substep is accepted if
 
     |m| <= limit and |r| <= CAP limit, or |r| <= limit,    limit = SHARE error size / horizon,
 
@@ -19,38 +19,38 @@ from typing import Any
 import warp as wp
 
 from ..common.types import kernel_module, precision
-from ..solvers.control import FAIL_ERROR, control_struct
+from ..solvers.newton_control import FAIL_ERROR, control_struct
 from ..solvers.pcg import pcg_struct
-from .control import step_span, step_struct
+from .step_control import step_span, step_struct
 
 __all__ = ["COUNTS", "KEPT", "MAX_LEVEL", "adaptive_kernels", "adaptive_struct"]
 
-KEPT = ("wish", "pace", "seen")
+KEPT = ("next_step", "mean_step", "seen")
 """Columns of the control's state, [world, column]: the upper bound of the next substep, s, 0 at the start; mean step
 size, s; number of substeps in the mean of rates, at most AVERAGE."""
 COUNTS = ("substeps", "rejected", "least_h", "largest_h")
 """Columns of a step's report: accepted substeps, substeps rejected for their error, smallest and largest size, s."""
 MAX_LEVEL = 26
 """Maximum halvings of the interval between synchronisation times; float32 times would not resolve smaller steps."""
-SHARE = 0.5
+ERROR_FRACTION = 0.5
 """Fraction of the requested error that the estimates may accumulate to: errors grow until the end."""
-GROW = 0.7
+DOUBLING_RATIO = 0.7
 """Fraction of the tolerance below which a doubled step's predicted error allows the doubling."""
-CUT = 3
+MAX_CUTS = 3
 """Maximum halvings of a rejected substep: for nonsmooth motions the estimate falls with a lower power of h."""
-SPREAD = 0.125
+MIN_STEP_RATIO = 0.125
 """Lower bound of the step size in an error rate, over the pace; 1 lets velocity errors from impacts accumulate."""
-START = 0.1
+FIRST_STEP_ERROR = 0.1
 """Fraction of the requested error allowed for the first step of a multistep scheme, of order 1."""
-MOST = 65536
+MAX_SUBSTEPS = 65536
 """Maximum number of substeps between two synchronisation times."""
-MEMORY = 256.0
+STEP_MEMORY = 256.0
 """Substeps in the running mean of step sizes."""
-AVERAGE = 16.0
+RATE_MEMORY = 16.0
 """Substeps in the running mean of rates."""
-CAP = 4.0
+RATE_RATIO = 4.0
 """Largest rate, over the bound of their mean."""
-ROUNDING = 2.0
+ROUNDING_UNITS = 2.0
 """Largest error of an estimate, in roundings of the largest displacement."""
 
 
@@ -97,12 +97,12 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
     module = kernel_module(f"adaptive_{dtype}_{scheme.variant}")
 
     @wp.func
-    def refine(step: Step, wish: f64, world: int):
-        """Raise the level until substeps are no longer than `wish`."""
+    def refine(step: Step, next_step: f64, world: int):
+        """Raise the level until substeps are no longer than `next_step`."""
         level = step.level[world]
         part = step.part[world]
         h = span_of(step, world) / f64(wp.lshift(1, level))
-        while level < MAX_LEVEL and h > f64(1.000001) * wish:
+        while level < MAX_LEVEL and h > f64(1.000001) * next_step:
             h = f64(0.5) * h
             level = level + 1
             part = part * 2
@@ -128,9 +128,9 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
     def begin_estimate(step: Step, newton: Newton, ctl: Adaptive):
         """Flag the worlds whose Newton iteration has converged."""
         world = wp.tid()
-        good = step.running[world] != 0 and newton.failed[world] == 0 and newton.turned[world] == 0
+        good = step.running[world] != 0 and newton.failed[world] == 0 and newton.inverted[world] == 0
         ctl.flags[world] = wp.where(good, 1, 0)
-        ctl.span[world] = wp.max(step.h[world], f64(SPREAD) * ctl.kept[world, 1])
+        ctl.span[world] = wp.max(step.h[world], f64(MIN_STEP_RATIO) * ctl.kept[world, 1])
         ctl.rate[world] = f64(0.0)
         ctl.mean[world] = f64(0.0)
         ctl.scatter[world] = f64(0.0)
@@ -151,13 +151,13 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
         return T(f64(1.0) / ctl.span[world]) * e
 
     @wp.func
-    def mean_of(ctl: Adaptive, world: int, mean: vec3, rate: vec3) -> vec3:
+    def running_mean(ctl: Adaptive, world: int, mean: vec3, rate: vec3) -> vec3:
         """Running mean including one more rate, m/s."""
-        part = f64(1.0) / wp.min(ctl.kept[world, 2] + f64(1.0), f64(AVERAGE))
+        part = f64(1.0) / wp.min(ctl.kept[world, 2] + f64(1.0), f64(RATE_MEMORY))
         return mean + T(part) * (rate - mean)
 
     @wp.func
-    def size_of(x: vec3) -> f64:
+    def finite_length(x: vec3) -> f64:
         """Length; 1e300 if not finite."""
         size = f64(wp.length(x))
         if not wp.isfinite(size):
@@ -185,14 +185,14 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
             return
         reach = arm[slot] * free[slot]
         rate = rate_of(step, ctl, world, v[world, slot], v_n[world, slot], v_before[world, slot])
-        wp.atomic_max(ctl.rate, world, size_of(wp.cw_mul(reach, rate)))
-        mean = mean_of(ctl, world, means[world, slot], rate)
-        wp.atomic_max(ctl.mean, world, size_of(wp.cw_mul(reach, mean)))
-        wp.atomic_max(ctl.scatter, world, size_of(wp.cw_mul(reach, rate - mean)))
-        wp.atomic_max(ctl.moved, world, size_of(wp.cw_mul(reach, u[world, slot])))
+        wp.atomic_max(ctl.rate, world, finite_length(wp.cw_mul(reach, rate)))
+        mean = running_mean(ctl, world, means[world, slot], rate)
+        wp.atomic_max(ctl.mean, world, finite_length(wp.cw_mul(reach, mean)))
+        wp.atomic_max(ctl.scatter, world, finite_length(wp.cw_mul(reach, rate - mean)))
+        wp.atomic_max(ctl.moved, world, finite_length(wp.cw_mul(reach, u[world, slot])))
 
     @wp.func
-    def starts(step: Step, world: int) -> int:
+    def is_first_substep(step: Step, world: int) -> int:
         """1 if the substep is a multistep scheme's first, of order 1."""
         if wp.static(multistep):
             if step.a1[world] == f64(0.0):
@@ -213,9 +213,9 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
         if step.accepted[world] == 0:
             return
         mean = vec3()
-        if starts(step, world) == 0:
+        if is_first_substep(step, world) == 0:
             rate = rate_of(step, ctl, world, v[world, slot], v_n[world, slot], v_before[world, slot])
-            mean = mean_of(ctl, world, means[world, slot], rate)
+            mean = running_mean(ctl, world, means[world, slot], rate)
         means[world, slot] = mean
 
     @wp.func
@@ -227,7 +227,7 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
         return out
 
     @wp.kernel(module=module)
-    def judge(step: Step, newton: Newton, pcg: PCG, ctl: Adaptive):
+    def control_step_size(step: Step, newton: Newton, pcg: PCG, ctl: Adaptive):
         """Reject a substep with too large an error; choose the size of the next."""
         world = wp.tid()
         if step.running[world] == 0:
@@ -239,52 +239,52 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
             if ctl.tries[world] > ctl.max_tries:
                 step.level[world] = MAX_LEVEL  # no more halvings
             return
-        pace = ctl.kept[world, 1]
+        mean_step = ctl.kept[world, 1]
         span = ctl.span[world]
-        limit = f64(SHARE) * ctl.tolerance / ctl.horizon[0]
-        rounding = f64(ROUNDING) * ctl.eps * ctl.moved[world] / span
+        limit = f64(ERROR_FRACTION) * ctl.tolerance / ctl.horizon[0]
+        rounding = f64(ROUNDING_UNITS) * ctl.eps * ctl.moved[world] / span
         rate = wp.max(ctl.rate[world] - rounding, f64(0.0))
-        part = f64(1.0) / wp.min(ctl.kept[world, 2] + f64(1.0), f64(AVERAGE))
+        part = f64(1.0) / wp.min(ctl.kept[world, 2] + f64(1.0), f64(RATE_MEMORY))
         mean = wp.max(ctl.mean[world] - part * wp.min(rounding, ctl.scatter[world]), f64(0.0))
-        steady = wp.max(mean, rate / f64(CAP))
+        steady = wp.max(mean, rate / f64(RATE_RATIO))
         ratio = wp.min(rate, steady) / limit
         n = wp.static(order) + 1
-        if starts(step, world) != 0:
+        if is_first_substep(step, world) != 0:
             n = 2
-            ratio = rate / wp.max(limit, f64(START) * ctl.tolerance / span)
-        if ctl.counts[world, 0] >= f64(MOST):
+            ratio = rate / wp.max(limit, f64(FIRST_STEP_ERROR) * ctl.tolerance / span)
+        if ctl.counts[world, 0] >= f64(MAX_SUBSTEPS):
             ratio = f64(wp.inf)
         if not ratio <= f64(1.0):
             newton.failed[world] = FAIL_ERROR
             ctl.counts[world, 1] = ctl.counts[world, 1] + f64(1.0)
-            if ctl.counts[world, 0] + ctl.counts[world, 1] > f64(MOST):
+            if ctl.counts[world, 0] + ctl.counts[world, 1] > f64(MAX_SUBSTEPS):
                 step.level[world] = MAX_LEVEL  # no more halvings
-            wish = f64(0.5) * h
+            next_step = f64(0.5) * h
             half = f64(1.0) / power(f64(2.0), n)
             ratio = ratio * half
-            for _k in range(1, CUT):
+            for _k in range(1, MAX_CUTS):
                 if ratio > f64(1.0):
                     ratio = ratio * half
-                    wish = f64(0.5) * wish
-            ctl.kept[world, 0] = wish
+                    next_step = f64(0.5) * next_step
+            ctl.kept[world, 0] = next_step
             return
         ctl.tries[world] = 0
         ctl.work[world] = ctl.work[world] + pcg.total[world]
         pcg.total[world] = 0
         double = f64(2.0) * h
-        longer = wp.max(double, f64(SPREAD) * pace)
-        if steady * (power(f64(2.0), n) * span / longer) <= f64(GROW) * limit:
+        longer = wp.max(double, f64(MIN_STEP_RATIO) * mean_step)
+        if steady * (power(f64(2.0), n) * span / longer) <= f64(DOUBLING_RATIO) * limit:
             ctl.kept[world, 0] = double
         else:
             ctl.kept[world, 0] = h
-        ctl.kept[world, 1] = pace + (h - pace) / f64(MEMORY)
+        ctl.kept[world, 1] = mean_step + (h - mean_step) / f64(STEP_MEMORY)
         if ctl.counts[world, 0] == f64(0.0) or h < ctl.counts[world, 2]:
             ctl.counts[world, 2] = h
         ctl.counts[world, 3] = wp.max(ctl.counts[world, 3], h)
         ctl.counts[world, 0] = ctl.counts[world, 0] + f64(1.0)
 
     @wp.kernel(module=module)
-    def settle(step: Step, ctl: Adaptive):
+    def refine_substeps(step: Step, ctl: Adaptive):
         """After an attempt: update the count of rates, refine the substeps to at most the bound.
 
         A rejected step returns to the state at its start.
@@ -292,8 +292,8 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
         world = wp.tid()
         step.first_refusal[world] = 0
         if step.accepted[world] != 0:
-            seen = wp.min(ctl.kept[world, 2] + f64(1.0), f64(AVERAGE))
-            ctl.kept[world, 2] = wp.where(starts(step, world) != 0, f64(0.0), seen)
+            seen = wp.min(ctl.kept[world, 2] + f64(1.0), f64(RATE_MEMORY))
+            ctl.kept[world, 2] = wp.where(is_first_substep(step, world) != 0, f64(0.0), seen)
         if step.running[world] != 0:
             refine(step, ctl.kept[world, 0], world)
 
@@ -309,7 +309,7 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
         begin_estimate=begin_estimate,
         local_error=local_error,
         keep_mean=keep_mean,
-        judge=judge,
-        settle=settle,
+        control_step_size=control_step_size,
+        refine_substeps=refine_substeps,
         close_step=close_step,
     )

@@ -12,7 +12,7 @@ from ..common.inverse import inverse_function
 from ..common.lanes import lane_functions
 from ..common.structs import additions_struct, balance_struct, mass_function, pattern_struct, topology_struct
 from ..common.traits import NO_TERMS, Traits
-from ..common.types import SMALL, kernel_module, precision
+from ..common.types import SHORT_UNROLL, kernel_module, precision
 from ..terms.constraints import constraint_struct, multiplier_struct
 
 __all__ = ["RESIDUAL_ROWS", "gather_kernels"]
@@ -32,7 +32,12 @@ REACTION = wp.constant(wp.float64(1.0e-6))
 @functools.cache
 def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
     """Kernels over slots; they depend on the traits "nonpotential", "tangent", "pooled", "ties" and "midpoint"."""
-    nonpotential, tangent, pooled, ties = traits.nonpotential, traits.tangent, traits.pooled, traits.ties
+    nonpotential, tangent, pooled, constraint_rows = (
+        traits.nonpotential,
+        traits.tangent,
+        traits.pooled,
+        traits.constraint_rows,
+    )
     midpoint = traits.midpoint
     p = precision(dtype)
     T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
@@ -43,9 +48,9 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
     Pattern = pattern_struct()
     lane_sum, row_sum = lane_functions(dtype).lane_sum, lane_functions(dtype).row_sum
     free_inverse, mass_at = inverse_function(dtype), mass_function(dtype)
-    name = f"{dtype}{traits.suffix('nonpotential', 'tangent', 'pooled', 'ties', 'midpoint')}"
-    module = kernel_module(f"gather_{name}", max_unroll=SMALL)
-    matrix_module = kernel_module(f"matrix_product_{name}", max_unroll=SMALL)
+    name = f"{dtype}{traits.suffix('nonpotential', 'tangent', 'pooled', 'constraint_rows', 'midpoint')}"
+    module = kernel_module(f"gather_{name}", max_unroll=SHORT_UNROLL)
+    matrix_module = kernel_module(f"matrix_product_{name}", max_unroll=SHORT_UNROLL)
 
     @wp.func
     def weighted(a: vec3, D: vec3) -> f64:
@@ -58,7 +63,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         return s
 
     @wp.func
-    def spread(balance: Balance, free: vec3, D: vec3, world: int, slot: int) -> f64:
+    def position_rounding(balance: Balance, free: vec3, D: vec3, world: int, slot: int) -> f64:
         """Squared D norm of the velocity u/(dq/dv): times eps^2, the residual due to round-off of u.
 
         If u = q~ + (dq/dv) v is a small difference, v sets the round-off.
@@ -74,17 +79,17 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
     @wp.func
     def constraint_forces(con: Constraints, mul: Multipliers, world: int, slot: int) -> wp.mat33d:
         """J^T of the trial's lambda, of rho c, and of the frozen lambda + rho c, as rows."""
-        tie = wp.vec3d()
-        squeeze = wp.vec3d()
+        constraint_force = wp.vec3d()
+        penalty = wp.vec3d()
         merit = wp.vec3d()
         for k in range(con.slot_start[slot], con.slot_start[slot + 1]):
             term = con.slot_term[k]
             row = term / 3
             d = con.slot_weight[k] * mul.gradient[world, term]
-            tie += mul.trial[world, row] * d
-            squeeze += mul.excess[world, row] * d
-            merit += mul.merit[world, row] * d
-        return wp.matrix_from_rows(tie, squeeze, merit)
+            constraint_force += mul.trial[world, row] * d
+            penalty += mul.penalty_force[world, row] * d
+            merit += mul.frozen_force[world, row] * d
+        return wp.matrix_from_rows(constraint_force, penalty, merit)
 
     @wp.func
     def gathered(topo: Topology, contribution: wp.array2d(dtype=vec3), world: int, slot: int) -> vec3:
@@ -103,9 +108,9 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         return f
 
     @wp.func
-    def sought(balance: Balance, world: int, slot: int) -> vec3:
+    def newton_gradient(balance: Balance, world: int, slot: int) -> vec3:
         """Gradient on the right side of the Newton step."""
-        if wp.static(ties):
+        if wp.static(constraint_rows):
             return balance.gradient[world, slot]
         else:
             return balance.g[world, slot]
@@ -164,19 +169,19 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         held = load
         if wp.static(nonpotential):
             new = balance.nonpotential[world, slot]
-            held = load + balance.nonpotential_held[world, slot]
+            held = load + balance.nonpotential_frozen[world, slot]
             load = load + new
             for k in range(3):
                 magnitude[k] = magnitude[k] + wp.abs(new[k])
         residual_force = a + f - load
         descent = a + f - held
-        if wp.static(ties):
-            tie = constraint_forces(con, mul, world, slot)
-            residual_force += vec3(tie[0])
-            balance.gradient[world, slot] = residual_force + vec3(tie[1])
-            descent += vec3(tie[2])
+        if wp.static(constraint_rows):
+            constraint_force = constraint_forces(con, mul, world, slot)
+            residual_force += vec3(constraint_force[0])
+            balance.gradient[world, slot] = residual_force + vec3(constraint_force[1])
+            descent += vec3(constraint_force[2])
             for k in range(3):
-                magnitude[k] = magnitude[k] + T(wp.abs(tie[0][k]))
+                magnitude[k] = magnitude[k] + T(wp.abs(constraint_force[0][k]))
         if wp.static(pooled):  # opposing contact forces on a body cancel: each sets a scale by itself
             for k in range(3):
                 magnitude[k] = magnitude[k] + wp.abs(of_pool[k])
@@ -196,15 +201,17 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         balance.rows[3, world, slot] = weighted(wp.cw_mul(a, free), D)
         balance.rows[4, world, slot] = f64(kinetic - work)
         if wp.static(midpoint):  # Phi does not exist: half of the squared gradient replaces it
-            balance.rows[4, world, slot] = f64(0.5) * weighted(wp.cw_mul(sought(balance, world, slot), free), D)
+            balance.rows[4, world, slot] = f64(0.5) * weighted(
+                wp.cw_mul(newton_gradient(balance, world, slot), free), D
+            )
         balance.rows[5, world, slot] = f64(wp.abs(kinetic) + wp.abs(work))
         balance.rows[6, world, slot] = f64(wp.dot(wp.cw_mul(descent, free), balance.direction[world, slot]))
         balance.rows[7, world, slot] = f64(0.0)
         if wp.static(nonpotential and not midpoint):
             balance.rows[7, world, slot] = f64(
-                wp.dot(balance.nonpotential_held[world, slot] - balance.nonpotential[world, slot], vs)
+                wp.dot(balance.nonpotential_frozen[world, slot] - balance.nonpotential[world, slot], vs)
             )
-        balance.rows[8, world, slot] = spread(balance, free, D, world, slot)
+        balance.rows[8, world, slot] = position_rounding(balance, free, D, world, slot)
         balance.rows[9, world, slot] = square(wp.cw_mul(residual_force, free))
         motion = T(0.5) * wp.dot(balance.v_tilde[world, slot], past)
         balance.rows[10, world, slot] = balance.mass_factor[world] * f64(motion)
@@ -218,7 +225,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         return out
 
     @wp.func
-    def finish(
+    def add_terms(
         topo: Topology,
         h: vec3,
         more: Additions,
@@ -243,12 +250,12 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
                 stiff += more.pool[world, more.pool_entry[k]]
             if pool[0] < pool[1]:
                 out += T(more.dq_dv[world]) * stiff
-        if wp.static(ties):
-            tie = wp.vec3d()
+        if wp.static(constraint_rows):
+            constraint_force = wp.vec3d()
             for k in range(con.slot_start[slot], con.slot_start[slot + 1]):
-                tie += con.slot_weight[k] * mul.product[world, con.slot_term[k]]
-            out += vec3(tie)
-        held = int(topo.held[slot])
+                constraint_force += con.slot_weight[k] * mul.product[world, con.slot_term[k]]
+            out += vec3(constraint_force)
+        held = int(topo.prescribed[slot])
         for k in range(3):
             if held & (1 << k) != 0:
                 out[k] = T(0.0)
@@ -256,7 +263,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         return f64(wp.dot(out, p))
 
     @wp.func
-    def share_of_warp(share: f64, index: int, warp: int, world: int, rows: wp.array3d(dtype=f64)):
+    def store_warp_sum(share: f64, index: int, warp: int, world: int, rows: wp.array3d(dtype=f64)):
         """Store the sum of p.Hp over a warp's rows."""
         total = row_sum(share, warp)
         if index % warp == 0:
@@ -287,8 +294,8 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
                 a += mass_at(topo, world, k) * p_in[world, topo.mass_column[k]]
             dq = T(more.dq_dv[world])
             h = T(more.mass_factor[world]) * a + dq * f
-            share = finish(topo, h, more, pool, p_in[world, slot], con, mul, world, slot, out)
-        share_of_warp(share, slot, more.warp, world, rows)
+            share = add_terms(topo, h, more, pool, p_in[world, slot], con, mul, world, slot, out)
+        store_warp_sum(share, slot, more.warp, world, rows)
 
     @wp.kernel(module=module, launch_bounds=(256, SUM_BLOCKS[dtype]))
     def with_mass_sum(
@@ -310,8 +317,8 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         if slot < out.shape[1]:
             pool = pool_range(more, slot)
             h = gathered(topo, contribution, world, slot)
-            share = finish(topo, h, more, pool, p_in[world, slot], con, mul, world, slot, out)
-        share_of_warp(share, slot, more.warp, world, rows)
+            share = add_terms(topo, h, more, pool, p_in[world, slot], con, mul, world, slot, out)
+        store_warp_sum(share, slot, more.warp, world, rows)
 
     @wp.kernel(module=matrix_module)
     def matrix_product(
@@ -342,8 +349,8 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         h = lane_sum(h, lanes)
         share = f64(0.0)
         if lane == 0 and slot < out.shape[1]:
-            share = finish(topo, h, more, pool, p_in[world, slot], con, mul, world, slot, out)
-        share_of_warp(share, index, more.warp, world, rows)
+            share = add_terms(topo, h, more, pool, p_in[world, slot], con, mul, world, slot, out)
+        store_warp_sum(share, index, more.warp, world, rows)
 
     @wp.kernel(module=module)
     def gather_blocks(

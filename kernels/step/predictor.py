@@ -10,16 +10,16 @@ import types as _types
 import warp as wp
 
 from ..common.types import precision
-from ..solvers.control import control_struct
-from .control import step_struct
+from ..solvers.newton_control import control_struct
+from .step_control import step_struct
 
 __all__ = ["PREDICTOR_ROWS", "predictor_kernels", "predictor_struct"]
 
 PREDICTOR_ROWS = 4
-"""Rows of `compare` that are summed per world."""
-BETTER = 0.05
+"""Rows of `order_errors` that are summed per world."""
+ORDER_MARGIN = 0.05
 """Squared error ratio to the lower order below which a higher order is chosen."""
-ROUNDINGS = 1.0e3
+PREDICTOR_ROUNDINGS = 1.0e3
 """Errors below this many roundings of the velocity are negligible."""
 
 
@@ -44,10 +44,10 @@ def predictor_kernels(dtype: str, accelerated: bool, module: wp.Module) -> _type
     T, vec3 = p.T, p.vec3
     f64 = wp.float64
     Predictor, Step, Newton = predictor_struct(), step_struct(), control_struct()
-    NOISE = (ROUNDINGS * {"float64": 2.0**-53, "float32": 2.0**-24}[dtype]) ** 2
+    NOISE = (PREDICTOR_ROUNDINGS * {"float64": 2.0**-53, "float32": 2.0**-24}[dtype]) ** 2
 
     @wp.func
-    def continued(order: int, v: vec3, before: vec3, first: vec3) -> vec3:
+    def extrapolated(order: int, v: vec3, before: vec3, first: vec3) -> vec3:
         """Extrapolation of order 1 or 2 from the velocities of the last three steps, m/s."""
         if order == 2:
             return T(3.0) * (v - before) + first
@@ -82,7 +82,7 @@ def predictor_kernels(dtype: str, accelerated: bool, module: wp.Module) -> _type
         order = predictor.order[world]
         if step.running[world] == 0 or order == 0:
             return
-        new = continued(order, v_n[world, slot], before[world, slot], first[world, slot])
+        new = extrapolated(order, v_n[world, slot], before[world, slot], first[world, slot])
         f = free[slot]
         old = v[world, slot]
         for k in range(3):
@@ -91,7 +91,7 @@ def predictor_kernels(dtype: str, accelerated: bool, module: wp.Module) -> _type
         v[world, slot] = old
 
     @wp.kernel(module=module)
-    def compare(
+    def order_errors(
         predictor: Predictor,
         step: Step,
         free: wp.array(dtype=vec3),
@@ -118,15 +118,15 @@ def predictor_kernels(dtype: str, accelerated: bool, module: wp.Module) -> _type
             fall = (T(step.h[world]) * is_position[slot]) * vec3(step.gravity[world])
         e = w - a - fall
         if step.a1[world] > f64(0.0):  # a multistep scheme already extrapolates linearly
-            e = w - continued(1, a, before[world, slot], first[world, slot])
+            e = w - extrapolated(1, a, before[world, slot], first[world, slot])
         rows[0, world, slot] = f64(wp.dot(D, wp.cw_mul(e, e)))
         for order in range(1, 3):
-            e = w - continued(order, a, before[world, slot], first[world, slot])
+            e = w - extrapolated(order, a, before[world, slot], first[world, slot])
             rows[order, world, slot] = f64(wp.dot(D, wp.cw_mul(e, e)))
         rows[3, world, slot] = f64(wp.dot(D, wp.cw_mul(w, w)))
 
     @wp.kernel(module=module)
-    def shift(
+    def shift_history(
         step: Step,
         own: int,
         v_n: wp.array2d(dtype=vec3),
@@ -141,23 +141,29 @@ def predictor_kernels(dtype: str, accelerated: bool, module: wp.Module) -> _type
                 before[world, slot] = v_n[world, slot]
 
     @wp.kernel(module=module)
-    def learn(predictor: Predictor, step: Step):
+    def choose_order(predictor: Predictor, step: Step):
         """Order of the next step: the smallest error, with a margin for higher orders."""
         world = wp.tid()
         if step.accepted[world] == 0:
             return
         count = predictor.count[world]
         best = int(0)  # noqa: RUF046 - a variable of the loop
-        least = f64(BETTER) * predictor.sums[0, world]
+        least = f64(ORDER_MARGIN) * predictor.sums[0, world]
         if predictor.sums[0, world] <= f64(NOISE) * predictor.sums[3, world]:
             least = f64(0.0)  # extrapolated round-off would grow from step to step
         for order in range(1, 3):
             if order <= count and predictor.sums[order, world] < least:
                 best = order
-                least = f64(BETTER) * predictor.sums[order, world]
+                least = f64(ORDER_MARGIN) * predictor.sums[order, world]
         predictor.kept[world, 0] = f64(best)
         predictor.kept[world, 1] = f64(wp.min(count + 1, 2))
         predictor.kept[world, 2] = step.h[world]
         predictor.kept[world, 3] = step.time[world]
 
-    return _types.SimpleNamespace(begin=begin, extrapolate=extrapolate, compare=compare, shift=shift, learn=learn)
+    return _types.SimpleNamespace(
+        begin=begin,
+        extrapolate=extrapolate,
+        order_errors=order_errors,
+        shift_history=shift_history,
+        choose_order=choose_order,
+    )

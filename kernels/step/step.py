@@ -13,18 +13,18 @@ import warp as wp
 
 from ..common.traits import NO_TERMS, Traits
 from ..common.types import kernel_module, precision
-from ..solvers.control import FAIL_ENERGY, FAIL_FLOOR, FAIL_INVERTED, FAIL_WORK, control_struct
+from ..solvers.newton_control import FAIL_ENERGY, FAIL_FLOOR, FAIL_INVERTED, FAIL_WORK, control_struct
 from ..solvers.pcg import pcg_struct
-from .control import STATUS, step_span, step_struct
-from .ledger import ledger_kernels
+from .energy_ledger import ledger_kernels
+from .step_control import STATUS, step_span, step_struct
 
 __all__ = ["step_kernels"]
 
-FULL = 1e-9
+FULL_LOAD_TOLERANCE = 1e-9
 """Tolerance of the load factor at full load."""
-LARGEST_GROWTH = {"float64": 1e9, "float32": 1e4}
+MAX_STEP_GROWTH = {"float64": 1e9, "float32": 1e4}
 """Largest step ratio for which a multistep scheme uses the previous step: beyond, its differences are round-off."""
-STRETCH = 4.0
+MAX_EXTRAPOLATED_GROWTH = 4.0
 """Largest step ratio for the extrapolation of accelerations: after many halvings they belong to a short event."""
 
 
@@ -47,11 +47,11 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
     end_of, slack_of, span_of = limits.end, limits.slack, limits.span
     Newton = control_struct()
     PCG = pcg_struct()
-    nonpotential, gated = traits.nonpotential, traits.gated
-    variant = traits.suffix("nonpotential", "gated")
+    nonpotential, has_constraints = traits.nonpotential, traits.has_constraints
+    variant = traits.suffix("nonpotential", "has_constraints")
     coefficients, static, multistep = scheme.coefficients, scheme.static, scheme.multistep
     takes_velocity, accelerated, midpoint = scheme.takes_velocity, scheme.accelerated, scheme.midpoint
-    GROWTH = LARGEST_GROWTH[dtype]
+    GROWTH = MAX_STEP_GROWTH[dtype]
     module = kernel_module(f"step_{dtype}_{scheme.variant}{variant}")
 
     @wp.kernel(module=module)
@@ -72,7 +72,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         newton.rough[world] = 0
         newton.step_floor[world] = f64(0.0)
         newton.potential_start[world] = newton.potential[world]
-        if wp.static(gated):
+        if wp.static(has_constraints):
             newton.outer[world] = 0
         pcg.total[world] = 0
         step.halvings[world] = 0
@@ -98,8 +98,8 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         newton.active[world] = step.running[world]
         newton.searching[world] = 0
         newton.floor[world] = f64(0.0)
-        newton.suspect[world] = 0
-        newton.turned[world] = 0
+        newton.inversion_suspected[world] = 0
+        newton.inverted[world] = 0
         if step.running[world] == 0:
             return  # `refused` stays set in a world that failed earlier in this step
         step.refused[world] = 0
@@ -119,7 +119,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
             if known and h <= f64(GROWTH) * step.previous_h[world]:
                 previous = step.previous_h[world]
         if wp.static(accelerated):
-            previous = wp.max(step.previous_h[world], h / f64(STRETCH))
+            previous = wp.max(step.previous_h[world], h / f64(MAX_EXTRAPOLATED_GROWTH))
             step.h_before[world] = previous
         c = coefficients(h, previous, step.parameter)
         step.a0[world] = c.a0
@@ -132,7 +132,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
             step.dq_dv[world] = f64(1.0)
             step.ramp[world] = step.new_time[world]
             short = f64(1.0) - step.new_time[world]
-            step.mass_factor[world] = wp.where(short > f64(FULL), step.stabilise * short, f64(0.0))
+            step.mass_factor[world] = wp.where(short > f64(FULL_LOAD_TOLERANCE), step.stabilise * short, f64(0.0))
         else:
             step.dq_dv[world] = c.dq_dv
             step.mass_factor[world] = c.mass_factor
@@ -212,7 +212,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
     ):
         """Alternative first iterate on the free components: 0: v~ + (dq/dv) g, 1: v_n, 2: the one with q = q_n."""
         world, slot = wp.tid()
-        if newton.choose[world] == 0:
+        if newton.choose_initial[world] == 0:
             return
         dq = T(step.dq_dv[world])
         new = v_n[world, slot]
@@ -238,7 +238,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         world = wp.tid()
         if step.running[world] == 0:
             return
-        if newton.turned[world] != 0 and newton.failed[world] == 0:
+        if newton.inverted[world] != 0 and newton.failed[world] == 0:
             newton.failed[world] = FAIL_INVERTED
         if newton.failed[world] == 0:
             step.accepted[world] = 1
@@ -269,7 +269,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         why = newton.failed[world]
         # a shorter step has no better round-off, and changes the motion
         hopeless = why == FAIL_WORK or why == FAIL_FLOOR
-        if step.most_newton > 0 and newton.total_iterations[world] >= step.most_newton:
+        if step.newton_budget > 0 and newton.total_iterations[world] >= step.newton_budget:
             hopeless = True
         if hopeless or level > step.max_halvings:
             step.status[world] = wp.static(STATUS["failed"])
@@ -290,7 +290,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
             newton.potential[world] = newton.potential_start[world]
 
     @wp.kernel(module=module)
-    def commit(
+    def accept_state(
         step: Step,
         newton: Newton,
         u: wp.array2d(dtype=vec3),
@@ -333,7 +333,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         report[world, 0] = f64(step.status[world])
         report[world, 1] = f64(newton.total_iterations[world])
         report[world, 2] = f64(pcg.total[world])
-        report[world, 3] = newton.relative[world]
+        report[world, 3] = newton.relative_residual[world]
         report[world, 4] = f64(step.halvings[world])
         report[world, 5] = step.total_J[world]
         report[world, 6] = step.time[world]
@@ -347,7 +347,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         report[world, 14] = f64(0.0)
         if step.watched != 0:
             report[world, 14] = step.growth[world, 0]
-        if wp.static(gated):
+        if wp.static(has_constraints):
             largest = f64(0.0)
             for c in range(newton.components):
                 largest = wp.max(largest, newton.violation[world, c])
@@ -384,7 +384,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         candidate=candidate,
         end_attempt=end_attempt,
         failed_now=failed_now,
-        commit=commit,
+        accept_state=accept_state,
         **vars(ledger_kernels(dtype, multistep or midpoint or accelerated, nonpotential, module)),
         write_report=write_report,
         probe_values=probe_values,

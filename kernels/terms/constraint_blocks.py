@@ -5,10 +5,10 @@ import types as _types
 
 import warp as wp
 
-from ..common.entries import add_block_function
+from ..common.block_entries import add_block_function
 from ..common.structs import pattern_struct, topology_struct
-from ..common.types import SMALL, kernel_module, precision
-from .constraints import DISTANCE, TURN, constraint_struct, multiplier_struct
+from ..common.types import SHORT_UNROLL, kernel_module, precision
+from .constraints import ANGLE, DISTANCE, constraint_struct, multiplier_struct
 
 __all__ = ["constraint_block_kernels", "coupling_struct"]
 
@@ -36,7 +36,7 @@ def constraint_block_kernels(dtype: str) -> _types.SimpleNamespace:
     Topology, Pattern, Couplings = topology_struct(dtype), pattern_struct(), coupling_struct()
     Constraints, Multipliers = constraint_struct(), multiplier_struct()
     add_block = add_block_function(dtype)
-    module = kernel_module(f"couplings_{dtype}", max_unroll=SMALL)
+    module = kernel_module(f"couplings_{dtype}", max_unroll=SHORT_UNROLL)
 
     @wp.kernel(module=module)
     def add_penalties(
@@ -72,7 +72,7 @@ def constraint_block_kernels(dtype: str) -> _types.SimpleNamespace:
             size = wp.abs(mul.value[world, row] / scale + f)
             if a == 0 and b == 0:
                 return (scale / size) * (one - wp.outer(n, n))
-        elif kind == TURN:
+        elif kind == ANGLE:
             if a + b == 1:
                 return -scale * wp.sin(f) * one
             if a + b == 3:
@@ -88,12 +88,12 @@ def constraint_block_kernels(dtype: str) -> _types.SimpleNamespace:
         pairs: Couplings,
         con: Constraints,
         mul: Multipliers,
-        share: f64,
+        midpoint_factor: f64,
         dq_dv: wp.array(dtype=f64),
         active: wp.array(dtype=wp.int32),
         value: wp.array2d(dtype=mat33),
     ):
-        """value += (dq/dv) (J^T rho J + share sum lambda d2c/dq2), `share` as gradients move with u."""
+        """value += (dq/dv) (J^T rho J + share sum lambda d2c/dq2), `midpoint_factor` as gradients move with u."""
         world, item = wp.tid()
         if active[world] == 0:
             return
@@ -102,9 +102,11 @@ def constraint_block_kernels(dtype: str) -> _types.SimpleNamespace:
             a = pairs.term_a[k]
             b = pairs.term_b[k]
             row = a / 3
-            tight = mul.stiffness[world, row] * wp.outer(mul.gradient[world, a], mul.gradient[world, b])
-            bend = share * mul.trial[world, row] * curvature(con, mul, world, row, a - 3 * row, b - 3 * row)
-            A += pairs.weight[k] * (tight + bend)
+            penalty_part = mul.stiffness[world, row] * wp.outer(mul.gradient[world, a], mul.gradient[world, b])
+            curvature_part = (
+                midpoint_factor * mul.trial[world, row] * curvature(con, mul, world, row, a - 3 * row, b - 3 * row)
+            )
+            A += pairs.weight[k] * (penalty_part + curvature_part)
         add_block(topo, pattern.upper[pairs.entry[item]], mat33(dq_dv[world] * A), world, value)
 
     return _types.SimpleNamespace(module=module, add_penalties=add_penalties, add_tangent=add_tangent)

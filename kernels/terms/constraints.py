@@ -19,10 +19,10 @@ import warp as wp
 from ..common.types import kernel_module, precision
 
 __all__ = [
+    "ANGLE",
     "DISTANCE",
     "DOT",
     "JOINT_COLUMNS",
-    "TURN",
     "constraint_functions",
     "constraint_kernels",
     "constraint_struct",
@@ -32,10 +32,10 @@ __all__ = [
 
 DOT = 0
 DISTANCE = 1
-TURN = 2
+ANGLE = 2
 JOINT_COLUMNS = 7
 """Columns per joint in the report of a step: force and moment on the child, N and N m, and violation, m."""
-MOST_TURN = 1.0
+MAX_ROTATION = 1.0
 """Largest change of a driven angle in a substep, rad: a larger one may crush a body instead of turning it."""
 
 
@@ -86,15 +86,15 @@ def multiplier_struct():
     class Multipliers:
         value: wp.array2d(dtype=wp.float64)  # c, m
         target: wp.array2d(dtype=wp.float64)  # f
-        last: wp.array2d(dtype=wp.float64)  # f of the last accepted step
+        last_target: wp.array2d(dtype=wp.float64)  # f of the last accepted step
         gradient: wp.array2d(dtype=wp.vec3d)  # [world, term] dc / d vector, where forces are evaluated
-        ahead: wp.array2d(dtype=wp.vec3d)  # dc / d vector at the end of the step, the derivative of c
+        end_gradient: wp.array2d(dtype=wp.vec3d)  # dc / d vector at the end of the step, the derivative of c
         scale: wp.array2d(dtype=wp.float64)  # of the row, negative beyond a right angle of a turn
         force: wp.array2d(dtype=wp.float64)  # lambda, N
         change: wp.array2d(dtype=wp.float64)  # of lambda with a full Newton step
         trial: wp.array2d(dtype=wp.float64)  # lambda at the trial of the line search
-        merit: wp.array2d(dtype=wp.float64)  # lambda + rho c with lambda frozen in the line search
-        excess: wp.array2d(dtype=wp.float64)  # rho c
+        frozen_force: wp.array2d(dtype=wp.float64)  # lambda + rho c with lambda frozen in the line search
+        penalty_force: wp.array2d(dtype=wp.float64)  # rho c
         stiffness: wp.array2d(dtype=wp.float64)  # rho, N/m
         product: wp.array2d(dtype=wp.vec3d)  # [world, term] contributions to H p
         rows: wp.array3d(dtype=wp.float64)  # [TERM_ROWS, world, row]
@@ -105,7 +105,7 @@ def multiplier_struct():
         restricted: wp.array2d(dtype=wp.float64)  # J D^-1 r
         swept: wp.array2d(dtype=wp.float64)
         solved: wp.array2d(dtype=wp.float64)  # inverse matrix times J D^-1 r
-        classical: wp.int32  # 1: multipliers change in the outer loop only
+        outer_updates: wp.int32  # 1: multipliers change in the outer loop only
         kappa: wp.float64
 
     return Multipliers
@@ -152,7 +152,7 @@ def constraint_functions(dtype: str) -> _types.SimpleNamespace:
         """(J x) of a row."""
         s = wp.dot(slope[world, 3 * row], combine(con, 3 * row, x, world))
         s += wp.dot(slope[world, 3 * row + 1], combine(con, 3 * row + 1, x, world))
-        if con.kind[row] == TURN:
+        if con.kind[row] == ANGLE:
             s += wp.dot(slope[world, 3 * row + 2], combine(con, 3 * row + 2, x, world))
         return s
 
@@ -179,14 +179,14 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
         """dc/da, dc/db, dc/da2 as rows, linear in the vectors; of a distance a must be a unit vector."""
         if kind == DISTANCE:
             return wp.matrix_from_rows(scale * a, vec3d(), vec3d())
-        if kind == TURN:
+        if kind == ANGLE:
             s = scale * wp.sin(f)
             c = scale * wp.cos(f)
             return wp.matrix_from_rows(-s * b, c * a2 - s * a, c * b)
         return wp.matrix_from_rows(scale * b, scale * a, vec3d())
 
     @wp.func
-    def put(into: wp.array2d(dtype=vec3d), world: int, row: int, G: wp.mat33d):
+    def store_gradients(into: wp.array2d(dtype=vec3d), world: int, row: int, G: wp.mat33d):
         """Store the output of `gradients`."""
         for side in range(3):
             into[world, 3 * row + side] = G[side]
@@ -231,7 +231,7 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
             # |a| - f without cancellation when f is the reference length
             c = scale * (con.constant[row] - f * f + f64(2.0) * wp.dot(A, da) + wp.dot(da, da)) / (size + f)
             slope = a / size
-        elif kind == TURN:
+        elif kind == ANGLE:
             a2 = con.reference[3 * row + 2] + combine(con, 3 * row + 2, u, world)
             along = wp.sin(f) * a2 + wp.cos(f) * a
             c = scale * wp.dot(wp.cos(f) * a2 - wp.sin(f) * a, b)
@@ -239,40 +239,40 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
                 # beyond a right angle: the sine also vanishes at a half turn, which is no solution
                 c = wp.sign(c) * f64(2.0) * scale - c
                 scale = -scale
-            if wp.abs(f - mul.last[world, row]) > f64(MOST_TURN):
+            if wp.abs(f - mul.last_target[world, row]) > f64(MAX_ROTATION):
                 c = f64(2.0) * con.scale[row]  # ambiguous number of turns: the step must be halved
         else:
             c = scale * (con.constant[row] - f + wp.dot(A, db) + wp.dot(da, B) + wp.dot(da, db))
         turn = f
         if wp.static(midpoint):
-            put(mul.ahead, world, row, gradients(kind, scale, f, slope, b, a2))
+            store_gradients(mul.end_gradient, world, row, gradients(kind, scale, f, slope, b, a2))
             middle = A + combine(con, 3 * row, u_stage, world)
             slope = middle
             if kind == DISTANCE:
                 slope = middle * (f64(2.0) / (wp.length(a) + wp.length(f64(2.0) * middle - a)))
             b = B + combine(con, 3 * row + 1, u_stage, world)
-            if kind == TURN:
+            if kind == ANGLE:
                 a2 = con.reference[3 * row + 2] + combine(con, 3 * row + 2, u_stage, world)
-                if wp.isfinite(mul.last[world, row]):
-                    turn = f64(0.5) * (mul.last[world, row] + f)
-        put(mul.gradient, world, row, gradients(kind, scale, turn, slope, b, a2))
+                if wp.isfinite(mul.last_target[world, row]):
+                    turn = f64(0.5) * (mul.last_target[world, row] + f)
+        store_gradients(mul.gradient, world, row, gradients(kind, scale, turn, slope, b, a2))
         rho = mul.stiffness[world, row]
-        held = mul.force[world, row]
-        new = held
+        frozen = mul.force[world, row]
+        new = frozen
         mul.value[world, row] = c
         mul.scale[world, row] = scale
         mul.target[world, row] = f
-        mul.merit[world, row] = held + rho * c
-        mul.trial[world, row] = held + rho * c
-        mul.excess[world, row] = f64(0.0)
-        if mul.classical == 0:
-            new = held + alpha[world] * mul.change[world, row]
+        mul.frozen_force[world, row] = frozen + rho * c
+        mul.trial[world, row] = frozen + rho * c
+        mul.penalty_force[world, row] = f64(0.0)
+        if mul.outer_updates == 0:
+            new = frozen + alpha[world] * mul.change[world, row]
             mul.trial[world, row] = new
-            mul.excess[world, row] = rho * c
-        squeeze = f64(0.5) * rho * c * c
-        mul.rows[0, world, row] = held * c + squeeze
-        mul.rows[1, world, row] = new * c + squeeze
-        mul.rows[2, world, row] = wp.max(wp.abs(held * c), wp.abs(new * c)) + squeeze
+            mul.penalty_force[world, row] = rho * c
+        penalty_energy = f64(0.5) * rho * c * c
+        mul.rows[0, world, row] = frozen * c + penalty_energy
+        mul.rows[1, world, row] = new * c + penalty_energy
+        mul.rows[2, world, row] = wp.max(wp.abs(frozen * c), wp.abs(new * c)) + penalty_energy
         wp.atomic_max(mul.violation, world, con.component[row], wp.abs(c))
 
     @wp.kernel(module=module)
@@ -291,27 +291,27 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
         a = combine(con, 3 * row, p_in, world)
         b = combine(con, 3 * row + 1, p_in, world)
         a2 = vec3d()
-        if kind == TURN:
+        if kind == ANGLE:
             a2 = combine(con, 3 * row + 2, p_in, world)
         Ga = mul.gradient[world, 3 * row]
         Gb = mul.gradient[world, 3 * row + 1]
         Gc = mul.gradient[world, 3 * row + 2]
-        change = wp.dot(mul.ahead[world, 3 * row], a) + wp.dot(mul.ahead[world, 3 * row + 1], b)
-        change += wp.dot(mul.ahead[world, 3 * row + 2], a2)
+        change = wp.dot(mul.end_gradient[world, 3 * row], a) + wp.dot(mul.end_gradient[world, 3 * row + 1], b)
+        change += wp.dot(mul.end_gradient[world, 3 * row + 2], a2)
         f = mul.target[world, row]
         scale = mul.scale[world, row]
         if kind == DISTANCE:
             n = Ga / scale
             size = wp.abs(mul.value[world, row] / scale + f)
             a = (a - wp.dot(n, a) * n) / size
-        bend = gradients(kind, scale, f, a, b, a2)
-        tight = dq_dv[world] * mul.stiffness[world, row] * change
+        curvature_part = gradients(kind, scale, f, a, b, a2)
+        penalty_part = dq_dv[world] * mul.stiffness[world, row] * change
         force = dq_dv[world] * mul.trial[world, row]
         if wp.static(midpoint):  # the gradients move by half of the end's change
             force = f64(0.5) * force
-        mul.product[world, 3 * row] = tight * Ga + force * bend[0]
-        mul.product[world, 3 * row + 1] = tight * Gb + force * bend[1]
-        mul.product[world, 3 * row + 2] = tight * Gc + force * bend[2]
+        mul.product[world, 3 * row] = penalty_part * Ga + force * curvature_part[0]
+        mul.product[world, 3 * row + 1] = penalty_part * Gb + force * curvature_part[1]
+        mul.product[world, 3 * row + 2] = penalty_part * Gc + force * curvature_part[2]
 
     @wp.kernel(module=module)
     def load_multipliers(
@@ -324,7 +324,7 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
         world, row = wp.tid()
         if active[world] == 0:
             return
-        mul.last[world, row] = travel[world, row]
+        mul.last_target[world, row] = travel[world, row]
         mul.force[world, row] = state[world, row]
         mul.trial[world, row] = state[world, row]
         mul.change[world, row] = f64(0.0)
@@ -345,11 +345,11 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
             return
         mul.change[world, row] = f64(0.0)
         if quiet[world, con.component[row]] == 0:
-            after = mul.value[world, row] + dq_dv[world] * directional(con, mul.ahead, direction, world, row)
+            after = mul.value[world, row] + dq_dv[world] * directional(con, mul.end_gradient, direction, world, row)
             mul.change[world, row] = mul.stiffness[world, row] * after
 
     @wp.kernel(module=module)
-    def adopt(flags: wp.array(dtype=wp.int32), mul: Multipliers):
+    def accept_trial(flags: wp.array(dtype=wp.int32), mul: Multipliers):
         """Make the trial's multipliers those of the iterate and clear their change: the iterate may be evaluated
         again."""
         world, row = wp.tid()
@@ -358,7 +358,7 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
             mul.change[world, row] = f64(0.0)
 
     @wp.kernel(module=module)
-    def commit_multipliers(
+    def store_multipliers(
         accepted: wp.array(dtype=wp.int32), mul: Multipliers, state: wp.array2d(dtype=f64),
         travel: wp.array2d(dtype=f64),
     ):  # fmt: skip
@@ -443,8 +443,8 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
         product_terms=product_terms,
         load_multipliers=load_multipliers,
         predict_change=predict_change,
-        adopt=adopt,
-        commit_multipliers=commit_multipliers,
+        accept_trial=accept_trial,
+        store_multipliers=store_multipliers,
         work_terms=work_terms,
         joint_report=joint_report,
     )

@@ -10,22 +10,22 @@ import types as _types
 import warp as wp
 
 from ..common.lanes import lane_functions
-from ..common.types import SMALL, kernel_module, precision
+from ..common.types import SHORT_UNROLL, kernel_module, precision
 from .contact_colliders import MESHES, collider_functions
-from .contact_data import attempt_struct, clock_struct, contact_struct, facet_struct, history_struct
 from .contact_laws import SMOOTH
-from .contact_touch import touch_functions
+from .contact_point import contact_point_functions
+from .contact_structs import clock_struct, contact_scratch_struct, contact_struct, facet_struct, history_struct
 
-__all__ = ["MOST_TURN", "RELAX_LANES", "SPEED_FLOOR", "contact_kernels"]
+__all__ = ["MAX_ROTATION", "MIN_APPROACH_SPEED", "RELAX_LANES", "contact_kernels"]
 
-SPEED_FLOOR = 1e-3
+MIN_APPROACH_SPEED = 1e-3
 """Lower bound of the approach speed in the damping of the default law, m/s."""
-IDLE, LOADED, STIFF = 0, 1, 2
+INACTIVE, FORCE_ONLY, WITH_STIFFNESS = 0, 1, 2
 """States of a point: no force; a force without tangent; a force with tangent."""
-MOST_TURN = 1.0
+MAX_ROTATION = 1.0
 """Largest rotation of a touched collider in a step, rad; larger rotations are rejected."""
 RELAX_LANES = 128
-SHRINKS = 0.35
+SLOW_REDUCTION = 0.35
 """Ratio of successive changes of the friction limits above which they are relaxed."""
 
 
@@ -37,147 +37,168 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
     f64, vec3d = wp.float64, wp.vec3d
     Contacts, Facets = contact_struct(meshes), facet_struct(dtype)
     lane_sum = lane_functions(dtype).lane_sum
-    History, Attempt, Clock = history_struct(), attempt_struct(dtype), clock_struct()
-    f = touch_functions(dtype, meshes)
-    along, record_of, reach, acts, shape_of = f.along, f.record_of, f.reach, f.acts, f.shape_of
-    put_explicit, touch, in_plane, hold = f.put_explicit, f.touch, f.in_plane, f.hold
+    History, ContactScratch, Clock = history_struct(), contact_scratch_struct(dtype), clock_struct()
+    f = contact_point_functions(dtype, meshes)
+    interpolate, history_row, contact_distance, is_acting, acting_shape = (
+        f.interpolate,
+        f.history_row,
+        f.contact_distance,
+        f.is_acting,
+        f.acting_shape,
+    )
+    set_explicit_force, evaluate_point, with_friction_normal, frozen_values = (
+        f.set_explicit_force,
+        f.evaluate_point,
+        f.with_friction_normal,
+        f.frozen_values,
+    )
     friction_potential, friction_force = f.friction_potential, f.friction_force
     point_stiffness = f.point_stiffness
     g = collider_functions(meshes)
-    distance, known_side, beside = g.distance, g.known_side, g.beside
-    module = kernel_module(f"contact_{dtype}{MESHES * meshes}", max_unroll=SMALL)
+    distance, stored_side, sheet_side = g.distance, g.stored_side, g.sheet_side
+    module = kernel_module(f"contact_{dtype}{MESHES * meshes}", max_unroll=SHORT_UNROLL)
 
     @wp.kernel(module=module)
     def poses(
-        con: Contacts, his: History, value: wp.array2d(dtype=vec3d), active: wp.array(dtype=wp.int32), at: Attempt
+        con: Contacts, his: History, value: wp.array2d(dtype=vec3d), active: wp.array(dtype=wp.int32),
+        scr: ContactScratch
     ):  # fmt: skip
         """Poses of the colliders at the end of the attempt, and their motion in it."""
         world, k = wp.tid()
         if active[world] == 0:
             return
-        place = con.center[k]
-        turn = con.axes[k]
+        position = con.center[k]
+        rotation = con.axes[k]
         if con.spin[k] >= 0:
             angle = value[world, con.spin[k]][0]
             n = con.axis[k]
             N = wp.skew(n)
             half = wp.sin(f64(0.5) * angle)
             R = wp.identity(n=3, dtype=f64) + wp.sin(angle) * N + (f64(2.0) * half * half) * (N * N)
-            place = con.anchor[k] + R * (place - con.anchor[k])
-            turn = R * turn
+            position = con.anchor[k] + R * (position - con.anchor[k])
+            rotation = R * rotation
         if con.path[k] >= 0:
-            place += value[world, con.path[k]]
+            position += value[world, con.path[k]]
         if k == 0:
-            at.changes[world] = 0
-        at.place[world, k] = place
-        at.turn[world, k] = turn
-        at.shift[world, k] = place - his.place[world, k]
+            scr.limit_updates[world] = 0
+        scr.position[world, k] = position
+        scr.rotation[world, k] = rotation
+        scr.translation[world, k] = position - his.position[world, k]
         if con.spin[k] >= 0:
-            at.angle[world, k] = value[world, con.spin[k]][0]
-            at.spin[world, k] = turn * wp.transpose(his.turn[world, k]) - wp.identity(n=3, dtype=f64)
+            scr.angle[world, k] = value[world, con.spin[k]][0]
+            scr.rotation_change[world, k] = rotation * wp.transpose(his.rotation[world, k]) - wp.identity(
+                n=3, dtype=f64
+            )
 
     @wp.kernel(module=module)
     def begin_points(
         con: Contacts, facets: Facets, his: History, clock: Clock, u_n: wp.array2d(dtype=vec3),
-        v_n: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), at: Attempt,
+        v_n: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), scr: ContactScratch,
     ):  # fmt: skip
         """Positions of the points at the start of an attempt, and the approach speed of the damping."""
         world, item, q = wp.tid()
         if active[world] == 0:
             return
         if q == 0 and item == 0 and facets.row == 0:
-            at.through[world] = 0
+            scr.passed_through[world] = 0
             if clock.part[world] == 0:
-                at.elapsed[world] = f64(0.0)
-        if facets.share[q, item] == f64(0.0):
+                scr.elapsed[world] = f64(0.0)
+        if facets.area_fraction[q, item] == f64(0.0):
             return
         c = facets.contact[item]
         point = facets.point + item * facets.points + q
-        rec = record_of(con, c, point)
+        rec = history_row(con, c, point)
         k = con.collider[c]
-        x = facets.X[q, item] + along(facets, u_n, world, q, item)
-        turn = his.turn[world, k]
-        y = wp.transpose(turn) * (x - his.place[world, k])
-        live = his.speed[world, rec] > f64(0.0)
+        x = facets.X[q, item] + interpolate(facets, u_n, world, q, item)
+        rotation = his.rotation[world, k]
+        y = wp.transpose(rotation) * (x - his.position[world, k])
+        in_contact = his.speed[world, rec] > f64(0.0)
         if wp.static(meshes):
-            if not live:
-                his.mark[world, rec] = beside(con, k, y, his.mark[world, rec])
-        side = known_side(con, k, live, his.mark[world, rec])
+            if not in_contact:
+                his.contact_state[world, rec] = sheet_side(con, k, y, his.contact_state[world, rec])
+        side = stored_side(con, k, in_contact, his.contact_state[world, rec])
         d = distance(con, k, y, side)
-        at.start[world, point] = y
-        begins = reach(con, his, world, c, point, clock.time[world], his.grown[world, k])
-        at.origin[world, point] = along(facets, u_n, world, q, item)
-        at.reach[world, point] = begins
-        at.depth[world, point] = begins - d[3]
-        speed = wp.max(his.speed[world, rec], f64(SPEED_FLOOR))
+        scr.start[world, point] = y
+        contact_distance_now = contact_distance(
+            con, his, world, c, point, clock.time[world], his.previous_margin[world, k]
+        )
+        scr.origin[world, point] = interpolate(facets, u_n, world, q, item)
+        scr.contact_distance[world, point] = contact_distance_now
+        scr.depth[world, point] = contact_distance_now - d[3]
+        speed = wp.max(his.speed[world, rec], f64(MIN_APPROACH_SPEED))
         if clock.still == 0:
-            moved = (at.turn[world, k] * y + at.place[world, k] - x) / clock.h[world]
-            approach = wp.dot(turn * vec3d(d[0], d[1], d[2]), moved - along(facets, v_n, world, q, item))
+            moved = (scr.rotation[world, k] * y + scr.position[world, k] - x) / clock.h[world]
+            approach = wp.dot(rotation * vec3d(d[0], d[1], d[2]), moved - interpolate(facets, v_n, world, q, item))
             speed = wp.max(speed, approach)
-        at.speed[world, point] = speed
+        scr.speed[world, point] = speed
 
     @wp.kernel(module=module)
     def settle(
-        con: Contacts, facets: Facets, his: History, time: wp.array(dtype=f64), u: wp.array2d(dtype=vec3), at: Attempt
+        con: Contacts, facets: Facets, his: History, time: wp.array(dtype=f64), u: wp.array2d(dtype=vec3),
+        scr: ContactScratch
     ):  # fmt: skip
         """Point data at a state without motion, for evaluations outside of a step."""
         world, item, q = wp.tid()
         c = facets.contact[item]
         k = con.collider[c]
-        x = facets.X[q, item] + along(facets, u, world, q, item)
+        x = facets.X[q, item] + interpolate(facets, u, world, q, item)
         point = facets.point + item * facets.points + q
-        y = wp.transpose(at.turn[world, k]) * (x - at.place[world, k])
-        at.start[world, point] = y
-        at.origin[world, point] = along(facets, u, world, q, item)
+        y = wp.transpose(scr.rotation[world, k]) * (x - scr.position[world, k])
+        scr.start[world, point] = y
+        scr.origin[world, point] = interpolate(facets, u, world, q, item)
         d = distance(con, k, y, -1)
-        at.reach[world, point] = reach(con, his, world, c, point, time[world], con.grow[world, k])
-        at.depth[world, point] = at.reach[world, point] - d[3]
+        scr.contact_distance[world, point] = contact_distance(
+            con, his, world, c, point, time[world], con.margin[world, k]
+        )
+        scr.depth[world, point] = scr.contact_distance[world, point] - d[3]
 
     @wp.kernel(module=module)
     def explicit_forces(
         con: Contacts, facets: Facets, his: History, clock: Clock, v_n: wp.array2d(dtype=vec3),
-        active: wp.array(dtype=wp.int32), at: Attempt,
+        active: wp.array(dtype=wp.int32), scr: ContactScratch,
     ):  # fmt: skip
         """Forces of explicit contacts at the state that the attempt begins from."""
         world, item, q = wp.tid()
-        if active[world] == 0 or facets.share[q, item] == f64(0.0):
+        if active[world] == 0 or facets.area_fraction[q, item] == f64(0.0):
             return
         c = facets.contact[item]
-        if con.dead[c] == 0:
+        if con.is_explicit[c] == 0:
             return
         point = facets.point + item * facets.points + q
-        rec = record_of(con, c, point)
+        rec = history_row(con, c, point)
         k = con.collider[c]
-        at.dead[world, point] = vec3d()
-        at.dead_spring[world, point] = vec3d()
-        delta = at.depth[world, point]
+        scr.explicit_force[world, point] = vec3d()
+        scr.explicit_spring[world, point] = vec3d()
+        delta = scr.depth[world, point]
         if delta <= f64(0.0):
             return
-        turn = his.turn[world, k]
-        y = at.start[world, point]
-        side = known_side(con, k, True, his.mark[world, rec])
+        rotation = his.rotation[world, k]
+        y = scr.start[world, point]
+        side = stored_side(con, k, True, his.contact_state[world, rec])
         d = distance(con, k, y, side)
-        n = turn * vec3d(d[0], d[1], d[2])
-        x = turn * y + his.place[world, k]
+        n = rotation * vec3d(d[0], d[1], d[2])
+        x = rotation * y + his.position[world, k]
         h = clock.h[world]
-        moved = (at.turn[world, k] * y + at.place[world, k] - x) / h
-        put_explicit(con, his, at, world, c, point, delta, n, along(facets, v_n, world, q, item) - moved, h)
+        moved = (scr.rotation[world, k] * y + scr.position[world, k] - x) / h
+        set_explicit_force(
+            con, his, scr, world, c, point, delta, n, interpolate(facets, v_n, world, q, item) - moved, h
+        )
 
     @wp.func
-    def dead_work(
-        con: Contacts, facets: Facets, his: History, at: Attempt, world: int, c: int, q: int, item: int, point: int,
-        u: wp.array2d(dtype=vec3d),
+    def explicit_work(
+        con: Contacts, facets: Facets, his: History, scr: ContactScratch, world: int, c: int, q: int, item: int,
+        point: int, u: wp.array2d(dtype=vec3d),
     ) -> f64:  # fmt: skip
         """Potential of an explicit force: minus its work on the step so far, J."""
         k = con.collider[c]
-        x_n = his.turn[world, k] * at.start[world, point] + his.place[world, k]
-        x = facets.X[q, item] + along(facets, u, world, q, item)
-        return -wp.dot(at.dead[world, point], x - x_n)
+        x_n = his.rotation[world, k] * scr.start[world, point] + his.position[world, k]
+        x = facets.X[q, item] + interpolate(facets, u, world, q, item)
+        return -wp.dot(scr.explicit_force[world, point], x - x_n)
 
     @wp.kernel(module=module)
     def forces(
         con: Contacts, facets: Facets, his: History, clock: Clock, u: wp.array2d(dtype=vec3d),
-        active: wp.array(dtype=wp.int32), fresh: int, at: Attempt,
+        active: wp.array(dtype=wp.int32), fresh: int, scr: ContactScratch,
     ):  # fmt: skip
         """Forces of points, N, their stiffness and potential.
 
@@ -189,55 +210,58 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
             return
         c = facets.contact[item]
         point = facets.point + item * facets.points + q
-        share = facets.share[q, item] * acts(con, at, world, c, point)
-        at.state[world, point] = IDLE
-        if share == f64(0.0):
+        area_fraction = facets.area_fraction[q, item] * is_acting(con, scr, world, c, point)
+        scr.activity[world, point] = INACTIVE
+        if area_fraction == f64(0.0):
             return
         inv_h = f64(0.0)
         if clock.still == 0:
             inv_h = f64(1.0) / clock.h[world]
-        rec = record_of(con, c, point)
-        held = at.held[world, rec]
+        rec = history_row(con, c, point)
+        frozen = scr.frozen[world, rec]
         if fresh != 0:
-            held[2] = f64(1.0)
-        t = touch(con, facets, his, at, world, c, q, item, point, u, clock.new_time[world], inv_h, held[2])
-        if con.dead[c] == 0:
-            new = hold(con, his, at, world, c, point, t)
+            frozen[2] = f64(1.0)
+        t = evaluate_point(con, facets, his, scr, world, c, q, item, point, u, clock.new_time[world], inv_h, frozen[2])
+        if con.is_explicit[c] == 0:
+            new = frozen_values(con, his, scr, world, c, point, t)
             if fresh != 0:  # initial limits: those of the last step, zero for a new contact
-                at.plane[world, rec] = t.n
-                held = new
-                held[0] = wp.min(new[0], his.cap[world, rec])
-                at.held[world, rec] = held
-            at.next_plane[world, rec] = t.n
-            t = in_plane(t, at.plane[world, rec])
-            at.next[world, rec] = new
+                scr.frozen_normal[world, rec] = t.n
+                frozen = new
+                frozen[0] = wp.min(new[0], his.friction_limit[world, rec])
+                scr.frozen[world, rec] = frozen
+            scr.updated_normal[world, rec] = t.n
+            t = with_friction_normal(t, scr.frozen_normal[world, rec])
+            scr.updated[world, rec] = new
         turned = f64(0.0)
         if con.spin[con.collider[c]] >= 0:
-            turned = wp.abs(at.angle[world, con.collider[c]] - his.angle[world, con.collider[c]])
-        near = t.depth > f64(0.0) or at.depth[world, point] > f64(0.0)
-        if t.side == -2 or (near and turned > f64(MOST_TURN)):
-            at.through[world] = wp.where(t.side == -2, point + 1, -point - 1)
-            at.state[world, point] = LOADED
-            at.force[world, point] = vec3d()
-            at.energy[world, point] = wp.vec2d(f64(wp.inf), f64(0.0))
-        elif con.dead[c] != 0:
-            if wp.length_sq(at.dead[world, point]) > f64(0.0):
-                work = share * dead_work(con, facets, his, at, world, c, q, item, point, u)
-                at.state[world, point] = LOADED
-                at.force[world, point] = -share * at.dead[world, point]
-                at.energy[world, point] = wp.vec2d(work, wp.abs(work))
-        elif t.depth > f64(0.0) or held[0] > f64(0.0) or con.law[c] == SMOOTH:
-            rub = friction_potential(con, world, c, t, held, inv_h)
-            K = point_stiffness(con, world, c, t, held, inv_h)
-            at.state[world, point] = STIFF
-            at.force[world, point] = share * (friction_force(con, world, c, t, held, inv_h) - t.law[0] * t.n)
-            at.energy[world, point] = wp.vec2d(share * (t.law[2] + rub), share * (t.law[3] + wp.abs(rub)))
-            at.stiffness[world, point] = sym(T(share * K[0, 0]), T(share * K[1, 1]), T(share * K[2, 2]),
-                T(share * K[1, 2]), T(share * K[0, 2]), T(share * K[0, 1]))  # fmt: skip
+            turned = wp.abs(scr.angle[world, con.collider[c]] - his.angle[world, con.collider[c]])
+        near = t.depth > f64(0.0) or scr.depth[world, point] > f64(0.0)
+        if t.side == -2 or (near and turned > f64(MAX_ROTATION)):
+            scr.passed_through[world] = wp.where(t.side == -2, point + 1, -point - 1)
+            scr.activity[world, point] = FORCE_ONLY
+            scr.force[world, point] = vec3d()
+            scr.energy[world, point] = wp.vec2d(f64(wp.inf), f64(0.0))
+        elif con.is_explicit[c] != 0:
+            if wp.length_sq(scr.explicit_force[world, point]) > f64(0.0):
+                work = area_fraction * explicit_work(con, facets, his, scr, world, c, q, item, point, u)
+                scr.activity[world, point] = FORCE_ONLY
+                scr.force[world, point] = -area_fraction * scr.explicit_force[world, point]
+                scr.energy[world, point] = wp.vec2d(work, wp.abs(work))
+        elif t.depth > f64(0.0) or frozen[0] > f64(0.0) or con.law[c] == SMOOTH:
+            friction_energy = friction_potential(con, world, c, t, frozen, inv_h)
+            K = point_stiffness(con, world, c, t, frozen, inv_h)
+            scr.activity[world, point] = WITH_STIFFNESS
+            scr.force[world, point] = area_fraction * (friction_force(con, world, c, t, frozen, inv_h) - t.law[0] * t.n)
+            scr.energy[world, point] = wp.vec2d(
+                area_fraction * (t.law[2] + friction_energy), area_fraction * (t.law[3] + wp.abs(friction_energy))
+            )
+            scr.stiffness[world, point] = sym(T(area_fraction * K[0, 0]), T(area_fraction * K[1, 1]),
+                T(area_fraction * K[2, 2]), T(area_fraction * K[1, 2]), T(area_fraction * K[0, 2]),
+                T(area_fraction * K[0, 1]))  # fmt: skip
 
     @wp.kernel(module=module)
     def gather_points(
-        facets: Facets, active: wp.array(dtype=wp.int32), lanes: int, at: Attempt, pool: wp.array2d(dtype=vec3),
+        facets: Facets, active: wp.array(dtype=wp.int32), lanes: int, scr: ContactScratch, pool: wp.array2d(dtype=vec3),
         rows: wp.array3d(dtype=f64), touching: wp.array(dtype=wp.int32),
     ):  # fmt: skip
         """Forces of facets on their slots and, once per facet, rows of the potential."""
@@ -249,14 +273,14 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         i = entry / facets.count
         lane = index % lanes
         first = facets.point + item * facets.points
-        touched = wp.int32(IDLE)
+        touched = wp.int32(INACTIVE)
         for q in range(facets.points):
-            touched = wp.max(touched, at.state[world, first + q])
+            touched = wp.max(touched, scr.activity[world, first + q])
         f = vec3()
-        if touched != IDLE:
+        if touched != INACTIVE:
             for q in range(lane, facets.points, lanes):
-                if at.state[world, first + q] != IDLE:
-                    f += shape_of(facets, at, world, q, i, item) * vec3(at.force[world, first + q])
+                if scr.activity[world, first + q] != INACTIVE:
+                    f += acting_shape(facets, scr, world, q, i, item) * vec3(scr.force[world, first + q])
         f = lane_sum(f, lanes)
         if lane > 0:
             return
@@ -264,68 +288,68 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         if i > 0:
             return
         row = facets.row + item
-        before = at.touched[world, row]
-        at.touched[world, row] = touched
-        if wp.max(before, touched) == IDLE:
+        before = scr.facet_activity[world, row]
+        scr.facet_activity[world, row] = touched
+        if wp.max(before, touched) == INACTIVE:
             return  # the rows are already zero
         energy = wp.vec2d()
         for q in range(facets.points):
-            state = at.state[world, first + q]
-            if state != IDLE:
-                energy += at.energy[world, first + q]
-            if state != STIFF:
-                at.stiffness[world, first + q] = sym()
-        if touched != IDLE:
+            state = scr.activity[world, first + q]
+            if state != INACTIVE:
+                energy += scr.energy[world, first + q]
+            if state != WITH_STIFFNESS:
+                scr.stiffness[world, first + q] = sym()
+        if touched != INACTIVE:
             wp.atomic_max(touching, world, 1)
         rows[0, world, row] = energy[0]
         rows[1, world, row] = energy[0]
         rows[2, world, row] = energy[1]
 
     @wp.kernel(module=module)
-    def partial_asked(flags: wp.array(dtype=wp.int32), at: Attempt):
+    def aitken_partial_sums(flags: wp.array(dtype=wp.int32), scr: ContactScratch):
         """Partial sums, by lanes, of r = limit of the iterate - frozen limit, and of the change of r, for `relax`."""
         world, lane = wp.tid()
         if flags[world] == 0:
             return
         out = wp.vec4d()
-        for point in range(lane, at.asked.shape[1], RELAX_LANES):
-            if at.state[world, point] == STIFF:
-                r = at.next[world, point][0] - at.held[world, point][0]
-                old = at.asked[world, point]
-                new = at.next[world, point][0]
+        for point in range(lane, scr.aitken_residual.shape[1], RELAX_LANES):
+            if scr.activity[world, point] == WITH_STIFFNESS:
+                r = scr.updated[world, point][0] - scr.frozen[world, point][0]
+                old = scr.aitken_residual[world, point]
+                new = scr.updated[world, point][0]
                 out += wp.vec4d(old * (r - old), (r - old) * (r - old), r * r, new * new)
-        at.asked_sums[world, lane] = out
+        scr.aitken_sums[world, lane] = out
 
     @wp.kernel(module=module)
-    def relax(flags: wp.array(dtype=wp.int32), tol: f64, at: Attempt, unsettled: wp.array(dtype=wp.int32)):
+    def relax(flags: wp.array(dtype=wp.int32), tol: f64, scr: ContactScratch, unsettled: wp.array(dtype=wp.int32)):
         """Relaxation factor of the friction limits: 1 while r shrinks, else Aitken's (Irons and Tuck 1969)."""
         world = wp.tid()
         if flags[world] == 0:
             return
         total = wp.vec4d()
         for lane in range(RELAX_LANES):
-            total += at.asked_sums[world, lane]
+            total += scr.aitken_sums[world, lane]
         omega = f64(1.0)
-        slow = total[2] > f64(SHRINKS) * f64(SHRINKS) * at.asked_size[world] and total[1] > f64(0.0)
-        if at.changes[world] > 0 and slow and total[2] > tol * tol * total[3]:
-            omega = wp.clamp(-at.omega[world] * total[0] / total[1], f64(0.05), f64(2.0))
+        slow = total[2] > f64(SLOW_REDUCTION) * f64(SLOW_REDUCTION) * scr.aitken_norm2[world] and total[1] > f64(0.0)
+        if scr.limit_updates[world] > 0 and slow and total[2] > tol * tol * total[3]:
+            omega = wp.clamp(-scr.relaxation[world] * total[0] / total[1], f64(0.05), f64(2.0))
             unsettled[world] = 1
-        at.omega[world] = omega
-        at.asked_size[world] = total[2]
-        at.changes[world] = at.changes[world] + 1
+        scr.relaxation[world] = omega
+        scr.aitken_norm2[world] = total[2]
+        scr.limit_updates[world] = scr.limit_updates[world] + 1
 
     @wp.kernel(module=module)
-    def refresh(flags: wp.array(dtype=wp.int32), at: Attempt):
+    def update_frozen(flags: wp.array(dtype=wp.int32), scr: ContactScratch):
         """Update the frozen friction limits by the relaxed change, and the plane of friction."""
         world, point = wp.tid()
         if flags[world] != 0:
-            new = at.next[world, point]
-            r = new[0] - at.held[world, point][0]
-            if at.omega[world] != f64(1.0):
-                new[0] = wp.max(at.held[world, point][0] + at.omega[world] * r, f64(0.0))
-            at.asked[world, point] = r
-            at.held[world, point] = new
-            at.plane[world, point] = at.next_plane[world, point]
+            new = scr.updated[world, point]
+            r = new[0] - scr.frozen[world, point][0]
+            if scr.relaxation[world] != f64(1.0):
+                new[0] = wp.max(scr.frozen[world, point][0] + scr.relaxation[world] * r, f64(0.0))
+            scr.aitken_residual[world, point] = r
+            scr.frozen[world, point] = new
+            scr.frozen_normal[world, point] = scr.updated_normal[world, point]
 
     @wp.func
     def times(k: sym, p: vec3) -> vec3:
@@ -335,21 +359,21 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def product_points(
-        facets: Facets, active: wp.array(dtype=wp.int32), p: wp.array2d(dtype=vec3), at: Attempt
+        facets: Facets, active: wp.array(dtype=wp.int32), p: wp.array2d(dtype=vec3), scr: ContactScratch
     ):  # fmt: skip
         """K times the displacement of each point."""
         world, item, q = wp.tid()
-        if active[world] == 0 or at.touched[world, facets.row + item] != STIFF:
+        if active[world] == 0 or scr.facet_activity[world, facets.row + item] != WITH_STIFFNESS:
             return
         d = vec3()
         for i in range(facets.conn.shape[0]):
-            d += shape_of(facets, at, world, q, i, item) * p[world, facets.conn[i, item]]
+            d += acting_shape(facets, scr, world, q, i, item) * p[world, facets.conn[i, item]]
         point = facets.point + item * facets.points + q
-        at.flux[world, point] = times(at.stiffness[world, point], d)
+        scr.product[world, point] = times(scr.stiffness[world, point], d)
 
     @wp.kernel(module=module)
     def product_facets(
-        facets: Facets, active: wp.array(dtype=wp.int32), lanes: int, at: Attempt, pool: wp.array2d(dtype=vec3)
+        facets: Facets, active: wp.array(dtype=wp.int32), lanes: int, scr: ContactScratch, pool: wp.array2d(dtype=vec3)
     ):  # fmt: skip
         """Sums of the point products on the slots of the facets."""
         world, index = wp.tid()
@@ -358,30 +382,30 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         entry = wp.min(index / lanes, facets.count * facets.conn.shape[0] - 1)
         item = entry % facets.count
         out = vec3()
-        if at.touched[world, facets.row + item] == STIFF:
+        if scr.facet_activity[world, facets.row + item] == WITH_STIFFNESS:
             for q in range(index % lanes, facets.points, lanes):
-                flux = at.flux[world, facets.point + item * facets.points + q]
-                out += shape_of(facets, at, world, q, entry / facets.count, item) * flux
+                flux = scr.product[world, facets.point + item * facets.points + q]
+                out += acting_shape(facets, scr, world, q, entry / facets.count, item) * flux
         out = lane_sum(out, lanes)
         if index % lanes == 0:
             pool[world, facets.pool + entry] = out
 
     @wp.kernel(module=module)
-    def diagonal(facets: Facets, active: wp.array(dtype=wp.int32), at: Attempt, pool: wp.array2d(dtype=sym)):
+    def diagonal(facets: Facets, active: wp.array(dtype=wp.int32), scr: ContactScratch, pool: wp.array2d(dtype=sym)):
         """3x3 diagonal blocks of the facets."""
         world, item, i = wp.tid()
         if active[world] == 0:
             return
         out = sym()
-        if at.touched[world, facets.row + item] == STIFF:
+        if scr.facet_activity[world, facets.row + item] == WITH_STIFFNESS:
             for q in range(facets.points):
-                s = shape_of(facets, at, world, q, i, item)
-                out += s * s * at.stiffness[world, facets.point + item * facets.points + q]
+                s = acting_shape(facets, scr, world, q, i, item)
+                out += s * s * scr.stiffness[world, facets.point + item * facets.points + q]
         pool[world, facets.pool + i * facets.count + item] = out
 
     return _types.SimpleNamespace(
         module=module, poses=poses, begin_points=begin_points, settle=settle, explicit_forces=explicit_forces,
         forces=forces, gather_points=gather_points,
-        partial_asked=partial_asked, relax=relax, refresh=refresh,
+        aitken_partial_sums=aitken_partial_sums, relax=relax, update_frozen=update_frozen,
         product_points=product_points, product_facets=product_facets, diagonal=diagonal,
     )  # fmt: skip

@@ -8,39 +8,41 @@ import types as _types
 
 import warp as wp
 
-from .contact_data import contact_struct
 from .contact_mesh import MESH, mesh_functions
 from .contact_shapes import BOX, HALF_SPACE, SPHERE, shape_functions
+from .contact_structs import contact_struct
 
 __all__ = ["MESHES", "collider_functions"]
 
 MESHES = "_meshes"
 """Suffix of the names of modules compiled with the mesh code."""
 
-SLIPS = 16
+SLIP_FLAG = 16
 """Bit of a point's contact state: slipping; the bits below are the side."""
-NAMES = ("distance", "sweep", "side_after", "deepening", "beside")
-MESH_SLIPS = 1 << 30
+NAMES = ("distance", "sweep", "updated_side", "depth_change", "sheet_side")
+MESH_SLIP_FLAG = 1 << 30
 """Slipping bit where sides are triangles."""
 
 
 @functools.cache
 def collider_functions(meshes: bool) -> _types.SimpleNamespace:
     """Device functions, see `contact_shapes` and `contact_mesh`, and the constant SLIPS."""
-    slips = MESH_SLIPS if meshes else SLIPS
+    slips = MESH_SLIP_FLAG if meshes else SLIP_FLAG
     f64, vec3d = wp.float64, wp.vec3d
     Contacts = contact_struct(meshes)
     shapes = shape_functions()
     of_shape, sweep_shape = shapes.distance, shapes.sweep
     mesh = mesh_functions(Contacts) if meshes else _types.SimpleNamespace(**dict.fromkeys(NAMES))
-    of_mesh, sweep_mesh, side_on_mesh, along_mesh, beside_mesh = (getattr(mesh, name) for name in NAMES)
+    distance_on_mesh, sweep_mesh, side_on_mesh, depth_change_on_mesh, sheet_side_on_mesh = (
+        getattr(mesh, name) for name in NAMES
+    )
 
     @wp.func
     def distance(con: Contacts, k: int, y: vec3d, side: int) -> wp.vec4d:
         """Outward unit normal and signed distance at a position in the frame of collider k."""
         if wp.static(meshes):
             if con.kind[k] == MESH:
-                return of_mesh(con, k, y, side)
+                return distance_on_mesh(con, k, y, side)
         return of_shape(con.kind[k], con.size[k], y, side)
 
     @wp.func
@@ -52,36 +54,36 @@ def collider_functions(meshes: bool) -> _types.SimpleNamespace:
         return sweep_shape(con.kind[k], con.size[k], start, end, side)
 
     @wp.func
-    def known_side(con: Contacts, k: int, live: bool, mark: int) -> int:
+    def stored_side(con: Contacts, k: int, in_contact: bool, contact_state: int) -> int:
         """Side stored in a contact state, -1: none; of a point without contact to a sheet -3 in front of it, -4
         behind."""
-        if live:
-            return mark % slips - 1
+        if in_contact:
+            return contact_state % slips - 1
         if wp.static(meshes):
-            if mark % slips > 0:
-                return -2 - mark % slips
+            if contact_state % slips > 0:
+                return -2 - contact_state % slips
         return -1
 
     @wp.func
-    def beside(con: Contacts, k: int, y: vec3d, mark: int) -> int:
+    def sheet_side(con: Contacts, k: int, y: vec3d, contact_state: int) -> int:
         """Contact state of a free point: its side of a sheet, unchanged where round-off hides the side."""
         if wp.static(meshes):
             if con.kind[k] == MESH and con.size[k][2] == f64(0.0):
-                return beside_mesh(con, k, y, mark)
+                return sheet_side_on_mesh(con, k, y, contact_state)
         return 0
 
     @wp.func
-    def released(con: Contacts, k: int, live: bool, mark: int) -> int:
+    def released_state(con: Contacts, k: int, in_contact: bool, contact_state: int) -> int:
         """Contact state of a point that has left contact."""
         if wp.static(meshes):
             if con.kind[k] == MESH and con.size[k][2] == f64(0.0):
-                if live and mark % slips > 0:
-                    return 1 + (mark % slips - 1) % 2
-                return wp.where(live, 0, mark)
+                if in_contact and contact_state % slips > 0:
+                    return 1 + (contact_state % slips - 1) % 2
+                return wp.where(in_contact, 0, contact_state)
         return 0
 
     @wp.func
-    def side_after(con: Contacts, k: int, y: vec3d, side: int) -> int:
+    def updated_side(con: Contacts, k: int, y: vec3d, side: int) -> int:
         """Updated side of a point at y that was swept to a side: on a mesh it slides over triangles."""
         if wp.static(meshes):
             if con.kind[k] == MESH:
@@ -89,7 +91,7 @@ def collider_functions(meshes: bool) -> _types.SimpleNamespace:
         return wp.max(side, -1)
 
     @wp.func
-    def deepening(
+    def depth_change(
         con: Contacts, k: int, side: int, start: vec3d, y: vec3d, local: vec3d, before: f64, after: f64
     ) -> wp.vec2d:  # fmt: skip
         """(change of depth, 1) from the motion itself where that is exact, else (difference of the end distances, 0).
@@ -115,10 +117,10 @@ def collider_functions(meshes: bool) -> _types.SimpleNamespace:
                 return wp.vec2d(-sign * local[axis], f64(1.0))
         if wp.static(meshes):
             if kind == MESH:
-                return along_mesh(con, k, side, start, y, local, before, after)
+                return depth_change_on_mesh(con, k, side, start, y, local, before, after)
         return wp.vec2d()
 
     return _types.SimpleNamespace(
-        distance=distance, sweep=sweep, known_side=known_side, side_after=side_after, beside=beside, released=released,
-        deepening=deepening, SLIPS=slips,
+        distance=distance, sweep=sweep, stored_side=stored_side, updated_side=updated_side, sheet_side=sheet_side,
+        released_state=released_state, depth_change=depth_change, SLIP_FLAG=slips,
     )  # fmt: skip

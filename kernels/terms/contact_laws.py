@@ -34,17 +34,17 @@ def law_functions() -> _types.SimpleNamespace:
     vec3d, vec4d = wp.vec3d, wp.vec4d
 
     @wp.func
-    def elastic(lumped: int, k: f64, delta: f64) -> wp.vec2d:
+    def elastic(single_point: int, k: f64, delta: f64) -> wp.vec2d:
         """Elastic force, N, and stored energy, J."""
         if delta <= f64(0.0):
             return wp.vec2d()
-        if lumped != 0:
+        if single_point != 0:
             force = k * delta * wp.sqrt(delta)
             return wp.vec2d(force, f64(0.4) * force * delta)
         return wp.vec2d(k * delta, f64(0.5) * k * delta * delta)
 
     @wp.func
-    def hunt_crossley(lumped: int, k: f64, rate: f64, delta: f64, delta_n: f64) -> vec4d:
+    def hunt_crossley(single_point: int, k: f64, rate: f64, delta: f64, delta_n: f64) -> vec4d:
         """F = F_el (1 + rate (delta - delta_n)), not below 0 (Hunt and Crossley 1975), its derivative, its integral,
         and the magnitude of the terms that the integral is the difference of (for its round-off).
 
@@ -55,27 +55,27 @@ def law_functions() -> _types.SimpleNamespace:
         factor = f64(1.0) + rate * (delta - delta_n)
         if factor <= f64(0.0):
             return vec4d()
-        m = wp.where(lumped != 0, f64(1.5), f64(1.0))
+        m = wp.where(single_point != 0, f64(1.5), f64(1.0))
         c0 = f64(1.0) - rate * delta_n
-        power = elastic(lumped, k, delta)[0]
+        power = elastic(single_point, k, delta)[0]
         force = power * factor
         slope = m * force / delta + power * rate
         psi = power * delta * (c0 / (m + f64(1.0)) + rate * delta / (m + f64(2.0)))
         size = power * delta * ((f64(1.0) + rate * wp.abs(delta_n)) / (m + f64(1.0)) + rate * delta / (m + f64(2.0)))
         if c0 < f64(0.0):  # the force begins at delta_a > 0
             begin = -c0 / rate
-            low = elastic(lumped, k, begin)[0] * begin
+            low = elastic(single_point, k, begin)[0] * begin
             psi -= low * (c0 / (m + f64(1.0)) + rate * begin / (m + f64(2.0)))
         return vec4d(force, slope, psi, size)
 
     @wp.func
-    def damped(lumped: int, k: f64, g: f64, ramp: f64, delta: f64, delta_n: f64) -> vec3d:
+    def damped(single_point: int, k: f64, g: f64, ramp: f64, delta: f64, delta_n: f64) -> vec3d:
         """k_n delta - gamma_n v_n of Eq. (77) before the cut at 0, its derivative and its integral.
 
         g = gamma_n / h (of spheres gamma_n is g h delta^(1/4)); the damping grows linearly over the depth `ramp`.
         """
-        spring = elastic(lumped, k, delta)
-        if lumped != 0:
+        spring = elastic(single_point, k, delta)
+        if single_point != 0:
             root = wp.sqrt(wp.sqrt(delta))
             force = spring[0] + g * root * (delta - delta_n)
             slope = f64(0.25) * force / wp.max(delta, f64(1.0e-300)) + root * (f64(1.25) * k * root + g)
@@ -92,24 +92,24 @@ def law_functions() -> _types.SimpleNamespace:
         return vec3d(spring[0] + g * (delta - delta_n), k + g, psi)
 
     @wp.func
-    def paper_law(lumped: int, k: f64, g: f64, ramp: f64, delta: f64, delta_n: f64) -> vec4d:
+    def paper_law(single_point: int, k: f64, g: f64, ramp: f64, delta: f64, delta_n: f64) -> vec4d:
         """Eq. (77): max(0, k_n delta - gamma_n v_n), its derivative, integral, and the magnitude of the integral."""
         if delta <= f64(0.0):
             return vec4d()
-        out = damped(lumped, k, g, ramp, delta, delta_n)
+        out = damped(single_point, k, g, ramp, delta, delta_n)
         if out[0] <= f64(0.0):
             return vec4d()
-        size = elastic(lumped, k, delta)[1] + g * delta * (delta + wp.abs(delta_n))
+        size = elastic(single_point, k, delta)[1] + g * delta * (delta + wp.abs(delta_n))
         if delta_n > f64(0.0) and g > f64(0.0):
             low = f64(0.0)  # depth at which the force begins: negative below, positive at delta_n
             high = wp.min(delta, delta_n)
             for _ in range(60):
                 middle = f64(0.5) * (low + high)
-                if damped(lumped, k, g, ramp, middle, delta_n)[0] > f64(0.0):
+                if damped(single_point, k, g, ramp, middle, delta_n)[0] > f64(0.0):
                     high = middle
                 else:
                     low = middle
-            out[2] = out[2] - damped(lumped, k, g, ramp, low, delta_n)[2]
+            out[2] = out[2] - damped(single_point, k, g, ramp, low, delta_n)[2]
         return vec4d(out[0], out[1], out[2], size)
 
     @wp.func
@@ -127,33 +127,35 @@ def law_functions() -> _types.SimpleNamespace:
 
     @wp.func
     def normal_law(
-        law: int, lumped: int, k: f64, g: f64, ramp: f64, eps: f64, delta: f64, delta_n: f64
+        law: int, single_point: int, k: f64, g: f64, ramp: f64, eps: f64, delta: f64, delta_n: f64
     ) -> vec4d:  # fmt: skip
         """Normal force, N, its derivative by the depth, N/m, its integral, J, and the magnitude of its terms; g is
         chi/h or gamma_n/h."""
         if law == DEFAULT:
-            return hunt_crossley(lumped, k, g, delta, delta_n)
+            return hunt_crossley(single_point, k, g, delta, delta_n)
         if law == PAPER:
-            return paper_law(lumped, k, g, ramp, delta, delta_n)
+            return paper_law(single_point, k, g, ramp, delta, delta_n)
         return smooth_law(k, g, eps, delta, delta_n)
 
     @wp.func
-    def friction(trial: vec3d, stiffness: f64, cap: f64) -> wp.vec2d:
-        """Huber potential, J, of a trial force stiffness x slip cut at `cap`, and the fraction of the trial force that
-        acts."""
+    def friction(trial: vec3d, stiffness: f64, friction_limit: f64) -> wp.vec2d:
+        """Huber potential, J, of a trial force stiffness x slip cut at `friction_limit`, and the fraction of the trial
+        force that acts."""
         size = wp.length(trial)
-        if size <= cap:
+        if size <= friction_limit:
             return wp.vec2d(f64(0.5) * size * size / stiffness, f64(1.0))
-        return wp.vec2d((cap * size - f64(0.5) * cap * cap) / stiffness, cap / size)
+        return wp.vec2d(
+            (friction_limit * size - f64(0.5) * friction_limit * friction_limit) / stiffness, friction_limit / size
+        )
 
     @wp.func
-    def smooth_friction(slip: vec3d, inv_h: f64, v_eps: f64, cap: f64) -> wp.vec2d:
+    def smooth_friction(slip: vec3d, inv_h: f64, v_eps: f64, friction_limit: f64) -> wp.vec2d:
         """cap v / sqrt(v^2 + v_eps^2) (Paper I, 6.2), v = slip/h: its potential, J, and force over slip, N/m."""
         v = inv_h * slip
         root = wp.sqrt(wp.dot(v, v) + v_eps * v_eps)
         if inv_h == f64(0.0):
             return wp.vec2d()
-        return wp.vec2d(cap * wp.dot(v, v) / (root + v_eps) / inv_h, cap * inv_h / root)
+        return wp.vec2d(friction_limit * wp.dot(v, v) / (root + v_eps) / inv_h, friction_limit * inv_h / root)
 
     return _types.SimpleNamespace(
         elastic=elastic, normal_law=normal_law, friction=friction, smooth_friction=smooth_friction

@@ -14,23 +14,23 @@ import types as _types
 
 import warp as wp
 
-__all__ = ["FLAT", "MESH", "RIM", "SHARP", "mesh_functions", "mesh_struct"]
+__all__ = ["BOUNDARY", "FLAT", "MESH", "SHARP", "mesh_functions", "mesh_struct"]
 
 MESH = 5
 """The kind of collider, after those of `contact_shapes`."""
-SHARP, FLAT, RIM = range(3)
+SHARP, FLAT, BOUNDARY = range(3)
 """Edge between triangles of different planes, of one plane, or of a single triangle."""
-PARTS = 7
+FEATURES = 7
 """Features of a triangle: face, edges ab, bc, ca, corners a, b, c."""
 STACK = 40
 """Stack size: at most one box per level of a tree and one more; 2^30 triangles need 30."""
-ALIKE = 0.5
+SAME_SIDE_COSINE = 0.5
 """Minimum cosine between the normals of triangles of one side."""
-FINE = 1e-12
+SURFACE_TOLERANCE = 1e-12
 """Distance behind a surface that counts as on it, over the mesh's size."""
-ROUNDED = 1e-6
+SIDE_TOLERANCE = 1e-6
 """FINE for a point that was on the other side: bound of the float32 round-off of a step's end."""
-SLIVER = 1e-6
+MIN_PASSAGE = 1e-6
 """Depth of a negligible passage (over the edge of a blade), over the mesh's thickness."""
 
 
@@ -61,13 +61,13 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
 
     @wp.struct
     class Nearest:
-        place: vec3d
-        square: f64  # squared distance
-        part: wp.int32
+        position: vec3d
+        distance_squared: f64  # squared distance
+        feature: wp.int32
         triangle: wp.int32  # -1: none
 
     @wp.struct
-    class Hits:
+    class Crossings:
         """First crossings of a segment to the back and to the front; parameter t in [0, 1], or 2."""
 
         into: f64
@@ -108,7 +108,7 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
         return vec4d(place[0], place[1], place[2], part)
 
     @wp.func
-    def away(low: vec3d, high: vec3d, y: vec3d) -> f64:
+    def box_distance_squared(low: vec3d, high: vec3d, y: vec3d) -> f64:
         """Squared distance from a box."""
         out = f64(0.0)
         for k in range(3):
@@ -117,25 +117,25 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
         return out
 
     @wp.func
-    def sense_of(side: int) -> f64:
+    def side_sign(side: int) -> f64:
         """Side sign: 1 for a point from the front, -1 from behind."""
         return wp.where(side >= 0 and side % 2 == 1, f64(-1.0), f64(1.0))
 
     @wp.func
-    def counts(con: Contacts, t: int, y: vec3d, side: int) -> bool:
+    def is_candidate(con: Contacts, t: int, y: vec3d, side: int) -> bool:
         """True if a triangle faces like that of a side and is ahead of a point that has passed the surface."""
         if side < 0:
             return True
         n = con.mesh.normal[0, t]
-        if wp.dot(n, con.mesh.normal[0, side / 2]) <= f64(ALIKE):
+        if wp.dot(n, con.mesh.normal[0, side / 2]) <= f64(SAME_SIDE_COSINE):
             return False
-        return sense_of(side) * wp.dot(y - con.mesh.corner[0, t], n) <= f64(0.0)
+        return side_sign(side) * wp.dot(y - con.mesh.corner[0, t], n) <= f64(0.0)
 
     @wp.func
     def nearest(con: Contacts, k: int, y: vec3d, side: int) -> Nearest:
         """Nearest position on a mesh to y; with a side, among the candidate triangles."""
         best = Nearest()
-        best.square = f64(1.0e300)
+        best.distance_squared = f64(1.0e300)
         best.triangle = -1
         base = con.mesh.box[k]
         inner = con.mesh.inner[k]
@@ -144,12 +144,12 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
         while top > 0:
             top -= 1
             i = waiting[top]
-            if away(con.mesh.low[base + i], con.mesh.high[base + i], y) < best.square:
+            if box_distance_squared(con.mesh.low[base + i], con.mesh.high[base + i], y) < best.distance_squared:
                 if i < inner:
                     near = 2 * i + 1
                     far = near + 1
-                    d_near = away(con.mesh.low[base + near], con.mesh.high[base + near], y)
-                    d_far = away(con.mesh.low[base + far], con.mesh.high[base + far], y)
+                    d_near = box_distance_squared(con.mesh.low[base + near], con.mesh.high[base + near], y)
+                    d_far = box_distance_squared(con.mesh.low[base + far], con.mesh.high[base + far], y)
                     if d_far < d_near:
                         near = far
                         far = 2 * i + 1
@@ -159,25 +159,25 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
                 else:
                     leaf = con.mesh.leaf[k] + i - inner
                     for t in range(con.mesh.start[leaf], con.mesh.start[leaf + 1]):
-                        if counts(con, t, y, side):
+                        if is_candidate(con, t, y, side):
                             c = closest_on(con.mesh.corner[0, t], con.mesh.corner[1, t], con.mesh.corner[2, t],
                                            con.mesh.normal[0, t], y)  # fmt: skip
                             place = vec3d(c[0], c[1], c[2])
                             square = wp.length_sq(y - place)
-                            if square < best.square:
-                                best.square = square
-                                best.place = place
-                                best.part = wp.int32(c[3])
+                            if square < best.distance_squared:
+                                best.distance_squared = square
+                                best.position = place
+                                best.feature = wp.int32(c[3])
                                 best.triangle = t
         return best
 
     @wp.func
-    def facing(con: Contacts, k: int, s: Nearest, y: vec3d) -> vec4d:
+    def signed_distance(con: Contacts, k: int, s: Nearest, y: vec3d) -> vec4d:
         """Normal and signed distance at the nearest position, positive in front of the surface."""
-        n = con.mesh.normal[s.part, s.triangle]
-        if con.mesh.border[s.part, s.triangle] == FLAT:
+        n = con.mesh.normal[s.feature, s.triangle]
+        if con.mesh.border[s.feature, s.triangle] == FLAT:
             return vec4d(n[0], n[1], n[2], wp.dot(y - con.mesh.corner[0, s.triangle], n))
-        arm = y - s.place
+        arm = y - s.position
         size = wp.length(arm)
         sign = wp.where(wp.dot(arm, n) >= f64(0.0), f64(1.0), f64(-1.0))
         if size > f64(1.0e-9) * con.size[k][0]:
@@ -185,28 +185,28 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
         return vec4d(n[0], n[1], n[2], sign * size)
 
     @wp.func
-    def rim(con: Contacts, s: Nearest) -> bool:
+    def on_boundary(con: Contacts, s: Nearest) -> bool:
         """True if the nearest position is on the boundary of a sheet."""
-        return con.mesh.border[s.part, s.triangle] == RIM
+        return con.mesh.border[s.feature, s.triangle] == BOUNDARY
 
     @wp.func
     def distance(con: Contacts, k: int, y: vec3d, side: int) -> vec4d:
         """Normal towards the side of the point, and signed distance; without a side: outside of a sheet."""
         s = nearest(con, k, y, -1)
-        d = facing(con, k, s, y)
-        if con.size[k][2] == f64(0.0) and (side < 0 or rim(con, s)):
+        d = signed_distance(con, k, s, y)
+        if con.size[k][2] == f64(0.0) and (side < 0 or on_boundary(con, s)):
             return wp.where(d[3] < f64(0.0), -d, d)
-        d = sense_of(side) * d
+        d = side_sign(side) * d
         if side >= 0 and d[3] < f64(0.0):
             ahead = nearest(con, k, y, side)
             if ahead.triangle >= 0:
-                d = sense_of(side) * facing(con, k, ahead, y)
-                if (d[3] > f64(0.0)) != rim(con, ahead):  # away from the boundary it is outside
+                d = side_sign(side) * signed_distance(con, k, ahead, y)
+                if (d[3] > f64(0.0)) != on_boundary(con, ahead):  # away from the boundary it is outside
                     d = -d
         return d
 
     @wp.func
-    def side_after(con: Contacts, k: int, y: vec3d, side: int) -> int:
+    def updated_side(con: Contacts, k: int, y: vec3d, side: int) -> int:
         """Side of a point at its new position, -1 outside."""
         if distance(con, k, y, side)[3] >= f64(0.0):
             return -1
@@ -216,18 +216,18 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
         return 2 * s.triangle + wp.max(side, 0) % 2
 
     @wp.func
-    def beside(con: Contacts, k: int, y: vec3d, mark: int) -> int:
+    def sheet_side(con: Contacts, k: int, y: vec3d, contact_state: int) -> int:
         """1 in front of a sheet, 2 behind, and unchanged within round-off of the sheet."""
         s = nearest(con, k, y, -1)
-        above = wp.dot(y - s.place, con.mesh.normal[s.part, s.triangle])
-        if wp.abs(above) <= f64(ROUNDED) * con.size[k][0]:
-            if mark == 0 and above < -f64(FINE) * con.size[k][0]:
+        above = wp.dot(y - s.position, con.mesh.normal[s.feature, s.triangle])
+        if wp.abs(above) <= f64(SIDE_TOLERANCE) * con.size[k][0]:
+            if contact_state == 0 and above < -f64(SURFACE_TOLERANCE) * con.size[k][0]:
                 return 2
-            return wp.max(mark, 1)
+            return wp.max(contact_state, 1)
         return wp.where(above > f64(0.0), 1, 2)
 
     @wp.func
-    def apart(low: vec3d, high: vec3d, middle: vec3d, half: vec3d) -> bool:
+    def misses_box(low: vec3d, high: vec3d, middle: vec3d, half: vec3d) -> bool:
         """True if a segment misses a box (separating axes)."""
         e = f64(0.5) * (high - low)
         c = middle - f64(0.5) * (high + low)
@@ -254,16 +254,16 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
         return True
 
     @wp.func
-    def hits(con: Contacts, k: int, a: vec3d, b: vec3d, side: int) -> Hits:
+    def crossings(con: Contacts, k: int, a: vec3d, b: vec3d, side: int) -> Crossings:
         """Crossings of the surface by the segment from a to b; `side` at its start: -3 in front, -4 behind."""
-        out = Hits()
+        out = Crossings()
         out.into = f64(2.0)
         out.out = f64(2.0)
-        tol = f64(FINE) * con.size[k][0]
+        tol = f64(SURFACE_TOLERANCE) * con.size[k][0]
         level = -tol  # lowest start height that counts as in front
         if side < -2:
-            level = wp.where(side == -3, -f64(ROUNDED), f64(ROUNDED)) * con.size[k][0]
-        reach = f64(2.0) * f64(ROUNDED) * con.size[k][0]
+            level = wp.where(side == -3, -f64(SIDE_TOLERANCE), f64(SIDE_TOLERANCE)) * con.size[k][0]
+        reach = f64(2.0) * f64(SIDE_TOLERANCE) * con.size[k][0]
         margin = vec3d(reach, reach, reach)
         base = con.mesh.box[k]
         inner = con.mesh.inner[k]
@@ -272,7 +272,7 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
         while top > 0:
             top -= 1
             i = waiting[top]
-            if not apart(con.mesh.low[base + i] - margin, con.mesh.high[base + i] + margin, f64(0.5) * (a + b),
+            if not misses_box(con.mesh.low[base + i] - margin, con.mesh.high[base + i] + margin, f64(0.5) * (a + b),
                          f64(0.5) * (b - a)):  # fmt: skip
                 if i < inner:
                     waiting[top] = 2 * i + 1
@@ -298,35 +298,35 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
         return out
 
     @wp.func
-    def passes(con: Contacts, k: int, first: int, entry: vec3d, last: int, leave: vec3d, sense: f64) -> bool:
+    def passes_through(con: Contacts, k: int, first: int, entry: vec3d, last: int, leave: vec3d, sense: f64) -> bool:
         """True if a path in through a triangle and out through another crosses the mesh, not just its edge."""
         n = con.mesh.normal[0, first]
         turn = wp.dot(n, con.mesh.normal[0, last])
         deep = sense * wp.dot(n, entry - leave)
         thick = con.size[k][1]
-        if turn < f64(-ALIKE):
-            return deep > f64(SLIVER) * thick
-        return turn < f64(ALIKE) and deep > f64(0.5) * thick
+        if turn < f64(-SAME_SIDE_COSINE):
+            return deep > f64(MIN_PASSAGE) * thick
+        return turn < f64(SAME_SIDE_COSINE) and deep > f64(0.5) * thick
 
     @wp.func
-    def passed(con: Contacts, k: int, side: int, y: vec3d) -> bool:
+    def beyond_sheet(con: Contacts, k: int, side: int, y: vec3d) -> bool:
         """True if a point is so far behind a sheet that it is beyond it."""
-        deep = sense_of(side) * wp.dot(con.mesh.normal[0, side / 2], con.mesh.corner[0, side / 2] - y)
+        deep = side_sign(side) * wp.dot(con.mesh.normal[0, side / 2], con.mesh.corner[0, side / 2] - y)
         return con.size[k][2] == f64(0.0) and deep > con.size[k][1]
 
     @wp.func
     def sweep(con: Contacts, k: int, start: vec3d, end: vec3d, side: int) -> int:
         """Side through which a motion has passed the surface at its end, -1: none or any, -2: it passed through; see
         `contact_shapes`."""
-        h = hits(con, k, start, end, side)
+        h = crossings(con, k, start, end, side)
         d = end - start
         if side >= 0:
             leave = wp.where(side % 2 == 0, h.out, h.into)
             last = wp.where(side % 2 == 0, h.out_triangle, h.into_triangle)
             if leave > f64(1.0):
-                return wp.where(passed(con, k, side, end), -2, side)
+                return wp.where(beyond_sheet(con, k, side, end), -2, side)
             entry = con.mesh.corner[0, side / 2]
-            if passes(con, k, side / 2, entry, last, start + leave * d, sense_of(side)):
+            if passes_through(con, k, side / 2, entry, last, start + leave * d, side_sign(side)):
                 return -2
             return -1
         if h.into > f64(1.0) and h.out > f64(1.0):
@@ -339,25 +339,25 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
         if t0 > f64(1.0) or t1 < t0:
             return -1
         if t1 > f64(1.0):
-            return wp.where(passed(con, k, 2 * first + behind, end), -2, 2 * first + behind)
-        if passes(con, k, first, start + t0 * d, last, start + t1 * d, sense_of(behind)):
+            return wp.where(beyond_sheet(con, k, 2 * first + behind, end), -2, 2 * first + behind)
+        if passes_through(con, k, first, start + t0 * d, last, start + t1 * d, side_sign(behind)):
             return -2
         return -1
 
     @wp.func
-    def deepening(
+    def depth_change(
         con: Contacts, k: int, side: int, start: vec3d, y: vec3d, local: vec3d, before: f64, after: f64
     ) -> wp.vec2d:  # fmt: skip
         """(change of depth, 1) by a motion along one plane, else (difference of the end distances, 0)."""
         if side < 0:
             return wp.vec2d()
-        n = sense_of(side) * con.mesh.normal[0, side / 2]
+        n = side_sign(side) * con.mesh.normal[0, side / 2]
         a = con.mesh.corner[0, side / 2]
-        tol = f64(FINE) * con.size[k][0]
+        tol = f64(SURFACE_TOLERANCE) * con.size[k][0]
         if wp.abs(wp.dot(start - a, n) - before) <= tol and wp.abs(wp.dot(y - a, n) - after) <= tol:
             return wp.vec2d(-wp.dot(n, local), f64(1.0))
         return wp.vec2d()
 
     return _types.SimpleNamespace(
-        distance=distance, sweep=sweep, side_after=side_after, deepening=deepening, beside=beside
+        distance=distance, sweep=sweep, updated_side=updated_side, depth_change=depth_change, sheet_side=sheet_side
     )

@@ -14,7 +14,7 @@ __all__ = ["BOX", "CAPSULE", "CYLINDER", "HALF_SPACE", "SPHERE", "shape_function
 HALF_SPACE, SPHERE, BOX, CAPSULE, CYLINDER = range(5)
 LATERAL = 6
 """Sides: 0 to 5 are the faces -x, +x, -y, +y, -z, +z (ends of a cylinder: 4, 5), 6 the lateral side of a cylinder."""
-THROUGH = 0.5
+PASSED_DEPTH = 0.5
 """A motion passes through a shape if it enters deeper than this fraction of its radius or thickness and leaves
 again."""
 
@@ -188,7 +188,7 @@ def shape_functions() -> _types.SimpleNamespace:
         d = end - start
         if kind == SPHERE or kind == CAPSULE:
             near = closest_on_chord(kind, size, start, d)
-            if near < f64(THROUGH) * size[0]:
+            if near < f64(PASSED_DEPTH) * size[0]:
                 before = distance(kind, size, start, -1)
                 after = distance(kind, size, end, -1)
                 turned = before[0] * after[0] + before[1] * after[1] + before[2] * after[2]
@@ -212,11 +212,11 @@ def shape_functions() -> _types.SimpleNamespace:
             if leave == LATERAL:
                 near = closest_on_chord(SPHERE, vec3d(size[0], f64(0.0), f64(0.0)), vec3d(start[0], start[1], f64(0.0)),
                                         vec3d(d[0], d[1], f64(0.0)))  # fmt: skip
-                if near < f64(THROUGH) * size[0]:
+                if near < f64(PASSED_DEPTH) * size[0]:
                     return -2
             return -1
         # it left by another side: over an edge, or through
-        limit = f64(2.0) * f64(THROUGH) * half_size(kind, size, wp.where(entry == LATERAL, 0, entry / 2))
+        limit = f64(2.0) * f64(PASSED_DEPTH) * half_size(kind, size, wp.where(entry == LATERAL, 0, entry / 2))
         if depth_below(kind, size, start + cross[1] * d, entry) > limit:
             return -2
         return -1

@@ -5,10 +5,10 @@ import types as _types
 
 import warp as wp
 
-from ..common.types import SMALL, kernel_module, precision
+from ..common.types import SHORT_UNROLL, kernel_module, precision
 from .contact_colliders import MESHES, collider_functions
-from .contact_data import attempt_struct, contact_struct, facet_struct
-from .contact_touch import touch_functions
+from .contact_point import contact_point_functions
+from .contact_structs import contact_scratch_struct, contact_struct, facet_struct
 
 __all__ = ["sheet_kernels"]
 
@@ -17,23 +17,23 @@ __all__ = ["sheet_kernels"]
 def sheet_kernels(dtype: str) -> _types.SimpleNamespace:
     """A kernel in a module of its own, run once at the start of a simulation."""
     vec3, vec3d = precision(dtype).vec3, wp.vec3d
-    Contacts, Facets, Attempt = contact_struct(True), facet_struct(dtype), attempt_struct(dtype)
-    along = touch_functions(dtype, True).along
+    Contacts, Facets, ContactScratch = contact_struct(True), facet_struct(dtype), contact_scratch_struct(dtype)
+    interpolate = contact_point_functions(dtype, True).interpolate
     distance, sweep = collider_functions(True).distance, collider_functions(True).sweep
-    module = kernel_module(f"contact_sheets_{dtype}{MESHES}", max_unroll=SMALL)
+    module = kernel_module(f"contact_sheets_{dtype}{MESHES}", max_unroll=SHORT_UNROLL)
 
     @wp.kernel(module=module)
     def across(
-        con: Contacts, facets: Facets, u: wp.array2d(dtype=vec3), tolerance: wp.array(dtype=wp.float64), at: Attempt,
-        found: wp.array2d(dtype=wp.int32),
+        con: Contacts, facets: Facets, u: wp.array2d(dtype=vec3), tolerance: wp.array(dtype=wp.float64),
+        scr: ContactScratch, found: wp.array2d(dtype=wp.int32),
     ):  # fmt: skip
         """Point of each facet that is behind a sheet as seen from the preceding point, + 1; found: [world, row]."""
         world, item = wp.tid()
         k = con.collider[facets.contact[item]]
         before = vec3d()
         for q in range(facets.points):
-            x = facets.X[q, item] + along(facets, u, world, q, item)
-            y = wp.transpose(at.turn[world, k]) * (x - at.place[world, k])
+            x = facets.X[q, item] + interpolate(facets, u, world, q, item)
+            y = wp.transpose(scr.rotation[world, k]) * (x - scr.position[world, k])
             if q > 0:
                 side = sweep(con, k, before, y, -1)
                 if side == -2 or (side >= 0 and distance(con, k, y, side)[3] < -tolerance[world]):

@@ -5,9 +5,9 @@ import types as _types
 
 import warp as wp
 
-from ..common.entries import add_symmetric_function
+from ..common.block_entries import add_symmetric_function
 from ..common.structs import pattern_struct, topology_struct
-from ..common.types import SMALL, kernel_module, precision
+from ..common.types import SHORT_UNROLL, kernel_module, precision
 
 __all__ = ["pair_block_kernels"]
 
@@ -20,7 +20,7 @@ def pair_block_kernels(dtype: str) -> _types.SimpleNamespace:
     f64 = wp.float64
     Topology, Pattern = topology_struct(dtype), pattern_struct()
     add_symmetric = add_symmetric_function(dtype)
-    module = kernel_module(f"pair_blocks_{dtype}", max_unroll=SMALL)
+    module = kernel_module(f"pair_blocks_{dtype}", max_unroll=SHORT_UNROLL)
 
     @wp.kernel(module=module)
     def add_masters(

@@ -12,14 +12,21 @@ import types as _types
 import warp as wp
 
 from ..common.lanes import lane_functions
-from ..common.types import SMALL, kernel_module, precision
-from .contact import IDLE, LOADED, STIFF
-from .contact_data import attempt_struct, clock_struct, contact_struct, facet_struct, history_struct, of_world
+from ..common.types import SHORT_UNROLL, kernel_module, precision
+from .contact import FORCE_ONLY, INACTIVE, WITH_STIFFNESS
 from .contact_laws import law_functions
-from .contact_touch import touch_functions
-from .pair_data import master_struct, seat_struct, touching_struct
-from .pair_places import place_functions
-from .pair_seek import THROUGH
+from .contact_point import contact_point_functions
+from .contact_structs import (
+    clock_struct,
+    contact_scratch_struct,
+    contact_struct,
+    facet_struct,
+    history_struct,
+    of_world,
+)
+from .facet_projection import facet_projection_functions
+from .facet_search import PENETRATED
+from .pair_structs import master_struct, pair_history_struct, pair_scratch_struct
 
 __all__ = ["pair_functions", "pair_kernels"]
 
@@ -28,26 +35,32 @@ __all__ = ["pair_functions", "pair_kernels"]
 def pair_functions(dtype: str) -> _types.SimpleNamespace:
     """Device function touch_of."""
     f64 = wp.float64
-    Contacts, Attempt, Touching = contact_struct(False), attempt_struct(dtype), touching_struct(dtype)
-    k, normal_law = touch_functions(dtype, False), law_functions().normal_law
-    Touch, in_plane, rate_of = k.Touch, k.in_plane, k.rate_of
+    Contacts, ContactScratch, PairScratch = (
+        contact_struct(False),
+        contact_scratch_struct(dtype),
+        pair_scratch_struct(dtype),
+    )
+    k, normal_law = contact_point_functions(dtype, False), law_functions().normal_law
+    PointContact, with_friction_normal, damping_rate = k.PointContact, k.with_friction_normal, k.damping_rate
 
     @wp.func
-    def touch_of(con: Contacts, at: Attempt, t: Touching, world: int, c: int, point: int, inv_h: f64) -> Touch:
+    def evaluate_pair_point(
+        con: Contacts, scr: ContactScratch, pair: PairScratch, world: int, c: int, point: int, inv_h: f64
+    ) -> PointContact:
         """A point on its facet."""
-        out = Touch()
-        out.n = t.normal[world, point]
-        out.depth = t.depth[world, point]
-        out.rise = out.depth - t.before[world, point]
+        out = PointContact()
+        out.n = pair.normal[world, point]
+        out.depth = pair.depth[world, point]
+        out.depth_increment = out.depth - pair.initial_depth[world, point]
         k_n = con.scale[world, c] * of_world(con.normal, world, c)
-        rate = rate_of(con, at, world, c, point, inv_h)
+        rate = damping_rate(con, scr, world, c, point, inv_h)
         out.law = normal_law(con.law[c], 0, k_n, rate, con.ramp[c], con.force_eps[c], out.depth,
-                             t.before[world, point])  # fmt: skip
-        out.motion = t.motion[world, point]
-        out.whole = t.whole[world, point]
-        return in_plane(out, wp.normalize(out.n))
+                             pair.initial_depth[world, point])  # fmt: skip
+        out.relative_motion = pair.relative_motion[world, point]
+        out.elastic_slip = pair.elastic_slip[world, point]
+        return with_friction_normal(out, wp.normalize(out.n))
 
-    return _types.SimpleNamespace(touch_of=touch_of)
+    return _types.SimpleNamespace(evaluate_pair_point=evaluate_pair_point)
 
 
 @functools.cache
@@ -57,79 +70,85 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
     T, vec2, vec3, sym = p.T, p.vec2, p.vec3, p.sym
     f64, vec3d = wp.float64, wp.vec3d
     Contacts, Facets, History = contact_struct(False), facet_struct(dtype), history_struct()
-    Attempt, Clock = attempt_struct(dtype), clock_struct()
-    Masters, Seats, Touching = master_struct(dtype), seat_struct(), touching_struct(dtype)
-    k, places = touch_functions(dtype, False), place_functions(dtype)
-    touch_of = pair_functions(dtype).touch_of
-    in_plane, hold, put_explicit = k.in_plane, k.hold, k.put_explicit
+    ContactScratch, Clock = contact_scratch_struct(dtype), clock_struct()
+    Masters, PairHistory, PairScratch = master_struct(dtype), pair_history_struct(), pair_scratch_struct(dtype)
+    k, places = contact_point_functions(dtype, False), facet_projection_functions(dtype)
+    evaluate_pair_point = pair_functions(dtype).evaluate_pair_point
+    with_friction_normal, frozen_values, set_explicit_force = (
+        k.with_friction_normal,
+        k.frozen_values,
+        k.set_explicit_force,
+    )
     friction_potential, friction_force, point_stiffness = k.friction_potential, k.friction_force, k.point_stiffness
-    jet, weigh = places.jet, places.weigh
+    surface_point, shape_value = places.surface_point, places.shape_value
     lane_sum = lane_functions(dtype).lane_sum
-    module = kernel_module(f"pairs_{dtype}", max_unroll=SMALL)
+    module = kernel_module(f"pairs_{dtype}", max_unroll=SHORT_UNROLL)
 
     @wp.kernel(module=module)
     def explicit_forces(
-        con: Contacts, mas: Masters, facets: Facets, his: History, seats: Seats, clock: Clock,
-        v_n: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), at: Attempt, t: Touching,
+        con: Contacts, mas: Masters, facets: Facets, his: History, pair_his: PairHistory, clock: Clock,
+        v_n: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), scr: ContactScratch, pair: PairScratch,
     ):  # fmt: skip
         """Forces of explicit contacts at the state that the attempt begins from."""
         world, item, q = wp.tid()
         c = facets.contact[item]
         point = facets.point + item * facets.points + q
-        if active[world] == 0 or facets.share[q, item] == f64(0.0) or con.dead[c] == 0:
+        if active[world] == 0 or facets.area_fraction[q, item] == f64(0.0) or con.is_explicit[c] == 0:
             return
-        at.dead[world, point] = vec3d()
-        at.dead_spring[world, point] = vec3d()
-        delta = at.depth[world, point]
+        scr.explicit_force[world, point] = vec3d()
+        scr.explicit_spring[world, point] = vec3d()
+        delta = scr.depth[world, point]
         if delta <= f64(0.0):
             return
-        f = seats.seat[world, point] - 1
-        spot = t.spot0[world, point]
-        s = jet(mas, t.C0, t.D0, world, f, spot)
+        f = pair_his.facet[world, point] - 1
+        xi = pair.anchor_xi[world, point]
+        s = surface_point(mas, pair.C0, pair.D0, world, f, xi)
         n = wp.normalize(wp.cross(s.a, s.b))
-        foot = vec3d(spot[0], spot[1], f64(0.0))
-        v = k.along(facets, v_n, world, q, item) - places.moved(mas, t.V0, t.V0, world, f, foot)
-        put_explicit(con, his, at, world, c, point, delta, n, v, clock.h[world])
+        projection = vec3d(xi[0], xi[1], f64(0.0))
+        v = k.interpolate(facets, v_n, world, q, item) - places.polynomial_value(
+            mas, pair.V0, pair.V0, world, f, projection
+        )
+        set_explicit_force(con, his, scr, world, c, point, delta, n, v, clock.h[world])
 
     @wp.func
-    def relative(
-        mas: Masters, facets: Facets, t: Touching, u: wp.array2d(dtype=vec3d), world: int, q: int, item: int,
+    def relative_displacement(
+        mas: Masters, facets: Facets, pair: PairScratch, u: wp.array2d(dtype=vec3d), world: int, q: int, item: int,
         point: int, f: int,
     ) -> vec3d:  # fmt: skip
         """Displacement of a point relative to a facet, by the frozen shape values."""
-        out = k.along(facets, u, world, q, item)
+        out = k.interpolate(facets, u, world, q, item)
         for i in range(mas.conn.shape[0]):
-            out -= f64(t.held_weight[world, point, i]) * vec3d(u[world, mas.conn[i, f]])
+            out -= f64(pair.friction_shape[world, point, i]) * vec3d(u[world, mas.conn[i, f]])
         return out
 
     @wp.func
-    def hold_functions(
-        mas: Masters, facets: Facets, t: Touching, u: wp.array2d(dtype=vec3d), world: int, q: int, item: int,
+    def freeze_friction_shapes(
+        mas: Masters, facets: Facets, pair: PairScratch, u: wp.array2d(dtype=vec3d), world: int, q: int, item: int,
         point: int, f: int,
     ):  # fmt: skip
         """Freeze the shape values of friction: store motion and relative displacement at this iterate."""
-        t.held_motion[world, point] = t.motion[world, point]
-        t.held_whole[world, point] = t.whole[world, point]
-        t.held_shift[world, point] = relative(mas, facets, t, u, world, q, item, point, f)
-        t.held_facet[world, point] = f
+        pair.frozen_motion[world, point] = pair.relative_motion[world, point]
+        pair.frozen_slip[world, point] = pair.elastic_slip[world, point]
+        pair.frozen_displacement[world, point] = relative_displacement(mas, facets, pair, u, world, q, item, point, f)
+        pair.frozen_facet[world, point] = f
 
     @wp.kernel(module=module)
-    def take_functions(
-        mas: Masters, facets: Facets, u: wp.array2d(dtype=vec3d), flags: wp.array(dtype=wp.int32), at: Attempt,
-        t: Touching,
+    def update_friction_shapes(
+        mas: Masters, facets: Facets, u: wp.array2d(dtype=vec3d), flags: wp.array(dtype=wp.int32), scr: ContactScratch,
+        pair: PairScratch,
     ):  # fmt: skip
         """Update the shape values of friction to those of the iterate."""
         world, item, q = wp.tid()
         point = facets.point + item * facets.points + q
-        if flags[world] == 0 or at.state[world, point] != STIFF:
+        if flags[world] == 0 or scr.activity[world, point] != WITH_STIFFNESS:
             return
-        f = t.seat[world, point]
+        f = pair.facet[world, point]
         for i in range(mas.conn.shape[0]):
-            t.held_weight[world, point, i] = T(weigh(mas, f, i, t.spot[world, point]))
-        hold_functions(mas, facets, t, u, world, q, item, point, f)
+            pair.friction_shape[world, point, i] = T(shape_value(mas, f, i, pair.xi[world, point]))
+        freeze_friction_shapes(mas, facets, pair, u, world, q, item, point, f)
 
     @wp.func
-    def lean_on(mas: Masters, t: Touching, world: int, point: int, f: int, gap: f64, force: f64):
+    def set_geometric_stiffness(mas: Masters, pair: PairScratch, world: int, point: int, f: int, gap: f64, force: f64):
         """Geometric stiffness of the normal force: rotation of the facet under a force, and motion of the projection.
 
         With the relative displacement d at the projection, e_a = n.(change of the tangent a_a), t_a = a_a.d, b the
@@ -137,42 +156,46 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         Contact Mechanics, 2006, 4.1, with the facet's curvature). `lean`: force m a; `bend`: force gap m, and M a^-1 b
         / force.
         """
-        spot = t.foot[world, point]
-        n = t.normal[world, point]
-        s = jet(mas, t.C, t.D, world, f, spot)
-        b = places.curved(mas, t.C, world, f, spot, n)
+        xi = pair.projection[world, point]
+        n = pair.normal[world, point]
+        s = surface_point(mas, pair.C, pair.D, world, f, xi)
+        b = places.second_derivatives(mas, pair.C, world, f, xi, n)
         aa, bb, ab = wp.dot(s.a, s.a), wp.dot(s.b, s.b), wp.dot(s.a, s.b)
         A = wp.mat22d(aa, ab, ab, bb)
         B = wp.mat22d(b[0], b[2], b[2], b[1])
         M = A - gap * B
         det = wp.determinant(M)
-        t.lean[world, point, 0] = vec3()
-        t.lean[world, point, 1] = vec3()
-        t.bend[world, point] = sym()
+        pair.geometric_tangent[world, point, 0] = vec3()
+        pair.geometric_tangent[world, point, 1] = vec3()
+        pair.geometric_curvature[world, point] = sym()
         if force <= f64(0.0) or det <= f64(0.1) * wp.determinant(A):
             return  # no projection beyond the centre of curvature
         m = force * wp.inverse(M)
-        t.lean[world, point, 0] = vec3(m[0, 0] * s.a + m[0, 1] * s.b)
-        t.lean[world, point, 1] = vec3(m[1, 0] * s.a + m[1, 1] * s.b)
+        pair.geometric_tangent[world, point, 0] = vec3(m[0, 0] * s.a + m[0, 1] * s.b)
+        pair.geometric_tangent[world, point, 1] = vec3(m[1, 0] * s.a + m[1, 1] * s.b)
         N = (M @ wp.inverse(A) @ B) / force
-        t.bend[world, point] = sym(T(gap * m[0, 0]), T(gap * m[1, 1]), T(gap * m[0, 1]), T(N[0, 0]), T(N[1, 1]),
+        pair.geometric_curvature[world, point] = sym(T(gap * m[0, 0]), T(gap * m[1, 1]), T(gap * m[0, 1]), T(N[0, 0]),
+            T(N[1, 1]),
                                    T(N[0, 1]))  # fmt: skip
 
     @wp.func
-    def put_dead(mas: Masters, at: Attempt, t: Touching, world: int, point: int, f: int, share: f64):
+    def apply_explicit_force(
+        mas: Masters, scr: ContactScratch, pair: PairScratch, world: int, point: int, f: int, area_fraction: f64
+    ):
         """Explicit force of a point, applied at its position at the start of the attempt."""
-        work = -share * wp.dot(at.dead[world, point], t.motion[world, point])
-        at.state[world, point] = LOADED
-        at.force[world, point] = -share * at.dead[world, point]
-        at.energy[world, point] = wp.vec2d(work, wp.abs(work))
-        t.friction[world, point] = vec3d()
+        work = -area_fraction * wp.dot(scr.explicit_force[world, point], pair.relative_motion[world, point])
+        scr.activity[world, point] = FORCE_ONLY
+        scr.force[world, point] = -area_fraction * scr.explicit_force[world, point]
+        scr.energy[world, point] = wp.vec2d(work, wp.abs(work))
+        pair.tangential_force[world, point] = vec3d()
         for i in range(mas.conn.shape[0]):
-            t.weight[world, point, i] = T(weigh(mas, f, i, t.spot0[world, point]))
+            pair.shape_values[world, point, i] = T(shape_value(mas, f, i, pair.anchor_xi[world, point]))
 
     @wp.kernel(module=module)
     def forces(
-        con: Contacts, mas: Masters, facets: Facets, his: History, seats: Seats, clock: Clock,
-        u: wp.array2d(dtype=vec3d), active: wp.array(dtype=wp.int32), fresh: int, at: Attempt, t: Touching,
+        con: Contacts, mas: Masters, facets: Facets, his: History, pair_his: PairHistory, clock: Clock,
+        u: wp.array2d(dtype=vec3d), active: wp.array(dtype=wp.int32), fresh: int, scr: ContactScratch,
+        pair: PairScratch,
     ):  # fmt: skip
         """Forces on points, their stiffness and potential; friction limits and shape values of friction are frozen."""
         world, item, q = wp.tid()
@@ -180,79 +203,88 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
             return
         c = facets.contact[item]
         point = facets.point + item * facets.points + q
-        share = facets.share[q, item]
-        at.state[world, point] = IDLE
-        f = t.seat[world, point]
-        if con.dead[c] != 0 and share > f64(0.0):
-            if wp.length_sq(at.dead[world, point]) > f64(0.0):
-                f = seats.seat[world, point] - 1
-                put_dead(mas, at, t, world, point, f, share)
-        elif f == THROUGH:
-            at.through[world] = point + 1
-            at.state[world, point] = LOADED
-            at.force[world, point] = vec3d()
-            t.friction[world, point] = vec3d()
-            at.energy[world, point] = wp.vec2d(f64(wp.inf), f64(0.0))
+        area_fraction = facets.area_fraction[q, item]
+        scr.activity[world, point] = INACTIVE
+        f = pair.facet[world, point]
+        if con.is_explicit[c] != 0 and area_fraction > f64(0.0):
+            if wp.length_sq(scr.explicit_force[world, point]) > f64(0.0):
+                f = pair_his.facet[world, point] - 1
+                apply_explicit_force(mas, scr, pair, world, point, f, area_fraction)
+        elif f == PENETRATED:
+            scr.passed_through[world] = point + 1
+            scr.activity[world, point] = FORCE_ONLY
+            scr.force[world, point] = vec3d()
+            pair.tangential_force[world, point] = vec3d()
+            scr.energy[world, point] = wp.vec2d(f64(wp.inf), f64(0.0))
             f = -1
-        elif f >= 0 and share > f64(0.0):
+        elif f >= 0 and area_fraction > f64(0.0):
             inv_h = f64(0.0)
             if clock.still == 0:
                 inv_h = f64(1.0) / clock.h[world]
-            s = touch_of(con, at, t, world, c, point, inv_h)
-            held = at.held[world, point]
-            new = hold(con, his, at, world, c, point, s)
+            s = evaluate_pair_point(con, scr, pair, world, c, point, inv_h)
+            frozen = scr.frozen[world, point]
+            new = frozen_values(con, his, scr, world, c, point, s)
             if fresh != 0:
-                at.plane[world, point] = s.m
-                held = new
-                held[0] = wp.min(new[0], his.cap[world, point])
-                at.held[world, point] = held
-            held[1] = new[1]
-            held[2] = f64(1.0)
-            at.next_plane[world, point] = s.m
-            at.next[world, point] = new
-            m = at.plane[world, point]
+                scr.frozen_normal[world, point] = s.m
+                frozen = new
+                frozen[0] = wp.min(new[0], his.friction_limit[world, point])
+                scr.frozen[world, point] = frozen
+            frozen[1] = new[1]
+            frozen[2] = f64(1.0)
+            scr.updated_normal[world, point] = s.m
+            scr.updated[world, point] = new
+            m = scr.frozen_normal[world, point]
             if wp.dot(m, s.m) <= f64(0.5):  # the point has passed to another facet since
                 m = s.m
-                at.plane[world, point] = m
+                scr.frozen_normal[world, point] = m
             for i in range(mas.conn.shape[0]):
-                t.weight[world, point, i] = T(weigh(mas, f, i, t.foot[world, point]))
-                t.slope[world, point, i] = vec2(places.slopes(mas, f, i, t.foot[world, point]))
-                if fresh != 0 or held[0] <= f64(0.0):
-                    t.held_weight[world, point, i] = T(weigh(mas, f, i, t.spot[world, point]))
+                pair.shape_values[world, point, i] = T(shape_value(mas, f, i, pair.projection[world, point]))
+                pair.shape_gradient[world, point, i] = vec2(
+                    places.shape_gradients(mas, f, i, pair.projection[world, point])
+                )
+                if fresh != 0 or frozen[0] <= f64(0.0):
+                    pair.friction_shape[world, point, i] = T(shape_value(mas, f, i, pair.xi[world, point]))
             if fresh != 0:
-                hold_functions(mas, facets, t, u, world, q, item, point, f)
-            if held[0] > f64(0.0):  # frozen shape values: friction has a potential
-                shift = relative(mas, facets, t, u, world, q, item, point, t.held_facet[world, point])
-                s.motion = t.held_motion[world, point] + (shift - t.held_shift[world, point])
-                s.whole = t.held_whole[world, point] + (shift - t.held_shift[world, point])
-            s = in_plane(s, m)
-            if s.depth > f64(0.0) or held[0] > f64(0.0):
-                rub = friction_potential(con, world, c, s, held, inv_h)
-                K = point_stiffness(con, world, c, s, held, inv_h)
-                pulled = share * friction_force(con, world, c, s, held, inv_h)
-                at.state[world, point] = STIFF
-                t.friction[world, point] = pulled
-                lean_on(mas, t, world, point, f, at.reach[world, point] - s.depth, share * s.law[0])
-                at.force[world, point] = pulled - (share * s.law[0]) * s.n
-                at.energy[world, point] = wp.vec2d(share * (s.law[2] + rub), share * (s.law[3] + wp.abs(rub)))
-                at.stiffness[world, point] = sym(T(share * K[0, 0]), T(share * K[1, 1]), T(share * K[2, 2]),
-                    T(share * K[1, 2]), T(share * K[0, 2]), T(share * K[0, 1]))  # fmt: skip
-        elif share > f64(0.0):
-            held = vec3d()
-            at.next[world, point] = held
+                freeze_friction_shapes(mas, facets, pair, u, world, q, item, point, f)
+            if frozen[0] > f64(0.0):  # frozen shape values: friction has a potential
+                shift = relative_displacement(
+                    mas, facets, pair, u, world, q, item, point, pair.frozen_facet[world, point]
+                )
+                s.relative_motion = pair.frozen_motion[world, point] + (shift - pair.frozen_displacement[world, point])
+                s.elastic_slip = pair.frozen_slip[world, point] + (shift - pair.frozen_displacement[world, point])
+            s = with_friction_normal(s, m)
+            if s.depth > f64(0.0) or frozen[0] > f64(0.0):
+                friction_energy = friction_potential(con, world, c, s, frozen, inv_h)
+                K = point_stiffness(con, world, c, s, frozen, inv_h)
+                tangential_force = area_fraction * friction_force(con, world, c, s, frozen, inv_h)
+                scr.activity[world, point] = WITH_STIFFNESS
+                pair.tangential_force[world, point] = tangential_force
+                set_geometric_stiffness(
+                    mas, pair, world, point, f, scr.contact_distance[world, point] - s.depth, area_fraction * s.law[0]
+                )
+                scr.force[world, point] = tangential_force - (area_fraction * s.law[0]) * s.n
+                scr.energy[world, point] = wp.vec2d(
+                    area_fraction * (s.law[2] + friction_energy), area_fraction * (s.law[3] + wp.abs(friction_energy))
+                )
+                scr.stiffness[world, point] = sym(T(area_fraction * K[0, 0]), T(area_fraction * K[1, 1]),
+                    T(area_fraction * K[2, 2]), T(area_fraction * K[1, 2]), T(area_fraction * K[0, 2]),
+                    T(area_fraction * K[0, 1]))  # fmt: skip
+        elif area_fraction > f64(0.0):
+            frozen = vec3d()
+            scr.updated[world, point] = frozen
             if fresh != 0:
-                at.held[world, point] = held
-                at.plane[world, point] = held
+                scr.frozen[world, point] = frozen
+                scr.frozen_normal[world, point] = frozen
         wanted = wp.int32(0)
-        if at.state[world, point] != IDLE and f >= 0:
+        if scr.activity[world, point] != INACTIVE and f >= 0:
             wanted = f + 1
-        if t.listed[world, point] != wanted:
-            t.listed[world, point] = wanted
-            t.changed[0] = 1
+        if pair.listed_facet[world, point] != wanted:
+            pair.listed_facet[world, point] = wanted
+            pair.lists_changed[0] = 1
 
     @wp.kernel(module=module)
     def gather_masters(
-        mas: Masters, active: wp.array(dtype=wp.int32), lanes: int, at: Attempt, t: Touching,
+        mas: Masters, active: wp.array(dtype=wp.int32), lanes: int, scr: ContactScratch, pair: PairScratch,
         pool: wp.array2d(dtype=vec3),
     ):  # fmt: skip
         """Forces of points on the slots of their master facets."""
@@ -263,12 +295,12 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         f = entry % mas.count
         i = entry / mas.count
         total = vec3()
-        first = t.start[world, f]
-        for k in range(index % lanes, t.points[world, f], lanes):
-            point = t.entry[world, first + k]
-            pulled = t.friction[world, point]
-            total -= t.weight[world, point, i] * vec3(at.force[world, point] - pulled)
-            total -= t.held_weight[world, point, i] * vec3(pulled)
+        first = pair.list_start[world, f]
+        for k in range(index % lanes, pair.list_size[world, f], lanes):
+            point = pair.list_point[world, first + k]
+            tangential_force = pair.tangential_force[world, point]
+            total -= pair.shape_values[world, point, i] * vec3(scr.force[world, point] - tangential_force)
+            total -= pair.friction_shape[world, point, i] * vec3(tangential_force)
         total = lane_sum(total, lanes)
         if index % lanes == 0:
             pool[world, mas.pool + entry] = total
@@ -281,43 +313,43 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def product_points(
-        mas: Masters, facets: Facets, active: wp.array(dtype=wp.int32), p: wp.array2d(dtype=vec3), at: Attempt,
-        t: Touching,
+        mas: Masters, facets: Facets, active: wp.array(dtype=wp.int32), p: wp.array2d(dtype=vec3), scr: ContactScratch,
+        pair: PairScratch,
     ):  # fmt: skip
         """K times the relative displacement of each point."""
         world, item, q = wp.tid()
-        if active[world] == 0 or at.touched[world, facets.row + item] != STIFF:
+        if active[world] == 0 or scr.facet_activity[world, facets.row + item] != WITH_STIFFNESS:
             return
         point = facets.point + item * facets.points + q
-        if at.state[world, point] != STIFF:
-            at.flux[world, point] = vec3()
-            t.turned[world, point] = vec2()
+        if scr.activity[world, point] != WITH_STIFFNESS:
+            scr.product[world, point] = vec3()
+            pair.facet_rotation[world, point] = vec2()
             return
-        f = t.listed[world, point] - 1
-        n = vec3(t.normal[world, point])
+        f = pair.listed_facet[world, point] - 1
+        n = vec3(pair.normal[world, point])
         d = vec3()
         e = vec2()
         for i in range(facets.conn.shape[0]):
             d += facets.shape[q, i, item] * p[world, facets.conn[i, item]]
         for i in range(mas.conn.shape[0]):
             own = p[world, mas.conn[i, f]]
-            d -= t.weight[world, point, i] * own
-            e += wp.dot(n, own) * t.slope[world, point, i]
-        a = t.lean[world, point, 0]
-        b = t.lean[world, point, 1]
-        g = t.bend[world, point]
+            d -= pair.shape_values[world, point, i] * own
+            e += wp.dot(n, own) * pair.shape_gradient[world, point, i]
+        a = pair.geometric_tangent[world, point, 0]
+        b = pair.geometric_tangent[world, point, 1]
+        g = pair.geometric_curvature[world, point]
         tau = vec2(wp.dot(a, d), wp.dot(b, d))
-        at.flux[world, point] = (
-            times(at.stiffness[world, point], d)
+        scr.product[world, point] = (
+            times(scr.stiffness[world, point], d)
             + (e[0] + g[3] * tau[0] + g[5] * tau[1]) * a
             + (e[1] + g[5] * tau[0] + g[4] * tau[1]) * b
         )
-        t.turned[world, point] = tau + vec2(g[0] * e[0] + g[2] * e[1], g[2] * e[0] + g[1] * e[1])
+        pair.facet_rotation[world, point] = tau + vec2(g[0] * e[0] + g[2] * e[1], g[2] * e[0] + g[1] * e[1])
 
     @wp.kernel(module=module)
     def product_sides(
-        mas: Masters, facets: Facets, active: wp.array(dtype=wp.int32), lanes: int, last: int, at: Attempt,
-        t: Touching, pool: wp.array2d(dtype=vec3),
+        mas: Masters, facets: Facets, active: wp.array(dtype=wp.int32), lanes: int, last: int, scr: ContactScratch,
+        pair: PairScratch, pool: wp.array2d(dtype=vec3),
     ):  # fmt: skip
         """Sums of the products on the slots of the slave facets, and of master facets where the launch includes
         them."""
@@ -332,41 +364,44 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         if entry < own:
             item = entry % facets.count
             i = entry / facets.count
-            if at.touched[world, facets.row + item] == STIFF:
+            if scr.facet_activity[world, facets.row + item] == WITH_STIFFNESS:
                 for q in range(lane, facets.points, lanes):
-                    out += facets.shape[q, i, item] * at.flux[world, facets.point + item * facets.points + q]
+                    out += facets.shape[q, i, item] * scr.product[world, facets.point + item * facets.points + q]
         else:
             entry -= own
             place = mas.pool + entry
             f = entry % mas.count
             i = entry / mas.count
-            first = t.start[world, f]
-            for k in range(lane, t.points[world, f], lanes):
-                point = t.entry[world, first + k]
-                out -= t.weight[world, point, i] * at.flux[world, point]
-                out += wp.dot(t.slope[world, point, i], t.turned[world, point]) * vec3(t.normal[world, point])
+            first = pair.list_start[world, f]
+            for k in range(lane, pair.list_size[world, f], lanes):
+                point = pair.list_point[world, first + k]
+                out -= pair.shape_values[world, point, i] * scr.product[world, point]
+                out += wp.dot(pair.shape_gradient[world, point, i], pair.facet_rotation[world, point]) * vec3(
+                    pair.normal[world, point]
+                )
         out = lane_sum(out, lanes)
         if lane == 0:
             pool[world, place] = out
 
     @wp.kernel(module=module)
     def diagonal_masters(
-        mas: Masters, active: wp.array(dtype=wp.int32), at: Attempt, t: Touching, pool: wp.array2d(dtype=sym)
+        mas: Masters, active: wp.array(dtype=wp.int32), scr: ContactScratch, pair: PairScratch,
+        pool: wp.array2d(dtype=sym)
     ):  # fmt: skip
         """3x3 diagonal blocks of master facets."""
         world, f, i = wp.tid()
         if active[world] == 0:
             return
         out = sym()
-        for k in range(t.points[world, f]):
-            point = t.entry[world, t.start[world, f] + k]
-            if at.state[world, point] == STIFF:
-                s = t.weight[world, point, i]
-                out += s * s * at.stiffness[world, point]
+        for k in range(pair.list_size[world, f]):
+            point = pair.list_point[world, pair.list_start[world, f] + k]
+            if scr.activity[world, point] == WITH_STIFFNESS:
+                s = pair.shape_values[world, point, i]
+                out += s * s * scr.stiffness[world, point]
         pool[world, mas.pool + i * mas.count + f] = out
 
     return _types.SimpleNamespace(
-        module=module, explicit_forces=explicit_forces, forces=forces, take_functions=take_functions,
+        module=module, explicit_forces=explicit_forces, forces=forces, update_friction_shapes=update_friction_shapes,
         gather_masters=gather_masters, product_points=product_points, product_sides=product_sides,
         diagonal_masters=diagonal_masters,
     )  # fmt: skip

@@ -30,7 +30,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import warp as wp
-from warpfea.kernels.terms.contact_data import RECORD
+from warpfea.kernels.terms.contact_structs import RECORD
 
 import warpfea as wf
 from warpfea.base.devices import find_device
@@ -134,8 +134,8 @@ def count_solves(sim: Simulation, steps: int) -> list[int]:
     assert isinstance(preconditioner, TwoLevel)
 
     def anew(active: wp.array) -> None:
-        loop.residual.take(active)
-        preconditioner.renew(active)
+        loop.residual.assemble_matrix(active)
+        preconditioner.discard(active)
         solve(active)
         counts.append(int(work.pcg.iterations.numpy()[0]))
 

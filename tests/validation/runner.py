@@ -15,7 +15,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NoReturn
 
 import warpfea as wf
-from warpfea.base.console import plain, quiet_warp, write_json
+from warpfea.base.console import quiet_warp, to_json, write_json
 from warpfea.base.devices import find_device
 from warpfea.base.errors import UsageError
 from warpfea.base.names import did_you_mean
@@ -155,7 +155,7 @@ def run(table: Table, given: Run, only: Sequence[str] | None = None, words: Sequ
             else:
                 content[name] = given.made[name]
             if given.out is not None and (not given.labels or any(given.made.values())):
-                write_json(str(given.out), plain(content))
+                write_json(str(given.out), to_json(content))
     if given.labels and not any(given.made.values()):
         raise UsageError(f"--rows {','.join(given.labels)}: no such row")
     return content

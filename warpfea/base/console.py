@@ -115,16 +115,16 @@ def write_json(target: str, content: dict[str, Any]) -> None:
         write_whole(pathlib.Path(target), lambda path: path.write_text(text))
 
 
-def plain(value: Any) -> Any:
+def to_json(value: Any) -> Any:
     """Convert to JSON types: lists for arrays and tuples, null for non-finite numbers."""
     if isinstance(value, dict):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): to_json(item) for key, item in value.items()}
     if isinstance(value, np.ndarray):
-        return plain(value.tolist())
+        return to_json(value.tolist())
     if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
+        return [to_json(item) for item in value]
     if isinstance(value, np.generic):
-        return plain(value.item())
+        return to_json(value.item())
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if value is None or isinstance(value, (bool, int, str)):

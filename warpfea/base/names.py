@@ -9,7 +9,7 @@ __all__ = ["did_you_mean", "listing"]
 
 CUTOFF = 0.6
 """Similarity, 0 to 1, from which a known name is suggested."""
-SHORT, SHORT_CUTOFF = 5, 0.75
+WARP_ROW, SHORT_CUTOFF = 5, 0.75
 """Maximum length of a short name, and its cutoff: one common letter is weaker evidence."""
 
 
@@ -39,7 +39,7 @@ def did_you_mean(name: object, known: Iterable[object]) -> str:
         plain.setdefault(_plain(text), text)
     if SYNONYMS.get(wanted) in plain.values():
         return f"; did you mean {SYNONYMS[wanted]!r}?"
-    found = difflib.get_close_matches(wanted, plain, n=1, cutoff=SHORT_CUTOFF if len(wanted) <= SHORT else CUTOFF)
+    found = difflib.get_close_matches(wanted, plain, n=1, cutoff=SHORT_CUTOFF if len(wanted) <= WARP_ROW else CUTOFF)
     found = found or [text for text in plain if sorted(text) == sorted(wanted)]
     return f"; did you mean {plain[found[0]]!r}?" if found else ""
 

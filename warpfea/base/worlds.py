@@ -9,10 +9,10 @@ import warp as wp
 
 from .errors import ModelError
 
-__all__ = ["chosen_worlds", "on_host", "per_world", "refuse"]
+__all__ = ["per_world", "refuse", "to_host", "worlds_mask"]
 
 
-def on_host(values: Any) -> np.ndarray:
+def to_host(values: Any) -> np.ndarray:
     """Array on the host or a device (Warp, or shared memory of another library). TypeError, ValueError for others."""
     if isinstance(values, wp.array):
         values = values.numpy()
@@ -23,7 +23,7 @@ def on_host(values: Any) -> np.ndarray:
     return np.asarray(values)
 
 
-def chosen_worlds(what: str, mask: Any, worlds: int) -> np.ndarray:
+def worlds_mask(what: str, mask: Any, worlds: int) -> np.ndarray:
     """(worlds,) flags from a mask or world indices; default all.
 
     Raises:
@@ -32,7 +32,7 @@ def chosen_worlds(what: str, mask: Any, worlds: int) -> np.ndarray:
     if mask is None:
         return np.ones(worlds, dtype=bool)
     try:
-        out = on_host(mask)
+        out = to_host(mask)
         known = out.dtype.kind in "biu" or out.size == 0
     except (TypeError, ValueError):
         known = False
@@ -59,7 +59,7 @@ def per_world(what: str, name: str, values: Any, worlds: int, row: tuple[int, ..
     """(worlds, *row) array of one value for all worlds, or one per world. ModelError for another shape."""
     one, each = f"{row}" if row else "a number", (worlds, *row)
     try:
-        out = np.asarray(on_host(values), dtype=float)
+        out = np.asarray(to_host(values), dtype=float)
     except (TypeError, ValueError):
         raise ModelError(f"{what}: {name} = {values!r} must be {one}, or one per world") from None
     if out.shape not in (row, each):

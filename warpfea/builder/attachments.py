@@ -12,10 +12,10 @@ from ..model import assembly
 from ..model.description import support_slots
 from ..model.discretisation import Discretisation
 from ..model.handles import MaterialPoint, NodeSet, SurfaceSet
-from ..model.joints import Part, Vector, constant
+from ..model.joints import Vector, VectorPart, constant
 from .checks import vector
 
-__all__ = ["COINCIDENT", "GROUND", "UNKNOWN", "Attachment", "Ground", "attach"]
+__all__ = ["COINCIDENT", "GROUND", "UNKNOWN_WEAKNESS", "Attachment", "Ground", "attach"]
 
 COINCIDENT = 1e-9
 """Distance of coincident points, relative to the size of their bodies."""
@@ -23,8 +23,8 @@ FLAT_SURFACE, FLAT_NODES = 1e-2, 1e-3
 """Variance of points across their plane, over that in it, below which the normal's rotation is undetermined by a
 fit.
 """
-ACROSS = 0.5
-UNKNOWN = 10.0
+WEAK_AXES = 0.5
+UNKNOWN_WEAKNESS = 10.0
 
 
 class Ground:
@@ -47,7 +47,7 @@ class Attachment:
         slots, weights, gradients: (n,), (n,), (n, 3): x = sum weights e, F = sum e gradients^T.
         known: (3, 3) projector on the directions n with known F n.
         weak: (3, 3) projector on those that a point constrains with almost no stiffness: a beam's axis, a shell's
-            tangents; in part (`ACROSS`) of a solid's face.
+            tangents; in part (`WEAK_AXES`) of a solid's face.
         label: for messages.
         child: the joint's child side.
     """
@@ -57,8 +57,8 @@ class Attachment:
     slots: np.ndarray
     weights: np.ndarray
     gradients: np.ndarray
-    known: np.ndarray
-    weak: np.ndarray
+    known_directions: np.ndarray
+    weak_directions: np.ndarray
     label: str
     child: bool
 
@@ -71,17 +71,17 @@ class Attachment:
         if np.linalg.norm(arm) > COINCIDENT * self.size:
             self._check(arm / np.linalg.norm(arm), what)
             weights = weights + self.gradients @ arm
-        return Vector(at, (Part(self.body, self.slots, weights, self.child),))
+        return Vector(at, (VectorPart(self.body, self.slots, weights, self.child),))
 
     def direction(self, n: np.ndarray, what: str) -> Vector:
         """F n."""
         if self.body is None:
             return constant(n)
         self._check(n, what)
-        return Vector(n, (Part(self.body, self.slots, self.gradients @ n, self.child),))
+        return Vector(n, (VectorPart(self.body, self.slots, self.gradients @ n, self.child),))
 
     def _check(self, n: np.ndarray, what: str) -> None:
-        lost = np.linalg.norm(n - self.known @ n)
+        lost = np.linalg.norm(n - self.known_directions @ n)
         if lost > 1e-6:
             raise ModelError(
                 f"{what}: {self.label} does not determine the rotation of direction {np.round(n, 6).tolist()}: give "
@@ -92,7 +92,10 @@ class Attachment:
         """0 for a direction carried by the section, director or solid, 1 for others; 10: not known."""
         if self.body is None:
             return 0.0
-        return float(np.linalg.norm(self.weak @ n) + UNKNOWN * (np.linalg.norm(n - self.known @ n) > 1e-6))
+        return float(
+            np.linalg.norm(self.weak_directions @ n)
+            + UNKNOWN_WEAKNESS * (np.linalg.norm(n - self.known_directions @ n) > 1e-6)
+        )
 
     @property
     def size(self) -> float:
@@ -207,6 +210,6 @@ def _of_surface(surface: SurfaceSet, child: bool) -> Attachment:
             np.add.at(gradients, body.connectivity[members], h)
             weak = rest @ _weak(body, assembly.orthonormal(J[0, 0])) @ rest
         if body.family.solid:  # the mean of F normal to a face includes the local strain; the in-plane fit does not
-            weak = ACROSS * rest
+            weak = WEAK_AXES * rest
     slots = np.flatnonzero((weights != 0.0) | gradients.any(axis=1))
     return Attachment(body, mean, slots, weights[slots], gradients[slots], np.eye(3), weak, label, child)

@@ -17,15 +17,15 @@ from ..mesh import Mesh
 
 __all__ = ["beam_geometry", "spline"]
 
-CORNER = math.radians(1.0)
+MAX_CORNER_ANGLE = math.radians(1.0)
 """Bend of a polyline, degrees, above which it has a corner."""
-KINK = 5.0
+MAX_KINK_ANGLE = 5.0
 """Maximum direction jump, degrees, of a curve given as a function."""
 STEPS = 32
 """Difference steps per element."""
-FORWARD = np.array([-147.0, 360.0, -450.0, 400.0, -225.0, 72.0, -10.0]) / 60.0
+FORWARD_WEIGHTS = np.array([-147.0, 360.0, -450.0, 400.0, -225.0, 72.0, -10.0]) / 60.0
 """Weights of f(0), f(h), ..., f(6 h) in h f'(0), of sixth order."""
-SMOOTH = 1e-4
+SLOPE_ROUNDOFF = 1e-4
 """Relative difference of the one-sided derivatives at a node that counts as rounding."""
 CHORDS = 8
 """Chords per element, for its total turning angle."""
@@ -70,7 +70,7 @@ class _Path:
 
     at: Callable[[float], np.ndarray]
     slope: Callable[[float, int], np.ndarray]
-    marks: tuple[float, ...] = ()
+    corner_parameters: tuple[float, ...] = ()
     turns: np.ndarray | None = None
 
 
@@ -93,10 +93,10 @@ def beam_geometry(
     if corners not in ("error", "weld"):
         raise ModelError(f"body {name!r}: corners = {corners!r} is neither 'error' nor 'weld'")
     path = _path(name, curve, int(elements), corners)
-    s = _parameters(name, int(elements), path.marks)
+    s = _parameters(name, int(elements), path.corner_parameters)
     points = np.array([path.at(k) for k in s])
     ends = [(path.slope(a, 1) * (b - a), path.slope(b, -1) * (b - a)) for a, b in itertools.pairwise(s)]
-    _check_turns(name, s, ends, path.turns, sharp_allowed=bool(path.marks))
+    _check_turns(name, s, ends, path.turns, sharp_allowed=bool(path.corner_parameters))
     frames = np.array(
         [[_frame(name, x, k, section, normal) for x, k in zip(pair, s[e : e + 2])] for e, pair in enumerate(ends)]
     )
@@ -128,7 +128,7 @@ def _check_turns(
         )
     for k in range(1, len(ends)):
         kink = float(_angles(np.array([ends[k - 1][1], ends[k][0]]))[0])
-        if kink > KINK and not sharp_allowed:
+        if kink > MAX_KINK_ANGLE and not sharp_allowed:
             _refuse_corner(name, kink, s[k])
 
 
@@ -168,11 +168,11 @@ def _frame(name: str, tangent: np.ndarray, s: float, section: Rectangle, normal:
     return np.stack([tangent, section.width * np.cross(n, t), section.height * n], axis=1)
 
 
-def _parameters(name: str, elements: int, marks: tuple[float, ...]) -> np.ndarray:
+def _parameters(name: str, elements: int, corner_parameters: tuple[float, ...]) -> np.ndarray:
     """Node parameters, evenly spaced between marks, which are nodes."""
-    if not marks:
+    if not corner_parameters:
         return np.linspace(0.0, 1.0, elements + 1)
-    edges = np.array([0.0, *marks, 1.0])
+    edges = np.array([0.0, *corner_parameters, 1.0])
     share = np.diff(edges)
     if elements < len(share):
         raise ModelError(f"body {name!r}: {elements} elements for {len(share)} sides; each side needs one at least")
@@ -197,7 +197,7 @@ def _path(name: str, curve: Any, elements: int, corners: str) -> _Path:
         raise ModelError(f"body {name!r}: point {int(np.argmin(size)) + 1} of the curve repeats the one before")
     straight = chord / size[:, None]
     bend = np.arccos(np.clip(np.sum(straight[1:] * straight[:-1], axis=1), -1.0, 1.0))
-    sharp = np.flatnonzero(bend > CORNER)
+    sharp = np.flatnonzero(bend > MAX_CORNER_ANGLE)
     if len(sharp) and corners == "error":
         k = int(sharp[0]) + 1
         raise ModelError(
@@ -213,8 +213,8 @@ def _path(name: str, curve: Any, elements: int, corners: str) -> _Path:
         k = np.searchsorted(at, s + which * 1e-9, side="right") - 1
         return straight[min(max(int(k), 0), len(straight) - 1)] * size.sum()
 
-    marks = tuple(at[1:-1][bend > 0.0]) if len(sharp) else ()
-    return _Path(lambda s: np.array([np.interp(s, at, ends[:, c]) for c in range(3)]), side, marks)
+    corner_parameters = tuple(at[1:-1][bend > 0.0]) if len(sharp) else ()
+    return _Path(lambda s: np.array([np.interp(s, at, ends[:, c]) for c in range(3)]), side, corner_parameters)
 
 
 def _function_path(name: str, curve: Callable[[float], Any], elements: int) -> _Path:
@@ -237,7 +237,7 @@ def _function_path(name: str, curve: Callable[[float], Any], elements: int) -> _
 
     def one_sided(s: float, side: int) -> np.ndarray:
         h = side / (STEPS * elements)
-        return FORWARD @ np.array([at(min(max(s + k * h, 0.0), 1.0)) for k in range(len(FORWARD))]) / h
+        return FORWARD_WEIGHTS @ np.array([at(min(max(s + k * h, 0.0), 1.0)) for k in range(len(FORWARD_WEIGHTS))]) / h
 
     @functools.lru_cache(maxsize=2)
     def sides(s: float) -> tuple[np.ndarray, np.ndarray]:
@@ -245,7 +245,7 @@ def _function_path(name: str, curve: Callable[[float], Any], elements: int) -> _
             end = one_sided(s, 1 if s == 0.0 else -1)
             return end, end
         left, right = one_sided(s, -1), one_sided(s, 1)
-        if np.linalg.norm(left - right) < SMOOTH * np.linalg.norm(left + right):
+        if np.linalg.norm(left - right) < SLOPE_ROUNDOFF * np.linalg.norm(left + right):
             left = right = 0.5 * (left + right)
         return left, right
 
@@ -260,10 +260,10 @@ def _turns(name: str, at: Callable[[float], np.ndarray], elements: int) -> np.nd
     grid = np.linspace(0.0, 1.0, CHORDS * elements + 1)
     turns = _angles(np.diff([at(s) for s in grid], axis=0))
     pairs = turns + np.append(turns[1:], 0.0)  # a corner between two points of the grid is split between both
-    for k in np.flatnonzero(pairs > 2.0 * KINK):
+    for k in np.flatnonzero(pairs > 2.0 * MAX_KINK_ANGLE):
         low, high = grid[k], grid[min(int(k) + 3, CHORDS * elements)]
         angle, where = _closest_turn(at, low, high)
-        if angle > KINK:
+        if angle > MAX_KINK_ANGLE:
             _refuse_corner(name, angle, where)
     inner = np.append(turns, 0.0).reshape(elements, CHORDS)[:, :-1]
     return np.asarray(inner.sum(axis=1))
@@ -277,7 +277,7 @@ def _closest_turn(at: Callable[[float], np.ndarray], low: float, high: float) ->
     for _ in range(HALVINGS):
         s = np.linspace(low, high, 5)
         turns = _angles(np.diff([at(k) for k in s], axis=0))
-        if turns.sum() <= KINK:
+        if turns.sum() <= MAX_KINK_ANGLE:
             break
         k = int(np.argmax(turns))
         low, high = float(s[k]), float(s[k + 2])

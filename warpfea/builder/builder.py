@@ -158,7 +158,7 @@ class ModelBuilder:
 
     def _add(self, body: Body, initial: Any) -> Body:
         body.index = len(self.bodies)
-        loads.start_from(body, initial)
+        loads.set_initial_positions(body, initial)
         self.bodies.append(body)
         return body
 

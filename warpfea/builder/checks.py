@@ -12,13 +12,13 @@ import warp as wp
 
 from ..base.errors import MeshWarning, ModelError, ModelWarning
 from ..base.names import did_you_mean, listing
-from ..laws import Control, TimeLaw, time_law
 from ..materials import Material
 from ..mesh import Mesh
 from ..model.assembly import require_density
 from ..model.bodies import Body
 from ..model.description import Description
 from ..model.handles import ElementSet, MaterialPoint, NodeSet, SurfaceSet
+from ..time_laws import Control, TimeLaw, time_law
 
 __all__ = [
     "COMPONENTS",

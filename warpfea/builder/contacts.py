@@ -9,7 +9,6 @@ import numpy as np
 from ..base.checks import is_count, is_number
 from ..base.errors import ModelError
 from ..base.names import did_you_mean
-from ..laws import time_law
 from ..model.bodies import Body
 from ..model.contact_points import check_points
 from ..model.contacts import Collider, ColliderRotation, Contact
@@ -18,6 +17,7 @@ from ..model.handles import SurfaceSet
 from ..model.pairs import PAIR_RULES, PairContact, choose_master
 from ..model.shapes import Shape
 from ..model.triangle_mesh import TriMesh
+from ..time_laws import time_law
 from .bodies import unused_name
 from .checks import vector
 

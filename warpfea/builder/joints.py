@@ -18,10 +18,10 @@ import numpy as np
 
 from ..base.errors import ModelError
 from ..base.names import did_you_mean
-from ..kernels.terms.constraints import DISTANCE, DOT, TURN
-from ..laws import TimeLaw, time_law
+from ..kernels.terms.constraints import ANGLE, DISTANCE, DOT
 from ..model.joints import Joint, Row, Vector, constant
-from .attachments import COINCIDENT, GROUND, UNKNOWN, Attachment, Ground, attach
+from ..time_laws import TimeLaw, time_law
+from .attachments import COINCIDENT, GROUND, UNKNOWN_WEAKNESS, Attachment, Ground, attach
 from .checks import vector
 
 __all__ = ["GROUND", "JOINTS", "Ground", "make_constraint", "make_joint", "pin_rows"]
@@ -126,7 +126,7 @@ def _driven(
             f"{what}: rotation angle about the axis undetermined by {P.label} and {Q.label}: give more nodes"
         )
     first, second, turned = angle
-    return Row(TURN, first, turned, 1.0, second, law, angular=True)
+    return Row(ANGLE, first, turned, 1.0, second, law, angular=True)
 
 
 def _between(P: Attachment, Q: Attachment) -> str:
@@ -159,8 +159,8 @@ def _locked(P: Attachment, Q: Attachment, what: str) -> list[Row]:
     """Three DP1 between two aligned triads, the pairs chosen among directions that both sides carry."""
     triads = [np.eye(3)]
     for side in (Q, P):
-        if side.body is not None and side.weak.any():
-            _, vectors = np.linalg.eigh(side.weak)
+        if side.body is not None and side.weak_directions.any():
+            _, vectors = np.linalg.eigh(side.weak_directions)
             triads.append(vectors.T)
     best = None
     for triad in triads:
@@ -180,8 +180,8 @@ def _pair(n: np.ndarray, P: Attachment, Q: Attachment) -> tuple[np.ndarray, np.n
     """Two directions completing a right-handed triad (u, w, n), along the weakly held direction if any."""
     u = _perpendicular(n)
     for side in (Q, P):
-        if side.body is not None and side.weak.any():
-            lean = side.weak - np.outer(side.weak @ n, n)
+        if side.body is not None and side.weak_directions.any():
+            lean = side.weak_directions - np.outer(side.weak_directions @ n, n)
             values, vectors = np.linalg.eigh((lean + lean.T) / 2.0)
             first = vectors[:, -1] - (vectors[:, -1] @ n) * n
             if np.linalg.norm(first) > 1e-6:
@@ -198,7 +198,7 @@ def _angle(n: np.ndarray, u: np.ndarray, w: np.ndarray, P: Attachment, Q: Attach
             cost = pair.weakness(u) + pair.weakness(w) + other.weakness(first)
             options.append((round(cost, 9), len(options), pair, other, first, sign * second))
     cost, _, pair, other, first, second = min(options, key=lambda option: option[:2])
-    if cost >= UNKNOWN:
+    if cost >= UNKNOWN_WEAKNESS:
         return None
     return pair.direction(first, what), pair.direction(second, what), other.direction(first, what)
 

@@ -8,12 +8,12 @@ import numpy as np
 import warp as wp
 
 from ..base.errors import ModelError
-from ..laws import time_law
 from ..model.assembly import surface_weights
 from ..model.bodies import Body
 from ..model.description import DeadLoad, Moment, Pressure, Probe, support_slots
 from ..model.handles import MaterialPoint, NodeSet, SurfaceSet
 from ..model.masses import center_of_mass
+from ..time_laws import time_law
 from .checks import slot_field, vector
 
 __all__ = [
@@ -22,9 +22,9 @@ __all__ = [
     "follower_pressure",
     "point_load",
     "probe_at",
+    "set_initial_positions",
     "set_initial_state",
     "spin_moment",
-    "start_from",
 ]
 
 
@@ -87,7 +87,7 @@ def check_field(field: Any) -> None:
         )
 
 
-def start_from(body: Body, initial: Any) -> None:
+def set_initial_positions(body: Body, initial: Any) -> None:
     """Initial positions of a body as an argument of the methods of ModelBuilder that add one; None: the reference."""
     if initial is not None:
         start, reference = slot_field(body, initial, f"body {body.name!r}: initial"), slot_field(body, lambda X: X, "")

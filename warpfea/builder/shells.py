@@ -12,7 +12,7 @@ from ..mesh import Mesh
 
 __all__ = ["shell_geometry"]
 
-CORNER = math.radians(30.0)
+MAX_CORNER_ANGLE = math.radians(30.0)
 
 
 def shell_geometry(name: str, mesh: Mesh, thickness: Any, normals: Any, corners: str) -> tuple[np.ndarray, np.ndarray]:
@@ -44,7 +44,7 @@ def shell_geometry(name: str, mesh: Mesh, thickness: Any, normals: Any, corners:
     director = _directors(label, mesh, normal, normals)
     d = director[mesh.cells]
     agree = np.sum(d * normal, axis=2)
-    sharp = agree < math.cos(CORNER)
+    sharp = agree < math.cos(MAX_CORNER_ANGLE)
     if sharp.any() and corners == "error":
         e, n = np.unravel_index(int(np.argmin(agree)), agree.shape)
         raise ModelError(

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from ..base.errors import ModelError
-from ..laws import time_law
 from ..model.bodies import Body
 from ..model.description import Rotation, Support, support_slots
 from ..model.handles import NodeSet
+from ..time_laws import time_law
 from .checks import component_mask, vector
 
 __all__ = ["clamp_support", "drive_supports"]

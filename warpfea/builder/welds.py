@@ -12,18 +12,18 @@ from ..model.bodies import Body
 from ..model.description import support_slots
 from ..model.discretisation import Discretisation
 from ..model.handles import NodeSet, SurfaceSet
-from ..model.joints import Joint, Part, Vector
+from ..model.joints import Joint, Vector, VectorPart
 from ..model.locate import locate
 from ..model.surfaces import named_faces
 from .joints import pin_rows
 
 __all__ = ["make_weld"]
 
-PER_ELEMENT = 2.0
-MOST_PARTS = 8
-NEAR = 0.5
+PARTS_PER_ELEMENT = 2.0
+MAX_PARTS = 8
+SURFACE_TOL = 0.5
 """Distance from a surface's points, over its size, beyond which a face is off it."""
-SLACK = 1e-4
+GAP_TOL = 1e-4
 """Bridged gap over the element size: files hold rounded coordinates."""
 
 
@@ -87,7 +87,7 @@ def _parts(face: SurfaceSet, holder: Discretisation) -> int:
     _, dA = assembly.facet_places(face.body, assembly.facet_tables(face))
     area = float(dA.sum(axis=1).max())
     size = np.cbrt(float(np.median(assembly.element_volumes(holder))))
-    return int(np.clip(np.ceil(PER_ELEMENT * np.sqrt(area) / size), 1, MOST_PARTS))
+    return int(np.clip(np.ceil(PARTS_PER_ELEMENT * np.sqrt(area) / size), 1, MAX_PARTS))
 
 
 def _pins(nodes: NodeSet, holder: Discretisation, within: SurfaceSet | None, what: str) -> tuple[list[Vector], Vector]:
@@ -115,7 +115,7 @@ def _check_near(X: np.ndarray, within: SurfaceSet | None, what: str) -> None:
     body = within.body
     x = assembly.facet_places(body, assembly.facet_tables(within))[0].reshape(-1, 3)
     low, high = x.min(axis=0), x.max(axis=0)
-    slack = NEAR * float(np.linalg.norm(high - low))
+    slack = SURFACE_TOL * float(np.linalg.norm(high - low))
     off = np.flatnonzero(((low - slack > X) | (high + slack < X)).any(axis=1))
     if len(off):
         raise ModelError(
@@ -126,16 +126,16 @@ def _check_near(X: np.ndarray, within: SurfaceSet | None, what: str) -> None:
 
 def _locate(holder: Discretisation, X: np.ndarray, what: str) -> Any:
     try:
-        return locate(holder, X, slack=SLACK)
+        return locate(holder, X, slack=GAP_TOL)
     except ModelError as error:
         raise ModelError(f"{what}: {error}; the welded face must lie in the other body") from None
 
 
 def _gap(body: Discretisation, holder: Discretisation, own: np.ndarray, other: np.ndarray) -> Vector:
     a, b = np.flatnonzero(own), np.flatnonzero(other)
-    return Vector(np.zeros(3), (Part(body, a, own[a], True), Part(holder, b, -other[b], False)))
+    return Vector(np.zeros(3), (VectorPart(body, a, own[a], True), VectorPart(holder, b, -other[b], False)))
 
 
 def _anchor(body: Discretisation, weights: np.ndarray, X: np.ndarray) -> Vector:
     slots = np.flatnonzero(weights)
-    return Vector(X, (Part(body, slots, weights[slots], True),))
+    return Vector(X, (VectorPart(body, slots, weights[slots], True),))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from .arguments import Once, add_general, call, count, positive
+from .arguments import StoreOnce, add_general, call, count, positive
 
 __all__ = ["SCENE", "add_accuracy"]
 
@@ -90,7 +90,9 @@ def add_accuracy(names: Any) -> None:
     )
     to.add_argument("--repeat", type=count, default=3, metavar="N", help="runs for the times (default 3)")
     to.add_argument("--limit", type=positive, metavar="S", help="s, after which a run is given up")
-    to.add_argument("--out", action=Once, metavar="FOLDER", help="NAME.csv, .json, .png, and what is needed to go on")
+    to.add_argument(
+        "--out", action=StoreOnce, metavar="FOLDER", help="NAME.csv, .json, .png, and what is needed to go on"
+    )
     to.add_argument("--name", metavar="NAME", help="of the files (default: the scene's)")
     add_general(to, "no bars, no table")
     to.set_defaults(command=call("study", "accuracy"))

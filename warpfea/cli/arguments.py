@@ -13,8 +13,8 @@ from ..base.errors import UsageError
 from ..base.names import did_you_mean
 
 __all__ = [
-    "Once",
     "Parser",
+    "StoreOnce",
     "add_general",
     "call",
     "color_range",
@@ -46,7 +46,7 @@ class Parser(argparse.ArgumentParser):
         raise UsageError(f"{message} (see {self.prog} --help)")
 
 
-class Once(argparse.Action):
+class StoreOnce(argparse.Action):
     """Store the value of an output option: a second value would discard a file."""
 
     def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option: str | None = None) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 from ..base.errors import UsageError
 from ..base.names import did_you_mean
 from .accuracy import SCENE, add_accuracy
-from .arguments import Once, Parser, add_general, call, count, counts, positive
+from .arguments import Parser, StoreOnce, add_general, call, count, counts, positive
 
 __all__ = ["add_bench", "add_profile", "add_stress", "add_study", "with_scene"]
 
@@ -178,7 +178,9 @@ def add_stress(commands: Any) -> None:
     to.add_argument("--device", help="cpu, cuda:0, ...; by default CUDA where there is one")
     to.add_argument("--dtype", choices=("float64", "float32", "both"), default="both", help="precision (default both)")
     to.add_argument("--meshes", metavar="FOLDER", help="meshes of the soft solids (mat.msh, ...); without: left out")
-    to.add_argument("--json", action=Once, metavar="FILE", help="rows with all numbers, kept after each; - for stdout")
+    to.add_argument(
+        "--json", action=StoreOnce, metavar="FILE", help="rows with all numbers, kept after each; - for stdout"
+    )
     to.add_argument("--resume", action="store_true", help="keep the rows that --json holds, of the same commit")
     add_general(to, "no bars, no table: which rows failed, and the exit code")
     to.set_defaults(command=call("stress", "stress"))

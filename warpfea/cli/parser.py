@@ -9,11 +9,11 @@ from typing import Any
 
 from ..base.errors import UsageError
 from ..base.names import did_you_mean
-from ..simulation.statics import UNSTABLE
+from ..simulation.statics import UNSTABLE_CHOICES
 from ..solvers import SOLVERS
 from .arguments import (
-    Once,
     Parser,
+    StoreOnce,
     add_general,
     call,
     color_range,
@@ -201,23 +201,29 @@ def _add_run(commands: Any) -> None:
     )
     to.add_argument(
         "--unstable",
-        choices=UNSTABLE,
+        choices=UNSTABLE_CHOICES,
         help="of --static: warn of an unstable equilibrium (default), refuse it, or do not judge it",
     )
     out = to.add_argument_group("output (existing files are replaced once the new one is whole)")
     out.add_argument(
-        "--usd", action=Once, metavar="FILE", help="animation (.usdc, .usda) with stress and displacement; validated"
+        "--usd",
+        action=StoreOnce,
+        metavar="FILE",
+        help="animation (.usdc, .usda) with stress and displacement; validated",
     )
-    out.add_argument("--vtu", action=Once, metavar="FOLDER", help="series of .vtu and a .pvd for ParaView")
-    out.add_argument("--png", action=Once, metavar="FILE", help="picture")
+    out.add_argument("--vtu", action=StoreOnce, metavar="FOLDER", help="series of .vtu and a .pvd for ParaView")
+    out.add_argument("--png", action=StoreOnce, metavar="FILE", help="picture")
     out.add_argument("--png-time", type=float, metavar="S", help="time of the picture")
-    out.add_argument("--gif", action=Once, metavar="FILE", help="animation")
+    out.add_argument("--gif", action=StoreOnce, metavar="FILE", help="animation")
     _add_look(out)
     out.add_argument("--fps", type=positive, metavar="N", help="frames per simulated second of --usd and --vtu")
     out.add_argument("--speed", type=positive, metavar="X", help="simulated seconds per second of --gif")
-    out.add_argument("--json", action=Once, metavar="FILE", help="summary of the run; - for stdout")
+    out.add_argument("--json", action=StoreOnce, metavar="FILE", help="summary of the run; - for stdout")
     out.add_argument(
-        "--checkpoint", action=Once, metavar="FILE", help="state (.npz), written every --every steps and at the end"
+        "--checkpoint",
+        action=StoreOnce,
+        metavar="FILE",
+        help="state (.npz), written every --every steps and at the end",
     )
     out.add_argument("--every", type=count, metavar="N", help="steps between checkpoints (default 100)")
     out.add_argument(

@@ -8,7 +8,7 @@ import statistics
 import sys
 from typing import Any
 
-from ..base.console import number, plain, quiet_warp, table, write_json
+from ..base.console import number, quiet_warp, table, to_json, write_json
 from ..base.provenance import machine, versions
 from ..base.writer import write_whole
 from ..simulation.simulation import Simulation
@@ -118,7 +118,7 @@ def _content(source: Source, sim: Simulation, found: Profile) -> dict[str, Any]:
         "versions": versions(),
     }
     assert tuple(content) == KEYS
-    return {name: plain(value) for name, value in content.items()}
+    return {name: to_json(value) for name, value in content.items()}
 
 
 def _row(k: KernelTime, found: Profile) -> dict[str, float | None]:

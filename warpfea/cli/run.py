@@ -13,7 +13,7 @@ from ..base.console import quiet_warp, write_json
 from ..base.errors import ConstraintError, ConvergenceError, OutputError, StabilityError, UsageError
 from ..base.names import did_you_mean
 from ..base.writer import Output, check_folder, check_target
-from ..kernels.step.control import SAME_TIME
+from ..kernels.step.step_control import SAME_TIME
 from ..model.model import Model
 from ..simulation.checkpoint import SUFFIXES as CHECKPOINT_SUFFIXES
 from ..simulation.checkpoint import Checkpoint, load_checkpoint, read_meta
@@ -35,7 +35,7 @@ TARGETS: dict[str, Sequence[str]] = {
     "checkpoint": CHECKPOINT_SUFFIXES,
 }
 
-EVERY = 100
+CHECKPOINT_STEPS = 100
 """Steps between checkpoints."""
 STATIC_SPEED = 0.5
 """Load factor per second of an animation of --static."""
@@ -52,7 +52,7 @@ def run(options: argparse.Namespace) -> int:
     t_end = options.t_end or source.scene.t_end
     _check_times(options, source, t_end)
     outputs = make_outputs(options, source, t_end)
-    before = {file: _mark(file) for file in _files(options).values()}
+    before = {file: _file_stamp(file) for file in _files(options).values()}
     with quiet_warp():
         model = source.model()
         _check_field(options.field, model)
@@ -121,7 +121,7 @@ def check_targets(options: argparse.Namespace) -> None:
         check_folder(folder if folder.is_dir() else folder.parent, folder)
 
 
-FOR_MOTION = ("t_end", "dt", "error", "integrator", "png_time", "checkpoint", "resume")
+MOTION_ONLY = ("t_end", "dt", "error", "integrator", "png_time", "checkpoint", "resume")
 
 
 def _check_kind(options: argparse.Namespace) -> None:
@@ -134,14 +134,14 @@ def _check_kind(options: argparse.Namespace) -> None:
         if options.unstable:
             raise UsageError("--unstable is for --static")
         return
-    given = [name for name in FOR_MOTION if getattr(options, name) is not None]
+    given = [name for name in MOTION_ONLY if getattr(options, name) is not None]
     if given:
         raise UsageError(f"--{given[0].replace('_', '-')} is for a motion; --static finds the equilibrium at full load")
     if options.solver != "newton-pcg":
         raise UsageError(f"--solver {options.solver} is for a motion; --static needs newton-pcg")
 
 
-USES = {
+OPTION_OUTPUTS = {
     "field": ("pictures", ("png", "gif", "usd")),
     "range": ("pictures", ("png", "gif", "usd")),
     "view": ("pictures", ("png", "gif")),
@@ -155,7 +155,7 @@ USES = {
 
 def _check_look(options: argparse.Namespace) -> None:
     """UsageError for options of missing outputs, and for outputs that can't be extended after --resume."""
-    for name, (what, uses) in USES.items():
+    for name, (what, uses) in OPTION_OUTPUTS.items():
         if getattr(options, name) is not None and not any(getattr(options, use) for use in uses):
             option, outputs = name.replace("_", "-"), " or ".join(f"--{use}" for use in uses)
             raise UsageError(f"--{option} is for {what}: give {outputs} too")
@@ -214,7 +214,7 @@ def make_outputs(options: argparse.Namespace, source: Source, t_end: float) -> l
         speed = options.speed or (STATIC_SPEED if options.static else source.scene.speed)
         out.append(GIFWriter(options.gif, speed=speed, progress=progress(options), **look))
     if options.checkpoint:
-        out.append(Checkpoint(options.checkpoint, every=options.every or EVERY))
+        out.append(Checkpoint(options.checkpoint, every=options.every or CHECKPOINT_STEPS))
     return out
 
 
@@ -227,7 +227,7 @@ def _files(options: argparse.Namespace) -> dict[str, pathlib.Path]:
     return files
 
 
-def _mark(file: pathlib.Path) -> tuple[int, int] | None:
+def _file_stamp(file: pathlib.Path) -> tuple[int, int] | None:
     """File identity (inode, time, size), or None: detects whether a writer replaced the file."""
     try:
         stat = file.stat()
@@ -241,6 +241,6 @@ def _written(options: argparse.Namespace, before: dict[pathlib.Path, Any]) -> li
     notes: dict[str, Any] = {"usd": "validated, for usdview, Blender, Omniverse", "vtu": "for ParaView"}
     texts = []
     for name, file in _files(options).items():
-        if _mark(file) not in (None, before[file]):
+        if _file_stamp(file) not in (None, before[file]):
             texts.append(f"{getattr(options, name)}" + (f"  ({notes[name]})" if name in notes else ""))
     return texts

@@ -8,16 +8,16 @@ import sys
 from typing import Any
 
 from .. import mesh as meshes
-from ..base.console import number, plain, quiet_warp, size, table, write_json
+from ..base.console import number, quiet_warp, size, table, to_json, write_json
 from ..base.errors import UsageError
 from ..builder.scene import Scene, find, names
 from . import DONE
 from .arguments import existing
+from .mesh_scene import mesh_facts
 from .parser import MATERIAL_HINT
-from .part import mesh_facts
 from .run import check_targets
 from .source import find_scene, is_mesh, load, progress, resolve
-from .summary import MANY, box_text, mass_text, model_box
+from .summary import MAX_ROWS, box_text, mass_text, model_box
 
 __all__ = ["info", "render", "scenes"]
 
@@ -76,7 +76,7 @@ def info(options: argparse.Namespace) -> int:
         content["modules"] = sorted(launcher.modules)
         content["launches"] = launcher.launches
     if options.json:
-        write_json(options.json, plain(content))
+        write_json(options.json, to_json(content))
     if options.json != "-":
         print(_info_table(content))
     return DONE
@@ -86,7 +86,7 @@ def _mesh_info(options: argparse.Namespace) -> int:
     """Contents of a mesh file, without a material."""
     facts = mesh_facts(meshes.read(existing(options.what), scale=options.scale or 1.0))
     if options.json:
-        write_json(options.json, plain({"scene": options.what, "mesh": facts}))
+        write_json(options.json, to_json({"scene": options.what, "mesh": facts}))
     if options.json != "-":
         print(table([["mesh", options.what], *_mesh_rows(facts)]))
         if not options.quiet:
@@ -149,7 +149,7 @@ def _body_rows(bodies: list[dict[str, Any]]) -> list[list[str]]:
         rules, materials = ", ".join(body["quadrature"]), ", ".join(body["materials"])
         what = f"{body['elements']} {body['element']} elements, {rules}, {body['nodes']} nodes, {materials}"
         texts[body["name"]] = what
-    if len(bodies) <= MANY:
+    if len(bodies) <= MAX_ROWS:
         return [[f"body {name}", what] for name, what in texts.items()]
     alike: dict[str, list[str]] = {}
     for name, what in texts.items():
@@ -162,7 +162,7 @@ def _body_rows(bodies: list[dict[str, Any]]) -> list[list[str]]:
 
 def _joint_rows(joints: list[dict[str, Any]]) -> list[list[str]]:
     """A row for each joint; many are counted by kind."""
-    if len(joints) <= MANY:
+    if len(joints) <= MAX_ROWS:
         return [[f"joint {j['name']}", f"{j['kind']}, {j['rows']} equations, {j['between']}"] for j in joints]
     counts: dict[str, list[int]] = {}
     for j in joints:
@@ -177,7 +177,7 @@ def _bodies(c: dict[str, Any]) -> str:
 
 def _contact_rows(contacts: list[dict[str, Any]]) -> list[list[str]]:
     """A row for each contact; a count for many."""
-    if len(contacts) > MANY:
+    if len(contacts) > MAX_ROWS:
         left = sum(c["left_out"] for c in contacts)
         return [["contacts", f"{len(contacts)}, {sum(c['points'] for c in contacts)} points{_clamped(left)}"]]
     return [

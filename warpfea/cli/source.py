@@ -16,7 +16,7 @@ from ..simulation.simulation import Simulation
 from ..simulation.statics import begin_static
 from ..solvers import SOLVERS
 from .arguments import existing
-from .part import OPTIONS, part_scene
+from .mesh_scene import OPTIONS, mesh_scene
 
 __all__ = ["Source", "find_scene", "is_mesh", "load", "progress", "resolve"]
 
@@ -125,7 +125,7 @@ def resolve(options: argparse.Namespace, checkpoint: dict[str, Any] | None = Non
     """Scene and options of `run` and `info`; dt, integrator and precision of a checkpoint override the scene's."""
     saved = checkpoint or {}
     if is_mesh(options.what):
-        found, parameters = part_scene(options)
+        found, parameters = mesh_scene(options)
         values: dict[str, Any] = {}
     else:
         given = [name for name in OPTIONS if getattr(options, name)]

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from ..base.console import number, plain, table
+from ..base.console import number, table, to_json
 from ..base.provenance import versions
-from ..kernels.elements.materials import ANY_J
-from ..kernels.step.control import SAME_TIME
+from ..kernels.elements.materials import DEFINED_FOR_ANY_J
+from ..kernels.step.step_control import SAME_TIME
 from ..model.model import Model
 from ..simulation.energy_growth import integrator_share
 from ..simulation.simulation import Simulation
@@ -55,22 +55,22 @@ KEYS = (
     "contacts",
     "stable",
 )
-MANY = 12
+MAX_ROWS = 12
 """Maximum number of joints and contacts listed one by one."""
-WORST = 4
+SHOWN_ROWS = 4
 """Number of joints and contacts listed of more."""
-SHARE = 0.05
+INTEGRATOR_SHARE = 0.05
 """Numerical dissipation over the energy exchanged above which the summary suggests another scheme."""
-LESS = {
+LESS_DISSIPATION = {
     "backward_euler": "--integrator bdf2 takes far less of slow motion, energy_momentum nothing; a smaller --dt less",
     "bdf2": "--integrator energy_momentum takes nothing, a smaller --dt less",
     "generalized_alpha": "--integrator energy_momentum takes nothing, a larger rho_inf or a smaller --dt less",
     "energy_momentum": "contact takes it at the end of steps; a smaller --dt takes less",
 }
 """Suggestion for large numerical dissipation."""
-ADDED = "--integrator bdf2 or 'energy_momentum(rho_inf=0.8)', or a smaller --dt"
+ADDED_ENERGY = "--integrator bdf2 or 'energy_momentum(rho_inf=0.8)', or a smaller --dt"
 """Suggestion after a warning that generalized-alpha adds energy."""
-NO_J = 1e30
+NO_MIN_J = 1e30
 """Reported min J without elements that have one."""
 
 
@@ -126,7 +126,7 @@ def summarize(
         "newton_iterations": int(sim.totals["newton"].sum()),
         "pcg_iterations": int(sim.totals["pcg"].sum()),
         "max_residual": sim.max_residual,
-        "min_J": sim.min_J if sim.min_J < NO_J else None,
+        "min_J": sim.min_J if sim.min_J < NO_MIN_J else None,
         "rough_steps": int(sim.totals["rough"].sum()),
         "floored_steps": int(sim.totals["floored"].sum()),
         "max_floor": sim.max_floor,
@@ -141,7 +141,7 @@ def summarize(
         "stable": None if sim.last is None or sim.last.stable is None else sim.last.stable[0],
     }
     assert tuple(content) == KEYS
-    return {name: plain(value) for name, value in content.items()}
+    return {name: to_json(value) for name, value in content.items()}
 
 
 def human(summary: dict[str, Any], sim: Simulation, wrote: Sequence[str]) -> str:
@@ -203,9 +203,9 @@ def _times(s: dict[str, Any]) -> str:
 def _suggestion(sim: Simulation) -> list[list[str]]:
     """A row suggesting other schemes if the integrator dissipates or adds much of the energy exchanged."""
     share, name = integrator_share(sim), sim.integrator.name
-    if not share > SHARE:
+    if not share > INTEGRATOR_SHARE:
         return []
-    text = ADDED if name == "generalized_alpha" and sim.energy_growth.told else LESS[name]
+    text = ADDED_ENERGY if name == "generalized_alpha" and sim.energy_growth.warned else LESS_DISSIPATION[name]
     return [["", f"that is {share:.0%} of the energy turned over: {text}"]]
 
 
@@ -237,7 +237,7 @@ def mass_text(mass: float | None) -> str:
 
 def _inverted(J: float, model: Model) -> str:
     """Text of J <= 0: laws that need J > 0 forbid it at the quadrature points, not at the vertices."""
-    if any(block.key.law in ANY_J for block in model.blocks):
+    if any(block.key.law in DEFINED_FOR_ANY_J for block in model.blocks):
         advice = "take a finer mesh, smaller loads or a law that forbids it (neo_hookean)"
         return f"an element turned inside out: J = {number(J, 3)}; {advice}"
     return f"J = {number(J, 3)} at a vertex of an element: take a finer mesh or smaller loads"
@@ -264,7 +264,7 @@ def _joints(sim: Simulation) -> list[list[str]]:
     """A row for each joint at the end; of many the most violated ones and a count."""
     joints = sim.model.constraints.joints if sim.model.constraints else []
     violation = np.array([sim.violation(joint)[0] for joint in joints])
-    shown = range(len(joints)) if len(joints) <= MANY else np.argsort(-violation, kind="stable")[:WORST]
+    shown = range(len(joints)) if len(joints) <= MAX_ROWS else np.argsort(-violation, kind="stable")[:SHOWN_ROWS]
     rows = []
     for k in shown:
         text = f"{joints[k].kind}, violation {_text(violation[k], 2)} m"
@@ -292,7 +292,7 @@ def _contacts(sim: Simulation) -> dict[str, Any]:
 def _contact_rows(contacts: dict[str, Any]) -> list[list[str]]:
     """A row for each contact; of many those with the largest forces and a count."""
     names = sorted(contacts, key=lambda name: -(contacts[name]["normal_force"] or 0.0))
-    shown = contacts if len(contacts) <= MANY else names[:WORST]
+    shown = contacts if len(contacts) <= MAX_ROWS else names[:SHOWN_ROWS]
     rows = []
     for name in shown:
         c = contacts[name]

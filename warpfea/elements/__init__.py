@@ -2,8 +2,8 @@
 
 from . import ancf_beam, ancf_shell, ancf_solid, lagrange
 from .family import (
+    EnergyPart,
     Family,
-    Part,
     families,
     for_cell,
     get,
@@ -13,8 +13,8 @@ from .quadrature import TET_RULES, Rule
 
 __all__ = [
     "TET_RULES",
+    "EnergyPart",
     "Family",
-    "Part",
     "Rule",
     "ancf_beam",
     "ancf_shell",

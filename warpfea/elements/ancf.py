@@ -2,8 +2,8 @@
 
 The functions of a family live on a parent square, cube or simplex, with slots r, r_xi, r_eta, r_zeta at each node.
 Neighbours share gradients along axes of the node instead. A frame T = dX/dxi per element and node, in those axes,
-transforms the functions of one into those of the other (Paper T's S* = S T; `fold`). This covers curved, stretched
-or rotated elements, and elements that meet at a node share its slots for any direction of their parent lines.
+transforms the functions of one into those of the other (Paper T's S* = S T; `to_node_axes`). This covers curved,
+stretched or rotated elements, and elements that meet at a node share its slots for any direction of their parent lines.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 
 from ..base.errors import ModelError
 
-__all__ = ["fold", "monomials", "nodal_basis", "nodal_functions"]
+__all__ = ["monomials", "nodal_basis", "nodal_functions", "to_node_axes"]
 
 
 def monomials(powers: np.ndarray, xi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -52,7 +52,7 @@ def nodal_functions(powers: np.ndarray, inverse: np.ndarray, xi: np.ndarray) -> 
     return b @ inverse.T, np.einsum("sm,qmk->qsk", inverse, db)
 
 
-def fold(s: np.ndarray, ds: np.ndarray, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def to_node_axes(s: np.ndarray, ds: np.ndarray, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """From slots of parent gradients to slots along the node's axes: s_(n,k) = sum_a s_(n,a) T_n[k, a].
 
     Args:

@@ -33,13 +33,13 @@ import numpy as np
 
 from ..base.errors import ModelError
 from ..materials import SVK, Material
-from .ancf import fold
+from .ancf import to_node_axes
 from .family import (
+    EnergyPart,
     Family,
-    Lattice,
     Parent,
-    Part,
     Tying,
+    VtkSubdivision,
     register,
 )
 from .quadrature import Rule, box_rule, square_rule
@@ -67,7 +67,7 @@ def parent_functions(xi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _shape(xi: np.ndarray, nodes: np.ndarray, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return fold(*parent_functions(xi), frames)
+    return to_node_axes(*parent_functions(xi), frames)
 
 
 def svk_only(material: Material) -> SVK:
@@ -108,14 +108,14 @@ def box_corners(low: tuple[float, ...], high: tuple[float, ...]) -> tuple[np.nda
     )
 
 
-def box_lattice(low: tuple[float, ...], high: tuple[float, ...], parts: tuple[int, int, int]) -> Lattice:
+def box_lattice(low: tuple[float, ...], high: tuple[float, ...], parts: tuple[int, int, int]) -> VtkSubdivision:
     """A box cut into parts[0] x parts[1] x parts[2] hexahedra, for drawing."""
     axes = [np.linspace(a, b, n + 1) for a, b, n in zip(low, high, parts)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     k = np.arange(len(points)).reshape([n + 1 for n in parts])
     corner = [k[:-1, :-1, :-1], k[1:, :-1, :-1], k[1:, 1:, :-1], k[:-1, 1:, :-1]]
     corner += [k[:-1, :-1, 1:], k[1:, :-1, 1:], k[1:, 1:, 1:], k[:-1, 1:, 1:]]
-    return Lattice(points, "hexahedron", np.stack(corner, axis=-1).reshape(-1, 8))
+    return VtkSubdivision(points, "hexahedron", np.stack(corner, axis=-1).reshape(-1, 8))
 
 
 SECTION = [(y, z) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]
@@ -206,20 +206,22 @@ BEAM = register(
         face_rule=square_rule(5),
         divisions=((2, 2), (2, 2), (6, 2), (6, 2), (6, 2), (6, 2)),
         node_samples=np.array([[(x, y, z) for y, z in SECTION] for x in (0.0, 1.0)]),
-        lattice=box_lattice(LOW, HIGH, (4, 1, 1)),
+        vtk_subdivision=box_lattice(LOW, HIGH, (4, 1, 1)),
         schemes={
             "tied": (
-                Part("axis", box_rule((3, 2, 2), RANGES), _axial_part, framed=True),
-                Part("section", at_ends(box_rule((2, 2, 2), RANGES)), _section_part, framed=True),
-                Part("D_nu", at_ends(box_rule((2, 1, 1), RANGES)), _poisson_part, framed=True),
-                Part("shear", box_rule((3, 2, 2), RANGES), _shear_part, tying=SHEAR),
+                EnergyPart("axis", box_rule((3, 2, 2), RANGES), _axial_part, framed=True),
+                EnergyPart("section", at_ends(box_rule((2, 2, 2), RANGES)), _section_part, framed=True),
+                EnergyPart("D_nu", at_ends(box_rule((2, 1, 1), RANGES)), _poisson_part, framed=True),
+                EnergyPart("shear", box_rule((3, 2, 2), RANGES), _shear_part, tying=SHEAR),
             ),
             "split": (
-                Part("D0", box_rule((3, 2, 2), RANGES), _poisson_free, framed=True),
-                Part("D_nu", box_rule((3, 1, 1), RANGES), _poisson_part, framed=True),
+                EnergyPart("D0", box_rule((3, 2, 2), RANGES), _poisson_free, framed=True),
+                EnergyPart("D_nu", box_rule((3, 1, 1), RANGES), _poisson_part, framed=True),
             ),
         },
-        output_schemes={"shear stress": (Part("shear", box_rule((3, 2, 2), RANGES), _shear_stress, framed=True),)},
+        output_schemes={
+            "shear stress": (EnergyPart("shear", box_rule((3, 2, 2), RANGES), _shear_stress, framed=True),)
+        },
         slot_sets={"axis": (1,), "section": (2, 3)},
         spin_vectors=2,
         solid=False,

@@ -39,9 +39,9 @@ import functools
 import numpy as np
 
 from ..materials import Material
-from .ancf import fold, nodal_basis, nodal_functions
+from .ancf import nodal_basis, nodal_functions, to_node_axes
 from .ancf_beam import box_corners, box_lattice, svk_only
-from .family import Family, Parent, Part, Tying, register
+from .family import EnergyPart, Family, Parent, Tying, register
 from .quadrature import Rule, box_rule, square_rule
 
 __all__ = ["POWERS", "SHELL"]
@@ -62,7 +62,7 @@ def _inverse() -> np.ndarray:
 
 
 def _shape(xi: np.ndarray, nodes: np.ndarray, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return fold(*nodal_functions(POWERS, _inverse(), xi), frames)
+    return to_node_axes(*nodal_functions(POWERS, _inverse(), xi), frames)
 
 
 def _plane_stress(material: Material) -> tuple[str, tuple[float, ...]]:
@@ -176,15 +176,15 @@ SHELL = register(
         face_rule=square_rule(5),
         divisions=((3, 3), (3, 3), (3, 2), (3, 2), (3, 2), (2, 3)),
         node_samples=NODES[:, None] + np.array([(0.0, 0.0, -0.5), (0.0, 0.0, 0.5)]),
-        lattice=box_lattice(LOW, HIGH, (2, 2, 1)),
+        vtk_subdivision=box_lattice(LOW, HIGH, (2, 2, 1)),
         schemes={
             "tied": (
-                Part("surface", box_rule((4, 4, 2), RANGES), _plane_stress, framed=True),
-                Part("thickness", SURFACE, _thickness_part, framed=True, tying=THICKNESS),
-                Part("shear", box_rule((4, 4, 2), RANGES), _shear_part, tying=SHEAR),
+                EnergyPart("surface", box_rule((4, 4, 2), RANGES), _plane_stress, framed=True),
+                EnergyPart("thickness", SURFACE, _thickness_part, framed=True, tying=THICKNESS),
+                EnergyPart("shear", box_rule((4, 4, 2), RANGES), _shear_part, tying=SHEAR),
             ),
         },
-        output_schemes={"thickness stress": (Part("thickness", CORNERS, _thickness_stress, framed=True),)},
+        output_schemes={"thickness stress": (EnergyPart("thickness", CORNERS, _thickness_stress, framed=True),)},
         slot_sets={"surface": (1, 2), "director": (3,)},
         spin_vectors=1,
         solid=False,

@@ -14,7 +14,7 @@ import itertools
 
 import numpy as np
 
-from .ancf import fold, monomials, nodal_basis, nodal_functions
+from .ancf import monomials, nodal_basis, nodal_functions, to_node_axes
 from .ancf_beam import box_lattice
 from .family import Family, Parent, register
 from .lagrange import CORNERS, FACES, QUADRATIC, TET_SIDES
@@ -67,7 +67,7 @@ def _tet_shape(
     elimination: float | None, xi: np.ndarray, nodes: np.ndarray, frames: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     s, ds = tet_functions(xi, elimination)
-    a, da = fold(s[:, :16], ds[:, :16], frames[:, :4])
+    a, da = to_node_axes(s[:, :16], ds[:, :16], frames[:, :4])
     if elimination is not None:
         return a, da
     E = len(frames)
@@ -97,7 +97,7 @@ def _tet(name: str, cell: str, elimination: float | None) -> Family:
             face_rule=conical_triangle(4),
             divisions=((3, 3),) * 4,
             node_samples=points[:, None],
-            lattice=QUADRATIC,
+            vtk_subdivision=QUADRATIC,
             slot_sets=GRADIENTS,
         )
     )
@@ -137,7 +137,7 @@ def _brick_inverse() -> np.ndarray:
 
 
 def _brick_shape(xi: np.ndarray, nodes: np.ndarray, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return fold(*nodal_functions(BRICK_POWERS, _brick_inverse(), xi), frames)
+    return to_node_axes(*nodal_functions(BRICK_POWERS, _brick_inverse(), xi), frames)
 
 
 BRICK = register(
@@ -157,7 +157,7 @@ BRICK = register(
         face_rule=square_rule(5),
         divisions=((3, 3),) * 6,
         node_samples=HEX[:, None],
-        lattice=box_lattice(LOW, HIGH, (2, 2, 2)),
+        vtk_subdivision=box_lattice(LOW, HIGH, (2, 2, 2)),
         slot_sets=GRADIENTS,
     )
 )

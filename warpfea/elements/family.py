@@ -13,7 +13,7 @@ from ..base.errors import ModelError
 from ..base.names import did_you_mean
 from .quadrature import Rule
 
-__all__ = ["Family", "Lattice", "Parent", "Part", "Tying", "families", "for_cell", "get", "register"]
+__all__ = ["EnergyPart", "Family", "Parent", "Tying", "VtkSubdivision", "families", "for_cell", "get", "register"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,7 @@ class Tying:
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class EnergyPart:
     """One integral of an element's strain energy; most elements have one, locking remedies split it.
 
     Attributes:
@@ -81,7 +81,7 @@ class Parent:
 
 
 @dataclass(frozen=True, eq=False)
-class Lattice:
+class VtkSubdivision:
     """VTK drawing of an element: parent points (P, 3), meshio cell type, cells (C, n)."""
 
     points: np.ndarray
@@ -135,17 +135,17 @@ class Family:
     face_rule: Rule
     divisions: tuple[tuple[int, int], ...]
     node_samples: np.ndarray
-    lattice: Lattice
-    schemes: dict[str, tuple[Part, ...]] = field(default_factory=dict)
-    output_schemes: dict[str, tuple[Part, ...]] = field(default_factory=dict)
+    vtk_subdivision: VtkSubdivision
+    schemes: dict[str, tuple[EnergyPart, ...]] = field(default_factory=dict)
+    output_schemes: dict[str, tuple[EnergyPart, ...]] = field(default_factory=dict)
     slot_sets: dict[str, tuple[int, ...]] = field(default_factory=dict)
     spin_vectors: int = 3
     solid: bool = True
 
-    def scheme(self, name: str) -> tuple[Part, ...]:
+    def scheme(self, name: str) -> tuple[EnergyPart, ...]:
         """The parts of the integration `name`, a scheme or a force rule. Raises KeyError."""
         known = {**self.schemes, **self.output_schemes}
-        return known[name] if name in known else (Part(name, self.rules[name]),)
+        return known[name] if name in known else (EnergyPart(name, self.rules[name]),)
 
     @property
     def slots(self) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..mesh.cells import TET_EDGES, barycentric, tet4_gradients, tet10_gradients
-from .family import Family, Lattice, Parent, register
+from .family import Family, Parent, VtkSubdivision, register
 from .quadrature import TET_RULES, conical_tet, triangle_6
 
 __all__ = ["CORNERS", "FACES", "T4", "T10"]
@@ -15,7 +15,7 @@ MIDDLES = np.array([(CORNERS[a] + CORNERS[b]) / 2 for a, b in TET_EDGES])
 FACES = ((0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2))
 """Corners of each face, outward, in the order of the mesh's local faces."""
 TET_SIDES = tuple(CORNERS[list(face)] for face in FACES)
-QUADRATIC = Lattice(np.vstack([CORNERS, MIDDLES]), "tetra10", np.arange(10)[None])
+QUADRATIC = VtkSubdivision(np.vstack([CORNERS, MIDDLES]), "tetra10", np.arange(10)[None])
 
 
 def _shape4(xi: np.ndarray, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -45,7 +45,7 @@ T10 = register(
         face_rule=triangle_6(),
         divisions=((2, 2),) * 4,
         node_samples=QUADRATIC.points[:, None],
-        lattice=QUADRATIC,
+        vtk_subdivision=QUADRATIC,
     )
 )
 
@@ -66,6 +66,6 @@ T4 = register(
         face_rule=triangle_6(),
         divisions=((1, 1),) * 4,
         node_samples=CORNERS[:, None],
-        lattice=Lattice(CORNERS, "tetra", np.arange(4)[None]),
+        vtk_subdivision=VtkSubdivision(CORNERS, "tetra", np.arange(4)[None]),
     )
 )

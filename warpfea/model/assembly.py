@@ -11,7 +11,7 @@ import scipy.sparse as sp
 
 from .. import elements as families
 from ..base.errors import MeshError, ModelError
-from ..elements import Part, Rule
+from ..elements import EnergyPart, Rule
 from ..elements.family import Tying
 from ..elements.quadrature import composite
 from ..kernels.elements.materials import NCOEF
@@ -33,16 +33,16 @@ __all__ = [
     "surface_weights",
 ]
 
-CHUNK = 20000
+CHUNK_ELEMENTS = 20000
 """Maximum elements per pass for tables with one row per element."""
-TABLE = 20_000_000
+CHUNK_ENTRIES = 20_000_000
 """Maximum entries (elements x points x slots) of a table computed at once."""
 
 
 def chunks(body: Discretisation, elements: np.ndarray, points: int) -> Iterator[np.ndarray]:
     """Runs of elements with small tables at `points` points."""
     per_element = points * body.family.slots if body.family.has_gradients else 1
-    size = max(1, min(CHUNK, TABLE // per_element))
+    size = max(1, min(CHUNK_ELEMENTS, CHUNK_ENTRIES // per_element))
     for first in range(0, len(elements), size):
         yield elements[first : first + size]
 
@@ -66,7 +66,7 @@ class BlockKey:
         return name if name in families.get(self.family).output_schemes else None
 
     @property
-    def integral(self) -> Part:
+    def integral(self) -> EnergyPart:
         """Part of the strain energy integrated by the block."""
         return families.get(self.family).scheme(self.scheme)[self.part]
 
@@ -152,13 +152,13 @@ def mass_rule(body: Discretisation, affine: bool) -> Rule:
     return body.family.mass_rule if affine and not varying else body.family.curved_mass_rule
 
 
-UNIT = 1.0
+UNIT_DENSITY = 1.0
 """Placeholder density, kg/m^3, of materials without one; uses of the mass are refused."""
 
 
 def density_of(material: Material) -> Any:
-    """Density of a material as given, or `UNIT`."""
-    return UNIT if material.density is None else material.density
+    """Density of a material as given, or `UNIT_DENSITY`."""
+    return UNIT_DENSITY if material.density is None else material.density
 
 
 def require_density(bodies: Iterable[Discretisation], what: str) -> None:
@@ -208,7 +208,7 @@ def parent_mass(family: Any) -> np.ndarray:
     return np.einsum("q,qi,qj->ij", family.mass_rule.weights, table, table)
 
 
-def law_of(integral: Part, material: Material) -> tuple[str, tuple[Any, ...]]:
+def law_of(integral: EnergyPart, material: Material) -> tuple[str, tuple[Any, ...]]:
     """Device law of a part of the energy, and its coefficients; arrays if those of the material are."""
     law, values = integral.law(material) if integral.law else (material.law, material.coefficients())
     assert law is not None
@@ -264,7 +264,7 @@ def orthonormal(J0: np.ndarray) -> np.ndarray:
     return np.stack([a, b, np.cross(a, b)], axis=-1)
 
 
-def check_orientation(body: Discretisation, integral: Part) -> None:
+def check_orientation(body: Discretisation, integral: EnergyPart) -> None:
     """Raise MeshError for det J0 <= 0 at an integration or tying point."""
     points = integral.rule.points
     if integral.tying:

@@ -9,11 +9,11 @@ import numpy as np
 import warp as wp
 
 from .. import elements
-from ..kernels.elements.cluster import cluster_size
 from ..kernels.elements.element import element_kernels
-from ..kernels.elements.materials import ANY_J
-from ..kernels.elements.mixed import mixed_product
+from ..kernels.elements.element_clusters import cluster_size
+from ..kernels.elements.materials import DEFINED_FOR_ANY_J
 from ..kernels.elements.points import block_struct
+from ..kernels.elements.predicted_stress import predicted_stress_product
 from ..kernels.elements.tied import tied_kernels
 from ..kernels.elements.tied_block import tied_struct
 from ..kernels.elements.with_mass import with_mass_kernel
@@ -84,12 +84,12 @@ class Block:
         self.coupled = True
         self.kernels = tied_kernels(dtype, self.slots, self.points, self.key.tying.width, False, True)
 
-    def mixed_product(self, dtype: str) -> wp.Kernel:
+    def predicted_stress_product(self, dtype: str) -> wp.Kernel:
         """Kernel of K p with the stress of the linear prediction, without viscosity."""
         k = self.key
         if k.tying:
-            return self.kernels.mixed_product
-        return mixed_product(dtype, k.law, self.slots, self.points, k.affine, k.framed)
+            return self.kernels.predicted_stress_product
+        return predicted_stress_product(dtype, k.law, self.slots, self.points, k.affine, k.framed)
 
     def with_mass_product(
         self, dtype: str, damping: str | None, midpoint: bool = False, dissipative: bool = False
@@ -220,7 +220,7 @@ def _point_tables(model: Any, data: Any, key: assembly.BlockKey, parts: list[ass
         table = np.moveaxis(np.concatenate(h), 0, 2)
         data.weight = model.element_array(np.concatenate(w).T, T)
     data.gradient = model.element_array(table[:Q], vec3)
-    if key.law not in ANY_J:
+    if key.law not in DEFINED_FOR_ANY_J:
         data.vertex_gradient = model.element_array(table[Q:], vec3)
     if key.framed:
         data.frame = model.element_array(np.moveaxis(np.concatenate(axes), 0, 1), mat33)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..laws import TimeLaw
+from ..time_laws import TimeLaw
 from .discretisation import Discretisation
 from .handles import SurfaceSet
 from .shapes import Shape

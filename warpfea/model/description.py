@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from ..base.brief import brief_repr
 from ..base.errors import ModelError
-from ..laws import TimeLaw
+from ..base.short_repr import use_short_repr
+from ..time_laws import TimeLaw
 from .bodies import Body
 from .contacts import Collider, Contact
 from .handles import NodeSet, SurfaceSet
@@ -43,7 +43,7 @@ class Rotation:
     axis: Any
     angle: Any
 
-    __repr__ = brief_repr
+    __repr__ = use_short_repr
 
 
 @dataclass(eq=False)

@@ -16,7 +16,7 @@ from .partition import morton_order
 
 __all__ = ["Discretisation", "boundary_faces", "element_boxes", "element_functions"]
 
-LARGE = 20000
+ORDERED_NODES = 20000
 """Node count above which slots and elements are ordered spatially; smaller bodies fit into caches."""
 
 
@@ -83,7 +83,7 @@ class Discretisation:
         Slots of large bodies are numbered along a space-filling curve, for memory locality.
         """
         counts = self.node_slot_count
-        order = morton_order(self.mesh.points) if len(counts) > LARGE else np.arange(len(counts))
+        order = morton_order(self.mesh.points) if len(counts) > ORDERED_NODES else np.arange(len(counts))
         first = np.empty(len(counts), dtype=np.int64)
         first[order] = np.concatenate([[0], np.cumsum(counts[order])[:-1]])
         return np.where(counts > 0, first, -1)
@@ -135,7 +135,7 @@ class Discretisation:
     @cached_property
     def element_order(self) -> np.ndarray:
         """(elements,) processing order: along a space-filling curve in large bodies."""
-        if len(self.mesh.points) <= LARGE:
+        if len(self.mesh.points) <= ORDERED_NODES:
             return np.arange(len(self.mesh.cells))
         return morton_order(self.mesh.points[self.mesh.cells].mean(axis=1))
 
@@ -178,7 +178,7 @@ def element_boxes(body: Discretisation) -> tuple[np.ndarray, np.ndarray, float]:
     E = body.reference[body.connectivity] + (body.slot_kind[body.connectivity] == 0)[:, :, None] * body.origin
     coords = E
     if body.family.has_gradients:
-        s, _ = element_functions(body, np.arange(len(E)), body.family.lattice.points)
+        s, _ = element_functions(body, np.arange(len(E)), body.family.vtk_subdivision.points)
         coords = np.einsum("eps,esk->epk", s, E, optimize=True)
     low, high = coords.min(axis=1), coords.max(axis=1)
     return low, high, float(np.max(high - low))

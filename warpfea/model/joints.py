@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 
 from ..kernels.terms.constraints import DISTANCE
-from ..laws import TimeLaw
+from ..time_laws import TimeLaw
 from .discretisation import Discretisation
 
-__all__ = ["NEGLIGIBLE", "Joint", "Part", "Row", "Vector", "constant"]
+__all__ = ["WEIGHT_TOL", "Joint", "Row", "Vector", "VectorPart", "constant"]
 
-NEGLIGIBLE = 1e-13
+WEIGHT_TOL = 1e-13
 """Weights below this fraction of a vector's largest are round-off of vanishing functions."""
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class VectorPart:
     """One body's part of a vector: sum_i w_i e_i; `child`: on the joint's child side."""
 
     body: Discretisation
@@ -32,10 +32,10 @@ class Vector:
     """A vector in space that is linear in the slots; value (3,) in the reference configuration, m or 1."""
 
     value: np.ndarray
-    parts: tuple[Part, ...] = ()
+    parts: tuple[VectorPart, ...] = ()
 
     def __sub__(self, other: Vector) -> Vector:
-        flipped = tuple(Part(p.body, p.slots, -p.weights, p.child) for p in other.parts)
+        flipped = tuple(VectorPart(p.body, p.slots, -p.weights, p.child) for p in other.parts)
         return Vector(self.value - other.value, self.parts + flipped)
 
     def entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -45,7 +45,7 @@ class Vector:
         slots = np.concatenate([p.body.slot_offset + p.slots for p in self.parts])
         weights = np.concatenate([p.weights for p in self.parts])
         child = np.concatenate([np.full(len(p.slots), p.child) for p in self.parts])
-        keep = np.abs(weights) > NEGLIGIBLE * np.abs(weights).max()
+        keep = np.abs(weights) > WEIGHT_TOL * np.abs(weights).max()
         return slots[keep], weights[keep], child[keep]
 
 

@@ -48,7 +48,7 @@ def mass_parts(body: Discretisation) -> list[MassPart]:
     """Consistent scalar mass m_ij = int rho s_i s_j dV (Eq. 20) of each material of a body."""
     flat = assembly.straight(body)
     n = body.slot_count
-    scales = [float(assembly.density_of(m)) if is_number(m) else assembly.UNIT for _, m in body.materials]
+    scales = [float(assembly.density_of(m)) if is_number(m) else assembly.UNIT_DENSITY for _, m in body.materials]
     out = []
     for k, scale in enumerate(scales):
         total, mass = sp.csr_matrix((n, n)), 0.0
@@ -58,7 +58,7 @@ def mass_parts(body: Discretisation) -> list[MassPart]:
             for part in assembly.chunks(body, chosen, len(rule.weights)):
                 conn = body.connectivity[part]
                 s, _, _, det = assembly.geometry(body, part, rule.points)
-                w = assembly.density_at(body, part, s, conn, assembly.UNIT) * det * rule.weights
+                w = assembly.density_at(body, part, s, conn, assembly.UNIT_DENSITY) * det * rule.weights
                 mass += float(w.sum())
                 subscripts = "eq,qi,qj->eij" if len(s) == 1 else "eq,eqi,eqj->eij"
                 table = s[0] if len(s) == 1 else s
@@ -104,7 +104,7 @@ class Masses:
         ]
         self.matrix = sp.block_diag(patterns, format="csr")
         self.matrix.sort_indices()
-        self.entries = {key: self._places(key, patterns[key[0]]) for key in self.parts}
+        self.entries = {key: self._entry_indices(key, patterns[key[0]]) for key in self.parts}
         self.scales = {key: np.array([part.scale]) for key, part in self.parts.items()}
         self._sum()
         self.matrix = self._csr(0)
@@ -155,7 +155,11 @@ class Masses:
         for part in parts:
             last = first + len(part.elements)
             material = part.body.materials[part.material][1]
-            own = assembly.UNIT if is_number(material) else np.asarray(material.density, dtype=float)[part.elements]
+            own = (
+                assembly.UNIT_DENSITY
+                if is_number(material)
+                else np.asarray(material.density, dtype=float)[part.elements]
+            )
             scale = self.scales[self.model.bodies.index(part.body), part.material]
             rows.append(scale[:, None] * (own * det[first:last]))
             first = last
@@ -167,21 +171,21 @@ class Masses:
         self.scales |= scales
         self._sum()
         m, known = self.model, self.model.cache
-        self.values = self._renew("mass", self.values, self.table)
-        self.lumped_values = self._renew("slots", self.lumped_values, self.lumped)
+        self.values = self._replace_array("mass", self.values, self.table)
+        self.lumped_values = self._replace_array("slots", self.lumped_values, self.lumped)
         m.topology.mass_value = self.values
         if "matrix" in known:
             pattern, mass = known["matrix"]
-            known["matrix"] = pattern, self._renew("matrix pattern", mass, self.of_pattern(pattern))
+            known["matrix"] = pattern, self._replace_array("matrix pattern", mass, self.of_pattern(pattern))
         if m.group_count:
-            m.groups.mass = self._renew("groups", m.groups.mass, self.of_groups(*known["free groups"]))
+            m.groups.mass = self._replace_array("groups", m.groups.mass, self.of_groups(*known["free groups"]))
             m.groups.lumped = self.lumped_values
         for block in m.blocks:
             if block.det is not None:
                 table = self.of_elements(block.parts, block.det)
-                block.data.density = self._renew("elements", block.data.density, table)
+                block.data.density = self._replace_array("elements", block.data.density, table)
 
-    def _renew(self, name: str, array: wp.array, values: np.ndarray) -> wp.array:
+    def _replace_array(self, name: str, array: wp.array, values: np.ndarray) -> wp.array:
         """Write values into a device array, or into a new one if the number of worlds differs."""
         if array.shape == values.shape:
             array.assign(values)
@@ -200,7 +204,7 @@ class Masses:
             rows = slice(body.slot_offset, body.slot_offset + body.slot_count)
             self.lumped[:, rows] += scale[:, None] * (part.matrix @ self.model.is_position_host[rows])
 
-    def _places(self, key: tuple[int, int], pattern: sp.csr_matrix) -> slice | np.ndarray:
+    def _entry_indices(self, key: tuple[int, int], pattern: sp.csr_matrix) -> slice | np.ndarray:
         """Entry indices of a part in `matrix`, whose rows of a body have the body's pattern."""
         part = self.parts[key].matrix
         for matrix in (pattern, part):

@@ -13,7 +13,7 @@ from ..base.devices import find_device
 from ..base.errors import ModelError
 from ..base.memory import enough_memory
 from ..kernels.common.types import precision
-from ..kernels.elements.materials import ANY_J, NCOEF
+from ..kernels.elements.materials import DEFINED_FOR_ANY_J, NCOEF
 from . import assembly
 from .blocks import Block, build_block
 from .bodies import Body
@@ -31,7 +31,7 @@ SHOWN = 3
 """Maximum number of bodies listed by a repr."""
 
 
-class Source(Protocol):
+class ModelSource(Protocol):
     """Source of a Model: a ModelBuilder."""
 
     description: Description
@@ -61,7 +61,7 @@ class Model:
 
     def __init__(
         self,
-        builder: Source,
+        builder: ModelSource,
         *,
         device: Any = None,
         dtype: str = "float64",
@@ -92,7 +92,7 @@ class Model:
         """The model as built, with another number of worlds or precision."""
         return Model(self._source, device=self.device, dtype=dtype or self.dtype, worlds=worlds, tables=self._tables)
 
-    def _build(self, builder: Source, tables: bool) -> None:
+    def _build(self, builder: ModelSource, tables: bool) -> None:
         """Number, assemble and upload the description."""
         self._number()
         self._assemble_mass()
@@ -100,7 +100,7 @@ class Model:
         self.gravity = np.asarray(builder.gravity, dtype=float)
         self.probes = list(builder.description.probes)
         self.terms, self.evaluation = builder.assemble(self)
-        self.part, self.component = label_components(self.graph(), self.terms.ties())
+        self.part, self.component = label_components(self.graph(), self.terms.tied_slots())
         self.component_count = int(self.component.max()) + 1
         self.terms.build()
         self.topology = make_topology(self)
@@ -233,7 +233,7 @@ class Model:
     @property
     def needs_positive_J(self) -> bool:
         """True if a law of the model requires J > 0."""
-        return any(b.key.law not in ANY_J for b in self.blocks)
+        return any(b.key.law not in DEFINED_FOR_ANY_J for b in self.blocks)
 
     @property
     def features(self) -> dict[str, bool]:
@@ -276,7 +276,7 @@ class Model:
                 {"name": j.name, "kind": j.kind, "rows": len(j.rows), "between": j.between}
                 for j in (self.constraints.joints if self.constraints else ())
             ],
-            "contacts": [fact for term in (self.terms.contact, self.terms.pairs) if term for fact in term.facts()],
+            "contacts": [fact for term in (self.terms.contact, self.terms.pairs) if term for fact in term.info()],
             "features": [k for k, on in features.items() if on],
             "left_out": [k for k, on in features.items() if not on],
             "blocks": [
@@ -309,7 +309,7 @@ class Model:
         out.register("displacement", vec3, (self.slots,), u)
         out.register("velocity", vec3, (self.slots,), v)
         out.register("time", wp.float64)
-        self.terms.laws.register(out)
+        self.terms.time_laws.register(out)
         return out
 
     def mass_matrix(self, world: int = 0) -> sp.csr_matrix:

@@ -23,11 +23,11 @@ PAIR_RULES: dict[int, dict[int, Rule]] = {
     4: {n * n: lobatto_square(n) for n in (2, 3, 4, 5)},
 }
 """Slave point rules: 16 by default, since meshes need not match."""
-SIZES = 1.25
+MASTER_SIZE_RATIO = 1.25
 """Ratio of element sizes beyond which the coarser surface is the master."""
-MITRE = 2.0
+MAX_CORNER_LENGTH = 2.0
 """Maximum length of the mitred corner normal, over the unit normal."""
-STEEP = 0.1
+RANK_TOL = 0.1
 """Relative singular value below which the normals at a node count as dependent."""
 
 
@@ -57,7 +57,7 @@ class PairContact(ContactOptions):
 
 @dataclass(frozen=True, eq=False)
 class MasterFacets:
-    """Facets as polynomials, see kernels/terms/pair_data.py.
+    """Facets as polynomials, see kernels/terms/pair_structs.py.
 
     Attributes:
         conn: (F, L) body slots of the facets' elements.
@@ -70,13 +70,13 @@ class MasterFacets:
 
     conn: np.ndarray
     shape: np.ndarray
-    rise: np.ndarray
+    director_shape: np.ndarray
     X: np.ndarray
     N: np.ndarray
     corners: int
     degree: int
     size: np.ndarray
-    limit: np.ndarray
+    depth_limit: np.ndarray
 
 
 def pair_points(surface: SurfaceSet, points: int | None = None) -> ContactPoints:
@@ -91,7 +91,7 @@ def choose_master(first: SurfaceSet, second: SurfaceSet) -> tuple[SurfaceSet, Su
         area = pair_points(surface).area.sum(axis=1)
         sides.append((math.sqrt(float(area.mean())), effective_modulus(surface.body, surface)[0]))
     (size_1, modulus_1), (size_2, modulus_2) = sides
-    if size_1 > SIZES * size_2 or (size_2 <= SIZES * size_1 and modulus_1 > modulus_2):
+    if size_1 > MASTER_SIZE_RATIO * size_2 or (size_2 <= MASTER_SIZE_RATIO * size_1 and modulus_1 > modulus_2):
         return second, first
     return first, second
 
@@ -158,12 +158,12 @@ def _outward(places: np.ndarray, normal: np.ndarray, size: float) -> np.ndarray:
     out = np.empty_like(flat)
     for rows in np.split(order, ends[:-1]):
         n = flat[rows]
-        vector = np.linalg.lstsq(n, np.ones(len(n)), rcond=STEEP)[0] if len(n) > 1 else n[0]
+        vector = np.linalg.lstsq(n, np.ones(len(n)), rcond=RANK_TOL)[0] if len(n) > 1 else n[0]
         length = np.linalg.norm(vector)
         if not length > 0.0 or (n @ vector).min() <= 0.0:
             out[rows] = n
         else:
-            out[rows] = vector * min(1.0, MITRE / length)
+            out[rows] = vector * min(1.0, MAX_CORNER_LENGTH / length)
     return out.reshape(normal.shape)
 
 
@@ -194,13 +194,13 @@ def master_facets(surface: SurfaceSet) -> MasterFacets:
     places = np.einsum("fqs,fsk->fqk", shape, e) + body.origin
     area = pair_points(surface).area.sum(axis=1)
     outward = _outward(places, normal, float(np.sqrt(area.max())))
-    rise = np.einsum("fqsk,fqk->fqs", gradient, outward)
-    used = (np.abs(shape).max(axis=(0, 1)) > 0.0) | (np.abs(rise).max(axis=(0, 1)) > 0.0)
-    conn, e, shape, rise = conn[:, used], e[:, used], shape[:, :, used], rise[:, :, used]
-    shape, rise = (np.einsum("mq,fqs->fms", inverse, x) for x in (shape, rise))
+    director_shape = np.einsum("fqsk,fqk->fqs", gradient, outward)
+    used = (np.abs(shape).max(axis=(0, 1)) > 0.0) | (np.abs(director_shape).max(axis=(0, 1)) > 0.0)
+    conn, e, shape, director_shape = conn[:, used], e[:, used], shape[:, :, used], director_shape[:, :, used]
+    shape, director_shape = (np.einsum("mq,fqs->fms", inverse, x) for x in (shape, director_shape))
     X = np.einsum("mq,fqk->fmk", inverse, places)
-    N = np.einsum("fms,fsk->fmk", rise, e)
-    return MasterFacets(conn, shape, rise, X, N, corners, degree, np.sqrt(area), 0.5 * thickness(surface))
+    N = np.einsum("fms,fsk->fmk", director_shape, e)
+    return MasterFacets(conn, shape, director_shape, X, N, corners, degree, np.sqrt(area), 0.5 * thickness(surface))
 
 
 def thickness(surface: SurfaceSet) -> np.ndarray:

@@ -64,7 +64,7 @@ class MaterialParameters:
     def __init__(self, model: Any) -> None:
         self.model = model
         self.values: dict[tuple[int, int, str], np.ndarray] = {}
-        self.begun = False
+        self.simulated = False
         self.version = 0
         # allocated on first use: a model may have more worlds than fit into memory
         self._changes: np.ndarray | None = None
@@ -164,7 +164,7 @@ class MaterialParameters:
         if name in DENSITIES:
             self._refuse_density(f"{owner}.{name}", [body for body, _ in members])
         keys = [(self._index(body), k, name) for body, k in members]
-        if self.begun and any(key not in self.values for key in keys):
+        if self.simulated and any(key not in self.values for key in keys):
             raise ModelError(
                 f"set_parameter: '{owner}.{name}' was uniform when a Simulation of this model was made: set it "
                 "before the first Simulation"
@@ -176,7 +176,7 @@ class MaterialParameters:
         self.values = fresh
         self._write(members, name, mask)
         for term in self.model.terms:
-            term.take_materials(mask)
+            term.update_materials(mask)
         self.changes[mask] += 1
         self.version += 1
 
@@ -214,7 +214,7 @@ class MaterialParameters:
                 m.coefficient_table[:, part.row] = assembly.coefficient_rows(values, material, m.worlds)
             tying = block.key.tying
             if mine and tying and name in tying.uses:
-                self._couple(block, mask)
+                self._update_couplings(block, mask)
             if mine and block.output:
                 block.output.data.coefficients = m.array("output", output_rows(m, block), m.types.T)
         if m.coefficients.shape[0] == m.worlds:
@@ -225,7 +225,7 @@ class MaterialParameters:
         for block in m.blocks:
             block.data.coefficients = m.coefficients
 
-    def _couple(self, block: Block, mask: np.ndarray) -> None:
+    def _update_couplings(self, block: Block, mask: np.ndarray) -> None:
         """Couplings of assumed strains of a block in the chosen worlds, per world.
 
         Other constants are those of the bodies as built: E/mu, a function of nu, then rounds identically.

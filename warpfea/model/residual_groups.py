@@ -13,7 +13,7 @@ from .assembly import components_of
 
 __all__ = ["SlotGroups", "slot_groups"]
 
-LIKE = 30.0
+STIFFNESS_RATIO = 30.0
 """Largest ratio of successive stiffnesses in one class."""
 
 
@@ -22,7 +22,7 @@ def stiffness_classes(stiffness: np.ndarray, label: np.ndarray) -> np.ndarray:
     out = np.zeros(len(stiffness), dtype=np.int64)
     for one in np.unique(label):
         values, which = np.unique(stiffness[label == one], return_inverse=True)
-        out[label == one] = np.append(0, np.cumsum(values[1:] > LIKE * values[:-1]))[which.ravel()]
+        out[label == one] = np.append(0, np.cumsum(values[1:] > STIFFNESS_RATIO * values[:-1]))[which.ravel()]
     return out
 
 
@@ -42,7 +42,7 @@ def slenderness(model: Any) -> np.ndarray:
     return np.maximum(least / largest, 1e-12)
 
 
-def like_stiffness(model: Any) -> tuple[np.ndarray, np.ndarray]:
+def stiffness_pieces(model: Any) -> tuple[np.ndarray, np.ndarray]:
     """Piece of similar stiffness, softest first, of each slot, and of each element in block order.
 
     A piece is connected by elements of one stiffness class and by constraints: stiff bodies on both sides of a soft
@@ -61,7 +61,7 @@ def like_stiffness(model: Any) -> tuple[np.ndarray, np.ndarray]:
     for conn, classes in zip(connectivity, of_block):
         np.maximum.at(of_slot, conn, classes[:, None])
     sets = [np.where(of_slot[conn] == own[:, None], conn, -1) for conn, own in zip(connectivity, of_block)]
-    for tie in model.terms.ties():
+    for tie in model.terms.tied_slots():
         sets += [tie[of_slot[tie] == one][None] for one in np.unique(of_slot[tie])]
     piece = np.unique(of_slot * model.slots + connected_slots(sets, model.slots), return_inverse=True)[1].ravel()
     softest = [conn[np.arange(len(conn)), of_slot[conn].argmin(axis=1)] for conn in connectivity]
@@ -97,7 +97,7 @@ class SlotGroups:
 
 def slot_groups(model: Any, label: np.ndarray) -> SlotGroups:
     """Groups of one `label` (slots,), constant within each element, and one piece of similar stiffness."""
-    of_slot, of_element = like_stiffness(model)
+    of_slot, of_element = stiffness_pieces(model)
     first = np.concatenate([block.connectivity[:, 0] for block in model.blocks])
     keys, of = np.unique(label * (of_slot.max() + 1) + of_slot, return_inverse=True)
     of_element = np.searchsorted(keys, label[first] * (of_slot.max() + 1) + of_element)

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from ..base.brief import lines
 from ..base.errors import CheckpointError, ModelError
 from ..base.memory import enough_memory
+from ..base.short_repr import lines
 from ..kernels.common.state import state_kernels
 
 if TYPE_CHECKING:
@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 
 __all__ = ["ArraySpec", "State", "words_of"]
 
-MEMORY = ("preconditioner", "operator", "predictor", "summed")
+SOLVER_MEMORY = ("preconditioner", "operator", "predictor", "summed")
 """Name prefixes of optional state arrays (solver history, summed time)."""
-WATCH = ("energy_growth",)
+WATCH_ARRAYS = ("energy_growth",)
 """Monitor arrays, optional in a checkpoint."""
 
 
@@ -113,7 +113,7 @@ class State:
         """Bytes of each array."""
         return {name: array.size * wp.types.type_size_in_bytes(array.dtype) for name, array in self._arrays.items()}
 
-    def like(self) -> State:
+    def copy(self) -> State:
         """Copy of the state with the same registry."""
         out = State(self.worlds, self.device)
         out.specs = dict(self.specs)
@@ -149,7 +149,8 @@ class State:
             CheckpointError: a missing name or another shape; nothing is set then.
         """
         own, given = (
-            {name for name in names if not (remembered(name) or name in WATCH)} for names in (self._arrays, values)
+            {name for name in names if not (is_solver_memory(name) or name in WATCH_ARRAYS)}
+            for names in (self._arrays, values)
         )
         if own != given:
             raise CheckpointError(
@@ -157,8 +158,8 @@ class State:
                 "with the integrator, the ledger and the constraints that it was made with"
             )
         host = {name: array.numpy() for name, array in self._arrays.items()}
-        memory = [name for name in host if remembered(name)]
-        for group in (memory, *([name] for name in WATCH if name in host)):
+        memory = [name for name in host if is_solver_memory(name)]
+        for group in (memory, *([name] for name in WATCH_ARRAYS if name in host)):
             if any(name not in values or values[name].shape != host[name].shape for name in group):
                 fresh = {name: np.full_like(host[name], self.specs[name].initial) for name in group}
                 values = values | fresh
@@ -173,9 +174,9 @@ class State:
             array.assign(values[name])
 
 
-def remembered(name: str) -> bool:
+def is_solver_memory(name: str) -> bool:
     """True for arrays of solver history."""
-    return name.partition("_")[0] in MEMORY
+    return name.partition("_")[0] in SOLVER_MEMORY
 
 
 def words_of(array: wp.array) -> wp.array:

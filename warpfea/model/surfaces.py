@@ -138,7 +138,7 @@ def _cut(corners: int, parts: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     return np.array(grid, dtype=float) / na, np.array(triangles)
 
 
-class _Points:
+class _PointMerger:
     """Collects material points of elements, and merges those with equal weights on the same slots."""
 
     def __init__(self, body: Discretisation) -> None:
@@ -206,7 +206,7 @@ def _sparse(values: np.ndarray, columns: np.ndarray, width: int) -> sp.csr_matri
 
 def make_skin(body: Discretisation) -> Skin:
     """Outer faces as triangles; faces of beams and shells share no points, for sharp edges."""
-    points = _Points(body)
+    points = _PointMerger(body)
     triangles = []
     for face, rows in _by_face(body.boundary):
         corners = body.family.faces[face]
@@ -220,9 +220,9 @@ def make_skin(body: Discretisation) -> Skin:
 
 def make_drawing(body: Discretisation) -> Drawing:
     """All elements as cells of VTK."""
-    lattice = body.family.lattice
+    lattice = body.family.vtk_subdivision
     elements = np.arange(len(body.mesh.cells))
-    points = _Points(body)
+    points = _PointMerger(body)
     number = points.add(elements, lattice.points, 0)
     new, slot_weights, node_weights = points.merge()
     cells = new[number[:, lattice.cells]].reshape(-1, lattice.cells.shape[1])

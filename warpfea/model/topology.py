@@ -26,7 +26,7 @@ def make_topology(model: Any) -> Any:
     topo.mass_column = model.array("mass", model.mass_host.indices, wp.int32)
     topo.mass_value = model.masses.values
     topo.free = model.array("slots", model.free_host, model.types.vec3)
-    topo.held = model.array("slots", (model.free_host == 0.0) @ [1, 2, 4], wp.uint8)
+    topo.prescribed = model.array("slots", (model.free_host == 0.0) @ [1, 2, 4], wp.uint8)
     model.terms.join(topo)
     return topo
 
@@ -52,7 +52,7 @@ def free_groups(model: Any) -> tuple[Any, int]:
     free = np.ones((count, 3))
     for c in range(3):
         free[np.unique(label[model.free_host[:, c] == 0.0]), c] = 0.0
-    model.terms.hold(free)
+    model.terms.mark_constrained(free)
     keep = np.flatnonzero(free.any(axis=1))
     groups = groups_struct(model.dtype)()
     if not len(keep):

@@ -11,19 +11,19 @@ import numpy as np
 
 from ..base.checks import is_number
 from ..base.errors import MeshError, ModelError
-from ..kernels.terms.contact_mesh import FLAT, MESH, RIM, SHARP
+from ..kernels.terms.contact_mesh import BOUNDARY, FLAT, MESH, SHARP
 from ..mesh.adapter import read_triangles
 from .shapes import Shape, set_checked
 
 __all__ = ["TriMesh", "TriangleTables"]
 
-NEEDLE = 1e-10
+MIN_HEIGHT_RATIO = 1e-10
 """Minimum height of a triangle over its longest edge."""
-PLANE = 1e-12
+FLAT_COSINE = 1e-12
 """Sine of the angle up to which triangles count as coplanar."""
-FOLD = 1e-6
+FOLD_COSINE = 1e-6
 """Minimum length of the sum of the normals at an edge."""
-LEAF = 4
+LEAF_TRIANGLES = 4
 """Maximum triangles per leaf."""
 
 
@@ -166,7 +166,7 @@ class TriMesh(Shape):
                 f"{self._edge(one[k])}: flip one"
             )
         normal = self._cross / np.linalg.norm(self._cross, axis=1, keepdims=True)
-        folded = np.linalg.norm(normal[one // 3] + normal[other // 3], axis=1) < FOLD
+        folded = np.linalg.norm(normal[one // 3] + normal[other // 3], axis=1) < FOLD_COSINE
         for k in np.flatnonzero(folded)[:1]:
             raise ModelError(f"TriMesh: coincident triangles {one[k] // 3} and {other[k] // 3} at "
                              f"{self._edge(one[k])}: the surface folds back on itself")  # fmt: skip
@@ -201,20 +201,20 @@ class TriMesh(Shape):
             out, back = p[:, (k + 1) % 3] - p[:, k], p[:, (k + 2) % 3] - p[:, k]
             angle = np.arctan2(np.linalg.norm(np.cross(out, back), axis=1), np.einsum("ij,ij->i", out, back))
             np.add.at(total, t[:, k], angle[:, None] * face)
-            bent[t[np.linalg.norm(face - first[t[:, k]], axis=1) > PLANE, k]] = True
+            bent[t[np.linalg.norm(face - first[t[:, k]], axis=1) > FLAT_COSINE, k]] = True
             alone = beyond[:, k] < 0
             rim[t[alone][:, [k, (k + 1) % 3]].ravel()] = True
             other = np.where(alone[:, None], face, face[beyond[:, k]])
-            sharp = np.linalg.norm(face - other, axis=1) > PLANE
+            sharp = np.linalg.norm(face - other, axis=1) > FLAT_COSINE
             mean = 0.5 * (face + other)
             normal[1 + k] = np.where(sharp[:, None], mean / np.linalg.norm(mean, axis=1, keepdims=True), face)
-            border[1 + k] = np.where(alone, RIM, np.where(sharp, SHARP, FLAT))
+            border[1 + k] = np.where(alone, BOUNDARY, np.where(sharp, SHARP, FLAT))
         length = np.linalg.norm(total, axis=1, keepdims=True)
         mean = np.where(length > 1e-9, total / np.maximum(length, 1e-300), first)
         for k in range(3):
             at = t[:, k]
             normal[4 + k] = np.where(bent[at][:, None], mean[at], face)
-            border[4 + k] = np.where(rim[at], RIM, np.where(bent[at], SHARP, FLAT))
+            border[4 + k] = np.where(rim[at], BOUNDARY, np.where(bent[at], SHARP, FLAT))
         return normal, border
 
 
@@ -227,7 +227,7 @@ def tree(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nd
         corners: (m, 3, 3) m.
     """
     count = len(corners)
-    levels = max(0, int(np.ceil(np.log2(count / LEAF))))
+    levels = max(0, int(np.ceil(np.log2(count / LEAF_TRIANGLES))))
     middle, order = corners.mean(axis=1), np.arange(count)
     for level in range(levels):
         start = np.arange((1 << level) + 1) * count >> level
@@ -271,7 +271,7 @@ def _triangles(values: Any, points: np.ndarray) -> np.ndarray:
         raise ModelError(f"TriMesh: triangle {k} = {out[k].tolist()} has a point number out of range, 0 .. {count - 1}")
     edges = points[np.roll(out, -1, axis=1)] - points[out]
     longest = np.einsum("tki,tki->tk", edges, edges).max(axis=1)
-    flat = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) <= NEEDLE * longest
+    flat = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) <= MIN_HEIGHT_RATIO * longest
     for k in np.flatnonzero(flat)[:1]:
         raise ModelError(f"TriMesh: triangle {k} = {out[k].tolist()} has no area ({int(flat.sum())} such)")
     return out.astype(np.int64)

@@ -15,11 +15,11 @@ import numpy.typing as npt
 
 from warpfea.base.checks import is_number
 from warpfea.base.errors import ModelError, OutputError
-from warpfea.outputs.obstacles import Obstacles, near
+from warpfea.outputs.obstacles import Obstacles, clip_to_box
 
 __all__ = [
+    "DrawnSurface",
     "FrameClock",
-    "Surface",
     "check_colors",
     "check_fields",
     "field_label",
@@ -123,7 +123,7 @@ def grid_offsets(worlds: int, spacing: tuple[float, float], up_axis: str = "Z") 
     return offsets
 
 
-class Surface:
+class DrawnSurface:
     """Drawn surfaces of a simulation: bodies and obstacles, and the grid of worlds.
 
     `spacing` (m) is the distance of neighbouring worlds, one number or (first, second horizontal axis);
@@ -141,7 +141,9 @@ class Surface:
         low = np.min([points.min(axis=(0, 1)) for points in start], axis=0)
         high = np.max([points.max(axis=(0, 1)) for points in start], axis=0)
         self.obstacles = Obstacles(sim, low, high)
-        start += [np.asarray(near(points, low, high, 0.5), dtype=np.float64) for points in self.obstacles.bounded()]
+        start += [
+            np.asarray(clip_to_box(points, low, high, 0.5), dtype=np.float64) for points in self.obstacles.bounded()
+        ]
         distance = self._spacing(start, spacing)
         self.offsets = grid_offsets(self.worlds, distance, self.up_axis)
         if min(distance) > 0.0:  # a plane must not hide the bodies of other worlds
@@ -191,12 +193,12 @@ class Surface:
         """Number of `points` of bodies, which come first."""
         return self.worlds * sum(self.counts)
 
-    def sheets(self) -> list[int]:
+    def plane_squares(self) -> list[int]:
         """First point of each square drawn for a half-space, in the order of `points`."""
         out, first = [], self.body_points
         for obstacle in self.obstacles.all:
             count = obstacle.points.shape[1]
-            if obstacle.sheet:
+            if obstacle.is_plane:
                 out += [first + world * count for world in range(self.worlds)]
             first += self.worlds * count
         return out

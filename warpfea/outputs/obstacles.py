@@ -17,13 +17,13 @@ from warpfea.kernels.terms.contact_mesh import MESH
 from warpfea.model.shapes import BOX, CAPSULE, CYLINDER, HALF_SPACE
 from warpfea.outputs.normals import smooth_corners, vertex_normals
 
-__all__ = ["GREY", "SHEET", "Obstacle", "Obstacles", "names_beside", "near"]
+__all__ = ["GREY", "PLANE_SIZE", "Obstacle", "Obstacles", "clip_to_box", "names_beside"]
 
 Array = npt.NDArray[np.floating[Any]]
 Floats = npt.NDArray[np.float64]
 GREY = (0.60, 0.60, 0.61)
 """Colour of obstacles, sRGB."""
-SHEET = 6.0
+PLANE_SIZE = 6.0
 """Side of the square drawn for a half-space, over the initial size of the bodies."""
 
 
@@ -46,7 +46,7 @@ class Obstacle:
     moves: bool
 
     @property
-    def sheet(self) -> bool:
+    def is_plane(self) -> bool:
         """A half-space, drawn as a square."""
         return self.kind == "HalfSpace"
 
@@ -65,7 +65,7 @@ class Obstacles:
         if self._sim is None:
             return
         place, turn, grow = sim.collider_poses()
-        side = SHEET * float(np.linalg.norm(high - low))
+        side = PLANE_SIZE * float(np.linalg.norm(high - low))
         middle = 0.5 * (low + high)
         for k, collider in enumerate(sim.model.description.colliders):
             shape = collider.shape
@@ -83,7 +83,7 @@ class Obstacles:
     def narrow(self, width: float) -> None:
         """Limit the side of squares, m."""
         for k, obstacle in enumerate(self.all):
-            if obstacle.sheet:
+            if obstacle.is_plane:
                 middle = obstacle.points.mean(axis=1, keepdims=True)
                 part = min(1.0, width / np.linalg.norm(obstacle.points[0, 1] - obstacle.points[0, 0]))
                 self.all[k] = replace(obstacle, points=middle + part * (obstacle.points - middle))
@@ -95,8 +95,8 @@ class Obstacles:
         """Current positions (B, K, 3), m, and rotations (B, K, 3, 3)."""
         assert self._sim is not None
         place, turn, grow = self._sim.collider_poses()
-        sheets = np.array([obstacle.sheet for obstacle in self.all])
-        return place + np.where(sheets, grow, 0.0)[:, :, None] * turn[:, :, :, 2], turn
+        plane_squares = np.array([obstacle.is_plane for obstacle in self.all])
+        return place + np.where(plane_squares, grow, 0.0)[:, :, None] * turn[:, :, :, 2], turn
 
     def points(self) -> list[Floats]:
         """(B, n, 3) current points of each, m."""
@@ -110,10 +110,10 @@ class Obstacles:
 
     def bounded(self) -> list[Floats]:
         """(B, n, 3) current points of those other than half-spaces, m."""
-        return [points for points, obstacle in zip(self.points(), self.all) if not obstacle.sheet]
+        return [points for points, obstacle in zip(self.points(), self.all) if not obstacle.is_plane]
 
 
-def near(points: Array, low: Array, high: Array, part: float) -> Array:
+def clip_to_box(points: Array, low: Array, high: Array, part: float) -> Array:
     """Points (..., 3) clamped to the box from low to high, enlarged each way by a fraction of its diagonal."""
     margin = part * float(np.linalg.norm(high - low))
     return np.clip(points, low - margin, high + margin)

@@ -13,7 +13,7 @@ from warpfea.base.errors import ModelError, OutputError
 from warpfea.outputs.colormap import to_linear, to_srgb
 from warpfea.outputs.normals import scatter_rows, smooth_corners, unit_rows
 
-__all__ = ["VIEW", "Camera", "Renderer", "check_view", "nice_number", "turned"]
+__all__ = ["VIEW", "Camera", "Renderer", "check_view", "nice_number", "to_z_up"]
 
 Floats = npt.NDArray[np.floating[Any]]
 Image = npt.NDArray[np.uint8]
@@ -101,7 +101,7 @@ def _centre(side: Floats, depth: Floats) -> float:
     return 0.5 * (low + high)
 
 
-def turned(points: Floats, up_axis: str) -> npt.NDArray[np.float64]:
+def to_z_up(points: Floats, up_axis: str) -> npt.NDArray[np.float64]:
     """Points (P, 3) as float64 in the frame with z up that cameras use."""
     p = np.asarray(points, dtype=np.float64)
     return p if up_axis == "Z" else np.stack([p[:, 0], -p[:, 2], p[:, 1]], axis=1)
@@ -137,9 +137,9 @@ class Renderer:
         self._groups: tuple[npt.NDArray[np.int64], int] | None = None
         self._mesh: Any = None
 
-    def turned(self, points: Floats) -> npt.NDArray[np.float64]:
+    def to_z_up(self, points: Floats) -> npt.NDArray[np.float64]:
         """Points (P, 3) as float64 in the frame with z up that cameras use."""
-        return turned(points, self.up_axis)
+        return to_z_up(points, self.up_axis)
 
     def render(
         self,
@@ -156,13 +156,13 @@ class Renderer:
 
         from warpfea.kernels.outputs import raycast
 
-        points = self.turned(points)
+        points = self.to_z_up(points)
         if not np.isfinite(points).all() or self.triangles.max() >= len(points) or len(colors) != len(points):
             raise OutputError("points must be finite, as many as colours, and as many as triangles refer to")
         width, height = size
         camera = camera or Camera.framing(points, aspect=width / height)
         if self._groups is None:
-            base = points if self._reference is None else self.turned(self._reference)
+            base = points if self._reference is None else self.to_z_up(self._reference)
             self._groups = smooth_corners(base, self.triangles)
         unit = (points - camera.target) / camera.size
         with quiet_warp(), wp.ScopedDevice("cpu"):

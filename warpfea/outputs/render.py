@@ -17,9 +17,10 @@ from warpfea.base.checks import is_count, is_number
 from warpfea.base.errors import ModelError
 from warpfea.base.names import did_you_mean
 from warpfea.base.writer import Output, check_target
+from warpfea.outputs.animation import Animation, Frame
 from warpfea.outputs.frames import (
+    DrawnSurface,
     FrameClock,
-    Surface,
     check_colors,
     check_fields,
     field_label,
@@ -27,7 +28,6 @@ from warpfea.outputs.frames import (
     time_of,
 )
 from warpfea.outputs.raycaster import VIEW, Camera, Renderer, check_view
-from warpfea.outputs.reel import Frame, Reel
 from warpfea.outputs.usd_check import in_words
 
 __all__ = ["Camera", "GIFWriter", "PNGWriter", "Renderer", "render_usd"]
@@ -67,18 +67,18 @@ class _Drawing(Output):
             raise ModelError(f"field must be the name of a field, or None for grey, got {field!r}")
         self.field, self.size, self.view = field, _checked_size(size), check_view(view)
         self.color_range, self.spacing, self.ground = check_colors(color_range), spacing, ground
-        self._reel: Reel | None = None
+        self._animation: Animation | None = None
 
     def open(self, sim: Any) -> None:
         self.abort()
         check_target(self.path, (self.suffix,))
         check_fields(sim, [self.field] if self.field else [])
-        self._surface = Surface(sim, self.spacing)
+        self._surface = DrawnSurface(sim, self.spacing)
         start = self._surface.points(sim)
         bodies = start[: self._surface.body_points]
         self._origin = 0.5 * (bodies.min(axis=0) + bodies.max(axis=0))
         title, units = field_label(self.field) if self.field else ("", "")
-        self._reel = Reel(
+        self._animation = Animation(
             self._surface.triangles(),
             self._surface.up_axis,
             np.asarray(start - self._origin, dtype=np.float32),
@@ -87,7 +87,7 @@ class _Drawing(Output):
             self.color_range,
             is_static(sim),
             self._surface.body_points,
-            self._surface.sheets(),
+            self._surface.plane_squares(),
         )
 
     def _frame(self, sim: Any) -> Frame:
@@ -97,7 +97,7 @@ class _Drawing(Output):
 
     def abort(self) -> None:
         """Discard the frames; nothing is on disk before `close`."""
-        self._reel = None
+        self._animation = None
 
 
 class PNGWriter(_Drawing):
@@ -135,17 +135,17 @@ class PNGWriter(_Drawing):
         self.moments = () if time is None else (time,)
 
     def write(self, sim: Any) -> None:
-        if self._reel is None or self.time is None or self._reel.frames:
+        if self._animation is None or self.time is None or self._animation.frames:
             return
         if time_of(sim) >= self.time - 1e-9 * max(1.0, abs(self.time)):
-            self._reel.frames = [self._frame(sim)]
+            self._animation.frames = [self._frame(sim)]
 
     def close(self, sim: Any) -> None:
-        if self._reel is None:
+        if self._animation is None:
             return
         try:
-            self._reel.frames = self._reel.frames or [self._frame(sim)]
-            self._reel.save_png(self.path, self.size, self.view, self.ground)
+            self._animation.frames = self._animation.frames or [self._frame(sim)]
+            self._animation.save_png(self.path, self.size, self.view, self.ground)
         finally:
             self.abort()
 
@@ -192,12 +192,12 @@ class GIFWriter(_Drawing):
         self._clock = FrameClock(self.fps / self.speed)
 
     def write(self, sim: Any) -> None:
-        if self._reel is not None and self._clock.due(time_of(sim)):
+        if self._animation is not None and self._clock.due(time_of(sim)):
             self._append(sim)
 
     def _append(self, sim: Any) -> None:
-        assert self._reel is not None
-        frames = self._reel.frames
+        assert self._animation is not None
+        frames = self._animation.frames
         frames.append(self._frame(sim))
         if len(frames) > self.max_frames:
             del frames[1::2]
@@ -206,12 +206,12 @@ class GIFWriter(_Drawing):
             self._clock = slower
 
     def close(self, sim: Any) -> None:
-        if self._reel is None:
+        if self._animation is None:
             return
         try:
             if time_of(sim) > self._clock.last:
                 self._append(sim)
-            self._reel.save_gif(self.path, self.size, self.view, self.ground, self.speed, self.progress)
+            self._animation.save_gif(self.path, self.size, self.view, self.ground, self.speed, self.progress)
         finally:
             self.abort()
 
@@ -274,12 +274,12 @@ def render_usd(
         if not source.start - slack <= at <= source.end + slack:
             raise ModelError(f"{path}: time {at:g} s lies outside {source.start:g} .. {source.end:g} s")
         times = np.array([at])
-    reel = source.reel(field, times)
-    reel.shown = color_range or reel.shown
+    animation = source.animation(field, times)
+    animation.shown = color_range or animation.shown
     if animated:
-        reel.save_gif(target, size, view, ground, speed, progress)
+        animation.save_gif(target, size, view, ground, speed, progress)
     else:
-        reel.save_png(target, size, view, ground)
+        animation.save_png(target, size, view, ground)
     return target
 
 
@@ -311,7 +311,7 @@ class _Source:
             self.stage.GetEndTimeCode() / self.rate,
         )
 
-    def reel(self, field: str | None, times: Floats) -> Reel:
+    def animation(self, field: str | None, times: Floats) -> Animation:
         """Frames at `times` (s); USD interpolates linearly between samples."""
         from pxr import UsdGeom
 
@@ -320,30 +320,34 @@ class _Source:
             have = ", ".join(self.about["fields"]) or "none"
             hint = did_you_mean(name, self.about["fields"])
             raise ModelError(f"{self.path}: has no field {name!r}; fields: {have}{hint}")
-        triangles, first, bodies, sheets = [], 0, 0, []
+        triangles, first, bodies, plane_squares = [], 0, 0, []
         for k, mesh in enumerate(self.meshes + self.obstacles):
             counts = np.asarray(mesh.GetFaceVertexCountsAttr().Get())
             if (counts != 3).any():
                 raise ModelError(f"{self.path}: {mesh.GetPath()} has faces that are not triangles")
             triangles.append(np.asarray(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3) + first)
             if mesh.GetPrim().GetCustomDataByKey("warpfea:collider") == "HalfSpace":
-                sheets.append(first)
+                plane_squares.append(first)
             first += len(mesh.GetPointsAttr().Get(self.start * self.rate))
             if k < len(self.meshes):
                 bodies = first
         start = self._points(self.start)
         self.origin = 0.5 * (start[:bodies].min(axis=0) + start[:bodies].max(axis=0))
         reference = np.asarray(start - self.origin, dtype=np.float32)
-        reel = Reel(np.concatenate(triangles), str(UsdGeom.GetStageUpAxis(self.stage)), reference)
-        reel.static, reel.bodies, reel.sheets = bool(self.about.get("static", False)), bodies, sheets
+        animation = Animation(np.concatenate(triangles), str(UsdGeom.GetStageUpAxis(self.stage)), reference)
+        animation.static, animation.bodies, animation.plane_squares = (
+            bool(self.about.get("static", False)),
+            bodies,
+            plane_squares,
+        )
         if name is not None:
             about = self.about["fields"][name]
             pair = self.about["colorRange"] if name == self.about["color"] else about["range"]
-            reel.title, reel.units, reel.shown = about["title"], about["units"], (pair[0], pair[1])
+            animation.title, animation.units, animation.shown = about["title"], about["units"], (pair[0], pair[1])
         for time in map(float, times):
             points = np.asarray(self._points(time) - self.origin, dtype=np.float32)
-            reel.frames.append(Frame(time, points, self._values(name, time) if name else None))
-        return reel
+            animation.frames.append(Frame(time, points, self._values(name, time) if name else None))
+        return animation
 
     def _points(self, time: float) -> npt.NDArray[np.float64]:
         """(P, 3) points of all meshes in the world (m), of the bodies first."""

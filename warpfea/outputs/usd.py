@@ -29,8 +29,8 @@ from warpfea.base.errors import ModelError, OutputError
 from warpfea.base.writer import Output, check_target, temporary_beside
 from warpfea.outputs.colormap import map_colors
 from warpfea.outputs.frames import (
+    DrawnSurface,
     FrameClock,
-    Surface,
     check_colors,
     check_fields,
     field_label,
@@ -40,7 +40,7 @@ from warpfea.outputs.frames import (
 from warpfea.outputs.normals import vertex_normals
 from warpfea.outputs.obstacles import names_beside
 from warpfea.outputs.usd_check import in_words, validate_usd
-from warpfea.outputs.usd_extend import read_earlier
+from warpfea.outputs.usd_extend import read_existing
 from warpfea.outputs.usd_obstacles import ObstaclePrims
 
 __all__ = ["SCHEMA", "USDWriter", "validate_usd"]
@@ -60,7 +60,7 @@ class USDWriter(Output):
         fields: scalar fields kept as vertex primvars, SI units.
         color: the field shown as display colour (also a primvar), or None for grey.
         color_range: (low, high) of the colours; without it the extremes over the whole run and all worlds.
-        spacing: distance of worlds (m); see :class:`warpfea.outputs.frames.Surface`.
+        spacing: distance of worlds (m); see :class:`warpfea.outputs.frames.DrawnSurface`.
         extend: extend the file of the resumed run, if it exists: same bodies and settings, ending at the current
             time.
 
@@ -104,7 +104,7 @@ class USDWriter(Output):
         self.abort()
         target = check_target(self.path, SUFFIXES)
         check_fields(sim, self.fields)
-        self._surface = Surface(sim, self.spacing)
+        self._surface = DrawnSurface(sim, self.spacing)
         self._clock = FrameClock(self.fps)
         self._codes: list[float] = []
         self._range = {name: (np.inf, -np.inf) for name in self.fields}
@@ -114,7 +114,7 @@ class USDWriter(Output):
         going_on = self.extend and target.is_file()
         try:
             if going_on:
-                self._take_up(sim, target)
+                self._resume(sim, target)
                 return
             self._stage = stage = Usd.Stage.CreateNew(str(self._temporary))
         except (OSError, Tf.ErrorException) as error:
@@ -140,7 +140,7 @@ class USDWriter(Output):
 
         return names_beside((), [Tf.MakeValidIdentifier(body.name) for body in self._surface.bodies])
 
-    def _take_up(self, sim: Any, target: pathlib.Path) -> None:
+    def _resume(self, sim: Any, target: pathlib.Path) -> None:
         """Open a copy of the existing file for extension."""
         from pxr import Usd, UsdGeom
 
@@ -150,7 +150,7 @@ class USDWriter(Output):
         worlds = range(self._surface.worlds)
         paths = [[f"/World/world_{world:04d}/{name}/skin" for world in worlds] for name in self._names()]
         wanted = {"fps": self.fps, "fields": self.fields, "color": self.color}
-        earlier = read_earlier(target, stage, sim, self._surface, paths, wanted)
+        earlier = read_existing(target, stage, sim, self._surface, paths, wanted)
         self._codes, self._box, self._surface.offsets = list(earlier.codes), earlier.box, earlier.offsets
         self._range = {name: earlier.ranges[name] for name in self.fields}
         self._clock.due(earlier.time)
@@ -160,7 +160,7 @@ class USDWriter(Output):
             moves = [UsdGeom.Xformable(m.GetPrim().GetParent()).GetOrderedXformOps()[0] for m in meshes]
             self._meshes.append([_Mesh(mesh, move, self.fields) for mesh, move in zip(meshes, moves)])
         self._obstacles = ObstaclePrims(stage, self._surface, self._names())
-        if not self._obstacles.take_up():
+        if not self._obstacles.resume():
             raise OutputError(f"{target}: can't go on with this file: it has other colliders; give another file name")
         for name in ("Camera", "Sky", "Sun"):  # authored for all frames at the end
             stage.RemovePrim(f"/World/{name}")

@@ -10,16 +10,16 @@ import numpy as np
 import numpy.typing as npt
 
 from warpfea.base.errors import OutputError
-from warpfea.outputs.frames import Surface, is_static, time_of
+from warpfea.outputs.frames import DrawnSurface, is_static, time_of
 
-__all__ = ["Earlier", "read_earlier"]
+__all__ = ["ExistingStage", "read_existing"]
 
-SAME = 1e-4
+CONTINUITY_TOL = 1e-4
 """Largest distance of the last frame from the current state, over the size of the drawn surface."""
 
 
 @dataclass(frozen=True, eq=False)
-class Earlier:
+class ExistingStage:
     """Contents of a stage of :class:`warpfea.USDWriter`.
 
     Attributes:
@@ -39,9 +39,9 @@ class Earlier:
     paths: list[list[str]]
 
 
-def read_earlier(
-    target: pathlib.Path, stage: Any, sim: Any, surface: Surface, paths: list[list[str]], wanted: dict[str, Any]
-) -> Earlier:
+def read_existing(
+    target: pathlib.Path, stage: Any, sim: Any, surface: DrawnSurface, paths: list[list[str]], wanted: dict[str, Any]
+) -> ExistingStage:
     """Contents of a stage extended by the run of `sim`.
 
     Args:
@@ -86,12 +86,12 @@ def read_earlier(
     offsets = np.array([_offset(stage, meshes[0][world]) for world in range(surface.worlds)])
     box = _box(meshes, codes, offsets)
     if abs(time - now) <= slack:
-        _check_frame(target, sim, surface, meshes, codes[-1], SAME * float(np.linalg.norm(box[1] - box[0])))
+        _check_frame(target, sim, surface, meshes, codes[-1], CONTINUITY_TOL * float(np.linalg.norm(box[1] - box[0])))
     ranges = {name: (float(field["range"][0]), float(field["range"][1])) for name, field in about["fields"].items()}
-    return Earlier(codes, time, ranges, box, offsets, paths)
+    return ExistingStage(codes, time, ranges, box, offsets, paths)
 
 
-def _check_faces(target: pathlib.Path, surface: Surface, meshes: list[list[Any]]) -> None:
+def _check_faces(target: pathlib.Path, surface: DrawnSurface, meshes: list[list[Any]]) -> None:
     """OutputError for meshes of the stage other than the drawn ones."""
     for body, worlds in zip(surface.bodies, meshes, strict=True):
         for mesh in worlds:
@@ -101,7 +101,7 @@ def _check_faces(target: pathlib.Path, surface: Surface, meshes: list[list[Any]]
 
 
 def _check_frame(
-    target: pathlib.Path, sim: Any, surface: Surface, meshes: list[list[Any]], code: float, bound: float
+    target: pathlib.Path, sim: Any, surface: DrawnSurface, meshes: list[list[Any]], code: float, bound: float
 ) -> None:
     """OutputError for a point of the frame at a time code farther than `bound`, m, from the simulation's."""
     for body, worlds in zip(surface.bodies, meshes, strict=True):

@@ -12,7 +12,7 @@ from warpfea.outputs.normals import vertex_normals
 from warpfea.outputs.obstacles import GREY, names_beside
 
 if TYPE_CHECKING:
-    from warpfea.outputs.frames import Surface
+    from warpfea.outputs.frames import DrawnSurface
 
 __all__ = ["ObstaclePrims"]
 
@@ -28,7 +28,7 @@ class ObstaclePrims:
         bodies: names of the bodies' prims.
     """
 
-    def __init__(self, stage: Any, surface: Surface, bodies: Sequence[str]) -> None:
+    def __init__(self, stage: Any, surface: DrawnSurface, bodies: Sequence[str]) -> None:
         from pxr import Tf
 
         self.stage, self.surface, self.obstacles = stage, surface, surface.obstacles
@@ -70,7 +70,7 @@ class ObstaclePrims:
         grey = Gf.Vec3f(*map(float, to_linear(GREY)))
         mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set(Vt.Vec3fArray([grey]))
 
-    def take_up(self) -> bool:
+    def resume(self) -> bool:
         """Find the prims in an extended stage; False if it has others."""
         from pxr import UsdGeom
 

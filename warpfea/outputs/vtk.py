@@ -98,9 +98,9 @@ class VTUWriter(Output):
         self._placed: dict[tuple[int, int], tuple[np.ndarray, str]] = {}
         self._kept = 0
         if self.extend and self.series.is_file():
-            self._take_up(time_of(sim))
+            self._resume(time_of(sim))
 
-    def _take_up(self, now: float) -> None:
+    def _resume(self, now: float) -> None:
         """Extend the frames of the series up to the time `now`, s."""
         self._frames = self._read_series(self.series, now)
         if self.collider_series.is_file():
@@ -241,7 +241,7 @@ def _frame_data(sim: Any, body: Any, fields: Sequence[str]) -> tuple[np.ndarray,
         data |= {field: np.asarray(sim.field(field, body), dtype=np.float64) for field in fields}
         return points, data, (mesh.cell_type, mesh.cells, _groups(mesh, np.arange(len(mesh.cells))))
     drawn = body.drawing
-    points = sim.placed(body, drawn.slot_weights)
+    points = sim.point_positions(body, drawn.slot_weights)
     v = sim.state.velocity.numpy()[:, body.slots].astype(float)
     data = {
         "displacement": points - reference_points(body, drawn.slot_weights),

@@ -13,23 +13,23 @@ from ..base.checks import is_number, number_hint
 from ..base.errors import ModelError
 from ..kernels.step.adaptive import COUNTS, KEPT, adaptive_kernels, adaptive_struct
 from ..solvers.newton import EPS, NewtonPCG
-from .instants import Instants
 from .integrators import INTEGRATORS, Integrator
+from .sync_times import SyncTimes
 
 if TYPE_CHECKING:
     from ..model.model import Model
-    from ..terms.term import At
+    from ..terms.term import StepContext
 
-__all__ = ["Adapt", "Adaptive", "adapt_of"]
+__all__ = ["AdaptiveOptions", "StepSizeControl", "adaptive_options"]
 
-LEAST = {"float64": 1e-9, "float32": 1e-5}
+MIN_ERROR = {"float64": 1e-9, "float32": 1e-5}
 """Smallest admissible error over the model's size; below it round-off is significant."""
-FIRST = 0.125
+FIRST_STEP = 0.125
 """First substep over horizon error^(1/order)."""
 
 
 @dataclass(frozen=True)
-class Adapt:
+class AdaptiveOptions:
     """Options of adaptive time stepping.
 
     Attributes:
@@ -44,9 +44,9 @@ class Adapt:
     horizon: float | None = None
 
 
-def adapt_of(
+def adaptive_options(
     dt: Any, error: Any, interval: Any, horizon: Any, *, model: Model, scheme: Integrator, solver: Any
-) -> Adapt | None:
+) -> AdaptiveOptions | None:
     """Options of dt = "auto"; None for a number.
 
     Raises:
@@ -77,14 +77,14 @@ def adapt_of(
         raise ModelError(
             "dt = 'auto' needs solver 'newton-pcg': with Jacobi the algebraic error hides the time discretisation error"
         )
-    least = LEAST[model.dtype]
+    least = MIN_ERROR[model.dtype]
     if error < least:
         finer = "; use float64" if model.dtype == "float32" else ""
         raise ModelError(f"error = {error!r} is below {model.dtype} round-off ({least:g} of the model size){finer}")
-    return Adapt(float(error), interval, horizon)
+    return AdaptiveOptions(float(error), interval, horizon)
 
 
-def _arms(model: Model) -> np.ndarray:
+def _lever_arms(model: Model) -> np.ndarray:
     """Lever arm (slots,), m, that converts an unknown to displacement: 1 for positions, half the section for gradients
     across beams and shells, 0 for gradients whose motion the adjacent positions represent."""
     out = model.is_position_host.astype(float)
@@ -97,7 +97,7 @@ def _arms(model: Model) -> np.ndarray:
     return out
 
 
-class Adaptive:
+class StepSizeControl:
     """Step size control per world with common synchronisation times set by the host.
 
     Attributes:
@@ -105,60 +105,62 @@ class Adaptive:
         instants: synchronisation times.
     """
 
-    def __init__(self, at: At, v_before: wp.array, scheme: Integrator, asked: Adapt, *, max_tries: int) -> None:
-        model, work = at.model, at.work
-        self.model, self.work, self.launch = model, work, at.launch
-        self.velocity, self.v_before, self.error, self.order = at.state.velocity, v_before, asked.error, scheme.order
-        self.instants = Instants(model.terms.laws.laws, asked.interval, asked.horizon)
+    def __init__(
+        self, ctx: StepContext, v_before: wp.array, scheme: Integrator, options: AdaptiveOptions, *, max_tries: int
+    ) -> None:
+        model, work = ctx.model, ctx.work
+        self.model, self.work, self.launch = model, work, ctx.launch
+        self.velocity, self.v_before, self.error, self.order = ctx.state.velocity, v_before, options.error, scheme.order
+        self.sync_times = SyncTimes(model.terms.time_laws.laws, options.interval, options.horizon)
         self.kernels = adaptive_kernels(model.dtype, scheme)
         self.dim = (model.worlds, model.slots)
-        self.arm = model.array("adaptive", _arms(model), model.types.T)
+        self.arm = model.array("adaptive", _lever_arms(model), model.types.T)
         shapes = {"counts": (model.worlds, len(COUNTS)), "horizon": (1,), "first": (1,)}
         self.control: Any = work.struct(adaptive_struct(), model.worlds, skip=("kept",), **shapes)
-        self.control.kept = at.state.register("adaptive", wp.float64, (len(KEPT),))
-        self.means = at.state.register("adaptive_means", model.types.vec3, (model.slots,))
-        self.control.tolerance = asked.error * float(model.size)
+        self.control.kept = ctx.state.register("adaptive", wp.float64, (len(KEPT),))
+        self.means = ctx.state.register("adaptive_means", model.types.vec3, (model.slots,))
+        self.control.tolerance = options.error * float(model.size)
         self.control.eps = EPS[model.dtype]
         self.control.max_tries = max_tries
 
-    def aim(self, time: np.ndarray) -> None:
+    def set_interval(self, time: np.ndarray) -> None:
         """Set the interval to the next synchronisation point before a step from times (B,), s."""
-        instants = self.instants
-        if not instants.settled:
-            instants.settle(float(time.min()))
-        self.control.horizon.fill_(instants.horizon)
-        self.control.first.fill_(FIRST * instants.horizon * self.error ** (1.0 / self.order))
-        self.work.step.dt.assign(instants.spans(time))
+        sync_times = self.sync_times
+        if not sync_times.is_set:
+            sync_times.set_defaults(float(time.min()))
+        self.control.horizon.fill_(sync_times.horizon)
+        self.control.first.fill_(FIRST_STEP * sync_times.horizon * self.error ** (1.0 / self.order))
+        self.work.step.dt.assign(sync_times.time_to_next(time))
 
-    def steps_to(self, now: float, end: float, outputs: Iterable[Any]) -> int:
+    def count_steps(self, now: float, end: float, outputs: Iterable[Any]) -> int:
         """Number of steps of a run from `now` to `end`, both s, with outputs; -1 for an empty run."""
         if end < now:
             return -1
-        self.instants.follow(outputs)
+        self.sync_times.add_outputs(outputs)
         if end > now:
-            self.instants.begin_run(now, end)
-        return self.instants.count(now, end) if end > now else 0
+            self.sync_times.begin_run(now, end)
+        return self.sync_times.count(now, end) if end > now else 0
 
-    def open(self) -> None:
+    def begin_interval(self) -> None:
         """Set the substep size from the state, after the kernel `begin_step`."""
         self.launch(self.kernels.open_step, self.model.worlds, [self.work.step, self.control])
 
-    def judge(self) -> None:
+    def check_local_error(self) -> None:
         """Estimate the local error of converged attempts; reject those above tolerance (before the kernel
         `end_attempt`)."""
         m, w, k, ctl, launch = self.model, self.work, self.kernels, self.control, self.launch
         launch(k.begin_estimate, m.worlds, [w.step, w.newton, ctl])
         args = [w.step, ctl, self.arm, m.topology.free, w.u, w.v, self.velocity, self.v_before, self.means]
         launch(k.local_error, self.dim, args)
-        launch(k.judge, m.worlds, [w.step, w.newton, w.pcg, ctl])
+        launch(k.control_step_size, m.worlds, [w.step, w.newton, w.pcg, ctl])
 
-    def settle(self) -> None:
+    def finish_attempt(self) -> None:
         """Compute mean rates and the size of the next substep, after the kernel `end_attempt` and before acceptance."""
         w, launch = self.work, self.launch
         launch(self.kernels.keep_mean, self.dim, [w.step, self.control, w.v, self.velocity, self.v_before, self.means])
-        launch(self.kernels.settle, self.model.worlds, [w.step, self.control])
+        launch(self.kernels.refine_substeps, self.model.worlds, [w.step, self.control])
 
-    def close(self) -> None:
+    def end_interval(self) -> None:
         """Finish the interval before the report."""
         self.launch(self.kernels.close_step, self.model.worlds, [self.work.pcg, self.control])
 

@@ -24,9 +24,9 @@ if TYPE_CHECKING:
 
 __all__ = ["check_capacity", "free_bytes"]
 
-PLENTY = 3000
+SLOT_VECTORS_BOUND = 3000
 """Upper bound of scratch vectors per slot (pendulums 200 to 600, solids of T10 300, piles of bodies 2000)."""
-KEPT = 0.02
+RESERVED_FRACTION = 0.02
 """Memory fraction reserved for uncounted allocations (code, graphs, pools)."""
 
 
@@ -53,14 +53,14 @@ def check_capacity(model: Model, make: Callable[[Model, State], Stepper]) -> Non
     """
     free = free_bytes(model.device)
     item = 3 * wp.types.type_size_in_bytes(model.types.T)
-    if free is None or model.worlds <= 2 or model.worlds * model.slots * PLENTY * item < free:
+    if free is None or model.worlds <= 2 or model.worlds * model.slots * SLOT_VECTORS_BOUND * item < free:
         return
-    small = Sizes(*(_arrays(model, worlds, make) for worlds in (1, 2)))
-    room = int((1.0 - KEPT) * free)
-    need = small.of(model.worlds)
+    small = ByteCounts(*(_arrays(model, worlds, make) for worlds in (1, 2)))
+    room = int((1.0 - RESERVED_FRACTION) * free)
+    need = small.for_worlds(model.worlds)
     if need <= room:
         return
-    fit = bisect.bisect_right(range(1, model.worlds), room, key=small.of)
+    fit = bisect.bisect_right(range(1, model.worlds), room, key=small.for_worlds)
     per_world = need // model.worlds
     raise CapacityError(
         f"a simulation of {model.worlds} worlds takes {size(need)}, {per_world} bytes per world, and {model.device} "
@@ -70,18 +70,18 @@ def check_capacity(model: Model, make: Callable[[Model, State], Stepper]) -> Non
 
 
 @dataclass(frozen=True)
-class Sizes:
+class ByteCounts:
     """Bytes of arrays by name with one and two worlds, and chunk sizes of chunked arrays."""
 
-    one: tuple[dict[str, int], dict[str, Callable[[int], int]]]
-    two: tuple[dict[str, int], dict[str, Callable[[int], int]]]
+    one_world: tuple[dict[str, int], dict[str, Callable[[int], int]]]
+    two_worlds: tuple[dict[str, int], dict[str, Callable[[int], int]]]
 
-    def of(self, worlds: int) -> int:
+    def for_worlds(self, worlds: int) -> int:
         """Bytes for a number of worlds."""
         out = 0
-        for name, count in self.one[0].items():
-            chunk = self.one[1].get(name, int)
-            out += count + (chunk(worlds) - 1) * (self.two[0][name] - count)
+        for name, count in self.one_world[0].items():
+            chunk = self.one_world[1].get(name, int)
+            out += count + (chunk(worlds) - 1) * (self.two_worlds[0][name] - count)
         return out
 
 

@@ -21,8 +21,9 @@ from .reports import idle_report
 
 __all__ = ["Checkpoint", "load_checkpoint", "read_meta", "save_checkpoint"]
 
-SCHEMA = 2
-"""1: constraints were registered with the solver, and the ledger had a column of joints in every model."""
+SCHEMA = 3
+"""1: constraints were registered with the solver, and the ledger had a column of joints in every model; 2: other names
+of history arrays and of the attributes of terms, which `Term.hash` reads."""
 SUFFIXES = (".npz",)
 
 
@@ -72,7 +73,7 @@ class Checkpoint(Output):
 def save_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
     """Write the simulation's state to `path` (.npz). OutputError on failure."""
     target = check_target(path, SUFFIXES)
-    sim.stepper.take_parameters()
+    sim.stepper.update_parameters()
     meta = {
         "schema": SCHEMA,
         "fingerprint": sim.model.fingerprint(),
@@ -90,9 +91,9 @@ def save_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
         "probes": [probe.name for probe in sim.model.probes],
     }
     if sim.stepper.adaptive:
-        instants = sim.stepper.adaptive.instants
+        sync_times = sim.stepper.adaptive.sync_times
         meta["error"] = sim.error
-        meta["instants"] = [instants.interval, instants.horizon, instants.origin] if instants.settled else None
+        meta["instants"] = [sync_times.interval, sync_times.horizon, sync_times.origin] if sync_times.is_set else None
     arrays: dict[str, Any] = {f"state.{name}": values for name, values in sim.state.numpy().items()}
     arrays |= {f"parameter.{name}": values for name, values in sim.model.parameters.numpy().items()}
     arrays |= {f"set.{name}": array.numpy() for name, array in sim.model.terms.parameter_arrays().items()}
@@ -147,13 +148,13 @@ def load_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
             if f"set.{name}" in arrays:  # absent in older files
                 array.assign(arrays[f"set.{name}"])
         for term in sim.model.terms:
-            term.parameters_taken()
-        sim.stepper.forget(potential="predictor_potential" not in state)
+            term.parameters_restored()
+        sim.stepper.invalidate(potential="predictor_potential" not in state)
         sim.stepper.start_terms()
     except CheckpointError as error:
         raise CheckpointError(f"{file}: {error}") from None
     if sim.stepper.adaptive and meta.get("instants"):
-        sim.stepper.adaptive.instants.load(*meta["instants"])
+        sim.stepper.adaptive.sync_times.load(*meta["instants"])
     sim.totals = {name: np.array(a) for name, a in totals.items()}
     sim.steps = int(meta["steps"])
     sim.max_residual = float(meta["max_residual"])
@@ -204,6 +205,6 @@ def _read(file: pathlib.Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     except (ValueError, KeyError, TypeError, EOFError, AttributeError, zipfile.BadZipFile) as error:
         raise CheckpointError(f"{file}: not a readable checkpoint, such as wf.Checkpoint writes") from error
     if schema != SCHEMA:
-        older = "was written by an older version of warpfea" if schema == 1 else "is unknown"
+        older = "was written by an older version of warpfea" if schema in range(1, SCHEMA) else "is unknown"
         raise CheckpointError(f"{file}: the checkpoint {older} (schema {schema!r}; this version reads {SCHEMA})")
     return meta, arrays

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from ..base.brief import FEW, brief, lines
 from ..base.errors import ModelError
 from ..base.names import did_you_mean, listing
-from ..laws import Control
-from ..terms.time_laws import control_array
+from ..base.short_repr import MAX_ITEMS, lines, short_repr
+from ..terms.time_law_table import control_array
+from ..time_laws import Control
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -27,7 +27,7 @@ class Controls(Mapping[str, "ControlValue"]):
     def __init__(self, model: Model, state: State) -> None:
         self._values = {
             name: ControlValue(control, getattr(state, control_array(name)))
-            for name, control in model.terms.laws.controls.items()
+            for name, control in model.terms.time_laws.controls.items()
         }
 
     def __getitem__(self, name: str) -> ControlValue:
@@ -141,7 +141,8 @@ class ControlValue:
 
     def __repr__(self) -> str:
         values = self.numpy()
-        return f"ControlValue({self.control.name!r}, {values.tolist() if len(values) <= FEW else brief(values)})"
+        shown = values.tolist() if len(values) <= MAX_ITEMS else short_repr(values)
+        return f"ControlValue({self.control.name!r}, {shown})"
 
     @property
     def _what(self) -> str:

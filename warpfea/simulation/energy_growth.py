@@ -1,4 +1,4 @@
-"""Monitor of spurious energy growth: device counters (kernels/step/ledger.py), warnings, rejection.
+"""Monitor of spurious energy growth: device counters (kernels/step/energy_ledger.py), warnings, rejection.
 
 Net measure: decrease of the ledger's `integrator` + `viscous` and increase of its `ledger_residual` since the start of
 monitoring, over the largest kinetic + strain + contact energy since, plus the sum of |work| and of the viscous loss.
@@ -18,26 +18,26 @@ import numpy as np
 import warp as wp
 
 from ..base.errors import ModelWarning
-from ..kernels.step.control import GROWTH
+from ..kernels.step.step_control import GROWTH
 from ..model.assembly import element_volumes
-from .jumps import drives
+from .drive_jumps import drives
 
 if TYPE_CHECKING:
     from ..model.model import Model
     from ..model.state import State
 
-__all__ = ["CHOICES", "REFUSED", "TOLD", "EnergyGrowth", "growth_error", "integrator_share"]
+__all__ = ["CHOICES", "REFUSE_LIMIT", "WARN_LIMIT", "EnergyGrowth", "growth_error", "integrator_share"]
 
 CHOICES = ("refuse", "warn", "ignore")
-TOLD, REFUSED = 0.01, 0.1
+WARN_LIMIT, REFUSE_LIMIT = 0.01, 0.1
 """Energy gain of the integrator over the energy, for a warning and for rejection of steps."""
-CALMER = {
+MORE_DISSIPATIVE = {
     "generalized_alpha": ("bdf2", "energy_momentum(rho_inf=0.8)", "backward_euler"),
     "energy_momentum": ("energy_momentum(rho_inf=0.8)", "bdf2", "backward_euler"),
     "bdf2": ("energy_momentum", "backward_euler"),
 }
 """Alternative schemes to one that gains energy."""
-ROUNDING = 100.0
+STRAIN_ROUNDINGS = 100.0
 """Strain in units of round-off whose energy counts as round-off."""
 
 
@@ -52,14 +52,14 @@ class EnergyGrowth:
     def __init__(self, choice: str, *, ledger: bool, static: bool) -> None:
         self.choice = choice
         self.watched = ledger and not static and choice != "ignore"
-        self.told = False
+        self.warned = False
         self._ledger = ledger
 
     def __str__(self) -> str:
         if not self.watched:
             return "not watched" + ("" if self._ledger else " (ledger=False)")
-        refused = f", refused above {REFUSED:.0%}" if self.choice == "refuse" else ""
-        return f"watched: warned of above {TOLD:.0%}{refused}"
+        refused = f", refused above {REFUSE_LIMIT:.0%}" if self.choice == "refuse" else ""
+        return f"watched: warned of above {WARN_LIMIT:.0%}{refused}"
 
     def bind(self, step: Any, model: Model, state: State) -> None:
         """Bind monitor arrays to the step control; resets the history of a reused state."""
@@ -70,14 +70,14 @@ class EnergyGrowth:
         step.growth, step.watched = rows, 1
         step.counted = float(not drives(model))
         self._model, self._rows = model, rows
-        self._least = wp.zeros(model.worlds, dtype=wp.float64, device=model.device)
+        self._least_energy = wp.zeros(model.worlds, dtype=wp.float64, device=model.device)
         self._written, self._writes = model.terms.written, model.terms.writes
-        self._least.assign(least_energy(model))
-        step.growth_told = TOLD
-        step.growth_limit = REFUSED if self.choice == "refuse" else np.inf
-        step.least_energy = self._least
+        self._least_energy.assign(least_energy(model))
+        step.growth_warn_limit = WARN_LIMIT
+        step.growth_limit = REFUSE_LIMIT if self.choice == "refuse" else np.inf
+        step.least_energy = self._least_energy
 
-    def follow(self) -> None:
+    def restart_changed(self) -> None:
         """Restart in worlds whose parameters were set: the energy jump is not the integrator's."""
         if not self.watched or self._written == self._model.terms.written:
             return
@@ -87,20 +87,20 @@ class EnergyGrowth:
         rows = self._rows.numpy()
         rows[chosen] = 0.0
         self._rows.assign(rows)
-        self._least.assign(least_energy(self._model))
+        self._least_energy.assign(least_energy(self._model))
 
-    def tell(self, sim: Any, shares: np.ndarray) -> None:
+    def warn_once(self, sim: Any, shares: np.ndarray) -> None:
         """Warn once if a world's energy gain (worlds,) exceeds TOLD."""
-        if self.told or not (worst := float(np.max(shares))) > TOLD:
+        if self.warned or not (worst := float(np.max(shares))) > WARN_LIMIT:
             return
-        self.told = True
+        self.warned = True
         world = int(np.argmax(shares))
         since = float(sim.state.energy_growth.numpy()[world, GROWTH.index("since")])
-        refused = f"; steps are refused above {REFUSED:.0%}" if self.choice == "refuse" else ""
+        refused = f"; steps are refused above {REFUSE_LIMIT:.0%}" if self.choice == "refuse" else ""
         where = f" in world {world}" if sim.model.worlds > 1 else ""
         warnings.warn(
-            f"{source(sim, world)} is gaining energy: {worst:.1%} of the peak energy{where} (above {TOLD:.0%} since "
-            f"t = {since:.6g} s){refused}; {remedy(sim, world)}",
+            f"{source(sim, world)} is gaining energy: {worst:.1%} of the peak energy{where} (above {WARN_LIMIT:.0%} "
+            f"since t = {since:.6g} s){refused}; {calmer_schemes_text(sim, world)}",
             ModelWarning,
             stacklevel=4,
         )
@@ -108,7 +108,7 @@ class EnergyGrowth:
 
 def least_energy(model: Model) -> np.ndarray:
     """Round-off level of the energy (worlds,), J: strain of ROUNDING eps everywhere."""
-    unit, out = ROUNDING * float(np.finfo(model.dtype).eps), np.zeros(model.worlds)
+    unit, out = STRAIN_ROUNDINGS * float(np.finfo(model.dtype).eps), np.zeros(model.worlds)
     for body in model.bodies:
         volume = float(element_volumes(body).sum())
         worlds = range(model.worlds) if model.parameters.varies(body) else [None]
@@ -132,11 +132,11 @@ def source(sim: Any, world: int) -> str:
     return "the work of accepted residuals" if by_residuals(sim, world) else sim.integrator.label
 
 
-def remedy(sim: Any, world: int) -> str:
+def calmer_schemes_text(sim: Any, world: int) -> str:
     """Alternative integrators or tolerance, as text."""
     if by_residuals(sim, world):
         return "take a smaller tol" + (", or dtype='float64'" if sim.model.dtype == "float32" else "")
-    others = [f"{other!r}" for other in CALMER.get(sim.integrator.name, ())]
+    others = [f"{other!r}" for other in MORE_DISSIPATIVE.get(sim.integrator.name, ())]
     return f"take integrator={', '.join(others)} or a smaller dt" if others else "take a smaller dt"
 
 
@@ -157,10 +157,10 @@ def growth_error(sim: Any, world: int) -> str:
     """Message of a step rejected for energy growth; restarts the monitor of the world."""
     rows = sim.state.energy_growth.numpy()
     share, since = (float(rows[world, GROWTH.index(name)]) for name in ("share", "since"))
-    name, cure = source(sim, world), remedy(sim, world)
+    name, cure = source(sim, world), calmer_schemes_text(sim, world)
     rows[world] = 0.0
     sim.state.energy_growth.assign(rows)
     return (
-        f"{name}: energy gain {share:.1%} of the peak energy (above {TOLD:.0%} since t = {since:.6g} s); {cure}; "
+        f"{name}: energy gain {share:.1%} of the peak energy (above {WARN_LIMIT:.0%} since t = {since:.6g} s); {cure}; "
         "energy_growth='warn' continues"
     )

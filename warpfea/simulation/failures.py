@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..base.errors import ConstraintError, ConvergenceError
-from ..kernels.solvers.control import (
+from ..kernels.solvers.convergence import STALL_ROUNDINGS
+from ..kernels.solvers.newton_control import (
     FAIL_CONSTRAINT,
     FAIL_CURVATURE,
     FAIL_ENERGY,
@@ -22,17 +23,16 @@ from ..kernels.solvers.control import (
     FAIL_NAN,
     FAIL_WORK,
 )
-from ..kernels.solvers.judging import NEAR
 from ..solvers import NewtonPCG
 from ..terms.evaluation import lowest_jacobian
+from .drive_jumps import jumping_drives
 from .energy_growth import growth_error
-from .jumps import jumping_drives
 from .overload import overload_text
 
 if TYPE_CHECKING:
     from ..model.model import Model
 
-__all__ = ["check_closed", "step_error"]
+__all__ = ["check_initial_constraints", "step_error"]
 
 REASONS = {
     FAIL_ITERATIONS: "Newton's method did not converge",
@@ -45,11 +45,11 @@ REASONS = {
     FAIL_INVERTED: "an element inverted (J <= 0)",
     FAIL_ERROR: "the error tolerance was not met within 65536 substeps",
 }
-UNSTABLE = (FAIL_ITERATIONS, FAIL_LINE_SEARCH, FAIL_CURVATURE)
+INDEFINITE_FAILURES = (FAIL_ITERATIONS, FAIL_LINE_SEARCH, FAIL_CURVATURE)
 """Failures that an indefinite tangent may explain."""
-UNKNOWN = 1e30
+NO_ESTIMATE = 1e30
 """Value of an unavailable error estimate."""
-OPEN = 1e-4
+MAX_INITIAL_VIOLATION = 1e-4
 """Largest initial constraint violation (over the model size) accepted by dynamics."""
 
 
@@ -62,17 +62,17 @@ def step_error(sim: Any, world: int) -> ConvergenceError | ConstraintError:
     # no halving follows the last rejection
     halvings = min(int(sim.last.halvings[world]) - 1, sim.solver.max_halvings)
     if code == FAIL_ENERGY:
-        text = f"{_step_from(sim, time, world)} was not taken in world {world}: {growth_error(sim, world)}"
+        text = f"{_step_text(sim, time, world)} was not taken in world {world}: {growth_error(sim, world)}"
         return ConvergenceError(text, time=time, world=world, state=sim.state)
     if code == FAIL_CONSTRAINT:
-        return _unsatisfied(sim, world, time, halvings)
+        return _constraint_error(sim, world, time, halvings)
     count = int(work.newton.iterations.numpy()[world]) + 1
     history = work.newton.history.numpy()[world, :count].tolist()
     if code in (FAIL_JACOBIAN, FAIL_INVERTED):
         element, where = lowest_jacobian(sim.model, work.u.numpy()[world].astype(float))
     else:
         element, where = _worst_element(sim.model, work.g.numpy()[world])
-    reason, hint = _why(sim, code, world)
+    reason, hint = _failure_reason(sim, code, world)
     if sim.integrator.stabilise and work.step.mass_factor.numpy()[world] == 0.0:
         hint += (
             "; the stabilising springs vanish at full load, where supports and contact alone do not restrain the bodies"
@@ -81,38 +81,38 @@ def step_error(sim: Any, world: int) -> ConvergenceError | ConstraintError:
     lumped = [c.name for c in sim.model.description.contacts if c.model == "sphere"] if sim.integrator.static else []
     if lumped and code != FAIL_FLOOR:
         hint += f"; the single contact point of {lumped[0]!r} jumps as the body rolls: use model='patch' in statics"
-    spent, most = int(sim.last.newton[world]), int(work.step.most_newton)
+    spent, most = int(sim.last.newton[world]), int(work.step.newton_budget)
     if code != FAIL_WORK and most and spent >= most and halvings < sim.solver.max_halvings:
         hint += f"; {spent} Newton iterations used up max_work = {sim.solver.max_work}"
     jumps = "" if code == FAIL_FLOOR else jumping_drives(sim, world)
     kind: type[ConvergenceError] = ConvergenceError
     for term in sim.model.terms:
-        if (found := term.explain(sim.stepper.at, world)) is not None:
+        if (found := term.failure_reason(sim.stepper.ctx, world)) is not None:
             kind, text = found
             reason, hint = f"{text}; {reason}", ""
         else:
-            hint += term.remark(sim.stepper.at, world)
+            hint += term.failure_note(sim.stepper.ctx, world)
     return kind(
-        f"{_step_from(sim, time, world)} was not accepted in world {world}: "
+        f"{_step_text(sim, time, world)} was not accepted in world {world}: "
         f"{reason} after {halvings} halvings; relative residuals "
         f"{', '.join(f'{x:.2e}' for x in history[-4:])}; worst {where}{hint}{jumps}",
         time=time, world=world, residuals=history, element=element, state=sim.state,
     )  # fmt: skip
 
 
-def _why(sim: Any, code: int, world: int) -> tuple[str, str]:
+def _failure_reason(sim: Any, code: int, world: int) -> tuple[str, str]:
     """Reason of a Newton failure, and a remedy."""
     work, dtype = sim.stepper.work, sim.model.dtype
     smaller = "; try more load steps" if sim.integrator.static else "; try a smaller dt"
     direct = sim.stepper.newton.direct
     if code == FAIL_CURVATURE and direct is not None and world in direct.singular:
         return "singular tangent matrix (unconstrained body or mechanism?)", ""
-    near = float(work.newton.floor_excess.numpy()[world]) <= NEAR
+    near = float(work.newton.rounding_ratio.numpy()[world]) <= STALL_ROUNDINGS
     finer = "; use float64" if dtype == "float32" else "; use fewer, stouter elements, or check the units"
     if code == FAIL_FLOOR:
-        eta = float(work.newton.eta.numpy()[world])
+        eta = float(work.newton.error_estimate.numpy()[world])
         left = ""
-        if eta < UNKNOWN:
+        if eta < NO_ESTIMATE:
             left = f" (estimated error {eta:.2g})"
         return f"{dtype} round-off limit reached{left}", finer
     if code == FAIL_WORK:
@@ -124,21 +124,21 @@ def _why(sim: Any, code: int, world: int) -> tuple[str, str]:
         return spent, "" if overload_text(sim.model) else slivers
     if code == FAIL_INVERTED:
         return REASONS[code], f"{smaller}, or NeoHookean in place of SVK; inversion='report' lets it pass"
-    bent = sim.integrator.static and int(work.newton.bent.numpy()[world])
-    if code in UNSTABLE and near and (dtype == "float32" or not bent):
+    bent = sim.integrator.static and int(work.newton.met_negative_curvature.numpy()[world])
+    if code in INDEFINITE_FAILURES and near and (dtype == "float32" or not bent):
         return f"{dtype} round-off limit reached", finer
-    if code in UNSTABLE and bent and dtype == "float32":
+    if code in INDEFINITE_FAILURES and bent and dtype == "float32":
         return f"{REASONS[code]}: forces in float32 have a direction without stiffness", (
             f"{finer}, which says whether the equilibrium is unstable, or more load steps"
         )
-    if code in UNSTABLE and bent:
+    if code in INDEFINITE_FAILURES and bent:
         return f"{REASONS[code]}: unstable equilibrium (buckling or snap-through)", (
             "; follow the post-critical path by damped dynamics or displacement control"
         )
     return REASONS.get(code, "unknown reason"), smaller
 
 
-def _step_from(sim: Any, time: float, world: int) -> str:
+def _step_text(sim: Any, time: float, world: int) -> str:
     """Rejected step, by its time (s) or load fraction."""
     if sim.integrator.static:
         return f"load step from {100.0 * time:.4g} % to {100.0 * (time + sim.dt):.4g} % of the load"
@@ -147,14 +147,14 @@ def _step_from(sim: Any, time: float, world: int) -> str:
     return f"step from t = {time:.6g} s with dt = {dt}"
 
 
-def check_closed(sim: Any, mask: np.ndarray | None = None) -> None:
+def check_initial_constraints(sim: Any, mask: np.ndarray | None = None) -> None:
     """Raise ConstraintError if dynamics starts with violated constraints, in the worlds of the mask (B,)."""
     if sim.model.constraints is None or sim.integrator.static:
         return
     for world, values in enumerate(sim.stepper.work.multipliers.value.numpy()):
         if mask is not None and not mask[world]:
             continue
-        names, worst = _violated(sim.model, values, OPEN * sim.model.size)
+        names, worst = _violated(sim.model, values, MAX_INITIAL_VIOLATION * sim.model.size)
         if names:
             time = float(sim.time[world])
             raise ConstraintError(
@@ -164,14 +164,14 @@ def check_closed(sim: Any, mask: np.ndarray | None = None) -> None:
             )  # fmt: skip
 
 
-def _unsatisfied(sim: Any, world: int, time: float, halvings: int) -> ConstraintError:
+def _constraint_error(sim: Any, world: int, time: float, halvings: int) -> ConstraintError:
     """Error of constraints that stay violated at equilibrium."""
     tol = sim.stepper.newton.constraint_tol
     names, values = _violated(sim.model, sim.stepper.work.multipliers.value.numpy()[world], tol)
     listed = ", ".join(f"{name!r} by {value:.3g} m" for name, value in zip(names[:4], values[:4]))
     few = "" if isinstance(sim.solver, NewtonPCG) else ", or Jacobi's iterations are too few"
     return ConstraintError(
-        f"{_step_from(sim, time, world)}: constraints could not be satisfied in world {world} after "
+        f"{_step_text(sim, time, world)}: constraints could not be satisfied in world {world} after "
         f"{halvings} halvings: {listed}{', ...' if len(names) > 4 else ''}; conflicting with each other or with "
         f"supports, or not reachable (tolerance {tol:.3g} m){few}{jumping_drives(sim, world)}",
         joints=names, violations=values, time=time, world=world, state=sim.state,

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..base.brief import lines
 from ..base.errors import ModelError
 from ..base.names import did_you_mean, listing
-from ..kernels.step.loops import MOTION, VALUES, observation_kernels
-from ..kernels.terms.contact_data import RECORD
+from ..base.short_repr import lines
+from ..kernels.step.episodes import JOINT_VALUES, MOTION_KINDS, observation_kernels
+from ..kernels.terms.contact_structs import RECORD
 
 __all__ = ["Observations"]
 
@@ -88,7 +88,7 @@ class Observations:
         if owner not in bodies:
             raise ModelError(f"observe: body {owner!r} is unknown; there are: {listing(bodies)}"
                              f"{did_you_mean(owner, list(bodies))}")  # fmt: skip
-        self._choose(name, what, MOTION)
+        self._choose(name, what, MOTION_KINDS)
         body = bodies[owner]
         for node, X in enumerate(body.mesh.points):
             slot = int(body.node_slot[node])
@@ -101,7 +101,7 @@ class Observations:
         if owner not in probes:
             raise ModelError(f"observe: probe {owner!r} is unknown; there are: {listing(probes)}"
                              f"{did_you_mean(owner, list(probes))}")  # fmt: skip
-        self._choose(name, what, MOTION)
+        self._choose(name, what, MOTION_KINDS)
         probe = probes[owner]
         self._points.append((probe.body.slot_offset + probe.slots, probe.weights, what, probe.X, self._width))
         self._width += 3
@@ -146,7 +146,8 @@ class Observations:
 
         points = self._points
         self._motion = [
-            *sums([(slots, weights) for slots, weights, *_ in points]), array([MOTION[p[2]] for p in points], wp.int32),
+            *sums([(slots, weights) for slots, weights, *_ in points]),
+            array([MOTION_KINDS[p[2]] for p in points], wp.int32),
             array(np.array([p[3] for p in points], dtype=float).reshape(-1, 3), wp.vec3d),
             array([p[4] for p in points], wp.int32),
         ] if points else []  # fmt: skip
@@ -155,14 +156,14 @@ class Observations:
         self._joint_values = [
             *sums([(slots, weights) for slots, weights, _ in entries]),
             array(np.array([v.value for v in vectors], dtype=float).reshape(-1, 3), wp.vec3d),
-            array([VALUES[v[1]] for v in self._values], wp.int32), array([v[2] for v in self._values], wp.int32),
+            array([JOINT_VALUES[v[1]] for v in self._values], wp.int32), array([v[2] for v in self._values], wp.int32),
             array([v[3] for v in self._values], wp.int32),
         ] if vectors else []  # fmt: skip
         reports = np.array(self._reports, dtype=np.int32).reshape(-1, 2)
         self._report_columns = [array(reports[:, k].copy(), wp.int32) for k in range(2)] if len(reports) else []
         self._stepped: wp.array | None = None
         if self._report_columns:
-            own = self._sim.stepper.loops.stepped
+            own = self._sim.stepper.episodes.stepped
             self._stepped = wp.zeros(m.worlds, dtype=wp.int32, device=m.device) if own is None else own
 
     # use
@@ -173,13 +174,13 @@ class Observations:
         state, launch = sim.state, sim.stepper.launch
         if self._motion:
             args = [*self._motion, state.displacement, state.velocity, self.array]
-            launch(k.motions, (B, len(self._points)), args)
+            launch(k.point_motions, (B, len(self._points)), args)
         if self._joint_values:
             args = [*self._joint_values, state.displacement, state.constraint_target, self.array]
             launch(k.joint_values, (B, len(self._values)), args)
         if self._report_columns:
             assert self._stepped is not None
-            if not sim.quiet:  # known on the host
+            if not sim.asynchronous:  # known on the host
                 self._stepped.assign(sim._stepped.astype(np.int32))
             args = [*self._report_columns, sim.stepper.work.report, self._stepped, self.array]
             launch(k.reports, (B, len(self._reports)), args)

@@ -38,20 +38,31 @@ class Predictor:
         self.own = not scheme.multistep
         field = model.types.vec3, (model.slots,)
         before = state.register("predictor_before", *field) if self.own else state.previous_velocity
-        self.past = before, state.register("predictor_first", *field)
+        self.previous_velocities = before, state.register("predictor_first", *field)
 
     def begin(self) -> None:
         """Write the first iterate to work.v, which holds v_n from the kernel `predict`."""
         m, w, step = self.model, self.work, self.work.step
         self.launch(self.kernels.begin, m.worlds, [self.control, step, w.newton])
-        args = [self.control, step, m.topology.free, self.state.velocity, *self.past, w.v]
+        args = [self.control, step, m.topology.free, self.state.velocity, *self.previous_velocities, w.v]
         self.launch(self.kernels.extrapolate, self.dim, args)
 
-    def commit(self) -> None:
+    def update_history(self) -> None:
         """Update the velocity history and choose the next extrapolation order, after an accepted attempt."""
         m, w, step = self.model, self.work, self.work.step
-        args = [self.control, step, m.topology.free, m.is_position, w.diagonal, w.v, self.state.velocity, *self.past]
-        self.launch(self.kernels.compare, self.dim, [*args, w.rows])
+        args = [
+            self.control,
+            step,
+            m.topology.free,
+            m.is_position,
+            w.diagonal,
+            w.v,
+            self.state.velocity,
+            *self.previous_velocities,
+        ]
+        self.launch(self.kernels.order_errors, self.dim, [*args, w.rows])
         self.reduce(w.rows, PREDICTOR_ROWS, step.accepted, self.control.sums)
-        self.launch(self.kernels.shift, self.dim, [step, int(self.own), self.state.velocity, *self.past])
-        self.launch(self.kernels.learn, m.worlds, [self.control, step])
+        self.launch(
+            self.kernels.shift_history, self.dim, [step, int(self.own), self.state.velocity, *self.previous_velocities]
+        )
+        self.launch(self.kernels.choose_order, m.worlds, [self.control, step])

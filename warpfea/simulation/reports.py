@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ..base.brief import brief_repr
 from ..base.errors import ModelError
+from ..base.short_repr import use_short_repr
 
 __all__ = ["ContactRecord", "JointRecord", "PendingReport", "ProbeRecord", "StepReport", "describe", "idle_report",
            "step_text"]  # fmt: skip
@@ -62,7 +62,7 @@ class StepReport:
     largest_h: np.ndarray | None = None
     stable: np.ndarray | None = None
 
-    __repr__ = brief_repr
+    __repr__ = use_short_repr
 
 
 class PendingReport(StepReport):
@@ -103,7 +103,7 @@ class JointRecord:
     moment: np.ndarray
     violation: np.ndarray
 
-    __repr__ = brief_repr
+    __repr__ = use_short_repr
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +136,7 @@ class ContactRecord:
     friction: np.ndarray
     collider_work: np.ndarray
 
-    __repr__ = brief_repr
+    __repr__ = use_short_repr
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +149,7 @@ class ProbeRecord:
     displacement: np.ndarray
     velocity: np.ndarray
 
-    __repr__ = brief_repr
+    __repr__ = use_short_repr
 
 
 def idle_report(sim: Any) -> StepReport:

@@ -74,14 +74,14 @@ class Results:
         self.check_body(body, "velocities")
         return self._rows(body, self.state.velocity.numpy())
 
-    def placed(self, body: Body, weights: Any) -> np.ndarray:
+    def point_positions(self, body: Body, weights: Any) -> np.ndarray:
         """Current positions (B, P, 3), m, of material points given by sparse weights (P, slots of the body)."""
         u = self.state.displacement.numpy()[:, body.slots].astype(float)
         return reference_points(body, weights) + np.stack([weights @ row for row in u])
 
     def skin_points(self, body: Body) -> np.ndarray:
         """Points (B, skin points, 3), m, of the drawn surface."""
-        return self.placed(body, body.skin.slot_weights)
+        return self.point_positions(body, body.skin.slot_weights)
 
     def skin_field(self, name: str, body: Body) -> np.ndarray:
         """Scalar field (B, skin points) at the drawn surface."""
@@ -110,7 +110,7 @@ class Results:
         """Scalar field (B, P) at the points of a Skin or Drawing of the body."""
         self.check_field(name)
         if name == "displacement":
-            moved = self.placed(body, drawn.slot_weights) - reference_points(body, drawn.slot_weights)
+            moved = self.point_positions(body, drawn.slot_weights) - reference_points(body, drawn.slot_weights)
             return np.linalg.norm(moved, axis=2)
         if name != "von_mises":
             values = self.model.terms.samples(name, body, self.state)

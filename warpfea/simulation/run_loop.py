@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..kernels.step.control import STATUS
+from ..kernels.step.step_control import STATUS
 
 __all__ = ["interruptible", "run_steps", "step_bar"]
 

@@ -15,14 +15,14 @@ from ..base.console import compile_bar, quiet_warp
 from ..base.errors import ModelError
 from ..base.memory import enough_memory
 from ..base.names import listing
-from ..base.worlds import chosen_worlds
-from ..kernels.step.control import SAME_TIME, STATUS
+from ..base.worlds import worlds_mask
+from ..kernels.step.step_control import SAME_TIME, STATUS
 from ..model.assembly import require_density
 from ..model.handles import NodeSet
 from ..model.state import State
 from ..solvers import Jacobi, NewtonPCG
 from . import integrators
-from .adaptive import adapt_of
+from .adaptive import adaptive_options
 from .capacity import check_capacity
 from .checks import (
     check_choice,
@@ -36,14 +36,14 @@ from .checks import (
     write_times,
 )
 from .controls import Controls
-from .digests import Digests
 from .energy_growth import CHOICES, EnergyGrowth
-from .failures import check_closed
-from .law_warnings import warn_of_ends, warn_of_jumps
+from .failures import check_initial_constraints
 from .observations import Observations
 from .reports import ContactRecord, JointRecord, PendingReport, ProbeRecord, StepReport, describe, idle_report
 from .run_loop import run_steps
+from .run_statistics import RunStatistics
 from .stepper import Stepper
+from .time_law_warnings import warn_early_ends, warn_initial_jumps
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 __all__ = ["ContactRecord", "JointRecord", "ProbeRecord", "Simulation", "StepReport"]
 
 
-class Simulation(Digests):
+class Simulation(RunStatistics):
     """Time integration of a model.
 
     Args:
@@ -125,7 +125,7 @@ class Simulation(Digests):
         if on_failure is not None:
             check_choice("on_failure", on_failure, "raise", "freeze")
         times = {"error": error, "interval": interval, "horizon": horizon}
-        adapt = adapt_of(dt, **times, model=model, scheme=scheme, solver=options)
+        adapt = adaptive_options(dt, **times, model=model, scheme=scheme, solver=options)
         if adapt is None:
             check_times("dt", dt, model, positive=True)
         if t_end is not None:
@@ -133,7 +133,7 @@ class Simulation(Digests):
                 raise ModelError(f"t_end = {t_end!r}: t_end of Simulation needs a fixed dt; use run(t_end)")
             check_times("t_end", t_end, model)
         # initial accelerations are computed on the host
-        quiet = on_failure == "freeze" and not record and not (adapt or scheme.accelerated or scheme.static)
+        asynchronous = on_failure == "freeze" and not record and not (adapt or scheme.accelerated or scheme.static)
         if constraint_tol is None:
             constraint_tol = {"float64": 1e-8, "float32": 1e-5}[model.dtype]
         check_constraint_tol(constraint_tol)
@@ -142,8 +142,8 @@ class Simulation(Digests):
             return Stepper(
                 model, state, scheme, options,
                 ledger=ledger, capture=capture, constraint_tol=constraint_tol * model.size, inversion=inversion,
-                adapt=adapt, loops={"quiet": quiet, "ends": t_end is not None}, growth=self.energy_growth,
-                on_compile=on_compile or bar,
+                adapt=adapt, episodes={"asynchronous": asynchronous, "ends": t_end is not None},
+                growth=self.energy_growth, on_compile=on_compile or bar,
             )  # fmt: skip
 
         self.model = model
@@ -157,19 +157,19 @@ class Simulation(Digests):
         room = enough_memory(f"a simulation of {model.worlds} worlds", model.device)
         with quiet_warp(), room, compile_bar(None if on_compile is None else False) as bar:
             self.stepper = stepper(model, self.state, capture)
-        model.parameters.begun = True
+        model.parameters.simulated = True
         self.controls = Controls(model, self.state)
         self.compile_s, self.output_s = clock.perf_counter() - began, 0.0
         self.error = adapt.error if adapt else None
-        self._open_digest(quiet)
+        self._reset_statistics(asynchronous)
         self._start: State | None = None
         self._start_of = -1
         if not isinstance(dt, str):
             self.dt = dt
         if t_end is not None:
             self.t_end = t_end
-        check_closed(self)
-        warn_of_jumps(self)
+        check_initial_constraints(self)
+        warn_initial_jumps(self)
         self._load: np.ndarray | None = None
 
     def __repr__(self) -> str:
@@ -182,7 +182,7 @@ class Simulation(Digests):
         """Step, s, or (worlds,) if set per world; for dt="auto" the synchronisation interval, NaN before the first run
         or step sets it; a longer run sets it again."""
         if self.stepper.adaptive:
-            return self.stepper.adaptive.instants.interval
+            return self.stepper.adaptive.sync_times.interval
         return self.stepper.work.step.dt.numpy().copy() if self._dt is None else self._dt
 
     @dt.setter
@@ -200,12 +200,12 @@ class Simulation(Digests):
     @property
     def t_end(self) -> np.ndarray | None:
         """End times (worlds,), s, at which worlds are frozen; None without."""
-        ends = self.stepper.loops.ends
+        ends = self.stepper.episodes.ends
         return None if ends is None else ends.numpy().copy()
 
     @t_end.setter
     def t_end(self, value: Any) -> None:
-        ends = self.stepper.loops.ends
+        ends = self.stepper.episodes.ends
         if ends is None:
             raise ModelError(f"t_end = {value!r}: this simulation was made without; give t_end to Simulation")
         check_times("t_end", value, self.model)
@@ -250,15 +250,15 @@ class Simulation(Digests):
         check_steps(count)
         for _ in range(count):
             if self.stepper.adaptive:
-                self.stepper.adaptive.aim(self.time)
-            self.stepper.take_parameters()
+                self.stepper.adaptive.set_interval(self.time)
+            self.stepper.update_parameters()
             self.stepper.run()
-            if self.quiet:
+            if self.asynchronous:
                 self.steps += 1
-                self._unread = True
+                self._unsynced = True
             else:
-                self._digest(self.stepper.work.report.numpy())
-        if self.quiet:
+                self._record_step(self.stepper.work.report.numpy())
+        if self.asynchronous:
             return PendingReport(self, self.steps)
         assert self.last is not None
         return self.last
@@ -296,19 +296,19 @@ class Simulation(Digests):
         if t_end < now - (0.0 if adaptive else SAME_TIME * self.dt):
             raise ModelError(f"t_end = {t_end:g} s lies in the past: the simulation is at t = {now:.6g} s")
         if adaptive:
-            total = adaptive.steps_to(now, t_end, outputs)
+            total = adaptive.count_steps(now, t_end, outputs)
         else:
             total = max(math.ceil((t_end - now) / self.dt - SAME_TIME), 0)
             if total == 0 and t_end != now and self.steps == 0:
                 raise ModelError(f"t_end = {t_end:g} s is within {SAME_TIME:g} dt of the start at t = {now:g} s, so no "
                                  "step would be done; take a later t_end")  # fmt: skip
         if not self.integrator.static:
-            warn_of_ends(self, t_end)
-        self.stepper.loops.stop_at(t_end, total)
+            warn_early_ends(self, t_end)
+        self.stepper.episodes.set_run_end(t_end, total)
         try:
             run_steps(self, total, t_end, outputs, on_step, progress)
         finally:
-            self.stepper.loops.stop_at()
+            self.stepper.episodes.set_run_end()
         if self.last is None:
             self.last = idle_report(self)
         return self.last
@@ -333,7 +333,7 @@ class Simulation(Digests):
                 [world] on the model's device: nothing is read back then, joints and overlaps are not checked, and
                 worlds end bitwise equal to a run from that state.
             state: target state. With a Warp array as the mask it must come from a simulation of this model, such as a
-                copy by `sim.state.like()`.
+                copy by `sim.state.copy()`.
 
         Raises:
             ModelError: another shape or device, or a state that lacks arrays of the simulation.
@@ -342,7 +342,7 @@ class Simulation(Digests):
         if isinstance(mask, wp.array):
             self._reset_on_device(mask, state)
             return
-        mask = chosen_worlds("reset", mask, self.model.worlds)
+        mask = worlds_mask("reset", mask, self.model.worlds)
         source = self.model.state() if state is None else state
         check_state(self.model, source)
         self._own_times |= bool(mask.any() and not mask.all())
@@ -352,13 +352,13 @@ class Simulation(Digests):
             spec = self.state.specs[name]
             array[mask] = fresh[name][mask] if name in fresh else np.asarray(spec.initial)
         self.state.load(values)
-        self.stepper.forget(mask)
-        self._unstep(mask)
+        self.stepper.invalidate(mask)
+        self._clear_stepped(mask)
         self.stepper.start_terms(mask)
         if self.model.constraints:
-            check_closed(self, mask)
+            check_initial_constraints(self, mask)
         if self.stepper.ledger:
-            self.stepper.begin_ledger(mask)
+            self.stepper.restart_ledger(mask)
 
     def _reset_on_device(self, mask: wp.array, state: State | None) -> None:
         check_mask(mask, self.model)
@@ -371,29 +371,29 @@ class Simulation(Digests):
         if lacks := [name for name in self.state.names if name not in state.names]:
             raise ModelError(f"reset: state lacks {listing(lacks)}: pass a copy of sim.state")
         self._own_times = True
-        flags = self.stepper.loops.flags(mask)
+        flags = self.stepper.episodes.as_flags(mask)
         self.state.copy_rows(self.stepper.launch, flags, state)
-        self.stepper.set_on_device(flags)
-        if self.quiet:
-            self.stepper.loops.unstep(flags)
-            self._unread = True
+        self.stepper.accept_device_reset(flags)
+        if self.asynchronous:
+            self.stepper.episodes.clear_stepped(flags)
+            self._unsynced = True
         else:
             self._stepped[flags.numpy() != 0] = False
 
     def _initial(self) -> State:
         """Initial state of a simulation from the model's initial state, without changing the present one."""
-        self.stepper.take_parameters()
-        now, stepped = self.state.like(), self._stepped.copy()
+        self.stepper.update_parameters()
+        now, stepped = self.state.copy(), self._stepped.copy()
         everyone = wp.ones(self.model.worlds, dtype=wp.int32, device=self.model.device)
         try:
             self.reset()
-            return self.state.like()
+            return self.state.copy()
         finally:
             self.state.copy_rows(self.stepper.launch, everyone, now)
-            self.stepper.set_on_device(everyone, restart=False)
+            self.stepper.accept_device_reset(everyone, restart=False)
             self._stepped = stepped
-            if self.stepper.loops.stepped is not None:
-                self.stepper.loops.stepped.assign(stepped.astype(np.int32))
+            if self.stepper.episodes.stepped is not None:
+                self.stepper.episodes.stepped.assign(stepped.astype(np.int32))
 
     def observe(self, *names: str) -> Observations:
         """Observation table of all worlds on the device, see Observations."""
@@ -437,7 +437,7 @@ class Simulation(Digests):
 
         load_checkpoint(self, path)
         self._start = None
-        self._unstep(np.ones(self.model.worlds, bool))
+        self._clear_stepped(np.ones(self.model.worlds, bool))
 
     def bytes(self) -> dict[str, int]:
         """Bytes on the device: constants, scratch, and each array of the state (twice if steps may be halved)."""

@@ -23,28 +23,28 @@ import scipy.linalg
 import warp as wp
 
 from ..base.errors import StabilityError, StabilityWarning
-from ..model.state import remembered
+from ..model.state import is_solver_memory
 from ..solvers import NewtonPCG
 from ..terms.term import Term
 from .simulation import Simulation
 
-__all__ = ["Stability", "announce", "judge_stability"]
+__all__ = ["Stability", "check_stability", "report_unstable"]
 
 REDUCTION = 1e-4
 """Relative residual, B norm, at which the search ends."""
-ITERATIONS, SHARE, MOST = 500, 0.3, 20_000
+ITERATIONS, SOLVE_FACTOR, MAX_ITERATIONS = 500, 0.3, 20_000
 """Iteration limits: the larger of ITERATIONS and SHARE times those of the solve; MOST with unstable="refuse"."""
-ROUNDING = 64.0
+CURVATURE_ROUNDINGS = 64.0
 """Round-off units of p.D p (D: diagonal of H) below which the sign of p.H p is unknown."""
 CLEAR = 1024.0
 """The same units: float32 curvatures above need no float64 tangent."""
-NOISE = 4.0
+ROUNDOFF_CHANGES = 4.0
 """Smallest float32 |p.H p| of known sign, over its change by one more rounding of the state."""
 MODE_ITERATIONS, MODE_CHANGE = 60, 1e-4
 """Iteration limit of the mode search, and the relative change of w at which it ends."""
-TANGENT = 1e-3
+TANGENT_TOL = 1e-3
 """Largest accepted relative difference between the true tangent of non-potential forces and that in H."""
-TWIN_SLOTS = 200_000
+FLOAT64_SLOTS = 200_000
 """Largest number of slots of all worlds for a float64 copy (about 7 kB each) of a float32 model."""
 
 
@@ -76,7 +76,7 @@ class Stability:
         return f"Stability({self.text})"
 
 
-def announce(result: Any, *, refuse: bool) -> None:
+def report_unstable(result: Any, *, refuse: bool) -> None:
     """Warn of unstable worlds of a StaticResult, or raise StabilityError for the first."""
     found, sim = result.stability, result.simulation
     worlds = [world for world, s in enumerate(found.stable) if s is False]
@@ -104,7 +104,7 @@ def announce(result: Any, *, refuse: bool) -> None:
     warnings.warn(text, StabilityWarning, stacklevel=4)
 
 
-def judge_stability(sim: Simulation, *, every: bool = False) -> Stability:
+def check_stability(sim: Simulation, *, every: bool = False) -> Stability:
     """Determine the stability of the equilibrium of a `begin_static` simulation, before its time is reset to 0.
 
     Args:
@@ -115,26 +115,30 @@ def judge_stability(sim: Simulation, *, every: bool = False) -> Stability:
         np.full(model.worlds, None), [""] * model.worlds, np.zeros((model.worlds, model.slots, 3)),
         np.zeros(model.worlds, dtype=int),
     )  # fmt: skip
-    for world, contact in _rubbing(sim):
+    for world, contact in _friction_contacts(sim):
         out.reasons[world] = f"contact {contact!r} has friction"
     single = model.dtype == "float32"
-    if single and not every and model.worlds * model.slots > TWIN_SLOTS:
+    if single and not every and model.worlds * model.slots > FLOAT64_SLOTS:
         out.reasons[:] = [text or "the float32 model is large; unstable='refuse' judges it" for text in out.reasons]
     if all(out.reasons):
         return out
     if single and not sim.stepper.newton.direct and _clear(sim, out):
         return out
     # an inverse of an indefinite H is no preconditioner
-    probe = Tangent(_twin(sim) if single or sim.stepper.newton.direct else sim)
-    strange = probe.unlike()
+    probe = TangentOperator(_float64_copy(sim) if single or sim.stepper.newton.direct else sim)
+    strange = probe.unsymmetric_forces()
     for world in range(model.worlds):
         if strange[world] and not out.reasons[world]:
             names = ", ".join(term.name for term in model.terms if not term.potential)
             out.reasons[world] = f"non-conservative forces: {names}"
-    most = np.full(model.worlds, MOST) if every else np.maximum(ITERATIONS, (SHARE * sim.totals["pcg"]).astype(int))
-    curvature, p = _search(probe, out, most)
+    most = (
+        np.full(model.worlds, MAX_ITERATIONS)
+        if every
+        else np.maximum(ITERATIONS, (SOLVE_FACTOR * sim.totals["pcg"]).astype(int))
+    )
+    curvature, p = _find_negative_curvature(probe, out, most)
     if single:
-        _shake(probe, sim, out, curvature, p)
+        _check_roundoff(probe, sim, out, curvature, p)
     unstable = np.array([s is False for s in out.stable])
     if unstable.any():
         out.mode[unstable] = _mode(probe, unstable, p)[unstable]
@@ -151,14 +155,14 @@ def _clear(sim: Simulation, out: Stability) -> bool:
         return False
     found = Stability(out.stable.copy(), list(out.reasons), out.mode, out.iterations.copy())
     most = np.full(sim.model.worlds, ITERATIONS)
-    _search(Tangent(sim), found, most, CLEAR)
+    _find_negative_curvature(TangentOperator(sim), found, most, CLEAR)
     if any(s is not True and not reason for s, reason in zip(found.stable, out.reasons)):
         return False
     out.stable[:], out.iterations[:] = found.stable, found.iterations
     return True
 
 
-def _rubbing(sim: Simulation) -> list[tuple[int, str]]:
+def _friction_contacts(sim: Simulation) -> list[tuple[int, str]]:
     """Worlds and names of contacts that touch with friction."""
     found = []
     for term in (sim.model.terms.contact, sim.model.terms.pairs):
@@ -169,7 +173,7 @@ def _rubbing(sim: Simulation) -> list[tuple[int, str]]:
     return found
 
 
-class Tangent:
+class TangentOperator:
     """Tangent H at the iterate of a simulation, its preconditioner B and diagonal, as host functions.
 
     Vectors are (worlds, slots, 3) float64, 0 where prescribed; `flags` (worlds,) selects worlds.
@@ -179,16 +183,16 @@ class Tangent:
         self.sim, self.model, self.stepper = sim, sim.model, sim.stepper
         self.residual, self.work = sim.stepper.newton.residual, sim.stepper.work
         self.free = self.model.free_host[None]
-        self.take()
+        self.linearise()
 
-    def take(self) -> None:
+    def linearise(self) -> None:
         """Assemble H at the current iterate with its own stress (not the linearly predicted one)."""
         w = self.work
         every = self.flags(np.ones(self.model.worlds))
         w.newton.active.fill_(1)
-        w.newton.quiet.zero_()
-        w.newton.mixed.zero_()
-        self.residual.take(every)
+        w.newton.component_converged.zero_()
+        w.newton.predicted_stress.zero_()
+        self.residual.assemble_matrix(every)
         self.stepper.newton.preconditioner.prepare(every)
         self.diagonal = np.where(self.free > 0.0, w.diagonal.numpy().astype(float), 1.0)
 
@@ -213,10 +217,10 @@ class Tangent:
     def _read(self, array: wp.array, chosen: np.ndarray) -> np.ndarray:
         return np.where(chosen[:, None, None], array.numpy().astype(float) * self.free, 0.0)
 
-    def unlike(self) -> np.ndarray:
+    def unsymmetric_forces(self) -> np.ndarray:
         """Flags (worlds,) of non-potential forces whose tangent differs from that in H: unsymmetric (pressure on an
         open surface), or absent from H (field)."""
-        m, w, at = self.model, self.work, self.stepper.at
+        m, w, ctx = self.model, self.work, self.stepper.ctx
         terms = [term for term in m.terms if not term.potential]
         if not terms:
             return np.zeros(m.worlds, dtype=bool)
@@ -227,8 +231,8 @@ class Tangent:
             pool.zero_()
             for term in terms:
                 if call != "product" or type(term).product is not Term.product:
-                    getattr(term, call)(at, *more, every)
-            at.launch(gather, (m.worlds, m.slots), [m.terms.side_topology, pool, every, w.Hp])
+                    getattr(term, call)(ctx, *more, every)
+            ctx.launch(gather, (m.worlds, m.slots), [m.terms.side_topology, pool, every, w.Hp])
             return self._read(w.Hp, np.ones(m.worlds, dtype=bool))
 
         step = 1e-5 * m.size
@@ -241,7 +245,7 @@ class Tangent:
         w.p.assign(p)
         taken = gathered("product", w.nonpotential_tangent, w.p) if m.terms.traits.tangent else 0.0 * true
         size = _norm(true) + _norm(taken) + 1e-3 * step / m.size * _norm(forces[2])
-        return _norm(true - taken) > TANGENT * size
+        return _norm(true - taken) > TANGENT_TOL * size
 
 
 def _norm(x: np.ndarray) -> np.ndarray:
@@ -253,8 +257,8 @@ def _dot(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.einsum("bsc,bsc->b", x, y)
 
 
-def _search(
-    probe: Tangent, out: Stability, most: np.ndarray, roundings: float | None = None
+def _find_negative_curvature(
+    probe: TangentOperator, out: Stability, most: np.ndarray, roundings: float | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Lanczos search for p.H p < 0 in undecided worlds, at most `most` (worlds,) iterations; sets `stable`, `reasons`.
 
@@ -266,7 +270,7 @@ def _search(
     m = probe.model
     solver = probe.sim.solver
     kappa = solver.kappa(m.dtype) if m.constraints and isinstance(solver, NewtonPCG) else 0.0
-    rounding = (roundings or ROUNDING) * (1.0 + kappa) * float(np.finfo(m.dtype).eps)
+    rounding = (roundings or CURVATURE_ROUNDINGS) * (1.0 + kappa) * float(np.finfo(m.dtype).eps)
     going = np.array([not reason for reason in out.reasons])
     random = np.random.default_rng(1).standard_normal((m.slots, 3))
     r = np.where(going[:, None, None], random * probe.free, 0.0)  # equal in all worlds
@@ -296,7 +300,9 @@ def _search(
         out.stable[done] = True
         going = going & ~done
         for world in np.flatnonzero(going & (count >= most)):
-            out.reasons[world] = f"not resolved in {most[world]} iterations; unstable='refuse' takes up to {MOST}"
+            out.reasons[world] = (
+                f"not resolved in {most[world]} iterations; unstable='refuse' takes up to {MAX_ITERATIONS}"
+            )
         going = going & (count < most)
         if not going.any():
             break
@@ -305,25 +311,27 @@ def _search(
     return curvature, best
 
 
-def _shake(probe: Tangent, sim: Simulation, out: Stability, curvature: np.ndarray, p: np.ndarray) -> None:
+def _check_roundoff(
+    probe: TangentOperator, sim: Simulation, out: Stability, curvature: np.ndarray, p: np.ndarray
+) -> None:
     """Set the sign of p.H p to unknown if float32 round-off of the state can change it."""
     state, u = probe.sim.state, sim.state.displacement.numpy().astype(float)
     shift = np.random.default_rng(3).uniform(-0.5, 0.5, u.shape) * np.finfo("float32").eps * np.abs(u) * probe.free
     state.displacement.assign(u + shift)
-    _open(probe.stepper)
-    probe.take()
+    _evaluate_state(probe.stepper)
+    probe.linearise()
     change = np.abs(_dot(p, probe.product(p, np.ones(len(u), dtype=bool))) - curvature)
     for world in range(len(u)):
-        if out.stable[world] is not None and abs(curvature[world]) <= NOISE * change[world]:
+        if out.stable[world] is not None and abs(curvature[world]) <= ROUNDOFF_CHANGES * change[world]:
             out.stable[world], out.reasons[world] = None, "within the rounding of float32"
     if all(s is not False for s in out.stable):
         return
     state.displacement.assign(u)
-    _open(probe.stepper)
-    probe.take()
+    _evaluate_state(probe.stepper)
+    probe.linearise()
 
 
-def _mode(probe: Tangent, chosen: np.ndarray, x: np.ndarray) -> np.ndarray:
+def _mode(probe: TangentOperator, chosen: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Modes of least p.H p / p.M p (worlds, slots, 3), largest displacement 1 m, from directions x."""
     m = probe.model
     x = np.where(chosen[:, None, None], x, 0.0)
@@ -363,7 +371,7 @@ def _mode(probe: Tangent, chosen: np.ndarray, x: np.ndarray) -> np.ndarray:
     return x / np.where(largest > 0.0, largest, 1.0)[:, None, None]
 
 
-def _twin(sim: Simulation) -> Simulation:
+def _float64_copy(sim: Simulation) -> Simulation:
     """Float64 copy of the equilibrium with its forces, ready for conjugate gradients."""
     model = sim.model
     twin = model.resized(model.worlds, dtype="float64")
@@ -373,21 +381,21 @@ def _twin(sim: Simulation) -> Simulation:
         for name, array in model.terms.parameter_arrays().items():
             arrays[name].assign(array.numpy().astype(arrays[name].numpy().dtype))
         for term in twin.terms:
-            term.parameters_taken()
+            term.parameters_restored()
     state = twin.state()
     assert isinstance(sim.solver, NewtonPCG)
     solver = NewtonPCG(multipliers=sim.solver.multipliers, penalty=sim.solver.penalty)
     out = Simulation(twin, state, dt=sim.dt, integrator=sim.integrator, solver=solver, ledger=False, capture=False)
     for name in state.names:
-        if name in sim.state.names and not remembered(name):
+        if name in sim.state.names and not is_solver_memory(name):
             array = getattr(state, name)
             array.assign(getattr(sim.state, name).numpy().astype(array.numpy().dtype))
     out.stepper.start_terms()
-    _open(out.stepper)
+    _evaluate_state(out.stepper)
     return out
 
 
-def _open(stepper: Any) -> None:
+def _evaluate_state(stepper: Any) -> None:
     """Evaluate residual and tangent at the current state (no solve)."""
     w, m, state = stepper.work, stepper.model, stepper.state
     k, launch = stepper.kernels, stepper.launch
@@ -395,12 +403,12 @@ def _open(stepper: Any) -> None:
     launch(k.begin_step, m.worlds, [w.step, w.newton, w.pcg])
     launch(k.begin_attempt, m.worlds, [w.step, w.newton])
     running = w.step.running
-    stepper._laws(running)
+    stepper._evaluate_time_laws(running)
     args = [w.step, m.is_position, m.topology.free, state.displacement, state.velocity]
     args += [stepper.u_before, stepper.v_before, w.q_tilde, w.v_tilde, w.v]
     launch(k.predict, stepper.dim, args)
-    m.terms.supports.drive(stepper.at, running)
+    m.terms.supports.drive(stepper.ctx, running)
     for term in m.terms:
-        term.begin(stepper.at, running)
+        term.begin(stepper.ctx, running)
     stepper.newton._clear_direction(running)
-    stepper.newton._open(running)
+    stepper.newton._evaluate_state(running)

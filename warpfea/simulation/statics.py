@@ -18,16 +18,16 @@ from .checks import check_choice, check_model
 from .integrators import INTEGRATORS
 from .simulation import Simulation, StepReport
 from .stabilise import Springs, spring_stiffness
-from .stability import Stability, announce, judge_stability
+from .stability import Stability, check_stability, report_unstable
 
 if TYPE_CHECKING:
     from ..model.model import Model
 
-__all__ = ["UNSTABLE", "StaticResult", "begin_static", "run_static", "solve_static"]
+__all__ = ["UNSTABLE_CHOICES", "StaticResult", "begin_static", "run_static", "solve_static"]
 
-UNSTABLE = ("warn", "refuse", "ignore")
+UNSTABLE_CHOICES = ("warn", "refuse", "ignore")
 """Treatments of an unstable equilibrium."""
-FULL = 1e-9
+FULL_LOAD_TOL = 1e-9
 """Tolerance of the load factor at full load."""
 
 
@@ -71,7 +71,7 @@ class StaticResult:
         """Copy of the state displaced by the unstable mode times a size, m: start of a motion off the equilibrium."""
         if self.stability is None:
             raise ModelError("no stability analysis was done (unstable='ignore')")
-        out = self.state.like()
+        out = self.state.copy()
         u = out.displacement.numpy()
         out.displacement.assign((u + size * self.stability.mode).astype(u.dtype))
         return out
@@ -160,7 +160,7 @@ def solve_static(
         OutputError: an output can't be written.
         KeyboardInterrupt: after Ctrl-C with load steps left, once outputs are closed.
     """
-    check_choice("unstable", unstable, *UNSTABLE)
+    check_choice("unstable", unstable, *UNSTABLE_CHOICES)
     options: dict[str, Any] = {"load_steps": load_steps, "tol": tol, "solver": solver, "state": state}
     options |= {"constraint_tol": constraint_tol, "inversion": inversion, "stabilise": stabilise}
     sim = begin_static(model, **options)
@@ -201,8 +201,8 @@ def begin_static(
         if not (math.isfinite(tol) and 0.0 < tol < 1.0):
             raise ModelError(f"solve_static: tol = {tol!r} must lie between 0 and 1")
         options = replace(options, tol=tol)
-    start = model.state() if state is None else state.like()
-    model.terms.rewind(start)
+    start = model.state() if state is None else state.copy()
+    model.terms.shift_time(start)
     scheme = replace(INTEGRATORS["static"], stabilise=springs)
     return Simulation(
         model, start, dt=1.0 / count, integrator=scheme, solver=options, ledger=False,
@@ -219,11 +219,11 @@ def run_static(
     assert sim.last is not None
     sim._load = sim.time  # load fraction of later output
     found = None
-    if unstable != "ignore" and (sim.time >= 1.0 - FULL).all():
-        found = judge_stability(sim, every=unstable == "refuse")
+    if unstable != "ignore" and (sim.time >= 1.0 - FULL_LOAD_TOL).all():
+        found = check_stability(sim, every=unstable == "refuse")
         sim.last = replace(sim.last, stable=found.stable)
-    sim.model.terms.rewind(sim.state)  # simulations from the equilibrium start at t = 0
+    sim.model.terms.shift_time(sim.state)  # simulations from the equilibrium start at t = 0
     result = StaticResult(sim.state, sim.last, sim, sim.totals["newton"], sim.totals["pcg"], springs, found)
     if found is not None:
-        announce(result, refuse=unstable == "refuse")
+        report_unstable(result, refuse=unstable == "refuse")
     return result

@@ -13,21 +13,21 @@ from ..base.errors import ModelError
 from ..base.launch import Launcher, labelled
 from ..base.memory import enough_memory
 from ..kernels.step.adaptive import MAX_LEVEL
-from ..kernels.step.control import REPORT
-from ..kernels.step.ledger import LEDGER_ROWS
+from ..kernels.step.energy_ledger import LEDGER_ROWS
 from ..kernels.step.step import step_kernels
+from ..kernels.step.step_control import REPORT
 from ..model.state import State
 from ..solvers import Jacobi, NewtonPCG, make_loop
 from ..terms.checks import check_measured
-from ..terms.term import At, Term
+from ..terms.term import StepContext, Term
 from ..terms.workspace import Workspace
-from .adaptive import Adapt, Adaptive
+from .adaptive import AdaptiveOptions, StepSizeControl
 from .checks import write_times
 from .compiling import OnCompile, load_modules
+from .consistent_initial_conditions import ConsistentInitialConditions
 from .energy_growth import EnergyGrowth
+from .episodes import Episodes
 from .integrators import Integrator
-from .loops import Loops
-from .opening import Opening
 from .predictor import Predictor
 
 if TYPE_CHECKING:
@@ -35,33 +35,22 @@ if TYPE_CHECKING:
 
 __all__ = ["Stepper"]
 
-CANDIDATES = (0, 1, 2)
+FIRST_ITERATES = (0, 1, 2)
 """Alternative first iterates, see the kernel `candidate`."""
 
 
 class Stepper:
     """Launches of a step of all worlds, and the graph that replays them.
 
-    The host writes `work.step.dt` and reads `work.report`; everything between stays on the device. `loops`: options of
-    Loops, quiet and ends.
+    The host writes `work.step.dt` and reads `work.report`; everything between stays on the device. `episodes`: options
+    of `Episodes`.
     """
 
     def __init__(
-        self,
-        model: Model,
-        state: State,
-        integrator: Integrator,
-        solver: NewtonPCG | Jacobi,
-        *,
-        ledger: bool,
-        capture: bool,
-        constraint_tol: float = 0.0,
-        inversion: str = "refuse",
-        adapt: Adapt | None = None,
-        loops: Mapping[str, bool] | None = None,
-        growth: EnergyGrowth | None = None,
-        on_compile: OnCompile | None = None,
-    ) -> None:
+        self, model: Model, state: State, integrator: Integrator, solver: NewtonPCG | Jacobi, *, ledger: bool, capture:
+        bool, constraint_tol: float = 0.0, inversion: str = "refuse", adapt: AdaptiveOptions | None = None, episodes:
+        Mapping[str, bool] | None = None, growth: EnergyGrowth | None = None, on_compile: OnCompile | None = None,
+    ) -> None:  # fmt: skip
         self.model, self.state, self.integrator, self.solver = model, state, integrator, solver
         self.ledger, self.on_compile = ledger, on_compile
         self.launch = Launcher(model.device)
@@ -72,7 +61,7 @@ class Stepper:
         self.kernels = step_kernels(model.dtype, integrator, model.terms.traits)
         vec3 = model.types.vec3
         state.sealed = False
-        model.terms.laws.register(state)
+        model.terms.time_laws.register(state)
         if integrator.multistep:
             state.register("previous_displacement", vec3, (model.slots,))
             state.register("previous_velocity", vec3, (model.slots,))
@@ -88,17 +77,17 @@ class Stepper:
             state.register("ledger_time", wp.float64)
         state.register("status", wp.int32)
         state.register("summed_time", wp.float64)
-        self.u_before, self.v_before = (getattr(state, name) for name in integrator.kept)
+        self.u_before, self.v_before = (getattr(state, name) for name in integrator.history_arrays)
         midpoint, loss = integrator.midpoint, integrator.dissipation
         self.work = Workspace(model, max_newton=solver.max_newton, ledger=ledger, midpoint=midpoint, dissipation=loss)
-        self.at = At(
+        self.ctx = StepContext(
             model, self.work, self.launch, state, self.u_before, inertia=not integrator.static,
             midpoint=midpoint, dissipation=loss, accelerated=integrator.accelerated,
         )  # fmt: skip
-        self.terms.allocate(self.work, self.at)
-        self.newton = make_loop(self.at, solver, constraint_tol=constraint_tol, inversion=inversion)
+        self.terms.allocate(self.work, self.ctx)
+        self.newton = make_loop(self.ctx, solver, constraint_tol=constraint_tol, inversion=inversion)
         self.newton.register(state)
-        if model.terms.traits.walls:  # contact energy, which is not evaluated at rest
+        if model.terms.traits.unilateral:  # contact energy, which is not evaluated at rest
             state.register("predictor_potential", wp.float64)
             self.work.newton.potential = state.predictor_potential
         self.predictor: Predictor | None = None
@@ -108,33 +97,35 @@ class Stepper:
             self.predictor = Predictor(model, self.work, self.launch, *more, scheme=integrator)
         self.dim = (model.worlds, model.slots)
         if not integrator.static and isinstance(solver, NewtonPCG):
-            self.newton.candidates = [partial(self._candidate, kind) for kind in CANDIDATES]
-        self.opening = Opening(self.at, self.newton.residual, integrator) if integrator.accelerated else None
+            self.newton.first_iterates = [partial(self._start_from_candidate, kind) for kind in FIRST_ITERATES]
+        self.initial_conditions = (
+            ConsistentInitialConditions(self.ctx, self.newton.residual, integrator) if integrator.accelerated else None
+        )
         flags = self.work.any_flag
         self.running, self.refused, self.failed = flags[2:3], flags[3:4], flags[4:5]
-        self.adaptive: Adaptive | None = None
+        self.adaptive: StepSizeControl | None = None
         if adapt:
             tries = solver.max_halvings
-            self.adaptive = Adaptive(self.at, self.v_before, integrator, adapt, max_tries=tries)
-        self._bind()
+            self.adaptive = StepSizeControl(self.ctx, self.v_before, integrator, adapt, max_tries=tries)
+        self._bind_structs()
         self.growth = growth
         if growth:
             growth.bind(self.work.step, model, state)
-        self.loops = Loops(model, self.work, self.launch, **(loops or {"quiet": False, "ends": False}))
+        self.episodes = Episodes(model, self.work, self.launch, **(episodes or {"asynchronous": False, "ends": False}))
         self._probe_tables = self._upload_probes() if model.probes else []
         state.sealed = True
-        self.backup = state.like() if solver.max_halvings > 0 or self.adaptive else None
+        self.backup = state.copy() if solver.max_halvings > 0 or self.adaptive else None
         self._load_modules()
         self.start_terms()
-        self._measure_potential(None)
+        self._evaluate_potential(None)
         self._version, self._changes = model.parameters.version, model.parameters.changes.copy()
         if ledger:
             fresh = ~self.state.ledger.numpy().any(axis=1)
-            self.begin_ledger(fresh | (self.state.ledger_time.numpy() != self.state.time.numpy()))
+            self.restart_ledger(fresh | (self.state.ledger_time.numpy() != self.state.time.numpy()))
         # a direct solver runs on the host
-        self.graph = self._record() if capture and self.newton.direct is None else None
+        self.graph = self._capture_graph() if capture and self.newton.direct is None else None
 
-    def _bind(self) -> None:
+    def _bind_structs(self) -> None:
         w, state = self.work, self.state
         w.step.time = state.time
         w.step.status, w.step.summed = state.status, state.summed_time
@@ -142,7 +133,7 @@ class Stepper:
         w.step.any_running, w.step.any_refused = self.running, w.any_flag[3:5]
         w.step.max_halvings = MAX_LEVEL if self.adaptive else self.solver.max_halvings
         if isinstance(self.solver, NewtonPCG) and not self.adaptive:
-            w.step.most_newton = self.solver.most_newton(bool(self.terms.traits.walls))
+            w.step.newton_budget = self.solver.newton_budget(bool(self.terms.traits.unilateral))
         w.step.stabilise = self.integrator.stabilise
         w.step.parameter = self.integrator.parameter
         if self.integrator.takes_velocity:
@@ -167,26 +158,26 @@ class Stepper:
         w.step.new_time.assign(state.time)
         w.stage_time.assign(state.time)
         w.step.ramp.fill_(0.0 if self.integrator.static else 1.0)
-        self._laws(active)
+        self._evaluate_time_laws(active)
         w.u.assign(state.displacement)
         for term in following:
-            term.start(self.at, active)
+            term.start(self.ctx, active)
 
-    def begin_ledger(self, mask: np.ndarray) -> None:
+    def restart_ledger(self, mask: np.ndarray) -> None:
         """Restart the ledger of the masked worlds at the present state; accumulated columns stay."""
         m = self.model
         columns = list(m.terms.ledger)
         ledger = self.state.ledger.numpy()
-        ledger[mask, :3] = self._stored()[mask]
+        ledger[mask, :3] = self._stored_energies()[mask]
         for term in self.terms:
-            measured = term.measure(self.at)
+            measured = term.stored_energy(self.ctx)
             check_measured(term, measured, m.worlds)
             for name, values in measured.items():
                 ledger[mask, columns.index(name)] = values[mask]
         self.state.ledger.assign(ledger)
         self.state.ledger_time.assign(self.state.time)
 
-    def _stored(self) -> np.ndarray:
+    def _stored_energies(self) -> np.ndarray:
         """Kinetic energy, strain energy and gravity potential of the state, (worlds, 3), J."""
         m = self.model
         rows = wp.zeros((1, m.worlds, m.slots), dtype=wp.float64, device=m.device)
@@ -196,21 +187,21 @@ class Stepper:
         pull = -np.einsum("bc,bs,bsc->b", m.terms.dead.gravity.numpy(), m.masses.of_worlds(m.worlds), u)
         return np.stack([rows.numpy()[0].sum(axis=1), m.strain_energy(self.state), pull], axis=1)
 
-    def forget(self, mask: np.ndarray | None = None, *, potential: bool = True) -> None:
+    def invalidate(self, mask: np.ndarray | None = None, *, potential: bool = True) -> None:
         """Invalidate solver history of worlds whose state was set externally.
 
         `potential`: also the stored potential of the state.
         """
-        self.newton.forget(self._flags(mask))
+        self.newton.invalidate(self._flags(mask))
         if potential or "predictor_potential" not in self.state.names:
-            self._measure_potential(mask)
+            self._evaluate_potential(mask)
         chosen = slice(None) if mask is None else np.asarray(mask, dtype=bool)
         self._changes[chosen] = self.model.parameters.changes[chosen]
 
-    def take_parameters(self) -> None:
+    def update_parameters(self) -> None:
         """Apply parameters set since the last step; the energy jump is booked as work of fields."""
         if self.growth:
-            self.growth.follow()
+            self.growth.restart_changed()
         parameters = self.model.parameters
         if self._version == parameters.version:
             return
@@ -218,41 +209,41 @@ class Stepper:
         mask = parameters.changes > self._changes
         if not mask.any():
             return
-        self.forget(mask)
+        self.invalidate(mask)
         if self.ledger:
             ledger = self.state.ledger.numpy()
-            stored = self._stored()
+            stored = self._stored_energies()
             ledger[mask, list(self.model.terms.ledger).index("work_fields")] += (stored - ledger[:, :3]).sum(axis=1)[
                 mask
             ]
             ledger[mask, :3] = stored[mask]
             self.state.ledger.assign(ledger)
 
-    def set_on_device(self, flags: wp.array, *, restart: bool = True) -> None:
+    def accept_device_reset(self, flags: wp.array, *, restart: bool = True) -> None:
         """Complete a device-side reset; terms and ledger already match the state.
 
         `restart`: also reset scratch, for a state other than the one it belongs to.
         """
-        self.newton.forget(flags)
+        self.newton.invalidate(flags)
         if "predictor_potential" not in self.state.names:
-            self._measure_potential(flags)
+            self._evaluate_potential(flags)
         for term in self.terms if restart else ():
-            term.restart(self.at, flags)
+            term.reset_scratch(self.ctx, flags)
 
-    def _measure_potential(self, flags: np.ndarray | wp.array | None) -> None:
+    def _evaluate_potential(self, flags: np.ndarray | wp.array | None) -> None:
         """Evaluate the strain energy of the state in the chosen worlds, for the choice of first iterates."""
         w = self.work
         active: wp.array = flags if isinstance(flags, wp.array) else self._flags(flags)
         w.u_stage.assign(self.state.displacement)
-        if self.at.midpoint:
+        if self.ctx.midpoint:
             w.v_stage.zero_()
         residual = self.newton.residual
         with self.launch.rare():
-            residual.elements.force(self.at, active)
+            residual.elements.force(self.ctx, active)
             residual.reduce(w.energy_rows, 2, active, w.newton.elem_sums)
         measured = w.newton.elem_sums[0]
         if isinstance(flags, wp.array):
-            self.loops.take_numbers(flags, measured, w.newton.potential)
+            self.episodes.copy_flagged(flags, measured, w.newton.potential)
         else:
             w.newton.potential.assign(np.where(active.numpy() != 0, measured.numpy(), w.newton.potential.numpy()))
 
@@ -261,9 +252,9 @@ class Stepper:
         flags = np.ones(self.model.worlds) if mask is None else np.asarray(mask)
         return wp.array(flags.astype(np.int32), dtype=wp.int32, device=self.model.device)
 
-    def _record(self) -> wp.Graph:
+    def _capture_graph(self) -> wp.Graph:
         with wp.ScopedCapture(device=self.model.device) as capture:
-            self.sequence()
+            self.launch_step()
         return capture.graph
 
     def modules(self) -> list[wp.Module]:
@@ -272,12 +263,12 @@ class Stepper:
         from ..kernels.common.state import state_kernels
 
         out = {self.kernels.module, reduce_kernels().module}
-        out |= self.newton.modules() | self.terms.modules(self.at)
+        out |= self.newton.modules() | self.terms.modules(self.ctx)
         if self.backup is not None:
             out.add(state_kernels().module)
         if self.adaptive:
             out.add(self.adaptive.kernels.module)
-        out |= self.loops.modules()
+        out |= self.episodes.modules()
         return sorted(out, key=lambda module: module.name)
 
     def _load_modules(self) -> None:
@@ -298,29 +289,29 @@ class Stepper:
 
     def run(self) -> None:
         """Take one step in every running world."""
-        if self.opening is not None:
-            self.opening.prepare(self._dt)
+        if self.initial_conditions is not None:
+            self.initial_conditions.prepare(self._dt)
         with enough_memory("a step", self.model.device):
             if self.graph is not None:
                 wp.capture_launch(self.graph)
             else:
-                self.sequence()
+                self.launch_step()
 
     # sequence of launches
 
-    def sequence(self) -> None:
+    def launch_step(self) -> None:
         """Launch all kernels of a step."""
         m, w, launch = self.model, self.work, self.launch
         w.any_flag[2:5].zero_()
-        self.loops.end()
+        self.episodes.freeze_finished()
         launch(self.kernels.begin_step, m.worlds, [w.step, w.newton, w.pcg])
         if self.adaptive:
             assert self.backup is not None
             self.backup.copy_rows(launch, w.step.running, self.state)
-            self.adaptive.open()
+            self.adaptive.begin_interval()
         wp.capture_while(self.running, self._attempt)
         if self.adaptive:
-            self.adaptive.close()
+            self.adaptive.end_interval()
         self._report()
 
     @labelled("commit")
@@ -328,25 +319,25 @@ class Stepper:
         """Roll back failed worlds; write the step report."""
         m, w, launch = self.model, self.work, self.launch
         with launch.rare():
-            wp.capture_if(self.failed, self._undo)
+            wp.capture_if(self.failed, self._restore_failed)
         launch(self.kernels.write_report, m.worlds, [w.step, w.newton, w.pcg, w.report])
         if m.probes:
             self._probe()
         for term in self.terms:
-            term.report(self.at)
-        self.loops.close()
+            term.report(self.ctx)
+        self.episodes.end_step()
 
     @labelled("commit")
-    def _undo(self) -> None:
+    def _restore_failed(self) -> None:
         """Restore the state of worlds whose step failed."""
         m, w, launch = self.model, self.work, self.launch
         launch(self.kernels.failed_now, m.worlds, [w.step, w.newton, w.newton.active])
         if self.backup is not None:
             self.state.copy_rows(launch, w.newton.active, self.backup, skip=("status",))
-        self.newton.forget(w.newton.active)
+        self.newton.invalidate(w.newton.active)
 
     @labelled("commit")
-    def _keep(self) -> None:
+    def _back_up_state(self) -> None:
         """Back up the state, still that of the step's start, before the first halving."""
         assert self.backup is not None
         self.backup.copy_rows(self.launch, self.work.step.first_refusal, self.state)
@@ -355,7 +346,7 @@ class Stepper:
         m, w, launch, state = self.model, self.work, self.launch, self.state
         launch(self.kernels.begin_attempt, m.worlds, [w.step, w.newton])
         running = w.step.running
-        self._laws(running)
+        self._evaluate_time_laws(running)
         args = [
             w.step,
             m.is_position,
@@ -368,63 +359,65 @@ class Stepper:
         launch(self.kernels.predict, self.dim, [*args, w.q_tilde, w.v_tilde, w.v])
         if self.predictor:
             self.predictor.begin()
-        self.terms.supports.drive(self.at, running)
+        self.terms.supports.drive(self.ctx, running)
         for term in self.terms:
-            term.begin(self.at, running)
+            term.begin(self.ctx, running)
         self.newton.run()
         if self.adaptive:
-            self.adaptive.judge()
+            self.adaptive.check_local_error()
         launch(self.kernels.end_attempt, m.worlds, [w.step, w.newton])
         if self.adaptive:
-            self.adaptive.settle()
-        self.commit()
+            self.adaptive.finish_attempt()
+        self.accept_attempt()
 
-    def _candidate(self, kind: int) -> None:
+    def _start_from_candidate(self, kind: int) -> None:
         """Write an alternative first iterate to work.v in worlds that choose one."""
         m, w, state = self.model, self.work, self.state
         args = [w.step, w.newton, kind, m.is_position, m.topology.free, state.displacement, state.velocity]
         self.launch(self.kernels.candidate, self.dim, [*args, w.q_tilde, w.v_tilde, w.v])
 
     @labelled("commit")
-    def commit(self) -> None:
+    def accept_attempt(self) -> None:
         """Accept a converged attempt."""
         w, launch, state = self.work, self.launch, self.state
         if self.backup is not None:
             with launch.rare():
-                wp.capture_if(self.refused, self._keep)
+                wp.capture_if(self.refused, self._back_up_state)
         if self.ledger:
-            self._book()
+            self._update_ledger()
         if self.predictor:
-            self.predictor.commit()
+            self.predictor.update_history()
         args = [w.step, w.newton, w.u, w.v, state.displacement, state.velocity, self.u_before, self.v_before]
-        launch(self.kernels.commit, self.dim, args)
+        launch(self.kernels.accept_state, self.dim, args)
         for term in self.terms:
-            term.commit(self.at, w.step.accepted)
-        self.newton.commit(w.step.accepted)
+            term.commit(self.ctx, w.step.accepted)
+        self.newton.store_history(w.step.accepted)
 
     @labelled("loads")
-    def _laws(self, active: wp.array) -> None:
+    def _evaluate_time_laws(self, active: wp.array) -> None:
         """Evaluate the time laws at the end of the attempt."""
         w = self.work
-        laws = self.terms.laws
-        laws.evaluate(self.launch, self.state, w.step.new_time, w.step.ramp, active, w.law_value)
-        if self.at.midpoint:
-            laws.evaluate(self.launch, self.state, w.stage_time, w.step.ramp, active, w.law_stage)
-        self.terms.dead.take_gravity(self.launch, w.law_stage, active)
+        laws = self.terms.time_laws
+        laws.evaluate(self.launch, self.state, w.step.new_time, w.step.ramp, active, w.time_law_values)
+        if self.ctx.midpoint:
+            laws.evaluate(self.launch, self.state, w.stage_time, w.step.ramp, active, w.time_law_stage_values)
+        self.terms.dead.take_gravity(self.launch, w.time_law_stage_values, active)
 
     def law_values(self, time: float) -> np.ndarray:
         """Values of the time laws at a time, s, or load fraction, (B, laws, 3), without changing those of the step."""
         m, w = self.model, self.work
-        kept = [(array, array.numpy().copy()) for array in (w.step.new_time, w.step.ramp, w.law_value, w.step.gravity)]
+        kept = [
+            (array, array.numpy().copy()) for array in (w.step.new_time, w.step.ramp, w.time_law_values, w.step.gravity)
+        ]
         w.step.new_time.fill_(time)
         w.step.ramp.fill_(time if self.integrator.static else 1.0)
-        self._laws(wp.ones(m.worlds, dtype=wp.int32, device=m.device))
-        values = w.law_value.numpy().copy()
+        self._evaluate_time_laws(wp.ones(m.worlds, dtype=wp.int32, device=m.device))
+        values = w.time_law_values.numpy().copy()
         for array, before in kept:
             array.assign(before)
         return values
 
-    def _book(self) -> None:
+    def _update_ledger(self) -> None:
         m, w, launch, state = self.model, self.work, self.launch, self.state
         accepted = w.step.accepted
         reduce = self.newton.residual.reduce
@@ -432,7 +425,7 @@ class Stepper:
         args = [w.step, topo, w.balance, m.masses.lumped_values, state.displacement, state.velocity]
         launch(self.kernels.ledger_rows, self.dim, args)
         reduce(w.rows, LEDGER_ROWS, accepted, w.ledger_sums)
-        self.terms.book(self.at, reduce, accepted)
+        self.terms.energy_increments(self.ctx, reduce, accepted)
         args = [w.step, w.newton, w.ledger_sums, self.booked, state.ledger]
         launch(self.kernels.ledger_update, m.worlds, args)
 

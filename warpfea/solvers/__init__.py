@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..base.errors import ModelError
 from ..base.names import did_you_mean
-from ..terms.term import At
+from ..terms.term import StepContext
 from .jacobi import Jacobi, JacobiLoop
 from .newton import NewtonLoop, NewtonPCG
 
@@ -38,22 +38,22 @@ def get(solver: Any) -> NewtonPCG | Jacobi:
     raise ModelError(f"solver = {solver!r} is unknown; there are {names}, or options such as wf.NewtonPCG(...){hint}")
 
 
-def make_loop(at: At, options: NewtonPCG | Jacobi, **more: Any) -> NewtonLoop:
+def make_loop(ctx: StepContext, options: NewtonPCG | Jacobi, **more: Any) -> NewtonLoop:
     """The solver loop of the given options.
 
     Raises:
         ModelError: a matrix-based solver for a term that couples bodies with a changing pattern.
     """
     if isinstance(options, Jacobi) or options.linear == "direct":
-        refuse_couplings(at.model, "Jacobi" if isinstance(options, Jacobi) else "NewtonPCG(linear='direct')")
+        refuse_couplings(ctx.model, "Jacobi" if isinstance(options, Jacobi) else "NewtonPCG(linear='direct')")
     if isinstance(options, Jacobi):
-        return JacobiLoop(at, options, **more)
-    return NewtonLoop(at, options, **more)
+        return JacobiLoop(ctx, options, **more)
+    return NewtonLoop(ctx, options, **more)
 
 
 def refuse_couplings(model: Model, name: str) -> None:
     """Raise ModelError for a term that couples bodies without a shared element: the matrix has a fixed pattern."""
-    found = [(term.name, couples) for term in model.terms if (couples := term.couples())]
+    found = [(term.name, couples) for term in model.terms if (couples := term.coupled_bodies())]
     if found:
         kind, couples = found[0]
         a, b = (repr(model.bodies[k].name) for k in couples[0])

@@ -120,18 +120,18 @@ class Assembled:
     ) -> None:
         self.model, self.work, self.launch = model, work, launch
         self.element_kernels = block_kernels_of
-        self.whole = not model.device.is_cuda if whole is None else whole
+        self.whole_elements = not model.device.is_cuda if whole is None else whole
         if "matrix" not in model.cache:
             model.cache["matrix"] = self._make_tables()
         self.pattern: Pattern = model.cache["matrix"][0]
-        self.runs = self._runs()
-        name = f"contributions to the matrix, {'whole elements' if self.whole else 'columns'}"
+        self.block_groups = self._group_blocks()
+        name = f"contributions to the matrix, {'whole elements' if self.whole_elements else 'columns'}"
         if name not in model.cache:
-            model.cache[name] = [self._contributions(parts[0][0]) for parts in self.runs]
+            model.cache[name] = [self._contributions(parts[0][0]) for parts in self.block_groups]
         self.contributions: list[tuple[wp.array, wp.array]] = model.cache[name]
         self.chunk = chunk_of(model.worlds)
         S = max(self._size(block) for block in model.blocks)
-        points = 0 if self.whole else max(5 * block.points * block.count for block in model.blocks)
+        points = 0 if self.whole_elements else max(5 * block.points * block.count for block in model.blocks)
         work.chunks |= dict.fromkeys(("element gradients", "element matrices"), chunk_of)
         self.lines = work.array("element gradients", (self.chunk, points), model.types.vec3)
         self.scratch = work.array("element matrices", (self.chunk, S), model.types.vec3)
@@ -144,11 +144,11 @@ class Assembled:
 
     def modules(self) -> set[wp.Module]:
         """Modules launched by assembly."""
-        out = {(k.element_rows if self.whole else k.element_matrix).module for k in self.element_kernels}
+        out = {(k.element_rows if self.whole_elements else k.element_matrix).module for k in self.element_kernels}
         out |= {self.assembly(block).module for block in self.model.blocks}
         return out | {module for term in self.model.terms for module in term.block_modules()}
 
-    def _runs(self) -> list[list[tuple[Any, Any]]]:
+    def _group_blocks(self) -> list[list[tuple[Any, Any]]]:
         """Blocks and their kernels, grouped: parts of one energy share elements."""
         runs: list[list[tuple[Any, Any]]] = []
         seen: list[np.ndarray] = []
@@ -165,11 +165,11 @@ class Assembled:
 
     def assembly(self, block: Any) -> Any:
         """Kernels that add a block's elements."""
-        return assembly_kernels(self.model.dtype, block.slots, self.whole)
+        return assembly_kernels(self.model.dtype, block.slots, self.whole_elements)
 
     def _size(self, block: Any) -> int:
         """Number of 3-vectors in the matrices of a block's elements."""
-        if self.whole:
+        if self.whole_elements:
             _, width, rows = panels_of(block.slots)
             return 3 * width * rows * block.count
         return 3 * block.slots * (block.slots + 1) // 2 * block.count
@@ -220,7 +220,7 @@ class Assembled:
         """
         w = self.work
         every = worlds or range(self.model.worlds)
-        state = [u, w.v_stage, w.base, w.newton.mixed, w.history, *factors, active, out]
+        state = [u, w.v_stage, w.base, w.newton.predicted_stress, w.history, *factors, active, out]
         for first in range(every.start, every.stop, self.chunk):
             last = min(first + self.chunk, every.stop)
             if last - first == self.model.worlds:
@@ -236,11 +236,11 @@ class Assembled:
         mass = m.cache["matrix"][1]
         if mass.shape[0] != 1:
             mass = mass[first_world : first_world + count]
-        for first, parts in enumerate(self.runs):
+        for first, parts in enumerate(self.block_groups):
             for k, (block, elements) in enumerate(parts):
                 data = self.work.data_of(block)
                 given = [data, u, v, base, mixed, history, dq_dv, int(projected), active]
-                if self.whole:
+                if self.whole_elements:
                     _, width, rows = panels_of(block.slots)
                     matrix = shaped(self.scratch, (count, block.count, rows), rows_type(m.dtype, width))
                     launch(elements.element_rows, (count, block.count), [*given, int(k > 0), matrix])

@@ -31,17 +31,17 @@ if TYPE_CHECKING:
 
 __all__ = ["Band", "BandFactor", "block_band", "find_band"]
 
-WIDEST = 112
+MAX_AUTO_WIDTH = 112
 """Widest band chosen automatically, blocks beside the diagonal; beyond it the two-level preconditioner is cheaper."""
-WHOLE_SLOTS = 160
+FULL_FACTOR_SLOTS = 160
 """Largest number of slots of a model factored as a whole: here in a band of any width, or else as a dense matrix."""
-LARGEST = 2**31
+MAX_FACTOR_BYTES = 2**31
 """Size of the factors of one world above which 32-bit indices overflow, bytes."""
-BLOCK_BYTES, WORLD_BYTES = 48 * 1024, 200_000
+MAX_WINDOW_BYTES, MAX_WORLD_FACTOR_BYTES = 48 * 1024, 200_000
 """CUDA limits, bytes: the shared-memory window of a thread block, and the factors of one world that it factors."""
-ASSEMBLY, FACTORISATION = 1.0, 5.5e-5
+ASSEMBLY_TIME, FACTORISATION_TIME = 1.0, 5.5e-5
 """us per unknown on one core: assembling H of 3243 and T10 elements; a factorisation, per square of the bandwidth."""
-PRODUCT, SOLUTION = 0.06, 5.4e-4
+PRODUCT_TIME, SOLUTION_TIME = 0.06, 5.4e-4
 """us per unknown on one core: H p; forward and backward substitution, per bandwidth."""
 
 
@@ -52,7 +52,7 @@ def block_band(model: Model) -> Band | None:
         return None
     size = wp.types.type_size_in_bytes(model.types.T)
     factors = band.rows * (band.width + 1) * BLOCK**2 * size
-    return band if factors <= WORLD_BYTES and window_numbers(band.width) * size < BLOCK_BYTES else None
+    return band if factors <= MAX_WORLD_FACTOR_BYTES and window_numbers(band.width) * size < MAX_WINDOW_BYTES else None
 
 
 @dataclass(eq=False)
@@ -74,12 +74,12 @@ class Band:
     def rebuild_cost(self) -> float:
         """Cost of assembly and factorisation, in PCG iterations."""
         b = BLOCK * self.width
-        return (ASSEMBLY + FACTORISATION * b * b) / (PRODUCT + SOLUTION * b)
+        return (ASSEMBLY_TIME + FACTORISATION_TIME * b * b) / (PRODUCT_TIME + SOLUTION_TIME * b)
 
     @property
-    def quick(self) -> bool:
+    def cheap(self) -> bool:
         """True if factorisation is cheap relative to assembly."""
-        return FACTORISATION * (BLOCK * self.width) ** 2 < 0.2 * ASSEMBLY
+        return FACTORISATION_TIME * (BLOCK * self.width) ** 2 < 0.2 * ASSEMBLY_TIME
 
 
 def find_band(model: Model, *, any_width: bool = False) -> Band | None:
@@ -97,9 +97,9 @@ def find_band(model: Model, *, any_width: bool = False) -> Band | None:
 def _find_band(model: Model, any_width: bool) -> Band | None:
     graph = coupled_slots(model)
     n = graph.shape[0]
-    free = any_width or n <= WHOLE_SLOTS
+    free = any_width or n <= FULL_FACTOR_SLOTS
     # lower bound of the bandwidth in any order: half the number of a row's neighbours
-    if not free and 3 * (int(np.diff(graph.indptr).max()) // 2) > BLOCK * (WIDEST + 1):
+    if not free and 3 * (int(np.diff(graph.indptr).max()) // 2) > BLOCK * (MAX_AUTO_WIDTH + 1):
         return None
     order = sp.csgraph.reverse_cuthill_mckee(graph, symmetric_mode=True)
     place = np.empty(n, dtype=np.int64)
@@ -107,14 +107,14 @@ def _find_band(model: Model, any_width: bool) -> Band | None:
     rows = np.repeat(place, np.diff(graph.indptr))
     columns = place[graph.indices]
     width = int(((3 * rows + 2) // BLOCK - (3 * columns) // BLOCK).max())
-    if not free and width > WIDEST:
+    if not free and width > MAX_AUTO_WIDTH:
         return None
     size = -(-3 * n // BLOCK) * BLOCK**2 * (width + 1) * wp.types.type_size_in_bytes(model.types.T)
-    if size >= LARGEST:
+    if size >= MAX_FACTOR_BYTES:
         if any_width:
             raise ModelError(
                 f"preconditioner = 'banded': the factors of {n} slots in a band of {BLOCK * width} unknowns take "
-                f"{size / 2**30:.1f} GiB per world, more than {LARGEST / 2**30:.0f}: take 'two-level'"
+                f"{size / 2**30:.1f} GiB per world, more than {MAX_FACTOR_BYTES / 2**30:.0f}: take 'two-level'"
             )
         return None
     at, of = (model.array("band", values, wp.int32) for values in (order, place))

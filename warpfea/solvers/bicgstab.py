@@ -22,7 +22,7 @@ class BiCGStab(PCG):
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
         m, w = self.model, self.work
-        self.recursion = bicgstab_kernels(m.dtype, m.terms.traits.gated)
+        self.recursion = bicgstab_kernels(m.dtype, m.terms.traits.has_constraints)
         self.control = w.struct(bicgstab_struct(), m.worlds, sums=(BICGSTAB_ROWS, m.worlds), any_again=(1,))
         field = (m.worlds, m.slots), m.types.vec3
         self.shadow, self.y, self.t = (w.array(f"bicgstab {name}", *field) for name in ("shadow", "y", "t"))
@@ -38,9 +38,9 @@ class BiCGStab(PCG):
         bi.any_again.zero_()
         launch(k.finish, self.model.worlds, [w.newton, w.pcg, bi, 1])
         with launch.rare():
-            wp.capture_if(bi.any_again, self._begin_again)
+            wp.capture_if(bi.any_again, self._restart)
 
-    def _begin_again(self) -> None:
+    def _restart(self) -> None:
         """Restart a stalled solve from its best iterate."""
         w, k, launch, bi = self.work, self.recursion, self.launch, self.control
         self._precondition(w.r, w.z, bi.again)

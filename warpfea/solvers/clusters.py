@@ -1,4 +1,4 @@
-"""Host tables for products by clusters of straight elements, see kernels/elements/cluster.py."""
+"""Host tables for products by clusters of straight elements, see kernels/elements/element_clusters.py."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from ..kernels.common.structs import topology_struct
-from ..kernels.elements.cluster import cluster_struct, pool_size, pool_struct, slot_capacity, table_layout
+from ..kernels.elements.element_clusters import cluster_struct, pool_size, pool_struct, slot_capacity, table_layout
 from ..model import assembly
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ __all__ = ["ClusterTables", "ModelClusters", "cluster_tables", "make_clusters", 
 
 @dataclass(eq=False)
 class ClusterTables:
-    """Element clusters of a block, as the device struct of kernels/elements/cluster.py.
+    """Element clusters of a block, as the device struct of kernels/elements/element_clusters.py.
 
     The slots of a cluster are sorted by falling valence to balance the warp.
     """
@@ -102,15 +102,15 @@ def make_clusters(model: Model) -> ModelClusters:
     topo = topology_struct(model.dtype)()
     start, entry = assembly.gather_table([of[:, None] for of in slots], model.slots)
     topo.start, topo.entry = model.array("clusters", start, wp.int32), model.array("clusters", entry, wp.int32)
-    topo.held = model.topology.held
+    topo.prescribed = model.topology.prescribed
     return ModelClusters(blocks, topo, offset)
 
 
 def make_pool(model: Model, work: Workspace, *, midpoint: bool) -> Any:
     """Device struct of the arrays that replace shared memory on the CPU; empty on CUDA."""
-    pool, on_host = pool_struct(model.dtype)(), not model.device.is_cuda
+    pool, to_host = pool_struct(model.dtype)(), not model.device.is_cuda
     numbers = max(pool_size(b.cluster, b.slots, 3 if midpoint or b.key.damping == "rate" else 2) for b in model.blocks)
     words = max(table_layout(b.cluster, b.slots)[2] for b in model.blocks)
-    pool.number = work.array("cluster numbers", (numbers if on_host else 1,), model.types.T)
-    pool.table = work.array("cluster table", (words if on_host else 1,), wp.int32)
+    pool.number = work.array("cluster numbers", (numbers if to_host else 1,), model.types.T)
+    pool.table = work.array("cluster table", (words if to_host else 1,), wp.int32)
     return pool

@@ -11,9 +11,9 @@ import scipy.sparse as sp
 import warp as wp
 
 from ..kernels.common.types import precision
+from ..kernels.solvers.dense_components import part_kernels
 from ..kernels.solvers.levels import LANES, TILE, level_kernels
 from ..kernels.solvers.levels_build import build_kernels
-from ..kernels.solvers.parts import part_kernels
 
 if TYPE_CHECKING:
     from ..base.launch import Launcher
@@ -21,11 +21,11 @@ if TYPE_CHECKING:
     from ..terms.workspace import Workspace
     from .assembled import Pattern
 
-__all__ = ["DenseInverse", "Parts", "gauss_jordan"]
+__all__ = ["DenseComponents", "DenseInverse", "gauss_jordan"]
 
 
 @dataclass(eq=False)
-class Parts:
+class DenseComponents:
     """Uncoupled components of a pattern.
 
     Attributes:
@@ -39,12 +39,12 @@ class Parts:
     place_of: wp.array
 
     @classmethod
-    def of(cls, model: Model, pattern: Pattern) -> Parts | None:
+    def of(cls, model: Model, pattern: Pattern) -> DenseComponents | None:
         """None if splitting saves no memory."""
         count, label = sp.csgraph.connected_components(pattern.graph, directed=False)
         slots = len(label)
         most = int(np.bincount(label).max())
-        if count * filled(3 * most) ** 2 >= filled(3 * slots) ** 2:
+        if count * padded_size(3 * most) ** 2 >= padded_size(3 * slots) ** 2:
             return None
         order = np.argsort(label, kind="stable")
         start = np.concatenate([[0], np.cumsum(np.bincount(label))])
@@ -55,7 +55,7 @@ class Parts:
         return cls(count, most, model.array("levels", table, wp.int32), model.array("levels", place, wp.int32))
 
 
-def filled(unknowns: int) -> int:
+def padded_size(unknowns: int) -> int:
     """Number of unknowns rounded up to whole tiles."""
     return TILE * -(-unknowns // TILE)
 
@@ -79,7 +79,7 @@ class DenseInverse:
 
     def __init__(
         self, model: Model, work: Workspace, launch: Launcher, name: str, unknowns: int, storage: str | None = None,
-        parts: Parts | None = None,
+        parts: DenseComponents | None = None,
     ) -> None:  # fmt: skip
         B, T = model.worlds, model.types.T
         storage = storage or model.dtype
@@ -92,7 +92,7 @@ class DenseInverse:
             B *= parts.count
             unknowns = 3 * parts.most
             self.flags = work.array(f"{name} flags", (B,), wp.int32)
-        self.blocks, self.size = B, filled(unknowns)
+        self.blocks, self.size = B, padded_size(unknowns)
         N = self.size
         self.matrix = work.array(f"{name} inverse", (B, N, N), T)
         self.stored = work.array(f"{name} stored", (B, N, N), S) if other else self.matrix

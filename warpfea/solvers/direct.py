@@ -18,12 +18,12 @@ import warp as wp
 
 from ..base.launch import labelled
 from ..kernels.solvers.direct import direct_kernels
-from ..terms.followers import FollowerMatrix, Followers
+from ..terms.follower_loads import FollowerMatrix, Followers
 from .factor import Singular, make_factors
 
 if TYPE_CHECKING:
     from ..model.state import State
-    from ..terms.term import At
+    from ..terms.term import StepContext
     from .residual import Residual
 
 __all__ = ["Direct"]
@@ -36,26 +36,26 @@ class Direct:
         singular: worlds whose last factorisation failed.
     """
 
-    def __init__(self, at: At, residual: Residual) -> None:
-        model = at.model
-        self.at, self.model, self.work, self.launch, self.residual = at, model, at.work, at.launch, residual
-        at.work.reserve_blocks()
+    def __init__(self, ctx: StepContext, residual: Residual) -> None:
+        model = ctx.model
+        self.ctx, self.model, self.work, self.launch, self.residual = ctx, model, ctx.work, ctx.launch, residual
+        ctx.work.reserve_blocks()
         assert residual.assembled is not None
         self.assembled = residual.assembled
         self.kernels = direct_kernels(model.dtype)
-        self.dim = (model.worlds, at.launch.padded(model.slots))
+        self.dim = (model.worlds, ctx.launch.padded(model.slots))
         self.factors = make_factors(model, self.assembled.pattern.graph)
-        self.alone = not model.terms.products
+        self.elements_only = not model.terms.products
         for term in model.terms:
-            term.reserve(at, self.assembled, projected=False)
-        self.spare: wp.array | None = None
-        self.untried: set[int] = set()
+            term.allocate_blocks(ctx, self.assembled, projected=False)
+        self.matrix_storage: wp.array | None = None
+        self.unverified: set[int] = set()
         self.singular: set[int] = set()
 
     def register(self, state: State) -> None:
         """Stateless."""
 
-    def forget(self, flags: wp.array) -> None:
+    def invalidate(self, flags: wp.array) -> None:
         """Stateless."""
 
     def modules(self) -> set[wp.Module]:
@@ -65,38 +65,38 @@ class Direct:
     @labelled("build")
     def start(self, active: wp.array) -> None:
         """Compute D and the inverses of its blocks."""
-        self.residual.blocks(active)
+        self.residual.diagonal_blocks(active)
 
-    def renew(self, active: wp.array) -> None:
+    def discard(self, active: wp.array) -> None:
         """No-op: only factors of the operator's matrix are reused."""
 
-    def follow(self, active: wp.array) -> None:
+    def update(self, active: wp.array) -> None:
         """No-op: D stays that of the start of the step."""
 
-    def commit(self, accepted: wp.array) -> None:
+    def store_history(self, accepted: wp.array) -> None:
         """No-op: no history."""
 
-    def judge(self, active: wp.array) -> None:
+    def record_cost(self, active: wp.array) -> None:
         """No reuse rule."""
 
     @property
     def followers(self) -> list[FollowerMatrix]:
         """Matrices of the follower loads' items, built on first use."""
-        return self.at.scratch.get(Followers.name, [])
+        return self.ctx.scratch.get(Followers.name, [])
 
     @property
     def value(self) -> wp.array:
         """Array of the matrix H, allocated on first use."""
-        if self.spare is None:
-            self.spare = self.assembled.values("direct matrix")
-        return self.spare
+        if self.matrix_storage is None:
+            self.matrix_storage = self.assembled.values("direct matrix")
+        return self.matrix_storage
 
     @labelled("build")
     def prepare(self, active: wp.array) -> None:
         """Factorise H in the active worlds."""
         residual = self.residual
-        own = self.alone and residual.by_matrix
-        worlds = np.flatnonzero((residual.reuse.control.build if own and residual.keep else active).numpy())
+        own = self.elements_only and residual.uses_matrix
+        worlds = np.flatnonzero((residual.reuse.control.build if own and residual.matrix_reuse else active).numpy())
         if not len(worlds):
             return
         if own:
@@ -112,20 +112,20 @@ class Direct:
         w = self.work
         self.assembled.assemble(w.u_stage, (w.step.mass_factor, w.step.dq_dv), flags, value, projected=projected)
         for term in self.model.terms:
-            live = [array for _, array in term.keep(self.at)]
-            term.blocks(self.at, self.assembled, live, w.step.dq_dv, flags, value, projected=projected)
+            live = [array for _, array in term.cached_inputs(self.ctx)]
+            term.blocks(self.ctx, self.assembled, live, w.step.dq_dv, flags, value, projected=projected)
 
     def _factorise(self, world: int, value: wp.array) -> None:
         self.singular.discard(world)
-        self.untried.add(world)
+        self.unverified.add(world)
         try:
             self.factors.factorise(value, world)
         except Singular:
-            self._retreat(world)
+            self._factorise_positive(world)
 
-    def _retreat(self, world: int) -> None:
+    def _factorise_positive(self, world: int) -> None:
         """Factorise the positive definite approximation."""
-        self.untried.discard(world)
+        self.unverified.discard(world)
         flags = np.zeros(self.model.worlds, dtype=np.int32)
         flags[world] = 1
         self._assemble(wp.array(flags, dtype=wp.int32, device=self.model.device), self.value, projected=True)
@@ -147,13 +147,13 @@ class Direct:
         """Solve in one world. False if the factorisation failed; the first solve verifies it (r.z >= 0)."""
         if world in self.singular:
             return False
-        downhill = self.factors.solve(r, z, world)
-        if world in self.untried and not downhill >= 0.0:
-            self._retreat(world)
+        r_dot_z = self.factors.solve(r, z, world)
+        if world in self.unverified and not r_dot_z >= 0.0:
+            self._factorise_positive(world)
             if world in self.singular:
                 return False
-            downhill = self.factors.solve(r, z, world)
-        self.untried.discard(world)
-        if not np.isfinite(downhill):
+            r_dot_z = self.factors.solve(r, z, world)
+        self.unverified.discard(world)
+        if not np.isfinite(r_dot_z):
             self.singular.add(world)
-        return bool(np.isfinite(downhill))
+        return bool(np.isfinite(r_dot_z))

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 __all__ = ["CuDSS", "Factors", "FreeMatrix", "Singular", "SuperLU", "make_factors"]
 
-PIVOT = 1e-3
+PIVOT_THRESHOLD = 1e-3
 """Smallest accepted diagonal pivot over its column maximum (matrix scaled to unit diagonal)."""
 
 
@@ -42,7 +42,7 @@ class FreeMatrix:
     free: np.ndarray
     start: np.ndarray
     index: np.ndarray
-    take: np.ndarray
+    value_index: np.ndarray
     row: np.ndarray
     diagonal: np.ndarray
 
@@ -64,7 +64,7 @@ class FreeMatrix:
             free=chosen,
             start=matrix.indptr.astype(np.int32),
             index=matrix.indices.astype(np.int32),
-            take=matrix.data.astype(np.int64) - 1,
+            value_index=matrix.data.astype(np.int64) - 1,
             row=row,
             diagonal=np.flatnonzero(row == matrix.indices),
         )
@@ -109,7 +109,7 @@ class SuperLU:
     def factorise(self, values: wp.array, world: int) -> None:
         """See Factors."""
         m = self.matrix
-        data = values[world].numpy().reshape(-1)[m.take].astype(float)
+        data = values[world].numpy().reshape(-1)[m.value_index].astype(float)
         diagonal = np.abs(data[m.diagonal])
         scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
         data *= scale[m.row] * scale[m.index]
@@ -118,7 +118,9 @@ class SuperLU:
             raise Singular
         matrix = sp.csc_matrix((data, m.index, m.start), shape=(len(m.free),) * 2)
         try:
-            lu = spla.splu(matrix, permc_spec="NATURAL", diag_pivot_thresh=PIVOT, options={"SymmetricMode": True})
+            lu = spla.splu(
+                matrix, permc_spec="NATURAL", diag_pivot_thresh=PIVOT_THRESHOLD, options={"SymmetricMode": True}
+            )
         except RuntimeError as error:
             if "singular" not in str(error):
                 raise
@@ -146,7 +148,7 @@ class CuDSS:
         self.device, self.cupy = model.device, cupy
         self.matrix = FreeMatrix.of(graph, model.free_host, ordered=False)
         with cupy.cuda.Device(self.device.ordinal):
-            self.take, self.free = cupy.asarray(self.matrix.take), cupy.asarray(self.matrix.free)
+            self.value_index, self.free = cupy.asarray(self.matrix.value_index), cupy.asarray(self.matrix.free)
         self.solvers: dict[int, Any] = {}
 
     def _make(self, data: Any) -> Any:
@@ -167,7 +169,7 @@ class CuDSS:
         cp = self.cupy
         wp.synchronize_device(self.device)
         with cp.cuda.Device(self.device.ordinal):
-            data = cp.asarray(values)[world].reshape(-1)[self.take].astype(cp.float64)
+            data = cp.asarray(values)[world].reshape(-1)[self.value_index].astype(cp.float64)
             if not bool(cp.isfinite(data).all()):
                 raise Singular
             if world not in self.solvers:

@@ -11,7 +11,8 @@ kernels/solvers/reuse.py. Accelerations:
   reduces to conjugate gradients with step lengths delayed by one iteration.
 - "anderson": without the conjugation, one reduction less: Anderson acceleration of type I.
 - "chebyshev": the semi-iteration as in Wang 2015, "A Chebyshev semi-iterative approach for accelerating projective and
-  position-based dynamics", for eigenvalues of B H between `LARGEST` / max(4, iterations^2 / 4) and `LARGEST`.
+  position-based dynamics", for eigenvalues of B H between `LARGEST_EIGENVALUE` / max(4, iterations^2 / 4) and
+  `LARGEST_EIGENVALUE`.
 - "none": p = 0.5 z.
 
 Measured (tests/results/jacobi_cpu.json): "secants" needs the fewest iterations on solids and joints, with a lead
@@ -38,21 +39,21 @@ from .newton import NewtonLoop, NewtonPCG
 from .twolevel import TwoLevel
 
 if TYPE_CHECKING:
-    from ..terms.term import At
+    from ..terms.term import StepContext
 
 __all__ = ["Jacobi", "JacobiLoop"]
 
 ACCELERATIONS = ("secants", "anderson", "chebyshev", "none")
-GROWTH = 10.0
+MAX_GROWTH = 10.0
 """Largest accepted ratio of the final to the initial residual of a step."""
-GAP = 1e-3
+MAX_VIOLATION = 1e-3
 """Largest accepted constraint violation over the model's size."""
 REBUILD_COST = 10.0
 """Extra iterations that trigger a rebuild of B: fewer than for Newton's method, since an old B costs accuracy here, not
 time. Of 5, 10, 20 and 40 on soft bars in large rotations, 40 saves a tenth of the time at up to 70 times the error."""
-STEP = {"secants": 0.7, "anderson": 0.7, "chebyshev": 1.0, "none": 0.5}
+STEP_LENGTH = {"secants": 0.7, "anderson": 0.7, "chebyshev": 1.0, "none": 0.5}
 """Factor of z = B r in the move, by acceleration."""
-LARGEST = 3.5
+LARGEST_EIGENVALUE = 3.5
 """Assumed largest eigenvalue of B H, as for the coarse levels of the preconditioner."""
 
 
@@ -135,14 +136,14 @@ class JacobiLoop(NewtonLoop):
 
     def __init__(
         self,
-        at: At,
+        ctx: StepContext,
         options: Jacobi,
         *,
         constraint_tol: float,
         inversion: str = "refuse",
     ) -> None:
-        super().__init__(at, options.newton, constraint_tol=constraint_tol, inversion=inversion)
-        model, work = at.model, at.work
+        super().__init__(ctx, options.newton, constraint_tol=constraint_tol, inversion=inversion)
+        model, work = ctx.model, ctx.work
         self.methods = {"solver": "jacobi"}
         # multipliers are updated once, on acceptance: no outer loop, and convergence includes violations
         self.classical = False
@@ -150,10 +151,10 @@ class JacobiLoop(NewtonLoop):
         assert isinstance(self.preconditioner, TwoLevel)
         self.preconditioner.rebuild_cost = REBUILD_COST
         self.acceleration = options.acceleration
-        self.paired = options.acceleration in ("secants", "anderson")
-        self.own = jacobi_kernels(model.dtype, model.terms.traits, options.acceleration)
+        self.uses_secants = options.acceleration in ("secants", "anderson")
+        self.descent_kernels = jacobi_kernels(model.dtype, model.terms.traits, options.acceleration)
         B, m = model.worlds, PAIRS
-        shape = (m, B, model.slots) if self.paired else (1, 1, 1)
+        shape = (m, B, model.slots) if self.uses_secants else (1, 1, 1)
         self.moves = work.array("jacobi moves", shape, model.types.vec3)
         self.changes = work.array("jacobi changes", shape, model.types.vec3)
         shapes: dict[str, Any] = {
@@ -164,53 +165,55 @@ class JacobiLoop(NewtonLoop):
             "sums": (2 * m, B),
         }
         self.control = work.struct(jacobi_struct(), B, **shapes)
-        self.control.growth = GROWTH
-        self.control.gap = GAP * model.size
-        self.control.step = STEP[options.acceleration]
-        least = LARGEST / max(4.0, 0.25 * options.iterations**2)
-        self.control.centre, self.control.half = 0.5 * (LARGEST + least), 0.5 * (LARGEST - least)
+        self.control.growth = MAX_GROWTH
+        self.control.gap = MAX_VIOLATION * model.size
+        self.control.step = STEP_LENGTH[options.acceleration]
+        least = LARGEST_EIGENVALUE / max(4.0, 0.25 * options.iterations**2)
+        self.control.centre, self.control.half = 0.5 * (LARGEST_EIGENVALUE + least), 0.5 * (LARGEST_EIGENVALUE - least)
 
     def modules(self) -> set[wp.Module]:
         """Modules launched by the loop, except those of reductions and constraints."""
-        return super().modules() | {self.own.module}
+        return super().modules() | {self.descent_kernels.module}
 
     def _solve(self, first: bool = False) -> None:
         """Iterate and report cost and reduction to the reuse rule."""
         w = self.work
-        self.launch(self.own.begin, self.model.worlds, [w.newton, self.control])
-        self._any(w.newton.active, self.iterating)
+        self.launch(self.descent_kernels.begin, self.model.worlds, [w.newton, self.control])
+        self._reduce_flags(w.newton.active, self.iterating)
         wp.capture_while(self.iterating, self._iterate)
-        self._rarely(self._look_for_inversion)
-        self.launch(self.own.tell, self.model.worlds, [w.newton, self.control, w.pcg, w.step.running])
-        self.preconditioner.judge(w.newton.active)
+        self._if_rare(self._check_inversion)
+        self.launch(
+            self.descent_kernels.report_cost, self.model.worlds, [w.newton, self.control, w.pcg, w.step.running]
+        )
+        self.preconditioner.record_cost(w.newton.active)
         w.newton.active.zero_()
 
     def _iterate(self) -> None:
-        w, k, launch = self.work, self.own, self.launch
+        w, k, launch = self.work, self.descent_kernels, self.launch
         active = w.newton.active
-        self._find_move(active)
+        self._compute_step(active)
         if self.limited:
             launch(self.kernels.free_step, self.model.worlds, [w.newton])
         for term in self.terms:
             if term.traits.limited:  # other terms predict multipliers, for Newton's method only
-                term.aim(self.at, active)
+                term.process_direction(self.ctx, active)
         launch(k.advance, self.dim, [w.newton, w.direction, w.v])
         self.residual.evaluate(active)
-        launch(k.judge, self.model.worlds, [w.newton, self.control])
+        launch(k.check_iterate, self.model.worlds, [w.newton, self.control])
         if self.terms.traits.stored:
-            self._each("adopt", active)
-            self._each("refresh", active)
-        self._any(active, self.iterating)
+            self._call_terms("accept_trial", active)
+            self._call_terms("update_frozen", active)
+        self._reduce_flags(active, self.iterating)
 
     @labelled("vectors")
-    def _find_move(self, active: wp.array) -> None:
+    def _compute_step(self, active: wp.array) -> None:
         """Write the next move p to work.direction."""
-        m, w, k, launch, ctl = self.model, self.work, self.own, self.launch, self.control
+        m, w, k, launch, ctl = self.model, self.work, self.descent_kernels, self.launch, self.control
         args = [w.newton, w.gradient, m.topology.free, w.direction, w.p, w.r, self.moves, self.changes, w.rows]
-        launch(k.remember, self.dim, args)
-        if self.paired:
+        launch(k.store_pair, self.dim, args)
+        if self.uses_secants:
             self.residual.reduce(w.rows, 2 * PAIRS, active, ctl.sums)
-            launch(k.shares, m.worlds, [w.newton, ctl])
+            launch(k.solve_gram, m.worlds, [w.newton, ctl])
             launch(k.project, self.dim, [w.newton, ctl, self.changes, w.r])
         elif self.acceleration == "chebyshev":
             launch(k.recursion, m.worlds, [w.newton, ctl])
@@ -222,5 +225,5 @@ class JacobiLoop(NewtonLoop):
         launch(k.combine, self.dim, [w.newton, ctl, self.moves, w.z, w.direction])
         if self.pcg.deflate:  # a loose tolerance then conserves the momentum of free bodies
             args = [w.newton, w.step.mass_factor, m.groups.lumped, w.gradient, m.topology.free, w.direction, w.r]
-            launch(k.momentum_left, self.dim, args)
-            self.pcg.translate(active)
+            launch(k.remaining_momentum, self.dim, args)
+            self.pcg.correct_translations(active)

@@ -23,7 +23,8 @@ class LevelArrays:
     """Matrices and vectors of one level, [world, ...]."""
 
     def __init__(
-        self, model: Model, work: Workspace, launch: Launcher, level: Level, depth: int, storage: str, parted: bool
+        self, model: Model, work: Workspace, launch: Launcher, level: Level, depth: int, storage: str,
+        by_component: bool
     ) -> None:  # fmt: skip
         B, n, T = model.worlds, level.slots, model.types.T
         S = precision(storage).T
@@ -32,7 +33,7 @@ class LevelArrays:
         self.value = work.array(f"{name} matrix", (B, level.pattern.entries), model.types.mat33) if depth else None
         if level.band is not None:
             return
-        parts = level.parts if parted else None
+        parts = level.parts if by_component else None
         self.dense = DenseInverse(model, work, launch, name, 3 * n, storage, parts) if level.dense else None
         if not level.dense:
             shape = (B, level.tiles, TILE, TILE)

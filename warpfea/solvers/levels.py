@@ -12,8 +12,8 @@ import warp as wp
 from ..kernels.solvers.levels import TILE_SLOTS, level_struct
 from ..model.partition import bisect, connected_groups
 from .assembled import Pattern, make_pattern
-from .band import WHOLE_SLOTS, Band
-from .dense import Parts
+from .band import FULL_FACTOR_SLOTS, Band
+from .dense import DenseComponents
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -29,7 +29,7 @@ cantilever of 180 slots takes half the iterations)."""
 BOTTOM_SLOTS = {"cpu": 160, "cuda": 1344}
 """Largest coarse level inverted as one dense matrix, slots by device; on CUDA this is cheaper than the launches of
 further levels."""
-PART_ENTRIES = 1344**2
+COMPONENT_PAIRS = 1344**2
 """Maximum slot pairs in components of up to WHOLE_SLOTS slots that are each inverted as a whole."""
 MAX_LEVELS = 12
 
@@ -57,7 +57,7 @@ class Level:
     groups: int = 0
     galerkin: tuple[wp.array, wp.array, wp.array] | None = None
     band: Band | None = None
-    parts: Parts | None = None
+    parts: DenseComponents | None = None
 
     @property
     def whole(self) -> bool:
@@ -66,7 +66,7 @@ class Level:
 
 
 @dataclass(eq=False)
-class Points:
+class ReferencePoints:
     """Reference configuration of a level's slots, at which affine functions are evaluated.
 
     Attributes:
@@ -82,26 +82,27 @@ class Points:
     label: np.ndarray
 
 
-def make_levels(model: Model, pattern: Pattern, *, coarse: bool = True, parted: bool = True) -> list[Level]:
+def make_levels(model: Model, pattern: Pattern, *, coarse: bool = True, by_component: bool = True) -> list[Level]:
     """Levels of a model, finest first; `pattern` is that of H.
 
-    Without `coarse`, only the tiles of the first level; without `parted`, dense matrices are not split into components.
+    Without `coarse`, only the tiles of the first level; without `by_component`, dense matrices are not split into
+    components.
     """
     origin = np.concatenate([np.tile(body.origin, (body.slot_count, 1)) for body in model.bodies])
     position = model.slot_kind == 0
     place = model.reference + origin * position[:, None]
-    points = Points(place, position, np.cumsum(position) - 1, model.part)
+    points = ReferencePoints(place, position, np.cumsum(position) - 1, model.part)
     if not coarse:
         return [_make_level(model, pattern, points, GROUP_SLOTS)[0]]
     levels = []
     bottom = BOTTOM_SLOTS["cuda" if model.device.is_cuda else "cpu"]
     for depth in range(MAX_LEVELS):
         n = pattern.graph.shape[0]
-        parts = Parts.of(model, pattern) if parted else None
-        small = n <= (bottom if depth else WHOLE_SLOTS)
+        parts = DenseComponents.of(model, pattern) if by_component else None
+        small = n <= (bottom if depth else FULL_FACTOR_SLOTS)
         if parts and not small:  # one matrix per component
             entries = parts.count * parts.most**2
-            small = entries <= (bottom**2 if depth else PART_ENTRIES if parts.most <= WHOLE_SLOTS else 0)
+            small = entries <= (bottom**2 if depth else COMPONENT_PAIRS if parts.most <= FULL_FACTOR_SLOTS else 0)
         if small:
             levels.append(Level(pattern, n, True, level_struct(model.dtype)(), parts=parts))
             return levels
@@ -124,7 +125,9 @@ def _first_members(level: Level) -> np.ndarray:
     return np.repeat(slot[start[:-1]], 4)
 
 
-def _make_level(model: Model, pattern: Pattern, points: Points, capacity: int) -> tuple[Level, Points, Pattern]:
+def _make_level(
+    model: Model, pattern: Pattern, points: ReferencePoints, capacity: int
+) -> tuple[Level, ReferencePoints, Pattern]:
     n = len(points.value)
     first = np.flatnonzero(np.diff(points.node, prepend=-1))
     sizes = np.diff(first, append=n)
@@ -162,10 +165,10 @@ def _make_level(model: Model, pattern: Pattern, points: Points, capacity: int) -
     position = np.tile([True, False, False, False], groups)
     node = np.repeat(np.arange(groups), 4)
     label = np.repeat(points.label[by_group[np.flatnonzero(np.diff(group[by_group], prepend=-1))]], 4)
-    return level, Points(value.reshape(-1, 3), position, node, label), coarse
+    return level, ReferencePoints(value.reshape(-1, 3), position, node, label), coarse
 
 
-def _affine(points: Points, group: np.ndarray, groups: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _affine(points: ReferencePoints, group: np.ndarray, groups: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Values (slots, 4) of the affine functions 1, x, y, z of each slot's group, with the groups' origins and scales.
 
     x, y, z are relative to the centre (groups, 3), m, divided by the size (groups,), m.

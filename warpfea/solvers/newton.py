@@ -12,9 +12,9 @@ import warp as wp
 from ..base.checks import is_count, is_number
 from ..base.errors import ModelError
 from ..base.launch import labelled
-from ..kernels.elements.materials import ANY_J
-from ..kernels.solvers.control import FLOOR_LANES
+from ..kernels.elements.materials import DEFINED_FOR_ANY_J
 from ..kernels.solvers.newton import newton_kernels
+from ..kernels.solvers.newton_control import FLOOR_LANES
 from ..kernels.solvers.perturbation import SAMPLES, perturbation_kernels
 from ..kernels.solvers.vectors import vector_kernels
 from .bicgstab import BiCGStab
@@ -25,20 +25,21 @@ from .residual import Residual
 
 if TYPE_CHECKING:
     from ..model.state import State
-    from ..terms.term import At
+    from ..terms.term import StepContext
 
 __all__ = ["NewtonLoop", "NewtonPCG"]
 
 EPS = {"float64": 2.0**-52, "float32": 2.0**-23}
-FLOOR = {"float64": 1e-4, "float32": 2e-3}
+MAX_FLOOR = {"float64": 1e-4, "float32": 2e-3}
 """Largest accepted error estimate (relative, energy norm) when round-off stops the residual."""
-NEWTON_WORK = {False: 20, True: 100}
+NEWTON_COST = {False: 20, True: 100}
 """CG iterations equivalent to one Newton iteration in `max_work`, without and with contact (line searches take many
 evaluations). A slender column perturbed by 1e-4 of its load takes 8037 of the 10 000 in the load step that buckles it;
 steps with contact rejected after 8 halvings take 500 to 800 of the 2000."""
-FALL = 9.81
-"""Acceleration scale, m/s^2, of the constraint tolerance of acceleration-level schemes: `FALL` (dq/dv)^2 tol, m."""
-CLOSED = 1e-14
+GRAVITY_SCALE = 9.81
+"""Acceleration scale, m/s^2, of the constraint tolerance of acceleration-level schemes: `GRAVITY_SCALE` (dq/dv)^2 tol,
+m."""
+MIN_VIOLATION = 1e-14
 """Smallest constraint tolerance of acceleration-level schemes, over the model's size."""
 
 
@@ -133,9 +134,9 @@ class NewtonPCG:
         if self.multipliers not in ("newton", "outer"):
             raise ModelError(f"NewtonPCG: multipliers = {self.multipliers!r} is neither 'newton' nor 'outer'")
 
-    def most_newton(self, contact: bool) -> int:
+    def newton_budget(self, contact: bool) -> int:
         """Newton iterations in a step, with or without contact, that use up `max_work`."""
-        return max(self.max_work // NEWTON_WORK[contact], 1)
+        return max(self.max_work // NEWTON_COST[contact], 1)
 
     def tolerance(self, dtype: str) -> float:
         """Relative tolerance for precision "float64" or "float32"."""
@@ -164,33 +165,35 @@ class TermOptions:
 class NewtonLoop:
     """Newton loop of all worlds: conditional loops on the device, one code path with and without capture."""
 
-    def __init__(self, at: At, options: NewtonPCG, *, constraint_tol: float, inversion: str = "refuse") -> None:
-        model, work, launch, inertia = at.model, at.work, at.launch, at.inertia
-        self.at, self.model, self.work, self.launch, self.terms = at, model, work, launch, model.terms
+    def __init__(
+        self, ctx: StepContext, options: NewtonPCG, *, constraint_tol: float, inversion: str = "refuse"
+    ) -> None:
+        model, work, launch, inertia = ctx.model, ctx.work, ctx.launch, ctx.inertia
+        self.ctx, self.model, self.work, self.launch, self.terms = ctx, model, work, launch, model.terms
         self.constraint_tol = constraint_tol
-        traits = at.traits
-        self.kernels, self.vectors = newton_kernels(traits), vector_kernels(model.dtype, traits.gated)
+        traits = ctx.traits
+        self.kernels, self.vectors = newton_kernels(traits), vector_kernels(model.dtype, traits.has_constraints)
         self.limited = traits.limited
-        self.classical = traits.gated and options.multipliers == "outer"
+        self.classical = traits.has_constraints and options.multipliers == "outer"
         self.max_outer = options.max_outer
         direct = options.linear == "direct"
         kind = "direct" if direct else choose(options.preconditioner, options.preconditioner_dtype, model)
         # factors include the penalties
         deflate = kind not in ("block-jacobi", "banded") and not direct
-        at.options = TermOptions(classical=self.classical, kappa=options.kappa(model.dtype), deflate=deflate)
+        ctx.options = TermOptions(classical=self.classical, kappa=options.kappa(model.dtype), deflate=deflate)
         for term in self.terms:
-            term.configure(at)
+            term.configure(ctx)
         operator = options.operator
         if direct and operator == "auto":  # factors live as long as the matrix, unless terms add to it
-            operator = "elements" if model.terms.products or at.midpoint else "matrix"
+            operator = "elements" if model.terms.products or ctx.midpoint else "matrix"
         banded = kind == "banded" and model.device.is_cuda
         assembled = kind not in ("deflated", "block-jacobi")
-        self.residual = Residual(at, operator=operator, assembled=assembled, banded=banded)
-        self.direct = Direct(at, self.residual) if direct else None
+        self.residual = Residual(ctx, operator=operator, assembled=assembled, banded=banded)
+        self.direct = Direct(ctx, self.residual) if direct else None
         self.preconditioner = self.direct or make(
             kind, options.preconditioner_dtype, model, work, launch, self.residual
         )
-        kind_of_solver = BiCGStab if at.midpoint else PCG  # unsymmetric operator of mid-point schemes
+        kind_of_solver = BiCGStab if ctx.midpoint else PCG  # unsymmetric operator of mid-point schemes
         self.pcg = kind_of_solver(
             model, work, launch, self.residual, self.preconditioner,
             max_iterations=options.max_pcg, max_work=options.max_work, deflate=inertia,
@@ -198,7 +201,7 @@ class NewtonLoop:
         self.methods = {
             "solver": "newton-pcg",
             "linear": options.linear,
-            "operator": "matrix" if self.residual.by_matrix else "elements",
+            "operator": "matrix" if self.residual.uses_matrix else "elements",
         }
         if not direct:
             self.methods["preconditioner"] = kind
@@ -208,7 +211,7 @@ class NewtonLoop:
         # a good preconditioner makes a decade of PCG cheaper than another Newton iteration
         # (in statics the first iterates are far off: solving them tightly is wasted)
         ctl.first_forcing = 0.1 if kind in ("block-jacobi", "deflated") or not inertia else 0.001
-        if traits.gated:  # constraints are stiff: a loose first solve costs more iterations than it saves
+        if traits.has_constraints:  # constraints are stiff: a loose first solve costs more iterations than it saves
             ctl.first_forcing = min(ctl.first_forcing, 0.01)
         ctl.fixed_forcing = int(options.forcing is not None)
         if options.forcing is not None:
@@ -220,24 +223,24 @@ class NewtonLoop:
         ctl.length = float(model.size)
         ctl.component_of_group = model.residual_groups.component
         ctl.max_iterations = options.max_newton
-        ctl.floor_bound = FLOOR[model.dtype]
+        ctl.max_floor = MAX_FLOOR[model.dtype]
         ctl.refuse_inversion = int(inversion == "refuse")
-        ctl.linear_stress = int(all(block.key.law in ANY_J for block in model.blocks))
+        ctl.linear_stress = int(all(block.key.law in DEFINED_FOR_ANY_J for block in model.blocks))
         rate = inertia and any(b.key.damping == "rate" for b in model.blocks)
         ctl.nonpotential = int(traits.nonpotential or rate)
         ctl.classical = int(self.classical)
-        ctl.slack = 1.0 / math.sqrt(1.0 + options.kappa(model.dtype))
+        ctl.penalty_norm_ratio = 1.0 / math.sqrt(1.0 + options.kappa(model.dtype))
         ctl.constraint_tol = 1e300 if self.classical else constraint_tol  # the classical inner solves converge g only
-        if at.accelerated and model.dtype == "float64":  # float32 positions have a larger round-off
-            ctl.constraint_pace = max(constraint_tol / model.size, ctl.tol) * FALL
-            ctl.constraint_least = CLOSED * model.size
+        if ctx.accelerated and model.dtype == "float64":  # float32 positions have a larger round-off
+            ctl.constraint_acceleration_tol = max(constraint_tol / model.size, ctl.tol) * GRAVITY_SCALE
+            ctl.constraint_tol_min = MIN_VIOLATION * model.size
         # in double precision round-off is far below the errors for which steps are rejected; forces at a mid-point are
         # not those of the positions
         self.perturbation = None
-        if model.dtype == "float32" and not at.midpoint:
+        if model.dtype == "float32" and not ctx.midpoint:
             self.perturbation = perturbation_kernels(model.dtype)
             self.perturbed = work.array("perturbed", (model.worlds,), wp.int32)
-        self.candidates: Sequence[Callable[[], None]] = ()
+        self.first_iterates: Sequence[Callable[[], None]] = ()
         self.iterating = work.any_flag[0:1]
         self.searching = work.any_flag[1:2]
 
@@ -246,15 +249,15 @@ class NewtonLoop:
         self.preconditioner.register(state)
         self.residual.register(state)
 
-    def forget(self, flags: wp.array) -> None:
+    def invalidate(self, flags: wp.array) -> None:
         """Invalidate solver history of the flagged worlds."""
-        self.preconditioner.forget(flags)
-        self.residual.forget(flags)
+        self.preconditioner.invalidate(flags)
+        self.residual.invalidate(flags)
 
-    def commit(self, accepted: wp.array) -> None:
+    def store_history(self, accepted: wp.array) -> None:
         """Store solver history in the state."""
-        self.preconditioner.commit(accepted)
-        self.residual.commit(accepted)
+        self.preconditioner.store_history(accepted)
+        self.residual.store_history(accepted)
 
     def modules(self) -> set[wp.Module]:
         """Modules launched by the loop, except those of reductions and terms."""
@@ -272,61 +275,61 @@ class NewtonLoop:
         self._open(w.newton.active)
         self._solve(first=True)
         if self.classical:
-            self._judge_outer()
+            self._check_constraints()
             wp.capture_while(self.iterating, self._update_multipliers)
 
     def _open(self, flags: wp.array) -> None:
         """Evaluate the first iterate."""
         # its check needs D, so the blocks come first
-        self.residual.place(flags)
-        self._each("prepare", flags)
+        self.residual.update_positions(flags)
+        self._call_terms("prepare", flags)
         self.preconditioner.start(flags)
-        self._each("scale", flags)
-        self.residual.evaluate(flags, hold=True)
+        self._call_terms("scale", flags)
+        self.residual.evaluate(flags, freeze=True)
 
     def _solve(self, first: bool = False) -> None:
         """Newton iteration from the current residual; `first`: first solve of an attempt."""
         w = self.work
-        choose = bool(self.candidates) and first
+        choose = bool(self.first_iterates) and first
         self.launch(self.kernels.begin, self.model.worlds, [w.newton, int(choose)])
-        self._rarely(self._choose if choose else self._look_for_inversion)
-        if self.terms.traits.walls:  # the first iterate may be the solution, as in free fall
-            self._refresh()
-        self._any(w.newton.active, self.iterating)
+        self._if_rare(self._choose_initial if choose else self._check_inversion)
+        if self.terms.traits.unilateral:  # the first iterate may be the solution, as in free fall
+            self._update_frozen()
+        self._reduce_flags(w.newton.active, self.iterating)
         wp.capture_while(self.iterating, self._iterate)
 
     @labelled("control")
-    def _choose(self) -> None:
+    def _choose_initial(self) -> None:
         """Select the best first iterate (J > 0 first, then lowest Phi)."""
         w, k, launch = self.work, self.kernels, self.launch
-        choose, better = w.newton.choose, w.newton.searching
+        choose, better = w.newton.choose_initial, w.newton.searching
         launch(k.compare, self.model.worlds, [w.newton, 1, better])
         launch(self.vectors.copy_active, self.dim, [w.v, better, w.best])
-        for put in self.candidates:
+        for put in self.first_iterates:
             put()
-            self.residual.evaluate(choose, hold=True)
+            self.residual.evaluate(choose, freeze=True)
             launch(k.compare, self.model.worlds, [w.newton, 0, better])
             launch(self.vectors.copy_active, self.dim, [w.v, better, w.best])
         launch(self.vectors.copy_active, self.dim, [w.best, choose, w.v])
-        self.preconditioner.renew(choose)
+        self.preconditioner.discard(choose)
         self._open(choose)
         launch(k.begin, self.model.worlds, [w.newton, 2])
-        self._look_for_inversion()
+        self._check_inversion()
 
-    def _judge_outer(self) -> None:
+    def _check_constraints(self) -> None:
         w = self.work
         args = [w.newton, w.step.running, self.constraint_tol, self.max_outer]
-        self.launch(self.kernels.judge_outer, self.model.worlds, args)
-        self._any(w.newton.active, self.iterating)
+        self.launch(self.kernels.check_constraints, self.model.worlds, args)
+        self._reduce_flags(w.newton.active, self.iterating)
 
     def _update_multipliers(self) -> None:
         """Update multipliers, lambda += rho c, in worlds with violated constraints, for another solve from the current
         v."""
         w = self.work
-        self._each("outer", w.newton.stepped)
-        self.residual.evaluate(w.newton.active, hold=True)
+        self._call_terms("update_multipliers", w.newton.trial_accepted)
+        self.residual.evaluate(w.newton.active, freeze=True)
         self._solve()
-        self._judge_outer()
+        self._check_constraints()
 
     def _iterate(self) -> None:
         w, k, launch = self.work, self.kernels, self.launch
@@ -334,25 +337,25 @@ class NewtonLoop:
         self.residual.linearise(active)
         if self.perturbation:
             with launch.rare():
-                wp.capture_if(w.newton.any_strict, self._perturb)
+                wp.capture_if(w.newton.any_estimate_error, self._perturb)
         self.pcg.solve(active)
-        self.residual.hold_nonpotential(active)
+        self.residual.freeze_nonpotential(active)
         self.residual.tangent_curvature(active)
         if self.limited:
             launch(k.free_step, self.model.worlds, [w.newton])
-        self._each("aim", active)
+        self._call_terms("process_direction", active)
         launch(self.vectors.set_base, self.dim, [w.newton, w.v, w.base, w.best])
         launch(self.vectors.dot_rows, self.dim, [w.gradient, w.direction, active, w.rows])
         self.residual.reduce(w.rows, 1, active, w.newton.slope_sum)
         launch(k.begin_search, self.model.worlds, [w.newton, w.pcg])
-        self._any(w.newton.searching, self.searching)
+        self._reduce_flags(w.newton.searching, self.searching)
         wp.capture_while(self.searching, self._search)
-        self._rarely(self._search_on)
-        if self.terms.traits.walls:
-            self._refresh()
-        self.preconditioner.follow(active)
-        self._each("follow", active)
-        self._any(active, self.iterating)
+        self._if_rare(self._rare_steps)
+        if self.terms.traits.unilateral:
+            self._update_frozen()
+        self.preconditioner.update(active)
+        self._call_terms("prepare_solve", active)
+        self._reduce_flags(active, self.iterating)
 
     @labelled("control")
     def _perturb(self) -> None:
@@ -365,76 +368,76 @@ class NewtonLoop:
         assert k is not None
         launch(k.begin_samples, self.dim, [w.newton, flags, w.p, w.z])
         for sample in range(SAMPLES):
-            self.residual.place(flags)
+            self.residual.update_positions(flags)
             launch(k.perturb, self.dim, [w.newton, flags, sample, w.u, w.p])
-            self.residual.balance(flags)
+            self.residual.evaluate_forces(flags)
             launch(k.add_sample, self.dim, [flags, w.gradient, w.z])
         self.residual.product(w.p, w.Hp, flags)
         args = [self.model.topology, w.step.mass_factor, flags, w.p, w.Hp, w.z, w.gradient]
         launch(k.mean_gradient, self.dim, args)
-        w.newton.any_strict.zero_()
+        w.newton.any_estimate_error.zero_()
 
     @labelled("control")
-    def _refresh(self) -> None:
+    def _update_frozen(self) -> None:
         """Update lagged term data (friction limits, multipliers) after convergence with frozen values."""
-        w, flags = self.work, self.work.newton.stepped
+        w, flags = self.work, self.work.newton.trial_accepted
         self.launch(self.kernels.begin_refresh, self.model.worlds, [w.newton, flags])
-        self._any(flags, self.searching)
-        wp.capture_if(self.searching, self._judge_anew)
+        self._reduce_flags(flags, self.searching)
+        wp.capture_if(self.searching, self._reevaluate_frozen)
 
-    def _judge_anew(self) -> None:
-        w, flags = self.work, self.work.newton.stepped
-        self._each("refresh", flags)
-        self.residual.reconsider(flags)
+    def _reevaluate_frozen(self) -> None:
+        w, flags = self.work, self.work.newton.trial_accepted
+        self._call_terms("update_frozen", flags)
+        self.residual.reevaluate_frozen(flags)
         self.launch(self.kernels.end_refresh, self.model.worlds, [w.newton, flags])
-        self._rarely(self._look_for_inversion)
+        self._if_rare(self._check_inversion)
 
     @labelled("control")
-    def _search_on(self) -> None:
+    def _rare_steps(self) -> None:
         """Rare branch: error estimate, step length of non-monotone trials, further searches, inversion check."""
         m, w, k = self.model, self.work, self.kernels
         parts = m.residual_parts
         args = [w.newton, parts.slot_start, parts.slot, parts.element_start, parts.element]
         args += [w.gradient, w.direction, w.inertia, w.v, w.v_tilde, w.u, w.energy_rows, w.newton.floor_sums]
         self.launch(self.vectors.floor_partial, (m.worlds, parts.count, FLOOR_LANES), args)
-        self.launch(k.judge_floor, m.worlds, [w.newton, parts.component])
+        self.launch(k.check_rounding_floor, m.worlds, [w.newton, parts.component])
         if self.perturbation:
             self.residual.evaluate(self.perturbed)
             self.perturbed.zero_()
-        self._any(w.newton.searching, self.searching)
+        self._reduce_flags(w.newton.searching, self.searching)
         wp.capture_while(self.searching, self._search)
-        self.residual.elements.measure_turn(self.at, w.direction, w.newton.active)
-        self.launch(k.plan_leap, m.worlds, [w.newton])
-        self._any(w.newton.searching, self.searching)
+        self.residual.elements.measure_direction_gradient(self.ctx, w.direction, w.newton.active)
+        self.launch(k.limit_nonmonotone_step, m.worlds, [w.newton])
+        self._reduce_flags(w.newton.searching, self.searching)
         wp.capture_while(self.searching, self._search)
-        self._look_for_inversion()
+        self._check_inversion()
 
-    def _look_for_inversion(self) -> None:
+    def _check_inversion(self) -> None:
         """Flag worlds with an element inverted by the accepted iterate."""
         w = self.work
-        self.residual.elements.look_for_inversion(self.at, w.newton.suspect)
-        w.newton.any_hard.zero_()
+        self.residual.elements.check_inversion(self.ctx, w.newton.inversion_suspected)
+        w.newton.any_rare.zero_()
 
     def _search(self) -> None:
         w, k, launch = self.work, self.kernels, self.launch
         launch(self.vectors.trial_velocity, self.dim, [w.newton, w.base, w.direction, w.best, w.v])
         self.residual.evaluate(w.newton.searching)
-        launch(k.judge_trial, self.model.worlds, [w.newton])
+        launch(k.check_trial, self.model.worlds, [w.newton])
         if self.terms.traits.stored:
-            self._each("adopt", w.newton.stepped)
-        self._any(w.newton.searching, self.searching)
+            self._call_terms("accept_trial", w.newton.trial_accepted)
+        self._reduce_flags(w.newton.searching, self.searching)
 
-    def _rarely(self, do: Callable[[], None]) -> None:
+    def _if_rare(self, do: Callable[[], None]) -> None:
         """Run `do` if any world needs the rare branch."""
         with self.launch.rare():
-            wp.capture_if(self.work.newton.any_hard, do)
+            wp.capture_if(self.work.newton.any_rare, do)
 
-    def _each(self, what: str, flags: wp.array) -> None:
+    def _call_terms(self, what: str, flags: wp.array) -> None:
         """Call one method of all terms."""
         for term in self.terms:
-            getattr(term, what)(self.at, flags)
+            getattr(term, what)(self.ctx, flags)
 
-    def _any(self, flags: wp.array, out: wp.array) -> None:
+    def _reduce_flags(self, flags: wp.array, out: wp.array) -> None:
         out.zero_()
         self.launch(self.vectors.any_set, self.model.worlds, [flags, out])
 

@@ -32,7 +32,7 @@ class PCG:
         self.model, self.work, self.launch = model, work, launch
         self.residual = residual
         self.preconditioner = preconditioner
-        self.kernels = pcg_kernels(model.dtype, model.terms.traits.gated)
+        self.kernels = pcg_kernels(model.dtype, model.terms.traits.has_constraints)
         self.dim = (model.worlds, model.slots)
         self.deflate = deflate and model.group_count > 0
         work.pcg.max_iterations = max_iterations
@@ -45,13 +45,13 @@ class PCG:
         launch(k.start, self.dim, [w.gradient, m.topology.free, active, w.direction, w.r])
         if m.component_count > 1:
             launch(k.silence, self.dim, [w.newton, m.component_of_slot, active, w.r])
-        self.translate(active)
+        self.correct_translations(active)
         self.preconditioner.prepare(active)
         self._precondition(w.r, w.z, active)
         w.pcg.any_active.zero_()
         self._run()
-        self.preconditioner.judge(active)
-        self.translate(active)
+        self.preconditioner.record_cost(active)
+        self.correct_translations(active)
 
     def modules(self) -> set[wp.Module]:
         """Modules launched, except those of operator and preconditioner."""
@@ -79,7 +79,7 @@ class PCG:
         self.preconditioner.apply(r, z, active)
         self.residual.reduce(w.warp_rows, 2, active, w.pcg.sums)
 
-    def translate(self, active: wp.array) -> None:
+    def correct_translations(self, active: wp.array) -> None:
         """Galerkin correction for the translations Z of free groups: x += Z (Z^T H Z)^-1 Z^T r, r updated."""
         if not self.deflate:
             return

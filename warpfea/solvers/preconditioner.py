@@ -9,7 +9,7 @@ import warp as wp
 from ..base.errors import ModelError
 from ..base.launch import labelled
 from ..kernels.solvers.pcg import pcg_kernels
-from .band import WHOLE_SLOTS, block_band, find_band
+from .band import FULL_FACTOR_SLOTS, block_band, find_band
 from .residual import Residual
 from .twolevel import TwoLevel
 
@@ -28,7 +28,7 @@ class Preconditioner(Protocol):
     def register(self, state: State) -> None:
         """Register the data kept between steps in the state."""
 
-    def forget(self, flags: wp.array) -> None:
+    def invalidate(self, flags: wp.array) -> None:
         """Invalidate history of worlds whose state was set externally."""
 
     def modules(self) -> set[wp.Module]:
@@ -37,19 +37,19 @@ class Preconditioner(Protocol):
     def start(self, active: wp.array) -> None:
         """Compute work.diagonal and work.inverse at the first iterate of an attempt."""
 
-    def renew(self, active: wp.array) -> None:
+    def discard(self, active: wp.array) -> None:
         """Discard the setup of the last `start`; the attempt restarts from another iterate."""
 
-    def follow(self, active: wp.array) -> None:
+    def update(self, active: wp.array) -> None:
         """Update at every further iterate as far as needed."""
 
-    def commit(self, accepted: wp.array) -> None:
+    def store_history(self, accepted: wp.array) -> None:
         """Store history after acceptance of the attempt."""
 
     def prepare(self, active: wp.array) -> None:
         """Compute the data of `apply` before a linear solve."""
 
-    def judge(self, active: wp.array) -> None:
+    def record_cost(self, active: wp.array) -> None:
         """After a linear solve: record its iteration count for the reuse rule."""
 
     def apply(self, r: wp.array, z: wp.array, active: wp.array) -> None:
@@ -62,13 +62,13 @@ class BlockJacobi:
     def __init__(self, model: Model, work: Workspace, launch: Launcher, residual: Residual) -> None:
         self.work, self.launch, self.residual = work, launch, residual
         work.reserve_blocks()
-        self.kernels = pcg_kernels(model.dtype, model.terms.traits.gated)
+        self.kernels = pcg_kernels(model.dtype, model.terms.traits.has_constraints)
         self.dim = (model.worlds, launch.padded(model.slots))
 
     def register(self, state: State) -> None:
         """Stateless."""
 
-    def forget(self, flags: wp.array) -> None:
+    def invalidate(self, flags: wp.array) -> None:
         """Stateless."""
 
     def modules(self) -> set[wp.Module]:
@@ -78,20 +78,20 @@ class BlockJacobi:
     @labelled("build")
     def start(self, active: wp.array) -> None:
         """Assemble and invert the blocks."""
-        self.residual.blocks(active)
+        self.residual.diagonal_blocks(active)
 
-    follow = start
+    update = start
 
-    def renew(self, active: wp.array) -> None:
+    def discard(self, active: wp.array) -> None:
         """No-op: no stored setup."""
 
-    def commit(self, accepted: wp.array) -> None:
+    def store_history(self, accepted: wp.array) -> None:
         """No-op: no history."""
 
     def prepare(self, active: wp.array) -> None:
         """No-op: the blocks of the iterate are available."""
 
-    def judge(self, active: wp.array) -> None:
+    def record_cost(self, active: wp.array) -> None:
         """No reuse rule."""
 
     @labelled("preconditioner")
@@ -99,10 +99,10 @@ class BlockJacobi:
         """z = D^-1 r, with constraints (D + (dq/dv) J^T rho J)^-1 r."""
         w = self.work
         self.launch(self.kernels.block_jacobi, self.dim, [w.inverse, r, w.diagonal, active, w.warp, z, w.warp_rows])
-        at = self.residual.at
+        ctx = self.residual.ctx
         for term in self.residual.terms:
-            if term.preconditions(at):
-                term.precondition(at, r, z, active)
+            if term.preconditions(ctx):
+                term.precondition(ctx, r, z, active)
 
 
 NAMES = ("two-level", "tiles", "banded", "deflated", "block-jacobi")
@@ -133,7 +133,9 @@ def choose(name: str, storage: str | None, model: Model) -> str:
     if banded and not model.device.is_cuda and find_band(model) is not None:
         return "banded"
     small = model.slots < SMALL_BODY * (int(model.part.max()) + 1)
-    return "deflated" if model.terms.traits.gated and small and model.slots > WHOLE_SLOTS else "two-level"
+    return (
+        "deflated" if model.terms.traits.has_constraints and small and model.slots > FULL_FACTOR_SLOTS else "two-level"
+    )
 
 
 def make(

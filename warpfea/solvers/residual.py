@@ -9,35 +9,35 @@ import warp as wp
 
 from ..base.launch import labelled
 from ..kernels.common.lanes import WARP
-from ..kernels.common.reduce import CHUNK, SHORT, reduce_kernels
+from ..kernels.common.reduce import CHUNK, WARP_ROW, reduce_kernels
 from ..kernels.common.structs import additions_struct
-from ..kernels.solvers.control import GROUP_ROWS, LANES, TERM_ROWS
 from ..kernels.solvers.newton import newton_kernels
+from ..kernels.solvers.newton_control import GROUP_ROWS, LANES, TERM_ROWS
 from ..kernels.solvers.vectors import vector_kernels
 from ..kernels.step.gather import RESIDUAL_ROWS, gather_kernels
-from ..kernels.step.stage import stage_kernels
+from ..kernels.step.midpoint import stage_kernels
 from ..kernels.terms.constraints import constraint_struct
 from ..terms.elements import Elements
 from .assembled import Assembled, shaped
 from .clusters import ModelClusters, make_clusters, make_pool
-from .reuse import Reuse
+from .reuse import ReuseRule
 
 if TYPE_CHECKING:
     from ..base.launch import Launcher
     from ..model.state import State
-    from ..terms.term import At
+    from ..terms.term import StepContext
     from ..terms.workspace import Workspace
 
 __all__ = ["Reducer", "Residual"]
 
 MATRIX_SLOTS = 10
 """Slots per element up to which H p from elements is cheaper than from their matrix, on a GPU."""
-MATRIX_COST = {False: 2.0, True: 0.5}
+MATRIX_REBUILD_COST = {False: 2.0, True: 0.5}
 """Assembly cost in Newton iterations, on the CPU and on CUDA."""
-BAND_COST = 3.0
+BAND_REBUILD_COST = 3.0
 """Assembly cost in Newton iterations of matrices factored in a band on a GPU. 4096 pendulums take 8.5, 8.1 and 8.2 ms
 per step with 0.5, 1.5 and 3 at a tolerance of 1e-8, and 6.9, 5.7 and 4.2 ms at 1e-4."""
-SMALL_SLOTS = 16384
+FAST_MATRIX_SLOTS = 16384
 """Slots up to which a GPU assembles a matrix faster than it solves with one."""
 
 
@@ -54,7 +54,7 @@ class Reducer:
     def __call__(self, rows: wp.array, count: int, active: wp.array, out: wp.array) -> None:
         """out[k] = sum of rows[k], k < count, in the active worlds."""
         n = rows.shape[2]
-        if n <= SHORT:
+        if n <= WARP_ROW:
             lanes = self.launch.lanes(WARP)
             self.launch(self.kernels.short_sums, count * self.worlds * lanes, [rows, lanes, active, out])
             return
@@ -75,16 +75,16 @@ class Residual:
         on_matrix: called with that matrix and the flags of worlds that reassembled it.
     """
 
-    def __init__(self, at: At, *, operator: str, assembled: bool, banded: bool = False) -> None:
-        model, work, launch = at.model, at.work, at.launch
-        self.at, self.model, self.work, self.launch, self.terms = at, model, work, launch, model.terms
+    def __init__(self, ctx: StepContext, *, operator: str, assembled: bool, banded: bool = False) -> None:
+        model, work, launch = ctx.model, ctx.work, ctx.launch
+        self.ctx, self.model, self.work, self.launch, self.terms = ctx, model, work, launch, model.terms
         self.elements: Elements = model.terms.find(Elements)
         self.reduce = Reducer(launch, work, model.worlds)
-        traits = at.traits
+        traits = ctx.traits
         self.gather = gather_kernels(model.dtype, traits)
-        self.newton, self.vectors = newton_kernels(traits), vector_kernels(model.dtype, traits.gated)
+        self.newton, self.vectors = newton_kernels(traits), vector_kernels(model.dtype, traits.has_constraints)
         self.stage = stage_kernels(model.dtype)
-        self.con = model.constraints.data if traits.ties else constraint_struct()()
+        self.con = model.constraints.data if traits.constraint_rows else constraint_struct()()
         self.dim = (model.worlds, model.slots)
         self.additions = self._additions()
         self.with_mass = all(block.with_mass for block in model.blocks)
@@ -96,42 +96,46 @@ class Residual:
             cheaper = assembled
         elif banded:  # their factors solve with the matrix
             cheaper = True
-        if at.midpoint:  # symmetric matrix, unsymmetric operator of a mid-point step
+        if ctx.midpoint:  # symmetric matrix, unsymmetric operator of a mid-point step
             cheaper = False
-        self.by_matrix: bool = operator == "matrix" or (operator == "auto" and cheaper)
+        self.uses_matrix: bool = operator == "matrix" or (operator == "auto" and cheaper)
         self.clusters: ModelClusters | None = None
         # an equilibrium takes few products per iterate, and fewer iterates with the predicted stress
-        self.mixed = not at.inertia and not self.by_matrix
-        if self.with_mass and not self.by_matrix and at.inertia:
+        self.uses_predicted_stress = not ctx.inertia and not self.uses_matrix
+        if self.with_mass and not self.uses_matrix and ctx.inertia:
             if "clusters" not in model.cache:
                 model.cache["clusters"] = make_clusters(model)
             self.clusters = model.cache["clusters"]
-            self.pool = make_pool(model, work, midpoint=at.midpoint)
-            forms = [block.key.damping if at.inertia else None for block in model.blocks]
+            self.pool = make_pool(model, work, midpoint=ctx.midpoint)
+            forms = [block.key.damping if ctx.inertia else None for block in model.blocks]
             self.products = [
-                block.with_mass_product(model.dtype, form, at.midpoint, at.dissipation > 0.0)
+                block.with_mass_product(model.dtype, form, ctx.midpoint, ctx.dissipation > 0.0)
                 for block, form in zip(model.blocks, forms)
             ]
-        self.keep, self.lasting = 0, False
-        self.on_matrix: Callable[[wp.array, wp.array], None] | None = None
+        self.matrix_reuse, self.reuse_across_steps = 0, False
+        self.on_assembled: Callable[[wp.array, wp.array], None] | None = None
         self.assembled: Assembled | None = None
-        if assembled or self.by_matrix:
-            self.assembled = Assembled(model, work, launch, self.elements.kernels(at))
-        if self.by_matrix:
+        if assembled or self.uses_matrix:
+            self.assembled = Assembled(model, work, launch, self.elements.kernels(ctx))
+        if self.uses_matrix:
             assert self.assembled is not None
             self.matrix = self.assembled.values("operator matrix")
             # not in statics (large steps) nor with damping (the viscous stress is no function of the state of a resumed
             # run) nor constraints (their forces are only as accurate as the solve); a GPU assembles a small matrix at
             # negligible cost
-            damped = at.midpoint or any(block.key.damping in ("incremental", "rate") for block in model.blocks)
-            small = model.device.is_cuda and model.slots <= SMALL_SLOTS
-            self.keep = 2 if at.inertia and not damped else 0 if small else 1
-            if traits.gated:
-                self.keep = 0
-            self.lasting = self.keep == 2
-            if self.keep:
-                self.reuse = Reuse(
-                    model, work, launch, "operator", BAND_COST if banded else MATRIX_COST[model.device.is_cuda]
+            damped = ctx.midpoint or any(block.key.damping in ("incremental", "rate") for block in model.blocks)
+            small = model.device.is_cuda and model.slots <= FAST_MATRIX_SLOTS
+            self.matrix_reuse = 2 if ctx.inertia and not damped else 0 if small else 1
+            if traits.has_constraints:
+                self.matrix_reuse = 0
+            self.reuse_across_steps = self.matrix_reuse == 2
+            if self.matrix_reuse:
+                self.reuse = ReuseRule(
+                    model,
+                    work,
+                    launch,
+                    "operator",
+                    BAND_REBUILD_COST if banded else MATRIX_REBUILD_COST[model.device.is_cuda],
                 )
 
     def _additions(self) -> Any:
@@ -149,108 +153,108 @@ class Residual:
     @property
     def block_kernels(self) -> list[Any]:
         """Kernels of the element blocks."""
-        return self.elements.kernels(self.at)
+        return self.elements.kernels(self.ctx)
 
     def modules(self) -> set[wp.Module]:
         """Modules of the gather and of an assembled matrix; terms list their own."""
-        out = {self.gather.module, self.vectors.module} | ({self.stage.module} if self.at.midpoint else set())
-        if self.by_matrix:
+        out = {self.gather.module, self.vectors.module} | ({self.stage.module} if self.ctx.midpoint else set())
+        if self.uses_matrix:
             assert self.assembled is not None
             out |= {self.gather.matrix_module} | self.assembled.modules()
-            out |= {self.reuse.kernels.module} if self.keep else set()
+            out |= {self.reuse.kernels.module} if self.matrix_reuse else set()
         elif self.clusters:
             out |= {kernel.module for kernel in self.products}
-        elif self.mixed:
-            out |= {kernel.module for kernel in self.elements.mixed_kernels()}
+        elif self.uses_predicted_stress:
+            out |= {kernel.module for kernel in self.elements.predicted_stress_kernels()}
         return out
 
     def register(self, state: State) -> None:
         """Register the reuse data of the operator matrix in the state."""
-        if self.lasting:
+        if self.reuse_across_steps:
             self.reuse.register(state)
 
-    def forget(self, flags: wp.array) -> None:
+    def invalidate(self, flags: wp.array) -> None:
         """Invalidate history of worlds whose state was set externally."""
-        if self.lasting:
-            self.reuse.forget(flags)
+        if self.reuse_across_steps:
+            self.reuse.invalidate(flags)
 
-    def commit(self, accepted: wp.array) -> None:
+    def store_history(self, accepted: wp.array) -> None:
         """Store the reuse data of the operator matrix in the state."""
-        if self.lasting:
+        if self.reuse_across_steps:
             args = [self.reuse.control, self.work.newton, accepted]
             self.launch(self.reuse.kernels.count_step, self.model.worlds, args)
-            self.reuse.carry(accepted)
-            self.reuse.commit(accepted)
+            self.reuse.move_point(accepted)
+            self.reuse.store_counts(accepted)
 
     @labelled("assembly")
     def linearise(self, active: wp.array) -> None:
         """Assemble the operator matrix at the iterate if its reuse rule requires it."""
-        if not self.by_matrix:
+        if not self.uses_matrix:
             return
-        if self.keep == 0:
-            self.take(active)
+        if self.matrix_reuse == 0:
+            self.assemble_matrix(active)
             return
         control = self.reuse.control
-        args = [control, self.work.newton, self.keep]
-        self.launch(self.reuse.kernels.judge_matrix, self.model.worlds, args)
-        self.reuse.decide(active)
-        self.launch(self.reuse.kernels.loosen, self.model.worlds, [control, self.work.newton])
+        args = [control, self.work.newton, self.matrix_reuse]
+        self.launch(self.reuse.kernels.check_matrix_reuse, self.model.worlds, args)
+        self.reuse.decide_rebuild(active)
+        self.launch(self.reuse.kernels.loosen_tolerance, self.model.worlds, [control, self.work.newton])
         wp.capture_if(control.any_build, self._assemble)
 
     @labelled("assembly")
     def _assemble(self) -> None:
         assert self.assembled is not None
         control = self.reuse.control
-        self.reuse.carry()
+        self.reuse.move_point()
         factors = (control.mass_factor, control.dq_dv)
-        self.assembled.assemble(self.reuse.place, factors, control.build, self.matrix, projected=False)
-        if self.on_matrix:
-            self.on_matrix(self.matrix, control.build)
-        self.reuse.made()
+        self.assembled.assemble(self.reuse.linearisation_point, factors, control.build, self.matrix, projected=False)
+        if self.on_assembled:
+            self.on_assembled(self.matrix, control.build)
+        self.reuse.mark_built()
 
-    def take(self, active: wp.array) -> None:
+    def assemble_matrix(self, active: wp.array) -> None:
         """Assemble the operator matrix at the iterate unconditionally."""
         w = self.work
-        if self.by_matrix:
+        if self.uses_matrix:
             assert self.assembled is not None
             factors = (w.step.mass_factor, w.step.dq_dv)
             self.assembled.assemble(w.u_stage, factors, active, self.matrix, projected=False)
-            if self.on_matrix:
-                self.on_matrix(self.matrix, active)
+            if self.on_assembled:
+                self.on_assembled(self.matrix, active)
 
-    def place(self, active: wp.array) -> None:
+    def update_positions(self, active: wp.array) -> None:
         """Positions q~ + (dq/dv) v, and stage positions of mid-point schemes."""
-        w, state = self.work, self.at.state
+        w, state = self.work, self.ctx.state
         self.launch(self.vectors.update_position, self.dim, [w.q_tilde, w.v, w.step.dq_dv, active, w.u])
-        if self.at.midpoint:
+        if self.ctx.midpoint:
             args = [state.displacement, state.velocity, w.v, w.step.dq_dv, active, w.u_stage, w.v_stage]
             self.launch(self.stage.take_stage, self.dim, args)
 
     @labelled("residual")
-    def reconsider(self, active: wp.array) -> None:
+    def reevaluate_frozen(self, active: wp.array) -> None:
         """Re-evaluate forces, g and sums after an update of lagged term data."""
-        self.at.moved = False
-        self.balance(active, hold=True)
-        self.at.moved = True
+        self.ctx.positions_changed = False
+        self.evaluate_forces(active, freeze=True)
+        self.ctx.positions_changed = True
 
     @labelled("residual")
-    def evaluate(self, active: wp.array, *, hold: bool = False) -> None:
-        """Evaluate q, forces, g and all sums at the iterate v; `hold`: Phi freezes the non-potential forces there."""
+    def evaluate(self, active: wp.array, *, freeze: bool = False) -> None:
+        """Evaluate q, forces, g and all sums at the iterate v; `freeze`: Phi freezes the non-potential forces there."""
         w, launch = self.work, self.launch
         launch(self.newton.reset_min_J, self.model.worlds, [w.newton, active])
-        self.place(active)
-        self.balance(active, hold=hold)
+        self.update_positions(active)
+        self.evaluate_forces(active, freeze=freeze)
 
-    def balance(self, active: wp.array, *, hold: bool = False) -> None:
+    def evaluate_forces(self, active: wp.array, *, freeze: bool = False) -> None:
         """Evaluate forces, g and all sums at work.u and work.v."""
         m, w, launch = self.model, self.work, self.launch
         for term in self.terms:
-            term.force(self.at, active)
+            term.force(self.ctx, active)
         if self.terms.traits.nonpotential:
             args = [self.terms.side_topology, w.nonpotential_contribution, active, w.nonpotential]
             launch(self.gather.gather_force, self.dim, args)
-        if hold:
-            self.hold_nonpotential(active)
+        if freeze:
+            self.freeze_nonpotential(active)
         if w.term_rows is not None:
             self.reduce(w.term_rows, TERM_ROWS, active, w.newton.term_sums)
         args = [m.topology, w.contribution, w.balance, active, self.con, w.multipliers]
@@ -266,18 +270,18 @@ class Residual:
             launch(self.vectors.norm_sum, sums, [w.residual_group_partial, active, w.newton.group_sums])
 
     @labelled("loads")
-    def hold_nonpotential(self, active: wp.array) -> None:
+    def freeze_nonpotential(self, active: wp.array) -> None:
         """Freeze the non-potential forces of Phi at this iterate."""
         if self.terms.traits.nonpotential:
-            args = [self.work.nonpotential, active, self.work.nonpotential_held]
+            args = [self.work.nonpotential, active, self.work.nonpotential_frozen]
             self.launch(self.vectors.copy_active, self.dim, args)
 
     @labelled("build")
-    def blocks(self, active: wp.array) -> None:
+    def diagonal_blocks(self, active: wp.array) -> None:
         """Diagonal blocks of H at the iterate: D for the norms, inverses for the preconditioner."""
         m, w, launch = self.model, self.work, self.launch
         for term in self.terms:
-            term.diagonal(self.at, active)
+            term.diagonal(self.ctx, active)
         args = [m.topology, w.block_contribution, w.pool_block, w.step.mass_factor, w.step.dq_dv, active]
         args += [w.diagonal, w.inverse]
         launch(self.gather.gather_blocks, self.dim, args)
@@ -302,14 +306,14 @@ class Residual:
                 ]
                 args += [lanes, self.pool, w.contribution]
                 launch(kernel, (m.worlds, count * lanes), args, block_dim=block.cluster)
-        elif self.mixed:
-            self.elements.mixed_tangent(self.at, p, active)
-        elif not self.by_matrix:
-            self.elements.tangent(self.at, p, active)
+        elif self.uses_predicted_stress:
+            self.elements.predicted_stress_tangent(self.ctx, p, active)
+        elif not self.uses_matrix:
+            self.elements.tangent(self.ctx, p, active)
         for term in self.terms:
-            term.product(self.at, p, active)
+            term.product(self.ctx, p, active)
         rest = [self.additions, p, active, self.con, w.multipliers]
-        if self.by_matrix:
+        if self.uses_matrix:
             assert self.assembled is not None
             pattern = self.assembled.pattern
             lanes = launch.lanes(pattern.width)
@@ -332,7 +336,7 @@ class Residual:
             return
         for term in self.terms:
             if not term.potential:
-                term.product(self.at, w.direction, active)
+                term.product(self.ctx, w.direction, active)
         args = [self.terms.side_topology, w.nonpotential_tangent, active, w.Hp]
         launch(self.gather.gather_force, self.dim, args)
         launch(self.vectors.dot_rows, self.dim, [w.Hp, w.direction, active, w.rows])  # p is 0 where prescribed

@@ -14,10 +14,10 @@ if TYPE_CHECKING:
     from ..model.state import State
     from ..terms.workspace import Workspace
 
-__all__ = ["Reuse"]
+__all__ = ["ReuseRule"]
 
 
-class Reuse:
+class ReuseRule:
     """Reuse rule of kernels/solvers/reuse.py for one object (preconditioner or matrix), with its linearisation point.
 
     Attributes:
@@ -29,7 +29,7 @@ class Reuse:
         self.model, self.work, self.launch, self.name = model, work, launch, name
         self.kernels = reuse_kernels(model.dtype)
         self.dim = (model.worlds, model.slots)
-        self.none = wp.zeros(0, dtype=wp.int32, device=model.device)
+        self.no_flags = wp.zeros(0, dtype=wp.int32, device=model.device)
         self.control: Any = reuse_struct()()
         for field, var in reuse_struct().vars.items():
             if isinstance(var.type, wp.array) and field != "kept":
@@ -38,38 +38,44 @@ class Reuse:
         self.control.limit = limit
         self.control.stale.fill_(1)
         self.control.mass_factor.fill_(-1.0)
-        self.place = work.array(f"{name} place", self.dim, model.types.vec3)
+        self.linearisation_point = work.array(f"{name} place", self.dim, model.types.vec3)
         # no state owns it before `register`
-        self.control.kept, self.kept = wp.zeros((0, 0), dtype=wp.float64, device=model.device), self.place
+        self.control.kept, self.kept = wp.zeros((0, 0), dtype=wp.float64, device=model.device), self.linearisation_point
 
     def register(self, state: State) -> None:
         """Register the linearisation point and counts in the state, so that a resumed run takes the same decisions."""
         self.control.kept = state.register(self.name, wp.float64, (6,), (0.0, -1.0, -1.0, 0.0, 0.0, 0.0))
         self.kept = state.register(f"{self.name}_displacement", self.model.types.vec3, (self.model.slots,))
 
-    def forget(self, flags: wp.array) -> None:
+    def invalidate(self, flags: wp.array) -> None:
         """Flag worlds whose state was set externally: the object is rebuilt at the stored linearisation point."""
-        self.launch(self.kernels.mark, self.model.worlds, [flags, self.control])
+        self.launch(self.kernels.mark_stale, self.model.worlds, [flags, self.control])
 
-    def decide(self, active: wp.array) -> None:
+    def decide_rebuild(self, active: wp.array) -> None:
         """Flag the worlds that build the object before this solve, in `control.build`."""
         w = self.work
         self.control.any_build.zero_()
         args = [self.control, w.newton, w.step.mass_factor, w.step.dq_dv, active]
-        self.launch(self.kernels.decide, self.model.worlds, args)
+        self.launch(self.kernels.decide_rebuild, self.model.worlds, args)
 
-    def carry(self, accepted: wp.array | None = None) -> None:
+    def move_point(self, accepted: wp.array | None = None) -> None:
         """Set the linearisation point before a solve: the iterate for a rebuild, the state's copy after a restore.
 
         `accepted`: flags of a step; the point is then copied to the state of accepted worlds instead.
         """
-        args = [self.control, self.none if accepted is None else accepted, self.work.u_stage, self.kept, self.place]
-        self.launch(self.kernels.carry_places, self.dim, args)
+        args = [
+            self.control,
+            self.no_flags if accepted is None else accepted,
+            self.work.u_stage,
+            self.kept,
+            self.linearisation_point,
+        ]
+        self.launch(self.kernels.carry_points, self.dim, args)
 
-    def made(self) -> None:
+    def mark_built(self) -> None:
         """Mark the object of the flagged worlds as built."""
-        self.launch(self.kernels.made, self.model.worlds, [self.control])
+        self.launch(self.kernels.mark_built, self.model.worlds, [self.control])
 
-    def commit(self, accepted: wp.array) -> None:
+    def store_counts(self, accepted: wp.array) -> None:
         """Store the rule's counts in the state of accepted worlds, after `carry` has stored the point."""
-        self.launch(self.kernels.commit, self.model.worlds, [self.control, accepted])
+        self.launch(self.kernels.store_counts, self.model.worlds, [self.control, accepted])

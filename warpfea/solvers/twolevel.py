@@ -36,14 +36,14 @@ from ..kernels.solvers.levels import TILE, TILE_SLOTS, level_kernels, level_stru
 from ..kernels.solvers.levels_build import FACTOR_LANES, build_kernels
 from ..kernels.solvers.pcg import pcg_kernels
 from ..model.state import words_of
-from ..terms.term import Kept
+from ..terms.term import CachedInputs
 from .assembled import chunk_of, shaped
-from .band import WHOLE_SLOTS, BandFactor, find_band
+from .band import FULL_FACTOR_SLOTS, BandFactor, find_band
 from .dense import gauss_jordan
 from .level_arrays import LevelArrays
 from .levels import GROUP_SLOTS, Level, make_levels
-from .motions import Motions, motion_bodies
-from .reuse import Reuse
+from .reuse import ReuseRule
+from .rigid_body_modes import RigidBodyModes, mode_bodies
 
 if TYPE_CHECKING:
     from ..base.launch import Launcher
@@ -55,9 +55,9 @@ if TYPE_CHECKING:
 __all__ = ["TwoLevel"]
 
 CHEBYSHEV_STEPS = 3
-LARGEST = 3.5
+LARGEST_EIGENVALUE = 3.5
 """Assumed largest eigenvalue of a preconditioned coarse matrix (2.7 to 3.5 measured)."""
-RATIO = 8.0
+EIGENVALUE_RATIO = 8.0
 """Design ratio of largest to smallest eigenvalue of the Chebyshev steps."""
 REBUILD_COST = 40.0
 """Setup cost of the preconditioner, in PCG iterations."""
@@ -81,62 +81,63 @@ class TwoLevel:
         assert residual.assembled is not None
         self.assembled = residual.assembled
         self.kernels = level_kernels(model.dtype, self.storage)
-        self.making = build_kernels(model.dtype, self.storage)
+        self.setup_kernels = build_kernels(model.dtype, self.storage)
         self.blocks = block_kernels(model.dtype)
-        self.jacobi = pcg_kernels(model.dtype, model.terms.traits.gated).block_jacobi
+        self.jacobi = pcg_kernels(model.dtype, model.terms.traits.has_constraints).block_jacobi
         self.dim = (model.worlds, model.slots)
         self.levels = self._levels(kind)
-        self.at, self.terms = residual.at, model.terms
+        self.ctx, self.terms = residual.ctx, model.terms
         for term in self.terms:
-            term.reserve(self.at, self.assembled, projected=True)
-        self.adding = model.terms.traits.pooled or model.terms.traits.ties  # terms add to the matrix
+            term.allocate_blocks(self.ctx, self.assembled, projected=True)
+        self.terms_add = model.terms.traits.pooled or model.terms.traits.constraint_rows  # terms add to the matrix
         first, pattern = self.levels[0], self.assembled.pattern
         band = first.band
         self.band = BandFactor(model, work, launch, band, pattern) if band is not None else None
         # factors of the operator's matrix if cheap, or for static equilibria of beams (the matrix made here then only
         # serves D); wider bands are reused for longer
-        one = self.storage == model.dtype and not residual.at.inertia and first.slots <= WHOLE_SLOTS
+        one = self.storage == model.dtype and not residual.ctx.inertia and first.slots <= FULL_FACTOR_SLOTS
         order = find_band(model) if first.dense and one else band
         # (a GPU factors the band of a small model, joint terms included, in about the time of its matrix)
-        quick = order is not None and (order.quick or (band is not None and model.device.is_cuda))
+        quick = order is not None and (order.cheap or (band is not None and model.device.is_cuda))
         traits = model.terms.traits
-        whole = not self.adding or (model.device.is_cuda and not traits.pooled and residual.keep == 0)
-        self.follows = quick and residual.by_matrix and whole and not traits.tangent
-        parted = not self.follows
+        whole = not self.terms_add or (model.device.is_cuda and not traits.pooled and residual.matrix_reuse == 0)
+        self.follows_matrix = quick and residual.uses_matrix and whole and not traits.tangent
+        by_component = not self.follows_matrix
         self.arrays = [
-            LevelArrays(model, work, launch, level, k, self.storage, parted) for k, level in enumerate(self.levels)
+            LevelArrays(model, work, launch, level, k, self.storage, by_component)
+            for k, level in enumerate(self.levels)
         ]
-        if self.follows:
-            residual.on_matrix = self._factor
+        if self.follows_matrix:
+            residual.on_assembled = self._factor
             self.half = work.array("level 0 half", (model.worlds, 3 * model.slots if first.dense else 0), model.types.T)
         # matrix of a chunk of worlds; with factors a GPU needs more worlds at once to be busy
-        share = 2 if self.follows and self.adding else 1
+        share = 2 if self.follows_matrix and self.terms_add else 1
         self.chunk = model.worlds
-        if not motion_bodies(model):
+        if not mode_bodies(model):
             work.chunks["preconditioner matrix"] = lambda worlds: min(worlds, share * chunk_of(worlds))
             self.chunk = work.chunks["preconditioner matrix"](model.worlds)
         self.value = self.assembled.values("preconditioner matrix", self.chunk)
         self.chosen = work.array("preconditioner chunk", (model.worlds,), wp.int32)
         free = model.group_count > 0  # bodies whose momentum is conserved by the translation correction
-        if self.follows and self.band and model.dtype == "float64" and residual.at.inertia and not free:
+        if self.follows_matrix and self.band and model.dtype == "float64" and residual.ctx.inertia and not free:
             work.pcg.exact = self.band.exact
-        self.motions, self.coupling = self._motions()
+        self.body_modes, self.coupling = self._motions()
         self.by_row = 0 if model.device.is_cuda else 1
-        self.corrected = not self.levels[0].whole and any(term.preconditions(self.at) for term in self.terms)
-        self.kept: dict[str, Kept] = {}
-        self.rebuild_cost = band.rebuild_cost if band is not None and not self.follows else REBUILD_COST
+        self.has_corrections = not self.levels[0].whole and any(term.preconditions(self.ctx) for term in self.terms)
+        self.kept: dict[str, CachedInputs] = {}
+        self.rebuild_cost = band.rebuild_cost if band is not None and not self.follows_matrix else REBUILD_COST
         # iteration counts are not comparable; separate key
         name = "preconditioner" if band is None else "preconditioner_banded"
-        self.reuse = Reuse(model, work, launch, name, self.rebuild_cost)
+        self.reuse = ReuseRule(model, work, launch, name, self.rebuild_cost)
         most = max([level.slots for level in self.levels[1:]], default=1)
         self.all_free = wp.full(most, 1.0, dtype=model.types.vec3, device=model.device)
 
-    def _motions(self) -> tuple[Motions | None, set[wp.Module]]:
+    def _motions(self) -> tuple[RigidBodyModes | None, set[wp.Module]]:
         """Rigid body modes of bodies coupled by terms, and the term modules that they need."""
-        if not motion_bodies(self.model):
+        if not mode_bodies(self.model):
             return None, set()
-        out = Motions(self.model, self.work, self.launch, self.residual, self.assembled.pattern)
-        return out, out.modules().union(*(term.reserve_motions(self.at, out) for term in self.terms))
+        out = RigidBodyModes(self.model, self.work, self.launch, self.residual, self.assembled.pattern)
+        return out, out.modules().union(*(term.allocate_mode_coupling(self.ctx, out) for term in self.terms))
 
     def _levels(self, kind: str) -> list[Level]:
         """Levels of a kind of preconditioner: "two-level", "tiles" (without a coarse space) or "banded"."""
@@ -144,10 +145,10 @@ class TwoLevel:
         if kind == "banded":
             band = find_band(model) or find_band(model, any_width=True)
             return [Level(pattern, model.slots, False, level_struct(model.dtype)(), band=band)]
-        parted = self.storage == model.dtype
-        key = kind if parted else f"{kind} whole"
+        by_component = self.storage == model.dtype
+        key = kind if by_component else f"{kind} whole"
         if key not in model.cache:
-            model.cache[key] = make_levels(model, pattern, coarse=kind != "tiles", parted=parted)
+            model.cache[key] = make_levels(model, pattern, coarse=kind != "tiles", by_component=by_component)
         return model.cache[key]
 
     def register(self, state: State) -> None:
@@ -155,8 +156,8 @@ class TwoLevel:
         self.reuse.control.limit = self.rebuild_cost
         self.reuse.register(state)
         for term in self.terms:
-            kept = Kept([], [], [])
-            for key, array in term.keep(self.at):
+            kept = CachedInputs([], [], [])
+            for key, array in term.cached_inputs(self.ctx):
                 name = f"{term.name}_{key}".replace(" ", "_")
                 kept.live.append(array)
                 kept.place.append(self.work.array(f"preconditioner {name}", array.shape, array.dtype))
@@ -164,13 +165,13 @@ class TwoLevel:
             if kept.live:
                 self.kept[term.name] = kept
 
-    def _carry(self, accepted: wp.array | None = None) -> None:
+    def _copy_cached(self, accepted: wp.array | None = None) -> None:
         reuse = self.reuse
-        reuse.carry(accepted)
-        flags = reuse.none if accepted is None else accepted
+        reuse.move_point(accepted)
+        flags = reuse.no_flags if accepted is None else accepted
         for term in self.terms:
             kept = self.kept.get(term.name)
-            if kept is not None and not term.carry(self.at, kept, reuse.control, flags):
+            if kept is not None and not term.copy_cached(self.ctx, kept, reuse.control, flags):
                 for arrays in zip(kept.live, kept.state, kept.place):
                     words = [words_of(array) for array in arrays]
                     self.launch(reuse.kernels.carry_words, words[0].shape, [reuse.control, flags, *words])
@@ -179,47 +180,47 @@ class TwoLevel:
         """Modules launched."""
         k = self.kernels
         out = {k.module, self.reuse.kernels.module, self.blocks.module} | self.assembled.modules() | self.coupling
-        out |= self.band.modules() if self.band else {self.making.module}
+        out |= self.band.modules() if self.band else {self.setup_kernels.module}
         return out.union(*(arrays.dense.modules() for arrays in self.arrays if not self.band and arrays.dense))
 
     # interface of Preconditioner
 
-    def renew(self, active: wp.array) -> None:
+    def discard(self, active: wp.array) -> None:
         """Request a rebuild at the new start iterate; with factors that follow the operator's matrix, D only."""
-        if self.follows and self.model.device.is_cuda:
+        if self.follows_matrix and self.model.device.is_cuda:
             return
-        self.launch(self.reuse.kernels.renew, self.model.worlds, [active, self.reuse.control])
+        self.launch(self.reuse.kernels.request_rebuild, self.model.worlds, [active, self.reuse.control])
 
-    def follow(self, active: wp.array) -> None:
+    def update(self, active: wp.array) -> None:
         """No-op: reused at later iterates."""
 
     @labelled("build")
-    def forget(self, flags: wp.array) -> None:
+    def invalidate(self, flags: wp.array) -> None:
         """Invalidate history of worlds whose state was set externally."""
-        self.reuse.forget(flags)
+        self.reuse.invalidate(flags)
 
-    def commit(self, accepted: wp.array) -> None:
+    def store_history(self, accepted: wp.array) -> None:
         """Store history in the state."""
-        self._carry(accepted)
-        self.reuse.commit(accepted)
+        self._copy_cached(accepted)
+        self.reuse.store_counts(accepted)
 
     @labelled("build")
     def start(self, active: wp.array) -> None:
         """Rebuild where due, with D and the penalties that follow from D."""
-        self.reuse.decide(active)
+        self.reuse.decide_rebuild(active)
         wp.capture_if(self.reuse.control.any_build, self._build_first)
 
     @labelled("build")
     def prepare(self, active: wp.array) -> None:
         """Rebuild where due, with the constraint penalties of the step."""
-        self.reuse.decide(active)
+        self.reuse.decide_rebuild(active)
         wp.capture_if(self.reuse.control.any_build, self._build)
 
     @labelled("build")
-    def judge(self, active: wp.array) -> None:
+    def record_cost(self, active: wp.array) -> None:
         """Record the iteration count of the solve."""
-        args = [self.reuse.control, self.work.newton, self.work.pcg, int(self.follows)]
-        self.launch(self.reuse.kernels.judge, self.model.worlds, args)
+        args = [self.reuse.control, self.work.newton, self.work.pcg, int(self.follows_matrix)]
+        self.launch(self.reuse.kernels.count_solve, self.model.worlds, args)
 
     @labelled("preconditioner")
     def apply(self, r: wp.array, z: wp.array, active: wp.array) -> None:
@@ -234,17 +235,17 @@ class TwoLevel:
             coarse, correct = z, 0
         else:
             coarse, correct = self._smooth(0, r, z, active), int(len(self.levels) > 1)
-        if self.motions:
-            self.motions.apply(r, z, active)
+        if self.body_modes:
+            self.body_modes.apply(r, z, active)
         args = [level.data, correct, coarse, m.topology.free, r, w.diagonal, active, w.warp, z, w.warp_rows]
         dim = (m.worlds, launch.padded(m.slots))
         launch(k.add_coarse, dim, args)
-        if self.corrected:
+        if self.has_corrections:
             args = [w.inverse, r, w.diagonal, active, w.warp, w.Hp, w.spare_rows]
             launch(self.jacobi, dim, args)
             for term in self.terms:
-                if term.preconditions(self.at):
-                    term.precondition(self.at, r, w.Hp, active, into=z)
+                if term.preconditions(self.ctx):
+                    term.precondition(self.ctx, r, w.Hp, active, into=z)
 
     # application
 
@@ -253,7 +254,7 @@ class TwoLevel:
         flat_r, flat_x = (_flat(a, self.model.types.T, (B, 3 * n)) for a in (r, x))
         dense = self.arrays[depth].dense
         assert dense is not None
-        if self.follows:  # z = L^-T (L^-1 r)
+        if self.follows_matrix:  # z = L^-T (L^-1 r)
             lanes = self.launch.lanes(3 * n)
             dim = (B, self.launch.padded(3 * n * lanes))
             for upper, given, out in ((0, flat_r, self.half), (1, self.half, flat_x)):
@@ -287,8 +288,8 @@ class TwoLevel:
         level, arrays = self.levels[depth], self.arrays[depth]
         v = arrays.vectors
         dim = (self.model.worlds, level.slots)
-        low = LARGEST / RATIO
-        centre, half = 0.5 * (LARGEST + low), 0.5 * (LARGEST - low)
+        low = LARGEST_EIGENVALUE / EIGENVALUE_RATIO
+        centre, half = 0.5 * (LARGEST_EIGENVALUE + low), 0.5 * (LARGEST_EIGENVALUE - low)
         ratio = centre / half
         rho = 1.0 / ratio
         keep, step = 0.0, 1.0 / centre
@@ -325,31 +326,33 @@ class TwoLevel:
         m, w, launch, reuse = self.model, self.work, self.launch, self.reuse.control
         factors = (reuse.mass_factor, reuse.dq_dv)
         # rows are scaled once the penalties are known
-        self.reuse.carry()
+        self.reuse.move_point()
         for worlds, flags, value in self._chunks(reuse.build):
-            self.assembled.assemble(self.reuse.place, factors, flags, value, projected=True, worlds=worlds)
-            if self.adding and m.terms.traits.pooled:
-                self._carry()
+            self.assembled.assemble(
+                self.reuse.linearisation_point, factors, flags, value, projected=True, worlds=worlds
+            )
+            if self.terms_add and m.terms.traits.pooled:
+                self._copy_cached()
                 self._add(value, flags, penalties=False)
             args = [m.topology, self.assembled.pattern.data, value, flags, w.diagonal, w.inverse]
             launch(self.blocks.take_diagonal, self.dim, args)
-            if m.terms.traits.gated:
+            if m.terms.traits.has_constraints:
                 if penalty:
                     for term in self.terms:
-                        term.scale(self.at, flags)
-                self._carry()
+                        term.scale(self.ctx, flags)
+                self._copy_cached()
                 self._add(value, flags, penalties=True)
-            self._take(value, flags)
-        self.reuse.made()
-        if self.motions:
-            self._couple(self.motions, reuse.build)
-        if not (self.follows or self.band):
+            self._factor_or_fill(value, flags)
+        self.reuse.mark_built()
+        if self.body_modes:
+            self._add_mode_coupling(self.body_modes, reuse.build)
+        if not (self.follows_matrix or self.band):
             self._invert(reuse.build)
 
-    def _take(self, value: wp.array, flags: wp.array) -> None:
+    def _factor_or_fill(self, value: wp.array, flags: wp.array) -> None:
         """Factor the matrix of some worlds, or fill the tiles and the next level."""
         level, arrays = self.levels[0], self.arrays[0]
-        if self.follows:
+        if self.follows_matrix:
             return
         if self.band:
             self.band.make(value, flags)
@@ -362,7 +365,7 @@ class TwoLevel:
         """Fill the tiles of a level and the matrix of the next one."""
         m, level, arrays = self.model, self.levels[depth], self.arrays[depth]
         args = [level.data, level.pattern.data, value, flags, arrays.diagonal, arrays.matrix]
-        self.launch(self.making.fill_tiles, (m.worlds, level.tiles, TILE_SLOTS), args)
+        self.launch(self.setup_kernels.fill_tiles, (m.worlds, level.tiles, TILE_SLOTS), args)
         if depth + 1 < len(self.levels):
             assert level.galerkin is not None
             free = self.all_free if depth else m.topology.free
@@ -381,14 +384,14 @@ class TwoLevel:
                 self._fill(depth, arrays.value, flags)
             self._invert_tiles(level, arrays, flags, keep=depth == 0)
 
-    def _couple(self, motions: Motions, flags: wp.array) -> None:
+    def _add_mode_coupling(self, motions: RigidBodyModes, flags: wp.array) -> None:
         """Assemble and invert the matrix of the rigid body modes."""
-        motions.begin(self.reuse.place, self.value, flags)
+        motions.assemble(self.reuse.linearisation_point, self.value, flags)
         for term in self.terms:
             kept = self.kept[term.name].place if term.name in self.kept else []
-            if term.couples():
-                term.couple(self.at, kept, self.reuse.control.dq_dv, flags)
-        motions.end(flags)
+            if term.coupled_bodies():
+                term.add_mode_coupling(self.ctx, kept, self.reuse.control.dq_dv, flags)
+        motions.invert(flags)
 
     def _add(self, value: wp.array, flags: wp.array, *, penalties: bool) -> None:
         """Add the terms' blocks to the matrix of some worlds: those that D is taken from, or the penalties."""
@@ -396,11 +399,11 @@ class TwoLevel:
         for term in self.terms:
             if term.penalty == penalties:
                 kept = self.kept[term.name].place if term.name in self.kept else []
-                term.blocks(self.at, self.assembled, kept, reuse.dq_dv, flags, value, projected=True)
+                term.blocks(self.ctx, self.assembled, kept, reuse.dq_dv, flags, value, projected=True)
 
     @labelled("build")
     def _factor(self, value: wp.array, flags: wp.array) -> None:
-        if self.band and not self.adding:
+        if self.band and not self.terms_add:
             self.band.make(value, flags)
             return
         if self.band:
@@ -413,7 +416,7 @@ class TwoLevel:
         lanes = FACTOR_LANES if self.model.device.is_cuda else 1
         dense.fill(self.levels[0].pattern, value, flags)
         args = [lanes, dense.scale, flags, dense.left, dense.top, dense.matrix]
-        self.launch(self.making.factor_dense, self.model.worlds * lanes, args, block_dim=FACTOR_LANES)
+        self.launch(self.setup_kernels.factor_dense, self.model.worlds * lanes, args, block_dim=FACTOR_LANES)
 
     def _add_to_copy(self, value: wp.array, worlds: range, flags: wp.array, out: wp.array) -> None:
         """Operator matrix of some worlds with all term contributions."""
@@ -422,11 +425,11 @@ class TwoLevel:
         given, copy = (shaped(a, dim, self.model.types.vec3) for a in (value[rows], self.value))
         self.launch(self.residual.vectors.copy_active, dim, [given, flags[rows], copy])
         for term in self.terms:
-            live = [array for _, array in term.keep(self.at)]
-            term.blocks(self.at, self.assembled, live, w.step.dq_dv, flags, out, projected=False)
+            live = [array for _, array in term.cached_inputs(self.ctx)]
+            term.blocks(self.ctx, self.assembled, live, w.step.dq_dv, flags, out, projected=False)
 
     def _invert_tiles(self, level: Level, arrays: LevelArrays, flags: wp.array, *, keep: bool) -> None:
-        B, k = self.model.worlds, self.making
+        B, k = self.model.worlds, self.setup_kernels
         gauss_jordan(self.launch, k, level.tiles, arrays, arrays.matrix, flags, keep=keep)
         if arrays.stored is not arrays.matrix:
             args = [level.tiles, arrays.diagonal, arrays.matrix, flags, arrays.root, arrays.stored]

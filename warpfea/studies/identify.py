@@ -22,7 +22,7 @@ from scipy.optimize import differential_evolution
 
 import warpfea as wf
 
-from ..base.console import number, plain, quiet_warp, write_json
+from ..base.console import number, quiet_warp, to_json, write_json
 from ..base.devices import find_device
 from ..base.provenance import origin
 from ..base.writer import check_target
@@ -145,4 +145,4 @@ def run(options: argparse.Namespace) -> None:
         found = asdict(identify(record(device), device=device, **given))
     print("  ".join(f"{name} {number(v) if isinstance(v, float) else v}" for name, v in found.items()), flush=True)
     if options.out is not None:
-        write_json(options.out, plain(content | {"rows": [found]}))
+        write_json(options.out, to_json(content | {"rows": [found]}))

@@ -13,8 +13,8 @@ from .. import elements as families
 from ..kernels.terms.loads import body_force_kernel
 from ..model import assembly
 from ..model.description import BodyForce
-from .term import At, Term
-from .time_laws import TimeLaws, argument_precision
+from .term import StepContext, Term
+from .time_law_table import TimeLawTable, argument_precision
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -52,7 +52,7 @@ class BodyForces(Term):
     def features(cls, model: Model) -> dict[str, bool]:
         return {"body forces": bool(model.description.body_forces)}
 
-    def build(self, laws: TimeLaws) -> None:
+    def build(self, laws: TimeLawTable) -> None:
         offset = 0
         for force in self.model.description.body_forces:
             for field, conn in self._parts(force):
@@ -103,15 +103,15 @@ class BodyForces(Term):
             block.data.field_weight = m.array("loads", np.concatenate(weights).T, m.types.T)
             block.field_rule = rule
 
-    def modules(self, at: At) -> Iterable[wp.Module]:
+    def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
         return {field.kernel.module for field in self.parts_of_fields}
 
-    def force(self, at: At, active: wp.array) -> None:
-        m, w = self.model, at.work
+    def force(self, ctx: StepContext, active: wp.array) -> None:
+        m, w = self.model, ctx.work
         for field in self.parts_of_fields:
             args = [field.block.data, field.members, m.reference_device, field.origin, w.u_stage, w.stage_time]
             args += [w.step.ramp, active, self.offset + field.offset, w.nonpotential_contribution]
-            at.launch(field.kernel, (m.worlds, field.count), args)
+            ctx.launch(field.kernel, (m.worlds, field.count), args)
 
     def hash(self, h: Any) -> None:
         for force in self.model.description.body_forces:

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..base.errors import ModelError
 from ..kernels.common.traits import Traits
-from ..kernels.step.ledger import HELD_VISCOUS, LEDGER, LOSS, NUMERICAL, STORED, WORK
+from ..kernels.step.energy_ledger import EXPLICIT_VISCOUS, LEDGER, LOSS, NUMERICAL, STORED, WORK
 from .term import Term
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ __all__ = [
     "stored_columns",
 ]
 
-KINDS = {STORED: "STORED", WORK: "WORK", LOSS: "LOSS", NUMERICAL: "NUMERICAL", HELD_VISCOUS: "HELD_VISCOUS"}
+KINDS = {STORED: "STORED", WORK: "WORK", LOSS: "LOSS", NUMERICAL: "NUMERICAL", EXPLICIT_VISCOUS: "EXPLICIT_VISCOUS"}
 RESERVED = ("work",)
 """Keys of energies() reserved for sums of columns."""
 
@@ -91,7 +91,7 @@ def check_tables(term: Term, model: Model) -> None:
             raise ModelError(f"{where}: expected an array of ints (items, slots of an item), got {found}")
         if conn.size and not (conn.min() >= 0 and conn.max() < model.slots):
             raise ModelError(f"{where}: slots {conn.min()} to {conn.max()} are not within 0 to {model.slots - 1}")
-    for name in ("rows", "report_columns", "booked_rows"):
+    for name in ("rows", "report_columns", "increment_rows"):
         value = getattr(term, name)
         if not isinstance(value, (int, np.integer)) or value < 0:
             raise ModelError(f"term {term.name!r}: {name} = {value!r} must be a whole number, 0 or more")
@@ -120,19 +120,21 @@ def stored_columns(term: Term) -> list[str]:
 def check_columns(term: Term, *, own: bool) -> None:
     """Raise ModelError unless a term's ledger columns are valid; `own`: a term of warpfea."""
     kind = type(term)
-    if term.columns and kind.book is Term.book:
-        raise ModelError(f"term {term.name!r} has columns, but does not override book")
+    if term.columns and kind.energy_increments is Term.energy_increments:
+        raise ModelError(f"term {term.name!r} has columns, but does not override energy_increments")
     for column in term.columns:
         where = f"term {term.name!r}, column {column.name!r}"
         if column.kind not in KINDS:
             raise ModelError(f"{where}: kind {column.kind!r} is none of {', '.join(KINDS.values())}")
         if column.kind in (STORED, WORK, LOSS) and not column.name:
             raise ModelError(f"{where}: {KINDS[column.kind]} needs a name, the column of energies()")
-        if column.kind == STORED and kind.measure is Term.measure:
-            raise ModelError(f"{where}: override measure, its stored energy: the ledger restarts from it after a reset")
+        if column.kind == STORED and kind.stored_energy is Term.stored_energy:
+            raise ModelError(
+                f"{where}: override stored_energy, its stored energy: the ledger restarts from it after a reset"
+            )
         if own:
             continue
-        if column.kind == HELD_VISCOUS:
+        if column.kind == EXPLICIT_VISCOUS:
             raise ModelError(f"{where}: HELD_VISCOUS is for damping among the dead loads")
         if column.name in (*LEDGER, *RESERVED):
             raise ModelError(f"{where}: the ledger has a column of its own by this name")
@@ -143,23 +145,25 @@ def check_columns(term: Term, *, own: bool) -> None:
 
 
 def check_measured(term: Term, values: Any, worlds: int) -> None:
-    """Raise ModelError unless `measure` returned all columns of stored energy."""
+    """Raise ModelError unless `stored_energy` returned all columns of stored energy."""
     if not isinstance(values, dict) or set(values) != set(stored_columns(term)):
         values = values if isinstance(values, dict) else [repr(values)]
         raise ModelError(
-            f"term {term.name!r}: measure gave {sorted(values)}; its columns of stored energy are "
+            f"term {term.name!r}: stored_energy gave {sorted(values)}; its columns of stored energy are "
             f"{stored_columns(term)}"
         )
     for name, amounts in values.items():
         if np.shape(amounts) != (worlds,):
-            raise ModelError(f"term {term.name!r}: measure gave {np.shape(amounts)} for {name!r}; expected ({worlds},)")
+            raise ModelError(
+                f"term {term.name!r}: stored_energy gave {np.shape(amounts)} for {name!r}; expected ({worlds},)"
+            )
 
 
 def check_rows(term: Term, rows: Any, worlds: int, longest: int) -> None:
-    """Raise ModelError unless `book` returned rows (columns, worlds, items) in float64."""
+    """Raise ModelError unless `energy_increments` returned rows (columns, worlds, items) in float64."""
     import warp as wp
 
-    where = f"term {term.name!r}: book returned"
+    where = f"term {term.name!r}: energy_increments returned"
     if not isinstance(rows, wp.array):
         raise ModelError(f"{where} {type(rows).__name__}; expected a warp array or None")
     count = len(term.columns)
@@ -170,5 +174,5 @@ def check_rows(term: Term, rows: Any, worlds: int, longest: int) -> None:
         )
     if rows.shape[2] > longest:
         raise ModelError(
-            f"{where} {rows.shape[2]} items a row; at most {longest} can be summed unless build sets booked_rows"
+            f"{where} {rows.shape[2]} items a row; at most {longest} can be summed unless build sets increment_rows"
         )

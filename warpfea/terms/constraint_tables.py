@@ -13,16 +13,16 @@ import warp as wp
 from ..base.errors import ModelError
 from ..kernels.terms.constraint_blocks import coupling_struct
 from ..kernels.terms.constraints import (
+    ANGLE,
     DISTANCE,
     DOT,
-    TURN,
     constraint_kernels,
     constraint_struct,
     joint_struct,
 )
-from ..laws import TimeLaw
 from ..model.joints import Joint, Vector
-from .time_laws import TimeLaws
+from ..time_laws import TimeLaw
+from .time_law_table import TimeLawTable
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -63,7 +63,7 @@ class ConstraintTables:
             for joint in self.joints
         ]
 
-    def hold(self, free: np.ndarray) -> None:
+    def mark_constrained(self, free: np.ndarray) -> None:
         """Clear the directions (components, 3) in which a component is tied to the ground."""
         position = self.model.slot_kind == 0
         for k, row in enumerate(self.rows):
@@ -78,7 +78,7 @@ class ConstraintTables:
 
     # device tables
 
-    def build(self, component: np.ndarray, laws: TimeLaws) -> None:
+    def build(self, component: np.ndarray, laws: TimeLawTable) -> None:
         """Upload the tables; `component` of each slot."""
         self._order(component)
         self._fill_terms(laws)
@@ -113,7 +113,7 @@ class ConstraintTables:
         self.cluster_host = np.array([seen.setdefault(int(c), len(seen)) for c in clusters])
         self.component_host = np.array(components)
 
-    def _fill_terms(self, laws: TimeLaws) -> None:
+    def _fill_terms(self, laws: TimeLawTable) -> None:
         m, rows = self.model, self.rows
         entries = [vector.entries() for row in rows for vector in row.terms]
         start = np.concatenate([[0], np.cumsum([len(e[0]) for e in entries])])
@@ -345,7 +345,7 @@ class ConstraintTables:
 
     def turn_of(self, joint: Joint) -> int:
         """Row of the drive that counts the full turns of a joint's angle, or -1."""
-        return next((int(k) for k in self.rows_of[joint.index] if self.rows[k].kind == TURN), -1)
+        return next((int(k) for k in self.rows_of[joint.index] if self.rows[k].kind == ANGLE), -1)
 
     def targets(self, state: Any) -> np.ndarray:
         """Right-hand sides (worlds, rows) of the state, or those at its time if it never stepped."""

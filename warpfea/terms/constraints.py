@@ -17,14 +17,14 @@ import warp as wp
 
 from ..base.launch import Launcher
 from ..kernels.common.traits import Traits
-from ..kernels.solvers.control import TERM_ROWS
 from ..kernels.solvers.deflation import deflation_kernels
+from ..kernels.solvers.newton_control import TERM_ROWS
 from ..kernels.solvers.reuse import reuse_kernels
 from ..kernels.terms.constraint_blocks import constraint_block_kernels
 from ..kernels.terms.constraints import JOINT_COLUMNS, constraint_kernels, multiplier_struct
 from .constraint_tables import ConstraintTables
-from .term import NUMERICAL, WORK, At, Column, Kept, Term, part
-from .time_laws import TimeLaws
+from .term import NUMERICAL, WORK, CachedInputs, Column, StepContext, Term, part
+from .time_law_table import TimeLawTable
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -51,7 +51,7 @@ class Constraints(Term):
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
-        self.traits = Traits(ties=True, gated=True)
+        self.traits = Traits(constraint_rows=True, has_constraints=True)
         self.tables = ConstraintTables(model, model.description.joints)
         self.kernels = self.tables.kernels
         self.rows = self.tables.count
@@ -66,14 +66,14 @@ class Constraints(Term):
     def features(cls, model: Model) -> dict[str, bool]:
         return {"constraints": bool(model.description.joints)}
 
-    def ties(self) -> list[np.ndarray]:
+    def tied_slots(self) -> list[np.ndarray]:
         return self.tables.slot_groups()
 
-    def build(self, laws: TimeLaws) -> None:
+    def build(self, laws: TimeLawTable) -> None:
         self.tables.build(self.model.component, laws)
 
-    def hold(self, free: np.ndarray) -> None:
-        self.tables.hold(free)
+    def mark_constrained(self, free: np.ndarray) -> None:
+        self.tables.mark_constrained(free)
 
     def restraints(self, state: State, component: int) -> sp.csr_matrix:
         return self.jacobian(state, 0)[np.flatnonzero(self.tables.component_host == component)]
@@ -86,18 +86,18 @@ class Constraints(Term):
 
     # simulation setup
 
-    def kernels_of(self, at: At) -> Any:
+    def kernels_of(self, ctx: StepContext) -> Any:
         """Kernels specialised for the integrator of a simulation."""
-        return constraint_kernels(self.model.dtype, at.midpoint)
+        return constraint_kernels(self.model.dtype, ctx.midpoint)
 
-    def allocate(self, work: Workspace, at: At) -> None:
+    def allocate(self, work: Workspace, ctx: StepContext) -> None:
         """Allocate multipliers and matrices, work.multipliers."""
         model, con = self.model, self.tables
         mul = multiplier_struct()()
         B, M = model.worlds, con.count
         shapes: dict[str, tuple[tuple[int, ...], Any]] = {
             "gradient": ((B, 3 * M), wp.vec3d),
-            "ahead": ((B, 3 * M), wp.vec3d),
+            "end_gradient": ((B, 3 * M), wp.vec3d),
             "product": ((B, 3 * M), wp.vec3d),
             "violation": ((B, model.component_count), wp.float64),
             "block": ((B, max(con.block_count, 1)), wp.mat33d),
@@ -105,73 +105,73 @@ class Constraints(Term):
             "coupling": ((B, max(con.couple_count, 1)), wp.float64),
         }
         for name, var in multiplier_struct().vars.items():
-            if name == "ahead" and not at.midpoint:
-                mul.ahead = mul.gradient
+            if name == "end_gradient" and not ctx.midpoint:
+                mul.end_gradient = mul.gradient
             elif isinstance(var.type, wp.array) and name != "rows":
                 shape, dtype = shapes.get(name, ((B, M), wp.float64))
                 setattr(mul, name, work.array(f"Multipliers.{name}", shape, dtype))
         mul.rows = work.rows_of(self)
         work.multipliers = mul
 
-    def register(self, at: At) -> None:
-        at.state.register("constraint_force", wp.float64, (self.tables.count,))
-        at.state.register("constraint_target", wp.float64, (self.tables.count,), np.nan)
+    def register(self, ctx: StepContext) -> None:
+        ctx.state.register("constraint_force", wp.float64, (self.tables.count,))
+        ctx.state.register("constraint_target", wp.float64, (self.tables.count,), np.nan)
 
-    def configure(self, at: At) -> None:
+    def configure(self, ctx: StepContext) -> None:
         """Read the solver's options: classical updates or not, kappa, and whether constraint directions are
         deflated."""
-        at.work.newton.violation = at.work.multipliers.violation
-        mul, options = at.work.multipliers, at.options
-        mul.classical, mul.kappa = int(options.classical), options.kappa
+        ctx.work.newton.violation = ctx.work.multipliers.violation
+        mul, options = ctx.work.multipliers, ctx.options
+        mul.outer_updates, mul.kappa = int(options.classical), options.kappa
         deflate = bool(options.deflate)
         sizes = self.tables.cluster_sizes
         large = np.flatnonzero(sizes > THREAD_LIMIT)
         largest = int(sizes[large].max()) if len(large) and deflate else 0
         table = self.model.array("constraints", large, wp.int32) if largest else None
-        at.scratch[self.name] = Deflation(deflate, largest, table, len(large))
+        ctx.scratch[self.name] = Deflation(deflate, largest, table, len(large))
 
-    def modules(self, at: At) -> Iterable[wp.Module]:
-        return {self.kernels_of(at).module, deflation_kernels(self.model.dtype).module}
+    def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
+        return {self.kernels_of(ctx).module, deflation_kernels(self.model.dtype).module}
 
-    def start(self, at: At, active: wp.array) -> None:
+    def start(self, ctx: StepContext, active: wp.array) -> None:
         """Initialise right-hand sides missing in the state, and the violation at the start."""
-        state, mul = at.state, at.work.multipliers
-        self.begin(at, active)
-        self.prepare(at, active)
+        state, mul = ctx.state, ctx.work.multipliers
+        self.begin(ctx, active)
+        self.prepare(ctx, active)
         known = state.constraint_target.numpy()
         state.constraint_target.assign(np.where(np.isnan(known), mul.target.numpy(), known))
 
     # in a step
 
     @part("constraints")
-    def begin(self, at: At, active: wp.array) -> None:
+    def begin(self, ctx: StepContext, active: wp.array) -> None:
         """Warm start of an attempt from the multipliers and right-hand sides of the state; rho is not known yet."""
-        args = [at.state.constraint_force, at.state.constraint_target, active, at.work.multipliers]
-        at.launch(self.kernels_of(at).load_multipliers, self.dim, args)
+        args = [ctx.state.constraint_force, ctx.state.constraint_target, active, ctx.work.multipliers]
+        ctx.launch(self.kernels_of(ctx).load_multipliers, self.dim, args)
 
     @part("constraints")
-    def force(self, at: At, active: wp.array) -> None:
+    def force(self, ctx: StepContext, active: wp.array) -> None:
         """Evaluate c, J and the rows of the augmented potential at work.u."""
-        m, w, k = self.model, at.work, self.kernels_of(at)
-        at.launch(k.reset_violation, (m.worlds, m.component_count), [active, w.multipliers])
-        args = [self.tables.data, w.u, w.u_stage, w.law_value, w.newton.alpha, active, w.multipliers]
-        at.launch(k.evaluate, self.dim, args)
+        m, w, k = self.model, ctx.work, self.kernels_of(ctx)
+        ctx.launch(k.reset_violation, (m.worlds, m.component_count), [active, w.multipliers])
+        args = [self.tables.data, w.u, w.u_stage, w.time_law_values, w.newton.alpha, active, w.multipliers]
+        ctx.launch(k.evaluate, self.dim, args)
 
     prepare = force  # J, for rho
 
-    def scale(self, at: At, active: wp.array) -> None:
-        self.invert(at, active, penalty=True)
+    def scale(self, ctx: StepContext, active: wp.array) -> None:
+        self.invert(ctx, active, penalty=True)
 
-    def follow(self, at: At, active: wp.array) -> None:
-        self.invert(at, active)
+    def prepare_solve(self, ctx: StepContext, active: wp.array) -> None:
+        self.invert(ctx, active)
 
     @part("build")
-    def invert(self, at: At, active: wp.array, *, penalty: bool = False) -> None:
+    def invert(self, ctx: StepContext, active: wp.array, *, penalty: bool = False) -> None:
         """Assemble and invert the cluster matrices from the inverse diagonal blocks; `penalty`: set rho from them."""
-        deflation: Deflation = at.scratch[self.name]
+        deflation: Deflation = ctx.scratch[self.name]
         if not (deflation.on or penalty):
             return
-        m, w, con, k, launch = self.model, at.work, self.tables, deflation_kernels(self.model.dtype), at.launch
+        m, w, con, k, launch = self.model, ctx.work, self.tables, deflation_kernels(self.model.dtype), ctx.launch
         data, mul = con.data, w.multipliers
         launch(k.pair_blocks, (m.worlds, con.block_count), [data, w.inverse, active, mul])
         launch(k.assemble_matrix, self.dim, [data, active, mul])
@@ -187,67 +187,67 @@ class Constraints(Term):
             launch(k.eliminate, dim, [data, deflation.large, pivot, active, mul])
             launch(k.scale_row, dim[:2], [data, deflation.large, pivot, active, mul])
 
-    def product(self, at: At, p: wp.array, active: wp.array) -> None:
+    def product(self, ctx: StepContext, p: wp.array, active: wp.array) -> None:
         """Constraint part of H p, for the gather."""
-        w = at.work
+        w = ctx.work
         args = [self.tables.data, w.multipliers, p, w.step.dq_dv, active]
-        at.launch(self.kernels_of(at).product_terms, self.dim, args)
+        ctx.launch(self.kernels_of(ctx).product_terms, self.dim, args)
 
     @part("constraints")
-    def aim(self, at: At, active: wp.array) -> None:
+    def process_direction(self, ctx: StepContext, active: wp.array) -> None:
         """Multiplier part of the Newton step in work.direction."""
-        w = at.work
-        args = [self.tables.data, w.multipliers, w.direction, w.newton.quiet, w.step.dq_dv, active]
-        at.launch(self.kernels_of(at).predict_change, self.dim, args)
+        w = ctx.work
+        args = [self.tables.data, w.multipliers, w.direction, w.newton.component_converged, w.step.dq_dv, active]
+        ctx.launch(self.kernels_of(ctx).predict_change, self.dim, args)
 
-    def adopt(self, at: At, flags: wp.array) -> None:
+    def accept_trial(self, ctx: StepContext, flags: wp.array) -> None:
         """Accept the trial's multipliers with every Newton step; the classical method uses its outer loop."""
-        if not at.options.classical:
-            self.outer(at, flags)
+        if not ctx.options.classical:
+            self.update_multipliers(ctx, flags)
 
     @part("constraints")
-    def outer(self, at: At, flags: wp.array) -> None:
+    def update_multipliers(self, ctx: StepContext, flags: wp.array) -> None:
         """Accept the trial's multipliers."""
-        at.launch(self.kernels_of(at).adopt, self.dim, [flags, at.work.multipliers])
+        ctx.launch(self.kernels_of(ctx).accept_trial, self.dim, [flags, ctx.work.multipliers])
 
     @part("constraints")
-    def book(self, at: At, accepted: wp.array) -> wp.array:
+    def energy_increments(self, ctx: StepContext, accepted: wp.array) -> wp.array:
         """Work of drives and the constraint work of the chord at rest, J, over an accepted substep."""
-        w, state = at.work, at.state
+        w, state = ctx.work, ctx.state
         args = [self.tables.data, w.multipliers, w.u, state.displacement, state.constraint_target, accepted]
-        at.launch(self.kernels_of(at).work_terms, self.dim, args)
+        ctx.launch(self.kernels_of(ctx).work_terms, self.dim, args)
         return w.multipliers.rows
 
     @part("constraints")
-    def commit(self, at: At, accepted: wp.array) -> None:
+    def commit(self, ctx: StepContext, accepted: wp.array) -> None:
         """Store multipliers and right-hand sides of an accepted substep."""
-        args = [accepted, at.work.multipliers, at.state.constraint_force, at.state.constraint_target]
-        at.launch(self.kernels_of(at).commit_multipliers, self.dim, args)
+        args = [accepted, ctx.work.multipliers, ctx.state.constraint_force, ctx.state.constraint_target]
+        ctx.launch(self.kernels_of(ctx).store_multipliers, self.dim, args)
 
-    def report(self, at: At) -> None:
+    def report(self, ctx: StepContext) -> None:
         """Report the force and moment on the child and the violation of each joint."""
-        w, con, state = at.work, self.tables, at.state
+        w, con, state = ctx.work, self.tables, ctx.state
         args = [con.data, w.multipliers, con.joint_data, state.displacement, state.constraint_force]
         dim = (self.model.worlds, len(con.joints))
-        at.launch(self.kernels_of(at).joint_report, dim, [*args, self.report_offset, w.report])
+        ctx.launch(self.kernels_of(ctx).joint_report, dim, [*args, self.report_offset, w.report])
 
     # in a linear solve
 
-    def keep(self, at: At) -> list[tuple[str, wp.array]]:
-        mul = at.work.multipliers
+    def cached_inputs(self, ctx: StepContext) -> list[tuple[str, wp.array]]:
+        mul = ctx.work.multipliers
         return [("gradient", mul.gradient), ("stiffness", mul.stiffness)]
 
-    def carry(self, at: At, kept: Kept, reuse: Any, accepted: wp.array) -> bool:
+    def copy_cached(self, ctx: StepContext, kept: CachedInputs, reuse: Any, accepted: wp.array) -> bool:
         args = [reuse, accepted, *kept.live, *kept.state, *kept.place]
-        at.launch(reuse_kernels(self.model.dtype).carry_rows, self.dim, args)
+        ctx.launch(reuse_kernels(self.model.dtype).carry_rows, self.dim, args)
         return True
 
-    def reserve(self, at: At, matrix: Any, *, projected: bool) -> None:
+    def allocate_blocks(self, ctx: StepContext, matrix: Any, *, projected: bool) -> None:
         if "couplings" not in self.model.cache:
             self.model.cache["couplings"] = self.tables.couplings(matrix.pattern)
 
     def blocks(
-        self, at: At, matrix: Any, kept: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,
+        self, ctx: StepContext, matrix: Any, kept: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,
         *, projected: bool,
     ) -> None:  # fmt: skip
         """J^T rho J and, unless projected, sum lambda d2c/dq2."""
@@ -256,22 +256,24 @@ class Constraints(Term):
         args = [self.model.topology, matrix.pattern.data, pairs]
         kernel, more = k.add_penalties, list[Any](kept)
         if not projected:
-            kernel, more = k.add_tangent, [self.tables.data, at.work.multipliers, at.share]
-        at.launch(kernel, (self.model.worlds, count), [*args, *more, dq_dv, active, out])
+            kernel, more = k.add_tangent, [self.tables.data, ctx.work.multipliers, ctx.midpoint_factor]
+        ctx.launch(kernel, (self.model.worlds, count), [*args, *more, dq_dv, active, out])
 
     def block_modules(self) -> set[wp.Module]:
         return {constraint_block_kernels(self.model.dtype).module}
 
-    def preconditions(self, at: At) -> bool:
-        return at.scratch[self.name].on
+    def preconditions(self, ctx: StepContext) -> bool:
+        return ctx.scratch[self.name].on
 
     @part("preconditioner")
-    def precondition(self, at: At, r: wp.array, z: wp.array, active: wp.array, into: wp.array | None = None) -> None:
+    def precondition(
+        self, ctx: StepContext, r: wp.array, z: wp.array, active: wp.array, into: wp.array | None = None
+    ) -> None:
         """z -= D^-1 J^T (1/((dq/dv) rho) + J D^-1 J^T)^-1 J z on the constrained slots, z = D^-1 r; and r.z.
 
         With `into` the result is added to it instead.
         """
-        m, w, k, launch = self.model, at.work, deflation_kernels(self.model.dtype), at.launch
+        m, w, k, launch = self.model, ctx.work, deflation_kernels(self.model.dtype), ctx.launch
         data, mul = self.tables.data, w.multipliers
         launch(k.restrict, self.dim, [data, mul, z, active])
         sizes = self.tables.colour_sizes
@@ -291,7 +293,7 @@ class Constraints(Term):
     def evaluate(self, state: State, multipliers: np.ndarray | None = None) -> Any:
         """Multiplier struct with the rows evaluated at a state, for given multipliers (rows,) and no penalty."""
         m, con, B = self.model, self.tables, self.model.worlds
-        launch, laws = Launcher(m.device), m.terms.laws
+        launch, laws = Launcher(m.device), m.terms.time_laws
 
         def zeros(shape: tuple[int, ...], dtype: Any) -> wp.array:
             return wp.zeros(shape, dtype=dtype, device=m.device)
@@ -300,16 +302,27 @@ class Constraints(Term):
         value = zeros((B, max(laws.count, 1)), wp.vec3d)
         laws.evaluate(launch, state, state.time, wp.ones(B, dtype=wp.float64, device=m.device), every, value)
         mul = multiplier_struct()()
-        for name in ("value", "target", "last", "scale", "force", "change", "trial", "merit", "excess", "stiffness"):
+        for name in (
+            "value",
+            "target",
+            "last_target",
+            "scale",
+            "force",
+            "change",
+            "trial",
+            "frozen_force",
+            "penalty_force",
+            "stiffness",
+        ):
             setattr(mul, name, zeros((B, con.count), wp.float64))
         for name in ("gradient", "product"):
             setattr(mul, name, zeros((B, 3 * con.count), wp.vec3d))
-        mul.ahead = mul.gradient
+        mul.end_gradient = mul.gradient
         mul.rows = zeros((TERM_ROWS, B, con.count), wp.float64)
         mul.violation = zeros((B, m.component_count), wp.float64)
         if multipliers is not None:
             mul.force.assign(np.tile(multipliers, (B, 1)))
-        mul.last.fill_(np.nan)  # any number of turns is valid
+        mul.last_target.fill_(np.nan)  # any number of turns is valid
         args = [con.data, state.displacement, state.displacement, value, zeros((B,), wp.float64), every, mul]
         launch(self.kernels.evaluate, self.dim, args)
         return mul

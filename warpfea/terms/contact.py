@@ -10,21 +10,21 @@ import warp as wp
 
 from ..base.errors import PenetrationError
 from ..kernels.common.traits import Traits
-from ..kernels.solvers.control import FAIL_FLOOR, FAIL_WORK
-from ..kernels.terms.contact import MOST_TURN, RELAX_LANES, contact_kernels
-from ..kernels.terms.contact_books import BOOKED, LANES, book_kernels, contact_block_kernels
-from ..kernels.terms.contact_data import RECORD, attempt_struct, clock_struct, history_struct
+from ..kernels.solvers.newton_control import FAIL_FLOOR, FAIL_WORK
+from ..kernels.terms.contact import MAX_ROTATION, RELAX_LANES, contact_kernels
+from ..kernels.terms.contact_ledger import ENERGY_COLUMNS, RECORD_LANES, contact_block_kernels, contact_ledger_kernels
+from ..kernels.terms.contact_structs import RECORD, clock_struct, contact_scratch_struct, history_struct
 from ..model.state import State
 from ..model.triangle_mesh import TriMesh
-from .contact_exact import Exact
 from .contact_fields import CONTACT_FIELDS, contact_field, nodal_force, obstacle_patches
 from .contact_parameters import collider_parameters, contact_parameters
-from .contact_places import Places, at_points
 from .contact_sheets import refuse_across
 from .contact_starts import reference_place, store_overlaps, touching_depth
 from .contact_tables import ContactTables, block_entries
-from .term import LOSS, NUMERICAL, STORED, WORK, At, Column, Term, part
-from .time_laws import TimeLaws
+from .deepest_point import DeepestPoints, at_points
+from .double_displacements import DoubleDisplacements
+from .term import LOSS, NUMERICAL, STORED, WORK, Column, StepContext, Term, part
+from .time_law_table import TimeLawTable
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -53,11 +53,14 @@ class Contact(Term):
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
-        self.traits = Traits(walls=True)
+        self.traits = Traits(unilateral=True)
         self.tables = ContactTables(model)
         meshes = self.tables.meshes
-        self.kernels, self.books = contact_kernels(model.dtype, meshes), book_kernels(model.dtype, meshes)
-        self.places = Places(self.tables) if self.tables.lumped else None
+        self.kernels, self.ledger_kernels = (
+            contact_kernels(model.dtype, meshes),
+            contact_ledger_kernels(model.dtype, meshes),
+        )
+        self.deepest_points = DeepestPoints(self.tables) if self.tables.lumped else None
         self.report_columns = len(RECORD) * len(self.tables.contacts)
 
     @classmethod
@@ -69,11 +72,11 @@ class Contact(Term):
         contacts = model.description.contacts
         return {"contact": bool(contacts), "friction": any(c.mu_static > 0.0 for c in contacts)}
 
-    def build(self, laws: TimeLaws) -> None:
+    def build(self, laws: TimeLawTable) -> None:
         self.tables.build(laws, self.offset)
         self.connectivity = [group.conn for group in self.tables.groups]
-        self.exact = Exact(self.model, self.connectivity) if self.model.dtype == "float32" else None
-        self.rows = self.booked_rows = self.tables.rows
+        self.exact = DoubleDisplacements(self.model, self.connectivity) if self.model.dtype == "float32" else None
+        self.rows = self.increment_rows = self.tables.rows
 
     def hash(self, h: Any) -> None:
         self.tables.hash(h)
@@ -85,211 +88,211 @@ class Contact(Term):
         t, B = self.tables, worlds
         K, P, C, R = len(t.colliders), t.points, len(t.contacts), t.rows
         shapes: dict[str, tuple[int, ...]] = {
-            "through": (B,), "elapsed": (B,), "omega": (B,), "changes": (B,), "asked_size": (B,),
-            "asked_sums": (B, RELAX_LANES), "pick": (B, C), "picks": (B, C), "total": (B, C, len(RECORD)),
-            "touched": (B, R), "near": (B, R), "spot": (B, R), "best": (B, R), "moves": (B, C), "middle": (B, C),
-            "weight": (B, C, max(group.conn.shape[1] for group in t.groups)),
-            "rows": (len(RECORD), B, R),
+            "passed_through": (B,), "elapsed": (B,), "relaxation": (B,), "limit_updates": (B,), "aitken_norm2": (B,),
+            "aitken_sums": (B, RELAX_LANES), "contact_point": (B, C), "choices": (B, C), "total": (B, C, len(RECORD)),
+            "facet_activity": (B, R), "facet_point": (B, R), "facet_xi": (B, R), "facet_depth": (B, R),
+            "chosen_facet": (B, C), "point_reference": (B, C),
+            "shape_values": (B, C, max(group.conn.shape[1] for group in t.groups)), "rows": (len(RECORD), B, R),
         }  # fmt: skip
-        shapes |= dict.fromkeys(("place", "turn", "shift", "spin", "angle"), (B, K))
+        shapes |= dict.fromkeys(("position", "rotation", "translation", "rotation_change", "angle"), (B, K))
         if not t.lumped:
-            shapes |= dict.fromkeys(("level", "near", "spot", "best", "moves", "middle"), (1, 1)) | {
-                "weight": (1, 1, 1)
-            }
-        shapes |= {} if t.explicit else dict.fromkeys(("dead", "dead_spring"), (1, 1))
-        out = attempt_struct(self.model.dtype)()
-        for name, var in attempt_struct(self.model.dtype).vars.items():
+            shapes |= dict.fromkeys(
+                ("point_depth", "facet_point", "facet_xi", "facet_depth", "chosen_facet", "point_reference"), (1, 1)
+            ) | {"shape_values": (1, 1, 1)}
+        shapes |= {} if t.explicit else dict.fromkeys(("explicit_force", "explicit_spring"), (1, 1))
+        out = contact_scratch_struct(self.model.dtype)()
+        for name, var in contact_scratch_struct(self.model.dtype).vars.items():
             setattr(out, name, make(name, shapes.get(name, (B, P)), var.type.dtype))
         return out
 
     def history_of(self, make: Callable[[str, Any, tuple[int, ...]], wp.array]) -> Any:
         """History struct with arrays from make(name, dtype, shape per world)."""
         out = history_struct()()
-        shapes: dict[str, tuple[int, ...]] = {"born": (), "posed": ()}
-        shapes |= dict.fromkeys(("place", "turn", "angle", "grown"), (len(self.tables.colliders),))
+        shapes: dict[str, tuple[int, ...]] = {"overlap_time": (), "pose_time": ()}
+        shapes |= dict.fromkeys(("position", "rotation", "angle", "previous_margin"), (len(self.tables.colliders),))
         for name, var in history_struct().vars.items():
-            if name == "lead" and not self.tables.moving:
+            if name == "previous_depth" and not self.tables.moving:
                 continue
             shape = shapes.get(name, (self.tables.points,))
             setattr(out, name, make(f"contact_{name}", var.type.dtype, shape))
         return out
 
-    def allocate(self, work: Workspace, at: At) -> None:
+    def allocate(self, work: Workspace, ctx: StepContext) -> None:
         t, B = self.tables, self.model.worlds
         C, R = len(t.contacts), t.rows
         attempt = self.attempt_of(B, lambda name, shape, dtype: work.array(f"contact {name}", shape, dtype))
-        attempt.omega.fill_(1.0)
+        attempt.relaxation.fill_(1.0)
         clock = clock_struct()()
         for name in ("time", "new_time", "h", "part"):
             setattr(clock, name, getattr(work.step, name))
-        clock.time, clock.still = at.state.time, int(not at.inertia)
+        clock.time, clock.still = ctx.state.time, int(not ctx.inertia)
         scratch = {
             "attempt": attempt,
             "clock": clock,
             # Newton's method only; unused by Jacobi's iteration
-            "touching": work.newton.touching,
-            "booked": work.array("contact booked", (BOOKED, B, R), wp.float64),
-            "parts": work.array("contact parts", (B, C, len(RECORD), LANES), wp.float64),
+            "touching": work.newton.contact_active,
+            "energies": work.array("contact booked", (ENERGY_COLUMNS, B, R), wp.float64),
+            "parts": work.array("contact parts", (B, C, len(RECORD), RECORD_LANES), wp.float64),
             "row_start": self.model.array("contact", t.row_start, wp.int32),
             "u": self.exact.allocate(work, self.name) if self.exact else work.u,
         }
-        at.scratch[self.name] = scratch | at.scratch.get(self.name, {})
+        ctx.scratch[self.name] = scratch | ctx.scratch.get(self.name, {})
 
-    def register(self, at: At) -> None:
-        at.scratch[self.name] = {"history": self.history_of(at.state.register)}
+    def register(self, ctx: StepContext) -> None:
+        ctx.scratch[self.name] = {"history": self.history_of(ctx.state.register)}
 
-    def modules(self, at: At) -> Iterable[wp.Module]:
-        others = (part.kernels.module for part in (self.places, self.exact) if part)
+    def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
+        others = (part.kernels.module for part in (self.deepest_points, self.exact) if part)
         return [self.kernels.module, *others]
 
-    def start(self, at: At, active: wp.array) -> None:
+    def start(self, ctx: StepContext, active: wp.array) -> None:
         """Collider poses at the state's time, and initial overlaps.
 
         Raises:
             ModelError: a new contact point overlaps an obstacle, and `overlap` is "refuse".
         """
-        s, state = at.scratch[self.name], at.state
+        s, state = ctx.scratch[self.name], ctx.state
         history = s["history"]
         time = state.time.numpy()
         # with a history at this time colliders continue from it: a control may have changed since
-        known = history.turn.numpy().any(axis=(1, 2, 3)) & (history.posed.numpy() == time)
+        known = history.rotation.numpy().any(axis=(1, 2, 3)) & (history.pose_time.numpy() == time)
         fresh = (active.numpy() != 0) & ~known
-        self._poses(at, active)
-        for name in ("place", "turn", "angle", "grown"):
-            source = self.tables.data.grow if name == "grown" else getattr(s["attempt"], name)
+        self._poses(ctx, active)
+        for name in ("position", "rotation", "angle", "previous_margin"):
+            source = self.tables.data.margin if name == "previous_margin" else getattr(s["attempt"], name)
             values = getattr(history, name).numpy()
             values[fresh] = source.numpy()[fresh]
             getattr(history, name).assign(values)
-        overlap, born = history.overlap.numpy(), history.born.numpy()
+        overlap, born = history.overlap.numpy(), history.overlap_time.numpy()
         new = fresh & ~(history.speed.numpy() > 0.0).any(axis=1)
         overlap[new] = 0.0
         born[new] = time[new]
-        posed = history.posed.numpy()
+        posed = history.pose_time.numpy()
         posed[fresh] = time[fresh]
-        history.posed.assign(posed)
+        history.pose_time.assign(posed)
         history.overlap.assign(overlap)
-        history.born.assign(born)
+        history.overlap_time.assign(born)
         gap, _ = self.at_points(state, history, places=False)
         touching = touching_depth(self.model.size, state.displacement.numpy())
         if self.tables.sheets and new.any():
-            refuse_across(self, s["attempt"], state.displacement, touching, new, at.launch)
+            refuse_across(self, s["attempt"], state.displacement, touching, new, ctx.launch)
         store_overlaps(self.tables, np.where(new[:, None], -gap, 0.0), touching, overlap)
         history.overlap.assign(overlap)
 
-    def rewind(self, state: State) -> None:
+    def shift_time(self, state: State) -> None:
         """Shift the start times of stored overlaps."""
-        if "contact_born" in state.specs:
-            state.contact_born.assign(state.contact_born.numpy() - state.time.numpy())  # type: ignore[attr-defined]
+        if "contact_overlap_time" in state.specs:
+            state.contact_overlap_time.assign(state.contact_overlap_time.numpy() - state.time.numpy())  # type: ignore[attr-defined]
 
-    def _poses(self, at: At, active: wp.array) -> None:
-        s = at.scratch[self.name]
-        args = [self.tables.data, s["history"], at.work.law_value, active, s["attempt"]]
-        at.launch(self.kernels.poses, (self.model.worlds, len(self.tables.colliders)), args)
+    def _poses(self, ctx: StepContext, active: wp.array) -> None:
+        s = ctx.scratch[self.name]
+        args = [self.tables.data, s["history"], ctx.work.time_law_values, active, s["attempt"]]
+        ctx.launch(self.kernels.poses, (self.model.worlds, len(self.tables.colliders)), args)
 
     # in a step
 
     @part("contact")
-    def begin(self, at: At, active: wp.array) -> None:
+    def begin(self, ctx: StepContext, active: wp.array) -> None:
         """Poses of the colliders at the end of the attempt, points at its start."""
-        s, m = at.scratch[self.name], self.model
+        s, m = ctx.scratch[self.name], self.model
         s["finished"] = False
-        self._poses(at, active)
+        self._poses(ctx, active)
         for group in self.tables.groups:
             dim = (m.worlds, group.count, group.data.points)
             args = [self.tables.data, group.data, s["history"], s["clock"]]
-            more = [at.state.displacement, at.state.velocity, active, s["attempt"]]
-            at.launch(self.kernels.begin_points, dim, [*args, *more])
+            more = [ctx.state.displacement, ctx.state.velocity, active, s["attempt"]]
+            ctx.launch(self.kernels.begin_points, dim, [*args, *more])
             if self.tables.explicit:
-                at.launch(self.kernels.explicit_forces, dim, [*args, *more[1:]])
+                ctx.launch(self.kernels.explicit_forces, dim, [*args, *more[1:]])
 
-    def prepare(self, at: At, active: wp.array) -> None:
+    def prepare(self, ctx: StepContext, active: wp.array) -> None:
         """Compute the first friction limits and the stiffness of the blocks."""
-        self._forces(at, active, fresh=1)
+        self._forces(ctx, active, fresh=1)
 
-    def force(self, at: At, active: wp.array) -> None:
-        self._forces(at, active, fresh=0)
+    def force(self, ctx: StepContext, active: wp.array) -> None:
+        self._forces(ctx, active, fresh=0)
 
     @part("contact")
-    def _forces(self, at: At, active: wp.array, *, fresh: int) -> None:
-        s, m, w, k = at.scratch[self.name], self.model, at.work, self.kernels
-        if self.exact and at.moved:
-            self.exact.follow(at, s["u"], active)
+    def _forces(self, ctx: StepContext, active: wp.array, *, fresh: int) -> None:
+        s, m, w, k = ctx.scratch[self.name], self.model, ctx.work, self.kernels
+        if self.exact and ctx.positions_changed:
+            self.exact.update(ctx, s["u"], active)
         if fresh:
-            self._pick(at, active, fresh=1)
+            self._pick(ctx, active, fresh=1)
         rows = w.rows_of(self)
         for group in self.tables.groups:
             args = [self.tables.data, group.data, s["history"], s["clock"], s["u"], active, fresh]
-            at.launch(k.forces, (m.worlds, group.count, group.data.points), [*args, s["attempt"]])
-            dim, lanes = group.sides(at.launch, m.worlds)
+            ctx.launch(k.forces, (m.worlds, group.count, group.data.points), [*args, s["attempt"]])
+            dim, lanes = group.sides(ctx.launch, m.worlds)
             args = [group.data, active, lanes, s["attempt"], w.pool_force, rows, s["touching"]]
-            at.launch(k.gather_points, dim, args)
+            ctx.launch(k.gather_points, dim, args)
 
-    def _pick(self, at: At, active: wp.array, *, fresh: int) -> None:
+    def _pick(self, ctx: StepContext, active: wp.array, *, fresh: int) -> None:
         """Select the point of each single-point contact at work.u."""
-        if not self.places:
+        if not self.deepest_points:
             return
-        s, w = at.scratch[self.name], at.work
-        state = (at.state.displacement, at.state.velocity)
-        place = self.places.choose
-        place(at.launch, s, w.step.new_time, s["u"], state, active, w.newton.new_walls, fresh=fresh)
+        s, w = ctx.scratch[self.name], ctx.work
+        state = (ctx.state.displacement, ctx.state.velocity)
+        place = self.deepest_points.choose
+        place(ctx.launch, s, w.step.new_time, s["u"], state, active, w.newton.unilateral_changed, fresh=fresh)
 
     @part("contact")
-    def refresh(self, at: At, flags: wp.array) -> None:
-        k, m, attempt = self.kernels, self.model, at.scratch[self.name]["attempt"]
-        at.launch(k.partial_asked, (m.worlds, RELAX_LANES), [flags, attempt])
-        at.launch(k.relax, m.worlds, [flags, at.work.newton.tol, attempt, at.work.newton.unsettled])
-        at.launch(k.refresh, (m.worlds, self.tables.points), [flags, attempt])
-        self._pick(at, flags, fresh=0)
+    def update_frozen(self, ctx: StepContext, flags: wp.array) -> None:
+        k, m, attempt = self.kernels, self.model, ctx.scratch[self.name]["attempt"]
+        ctx.launch(k.aitken_partial_sums, (m.worlds, RELAX_LANES), [flags, attempt])
+        ctx.launch(k.relax, m.worlds, [flags, ctx.work.newton.tol, attempt, ctx.work.newton.partly_updated])
+        ctx.launch(k.update_frozen, (m.worlds, self.tables.points), [flags, attempt])
+        self._pick(ctx, flags, fresh=0)
 
     @part("contact")
-    def product(self, at: At, p: wp.array, active: wp.array) -> None:
-        m, k, attempt = self.model, self.kernels, at.scratch[self.name]["attempt"]
+    def product(self, ctx: StepContext, p: wp.array, active: wp.array) -> None:
+        m, k, attempt = self.model, self.kernels, ctx.scratch[self.name]["attempt"]
         for group in self.tables.groups:
             dim = (m.worlds, group.count, group.data.points)
-            at.launch(k.product_points, dim, [group.data, active, p, attempt])
-            sides, lanes = group.sides(at.launch, m.worlds)
-            args = [group.data, active, lanes, attempt, at.work.pool_product]
-            at.launch(k.product_facets, sides, args)
+            ctx.launch(k.product_points, dim, [group.data, active, p, attempt])
+            sides, lanes = group.sides(ctx.launch, m.worlds)
+            args = [group.data, active, lanes, attempt, ctx.work.pool_product]
+            ctx.launch(k.product_facets, sides, args)
 
     @part("contact")
-    def diagonal(self, at: At, active: wp.array) -> None:
-        m, w = self.model, at.work
+    def diagonal(self, ctx: StepContext, active: wp.array) -> None:
+        m, w = self.model, ctx.work
         for group in self.tables.groups:
-            args = [group.data, active, at.scratch[self.name]["attempt"], w.pool_block]
-            at.launch(self.kernels.diagonal, (m.worlds, group.count, group.conn.shape[1]), args)
+            args = [group.data, active, ctx.scratch[self.name]["attempt"], w.pool_block]
+            ctx.launch(self.kernels.diagonal, (m.worlds, group.count, group.conn.shape[1]), args)
 
-    def book(self, at: At, accepted: wp.array) -> wp.array:
-        self._finish(at, accepted)
-        at.scratch[self.name]["finished"] = True
-        return at.scratch[self.name]["booked"]
+    def energy_increments(self, ctx: StepContext, accepted: wp.array) -> wp.array:
+        self._finish(ctx, accepted)
+        ctx.scratch[self.name]["finished"] = True
+        return ctx.scratch[self.name]["energies"]
 
     @part("contact")
-    def _finish(self, at: At, accepted: wp.array) -> None:
+    def _finish(self, ctx: StepContext, accepted: wp.array) -> None:
         """Update history, ledger rows and records of an accepted substep."""
-        s, m, k = at.scratch[self.name], self.model, self.books
+        s, m, k = ctx.scratch[self.name], self.model, self.ledger_kernels
         C = len(self.tables.contacts)
         for group in self.tables.groups:
             args = [self.tables.data, group.data, s["history"], s["clock"], s["u"], accepted, s["attempt"]]
-            at.launch(k.finish, (m.worlds, group.count), [*args, s["booked"]])
+            ctx.launch(k.record_substep, (m.worlds, group.count), [*args, s["energies"]])
         args = [self.tables.data, s["row_start"], accepted, s["attempt"], s["parts"]]
-        at.launch(k.partial_records, (m.worlds, C, len(RECORD), LANES), args)
-        at.launch(k.total_records, (m.worlds, C, len(RECORD)), [s["clock"], accepted, s["parts"], s["attempt"]])
+        ctx.launch(k.partial_records, (m.worlds, C, len(RECORD), RECORD_LANES), args)
+        ctx.launch(k.total_records, (m.worlds, C, len(RECORD)), [s["clock"], accepted, s["parts"], s["attempt"]])
 
     @part("contact")
-    def commit(self, at: At, accepted: wp.array) -> None:
-        s, m, w = at.scratch[self.name], self.model, at.work
-        if not s["finished"]:  # no ledger, `book` not called
-            self._finish(at, accepted)
+    def commit(self, ctx: StepContext, accepted: wp.array) -> None:
+        s, m, w = ctx.scratch[self.name], self.model, ctx.work
+        if not s["finished"]:  # no ledger, `energy_increments` not called
+            self._finish(ctx, accepted)
         args = [self.tables.data, s["clock"], w.newton.potential, w.newton.term_sums, accepted, s["history"]]
-        at.launch(self.books.keep_poses, (m.worlds, len(self.tables.colliders)), [*args, s["attempt"]])
+        ctx.launch(self.ledger_kernels.store_poses, (m.worlds, len(self.tables.colliders)), [*args, s["attempt"]])
 
-    def report(self, at: At) -> None:
-        args = [at.scratch[self.name]["attempt"], self.report_offset, at.work.report]
-        at.launch(self.books.write_records, (self.model.worlds, len(self.tables.contacts)), args)
+    def report(self, ctx: StepContext) -> None:
+        args = [ctx.scratch[self.name]["attempt"], self.report_offset, ctx.work.report]
+        ctx.launch(self.ledger_kernels.write_records, (self.model.worlds, len(self.tables.contacts)), args)
 
-    def measure(self, at: At) -> dict[str, np.ndarray]:
+    def stored_energy(self, ctx: StepContext) -> dict[str, np.ndarray]:
         """Stored energy according to the history, by points; a single-point contact stores it at its first point."""
-        stored = at.scratch[self.name]["history"].stored.numpy()
+        stored = ctx.scratch[self.name]["history"].stored.numpy()
         return {"contact": stored @ self.weights}
 
     @property
@@ -303,32 +306,32 @@ class Contact(Term):
 
     # in a linear solve
 
-    def keep(self, at: At) -> list[tuple[str, wp.array]]:
-        attempt = at.scratch[self.name]["attempt"]
-        return [("stiffness", attempt.stiffness)] + ([("weight", attempt.weight)] if self.tables.moving else [])
+    def cached_inputs(self, ctx: StepContext) -> list[tuple[str, wp.array]]:
+        attempt = ctx.scratch[self.name]["attempt"]
+        return [("stiffness", attempt.stiffness)] + ([("weight", attempt.shape_values)] if self.tables.moving else [])
 
-    def reserve(self, at: At, matrix: Any, *, projected: bool) -> None:
+    def allocate_blocks(self, ctx: StepContext, matrix: Any, *, projected: bool) -> None:
         if "contact blocks" not in self.model.cache:
             conns = [group.conn for group in self.tables.groups]
             self.model.cache["contact blocks"] = [block_entries(self.model, conn, matrix.pattern) for conn in conns]
 
     def blocks(
-        self, at: At, matrix: Any, kept: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,
+        self, ctx: StepContext, matrix: Any, kept: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,
         *, projected: bool,
     ) -> None:  # fmt: skip
         """Positive semi-definite stiffness of the points."""
         m, kernel = self.model, contact_block_kernels(self.model.dtype).add_contact
         for group, (entry, start, source, count) in zip(self.tables.groups, m.cache["contact blocks"]):
             args = [m.topology, matrix.pattern.data, group.data, entry, start, source, kept[0]]
-            weight = kept[1] if self.tables.moving else at.scratch[self.name]["attempt"].weight
-            at.launch(kernel, (m.worlds, count), [*args, weight, dq_dv, active, out])
+            weight = kept[1] if self.tables.moving else ctx.scratch[self.name]["attempt"].weight
+            ctx.launch(kernel, (m.worlds, count), [*args, weight, dq_dv, active, out])
 
     def block_modules(self) -> set[wp.Module]:
         return {contact_block_kernels(self.model.dtype).module}
 
-    def explain(self, at: At, world: int) -> tuple[type[PenetrationError], str] | None:
-        found = int(at.scratch[self.name]["attempt"].through.numpy()[world])
-        if found == 0 or int(at.work.newton.failed.numpy()[world]) in (FAIL_FLOOR, FAIL_WORK):
+    def failure_reason(self, ctx: StepContext, world: int) -> tuple[type[PenetrationError], str] | None:
+        found = int(ctx.scratch[self.name]["attempt"].passed_through.numpy()[world])
+        if found == 0 or int(ctx.work.newton.failed.numpy()[world]) in (FAIL_FLOOR, FAIL_WORK):
             return None
         number = abs(found) - 1
         t = self.tables
@@ -336,8 +339,8 @@ class Contact(Term):
         contact = t.contacts[k]
         if found < 0:
             return PenetrationError, (
-                f"contact {contact.name!r}: collider {contact.collider.name!r} turns by more than {MOST_TURN:g} rad in "
-                "the step, in which it is touched; take a smaller dt"
+                f"contact {contact.name!r}: collider {contact.collider.name!r} turns by more than {MAX_ROTATION:g} rad "
+                "in the step, in which it is touched; take a smaller dt"
             )
         where = reference_place(t, k, number - int(t.first[k]))
         return PenetrationError, (
@@ -346,8 +349,8 @@ class Contact(Term):
             "stiffness= of the contact or a thicker shape, or a smaller dt where it moves that far in a step"
         )
 
-    def remark(self, at: At, world: int) -> str:
-        touched = at.scratch[self.name]["attempt"].touched.numpy()[world] > 0
+    def failure_note(self, ctx: StepContext, world: int) -> str:
+        touched = ctx.scratch[self.name]["attempt"].facet_activity.numpy()[world] > 0
         t = self.tables
         pairs = [
             f"{contact.name!r} with collider {contact.collider.name!r}"
@@ -360,13 +363,13 @@ class Contact(Term):
     def parameter_arrays(self) -> dict[str, wp.array]:
         return self.tables.set_arrays
 
-    def take_materials(self, mask: np.ndarray) -> None:
-        self.tables.take_materials(mask)
+    def update_materials(self, mask: np.ndarray) -> None:
+        self.tables.update_materials(mask)
 
     def parameters(self) -> dict[str, Callable[[Any, np.ndarray], None]]:
         return contact_parameters(self.tables) | collider_parameters(self.tables)
 
-    def facts(self) -> list[dict[str, Any]]:
+    def info(self) -> list[dict[str, Any]]:
         """Entries of `Model.info` per contact, in the order of addition: active points, and points excluded because
         their slots are clamped."""
         t, out = self.tables, []
@@ -388,9 +391,9 @@ class Contact(Term):
     def poses(self, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
         """Positions (worlds, colliders, 3), m, rotations (..., 3, 3) and surface offsets (worlds, colliders), m, of the
         colliders at a state; None without history."""
-        if "contact_place" not in state.specs:
+        if "contact_position" not in state.specs:
             return None
-        return state.contact_place.numpy(), state.contact_turn.numpy(), self.tables.data.grow.numpy()  # type: ignore[attr-defined]
+        return state.contact_position.numpy(), state.contact_rotation.numpy(), self.tables.data.margin.numpy()  # type: ignore[attr-defined]
 
     def samples(self, field: str, body: Any, state: State) -> np.ndarray:
         mine = any(contact.body is body for contact in self.tables.contacts)

@@ -77,7 +77,7 @@ def _set_offset(tables: ContactTables, collider: Collider, values: Any, mask: np
     _check(what, "offset", wanted, ~mask, np.isfinite(wanted))
     if isinstance(collider.shape, HalfSpace):
         wanted = wanted - collider.shape.offset
-    _write(tables.data.grow, tables.colliders.index(collider), wanted, mask)
+    _write(tables.data.margin, tables.colliders.index(collider), wanted, mask)
 
 
 def _check(

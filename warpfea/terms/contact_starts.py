@@ -67,7 +67,7 @@ def store_overlaps(
         overlap[deep, points] = kept.max(axis=1, keepdims=True) if contact.model == "sphere" else kept
 
 
-def refuse_sunk(tables: PairTables, u: np.ndarray, places: np.ndarray, seats: np.ndarray, new: np.ndarray) -> None:
+def refuse_sunk(tables: PairTables, u: np.ndarray, places: np.ndarray, facets: np.ndarray, new: np.ndarray) -> None:
     """Reject bodies that begin deeper in another body than any of its facets reaches.
 
     Args:
@@ -83,14 +83,14 @@ def refuse_sunk(tables: PairTables, u: np.ndarray, places: np.ndarray, seats: np
         if contact.overlap != "refuse":
             continue
         body, points = contact.master.body, slice(tables.first[k], tables.first[k + 1])
-        limit = tables.masters[tables.of[k]].limit
+        limit = tables.masters[tables.of[k]].depth_limit
         least = SUNK * float(limit.min())
         beyond = (0.0 if body.family.solid else float(limit.max())) - least  # margin of the nodal bounding box
         nodes = body.slot_kind == 0
         spans = body.reference[nodes] + body.origin + u[:, body.slots[nodes]]
         low, high = (end(axis=1)[:, None] for end in (spans.min, spans.max))
         x = places[:, points]
-        near = ((x > low - beyond) & (x < high + beyond)).all(axis=2) & (seats[:, points] < 0)
+        near = ((x > low - beyond) & (x < high + beyond)).all(axis=2) & (facets[:, points] < 0)
         near &= new[:, None] & (tables.host[k].area.ravel() > 0.0)
         seen = set()
         for world in np.flatnonzero(near.any(axis=1)):

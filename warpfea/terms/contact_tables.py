@@ -9,13 +9,13 @@ import numpy as np
 import warp as wp
 
 from ..base.errors import ModelError
-from ..kernels.terms.contact_data import contact_struct
+from ..kernels.terms.contact_structs import contact_struct
 from ..model.contact_points import ContactPoints, Modulus, body_mass_total, contact_points, effective_modulus
 from ..model.contacts import Collider, Contact
 from ..model.triangle_mesh import TriMesh
 from .collider_meshes import mesh_tables, sizes
 from .facet_tables import PER_WORLD, FacetTables, clamped_slots, normal_damping
-from .time_laws import TimeLaws
+from .time_law_table import TimeLawTable
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -49,7 +49,7 @@ class ContactTables(FacetTables[Contact]):
     @property
     def moving(self) -> bool:
         """True if a contact acts at its deepest position anywhere on its facets."""
-        return any(group.data.moving for group in self.groups)
+        return any(group.data.tracks_deepest for group in self.groups)
 
     @property
     def meshes(self) -> bool:
@@ -77,7 +77,7 @@ class ContactTables(FacetTables[Contact]):
         region = math.pi * contact.radius**2 if contact.radius else float(p.area.sum())
         return np.where(used, p.area / region, 0.0)
 
-    def build(self, laws: TimeLaws, pool: int) -> None:
+    def build(self, laws: TimeLawTable, pool: int) -> None:
         """Upload the tables; `pool`: first pool entry of the term."""
         self._build_facets(pool)
         self.data = self._contacts(laws)
@@ -85,9 +85,9 @@ class ContactTables(FacetTables[Contact]):
 
     @property
     def set_arrays(self) -> dict[str, wp.array]:
-        return super().set_arrays | {"grow": self.data.grow}
+        return super().set_arrays | {"margin": self.data.margin}
 
-    def _contacts(self, laws: TimeLaws) -> Any:
+    def _contacts(self, laws: TimeLawTable) -> Any:
         """Device struct of the contacts."""
         m, C, K = self.model, self.contacts, self.colliders
         out = contact_struct(self.meshes)()
@@ -97,7 +97,7 @@ class ContactTables(FacetTables[Contact]):
 
         self._put_laws(out, [self.numbers(c) for c in C])
         put("collider", [K.index(c.collider) for c in C], wp.int32)
-        put("grow", np.zeros((m.worlds, len(K))), wp.float64)
+        put("margin", np.zeros((m.worlds, len(K))), wp.float64)
         frames = [k.shape.frame() for k in K]
         put("kind", [k.shape.kind for k in K], wp.int32)
         put("size", [sizes(k.shape, self._touching(k)) for k in K], wp.vec3d)

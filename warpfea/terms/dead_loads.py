@@ -12,8 +12,8 @@ from ..base.errors import ModelError
 from ..base.worlds import per_world, refuse
 from ..kernels.terms.loads import load_kernels
 from ..model.assembly import require_density
-from .term import At, Term, part
-from .time_laws import TimeLaws
+from .term import StepContext, Term, part
+from .time_law_table import TimeLawTable
 
 if TYPE_CHECKING:
     from ..base.launch import Launcher
@@ -51,7 +51,7 @@ class DeadLoads(Term):
             "dead loads": bool(model.description.dead_loads),
         }
 
-    def build(self, laws: TimeLaws) -> None:
+    def build(self, laws: TimeLawTable) -> None:
         m = self.model
         slots, numbers, weights = [], [], []
         for load in m.description.dead_loads:
@@ -83,7 +83,7 @@ class DeadLoads(Term):
         """True with gravity or a time law of it."""
         return self.gravity_law is not None or bool(np.any(self.gravity_host))
 
-    def modules(self, at: At) -> Iterable[wp.Module]:
+    def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
         law = [self.kernels.take_gravity.module] * (self.gravity_law is not None)
         return law + [self.kernels.dead_load.module] * self.present
 
@@ -93,22 +93,22 @@ class DeadLoads(Term):
             launch(self.kernels.take_gravity, self.model.worlds, [value, self.number, active, self.gravity])
 
     @part("loads")
-    def begin(self, at: At, active: wp.array) -> None:
+    def begin(self, ctx: StepContext, active: wp.array) -> None:
         """Assemble force and magnitude of all dead loads per slot."""
         if not self.present:
             return
-        m, w = self.model, at.work
+        m, w = self.model, ctx.work
         args = [
             self.start_of_slot,
             self.law,
             self.weight,
-            w.law_stage,
+            w.time_law_stage_values,
             m.masses.lumped_values,
             self.constant,
             w.step.ramp,
             active,
         ]
-        at.launch(self.kernels.dead_load, (m.worlds, m.slots), [*args, w.dead, w.dead_magnitude])
+        ctx.launch(self.kernels.dead_load, (m.worlds, m.slots), [*args, w.dead, w.dead_magnitude])
 
     def set_gravity(self, gravity: Any, mask: np.ndarray) -> None:
         """Set gravity in the chosen worlds, (3,) or (worlds, 3), m/s^2.
@@ -135,7 +135,7 @@ class DeadLoads(Term):
     def parameter_arrays(self) -> dict[str, wp.array]:
         return {} if self.gravity_law is not None else {"gravity": self.gravity}
 
-    def parameters_taken(self) -> None:
+    def parameters_restored(self) -> None:
         if self.gravity_law is None:
             self.gravity_host = self.gravity.numpy().copy()
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
-from .term import At, Term
+from .term import StepContext, Term
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -34,22 +34,22 @@ class Elements(Term):
             "table elements": any(not b.key.affine for b in model.blocks),
         }
 
-    def kernels(self, at: At) -> list:
+    def kernels(self, ctx: StepContext) -> list:
         """Kernels of the blocks; statics has no rates and uses those without damping."""
         dtype, blocks = self.model.dtype, self.model.blocks
-        if at.midpoint:
-            lossy = at.dissipation > 0.0
+        if ctx.midpoint:
+            lossy = ctx.dissipation > 0.0
             return [b.kernels_for(dtype, b.key.damping, midpoint=True, dissipative=lossy) for b in blocks]
-        return [b.kernels if at.inertia else b.kernels_for(dtype, None) for b in blocks]
+        return [b.kernels if ctx.inertia else b.kernels_for(dtype, None) for b in blocks]
 
-    def modules(self, at: At) -> Iterable[wp.Module]:
-        return {kernels.module for kernels in self.kernels(at)}
+    def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
+        return {kernels.module for kernels in self.kernels(ctx)}
 
-    def force(self, at: At, active: wp.array) -> None:
-        if not at.moved:
+    def force(self, ctx: StepContext, active: wp.array) -> None:
+        if not ctx.positions_changed:
             return
-        m, w, launch = self.model, at.work, at.launch
-        for block, kernels in zip(m.blocks, self.kernels(at)):
+        m, w, launch = self.model, ctx.work, ctx.launch
+        for block, kernels in zip(m.blocks, self.kernels(ctx)):
             lanes = launch.lanes(block.points // 2) if block.points >= MANY_POINTS and not block.key.tying else 1
             args = [
                 w.data_of(block),
@@ -65,41 +65,52 @@ class Elements(Term):
             dim = (w.u.shape[0], launch.padded(block.count * lanes))
             launch(kernels.internal_force, dim, [*args, w.newton.min_J, w.newton.domain_J])
 
-    def look_for_inversion(self, at: At, active: wp.array) -> None:
+    def check_inversion(self, ctx: StepContext, active: wp.array) -> None:
         """Flag in newton.turned the worlds with a point where J > 0 in the state and J <= 0 at the iterate."""
-        w = at.work
-        for block, kernels in zip(self.model.blocks, self.kernels(at)):
+        w = ctx.work
+        for block, kernels in zip(self.model.blocks, self.kernels(ctx)):
             if not block.key.tying:
-                args = [w.data_of(block), at.state.displacement, w.u, active, w.newton.turned]
-                at.launch(kernels.turned_over, (w.u.shape[0], block.count), args)
+                args = [w.data_of(block), ctx.state.displacement, w.u, active, w.newton.inverted]
+                ctx.launch(kernels.inverted_elements, (w.u.shape[0], block.count), args)
 
-    def measure_turn(self, at: At, p: wp.array, active: wp.array) -> None:
+    def measure_direction_gradient(self, ctx: StepContext, p: wp.array, active: wp.array) -> None:
         """Maximum gradient of a direction, into newton.turn."""
-        for block, kernels in zip(self.model.blocks, self.kernels(at)):
+        for block, kernels in zip(self.model.blocks, self.kernels(ctx)):
             if not block.key.tying:
-                args = [at.work.data_of(block), p, active, at.work.newton.turn]
-                at.launch(kernels.largest_turn, (p.shape[0], block.count), args)
+                args = [ctx.work.data_of(block), p, active, ctx.work.newton.direction_gradient]
+                ctx.launch(kernels.largest_gradient, (p.shape[0], block.count), args)
 
-    def mixed_kernels(self) -> list[wp.Kernel]:
-        """Kernels of `mixed_tangent`."""
-        return [block.mixed_product(self.model.dtype) for block in self.model.blocks]
+    def predicted_stress_kernels(self) -> list[wp.Kernel]:
+        """Kernels of `predicted_stress_tangent`."""
+        return [block.predicted_stress_product(self.model.dtype) for block in self.model.blocks]
 
-    def mixed_tangent(self, at: At, p: wp.array, active: wp.array) -> None:
+    def predicted_stress_tangent(self, ctx: StepContext, p: wp.array, active: wp.array) -> None:
         """`tangent` with the linearly predicted stress in its geometric part, for worlds flagged `mixed`."""
-        m, w = self.model, at.work
-        for block, kernel in zip(m.blocks, self.mixed_kernels()):
-            args = [block.data, w.u, w.v, w.base, w.newton.mixed, w.history, w.step.dq_dv, active, p, w.contribution]
-            at.launch(kernel, (p.shape[0], block.count), args)
+        m, w = self.model, ctx.work
+        for block, kernel in zip(m.blocks, self.predicted_stress_kernels()):
+            args = [
+                block.data,
+                w.u,
+                w.v,
+                w.base,
+                w.newton.predicted_stress,
+                w.history,
+                w.step.dq_dv,
+                active,
+                p,
+                w.contribution,
+            ]
+            ctx.launch(kernel, (p.shape[0], block.count), args)
 
-    def tangent(self, at: At, p: wp.array, active: wp.array) -> None:
+    def tangent(self, ctx: StepContext, p: wp.array, active: wp.array) -> None:
         """K p of all elements into work.contribution, for matrix-free products."""
-        m, w = self.model, at.work
-        for block, kernels in zip(m.blocks, self.kernels(at)):
+        m, w = self.model, ctx.work
+        for block, kernels in zip(m.blocks, self.kernels(ctx)):
             args = [w.data_of(block), w.u_stage, w.v_stage, w.history, w.step.dq_dv, active, p, w.contribution]
-            at.launch(kernels.tangent_product, (p.shape[0], block.count), args)
+            ctx.launch(kernels.tangent_product, (p.shape[0], block.count), args)
 
-    def diagonal(self, at: At, active: wp.array) -> None:
-        m, w = self.model, at.work
-        for block, kernels in zip(m.blocks, self.kernels(at)):
+    def diagonal(self, ctx: StepContext, active: wp.array) -> None:
+        m, w = self.model, ctx.work
+        for block, kernels in zip(m.blocks, self.kernels(ctx)):
             args = [w.data_of(block), w.u_stage, w.step.dq_dv, active, w.block_contribution]
-            at.launch(kernels.diagonal_blocks, (m.worlds, block.count), args)
+            ctx.launch(kernels.diagonal_blocks, (m.worlds, block.count), args)

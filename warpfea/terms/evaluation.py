@@ -15,14 +15,14 @@ from ..base.launch import Launcher
 from ..base.memory import enough_memory
 from ..elements import Rule
 from ..kernels.common.types import precision
-from ..kernels.elements.materials import ANY_J
+from ..kernels.elements.materials import DEFINED_FOR_ANY_J
 from ..kernels.step.gather import gather_kernels
 from ..model import assembly
 from ..model.assembly import chunks, geometry, gradients
 from ..model.blocks import output_block
 from ..model.state import State
 from .elements import Elements
-from .term import At
+from .term import StepContext
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -52,7 +52,7 @@ class Evaluation:
     def _all(self) -> wp.array:
         return wp.ones(self.model.worlds, dtype=wp.int32, device=self.model.device)
 
-    def _at(self, u: wp.array) -> At:
+    def _at(self, u: wp.array) -> StepContext:
         """Step context of the element term: the elastic part at displacements u (worlds, slots)."""
         m, B = self.model, u.shape[0]
         least = [wp.full(B, 1e30, dtype=wp.float64, device=m.device) for _ in range(2)]
@@ -68,13 +68,13 @@ class Evaluation:
             energy_rows=self._zeros((2, B, m.element_count), wp.float64),
             newton=SimpleNamespace(min_J=least[0], domain_J=least[1]),
         )
-        return At(m, work, self.launch, state=none, u_before=none, inertia=False)
+        return StepContext(m, work, self.launch, state=none, u_before=none, inertia=False)
 
     def internal_force(self, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Elastic force [world, slot, 3], strain energy [world], smallest J [world]."""
-        at = self._at(state.displacement)
-        w = at.work
-        self.elements.force(at, self._all())
+        ctx = self._at(state.displacement)
+        w = ctx.work
+        self.elements.force(ctx, self._all())
         return self._gather(w.contribution), w.energy_rows.numpy()[0].sum(axis=1), w.newton.min_J.numpy()
 
     def viscous_force(self, state: State) -> tuple[np.ndarray, np.ndarray]:
@@ -115,7 +115,7 @@ class Evaluation:
         """df_int/dq as CSR, by one product per colour and axis; no element has two slots of one colour."""
         m = self.model
         row = state.displacement.numpy()[world : world + 1]
-        at = self._at(wp.array(row, dtype=m.types.vec3, device=m.device))
+        ctx = self._at(wp.array(row, dtype=m.types.vec3, device=m.device))
         direction = self._zeros((1, m.slots), m.types.vec3)
         flag = wp.ones(1, dtype=wp.int32, device=m.device)
         conns = [b.connectivity for b in m.blocks]
@@ -127,8 +127,8 @@ class Evaluation:
                 host[0, colour == c, axis] = 1.0
                 direction.assign(host)
                 with m.parameters.window(world, world + 1):
-                    self.elements.tangent(at, direction, flag)
-                out = at.work.contribution.numpy()[0]
+                    self.elements.tangent(ctx, direction, flag)
+                out = ctx.work.contribution.numpy()[0]
                 for block, conn in zip(m.blocks, conns):
                     part = out[block.contribution_offset :][: block.count * block.slots]
                     part = part.reshape(block.slots, block.count, 3)
@@ -200,7 +200,7 @@ def lowest_jacobian(model: Model, u: np.ndarray) -> tuple[int, str]:
     """Model index and description of the element with the smallest J at points and vertices; u (slots, 3), m."""
     best, index, text = np.inf, -1, "no element"
     for block in model.blocks:
-        if model.needs_positive_J and block.key.law in ANY_J:
+        if model.needs_positive_J and block.key.law in DEFINED_FOR_ANY_J:
             continue  # J <= 0 is admissible
         for part in block.parts:
             body = part.body

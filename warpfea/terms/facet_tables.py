@@ -11,8 +11,8 @@ import numpy as np
 import warp as wp
 from scipy.optimize import brentq
 
-from ..kernels.terms.contact_data import facet_struct
 from ..kernels.terms.contact_laws import DEFAULT, PAPER, SMOOTH
+from ..kernels.terms.contact_structs import facet_struct
 from ..model.contact_points import RULES, ContactPoints, lagrange_basis
 from ..model.contacts import Contact
 from ..model.pairs import PairContact
@@ -173,12 +173,16 @@ class FacetTables(Generic[AnyContact]):
         put("conn", conn.T, wp.int32)
         put("shape", np.moveaxis(np.concatenate([p.shape for p in parts]), 0, 2), m.types.T)
         put("X", np.swapaxes(np.concatenate([p.X for p in parts]), 0, 1), wp.vec3d)
-        put("share", np.concatenate([self.shares[k] for k in chosen]).T, wp.float64)
+        put("area_fraction", np.concatenate([self.shares[k] for k in chosen]).T, wp.float64)
         put("area", np.concatenate([p.area for p in parts]).T, wp.float64)
         put("contact", np.repeat(chosen, [len(p.conn) for p in parts]), wp.int32)
         data.pool, data.row, data.point = pool, self.rows, self.points
         _, data.points, acts = kind
-        data.count, data.moving, data.corners = len(conn), int(acts == MOVING), 3 if data.points in RULES[3] else 4
+        data.count, data.tracks_deepest, data.corners = (
+            len(conn),
+            int(acts == MOVING),
+            3 if data.points in RULES[3] else 4,
+        )
         if acts != PATCH:
             points = RULES[data.corners][data.points].points
             basis, power = lagrange_basis(points)
@@ -200,7 +204,7 @@ class FacetTables(Generic[AnyContact]):
         """Store the built values: checkpoints compare them to identify the model."""
         self.built = b"".join(array.numpy().tobytes() for array in self.set_arrays.values())
 
-    def take_materials(self, mask: np.ndarray) -> None:
+    def update_materials(self, mask: np.ndarray) -> None:
         """Recompute the derived constants after material parameters were set in the chosen worlds."""
         m, data = self.model, self.data
         touched = [
@@ -230,8 +234,8 @@ class FacetTables(Generic[AnyContact]):
             setattr(out, name, m.array("contact", np.asarray(values), dtype))
 
         put("law", [LAWS[c.law] for c in C], wp.int32)
-        put("lumped", [int(c.model == "sphere") for c in C], wp.int32)
-        put("dead", [int(c.treatment == "explicit") for c in C], wp.int32)
+        put("single_point", [int(c.model == "sphere") for c in C], wp.int32)
+        put("is_explicit", [int(c.treatment == "explicit") for c in C], wp.int32)
         put("first", self.first, wp.int32)
         for name in FROM_BODIES:
             put(name, [[row[name] for row in numbers]])

@@ -9,15 +9,15 @@ import warp as wp
 
 from ..kernels.common.state import state_kernels
 from ..kernels.terms.contact import contact_kernels
-from ..kernels.terms.contact_books import contact_block_kernels
+from ..kernels.terms.contact_ledger import contact_block_kernels
 from ..kernels.terms.pair_blocks import pair_block_kernels
 from ..kernels.terms.pairs import pair_kernels
 from ..model.state import words_of
 from .contact_tables import block_entries
 from .facet_tables import LISTED
-from .pair_motions import PairMotions
+from .pair_rigid_modes import PairRigidModes
 from .pair_tables import PairTables
-from .term import At, Term, part
+from .term import StepContext, Term, part
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -41,46 +41,52 @@ class PairSolves(Term):
         self.shared, self.kernels = contact_kernels(model.dtype, False), pair_kernels(model.dtype)
 
     @part("pairs")
-    def product(self, at: At, p: wp.array, active: wp.array) -> None:
-        s, m, w, t, k = at.scratch[self.name], self.model, at.work, self.tables, self.kernels
+    def product(self, ctx: StepContext, p: wp.array, active: wp.array) -> None:
+        s, m, w, t, k = ctx.scratch[self.name], self.model, ctx.work, self.tables, self.kernels
         attempt, touching, masters = s["attempt"], s["touching"], s["masters"]
         for group in t.groups:
             dim = (m.worlds, group.count, group.data.points)
-            at.launch(k.product_points, dim, [masters, group.data, active, p, attempt, touching])
+            ctx.launch(k.product_points, dim, [masters, group.data, active, p, attempt, touching])
         for group in t.groups:  # the last group includes the master facets
             entries = group.conn.size + (t.master_conn.size if group is t.groups[-1] else 0)
-            lanes = at.launch.lanes(LISTED)
+            lanes = ctx.launch.lanes(LISTED)
             args = [masters, group.data, active, lanes, entries - 1, attempt, touching, w.pool_product]
-            at.launch(k.product_sides, (m.worlds, at.launch.padded(lanes * entries)), args)
+            ctx.launch(k.product_sides, (m.worlds, ctx.launch.padded(lanes * entries)), args)
 
     @part("pairs")
-    def diagonal(self, at: At, active: wp.array) -> None:
-        s, m, w, t = at.scratch[self.name], self.model, at.work, self.tables
+    def diagonal(self, ctx: StepContext, active: wp.array) -> None:
+        s, m, w, t = ctx.scratch[self.name], self.model, ctx.work, self.tables
         for group in t.groups:
             args = [group.data, active, s["attempt"], w.pool_block]
-            at.launch(self.shared.diagonal, (m.worlds, group.count, group.conn.shape[1]), args)
+            ctx.launch(self.shared.diagonal, (m.worlds, group.count, group.conn.shape[1]), args)
         args = [s["masters"], active, s["attempt"], s["touching"], w.pool_block]
-        at.launch(self.kernels.diagonal_masters, (m.worlds, t.facets, t.master_conn.shape[1]), args)
+        ctx.launch(self.kernels.diagonal_masters, (m.worlds, t.facets, t.master_conn.shape[1]), args)
 
-    def keep(self, at: At) -> list[tuple[str, wp.array]]:
-        s = at.scratch[self.name]
+    def cached_inputs(self, ctx: StepContext) -> list[tuple[str, wp.array]]:
+        s = ctx.scratch[self.name]
         t = s["touching"]
-        arrays = {"points": t.points, "start": t.start, "entry": t.entry, "weight": t.weight, "listed": t.listed}
+        arrays = {
+            "list_size": t.list_size,
+            "list_start": t.list_start,
+            "list_point": t.list_point,
+            "shape_values": t.shape_values,
+            "listed_facet": t.listed_facet,
+        }
         return [("stiffness", s["attempt"].stiffness), *arrays.items()]
 
-    def restart(self, at: At, flags: wp.array) -> None:
+    def reset_scratch(self, ctx: StepContext, flags: wp.array) -> None:
         # lists are longer than their contents, and a preconditioner copies all of them
-        for _, array in self.keep(at):
+        for _, array in self.cached_inputs(ctx):
             words = words_of(array)
-            at.launch(state_kernels().clear_rows, words.shape, [flags, words])
+            ctx.launch(state_kernels().clear_rows, words.shape, [flags, words])
 
-    def reserve(self, at: At, matrix: Any, *, projected: bool) -> None:
+    def allocate_blocks(self, ctx: StepContext, matrix: Any, *, projected: bool) -> None:
         if "pair blocks" not in self.model.cache:
             conns = [group.conn for group in self.tables.groups] + [self.tables.master_conn]
             self.model.cache["pair blocks"] = [block_entries(self.model, conn, matrix.pattern) for conn in conns]
 
     def blocks(
-        self, at: At, matrix: Any, kept: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,
+        self, ctx: StepContext, matrix: Any, kept: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,
         *, projected: bool,
     ) -> None:  # fmt: skip
         """Stiffness of the points on their own facets and on master facets, without the coupling of both."""
@@ -90,24 +96,24 @@ class PairSolves(Term):
         add = contact_block_kernels(m.dtype).add_contact
         for group, (index, begin, source, count) in zip(t.groups, slaves):
             args = [m.topology, matrix.pattern.data, group.data, index, begin, source, stiffness, weight]
-            at.launch(add, (m.worlds, count), [*args, dq_dv, active, out])
+            ctx.launch(add, (m.worlds, count), [*args, dq_dv, active, out])
         index, begin, source, count = masters
         args = [m.topology, matrix.pattern.data, index, begin, source, stiffness, weight, points, start, entry]
         add = pair_block_kernels(m.dtype).add_masters
-        at.launch(add, (m.worlds, count), [*args, dq_dv, active, out])
+        ctx.launch(add, (m.worlds, count), [*args, dq_dv, active, out])
 
     def block_modules(self) -> set[wp.Module]:
         dtype = self.model.dtype
         return {contact_block_kernels(dtype).module, pair_block_kernels(dtype).module}
 
-    def couples(self) -> list[tuple[int, int]]:
+    def coupled_bodies(self) -> list[tuple[int, int]]:
         number = {id(body): k for k, body in enumerate(self.model.bodies)}
         return [(number[id(c.first.body)], number[id(c.second.body)]) for c in self.tables.contacts]
 
-    def reserve_motions(self, at: At, motions: Any) -> Iterable[wp.Module]:
-        s = at.scratch[self.name]
-        s["motions"] = PairMotions(at, self.tables, s["masters"], motions)
+    def allocate_mode_coupling(self, ctx: StepContext, motions: Any) -> Iterable[wp.Module]:
+        s = ctx.scratch[self.name]
+        s["motions"] = PairRigidModes(ctx, self.tables, s["masters"], motions)
         return {s["motions"].kernels.module}
 
-    def couple(self, at: At, kept: list[wp.array], dq_dv: wp.array, active: wp.array) -> None:
-        at.scratch[self.name]["motions"].add(kept, dq_dv, active)
+    def add_mode_coupling(self, ctx: StepContext, kept: list[wp.array], dq_dv: wp.array, active: wp.array) -> None:
+        ctx.scratch[self.name]["motions"].add(kept, dq_dv, active)

@@ -10,8 +10,8 @@ import numpy as np
 import warp as wp
 
 from ..base.errors import ModelError
-from ..kernels.terms.contact_data import contact_struct
-from ..kernels.terms.pair_data import master_struct
+from ..kernels.terms.contact_structs import contact_struct
+from ..kernels.terms.pair_structs import master_struct
 from ..model.contact_points import corner_points
 from ..model.handles import SurfaceSet
 from ..model.pairs import (
@@ -101,7 +101,7 @@ class PairTables(FacetTables[PairContact]):
         self.reaching = 1e-3 * max(float(mas.size.mean()) for mas in self.masters) + max(
             abs(contact.offset) for contact in self.contacts
         )
-        self.deepest = max(float(mas.limit.max()) for mas in self.masters)
+        self.deepest = max(float(mas.depth_limit.max()) for mas in self.masters)
         self.far = max(float(mas.size.max()) for mas in self.masters)
         self.master_conn = self._master_conn()
         self.size = self.model.size
@@ -156,7 +156,7 @@ class PairTables(FacetTables[PairContact]):
 
             def whole(name: str) -> np.ndarray:
                 values = [getattr(mas, name) for mas in all_of]
-                if values[0].ndim == 3 and name in ("shape", "rise"):
+                if values[0].ndim == 3 and name in ("shape", "director_shape"):
                     values = [np.pad(x, ((0, 0), (0, most - x.shape[1]), (0, width - x.shape[2]))) for x in values]
                 elif values[0].ndim == 3:
                     values = [np.pad(x, ((0, 0), (0, most - x.shape[1]), (0, 0))) for x in values]
@@ -173,27 +173,27 @@ class PairTables(FacetTables[PairContact]):
                 hull[k, :count, :count] = bernstein(*kind)
             counts = [len(mas.conn) for mas in all_of]
             m.cache["pair masters"] = {
-                "of": put(self.of, wp.int32),
+                "surface_of": put(self.of, wp.int32),
                 "sign": put([1.0 if c.slave is c.first else -1.0 for c in self.contacts], wp.float64),
                 "bodies": put(
                     [[self.bodies.index(s.body.index) for s in (c.slave, c.master)] for c in self.contacts], wp.vec2i
                 ),
                 "conn": put(self.master_conn.T, wp.int32),
                 "shape": put(np.moveaxis(whole("shape"), 0, 2), m.types.T),
-                "rise": put(np.moveaxis(whole("rise"), 0, 2), m.types.T),
+                "director_shape": put(np.moveaxis(whole("director_shape"), 0, 2), m.types.T),
                 "X": put(np.swapaxes(whole("X"), 0, 1), wp.vec3d),
                 "N": put(np.swapaxes(whole("N"), 0, 1), wp.vec3d),
                 "kind": put(np.repeat([kinds.index((q.corners, q.degree)) for q in all_of], counts), wp.int32),
-                "terms": put([len(exponents(*kind)) for kind in kinds], wp.int32),
+                "monomials": put([len(exponents(*kind)) for kind in kinds], wp.int32),
                 "corners": put([kind[0] for kind in kinds], wp.int32),
                 "power": put(power, wp.vec2i),
                 "hull": put(hull, wp.float64),
-                "limit": put(whole("limit"), wp.float64),
+                "depth_limit": put(whole("depth_limit"), wp.float64),
                 "size": put(whole("size"), wp.float64),
                 "surface": put(np.repeat(np.arange(len(counts)), counts), wp.int32),
-                "most": most,
+                "max_monomials": most,
                 "surfaces": len(self.surfaces),
-                "touch": TOUCH * self.size,
+                "touch_depth": TOUCH * self.size,
                 "pool": self.pool,
                 "count": self.facets,
             }

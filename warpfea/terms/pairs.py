@@ -10,32 +10,32 @@ import warp as wp
 
 from ..base.errors import PenetrationError
 from ..kernels.common.traits import Traits
-from ..kernels.solvers.control import FAIL_FLOOR, FAIL_WORK
+from ..kernels.solvers.newton_control import FAIL_FLOOR, FAIL_WORK
 from ..kernels.terms.contact import RELAX_LANES
-from ..kernels.terms.contact_books import BOOKED, LANES, book_kernels
-from ..kernels.terms.contact_data import RECORD, attempt_struct, clock_struct, history_struct
-from ..kernels.terms.pair_books import pair_book_kernels
-from ..kernels.terms.pair_data import seat_struct, touching_struct
-from ..kernels.terms.pair_lists import CHUNK, list_kernels
-from ..kernels.terms.pair_seek import seek_kernels
+from ..kernels.terms.contact_ledger import ENERGY_COLUMNS, RECORD_LANES, contact_ledger_kernels
+from ..kernels.terms.contact_structs import RECORD, clock_struct, contact_scratch_struct, history_struct
+from ..kernels.terms.facet_point_lists import FACETS_PER_CHUNK, list_kernels
+from ..kernels.terms.facet_search import facet_search_kernels
+from ..kernels.terms.pair_ledger import pair_ledger_kernels
+from ..kernels.terms.pair_structs import pair_history_struct, pair_scratch_struct
 from ..model.state import State
-from .contact_exact import Exact
 from .contact_fields import CONTACT_FIELDS, contact_field
 from .contact_parameters import contact_parameters
 from .contact_starts import reference_place, refuse_sunk, store_overlaps, touching_depth
+from .double_displacements import DoubleDisplacements
 from .facet_tables import LISTED
+from .pair_evaluation import evaluate_pairs
 from .pair_solves import PairSolves
-from .pair_survey import survey
-from .term import LOSS, NUMERICAL, STORED, WORK, At, Column, part
+from .term import LOSS, NUMERICAL, STORED, WORK, Column, StepContext, part
 
 if TYPE_CHECKING:
     from ..model.model import Model
-    from .time_laws import TimeLaws
+    from .time_law_table import TimeLawTable
     from .workspace import Workspace
 
 __all__ = ["Pairs"]
 
-KEPT = ("angle", "grown", "lead", "place", "turn")
+UNUSED_HISTORY = ("angle", "previous_margin", "previous_depth", "position", "rotation")
 """History of colliders and of single-point contacts."""
 
 
@@ -59,9 +59,9 @@ class Pairs(PairSolves):
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
-        self.traits = Traits(walls=True)
-        self.books, self.seek = book_kernels(model.dtype, False), seek_kernels(model.dtype)
-        self.lists, self.ending = list_kernels(model.dtype), pair_book_kernels(model.dtype)
+        self.traits = Traits(unilateral=True)
+        self.ledger_kernels, self.seek = contact_ledger_kernels(model.dtype, False), facet_search_kernels(model.dtype)
+        self.lists, self.pair_ledger_kernels = list_kernels(model.dtype), pair_ledger_kernels(model.dtype)
         self.report_columns = len(RECORD) * len(self.tables.contacts)
 
     @classmethod
@@ -72,18 +72,18 @@ class Pairs(PairSolves):
     def features(cls, model: Model) -> dict[str, bool]:
         return {"contact between bodies": bool(model.description.pairs)}
 
-    def ties(self) -> list[np.ndarray]:
+    def tied_slots(self) -> list[np.ndarray]:
         """Bodies in contact form one component."""
         return self.tables.slots
 
-    def hold(self, free: np.ndarray) -> None:
+    def mark_constrained(self, free: np.ndarray) -> None:
         """No-op: the forces of a pair are self-equilibrated under translations."""
 
-    def build(self, laws: TimeLaws) -> None:
+    def build(self, laws: TimeLawTable) -> None:
         self.tables.build(self.offset)
         self.connectivity = [group.conn for group in self.tables.groups] + [self.tables.master_conn]
-        self.exact = Exact(self.model, self.connectivity) if self.model.dtype == "float32" else None
-        self.rows = self.booked_rows = self.tables.rows
+        self.exact = DoubleDisplacements(self.model, self.connectivity) if self.model.dtype == "float32" else None
+        self.rows = self.increment_rows = self.tables.rows
 
     def hash(self, h: Any) -> None:
         self.tables.hash(h)
@@ -95,45 +95,61 @@ class Pairs(PairSolves):
         C, P = len(t.contacts), t.points
         point = (B, P)
         shapes: dict[str, tuple[int, ...]] = dict.fromkeys(
-            ("origin", "reach", "depth", "speed", "held", "next", "plane", "next_plane", "asked", "state", "force",
-             "energy", "stiffness", "flux"), point)  # fmt: skip
-        shapes |= dict.fromkeys(("dead", "dead_spring"), point if t.explicit else (1, 1))
-        shapes |= dict.fromkeys(("through", "elapsed", "omega", "changes", "asked_size"), (B,))
-        shapes |= {"asked_sums": (B, RELAX_LANES), "total": (B, C, len(RECORD)), "touched": (B, t.rows)}
-        shapes |= {"rows": (len(RECORD), B, t.rows), "weight": (1, 1, 1)}
-        out = attempt_struct(self.model.dtype)()
+            (
+                "origin",
+                "contact_distance",
+                "depth",
+                "speed",
+                "frozen",
+                "updated",
+                "frozen_normal",
+                "updated_normal",
+                "aitken_residual",
+                "activity",
+                "force",
+                "energy",
+                "stiffness",
+                "product",
+            ),
+            point,
+        )
+        shapes |= dict.fromkeys(("explicit_force", "explicit_spring"), point if t.explicit else (1, 1))
+        shapes |= dict.fromkeys(("passed_through", "elapsed", "relaxation", "limit_updates", "aitken_norm2"), (B,))
+        shapes |= {"aitken_sums": (B, RELAX_LANES), "total": (B, C, len(RECORD)), "facet_activity": (B, t.rows)}
+        shapes |= {"rows": (len(RECORD), B, t.rows), "shape_values": (1, 1, 1)}
+        out = contact_scratch_struct(self.model.dtype)()
         for name, shape in shapes.items():
-            dtype = attempt_struct(self.model.dtype).vars[name].type.dtype
+            dtype = contact_scratch_struct(self.model.dtype).vars[name].type.dtype
             setattr(out, name, work.array(f"pairs {name}", shape, dtype))
-        out.omega.fill_(1.0)
+        out.relaxation.fill_(1.0)
         return out
 
     def _touching(self, work: Workspace) -> Any:
         t, B = self.tables, self.model.worlds
-        most = t.masters_of(wp.uint64(0)).most
+        most = t.masters_of(wp.uint64(0)).max_monomials
         F, P, R = t.facets, t.points, t.rows
         shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("C", "D", "C0", "D0", "V0"), (B, F * most))
-        shapes |= dict.fromkeys(("lower", "upper", "wanted_lower", "wanted_upper", "count"), (B * F,))
-        shapes |= dict.fromkeys(("stale", "fits", "changed"), (1,))
-        shapes |= dict.fromkeys(("near", "calm_lower", "calm_upper", "calm"), (B, R))
-        shapes |= dict.fromkeys(("points", "start", "middle", "middle0", "swell"), (B, F))
-        shapes |= {"chunk": (B, -(-F // CHUNK))}
-        shapes |= dict.fromkeys(("weight", "held_weight", "slope"), (B, P, t.master_conn.shape[1]))
-        shapes |= {"lean": (B, P, 2), "deepest": (B, len(t.bodies))}
-        out = touching_struct(self.model.dtype)()
-        for name, var in touching_struct(self.model.dtype).vars.items():
+        shapes |= dict.fromkeys(("lower", "upper", "refit_lower", "refit_upper", "list_count"), (B * F,))
+        shapes |= dict.fromkeys(("refit_needed", "refits", "lists_changed"), (1,))
+        shapes |= dict.fromkeys(("in_reach", "empty_box_lower", "empty_box_upper", "empty_box_refit"), (B, R))
+        shapes |= dict.fromkeys(("list_size", "list_start", "centre", "centre0", "bulge"), (B, F))
+        shapes |= {"chunk_offset": (B, -(-F // FACETS_PER_CHUNK))}
+        shapes |= dict.fromkeys(("shape_values", "friction_shape", "shape_gradient"), (B, P, t.master_conn.shape[1]))
+        shapes |= {"geometric_tangent": (B, P, 2), "deepest_contact": (B, len(t.bodies))}
+        out = pair_scratch_struct(self.model.dtype)()
+        for name, var in pair_scratch_struct(self.model.dtype).vars.items():
             setattr(out, name, work.array(f"pairs {name}", shapes.get(name, (B, P)), var.type.dtype))
-        out.fits.fill_(1)
+        out.refits.fill_(1)
         return out
 
-    def allocate(self, work: Workspace, at: At) -> None:
+    def allocate(self, work: Workspace, ctx: StepContext) -> None:
         t, m = self.tables, self.model
         C, R, B = len(t.contacts), t.rows, m.worlds
         attempt, touching = self._attempt(work), self._touching(work)
         clock = clock_struct()()
         for name in ("time", "new_time", "h", "part"):
             setattr(clock, name, getattr(work.step, name))
-        clock.time, clock.still = at.state.time, int(not at.inertia)
+        clock.time, clock.still = ctx.state.time, int(not ctx.inertia)
         tree = self._tree(touching)
         scratch = {
             "attempt": attempt,
@@ -141,13 +157,13 @@ class Pairs(PairSolves):
             "tree": tree,
             "masters": t.masters_of(tree.id),
             "clock": clock,
-            "active": work.newton.touching,
-            "booked": work.array("pairs booked", (BOOKED, B, R), wp.float64),
-            "parts": work.array("pairs parts", (B, C, len(RECORD), LANES), wp.float64),
+            "active": work.newton.contact_active,
+            "energies": work.array("pairs booked", (ENERGY_COLUMNS, B, R), wp.float64),
+            "parts": work.array("pairs parts", (B, C, len(RECORD), RECORD_LANES), wp.float64),
             "row_start": m.array("contact", t.row_start, wp.int32),
             "u": self.exact.allocate(work, self.name) if self.exact else work.u,
         }
-        at.scratch[self.name] = scratch | at.scratch.get(self.name, {})
+        ctx.scratch[self.name] = scratch | ctx.scratch.get(self.name, {})
 
     def _tree(self, touching: Any) -> wp.Bvh:
         """Bounding volume hierarchy of the facets in the reference; one group per world and surface."""
@@ -158,193 +174,195 @@ class Pairs(PairSolves):
 
     def history_of(self, make: Callable[[str, Any, tuple[int, ...]], wp.array]) -> tuple[Any, Any]:
         """Structs of history and facet assignment, with arrays from make(name, dtype, shape per world)."""
-        history, seats = history_struct()(), seat_struct()()
+        history, seats = history_struct()(), pair_history_struct()()
         points = (self.tables.points,)
         for name, var in history_struct().vars.items():
-            if name not in KEPT:
-                shape = () if name in ("born", "posed") else points
+            if name not in UNUSED_HISTORY:
+                shape = () if name in ("overlap_time", "pose_time") else points
                 setattr(history, name, make(f"pairs_{name}", var.type.dtype, shape))
-        for name, var in seat_struct().vars.items():
+        for name, var in pair_history_struct().vars.items():
             setattr(seats, name, make(f"pairs_{name}", var.type.dtype, points))
         return history, seats
 
-    def register(self, at: At) -> None:
-        history, seats = self.history_of(at.state.register)
-        at.scratch[self.name] = {"history": history, "seats": seats}
+    def register(self, ctx: StepContext) -> None:
+        history, seats = self.history_of(ctx.state.register)
+        ctx.scratch[self.name] = {"history": history, "seats": seats}
 
-    def modules(self, at: At) -> Iterable[wp.Module]:
+    def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
         exact = [self.exact.kernels.module] if self.exact else []
         return [self.shared.module, self.seek.module, self.kernels.module, *exact]
 
-    def start(self, at: At, active: wp.array) -> None:
+    def start(self, ctx: StepContext, active: wp.array) -> None:
         """Initial overlaps at the state.
 
         Raises:
             ModelError: a new contact overlaps, and `overlap` is "refuse".
         """
-        s, t = at.scratch[self.name], self.tables
+        s, t = ctx.scratch[self.name], self.tables
         history = s["history"]
         new = (active.numpy() != 0) & ~(history.speed.numpy() > 0.0).any(axis=1)
         if not new.any():
             return
         flags: wp.array = wp.array(new.astype(np.int32), dtype=wp.int32, device=self.model.device)
-        overlap, born = history.overlap.numpy(), history.born.numpy()
+        overlap, born = history.overlap.numpy(), history.overlap_time.numpy()
         overlap[new] = 0.0
-        born[new] = at.state.time.numpy()[new]
+        born[new] = ctx.state.time.numpy()[new]
         history.overlap.assign(overlap)
-        history.born.assign(born)
-        self._begin(at, flags)
-        u = at.state.displacement
+        history.overlap_time.assign(born)
+        self._begin(ctx, flags)
+        u = ctx.state.displacement
         if self.exact:
             u = s["u"]
-            self.exact.widen(at.launch, at.state.displacement, flags, u)
-        self._seek(at, u, flags, settling=t.deepest)
-        seat = s["touching"].seat.numpy()
-        depth = np.where((seat != -1) & new[:, None], s["touching"].depth.numpy(), 0.0)
-        touching = touching_depth(self.model.size, at.state.displacement.numpy())
+            self.exact.widen(ctx.launch, ctx.state.displacement, flags, u)
+        self._seek(ctx, u, flags, overlap_limit=t.deepest)
+        facet = s["touching"].facet.numpy()
+        depth = np.where((facet != -1) & new[:, None], s["touching"].depth.numpy(), 0.0)
+        touching = touching_depth(self.model.size, ctx.state.displacement.numpy())
         store_overlaps(t, depth, touching, overlap)
-        refuse_sunk(t, at.state.displacement.numpy(), s["touching"].x0.numpy(), seat, new)
+        refuse_sunk(t, ctx.state.displacement.numpy(), s["touching"].x0.numpy(), facet, new)
         history.overlap.assign(overlap)
 
-    def rewind(self, state: State) -> None:
+    def shift_time(self, state: State) -> None:
         """Shift the start times of stored overlaps."""
-        if "pairs_born" in state.specs:
-            state.pairs_born.assign(state.pairs_born.numpy() - state.time.numpy())  # type: ignore[attr-defined]
+        if "pairs_overlap_time" in state.specs:
+            state.pairs_overlap_time.assign(state.pairs_overlap_time.numpy() - state.time.numpy())  # type: ignore[attr-defined]
 
     # in a step
 
     @part("pairs")
-    def begin(self, at: At, active: wp.array) -> None:
+    def begin(self, ctx: StepContext, active: wp.array) -> None:
         """Update facets and points at the start of the attempt."""
-        at.scratch[self.name]["finished"] = False
-        self._begin(at, active)
+        ctx.scratch[self.name]["finished"] = False
+        self._begin(ctx, active)
 
-    def _begin(self, at: At, active: wp.array) -> None:
-        s, m, t = at.scratch[self.name], self.model, self.tables
+    def _begin(self, ctx: StepContext, active: wp.array) -> None:
+        s, m, t = ctx.scratch[self.name], self.model, self.tables
         touching, masters = s["touching"], s["masters"]
-        u, v = at.state.displacement, at.state.velocity
-        dim = (m.worlds, t.facets, masters.most)
-        at.launch(self.seek.controls_before, dim, [masters, u, v, active, touching])
+        u, v = ctx.state.displacement, ctx.state.velocity
+        dim = (m.worlds, t.facets, masters.max_monomials)
+        ctx.launch(self.seek.initial_coefficients, dim, [masters, u, v, active, touching])
         for group in t.groups:
             args = [t.data, masters, group.data, s["history"], s["seats"], s["clock"]]
             dim = (m.worlds, group.count, group.data.points)
-            at.launch(self.seek.begin_points, dim, [*args, u, v, active, s["attempt"], touching])
+            ctx.launch(self.seek.begin_points, dim, [*args, u, v, active, s["attempt"], touching])
             if t.explicit:
-                at.launch(self.kernels.explicit_forces, dim, [*args, v, active, s["attempt"], touching])
+                ctx.launch(self.kernels.explicit_forces, dim, [*args, v, active, s["attempt"], touching])
 
-    def _refit(self, at: At) -> None:
-        s = at.scratch[self.name]
-        at.launch(self.seek.adopt_boxes, self.model.worlds * self.tables.facets, [s["touching"]])
+    def _refit(self, ctx: StepContext) -> None:
+        s = ctx.scratch[self.name]
+        ctx.launch(self.seek.accept_boxes, self.model.worlds * self.tables.facets, [s["touching"]])
         s["tree"].refit()
 
-    def _seek(self, at: At, u: wp.array, active: wp.array, *, settling: float) -> None:
+    def _seek(self, ctx: StepContext, u: wp.array, active: wp.array, *, overlap_limit: float) -> None:
         """Assign all points to facets at u."""
-        s, m, t, k = at.scratch[self.name], self.model, self.tables, self.seek
+        s, m, t, k = ctx.scratch[self.name], self.model, self.tables, self.seek
         touching, masters = s["touching"], s["masters"]
-        dim = (m.worlds, t.facets, masters.most)
-        at.launch(k.controls, dim, [masters, u, active, touching.C, touching.D])
-        at.launch(k.check_boxes, (m.worlds, t.facets), [masters, active, touching])
-        at.launch(k.keep_middles, (m.worlds, t.facets), [masters, active, touching])
-        wp.capture_if(touching.stale, self._refit, at=at)
+        dim = (m.worlds, t.facets, masters.max_monomials)
+        ctx.launch(k.update_coefficients, dim, [masters, u, active, touching.C, touching.D])
+        ctx.launch(k.check_boxes, (m.worlds, t.facets), [masters, active, touching])
+        ctx.launch(k.update_centres, (m.worlds, t.facets), [masters, active, touching])
+        wp.capture_if(touching.refit_needed, self._refit, ctx=ctx)
         for group, corners in zip(t.groups, t.corners):
             args = [t.data, masters, group.data, s["history"]]
-            at.launch(k.look_around, (m.worlds, group.count), [*args, u, active, t.reaching + settling, touching])
-            args += [s["seats"], s["clock"], u, at.state.velocity, active, settling]
-            at.launch(k.seek, (m.worlds, group.count, group.data.points), [*args, s["attempt"], touching, corners])
+            ctx.launch(k.query_boxes, (m.worlds, group.count), [*args, u, active, t.reaching + overlap_limit, touching])
+            args += [s["seats"], s["clock"], u, ctx.state.velocity, active, overlap_limit]
+            ctx.launch(
+                k.find_facets, (m.worlds, group.count, group.data.points), [*args, s["attempt"], touching, corners]
+            )
 
-    def prepare(self, at: At, active: wp.array) -> None:
+    def prepare(self, ctx: StepContext, active: wp.array) -> None:
         """Compute the first friction limits and the stiffness of the blocks."""
-        self._forces(at, active, fresh=1)
+        self._forces(ctx, active, fresh=1)
 
-    def force(self, at: At, active: wp.array) -> None:
-        self._forces(at, active, fresh=0)
+    def force(self, ctx: StepContext, active: wp.array) -> None:
+        self._forces(ctx, active, fresh=0)
 
     @part("pairs")
-    def _forces(self, at: At, active: wp.array, *, fresh: int) -> None:
-        s, m, w, t = at.scratch[self.name], self.model, at.work, self.tables
+    def _forces(self, ctx: StepContext, active: wp.array, *, fresh: int) -> None:
+        s, m, w, t = ctx.scratch[self.name], self.model, ctx.work, self.tables
         touching, masters = s["touching"], s["masters"]
-        if at.moved:
+        if ctx.positions_changed:
             if self.exact:
-                self.exact.follow(at, s["u"], active)
-            self._seek(at, s["u"], active, settling=0.0)
+                self.exact.update(ctx, s["u"], active)
+            self._seek(ctx, s["u"], active, overlap_limit=0.0)
         for group in t.groups:
             args = [t.data, masters, group.data, s["history"], s["seats"], s["clock"], s["u"], active, fresh]
             dim = (m.worlds, group.count, group.data.points)
-            at.launch(self.kernels.forces, dim, [*args, s["attempt"], touching])
-        wp.capture_if(touching.changed, self._list, at=at)
+            ctx.launch(self.kernels.forces, dim, [*args, s["attempt"], touching])
+        wp.capture_if(touching.lists_changed, self._list, ctx=ctx)
         for group in t.groups:
-            sides, lanes = group.sides(at.launch, m.worlds)
+            sides, lanes = group.sides(ctx.launch, m.worlds)
             args = [group.data, active, lanes, s["attempt"], w.pool_force, w.rows_of(self), s["active"]]
-            at.launch(self.shared.gather_points, sides, args)
-        lanes = at.launch.lanes(LISTED)
+            ctx.launch(self.shared.gather_points, sides, args)
+        lanes = ctx.launch.lanes(LISTED)
         args = [masters, active, lanes, s["attempt"], touching, w.pool_force]
-        at.launch(self.kernels.gather_masters, (m.worlds, at.launch.padded(lanes * t.master_conn.size)), args)
+        ctx.launch(self.kernels.gather_masters, (m.worlds, ctx.launch.padded(lanes * t.master_conn.size)), args)
 
-    def _list(self, at: At) -> None:
+    def _list(self, ctx: StepContext) -> None:
         """Build the point lists of the master facets."""
-        s, m, t, k = at.scratch[self.name], self.model, self.tables, self.lists
+        s, m, t, k = ctx.scratch[self.name], self.model, self.tables, self.lists
         touching, masters = s["touching"], s["masters"]
-        at.launch(k.clear_lists, m.worlds * t.facets, [touching])
-        at.launch(k.count_points, (m.worlds, t.points), [masters, touching])
-        at.launch(k.sum_chunks, touching.chunk.shape, [masters, touching])
-        at.launch(k.scan_chunks, m.worlds, [touching])
-        at.launch(k.place_lists, (m.worlds, t.facets), [masters, touching])
-        at.launch(k.fill_lists, (m.worlds, t.points), [masters, touching])
-        at.launch(k.sort_lists, (m.worlds, t.facets), [touching])
+        ctx.launch(k.clear_lists, m.worlds * t.facets, [touching])
+        ctx.launch(k.count_points, (m.worlds, t.points), [masters, touching])
+        ctx.launch(k.sum_chunks, touching.chunk_offset.shape, [masters, touching])
+        ctx.launch(k.scan_chunks, m.worlds, [touching])
+        ctx.launch(k.place_lists, (m.worlds, t.facets), [masters, touching])
+        ctx.launch(k.fill_lists, (m.worlds, t.points), [masters, touching])
+        ctx.launch(k.sort_lists, (m.worlds, t.facets), [touching])
 
     @part("pairs")
-    def refresh(self, at: At, flags: wp.array) -> None:
-        k, m, attempt = self.shared, self.model, at.scratch[self.name]["attempt"]
-        at.launch(k.partial_asked, (m.worlds, RELAX_LANES), [flags, attempt])
-        at.launch(k.relax, m.worlds, [flags, at.work.newton.tol, attempt, at.work.newton.unsettled])
-        at.launch(k.refresh, (m.worlds, self.tables.points), [flags, attempt])
-        s = at.scratch[self.name]
+    def update_frozen(self, ctx: StepContext, flags: wp.array) -> None:
+        k, m, attempt = self.shared, self.model, ctx.scratch[self.name]["attempt"]
+        ctx.launch(k.aitken_partial_sums, (m.worlds, RELAX_LANES), [flags, attempt])
+        ctx.launch(k.relax, m.worlds, [flags, ctx.work.newton.tol, attempt, ctx.work.newton.partly_updated])
+        ctx.launch(k.update_frozen, (m.worlds, self.tables.points), [flags, attempt])
+        s = ctx.scratch[self.name]
         for group in self.tables.groups:
             args = [s["masters"], group.data, s["u"], flags, attempt, s["touching"]]
-            at.launch(self.kernels.take_functions, (m.worlds, group.count, group.data.points), args)
+            ctx.launch(self.kernels.update_friction_shapes, (m.worlds, group.count, group.data.points), args)
 
-    def book(self, at: At, accepted: wp.array) -> wp.array:
-        self._finish(at, accepted)
-        at.scratch[self.name]["finished"] = True
-        return at.scratch[self.name]["booked"]
+    def energy_increments(self, ctx: StepContext, accepted: wp.array) -> wp.array:
+        self._finish(ctx, accepted)
+        ctx.scratch[self.name]["finished"] = True
+        return ctx.scratch[self.name]["energies"]
 
     @part("pairs")
-    def _finish(self, at: At, accepted: wp.array) -> None:
+    def _finish(self, ctx: StepContext, accepted: wp.array) -> None:
         """Update history, ledger rows and records of an accepted substep."""
-        s, m, t = at.scratch[self.name], self.model, self.tables
+        s, m, t = ctx.scratch[self.name], self.model, self.tables
         C = len(t.contacts)
-        self._seek(at, s["u"], accepted, settling=0.0)
+        self._seek(ctx, s["u"], accepted, overlap_limit=0.0)
         for group in t.groups:
             args = [t.data, s["masters"], group.data, s["history"], s["seats"], s["clock"], accepted]
-            args += [s["attempt"], s["touching"], s["booked"]]
-            at.launch(self.ending.finish, (m.worlds, group.count), args)
+            args += [s["attempt"], s["touching"], s["energies"]]
+            ctx.launch(self.pair_ledger_kernels.record_substep, (m.worlds, group.count), args)
         args = [t.data, s["row_start"], accepted, s["attempt"], s["parts"]]
-        at.launch(self.books.partial_records, (m.worlds, C, len(RECORD), LANES), args)
+        ctx.launch(self.ledger_kernels.partial_records, (m.worlds, C, len(RECORD), RECORD_LANES), args)
         args = [s["clock"], accepted, s["parts"], s["attempt"]]
-        at.launch(self.books.total_records, (m.worlds, C, len(RECORD)), args)
+        ctx.launch(self.ledger_kernels.total_records, (m.worlds, C, len(RECORD)), args)
 
     @part("pairs")
-    def commit(self, at: At, accepted: wp.array) -> None:
-        s, w = at.scratch[self.name], at.work
-        if not s["finished"]:  # no ledger, `book` not called
-            self._finish(at, accepted)
+    def commit(self, ctx: StepContext, accepted: wp.array) -> None:
+        s, w = ctx.scratch[self.name], ctx.work
+        if not s["finished"]:  # no ledger, `energy_increments` not called
+            self._finish(ctx, accepted)
         args = [s["clock"], w.newton.potential, w.newton.term_sums, accepted, s["history"], s["attempt"]]
-        at.launch(self.ending.close, self.model.worlds, args)
+        ctx.launch(self.pair_ledger_kernels.store_times, self.model.worlds, args)
 
-    def report(self, at: At) -> None:
-        args = [at.scratch[self.name]["attempt"], self.report_offset, at.work.report]
-        at.launch(self.books.write_records, (self.model.worlds, len(self.tables.contacts)), args)
+    def report(self, ctx: StepContext) -> None:
+        args = [ctx.scratch[self.name]["attempt"], self.report_offset, ctx.work.report]
+        ctx.launch(self.ledger_kernels.write_records, (self.model.worlds, len(self.tables.contacts)), args)
 
-    def measure(self, at: At) -> dict[str, np.ndarray]:
+    def stored_energy(self, ctx: StepContext) -> dict[str, np.ndarray]:
         """Stored energy according to the history, by points."""
         weights = np.concatenate([share.ravel() for share in self.tables.shares])
-        return {"contact_pairs": at.scratch[self.name]["history"].stored.numpy() @ weights}
+        return {"contact_pairs": ctx.scratch[self.name]["history"].stored.numpy() @ weights}
 
     # results
 
-    def explain(self, at: At, world: int) -> tuple[type[PenetrationError], str] | None:
-        found = int(at.scratch[self.name]["attempt"].through.numpy()[world])
-        if found == 0 or int(at.work.newton.failed.numpy()[world]) in (FAIL_FLOOR, FAIL_WORK):
+    def failure_reason(self, ctx: StepContext, world: int) -> tuple[type[PenetrationError], str] | None:
+        found = int(ctx.scratch[self.name]["attempt"].passed_through.numpy()[world])
+        if found == 0 or int(ctx.work.newton.failed.numpy()[world]) in (FAIL_FLOOR, FAIL_WORK):
             return None
         t = self.tables
         k = int(np.searchsorted(t.first, found - 1, side="right")) - 1
@@ -355,8 +373,8 @@ class Pairs(PairSolves):
             "stiffness= of the contact or a thicker body, or a smaller dt where it moves that far in a step"
         )
 
-    def remark(self, at: At, world: int) -> str:
-        touched = at.scratch[self.name]["attempt"].touched.numpy()[world] > 0
+    def failure_note(self, ctx: StepContext, world: int) -> str:
+        touched = ctx.scratch[self.name]["attempt"].facet_activity.numpy()[world] > 0
         t = self.tables
         names = [repr(c.name) for k, c in enumerate(t.contacts) if touched[t.row_start[k] : t.row_start[k + 1]].any()]
         more = f" and {len(names) - 3} more" if len(names) > 3 else ""
@@ -365,13 +383,13 @@ class Pairs(PairSolves):
     def parameter_arrays(self) -> dict[str, wp.array]:
         return self.tables.set_arrays
 
-    def take_materials(self, mask: np.ndarray) -> None:
-        self.tables.take_materials(mask)
+    def update_materials(self, mask: np.ndarray) -> None:
+        self.tables.update_materials(mask)
 
     def parameters(self) -> dict[str, Callable[[Any, np.ndarray], None]]:
         return contact_parameters(self.tables)
 
-    def facts(self) -> list[dict[str, Any]]:
+    def info(self) -> list[dict[str, Any]]:
         """Entries of `Model.info` per contact, in the order of addition."""
         t, out = self.tables, []
         for contact in self.model.description.pairs:
@@ -385,9 +403,9 @@ class Pairs(PairSolves):
 
     def nodal_force(self, state: State) -> np.ndarray:
         """Elastic nodal forces of all contacts at a state, both bodies, (worlds, slots, 3), N."""
-        return survey(self, state).nodal_force()
+        return evaluate_pairs(self, state).nodal_force()
 
     def samples(self, field: str, body: Any, state: State) -> np.ndarray:
         bodies = [side.body for contact in self.tables.contacts for side in (contact.slave, contact.master)]
-        patches = survey(self, state).patches(body) if body in bodies else []
+        patches = evaluate_pairs(self, state).patches(body) if body in bodies else []
         return contact_field(field, body, state.worlds, patches)

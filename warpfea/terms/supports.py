@@ -13,10 +13,10 @@ import warp as wp
 
 from ..base.errors import ModelError
 from ..kernels.terms.loads import load_kernels
-from ..laws import TimeLaw
 from ..model.description import Support
-from .term import At, part
-from .time_laws import TimeLaws
+from ..time_laws import TimeLaw
+from .term import StepContext, part
+from .time_law_table import TimeLawTable
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -42,10 +42,10 @@ class Supports:
     def __init__(self, model: Model) -> None:
         self.model = model
         self.kernels = load_kernels(model.dtype)
-        self.moved: Drives | None = None
-        self.turned: Drives | None = None
+        self.displaced: Drives | None = None
+        self.rotated: Drives | None = None
 
-    def build(self, laws: TimeLaws) -> None:
+    def build(self, laws: TimeLawTable) -> None:
         """Build one row per driven slot with a law for each component; contradictory laws are rejected.
 
         Raises:
@@ -62,7 +62,7 @@ class Supports:
                 node_law = support.node_laws[k] if support.node_laws else None
                 own = index if node_law is None else laws.add(node_law)
                 turn = support if arms is not None else None
-                _claim(taken, support, int(slot), (node_law or support.law, turn))
+                _check_conflict(taken, support, int(slot), (node_law or support.law, turn))
                 if arms is not None:
                     assert support.rotation is not None
                     turned.append((slot, own, support.components, arms[k], support.rotation[1]))
@@ -73,12 +73,12 @@ class Supports:
         m = self.model
         if moved:
             rows = np.array([[slot, *numbers] for slot, numbers in moved.items()])
-            self.moved = Drives(
+            self.displaced = Drives(
                 m.array("drives", rows[:, 0], wp.int32), m.array("drives", rows[:, 1:], wp.vec3i), len(rows)
             )
         if turned:
             slot, law, components, arm, axis = (np.array(column) for column in zip(*turned))
-            self.turned = Drives(
+            self.rotated = Drives(
                 m.array("drives", slot, wp.int32),
                 m.array("drives", law, wp.int32),
                 len(turned),
@@ -88,33 +88,33 @@ class Supports:
             )
 
     @part("loads")
-    def drive(self, at: At, active: wp.array) -> None:
+    def drive(self, ctx: StepContext, active: wp.array) -> None:
         """Write the velocities of the driven components to work.v."""
-        w, launch, k, B = at.work, at.launch, self.kernels, self.model.worlds
-        if self.moved:
-            d = self.moved
-            args = [d.slot, d.law, w.law_value, w.q_tilde, w.step.dq_dv, active, w.v]
+        w, launch, k, B = ctx.work, ctx.launch, self.kernels, self.model.worlds
+        if self.displaced:
+            d = self.displaced
+            args = [d.slot, d.law, w.time_law_values, w.q_tilde, w.step.dq_dv, active, w.v]
             launch(k.drive_displacement, (B, d.count), args)
-        if self.turned:
-            d = self.turned
-            args = [d.slot, d.law, d.components, d.arm, d.axis, w.law_value, w.q_tilde, w.step.dq_dv, active, w.v]
+        if self.rotated:
+            d = self.rotated
+            args = [d.slot, d.law, d.components, d.arm, d.axis, w.time_law_values, w.q_tilde, w.step.dq_dv, active, w.v]
             launch(k.drive_rotation, (B, d.count), args)
 
     def modules(self) -> set[wp.Module]:
         """Modules launched by `drive`."""
         k = self.kernels
-        kernels = [k.drive_displacement] * bool(self.moved) + [k.drive_rotation] * bool(self.turned)
+        kernels = [k.drive_displacement] * bool(self.displaced) + [k.drive_rotation] * bool(self.rotated)
         return {kernel.module for kernel in kernels}
 
     def hash(self, h: Any) -> None:
         """Hash the drives."""
-        for drive in (self.moved, self.turned):
+        for drive in (self.displaced, self.rotated):
             for values in (drive.slot, drive.law, drive.components, drive.arm, drive.axis) if drive else ():
                 if values is not None:
                     h.update(values.numpy().tobytes())
 
 
-def _claim(taken: dict[tuple[int, int], Any], support: Support, slot: int, kind: tuple[Any, Any]) -> None:
+def _check_conflict(taken: dict[tuple[int, int], Any], support: Support, slot: int, kind: tuple[Any, Any]) -> None:
     """Register the prescription of a component; equal ones may overlap, others raise ModelError."""
     body = support.body
     for c in np.flatnonzero(support.components):

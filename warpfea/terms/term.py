@@ -1,8 +1,8 @@
 """Interface of residual contributions, Eq. (17): elements, damping, loads, constraints, contact.
 
 A term is constructed once per model and holds constants; variables are in the workspace and the state of a simulation,
-passed as an `At`. A step calls the methods that each term overrides. Models: `Form` of PolyFEM, `BaseForceField` of
-SOFA, the items of felupe.
+passed as a `StepContext`. A step calls the methods that each term overrides. Models: `Form` of PolyFEM,
+`BaseForceField` of SOFA, the items of felupe.
 """
 
 from __future__ import annotations
@@ -16,26 +16,27 @@ import numpy as np
 import warp as wp
 
 from ..kernels.common.traits import Traits
-from ..kernels.step.ledger import HELD_VISCOUS, LOSS, NUMERICAL, STORED, WORK
+from ..kernels.step.energy_ledger import EXPLICIT_VISCOUS, LOSS, NUMERICAL, STORED, WORK
+from .renamed import check_methods
 
 if TYPE_CHECKING:
     from ..base.errors import ConvergenceError
     from ..base.launch import Launcher
     from ..model.model import Model
     from ..model.state import State
-    from .time_laws import TimeLaws
+    from .time_law_table import TimeLawTable
     from .workspace import Workspace
 
 __all__ = [
-    "HELD_VISCOUS",
+    "EXPLICIT_VISCOUS",
     "LOSS",
     "NUMERICAL",
     "STORED",
     "WORK",
-    "At",
+    "CachedInputs",
     "Column",
     "FieldSpec",
-    "Kept",
+    "StepContext",
     "Term",
     "part",
 ]
@@ -44,7 +45,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 @dataclass(eq=False)
-class At:
+class StepContext:
     """Simulation context passed to terms.
 
     Attributes:
@@ -53,7 +54,7 @@ class At:
             accelerations for acceleration-level schemes.
         inertia: dynamics; no rates in statics.
         midpoint: forces are evaluated at the middle of a step, at work.u_stage and work.stage_time.
-        dissipation: chi of its dissipative form, see kernels/elements/conserving.py.
+        dissipation: chi of its dissipative form, see kernels/elements/energy_momentum.py.
         accelerated: the scheme has accelerations as state variables.
         moved: positions changed since the last evaluation; if not, only lagged term data did.
         options: solver options for terms.
@@ -69,7 +70,7 @@ class At:
     midpoint: bool = False
     dissipation: float = 0.0
     accelerated: bool = False
-    moved: bool = True
+    positions_changed: bool = True
     options: Any = None
     scratch: dict[str, Any] = field(default_factory=dict)
 
@@ -79,7 +80,7 @@ class At:
         return self.model.terms.traits._replace(midpoint=self.midpoint)
 
     @property
-    def share(self) -> float:
+    def midpoint_factor(self) -> float:
         """Ratio of stage to end-of-step increment: 1/2 for mid-point schemes, else 1."""
         return 0.5 if self.midpoint else 1.0
 
@@ -115,7 +116,7 @@ class FieldSpec:
 
 
 @dataclass(eq=False)
-class Kept:
+class CachedInputs:
     """Inputs of a term's blocks at linearisation, besides displacements: live, cached and state arrays, [world,
     ...]."""
 
@@ -129,9 +130,9 @@ def part(name: str) -> Callable[[F], F]:
 
     def mark(method: F) -> F:
         @functools.wraps(method)
-        def marked(self: Any, at: At, *args: Any, **options: Any) -> Any:
-            with at.launch.part(name):
-                return method(self, at, *args, **options)
+        def marked(self: Any, ctx: StepContext, *args: Any, **options: Any) -> Any:
+            with ctx.launch.part(name):
+                return method(self, ctx, *args, **options)
 
         return marked  # type: ignore[return-value]
 
@@ -150,15 +151,16 @@ class Term:
         name: unique.
         potential: True for potential forces; else its force is frozen during a line search, and work not in its own
             columns counts as field work.
-        traits: kernel features that it requires. `limited` is declared by a term; `ties` and `gated` belong to
-            constraints; the others follow from connectivity, rows and an overridden `product`.
+        traits: kernel features that it requires. `limited` is declared by a term; `tied_slots` and `has_constraints`
+            belong to constraints; the others follow from connectivity, rows and an overridden `product`.
         connectivity: arrays (items, slots of an item) of model slots that it contributes to.
         columns: ledger rows, see Column; energies() has one key per column.
         fields: nodal scalars by name.
         parts: profile parts named by its launches, each with a description.
         report_columns: columns of the step report.
         rows: rows [TERM_ROWS, world, row] of its potential in work.term_rows, see `Workspace.rows_of`.
-        booked_rows: length of the rows of `book`, if larger than the numbers of slots, elements and `rows`.
+        booked_rows: length of the rows of `energy_increments`, if larger than the numbers of slots, elements and
+            `rows`.
         penalty: its blocks are added to the matrix after D is taken from it.
         offset, row_offset, report_offset: offsets in the pools, rows and report, set by the TermSet.
     """
@@ -170,11 +172,16 @@ class Term:
     parts: ClassVar[Mapping[str, str]] = {}
     penalty: ClassVar[bool] = False
 
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Refuse members by former names, see renamed.py."""
+        super().__init_subclass__(**options)
+        check_methods(cls, Term)
+
     def __init__(self, model: Model) -> None:
         self.model = model
         self.traits = Traits()
         self.offset = self.row_offset = self.report_offset = 0
-        self.rows = self.report_columns = self.booked_rows = 0
+        self.rows = self.report_columns = self.increment_rows = 0
         self.connectivity: list[np.ndarray] = []
 
     @classmethod
@@ -189,14 +196,14 @@ class Term:
 
     # before components are known
 
-    def ties(self) -> list[np.ndarray]:
+    def tied_slots(self) -> list[np.ndarray]:
         """Sets of model slots tied to each other: each becomes one component."""
         return []
 
-    def build(self, laws: TimeLaws) -> None:
+    def build(self, laws: TimeLawTable) -> None:
         """Build tables that need the components and add time laws; sets `connectivity`, `rows`, `report_columns`."""
 
-    def hold(self, free: np.ndarray) -> None:
+    def mark_constrained(self, free: np.ndarray) -> None:
         """Clear directions (components, 3) in which it constrains a component to the ground or another component.
 
         Translations of a free component involve elements and mass only. A solve can't be corrected along translations
@@ -228,146 +235,147 @@ class Term:
 
     # simulation setup
 
-    def allocate(self, work: Workspace, at: At) -> None:
+    def allocate(self, work: Workspace, ctx: StepContext) -> None:
         """Allocate scratch in at.scratch[name]."""
 
-    def register(self, at: At) -> None:
+    def register(self, ctx: StepContext) -> None:
         """Register history with at.state: restored, halved, reset and saved with the state."""
 
-    def configure(self, at: At) -> None:
+    def configure(self, ctx: StepContext) -> None:
         """Configure for the solver and state, both known here."""
 
-    def modules(self, at: At) -> Iterable[wp.Module]:
+    def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
         """Modules launched in a step."""
         return ()
 
-    def start(self, at: At, active: wp.array) -> None:
+    def start(self, ctx: StepContext, active: wp.array) -> None:
         """Reinitialise after the state was set; time laws and work.u are current."""
 
-    def rewind(self, state: State) -> None:
+    def shift_time(self, state: State) -> None:
         """Shift stored times before the state's time is reset to 0."""
 
     # in a step, in this order
 
-    def begin(self, at: At, active: wp.array) -> None:
+    def begin(self, ctx: StepContext, active: wp.array) -> None:
         """Begin an attempt; time laws are evaluated at its end."""
 
-    def prepare(self, at: At, active: wp.array) -> None:
+    def prepare(self, ctx: StepContext, active: wp.array) -> None:
         """Evaluate the data of blocks and penalties at the first iterate work.u."""
 
-    def scale(self, at: At, active: wp.array) -> None:
+    def scale(self, ctx: StepContext, active: wp.array) -> None:
         """Scale by D of the first iterate; penalties are known."""
 
-    def force(self, at: At, active: wp.array) -> None:
+    def force(self, ctx: StepContext, active: wp.array) -> None:
         """Forces and potential rows at work.u, work.v; in statics work.v is the load step increment, m."""
 
-    def aim(self, at: At, active: wp.array) -> None:
+    def process_direction(self, ctx: StepContext, active: wp.array) -> None:
         """Process the Newton direction work.direction. To limit the step, lower work.newton.limit.
 
         A limit <= 0 allows no step: the attempt fails and is halved.
         """
 
-    def adopt(self, at: At, flags: wp.array) -> None:
+    def accept_trial(self, ctx: StepContext, flags: wp.array) -> None:
         """Accept a trial in the flagged worlds: freeze its multipliers, friction limits, ... for the next search."""
 
-    def refresh(self, at: At, flags: wp.array) -> None:
+    def update_frozen(self, ctx: StepContext, flags: wp.array) -> None:
         """Update lagged quantities in the flagged worlds (trait "walls").
 
         Forces and residual are re-evaluated and checked with the updated values.
         """
 
-    def follow(self, at: At, active: wp.array) -> None:
+    def prepare_solve(self, ctx: StepContext, active: wp.array) -> None:
         """Prepare a linear solve at a new iterate."""
 
-    def outer(self, at: At, flags: wp.array) -> None:
+    def update_multipliers(self, ctx: StepContext, flags: wp.array) -> None:
         """Update multipliers after the inner solve of a classical multiplier method in the flagged worlds."""
 
-    def book(self, at: At, accepted: wp.array) -> wp.array | None:
+    def energy_increments(self, ctx: StepContext, accepted: wp.array) -> wp.array | None:
         """Energy rows [column, world, item], J, float64, to be summed; the state is still that before the substep.
 
         None: the sums of the last substep remain valid.
         """
         return None
 
-    def commit(self, at: At, accepted: wp.array) -> None:
+    def commit(self, ctx: StepContext, accepted: wp.array) -> None:
         """Store history of an accepted attempt."""
 
-    def report(self, at: At) -> None:
+    def report(self, ctx: StepContext) -> None:
         """Write columns of work.report from report_offset on."""
 
-    def measure(self, at: At) -> dict[str, np.ndarray]:
+    def stored_energy(self, ctx: StepContext) -> dict[str, np.ndarray]:
         """STORED columns at the state, (worlds,), J, from which the ledger restarts."""
         return {}
 
-    def restart(self, at: At, flags: wp.array) -> None:
+    def reset_scratch(self, ctx: StepContext, flags: wp.array) -> None:
         """Reset persistent scratch of the flagged worlds after a device-side reset."""
 
     # in a linear solve
 
-    def product(self, at: At, p: wp.array, active: wp.array) -> None:
+    def product(self, ctx: StepContext, p: wp.array, active: wp.array) -> None:
         """Derivative of the force along p, a change of the positions, m; velocities change by p/(dq/dv)."""
 
-    def diagonal(self, at: At, active: wp.array) -> None:
+    def diagonal(self, ctx: StepContext, active: wp.array) -> None:
         """Positive semi-definite 3x3 diagonal blocks, into the pool.
 
         For solvers that use the blocks of every iterate; the others take them from `blocks`.
         """
 
-    def keep(self, at: At) -> list[tuple[str, wp.array]]:
+    def cached_inputs(self, ctx: StepContext) -> list[tuple[str, wp.array]]:
         """Names and arrays [world, ...] that `blocks(projected=True)` depends on besides the displacements.
 
         A preconditioner stores copies, so that a resumed run rebuilds the same one.
         """
         return []
 
-    def carry(self, at: At, kept: Kept, reuse: Any, accepted: wp.array) -> bool:
+    def copy_cached(self, ctx: StepContext, kept: CachedInputs, reuse: Any, accepted: wp.array) -> bool:
         """Copy the cached inputs with a kernel of its own; False: the caller copies array by array."""
         return False
 
     def blocks(
-        self, at: At, matrix: Any, kept: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,
+        self, ctx: StepContext, matrix: Any, kept: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,
         *, projected: bool,
     ) -> None:  # fmt: skip
-        """out += (dq/dv) K, with the pattern of `matrix` (see solvers.assembled.Assembled), from the arrays of `keep`.
+        """out += (dq/dv) K, with the pattern of `matrix` (see solvers.assembled.Assembled), from the arrays of
+        `cached_inputs`.
 
         `projected`: the positive semi-definite part only. Omitted stiffness costs iterations: both D and the
         preconditioner lack it then.
         """
 
-    def reserve(self, at: At, matrix: Any, *, projected: bool) -> None:
+    def allocate_blocks(self, ctx: StepContext, matrix: Any, *, projected: bool) -> None:
         """Allocate for `blocks` before launches are captured; `projected`: no other blocks are needed."""
 
     def block_modules(self) -> Iterable[wp.Module]:
         """Modules launched by `blocks`."""
         return ()
 
-    def couples(self) -> list[tuple[int, int]]:
-        """Body pairs coupled by the tangent but not by `blocks`: the rest is added by `couple`."""
+    def coupled_bodies(self) -> list[tuple[int, int]]:
+        """Body pairs coupled by the tangent but not by `blocks`: the rest is added by `add_mode_coupling`."""
         return []
 
-    def reserve_motions(self, at: At, motions: Any) -> Iterable[wp.Module]:
-        """Allocate for `couple` before launches are captured; returns its modules."""
+    def allocate_mode_coupling(self, ctx: StepContext, motions: Any) -> Iterable[wp.Module]:
+        """Allocate for `add_mode_coupling` before launches are captured; returns its modules."""
         return ()
 
-    def couple(self, at: At, kept: list[wp.array], dq_dv: wp.array, active: wp.array) -> None:
-        """Add the coupling of bodies to the rigid body mode matrix of `reserve_motions` (solvers/motions.py)."""
+    def add_mode_coupling(self, ctx: StepContext, kept: list[wp.array], dq_dv: wp.array, active: wp.array) -> None:
+        """Add the coupling of bodies to the rigid body mode matrix of `allocate_mode_coupling` (solvers/motions.py)."""
 
-    def preconditions(self, at: At) -> bool:
+    def preconditions(self, ctx: StepContext) -> bool:
         """True if `precondition` adds a correction."""
         return False
 
     def precondition(
-        self, at: At, r: wp.array, z: wp.array, active: wp.array, into: wp.array | None = None
+        self, ctx: StepContext, r: wp.array, z: wp.array, active: wp.array, into: wp.array | None = None
     ) -> None:  # fmt: skip
         """Correct z = D^-1 r on the slots that it couples; with `into` add the result there instead."""
 
     # results
 
-    def explain(self, at: At, world: int) -> tuple[type[ConvergenceError], str] | None:
+    def failure_reason(self, ctx: StepContext, world: int) -> tuple[type[ConvergenceError], str] | None:
         """Error class and reason of the last rejected attempt of a world, or None if unknown to the term."""
         return None
 
-    def remark(self, at: At, world: int) -> str:
+    def failure_note(self, ctx: StepContext, world: int) -> str:
         """Additional note on the last rejected attempt of a world; "" for none."""
         return ""
 
@@ -375,10 +383,10 @@ class Term:
         """Arrays written by `parameters`, by the term's own names: saved in checkpoints and restored."""
         return {}
 
-    def parameters_taken(self) -> None:
+    def parameters_restored(self) -> None:
         """Update after `parameter_arrays` were restored from a checkpoint."""
 
-    def take_materials(self, mask: np.ndarray) -> None:
+    def update_materials(self, mask: np.ndarray) -> None:
         """Update in place after material constants (see `model.parameters`) were set in the chosen worlds (worlds,);
         before the first simulation arrays may be replaced by longer ones."""
 

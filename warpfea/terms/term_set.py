@@ -12,12 +12,12 @@ import warp as wp
 from ..base.errors import ModelError
 from ..base.launch import PARTS
 from ..base.names import did_you_mean, listing
-from ..base.worlds import chosen_worlds
+from ..base.worlds import worlds_mask
 from ..kernels.common.traits import Traits
-from ..kernels.step.control import REPORT
-from ..kernels.step.ledger import LEDGER, booked_struct
+from ..kernels.step.energy_ledger import LEDGER, term_energies_struct
+from ..kernels.step.step_control import REPORT
 from ..model import assembly
-from ..model.state import MEMORY
+from ..model.state import SOLVER_MEMORY
 from .body_forces import BodyForces
 from .checks import check_columns, check_made, check_names, check_rows, check_stored, check_tables, derived_traits
 from .constraints import Constraints
@@ -25,11 +25,11 @@ from .contact import Contact
 from .damping import Damping
 from .dead_loads import DeadLoads
 from .elements import Elements
-from .followers import Followers
+from .follower_loads import Followers
 from .pairs import Pairs
 from .supports import Supports
-from .term import At, FieldSpec, Term
-from .time_laws import TimeLaws, control_array
+from .term import FieldSpec, StepContext, Term
+from .time_law_table import TimeLawTable, control_array
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -70,7 +70,7 @@ class TermSet:
 
     def __init__(self, model: Model, more: list[Callable[[Model], Term | None]] | None = None) -> None:
         self.model = model
-        self.laws, self.supports = TimeLaws(model), Supports(model)
+        self.time_laws, self.supports = TimeLawTable(model), Supports(model)
         makers = [kind.of for kind in KINDS] + list(more or ())
         self.all: list[Term] = []
         for make in makers:
@@ -94,7 +94,7 @@ class TermSet:
         for term in self.all:
             check_columns(term, own=term not in added)
         for term in added:
-            for trait in ("ties", "gated"):
+            for trait in ("constraint_rows", "has_constraints"):
                 if getattr(term.traits, trait):
                     raise ModelError(f"term {term.name!r} declares the trait {trait!r}, which belongs to constraints")
         check_stored(self.all)
@@ -121,23 +121,23 @@ class TermSet:
     @property
     def products(self) -> bool:
         """True if terms besides the elements contribute to H."""
-        return self.traits.tangent or self.traits.pooled or self.traits.ties
+        return self.traits.tangent or self.traits.pooled or self.traits.constraint_rows
 
     # for the model
 
-    def ties(self) -> list[np.ndarray]:
+    def tied_slots(self) -> list[np.ndarray]:
         """Sets of slots tied by terms."""
-        return [slots for term in self.all for slots in term.ties()]
+        return [slots for term in self.all for slots in term.tied_slots()]
 
     def build(self) -> None:
         """Build the terms' tables, once components are known, and their pool offsets."""
         for term in self.all:
             term.offset = self._entries(self.all, term.potential)
-            term.build(self.laws)
+            term.build(self.time_laws)
             check_tables(term, self.model)
             if term is self.dead:  # time laws are numbered in this order
-                self.supports.build(self.laws)
-        self.laws.upload()
+                self.supports.build(self.time_laws)
+        self.time_laws.upload()
         self.traits = Traits(*map(any, zip(*(derived_traits(term) for term in self.all))))
         self.side_entries, self.pool_entries = self._entries(self.all, False), self._entries(self.all, True)
         self.rows = 0
@@ -173,10 +173,10 @@ class TermSet:
             pool = self._topology(conns)
             topology.pool_start, topology.pool_entry = pool.start, pool.entry
 
-    def hold(self, free: np.ndarray) -> None:
+    def mark_constrained(self, free: np.ndarray) -> None:
         """Clear the directions (components, 3) in which terms tie components to the ground."""
         for term in self.all:
-            term.hold(free)
+            term.mark_constrained(free)
 
     @property
     def features(self) -> dict[str, bool]:
@@ -186,17 +186,17 @@ class TermSet:
         for kind in kinds:
             out |= kind.features(self.model)
         out |= {term.name: True for term in self.all if type(term) not in KINDS}
-        return out | {"controls": bool(self.laws.controls)}
+        return out | {"controls": bool(self.time_laws.controls)}
 
-    def rewind(self, state: State) -> None:
+    def shift_time(self, state: State) -> None:
         """Reset the time of a state to 0, and shift the times stored by terms."""
         for term in self.all:
-            term.rewind(state)
+            term.shift_time(state)
         state.time.zero_()
 
     def hash(self, h: Any) -> None:
         """Hash the definitions of the terms."""
-        self.laws.hash(h)
+        self.time_laws.hash(h)
         self.supports.hash(h)
         for term in self.all:
             if term in self.added:
@@ -257,7 +257,7 @@ class TermSet:
         owners = [term.parameters() for term in self.all] + [materials.setters(), {"gravity": self.dead.set_gravity}]
         found = [known[name] for known in owners if name in known]
         if len(found) == 1:
-            chosen = chosen_worlds("set_parameter", mask, self.model.worlds)
+            chosen = worlds_mask("set_parameter", mask, self.model.worlds)
             found[0](values, chosen)
             self.written += 1
             self.writes = self.writes + chosen
@@ -277,19 +277,19 @@ class TermSet:
 
     # simulation setup
 
-    def allocate(self, work: Workspace, at: At) -> None:
+    def allocate(self, work: Workspace, ctx: StepContext) -> None:
         """Allocate the terms' scratch and register their history."""
         owner: dict[str, str] = {}
-        controls = [control_array(name) for name in self.laws.controls]
+        controls = [control_array(name) for name in self.time_laws.controls]
         for term in self.all:
-            before = len(at.state.asked)
-            term.register(at)
-            for name in at.state.asked[before:]:
-                if name in owner or name in STATE or name in controls or name.startswith(MEMORY):
+            before = len(ctx.state.asked)
+            term.register(ctx)
+            for name in ctx.state.asked[before:]:
+                if name in owner or name in STATE or name in controls or name.startswith(SOLVER_MEMORY):
                     taken = f"term {owner[name]!r}" if name in owner else "the state itself"
                     raise ModelError(f"term {term.name!r}: the state's array {name!r} is that of {taken}; rename it")
                 owner[name] = term.name
-            term.allocate(work, at)
+            term.allocate(work, ctx)
 
     @property
     def booking(self) -> list[Term]:
@@ -297,9 +297,9 @@ class TermSet:
         return [term for term in self.all if term.columns]
 
     def booked(self, work: Any) -> Any:
-        """Device table of the ledger columns of the terms; `book` fills their sums."""
+        """Device table of the ledger columns of the terms; `energy_increments` fills their sums."""
         columns = [column for term in self.booking for column in term.columns]
-        out = booked_struct()()
+        out = term_energies_struct()()
         device = self.model.device
         out.kind = wp.array([c.kind for c in columns], dtype=wp.int32, device=device)
         held = [int(not term.potential) for term in self.booking for _ in term.columns]
@@ -309,21 +309,21 @@ class TermSet:
         out.sums = work.booked
         return out
 
-    def book(self, at: At, reduce: Any, accepted: wp.array) -> None:
+    def energy_increments(self, ctx: StepContext, reduce: Any, accepted: wp.array) -> None:
         """Evaluate and sum the terms' ledger rows for an accepted substep."""
         first = 0
         for term in self.booking:
-            rows, count = term.book(at, accepted), len(term.columns)
+            rows, count = term.energy_increments(ctx, accepted), len(term.columns)
             if rows is not None:
-                check_rows(term, rows, self.model.worlds, at.work.longest)
-                reduce(rows, count, accepted, at.work.booked[first : first + count])
+                check_rows(term, rows, self.model.worlds, ctx.work.longest)
+                reduce(rows, count, accepted, ctx.work.booked[first : first + count])
             first += count
 
-    def modules(self, at: At) -> set[wp.Module]:
+    def modules(self, ctx: StepContext) -> set[wp.Module]:
         """Modules launched by terms in a step."""
-        out = self.laws.modules() | self.supports.modules()
+        out = self.time_laws.modules() | self.supports.modules()
         for term in self.all:
-            out |= set(term.modules(at))
+            out |= set(term.modules(ctx))
         return out
 
     def energies(self, ledger: np.ndarray) -> dict[str, np.ndarray]:

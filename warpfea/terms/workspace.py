@@ -13,12 +13,12 @@ from ..base.memory import enough_memory
 from ..kernels.common.lanes import WARP
 from ..kernels.common.reduce import CHUNK
 from ..kernels.common.structs import balance_struct
-from ..kernels.solvers.control import FLOOR_LANES, FLOOR_ROWS, GROUP_ROWS, LANES, TERM_ROWS, control_struct
+from ..kernels.solvers.newton_control import FLOOR_LANES, FLOOR_ROWS, GROUP_ROWS, LANES, TERM_ROWS, control_struct
 from ..kernels.solvers.pcg import LANES as GROUP_LANES
 from ..kernels.solvers.pcg import pcg_struct
-from ..kernels.step.control import step_struct
+from ..kernels.step.energy_ledger import LEDGER_ROWS
 from ..kernels.step.gather import RESIDUAL_ROWS
-from ..kernels.step.ledger import LEDGER_ROWS
+from ..kernels.step.step_control import step_struct
 from ..kernels.terms.constraints import multiplier_struct
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ class Workspace:
         self.g, self.inertia, self.internal = field("g"), field("inertia"), field("internal")
         terms, traits = model.terms, model.terms.traits
         # with constraints PCG uses the gradient of the augmented potential
-        self.gradient = field("gradient") if traits.ties else self.g
+        self.gradient = field("gradient") if traits.constraint_rows else self.g
         self.dead, self.dead_magnitude = field("dead"), field("dead_magnitude")
         self.diagonal = field("diagonal")
         self.inverse = self.array("inverse", (B, n), model.types.mat33)
@@ -66,7 +66,7 @@ class Workspace:
         none = self.array("none", (1, 1), vec3)
         side = (B, terms.side_entries)
         self.nonpotential = field("nonpotential") if traits.nonpotential else none
-        self.nonpotential_held = field("nonpotential_held") if traits.nonpotential else none
+        self.nonpotential_frozen = field("nonpotential_frozen") if traits.nonpotential else none
         self.nonpotential_contribution = (
             self.array("nonpotential_contribution", side, vec3) if traits.nonpotential else none
         )
@@ -83,21 +83,21 @@ class Workspace:
         self.booked = self.array("booked", (max(booked, 1), B), wp.float64)
         self.history = self.array("history", (B, max(model.history_count, 1)), model.types.sym)
         # scratch for kernels whose sums are unused
-        self.spare_rows = self.array("spare_rows", (2, B, n) if traits.ties else (1, 1, 1), wp.float64)
+        self.spare_rows = self.array("spare_rows", (2, B, n) if traits.constraint_rows else (1, 1, 1), wp.float64)
         # PCG sums have one row per warp
         self.warp = WARP if model.device.is_cuda else 1
         self.warp_rows = self.array("warp_rows", (2, B, -(-n // self.warp)), wp.float64)
         self.rows = self.array("rows", (max(RESIDUAL_ROWS, LEDGER_ROWS), B, n), wp.float64)
         self.energy_rows = self.array("energy_rows", (2, B, model.element_count), wp.float64)
-        longest = max(n, model.element_count, terms.rows, *(term.booked_rows for term in terms))
+        longest = max(n, model.element_count, terms.rows, *(term.increment_rows for term in terms))
         chunks = -(-longest // CHUNK) if longest > CHUNK else 1
         self.longest = chunks * CHUNK  # maximum items of a summed row
         most = max(RESIDUAL_ROWS, LEDGER_ROWS, *(len(term.columns) for term in terms))
         self.partial = self.array("partial", (most, B, chunks), wp.float64)
-        self.law_value = self.array("law_value", (B, max(terms.laws.count, 1)), wp.vec3d)
-        self.law_stage = self.law_value
+        self.time_law_values = self.array("law_value", (B, max(terms.time_laws.count, 1)), wp.vec3d)
+        self.time_law_stage_values = self.time_law_values
         if midpoint:
-            self.law_stage = self.array("law_stage", self.law_value.shape, wp.vec3d)
+            self.time_law_stage_values = self.array("law_stage", self.time_law_values.shape, wp.vec3d)
         self.group_partial = self.array("group_partial", (B, max(model.group_count, 1), GROUP_LANES), vec3)
         self.group_velocity = self.array("group_velocity", (B, max(model.group_count, 1)), vec3)
         self.ledger_sums = self.array("ledger_sums", (LEDGER_ROWS if ledger else 1, B), wp.float64)
@@ -109,32 +109,40 @@ class Workspace:
         self.residual_group_partial = self.array(
             "residual_group_partial", (*sums, LANES) if groups > 1 else (1, 1, 1, 1), wp.float64
         )
-        skip: tuple[str, ...] = ("violation", "negative", "unsolved", "component_of_group")  # for other solvers
-        skip += () if traits.gated else ("outer", "open")
-        skip += () if traits.stored else ("term_sums", "stepped")
+        skip: tuple[str, ...] = (
+            "violation",
+            "negative_curvature",
+            "pcg_unconverged",
+            "component_of_group",
+        )  # for other solvers
+        skip += () if traits.has_constraints else ("outer", "violation_ratio")
+        skip += () if traits.stored else ("term_sums", "trial_accepted")
         skip += () if traits.limited else ("limit",)
         skip += (
             ()
-            if traits.walls
+            if traits.unilateral
             else (
-                "refreshed",
-                "new_walls",
-                "excursions",
-                "unsettled",
-                "touching",
-                "lower",
-                "upper",
+                "frozen_updated",
+                "unilateral_changed",
+                "penetrating_steps",
+                "partly_updated",
+                "contact_active",
+                "bracket_low",
+                "bracket_high",
             )
         )
         self.newton = self.struct(
             control_struct(), B, skip=skip,
-            history=(B, max_newton + 1), slot_sums=(RESIDUAL_ROWS, B), group_sums=sums, quiet=(B, C),
+            history=(B, max_newton + 1), slot_sums=(RESIDUAL_ROWS, B), group_sums=sums, component_converged=(B, C),
             term_sums=(TERM_ROWS, B), floor_sums=(FLOOR_ROWS, B, model.residual_parts.count, FLOOR_LANES),
         )  # fmt: skip
         self.newton.components, self.newton.groups = C, groups
         self.multipliers: Any = multiplier_struct()()  # of constraints, if any
         self.pcg = self.struct(pcg_struct(), B, sums=(2, B), curvature=(1, B))
-        self.newton.negative, self.newton.unsolved = self.pcg.negative, self.pcg.unsolved
+        self.newton.negative_curvature, self.newton.pcg_unconverged = (
+            self.pcg.negative_curvature,
+            self.pcg.pcg_unconverged,
+        )
         unused: tuple[str, ...] = ("b", "q_a", "h_before", "any_refused", "summed", "ends", "growth", "least_energy")
         unused += () if midpoint else ("stage_time",)
         self.step = self.struct(step_struct(), B, skip=unused, stop=(2,))
@@ -183,7 +191,7 @@ class Workspace:
             "elem_sums": (2, worlds),
             "slope_sum": (1, worlds),
             "tangent_sum": (1, worlds),
-            **dict.fromkeys(("any_active", "any_running", "any_hard", "any_strict"), (1,)),
+            **dict.fromkeys(("any_active", "any_running", "any_rare", "any_estimate_error"), (1,)),
         } | shapes
         for name, var in kind.vars.items():
             if isinstance(var.type, wp.array) and name not in skip:

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ...kernels.step.control import Coefficients
+from ...kernels.step.step_control import Coefficients
 from .scheme import Integrator
 
 __all__ = ["BACKWARD_EULER", "STATIC", "backward_euler", "euler_error"]

@@ -1,7 +1,7 @@
 """Conserving mid-point scheme of Simo and Tarnow (1992), with Gonzalez' discrete gradient (2000).
 
 M (v - v_n)/h + f(q_n, q) = f(t_n + h/2) with q = q_n + h/2 (v_n + v), and internal forces whose work equals the change
-of strain energy exactly: see kernels/elements/conserving.py. Constraints hold at the end of the step and act along
+of strain energy exactly: see kernels/elements/energy_momentum.py. Constraints hold at the end of the step and act along
 their gradient in its middle.
 
 With rho_inf < 1 stresses include (chi/2) C0 : (E_{n+1} - E_n), chi = (1 - rho_inf)/(1 + rho_inf): the stress
@@ -13,7 +13,7 @@ import math
 import warp as wp
 
 from ...base.errors import ModelError
-from ...kernels.step.control import Coefficients
+from ...kernels.step.step_control import Coefficients
 from .scheme import Integrator
 
 __all__ = ["EnergyMomentum", "energy_momentum"]

@@ -19,7 +19,7 @@ import math
 import warp as wp
 
 from ...base.errors import ModelError
-from ...kernels.step.control import Coefficients
+from ...kernels.step.step_control import Coefficients
 from .scheme import Integrator
 
 __all__ = ["GeneralizedAlpha", "generalized_alpha"]

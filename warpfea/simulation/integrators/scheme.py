@@ -14,7 +14,7 @@ class Integrator:
 
     Attributes:
         name: name for users.
-        coefficients: wp.func (h, previous h, parameter) -> `Coefficients` (kernels/step/control.py).
+        coefficients: wp.func (h, previous h, parameter) -> `Coefficients` (kernels/step/step_control.py).
         order: order of convergence in h.
         multistep: uses the state before the last, q_{n-1} and v_{n-1}.
         takes_velocity: q~ depends on v_n.
@@ -48,11 +48,11 @@ class Integrator:
 
     @property
     def dissipation(self) -> float:
-        """chi of the dissipative mid-point scheme, see kernels/elements/conserving.py; 0 for others."""
+        """chi of the dissipative mid-point scheme, see kernels/elements/energy_momentum.py; 0 for others."""
         return 0.0
 
     @property
-    def kept(self) -> tuple[str, str]:
+    def history_arrays(self) -> tuple[str, str]:
         """State arrays besides q_n and v_n: those of the previous step, or accelerations."""
         if self.accelerated:
             return "algorithmic_acceleration", "acceleration"

@@ -12,10 +12,10 @@ from typing import Any, overload
 
 import numpy as np
 
-from ...base.brief import brief_repr
-from ...base.console import number, plain, size, table, write_json
+from ...base.console import number, size, table, to_json, write_json
 from ...base.errors import OutputError
 from ...base.provenance import machine, origin, versions
+from ...base.short_repr import use_short_repr
 from ...base.writer import write_whole
 from ..files import prepare, require_matplotlib, write_csv
 from .measure import DONE
@@ -86,7 +86,7 @@ class Row:
     split: dict[str, float | None] | None = None
     ledger: dict[str, float] | None = None
 
-    __repr__ = brief_repr
+    __repr__ = use_short_repr
 
     @property
     def reaches(self) -> float:
@@ -322,13 +322,13 @@ class Study(Sequence[Row]):
             "scene": self.what,
             "measure": self.measure,
             "target": self.target,
-            "settings": plain(self.settings),
-            "over": plain(self.axes.over),
-            "references": plain(self.references),
+            "settings": to_json(self.settings),
+            "over": to_json(self.axes.over),
+            "references": to_json(self.references),
             "orders": self.fits(),
             "answer": None if self.answer is None else {"row": self.rows.index(self.answer), "command": self.command},
-            "checks": [plain(asdict(row)) for row in self.checks],
-            "rows": [plain(asdict(row)) for row in self.rows],
+            "checks": [to_json(asdict(row)) for row in self.checks],
+            "rows": [to_json(asdict(row)) for row in self.rows],
         }
 
     def write(self, folder: str | pathlib.Path, words: Sequence[str] = ("study",)) -> list[pathlib.Path]:
@@ -355,8 +355,8 @@ class Study(Sequence[Row]):
 
     def _flat(self, row: Row) -> dict[str, Any]:
         """A row without nesting, for the CSV."""
-        out = {k: v for k, v in plain(asdict(row)).items() if not isinstance(v, dict)}
-        given = plain(asdict(row.setting))
+        out = {k: v for k, v in to_json(asdict(row)).items() if not isinstance(v, dict)}
+        given = to_json(asdict(row.setting))
         given["asked error"] = given.pop("error")  # `error` is the measured one
         out = {k: v for k, v in given.items() if k != "values"} | out
         out = {f"set {k}": v for k, v in row.setting.values.items()} | out

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from ...base.console import plain
+from ...base.console import to_json
 from ...base.errors import ModelError
 from ...base.names import did_you_mean
 from ...builder.scene import Scene
@@ -67,7 +67,7 @@ class Setting:
 
     def key(self, code: str) -> str:
         """Name of the run, from the settings and the code version."""
-        return hashlib.sha256(json.dumps([plain(asdict(self)), code], sort_keys=True).encode()).hexdigest()[:20]
+        return hashlib.sha256(json.dumps([to_json(asdict(self)), code], sort_keys=True).encode()).hexdigest()[:20]
 
     def command(self, what: str, scene: Scene[Any]) -> str:
         """Command line of the run."""

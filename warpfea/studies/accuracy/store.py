@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
 
-from ...base.console import plain
+from ...base.console import to_json
 from ...base.errors import OutputError
 from ...base.provenance import machine
 from ...builder.scene import Scene
@@ -89,7 +89,7 @@ class Store:
         self.outcomes[key] = outcome
         if self.file is not None and outcome.status != REFUSED:
             line = {"key": key, "settings": asdict(setting), **outcome.packed()}
-            self._append(json.dumps(plain(line)) + "\n")
+            self._append(json.dumps(to_json(line)) + "\n")
 
     def told(self) -> str:
         """Text of the partial results of an interrupted study."""

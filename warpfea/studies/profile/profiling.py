@@ -27,7 +27,7 @@ from ...base.checks import is_count
 from ...base.console import quiet_warp
 from ...base.errors import ModelError
 from ...base.launch import PARTS, kernel_name
-from ...kernels.common.probe import probe_kernels
+from ...kernels.common.empty_kernel import empty_kernels
 from ...simulation.simulation import Simulation
 
 __all__ = ["KernelTime", "Profile", "Recorder", "Replay", "copy_bandwidth", "launch_bytes", "profile", "replay"]
@@ -319,10 +319,10 @@ def replay(sim: Simulation, steps: int, on_step: Callable[[], object] | None = N
     stepper.launch.recorder = recorder
     try:
         sim.state.load(start)
-        stepper.forget()
-        do(1, stepper.sequence)  # creates the commands, and data outside the state
+        stepper.invalidate()
+        do(1, stepper.launch_step)  # creates the commands, and data outside the state
         recorder.clear()
-        do(steps, lambda: recorder.measure(stepper.sequence))
+        do(steps, lambda: recorder.measure(stepper.launch_step))
     finally:
         stepper.launch.recorder = None
     return Replay(tuple(step_ms), per_step["newton"], per_step["pcg"], recorder)
@@ -333,7 +333,7 @@ def _empty_launch(device: Any) -> float:
     device = wp.get_device(device)
     flags = wp.zeros(1, dtype=wp.int32, device=device)
     with quiet_warp():  # load its module now
-        command = wp.launch(probe_kernels().empty, dim=1, inputs=[flags], device=device, record_cmd=True)
+        command = wp.launch(empty_kernels().empty, dim=1, inputs=[flags], device=device, record_cmd=True)
         command.launch()
     if device.is_cuda:
         wp.timing_begin(cuda_filter=wp.TIMING_KERNEL)

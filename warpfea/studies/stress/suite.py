@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ...base.console import number, plain, quiet_warp, table, write_json
+from ...base.console import number, quiet_warp, table, to_json, write_json
 from ...base.devices import find_device
 from ...base.errors import Error, UsageError
 from ...base.names import did_you_mean
@@ -133,7 +133,7 @@ def attempt(row: Row, setting: Setting, debug: bool = False) -> dict[str, Any]:
             "min_J": answer.min_J, "floor": answer.floor,
         }  # fmt: skip
     out |= {"wall_s": clock.perf_counter() - began, "note": note}
-    return dict(plain(out))
+    return dict(to_json(out))
 
 
 def _judge(case: Case, answer: Answer) -> tuple[str, bool, str]:

@@ -1,0 +1,102 @@
+"""Outer loop of Newton's method: classical multiplier updates, updates of frozen quantities, step limits."""
+
+import types as _types
+
+import warp as wp
+
+from ..common.traits import Traits
+from .convergence import STALL_ROUNDINGS, judging_functions
+from .newton_control import FAIL_CONSTRAINT, FAIL_ITERATIONS, control_struct
+
+__all__ = ["outer_kernels"]
+
+RESIDUAL_GROWTH = 3.0
+LOOSE_FORCING = 0.03
+"""Tolerance of linear solves if the residual grows by more than the factor AHEAD when frozen quantities are updated."""
+UPDATE_RESIDUAL = 0.1
+"""Relative residual below which frozen quantities (friction limits) are updated at each iterate."""
+
+
+def outer_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
+    """Kernels in the module of Newton's method."""
+    f64 = wp.float64
+    Control = control_struct()
+    judging = judging_functions(traits)
+    allowed_violation = judging.allowed_violation
+    objective, magnitude, largest_violation = judging.objective, judging.magnitude, judging.largest_violation
+    evaluate_norms, check_convergence, record_residual, give_up = (
+        judging.evaluate_norms,
+        judging.check_convergence,
+        judging.record_residual,
+        judging.give_up,
+    )
+
+    @wp.kernel(module=module)
+    def begin_refresh(ctl: Control, flags: wp.array(dtype=wp.int32)):
+        """Flag the worlds whose frozen quantities are due for an update: the residual is small enough."""
+        world = wp.tid()
+        flags[world] = 0
+        if ctl.active[world] != 0 and ctl.contact_active[world] == 0:
+            check_convergence(ctl, world)  # nothing is frozen
+        elif ctl.active[world] != 0:
+            last = ctl.iterations[world] + 1 >= ctl.max_iterations
+            # within round-off the residual may not fall further
+            rounding = ctl.rounding_ratio[world] <= f64(STALL_ROUNDINGS)
+            if ctl.relative_residual[world] <= f64(UPDATE_RESIDUAL) or rounding or last:
+                flags[world] = 1
+            else:
+                record_residual(ctl, world)
+
+    @wp.kernel(module=module)
+    def end_refresh(ctl: Control, flags: wp.array(dtype=wp.int32)):
+        """Re-evaluate the iterate of the flagged worlds with the updated frozen quantities."""
+        world = wp.tid()
+        if ctl.active[world] != 0 and flags[world] != 0:
+            before = ctl.norm[world]
+            evaluate_norms(ctl, world)
+            if ctl.fixed_forcing == 0 and ctl.norm[world] > f64(RESIDUAL_GROWTH) * before:
+                # the frozen quantities were the larger error: tighter solves are wasted
+                ctl.forcing[world] = wp.max(ctl.forcing[world], f64(LOOSE_FORCING))
+            ctl.phi[world] = objective(ctl, world) + ctl.slot_sums[7, world]
+            ctl.phi_magnitude[world] = magnitude(ctl, world)
+            ctl.nonmonotone_steps[world] = 0
+            ctl.frozen_updated[world] = 1 - ctl.unilateral_changed[world]
+            ctl.unilateral_changed[world] = 0
+            part = ctl.partly_updated[world] != 0
+            ctl.partly_updated[world] = 0
+            if not part:
+                check_convergence(ctl, world)
+            else:
+                record_residual(ctl, world)
+                if ctl.iterations[world] >= ctl.max_iterations:
+                    give_up(ctl, world, FAIL_ITERATIONS)
+
+    @wp.kernel(module=module)
+    def check_constraints(ctl: Control, running: wp.array(dtype=wp.int32), tol: f64, limit: int):
+        """Classical multiplier updates: start another inner solve if a constraint is still violated."""
+        world = wp.tid()
+        ctl.trial_accepted[world] = 0
+        if running[world] == 0 or ctl.failed[world] != 0:
+            return
+        if largest_violation(ctl, world) <= allowed_violation(ctl, world, tol):
+            return
+        if ctl.outer[world] >= limit:
+            ctl.failed[world] = FAIL_CONSTRAINT
+            return
+        ctl.outer[world] = ctl.outer[world] + 1
+        ctl.iterations[world] = 0
+        ctl.inversion_suspected[world] = 0
+        ctl.inverted[world] = 0
+        ctl.active[world] = 1
+        ctl.trial_accepted[world] = 1
+
+    @wp.kernel(module=module)
+    def free_step(ctl: Control):
+        """Reset the step limit to the full step."""
+        world = wp.tid()
+        if ctl.active[world] != 0:
+            ctl.limit[world] = f64(1.0)
+
+    return _types.SimpleNamespace(
+        free_step=free_step, check_constraints=check_constraints, begin_refresh=begin_refresh, end_refresh=end_refresh
+    )

@@ -1,0 +1,84 @@
+"""Block-diagonal matrices of uncoupled components, each a dense matrix: [world part, i, j]."""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from ..common.lanes import lane_functions
+from ..common.structs import pattern_struct
+from ..common.types import SHORT_UNROLL, kernel_module, precision
+
+__all__ = ["part_kernels"]
+
+
+@functools.cache
+def part_kernels(dtype: str) -> _types.SimpleNamespace:
+    """Kernels in one precision. `slot`: [part, place] or -1; `part_of`, `place_of`: [slot]."""
+    p = precision(dtype)
+    T, mat33 = p.T, p.mat33
+    Pattern = pattern_struct()
+    scalar_sum = lane_functions(dtype).scalar_sum
+    module = kernel_module(f"parts_{dtype}", max_unroll=SHORT_UNROLL)
+
+    @wp.kernel(module=module)
+    def spread(flags: wp.array(dtype=wp.int32), out: wp.array(dtype=wp.int32)):
+        """World flags copied to each component."""
+        block = wp.tid()
+        out[block] = flags[block / (out.shape[0] / flags.shape[0])]
+
+    @wp.kernel(module=module)
+    def fill_parts(
+        pattern: Pattern, value: wp.array2d(dtype=mat33), slot: wp.array2d(dtype=wp.int32),
+        place_of: wp.array(dtype=wp.int32), flags: wp.array(dtype=wp.int32), scale: wp.array2d(dtype=T),
+        matrix: wp.array3d(dtype=T),
+    ):  # fmt: skip
+        """A as dense matrices, and its diagonal; rows without a slot are zero."""
+        block, row = wp.tid()
+        if flags[block] == 0:
+            return
+        for j in range(matrix.shape[2]):
+            matrix[block, row, j] = T(0.0)
+        scale[block, row] = T(0.0)
+        place = row / 3
+        part = block % slot.shape[0]
+        if place >= slot.shape[1]:
+            return
+        own = slot[part, place]
+        if own < 0:
+            return
+        i = row % 3
+        for k in range(pattern.start[own], pattern.start[own + 1]):
+            A = value[block / slot.shape[0], k]
+            other = pattern.column[k]
+            for j in range(3):
+                matrix[block, row, 3 * place_of[other] + j] = A[i, j]
+            if other == own:
+                scale[block, row] = A[i, i]
+
+    @wp.kernel(module=module)
+    def apply_parts(
+        matrix: wp.array3d(dtype=T), slot: wp.array2d(dtype=wp.int32), lanes: int, r: wp.array2d(dtype=T),
+        active: wp.array(dtype=wp.int32), x: wp.array2d(dtype=T),
+    ):  # fmt: skip
+        """x = A^-1 r with dense inverses, `lanes` threads per row."""
+        world, index = wp.tid()
+        if active[world] == 0:
+            return
+        n = 3 * slot.shape[1]
+        row = wp.min(index / lanes, slot.shape[0] * n - 1)
+        part = row / n
+        i = row % n
+        own = slot[part, i / 3]
+        block = world * slot.shape[0] + part
+        s = T(0.0)
+        if own >= 0:
+            for j in range(index % lanes, n, lanes):
+                other = slot[part, j / 3]
+                if other >= 0:
+                    s += matrix[block, i, j] * r[world, 3 * other + j % 3]
+        s = scalar_sum(s, lanes)
+        if index % lanes == 0 and own >= 0:
+            x[world, 3 * own + i % 3] = s
+
+    return _types.SimpleNamespace(module=module, spread=spread, fill_parts=fill_parts, apply_parts=apply_parts)

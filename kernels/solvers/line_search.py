@@ -1,0 +1,260 @@
+"""Line search of Newton's method: acceptance of trials and choice of the next step length. One thread per world."""
+
+import types as _types
+
+import warp as wp
+
+from ..common.traits import Traits
+from .convergence import judging_functions
+from .newton_control import FAIL_JACOBIAN, FAIL_LINE_SEARCH, control_struct
+
+__all__ = ["MAX_TRUST_RADIUS", "NOISE", "search_kernels"]
+
+ARMIJO = 1.0e-4
+WOLFE = 0.8
+NOISE = 100.0  # roundings of its parts below which changes of Phi are noise
+MAX_SEARCH = 20
+REUSED_SEARCH = 2
+MAX_NONMONOTONE = 5
+"""Consecutive full steps that may raise Phi: with the predicted stress in H, a slender body reaches equilibrium over
+iterates whose membrane energy is far above that of both ends (Magisano, Leonetti and Garcea 2017)."""
+MAX_TRUST_RADIUS, RADIUS_SHRINK = 0.5, 0.4
+"""Largest rotation or stretch of an element in such a step, and its reduction factor after restoring the best
+iterate."""
+SOLVES_WITHOUT_STEP = 10  # solves without a step after which the exact tangent is used; with 0 soft solids take longer
+MAX_DOUBLINGS = 30  # maximum doublings of a step along which Phi is concave
+MAX_PENETRATING_STEPS = 1  # maximum deep penetrations by full steps in an attempt: the return may end at the start
+KINK, KINKS = 0.5, 8
+"""Contact: a positive slope of Phi at a trial above KINK times that at the iterate indicates that slipping points have
+reversed and Phi has a kink before. It is located by at most KINKS trials: a step beyond it makes the points slip back,
+again and again, while one that ends near it makes them stick."""
+
+
+def search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
+    """Kernels in the module of Newton's method, and the function `tangent_needed`."""
+    f64 = wp.float64
+    Control = control_struct()
+    stored, unilateral, midpoint, limited = traits.stored, traits.unilateral, traits.midpoint, traits.limited
+    judging = judging_functions(traits)
+    objective, magnitude, evaluate_norms = judging.objective, judging.magnitude, judging.evaluate_norms
+    check_convergence, fail = judging.check_convergence, judging.fail
+
+    @wp.func
+    def tangent_needed(ctl: Control, world: int) -> bool:
+        """True if solves with matrices other than the tangent have failed too often, for laws with their own tangent:
+        beyond a bifurcation only the exact tangent gives descent."""
+        return ctl.linear_stress == 0 and ctl.linear_solves[world] - ctl.iterations[world] > SOLVES_WITHOUT_STEP
+
+    @wp.func
+    def track_best(ctl: Control, world: int, old_phi: f64, old_norm: f64):
+        """Bookkeeping after a step that raised Phi and the steps that follow it: restore the best iterate if for LEAPS
+        steps neither the residual halved nor Phi fell below its best value."""
+        if ctl.nonmonotone_steps[world] == 0:
+            ctl.store_best[world] = 1
+            ctl.best_phi[world] = old_phi
+            if wp.static(unilateral):
+                ctl.penetrating_steps[world] = ctl.penetrating_steps[world] + 1
+            ctl.best_norm[world] = old_norm
+        if wp.static(not midpoint):
+            ctl.predicted_stress[world] = 1
+        counts = True
+        if wp.static(unilateral):  # Phi decreases monotonically on the way back out of an obstacle
+            counts = ctl.nonmonotone_steps[world] == 0 or not ctl.phi[world] < old_phi
+        if counts:
+            ctl.nonmonotone_steps[world] = ctl.nonmonotone_steps[world] + 1
+        if ctl.norm[world] <= f64(0.5) * ctl.best_norm[world] or ctl.phi[world] < ctl.best_phi[world]:
+            ctl.nonmonotone_steps[world] = 0
+            ctl.trust_radius[world] = wp.min(f64(2.0) * ctl.trust_radius[world], f64(MAX_TRUST_RADIUS))
+        elif ctl.nonmonotone_steps[world] >= MAX_NONMONOTONE and ctl.active[world] != 0:
+            ctl.restore_best[world] = 1
+            ctl.searching[world] = 1
+
+    @wp.kernel(module=module)
+    def limit_nonmonotone_step(ctl: Control):
+        """Length of a nonmonotone step: the rotation and stretch of elements stay below the trust radius."""
+        world = wp.tid()
+        if ctl.active[world] != 0 and ctl.nonmonotone_trial[world] == 1:
+            ctl.nonmonotone_trial[world] = 2
+            ctl.searching[world] = 1
+            most = ctl.dq_dv[world] * ctl.direction_gradient[world]
+            ctl.alpha[world] = wp.min(ctl.alpha[world], ctl.trust_radius[world] / wp.max(most, f64(1.0e-300)))
+
+    @wp.func
+    def accept_trial(ctl: Control, world: int, stands: bool, nonmonotone: bool):
+        """Accept the trial and end the search: norms, tolerance of the next solve, convergence.
+
+        `stands`: the trial is the iterate itself or the best one. `nonmonotone`: it may have raised Phi.
+        """
+        old_norm = ctl.norm[world]
+        old_worst = ctl.residual_ratio[world]
+        old_phi = ctl.phi[world]
+        ctl.searching[world] = 0
+        evaluate_norms(ctl, world)
+        ctl.phi[world] = objective(ctl, world) + ctl.slot_sums[7, world]
+        if wp.static(stored):
+            ctl.trial_accepted[world] = 1
+        if wp.static(stored and not midpoint):
+            more = ctl.term_sums[1, world] - ctl.term_sums[0, world]
+            ctl.phi[world] = ctl.phi[world] + more / ctl.dq_dv[world]
+        ctl.phi_magnitude[world] = magnitude(ctl, world)
+        if stands:
+            if ctl.reused[world] != 0:
+                ctl.reused[world] = 2
+            if ctl.restore_best[world] != 0:
+                ctl.restore_best[world] = 0
+                ctl.trust_radius[world] = f64(RADIUS_SHRINK) * ctl.trust_radius[world]
+                ctl.nonmonotone_steps[world] = 0
+                if wp.static(not midpoint):
+                    ctl.predicted_stress[world] = wp.where(tangent_needed(ctl, world), 0, 2)
+                ctl.require_armijo[world] = 1
+        else:
+            ctl.iterations[world] = ctl.iterations[world] + 1
+            if ctl.require_armijo[world] != 0:
+                ctl.require_armijo[world] = 0
+                if wp.static(not midpoint):
+                    ctl.predicted_stress[world] = wp.where(tangent_needed(ctl, world), 0, 1)
+        ctl.total_iterations[world] = ctl.total_iterations[world] + 1
+        ratio = ctl.norm[world] / wp.max(old_norm, f64(1.0e-300))
+        if ctl.groups > ctl.components:  # one group's forces may dwarf those of the unconverged groups
+            ratio = ctl.residual_ratio[world] / wp.max(old_worst, f64(1.0e-300))
+        ctl.reduction[world] = ratio
+        eta = f64(0.9) * ratio * ratio
+        guard = f64(0.9) * ctl.forcing[world] * ctl.forcing[world]
+        if guard > f64(0.1):
+            eta = wp.max(eta, guard)
+        if ctl.fixed_forcing == 0 and not stands:
+            ctl.forcing[world] = wp.clamp(eta, f64(1.0e-6), f64(0.1))
+        if wp.static(not unilateral):
+            check_convergence(ctl, world)
+        if not stands and ctl.estimate_error[world] == 0 and (nonmonotone or ctl.nonmonotone_steps[world] > 0):
+            track_best(ctl, world, old_phi, old_norm)
+
+    @wp.func
+    def shorten(ctl: Control, world: int, reused: bool):
+        """Halve the step, or end the search; `reused`: the operator is of an earlier iterate."""
+        ctl.nonmonotone_trial[world] = 0
+        ctl.searches[world] = ctl.searches[world] + 1
+        ctl.alpha[world] = f64(0.5) * ctl.alpha[world]
+        if reused and ctl.searches[world] > REUSED_SEARCH:
+            # the reused operator is at fault: keep the iterate and solve with its own operator
+            ctl.alpha[world] = f64(0.0)
+        if ctl.searches[world] > MAX_SEARCH:
+            why = FAIL_LINE_SEARCH
+            if ctl.domain_J[world] <= f64(0.0):
+                why = FAIL_JACOBIAN
+            fail(ctl, world, why)
+
+    @wp.func
+    def lengthen(ctl: Control, world: int, good: bool, slope: f64) -> bool:
+        """Double the step while Phi falls ever faster along it, undo the last doubling if the trial fails: replaces
+        solves near a saddle. Statics, after a solve that met negative curvature."""
+        alpha = ctl.alpha[world]
+        longer = (
+            good and slope <= ctl.slope[world] and ctl.doublings[world] >= 0 and ctl.doublings[world] < MAX_DOUBLINGS
+        )
+        if wp.static(limited):
+            longer = longer and f64(2.0) * alpha <= ctl.limit[world]
+        if longer:
+            ctl.doublings[world] = ctl.doublings[world] + 1
+            ctl.alpha[world] = f64(2.0) * alpha
+        elif not good and ctl.doublings[world] > 0:
+            ctl.doublings[world] = -1
+            ctl.alpha[world] = f64(0.5) * alpha
+            longer = True
+        return longer
+
+    @wp.func
+    def bracket_step(ctl: Control, world: int, slope: f64) -> f64:
+        """Next step length when the trial is beyond a kink of Phi, or still steep before it: Illinois method on slopes
+        (Dowell and Jarratt 1971)."""
+        alpha = ctl.alpha[world]
+        low = wp.vec2d(ctl.bracket_low[world])
+        high = wp.vec2d(ctl.bracket_high[world])
+        if slope > f64(0.0):
+            if high[0] > f64(0.0) and ctl.searches[world] > 1:
+                low[1] = f64(0.5) * low[1]
+            high = wp.vec2d(alpha, slope)
+        else:
+            high[1] = f64(0.5) * high[1]
+            low = wp.vec2d(alpha, slope)
+        ctl.bracket_low[world] = low
+        ctl.bracket_high[world] = high
+        part = wp.clamp(low[1] / (low[1] - high[1]), f64(0.05), f64(0.95))
+        return low[0] + part * (high[0] - low[0])
+
+    @wp.kernel(module=module)
+    def check_trial(ctl: Control):
+        """Armijo test on Phi above its noise, else sign of the slope; then convergence."""
+        world = wp.tid()
+        if ctl.searching[world] == 0:
+            return
+        alpha = ctl.alpha[world]
+        old_norm = ctl.norm[world]
+        old_phi = ctl.phi[world]
+        # frozen forces keep their symmetric tangent: the curvature of Phi then agrees with H
+        bend = ctl.dq_dv[world] * ctl.tangent_sum[0, world]
+        phi = objective(ctl, world) - f64(0.5) * alpha * alpha * bend
+        norm = wp.sqrt(ctl.slot_sums[0, world])
+        change = phi - old_phi
+        noise = f64(NOISE) * ctl.eps * (ctl.phi_magnitude[world] + magnitude(ctl, world))
+        finite = wp.isfinite(phi) and wp.isfinite(norm)
+        good = finite
+        if good:
+            if wp.abs(change) > noise:
+                good = change <= f64(ARMIJO) * alpha * ctl.slope[world]
+            else:
+                good = ctl.slot_sums[6, world] - alpha * bend <= f64(WOLFE) * wp.abs(ctl.slope[world])
+            if wp.static(midpoint):
+                good = finite and change <= f64(-2.0) * f64(ARMIJO) * alpha * old_phi
+            if ctl.nonpotential != 0 and norm <= f64(0.5) * old_norm:
+                good = True
+        if ctl.domain_J[world] <= f64(0.0):
+            good = False
+        reused = ctl.reused[world] != 0
+        if reused and ctl.iterations[world] == 0 and not norm <= f64(0.5) * old_norm:
+            good = False  # a step must not start worse than with its own operator
+            ctl.searches[world] = REUSED_SEARCH
+        stands = alpha == f64(0.0) or ctl.restore_best[world] != 0
+        wants_nonmonotone = finite and not (good or stands or reused) and ctl.searches[world] == 0
+        wants_nonmonotone = (
+            wants_nonmonotone and ctl.nonmonotone_trial[world] == 0 and ctl.negative_curvature[world] == 0
+        )
+        wants_nonmonotone = wants_nonmonotone and (ctl.require_armijo[world] == 0 or ctl.predicted_stress[world] == 2)
+        if wp.static(
+            unilateral
+        ):  # into an obstacle and back; friction has a convex potential, and full steps overshoot
+            wants_nonmonotone = (
+                wants_nonmonotone
+                and ctl.frozen_updated[world] == 0
+                and ctl.penetrating_steps[world] < MAX_PENETRATING_STEPS
+            )
+        if wp.static(unilateral and not midpoint):  # sticking begins where Phi rises again
+            slope = ctl.slot_sums[6, world] - alpha * bend
+            steep = f64(KINK) * wp.abs(ctl.slope[world])
+            tries = (
+                not (stands or wants_nonmonotone or reused)
+                and ctl.nonmonotone_trial[world] == 0
+                and ctl.searches[world] < KINKS
+            )
+            beyond = slope > steep or (ctl.bracket_high[world][0] > f64(0.0) and slope < -steep)
+            if tries and beyond and finite and ctl.domain_J[world] > f64(0.0):
+                ctl.searches[world] = ctl.searches[world] + 1
+                ctl.alpha[world] = bracket_step(ctl, world, slope)
+                return
+        if lengthen(ctl, world, good and not (stands or reused), ctl.slot_sums[6, world] - alpha * bend):
+            return
+        nonmonotone = ctl.nonmonotone_trial[world] == 2 and finite and ctl.min_J[world] > f64(0.0)
+        if good or stands or nonmonotone:
+            accept_trial(ctl, world, stands, nonmonotone)
+        elif wants_nonmonotone:
+            ctl.nonmonotone_trial[world] = 1
+            ctl.searching[world] = 0
+            wp.atomic_max(ctl.any_rare, 0, 1)
+        elif ctl.nonmonotone_steps[world] > 0:
+            ctl.restore_best[world] = 1
+        else:
+            shorten(ctl, world, reused)
+
+    return _types.SimpleNamespace(
+        tangent_needed=tangent_needed, limit_nonmonotone_step=limit_nonmonotone_step, check_trial=check_trial
+    )

@@ -1,0 +1,138 @@
+"""Step control data of each world, report columns, time integration coefficients."""
+
+import functools
+import types as _types
+
+import warp as wp
+
+__all__ = ["GROWTH", "REPORT", "SAME_TIME", "STATUS", "Coefficients", "step_span", "step_struct"]
+
+STATUS = {"running": 0, "failed": 1, "frozen": 2}
+
+REPORT = (
+    "status",
+    "newton",
+    "pcg",
+    "residual",
+    "halvings",
+    "min_J",
+    "time",
+    "failure",
+    "attempt_time",
+    "violation",
+    "outer",
+    "residual_force",
+    "rough",
+    "floor",
+    "energy_growth",
+)
+"""Columns of the report of a step, [world, column] in float64; probes follow."""
+
+SAME_TIME = 1e-6
+"""Times closer than this fraction of a step are equal."""
+GROWTH = ("share", "largest", "turnover", "added", "since", "steps", "next")
+"""Columns of the monitor of spurious energy growth: energy added by integrator and residuals over the peak energy;
+largest stored energy, J; sum of |work| and viscous loss, J; added energy, J; time at which the share first exceeded
+`growth_warn_limit`, s; substeps since the onset of loads; sum of |work| and loss, J, at the next onset."""
+
+
+@wp.struct
+class Coefficients:
+    """Coefficients of a time discretisation.
+
+    q~ = a0 q_n - a1 q_{n-1} + b v_n + q_a a_n and v~ = a0 v_n - a1 v_{n-1} + v_a a_n + v_w w_n; a_n are algorithmic
+    accelerations, a_{n+1} = a_v (v - v_n) - a_a a_n, and w_n those of the equilibrium, q''.
+    """
+
+    a0: wp.float64
+    a1: wp.float64
+    b: wp.float64  # s
+    dq_dv: wp.float64  # s
+    mass_factor: wp.float64  # 1/s
+    q_a: wp.float64  # s^2
+    v_a: wp.float64  # s
+    v_w: wp.float64  # s
+    a_v: wp.float64  # 1/s
+    a_a: wp.float64
+
+
+@functools.cache
+def step_struct():
+    """Step control data of each world."""
+
+    @wp.struct
+    class StepControl:
+        status: wp.array(dtype=wp.int32)  # STATUS
+        running: wp.array(dtype=wp.int32)  # this step is unfinished
+        level: wp.array(dtype=wp.int32)
+        part: wp.array(dtype=wp.int32)  # finished substeps at this level
+        halvings: wp.array(dtype=wp.int32)
+        refused: wp.array(dtype=wp.int32)  # in this attempt
+        accepted: wp.array(dtype=wp.int32)
+        first_refusal: wp.array(dtype=wp.int32)
+        time: wp.array(dtype=wp.float64)  # s, state
+        summed: wp.array(dtype=wp.float64)  # s, state: sum of the steps, where `time` was snapped to an end nearby
+        stop: wp.array(dtype=wp.float64)  # [2] s: end of the run, inf without; round-off of its times
+        ends: wp.array(dtype=wp.float64)  # s, end of each world, if set
+        new_time: wp.array(dtype=wp.float64)  # end of the attempt
+        stage_time: wp.array(dtype=wp.float64)  # its midpoint, for midpoint schemes
+        step_start: wp.array(dtype=wp.float64)
+        h: wp.array(dtype=wp.float64)
+        previous_h: wp.array(dtype=wp.float64)  # state of multistep schemes; 0 before the first step
+        previous_end: wp.array(dtype=wp.float64)  # end time of the previous step, of schemes that use its state
+        dt: wp.array(dtype=wp.float64)
+        a0: wp.array(dtype=wp.float64)  # q~ = a0 q_n - a1 q_{n-1} + b v_n
+        a1: wp.array(dtype=wp.float64)
+        b: wp.array(dtype=wp.float64)  # of schemes with v_n in q~
+        q_a: wp.array(dtype=wp.float64)  # of schemes with accelerations in their state
+        h_before: wp.array(dtype=wp.float64)  # s, of the same schemes: the step that led to a_n, at least h / STRETCH
+        dq_dv: wp.array(dtype=wp.float64)
+        mass_factor: wp.array(dtype=wp.float64)  # c_M of the inertia; in statics of the springs, `stabilise`
+        ramp: wp.array(dtype=wp.float64)  # factor of constant loads
+        gravity: wp.array(dtype=wp.vec3d)
+        any_running: wp.array(dtype=wp.int32)
+        any_refused: wp.array(dtype=wp.int32)  # [2] first refusal in the step; final failure
+        max_halvings: wp.int32
+        newton_budget: wp.int32  # Newton iterations in a step after which it is not halved; 0: no limit
+        parameter: wp.float64  # of the integrator
+        stabilise: wp.float64  # N/m per kg, statics: springs from the last equilibrium, none at full load
+        total_J: wp.array(dtype=wp.float64)
+        ledger_time: wp.array(dtype=wp.float64)  # s, time of the last ledger update
+        growth: wp.array2d(dtype=wp.float64)  # [world, GROWTH], in the state; if monitored
+        watched: wp.int32  # 1: energy growth is monitored
+        counted: wp.float64  # 1: the work of residuals counts; 0: it does not, as a drive balances it
+        growth_warn_limit: wp.float64  # share of the energy at which the time is recorded
+        growth_limit: wp.float64  # share at which steps are refused
+        least_energy: wp.array(dtype=wp.float64)  # [world] J, round-off level of the energy
+
+    return StepControl
+
+
+@functools.cache
+def step_span() -> _types.SimpleNamespace:
+    """Device functions of the end of a run or world, matched by the last step."""
+    f64 = wp.float64
+    Step = step_struct()
+
+    @wp.func
+    def end(step: Step, world: int) -> f64:
+        """End of the run or of the world, s."""
+        first = step.stop[0]
+        if step.ends:
+            first = wp.min(first, step.ends[world])
+        return first
+
+    @wp.func
+    def slack(step: Step, world: int) -> f64:
+        """Time tolerance, s."""
+        return wp.max(f64(SAME_TIME) * step.dt[world], step.stop[1])
+
+    @wp.func
+    def span(step: Step, world: int) -> f64:
+        """Length of the step, s: dt, or the remainder to the end."""
+        left = end(step, world) - step.step_start[world]
+        if left < step.dt[world] - slack(step, world):
+            return left
+        return step.dt[world]
+
+    return _types.SimpleNamespace(end=end, slack=slack, span=span)

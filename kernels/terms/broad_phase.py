@@ -1,0 +1,174 @@
+"""Master facets during an attempt: polynomial coefficients, midpoints, and bounding boxes of the tree."""
+
+import functools
+import types as _types
+from typing import Any
+
+import warp as wp
+
+from ..common.types import SHORT_UNROLL, kernel_module, precision
+from .facet_projection import facet_projection_functions
+from .pair_structs import master_struct, pair_scratch_struct
+
+__all__ = ["MARGIN", "broad_phase_kernels"]
+
+MARGIN = 0.25
+"""Enlargement of the boxes of the tree over a facet's side: they stay valid for several steps."""
+ROUNDING = 2.4e-7
+
+
+@functools.cache
+def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
+    """Kernels in one precision of the displacements, in the module of `facet_search_kernels`, and box functions."""
+    vec3 = precision(dtype).vec3
+    f64, vec3d, box3 = wp.float64, wp.vec3d, wp.vec3
+    mat43 = wp.types.matrix(shape=(4, 3), dtype=f64)
+    Masters, PairScratch = master_struct(dtype), pair_scratch_struct(dtype)
+    f = facet_projection_functions(dtype)
+    SurfacePoint, surface_point, facet_centre, unit_normal = (
+        f.SurfacePoint,
+        f.surface_point,
+        f.facet_centre,
+        f.unit_normal,
+    )
+    module = kernel_module(f"pair_seek_{dtype}", max_unroll=SHORT_UNROLL)
+
+    @wp.func
+    def set_coefficient(
+        mas: Masters, u: wp.array2d(dtype=Any), world: int, item: int, m: int, C: wp.array2d(dtype=vec3d),
+        D: wp.array2d(dtype=vec3d),
+    ):  # fmt: skip
+        """Coefficient m of a slot field on a master facet."""
+        c = vec3d()
+        d = vec3d()
+        for i in range(mas.conn.shape[0]):
+            value = vec3d(u[world, mas.conn[i, item]])
+            c += f64(mas.shape[m, i, item]) * value
+            d += f64(mas.director_shape[m, i, item]) * value
+        C[world, mas.max_monomials * item + m] = c
+        D[world, mas.max_monomials * item + m] = d
+
+    @wp.kernel(module=module)
+    def update_coefficients(
+        mas: Masters, u: wp.array2d(dtype=vec3d), active: wp.array(dtype=wp.int32), C: wp.array2d(dtype=vec3d),
+        D: wp.array2d(dtype=vec3d),
+    ):  # fmt: skip
+        """Coefficients of displacements on master facets in float64, see kernels/terms/double_displacements.py."""
+        world, item, m = wp.tid()
+        if active[world] != 0 and m < mas.monomials[mas.kind[item]]:
+            set_coefficient(mas, u, world, item, m, C, D)
+
+    @wp.kernel(module=module)
+    def initial_coefficients(
+        mas: Masters, u_n: wp.array2d(dtype=vec3), v_n: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32),
+        pair: PairScratch,
+    ):  # fmt: skip
+        """Coefficients of displacements and velocities at the start of an attempt; resets the largest depths."""
+        world, item, m = wp.tid()
+        if active[world] != 0:
+            for body in range(
+                mas.max_monomials * item + m, pair.deepest_contact.shape[1], mas.max_monomials * mas.count
+            ):
+                pair.deepest_contact[world, body] = f64(0.0)
+        if active[world] != 0 and m < mas.monomials[mas.kind[item]]:
+            set_coefficient(mas, v_n, world, item, m, pair.V0, pair.D0)
+            set_coefficient(mas, u_n, world, item, m, pair.C0, pair.D0)
+
+    @wp.func
+    def down(x: vec3d) -> box3:
+        """x in single precision, rounded down by more than its largest round-off."""
+        return box3(
+            wp.float32(x[0] - wp.abs(x[0]) * f64(ROUNDING)),
+            wp.float32(x[1] - wp.abs(x[1]) * f64(ROUNDING)),
+            wp.float32(x[2] - wp.abs(x[2]) * f64(ROUNDING)),
+        )
+
+    @wp.func
+    def up(x: vec3d) -> box3:
+        """x in single precision, rounded up."""
+        return -down(-x)
+
+    @wp.func
+    def contains(low: box3, high: box3, other_low: box3, other_high: box3) -> bool:
+        """True if a box contains another one."""
+        inside = bool(True)
+        for j in range(3):
+            if other_low[j] < low[j] or other_high[j] > high[j]:
+                inside = False
+        return inside
+
+    @wp.func
+    def pack_surface_point(s: SurfacePoint) -> mat43:
+        """Position and derivatives, packed in a matrix."""
+        return mat43(s.x[0], s.x[1], s.x[2], s.a[0], s.a[1], s.a[2], s.b[0], s.b[1], s.b[2], s.c[0], s.c[1], s.c[2])
+
+    @wp.func
+    def unpack_surface_point(m: mat43) -> SurfacePoint:
+        """Position and derivatives from their matrix."""
+        return SurfacePoint(m[0], m[1], m[2], m[3])
+
+    @wp.kernel(module=module)
+    def check_boxes(mas: Masters, active: wp.array(dtype=wp.int32), pair: PairScratch):
+        """Flag facets outside of their boxes, at the start of the attempt or now; compute new boxes."""
+        world, item = wp.tid()
+        if active[world] == 0:
+            return
+        low = vec3d(f64(1.0e300), f64(1.0e300), f64(1.0e300))
+        high = -low
+        kind = mas.kind[item]
+        count = mas.monomials[kind]
+        for q in range(count):
+            x = vec3d()
+            y = vec3d()
+            for m in range(count):
+                part = mas.hull[kind, q, m]
+                if part != f64(0.0):
+                    x += part * (mas.X[m, item] + pair.C[world, mas.max_monomials * item + m])
+                    y += part * (mas.X[m, item] + pair.C0[world, mas.max_monomials * item + m])
+            low = wp.min(low, wp.min(x, y))
+            high = wp.max(high, wp.max(x, y))
+        index = world * mas.count + item
+        if not contains(pair.lower[index], pair.upper[index], down(low), up(high)):
+            pair.refit_needed[0] = 1
+        room = f64(MARGIN) * mas.size[item]
+        pad = vec3d(room, room, room)
+        pair.refit_lower[index] = down(low - pad)
+        pair.refit_upper[index] = up(high + pad)
+
+    @wp.kernel(module=module)
+    def update_centres(mas: Masters, active: wp.array(dtype=wp.int32), pair: PairScratch):
+        """Position and derivatives at the midpoint of each facet, at the start of the attempt and now, and the facet's
+        largest height above the tangent plane there."""
+        world, item = wp.tid()
+        if active[world] == 0:
+            return
+        kind = mas.kind[item]
+        count = mas.monomials[kind]
+        xi = facet_centre(mas.corners[kind])
+        s = surface_point(mas, pair.C, pair.D, world, item, xi)
+        n = unit_normal(s)
+        bulge = f64(0.0)
+        for q in range(count):
+            x = vec3d()
+            for m in range(count):
+                x += mas.hull[kind, q, m] * (mas.X[m, item] + pair.C[world, mas.max_monomials * item + m])
+            bulge = wp.max(bulge, wp.dot(x - s.x, n))
+        pair.bulge[world, item] = bulge
+        pair.centre[world, item] = pack_surface_point(s)
+        pair.centre0[world, item] = pack_surface_point(surface_point(mas, pair.C0, pair.D0, world, item, xi))
+
+    @wp.kernel(module=module)
+    def accept_boxes(pair: PairScratch):
+        """Replace the boxes by the new ones."""
+        index = wp.tid()
+        pair.lower[index] = pair.refit_lower[index]
+        pair.upper[index] = pair.refit_upper[index]
+        if index == 0:
+            pair.refit_needed[0] = 0
+            pair.refits[0] = pair.refits[0] + 1
+
+    return _types.SimpleNamespace(
+        update_coefficients=update_coefficients, initial_coefficients=initial_coefficients, check_boxes=check_boxes,
+        update_centres=update_centres, accept_boxes=accept_boxes, down=down, up=up, contains=contains,
+        unpack_surface_point=unpack_surface_point,
+    )  # fmt: skip

@@ -1,0 +1,360 @@
+"""A surface point against its obstacle: position, normal force, friction, and their derivative."""
+
+import functools
+import types as _types
+from typing import Any
+
+import warp as wp
+
+from ..common.types import precision
+from .contact_colliders import collider_functions
+from .contact_laws import DEFAULT, PAPER, SMOOTH, law_functions
+from .contact_mesh import MESH
+from .contact_structs import (
+    clock_struct,
+    contact_scratch_struct,
+    contact_struct,
+    facet_struct,
+    history_struct,
+    of_world,
+)
+
+__all__ = ["contact_point_functions"]
+
+
+@functools.cache
+def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
+    """Device functions in one precision of the displacements; everything else is float64. `meshes`: some collider is a
+    mesh."""
+    T = precision(dtype).T
+    f64, vec3d, mat33d = wp.float64, wp.vec3d, wp.mat33d
+    Contacts, Facets = contact_struct(meshes), facet_struct(dtype)
+    History, ContactScratch, Clock = history_struct(), contact_scratch_struct(dtype), clock_struct()
+    colliders, laws = collider_functions(meshes), law_functions()
+    distance, sweep, depth_change, stored_side = (
+        colliders.distance,
+        colliders.sweep,
+        colliders.depth_change,
+        colliders.stored_side,
+    )
+    SLIP_FLAG = colliders.SLIP_FLAG
+    normal_law, elastic = laws.normal_law, laws.elastic
+    friction, smooth_friction = laws.friction, laws.smooth_friction
+
+    @wp.struct
+    class PointContact:
+        """A point at an iterate; forces are of the whole region."""
+
+        n: vec3d  # outward normal of the shape
+        depth: f64
+        depth_increment: (
+            f64  # change of depth in the step; of a moving contact point, from the depth of the previous one
+        )
+        side: wp.int32
+        law: wp.vec4d  # normal force, its derivative, its potential, the magnitude of the potential's terms
+        m: vec3d  # normal of the plane of friction
+        relative_motion: vec3d  # in the step, relative to the collider, m
+        elastic_slip: vec3d  # motion plus spring, m
+        slip: vec3d  # motion in that plane, m
+        q: vec3d  # spring: tangential slip since it was anchored, m
+        y: vec3d  # position in the collider's frame, m
+
+    @wp.func
+    def interpolate(facets: Facets, field: wp.array2d(dtype=Any), world: int, point: int, item: int) -> vec3d:
+        """sum_i s_i field_i at a point."""
+        out = vec3d()
+        for i in range(facets.conn.shape[0]):
+            out += f64(facets.shape[point, i, item]) * vec3d(field[world, facets.conn[i, item]])
+        return out
+
+    @wp.func
+    def acting_shape(facets: Facets, scr: ContactScratch, world: int, point: int, i: int, item: int) -> T:
+        """Shape value of slot i at the active point: a point of a facet, or that of a lumped contact."""
+        if facets.tracks_deepest != 0:
+            return scr.shape_values[world, facets.contact[item], i]
+        return facets.shape[point, i, item]
+
+    @wp.func
+    def interpolate_acting(
+        facets: Facets, scr: ContactScratch, field: wp.array2d(dtype=Any), world: int, point: int, item: int
+    ) -> vec3d:
+        """sum_i s_i field_i at the active point."""
+        if facets.tracks_deepest == 0:
+            return interpolate(facets, field, world, point, item)
+        out = vec3d()
+        for i in range(facets.conn.shape[0]):
+            out += f64(acting_shape(facets, scr, world, point, i, item)) * vec3d(field[world, facets.conn[i, item]])
+        return out
+
+    @wp.func
+    def reference_position(facets: Facets, scr: ContactScratch, world: int, point: int, item: int) -> vec3d:
+        """Reference position of the active point, m."""
+        if facets.tracks_deepest != 0:
+            return scr.point_reference[world, facets.contact[item]]
+        return facets.X[point, item]
+
+    @wp.func
+    def monomial(x: f64, power: int, derivative: int) -> f64:
+        """Derivative of x^power."""
+        out = f64(1.0)
+        for j in range(derivative):
+            out *= f64(power - j)
+        for _ in range(power - derivative):
+            out *= x
+        return out
+
+    @wp.func
+    def lagrange(facets: Facets, q: int, s: wp.vec2d) -> f64:
+        """Lagrange polynomial of a facet: 1 at point q and 0 at the others."""
+        out = f64(0.0)
+        for m in range(facets.power.shape[0]):
+            out += facets.basis[q, m] * (monomial(s[0], facets.power[m][0], 0) * monomial(s[1], facets.power[m][1], 0))
+        return out
+
+    @wp.func
+    def tangential(n: vec3d, a: vec3d) -> vec3d:
+        """Component of a normal to n."""
+        return a - wp.dot(n, a) * n
+
+    @wp.func
+    def history_row(con: Contacts, c: int, point: int) -> int:
+        """Index of a point's history."""
+        if con.single_point[c] != 0:
+            return con.first[c]
+        return point
+
+    @wp.func
+    def remaining_overlap(con: Contacts, his: History, world: int, c: int, point: int, time: f64) -> f64:
+        """Remaining part of an initial overlap, m."""
+        left = f64(1.0) - (time - his.overlap_time[world]) / con.decay[c]
+        return his.overlap[world, point] * wp.clamp(left, f64(0.0), f64(1.0))
+
+    @wp.func
+    def overlap_recovery(con: Contacts, his: History, clock: Clock, world: int, c: int, point: int) -> f64:
+        """Outward motion of the surface of an initial overlap in a substep, m: its force does work."""
+        now = clock.new_time[world]
+        before = remaining_overlap(con, his, world, c, point, now - clock.h[world])
+        return before - remaining_overlap(con, his, world, c, point, now)
+
+    @wp.func
+    def contact_distance(con: Contacts, his: History, world: int, c: int, point: int, time: f64, margin: f64) -> f64:
+        """Gap at which contact begins, m: offset + `margin` - remaining overlap."""
+        return con.offset[c] + margin - remaining_overlap(con, his, world, c, point, time)
+
+    @wp.func
+    def depth_before(
+        con: Contacts, facets: Facets, his: History, scr: ContactScratch, world: int, c: int, point: int
+    ) -> f64:
+        """Depth at the start of the step, m; for a moving point in contact, that of the deepest position then."""
+        if facets.tracks_deepest != 0:
+            rec = history_row(con, c, point)
+            if his.speed[world, rec] > f64(0.0):
+                return his.previous_depth[world, rec]
+        return scr.depth[world, point]
+
+    @wp.func
+    def damping_rate(con: Contacts, scr: ContactScratch, world: int, c: int, point: int, inv_h: f64) -> f64:
+        """Damping per depth of the normal law: chi/h, or gamma_n/h."""
+        if con.law[c] == DEFAULT:
+            return con.damping[world, c] * inv_h / scr.speed[world, point]
+        return con.beta[world, c] * wp.sqrt(con.scale[world, c]) * of_world(con.normal_damping, world, c) * inv_h
+
+    @wp.func
+    def tangent_damping(con: Contacts, world: int, c: int, stiffness: f64) -> f64:
+        """gamma_t of Eq. (80), N s/m."""
+        return f64(1.8257418583505538) * con.beta[world, c] * wp.sqrt(of_world(con.mass, world, c) * stiffness)
+
+    @wp.func
+    def with_friction_normal(t: PointContact, m: vec3d) -> PointContact:
+        """The point with friction in the plane of a normal m, frozen with the friction limits: on a curved shape the
+        force would not be the derivative of its potential if the plane turned with the iterate."""
+        out = t
+        out.m = m
+        out.slip = tangential(m, t.relative_motion)
+        out.q = tangential(m, t.elastic_slip)
+        return out
+
+    @wp.func
+    def evaluate_point(
+        con: Contacts, facets: Facets, his: History, scr: ContactScratch, world: int, c: int, q: int, item: int,
+        point: int, u: wp.array2d(dtype=vec3d), time: f64, inv_h: f64, shrink: f64,
+    ) -> PointContact:  # fmt: skip
+        """A point at displacements u (float64, see kernels/terms/double_displacements.py)."""
+        out = PointContact()
+        k = con.collider[c]
+        rec = history_row(con, c, point)
+        moved = interpolate_acting(facets, scr, u, world, q, item)
+        x = reference_position(facets, scr, world, q, item) + moved
+        rotation = scr.rotation[world, k]
+        out.y = wp.transpose(rotation) * (x - scr.position[world, k])
+        in_contact = his.speed[world, rec] > f64(0.0)
+        side = stored_side(con, k, in_contact, his.contact_state[world, rec])
+        contact_distance_now = contact_distance(con, his, world, c, point, time, con.margin[world, k])
+        d = wp.vec4d(f64(0.0), f64(0.0), f64(1.0), f64(0.0))
+        out.side = -1
+        far = bool(False)
+        if wp.static(meshes):  # lower bound of the distance, the last one minus the motion: avoids a search of the mesh
+            d[3] = (
+                scr.contact_distance[world, point]
+                - scr.depth[world, point]
+                - wp.length(out.y - scr.start[world, point])
+            )
+            far = (
+                con.kind[k] == MESH
+                and con.law[c] != SMOOTH
+                and not in_contact
+                and d[3] > wp.max(contact_distance_now, f64(0.0))
+            )
+        if not far:
+            out.side = sweep(con, k, scr.start[world, point], out.y, side)
+            d = distance(con, k, out.y, out.side)
+        out.n = rotation * vec3d(d[0], d[1], d[2])
+        out.depth = contact_distance_now - d[3]
+        motion = moved - scr.origin[world, point] - scr.translation[world, k]
+        if con.spin[k] >= 0:
+            motion -= scr.rotation_change[world, k] * (his.rotation[world, k] * scr.start[world, point])
+        before = scr.depth[world, point]
+        change = depth_change(con, k, out.side, scr.start[world, point], out.y, wp.transpose(rotation) * motion,
+                           scr.contact_distance[world, point] - before, d[3])  # fmt: skip
+        if change[1] != f64(0.0):
+            out.depth = before + change[0] + (contact_distance_now - scr.contact_distance[world, point])
+        rate = damping_rate(con, scr, world, c, point, inv_h)
+        k_n = con.scale[world, c] * of_world(con.normal, world, c)
+        previous_depth = depth_before(con, facets, his, scr, world, c, point)
+        out.law = normal_law(con.law[c], con.single_point[c], k_n, rate, con.ramp[c], con.force_eps[c], out.depth,
+                             previous_depth)  # fmt: skip
+        out.depth_increment = out.depth - previous_depth
+        out.relative_motion = motion
+        spring = vec3d()
+        if in_contact:
+            spring = his.spring[world, rec]
+            if con.law[c] != PAPER:
+                spring = shrink * (rotation * spring)
+        out.elastic_slip = spring + motion
+        return with_friction_normal(out, out.n)
+
+    @wp.func
+    def coefficient(con: Contacts, his: History, world: int, c: int, rec: int) -> f64:
+        """Friction coefficient: mu for a contact that slipped in the last step, else mu_static."""
+        in_contact = his.speed[world, rec] > f64(0.0)
+        if in_contact and his.contact_state[world, rec] >= SLIP_FLAG:
+            return con.mu[world, c]
+        return con.mu_static[world, c]
+
+    @wp.func
+    def set_explicit_force(
+        con: Contacts, his: History, scr: ContactScratch, world: int, c: int, point: int, delta: f64, n: vec3d,
+        v: vec3d, h: f64
+    ):  # fmt: skip
+        """Force and spring, Eqs. (77)-(83) unmodified, of a point at depth delta with relative velocity v, for a step
+        h."""
+        rec = history_row(con, c, point)
+        v_n_rel = wp.dot(v, n)
+        v_t = v - v_n_rel * n
+        beta = con.beta[world, c]
+        scale = con.scale[world, c]
+        spring = elastic(con.single_point[c], scale * of_world(con.normal, world, c), delta)[0]
+        gamma = beta * wp.sqrt(scale) * of_world(con.normal_damping, world, c)
+        k_t = scale * of_world(con.tangent, world, c)
+        if con.single_point[c] != 0:
+            gamma *= wp.sqrt(wp.sqrt(delta))
+            k_t *= wp.sqrt(delta)
+        force = wp.max(spring - gamma * v_n_rel, f64(0.0))
+        s = tangential(n, his.spring[world, rec] + h * v_t)
+        gamma_t = tangent_damping(con, world, c, k_t)
+        tangential_force = -k_t * s - gamma_t * v_t
+        friction_limit = coefficient(con, his, world, c, rec) * force
+        size = wp.length(tangential_force)
+        if size > friction_limit:
+            tangential_force = (friction_limit / size) * tangential_force
+            s = (f64(-1.0) / k_t) * (tangential_force + gamma_t * v_t)
+        scr.explicit_spring[world, point] = s
+        scr.explicit_force[world, point] = force * n + tangential_force
+
+    @wp.func
+    def frozen_values(
+        con: Contacts, his: History, scr: ContactScratch, world: int, c: int, point: int, t: PointContact
+    ) -> vec3d:
+        """Friction limit, k_t and reduction factor of the spring at an iterate."""
+        rec = history_row(con, c, point)
+        mu = coefficient(con, his, world, c, rec)
+        in_contact = his.speed[world, rec] > f64(0.0)
+        stiffness = con.scale[world, c] * of_world(con.tangent, world, c)
+        shrink = f64(1.0)
+        if con.single_point[c] != 0:
+            depth = wp.max(t.depth, f64(0.0))
+            stiffness *= wp.sqrt(depth)
+            before = t.depth - t.depth_increment
+            if in_contact and depth < before and con.law[c] == DEFAULT:
+                shrink = wp.sqrt(depth / before)
+        return vec3d(mu * t.law[0], stiffness, shrink)
+
+    @wp.func
+    def friction_trial(con: Contacts, world: int, c: int, t: PointContact, frozen: vec3d, inv_h: f64) -> wp.vec4d:
+        """Friction opposing the motion: trial force, and in w its total stiffness (spring and damper)."""
+        gamma = tangent_damping(con, world, c, frozen[1]) * inv_h
+        trial = frozen[1] * t.q + gamma * t.slip
+        return wp.vec4d(trial[0], trial[1], trial[2], frozen[1] + gamma)
+
+    @wp.func
+    def friction_potential(con: Contacts, world: int, c: int, t: PointContact, frozen: vec3d, inv_h: f64) -> f64:
+        """Friction potential with a frozen limit, J."""
+        if frozen[0] <= f64(0.0):
+            return f64(0.0)
+        if con.law[c] == SMOOTH:
+            return smooth_friction(t.slip, inv_h, con.speed_eps[c], frozen[0])[0]
+        w = friction_trial(con, world, c, t, frozen, inv_h)
+        if w[3] <= f64(0.0):
+            return f64(0.0)
+        return friction(vec3d(w[0], w[1], w[2]), w[3], frozen[0])[0]
+
+    @wp.func
+    def friction_force(con: Contacts, world: int, c: int, t: PointContact, frozen: vec3d, inv_h: f64) -> vec3d:
+        """Friction force on the residual, N."""
+        if frozen[0] <= f64(0.0):
+            return vec3d()
+        if con.law[c] == SMOOTH:
+            return smooth_friction(t.slip, inv_h, con.speed_eps[c], frozen[0])[1] * t.slip
+        w = friction_trial(con, world, c, t, frozen, inv_h)
+        if w[3] <= f64(0.0):
+            return vec3d()
+        trial = vec3d(w[0], w[1], w[2])
+        return friction(trial, w[3], frozen[0])[1] * trial
+
+    @wp.func
+    def point_stiffness(con: Contacts, world: int, c: int, t: PointContact, frozen: vec3d, inv_h: f64) -> mat33d:
+        """Derivative of the force that a point adds to the residual, positive; the change of the normal is omitted."""
+        K = wp.max(t.law[1], f64(0.0)) * wp.outer(t.n, t.n)
+        if frozen[0] > f64(0.0):
+            P = wp.identity(n=3, dtype=f64) - wp.outer(t.m, t.m)
+            if con.law[c] == SMOOTH:
+                part = smooth_friction(t.slip, inv_h, con.speed_eps[c], frozen[0])[1]
+                v = inv_h * t.slip
+                root = wp.dot(v, v) + con.speed_eps[c] * con.speed_eps[c]
+                K += part * (P - wp.outer(v, v) / root)
+            else:
+                w = friction_trial(con, world, c, t, frozen, inv_h)
+                trial = vec3d(w[0], w[1], w[2])
+                size2 = wp.dot(trial, trial)
+                if size2 <= frozen[0] * frozen[0]:
+                    K += w[3] * P
+                else:
+                    K += (w[3] * frozen[0] / wp.sqrt(size2)) * (P - wp.outer(trial, trial) / size2)
+        return K
+
+    @wp.func
+    def is_acting(con: Contacts, scr: ContactScratch, world: int, c: int, point: int) -> f64:
+        """1, or 0 if another point represents the contact."""
+        if con.single_point[c] != 0 and scr.contact_point[world, c] != point:
+            return f64(0.0)
+        return f64(1.0)
+
+    return _types.SimpleNamespace(
+        PointContact=PointContact, interpolate=interpolate, tangential=tangential, history_row=history_row,
+        contact_distance=contact_distance, remaining_overlap=remaining_overlap, overlap_recovery=overlap_recovery,
+        damping_rate=damping_rate, depth_before=depth_before, evaluate_point=evaluate_point,
+        with_friction_normal=with_friction_normal, coefficient=coefficient, set_explicit_force=set_explicit_force,
+        frozen_values=frozen_values, friction_trial=friction_trial, friction_potential=friction_potential,
+        friction_force=friction_force, point_stiffness=point_stiffness, is_acting=is_acting, acting_shape=acting_shape,
+        lagrange=lagrange, monomial=monomial,
+    )  # fmt: skip

@@ -1,0 +1,270 @@
+"""Follower loads: pressure on faces, moments, and the symmetric part of their tangents."""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from ..common.types import kernel_module, precision
+
+__all__ = ["follower_struct", "moment_kernels", "pressure_kernels"]
+
+
+@functools.cache
+def follower_struct(dtype: str):
+    """Loaded items (faces, or points with a moment): their slots, time laws and tables."""
+    p = precision(dtype)
+    T, vec3 = p.T, p.vec3
+
+    @wp.struct
+    class Follower:
+        conn: wp.array2d(dtype=wp.int32)  # [local, item] slot
+        law: wp.array(dtype=wp.int32)  # [item]
+        reference: wp.array2d(dtype=vec3)  # [local, item] reference value, positions from the first slot; faces
+        is_position: wp.array2d(dtype=T)  # [local, item]; faces
+        shape: wp.array3d(dtype=T)  # [point, local, item]; faces
+        d_a: wp.array3d(dtype=T)
+        d_b: wp.array3d(dtype=T)
+        weight: wp.array(dtype=T)  # [point]; faces
+        gradient: wp.array2d(dtype=vec3)  # [local, item] c_ki of the point's vectors y_k = sum_i c_ki e_i; moments
+        axes: wp.array(dtype=p.mat33)  # [item] reference values of the vectors (columns); moments
+        fraction: wp.array(dtype=T)  # [item] fraction of the moment; moments
+        offset: wp.int32
+        count: wp.int32
+
+    return Follower
+
+
+@functools.cache
+def pressure_kernels(dtype: str) -> _types.SimpleNamespace:
+    """Kernels of the pressure in one precision."""
+    p = precision(dtype)
+    T, vec3 = p.T, p.vec3
+    Follower = follower_struct(dtype)
+    pressure_module = kernel_module(f"pressure_{dtype}")
+
+    @wp.func
+    def tangent_vector(
+        data: Follower, table: wp.array3d(dtype=T), u: wp.array2d(dtype=vec3), world: int, point: int, item: int
+    ) -> vec3:
+        """dx/da of a face at a point, positions taken from the first slot."""
+        out = vec3()
+        first = u[world, data.conn[0, item]]
+        for i in range(data.conn.shape[0]):
+            x = data.reference[i, item] + u[world, data.conn[i, item]] - data.is_position[i, item] * first
+            out += table[point, i, item] * x
+        return out
+
+    @wp.func
+    def combine(
+        data: Follower, table: wp.array3d(dtype=T), field: wp.array2d(dtype=vec3), world: int, point: int, item: int
+    ) -> vec3:
+        """sum table_i field_i."""
+        out = vec3()
+        for i in range(data.conn.shape[0]):
+            out += table[point, i, item] * field[world, data.conn[i, item]]
+        return out
+
+    @wp.func
+    def clear(data: Follower, world: int, item: int, contribution: wp.array2d(dtype=vec3)):
+        """Zero the entries of an item."""
+        for i in range(data.conn.shape[0]):
+            contribution[world, data.offset + i * data.count + item] = vec3()
+
+    @wp.kernel(module=pressure_module)
+    def pressure(
+        data: Follower,
+        u: wp.array2d(dtype=vec3),
+        value: wp.array2d(dtype=wp.vec3d),
+        active: wp.array(dtype=wp.int32),
+        contribution: wp.array2d(dtype=vec3),
+    ):
+        """f_i = - int p s_i (x_a x x_b): pressure p against the current outward normal of a face."""
+        world, item = wp.tid()
+        if active[world] == 0:
+            return
+        clear(data, world, item, contribution)
+        for q in range(data.weight.shape[0]):
+            normal = wp.cross(
+                tangent_vector(data, data.d_a, u, world, q, item), tangent_vector(data, data.d_b, u, world, q, item)
+            )
+            f = (-T(value[world, data.law[item]][0]) * data.weight[q]) * normal
+            for i in range(data.conn.shape[0]):
+                k = data.offset + i * data.count + item
+                contribution[world, k] = contribution[world, k] + data.shape[q, i, item] * f
+
+    @wp.kernel(module=pressure_module)
+    def pressure_product(
+        data: Follower,
+        midpoint_factor: T,
+        u: wp.array2d(dtype=vec3),
+        value: wp.array2d(dtype=wp.vec3d),
+        active: wp.array(dtype=wp.int32),
+        direction: wp.array2d(dtype=vec3),
+        contribution: wp.array2d(dtype=vec3),
+    ):
+        """(K + K^T)/2 p with K = df/dq of the pressure force: its symmetric part; exact on a closed surface.
+
+        `midpoint_factor`: factor on the change of u in p.
+        """
+        world, item = wp.tid()
+        if active[world] == 0:
+            return
+        clear(data, world, item, contribution)
+        for q in range(data.weight.shape[0]):
+            a = tangent_vector(data, data.d_a, u, world, q, item)
+            b = tangent_vector(data, data.d_b, u, world, q, item)
+            da = combine(data, data.d_a, direction, world, q, item)
+            db = combine(data, data.d_b, direction, world, q, item)
+            d = combine(data, data.shape, direction, world, q, item)
+            w = midpoint_factor * T(-0.5) * T(value[world, data.law[item]][0]) * data.weight[q]
+            force = wp.cross(da, b) + wp.cross(a, db)
+            left = wp.cross(b, d)
+            right = wp.cross(d, a)
+            for i in range(data.conn.shape[0]):
+                k = data.offset + i * data.count + item
+                f = data.shape[q, i, item] * force + data.d_a[q, i, item] * left + data.d_b[q, i, item] * right
+                contribution[world, k] = contribution[world, k] + w * f
+
+    return _types.SimpleNamespace(pressure=pressure, pressure_product=pressure_product)
+
+
+@functools.cache
+def moment_kernels(dtype: str, vectors: int) -> _types.SimpleNamespace:
+    """Kernels of moments on the spin of a point's material vectors y_k = sum_i c_ki e_i.
+
+    Args:
+        vectors: 3, all of F (solids); 2, those of a beam's section, y_1 and y_2; 1, a shell's director, y_2.
+    """
+    p = precision(dtype)
+    T, vec3, mat33 = p.T, p.vec3, p.mat33
+    Follower = follower_struct(dtype)
+    module = kernel_module(f"moment_{dtype}_{vectors}")
+    first = 3 - vectors
+
+    @wp.func
+    def column(A: mat33, k: int) -> vec3:
+        """Column k."""
+        return vec3(A[0, k], A[1, k], A[2, k])
+
+    @wp.func
+    def with_column(A: mat33, k: int, a: vec3) -> mat33:
+        """A with column k replaced by a."""
+        out = A
+        for c in range(3):
+            out[c, k] = a[c]
+        return out
+
+    @wp.func
+    def complete(Y: mat33) -> mat33:
+        """Section vectors preceded by their unit normal."""
+        return with_column(Y, 0, wp.normalize(wp.cross(column(Y, 1), column(Y, 2))))
+
+    @wp.func
+    def spin_force(Y: mat33, m: vec3) -> mat33:
+        """Forces on the vectors (columns) whose work on their spin w is m.w.
+
+        3: w is the axial vector of Ydot Y^-1. 2: rotation of the section with its normal, w = axial of Adot A^-1 with A
+        = [n, y_1, y_2]. 1: w = y x ydot / y^2.
+        """
+        out = mat33()
+        if wp.static(vectors == 3):
+            G = wp.transpose(wp.inverse(Y))
+            for k in range(3):
+                out = with_column(out, k, T(0.5) * wp.cross(m, column(G, k)))
+        if wp.static(vectors == 2):
+            A = complete(Y)
+            n = column(A, 0)
+            G = wp.transpose(wp.inverse(A))
+            for k in range(1, 3):
+                g = column(G, k)
+                out = with_column(out, k, T(0.5) * (wp.cross(m, g) - wp.dot(m, wp.cross(n, g)) * n))
+        if wp.static(vectors == 1):
+            d = column(Y, 2)
+            out = with_column(out, 2, wp.cross(m, d) / wp.dot(d, d))
+        return out
+
+    @wp.func
+    def spin_force_change(Y: mat33, dY: mat33, m: vec3) -> mat33:
+        """Derivative of `spin_force` along dY."""
+        out = mat33()
+        if wp.static(vectors == 3):
+            G = wp.transpose(wp.inverse(Y))
+            dG = -(G * wp.transpose(dY) * G)
+            for k in range(3):
+                out = with_column(out, k, T(0.5) * wp.cross(m, column(dG, k)))
+        if wp.static(vectors == 2):
+            A = complete(Y)
+            n = column(A, 0)
+            G = wp.transpose(wp.inverse(A))
+            dn = -(wp.dot(n, column(dY, 1)) * column(G, 1) + wp.dot(n, column(dY, 2)) * column(G, 2))
+            dG = -(G * wp.transpose(with_column(dY, 0, dn)) * G)
+            for k in range(1, 3):
+                g = column(G, k)
+                dg = column(dG, k)
+                turn = wp.dot(m, wp.cross(dn, g)) + wp.dot(m, wp.cross(n, dg))
+                out = with_column(out, k, T(0.5) * (wp.cross(m, dg) - wp.dot(m, wp.cross(n, g)) * dn - turn * n))
+        if wp.static(vectors == 1):
+            d = column(Y, 2)
+            dd = column(dY, 2)
+            s = T(1.0) / wp.dot(d, d)
+            out = with_column(out, 2, s * wp.cross(m, dd) - (T(2.0) * s * s * wp.dot(d, dd)) * wp.cross(m, d))
+        return out
+
+    @wp.func
+    def gather(data: Follower, field: wp.array2d(dtype=vec3), world: int, item: int) -> mat33:
+        """sum_i c_ki field_i in column k."""
+        out = mat33()
+        for i in range(data.conn.shape[0]):
+            out += wp.outer(field[world, data.conn[i, item]], data.gradient[i, item])
+        return out
+
+    @wp.func
+    def current(data: Follower, u: wp.array2d(dtype=vec3), world: int, item: int) -> mat33:
+        """Current vectors: their reference values (the axes) plus displacements."""
+        return data.axes[item] + gather(data, u, world, item)
+
+    @wp.kernel(module=module)
+    def moment(
+        data: Follower,
+        u: wp.array2d(dtype=vec3),
+        value: wp.array2d(dtype=wp.vec3d),
+        active: wp.array(dtype=wp.int32),
+        contribution: wp.array2d(dtype=vec3),
+    ):
+        """f_i = sum_k c_ki phi_k, phi the forces that do the moment's work on the spin of the vectors."""
+        world, item = wp.tid()
+        if active[world] == 0:
+            return
+        m = data.fraction[item] * vec3(value[world, data.law[item]])
+        phi = spin_force(current(data, u, world, item), m)
+        for i in range(data.conn.shape[0]):
+            contribution[world, data.offset + i * data.count + item] = phi * data.gradient[i, item]
+
+    @wp.kernel(module=module)
+    def moment_product(
+        data: Follower,
+        midpoint_factor: T,
+        u: wp.array2d(dtype=vec3),
+        value: wp.array2d(dtype=wp.vec3d),
+        active: wp.array(dtype=wp.int32),
+        direction: wp.array2d(dtype=vec3),
+        contribution: wp.array2d(dtype=vec3),
+    ):
+        """(K + K^T)/2 p with K = df/dq; `midpoint_factor`: factor on the change of u in p."""
+        world, item = wp.tid()
+        if active[world] == 0:
+            return
+        m = (midpoint_factor * data.fraction[item]) * vec3(value[world, data.law[item]])
+        Y = current(data, u, world, item)
+        D = gather(data, direction, world, item)
+        S = T(0.5) * spin_force_change(Y, D, m)
+        for k in range(first, 3):
+            for c in range(3):
+                unit = mat33()
+                unit[c, k] = T(1.0)
+                S[c, k] = S[c, k] + T(0.5) * wp.ddot(D, spin_force_change(Y, unit, m))
+        for i in range(data.conn.shape[0]):
+            contribution[world, data.offset + i * data.count + item] = S * data.gradient[i, item]
+
+    return _types.SimpleNamespace(moment=moment, moment_product=moment_product)

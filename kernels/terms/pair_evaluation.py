@@ -1,0 +1,153 @@
+"""Contact between bodies at a state: gap, elastic force and facet of every point, for fields and checks."""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from ..common.types import SHORT_UNROLL, kernel_module
+from .contact_laws import PAPER, law_functions
+from .contact_point import contact_point_functions
+from .contact_structs import contact_scratch_struct, contact_struct, facet_struct, history_struct, of_world
+from .facet_projection import OUTSIDE_TOLERANCE, facet_projection_functions
+from .facet_search import facet_search_kernels
+from .pair_structs import master_struct, pair_history_struct, pair_scratch_struct
+
+__all__ = ["pair_evaluation_kernels", "pair_results_struct"]
+
+
+@functools.cache
+def pair_results_struct():
+    """Result of the evaluation, [world, point]."""
+
+    @wp.struct
+    class PairResults:
+        gap: wp.array2d(dtype=wp.float64)  # m, 1e30: no facet nearby
+        normal: wp.array2d(dtype=wp.float64)  # force, N
+        force: wp.array2d(dtype=wp.vec3d)  # on the slave, N
+        facet: wp.array2d(dtype=wp.int32)  # -1: none
+        xi: wp.array2d(dtype=wp.vec3d)  # coordinates on it
+        reaction: wp.array3d(dtype=wp.vec3d)  # [world, point, local] forces on its slots, N
+
+    return PairResults
+
+
+@functools.cache
+def pair_evaluation_kernels(dtype: str) -> _types.SimpleNamespace:
+    """Kernels in one precision of the model."""
+    f64, vec3d = wp.float64, wp.vec3d
+    Contacts, Facets, History = contact_struct(False), facet_struct(dtype), history_struct()
+    ContactScratch, PairResults = contact_scratch_struct(dtype), pair_results_struct()
+    Masters, PairHistory, PairScratch = master_struct(dtype), pair_history_struct(), pair_scratch_struct(dtype)
+    k, places, seek = (
+        contact_point_functions(dtype, False),
+        facet_projection_functions(dtype),
+        facet_search_kernels(dtype),
+    )
+    PointContact, interpolate, contact_distance, frozen_values, with_friction_normal = (
+        k.PointContact,
+        k.interpolate,
+        k.contact_distance,
+        k.frozen_values,
+        k.with_friction_normal,
+    )
+    friction_force, normal_law = k.friction_force, law_functions().normal_law
+    surface_point, inverse_map, distance_outside, unit_normal, facet_centre = (
+        places.surface_point,
+        places.inverse_map,
+        places.distance_outside,
+        places.unit_normal,
+        places.facet_centre,
+    )
+    project_on_facet, shape_value, frame, down, up = (
+        places.project_on_facet,
+        places.shape_value,
+        seek.frame,
+        seek.down,
+        seek.up,
+    )
+    module = kernel_module(f"pair_survey_{dtype}", max_unroll=SHORT_UNROLL)
+
+    @wp.func
+    def nearest(mas: Masters, pair: PairScratch, world: int, surface: int, x: vec3d, far: f64) -> wp.vec4d:
+        """Coordinates of x on the closest facet of a surface, and that facet; -1: none within `far`."""
+        out = wp.vec4d(f64(0.0), f64(0.0), f64(0.0), f64(-1.0))
+        height = far
+        off = f64(OUTSIDE_TOLERANCE)
+        pad = vec3d(far, far, far)
+        root = wp.bvh_get_group_root(mas.tree, world * mas.surfaces + surface)
+        query = wp.bvh_query_aabb(mas.tree, down(x - pad), up(x + pad), root)
+        index = wp.int32(0)
+        while wp.bvh_query_next(query, index):
+            f = index - world * mas.count
+            corners = mas.corners[mas.kind[f]]
+            found = inverse_map(mas, pair.C, pair.D, world, f, x, facet_centre(corners))
+            xi = vec3d(found[0], found[1], found[2])
+            o = distance_outside(corners, xi)
+            if found[3] != f64(0.0) and o <= off:
+                s = surface_point(mas, pair.C, pair.D, world, f, xi)
+                gap = xi[2] * wp.dot(unit_normal(s), s.c)
+                closer = wp.abs(gap) < height or (wp.abs(gap) == height and f64(f) < out[3])
+                if gap >= -mas.depth_limit[f] and (o < off or closer) and wp.abs(gap) <= far:
+                    out = wp.vec4d(xi[0], xi[1], xi[2], f64(f))
+                    height = wp.abs(gap)
+                    off = o
+        return out
+
+    @wp.kernel(module=module)
+    def evaluate_pairs(
+        con: Contacts, mas: Masters, facets: Facets, his: History, pair_his: PairHistory, time: wp.array(dtype=f64),
+        u: wp.array2d(dtype=vec3d), far: f64, scr: ContactScratch, pair: PairScratch, out: PairResults,
+    ):  # fmt: skip
+        """Gaps of points in contact on their facets, of others on the closest facet; elastic forces, without motion."""
+        world, item, q = wp.tid()
+        c = facets.contact[item]
+        point = facets.point + item * facets.points + q
+        area_fraction = facets.area_fraction[q, item]
+        out.gap[world, point] = f64(1.0e30)
+        out.facet[world, point] = -1
+        if area_fraction == f64(0.0):
+            return
+        x = facets.X[q, item] + interpolate(facets, u, world, q, item)
+        in_contact = his.speed[world, point] > f64(0.0)
+        f = wp.int32(-1)
+        place = vec3d()
+        if in_contact:
+            f = pair_his.facet[world, point] - 1
+            found = inverse_map(mas, pair.C, pair.D, world, f, x, pair_his.xi[world, point])
+            place = vec3d(found[0], found[1], found[2])
+            if found[3] == f64(0.0):
+                f = -1
+        if f < 0:
+            found = nearest(mas, pair, world, mas.surface_of[c], x, far)
+            place = vec3d(found[0], found[1], found[2])
+            f = wp.int32(found[3])
+        if f < 0:
+            return
+        projection = project_on_facet(mas, pair.C, pair.D, world, f, place)
+        s = PointContact()
+        s.n = projection.n
+        contact_distance_now = contact_distance(con, his, world, c, point, time[world], f64(0.0))
+        s.depth = contact_distance_now - (place[2] * projection.gap_slope + projection.gap_offset)
+        k_n = con.scale[world, c] * of_world(con.normal, world, c)
+        s.law = normal_law(con.law[c], 0, k_n, f64(0.0), con.ramp[c], con.force_eps[c], s.depth, s.depth)
+        if in_contact:
+            s.elastic_slip = his.spring[world, point]
+            if con.law[c] != PAPER:
+                s.elastic_slip = frame(surface_point(mas, pair.C, pair.D, world, f, place)) * s.elastic_slip
+        s = with_friction_normal(s, s.n)
+        frozen = frozen_values(con, his, scr, world, c, point, s)
+        frozen[2] = f64(1.0)
+        pressed = area_fraction * s.law[0] * s.n
+        tangential_force = area_fraction * friction_force(con, world, c, s, frozen, f64(0.0))
+        out.gap[world, point] = -s.depth
+        out.normal[world, point] = area_fraction * s.law[0]
+        out.force[world, point] = pressed - tangential_force
+        out.facet[world, point] = f
+        out.xi[world, point] = place
+        for i in range(mas.conn.shape[0]):
+            out.reaction[world, point, i] = (
+                shape_value(mas, f, i, place) * tangential_force - shape_value(mas, f, i, projection.xi) * pressed
+            )
+
+    return _types.SimpleNamespace(module=module, evaluate_pairs=evaluate_pairs)

@@ -1,0 +1,208 @@
+"""Contact between bodies after an accepted step: energy ledger, records, history."""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from ..common.types import SHORT_UNROLL, kernel_module
+from .contact import INACTIVE
+from .contact_colliders import SLIP_FLAG
+from .contact_laws import PAPER, law_functions
+from .contact_ledger import ENERGY_COLUMNS, RECORD_SUMS
+from .contact_point import contact_point_functions
+from .contact_structs import (
+    clock_struct,
+    contact_scratch_struct,
+    contact_struct,
+    facet_struct,
+    history_struct,
+    of_world,
+)
+from .facet_projection import facet_projection_functions
+from .facet_search import facet_search_kernels
+from .pair_structs import master_struct, pair_history_struct, pair_scratch_struct
+from .pairs import pair_functions
+
+__all__ = ["pair_ledger_kernels"]
+
+
+@functools.cache
+def pair_ledger_kernels(dtype: str) -> _types.SimpleNamespace:
+    """Kernels in the module of `pair_kernels`."""
+    f64, vec3d = wp.float64, wp.vec3d
+    Contacts, Facets, History = contact_struct(False), facet_struct(dtype), history_struct()
+    ContactScratch, Clock = contact_scratch_struct(dtype), clock_struct()
+    Masters, PairHistory, PairScratch = master_struct(dtype), pair_history_struct(), pair_scratch_struct(dtype)
+    k, surface_point = contact_point_functions(dtype, False), facet_projection_functions(dtype).surface_point
+    PointContact, with_friction_normal, friction_trial, tangential, friction_force, coefficient, overlap_recovery = (
+        k.PointContact,
+        k.with_friction_normal,
+        k.friction_trial,
+        k.tangential,
+        k.friction_force,
+        k.coefficient,
+        k.overlap_recovery,
+    )
+    elastic = law_functions().elastic
+    evaluate_pair_point = pair_functions(dtype).evaluate_pair_point
+    frame = facet_search_kernels(dtype).frame
+    module = kernel_module(f"pairs_{dtype}", max_unroll=SHORT_UNROLL)
+
+    @wp.func
+    def add(rows: wp.array3d(dtype=f64), j: int, world: int, row: int, value: f64):
+        """rows[j, world, row] += value."""
+        rows[j, world, row] = rows[j, world, row] + value
+
+    @wp.func
+    def add_work(rows: wp.array3d(dtype=f64), world: int, row: int, work: f64):
+        """Work of a recovering initial overlap, which the integrator's own formula omits."""
+        add(rows, 3, world, row, work)
+        add(rows, 4, world, row, work)
+
+    @wp.func
+    def clear_history(his: History, pair_his: PairHistory, world: int, point: int):
+        """Reset the history of a point that has left contact."""
+        his.spring[world, point] = vec3d()
+        his.stored[world, point] = f64(0.0)
+        his.friction_limit[world, point] = f64(0.0)
+        his.speed[world, point] = f64(0.0)
+        his.contact_state[world, point] = 0
+        pair_his.facet[world, point] = 0
+        pair_his.xi[world, point] = vec3d()
+
+    @wp.func
+    def record_force(scr: ContactScratch, world: int, row: int, force: vec3d, x: vec3d):
+        """Add a force and its moment to the record of a facet."""
+        moment = wp.cross(x, force)
+        for j in range(3):
+            add(scr.rows, j, world, row, force[j])
+            add(scr.rows, 3 + j, world, row, moment[j])
+
+    @wp.func
+    def return_mapping(law: int, s: PointContact, frozen: vec3d, w: wp.vec4d, tangential_force: vec3d) -> vec3d:
+        """Friction spring after the force was cut to the friction limit; Eq. (83) for the paper's law."""
+        trial = vec3d(w[0], w[1], w[2])
+        size = wp.length(trial)
+        if size <= frozen[0]:
+            return s.q
+        if frozen[0] <= f64(0.0):
+            return vec3d()
+        if law == PAPER:
+            return (f64(1.0) / frozen[1]) * tangential_force - ((w[3] - frozen[1]) / frozen[1]) * s.slip
+        return s.q - ((size - frozen[0]) / (w[3] * size)) * trial
+
+    @wp.func
+    def update_history(
+        his: History, pair_his: PairHistory, scr: ContactScratch, pair: PairScratch, world: int, point: int, f: int,
+        friction_limit: f64, slipping: int, closing: f64,
+    ):  # fmt: skip
+        """Store the master facet of a point, its largest approach speed, and its slip state."""
+        his.friction_limit[world, point] = friction_limit
+        his.speed[world, point] = wp.max(scr.speed[world, point], closing)
+        contact_state = wp.int32(1)
+        if slipping != 0 and friction_limit > f64(0.0):
+            contact_state += SLIP_FLAG
+        his.contact_state[world, point] = contact_state
+        pair_his.facet[world, point] = f + 1
+        pair_his.xi[world, point] = pair.xi[world, point]
+
+    @wp.kernel(module=module)
+    def record_substep(
+        con: Contacts, mas: Masters, facets: Facets, his: History, pair_his: PairHistory, clock: Clock,
+        accepted: wp.array(dtype=wp.int32), scr: ContactScratch, pair: PairScratch, energies: wp.array3d(dtype=f64),
+    ):  # fmt: skip
+        """Energy increments of an accepted substep, its record per facet, and the history after it."""
+        world, item = wp.tid()
+        if accepted[world] == 0:
+            return
+        c = facets.contact[item]
+        law = con.law[c]
+        row = facets.row + item
+        for j in range(ENERGY_COLUMNS):
+            energies[j, world, row] = f64(0.0)
+        for j in range(RECORD_SUMS + 1):
+            scr.rows[j, world, row] = f64(0.0)
+        inv_h = f64(0.0)
+        if clock.still == 0:
+            inv_h = f64(1.0) / clock.h[world]
+        for q in range(facets.points):
+            point = facets.point + item * facets.points + q
+            area_fraction = facets.area_fraction[q, item]
+            in_contact = his.speed[world, point] > f64(0.0)
+            f = pair.facet[world, point]
+            if area_fraction == f64(0.0) or (f < 0 and not in_contact):
+                continue
+            stored, friction_spring, previous_spring = f64(0.0), vec3d(), vec3d()
+            if f < 0:  # beyond the boundary of the surface
+                scr.activity[world, point] = INACTIVE
+                add(energies, 1, world, row, area_fraction * his.stored[world, point])
+                clear_history(his, pair_his, world, point)
+                continue
+            s = evaluate_pair_point(con, scr, pair, world, c, point, inv_h)
+            frozen = scr.frozen[world, point]
+            frozen[2] = f64(1.0)
+            s = with_friction_normal(s, scr.frozen_normal[world, point])
+            normal = s.law[0]
+            tangential_force = friction_force(con, world, c, s, frozen, inv_h)
+            w = friction_trial(con, world, c, s, frozen, inv_h)
+            slipping = wp.where(wp.length(vec3d(w[0], w[1], w[2])) > frozen[0], 1, 0)
+            if in_contact:
+                previous_spring = tangential(s.m, pair.elastic_slip[world, point] - pair.relative_motion[world, point])
+            force = normal * s.n - tangential_force
+            if con.is_explicit[c] != 0:
+                force = scr.explicit_force[world, point]
+                normal = wp.dot(force, s.m)
+                tangential_force = normal * s.m - force
+                friction_spring = scr.explicit_spring[world, point]
+                k_t = con.scale[world, c] * of_world(con.tangent, world, c)
+                frozen = vec3d(coefficient(con, his, world, c, point) * normal, k_t, f64(1.0))
+                slipping = wp.where(wp.length(tangential_force) >= f64(0.999999) * frozen[0], 1, 0)
+            elif normal > f64(0.0) and frozen[1] > f64(0.0):
+                friction_spring = return_mapping(law, s, frozen, w, tangential_force)
+            spring = elastic(0, con.scale[world, c] * of_world(con.normal, world, c), s.depth)
+            stored = spring[1] + f64(0.5) * frozen[1] * wp.dot(friction_spring, friction_spring)
+            slip_increment = s.slip - (friction_spring - previous_spring)
+            friction_loss = wp.dot(
+                tangential_force - frozen[1] * friction_spring, friction_spring - previous_spring
+            ) + wp.dot(tangential_force, slip_increment)
+            add(energies, 0, world, row, area_fraction * stored)
+            add(energies, 1, world, row, area_fraction * (normal - spring[0]) * s.depth_increment)
+            add(energies, 2, world, row, area_fraction * friction_loss)
+            add_work(energies, world, row, area_fraction * normal * overlap_recovery(con, his, clock, world, c, point))
+            place = surface_point(mas, pair.C, pair.D, world, f, pair.xi[world, point])
+            add(scr.rows, 6, world, row, area_fraction * normal)
+            record_force(scr, world, row, (mas.sign[c] * area_fraction) * force, place.x)
+            if s.depth > f64(0.0):
+                area = facets.area[q, item]
+                add(scr.rows, 7, world, row, area * f64(slipping) * wp.length(slip_increment))
+                add(scr.rows, 8, world, row, area)
+                add(scr.rows, 9, world, row, area * f64(1 - slipping))
+            scr.rows[14, world, row] = wp.max(scr.rows[14, world, row], s.depth)
+            if s.depth <= f64(0.0):
+                clear_history(his, pair_his, world, point)
+            else:
+                if law != PAPER:
+                    friction_spring = wp.transpose(frame(place)) * friction_spring
+                his.spring[world, point] = friction_spring
+                his.stored[world, point] = stored
+                update_history(
+                    his, pair_his, scr, pair, world, point, f, frozen[0], slipping, s.depth_increment * inv_h
+                )
+        for j in range(4):
+            scr.rows[10 + j, world, row] = energies[j, world, row]
+
+    @wp.kernel(module=module)
+    def store_times(
+        clock: Clock, potential: wp.array(dtype=f64), term_sums: wp.array2d(dtype=f64),
+        accepted: wp.array(dtype=wp.int32), his: History, scr: ContactScratch,
+    ):  # fmt: skip
+        """Add the contact energy to the bound of the next initial iterate."""
+        world = wp.tid()
+        if accepted[world] == 0:
+            return
+        his.pose_time[world] = clock.time[world]
+        scr.elapsed[world] = scr.elapsed[world] + clock.h[world]
+        potential[world] = potential[world] + term_sums[1, world]
+
+    return _types.SimpleNamespace(record_substep=record_substep, store_times=store_times)

@@ -1,0 +1,128 @@
+"""Structs of contact between bodies, in addition to those of contact with obstacles."""
+
+import functools
+
+import warp as wp
+
+from ..common.types import precision
+
+__all__ = ["master_struct", "pair_history_struct", "pair_scratch_struct"]
+
+
+@functools.cache
+def master_struct(dtype: str):
+    """Facets of master surfaces: positions are polynomials of two coordinates, linear along an outward vector.
+
+    x(s, z) = sum_m s^m ((X_m + sum_i shape_mi u_i) + z (N_m + sum_i rise_mi u_i)): the outward vector is a material
+    vector mapped by the deformation gradient, so that a point near a surface depends on the slots of one element.
+    """
+    T = precision(dtype).T
+
+    @wp.struct
+    class Masters:
+        tree: wp.uint64  # bounding-box tree of [world, facet], grouped by world and surface
+        surface_of: wp.array(dtype=wp.int32)  # [contact] its master surface
+        sign: wp.array(dtype=wp.float64)  # [contact] -1 where the points belong to the second body
+        bodies: wp.array(dtype=wp.vec2i)  # [contact] of the points and of the facets, numbered among bodies in pairs
+        surfaces: wp.int32
+        touch_depth: wp.float64  # depth at the start of a step that counts as contact, m
+        max_monomials: wp.int32  # maximum number of monomials of a facet
+        conn: wp.array2d(dtype=wp.int32)  # [local, facet] slot
+        shape: wp.array3d(dtype=T)  # [monomial, local, facet]
+        director_shape: wp.array3d(dtype=T)  # 1/m
+        X: wp.array2d(dtype=wp.vec3d)  # [monomial, facet]
+        N: wp.array2d(dtype=wp.vec3d)
+        kind: wp.array(dtype=wp.int32)  # [facet]
+        monomials: wp.array(dtype=wp.int32)  # [kind] number of monomials
+        corners: wp.array(dtype=wp.int32)  # [kind]
+        power: wp.array2d(dtype=wp.vec2i)  # [kind, monomial] exponents
+        hull: wp.array3d(dtype=wp.float64)  # [kind, point, monomial] control points; convex hull of the facet
+        depth_limit: wp.array(
+            dtype=wp.float64
+        )  # [facet] depth beyond which a point would leave through the opposite side, m
+        size: wp.array(dtype=wp.float64)  # [facet] length of a side, m
+        surface: wp.array(dtype=wp.int32)  # [facet]
+        pool: wp.int32  # first entry in the pool
+        count: wp.int32
+
+    return Masters
+
+
+@functools.cache
+def pair_history_struct():
+    """Pair history in the state beside `History`, [world, point]."""
+
+    @wp.struct
+    class PairHistory:
+        facet: wp.array2d(dtype=wp.int32)  # master facet in contact + 1; 0: none
+        xi: wp.array2d(dtype=wp.vec3d)  # its coordinates, and m along the outward vector
+
+    return PairHistory
+
+
+@functools.cache
+def pair_scratch_struct(dtype: str):
+    """Pair quantities of an attempt; [world, control]: monomial m of facet f is control `most f + m`."""
+    p = precision(dtype)
+    T, vec3, vec2, sym = p.T, p.vec3, p.vec2, p.sym
+    mat43 = wp.types.matrix(shape=(4, 3), dtype=wp.float64)
+
+    @wp.struct
+    class PairScratch:
+        C: wp.array2d(dtype=wp.vec3d)  # [world, control] coefficients of displacements at the iterate
+        D: wp.array2d(dtype=wp.vec3d)  # of the outward vector
+        C0: wp.array2d(dtype=wp.vec3d)  # at the start of the attempt
+        D0: wp.array2d(dtype=wp.vec3d)
+        V0: wp.array2d(dtype=wp.vec3d)  # of velocities at the start of the attempt
+        centre: wp.array2d(dtype=mat43)  # [world, facet] position at the midpoint and derivatives, rows as of a Jet
+        bulge: wp.array2d(dtype=wp.float64)  # [world, facet] largest height above the tangent plane at the midpoint, m
+        centre0: wp.array2d(dtype=mat43)  # at the start of the attempt
+        lower: wp.array(dtype=wp.vec3)  # [world facet] boxes of the tree
+        upper: wp.array(dtype=wp.vec3)
+        refit_lower: wp.array(dtype=wp.vec3)
+        refit_upper: wp.array(dtype=wp.vec3)
+        refit_needed: wp.array(dtype=wp.int32)  # a facet has left its box
+        refits: wp.array(dtype=wp.int32)  # number of refits so far
+        in_reach: wp.array2d(dtype=wp.int32)  # [world, facet row of the slaves] 1 if a master surface is within reach
+        empty_box_lower: wp.array2d(dtype=wp.vec3)  # box without master facets, valid for refit `empty_box_known`
+        empty_box_upper: wp.array2d(dtype=wp.vec3)
+        empty_box_refit: wp.array2d(dtype=wp.int32)
+        x0: wp.array2d(dtype=wp.vec3d)  # [world, point] position at the start of the attempt, m
+        deepest_contact: wp.array2d(
+            dtype=wp.float64
+        )  # [world, body] largest depth of its points in contact at the start, m
+        anchor_facet: wp.array2d(dtype=wp.int32)  # facet + 1 that its motion is relative to; 0: not yet set
+        anchor_xi: wp.array2d(dtype=wp.vec3d)  # start coordinates on that facet
+        anchor_gap: wp.array2d(dtype=wp.vec2d)  # start value of the gap per outward coordinate, and its remainder, m
+        facet: wp.array2d(dtype=wp.int32)  # master facet at the iterate, -1: none; -2: penetrated completely
+        xi: wp.array2d(dtype=wp.vec3d)
+        projection: wp.array2d(dtype=wp.vec3d)  # coordinates of the projection on the facet
+        depth: wp.array2d(dtype=wp.float64)
+        initial_depth: wp.array2d(dtype=wp.float64)  # depth at the start of the attempt, m
+        normal: wp.array2d(dtype=wp.vec3d)  # of the facet there, minus the derivative of the depth by the position
+        relative_motion: wp.array2d(dtype=wp.vec3d)  # in the step, relative to the master's material, m
+        elastic_slip: wp.array2d(dtype=wp.vec3d)  # motion plus friction spring, m
+        shape_values: wp.array3d(dtype=T)  # [world, point, local] shape values of the master's slots at the projection
+        shape_gradient: wp.array3d(dtype=vec2)  # their derivatives by the facet coordinates
+        geometric_tangent: wp.array3d(
+            dtype=vec3
+        )  # [world, point, 2] geometric stiffness by rotation of the facet, see `set_geometric_stiffness`
+        geometric_curvature: wp.array2d(dtype=sym)  # geometric stiffness by change of the projection and by curvature
+        facet_rotation: wp.array2d(dtype=vec2)  # [world, point] of a product: rotation of the facet
+        friction_shape: wp.array3d(dtype=T)  # shape values of friction, frozen with the friction limit
+        frozen_motion: wp.array2d(dtype=wp.vec3d)
+        frozen_slip: wp.array2d(dtype=wp.vec3d)  # motion plus spring when they were frozen, m
+        frozen_displacement: wp.array2d(
+            dtype=wp.vec3d
+        )  # relative displacement by the frozen shape values at that time, m
+        frozen_facet: wp.array2d(dtype=wp.int32)
+        tangential_force: wp.array2d(dtype=wp.vec3d)  # friction part of a point's force, N
+        listed_facet: wp.array2d(dtype=wp.int32)  # [world, point] facet + 1 of the list that contains it
+        lists_changed: wp.array(dtype=wp.int32)  # 1 if some point belongs to another list
+        list_count: wp.array(dtype=wp.int32)  # [world facet] point counts during list construction
+        chunk_offset: wp.array2d(dtype=wp.int32)  # [world, chunk of facets] number of preceding points
+        list_size: wp.array2d(dtype=wp.int32)  # [world, facet] number of points in its list, which begins at `start`
+        list_start: wp.array2d(dtype=wp.int32)
+        list_point: wp.array2d(dtype=wp.int32)  # [world, point]
+
+    return PairScratch

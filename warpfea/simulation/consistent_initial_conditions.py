@@ -1,0 +1,382 @@
+"""Consistent initial velocities and accelerations of generalized-alpha schemes.
+
+At a state (q, v) at time t, with supports and constraints c(q, t) = 0, whose rates along the motion are c' and c'',
+
+    M dv + J^T L = 0,    J (v + dv) + c_t = 0,        M w + J^T m = f - f_int,    J w = -(c'' without J w)
+
+are solved on the host, by factors of the mass matrix and a dense matrix of the constraints. In prescribed directions
+a_0 = w(t + (am - af) h), and v_0 is offset by h^2 (1/6 - beta - (am - af)/2) w', the limit of constant steps (Arnold,
+Bruels and Cardona 2015): without it the first reactions are of first order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.linalg as spl
+import warp as wp
+
+from ..base.errors import ModelError
+from ..kernels.step.step_control import STATUS
+from ..kernels.terms.constraints import ANGLE, DISTANCE
+from ..time_laws import TimeLaw
+from .discontinuities import jumps, kinks
+
+if TYPE_CHECKING:
+    from ..model.model import Model
+    from ..solvers.residual import Residual
+    from ..terms.term import StepContext
+    from .integrators import Integrator
+
+__all__ = ["ConsistentInitialConditions"]
+
+TIME_TOL = 1e-6
+"""Tolerance of equal times, over a step."""
+FACTORED_SLOTS = 20_000
+"""Maximum slots of a factorised mass matrix; larger ones are solved iteratively."""
+FIRST_DERIVATIVE = np.array([-25.0, 48.0, -36.0, 16.0, -3.0]) / 12.0
+SECOND_DERIVATIVE = np.array([35.0, -104.0, 114.0, -56.0, 11.0]) / 12.0
+THIRD_DERIVATIVE = np.array([-5.0, 18.0, -24.0, 14.0, -3.0]) / 2.0
+"""Finite-difference weights of the third derivative at the first of five points."""
+RANK_TOL = 1e-11
+"""Relative singular value of the constraint matrix below which rows are redundant."""
+
+
+class ConsistentInitialConditions:
+    """Recompute consistent initial accelerations after a reset or a discontinuity.
+
+    Attributes:
+        count: number of restarts per world.
+    """
+
+    def __init__(self, ctx: StepContext, residual: Residual, integrator: Integrator) -> None:
+        self.ctx, self.residual, self.integrator = ctx, residual, integrator
+        self.model = ctx.model
+        supports = ctx.model.terms.supports
+        self.driven = supports.displaced is not None or supports.rotated is not None
+        self.count = 0
+        self._discontinuities: tuple[float, np.ndarray, np.ndarray] = (0.0, np.zeros(0), np.zeros((2, 0)))
+        self._mass: dict[int, list[tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]]] = {}
+        self._version = -1  # parameter version of the factors in _mass
+        self._world = 0  # the world being restarted
+        check_rho_inf(ctx.model, integrator, self.driven)
+
+    def prepare(self, dt: float) -> None:
+        """Restart the worlds that need it, before a step of size dt, s."""
+        state = self.ctx.state
+        time, known = state.time.numpy(), state.acceleration_end.numpy()  # type: ignore[attr-defined]
+        after_jump, slope_jump = self._discontinuities_at(time, dt)
+        flags = (state.status.numpy() == STATUS["running"]) & ((known != time) | slope_jump)  # type: ignore[attr-defined]
+        if flags.any():
+            self._start(flags, time, after_jump, dt)
+
+    def _discontinuities_at(self, time: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
+        """Times (B,) just after a jump at the state, else its own; and flags of a kink within the previous step."""
+        if self._discontinuities[0] != dt:
+            self._discontinuities = dt, *self._find_discontinuities(dt)
+        near = TIME_TOL * dt
+        _, times, (begins, ends) = self._discontinuities
+        there = time[:, None]
+        found = np.any((times > there - dt + near) & (times <= there + near), axis=1)
+        steep = (begins <= there + near) & (ends > there)
+        after_jump = np.where(steep, ends, there).max(axis=1, initial=-np.inf)
+        return np.maximum(after_jump, time), found
+
+    def _find_discontinuities(self, dt: float) -> tuple[np.ndarray, np.ndarray]:
+        """Times of all kinks, and starts and ends of jumps (2, n), for a step dt, s."""
+        laws = self.model.terms.time_laws.laws
+        steep = np.concatenate([np.zeros((0, 2)), *(jumps(law, dt) for law in laws)])
+        # accelerations stay continuous across force kinks
+        bent = [kinks(law, dt) for number, law in enumerate(laws) if number in self._drive_law_numbers()]
+        return np.concatenate([steep[:, 0], *bent]), steep.T
+
+    def _drive_law_numbers(self) -> set[int]:
+        """Indices of the laws that prescribe positions."""
+        terms = self.model.terms
+        out = set()
+        if terms.supports.displaced is not None:
+            out |= set(terms.supports.displaced.law.numpy().ravel().tolist())
+        if terms.supports.rotated is not None:
+            out |= set(terms.supports.rotated.law.numpy().tolist())
+        if self.model.constraints is not None:
+            out |= set(terms.constraints.tables.data.law.numpy().tolist())
+        return out
+
+    def _start(self, flags: np.ndarray, time: np.ndarray, after_jump: np.ndarray, dt: float) -> None:
+        state: Any = self.ctx.state
+        if self._version != self.model.parameters.version:
+            self._version = self.model.parameters.version
+            self._mass.clear()
+        laws = self._law_derivatives(flags, after_jump, dt)
+        u, v = state.displacement.numpy().astype(float), state.velocity.numpy().astype(float)
+        before = self._kinetic(v)
+        for world in np.flatnonzero(flags).tolist():
+            self._world = world
+            v[world] += self._impulse(u[world], v[world], laws[:, world])
+        self._write_flagged(state.velocity, flags, v)
+        g = self._unbalanced_force(flags, after_jump, dt)
+        w, a = np.zeros_like(v), np.zeros_like(v)
+        rho = self.integrator.parameter
+        early = (rho - 1.0) / (rho + 1.0)  # a_n belongs to the time t + early dt
+        late = 1.0 / 6.0 - 1.0 / (rho + 1.0) ** 2 - 0.5 * early
+        for world in np.flatnonzero(flags).tolist():
+            self._world = world
+            motion = u[world], v[world], laws[:, world]
+            w[world] = self._acceleration(g[world], *motion)
+            jerk = self._jerk(*motion, w[world], 0.25 * dt)
+            a[world] = w[world] + early * dt * jerk
+            v[world] += late * dt**2 * jerk  # prescribed: the limit of a scheme with constant steps
+        self._write_flagged(state.velocity, flags, v)
+        self._record_impulse(flags, self._kinetic(v) - before)
+        self._write_flagged(state.acceleration, flags, w)
+        self._write_flagged(state.algorithmic_acceleration, flags, a)
+        self._write_flagged(state.previous_step, flags, np.full(len(time), dt))
+        self._write_flagged(state.acceleration_end, flags, time)
+        self.count += 1
+
+    @staticmethod
+    def _write_flagged(array: wp.array, flags: np.ndarray, values: np.ndarray) -> None:
+        host = array.numpy()
+        host[flags] = values[flags]
+        array.assign(host)
+
+    def _kinetic(self, v: np.ndarray) -> np.ndarray:
+        """1/2 v.M v, (B,), J."""
+        masses = self.model.masses
+        return np.array([0.5 * np.sum(one * (masses.of_world(world) @ one)) for world, one in enumerate(v)])
+
+    def _record_impulse(self, flags: np.ndarray, change: np.ndarray) -> None:
+        """Book the kinetic energy of the velocity correction as integrator work."""
+        state: Any = self.ctx.state
+        if "ledger" in state.specs:
+            columns = list(self.model.terms.ledger)
+            ledger = state.ledger.numpy()
+            ledger[flags, columns.index("kinetic")] += change[flags]
+            ledger[flags, columns.index("integrator")] -= change[flags]
+            state.ledger.assign(ledger)
+
+    def _law_derivatives(self, flags: np.ndarray, time: np.ndarray, dt: float) -> np.ndarray:
+        """Values of the time laws and their first three rates after the time (B,), (4, B, laws, 3).
+
+        Samples have the slope after the time only; functions are differenced over dt.
+        """
+        laws = self.model.terms.time_laws.laws
+        points = np.array([self._law_values(flags, time + 0.25 * dt * k) for k in range(len(FIRST_DERIVATIVE))])
+        out = np.zeros((4, *points.shape[1:]))
+        out[0] = points[0]
+        for k, law in enumerate(laws):
+            if law.function is not None:
+                for order, weights in enumerate((FIRST_DERIVATIVE, SECOND_DERIVATIVE, THIRD_DERIVATIVE), start=1):
+                    out[order, :, k] = np.tensordot(weights, points[:, :, k], 1) / (0.25 * dt) ** order
+            else:
+                out[1, :, k] = [slope_after(law, t + TIME_TOL * dt) for t in time]
+        return out
+
+    def _law_values(self, flags: np.ndarray, time: np.ndarray) -> np.ndarray:
+        """Values of the time laws in the flagged worlds at times (B,), (B, laws, 3)."""
+        m, w = self.model, self.ctx.work
+        self._write_flagged(w.step.new_time, flags, time)
+        active = self._world_flags(flags)
+        m.terms.time_laws.evaluate(
+            self.ctx.launch, self.ctx.state, w.step.new_time, w.step.ramp, active, w.time_law_values
+        )
+        return w.time_law_values.numpy().copy()
+
+    def _world_flags(self, flags: np.ndarray) -> Any:
+        return wp.array(flags.astype(np.int32), dtype=wp.int32, device=self.model.device)
+
+    def _unbalanced_force(self, flags: np.ndarray, time: np.ndarray, dt: float) -> np.ndarray:
+        """f_int + J^T lambda - f at the state in the flagged worlds, with the laws at times (B,); (B, slots, 3), N."""
+        m, ctx, w = self.model, self.ctx, self.ctx.work
+        every, active = np.ones(len(flags)), self._world_flags(flags)
+        # strain rates of the state: E~ = E - (dq/dv) dE/dt
+        for array, value in (
+            (w.step.ramp, 1.0),
+            (w.step.h, dt),
+            (w.step.dq_dv, dt),
+            (w.step.b, -dt),
+            (w.step.q_a, 0.0),
+        ):
+            self._write_flagged(array, flags, value * every)
+        self._write_flagged(w.step.mass_factor, flags, every / dt)
+        self._law_values(flags, time)
+        m.terms.dead.take_gravity(ctx.launch, w.time_law_values, active)
+        u, v = ctx.state.displacement.numpy(), ctx.state.velocity.numpy()
+        for array, values in ((w.u, u), (w.v, v), (w.v_tilde, v), (w.q_tilde, u - dt * v)):
+            self._write_flagged(array, flags, values)
+        for term in m.terms:
+            term.begin(ctx, active)
+        for term in m.terms:
+            term.prepare(ctx, active)
+        self.residual.evaluate_forces(active)
+        return w.g.numpy().astype(float)
+
+    # supports and constraints
+
+    def _constraint_rows(self, u: np.ndarray, v: np.ndarray, laws: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray]:
+        """J (rows, 3 slots), c' and c'' without J w (rows,)."""
+        tables = self.model.constraints
+        gradients, first, second = constraint_rates(tables, u, v, laws)
+        return tables.expand(gradients), first, second
+
+    def _prescribed_rates(self, laws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Velocities and accelerations (slots, 3) of prescribed components, 0 for others."""
+        rate, acceleration = np.zeros((2, self.model.slots, 3))
+        supports = self.model.terms.supports
+        if (d := supports.displaced) is not None:
+            slot, law = d.slot.numpy(), d.law.numpy()
+            k, c = np.nonzero(law >= 0)
+            rate[slot[k], c] = laws[1][law[k, c], c]
+            acceleration[slot[k], c] = laws[2][law[k, c], c]
+        if (d := supports.rotated) is not None:
+            slot, law, on = d.slot.numpy(), d.law.numpy(), d.components.numpy() != 0.0
+            angle, first, second = (laws[k][law, 0][:, None] for k in range(3))
+            turn = np.cross(d.axis.numpy(), d.arm.numpy())
+            twice = np.cross(d.axis.numpy(), turn)
+            along = np.cos(angle) * turn + np.sin(angle) * twice
+            across = np.cos(angle) * twice - np.sin(angle) * turn
+            for target, values in ((rate, first * along), (acceleration, second * along + first**2 * across)):
+                target[slot] = np.where(on, values, target[slot])
+        prescribed = self.model.free_host == 0.0
+        return np.where(prescribed, rate, 0.0), np.where(prescribed, acceleration, 0.0)
+
+    # linear algebra
+
+    def _impulse(self, u: np.ndarray, v: np.ndarray, laws: np.ndarray) -> np.ndarray:
+        """Velocity correction dv, m/s; zero if consistent."""
+        jump = self._prescribed_rates(laws)[0] - np.where(self.model.free_host == 0.0, v, 0.0)
+        if self.model.constraints is None:
+            return self._solve_saddle_point(np.zeros_like(v), jump) if jump.any() else jump
+        J, first, _ = self._constraint_rows(u, v, laws)
+        return self._solve_saddle_point(np.zeros_like(v), jump, J, -first)
+
+    def _acceleration(self, g: np.ndarray, u: np.ndarray, v: np.ndarray, laws: np.ndarray) -> np.ndarray:
+        """Acceleration w, m/s^2."""
+        prescribed = self._prescribed_rates(laws)[1]
+        if self.model.constraints is None:
+            return self._solve_saddle_point(-g, prescribed)
+        J, _, second = self._constraint_rows(u, v, laws)
+        return self._solve_saddle_point(-g, prescribed, J, -second)
+
+    def _jerk(self, u: np.ndarray, v: np.ndarray, laws: np.ndarray, w: np.ndarray, s: float) -> np.ndarray:
+        """Jerk dw/dt, m/s^3, prescribed by supports and constraints, by differences over -s .. s.
+
+        Elastic jerk is omitted: it is unresolved for stiff bodies.
+        """
+        if self.model.constraints is None and not self.driven:
+            return np.zeros_like(w)
+        prescribed, constraint_rhs, rows = np.zeros_like(w), None, None
+        for sign in (-0.5 / s, 0.5 / s):
+            x = np.copysign(s, sign)
+            there = np.tensordot(
+                [[1.0, x, x**2 / 2.0, x**3 / 6.0], [0.0, 1.0, x, x**2 / 2.0], [0.0, 0.0, 1.0, x]], laws, 1
+            )
+            prescribed += sign * self._prescribed_rates(there)[1]
+            if self.model.constraints is not None:
+                J, _, second = self._constraint_rows(u + x * v + 0.5 * x**2 * w, v + x * w, there)
+                constraint_rhs = (0.0 if constraint_rhs is None else constraint_rhs) - sign * (second + J @ w.ravel())
+        if self.model.constraints is not None:
+            rows = self._constraint_rows(u, v, laws)[0]
+        return self._solve_saddle_point(np.zeros_like(w), prescribed, rows, constraint_rhs)
+
+    def _solve_saddle_point(
+        self, force: np.ndarray, prescribed: np.ndarray, J: Any = None, constraint_rhs: Any = None
+    ) -> np.ndarray:
+        """Solve M x + J^T m = force on free components, x = held on others, and J x = goal for x (slots, 3)."""
+        m = self.model
+        x = self._solve_mass(force - m.masses.of_world(self._world) @ prescribed) + prescribed
+        if J is None:
+            return x
+        free = m.free_host.ravel() != 0.0
+        columns = (J.toarray() * free).reshape(-1, m.slots, 3)
+        inverse = np.array([self._solve_mass(row).ravel() for row in columns])  # rows of J M^-1
+        matrix = J @ inverse.T
+        multipliers = np.linalg.lstsq(matrix, J @ x.ravel() - constraint_rhs, rcond=RANK_TOL)[0]
+        return x - (multipliers @ inverse).reshape(x.shape)
+
+    def _solve_mass(self, force: np.ndarray) -> np.ndarray:
+        """M^-1 force on the free components, 0 on others."""
+        world = self._world if self.model.masses.varied else 0
+        if world not in self._mass:
+            self._mass[world] = [mass_solver(self.model, c, world) for c in range(3)]
+        out = np.zeros_like(force)
+        for c, (free, solve) in enumerate(self._mass[world]):
+            if len(free) and force[free, c].any():
+                out[free, c] = solve(force[free, c])
+        return out
+
+
+def mass_solver(model: Model, component: int, world: int = 0) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
+    """Free slots of a component, and a solver for their mass matrix."""
+    free = np.flatnonzero(model.free_host[:, component])
+    M = model.masses.of_world(world)[free][:, free].astype(float).tocsc()
+    if len(free) <= FACTORED_SLOTS:
+        return free, spl.splu(M).solve if len(free) else lambda f: f
+    scale = sp.diags(1.0 / M.diagonal())
+    return free, lambda f: spl.cg(M, f, rtol=1e-14, atol=0.0, maxiter=2000, M=scale)[0]
+
+
+def slope_after(law: TimeLaw, time: float) -> np.ndarray:
+    """Slope (3,) of a sampled law in the interval that contains a time or begins there; 0 outside its samples."""
+    k = int(np.searchsorted(law.times, time, side="right")) - 1
+    if k < 0 or k >= len(law.times) - 1:
+        return np.zeros(3)
+    return (law.values[k + 1] - law.values[k]) / (law.times[k + 1] - law.times[k])
+
+
+def constraint_rates(
+    tables: Any, u: np.ndarray, v: np.ndarray, laws: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Gradients (rows, 3, 3), first rates c' (rows,) m/s, and second rates without J w, m/s^2, of the rows of one
+    world.
+
+    u, v: (slots, 3); laws: (3 or 4, laws, 3), values, rates and second rates. See kernels/terms/constraints.py.
+    """
+    count = tables.count
+    moved, speed = np.zeros((2, 3 * count, 3))
+    for out, field in ((moved, u), (speed, v)):
+        np.add.at(out, tables.term_host, tables.weight_host[:, None] * field[tables.slot_host])
+    a, b, a2 = (tables.reference_host + moved).reshape(count, 3, 3).swapaxes(0, 1)
+    da, db, da2 = speed.reshape(count, 3, 3).swapaxes(0, 1)
+    kind, scale = tables.data.kind.numpy(), tables.scale_host
+    f, df, ddf = tables.data.fixed.numpy().copy(), np.zeros(count), np.zeros(count)
+    law, component = tables.data.law.numpy(), tables.data.law_component.numpy()
+    on = law >= 0
+    f[on] += laws[0][law[on], component[on]]
+    df[on], ddf[on] = (laws[k][law[on], component[on]] for k in (1, 2))
+
+    def dot(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return np.sum(x * y, axis=1)
+
+    G = np.stack([b, a, np.zeros_like(a)], axis=1)
+    first, second = dot(da, b) + dot(a, db) - df, 2.0 * dot(da, db) - ddf
+    far = kind == DISTANCE
+    size = np.where(far, np.linalg.norm(a, axis=1), 1.0)
+    n = a / size[:, None]
+    G[far] = np.stack([n, 0 * a, 0 * a], axis=1)[far]
+    first[far] = (dot(n, da) - df)[far]
+    second[far] = ((dot(da, da) - dot(n, da) ** 2) / size - ddf)[far]
+    turn = kind == ANGLE
+    s, c, w, dw = (x[:, None] for x in (np.sin(f), np.cos(f), df, ddf))
+    d, e = c * a2 - s * a, s * a2 + c * a
+    rate = c * da2 - s * da - w * e
+    bend = -2.0 * w * (s * da2 + c * da) - dw * e - w**2 * d
+    G[turn] = np.stack([-s * b, d, c * b], axis=1)[turn]
+    first[turn] = (dot(rate, b) + dot(d, db))[turn]
+    second[turn] = (dot(bend, b) + 2.0 * dot(rate, db))[turn]
+    return scale[:, None, None] * G, scale * first, scale * second
+
+
+def check_rho_inf(model: Model, integrator: Integrator, driven: bool) -> None:
+    """Raise ModelError if prescribed positions would make the accelerations of an undamped scheme grow."""
+    if integrator.parameter < 1.0:
+        return
+    if model.constraints is not None or driven:
+        what = f"joint {model.constraints.joints[0].name!r}" if model.constraints is not None else "a drive"
+        raise ModelError(
+            f"{integrator!r}: rho_inf = 1 is unstable with constraints, and the model has {what}: use rho_inf "
+            "< 1, e.g. 0.2"
+        )

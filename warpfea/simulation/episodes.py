@@ -1,0 +1,97 @@
+"""Episode bookkeeping for reinforcement learning: ends, statistics, stepped worlds."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from ..kernels.step.episodes import STATISTICS, loop_kernels
+
+if TYPE_CHECKING:
+    from ..base.launch import Launcher
+    from ..model.model import Model
+    from ..terms.workspace import Workspace
+
+__all__ = ["Episodes"]
+
+
+class Episodes:
+    """Arrays and launches of episodes; unused ones are None and launch nothing.
+
+    Attributes:
+        ends: [world] end times, s, at which worlds are frozen.
+        tally: [world, TALLY] statistics since the last read; stepped: [world] flags since the state was set.
+    """
+
+    def __init__(self, model: Model, work: Workspace, launch: Launcher, *, asynchronous: bool, ends: bool) -> None:
+        self.worlds, self.work, self.launch = model.worlds, work, launch
+        self.ends: wp.array | None = work.array("t_end", (model.worlds,), wp.float64) if ends else None
+        self.tally: wp.array | None = None
+        self.stepped: wp.array | None = None
+        self._flags: wp.array | None = None
+        self.set_run_end()
+        if ends:
+            work.step.ends = self.ends
+        if asynchronous:
+            self.tally = work.array("tally", (model.worlds, len(STATISTICS)), wp.float64)
+            self.stepped = work.array("stepped", (model.worlds,), wp.int32)
+            self._clear()
+
+    def modules(self) -> set[wp.Module]:
+        """Modules launched."""
+        return set() if self.tally is None and self.ends is None else {loop_kernels().module}
+
+    def set_run_end(self, end: float = math.inf, steps: int = 0) -> None:
+        """Set the end, s, and the number of steps of a run; inf: no run."""
+        # summed steps reach the end up to round-off
+        self.work.step.stop.assign(np.array([end, steps * math.ulp(end) if steps else 0.0]))
+
+    def freeze_finished(self) -> None:
+        """Freeze worlds that have reached their end time, at the start of a step or after its report."""
+        step = self.work.step
+        if self.ends is not None:
+            self.launch(loop_kernels().end_episodes, self.worlds, [step.time, self.ends, step.dt, step.status])
+
+    def end_step(self) -> None:
+        """Accumulate the statistics of a reported step."""
+        if self.tally is not None:
+            self.launch(loop_kernels().add_statistics, self.worlds, [self.work.report, self.tally, self.stepped])
+        self.freeze_finished()
+
+    def read_totals(self) -> tuple[np.ndarray, np.ndarray]:
+        """Read and reset the statistics (worlds, TALLY); also the stepped worlds (worlds,)."""
+        assert self.tally is not None
+        assert self.stepped is not None
+        sums = self.tally.numpy().copy()
+        self._clear()
+        return sums, self.stepped.numpy() != 0
+
+    def _clear(self) -> None:
+        assert self.tally is not None
+        self.launch(loop_kernels().clear_statistics, self.tally.shape, [self.tally])
+
+    def as_flags(self, mask: wp.array) -> wp.array:
+        """Copy a mask of int32 or bool to a persistent int32 array: the mask itself may be reset."""
+        if self._flags is None:
+            self._flags = wp.zeros(self.worlds, dtype=wp.int32, device=mask.device)
+        if mask.dtype == wp.int32:
+            wp.copy(self._flags, mask)
+        else:
+            wp.utils.array_cast(mask, self._flags)
+        return self._flags
+
+    def clear_stepped(self, worlds: np.ndarray | wp.array) -> None:
+        """Mark the chosen worlds (host mask or device flags) as not stepped since their state was set."""
+        if self.stepped is None:
+            return
+        if isinstance(worlds, wp.array):
+            self.launch(loop_kernels().clear_chosen, self.worlds, [worlds, self.stepped])
+        else:
+            self.stepped.assign(np.where(worlds, 0, self.stepped.numpy()))
+
+    def copy_flagged(self, flags: wp.array, source: Any, target: wp.array) -> None:
+        """Copy one value of the flagged worlds on the device."""
+        self.launch(loop_kernels().copy_chosen, self.worlds, [flags, source, target])

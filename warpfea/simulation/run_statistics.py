@@ -1,0 +1,177 @@
+"""Run statistics and last step report, read lazily in asynchronous runs."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from ..base.errors import ConstraintError, ConvergenceError
+from ..kernels.step.episodes import STATISTICS
+from ..kernels.step.step_control import REPORT, STATUS
+from .energy_growth import EnergyGrowth
+from .failures import step_error
+from .records import Records
+from .reports import StepReport
+
+__all__ = ["RunStatistics"]
+
+COUNTERS = ("newton", "pcg", "rough", "floored")
+
+
+class SyncedAttribute:
+    """Descriptor that synchronises device statistics before reading."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.key = f"_kept_{name.lstrip('_')}"
+
+    def __get__(self, sim: Any, owner: type) -> Any:
+        if sim is None:
+            return self
+        sim._sync_from_device()
+        return getattr(sim, self.key)
+
+    def __set__(self, sim: Any, value: Any) -> None:
+        setattr(sim, self.key, value)
+
+
+class RunStatistics(Records):
+    """Totals over steps, the last report, and records.
+
+    Attributes:
+        steps: number of steps taken.
+        last: report of the last step, None before the first.
+        totals: iterations by world; "rough" and "floored" count steps.
+        max_residual, max_floor, max_violation, min_J: extremes over all steps and worlds.
+        quiet: asynchronous steps without device reads: `record` is False, failed worlds are frozen, and neither step
+            sizes nor initial accelerations are computed on the host.
+    """
+
+    last: Any = SyncedAttribute()
+    totals: Any = SyncedAttribute()
+    max_residual: Any = SyncedAttribute()
+    max_floor: Any = SyncedAttribute()
+    max_violation: Any = SyncedAttribute()
+    min_J: Any = SyncedAttribute()
+    _stepped: Any = SyncedAttribute()
+    _failed: np.ndarray
+    _history: Any = SyncedAttribute()
+    on_failure: str | None
+    record: bool
+    energy_growth: EnergyGrowth
+
+    def _reset_statistics(self, asynchronous: bool) -> None:
+        B = self.model.worlds
+        self.asynchronous, self._unsynced, self._own_times = asynchronous, False, False
+        self.steps = 0
+        self.last = None
+        self.totals = {name: np.zeros(B, int) for name in COUNTERS}
+        if self.stepper.adaptive:
+            self.totals |= {name: np.zeros(B, int) for name in ("substeps", "rejected")}
+        self.max_residual = self.max_floor = self.max_violation = 0.0
+        self.min_J = math.inf
+        self._stepped, self._failed = (np.zeros(B, dtype=bool) for _ in range(2))
+        self._history = []
+
+    def _sync_from_device(self) -> None:
+        """Read the device statistics of the steps since the last reading."""
+        if not self._unsynced:
+            return
+        self._unsynced = False
+        sums, stepped = self.stepper.episodes.read_totals()
+        rows = self.stepper.work.report.numpy()
+        self.last = self._report_of(rows)
+        for name in COUNTERS:
+            self.totals[name] += sums[:, STATISTICS.index(name)].astype(int)
+        for name in ("residual", "floor", "violation"):
+            key = f"max_{name}"
+            setattr(self, key, max(getattr(self, key), float(sums[:, STATISTICS.index(name)].max())))
+        self.min_J = min(self.min_J, float(sums[:, STATISTICS.index("min_J")].min()))
+        self.energy_growth.warn_once(self, sums[:, STATISTICS.index("energy_growth")])
+        self._stepped = stepped
+        if self._recorded:
+            self._history = [self._history_row(rows)]
+
+    def _clear_stepped(self, mask: np.ndarray) -> None:
+        """Mark worlds as not stepped since their state was set."""
+        self._stepped[mask] = False
+        self.stepper.episodes.clear_stepped(mask)
+
+    def _report_of(self, rows: np.ndarray) -> StepReport:
+        """Report of a step from its columns (worlds, columns)."""
+        column = {name: rows[:, k].copy() for k, name in enumerate(REPORT)}
+        status = column["status"].astype(int)
+        return StepReport(
+            converged=(status == STATUS["running"]) & (column["rough"] == 0.0),
+            newton=column["newton"].astype(int),
+            pcg=column["pcg"].astype(int),
+            residual=column["residual"],
+            halvings=column["halvings"].astype(int),
+            status=status,
+            min_J=column["min_J"],
+            time=column["time"],
+            failure=column["failure"].astype(int),
+            violation=column["violation"],
+            outer=column["outer"].astype(int),
+            residual_force=column["residual_force"],
+            floor=column["floor"],
+            energy_growth=column["energy_growth"],
+            **(self.stepper.adaptive.counts() if self.stepper.adaptive else {}),
+        )
+
+    def _record_step(self, rows: np.ndarray) -> None:
+        """Accumulate the statistics of a step (worlds, columns); raise for failed worlds if requested."""
+        last = self.last = self._report_of(rows)
+        failed = last.status == STATUS["failed"]
+        fresh, self._failed = failed & ~self._failed, failed
+        self.steps += 1
+        good = last.status == STATUS["running"]
+        self._stepped |= good
+        self._stepped &= last.status != STATUS["failed"]
+        totals = self.totals
+        if self.stepper.adaptive:
+            totals["substeps"] += last.substeps
+            totals["rejected"] += last.rejected
+        totals["newton"] += last.newton
+        totals["pcg"] += last.pcg
+        totals["rough"] += good & ~last.converged
+        totals["floored"] += good & (last.floor > 0.0)
+        if good.any():
+            self.max_residual = max(self.max_residual, float(last.residual[good].max()))
+            self.max_floor = max(self.max_floor, float(last.floor[good].max()))
+            self.max_violation = max(self.max_violation, float(last.violation[good].max()))
+            self.min_J = min(self.min_J, float(last.min_J[good].min()))
+        if self._recorded:
+            if not self.record:
+                self._history.clear()
+            self._history.append(self._history_row(rows))
+        self.energy_growth.warn_once(self, last.energy_growth)
+        if fresh.any():
+            fatal = self.on_failure == "raise" or (self.on_failure is None and not good.any())
+            if fatal:
+                if not good.any():  # no world advanced
+                    self.steps -= 1
+                    if self._recorded:
+                        self._history.pop()
+                raise self._failure(int(np.flatnonzero(fresh)[0]))
+
+    def _history_row(self, rows: np.ndarray) -> np.ndarray:
+        """Recorded columns of a report: time, probes, and term columns, NaN for worlds that did not step."""
+        row = rows[:, [REPORT.index("time"), *range(len(REPORT), rows.shape[1])]].copy()
+        row[~self._stepped, 1 + 6 * len(self.model.probes) :] = np.nan
+        return row
+
+    @property
+    def _recorded(self) -> bool:
+        """True if any quantity is recorded per step."""
+        return self.model.terms.report_width > len(REPORT)
+
+    def _failure(self, world: int) -> ConvergenceError | ConstraintError:
+        """Error of a failed world; its status is cleared so that a caller may retry with another dt."""
+        error = step_error(self, world)
+        status = self.state.status.numpy()
+        status[status == STATUS["failed"]] = STATUS["running"]
+        self.state.status.assign(status)
+        self._failed[:] = False
+        return error

@@ -1,0 +1,131 @@
+"""Coarse space of rigid body modes of bodies coupled by terms, see kernels/solvers/rigid_body_modes.py."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from ..kernels.common.rigid import RIGID_MODES, bodies_struct
+from ..kernels.solvers.rigid_body_modes import rigid_mode_kernels
+from .dense import DenseInverse
+from .levels import BOTTOM_SLOTS
+
+if TYPE_CHECKING:
+    from ..base.launch import Launcher
+    from ..model.model import Model
+    from ..terms.workspace import Workspace
+    from .assembled import Pattern
+    from .residual import Residual
+
+__all__ = ["RigidBodyModes", "lanes_for", "mode_bodies"]
+
+CENTRE_SAMPLES = 16
+"""Slots averaged for the centre of a body."""
+MAX_LANES, MIN_PER_LANE = 256, 4
+"""Maximum number of partial sums, and the minimum count per partial sum."""
+
+
+def lanes_for(count: int) -> int:
+    """Number of partial sums for `count` values: a power of two, independent of the number of worlds."""
+    return int(min(MAX_LANES, 1 << max(0, (max(count, 1) - 1) // MIN_PER_LANE).bit_length()))
+
+
+def mode_bodies(model: Model) -> dict[int, int]:
+    """Mode index of each body that a term couples to another body with free rigid body modes.
+
+    Bodies without free modes are omitted; the map is empty if the matrix would be too large to invert.
+    """
+    free = [bool(allowed.any()) for allowed in map(_free_modes, [model] * len(model.bodies), range(len(model.bodies)))]
+    pairs = [(a, b) for term in model.terms for a, b in term.coupled_bodies() if a != b and free[a] and free[b]]
+    chosen = sorted({body for pair in pairs for body in pair})
+    most = BOTTOM_SLOTS["cuda" if model.device.is_cuda else "cpu"]
+    return {body: k for k, body in enumerate(chosen)} if 2 * len(chosen) <= most else {}
+
+
+def _free_modes(model: Model, body: int) -> np.ndarray:
+    """Free modes (6,): unprescribed translations, and rotations of a body without prescribed components."""
+    b = model.bodies[body]
+    free = model.free_host[b.slot_offset : b.slot_offset + b.slot_count]
+    return np.concatenate([free.min(axis=0), np.full(3, free.min())])
+
+
+class RigidBodyModes:
+    """Rigid body modes R of `mode_bodies`, the matrix R^T H R and its inverse.
+
+    Attributes:
+        bodies: device struct. number: mode index of a body of the model.
+        dense: the inverse; a term's `add_mode_coupling` adds to its `matrix`.
+    """
+
+    def __init__(self, model: Model, work: Workspace, launch: Launcher, residual: Residual, pattern: Pattern) -> None:
+        self.model, self.launch, self.residual, self.pattern = model, launch, residual, pattern
+        self.kernels = rigid_mode_kernels(model.dtype)
+        self.number = mode_bodies(model)
+        n, B, T = len(self.number), model.worlds, model.types.T
+        self.bodies = self._bodies()
+        self.bodies.arm = work.array("motions arm", (B, model.slots), wp.vec3d)
+        most = max(model.bodies[k].slot_count for k in self.number)
+        self.parts = work.array("motions parts", (B, n, lanes_for(most), 3), wp.mat33d)
+        self.dense = DenseInverse(model, work, launch, "motions", RIGID_MODES * n)
+        self.r, self.x = (work.array(f"motions {name}", (B, RIGID_MODES * n), T) for name in "rx")
+
+    def _bodies(self) -> Any:
+        m, chosen = self.model, [self.model.bodies[k] for k in self.number]
+        of_slot = np.full(m.slots, -1)
+        place = m.slot_kind == 0
+        X = np.array(m.reference, dtype=float)
+        sample, size = [], []
+        for k, body in enumerate(chosen):
+            own = slice(body.slot_offset, body.slot_offset + body.slot_count)
+            of_slot[own] = k
+            X[own] += np.asarray(body.origin) * place[own, None]
+            at = body.slot_offset + np.flatnonzero(place[own])
+            sample.append(at[np.linspace(0, len(at) - 1, CENTRE_SAMPLES).round().astype(int)])
+            size.append(float(np.ptp(X[at], axis=0).max()))
+        allowed = np.array([_free_modes(m, k) for k in self.number])
+        out = bodies_struct(m.dtype)()
+        tables: dict[str, tuple[Any, Any]] = {
+            "first": ([body.slot_offset for body in chosen], wp.int32),
+            "last": ([body.slot_offset + body.slot_count for body in chosen], wp.int32),
+            "size": (size, wp.float64),
+            "translations": (allowed[:, :3], wp.vec3d),
+            "rotations": (allowed[:, 3:], wp.vec3d),
+            "centre_slots": (np.array(sample).T, wp.int32),
+            "of_slot": (of_slot, wp.int32),
+            "is_position": (place, m.types.T),
+            "X": (X, wp.vec3d),
+        }
+        for name, (values, dtype) in tables.items():
+            setattr(out, name, m.array("motions", np.ascontiguousarray(values), dtype))
+        return out
+
+    def lanes(self, count: int) -> int:
+        """Number of partial sums for `count` values."""
+        return lanes_for(count)
+
+    def modules(self) -> set[wp.Module]:
+        """Modules launched."""
+        return {self.kernels.module} | self.dense.modules()
+
+    def assemble(self, u: wp.array, value: wp.array, flags: wp.array) -> None:
+        """Assemble the uncoupled matrix R^T H R at displacements u; `value`: H without the coupling terms."""
+        m, k, dense = self.model, self.kernels, self.dense
+        self.launch(k.update_arms, (m.worlds, m.slots), [self.bodies, u, flags])
+        lanes = self.parts.shape[2]
+        args = [self.bodies, self.pattern.data, m.topology.free, value, flags, lanes, self.parts]
+        self.launch(k.body_sums, self.parts.shape[:3], args)
+        self.launch(k.fill, (m.worlds, dense.size), [flags, self.parts, dense.scale, dense.matrix])
+
+    def invert(self, flags: wp.array) -> None:
+        """Invert the matrix after terms have added to it."""
+        self.dense.invert(flags, keep=False, reduce=self.residual.reduce)
+
+    def apply(self, r: wp.array, z: wp.array, active: wp.array) -> None:
+        """z += R (R^T H R)^-1 R^T r."""
+        m, k, launch = self.model, self.kernels, self.launch
+        args = [self.bodies, r, active, self.r]
+        launch.tiled(k.restrict, (m.worlds, len(self.number)), args)
+        self.dense.apply(self.r, self.x, active)
+        launch(k.prolong, (m.worlds, m.slots), [self.bodies, self.x, m.topology.free, active, z])

@@ -1,0 +1,195 @@
+"""Follower loads: pressure on faces, and moments."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from ..kernels.solvers.direct import direct_kernels, followed_struct
+from ..kernels.terms.follower_loads import follower_struct, moment_kernels, pressure_kernels
+from ..model import assembly
+from ..model.description import Moment, Pressure
+from ..time_laws import TimeLaw
+from .term import StepContext, Term
+from .time_law_table import TimeLawTable
+
+if TYPE_CHECKING:
+    from ..model.model import Model
+
+__all__ = ["FollowerMatrix", "FollowerPart", "Followers"]
+
+
+@dataclass(eq=False)
+class FollowerPart:
+    """Pressure on faces or moment at points: device data, kernels of the force and of its symmetric tangent."""
+
+    data: Any
+    force: Any
+    product: Any
+    count: int
+
+
+class Followers(Term):
+    """Pressures and moments, non-potential in general; H contains the symmetric part of their tangent."""
+
+    name = "followers"
+    potential = False
+
+    def __init__(self, model: Model) -> None:
+        super().__init__(model)
+        self.items: list[FollowerPart] = []
+        self._entries = 0
+
+    @classmethod
+    def of(cls, model: Model) -> Followers | None:
+        d = model.description
+        return cls(model) if d.pressures or d.moments else None
+
+    @classmethod
+    def features(cls, model: Model) -> dict[str, bool]:
+        return {"follower pressure": bool(model.description.pressures), "moments": bool(model.description.moments)}
+
+    def build(self, laws: TimeLawTable) -> None:
+        self.items = [self._pressure(p, laws) for p in self.model.description.pressures]
+        self.items += [self._moment(p, laws) for p in self.model.description.moments]
+
+    def _data(self, conn: np.ndarray, law: TimeLaw, laws: TimeLawTable) -> Any:
+        """Common device data; conn (items, local) in model slots."""
+        m = self.model
+        data = follower_struct(m.dtype)()
+        data.conn = m.array("loads", conn.T, wp.int32)
+        data.law = m.array("loads", np.full(len(conn), laws.add(law)), wp.int32)
+        data.offset, data.count = self.offset + self._entries, len(conn)
+        self.connectivity.append(conn)
+        self._entries += conn.size
+        return data
+
+    def _pressure(self, pressure: Pressure, laws: TimeLawTable) -> FollowerPart:
+        m = self.model
+        body = pressure.surface.body
+        t = assembly.facet_tables(pressure.surface)
+        data = self._data(t.conn + body.slot_offset, pressure.law, laws)
+        position = body.slot_kind[t.conn] == 0
+        value = body.reference[t.conn]
+        value = np.where(position[:, :, None], value - value[:, :1], value)
+        data.reference = m.array("loads", np.swapaxes(value, 0, 1), m.types.vec3)
+        data.is_position = m.array("loads", position.T.astype(float), m.types.T)
+        for name, table in (("shape", t.shape), ("d_a", t.d_a), ("d_b", t.d_b)):
+            setattr(data, name, m.array("loads", np.moveaxis(table, 0, 2), m.types.T))
+        data.weight = m.array("loads", t.weights[0], m.types.T)
+        k = pressure_kernels(m.dtype)
+        return FollowerPart(data, k.pressure, k.pressure_product, len(t.conn))
+
+    def _moment(self, moment: Moment, laws: TimeLawTable) -> FollowerPart:
+        m = self.model
+        data = self._data(moment.slots + moment.body.slot_offset, moment.law, laws)
+        data.gradient = m.array("loads", np.swapaxes(moment.vectors, 0, 1), m.types.vec3)
+        data.axes = m.array("loads", moment.axes, m.types.mat33)
+        data.fraction = m.array("loads", np.full(len(moment.slots), 1.0 / len(moment.slots)), m.types.T)
+        k = moment_kernels(m.dtype, moment.body.family.spin_vectors)
+        return FollowerPart(data, k.moment, k.moment_product, len(moment.slots))
+
+    def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
+        return {kernel.module for item in self.items for kernel in (item.force, item.product)}
+
+    def force(self, ctx: StepContext, active: wp.array) -> None:
+        m, w = self.model, ctx.work
+        for item in self.items:
+            args = [item.data, w.u_stage, w.time_law_stage_values, active, w.nonpotential_contribution]
+            ctx.launch(item.force, (m.worlds, item.count), args)
+
+    def product(self, ctx: StepContext, p: wp.array, active: wp.array) -> None:
+        """Symmetric tangent of the force times p."""
+        m, w = self.model, ctx.work
+        for item in self.items:
+            args = [
+                item.data,
+                ctx.midpoint_factor,
+                w.u_stage,
+                w.time_law_stage_values,
+                active,
+                p,
+                w.nonpotential_tangent,
+            ]
+            ctx.launch(item.product, (m.worlds, item.count), args)
+
+    def mark_constrained(self, free: np.ndarray) -> None:
+        """No-op: pressures and moments are translation invariant."""
+
+    def allocate_blocks(self, ctx: StepContext, matrix: Any, *, projected: bool) -> None:
+        if not projected:
+            items = self.items
+            ctx.scratch[self.name] = [FollowerMatrix(self, ctx, item, matrix.pattern) for item in items]
+
+    def blocks(
+        self, ctx: StepContext, matrix: Any, kept: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,
+        *, projected: bool,
+    ) -> None:  # fmt: skip
+        """Minus the symmetric tangent of the force; indefinite, so nothing if projected."""
+        if projected:
+            return
+        for item in ctx.scratch[self.name]:
+            item.add(ctx, matrix, dq_dv, active, out)
+
+    def hash(self, h: Any) -> None:
+        for conn in self.connectivity:
+            h.update(np.ascontiguousarray(conn).tobytes())
+        for pressure in self.model.description.pressures:
+            h.update(np.ascontiguousarray(pressure.surface.faces).tobytes())
+        for moment in self.model.description.moments:
+            h.update(np.ascontiguousarray(moment.vectors).tobytes())
+
+
+class FollowerMatrix:
+    """Matrices of a follower load's items, built by columns as products with unit vectors at local slots."""
+
+    def __init__(self, term: Followers, ctx: StepContext, item: FollowerPart, pattern: Any) -> None:
+        model, work = term.model, ctx.work
+        self.model, self.item = model, item
+        self.kernels = direct_kernels(model.dtype)
+        conn = item.data.conn.numpy()
+        self.slots, self.count = conn.shape
+        size = conn.size
+        self.data = follower_struct(model.dtype)()
+        for name in follower_struct(model.dtype).vars:
+            setattr(self.data, name, getattr(item.data, name))
+        own = np.arange(size, dtype=np.int32).reshape(conn.shape)
+        self.data.conn = wp.array(own, dtype=wp.int32, device=model.device)
+        self.data.offset = 0
+        name = f"direct follower {item.data.offset}"
+        vec3, B = model.types.vec3, model.worlds
+        self.u = work.array(f"{name} u", (B, size), vec3)
+        self.direction = work.array(f"{name} direction", (B, size), vec3)
+        self.columns = work.array(f"{name} columns", (3 * self.slots, B, size), vec3)
+        self.places, self.entries = self._find(conn, pattern)
+
+    def _find(self, conn: np.ndarray, pattern: Any) -> tuple[Any, int]:
+        """Pattern entries of the items' matrices."""
+        i, j, item = (a.ravel() for a in np.indices((self.slots, self.slots, self.count)))
+        index = pattern.find(conn[i, item], conn[j, item])
+        chosen = np.flatnonzero(index >= 0)
+        chosen = chosen[np.argsort(index[chosen], kind="stable")]
+        entry, count = np.unique(index[chosen], return_counts=True)
+        places = followed_struct()()
+        values = (entry, np.concatenate([[0], np.cumsum(count)]), (i * self.count + item)[chosen], j[chosen])
+        for name, value in zip(("entry", "start", "row", "column"), values):
+            setattr(places, name, self.model.array("matrix pattern", value, wp.int32))
+        return places, len(entry)
+
+    def add(self, ctx: StepContext, matrix: Any, dq_dv: wp.array, active: wp.array, out: wp.array) -> None:
+        """out -= (dq/dv) times the items' matrices."""
+        B, k, w, launch = self.model.worlds, self.kernels, ctx.work, ctx.launch
+        launch(k.take_local, (B, self.slots, self.count), [self.item.data.conn, w.u_stage, active, self.u])
+        for local in range(self.slots):
+            for axis in range(3):
+                args = [local, axis, self.count, self.direction]
+                launch(k.unit_direction, (B, self.slots * self.count), args)
+                column = self.columns[3 * local + axis]
+                args = [self.data, ctx.midpoint_factor, self.u, w.time_law_stage_values, active, self.direction, column]
+                launch(self.item.product, (B, self.count), args)
+        args = [self.model.topology, matrix.pattern.data, self.places, self.columns, dq_dv, active, out]
+        launch(k.add_followers, (B, self.entries), args)

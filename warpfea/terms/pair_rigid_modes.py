@@ -1,0 +1,53 @@
+"""Coupling of bodies in contact in the matrix of their rigid body modes (solvers/motions.py)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from ..kernels.terms.pair_rigid_modes import pair_rigid_mode_kernels
+
+if TYPE_CHECKING:
+    from .pair_tables import PairTables
+    from .term import StepContext
+
+__all__ = ["PairRigidModes"]
+
+
+class PairRigidModes:
+    """Couplings between the bodies of a preconditioner's `motions` by contacts, with sums over their points."""
+
+    def __init__(self, ctx: StepContext, tables: PairTables, masters: Any, motions: Any) -> None:
+        m, t = ctx.model, tables
+        self.ctx, self.tables, self.masters, self.motions = ctx, tables, masters, motions
+        self.kernels = pair_rigid_mode_kernels(m.dtype)
+        number = {id(body): motions.number.get(k, -1) for k, body in enumerate(m.bodies)}
+        sides = [(number[id(c.slave.body)], number[id(c.master.body)]) for c in t.contacts]
+        coupled = [k for k, (a, b) in enumerate(sides) if min(a, b) >= 0 and a != b]
+        pairs = sorted({(min(sides[k]), max(sides[k])) for k in coupled})
+        found = [[(k, int(sides[k] != pair)) for k in coupled if tuple(sorted(sides[k])) == pair] for pair in pairs]
+        start = np.concatenate([[0], np.cumsum([len(rows) for rows in found])])
+        self.pair, self.count = m.array("motions", np.array(pairs), wp.vec2i), len(pairs)
+        self.start = m.array("motions", start, wp.int32)
+        self.source = m.array("motions", np.concatenate(found), wp.vec2i)
+        self.first = m.array("motions", t.first, wp.int32)
+        self.groups = []
+        for group in t.groups:
+            low, high = group.data.point, group.data.point + group.data.count * group.data.points
+            own = [k for k in coupled if low <= t.first[k] < high]
+            if own:
+                self.groups.append((group, m.array("motions", np.array(own), wp.int32), len(own)))
+        most = int(np.diff(t.first)[coupled].max())
+        self.parts = ctx.work.array("pairs motions", (m.worlds, len(t.contacts), motions.lanes(most), 4), wp.mat33d)
+
+    def add(self, kept: list[wp.array], dq_dv: wp.array, active: wp.array) -> None:
+        """Add the coupling blocks, from the arrays of `cached_inputs`."""
+        stiffness, _, _, _, weight, listed = kept
+        B, lanes, launch, bodies = self.ctx.model.worlds, self.parts.shape[2], self.ctx.launch, self.motions.bodies
+        for group, contact, count in self.groups:
+            args = [bodies, self.masters, group.data, contact, self.first, stiffness, weight, listed, active, lanes]
+            launch(self.kernels.cross_term_sums, (B, count, lanes), [*args, self.parts])
+        args = [self.pair, self.start, self.source, self.parts, dq_dv, active, self.motions.dense.matrix]
+        launch(self.kernels.add_cross_terms, (B, self.count, 4), args)

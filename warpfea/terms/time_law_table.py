@@ -1,0 +1,127 @@
+"""Device table of the time laws of a model."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from ..base.errors import ModelError
+from ..kernels.terms.loads import law_function_kernel, law_struct, load_kernels
+from ..time_laws import Control, TimeLaw
+
+if TYPE_CHECKING:
+    from ..base.launch import Launcher
+    from ..model.model import Model
+    from ..model.state import State
+
+__all__ = ["TimeLawTable", "argument_precision", "control_array"]
+
+
+class TimeLawTable:
+    """Time laws, numbered as added, then uploaded; `evaluate` fills one row of values per world.
+
+    Attributes:
+        controls: those in use, by name; their values are state arrays, see `control_array`.
+    """
+
+    def __init__(self, model: Model) -> None:
+        self.model = model
+        self.kernels = load_kernels(model.dtype)
+        self.laws: list[TimeLaw] = []
+        self.functions: list[tuple[Any, int]] = []
+        self.controls: dict[str, Control] = {}
+        self.controlled: dict[tuple[str, bool], int] = {}
+        self.data = law_struct()()
+
+    def add(self, law: TimeLaw) -> int:
+        """Index of a law; a control keeps its first index.
+
+        Raises:
+            ModelError: a name used by two controls.
+        """
+        if law.control is not None:
+            known = self.controls.setdefault(law.control.name, law.control)
+            if known != law.control:
+                raise ModelError(
+                    f"two controls have the name {known.name!r}: {known} and {law.control}; give each its own, or use "
+                    "one for both"
+                )
+            if (known.name, law.ramped) in self.controlled:
+                return self.controlled[known.name, law.ramped]
+            self.controlled[known.name, law.ramped] = len(self.laws)
+        self.laws.append(law)
+        return len(self.laws) - 1
+
+    def register(self, state: State) -> None:
+        """Add missing arrays of control values to a state."""
+        for control in self.controls.values():
+            state.register(control_array(control.name), wp.float64, (control.size,), control.initial)
+
+    @property
+    def count(self) -> int:
+        """Number of laws."""
+        return len(self.laws)
+
+    def upload(self) -> None:
+        """Upload the device table; no-op without laws."""
+        m, laws = self.model, self.laws
+        if not laws:
+            return
+        start = np.concatenate([[0], np.cumsum([len(w.times) for w in laws])])
+        self.data.start = m.array("laws", start, wp.int32)
+        self.data.times = m.array("laws", np.concatenate([w.times for w in laws] + [[0.0]]), wp.float64)
+        self.data.values = m.array("laws", np.concatenate([w.values for w in laws] + [np.zeros((1, 3))]), wp.vec3d)
+        for k, law in enumerate(laws):
+            if law.function is not None:
+                take = argument_precision(law.function, m.dtype)
+                self.functions.append((law_function_kernel(law.function, law.scalar, take), k))
+
+    def evaluate(
+        self, launch: Launcher, state: State, time: wp.array, ramp: wp.array, active: wp.array, value: wp.array
+    ) -> None:
+        """value[world, law] at times [world]; constants and controls are scaled by the ramp [world] of a static load
+        path.
+
+        Control values are read from the state.
+        """
+        if not self.laws:
+            return
+        B = self.model.worlds
+        launch(self.kernels.evaluate_laws, (B, self.count), [self.data, time, ramp, active, value])
+        for kernel, law in self.functions:
+            launch(kernel, B, [law, time, active, value])
+        for (name, ramped), law in self.controlled.items():
+            args = [getattr(state, control_array(name)), law, int(ramped), ramp, active, value]
+            launch(self.kernels.evaluate_control, B, args)
+
+    def modules(self) -> set[wp.Module]:
+        """Modules launched by `evaluate`."""
+        out = {kernel.module for kernel, _ in self.functions}
+        out |= {self.kernels.evaluate_control.module} if self.controls else set()
+        return out | ({self.kernels.evaluate_laws.module} if self.laws else set())
+
+    def hash(self, h: Any) -> None:
+        """Hash the laws."""
+        for law in self.laws:
+            h.update(law.times.tobytes() + law.values.tobytes())
+            if law.function is not None:
+                h.update(law.function.key.encode())
+            if law.control is not None:
+                h.update(f"{law.control!r} {law.ramped}".encode())
+
+
+def control_array(name: str) -> str:
+    """Name of the state array [world, size] with the values of a control."""
+    return f"control_{name}"
+
+
+def argument_precision(function: wp.Function, default: str) -> str:
+    """Precision of a user function's arguments, from its annotations."""
+    text = " ".join(str(t) for t in getattr(function, "input_types", {}).values())
+    if any(word in text for word in ("float64", "vec3d", "vec_t[float64")):
+        return "float64"
+    if any(word in text for word in ("float32", "vec3f", "<class 'float'>")):
+        return "float32"
+    return default
