@@ -91,13 +91,13 @@ def at_points(term: Any, state: State, history: Any = None, places: bool = True)
     for group in t.groups:
         dim = (B, group.count, group.data.points)
         launch(term.kernels.settle, dim, [t.data, group.data, history, state.time, state.displacement, attempt])
-    if term.places:
+    if term.deepest_points:
         clock = clock_struct()()
         clock.time, clock.still = state.time, 1
         row_start = m.array("contact", t.row_start, wp.int32)
         s = {"history": history, "attempt": attempt, "clock": clock, "row_start": row_start}
         before, changed = (state.displacement,) * 2, zeros((B,), wp.int32)
-        term.places.choose(launch, s, state.time, u, before, every, changed, fresh=1, settled=1)
+        term.deepest_points.choose(launch, s, state.time, u, before, every, changed, fresh=1, settled=1)
     for group in t.groups:
         dim = (B, group.count, group.data.points)
         args = [t.data, group.data, history, u, state.time, attempt, int(places), gap, force]
