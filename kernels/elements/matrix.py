@@ -188,6 +188,28 @@ def matrix_kernels(
         lines[world, 5 * point + 3, elem] = vec3(S[0, 0], S[1, 1], S[2, 2])
         lines[world, 5 * point + 4, elem] = vec3(S[1, 2], S[0, 2], S[0, 1])
 
+    @wp.func
+    def load_point(lines: wp.array3d(dtype=vec3), world: int, point: int, elem: int):
+        """F and S of a point from the rows of `prepare_matrix`."""
+        F = wp.matrix_from_rows(
+            lines[world, 5 * point, elem], lines[world, 5 * point + 1, elem], lines[world, 5 * point + 2, elem]
+        )
+        d = lines[world, 5 * point + 3, elem]
+        o = lines[world, 5 * point + 4, elem]
+        return F, mat33(d[0], o[2], o[1], o[2], d[1], o[0], o[1], o[0], d[2])
+
+    @wp.func
+    def slot_gradient(block: Block, point: int, slot: int, elem: int) -> vec3:
+        """h of a slot at a point, along the law's axes, 1/m."""
+        h = vec3()
+        if wp.static(affine):
+            h = wp.transpose(fn.inverse_jacobian(block, elem)) * block.gradient[point, slot, 0]
+        else:
+            h = block.gradient[point, slot, elem]
+        if wp.static(framed):
+            h = wp.transpose(block.frame[point, elem]) * h
+        return h
+
     @wp.kernel(module=module)
     def element_matrix(
         block: Block,
@@ -219,19 +241,8 @@ def matrix_kernels(
         unit[axis] = T(1.0)
         out = Local()
         for point in range(block.gradient.shape[0]):
-            F = wp.matrix_from_rows(
-                lines[world, 5 * point, elem], lines[world, 5 * point + 1, elem], lines[world, 5 * point + 2, elem]
-            )
-            d = lines[world, 5 * point + 3, elem]
-            o = lines[world, 5 * point + 4, elem]
-            S = mat33(d[0], o[2], o[1], o[2], d[1], o[0], o[1], o[0], d[2])
-            h = vec3()
-            if wp.static(affine):
-                h = wp.transpose(fn.inverse_jacobian(block, elem)) * block.gradient[point, b, 0]
-            else:
-                h = block.gradient[point, b, elem]
-            if wp.static(framed):
-                h = wp.transpose(block.frame[point, elem]) * h
+            F, S = load_point(lines, world, point, elem)
+            h = slot_gradient(block, point, b, elem)
             # dF = unit h^T, so that F^T dF is the outer product of a row of F and h
             B = t.sym(wp.outer(wp.transpose(F) * unit, h))
             dP = wp.outer(unit, S * h)
@@ -318,6 +329,19 @@ def matrix_kernels(
                             A[3 * i + k, 3 * j + l] = A[3 * i + k, 3 * j + l] + dP[i, k]
         return A
 
+    @wp.func
+    def tangent_moduli(block: Block, c: coef, dq_dv: wp.float64) -> moduli9:
+        """Moduli of the stresses that are linear in E, viscous stress included, Pa; 0 for a law that needs J > 0."""
+        cv = fn.damping_coefficients(c, T(1.0) / T(dq_dv))
+        moduli = t.moduli9()
+        if wp.static(not needs_J):
+            moduli = m.moduli(c)
+            if wp.static(dissipative):
+                moduli = fn.dissipation_factor(block) * moduli
+        if wp.static(damping == "incremental" or damping == "rate"):
+            moduli += t.isotropic_moduli(cv[0], cv[1])
+        return moduli
+
     @wp.kernel(module=rows_module)
     def element_rows(
         block: Block,
@@ -344,14 +368,7 @@ def matrix_kernels(
         if active[world] == 0:
             return
         c = fn.coefficients(block, world, elem)
-        cv = fn.damping_coefficients(c, T(1.0) / T(dq_dv[world]))
-        moduli = t.moduli9()
-        if wp.static(not needs_J):
-            moduli = m.moduli(c)
-            if wp.static(dissipative):
-                moduli = fn.dissipation_factor(block) * moduli
-        if wp.static(damping == "incremental" or damping == "rate"):
-            moduli += t.isotropic_moduli(cv[0], cv[1])
+        moduli = tangent_moduli(block, c, dq_dv[world])
         U, V = fn.load(block, u, world, elem), velocities(block, v, world, elem)
         step = last_change(block, v, base, use_prediction[world], dq_dv[world], world, elem)
         if add == 0:

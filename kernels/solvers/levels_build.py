@@ -77,6 +77,23 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         for a in range(3):
             diagonal[world, tile, 3 * place + a] = matrix[world, tile, 3 * place + a, 3 * place + a]
 
+    @wp.func
+    def eliminate_column(at: wp.uint64, c: wp.uint64, k: int, j: int, scale: T):
+        """Column j of a tile after pivot k of Gauss-Jordan, of which c is the column and `scale` the inverse."""
+        if j == k:
+            for i in range(TILE):
+                memory.store(at, TILE * i + k, -scale * line.load(c, i))
+            memory.store(at, TILE * k + k, scale)
+        else:
+            d = scale * memory.load(at, TILE * k + j)
+            for i in range(0, TILE, 4):  # four rows load at once
+                s = vec4()
+                for a in range(4):
+                    s[a] = memory.load(at, TILE * (i + a) + j) - d * line.load(c, i + a)
+                for a in range(4):
+                    memory.store(at, TILE * (i + a) + j, s[a])
+            memory.store(at, TILE * k + j, d)
+
     @wp.kernel(module=module)
     def invert_tiles(
         lanes: int,
@@ -116,19 +133,7 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
             if pivot > T(NEGLIGIBLE) * size and size > T(0.0):
                 scale = T(1.0) / pivot
                 for j in range(lane, TILE, lanes):
-                    if j == k:
-                        for i in range(TILE):
-                            memory.store(at, TILE * i + k, -scale * line.load(c, i))
-                        memory.store(at, TILE * k + k, scale)
-                    else:
-                        d = scale * memory.load(at, TILE * k + j)
-                        for i in range(0, TILE, 4):  # four rows load at once
-                            s = vec4()
-                            for a in range(4):
-                                s[a] = memory.load(at, TILE * (i + a) + j) - d * line.load(c, i + a)
-                            for a in range(4):
-                                memory.store(at, TILE * (i + a) + j, s[a])
-                        memory.store(at, TILE * k + j, d)
+                    eliminate_column(at, c, k, j, scale)
             else:
                 for j in range(lane, TILE, lanes):
                     memory.store(at, TILE * k + j, T(0.0))

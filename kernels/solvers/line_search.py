@@ -35,6 +35,7 @@ def search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
     f64 = wp.float64
     Control = control_struct()
     stored, unilateral, midpoint, limited = traits.stored, traits.unilateral, traits.midpoint, traits.limited
+    has_kinks = unilateral and not midpoint
     judging = judging_functions(traits)
     objective, magnitude, evaluate_norms = judging.objective, judging.magnitude, judging.evaluate_norms
     check_convergence, fail = judging.check_convergence, judging.fail
@@ -182,71 +183,56 @@ def search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
         part = wp.clamp(low[1] / (low[1] - high[1]), f64(0.05), f64(0.95))
         return low[0] + part * (high[0] - low[0])
 
-    @wp.kernel(module=module)
-    def check_trial(ctl: Control):
-        """Armijo test on Phi above its noise, else sign of the slope; then convergence."""
-        world = wp.tid()
-        if ctl.searching[world] == 0:
-            return
+    @wp.func
+    def sufficient_decrease(ctl: Control, world: int, change: f64, slope: f64, norm: f64) -> bool:
+        """True if a trial is good: Armijo on the change of Phi above its noise, else the sign of the slope."""
         alpha = ctl.alpha[world]
-        old_norm = ctl.norm[world]
-        old_phi = ctl.phi[world]
-        # frozen forces keep their symmetric tangent: the curvature of Phi then agrees with H
-        bend = ctl.dq_dv[world] * ctl.tangent_sum[0, world]
-        phi = objective(ctl, world) - f64(0.5) * alpha * alpha * bend
-        norm = wp.sqrt(ctl.slot_sums[0, world])
-        change = phi - old_phi
         noise = f64(NOISE) * ctl.eps * (ctl.phi_magnitude[world] + magnitude(ctl, world))
-        finite = wp.isfinite(phi) and wp.isfinite(norm)
-        good = finite
+        good = slope <= f64(WOLFE) * wp.abs(ctl.slope[world])
+        if wp.abs(change) > noise:
+            good = change <= f64(ARMIJO) * alpha * ctl.slope[world]
+        if wp.static(midpoint):
+            good = change <= f64(-2.0) * f64(ARMIJO) * alpha * ctl.phi[world]
+        return good or (ctl.nonpotential != 0 and norm <= f64(0.5) * ctl.norm[world])
+
+    @wp.func
+    def good_trial(ctl: Control, world: int, phi: f64, slope: f64, norm: f64) -> bool:
+        """True for a trial with finite Phi, J > 0 and sufficient decrease; with a reused operator the first one must
+        also halve the residual."""
+        good = wp.isfinite(phi) and wp.isfinite(norm) and not ctl.domain_J[world] <= f64(0.0)
         if good:
-            if wp.abs(change) > noise:
-                good = change <= f64(ARMIJO) * alpha * ctl.slope[world]
-            else:
-                good = ctl.slot_sums[6, world] - alpha * bend <= f64(WOLFE) * wp.abs(ctl.slope[world])
-            if wp.static(midpoint):
-                good = finite and change <= f64(-2.0) * f64(ARMIJO) * alpha * old_phi
-            if ctl.nonpotential != 0 and norm <= f64(0.5) * old_norm:
-                good = True
-        if ctl.domain_J[world] <= f64(0.0):
-            good = False
-        reused = ctl.reused[world] != 0
-        if reused and ctl.iterations[world] == 0 and not norm <= f64(0.5) * old_norm:
+            good = sufficient_decrease(ctl, world, phi - ctl.phi[world], slope, norm)
+        if ctl.reused[world] != 0 and ctl.iterations[world] == 0 and not norm <= f64(0.5) * ctl.norm[world]:
             good = False  # a step must not start worse than with its own operator
             ctl.searches[world] = REUSED_SEARCH
-        stands = alpha == f64(0.0) or ctl.restore_best[world] != 0
-        wants_nonmonotone = finite and not (good or stands or reused) and ctl.searches[world] == 0
-        wants_nonmonotone = (
-            wants_nonmonotone and ctl.nonmonotone_trial[world] == 0 and ctl.negative_curvature[world] == 0
-        )
-        wants_nonmonotone = wants_nonmonotone and (ctl.require_armijo[world] == 0 or ctl.predicted_stress[world] == 2)
-        if wp.static(
-            unilateral
-        ):  # into an obstacle and back; friction has a convex potential, and full steps overshoot
-            wants_nonmonotone = (
-                wants_nonmonotone
-                and ctl.frozen_updated[world] == 0
-                and ctl.penetrating_steps[world] < MAX_PENETRATING_STEPS
-            )
-        if wp.static(unilateral and not midpoint):  # sticking begins where Phi rises again
-            slope = ctl.slot_sums[6, world] - alpha * bend
-            steep = f64(KINK) * wp.abs(ctl.slope[world])
-            tries = (
-                not (stands or wants_nonmonotone or reused)
-                and ctl.nonmonotone_trial[world] == 0
-                and ctl.searches[world] < KINKS
-            )
-            beyond = slope > steep or (ctl.bracket_high[world][0] > f64(0.0) and slope < -steep)
-            if tries and beyond and finite and ctl.domain_J[world] > f64(0.0):
-                ctl.searches[world] = ctl.searches[world] + 1
-                ctl.alpha[world] = bracket_step(ctl, world, slope)
-                return
-        if lengthen(ctl, world, good and not (stands or reused), ctl.slot_sums[6, world] - alpha * bend):
-            return
-        nonmonotone = ctl.nonmonotone_trial[world] == 2 and finite and ctl.min_J[world] > f64(0.0)
-        if good or stands or nonmonotone:
-            accept_trial(ctl, world, stands, nonmonotone)
-        elif wants_nonmonotone:
+        return good
+
+    @wp.func
+    def nonmonotone_allowed(ctl: Control, world: int) -> bool:
+        """True if the full step of this search may raise Phi."""
+        out = ctl.searches[world] == 0 and ctl.nonmonotone_trial[world] == 0 and ctl.negative_curvature[world] == 0
+        out = out and (ctl.require_armijo[world] == 0 or ctl.predicted_stress[world] == 2)
+        if wp.static(unilateral):  # into an obstacle and back; friction has a convex potential: full steps overshoot
+            out = out and ctl.frozen_updated[world] == 0 and ctl.penetrating_steps[world] < MAX_PENETRATING_STEPS
+        return out
+
+    @wp.func
+    def locate_kink(ctl: Control, world: int, slope: f64) -> bool:
+        """True if a trial is beside a kink of Phi, where sticking begins: Phi rises steeply there, or still falls
+        steeply within the bracket. Sets the next step length."""
+        if ctl.nonmonotone_trial[world] != 0 or ctl.searches[world] >= KINKS or not ctl.domain_J[world] > f64(0.0):
+            return False
+        steep = f64(KINK) * wp.abs(ctl.slope[world])
+        beyond = slope > steep or (ctl.bracket_high[world][0] > f64(0.0) and slope < -steep)
+        if beyond:
+            ctl.searches[world] = ctl.searches[world] + 1
+            ctl.alpha[world] = bracket_step(ctl, world, slope)
+        return beyond
+
+    @wp.func
+    def refuse_trial(ctl: Control, world: int, wants_nonmonotone: bool, reused: bool):
+        """Next trial after a refused one: a nonmonotone step, the best iterate, or half the step."""
+        if wants_nonmonotone:
             ctl.nonmonotone_trial[world] = 1
             ctl.searching[world] = 0
             wp.atomic_max(ctl.any_rare, 0, 1)
@@ -254,6 +240,36 @@ def search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
             ctl.restore_best[world] = 1
         else:
             shorten(ctl, world, reused)
+
+    @wp.kernel(module=module)
+    def check_trial(ctl: Control):
+        """Acceptance of a trial, Armijo on Phi, Eq. (18), or the next step length; then convergence."""
+        world = wp.tid()
+        if ctl.searching[world] == 0:
+            return
+        alpha = ctl.alpha[world]
+        # frozen forces keep their symmetric tangent: the curvature of Phi then agrees with H
+        bend = ctl.dq_dv[world] * ctl.tangent_sum[0, world]
+        phi = objective(ctl, world) - f64(0.5) * alpha * alpha * bend
+        slope = ctl.slot_sums[6, world] - alpha * bend
+        norm = wp.sqrt(ctl.slot_sums[0, world])
+        finite = wp.isfinite(phi) and wp.isfinite(norm)
+        good = good_trial(ctl, world, phi, slope, norm)
+        reused = ctl.reused[world] != 0
+        stands = alpha == f64(0.0) or ctl.restore_best[world] != 0
+        usable = finite and not (stands or reused)
+        wants_nonmonotone = usable and not good and nonmonotone_allowed(ctl, world)
+        if wp.static(has_kinks):
+            if usable and not wants_nonmonotone:
+                if locate_kink(ctl, world, slope):
+                    return
+        if lengthen(ctl, world, good and not (stands or reused), slope):
+            return
+        nonmonotone = ctl.nonmonotone_trial[world] == 2 and finite and ctl.min_J[world] > f64(0.0)
+        if good or stands or nonmonotone:
+            accept_trial(ctl, world, stands, nonmonotone)
+        else:
+            refuse_trial(ctl, world, wants_nonmonotone, reused)
 
     return _types.SimpleNamespace(
         tangent_needed=tangent_needed, limit_nonmonotone_step=limit_nonmonotone_step, check_trial=check_trial

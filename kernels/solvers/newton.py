@@ -189,6 +189,32 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
             else:
                 fail(ctl, world, FAIL_CURVATURE)
 
+    @wp.func
+    def part_error(ctl: Control, world: int, part: int, whole: f64, largest: f64) -> f64:
+        """Error estimate of a part, see `check_rounding_floor`.
+
+        `whole`: -g.p of all parts, W; `largest`: the largest length that is rounded, m.
+        """
+        dq = ctl.dq_dv[world]
+        work, kinetic, strain, step, speed = f64(0.0), f64(0.0), f64(0.0), f64(0.0), f64(0.0)
+        for lane in range(FLOOR_LANES):
+            work += ctl.floor_sums[0, world, part, lane]
+            kinetic += ctl.floor_sums[1, world, part, lane]
+            strain += ctl.floor_sums[2, world, part, lane]
+            step = wp.max(step, ctl.floor_sums[3, world, part, lane])
+            speed = wp.max(speed, ctl.floor_sums[5, world, part, lane])
+        eta = f64(1.0e30)
+        if ctl.negative_curvature[world] == 0 and wp.isfinite(work) and whole > f64(0.0):
+            eta = wp.sqrt(wp.abs(work) * dq / wp.max(f64(2.0) * strain + kinetic * dq, f64(1.0e-300)))
+            if ctl.eps > f64(SINGLE_EPS):  # a soft direction may be invisible to the energy
+                eta = wp.max(eta, f64(SCATTER) * dq * step / wp.max(largest, f64(1.0e-300)))
+            if eta > ctl.max_floor and dq * step <= f64(DISPLACEMENT_ROUNDINGS) * ctl.eps * largest:
+                eta = dq * step / wp.max(largest, f64(1.0e-300))
+            slow = step <= f64(VELOCITY_ROUNDINGS) * ctl.eps * speed
+            if eta > ctl.max_floor and slow and ctl.eps < f64(SINGLE_EPS):
+                eta = step / speed
+        return eta
+
     @wp.kernel(module=module)
     def check_rounding_floor(ctl: Control, component_of_part: wp.array(dtype=wp.int32)):
         """Error estimate of a stalled residual, relative to the solution, of the worst part.
@@ -203,7 +229,6 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         if ctl.pcg_unconverged[world] != 0 and ctl.eps > f64(SINGLE_EPS):  # this solve cannot give the error either
             give_up(ctl, world, FAIL_FLOOR)
             return
-        dq = ctl.dq_dv[world]
         largest, whole = f64(0.0), f64(0.0)
         for part in range(component_of_part.shape[0]):
             for lane in range(FLOOR_LANES):
@@ -214,27 +239,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         worst = f64(0.0)
         for part in range(component_of_part.shape[0]):
             if ctl.component_converged[world, component_of_part[part]] == 0:
-                work, kinetic, strain, step, speed = f64(0.0), f64(0.0), f64(0.0), f64(0.0), f64(0.0)
-                for lane in range(FLOOR_LANES):
-                    work += ctl.floor_sums[0, world, part, lane]
-                    kinetic += ctl.floor_sums[1, world, part, lane]
-                    strain += ctl.floor_sums[2, world, part, lane]
-                    step = wp.max(step, ctl.floor_sums[3, world, part, lane])
-                    speed = wp.max(speed, ctl.floor_sums[5, world, part, lane])
-                eta = f64(1.0e30)
-                if ctl.negative_curvature[world] == 0 and wp.isfinite(work) and whole > f64(0.0):
-                    eta = wp.sqrt(wp.abs(work) * dq / wp.max(f64(2.0) * strain + kinetic * dq, f64(1.0e-300)))
-                    if ctl.eps > f64(SINGLE_EPS):  # a soft direction may be invisible to the energy
-                        eta = wp.max(eta, f64(SCATTER) * dq * step / wp.max(largest, f64(1.0e-300)))
-                    if eta > ctl.max_floor and dq * step <= f64(DISPLACEMENT_ROUNDINGS) * ctl.eps * largest:
-                        eta = dq * step / wp.max(largest, f64(1.0e-300))
-                    if (
-                        eta > ctl.max_floor
-                        and step <= f64(VELOCITY_ROUNDINGS) * ctl.eps * speed
-                        and ctl.eps < f64(SINGLE_EPS)
-                    ):
-                        eta = step / speed
-                worst = wp.max(worst, eta)
+                worst = wp.max(worst, part_error(ctl, world, part, whole, largest))
         ctl.error_estimate[world] = worst
         if worst <= ctl.max_floor:
             ctl.floor[world] = wp.max(ctl.floor[world], worst)

@@ -115,7 +115,6 @@ def vector_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNa
         v_tilde: wp.array2d(dtype=vec3),
         u: wp.array2d(dtype=vec3),
         energy: wp.array3d(dtype=f64),
-        sums: wp.array4d(dtype=f64),
     ):
         """Strided partial sums of FLOOR_ROWS over the slots and elements of a part; empty lists: all."""
         world, part, lane = wp.tid()
@@ -138,12 +137,12 @@ def vector_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNa
             if element.shape[0] > 0:
                 e = element[k]
             strain += energy[0, world, e]
-        sums[0, world, part, lane] = work
-        sums[1, world, part, lane] = kinetic
-        sums[2, world, part, lane] = strain
-        sums[3, world, part, lane] = step
-        sums[4, world, part, lane] = size
-        sums[5, world, part, lane] = speed
+        ctl.floor_sums[0, world, part, lane] = work
+        ctl.floor_sums[1, world, part, lane] = kinetic
+        ctl.floor_sums[2, world, part, lane] = strain
+        ctl.floor_sums[3, world, part, lane] = step
+        ctl.floor_sums[4, world, part, lane] = size
+        ctl.floor_sums[5, world, part, lane] = speed
 
     @wp.kernel(module=module)
     def copy_active(source: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), target: wp.array2d(dtype=vec3)):

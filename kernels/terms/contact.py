@@ -221,7 +221,7 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         frozen = scr.frozen[world, rec]
         if fresh != 0:
             frozen[2] = f64(1.0)
-        t = evaluate_point(con, facets, his, scr, world, c, q, item, point, u, clock.new_time[world], inv_h, frozen[2])
+        t = evaluate_point(con, facets, his, scr, world, q, item, point, u, clock.new_time[world], inv_h, frozen[2])
         if con.is_explicit[c] == 0:
             new = frozen_values(con, his, scr, world, c, point, t)
             if fresh != 0:  # initial limits: those of the last step, zero for a new contact

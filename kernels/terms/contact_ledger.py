@@ -106,7 +106,7 @@ def contact_ledger_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         if clock.still == 0:
             inv_h = f64(1.0) / clock.h[world]
         frozen = scr.frozen[world, rec]
-        t = evaluate_point(con, facets, his, scr, world, c, q, item, point, u, clock.new_time[world], inv_h, frozen[2])
+        t = evaluate_point(con, facets, his, scr, world, q, item, point, u, clock.new_time[world], inv_h, frozen[2])
         if con.is_explicit[c] == 0:
             t = with_friction_normal(t, scr.frozen_normal[world, rec])
         change = t.depth - scr.depth[world, point]
@@ -339,7 +339,7 @@ def contact_ledger_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
                     area_fraction = wp.where(acting_point == point, f64(1.0), f64(0.0))
             if area_fraction == f64(0.0) and acting_point != point:
                 return
-        t = evaluate_point(con, facets, his, scr, world, c, q, item, acting_point, u, time[world], f64(0.0), f64(1.0))
+        t = evaluate_point(con, facets, his, scr, world, q, item, acting_point, u, time[world], f64(0.0), f64(1.0))
         frozen = frozen_values(con, his, scr, world, c, acting_point, t)
         if acting_point == point and (facets.tracks_deepest == 0 or places != 0):
             gap[world, point] = -t.depth

@@ -176,11 +176,12 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
     @wp.func
     def evaluate_point(
-        con: Contacts, facets: Facets, his: History, scr: ContactScratch, world: int, c: int, q: int, item: int,
-        point: int, u: wp.array2d(dtype=vec3d), time: f64, inv_h: f64, shrink: f64,
+        con: Contacts, facets: Facets, his: History, scr: ContactScratch, world: int, q: int, item: int, point: int,
+        u: wp.array2d(dtype=vec3d), time: f64, inv_h: f64, shrink: f64,
     ) -> PointContact:  # fmt: skip
         """A point at displacements u (float64, see kernels/terms/double_displacements.py)."""
         out = PointContact()
+        c = facets.contact[item]
         k = con.collider[c]
         rec = history_row(con, c, point)
         moved = interpolate_acting(facets, scr, u, world, q, item)

@@ -8,6 +8,7 @@ import warp as wp
 from ..common.block_entries import add_symmetric_function
 from ..common.structs import pattern_struct, topology_struct
 from ..common.types import SHORT_UNROLL, kernel_module, precision
+from .pair_structs import point_list_struct
 
 __all__ = ["pair_block_kernels"]
 
@@ -18,7 +19,7 @@ def pair_block_kernels(dtype: str) -> _types.SimpleNamespace:
     p = precision(dtype)
     T, mat33, sym = p.T, p.mat33, p.sym
     f64 = wp.float64
-    Topology, Pattern = topology_struct(dtype), pattern_struct()
+    Topology, Pattern, PointLists = topology_struct(dtype), pattern_struct(), point_list_struct()
     add_symmetric = add_symmetric_function(dtype)
     module = kernel_module(f"pair_blocks_{dtype}", max_unroll=SHORT_UNROLL)
 
@@ -26,8 +27,7 @@ def pair_block_kernels(dtype: str) -> _types.SimpleNamespace:
     def add_masters(
         topo: Topology, pattern: Pattern, entry: wp.array(dtype=wp.int32), start: wp.array(dtype=wp.int32),
         source: wp.array(dtype=wp.vec3i), stiffness: wp.array2d(dtype=sym), weight: wp.array3d(dtype=T),
-        points: wp.array2d(dtype=wp.int32), first: wp.array2d(dtype=wp.int32), listed: wp.array2d(dtype=wp.int32),
-        dq_dv: wp.array(dtype=f64), active: wp.array(dtype=wp.int32), value: wp.array2d(dtype=mat33),
+        lists: PointLists, dq_dv: wp.array(dtype=f64), active: wp.array(dtype=wp.int32), value: wp.array2d(dtype=mat33),
     ):  # fmt: skip
         """value += (dq/dv) sum over the points of a facet of w_a w_b K; `source`: facet and two of its slots."""
         world, index = wp.tid()
@@ -36,9 +36,9 @@ def pair_block_kernels(dtype: str) -> _types.SimpleNamespace:
         k6 = sym()
         for e in range(start[index], start[index + 1]):
             at = source[e]
-            begin = first[world, at[0]]
-            for k in range(points[world, at[0]]):
-                point = listed[world, begin + k]
+            begin = lists.list_start[world, at[0]]
+            for k in range(lists.list_size[world, at[0]]):
+                point = lists.list_point[world, begin + k]
                 k6 += (weight[world, point, at[1]] * weight[world, point, at[2]]) * stiffness[world, point]
         add_symmetric(topo, pattern.upper[entry[index]], T(dq_dv[world]) * k6, world, value)
 

@@ -55,6 +55,14 @@ def pair_ledger_kernels(dtype: str) -> _types.SimpleNamespace:
         rows[j, world, row] = rows[j, world, row] + value
 
     @wp.func
+    def clear_rows(energies: wp.array3d(dtype=f64), scr: ContactScratch, world: int, row: int):
+        """Clear the energy increments and the record of a facet."""
+        for j in range(ENERGY_COLUMNS):
+            energies[j, world, row] = f64(0.0)
+        for j in range(RECORD_SUMS + 1):
+            scr.rows[j, world, row] = f64(0.0)
+
+    @wp.func
     def add_work(rows: wp.array3d(dtype=f64), world: int, row: int, work: f64):
         """Work of a recovering initial overlap, which the integrator's own formula omits."""
         add(rows, 3, world, row, work)
@@ -70,6 +78,17 @@ def pair_ledger_kernels(dtype: str) -> _types.SimpleNamespace:
         his.contact_state[world, point] = 0
         pair_his.facet[world, point] = 0
         pair_his.xi[world, point] = vec3d()
+
+    @wp.func
+    def record_slip(
+        scr: ContactScratch, world: int, row: int, depth: f64, area: f64, slipping: int, slip_increment: vec3d
+    ):
+        """Add area, slip and sticking area of a point in contact to the record of a facet, and its depth."""
+        if depth > f64(0.0):
+            add(scr.rows, 7, world, row, area * f64(slipping) * wp.length(slip_increment))
+            add(scr.rows, 8, world, row, area)
+            add(scr.rows, 9, world, row, area * f64(1 - slipping))
+        scr.rows[14, world, row] = wp.max(scr.rows[14, world, row], depth)
 
     @wp.func
     def record_force(scr: ContactScratch, world: int, row: int, force: vec3d, x: vec3d):
@@ -119,10 +138,7 @@ def pair_ledger_kernels(dtype: str) -> _types.SimpleNamespace:
         c = facets.contact[item]
         law = con.law[c]
         row = facets.row + item
-        for j in range(ENERGY_COLUMNS):
-            energies[j, world, row] = f64(0.0)
-        for j in range(RECORD_SUMS + 1):
-            scr.rows[j, world, row] = f64(0.0)
+        clear_rows(energies, scr, world, row)
         inv_h = f64(0.0)
         if clock.still == 0:
             inv_h = f64(1.0) / clock.h[world]
@@ -173,12 +189,7 @@ def pair_ledger_kernels(dtype: str) -> _types.SimpleNamespace:
             place = surface_point(mas, pair.C, pair.D, world, f, pair.xi[world, point])
             add(scr.rows, 6, world, row, area_fraction * normal)
             record_force(scr, world, row, (mas.sign[c] * area_fraction) * force, place.x)
-            if s.depth > f64(0.0):
-                area = facets.area[q, item]
-                add(scr.rows, 7, world, row, area * f64(slipping) * wp.length(slip_increment))
-                add(scr.rows, 8, world, row, area)
-                add(scr.rows, 9, world, row, area * f64(1 - slipping))
-            scr.rows[14, world, row] = wp.max(scr.rows[14, world, row], s.depth)
+            record_slip(scr, world, row, s.depth, facets.area[q, item], slipping, slip_increment)
             if s.depth <= f64(0.0):
                 clear_history(his, pair_his, world, point)
             else:

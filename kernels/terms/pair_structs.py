@@ -6,7 +6,7 @@ import warp as wp
 
 from ..common.types import precision
 
-__all__ = ["master_struct", "pair_history_struct", "pair_scratch_struct"]
+__all__ = ["master_struct", "pair_history_struct", "pair_scratch_struct", "point_list_struct"]
 
 
 @functools.cache
@@ -126,3 +126,16 @@ def pair_scratch_struct(dtype: str):
         list_point: wp.array2d(dtype=wp.int32)  # [world, point]
 
     return PairScratch
+
+
+@functools.cache
+def point_list_struct():
+    """Points of master facets, as kept with a preconditioner; see `PairScratch`."""
+
+    @wp.struct
+    class PointLists:
+        list_size: wp.array2d(dtype=wp.int32)  # [world, facet]
+        list_start: wp.array2d(dtype=wp.int32)
+        list_point: wp.array2d(dtype=wp.int32)  # [world, place in a list]
+
+    return PointLists

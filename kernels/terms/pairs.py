@@ -33,7 +33,7 @@ __all__ = ["pair_functions", "pair_kernels"]
 
 @functools.cache
 def pair_functions(dtype: str) -> _types.SimpleNamespace:
-    """Device function touch_of."""
+    """Device function `evaluate_pair_point`."""
     f64 = wp.float64
     Contacts, ContactScratch, PairScratch = (
         contact_struct(False),
@@ -73,7 +73,7 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
     ContactScratch, Clock = contact_scratch_struct(dtype), clock_struct()
     Masters, PairHistory, PairScratch = master_struct(dtype), pair_history_struct(), pair_scratch_struct(dtype)
     k, places = contact_point_functions(dtype, False), facet_projection_functions(dtype)
-    evaluate_pair_point = pair_functions(dtype).evaluate_pair_point
+    PointContact, evaluate_pair_point = k.PointContact, pair_functions(dtype).evaluate_pair_point
     with_friction_normal, frozen_values, set_explicit_force = (
         k.with_friction_normal,
         k.frozen_values,
@@ -191,6 +191,76 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         for i in range(mas.conn.shape[0]):
             pair.shape_values[world, point, i] = T(shape_value(mas, f, i, pair.anchor_xi[world, point]))
 
+    @wp.func
+    def refuse_point(scr: ContactScratch, pair: PairScratch, world: int, point: int):
+        """Infinite potential of a point that has passed through a body: the iterate is refused."""
+        scr.passed_through[world] = point + 1
+        scr.activity[world, point] = FORCE_ONLY
+        scr.force[world, point] = vec3d()
+        pair.tangential_force[world, point] = vec3d()
+        scr.energy[world, point] = wp.vec2d(f64(wp.inf), f64(0.0))
+
+    @wp.func
+    def freeze_limits(
+        con: Contacts, his: History, scr: ContactScratch, world: int, c: int, point: int, s: PointContact, fresh: int
+    ) -> vec3d:
+        """Frozen friction limit, k_t and spring factor of a point; `fresh`: they and the normal are those of s."""
+        frozen = scr.frozen[world, point]
+        new = frozen_values(con, his, scr, world, c, point, s)
+        if fresh != 0:
+            scr.frozen_normal[world, point] = s.m
+            frozen = new
+            frozen[0] = wp.min(new[0], his.friction_limit[world, point])
+            scr.frozen[world, point] = frozen
+        frozen[1] = new[1]
+        frozen[2] = f64(1.0)
+        scr.updated_normal[world, point] = s.m
+        scr.updated[world, point] = new
+        return frozen
+
+    @wp.func
+    def set_master_shapes(mas: Masters, pair: PairScratch, world: int, point: int, f: int, friction: bool):
+        """Shape values of the master's slots at the projection of a point, those of friction at its coordinates."""
+        for i in range(mas.conn.shape[0]):
+            pair.shape_values[world, point, i] = T(shape_value(mas, f, i, pair.projection[world, point]))
+            pair.shape_gradient[world, point, i] = vec2(
+                places.shape_gradients(mas, f, i, pair.projection[world, point])
+            )
+            if friction:
+                pair.friction_shape[world, point, i] = T(shape_value(mas, f, i, pair.xi[world, point]))
+
+    @wp.func
+    def store_force(
+        con: Contacts, mas: Masters, scr: ContactScratch, pair: PairScratch, world: int, c: int, point: int, f: int,
+        s: PointContact, frozen: vec3d, inv_h: f64, area_fraction: f64,
+    ):  # fmt: skip
+        """Normal force and friction of a point on its facet, their potential, and the stiffness, N/m."""
+        friction_energy = friction_potential(con, world, c, s, frozen, inv_h)
+        K = point_stiffness(con, world, c, s, frozen, inv_h)
+        tangential_force = area_fraction * friction_force(con, world, c, s, frozen, inv_h)
+        scr.activity[world, point] = WITH_STIFFNESS
+        pair.tangential_force[world, point] = tangential_force
+        set_geometric_stiffness(
+            mas, pair, world, point, f, scr.contact_distance[world, point] - s.depth, area_fraction * s.law[0]
+        )
+        scr.force[world, point] = tangential_force - (area_fraction * s.law[0]) * s.n
+        scr.energy[world, point] = wp.vec2d(
+            area_fraction * (s.law[2] + friction_energy), area_fraction * (s.law[3] + wp.abs(friction_energy))
+        )
+        scr.stiffness[world, point] = sym(T(area_fraction * K[0, 0]), T(area_fraction * K[1, 1]),
+            T(area_fraction * K[2, 2]), T(area_fraction * K[1, 2]), T(area_fraction * K[0, 2]),
+            T(area_fraction * K[0, 1]))  # fmt: skip
+
+    @wp.func
+    def change_list(scr: ContactScratch, pair: PairScratch, world: int, point: int, f: int):
+        """Facet whose list contains a point: its own where it has a force."""
+        wanted = wp.int32(0)
+        if scr.activity[world, point] != INACTIVE and f >= 0:
+            wanted = f + 1
+        if pair.listed_facet[world, point] != wanted:
+            pair.listed_facet[world, point] = wanted
+            pair.lists_changed[0] = 1
+
     @wp.kernel(module=module)
     def forces(
         con: Contacts, mas: Masters, facets: Facets, his: History, pair_his: PairHistory, clock: Clock,
@@ -211,39 +281,19 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
                 f = pair_his.facet[world, point] - 1
                 apply_explicit_force(mas, scr, pair, world, point, f, area_fraction)
         elif f == PENETRATED:
-            scr.passed_through[world] = point + 1
-            scr.activity[world, point] = FORCE_ONLY
-            scr.force[world, point] = vec3d()
-            pair.tangential_force[world, point] = vec3d()
-            scr.energy[world, point] = wp.vec2d(f64(wp.inf), f64(0.0))
+            refuse_point(scr, pair, world, point)
             f = -1
         elif f >= 0 and area_fraction > f64(0.0):
             inv_h = f64(0.0)
             if clock.still == 0:
                 inv_h = f64(1.0) / clock.h[world]
             s = evaluate_pair_point(con, scr, pair, world, c, point, inv_h)
-            frozen = scr.frozen[world, point]
-            new = frozen_values(con, his, scr, world, c, point, s)
-            if fresh != 0:
-                scr.frozen_normal[world, point] = s.m
-                frozen = new
-                frozen[0] = wp.min(new[0], his.friction_limit[world, point])
-                scr.frozen[world, point] = frozen
-            frozen[1] = new[1]
-            frozen[2] = f64(1.0)
-            scr.updated_normal[world, point] = s.m
-            scr.updated[world, point] = new
+            frozen = freeze_limits(con, his, scr, world, c, point, s, fresh)
             m = scr.frozen_normal[world, point]
             if wp.dot(m, s.m) <= f64(0.5):  # the point has passed to another facet since
                 m = s.m
                 scr.frozen_normal[world, point] = m
-            for i in range(mas.conn.shape[0]):
-                pair.shape_values[world, point, i] = T(shape_value(mas, f, i, pair.projection[world, point]))
-                pair.shape_gradient[world, point, i] = vec2(
-                    places.shape_gradients(mas, f, i, pair.projection[world, point])
-                )
-                if fresh != 0 or frozen[0] <= f64(0.0):
-                    pair.friction_shape[world, point, i] = T(shape_value(mas, f, i, pair.xi[world, point]))
+            set_master_shapes(mas, pair, world, point, f, fresh != 0 or frozen[0] <= f64(0.0))
             if fresh != 0:
                 freeze_friction_shapes(mas, facets, pair, u, world, q, item, point, f)
             if frozen[0] > f64(0.0):  # frozen shape values: friction has a potential
@@ -254,33 +304,14 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
                 s.elastic_slip = pair.frozen_slip[world, point] + (shift - pair.frozen_displacement[world, point])
             s = with_friction_normal(s, m)
             if s.depth > f64(0.0) or frozen[0] > f64(0.0):
-                friction_energy = friction_potential(con, world, c, s, frozen, inv_h)
-                K = point_stiffness(con, world, c, s, frozen, inv_h)
-                tangential_force = area_fraction * friction_force(con, world, c, s, frozen, inv_h)
-                scr.activity[world, point] = WITH_STIFFNESS
-                pair.tangential_force[world, point] = tangential_force
-                set_geometric_stiffness(
-                    mas, pair, world, point, f, scr.contact_distance[world, point] - s.depth, area_fraction * s.law[0]
-                )
-                scr.force[world, point] = tangential_force - (area_fraction * s.law[0]) * s.n
-                scr.energy[world, point] = wp.vec2d(
-                    area_fraction * (s.law[2] + friction_energy), area_fraction * (s.law[3] + wp.abs(friction_energy))
-                )
-                scr.stiffness[world, point] = sym(T(area_fraction * K[0, 0]), T(area_fraction * K[1, 1]),
-                    T(area_fraction * K[2, 2]), T(area_fraction * K[1, 2]), T(area_fraction * K[0, 2]),
-                    T(area_fraction * K[0, 1]))  # fmt: skip
+                store_force(con, mas, scr, pair, world, c, point, f, s, frozen, inv_h, area_fraction)
         elif area_fraction > f64(0.0):
             frozen = vec3d()
             scr.updated[world, point] = frozen
             if fresh != 0:
                 scr.frozen[world, point] = frozen
                 scr.frozen_normal[world, point] = frozen
-        wanted = wp.int32(0)
-        if scr.activity[world, point] != INACTIVE and f >= 0:
-            wanted = f + 1
-        if pair.listed_facet[world, point] != wanted:
-            pair.listed_facet[world, point] = wanted
-            pair.lists_changed[0] = 1
+        change_list(scr, pair, world, point, f)
 
     @wp.kernel(module=module)
     def gather_masters(

@@ -398,7 +398,7 @@ class NewtonLoop:
         m, w, k = self.model, self.work, self.kernels
         parts = m.residual_parts
         args = [w.newton, parts.slot_start, parts.slot, parts.element_start, parts.element]
-        args += [w.gradient, w.direction, w.inertia, w.v, w.v_tilde, w.u, w.energy_rows, w.newton.floor_sums]
+        args += [w.gradient, w.direction, w.inertia, w.v, w.v_tilde, w.u, w.energy_rows]
         self.launch(self.vectors.floor_partial, (m.worlds, parts.count, FLOOR_LANES), args)
         self.launch(k.check_rounding_floor, m.worlds, [w.newton, parts.component])
         if self.perturbation:

@@ -11,6 +11,7 @@ from ..kernels.common.state import state_kernels
 from ..kernels.terms.contact import contact_kernels
 from ..kernels.terms.contact_ledger import contact_block_kernels
 from ..kernels.terms.pair_blocks import pair_block_kernels
+from ..kernels.terms.pair_structs import point_list_struct
 from ..kernels.terms.pairs import pair_kernels
 from ..model.state import words_of
 from .contact_tables import block_entries
@@ -91,14 +92,15 @@ class PairSolves(Term):
     ) -> None:  # fmt: skip
         """Stiffness of the points on their own facets and on master facets, without the coupling of both."""
         m, t = self.model, self.tables
-        stiffness, points, start, entry, weight, _ = kept
+        lists = point_list_struct()()
+        stiffness, lists.list_size, lists.list_start, lists.list_point, weight, _ = kept
         *slaves, masters = m.cache["pair blocks"]
         add = contact_block_kernels(m.dtype).add_contact
         for group, (index, begin, source, count) in zip(t.groups, slaves):
             args = [m.topology, matrix.pattern.data, group.data, index, begin, source, stiffness, weight]
             ctx.launch(add, (m.worlds, count), [*args, dq_dv, active, out])
         index, begin, source, count = masters
-        args = [m.topology, matrix.pattern.data, index, begin, source, stiffness, weight, points, start, entry]
+        args = [m.topology, matrix.pattern.data, index, begin, source, stiffness, weight, lists]
         add = pair_block_kernels(m.dtype).add_masters
         ctx.launch(add, (m.worlds, count), [*args, dq_dv, active, out])
 

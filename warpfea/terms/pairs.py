@@ -265,10 +265,8 @@ class Pairs(PairSolves):
         for group, corners in zip(t.groups, t.corners):
             args = [t.data, masters, group.data, s["history"]]
             ctx.launch(k.query_boxes, (m.worlds, group.count), [*args, u, active, t.reaching + overlap_limit, touching])
-            args += [s["seats"], s["clock"], u, ctx.state.velocity, active, overlap_limit]
-            ctx.launch(
-                k.find_facets, (m.worlds, group.count, group.data.points), [*args, s["attempt"], touching, corners]
-            )
+            args += [s["clock"], u, ctx.state.velocity, active, overlap_limit, s["attempt"], touching, corners]
+            ctx.launch(k.find_facets, (m.worlds, group.count, group.data.points), args)
 
     def prepare(self, ctx: StepContext, active: wp.array) -> None:
         """Compute the first friction limits and the stiffness of the blocks."""
