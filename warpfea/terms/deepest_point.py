@@ -48,7 +48,7 @@ class DeepestPoints:
         for group in groups:
             args = [t.data, group.data, s["history"], time, u, active, s["attempt"]]
             launch(k.point_depths, (B, group.count, group.data.points), args)
-            launch(k.find_facets, (B, group.count), args)
+            launch(k.find_deepest, (B, group.count), args)
         args = [t.data, s["row_start"], active, fresh, s["attempt"], changed]
         launch(k.choose_deepest, (B, len(t.contacts)), args)
         for group in groups:
