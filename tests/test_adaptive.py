@@ -1,42 +1,15 @@
-"""dt="auto": errors asked for and met, decisions that are bits of the state, instants, and what is refused."""
+"""dt="auto": errors asked for and met, and steps that follow from the state alone."""
 
 from __future__ import annotations
-
-import json
-import pathlib
 
 import numpy as np
 import pytest
 import warp as wp
+from adaptive_bars import KICK, LAW, SCHEMES, auto, bar
 
 import warpfea as wf
-from warpfea.cli import main
 from warpfea.simulation.checkpoint import Checkpoint
-from warpfea.simulation.integrators import Integrator
-from warpfea.simulation.integrators.backward_euler import BACKWARD_EULER
 from warpfea.simulation.integrators.bdf2 import bdf2, bdf2_error
-from warpfea.simulation.sync_times import SyncTimes
-from warpfea.time_laws import time_law
-
-RESULT = pathlib.Path(__file__).resolve().parent / "results" / "adaptive_cpu.json"
-SCHEMES = ("backward_euler", "bdf2")
-LAW = wf.SVK(E=1e6, nu=0.3, density=1000.0)
-KICK = 0.0123
-
-
-def bar(*, worlds=1, dtype="float64", gravity=(0, 0, -9.81), kick=False):
-    b = wf.ModelBuilder(gravity=gravity)
-    body = b.add_solid(wf.mesh.box((1, 0.2, 0.2), cells=(2, 1, 1)), material=LAW, name="bar")
-    b.clamp(body.nodes("x-"))
-    if kick:
-        pull = [(0, 0, 0), (0, 0, 0), (0, 0, 3e3), (0, 0, 3e3)]
-        b.add_traction(body.surface("x+"), ([0, KICK, KICK + 1e-3, 1.0], pull))
-    b.add_probe("tip", body.surface("x+"))
-    return b.finalize(device="cpu", dtype=dtype, worlds=worlds)
-
-
-def auto(model=None, error=1e-3, **options):
-    return wf.Simulation(model or bar(), dt="auto", error=error, **options)
 
 
 def everything(sim):
@@ -220,130 +193,6 @@ def test_a_failed_step_leaves_the_state_of_its_start():
         np.testing.assert_array_equal(sim.state.numpy()[name], before[name], err_msg=name)
 
 
-# instants
-
-
-def test_kinks_of_tables_are_instants_and_samples_of_curves_are_not():
-    t = np.linspace(0.0, 1.0, 201)
-    smooth = time_law((t, np.column_stack([np.sin(20.0 * t), 0 * t, 0 * t])), "curve")
-    ramp = time_law(([0.0, 0.1, 0.100001, 5.0], [(0, 0, 0), (0, 0, 0), (1, 0, 0), (1, 0, 0)]), "ramp")
-    assert SyncTimes([smooth], 1.0, 1.0).kinks.tolist() == [0.0, 1.0]  # where it begins and ends
-    assert SyncTimes([ramp, time_law((1, 0, 0), "constant")], 1.0, 1.0).kinks.tolist() == [0.1, 0.100001]
-
-
-def test_a_short_pulse_is_seen_beside_a_jump():
-    """A jump is so steep that slopes of all else are small beside it: the pulse lies between two instants."""
-    start, half = 0.0101, 1e-4
-    times = [0.0, start, start + half, start + 2 * half, 0.5, 0.5 + 1e-7, 1.0]
-    load = np.outer([0, 0, 1e5, 0, 0, 1e5, 1e5], [1.0, 0, 0])
-    law = time_law((times, load), "pull")
-    assert set(times[1:4]) <= set(SyncTimes([law], 1.0, 1.0).kinks)
-    b = wf.ModelBuilder(gravity=(0, 0, 0))
-    body = b.add_solid(wf.mesh.box((1, 1, 1), cells=(1, 1, 1)), material=LAW)
-    b.add_traction(body.surface("x+"), (times, load))
-    model = b.finalize(device="cpu")
-    sim = auto(model, 1e-3, integrator="bdf2")
-    sim.run(0.05)
-    speed = model.lumped_host @ sim.state.velocity.numpy()[0, :, 0] / model.lumped_host.sum()
-    assert speed == pytest.approx(1e5 * half / 1000.0, rel=0.25)  # impulse over mass; unseen: 0
-
-
-@pytest.mark.parametrize("start", [1e4, 1e6])
-def test_a_late_start_ends(start):
-    """Rounding of the time is above a billionth of the interval."""
-    model = bar()
-    state = model.state()
-    state.time.fill_(start)
-    sim = auto(model, 1e-2)
-    sim.run(0.1)
-    late = wf.Simulation(model, state, dt="auto", error=1e-2)
-    late.run(start + 0.1)
-    assert late.time[0] == pytest.approx(start + 0.1, abs=64.0 * np.spacing(start))
-    way = np.abs(sim.probe("tip").displacement[0, -1]).max()
-    assert np.abs(late.probe("tip").displacement[0, -1] - sim.probe("tip").displacement[0, -1]).max() < 1e-3 * way
-
-
-def test_an_interval_within_the_rounding_of_the_time_is_refused():
-    sim = auto(bar(), 1e-2, interval=1e-20, horizon=0.1)
-    with pytest.raises(wf.ModelError, match=r"interval 1e-20 s is below the round-off of t = .*: use a longer one"):
-        sim.run(0.1)
-
-
-def test_a_checkpoint_of_fixed_steps_is_refused(tmp_path):
-    fixed = wf.Simulation(bar(), dt=1e-3)
-    fixed.run(2e-3, outputs=[Checkpoint(tmp_path / "c.npz")])
-    with pytest.raises(wf.CheckpointError, match=r"dt of the checkpoint is 0\.001, of the simulation 'auto'"):
-        auto().resume(tmp_path / "c.npz")
-
-
-def test_instants_are_intervals_frames_moments_and_the_end():
-    class Frames:
-        rate = 30.0
-        moments = (0.0101,)
-
-    sync_times = SyncTimes([], None, None)
-    sync_times.add_outputs([Frames()])
-    sync_times.set_defaults(0.0, 0.1)
-    assert (1.0 / 30.0 / sync_times.interval) % 1.0 == pytest.approx(0.0, abs=1e-12)
-    count = sync_times.count(0.0, 0.1)
-    times = [0.0]
-    while times[-1] < 0.1 - 1e-12:
-        times.append(sync_times.next_after(times[-1]))
-    assert len(times) == count + 1
-    for due in (0.0101, 1.0 / 30.0, 2.0 / 30.0, 0.1):
-        assert np.abs(np.array(times) - due).min() < 1e-15
-    assert np.diff(times).min() > 1e-6
-
-
-def test_a_whole_interval_has_always_the_same_bits():
-    sync_times = SyncTimes([], 0.01, 1.0)
-    sync_times.set_defaults(0.0)
-    time, spans = np.zeros(1), set()
-    for _ in range(300):
-        span = sync_times.time_to_next(time)
-        spans.add(float(span[0]))
-        time = time + span
-    assert spans == {0.01}
-
-
-# what is refused
-
-
-@pytest.mark.parametrize(
-    ("options", "text"),
-    [
-        ({"dt": "Auto", "error": 1e-4}, "dt = 'Auto' must be a positive finite time"),
-        ({"dt": "auto"}, "needs error"),
-        ({"dt": "auto", "error": 0.0}, "needs error"),
-        ({"dt": "auto", "error": -1e-4}, "needs error"),
-        ({"dt": "auto", "error": float("nan")}, "needs error"),
-        ({"dt": "auto", "error": 2.0}, "needs error"),
-        ({"dt": "auto", "error": "1e-4"}, "needs error"),
-        ({"dt": "auto", "error": 1e-12}, "below float64 round-off"),
-        ({"dt": 1e-3, "error": 1e-4}, "error = 0.0001 is for dt = 'auto'"),
-        ({"dt": 1e-3, "interval": 1e-4}, "interval = 0.0001 is for dt = 'auto'"),
-        ({"dt": "auto", "error": 1e-4, "interval": 0.0}, "interval = 0.0 must be"),
-        ({"dt": "auto", "error": 1e-4, "horizon": -1.0}, "horizon = -1.0 must be"),
-        ({"dt": "auto", "error": 1e-4, "solver": "jacobi"}, "needs solver 'newton-pcg'"),
-    ],
-)
-def test_bad_input_is_refused_by_name(options, text):
-    with pytest.raises(wf.ModelError, match=text):
-        wf.Simulation(bar(), **options)
-
-
-def test_schemes_without_an_estimate_are_refused():
-    to_json = Integrator("plain", BACKWARD_EULER.coefficients, order=1)
-    with pytest.raises(wf.ModelError, match="'plain' has no estimate of its error; there are backward_euler, bdf2"):
-        auto(integrator=to_json)
-
-
-@pytest.mark.parametrize("integrator", ["energy_momentum", wf.GeneralizedAlpha(rho_inf=0.8)])
-def test_energy_momentum_and_generalized_alpha_are_refused_by_name(integrator):
-    with pytest.raises(wf.ModelError, match=r"'(energy_momentum|generalized_alpha)' has no estimate of its error"):
-        auto(integrator=integrator)
-
-
 def test_float32_runs_and_refuses_what_it_does_not_resolve():
     with pytest.raises(wf.ModelError, match=r"below float32 round-off \(1e-05 of the model size\); use float64"):
         auto(bar(dtype="float32"), 1e-6)
@@ -377,49 +226,6 @@ def test_float32_takes_what_it_promises_on_a_pendulum(E, error, horizon, end):
     assert counts[1] < 1.1 * counts[0]
 
 
-def test_a_longer_run_settles_its_own_interval():
-    """A pulse of 1 ms with a run of its own, then 1 s. Fails on 8934ce7: 64 109 substeps, intervals of the pulse's."""
-    b = wf.ModelBuilder(gravity=(0, 0, -9.81))
-    law = wf.SVK(E=1e6, nu=0.3, density=1000.0, damping=wf.KelvinVoigt(eta=1e3))
-    body = b.add_solid(wf.mesh.box((1, 0.2, 0.2), cells=(2, 1, 1)), material=law)
-    b.clamp(body.nodes("x-"))
-    b.add_traction(body.surface("x+"), ([0.0, 5e-4, 1e-3], [(0, 0, 0), (0, 0, 3e4), (0, 0, 0)]))
-    b.add_probe("tip", body.surface("x+"))
-    model = b.finalize(device="cpu")
-    split, whole = auto(model, integrator="bdf2"), auto(model, integrator="bdf2")
-    split.run(1e-3)
-    assert split.dt == pytest.approx(1e-3 / 64)
-    for sim in (split, whole):
-        sim.run(1.001)
-    assert split.dt == pytest.approx(1.0 / 64)
-    assert whole.totals["substeps"][0] < split.totals["substeps"][0] < 2 * whole.totals["substeps"][0]
-    fine = auto(model, 1e-4, integrator="bdf2")
-    fine.run(1.001)
-    tips = [sim.probe("tip").displacement[0, -1] for sim in (split, fine)]
-    assert np.linalg.norm(tips[0] - tips[1]) < 1e-3 * model.size
-    interval = split.dt
-    split.run(1.5)  # no longer than the last
-    assert split.dt == interval
-
-
-def test_dt_can_not_be_set():
-    sim = auto()
-    with pytest.raises(wf.ModelError, match="made with dt = 'auto'"):
-        sim.dt = 1e-3
-    assert "dt = auto, error = 0.001" in repr(sim)
-
-
-def test_a_fixed_step_has_nothing_of_it():
-    sim = wf.Simulation(bar(), dt=1e-3)
-    report = sim.step()
-    assert report.substeps is None
-    assert report.least_h is None
-    assert "adaptive" not in sim.state.names
-    assert not any("adaptive" in module.name for module in sim.stepper.modules())
-    assert not any("adaptive" in name.lower() for name in sim.bytes())
-    assert "substeps" not in sim.totals
-
-
 @pytest.mark.parametrize("integrator", SCHEMES)
 def test_the_twist_of_a_beam_counts(integrator):
     """Its axis does not move: only the gradients across it do, by half the section. Steps of 20 us as reference."""
@@ -438,101 +244,3 @@ def test_the_twist_of_a_beam_counts(integrator):
     error = 1e-3
     surface = 0.05 * np.abs(twisted(dt="auto", error=error) - twisted(dt=2e-5))[4:].max()
     assert surface <= 5.0 * error
-
-
-def test_a_fall_that_no_step_resolves_is_refused_by_name():
-    model = bar()
-    model.set_gravity([(0, 0, -1e9)])
-    sim = wf.Simulation(model, dt="auto", error=1e-6, interval=0.05)
-    with pytest.raises(wf.ConvergenceError, match=r"error tolerance was not met within 65536 substeps"):
-        sim.step()
-
-
-# the command line
-
-
-def test_the_command_line_adapts_steps(tmp_path, capsys):
-    out = tmp_path / "out.json"
-    options = ["run", "pendulum", "--set", "elements=2", "--t-end", "0.05", "--device", "cpu", "--json", str(out)]
-    assert main([*options, "--dt", "auto", "--error", "1e-4"]) == 0
-    printed = capsys.readouterr().out
-    summary = json.loads(out.read_text())
-    assert f"{summary['substeps']} adaptive steps" in printed
-    assert summary["substeps"] > summary["steps"]
-    assert f"{summary['newton_iterations'] / summary['substeps']:.1f} Newton" in printed
-    assert summary["dt"] == "auto"
-    assert summary["t_end"] == pytest.approx(0.05, rel=1e-12)
-    assert main([*options, "--dt", "auto"]) == 2
-    assert "--dt auto needs --error" in capsys.readouterr().err
-    assert main([*options, "--error", "1e-3"]) == 2
-    assert "--error is for --dt auto" in capsys.readouterr().err
-
-
-# the committed study
-
-SMOOTH = ("stiff", "dead_points", "free_flight")
-STRUCK = ("impact", "contact")
-SCENES = (*SMOOTH, *STRUCK, "soft_contact")
-ERRORS = (1e-2, 1e-3, 1e-4, 1e-5)
-NOT_RUN = {("impact", "backward_euler", 1e-4), ("impact", "backward_euler", 1e-5), ("contact", "backward_euler", 1e-5)}
-"""They would take 3e5, 3e6 and 1e5 steps."""
-
-
-def study(scene, integrator):
-    content = json.loads(RESULT.read_text())
-    return [row for row in content["adaptive"] if (row["scene"], row["integrator"]) == (scene, integrator)]
-
-
-@pytest.mark.parametrize("scene", SCENES)
-def test_references_are_ten_times_finer_than_what_they_judge(scene):
-    """A run for a quarter of the error has at most a third of the difference left."""
-    content = json.loads(RESULT.read_text())
-    (own,) = [row["own_error"] / 3.0 for row in content["references"] if row["scene"] == scene]
-    assert 10.0 * own <= min(row["true"] for row in content["adaptive"] if row["scene"] == scene)
-
-
-@pytest.mark.parametrize("integrator", SCHEMES)
-@pytest.mark.parametrize("scene", SCENES)
-def test_true_errors_keep_to_those_asked(scene, integrator):
-    rows = study(scene, integrator)
-    assert len(rows) >= 2
-    for row in rows:
-        assert 0.01 <= row["true"] / row["asked"] <= 5.0
-
-
-@pytest.mark.parametrize("integrator", SCHEMES)
-@pytest.mark.parametrize("scene", SCENES)
-def test_true_errors_fall_as_those_asked(scene, integrator):
-    rows = study(scene, integrator)
-    slope = np.polyfit(np.log([row["asked"] for row in rows]), np.log([row["true"] for row in rows]), 1)[0]
-    assert 0.8 <= slope <= 1.2
-
-
-COSTLY = {
-    ("impact", "backward_euler"): (
-        {1e-2, 1e-3},
-        "1.06, 0.75: the flight after the blow alone takes 0.70 and 0.40, with the steps that the best fixed one has",
-    ),
-    ("contact", "bdf2"): (
-        {1e-2},
-        "1.92: 16 and 32 fixed steps, longer than the contact, are at 1.4e-2 and 6.7e-3 by chance, 64 at 2.6e-2",
-    ),
-}
-"""What misses the iterations asked for: at which errors, and by how much."""
-
-
-def costs():
-    for scene in SMOOTH + STRUCK:
-        for integrator in SCHEMES:
-            missed, reason = COSTLY.get((scene, integrator), (set(), ""))
-            for error in ERRORS:
-                if (scene, integrator, error) not in NOT_RUN:
-                    marks = [pytest.mark.xfail(strict=True, reason=reason)] if error in missed else []
-                    yield pytest.param(scene, integrator, error, marks=marks)
-
-
-@pytest.mark.parametrize(("scene", "integrator", "error"), list(costs()))
-def test_newton_iterations_beside_the_best_fixed_step(scene, integrator, error):
-    """At most 1.5 times those of the best fixed step on smooth motions, 0.7 times with an impact."""
-    (row,) = [row for row in study(scene, integrator) if row["asked"] == error]
-    assert row["cost"] <= (1.5 if scene in SMOOTH else 0.7), row

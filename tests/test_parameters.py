@@ -5,89 +5,29 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import warp as wp
+from parameter_models import (
+    CASES,
+    NEO,
+    NU,
+    RHO,
+    SVK,
+    VALUES,
+    E,
+    beam,
+    material,
+    model,
+    rows,
+    solid,
+    varied,
+)
 
 import warpfea as wf
 
-E, NU, ETA = np.array([1e6, 2.1e6, 0.7e6]), np.array([0.3, 0.45, 0.2]), np.array([30.0, 0.0, 77.0])
-RHO = np.array([1100.0, 2530.0, 870.0])
-JOINT_VALUES = {"E": E, "nu": NU, "eta": ETA, "density": RHO}
-SVK, NEO, RIVLIN = wf.SVK.from_E_nu, wf.NeoHookean.from_E_nu, wf.MooneyRivlin.from_E_nu
 
-
-def material(law=SVK, E=1e6, nu=0.3, eta=30.0, density=1100.0, form="incremental"):
-    return law(E=E, nu=nu, density=density, damping=wf.KelvinVoigt(eta, 20.0, form))
-
-
-def solid(element="T10", bulge=0.0, **options):
-    def add(b, law):
-        mesh = wf.mesh.box((0.1, 0.02, 0.02), cells=(3, 1, 1), element="T4" if element == "ENMC" else element)
-        if bulge:
-            x = mesh.points
-            mesh = replace(mesh, points=x + bulge * np.sin(np.pi * x[:, :1] / 0.1) * [0.0, 0.0, 1.0])
-        more = {"element": element} if element == "ENMC" else {}
-        body = b.add_solid(mesh, material=law, name="body", **more, **options)
-        b.clamp(body.nodes("x-"), slots="all")
-        b.add_probe("tip", body.surface("x+"))
-
-    return add
-
-
-def beam(integration="tied"):
-    def add(b, law):
-        body = b.add_beam([(0, 0, 0), (0.1, 0, 0)], elements=3, section=wf.Rectangle(0.01, 0.02), normal=(0, 0, 1),
-                          material=law, integration=integration, name="body")  # fmt: skip
-        b.clamp(body.start, slots="all")
-        b.add_probe("tip", body.end)
-
-    return add
-
-
-def shell(integration="tied"):
-    def add(b, law):
-        body = b.add_shell(wf.mesh.grid((0.1, 0.05), cells=(3, 2)), thickness=0.01, material=law,
-                           integration=integration, name="body")  # fmt: skip
-        b.clamp(body.edge("x-"), slots="all")
-        b.add_probe("tip", body.edge("x+"))
-
-    return add
-
-
-def model(add, law, worlds=1, dtype="float64", gravity=(0.0, 3.0, -9.81)):
-    b = wf.ModelBuilder(gravity=gravity)
-    add(b, law)
-    return b.finalize(device="cpu", worlds=worlds, dtype=dtype)
-
-
-def varied(add, worlds=3, names=tuple(JOINT_VALUES), dtype="float64", **law):
-    out = model(add, material(**law), worlds, dtype)
-    for name in names:
-        out.set_parameter(f"body.{name}", JOINT_VALUES[name])
-    return out
-
-
-def rows(sim, world):
-    return {name: values[world].tobytes() for name, values in sim.state.numpy().items() if name != "status"}
-
-
-CASES = {
-    "T4": (solid("T4"), {}),
-    "T10": (solid(), {"law": NEO}),
-    "curved T10": (solid(bulge=0.004), {"law": RIVLIN}),
-    "T10 rate": (solid(), {"form": "rate"}),
-    "T10 explicit": (solid(), {"form": "explicit"}),
-    "ENMC": (solid("ENMC"), {}),
-    "3243": (beam(), {}),
-    "3243 split": (beam("split"), {}),
-    "3243 full": (beam("full"), {"law": RIVLIN}),
-    "3443": (shell(), {}),
-    "3443 full": (shell("full"), {"law": NEO}),
-}
-
-
-def alone_with(case, world, dtype="float64", names=tuple(JOINT_VALUES)):
+def alone_with(case, world, dtype="float64", names=tuple(VALUES)):
     """One world, built with the values of a world; a tied beam has them set, as E/mu in it may round another way."""
     add, law = CASES[case]
-    values = {name: JOINT_VALUES[name][world] for name in names}
+    values = {name: VALUES[name][world] for name in names}
     if case != "3243":
         return model(add, material(**values, **law), dtype=dtype)
     out = model(add, material(**law), dtype=dtype)
@@ -135,98 +75,6 @@ def test_of_other_integrators(case, integrator):
         alone = wf.Simulation(alone_with(case, world), dt=2e-3, integrator=integrator)
         alone.step(4)
         assert rows(sim, world) == rows(alone, 0), world
-
-
-PAIRS = [
-    *((case, "backward_euler") for case in ("T4", "curved T10", "ENMC", "3243")),
-    *((case, scheme) for case in ("T10", "3443") for scheme in ("bdf2", "energy_momentum", "generalized_alpha")),
-]
-ONE = {"E": (2.1e6, 0.7e6), "nu": (0.45, 0.2), "eta": (0.0, 77.0), "density": (2530.0, 870.0)}
-
-
-def alike(sim, built, exact):
-    """Whether all arrays of the states are the same, or close where constants are rounded another way."""
-    assert np.array_equal(sim.model.mass_matrix().toarray(), built.model.mass_matrix().toarray())
-    assert sim.model.mass == built.model.mass
-    if exact:
-        assert rows(sim, 0) == rows(built, 0)
-    one, other = (s.state.displacement.numpy() for s in (sim, built))
-    assert np.abs(one - other).max() <= 1e-10 * np.abs(other).max()
-
-
-@pytest.mark.parametrize(("case", "integrator", "name"), [(*pair, name) for pair in PAIRS for name in ONE])
-def test_one_world_takes_a_parameter(case, integrator, name):
-    """Set before the first step, and once more in the run: after a reset it runs as one built with the last value.
-
-    Fails on 8934ce7 for density: mass_matrix() was of the value built with, and with it the initial accelerations.
-    """
-    add, law = CASES[case]
-    first, second = ONE[name]
-    one = model(add, material(**law))
-    one.set_parameter(f"body.{name}", first)
-    sim = wf.Simulation(one, dt=2e-3, integrator=integrator)
-    sim.step(2)
-    one.set_parameter(f"body.{name}", second)
-    sim.reset()
-    sim.step(2)
-    built = wf.Simulation(model(add, material(**{name: second}, **law)), dt=2e-3, integrator=integrator)
-    built.step(2)
-    alike(sim, built, exact=case != "3243")
-
-
-OWN = {
-    "mu10": (wf.MooneyRivlin, {"mu10": 1e5, "mu01": 1e5, "k": 1e7}, 3e5),
-    "mu01": (wf.MooneyRivlin, {"mu10": 1e5, "mu01": 1e5, "k": 1e7}, 0.0),
-    "k": (wf.MooneyRivlin, {"mu10": 1e5, "mu01": 1e5, "k": 1e7}, 1e6),
-    "lambda_v": (wf.MooneyRivlin, {"mu10": 1e5, "mu01": 1e5, "k": 1e7}, 40.0),
-    "density_factor": (NEO, {"E": 1e6, "nu": 0.3}, 1.7),
-}
-
-
-@pytest.mark.parametrize("name", OWN)
-def test_one_world_takes_the_constants_of_a_law(name):
-    law, numbers, value = OWN[name]
-
-    def build(lambda_v=3.0, density_factor=1.0, **changed):
-        density = (lambda X: density_factor * (1e3 + 1e4 * X[:, 0])) if name == "density_factor" else 1e3
-        return model(solid(), law(**{**numbers, **changed}, density=density, damping=wf.KelvinVoigt(5.0, lambda_v)))
-
-    one = build()
-    one.set_parameter(f"body.{name}", value)
-    scheme = "generalized_alpha" if name == "density_factor" else "backward_euler"
-    pair = [wf.Simulation(m, dt=2e-3, integrator=scheme) for m in (one, build(**{name: value}))]
-    for sim in pair:
-        sim.step(2)
-    found, built = (m.model.mass_matrix() for m in pair)
-    assert abs(found - built).max() <= 1e-14 * abs(built).max()
-    found, built = (sim.state.displacement.numpy() for sim in pair)
-    assert np.abs(found - built).max() <= 1e-12 * np.abs(built).max()
-
-
-@pytest.mark.parametrize(
-    "name", ["pad.mu", "pad.mu_static", "pad.restitution", "pad.stiffness", "floor.offset", "gravity"]
-)
-def test_one_world_takes_parameters_of_contacts_and_gravity(name):
-    """Set before the run against built with the value."""
-    values = {"pad.mu": 0.05, "pad.mu_static": 0.5, "pad.restitution": 0.9, "pad.stiffness": 2e9, "floor.offset": -1e-4,
-              "gravity": (0.0, 1.0, -3.0)}  # fmt: skip
-
-    def build(gravity=(0.0, 0.0, -9.81), offset=0.0, **pad):
-        b = wf.ModelBuilder(gravity=gravity)
-        block = b.add_solid(wf.mesh.box((0.1, 0.1, 0.1), cells=(1, 1, 1)), material=material(), name="body")
-        b.set_initial(block, velocity=(0.5, 0, -0.1))
-        floor = b.add_collider(wf.HalfSpace(normal=(0, 0, 1), offset=offset), name="floor")
-        b.add_contact(block, floor, **({"mu": 0.3, "mu_static": 0.4, "restitution": 0.3} | pad), name="pad")
-        return b.finalize(device="cpu")
-
-    one = build()
-    one.set_parameter(name, values[name])
-    pair = [wf.Simulation(m, dt=1e-3) for m in (one, build(**{name.split(".")[-1]: values[name]}), build())]
-    for sim in pair:
-        sim.step(8)
-    found, built, other = (sim.state.displacement.numpy() for sim in pair)
-    assert np.abs(found - built).max() <= 1e-12 * np.abs(built).max()
-    assert np.abs(found - other).max() > 1e-6 * np.abs(built).max()
 
 
 @pytest.mark.parametrize("linear", ["pcg", "direct"])
@@ -362,7 +210,7 @@ def test_a_change_in_a_run_reaches_the_chosen_worlds_alone(case):
     }
     many = run(3, (None, new), wp.array([False, True, True], dtype=wp.bool, device="cpu"))
     for world in range(3):
-        first = {name: values[world] for name, values in JOINT_VALUES.items()}
+        first = {name: values[world] for name, values in VALUES.items()}
         second = (
             {"E": (5e6, 3e5)[world - 1], "nu": (0.1, 0.33)[world - 1], "eta": 5.0, "density": 700.0} if world else {}
         )
@@ -390,91 +238,6 @@ def test_reset_takes_the_values_there_are():
     assert one == other
 
 
-def test_what_no_world_varies_costs_nothing():
-    add, law = CASES["3443"]
-    to_json, many = model(add, material(**law), worlds=3), varied(add, names=("E",))
-    assert all(block.data.coefficients.shape[0] == 1 for block in to_json.blocks)
-    size = np.dtype(float).itemsize * to_json.coefficients.size
-    assert many.bytes["materials"] - to_json.bytes["materials"] == 2 * size
-    assert many.bytes["elements"] == to_json.bytes["elements"]
-    assert many.info()["kernels"] == to_json.info()["kernels"]
-    coupled = varied(add, names=("nu",))
-    assert coupled.bytes["elements"] > to_json.bytes["elements"]
-
-
-BAD = {
-    "length": ("body.E", [1e6, 2e6], r"body: E has shape \(2,\), expected a number or \(3,\)"),
-    "nan": ("body.E", [1e6, np.nan, 1e6], r"body: E = nan in world 1 must be positive"),
-    "inf": ("body.E", np.inf, r"E = inf in world 0"),
-    "zero E": ("body.E", 0.0, r"E = 0.0 in world 0 must be positive, Pa"),
-    "nu": ("body.nu", [0.3, 0.3, 0.5], r"nu = 0.5 in world 2 must be between -1 and 0.5"),
-    "eta": ("body.eta", -1.0, r"eta = -1.0 in world 0 must be 0 or above, Pa s"),
-    "text": ("body.E", "stiff", r"E = 'stiff' must be a number"),
-    "misspelt": ("body.Eta", 1.0, r"'body.Eta' is unknown; there are: .*; did you mean 'body.eta'"),
-    "body": ("bdoy.E", 1.0, r"'bdoy.E' is unknown.*did you mean 'body.E'"),
-    "shared": ("body.frames", 1.0, r"'body.frames' can't be set: shared by all worlds \(the reference geometry"),
-    "density": ("body.density", [1.0, 0.0, 2.0], r"density = 0.0 in world 1 must be positive, kg/m\^3"),
-    "factor": ("body.density_factor", 1.0, r"'body.density_factor' is unknown.*did you mean 'body.density'"),
-    "mesh": ("body.points", 1.0, r"'body.points' can't be set: shared by all worlds \(the mesh"),
-    "section": ("body.section", 1.0, r"shared by all worlds \(the reference geometry"),
-    "own": ("body.mu10", 1.0, r"'body.mu10' is unknown"),
-    "gravity": ("gravity", [1.0, 2.0], r"gravity has shape \(2,\), expected \(3,\) or \(3, 3\)"),
-    "no gravity": ("gravity", (0, np.inf, 0), r"gravity = \[0.0, inf, 0.0\] in world 0 must be finite"),
-}
-
-
-@pytest.mark.parametrize("case", BAD)
-def test_bad_values_leave_nothing_behind(case):
-    name, value, text = BAD[case]
-    m = model(CASES["T10"][0], material(), worlds=3)
-    before = m.bytes, m.fingerprint(), m.coefficients.numpy().tobytes(), m.parameters.numpy()
-    with pytest.raises(wf.ModelError, match=text):
-        m.set_parameter(name, value)
-    assert (m.bytes, m.fingerprint(), m.coefficients.numpy().tobytes(), m.parameters.numpy()) == before
-
-
-@pytest.mark.parametrize("mask", [[True], [0.5, 1, 0], "all", [True, False, None]])
-def test_bad_masks(mask):
-    m = model(CASES["T10"][0], material(), worlds=3)
-    with pytest.raises(wf.ModelError, match=r"set_parameter: mask = .* must be \(3,\) of True and False"):
-        m.set_parameter("body.E", 1e6, mask=mask)
-
-
-def test_what_a_material_was_made_of_is_told():
-    m = model(solid(), wf.MooneyRivlin(mu10=1e5, mu01=1e5, k=1e7, density=1e3))
-    with pytest.raises(wf.ModelError, match=r"MooneyRivlin was made of 'mu10', 'mu01', 'k'; from_E_nu takes 'E'"):
-        m.set_parameter("body.E", 1e6)
-    with pytest.raises(wf.ModelError, match=r"MooneyRivlin has no damping.* KelvinVoigt\(eta=0\)"):
-        m.set_parameter("body.eta", 1e6)
-    m = model(solid(), RIVLIN(E=1e6, nu=0.3, density=1e3))
-    with pytest.raises(wf.ModelError, match=r"was made of 'E', 'nu'; its constructor takes 'mu10'"):
-        m.set_parameter("body.mu10", 1e6)
-
-
-def test_stresses_follow_values_that_are_set_later():
-    """Those of a tied beam come from tables of their own, which the first look at them makes."""
-    m = model(beam(), material(), worlds=2)
-    m.set_parameter("body.E", 1e6)
-    state = m.state()
-    u = np.random.default_rng(0).normal(scale=1e-4, size=(2, m.slots, 3))
-    u[1] = u[0]
-    state.displacement.assign(u)
-    first = m.evaluation.sample_stress(state, m.bodies[0])
-    m.set_parameter("body.E", 3e6, mask=[False, True])
-    then = m.evaluation.sample_stress(state, m.bodies[0])
-    assert np.array_equal(then[0], first[0])
-    assert then[1] == pytest.approx(3.0 * first[1], rel=1e-12)
-
-
-def test_the_first_value_precedes_the_simulation():
-    m = model(solid(), material(), worlds=2)
-    m.set_parameter("body.E", 2e6)
-    wf.Simulation(m, dt=1e-3)
-    m.set_parameter("body.E", [1e6, 2e6])
-    with pytest.raises(wf.ModelError, match=r"'body.nu' was uniform .* before the first Simulation"):
-        m.set_parameter("body.nu", 0.2)
-
-
 def test_damping_of_zero_stays_a_feature():
     m = model(solid(), material(eta=0.0), worlds=2)
     m.set_parameter("body.eta", [0.0, 40.0])
@@ -483,13 +246,6 @@ def test_damping_of_zero_stays_a_feature():
     alone = wf.Simulation(model(solid(), material(eta=40.0)), dt=2e-3)
     alone.step(3)
     assert rows(sim, 1) == rows(alone, 0)
-
-
-def test_gravity_by_name_and_mask():
-    m = model(solid(), material(), worlds=2)
-    m.set_parameter("gravity", wp.array([(0.0, 0.0, -1.0), (0.0, 2.0, 0.0)], dtype=wp.vec3d, device="cpu"))
-    m.set_gravity((1.0, 0.0, 0.0), mask=[False, True])
-    assert np.array_equal(m.terms.dead.gravity.numpy(), [(0.0, 0.0, -1.0), (1.0, 0.0, 0.0)])
 
 
 def test_a_checkpoint_holds_the_values(tmp_path):
@@ -561,14 +317,6 @@ def test_masses_are_those_of_the_densities():
         kinetic = alone.energies()["kinetic"][0]  # a free fall: half of m v^2
         assert kinetic == pytest.approx(0.5 * single.mass * (9.81 * 3e-3) ** 2, rel=1e-9)
         assert sim.energies()["kinetic"][world] == pytest.approx(kinetic, rel=1e-12)
-
-
-def test_what_is_made_of_a_density_is_refused():
-    b = wf.ModelBuilder(gravity=([0.0, 1.0], [(0.0, 0.0, 0.0), (0.0, 0.0, -9.81)]))
-    CASES["T4"][0](b, material())
-    m = b.finalize(device="cpu", worlds=2)
-    with pytest.raises(wf.ModelError, match=r"'body.density' can't be set: .*a time law of gravity"):
-        m.set_parameter("body.density", 900.0)
 
 
 @pytest.mark.parametrize("solver", [wf.NewtonPCG(preconditioner="two-level"), wf.Jacobi()], ids=["two-level", "jacobi"])

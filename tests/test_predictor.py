@@ -82,12 +82,12 @@ def test_the_best_order_is_that_of_the_smallest_error():
         (lambda t: a + b * t, 1),  # as good as order 2
         (lambda t: a * (-1.0) ** round(t), 0),
     ):
-        for k, array in enumerate((w.v, sim.state.velocity, *predictor.past)):
+        for k, array in enumerate((w.v, sim.state.velocity, *predictor.previous_velocities)):
             array.assign(velocity(3.0 - k))
         predictor.control.count.fill_(2)
         predictor.update_history()
         assert next_order(sim) == expected
-        np.testing.assert_array_equal(predictor.past[0].numpy(), sim.state.velocity.numpy())
+        np.testing.assert_array_equal(predictor.previous_velocities[0].numpy(), sim.state.velocity.numpy())
 
 
 def test_impacts_do_not_halve_more_steps(monkeypatch):
