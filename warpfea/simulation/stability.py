@@ -411,4 +411,4 @@ def _evaluate_state(stepper: Any) -> None:
     for term in m.terms:
         term.begin(stepper.ctx, running)
     stepper.newton._clear_direction(running)
-    stepper.newton._evaluate_state(running)
+    stepper.newton._open(running)
