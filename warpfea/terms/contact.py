@@ -323,7 +323,7 @@ class Contact(Term):
         m, kernel = self.model, contact_block_kernels(self.model.dtype).add_contact
         for group, (entry, start, source, count) in zip(self.tables.groups, m.cache["contact blocks"]):
             args = [m.topology, matrix.pattern.data, group.data, entry, start, source, kept[0]]
-            weight = kept[1] if self.tables.moving else ctx.scratch[self.name]["attempt"].weight
+            weight = kept[1] if self.tables.moving else ctx.scratch[self.name]["attempt"].shape_values
             ctx.launch(kernel, (m.worlds, count), [*args, weight, dq_dv, active, out])
 
     def block_modules(self) -> set[wp.Module]:
