@@ -21,6 +21,9 @@ __all__ = ["MAX_ERROR_ESTIMATES", "SINGLE_EPS", "VELOCITY_ROUNDINGS", "judging_f
 
 ROUNDING_TOL = 16.0
 PREDICTED_TOL = 1.0e-3
+UNSOLVED_TOL = 0.1
+"""Fractions of the tolerance for a first iterate, extrapolated or not: what no solve has reduced lies in the softest
+directions, and would accumulate over steps without iterations."""
 STALLED = 0.5
 """Residual ratio above which an iteration counts as stalled."""
 CLOSING_ITERATIONS = 4
@@ -169,9 +172,9 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
                 # the force tolerance in this norm, by their ratio at this iterate
                 accept = wp.max(accept, norm * (ctl.force_tol / force))
             if ctl.predicted[world] != 0:
-                accept = (
-                    f64(PREDICTED_TOL) * accept
-                )  # unsolved remainders would accumulate over steps without iterations
+                accept = f64(PREDICTED_TOL) * accept
+            elif ctl.iterations[world] == 0 and ctl.equilibrium == 0 and ctl.eps > f64(SINGLE_EPS):
+                accept = f64(UNSOLVED_TOL) * accept
             rounding = f64(2.0) * ctl.eps * wp.sqrt(sums[2])
             if norm > accept and within_roundoff(ctl, world, group, norm, rounding):
                 accept = norm

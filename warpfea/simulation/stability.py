@@ -95,7 +95,7 @@ def report_unstable(result: Any, *, refuse: bool) -> None:
         f"the equilibrium is unstable in {many}: body {body.name!r} buckles or snaps through; its mode is largest at "
         f"({where}) m, along ({way}). To follow the bifurcated path add an imperfection: {size_m} * r.mode(body)"
         f"[{world}] added to the points it is built from, a small load across, or a damped motion from "
-        f"r.perturbed({size_m})"
+        f"r.perturbed({size_m}) (a static solve from there may return to this equilibrium)"
     )
     if refuse:
         error = StabilityError(text, time=1.0, world=world, state=sim.state)

@@ -14,8 +14,6 @@ MISSES: dict[tuple[str, str, str], str] = {
     ("annular/auto", "float64", ""): "the whole load at once takes 160 to 230 iterations; three load steps take 86",
     ("annular/auto", "float32", "cuda"): _THIN,
     ("soft-thin-limbs", "float64", ""): "found, in 642 iterations on the CPU and 166 on a GPU, in place of 80",
-    ("stiff-beside-soft-motion/weld", "float32", ""): "the block squeezes the welded face by more than the arm weighs, "
-    "and residuals are relative to that: 1.05 % after 300 steps of creep, 3e-5 with tol=3e-5",
     ("soft-dolphin", "float32", ""): "refused by name: float32 can't hold it",
     ("soft-thin-limbs", "float32", ""): "refused by name: float32 can't hold it",
     ("thin-static/T10-500", "float32", "cuda"): _THIN,
