@@ -92,7 +92,7 @@ def finalize(b):
 
 
 @functools.cache
-def to_json(name):
+def plain(name):
     b, body = scene(name)
     return body, finalize(b)
 

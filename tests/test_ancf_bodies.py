@@ -20,11 +20,11 @@ from ancf_bodies import (
     affine,
     finalize,
     placed,
+    plain,
     rotation,
     scene,
     state_of,
     tets,
-    to_json,
     turned,
 )
 
@@ -74,7 +74,7 @@ def test_named_surfaces(name):
 
 def test_surfaces_by_predicate_and_rows():
     for name in ("beam", "plate"):
-        body, _ = to_json(name)
+        body, _ = plain(name)
         every = body.surface(lambda X: np.ones(len(X), bool))
         assert len(every) == {"beam": 2 + 4 * 3, "plate": 2 * 4 + 8}[name]
         half = body.surface(lambda X: (X - SHIFT) @ TURN[:, 0] > 0.999)

@@ -18,9 +18,9 @@ from ancf_bodies import (
     ball,
     finalize,
     parent_points,
+    plain,
     reference_at,
     rolled,
-    to_json,
 )
 
 import warpfea as wf
@@ -176,7 +176,7 @@ def test_section_constants(section):
 
 def test_axes_of_shells():
     for name in ("plate", "roof"):
-        body, _ = to_json(name)
+        body, _ = plain(name)
         axes = body.node_axes
         np.testing.assert_allclose(np.swapaxes(axes, 1, 2) @ axes, np.tile(np.eye(3), (len(axes), 1, 1)), atol=1e-14)
         np.testing.assert_allclose(np.linalg.det(axes), 1.0, rtol=1e-14)
@@ -293,7 +293,7 @@ def test_solids_from_meshes():
 @pytest.mark.parametrize("name", BODIES)
 def test_material_points(name):
     """Points inside are found, with their functions and gradients; points outside are refused."""
-    body, _ = to_json(name)
+    body, _ = plain(name)
     chosen = np.random.default_rng(1).choice(len(body.mesh.cells), 3, replace=False)
     for X in reference_at(body, chosen, parent_points(body.family)).reshape(-1, 3):
         point = body.at(X)

@@ -21,12 +21,12 @@ from ancf_bodies import (
     finalize,
     hexes,
     placed,
+    plain,
     radial,
     rotation,
     scene,
     state_of,
     tets,
-    to_json,
 )
 
 import warpfea as wf
@@ -61,7 +61,7 @@ def test_initial_velocity(name):
 def test_a_spin_has_no_strain_rate(name):
     damped = replace(SVK, damping=wf.KelvinVoigt(eta=1e3, lambda_v=1e3, form="rate"))
     b = wf.ModelBuilder(gravity=(0, 0, 0))
-    source, _ = to_json(name)
+    source, _ = plain(name)
     make = {"ENMC": ("ENMC", tets("ENMC")), "FN": ("FN", tets("FN")), "H3843": ("H3843", hexes())}.get(name)
     if name == "arc":
         body = add_beam(arc, lambda s: TURN @ radial(s), material=damped, b=b)
@@ -131,7 +131,7 @@ VOLUMES = {"beam": 0.015, "arc": 1.5 * 0.015, "plate": 0.08, "roof": 0.1, "ENMC"
 @pytest.mark.parametrize("name", BODIES)
 def test_skin_and_drawing(name):
     """The skin is closed, looks outward and encloses the volume; the drawn cells fill it."""
-    body, _ = to_json(name)
+    body, _ = plain(name)
     volume = VOLUMES.get(name.split()[0]) or body.mesh.volume() if name != "ball" else ball().volume()
     skin = body.skin
     points = reference_points(body, skin.slot_weights)
@@ -169,7 +169,7 @@ def test_uniform_stress(name):
     "tied" leaves out the transverse shear, which vanishes at a shell's faces and a beam's edges: there is none here. On
     curved axes the parts of the law have axes that turn, and add up but for the error of their interpolation.
     """
-    body, model = to_json(name)
+    body, model = plain(name)
     plane = np.array([[1.1, 0.2, 0], [0.2, 0.9, 0], [0, 0, 1.2]])
     stretch = {
         "plate": TURN @ plane @ TURN.T,

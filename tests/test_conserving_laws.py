@@ -118,9 +118,7 @@ def law_stress(name, G):
     coef = wp.types.vector(length=materials.NCOEF, dtype=p.T)
 
     @wp.kernel(module=kernel_module(f"test_conserving_plain_{name}"))
-    def to_json(
-        c: wp.array(dtype=coef), G: wp.array(dtype=p.mat33), W: wp.array(dtype=p.T), P: wp.array(dtype=p.mat33)
-    ):
+    def plain(c: wp.array(dtype=coef), G: wp.array(dtype=p.mat33), W: wp.array(dtype=p.T), P: wp.array(dtype=p.mat33)):
         k = wp.tid()
         W[k] = law.energy(G[k], c[0])
         P[k] = law.stress(G[k], c[0])
@@ -130,7 +128,7 @@ def law_stress(name, G):
     c[0, : len(own)] = own
     ins = [wp.array(x, dtype=kind, device="cpu") for x, kind in ((c, coef), (G, p.mat33))]
     outs = [wp.zeros(len(G), dtype=kind, device="cpu") for kind in (p.T, p.mat33)]
-    wp.launch(to_json, dim=len(G), inputs=ins + outs, device="cpu")
+    wp.launch(plain, dim=len(G), inputs=ins + outs, device="cpu")
     return [x.numpy() for x in outs]
 
 

@@ -282,10 +282,10 @@ def count_calls(patch, calls, names):
     counts = dict.fromkeys(names, 0)
     calls.append(counts)
 
-    def counting(name, to_json):
+    def counting(name, plain):
         def counted(*args, **options):
             counts[name] += 1
-            return to_json(*args, **options)
+            return plain(*args, **options)
 
         return counted
 

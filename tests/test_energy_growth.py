@@ -115,10 +115,10 @@ def test_each_world_is_watched_where_nothing_is_read_back(device):
     calm.state.energy_growth.assign(rows)
     with pytest.warns(wf.ModelWarning, match="bdf2 is gaining energy.* in world 1"):
         assert calm.step().status.tolist() == [0, 1]
-    to_json = wf.Simulation(model, slow_and_fast(model), **options, **QUIET)
-    to_json.step(21)
+    plain = wf.Simulation(model, slow_and_fast(model), **options, **QUIET)
+    plain.step(21)
     for name in ("displacement", "velocity", "ledger", "energy_growth"):
-        np.testing.assert_array_equal(getattr(calm.state, name).numpy()[0], getattr(to_json.state, name).numpy()[0])
+        np.testing.assert_array_equal(getattr(calm.state, name).numpy()[0], getattr(plain.state, name).numpy()[0])
     calm.reset(wp.array([0, 1], dtype=wp.int32, device=model.device))
     calm.step(5)
     assert calm.status.tolist() == [0, 0]

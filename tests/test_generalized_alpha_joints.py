@@ -159,10 +159,10 @@ def test_accelerations_of_a_state_that_another_scheme_advanced_are_computed_agai
 def test_kinks_of_a_law():
     smooth = np.linspace(0, 1, 60)
     laws = {
-        "ramp": wf.laws.time_law(([0.0, 0.5, 1.0], [0.0, 1.0, 1.0]), "x", scalar=True),
-        "jump": wf.laws.time_law(([0.0, 0.5, 0.5 + 1e-9, 1.0], [0.0, 0.0, 1.0, 1.0]), "x", scalar=True),
-        "sine": wf.laws.time_law((smooth, np.sin(6 * smooth)), "x", scalar=True),
-        "constant": wf.laws.time_law(2.0, "x", scalar=True),
+        "ramp": wf.time_laws.time_law(([0.0, 0.5, 1.0], [0.0, 1.0, 1.0]), "x", scalar=True),
+        "jump": wf.time_laws.time_law(([0.0, 0.5, 0.5 + 1e-9, 1.0], [0.0, 0.0, 1.0, 1.0]), "x", scalar=True),
+        "sine": wf.time_laws.time_law((smooth, np.sin(6 * smooth)), "x", scalar=True),
+        "constant": wf.time_laws.time_law(2.0, "x", scalar=True),
     }
     assert kinks(laws["ramp"], 1e-3).tolist() == [0.0, 0.5]
     assert jumps(laws["ramp"], 1e-3).size == 0

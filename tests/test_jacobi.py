@@ -163,9 +163,9 @@ def test_worlds_equal_runs_of_their_own():
 
 def test_the_graph_does_what_the_launches_do(soft):
     model, _ = soft
-    to_json = wf.Simulation(model, dt=5e-3, solver=wf.Jacobi(), capture=False)
-    to_json.step(3)
-    assert np.array_equal(to_json.probe("tip").displacement[0], way(model, 3)[1])
+    plain = wf.Simulation(model, dt=5e-3, solver=wf.Jacobi(), capture=False)
+    plain.step(3)
+    assert np.array_equal(plain.probe("tip").displacement[0], way(model, 3)[1])
 
 
 def test_a_resumed_run_equals_the_undisturbed_one(tmp_path):

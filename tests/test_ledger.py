@@ -64,10 +64,10 @@ def test_a_wrong_sign_on_the_device_shows(row, monkeypatch):
         b, _ = scene("incremental")
         sim = wf.Simulation(b.finalize(device="cpu"), dt=4e-3, solver=wf.NewtonPCG(tol=1e-8), capture=False)
         if turned is not None:
-            to_json = Reducer.__call__
+            plain = Reducer.__call__
 
             def wrong(self, rows, count, active, out):
-                to_json(self, rows, count, active, out)
+                plain(self, rows, count, active, out)
                 if out is sim.stepper.work.ledger_sums:
                     values = out.numpy()
                     values[turned] *= -1.0

@@ -47,7 +47,7 @@ def hermite_shape(xi, nodes, frames=None):
     return s, ds
 
 
-SHARED_WITH_T4 = ("parent", "faces", "face_rule", "divisions", "node_samples", "lattice")
+SHARED_WITH_T4 = ("parent", "faces", "face_rule", "divisions", "node_samples", "vtk_subdivision")
 
 
 @pytest.fixture(scope="module")

@@ -85,7 +85,7 @@ def check(found, steps):
 
 
 def test_profile_adds_up_and_leaves_the_run_as_it_was(device):
-    sim, to_json = simulation("cantilever", device, cells=2), simulation("cantilever", device, cells=2)
+    sim, plain = simulation("cantilever", device, cells=2), simulation("cantilever", device, cells=2)
     calls = []
     recorded = sim.stepper.launch.launches
     found = profile(sim, steps=2, on_step=lambda: calls.append(1))
@@ -94,13 +94,13 @@ def test_profile_adds_up_and_leaves_the_run_as_it_was(device):
     assert len(calls) == profiling.WARM_UP + 2 + 1 + 2
     assert "loads" in found.parts  # gravity
     assert "constraints" not in found.parts
-    to_json.step(profiling.WARM_UP + 2)
-    assert sim.steps == to_json.steps
-    for name, values in to_json.state.numpy().items():
+    plain.step(profiling.WARM_UP + 2)
+    assert sim.steps == plain.steps
+    for name, values in plain.state.numpy().items():
         assert np.array_equal(sim.state.numpy()[name], values), name
     assert sim.stepper.launch.recorder is None
     assert sim.stepper.launch.launches == recorded
-    assert np.array_equal(sim.step().pcg, to_json.step().pcg)
+    assert np.array_equal(sim.step().pcg, plain.step().pcg)
 
 
 def test_each_launch_takes_its_time_less_that_of_an_empty_one(device, monkeypatch):

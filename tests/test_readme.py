@@ -254,9 +254,9 @@ def test_launches_come_in_the_order_of_the_table(name, monkeypatch):
     sim.step(2)
     table = launch_table()
     named = {kernel for kernels, _ in table for kernel in kernels}
-    shared = ("begin", "commit", "start")  # names that several files have: the table gives the file
-    for file, to_json in dict.fromkeys(seen):
-        assert f"{file}.{to_json}" in named or (to_json in named and to_json not in shared), (file, to_json)
+    shared = ("begin", "start")  # names that several files have: the table gives the file
+    for file, plain in dict.fromkeys(seen):
+        assert f"{file}.{plain}" in named or (plain in named and plain not in shared), (file, plain)
     always = [kernel for kernels, when in table if when in ALWAYS for kernel in kernels]
     assert len(always) >= 35
     order = [full if full in always else full.partition(".")[2] for full in map(".".join, first)]
@@ -269,8 +269,8 @@ def test_the_table_of_launches_names_kernels():
     sources = {path.stem: path.read_text() for path in (ROOT / "kernels").rglob("*.py")}
     for kernels, _ in table:
         for name in kernels:
-            file, _, to_json = name.rpartition(".")
-            assert any(f"def {to_json}(" in text for stem, text in sources.items() if file in ("", stem)), name
+            file, _, plain = name.rpartition(".")
+            assert any(f"def {plain}(" in text for stem, text in sources.items() if file in ("", stem)), name
 
 
 def result(name, key="rows"):

@@ -55,10 +55,10 @@ def test_without_them_nothing_changes():
     b.clamp(bar.nodes("x-"))
     b.add_probe("tip", bar.surface("x+"))
     clamped = b.finalize(device="cpu")
-    to_json = wf.solve_static(clamped, tol=1e-12)
+    plain = wf.solve_static(clamped, tol=1e-12)
     held = wf.solve_static(clamped, tol=1e-12, stabilise=True)
-    assert to_json.stabilise is None
-    assert np.allclose(held.probe("tip").displacement[:, -1], to_json.probe("tip").displacement[:, -1], rtol=1e-9)
+    assert plain.stabilise is None
+    assert np.allclose(held.probe("tip").displacement[:, -1], plain.probe("tip").displacement[:, -1], rtol=1e-9)
 
 
 def test_friction_holds_a_block_on_an_incline():

@@ -22,8 +22,8 @@ __all__ = ["MAX_ERROR_ESTIMATES", "SINGLE_EPS", "VELOCITY_ROUNDINGS", "judging_f
 ROUNDING_TOL = 16.0
 PREDICTED_TOL = 1.0e-3
 UNSOLVED_TOL = 0.1
-"""Fractions of the tolerance for a first iterate, extrapolated or not: what no solve has reduced lies in the softest
-directions, and would accumulate over steps without iterations."""
+"""Fractions of the tolerance for a first iterate, extrapolated or (float32, soft beside stiff) not: what no solve has
+reduced lies in the softest directions, and would accumulate over steps without iterations."""
 STALLED = 0.5
 """Residual ratio above which an iteration counts as stalled."""
 CLOSING_ITERATIONS = 4
@@ -132,6 +132,12 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         return wp.vec3d(ctl.group_sums[0, world, group], wp.max(f2, stress), ctl.group_sums[4, world, group])
 
     @wp.func
+    def is_unsolved_beside_stiff(ctl: Control, world: int) -> bool:
+        """True in float32 at a first iterate of motion where bodies have parts of unlike stiffness."""
+        first = ctl.iterations[world] == 0 and ctl.equilibrium == 0
+        return first and ctl.groups > ctl.components and ctl.eps > f64(SINGLE_EPS)
+
+    @wp.func
     def within_roundoff(ctl: Control, world: int, group: int, norm: f64, rounding: f64) -> bool:
         """True in float64 if a group's residual is position round-off, and within the tolerance of all groups of its
         component: further iterations would not reduce it."""
@@ -173,7 +179,7 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
                 accept = wp.max(accept, norm * (ctl.force_tol / force))
             if ctl.predicted[world] != 0:
                 accept = f64(PREDICTED_TOL) * accept
-            elif ctl.iterations[world] == 0 and ctl.equilibrium == 0 and ctl.eps > f64(SINGLE_EPS):
+            elif is_unsolved_beside_stiff(ctl, world):
                 accept = f64(UNSOLVED_TOL) * accept
             rounding = f64(2.0) * ctl.eps * wp.sqrt(sums[2])
             if norm > accept and within_roundoff(ctl, world, group, norm, rounding):

@@ -207,8 +207,8 @@ def pendulum(run: Run) -> Iterator[Row]:
     cases = reference("S4_pendulum_spectral")["cases"]
     for name in ("stiff_E5e7_ANCF3243_SVK_nu0", "soft_E5e6_ANCF3243_SVK_nu0", "stiff_E5e7_ANCF3243_SVK_nu0.3"):
         case = cases[name]
-        to_json = case["nu"] == 0.0
-        for integration in ("tied", "split") if to_json else ("full",):
+        plain = case["nu"] == 0.0
+        for integration in ("tied", "split") if plain else ("full",):
             for n, dt in ((16, 1e-3),) if run.quick else ((4, 5e-4), (8, 5e-4), (16, 1e-3), (16, 5e-4), (32, 5e-4)):
                 b = wf.ModelBuilder(gravity=(0, -9.81, 0))
                 law = wf.SVK(E=case["E"], nu=case["nu"], density=1000.0)

@@ -111,7 +111,9 @@ def evaluate_pairs(term: Any, state: State) -> PairEvaluation:
     arrays |= dict.fromkeys(("lower", "upper", "refit_lower", "refit_upper"), ((B * t.facets,), wp.vec3))
     touching = fill(pair_scratch_struct(m.dtype)(), arrays | {"refit_needed": ((1,), wp.int32)})
     touching.C0 = touching.C
-    launch(term.seek.controls, (B, t.facets, masters.max_monomials), [masters, u, every, touching.C, touching.D])
+    launch(
+        term.seek.update_coefficients, (B, t.facets, masters.max_monomials), [masters, u, every, touching.C, touching.D]
+    )
     launch(term.seek.check_boxes, (B, t.facets), [masters, every, touching])
     tree = wp.Bvh(touching.refit_lower, touching.refit_upper, groups=t.box_groups)
     P, L = t.points, t.master_conn.shape[1]

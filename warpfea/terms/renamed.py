@@ -10,7 +10,6 @@ RENAMED = {
     "book": "energy_increments",
     "booked_rows": "increment_rows",
     "carry": "copy_cached",
-    "commit": "store_history",
     "couple": "add_mode_coupling",
     "couples": "coupled_bodies",
     "explain": "failure_reason",
