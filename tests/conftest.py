@@ -1,4 +1,4 @@
-"""What the tests share: a quiet Warp, the reference data, the skipping of CUDA tests."""
+"""Shared by the tests: a quiet Warp, the reference data, the skipping of CUDA tests."""
 
 from __future__ import annotations
 

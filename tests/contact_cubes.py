@@ -36,7 +36,7 @@ def middle(map=None, origin=(0.0, 0.0, 0.0)):
 
 
 def record(sim, contact):
-    """What the last step says of a contact, by name."""
+    """Fields of the last step's record of a contact, by name."""
     term = sim.model.terms.find(Contact)
     first = term.report_offset + len(RECORD) * term.tables.number[contact.index]
     return dict(zip(RECORD, sim.stepper.work.report.numpy()[0, first : first + len(RECORD)]))

@@ -108,7 +108,7 @@ def floor_kernels(dtype):
         anchor: wp.array2d(dtype=vec3), stuck: wp.array2d(dtype=wp.int32), accepted: wp.array(dtype=wp.int32),
         rows: wp.array3d(dtype=f64),
     ):  # fmt: skip
-        """What is stored when history is kept, and what the springs of points that leave lose."""
+        """History stored at the end of a step, and the energy lost by springs of points that leave."""
         world, item = wp.tid()
         if accepted[world] == 0:
             return

@@ -143,7 +143,7 @@ def run(tree: pathlib.Path, label: str, device: str) -> dict[str, Any]:
 
 
 def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
-    """What differs, in words."""
+    """Differences of two results, in words."""
     return [f"{key}: {old.get(key)} -> {new.get(key)}" for key in sorted({*old, *new}) if old.get(key) != new.get(key)]
 
 

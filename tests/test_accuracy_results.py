@@ -21,7 +21,7 @@ LARGE = "large_soft_body_h200"
 """Such a one with 285 thousand unknowns, on an H200."""
 OTHERS = ("rigid_double_pendulum", "rigid_slider_crank", "exact_cantilever", "spectral_pendulum", "bouncing_ball")
 FAILED = {("rigid_slider_crank", "energy_momentum"), ("rigid_slider_crank_time", "energy_momentum")}
-"""Where the larger steps were not accepted: bars of 2e13 Pa, whose strains are rounding, at dead points."""
+"""Cases without the larger steps: bars of 2e13 Pa, whose strains are rounding, at dead points."""
 
 
 def result(name):

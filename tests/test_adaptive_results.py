@@ -58,7 +58,7 @@ COSTLY = {
         "1.92: 16 and 32 fixed steps, longer than the contact, are at 1.4e-2 and 6.7e-3 by chance, 64 at 2.6e-2",
     ),
 }
-"""What misses the iterations asked for: at which errors, and by how much."""
+"""Misses of the iterations asked for: errors, and factors."""
 
 
 def costs():

@@ -1,4 +1,4 @@
-"""What the Python interface says to wrong arguments: handles of other models, constants, densities, files."""
+"""Messages of the Python interface for wrong arguments: handles of other models, constants, densities, files."""
 
 from __future__ import annotations
 

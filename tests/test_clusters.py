@@ -13,7 +13,7 @@ from warpfea.solvers.clusters import cluster_tables
 
 
 def summed(conn, size, values, n):
-    """What the kernel does with contributions [element, local], from the tables alone."""
+    """Sums by the kernel of contributions [element, local], from the tables alone."""
     count, slots = conn.shape
     t = cluster_tables(conn, size)
     place, start, words = table_layout(size, slots)

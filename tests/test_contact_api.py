@@ -146,7 +146,7 @@ def test_all_nodes_may_be_driven():
 
 
 def test_a_static_equilibrium_bears_on_the_collider():
-    """What a collider presses with is what the clamp holds; also of the state that statics leaves."""
+    """The force of a collider equals the reaction of the clamp; also of the state that statics leaves."""
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     mesh = wf.mesh.box((0.1, 0.1, 0.1), cells=(2, 2, 2))
     cube = b.add_solid(mesh, material=wf.SVK(E=1e6, nu=0.3, density=1000), name="cube")

@@ -292,7 +292,7 @@ def test_elastic_bounces_keep_their_height():
 @pytest.mark.parametrize("face", [1.0, -1.0])
 @pytest.mark.parametrize("kind", ["beam", "shell"])
 def test_thin_bodies_hit_a_cylinder_with_either_face(kind, face):
-    """What the ledger keeps is the energy that there was, and nothing is pushed aside."""
+    """The ledger keeps the energy of the start, and nothing is pushed aside."""
     thick, v, h = 0.005, 2.0, 2e-4
     z = face * (0.035 + 0.5 * thick)
     material = wf.SVK(E=1e8, nu=0.3, density=1000.0)

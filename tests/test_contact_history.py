@@ -1,4 +1,4 @@
-"""What contact keeps beside the bodies: overlaps, colliders of a resumed state, deepest points; explicit contact."""
+"""State of contact beside the bodies: overlaps, colliders of a resumed state, deepest points; explicit contact."""
 
 from __future__ import annotations
 

@@ -93,7 +93,7 @@ def random_depths(law, seed=0):
 
 
 def inner(parts, delta, kinks):
-    """Where differences do not straddle a kink: the force acts on both sides or on neither."""
+    """Points whose differences do not straddle a kink: the force acts on both sides or on neither."""
     ok = (parts[0][:, 0] > 0.0) == (parts[1][:, 0] > 0.0)
     for kink in kinks:
         ok &= np.abs(delta - kink) > 2.0 * STEP

@@ -1,4 +1,4 @@
-"""What is shown of contact: pressure and gap at nodes, colliders in USD, VTU and pictures."""
+"""Outputs of contact: pressure and gap at nodes, colliders in USD, VTU and pictures."""
 
 from __future__ import annotations
 

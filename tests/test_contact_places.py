@@ -1,4 +1,4 @@
-"""Where a lumped contact acts: places between the points of a surface, and bodies that roll over them."""
+"""Points at which a lumped contact acts: places between the points of a surface, and bodies that roll over them."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ MOST = 240.0
 
 @pytest.mark.slow
 def test_modules_of_the_scenes_compile_for_cuda():
-    """What `cuda_modules.py --record` has noted, in a process of its own."""
+    """The modules recorded by `cuda_modules.py --record`, in a process of its own."""
     began = time.perf_counter()
     done = subprocess.run([sys.executable, str(HERE / "cuda_modules.py")], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]

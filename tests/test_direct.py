@@ -126,7 +126,7 @@ def test_statics_of_a_slender_beam(data):
 
 @pytest.mark.slow
 def test_a_column_beyond_its_critical_load(data, monkeypatch):
-    """Where H is indefinite its inverse may lead uphill, and the positive matrix takes its place."""
+    """The positive matrix replaces an indefinite H, whose inverse may lead uphill."""
     from warpfea.solvers.direct import Direct
 
     uphill = []

@@ -90,7 +90,7 @@ def test_the_matrix_differs_from_the_derivative_by_the_turn_of_a_step(family, la
 
 @pytest.mark.parametrize(("family", "law"), [("T10", "svk"), ("T4", "neo_hookean"), ("3243 tied", "svk")])
 def test_columns_and_whole_elements_give_one_matrix(family, law):
-    """What a GPU launches and what the CPU does, here on the CPU both."""
+    """The kernels of a GPU and those of the CPU, here both on the CPU."""
     sim = simulate(tumble(family, law), solver=wf.NewtonPCG(operator="matrix"), capture=False)
     sim.step(3)
     w, residual = sim.stepper.work, sim.stepper.newton.residual
@@ -155,7 +155,7 @@ def test_every_way_to_solve_conserves(family, law, options):
 
 @pytest.mark.parametrize("scheme", ["backward_euler", "bdf2"])
 def test_others_do_not_conserve(scheme):
-    """What the bounds above are worth."""
+    """Sharpness of the bounds above."""
     sim = wf.Simulation(tumble("T10", "svk"), dt=DT, integrator=scheme, solver=TIGHT)
     watch = Conserved(sim)
     for _ in range(100):

@@ -1,4 +1,4 @@
-"""What `StepReport.floor` tells of float32, beside the true error; tests/results/floor_cpu.json, made by
+"""`StepReport.floor` in float32, beside the true error; tests/results/floor_cpu.json, made by
 `python -m tests.validation floor`."""
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""What a scene does not use costs nothing: no launches, modules or bytes."""
+"""Features that a scene does not use cost nothing: no launches, modules or bytes."""
 
 import numpy as np
 import pytest

@@ -11,7 +11,7 @@ import warpfea as wf
 
 
 def leaves(target, source):
-    """Whether a copy leaves the device."""
+    """True if a copy leaves the device."""
     return source.device.is_cuda and not target.device.is_cuda
 
 

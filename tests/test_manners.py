@@ -1,4 +1,4 @@
-"""What a new user meets first: quiet, named errors, plausible sizes, names that are nearly right."""
+"""First impressions of a new user: quiet, named errors, plausible sizes, names that are nearly right."""
 
 from __future__ import annotations
 

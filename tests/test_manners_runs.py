@@ -1,4 +1,4 @@
-"""What a run leaves and says: files that go on, statics, pictures, reprs, refusals, summaries."""
+"""Files and messages of a run: files that go on, statics, pictures, reprs, refusals, summaries."""
 
 from __future__ import annotations
 

@@ -378,7 +378,7 @@ def test_generators_are_deterministic():
 
 
 def lines_run(call):
-    """What a call gives, and how many lines of Python ran in it."""
+    """Result of a call, and the number of Python lines run in it."""
     count = 0
 
     def trace(frame, event, arg):

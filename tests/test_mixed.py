@@ -72,7 +72,7 @@ def test_matrix_and_elements_agree(kind: str, mixed: int) -> None:
 
 @pytest.mark.parametrize("kind", ["svk", "neo_hookean", "beam"])
 def test_stress_is_that_of_the_linear_prediction(kind: str) -> None:
-    """What it differs by from the stress of the iterate is of second order in the last step."""
+    """The difference from the stress of the iterate is of second order in the last step."""
     sim = static(kind, "matrix")
     p = placed(sim, 1, amount=1e-3)
     w = sim.stepper.work
@@ -89,7 +89,7 @@ def test_stress_is_that_of_the_linear_prediction(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", ["svk", "neo_hookean", "beam"])
 def test_positive_matrix_has_no_negative_curvature(kind: str) -> None:
-    """Where the linear prediction is indefinite, H is replaced by one that is positive semi-definite."""
+    """An indefinite linear prediction is replaced by a positive semi-definite H."""
     sim = static(kind, "matrix")
     placed(sim, 2)
     w = sim.stepper.work

@@ -1,4 +1,4 @@
-"""What a new user types: messages that say what to write, short reprs, the names of `warpfea`, devices, times told."""
+"""Input of a new user: messages that say what to write, short reprs, the names of `warpfea`, devices, times told."""
 
 from __future__ import annotations
 

@@ -82,7 +82,7 @@ def test_nothing_else_of_the_checkout_is_importable():
 
 
 def copy_sources(target):
-    """What a wheel is made of, without what earlier builds left behind."""
+    """The files of a wheel, without leftovers of earlier builds."""
     target.mkdir()
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, target)
@@ -235,7 +235,7 @@ def test_folders_keep_to_their_lines(record_property):
     validation = lines("tests/validation")
     assert validation <= 4000
     assert lines("warpfea/studies") <= 6800
-    assert lines("tests") - validation <= 31_400  # 30 864 at 51a4e5d; to be brought back to that
+    assert lines("tests") - validation <= 31297  # 30 864 at 51a4e5d; to be brought back to that
     record_property("lines outside tests", lines(*PROJECT["tool"]["setuptools"]["package-dir"].values()))
 
 

@@ -47,7 +47,7 @@ def weights(straight, blocks=BLOCKS):
 
 
 def stands(mu, straight, blocks=BLOCKS):
-    """Whether forces at the ends of all joints, pressing and within Coulomb's cone, balance the blocks' weights."""
+    """True if forces at the ends of all joints, pressing and within Coulomb's cone, balance the blocks' weights."""
     _, radial, along = joints(blocks)
     area, middle = weights(straight, blocks)
     A, load = np.zeros((3 * blocks, 3 * (blocks + 1))), np.zeros(3 * blocks)
@@ -102,7 +102,7 @@ def arch(mu):
 
 
 def drop(mu, duration):
-    """How far the top sinks, m, and its speed, m/s, when gravity is ramped up in half a second."""
+    """Sinking of the top, m, and its speed, m/s, when gravity is ramped up in half a second."""
     sim, top = arch(mu)
     began = sim.positions(top)[0][:, 2].mean()
     for k in range(round(duration / 5e-3)):

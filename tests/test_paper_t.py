@@ -245,7 +245,7 @@ def test_reproduction_of_polynomials(corners, c, degree):
 
 
 def test_quadratics_that_fn_misses(ref, data):
-    """What FN makes of monomials on the unit tetrahedron, against the symbolic result."""
+    """FN applied to monomials on the unit tetrahedron, against the symbolic result."""
     x, y, z = LAMBDA[:, 1:].T
     s = T.fn_cartesian(LAMBDA, CORNERS)
     slots = cartesian_slots(T.power_basis, CORNERS)[:16]

@@ -15,7 +15,7 @@ ONE = {"E": (2.1e6, 0.7e6), "nu": (0.45, 0.2), "eta": (0.0, 77.0), "density": (2
 
 
 def alike(sim, built, exact):
-    """Whether all arrays of the states are the same, or close where constants are rounded another way."""
+    """True if all arrays of the states are the same, or close where constants are rounded another way."""
     assert np.array_equal(sim.model.mass_matrix().toarray(), built.model.mass_matrix().toarray())
     assert sim.model.mass == built.model.mass
     if exact:

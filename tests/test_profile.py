@@ -62,7 +62,7 @@ def launches_of(name, device, steps, after, **values):
 
 
 def check(found, steps):
-    """What holds for any profile."""
+    """Properties of any profile."""
     assert len(found.step_ms) == steps
     own = [name for name in PARTS if name in found.parts]
     assert list(found.parts)[: len(own)] == own

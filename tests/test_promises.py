@@ -1,4 +1,4 @@
-"""What a failure leaves: the promises of warpfea/simulation/README.md, one after the other."""
+"""State after a failure: the promises of warpfea/simulation/README.md, one after the other."""
 
 import contextlib
 import itertools

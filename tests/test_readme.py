@@ -223,7 +223,7 @@ def test_the_table_has_the_equations_that_readers_look_for():
 
 
 ALWAYS = ("always", "energy ledger", "float64", "two-level, banded")
-"""What the table of launches says of kernels that each of these scenes launches, in the same order."""
+"""Conditions in the table of launches of kernels that each of these scenes launches, in the same order."""
 
 
 def launch_table():

@@ -81,7 +81,7 @@ def test_all_scenes_take_fewer_iterations_than_before(tables):
 
 @pytest.mark.parametrize("label", ["cantilever", "slider_crank", "loads rate auto"])
 def test_the_table_is_up_to_date(tables, label):
-    """What is recorded for a step, counted anew."""
+    """Launches recorded for a step, counted again."""
     case = next(case for case in bench.cases() if case.label == label)
     model = case.make().finalize(device="cpu", dtype=case.dtype, worlds=case.worlds)
     solver = wf.NewtonPCG(tol=case.tol, **case.solver)

@@ -262,7 +262,7 @@ def test_a_change_by_rounding_the_state_is_not_told(monkeypatch):
 
 @pytest.mark.parametrize(("slender", "twins"), [(False, 0), (True, 1)])
 def test_only_slender_models_in_single_precision_are_judged_in_double(slender, twins, monkeypatch):
-    """Where float32 itself has curvatures far above rounding there is no twin in float64: fails on 51a4e5d."""
+    """No copy in float64 is made if float32 itself has curvatures far above rounding: fails on 51a4e5d."""
     made, twin = [], stability._float64_copy
     monkeypatch.setattr(stability, "_float64_copy", lambda sim: made.append(sim) or twin(sim))
     if slender:

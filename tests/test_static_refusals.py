@@ -1,4 +1,4 @@
-"""What statics says where it can't go on: loads beyond a body's stiffness, loose pieces, work that has no end."""
+"""Refusals of statics: loads beyond a body's stiffness, loose pieces, work that has no end."""
 
 import numpy as np
 import pytest

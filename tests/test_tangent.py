@@ -302,7 +302,7 @@ def test_a_damped_body_turns_by_any_angle_in_a_step(angle, data):
 
 
 def test_rate_damping_swells_a_turning_body(data):
-    """What the incremental form is for: Eq. (58) with F and Fdot at the end of the step strains the body."""
+    """Purpose of the incremental form: Eq. (58) with F and Fdot at the end of the step strains the body."""
     _, body, u, turned = one_turning_step("rate", 40.0)
     assert data.error(u, turned) > 1e-2
     x, X = body.mesh.points + u, body.mesh.points

@@ -1,4 +1,4 @@
-"""What a term of one's own may get wrong, and that it is told by name: the half-space of floor_term.py, spoilt."""
+"""Mistakes in user-defined terms are refused by name: the half-space of floor_term.py, spoilt."""
 
 import functools
 import types

@@ -91,7 +91,7 @@ def test_a_deep_tree_is_searched_alike_on_cuda():
 
 
 def test_places_over_edges_and_corners_are_told_in_or_out():
-    """Where several triangles are equally near, a face's own normal may say the wrong side."""
+    """A face's own normal may give the wrong side if several triangles are equally near."""
     for mesh in (wf.TriMesh(*octahedron()), dented(), boxed(), blade()):
         p = mesh.points[mesh.triangles]
         middles = 0.5 * (p + np.roll(p, 1, axis=1)).reshape(-1, 3)

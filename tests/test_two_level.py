@@ -173,7 +173,7 @@ def test_large_bodies_are_numbered_by_place_and_report_in_file_order(monkeypatch
     + [("T10 rubber", "float32"), pytest.param("3243 askew, incremental", "float32", marks=pytest.mark.slow)],
 )
 def test_columns_and_whole_elements_give_one_matrix(scene, dtype):
-    """What a GPU launches and what the CPU does, here on the CPU both."""
+    """The kernels of a GPU and those of the CPU, here both on the CPU."""
     sim = simulation(SCENES[scene](), shake=1e-3, dtype=dtype)
     for projected in (False, True):
         by_column, whole = (assembled(sim, projected=projected, whole=whole) for whole in (False, True))

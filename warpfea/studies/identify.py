@@ -66,7 +66,7 @@ def record(device: Any, t_end: float = T_END, seed: int = 7) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Found:
-    """What a search found.
+    """Result of a search.
 
     Attributes:
         E, eta: Pa, Pa s; E_error, eta_error: over the truth.

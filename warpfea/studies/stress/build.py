@@ -1,4 +1,4 @@
-"""What the cases share: bars and beams, static solutions with their counts, differences."""
+"""Shared by the cases: bars and beams, static solutions with their counts, differences."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from ..case import Answer, Setting, case
 SIZE = (0.5, 0.1, 0.1)
 """Of the bar, m."""
 BUILT: dict[str, float] = {"E": 1e6, "nu": 0.3, "eta": 10.0, "density": 1000.0}
-"""What the model is built with, and in `SET` what it is set to."""
+"""Values of the model as built; those set later are in `SET`."""
 SET: dict[str, float] = {"E": 3e6, "nu": 0.1, "eta": 250.0, "density": 7000.0, "mu": 0.05}
 G = 9.81
 
