@@ -131,7 +131,7 @@ def test_a_column_beyond_its_critical_load(data, monkeypatch):
 
     uphill = []
     retreat = Direct._factorise_positive
-    monkeypatch.setattr(Direct, "_retreat", lambda self, world: (uphill.append(world), retreat(self, world)))
+    monkeypatch.setattr(Direct, "_factorise_positive", lambda self, world: (uphill.append(world), retreat(self, world)))
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     column = b.add_beam(
         [(0, 0, 0), (0, 0, 1)], elements=6, section=wf.Rectangle(0.1, 0.1), normal=(1, 0, 0),
