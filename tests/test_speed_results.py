@@ -143,7 +143,6 @@ def test_four_million_unknowns_tell_their_memory(peer):
 
 @pytest.mark.parametrize(("name", "least"), [("trials_h200.json", 12), ("renaming_h200.json", 9)])
 def test_no_row_is_slower_than_before_by_more_than_five_percent(name, least):
-    """In turn on one machine."""
     content = content_of(name, device="cuda")
     assert len(content["baseline"]) == 40
     assert len(content["rows"]) >= least
