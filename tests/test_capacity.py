@@ -44,7 +44,7 @@ def test_where_there_is_plenty_nothing_is_measured(monkeypatch):
         raise AssertionError("a model was built once more")
 
     monkeypatch.setattr(wf.Model, "resized", fail)
-    wf.Simulation(build(3), dt=1e-3)
+    assert wf.Simulation(build(3), dt=1e-3).model.worlds == 3
 
 
 def test_memory_of_the_host_is_known_or_not_asked_for():

@@ -191,7 +191,7 @@ def test_motions_that_set_in_are_no_growth(integrator, load):
     sim = wf.Simulation(b.finalize(device="cpu"), dt=2e-2, integrator=integrator)
     with warnings.catch_warnings():
         warnings.simplefilter("error", wf.ModelWarning)
-        sim.step(30)
+        assert sim.step(30).converged.all()
 
 
 @pytest.mark.slow

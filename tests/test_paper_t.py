@@ -223,8 +223,7 @@ def test_incomplete_coefficients(corners, data):
 
 
 @pytest.mark.parametrize(
-    ("c", "key"),
-    [(None, "ENMC_space"), (FACTORS[0], "FN_space"), (FACTORS[1], "FN_space_with_1_18_instead_of_2_81")],
+    ("c", "key"), [(None, "ENMC_space"), (FACTORS[0], "FN_space"), (FACTORS[1], "FN_space_with_1_18_instead_of_2_81")]
 )
 def test_dimensions_of_the_spaces(c, key, ref):
     functions = T.enmc_volume if c is None else functools.partial(T.fn_volume, c=c)

@@ -5,21 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import warp as wp
-from parameter_models import (
-    CASES,
-    NEO,
-    NU,
-    RHO,
-    SVK,
-    VALUES,
-    E,
-    beam,
-    material,
-    model,
-    rows,
-    solid,
-    varied,
-)
+from parameter_models import CASES, NEO, NU, RHO, SVK, VALUES, E, beam, material, model, rows, solid, varied
 
 import warpfea as wf
 

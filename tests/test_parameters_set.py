@@ -14,8 +14,8 @@ PAIRS = [
 ONE = {"E": (2.1e6, 0.7e6), "nu": (0.45, 0.2), "eta": (0.0, 77.0), "density": (2530.0, 870.0)}
 
 
-def alike(sim, built, exact):
-    """True if all arrays of the states are the same, or close where constants are rounded another way."""
+def assert_alike(sim, built, exact):
+    """Assert that all arrays of the states are the same, or close where constants are rounded another way."""
     assert np.array_equal(sim.model.mass_matrix().toarray(), built.model.mass_matrix().toarray())
     assert sim.model.mass == built.model.mass
     if exact:
@@ -41,7 +41,7 @@ def test_one_world_takes_a_parameter(case, integrator, name):
     sim.step(2)
     built = wf.Simulation(model(add, material(**{name: second}, **law)), dt=2e-3, integrator=integrator)
     built.step(2)
-    alike(sim, built, exact=case != "3243")
+    assert_alike(sim, built, exact=case != "3243")
 
 
 OWN = {

@@ -48,7 +48,7 @@ def test_a_metal_in_mpa(E, density):
 
 @pytest.mark.parametrize(("E", "density"), [(1e4, 1000.0), (2e6, 7200.0), (2.1e11, 7850.0), (1e5, 2000.0)])
 def test_soft_matter_is_no_metal(E, density):
-    silent(lambda: bar(E=E, density=density))
+    assert silent(lambda: bar(E=E, density=density)).worlds == 1
 
 
 @pytest.mark.parametrize("law", [wf.SVK, wf.NeoHookean])
@@ -78,9 +78,9 @@ def test_a_drive_that_jumps_at_the_start(options, told):
 
 
 def test_a_drive_that_begins_where_its_nodes_are():
-    silent(lambda: wf.Simulation(bar(drive=([0, 1], [(0, 0, 0), (0.1, 0, 0)])), dt=1e-3))
-    silent(lambda: wf.Simulation(bar(turn=([0, 1], [0, 1.0])), dt=1e-3))
-    silent(lambda: wf.Simulation(bar(drive=wf.Control("x", 3)), dt=1e-3))
+    assert silent(lambda: wf.Simulation(bar(drive=([0, 1], [(0, 0, 0), (0.1, 0, 0)])), dt=1e-3)).time == 0.0
+    assert silent(lambda: wf.Simulation(bar(turn=([0, 1], [0, 1.0])), dt=1e-3)).time == 0.0
+    assert silent(lambda: wf.Simulation(bar(drive=wf.Control("x", 3)), dt=1e-3)).time == 0.0
 
 
 def test_a_law_that_ends_before_the_run():
