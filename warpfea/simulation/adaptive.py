@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,10 +20,12 @@ if TYPE_CHECKING:
     from ..model.model import Model
     from ..terms.term import StepContext
 
-__all__ = ["AdaptiveOptions", "StepSizeControl", "adaptive_options"]
+__all__ = ["AdaptiveOptions", "StepSizeControl", "adaptive_options", "algebraic_tolerance"]
 
 MIN_ERROR = {"float64": 1e-9, "float32": 1e-5}
 """Smallest admissible error over the model's size; below it round-off is significant."""
+ALGEBRAIC_FRACTION = 0.1
+"""Largest default tolerance of Newton's method, over the requested error."""
 FIRST_STEP = 0.125
 """First substep over horizon error^(1/order)."""
 
@@ -82,6 +84,16 @@ def adaptive_options(
         finer = "; use float64" if model.dtype == "float32" else ""
         raise ModelError(f"error = {error!r} is below {model.dtype} round-off ({least:g} of the model size){finer}")
     return AdaptiveOptions(float(error), interval, horizon)
+
+
+def algebraic_tolerance(solver: NewtonPCG, options: AdaptiveOptions, dtype: str) -> NewtonPCG:
+    """Solver options whose default tolerance is at most a tenth of the error.
+
+    Otherwise residuals accepted in float32 look like local errors, which shorter steps do not reduce.
+    """
+    if solver.tol is not None:
+        return solver
+    return replace(solver, tol=min(solver.tolerance(dtype), ALGEBRAIC_FRACTION * options.error))
 
 
 def _lever_arms(model: Model) -> np.ndarray:
@@ -163,6 +175,11 @@ class StepSizeControl:
     def end_interval(self) -> None:
         """Finish the interval before the report."""
         self.launch(self.kernels.close_step, self.model.worlds, [self.work.pcg, self.control])
+
+    def least_error(self, world: int) -> float:
+        """Smallest tolerance, over the model's size, that round-off lets the estimates meet; 0 if they meet theirs."""
+        blind = float(self.control.blind.numpy()[world])
+        return blind * self.error if blind > 1.0 else 0.0
 
     def counts(self) -> dict[str, np.ndarray]:
         """Counts of the last step, each (B,), see COUNTS."""

@@ -109,6 +109,12 @@ def _failure_reason(sim: Any, code: int, world: int) -> tuple[str, str]:
         return "singular tangent matrix (unconstrained body or mechanism?)", ""
     near = float(work.newton.rounding_ratio.numpy()[world]) <= STALL_ROUNDINGS
     finer = "; use float64" if dtype == "float32" else "; use fewer, stouter elements, or check the units"
+    adaptive = sim.stepper.adaptive
+    if code == FAIL_FLOOR and adaptive and (least := adaptive.least_error(world)):
+        hides = f"{dtype} round-off of displacements hides the local errors of substeps"
+        return hides, f"{finer}, or error = {1.05 * least:.2g} or more"
+    if code == FAIL_ERROR:
+        return REASONS[code], f"; {'use float64, or ' if dtype == 'float32' else 'use '}a larger error"
     if code == FAIL_FLOOR:
         eta = float(work.newton.error_estimate.numpy()[world])
         left = ""

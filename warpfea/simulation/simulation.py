@@ -22,7 +22,7 @@ from ..model.handles import NodeSet
 from ..model.state import State
 from ..solvers import Jacobi, NewtonPCG
 from . import integrators
-from .adaptive import adaptive_options
+from .adaptive import adaptive_options, algebraic_tolerance
 from .capacity import check_capacity
 from .checks import (
     check_choice,
@@ -128,6 +128,8 @@ class Simulation(RunStatistics):
         adapt = adaptive_options(dt, **times, model=model, scheme=scheme, solver=options)
         if adapt is None:
             check_times("dt", dt, model, positive=True)
+        else:
+            options = algebraic_tolerance(options, adapt, model.dtype)
         if t_end is not None:
             if adapt or scheme.static:
                 raise ModelError(f"t_end = {t_end!r}: t_end of Simulation needs a fixed dt; use run(t_end)")

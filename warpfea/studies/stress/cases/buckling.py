@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import warnings
 
 import numpy as np
@@ -13,6 +14,8 @@ from ..case import Answer, Setting, case
 
 GROUP = "Stability"
 MODULUS, LENGTH, SIDE, THICKNESS = 2e11, 1.0, 0.02, 0.01
+BUCKLED = {1e-3: 0.01504, 1e-4: 0.0151}
+"""Displacement of the middle, m, of 32 x 32 shells in float64, by imperfection, m."""
 PUSH = 1e-5
 """Of the load, across a column."""
 
@@ -63,18 +66,43 @@ def pushed(setting: Setting, factor: float) -> Answer:
     return Answer(0.0 if told or side > 0.1 else 1.0, 0.1, "Euler", **count.fields, note=note)
 
 
-@case("buckling-plate", GROUP, values=(0.9, 1.1, 1.5), quick="both")
-def plate(setting: Setting, factor: float) -> Answer:
+def _supported_plate(factor: float, imperfection: float = 0.0) -> tuple[wf.ModelBuilder, wf.Body]:
     """A square plate of 8 x 8 shells, simply supported, under so many times its load in one direction.
 
-    N = 4 pi^2 D / a^2 (Bryan 1891); of the mesh it is 0.976 of that.
+    N = 4 pi^2 D / a^2 (Bryan 1891); of the mesh it is 0.976 of that. `imperfection`: height of the middle, m, in the
+    shape of its lowest mode.
     """
     nu = 0.3
     critical = 4.0 * np.pi**2 * MODULUS * THICKNESS**3 / 12.0 / (1.0 - nu**2) / LENGTH**2
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     mesh = wf.mesh.grid((LENGTH, LENGTH), cells=(8, 8))
+    x, y = mesh.points[:, 0] / LENGTH, mesh.points[:, 1] / LENGTH
+    points = np.column_stack([mesh.points[:, :2], imperfection * np.sin(np.pi * x) * np.sin(np.pi * y)])
+    mesh = dataclasses.replace(mesh, points=points)
     body = b.add_shell(mesh, thickness=THICKNESS, material=wf.SVK(E=MODULUS, nu=nu), name="plate")
     for side, components in (("x-", "xz"), ("x+", "z"), ("y-", "yz"), ("y+", "z")):
         b.clamp(body.edge(side), components=components, slots="position")
     b.add_traction(body.surface("x+"), (-factor * critical / THICKNESS, 0.0, 0.0))
-    return _judged(b, setting, factor < 1.0, "Bryan")
+    return b, body
+
+
+@case("buckling-plate", GROUP, values=(0.9, 1.1, 1.5), quick="both")
+def plate(setting: Setting, factor: float) -> Answer:
+    """A perfect, simply supported plate under so many times Bryan's load is said to be stable or not."""
+    return _judged(_supported_plate(factor)[0], setting, factor < 1.0, "Bryan")
+
+
+@case("buckling-imperfect-plate", GROUP, values=(1e-3, 1e-4), quick="both")
+def imperfect_plate(setting: Setting, imperfection: float) -> Answer:
+    """At 1.5 of Bryan's load it buckles to where 32 x 32 shells do, and is stable.
+
+    The single-precision answer was once 3e-6 m.
+    """
+    b, body = _supported_plate(1.5, imperfection)
+    b.add_probe("middle", body.at((LENGTH / 2, LENGTH / 2, imperfection)))
+    count = Count()
+    found = wf.solve_static(finalize(b, setting), outputs=[count])
+    assert found.report.stable is not None
+    middle = float(found.probe("middle").displacement[0, -1, 2])
+    error = abs(middle / BUCKLED[imperfection] - 1.0) if found.report.stable[0] else 1.0
+    return Answer(error, 0.04, "32 x 32 shells", **count.fields, note=f"middle at {middle:.4g} m")
