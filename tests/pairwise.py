@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-__all__ = ["covering"]
+__all__ = ["covering", "on_devices"]
 
 
 def covering(*axes: Sequence[Any], strength: int = 2) -> list[Any]:
@@ -31,3 +31,9 @@ def covering(*axes: Sequence[Any], strength: int = 2) -> list[Any]:
         chosen.add(best)
         left -= covers[best]
     return [pytest.param(*case, marks=[] if k in chosen else [pytest.mark.slow]) for k, case in enumerate(cases)]
+
+
+def on_devices(*axes: Sequence[Any], strength: int = 2, cuda: Sequence[Sequence[Any]] | None = None) -> list[Any]:
+    """Cases with a device before them: those of `covering` on the CPU, the product of axes, or of `cuda`, on a GPU."""
+    on_gpu = [pytest.param("cuda", *case, marks=pytest.mark.cuda) for case in itertools.product(*(cuda or axes))]
+    return covering(["cpu"], *axes, strength=strength) + on_gpu

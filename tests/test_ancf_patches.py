@@ -204,7 +204,7 @@ def test_free_fall_is_exact(name, integration, dtype):
                 assert fall_error(sim, [body], fall(load, h, 8)) < bound, (load, cap, h)
 
 
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
 def test_free_fall_of_all_families_beside_held_ones(dtype):
     """All in one model, with a clamped beam and a driven shell, which do not feel the others."""
     b = wf.ModelBuilder(gravity=GRAVITY)

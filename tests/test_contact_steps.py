@@ -2,21 +2,13 @@
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 import pytest
 from contact_runs import DEVICES, DT, DTYPES, PLACES, TIGHT, simulated, thrown
-from pairwise import covering
+from pairwise import on_devices
 
 import warpfea as wf
 from warpfea.simulation.checkpoint import save_checkpoint
-
-
-def placed(*cuda):
-    """Devices and obstacles: all on the CPU, those named on a GPU."""
-    on_gpu = [pytest.param("cuda", place, marks=pytest.mark.cuda) for place in cuda]
-    return pytest.mark.parametrize(("device", "place"), [*(("cpu", place) for place in PLACES), *on_gpu])
 
 
 def falling(shape, *, E, speed, solver=None, worlds=1, **options):
@@ -150,16 +142,12 @@ LAWS = {
 }  # fmt: skip
 
 
-BOOKED = (LAWS, ("backward_euler", "bdf2", "energy_momentum"))
+ON_GPU = ("plane", "rotation", "capsule")
+SCHEMES = ("backward_euler", "bdf2", "energy_momentum")
 
 
 @pytest.mark.parametrize(
-    ("device", "place", "law", "integrator"),
-    covering(["cpu"], PLACES, *BOOKED)
-    + [
-        pytest.param("cuda", *case, marks=pytest.mark.cuda)
-        for case in itertools.product(("plane", "rotation", "capsule"), *BOOKED)
-    ],
+    ("device", "place", "law", "integrator"), on_devices(PLACES, LAWS, SCHEMES, cuda=(ON_GPU, LAWS, SCHEMES))
 )
 def test_the_ledger_closes(device, place, law, integrator):
     sim = simulated(40, place, device=device, solver=TIGHT, integrator=integrator, **LAWS[law])
@@ -189,8 +177,7 @@ def momentum_error(solver, *args, **options):
     return np.abs(change - impulse).max() / np.abs(change).max()
 
 
-@placed("plane", "rotation", "capsule")
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize(("device", "place", "law"), on_devices(PLACES, LAWS, strength=1, cuda=(ON_GPU, LAWS)))
 def test_momentum_is_the_impulse_of_the_records(device, place, law):
     assert momentum_error(TIGHT, place, device=device, **LAWS[law]) <= 1e-10
 
@@ -229,17 +216,16 @@ def everything(sim):
 
 
 SINGLE = [("default", "float32"), ("explicit", "float32"), ("smooth", "float32")]
+STEPPED = [("backward_euler", 30), ("bdf2", 30), ("energy_momentum", 30), ("backward_euler", 6)]
+"""Integrators, and Newton iterations before a step is halved."""
 
 
-@pytest.mark.parametrize(("law", "dtype"), [*((law, "float64") for law in LAWS), *SINGLE])
 @pytest.mark.parametrize(
-    ("integrator", "max_newton"), [("backward_euler", 30), ("bdf2", 30), ("energy_momentum", 30), ("backward_euler", 6)]
+    ("device", "scheme", "law"), on_devices(STEPPED, [*((law, "float64") for law in LAWS), *SINGLE], strength=1)
 )
-@pytest.mark.parametrize("device", DEVICES)
-def test_a_resumed_run_with_live_contacts_equals_the_undisturbed_one(
-    tmp_path, device, integrator, max_newton, law, dtype
-):  # fmt: skip
+def test_a_resumed_run_with_live_contacts_equals_the_undisturbed_one(tmp_path, device, scheme, law):
     """Also across halved steps."""
+    (integrator, max_newton), (law, dtype) = scheme, law
     path = tmp_path / "c.npz"
     options = {"integrator": integrator, "dt": 2e-3 if max_newton < 30 else DT}
     solver = wf.NewtonPCG(max_newton=max_newton)
@@ -286,9 +272,9 @@ RAMPED = {"law": "paper", "smoothing": 1e-4}
 """The paper's implicit law where a step always has a solution: its damping is ramped in over 0.1 mm."""
 
 
-@pytest.mark.parametrize("law", LAWS)
-@pytest.mark.parametrize("place", ["plane", "path", "rotation", "ball", "capsule"])
-@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize(
+    ("device", "place", "law"), on_devices(["plane", "path", "rotation", "ball", "capsule"], LAWS, strength=1)
+)
 def test_single_precision_runs(device, place, law):
     options = RAMPED if law == "paper" else LAWS[law]
     double, single = (simulated(30, place, device=device, dtype=dtype, **options) for dtype in DTYPES)
