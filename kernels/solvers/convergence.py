@@ -138,18 +138,22 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         return first and ctl.groups > ctl.components and ctl.eps > f64(SINGLE_EPS)
 
     @wp.func
+    def component_sum(ctl: Control, world: int, group: int, row: int) -> f64:
+        """Sum of a row of `group_sums` over the groups of a group's component."""
+        total = f64(0.0)
+        for other in range(ctl.groups):
+            if ctl.component_of_group[other] == ctl.component_of_group[group]:
+                total += ctl.group_sums[row, world, other]
+        return total
+
+    @wp.func
     def within_roundoff(ctl: Control, world: int, group: int, norm: f64, rounding: f64) -> bool:
         """True in float64 if a group's residual is position round-off, and within the tolerance of all groups of its
         component: further iterations would not reduce it."""
         if ctl.groups == ctl.components or ctl.eps > f64(SINGLE_EPS) or norm > f64(GROUP_ROUNDINGS) * rounding:
             return False
-        internal, loads, inertia = f64(0.0), f64(0.0), f64(0.0)
-        for other in range(ctl.groups):
-            if ctl.component_of_group[other] == ctl.component_of_group[group]:
-                internal += ctl.group_sums[1, world, other]
-                loads += ctl.group_sums[2, world, other]
-                inertia += ctl.group_sums[3, world, other]
-        return norm <= ctl.tol * wp.sqrt(wp.max(internal, wp.max(loads, inertia)))
+        internal, loads = component_sum(ctl, world, group, 1), component_sum(ctl, world, group, 2)
+        return norm <= ctl.tol * wp.sqrt(wp.max(internal, wp.max(loads, component_sum(ctl, world, group, 3))))
 
     @wp.func
     def evaluate_norms(ctl: Control, world: int):
@@ -196,6 +200,8 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
                 ctl.component_converged[world, ctl.component_of_group[group]] = 0
                 solve += g2
                 solve_accept = wp.min(solve_accept, accept)
+                if ctl.groups > ctl.components:  # forces between groups have the round-off of both
+                    rounding = f64(2.0) * ctl.eps * wp.sqrt(component_sum(ctl, world, group, 4))
                 if wp.static(has_constraints):
                     if ctl.classical != 0:  # the residual contains rho c: position round-off times kappa
                         rounding = rounding / (ctl.penalty_norm_ratio * ctl.penalty_norm_ratio)
@@ -267,6 +273,14 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
                 ctl.failed[world] = FAIL_CONSTRAINT
 
     @wp.func
+    def is_velocity_roundoff(ctl: Control, world: int) -> bool:
+        """True in float64 if the last step changes velocities by their round-off: gaps of moving bodies have the
+        round-off of their positions, and no other force may act."""
+        fine = f64(VELOCITY_ROUNDINGS) * ctl.eps
+        step = wp.abs(ctl.slope[world])
+        return ctl.eps < f64(SINGLE_EPS) and step <= fine * fine * ctl.slot_sums[10, world]
+
+    @wp.func
     def check_convergence(ctl: Control, world: int):
         """End the iteration if it has converged or used up its iterations; if it stalls within round-off, request an
         error estimate."""
@@ -282,9 +296,7 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         if wp.static(not midpoint) and not near and ctl.rounding_ratio[world] < f64(1.0e300):  # g.p: no energy
             near = step <= alike * alike * energy
         if wp.static(unilateral):
-            # gaps of gliding bodies have position round-off, possibly without any other force
-            fine = f64(VELOCITY_ROUNDINGS) * ctl.eps
-            if ctl.eps < f64(SINGLE_EPS) and step <= fine * fine * ctl.dq_dv[world] * ctl.slot_sums[10, world]:
+            if is_velocity_roundoff(ctl, world):
                 near = True
                 settling = True
         near = near and ctl.error_estimates[world] < MAX_ERROR_ESTIMATES
@@ -299,7 +311,10 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
     @wp.func
     def fail(ctl: Control, world: int, why: int):
         """Handle a failed search: if round-off may explain it, keep the iterate and request an error estimate."""
-        near = ctl.rounding_ratio[world] <= f64(BOUND) and ctl.error_estimates[world] < MAX_ERROR_ESTIMATES
+        near = ctl.rounding_ratio[world] <= f64(BOUND)
+        if wp.static(unilateral):
+            near = near or is_velocity_roundoff(ctl, world)
+        near = near and ctl.error_estimates[world] < MAX_ERROR_ESTIMATES
         enough = False
         if wp.static(has_constraints):  # only accelerations need the tighter tolerance, which round-off prevents
             if (
