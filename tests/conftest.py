@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import json
-import re
 import types
 from pathlib import Path
 
@@ -56,23 +55,6 @@ def _reference(name):
 @functools.cache
 def _mesh(name):
     return wf.mesh.read(DATA / f"{name}.msh")
-
-
-RARE = re.compile(r"warpfea\.kernels\.(element|tied|with_mass)_(?!float64_(svk_(4|10)|orthotropic_8|8)_)")
-"""Element modules of kinds that few fast tests use, for a few short steps."""
-
-
-def pytest_configure(config):
-    """Compile rare modules without optimisation on the CPU in fast tests: the same bits in a third of the time."""
-    if config.option.markexpr != "not slow" or wp.is_cuda_available():
-        return
-    set_module_options = wp.set_module_options
-
-    def set_options(options, module=None):
-        light = {"optimization_level": 0} if module is not None and RARE.match(module.name) else {}
-        set_module_options(light | options, module=module)
-
-    wp.set_module_options = set_options
 
 
 def pytest_collection_modifyitems(items):

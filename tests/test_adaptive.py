@@ -219,7 +219,7 @@ def falling(E, dtype, error, horizon):
     ("E", "error", "horizon", "end"), [(1e7, 1e-4, 2.0, 0.25), (1e7, 3e-5, 1.0, 0.1), (1e9, 1e-5, 0.3, 0.1)]
 )
 def test_float32_takes_what_it_promises_on_a_pendulum(E, error, horizon, end):
-    """What rounds the displacements is no error of the step.
+    """Round-off of displacements is no error of the step.
 
     Fails on 8934ce7: refused at 0.1875 s and 0.0703 s, "no step is short enough for the error asked for".
     """

@@ -86,12 +86,12 @@ def adaptive_options(
     return AdaptiveOptions(float(error), interval, horizon)
 
 
-def algebraic_tolerance(solver: NewtonPCG, options: AdaptiveOptions, dtype: str) -> NewtonPCG:
-    """Solver options whose default tolerance is at most a tenth of the error.
+def algebraic_tolerance(solver: Any, options: AdaptiveOptions | None, dtype: str) -> Any:
+    """Solver options whose default tolerance is at most a tenth of the error of dt = "auto".
 
     Otherwise residuals accepted in float32 look like local errors, which shorter steps do not reduce.
     """
-    if solver.tol is not None:
+    if options is None or solver.tol is not None:
         return solver
     return replace(solver, tol=min(solver.tolerance(dtype), ALGEBRAIC_FRACTION * options.error))
 

@@ -126,10 +126,9 @@ class Simulation(RunStatistics):
             check_choice("on_failure", on_failure, "raise", "freeze")
         times = {"error": error, "interval": interval, "horizon": horizon}
         adapt = adaptive_options(dt, **times, model=model, scheme=scheme, solver=options)
+        options = algebraic_tolerance(options, adapt, model.dtype)
         if adapt is None:
             check_times("dt", dt, model, positive=True)
-        else:
-            options = algebraic_tolerance(options, adapt, model.dtype)
         if t_end is not None:
             if adapt or scheme.static:
                 raise ModelError(f"t_end = {t_end!r}: t_end of Simulation needs a fixed dt; use run(t_end)")

@@ -61,9 +61,4 @@ def split(setting: Setting, axes: Axes, motion: Motion, run: Callable[[Setting],
     algebra = away(setting.changed({"tol": tol / TIGHTER}))
     single = setting.dtype == "float32"
     other = away(setting.changed({"dtype": "float64" if single else "float32"}))
-    return {
-        "time": time,
-        "space": space,
-        "algebra": algebra,
-        "rounding": other if single else times(other, UNITS),
-    }
+    return {"time": time, "space": space, "algebra": algebra, "rounding": other if single else times(other, UNITS)}

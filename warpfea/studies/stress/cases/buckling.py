@@ -14,8 +14,8 @@ from ..case import Answer, Setting, case
 
 GROUP = "Stability"
 MODULUS, LENGTH, SIDE, THICKNESS = 2e11, 1.0, 0.02, 0.01
-BUCKLED = {1e-3: 0.01504, 1e-4: 0.0151}
-"""Displacement of the middle, m, of 32 x 32 shells in float64, by imperfection, m."""
+BUCKLED = 0.01507
+"""Displacement of the middle, m, of 32 x 32 shells in float64 with imperfections of 1 and 0.1 mm, within 0.3 %."""
 PUSH = 1e-5
 """Of the load, across a column."""
 
@@ -33,29 +33,29 @@ def _judged(b: wf.ModelBuilder, setting: Setting, stable: bool, reference: str) 
     return Answer(error, 0.1, reference, **count.fields, note=note)
 
 
-@case("buckling-column", GROUP, values=(0.9, 1.1, 10.0), quick="both")
-def column(setting: Setting, factor: float) -> Answer:
-    """A perfect cantilever of 16 beam elements under so many times Euler's load is said to be stable or not."""
+def _column(factor: float, across: float = 0.0) -> wf.ModelBuilder:
+    """A cantilever of 16 beam elements under so many times Euler's load, and a fraction of it across."""
     load = factor * np.pi**2 * MODULUS * SIDE**4 / 12.0 / (4.0 * LENGTH**2)
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     body = b.add_beam([(0, 0, 0), (LENGTH, 0, 0)], elements=16, section=wf.Rectangle(SIDE, SIDE), normal=Z,
                       material=wf.SVK(E=MODULUS, nu=0.0), name="column")  # fmt: skip
     b.clamp(body.start, slots="position+section")
-    b.add_point_load(body.end, (-load, 0.0, 0.0))
-    return _judged(b, setting, factor < 1.0, "Euler")
+    b.add_point_load(body.end, (-load, 0.0, across * load))
+    b.add_probe("tip", body.end)
+    return b
+
+
+@case("buckling-column", GROUP, values=(0.9, 1.1, 10.0), quick="both")
+def column(setting: Setting, factor: float) -> Answer:
+    """A perfect cantilever under so many times Euler's load is said to be stable or not."""
+    return _judged(_column(factor), setting, factor < 1.0, "Euler")
 
 
 @case("buckling-pushed", GROUP, values=(1.01, 1.1, 10.0), quick="both",
       refusal={"float64": ("was not accepted",), "float32": ("float32",)})  # fmt: skip
 def pushed(setting: Setting, factor: float) -> Answer:
     """The same with 1e-5 of the load across it does not stay straight in silence: told, refused, or bent by 0.1 L."""
-    load = factor * np.pi**2 * MODULUS * SIDE**4 / 12.0 / (4.0 * LENGTH**2)
-    b = wf.ModelBuilder(gravity=(0, 0, 0))
-    body = b.add_beam([(0, 0, 0), (LENGTH, 0, 0)], elements=16, section=wf.Rectangle(SIDE, SIDE), normal=Z,
-                      material=wf.SVK(E=MODULUS, nu=0.0), name="column")  # fmt: skip
-    b.clamp(body.start, slots="position+section")
-    b.add_point_load(body.end, (-load, 0.0, PUSH * load))
-    b.add_probe("tip", body.end)
+    b = _column(factor, PUSH)
     count = Count()
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always", wf.StabilityWarning)
@@ -104,5 +104,5 @@ def imperfect_plate(setting: Setting, imperfection: float) -> Answer:
     found = wf.solve_static(finalize(b, setting), outputs=[count])
     assert found.report.stable is not None
     middle = float(found.probe("middle").displacement[0, -1, 2])
-    error = abs(middle / BUCKLED[imperfection] - 1.0) if found.report.stable[0] else 1.0
+    error = abs(middle / BUCKLED - 1.0) if found.report.stable[0] else 1.0
     return Answer(error, 0.04, "32 x 32 shells", **count.fields, note=f"middle at {middle:.4g} m")

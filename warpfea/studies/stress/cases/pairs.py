@@ -138,16 +138,8 @@ def impact(setting: Setting, value: tuple[float, float]) -> Answer:
 @case("pairs-shell", GROUP, values=(1.0, 20.0, 100.0), quick="none", refusal=NAMED)
 def thin_shell(setting: Setting, speed: float) -> Answer:
     """A cube hits a shell of a hundredth of its side at 1 to 100 m/s, h = 1 ms: no penetration."""
-    s = pair(
-        E=(1e6, 1e8),
-        gravity=(0, 0, 0),
-        place=(0, 0, 0.05),
-        thickness=1e-3,
-        shell=True,
-        mu=0.3,
-        restitution=0.5,
-        stiffness=1e4,
-    )
+    s = pair(E=(1e6, 1e8), gravity=(0, 0, 0), place=(0, 0, 0.05), thickness=1e-3, shell=True, mu=0.3, restitution=0.5,
+             stiffness=1e4)  # fmt: skip
     s.builder.set_initial(s.upper, velocity=(0, 0, -speed))
     seen = watch(wf.Simulation(s.model(setting), dt=1e-3), s, 60)
     return seen.answer(setting, max(seen.through, 0.0), 0.0, "the centre stays before the shell")
