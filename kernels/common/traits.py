@@ -12,11 +12,11 @@ class Traits(NamedTuple):
         nonpotential: non-conservative forces; Phi freezes those of the last iterate in a line search.
         tangent: such forces have a symmetric tangent in H.
         pooled: terms with a potential that contribute to slots through the pool of terms.
-        ties: constraints, whose rows are gathered with the slots.
+        constraint_rows: constraints, whose rows are gathered with the slots.
         stored: terms have stored energy, in rows that are summed per world.
-        gated: constraints with a violation tolerance, and with multipliers that change with the iterate.
+        has_constraints: constraints with a violation tolerance, and with multipliers that change with the iterate.
         limited: terms may shorten a Newton step.
-        walls: terms have unilateral forces, such as contact.
+        unilateral: terms have unilateral forces, such as contact.
         midpoint: of the integrator: forces are those at the midpoint of a step and have no potential in its end state.
     """
 

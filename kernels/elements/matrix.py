@@ -2,7 +2,7 @@
 
 A GPU has many threads with few registers: one thread computes one column of an element's matrix. A core of a CPU
 computes whole elements: it forms dP/dF once per quadrature point, and its vector units process the slots of a panel
-(up to WIDEST slots) side by side.
+(up to MAX_PANEL_SLOTS slots) side by side.
 """
 
 import functools
@@ -362,7 +362,7 @@ def matrix_kernels(
 
         Args:
             matrix: [world, elem, row_of(panel, a)], K_ab over the slots b of a panel, see `rows_type`.
-            form, add: see `element_matrix`; base, mixed: see `prepare_matrix`.
+            form, add: see `element_matrix`; base, use_prediction: see `prepare_matrix`.
         """
         world, elem = wp.tid()
         if active[world] == 0:

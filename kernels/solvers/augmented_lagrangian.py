@@ -12,7 +12,7 @@ __all__ = ["outer_kernels"]
 
 RESIDUAL_GROWTH = 3.0
 LOOSE_FORCING = 0.03
-"""Tolerance of linear solves if the residual grows by more than the factor AHEAD when frozen quantities are updated."""
+"""Tolerance of linear solves if the residual grows by more than RESIDUAL_GROWTH when frozen quantities are updated."""
 UPDATE_RESIDUAL = 0.1
 """Relative residual below which frozen quantities (friction limits) are updated at each iterate."""
 

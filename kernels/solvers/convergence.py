@@ -55,7 +55,7 @@ MAX_ERROR_ESTIMATES = 3
 
 @functools.cache
 def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
-    """Functions; they depend on the traits "stored", "gated", "midpoint" and "walls"."""
+    """Device functions; traits used: "stored", "has_constraints", "midpoint" and "unilateral"."""
     f64 = wp.float64
     Control = control_struct()
     stored, has_constraints, midpoint, unilateral = (
@@ -70,8 +70,8 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
     def objective(ctl: Control, world: int) -> f64:
         """Phi of Eq. (18) at the trial, over dq/dv, with the quantities frozen during the line search.
 
-        Phi = 1/2 (v - v~).M (v - v~) c_M - f_held.v + [Psi_el + Psi_visc + Psi_terms] / (dq/dv); its derivative by v is
-        the residual, Eq. (17). Sums over a world: inertia and the frozen forces f_held (dead loads, and
+        Phi = 1/2 (v - v~).M (v - v~) c_M - f_frozen.v + [Psi_el + Psi_visc + Psi_terms] / (dq/dv); its derivative by v
+        is the residual, Eq. (17). Sums over a world: inertia and the frozen forces f_frozen (dead loads, and
         non-conservative forces at the start of the search) are slot_sums[4], row 4 of `residual`; Psi_el and Psi_visc,
         J, are elem_sums[0] and [1], of `internal_force`; Psi_terms, J, of constraints lambda.c + rho/2 c.c, is
         term_sums[0]. With the trait "midpoint" Phi does not exist: half of the squared D^-1 norm of the residual
@@ -244,7 +244,7 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
 
     @wp.func
     def request_error_estimate(ctl: Control, world: int):
-        """Request an error estimate from the next solve, see `judge_floor`."""
+        """Request an error estimate from the next solve, see `check_rounding_floor`."""
         ctl.estimate_error[world] = 1
         wp.atomic_max(ctl.any_estimate_error, 0, 1)
         ctl.predicted_stress[world] = 0

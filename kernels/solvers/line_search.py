@@ -48,8 +48,8 @@ def search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
 
     @wp.func
     def track_best(ctl: Control, world: int, old_phi: f64, old_norm: f64):
-        """Bookkeeping after a step that raised Phi and the steps that follow it: restore the best iterate if for LEAPS
-        steps neither the residual halved nor Phi fell below its best value."""
+        """Bookkeeping after a step that raised Phi and the steps that follow it: restore the best iterate if for
+        MAX_NONMONOTONE steps neither the residual halved nor Phi fell below its best value."""
         if ctl.nonmonotone_steps[world] == 0:
             ctl.store_best[world] = 1
             ctl.best_phi[world] = old_phi

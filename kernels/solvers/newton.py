@@ -39,7 +39,7 @@ MAX_ENERGY_RATIO = 3.0
 def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
     """Kernels of the Newton iteration, of one thread per world; scalars are float64.
 
-    They depend on the traits "stored", "gated", "limited", "walls" and "midpoint".
+    They depend on the traits "stored", "has_constraints", "limited", "unilateral" and "midpoint".
     """
     f64 = wp.float64
     Control = control_struct()

@@ -95,7 +95,7 @@ def control_struct():
         constraint_tol: wp.float64  # m
         constraint_acceleration_tol: (
             wp.float64
-        )  # m/s^2: tolerance also this times (dq/dv)^2, at least `constraint_least`; 0: off
+        )  # m/s^2: tolerance also this times (dq/dv)^2, at least `constraint_tol_min`; 0: off
         constraint_tol_min: wp.float64  # m
         violation_ratio: wp.array(dtype=wp.float64)  # largest violation over its tolerance; with constraints
         penalty_norm_ratio: wp.float64  # norm of PCG over the norm of the convergence test, across constraints
@@ -122,14 +122,14 @@ def control_struct():
         restore_best: wp.array(dtype=wp.int32)  # the trial is the best iterate
         best_phi: wp.array(dtype=wp.float64)
         best_norm: wp.array(dtype=wp.float64)
-        frozen_updated: wp.array(dtype=wp.int32)  # frozen quantities of terms were updated; with walls
+        frozen_updated: wp.array(dtype=wp.int32)  # frozen quantities of terms were updated; with unilateral forces
         partly_updated: wp.array(
             dtype=wp.int32
         )  # they were updated only partly: the residual is not that of the iterate
         contact_active: wp.array(dtype=wp.int32)  # unilateral forces act at the iterate
         penetrating_steps: wp.array(dtype=wp.int32)  # nonmonotone steps into obstacles in this attempt
         bracket_low: wp.array(dtype=wp.vec2d)  # bracket: step length where Phi falls, and its slope there
-        bracket_high: wp.array(dtype=wp.vec2d)  # bracket: step length beyond which Phi rises; with walls
+        bracket_high: wp.array(dtype=wp.vec2d)  # bracket: step length beyond which Phi rises; with unilateral forces
         unilateral_changed: wp.array(dtype=wp.int32)  # the updated quantities may activate unilateral forces again
         # round-off floor of the residual
         estimate_error: wp.array(dtype=wp.int32)  # 1: the next solve estimates the error; 2: done

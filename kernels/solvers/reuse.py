@@ -21,9 +21,9 @@ __all__ = ["reuse_kernels", "reuse_struct"]
 NEWTON_DECADES = 3.0
 """Expected residual reduction of a Newton iteration with a new matrix, in decades."""
 RETRY_FACTOR = 0.8
-"""Factor on `reduction` when a step begins with a new matrix: the rule retries an old matrix after some steps."""
+"""Factor on `first_reduction` when a step begins with a new matrix: the rule retries an old matrix after some steps."""
 DIAGONAL_AGEING = 0.25
-"""Increment of `excess` per solve if only D, which weights the norms, is kept."""
+"""Increment of `extra_iterations` per solve if only D, which weights the norms, is kept."""
 FORCING_FACTOR = 0.3
 """Relative tolerance of a linear solve with a reused matrix, over the reduction by the last Newton iteration."""
 
@@ -49,8 +49,8 @@ def reuse_struct():
         first_reduction: wp.array(
             dtype=wp.float64
         )  # reduction of the residual by a step's first iteration with a kept matrix
-        kept: wp.array2d(dtype=wp.float64)  # in the state: due, mass_factor, dq_dv, rate, excess, pace
-        limit: wp.float64  # excess at which a rebuild pays
+        kept: wp.array2d(dtype=wp.float64)  # in the state: the six values of `restore_counts`
+        limit: wp.float64  # extra iterations at which a rebuild pays
         any_build: wp.array(dtype=wp.int32)
 
     return ReuseControl
@@ -119,7 +119,7 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
 
         The number of remaining iterations with the present matrix is estimated from its gain per iteration: that of the
         last one or, at the start of a step, of the first one of the last step that began with a kept matrix
-        (`reduction`, which fades). `keep`: 1: the matrix may be kept within a step; 2: from step to step.
+        (`first_reduction`, which fades). `keep`: 1: the matrix may be kept within a step; 2: from step to step.
         """
         world = wp.tid()
         if newton.active[world] == 0:

@@ -151,8 +151,8 @@ def ledger_kernels(dtype: str, chord: bool, nonpotential: bool, module: wp.Modul
     ):
         """Add a substep to the ledger; the integrator part by its own formula, never as the remainder.
 
-        The force of a term does the work f.dq on a substep. Its stored energy and loss are booked; the remainder is the
-        integrator's, or for a non-conservative force the work of fields.
+        The force of a term does the work f.dq on a substep. Its stored energy and loss have columns; the remainder is
+        the integrator's, or for a non-conservative force the work of fields.
         """
         world = wp.tid()
         if step.accepted[world] == 0:

@@ -31,7 +31,7 @@ REACTION = wp.constant(wp.float64(1.0e-6))
 
 @functools.cache
 def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
-    """Kernels over slots; they depend on the traits "nonpotential", "tangent", "pooled", "ties" and "midpoint"."""
+    """Kernels over slots; traits used: "nonpotential", "tangent", "pooled", "constraint_rows" and "midpoint"."""
     nonpotential, tangent, pooled, constraint_rows = (
         traits.nonpotential,
         traits.tangent,

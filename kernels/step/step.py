@@ -38,7 +38,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
             the specialisation of its kernels: static (no inertia, v is the displacement increment), multistep (uses the
             state before the last), takes_velocity (v_n in q~), accelerated (with accelerations: a_n and w_n replace the
             state before the last), midpoint (forces at the midpoint), variant (their name).
-        traits: of the model; depends on "nonpotential" and "gated".
+        traits: of the model; depends on "nonpotential" and "has_constraints".
     """
     p = precision(dtype)
     T, vec3 = p.T, p.vec3

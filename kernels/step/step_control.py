@@ -32,7 +32,7 @@ SAME_TIME = 1e-6
 """Times closer than this fraction of a step are equal."""
 GROWTH = ("share", "largest", "turnover", "added", "since", "steps", "next")
 """Columns of the monitor of spurious energy growth: energy added by integrator and residuals over the peak energy;
-largest stored energy, J; sum of |work| and viscous loss, J; added energy, J; time at which the share first exceeded
+largest stored energy, J; sum of |work| and viscous loss, J; added energy, J; time at which the fraction first exceeded
 `growth_warn_limit`, s; substeps since the onset of loads; sum of |work| and loss, J, at the next onset."""
 
 
@@ -85,7 +85,7 @@ def step_struct():
         a1: wp.array(dtype=wp.float64)
         b: wp.array(dtype=wp.float64)  # of schemes with v_n in q~
         q_a: wp.array(dtype=wp.float64)  # of schemes with accelerations in their state
-        h_before: wp.array(dtype=wp.float64)  # s, of the same schemes: the step that led to a_n, at least h / STRETCH
+        h_before: wp.array(dtype=wp.float64)  # s, of the same schemes: the step that led to a_n, at least h / 4
         dq_dv: wp.array(dtype=wp.float64)
         mass_factor: wp.array(dtype=wp.float64)  # c_M of the inertia; in statics of the springs, `stabilise`
         ramp: wp.array(dtype=wp.float64)  # factor of constant loads
@@ -101,8 +101,8 @@ def step_struct():
         growth: wp.array2d(dtype=wp.float64)  # [world, GROWTH], in the state; if monitored
         watched: wp.int32  # 1: energy growth is monitored
         counted: wp.float64  # 1: the work of residuals counts; 0: it does not, as a drive balances it
-        growth_warn_limit: wp.float64  # share of the energy at which the time is recorded
-        growth_limit: wp.float64  # share at which steps are refused
+        growth_warn_limit: wp.float64  # fraction of the energy at which the time is recorded
+        growth_limit: wp.float64  # fraction at which steps are refused
         least_energy: wp.array(dtype=wp.float64)  # [world] J, round-off level of the energy
 
     return StepControl

@@ -93,7 +93,7 @@ def constraint_block_kernels(dtype: str) -> _types.SimpleNamespace:
         active: wp.array(dtype=wp.int32),
         value: wp.array2d(dtype=mat33),
     ):
-        """value += (dq/dv) (J^T rho J + share sum lambda d2c/dq2), `midpoint_factor` as gradients move with u."""
+        """value += (dq/dv) (J^T rho J + midpoint_factor sum lambda d2c/dq2), as gradients move with u."""
         world, item = wp.tid()
         if active[world] == 0:
             return

@@ -5,7 +5,7 @@ direction, a constant), at most three per row:
 
     DOT       c = scale (a.b - f)                       DP1, DP2; PIN with b a constant axis
     DISTANCE  c = scale (|a| - f)                       DIST
-    TURN      c = scale (cos f a2 - sin f a).b          the sine of the angle between b and the direction f of (a, a2)
+    ANGLE     c = scale (cos f a2 - sin f a).b          the sine of the angle between b and the direction f of (a, a2)
 
 Vectors are the terms 3 row + side, sides a, b, a2. Rows are evaluated in float64 from displacements, so that c is free
 of the round-off of large coordinates. One thread per (world, row); slots gather from terms in a fixed order.

@@ -26,7 +26,7 @@ MESH_SLIP_FLAG = 1 << 30
 
 @functools.cache
 def collider_functions(meshes: bool) -> _types.SimpleNamespace:
-    """Device functions, see `contact_shapes` and `contact_mesh`, and the constant SLIPS."""
+    """Device functions, see `contact_shapes` and `contact_mesh`, and the slipping bit SLIP_FLAG."""
     slips = MESH_SLIP_FLAG if meshes else SLIP_FLAG
     f64, vec3d = wp.float64, wp.vec3d
     Contacts = contact_struct(meshes)

@@ -150,7 +150,7 @@ def law_functions() -> _types.SimpleNamespace:
 
     @wp.func
     def smooth_friction(slip: vec3d, inv_h: f64, v_eps: f64, friction_limit: f64) -> wp.vec2d:
-        """cap v / sqrt(v^2 + v_eps^2) (Paper I, 6.2), v = slip/h: its potential, J, and force over slip, N/m."""
+        """friction_limit v / sqrt(v^2 + v_eps^2) (Paper I, 6.2), v = slip/h: potential, J, and force over slip, N/m."""
         v = inv_h * slip
         root = wp.sqrt(wp.dot(v, v) + v_eps * v_eps)
         if inv_h == f64(0.0):

@@ -94,9 +94,9 @@ def contact_ledger_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
     ) -> PointOutcome:  # fmt: skip
         """Force, friction spring and energies of a point at the end of a substep.
 
-        The force on the body does `given` = f . (motion of the collider's material at the point) and, on the relative
-        motion, -(change of stored energy + loss + friction + the integrator's part). The integrator's part has formulas
-        of its own: chords of convex energies, and the contributions of a turning normal and a turning collider.
+        The force on the body does `collider_work` = f . (motion of the collider's material at the point) and, on the
+        relative motion, -(change of stored energy + loss + friction + the integrator's part). The integrator's part has
+        its own formulas: chords of convex energies, and the contributions of a turning normal and a turning collider.
         """
         out = PointOutcome()
         rec = history_row(con, c, point)

@@ -29,7 +29,7 @@ SAME_SIDE_COSINE = 0.5
 SURFACE_TOLERANCE = 1e-12
 """Distance behind a surface that counts as on it, over the mesh's size."""
 SIDE_TOLERANCE = 1e-6
-"""FINE for a point that was on the other side: bound of the float32 round-off of a step's end."""
+"""SURFACE_TOLERANCE for a point that was on the other side: bound of the float32 round-off of a step's end."""
 MIN_PASSAGE = 1e-6
 """Depth of a negligible passage (over the edge of a blade), over the mesh's thickness."""
 
@@ -47,8 +47,8 @@ def mesh_struct():
         high: wp.array(dtype=wp.vec3d)
         start: wp.array(dtype=wp.int32)  # [leaf] index of its first triangle; the next entry ends it
         corner: wp.array2d(dtype=wp.vec3d)  # [corner, triangle], m
-        normal: wp.array2d(dtype=wp.vec3d)  # [part, triangle] unit normal
-        border: wp.array2d(dtype=wp.int32)  # [part, triangle] FLAT, SHARP or RIM
+        normal: wp.array2d(dtype=wp.vec3d)  # [feature, triangle] unit normal
+        border: wp.array2d(dtype=wp.int32)  # [feature, triangle] FLAT, SHARP or BOUNDARY
 
     return Meshes
 

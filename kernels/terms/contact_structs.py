@@ -105,7 +105,7 @@ def history_struct():
         previous_margin: wp.array2d(dtype=wp.float64)  # `Contacts.margin` of the last step, m
         spring: wp.array2d(dtype=wp.vec3d)  # stretch of the friction spring, in the collider's frame (paper: world), m
         speed: wp.array2d(dtype=wp.float64)  # largest approach speed since contact began, m/s; 0: not in contact
-        contact_state: wp.array2d(dtype=wp.int32)  # side + 1, plus SLIPS if slipping; see known_side
+        contact_state: wp.array2d(dtype=wp.int32)  # side + 1, plus SLIP_FLAG if slipping; see stored_side
         overlap: wp.array2d(dtype=wp.float64)  # initial overlap, m
         friction_limit: wp.array2d(dtype=wp.float64)  # mu F_n of the last step, N over the point's area fraction
         stored: wp.array2d(dtype=wp.float64)  # energy of the contact, J over the point's area fraction
@@ -145,12 +145,12 @@ def contact_scratch_struct(dtype: str):
         relaxation: wp.array(dtype=wp.float64)  # [world] relaxation factor
         aitken_norm2: wp.array(dtype=wp.float64)  # [world] sum of squares of the last r
         limit_updates: wp.array(dtype=wp.int32)  # [world] updates in this attempt
-        activity: wp.array2d(dtype=wp.int32)  # [world, point] IDLE, LOADED or STIFF
-        force: wp.array2d(dtype=wp.vec3d)  # on the residual, N, unless IDLE
+        activity: wp.array2d(dtype=wp.int32)  # [world, point] INACTIVE, FORCE_ONLY or WITH_STIFFNESS
+        force: wp.array2d(dtype=wp.vec3d)  # on the residual, N, unless INACTIVE
         energy: wp.array2d(dtype=wp.vec2d)  # potential, and the magnitude of its terms, J
-        stiffness: wp.array2d(dtype=sym)  # derivative of the force, N/m; 0 unless STIFF
+        stiffness: wp.array2d(dtype=sym)  # derivative of the force, N/m; 0 unless WITH_STIFFNESS
         product: wp.array2d(dtype=vec3)  # of a product, N
-        facet_activity: wp.array2d(dtype=wp.int32)  # [world, facet row] maximum state of its points
+        facet_activity: wp.array2d(dtype=wp.int32)  # [world, facet row] largest activity of its points
         explicit_force: wp.array2d(dtype=wp.vec3d)  # [world, point] explicit force
         explicit_spring: wp.array2d(dtype=wp.vec3d)
         point_depth: wp.array2d(dtype=wp.float64)  # [world, point] depth; with lumped contacts

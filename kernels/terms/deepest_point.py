@@ -228,7 +228,7 @@ def place_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         con: Contacts, row_start: wp.array(dtype=wp.int32), active: wp.array(dtype=wp.int32), fresh: int,
         scr: ContactScratch, changed: wp.array(dtype=wp.int32),
     ):  # fmt: skip
-        """Deepest facet of each lumped contact, the first of equals; it may change PICKS times per attempt.
+        """Deepest facet of each lumped contact, the first of equals; it may change MAX_CHOICES times per attempt.
 
         With two equally deep positions neither alone gives an equilibrium: the last choice stays.
         """

@@ -213,7 +213,7 @@ def facet_projection_functions(dtype: str) -> _types.SimpleNamespace:
 
     @wp.struct
     class Projection:
-        """Projection of a point onto a facet: gap = rise x (coordinate along the outward vector) + rest."""
+        """Projection of a point onto a facet: gap = gap_slope x (coordinate along the outward vector) + gap_offset."""
 
         xi: vec3d
         n: vec3d  # normal at the projection

@@ -13,8 +13,8 @@ __all__ = ["master_struct", "pair_history_struct", "pair_scratch_struct", "point
 def master_struct(dtype: str):
     """Facets of master surfaces: positions are polynomials of two coordinates, linear along an outward vector.
 
-    x(s, z) = sum_m s^m ((X_m + sum_i shape_mi u_i) + z (N_m + sum_i rise_mi u_i)): the outward vector is a material
-    vector mapped by the deformation gradient, so that a point near a surface depends on the slots of one element.
+    x(s, z) = sum_m s^m ((X_m + sum_i shape_mi u_i) + z (N_m + sum_i director_shape_mi u_i)): the outward vector is a
+    material vector mapped by the deformation gradient, so that a point near a surface depends on the slots of one element.
     """
     T = precision(dtype).T
 
@@ -62,7 +62,7 @@ def pair_history_struct():
 
 @functools.cache
 def pair_scratch_struct(dtype: str):
-    """Pair quantities of an attempt; [world, control]: monomial m of facet f is control `most f + m`."""
+    """Pair quantities of an attempt; [world, control]: monomial m of facet f is control `max_monomials f + m`."""
     p = precision(dtype)
     T, vec3, vec2, sym = p.T, p.vec3, p.vec2, p.sym
     mat43 = wp.types.matrix(shape=(4, 3), dtype=wp.float64)
@@ -74,7 +74,7 @@ def pair_scratch_struct(dtype: str):
         C0: wp.array2d(dtype=wp.vec3d)  # at the start of the attempt
         D0: wp.array2d(dtype=wp.vec3d)
         V0: wp.array2d(dtype=wp.vec3d)  # of velocities at the start of the attempt
-        centre: wp.array2d(dtype=mat43)  # [world, facet] position at the midpoint and derivatives, rows as of a Jet
+        centre: wp.array2d(dtype=mat43)  # [world, facet] midpoint and derivatives, rows as of a SurfacePoint
         bulge: wp.array2d(dtype=wp.float64)  # [world, facet] largest height above the tangent plane at the midpoint, m
         centre0: wp.array2d(dtype=mat43)  # at the start of the attempt
         lower: wp.array(dtype=wp.vec3)  # [world facet] boxes of the tree

@@ -153,8 +153,8 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
 
         With the relative displacement d at the projection, e_a = n.(change of the tangent a_a), t_a = a_a.d, b the
         curvature, M = a - gap b and m its inverse, it is 2 t m e + gap e m e + t a^-1 b m t (Wriggers, Computational
-        Contact Mechanics, 2006, 4.1, with the facet's curvature). `lean`: force m a; `bend`: force gap m, and M a^-1 b
-        / force.
+        Contact Mechanics, 2006, 4.1, with the facet's curvature). `geometric_tangent`: force m a;
+        `geometric_curvature`: force gap m, and M a^-1 b / force.
         """
         xi = pair.projection[world, point]
         n = pair.normal[world, point]

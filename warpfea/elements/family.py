@@ -111,7 +111,7 @@ class Family:
         face_rule: rule on the unit triangle or square, exact for a pressure on a flat face.
         divisions: parts (a, b) into which each face is cut along its two sides for drawing; triangles take the first.
         node_samples: (n, k, 3) parent points at each element node where fields are evaluated for drawing.
-        lattice: drawing of an element in VTK.
+        vtk_subdivision: drawing of an element in VTK.
         schemes: integrations of several parts by name; each force rule is also one of a single part.
         output_schemes: integrations that are for stress output only: "shear stress" in place of a tied part "shear".
         slot_sets: slot kinds by the name under which supports may hold them.

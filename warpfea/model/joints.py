@@ -59,7 +59,7 @@ class Row:
     """A scalar constraint; see kernels/terms/constraints.py for the kinds.
 
     Attributes:
-        kind: DOT, DISTANCE or TURN.
+        kind: DOT, DISTANCE or ANGLE.
         a, b, a2: its vectors.
         scale: factor to metres; with `angular` times the model's size.
         law: right side over time, or None: `fixed`.

@@ -57,7 +57,7 @@ class MaterialParameters:
 
     Attributes:
         values: (worlds,) set values by (body index, material index, name).
-        begun: True once a simulation of the model exists.
+        simulated: True once a simulation of the model exists.
         version: number of writes.
     """
 

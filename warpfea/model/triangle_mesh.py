@@ -37,7 +37,7 @@ class TriangleTables:
         start: (leaves + 1,) first triangle of each leaf; last: total number.
         corner: (3, triangles, 3) m, in the order of the leaves.
         normal: (7, triangles, 3) of face, edges ab, bc, ca and corners a, b, c.
-        border: (7, triangles) FLAT, SHARP or RIM.
+        border: (7, triangles) FLAT, SHARP or BOUNDARY.
     """
 
     low: np.ndarray

@@ -43,7 +43,7 @@ class Animation:
         shown: colour range; None: the extremes.
         static: the frames' times are load factors.
         bodies: number of points of bodies, which come first; None: all. The others belong to obstacles.
-        sheets: first of the four points of each square drawn for a half-space.
+        plane_squares: first of the four points of each square drawn for a half-space.
     """
 
     triangles: npt.NDArray[np.integer[Any]]

@@ -114,7 +114,7 @@ class StepSizeControl:
 
     Attributes:
         error: tolerance, over the model's size.
-        instants: synchronisation times.
+        sync_times: synchronisation times.
     """
 
     def __init__(

@@ -149,7 +149,7 @@ class ConsistentInitialConditions:
         return np.array([0.5 * np.sum(one * (masses.of_world(world) @ one)) for world, one in enumerate(v)])
 
     def _record_impulse(self, flags: np.ndarray, change: np.ndarray) -> None:
-        """Book the kinetic energy of the velocity correction as integrator work."""
+        """Add the kinetic energy of the velocity correction to the integrator column of the ledger."""
         state: Any = self.ctx.state
         if "ledger" in state.specs:
             columns = list(self.model.terms.ledger)
@@ -285,7 +285,7 @@ class ConsistentInitialConditions:
     def _solve_saddle_point(
         self, force: np.ndarray, prescribed: np.ndarray, J: Any = None, constraint_rhs: Any = None
     ) -> np.ndarray:
-        """Solve M x + J^T m = force on free components, x = held on others, and J x = goal for x (slots, 3)."""
+        """Solve M x + J^T m = force on free components, x = prescribed on others, J x = constraint_rhs; (slots, 3)."""
         m = self.model
         x = self._solve_mass(force - m.masses.of_world(self._world) @ prescribed) + prescribed
         if J is None:

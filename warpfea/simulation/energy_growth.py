@@ -90,7 +90,7 @@ class EnergyGrowth:
         self._least_energy.assign(least_energy(self._model))
 
     def warn_once(self, sim: Any, shares: np.ndarray) -> None:
-        """Warn once if a world's energy gain (worlds,) exceeds TOLD."""
+        """Warn once if a world's energy gain (worlds,) exceeds WARN_LIMIT."""
         if self.warned or not (worst := float(np.max(shares))) > WARN_LIMIT:
             return
         self.warned = True
@@ -107,7 +107,7 @@ class EnergyGrowth:
 
 
 def least_energy(model: Model) -> np.ndarray:
-    """Round-off level of the energy (worlds,), J: strain of ROUNDING eps everywhere."""
+    """Round-off level of the energy (worlds,), J: strain of STRAIN_ROUNDINGS eps everywhere."""
     unit, out = STRAIN_ROUNDINGS * float(np.finfo(model.dtype).eps), np.zeros(model.worlds)
     for body in model.bodies:
         volume = float(element_volumes(body).sum())

@@ -23,7 +23,7 @@ class Episodes:
 
     Attributes:
         ends: [world] end times, s, at which worlds are frozen.
-        tally: [world, TALLY] statistics since the last read; stepped: [world] flags since the state was set.
+        tally: [world, STATISTICS] run statistics since the last read; stepped: [world] flags since the state was set.
     """
 
     def __init__(self, model: Model, work: Workspace, launch: Launcher, *, asynchronous: bool, ends: bool) -> None:
@@ -62,7 +62,7 @@ class Episodes:
         self.freeze_finished()
 
     def read_totals(self) -> tuple[np.ndarray, np.ndarray]:
-        """Read and reset the statistics (worlds, TALLY); also the stepped worlds (worlds,)."""
+        """Read and reset the statistics (worlds, STATISTICS); also the stepped worlds (worlds,)."""
         assert self.tally is not None
         assert self.stepped is not None
         sums = self.tally.numpy().copy()

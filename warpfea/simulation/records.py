@@ -75,7 +75,7 @@ class Records(Results):
         constraints = self.model.constraints
         assert constraints is not None
         values = np.abs(self.model.constraint_values(self.state)[:, constraints.rows_of[k]]).max(axis=1)
-        # right-hand sides of the last step if it led to this state: statics has a time of its own
+        # right-hand sides of the last step if it led to this state: statics resets its time
         column = self._joint_column(joint) + 6
         return np.where(self._stepped, self.stepper.work.report.numpy()[:, column], values)
 

@@ -44,7 +44,7 @@ class RunStatistics(Records):
         last: report of the last step, None before the first.
         totals: iterations by world; "rough" and "floored" count steps.
         max_residual, max_floor, max_violation, min_J: extremes over all steps and worlds.
-        quiet: asynchronous steps without device reads: `record` is False, failed worlds are frozen, and neither step
+        asynchronous: steps without device reads: `record` is False, failed worlds are frozen, and neither step
             sizes nor initial accelerations are computed on the host.
     """
 

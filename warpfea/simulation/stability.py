@@ -33,7 +33,7 @@ __all__ = ["Stability", "check_stability", "report_unstable"]
 REDUCTION = 1e-4
 """Relative residual, B norm, at which the search ends."""
 ITERATIONS, SOLVE_FACTOR, MAX_ITERATIONS = 500, 0.3, 20_000
-"""Iteration limits: the larger of ITERATIONS and SHARE times those of the solve; MOST with unstable="refuse"."""
+"""Iteration limits: larger of ITERATIONS and SOLVE_FACTOR times the solve's; with unstable="refuse" MAX_ITERATIONS."""
 CURVATURE_ROUNDINGS = 64.0
 """Round-off units of p.D p (D: diagonal of H) below which the sign of p.H p is unknown."""
 CLEAR = 1024.0
@@ -146,10 +146,10 @@ def check_stability(sim: Simulation, *, every: bool = False) -> Stability:
 
 
 def _clear(sim: Simulation, out: Stability) -> bool:
-    """Judge by the float32 tangent where all its curvatures are far above rounding; False where float64 is needed.
+    """Decide by the float32 tangent if all its curvatures are far above round-off; False if float64 is needed.
 
-    H in float32 is off by some roundings of p.D p: what is stable by CLEAR of them in each direction of the search is
-    stable. Neither unstable worlds nor forces without a potential are judged by it.
+    H in float32 is off by some roundings of p.D p: a world whose curvature exceeds CLEAR of them in each direction of
+    the search is stable. Unstable worlds and forces without a potential need float64.
     """
     if any(not term.potential for term in sim.model.terms):
         return False
@@ -262,8 +262,7 @@ def _find_negative_curvature(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Lanczos search for p.H p < 0 in undecided worlds, at most `most` (worlds,) iterations; sets `stable`, `reasons`.
 
-    Curvatures below `roundings` round-off units, by default ROUNDING, have no sign.
-
+    Curvatures below `roundings` round-off units, by default CURVATURE_ROUNDINGS, have no sign.
 
     Returns p.H p (worlds,) and the deciding directions p: the first negative one or the softest.
     """

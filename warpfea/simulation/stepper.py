@@ -199,7 +199,7 @@ class Stepper:
         self._changes[chosen] = self.model.parameters.changes[chosen]
 
     def update_parameters(self) -> None:
-        """Apply parameters set since the last step; the energy jump is booked as work of fields."""
+        """Apply parameters set since the last step; the energy jump counts as work of fields."""
         if self.growth:
             self.growth.restart_changed()
         parameters = self.model.parameters

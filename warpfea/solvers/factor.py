@@ -34,7 +34,7 @@ class FreeMatrix:
     Attributes:
         free: (n,) components, 3 slot + axis, in row order.
         start, index: (n + 1,) and (m,), the rows.
-        take: (m,) index of each entry in the flattened blocks.
+        value_index: (m,) index of each entry in the flattened blocks.
         row: (m,) row of each entry.
         diagonal: (n,) diagonal entries.
     """

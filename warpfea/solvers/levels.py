@@ -30,7 +30,7 @@ BOTTOM_SLOTS = {"cpu": 160, "cuda": 1344}
 """Largest coarse level inverted as one dense matrix, slots by device; on CUDA this is cheaper than the launches of
 further levels."""
 COMPONENT_PAIRS = 1344**2
-"""Maximum slot pairs in components of up to WHOLE_SLOTS slots that are each inverted as a whole."""
+"""Maximum slot pairs in components of up to FULL_FACTOR_SLOTS slots that are each inverted as a whole."""
 MAX_LEVELS = 12
 
 

@@ -268,7 +268,7 @@ class NewtonLoop:
     def run(self) -> None:
         """Iterate from work.v until every active world has converged or failed.
 
-        `candidates` write other first iterates to work.v in the worlds flagged by `choose`.
+        `first_iterates` write other first iterates to work.v in the worlds flagged by `choose_initial`.
         """
         w = self.work
         self._clear_direction(w.newton.active)

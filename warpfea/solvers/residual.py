@@ -71,8 +71,8 @@ class Residual:
     """Launches that evaluate g(v), Phi(v), the norms, and H p.
 
     Attributes:
-        by_matrix: H p is a product with the assembled matrix.
-        on_matrix: called with that matrix and the flags of worlds that reassembled it.
+        uses_matrix: H p is a product with the assembled matrix.
+        on_assembled: called with that matrix and the flags of worlds that reassembled it.
     """
 
     def __init__(self, ctx: StepContext, *, operator: str, assembled: bool, banded: bool = False) -> None:

@@ -22,7 +22,7 @@ class ReuseRule:
 
     Attributes:
         control: counts of the rule on the device; `build` flags the worlds that build the object before a solve.
-        place: displacements of the linearisation point, [world, slot], m.
+        linearisation_point: displacements of the linearisation point, [world, slot], m.
     """
 
     def __init__(self, model: Model, work: Workspace, launch: Launcher, name: str, limit: float) -> None:
@@ -77,5 +77,5 @@ class ReuseRule:
         self.launch(self.kernels.mark_built, self.model.worlds, [self.control])
 
     def store_counts(self, accepted: wp.array) -> None:
-        """Store the rule's counts in the state of accepted worlds, after `carry` has stored the point."""
+        """Store the rule's counts in the state of accepted worlds, after `move_point` has stored the point."""
         self.launch(self.kernels.store_counts, self.model.worlds, [self.control, accepted])

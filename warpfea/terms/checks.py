@@ -135,7 +135,7 @@ def check_columns(term: Term, *, own: bool) -> None:
         if own:
             continue
         if column.kind == EXPLICIT_VISCOUS:
-            raise ModelError(f"{where}: HELD_VISCOUS is for damping among the dead loads")
+            raise ModelError(f"{where}: EXPLICIT_VISCOUS is for damping among the dead loads")
         if column.name in (*LEDGER, *RESERVED):
             raise ModelError(f"{where}: the ledger has a column of its own by this name")
         if column.kind == WORK and not column.name.startswith("work_"):

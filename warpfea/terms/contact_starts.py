@@ -73,7 +73,7 @@ def refuse_sunk(tables: PairTables, u: np.ndarray, places: np.ndarray, facets: n
     Args:
         u: displacements (worlds, slots, 3), m.
         places: positions of the points (worlds, points, 3), m.
-        seats: facets that the points are assigned to, -1 for none, (worlds, points).
+        facets: facets that the points are assigned to, -1 for none, (worlds, points).
         new: (worlds,) flags of the worlds that begin.
 
     Raises:

@@ -66,7 +66,7 @@ class Elements(Term):
             launch(kernels.internal_force, dim, [*args, w.newton.min_J, w.newton.domain_J])
 
     def check_inversion(self, ctx: StepContext, active: wp.array) -> None:
-        """Flag in newton.turned the worlds with a point where J > 0 in the state and J <= 0 at the iterate."""
+        """Flag in newton.inverted the worlds with a point where J > 0 in the state and J <= 0 at the iterate."""
         w = ctx.work
         for block, kernels in zip(self.model.blocks, self.kernels(ctx)):
             if not block.key.tying:
@@ -74,7 +74,7 @@ class Elements(Term):
                 ctx.launch(kernels.inverted_elements, (w.u.shape[0], block.count), args)
 
     def measure_direction_gradient(self, ctx: StepContext, p: wp.array, active: wp.array) -> None:
-        """Maximum gradient of a direction, into newton.turn."""
+        """Maximum gradient of a direction, into newton.direction_gradient."""
         for block, kernels in zip(self.model.blocks, self.kernels(ctx)):
             if not block.key.tying:
                 args = [ctx.work.data_of(block), p, active, ctx.work.newton.direction_gradient]
@@ -85,7 +85,7 @@ class Elements(Term):
         return [block.predicted_stress_product(self.model.dtype) for block in self.model.blocks]
 
     def predicted_stress_tangent(self, ctx: StepContext, p: wp.array, active: wp.array) -> None:
-        """`tangent` with the linearly predicted stress in its geometric part, for worlds flagged `mixed`."""
+        """`tangent` with the linearly predicted stress in its geometric part, for worlds flagged `predicted_stress`."""
         m, w = self.model, ctx.work
         for block, kernel in zip(m.blocks, self.predicted_stress_kernels()):
             args = [

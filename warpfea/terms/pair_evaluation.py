@@ -28,7 +28,7 @@ class PairEvaluation:
 
     Attributes:
         gap: m, 1e30 without a facet nearby. normal: elastic normal force, N. force: on the slave, N, (..., 3).
-        facet: of the master surfaces, -1: none. spot: parametric position. reaction: on its slots, N, (..., L, 3).
+        facet: of the master surfaces, -1: none. xi: parametric position. reaction: on its slots, N, (..., L, 3).
     """
 
     tables: PairTables

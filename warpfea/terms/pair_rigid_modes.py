@@ -1,4 +1,4 @@
-"""Coupling of bodies in contact in the matrix of their rigid body modes (solvers/motions.py)."""
+"""Coupling of bodies in contact in the matrix of their rigid body modes (solvers/rigid_body_modes.py)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["PairRigidModes"]
 
 
 class PairRigidModes:
-    """Couplings between the bodies of a preconditioner's `motions` by contacts, with sums over their points."""
+    """Couplings by contacts between the bodies with rigid body modes, `motions`, with sums over their points."""
 
     def __init__(self, ctx: StepContext, tables: PairTables, masters: Any, motions: Any) -> None:
         m, t = ctx.model, tables

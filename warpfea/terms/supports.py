@@ -37,7 +37,7 @@ class Drives:
 
 
 class Supports:
-    """Driven slots of a model: `moved` by displacement laws, `turned` by rotations; None if unused."""
+    """Driven slots of a model: `displaced` by displacement laws, `rotated` by rotations; None if unused."""
 
     def __init__(self, model: Model) -> None:
         self.model = model

@@ -56,7 +56,7 @@ class StepContext:
         midpoint: forces are evaluated at the middle of a step, at work.u_stage and work.stage_time.
         dissipation: chi of its dissipative form, see kernels/elements/energy_momentum.py.
         accelerated: the scheme has accelerations as state variables.
-        moved: positions changed since the last evaluation; if not, only lagged term data did.
+        positions_changed: positions changed since the last evaluation; if not, only lagged term data did.
         options: solver options for terms.
         scratch: arrays allocated by terms, by term name.
     """
@@ -92,7 +92,7 @@ class Column:
     Attributes:
         name: column of the energy ledger; "" for none.
         kind: STORED, energy stored at present; WORK, done on the model; LOSS; NUMERICAL, part of the integrator's;
-            HELD_VISCOUS, viscous loss of a force among the dead loads.
+            EXPLICIT_VISCOUS, viscous loss of a force among the dead loads.
     """
 
     name: str
@@ -159,7 +159,7 @@ class Term:
         parts: profile parts named by its launches, each with a description.
         report_columns: columns of the step report.
         rows: rows [TERM_ROWS, world, row] of its potential in work.term_rows, see `Workspace.rows_of`.
-        booked_rows: length of the rows of `energy_increments`, if larger than the numbers of slots, elements and
+        increment_rows: length of the rows of `energy_increments`, if larger than the numbers of slots, elements and
             `rows`.
         penalty: its blocks are added to the matrix after D is taken from it.
         offset, row_offset, report_offset: offsets in the pools, rows and report, set by the TermSet.
@@ -236,10 +236,10 @@ class Term:
     # simulation setup
 
     def allocate(self, work: Workspace, ctx: StepContext) -> None:
-        """Allocate scratch in at.scratch[name]."""
+        """Allocate scratch in ctx.scratch[name]."""
 
     def register(self, ctx: StepContext) -> None:
-        """Register history with at.state: restored, halved, reset and saved with the state."""
+        """Register history with ctx.state: restored, halved, reset and saved with the state."""
 
     def configure(self, ctx: StepContext) -> None:
         """Configure for the solver and state, both known here."""
@@ -278,7 +278,7 @@ class Term:
         """Accept a trial in the flagged worlds: freeze its multipliers, friction limits, ... for the next search."""
 
     def update_frozen(self, ctx: StepContext, flags: wp.array) -> None:
-        """Update lagged quantities in the flagged worlds (trait "walls").
+        """Update lagged quantities in the flagged worlds (trait "unilateral").
 
         Forces and residual are re-evaluated and checked with the updated values.
         """
@@ -358,7 +358,7 @@ class Term:
         return ()
 
     def add_mode_coupling(self, ctx: StepContext, kept: list[wp.array], dq_dv: wp.array, active: wp.array) -> None:
-        """Add the coupling of bodies to the rigid body mode matrix of `allocate_mode_coupling` (solvers/motions.py)."""
+        """Add the coupling of bodies to the rigid body mode matrix (solvers/rigid_body_modes.py)."""
 
     def preconditions(self, ctx: StepContext) -> bool:
         """True if `precondition` adds a correction."""
