@@ -14,7 +14,7 @@ def master_struct(dtype: str):
     """Facets of master surfaces: positions are polynomials of two coordinates, linear along an outward vector.
 
     x(s, z) = sum_m s^m ((X_m + sum_i shape_mi u_i) + z (N_m + sum_i director_shape_mi u_i)): the outward vector is a
-    material vector mapped by the deformation gradient, so that a point near a surface depends on the slots of one element.
+    material vector mapped by the deformation gradient, so that a point near a surface depends on one element only.
     """
     T = precision(dtype).T
 
