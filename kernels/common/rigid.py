@@ -25,7 +25,7 @@ def bodies_struct(dtype: str):
         size: wp.array(dtype=wp.float64)  # m
         translations: wp.array(dtype=wp.vec3d)  # [body] 1 for free translations, 0 for prescribed ones
         rotations: wp.array(dtype=wp.vec3d)  # [body] 1 for free rotations, else 0
-        centre_slots: wp.array2d(dtype=wp.int32)  # [place, body] slots whose mean position is the centre
+        centre_slots: wp.array2d(dtype=wp.int32)  # [sample, body] slots whose mean position is the centre
         of_slot: wp.array(dtype=wp.int32)  # [slot] body or -1
         is_position: wp.array(dtype=T)  # [slot] 1 for a position, 0 for a gradient
         X: wp.array(dtype=wp.vec3d)  # [slot] reference position, m, or gradient

@@ -81,7 +81,7 @@ def cluster_struct():
     class Clusters:
         start: wp.array(dtype=wp.int32)  # [cluster + 1] first element
         slot_start: wp.array(dtype=wp.int32)  # [cluster + 1] first sum, numbered within the block
-        slot: wp.array2d(dtype=wp.int32)  # [cluster, place] slot; rows are padded with their last slot
+        slot: wp.array2d(dtype=wp.int32)  # [cluster, position] slot; rows are padded with their last slot
         table: wp.array(dtype=wp.int32)  # [cluster * words]
         offset: wp.int32  # of the block's sums among those of all blocks
 

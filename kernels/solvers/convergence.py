@@ -22,8 +22,8 @@ __all__ = ["MAX_ERROR_ESTIMATES", "SINGLE_EPS", "VELOCITY_ROUNDINGS", "judging_f
 ROUNDING_TOL = 16.0
 PREDICTED_TOL = 1.0e-3
 UNSOLVED_TOL = 0.1
-"""Fractions of the tolerance for a first iterate, extrapolated or (float32, soft beside stiff) not: what no solve has
-reduced lies in the softest directions, and would accumulate over steps without iterations."""
+"""Fractions of the tolerance that a first iterate must meet: extrapolated; in float32 with parts of unlike stiffness.
+The residual of an unsolved iterate lies in the softest directions and accumulates over steps without iterations."""
 STALLED = 0.5
 """Residual ratio above which an iteration counts as stalled."""
 CLOSING_ITERATIONS = 4

@@ -1,4 +1,4 @@
-"""Block-diagonal matrices of uncoupled components, each a dense matrix: [world part, i, j]."""
+"""Block-diagonal matrices of uncoupled components, each a dense matrix: [world component, i, j]."""
 
 import functools
 import types as _types
@@ -14,7 +14,7 @@ __all__ = ["part_kernels"]
 
 @functools.cache
 def part_kernels(dtype: str) -> _types.SimpleNamespace:
-    """Kernels in one precision. `slot`: [part, place] or -1; `part_of`, `place_of`: [slot]."""
+    """Kernels in one precision. `slot`: [component, position] or -1; `part_of`, `place_of`: [slot]."""
     p = precision(dtype)
     T, mat33 = p.T, p.mat33
     Pattern = pattern_struct()

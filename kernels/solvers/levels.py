@@ -31,7 +31,7 @@ def level_struct(dtype: str):
 
     @wp.struct
     class Level:
-        tile_slot: wp.array2d(dtype=wp.int32)  # [tile, place] slot or -1
+        tile_slot: wp.array2d(dtype=wp.int32)  # [tile, position] slot or -1
         tile_of: wp.array(dtype=wp.int32)  # [slot]
         place_of: wp.array(dtype=wp.int32)  # [slot] in its tile
         group_start: wp.array(dtype=wp.int32)  # [group + 1]

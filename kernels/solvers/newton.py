@@ -129,7 +129,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def begin(ctl: Control, stage: int):
-        """Start with the first iterate; `stage` 0: the only one. 1: others may be better. 2: it was chosen."""
+        """Start with the first iterate; `stage` 0: no alternatives; 1: some follow if it is poor; 2: the best."""
         world = wp.tid()
         if stage != 2:
             ctl.choose_initial[world] = 0
@@ -193,7 +193,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
     def part_error(ctl: Control, world: int, part: int, whole: f64, largest: f64) -> f64:
         """Error estimate of a part, see `check_rounding_floor`.
 
-        `whole`: -g.p of all parts, W; `largest`: the largest length that is rounded, m.
+        `whole`: -g.p of all parts, W; `largest`: the largest length in the round-off bound, m.
         """
         dq = ctl.dq_dv[world]
         work, kinetic, strain, step, speed = f64(0.0), f64(0.0), f64(0.0), f64(0.0), f64(0.0)

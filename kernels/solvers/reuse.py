@@ -37,7 +37,7 @@ def reuse_struct():
         build: wp.array(dtype=wp.int32)  # build the object now
         rebuilt_here: wp.array(dtype=wp.int32)  # 1: build it at this iterate; 0: at its old linearisation point
         point_changed: wp.array(dtype=wp.int32)  # the linearisation point has changed since it was stored in the state
-        stale: wp.array(dtype=wp.int32)  # 1: the object is not the state's; 2: nor is it, but its counts are
+        stale: wp.array(dtype=wp.int32)  # 1: object and counts are not the state's; 2: the object is not
         rebuild_due: wp.array(dtype=wp.int32)  # rebuild it at the next solve
         mass_factor: wp.array(dtype=wp.float64)  # c_M and dq/dv of the object; negative: never built
         dq_dv: wp.array(dtype=wp.float64)

@@ -11,8 +11,8 @@ change sign and do not accumulate: since only their means are bounded, a vibrati
 resolved. At a velocity jump e is of order h for any h: the bound by the mean step accepts it. In single precision the
 round-off of displacements is subtracted: at most ROUNDING_UNITS eps |u| from e, and from the mean of n rates 1/n of
 that, as round-off does not accumulate, and no more than the scatter of the rates. Where RATE_MEMORY rates leave more
-than the requested error over the horizon, estimates are blind and the step is refused: a falling pendulum of 1e9 Pa,
-asked for 1e-5, had errors of 0.25, 1.3 and 142 times that after 0.1, 0.2 and 0.4 s.
+than the requested error over the horizon, estimates are unreliable and the step is refused: a falling pendulum of
+1e9 Pa with error=1e-5 had errors of 0.25, 1.3 and 142 times that after 0.1, 0.2 and 0.4 s.
 """
 
 import functools
@@ -30,7 +30,7 @@ __all__ = ["COUNTS", "KEPT", "MAX_LEVEL", "adaptive_kernels", "adaptive_struct"]
 
 KEPT = ("next_step", "mean_step", "seen")
 """Columns of the control's state, [world, column]: the upper bound of the next substep, s, 0 at the start; mean step
-size, s; number of substeps in the mean of rates, at most AVERAGE."""
+size, s; number of substeps in the mean of rates, at most RATE_MEMORY."""
 COUNTS = ("substeps", "rejected", "least_h", "largest_h")
 """Columns of a step's report: accepted substeps, substeps rejected for their error, smallest and largest size, s."""
 MAX_LEVEL = 26

@@ -95,7 +95,7 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
     @wp.func
     def monomial(x: f64, power: int, derivative: int) -> f64:
-        """Derivative of x^power."""
+        """Derivative of x^power of order `derivative`."""
         out = f64(1.0)
         for j in range(derivative):
             out *= f64(power - j)

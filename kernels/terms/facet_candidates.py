@@ -77,8 +77,8 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
         height: f64  # height above the facet
         rank: wp.int32  # see `candidate_rank`
         entered: wp.bool  # the point passed a side of the body
-        needs_entry: wp.bool  # it must have, for this facet to be accepted
-        passed_through: wp.bool  # the point has left through a facet, if it has no other
+        needs_entry: wp.bool  # the facet is accepted only with `entered`
+        passed_through: wp.bool  # without another facet the point has left through one
 
     @wp.func
     def slave_point(facets: Facets, world: int, item: int, q: int) -> SlavePoint:

@@ -111,10 +111,10 @@ def pair_scratch_struct(dtype: str):
         facet_rotation: wp.array2d(dtype=vec2)  # [world, point] of a product: rotation of the facet
         friction_shape: wp.array3d(dtype=T)  # shape values of friction, frozen with the friction limit
         frozen_motion: wp.array2d(dtype=wp.vec3d)
-        frozen_slip: wp.array2d(dtype=wp.vec3d)  # motion plus spring when they were frozen, m
+        frozen_slip: wp.array2d(dtype=wp.vec3d)  # motion plus spring at freezing, m
         frozen_displacement: wp.array2d(
             dtype=wp.vec3d
-        )  # relative displacement by the frozen shape values at that time, m
+        )  # relative displacement by the frozen shape values at freezing, m
         frozen_facet: wp.array2d(dtype=wp.int32)
         tangential_force: wp.array2d(dtype=wp.vec3d)  # friction part of a point's force, N
         listed_facet: wp.array2d(dtype=wp.int32)  # [world, point] facet + 1 of the list that contains it
@@ -130,12 +130,12 @@ def pair_scratch_struct(dtype: str):
 
 @functools.cache
 def point_list_struct():
-    """Points of master facets, as kept with a preconditioner; see `PairScratch`."""
+    """Points of master facets, as stored with a preconditioner; see `PairScratch`."""
 
     @wp.struct
     class PointLists:
         list_size: wp.array2d(dtype=wp.int32)  # [world, facet]
         list_start: wp.array2d(dtype=wp.int32)
-        list_point: wp.array2d(dtype=wp.int32)  # [world, place in a list]
+        list_point: wp.array2d(dtype=wp.int32)  # [world, position in the lists]
 
     return PointLists

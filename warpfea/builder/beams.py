@@ -64,7 +64,7 @@ class _Path:
     Attributes:
         at: s -> (3,) m.
         slope: (s, side) -> dX/ds (3,), side -1 or 1.
-        marks: parameters of corners (nodes there).
+        corner_parameters: parameters of corners (nodes there).
         turns: total turning angle of each element, degrees, if not determined by its ends.
     """
 

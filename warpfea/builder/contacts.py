@@ -90,7 +90,7 @@ def make_contact(d: Description, thing: Body | SurfaceSet, collider: Any, name: 
     """See ModelBuilder.add_contact.
 
     Args:
-        options: those of ModelBuilder.add_contact, all of them.
+        options: all those of ModelBuilder.add_contact.
     """
     if isinstance(collider, Shape):
         shape = type(collider).__name__

@@ -49,10 +49,10 @@ class ContactPoints:
 
     Attributes:
         conn: (F, L) body slots; faces that use fewer repeat their first one with functions of zero.
-        shape: (F, P, L) functions: the place of a point is sum_i shape_i e_i, plus the body's origin.
+        shape: (F, P, L) functions: the position of a point is sum_i shape_i e_i, plus the body's origin.
         area: (F, P) reference area of each point, m^2; their sum is the area of the surface. Faces with fewer points
             than others repeat their last one with area 0.
-        X: (F, P, 3) reference places, m.
+        X: (F, P, 3) reference positions, m.
         normal: (F, P, 3) outward unit normals in the reference; 0 for degenerate faces.
         faces: (F, 2) rows (element, local face).
     """

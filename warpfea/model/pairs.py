@@ -62,7 +62,7 @@ class MasterFacets:
     Attributes:
         conn: (F, L) body slots of the facets' elements.
         shape, director_shape: (F, M, L) coefficients of functions, and of their outward derivatives, 1/m.
-        X, N: (F, M, 3) coefficients of the reference place, m, and of the outward vector.
+        X, N: (F, M, 3) coefficients of the reference position, m, and of the outward vector.
         corners, degree: of the polynomials of all facets.
         size: (F,) length of a side, m.
         depth_limit: (F,) half the thickness of the body behind it, m.
