@@ -23,7 +23,6 @@ def element_kernels(
     dtype: str,
     law: str,
     slots: int,
-    points: int,
     affine: bool,
     damping: str | None,
     framed: bool = False,
@@ -35,7 +34,7 @@ def element_kernels(
     Args:
         dtype: precision.
         law: name in `materials.LAWS`.
-        slots, points: slots and quadrature points per element.
+        slots: per element.
         affine: straight elements with parent gradients and one J0 each; False: a table of h_i per element and point.
         damping: None, "incremental", "rate" or "explicit" (Kelvin-Voigt forms).
         framed: the law has axes of its own at each point, `block.frame`.
@@ -52,7 +51,7 @@ def element_kernels(
     viscous = materials.svk(dtype)
     lane_sum, row_sum = lane_functions(dtype).lane_sum, lane_functions(dtype).row_sum
     form = "affine" if affine else "framed" if framed else "table"
-    name = f"element_{dtype}_{law}_{slots}_{points}_{form}_{damping}{stage_name(midpoint, dissipative)}"
+    name = f"element_{dtype}_{law}_{slots}_{form}_{damping}{stage_name(midpoint, dissipative)}"
     module = kernel_module(name)
 
     @wp.kernel(module=module)
@@ -244,5 +243,5 @@ def element_kernels(
         tangent_product=tangent_product,
         diagonal_blocks=diagonal_blocks,
         **vars(matrix_kernels(dtype, law, slots, affine, damping, framed, midpoint, dissipative)),
-        **vars(output_kernels(fn, name, points)),
+        **vars(output_kernels(fn, name)),
     )

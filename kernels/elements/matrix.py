@@ -287,33 +287,25 @@ def matrix_kernels(
         """
         A = Tensor()
         for k in range(3):
-            for l in range(k, 3):
-                shear = vec3()
-                if k == l:
-                    for o in range(3):
-                        if o != k:
-                            shear[o] = w * moduli[9 - k - o]
-                for i in range(3):
-                    x = T(0.0)
-                    y = T(0.0)
-                    if k == l:
-                        x = w * moduli[k] * F[i, k]
-                    else:
-                        x = w * moduli[6 - k - l] * F[i, k]
-                        y = w * moduli[9 - k - l] * F[i, l]
+            low = wp.where(k == 0, 1, 0)
+            high = 3 - k - low  # the other two axes
+            for i in range(3):
+                x = w * moduli[k] * F[i, k]
+                y = w * moduli[9 - k - low] * F[i, low]
+                z = w * moduli[9 - k - high] * F[i, high]
+                for j in range(3):
+                    A[3 * i + k, 3 * j + k] = x * F[j, k] + y * F[j, low] + z * F[j, high]
+                A[3 * i + k, 3 * i + k] = A[3 * i + k, 3 * i + k] + w * S[k, k]
+                for l in range(k + 1, 3):
+                    x = w * moduli[6 - k - l] * F[i, k]
+                    y = w * moduli[9 - k - l] * F[i, l]
                     for j in range(3):
-                        a = x * F[j, l]
-                        if k != l:
-                            a += y * F[j, k]
-                        else:
-                            for o in range(3):
-                                if o != k:
-                                    a += shear[o] * F[i, o] * F[j, o]
-                        if i == j:
-                            a += w * S[k, l]
+                        a = x * F[j, l] + y * F[j, k]
                         A[3 * i + k, 3 * j + l] = a
-                        if k != l:
-                            A[3 * j + l, 3 * i + k] = a
+                        A[3 * j + l, 3 * i + k] = a
+                    a = A[3 * i + k, 3 * i + l] + w * S[k, l]
+                    A[3 * i + k, 3 * i + l] = a
+                    A[3 * i + l, 3 * i + k] = a
         if wp.static(needs_J):
             for j in range(3):
                 for l in range(3):

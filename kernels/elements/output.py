@@ -10,15 +10,13 @@ from . import materials
 __all__ = ["output_kernels"]
 
 
-def output_kernels(fn: _types.SimpleNamespace, name: str, points: int) -> _types.SimpleNamespace:
+def output_kernels(fn: _types.SimpleNamespace, name: str) -> _types.SimpleNamespace:
     """Kernels of one kind of element block.
 
     Args:
         fn: the functions of points.py for this kind.
         name: beginning of the names of the modules.
-        points: quadrature points per element.
     """
-    NQ = points
     history_module = kernel_module(f"{name}_history")
     moving_module = kernel_module(f"{name}_history_moving")
     viscous_module = kernel_module(f"{name}_viscous")
@@ -42,7 +40,7 @@ def output_kernels(fn: _types.SimpleNamespace, name: str, points: int) -> _types
         if active[world] == 0:
             return
         U0 = fn.load(block, u0, world, elem)
-        for point in range(NQ):
+        for point in range(block.gradient.shape[0]):
             E = T(a0[world]) * t.green(fn.to_material_axes(block, fn.gradient_of(block, U0, point, elem), point, elem))
             if a1[world] != wp.float64(0.0):
                 U1 = fn.load(block, u1, world, elem)
@@ -70,7 +68,7 @@ def output_kernels(fn: _types.SimpleNamespace, name: str, points: int) -> _types
         U = fn.load(block, u, world, elem)
         V = fn.load(block, v, world, elem)
         A = fn.load(block, a, world, elem)
-        for point in range(NQ):
+        for point in range(block.gradient.shape[0]):
             G = fn.to_material_axes(block, fn.gradient_of(block, U, point, elem), point, elem)
             D = fn.to_material_axes(block, fn.gradient_of(block, V, point, elem), point, elem)
             F = wp.transpose(t.identity() + G)
@@ -98,7 +96,7 @@ def output_kernels(fn: _types.SimpleNamespace, name: str, points: int) -> _types
         V = fn.load(block, v, world, elem)
         f = Local()
         rate_of_work = T(0.0)
-        for point in range(NQ):
+        for point in range(block.gradient.shape[0]):
             G = fn.gradient_of(block, U, point, elem)
             F = t.identity() + G
             rate = t.sym(wp.transpose(F) * fn.gradient_of(block, V, point, elem))
@@ -119,7 +117,7 @@ def output_kernels(fn: _types.SimpleNamespace, name: str, points: int) -> _types
         world, elem = wp.tid()
         c = fn.coefficients(block, world, elem)
         U = fn.load(block, u, world, elem)
-        for point in range(NQ):
+        for point in range(block.gradient.shape[0]):
             G = fn.gradient_of(block, U, point, elem)
             J = T(1.0) + t.volume_change(G)
             P = fn.to_body_axes(block, m.stress(fn.to_material_axes(block, G, point, elem), c), point, elem)

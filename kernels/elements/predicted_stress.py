@@ -12,13 +12,13 @@ __all__ = ["predicted_stress_product"]
 
 
 @functools.cache
-def predicted_stress_product(dtype: str, law: str, slots: int, points: int, affine: bool, framed: bool) -> wp.Kernel:
+def predicted_stress_product(dtype: str, law: str, slots: int, affine: bool, framed: bool) -> wp.Kernel:
     """Kernel for one kind of element block, without viscosity; arguments as those of `element_kernels`."""
     fn: _types.SimpleNamespace = point_functions(dtype, law, slots, affine, None, framed)
     T, vec3, mat33, sym6 = fn.types.T, fn.types.vec3, fn.types.mat33, fn.types.sym
     Block, t = fn.Block, fn.tensors
     form = "affine" if affine else "framed" if framed else "table"
-    module = kernel_module(f"element_{dtype}_{law}_{slots}_{points}_{form}_mixed")
+    module = kernel_module(f"element_{dtype}_{law}_{slots}_{form}_mixed")
 
     @wp.kernel(module=module)
     def product(

@@ -65,9 +65,9 @@ class Block:
         if k.tying:
             return self.kernels
         if midpoint:
-            kind = (k.law, self.slots, self.points, k.affine, mean_damping(damping), k.framed)
+            kind = (k.law, self.slots, k.affine, mean_damping(damping), k.framed)
             return element_kernels(dtype, *kind, midpoint, dissipative)
-        return element_kernels(dtype, k.law, self.slots, self.points, k.affine, damping, k.framed)
+        return element_kernels(dtype, k.law, self.slots, k.affine, damping, k.framed)
 
     def dissipative_data(self, dtype: str, dissipation: float) -> Any:
         """Constants for the dissipative mid-point scheme with its chi."""
@@ -89,7 +89,7 @@ class Block:
         k = self.key
         if k.tying:
             return self.kernels.predicted_stress_product
-        return predicted_stress_product(dtype, k.law, self.slots, self.points, k.affine, k.framed)
+        return predicted_stress_product(dtype, k.law, self.slots, k.affine, k.framed)
 
     def with_mass_product(
         self, dtype: str, damping: str | None, midpoint: bool = False, dissipative: bool = False
@@ -129,7 +129,7 @@ def build_block(
     else:
         det = _point_tables(model, data, key, parts)
         points = len(key.rule.weights)
-        kind = (key.law, family.slots, points, key.affine, key.damping, key.framed)
+        kind = (key.law, family.slots, key.affine, key.damping, key.framed)
         kernels = element_kernels(model.dtype, *kind)
     cluster = cluster_size(model.dtype, len(conn), fit=model.device.is_cuda)
     sizes = len(conn), points, family.slots
@@ -147,7 +147,7 @@ def output_block(model: Any, block: Block, scheme: str) -> Block:
     data.material = model.array("output", index, wp.int32)
     _point_tables(model, data, key, parts)
     points = len(key.rule.weights)
-    kernels = element_kernels(model.dtype, key.law, block.slots, points, False, None, True)
+    kernels = element_kernels(model.dtype, key.law, block.slots, False, None, True)
     return Block(key, data, kernels, parts, block.count, points, block.slots, 0, 0, block.cluster)
 
 
