@@ -56,6 +56,7 @@ def test_a_scene_is_priced_as_in_the_table(tmp_path, capfd):
     assert_priced(row)
 
 
+@pytest.mark.slow
 def test_what_is_forced_in_is_all_that_the_scene_leaves_out():
     scene = find("slider_crank")
     row = measure(scene, device="cpu", steps=1, repeat=1)

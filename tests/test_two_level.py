@@ -167,10 +167,10 @@ def test_large_bodies_are_numbered_by_place_and_report_in_file_order(monkeypatch
 @pytest.mark.parametrize(
     ("scene", "dtype"),
     [
-        pytest.param(scene, "float64", marks=[pytest.mark.slow] if scene == "3243 askew, rate" else [])
+        pytest.param(scene, "float64", marks=[pytest.mark.slow] if scene in ("3243 askew, rate", "T10 rate") else [])
         for scene in SCENES
     ]
-    + [("T10 rubber", "float32"), pytest.param("3243 askew, incremental", "float32", marks=pytest.mark.slow)],
+    + [pytest.param(s, "float32", marks=pytest.mark.slow) for s in ("T10 rubber", "3243 askew, incremental")],
 )
 def test_columns_and_whole_elements_give_one_matrix(scene, dtype):
     """The kernels of a GPU and those of the CPU, here both on the CPU."""
