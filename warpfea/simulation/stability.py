@@ -373,7 +373,9 @@ def _mode(probe: TangentOperator, chosen: np.ndarray, x: np.ndarray) -> np.ndarr
 def _float64_copy(sim: Simulation) -> Simulation:
     """Float64 copy of the equilibrium with its forces, ready for conjugate gradients."""
     model = sim.model
-    twin = model.resized(model.worlds, dtype="float64")
+    if "float64" not in model.cache:  # half of the time of a check of a small model
+        model.cache["float64"] = model.resized(model.worlds, dtype="float64")
+    twin = model.cache["float64"]
     if model.terms.written:
         twin.parameters.take(model.parameters.values)
         arrays = twin.terms.parameter_arrays()
