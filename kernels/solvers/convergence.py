@@ -311,10 +311,11 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
     @wp.func
     def fail(ctl: Control, world: int, why: int):
         """Handle a failed search: if round-off may explain it, keep the iterate and request an error estimate."""
-        near = ctl.rounding_ratio[world] <= f64(BOUND)
+        rounded = ctl.rounding_ratio[world] <= f64(BOUND)
         if wp.static(unilateral):
-            near = near or is_velocity_roundoff(ctl, world)
-        near = near and ctl.error_estimates[world] < MAX_ERROR_ESTIMATES
+            rounded = rounded or is_velocity_roundoff(ctl, world)
+        near = rounded and ctl.error_estimates[world] < MAX_ERROR_ESTIMATES
+        rounded = rounded or ctl.eps > f64(SINGLE_EPS)
         enough = False
         if wp.static(has_constraints):  # only accelerations need the tighter tolerance, which round-off prevents
             if (
@@ -327,7 +328,7 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         elif near and (why == FAIL_LINE_SEARCH or why == FAIL_CURVATURE):
             request_error_estimate(ctl, world)
             ctl.alpha[world] = f64(0.0)
-        elif (why == FAIL_LINE_SEARCH or why == FAIL_CURVATURE) and ctl.error_estimate[world] < f64(1.0e30):
+        elif (why == FAIL_LINE_SEARCH or why == FAIL_CURVATURE) and rounded and ctl.error_estimate[world] < f64(1.0e30):
             give_up(ctl, world, FAIL_FLOOR)
         else:
             give_up(ctl, world, why)

@@ -10,11 +10,7 @@ __all__ = ["MISSES", "reason_for"]
 _THIN = "refused for the work spent or without a reason; with two levels on the CPU float32 is named now"
 
 MISSES: dict[tuple[str, str, str], str] = {
-    (
-        "annular/3",
-        "float64",
-        "cpu",
-    ): "68 and 86 iterations on two processors, 266 on others: rounding decides the path",
+    ("annular/3", "float64", "cpu"): "68 or 86 iterations on two processors, 266 on others: by rounding",
     ("annular/auto", "float64", ""): "the whole load at once takes 160 to 230 iterations; three load steps take 86",
     ("annular/auto", "float32", "cuda"): _THIN,
     ("soft-thin-limbs", "float64", ""): "found, in 642 iterations on the CPU and 166 on a GPU, in place of 80",
