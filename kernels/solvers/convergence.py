@@ -29,7 +29,7 @@ STALLED = 0.5
 CLOSING_ITERATIONS = 4
 """Iterations in which constraints are closed to the tolerance of accelerations, if `constraint_tol` is looser."""
 STALL_ROUNDINGS = 1.0e3
-"""Multiple of the residual of rounded positions below which a stall may be due to round-off."""
+"""Multiple of the residual of at_roundoff positions below which a stall may be due to round-off."""
 STALL_ROUNDINGS_MIDPOINT = 4.0
 """`STALL_ROUNDINGS` for midpoint schemes, whose unsymmetric linear solves may stall long before round-off."""
 STALL_STEP = 10.0
@@ -311,11 +311,11 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
     @wp.func
     def fail(ctl: Control, world: int, why: int):
         """Handle a failed search: if round-off may explain it, keep the iterate and request an error estimate."""
-        rounded = ctl.rounding_ratio[world] <= f64(BOUND)
+        at_roundoff = ctl.rounding_ratio[world] <= f64(BOUND)
         if wp.static(unilateral):
-            rounded = rounded or is_velocity_roundoff(ctl, world)
-        near = rounded and ctl.error_estimates[world] < MAX_ERROR_ESTIMATES
-        rounded = rounded or ctl.eps > f64(SINGLE_EPS)
+            at_roundoff = at_roundoff or is_velocity_roundoff(ctl, world)
+        near = at_roundoff and ctl.error_estimates[world] < MAX_ERROR_ESTIMATES
+        at_roundoff = at_roundoff or ctl.eps > f64(SINGLE_EPS)
         enough = False
         if wp.static(has_constraints):  # only accelerations need the tighter tolerance, which round-off prevents
             if (
@@ -328,7 +328,11 @@ def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         elif near and (why == FAIL_LINE_SEARCH or why == FAIL_CURVATURE):
             request_error_estimate(ctl, world)
             ctl.alpha[world] = f64(0.0)
-        elif (why == FAIL_LINE_SEARCH or why == FAIL_CURVATURE) and rounded and ctl.error_estimate[world] < f64(1.0e30):
+        elif (
+            (why == FAIL_LINE_SEARCH or why == FAIL_CURVATURE)
+            and at_roundoff
+            and ctl.error_estimate[world] < f64(1.0e30)
+        ):
             give_up(ctl, world, FAIL_FLOOR)
         else:
             give_up(ctl, world, why)
