@@ -29,7 +29,7 @@ STALLED = 0.5
 CLOSING_ITERATIONS = 4
 """Iterations in which constraints are closed to the tolerance of accelerations, if `constraint_tol` is looser."""
 STALL_ROUNDINGS = 1.0e3
-"""Multiple of the residual of at_roundoff positions below which a stall may be due to round-off."""
+"""Multiple of the residual of rounded positions below which a stall may be due to round-off."""
 STALL_ROUNDINGS_MIDPOINT = 4.0
 """`STALL_ROUNDINGS` for midpoint schemes, whose unsymmetric linear solves may stall long before round-off."""
 STALL_STEP = 10.0
