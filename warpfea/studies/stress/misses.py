@@ -14,8 +14,6 @@ MISSES: dict[tuple[str, str, str], str] = {
     ("annular/auto", "float64", ""): "the whole load at once takes 160 to 230 iterations; three load steps take 86",
     ("annular/auto", "float32", "cuda"): _THIN,
     ("soft-thin-limbs", "float64", ""): "found, in 642 iterations on the CPU and 166 on a GPU, in place of 80",
-    ("stiff-beside-soft-motion/weld", "float32", "cuda"): "1.05 % before first iterates had to meet a tenth of the "
-    "tolerance beside stiff parts (1e-4 on the CPU since); not measured on a GPU since",
     ("soft-dolphin", "float32", ""): "refused by name: float32 can't hold it",
     ("soft-thin-limbs", "float32", ""): "refused by name: float32 can't hold it",
     ("thin-static/T10-500", "float32", "cuda"): _THIN,
