@@ -209,7 +209,7 @@ class Floor(Term):
         return [("floor", ctx.scratch[self.name][0])]
 
     def allocate_blocks(self, ctx, matrix, *, projected):
-        self.entry = self.model.array("floor", matrix.pattern.find(self.slots, self.slots), wp.int32)
+        self.entry = self.model.array("floor", matrix.pattern.find_upper(self.slots, self.slots), wp.int32)
 
     def blocks(self, ctx, matrix, kept, dq_dv, active, out, *, projected):
         args = [self.model.topology, matrix.pattern.data, self.entry, *kept, dq_dv, active, out]

@@ -117,6 +117,7 @@ def test_paper_patch_ramped_in_always_finds_a_solution(per_contact):
     assert sim.status.sum() == 0
 
 
+@pytest.mark.slow
 def test_paper_patch_fails_where_it_has_no_solution_and_only_there():
     sim, without = impacts(3000, 1, "paper", 20)
     assert 30 < without.sum() < 300

@@ -85,7 +85,7 @@ def test_committed_agreement():
     assert result["versions"]["warp"].startswith("1.19")
 
 
-@pytest.mark.parametrize("shift", [0.0, 1e4])
+@pytest.mark.parametrize("shift", [pytest.param(0.0, marks=pytest.mark.slow), 1e4])
 def test_float32_agrees_with_float64(shift):
     """S3, 0.5 s: float32 stays within 1e-4 of the tip's travel, also 10 km from the origin."""
     mesh = report.s3_mesh().transformed(transform=(np.eye(3), (shift, -shift, shift)))

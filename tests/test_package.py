@@ -91,6 +91,7 @@ def copy_sources(target):
     return target
 
 
+@pytest.mark.slow
 def test_wheel_runs_a_scene_from_another_folder(tmp_path):
     wheels = tmp_path / "wheels"
     sources = copy_sources(tmp_path / "sources")
@@ -287,6 +288,7 @@ sys.meta_path.insert(0, Blocker())
 """
 
 
+@pytest.mark.slow
 def test_cuda_tests_collect_without_meshio_and_usd(tmp_path):
     """As on a machine with a GPU and little else: every file is imported, and the tests marked `cuda` are found."""
     (tmp_path / "sitecustomize.py").write_text(BLOCKER)

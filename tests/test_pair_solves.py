@@ -61,7 +61,7 @@ def iterations(model, kind):
     return float(np.mean(counts))
 
 
-@pytest.mark.parametrize("kind", ["banded", "two-level"])
+@pytest.mark.parametrize("kind", ["banded", pytest.param("two-level", marks=pytest.mark.slow)])
 def test_iterations_do_not_grow_with_the_stack(kind):
     few, many = (iterations(stack(n, 1e8, cells=3), kind) for n in (5, 20))
     assert many < 1.5 * few

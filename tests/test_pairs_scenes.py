@@ -69,6 +69,7 @@ def test_driver_turns_the_wheel_the_other_way():
     assert sim.contact_record("mesh").normal_force.max() > 10.0
 
 
+@pytest.mark.slow
 def test_finger_pushes_the_beam_off_the_shell():
     sim = run_contact_scene("finger_beam_shell")
     probe, table, push = sim.probe("beam"), sim.contact_record("table"), sim.contact_record("push")

@@ -47,6 +47,7 @@ def test_no_scene_pays_for_what_it_does_not_use():
         assert row["ratio"] > 1.0, row["scene"]
 
 
+@pytest.mark.slow
 def test_a_scene_is_priced_as_in_the_table(tmp_path, capfd):
     out = tmp_path / "price.json"
     words = ["--rows", "cantilever", "--set", "steps=2", "--set", "repeat=1", "--out", str(out)]

@@ -278,6 +278,7 @@ def test_work_ends_within_a_solve(preconditioner, most, device):
 
 
 @pytest.mark.parametrize("element", ["T10", "H3843"])
+@pytest.mark.slow
 def test_stress_that_rounds_more_than_positions_ends_at_its_floor(element):
     """A cube pressed to a twentieth in single precision: the residual stalls, and the error that is left is told."""
     answer = stretch(Setting("cpu", "float32"), f"{element}-0.05")
@@ -286,6 +287,7 @@ def test_stress_that_rounds_more_than_positions_ends_at_its_floor(element):
 
 
 @pytest.mark.parametrize("how", ["squeezed", "twisted"])
+@pytest.mark.slow
 def test_soft_bars_are_found_past_their_bifurcations(how, monkeypatch):
     """Squeezed to a twentieth or twisted four turns a neo-Hookean bar buckles: its tangent is indefinite."""
     monkeypatch.setitem(inside_out.CELLS, "H3843", (10, 1, 1))

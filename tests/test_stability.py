@@ -296,6 +296,7 @@ def plate(factor, imperfection, dtype):
 
 
 @pytest.mark.parametrize("imperfection", [1e-5, 1e-3])
+@pytest.mark.slow
 def test_an_imperfect_plate_buckles_in_single_precision_too(imperfection):
     """On 8934ce7 float32 may stay straight: 3.0e-6 m in place of 0.0172 m, accepted."""
     exact = plate(1.5, imperfection, "float64")

@@ -123,6 +123,7 @@ def test_cuda_is_as_a_box_and_as_the_cpu(name):
     assert np.abs(found - wanted).max() < 1e-9 * SIDE
 
 
+@pytest.mark.slow
 def test_float32_follows_float64():
     wanted, _ = moved(20, boxed(cells=4))
     found, sim = moved(20, boxed(cells=4), dtype="float32")

@@ -92,7 +92,7 @@ def _discrete_gradient(dtype: str, second_invariant: bool) -> _types.SimpleNames
         return out
 
     @wp.func
-    def inverse_stretch(E: mat33) -> mat33:
+    def inverse_cauchy_green(E: mat33) -> mat33:
         """C^-1 = (I + 2 E)^-1."""
         return wp.inverse(t.identity() + T(2.0) * E)
 
@@ -111,7 +111,7 @@ def _discrete_gradient(dtype: str, second_invariant: bool) -> _types.SimpleNames
             d = (J1/J0)^(-2/3) - 1 = -i1/3 + rho.
         The first-order part in X is S(E0) : X/2; the rest follows without cancellation.
         """
-        Ci = inverse_stretch(E0)
+        Ci = inverse_cauchy_green(E0)
         A = Ci * X
         i1 = wp.trace(A)
         i23 = T(0.5) * (i1 * i1 - wp.trace(A * A)) + wp.determinant(A)
@@ -148,7 +148,7 @@ def _discrete_gradient(dtype: str, second_invariant: bool) -> _types.SimpleNames
         """The discrete gradient, Pa."""
         E = t.green(G) + T(0.5) * wp.transpose(D) * D
         dE = T(2.0) * t.sym(D + wp.transpose(G) * D)
-        S = t.sym(inverse_stretch(E) * c_times_stress(E, c))
+        S = t.sym(inverse_cauchy_green(E) * c_times_stress(E, c))
         rest = energy_change(E - T(0.5) * dE, T(2.0) * dE, c) - wp.ddot(S, dE)
         return S + (rest / (wp.ddot(dE, dE) + tiny)) * dE
 
@@ -156,7 +156,7 @@ def _discrete_gradient(dtype: str, second_invariant: bool) -> _types.SimpleNames
     def mean_increment(G: mat33, dE: mat33, c: coef) -> mat33:
         """dS of S(E) along dE at the strain of G, Pa."""
         E = t.green(G)
-        Ci = inverse_stretch(E)
+        Ci = inverse_cauchy_green(E)
         j1 = jacobian_minus_one(E)
         J = T(1.0) + j1
         trL = wp.ddot(Ci, dE)

@@ -5,7 +5,7 @@ import types as _types
 import warp as wp
 
 from ..common.traits import Traits
-from .convergence import STALL_ROUNDINGS, judging_functions
+from .convergence import STALL_ROUNDINGS, convergence_functions
 from .newton_control import FAIL_CONSTRAINT, FAIL_ITERATIONS, control_struct
 
 __all__ = ["outer_kernels"]
@@ -21,7 +21,7 @@ def outer_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
     """Kernels in the module of Newton's method."""
     f64 = wp.float64
     Control = control_struct()
-    judging = judging_functions(traits)
+    judging = convergence_functions(traits)
     allowed_violation = judging.allowed_violation
     objective, magnitude, largest_violation = judging.objective, judging.magnitude, judging.largest_violation
     evaluate_norms, check_convergence, record_residual, give_up = (
@@ -32,7 +32,7 @@ def outer_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
     )
 
     @wp.kernel(module=module)
-    def begin_refresh(ctl: Control, flags: wp.array(dtype=wp.int32)):
+    def begin_frozen_update(ctl: Control, flags: wp.array(dtype=wp.int32)):
         """Flag the worlds whose frozen quantities are due for an update: the residual is small enough."""
         world = wp.tid()
         flags[world] = 0
@@ -48,7 +48,7 @@ def outer_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
                 record_residual(ctl, world)
 
     @wp.kernel(module=module)
-    def end_refresh(ctl: Control, flags: wp.array(dtype=wp.int32)):
+    def end_frozen_update(ctl: Control, flags: wp.array(dtype=wp.int32)):
         """Re-evaluate the iterate of the flagged worlds with the updated frozen quantities."""
         world = wp.tid()
         if ctl.active[world] != 0 and flags[world] != 0:
@@ -98,5 +98,8 @@ def outer_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
             ctl.limit[world] = f64(1.0)
 
     return _types.SimpleNamespace(
-        free_step=free_step, check_constraints=check_constraints, begin_refresh=begin_refresh, end_refresh=end_refresh
+        free_step=free_step,
+        check_constraints=check_constraints,
+        begin_frozen_update=begin_frozen_update,
+        end_frozen_update=end_frozen_update,
     )

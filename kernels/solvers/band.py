@@ -166,7 +166,7 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
             shift[world] = T(0.0)
 
     @wp.kernel(module=module)
-    def settle(
+    def raise_shift(
         bad: wp.array(dtype=wp.int32),
         doing: wp.array(dtype=wp.int32),
         shift: wp.array(dtype=T),
@@ -241,7 +241,7 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
         clear=clear,
         fill=fill,
         factor=factor,
-        settle=settle,
+        raise_shift=raise_shift,
         solve=solve,
         inverse_factor=inverse_factor,
     )

@@ -18,16 +18,16 @@ from .pcg import forcing_functions, pcg_struct
 __all__ = ["BICGSTAB_ROWS", "bicgstab_kernels", "bicgstab_struct"]
 
 BICGSTAB_ROWS = 4
-"""Rows of `second_rows`."""
-FAR, CLOSE = 0.1, 1.0e-8
+"""Rows of `second_dot_terms`."""
+START_STRESS_RESIDUAL, START_STRESS_TOL = 0.1, 1.0e-8
 """Relative residual above which the stress of an iterate is unreliable: a rotation error delta strains a stiff body by
 delta^2, and E delta^2 spoils the geometric stiffness. Products then use the stress at the start of the step, and solves
-go to CLOSE, as the residual of a rotation is small beside that of strains."""
+go to START_STRESS_TOL, as the residual of a rotation is small beside that of strains."""
 STALLED = 50
 """Iterations without halving the best residual after which a solve ends with the best: later residuals may grow."""
-FOUND = 0.1
+ESTIMATE_RESIDUAL = 0.1
 """Largest final relative residual of a solve that yields an error estimate."""
-STRICT = 1.0e-6
+ESTIMATE_TOL = 1.0e-6
 """Relative residual of solves for error estimates."""
 
 
@@ -86,11 +86,11 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> _types.Simple
         bi.since[world] = 0
         ctl.target[world] = forced(newton, world, norm)
         if newton.estimate_error[world] != 0:
-            ctl.target[world] = f64(STRICT) * norm
-        elif newton.relative_residual[world] > f64(FAR) and newton.fixed_forcing == 0:
-            ctl.target[world] = wp.max(f64(CLOSE) * norm, least_norm(newton, world))
+            ctl.target[world] = f64(ESTIMATE_TOL) * norm
+        elif newton.relative_residual[world] > f64(START_STRESS_RESIDUAL) and newton.fixed_forcing == 0:
+            ctl.target[world] = wp.max(f64(START_STRESS_TOL) * norm, least_norm(newton, world))
         if norm > ctl.target[world] and ctl.max_iterations > 0 and wp.isfinite(norm) and bi.rho[world] != f64(0.0):
-            ctl.active[world] = wp.where(newton.relative_residual[world] > f64(FAR), 2, 1)
+            ctl.active[world] = wp.where(newton.relative_residual[world] > f64(START_STRESS_RESIDUAL), 2, 1)
             wp.atomic_max(ctl.any_active, 0, 1)
         elif newton.estimate_error[world] != 0:
             ctl.negative_curvature[world] = 1  # no error estimate
@@ -148,7 +148,7 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> _types.Simple
             r[world, slot] = r[world, slot] - alpha * v[world, slot]
 
     @wp.kernel(module=module)
-    def look(ctl: Control, bi: Recursion):
+    def check_half_step(ctl: Control, bi: Recursion):
         """End the solve if the half step has reached the target."""
         world = wp.tid()
         if ctl.active[world] != 0:
@@ -159,7 +159,7 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> _types.Simple
                 ctl.active[world] = 0
 
     @wp.kernel(module=module)
-    def second_rows(
+    def second_dot_terms(
         ctl: Control,
         diagonal: wp.array2d(dtype=vec3),
         r: wp.array2d(dtype=vec3),
@@ -237,14 +237,14 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> _types.Simple
             p_out[world, slot] = new + T(bi.beta[world]) * (p_out[world, slot] - omega * v[world, slot])
 
     @wp.kernel(module=module)
-    def close(ctl: Control, bi: Recursion):
+    def deactivate_finished(ctl: Control, bi: Recursion):
         """Deactivate finished worlds."""
         world = wp.tid()
         if bi.going[world] == 0:
             ctl.active[world] = 0
 
     @wp.kernel(module=module)
-    def finish(newton: Newton, ctl: Control, bi: Recursion, first: int):
+    def mark_restarts(newton: Newton, ctl: Control, bi: Recursion, first: int):
         """Mark the worlds that restart; `first`: a restart is allowed."""
         world = wp.tid()
         bi.again[world] = 0
@@ -255,18 +255,20 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> _types.Simple
         if first != 0 and ctl.norm[world] > ctl.target[world] and has_work(ctl, world):
             bi.again[world] = 1
             wp.atomic_max(bi.any_again, 0, 1)
-        elif newton.estimate_error[world] != 0 and not ctl.norm[world] <= f64(FOUND) * ctl.first_norm[world]:
+        elif (
+            newton.estimate_error[world] != 0 and not ctl.norm[world] <= f64(ESTIMATE_RESIDUAL) * ctl.first_norm[world]
+        ):
             ctl.negative_curvature[world] = 1
 
     @wp.kernel(module=module)
-    def begin_again(newton: Newton, ctl: Control, bi: Recursion):
+    def restart(newton: Newton, ctl: Control, bi: Recursion):
         """Restart: r^ = B r with r of the best iterate."""
         world = wp.tid()
         if bi.again[world] != 0 and ctl.sums[0, world] != f64(0.0) and wp.isfinite(ctl.sums[0, world]):
             bi.rho[world] = ctl.sums[0, world]
             bi.mark[world] = bi.best[world]
             bi.since[world] = 0
-            ctl.active[world] = wp.where(newton.relative_residual[world] > f64(FAR), 2, 1)
+            ctl.active[world] = wp.where(newton.relative_residual[world] > f64(START_STRESS_RESIDUAL), 2, 1)
             wp.atomic_max(ctl.any_active, 0, 1)
 
     @wp.kernel(module=module)
@@ -293,12 +295,12 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> _types.Simple
         first_direction=first_direction,
         first_length=first_length,
         first_step=first_step,
-        look=look,
-        second_rows=second_rows,
+        check_half_step=check_half_step,
+        second_dot_terms=second_dot_terms,
         second_length=second_length,
         second_step=second_step,
-        close=close,
+        deactivate_finished=deactivate_finished,
         take_best=take_best,
-        finish=finish,
-        begin_again=begin_again,
+        mark_restarts=mark_restarts,
+        restart=restart,
     )

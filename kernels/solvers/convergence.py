@@ -17,7 +17,7 @@ from .newton_control import (
     control_struct,
 )
 
-__all__ = ["MAX_ERROR_ESTIMATES", "SINGLE_EPS", "VELOCITY_ROUNDINGS", "judging_functions"]
+__all__ = ["MAX_ERROR_ESTIMATES", "SINGLE_EPS", "VELOCITY_ROUNDINGS", "convergence_functions"]
 
 ROUNDING_TOL = 16.0
 PREDICTED_TOL = 1.0e-3
@@ -54,7 +54,7 @@ MAX_ERROR_ESTIMATES = 3
 
 
 @functools.cache
-def judging_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
+def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
     """Device functions; traits used: "stored", "has_constraints", "midpoint" and "unilateral"."""
     f64 = wp.float64
     Control = control_struct()

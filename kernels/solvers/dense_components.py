@@ -9,11 +9,11 @@ from ..common.lanes import lane_functions
 from ..common.structs import pattern_struct
 from ..common.types import SHORT_UNROLL, kernel_module, precision
 
-__all__ = ["part_kernels"]
+__all__ = ["dense_component_kernels"]
 
 
 @functools.cache
-def part_kernels(dtype: str) -> _types.SimpleNamespace:
+def dense_component_kernels(dtype: str) -> _types.SimpleNamespace:
     """Kernels in one precision. `slot`: [component, position] or -1; `part_of`, `place_of`: [slot]."""
     p = precision(dtype)
     T, mat33 = p.T, p.mat33

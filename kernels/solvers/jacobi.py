@@ -11,7 +11,7 @@ import warp as wp
 
 from ..common.traits import Traits
 from ..common.types import kernel_module, precision
-from .convergence import judging_functions
+from .convergence import convergence_functions
 from .newton import newton_kernels
 from .newton_control import FAIL_CONSTRAINT, FAIL_GROWTH, FAIL_JACOBIAN, FAIL_LIMIT, FAIL_NAN, control_struct
 from .pcg import pcg_struct
@@ -54,7 +54,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
     Newton, PCG, Jacobi = control_struct(), pcg_struct(), jacobi_struct()
     shared = newton_kernels(traits)
     evaluate_norms, record_residual, accept = shared.evaluate_norms, shared.record_residual, shared.accept
-    allowed_violation = judging_functions(traits).allowed_violation
+    allowed_violation = convergence_functions(traits).allowed_violation
     paired = acceleration in ("secants", "anderson")
     module = kernel_module(f"jacobi_{dtype}_{acceleration}{traits.suffix('stored', 'has_constraints', 'limited')}")
 

@@ -5,10 +5,10 @@ import types as _types
 import warp as wp
 
 from ..common.traits import Traits
-from .convergence import judging_functions
+from .convergence import convergence_functions
 from .newton_control import FAIL_JACOBIAN, FAIL_LINE_SEARCH, control_struct
 
-__all__ = ["MAX_TRUST_RADIUS", "NOISE", "search_kernels"]
+__all__ = ["MAX_TRUST_RADIUS", "NOISE", "line_search_kernels"]
 
 ARMIJO = 1.0e-4
 WOLFE = 0.8
@@ -30,13 +30,13 @@ reversed and Phi has a kink before. It is located by at most KINKS trials: a ste
 again and again, while one that ends near it makes them stick."""
 
 
-def search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
+def line_search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
     """Kernels in the module of Newton's method, and the function `tangent_needed`."""
     f64 = wp.float64
     Control = control_struct()
     stored, unilateral, midpoint, limited = traits.stored, traits.unilateral, traits.midpoint, traits.limited
     has_kinks = unilateral and not midpoint
-    judging = judging_functions(traits)
+    judging = convergence_functions(traits)
     objective, magnitude, evaluate_norms = judging.objective, judging.magnitude, judging.evaluate_norms
     check_convergence, fail = judging.check_convergence, judging.fail
 

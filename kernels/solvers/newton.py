@@ -8,8 +8,8 @@ import warp as wp
 from ..common.traits import NO_TERMS, Traits
 from ..common.types import kernel_module
 from .augmented_lagrangian import outer_kernels
-from .convergence import MAX_ERROR_ESTIMATES, SINGLE_EPS, VELOCITY_ROUNDINGS, judging_functions
-from .line_search import MAX_TRUST_RADIUS, NOISE, search_kernels
+from .convergence import MAX_ERROR_ESTIMATES, SINGLE_EPS, VELOCITY_ROUNDINGS, convergence_functions
+from .line_search import MAX_TRUST_RADIUS, NOISE, line_search_kernels
 from .newton_control import (
     FAIL_CURVATURE,
     FAIL_FLOOR,
@@ -51,7 +51,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         traits.unilateral,
     )
     midpoint = traits.midpoint
-    judging = judging_functions(traits)
+    judging = convergence_functions(traits)
     objective, magnitude = judging.objective, judging.magnitude
     evaluate_norms, check_convergence, fail = judging.evaluate_norms, judging.check_convergence, judging.fail
     accept, give_up, record_residual, iteration_factor = (
@@ -64,7 +64,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         f"newton{traits.suffix('stored', 'has_constraints', 'limited', 'unilateral', 'midpoint')}", light=True
     )
 
-    searching = search_kernels(traits, module)
+    searching = line_search_kernels(traits, module)
     tangent_needed = searching.tangent_needed
 
     @wp.kernel(module=module)

@@ -14,11 +14,11 @@ from .newton_control import control_struct
 
 __all__ = ["LANES", "forcing_functions", "groups_struct", "pcg_kernels", "pcg_struct"]
 
-TIGHTER = 0.4
+CONSTRAINT_FORCING = 0.4
 """Factor on the tolerance of solves with constraints. Of 0.03, 0.18, 0.4 and 1 it avoids the third Newton iteration at
 the least cost: with 0.18, 0.4 and 1 a chain of 100 joints takes 64, 54 and 52 PCG iterations per step, and 2.0, 2.0
 and 2.55 Newton iterations."""
-TRUSTED = 3
+UNCHECKED_ITERATIONS = 3
 """Newton iterations whose linear solves rely on factors of the operator's own matrix. Later solves are checked and
 refined by conjugate gradients."""
 STRICT_CHECK, STRICT_GAIN = 10, 0.01
@@ -90,7 +90,7 @@ def forcing_functions(has_constraints: bool) -> _types.SimpleNamespace:
         least = f64(0.1) * newton.unconverged_tol[world]
         if wp.static(has_constraints):
             # the solve also yields the constraint forces: the residual across constraints is their error
-            least = f64(TIGHTER) * least
+            least = f64(CONSTRAINT_FORCING) * least
             if newton.classical == 0:
                 # a loose force tolerance must not leave constraints violated
                 least = least / wp.max(f64(10.0) * newton.violation_ratio[world], f64(1.0))
@@ -106,7 +106,7 @@ def forcing_functions(has_constraints: bool) -> _types.SimpleNamespace:
             # with balanced forces the remaining constraint violation may still require a step
             goal = newton.forcing[world] * wp.min(newton.unconverged_norm[world], norm)
             if newton.classical == 0:
-                goal = f64(TIGHTER) * goal
+                goal = f64(CONSTRAINT_FORCING) * goal
         return wp.max(goal, least_norm(newton, world))
 
     return _types.SimpleNamespace(least_norm=least_norm, forced=forced)
@@ -139,7 +139,7 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNames
             r[world, slot] = -wp.cw_mul(g[world, slot], free[slot])
 
     @wp.kernel(module=module)
-    def silence(
+    def zero_converged(
         newton: Newton,
         of_slot: wp.array(dtype=wp.int32),
         active: wp.array(dtype=wp.int32),
@@ -210,7 +210,7 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNames
             return  # the step is given up, see `begin_search`
         if norm > ctl.target[world] and rz > f64(0.0) and ctl.max_iterations > 0:
             checked = (
-                newton.iterations[world] >= TRUSTED
+                newton.iterations[world] >= UNCHECKED_ITERATIONS
                 or newton.predicted_stress[world] != 0
                 or ctl.estimate_error[world] != 0
             )
@@ -361,7 +361,7 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNames
     return _types.SimpleNamespace(
         module=module,
         start=start,
-        silence=silence,
+        zero_converged=zero_converged,
         block_jacobi=block_jacobi,
         begin=begin,
         first_direction=first_direction,

@@ -4,15 +4,16 @@ The error e of a substep h, a vector at each slot, gives the rate r = e / max(h,
 `mean_step` the running mean of the accepted step sizes, and updates the slot's running mean m of the rates. The substep
 is accepted if
 
-    |m| <= limit and |r| <= RATE_RATIO limit, or |r| <= limit,    limit = ERROR_FRACTION error size / horizon,
+    |m| <= limit and |r| <= RATE_RATIO limit, or |r| <= limit,    limit = ERROR_FRACTION tolerance / horizon,
 
-at all slots: local errors then accumulate over the horizon to a fraction of the requested error. Errors of vibrations
-change sign and do not accumulate: since only their means are bounded, a vibration below the requested error is not
-resolved. At a velocity jump e is of order h for any h: the bound by the mean step accepts it. In single precision the
-round-off of displacements is subtracted: at most ROUNDING_UNITS eps |u| from e, and from the mean of n rates 1/n of
-that, as round-off does not accumulate, and no more than the scatter of the rates. Where RATE_MEMORY rates leave more
-than the requested error over the horizon, estimates are unreliable and the step is refused: a falling pendulum of
-1e9 Pa with error=1e-5 had errors of 0.25, 1.3 and 142 times that after 0.1, 0.2 and 0.4 s.
+at all slots, with the requested error as a length, `tolerance`: local errors then accumulate over the horizon to a
+fraction of it. Errors of vibrations change sign and do not accumulate: since only their means are bounded, a vibration
+below the requested error is not resolved. At a velocity jump e is of order h for any h, and e/h does not fall: the
+lower bound of the denominator accepts it. In single precision the round-off of displacements is subtracted: at most
+ROUNDING_UNITS eps |u| from e, and from the mean of n rates 1/n of that, as round-off does not accumulate, and no more
+than the scatter of the rates. Where RATE_MEMORY rates leave more than the requested error over the horizon, round-off
+dominates the estimates and the run fails: a falling pendulum of 1e9 Pa, asked for 1e-5, had errors of 0.25, 1.3 and 142
+times that after 0.1, 0.2 and 0.4 s.
 """
 
 import functools
@@ -26,23 +27,23 @@ from ..solvers.newton_control import FAIL_ERROR, FAIL_FLOOR, control_struct
 from ..solvers.pcg import pcg_struct
 from .step_control import step_span, step_struct
 
-__all__ = ["COUNTS", "KEPT", "MAX_LEVEL", "adaptive_kernels", "adaptive_struct"]
+__all__ = ["CONTROL_STATE", "MAX_LEVEL", "STEP_STATISTICS", "adaptive_kernels", "adaptive_struct"]
 
-KEPT = ("next_step", "mean_step", "seen")
+CONTROL_STATE = ("next_step", "mean_step", "rate_count")
 """Columns of the control's state, [world, column]: the upper bound of the next substep, s, 0 at the start; mean step
 size, s; number of substeps in the mean of rates, at most RATE_MEMORY."""
-COUNTS = ("substeps", "rejected", "least_h", "largest_h")
+STEP_STATISTICS = ("substeps", "rejected", "least_h", "largest_h")
 """Columns of a step's report: accepted substeps, substeps rejected for their error, smallest and largest size, s."""
 MAX_LEVEL = 26
 """Maximum halvings of the interval between synchronisation times; float32 times would not resolve smaller steps."""
 ERROR_FRACTION = 0.5
-"""Fraction of the requested error that the estimates may accumulate to: errors grow until the end."""
+"""Fraction of the requested error that the estimates may accumulate to: errors made early grow until the end."""
 DOUBLING_RATIO = 0.7
 """Fraction of the tolerance below which a doubled step's predicted error allows the doubling."""
 MAX_CUTS = 3
 """Maximum halvings of a rejected substep: for nonsmooth motions the estimate falls with a lower power of h."""
 MIN_STEP_RATIO = 0.125
-"""Lower bound of the step size in an error rate, over the pace; 1 lets velocity errors from impacts accumulate."""
+"""Lower bound of the step size in an error rate, over the mean step; 1 lets velocity errors of impacts accumulate."""
 FIRST_STEP_ERROR = 0.1
 """Fraction of the requested error allowed for the first step of a multistep scheme, of order 1."""
 MAX_SUBSTEPS = 65536
@@ -52,9 +53,9 @@ STEP_MEMORY = 256.0
 RATE_MEMORY = 16.0
 """Substeps in the running mean of rates."""
 RATE_RATIO = 4.0
-"""Largest rate, over the bound of their mean."""
+"""Bound of a single rate, over that of the mean rate."""
 ROUNDING_UNITS = 2.0
-"""Largest error of an estimate, in roundings of the largest displacement."""
+"""Bound of the round-off in an estimate, in round-offs of the largest displacement."""
 
 
 @functools.cache
@@ -67,13 +68,13 @@ def adaptive_struct():
         span: wp.array(dtype=wp.float64)  # s, time in the error rate of this attempt
         rate: wp.array(dtype=wp.float64)  # largest rate of this attempt, m/s
         mean: wp.array(dtype=wp.float64)  # largest mean of rates including it, m/s
-        scatter: wp.array(dtype=wp.float64)  # largest difference of the two, m/s
+        scatter: wp.array(dtype=wp.float64)  # largest |rate - mean|, m/s
         moved: wp.array(dtype=wp.float64)  # largest displacement, m
-        blind: wp.array(dtype=wp.float64)  # round-off in a mean of rates, over its limit; above 1 the step is refused
+        round_off_ratio: wp.array(dtype=wp.float64)  # round-off in a mean of rates, over its limit; above 1: failed
         tries: wp.array(dtype=wp.int32)  # consecutive rejections not due to the estimate
         work: wp.array(dtype=wp.int32)  # PCG iterations of the previous substeps
-        kept: wp.array2d(dtype=wp.float64)  # KEPT, in the state
-        counts: wp.array2d(dtype=wp.float64)  # COUNTS
+        kept: wp.array2d(dtype=wp.float64)  # CONTROL_STATE, in the state
+        counts: wp.array2d(dtype=wp.float64)  # STEP_STATISTICS
         horizon: wp.array(dtype=wp.float64)  # [1] s, over which errors may accumulate
         first: wp.array(dtype=wp.float64)  # [1] s, size of the first substep
         tolerance: wp.float64  # m
@@ -182,7 +183,8 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
     ):
         """Largest rate, mean of rates and displacement over free slots. The maximum is independent of the order.
 
-        `arm`: lever arm of an unknown, m: 1 for positions, half the section for gradients across it, else 0.
+        `arm`: displacement over unknown: 1 for positions; half the section, m, for gradients across it; else 0. `free`:
+        1, or 0 for prescribed components.
         """
         world, slot = wp.tid()
         if ctl.flags[world] == 0 or arm[slot] == T(0.0):
@@ -247,16 +249,16 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
         span = ctl.span[world]
         limit = f64(ERROR_FRACTION) * ctl.tolerance / ctl.horizon[0]
         round_off = f64(ROUNDING_UNITS) * ctl.eps * ctl.moved[world]
-        ctl.blind[world] = round_off * ctl.horizon[0] / (f64(RATE_MEMORY) * mean_step * ctl.tolerance)
-        if ctl.blind[world] > f64(1.0):
+        ctl.round_off_ratio[world] = round_off * ctl.horizon[0] / (f64(RATE_MEMORY) * mean_step * ctl.tolerance)
+        if ctl.round_off_ratio[world] > f64(1.0):
             newton.failed[world] = FAIL_FLOOR  # not halved
             return
         rounding = round_off / span
         rate = wp.max(ctl.rate[world] - rounding, f64(0.0))
         part = f64(1.0) / wp.min(ctl.kept[world, 2] + f64(1.0), f64(RATE_MEMORY))
         mean = wp.max(ctl.mean[world] - part * wp.min(rounding, ctl.scatter[world]), f64(0.0))
-        steady = wp.max(mean, rate / f64(RATE_RATIO))
-        ratio = wp.min(rate, steady) / limit
+        effective_rate = wp.max(mean, rate / f64(RATE_RATIO))
+        ratio = wp.min(rate, effective_rate) / limit
         n = wp.static(order) + 1
         if is_first_substep(step, world) != 0:
             n = 2
@@ -282,7 +284,7 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
         pcg.total[world] = 0
         double = f64(2.0) * h
         longer = wp.max(double, f64(MIN_STEP_RATIO) * mean_step)
-        if steady * (power(f64(2.0), n) * span / longer) <= f64(DOUBLING_RATIO) * limit:
+        if effective_rate * (power(f64(2.0), n) * span / longer) <= f64(DOUBLING_RATIO) * limit:
             ctl.kept[world, 0] = double
         else:
             ctl.kept[world, 0] = h

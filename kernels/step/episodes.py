@@ -9,7 +9,7 @@ import warp as wp
 from ..common.types import kernel_module, precision
 from .step_control import REPORT, SAME_TIME, STATUS
 
-__all__ = ["JOINT_VALUES", "MOTION_KINDS", "STATISTICS", "loop_kernels", "observation_kernels"]
+__all__ = ["JOINT_VALUES", "MOTION_KINDS", "STATISTICS", "episode_kernels", "observation_kernels"]
 
 STATISTICS = ("newton", "pcg", "rough", "floored", "residual", "floor", "violation", "energy_growth", "min_J")
 """Columns of the run statistics: sums, then maxima, then minima."""
@@ -22,7 +22,7 @@ JOINT_VALUES = {"length": 0, "travel": 1, "angle": 2}
 
 
 @functools.cache
-def loop_kernels() -> _types.SimpleNamespace:
+def episode_kernels() -> _types.SimpleNamespace:
     """Kernels with one thread per world."""
     f64 = wp.float64
     module = kernel_module("loops", light=True)

@@ -133,7 +133,7 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         scr.speed[world, point] = speed
 
     @wp.kernel(module=module)
-    def settle(
+    def points_at_state(
         con: Contacts, facets: Facets, his: History, time: wp.array(dtype=f64), u: wp.array2d(dtype=vec3),
         scr: ContactScratch
     ):  # fmt: skip
@@ -404,8 +404,8 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         pool[world, facets.pool + i * facets.count + item] = out
 
     return _types.SimpleNamespace(
-        module=module, poses=poses, begin_points=begin_points, settle=settle, explicit_forces=explicit_forces,
-        forces=forces, gather_points=gather_points,
+        module=module, poses=poses, begin_points=begin_points, points_at_state=points_at_state,
+        explicit_forces=explicit_forces, forces=forces, gather_points=gather_points,
         aitken_partial_sums=aitken_partial_sums, relax=relax, update_frozen=update_frozen,
         product_points=product_points, product_facets=product_facets, diagonal=diagonal,
     )  # fmt: skip

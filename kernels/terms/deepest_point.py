@@ -15,7 +15,7 @@ from .contact_colliders import MESHES, collider_functions
 from .contact_point import contact_point_functions
 from .contact_structs import clock_struct, contact_scratch_struct, contact_struct, facet_struct, history_struct
 
-__all__ = ["place_kernels"]
+__all__ = ["deepest_point_kernels"]
 
 MAX_CHOICES = 8
 """Choices of the contact point in an attempt."""
@@ -27,7 +27,7 @@ DIFFERENCE_STEP = 1e-5
 
 
 @functools.cache
-def place_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
+def deepest_point_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
     """Kernels of lumped contacts, in a module of their own; `meshes`: some collider is a triangle mesh."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3

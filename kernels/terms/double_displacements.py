@@ -11,11 +11,11 @@ import warp as wp
 
 from ..common.types import kernel_module
 
-__all__ = ["exact_kernels"]
+__all__ = ["double_displacement_kernels"]
 
 
 @functools.cache
-def exact_kernels() -> _types.SimpleNamespace:
+def double_displacement_kernels() -> _types.SimpleNamespace:
     """Kernels of float32 models, [world, listed slot]."""
     f64, vec3, vec3d = wp.float64, wp.vec3f, wp.vec3d
     module = kernel_module("contact_exact")

@@ -63,8 +63,8 @@ def pair_ledger_kernels(dtype: str) -> _types.SimpleNamespace:
             scr.rows[j, world, row] = f64(0.0)
 
     @wp.func
-    def add_work(rows: wp.array3d(dtype=f64), world: int, row: int, work: f64):
-        """Work of a recovering initial overlap, which the integrator's own formula omits."""
+    def add_overlap_work(rows: wp.array3d(dtype=f64), world: int, row: int, work: f64):
+        """Work of the contact force, J, while an initial overlap is relaxed: the integrator's formula omits it."""
         add(rows, 3, world, row, work)
         add(rows, 4, world, row, work)
 
@@ -83,7 +83,7 @@ def pair_ledger_kernels(dtype: str) -> _types.SimpleNamespace:
     def record_slip(
         scr: ContactScratch, world: int, row: int, depth: f64, area: f64, slipping: int, slip_increment: vec3d
     ):
-        """Add area, slip and sticking area of a point in contact to the record of a facet, and its depth."""
+        """Add slip times area, area and sticking area of a point to the record of a facet; its depth by the maximum."""
         if depth > f64(0.0):
             add(scr.rows, 7, world, row, area * f64(slipping) * wp.length(slip_increment))
             add(scr.rows, 8, world, row, area)
@@ -92,7 +92,7 @@ def pair_ledger_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def record_force(scr: ContactScratch, world: int, row: int, force: vec3d, x: vec3d):
-        """Add a force and its moment to the record of a facet."""
+        """Add a force and its moment about the origin to the record of a facet."""
         moment = wp.cross(x, force)
         for j in range(3):
             add(scr.rows, j, world, row, force[j])
@@ -100,7 +100,7 @@ def pair_ledger_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def return_mapping(law: int, s: PointContact, frozen: vec3d, w: wp.vec4d, tangential_force: vec3d) -> vec3d:
-        """Friction spring after the force was cut to the friction limit; Eq. (83) for the paper's law."""
+        """Elastic slip, m, after the force was cut to the friction limit; Eq. (83) of Paper I for the paper's law."""
         trial = vec3d(w[0], w[1], w[2])
         size = wp.length(trial)
         if size <= frozen[0]:
@@ -185,7 +185,9 @@ def pair_ledger_kernels(dtype: str) -> _types.SimpleNamespace:
             add(energies, 0, world, row, area_fraction * stored)
             add(energies, 1, world, row, area_fraction * (normal - spring[0]) * s.depth_increment)
             add(energies, 2, world, row, area_fraction * friction_loss)
-            add_work(energies, world, row, area_fraction * normal * overlap_recovery(con, his, clock, world, c, point))
+            add_overlap_work(
+                energies, world, row, area_fraction * normal * overlap_recovery(con, his, clock, world, c, point)
+            )
             place = surface_point(mas, pair.C, pair.D, world, f, pair.xi[world, point])
             add(scr.rows, 6, world, row, area_fraction * normal)
             record_force(scr, world, row, (mas.sign[c] * area_fraction) * force, place.x)
@@ -204,11 +206,12 @@ def pair_ledger_kernels(dtype: str) -> _types.SimpleNamespace:
             scr.rows[10 + j, world, row] = energies[j, world, row]
 
     @wp.kernel(module=module)
-    def store_times(
+    def add_energy_bound(
         clock: Clock, potential: wp.array(dtype=f64), term_sums: wp.array2d(dtype=f64),
         accepted: wp.array(dtype=wp.int32), his: History, scr: ContactScratch,
     ):  # fmt: skip
-        """Add the contact energy to the bound of the next initial iterate."""
+        """Store the time of the accepted state, advance the elapsed time; add the contact energy, J, to the bound of
+        the next initial iterate."""
         world = wp.tid()
         if accepted[world] == 0:
             return
@@ -216,4 +219,4 @@ def pair_ledger_kernels(dtype: str) -> _types.SimpleNamespace:
         scr.elapsed[world] = scr.elapsed[world] + clock.h[world]
         potential[world] = potential[world] + term_sums[1, world]
 
-    return _types.SimpleNamespace(record_substep=record_substep, store_times=store_times)
+    return _types.SimpleNamespace(record_substep=record_substep, add_energy_bound=add_energy_bound)

@@ -62,7 +62,7 @@ class MasterFacets:
     Attributes:
         conn: (F, L) body slots of the facets' elements.
         shape, director_shape: (F, M, L) coefficients of functions, and of their outward derivatives, 1/m.
-        X, N: (F, M, 3) coefficients of the reference position, m, and of the outward vector.
+        X, N: (F, M, 3) monomial coefficients of the reference position, m, and of the outward vector.
         corners, degree: of the polynomials of all facets.
         size: (F,) length of a side, m.
         depth_limit: (F,) half the thickness of the body behind it, m.
@@ -101,7 +101,7 @@ def exponents(corners: int, degree: int) -> np.ndarray:
     return np.array([(i, j) for i in range(degree + 1) for j in range(degree + 1) if corners == 4 or i + j <= degree])
 
 
-def nodes_of(corners: int, degree: int) -> np.ndarray:
+def interpolation_nodes(corners: int, degree: int) -> np.ndarray:
     """(M, 2) interpolation points of such a polynomial."""
     return exponents(corners, degree) / degree
 
@@ -114,7 +114,7 @@ def monomials(points: np.ndarray, corners: int, degree: int) -> np.ndarray:
 def bernstein(corners: int, degree: int) -> np.ndarray:
     """(M, M): control points of Bernstein's form, whose convex hull holds the facet, from monomial coefficients."""
     powers = exponents(corners, degree)
-    nodes = nodes_of(corners, degree)
+    nodes = interpolation_nodes(corners, degree)
     if corners == 4:
         values = [math.comb(degree, i) * math.comb(degree, j) * nodes[:, 0] ** i * (1 - nodes[:, 0]) ** (degree - i)
                   * nodes[:, 1] ** j * (1 - nodes[:, 1]) ** (degree - j) for i, j in powers]  # fmt: skip
@@ -181,7 +181,7 @@ def master_facets(surface: SurfaceSet) -> MasterFacets:
     check = PAIR_RULES[corners][16].points
     wanted = _functions(surface, check)[0]
     for degree in (1, 2, 3):
-        ab = nodes_of(corners, degree)
+        ab = interpolation_nodes(corners, degree)
         inverse = np.linalg.inv(monomials(ab, corners, degree))
         shape, gradient, normal = _functions(surface, ab)
         fitted = np.einsum("qm,mn,fns->fqs", monomials(check, corners, degree), inverse, shape)

@@ -1,7 +1,7 @@
 """Pictures and animations: `PNGWriter` and `GIFWriter` of a run, `render_usd` of a file made by `USDWriter`.
 
-Common layout: worlds on the grid of the USD file, a camera that frames the whole motion, one colour range for all
-frames, a colour bar and the time.
+Common layout: parallel worlds on the same grid as in the USD file, a camera that frames the whole motion, one colour
+range for all frames, a colour bar and the time.
 """
 
 from __future__ import annotations

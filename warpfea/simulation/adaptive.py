@@ -11,7 +11,7 @@ import warp as wp
 
 from ..base.checks import is_number, number_hint
 from ..base.errors import ModelError
-from ..kernels.step.adaptive import COUNTS, KEPT, adaptive_kernels, adaptive_struct
+from ..kernels.step.adaptive import CONTROL_STATE, STEP_STATISTICS, adaptive_kernels, adaptive_struct
 from ..solvers.newton import EPS, NewtonPCG
 from .integrators import INTEGRATORS, Integrator
 from .sync_times import SyncTimes
@@ -127,9 +127,9 @@ class StepSizeControl:
         self.kernels = adaptive_kernels(model.dtype, scheme)
         self.dim = (model.worlds, model.slots)
         self.arm = model.array("adaptive", _lever_arms(model), model.types.T)
-        shapes = {"counts": (model.worlds, len(COUNTS)), "horizon": (1,), "first": (1,)}
+        shapes = {"counts": (model.worlds, len(STEP_STATISTICS)), "horizon": (1,), "first": (1,)}
         self.control: Any = work.struct(adaptive_struct(), model.worlds, skip=("kept",), **shapes)
-        self.control.kept = ctx.state.register("adaptive", wp.float64, (len(KEPT),))
+        self.control.kept = ctx.state.register("adaptive", wp.float64, (len(CONTROL_STATE),))
         self.means = ctx.state.register("adaptive_means", model.types.vec3, (model.slots,))
         self.control.tolerance = options.error * float(model.size)
         self.control.eps = EPS[model.dtype]
@@ -178,10 +178,10 @@ class StepSizeControl:
 
     def least_error(self, world: int) -> float:
         """Smallest tolerance, over the model's size, that round-off lets the estimates meet; 0 if they meet theirs."""
-        blind = float(self.control.blind.numpy()[world])
-        return blind * self.error if blind > 1.0 else 0.0
+        round_off_ratio = float(self.control.round_off_ratio.numpy()[world])
+        return round_off_ratio * self.error if round_off_ratio > 1.0 else 0.0
 
     def counts(self) -> dict[str, np.ndarray]:
-        """Counts of the last step, each (B,), see COUNTS."""
+        """Counts of the last step, each (B,), see STEP_STATISTICS."""
         rows = self.control.counts.numpy()
-        return {name: rows[:, k].astype(int if k < 2 else float) for k, name in enumerate(COUNTS)}
+        return {name: rows[:, k].astype(int if k < 2 else float) for k, name in enumerate(STEP_STATISTICS)}

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from ..kernels.step.episodes import STATISTICS, loop_kernels
+from ..kernels.step.episodes import STATISTICS, episode_kernels
 
 if TYPE_CHECKING:
     from ..base.launch import Launcher
@@ -42,7 +42,7 @@ class Episodes:
 
     def modules(self) -> set[wp.Module]:
         """Modules launched."""
-        return set() if self.tally is None and self.ends is None else {loop_kernels().module}
+        return set() if self.tally is None and self.ends is None else {episode_kernels().module}
 
     def set_run_end(self, end: float = math.inf, steps: int = 0) -> None:
         """Set the end, s, and the number of steps of a run; inf: no run."""
@@ -53,12 +53,12 @@ class Episodes:
         """Freeze worlds that have reached their end time, at the start of a step or after its report."""
         step = self.work.step
         if self.ends is not None:
-            self.launch(loop_kernels().end_episodes, self.worlds, [step.time, self.ends, step.dt, step.status])
+            self.launch(episode_kernels().end_episodes, self.worlds, [step.time, self.ends, step.dt, step.status])
 
     def end_step(self) -> None:
         """Accumulate the statistics of a reported step."""
         if self.tally is not None:
-            self.launch(loop_kernels().add_statistics, self.worlds, [self.work.report, self.tally, self.stepped])
+            self.launch(episode_kernels().add_statistics, self.worlds, [self.work.report, self.tally, self.stepped])
         self.freeze_finished()
 
     def read_totals(self) -> tuple[np.ndarray, np.ndarray]:
@@ -71,7 +71,7 @@ class Episodes:
 
     def _clear(self) -> None:
         assert self.tally is not None
-        self.launch(loop_kernels().clear_statistics, self.tally.shape, [self.tally])
+        self.launch(episode_kernels().clear_statistics, self.tally.shape, [self.tally])
 
     def as_flags(self, mask: wp.array) -> wp.array:
         """Copy a mask of int32 or bool to a persistent int32 array: the mask itself may be reset."""
@@ -88,10 +88,10 @@ class Episodes:
         if self.stepped is None:
             return
         if isinstance(worlds, wp.array):
-            self.launch(loop_kernels().clear_chosen, self.worlds, [worlds, self.stepped])
+            self.launch(episode_kernels().clear_chosen, self.worlds, [worlds, self.stepped])
         else:
             self.stepped.assign(np.where(worlds, 0, self.stepped.numpy()))
 
     def copy_flagged(self, flags: wp.array, source: Any, target: wp.array) -> None:
         """Copy one value of the flagged worlds on the device."""
-        self.launch(loop_kernels().copy_chosen, self.worlds, [flags, source, target])
+        self.launch(episode_kernels().copy_chosen, self.worlds, [flags, source, target])

@@ -36,7 +36,7 @@ ITERATIONS, SOLVE_FACTOR, MAX_ITERATIONS = 500, 0.3, 20_000
 """Iteration limits: larger of ITERATIONS and SOLVE_FACTOR times the solve's; with unstable="refuse" MAX_ITERATIONS."""
 CURVATURE_ROUNDINGS = 64.0
 """Round-off units of p.D p (D: diagonal of H) below which the sign of p.H p is unknown."""
-CLEAR = 1024.0
+CLEAR_ROUNDINGS = 1024.0
 """The same units: float32 curvatures above need no float64 tangent."""
 ROUNDOFF_CHANGES = 4.0
 """Smallest float32 |p.H p| of known sign, over its change by one more rounding of the state."""
@@ -148,14 +148,14 @@ def check_stability(sim: Simulation, *, every: bool = False) -> Stability:
 def _clear(sim: Simulation, out: Stability) -> bool:
     """Decide by the float32 tangent if all its curvatures are far above round-off; False if float64 is needed.
 
-    H in float32 is off by some roundings of p.D p: a world whose curvature exceeds CLEAR of them in each direction of
-    the search is stable. Unstable worlds and forces without a potential need float64.
+    H in float32 is off by some roundings of p.D p: a world whose curvature exceeds CLEAR_ROUNDINGS of them in each
+    direction of the search is stable. Unstable worlds and forces without a potential need float64.
     """
     if any(not term.potential for term in sim.model.terms):
         return False
     found = Stability(out.stable.copy(), list(out.reasons), out.mode, out.iterations.copy())
     most = np.full(sim.model.worlds, ITERATIONS)
-    _find_negative_curvature(TangentOperator(sim), found, most, CLEAR)
+    _find_negative_curvature(TangentOperator(sim), found, most, CLEAR_ROUNDINGS)
     if any(s is not True and not reason for s, reason in zip(found.stable, out.reasons)):
         return False
     out.stable[:], out.iterations[:] = found.stable, found.iterations

@@ -18,7 +18,7 @@ from ..kernels.step.step import step_kernels
 from ..kernels.step.step_control import REPORT
 from ..model.state import State
 from ..solvers import Jacobi, NewtonPCG, make_loop
-from ..terms.checks import check_measured
+from ..terms.checks import check_stored_energy
 from ..terms.term import StepContext, Term
 from ..terms.workspace import Workspace
 from .adaptive import AdaptiveOptions, StepSizeControl
@@ -146,7 +146,7 @@ class Stepper:
             w.step.previous_end = state.acceleration_end if self.integrator.accelerated else state.previous_end
         if self.ledger:
             w.step.ledger_time = state.ledger_time
-            self.booked = self.terms.booked(w)
+            self.increments = self.terms.increment_table(w)
 
     def start_terms(self, mask: np.ndarray | None = None) -> None:
         """Reinitialise terms after the state of the masked worlds was set."""
@@ -171,7 +171,7 @@ class Stepper:
         ledger[mask, :3] = self._stored_energies()[mask]
         for term in self.terms:
             measured = term.stored_energy(self.ctx)
-            check_measured(term, measured, m.worlds)
+            check_stored_energy(term, measured, m.worlds)
             for name, values in measured.items():
                 ledger[mask, columns.index(name)] = values[mask]
         self.state.ledger.assign(ledger)
@@ -426,7 +426,7 @@ class Stepper:
         launch(self.kernels.ledger_rows, self.dim, args)
         reduce(w.rows, LEDGER_ROWS, accepted, w.ledger_sums)
         self.terms.energy_increments(self.ctx, reduce, accepted)
-        args = [w.step, w.newton, w.ledger_sums, self.booked, state.ledger]
+        args = [w.step, w.newton, w.ledger_sums, self.increments, state.ledger]
         launch(self.kernels.ledger_update, m.worlds, args)
 
     def _upload_probes(self) -> list[wp.array]:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 __all__ = ["warn_early_ends", "warn_initial_jumps"]
 
-START_JUMP = 1e-4
+INITIAL_JUMP_RATIO = 1e-4
 """Smallest reported distance of driven nodes from the start of their law, over the model's size; joints raise an
 error."""
 END_SLOPE, PULSE_END = 0.05, 1e-9
@@ -76,7 +76,7 @@ def warn_initial_jumps(sim: Any) -> None:
         if law is None or id(law) not in values:
             continue
         worst = float(np.linalg.norm(_drive_error(support, values, u), axis=1).max(initial=0.0))
-        if not worst > START_JUMP * sim.model.size:
+        if not worst > INITIAL_JUMP_RATIO * sim.model.size:
             continue
         warnings.warn(
             f"initial jump of {worst:.3g} m: {law.name} at t = {time:g} s differs from the nodes' positions: start it "

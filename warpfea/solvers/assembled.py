@@ -46,7 +46,7 @@ class Pattern:
     data: Any
     upper: np.ndarray
 
-    def find(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    def find_upper(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """Indices into `upper` of entries (row, column) on or above the diagonal; -1 for others."""
         n = np.int64(self.graph.shape[0])
         key = self.upper[:, 2].astype(np.int64) * n + self.upper[:, 3]

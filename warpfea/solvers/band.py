@@ -172,7 +172,7 @@ class BandFactor:
             args = [self.pattern.data, value, b.place_of, b.width, self.shift, self.doing, self.factors]
             launch(k.fill, (self.worlds, slots), args)
             launch(k.factor, self.worlds, [b.width, self.doing, self.bad, self.factors])
-        launch(k.settle, self.worlds, [self.bad, self.doing, self.shift, self.again, self.exact])
+        launch(k.raise_shift, self.worlds, [self.bad, self.doing, self.shift, self.again, self.exact])
 
     def solve(self, r: wp.array, z: wp.array, active: wp.array) -> None:
         """z = A^-1 r, [world, slot]."""

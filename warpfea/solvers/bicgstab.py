@@ -36,7 +36,7 @@ class BiCGStab(PCG):
         launch(k.begin, self.model.worlds, [w.newton, w.pcg, bi])
         self._recur()
         bi.any_again.zero_()
-        launch(k.finish, self.model.worlds, [w.newton, w.pcg, bi, 1])
+        launch(k.mark_restarts, self.model.worlds, [w.newton, w.pcg, bi, 1])
         with launch.rare():
             wp.capture_if(bi.any_again, self._restart)
 
@@ -45,9 +45,9 @@ class BiCGStab(PCG):
         w, k, launch, bi = self.work, self.recursion, self.launch, self.control
         self._precondition(w.r, w.z, bi.again)
         w.pcg.any_active.zero_()
-        launch(k.begin_again, self.model.worlds, [w.newton, w.pcg, bi])
+        launch(k.restart, self.model.worlds, [w.newton, w.pcg, bi])
         self._recur()
-        launch(k.finish, self.model.worlds, [w.newton, w.pcg, bi, 0])
+        launch(k.mark_restarts, self.model.worlds, [w.newton, w.pcg, bi, 0])
 
     def _recur(self) -> None:
         """Iterate from r and z = B r; keep the best iterate."""
@@ -66,10 +66,10 @@ class BiCGStab(PCG):
         launch(k.first_length, m.worlds, [w.pcg, bi])
         launch(k.first_step, self.dim, [w.pcg, bi, self.y, w.Hp, w.direction, w.r])
         self._precondition(w.r, w.z, active)
-        launch(k.look, m.worlds, [w.pcg, bi])
+        launch(k.check_half_step, m.worlds, [w.pcg, bi])
         self.residual.product(w.z, self.t, active)
-        launch(k.second_rows, self.dim, [w.pcg, w.diagonal, w.r, self.t, self.shadow, w.rows])
+        launch(k.second_dot_terms, self.dim, [w.pcg, w.diagonal, w.r, self.t, self.shadow, w.rows])
         reduce(w.rows, BICGSTAB_ROWS, active, bi.sums)
         launch(k.second_length, m.worlds, [w.pcg, bi])
         launch(k.second_step, self.dim, [w.pcg, bi, w.z, self.t, w.Hp, w.direction, w.r, w.p, *self.best])
-        launch(k.close, m.worlds, [w.pcg, bi])
+        launch(k.deactivate_finished, m.worlds, [w.pcg, bi])

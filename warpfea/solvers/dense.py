@@ -11,7 +11,7 @@ import scipy.sparse as sp
 import warp as wp
 
 from ..kernels.common.types import precision
-from ..kernels.solvers.dense_components import part_kernels
+from ..kernels.solvers.dense_components import dense_component_kernels
 from ..kernels.solvers.levels import LANES, TILE, level_kernels
 from ..kernels.solvers.levels_build import build_kernels
 
@@ -88,7 +88,7 @@ class DenseInverse:
         self.worlds, self.launch, self.unknowns, self.parts = B, launch, unknowns, parts
         self.kernels, self.making = level_kernels(model.dtype, storage), build_kernels(model.dtype, storage)
         if parts:
-            self.by_part = part_kernels(model.dtype)
+            self.by_part = dense_component_kernels(model.dtype)
             B *= parts.count
             unknowns = 3 * parts.most
             self.flags = work.array(f"{name} flags", (B,), wp.int32)

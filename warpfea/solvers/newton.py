@@ -381,7 +381,7 @@ class NewtonLoop:
     def _update_frozen(self) -> None:
         """Update lagged term data (friction limits, multipliers) after convergence with frozen values."""
         w, flags = self.work, self.work.newton.trial_accepted
-        self.launch(self.kernels.begin_refresh, self.model.worlds, [w.newton, flags])
+        self.launch(self.kernels.begin_frozen_update, self.model.worlds, [w.newton, flags])
         self._reduce_flags(flags, self.searching)
         wp.capture_if(self.searching, self._reevaluate_frozen)
 
@@ -389,7 +389,7 @@ class NewtonLoop:
         w, flags = self.work, self.work.newton.trial_accepted
         self._call_terms("update_frozen", flags)
         self.residual.reevaluate_frozen(flags)
-        self.launch(self.kernels.end_refresh, self.model.worlds, [w.newton, flags])
+        self.launch(self.kernels.end_frozen_update, self.model.worlds, [w.newton, flags])
         self._if_rare(self._check_inversion)
 
     @labelled("control")

@@ -44,7 +44,7 @@ class PCG:
         m, w, k, launch = self.model, self.work, self.kernels, self.launch
         launch(k.start, self.dim, [w.gradient, m.topology.free, active, w.direction, w.r])
         if m.component_count > 1:
-            launch(k.silence, self.dim, [w.newton, m.component_of_slot, active, w.r])
+            launch(k.zero_converged, self.dim, [w.newton, m.component_of_slot, active, w.r])
         self.correct_translations(active)
         self.preconditioner.prepare(active)
         self._precondition(w.r, w.z, active)

@@ -17,11 +17,11 @@ if TYPE_CHECKING:
 
 __all__ = [
     "check_columns",
+    "check_energy_increments",
     "check_made",
-    "check_measured",
     "check_names",
-    "check_rows",
     "check_stored",
+    "check_stored_energy",
     "check_tables",
     "derived_traits",
     "stored_columns",
@@ -33,11 +33,11 @@ RESERVED = ("work",)
 
 
 def check_made(term: Any, make: Any, model: Model) -> None:
-    """Raise ModelError unless the maker returned a named term of this model."""
+    """Raise ModelError unless the function given to add_term returned a named term of this model."""
     if not isinstance(term, Term):
         raise ModelError(f"add_term: {make!r} returned {term!r}; expected a warpfea.terms.Term, or None")
     if not isinstance(getattr(term, "name", None), str) or not term.name:
-        raise ModelError(f"term {type(term).__name__}: `name` must be a text, such as name = 'contact'")
+        raise ModelError(f"term {type(term).__name__}: `name` must be a non-empty string, such as name = 'contact'")
     if not hasattr(term, "connectivity"):
         raise ModelError(f"term {term.name!r}: its __init__ must call super().__init__(model)")
     if term.model is not model:
@@ -45,9 +45,9 @@ def check_made(term: Any, make: Any, model: Model) -> None:
 
 
 def check_names(terms: Sequence[Term], taken: Sequence[str], what: str, names: Any) -> None:
-    """Raise ModelError for a duplicate or reserved name; `names` maps a term to its names.
+    """Raise ModelError for a duplicate or reserved name; `names(term)`: dict of name and specification.
 
-    Two terms may share a field whose specification defines the join.
+    Two terms may share a field whose specification says how their values are merged (`join`).
     """
     owner: dict[str, Term] = {}
     for term in terms:
@@ -71,7 +71,7 @@ def derived_traits(term: Term) -> Traits:
     if term.traits.tangent and kind.product is Term.product:
         raise ModelError(f"term {term.name!r} declares the trait 'tangent', but does not override product")
     if term.traits.stored and term.connectivity and not term.rows:
-        raise ModelError(f"term {term.name!r} declares the trait 'stored', but sets no rows")
+        raise ModelError(f"term {term.name!r} declares the trait 'stored', but has rows = 0 (rows of stored energy)")
     entries = any(conn.size for conn in term.connectivity)
     tangent = entries and not term.potential and kind.product is not Term.product
     return term.traits._replace(
@@ -104,12 +104,14 @@ def _arrays(term: Term) -> Sequence[Any]:
 
 
 def check_stored(terms: Sequence[Term]) -> None:
-    """Raise ModelError for a column of stored energy with two terms: it holds the present amount and can't add up."""
+    """Raise ModelError for a column of stored energy of two terms: it holds a current value, J, not an increment."""
     every = [(column.name, term.name) for term in terms for column in term.columns if column.name]
     for name in (name for term in terms for name in stored_columns(term)):
         owners = [owner for other, owner in every if other == name]
         if len(owners) > 1:
-            raise ModelError(f"energy column {name!r} is written twice: by {owners[0]!r} and {owners[1]!r}")
+            raise ModelError(
+                f"energy column {name!r} stores energy and is shared by {owners[0]!r} and {owners[1]!r}: rename one"
+            )
 
 
 def stored_columns(term: Term) -> list[str]:
@@ -118,7 +120,7 @@ def stored_columns(term: Term) -> list[str]:
 
 
 def check_columns(term: Term, *, own: bool) -> None:
-    """Raise ModelError unless a term's ledger columns are valid; `own`: a term of warpfea."""
+    """Raise ModelError unless a term's ledger columns are valid; `own`: a built-in term."""
     kind = type(term)
     if term.columns and kind.energy_increments is Term.energy_increments:
         raise ModelError(f"term {term.name!r} has columns, but does not override energy_increments")
@@ -129,13 +131,11 @@ def check_columns(term: Term, *, own: bool) -> None:
         if column.kind in (STORED, WORK, LOSS) and not column.name:
             raise ModelError(f"{where}: {KINDS[column.kind]} needs a name, the column of energies()")
         if column.kind == STORED and kind.stored_energy is Term.stored_energy:
-            raise ModelError(
-                f"{where}: override stored_energy, its stored energy: the ledger restarts from it after a reset"
-            )
+            raise ModelError(f"{where}: override stored_energy: the ledger restarts from its value after a reset")
         if own:
             continue
         if column.kind == EXPLICIT_VISCOUS:
-            raise ModelError(f"{where}: EXPLICIT_VISCOUS is for damping among the dead loads")
+            raise ModelError(f"{where}: EXPLICIT_VISCOUS is reserved for explicit damping terms of warpfea")
         if column.name in (*LEDGER, *RESERVED):
             raise ModelError(f"{where}: the ledger has a column of its own by this name")
         if column.kind == WORK and not column.name.startswith("work_"):
@@ -144,7 +144,7 @@ def check_columns(term: Term, *, own: bool) -> None:
             raise ModelError(f"{where}: columns named work_... count in energies()['work'], this one is no work")
 
 
-def check_measured(term: Term, values: Any, worlds: int) -> None:
+def check_stored_energy(term: Term, values: Any, worlds: int) -> None:
     """Raise ModelError unless `stored_energy` returned all columns of stored energy."""
     if not isinstance(values, dict) or set(values) != set(stored_columns(term)):
         values = values if isinstance(values, dict) else [repr(values)]
@@ -159,7 +159,7 @@ def check_measured(term: Term, values: Any, worlds: int) -> None:
             )
 
 
-def check_rows(term: Term, rows: Any, worlds: int, longest: int) -> None:
+def check_energy_increments(term: Term, rows: Any, worlds: int, max_items: int) -> None:
     """Raise ModelError unless `energy_increments` returned rows (columns, worlds, items) in float64."""
     import warp as wp
 
@@ -169,10 +169,10 @@ def check_rows(term: Term, rows: Any, worlds: int, longest: int) -> None:
     count = len(term.columns)
     if rows.ndim != 3 or rows.dtype != wp.float64 or rows.shape[0] < count or rows.shape[1] != worlds:
         raise ModelError(
-            f"{where} {rows.dtype.__name__}{list(rows.shape)}; expected float64[{count}, {worlds}, items]: a row per "
-            "column and world"
+            f"{where} {rows.dtype.__name__}{list(rows.shape)}; expected float64[at least {count}, {worlds}, items]: a "
+            "row per column and world"
         )
-    if rows.shape[2] > longest:
+    if rows.shape[2] > max_items:
         raise ModelError(
-            f"{where} {rows.shape[2]} items a row; at most {longest} can be summed unless build sets increment_rows"
+            f"{where} {rows.shape[2]} items a row; at most {max_items} can be summed unless build sets increment_rows"
         )

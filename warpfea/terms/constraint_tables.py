@@ -376,7 +376,7 @@ class ConstraintTables:
             i, j = np.meshgrid(np.arange(len(slot)), np.arange(len(slot)), indexing="ij")
             keep = slot[i] <= slot[j]
             i, j = i[keep], j[keep]
-            items.append(pattern.find(slot[i], slot[j]))
+            items.append(pattern.find_upper(slot[i], slot[j]))
             term_a.append(term[i])
             term_b.append(term[j])
             weight.append(w[i] * w[j])

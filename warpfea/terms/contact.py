@@ -131,7 +131,7 @@ class Contact(Term):
             "clock": clock,
             # Newton's method only; unused by Jacobi's iteration
             "touching": work.newton.contact_active,
-            "energies": work.array("contact booked", (ENERGY_COLUMNS, B, R), wp.float64),
+            "energies": work.array("contact energies", (ENERGY_COLUMNS, B, R), wp.float64),
             "parts": work.array("contact parts", (B, C, len(RECORD), RECORD_LANES), wp.float64),
             "row_start": self.model.array("contact", t.row_start, wp.int32),
             "u": self.exact.allocate(work, self.name) if self.exact else work.u,

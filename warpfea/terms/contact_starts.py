@@ -18,17 +18,17 @@ if TYPE_CHECKING:
 
 __all__ = ["reference_place", "refuse_sunk", "store_overlaps", "touching_depth"]
 
-TOUCHING = 1e-9
+TOUCH_TOL = 1e-9
 """Initial depth over the model's size treated as touching; round-off of displacements is added."""
 
-SUNK = 0.1
+MIN_SUNK_RATIO = 0.1
 """Smallest depth, over the depth limit of the body's thinnest facet, at which an unassigned point counts as inside: the
 inside test uses flat triangles."""
 
 
 def touching_depth(size: float, u: np.ndarray) -> np.ndarray:
     """Largest depth (worlds,), m, treated as touching, at displacements u (worlds, slots, 3)."""
-    return np.asarray(TOUCHING * size + 4.0 * np.finfo(u.dtype).eps * np.abs(u).max(axis=(1, 2)))
+    return np.asarray(TOUCH_TOL * size + 4.0 * np.finfo(u.dtype).eps * np.abs(u).max(axis=(1, 2)))
 
 
 def reference_place(tables: ContactTables | PairTables, k: int, point: int) -> str:
@@ -84,7 +84,7 @@ def refuse_sunk(tables: PairTables, u: np.ndarray, places: np.ndarray, facets: n
             continue
         body, points = contact.master.body, slice(tables.first[k], tables.first[k + 1])
         limit = tables.masters[tables.of[k]].depth_limit
-        least = SUNK * float(limit.min())
+        least = MIN_SUNK_RATIO * float(limit.min())
         beyond = (0.0 if body.family.solid else float(limit.max())) - least  # margin of the nodal bounding box
         nodes = body.slot_kind == 0
         spans = body.reference[nodes] + body.origin + u[:, body.slots[nodes]]

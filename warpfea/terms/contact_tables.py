@@ -174,7 +174,7 @@ def block_entries(model: Model, conn: np.ndarray, pattern: Any) -> tuple[wp.arra
     a, b = (x.ravel() for x in np.indices((conn.shape[1],) * 2))
     facet = np.repeat(np.arange(len(conn)), len(a))
     a, b = np.tile(a, len(conn)), np.tile(b, len(conn))
-    index = pattern.find(conn[facet, a], conn[facet, b])
+    index = pattern.find_upper(conn[facet, a], conn[facet, b])
     chosen = np.flatnonzero(index >= 0)
     chosen = chosen[np.argsort(index[chosen], kind="stable")]
     entry, count = np.unique(index[chosen], return_counts=True)

@@ -9,7 +9,7 @@ import warp as wp
 
 from ..base.launch import Launcher
 from ..kernels.terms.contact_structs import clock_struct
-from ..kernels.terms.deepest_point import place_kernels
+from ..kernels.terms.deepest_point import deepest_point_kernels
 from ..model.state import State
 from .contact_tables import ContactTables
 
@@ -25,7 +25,7 @@ class DeepestPoints:
 
     def __init__(self, tables: ContactTables) -> None:
         self.tables = tables
-        self.kernels = place_kernels(tables.model.dtype, tables.meshes)
+        self.kernels = deepest_point_kernels(tables.model.dtype, tables.meshes)
 
     def choose(
         self, launch: Launcher, s: dict[str, Any], time: wp.array, u: wp.array, state: tuple[wp.array, wp.array],
@@ -90,7 +90,9 @@ def at_points(term: Any, state: State, history: Any = None, places: bool = True)
         term.exact.widen(launch, state.displacement, every, u)
     for group in t.groups:
         dim = (B, group.count, group.data.points)
-        launch(term.kernels.settle, dim, [t.data, group.data, history, state.time, state.displacement, attempt])
+        launch(
+            term.kernels.points_at_state, dim, [t.data, group.data, history, state.time, state.displacement, attempt]
+        )
     if term.deepest_points:
         clock = clock_struct()()
         clock.time, clock.still = state.time, 1

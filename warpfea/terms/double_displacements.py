@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from ..base.launch import Launcher
-from ..kernels.terms.double_displacements import exact_kernels
+from ..kernels.terms.double_displacements import double_displacement_kernels
 from .term import StepContext
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ class DoubleDisplacements:
     """
 
     def __init__(self, model: Model, connectivity: list[np.ndarray]) -> None:
-        self.kernels = exact_kernels()
+        self.kernels = double_displacement_kernels()
         slots = np.unique(np.concatenate([conn.ravel() for conn in connectivity]))
         self._slots = model.array("contact", slots, wp.int32)
 

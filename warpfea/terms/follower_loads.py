@@ -170,7 +170,7 @@ class FollowerMatrix:
     def _find(self, conn: np.ndarray, pattern: Any) -> tuple[Any, int]:
         """Pattern entries of the items' matrices."""
         i, j, item = (a.ravel() for a in np.indices((self.slots, self.slots, self.count)))
-        index = pattern.find(conn[i, item], conn[j, item])
+        index = pattern.find_upper(conn[i, item], conn[j, item])
         chosen = np.flatnonzero(index >= 0)
         chosen = chosen[np.argsort(index[chosen], kind="stable")]
         entry, count = np.unique(index[chosen], return_counts=True)

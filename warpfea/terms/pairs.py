@@ -158,7 +158,7 @@ class Pairs(PairSolves):
             "masters": t.masters_of(tree.id),
             "clock": clock,
             "active": work.newton.contact_active,
-            "energies": work.array("pairs booked", (ENERGY_COLUMNS, B, R), wp.float64),
+            "energies": work.array("pairs energies", (ENERGY_COLUMNS, B, R), wp.float64),
             "parts": work.array("pairs parts", (B, C, len(RECORD), RECORD_LANES), wp.float64),
             "row_start": m.array("contact", t.row_start, wp.int32),
             "u": self.exact.allocate(work, self.name) if self.exact else work.u,
@@ -345,7 +345,7 @@ class Pairs(PairSolves):
         if not s["finished"]:  # no ledger, `energy_increments` not called
             self._finish(ctx, accepted)
         args = [s["clock"], w.newton.potential, w.newton.term_sums, accepted, s["history"], s["attempt"]]
-        ctx.launch(self.pair_ledger_kernels.store_times, self.model.worlds, args)
+        ctx.launch(self.pair_ledger_kernels.add_energy_bound, self.model.worlds, args)
 
     def report(self, ctx: StepContext) -> None:
         args = [ctx.scratch[self.name]["attempt"], self.report_offset, ctx.work.report]

@@ -19,7 +19,15 @@ from ..kernels.step.step_control import REPORT
 from ..model import assembly
 from ..model.state import SOLVER_MEMORY
 from .body_forces import BodyForces
-from .checks import check_columns, check_made, check_names, check_rows, check_stored, check_tables, derived_traits
+from .checks import (
+    check_columns,
+    check_energy_increments,
+    check_made,
+    check_names,
+    check_stored,
+    check_tables,
+    derived_traits,
+)
 from .constraints import Constraints
 from .contact import Contact
 from .damping import Damping
@@ -296,7 +304,7 @@ class TermSet:
         """Terms with ledger rows."""
         return [term for term in self.all if term.columns]
 
-    def booked(self, work: Any) -> Any:
+    def increment_table(self, work: Any) -> Any:
         """Device table of the ledger columns of the terms; `energy_increments` fills their sums."""
         columns = [column for term in self.booking for column in term.columns]
         out = term_energies_struct()()
@@ -306,7 +314,7 @@ class TermSet:
         out.nonpotential = wp.array(held, dtype=wp.int32, device=device)
         numbers = [self.ledger.index(c.name) if c.name else -1 for c in columns]
         out.column = wp.array(numbers, dtype=wp.int32, device=device)
-        out.sums = work.booked
+        out.sums = work.increment_sums
         return out
 
     def energy_increments(self, ctx: StepContext, reduce: Any, accepted: wp.array) -> None:
@@ -315,8 +323,8 @@ class TermSet:
         for term in self.booking:
             rows, count = term.energy_increments(ctx, accepted), len(term.columns)
             if rows is not None:
-                check_rows(term, rows, self.model.worlds, ctx.work.longest)
-                reduce(rows, count, accepted, ctx.work.booked[first : first + count])
+                check_energy_increments(term, rows, self.model.worlds, ctx.work.longest)
+                reduce(rows, count, accepted, ctx.work.increment_sums[first : first + count])
             first += count
 
     def modules(self, ctx: StepContext) -> set[wp.Module]:

@@ -79,8 +79,8 @@ class Workspace:
         self.pool_block = self.array("pool_block", pool, model.types.sym) if traits.pooled else self.block_contribution
         rows = (TERM_ROWS, B, terms.rows) if traits.stored else (1, 1, 1)
         self.term_rows = self.array("term_rows", rows, wp.float64) if traits.stored else None
-        booked = sum(len(term.columns) for term in terms)
-        self.booked = self.array("booked", (max(booked, 1), B), wp.float64)
+        columns = sum(len(term.columns) for term in terms)
+        self.increment_sums = self.array("increment_sums", (max(columns, 1), B), wp.float64)
         self.history = self.array("history", (B, max(model.history_count, 1)), model.types.sym)
         # scratch for kernels whose sums are unused
         self.spare_rows = self.array("spare_rows", (2, B, n) if traits.constraint_rows else (1, 1, 1), wp.float64)

@@ -21,7 +21,7 @@ GROUP = "contact"
 SIDE, DENSITY, G = 0.1, 1000.0, 9.81
 MODULI, STEPS = (1e4, 1e6, 1e8, 1e11), (1e-5, 1e-3, 1e-2)
 GRID = tuple((E, h) for E in MODULI for h in STEPS)
-NAMED = {dtype: ["collider", "inverted", "J <= 0"] for dtype in DTYPES}
+REFUSAL_TEXTS = {dtype: ["collider", "inverted", "J <= 0"] for dtype in DTYPES}
 SINGLE = {"float32": ["float32"]}
 FAST = 100.0
 """Speed of impacts, m/s."""
@@ -168,7 +168,7 @@ OBSTACLES = {
 
 @case(
     "contact-impact", GROUP, values=tuple((name, E) for name in OBSTACLES for E in (1e6, 1e8)), quick="none",
-    refusal=NAMED,
+    refusal=REFUSAL_TEXTS,
 )  # fmt: skip
 def impact(setting: Setting, value: tuple[str, float]) -> Answer:
     """A cube at 100 m/s onto a half-space, a thin box, a sphere, ten of its sides a step: no penetration."""
@@ -331,7 +331,7 @@ def extreme_restitution(setting: Setting, e: float) -> Answer:
 
 @case(
     "contact-jump", GROUP, values=(0.005, 0.05, 0.5), quick="none",
-    refusal=NAMED,
+    refusal=REFUSAL_TEXTS,
 )  # fmt: skip
 def jump(setting: Setting, height: float) -> Answer:
     """The floor jumps by 5, 50 or 500 mm into a resting cube of 100 mm within a step: above it after, or refused."""

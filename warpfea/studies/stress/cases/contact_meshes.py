@@ -9,7 +9,7 @@ import numpy as np
 import warpfea as wf
 
 from ..case import Answer, Setting, case
-from .contact import FAST, GROUP, NAMED, SIDE, SINGLE, corner_down, edge_down, exact, middle, scene, watch
+from .contact import FAST, GROUP, REFUSAL_TEXTS, SIDE, SINGLE, corner_down, edge_down, exact, middle, scene, watch
 
 SQUARE = np.array([(0, 1, 2), (0, 2, 3)])
 
@@ -43,7 +43,7 @@ def roof(height: float = 0.1, half: float = 0.2, long: float = 0.4) -> wf.TriMes
 
 @case(
     "contact-sheet", GROUP, values=tuple((way, E) for way in ("front", "behind") for E in (1e6, 1e8)), quick="none",
-    refusal=NAMED,
+    refusal=REFUSAL_TEXTS,
 )  # fmt: skip
 def impact(setting: Setting, value: tuple[str, float]) -> Answer:
     """A cube at 100 m/s onto a sheet without thickness, ten of its sides a step: no penetration."""

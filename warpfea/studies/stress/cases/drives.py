@@ -11,7 +11,7 @@ import warpfea as wf
 from ..build import Count, beam, off, solve
 from ..case import Answer, Setting, case
 
-NAMED = ["'crank'", "drive", "inverted"]
+REFUSAL_TEXTS = ["'crank'", "drive", "inverted"]
 JUMP_STEP = 1e-3
 """Step size, s."""
 WITHIN = {"ramp": (2.0, 3.0), "jump": (2.5, 2.500001)}
@@ -30,7 +30,7 @@ buckling.
 
 
 @case(
-    "drive-jump", "drives", quick="float64", refusal={"float64": NAMED, "float32": NAMED},
+    "drive-jump", "drives", quick="float64", refusal={"float64": REFUSAL_TEXTS, "float32": REFUSAL_TEXTS},
     values=tuple((body, angle, how) for body in ("beam", "solid") for angle in (0.5, 4.0) for how in WITHIN),
 )  # fmt: skip
 def drive_jump(setting: Setting, value: tuple[str, float, str]) -> Answer:

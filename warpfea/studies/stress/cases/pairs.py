@@ -19,8 +19,8 @@ from .contact import Watched, corner_down, edge_down, exact, momentum, total
 
 GROUP = "pairs"
 SIDE, DENSITY, G = 0.1, 1000.0, 9.81
-NAMED = {dtype: ["through body", "inverted", "J <= 0"] for dtype in DTYPES}
-NAMED["float32"].append("float32")
+REFUSAL_TEXTS = {dtype: ["through body", "inverted", "J <= 0"] for dtype in DTYPES}
+REFUSAL_TEXTS["float32"].append("float32")
 SINGLE = {"float32": ["float32"]}
 FAST = 100.0
 """Speed of impacts, m/s."""
@@ -125,7 +125,7 @@ def watch(sim: wf.Simulation, s: Pair, steps: int, *, mu: float | None = None) -
 
 
 @case("pairs-impact", GROUP, values=tuple((E, h) for E in (1e6, 1e8, 1e10) for h in (1e-3, 1e-2)), quick="none",
-      refusal=NAMED)  # fmt: skip
+      refusal=REFUSAL_TEXTS)  # fmt: skip
 def impact(setting: Setting, value: tuple[float, float]) -> Answer:
     """A cube at 100 m/s onto a free plate a tenth as thick, up to ten sides a step: no penetration."""
     E, h = value
@@ -135,7 +135,7 @@ def impact(setting: Setting, value: tuple[float, float]) -> Answer:
     return seen.answer(setting, max(seen.through, 0.0), 0.0, "the centre stays before the plate")
 
 
-@case("pairs-shell", GROUP, values=(1.0, 20.0, 100.0), quick="none", refusal=NAMED)
+@case("pairs-shell", GROUP, values=(1.0, 20.0, 100.0), quick="none", refusal=REFUSAL_TEXTS)
 def thin_shell(setting: Setting, speed: float) -> Answer:
     """A cube hits a shell of a hundredth of its side at 1 to 100 m/s, h = 1 ms: no penetration."""
     s = pair(E=(1e6, 1e8), gravity=(0, 0, 0), place=(0, 0, 0.05), thickness=1e-3, shell=True, mu=0.3, restitution=0.5,

@@ -15,7 +15,7 @@ MODULUS = 1e6
 SOLIDS = ("T4", "T10", "ENMC", "FN18", "H3843")
 ROWS = [f"{e}-{law}" for e in SOLIDS for law in ("svk", "neo")] + ["3243-svk", "3443-svk"]
 
-NAMED = ("worst element", "J <= 0")
+REFUSAL_TEXTS = ("worst element", "J <= 0")
 """Texts of refusals, which name the element."""
 
 
@@ -81,7 +81,7 @@ def _run(setting: Setting, value: str, kind: str, damped: bool) -> Answer:
 
 def _add(kind: str, what: str) -> None:
     """Cases of a kind of initial state: by statics, and by steps of backward Euler longer than its periods."""
-    refusal: dict[str, Sequence[str]] = {"float64": NAMED, "float32": NAMED}
+    refusal: dict[str, Sequence[str]] = {"float64": REFUSAL_TEXTS, "float32": REFUSAL_TEXTS}
     for damped, way in ((False, "statics"), (True, "damped steps")):
 
         def run(setting: Setting, value: str, damped: bool = damped) -> Answer:
