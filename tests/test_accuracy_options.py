@@ -14,7 +14,7 @@ from warpfea.cli import main
 from warpfea.simulation import integrators
 from warpfea.studies.accuracy.measure import Outcome
 from warpfea.studies.accuracy.motion import interpolant, observed
-from warpfea.studies.accuracy.settings import make_axes, parse_over, split_methods
+from warpfea.studies.accuracy.settings import parse_over, split_methods, sweep_axes
 
 FILE = """
 import warpfea as wf
@@ -199,7 +199,7 @@ def test_methods_with_options():
 
 
 def test_what_is_swept_is_sorted_out():
-    axes = make_axes(falling, {"cells": [1, 2], "element": ["T4"], "gravity": [1.0], "dt": [1e-3]}, None)
+    axes = sweep_axes(falling, {"cells": [1, 2], "element": ["T4"], "gravity": [1.0], "dt": [1e-3]}, None)
     assert (axes.mesh, axes.choices, axes.physical) == (("cells",), ("element",), ("gravity",))
     assert axes.sizes == ["cells", "dt"]
     assert parse_over(falling, ["methods=bdf2", "bad=true,no"]) == {"method": ["bdf2"], "bad": [True, False]}

@@ -36,7 +36,7 @@ def element_kernels(
         law: name in `materials.LAWS`.
         slots: per element.
         affine: straight elements with parent gradients and one J0 each; False: a table of h_i per element and point.
-        damping: None, "incremental", "rate" or "explicit" (Kelvin-Voigt forms).
+        damping: None, "incremental" or "rate" (implicit Kelvin-Voigt forms).
         framed: the law has axes of its own at each point, `block.frame`.
         midpoint: conserving scheme, see `point_functions` and kernels/elements/energy_momentum.py; u is that at the
             midpoint of the step and v half of the change of u. Energies and J are those at its end.

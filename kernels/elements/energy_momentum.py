@@ -42,14 +42,14 @@ def energy_momentum_law(name: str, dtype: str) -> _types.SimpleNamespace:
     @wp.func
     def mean_stress(G: mat33, D: mat33, c: coef) -> mat33:
         """S at the mean of the strains at both ends."""
-        return m.stiffness(t.green(G) + T(0.5) * wp.transpose(D) * D, c)
+        return m.pk2_stress(t.green(G) + T(0.5) * wp.transpose(D) * D, c)
 
     @wp.func
     def mean_increment(G: mat33, dE: mat33, c: coef) -> mat33:
         """Twice dS/dE1 : dE, exact for S linear in E, Pa."""
-        return m.stiffness(dE, c)
+        return m.pk2_stress(dE, c)
 
-    return _types.SimpleNamespace(mean_stress=mean_stress, mean_increment=mean_increment, rest_increment=m.stiffness)
+    return _types.SimpleNamespace(mean_stress=mean_stress, mean_increment=mean_increment, rest_increment=m.pk2_stress)
 
 
 def _discrete_gradient(dtype: str, second_invariant: bool) -> _types.SimpleNamespace:

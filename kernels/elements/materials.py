@@ -10,7 +10,7 @@ four functions
     block(G, a, c)          symmetric 3x3 matrix B with d.B d = d2Psi along the rank-one dF = d a^T, projected to be
                             positive semi-definite where the exact one need not be (for preconditioners)
 
-of the law's coefficients c. Laws whose S is linear in E have two more: stiffness(E, c) is S, and moduli(c) its numbers
+of the law's coefficients c. Laws whose S is linear in E have two more: pk2_stress(E, c) is S, and moduli(c) its numbers
 (D11, D22, D33, D23, D13, D12, G23, G13, G12), with S_ii = sum_j D_ij E_jj and S_ij = 2 G_ij E_ij. Kelvin-Voigt damping
 can be added to any law; Eq. (62) has the form of St. Venant-Kirchhoff's Eq. (26) and uses the same functions.
 """
@@ -86,7 +86,7 @@ def svk(dtype: str) -> _types.SimpleNamespace:
     coef = wp.types.vector(length=NCOEF, dtype=T)
 
     @wp.func
-    def stiffness(E: mat33, c: coef) -> mat33:
+    def pk2_stress(E: mat33, c: coef) -> mat33:
         """S = lambda tr(E) I + 2 mu E, Eq. (26)."""
         return t.isotropic(E, c[0], c[1])
 
@@ -126,7 +126,7 @@ def svk(dtype: str) -> _types.SimpleNamespace:
         return (c[0] + c[1]) * wp.outer(Fa, Fa) + c[1] * wp.dot(a, a) * (F * wp.transpose(F)) + geometric * t.identity()
 
     return _types.SimpleNamespace(
-        energy=energy, stress=stress, increment=increment, block=block, stiffness=stiffness, moduli=moduli
+        energy=energy, stress=stress, increment=increment, block=block, pk2_stress=pk2_stress, moduli=moduli
     )
 
 
@@ -275,7 +275,7 @@ def orthotropic(dtype: str) -> _types.SimpleNamespace:
     coef = wp.types.vector(length=NCOEF, dtype=T)
 
     @wp.func
-    def stiffness(E: mat33, c: coef) -> mat33:
+    def pk2_stress(E: mat33, c: coef) -> mat33:
         """S = D : E."""
         s1 = c[0] * E[0, 0] + c[5] * E[1, 1] + c[4] * E[2, 2]
         s2 = c[5] * E[0, 0] + c[1] * E[1, 1] + c[3] * E[2, 2]
@@ -294,19 +294,19 @@ def orthotropic(dtype: str) -> _types.SimpleNamespace:
     def energy(G: mat33, c: coef) -> T:
         """Psi = E : D : E / 2."""
         E = t.green(G)
-        return T(0.5) * wp.ddot(E, stiffness(E, c))
+        return T(0.5) * wp.ddot(E, pk2_stress(E, c))
 
     @wp.func
     def stress(G: mat33, c: coef) -> mat33:
         """P = F S."""
-        S = stiffness(t.green(G), c)
+        S = pk2_stress(t.green(G), c)
         return S + G * S
 
     @wp.func
     def increment(G: mat33, dG: mat33, c: coef) -> mat33:
         """dP = dF S + F dS."""
         F = t.identity() + G
-        return dG * stiffness(t.green(G), c) + F * stiffness(t.sym(wp.transpose(F) * dG), c)
+        return dG * pk2_stress(t.green(G), c) + F * pk2_stress(t.sym(wp.transpose(F) * dG), c)
 
     @wp.func
     def block(G: mat33, a: vec3, c: coef) -> mat33:
@@ -329,7 +329,7 @@ def orthotropic(dtype: str) -> _types.SimpleNamespace:
         return F * M * wp.transpose(F)
 
     return _types.SimpleNamespace(
-        energy=energy, stress=stress, increment=increment, block=block, stiffness=stiffness, moduli=moduli
+        energy=energy, stress=stress, increment=increment, block=block, pk2_stress=pk2_stress, moduli=moduli
     )
 
 

@@ -106,10 +106,10 @@ def matrix_kernels(
         if wp.static(not needs_J):
             if wp.static(midpoint):
                 if form == 1:
-                    S = m.stiffness(t.green(local), c)
+                    S = m.pk2_stress(t.green(local), c)
                     S += fn.max_compression(S) * t.identity()
             else:
-                S = m.stiffness(t.green(local), c)
+                S = m.pk2_stress(t.green(local), c)
                 if form == 1:
                     S += fn.max_compression(S) * t.identity()
         if wp.static(damping == "incremental" or damping == "rate"):
@@ -247,7 +247,7 @@ def matrix_kernels(
             B = t.sym(wp.outer(wp.transpose(F) * unit, h))
             dP = wp.outer(unit, S * h)
             if wp.static(not needs_J):
-                dS = m.stiffness(B, c)
+                dS = m.pk2_stress(B, c)
                 if wp.static(dissipative):
                     dS = fn.dissipation_factor(block) * dS
                 if wp.static(damping == "incremental" or damping == "rate"):

@@ -250,7 +250,7 @@ def point_functions(
         if wp.static(needs_J):
             return t.sym(wp.inverse(t.identity() + G) * m.stress(G, c))
         else:
-            return m.stiffness(t.green(G), c)
+            return m.pk2_stress(t.green(G), c)
 
     @wp.func
     def dissipation_factor(block: Block) -> T:
@@ -274,7 +274,7 @@ def point_functions(
             ahead = S + Fi * (m.increment(past, dG, c) - dG * S)
             change = t.sym(ahead - wp.inverse(t.identity() + G) * m.stress(G, c))
         else:
-            change = -m.stiffness(T(0.5) * wp.transpose(dG) * dG, c)
+            change = -m.pk2_stress(T(0.5) * wp.transpose(dG) * dG, c)
         if wp.static(damping == "incremental"):
             change = change - t.isotropic(T(0.5) * wp.transpose(dG) * dG, c[LAMBDA_V] / dq, c[ETA] / dq)
         return change

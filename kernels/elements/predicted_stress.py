@@ -59,7 +59,7 @@ def predicted_stress_product(dtype: str, law: str, slots: int, affine: bool, fra
                     change = fn.to_material_axes(block, dG, point, elem)
                     dP = fn.to_body_axes(block, fn.spd_tangent(t.identity() + local, change, c), point, elem)
                 else:
-                    dP += fn.max_compression(fn.law.stiffness(t.green(local), c)) * dG
+                    dP += fn.max_compression(fn.law.pk2_stress(t.green(local), c)) * dG
             f = fn.scatter(block, f, dP, point, elem)
         fn.store(block, f, world, elem, contribution)
 

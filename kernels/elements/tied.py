@@ -64,7 +64,7 @@ def tied_kernels(
     prediction_module = kernel_module(f"{name}_mixed")
 
     @wp.func
-    def end_factor(x: T) -> T:
+    def midpoint_weight(x: T) -> T:
         """Half of a stiffness with `midpoint`: midpoint values move by half of the end's change."""
         if wp.static(midpoint):
             return T(0.5) * x
@@ -73,11 +73,11 @@ def tied_kernels(
 
     @wp.func
     def matrix_modulus(block: Block, mu: T) -> T:
-        """Modulus in a matrix: `end_factor`, times (1 + chi) in a dissipative step."""
+        """Modulus in a matrix: `midpoint_weight`, times (1 + chi) in a dissipative step."""
         if wp.static(dissipative):
-            return (T(1.0) + block.dissipation) * end_factor(mu)
+            return (T(1.0) + block.dissipation) * midpoint_weight(mu)
         else:
-            return end_factor(mu)
+            return midpoint_weight(mu)
 
     @wp.func
     def stresses(block: Block, e: Ties, world: int, elem: int) -> Ties:
@@ -308,7 +308,7 @@ def tied_kernels(
         mu = block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0]
         if use_prediction[world] == 2:
             mu = T(0.0)  # no geometric part
-        lines[world, 3 * NT + tie, elem] = vec3(end_factor(mu) * s, T(0.0), T(0.0))
+        lines[world, 3 * NT + tie, elem] = vec3(midpoint_weight(mu) * s, T(0.0), T(0.0))
 
     @wp.kernel(module=matrix_module)
     def element_matrix(
@@ -428,7 +428,7 @@ def tied_kernels(
                             c = B[3 * (row + o) + i, n]
                             for j in range(3):
                                 R[3 * i + j] = R[3 * i + j] + c * AB[3 * t + j]
-                        G = end_factor(stress[t]) * (
+                        G = midpoint_weight(stress[t]) * (
                             second[row + o, n] * first[NT * panel + t] + first[row + o, n] * second[NT * panel + t]
                         )
                         for i in range(3):

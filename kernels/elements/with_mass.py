@@ -31,7 +31,7 @@ def with_mass_kernel(
         dtype: precision.
         law: name in `materials.LAWS`.
         slots, points: slots and quadrature points per element.
-        damping: None, "incremental", "rate" or "explicit" (Kelvin-Voigt forms).
+        damping: None, "incremental" or "rate" (implicit Kelvin-Voigt forms).
         vertex: 10-node tetrahedra with a rule that kernels/elements/vertex.py handles.
         size: elements of a cluster.
         midpoint, dissipative: of the conserving scheme, see `point_functions`.

@@ -13,13 +13,14 @@ from .pair_structs import master_struct, pair_scratch_struct
 __all__ = ["MARGIN", "broad_phase_kernels"]
 
 MARGIN = 0.25
-"""Enlargement of the boxes of the tree over a facet's side: they stay valid for several steps."""
+"""Enlargement of the boxes of the tree, as a fraction of a facet's side: they stay valid for several steps."""
 ROUNDING = 2.4e-7
+"""Relative widening of boxes in float32: twice its unit round-off."""
 
 
 @functools.cache
 def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
-    """Kernels in one precision of the displacements, in the module of `facet_search_kernels`, and box functions."""
+    """Kernels for displacements of a precision, in the module of `facet_search_kernels`, and functions of boxes."""
     vec3 = precision(dtype).vec3
     f64, vec3d, box3 = wp.float64, wp.vec3d, wp.vec3
     mat43 = wp.types.matrix(shape=(4, 3), dtype=f64)
@@ -31,14 +32,14 @@ def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
         f.facet_centre,
         f.unit_normal,
     )
-    module = kernel_module(f"pair_seek_{dtype}", max_unroll=SHORT_UNROLL)
+    module = kernel_module(f"facet_search_{dtype}", max_unroll=SHORT_UNROLL)
 
     @wp.func
     def set_coefficient(
         mas: Masters, u: wp.array2d(dtype=Any), world: int, item: int, m: int, C: wp.array2d(dtype=vec3d),
         D: wp.array2d(dtype=vec3d),
     ):  # fmt: skip
-        """Coefficient m of a slot field on a master facet."""
+        """Monomial coefficients m of a field u on facet `item`: C of its value, D of its outward derivative."""
         c = vec3d()
         d = vec3d()
         for i in range(mas.conn.shape[0]):
@@ -75,7 +76,7 @@ def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
             set_coefficient(mas, u_n, world, item, m, pair.C0, pair.D0)
 
     @wp.func
-    def down(x: vec3d) -> box3:
+    def round_down(x: vec3d) -> box3:
         """x in single precision, rounded down by more than its largest round-off."""
         return box3(
             wp.float32(x[0] - wp.abs(x[0]) * f64(ROUNDING)),
@@ -84,9 +85,9 @@ def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
         )
 
     @wp.func
-    def up(x: vec3d) -> box3:
+    def round_up(x: vec3d) -> box3:
         """x in single precision, rounded up."""
-        return -down(-x)
+        return -round_down(-x)
 
     @wp.func
     def contains(low: box3, high: box3, other_low: box3, other_high: box3) -> bool:
@@ -128,12 +129,12 @@ def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
             low = wp.min(low, wp.min(x, y))
             high = wp.max(high, wp.max(x, y))
         index = world * mas.count + item
-        if not contains(pair.lower[index], pair.upper[index], down(low), up(high)):
+        if not contains(pair.lower[index], pair.upper[index], round_down(low), round_up(high)):
             pair.refit_needed[0] = 1
         room = f64(MARGIN) * mas.size[item]
         pad = vec3d(room, room, room)
-        pair.refit_lower[index] = down(low - pad)
-        pair.refit_upper[index] = up(high + pad)
+        pair.refit_lower[index] = round_down(low - pad)
+        pair.refit_upper[index] = round_up(high + pad)
 
     @wp.kernel(module=module)
     def update_centres(mas: Masters, active: wp.array(dtype=wp.int32), pair: PairScratch):
@@ -169,6 +170,6 @@ def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
 
     return _types.SimpleNamespace(
         update_coefficients=update_coefficients, initial_coefficients=initial_coefficients, check_boxes=check_boxes,
-        update_centres=update_centres, accept_boxes=accept_boxes, down=down, up=up, contains=contains,
-        unpack_surface_point=unpack_surface_point,
+        update_centres=update_centres, accept_boxes=accept_boxes, round_down=round_down, round_up=round_up,
+        contains=contains, unpack_surface_point=unpack_surface_point,
     )  # fmt: skip

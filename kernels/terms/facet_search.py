@@ -42,7 +42,7 @@ def facet_search_kernels(dtype: str) -> _types.SimpleNamespace:
     down, up, contains = boxes.down, boxes.up, boxes.contains
     SlavePoint, slave_point, slave_point_at = candidates.SlavePoint, candidates.slave_point, candidates.slave_point_at
     anchor_candidate, search_facets = candidates.anchor_candidate, candidates.search_facets
-    module = kernel_module(f"pair_seek_{dtype}", max_unroll=SHORT_UNROLL)
+    module = kernel_module(f"facet_search_{dtype}", max_unroll=SHORT_UNROLL)
 
     @wp.func
     def approach_speed(

@@ -84,7 +84,7 @@ def pair_scratch_struct(dtype: str):
         refit_needed: wp.array(dtype=wp.int32)  # a facet has left its box
         refits: wp.array(dtype=wp.int32)  # number of refits so far
         in_reach: wp.array2d(dtype=wp.int32)  # [world, facet row of the slaves] 1 if a master surface is within reach
-        empty_box_lower: wp.array2d(dtype=wp.vec3)  # box without master facets, valid for refit `empty_box_known`
+        empty_box_lower: wp.array2d(dtype=wp.vec3)  # box without master facets, valid for refit `empty_box_refit`
         empty_box_upper: wp.array2d(dtype=wp.vec3)
         empty_box_refit: wp.array2d(dtype=wp.int32)
         x0: wp.array2d(dtype=wp.vec3d)  # [world, point] position at the start of the attempt, m

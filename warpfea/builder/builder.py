@@ -441,7 +441,7 @@ class ModelBuilder:
             raise ModelError(f"add_term: expected a function or class that takes the Model, got {make!r}")
         self._terms.append(make)
 
-    def assemble(self, model: Model) -> tuple[TermSet, Evaluation]:
+    def make_terms(self, model: Model) -> tuple[TermSet, Evaluation]:
         """The terms of a model, for Model itself."""
         return TermSet(model, self._terms), Evaluation(model)
 

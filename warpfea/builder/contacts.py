@@ -14,7 +14,7 @@ from ..model.contact_points import check_points
 from ..model.contacts import Collider, ColliderRotation, Contact
 from ..model.description import Description, Rotation
 from ..model.handles import SurfaceSet
-from ..model.pairs import PAIR_RULES, PairContact, choose_master
+from ..model.pairs import PAIR_RULES, PairContact, slave_and_master
 from ..model.shapes import Shape
 from ..model.triangle_mesh import TriMesh
 from ..time_laws import time_law
@@ -129,7 +129,7 @@ def make_pair(
         raise NotImplementedError(
             f"{what}: law = 'smooth' acts at any distance, and is for contact with colliders; take 'default' or 'paper'"
         )
-    slave, master = choose_master(a, b)
+    slave, master = slave_and_master(a, b)
     points, options["points"] = options["points"], None
     o = _checked(what, slave, dict(options))
     corners = {len(slave.body.family.faces[int(face)]) for face in np.unique(slave.faces[:, 1])}

@@ -52,7 +52,7 @@ def linear(mesh: Mesh) -> Mesh:
 def with_face_nodes(mesh: Mesh, face_points: Floats | None = None) -> Mesh:
     """T4 mesh with one node per face, shared by its two elements: cell type "tetra_faces".
 
-    Face nodes are numbered after the file's nodes, in the order of first occurrence by element. A set
+    Face nodes are numbered after the nodes of the mesh, in the order of first occurrence by element. A set
     of nodes gains a face node if it holds the face's three corners and the face is one of the cells that gave the
     set its name: a face of the surface set of that name, any face of an element of the element set of that name,
     or, where neither set exists, an outer face. Element and surface sets are unchanged.

@@ -65,9 +65,9 @@ class Block:
         if k.tying:
             return self.kernels
         if midpoint:
-            kind = (k.law, self.slots, k.affine, mean_damping(damping), k.framed)
+            kind = (k.law, self.slots, k.affine, tangent_damping(mean_damping(damping)), k.framed)
             return element_kernels(dtype, *kind, midpoint, dissipative)
-        return element_kernels(dtype, k.law, self.slots, k.affine, damping, k.framed)
+        return element_kernels(dtype, k.law, self.slots, k.affine, tangent_damping(damping), k.framed)
 
     def dissipative_data(self, dtype: str, dissipation: float) -> Any:
         """Constants for the dissipative mid-point scheme with its chi."""
@@ -97,9 +97,14 @@ class Block:
         """Kernel of the product of a with_mass block, with a form of damping; others: see `kernels_for`."""
         k = self.key
         if midpoint:
-            kind = (k.law, self.slots, self.points, mean_damping(damping), k.vertex, self.cluster)
+            kind = (k.law, self.slots, self.points, tangent_damping(mean_damping(damping)), k.vertex, self.cluster)
             return with_mass_kernel(dtype, *kind, midpoint, dissipative)
-        return with_mass_kernel(dtype, k.law, self.slots, self.points, damping, k.vertex, self.cluster)
+        return with_mass_kernel(dtype, k.law, self.slots, self.points, tangent_damping(damping), k.vertex, self.cluster)
+
+
+def tangent_damping(damping: str | None) -> str | None:
+    """Form of damping in element kernels: explicit damping is a load, see warpfea/terms/damping.py."""
+    return None if damping == "explicit" else damping
 
 
 def mean_damping(damping: str | None) -> str | None:
@@ -129,7 +134,7 @@ def build_block(
     else:
         det = _point_tables(model, data, key, parts)
         points = len(key.rule.weights)
-        kind = (key.law, family.slots, key.affine, key.damping, key.framed)
+        kind = (key.law, family.slots, key.affine, tangent_damping(key.damping), key.framed)
         kernels = element_kernels(model.dtype, *kind)
     cluster = cluster_size(model.dtype, len(conn), fit=model.device.is_cuda)
     sizes = len(conn), points, family.slots

@@ -42,7 +42,7 @@ class ModelSource(Protocol):
     def bodies(self) -> list[Body]:
         """Bodies in the order of addition."""
 
-    def assemble(self, model: Model) -> tuple[Any, Any]:
+    def make_terms(self, model: Model) -> tuple[Any, Any]:
         """TermSet of a model and its evaluation at a state."""
 
 
@@ -89,7 +89,7 @@ class Model:
             self._build(builder, tables)
 
     def resized(self, worlds: int, dtype: str | None = None) -> Model:
-        """The model as built, with another number of worlds or precision."""
+        """Model of the same description, without values set since, with another number of worlds or precision."""
         return Model(self._source, device=self.device, dtype=dtype or self.dtype, worlds=worlds, tables=self._tables)
 
     def _build(self, builder: ModelSource, tables: bool) -> None:
@@ -99,7 +99,7 @@ class Model:
         self._build_blocks(tables)
         self.gravity = np.asarray(builder.gravity, dtype=float)
         self.probes = list(builder.description.probes)
-        self.terms, self.evaluation = builder.assemble(self)
+        self.terms, self.evaluation = builder.make_terms(self)
         self.part, self.component = label_components(self.graph(), self.terms.tied_slots())
         self.component_count = int(self.component.max()) + 1
         self.terms.build()

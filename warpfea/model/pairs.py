@@ -16,7 +16,7 @@ from .contacts import ContactOptions
 from .discretisation import Discretisation, element_functions
 from .handles import SurfaceSet
 
-__all__ = ["PAIR_RULES", "MasterFacets", "PairContact", "choose_master", "master_facets", "pair_points"]
+__all__ = ["PAIR_RULES", "MasterFacets", "PairContact", "master_facets", "pair_points", "slave_and_master"]
 
 PAIR_RULES: dict[int, dict[int, Rule]] = {
     3: {7: triangle_7(), 16: triangle_16()},
@@ -61,9 +61,10 @@ class MasterFacets:
 
     Attributes:
         conn: (F, L) body slots of the facets' elements.
-        shape, director_shape: (F, M, L) coefficients of functions, and of their outward derivatives, 1/m.
+        shape, director_shape: (F, M, L) monomial coefficients of the L slots' shape functions, and of their outward
+            derivatives, 1/m.
         X, N: (F, M, 3) monomial coefficients of the reference position, m, and of the outward vector.
-        corners, degree: of the polynomials of all facets.
+        corners, degree: 3 or 4, of each facet; of the polynomials.
         size: (F,) length of a side, m.
         depth_limit: (F,) half the thickness of the body behind it, m.
     """
@@ -84,7 +85,7 @@ def pair_points(surface: SurfaceSet, points: int | None = None) -> ContactPoints
     return points_by_rules(surface, PAIR_RULES, {3: 16, 4: 16}, points)
 
 
-def choose_master(first: SurfaceSet, second: SurfaceSet) -> tuple[SurfaceSet, SurfaceSet]:
+def slave_and_master(first: SurfaceSet, second: SurfaceSet) -> tuple[SurfaceSet, SurfaceSet]:
     """Master selection: the coarser surface; at equal size the stiffer, then the second."""
     sides = []
     for surface in (first, second):
@@ -231,14 +232,14 @@ def thickness(surface: SurfaceSet) -> np.ndarray:
         return np.asarray(out.numpy(), dtype=float) * size
 
 
-def pair_numbers(
+def contact_constants(
     contact: PairContact, area: float, mass_of: Callable[[Discretisation], float], modulus_of: Modulus
 ) -> dict[str, float]:
     """Constants of Eqs. (74)-(76), (79), (80) of two bodies whose region has an area, m^2, and the effective mass."""
-    compliance = shear = lightness = 0.0
+    compliance = shear = inverse_mass = 0.0
     for surface in (contact.slave, contact.master):
         total = mass_of(surface.body)
-        lightness += 1.0 / total if total > 0.0 else math.inf
+        inverse_mass += 1.0 / total if total > 0.0 else math.inf
         E, nu = modulus_of(surface.body, surface)
         compliance += (1.0 - nu**2) / E
         shear += 2.0 * (2.0 - nu) * (1.0 + nu) / E
@@ -246,6 +247,6 @@ def pair_numbers(
     return {
         "normal": 4.0 / 3.0 * a / compliance,
         "tangent": 8.0 * a / shear,
-        "modulus": 2.0 * a / compliance,
-        "mass": 1.0 / lightness,
+        "damping_stiffness": 2.0 * a / compliance,
+        "mass": 1.0 / inverse_mass,
     }

@@ -33,7 +33,7 @@ __all__ = ["Band", "BandFactor", "block_band", "find_band"]
 
 MAX_AUTO_WIDTH = 112
 """Widest band chosen automatically, blocks beside the diagonal; beyond it the two-level preconditioner is cheaper."""
-FULL_FACTOR_SLOTS = 160
+MAX_FULL_FACTOR_SLOTS = 160
 """Largest number of slots of a model factored as a whole: here in a band of any width, or else as a dense matrix."""
 MAX_FACTOR_BYTES = 2**31
 """Size of the factors of one world above which 32-bit indices overflow, bytes."""
@@ -97,7 +97,7 @@ def find_band(model: Model, *, any_width: bool = False) -> Band | None:
 def _find_band(model: Model, any_width: bool) -> Band | None:
     graph = coupled_slots(model)
     n = graph.shape[0]
-    free = any_width or n <= FULL_FACTOR_SLOTS
+    free = any_width or n <= MAX_FULL_FACTOR_SLOTS
     # lower bound of the bandwidth in any order: half the number of a row's neighbours
     if not free and 3 * (int(np.diff(graph.indptr).max()) // 2) > BLOCK * (MAX_AUTO_WIDTH + 1):
         return None

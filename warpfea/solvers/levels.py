@@ -12,7 +12,7 @@ import warp as wp
 from ..kernels.solvers.levels import TILE_SLOTS, level_struct
 from ..model.partition import bisect, connected_groups
 from .assembled import Pattern, make_pattern
-from .band import FULL_FACTOR_SLOTS, Band
+from .band import MAX_FULL_FACTOR_SLOTS, Band
 from .dense import DenseComponents
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ BOTTOM_SLOTS = {"cpu": 160, "cuda": 1344}
 """Largest coarse level inverted as one dense matrix, slots by device; on CUDA this is cheaper than the launches of
 further levels."""
 COMPONENT_PAIRS = 1344**2
-"""Maximum slot pairs in components of up to FULL_FACTOR_SLOTS slots that are each inverted as a whole."""
+"""Maximum slot pairs in components of up to MAX_FULL_FACTOR_SLOTS slots that are each inverted as a whole."""
 MAX_LEVELS = 12
 
 
@@ -99,10 +99,10 @@ def make_levels(model: Model, pattern: Pattern, *, coarse: bool = True, by_compo
     for depth in range(MAX_LEVELS):
         n = pattern.graph.shape[0]
         parts = DenseComponents.of(model, pattern) if by_component else None
-        small = n <= (bottom if depth else FULL_FACTOR_SLOTS)
+        small = n <= (bottom if depth else MAX_FULL_FACTOR_SLOTS)
         if parts and not small:  # one matrix per component
             entries = parts.count * parts.most**2
-            small = entries <= (bottom**2 if depth else COMPONENT_PAIRS if parts.most <= FULL_FACTOR_SLOTS else 0)
+            small = entries <= (bottom**2 if depth else COMPONENT_PAIRS if parts.most <= MAX_FULL_FACTOR_SLOTS else 0)
         if small:
             levels.append(Level(pattern, n, True, level_struct(model.dtype)(), parts=parts))
             return levels

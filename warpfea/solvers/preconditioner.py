@@ -9,7 +9,7 @@ import warp as wp
 from ..base.errors import ModelError
 from ..base.launch import labelled
 from ..kernels.solvers.pcg import pcg_kernels
-from .band import FULL_FACTOR_SLOTS, block_band, find_band
+from .band import MAX_FULL_FACTOR_SLOTS, block_band, find_band
 from .residual import Residual
 from .twolevel import TwoLevel
 
@@ -134,7 +134,9 @@ def choose(name: str, storage: str | None, model: Model) -> str:
         return "banded"
     small = model.slots < SMALL_BODY * (int(model.part.max()) + 1)
     return (
-        "deflated" if model.terms.traits.has_constraints and small and model.slots > FULL_FACTOR_SLOTS else "two-level"
+        "deflated"
+        if model.terms.traits.has_constraints and small and model.slots > MAX_FULL_FACTOR_SLOTS
+        else "two-level"
     )
 
 

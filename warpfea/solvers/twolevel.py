@@ -38,7 +38,7 @@ from ..kernels.solvers.pcg import pcg_kernels
 from ..model.state import words_of
 from ..terms.term import CachedInputs
 from .assembled import chunk_of, shaped
-from .band import FULL_FACTOR_SLOTS, BandFactor, find_band
+from .band import MAX_FULL_FACTOR_SLOTS, BandFactor, find_band
 from .dense import gauss_jordan
 from .level_arrays import LevelArrays
 from .levels import GROUP_SLOTS, Level, make_levels
@@ -95,7 +95,7 @@ class TwoLevel:
         self.band = BandFactor(model, work, launch, band, pattern) if band is not None else None
         # factors of the operator's matrix if cheap, or for static equilibria of beams (the matrix made here then only
         # serves D); wider bands are reused for longer
-        one = self.storage == model.dtype and not residual.ctx.inertia and first.slots <= FULL_FACTOR_SLOTS
+        one = self.storage == model.dtype and not residual.ctx.inertia and first.slots <= MAX_FULL_FACTOR_SLOTS
         order = find_band(model) if first.dense and one else band
         # (a GPU factors the band of a small model, joint terms included, in about the time of its matrix)
         quick = order is not None and (order.cheap or (band is not None and model.device.is_cuda))

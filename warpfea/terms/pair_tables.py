@@ -18,9 +18,9 @@ from ..model.pairs import (
     MasterFacets,
     PairContact,
     bernstein,
+    contact_constants,
     exponents,
     master_facets,
-    pair_numbers,
     pair_points,
 )
 from .facet_tables import PER_WORLD, FacetTables, clamped_slots, normal_damping
@@ -109,8 +109,8 @@ class PairTables(FacetTables[PairContact]):
     def numbers(self, contact: PairContact, world: int | None = None) -> dict[str, float]:
         region = self.regions[self.number[contact.index]]
         parameters = self.model.parameters
-        row = pair_numbers(contact, region, partial(parameters.mass, world=world), parameters.modulus(world))
-        return row | {"normal_damping": normal_damping(row["modulus"], row["mass"])}
+        row = contact_constants(contact, region, partial(parameters.mass, world=world), parameters.modulus(world))
+        return row | {"normal_damping": normal_damping(row["damping_stiffness"], row["mass"])}
 
     @property
     def set_arrays(self) -> dict[str, wp.array]:

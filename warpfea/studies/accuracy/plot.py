@@ -18,7 +18,7 @@ COLORS = ("#0072b2", "#d55e00", "#009e73", "#e69f00", "#cc79a7", "#56b4e9", "#00
 """Colour-blind-safe palette (Okabe and Ito)."""
 MARKERS = "osD^vP*X"
 SHOWN = 6
-"""Maximum lines of omissions."""
+"""Maximum number of lines that list omitted runs."""
 MEANING = {
     "l2": "error {} (L2 over time) / largest travel",
     "end": "error {} at the end / largest travel",
@@ -30,7 +30,7 @@ MEANING = {
 def draw(study: Any, path: pathlib.Path) -> None:
     """Write the plot as PNG: a curve per method, hollow points for errors not resolved by the reference.
 
-    A ring marks the Pareto front; a cross at the upper edge a failed run, at its time of failure.
+    A ring marks the Pareto front; a cross at the upper edge a failed run, at its run time.
     """
     figure = require_matplotlib()(figsize=(8.4, 6.4), layout="constrained")
     axes = figure.subplots()
@@ -83,7 +83,7 @@ def _curve(axes: Any, label: str, rows: list[Any], color: str, marker: str) -> N
 
 
 def _reference(axes: Any, study: Any) -> None:
-    """Band of unresolved errors."""
+    """Line below which the reference does not resolve errors."""
     own = max((ref["own_error"].get(study.measure, 0.0) for ref in study.references), default=0.0)
     if RESOLVED * own > axes.get_ylim()[0]:
         text = f"{RESOLVED:g} times the error of the reference ({number(own, 2)})"

@@ -20,7 +20,9 @@ from ...builder.scene import Scene
 from ...simulation import integrators
 from ...solvers import SOLVERS
 
-__all__ = ["OPTIONS", "Axes", "Setting", "check_steps", "make_axes", "method_text", "order_of", "parse_over", "product"]
+__all__ = [
+    "OPTIONS", "Axes", "Setting", "check_steps", "method_text", "order_of", "parse_over", "product", "sweep_axes",
+]  # fmt: skip
 
 OPTIONS = ("method", "dt", "error", "solver", "tol", "dtype", "device")
 """Sweepable options besides the parameters of the scene."""
@@ -186,7 +188,7 @@ def _check_names(scene: Scene[Any], names: Iterable[str]) -> None:
             )
 
 
-def make_axes(scene: Scene[Any], over: Mapping[str, Sequence[Any]], mesh: Sequence[str] | None) -> Axes:
+def sweep_axes(scene: Scene[Any], over: Mapping[str, Sequence[Any]], mesh: Sequence[str] | None) -> Axes:
     """Validate the swept values.
 
     Args:

@@ -27,7 +27,7 @@ __all__ = ["split"]
 
 UNITS = 2.0**-29
 """Unit round-off of float64 over that of float32."""
-REFERENCE_TOL_RATIO = 100.0
+TIGHTENING = 100.0
 DEFAULTS = {"float64": 1e-8, "float32": 1e-4}
 """Tolerances of the solvers."""
 
@@ -58,7 +58,7 @@ def split(setting: Setting, axes: Axes, motion: Motion, run: Callable[[Setting],
     finer = {name: scaled(setting.values[name], 2) for name in axes.mesh}
     space = times(away(setting.changed(finer)), 2.0) if finer else None
     tol = setting.tol if setting.tol is not None else DEFAULTS[setting.dtype]
-    algebra = away(setting.changed({"tol": tol / REFERENCE_TOL_RATIO}))
+    algebra = away(setting.changed({"tol": tol / TIGHTENING}))
     single = setting.dtype == "float32"
     other = away(setting.changed({"dtype": "float64" if single else "float32"}))
     return {"time": time, "space": space, "algebra": algebra, "rounding": other if single else times(other, UNITS)}

@@ -25,7 +25,7 @@ from .measure import measure as run_once
 from .motion import RESOLVED, ROUNDING, Motion, distances, known_motion
 from .options import StudyOptions, check_positive, names_moved
 from .report import Row, Study, with_orders, with_pareto
-from .settings import OPTIONS, Axes, Setting, make_axes, method_text, product
+from .settings import OPTIONS, Axes, Setting, method_text, product, sweep_axes
 from .split import split as parts_of_error
 from .store import Store, code_version
 
@@ -87,7 +87,7 @@ def study(
                 raise ModelError(f"study: {option} is given twice")
             sweep[option] = many
     check_positive(dt=dt, t_end=t_end, tol=tol)
-    axes = make_axes(found, sweep, options.mesh)
+    axes = sweep_axes(found, sweep, options.mesh)
     values = dict(parameters or {})
     _check_names("parameter", values, found.parameters)
     _check_names("finer", options.finer or {}, [*OPTIONS, *found.parameters])
@@ -103,7 +103,7 @@ def study(
         t_end=float(t_end or found.t_end),
         values=found.resolve(swept | values),
     )
-    make_axes(found, {option: [base.get(option)] for option in ("solver", "dtype")}, None)
+    sweep_axes(found, {option: [base.get(option)] for option in ("solver", "dtype")}, None)
     settings = product(base, axes)
     if options.measure == "field" and found.field is None:
         raise ModelError(f"study: scene {found.name!r} has no field whose error could count: @wf.scene(field=...)")

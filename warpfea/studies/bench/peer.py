@@ -45,7 +45,7 @@ FIRST = 20
 TIP_STEP = 100
 OPTIONS = {"preconditioner_dtype": "float32"}
 FORCE_TOL = 5e-4
-REFERENCE_TOL_RATIO = 10.0
+TIGHTENING = 10.0
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ def _settings(options: argparse.Namespace, cases: Sequence[Case]) -> dict[str, A
         "force_tol": FORCE_TOL,
         **OPTIONS,
         "tip_after_step": min(options.steps, TIP_STEP),
-        "reference_tolerance_factor": 1.0 / REFERENCE_TOL_RATIO,
+        "reference_tolerance_factor": 1.0 / TIGHTENING,
         "steps_without_peer": min(options.steps, LARGE_STEPS),
     }
 
@@ -161,7 +161,7 @@ def _measure(case: Case, dtype: str, options: argparse.Namespace) -> Row | str:
     if case.peer_ms:
         if dtype != "float64":
             model = builder.finalize(device=options.device)
-        how = solver(NewtonPCG().tolerance("float64") / REFERENCE_TOL_RATIO, force_tol=FORCE_TOL / REFERENCE_TOL_RATIO)
+        how = solver(NewtonPCG().tolerance("float64") / TIGHTENING, force_tol=FORCE_TOL / TIGHTENING)
         exact = float(run_once(model, dt=DT, steps=at, solver=how).tip(problem.axis)[-1])
         row["speedup"] = case.peer_ms / row["ms_per_step"] if run.residual_force <= FORCE_TOL else None
         row["tip_difference"] = abs(row["tip"] - exact) / abs(exact)

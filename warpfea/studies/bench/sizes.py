@@ -25,7 +25,7 @@ __all__ = ["SIZES_KIND", "check_sizes"]
 
 WARM_UP = 2
 """First steps whose time does not count."""
-REFERENCE_TOL_RATIO = 100.0
+TIGHTENING = 100.0
 """Factor by which the tolerance of a reference is smaller."""
 DEFAULTS: dict[str, Any] = {"steps": 10, "repeat": 3, "dt": 1e-3, "dtype": ["float64", "float32"], "linear": ["pcg"],
             "reference_up_to": [100000]}  # fmt: skip
@@ -67,7 +67,7 @@ def _settings(options: argparse.Namespace, cases: Sequence[Case]) -> dict[str, A
         "problems": {case.problem.name: list(options.unknowns or case.problem.defaults) for case in cases},
         "dtypes": options.dtype,
         **{name: getattr(options, name) for name in ("linear", "steps", "repeat", "dt", "tol")},
-        "reference_tolerance_factor": 1.0 / REFERENCE_TOL_RATIO,
+        "reference_tolerance_factor": 1.0 / TIGHTENING,
         "reference_up_to": max(options.reference_up_to),
         "warm_up_steps": min(WARM_UP, options.steps - 1),
     }
@@ -78,7 +78,7 @@ def _measure(case: Case, dtype: str, options: argparse.Namespace) -> Row:
     problem, mesh, known = case.problem, (case.problem.name, case.wanted), options.references
     builder, how = problem.build(problem.size_for(case.wanted)), {"dt": options.dt, "steps": options.steps}
     if mesh not in known and case.wanted <= max(options.reference_up_to):
-        tight = solver(NewtonPCG(tol=options.tol).tolerance("float64") / REFERENCE_TOL_RATIO)
+        tight = solver(NewtonPCG(tol=options.tol).tolerance("float64") / TIGHTENING)
         known[mesh] = run_once(builder.finalize(device=options.device), solver=tight, **how).tip(problem.axis)
     began = clock.perf_counter()
     model = builder.finalize(device=options.device, dtype=dtype)

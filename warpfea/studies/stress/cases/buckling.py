@@ -33,7 +33,7 @@ def _judged(b: wf.ModelBuilder, setting: Setting, stable: bool, reference: str) 
     return Answer(error, 0.1, reference, **count.fields, note=note)
 
 
-def _column(factor: float, across: float = 0.0) -> wf.ModelBuilder:
+def _column_model(factor: float, across: float = 0.0) -> wf.ModelBuilder:
     """A cantilever of 16 beam elements under so many times Euler's load, and a fraction of it across."""
     load = factor * np.pi**2 * MODULUS * SIDE**4 / 12.0 / (4.0 * LENGTH**2)
     b = wf.ModelBuilder(gravity=(0, 0, 0))
@@ -48,14 +48,14 @@ def _column(factor: float, across: float = 0.0) -> wf.ModelBuilder:
 @case("buckling-column", GROUP, values=(0.9, 1.1, 10.0), quick="both")
 def column(setting: Setting, factor: float) -> Answer:
     """A perfect cantilever under so many times Euler's load is said to be stable or not."""
-    return _judged(_column(factor), setting, factor < 1.0, "Euler")
+    return _judged(_column_model(factor), setting, factor < 1.0, "Euler")
 
 
 @case("buckling-pushed", GROUP, values=(1.01, 1.1, 10.0), quick="both",
       refusal={"float64": ("was not accepted",), "float32": ("float32",)})  # fmt: skip
 def pushed(setting: Setting, factor: float) -> Answer:
     """The same with 1e-5 of the load across it does not stay straight in silence: told, refused, or bent by 0.1 L."""
-    b = _column(factor, PUSH)
+    b = _column_model(factor, PUSH)
     count = Count()
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always", wf.StabilityWarning)
