@@ -45,7 +45,7 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
         f.track_point, f.unit_normal,
     )  # fmt: skip
     boxes = broad_phase_kernels(dtype)
-    down, up, unpack_surface_point = boxes.down, boxes.up, boxes.unpack_surface_point
+    round_down, round_up, unpack_surface_point = boxes.round_down, boxes.round_up, boxes.unpack_surface_point
 
     @wp.struct
     class SlavePoint:
@@ -319,8 +319,8 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
             depth = scr.depth[world, slave.point] - wp.dot(slave.motion, slave.facing)
             out.passed_through = depth > f64(PASSED_DEPTH) * mas.depth_limit[f]
         wide = vec3d(slave.pad, slave.pad, slave.pad)
-        low = down(wp.min(slave.x, slave.x0) - wide)
-        high = up(wp.max(slave.x, slave.x0) + wide)
+        low = round_down(wp.min(slave.x, slave.x0) - wide)
+        high = round_up(wp.max(slave.x, slave.x0) + wide)
         root = wp.bvh_get_group_root(mas.tree, world * mas.surfaces + mas.surface_of[slave.contact])
         query = wp.bvh_query_aabb(mas.tree, low, high, root)
         index = wp.int32(0)

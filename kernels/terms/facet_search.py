@@ -39,7 +39,7 @@ def facet_search_kernels(dtype: str) -> _types.SimpleNamespace:
     surface_point, polynomial_value, displacement_change = f.surface_point, f.polynomial_value, f.displacement_change
     distance_outside, inverse_map, project_on_facet = f.distance_outside, f.inverse_map, f.project_on_facet
     SurfacePoint, boxes, candidates = f.SurfacePoint, broad_phase_kernels(dtype), facet_candidate_functions(dtype)
-    down, up, contains = boxes.down, boxes.up, boxes.contains
+    round_down, round_up, contains = boxes.round_down, boxes.round_up, boxes.contains
     SlavePoint, slave_point, slave_point_at = candidates.SlavePoint, candidates.slave_point, candidates.slave_point_at
     anchor_candidate, search_facets = candidates.anchor_candidate, candidates.search_facets
     module = kernel_module(f"facet_search_{dtype}", max_unroll=SHORT_UNROLL)
@@ -149,14 +149,17 @@ def facet_search_kernels(dtype: str) -> _types.SimpleNamespace:
         pad = vec3d(far, far, far)
         empty_box_known = pair.empty_box_refit[world, row] == pair.refits[0]
         if empty_box_known and contains(
-            pair.empty_box_lower[world, row], pair.empty_box_upper[world, row], down(low - pad), up(high + pad)
+            pair.empty_box_lower[world, row],
+            pair.empty_box_upper[world, row],
+            round_down(low - pad),
+            round_up(high + pad),
         ):
             pair.in_reach[world, row] = 0
             return
         room = f64(2.0) * far + f64(MARGIN) * wp.length(high - low)
         wide = vec3d(room, room, room)
         root = wp.bvh_get_group_root(mas.tree, world * mas.surfaces + mas.surface_of[facets.contact[item]])
-        query = wp.bvh_query_aabb(mas.tree, down(low - wide), up(high + wide), root)
+        query = wp.bvh_query_aabb(mas.tree, round_down(low - wide), round_up(high + wide), root)
         index = wp.int32(0)
         if wp.bvh_query_next(query, index):
             pair.in_reach[world, row] = 1
@@ -164,8 +167,8 @@ def facet_search_kernels(dtype: str) -> _types.SimpleNamespace:
             return
         pair.in_reach[world, row] = 0
         pair.empty_box_refit[world, row] = pair.refits[0]
-        pair.empty_box_lower[world, row] = down(low - wide)
-        pair.empty_box_upper[world, row] = up(high + wide)
+        pair.empty_box_lower[world, row] = round_down(low - wide)
+        pair.empty_box_upper[world, row] = round_up(high + wide)
 
     @wp.func
     def frame(s: SurfacePoint) -> wp.mat33d:

@@ -59,12 +59,12 @@ def pair_evaluation_kernels(dtype: str) -> _types.SimpleNamespace:
         places.unit_normal,
         places.facet_centre,
     )
-    project_on_facet, shape_value, frame, down, up = (
+    project_on_facet, shape_value, frame, round_down, round_up = (
         places.project_on_facet,
         places.shape_value,
         seek.frame,
-        seek.down,
-        seek.up,
+        seek.round_down,
+        seek.round_up,
     )
     module = kernel_module(f"pair_survey_{dtype}", max_unroll=SHORT_UNROLL)
 
@@ -76,7 +76,7 @@ def pair_evaluation_kernels(dtype: str) -> _types.SimpleNamespace:
         off = f64(OUTSIDE_TOLERANCE)
         pad = vec3d(far, far, far)
         root = wp.bvh_get_group_root(mas.tree, world * mas.surfaces + surface)
-        query = wp.bvh_query_aabb(mas.tree, down(x - pad), up(x + pad), root)
+        query = wp.bvh_query_aabb(mas.tree, round_down(x - pad), round_up(x + pad), root)
         index = wp.int32(0)
         while wp.bvh_query_next(query, index):
             f = index - world * mas.count
