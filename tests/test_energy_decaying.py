@@ -72,7 +72,7 @@ def test_a_free_bar_gains_no_energy_and_keeps_its_momenta(E, turn, steps):
 @pytest.mark.parametrize("scheme", ["energy_momentum", LOSSY])
 def test_the_body_of_the_stress_rows_keeps_its_momenta_at_a_tight_tolerance(scheme, device):
     """Rows `turning` of `warpfea stress` keep angular momentum to 1e-6 at the default tolerance, 1e-8."""
-    model = rotation._turning(Setting(device, "float64"), "free", 1e9)
+    model = rotation._rotating_body(Setting(device, "float64"), "free", 1e9)
     sim = wf.Simulation(model, dt=0.2 / SPEED, integrator=scheme, solver=wf.NewtonPCG(tol=1e-12))
     watch = Conserved(sim)
     for _ in range(100):

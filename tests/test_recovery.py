@@ -291,7 +291,7 @@ def test_stress_that_rounds_more_than_positions_ends_at_its_floor(element):
 def test_soft_bars_are_found_past_their_bifurcations(how, monkeypatch):
     """Squeezed to a twentieth or twisted four turns a neo-Hookean bar buckles: its tangent is indefinite."""
     monkeypatch.setitem(inside_out.CELLS, "H3843", (10, 1, 1))
-    b, bar = inside_out.forced("H3843", inside_out.NEO_HOOKEAN, how)
+    b, bar = inside_out.driven_bar("H3843", inside_out.NEO_HOOKEAN, how)
     found = wf.solve_static(b.finalize(device="cpu"), load_steps=20)
     ends = [found.reaction(bar.nodes(side))[0] for side in ("x-", "x+")]
     assert np.abs(ends[0] + ends[1]).max() < 1e-6 * np.abs(ends).max()

@@ -11,9 +11,9 @@ import warpfea as wf
 from warpfea.cli import main
 from warpfea.studies.stress import case as table_of_cases
 from warpfea.studies.stress import suite
-from warpfea.studies.stress.build import Count
+from warpfea.studies.stress.build import StepStats
 from warpfea.studies.stress.case import Answer, Setting, Skipped, case, label
-from warpfea.studies.stress.suite import Row, attempt, choose, load_cases
+from warpfea.studies.stress.suite import Row, load_cases, run_row, select_rows
 
 REAL = dict(load_cases())
 BOTH = ("float64", "float32")
@@ -66,7 +66,7 @@ def judged(run, dtype="float64", meshes=None, **options):
     """The row that a toy case gives."""
     case("toy", "toys", **options)(run)
     toy = table_of_cases.CASES["toy"]
-    return attempt(Row(toy, toy.values[0], dtype), Setting("cpu", dtype, meshes))
+    return run_row(Row(toy, toy.values[0], dtype), Setting("cpu", dtype, meshes))
 
 
 INSIDE_OUT = {"float64": ["inside out"]}
@@ -82,8 +82,8 @@ INSIDE_OUT = {"float64": ["inside out"]}
         (refuses, {"refusal": INSIDE_OUT}, "refused", True, "inside out"),
         (refuses, {"refusal": {"float64": ["float32"]}}, "FAILED", False, "which does not say 'float32'"),
         (refuses, {"refusal": {"float32": ["inside out"]}}, "FAILED", False, "refused: ConvergenceError"),
-        (refuses, {"refusal": INSIDE_OUT, "must": True}, "refused", True, "inside out"),
-        (right, {"refusal": INSIDE_OUT, "must": True}, "FAILED", False, "accepted what is to be refused"),
+        (refuses, {"refusal": INSIDE_OUT, "must_refuse": True}, "refused", True, "inside out"),
+        (right, {"refusal": INSIDE_OUT, "must_refuse": True}, "FAILED", False, "accepted what is to be refused"),
         (breaks, {"refusal": INSIDE_OUT}, "FAILED", False, "ValueError: a defect"),
         (absent, {}, "no mesh", None, ""),
     ],
@@ -110,8 +110,8 @@ def test_a_row_is_told_its_value_and_precision(cases):
         return right(setting)
 
     case("toy", "toys", values=(50, 1e3))(run)
-    for row in choose(cases, [], False, BOTH):
-        attempt(row, Setting("cpu", row.dtype))
+    for row in select_rows(cases, [], False, BOTH):
+        run_row(row, Setting("cpu", row.dtype))
     assert seen == [("cpu", d, d == "float32", v) for v in (50, 1e3) for d in BOTH]
 
 
@@ -126,7 +126,7 @@ def test_rows_are_chosen_by_case_row_group_precision_and_speed(cases):
     case("heavy", "dynamics")(right)
 
     def chosen(*names, quick=False, dtypes=BOTH):
-        return [(row.label, row.dtype) for row in choose(cases, names, quick, dtypes)]
+        return [(row.label, row.dtype) for row in select_rows(cases, names, quick, dtypes)]
 
     assert chosen("thin/500", "heavy", dtypes=["float32"]) == [("thin/500", "float32"), ("heavy", "float32")]
     assert chosen("dynamics") == [(name, d) for name in ("long", "heavy") for d in BOTH]
@@ -242,7 +242,7 @@ def test_the_list_names_every_case(capfd):
     assert code == 0
     for name, found in REAL.items():
         assert f"  {name} " in out
-        assert found.about in out
+        assert found.description in out
 
 
 def test_the_cases_are_well_formed():
@@ -253,7 +253,7 @@ def test_the_cases_are_well_formed():
         assert set(found.refusal) <= set(BOTH), name
         labels = [label(name, value) for value in found.values]
         assert len(set(labels)) == len(labels), name
-        assert not found.must or set(found.refusal) == set(BOTH), name
+        assert not found.must_refuse or set(found.refusal) == set(BOTH), name
 
 
 def test_skipped_is_no_named_error():
@@ -266,14 +266,14 @@ def test_counts_hold_errors_to_the_floors_that_reports_told():
         last = types.SimpleNamespace(**{name: np.array([value]) for name, value in one.items()})
         return types.SimpleNamespace(last=last, model=types.SimpleNamespace(constraints=None))
 
-    count = Count()
+    count = StepStats()
     count.add(report(1e-3))
     count.add(report(2e-3, newton=7))
     assert (count.newton, count.worst_newton, count.pcg, count.floor) == (10, 7, 10, 2e-3)
-    assert count.answer(5e-3, 1e-2, "", told=count.last_floor).passed
-    assert not count.answer(7e-3, 1e-2, "", told=count.last_floor).passed
-    assert count.answer(7e-3, 1e-2, "", told=count.sum_of_floors).passed
+    assert count.answer(5e-3, 1e-2, "", reported_error=count.last_floor).passed
+    assert not count.answer(7e-3, 1e-2, "", reported_error=count.last_floor).passed
+    assert count.answer(7e-3, 1e-2, "", reported_error=count.sum_of_floors).passed
     assert count.answer(7e-3, 1e-2, "").passed
     count.add(report(0.0, min_J=-0.1))
-    assert not count.answer(0.0, 1e-2, "", told=count.last_floor).passed
-    assert count.answer(0.0, 1e-2, "", low=None, told=count.last_floor).passed
+    assert not count.answer(0.0, 1e-2, "", reported_error=count.last_floor).passed
+    assert count.answer(0.0, 1e-2, "", lowest_J=None, reported_error=count.last_floor).passed

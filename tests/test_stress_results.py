@@ -10,8 +10,8 @@ cases that were stopped.
 import pytest
 from result_files import content_of, rows_of
 
-from warpfea.studies.stress.misses import MISSES, reason_for
-from warpfea.studies.stress.suite import choose, load_cases
+from warpfea.studies.stress.misses import KNOWN_MISSES, known_miss_reason
+from warpfea.studies.stress.suite import load_cases, select_rows
 
 FILES = {"stress_cpu.json": "cpu", "stress_h200.json": "cuda:0"}
 SPEED = {"hard_steps_h200.json": ("--peer", 1.05, 13), "hard_steps_cpu.json": ("--cpu", 1.10, 12)}
@@ -24,7 +24,7 @@ SLOWER = {("hard_steps_h200.json", f"{beam} beam float64 {n}") for beam, n in BE
 def test_every_row_meets_its_criterion_or_is_a_known_miss(name):
     for row in rows_of(name):
         if row["passed"] is False or row["outcome"] == "missed":
-            assert reason_for(row["case"], row["precision"], FILES[name]), row
+            assert known_miss_reason(row["case"], row["precision"], FILES[name]), row
         elif row["outcome"] == "done":
             assert row["error"] <= row["bound"], row
             assert all(limit["value"] <= limit["bound"] for limit in row["limits"].values()), row
@@ -36,13 +36,13 @@ def test_every_row_was_run(name):
     ran = {(row["case"], row["precision"]) for row in found["rows"]}
     stopped = {case for case, _ in found.get("unfinished", [])}
     assert stopped <= {"rest-1e6"}
-    for row in choose(load_cases(), [], False, ("float64", "float32")):
+    for row in select_rows(load_cases(), [], False, ("float64", "float32")):
         assert (row.label, row.dtype) in ran or row.case.name in stopped or row.case.name.startswith("soft-"), row.label
 
 
 def test_misses_are_rows_of_the_suite():
-    rows = {(row.label, row.dtype) for row in choose(load_cases(), [], False, ("float64", "float32"))}
-    assert {(label, dtype) for label, dtype, _ in MISSES} <= rows
+    rows = {(row.label, row.dtype) for row in select_rows(load_cases(), [], False, ("float64", "float32"))}
+    assert {(label, dtype) for label, dtype, _ in KNOWN_MISSES} <= rows
 
 
 @pytest.mark.parametrize("name", ["elastica/10", "elastica/1000", "elastica/100000", "annular/3"])
@@ -50,7 +50,7 @@ def test_goals_of_slender_bodies_on_the_cpu(name):
     """Elastica at most 10 Newton iterations per load step, the slit annular plate at most 150 in all."""
     (row,) = [r for r in rows_of("stress_cpu.json") if (r["case"], r["precision"]) == (name, "float64")]
     if row["outcome"] == "missed":
-        pytest.xfail(reason_for(name, "float64", "cpu"))
+        pytest.xfail(known_miss_reason(name, "float64", "cpu"))
     assert row["outcome"] == "done"
     assert row["newton"] <= (150 if name == "annular/3" else 50)
 

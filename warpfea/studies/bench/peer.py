@@ -117,18 +117,11 @@ def _cases(options: argparse.Namespace) -> list[Case]:
 
 def _settings(options: argparse.Namespace, cases: Sequence[Case]) -> dict[str, Any]:
     return {
-        "peer": SOURCE,
-        "rows": [case.label for case in cases],
-        "dtypes": options.dtype,
-        "dt": DT,
-        "steps": options.steps,
-        "first_step_timed": first_counted(options.steps),
-        "force_tol": FORCE_TOL,
-        **OPTIONS,
-        "tip_after_step": min(options.steps, TIP_STEP),
-        "reference_tolerance_factor": 1.0 / TIGHTENING,
+        "peer": SOURCE, "rows": [case.label for case in cases], "dtypes": options.dtype, "dt": DT,
+        "steps": options.steps, "first_step_timed": first_counted(options.steps), "force_tol": FORCE_TOL, **OPTIONS,
+        "tip_after_step": min(options.steps, TIP_STEP), "reference_tolerance_factor": 1.0 / TIGHTENING,
         "steps_without_peer": min(options.steps, LARGE_STEPS),
-    }
+    }  # fmt: skip
 
 
 def _measure(case: Case, dtype: str, options: argparse.Namespace) -> Row | str:
@@ -147,17 +140,11 @@ def _measure(case: Case, dtype: str, options: argparse.Namespace) -> Row | str:
     setup = clock.perf_counter() - began
     run = run_once(model, dt=DT, steps=steps, solver=solver(None, force_tol=FORCE_TOL, **OPTIONS))
     row = {
-        "problem": case.problem,
-        "label": case.label,
-        "unknowns": 3 * model.slots,
-        "free_unknowns": model.info()["unknowns"],
-        "peer_ms": case.peer_ms,
-        "required": required(case),
-        "residual_force": run.residual_force,
-        "tip": float(run.tip(problem.axis)[at - 1]),
-        "setup_s": setup,
+        "problem": case.problem, "label": case.label, "unknowns": 3 * model.slots, "peer_ms": case.peer_ms,
+        "free_unknowns": model.info()["unknowns"], "required": required(case), "residual_force": run.residual_force,
+        "tip": float(run.tip(problem.axis)[at - 1]), "setup_s": setup,
         **figures(run, statistics.median(run.times[first_counted(steps) - 1 :])),
-    }
+    }  # fmt: skip
     if case.peer_ms:
         if dtype != "float64":
             model = builder.finalize(device=options.device)

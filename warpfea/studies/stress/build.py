@@ -14,17 +14,17 @@ from warpfea.simulation.statics import StaticResult
 
 from .case import Answer, Setting
 
-__all__ = ["BUILT_IN", "DOWN", "REFINED", "SOUND", "STEEL", "Count", "Solved", "X", "Y", "Z", "bar", "beam", "finalize",
-           "off", "put", "solve"]  # fmt: skip
+__all__ = ["CLAMPED_SLOTS", "GRAVITY_VECTOR", "MIN_POSITIVE_J", "REFERENCE_TOL", "STEEL", "StaticSolution", "StepStats",
+           "X", "Y", "Z", "bar", "beam", "finalize", "relative_error", "solve"]  # fmt: skip
 
 X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
-DOWN = (0.0, 0.0, -9.81)
+GRAVITY_VECTOR = (0.0, 0.0, -9.81)
 STEEL = wf.SVK(E=2e11, nu=0.3, density=7800.0)
-SOUND = 1e-12
-"""J that counts as positive."""
-REFINED = 1e-10
-"""Relative residual of references that are solved in float64."""
-BUILT_IN = {
+MIN_POSITIVE_J = 1e-12
+"""Smallest accepted J of a deformation without inversion."""
+REFERENCE_TOL = 1e-10
+"""Solver tolerance of float64 references."""
+CLAMPED_SLOTS = {
     "T4": "all",
     "T10": "all",
     "FN18": "position+gradient-y+gradient-z",
@@ -32,7 +32,7 @@ BUILT_IN = {
     "3243": "position+section",
     "3443": "position+director",
 }
-"""Slots that a wall x = const holds."""
+"""Slots that a clamped wall x = const fixes, by element."""
 
 
 def bar(
@@ -42,7 +42,7 @@ def bar(
     b = wf.ModelBuilder(gravity=tuple(gravity))
     mesh = wf.mesh.box(tuple(size), cells=tuple(cells), element=element)
     body = b.add_solid(mesh, material=law, element=element, name="bar")
-    b.clamp(body.nodes("x-"), slots=BUILT_IN[element])
+    b.clamp(body.nodes("x-"), slots=CLAMPED_SLOTS[element])
     b.add_probe("tip", body.surface("x+"))
     return b, body
 
@@ -55,21 +55,21 @@ def beam(
     section = wf.Rectangle(side, side)
     line = [(0, 0, 0), (length, 0, 0)]
     body = b.add_beam(line, elements=elements, section=section, normal=(0, 0, 1), material=law, name="beam")
-    b.clamp(body.start, slots=BUILT_IN["3243"])
+    b.clamp(body.start, slots=CLAMPED_SLOTS["3243"])
     b.add_probe("tip", body.end)
     return b, body
 
 
 @dataclass
-class Count(Output):
-    """Iterations and other numbers of all steps so far; an output of `run` and `solve_static`, or fed by `step`.
+class StepStats(Output):
+    """Iterations, smallest J and round-off of all steps so far: an output of `run` and `solve_static`, or by `step`.
 
     Attributes:
         newton, pcg, halvings: sums, of the worst world; worst_newton: of a step.
         min_J: the smallest, of worlds that have not failed.
-        floor: the largest; last_floor and sum_of_floors: of the last step and of all.
+        floor: the largest round-off estimate of the reports; last_floor, sum_of_floors: of the last step, of all.
         violation: the largest of constraints over the model's size; None without constraints.
-        seen: the last report counted.
+        last_report: of the last step added.
     """
 
     newton: int = 0
@@ -81,11 +81,11 @@ class Count(Output):
     last_floor: float = 0.0
     sum_of_floors: float = 0.0
     violation: float | None = None
-    seen: Any = field(default=None, repr=False)
+    last_report: Any = field(default=None, repr=False)
 
     def add(self, sim: Any) -> None:
-        """Count the last step of a simulation."""
-        report = self.seen = sim.last
+        """Add the last step of a simulation."""
+        report = self.last_report = sim.last
         self.newton += int(report.newton.max())
         self.pcg += int(report.pcg.max())
         self.worst_newton = max(self.worst_newton, int(report.newton.max()))
@@ -98,44 +98,51 @@ class Count(Output):
             self.violation = max(self.violation or 0.0, float(report.violation.max()) / sim.model.size)
 
     def step(self, sim: wf.Simulation, steps: int = 1) -> wf.StepReport:
-        """Do steps one by one and count them; the last report."""
+        """Step a simulation and add each step; returns the last report."""
         for _ in range(steps):
             report = sim.step()
             self.add(sim)
         return report
 
     @property
-    def fields(self) -> dict[str, Any]:
-        """Those of an Answer."""
+    def answer_fields(self) -> dict[str, Any]:
+        """These numbers as fields of an Answer."""
         return {
             "newton": self.newton, "pcg": self.pcg, "halvings": self.halvings, "floor": self.floor,
             "min_J": None if self.min_J == np.inf else float(self.min_J), "violation": self.violation,
         }  # fmt: skip
 
     def answer(
-        self, error: float, bound: float, reference: str, *, low: float | None = SOUND, told: float = 0.0, **more: Any
+        self,
+        error: float,
+        bound: float,
+        reference: str,
+        *,
+        lowest_J: float | None = MIN_POSITIVE_J,
+        reported_error: float = 0.0,
+        **more: Any,
     ) -> Answer:
         """An answer with these counts.
 
         Args:
-            low: no step may have been accepted with J below it at a point; None: whatever J.
-            told: estimate of the relative error that the reports gave, which the error may exceed threefold; 0: none.
-                Only where the reference is of the same mesh: `last_floor` of a static solution, `sum_of_floors` of a
+            lowest_J: no step may have been accepted with J below it at a point; None: whatever J.
+            reported_error: round-off estimate of the reports, which the error may exceed threefold; 0: none.
+                Only if the reference has the same mesh: `last_floor` of a static solution, `sum_of_floors` of a
                 motion.
         """
         limits = dict(more.pop("limits", {}))
-        if low is not None:
-            limits["J short of its least"] = (low - self.min_J, 0.0)
-        if told > 0.0:
-            limits["error over the floor told"] = (error, 3.0 * told)
-        return Answer(float(error), bound, reference, limits=limits, **self.fields, **more)
+        if lowest_J is not None:
+            limits["J short of its least"] = (lowest_J - self.min_J, 0.0)
+        if reported_error > 0.0:
+            limits["error over the floor told"] = (error, 3.0 * reported_error)
+        return Answer(float(error), bound, reference, limits=limits, **self.answer_fields, **more)
 
     def open(self, sim: Any) -> None:
         """Nothing to prepare."""
 
     def write(self, sim: Any) -> None:
-        """Take the step that was done since the last call."""
-        if sim.last is not None and sim.last is not self.seen:
+        """Add the step done since the last call."""
+        if sim.last is not None and sim.last is not self.last_report:
             self.add(sim)
 
     def close(self, sim: Any) -> None:
@@ -146,11 +153,11 @@ class Count(Output):
 
 
 @dataclass
-class Solved:
-    """A static solution with its counts."""
+class StaticSolution:
+    """Static solution, and statistics of its load steps."""
 
     result: StaticResult
-    count: Count
+    stats: StepStats
 
     @property
     def tip(self) -> np.ndarray:
@@ -163,19 +170,13 @@ def finalize(b: wf.ModelBuilder, setting: Setting, worlds: int = 1) -> wf.Model:
     return b.finalize(device=setting.device, dtype=setting.dtype, worlds=worlds)
 
 
-def solve(b: wf.ModelBuilder, setting: Setting, count: Count | None = None, **options: Any) -> Solved:
-    """`solve_static` with these options, counted; `count` goes on from earlier solutions."""
-    count = count or Count()
-    return Solved(wf.solve_static(finalize(b, setting), outputs=[count], **options), count)
+def solve(b: wf.ModelBuilder, setting: Setting, stats: StepStats | None = None, **options: Any) -> StaticSolution:
+    """Result of `solve_static` with these options; `stats`: statistics to add to."""
+    stats = stats or StepStats()
+    return StaticSolution(wf.solve_static(finalize(b, setting), outputs=[stats], **options), stats)
 
 
-def put(state: Any, values: np.ndarray, name: str = "displacement") -> None:
-    """Set an array of a state in all worlds, values (slots, 3)."""
-    array = getattr(state, name)
-    array.assign(np.broadcast_to(values, (*array.shape, 3)).astype(array.numpy().dtype))
-
-
-def off(value: Any, reference: Any, scale: float | None = None) -> float:
-    """Largest difference over `scale`, by default the largest value of the reference."""
+def relative_error(value: Any, reference: Any, scale: float | None = None) -> float:
+    """Largest difference over `scale`, by default the largest absolute value of the reference."""
     value, reference = np.asarray(value, dtype=float), np.asarray(reference, dtype=float)
     return float(np.abs(value - reference).max() / (np.abs(reference).max() if scale is None else scale))

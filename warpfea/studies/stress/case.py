@@ -92,9 +92,9 @@ class Case:
         values: one row each; (None,): a single row.
         quick: rows of the quick suite, "none", "float64" or "both" precisions.
         refusal: {dtype: texts}: precisions in which the case may end with an error of warpfea containing one of
-            `texts` instead of an answer; with `must`, has to.
-        must: an answer fails, the case must be refused.
-        about: description, one line.
+            `texts` instead of an answer; with `must_refuse`, has to.
+        must_refuse: an answer fails the case.
+        description: one line.
         dtypes: precisions of the case.
     """
 
@@ -104,8 +104,8 @@ class Case:
     values: tuple[Any, ...]
     quick: str
     refusal: dict[str, tuple[str, ...]]
-    must: bool
-    about: str
+    must_refuse: bool
+    description: str
     dtypes: tuple[str, ...] = DTYPES
 
 
@@ -123,14 +123,14 @@ CASES: dict[str, Case] = {}
 
 def case(
     name: str, group: str, *, values: Sequence[Any] = (None,), quick: str = "none",
-    refusal: Mapping[str, Sequence[str]] | None = None, must: bool = False, dtypes: Sequence[str] = DTYPES,
+    refusal: Mapping[str, Sequence[str]] | None = None, must_refuse: bool = False, dtypes: Sequence[str] = DTYPES,
 ) -> Callable[[Callable[..., Answer]], Callable[..., Answer]]:  # fmt: skip
     """Add a function to `CASES`; see Case. The first line of its docstring is the description."""
 
     def add(run: Callable[..., Answer]) -> Callable[..., Answer]:
         texts = {dtype: tuple(t) for dtype, t in (refusal or {}).items()}
-        about = (run.__doc__ or "").strip().splitlines()[0]
-        CASES[name] = Case(name, group, run, tuple(values), quick, texts, must, about, tuple(dtypes))
+        description = (run.__doc__ or "").strip().splitlines()[0]
+        CASES[name] = Case(name, group, run, tuple(values), quick, texts, must_refuse, description, tuple(dtypes))
         return run
 
     return add

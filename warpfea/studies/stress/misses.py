@@ -5,23 +5,23 @@ A listed row that meets its criterion passes: some depend on round-off.
 
 from __future__ import annotations
 
-__all__ = ["MISSES", "reason_for"]
+__all__ = ["KNOWN_MISSES", "known_miss_reason"]
 
-_THIN = "refused for the work spent or without a reason; with two levels on the CPU float32 is named now"
+_THIN_REASON = "refused for the work spent or without a reason; with two levels on the CPU float32 is named now"
 
-MISSES: dict[tuple[str, str, str], str] = {
+KNOWN_MISSES: dict[tuple[str, str, str], str] = {
     ("annular/3", "float64", "cpu"): "68 or 86 iterations on two processors, 266 on others: by rounding",
     ("annular/auto", "float64", ""): "the whole load at once takes 160 to 230 iterations; three load steps take 86",
-    ("annular/auto", "float32", "cuda"): _THIN,
+    ("annular/auto", "float32", "cuda"): _THIN_REASON,
     ("soft-thin-limbs", "float64", ""): "found, in 642 iterations on the CPU and 166 on a GPU, in place of 80",
     ("soft-dolphin", "float32", ""): "refused by name: float32 can't hold it",
     ("soft-thin-limbs", "float32", ""): "refused by name: float32 can't hold it",
-    ("thin-static/T10-500", "float32", "cuda"): _THIN,
+    ("thin-static/T10-500", "float32", "cuda"): _THIN_REASON,
 }
 """Reasons by row, precision and kind of device ("": any)."""
 
 
-def reason_for(label: str, dtype: str, device: str) -> str | None:
+def known_miss_reason(label: str, dtype: str, device: str) -> str | None:
     """Reason for a known miss of a row on a device, or None."""
     kind = "cuda" if device.startswith("cuda") else "cpu"
-    return MISSES.get((label, dtype, kind)) or MISSES.get((label, dtype, ""))
+    return KNOWN_MISSES.get((label, dtype, kind)) or KNOWN_MISSES.get((label, dtype, ""))

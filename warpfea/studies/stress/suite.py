@@ -22,16 +22,16 @@ from ...base.names import did_you_mean
 from ...base.provenance import origin
 from ...base.writer import check_target
 from .case import CASES, DTYPES, Answer, Case, Setting, Skipped, label
-from .misses import reason_for
+from .misses import known_miss_reason
 
-__all__ = ["Row", "attempt", "choose", "list_cases", "load_cases", "run_rows", "stress"]
+__all__ = ["Row", "list_cases", "load_cases", "run_row", "run_rows", "select_rows", "stress"]
 
 SCHEMA = 1
 DONE, REFUSED, FAILED, MISSED = "done", "refused", "FAILED", "missed"
 STDOUT = "-"
-NOTE = 120
+NOTE_WIDTH = 120
 """Characters of a note in the table; the file has the full text."""
-HEAD = (
+HEADINGS = (
     "case", "precision", "outcome", "error", "bound", "Newton", "PCG", "largest step", "drift", "violation", "s",
     "note",
 )  # fmt: skip
@@ -60,7 +60,7 @@ def load_cases() -> dict[str, Case]:
     return CASES
 
 
-def choose(cases: Mapping[str, Case], names: Sequence[str], quick: bool, dtypes: Sequence[str]) -> list[Row]:
+def select_rows(cases: Mapping[str, Case], names: Sequence[str], quick: bool, dtypes: Sequence[str]) -> list[Row]:
     """Rows of `names` (cases, rows or groups; none: all). UsageError for an unknown name."""
     known = dict.fromkeys(
         [*cases, *(c.group for c in cases.values()), *(label(c.name, v) for c in cases.values() for v in c.values)]
@@ -90,11 +90,11 @@ def list_cases(cases: Mapping[str, Case]) -> str:
         for case in cases.values():
             if case.group == group:
                 values = ", ".join(label("", value)[1:] for value in case.values if value is not None)
-                out.append([f"  {case.name}", case.quick, f"{case.about}{f' [{values}]' if values else ''}"])
+                out.append([f"  {case.name}", case.quick, f"{case.description}{f' [{values}]' if values else ''}"])
     return table([["case", "quick", "what is tried [values]"], *out])
 
 
-def attempt(row: Row, setting: Setting, debug: bool = False) -> dict[str, Any]:
+def run_row(row: Row, setting: Setting, debug: bool = False) -> dict[str, Any]:
     """Run and evaluate a row: a JSON-compatible dict, `passed` True, False, or None if skipped.
 
     With `debug` errors other than warpfea's are raised.
@@ -104,17 +104,17 @@ def attempt(row: Row, setting: Setting, debug: bool = False) -> dict[str, Any]:
     answer: Answer | None = None
     try:
         answer = case.run(setting) if row.value is None else case.run(setting, row.value)
-        outcome, passed, note = _judge(case, answer)
+        outcome, passed, note = _evaluate_answer(case, answer)
     except Skipped as reason:
         outcome, passed, note = str(reason), None, ""
     except Error as error:
-        outcome, passed, note = _judge_error(case, error, setting.dtype)
+        outcome, passed, note = _evaluate_error(case, error, setting.dtype)
     except Exception as error:
         if debug:
             raise
         line = traceback.format_exception_only(error)[-1].strip()
         outcome, passed, note = FAILED, False, line
-    known = reason_for(row.label, row.dtype, setting.device)
+    known = known_miss_reason(row.label, row.dtype, setting.device)
     if known and passed is False:
         outcome, passed, note = MISSED, None, f"{known} ({note})"
     out: dict[str, Any] = {
@@ -136,9 +136,9 @@ def attempt(row: Row, setting: Setting, debug: bool = False) -> dict[str, Any]:
     return dict(to_json(out))
 
 
-def _judge(case: Case, answer: Answer) -> tuple[str, bool, str]:
+def _evaluate_answer(case: Case, answer: Answer) -> tuple[str, bool, str]:
     """Outcome, passed or not, and a note."""
-    if case.must:
+    if case.must_refuse:
         return FAILED, False, f"accepted what is to be refused; {answer.note}".rstrip("; ")
     if answer.passed:
         return DONE, True, answer.note
@@ -149,14 +149,14 @@ def _judge(case: Case, answer: Answer) -> tuple[str, bool, str]:
     return FAILED, False, "; ".join([*over, answer.note]).rstrip("; ")
 
 
-def _judge_error(case: Case, error: Error, dtype: str) -> tuple[str, bool, str]:
+def _evaluate_error(case: Case, error: Error, dtype: str) -> tuple[str, bool, str]:
     """Outcome for a named error: it passes if the refusal is expected with this text."""
     text = " ".join(str(error).split())
     expected = case.refusal.get(dtype, ())
     if any(part in text for part in expected):
         return REFUSED, True, text
-    told = f", which does not say {' or '.join(map(repr, expected))}" if expected else ""
-    return FAILED, False, f"refused{told}: {type(error).__name__}: {text}"
+    missing_text = f", which does not say {' or '.join(map(repr, expected))}" if expected else ""
+    return FAILED, False, f"refused{missing_text}: {type(error).__name__}: {text}"
 
 
 def run_rows(
@@ -166,22 +166,22 @@ def run_rows(
     have = {(row["case"], row["precision"]): row for row in content["rows"]}
     width = max(len(row.label) for row in rows)
     live = sys.stderr.isatty() and not (options.quiet or options.no_progress)
-    _show(options, dict(zip(HEAD, HEAD)), width)
+    _print_row(options, dict(zip(HEADINGS, HEADINGS)), width)
     for k, row in enumerate(rows):
         found = have.get((row.label, row.dtype))
         if found is None:
             if live:
                 print(f"\r\x1b[K{k + 1}/{len(rows)} {row.label} {row.dtype} ...", end="", file=sys.stderr, flush=True)
-            found = attempt(row, Setting(device, row.dtype, meshes), options.debug)
+            found = run_row(row, Setting(device, row.dtype, meshes), options.debug)
             content["rows"].append(found)
             if options.json and options.json != STDOUT:
                 write_json(options.json, content)
         if live:
             print("\r\x1b[K", end="", file=sys.stderr, flush=True)
-        _show(options, _cells(found), width)
+        _print_row(options, _row_texts(found), width)
 
 
-def _cells(row: Mapping[str, Any]) -> dict[str, str]:
+def _row_texts(row: Mapping[str, Any]) -> dict[str, str]:
     """A row as text, by the heads of the table."""
 
     def text(name: str) -> str:
@@ -197,16 +197,16 @@ def _cells(row: Mapping[str, Any]) -> dict[str, str]:
     }  # fmt: skip
 
 
-def _show(options: argparse.Namespace, cells: Mapping[str, str], width: int) -> None:
+def _print_row(options: argparse.Namespace, cells: Mapping[str, str], width: int) -> None:
     """A line of the table on stdout."""
     if not options.quiet and options.json != STDOUT:
         first = [cells["case"].ljust(width), cells["precision"].ljust(9), cells["outcome"].ljust(8)]
-        middle = [cells[name].rjust(max(len(name), 8)) for name in HEAD[3:-1]]
-        note = cells["note"] if len(cells["note"]) <= NOTE else f"{cells['note'][: NOTE - 3]}..."
+        middle = [cells[name].rjust(max(len(name), 8)) for name in HEADINGS[3:-1]]
+        note = cells["note"] if len(cells["note"]) <= NOTE_WIDTH else f"{cells['note'][: NOTE_WIDTH - 3]}..."
         print("  ".join([*first, *middle, note]).rstrip(), flush=True)
 
 
-def _started(options: argparse.Namespace, settings: Mapping[str, Any], device: str) -> dict[str, Any]:
+def _initial_content(options: argparse.Namespace, settings: Mapping[str, Any], device: str) -> dict[str, Any]:
     """Contents of --json before the first row: the rows of the file to resume, or none. UsageError."""
     content = {"schema": SCHEMA, **origin(options.words, device), "settings": dict(settings), "rows": []}
     path = pathlib.Path(options.json) if options.json and options.json != STDOUT else None
@@ -236,7 +236,7 @@ def stress(options: argparse.Namespace) -> bool:
         print(list_cases(cases))
         return True
     dtypes = DTYPES if options.dtype == "both" else (options.dtype,)
-    rows = choose(cases, options.case, options.quick, dtypes)
+    rows = select_rows(cases, options.case, options.quick, dtypes)
     meshes = pathlib.Path(options.meshes) if options.meshes else None
     if meshes is not None and not meshes.is_dir():
         raise UsageError(f"--meshes {meshes}: no such folder")
@@ -245,16 +245,16 @@ def stress(options: argparse.Namespace) -> bool:
     with quiet_warp():
         device = str(find_device(options.device))
         settings = {"case": options.case, "quick": options.quick, "dtype": options.dtype, "meshes": meshes is not None}
-        content = _started(options, settings, device)
+        content = _initial_content(options, settings, device)
         run_rows(rows, device, meshes, content, options)
     if options.json == STDOUT:
         write_json(STDOUT, content)
     wanted = {(row.label, row.dtype) for row in rows}
     results = [row for row in content["rows"] if (row["case"], row["precision"]) in wanted]
-    return _conclude(options, results)
+    return _print_summary(options, results)
 
 
-def _conclude(options: argparse.Namespace, results: Sequence[Mapping[str, Any]]) -> bool:
+def _print_summary(options: argparse.Namespace, results: Sequence[Mapping[str, Any]]) -> bool:
     """Print the number of passed rows, and the failed ones."""
     wrong = [f"{row['case']} {row['precision']}" for row in results if row["passed"] is False]
     counted = sum(row["passed"] is not None for row in results)

@@ -9,61 +9,61 @@ import numpy as np
 
 import warpfea as wf
 
-from ..build import Count, Z, finalize
+from ..build import StepStats, Z, finalize
 from ..case import Answer, Setting, case
 
 GROUP = "Stability"
 MODULUS, LENGTH, SIDE, THICKNESS = 2e11, 1.0, 0.02, 0.01
-BUCKLED = 0.01507
+BUCKLED_DEFLECTION = 0.01507
 """Displacement of the middle, m, of 32 x 32 shells in float64 with imperfections of 1 and 0.1 mm, within 0.3 %."""
-PUSH = 1e-5
-"""Of the load, across a column."""
+TRANSVERSE_FRACTION = 1e-5
+"""Transverse load on a column over the axial one."""
 
 
-def _judged(b: wf.ModelBuilder, setting: Setting, stable: bool, reference: str) -> Answer:
-    """Error 0 where statics says so, 1 where it says the other and 0.5 where it does not know."""
-    count = Count()
+def _stability_answer(b: wf.ModelBuilder, setting: Setting, stable: bool, reference: str) -> Answer:
+    """Error 0 if statics reports the equilibrium as `stable`, 1 if as the opposite, 0.5 if as undecided."""
+    stats = StepStats()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", wf.StabilityWarning)
-        found = wf.solve_static(finalize(b, setting), outputs=[count])
+        found = wf.solve_static(finalize(b, setting), outputs=[stats])
     assert found.stability is not None
-    said = found.stability.stable[0]
-    error = 0.5 if said is None else float(said is not stable)
+    warnings_caught = found.stability.stable[0]
+    error = 0.5 if warnings_caught is None else float(warnings_caught is not stable)
     note = f"{found.stability.text} {found.stability.reasons[0]}, {int(found.stability.iterations[0])} products"
-    return Answer(error, 0.1, reference, **count.fields, note=note)
+    return Answer(error, 0.1, reference, **stats.answer_fields, note=note)
 
 
-def _column_model(factor: float, across: float = 0.0) -> wf.ModelBuilder:
-    """A cantilever of 16 beam elements under so many times Euler's load, and a fraction of it across."""
+def _column_model(factor: float, transverse: float = 0.0) -> wf.ModelBuilder:
+    """A cantilever of 16 beam elements under so many times Euler's load, and the fraction `transverse` of it across."""
     load = factor * np.pi**2 * MODULUS * SIDE**4 / 12.0 / (4.0 * LENGTH**2)
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     body = b.add_beam([(0, 0, 0), (LENGTH, 0, 0)], elements=16, section=wf.Rectangle(SIDE, SIDE), normal=Z,
                       material=wf.SVK(E=MODULUS, nu=0.0), name="column")  # fmt: skip
     b.clamp(body.start, slots="position+section")
-    b.add_point_load(body.end, (-load, 0.0, across * load))
+    b.add_point_load(body.end, (-load, 0.0, transverse * load))
     b.add_probe("tip", body.end)
     return b
 
 
 @case("buckling-column", GROUP, values=(0.9, 1.1, 10.0), quick="both")
-def column(setting: Setting, factor: float) -> Answer:
-    """A perfect cantilever under so many times Euler's load is said to be stable or not."""
-    return _judged(_column_model(factor), setting, factor < 1.0, "Euler")
+def perfect_column(setting: Setting, factor: float) -> Answer:
+    """A perfect cantilever under so many times Euler's load is reported as stable or not."""
+    return _stability_answer(_column_model(factor), setting, factor < 1.0, "Euler")
 
 
 @case("buckling-pushed", GROUP, values=(1.01, 1.1, 10.0), quick="both",
       refusal={"float64": ("was not accepted",), "float32": ("float32",)})  # fmt: skip
-def pushed(setting: Setting, factor: float) -> Answer:
-    """The same with 1e-5 of the load across it does not stay straight in silence: told, refused, or bent by 0.1 L."""
-    b = _column_model(factor, PUSH)
-    count = Count()
-    with warnings.catch_warnings(record=True) as said:
+def imperfect_column(setting: Setting, factor: float) -> Answer:
+    """With 1e-5 of the load across it a column is reported as unstable, refused, or bent by 0.1 L."""
+    b = _column_model(factor, TRANSVERSE_FRACTION)
+    stats = StepStats()
+    with warnings.catch_warnings(record=True) as warnings_caught:
         warnings.simplefilter("always", wf.StabilityWarning)
-        found = wf.solve_static(finalize(b, setting), outputs=[count])
+        found = wf.solve_static(finalize(b, setting), outputs=[stats])
     side = abs(float(found.probe("tip").displacement[0, -1, 2])) / LENGTH
-    told = any(issubclass(w.category, wf.StabilityWarning) for w in said)
-    note = f"{side:.2g} L to the side, {'un' if told else ''}stable"
-    return Answer(0.0 if told or side > 0.1 else 1.0, 0.1, "Euler", **count.fields, note=note)
+    warned = any(issubclass(w.category, wf.StabilityWarning) for w in warnings_caught)
+    note = f"{side:.2g} L to the side, {'un' if warned else ''}stable"
+    return Answer(0.0 if warned or side > 0.1 else 1.0, 0.1, "Euler", **stats.answer_fields, note=note)
 
 
 def _supported_plate(factor: float, imperfection: float = 0.0) -> tuple[wf.ModelBuilder, wf.Body]:
@@ -87,22 +87,19 @@ def _supported_plate(factor: float, imperfection: float = 0.0) -> tuple[wf.Model
 
 
 @case("buckling-plate", GROUP, values=(0.9, 1.1, 1.5), quick="both")
-def plate(setting: Setting, factor: float) -> Answer:
-    """A perfect, simply supported plate under so many times Bryan's load is said to be stable or not."""
-    return _judged(_supported_plate(factor)[0], setting, factor < 1.0, "Bryan")
+def perfect_plate(setting: Setting, factor: float) -> Answer:
+    """A perfect, simply supported plate under so many times Bryan's load is reported as stable or not."""
+    return _stability_answer(_supported_plate(factor)[0], setting, factor < 1.0, "Bryan")
 
 
 @case("buckling-imperfect-plate", GROUP, values=(1e-3, 1e-4), quick="both")
 def imperfect_plate(setting: Setting, imperfection: float) -> Answer:
-    """At 1.5 of Bryan's load it buckles to where 32 x 32 shells do, and is stable.
-
-    The single-precision answer was once 3e-6 m.
-    """
+    """At 1.5 of Bryan's load the plate buckles as far as one of 32 x 32 shells, and is stable."""
     b, body = _supported_plate(1.5, imperfection)
     b.add_probe("middle", body.at((LENGTH / 2, LENGTH / 2, imperfection)))
-    count = Count()
-    found = wf.solve_static(finalize(b, setting), outputs=[count])
+    stats = StepStats()
+    found = wf.solve_static(finalize(b, setting), outputs=[stats])
     assert found.report.stable is not None
     middle = float(found.probe("middle").displacement[0, -1, 2])
-    error = abs(middle / BUCKLED - 1.0) if found.report.stable[0] else 1.0
-    return Answer(error, 0.04, "32 x 32 shells", **count.fields, note=f"middle at {middle:.4g} m")
+    error = abs(middle / BUCKLED_DEFLECTION - 1.0) if found.report.stable[0] else 1.0
+    return Answer(error, 0.04, "32 x 32 shells", **stats.answer_fields, note=f"middle at {middle:.4g} m")

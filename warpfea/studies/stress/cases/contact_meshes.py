@@ -9,25 +9,26 @@ import numpy as np
 import warpfea as wf
 
 from ..case import Answer, Setting, case
-from .contact import FAST, GROUP, REFUSAL_TEXTS, SIDE, SINGLE, corner_down, edge_down, exact, middle, scene, watch
+from . import contact
+from .contact import IMPACT_SPEED, SIDE, bound_for, center_of_mass, edge_down, make_scene, simulate, vertex_down
 
-SQUARE = np.array([(0, 1, 2), (0, 2, 3)])
+SQUARE_TRIANGLES = np.array([(0, 1, 2), (0, 2, 3)])
 
 
-def sheet(cells: int = 4, half: float = 0.3, height: float = 0.0) -> wf.TriMesh:
+def square_sheet(cells: int = 4, half: float = 0.3, height: float = 0.0) -> wf.TriMesh:
     """A square centred at the cube, of cells x cells squares."""
     g = np.linspace(-half, half, cells + 1) + SIDE / 2
     points = np.array([(x, y, height) for y in g for x in g])
     first = np.arange(cells * (cells + 1)).reshape(cells, cells + 1)[:, :-1].reshape(-1, 1, 1)
     corners = np.array([0, 1, cells + 2, cells + 1])
-    return wf.TriMesh(points, (first + corners[SQUARE]).reshape(-1, 3))
+    return wf.TriMesh(points, (first + corners[SQUARE_TRIANGLES]).reshape(-1, 3))
 
 
 def pyramid(height: float = 0.2, half: float = 0.2) -> wf.TriMesh:
     """A solid with its tip, of four triangles, at the origin."""
     base = [(-half, -half, -height), (half, -half, -height), (half, half, -height), (-half, half, -height)]
     sides = [(0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4)]
-    return wf.TriMesh(np.array([*base, (0, 0, 0)]), np.array([*SQUARE[:, ::-1].tolist(), *sides]))
+    return wf.TriMesh(np.array([*base, (0, 0, 0)]), np.array([*SQUARE_TRIANGLES[:, ::-1].tolist(), *sides]))
 
 
 def roof(height: float = 0.1, half: float = 0.2, long: float = 0.4) -> wf.TriMesh:
@@ -42,62 +43,64 @@ def roof(height: float = 0.1, half: float = 0.2, long: float = 0.4) -> wf.TriMes
 
 
 @case(
-    "contact-sheet", GROUP, values=tuple((way, E) for way in ("front", "behind") for E in (1e6, 1e8)), quick="none",
-    refusal=REFUSAL_TEXTS,
+    "contact-sheet", contact.GROUP, values=tuple((way, E) for way in ("front", "behind") for E in (1e6, 1e8)),
+    quick="none", refusal=contact.REFUSAL_TEXTS,
 )  # fmt: skip
 def impact(setting: Setting, value: tuple[str, float]) -> Answer:
     """A cube at 100 m/s onto a sheet without thickness, ten of its sides a step: no penetration."""
     way, E = value
-    shape = sheet()
+    shape = square_sheet()
     if way == "behind":
         shape = wf.TriMesh(shape.points, shape.triangles[:, ::-1])
-    s = scene(shape, E=E, gravity=(0, 0, 0), place=(0, 0, 0.3), mu=0.3, restitution=0.5)
-    s.builder.set_initial(s.body, velocity=(0, 0, -FAST))
+    s = make_scene(shape, E=E, gravity=(0, 0, 0), translation=(0, 0, 0.3), mu=0.3, restitution=0.5)
+    s.builder.set_initial(s.body, velocity=(0, 0, -IMPACT_SPEED))
     sim = wf.Simulation(s.model(setting), dt=1e-2)
-    seen = watch(sim, s, 5, mu=0.3)
-    return seen.answer(setting, max(seen.through, 0.0), 0.0, "the centre stays before the obstacle")
+    run = simulate(sim, s, 5, mu=0.3)
+    return run.answer(setting, max(run.center_depth, 0.0), 0.0, "the centre stays before the obstacle")
 
 
 FEATURES: dict[str, tuple[Callable[[], wf.TriMesh], Callable[[], np.ndarray]]] = {
-    "vertex on vertex": (pyramid, corner_down),
-    "vertex on edge": (roof, corner_down),
+    "vertex on vertex": (pyramid, vertex_down),
+    "vertex on edge": (roof, vertex_down),
     "edge on edge": (roof, edge_down),
     "edge on vertex": (pyramid, edge_down),
-    "vertex on border": (lambda: sheet(2), corner_down),
+    "vertex on border": (lambda: square_sheet(2), vertex_down),
 }
 
 
-@case("contact-mesh", GROUP, values=tuple(FEATURES), quick="float64", refusal=SINGLE)
-def features(setting: Setting, which: str) -> Answer:
+@case("contact-mesh", contact.GROUP, values=tuple(FEATURES), quick="float64", refusal=contact.FLOAT32_REFUSAL)
+def feature_contact(setting: Setting, which: str) -> Answer:
     """A turned cube falls at 1 m/s with its vertex or edge on one of a mesh, 40 steps: no penetration, the
     change of its momentum is the impulse, and no energy is gained."""
-    shape, turn = FEATURES[which]
-    s = scene(shape(), E=1e6, turn=turn(), place=(0, 0, 5e-4), mu=0.3, restitution=0.5, stiffness=10.0)
+    shape, rotation = FEATURES[which]
+    s = make_scene(
+        shape(), E=1e6, rotation=rotation(), translation=(0, 0, 5e-4), mu=0.3, restitution=0.5, stiffness=10.0
+    )
     s.builder.set_initial(s.body, velocity=(0, 0, -1.0))
     sim = wf.Simulation(s.model(setting), dt=1e-3)
-    seen = watch(sim, s, 40, mu=0.3)
-    sunk = float(sim.contact_record(s.pads[0]).penetration[0].max()) / SIDE
-    limits = {"through": (seen.through, 0.0), "sunk": (sunk, 0.3)}
-    return seen.answer(setting, None, exact(setting, 1e-6, 1e-2), "impulse of the records", limits=limits)
+    run = simulate(sim, s, 40, mu=0.3)
+    sunk = float(sim.contact_record(s.contacts[0]).penetration[0].max()) / SIDE
+    limits = {"through": (run.center_depth, 0.0), "sunk": (sunk, 0.3)}
+    return run.answer(setting, None, bound_for(setting, 1e-6, 1e-2), "impulse of the records", limits=limits)
 
 
-@case("contact-mesh-touch", GROUP, values=("sheet", "borders", "same faces", "tip"), quick="both")
+@case("contact-mesh-touch", contact.GROUP, values=("sheet", "borders", "same faces", "tip"), quick="both")
 def exact_touch(setting: Setting, which: str) -> Answer:
     """A cube begins in exact touch with a mesh, under its weight, 50 steps: on a sheet, with its edges on borders of
     triangles, face on face with a mesh of its own size, or with a tip on the middle of its face."""
     cube = wf.Box(center=(SIDE / 2, SIDE / 2, -SIDE / 2), size=(SIDE, SIDE, SIDE))
     shapes = {
-        "sheet": sheet(3),
-        "borders": sheet(6),
+        "sheet": square_sheet(3),
+        "borders": square_sheet(6),
         "same faces": wf.TriMesh(*cube.mesh()),
         "tip": wf.TriMesh(pyramid().points + (SIDE / 2, SIDE / 2, 0), pyramid().triangles),
     }
-    s = scene(shapes[which], mu=0.5, restitution=0.5, stiffness=100.0 if which == "tip" else 1.0)
+    s = make_scene(shapes[which], mu=0.5, restitution=0.5, stiffness=100.0 if which == "tip" else 1.0)
     sim = wf.Simulation(s.model(setting), dt=1e-3)
-    seen = watch(sim, s, 50, mu=0.5)
-    sunk = float(sim.contact_record(s.pads[0]).penetration[0].max()) / SIDE
-    shifted = float(np.abs(middle(sim, s)[:2] / SIDE - 0.5).max())
+    run = simulate(sim, s, 50, mu=0.5)
+    sunk = float(sim.contact_record(s.contacts[0]).penetration[0].max()) / SIDE
+    shifted = float(np.abs(center_of_mass(sim, s)[:2] / SIDE - 0.5).max())
     limits = {"sunk": (sunk, 0.05)}
     if which != "tip":  # it slides off, as four slopes of 45 degrees and mu = 0.5 allow
-        limits["shifted"] = (shifted, exact(setting, 1e-3, 1e-2))
-    return seen.answer(setting, None, exact(setting, 1e-6, 1e-2), "impulse of the records", limits=limits)
+        limits["shifted"] = (shifted, bound_for(setting, 1e-3, 1e-2))
+    return run.answer(setting, None, bound_for(setting, 1e-6, 1e-2), "impulse of the records", limits=limits)

@@ -11,14 +11,14 @@ from ..case import Answer, Setting, case
 
 RADIUS, PITCH = 0.02, 0.005
 """Radius and pitch of the helix, m."""
-PER_TURN = 24
+ELEMENTS_PER_TURN = 24
 """Elements per turn, 15 degrees each."""
-BOUND = 1e-6
+TANGENT_BOUND = 1e-6
 """Bounds of the angle of a tangent, rad, and of the length of dX/dxi, relative."""
 
 
 @case("curves", "geometry", values=(10, 100, 160, 1000), quick="float64", dtypes=("float64",))
-def curves(setting: Setting, turns: int) -> Answer:
+def helix_tangents(setting: Setting, turns: int) -> Answer:
     """A helix given as a function of s: tangents and lengths dX/dxi at the nodes against the exact ones."""
     turn = 2.0 * np.pi * turns
 
@@ -26,7 +26,7 @@ def curves(setting: Setting, turns: int) -> Answer:
         return RADIUS * np.cos(turn * s), RADIUS * np.sin(turn * s), PITCH * turns * s
 
     b = wf.ModelBuilder(gravity=(0, 0, 0))
-    elements = PER_TURN * turns
+    elements = ELEMENTS_PER_TURN * turns
     beam = b.add_beam(
         helix, elements=elements, section=wf.Rectangle(0.002, 0.002), normal=(0, 0, 1), material=STEEL, name="helix",
     )  # fmt: skip
@@ -42,5 +42,5 @@ def curves(setting: Setting, turns: int) -> Answer:
     angle = float(np.arctan2(across, np.sum(made * exact, axis=2)).max())
     stretch = float(np.abs(np.linalg.norm(made, axis=2) / length - 1.0).max())
     off_curve = float(np.linalg.norm(beam.mesh.points - np.array([helix(k) for k in s]), axis=1).max() / RADIUS)
-    return Answer(max(angle, stretch, off_curve), BOUND, "derivative of the helix",
+    return Answer(max(angle, stretch, off_curve), TANGENT_BOUND, "derivative of the helix",
                   note=f"angle {angle:.2g} rad, length {stretch:.2g}")  # fmt: skip

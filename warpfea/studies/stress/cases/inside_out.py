@@ -8,29 +8,29 @@ import numpy as np
 
 import warpfea as wf
 
-from ..build import BUILT_IN, SOUND, bar, solve
+from ..build import CLAMPED_SLOTS, MIN_POSITIVE_J, bar, solve
 from ..case import Answer, Setting, Skipped, case
 
 SIZE = (1.0, 0.1, 0.1)
 CELLS = {"T4": (20, 2, 2), "T10": (20, 2, 2), "FN18": (20, 2, 2), "H3843": (20, 1, 1)}
-PULLED = CELLS | {"T10": (10, 1, 1), "FN18": (10, 1, 1)}
+STRETCHED_CELLS = CELLS | {"T10": (10, 1, 1), "FN18": (10, 1, 1)}
 """Cells of the neo-Hookean bar stretched tenfold, which takes minutes with finer ones."""
 SVK = wf.SVK(E=1e6, nu=0.3, density=1000.0)
 NEO_HOOKEAN = wf.NeoHookean.from_E_nu(E=1e6, nu=0.3, density=1000.0)
-REASONS = ["inverted", "unstable equilibrium"]
+REFUSAL_TEXTS = ["inverted", "unstable equilibrium"]
 """Accepted refusal: a limit point past which a bar snaps into an inverted state."""
-INSIDE_OUT = {"float64": REASONS, "float32": [*REASONS, "float32"]}
-COARSE = {"float32": ["float32"]}
-MOVED = {"squeezed": -0.95, "stretched": 9.0}
-"""Travel of the far end along the bar, m."""
-TURNS = 4.0
-BALANCE = {"float64": 1e-6, "float32": 1e-3}
+SVK_REFUSAL = {"float64": REFUSAL_TEXTS, "float32": [*REFUSAL_TEXTS, "float32"]}
+FLOAT32_REFUSAL = {"float32": ["float32"]}
+END_DISPLACEMENTS = {"squeezed": -0.95, "stretched": 9.0}
+"""Displacement of the driven end along the bar, m."""
+TWIST_TURNS = 4.0
+BALANCE_BOUNDS = {"float64": 1e-6, "float32": 1e-3}
 """Bound of the sum of the forces at both ends, over the larger."""
-LOWEST_J = 0.35
+MIN_STRETCHED_J = 0.35
 """Minimum J of the neo-Hookean bar stretched tenfold, at integration points."""
 
 
-def pressed(element: str) -> tuple[wf.ModelBuilder, wf.Body]:
+def pressed_bar(element: str) -> tuple[wf.ModelBuilder, wf.Body]:
     """An SVK bar under a pressure of ten times its modulus, guided along its axis to prevent buckling."""
     b, body = bar(element, CELLS[element], SIZE, SVK)
     b.clamp(body.nodes(lambda X: X[:, 0] > -1.0), slots="all", components="yz")
@@ -38,37 +38,40 @@ def pressed(element: str) -> tuple[wf.ModelBuilder, wf.Body]:
     return b, body
 
 
-def forced(element: str, law: wf.SVK | wf.NeoHookean, how: str) -> tuple[wf.ModelBuilder, wf.Body]:
+def driven_bar(element: str, law: wf.SVK | wf.NeoHookean, how: str) -> tuple[wf.ModelBuilder, wf.Body]:
     """A bar with fully clamped ends, one of them driven: compressed, stretched or twisted."""
-    cells = PULLED if law is NEO_HOOKEAN and how == "stretched" else CELLS
+    cells = STRETCHED_CELLS if law is NEO_HOOKEAN and how == "stretched" else CELLS
     b, body = bar(element, cells[element], SIZE, law)
-    slots = BUILT_IN[element]
+    slots = CLAMPED_SLOTS[element]
     if how == "twisted":
-        turn = wf.Rotation(anchor=(0, 0.05, 0.05), axis=(1, 0, 0), angle=([0, 1], [0, 2.0 * np.pi * TURNS]))
+        turn = wf.Rotation(anchor=(0, 0.05, 0.05), axis=(1, 0, 0), angle=([0, 1], [0, 2.0 * np.pi * TWIST_TURNS]))
         b.drive(body.nodes("x+"), rotation=turn, slots=slots)
     else:
         slots = slots.replace("all", "position")
-        b.drive(body.nodes("x+"), displacement=([0, 1], [(0, 0, 0), (MOVED[how], 0, 0)]), slots=slots)
+        b.drive(body.nodes("x+"), displacement=([0, 1], [(0, 0, 0), (END_DISPLACEMENTS[how], 0, 0)]), slots=slots)
     return b, body
 
 
-def balance(setting: Setting, element: str, law: wf.SVK | wf.NeoHookean, how: str, low: float = SOUND) -> Answer:
-    """Answer of such a bar: the forces at its ends are opposite, and J >= `low` everywhere."""
-    b, body = forced(element, law, how)
+def force_balance(
+    setting: Setting, element: str, law: wf.SVK | wf.NeoHookean, how: str, lowest_J: float = MIN_POSITIVE_J
+) -> Answer:
+    """Answer of such a bar: the forces at its ends are opposite, and J >= `lowest_J` everywhere."""
+    b, body = driven_bar(element, law, how)
     found = solve(b, setting, load_steps=40)
     ends = [found.result.reaction(body.nodes(side))[0] for side in ("x-", "x+")]
     scale = max(float(np.abs(ends).max()), 1e-6 * law.lame[1] * SIZE[1] * SIZE[2])
     error = float(np.abs(ends[0] + ends[1]).max()) / scale
-    count = found.count
-    told = "forces of both ends are opposite"
-    return count.answer(error, BALANCE[setting.dtype], told, low=low, note=f"min J {count.min_J:.3g}")
+    stats = found.stats
+    reference = "forces of both ends are opposite"
+    bound, note = BALANCE_BOUNDS[setting.dtype], f"min J {stats.min_J:.3g}"
+    return stats.answer(error, bound, reference, lowest_J=lowest_J, note=note)
 
 
-@case("inverted-traction", "inside out", values=tuple(CELLS), quick="float64", refusal=INSIDE_OUT, must=True)
+@case("inverted-traction", "inside out", values=tuple(CELLS), quick="float64", refusal=SVK_REFUSAL, must_refuse=True)
 def inverted_traction(setting: Setting, element: str) -> Answer:
     """A guided SVK bar under a pressing traction ten times its modulus, without an admissible equilibrium."""
-    found = solve(pressed(element)[0], setting)
-    return found.count.answer(0.0, 0.0, "SVK softens: no state with J > 0", note=f"min J {found.count.min_J:.3g}")
+    found = solve(pressed_bar(element)[0], setting)
+    return found.stats.answer(0.0, 0.0, "SVK softens: no state with J > 0", note=f"min J {found.stats.min_J:.3g}")
 
 
 @case("inverted-report", "inside out")
@@ -76,47 +79,47 @@ def inverted_report(setting: Setting) -> Answer:
     """The guided bar with inversion="report": the state is returned, reported as inverted."""
     if "inversion" not in inspect.signature(wf.solve_static).parameters:
         raise Skipped("no option")
-    b, body = pressed("T10")
+    b, body = pressed_bar("T10")
     found = solve(b, setting, inversion="report")
     end = found.result.reaction(body.nodes("x-"))[0, 0]
     load = 1e7 * SIZE[1] * SIZE[2]
-    limits = {"min J": (found.count.min_J, 0.0)}
+    limits = {"min J": (found.stats.min_J, 0.0)}
     error = abs(end / load - 1.0)
-    told = "the wall carries the load"
-    return found.count.answer(error, BALANCE[setting.dtype], told, low=None, limits=limits)
+    reference = "the wall carries the load"
+    return found.stats.answer(error, BALANCE_BOUNDS[setting.dtype], reference, lowest_J=None, limits=limits)
 
 
-@case("inverted-squeezed", "inside out", values=tuple(CELLS), refusal=INSIDE_OUT)
+@case("inverted-squeezed", "inside out", values=tuple(CELLS), refusal=SVK_REFUSAL)
 def inverted_squeezed(setting: Setting, element: str) -> Answer:
     """An SVK bar compressed to a twentieth: correct with J > 0, or refused."""
-    return balance(setting, element, SVK, "squeezed")
+    return force_balance(setting, element, SVK, "squeezed")
 
 
-@case("inverted-stretched", "inside out", values=tuple(CELLS), refusal=INSIDE_OUT)
+@case("inverted-stretched", "inside out", values=tuple(CELLS), refusal=SVK_REFUSAL)
 def inverted_stretched(setting: Setting, element: str) -> Answer:
     """An SVK bar stretched tenfold: correct with J > 0, or refused."""
-    return balance(setting, element, SVK, "stretched")
+    return force_balance(setting, element, SVK, "stretched")
 
 
-@case("inverted-twisted", "inside out", values=tuple(CELLS), refusal=INSIDE_OUT)
+@case("inverted-twisted", "inside out", values=tuple(CELLS), refusal=SVK_REFUSAL)
 def inverted_twisted(setting: Setting, element: str) -> Answer:
     """An SVK bar twisted by four turns: correct with J > 0, or refused."""
-    return balance(setting, element, SVK, "twisted")
+    return force_balance(setting, element, SVK, "twisted")
 
 
-@case("neo-squeezed", "inside out", values=tuple(CELLS), refusal=COARSE)
+@case("neo-squeezed", "inside out", values=tuple(CELLS), refusal=FLOAT32_REFUSAL)
 def neo_squeezed(setting: Setting, element: str) -> Answer:
     """A neo-Hookean bar compressed to a twentieth: a solution is required."""
-    return balance(setting, element, NEO_HOOKEAN, "squeezed")
+    return force_balance(setting, element, NEO_HOOKEAN, "squeezed")
 
 
-@case("neo-stretched", "inside out", values=tuple(CELLS), refusal=COARSE)
+@case("neo-stretched", "inside out", values=tuple(CELLS), refusal=FLOAT32_REFUSAL)
 def neo_stretched(setting: Setting, element: str) -> Answer:
     """A neo-Hookean bar stretched tenfold: a solution is required, with J >= 0.35 at its points."""
-    return balance(setting, element, NEO_HOOKEAN, "stretched", LOWEST_J)
+    return force_balance(setting, element, NEO_HOOKEAN, "stretched", MIN_STRETCHED_J)
 
 
-@case("neo-twisted", "inside out", values=tuple(CELLS), refusal=COARSE)
+@case("neo-twisted", "inside out", values=tuple(CELLS), refusal=FLOAT32_REFUSAL)
 def neo_twisted(setting: Setting, element: str) -> Answer:
     """A neo-Hookean bar twisted by four turns: a solution is required."""
-    return balance(setting, element, NEO_HOOKEAN, "twisted")
+    return force_balance(setting, element, NEO_HOOKEAN, "twisted")

@@ -9,10 +9,10 @@ from scipy.spatial.transform import Rotation as Turn
 
 import warpfea as wf
 
-from ..build import Count, finalize, off, solve
+from ..build import StepStats, finalize, relative_error, solve
 from ..case import Answer, Setting, case
 
-TURNS = ((0.3, 0.0, 0.0), (1.2, -2.1, 0.7), (0.0, np.pi, 0.0))
+ROTATION_VECTORS = ((0.3, 0.0, 0.0), (1.2, -2.1, 0.7), (0.0, np.pi, 0.0))
 """Rotation vectors, rad."""
 SIZE = (1.0, 0.1, 0.1)
 """Length of the cantilevers, in the unit of the row."""
@@ -50,7 +50,7 @@ def _cantilever(
 
 @case("frame", "Invariance", values=("T10-1e4", "T10-1e6", "H3843-1e6", "3243-1e4", "3243-1e6", "3443-1e6"),
       quick="both")  # fmt: skip
-def frame(setting: Setting, value: str) -> Answer:
+def frame_invariance(setting: Setting, value: str) -> Answer:
     """A cantilever bent by a third of its length, rotated and moved by 10 or 1000 km, deflects as at the origin.
 
     In float32 up to the round-off estimates of both reports.
@@ -59,24 +59,24 @@ def frame(setting: Setting, value: str) -> Answer:
     law = wf.SVK(E=1e9, nu=0.3)
     load = 1e9 * SIZE[1] ** 4 / 12.0
     tol = None if setting.single else 1e-12
-    count = Count()
+    stats = StepStats()
     worst, at_home = 0.0, None
-    for turn in (Turn.identity(), *(Turn.from_rotvec(v) for v in TURNS)):
+    for turn in (Turn.identity(), *(Turn.from_rotvec(v) for v in ROTATION_VECTORS)):
         shift = np.zeros(3) if at_home is None else float(away) * np.array([0.6, -0.48, 0.64])
         b, _ = _cantilever(element, law, load, turn, shift)
-        tip = turn.inv().apply(solve(b, setting, count, load_steps=2, tol=tol).result.probe("tip").displacement[0, -1])
+        tip = turn.inv().apply(solve(b, setting, stats, load_steps=2, tol=tol).result.probe("tip").displacement[0, -1])
         if at_home is None:
             at_home = tip
-        worst = max(worst, off(tip, at_home))
-    bound = max(1e-4, 3.0 * count.floor) if setting.single else 1e-8
-    return Answer(worst, bound, "the same body at the origin", **count.fields)
+        worst = max(worst, relative_error(tip, at_home))
+    bound = max(1e-4, 3.0 * stats.floor) if setting.single else 1e-8
+    return Answer(worst, bound, "the same body at the origin", **stats.answer_fields)
 
 
 @case("units", "Invariance", values=("mm", "km"), quick="both")
-def units(setting: Setting, value: str) -> Answer:
+def unit_invariance(setting: Setting, value: str) -> Answer:
     """A cantilever measured in mm and N, and in km and N, has the same relative deflection as in m."""
     unit = {"mm": 1e3, "km": 1e-3}[value]
-    count = Count()
+    stats = StepStats()
     worst = 0.0
     for element in ("T10", "3243", "3443"):
         tips = []
@@ -85,10 +85,10 @@ def units(setting: Setting, value: str) -> Answer:
             load = 1e9 * SIZE[1] ** 4 / 12.0
             b, _ = _cantilever(element, law, load, Turn.identity(), np.zeros(3), per_metre)
             tol = None if setting.single else 1e-12
-            result = solve(b, setting, count, load_steps=2, tol=tol).result
+            result = solve(b, setting, stats, load_steps=2, tol=tol).result
             tips.append(result.probe("tip").displacement[0, -1] / per_metre)
-        worst = max(worst, off(tips[1], tips[0]))
-    return Answer(worst, 1e-4 if setting.single else 1e-8, "the same body in m", **count.fields)
+        worst = max(worst, relative_error(tips[1], tips[0]))
+    return Answer(worst, 1e-4 if setting.single else 1e-8, "the same body in m", **stats.answer_fields)
 
 
 MODULI = ("1e3", "1e6", "1e9", "1e12")
@@ -98,23 +98,23 @@ MODULI = ("1e3", "1e6", "1e9", "1e12")
 def stiffness_static(setting: Setting, value: str) -> Answer:
     """A fixed small load: deflection times E is equal for E from 1 kPa to 1 TPa."""
     load = 1e-6 * 1e3 * SIZE[1] ** 4 / 12.0
-    count = Count()
+    stats = StepStats()
     worst = 0.0
     for element in ("T10", "3243", "3443"):
         K = []
         for E in (1e6, float(value)):
             b, _ = _cantilever(element, wf.SVK(E=E, nu=0.3), load, Turn.identity(), np.zeros(3))
             tol = 1e-6 if setting.single else 1e-10
-            K.append(E * solve(b, setting, count, load_steps=1, tol=tol).result.probe("tip").displacement[0, -1, 2])
-        worst = max(worst, off(K[1], K[0]))
-    return Answer(worst, 1e-4 if setting.single else 1e-8, "linear statics", **count.fields)
+            K.append(E * solve(b, setting, stats, load_steps=1, tol=tol).result.probe("tip").displacement[0, -1, 2])
+        worst = max(worst, relative_error(K[1], K[0]))
+    return Answer(worst, 1e-4 if setting.single else 1e-8, "linear statics", **stats.answer_fields)
 
 
 @case("stiffness-dynamic", "Invariance", values=MODULI, quick="both")
 def stiffness_dynamic(setting: Setting, value: str) -> Answer:
     """Steps of 1 ms of backward Euler from rest under a small load, E from 1 kPa to 1 TPa."""
     E, h, steps = float(value), 1e-3, 20
-    count = Count()
+    stats = StepStats()
     worst = 0.0
     for element in ("T10", "3243"):
         law = wf.SVK(E=E, nu=0.3, density=1000.0)
@@ -123,9 +123,9 @@ def stiffness_dynamic(setting: Setting, value: str) -> Answer:
         b, _ = _cantilever(element, law, load, Turn.identity(), np.zeros(3))
         tol = None if setting.single else 1e-10
         sim = wf.Simulation(finalize(b, setting), dt=h, solver=wf.NewtonPCG(tol=tol))
-        count.step(sim, steps)
-        worst = max(worst, off(sim.state.displacement.numpy()[0], load * exact))
-    return Answer(worst, 1e-4 if setting.single else 1e-6, "linear backward Euler by scipy", **count.fields)
+        stats.step(sim, steps)
+        worst = max(worst, relative_error(sim.state.displacement.numpy()[0], load * exact))
+    return Answer(worst, 1e-4 if setting.single else 1e-6, "linear backward Euler by scipy", **stats.answer_fields)
 
 
 def _linear_steps(b: wf.ModelBuilder, body: wf.Body, h: float, steps: int) -> np.ndarray:

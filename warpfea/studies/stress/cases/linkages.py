@@ -9,45 +9,45 @@ from scipy.integrate import solve_ivp
 
 import warpfea as wf
 
-from ..build import Count, X, Y, Z, finalize
+from ..build import StepStats, X, Y, Z, finalize
 from ..case import Answer, Setting, case
 
-G = 9.81
-SIDE, LINK = 0.05, 0.5
+GRAVITY = 9.81
+SIDE, LINK_LENGTH = 0.05, 0.5
 """Length of a link, m."""
 LIGHT, RATIO = 10.0, 1e6
 """Density of the light links, kg/m^3, and the mass ratio of the others."""
 
 
-def _tol(setting: Setting) -> float:
+def _violation_bound(setting: Setting) -> float:
     return 1e-5 if setting.single else 1e-8
 
 
-def _links(
+def _add_links(
     b: wf.ModelBuilder, kind: str, densities: Any, along: np.ndarray, across: Any, E: float
 ) -> tuple[list[wf.Body], list[Any]]:
-    """Beams of one element in a row from the origin, with joints above each."""
+    """Beams of one element in a row from the origin, each with a joint to its predecessor."""
     bodies, joints = [], []
-    above: Any = wf.GROUND
+    parent: Any = wf.GROUND
     for k, density in enumerate(densities):
-        ends = [k * LINK * along, (k + 1) * LINK * along]
+        ends = [k * LINK_LENGTH * along, (k + 1) * LINK_LENGTH * along]
         link = b.add_beam(ends, elements=1, section=wf.Rectangle(SIDE, SIDE), normal=across, name=f"link {k}",
                           material=wf.SVK(E=E, nu=0.3, density=density))  # fmt: skip
         axis = Y if kind == "revolute" else None
-        joints.append(b.add_joint(kind, parent=above, child=link.start, axis=axis))
+        joints.append(b.add_joint(kind, parent=parent, child=link.start, axis=axis))
         bodies.append(link)
-        above = link.end
+        parent = link.end
     return bodies, joints
 
 
-def _pendulum(masses: Any, angle: float, times: np.ndarray) -> np.ndarray:
+def _double_pendulum(masses: Any, angle: float, times: np.ndarray) -> np.ndarray:
     """Angles (times, 2) of two rigid links from rest, from the downward vertical."""
-    c = LINK / 2.0
-    own = [m * (LINK**2 + SIDE**2) / 12.0 for m in masses]
-    A = own[0] + masses[0] * c**2 + masses[1] * LINK**2
-    B = masses[1] * LINK * c
+    c = LINK_LENGTH / 2.0
+    own = [m * (LINK_LENGTH**2 + SIDE**2) / 12.0 for m in masses]
+    A = own[0] + masses[0] * c**2 + masses[1] * LINK_LENGTH**2
+    B = masses[1] * LINK_LENGTH * c
     C = own[1] + masses[1] * c**2
-    weights = G * np.array([masses[0] * c + masses[1] * LINK, masses[1] * c])
+    weights = GRAVITY * np.array([masses[0] * c + masses[1] * LINK_LENGTH, masses[1] * c])
 
     def rates(_: float, y: np.ndarray) -> np.ndarray:
         q, v = y[:2], y[2:]
@@ -65,82 +65,82 @@ def mass_ratio(setting: Setting, value: str) -> Answer:
     densities = [LIGHT * (RATIO if word == "heavy" else 1.0) for word in value.split("-")]
     angle, h = np.pi / 4, 1e-3
     along = np.array([np.sin(angle), 0.0, -np.cos(angle)])
-    b = wf.ModelBuilder(gravity=(0, 0, -G))
-    bodies, _ = _links(b, "revolute", densities, along, np.cross(along, Y), 2e12)
+    b = wf.ModelBuilder(gravity=(0, 0, -GRAVITY))
+    bodies, _ = _add_links(b, "revolute", densities, along, np.cross(along, Y), 2e12)
     for name, body in zip(("elbow", "tip"), bodies):
         b.add_probe(name, body.end)
     model = finalize(b, setting)
     sim = wf.Simulation(model, dt=h, integrator="bdf2")
-    count = Count()
-    sim.run(1.0, outputs=[count], progress=False)
+    stats = StepStats()
+    sim.run(1.0, outputs=[stats], progress=False)
     times = sim.probe("tip").time
-    angles = _pendulum([d * SIDE**2 * LINK for d in densities], angle, np.append(0.0, times))[1:]
+    angles = _double_pendulum([d * SIDE**2 * LINK_LENGTH for d in densities], angle, np.append(0.0, times))[1:]
     ways = np.stack([np.sin(angles), 0.0 * angles, -np.cos(angles)], axis=-1)
-    exact = LINK * np.cumsum(ways, axis=1)
+    exact = LINK_LENGTH * np.cumsum(ways, axis=1)
     got = np.stack([sim.probe(name).position[0] for name in ("elbow", "tip")], axis=1)
-    error = float(np.linalg.norm(got - exact, axis=2).max() / (2.0 * LINK))
-    return Answer(error, 5e-3 if setting.single else 1e-3, "rigid double pendulum by scipy", **count.fields,
-                  limits={"violation": (count.violation or 0.0, _tol(setting))})  # fmt: skip
+    error = float(np.linalg.norm(got - exact, axis=2).max() / (2.0 * LINK_LENGTH))
+    return Answer(error, 5e-3 if setting.single else 1e-3, "rigid double pendulum by scipy", **stats.answer_fields,
+                  limits={"violation": (stats.violation or 0.0, _violation_bound(setting))})  # fmt: skip
 
 
 @case("mass-ratio-chain", "Joints", values=("fixed", "revolute"), quick="both")
 def mass_ratio_chain(setting: Setting, kind: str) -> Answer:
     """Six hanging links at rest, alternately light and 1e6 times as heavy: force of every joint against the weight."""
     densities = [LIGHT, RATIO * LIGHT] * 3
-    return _hanging(setting, kind, densities, 0.0)
+    return _chain_forces(setting, kind, densities, 0.0)
 
 
 @case("chain-1e3", "Joints", values=("fixed", "revolute"), quick="both")
-def chain(setting: Setting, kind: str) -> Answer:
+def loaded_chain(setting: Setting, kind: str) -> Answer:
     """Ten hanging links at rest with a load of 1000 times a link's weight at their end."""
-    return _hanging(setting, kind, [1000.0] * 10, 1000.0)
+    return _chain_forces(setting, kind, [1000.0] * 10, 1000.0)
 
 
-def _hanging(setting: Setting, kind: str, densities: list[float], load: float) -> Answer:
+def _chain_forces(setting: Setting, kind: str, densities: list[float], load: float) -> Answer:
     """Joint forces of a chain at rest over the weight below, `load` in weights of the first link hung from its end.
 
     Statics if the joints leave no free mode, else 100 damping steps of 10 ms of backward Euler.
     """
-    b = wf.ModelBuilder(gravity=(0, 0, -G))
-    bodies, joints = _links(b, kind, densities, -np.array(Z), X, 2e11)
-    weights = np.array(densities) * SIDE**2 * LINK * G
+    b = wf.ModelBuilder(gravity=(0, 0, -GRAVITY))
+    bodies, joints = _add_links(b, kind, densities, -np.array(Z), X, 2e11)
+    weights = np.array(densities) * SIDE**2 * LINK_LENGTH * GRAVITY
     if load:
         b.add_point_load(bodies[-1].end, (0, 0, -load * weights[0]))
-    count = Count()
+    stats = StepStats()
     model = finalize(b, setting)
     if kind == "fixed":
-        sim = wf.solve_static(model, load_steps=1, outputs=[count]).simulation
+        sim = wf.solve_static(model, load_steps=1, outputs=[stats]).simulation
     else:
         sim = wf.Simulation(model, dt=1e-2)
-        count.step(sim, 100)
+        stats.step(sim, 100)
     below = np.cumsum(weights[::-1])[::-1] + load * weights[0]
     got = np.array([sim.joint_force(joint)[0, :3] for joint in joints])
     error = float((np.linalg.norm(got - below[:, None] * np.array(Z), axis=1) / below).max())
-    return Answer(error, 1e-3 if setting.single else 1e-6, "weight below", **count.fields,
-                  limits={"violation": (count.violation or 0.0, _tol(setting))})  # fmt: skip
+    return Answer(error, 1e-3 if setting.single else 1e-6, "weight below", **stats.answer_fields,
+                  limits={"violation": (stats.violation or 0.0, _violation_bound(setting))})  # fmt: skip
 
 
 @case("joints", "Joints", values=("redundant", "dead-point"), quick="both")
 def joints(setting: Setting, value: str) -> Answer:
     """A door on two coincident hinges; a parallelogram driven through its dead points."""
-    return _redundant(setting) if value == "redundant" else _dead_point(setting)
+    return _redundant_hinges(setting) if value == "redundant" else _dead_point(setting)
 
 
-def _redundant(setting: Setting) -> Answer:
+def _redundant_hinges(setting: Setting) -> Answer:
     """Sum of the hinges' forces on a hanging door at rest, against its weight."""
-    b = wf.ModelBuilder(gravity=(0, 0, -G))
+    b = wf.ModelBuilder(gravity=(0, 0, -GRAVITY))
     mesh = wf.mesh.box((0.4, 0.04, 0.8), cells=(2, 1, 4), origin=(-0.2, -0.02, -0.8))
     door = b.add_solid(mesh, material=wf.SVK(E=1e9, nu=0.3, density=600.0))
     hinges = [b.add_joint("revolute", parent=wf.GROUND, child=door.surface("z+"), axis=Y) for _ in range(2)]
     model = finalize(b, setting)
     sim = wf.Simulation(model, dt=1e-2)
-    count = Count()
-    count.step(sim, 40)
-    weight = 600.0 * 0.4 * 0.04 * 0.8 * G
+    stats = StepStats()
+    stats.step(sim, 40)
+    weight = 600.0 * 0.4 * 0.04 * 0.8 * GRAVITY
     total = sum(sim.joint_force(hinge)[0] for hinge in hinges)
     error = float(np.linalg.norm(total[:3] - weight * np.array(Z)) / weight)
-    return Answer(error, 1e-3 if setting.single else 1e-6, "weight of the door", **count.fields,
-                  limits={"violation": (count.violation or 0.0, _tol(setting))})  # fmt: skip
+    return Answer(error, 1e-3 if setting.single else 1e-6, "weight of the door", **stats.answer_fields,
+                  limits={"violation": (stats.violation or 0.0, _violation_bound(setting))})  # fmt: skip
 
 
 def _dead_point(setting: Setting) -> Answer:
@@ -173,32 +173,33 @@ def _dead_point(setting: Setting) -> Answer:
     for name, body in (("pin", first), ("far", second)):
         b.add_probe(name, body.end)
     sim = wf.Simulation(finalize(b, setting), dt=h, integrator="bdf2")
-    count = Count()
-    sim.run(1.0, outputs=[count], progress=False)
+    stats = StepStats()
+    sim.run(1.0, outputs=[stats], progress=False)
     pin, far = (sim.probe(name).position[0] for name in ("pin", "far"))
     lengths = np.stack([np.linalg.norm(far - pin, axis=1) / coupler, np.linalg.norm(far - span, axis=1) / crank])
     angle = start + 2.0 * np.pi * sim.probe("pin").time
     exact = crank * np.stack([np.cos(angle), 0.0 * angle, np.sin(angle)], axis=1)
     error = max(float(np.abs(lengths - 1.0).max()), float(np.linalg.norm(pin - exact, axis=1).max() / crank))
     away = float(np.linalg.norm(far - pin - span, axis=1).max())
-    return Answer(error, 1e-3, "rigid bars", **count.fields,
-                  limits={"violation": (count.violation or 0.0, _tol(setting))},
+    return Answer(error, 1e-3, "rigid bars", **stats.answer_fields,
+                  limits={"violation": (stats.violation or 0.0, _violation_bound(setting))},
                   note="stays a parallelogram" if away < 1e-2 * coupler else "crosses over")  # fmt: skip
 
 
-REFUSED = ("constraints could not be satisfied",)
+REFUSAL_TEXTS = ("constraints could not be satisfied",)
 
 
-@case("joints-conflicting", "Joints", quick="both", must=True, refusal={"float64": REFUSED, "float32": REFUSED})
-def joints_conflicting(setting: Setting) -> Answer:
+@case("joints-conflicting", "Joints", quick="both", must_refuse=True,
+      refusal={"float64": REFUSAL_TEXTS, "float32": REFUSAL_TEXTS})  # fmt: skip
+def conflicting_pins(setting: Setting) -> Answer:
     """One point pinned to two positions is refused with the names of the pins."""
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     body = b.add_solid(wf.mesh.box((1, 0.2, 0.2), cells=(1, 1, 1)), material=wf.SVK(E=1e7, nu=0.3, density=1000.0))
     b.clamp(body.nodes("x-"))
     tip = body.at((1, 0.1, 0.1))
-    count = Count()
+    stats = StepStats()
     for k, way in enumerate((0.1, 0.2)):
         b.add_constraint("PIN", points=(tip, (1, 0.1, 0.1)), value=([0, 1e-2], [(0, 0, 0), (0, 0, way)]),
                          name=f"pin {k}")  # fmt: skip
-    count.step(wf.Simulation(finalize(b, setting), dt=1e-3), 10)
-    return Answer(float("nan"), 0.0, "no place satisfies both", **count.fields)
+    stats.step(wf.Simulation(finalize(b, setting), dt=1e-3), 10)
+    return Answer(float("nan"), 0.0, "no place satisfies both", **stats.answer_fields)

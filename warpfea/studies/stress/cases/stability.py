@@ -9,18 +9,18 @@ from scipy.optimize import brentq
 
 import warpfea as wf
 
-from ..build import Count, Y, Z, finalize
+from ..build import StepStats, Y, Z, finalize
 from ..case import Answer, Setting, case
 
 SPAN, RISE, SIDE, E = 1.0, 0.1, 0.1, 1e7
 """Half span, rise and side of the bars of the two-bar truss, m; modulus, Pa."""
-LENGTH = float(np.hypot(SPAN, RISE))
+BAR_LENGTH = float(np.hypot(SPAN, RISE))
 
 
-def _load(height: float) -> float:
+def _apex_load(height: float) -> float:
     """Downward load, N, in equilibrium with the apex at a height; SVK bars without Poisson's effect."""
-    strain = (height**2 - RISE**2) / (2.0 * LENGTH**2)
-    return -2.0 * E * SIDE**2 * strain * height / LENGTH
+    strain = (height**2 - RISE**2) / (2.0 * BAR_LENGTH**2)
+    return -2.0 * E * SIDE**2 * strain * height / BAR_LENGTH
 
 
 def _truss(setting: Setting, element: str, load: float) -> wf.Model:
@@ -30,18 +30,18 @@ def _truss(setting: Setting, element: str, load: float) -> wf.Model:
     ends: list[Any] = []
     for sign in (-1.0, 1.0):
         foot, apex = np.array([sign * SPAN, 0.0, 0.0]), np.array([0.0, 0.0, RISE])
-        along = (apex - foot) / LENGTH
+        along = (apex - foot) / BAR_LENGTH
         across = np.cross(along, Y)
         if element == "3243":
             bar = b.add_beam([foot, apex], elements=1, section=wf.Rectangle(SIDE, SIDE), normal=across, material=law)
-            near: Any = bar.start
+            foot_end: Any = bar.start
             ends.append(bar.end)
         else:
-            mesh = wf.mesh.box((LENGTH, SIDE, SIDE), cells=(1, 1, 1), origin=(0.0, -SIDE / 2, -SIDE / 2))
+            mesh = wf.mesh.box((BAR_LENGTH, SIDE, SIDE), cells=(1, 1, 1), origin=(0.0, -SIDE / 2, -SIDE / 2))
             bar = b.add_solid(mesh, material=law, transform=(np.stack([along, Y, across], axis=1), foot))
-            near = bar.surface("x-")
+            foot_end = bar.surface("x-")
             ends.append(bar.surface("x+"))
-        b.add_joint("revolute", parent=wf.GROUND, child=near, axis=Y)
+        b.add_joint("revolute", parent=wf.GROUND, child=foot_end, axis=Y)
     b.add_joint("revolute", parent=ends[0], child=ends[1], axis=Y)
     b.add_probe("apex", ends[0])
     for end in ends:
@@ -61,18 +61,18 @@ def snap_through(setting: Setting, value: str) -> Answer:
     Statics under the load may refuse, or find the same state.
     """
     element, way = value.split("-")
-    load = 1.2 * _load(RISE / np.sqrt(3.0))
-    height = brentq(lambda z: _load(z) - load, -2.0 * RISE, -RISE, xtol=1e-15)
+    load = 1.2 * _apex_load(RISE / np.sqrt(3.0))
+    height = brentq(lambda z: _apex_load(z) - load, -2.0 * RISE, -RISE, xtol=1e-15)
     model = _truss(setting, element, load)
-    count = Count()
+    stats = StepStats()
     if way == "static":
-        probe: Any = wf.solve_static(model, load_steps=6, outputs=[count]).probe("apex")
+        probe: Any = wf.solve_static(model, load_steps=6, outputs=[stats]).probe("apex")
     else:
         sim = wf.Simulation(model, dt=2e-2)
-        count.step(sim, 500)
+        stats.step(sim, 500)
         probe = sim.probe("apex")
     got = probe.position[0, -1, 2]
-    return Answer(abs(got / height - 1.0), 1e-3 if setting.single else 1e-6, "closed form", **count.fields,
+    return Answer(abs(got / height - 1.0), 1e-3 if setting.single else 1e-6, "closed form", **stats.answer_fields,
                   note=f"apex from {RISE:g} to {got:.5f} m")  # fmt: skip
 
 
@@ -94,9 +94,9 @@ def lateral_buckling(setting: Setting, value: str) -> Answer:
     b.clamp(strip.start, slots="position+section")
     b.add_point_load(strip.end, (0.0, 1e-4 * load, -load))
     b.add_probe("tip", strip.end)
-    count = Count()
-    result = wf.solve_static(finalize(b, setting), load_steps=8, outputs=[count])
+    stats = StepStats()
+    result = wf.solve_static(finalize(b, setting), load_steps=8, outputs=[stats])
     side = abs(float(result.probe("tip").displacement[0, -1, 1])) / L
     error = side / 0.01 if float(value) < 1.0 else 0.1 / side
     note = f"{side:.4f} L to the side; error: over 0.01 L below, 0.1 L over it above"
-    return Answer(error, 1.0, "Timoshenko", **count.fields, note=note)
+    return Answer(error, 1.0, "Timoshenko", **stats.answer_fields, note=note)

@@ -8,12 +8,12 @@ import numpy as np
 
 import warpfea as wf
 
-from ..build import Count, Z, finalize
+from ..build import StepStats, Z, finalize
 from ..case import Answer, Setting, case
 
 MODULUS = 1e6
 SOLIDS = ("T4", "T10", "ENMC", "FN18", "H3843")
-ROWS = [f"{e}-{law}" for e in SOLIDS for law in ("svk", "neo")] + ["3243-svk", "3443-svk"]
+ELEMENT_LAWS = [f"{e}-{law}" for e in SOLIDS for law in ("svk", "neo")] + ["3243-svk", "3443-svk"]
 
 REFUSAL_TEXTS = ("worst element", "J <= 0")
 """Texts of refusals, which name the element."""
@@ -36,30 +36,30 @@ def _body(b: wf.ModelBuilder, element: str, law: str) -> wf.Body:
     return body
 
 
-def _starts(kind: str, body: wf.Body) -> np.ndarray:
+def _initial_values(kind: str, body: wf.Body) -> np.ndarray:
     """Slot values (slots, 3) of an initial state, positions relative to the body's centre."""
-    E = body.reference
+    reference = body.reference
     if kind == "inverted":
-        return E * (-1.0, 1.0, 1.0)
+        return reference * (-1.0, 1.0, 1.0)
     if kind == "flat":
-        return E * (1.0, 1.0, 0.0)
+        return reference * (1.0, 1.0, 0.0)
     if kind == "collapsed":
-        return 0.0 * E
+        return 0.0 * reference
     size = np.where(body.slot_kind == 0, 0.05, 0.3)[:, None]
     if body.materials[0][1].law != "svk":  # no inverted point
         size = 0.06 * size
-    return E + size * np.random.default_rng(0).standard_normal(E.shape)
+    return reference + size * np.random.default_rng(0).standard_normal(reference.shape)
 
 
-def _run(setting: Setting, value: str, kind: str, damped: bool) -> Answer:
-    """Release an initial state without load; distance of the end from rest, over the length."""
+def _release(setting: Setting, value: str, kind: str, damped: bool) -> Answer:
+    """Release an initial state without load; error: distance of the end from rest, over the length."""
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     body = _body(b, *value.split("-"))
     model = finalize(b, setting)
     state = model.state()
-    u = (_starts(kind, body) - body.reference) * model.free_slots[body.slots]
+    u = (_initial_values(kind, body) - body.reference) * model.free_slots[body.slots]
     state.displacement.assign(u[None].astype(state.displacement.numpy().dtype))
-    count = Count()
+    stats = StepStats()
     bound = 1e-4 if setting.single else 1e-6
     # the rest state is stress-free: the force scale is round-off of the forces at a strain of 1
     area = {"3243": 0.01, "3443": 0.025}.get(body.family.name, 0.16)
@@ -67,32 +67,32 @@ def _run(setting: Setting, value: str, kind: str, damped: bool) -> Answer:
     if damped:  # omega h > 6 for the slowest mode: a step of backward Euler leaves less than a sixth of any mode
         h = 4.0 if body.family.name in ("3243", "3443") else 0.5
         sim = wf.Simulation(model, state, dt=h, solver=solver)
-        count.step(sim, 30)
+        stats.step(sim, 30)
     else:
-        sim = wf.solve_static(model, load_steps=1, state=state, solver=solver, outputs=[count]).simulation
+        sim = wf.solve_static(model, load_steps=1, state=state, solver=solver, outputs=[stats]).simulation
     assert sim.last is not None
     low = float(sim.last.min_J[0])
     away = float(np.abs(sim.displacements(body)).max())
-    told = count.fields | {"min_J": low}
+    values = stats.answer_fields | {"min_J": low}
     if low <= 0.0:
-        return Answer(0.0, bound, "min_J <= 0 is reported", **told, note=f"stays so, {away:.2g} m off; reported")
-    return Answer(away, bound, "rest", **told, note="recovered" if away <= bound else "another equilibrium")
+        return Answer(0.0, bound, "min_J <= 0 is reported", **values, note=f"stays so, {away:.2g} m off; reported")
+    return Answer(away, bound, "rest", **values, note="recovered" if away <= bound else "another equilibrium")
 
 
-def _add(kind: str, what: str) -> None:
+def _add_cases(kind: str, what: str) -> None:
     """Cases of a kind of initial state: by statics, and by steps of backward Euler longer than its periods."""
     refusal: dict[str, Sequence[str]] = {"float64": REFUSAL_TEXTS, "float32": REFUSAL_TEXTS}
     for damped, way in ((False, "statics"), (True, "damped steps")):
 
         def run(setting: Setting, value: str, damped: bool = damped) -> Answer:
-            return _run(setting, value, kind, damped)
+            return _release(setting, value, kind, damped)
 
         run.__doc__ = f"{what}, by {way}: recovers, is refused by the name of an element, or says that J <= 0."
         name, quick = (f"start-{kind}-damped", "none") if damped else (f"start-{kind}", "float64")
-        case(name, "Starts", values=ROWS, quick=quick, refusal=refusal)(run)
+        case(name, "Starts", values=ELEMENT_LAWS, quick=quick, refusal=refusal)(run)
 
 
-_add("inverted", "A mirrored body")
-_add("flat", "A body pressed flat")
-_add("collapsed", "A body in one point")
-_add("random", "A scrambled body")
+_add_cases("inverted", "A mirrored body")
+_add_cases("flat", "A body pressed flat")
+_add_cases("collapsed", "A body in one point")
+_add_cases("random", "A scrambled body")

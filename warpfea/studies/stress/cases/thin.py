@@ -8,22 +8,22 @@ import numpy as np
 
 import warpfea as wf
 
-from ..build import BUILT_IN, DOWN, REFINED, STEEL, Count, bar, beam, off, solve
+from ..build import CLAMPED_SLOTS, GRAVITY_VECTOR, REFERENCE_TOL, STEEL, StepStats, bar, beam, relative_error, solve
 from ..case import Answer, Setting, case
 
 SAG = 0.05
 """Tip deflection by Euler-Bernoulli theory, for the length of 1 m."""
 BOUNDS = {"float64": 3e-4, "float32": 6e-3}
-"""Bound of the difference from a refined float64 solution: three times the accepted round-off estimates."""
+"""Bound of the difference from float64 with tol 1e-10: three times the accepted round-off estimates."""
 SOLIDS = ("T10-50", "T10-500", "H3843-50", "H3843-500", "T10-incompressible-50")
 STRUCTURES = ("3243-500", "3443-5000")
 LOAD_STEPS = 3
 STEPS = 60
-"""Bound for a motion."""
-SAME = "the same in float64, tol 1e-10"
+"""Number of steps of the motion."""
+REFERENCE = "the same in float64, tol 1e-10"
 
 
-def thin(value: str) -> wf.ModelBuilder:
+def thin_body(value: str) -> wf.ModelBuilder:
     """A bar, beam or strip of 1 m and L/t as in `value`, with the tip load for a deflection SAG by Euler's theory."""
     element, slenderness = value.split("-")[0], float(value.split("-")[-1])
     t = 1.0 / slenderness
@@ -34,7 +34,7 @@ def thin(value: str) -> wf.ModelBuilder:
     if element == "3443":
         b = wf.ModelBuilder(gravity=(0, 0, 0))
         body = b.add_shell(wf.mesh.grid((1.0, width), cells=(16, 4)), thickness=t, material=law, name="strip")
-        b.clamp(body.edge("x-"), slots=BUILT_IN["3443"])
+        b.clamp(body.edge("x-"), slots=CLAMPED_SLOTS["3443"])
         b.add_probe("tip", body.surface("x+"))
     elif element == "3243":
         b, body = beam(16, t, law)
@@ -47,9 +47,9 @@ def thin(value: str) -> wf.ModelBuilder:
 
 
 @functools.cache
-def refined(value: str, device: str) -> np.ndarray:
-    """Displacement of the tip by a refined solution in float64 (3,), m."""
-    return solve(thin(value), Setting(device, "float64"), load_steps=LOAD_STEPS, tol=REFINED).tip
+def reference_tip(value: str, device: str) -> np.ndarray:
+    """Displacement of the tip in float64 with tol 1e-10 (3,), m."""
+    return solve(thin_body(value), Setting(device, "float64"), load_steps=LOAD_STEPS, tol=REFERENCE_TOL).tip
 
 
 @case(
@@ -57,39 +57,39 @@ def refined(value: str, device: str) -> np.ndarray:
 )  # fmt: skip
 def thin_static(setting: Setting, value: str) -> Answer:
     """Statics of bodies of slenderness 50 to 5000 bent by 5 % of their length."""
-    found = solve(thin(value), setting, load_steps=LOAD_STEPS)
-    reference = refined(value, setting.device)
+    found = solve(thin_body(value), setting, load_steps=LOAD_STEPS)
+    reference = reference_tip(value, setting.device)
     theory = {}
     if "incompressible" not in value:
         theory = {"off Euler and Bernoulli": (abs(found.tip[2] / -SAG - 1.0), 0.05)}
     bound = BOUNDS[setting.dtype]
-    error = off(found.tip, reference)
-    return found.count.answer(error, bound, SAME, told=found.count.last_floor, limits=theory)
+    error = relative_error(found.tip, reference)
+    return found.stats.answer(error, bound, REFERENCE, reported_error=found.stats.last_floor, limits=theory)
 
 
-def falling(value: str, device: str, dtype: str, tol: float | None) -> tuple[np.ndarray, Count]:
+def released_bar(value: str, device: str, dtype: str, tol: float | None) -> tuple[np.ndarray, StepStats]:
     """Motion of the tip of a bar released under its weight, for steps of 5 ms (STEPS, 3), m.
 
     No step may be halved: shorter steps change the motion by a sixth of the sag.
     """
     t = 1.0 / float(value.split("-")[1])
-    b, _ = bar("T10", (20, 1, 1), (1.0, t, t), STEEL, DOWN)
+    b, _ = bar("T10", (20, 1, 1), (1.0, t, t), STEEL, GRAVITY_VECTOR)
     solver = wf.NewtonPCG(tol=tol, max_pcg=20000, max_halvings=0)
     sim = wf.Simulation(b.finalize(device=device, dtype=dtype), dt=5e-3, solver=solver)
-    count = Count()
-    count.step(sim, STEPS)
-    return sim.probe("tip").displacement[0], count
+    stats = StepStats()
+    stats.step(sim, STEPS)
+    return sim.probe("tip").displacement[0], stats
 
 
 @functools.cache
-def refined_way(value: str, device: str) -> np.ndarray:
-    """Motion of the tip by a refined solution in float64."""
-    return falling(value, device, "float64", REFINED)[0]
+def reference_motion(value: str, device: str) -> np.ndarray:
+    """Motion of the tip in float64 with tol 1e-10, (STEPS, 3), m."""
+    return released_bar(value, device, "float64", REFERENCE_TOL)[0]
 
 
 @case("thin-dynamic", "thin", values=("T10-50", "T10-500"), quick="both", refusal={"float32": ["float32"]})
 def thin_dynamic(setting: Setting, value: str) -> Answer:
     """A clamped steel bar released under its weight, 0.3 s."""
-    way, count = falling(value, setting.device, setting.dtype, None)
-    error = off(way, refined_way(value, setting.device))
-    return count.answer(error, BOUNDS[setting.dtype], SAME, told=count.sum_of_floors)
+    path, stats = released_bar(value, setting.device, setting.dtype, None)
+    error = relative_error(path, reference_motion(value, setting.device))
+    return stats.answer(error, BOUNDS[setting.dtype], REFERENCE, reported_error=stats.sum_of_floors)
