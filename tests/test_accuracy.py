@@ -16,7 +16,7 @@ from warpfea.builder.scene import locate
 from warpfea.cli.parser import parse
 from warpfea.studies.accuracy import Row, Study
 from warpfea.studies.accuracy.report import with_orders
-from warpfea.studies.accuracy.settings import product, sweep_axes
+from warpfea.studies.accuracy.settings import setting_product, sweep_axes
 
 BOTH = ["backward_euler", "bdf2"]
 PROBLEMS = pathlib.Path(__file__).parent / "validation" / "problems"
@@ -175,7 +175,7 @@ def test_a_parameter_of_the_problem_has_references_of_its_own():
 def test_steps_that_adapt_stand_beside_fixed_ones(fall):
     """Rows made by hand: a curve of their own, the slope of true against asked error, and the command that runs one."""
     axes = sweep_axes(falling, {"dt": [1e-2, 5e-3], "error": [1e-2, 1e-3], "method": ["bdf2"]}, None)
-    settings = product(fall[0].setting, axes)
+    settings = setting_product(fall[0].setting, axes)
     assert [(s.dt, s.error) for s in settings] == [(1e-2, None), (5e-3, None), (None, 1e-2), (None, 1e-3)]
     errors = [4e-2, 1e-2, 2e-2, 2e-3]
     rows = [Row(s, {"dt": s.dt, "error": s.error, "method": s.method}, "done", error=e, resolved=True, seconds=1.0)

@@ -7,7 +7,7 @@ from accuracy_runs import run
 
 import warpfea as wf
 from warpfea.cli import main
-from warpfea.studies.accuracy.plot import MEANING
+from warpfea.studies.accuracy.plot import AXIS_LABELS
 
 SCENE = """
 import warpfea as wf
@@ -58,4 +58,4 @@ def test_axes_tell_which_error(scene):
     still = wf.Reference({"tip": ([0.0, 0.08], [[1.0, 0.1, 0.1], [1.0, 0.1, 0.0]])})
     known = run(str(scene), **options, reference=still)
     assert known.kind == "in time and mesh"
-    assert MEANING["l2"].format(known.kind) == "error in time and mesh (L2 over time) / largest travel"
+    assert AXIS_LABELS["l2"].format(known.kind) == "error in time and mesh (L2 over time) / largest travel"

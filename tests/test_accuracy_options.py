@@ -13,7 +13,7 @@ from warpfea.builder.reference import read_reference, reference_of
 from warpfea.cli import main
 from warpfea.simulation import integrators
 from warpfea.studies.accuracy.measure import Outcome
-from warpfea.studies.accuracy.motion import interpolant, observed
+from warpfea.studies.accuracy.motion import interpolant, observed_order
 from warpfea.studies.accuracy.settings import parse_over, split_methods, sweep_axes
 
 FILE = """
@@ -111,11 +111,11 @@ def test_a_stopped_study_goes_on(tmp_path, monkeypatch, capsys):
 def test_an_outcome_is_kept_with_all_digits():
     x = np.random.default_rng(0).normal(size=(5, 3))
     one = Outcome("done", "", {"steps": 5}, np.arange(5.0) / 3, {"p": (x, -x)}, {"p": x[0]}, x)
-    two = Outcome.unpacked(json.loads(json.dumps(one.packed())))
+    two = Outcome.from_dict(json.loads(json.dumps(one.to_dict())))
     np.testing.assert_array_equal(two.times, one.times)
     np.testing.assert_array_equal(two.probes["p"][1], -x)
     np.testing.assert_array_equal(two.field, x)
-    assert (two.status, two.numbers) == ("done", {"steps": 5})
+    assert (two.status, two.cost) == ("done", {"steps": 5})
 
 
 # references
@@ -181,8 +181,8 @@ def test_cubics_between_steps_are_of_fourth_order():
         return np.abs(interpolant(t, x, v)(at) - np.sin(3 * at)[:, None] * [1, 2, 3]).max()
 
     assert np.log2(error(20) / error(40)) == pytest.approx(4.0, abs=0.1)
-    assert observed(4e-3, 1e-3, 2.0, 0.5, 6.0) == pytest.approx(2.0)
-    assert observed(1e-3, 2e-3, 2.0, 0.5, 6.0) == 0.5
+    assert observed_order(4e-3, 1e-3, 2.0, 0.5, 6.0) == pytest.approx(2.0)
+    assert observed_order(1e-3, 2e-3, 2.0, 0.5, 6.0) == 0.5
 
 
 # what is asked

@@ -34,7 +34,7 @@ def fixed(content, scheme):
     return sorted((r for r in rows if r["status"] == "done"), key=lambda r: -r["setting"]["dt"])
 
 
-def order_of(rows):
+def convergence_order(rows):
     """Over the three smallest steps: at the coarse end fast modes are not resolved yet."""
     a, b = rows[-3], rows[-1]
     return math.log(a["l2"] / b["l2"]) / math.log(a["setting"]["dt"] / b["setting"]["dt"])
@@ -66,7 +66,7 @@ def test_results_have_the_orders_of_the_schemes(name, scheme):
     rows = fixed(result(name), scheme)
     assert len(rows) >= (3 if (name, scheme) in FAILED or name == LARGE else 4)
     assert all(r["resolved"] for r in rows)
-    assert order_of(rows) == pytest.approx(SCHEMES[scheme], abs=0.1)
+    assert convergence_order(rows) == pytest.approx(SCHEMES[scheme], abs=0.1)
 
 
 @pytest.mark.parametrize("name", ["exact_cantilever", "exact_cantilever_damped", "spectral_pendulum"])
@@ -125,7 +125,7 @@ def cheapest_text(content):
 def order_text(content, scheme):
     """Order over the three smallest steps, or - where the reference does not resolve them, or steps were refused."""
     rows = fixed(content, scheme)
-    return f"{order_of(rows):.2f}" if len(rows) > 2 and all(r["resolved"] for r in rows[-3:]) else "-"
+    return f"{convergence_order(rows):.2f}" if len(rows) > 2 and all(r["resolved"] for r in rows[-3:]) else "-"
 
 
 def test_winners_of_the_table():

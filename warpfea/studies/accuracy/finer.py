@@ -10,26 +10,26 @@ from ...base.checks import is_number
 from ...base.console import number
 from ...base.errors import ConvergenceError, ModelError
 from .measure import DONE, REFUSED, Outcome
-from .motion import Motion, distances, observed, run_motion
-from .settings import Axes, Setting, check_steps, order_of
+from .motion import Motion, motion_errors, observed_order, run_motion
+from .settings import Setting, SweepAxes, check_steps, convergence_order
 
 __all__ = ["check_finer", "finer_motion", "finer_setting"]
 
-STEP, MESH, TOL = 8.0, 2, 100.0
+STEP_REFINEMENT, MESH_REFINEMENT, TOL_REFINEMENT = 8.0, 2, 100.0
 """Refinement factors relative to the finest run: step, cells along an edge, tolerance."""
-SECOND_ORDER = "bdf2"
-TIGHTEST = 1e-11
+SECOND_ORDER_METHOD = "bdf2"
+MIN_TOL = 1e-11
 """Minimum tolerance of the reference; below, round-off dominates."""
 DEFAULT_TOL = 1e-8
-LOWEST_TIME, LOWEST_MESH, HIGHEST_MESH = 0.5, 1.0, 6.0
-"""Bounds of the estimated orders."""
-MEASURES = ("l2", "end", "field")
+MIN_TIME_ORDER, MIN_MESH_ORDER, MAX_MESH_ORDER = 0.5, 1.0, 6.0
+"""Bounds of the estimated orders of convergence."""
+REFERENCE_MEASURES = ("l2", "end", "field")
 
 
-def scaled(value: Any, factor: float) -> Any:
-    """Whole numbers, also in a tuple, times a factor; None if the result is not whole."""
+def scale_counts(value: Any, factor: float) -> Any:
+    """Number of cells, or a tuple of numbers, times a factor; None if a result is not whole."""
     if isinstance(value, tuple):
-        parts = tuple(scaled(part, factor) for part in value)
+        parts = tuple(scale_counts(part, factor) for part in value)
         return None if None in parts else parts
     out = value * factor
     return int(out) if out == int(out) and out >= 1 else None
@@ -48,7 +48,7 @@ def check_finer(given: Mapping[str, Any]) -> None:
             raise ModelError(f"study: finer {name} = {value!r} must be a positive finite number")
 
 
-def finer_setting(group: Sequence[Setting], axes: Axes, given: Mapping[str, Any], default_dt: float) -> Setting:
+def finer_setting(group: Sequence[Setting], axes: SweepAxes, given: Mapping[str, Any], default_dt: float) -> Setting:
     """Reference of settings that share a problem: finer than all of them in every swept direction.
 
     The step is an eighth of the smallest, with a method of order 2; swept meshes are twice as fine as the finest; of
@@ -60,27 +60,27 @@ def finer_setting(group: Sequence[Setting], axes: Axes, given: Mapping[str, Any]
     steps = [s.dt for s in group if s.dt is not None] or [default_dt]
     tols = [s.tol for s in group if s.tol is not None and s.dtype == "float64"]
     changes: dict[str, Any] = {
-        "method": next((m for m in methods if order_of(m) >= 2), SECOND_ORDER),
-        "dt": min(steps) / STEP,
-        "tol": max(TIGHTEST, min([*tols, DEFAULT_TOL]) / TOL),
+        "method": next((m for m in methods if convergence_order(m) >= 2), SECOND_ORDER_METHOD),
+        "dt": min(steps) / STEP_REFINEMENT,
+        "tol": max(MIN_TOL, min([*tols, DEFAULT_TOL]) / TOL_REFINEMENT),
         "dtype": "float64",
         "solver": next((s.solver for s in group if s.solver != "jacobi"), "newton-pcg"),
     }
     for name in axes.over:
         if name in axes.mesh:
-            finest = max((s.values[name] for s in group), key=_size)
-            changes[name] = scaled(finest, MESH)
+            finest = max((s.values[name] for s in group), key=_total_cells)
+            changes[name] = scale_counts(finest, MESH_REFINEMENT)
         elif name in axes.choices:
             changes[name] = axes.over[name][-1]
-    return first.changed(changes | dict(given))
+    return first.with_changes(changes | dict(given))
 
 
-def _size(value: Any) -> float:
+def _total_cells(value: Any) -> float:
     return float(sum(value)) if isinstance(value, tuple) else float(value)
 
 
 def finer_motion(
-    setting: Setting, axes: Axes, chosen: Sequence[str] | None, run: Callable[[Setting], Outcome]
+    setting: Setting, axes: SweepAxes, chosen: Sequence[str] | None, run: Callable[[Setting], Outcome]
 ) -> Motion:
     """Run the reference, and further runs for its own error.
 
@@ -94,48 +94,48 @@ def finer_motion(
     """
     assert setting.dt is not None
     assert setting.tol is not None
-    coarser = [setting.changed({"dt": k * setting.dt, "tol": f * setting.tol}) for k, f in ((2, 10.0), (4, 100.0))]
+    coarser = [setting.with_changes({"dt": k * setting.dt, "tol": f * setting.tol}) for k, f in ((2, 10.0), (4, 100.0))]
     for one in (setting, *coarser):
         check_steps(one.dt or 0.0, one.t_end)
-    best = _done(run, setting)
+    best = _finished_run(run, setting)
     names = list(chosen) if chosen is not None else list(best.probes)
     about = f"a run with {setting.method}, dt = {number(setting.dt or 0.0)} s, tol = {number(setting.tol or 0.0)}"
     swept = [name for name in axes.mesh if name in axes.over]
     about += "".join(f", {name} = {setting.values[name]}" for name in (*swept, *axes.choices))
     motion = run_motion(best, names, about)
-    own = dict.fromkeys(MEASURES, 0.0)
-    told: dict[str, Any] = {}
+    own_error = dict.fromkeys(REFERENCE_MEASURES, 0.0)
+    estimates: dict[str, Any] = {}
 
-    def add(label: str, settings: list[Setting], low: float, high: float) -> None:
+    def add_estimate(label: str, settings: list[Setting], min_order: float, max_order: float) -> None:
         """Add the error in one direction, from coarser runs in it, the nearest first."""
-        runs = [_done(run, s) for s in settings]
-        near = distances(runs[0], motion)
-        far = distances(runs[1], run_motion(runs[0], names, "")) if len(runs) > 1 else None
-        told[label] = {}
-        for what in MEASURES:
+        runs = [_finished_run(run, s) for s in settings]
+        near = motion_errors(runs[0], motion)
+        far = motion_errors(runs[1], run_motion(runs[0], names, "")) if len(runs) > 1 else None
+        estimates[label] = {}
+        for what in REFERENCE_MEASURES:
             if near[what] is None:
                 continue
-            p = low if far is None else observed(far[what], near[what], 2.0, low, high)
-            own[what] += near[what] / (2.0**p - 1.0)
-            told[label][what] = {"order": p, "difference": near[what]}
+            p = min_order if far is None else observed_order(far[what], near[what], 2.0, min_order, max_order)
+            own_error[what] += near[what] / (2.0**p - 1.0)
+            estimates[label][what] = {"order": p, "difference": near[what]}
 
-    add("time", coarser, LOWEST_TIME, float(order_of(setting.method)))
+    add_estimate("time", coarser, MIN_TIME_ORDER, float(convergence_order(setting.method)))
     if swept:
         meshes = []
         for factor in (0.5, 0.25):
-            values = {name: scaled(setting.values[name], factor) for name in swept}
+            values = {name: scale_counts(setting.values[name], factor) for name in swept}
             if None in values.values():
                 break
-            meshes.append(setting.changed(values))
+            meshes.append(setting.with_changes(values))
         if not meshes:
             raise ModelError(f"study: the reference has {', '.join(swept)} that can't be halved; give an even --finer")
-        add("space", meshes, LOWEST_MESH, HIGHEST_MESH)
+        add_estimate("space", meshes, MIN_MESH_ORDER, MAX_MESH_ORDER)
     if motion.field is None:
-        del own["field"]
-    return replace(motion, own=own, runs=told)
+        del own_error["field"]
+    return replace(motion, own_error=own_error, runs=estimates)
 
 
-def _done(run: Callable[[Setting], Outcome], setting: Setting) -> Outcome:
+def _finished_run(run: Callable[[Setting], Outcome], setting: Setting) -> Outcome:
     out = run(setting)
     if out.status == DONE:
         return out

@@ -19,13 +19,13 @@ from ...simulation.simulation import Simulation
 from ...solvers import SOLVERS
 from .settings import Setting
 
-__all__ = ["DONE", "FAILED", "LONG", "REFUSED", "Outcome", "measure"]
+__all__ = ["DONE", "FAILED", "REFUSED", "TOO_LONG", "Outcome", "measure"]
 
-DONE, FAILED, LONG, REFUSED = "done", "failed", "too long", "refused"
-NOT_REPEATED = 2.0
+DONE, FAILED, TOO_LONG, REFUSED = "done", "failed", "too long", "refused"
+MAX_REPEATED_SECONDS = 2.0
 """s; a run that takes longer is done once."""
-HELD = ("kinetic", "strain", "contact", "contact_pairs")
-CHANGES = ("potential", "work", "viscous", "contact_loss", "friction", "collider_work")
+STORED_ENERGIES = ("kinetic", "strain", "contact", "contact_pairs")
+EXCHANGED_ENERGIES = ("potential", "work", "viscous", "contact_loss", "friction", "collider_work")
 """Columns of the energy ledger that define the energy exchanged: their size, or their change."""
 
 
@@ -36,50 +36,44 @@ class Outcome:
     Attributes:
         status: done; failed: a step was not accepted; too long; refused: invalid setting for this scene.
         why: reason of all others than done.
-        numbers: its cost, see `_numbers`; empty if nothing was run.
-        times: (n,), s. probes: by name position and velocity (n, 3) each, m and m/s. starts: by name (3,), m.
+        cost: see `_Run.cost`; empty if nothing was run.
+        times: (n,), s. probes: by name position and velocity (n, 3) each, m and m/s. start_positions: by name (3,), m.
         field: value of the scene's `field`, or None.
     """
 
     status: str
     why: str = ""
-    numbers: dict[str, Any] = dataclasses.field(default_factory=dict)
+    cost: dict[str, Any] = dataclasses.field(default_factory=dict)
     times: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
     probes: dict[str, tuple[np.ndarray, np.ndarray]] = dataclasses.field(default_factory=dict)
-    starts: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    start_positions: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
     field: np.ndarray | None = None
 
-    def packed(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """JSON-compatible form, with all digits."""
         return {
-            "status": self.status,
-            "why": self.why,
-            "numbers": self.numbers,
-            "times": _pack(self.times),
-            "probes": {name: [_pack(x), _pack(v)] for name, (x, v) in self.probes.items()},
-            "starts": {name: _pack(x) for name, x in self.starts.items()},
-            "field": None if self.field is None else _pack(self.field),
-        }
+            "status": self.status, "why": self.why, "numbers": self.cost, "times": _encode_array(self.times),
+            "probes": {name: [_encode_array(x), _encode_array(v)] for name, (x, v) in self.probes.items()},
+            "starts": {name: _encode_array(x) for name, x in self.start_positions.items()},
+            "field": None if self.field is None else _encode_array(self.field),
+        }  # fmt: skip
 
     @staticmethod
-    def unpacked(data: dict[str, Any]) -> Outcome:
-        """Outcome from the output of `packed`."""
+    def from_dict(data: dict[str, Any]) -> Outcome:
+        """Outcome from the output of `to_dict`."""
         return Outcome(
-            data["status"],
-            data["why"],
-            data["numbers"],
-            _unpack(data["times"]),
-            {name: (_unpack(x), _unpack(v)) for name, (x, v) in data["probes"].items()},
-            {name: _unpack(x) for name, x in data["starts"].items()},
-            None if data["field"] is None else _unpack(data["field"]),
-        )
+            data["status"], data["why"], data["numbers"], _decode_array(data["times"]),
+            {name: (_decode_array(x), _decode_array(v)) for name, (x, v) in data["probes"].items()},
+            {name: _decode_array(x) for name, x in data["starts"].items()},
+            None if data["field"] is None else _decode_array(data["field"]),
+        )  # fmt: skip
 
 
-def _pack(values: np.ndarray) -> list[Any]:
+def _encode_array(values: np.ndarray) -> list[Any]:
     return [list(values.shape), base64.b64encode(zlib.compress(np.ascontiguousarray(values, float).tobytes())).decode()]
 
 
-def _unpack(data: list[Any]) -> np.ndarray:
+def _decode_array(data: list[Any]) -> np.ndarray:
     shape, text = data
     return np.frombuffer(zlib.decompress(base64.b64decode(text)), float).reshape(shape).copy()
 
@@ -98,39 +92,32 @@ def measure(scene: Scene[Any], setting: Setting, *, repeat: int, limit: float | 
         model = scene.build(setting.values).finalize(device=setting.device, dtype=setting.dtype)
         setup = clock.perf_counter() - began
         runs = [_Run(model, setting, limit)]
-        while len(runs) < repeat and runs[-1].seconds <= NOT_REPEATED:
+        while len(runs) < repeat and runs[-1].seconds <= MAX_REPEATED_SECONDS:
             runs.append(_Run(model, setting, limit))
     except (ConvergenceError, ConstraintError, CapacityError) as error:  # before the first step
-        return Outcome(FAILED, _line(error))
+        return Outcome(FAILED, _one_line(error))
     except (Error, NotImplementedError) as error:
-        return Outcome(REFUSED, _line(error))
+        return Outcome(REFUSED, _one_line(error))
     first = runs[0]
-    numbers = first.numbers() | {"setup_s": setup, "seconds": [run.seconds for run in runs]}
-    numbers |= {"asked": repeat, "limit": limit}
+    cost = first.cost() | {"setup_s": setup, "seconds": [run.seconds for run in runs]}
+    cost |= {"asked": repeat, "limit": limit}
     if first.status != DONE:
-        return Outcome(first.status, first.why, numbers)
+        return Outcome(first.status, first.why, cost)
     probes = {p.name: first.sim.probe(p.name) for p in model.probes}
     times = next(iter(probes.values())).time
     values = None
     if scene.field is not None:
         with user_code(f"field of scene {scene.name!r}"):
             values = np.asarray(scene.field(first.sim), dtype=float)
-    return Outcome(
-        DONE,
-        "",
-        numbers,
-        np.ravel(times),
-        {name: (record.position[0], record.velocity[0]) for name, record in probes.items()},
-        _starts(model),
-        values,
-    )
+    motions = {name: (record.position[0], record.velocity[0]) for name, record in probes.items()}
+    return Outcome(DONE, "", cost, np.ravel(times), motions, _start_positions(model), values)
 
 
-def _line(error: BaseException) -> str:
+def _one_line(error: BaseException) -> str:
     return " ".join(str(error).split())
 
 
-def _starts(model: Model) -> dict[str, np.ndarray]:
+def _start_positions(model: Model) -> dict[str, np.ndarray]:
     """Initial positions of the probes, m."""
     u = model.state().displacement.numpy()[0].astype(float)
     return {p.name: np.asarray(p.X + p.weights @ u[p.slots], dtype=float) for p in model.probes}
@@ -148,23 +135,23 @@ class _Run:
         self.sim = Simulation(model, solver=solver, integrator=setting.method, **steps)
         self.energies = [self.sim.energies()]
         self.limit = limit
-        self.mark = clock.perf_counter()
+        self.step_began = clock.perf_counter()
         try:
             self.sim.run(setting.t_end, on_step=self._after_step, progress=False)
         except (ConvergenceError, ConstraintError) as error:
-            self.seconds += clock.perf_counter() - self.mark
-            self.status, self.why = FAILED, _line(error)
+            self.seconds += clock.perf_counter() - self.step_began
+            self.status, self.why = FAILED, _one_line(error)
 
     def _after_step(self, sim: Simulation) -> bool:
-        self.seconds += clock.perf_counter() - self.mark
+        self.seconds += clock.perf_counter() - self.step_began
         self.energies.append(sim.energies())
         if self.limit is not None and self.seconds > self.limit:
-            self.status, self.why = LONG, f"more than {self.limit:g} s"
+            self.status, self.why = TOO_LONG, f"more than {self.limit:g} s"
             return False
-        self.mark = clock.perf_counter()
+        self.step_began = clock.perf_counter()
         return True
 
-    def numbers(self) -> dict[str, Any]:
+    def cost(self) -> dict[str, Any]:
         """Cost and losses of the run: counts over all steps, bytes on the device, energies in J.
 
         drift: largest |change of energy + losses of the model - work|: error of the scheme and the solver;
@@ -173,7 +160,8 @@ class _Run:
         """
         sim, info = self.sim, self.sim.model.info()
         table = {name: np.array([float(e[name][0]) for e in self.energies]) for name in self.energies[0]}
-        kinds = [np.abs(table[name] - (name in CHANGES) * table[name][0]).max() for name in (*HELD, *CHANGES)]
+        sizes = [np.abs(table[name]).max() for name in STORED_ENERGIES]
+        sizes += [np.abs(table[name] - table[name][0]).max() for name in EXCHANGED_ENERGIES]
         drift = np.abs(table["ledger_residual"] - table["integrator"])
         return {
             "time": float(sim.time[0]),
@@ -185,7 +173,7 @@ class _Run:
             "unknowns": int(info["unknowns"]),
             "elements": int(info["elements"]),
             "drift": float(drift.max()),
-            "exchanged": float(max(kinds)),
+            "exchanged": float(max(sizes)),
             "ledger": {name: float(values[-1] - values[0]) for name, values in table.items()},
             "compile_s": sim.compile_s,
         }

@@ -23,15 +23,15 @@ from ...base.usercode import user_code
 from ...builder.reference import Reference
 from .measure import Outcome
 
-__all__ = ["Motion", "distances", "known_motion", "observed", "run_motion"]
+__all__ = ["Motion", "known_motion", "motion_errors", "observed_order", "run_motion"]
 
 CURVE_POINTS = 1001
 """Number of times at which the travel of a reference function is evaluated."""
-SLACK = 1e-9
+END_TIME_TOL = 1e-9
 """Tolerance, relative to the end time, for samples at the end of the run."""
-RESOLVED = 10.0
+RESOLVED_RATIO = 10.0
 """Minimum ratio of an error to that of the reference."""
-ROUNDING = 1e-13
+ROUND_OFF_ERROR = 1e-13
 """Round-off level: smaller errors have no order."""
 
 
@@ -40,20 +40,20 @@ class Motion:
     """Reference motion of the errors.
 
     Attributes:
-        about: text.
+        about: description.
         probes: by name: a function of times (n,) returning positions (n, 3).
-        times: the only known times; None: all.
+        times: the only known times (n,), s; None: all.
         travel: L, m.
-        own: its own error by measure, over L (field: over the field's norm).
+        own_error: its own error by measure, over L (field: over the field's norm).
         field: expected value of the scene's `field`; None: unknown.
-        runs: error estimates of a run, for the file.
+        runs: observed orders and differences behind own_error, for the file.
     """
 
     about: str
     probes: dict[str, Callable[[np.ndarray], np.ndarray]]
     times: np.ndarray | None
     travel: float
-    own: dict[str, float]
+    own_error: dict[str, float]
     field: np.ndarray | None = None
     runs: dict[str, Any] = dataclasses.field(default_factory=dict)
 
@@ -83,27 +83,27 @@ def known_motion(reference: Reference, chosen: Sequence[str] | None, run: Outcom
     for name in names:
         given = reference.probes[name]
         if callable(given):
-            probes[name] = _checked(given, f"reference {reference.about!r}, probe {name!r}")
+            probes[name] = _validated_function(given, f"reference {reference.about!r}, probe {name!r}")
             continue
-        own, x = (np.asarray(part, dtype=float) for part in given)
-        inside = (own > SLACK * t_end) & (own <= (1.0 + SLACK) * t_end)
-        if not inside.any() or own[inside][-1] < (1.0 - SLACK) * t_end:
+        sample_times, x = (np.asarray(part, dtype=float) for part in given)
+        inside = (sample_times > END_TIME_TOL * t_end) & (sample_times <= (1.0 + END_TIME_TOL) * t_end)
+        if not inside.any() or sample_times[inside][-1] < (1.0 - END_TIME_TOL) * t_end:
             raise ModelError(
-                f"reference {reference.about!r}: its samples of {name!r} end at t = {own[-1]:g} s without one at the "
-                f"end time {t_end:g} s; take another end time"
+                f"reference {reference.about!r}: its samples of {name!r} end at t = {sample_times[-1]:g} s without one "
+                f"at the end time {t_end:g} s; take another end time"
             )
-        if times is not None and not np.array_equal(times, own[inside]):
+        if times is not None and not np.array_equal(times, sample_times[inside]):
             raise ModelError(f"reference {reference.about!r}: its probes must have the same times")
-        times = own[inside]
-        probes[name] = _samples(times, x[inside])
+        times = sample_times[inside]
+        probes[name] = _sample_lookup(times, x[inside])
     curve = np.linspace(0.0, t_end, CURVE_POINTS)[1:] if times is None else times
-    travel = _travel(probes, run.starts, curve)
+    travel = _largest_travel(probes, run.start_positions, curve)
     own_error = reference.error / travel
     fields = None if reference.field is None else np.asarray(reference.field, dtype=float)
     return Motion(reference.about, probes, times, travel, {"l2": own_error, "end": own_error}, fields)
 
 
-def _checked(function: Callable[[np.ndarray], Any], what: str) -> Callable[[np.ndarray], np.ndarray]:
+def _validated_function(function: Callable[[np.ndarray], Any], what: str) -> Callable[[np.ndarray], np.ndarray]:
     def call(times: np.ndarray) -> np.ndarray:
         with user_code(what):
             out = np.asarray(function(times), dtype=float)
@@ -114,15 +114,17 @@ def _checked(function: Callable[[np.ndarray], Any], what: str) -> Callable[[np.n
     return call
 
 
-def _samples(times: np.ndarray, x: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    def pick(at: np.ndarray) -> np.ndarray:
+def _sample_lookup(times: np.ndarray, x: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    def sample_at(at: np.ndarray) -> np.ndarray:
         return x[np.searchsorted(times, at)]
 
-    return pick
+    return sample_at
 
 
-def _travel(probes: Mapping[str, Callable], starts: Mapping[str, np.ndarray], times: np.ndarray) -> float:
-    travel = max(float(np.linalg.norm(at(times) - starts[name], axis=1).max()) for name, at in probes.items())
+def _largest_travel(
+    probes: Mapping[str, Callable], start_positions: Mapping[str, np.ndarray], times: np.ndarray
+) -> float:
+    travel = max(float(np.linalg.norm(at(times) - start_positions[name], axis=1).max()) for name, at in probes.items())
     if not travel > 0.0:
         raise ModelError("study: the probes do not move in the reference, so that errors have no scale")
     return travel
@@ -131,10 +133,10 @@ def _travel(probes: Mapping[str, Callable], starts: Mapping[str, np.ndarray], ti
 def run_motion(run: Outcome, chosen: Sequence[str], about: str) -> Motion:
     """Finished run as a Motion of unknown error."""
     probes = {name: interpolant(run.times, *run.probes[name]) for name in chosen}
-    return Motion(about, probes, None, _travel(probes, run.starts, run.times), {}, run.field)
+    return Motion(about, probes, None, _largest_travel(probes, run.start_positions, run.times), {}, run.field)
 
 
-def distances(run: Outcome, motion: Motion) -> dict[str, Any]:
+def motion_errors(run: Outcome, motion: Motion) -> dict[str, Any]:
     """Errors of a run: end and l2, the largest of the probes, those of each probe under "probes", and field.
 
     field is the relative norm of the difference from the reference; None if one is unknown.
@@ -144,9 +146,9 @@ def distances(run: Outcome, motion: Motion) -> dict[str, Any]:
     probes = {}
     for name, at in motion.probes.items():
         x, v = run.probes[name]
-        own = x if motion.times is None else interpolant(run.times, x, v)(times)
-        away = np.linalg.norm(own - at(times), axis=1) / motion.travel
-        probes[name] = {"end": float(away[-1]), "l2": float(np.sqrt(weights @ away**2 / weights.sum()))}
+        positions = x if motion.times is None else interpolant(run.times, x, v)(times)
+        distance = np.linalg.norm(positions - at(times), axis=1) / motion.travel
+        probes[name] = {"end": float(distance[-1]), "l2": float(np.sqrt(weights @ distance**2 / weights.sum()))}
     out: dict[str, Any] = {what: max(p[what] for p in probes.values()) for what in ("end", "l2")}
     out["field"] = None
     if run.field is not None and motion.field is not None:
@@ -160,7 +162,7 @@ def distances(run: Outcome, motion: Motion) -> dict[str, Any]:
     return out | {"probes": probes}
 
 
-def observed(coarse: float, fine: float, ratio: float, low: float, high: float) -> float:
+def observed_order(coarse: float, fine: float, ratio: float, low: float, high: float) -> float:
     """Order p of the differences of three runs, each `ratio` times finer, within bounds."""
     if not (coarse > 0.0 and fine > 0.0):
         return low if coarse <= fine else high

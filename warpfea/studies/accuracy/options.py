@@ -15,11 +15,11 @@ from ...base.errors import ModelError
 from ...base.names import did_you_mean
 from ...builder.reference import Reference
 from .finer import check_finer
-from .report import MEASURES
+from .report import ERROR_MEASURES
 
-__all__ = ["StudyOptions", "check_positive", "names_moved"]
+__all__ = ["StudyOptions", "check_positive", "refuse_moved_keywords"]
 
-SPLITS = ("best", "all", "none")
+SPLIT_CHOICES = ("best", "all", "none")
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -66,7 +66,7 @@ class StudyOptions:
     def __post_init__(self) -> None:
         if self.name is not None and not re.fullmatch(r"[\w.-]+", self.name):
             raise ModelError(f"study: name {self.name!r} is to be part of names of files: letters, digits, _ - and .")
-        for option, known in (("measure", MEASURES), ("split", SPLITS)):
+        for option, known in (("measure", ERROR_MEASURES), ("split", SPLIT_CHOICES)):
             value = getattr(self, option)
             if value not in known:
                 hint = did_you_mean(value, known)
@@ -84,7 +84,7 @@ def check_positive(**values: float | None) -> None:
             raise ModelError(f"study: {option} = {value!r} must be a positive finite number")
 
 
-def names_moved(function: Callable[P, R]) -> Callable[P, R]:
+def refuse_moved_keywords(function: Callable[P, R]) -> Callable[P, R]:
     """The function, with a ModelError for keywords that are fields of StudyOptions."""
     fields = {field.name for field in dataclasses.fields(StudyOptions)}
 

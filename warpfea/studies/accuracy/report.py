@@ -19,13 +19,13 @@ from ...base.short_repr import use_short_repr
 from ...base.writer import write_whole
 from ..files import prepare, require_matplotlib, write_csv
 from .measure import DONE
-from .motion import RESOLVED
-from .settings import Axes, Setting, word
+from .motion import RESOLVED_RATIO
+from .settings import Setting, SweepAxes, cli_text
 
 __all__ = ["Row", "Study", "with_orders", "with_pareto"]
 
 SCHEMA = 1
-MEASURES = ("l2", "end", "energy", "field")
+ERROR_MEASURES = ("l2", "end", "energy", "field")
 
 
 @dataclass(frozen=True)
@@ -89,15 +89,15 @@ class Row:
     __repr__ = use_short_repr
 
     @property
-    def reaches(self) -> float:
+    def total_error(self) -> float:
         """Error plus that of the reference and of the mesh, as far as estimated; inf if there is none."""
         return math.inf if self.error is None else self.error + self.own_error + (self.mesh_error or 0.0)
 
-    def curve(self, axes: Axes) -> tuple[tuple[str, Any], ...]:
+    def curve_key(self, axes: SweepAxes) -> tuple[tuple[str, Any], ...]:
         """Common key of the rows of one curve."""
-        along = ("dt", "error") if axes.along == "step" else (axes.along,)
-        first = {"method": self.setting.method} | {k: v for k, v in self.swept.items() if k not in along}
-        if axes.along == "step" and self.setting.error is not None:
+        curve_axis = ("dt", "error") if axes.curve_axis == "step" else (axes.curve_axis,)
+        first = {"method": self.setting.method} | {k: v for k, v in self.swept.items() if k not in curve_axis}
+        if axes.curve_axis == "step" and self.setting.error is not None:
             first["steps"] = "adaptive"
         return tuple(first.items())
 
@@ -107,7 +107,7 @@ def mean_size(value: Any) -> float:
     return float(np.exp(np.mean(np.log(value)))) if isinstance(value, tuple) else float(value)
 
 
-def with_orders(rows: Sequence[Row], axes: Axes) -> list[Row]:
+def with_orders(rows: Sequence[Row], axes: SweepAxes) -> list[Row]:
     """Rows with orders observed from the next coarser one, if both errors are resolved.
 
     p = log(e1/e2) / log(h1/h2) for a step, with the reciprocal numbers of cells for a mesh, and with the requested
@@ -134,7 +134,7 @@ def with_orders(rows: Sequence[Row], axes: Axes) -> list[Row]:
 def with_pareto(rows: Sequence[Row]) -> list[Row]:
     """Rows, with those marked for which no other has a smaller error in at most the same time, or the same in less."""
 
-    def beaten(row: Row) -> bool:
+    def dominated(row: Row) -> bool:
         assert row.error is not None
         assert row.seconds is not None
         return any(
@@ -143,7 +143,7 @@ def with_pareto(rows: Sequence[Row]) -> list[Row]:
             if o.error is not None and o.seconds is not None
         )
 
-    return [replace(r, pareto=r.error is not None and r.seconds is not None and not beaten(r)) for r in rows]
+    return [replace(r, pareto=r.error is not None and r.seconds is not None and not dominated(r)) for r in rows]
 
 
 @dataclass(frozen=True)
@@ -163,7 +163,7 @@ class Study(Sequence[Row]):
     name: str
     what: str
     rows: list[Row] = dataclasses.field(repr=False)
-    axes: Axes = dataclasses.field(repr=False)
+    axes: SweepAxes = dataclasses.field(repr=False)
     measure: str
     target: float | None
     references: list[dict[str, Any]] = dataclasses.field(repr=False)
@@ -200,7 +200,7 @@ class Study(Sequence[Row]):
         """Rows by curve, as text."""
         out: dict[str, list[Row]] = {}
         for row in self.rows:
-            texts = [word(v) if k == "method" else f"{k}={word(v)}" for k, v in row.curve(self.axes)]
+            texts = [cli_text(v) if k == "method" else f"{k}={cli_text(v)}" for k, v in row.curve_key(self.axes)]
             out.setdefault(" ".join(texts), []).append(row)
         return out
 
@@ -208,15 +208,15 @@ class Study(Sequence[Row]):
         """Order of each curve along its own size, by least squares over the resolved rows."""
         out: list[dict[str, Any]] = []
         for label, rows in self.curves().items():
-            along = self.axes.along
-            if along == "step":
-                along = "dt" if rows[0].setting.error is None else "error"
-            good = [r for r in rows if r.resolved and r.error and r.swept.get(along or "") is not None]
-            if along in self.axes.sizes and len(good) > 1:
-                sizes = np.log([mean_size(r.swept[along]) for r in good])
+            curve_axis = self.axes.curve_axis
+            if curve_axis == "step":
+                curve_axis = "dt" if rows[0].setting.error is None else "error"
+            good = [r for r in rows if r.resolved and r.error and r.swept.get(curve_axis or "") is not None]
+            if curve_axis in self.axes.sizes and len(good) > 1:
+                sizes = np.log([mean_size(r.swept[curve_axis]) for r in good])
                 slope = float(np.polyfit(sizes, np.log([r.error or 1.0 for r in good]), 1)[0])
-                slope = -slope if along in self.axes.mesh else slope
-                out.append({"curve": label, "size": along, "order": slope, "rows": len(good)})
+                slope = -slope if curve_axis in self.axes.mesh else slope
+                out.append({"curve": label, "size": curve_axis, "order": slope, "rows": len(good)})
         return out
 
     def omissions(self) -> list[str]:
@@ -228,25 +228,24 @@ class Study(Sequence[Row]):
         out = [f"{'; '.join(labels)}: {reason}" for reason, labels in reasons.items()]
         near = [self.label(r) for r in self.rows if r.status == DONE and not r.resolved]
         if near:
-            out.append(
-                f"not resolved (within {RESOLVED:g} times the error of the reference, or rounding): {'; '.join(near)}"
-            )
+            limit = f"within {RESOLVED_RATIO:g} times the error of the reference, or rounding"
+            out.append(f"not resolved ({limit}): {'; '.join(near)}")
         return out
 
     def label(self, row: Row) -> str:
         """Text of a row."""
         given = {"method": row.setting.method} | row.swept
-        return ", ".join(word(v) if k == "method" else f"{k}={word(v)}" for k, v in given.items() if v is not None)
+        return ", ".join(("" if k == "method" else f"{k}=") + cli_text(v) for k, v in given.items() if v is not None)
 
     def table(self) -> str:
         """Readable text of the study."""
         head = ["method", *(k for k in self.axes.over if k != "method"), self.measure, *(f"order {s}" for s in
                 self.axes.sizes), "end" if self.measure != "end" else "l2", "energy"]  # fmt: skip
         head += ["s", "s min", "digits", "steps", "Newton", "PCG", "memory", ""]
-        lines = [head, *([*self._cells(row, head)] for row in self.rows)]
+        lines = [head, *([*self._row_texts(row, head)] for row in self.rows)]
         text = [table(lines, right=range(1, len(head) - 1)), ""]
         for ref in self.references:
-            at = ", ".join(f"{k} = {word(v)}" for k, v in ref["values"].items())
+            at = ", ".join(f"{k} = {cli_text(v)}" for k, v in ref["values"].items())
             own = ", ".join(f"{k} {number(v, 2)}" for k, v in ref["own_error"].items())
             text.append(f"reference{f' at {at}' if at else ''}: {ref['about']}; its own error: {own or 'none'}")
         travel = ", ".join(number(r["travel"]) for r in self.references)
@@ -278,26 +277,28 @@ class Study(Sequence[Row]):
                 found += f" (in time; mesh error {mesh})"
             text = f"cheapest that reaches {self.target:g}: {self.label(r)}: {found}\n  {self.command}"
             for c in self.checks:
-                size = f"error={word(c.setting.error)}" if c.setting.error else f"dt={word(c.setting.dt)}"
+                size = f"error={cli_text(c.setting.error)}" if c.setting.error else f"dt={cli_text(c.setting.dt)}"
                 text += f"\nchecked with {size}: " + (c.why if c.error is None else f"error {number(c.error, 3)}")
             return text
-        near = min(self.rows, key=lambda r: r.reaches)
+        near = min(self.rows, key=lambda r: r.total_error)
         if near.error is None:
             return f"no setting was measured to reach {self.target:g}"
         if near.mesh_error is not None and near.error + near.own_error <= (self.target or 0.0):
             missed = f"mesh error {number(near.mesh_error, 2)}"
             if near.mesh_error <= (self.target or 0.0):
-                missed = f"with {missed} the sum {number(near.reaches, 3)}"
+                missed = f"with {missed} the sum {number(near.total_error, 3)}"
             found = f"error {number(near.error, 3)} in {number(near.seconds or 0.0, 3)} s"
             more = f"refine {', '.join(self.axes.mesh)}"
             return f"reached in time; {missed} misses {self.target:g}: {self.label(near)}: {found}; {more}"
         own = f" (and {number(near.own_error, 2)} of the reference)" if near.own_error else ""
         return f"no setting was measured to reach {self.target:g}; nearest: {self.label(near)}: {near.error:.3g}{own}"
 
-    def _cells(self, row: Row, head: Sequence[str]) -> Iterator[str]:
+    def _row_texts(self, row: Row, head: Sequence[str]) -> Iterator[str]:
         other = "end" if self.measure != "end" else "l2"
         values: dict[str, str] = {"method": row.setting.method}
-        values |= {k: "-" if row.swept.get(k) is None else word(row.swept[k]) for k in self.axes.over if k != "method"}
+        values |= {
+            k: "-" if row.swept.get(k) is None else cli_text(row.swept[k]) for k in self.axes.over if k != "method"
+        }
         for name in {self.measure, other, "energy"}:
             value = getattr(row, name)
             values[name] = "-" if value is None else f"{value:.2e}"
@@ -317,19 +318,13 @@ class Study(Sequence[Row]):
     def content(self, words: Sequence[str]) -> dict[str, Any]:
         """Contents of the JSON file."""
         return {
-            "schema": SCHEMA,
-            **origin(words, self.rows[0].setting.device),
-            "scene": self.what,
-            "measure": self.measure,
-            "target": self.target,
-            "settings": to_json(self.settings),
-            "over": to_json(self.axes.over),
-            "references": to_json(self.references),
-            "orders": self.fits(),
+            "schema": SCHEMA, **origin(words, self.rows[0].setting.device), "scene": self.what,
+            "measure": self.measure, "target": self.target, "settings": to_json(self.settings),
+            "over": to_json(self.axes.over), "references": to_json(self.references), "orders": self.fits(),
             "answer": None if self.answer is None else {"row": self.rows.index(self.answer), "command": self.command},
             "checks": [to_json(asdict(row)) for row in self.checks],
             "rows": [to_json(asdict(row)) for row in self.rows],
-        }
+        }  # fmt: skip
 
     def write(self, folder: str | pathlib.Path, words: Sequence[str] = ("study",)) -> list[pathlib.Path]:
         """Write NAME.json, NAME.csv and, with matplotlib, NAME.png into a folder; returns their paths.
@@ -344,7 +339,7 @@ class Study(Sequence[Row]):
         out = prepare(folder)
         paths = [out / f"{self.name}.{suffix}" for suffix in ("json", "csv", "png")]
         write_json(str(paths[0]), self.content(words))
-        rows = [self._flat(row) for row in self.rows]
+        rows = [self._flat_row(row) for row in self.rows]
         write_csv(paths[1], list(dict.fromkeys(key for row in rows for key in row)), rows)
         try:
             require_matplotlib()
@@ -353,7 +348,7 @@ class Study(Sequence[Row]):
         write_whole(paths[2], lambda path: draw(self, path))
         return paths
 
-    def _flat(self, row: Row) -> dict[str, Any]:
+    def _flat_row(self, row: Row) -> dict[str, Any]:
         """A row without nesting, for the CSV."""
         out = {k: v for k, v in to_json(asdict(row)).items() if not isinstance(v, dict)}
         given = to_json(asdict(row.setting))

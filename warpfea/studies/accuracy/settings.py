@@ -21,14 +21,15 @@ from ...simulation import integrators
 from ...solvers import SOLVERS
 
 __all__ = [
-    "OPTIONS", "Axes", "Setting", "check_steps", "method_text", "order_of", "parse_over", "product", "sweep_axes",
+    "SWEEP_OPTIONS", "Setting", "SweepAxes", "check_steps", "convergence_order", "method_text", "parse_over",
+    "setting_product", "sweep_axes",
 ]  # fmt: skip
 
-OPTIONS = ("method", "dt", "error", "solver", "tol", "dtype", "device")
+SWEEP_OPTIONS = ("method", "dt", "error", "solver", "tol", "dtype", "device")
 """Sweepable options besides the parameters of the scene."""
-NAMES = {"methods": "method", "integrator": "method"}
+SYNONYMS = {"methods": "method", "integrator": "method"}
 """Synonyms of options."""
-MESH = ("cells", "elements", "across")
+MESH_PARAMETERS = ("cells", "elements", "across")
 """Whole-number parameters of scenes that refine the mesh."""
 DTYPES = ("float64", "float32")
 
@@ -55,41 +56,42 @@ class Setting:
 
     def get(self, name: str) -> Any:
         """Value of an option or a parameter."""
-        return getattr(self, name) if name in OPTIONS else self.values[name]
+        return getattr(self, name) if name in SWEEP_OPTIONS else self.values[name]
 
-    def changed(self, changes: Mapping[str, Any]) -> Setting:
+    def with_changes(self, changes: Mapping[str, Any]) -> Setting:
         """Copy with other options or parameters; dt replaces an `error`, and vice versa."""
-        own = {name: value for name, value in changes.items() if name in OPTIONS}
+        own = {name: value for name, value in changes.items() if name in SWEEP_OPTIONS}
         if own.get("dt") is not None:
             own.setdefault("error", None)
         if own.get("error") is not None:
             own.setdefault("dt", None)
-        values = self.values | {name: value for name, value in changes.items() if name not in OPTIONS}
+        values = self.values | {name: value for name, value in changes.items() if name not in SWEEP_OPTIONS}
         return replace(self, **own, values=values)
 
-    def key(self, code: str) -> str:
-        """Name of the run, from the settings and the code version."""
+    def hash_key(self, code: str) -> str:
+        """Hash of the settings and the code version, the name of the run in a store."""
         return hashlib.sha256(json.dumps([to_json(asdict(self)), code], sort_keys=True).encode()).hexdigest()[:20]
 
     def command(self, what: str, scene: Scene[Any]) -> str:
         """Command line of the run."""
         words = ["warpfea", "run", what, "--integrator", self.method]
-        words += ["--dt", word(self.dt)] if self.error is None else ["--dt", "auto", "--error", word(self.error)]
+        words += ["--dt", "auto" if self.error is not None else cli_text(self.dt)]
+        words += ["--error", cli_text(self.error)] if self.error is not None else []
         if self.t_end != scene.t_end:
-            words += ["--t-end", word(self.t_end)]
+            words += ["--t-end", cli_text(self.t_end)]
         if self.solver != "newton-pcg":
             words += ["--solver", self.solver]
         if self.tol is not None and self.tol != scene.tol:
-            words += ["--tol", word(self.tol)]
+            words += ["--tol", cli_text(self.tol)]
         words += ["--dtype", self.dtype, "--device", self.device]
         for name, value in self.values.items():
             if value != scene.parameters[name].default:
-                words += ["--set", f"{name}={word(value)}"]
+                words += ["--set", f"{name}={cli_text(value)}"]
         return shlex.join(words)
 
 
 @dataclass(frozen=True)
-class Axes:
+class SweepAxes:
     """Swept axes.
 
     Attributes:
@@ -110,7 +112,7 @@ class Axes:
         return [name for name in self.over if name in ("dt", "error", *self.mesh)]
 
     @property
-    def along(self) -> str | None:
+    def curve_axis(self) -> str | None:
         """Axis along a curve; None if only names vary."""
         for name in ("dt", "error", *self.mesh, "tol"):
             if name in self.over:
@@ -118,14 +120,14 @@ class Axes:
         return None
 
 
-def word(value: Any) -> str:
+def cli_text(value: Any) -> str:
     """A value as on the command line."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, float):
         return f"{value:.12g}"
     if isinstance(value, (tuple, list)):
-        return ",".join(map(word, value))
+        return ",".join(map(cli_text, value))
     return "none" if value is None else str(value)
 
 
@@ -140,7 +142,7 @@ def method_text(given: str | integrators.Integrator) -> str:
     return given if isinstance(given, str) else label
 
 
-def order_of(text: str) -> int:
+def convergence_order(text: str) -> int:
     """Order of convergence of an integrator."""
     return integrators.get(text).order
 
@@ -150,15 +152,15 @@ def parse_over(scene: Scene[Any], texts: Iterable[str], option: str = "--over") 
     out: dict[str, list[Any]] = {}
     for text in texts:
         name, equals, values = text.partition("=")
-        name = NAMES.get(name.strip(), name.strip())
+        name = SYNONYMS.get(name.strip(), name.strip())
         if not equals or not values.strip():
             raise ModelError(f"{option} {text}: expected NAME=V1,V2,...")
         if name in out:
             raise ModelError(f"{option} {name}: given twice")
         out[name] = split_methods(values) if name == "method" else [part.strip() for part in values.split(",")]
         if name in ("dt", "error", "tol"):
-            out[name] = [_number(name, value) for value in out[name]]
-        elif name not in OPTIONS:
+            out[name] = [_positive_number(name, value) for value in out[name]]
+        elif name not in SWEEP_OPTIONS:
             _check_names(scene, [name])
             parts = out[name]
             if typing.get_origin(scene.parameters[name].kind) is tuple:  # 6x2x1: commas separate values
@@ -167,7 +169,7 @@ def parse_over(scene: Scene[Any], texts: Iterable[str], option: str = "--over") 
     return out
 
 
-def _number(name: str, text: Any) -> float:
+def _positive_number(name: str, text: Any) -> float:
     try:
         value = float(text)
     except (TypeError, ValueError):
@@ -179,27 +181,27 @@ def _number(name: str, text: Any) -> float:
 
 def _check_names(scene: Scene[Any], names: Iterable[str]) -> None:
     """ModelError for a name that is neither an option nor a parameter of the scene."""
-    known = [*OPTIONS, *scene.parameters]
+    known = [*SWEEP_OPTIONS, *scene.parameters]
     for name in names:
         if name not in known:
             raise ModelError(
-                f"study of {scene.name!r}: can't sweep {name!r}; there are {', '.join(OPTIONS)}, and of the scene "
-                f"{', '.join(scene.parameters) or 'no parameters'}{did_you_mean(name, known)}"
+                f"study of {scene.name!r}: can't sweep {name!r}; there are {', '.join(SWEEP_OPTIONS)}, and of the "
+                f"scene {', '.join(scene.parameters) or 'no parameters'}{did_you_mean(name, known)}"
             )
 
 
-def sweep_axes(scene: Scene[Any], over: Mapping[str, Sequence[Any]], mesh: Sequence[str] | None) -> Axes:
-    """Validate the swept values.
+def sweep_axes(scene: Scene[Any], over: Mapping[str, Sequence[Any]], mesh: Sequence[str] | None) -> SweepAxes:
+    """Swept axes, after a check of their values.
 
     Args:
         scene: the scene.
         over: values by name.
-        mesh: parameters that refine the mesh; None: those of MESH that are whole numbers.
+        mesh: parameters that refine the mesh; None: those of MESH_PARAMETERS that are whole numbers.
 
     Raises:
         ModelError: an unknown name, no values, a repeated or an invalid value.
     """
-    chosen = {NAMES.get(name, name): values for name, values in over.items()}
+    chosen = {SYNONYMS.get(name, name): values for name, values in over.items()}
     if len(chosen) < len(over):
         raise ModelError(f"study: {', '.join(over)} name the same thing twice")
     _check_names(scene, chosen)
@@ -207,7 +209,7 @@ def sweep_axes(scene: Scene[Any], over: Mapping[str, Sequence[Any]], mesh: Seque
     for name, values in chosen.items():
         if isinstance(values, (str, bytes)) or not isinstance(values, Iterable) or not list(values):
             raise ModelError(f"study: over {name} = {values!r} must be a list of values, at least one")
-        out[name] = [_number(name, v) if name in ("dt", "error", "tol") else v for v in values]
+        out[name] = [_positive_number(name, v) if name in ("dt", "error", "tol") else v for v in values]
         if name == "method":
             out[name] = [method_text(value) for value in out[name]]
         if len({repr(value) for value in out[name]}) < len(out[name]):
@@ -217,23 +219,23 @@ def sweep_axes(scene: Scene[Any], over: Mapping[str, Sequence[Any]], mesh: Seque
             if known and value not in known:
                 hint = did_you_mean(value, known)
                 raise ModelError(f"study: {name} {value!r} is unknown; there are {', '.join(known)}{hint}")
-    whole = {name for name, p in scene.parameters.items() if is_whole(p.default) and not isinstance(p.default, bool)}
+    whole = {name for name, p in scene.parameters.items() if is_integer(p.default) and not isinstance(p.default, bool)}
     for name in mesh or ():
         if name not in whole:
             hint = did_you_mean(name, whole)
             raise ModelError(f"study: mesh {name!r} is no whole number of the scene; it has {sorted(whole)}{hint}")
-    refine = tuple(mesh) if mesh is not None else tuple(name for name in MESH if name in whole)
-    swept = [name for name in out if name not in (*OPTIONS, *refine)]
+    refine = tuple(mesh) if mesh is not None else tuple(name for name in MESH_PARAMETERS if name in whole)
+    swept = [name for name in out if name not in (*SWEEP_OPTIONS, *refine)]
     choices = tuple(name for name in swept if all(isinstance(v, (str, bool)) for v in out[name]))
-    return Axes(out, refine, choices, tuple(name for name in swept if name not in choices))
+    return SweepAxes(out, refine, choices, tuple(name for name in swept if name not in choices))
 
 
-def is_whole(value: Any) -> bool:
+def is_integer(value: Any) -> bool:
     """True for a whole number or a tuple of them."""
-    return isinstance(value, int) or (isinstance(value, tuple) and bool(value) and all(map(is_whole, value)))
+    return isinstance(value, int) or (isinstance(value, tuple) and bool(value) and all(map(is_integer, value)))
 
 
-def product(base: Setting, axes: Axes) -> list[Setting]:
+def setting_product(base: Setting, axes: SweepAxes) -> list[Setting]:
     """Every combination, with fixed and adaptive steps.
 
     Raises:
@@ -243,7 +245,7 @@ def product(base: Setting, axes: Axes) -> list[Setting]:
     others = [[{name: v} for v in values] for name, values in axes.over.items() if name not in ("dt", "error")]
     out = []
     for *parts, step in itertools.product(*others, steps):
-        setting = base.changed({k: v for part in [*parts, step] for k, v in part.items()})
+        setting = base.with_changes({k: v for part in [*parts, step] for k, v in part.items()})
         if setting.dt is not None:
             check_steps(setting.dt, setting.t_end)
         out.append(setting)

@@ -18,47 +18,50 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from .finer import scaled
+from .finer import scale_counts
 from .measure import DONE, Outcome
-from .motion import Motion, distances, run_motion
-from .settings import Axes, Setting, order_of
+from .motion import Motion, motion_errors, run_motion
+from .settings import Setting, SweepAxes, convergence_order
 
-__all__ = ["split"]
+__all__ = ["split_error"]
 
-UNITS = 2.0**-29
+ErrorParts = dict[str, float | None]
+
+ROUND_OFF_RATIO = 2.0**-29
 """Unit round-off of float64 over that of float32."""
 TIGHTENING = 100.0
-DEFAULTS = {"float64": 1e-8, "float32": 1e-4}
+DEFAULT_TOLS = {"float64": 1e-8, "float32": 1e-4}
 """Tolerances of the solvers."""
 
 
-def split(setting: Setting, axes: Axes, motion: Motion, run: Callable[[Setting], Outcome]) -> dict[str, float | None]:
+def split_error(setting: Setting, axes: SweepAxes, motion: Motion, run: Callable[[Setting], Outcome]) -> ErrorParts:
     """time, space, algebra and rounding of the error of a setting, over the travel of the reference; None: unknown."""
     base = run(setting)
     if base.status != DONE:
         return dict.fromkeys(("time", "space", "algebra", "rounding"))
     names = list(motion.probes)
 
-    def away(other: Setting) -> float | None:
+    def distance_to(other: Setting) -> float | None:
         found = run(other)
         if found.status != DONE:
             return None
-        own = run_motion(found, names, "")
-        return float(distances(base, own)["l2"]) * own.travel / motion.travel
+        reference = run_motion(found, names, "")
+        return float(motion_errors(base, reference)["l2"]) * reference.travel / motion.travel
 
     def times(value: float | None, factor: float) -> float | None:
         return None if value is None else factor * value
 
     if setting.dt is not None:
-        growth = 2.0 ** order_of(setting.method)
-        time = times(away(setting.changed({"dt": setting.dt / 2})), growth / (growth - 1.0))
+        growth = 2.0 ** convergence_order(setting.method)
+        time = times(distance_to(setting.with_changes({"dt": setting.dt / 2})), growth / (growth - 1.0))
     else:
         assert setting.error is not None
-        time = away(setting.changed({"error": setting.error / 10}))
-    finer = {name: scaled(setting.values[name], 2) for name in axes.mesh}
-    space = times(away(setting.changed(finer)), 2.0) if finer else None
-    tol = setting.tol if setting.tol is not None else DEFAULTS[setting.dtype]
-    algebra = away(setting.changed({"tol": tol / TIGHTENING}))
+        time = distance_to(setting.with_changes({"error": setting.error / 10}))
+    finer = {name: scale_counts(setting.values[name], 2) for name in axes.mesh}
+    space = times(distance_to(setting.with_changes(finer)), 2.0) if finer else None
+    tol = setting.tol if setting.tol is not None else DEFAULT_TOLS[setting.dtype]
+    algebra = distance_to(setting.with_changes({"tol": tol / TIGHTENING}))
     single = setting.dtype == "float32"
-    other = away(setting.changed({"dtype": "float64" if single else "float32"}))
-    return {"time": time, "space": space, "algebra": algebra, "rounding": other if single else times(other, UNITS)}
+    other = distance_to(setting.with_changes({"dtype": "float64" if single else "float32"}))
+    rounding = other if single else times(other, ROUND_OFF_RATIO)
+    return {"time": time, "space": space, "algebra": algebra, "rounding": rounding}

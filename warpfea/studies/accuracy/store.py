@@ -16,13 +16,13 @@ from ...base.console import to_json
 from ...base.errors import OutputError
 from ...base.provenance import machine
 from ...builder.scene import Scene
-from .measure import LONG, REFUSED, Outcome
+from .measure import REFUSED, TOO_LONG, Outcome
 from .settings import Setting
 
-__all__ = ["Store", "code_version"]
+__all__ = ["OutcomeStore", "code_version"]
 
 _ROOT = pathlib.Path(__file__).resolve().parents[2]
-UNRELATED = ("cli", "outputs", "studies", "__pycache__")
+UNRELATED_FOLDERS = ("cli", "outputs", "studies", "__pycache__")
 """Folders of the package without influence on results."""
 
 
@@ -34,7 +34,7 @@ def _package_version() -> str:
     total = hashlib.sha256()
     for root in (_ROOT, pathlib.Path(next(iter(kernels.__path__)))):
         for path in sorted(root.rglob("*.py")):
-            if not set(path.relative_to(root).parts) & set(UNRELATED):
+            if not set(path.relative_to(root).parts) & set(UNRELATED_FOLDERS):
                 total.update(path.read_bytes())
     return total.hexdigest()
 
@@ -46,7 +46,7 @@ def code_version(scene: Scene[Any], device: str) -> str:
     return json.dumps([_package_version(), hashlib.sha256(own).hexdigest(), scene.name, machine(device)])
 
 
-class Store:
+class OutcomeStore:
     """Outcomes by setting. With a file each finished run is appended at once.
 
     Args:
@@ -68,7 +68,7 @@ class Store:
             for line in text.splitlines():
                 try:
                     data = json.loads(line)
-                    self.outcomes[data["key"]] = Outcome.unpacked(data)
+                    self.outcomes[data["key"]] = Outcome.from_dict(data)
                 except (ValueError, KeyError, TypeError):  # line truncated by a kill
                     continue
             if text and not text.endswith("\n"):
@@ -76,22 +76,22 @@ class Store:
 
     def get(self, setting: Setting, repeat: int, limit: float | None) -> Outcome | None:
         """Outcome of a setting, unless it has fewer repetitions or was given up earlier than requested."""
-        found = self.outcomes.get(setting.key(self.version(setting.device)))
-        if found is None or found.numbers.get("asked", repeat) < repeat:
+        found = self.outcomes.get(setting.hash_key(self.version(setting.device)))
+        if found is None or found.cost.get("asked", repeat) < repeat:
             return None
-        if found.status == LONG and (limit is None or limit > found.numbers["limit"]):
+        if found.status == TOO_LONG and (limit is None or limit > found.cost["limit"]):
             return None
         return found
 
     def put(self, setting: Setting, outcome: Outcome) -> None:
         """Store an outcome. OutputError."""
-        key = setting.key(self.version(setting.device))
+        key = setting.hash_key(self.version(setting.device))
         self.outcomes[key] = outcome
         if self.file is not None and outcome.status != REFUSED:
-            line = {"key": key, "settings": asdict(setting), **outcome.packed()}
+            line = {"key": key, "settings": asdict(setting), **outcome.to_dict()}
             self._append(json.dumps(to_json(line)) + "\n")
 
-    def told(self) -> str:
+    def summary(self) -> str:
         """Text of the partial results of an interrupted study."""
         if self.file is None:
             return "nothing is kept without a folder for it"

@@ -22,22 +22,22 @@ from ..files import prepare
 from .finer import finer_motion, finer_setting
 from .measure import DONE, REFUSED, Outcome
 from .measure import measure as run_once
-from .motion import RESOLVED, ROUNDING, Motion, distances, known_motion
-from .options import StudyOptions, check_positive, names_moved
+from .motion import RESOLVED_RATIO, ROUND_OFF_ERROR, Motion, known_motion, motion_errors
+from .options import StudyOptions, check_positive, refuse_moved_keywords
 from .report import Row, Study, with_orders, with_pareto
-from .settings import OPTIONS, Axes, Setting, method_text, product, sweep_axes
-from .split import split as parts_of_error
-from .store import Store, code_version
+from .settings import SWEEP_OPTIONS, Setting, SweepAxes, method_text, setting_product, sweep_axes
+from .split import split_error
+from .store import OutcomeStore, code_version
 
 __all__ = ["study"]
 
-CHECKED = (0.9, 1.1)
+CHECK_FACTORS = (0.9, 1.1)
 """Factors on the step of the answer for its reruns."""
-RUN = "run"
+FINER_RUN = "run"
 """As `reference`: a finer run, even for a scene with a known motion."""
 
 
-@names_moved
+@refuse_moved_keywords
 def study(
     scene: Scene[Any] | Callable[..., ModelBuilder] | str,
     *,
@@ -78,7 +78,7 @@ def study(
         KeyboardInterrupt: after Ctrl-C; finished runs are kept in `out`.
     """
     options = options or StudyOptions()
-    named, found = _scene(scene, dt, t_end)
+    named, found = _resolve_scene(scene, dt, t_end)
     options = replace(options, what=options.what or named, name=options.name or found.name)
     sweep = dict(over or {})
     for option, many in (("methods", methods), ("error", error)):
@@ -90,8 +90,8 @@ def study(
     axes = sweep_axes(found, sweep, options.mesh)
     values = dict(parameters or {})
     _check_names("parameter", values, found.parameters)
-    _check_names("finer", options.finer or {}, [*OPTIONS, *found.parameters])
-    swept = {axis: many[0] for axis, many in axes.over.items() if axis not in OPTIONS}
+    _check_names("finer", options.finer or {}, [*SWEEP_OPTIONS, *found.parameters])
+    swept = {axis: many[0] for axis, many in axes.over.items() if axis not in SWEEP_OPTIONS}
     base = Setting(
         method=method_text(found.integrator),
         dt=float(dt or found.dt),
@@ -104,18 +104,18 @@ def study(
         values=found.resolve(swept | values),
     )
     sweep_axes(found, {option: [base.get(option)] for option in ("solver", "dtype")}, None)
-    settings = product(base, axes)
+    settings = setting_product(base, axes)
     if options.measure == "field" and found.field is None:
         raise ModelError(f"study: scene {found.name!r} has no field whose error could count: @wf.scene(field=...)")
-    known = _reference(options.reference, found, base, probes)
+    known = _reference_function(options.reference, found, base, probes)
     with quiet_warp():
         _check_probes(found, settings[0], probes)
         folder = None if options.out is None else prepare(options.out)
-        store = Store(folder and folder / f"{options.name}.points.jsonl", lambda dev: code_version(found, dev))
-        return _Work(found, axes, store, options, known, probes, base).result(settings, folder)
+        store = OutcomeStore(folder and folder / f"{options.name}.points.jsonl", lambda dev: code_version(found, dev))
+        return _StudyRunner(found, axes, store, options, known, probes, base).result(settings, folder)
 
 
-def _scene(given: Any, dt: float | None, t_end: float | None) -> tuple[str, Scene[Any]]:
+def _resolve_scene(given: Any, dt: float | None, t_end: float | None) -> tuple[str, Scene[Any]]:
     """Scene, and its name on the command line."""
     if isinstance(given, str):
         return given, locate(given)
@@ -150,17 +150,17 @@ def _check_probes(scene: Scene[Any], setting: Setting, chosen: Sequence[str] | N
             raise ModelError(f"study: probe {name!r} is unknown; there are {listing(names)}{did_you_mean(name, names)}")
 
 
-def _reference(
+def _reference_function(
     given: Any, scene: Scene[Any], base: Setting, probes: Sequence[str] | None
 ) -> Callable[[Setting], Reference | None]:
     """Function giving the known motion for the parameters of a setting; None if a finer run is needed."""
-    if given == RUN:
+    if given == FINER_RUN:
         return lambda setting: None
     if given is None:
         return lambda setting: reference_of(scene.reference, setting.values)
     if isinstance(given, (str, pathlib.Path)):
         if not str(given).lower().endswith((".csv", ".json")):
-            raise ModelError(f"study: reference {str(given)!r} is neither a file .csv or .json nor {RUN!r}")
+            raise ModelError(f"study: reference {str(given)!r} is neither a file .csv or .json nor {FINER_RUN!r}")
         names = list(probes or [p.name for p in scene.build(base.values).description.probes][:1])
         read = read_reference(given, names[0] if names else "")
         return lambda setting: read
@@ -168,20 +168,20 @@ def _reference(
     return lambda setting: fixed
 
 
-def _answer(rows: Sequence[Row], target: float | None) -> Row | None:
+def _cheapest_row(rows: Sequence[Row], target: float | None) -> Row | None:
     """Row with the smallest median time whose error, plus those of reference and mesh, is within the target."""
-    good = [r for r in rows if target is not None and r.status == DONE and r.reaches <= target]
+    good = [r for r in rows if target is not None and r.status == DONE and r.total_error <= target]
     return min(good, key=lambda r: r.seconds or 0.0) if good else None
 
 
-class _Work:
+class _StudyRunner:
     """Runs and evaluates a study."""
 
     def __init__(
         self,
         scene: Scene[Any],
-        axes: Axes,
-        store: Store,
+        axes: SweepAxes,
+        store: OutcomeStore,
         options: StudyOptions,
         known: Callable[[Setting], Reference | None],
         chosen: Sequence[str] | None,
@@ -189,7 +189,7 @@ class _Work:
     ) -> None:
         self.scene, self.axes, self.store, self.options = scene, axes, store, options
         self.known, self.chosen, self.base = known, chosen, base
-        self.show = sys.stderr.isatty() if options.progress is None else options.progress
+        self.show_progress = sys.stderr.isatty() if options.progress is None else options.progress
 
     def result(self, settings: Sequence[Setting], folder: pathlib.Path | None) -> Study:
         """The study of all settings, written into the folder if there is one."""
@@ -198,19 +198,19 @@ class _Work:
         assert options.what is not None
         try:
             rows, references, motions = self.rows(settings)
-            rows = self.judged(rows, motions)
-            answer = _answer(rows, options.target)
+            rows = self.add_error_parts(rows, motions)
+            answer = _cheapest_row(rows, options.target)
             checks = [] if answer is None else self.checks(answer, motions)
         except KeyboardInterrupt:
-            raise KeyboardInterrupt(self.store.told()) from None
+            raise KeyboardInterrupt(self.store.summary()) from None
         command = None if answer is None else answer.setting.command(options.what, self.scene)
-        told = {
+        run_options = {
             "t_end": base.t_end, "repeat": options.repeat, "limit": options.limit, "split": options.split,
             "parameters": base.values, "dt": base.dt, "tol": base.tol, "solver": base.solver, "dtype": base.dtype,
             "integrator": base.method, "probes": self.chosen,
         }  # fmt: skip
-        found = Study(options.name, options.what, rows, self.axes, options.measure, options.target, references, told,
-                      answer, command, checks)  # fmt: skip
+        found = Study(options.name, options.what, rows, self.axes, options.measure, options.target, references,
+                      run_options, answer, command, checks)  # fmt: skip
         if folder is not None:
             found.write(folder, options.words or ["study", options.what])
         return found
@@ -218,13 +218,13 @@ class _Work:
     def run(self, setting: Setting) -> Outcome:
         """Outcome of a setting besides the sweep."""
         self.bar.total = (self.bar.total or 0) + 1
-        return self.point(setting, 1, None)
+        return self.run_setting(setting, 1, None)
 
-    def point(self, setting: Setting, repeat: int, limit: float | None) -> Outcome:
+    def run_setting(self, setting: Setting, repeat: int, limit: float | None) -> Outcome:
         """Outcome of a setting, run unless known."""
         found = self.store.get(setting, repeat, limit)
         if found is None:
-            self.bar.set_postfix_str(_short(setting, self.axes), refresh=True)
+            self.bar.set_postfix_str(_progress_text(setting, self.axes), refresh=True)
             found = run_once(self.scene, setting, repeat=repeat, limit=limit)
             self.store.put(setting, found)
         self.bar.update()
@@ -236,10 +236,12 @@ class _Work:
 
         groups: dict[str, list[Setting]] = {}
         for setting in settings:
-            groups.setdefault(self._problem(setting), []).append(setting)
+            groups.setdefault(self._problem_key(setting), []).append(setting)
         motions: dict[str, Motion] = {}
         references = []
-        with tqdm(desc=self.scene.name, unit="run", leave=False, disable=not self.show, file=sys.stderr) as self.bar:
+        with tqdm(
+            desc=self.scene.name, unit="run", leave=False, disable=not self.show_progress, file=sys.stderr
+        ) as self.bar:
             self.bar.total = len(settings)
             outcomes = {}
             for name, group in groups.items():
@@ -248,28 +250,28 @@ class _Work:
                     best = finer_setting(group, self.axes, self.options.finer or {}, self.base.dt or self.scene.dt)
                     motions[name] = finer_motion(best, self.axes, self.chosen, self.run)
                 for setting in group:
-                    outcomes[id(setting)] = self.point(setting, self.options.repeat, self.options.limit)
+                    outcomes[id(setting)] = self.run_setting(setting, self.options.repeat, self.options.limit)
                 done = [o for s in group if (o := outcomes[id(s)]).status == DONE]
                 if known is not None and done:
                     motions[name] = known_motion(known, self.chosen, done[0], self.base.t_end)
                 if name in motions:
                     m, values = motions[name], {k: group[0].get(k) for k in self.axes.physical}
                     references.append(
-                        {"values": values, "about": m.about, "travel": m.travel, "own_error": m.own, "runs": m.runs,
-                         "known": known is not None}
+                        {"values": values, "about": m.about, "travel": m.travel, "own_error": m.own_error,
+                         "runs": m.runs, "known": known is not None}
                     )  # fmt: skip
         found = [outcomes[id(s)] for s in settings]
         if all(o.status == REFUSED for o in found):
             raise ModelError(found[0].why)
-        rows = [self._row(s, o, motions.get(self._problem(s))) for s, o in zip(settings, found)]
+        rows = [self._make_row(s, o, motions.get(self._problem_key(s))) for s, o in zip(settings, found)]
         return with_pareto(with_orders(rows, self.axes)), references, motions
 
-    def _problem(self, setting: Setting) -> str:
+    def _problem_key(self, setting: Setting) -> str:
         return repr([setting.get(name) for name in self.axes.physical])
 
-    def _row(self, setting: Setting, outcome: Outcome, motion: Motion | None) -> Row:
+    def _make_row(self, setting: Setting, outcome: Outcome, motion: Motion | None) -> Row:
         swept = {name: setting.get(name) for name in self.axes.over}
-        n = outcome.numbers
+        n = outcome.cost
         row = Row(setting, swept, outcome.status, outcome.why)
         if n:
             names = ("compile_s", "setup_s", "steps", "newton", "pcg", "rough", "bytes", "unknowns", "elements")
@@ -279,27 +281,33 @@ class _Work:
             )  # fmt: skip
         if outcome.status != DONE or motion is None:
             return row
-        away: dict[str, Any] = distances(outcome, motion)
-        away["energy"] = n["drift"] / n["exchanged"] if n["exchanged"] > 0.0 else None
+        errors: dict[str, Any] = motion_errors(outcome, motion)
+        errors["energy"] = n["drift"] / n["exchanged"] if n["exchanged"] > 0.0 else None
         if n["exchanged"] > 0.0:
-            away["ledger"] = {name: change / n["exchanged"] for name, change in n["ledger"].items()}
+            errors["ledger"] = {name: change / n["exchanged"] for name, change in n["ledger"].items()}
         measure = self.options.measure
-        error, own = away[measure], motion.own.get(measure, 0.0)
+        error, own = errors[measure], motion.own_error.get(measure, 0.0)
         if error is None:
             needs = "a field=, and a reference that has one" if measure == "field" else "energy that is exchanged"
             raise ModelError(f"study: no error by {measure!r} of scene {self.scene.name!r}: it needs {needs}")
         digits = -math.log10(error * row.seconds) if error > 0.0 and row.seconds else None
         return replace(
-            row, error=error, own_error=own, resolved=error >= max(RESOLVED * own, ROUNDING), efficacy=digits, **away
+            row, error=error, own_error=own, resolved=error >= max(RESOLVED_RATIO * own, ROUND_OFF_ERROR),
+            efficacy=digits, **errors
         )  # fmt: skip
 
-    def judged(self, rows: list[Row], motions: dict[str, Motion]) -> list[Row]:
-        """Rows with parts of the error, and the mesh error if the cheapest one depends on it."""
+    def add_error_parts(self, rows: list[Row], motions: dict[str, Motion]) -> list[Row]:
+        """Rows with the requested parts of the error, and the mesh error if the cheapest one depends on it."""
         while True:
-            answer = _answer(rows, self.options.target)
+            answer = _cheapest_row(rows, self.options.target)
             rows = self.split(rows, motions, answer)
-            answer = _answer(rows, self.options.target)
-            if answer is None or answer.split is None or answer.mesh_error is not None or not self._in_time(answer):
+            answer = _cheapest_row(rows, self.options.target)
+            if (
+                answer is None
+                or answer.split is None
+                or answer.mesh_error is not None
+                or not self._in_time_only(answer)
+            ):
                 return rows
             space, values = answer.split["space"], answer.setting.values
             if space is None:
@@ -307,7 +315,7 @@ class _Work:
             rows = [replace(r, mesh_error=space) if r.error is not None and r.setting.values == values else r
                     for r in rows]  # fmt: skip
 
-    def _in_time(self, row: Row) -> bool:
+    def _in_time_only(self, row: Row) -> bool:
         """True if the error of a row excludes that of the mesh, which can be estimated."""
         swept = any(name in self.axes.over for name in self.axes.mesh)
         return self.options.measure in ("l2", "end") and not swept and self.known(row.setting) is None
@@ -323,12 +331,12 @@ class _Work:
         best = answer or max(done, key=lambda r: -math.inf if r.efficacy is None else r.efficacy)
         out = []
         with tqdm(
-            desc="parts of the error", unit="run", leave=False, disable=not self.show, file=sys.stderr
+            desc="parts of the error", unit="run", leave=False, disable=not self.show_progress, file=sys.stderr
         ) as self.bar:
             for row in rows:
                 if row.error is not None and row.split is None and (which == "all" or row is best):
-                    motion = motions[self._problem(row.setting)]
-                    row = replace(row, split=parts_of_error(row.setting, self.axes, motion, self.run))
+                    motion = motions[self._problem_key(row.setting)]
+                    row = replace(row, split=split_error(row.setting, self.axes, motion, self.run))
                 out.append(row)
         return out
 
@@ -340,19 +348,19 @@ class _Work:
         from tqdm import tqdm
 
         setting, found = answer.setting, []
-        with tqdm(desc="target", unit="run", leave=False, disable=not self.show, file=sys.stderr) as self.bar:
-            for factor in CHECKED:
+        with tqdm(desc="target", unit="run", leave=False, disable=not self.show_progress, file=sys.stderr) as self.bar:
+            for factor in CHECK_FACTORS:
                 if setting.dt is None:
                     assert setting.error is not None
-                    near = setting.changed({"error": factor * setting.error})
+                    near = setting.with_changes({"error": factor * setting.error})
                 else:
                     steps = max(1, round(setting.t_end / (factor * setting.dt)))
-                    near = setting.changed({"dt": setting.t_end / steps})
-                found.append(self._row(near, self.run(near), motions[self._problem(near)]))
+                    near = setting.with_changes({"dt": setting.t_end / steps})
+                found.append(self._make_row(near, self.run(near), motions[self._problem_key(near)]))
         return found
 
 
-def _short(setting: Setting, axes: Axes) -> str:
+def _progress_text(setting: Setting, axes: SweepAxes) -> str:
     """Short text of a run, for the bar."""
     step = f"dt={setting.dt:g}" if setting.dt is not None else f"error={setting.error:g}"
     more = [f"{name}={setting.values[name]}" for name in axes.over if name in setting.values]
