@@ -9,7 +9,7 @@ import pytest
 
 import warpfea as wf
 from warpfea.base.errors import OutputError
-from warpfea.studies.profile.profiling import _empty_launch
+from warpfea.studies.profile.profiling import _empty_launch_seconds
 
 
 def builder(density=1000.0, gravity=(0, 0, 0), size=(1, 0.2, 0.2)):
@@ -101,5 +101,5 @@ def test_a_file_that_is_no_stage_cannot_be_continued(tmp_path):
 
 
 def test_measuring_launches_is_quiet(capfd):
-    assert _empty_launch("cpu") > 0.0
+    assert _empty_launch_seconds("cpu") > 0.0
     assert capfd.readouterr().out == ""

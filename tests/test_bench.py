@@ -63,7 +63,7 @@ def test_float32_is_judged_against_float64(bench):
 
 def test_what_has_no_peer_is_timed_for_a_few_steps(bench, monkeypatch):
     small = bench_peer.Case("bar-6x4x2", "bar", (6, 4, 2), 1755, None)
-    monkeypatch.setattr(bench_peer, "LARGE", small)
+    monkeypatch.setattr(bench_peer, "LARGE_CASE", small)
     code, text, content = bench("--peer", "--large", "--rows", "bar-3x2x1", "--steps", "12")
     assert code == 0, text
     first, row = content["rows"]
@@ -82,27 +82,27 @@ def test_rows_without_their_mesh_are_left_out_and_named(bench, tmp_path):
 
 
 def test_times_that_count():
-    assert bench_peer.first_counted(120) == 20
-    assert [bench_peer.first_counted(n) for n in (1, 2, 10)] == [1, 2, 6]
+    assert bench_peer.first_timed_step(120) == 20
+    assert [bench_peer.first_timed_step(n) for n in (1, 2, 10)] == [1, 2, 6]
 
 
 def test_table_of_the_peer():
-    assert len({case.label for case in bench_peer.PEER}) == 15
-    for case in (*bench_peer.PEER, bench_peer.LARGE):
+    assert len({case.label for case in bench_peer.PEER_CASES}) == 15
+    for case in (*bench_peer.PEER_CASES, bench_peer.LARGE_CASE):
         if case.problem == "bar" and not isinstance(case.size, str):
             assert case.unknowns == 3 * np.prod([2 * k + 1 for k in case.size])
         elif case.problem != "bar" and case.unknowns < 30_000:
             (body,) = PROBLEMS[case.problem].build(case.size).bodies
             assert case.unknowns == 3 * body.slot_count
-    bars = {case.unknowns: bench_peer.required(case) for case in bench_peer.PEER}
+    bars = {case.unknowns: bench_peer.required_speedup(case) for case in bench_peer.PEER_CASES}
     assert {n for n, bar in bars.items() if bar == 40.0} == {883227}
     assert {n for n, bar in bars.items() if bar == 3.0} == {n for n in bars if n < 100_000}
     assert set(bars.values()) == {3.0, 10.0, 40.0}
 
 
-@pytest.mark.parametrize("case", [c for c in bench_peer.PEER if isinstance(c.size, str)], ids=lambda c: c.label)
+@pytest.mark.parametrize("case", [c for c in bench_peer.PEER_CASES if isinstance(c.size, str)], ids=lambda c: c.label)
 def test_unstructured_meshes_are_as_large_as_the_peers(case):
-    mesh = bench_peer.load(DATA / case.size)
+    mesh = bench_peer.load_mesh(DATA / case.size)
     assert mesh.volume() == pytest.approx(6.0, rel=1e-14)
     assert mesh.straight_sided().all()
     assert 3 * len(mesh.points) == pytest.approx(case.unknowns, rel=0.02)

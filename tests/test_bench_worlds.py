@@ -7,12 +7,12 @@ import pytest
 from result_files import rows_of
 
 from warpfea.cli import main
-from warpfea.studies.bench.worlds import GOALS, five_tets
+from warpfea.studies.bench.worlds import RATE_GOALS, five_tet_box
 
 
 @pytest.mark.parametrize("cells", [(1, 1, 1), (3, 2, 2)])
 def test_five_tets_fill_a_box_and_match(cells):
-    found = five_tets((3.0, 2.0, 1.0), cells)
+    found = five_tet_box((3.0, 2.0, 1.0), cells)
     edges = found.points[found.cells[:, 1:]] - found.points[found.cells[:, :1]]
     volumes = np.linalg.det(edges) / 6.0
     assert len(found.cells) == 5 * np.prod(cells)
@@ -59,7 +59,7 @@ def miss(value, reason):
 )
 def test_worlds_step_as_fast_as_was_asked(rows, label):
     row = rows[label, "float64"]
-    assert row["goal"] == GOALS[label.split("-")[0]]
+    assert row["goal"] == RATE_GOALS[label.split("-")[0]]
     assert row["reached"]
     assert row["world_steps_per_s"] >= row["goal"]
 

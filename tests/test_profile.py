@@ -16,7 +16,7 @@ from warpfea.builder.scene import find
 from warpfea.cli import main
 from warpfea.cli.profile import KEYS
 from warpfea.studies.profile import profiling
-from warpfea.studies.profile.profiling import Recorder, launch_bytes, profile
+from warpfea.studies.profile.profiling import LaunchRecorder, launch_bytes, profile
 from warpfea.terms.term_set import all_parts
 
 WORDS = ["profile", "cantilever", "--set", "cells=2", "--device", "cpu", "--steps", "2"]
@@ -90,11 +90,11 @@ def test_profile_adds_up_and_leaves_the_run_as_it_was(device):
     recorded = sim.stepper.launch.launches
     found = profile(sim, steps=2, on_step=lambda: calls.append(1))
     check(found, 2)
-    assert 2 * found.launches == launches_of("cantilever", device, 2, profiling.WARM_UP, cells=2)
-    assert len(calls) == profiling.WARM_UP + 2 + 1 + 2
+    assert 2 * found.launches == launches_of("cantilever", device, 2, profiling.WARM_UP_STEPS, cells=2)
+    assert len(calls) == profiling.WARM_UP_STEPS + 2 + 1 + 2
     assert "loads" in found.parts  # gravity
     assert "constraints" not in found.parts
-    plain.step(profiling.WARM_UP + 2)
+    plain.step(profiling.WARM_UP_STEPS + 2)
     assert sim.steps == plain.steps
     for name, values in plain.state.numpy().items():
         assert np.array_equal(sim.state.numpy()[name], values), name
@@ -105,8 +105,8 @@ def test_profile_adds_up_and_leaves_the_run_as_it_was(device):
 
 def test_each_launch_takes_its_time_less_that_of_an_empty_one(device, monkeypatch):
     """With a clock that counts, a launch is one reading long, a step is one, and an empty launch is one."""
-    assert profiling._empty_launch(device) == pytest.approx(TICK)
-    monkeypatch.setattr(profiling, "_empty_launch", lambda device: 0.25 * TICK)
+    assert profiling._empty_launch_seconds(device) == pytest.approx(TICK)
+    monkeypatch.setattr(profiling, "_empty_launch_seconds", lambda device: 0.25 * TICK)
     found = profile(simulation("cantilever", device, cells=2), steps=2)
     assert found.step_ms == pytest.approx([1.0, 1.0])
     assert found.empty_launch_us == pytest.approx(250.0)
@@ -201,7 +201,7 @@ def test_bytes_count_each_array_once(device):
 
 
 def test_times_of_a_gpu_are_booked_in_order():
-    recorder = Recorder("cpu")
+    recorder = LaunchRecorder("cpu")
     recorder.device = types.SimpleNamespace(is_cuda=True)
     kernel, flags = state_kernels().copy_rows, wp.zeros(2, dtype=wp.int32, device="cpu")
     made = []
@@ -212,7 +212,7 @@ def test_times_of_a_gpu_are_booked_in_order():
 
     for name in ("product", "loads", "product"):
         recorder(name, kernel, (1, 1), [flags], make)
-    recorder.collect([1.0, 5.0, 2.0])
+    recorder.book_times([1.0, 5.0, 2.0])
     assert len(made) == 2  # a command that comes again is kept
     rows = recorder.kernels(2, 0.5e-3)
     assert [(r.part, r.launches, r.bytes) for r in rows] == [("loads", 0.5, 4.0), ("product", 1.0, 8.0)]
@@ -220,7 +220,7 @@ def test_times_of_a_gpu_are_booked_in_order():
     assert rows[0].GBps == pytest.approx(4.0 / 2.25e-3 * 1e-9)
     recorder(name, kernel, (1, 1), [flags], make)
     with pytest.raises(wf.ModelError, match="2 kernels were timed and 1 launched"):
-        recorder.collect([1.0, 1.0])
+        recorder.book_times([1.0, 1.0])
 
 
 # the command

@@ -5,7 +5,7 @@ import pytest
 from result_files import RESULTS, content_of, rows_of
 from validation.cpu import CASES
 
-from warpfea.studies.bench.peer import LARGE, PEER, required
+from warpfea.studies.bench.peer import LARGE_CASE, PEER_CASES, required_speedup
 
 ALL = sorted(path.name for path in RESULTS.glob("*.json"))
 
@@ -119,10 +119,10 @@ def test_peer_table_is_whole_and_follows_the_protocol(peer):
     assert (settings["force_tol"], settings["tip_after_step"]) == (5e-4, 100)
     assert settings["reference_tolerance_factor"] == 0.1
     rows = [row for row in peer["rows"] if row["dtype"] == "float64"]
-    assert [row["label"] for row in rows] == [case.label for case in (*PEER, LARGE)]
+    assert [row["label"] for row in rows] == [case.label for case in (*PEER_CASES, LARGE_CASE)]
 
 
-@pytest.mark.parametrize("case", PEER, ids=[case.label for case in PEER])
+@pytest.mark.parametrize("case", PEER_CASES, ids=[case.label for case in PEER_CASES])
 def test_faster_than_the_peer_at_the_stated_residual(peer, case):
     (row,) = (r for r in peer["rows"] if r["label"] == case.label and r["dtype"] == "float64")
     assert row["peer_ms"] == case.peer_ms
@@ -130,12 +130,12 @@ def test_faster_than_the_peer_at_the_stated_residual(peer, case):
     assert row["residual_force"] <= 5e-4
     assert row["tip_difference"] <= 1e-6
     assert row["speedup"] == pytest.approx(case.peer_ms / row["ms_per_step"])
-    assert row["speedup"] >= required(case)
+    assert row["speedup"] >= required_speedup(case)
 
 
 def test_four_million_unknowns_tell_their_memory(peer):
-    (row,) = (r for r in peer["rows"] if r["label"] == LARGE.label and r["dtype"] == "float64")
-    assert row["unknowns"] == LARGE.unknowns
+    (row,) = (r for r in peer["rows"] if r["label"] == LARGE_CASE.label and r["dtype"] == "float64")
+    assert row["unknowns"] == LARGE_CASE.unknowns
     assert row["residual_force"] <= 5e-4
     assert row["ms_per_step"] > 0.0
     assert row["bytes_per_unknown"] > 0.0

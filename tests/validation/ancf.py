@@ -20,7 +20,7 @@ import warp as wp
 import warpfea as wf
 from warpfea.model.assembly import geometry
 from warpfea.simulation.statics import StaticResult
-from warpfea.studies.checkout import reference
+from warpfea.studies.checkout import reference_data
 
 from .table import Row, Run, Table
 
@@ -56,7 +56,7 @@ def static(b: wf.ModelBuilder, device: Any, **options: Any) -> tuple[StaticResul
 
 def static_beam(run: Run) -> Iterator[Row]:
     """Cantilever 1 x 0.1 x 0.1 m, F L^2 / E I = 1, all 12 slots of the root clamped, beside Project Chrono's rows."""
-    chrono = reference("chrono_3243_3443")["static_beam"]["results"]
+    chrono = reference_data("chrono_3243_3443")["static_beam"]["results"]
     names = {"split": "3243_enhanced_3x2x2(default)", "full": "3243_full_5x3x3"}
     for integration in ("tied", "split", "full"):
         for nu in (0.0, 0.3):
@@ -93,7 +93,7 @@ def static_shell(run: Run) -> Iterator[Row]:
 
 def rollup(run: Run) -> Iterator[Row]:
     """Beam rolled into a circle by an end moment 2 pi E I / L, in a plane, against the limit of its kinematics."""
-    table = reference("S4_analytic_beams_plates")["rollup"]["ancf3243_SVK_exact_uniform_bending"]["table"]
+    table = reference_data("S4_analytic_beams_plates")["rollup"]["ancf3243_SVK_exact_uniform_bending"]["table"]
     for h, counts in ((0.02, (16,) if run.quick else (8, 16, 32, 64, 96)), (0.005, () if run.quick else (16, 32))):
         limit = [r["tip_xy"] for r in table if (r["h_over_L"], r["nu"], r["M_fraction"]) == (h, 0.0, 1.0)]
         for integration in ("tied", "split"):
@@ -111,7 +111,7 @@ def rollup(run: Run) -> Iterator[Row]:
 
 def princeton(run: Run) -> Iterator[Row]:
     """The Princeton beam against the exact geometrically exact beam, shear factor 5/6."""
-    data = reference("S4_princeton_beam")
+    data = reference_data("S4_princeton_beam")
     L, h, t = data["L"], data["h"], data["t"]
     cases = [
         r for r in data["results"] if r["ks"] < 0.9 and (not run.quick or (r["P"] > 13.0 and r["theta_deg"] == 45))
@@ -132,7 +132,7 @@ def princeton(run: Run) -> Iterator[Row]:
 
 def slender(run: Run) -> Iterator[Row]:
     """L/H = 1000 beam (tip load, small and large) and L/t = 1000 plate (clamped, pressure): deflection over theory."""
-    elastica = {r["PL2_over_EI"]: r for r in reference("S4_analytic_beams_plates")["elastica_tip_load"]["table"]}
+    elastica = {r["PL2_over_EI"]: r for r in reference_data("S4_analytic_beams_plates")["elastica_tip_load"]["table"]}
     h, E = 1e-3, 1e9
     for integration in ("tied", "split"):
         for load_factor in (0.2, 1.0):
@@ -162,7 +162,7 @@ def slender(run: Run) -> Iterator[Row]:
 
 def frequencies(run: Run) -> Iterator[Row]:
     """Cantilever beam 1 x 0.05 x 0.05 m and plate 1 x 1 x 0.02 m clamped at one edge, 16 elements along a side."""
-    data = reference("S4_analytic_beams_plates")
+    data = reference_data("S4_analytic_beams_plates")
     for nu in (0.0, 0.3):
         for integration in ("tied", "split", "full"):
             law = wf.SVK(E=1e7, nu=nu, density=1000.0)
@@ -204,7 +204,7 @@ def _modes(element, integration, nu, got, limit, theory, count):
 
 def pendulum(run: Run) -> Iterator[Row]:
     """Flexible pendulum for 1 s with BDF2 against the spectral solution of 3243's kinematics (SVK)."""
-    cases = reference("S4_pendulum_spectral")["cases"]
+    cases = reference_data("S4_pendulum_spectral")["cases"]
     for name in ("stiff_E5e7_ANCF3243_SVK_nu0", "soft_E5e6_ANCF3243_SVK_nu0", "stiff_E5e7_ANCF3243_SVK_nu0.3"):
         case = cases[name]
         plain = case["nu"] == 0.0

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from warpfea.base.errors import UsageError
-from warpfea.studies.bench.measure import figures, run_once, solver
+from warpfea.studies.bench.measure import run_columns, run_once, solver
 from warpfea.studies.bench.peer import DT, FORCE_TOL
 from warpfea.studies.bench.problems import PROBLEMS
 
@@ -92,7 +92,7 @@ def rows(run: Run) -> Iterator[Row]:
                 how = solver(None, force_tol=FORCE_TOL, **options)
                 found = run_once(model, dt=DT, steps=steps, solver=how, limit=limit)
                 done, took = len(found.times), sum(found.times)
-                row |= {"steps": done, "residual_force": found.residual_force, **figures(found, took / done)}
+                row |= {"steps": done, "residual_force": found.residual_force, **run_columns(found, took / done)}
                 row["note"] = None if done == steps else f"{done} of {steps} steps took {took:.3g} s"
             if name == "direct":
                 before[case.problem] = row

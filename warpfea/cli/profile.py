@@ -12,7 +12,7 @@ from ..base.console import number, quiet_warp, table, to_json, write_json
 from ..base.provenance import machine, versions
 from ..base.writer import write_whole
 from ..simulation.simulation import Simulation
-from ..studies.profile.profiling import WARM_UP, KernelTime, Profile
+from ..studies.profile.profiling import WARM_UP_STEPS, KernelTime, Profile
 from ..studies.profile.profiling import profile as measure
 from . import DONE
 from .run import check_targets
@@ -65,7 +65,7 @@ def profile(options: argparse.Namespace) -> int:
     with quiet_warp():
         show = progress(options)
         sim = source.simulation(source.model(), show)
-        total, hide = WARM_UP + 1 + 2 * options.steps, None if show is None else not show
+        total, hide = WARM_UP_STEPS + 1 + 2 * options.steps, None if show is None else not show
         with tqdm(desc="profile", unit="step", total=total, leave=False, disable=hide, file=sys.stderr) as bar:
             found = measure(sim, steps=options.steps, on_step=bar.update)
         content = _content(source, sim, found)
@@ -95,7 +95,7 @@ def _content(source: Source, sim: Simulation, found: Profile) -> dict[str, Any]:
         "integrator": sim.integrator.label,
         "elements": info["elements"],
         "unknowns": info["unknowns"],
-        "warm_up": WARM_UP,
+        "warm_up": WARM_UP_STEPS,
         "steps": len(found.step_ms),
         "step_ms": {
             "median": statistics.median(found.step_ms),
@@ -156,7 +156,7 @@ def _human(c: dict[str, Any], found: Profile, wrote: list[str]) -> str:
     parts += [[name, *_cells(k, found), found.about.get(name, "")] for name, k in found.parts.items()]
     gap, share = found.between_ms, 100.0 * found.between_ms / found.total_ms
     cells = [number(gap, 3), f"{share:.1f} %"] if gap > 0.0 else ["-", "-"]
-    parts.append(["between", *cells, "", "", "", "", BETWEEN])
+    parts.append(["between", *cells, "", "", "", "", BETWEEN_NOTE])
     kernels = [[*HEADER, "part", "kernel"]]
     kernels += [[*_cells(k, found), k.part, k.kernel] for k in found.kernels[:SHOWN]]
     lines = [table(rows), "", table(parts, right=range(1, 7)), "", table(kernels, right=range(6))]
@@ -175,7 +175,7 @@ def _human(c: dict[str, Any], found: Profile, wrote: list[str]) -> str:
     return "\n".join(lines)
 
 
-BETWEEN = "starting of kernels, conditions of loops, reading of the report"
+BETWEEN_NOTE = "starting of kernels, conditions of loops, reading of the report"
 HEADER = ("ms/step", "share", "launches", "MB/step", "GB/s", "of copy")
 
 

@@ -10,10 +10,10 @@ from typing import Any
 from ..base.errors import OutputError
 from ..base.writer import check_folder, write_whole
 
-__all__ = ["prepare", "require_matplotlib", "write_csv"]
+__all__ = ["make_folder", "require_matplotlib", "write_csv"]
 
 
-def prepare(folder: str | pathlib.Path) -> pathlib.Path:
+def make_folder(folder: str | pathlib.Path) -> pathlib.Path:
     """Make the folder if it is not there. OutputError for one that can't be written."""
     path = pathlib.Path(folder)
     if not path.exists():

@@ -27,17 +27,17 @@ from ..base.devices import find_device
 from ..base.provenance import origin
 from ..base.writer import check_target
 
-__all__ = ["Found", "identify", "record", "run"]
+__all__ = ["Identification", "identify", "record_tip", "run"]
 
-TRUTH = {"E": 1.27e6, "eta": 4300.0}
-BOUNDS = {"E": (4e5, 4e6), "eta": (4e2, 4e4)}
-NOISE = 0.01
+TRUE_CONSTANTS = {"E": 1.27e6, "eta": 4300.0}
+SEARCH_BOUNDS = {"E": (4e5, 4e6), "eta": (4e2, 4e4)}
+NOISE_RATIO = 0.01
 DT, T_END = 2e-3, 0.24
-FINER = 4
+RECORD_REFINEMENT = 4
 GENERATIONS, WORLDS = 16, 64
 
 
-def finger(device: Any, worlds: int) -> Any:
+def finger_model(device: Any, worlds: int) -> Any:
     """The model; its constants are set for each world."""
     b = wf.ModelBuilder(gravity=(0, 0, -9.81))
     law = wf.NeoHookean.from_E_nu(E=1e6, nu=0.45, density=1100.0, damping=wf.KelvinVoigt(eta=1e3))
@@ -47,25 +47,25 @@ def finger(device: Any, worlds: int) -> Any:
     return b.finalize(device=device, worlds=worlds)
 
 
-def motion(model: Any, dt: float, **how: Any) -> wf.Simulation:
+def make_simulation(model: Any, dt: float, **how: Any) -> wf.Simulation:
     """A simulation of the model; the constants of all worlds have been set."""
     return wf.Simulation(model, dt=dt, integrator="bdf2", solver=wf.NewtonPCG(tol=1e-6), ledger=False, **how)
 
 
-def record(device: Any, t_end: float = T_END, seed: int = 7) -> np.ndarray:
+def record_tip(device: Any, t_end: float = T_END, seed: int = 7) -> np.ndarray:
     """The tip's deflection (steps, 3), m, every `DT`, of the true constants, with noise."""
-    model = finger(device, 1)
-    for name, value in TRUTH.items():
+    model = finger_model(device, 1)
+    for name, value in TRUE_CONSTANTS.items():
         model.set_parameter(f"finger.{name}", value)
-    sim = motion(model, DT / FINER)
-    sim.step(FINER * round(t_end / DT))
-    samples = sim.probe("tip").displacement[0, FINER - 1 :: FINER]
+    sim = make_simulation(model, DT / RECORD_REFINEMENT)
+    sim.step(RECORD_REFINEMENT * round(t_end / DT))
+    samples = sim.probe("tip").displacement[0, RECORD_REFINEMENT - 1 :: RECORD_REFINEMENT]
     noise = np.random.default_rng(seed).normal(size=samples.shape)
-    return samples + NOISE * np.abs(samples).max() * noise
+    return samples + NOISE_RATIO * np.abs(samples).max() * noise
 
 
 @dataclass(frozen=True)
-class Found:
+class Identification:
     """Result of a search.
 
     Attributes:
@@ -92,14 +92,14 @@ class Found:
 
 def identify(
     samples: np.ndarray, *, device: Any, worlds: int = WORLDS, generations: int = GENERATIONS, seed: int = 1
-) -> Found:
+) -> Identification:
     """Look for E and eta that give the recorded deflections (steps, 3), m; the worlds are the candidates."""
     began = clock.perf_counter()
-    model = finger(device, worlds)
-    names = list(BOUNDS)
+    model = finger_model(device, worlds)
+    names = list(SEARCH_BOUNDS)
     for name in names:  # the first values precede the simulation
-        model.set_parameter(f"finger.{name}", np.full(worlds, BOUNDS[name][0]))
-    sim = motion(model, DT, record=False, on_failure="freeze")
+        model.set_parameter(f"finger.{name}", np.full(worlds, SEARCH_BOUNDS[name][0]))
+    sim = make_simulation(model, DT, record=False, on_failure="freeze")
     tip = sim.observe("probe.tip.displacement")
     everyone = wp.ones(worlds, dtype=wp.int32, device=model.device)
     sim.step()
@@ -122,13 +122,14 @@ def identify(
         return np.where(sim.status == 0, sums / len(samples), 1e30)[:count]
 
     found = differential_evolution(
-        misfits, [tuple(np.log(BOUNDS[name])) for name in names], vectorized=True, updating="deferred", polish=False,
-        popsize=worlds // len(names), maxiter=generations - 1, tol=0.0, init="sobol", rng=np.random.default_rng(seed),
+        misfits, [tuple(np.log(SEARCH_BOUNDS[name])) for name in names], vectorized=True, updating="deferred",
+        polish=False, popsize=worlds // len(names), maxiter=generations - 1, tol=0.0, init="sobol",
+        rng=np.random.default_rng(seed),
     )  # fmt: skip
     E, eta = (float(x) for x in np.exp(found.x))
-    return Found(
-        str(model.device), worlds, generations, len(samples), model.info()["unknowns"], NOISE, E, eta,
-        abs(E / TRUTH["E"] - 1.0), abs(eta / TRUTH["eta"] - 1.0),
+    return Identification(
+        str(model.device), worlds, generations, len(samples), model.info()["unknowns"], NOISE_RATIO, E, eta,
+        abs(E / TRUE_CONSTANTS["E"] - 1.0), abs(eta / TRUE_CONSTANTS["eta"] - 1.0),
         float(np.sqrt(found.fun) / np.abs(samples).max()), runs, ready - began, clock.perf_counter() - ready,
     )  # fmt: skip
 
@@ -139,10 +140,11 @@ def run(options: argparse.Namespace) -> None:
         check_target(options.out, (".json",))
     device = find_device(options.device)
     given = {"worlds": options.worlds or WORLDS, "generations": 3 if options.quick else GENERATIONS}
-    settings = {**given, "truth": TRUTH, "bounds": BOUNDS, "noise": NOISE, "dt": DT, "t_end": T_END}
+    settings = {**given, "truth": TRUE_CONSTANTS, "bounds": SEARCH_BOUNDS, "noise": NOISE_RATIO}
+    settings |= {"dt": DT, "t_end": T_END}
     with quiet_warp():
         content = {"schema": 1, **origin(options.words, device), "settings": settings}
-        found = asdict(identify(record(device), device=device, **given))
+        found = asdict(identify(record_tip(device), device=device, **given))
     print("  ".join(f"{name} {number(v) if isinstance(v, float) else v}" for name, v in found.items()), flush=True)
     if options.out is not None:
         write_json(options.out, to_json(content | {"rows": [found]}))

@@ -17,7 +17,7 @@ from ...base.errors import OutputError
 from ...base.provenance import machine, origin, versions
 from ...base.short_repr import use_short_repr
 from ...base.writer import write_whole
-from ..files import prepare, require_matplotlib, write_csv
+from ..files import make_folder, require_matplotlib, write_csv
 from .measure import DONE
 from .motion import RESOLVED_RATIO
 from .settings import Setting, SweepAxes, cli_text
@@ -336,7 +336,7 @@ class Study(Sequence[Row]):
         """
         from .plot import draw
 
-        out = prepare(folder)
+        out = make_folder(folder)
         paths = [out / f"{self.name}.{suffix}" for suffix in ("json", "csv", "png")]
         write_json(str(paths[0]), self.content(words))
         rows = [self._flat_row(row) for row in self.rows]

@@ -18,7 +18,7 @@ from ...builder.builder import ModelBuilder
 from ...builder.reference import Reference, read_reference, reference_of
 from ...builder.scene import Scene, locate
 from ...builder.scene import scene as as_scene
-from ..files import prepare
+from ..files import make_folder
 from .finer import finer_motion, finer_setting
 from .measure import DONE, REFUSED, Outcome
 from .measure import measure as run_once
@@ -110,7 +110,7 @@ def study(
     known = _reference_function(options.reference, found, base, probes)
     with quiet_warp():
         _check_probes(found, settings[0], probes)
-        folder = None if options.out is None else prepare(options.out)
+        folder = None if options.out is None else make_folder(options.out)
         store = OutcomeStore(folder and folder / f"{options.name}.points.jsonl", lambda dev: code_version(found, dev))
         return _StudyRunner(found, axes, store, options, known, probes, base).result(settings, folder)
 

@@ -1,4 +1,4 @@
-"""The loop of all kinds of `warpfea bench`: cases that are declared, a row after another, printed and written."""
+"""Loop of all kinds of `warpfea bench`: measures their declared cases, prints and writes a row of each."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ...model.model import Model
 from ...simulation.simulation import Simulation
 from ...solvers import NewtonPCG
 
-__all__ = ["Kind", "Row", "Run", "by_label", "figures", "run_kind", "run_once", "solver"]
+__all__ = ["Kind", "Row", "Run", "run_columns", "run_kind", "run_once", "select_by_label", "solver"]
 
 SCHEMA = 1
 Row = dict[str, Any]
@@ -52,14 +52,14 @@ class Run:
 
     Attributes:
         sim: the simulation.
-        times: s of each step.
-        ready_s: s until it could step.
+        times: of each step, s.
+        startup_s: s until it could step: construction and compilation.
         residual_force: largest |g|_2 over the free components of a step, N.
     """
 
     sim: Simulation
     times: list[float]
-    ready_s: float
+    startup_s: float
     residual_force: float
 
     def tip(self, axis: int) -> np.ndarray:
@@ -81,18 +81,18 @@ def run_kind(kind: Kind, options: argparse.Namespace) -> None:
         if options.out is not None:
             write_json(options.out, about | {"rows": rows})
 
-    print(_line(kind.columns), flush=True)
+    print(_format_row(kind.columns), flush=True)
     for case in cases:
         for dtype in options.dtype:
             found = kind.measure(case, dtype, options)
             if not isinstance(found, str):
                 rows.append(dict.fromkeys(kind.columns) | found)
-            print(found if isinstance(found, str) else _line(kind.columns, rows[-1]), flush=True)
+            print(found if isinstance(found, str) else _format_row(kind.columns, rows[-1]), flush=True)
             write()
     write()
 
 
-def _line(columns: Mapping[str, str], row: Row | None = None) -> str:
+def _format_row(columns: Mapping[str, str], row: Row | None = None) -> str:
     """The row as text, or the headings; texts end with their column's left side, the note stands last."""
     cells = []
     for name, shown in columns.items():
@@ -131,8 +131,8 @@ def run_once(model: Model, *, dt: float, steps: int, solver: NewtonPCG, limit: f
     return Run(sim, times, ready, largest)
 
 
-def figures(run: Run, seconds: float) -> Row:
-    """The columns of every run from rest; `seconds` is the time of a step. Bytes are per free unknown."""
+def run_columns(run: Run, seconds: float) -> Row:
+    """Columns common to runs from rest; `seconds`: time of a step. Bytes are per free unknown."""
     sim, steps = run.sim, len(run.times)
     info = sim.model.info()
     return {
@@ -143,11 +143,11 @@ def figures(run: Run, seconds: float) -> Row:
         "pcg_per_step": float(sim.totals["pcg"][0]) / steps,
         "bytes_per_unknown": sum(sim.bytes().values()) / info["unknowns"],
         "residual": float(sim.max_residual),
-        "compile_s": run.ready_s,
+        "compile_s": run.startup_s,
     }
 
 
-def by_label(rows: str | None, every: Sequence[Any]) -> list[Any]:
+def select_by_label(rows: str | None, every: Sequence[Any]) -> list[Any]:
     """Cases whose labels fit one of the words with commas, in their order; all without words. UsageError."""
     words = [word.strip() for word in (rows or "*").split(",")]
     for word in words:

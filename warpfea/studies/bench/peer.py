@@ -1,7 +1,7 @@
 """`warpfea bench --peer`: warpfea beside a peer, the CUDA code of the authors of the papers (Newton + cuDSS, H200).
 
 Each row steps a problem of problems.py from rest with h = 1 ms. ms per step is the median over steps 20 to 120,
-with the Newton iterations that |g|_2 < 5e-4 N takes; set-up and compilation are told apart. The tip after 0.1 s is
+with the Newton iterations that |g|_2 < 5e-4 N takes; set-up and compilation are separate. The tip after 0.1 s is
 compared with a solve ten times tighter in float64. The peer spreads the bar's 5000 N evenly over the nodes of x = 3,
 here it is a uniform traction of the same total. Its unstructured meshes are not published: those here have nearly as
 many elements and nodes (Gmsh 4.15.2: surface triangles of one size, and a coarser inside).
@@ -31,19 +31,19 @@ import numpy as np
 from ...base.errors import UsageError
 from ...mesh import Mesh, check
 from ...solvers import NewtonPCG
-from ..checkout import DATA
-from .measure import Kind, Row, by_label, figures, run_once, solver
+from ..checkout import DATA_FOLDER
+from .measure import Kind, Row, run_columns, run_once, select_by_label, solver
 from .problems import PROBLEMS
 
-__all__ = ["DT", "FORCE_TOL", "LARGE", "PEER", "PEER_KIND", "Case", "required"]
+__all__ = ["DT", "FORCE_TOL", "LARGE_CASE", "PEER_CASES", "PEER_KIND", "Case", "required_speedup"]
 
-SOURCE = "the authors' own CUDA code (Newton + cuDSS, fixed sparsity), H200, two Newton iterations per step"
+PEER_SOURCE = "the authors' own CUDA code (Newton + cuDSS, fixed sparsity), H200, two Newton iterations per step"
 DT = 1e-3
 STEPS = 120
-FIRST = 20
+FIRST_TIMED_STEP = 20
 """First step whose time counts."""
 TIP_STEP = 100
-OPTIONS = {"preconditioner_dtype": "float32"}
+SOLVER_OPTIONS = {"preconditioner_dtype": "float32"}
 FORCE_TOL = 5e-4
 TIGHTENING = 10.0
 
@@ -59,7 +59,7 @@ class Case:
     peer_ms: float | None
 
 
-PEER = (
+PEER_CASES = (
     Case("bar-3x2x1", "bar", (3, 2, 1), 315, 2.46),
     Case("bar-12x8x4", "bar", (12, 8, 4), 11475, 13.4),
     Case("bar-unstructured-4567", "bar", "bar_4752.npz", 27150, 22.5),
@@ -76,7 +76,7 @@ PEER = (
     Case("plate-64x32", "plate", 32, 25740, 42.4),
     Case("plate-128x64", "plate", 64, 100620, 192.0),
 )
-LARGE = Case("bar-90x60x30", "bar", (90, 60, 30), 4007883, None)
+LARGE_CASE = Case("bar-90x60x30", "bar", (90, 60, 30), 4007883, None)
 LARGE_STEPS = 10
 COLUMNS = {
     "problem": "", "label": "row 22", "dtype": "dtype 8", "unknowns": "unknowns 8d", "free_unknowns": "",
@@ -87,19 +87,19 @@ COLUMNS = {
 }  # fmt: skip
 
 
-def required(case: Case) -> float | None:
+def required_speedup(case: Case) -> float | None:
     """The smallest speedup that will do."""
     if case.peer_ms is None:
         return None
     return 40.0 if case.unknowns >= 800_000 else 10.0 if case.unknowns >= 100_000 else 3.0
 
 
-def first_counted(steps: int) -> int:
+def first_timed_step(steps: int) -> int:
     """The first step, from 1, whose time counts; of short runs those of the second half do."""
-    return min(FIRST, steps // 2 + 1)
+    return min(FIRST_TIMED_STEP, steps // 2 + 1)
 
 
-def load(path: pathlib.Path) -> Mesh:
+def load_mesh(path: pathlib.Path) -> Mesh:
     """A mesh of T10 stored as points and cells. MeshError."""
     with np.load(path) as data:
         return check(Mesh(data["points"], data["cells"], "tetra10", name=path.stem))
@@ -110,17 +110,17 @@ def _cases(options: argparse.Namespace) -> list[Case]:
     if options.meshes and not pathlib.Path(options.meshes).is_dir():
         raise UsageError(f"--meshes {options.meshes}: no such folder")
     options.steps, options.dtype = options.steps or STEPS, options.dtype or ["float64"]
-    every = [*PEER, LARGE]
-    named = by_label(options.rows, every) if options.rows else PEER
-    return [case for case in every if case in named or (options.large and case is LARGE)]
+    every = [*PEER_CASES, LARGE_CASE]
+    named = select_by_label(options.rows, every) if options.rows else PEER_CASES
+    return [case for case in every if case in named or (options.large and case is LARGE_CASE)]
 
 
 def _settings(options: argparse.Namespace, cases: Sequence[Case]) -> dict[str, Any]:
     return {
-        "peer": SOURCE, "rows": [case.label for case in cases], "dtypes": options.dtype, "dt": DT,
-        "steps": options.steps, "first_step_timed": first_counted(options.steps), "force_tol": FORCE_TOL, **OPTIONS,
-        "tip_after_step": min(options.steps, TIP_STEP), "reference_tolerance_factor": 1.0 / TIGHTENING,
-        "steps_without_peer": min(options.steps, LARGE_STEPS),
+        "peer": PEER_SOURCE, "rows": [case.label for case in cases], "dtypes": options.dtype, "dt": DT,
+        "steps": options.steps, "first_step_timed": first_timed_step(options.steps), "force_tol": FORCE_TOL,
+        **SOLVER_OPTIONS, "tip_after_step": min(options.steps, TIP_STEP),
+        "reference_tolerance_factor": 1.0 / TIGHTENING, "steps_without_peer": min(options.steps, LARGE_STEPS),
     }  # fmt: skip
 
 
@@ -128,28 +128,28 @@ def _measure(case: Case, dtype: str, options: argparse.Namespace) -> Row | str:
     """The row of a case; what has no peer is timed only."""
     problem, size = PROBLEMS[case.problem], case.size
     if isinstance(size, str):
-        path = pathlib.Path(options.meshes or DATA) / size
+        path = pathlib.Path(options.meshes or DATA_FOLDER) / size
         if not path.is_file():
             return f"{case.label}: left out, there is no {size} in {path.parent} (--meshes)"
-        size = load(path)
+        size = load_mesh(path)
     steps = options.steps if case.peer_ms else min(options.steps, LARGE_STEPS)
     at = min(steps, TIP_STEP)
     began = clock.perf_counter()
     builder = problem.build(size)
     model = builder.finalize(device=options.device, dtype=dtype)
     setup = clock.perf_counter() - began
-    run = run_once(model, dt=DT, steps=steps, solver=solver(None, force_tol=FORCE_TOL, **OPTIONS))
+    run = run_once(model, dt=DT, steps=steps, solver=solver(None, force_tol=FORCE_TOL, **SOLVER_OPTIONS))
     row = {
         "problem": case.problem, "label": case.label, "unknowns": 3 * model.slots, "peer_ms": case.peer_ms,
-        "free_unknowns": model.info()["unknowns"], "required": required(case), "residual_force": run.residual_force,
-        "tip": float(run.tip(problem.axis)[at - 1]), "setup_s": setup,
-        **figures(run, statistics.median(run.times[first_counted(steps) - 1 :])),
+        "free_unknowns": model.info()["unknowns"], "required": required_speedup(case),
+        "residual_force": run.residual_force, "tip": float(run.tip(problem.tip_axis)[at - 1]), "setup_s": setup,
+        **run_columns(run, statistics.median(run.times[first_timed_step(steps) - 1 :])),
     }  # fmt: skip
     if case.peer_ms:
         if dtype != "float64":
             model = builder.finalize(device=options.device)
         how = solver(NewtonPCG().tolerance("float64") / TIGHTENING, force_tol=FORCE_TOL / TIGHTENING)
-        exact = float(run_once(model, dt=DT, steps=at, solver=how).tip(problem.axis)[-1])
+        exact = float(run_once(model, dt=DT, steps=at, solver=how).tip(problem.tip_axis)[-1])
         row["speedup"] = case.peer_ms / row["ms_per_step"] if run.residual_force <= FORCE_TOL else None
         row["tip_difference"] = abs(row["tip"] - exact) / abs(exact)
     return row

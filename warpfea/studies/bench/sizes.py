@@ -18,17 +18,17 @@ import numpy as np
 
 from ...base.errors import UsageError
 from ...solvers import NewtonPCG
-from .measure import Kind, Row, figures, run_once, solver
+from .measure import Kind, Row, run_columns, run_once, solver
 from .problems import PROBLEMS, Problem
 
 __all__ = ["SIZES_KIND", "check_sizes"]
 
-WARM_UP = 2
+WARM_UP_STEPS = 2
 """First steps whose time does not count."""
 TIGHTENING = 100.0
 """Factor by which the tolerance of a reference is smaller."""
-DEFAULTS: dict[str, Any] = {"steps": 10, "repeat": 3, "dt": 1e-3, "dtype": ["float64", "float32"], "linear": ["pcg"],
-            "reference_up_to": [100000]}  # fmt: skip
+DEFAULT_OPTIONS: dict[str, Any] = {"steps": 10, "repeat": 3, "dt": 1e-3, "dtype": ["float64", "float32"],
+            "linear": ["pcg"], "reference_up_to": [100000]}  # fmt: skip
 COLUMNS = {
     "problem": "problem 8", "dtype": "dtype 8", "linear": "linear 6", "unknowns": "unknowns 9d",
     "elements": "elements 9d", "ms_per_step": "ms/step 10.2f", "newton_per_step": "Newton 7.1f",
@@ -40,55 +40,55 @@ COLUMNS = {
 def check_sizes(problems: Sequence[Problem], sizes: Sequence[int]) -> None:
     """Refuse sizes that a problem does not have. UsageError."""
     for problem in problems:
-        if sizes and min(sizes) < problem.smallest:
-            raise UsageError(f"--unknowns {min(sizes)}: the smallest {problem.name} has {problem.smallest}")
+        if sizes and min(sizes) < problem.min_unknowns:
+            raise UsageError(f"--unknowns {min(sizes)}: the smallest {problem.name} has {problem.min_unknowns}")
 
 
 @dataclass(frozen=True)
 class Case:
-    """A mesh, by its wanted number of unknowns, and a linear solver."""
+    """A mesh, by its approximate number of unknowns, and a linear solver."""
 
     problem: Problem
-    wanted: int
+    target_unknowns: int
     linear: str
 
 
 def _cases(options: argparse.Namespace) -> list[Case]:
     problems = [PROBLEMS[name] for name in options.problem or ["bar"]]
     check_sizes(problems, options.unknowns)
-    for name, value in DEFAULTS.items():
+    for name, value in DEFAULT_OPTIONS.items():
         setattr(options, name, getattr(options, name) or value)
     options.references = {}
-    return [Case(p, n, how) for p in problems for n in options.unknowns or p.defaults for how in options.linear]
+    return [Case(p, n, how) for p in problems for n in options.unknowns or p.default_unknowns for how in options.linear]
 
 
 def _settings(options: argparse.Namespace, cases: Sequence[Case]) -> dict[str, Any]:
     return {
-        "problems": {case.problem.name: list(options.unknowns or case.problem.defaults) for case in cases},
+        "problems": {case.problem.name: list(options.unknowns or case.problem.default_unknowns) for case in cases},
         "dtypes": options.dtype,
         **{name: getattr(options, name) for name in ("linear", "steps", "repeat", "dt", "tol")},
         "reference_tolerance_factor": 1.0 / TIGHTENING,
         "reference_up_to": max(options.reference_up_to),
-        "warm_up_steps": min(WARM_UP, options.steps - 1),
+        "warm_up_steps": min(WARM_UP_STEPS, options.steps - 1),
     }
 
 
 def _measure(case: Case, dtype: str, options: argparse.Namespace) -> Row:
     """The row of a mesh; its reference is made with its first."""
-    problem, mesh, known = case.problem, (case.problem.name, case.wanted), options.references
-    builder, how = problem.build(problem.size_for(case.wanted)), {"dt": options.dt, "steps": options.steps}
-    if mesh not in known and case.wanted <= max(options.reference_up_to):
+    problem, mesh, known = case.problem, (case.problem.name, case.target_unknowns), options.references
+    builder, how = problem.build(problem.size_for(case.target_unknowns)), {"dt": options.dt, "steps": options.steps}
+    if mesh not in known and case.target_unknowns <= max(options.reference_up_to):
         tight = solver(NewtonPCG(tol=options.tol).tolerance("float64") / TIGHTENING)
-        known[mesh] = run_once(builder.finalize(device=options.device), solver=tight, **how).tip(problem.axis)
+        known[mesh] = run_once(builder.finalize(device=options.device), solver=tight, **how).tip(problem.tip_axis)
     began = clock.perf_counter()
     model = builder.finalize(device=options.device, dtype=dtype)
     setup = clock.perf_counter() - began
-    method, first = solver(options.tol, linear=case.linear), min(WARM_UP, options.steps - 1)
+    method, first = solver(options.tol, linear=case.linear), min(WARM_UP_STEPS, options.steps - 1)
     run = run_once(model, solver=method, **how)
     times = run.times[first:]
     for _ in range(options.repeat - 1):
         times += run_once(model, solver=method, **how).times[first:]
-    tip, reference = run.tip(problem.axis), known.get(mesh)
+    tip, reference = run.tip(problem.tip_axis), known.get(mesh)
     return {
         "problem": problem.name,
         "linear": case.linear,
@@ -96,9 +96,9 @@ def _measure(case: Case, dtype: str, options: argparse.Namespace) -> Row:
         "tip": float(tip[-1]),
         "tip_error": None if reference is None else float(np.abs(tip - reference).max() / np.abs(reference).max()),
         "setup_s": setup,
-        **figures(run, statistics.median(times)),
+        **run_columns(run, statistics.median(times)),
     }
 
 
-TAKEN = frozenset({"problem", "unknowns", "dtype", "linear", "steps", "repeat", "dt", "tol", "reference_up_to"})
-SIZES_KIND = Kind(TAKEN, COLUMNS, _cases, _settings, _measure)
+SIZES_OPTIONS = frozenset({"problem", "unknowns", "dtype", "linear", "steps", "repeat", "dt", "tol", "reference_up_to"})
+SIZES_KIND = Kind(SIZES_OPTIONS, COLUMNS, _cases, _settings, _measure)

@@ -17,7 +17,7 @@ Columns, with times in ms and errors over the tip's travel:
 
 later_ms, later_error   after `LATER` steps
 equal                   every world has the bits of the first
-whole_ms                of all steps of a scene in `WHOLE`, from the start; there `goal` and `reached` are about it
+whole_ms                of all steps of a scene in `WHOLE_MOTION_STEPS`; its `goal` and `reached` are about them
 goal, reached           world-steps per second asked for, and whether they are
 note                    why there are no numbers, such as too little memory
 """
@@ -41,38 +41,38 @@ from ...builder.scene import find
 from ...materials import KelvinVoigt, NeoHookean
 from ...simulation.simulation import Simulation
 from ...solvers import NewtonPCG
-from .measure import Kind, Row, by_label
+from .measure import Kind, Row, select_by_label
 
-__all__ = ["CASES", "GOALS", "WORLDS_KIND", "five_tets"]
+__all__ = ["CASES", "RATE_GOALS", "WORLDS_KIND", "five_tet_box"]
 
-WORLDS = (1, 64, 1024, 4096, 16384)
+WORLD_COUNTS = (1, 64, 1024, 4096, 16384)
 WARM, TIMED, LATER = 3, 10, 100
-GOALS = {
+RATE_GOALS = {
     "pendulum": 850_000, "slider": 200_000, "double": 100_000, "finger": 25_000, "tets": 1_638_400, "gripper": 74_400,
 }  # fmt: skip
 """World-steps/s at 4096 worlds; of `tets` 2.5 ms per step, of `gripper` 18 600 steps of environments per second."""
-WHOLE = {"gripper": 240}
+WHOLE_MOTION_STEPS = {"gripper": 240}
 """Steps of scenes whose beginning stands for little: the block falls, is gripped and lifted in 1 s."""
-TOLERANCES = {"auto": None, "banded": None, "loose": 1e-4, "rough": 1e-2}
+METHOD_TOLS = {"auto": None, "banded": None, "loose": 1e-4, "rough": 1e-2}
 """Methods, and their tolerances; None: the default of the precision."""
-NARROW = ("pendulum", "slider", "tets")
+NARROW_BAND_SCENES = ("pendulum", "slider", "tets")
 """Scenes with a narrow band, which all methods but "auto" factor."""
-TIGHT = (1e-11, 1e-10, 1e-9)
+REFERENCE_TOLS = (1e-11, 1e-10, 1e-9)
 """Tolerances of references; the first that no step is halved for, which would make it another motion."""
 
 
-def five_tets(size: tuple[float, float, float], cells: tuple[int, int, int]) -> Any:
+def five_tet_box(size: tuple[float, float, float], cells: tuple[int, int, int]) -> Any:
     """A box of T4, five per cell, mirrored from cell to cell so that faces match."""
     n = np.array(cells) + 1
     grid = np.stack(np.meshgrid(*(np.linspace(0.0, s, k) for s, k in zip(size, n)), indexing="ij"), axis=-1)
 
-    def number(i: int, j: int, k: int) -> int:
+    def node_number(i: int, j: int, k: int) -> int:
         return int((i * n[1] + j) * n[2] + k)
 
     out = []
     for i, j, k in np.ndindex(*cells):
         odd = (i + j + k) % 2
-        c = [number(i + (a ^ odd), j + b, k + d) for a in (0, 1) for b in (0, 1) for d in (0, 1)]
+        c = [node_number(i + (a ^ odd), j + b, k + d) for a in (0, 1) for b in (0, 1) for d in (0, 1)]
         out += [[c[p] for p in tet] for tet in ((0, 1, 2, 4), (3, 2, 1, 7), (5, 4, 7, 1), (6, 7, 4, 2), (1, 2, 4, 7))]
     points, tets = grid.reshape(-1, 3), np.array(out)
     edges = points[tets[:, 1:]] - points[tets[:, :1]]
@@ -82,7 +82,7 @@ def five_tets(size: tuple[float, float, float], cells: tuple[int, int, int]) -> 
     return mesh.Mesh(points, tets, "tetra", node_sets=ends)
 
 
-def _finger(points: Any, traction: bool) -> ModelBuilder:
+def _finger_model(points: Any, traction: bool) -> ModelBuilder:
     b = ModelBuilder(gravity=(0, 0, -9.81))
     law = NeoHookean.from_E_nu(E=1e6, nu=0.45, density=1100.0, damping=KelvinVoigt(eta=300.0) if traction else None)
     body = b.add_solid(points, material=law, name="finger")
@@ -93,17 +93,17 @@ def _finger(points: Any, traction: bool) -> ModelBuilder:
     return b
 
 
-def _scene(name: str, **given: Any) -> ModelBuilder:
+def _named_scene(name: str, **given: Any) -> ModelBuilder:
     return find(name)(**given)
 
 
 SCENES: dict[str, tuple[Callable[[], ModelBuilder], float]] = {
-    "pendulum": (partial(_scene, "pendulum", elements=16), 2e-3),
-    "slider": (partial(_scene, "slider_crank"), 1e-3),
-    "double": (partial(_scene, "double_pendulum"), 4e-3),
-    "finger": (lambda: _finger(mesh.box((0.12, 0.02, 0.02), cells=(20, 2, 2)), True), 2e-3),
-    "gripper": (partial(_scene, "gripper", element="T4"), 1.0 / 240.0),
-    "tets": (lambda: _finger(five_tets((0.12, 0.02, 0.02), (12, 2, 2)), False), 2e-3),
+    "pendulum": (partial(_named_scene, "pendulum", elements=16), 2e-3),
+    "slider": (partial(_named_scene, "slider_crank"), 1e-3),
+    "double": (partial(_named_scene, "double_pendulum"), 4e-3),
+    "finger": (lambda: _finger_model(mesh.box((0.12, 0.02, 0.02), cells=(20, 2, 2)), True), 2e-3),
+    "gripper": (partial(_named_scene, "gripper", element="T4"), 1.0 / 240.0),
+    "tets": (lambda: _finger_model(five_tet_box((0.12, 0.02, 0.02), (12, 2, 2)), False), 2e-3),
 }
 
 
@@ -118,12 +118,12 @@ class Case:
 
 
 def _methods(scene: str) -> list[str]:
-    if scene not in NARROW:
+    if scene not in NARROW_BAND_SCENES:
         return ["auto", "loose"]
-    return list(TOLERANCES) if scene == "tets" else ["auto", "banded", "loose"]
+    return list(METHOD_TOLS) if scene == "tets" else ["auto", "banded", "loose"]
 
 
-CASES = [Case(f"{s}-{m}-{B}", s, m, B) for s in SCENES for m in _methods(s) for B in WORLDS]
+CASES = [Case(f"{s}-{m}-{B}", s, m, B) for s in SCENES for m in _methods(s) for B in WORLD_COUNTS]
 
 
 COLUMNS = {
@@ -135,7 +135,7 @@ COLUMNS = {
 }  # fmt: skip
 
 
-class References(dict[str, list[Any]]):
+class ReferenceTips(dict[str, list[Any]]):
     """Tips of one world with a tight tolerance, by scene: after the timed steps, and after the later ones."""
 
     def __init__(self, device: Any) -> None:
@@ -147,7 +147,7 @@ class References(dict[str, list[Any]]):
         model = build().finalize(device=self.device)
         steps = WARM + TIMED, LATER + TIMED
         found: list[Any] = [None, None]
-        for tol in TIGHT:
+        for tol in REFERENCE_TOLS:
             sim = Simulation(model, dt=dt, solver=NewtonPCG(tol=tol), ledger=False)
             whole = 0
             while whole < max(steps) and not sim.step().halvings.any():
@@ -165,7 +165,7 @@ class References(dict[str, list[Any]]):
         return None if wanted is None else float(np.linalg.norm(tip - wanted) / np.linalg.norm(wanted))
 
 
-def _timed(sim: Simulation, steps: int = TIMED) -> float:
+def _ms_per_step(sim: Simulation, steps: int = TIMED) -> float:
     """ms per step of the next ones."""
     wp.synchronize_device(sim.model.device)
     began = clock.perf_counter()
@@ -176,14 +176,14 @@ def _timed(sim: Simulation, steps: int = TIMED) -> float:
 
 def _cases(options: argparse.Namespace) -> list[Case]:
     options.dtype = options.dtype or ["float64", "float32"]
-    options.references = References(options.device)
-    return by_label(options.rows, CASES)
+    options.references = ReferenceTips(options.device)
+    return select_by_label(options.rows, CASES)
 
 
 def _settings(options: argparse.Namespace, cases: Sequence[Case]) -> dict[str, Any]:
     return {
         "rows": [case.label for case in cases], "dtypes": options.dtype, "warm_up": WARM, "timed": TIMED,
-        "later": LATER, "reference_tol": TIGHT,
+        "later": LATER, "reference_tol": REFERENCE_TOLS,
     }  # fmt: skip
 
 
@@ -191,30 +191,30 @@ def _measure(case: Case, dtype: str, options: argparse.Namespace) -> Row:
     """A row; where memory does not suffice, or a method does not serve, it says so."""
     (build, dt), references = SCENES[case.scene], options.references
     began = clock.perf_counter()
-    goal = GOALS[case.scene] if case.worlds == 4096 and dtype == "float64" else None
+    goal = RATE_GOALS[case.scene] if case.worlds == 4096 and dtype == "float64" else None
     row: Row = {"label": case.label, "dtype": dtype, "worlds": case.worlds, "unknowns": 0, "goal": goal}
     try:
         model = build().finalize(device=options.device, dtype=dtype, worlds=case.worlds)
         row["unknowns"] = model.info()["unknowns"]
-        banded = case.method != "auto" and case.scene in NARROW
-        method = NewtonPCG(tol=TOLERANCES[case.method], preconditioner="banded" if banded else "auto")
+        banded = case.method != "auto" and case.scene in NARROW_BAND_SCENES
+        method = NewtonPCG(tol=METHOD_TOLS[case.method], preconditioner="banded" if banded else "auto")
         sim = Simulation(model, dt=dt, solver=method, ledger=False, record=False, on_failure="freeze")
         sim.step(WARM)
     except (CapacityError, ModelError) as refused:
         return row | {"note": str(refused)}
     row |= {"setup_s": clock.perf_counter() - began, "methods": sim.methods}
     before = {name: int(sim.totals[name][0]) for name in ("newton", "pcg")}
-    ms = row["ms_per_step"] = _timed(sim)
+    ms = row["ms_per_step"] = _ms_per_step(sim)
     row |= {f"{name}_per_step": (int(sim.totals[name][0]) - count) / TIMED for name, count in before.items()}
     name = model.probes[0].name
     row["tip_error"] = references.error(case.scene, 0, sim.probe(name).displacement[0, -1])
     sim.step(LATER - WARM - TIMED)
-    row["later_ms"] = _timed(sim)
+    row["later_ms"] = _ms_per_step(sim)
     u = sim.state.displacement.numpy()
     row["later_error"] = references.error(case.scene, 1, sim.probe(name).displacement[0, -1])
-    if case.scene in WHOLE:
+    if case.scene in WHOLE_MOTION_STEPS:
         sim.reset()
-        ms = row["whole_ms"] = _timed(sim, WHOLE[case.scene])
+        ms = row["whole_ms"] = _ms_per_step(sim, WHOLE_MOTION_STEPS[case.scene])
     rate = row["world_steps_per_s"] = 1e3 * case.worlds / ms
     return row | {
         "bytes_per_world": sum(sim.bytes().values()) / case.worlds,

@@ -7,9 +7,9 @@ import pathlib
 from ..files import require_matplotlib
 from .profiling import Profile
 
-__all__ = ["BETWEEN", "draw"]
+__all__ = ["BETWEEN_KERNELS", "draw"]
 
-BETWEEN = "between kernels"
+BETWEEN_KERNELS = "between kernels"
 COLORS = {  # colour-blind-safe set (Okabe and Ito), greys for parts without arithmetic
     "residual": "#e69f00",
     "product": "#0072b2",
@@ -21,9 +21,9 @@ COLORS = {  # colour-blind-safe set (Okabe and Ito), greys for parts without ari
     "loads": "#f0e442",
     "control": "#777777",
     "commit": "#999999",
-    BETWEEN: "#cccccc",
+    BETWEEN_KERNELS: "#cccccc",
 }
-OTHER = "#882255"
+OTHER_COLOR = "#882255"
 """Parts of terms not listed."""
 
 
@@ -37,11 +37,11 @@ def draw(found: Profile, title: str, path: pathlib.Path) -> None:
     figure = require_matplotlib()(figsize=(11.0, 1.9 + 0.36 * len(times)), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True, width_ratios=(3, 2))
     figure.suptitle(title, fontsize=11)
-    colors = [COLORS.get(name, OTHER) for name in (*names, BETWEEN)]
+    colors = [COLORS.get(name, OTHER_COLOR) for name in (*names, BETWEEN_KERNELS)]
     rows = range(len(times))
     bars = left.barh(rows, times, color=colors)
-    left.bar_label(bars, [_time(t, found.total_ms) for t in times], padding=4, fontsize=9)
-    left.set_yticks(rows, [*names, BETWEEN])
+    left.bar_label(bars, [_time_text(t, found.total_ms) for t in times], padding=4, fontsize=9)
+    left.set_yticks(rows, [*names, BETWEEN_KERNELS])
     left.invert_yaxis()
     left.set_xlim(0.0, 1.3 * max(times))
     left.set_xlabel("time per step, ms")
@@ -57,7 +57,7 @@ def draw(found: Profile, title: str, path: pathlib.Path) -> None:
     figure.savefig(path, format="png", dpi=110)
 
 
-def _time(ms: float, total: float) -> str:
+def _time_text(ms: float, total: float) -> str:
     """Text at a bar."""
     share = 100.0 * ms / total
     if ms == 0.0:

@@ -30,12 +30,12 @@ from ...base.launch import PARTS, kernel_name
 from ...kernels.common.empty_kernel import empty_kernels
 from ...simulation.simulation import Simulation
 
-__all__ = ["KernelTime", "Profile", "Recorder", "Replay", "copy_bandwidth", "launch_bytes", "profile", "replay"]
+__all__ = ["KernelTime", "LaunchRecorder", "Profile", "Replay", "copy_bandwidth", "launch_bytes", "profile", "replay"]
 
-WARM_UP = 2
+WARM_UP_STEPS = 2
 EMPTY_LAUNCHES = 200
 COPY_BYTES = {"cpu": 2**27, "cuda": 2**30}
-COPIES = 10
+COPY_REPEATS = 10
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ class Profile:
 
 
 @dataclass
-class _Booked:
+class _LaunchTotals:
     """Sums over launches."""
 
     launches: int = 0
@@ -121,7 +121,7 @@ class _Booked:
     bytes: int = 0
 
 
-class Recorder:
+class LaunchRecorder:
     """Executes launches one by one and books time and bytes by part and kernel.
 
     Commands are cached, for little host work between repeated launches: caches stay warm.
@@ -129,36 +129,36 @@ class Recorder:
 
     def __init__(self, device: Any) -> None:
         self.device = wp.get_device(device)
-        self._pending: list[_Booked] = []
-        self._booked: dict[tuple[str, str], _Booked] = {}
-        self._known: dict[Any, tuple[wp.Launch, _Booked, int, list[Any]]] = {}
+        self._pending: list[_LaunchTotals] = []
+        self._totals: dict[tuple[str, str], _LaunchTotals] = {}
+        self._known: dict[Any, tuple[wp.Launch, _LaunchTotals, int, list[Any]]] = {}
 
     def __call__(
         self, part: str, kernel: wp.Kernel, size: Sequence[int], inputs: list[Any], make: Callable[[], wp.Launch]
     ) -> None:
         """Execute the launch; on the CPU time it."""
-        key = (part, kernel, *size, *map(_identity, inputs))
+        key = (part, kernel, *size, *map(_argument_key, inputs))
         known = self._known.get(key)
         if known is None:
-            booked = self._booked.setdefault((part, kernel_name(kernel)), _Booked())
+            totals = self._totals.setdefault((part, kernel_name(kernel)), _LaunchTotals())
             # the inputs are referenced, so that the id of a struct stays unique
-            known = self._known[key] = make(), booked, launch_bytes(inputs, _members(kernel)), inputs
-        command, booked, reached, _ = known
+            known = self._known[key] = make(), totals, launch_bytes(inputs, _struct_members(kernel)), inputs
+        command, totals, reached, _ = known
         if self.device.is_cuda:
-            self._pending.append(booked)
+            self._pending.append(totals)
             command.launch()
         else:
             began = clock.perf_counter()
             command.launch()
-            booked.seconds += clock.perf_counter() - began
-        booked.launches += 1
-        booked.bytes += reached
+            totals.seconds += clock.perf_counter() - began
+        totals.launches += 1
+        totals.bytes += reached
 
     def clear(self) -> None:
         """Clear the bookings; commands are kept."""
         self._pending.clear()
-        for booked in self._booked.values():
-            booked.launches, booked.seconds, booked.bytes = 0, 0.0, 0
+        for totals in self._totals.values():
+            totals.launches, totals.seconds, totals.bytes = 0, 0.0, 0
 
     def measure(self, work: Callable[[], object]) -> None:
         """Call `work` with its launches recorded; on the GPU collect their times."""
@@ -176,30 +176,30 @@ class Recorder:
             work()
         finally:
             results = wp.timing_end()
-        self.collect([r.elapsed for r in results])
+        self.book_times([r.elapsed for r in results])
 
-    def collect(self, elapsed_ms: list[float]) -> None:
+    def book_times(self, elapsed_ms: list[float]) -> None:
         """Book the times of the pending launches, in their order. ModelError if others were timed too."""
         if len(elapsed_ms) != len(self._pending):
             raise ModelError(
                 f"profile: {len(elapsed_ms)} kernels were timed and {len(self._pending)} launched; others run that "
                 "do not pass the Launcher"
             )
-        for booked, ms in zip(self._pending, elapsed_ms):
-            booked.seconds += 1e-3 * ms
+        for totals, ms in zip(self._pending, elapsed_ms):
+            totals.seconds += 1e-3 * ms
         self._pending.clear()
 
     def kernels(self, steps: int, empty: float) -> tuple[KernelTime, ...]:
         """Bookings per step, less `empty` seconds per launch; the longest first."""
         rows = []
-        for (part, kernel), b in self._booked.items():
+        for (part, kernel), b in self._totals.items():
             if b.launches:
                 ms = 1e3 * max(b.seconds - b.launches * empty, 0.0)
                 rows.append(KernelTime(part, kernel, b.launches / steps, ms / steps, b.bytes / steps))
         return tuple(sorted(rows, key=lambda row: -row.ms))
 
 
-def _identity(value: Any) -> Any:
+def _argument_key(value: Any) -> Any:
     """Key of the arguments of a launch."""
     if isinstance(value, wp.array):
         return value.ptr, value.shape, value.strides
@@ -227,7 +227,7 @@ def launch_bytes(inputs: list[Any], members: set[str] | None = None) -> int:
 
 
 @functools.cache
-def _members(kernel: wp.Kernel) -> set[str] | None:
+def _struct_members(kernel: wp.Kernel) -> set[str] | None:
     """Names of all struct members in a kernel and its functions; None if unknown."""
     names: set[str] = set()
     seen: set[int] = set()
@@ -259,7 +259,7 @@ class Replay:
     step_ms: tuple[float, ...]
     newton: float
     pcg: float
-    recorder: Recorder
+    recorder: LaunchRecorder
 
 
 def profile(sim: Simulation, *, steps: int = 10, on_step: Callable[[], object] | None = None) -> Profile:
@@ -275,7 +275,7 @@ def profile(sim: Simulation, *, steps: int = 10, on_step: Callable[[], object] |
         ConvergenceError, ConstraintError: a step failed.
     """
     done = replay(sim, steps, on_step)
-    empty = _empty_launch(sim.model.device)
+    empty = _empty_launch_seconds(sim.model.device)
     return Profile(
         step_ms=done.step_ms,
         kernels=done.recorder.kernels(steps, empty),
@@ -299,7 +299,7 @@ def replay(sim: Simulation, steps: int, on_step: Callable[[], object] | None = N
     if stepper.graph is None:
         raise ModelError("profile: the simulation was made with capture=False, or with linear='direct'")
 
-    def do(count: int, run: Callable[[], object]) -> list[float]:
+    def time_steps(count: int, run: Callable[[], object]) -> list[float]:
         times = []
         for _ in range(count):
             began = clock.perf_counter()
@@ -309,26 +309,26 @@ def replay(sim: Simulation, steps: int, on_step: Callable[[], object] | None = N
                 on_step()
         return times
 
-    do(WARM_UP - 1, sim.step)
+    time_steps(WARM_UP_STEPS - 1, sim.step)
     start = sim.state.numpy()
-    do(1, sim.step)
+    time_steps(1, sim.step)
     before = {name: total.sum() for name, total in sim.totals.items()}
-    step_ms = do(steps, sim.step)
+    step_ms = time_steps(steps, sim.step)
     per_step = {name: float(total.sum() - before[name]) / steps for name, total in sim.totals.items()}
-    recorder = Recorder(sim.model.device)
+    recorder = LaunchRecorder(sim.model.device)
     stepper.launch.recorder = recorder
     try:
         sim.state.load(start)
         stepper.invalidate()
-        do(1, stepper.launch_step)  # creates the commands, and data outside the state
+        time_steps(1, stepper.launch_step)  # creates the commands, and data outside the state
         recorder.clear()
-        do(steps, lambda: recorder.measure(stepper.launch_step))
+        time_steps(steps, lambda: recorder.measure(stepper.launch_step))
     finally:
         stepper.launch.recorder = None
     return Replay(tuple(step_ms), per_step["newton"], per_step["pcg"], recorder)
 
 
-def _empty_launch(device: Any) -> float:
+def _empty_launch_seconds(device: Any) -> float:
     """Seconds of an empty launch measured by the recorder: the median of single ones."""
     device = wp.get_device(device)
     flags = wp.zeros(1, dtype=wp.int32, device=device)
@@ -357,7 +357,7 @@ def copy_bandwidth(device: Any) -> float:
         size = min(size, device.free_memory // 4)
     source, target = (wp.zeros(int(size), dtype=wp.uint8, device=device) for _ in range(2))
     times = []
-    for _ in range(1 + COPIES):
+    for _ in range(1 + COPY_REPEATS):
         if device.is_cuda:
             first, last = (wp.Event(device, enable_timing=True) for _ in range(2))
             device.stream.record_event(first)
