@@ -11,7 +11,7 @@ import pytest
 from accuracy_runs import STEPS, G, T, falling, run
 
 import warpfea as wf
-from warpfea.builder.reference import reference_of
+from warpfea.builder.reference import make_reference
 from warpfea.builder.scene import locate
 from warpfea.cli.parser import parse
 from warpfea.studies.accuracy import Row, Study
@@ -253,7 +253,7 @@ def test_problems_are_described_and_their_motions_begin_where_the_probes_are(nam
     assert all(p.doc and not p.required for p in scene.parameters.values())
     assert scene.t_end / scene.dt == pytest.approx(round(scene.t_end / scene.dt), abs=1e-9)
     model = scene.build(scene.resolve({})).finalize(device="cpu")
-    reference = reference_of(scene.reference, scene.resolve({}))
+    reference = make_reference(scene.reference, scene.resolve({}))
     if reference is None:
         return
     probes = {p.name: p for p in model.probes}

@@ -9,7 +9,7 @@ import pytest
 from accuracy_runs import START, STEPS, T, fallen, falling, run
 
 import warpfea as wf
-from warpfea.builder.reference import read_reference, reference_of
+from warpfea.builder.reference import make_reference, read_reference
 from warpfea.cli import main
 from warpfea.simulation import integrators
 from warpfea.studies.accuracy.measure import Outcome
@@ -143,16 +143,16 @@ def test_references_of_functions_get_the_parameters_that_they_name():
     def known(gravity, other=3.0):
         return {"face": lambda t: gravity * other}
 
-    found = reference_of(known, {"gravity": 2.0, "cells": 1})
+    found = make_reference(known, {"gravity": 2.0, "cells": 1})
     assert found.probes["face"](0.0) == 6.0
     with pytest.raises(wf.ModelError, match="'gravity' is no parameter"):
-        reference_of(known, {"cells": 1})
+        make_reference(known, {"cells": 1})
 
     def broken():
         return 1 / 0
 
     with pytest.raises(wf.ModelError, match=r"reference 'broken': ZeroDivisionError.*test_accuracy_options\.py:\d+"):
-        reference_of(broken, {})
+        make_reference(broken, {})
 
 
 @pytest.mark.parametrize(

@@ -15,16 +15,18 @@ from ..model.handles import MaterialPoint, NodeSet, SurfaceSet
 from ..model.joints import Vector, VectorPart, constant
 from .checks import vector
 
-__all__ = ["COINCIDENT", "GROUND", "UNKNOWN_WEAKNESS", "Attachment", "Ground", "attach"]
+__all__ = ["COINCIDENCE_TOL", "GROUND", "UNKNOWN_WEAKNESS", "Attachment", "Ground", "make_attachment"]
 
-COINCIDENT = 1e-9
+COINCIDENCE_TOL = 1e-9
 """Distance of coincident points, relative to the size of their bodies."""
 FLAT_SURFACE, FLAT_NODES = 1e-2, 1e-3
 """Variance of points across their plane, over that in it, below which the normal's rotation is undetermined by a
 fit.
 """
-WEAK_AXES = 0.5
+FACE_NORMAL_WEAKNESS = 0.5
+"""Weakness of the normal of a solid's face."""
 UNKNOWN_WEAKNESS = 10.0
+"""Weakness of a direction whose rotation is not determined."""
 
 
 class Ground:
@@ -45,9 +47,9 @@ class Attachment:
         body: None for the ground.
         X: (3,) reference position, m.
         slots, weights, gradients: (n,), (n,), (n, 3): x = sum weights e, F = sum e gradients^T.
-        known: (3, 3) projector on the directions n with known F n.
-        weak: (3, 3) projector on those that a point constrains with almost no stiffness: a beam's axis, a shell's
-            tangents; in part (`WEAK_AXES`) of a solid's face.
+        known_directions: (3, 3) projector on the directions n with known F n.
+        weak_directions: (3, 3) projector on those that a point constrains with almost no stiffness: a beam's axis,
+            a shell's tangents; in part (`FACE_NORMAL_WEAKNESS`) the normal of a solid's face.
         label: for messages.
         child: the joint's child side.
     """
@@ -68,13 +70,13 @@ class Attachment:
         if self.body is None:
             return constant(at)
         weights = self.weights
-        if np.linalg.norm(arm) > COINCIDENT * self.size:
+        if np.linalg.norm(arm) > COINCIDENCE_TOL * self.size:
             self._check(arm / np.linalg.norm(arm), what)
             weights = weights + self.gradients @ arm
         return Vector(at, (VectorPart(self.body, self.slots, weights, self.child),))
 
     def direction(self, n: np.ndarray, what: str) -> Vector:
-        """F n."""
+        """Material direction F n of the reference direction n (3,)."""
         if self.body is None:
             return constant(n)
         self._check(n, what)
@@ -105,7 +107,7 @@ class Attachment:
         low, high = self.body.mesh.bounding_box()
         return float(np.linalg.norm(np.asarray(high) - np.asarray(low)))
 
-    def same_as(self, other: Attachment) -> bool:
+    def coincides_with(self, other: Attachment) -> bool:
         """True if both are the same point of the same body."""
         return (
             self.body is not None
@@ -115,34 +117,34 @@ class Attachment:
         )
 
 
-def attach(thing: Any, what: str, *, child: bool) -> Attachment:
+def make_attachment(thing: Any, what: str, *, child: bool) -> Attachment:
     """Attachment of a handle, or of a fixed point (3,). ModelError for anything else."""
     all_known, none_weak = np.eye(3), np.zeros((3, 3))
     if isinstance(thing, Ground):
-        return Attachment(None, np.full(3, np.nan), *_none(), all_known, none_weak, "the ground", child)
+        return Attachment(None, np.full(3, np.nan), *_empty_support(), all_known, none_weak, "the ground", child)
     if isinstance(thing, MaterialPoint):
         label = f"the point {np.round(thing.X, 6).tolist()} of body {thing.body.name!r}"
-        weak = _weak(thing.body, thing.axes)
+        weak = _weak_projector(thing.body, thing.axes)
         return Attachment(
             thing.body, thing.X, thing.slots, thing.weights, thing.gradients, all_known, weak, label, child
         )
     if isinstance(thing, NodeSet):
-        return _of_nodes(thing, child)
+        return _node_attachment(thing, child)
     if isinstance(thing, SurfaceSet):
-        return _of_surface(thing, child)
+        return _surface_attachment(thing, child)
     if isinstance(thing, (tuple, list, np.ndarray)):
-        return Attachment(None, vector(thing, what), *_none(), all_known, none_weak, "a fixed point", child)
+        return Attachment(None, vector(thing, what), *_empty_support(), all_known, none_weak, "a fixed point", child)
     raise ModelError(
         f"{what}: expected wf.GROUND, body.at(X), body.nodes(...), body.surface(...), beam.start or beam.end, got "
         f"{thing!r}"
     )
 
 
-def _none() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _empty_support() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 3))
 
 
-def _weak(body: Discretisation, axes: np.ndarray) -> np.ndarray:
+def _weak_projector(body: Discretisation, axes: np.ndarray) -> np.ndarray:
     """Projector on the axes (columns) outside a beam's section or a shell's director."""
     if body.family.solid:
         return np.zeros((3, 3))
@@ -150,7 +152,7 @@ def _weak(body: Discretisation, axes: np.ndarray) -> np.ndarray:
     return columns @ columns.T
 
 
-def _fit(weights: np.ndarray, X: np.ndarray, flat: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _affine_fit(weights: np.ndarray, X: np.ndarray, flat: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Affine least-squares fit of points X (n, 3): mean (3,), gradients (n, 3), projector on their span."""
     mean = weights @ X
     arm = X - mean
@@ -162,14 +164,14 @@ def _fit(weights: np.ndarray, X: np.ndarray, flat: float) -> tuple[np.ndarray, n
     return mean, weights[:, None] * arm @ inverse, good @ good.T
 
 
-def _of_nodes(nodes: NodeSet, child: bool) -> Attachment:
+def _node_attachment(nodes: NodeSet, child: bool) -> Attachment:
     """Mean of the nodes and their best-fit affine motion; directions off their span by their gradient slots."""
     body = nodes.body
     label = f"nodes {nodes.name!r} of body {body.name!r}" if nodes.name else f"{len(nodes)} nodes of body {body.name!r}"
     position = support_slots(nodes, "position")
     X = body.reference[position] + body.origin
     weights = np.full(len(position), 1.0 / len(position))
-    mean, gradients, span = _fit(weights, X, FLAT_NODES)
+    mean, gradients, span = _affine_fit(weights, X, FLAT_NODES)
     weak = np.zeros((3, 3))
     full = nodes.indices[body.node_slot_count[nodes.indices] == 4]
     if len(full) and np.linalg.norm(span - np.eye(3)) > 1e-9:
@@ -179,12 +181,12 @@ def _of_nodes(nodes: NodeSet, child: bool) -> Attachment:
         position = np.concatenate([position, slots.ravel()])
         weights = np.concatenate([weights, np.zeros(slots.size)])
         gradients = np.concatenate([gradients, axes.reshape(-1, 3) @ rest / len(full)])
-        weak = rest @ _weak(body, axes[0].T) @ rest
+        weak = rest @ _weak_projector(body, axes[0].T) @ rest
         span = np.eye(3)
     return Attachment(body, mean, position, weights, gradients, span, weak, label, child)
 
 
-def _of_surface(surface: SurfaceSet, child: bool) -> Attachment:
+def _surface_attachment(surface: SurfaceSet, child: bool) -> Attachment:
     """Area mean of a surface; in its plane the best-fit affine motion, across it the mean of F."""
     body = surface.body
     label = f"surface {surface.name!r} of body {body.name!r}" if surface.name else f"a surface of body {body.name!r}"
@@ -192,7 +194,7 @@ def _of_surface(surface: SurfaceSet, child: bool) -> Attachment:
     X, dA = assembly.facet_places(body, t)
     share = (dA / dA.sum()).ravel()
     X = X.reshape(-1, 3)
-    mean, at_points, span = _fit(share, X, FLAT_SURFACE)
+    mean, at_points, span = _affine_fit(share, X, FLAT_SURFACE)
     n = body.slot_count
     weights, gradients = np.zeros(n), np.zeros((n, 3))
     np.add.at(weights, t.conn, np.einsum("fq,fqi->fi", dA / dA.sum(), t.shape))
@@ -208,8 +210,8 @@ def _of_surface(surface: SurfaceSet, child: bool) -> Attachment:
             _, ds, J, _ = assembly.geometry(body, members, xi)
             h = np.einsum("fq,fqsk->fsk", dA[rows] / dA.sum(), assembly.gradients(ds, J)) @ rest
             np.add.at(gradients, body.connectivity[members], h)
-            weak = rest @ _weak(body, assembly.orthonormal(J[0, 0])) @ rest
+            weak = rest @ _weak_projector(body, assembly.orthonormal(J[0, 0])) @ rest
         if body.family.solid:  # the mean of F normal to a face includes the local strain; the in-plane fit does not
-            weak = WEAK_AXES * rest
+            weak = FACE_NORMAL_WEAKNESS * rest
     slots = np.flatnonzero((weights != 0.0) | gradients.any(axis=1))
     return Attachment(body, mean, slots, weights[slots], gradients[slots], np.eye(3), weak, label, child)

@@ -18,18 +18,18 @@ from ..mesh import Mesh
 __all__ = ["beam_geometry", "spline"]
 
 MAX_CORNER_ANGLE = math.radians(1.0)
-"""Bend of a polyline, degrees, above which it has a corner."""
+"""Bend of a polyline, rad, above which it has a corner."""
 MAX_KINK_ANGLE = 5.0
 """Maximum direction jump, degrees, of a curve given as a function."""
-STEPS = 32
+DIFFERENCE_STEPS = 32
 """Difference steps per element."""
 FORWARD_WEIGHTS = np.array([-147.0, 360.0, -450.0, 400.0, -225.0, 72.0, -10.0]) / 60.0
 """Weights of f(0), f(h), ..., f(6 h) in h f'(0), of sixth order."""
 SLOPE_ROUNDOFF = 1e-4
 """Relative difference of the one-sided derivatives at a node that counts as rounding."""
-CHORDS = 8
+CHORDS_PER_ELEMENT = 8
 """Chords per element, for its total turning angle."""
-HALVINGS = 16
+MAX_HALVINGS = 16
 """Interval halvings in the search for a corner."""
 
 
@@ -58,20 +58,20 @@ def spline(points: Any, *, closed: bool = False) -> Callable[[float], np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
-class _Path:
+class _Curve:
     """Curve of a parameter s in [0, 1]: position, one-sided derivative, and admissible element ends.
 
     Attributes:
-        at: s -> (3,) m.
-        slope: (s, side) -> dX/ds (3,), side -1 or 1.
+        position: s -> (3,) m.
+        derivative: (s, side) -> dX/ds (3,), side -1 or 1.
         corner_parameters: parameters of corners (nodes there).
-        turns: total turning angle of each element, degrees, if not determined by its ends.
+        turning_angles: total turning angle of each element, degrees, if not determined by its ends.
     """
 
-    at: Callable[[float], np.ndarray]
-    slope: Callable[[float, int], np.ndarray]
+    position: Callable[[float], np.ndarray]
+    derivative: Callable[[float, int], np.ndarray]
     corner_parameters: tuple[float, ...] = ()
-    turns: np.ndarray | None = None
+    turning_angles: np.ndarray | None = None
 
 
 def beam_geometry(
@@ -92,13 +92,19 @@ def beam_geometry(
         raise ModelError(f"body {name!r}: section must be a Rectangle, got {section!r}")
     if corners not in ("error", "weld"):
         raise ModelError(f"body {name!r}: corners = {corners!r} is neither 'error' nor 'weld'")
-    path = _path(name, curve, int(elements), corners)
-    s = _parameters(name, int(elements), path.corner_parameters)
-    points = np.array([path.at(k) for k in s])
-    ends = [(path.slope(a, 1) * (b - a), path.slope(b, -1) * (b - a)) for a, b in itertools.pairwise(s)]
-    _check_turns(name, s, ends, path.turns, sharp_allowed=bool(path.corner_parameters))
+    axis_curve = _make_curve(name, curve, int(elements), corners)
+    s = _node_parameters(name, int(elements), axis_curve.corner_parameters)
+    points = np.array([axis_curve.position(k) for k in s])
+    ends = [
+        (axis_curve.derivative(a, 1) * (b - a), axis_curve.derivative(b, -1) * (b - a))
+        for a, b in itertools.pairwise(s)
+    ]
+    _check_turning_angles(name, s, ends, axis_curve.turning_angles, sharp_allowed=bool(axis_curve.corner_parameters))
     frames = np.array(
-        [[_frame(name, x, k, section, normal) for x, k in zip(pair, s[e : e + 2])] for e, pair in enumerate(ends)]
+        [
+            [_section_frame(name, x, k, section, normal) for x, k in zip(pair, s[e : e + 2])]
+            for e, pair in enumerate(ends)
+        ]
     )
     axes = np.concatenate([frames[:, 0], frames[-1:, 1]])
     axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
@@ -108,7 +114,7 @@ def beam_geometry(
     return Mesh(points, cells, "line", node_sets=sets, name=name), axes, local
 
 
-def _check_turns(
+def _check_turning_angles(
     name: str,
     s: np.ndarray,
     ends: list[tuple[np.ndarray, np.ndarray]],
@@ -117,7 +123,7 @@ def _check_turns(
     sharp_allowed: bool,
 ) -> None:
     """Refuse elements that turn too far for a cubic, and kinks between elements."""
-    turns = np.array([float(_angles(np.array(pair))[0]) for pair in ends])
+    turns = np.array([float(_angles_between(np.array(pair))[0]) for pair in ends])
     if along is not None:
         turns = np.maximum(turns, along)
     worst = int(np.argmax(turns))
@@ -127,26 +133,26 @@ def _check_turns(
             f"degrees; use elements = {math.ceil(len(ends) * turns[worst] / 20.0)} or more, for 20 degrees each"
         )
     for k in range(1, len(ends)):
-        kink = float(_angles(np.array([ends[k - 1][1], ends[k][0]]))[0])
+        kink = float(_angles_between(np.array([ends[k - 1][1], ends[k][0]]))[0])
         if kink > MAX_KINK_ANGLE and not sharp_allowed:
-            _refuse_corner(name, kink, s[k])
+            _raise_corner_error(name, kink, s[k])
 
 
-def _refuse_corner(name: str, angle: float, s: float) -> None:
+def _raise_corner_error(name: str, angle: float, s: float) -> None:
     raise ModelError(
         f"body {name!r}: the curve has a corner of {angle:.3g} degrees at s = {s:.3g}; give a smooth curve, "
         "one beam per side, or a polyline with corners='weld'"
     )
 
 
-def _angles(lines: np.ndarray) -> np.ndarray:
+def _angles_between(lines: np.ndarray) -> np.ndarray:
     """Angles (degrees) between successive vectors (n, 3), (n - 1,); 0 next to a zero vector."""
     a, b = lines[:-1], lines[1:]
     across = np.linalg.norm(np.cross(a, b), axis=1)
     return np.degrees(np.arctan2(across, np.sum(a * b, axis=1)))
 
 
-def _frame(name: str, tangent: np.ndarray, s: float, section: Rectangle, normal: Any) -> np.ndarray:
+def _section_frame(name: str, tangent: np.ndarray, s: float, section: Rectangle, normal: Any) -> np.ndarray:
     """(3, 3) columns: tangent (unscaled), width and height vectors."""
     length = float(np.linalg.norm(tangent))
     if not (math.isfinite(length) and length > 0.0):
@@ -168,8 +174,8 @@ def _frame(name: str, tangent: np.ndarray, s: float, section: Rectangle, normal:
     return np.stack([tangent, section.width * np.cross(n, t), section.height * n], axis=1)
 
 
-def _parameters(name: str, elements: int, corner_parameters: tuple[float, ...]) -> np.ndarray:
-    """Node parameters, evenly spaced between marks, which are nodes."""
+def _node_parameters(name: str, elements: int, corner_parameters: tuple[float, ...]) -> np.ndarray:
+    """Node parameters, evenly spaced between corners, which are nodes."""
     if not corner_parameters:
         return np.linspace(0.0, 1.0, elements + 1)
     edges = np.array([0.0, *corner_parameters, 1.0])
@@ -183,9 +189,9 @@ def _parameters(name: str, elements: int, corner_parameters: tuple[float, ...]) 
     return np.concatenate([*parts, [1.0]])
 
 
-def _path(name: str, curve: Any, elements: int, corners: str) -> _Path:
+def _make_curve(name: str, curve: Any, elements: int, corners: str) -> _Curve:
     if callable(curve):
-        return _function_path(name, curve, elements)
+        return _function_curve(name, curve, elements)
     ends = np.asarray(curve, dtype=float)
     if ends.ndim != 2 or ends.shape[1] != 3 or len(ends) < 2 or not np.all(np.isfinite(ends)):
         raise ModelError(
@@ -214,10 +220,10 @@ def _path(name: str, curve: Any, elements: int, corners: str) -> _Path:
         return straight[min(max(int(k), 0), len(straight) - 1)] * size.sum()
 
     corner_parameters = tuple(at[1:-1][bend > 0.0]) if len(sharp) else ()
-    return _Path(lambda s: np.array([np.interp(s, at, ends[:, c]) for c in range(3)]), side, corner_parameters)
+    return _Curve(lambda s: np.array([np.interp(s, at, ends[:, c]) for c in range(3)]), side, corner_parameters)
 
 
-def _function_path(name: str, curve: Callable[[float], Any], elements: int) -> _Path:
+def _function_curve(name: str, curve: Callable[[float], Any], elements: int) -> _Curve:
     """Smooth curve. The derivative at an element's end is taken from points within the element.
 
     It is therefore valid for any number of turns and at junctions of arcs and lines; the function is evaluated in
@@ -235,48 +241,48 @@ def _function_path(name: str, curve: Callable[[float], Any], elements: int) -> _
             )
         return out
 
-    def one_sided(s: float, side: int) -> np.ndarray:
-        h = side / (STEPS * elements)
+    def one_sided_derivative(s: float, side: int) -> np.ndarray:
+        h = side / (DIFFERENCE_STEPS * elements)
         return FORWARD_WEIGHTS @ np.array([at(min(max(s + k * h, 0.0), 1.0)) for k in range(len(FORWARD_WEIGHTS))]) / h
 
     @functools.lru_cache(maxsize=2)
-    def sides(s: float) -> tuple[np.ndarray, np.ndarray]:
+    def side_derivatives(s: float) -> tuple[np.ndarray, np.ndarray]:
         if s in (0.0, 1.0):
-            end = one_sided(s, 1 if s == 0.0 else -1)
+            end = one_sided_derivative(s, 1 if s == 0.0 else -1)
             return end, end
-        left, right = one_sided(s, -1), one_sided(s, 1)
+        left, right = one_sided_derivative(s, -1), one_sided_derivative(s, 1)
         if np.linalg.norm(left - right) < SLOPE_ROUNDOFF * np.linalg.norm(left + right):
             left = right = 0.5 * (left + right)
         return left, right
 
     def slope(s: float, side: int) -> np.ndarray:
-        return sides(s)[(side + 1) // 2]
+        return side_derivatives(s)[(side + 1) // 2]
 
-    return _Path(at, slope, turns=_turns(name, at, elements))
+    return _Curve(at, slope, turning_angles=_turning_angles(name, at, elements))
 
 
-def _turns(name: str, at: Callable[[float], np.ndarray], elements: int) -> np.ndarray:
+def _turning_angles(name: str, at: Callable[[float], np.ndarray], elements: int) -> np.ndarray:
     """Turning angles (degrees) of the chords within each element, summed. ModelError for a corner of the curve."""
-    grid = np.linspace(0.0, 1.0, CHORDS * elements + 1)
-    turns = _angles(np.diff([at(s) for s in grid], axis=0))
+    grid = np.linspace(0.0, 1.0, CHORDS_PER_ELEMENT * elements + 1)
+    turns = _angles_between(np.diff([at(s) for s in grid], axis=0))
     pairs = turns + np.append(turns[1:], 0.0)  # a corner between two points of the grid is split between both
     for k in np.flatnonzero(pairs > 2.0 * MAX_KINK_ANGLE):
-        low, high = grid[k], grid[min(int(k) + 3, CHORDS * elements)]
-        angle, where = _closest_turn(at, low, high)
+        low, high = grid[k], grid[min(int(k) + 3, CHORDS_PER_ELEMENT * elements)]
+        angle, where = _sharpest_turn(at, low, high)
         if angle > MAX_KINK_ANGLE:
-            _refuse_corner(name, angle, where)
-    inner = np.append(turns, 0.0).reshape(elements, CHORDS)[:, :-1]
+            _raise_corner_error(name, angle, where)
+    inner = np.append(turns, 0.0).reshape(elements, CHORDS_PER_ELEMENT)[:, :-1]
     return np.asarray(inner.sum(axis=1))
 
 
-def _closest_turn(at: Callable[[float], np.ndarray], low: float, high: float) -> tuple[float, float]:
+def _sharpest_turn(at: Callable[[float], np.ndarray], low: float, high: float) -> tuple[float, float]:
     """Largest direction change (degrees) of a curve under interval refinement, and its parameter.
 
     It tends to 0 with the interval for a smooth curve, not for a corner.
     """
-    for _ in range(HALVINGS):
+    for _ in range(MAX_HALVINGS):
         s = np.linspace(low, high, 5)
-        turns = _angles(np.diff([at(k) for k in s], axis=0))
+        turns = _angles_between(np.diff([at(k) for k in s], axis=0))
         if turns.sum() <= MAX_KINK_ANGLE:
             break
         k = int(np.argmax(turns))

@@ -24,7 +24,7 @@ from . import loads
 from .attachments import Ground
 from .beams import beam_geometry
 from .bodies import MeshLike, as_mesh, make_solid, make_structure, unused_name
-from .checks import check_densities, gravity_of, owner_of, warn_implausible
+from .checks import body_of_handle, check_densities, parse_gravity, warn_implausible
 from .contacts import add_contact, make_collider
 from .joints import make_constraint, make_joint
 from .shells import shell_geometry
@@ -46,7 +46,7 @@ class ModelBuilder:
     """
 
     def __init__(self, gravity: Any = (0.0, 0.0, -9.81), up_axis: str = "Z") -> None:
-        self.gravity, law = gravity_of(gravity)
+        self.gravity, law = parse_gravity(gravity)
         if up_axis not in ("Z", "Y"):
             raise ModelError(f"up_axis = {up_axis!r} is neither 'Z' nor 'Y'")
         self.up_axis = up_axis
@@ -91,7 +91,7 @@ class ModelBuilder:
         """
         mesh = as_mesh(mesh, "add_solid", scale, transform)
         name = self._body_name(name, mesh.name)
-        return self._add(make_solid(name, mesh, material, element, quadrature), initial)
+        return self._add_body(make_solid(name, mesh, material, element, quadrature), initial)
 
     def add_beam(
         self, curve: Any, *, elements: int, section: Rectangle, normal: Any, material: Material,
@@ -120,7 +120,7 @@ class ModelBuilder:
         """
         name = self._body_name(name, "beam")
         mesh, axes, frames = beam_geometry(name, curve, elements, section, normal, corners)
-        return self._add(make_structure(name, mesh, "3243", material, integration, axes, frames, section), initial)
+        return self._add_body(make_structure(name, mesh, "3243", material, integration, axes, frames, section), initial)
 
     def add_shell(
         self, mesh: MeshLike, *, thickness: float, material: Material | dict[str, Material],
@@ -151,12 +151,12 @@ class ModelBuilder:
         mesh = as_mesh(mesh, "add_shell", scale, transform)
         name = self._body_name(name, mesh.name)
         axes, frames = shell_geometry(name, mesh, thickness, normals, corners)
-        return self._add(make_structure(name, mesh, "3443", material, integration, axes, frames), initial)
+        return self._add_body(make_structure(name, mesh, "3443", material, integration, axes, frames), initial)
 
     def _body_name(self, name: str | None, default: str) -> str:
         return unused_name(name, default, {body.name for body in self.bodies}, "body")
 
-    def _add(self, body: Body, initial: Any) -> Body:
+    def _add_body(self, body: Body, initial: Any) -> Body:
         body.index = len(self.bodies)
         loads.set_initial_positions(body, initial)
         self.bodies.append(body)
@@ -179,7 +179,7 @@ class ModelBuilder:
         Raises:
             ModelError: an unknown name of slots or components, or nodes of another builder.
         """
-        body = self._own(nodes, "clamp", NodeSet)
+        body = self._check_owner(nodes, "clamp", NodeSet)
         self.description.supports.append(clamp_support(body, nodes, slots, components))
 
     def drive(
@@ -200,14 +200,14 @@ class ModelBuilder:
         Raises:
             ModelError: neither or both of displacement and rotation, or a wrong shape.
         """
-        body = self._own(nodes, "drive", NodeSet)
+        body = self._check_owner(nodes, "drive", NodeSet)
         self.description.supports += drive_supports(body, nodes, displacement, rotation, components, slots)
 
     # loads
 
     def add_point_load(self, point: MaterialPoint | NodeSet, force: Any) -> None:
         """A force (time law, N) at a material point (Eq. 72), or shared equally by the nodes of a set."""
-        body = self._own(point, "add_point_load", MaterialPoint, NodeSet)
+        body = self._check_owner(point, "add_point_load", MaterialPoint, NodeSet)
         self.description.dead_loads.append(loads.point_load(body, point, force))
 
     def add_moment(self, point: MaterialPoint | NodeSet, moment: Any) -> None:
@@ -219,17 +219,17 @@ class ModelBuilder:
         Raises:
             ModelError: nodes without gradient slots (T4, T10).
         """
-        body = self._own(point, "add_moment", MaterialPoint, NodeSet)
-        self.description.moments.append(loads.spin_moment(body, point, moment))
+        body = self._check_owner(point, "add_moment", MaterialPoint, NodeSet)
+        self.description.moments.append(loads.moment_load(body, point, moment))
 
     def add_traction(self, surface: SurfaceSet, traction: Any) -> None:
         """A dead traction (time law (3,), N per m^2 of the reference area) on faces."""
-        body = self._own(surface, "add_traction", SurfaceSet)
+        body = self._check_owner(surface, "add_traction", SurfaceSet)
         self.description.dead_loads.append(loads.dead_traction(body, surface, traction))
 
     def add_pressure(self, surface: SurfaceSet, pressure: Any) -> None:
         """A follower pressure (time law, Pa) against the current outward normal of faces."""
-        body = self._own(surface, "add_pressure", SurfaceSet)
+        body = self._check_owner(surface, "add_pressure", SurfaceSet)
         self.description.pressures.append(loads.follower_pressure(body, surface, pressure))
 
     def add_body_force(self, field: Any, *, bodies: list[Body] | None = None) -> None:
@@ -242,7 +242,7 @@ class ModelBuilder:
         loads.check_field(field)
         chosen = list(self.bodies if bodies is None else bodies)
         for body in chosen:
-            self._own(body, "add_body_force", Body)
+            self._check_owner(body, "add_body_force", Body)
         self.description.body_forces.append(BodyForce(field, chosen))
 
     def set_initial(
@@ -255,12 +255,12 @@ class ModelBuilder:
             angular_velocity: (3,) rad/s about the centre of mass.
             displacement: a function X (n, 3) -> (n, 3), m, or, for T4 and T10, (nodes, 3).
         """
-        self._own(body, "set_initial", Body)
+        self._check_owner(body, "set_initial", Body)
         loads.set_initial_state(body, velocity, angular_velocity, displacement)
 
     def add_probe(self, name: str, where: MaterialPoint | SurfaceSet | NodeSet) -> None:
         """Record a point at every step: area mean of a surface, mean of nodes."""
-        body = self._own(where, "add_probe", MaterialPoint, SurfaceSet, NodeSet)
+        body = self._check_owner(where, "add_probe", MaterialPoint, SurfaceSet, NodeSet)
         if any(p.name == name for p in self.description.probes):
             raise ModelError(f"probe {name!r} is there already")
         self.description.probes.append(loads.probe_at(name, body, where))
@@ -298,8 +298,8 @@ class ModelBuilder:
         name = self._joint_name(name, str(kind))
         for side, thing in (("parent", parent), ("child", child)):
             if not isinstance(thing, Ground):
-                self._own(thing, f"joint {name!r}: {side}", MaterialPoint, NodeSet, SurfaceSet)
-        return self._join(make_joint(kind, parent, child, anchor, axis, axis2, drive, name))
+                self._check_owner(thing, f"joint {name!r}: {side}", MaterialPoint, NodeSet, SurfaceSet)
+        return self._record_joint(make_joint(kind, parent, child, anchor, axis, axis2, drive, name))
 
     def add_constraint(self, kind: str, *, points: Any, value: Any = None, name: str | None = None) -> Joint:
         """A single basic constraint between points (Paper I, section 5.4).
@@ -318,8 +318,8 @@ class ModelBuilder:
         name = self._joint_name(name, str(kind))
         for k, point in enumerate(points if isinstance(points, (tuple, list)) else ()):
             if hasattr(point, "body"):
-                self._own(point, f"constraint {name!r}: point {k + 1}", MaterialPoint, NodeSet, SurfaceSet)
-        return self._join(make_constraint(kind, points, value, name))
+                self._check_owner(point, f"constraint {name!r}: point {k + 1}", MaterialPoint, NodeSet, SurfaceSet)
+        return self._record_joint(make_constraint(kind, points, value, name))
 
     def weld(self, first: NodeSet | SurfaceSet, second: SurfaceSet | Body, *, name: str | None = None) -> Joint:
         """Tie a face to another body that contains it, of any element families: beam to solid, shell to solid, ...
@@ -337,14 +337,14 @@ class ModelBuilder:
             ModelError: a point of the first face outside the second body, or one body twice.
         """
         name = self._joint_name(name, "weld")
-        self._own(first, f"weld {name!r}", NodeSet, SurfaceSet)
-        self._own(second, f"weld {name!r}", SurfaceSet, Body)
-        return self._join(make_weld(first, second, name))
+        self._check_owner(first, f"weld {name!r}", NodeSet, SurfaceSet)
+        self._check_owner(second, f"weld {name!r}", SurfaceSet, Body)
+        return self._record_joint(make_weld(first, second, name))
 
     def _joint_name(self, name: str | None, kind: str) -> str:
         return unused_name(name, kind, {joint.name for joint in self.description.joints}, "joint")
 
-    def _join(self, joint: Joint) -> Joint:
+    def _record_joint(self, joint: Joint) -> Joint:
         self.description.joints.append(joint)
         return joint
 
@@ -400,9 +400,9 @@ class ModelBuilder:
             ModelError: a value out of range, an unknown name, no faces, or a handle of another builder.
             NotImplementedError: a body with itself, model = "sphere" or law = "smooth" between bodies.
         """
-        self._own(surface, "add_contact", Body, SurfaceSet)
+        self._check_owner(surface, "add_contact", Body, SurfaceSet)
         if isinstance(collider, (Body, SurfaceSet)):
-            self._own(collider, "add_contact", Body, SurfaceSet)
+            self._check_owner(collider, "add_contact", Body, SurfaceSet)
         options = dict(mu=mu, mu_static=mu_static, restitution=restitution, law=law, treatment=treatment,
                        stiffness=stiffness, model=model, radius=radius, offset=offset, points=points,
                        smoothing=smoothing, overlap=overlap, overlap_time=overlap_time)  # fmt: skip
@@ -445,6 +445,6 @@ class ModelBuilder:
         """The terms of a model, for Model itself."""
         return TermSet(model, self._terms), Evaluation(model)
 
-    def _own(self, thing: Any, what: str, *kinds: type) -> Body:
+    def _check_owner(self, thing: Any, what: str, *kinds: type) -> Body:
         """Body of a handle, which must be of one of the kinds and of this builder."""
-        return owner_of(thing, what, kinds, self.bodies)
+        return body_of_handle(thing, what, kinds, self.bodies)

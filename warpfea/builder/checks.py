@@ -21,32 +21,32 @@ from ..model.handles import ElementSet, MaterialPoint, NodeSet, SurfaceSet
 from ..time_laws import Control, TimeLaw, time_law
 
 __all__ = [
-    "COMPONENTS",
+    "COMPONENT_INDEX",
     "assign_materials",
+    "body_of_handle",
     "check_densities",
     "component_mask",
-    "gravity_of",
-    "nodal",
-    "owner_of",
+    "nodal_vectors",
+    "parse_gravity",
     "slot_field",
     "vector",
     "warn_implausible",
 ]
 
-COMPONENTS = {"x": 0, "y": 1, "z": 2}
-SIZES = (1e-6, 1e3)
+COMPONENT_INDEX = {"x": 0, "y": 1, "z": 2}
+SIZE_RANGE = (1e-6, 1e3)
 """Least and largest plausible size of a body, m: the longest side of its bounding box."""
-MASSES = (1e-12, 1e7)
+MASS_RANGE = (1e-12, 1e7)
 """Least and largest plausible mass of a body, kg: a grain of dust, and more than a steel tower of 300 m."""
-LEAST_E, METAL = 1e6, 2500.0
+MIN_METAL_E, METAL_DENSITY = 1e6, 2500.0
 """Pa and kg/m^3: metals in MPa have at most 4.1e5; soft matter is lighter, dense rubber stiffer."""
-LARGEST_NU = 0.499
+MAX_NU = 0.499
 """Limit of nu for solids; above it volumetric locking of a coarse mesh dominates."""
-LEAST_DENSITY = 1.0
+MIN_DENSITY = 1.0
 """Least plausible density, kg/m^3: an aerogel; t/mm^3 are far below. Heavy bodies may stand for others."""
-FOAM, STIFFEST_FOAM = 25.0, 1e9
+FOAM_DENSITY, MAX_FOAM_E = 25.0, 1e9
 """kg/m^3 and Pa: no lighter solid is stiffer, except densities given in g/cm^3."""
-HANDLES: dict[type, str] = {
+HANDLE_NAMES: dict[type, str] = {
     Body: "the body",
     NodeSet: "nodes (body.nodes)",
     SurfaceSet: "a surface (body.surface)",
@@ -55,19 +55,19 @@ HANDLES: dict[type, str] = {
 }
 
 
-def owner_of(thing: Any, what: str, kinds: tuple[type, ...], bodies: list[Body]) -> Body:
+def body_of_handle(thing: Any, what: str, kinds: tuple[type, ...], bodies: list[Body]) -> Body:
     """Body of a handle, which must be non-empty, of one of the kinds and of one of the bodies.
 
     Raises:
         ModelError: otherwise; the text begins with `what`.
     """
     body = thing if isinstance(thing, Body) else getattr(thing, "body", None)
-    wanted = " or ".join(HANDLES[kind] for kind in kinds)
+    wanted = " or ".join(HANDLE_NAMES[kind] for kind in kinds)
     if not isinstance(body, Body):
         hint = f"; write body.nodes({thing!r}) or body.surface({thing!r})" if isinstance(thing, str) else ""
         raise ModelError(f"{what}: expected a handle of a body, {wanted}, got {thing!r}{hint}")
     if not isinstance(thing, kinds):
-        raise ModelError(f"{what}: expected {wanted} of body {body.name!r}, got {HANDLES[type(thing)]}")
+        raise ModelError(f"{what}: expected {wanted} of body {body.name!r}, got {HANDLE_NAMES[type(thing)]}")
     if body not in bodies:
         raise ModelError(f"{what}: body {body.name!r} belongs to another builder")
     if isinstance(thing, (NodeSet, SurfaceSet)) and len(thing) == 0:
@@ -80,7 +80,7 @@ def owner_of(thing: Any, what: str, kinds: tuple[type, ...], bodies: list[Body])
     return body
 
 
-def gravity_of(value: Any) -> tuple[np.ndarray, TimeLaw | None]:
+def parse_gravity(value: Any) -> tuple[np.ndarray, TimeLaw | None]:
     """Gravity as (constant (3,), m/s^2, time law or None); the constant is zero with a law."""
     samples = isinstance(value, (tuple, list)) and len(value) == 2 and np.ndim(value[0]) == 1
     if samples or isinstance(value, (wp.Function, Control)) or callable(value):
@@ -101,14 +101,14 @@ def warn_implausible(model: Any) -> None:
     """Warn (MeshWarning) of a size, mass or density that suggests a wrong unit."""
     for body in model.bodies:
         _warn_of_densities(body)
-        _warn_of_constants(body)
+        _warn_of_moduli(body)
         low, high = body.mesh.bounding_box()
         size = float(np.max(high - low))
         mass = None
         if all(material.density is not None for _, material in body.materials):
             mass = float(model.lumped_host[body.slots][body.slot_kind == 0].sum())
-        large = size > SIZES[1] or (mass is not None and mass > MASSES[1])
-        small = size < SIZES[0] or (mass is not None and mass < MASSES[0])
+        large = size > SIZE_RANGE[1] or (mass is not None and mass > MASS_RANGE[1])
+        small = size < SIZE_RANGE[0] or (mass is not None and mass < MASS_RANGE[0])
         if not (large or small):
             continue
         what = f"is {size:.3g} m long" + ("" if mass is None else f" and weighs {mass:.3g} kg")
@@ -120,14 +120,14 @@ def warn_implausible(model: Any) -> None:
         warnings.warn(f"body {body.name!r} {what}: {hint}", MeshWarning, stacklevel=3)
 
 
-def _warn_of_constants(body: Body) -> None:
+def _warn_of_moduli(body: Body) -> None:
     """Warn of a metal with E probably in MPa, and of volumetric locking of solids."""
     for group, material in body.materials:
         law = type(material).__name__ + (f" of group {group!r}" if group else "")
         lam, mu = material.lame
         E, nu = mu * (3.0 * lam + 2.0 * mu) / (lam + mu), lam / (2.0 * (lam + mu))
         dense = material.density is not None and not callable(material.density)
-        if dense and E < LEAST_E and (low := float(np.min(material.density))) > METAL:
+        if dense and E < MIN_METAL_E and (low := float(np.min(material.density))) > METAL_DENSITY:
             speed = math.sqrt(E / low)
             warnings.warn(
                 f"body {body.name!r}: {law} with E = {E:.3g} Pa and {low:.4g} kg/m^3: implausible wave speed "
@@ -135,9 +135,9 @@ def _warn_of_constants(body: Body) -> None:
                 ModelWarning,
                 stacklevel=4,
             )
-        if body.family.solid and nu > LARGEST_NU:
+        if body.family.solid and nu > MAX_NU:
             warnings.warn(
-                f"body {body.name!r}: {law} with nu = {nu:.6g}: volumetric locking above {LARGEST_NU}: use nu=0.49, "
+                f"body {body.name!r}: {law} with nu = {nu:.6g}: volumetric locking above {MAX_NU}: use nu=0.49, "
                 "or refine the mesh until the result is stable",
                 ModelWarning,
                 stacklevel=4,
@@ -151,8 +151,8 @@ def _warn_of_densities(body: Body) -> None:
         values = material.density(body.mesh.points) if callable(material.density) else material.density
         low = float(np.min(values))
         lam, mu = material.lame
-        stiff = mu * (3.0 * lam + 2.0 * mu) / (lam + mu) > STIFFEST_FOAM
-        if low >= (FOAM if stiff else LEAST_DENSITY):
+        stiff = mu * (3.0 * lam + 2.0 * mu) / (lam + mu) > MAX_FOAM_E
+        if low >= (FOAM_DENSITY if stiff else MIN_DENSITY):
             continue
         law = type(material).__name__ + (f" of group {group!r}" if group else "")
         warnings.warn(
@@ -174,7 +174,7 @@ def vector(value: Any, what: str) -> np.ndarray:
     return out
 
 
-def nodal(values: Any, nodes: int, what: str) -> np.ndarray:
+def nodal_vectors(values: Any, nodes: int, what: str) -> np.ndarray:
     """(nodes, 3) from one vector or one per node. ModelError for another shape or values that are not finite."""
     out = np.asarray(values, dtype=float)
     if out.shape == (3,):
@@ -199,14 +199,15 @@ def slot_field(body: Body, values: Any, what: str) -> np.ndarray:
     """
     X = body.mesh.points
     if callable(values):
-        out = nodal(values(X), len(X), what)[body.slot_node]
+        out = nodal_vectors(values(X), len(X), what)[body.slot_node]
         gradient = np.flatnonzero(body.slot_kind > 0)
         if len(gradient):
             node = body.slot_node[gradient]
-            step = _node_sizes(body.mesh)[node, None] / 256.0
+            step = _node_cell_sizes(body.mesh)[node, None] / 256.0
             at, along = X[node], step * body.reference[gradient]
             far, near = (
-                nodal(values(at + k * along), len(at), what) - nodal(values(at - k * along), len(at), what)
+                nodal_vectors(values(at + k * along), len(at), what)
+                - nodal_vectors(values(at - k * along), len(at), what)
                 for k in (2.0, 1.0)
             )
             out[gradient] = (8.0 * near - far) / (12.0 * step)
@@ -216,10 +217,10 @@ def slot_field(body: Body, values: Any, what: str) -> np.ndarray:
             f"{what}: body {body.name!r} of element {body.family.name} has gradients at its nodes; give a function "
             "X (n, 3) -> (n, 3), or one vector (3,)"
         )
-    return np.where((body.slot_kind == 0)[:, None], nodal(values, len(X), what)[body.slot_node], 0.0)
+    return np.where((body.slot_kind == 0)[:, None], nodal_vectors(values, len(X), what)[body.slot_node], 0.0)
 
 
-def _node_sizes(mesh: Mesh) -> np.ndarray:
+def _node_cell_sizes(mesh: Mesh) -> np.ndarray:
     """Extent (m) of the smallest cell at each node (nodes,), 1 for nodes without cells."""
     x = mesh.points[mesh.cells]
     extent = np.max(x.max(axis=1) - x.min(axis=1), axis=1)
@@ -231,10 +232,10 @@ def _node_sizes(mesh: Mesh) -> np.ndarray:
 def component_mask(text: str, what: str) -> np.ndarray:
     """(3,) ones for the letters of "xyz" in the argument."""
     out = np.zeros(3)
-    if not isinstance(text, str) or not text or any(c not in COMPONENTS for c in text):
+    if not isinstance(text, str) or not text or any(c not in COMPONENT_INDEX for c in text):
         raise ModelError(f"{what}: components = {text!r} must be letters of 'xyz'")
     for c in text:
-        out[COMPONENTS[c]] = 1.0
+        out[COMPONENT_INDEX[c]] = 1.0
     return out
 
 
@@ -253,7 +254,8 @@ def assign_materials(name: str, mesh: Mesh, material: Any) -> tuple[list[tuple[s
         if group not in mesh.element_sets:
             raise ModelError(
                 f"body {name!r}: material group {group!r} is not an element group of {mesh.label}; there are "
-                f"{listing(sorted(mesh.element_sets))}{did_you_mean(group, mesh.element_sets)}{_bare_volume(mesh)}"
+                f"{listing(sorted(mesh.element_sets))}{did_you_mean(group, mesh.element_sets)}"
+                f"{_missing_group_hint(mesh)}"
             )
         members = mesh.element_sets[group]
         twice = members[index[members] >= 0]
@@ -270,7 +272,7 @@ def assign_materials(name: str, mesh: Mesh, material: Any) -> tuple[list[tuple[s
     return list(material.items()), index
 
 
-def _bare_volume(mesh: Mesh) -> str:
+def _missing_group_hint(mesh: Mesh) -> str:
     """Hint for a mesh without element groups."""
     if mesh.element_sets:
         return ""

@@ -21,20 +21,20 @@ from ..time_laws import time_law
 from .bodies import unused_name
 from .checks import vector
 
-__all__ = ["CONTACT_LAWS", "CONTACT_MODELS", "OVERLAPS", "TREATMENTS", "contact_surface", "make_collider",
-           "make_contact", "make_pair"]  # fmt: skip
+__all__ = ["CONTACT_LAWS", "CONTACT_MODELS", "OVERLAP_OPTIONS", "TIME_TREATMENTS", "make_collider", "make_contact",
+           "make_pair", "outer_surface"]  # fmt: skip
 
 CONTACT_LAWS = ("default", "paper", "smooth")
-TREATMENTS = ("implicit", "explicit")
+TIME_TREATMENTS = ("implicit", "explicit")
 CONTACT_MODELS = ("patch", "sphere")
-OVERLAPS = ("refuse", "offset")
-SHAPES = "HalfSpace, Sphere, Box, Capsule, Cylinder or TriMesh"
+OVERLAP_OPTIONS = ("refuse", "offset")
+SHAPE_NAMES = "HalfSpace, Sphere, Box, Capsule, Cylinder or TriMesh"
 
 
 def make_collider(d: Description, shape: Any, path: Any, name: str | None) -> Collider:
     """See ModelBuilder.add_collider."""
     if not isinstance(shape, Shape):
-        raise ModelError(f"add_collider: expected a shape ({SHAPES}), got {shape!r}")
+        raise ModelError(f"add_collider: expected a shape ({SHAPE_NAMES}), got {shape!r}")
     default = {"HalfSpace": "half_space", "TriMesh": "mesh"}.get(type(shape).__name__, type(shape).__name__.lower())
     name = unused_name(name, default, {c.name for c in d.colliders}, "collider")
     out = Collider(shape, name, index=len(d.colliders))
@@ -50,7 +50,7 @@ def make_collider(d: Description, shape: Any, path: Any, name: str | None) -> Co
     return out
 
 
-def contact_surface(thing: Body | SurfaceSet) -> SurfaceSet:
+def outer_surface(thing: Body | SurfaceSet) -> SurfaceSet:
     """A surface, or all outer faces of a body.
 
     Raises:
@@ -99,10 +99,10 @@ def make_contact(d: Description, thing: Body | SurfaceSet, collider: Any, name: 
         raise ModelError(f"add_contact: expected a collider, as add_collider returns, got {collider!r}")
     if collider not in d.colliders:
         raise ModelError(f"add_contact: collider {collider.name!r} belongs to another builder")
-    surface = contact_surface(thing)
+    surface = outer_surface(thing)
     default = f"{surface.body.name} on {collider.name}"
     name = unused_name(name, default, {c.name for c in d.contacts} | {c.name for c in d.pairs}, "contact")
-    o = _checked(f"contact {name!r}", surface, dict(options))
+    o = _checked_options(f"contact {name!r}", surface, dict(options))
     if o["model"] == "sphere" and isinstance(collider.shape, TriMesh) and not collider.shape.closed:
         raise ModelError(
             f"contact {name!r}: collider {collider.name!r} is a sheet of triangles, and model = 'sphere' needs an "
@@ -115,7 +115,7 @@ def make_pair(
     d: Description, first: Body | SurfaceSet, second: Body | SurfaceSet, name: str | None, **options: Any
 ) -> PairContact:  # fmt: skip
     """See ModelBuilder.add_contact, with two bodies."""
-    a, b = contact_surface(first), contact_surface(second)
+    a, b = outer_surface(first), outer_surface(second)
     if a.body is b.body:
         raise NotImplementedError(
             f"add_contact: body {a.body.name!r} with itself is not part of this version; give two bodies"
@@ -131,7 +131,7 @@ def make_pair(
         )
     slave, master = slave_and_master(a, b)
     points, options["points"] = options["points"], None
-    o = _checked(what, slave, dict(options))
+    o = _checked_options(what, slave, dict(options))
     corners = {len(slave.body.family.faces[int(face)]) for face in np.unique(slave.faces[:, 1])}
     for k in corners:
         if points is not None and (not is_count(points) or points not in PAIR_RULES[k]):
@@ -143,10 +143,10 @@ def make_pair(
     return PairContact(a, b, name, slave, master, index=len(d.pairs), **o)
 
 
-def _checked(what: str, surface: SurfaceSet, o: dict[str, Any]) -> dict[str, Any]:
+def _checked_options(what: str, surface: SurfaceSet, o: dict[str, Any]) -> dict[str, Any]:
     """Contact options with None replaced by defaults. ModelError names the invalid one."""
-    for option, known in (("law", CONTACT_LAWS), ("treatment", TREATMENTS), ("model", CONTACT_MODELS),
-                          ("overlap", OVERLAPS)):  # fmt: skip
+    for option, known in (("law", CONTACT_LAWS), ("treatment", TIME_TREATMENTS), ("model", CONTACT_MODELS),
+                          ("overlap", OVERLAP_OPTIONS)):  # fmt: skip
         if o[option] not in known:
             hint = did_you_mean(o[option], known)
             raise ModelError(f"{what}: {option} = {o[option]!r} is none of {', '.join(map(repr, known))}{hint}")

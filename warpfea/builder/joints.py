@@ -21,18 +21,19 @@ from ..base.names import did_you_mean
 from ..kernels.terms.constraints import ANGLE, DISTANCE, DOT
 from ..model.joints import Joint, Row, Vector, constant
 from ..time_laws import TimeLaw, time_law
-from .attachments import COINCIDENT, GROUND, UNKNOWN_WEAKNESS, Attachment, Ground, attach
+from .attachments import COINCIDENCE_TOL, GROUND, UNKNOWN_WEAKNESS, Attachment, Ground, make_attachment
 from .checks import vector
 
-__all__ = ["GROUND", "JOINTS", "Ground", "make_constraint", "make_joint", "pin_rows"]
+__all__ = ["GROUND", "JOINT_KINDS", "Ground", "make_constraint", "make_joint", "pin_rows"]
 
-JOINTS = ("spherical", "universal", "revolute", "cylindrical", "translational", "fixed", "distance")
-NEEDS_AXIS = ("universal", "revolute", "cylindrical", "translational")
-DRIVEN = ("revolute", "translational", "distance")
-PINNED = ("spherical", "universal", "revolute", "fixed")
-CONSTRAINTS = {"DP1": 4, "DP2": 4, "DIST": 2, "PIN": 2}
-Angle = tuple[Vector, Vector, Vector]
-"""Vectors (a, a2, b), see `_angle`."""
+JOINT_KINDS = ("spherical", "universal", "revolute", "cylindrical", "translational", "fixed", "distance")
+KINDS_WITH_AXIS = ("universal", "revolute", "cylindrical", "translational")
+DRIVABLE_KINDS = ("revolute", "translational", "distance")
+KINDS_WITH_PIN = ("spherical", "universal", "revolute", "fixed")
+CONSTRAINT_POINTS = {"DP1": 4, "DP2": 4, "DIST": 2, "PIN": 2}
+"""Number of points of each kind."""
+AngleVectors = tuple[Vector, Vector, Vector]
+"""Vectors (a, a2, b) of the angle atan2(a2.b, a.b), see `_angle_vectors`."""
 
 
 def make_joint(
@@ -40,82 +41,84 @@ def make_joint(
 ) -> Joint:  # fmt: skip
     """Compose a joint. ModelError naming the joint and the error."""
     what = f"joint {name!r}"
-    P, Q = _sides(what, kind, parent, child)
+    P, Q = _attachments(what, kind, parent, child)
     if axis2 is not None and kind != "universal":
         raise ModelError(f"{what}: only universal joints have an axis2")
     law = None
     if drive is not None:
-        if kind not in DRIVEN:
-            raise ModelError(f"{what}: a {kind} joint can't be driven; {', '.join(DRIVEN)} can")
+        if kind not in DRIVABLE_KINDS:
+            raise ModelError(f"{what}: a {kind} joint can't be driven; {', '.join(DRIVABLE_KINDS)} can")
         law = time_law(drive, f"{what}: drive", scalar=True)
     if kind == "distance":
         if axis is not None:
             raise ModelError(f"{what}: a distance joint has no axis")
-        return _distance(what, name, P, Q, anchor, law)
-    if (axis is None) == (kind in NEEDS_AXIS):
+        return _distance_joint(what, name, P, Q, anchor, law)
+    if (axis is None) == (kind in KINDS_WITH_AXIS):
         raise ModelError(f"{what}: a {kind} joint {'needs an axis' if axis is None else 'has no axis'}")
-    at = _anchor(what, P, Q, anchor)
-    n = None if axis is None else _unit(axis, f"{what}: axis")
+    at = _joint_anchor(what, P, Q, anchor)
+    n = None if axis is None else _unit_vector(axis, f"{what}: axis")
     x_p, x_c = P.position(at, what), Q.position(at, what)
     gap = Vector(np.zeros(3), (x_c - x_p).parts)
-    rows = pin_rows(gap) if kind in PINNED else []
+    rows = pin_rows(gap) if kind in KINDS_WITH_PIN else []
     angle = travel = None
     if kind == "fixed":
-        rows += _locked(P, Q, what)
+        rows += _fixed_rotation_rows(P, Q, what)
     elif kind == "universal":
         assert n is not None
-        rows.append(_cross(n, axis2, P, Q, what))
+        rows.append(_cross_row(n, axis2, P, Q, what))
     elif n is not None:
-        more, angle, travel = _guide(kind, n, gap, P, Q, what)
+        more, angle, travel = _guide_rows(kind, n, gap, P, Q, what)
         rows += more
     if law is not None:
-        rows.append(_driven(kind, angle, travel, law, P, Q, what))
-    return Joint(name, kind, rows, x_c, _between(P, Q), angle, travel)
+        rows.append(_drive_row(kind, angle, travel, law, P, Q, what))
+    return Joint(name, kind, rows, x_c, _pair_label(P, Q), angle, travel)
 
 
-def _sides(what: str, kind: str, parent: Any, child: Any) -> tuple[Attachment, Attachment]:
+def _attachments(what: str, kind: str, parent: Any, child: Any) -> tuple[Attachment, Attachment]:
     """Parent and child of a joint. ModelError for an unknown kind, two grounds, or identical attachment points."""
-    if kind not in JOINTS:
-        raise ModelError(f"{what}: kind {kind!r} is unknown; there are {', '.join(JOINTS)}{did_you_mean(kind, JOINTS)}")
-    P, Q = attach(parent, f"{what}: parent", child=False), attach(child, f"{what}: child", child=True)
+    if kind not in JOINT_KINDS:
+        raise ModelError(
+            f"{what}: kind {kind!r} is unknown; there are {', '.join(JOINT_KINDS)}{did_you_mean(kind, JOINT_KINDS)}"
+        )
+    P, Q = make_attachment(parent, f"{what}: parent", child=False), make_attachment(child, f"{what}: child", child=True)
     if P.body is None and Q.body is None:
         raise ModelError(f"{what}: neither parent nor child is a body")
-    if P.same_as(Q):
+    if P.coincides_with(Q):
         raise ModelError(f"{what}: parent and child are the same place, {P.label}")
     return P, Q
 
 
-def _cross(n: np.ndarray, axis2: Any, P: Attachment, Q: Attachment, what: str) -> Row:
+def _cross_row(n: np.ndarray, axis2: Any, P: Attachment, Q: Attachment, what: str) -> Row:
     """Perpendicular axes of a universal joint, n on the parent and axis2 on the child."""
-    m = _perpendicular(n) if axis2 is None else _unit(axis2, f"{what}: axis2")
+    m = _perpendicular_to(n) if axis2 is None else _unit_vector(axis2, f"{what}: axis2")
     if abs(n @ m) > 1e-6:
         raise ModelError(f"{what}: axis2 = {axis2!r} must be perpendicular to the axis")
-    m = _orthogonal(m, n)
-    return _dp(P.direction(n, what), Q.direction(m, what))
+    m = _orthogonalise(m, n)
+    return _dot_row(P.direction(n, what), Q.direction(m, what))
 
 
-def _guide(
+def _guide_rows(
     kind: str, n: np.ndarray, gap: Vector, P: Attachment, Q: Attachment, what: str
-) -> tuple[list[Row], Angle | None, tuple[Vector, Vector] | None]:
+) -> tuple[list[Row], AngleVectors | None, tuple[Vector, Vector] | None]:
     """Rows of a revolute, cylindrical or translational joint besides its pin; vectors of its angle and travel."""
-    u, w = _pair(n, P, Q)
+    u, w = _perpendicular_pair(n, P, Q)
     if P.weakness(n) + Q.weakness(u) + Q.weakness(w) <= Q.weakness(n) + P.weakness(u) + P.weakness(w):
-        rows = [_dp(P.direction(n, what), Q.direction(d, what)) for d in (u, w)]
+        rows = [_dot_row(P.direction(n, what), Q.direction(d, what)) for d in (u, w)]
     else:
-        rows = [_dp(P.direction(d, what), Q.direction(n, what)) for d in (u, w)]
+        rows = [_dot_row(P.direction(d, what), Q.direction(n, what)) for d in (u, w)]
     travel = None
     if kind != "revolute":
         rows += [Row(DOT, gap, P.direction(d, what)) for d in (u, w)]
         travel = (gap, P.direction(n, what))
     if kind != "translational":
-        return rows, _angle(n, u, w, P, Q, what), travel
+        return rows, _angle_vectors(n, u, w, P, Q, what), travel
     a, b = min(((u, w), (w, u)), key=lambda d: P.weakness(d[0]) + Q.weakness(d[1]))
-    return [*rows, _dp(P.direction(a, what), Q.direction(b, what))], None, travel
+    return [*rows, _dot_row(P.direction(a, what), Q.direction(b, what))], None, travel
 
 
-def _driven(
-    kind: str, angle: Angle | None, travel: tuple[Vector, Vector] | None, law: TimeLaw, P: Attachment, Q: Attachment,
-    what: str,
+def _drive_row(
+    kind: str, angle: AngleVectors | None, travel: tuple[Vector, Vector] | None, law: TimeLaw, P: Attachment,
+    Q: Attachment, what: str,
 ) -> Row:  # fmt: skip
     """Row of the prescribed angle of a revolute joint, or of the travel of a translational one."""
     if kind != "revolute":
@@ -129,7 +132,7 @@ def _driven(
     return Row(ANGLE, first, turned, 1.0, second, law, angular=True)
 
 
-def _between(P: Attachment, Q: Attachment) -> str:
+def _pair_label(P: Attachment, Q: Attachment) -> str:
     return f"{P.label} and {Q.label}"
 
 
@@ -146,16 +149,16 @@ def _right_side(law: TimeLaw | None, component: int = 0) -> dict[str, Any]:
     return {"law": replace(law, ramped=False) if law is not None and law.control is not None else law}
 
 
-def _dp(a: Vector, b: Vector) -> Row:
+def _dot_row(a: Vector, b: Vector) -> Row:
     """Perpendicular directions; the cosine times the model's size is the violation."""
-    return Row(DOT, a, b, _scale(a, b), angular=True)
+    return Row(DOT, a, b, _inverse_lengths(a, b), angular=True)
 
 
-def _scale(a: Vector, b: Vector) -> float:
+def _inverse_lengths(a: Vector, b: Vector) -> float:
     return 1.0 / float(np.linalg.norm(a.value) * np.linalg.norm(b.value))
 
 
-def _locked(P: Attachment, Q: Attachment, what: str) -> list[Row]:
+def _fixed_rotation_rows(P: Attachment, Q: Attachment, what: str) -> list[Row]:
     """Three DP1 between two aligned triads, the pairs chosen among directions that both sides carry."""
     triads = [np.eye(3)]
     for side in (Q, P):
@@ -173,12 +176,12 @@ def _locked(P: Attachment, Q: Attachment, what: str) -> list[Row]:
                 if best is None or cost < best[0] - 1e-9:
                     best = (cost, [(triad[a], triad[b]) for a, b in chosen])
     assert best is not None
-    return [_dp(P.direction(a, what), Q.direction(b, what)) for a, b in best[1]]
+    return [_dot_row(P.direction(a, what), Q.direction(b, what)) for a, b in best[1]]
 
 
-def _pair(n: np.ndarray, P: Attachment, Q: Attachment) -> tuple[np.ndarray, np.ndarray]:
+def _perpendicular_pair(n: np.ndarray, P: Attachment, Q: Attachment) -> tuple[np.ndarray, np.ndarray]:
     """Two directions completing a right-handed triad (u, w, n), along the weakly held direction if any."""
-    u = _perpendicular(n)
+    u = _perpendicular_to(n)
     for side in (Q, P):
         if side.body is not None and side.weak_directions.any():
             lean = side.weak_directions - np.outer(side.weak_directions @ n, n)
@@ -190,7 +193,9 @@ def _pair(n: np.ndarray, P: Attachment, Q: Attachment) -> tuple[np.ndarray, np.n
     return u, np.cross(n, u)
 
 
-def _angle(n: np.ndarray, u: np.ndarray, w: np.ndarray, P: Attachment, Q: Attachment, what: str) -> Angle | None:
+def _angle_vectors(
+    n: np.ndarray, u: np.ndarray, w: np.ndarray, P: Attachment, Q: Attachment, what: str
+) -> AngleVectors | None:
     """Vectors (a, a2, b) of the joint angle atan2(a2.b, a.b) about n, or None."""
     options: list[Any] = []
     for first, second in ((u, w), (w, -u)):
@@ -203,13 +208,13 @@ def _angle(n: np.ndarray, u: np.ndarray, w: np.ndarray, P: Attachment, Q: Attach
     return pair.direction(first, what), pair.direction(second, what), other.direction(first, what)
 
 
-def _anchor(what: str, P: Attachment, Q: Attachment, anchor: Any) -> np.ndarray:
+def _joint_anchor(what: str, P: Attachment, Q: Attachment, anchor: Any) -> np.ndarray:
     if anchor is not None:
         return vector(anchor, f"{what}: anchor")
     at = Q.X if Q.body is not None else P.X
     if P.body is not None and Q.body is not None:
         apart = float(np.linalg.norm(P.X - Q.X))
-        if apart > COINCIDENT * max(P.size, Q.size):
+        if apart > COINCIDENCE_TOL * max(P.size, Q.size):
             raise ModelError(
                 f"{what}: {P.label} and {Q.label} are {apart:.6g} m apart: give anchor= to keep the offset, or pin "
                 "both with value=(0, 0, 0) and call solve_static to close it"
@@ -217,7 +222,7 @@ def _anchor(what: str, P: Attachment, Q: Attachment, anchor: Any) -> np.ndarray:
     return at
 
 
-def _distance(what: str, name: str, P: Attachment, Q: Attachment, anchor: Any, law: TimeLaw | None) -> Joint:
+def _distance_joint(what: str, name: str, P: Attachment, Q: Attachment, anchor: Any, law: TimeLaw | None) -> Joint:
     ends = []
     for side in (P, Q):
         if side.body is None and np.isnan(side.X).any():
@@ -228,13 +233,15 @@ def _distance(what: str, name: str, P: Attachment, Q: Attachment, anchor: Any, l
             ends.append(side.position(side.X, what))
     if anchor is not None and P.body is not None and Q.body is not None:
         raise ModelError(f"{what}: a distance joint between two bodies ends at their points; it has no anchor")
-    return Joint(name, "distance", [_dist(what, ends[0], ends[1], law, max(P.size, Q.size))], ends[1], _between(P, Q))
+    return Joint(
+        name, "distance", [_distance_row(what, ends[0], ends[1], law, max(P.size, Q.size))], ends[1], _pair_label(P, Q)
+    )
 
 
-def _dist(what: str, p: Vector, q: Vector, law: TimeLaw | None, size: float) -> Row:
+def _distance_row(what: str, p: Vector, q: Vector, law: TimeLaw | None, size: float) -> Row:
     gap = q - p
     length = float(np.linalg.norm(gap.value))
-    if length <= COINCIDENT * size:
+    if length <= COINCIDENCE_TOL * size:
         raise ModelError(f"{what}: its two points coincide, so that the distance has no direction; pin them instead")
     if law is not None and len(law.values) and law.values[:, 0].min() <= 0.0:
         raise ModelError(f"{what}: the distance must be positive, the law falls to {law.values[:, 0].min():g} m")
@@ -246,7 +253,7 @@ def _dist(what: str, p: Vector, q: Vector, law: TimeLaw | None, size: float) -> 
     return Row(DISTANCE, gap, constant(np.zeros(3)), **(_right_side(law) if law else {"fixed": length}))
 
 
-def _unit(value: Any, what: str) -> np.ndarray:
+def _unit_vector(value: Any, what: str) -> np.ndarray:
     n = vector(value, what)
     size = np.linalg.norm(n)
     if not size > 0.0:
@@ -254,15 +261,15 @@ def _unit(value: Any, what: str) -> np.ndarray:
     return n / size
 
 
-def _orthogonal(m: np.ndarray, n: np.ndarray) -> np.ndarray:
+def _orthogonalise(m: np.ndarray, n: np.ndarray) -> np.ndarray:
     m = m - (m @ n) * n
     return m / np.linalg.norm(m)
 
 
-def _perpendicular(n: np.ndarray) -> np.ndarray:
+def _perpendicular_to(n: np.ndarray) -> np.ndarray:
     """A unit vector perpendicular to n, along a global axis if n is."""
     e = np.eye(3)[int(np.argmin(np.abs(n)))]
-    return _orthogonal(e, n)
+    return _orthogonalise(e, n)
 
 
 # single constraints
@@ -275,52 +282,53 @@ def make_constraint(kind: str, points: Any, value: Any, name: str) -> Joint:
         ModelError: an unknown kind, a wrong number of points, or points that coincide where a direction is needed.
     """
     what = f"constraint {name!r} ({kind})"
-    places = _places(what, kind, points)
-    size = max(p.size for p in places)
-    x = [p.position(p.X, what) for p in places]
-    between = ", ".join(p.label for p in places)
+    attachments = _constraint_points(what, kind, points)
+    size = max(p.size for p in attachments)
+    x = [p.position(p.X, what) for p in attachments]
+    between = ", ".join(p.label for p in attachments)
     if kind == "PIN":
-        return Joint(name, kind, _pin(what, x[0] - x[1], value, size), x[1], between)
+        return Joint(name, kind, _coincidence_rows(what, x[0] - x[1], value, size), x[1], between)
     law = None if value is None else time_law(value, f"{what}: value", scalar=True)
     if kind == "DIST":
-        return Joint(name, kind, [_dist(what, x[0], x[1], law, size)], x[1], between)
+        return Joint(name, kind, [_distance_row(what, x[0], x[1], law, size)], x[1], between)
     a, b = x[1] - x[0], x[3] - x[2]
-    if kind == "DP2" and places[2].body is not places[0].body:
+    if kind == "DP2" and attachments[2].body is not attachments[0].body:
         raise ModelError(f"{what}: its third point must be on the body of the first two; use DP1")
     for label, v in (("P and Q", a), ("R and T", b)):
-        if np.linalg.norm(v.value) <= COINCIDENT * size:
+        if np.linalg.norm(v.value) <= COINCIDENCE_TOL * size:
             raise ModelError(f"{what}: its points {label} coincide, so that it has no direction")
-    return Joint(name, kind, [Row(DOT, a, b, _scale(a, b), angular=True, **_right_side(law))], x[3], between)
+    return Joint(name, kind, [Row(DOT, a, b, _inverse_lengths(a, b), angular=True, **_right_side(law))], x[3], between)
 
 
-def _places(what: str, kind: str, points: Any) -> list[Attachment]:
+def _constraint_points(what: str, kind: str, points: Any) -> list[Attachment]:
     """Points of a single constraint. ModelError for an unknown kind, a wrong number, or no point on a body."""
-    if kind not in CONSTRAINTS:
+    if kind not in CONSTRAINT_POINTS:
         raise ModelError(
-            f"{what}: the kind is unknown; there are {', '.join(CONSTRAINTS)}{did_you_mean(kind, CONSTRAINTS)}"
+            f"{what}: the kind is unknown; there are {', '.join(CONSTRAINT_POINTS)}"
+            f"{did_you_mean(kind, CONSTRAINT_POINTS)}"
         )
-    count = CONSTRAINTS[kind]
+    count = CONSTRAINT_POINTS[kind]
     if not isinstance(points, (tuple, list)) or len(points) != count:
         raise ModelError(f"{what}: points must be {count} points, got {points!r}")
-    places = []
+    attachments = []
     for k, point in enumerate(points):
         if isinstance(point, Ground):
             raise ModelError(f"{what}: a point of the ground is given by its place (x, y, z)")
-        places.append(attach(point, f"{what}: point {k + 1}", child=k == count - 1))
-    first, last = places[0], places[-1]
-    if count == 4 and places[2].body is last.body is not first.body:
-        places[2] = replace(places[2], child=True)  # DP1 acts on the last point's body with a couple
-    if all(p.body is None for p in places):
+        attachments.append(make_attachment(point, f"{what}: point {k + 1}", child=k == count - 1))
+    first, last = attachments[0], attachments[-1]
+    if count == 4 and attachments[2].body is last.body is not first.body:
+        attachments[2] = replace(attachments[2], child=True)  # DP1 acts on the last point's body with a couple
+    if all(p.body is None for p in attachments):
         raise ModelError(f"{what}: none of its points belongs to a body")
-    return places
+    return attachments
 
 
-def _pin(what: str, gap: Vector, value: Any, size: float) -> list[Row]:
+def _coincidence_rows(what: str, gap: Vector, value: Any, size: float) -> list[Row]:
     """Rows of P - Q = value, or of coincident points. ModelError for distinct points without a value."""
     if value is not None:
         return pin_rows(gap, time_law(value, f"{what}: value"))
     apart = float(np.linalg.norm(gap.value))
-    if apart > COINCIDENT * size:
+    if apart > COINCIDENCE_TOL * size:
         raise ModelError(
             f"{what}: its points are {apart:.6g} m apart in the reference; value=(x, y, z) prescribes P - Q"
         )

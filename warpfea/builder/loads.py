@@ -20,11 +20,11 @@ __all__ = [
     "check_field",
     "dead_traction",
     "follower_pressure",
+    "moment_load",
     "point_load",
     "probe_at",
     "set_initial_positions",
     "set_initial_state",
-    "spin_moment",
 ]
 
 
@@ -39,7 +39,7 @@ def point_load(body: Body, point: MaterialPoint | NodeSet, force: Any) -> DeadLo
     return DeadLoad(body, slots, weights, law, "point load")
 
 
-def spin_moment(body: Body, point: MaterialPoint | NodeSet, moment: Any) -> Moment:
+def moment_load(body: Body, point: MaterialPoint | NodeSet, moment: Any) -> Moment:
     """See ModelBuilder.add_moment."""
     law = time_law(moment, f"moment on {body.name!r}")
     if isinstance(point, MaterialPoint):

@@ -15,7 +15,7 @@ import numpy as np
 from ..base.errors import ModelError
 from ..base.usercode import user_code
 
-__all__ = ["Reference", "read_reference", "reference_of"]
+__all__ = ["Reference", "make_reference", "read_reference"]
 
 Positions = Callable[[np.ndarray], np.ndarray] | tuple[Any, Any]
 
@@ -55,7 +55,7 @@ def _check_samples(what: str, times: Any, positions: Any) -> None:
         raise ModelError(f"{what}: times must ascend, at least one")
 
 
-def reference_of(given: Any, parameters: Mapping[str, Any]) -> Reference | None:
+def make_reference(given: Any, parameters: Mapping[str, Any]) -> Reference | None:
     """Reference of a scene for the given parameter values; None if it has none.
 
     Args:

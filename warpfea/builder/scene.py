@@ -41,7 +41,7 @@ __all__ = ["Parameter", "Scene", "find", "load_file", "locate", "names", "scene"
 
 P = ParamSpec("P")
 REQUIRED = inspect.Parameter.empty
-_BOOL = {"true": True, "yes": True, "on": True, "1": True, "false": False, "no": False, "off": False, "0": False}
+_BOOL_WORDS = {"true": True, "yes": True, "on": True, "1": True, "false": False, "no": False, "off": False, "0": False}
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ class Scene(Generic[P]):
         text = inspect.getdoc(function) or ""
         self.description = text.split("\n\n")[0].replace("\n", " ").strip()
         self.details = text.partition("\n\n")[2].partition("Args:")[0].strip()
-        self.parameters = _parameters(function, text)
+        self.parameters = _read_parameters(function, text)
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> ModelBuilder:
         return self.function(*args, **kwargs)
@@ -130,7 +130,7 @@ class Scene(Generic[P]):
                 raise ModelError(f"--set {setting}: expected name=value")
             if name not in self.parameters:
                 hint = did_you_mean(name, self.parameters)
-                raise ModelError(f"scene {self.name!r} has no parameter {name!r}; {self._listing()}{hint}")
+                raise ModelError(f"scene {self.name!r} has no parameter {name!r}; {self._parameter_listing()}{hint}")
             if name in out:
                 raise ModelError(f"--set {name}: given twice")
             try:
@@ -166,7 +166,7 @@ class Scene(Generic[P]):
             raise ModelError(f"scene {self.name!r} must return a ModelBuilder, it returned {type(out).__name__}")
         return out
 
-    def _listing(self) -> str:
+    def _parameter_listing(self) -> str:
         if not self.parameters:
             return "it has none"
         texts = [p.name + ("" if p.required else f"={p.default}") for p in self.parameters.values()]
@@ -291,7 +291,7 @@ def load_file(path: str | pathlib.Path) -> dict[str, Scene[Any]]:
         spec.loader.exec_module(module)
     except Exception as error:
         del sys.modules[name]
-        raise ModelError(f"{_place(error, file)}: {type(error).__name__}: {error}") from error
+        raise ModelError(f"{_error_location(error, file)}: {type(error).__name__}: {error}") from error
     finally:
         sys.path.remove(str(folder))
     every = {item.name: item for item in vars(module).values() if isinstance(item, Scene)}
@@ -301,7 +301,7 @@ def load_file(path: str | pathlib.Path) -> dict[str, Scene[Any]]:
     return own or every
 
 
-def _place(error: BaseException, file: pathlib.Path) -> str:
+def _error_location(error: BaseException, file: pathlib.Path) -> str:
     """`file:line` of the deepest frame of an error that lies in the file."""
     if isinstance(error, SyntaxError):
         return f"{error.filename or file}:{error.lineno}"
@@ -317,7 +317,7 @@ def _place(error: BaseException, file: pathlib.Path) -> str:
 # parameters
 
 
-def _parameters(function: Callable[..., Any], text: str) -> dict[str, Parameter]:
+def _read_parameters(function: Callable[..., Any], text: str) -> dict[str, Parameter]:
     docs = _argument_docs(text)
     try:
         hints = typing.get_type_hints(function)
@@ -376,15 +376,15 @@ def _parse(text: str, kind: Any) -> Any:
         raise ValueError(f"{text!r} is not {_kind_name(kind)}")
     if origin is tuple or kind is tuple:
         return _parse_tuple(text, kind, arguments or (float, Ellipsis))
-    if kind not in _SCALARS:
+    if kind not in _SCALAR_PARSERS:
         raise ValueError(f"{text!r} can't be read as {_kind_name(kind)}")
-    return _SCALARS[kind](text)
+    return _SCALAR_PARSERS[kind](text)
 
 
 def _parse_bool(text: str) -> bool:
-    if text.lower() not in _BOOL:
+    if text.lower() not in _BOOL_WORDS:
         raise ValueError(f"{text!r} is not true or false")
-    return _BOOL[text.lower()]
+    return _BOOL_WORDS[text.lower()]
 
 
 def _parse_int(text: str) -> int:
@@ -404,7 +404,7 @@ def _parse_float(text: str) -> float:
     return value
 
 
-_SCALARS: dict[Any, Callable[[str], Any]] = {
+_SCALAR_PARSERS: dict[Any, Callable[[str], Any]] = {
     bool: _parse_bool, int: _parse_int, float: _parse_float, str: str, pathlib.Path: pathlib.Path,
 }  # fmt: skip
 """Parsers of values other than unions, literals and tuples."""

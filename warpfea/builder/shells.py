@@ -52,11 +52,11 @@ def shell_geometry(name: str, mesh: Mesh, thickness: Any, normals: Any, corners:
             f"{int(e)} lies {math.degrees(math.acos(max(-1.0, agree[e, n]))):.3g} degrees off the mean there. Use one "
             "shell per side, a finer mesh, or corners='weld', which makes a rigid corner"
         )
-    smooth = ~_at_corners(mesh, sharp)
+    smooth = ~_corner_mask(mesh, sharp)
     own = np.where(smooth[:, :, None], d, normal)
-    along, across = (_tangent(a, own, smooth) for a in (along, across))
+    along, across = (_tangent_lines(a, own, smooth) for a in (along, across))
     frames = np.stack([along, across, float(thickness) * own], axis=3)
-    axes = _axes(mesh, director, along)
+    axes = _node_axes(mesh, director, along)
     return axes, np.einsum("enck,encl->enkl", axes[mesh.cells], frames)
 
 
@@ -75,14 +75,14 @@ def _directors(label: str, mesh: Mesh, normal: np.ndarray, given: Any) -> np.nda
     return out / np.where(length > 0.0, length, 1.0)
 
 
-def _at_corners(mesh: Mesh, sharp: np.ndarray) -> np.ndarray:
+def _corner_mask(mesh: Mesh, sharp: np.ndarray) -> np.ndarray:
     """(E, 4) True if the element's node lies on a corner of the surface."""
     nodes = np.zeros(len(mesh.points), dtype=bool)
     nodes[mesh.cells[sharp]] = True
     return nodes[mesh.cells]
 
 
-def _tangent(line: np.ndarray, director: np.ndarray, smooth: np.ndarray) -> np.ndarray:
+def _tangent_lines(line: np.ndarray, director: np.ndarray, smooth: np.ndarray) -> np.ndarray:
     """Lines (E, 4, 3) rotated into the tangent plane; a smooth surface keeps their arc length."""
     flat = line - np.sum(line * director, axis=2, keepdims=True) * director
     length = np.linalg.norm(flat, axis=2, keepdims=True)
@@ -93,7 +93,7 @@ def _tangent(line: np.ndarray, director: np.ndarray, smooth: np.ndarray) -> np.n
     return np.where(smooth[:, :, None], flat / length * arc, line)
 
 
-def _axes(mesh: Mesh, director: np.ndarray, along: np.ndarray) -> np.ndarray:
+def _node_axes(mesh: Mesh, director: np.ndarray, along: np.ndarray) -> np.ndarray:
     """Node axes (nodes, 3, 3): an element's line projected perpendicular to the director, its cross product, the
     director.
     """

@@ -35,10 +35,10 @@ def solid_geometry(name: str, mesh: Mesh, family: Family) -> tuple[Mesh, np.ndar
     if family.parent.low is not None:
         if mesh.cell_type != "hexahedron":
             raise ModelError(f"{label}: element {family.name} needs hexahedra, {mesh.label} has {mesh.cell_type}")
-        return mesh, _frames(mesh, CELL_TYPES["hexahedron"].gradients(family.node_points))
+        return mesh, _node_frames(mesh, CELL_TYPES["hexahedron"].gradients(family.node_points))
     if mesh.cell_type not in ("tetra", "tetra10"):
         raise ModelError(f"{label}: element {family.name} needs tetrahedra, {mesh.label} has {mesh.cell_type}")
-    frames = _frames(mesh, CELL_TYPES[mesh.cell_type].gradients(CORNERS))
+    frames = _node_frames(mesh, CELL_TYPES[mesh.cell_type].gradients(CORNERS))
     corner = linear(mesh)
     if family.cell_type == "tetra":
         return corner, frames
@@ -52,6 +52,6 @@ def solid_geometry(name: str, mesh: Mesh, family: Family) -> tuple[Mesh, np.ndar
     return full, np.concatenate([frames, np.broadcast_to(np.eye(3), (len(frames), 4, 3, 3))], axis=1)
 
 
-def _frames(mesh: Mesh, gradients: np.ndarray) -> np.ndarray:
+def _node_frames(mesh: Mesh, gradients: np.ndarray) -> np.ndarray:
     """dX/dxi (E, n, 3, 3) at points with shape derivatives (n, nodes, 3)."""
     return np.einsum("esk,nsl->enkl", mesh.points[mesh.cells], gradients)

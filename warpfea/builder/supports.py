@@ -18,10 +18,10 @@ __all__ = ["clamp_support", "drive_supports"]
 
 def clamp_support(body: Body, nodes: NodeSet, slots: str, components: str) -> Support:
     """See ModelBuilder.clamp."""
-    held = support_slots(nodes, slots)
-    if not len(held):
+    clamped_slots = support_slots(nodes, slots)
+    if not len(clamped_slots):
         raise ModelError(f"clamp on {body.name!r}: the nodes {nodes.name!r} have no slots {slots!r}")
-    return Support(body, held, component_mask(components, f"clamp on {body.name!r}"))
+    return Support(body, clamped_slots, component_mask(components, f"clamp on {body.name!r}"))
 
 
 def drive_supports(
@@ -45,12 +45,12 @@ def drive_supports(
         support.rotation = (vector(rotation.anchor, f"{what}: anchor"), axis / np.linalg.norm(axis))
         return [support]
     out = []
-    moved = np.isin(support.slots, support_slots(nodes, "position"))
-    if not moved.any():
+    position_mask = np.isin(support.slots, support_slots(nodes, "position"))
+    if not position_mask.any():
         raise ModelError(f"{what}: slots = {slots!r} has no position to displace; clamp holds gradients")
-    if not moved.all():  # gradients stay constant
-        out.append(Support(body, support.slots[~moved], support.components))
-    support.slots = support.slots[moved]
+    if not position_mask.all():  # gradients stay constant
+        out.append(Support(body, support.slots[~position_mask], support.components))
+    support.slots = support.slots[position_mask]
     if isinstance(displacement, tuple) and len(displacement) == 2 and np.ndim(displacement[1]) == 3:
         times, values = np.asarray(displacement[0], float), np.asarray(displacement[1], float)
         if values.shape != (len(times), len(nodes), 3):

@@ -19,8 +19,8 @@ from .joints import pin_rows
 
 __all__ = ["make_weld"]
 
-PARTS_PER_ELEMENT = 2.0
-MAX_PARTS = 8
+SUBDIVISIONS_PER_ELEMENT = 2.0
+MAX_SUBDIVISIONS = 8
 SURFACE_TOL = 0.5
 """Distance from a surface's points, over its size, beyond which a face is off it."""
 GAP_TOL = 1e-4
@@ -34,20 +34,20 @@ def make_weld(first: NodeSet | SurfaceSet, second: SurfaceSet | Body, name: str)
     body = first.body
     if body is holder:
         raise ModelError(f"{what}: both sides are body {body.name!r}")
-    face = first if isinstance(first, SurfaceSet) else _face(first)
-    within = second if isinstance(second, SurfaceSet) else None
+    face = first if isinstance(first, SurfaceSet) else _named_face(first)
+    target_surface = second if isinstance(second, SurfaceSet) else None
     if face is not None:
-        gaps, anchor = _mortar(face, holder, within, what)
+        gaps, anchor = _mortar_gaps(face, holder, target_surface, what)
         label = f"surface {face.name!r} of body {body.name!r}" if face.name else f"a surface of body {body.name!r}"
     else:
         assert isinstance(first, NodeSet)
-        gaps, anchor = _pins(first, holder, within, what)
+        gaps, anchor = _node_gaps(first, holder, target_surface, what)
         label = f"{len(gaps)} nodes of body {body.name!r}"
     rows = [row for gap in gaps for row in pin_rows(gap)]
     return Joint(name, "weld", rows, anchor, f"body {holder.name!r} and {label}")
 
 
-def _face(nodes: NodeSet) -> SurfaceSet | None:
+def _named_face(nodes: NodeSet) -> SurfaceSet | None:
     """Face of a beam or shell denoted by a named set of nodes."""
     body = nodes.body
     if body.family.solid or not nodes.name:
@@ -56,71 +56,73 @@ def _face(nodes: NodeSet) -> SurfaceSet | None:
     return None if faces is None else SurfaceSet(body, faces, nodes.name)
 
 
-def _mortar(
-    face: SurfaceSet, holder: Discretisation, within: SurfaceSet | None, what: str
+def _mortar_gaps(
+    face: SurfaceSet, holder: Discretisation, target_surface: SurfaceSet | None, what: str
 ) -> tuple[list[Vector], Vector]:
     """One vector per slot i of the face: int phi_i (x - x_holder) dA / int |phi_i| dA."""
     body = face.body
-    t = assembly.facet_tables(face, _parts(face, holder))
+    t = assembly.facet_tables(face, _subdivisions(face, holder))
     X, dA = assembly.facet_places(body, t)
-    _check_near(X.reshape(-1, 3), within, what)
+    _check_near_surface(X.reshape(-1, 3), target_surface, what)
     n, m = body.slot_count, holder.slot_count
     F, Q, _ = t.shape.shape
-    own, other = np.zeros((F * Q, n)), np.zeros((F * Q, m))
+    own_weights, holder_weights = np.zeros((F * Q, n)), np.zeros((F * Q, m))
     for k, (f, q) in enumerate(np.ndindex(F, Q)):
-        np.add.at(own[k], t.conn[f], t.shape[f, q])
-        place = _locate(holder, X[f, q], what)
-        np.add.at(other[k], place.slots, place.weights)
+        np.add.at(own_weights[k], t.conn[f], t.shape[f, q])
+        location = _locate(holder, X[f, q], what)
+        np.add.at(holder_weights[k], location.slots, location.weights)
     share = dA.ravel()
     gaps = []
     for slot in np.unique(t.conn):
-        test = own[:, slot] * share
+        test = own_weights[:, slot] * share
         size = np.abs(test).sum()
         if size > 1e-12 * share.sum():
-            gaps.append(_gap(body, holder, test @ own / size, test @ other / size))
+            gaps.append(_gap_vector(body, holder, test @ own_weights / size, test @ holder_weights / size))
     mean = share / share.sum()
-    return gaps, _anchor(body, mean @ own, mean @ X.reshape(-1, 3))
+    return gaps, _mean_point(body, mean @ own_weights, mean @ X.reshape(-1, 3))
 
 
-def _parts(face: SurfaceSet, holder: Discretisation) -> int:
+def _subdivisions(face: SurfaceSet, holder: Discretisation) -> int:
     """Quadrature subdivisions of a face that resolve the other body's element boundaries."""
     _, dA = assembly.facet_places(face.body, assembly.facet_tables(face))
     area = float(dA.sum(axis=1).max())
     size = np.cbrt(float(np.median(assembly.element_volumes(holder))))
-    return int(np.clip(np.ceil(PARTS_PER_ELEMENT * np.sqrt(area) / size), 1, MAX_PARTS))
+    return int(np.clip(np.ceil(SUBDIVISIONS_PER_ELEMENT * np.sqrt(area) / size), 1, MAX_SUBDIVISIONS))
 
 
-def _pins(nodes: NodeSet, holder: Discretisation, within: SurfaceSet | None, what: str) -> tuple[list[Vector], Vector]:
+def _node_gaps(
+    nodes: NodeSet, holder: Discretisation, target_surface: SurfaceSet | None, what: str
+) -> tuple[list[Vector], Vector]:
     """Pins of nodes at their positions in the second body."""
     body = nodes.body
     slots = support_slots(nodes, "position")
     places = body.reference[slots] + body.origin
-    _check_near(places, within, what)
+    _check_near_surface(places, target_surface, what)
     gaps = []
     for slot, X in zip(slots, places):
-        own, other = np.zeros(body.slot_count), np.zeros(holder.slot_count)
-        own[slot] = 1.0
-        place = _locate(holder, X, what)
-        np.add.at(other, place.slots, place.weights)
-        gaps.append(_gap(body, holder, own, other))
+        own_weights, holder_weights = np.zeros(body.slot_count), np.zeros(holder.slot_count)
+        own_weights[slot] = 1.0
+        location = _locate(holder, X, what)
+        np.add.at(holder_weights, location.slots, location.weights)
+        gaps.append(_gap_vector(body, holder, own_weights, holder_weights))
     mean = np.zeros(body.slot_count)
     mean[slots] = 1.0 / len(slots)
-    return gaps, _anchor(body, mean, places.mean(axis=0))
+    return gaps, _mean_point(body, mean, places.mean(axis=0))
 
 
-def _check_near(X: np.ndarray, within: SurfaceSet | None, what: str) -> None:
+def _check_near_surface(X: np.ndarray, target_surface: SurfaceSet | None, what: str) -> None:
     """Raise ModelError for points (n, 3) outside the bounding box of the named surface."""
-    if within is None:
+    if target_surface is None:
         return
-    body = within.body
-    x = assembly.facet_places(body, assembly.facet_tables(within))[0].reshape(-1, 3)
+    body = target_surface.body
+    x = assembly.facet_places(body, assembly.facet_tables(target_surface))[0].reshape(-1, 3)
     low, high = x.min(axis=0), x.max(axis=0)
     slack = SURFACE_TOL * float(np.linalg.norm(high - low))
     off = np.flatnonzero(((low - slack > X) | (high + slack < X)).any(axis=1))
     if len(off):
         raise ModelError(
-            f"{what}: the point {np.round(X[off[0]], 6).tolist()} of the first face is not on surface {within.name!r} "
-            f"of body {body.name!r}"
+            f"{what}: the point {np.round(X[off[0]], 6).tolist()} of the first face is not on surface "
+            f"{target_surface.name!r} of body {body.name!r}"
         )
 
 
@@ -131,11 +133,15 @@ def _locate(holder: Discretisation, X: np.ndarray, what: str) -> Any:
         raise ModelError(f"{what}: {error}; the welded face must lie in the other body") from None
 
 
-def _gap(body: Discretisation, holder: Discretisation, own: np.ndarray, other: np.ndarray) -> Vector:
-    a, b = np.flatnonzero(own), np.flatnonzero(other)
-    return Vector(np.zeros(3), (VectorPart(body, a, own[a], True), VectorPart(holder, b, -other[b], False)))
+def _gap_vector(
+    body: Discretisation, holder: Discretisation, own_weights: np.ndarray, holder_weights: np.ndarray
+) -> Vector:
+    a, b = np.flatnonzero(own_weights), np.flatnonzero(holder_weights)
+    return Vector(
+        np.zeros(3), (VectorPart(body, a, own_weights[a], True), VectorPart(holder, b, -holder_weights[b], False))
+    )
 
 
-def _anchor(body: Discretisation, weights: np.ndarray, X: np.ndarray) -> Vector:
+def _mean_point(body: Discretisation, weights: np.ndarray, X: np.ndarray) -> Vector:
     slots = np.flatnonzero(weights)
     return Vector(X, (VectorPart(body, slots, weights[slots], True),))

@@ -15,7 +15,7 @@ from ...base.devices import find_device
 from ...base.errors import ModelError
 from ...base.names import did_you_mean, listing
 from ...builder.builder import ModelBuilder
-from ...builder.reference import Reference, read_reference, reference_of
+from ...builder.reference import Reference, make_reference, read_reference
 from ...builder.scene import Scene, locate
 from ...builder.scene import scene as as_scene
 from ..files import make_folder
@@ -157,14 +157,14 @@ def _reference_function(
     if given == FINER_RUN:
         return lambda setting: None
     if given is None:
-        return lambda setting: reference_of(scene.reference, setting.values)
+        return lambda setting: make_reference(scene.reference, setting.values)
     if isinstance(given, (str, pathlib.Path)):
         if not str(given).lower().endswith((".csv", ".json")):
             raise ModelError(f"study: reference {str(given)!r} is neither a file .csv or .json nor {FINER_RUN!r}")
         names = list(probes or [p.name for p in scene.build(base.values).description.probes][:1])
         read = read_reference(given, names[0] if names else "")
         return lambda setting: read
-    fixed = reference_of(given, base.values)
+    fixed = make_reference(given, base.values)
     return lambda setting: fixed
 
 
