@@ -15,7 +15,7 @@ from warpfea.base.errors import OutputError, UsageError
 from warpfea.cli.mesh_scene import _load
 from warpfea.cli.summary import human, summarize
 from warpfea.outputs import animation, usd
-from warpfea.outputs.frames import time_of
+from warpfea.outputs.frames import frame_time
 from warpfea.outputs.usd import validate_usd
 
 BOX = wf.mesh.box((1, 0.2, 0.2), cells=(2, 1, 1))
@@ -205,13 +205,13 @@ def test_usd_speaks_our_words(tmp_path, monkeypatch):
 def labels(monkeypatch):
     """Collects what is written under pictures."""
     seen = []
-    label = animation.label
+    label = animation.draw_labels
 
     def note(image, time, bar):
         seen.append(time)
         return label(image, time, bar)
 
-    monkeypatch.setattr(animation, "label", note)
+    monkeypatch.setattr(animation, "draw_labels", note)
     return seen
 
 
@@ -241,7 +241,7 @@ def test_statics_write_outputs_and_say_the_load(tmp_path, monkeypatch):
 
     render_usd(tmp_path / "o.usdc", tmp_path / "usd.png", size=(160, 90))
     assert seen == ["load 100 %", "load 100 %"]
-    assert time_of(static.simulation) == 1.0
+    assert frame_time(static.simulation) == 1.0
 
 
 def test_a_motion_still_says_the_time(tmp_path, monkeypatch):

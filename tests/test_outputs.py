@@ -12,7 +12,7 @@ import pytest
 from stub_simulation import FAR, StubSim, left_over, tet_box
 
 from warpfea.base.errors import ModelError, OutputError
-from warpfea.outputs.colormap import TABLE, map_colors, to_linear, to_srgb
+from warpfea.outputs.colormap import COLOR_TABLE, map_colors, to_linear, to_srgb
 from warpfea.outputs.frames import FrameClock, grid_offsets
 from warpfea.outputs.normals import vertex_normals
 from warpfea.outputs.render import GIFWriter, PNGWriter
@@ -31,8 +31,8 @@ def test_frame_clock():
         assert k / 10 - 1e-9 <= t < k / 10 + 0.03
     coarse = FrameClock(100.0)
     assert [coarse.due(t) for t in (0.0, 0.035, 0.036, 0.0399, 0.04)] == [True, True, False, False, True]
-    assert coarse.code(0.04) == 4.0
-    assert coarse.code(0.045) == pytest.approx(4.5)
+    assert coarse.time_code(0.04) == 4.0
+    assert coarse.time_code(0.045) == pytest.approx(4.5)
     for bad in (0.0, -1.0, np.inf, np.nan):
         with pytest.raises(ModelError, match="frames per second"):
             FrameClock(bad)
@@ -55,7 +55,7 @@ def test_grid_offsets_and_normals():
 
 
 def test_colormap_is_even():
-    linear = to_linear(TABLE)
+    linear = to_linear(COLOR_TABLE)
     light = 116 * np.cbrt(linear @ [0.2126, 0.7152, 0.0722]) - 16
     assert np.diff(light).min() > 1.9
     assert np.diff(light).max() < 2.8
@@ -72,13 +72,13 @@ def test_colormap_is_even():
     lab = np.cbrt(linear @ np.transpose(to_lms)) @ np.transpose(to_lab)
     distance = np.linalg.norm(np.diff(lab, axis=0), axis=1)
     assert np.abs(distance / distance.mean() - 1.0).max() < 0.15
-    assert np.abs(to_srgb(linear) - TABLE).max() < 1e-12
+    assert np.abs(to_srgb(linear) - COLOR_TABLE).max() < 1e-12
     colors = map_colors([-1.0, 0.0, 5.0, 10.0, 11.0, np.nan], 0.0, 10.0)
-    assert np.allclose(colors[[0, 1]], TABLE[0])
-    assert np.allclose(colors[[3, 4]], TABLE[-1])
-    assert np.allclose(colors[2], TABLE[16])
+    assert np.allclose(colors[[0, 1]], COLOR_TABLE[0])
+    assert np.allclose(colors[[3, 4]], COLOR_TABLE[-1])
+    assert np.allclose(colors[2], COLOR_TABLE[16])
     assert np.allclose(colors[5], 0.5)
-    assert np.allclose(map_colors([3.0, 4.0], 3.0, 3.0), TABLE[0])
+    assert np.allclose(map_colors([3.0, 4.0], 3.0, 3.0), COLOR_TABLE[0])
 
 
 # ----------------------------------------------------------------------------------------- errors, clean-up

@@ -12,23 +12,33 @@ import numpy.typing as npt
 
 from warpfea.base.writer import progress_bar, write_whole
 from warpfea.outputs.colormap import map_colors
-from warpfea.outputs.obstacles import GREY as OBSTACLE
-from warpfea.outputs.obstacles import clip_to_box
+from warpfea.outputs.obstacles import OBSTACLE_COLOR, clip_to_box
 from warpfea.outputs.raycaster import Camera, Image, Renderer, to_z_up
 
 __all__ = ["Animation", "Frame"]
 
 Floats = npt.NDArray[np.floating[Any]]
-_INK = (45, 50, 60)
-_GREY = (0.62, 0.66, 0.72)
-_BAR = 0.17  # width fraction of the colour bar
-_PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, "u"), (1e-9, "n"))  # the font has no µ
-_PAUSE = 0.6  # duration of the last frame, s
+_TEXT_COLOR = (45, 50, 60)
+_BODY_COLOR = (0.62, 0.66, 0.72)
+_BAR_WIDTH = 0.17  # width fraction of the colour bar
+_UNIT_PREFIXES = (
+    (1e9, "G"),
+    (1e6, "M"),
+    (1e3, "k"),
+    (1.0, ""),
+    (1e-3, "m"),
+    (1e-6, "u"),
+    (1e-9, "n"),
+)  # the font has no µ
+_LAST_FRAME_SECONDS = 0.6  # duration of the last frame, s
 
 
 @dataclass
 class Frame:
-    """One state: time (s), points (P, 3) float32 about the reel's origin (m), values of its field at the bodies'."""
+    """One state: time (s), points (P, 3) float32 about the animation's origin (m), values of its field at the bodies'.
+
+    The origin is the centre of the bodies' box at the start.
+    """
 
     time: float
     points: Floats
@@ -40,9 +50,9 @@ class Animation:
     """Frames of one surface and their display options.
 
     Attributes:
-        shown: colour range; None: the extremes.
+        color_range: (low, high); None: the extremes.
         static: the frames' times are load factors.
-        bodies: number of points of bodies, which come first; None: all. The others belong to obstacles.
+        body_points: number of points of bodies, which come first; None: all. The others belong to obstacles.
         plane_squares: first of the four points of each square drawn for a half-space.
     """
 
@@ -51,9 +61,9 @@ class Animation:
     reference: Floats
     title: str = ""
     units: str = ""
-    shown: tuple[float, float] | None = None
+    color_range: tuple[float, float] | None = None
     static: bool = False
-    bodies: int | None = None
+    body_points: int | None = None
     plane_squares: list[int] = field(default_factory=list)
     frames: list[Frame] = field(default_factory=list)
 
@@ -61,18 +71,18 @@ class Animation:
         self, size: tuple[int, int], view: tuple[float, float], chosen: list[int], ground: bool = True
     ) -> Iterator[Image]:
         """Pictures of the chosen frames; camera, ground and colours are those of all frames."""
-        n = self.bodies or len(self.reference)
+        n = self.body_points or len(self.reference)
         stride = max(1, n * len(self.frames) // 50_000)
         swept = np.concatenate([frame.points[k % stride : n : stride] for k, frame in enumerate(self.frames)])
-        swept = np.concatenate([swept, *self._obstacles(swept.min(axis=0), swept.max(axis=0))])
-        low, high = self.range()
+        swept = np.concatenate([swept, *self._obstacle_points(swept.min(axis=0), swept.max(axis=0))])
+        low, high = self.color_limits()
         longest = max(abs(frame.time) for frame in self.frames)
         decimals = int(np.clip(3 - np.floor(np.log10(longest)), 1, 12)) if longest > 0 else 1
         barred = self.frames[0].values is not None
-        margins = (0.05, _BAR if barred else 0.05, 0.09, 0.07)
+        margins = (0.05, _BAR_WIDTH if barred else 0.05, 0.09, 0.07)
         camera = Camera.framing(to_z_up(swept, self.up_axis), view=view, aspect=size[0] / size[1], margins=margins)
-        height, hidden = self._floor(camera)
-        shown = ~np.isin(self.triangles[:, 0], [first + k for first in hidden for k in range(4)])
+        height, hidden_squares = self._ground_height(camera)
+        shown = ~np.isin(self.triangles[:, 0], [first + k for first in hidden_squares for k in range(4)])
         used, triangles = np.unique(self.triangles[shown], return_inverse=True)
         renderer = Renderer(
             triangles.reshape(-1, 3),
@@ -82,33 +92,33 @@ class Animation:
         )
         for k in chosen:
             frame = self.frames[k]
-            colors = np.full(frame.points.shape, OBSTACLE, dtype=np.float32)
-            colors[:n] = _GREY
+            colors = np.full(frame.points.shape, OBSTACLE_COLOR, dtype=np.float32)
+            colors[:n] = _BODY_COLOR
             if frame.values is not None:
-                known = np.isfinite(frame.values)
-                colors[:n][known] = map_colors(frame.values[known], low, high)
+                finite = np.isfinite(frame.values)
+                colors[:n][finite] = map_colors(frame.values[finite], low, high)
             image = renderer.render(frame.points[used], colors[used], camera, size)
-            yield label(
+            yield draw_labels(
                 image,
                 f"load {100.0 * frame.time:.4g} %" if self.static else f"t = {frame.time:.{decimals}f} s",
                 (low, high, self.title, self.units) if barred else None,
             )
 
-    def _obstacles(self, low: Floats, high: Floats) -> list[Floats]:
+    def _obstacle_points(self, low: Floats, high: Floats) -> list[Floats]:
         """Points of the obstacles, clamped to the neighbourhood of the bodies' bounding box, for the camera."""
-        first = self.bodies or len(self.reference)
+        first = self.body_points or len(self.reference)
         return [
             clip_to_box(frame.points[first:], low, high, 0.15) for frame in self.frames if len(frame.points) > first
         ]
 
-    def _floor(self, camera: Camera) -> tuple[float | None, list[int]]:
+    def _ground_height(self, camera: Camera) -> tuple[float | None, list[int]]:
         """Height of the ground, and hidden squares.
 
         A horizontal fixed half-space is the ground; with other half-spaces there is none, without any it is at the
         lowest point. Squares seen from behind are hidden, as they would cover the bodies.
         """
         level: dict[int, float] = {}
-        hidden = []
+        hidden_squares = []
         slack = 1e-5 * camera.size
         for first in self.plane_squares:
             squares = [to_z_up(frame.points[first : first + 4], self.up_axis) for frame in self.frames]
@@ -117,18 +127,18 @@ class Animation:
             if np.ptp(heights) <= slack and normals[0][2] > 0.0:
                 level[first] = float(heights.mean())
             elif any((camera.eye - square[0]) @ normal <= 0.0 for square, normal in zip(squares, normals)):
-                hidden.append(first)
+                hidden_squares.append(first)
         if not self.plane_squares:
             up = 2 if self.up_axis == "Z" else 1
-            return min(float(frame.points[:, up].min()) for frame in self.frames), hidden
+            return min(float(frame.points[:, up].min()) for frame in self.frames), hidden_squares
         if not level or max(level.values()) - min(level.values()) > slack:
-            return None, hidden
-        return max(level.values()), hidden + list(level)
+            return None, hidden_squares
+        return max(level.values()), hidden_squares + list(level)
 
-    def range(self) -> tuple[float, float]:
+    def color_limits(self) -> tuple[float, float]:
         """Colour range: as given, or the extremes over all frames."""
-        if self.shown is not None:
-            return self.shown
+        if self.color_range is not None:
+            return self.color_range
         values = [frame.values[np.isfinite(frame.values)] for frame in self.frames if frame.values is not None]
         values = [v for v in values if v.size]
         if not values:
@@ -153,10 +163,10 @@ class Animation:
     ) -> None:
         """Draw all frames, with one palette made from five of them."""
         count = len(self.frames)
-        keys = sorted({round(k) for k in np.linspace(0, count - 1, min(5, count))})
-        palette = make_palette(list(self.draw(size, view, keys, ground)), self.frames[0].values is not None)
+        palette_frames = sorted({round(k) for k in np.linspace(0, count - 1, min(5, count))})
+        palette = make_palette(list(self.draw(size, view, palette_frames, ground)), self.frames[0].values is not None)
         clock = np.round(np.array([frame.time for frame in self.frames]) / speed * 100.0)
-        durations = [int(d) for d in np.maximum(np.diff(clock), 2.0) * 10.0] + [int(1000 * _PAUSE)]
+        durations = [int(d) for d in np.maximum(np.diff(clock), 2.0) * 10.0] + [int(1000 * _LAST_FRAME_SECONDS)]
         with progress_bar(count, "drawing", progress) as advance:
             pictures = []
             for image in self.draw(size, view, list(range(count)), ground):
@@ -169,7 +179,7 @@ class Animation:
         write_whole(target, save)
 
 
-def label(image: Image, time: str, bar: tuple[float, float, str, str] | None) -> Image:
+def draw_labels(image: Image, time: str, bar: tuple[float, float, str, str] | None) -> Image:
     """Write the time, and a colour bar for (low, high, title, units), onto a picture."""
     from PIL import Image as Pictures
     from PIL import ImageDraw, ImageFont
@@ -180,25 +190,27 @@ def label(image: Image, time: str, bar: tuple[float, float, str, str] | None) ->
     font = ImageFont.load_default(max(10.0, height / 30))
     small = ImageFont.load_default(max(9.0, height / 36))
     line = 1.25 * height / 30
-    draw.text((0.025 * width, height - 1.6 * line), time, fill=_INK, font=font)
+    draw.text((0.025 * width, height - 1.6 * line), time, fill=_TEXT_COLOR, font=font)
     if bar is None:
         return np.asarray(picture)
     low, high, title, units = bar
     factor, prefix = (
-        next((p for p in _PREFIXES if max(abs(low), abs(high)) >= 0.9995 * p[0]), (1.0, "")) if units else (1.0, "")
+        next((p for p in _UNIT_PREFIXES if max(abs(low), abs(high)) >= 0.9995 * p[0]), (1.0, ""))
+        if units
+        else (1.0, "")
     )
-    left, right = round(width * (1.0 - 0.75 * _BAR)), round(width * (1.0 - 0.61 * _BAR))
+    left, right = round(width * (1.0 - 0.75 * _BAR_WIDTH)), round(width * (1.0 - 0.61 * _BAR_WIDTH))
     top, bottom = round(0.26 * height), round(0.80 * height)
     ramp = map_colors(np.linspace(1.0, 0.0, bottom - top), 0.0, 1.0 if high > low else 0.0)
     strip = np.broadcast_to(np.round(255 * ramp)[:, None, :], (bottom - top, right - left, 3)).astype(np.uint8)
     picture.paste(Pictures.fromarray(np.ascontiguousarray(strip)), (left, top))
-    draw.rectangle((left - 1, top - 1, right, bottom), outline=_INK)
+    draw.rectangle((left - 1, top - 1, right, bottom), outline=_TEXT_COLOR)
     ticks = np.linspace(low, high, 5) if high > low else np.array([low])
-    texts = _numbers(ticks / factor)
+    texts = _tick_texts(ticks / factor)
     for k, text in enumerate(texts):
         y = bottom - (bottom - top) * (k / 4 if len(texts) > 1 else 0.0)
-        draw.line((right, y, right + 0.005 * width, y), fill=_INK)
-        draw.text((right + 0.009 * width, y), text, fill=_INK, font=small, anchor="lm")
+        draw.line((right, y, right + 0.005 * width, y), fill=_TEXT_COLOR)
+        draw.text((right + 0.009 * width, y), text, fill=_TEXT_COLOR, font=small, anchor="lm")
     words = title.split()
     rows = [" ".join(words[:-1]), words[-1]] if len(title) > 12 and len(words) > 1 else [title]
     if units:
@@ -206,11 +218,11 @@ def label(image: Image, time: str, bar: tuple[float, float, str, str] | None) ->
     for k, row in enumerate(reversed(rows)):
         y = top - line * (0.9 + k)
         x = min(left - 1, 0.985 * width - draw.textlength(row, font=font))
-        draw.text((x, y), row, fill=_INK, font=font, anchor="lm")
+        draw.text((x, y), row, fill=_TEXT_COLOR, font=font, anchor="lm")
     return np.asarray(picture)
 
 
-def _numbers(ticks: Floats) -> list[str]:
+def _tick_texts(ticks: Floats) -> list[str]:
     """Ticks with the decimals needed to distinguish neighbours."""
     step = float(np.ptp(ticks)) / 4.0
     largest = float(np.abs(ticks).max())
@@ -233,9 +245,9 @@ def make_palette(images: list[Image], barred: bool) -> Any:
     vivid = np.max(pixels, axis=1).astype(int) - np.min(pixels, axis=1) > 40
     room = {False: 64, True: 128} if barred else {False: 256}
     for kind, count in room.items():
-        part = pixels[vivid == kind] if barred else pixels
-        if len(part):
-            picture = Pictures.fromarray(np.ascontiguousarray(part[None]))
+        fraction = pixels[vivid == kind] if barred else pixels
+        if len(fraction):
+            picture = Pictures.fromarray(np.ascontiguousarray(fraction[None]))
             found = picture.quantize(count, method=Pictures.Quantize.MEDIANCUT, kmeans=1).getpalette() or []
             colors = np.concatenate([colors, np.array(found, dtype=np.uint8).reshape(-1, 3)[:count]])
     palette = Pictures.new("P", (1, 1))

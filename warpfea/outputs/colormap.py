@@ -5,18 +5,18 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["TABLE", "map_colors", "to_linear", "to_srgb"]
+__all__ = ["COLOR_TABLE", "map_colors", "to_linear", "to_srgb"]
 
 # 33 sRGB entries from dark violet over teal to yellow. The hues are those of the viridis family; the entries
 # were re-spaced so that CIELAB lightness rises by 1.9 to 2.8 per entry and the OKLab distance of neighbours
 # stays within 15 % of its mean. A test checks both.
-_HEX = (
+_HEX_COLORS = (
     "440154 460c5f 471669 482072 482a79 46337f 443d83 404687 3c4f8b 38588d 35608d "
     "31688e 2d718f 2a798f 27818e 23898d 20918c 1e988b 20a088 21a884 25af80 33b67a "
     "45bd72 55c369 64c95f 73cf55 86d449 9ad93b aedd2f c1e127 d5e420 e9e61e fde725"
 )
-TABLE: npt.NDArray[np.float64] = np.array(
-    [[int(entry[k : k + 2], 16) / 255.0 for k in (0, 2, 4)] for entry in _HEX.split()]
+COLOR_TABLE: npt.NDArray[np.float64] = np.array(
+    [[int(entry[k : k + 2], 16) / 255.0 for k in (0, 2, 4)] for entry in _HEX_COLORS.split()]
 )
 """(33, 3) sRGB components in [0, 1]."""
 
@@ -43,9 +43,9 @@ def map_colors(values: npt.ArrayLike, low: float, high: float, *, linear: bool =
     finite = np.isfinite(v)
     span = float(high) - float(low)
     t = (np.where(finite, v, low) - low) / span if span > 0.0 else np.zeros_like(v)
-    t = np.clip(t, 0.0, 1.0) * (len(TABLE) - 1)
-    index = np.minimum(t.astype(np.intp), len(TABLE) - 2)
+    t = np.clip(t, 0.0, 1.0) * (len(COLOR_TABLE) - 1)
+    index = np.minimum(t.astype(np.intp), len(COLOR_TABLE) - 2)
     weight = (t - index)[..., None]
-    rgb = TABLE[index] * (1.0 - weight) + TABLE[index + 1] * weight
+    rgb = COLOR_TABLE[index] * (1.0 - weight) + COLOR_TABLE[index + 1] * weight
     rgb = np.where(finite[..., None], rgb, 0.5)
     return np.asarray(to_linear(rgb) if linear else rgb, dtype=np.float32)

@@ -30,7 +30,7 @@ __all__ = [
 Array = npt.NDArray[Any]
 
 # name -> (title, units) of known fields
-FIELDS: dict[str, tuple[str, str]] = {
+FIELD_LABELS: dict[str, tuple[str, str]] = {
     "von_mises": ("von Mises stress", "Pa"),
     "displacement": ("displacement", "m"),
     "velocity": ("velocity", "m/s"),
@@ -43,10 +43,10 @@ FIELDS: dict[str, tuple[str, str]] = {
 
 def field_label(name: str) -> tuple[str, str]:
     """(title, units) of a field; an unknown name is its own title, without units."""
-    return FIELDS.get(name, (name.replace("_", " "), ""))
+    return FIELD_LABELS.get(name, (name.replace("_", " "), ""))
 
 
-def time_of(sim: Any) -> float:
+def frame_time(sim: Any) -> float:
     """The simulated time (s) of a frame: that of the most advanced world (frozen worlds lag).
 
     In statics the load factor, 0 to 1.
@@ -94,19 +94,19 @@ class FrameClock:
             raise ModelError(f"fps: frames per second must be positive and finite, got {fps!r}")
         self.fps = float(fps)
         self.last = -np.inf
-        self._next = -np.inf
+        self._next_frame = -np.inf
 
     def due(self, time: float) -> bool:
         """True if the state at `time` (s) is a frame; once per frame."""
         frame = time * self.fps
         slack = 1e-6 + 1e-12 * abs(frame)
-        if frame < self._next - slack:
+        if frame < self._next_frame - slack:
             return False
-        self._next = np.floor(frame + slack) + 1.0
+        self._next_frame = np.floor(frame + slack) + 1.0
         self.last = time
         return True
 
-    def code(self, time: float) -> float:
+    def time_code(self, time: float) -> float:
         """Time code of `time`: time * fps, rounded to a whole number within round-off."""
         frame = time * self.fps
         nearest = float(np.round(frame))
@@ -136,20 +136,21 @@ class DrawnSurface:
         self.up_axis = str(sim.model.up_axis).upper()
         if not self.bodies:
             raise OutputError("nothing to draw: no body has a surface")
-        start = [self.points_of(sim, body) for body in self.bodies]
-        self.counts = [points.shape[1] for points in start]
+        start = [self.skin_points(sim, body) for body in self.bodies]
+        self.point_counts = [points.shape[1] for points in start]
         low = np.min([points.min(axis=(0, 1)) for points in start], axis=0)
         high = np.max([points.max(axis=(0, 1)) for points in start], axis=0)
         self.obstacles = Obstacles(sim, low, high)
         start += [
-            np.asarray(clip_to_box(points, low, high, 0.5), dtype=np.float64) for points in self.obstacles.bounded()
+            np.asarray(clip_to_box(points, low, high, 0.5), dtype=np.float64)
+            for points in self.obstacles.bounded_points()
         ]
-        distance = self._spacing(start, spacing)
+        distance = self._grid_spacing(start, spacing)
         self.offsets = grid_offsets(self.worlds, distance, self.up_axis)
         if min(distance) > 0.0:  # a plane must not hide the bodies of other worlds
-            self.obstacles.narrow(min(distance))
+            self.obstacles.limit_plane_size(min(distance))
 
-    def _spacing(
+    def _grid_spacing(
         self, start: list[npt.NDArray[np.float64]], spacing: float | tuple[float, float] | None
     ) -> tuple[float, float]:
         if self.worlds == 1:
@@ -166,12 +167,14 @@ class DrawnSurface:
         return 1.25 * float(size[0]), 1.25 * float(size[1 if self.up_axis == "Z" else 2])
 
     @staticmethod
-    def points_of(sim: Any, body: Any) -> npt.NDArray[np.float64]:
+    def skin_points(sim: Any, body: Any) -> npt.NDArray[np.float64]:
         """(B, P, 3) current surface points (m) without the grid offsets; OutputError for non-finite ones."""
         points = np.asarray(sim.skin_points(body), dtype=np.float64)
         if not np.isfinite(points).all():
             world = int(np.argmin(np.isfinite(points).all(axis=(1, 2))))
-            raise OutputError(f"body {body.name!r}, world {world}: positions are not finite at t = {time_of(sim):g} s")
+            raise OutputError(
+                f"body {body.name!r}, world {world}: positions are not finite at t = {frame_time(sim):g} s"
+            )
         return points
 
     def triangles(self) -> npt.NDArray[np.int32]:
@@ -185,13 +188,13 @@ class DrawnSurface:
 
     def _meshes(self) -> list[tuple[Array, int]]:
         """Triangles of a world and points of each body, then of each obstacle."""
-        bodies = [(body.skin.triangles, count) for body, count in zip(self.bodies, self.counts, strict=True)]
+        bodies = [(body.skin.triangles, count) for body, count in zip(self.bodies, self.point_counts, strict=True)]
         return bodies + [(obstacle.triangles, obstacle.points.shape[1]) for obstacle in self.obstacles.all]
 
     @property
     def body_points(self) -> int:
         """Number of `points` of bodies, which come first."""
-        return self.worlds * sum(self.counts)
+        return self.worlds * sum(self.point_counts)
 
     def plane_squares(self) -> list[int]:
         """First point of each square drawn for a half-space, in the order of `points`."""
@@ -205,7 +208,7 @@ class DrawnSurface:
 
     def points(self, sim: Any) -> npt.NDArray[np.float64]:
         """(P, 3) current points (m) of all worlds, of the bodies and then the obstacles, with the grid offsets."""
-        blocks = [self.points_of(sim, body) for body in self.bodies] + self.obstacles.points()
+        blocks = [self.skin_points(sim, body) for body in self.bodies] + self.obstacles.points()
         return np.concatenate([(block + self.offsets[:, None, :]).reshape(-1, 3) for block in blocks])
 
     def values(self, sim: Any, field: str) -> npt.NDArray[np.float32]:

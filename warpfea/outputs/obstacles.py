@@ -17,11 +17,11 @@ from warpfea.kernels.terms.contact_mesh import MESH
 from warpfea.model.shapes import BOX, CAPSULE, CYLINDER, HALF_SPACE
 from warpfea.outputs.normals import smooth_corners, vertex_normals
 
-__all__ = ["GREY", "PLANE_SIZE", "Obstacle", "Obstacles", "clip_to_box", "names_beside"]
+__all__ = ["OBSTACLE_COLOR", "PLANE_SIZE", "Obstacle", "Obstacles", "clip_to_box", "unique_names"]
 
 Array = npt.NDArray[np.floating[Any]]
 Floats = npt.NDArray[np.float64]
-GREY = (0.60, 0.60, 0.61)
+OBSTACLE_COLOR = (0.60, 0.60, 0.61)
 """Colour of obstacles, sRGB."""
 PLANE_SIZE = 6.0
 """Side of the square drawn for a half-space, over the initial size of the bodies."""
@@ -64,7 +64,7 @@ class Obstacles:
         self.all: list[Obstacle] = []
         if self._sim is None:
             return
-        place, turn, grow = sim.collider_poses()
+        position, rotation, offsets = sim.collider_poses()
         side = PLANE_SIZE * float(np.linalg.norm(high - low))
         middle = 0.5 * (low + high)
         for k, collider in enumerate(sim.model.description.colliders):
@@ -72,21 +72,21 @@ class Obstacles:
             center, axes = shape.frame()
             if shape.kind == HALF_SPACE:
                 # the plane may be rotated already: centre the square at the bodies' current position
-                around = center + axes @ (turn[0, k].T @ (middle - place[0, k]))
+                around = center + axes @ (rotation[0, k].T @ (middle - position[0, k]))
                 points, triangles = shape.mesh(size=side, around=around)
             else:
                 points, triangles = shape.mesh(48)
             points, triangles = split_edges((points - center) @ axes, triangles)
-            grown = np.stack([_grown(shape, points, triangles, by) for by in grow[:, k]])
-            self.all.append(Obstacle(collider.name, type(shape).__name__, grown, triangles, collider.moves))
+            points_of_worlds = np.stack([_offset_points(shape, points, triangles, offset) for offset in offsets[:, k]])
+            self.all.append(Obstacle(collider.name, type(shape).__name__, points_of_worlds, triangles, collider.moves))
 
-    def narrow(self, width: float) -> None:
+    def limit_plane_size(self, width: float) -> None:
         """Limit the side of squares, m."""
         for k, obstacle in enumerate(self.all):
             if obstacle.is_plane:
                 middle = obstacle.points.mean(axis=1, keepdims=True)
-                part = min(1.0, width / np.linalg.norm(obstacle.points[0, 1] - obstacle.points[0, 0]))
-                self.all[k] = replace(obstacle, points=middle + part * (obstacle.points - middle))
+                fraction = min(1.0, width / np.linalg.norm(obstacle.points[0, 1] - obstacle.points[0, 0]))
+                self.all[k] = replace(obstacle, points=middle + fraction * (obstacle.points - middle))
 
     def __len__(self) -> int:
         return len(self.all)
@@ -94,28 +94,28 @@ class Obstacles:
     def poses(self) -> tuple[Floats, Floats]:
         """Current positions (B, K, 3), m, and rotations (B, K, 3, 3)."""
         assert self._sim is not None
-        place, turn, grow = self._sim.collider_poses()
+        position, rotation, offsets = self._sim.collider_poses()
         plane_squares = np.array([obstacle.is_plane for obstacle in self.all])
-        return place + np.where(plane_squares, grow, 0.0)[:, :, None] * turn[:, :, :, 2], turn
+        return position + np.where(plane_squares, offsets, 0.0)[:, :, None] * rotation[:, :, :, 2], rotation
 
     def points(self) -> list[Floats]:
         """(B, n, 3) current points of each, m."""
         if not self.all:
             return []
-        place, turn = self.poses()
+        position, rotation = self.poses()
         return [
-            place[:, k, None] + np.einsum("bnj,bij->bni", obstacle.points, turn[:, k])
+            position[:, k, None] + np.einsum("bnj,bij->bni", obstacle.points, rotation[:, k])
             for k, obstacle in enumerate(self.all)
         ]
 
-    def bounded(self) -> list[Floats]:
+    def bounded_points(self) -> list[Floats]:
         """(B, n, 3) current points of those other than half-spaces, m."""
         return [points for points, obstacle in zip(self.points(), self.all) if not obstacle.is_plane]
 
 
-def clip_to_box(points: Array, low: Array, high: Array, part: float) -> Array:
+def clip_to_box(points: Array, low: Array, high: Array, fraction: float) -> Array:
     """Points (..., 3) clamped to the box from low to high, enlarged each way by a fraction of its diagonal."""
-    margin = part * float(np.linalg.norm(high - low))
+    margin = fraction * float(np.linalg.norm(high - low))
     return np.clip(points, low - margin, high + margin)
 
 
@@ -127,12 +127,12 @@ def split_edges(points: Floats, triangles: npt.NDArray[np.integer[Any]]) -> tupl
     return points[corner], group.reshape(-1, 3).astype(np.int32)
 
 
-def _grown(shape: Any, points: Floats, triangles: npt.NDArray[np.int32], by: float) -> Floats:
+def _offset_points(shape: Any, points: Floats, triangles: npt.NDArray[np.int32], offset: float) -> Floats:
     """Local points of a shape with an outward offset of the surface; half-spaces are translated instead."""
-    if by == 0.0 or shape.kind == HALF_SPACE:
+    if offset == 0.0 or shape.kind == HALF_SPACE:
         return points
     if shape.kind == MESH:
-        return points + by * vertex_normals(points, triangles)
+        return points + offset * vertex_normals(points, triangles)
     first, second, third = shape.sizes
     size = np.full(3, first)
     if shape.kind == BOX:
@@ -142,10 +142,10 @@ def _grown(shape: Any, points: Floats, triangles: npt.NDArray[np.int32], by: flo
     ends = np.zeros_like(points)
     if shape.kind == CAPSULE:
         ends[:, 2] = second * np.sign(points[:, 2])
-    return ends + (points - ends) * (size + by) / size
+    return ends + (points - ends) * (size + offset) / size
 
 
-def names_beside(taken: Sequence[str], wanted: Sequence[str]) -> list[str]:
+def unique_names(taken: Sequence[str], wanted: Sequence[str]) -> list[str]:
     """Names made unique among each other and the given ones."""
     out: list[str] = []
     for name in wanted:

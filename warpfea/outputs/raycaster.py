@@ -13,11 +13,11 @@ from warpfea.base.errors import ModelError, OutputError
 from warpfea.outputs.colormap import to_linear, to_srgb
 from warpfea.outputs.normals import scatter_rows, smooth_corners, unit_rows
 
-__all__ = ["VIEW", "Camera", "Renderer", "check_view", "nice_number", "to_z_up"]
+__all__ = ["DEFAULT_VIEW", "Camera", "Renderer", "check_view", "nice_number", "to_z_up"]
 
 Floats = npt.NDArray[np.floating[Any]]
 Image = npt.NDArray[np.uint8]
-VIEW = (-65.0, 20.0)  # default azimuth, elevation (degrees)
+DEFAULT_VIEW = (-65.0, 20.0)  # default azimuth, elevation (degrees)
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Camera:
     """A perspective camera in a frame with z up.
 
     eye, target: (3,) float64, m. fov: vertical opening (degrees). center: position of the target in the picture,
-    each in [-1, 1]. size: radius (m) of the scene, the scale of ground and shadows.
+    from (-1, -1) lower left to (1, 1) upper right. size: radius (m) of the scene, the scale of ground and shadows.
     """
 
     eye: Floats
@@ -48,7 +48,7 @@ class Camera:
         cls,
         points: Floats,
         *,
-        view: tuple[float, float] = VIEW,
+        view: tuple[float, float] = DEFAULT_VIEW,
         aspect: float = 16 / 9,
         fov: float = 24.0,
         margins: tuple[float, float, float, float] = (0.06, 0.06, 0.08, 0.08),
@@ -75,7 +75,7 @@ class Camera:
         for side, slope in zip(local[:, :2].T, tangent * share):  # all |side - eye| <= slope (depth + distance)
             reach = (side - slope * local[:, 2]).max() - (side + slope * local[:, 2]).min()
             distance = max(distance, 0.5 * float(reach) / slope)
-        offset = [_centre(side, local[:, 2] + distance) for side in local[:, :2].T]
+        offset = [_centred_eye(side, local[:, 2] + distance) for side in local[:, :2].T]
         target = middle + right * offset[0] + up * offset[1]
         return cls(target + distance * back, target, fov, center, size)
 
@@ -91,13 +91,13 @@ def check_view(view: Any) -> tuple[float, float]:
     return azimuth, elevation
 
 
-def _centre(side: Floats, depth: Floats) -> float:
+def _centred_eye(side: Floats, depth: Floats) -> float:
     """Eye position along one axis that centres the points (P,) in the picture."""
     low, high = float(side.min()), float(side.max())
     for _ in range(60):  # monotonic in the eye position: bisection
         eye = 0.5 * (low + high)
-        seen = (side - eye) / depth
-        low, high = (eye, high) if seen.max() + seen.min() > 0.0 else (low, eye)
+        projected = (side - eye) / depth
+        low, high = (eye, high) if projected.max() + projected.min() > 0.0 else (low, eye)
     return 0.5 * (low + high)
 
 
@@ -111,7 +111,7 @@ class Renderer:
     """Draws triangles with smooth normals, soft light and a shadow on the ground.
 
     Args:
-        triangles: (T, 3) int, outward.
+        triangles: (T, 3) point indices, counter-clockwise seen from outside.
         reference: (P, 3) points whose dihedral angles define edges (sharper than 40 degrees); default: those of the
             first picture.
         up_axis: "Z" or "Y"; points are rotated so that this axis is up.
@@ -134,7 +134,7 @@ class Renderer:
         self.up_axis = up_axis
         self.ground = ground
         self._reference = None if reference is None else np.asarray(reference, dtype=np.float64)
-        self._groups: tuple[npt.NDArray[np.int64], int] | None = None
+        self._normal_groups: tuple[npt.NDArray[np.int64], int] | None = None
         self._mesh: Any = None
 
     def to_z_up(self, points: Floats) -> npt.NDArray[np.float64]:
@@ -148,7 +148,7 @@ class Renderer:
         camera: Camera | None = None,
         size: tuple[int, int] = (960, 540),
     ) -> Image:
-        """A picture (height, width, 3) of points (P, 3) in metres with sRGB colours (P, 3).
+        """A picture (height, width, 3) of points (P, 3) in metres with sRGB colours (P, 3) in [0, 1].
 
         Without a camera, one that frames the points. OutputError if points are not finite or counts differ.
         """
@@ -161,23 +161,25 @@ class Renderer:
             raise OutputError("points must be finite, as many as colours, and as many as triangles refer to")
         width, height = size
         camera = camera or Camera.framing(points, aspect=width / height)
-        if self._groups is None:
+        if self._normal_groups is None:
             base = points if self._reference is None else self.to_z_up(self._reference)
-            self._groups = smooth_corners(base, self.triangles)
+            self._normal_groups = smooth_corners(base, self.triangles)
         unit = (points - camera.target) / camera.size
         with quiet_warp(), wp.ScopedDevice("cpu"):
-            scene = self._scene(wp, raycast, unit, np.asarray(colors), camera, size)
+            scene = self._make_scene(wp, raycast, unit, np.asarray(colors), camera, size)
             self._cast_shadow(wp, raycast, scene, unit)
             image = self._cast(wp, raycast, scene, pixel_grid(width, height)).reshape(height, width, 3)
-            rough = rough_pixels(to_srgb(image))
-            rows, columns = np.nonzero(rough)
+            edges = edge_pixels(to_srgb(image))
+            rows, columns = np.nonzero(edges)
             corners = np.stack([columns, rows], axis=1).astype(np.float32)
             fine = (corners[:, None, :] + _SUBPIXELS).reshape(-1, 2)
-            image[rough] = self._cast(wp, raycast, scene, fine).reshape(-1, len(_SUBPIXELS), 3).mean(axis=1)
+            image[edges] = self._cast(wp, raycast, scene, fine).reshape(-1, len(_SUBPIXELS), 3).mean(axis=1)
         return np.asarray(np.round(to_srgb(image) * 255.0), dtype=np.uint8)
 
-    def _scene(self, wp: Any, raycast: Any, unit: Floats, colors: Floats, camera: Camera, size: tuple[int, int]) -> Any:
-        assert self._groups is not None
+    def _make_scene(
+        self, wp: Any, raycast: Any, unit: Floats, colors: Floats, camera: Camera, size: tuple[int, int]
+    ) -> Any:
+        assert self._normal_groups is not None
         points = np.ascontiguousarray(unit, dtype=np.float32)
         if self._mesh is None or len(self._mesh.points) != len(points):
             indices = wp.array(self.triangles.ravel(), dtype=wp.int32)
@@ -187,7 +189,7 @@ class Renderer:
             self._mesh.refit()
         corner = unit[self.triangles]
         area = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-        group, count = self._groups
+        group, count = self._normal_groups
         normals = unit_rows(scatter_rows(group, np.repeat(area, 3, axis=0), count))[group]
         forward, right, up = camera.axes()
         tangent = np.tan(np.radians(0.5 * camera.fov))
@@ -218,7 +220,7 @@ class Renderer:
         scene.shadow_cell = 1.0
         if not scene.has_ground:
             return
-        lights = cone(self._light, 0.14, 40)
+        lights = cone_directions(self._light, 0.14, 40)
         lights = lights[lights[:, 2] > 0.05]
         fall = np.maximum(unit[:, 2] - scene.ground, 0.0)[:, None, None]
         spots = unit[:, None, :2] - fall * (lights[:, :2] / lights[:, 2:])[None, ::4]
@@ -249,25 +251,25 @@ def pixel_grid(width: int, height: int) -> npt.NDArray[np.float32]:
     return np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float32)
 
 
-def rough_pixels(image: Floats, limit: float = 0.025) -> npt.NDArray[np.bool_]:
-    """(height, width) pixels of an sRGB picture that differ from a neighbour, for resampling."""
-    rough = np.zeros(image.shape[:2], dtype=bool)
+def edge_pixels(image: Floats, limit: float = 0.025) -> npt.NDArray[np.bool_]:
+    """(height, width) pixels of an sRGB picture that differ from a neighbour, for supersampling."""
+    edges = np.zeros(image.shape[:2], dtype=bool)
     for channel in np.moveaxis(image, 2, 0):  # reductions over an axis of length three are slow in numpy
         down = np.abs(np.diff(channel, axis=0)) > limit
         across = np.abs(np.diff(channel, axis=1)) > limit
-        rough[1:] |= down
-        rough[:-1] |= down
-        rough[:, 1:] |= across
-        rough[:, :-1] |= across
-    return rough
+        edges[1:] |= down
+        edges[:-1] |= down
+        edges[:, 1:] |= across
+        edges[:, :-1] |= across
+    return edges
 
 
-def cone(axis: Floats, spread: float, count: int) -> npt.NDArray[np.float32]:
-    """(count, 3) unit directions spread evenly over a disc of radius `spread` around a unit axis."""
+def cone_directions(axis: Floats, tangent: float, count: int) -> npt.NDArray[np.float32]:
+    """(count, 3) unit directions evenly over a disc of radius `tangent` (of the half angle) around a unit axis."""
     side = np.cross(axis, (1.0, 0.0, 0.0) if abs(axis[0]) < 0.7 else (0.0, 1.0, 0.0))
     side /= np.linalg.norm(side)
     k = np.arange(count)
-    radius, angle = spread * np.sqrt((k + 0.5) / count), 2.399963 * k
+    radius, angle = tangent * np.sqrt((k + 0.5) / count), 2.399963 * k
     directions = axis + radius[:, None] * (
         np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * np.cross(axis, side)
     )

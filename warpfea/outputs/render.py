@@ -1,7 +1,7 @@
 """Pictures and animations: `PNGWriter` and `GIFWriter` of a run, `render_usd` of a file made by `USDWriter`.
 
-Common layout: parallel worlds on the same grid as in the USD file, a camera that frames the whole motion, one colour
-range for all frames, a colour bar and the time.
+Common layout: parallel worlds laid out on the same grid as in the USD file, a camera that frames the whole motion,
+one colour range for all frames, a colour bar and the time.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from warpfea.outputs.frames import (
     check_colors,
     check_fields,
     field_label,
+    frame_time,
     is_static,
-    time_of,
 )
-from warpfea.outputs.raycaster import VIEW, Camera, Renderer, check_view
-from warpfea.outputs.usd_check import in_words
+from warpfea.outputs.raycaster import DEFAULT_VIEW, Camera, Renderer, check_view
+from warpfea.outputs.usd_check import error_text
 
 __all__ = ["Camera", "GIFWriter", "PNGWriter", "Renderer", "render_usd"]
 
@@ -38,15 +38,15 @@ Floats = npt.NDArray[np.floating[Any]]
 def _checked_size(size: Any) -> tuple[int, int]:
     try:
         width, height = size
-        known = all(32 <= k <= 8192 and k == int(k) for k in (width, height))
+        valid = all(32 <= k <= 8192 and k == int(k) for k in (width, height))
     except (TypeError, ValueError):
-        known = False
-    if not known:
+        valid = False
+    if not valid:
         raise ModelError(f"size: a picture must have (width, height) of 32 to 8192 pixels each way, got {size!r}")
     return int(width), int(height)
 
 
-class _Drawing(Output):
+class _PictureWriter(Output):
     """Common parts of PNGWriter and GIFWriter: collection of frames."""
 
     suffix = ""
@@ -75,8 +75,8 @@ class _Drawing(Output):
         check_fields(sim, [self.field] if self.field else [])
         self._surface = DrawnSurface(sim, self.spacing)
         start = self._surface.points(sim)
-        bodies = start[: self._surface.body_points]
-        self._origin = 0.5 * (bodies.min(axis=0) + bodies.max(axis=0))
+        body_points = start[: self._surface.body_points]
+        self._origin = 0.5 * (body_points.min(axis=0) + body_points.max(axis=0))
         title, units = field_label(self.field) if self.field else ("", "")
         self._animation = Animation(
             self._surface.triangles(),
@@ -93,14 +93,14 @@ class _Drawing(Output):
     def _frame(self, sim: Any) -> Frame:
         points = np.asarray(self._surface.points(sim) - self._origin, dtype=np.float32)
         values = self._surface.values(sim, self.field) if self.field else None
-        return Frame(time_of(sim), points, values)
+        return Frame(frame_time(sim), points, values)
 
     def abort(self) -> None:
         """Discard the frames; nothing is on disk before `close`."""
         self._animation = None
 
 
-class PNGWriter(_Drawing):
+class PNGWriter(_PictureWriter):
     """Draws one state to `path` (.png).
 
     Args:
@@ -108,7 +108,8 @@ class PNGWriter(_Drawing):
         time: the first state at or after this time (s) is drawn; without it, or if never reached, the last.
         view: (azimuth, elevation) of the camera, degrees.
         color_range: (low, high) of the colours, by default the extremes of the drawn values.
-        spacing: of worlds (m). ground: True to draw the ground at the lowest point.
+        spacing: distance of neighbouring worlds (m), one number or (x, y).
+        ground: True to draw the ground at the lowest point.
 
     ModelError: a bad size, view or field. OutputError: a bad colour range, a bad suffix or folder (at `open`), a file
     that can't be written (at `close`).
@@ -123,7 +124,7 @@ class PNGWriter(_Drawing):
         field: str | None = "von_mises",
         size: tuple[int, int] = (960, 540),
         time: float | None = None,
-        view: tuple[float, float] = VIEW,
+        view: tuple[float, float] = DEFAULT_VIEW,
         color_range: tuple[float, float] | None = None,
         spacing: float | tuple[float, float] | None = None,
         ground: bool = True,
@@ -137,7 +138,7 @@ class PNGWriter(_Drawing):
     def write(self, sim: Any) -> None:
         if self._animation is None or self.time is None or self._animation.frames:
             return
-        if time_of(sim) >= self.time - 1e-9 * max(1.0, abs(self.time)):
+        if frame_time(sim) >= self.time - 1e-9 * max(1.0, abs(self.time)):
             self._animation.frames = [self._frame(sim)]
 
     def close(self, sim: Any) -> None:
@@ -150,7 +151,7 @@ class PNGWriter(_Drawing):
             self.abort()
 
 
-class GIFWriter(_Drawing):
+class GIFWriter(_PictureWriter):
     """Draws an animation to `path` (.gif).
 
     Args:
@@ -174,7 +175,7 @@ class GIFWriter(_Drawing):
         field: str | None = "von_mises",
         size: tuple[int, int] = (640, 360),
         max_frames: int = 240,
-        view: tuple[float, float] = VIEW,
+        view: tuple[float, float] = DEFAULT_VIEW,
         color_range: tuple[float, float] | None = None,
         spacing: float | tuple[float, float] | None = None,
         ground: bool = True,
@@ -192,7 +193,7 @@ class GIFWriter(_Drawing):
         self._clock = FrameClock(self.fps / self.speed)
 
     def write(self, sim: Any) -> None:
-        if self._animation is not None and self._clock.due(time_of(sim)):
+        if self._animation is not None and self._clock.due(frame_time(sim)):
             self._append(sim)
 
     def _append(self, sim: Any) -> None:
@@ -209,7 +210,7 @@ class GIFWriter(_Drawing):
         if self._animation is None:
             return
         try:
-            if time_of(sim) > self._clock.last:
+            if frame_time(sim) > self._clock.last:
                 self._append(sim)
             self._animation.save_gif(self.path, self.size, self.view, self.ground, self.speed, self.progress)
         finally:
@@ -236,7 +237,7 @@ def render_usd(
     max_frames: int = 240,
     field: str | None = None,
     time: float | None = None,
-    view: tuple[float, float] = VIEW,
+    view: tuple[float, float] = DEFAULT_VIEW,
     color_range: tuple[float, float] | None = None,
     ground: bool = True,
     progress: bool | None = None,
@@ -245,7 +246,7 @@ def render_usd(
 
     Args:
         field: a field of the file, or "none" for grey; None: the field of its colours.
-        time: of a PNG (s); None: the last.
+        time: of the state drawn to a PNG (s); None: the last in the file.
         fps, speed, max_frames: of a GIF, which spans the whole file; more frames are spread over the span.
         color_range: (low, high) of the colours; None: those of the file, or the extremes of the run.
         size: (width, height), default (960, 540) for PNG and (640, 360) for GIF.
@@ -260,7 +261,7 @@ def render_usd(
     check_rates(fps, speed, max_frames)
     color_range = check_colors(color_range)
     view = check_view(view)
-    source = _Source(pathlib.Path(path))
+    source = _StageReader(pathlib.Path(path))
     if animated:
         count = int(np.floor((source.end - source.start) * fps / speed * (1 + 1e-9))) + 1
         times = source.start + np.arange(count) * speed / fps
@@ -275,7 +276,7 @@ def render_usd(
             raise ModelError(f"{path}: time {at:g} s lies outside {source.start:g} .. {source.end:g} s")
         times = np.array([at])
     animation = source.animation(field, times)
-    animation.shown = color_range or animation.shown
+    animation.color_range = color_range or animation.color_range
     if animated:
         animation.save_gif(target, size, view, ground, speed, progress)
     else:
@@ -283,7 +284,7 @@ def render_usd(
     return target
 
 
-class _Source:
+class _StageReader:
     """A stage written by USDWriter, opened for drawing."""
 
     def __init__(self, path: pathlib.Path) -> None:
@@ -295,15 +296,15 @@ class _Source:
         try:
             self.stage = Usd.Stage.Open(str(path))
         except Tf.ErrorException as error:
-            raise ModelError(f"{path}: can't be read as USD ({in_words(error)})") from error
+            raise ModelError(f"{path}: can't be read as USD ({error_text(error)})") from error
         meshes = [UsdGeom.Mesh(prim) for prim in self.stage.Traverse() if prim.IsA(UsdGeom.Mesh)]
         self.obstacles = [mesh for mesh in meshes if mesh.GetPrim().GetCustomDataByKey("warpfea:collider")]
         self.meshes = [mesh for mesh in meshes if not mesh.GetPrim().GetCustomDataByKey("warpfea:collider")]
         if not self.meshes:
             raise ModelError(f"{path}: holds no mesh")
         root = self.stage.GetDefaultPrim()
-        self.about: Any = root.GetCustomDataByKey("warpfea") if root else None
-        if not self.about:
+        self.metadata: Any = root.GetCustomDataByKey("warpfea") if root else None
+        if not self.metadata:
             raise ModelError(f"{path}: was not written by warpfea")
         self.rate = self.stage.GetTimeCodesPerSecond()
         self.start, self.end = (
@@ -315,35 +316,39 @@ class _Source:
         """Frames at `times` (s); USD interpolates linearly between samples."""
         from pxr import UsdGeom
 
-        name = None if field == "none" else field or self.about["color"] or None
-        if name is not None and name not in self.about["fields"]:
-            have = ", ".join(self.about["fields"]) or "none"
-            hint = did_you_mean(name, self.about["fields"])
+        name = None if field == "none" else field or self.metadata["color"] or None
+        if name is not None and name not in self.metadata["fields"]:
+            have = ", ".join(self.metadata["fields"]) or "none"
+            hint = did_you_mean(name, self.metadata["fields"])
             raise ModelError(f"{self.path}: has no field {name!r}; fields: {have}{hint}")
-        triangles, first, bodies, plane_squares = [], 0, 0, []
+        triangles, point_offset, body_points, plane_squares = [], 0, 0, []
         for k, mesh in enumerate(self.meshes + self.obstacles):
             counts = np.asarray(mesh.GetFaceVertexCountsAttr().Get())
             if (counts != 3).any():
                 raise ModelError(f"{self.path}: {mesh.GetPath()} has faces that are not triangles")
-            triangles.append(np.asarray(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3) + first)
+            triangles.append(np.asarray(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3) + point_offset)
             if mesh.GetPrim().GetCustomDataByKey("warpfea:collider") == "HalfSpace":
-                plane_squares.append(first)
-            first += len(mesh.GetPointsAttr().Get(self.start * self.rate))
+                plane_squares.append(point_offset)
+            point_offset += len(mesh.GetPointsAttr().Get(self.start * self.rate))
             if k < len(self.meshes):
-                bodies = first
+                body_points = point_offset
         start = self._points(self.start)
-        self.origin = 0.5 * (start[:bodies].min(axis=0) + start[:bodies].max(axis=0))
+        self.origin = 0.5 * (start[:body_points].min(axis=0) + start[:body_points].max(axis=0))
         reference = np.asarray(start - self.origin, dtype=np.float32)
         animation = Animation(np.concatenate(triangles), str(UsdGeom.GetStageUpAxis(self.stage)), reference)
-        animation.static, animation.bodies, animation.plane_squares = (
-            bool(self.about.get("static", False)),
-            bodies,
+        animation.static, animation.body_points, animation.plane_squares = (
+            bool(self.metadata.get("static", False)),
+            body_points,
             plane_squares,
         )
         if name is not None:
-            about = self.about["fields"][name]
-            pair = self.about["colorRange"] if name == self.about["color"] else about["range"]
-            animation.title, animation.units, animation.shown = about["title"], about["units"], (pair[0], pair[1])
+            field_metadata = self.metadata["fields"][name]
+            pair = self.metadata["colorRange"] if name == self.metadata["color"] else field_metadata["range"]
+            animation.title, animation.units, animation.color_range = (
+                field_metadata["title"],
+                field_metadata["units"],
+                (pair[0], pair[1]),
+            )
         for time in map(float, times):
             points = np.asarray(self._points(time) - self.origin, dtype=np.float32)
             animation.frames.append(Frame(time, points, self._values(name, time) if name else None))

@@ -34,12 +34,12 @@ from warpfea.outputs.frames import (
     check_colors,
     check_fields,
     field_label,
+    frame_time,
     is_static,
-    time_of,
 )
 from warpfea.outputs.normals import vertex_normals
-from warpfea.outputs.obstacles import names_beside
-from warpfea.outputs.usd_check import in_words, validate_usd
+from warpfea.outputs.obstacles import unique_names
+from warpfea.outputs.usd_check import error_text, validate_usd
 from warpfea.outputs.usd_extend import read_existing
 from warpfea.outputs.usd_obstacles import ObstaclePrims
 
@@ -48,7 +48,7 @@ __all__ = ["SCHEMA", "USDWriter", "validate_usd"]
 SCHEMA = 1
 SUFFIXES = (".usdc", ".usda", ".usd")
 _SAVE_BYTES = 32 << 20  # unsaved data (bytes) above which a binary layer is flushed to disk
-_GREY = (0.55, 0.57, 0.60)
+_BODY_COLOR = (0.55, 0.57, 0.60)
 
 
 class USDWriter(Output):
@@ -106,21 +106,21 @@ class USDWriter(Output):
         check_fields(sim, self.fields)
         self._surface = DrawnSurface(sim, self.spacing)
         self._clock = FrameClock(self.fps)
-        self._codes: list[float] = []
-        self._range = {name: (np.inf, -np.inf) for name in self.fields}
-        self._box = (np.full(3, np.inf), np.full(3, -np.inf))
-        self._unsaved = 0
+        self._time_codes: list[float] = []
+        self._field_ranges = {name: (np.inf, -np.inf) for name in self.fields}
+        self._bounding_box = (np.full(3, np.inf), np.full(3, -np.inf))
+        self._unsaved_bytes = 0
         self._temporary = temporary_beside(target)
-        going_on = self.extend and target.is_file()
+        extending = self.extend and target.is_file()
         try:
-            if going_on:
+            if extending:
                 self._resume(sim, target)
                 return
             self._stage = stage = Usd.Stage.CreateNew(str(self._temporary))
         except (OSError, Tf.ErrorException) as error:
             self.abort()
-            reason = in_words(error) if isinstance(error, Tf.ErrorException) else error.strerror
-            what = "read or continued" if going_on else "written"
+            reason = error_text(error) if isinstance(error, Tf.ErrorException) else error.strerror
+            what = "read or continued" if extending else "written"
             raise OutputError(f"{target}: can't be {what} ({reason})") from error
         except OutputError:
             self.abort()
@@ -138,7 +138,7 @@ class USDWriter(Output):
         """Names of the bodies' prims."""
         from pxr import Tf
 
-        return names_beside((), [Tf.MakeValidIdentifier(body.name) for body in self._surface.bodies])
+        return unique_names((), [Tf.MakeValidIdentifier(body.name) for body in self._surface.bodies])
 
     def _resume(self, sim: Any, target: pathlib.Path) -> None:
         """Open a copy of the existing file for extension."""
@@ -150,15 +150,19 @@ class USDWriter(Output):
         worlds = range(self._surface.worlds)
         paths = [[f"/World/world_{world:04d}/{name}/skin" for world in worlds] for name in self._names()]
         wanted = {"fps": self.fps, "fields": self.fields, "color": self.color}
-        earlier = read_existing(target, stage, sim, self._surface, paths, wanted)
-        self._codes, self._box, self._surface.offsets = list(earlier.codes), earlier.box, earlier.offsets
-        self._range = {name: earlier.ranges[name] for name in self.fields}
-        self._clock.due(earlier.time)
-        self._meshes: list[list[_Mesh]] = []
+        existing = read_existing(target, stage, sim, self._surface, paths, wanted)
+        self._time_codes, self._bounding_box, self._surface.offsets = (
+            list(existing.codes),
+            existing.box,
+            existing.offsets,
+        )
+        self._field_ranges = {name: existing.ranges[name] for name in self.fields}
+        self._clock.due(existing.time)
+        self._meshes: list[list[_MeshPrim]] = []
         for of_body in paths:
             meshes = [UsdGeom.Mesh(stage.GetPrimAtPath(path)) for path in of_body]
             moves = [UsdGeom.Xformable(m.GetPrim().GetParent()).GetOrderedXformOps()[0] for m in meshes]
-            self._meshes.append([_Mesh(mesh, move, self.fields) for mesh, move in zip(meshes, moves)])
+            self._meshes.append([_MeshPrim(mesh, move, self.fields) for mesh, move in zip(meshes, moves)])
         self._obstacles = ObstaclePrims(stage, self._surface, self._names())
         if not self._obstacles.resume():
             raise OutputError(f"{target}: can't go on with this file: it has other colliders; give another file name")
@@ -186,53 +190,53 @@ class USDWriter(Output):
                 mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
                 mesh.CreateOrientationAttr(UsdGeom.Tokens.rightHanded)
                 mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
-                meshes.append(_Mesh(mesh, xform.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble), self.fields))
+                meshes.append(_MeshPrim(mesh, xform.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble), self.fields))
         self._obstacles = ObstaclePrims(self._stage, self._surface, names)
         self._obstacles.define()
 
     def write(self, sim: Any) -> None:
-        time = time_of(sim)
+        time = frame_time(sim)
         if self._clock.due(time):
-            self._frame(sim, time)
+            self._write_frame(sim, time)
 
-    def _frame(self, sim: Any, time: float) -> None:
+    def _write_frame(self, sim: Any, time: float) -> None:
         from pxr import Tf
 
-        code = self._clock.code(time)
+        code = self._clock.time_code(time)
         try:
-            taken = [
-                (self._surface.points_of(sim, body), {n: self._field(sim, n, body) for n in self.fields})
+            samples = [
+                (self._surface.skin_points(sim, body), {n: self._field_values(sim, n, body) for n in self.fields})
                 for body in self._surface.bodies
             ]  # evaluate all first: a failed frame must leave nothing in the stage
-            for body, meshes, (points, fields) in zip(self._surface.bodies, self._meshes, taken, strict=True):
+            for body, meshes, (points, fields) in zip(self._surface.bodies, self._meshes, samples, strict=True):
                 for world, mesh in enumerate(meshes):
                     values = {name: field[world] for name, field in fields.items()}
                     low, high = mesh.write(code, points[world], body.skin.triangles, values)
                     offset = self._surface.offsets[world]
-                    self._box = (
-                        np.minimum(self._box[0], low + offset),
-                        np.maximum(self._box[1], high + offset),
+                    self._bounding_box = (
+                        np.minimum(self._bounding_box[0], low + offset),
+                        np.maximum(self._bounding_box[1], high + offset),
                     )
-                self._unsaved += points.shape[0] * points.shape[1] * (24 + 4 * len(fields))
+                self._unsaved_bytes += points.shape[0] * points.shape[1] * (24 + 4 * len(fields))
             self._obstacles.write(code)
-            self._codes.append(code)
-            if self._unsaved > _SAVE_BYTES and self.path.suffix.lower() != ".usda":
+            self._time_codes.append(code)
+            if self._unsaved_bytes > _SAVE_BYTES and self.path.suffix.lower() != ".usda":
                 self._save()
         except Tf.ErrorException as error:
-            raise OutputError(f"{self.path}: can't be written ({in_words(error)})") from error
+            raise OutputError(f"{self.path}: can't be written ({error_text(error)})") from error
 
-    def _field(self, sim: Any, name: str, body: Any) -> npt.NDArray[np.float32]:
+    def _field_values(self, sim: Any, name: str, body: Any) -> npt.NDArray[np.float32]:
         values = np.ascontiguousarray(sim.skin_field(name, body), dtype=np.float32)
         finite = values[np.isfinite(values)]
         if finite.size:
-            low, high = self._range[name]
-            self._range[name] = (min(low, float(finite.min())), max(high, float(finite.max())))
+            low, high = self._field_ranges[name]
+            self._field_ranges[name] = (min(low, float(finite.min())), max(high, float(finite.max())))
         return values
 
     def _save(self) -> None:
         if not self._stage.GetRootLayer().Save():
             raise OutputError(f"{self.path}: can't be written")
-        self._unsaved = 0
+        self._unsaved_bytes = 0
 
     def close(self, sim: Any) -> None:
         if self._stage is None or self._temporary is None:
@@ -241,10 +245,10 @@ class USDWriter(Output):
 
         temporary = self._temporary
         try:
-            time = time_of(sim)
+            time = frame_time(sim)
             if time > self._clock.last:
-                self._frame(sim, time)
-            self._finish(sim)
+                self._write_frame(sim, time)
+            self._write_metadata(sim)
             self._save()
             self._stage, self._meshes = None, []
             problems = validate_usd(temporary)
@@ -254,7 +258,7 @@ class USDWriter(Output):
         except OSError as error:
             raise OutputError(f"{self.path}: can't be written ({error})") from error
         except Tf.ErrorException as error:
-            raise OutputError(f"{self.path}: can't be written ({in_words(error)})") from error
+            raise OutputError(f"{self.path}: can't be written ({error_text(error)})") from error
         finally:
             self.abort()
         stale = Sdf.Layer.Find(str(self.path))
@@ -267,34 +271,34 @@ class USDWriter(Output):
             self._temporary.unlink(missing_ok=True)
             self._temporary = None
 
-    def _finish(self, sim: Any) -> None:
+    def _write_metadata(self, sim: Any) -> None:
         """Author data known at the end only: time span, colours, camera, lights and customData."""
         stage = self._stage
-        if self._codes:
-            stage.SetStartTimeCode(min(self._codes))
-            stage.SetEndTimeCode(max(self._codes))
-        ranges = {name: pair if pair[0] <= pair[1] else (0.0, 0.0) for name, pair in self._range.items()}
+        if self._time_codes:
+            stage.SetStartTimeCode(min(self._time_codes))
+            stage.SetEndTimeCode(max(self._time_codes))
+        ranges = {name: pair if pair[0] <= pair[1] else (0.0, 0.0) for name, pair in self._field_ranges.items()}
         shown = self.color_range or (ranges[self.color] if self.color else (0.0, 0.0))
         for meshes in self._meshes:
             for mesh in meshes:
-                self._unsaved += mesh.write_colors(self.color, shown)
-                if self._unsaved > _SAVE_BYTES and self.path.suffix.lower() != ".usda":
+                self._unsaved_bytes += mesh.write_colors(self.color, shown)
+                if self._unsaved_bytes > _SAVE_BYTES and self.path.suffix.lower() != ".usda":
                     self._save()
-        _define_view(stage, *self._box, self._surface.up_axis)
-        data: dict[str, Any] = {"schema": SCHEMA, "frames": len(self._codes), "worlds": self._surface.worlds}
+        _define_camera(stage, *self._bounding_box, self._surface.up_axis)
+        data: dict[str, Any] = {"schema": SCHEMA, "frames": len(self._time_codes), "worlds": self._surface.worlds}
         dt = np.ravel(np.asarray(getattr(sim, "dt", np.nan), dtype=np.float64))
         data["dt"] = float(dt[0]) if dt.size else float("nan")
         data["color"] = self.color or ""
         data["static"] = is_static(sim)
-        data["colorRange"] = _pair(shown)
+        data["colorRange"] = _vec2d(shown)
         data["fields"] = {
-            name: {"title": field_label(name)[0], "units": field_label(name)[1], "range": _pair(ranges[name])}
+            name: {"title": field_label(name)[0], "units": field_label(name)[1], "range": _vec2d(ranges[name])}
             for name in self.fields
         }
         stage.GetDefaultPrim().SetCustomDataByKey("warpfea", data)
 
 
-class _Mesh:
+class _MeshPrim:
     """The varying attributes of one body in one world."""
 
     def __init__(self, mesh: Any, translate: Any, fields: Sequence[str]) -> None:
@@ -333,7 +337,7 @@ class _Mesh:
 
         if name is None:
             self.color.SetInterpolation(UsdGeom.Tokens.constant)
-            self.color.Set(Vt.Vec3fArray([Gf.Vec3f(*_GREY)]))
+            self.color.Set(Vt.Vec3fArray([Gf.Vec3f(*_BODY_COLOR)]))
             return 12
         size = 0
         for code in self.fields[name].GetTimeSamples():
@@ -343,13 +347,13 @@ class _Mesh:
         return size
 
 
-def _pair(pair: tuple[float, float]) -> Any:
+def _vec2d(pair: tuple[float, float]) -> Any:
     from pxr import Gf
 
     return Gf.Vec2d(float(pair[0]), float(pair[1]))
 
 
-def _define_view(stage: Any, low: npt.NDArray[np.float64], high: npt.NDArray[np.float64], up_axis: str) -> None:
+def _define_camera(stage: Any, low: npt.NDArray[np.float64], high: npt.NDArray[np.float64], up_axis: str) -> None:
     """A camera that frames the box (m) from the front right above, a sky and a sun."""
     from pxr import Gf, UsdGeom, UsdLux
 
@@ -358,12 +362,12 @@ def _define_view(stage: Any, low: npt.NDArray[np.float64], high: npt.NDArray[np.
     center, radius = 0.5 * (low + high), max(0.5 * float(np.linalg.norm(high - low)), 1e-6)
     up = Gf.Vec3d(0, 0, 1) if up_axis == "Z" else Gf.Vec3d(0, 1, 0)
 
-    def along(azimuth: float, elevation: float) -> npt.NDArray[np.float64]:
+    def direction(azimuth: float, elevation: float) -> npt.NDArray[np.float64]:
         a, e = np.radians([azimuth, elevation])
         x, y, z = np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)
         return np.array([x, y, z] if up_axis == "Z" else [x, z, -y])
 
-    def look(xform: Any, eye: npt.NDArray[np.float64]) -> None:
+    def look_from(xform: Any, eye: npt.NDArray[np.float64]) -> None:
         view = Gf.Matrix4d().SetLookAt(Gf.Vec3d(*map(float, eye)), Gf.Vec3d(*map(float, center)), up)
         xform.AddTransformOp().Set(view.GetInverse())
 
@@ -372,10 +376,10 @@ def _define_view(stage: Any, low: npt.NDArray[np.float64], high: npt.NDArray[np.
     camera.CreateHorizontalApertureAttr(36.0)
     camera.CreateVerticalApertureAttr(20.25)
     distance = 1.05 * radius / np.sin(np.arctan(0.5 * 20.25 / 50.0))
-    look(camera, center + distance * along(-65.0, 20.0))
+    look_from(camera, center + distance * direction(-65.0, 20.0))
     camera.CreateClippingRangeAttr(Gf.Vec2f(float(1e-3 * distance), float(1e3 * distance)))
     sun = UsdLux.DistantLight.Define(stage, "/World/Sun")
-    look(sun, center + radius * along(-110.0, 50.0))
+    look_from(sun, center + radius * direction(-110.0, 50.0))
     sun.CreateIntensityAttr(2.0)
     sun.CreateNormalizeAttr(True)
     sun.CreateAngleAttr(2.0)

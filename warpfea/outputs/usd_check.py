@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["in_words", "validate_usd"]
+__all__ = ["error_text", "validate_usd"]
 
 
-def in_words(error: Exception) -> str:
+def error_text(error: Exception) -> str:
     """USD error text without source locations."""
     texts = re.findall(r" : '(.*)'\s*$", str(error), re.MULTILINE)
     if texts and texts[0].startswith("Cannot determine file format"):
@@ -31,7 +31,7 @@ def validate_usd(path: str | os.PathLike[str], max_samples: int = 64) -> list[st
     try:
         stage = Usd.Stage.Open(str(path))
     except Tf.ErrorException as error:
-        return [f"{path}: can't be opened ({in_words(error)})"]
+        return [f"{path}: can't be opened ({error_text(error)})"]
     validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
     problems = [
         f"{error.GetName()}: {error.GetMessage()}"

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from warpfea.base.errors import OutputError
-from warpfea.outputs.frames import DrawnSurface, is_static, time_of
+from warpfea.outputs.frames import DrawnSurface, frame_time, is_static
 
 __all__ = ["ExistingStage", "read_existing"]
 
@@ -58,7 +58,7 @@ def read_existing(
     root = stage.GetDefaultPrim()
     about = root.GetCustomDataByKey("warpfea") if root else None
     if not about:
-        raise _refused(target, "it was not written by warpfea")
+        raise _extension_error(target, "it was not written by warpfea")
     has = {
         "number of worlds": (int(about["worlds"]), surface.worlds),
         "frames per second": (float(stage.GetTimeCodesPerSecond()), float(wanted["fps"])),
@@ -69,22 +69,24 @@ def read_existing(
     }
     for what, (old, new) in has.items():
         if old != new:
-            raise _refused(target, f"its {what} is {old!r}, of this run {new!r}")
+            raise _extension_error(target, f"its {what} is {old!r}, of this run {new!r}")
     meshes = [[UsdGeom.Mesh(stage.GetPrimAtPath(path)) for path in worlds] for worlds in paths]
     _check_faces(target, surface, meshes)
     codes = list(map(float, meshes[0][0].GetPointsAttr().GetTimeSamples()))
     if not codes:
-        raise _refused(target, "it has no frames")
-    time, now = codes[-1] / wanted["fps"], time_of(sim)
+        raise _extension_error(target, "it has no frames")
+    time, now = codes[-1] / wanted["fps"], frame_time(sim)
     slack = 1e-6 * max(1.0 / wanted["fps"], abs(now))
     if time > now + slack:
-        raise _refused(target, f"its last frame, t = {time:.6g} s, is later than the checkpoint, t = {now:.6g} s")
+        raise _extension_error(
+            target, f"its last frame, t = {time:.6g} s, is later than the checkpoint, t = {now:.6g} s"
+        )
     if time < now - slack - 1.001 / wanted["fps"]:
-        raise _refused(
+        raise _extension_error(
             target, f"it ends at t = {time:.6g} s, and the run is resumed at t = {now:.6g} s: frames are missing"
         )
-    offsets = np.array([_offset(stage, meshes[0][world]) for world in range(surface.worlds)])
-    box = _box(meshes, codes, offsets)
+    offsets = np.array([_grid_origin(stage, meshes[0][world]) for world in range(surface.worlds)])
+    box = _bounding_box(meshes, codes, offsets)
     if abs(time - now) <= slack:
         _check_frame(target, sim, surface, meshes, codes[-1], CONTINUITY_TOL * float(np.linalg.norm(box[1] - box[0])))
     ranges = {name: (float(field["range"][0]), float(field["range"][1])) for name, field in about["fields"].items()}
@@ -97,7 +99,7 @@ def _check_faces(target: pathlib.Path, surface: DrawnSurface, meshes: list[list[
         for mesh in worlds:
             faces = np.asarray(mesh.GetFaceVertexIndicesAttr().Get() if mesh else ()).reshape(-1)
             if not np.array_equal(faces, np.asarray(body.skin.triangles).ravel()):
-                raise _refused(target, f"body {body.name!r} is not in it, or has another mesh")
+                raise _extension_error(target, f"body {body.name!r} is not in it, or has another mesh")
 
 
 def _check_frame(
@@ -105,18 +107,18 @@ def _check_frame(
 ) -> None:
     """OutputError for a point of the frame at a time code farther than `bound`, m, from the simulation's."""
     for body, worlds in zip(surface.bodies, meshes, strict=True):
-        points = surface.points_of(sim, body)
+        points = surface.skin_points(sim, body)
         for world, mesh in enumerate(worlds):
-            drawn = np.asarray(mesh.GetPointsAttr().Get(code), dtype=float) + _center(mesh, code)
+            drawn = np.asarray(mesh.GetPointsAttr().Get(code), dtype=float) + _body_center(mesh, code)
             if np.abs(drawn - points[world]).max() > bound:
-                raise _refused(target, f"its last frame shows body {body.name!r} elsewhere than the checkpoint")
+                raise _extension_error(target, f"its last frame shows body {body.name!r} elsewhere than the checkpoint")
 
 
-def _refused(target: pathlib.Path, reason: str) -> OutputError:
+def _extension_error(target: pathlib.Path, reason: str) -> OutputError:
     return OutputError(f"{target}: can't go on with this file: {reason}; give another file name")
 
 
-def _center(mesh: Any, code: float) -> npt.NDArray[np.float64]:
+def _body_center(mesh: Any, code: float) -> npt.NDArray[np.float64]:
     """The body's centre in its world at a time code, (3,) m."""
     from pxr import UsdGeom
 
@@ -124,7 +126,7 @@ def _center(mesh: Any, code: float) -> npt.NDArray[np.float64]:
     return np.asarray(op.Get(code), dtype=float)
 
 
-def _offset(stage: Any, mesh: Any) -> npt.NDArray[np.float64]:
+def _grid_origin(stage: Any, mesh: Any) -> npt.NDArray[np.float64]:
     """Grid origin of the world of a mesh, (3,) m."""
     from pxr import UsdGeom
 
@@ -132,7 +134,7 @@ def _offset(stage: Any, mesh: Any) -> npt.NDArray[np.float64]:
     return np.asarray(op.Get(), dtype=float)
 
 
-def _box(
+def _bounding_box(
     meshes: list[list[Any]], codes: list[float], offsets: npt.NDArray[np.float64]
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Corners of the box of all frames, m."""
@@ -140,6 +142,8 @@ def _box(
     for worlds in meshes:
         for world, mesh in enumerate(worlds):
             for code in codes:
-                extent = np.asarray(mesh.GetExtentAttr().Get(code), dtype=float) + _center(mesh, code) + offsets[world]
+                extent = (
+                    np.asarray(mesh.GetExtentAttr().Get(code), dtype=float) + _body_center(mesh, code) + offsets[world]
+                )
                 low, high = np.minimum(low, extent[0]), np.maximum(high, extent[1])
     return low, high

@@ -9,14 +9,14 @@ import numpy as np
 
 from warpfea.outputs.colormap import to_linear
 from warpfea.outputs.normals import vertex_normals
-from warpfea.outputs.obstacles import GREY, names_beside
+from warpfea.outputs.obstacles import OBSTACLE_COLOR, unique_names
 
 if TYPE_CHECKING:
     from warpfea.outputs.frames import DrawnSurface
 
 __all__ = ["ObstaclePrims"]
 
-KEY = "warpfea:collider"
+COLLIDER_KEY = "warpfea:collider"
 
 
 class ObstaclePrims:
@@ -32,10 +32,10 @@ class ObstaclePrims:
         from pxr import Tf
 
         self.stage, self.surface, self.obstacles = stage, surface, surface.obstacles
-        self.names = names_beside(bodies, [Tf.MakeValidIdentifier(obstacle.name) for obstacle in self.obstacles.all])
-        self._ops: list[list[tuple[Any, Any]]] = []
+        self.names = unique_names(bodies, [Tf.MakeValidIdentifier(obstacle.name) for obstacle in self.obstacles.all])
+        self._transform_ops: list[list[tuple[Any, Any]]] = []
 
-    def _path(self, world: int, name: str) -> str:
+    def _prim_path(self, world: int, name: str) -> str:
         return f"/World/world_{world:04d}/{name}"
 
     def define(self) -> None:
@@ -45,20 +45,20 @@ class ObstaclePrims:
         for obstacle, name in zip(self.obstacles.all, self.names):
             ops = []
             for world in range(self.surface.worlds):
-                xform = UsdGeom.Xform.Define(self.stage, self._path(world, name))
+                xform = UsdGeom.Xform.Define(self.stage, self._prim_path(world, name))
                 xform.GetPrim().SetDisplayName(obstacle.name)
                 double = UsdGeom.XformOp.PrecisionDouble
                 ops.append((xform.AddTranslateOp(double), xform.AddOrientOp(double)))
-                self._mesh(obstacle, world, self._path(world, name) + "/shape")
-            self._ops.append(ops)
-        self._place(lambda obstacle: not obstacle.moves)
+                self._define_mesh(obstacle, world, self._prim_path(world, name) + "/shape")
+            self._transform_ops.append(ops)
+        self._set_transforms(lambda obstacle: not obstacle.moves)
 
-    def _mesh(self, obstacle: Any, world: int, path: str) -> None:
+    def _define_mesh(self, obstacle: Any, world: int, path: str) -> None:
         from pxr import Gf, UsdGeom, Vt
 
         points = np.asarray(obstacle.points[world], dtype=np.float32)
         mesh = UsdGeom.Mesh.Define(self.stage, path)
-        mesh.GetPrim().SetCustomDataByKey(KEY, obstacle.kind)
+        mesh.GetPrim().SetCustomDataByKey(COLLIDER_KEY, obstacle.kind)
         mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
         mesh.CreateFaceVertexCountsAttr(Vt.IntArray(len(obstacle.triangles), 3))
         mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.ascontiguousarray(obstacle.triangles.ravel())))
@@ -67,36 +67,38 @@ class ObstaclePrims:
         mesh.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.stack([points.min(axis=0), points.max(axis=0)])))
         mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
         mesh.CreateOrientationAttr(UsdGeom.Tokens.rightHanded)
-        grey = Gf.Vec3f(*map(float, to_linear(GREY)))
+        grey = Gf.Vec3f(*map(float, to_linear(OBSTACLE_COLOR)))
         mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set(Vt.Vec3fArray([grey]))
 
     def resume(self) -> bool:
         """Find the prims in an extended stage; False if it has others."""
         from pxr import UsdGeom
 
-        there = {str(prim.GetParent().GetPath()) for prim in self.stage.Traverse() if prim.GetCustomDataByKey(KEY)}
+        there = {
+            str(prim.GetParent().GetPath()) for prim in self.stage.Traverse() if prim.GetCustomDataByKey(COLLIDER_KEY)
+        }
         worlds = range(self.surface.worlds)
-        if there != {self._path(world, name) for name in self.names for world in worlds}:
+        if there != {self._prim_path(world, name) for name in self.names for world in worlds}:
             return False
         for name in self.names:
-            prims = [self.stage.GetPrimAtPath(self._path(world, name)) for world in worlds]
+            prims = [self.stage.GetPrimAtPath(self._prim_path(world, name)) for world in worlds]
             ops = [UsdGeom.Xformable(prim).GetOrderedXformOps() for prim in prims]
-            self._ops.append([(pair[0], pair[1]) for pair in ops])
+            self._transform_ops.append([(pair[0], pair[1]) for pair in ops])
         return True
 
     def write(self, code: float) -> None:
         """Current transforms of moving obstacles."""
-        self._place(lambda obstacle: obstacle.moves, code)
+        self._set_transforms(lambda obstacle: obstacle.moves, code)
 
-    def _place(self, chosen: Any, *code: float) -> None:
+    def _set_transforms(self, chosen: Any, *code: float) -> None:
         from pxr import Gf
 
         if not any(map(chosen, self.obstacles.all)):
             return
-        place, turn = self.obstacles.poses()
+        position, rotation = self.obstacles.poses()
         for k, obstacle in enumerate(self.obstacles.all):
-            for world, (translate, orient) in enumerate(self._ops[k] if chosen(obstacle) else ()):
-                translate.Set(Gf.Vec3d(*map(float, place[world, k])), *code)
+            for world, (translate, orient) in enumerate(self._transform_ops[k] if chosen(obstacle) else ()):
+                translate.Set(Gf.Vec3d(*map(float, position[world, k])), *code)
                 # rows are the images of the axes
-                rotation = Gf.Matrix3d(*map(float, turn[world, k].T.ravel())).ExtractRotation()
-                orient.Set(Gf.Quatd(rotation.GetQuat()), *code)
+                matrix = Gf.Matrix3d(*map(float, rotation[world, k].T.ravel())).ExtractRotation()
+                orient.Set(Gf.Quatd(matrix.GetQuat()), *code)

@@ -16,7 +16,7 @@ import numpy as np
 from warpfea.base.errors import OutputError
 from warpfea.base.writer import Output, check_folder, write_whole
 from warpfea.model.surfaces import reference_points
-from warpfea.outputs.frames import FrameClock, check_fields, time_of
+from warpfea.outputs.frames import FrameClock, check_fields, frame_time
 from warpfea.outputs.obstacles import Obstacles
 
 __all__ = ["VTUWriter"]
@@ -78,38 +78,38 @@ class VTUWriter(Output):
         check_fields(sim, self.fields)
         if self.folder.exists() and not self.folder.is_dir():
             raise OutputError(f"{self.folder}: is a file, not a folder")
-        self._made = not self.folder.exists()
-        check_folder(self.folder if not self._made else self.folder.parent, self.folder)
+        self._folder_created = not self.folder.exists()
+        check_folder(self.folder if not self._folder_created else self.folder.parent, self.folder)
         try:
             self.folder.mkdir(exist_ok=True)
         except OSError as error:
             raise OutputError(f"{self.folder}: can't be made ({error})") from error
         self._open = True
         self._clock = None if self.fps is None else FrameClock(self.fps)
-        self._calls = 0
-        self._last = -np.inf
+        self._write_calls = 0
+        self._last_time = -np.inf
         self._frames: list[tuple[float, list[str]]] = []
         self._colliders: list[tuple[float, list[str]]] = []
-        self._listed = 0
-        self._names = self._names_of([body.name for body in sim.model.bodies])
-        self._obstacles = self._obstacles_of(sim)
+        self._indexed_frames = 0
+        self._names = self._file_names([body.name for body in sim.model.bodies])
+        self._obstacles = self._make_obstacles(sim)
         named = [f"collider_{obstacle.name}" for obstacle in self._obstacles.all]
-        self._collider_names = self._names_of([*self._names, *named])[len(self._names) :]
-        self._placed: dict[tuple[int, int], tuple[np.ndarray, str]] = {}
-        self._kept = 0
+        self._collider_names = self._file_names([*self._names, *named])[len(self._names) :]
+        self._last_written: dict[tuple[int, int], tuple[np.ndarray, str]] = {}
+        self._kept_frames = 0
         if self.extend and self.series.is_file():
-            self._resume(time_of(sim))
+            self._resume(frame_time(sim))
 
     def _resume(self, now: float) -> None:
         """Extend the frames of the series up to the time `now`, s."""
         self._frames = self._read_series(self.series, now)
         if self.collider_series.is_file():
             self._colliders = self._read_series(self.collider_series, now)
-        self._kept = self._listed = len(self._frames)
+        self._kept_frames = self._indexed_frames = len(self._frames)
         if self._frames:
-            self._last = self._frames[-1][0]
+            self._last_time = self._frames[-1][0]
             if self._clock:
-                self._clock.due(self._last)
+                self._clock.due(self._last_time)
 
     def _read_series(self, path: pathlib.Path, now: float) -> list[tuple[float, list[str]]]:
         """Times up to `now`, s, and files of a .pvd."""
@@ -128,7 +128,7 @@ class VTUWriter(Output):
         return frames
 
     @staticmethod
-    def _obstacles_of(sim: Any) -> Obstacles:
+    def _make_obstacles(sim: Any) -> Obstacles:
         """Colliders, with half-spaces drawn around the bodies."""
         bodies = [body for body in sim.model.bodies if getattr(body, "mesh", None) is not None]
         points = np.concatenate(
@@ -137,7 +137,7 @@ class VTUWriter(Output):
         return Obstacles(sim, points.min(axis=0), points.max(axis=0))
 
     @staticmethod
-    def _names_of(given: Sequence[str]) -> list[str]:
+    def _file_names(given: Sequence[str]) -> list[str]:
         """Names valid in file names, still unique."""
         names: list[str] = []
         for text in given:
@@ -148,17 +148,17 @@ class VTUWriter(Output):
         return names
 
     def write(self, sim: Any) -> None:
-        time = time_of(sim)
-        due = self._clock.due(time) if self._clock else self._calls % self.every == 0
-        self._calls += 1
-        if due and time > self._last:
-            self._frame(sim, time)
+        time = frame_time(sim)
+        due = self._clock.due(time) if self._clock else self._write_calls % self.every == 0
+        self._write_calls += 1
+        if due and time > self._last_time:
+            self._write_frame(sim, time)
 
-    def _frame(self, sim: Any, time: float) -> None:
+    def _write_frame(self, sim: Any, time: float) -> None:
         frame = len(self._frames)
         files: list[str] = []
         self._frames.append((time, files))
-        self._last = time
+        self._last_time = time
         for body, name in zip(sim.model.bodies, self._names, strict=True):
             if getattr(body, "mesh", None) is None:
                 continue
@@ -170,7 +170,7 @@ class VTUWriter(Output):
                 files.append(file)
         if len(self._obstacles):
             self._colliders.append((time, self._collider_files(frame)))
-        if frame + 1 >= self._listed + max(1, self._listed // 10):
+        if frame + 1 >= self._indexed_frames + max(1, self._indexed_frames // 10):
             self._write_series()
 
     def _collider_files(self, frame: int) -> list[str]:
@@ -180,11 +180,11 @@ class VTUWriter(Output):
         for k, (obstacle, name, points) in enumerate(drawn):
             cells: Cells = ("triangle", obstacle.triangles, {})
             for world in range(len(points)):
-                before, file = self._placed.get((k, world), (None, ""))
+                before, file = self._last_written.get((k, world), (None, ""))
                 if before is None or not np.array_equal(before, points[world]):
                     file = f"{name}_{world:04d}_{frame:06d}.vtu"
                     write_whole(self.folder / file, functools.partial(_write_vtu, cells, points[world], {}))
-                    self._placed[k, world] = (points[world], file)
+                    self._last_written[k, world] = (points[world], file)
                 files.append(file)
         return files
 
@@ -192,14 +192,14 @@ class VTUWriter(Output):
         _write_pvd(self.series, self._frames)
         if self._colliders:
             _write_pvd(self.collider_series, self._colliders)
-        self._listed = len(self._frames)
+        self._indexed_frames = len(self._frames)
 
     def close(self, sim: Any) -> None:
         if not self._open:
             return
-        time = time_of(sim)
-        if time > self._last:
-            self._frame(sim, time)
+        time = frame_time(sim)
+        if time > self._last_time:
+            self._write_frame(sim, time)
         self._write_series()
         self._open = False
 
@@ -207,18 +207,18 @@ class VTUWriter(Output):
         """Remove the files of this run, and the folder if this run created it and it is empty."""
         if not self._open:
             return
-        kept = {file for _, files in self._colliders[: self._kept] for file in files}
-        for _, files in self._frames[self._kept :] + self._colliders[self._kept :]:
+        kept = {file for _, files in self._colliders[: self._kept_frames] for file in files}
+        for _, files in self._frames[self._kept_frames :] + self._colliders[self._kept_frames :]:
             for file in files:
                 if file not in kept:
                     (self.folder / file).unlink(missing_ok=True)
-        if self._kept:
-            self._frames, self._colliders = self._frames[: self._kept], self._colliders[: self._kept]
+        if self._kept_frames:
+            self._frames, self._colliders = self._frames[: self._kept_frames], self._colliders[: self._kept_frames]
             self._write_series()
-        elif self._listed:
+        elif self._indexed_frames:
             self.series.unlink(missing_ok=True)
             self.collider_series.unlink(missing_ok=True)
-        if self._made and not any(self.folder.iterdir()):
+        if self._folder_created and not any(self.folder.iterdir()):
             self.folder.rmdir()
         self._open = False
 
@@ -239,7 +239,7 @@ def _frame_data(sim: Any, body: Any, fields: Sequence[str]) -> tuple[np.ndarray,
         if hasattr(sim, "velocities"):
             data["velocity"] = np.asarray(sim.velocities(body), dtype=np.float64)
         data |= {field: np.asarray(sim.field(field, body), dtype=np.float64) for field in fields}
-        return points, data, (mesh.cell_type, mesh.cells, _groups(mesh, np.arange(len(mesh.cells))))
+        return points, data, (mesh.cell_type, mesh.cells, _element_set_flags(mesh, np.arange(len(mesh.cells))))
     drawn = body.drawing
     points = sim.point_positions(body, drawn.slot_weights)
     v = sim.state.velocity.numpy()[:, body.slots].astype(float)
@@ -248,7 +248,7 @@ def _frame_data(sim: Any, body: Any, fields: Sequence[str]) -> tuple[np.ndarray,
         "velocity": np.stack([drawn.slot_weights @ row for row in v]),
     }
     data |= {field: sim.field_on(field, body, drawn) for field in fields}
-    return points, data, (drawn.cell_type, drawn.cells, _groups(mesh, drawn.element))
+    return points, data, (drawn.cell_type, drawn.cells, _element_set_flags(mesh, drawn.element))
 
 
 def _write_pvd(target: pathlib.Path, frames: list[tuple[float, list[str]]]) -> None:
@@ -263,7 +263,7 @@ def _write_pvd(target: pathlib.Path, frames: list[tuple[float, list[str]]]) -> N
     write_whole(target, lambda path: path.write_text("\n".join(lines), encoding="utf-8"))
 
 
-def _groups(mesh: Any, element: np.ndarray) -> dict[str, np.ndarray]:
+def _element_set_flags(mesh: Any, element: np.ndarray) -> dict[str, np.ndarray]:
     """0/1 flags of the cells of each element group; `element`: the element of each cell."""
     sets = getattr(mesh, "element_sets", None) or {}
     return {f"set:{name}": np.isin(element, np.asarray(members)).astype(np.int32) for name, members in sets.items()}
