@@ -26,7 +26,7 @@ import numpy as np
 
 from ..base.errors import MeshError
 from . import abaqus
-from .assemble import RawMesh, assemble
+from .assemble import RawMesh, assemble_mesh
 from .cells import FILE_CELLS, cell_dimension
 from .checks import check
 from .mesh import Mesh, transformation
@@ -84,11 +84,11 @@ def read(path: str | os.PathLike[str], scale: float = 1.0, transform: Any = None
         raise MeshError(f"{label}: unknown mesh format {suffix!r}, known are {', '.join(FORMATS)}")
     readers = {".msh": _read_gmsh, ".vtu": _read_vtu, ".inp": abaqus.read_inp}
     try:
-        with _quiet(label):
+        with _meshio_errors(label):
             raw = readers[suffix](file)
     except OSError as error:
         raise MeshError(f"{label}: can't be read: {error}") from error
-    mesh = assemble(raw, file, cell_type)
+    mesh = assemble_mesh(raw, file, cell_type)
     return check(mesh.transformed(transform=(matrix, shift)))
 
 
@@ -106,7 +106,7 @@ def read_triangles(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray
     if not file.is_file():
         raise MeshError(f"{file}: no such mesh file")
     try:
-        with _quiet(str(file)):
+        with _meshio_errors(str(file)):
             mesh = meshio.read(file)
     except OSError as error:
         raise MeshError(f"{file}: can't be read: {error}") from error
@@ -146,7 +146,7 @@ def from_meshio(mesh: Any, scale: float = 1.0, transform: Any = None, cell_type:
     matrix, shift = transformation(scale, transform, label)
     if cell_type is not None and cell_type not in FILE_CELLS:
         raise MeshError(f"{label}: unknown cell_type {cell_type!r}, known are {sorted(FILE_CELLS)}")
-    raw = _raw(mesh)
+    raw = _raw_mesh(mesh)
     raw.duplicates = "gmsh:physical" in mesh.cell_data  # MSH 2.2 repeats cells of two groups
     for name, arrays in mesh.cell_sets.items():
         if not name.startswith("gmsh:"):
@@ -155,12 +155,12 @@ def from_meshio(mesh: Any, scale: float = 1.0, transform: Any = None, cell_type:
                     raw.groups.append((str(name), k, np.asarray(numbers, dtype=np.int64)))
     for name, nodes in mesh.point_sets.items():
         raw.node_groups[str(name)] = np.unique(np.asarray(nodes, dtype=np.int64))
-    found = assemble(raw, Path(label), cell_type)
+    found = assemble_mesh(raw, Path(label), cell_type)
     return check(replace(found.transformed(transform=(matrix, shift)), name="mesh", path=None))
 
 
 @contextlib.contextmanager
-def _quiet(label: str) -> Iterator[io.StringIO]:
+def _meshio_errors(label: str) -> Iterator[io.StringIO]:
     """Suppress printing, warnings and exits of meshio; its errors become a MeshError naming the file."""
     said = io.StringIO()
     try:
@@ -198,13 +198,13 @@ def _read_gmsh(file: Path) -> RawMesh:
     for section in (b"Nodes", b"Elements"):
         if data.find(b"$" + section) < 0 or data.find(b"$End" + section, start) < 0:
             raise MeshError(f"damaged or truncated: section ${section.decode()} is missing or not closed")
-    names = _section(data[:start], b"PhysicalNames")
-    entities = _section(data[:start], b"Entities")
+    names = _gmsh_section(data[:start], b"PhysicalNames")
+    entities = _gmsh_section(data[:start], b"Entities")
     named = {
         (int(d), abs(int(t))): name.decode(errors="replace")
         for d, t, name in re.findall(rb'^\s*(\d)\s+(-?\d+)\s+"(.*)"', names, re.MULTILINE)
     }
-    mesh = _gmsh_body(file, start, new, is_ascii, size)
+    mesh = _read_gmsh_cells(file, start, new, is_ascii, size)
     physical = mesh.cell_data.get("gmsh:physical")
     entity = mesh.cell_data.get("gmsh:geometrical")
     tags_of = _entity_groups(entities, is_ascii, size) if new and entities else {}
@@ -225,7 +225,7 @@ def _read_gmsh(file: Path) -> RawMesh:
     return raw
 
 
-def _gmsh_body(file: Path, start: int, new: bool, is_ascii: bool, size: int) -> Any:
+def _read_gmsh_cells(file: Path, start: int, new: bool, is_ascii: bool, size: int) -> Any:
     """meshio's mesh of a Gmsh file of format 4.1, or 2.2 unless `new`, read from the byte `start` on."""
     from meshio.gmsh import _gmsh22, _gmsh41
 
@@ -242,7 +242,7 @@ def _gmsh_body(file: Path, start: int, new: bool, is_ascii: bool, size: int) -> 
             raise MeshError(f"unknown Gmsh element type {error}") from None
 
 
-def _section(data: bytes, name: bytes) -> bytes:
+def _gmsh_section(data: bytes, name: bytes) -> bytes:
     """Body of a section, or b""."""
     at = data.find(b"$" + name)
     if at < 0:
@@ -258,7 +258,7 @@ def _entity_groups(body: bytes, is_ascii: bool, size: int) -> dict[tuple[int, in
     words = iter(body.split()) if is_ascii else iter(())
     at = 0
 
-    def take(code: str, count: int) -> list[float]:
+    def take_values(code: str, count: int) -> list[float]:
         nonlocal at
         if is_ascii:
             return [float(next(words)) for _ in range(count)]
@@ -269,13 +269,13 @@ def _entity_groups(body: bytes, is_ascii: bool, size: int) -> dict[tuple[int, in
     unsigned = {4: "I", 8: "Q"}[size]
     groups: dict[tuple[int, int], list[int]] = {}
     try:
-        for dim, count in enumerate(take(unsigned, 4)):
+        for dim, count in enumerate(take_values(unsigned, 4)):
             for _ in range(int(count)):
-                tag = int(take("i", 1)[0])
-                take("d", 3 if dim == 0 else 6)
-                groups[dim, tag] = [abs(int(t)) for t in take("i", int(take(unsigned, 1)[0]))]
+                tag = int(take_values("i", 1)[0])
+                take_values("d", 3 if dim == 0 else 6)
+                groups[dim, tag] = [abs(int(t)) for t in take_values("i", int(take_values(unsigned, 1)[0]))]
                 if dim:
-                    take("i", int(take(unsigned, 1)[0]))
+                    take_values("i", int(take_values(unsigned, 1)[0]))
     except (StopIteration, struct.error):
         raise MeshError("damaged or truncated: section $Entities ends early") from None
     return groups
@@ -289,15 +289,15 @@ def _read_vtu(file: Path) -> RawMesh:
 
     if file.read_bytes().count(b"<Piece") > 1:
         raise MeshError("a VTU file of several pieces is not supported: merge them")
-    with _quiet(str(file)) as said:
+    with _meshio_errors(str(file)) as said:
         mesh = meshio.read(file, file_format="vtu")
     skipped = re.search(r"cannot handle \(type (\d+)\)", " ".join(said.getvalue().split()))
     if skipped:
         raise MeshError(f"unknown VTK cell type {skipped[1]}")
-    return _raw(mesh)
+    return _raw_mesh(mesh)
 
 
-def _raw(mesh: Any) -> RawMesh:
+def _raw_mesh(mesh: Any) -> RawMesh:
     """Points, cells, and groups from integer arrays of a meshio.Mesh."""
     named = {}
     for name, value in (mesh.field_data or {}).items():
@@ -309,7 +309,7 @@ def _raw(mesh: Any) -> RawMesh:
         flat = [np.asarray(a).reshape(len(a), -1) for a in arrays]
         if all(a.shape[1] == 1 for a in flat) and name != "gmsh:geometrical":
             joined = np.concatenate([a[:, 0] for a in flat])
-            for value, suffix in _set_values(joined):
+            for value, suffix in _values_of_sets(joined):
                 for k, column in enumerate(flat):
                     numbers = np.flatnonzero(column[:, 0] == value)
                     if numbers.size:
@@ -319,12 +319,12 @@ def _raw(mesh: Any) -> RawMesh:
     for name, array in (mesh.point_data or {}).items():
         column = np.asarray(array).reshape(len(points), -1)
         if column.shape[1] == 1:
-            for value, suffix in _set_values(column[:, 0]):
+            for value, suffix in _values_of_sets(column[:, 0]):
                 raw.node_groups[name + suffix] = np.flatnonzero(column[:, 0] == value)
     return raw
 
 
-def _set_values(array: np.ndarray) -> list[tuple[int, str]]:
+def _values_of_sets(array: np.ndarray) -> list[tuple[int, str]]:
     """Positive values of an integer array with the suffix of their sets' names; none if too many."""
     if array.dtype.kind not in "iub" or not array.size:
         return []

@@ -12,13 +12,13 @@ from ..base.errors import MeshError
 from ..base.names import did_you_mean
 from .cells import ELEMENT_CELLS, Floats
 
-__all__ = ["PointMap", "cell_type_of", "counts", "even", "finite", "mapped", "positive"]
+__all__ = ["PointMap", "cell_counts", "cell_type_of", "check_even", "finite_numbers", "map_points", "positive_numbers"]
 
 PointMap = Callable[[Floats], Any]
 """Positions X (n, 3) in m -> (n, 3) in m."""
 
 
-def _numbers(what: str, values: Any, count: int) -> Floats:
+def _number_array(what: str, values: Any, count: int) -> Floats:
     try:
         array = np.array(values, dtype=float)
     except (TypeError, ValueError):
@@ -29,31 +29,31 @@ def _numbers(what: str, values: Any, count: int) -> Floats:
     return array
 
 
-def finite(what: str, values: Any, count: int) -> Floats:
+def finite_numbers(what: str, values: Any, count: int) -> Floats:
     """``count`` finite numbers, (count,)."""
-    array = _numbers(what, values, count)
+    array = _number_array(what, values, count)
     if not np.isfinite(array).all():
         raise MeshError(f"{what} must be finite, got {values!r}")
     return array
 
 
-def positive(what: str, values: Any, count: int) -> Floats:
+def positive_numbers(what: str, values: Any, count: int) -> Floats:
     """``count`` positive numbers, (count,)."""
-    array = finite(what, values, count)
+    array = finite_numbers(what, values, count)
     if not (array > 0.0).all():
         raise MeshError(f"{what} must be positive, got {array.tolist()}")
     return array
 
 
-def counts(what: str, values: Any, count: int) -> tuple[int, ...]:
+def cell_counts(what: str, values: Any, count: int) -> tuple[int, ...]:
     """``count`` whole numbers of at least 1."""
-    array = _numbers(what, values, count)
+    array = _number_array(what, values, count)
     if not ((array >= 1) & (array == np.round(array))).all():
         raise MeshError(f"{what} must be integers of at least 1, got {values!r}")
     return tuple(int(v) for v in array)
 
 
-def even(what: str, value: int) -> None:
+def check_even(what: str, value: int) -> None:
     """Refuse an odd number."""
     if value % 2:
         raise MeshError(f"{what} must be an even number, got {value}")
@@ -67,7 +67,7 @@ def cell_type_of(what: str, element: Any) -> str:
     return ELEMENT_CELLS[element]
 
 
-def mapped(what: str, points: Floats, function: PointMap | None) -> Floats:
+def map_points(what: str, points: Floats, function: PointMap | None) -> Floats:
     """``function`` of the points (n, 3), or the points themselves if it is None.
 
     Raises

@@ -13,15 +13,15 @@ from .cells import FILE_CELLS, Floats, Ints, cell_dimension, row_keys
 from .checks import check_topology
 from .mesh import Mesh, check_range
 
-__all__ = ["RawMesh", "assemble"]
+__all__ = ["RawMesh", "assemble_mesh"]
 
-_WORDS = {
+_CELL_NOUNS = {
     "tetra": ("tetrahedron", "tetrahedra"),
     "tetra10": ("tetrahedron", "tetrahedra"),
     "hexahedron": ("hexahedron", "hexahedra"),
     "quad": ("quad", "quads"),
 }
-_BOUNDARY = {"tetra": "triangle", "tetra10": "triangle", "hexahedron": "quad"}
+_BOUNDARY_CELLS = {"tetra": "triangle", "tetra10": "triangle", "hexahedron": "quad"}
 """Type prefixes of boundary cells."""
 
 
@@ -42,7 +42,7 @@ class RawMesh:
     duplicates: bool = False
 
 
-def assemble(raw: RawMesh, file: Path, cell_type: str | None) -> Mesh:
+def assemble_mesh(raw: RawMesh, file: Path, cell_type: str | None) -> Mesh:
     """Mesh with validated topology, and sets from the file's groups.
 
     Raises
@@ -52,7 +52,7 @@ def assemble(raw: RawMesh, file: Path, cell_type: str | None) -> Mesh:
         not faces, and :func:`check_topology`'s.
     """
     label = str(file)
-    body = _body_type(raw, label, cell_type)
+    body = _body_cell_type(raw, label, cell_type)
     where = [k for k, (kind, _) in enumerate(raw.blocks) if kind == body]
     cells = np.concatenate([raw.blocks[k][1] for k in where])
     offsets = dict(zip(where, np.cumsum([0] + [len(raw.blocks[k][1]) for k in where])))
@@ -84,7 +84,7 @@ def assemble(raw: RawMesh, file: Path, cell_type: str | None) -> Mesh:
     for name, rows in raw.faces.items():
         table = np.array([(number[offsets[b] + e], f) for b, e, f in rows if b in offsets], dtype=np.int64)
         if len(table) != len(rows) or not len(rows):
-            raise MeshError(f"{label}: surface {name!r} holds faces of cells that are not {_WORDS[body][1]}")
+            raise MeshError(f"{label}: surface {name!r} holds faces of cells that are not {_CELL_NOUNS[body][1]}")
         surface_sets.setdefault(name, []).append(table)
         node_sets.setdefault(name, []).append(mesh.faces(table).ravel())
     node_sets.update({name: [nodes] for name, nodes in raw.node_groups.items()})
@@ -100,19 +100,19 @@ def assemble(raw: RawMesh, file: Path, cell_type: str | None) -> Mesh:
     )
 
 
-def _body_type(raw: RawMesh, label: str, cell_type: str | None) -> str:
+def _body_cell_type(raw: RawMesh, label: str, cell_type: str | None) -> str:
     """Cell type of the body: that of the solids, of one known type, or else quads."""
-    counts: dict[str, int] = {}
+    cell_counts: dict[str, int] = {}
     for kind, cells in raw.blocks:
         if len(cells):
-            counts[kind] = counts.get(kind, 0) + len(cells)
-    held = ", ".join(f"{n} {kind}" for kind, n in counts.items()) or "no cells"
-    solids = [kind for kind in counts if cell_dimension(kind) == 3]
-    surfaces = [kind for kind in counts if cell_dimension(kind) == 2]
+            cell_counts[kind] = cell_counts.get(kind, 0) + len(cells)
+    held = ", ".join(f"{n} {kind}" for kind, n in cell_counts.items()) or "no cells"
+    solids = [kind for kind in cell_counts if cell_dimension(kind) == 3]
+    surfaces = [kind for kind in cell_counts if cell_dimension(kind) == 2]
     for kind in solids:
         if kind not in FILE_CELLS:
             raise MeshError(
-                f"{label}: unknown cell type {kind!r} ({counts[kind]} cells); known are {', '.join(FILE_CELLS)}"
+                f"{label}: unknown cell type {kind!r} ({cell_counts[kind]} cells); known are {', '.join(FILE_CELLS)}"
             )
     if len(solids) > 1:
         what = "solid cells" if "hexahedron" in solids else "tetrahedra"
@@ -139,12 +139,12 @@ class _FaceFinder:
 
     def __init__(self, mesh: Mesh) -> None:
         self.mesh = mesh
-        self.sorted: tuple[Ints, Ints] | None = None
+        self.sorted_corners: tuple[Ints, Ints] | None = None
 
     def find(self, kind: str, nodes: Ints, name: str) -> Ints:
         """Rows (element, local face) of boundary cells (K, n)."""
         mesh, label = self.mesh, self.mesh.label
-        row, boundary, (solid, solids) = mesh.kind, _BOUNDARY[mesh.cell_type], _WORDS[mesh.cell_type]
+        row, boundary, (solid, solids) = mesh.kind, _BOUNDARY_CELLS[mesh.cell_type], _CELL_NOUNS[mesh.cell_type]
         if not kind.startswith(boundary):
             raise MeshError(
                 f"{label}: surface {name!r} holds {len(nodes)} cells of type {kind!r}, not faces of {solids}"
@@ -152,10 +152,10 @@ class _FaceFinder:
         corners = nodes[:, : row.face_corners]
         check_range(corners, len(mesh.points), f"{label}: surface {name!r}, node")
         # keys of faces and queries are numbered together: row_keys may compress
-        if self.sorted is None:
+        if self.sorted_corners is None:
             local = row.faces[:, : row.face_corners]
-            self.sorted = (np.sort(mesh.cells[:, local].reshape(-1, row.face_corners), axis=1), local)
-        table, local = self.sorted
+            self.sorted_corners = (np.sort(mesh.cells[:, local].reshape(-1, row.face_corners), axis=1), local)
+        table, local = self.sorted_corners
         keys = row_keys(np.concatenate([table, np.sort(corners, axis=1)]), len(mesh.points))
         keys, wanted = keys[: len(table)], keys[len(table) :]
         order = np.argsort(keys, kind="stable")

@@ -37,7 +37,7 @@ class CellType:
     mid-edge node of edge k is ``corners + k`` if the type has any; ``faces``: local node numbers, outward;
     ``face_corners``: corners per face; ``gradients(xi)``: (P, nodes, d) shape derivatives
     at xi (P, d), d the dimension; ``rule``: points (P, d) and weights (P,) exact for the volume of a curved
-    cell; ``checked``: points (P, d) where det J0 must be positive.
+    cell; ``check_points``: points (P, d) where det J0 must be positive.
     """
 
     name: str
@@ -48,7 +48,7 @@ class CellType:
     face_corners: int
     gradients: Callable[[Floats], Floats]
     rule: tuple[Floats, Floats]
-    checked: Floats
+    check_points: Floats
 
     @property
     def has_mid_nodes(self) -> bool:
@@ -66,7 +66,7 @@ _TET_FACES = np.array([(0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2)], dtype=np.int
 _TET10_FACES = np.array(
     [(0, 2, 1, 6, 5, 4), (0, 1, 3, 4, 8, 7), (1, 2, 3, 5, 9, 8), (0, 3, 2, 7, 9, 6)], dtype=np.int64
 )
-_DL = np.array([(-1.0, -1.0, -1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)])  # dL_i/dxi
+_BARYCENTRIC_GRADIENTS = np.array([(-1.0, -1.0, -1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)])  # dL_i/dxi
 
 
 def barycentric(xi: Floats) -> Floats:
@@ -76,19 +76,19 @@ def barycentric(xi: Floats) -> Floats:
 
 def tet4_gradients(xi: Floats) -> Floats:
     """ds_i/dxi of T4: (P, 4, 3)."""
-    return np.broadcast_to(_DL, (len(xi), 4, 3))
+    return np.broadcast_to(_BARYCENTRIC_GRADIENTS, (len(xi), 4, 3))
 
 
 def tet10_gradients(xi: Floats) -> Floats:
     """ds_i/dxi of T10, (P, 10, 3): corners s = L (2 L - 1), mid-edges s = 4 L_a L_b."""
     lam = barycentric(xi)
     a, b = TET_EDGES.T
-    corner = (4.0 * lam - 1.0)[:, :, None] * _DL
-    mid = 4.0 * (lam[:, a, None] * _DL[b] + lam[:, b, None] * _DL[a])
+    corner = (4.0 * lam - 1.0)[:, :, None] * _BARYCENTRIC_GRADIENTS
+    mid = 4.0 * (lam[:, a, None] * _BARYCENTRIC_GRADIENTS[b] + lam[:, b, None] * _BARYCENTRIC_GRADIENTS[a])
     return np.concatenate([corner, mid], axis=1)
 
 
-def _orbit(a: float) -> list[tuple[float, float, float]]:
+def _vertex_orbit(a: float) -> list[tuple[float, float, float]]:
     """The four points with barycentric coordinates (a, a, a, 1 - 3 a) in any order."""
     b = 1.0 - 3.0 * a
     return [(a, a, a), (b, a, a), (a, b, a), (a, a, b)]
@@ -101,19 +101,19 @@ def _edge_orbit(a: float) -> list[tuple[float, float, float]]:
 
 
 _CENTROID = [(0.25, 0.25, 0.25)]
-_RULE5 = (
-    np.array(_CENTROID + _orbit(1.0 / 6.0)),
+_FIVE_POINT_RULE = (
+    np.array(_CENTROID + _vertex_orbit(1.0 / 6.0)),
     np.array([-4.0 / 5.0, *(4 * [9.0 / 20.0])]) / 6.0,
 )  # degree 3: exact for det J0 of a T10, which is cubic; for volumes only, never for a mass matrix
-_RULE1 = (np.array(_CENTROID), np.array([1.0 / 6.0]))
-_CHECKED = np.array(
-    _orbit(0.0)  # corners
+_ONE_POINT_RULE = (np.array(_CENTROID), np.array([1.0 / 6.0]))
+_TET10_CHECK_POINTS = np.array(
+    _vertex_orbit(0.0)  # corners
     + _edge_orbit(0.0)  # mid-edges
     + _CENTROID
-    + _orbit((5.0 - 5.0**0.5) / 20.0)  # tet4
-    + _orbit(1.0 / 6.0)  # tet5_paper
-    + _orbit(0.31088591926330060980)  # tet14, three orbits
-    + _orbit(0.092735250310891226402)
+    + _vertex_orbit((5.0 - 5.0**0.5) / 20.0)  # tet4
+    + _vertex_orbit(1.0 / 6.0)  # tet5_paper
+    + _vertex_orbit(0.31088591926330060980)  # tet14, three orbits
+    + _vertex_orbit(0.092735250310891226402)
     + _edge_orbit(0.045503704125649649492)
 )
 
@@ -127,12 +127,12 @@ def tet_faces_gradients(xi: Floats) -> Floats:
 
 # corners, edges and faces of the unit line, square and cube
 
-_LINE = np.array([(0.0,), (1.0,)])
+_LINE_CORNERS = np.array([(0.0,), (1.0,)])
 _LINE_EDGES = np.array([(0, 1)], dtype=np.int64)
 _LINE_FACES = np.empty((0, 2), dtype=np.int64)
-_QUAD = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
+_QUAD_CORNERS = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
 _QUAD_EDGES = np.array([(0, 1), (1, 2), (2, 3), (3, 0)], dtype=np.int64)
-_HEX = np.array([(*corner, z) for z in (0.0, 1.0) for corner in _QUAD])
+_HEX_CORNERS = np.array([(*corner, z) for z in (0.0, 1.0) for corner in _QUAD_CORNERS])
 _HEX_EDGES = np.array(
     [(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)], dtype=np.int64
 )
@@ -151,38 +151,40 @@ def _multilinear_gradients(corners: Floats, xi: Floats) -> Floats:
 
 def line_gradients(xi: Floats) -> Floats:
     """ds_i/dxi of the linear line on the unit interval: (P, 2, 1)."""
-    return _multilinear_gradients(_LINE, xi)
+    return _multilinear_gradients(_LINE_CORNERS, xi)
 
 
 def quad_gradients(xi: Floats) -> Floats:
     """ds_i/dxi of the bilinear quadrilateral on the unit square: (P, 4, 2)."""
-    return _multilinear_gradients(_QUAD, xi)
+    return _multilinear_gradients(_QUAD_CORNERS, xi)
 
 
 def hex_gradients(xi: Floats) -> Floats:
     """ds_i/dxi of the trilinear hexahedron on the unit cube: (P, 8, 3)."""
-    return _multilinear_gradients(_HEX, xi)
+    return _multilinear_gradients(_HEX_CORNERS, xi)
 
 
-def _gauss(dimension: int) -> tuple[Floats, Floats]:
+def _gauss_rule(dimension: int) -> tuple[Floats, Floats]:
     """Two Gauss points per axis of the unit line, square or cube; exact for det J0 of a hexahedron."""
     one = 0.5 + np.array([-0.5, 0.5]) / 3.0**0.5
     points = np.stack(np.meshgrid(*(dimension * [one]), indexing="ij"), axis=-1).reshape(-1, dimension)
     return points, np.full(len(points), 1.0 / len(points))
 
 
-_LINE_RULE, _QUAD_RULE, _HEX_RULE = _gauss(1), _gauss(2), _gauss(3)
-_HEX_CHECKED = np.concatenate([_HEX, [(0.5, 0.5, 0.5)], _HEX_RULE[0]])
+_LINE_RULE, _QUAD_RULE, _HEX_RULE = _gauss_rule(1), _gauss_rule(2), _gauss_rule(3)
+_HEX_CHECK_POINTS = np.concatenate([_HEX_CORNERS, [(0.5, 0.5, 0.5)], _HEX_RULE[0]])
 
-_ROWS = (
-    CellType("tetra", 4, 4, TET_EDGES, _TET_FACES, 3, tet4_gradients, _RULE1, _RULE1[0]),
-    CellType("tetra10", 10, 4, TET_EDGES, _TET10_FACES, 3, tet10_gradients, _RULE5, _CHECKED),
-    CellType("hexahedron", 8, 8, _HEX_EDGES, _HEX_FACES, 4, hex_gradients, _HEX_RULE, _HEX_CHECKED),
+_CELL_TYPE_ROWS = (
+    CellType("tetra", 4, 4, TET_EDGES, _TET_FACES, 3, tet4_gradients, _ONE_POINT_RULE, _ONE_POINT_RULE[0]),
+    CellType("tetra10", 10, 4, TET_EDGES, _TET10_FACES, 3, tet10_gradients, _FIVE_POINT_RULE, _TET10_CHECK_POINTS),
+    CellType("hexahedron", 8, 8, _HEX_EDGES, _HEX_FACES, 4, hex_gradients, _HEX_RULE, _HEX_CHECK_POINTS),
     CellType("quad", 4, 4, _QUAD_EDGES, _QUAD_EDGES, 2, quad_gradients, _QUAD_RULE, _QUAD_RULE[0]),
     CellType("line", 2, 2, _LINE_EDGES, _LINE_FACES, 2, line_gradients, _LINE_RULE, _LINE_RULE[0]),
-    CellType("tetra_faces", 8, 4, TET_EDGES, _TET_FACE_NODES, 3, tet_faces_gradients, _RULE1, _RULE1[0]),
+    CellType(
+        "tetra_faces", 8, 4, TET_EDGES, _TET_FACE_NODES, 3, tet_faces_gradients, _ONE_POINT_RULE, _ONE_POINT_RULE[0]
+    ),
 )
-CELL_TYPES: dict[str, CellType] = {row.name: row for row in _ROWS}
+CELL_TYPES: dict[str, CellType] = {row.name: row for row in _CELL_TYPE_ROWS}
 FILE_CELLS = ("tetra", "tetra10", "hexahedron", "quad")
 """Cell types in files; "line" (beams) and "tetra_faces" (ENMC) are generated."""
 ELEMENT_CELLS = {

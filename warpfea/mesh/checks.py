@@ -17,19 +17,19 @@ from .cells import (
 )
 from .mesh import Mesh
 
-__all__ = ["COINCIDENT", "check", "check_topology", "check_volumes"]
+__all__ = ["COINCIDENCE_TOL", "check", "check_topology", "check_volumes"]
 
-COINCIDENT = 1e-10
+COINCIDENCE_TOL = 1e-10
 """Distance of used nodes, over the mesh size, below which they count as one unmerged node."""
-FLAT = 1e-12
+FLATNESS_TOL = 1e-12
 """Volume or det J0 over the cube (area: square) of the longest edge below which an element is degenerate."""
-_LEFT_HANDED = {
+_LEFT_HANDED_HINTS = {
     "tetra": "swap two corners",
     "tetra10": "swap two corners and their mid-edge nodes",
     "hexahedron": "swap the nodes 0 .. 3 and 4 .. 7",
     "tetra_faces": "swap two corners and their face nodes",
 }
-_TOO_CURVED = {"hexahedron": "a corner, centre or quadrature point (too distorted)"}
+_INVERSION_PLACES = {"hexahedron": "a corner, centre or quadrature point (too distorted)"}
 
 
 def check(mesh: Mesh) -> Mesh:
@@ -51,8 +51,8 @@ def check(mesh: Mesh) -> Mesh:
     orphans = mesh.orphan_nodes
     if orphans.size:
         warnings.warn(
-            f"{mesh.label}: {orphans.size} orphan node{_s(orphans)} belong to no element (first: "
-            f"{_first(orphans)}); "
+            f"{mesh.label}: {orphans.size} orphan node{_plural(orphans)} belong to no element (first: "
+            f"{_list_numbers(orphans)}); "
             "they keep their place in the numbering and stay where they are",
             MeshWarning,
             stacklevel=2,
@@ -60,7 +60,7 @@ def check(mesh: Mesh) -> Mesh:
     _check_coincident(mesh)
     if mesh.cell_type == "quad":
         _check_quads(mesh)
-        _check_sheet(mesh)
+        _check_manifold(mesh)
         return mesh
     curved = np.flatnonzero(~mesh.straight_sided(1e-12))
     if mesh.kind.has_mid_nodes:
@@ -87,8 +87,8 @@ def check_topology(points: Floats, cells: Ints, cell_type: str, label: str) -> N
     bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if bad.size:
         raise MeshError(
-            f"{label}: node {bad[0]} has the coordinates {_vector(points[bad[0]])}, which are not finite "
-            f"({bad.size} such node{_s(bad)})"
+            f"{label}: node {bad[0]} has the coordinates {_vector_text(points[bad[0]])}, which are not finite "
+            f"({bad.size} such node{_plural(bad)})"
         )
     outside = (cells < 0) | (cells >= len(points))
     if outside.any():
@@ -110,7 +110,7 @@ def check_topology(points: Floats, cells: Ints, cell_type: str, label: str) -> N
         a, b = order[same[0]], order[same[0] + 1]
         raise MeshError(
             f"{label}: elements {a} and {b} have the same corners {cells[a, : kind.corners].tolist()} "
-            f"({same.size} duplicate element{_s(same)})"
+            f"({same.size} duplicate element{_plural(same)})"
         )
 
 
@@ -121,14 +121,14 @@ def _check_coincident(mesh: Mesh) -> None:
     size = float(np.linalg.norm(high - low))
     used = mesh.used_nodes
     tree = cKDTree(mesh.points[used] - low, balanced_tree=False, compact_nodes=False)
-    pairs = tree.query_pairs(COINCIDENT * size, output_type="ndarray")
+    pairs = tree.query_pairs(COINCIDENCE_TOL * size, output_type="ndarray")
     if len(pairs):
         pairs = np.sort(used[pairs], axis=1)
         a, b = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))[0]]
         gap = float(np.linalg.norm(mesh.points[a] - mesh.points[b]))
         raise MeshError(
-            f"{mesh.label}: nodes {a} and {b} coincide at {_vector(mesh.points[a])}, {gap:.3g} m apart "
-            f"({len(pairs)} such pair{_s(pairs)}); merge them, or the body falls apart there"
+            f"{mesh.label}: nodes {a} and {b} coincide at {_vector_text(mesh.points[a])}, {gap:.3g} m apart "
+            f"({len(pairs)} such pair{_plural(pairs)}); merge them, or the body falls apart there"
         )
 
 
@@ -149,9 +149,9 @@ def _check_mid_nodes(mesh: Mesh, curved: Ints) -> None:
     left = out_of_order[np.linalg.det(corners[:, 1:] - corners[:, :1]) < 0.0] if kind.name == "tetra10" else curved[:0]
     if left.size:
         raise MeshError(
-            f"{mesh.label}: element {left[0]} is inverted: its corners {mesh.cells[left[0], :4].tolist()} are numbered "
-            f"left-handed, and its mid-side nodes are not those of its edges ({left.size} such element{_s(left)}); "
-            f"{_swap_back(mesh, int(left[0]))}"
+            f"{mesh.label}: element {left[0]} is inverted: its corners {mesh.cells[left[0], :4].tolist()} are "
+            f"numbered left-handed, and its mid-side nodes are not those of its edges ({left.size} such "
+            f"element{_plural(left)}); {_swap_hint(mesh, int(left[0]))}"
         )
     i, k = np.argwhere(wrong)[0]
     own, other = kind.edges[k], kind.edges[nearest[i, k]]
@@ -166,7 +166,7 @@ def _check_mid_nodes(mesh: Mesh, curved: Ints) -> None:
     )
 
 
-def _swap_back(mesh: Mesh, element: int) -> str:
+def _swap_hint(mesh: Mesh, element: int) -> str:
     """Hint for an inverted quadratic tetrahedron: the two swapped corners, if that is the only error."""
     edges = mesh.kind.edges
     x = mesh.points[mesh.cells[element]]
@@ -176,7 +176,7 @@ def _swap_back(mesh: Mesh, element: int) -> str:
         middle = 0.5 * (x[order[edges[:, 0]]] + x[order[edges[:, 1]]])
         if (np.linalg.norm(x[4:, None] - middle, axis=2).argmin(axis=1) == np.arange(6)).all():
             return f"corners {a} and {b} were swapped without them: cells[e, [{a}, {b}]] = cells[e, [{b}, {a}]]"
-    return f"{_LEFT_HANDED[mesh.cell_type]}"
+    return f"{_LEFT_HANDED_HINTS[mesh.cell_type]}"
 
 
 def check_volumes(mesh: Mesh) -> None:
@@ -191,34 +191,34 @@ def check_volumes(mesh: Mesh) -> None:
     longest = _longest_edges(mesh)
     scale = longest**kind.dimension
     volumes = mesh.volumes()
-    flat = np.flatnonzero(np.abs(volumes) <= FLAT * scale)
+    flat = np.flatnonzero(np.abs(volumes) <= FLATNESS_TOL * scale)
     if flat.size:
         e = flat[0]
         what, unit = {1: ("length", "m"), 3: ("volume", "m^3")}[kind.dimension]
         raise MeshError(
             f"{mesh.label}: element {e} has zero {what} ({volumes[e]:.3g} {unit}, longest edge "
-            f"{longest[e]:.3g} m; {flat.size} such element{_s(flat)})"
+            f"{longest[e]:.3g} m; {flat.size} such element{_plural(flat)})"
         )
     lowest = volumes / kind.rule[1].sum()  # mean det J0; constant in a straight simplex
     simplex = kind.corners == kind.dimension + 1
     bent = np.flatnonzero(~mesh.straight_sided(1e-12)) if simplex else np.arange(len(mesh.cells))
     if bent.size:
-        at = det_j0(mesh.points, mesh.cells[bent], kind, kind.checked)
+        at = det_j0(mesh.points, mesh.cells[bent], kind, kind.check_points)
         lowest[bent] = np.minimum(lowest[bent], at.min(axis=1))
-    inverted = np.flatnonzero(lowest <= FLAT * scale)
+    inverted = np.flatnonzero(lowest <= FLATNESS_TOL * scale)
     if not inverted.size:
         return
     e = inverted[np.argmin(lowest[inverted] / scale[inverted])]
     if len(inverted) == len(mesh.cells) and (volumes < 0.0).all():
         raise MeshError(
             f"{mesh.label}: all {len(inverted)} elements are inverted (element 0 has det J0 = {lowest[0]:.6g} m^3): "
-            f"they are numbered left-handed ({_LEFT_HANDED[mesh.cell_type]}), or the mesh is mirrored"
+            f"they are numbered left-handed ({_LEFT_HANDED_HINTS[mesh.cell_type]}), or the mesh is mirrored"
         )
-    where = _TOO_CURVED.get(mesh.cell_type, "a corner, mid-edge or quadrature point (too curved)")
+    where = _INVERSION_PLACES.get(mesh.cell_type, "a corner, mid-edge or quadrature point (too curved)")
     raise MeshError(
         f"{mesh.label}: element {e} is inverted{'' if volumes[e] < 0.0 else f' at {where}'}: smallest det J0 = "
         f"{lowest[e]:.6g} m^3, volume {volumes[e]:.6g} m^3 "
-        f"({inverted.size} such element{_s(inverted)}, first: {_first(inverted)})"
+        f"({inverted.size} such element{_plural(inverted)}, first: {_list_numbers(inverted)})"
     )
 
 
@@ -231,30 +231,30 @@ def _check_quads(mesh: Mesh) -> None:
     """Each quad has an area, and is convex with respect to its mean normal."""
     longest = _longest_edges(mesh)
     areas = mesh.volumes()
-    flat = np.flatnonzero(areas <= FLAT * longest**2)
+    flat = np.flatnonzero(areas <= FLATNESS_TOL * longest**2)
     if flat.size:
         e = flat[0]
         raise MeshError(
             f"{mesh.label}: quad {e} has zero area ({areas[e]:.3g} m^2, longest edge {longest[e]:.3g} m; "
-            f"{flat.size} such quad{_s(flat)})"
+            f"{flat.size} such quad{_plural(flat)})"
         )
     x = mesh.points[mesh.cells]
     normals = np.cross(np.roll(x, -1, axis=1) - x, np.roll(x, 1, axis=1) - x)
     mean = normals.mean(axis=1)
     size = np.linalg.norm(mean, axis=1)
     along = np.einsum("mki,mi->mk", normals, mean / np.where(size > 0.0, size, 1.0)[:, None])
-    bad = np.flatnonzero(along.min(axis=1) <= FLAT * longest**2)
+    bad = np.flatnonzero(along.min(axis=1) <= FLATNESS_TOL * longest**2)
     if bad.size:
         e = bad[0]
         k = int(along[e].argmin())
         raise MeshError(
             f"{mesh.label}: quad {e} is not convex: at corner {k} (node {mesh.cells[e, k]}) the edges span "
             f"{along[e, k]:.3g} m^2 along the mean normal, which must be positive at all four "
-            f"({bad.size} such quad{_s(bad)}); move the node, or put the nodes in the order of a walk around"
+            f"({bad.size} such quad{_plural(bad)}); move the node, or put the nodes in the order of a walk around"
         )
 
 
-def _check_sheet(mesh: Mesh) -> None:
+def _check_manifold(mesh: Mesh) -> None:
     """An edge belongs to at most two quads, with opposite directions."""
     sides = len(mesh.kind.edges)
     edges = mesh.cells[:, mesh.kind.edges].reshape(-1, 2)
@@ -269,7 +269,8 @@ def _check_sheet(mesh: Mesh) -> None:
         a, b = edges[rows[0]]
         raise MeshError(
             f"{mesh.label}: the edge between nodes {a} and {b} is shared by {len(rows)} quads "
-            f"({_first(rows // sides)}; {many.size} such edge{_s(many)}): a shell can't branch, use one body per sheet"
+            f"({_list_numbers(rows // sides)}; {many.size} such edge{_plural(many)}): a shell can't branch, use one "
+            "body per sheet"
         )
     one, other = order[first[count == 2]], order[first[count == 2] + 1]
     same = np.flatnonzero(edges[one, 0] == edges[other, 0])
@@ -278,18 +279,18 @@ def _check_sheet(mesh: Mesh) -> None:
         a, b = edges[one[i]]
         raise MeshError(
             f"{mesh.label}: quads {one[i] // sides} and {other[i] // sides} both run from node {a} to node {b} through "
-            f"the edge they share, so that their normals disagree ({same.size} such edge{_s(same)}): flip one of "
+            f"the edge they share, so that their normals disagree ({same.size} such edge{_plural(same)}): flip one of "
             "them (reverse the order of its nodes)"
         )
 
 
-def _first(numbers: Ints, count: int = 5) -> str:
+def _list_numbers(numbers: Ints, count: int = 5) -> str:
     return ", ".join(str(int(n)) for n in numbers[:count]) + (", ..." if len(numbers) > count else "")
 
 
-def _vector(x: Floats) -> str:
+def _vector_text(x: Floats) -> str:
     return "(" + ", ".join(f"{v:.6g}" for v in x) + ")"
 
 
-def _s(items: np.ndarray) -> str:
+def _plural(items: np.ndarray) -> str:
     return "" if len(items) == 1 else "s"

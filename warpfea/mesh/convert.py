@@ -31,12 +31,12 @@ def linear(mesh: Mesh) -> Mesh:
     keep = np.ones(len(mesh.points), dtype=bool)
     keep[mesh.used_nodes] = False
     keep[corners] = True
-    number = np.cumsum(keep) - 1
+    new_number = np.cumsum(keep) - 1
     out = Mesh(
         mesh.points[keep],
-        number[corners],
+        new_number[corners],
         "tetra",
-        node_sets={name: number[nodes[keep[nodes]]] for name, nodes in mesh.node_sets.items()},
+        node_sets={name: new_number[nodes[keep[nodes]]] for name, nodes in mesh.node_sets.items()},
         element_sets=mesh.element_sets,
         surface_sets=mesh.surface_sets,
         name=mesh.name,
@@ -52,10 +52,10 @@ def linear(mesh: Mesh) -> Mesh:
 def with_face_nodes(mesh: Mesh, face_points: Floats | None = None) -> Mesh:
     """T4 mesh with one node per face, shared by its two elements: cell type "tetra_faces".
 
-    Face nodes are numbered after the nodes of the mesh, in the order of first occurrence by element. A set
-    of nodes gains a face node if it holds the face's three corners and the face is one of the cells that gave the
-    set its name: a face of the surface set of that name, any face of an element of the element set of that name,
-    or, where neither set exists, an outer face. Element and surface sets are unchanged.
+    Face nodes are numbered after the nodes of the mesh, in the order of first occurrence by element. A node
+    set gains the node of a face if it holds its three corners and the face is in the surface set of the same name,
+    or belongs to an element of the element set of that name, or, without either set, is a boundary face. Element and
+    surface sets are unchanged.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ def with_face_nodes(mesh: Mesh, face_points: Floats | None = None) -> Mesh:
         np.concatenate([mesh.cells, start + face.reshape(-1, 4)], axis=1),
         "tetra_faces",
         node_sets={
-            name: np.concatenate([nodes, start + np.unique(face[_rows_of_set(mesh, name, nodes, corners)])])
+            name: np.concatenate([nodes, start + np.unique(face[_face_rows_of_set(mesh, name, nodes, corners)])])
             for name, nodes in mesh.node_sets.items()
         },
         element_sets=mesh.element_sets,
@@ -96,8 +96,8 @@ def with_face_nodes(mesh: Mesh, face_points: Floats | None = None) -> Mesh:
     )
 
 
-def _rows_of_set(mesh: Mesh, name: str, nodes: Ints, corners: Ints) -> Ints:
-    """Rows 4 e + k of the faces whose nodes belong to the node set ``name``."""
+def _face_rows_of_set(mesh: Mesh, name: str, nodes: Ints, corners: Ints) -> Ints:
+    """Indices 4 e + k (element e, local face k) of the faces whose face nodes join the node set ``name``."""
     rows = []
     if name in mesh.surface_sets:
         rows.append(mesh.surface_sets[name] @ (4, 1))
@@ -110,7 +110,7 @@ def _rows_of_set(mesh: Mesh, name: str, nodes: Ints, corners: Ints) -> Ints:
 
 
 def _shared_points(mesh: Mesh, face_points: Floats, face: Ints, first: Ints) -> Floats:
-    """One point (m) per face, (F, 3), of the points per element and local face."""
+    """Face points (F, 3), m, from face_points (M, 4, 3), checked to agree on both sides of a shared face."""
     given = np.asarray(face_points, dtype=float)
     if given.shape != (len(mesh.cells), 4, 3):
         raise MeshError(f"{mesh.label}: face_points have shape {given.shape}, expected ({len(mesh.cells)}, 4, 3)")

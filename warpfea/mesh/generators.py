@@ -16,12 +16,12 @@ import numpy as np
 from ..base.errors import MeshError
 from .arguments import (
     PointMap,
+    cell_counts,
     cell_type_of,
-    counts,
-    even,
-    finite,
-    mapped,
-    positive,
+    check_even,
+    finite_numbers,
+    map_points,
+    positive_numbers,
 )
 from .cells import CELL_TYPES, Floats, Ints
 from .checks import check
@@ -29,7 +29,7 @@ from .mesh import Mesh
 
 __all__ = ["box", "cylinder", "sphere"]
 
-_SIDES = ("x-", "x+", "y-", "y+", "z-", "z+")
+_BOX_SIDES = ("x-", "x+", "y-", "y+", "z-", "z+")
 
 
 def box(
@@ -59,16 +59,16 @@ def box(
         Non-positive size, fewer than one cell, unknown element; a map without (n, 3) finite values, or with a mesh
         that fails :func:`warpfea.mesh.check`, e.g. a reflection.
     """
-    lengths = positive("box: size", size, 3)
-    numbers = counts("box: cells", cells, 3)
-    low = finite("box: origin", origin, 3)
+    lengths = positive_numbers("box: size", size, 3)
+    numbers = cell_counts("box: cells", cells, 3)
+    low = finite_numbers("box: origin", origin, 3)
     kind = cell_type_of("box", element)
     if kind == "hexahedron":
-        lattice, corners = _bricks(numbers)
+        lattice, corners = _hexahedral_grid(numbers)
     else:
-        lattice, corners = _kuhn(numbers, kind, (False, False, False))
-    points = mapped("box: map", low + lengths * (lattice / lattice[-1]), map)
-    mesh = _assemble(points, corners, kind, _grid_sides(lattice, corners, kind), name)
+        lattice, corners = _kuhn_tetrahedra(numbers, kind, (False, False, False))
+    points = map_points("box: map", low + lengths * (lattice / lattice[-1]), map)
+    mesh = _make_mesh(points, corners, kind, _grid_sides(lattice, corners, kind), name)
     return mesh if map is None else check(mesh)
 
 
@@ -97,21 +97,21 @@ def cylinder(
     MeshError
         Non-positive radius or length, an odd n, unknown element.
     """
-    (r,) = positive("cylinder: radius", [radius], 1)
-    (height,) = positive("cylinder: length", [length], 1)
-    n, nz = counts("cylinder: cells", cells, 2)
-    even("cylinder: cells across the diameter", n)
-    low = finite("cylinder: origin", origin, 3)
+    (r,) = positive_numbers("cylinder: radius", [radius], 1)
+    (height,) = positive_numbers("cylinder: length", [length], 1)
+    n, nz = cell_counts("cylinder: cells", cells, 2)
+    check_even("cylinder: cells across the diameter", n)
+    low = finite_numbers("cylinder: origin", origin, 3)
 
-    def place(p: Floats) -> Floats:
-        x, y = _disk(p[:, 0], p[:, 1])
+    def parent_map(p: Floats) -> Floats:
+        x, y = _map_to_disk(p[:, 0], p[:, 1])
         return np.column_stack([r * x, r * y, 0.5 * height * (p[:, 2] + 1.0)]) + low
 
-    kind = _round_type("cylinder", element)
-    lattice, corners = _kuhn((n, n, nz), kind, (True, True, False))
+    kind = _round_cell_type("cylinder", element)
+    lattice, corners = _kuhn_tetrahedra((n, n, nz), kind, (True, True, False))
     sides = _grid_sides(lattice, corners, kind)
-    named = {"bottom": sides["z-"], "top": sides["z+"], "side": _join(sides, ("x-", "x+", "y-", "y+"))}
-    return _assemble(_round_points(lattice, corners, kind, place, (0, 1)), corners, kind, named, name)
+    named = {"bottom": sides["z-"], "top": sides["z+"], "side": _merge_sides(sides, ("x-", "x+", "y-", "y+"))}
+    return _make_mesh(_round_points(lattice, corners, kind, parent_map, (0, 1)), corners, kind, named, name)
 
 
 def sphere(
@@ -132,18 +132,18 @@ def sphere(
     MeshError
         Non-positive radius, an odd number of cells, unknown element.
     """
-    (r,) = positive("sphere: radius", [radius], 1)
-    (n,) = counts("sphere: cells", [cells], 1)
-    even("sphere: cells", n)
-    middle = finite("sphere: center", center, 3)
-    kind = _round_type("sphere", element)
-    lattice, corners = _kuhn((n, n, n), kind, (True, True, True))
-    points = _round_points(lattice, corners, kind, lambda p: middle + r * _ball(p), (0, 1, 2))
-    named = {"surface": _join(_grid_sides(lattice, corners, kind), _SIDES)}
-    return _assemble(points, corners, kind, named, name)
+    (r,) = positive_numbers("sphere: radius", [radius], 1)
+    (n,) = cell_counts("sphere: cells", [cells], 1)
+    check_even("sphere: cells", n)
+    middle = finite_numbers("sphere: center", center, 3)
+    kind = _round_cell_type("sphere", element)
+    lattice, corners = _kuhn_tetrahedra((n, n, n), kind, (True, True, True))
+    points = _round_points(lattice, corners, kind, lambda p: middle + r * _map_to_ball(p), (0, 1, 2))
+    named = {"surface": _merge_sides(_grid_sides(lattice, corners, kind), _BOX_SIDES)}
+    return _make_mesh(points, corners, kind, named, name)
 
 
-def _round_type(what: str, element: str) -> str:
+def _round_cell_type(what: str, element: str) -> str:
     """Cell type of an element available for round bodies."""
     kind = cell_type_of(what, element)
     if kind == "hexahedron":
@@ -160,7 +160,7 @@ def _lattice(shape: Sequence[int]) -> Ints:
     return np.column_stack([x, y, z])
 
 
-def _bricks(numbers: Sequence[int]) -> tuple[Ints, Ints]:
+def _hexahedral_grid(numbers: Sequence[int]) -> tuple[Ints, Ints]:
     """Lattice points (N, 3) and hexahedra (M, 8), x fastest, of a grid of ``cells``."""
     nx, ny, nz = numbers
     base = _lattice((nx, ny, nz)) @ (1, nx + 1, (nx + 1) * (ny + 1))
@@ -169,7 +169,7 @@ def _bricks(numbers: Sequence[int]) -> tuple[Ints, Ints]:
     return _lattice((nx + 1, ny + 1, nz + 1)), base[:, None] + np.concatenate([bottom, bottom + up])
 
 
-def _kuhn(numbers: Sequence[int], kind: str, mirrored: Sequence[bool]) -> tuple[Ints, Ints]:
+def _kuhn_tetrahedra(numbers: Sequence[int], kind: str, mirrored: Sequence[bool]) -> tuple[Ints, Ints]:
     """Lattice points (N, 3), x fastest, and tetrahedra of a grid of ``cells``.
 
     The lattice has step 2 per cell with T10 (all its points are nodes), 1 with T4. In a mirrored axis the
@@ -213,17 +213,17 @@ def _grid_sides(lattice: Ints, cells: Ints, kind: str) -> dict[str, Ints]:
     return sides
 
 
-def _join(sides: dict[str, Ints], names: Sequence[str]) -> Ints:
+def _merge_sides(sides: dict[str, Ints], names: Sequence[str]) -> Ints:
     table = np.concatenate([sides[n] for n in names])
     return table[np.lexsort((table[:, 1], table[:, 0]))]
 
 
 def _round_points(
-    lattice: Ints, cells: Ints, kind: str, place: Callable[[Floats], Floats], round_axes: tuple[int, ...]
+    lattice: Ints, cells: Ints, kind: str, parent_map: Callable[[Floats], Floats], round_axes: tuple[int, ...]
 ) -> Floats:
     """Points of the mapped lattice, with straight edges except on the round side."""
     parent = 2.0 * lattice / lattice[-1] - 1.0  # -1 .. 1, exact at both ends and in the middle
-    points = place(parent)
+    points = parent_map(parent)
     row = CELL_TYPES[kind]
     if row.has_mid_nodes:
         outside = np.abs(parent[:, round_axes]).max(axis=1) == 1.0
@@ -233,7 +233,7 @@ def _round_points(
     return points
 
 
-def _disk(x: Floats, y: Floats) -> tuple[Floats, Floats]:
+def _map_to_disk(x: Floats, y: Floats) -> tuple[Floats, Floats]:
     """The square [-1, 1]^2 onto the unit disk: concentric squares onto circles, with equal angles."""
     big = np.maximum(np.abs(x), np.abs(y))
     first = np.abs(x) >= np.abs(y)
@@ -244,7 +244,7 @@ def _disk(x: Floats, y: Floats) -> tuple[Floats, Floats]:
     return np.where(zero, 0.0, np.where(first, along, across)), np.where(zero, 0.0, np.where(first, across, along))
 
 
-def _ball(p: Floats) -> Floats:
+def _map_to_ball(p: Floats) -> Floats:
     """The cube [-1, 1]^3 onto the unit ball: concentric cubes onto spheres, with equal angles."""
     big = np.abs(p).max(axis=1, keepdims=True)
     direction = np.tan(0.25 * np.pi * p / np.where(big > 0.0, big, 1.0))
@@ -252,7 +252,7 @@ def _ball(p: Floats) -> Floats:
     return big * direction / np.where(norm > 0.0, norm, 1.0)
 
 
-def _assemble(points: Floats, cells: Ints, kind: str, surfaces: dict[str, Ints], name: str) -> Mesh:
+def _make_mesh(points: Floats, cells: Ints, kind: str, surfaces: dict[str, Ints], name: str) -> Mesh:
     faces = CELL_TYPES[kind].faces
     nodes = {key: np.unique(cells[table[:, 0, None], faces[table[:, 1]]]) for key, table in surfaces.items()}
     return Mesh(points, cells, kind, node_sets=nodes, surface_sets=surfaces, name=name)

@@ -71,8 +71,8 @@ class Mesh:
         put = lambda key, value: object.__setattr__(self, key, value)  # noqa: E731
         if self.cell_type not in CELL_TYPES:
             raise MeshError(f"{self.label}: unknown cell type {self.cell_type!r}, known are {sorted(CELL_TYPES)}")
-        put("points", _frozen(self.points, np.float64))
-        put("cells", _frozen(self.cells, np.int64))
+        put("points", _read_only_array(self.points, np.float64))
+        put("cells", _read_only_array(self.cells, np.int64))
         if self.points.ndim != 2 or self.points.shape[1] != 3:
             raise MeshError(f"{self.label}: points have shape {self.points.shape}, expected (N, 3)")
         if self.cells.ndim != 2 or self.cells.shape[1] != self.kind.nodes:
@@ -87,14 +87,14 @@ class Mesh:
             "surface_sets": len(self.cells),
         }
         for attribute, limit in limits.items():
-            sets = {str(key): _frozen(value, np.int64) for key, value in getattr(self, attribute).items()}
+            sets = {str(key): _read_only_array(value, np.int64) for key, value in getattr(self, attribute).items()}
             for key, value in sets.items():
                 where = f"{self.label}: {attribute}[{key!r}]"
                 columns = value.reshape(-1, 2) if attribute == "surface_sets" else value.reshape(-1, 1)
                 check_range(columns[:, 0], limit, where)
                 if attribute == "surface_sets":
                     check_range(columns[:, 1], len(self.kind.faces), where)
-                    sets[key] = _frozen(columns, np.int64)
+                    sets[key] = _read_only_array(columns, np.int64)
             put(attribute, sets)
 
     def __repr__(self) -> str:
@@ -120,12 +120,12 @@ class Mesh:
     @cached_property
     def used_nodes(self) -> Ints:
         """Sorted numbers of used nodes."""
-        return _frozen(np.flatnonzero(self._used_mask), np.int64)
+        return _read_only_array(np.flatnonzero(self._used_mask), np.int64)
 
     @cached_property
     def orphan_nodes(self) -> Ints:
         """Sorted numbers of unused nodes."""
-        return _frozen(np.flatnonzero(~self._used_mask), np.int64)
+        return _read_only_array(np.flatnonzero(~self._used_mask), np.int64)
 
     @cached_property
     def _used_mask(self) -> np.ndarray:
@@ -201,7 +201,7 @@ class Mesh:
         ordered = keys[order]
         first = np.flatnonzero(np.r_[True, ordered[1:] != ordered[:-1]])
         alone = np.sort(order[first[np.diff(np.r_[first, len(keys)]) == 1]])
-        return _frozen(np.column_stack(np.divmod(alone, len(self.kind.faces))), np.int64)
+        return _read_only_array(np.column_stack(np.divmod(alone, len(self.kind.faces))), np.int64)
 
     @cached_property
     def _face_keys(self) -> Ints:
@@ -224,11 +224,11 @@ class Mesh:
             length.
         """
         if isinstance(selection, str):
-            return self._named("node", self.node_sets, selection)
+            return self._set_by_name("node", self.node_sets, selection)
         if callable(selection):
             used = self.used_nodes
-            return used[self._mask(selection, self.points[used], "nodes")]
-        return self._numbers(selection, len(self.points), "nodes")
+            return used[self._predicate_mask(selection, self.points[used], "nodes")]
+        return self._checked_numbers(selection, len(self.points), "nodes")
 
     def elements(self, selection: Selection) -> Ints:
         """Element numbers of a set name, a predicate of the centroids (M, 3), a mask (M,) or an array of
@@ -240,10 +240,10 @@ class Mesh:
             As :meth:`nodes`.
         """
         if isinstance(selection, str):
-            return self._named("element", self.element_sets, selection)
+            return self._set_by_name("element", self.element_sets, selection)
         if callable(selection):
-            return np.flatnonzero(self._mask(selection, self.centroids(), "elements"))
-        return self._numbers(selection, len(self.cells), "elements")
+            return np.flatnonzero(self._predicate_mask(selection, self.centroids(), "elements"))
+        return self._checked_numbers(selection, len(self.cells), "elements")
 
     def surface(self, selection: Selection) -> Ints:
         """Rows (element, local face), (K, 2), of a set name, a predicate of the outer faces' centroids, or
@@ -255,10 +255,10 @@ class Mesh:
             As :meth:`nodes`.
         """
         if isinstance(selection, str):
-            return self._named("surface", self.surface_sets, selection)
+            return self._set_by_name("surface", self.surface_sets, selection)
         if callable(selection):
             table = self._boundary
-            return table[self._mask(selection, self.face_centroids(table), "surface")]
+            return table[self._predicate_mask(selection, self.face_centroids(table), "surface")]
         rows = np.asarray(selection)
         if rows.size == 0:
             return np.empty((0, 2), dtype=np.int64)
@@ -271,19 +271,19 @@ class Mesh:
         check_range(rows[:, 1], len(self.kind.faces), f"{self.label}: surface, local face")
         return rows.astype(np.int64)
 
-    def _named(self, what: str, sets: dict[str, Ints], name: str) -> Ints:
+    def _set_by_name(self, what: str, sets: dict[str, Ints], name: str) -> Ints:
         if name not in sets:
-            elsewhere = self._kinds_of(name)
+            elsewhere = self._set_kinds(name)
             hint = f"; {name!r} is a set of {' and '.join(elsewhere)}" if elsewhere else did_you_mean(name, sets)
             raise MeshError(f"{self.label}: no {what} set named {name!r}; there are: {listing(sorted(sets))}{hint}")
         return sets[name]
 
-    def _kinds_of(self, name: str) -> list[str]:
+    def _set_kinds(self, name: str) -> list[str]:
         """Kinds of sets of this name in the mesh: "nodes", "elements", "faces"."""
         kinds = {"elements": self.element_sets, "faces": self.surface_sets, "nodes": self.node_sets}
         return [kind for kind, sets in kinds.items() if name in sets]
 
-    def _mask(self, predicate: Callable[[Floats], Any], coordinates: Floats, what: str) -> np.ndarray:
+    def _predicate_mask(self, predicate: Callable[[Floats], Any], coordinates: Floats, what: str) -> np.ndarray:
         mask = np.asarray(predicate(coordinates))
         if mask.shape != (len(coordinates),) or mask.dtype != bool:
             raise MeshError(
@@ -293,7 +293,7 @@ class Mesh:
             )
         return mask
 
-    def _numbers(self, selection: Any, limit: int, what: str) -> Ints:
+    def _checked_numbers(self, selection: Any, limit: int, what: str) -> Ints:
         numbers = np.asarray(selection)
         if numbers.size == 0 and numbers.dtype != bool:
             return np.empty(0, dtype=np.int64)
@@ -358,7 +358,7 @@ def transformation(scale: float, transform: Any, label: str) -> tuple[Floats, Fl
     return factor * a, t
 
 
-def _frozen(values: Any, dtype: Any) -> np.ndarray:
+def _read_only_array(values: Any, dtype: Any) -> np.ndarray:
     """Read-only C-contiguous array; copied only if it is writable elsewhere."""
     array = np.asarray(values)
     if dtype == np.int64 and array.dtype.kind not in "iub" and array.size:

@@ -100,5 +100,5 @@ class ObstaclePrims:
             for world, (translate, orient) in enumerate(self._transform_ops[k] if chosen(obstacle) else ()):
                 translate.Set(Gf.Vec3d(*map(float, position[world, k])), *code)
                 # rows are the images of the axes
-                matrix = Gf.Matrix3d(*map(float, rotation[world, k].T.ravel())).ExtractRotation()
-                orient.Set(Gf.Quatd(matrix.GetQuat()), *code)
+                quaternion = Gf.Matrix3d(*map(float, rotation[world, k].T.ravel())).ExtractRotation().GetQuat()
+                orient.Set(Gf.Quatd(quaternion), *code)
