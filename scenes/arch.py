@@ -45,25 +45,25 @@ def arch(
     b = wf.ModelBuilder(gravity=([0.0, ramp, 2.0 * ramp], [(0.0, 0.0, 0.0), (0.0, 0.0, -9.81), (0.0, 0.0, -9.81)]))
     material = wf.SVK(E=E, nu=nu, density=density)
     ground = b.add_collider(wf.HalfSpace(normal=(0, 0, 1)), name="ground")
-    options: dict[str, Any] = {"mu": mu, "restitution": 0.1, "stiffness": stiffness}
-    part = math.pi / blocks
+    contact_options: dict[str, Any] = {"mu": mu, "restitution": 0.1, "stiffness": stiffness}
+    block_angle = math.pi / blocks
 
-    def bend(X: np.ndarray) -> np.ndarray:
+    def polar_map(X: np.ndarray) -> np.ndarray:
         """From (angle, depth, radius), angles from the left foot; sides stay planes."""
         return np.column_stack([-X[:, 2] * np.cos(X[:, 0]), X[:, 1], X[:, 2] * np.sin(X[:, 0])])
 
-    before: wf.Body | None = None
+    previous: wf.Body | None = None
     for k in range(blocks):
-        origin = (k * part, -0.5 * depth, radius - 0.5 * thickness)
-        mesh = wf.mesh.box((part, depth, thickness), cells=(2, 1, 1), origin=origin, map=bend)
+        origin = (k * block_angle, -0.5 * depth, radius - 0.5 * thickness)
+        mesh = wf.mesh.box((block_angle, depth, thickness), cells=(2, 1, 1), origin=origin, map=polar_map)
         block = b.add_solid(mesh, material=material, name=f"block {k + 1}")
-        if before is None:
-            b.add_contact(block.surface("x-"), ground, name="left foot", **options)
+        if previous is None:
+            b.add_contact(block.surface("x-"), ground, name="left foot", **contact_options)
         else:
-            b.add_contact(before.surface("x+"), block.surface("x-"), name=f"joint {k}", **options)
-        before = block
-    b.add_contact(block.surface("x+"), ground, name="right foot", **options)
+            b.add_contact(previous.surface("x+"), block.surface("x-"), name=f"joint {k}", **contact_options)
+        previous = block
+    b.add_contact(block.surface("x+"), ground, name="right foot", **contact_options)
     middle = b.bodies[blocks // 2]
-    angle = 0.5 * math.pi if blocks % 2 else 0.5 * math.pi + 0.5 * part
-    b.add_probe("crown", middle.at(bend(np.array([(angle, 0.0, radius)]))[0]))
+    angle = 0.5 * math.pi if blocks % 2 else 0.5 * math.pi + 0.5 * block_angle
+    b.add_probe("crown", middle.at(polar_map(np.array([(angle, 0.0, radius)]))[0]))
     return b

@@ -49,23 +49,24 @@ def chain(
     mass = mass_ratio * density * length * side**2
     stretch = 9.81 * mass * math.cos(start) / (E * side**2)  # strain of a link under the pull of the weight at t = 0
 
-    def stretched(X: np.ndarray) -> np.ndarray:
-        way = X @ along
-        return np.outer(stretch * way, along) - nu * stretch * (X - np.outer(way, along))
+    def prestretch(X: np.ndarray) -> np.ndarray:
+        """Displacement (n, 3), m, of a link under the pull of the weight."""
+        distance = X @ along
+        return np.outer(stretch * distance, along) - nu * stretch * (X - np.outer(distance, along))
 
-    before: Any = wf.GROUND
+    previous: Any = wf.GROUND
     for k in range(links):
         ends = [k * length * along, (k + 1) * length * along]
         link = b.add_beam(ends, elements=1, section=section, normal=across, material=material, name=f"link {k + 1}")
-        b.set_initial(link, displacement=stretched)
+        b.set_initial(link, displacement=prestretch)
         axis = {"axis": across if k % 2 else y} if joint == "revolute" else {}
-        b.add_joint(joint, parent=before, child=link.start, name=f"hinge {k + 1}", **axis)
-        before = link.end
+        b.add_joint(joint, parent=previous, child=link.start, name=f"hinge {k + 1}", **axis)
+        previous = link.end
     size = 0.06 * links * length
     cube = wf.mesh.box((size, size, size), cells=(1, 1, 1), origin=(0.0, -0.5 * size, -0.5 * size), name="weight")
-    place = (np.column_stack([along, y, across]), links * length * along)
-    weight = b.add_solid(cube, material=wf.SVK(E=E, nu=nu, density=mass / size**3), transform=place)
+    transform = (np.column_stack([along, y, across]), links * length * along)
+    weight = b.add_solid(cube, material=wf.SVK(E=E, nu=nu, density=mass / size**3), transform=transform)
     b.set_initial(weight, displacement=stretch * links * length * along)
-    b.add_joint("spherical", parent=before, child=weight.surface("x-"), name="shackle")
+    b.add_joint("spherical", parent=previous, child=weight.surface("x-"), name="shackle")
     b.add_probe("weight", weight.surface("x-"))
     return b

@@ -43,13 +43,13 @@ def spin(
         eta: shear viscosity (Kelvin-Voigt), Pa s; with it the body ends up turning about z.
     """
 
-    def narrowed(X: np.ndarray) -> np.ndarray:
-        part = waist + (1.0 - waist) * np.sin(np.pi * X[:, 0] / size[0]) ** 2
-        return X * np.column_stack([np.ones_like(part), part, np.ones_like(part)])
+    def waist_map(X: np.ndarray) -> np.ndarray:
+        width_ratio = waist + (1.0 - waist) * np.sin(np.pi * X[:, 0] / size[0]) ** 2
+        return X * np.column_stack([np.ones_like(width_ratio), width_ratio, np.ones_like(width_ratio)])
 
     b = wf.ModelBuilder(gravity=(0.0, 0.0, 0.0))
     corner = [-0.5 * length for length in size]
-    mesh = wf.mesh.box(size, cells=cells, element="T10", origin=corner, map=narrowed, name="dumb-bell")
+    mesh = wf.mesh.box(size, cells=cells, element="T10", origin=corner, map=waist_map, name="dumb-bell")
     material = wf.SVK(E=E, nu=nu, density=density, damping=wf.KelvinVoigt(eta=eta) if eta else None)
     body = b.add_solid(mesh, material=material, element=element)
     b.set_initial(body, angular_velocity=(rate * np.sin(tilt), rate * np.cos(tilt), 0.0))

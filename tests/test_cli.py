@@ -13,7 +13,7 @@ import warpfea as wf
 from warpfea.base.errors import UsageError
 from warpfea.builder.scene import find
 from warpfea.cli.mesh_scene import parse_material
-from warpfea.cli.summary import KEYS
+from warpfea.cli.summary import SUMMARY_KEYS
 from warpfea.outputs.usd import validate_usd
 
 
@@ -43,7 +43,7 @@ def test_summary_has_the_fixed_keys(folder, capfd):
     code, out, _ = run(capfd, *SHORT, "--json", "a.json", "--usd", "a.usdc")
     assert code == 0
     summary = json.loads((folder / "a.json").read_text())
-    assert tuple(summary) == KEYS
+    assert tuple(summary) == SUMMARY_KEYS
     assert summary["schema"] == 1
     assert summary["scene"] == "cantilever"
     assert summary["parameters"]["cells"] == 2
@@ -137,7 +137,7 @@ def test_a_run_resumes_from_its_checkpoint_bit_for_bit(folder, capfd):
     rest = ["run", "cantilever", "--device", "cpu", "--set", "cells=2", "--t-end", "0.012", "--quiet"]
     assert run(capfd, *rest, "--resume", "c.npz", "--checkpoint", "c.npz", "--json", "rest.json")[0] == 0
     whole, rest = (json.loads((folder / f"{name}.json").read_text()) for name in ("whole", "rest"))
-    for key in KEYS:
+    for key in SUMMARY_KEYS:
         if not key.endswith("_s"):  # times
             assert rest[key] == whole[key], key
 
@@ -179,7 +179,7 @@ def test_statics_from_the_command_line(folder, capfd):
     for words in ("done, static, at 100 % of the load, 4 load steps", "no density", "probe x+", "a.png"):
         assert words in out
     summary = json.loads((folder / "a.json").read_text())
-    assert tuple(summary) == KEYS
+    assert tuple(summary) == SUMMARY_KEYS
     assert (summary["analysis"], summary["load"], summary["steps"], summary["status"]) == ("static", 1.0, 4, "done")
     assert summary["dt"] is summary["t_end"] is summary["mass"] is None
     assert set(summary["energies"]) == {"strain"}

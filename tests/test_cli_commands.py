@@ -120,13 +120,13 @@ def test_pictures_take_field_view_and_range(folder, capfd, monkeypatch):
     from warpfea.outputs import animation
 
     shown = []
-    label = animation.label
+    label = animation.draw_labels
 
     def note(image, time, bar):
         shown.append(bar)
         return label(image, time, bar)
 
-    monkeypatch.setattr(animation, "label", note)
+    monkeypatch.setattr(animation, "draw_labels", note)
     look = ["--field", "displacement", "--range", "-1e-3,2e-3", "--view", "-60,10", "--quiet"]
     assert run(capfd, *SHORT, "--png", "a.png", "--gif", "a.gif", "--usd", "a.usdc", *look)[0] == 0
     assert {(bar[0], bar[1], bar[2]) for bar in shown} == {(-1e-3, 2e-3, "displacement")}

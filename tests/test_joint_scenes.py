@@ -14,7 +14,7 @@ from scene_runs import scene_simulation
 
 import warpfea as wf
 from warpfea.builder.scene import find
-from warpfea.cli.summary import KEYS, MAX_ROWS
+from warpfea.cli.summary import MAX_ROWS, SUMMARY_KEYS
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 SMALL = {
@@ -156,7 +156,7 @@ def test_summary_has_a_row_for_each_joint(capfd, tmp_path):
         assert force == pytest.approx(np.linalg.norm(values[:3]), rel=1e-3)
         assert moment == pytest.approx(np.linalg.norm(values[3:]), rel=1e-3)
     summary = json.loads(target.read_text())
-    assert tuple(summary) == KEYS
+    assert tuple(summary) == SUMMARY_KEYS
     assert summary["violation"] == sim.max_violation > 0.0
     assert f"violation up to {summary['violation']:.2g} m" in out
 
@@ -193,7 +193,7 @@ def test_a_run_with_joints_resumes_bit_for_bit(capfd, tmp_path):
     assert run(capfd, "run", *crank("--t-end", "4e-4", "--checkpoint", saved, "--quiet"))[0] == 0
     assert run(capfd, "run", *crank("--t-end", "8e-4", "--resume", saved, "--json", rest, "--quiet"))[0] == 0
     a, b = (json.loads(path.read_text()) for path in (whole, rest))
-    for key in KEYS:
+    for key in SUMMARY_KEYS:
         if not key.endswith("_s"):  # times
             assert a[key] == b[key], key
 

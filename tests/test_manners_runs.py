@@ -12,8 +12,8 @@ from cli_runs import run as command
 
 import warpfea as wf
 from warpfea.base.errors import OutputError, UsageError
-from warpfea.cli.mesh_scene import _load
-from warpfea.cli.summary import human, summarize
+from warpfea.cli.mesh_scene import _parse_load
+from warpfea.cli.summary import summarize, summary_text
 from warpfea.outputs import animation, usd
 from warpfea.outputs.frames import frame_time
 from warpfea.outputs.usd import validate_usd
@@ -338,12 +338,12 @@ def test_an_element_turned_inside_out_is_told(tmp_path, capfd):
     assert sim.min_J <= 0
     source = SimpleNamespace(label="bar", parameters={})
     summary = summarize(source, sim, status="done", wall_s=0.0)
-    assert f"an element turned inside out: J = {sim.min_J:.3g}; take a finer mesh" in human(summary, sim, [])
+    assert f"an element turned inside out: J = {sim.min_J:.3g}; take a finer mesh" in summary_text(summary, sim, [])
     stiffening = bar(wf.NeoHookean.from_E_nu(E=1e6, nu=0.3, density=1000.0))[0].finalize(device="cpu")
     sim = wf.Simulation(stiffening, dt=2e-3)
     sim.step()
     summary = summarize(source, sim, status="done", wall_s=0.0) | {"min_J": -0.1}
-    assert "J = -0.1 at a vertex of an element: take a finer mesh or smaller loads" in human(summary, sim, [])
+    assert "J = -0.1 at a vertex of an element: take a finer mesh or smaller loads" in summary_text(summary, sim, [])
 
 
 def test_what_was_not_written_is_not_listed(tmp_path, capfd, monkeypatch):
@@ -398,14 +398,14 @@ def test_the_summary_says_that_rounding_set_the_limit():
     sim.step()
     summary = summarize(SimpleNamespace(label="bar", parameters={}), sim, status="done", wall_s=0.0)
     assert (summary["floored_steps"], summary["max_floor"]) == (0, 0.0)
-    assert "rounding" not in human(summary, sim, [])
+    assert "rounding" not in summary_text(summary, sim, [])
     summary |= {"floored_steps": 1, "max_floor": 1.234e-3}
     text = "1 of 1 steps end where rounding stops the residual; largest estimated error 0.0012"
-    assert text in human(summary, sim, [])
+    assert text in summary_text(summary, sim, [])
     summary["floored_steps"] = 0
     summary["steps"] = 0
-    assert "residual up to" not in human(summary, sim, [])
-    assert "no step was accepted" in human(summary, sim, [])
+    assert "residual up to" not in summary_text(summary, sim, [])
+    assert "no step was accepted" in summary_text(summary, sim, [])
 
 
 @pytest.mark.parametrize(
@@ -455,7 +455,7 @@ def test_words_of_the_command_line(tmp_path, capfd):
     _, _, err = command(capfd, "fly")
     assert "sweep" not in err
     with pytest.raises(UsageError, match=r"'nan' is not a finite number$"):
-        _load("x+:nan", "--pressure", 1)
+        _parse_load("x+:nan", "--pressure", 1)
 
 
 def test_an_error_in_a_scene_file_has_its_line(tmp_path, capfd, monkeypatch):

@@ -14,7 +14,7 @@ import warpfea as wf
 from warpfea.base.launch import PARTS, Launcher, labelled
 from warpfea.builder.scene import find
 from warpfea.cli import main
-from warpfea.cli.profile import KEYS
+from warpfea.cli.profile import JSON_KEYS
 from warpfea.studies.profile import profiling
 from warpfea.studies.profile.profiling import LaunchRecorder, launch_bytes, profile
 from warpfea.terms.term_set import all_parts
@@ -233,7 +233,7 @@ def test_command_writes_tables_json_and_picture(tmp_path, capsys):
     printed, progress = capsys.readouterr()
     assert not progress  # stderr is no terminal
     content = json.loads(file.read_text())
-    assert tuple(content) == KEYS
+    assert tuple(content) == JSON_KEYS
     assert content["steps"] == 2
     assert content["parameters"]["cells"] == 2
     assert content["step_ms"]["min"] <= content["step_ms"]["median"] <= content["step_ms"]["max"]

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from .arguments import StoreOnce, add_general, call, count, positive
+from .arguments import StoreOnce, add_general_options, lazy_command, positive_integer, positive_number
 
-__all__ = ["SCENE", "add_accuracy"]
+__all__ = ["SCENE_COMMAND", "add_accuracy"]
 
-SCENE = "SCENE"
+SCENE_COMMAND = "SCENE"
 """Placeholder for a study's name, inserted before the name of a scene."""
 
 EXAMPLES = """\
@@ -52,22 +52,22 @@ exit codes: 0 done, 3 nothing reaches --target or the reference was refused, 2 b
 def add_accuracy(names: Any) -> None:
     """The parser of `warpfea study SCENE`."""
     to = names.add_parser(
-        SCENE,
+        SCENE_COMMAND,
         help="error against run time of a scene, or of file.py[:NAME]: any sweep, with orders and a plot",
         description="Run a scene with every combination of settings, and tell error and run time of each: a table, and "
         "with --out CSV, JSON and a plot. A file of one's own needs a function decorated with @wf.scene, and a probe.",
         epilog=EXAMPLES,
     )
-    to.add_argument("what", metavar=SCENE, help="a scene, file.py or file.py:scene")
+    to.add_argument("what", metavar=SCENE_COMMAND, help="a scene, file.py or file.py:scene")
     sweep = to.add_argument_group("the sweep")
     sweep.add_argument("--over", action="append", default=[], metavar="NAME=V1,V2", help="repeatable")
     sweep.add_argument("--methods", metavar="NAME,NAME", help="integrators, with options as name(option=value)")
     sweep.add_argument("--error", metavar="X,X", help="steps that adapt, to each of these errors")
     fixed = to.add_argument_group("for all runs (defaults are the scene's)")
     fixed.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="a parameter of the scene")
-    fixed.add_argument("--dt", type=positive, metavar="S", help="step, s, where it is not swept")
-    fixed.add_argument("--t-end", type=positive, metavar="S", help="end time, s")
-    fixed.add_argument("--tol", type=positive, metavar="X", help="relative residual at which a step is accepted")
+    fixed.add_argument("--dt", type=positive_number, metavar="S", help="step, s, where it is not swept")
+    fixed.add_argument("--t-end", type=positive_number, metavar="S", help="end time, s")
+    fixed.add_argument("--tol", type=positive_number, metavar="X", help="relative residual at which a step is accepted")
     fixed.add_argument("--solver", default="newton-pcg", metavar="NAME", help="newton-pcg (default), jacobi, direct")
     fixed.add_argument("--dtype", default="float64", metavar="NAME", help="float64 (default) or float32")
     fixed.add_argument("--device", help="cpu, cuda:0, ...; by default CUDA where there is one")
@@ -81,18 +81,18 @@ def add_accuracy(names: Any) -> None:
     )
     judge.add_argument(
         "--target",
-        type=positive,
+        type=positive_number,
         metavar="X",
         help="name the cheapest setting with at most this error, in time and mesh",
     )
     judge.add_argument(
         "--split", default="best", metavar="ROWS", help="parts of the error of the best row (default), of all, or none"
     )
-    to.add_argument("--repeat", type=count, default=3, metavar="N", help="runs for the times (default 3)")
-    to.add_argument("--limit", type=positive, metavar="S", help="s, after which a run is given up")
+    to.add_argument("--repeat", type=positive_integer, default=3, metavar="N", help="runs for the times (default 3)")
+    to.add_argument("--limit", type=positive_number, metavar="S", help="s, after which a run is given up")
     to.add_argument(
         "--out", action=StoreOnce, metavar="FOLDER", help="NAME.csv, .json, .png, and what is needed to go on"
     )
     to.add_argument("--name", metavar="NAME", help="of the files (default: the scene's)")
-    add_general(to, "no bars, no table")
-    to.set_defaults(command=call("study", "accuracy"))
+    add_general_options(to, "no bars, no table")
+    to.set_defaults(command=lazy_command("study", "accuracy"))

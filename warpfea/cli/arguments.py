@@ -15,16 +15,16 @@ from ..base.names import did_you_mean
 __all__ = [
     "Parser",
     "StoreOnce",
-    "add_general",
-    "call",
+    "add_general_options",
     "color_range",
-    "count",
-    "counts",
-    "existing",
+    "existing_file",
+    "lazy_command",
     "load_steps",
-    "numbers",
-    "pair",
-    "positive",
+    "number_pair",
+    "number_tuple",
+    "positive_integer",
+    "positive_integers",
+    "positive_number",
     "size",
     "step_size",
     "vector",
@@ -56,7 +56,7 @@ class StoreOnce(argparse.Action):
         setattr(namespace, self.dest, values)
 
 
-def existing(text: str) -> pathlib.Path:
+def existing_file(text: str) -> pathlib.Path:
     """Path of an existing file. UsageError."""
     path = pathlib.Path(text)
     if not path.is_file():
@@ -64,7 +64,7 @@ def existing(text: str) -> pathlib.Path:
     return path
 
 
-def positive(text: str) -> float:
+def positive_number(text: str) -> float:
     """A positive finite number."""
     try:
         value = float(text)
@@ -80,12 +80,12 @@ def step_size(text: str) -> float | str:
     if text == "auto":
         return text
     try:
-        return positive(text)
+        return positive_number(text)
     except argparse.ArgumentTypeError:
         raise argparse.ArgumentTypeError(f"{text!r} is neither a positive finite number nor auto") from None
 
 
-def count(text: str) -> int:
+def positive_integer(text: str) -> int:
     """A positive whole number."""
     if not (text.isdecimal() and int(text) > 0):
         raise argparse.ArgumentTypeError(f"{text!r} is not a positive whole number")
@@ -97,12 +97,12 @@ def load_steps(text: str) -> int:
     if text == "auto":
         return 1
     try:
-        return count(text)
+        return positive_integer(text)
     except argparse.ArgumentTypeError:
         raise argparse.ArgumentTypeError(f"{text!r} is neither a positive whole number nor auto") from None
 
 
-def counts(text: str) -> list[int]:
+def positive_integers(text: str) -> list[int]:
     """Positive whole numbers separated by commas; 1e5 counts as one."""
     try:
         values = [float(part) for part in text.split(",")]
@@ -112,7 +112,7 @@ def counts(text: str) -> list[int]:
     return [int(v) for v in values]
 
 
-def numbers(text: str, size: int) -> tuple[float, ...]:
+def number_tuple(text: str, size: int) -> tuple[float, ...]:
     """Finite numbers separated by commas."""
     try:
         values = tuple(float(part) for part in text.split(","))
@@ -126,17 +126,17 @@ def numbers(text: str, size: int) -> tuple[float, ...]:
 
 def vector(text: str) -> tuple[float, ...]:
     """x,y,z."""
-    return numbers(text, 3)
+    return number_tuple(text, 3)
 
 
-def pair(text: str) -> tuple[float, ...]:
+def number_pair(text: str) -> tuple[float, ...]:
     """Two numbers separated by a comma."""
-    return numbers(text, 2)
+    return number_tuple(text, 2)
 
 
 def color_range(text: str) -> tuple[float, ...]:
     """Two finite increasing numbers separated by a comma."""
-    low, high = numbers(text, 2)
+    low, high = number_tuple(text, 2)
     if not low < high:
         raise argparse.ArgumentTypeError(f"{text!r} does not rise: give LOW,HIGH")
     return low, high
@@ -150,7 +150,7 @@ def size(text: str) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
-def call(module: str, function: str) -> Any:
+def lazy_command(module: str, function: str) -> Any:
     """The command, imported on call."""
 
     def command(arguments: argparse.Namespace) -> int:
@@ -161,7 +161,7 @@ def call(module: str, function: str) -> Any:
     return command
 
 
-def add_general(to: argparse.ArgumentParser, quiet: str = "no bars and no summary table") -> None:
+def add_general_options(to: argparse.ArgumentParser, quiet: str = "no bars and no summary table") -> None:
     """Options common to all commands; `quiet` is the help of --quiet."""
     group = to.add_argument_group("general")
     group.add_argument("--quiet", action="store_true", help=quiet)

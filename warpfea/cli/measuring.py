@@ -9,10 +9,18 @@ from typing import Any
 
 from ..base.errors import UsageError
 from ..base.names import did_you_mean
-from .accuracy import SCENE, add_accuracy
-from .arguments import Parser, StoreOnce, add_general, call, count, counts, positive
+from .accuracy import SCENE_COMMAND, add_accuracy
+from .arguments import (
+    Parser,
+    StoreOnce,
+    add_general_options,
+    lazy_command,
+    positive_integer,
+    positive_integers,
+    positive_number,
+)
 
-__all__ = ["add_bench", "add_profile", "add_stress", "add_study", "with_scene"]
+__all__ = ["add_bench", "add_profile", "add_stress", "add_study", "insert_scene_command"]
 
 PROFILE_EXAMPLES = """\
 examples:
@@ -90,7 +98,12 @@ def add_bench(commands: Any) -> None:
         help="may be repeated; default bar",
     )
     to.add_argument(
-        "--unknowns", "--sizes", type=counts, default=[], metavar="N,N,...", help="sizes (default: a few per problem)"
+        "--unknowns",
+        "--sizes",
+        type=positive_integers,
+        default=[],
+        metavar="N,N,...",
+        help="sizes (default: a few per problem)",
     )
     to.add_argument("--device", help="cpu, cuda:0, ...; by default CUDA where there is one")
     to.add_argument(
@@ -102,13 +115,13 @@ def add_bench(commands: Any) -> None:
     to.add_argument(
         "--linear", action="append", choices=("pcg", "direct"), help="linear solver, may be repeated; default pcg"
     )
-    to.add_argument("--steps", type=count, metavar="N", help="steps to simulate (default 10, --peer 120)")
-    to.add_argument("--repeat", type=count, metavar="N", help="runs; the median counts (default 3)")
-    to.add_argument("--dt", type=positive, metavar="S", help="step, s (default 1e-3)")
-    to.add_argument("--tol", type=positive, metavar="X", help="relative residual at which a step is accepted")
+    to.add_argument("--steps", type=positive_integer, metavar="N", help="steps to simulate (default 10, --peer 120)")
+    to.add_argument("--repeat", type=positive_integer, metavar="N", help="runs; the median counts (default 3)")
+    to.add_argument("--dt", type=positive_number, metavar="S", help="step, s (default 1e-3)")
+    to.add_argument("--tol", type=positive_number, metavar="X", help="relative residual at which a step is accepted")
     to.add_argument(
         "--reference-up-to",
-        type=counts,
+        type=positive_integers,
         metavar="N",
         help="largest size that gets a reference with 100 times tighter tolerance (default 100000)",
     )
@@ -119,7 +132,7 @@ def add_bench(commands: Any) -> None:
         "--meshes", metavar="FOLDER", help="--peer: unstructured meshes (default: tests/data of the checkout)"
     )
     to.add_argument("--out", metavar="FILE", help="JSON with command, machine, settings and rows")
-    add_general(to, "no bars; the table is what it is for")
+    add_general_options(to, "no bars; the table is what it is for")
     to.set_defaults(command=_bench)
 
 
@@ -133,10 +146,10 @@ STUDIES: dict[str, tuple[str, tuple[str, ...], str]] = {
     ),
 }
 """Studies other than those of scenes: name -> help, options, description; executed by `run` of cli/study.py."""
-_OPTIONS: dict[str, dict[str, Any]] = {
+_STUDY_OPTIONS: dict[str, dict[str, Any]] = {
     "--device": {"help": "cpu, cuda:0, ..."},
     "--quick": {"action": "store_true", "help": "a trial: few and small rows, no result"},
-    "--worlds": {"type": count, "metavar": "N", "help": "candidates at a time (default 64)"},
+    "--worlds": {"type": positive_integer, "metavar": "N", "help": "candidates at a time (default 64)"},
     "--out": {"metavar": "PATH", "help": "JSON with command, machine, settings and rows"},
 }
 
@@ -156,9 +169,9 @@ def add_study(commands: Any) -> None:
     for name, (text, options, about) in STUDIES.items():
         one = names.add_parser(name, help=text, description=about, epilog=f"example:\n  warpfea study {name}")
         for flag in options:
-            one.add_argument(flag, **_OPTIONS[flag])
-        add_general(one, "no bars, no table")
-        one.set_defaults(command=call("study", "study"))
+            one.add_argument(flag, **_STUDY_OPTIONS[flag])
+        add_general_options(one, "no bars, no table")
+        one.set_defaults(command=lazy_command("study", "study"))
 
 
 def add_stress(commands: Any) -> None:
@@ -182,11 +195,11 @@ def add_stress(commands: Any) -> None:
         "--json", action=StoreOnce, metavar="FILE", help="rows with all numbers, kept after each; - for stdout"
     )
     to.add_argument("--resume", action="store_true", help="keep the rows that --json holds, of the same commit")
-    add_general(to, "no bars, no table: which rows failed, and the exit code")
-    to.set_defaults(command=call("stress", "stress"))
+    add_general_options(to, "no bars, no table: which rows failed, and the exit code")
+    to.set_defaults(command=lazy_command("stress", "stress"))
 
 
-def with_scene(words: Sequence[str]) -> list[str]:
+def insert_scene_command(words: Sequence[str]) -> list[str]:
     """Words of `warpfea study NAME`, with the placeholder of scenes inserted unless NAME is a study.
 
     Raises:
@@ -194,7 +207,7 @@ def with_scene(words: Sequence[str]) -> list[str]:
     """
     from ..builder.scene import names
 
-    if len(words) < 2 or words[0] != "study" or words[1].startswith("-") or words[1] in (*STUDIES, SCENE):
+    if len(words) < 2 or words[0] != "study" or words[1].startswith("-") or words[1] in (*STUDIES, SCENE_COMMAND):
         return list(words)
     scenes = names()
     if not pathlib.Path(words[1]).suffix and words[1] not in scenes:
@@ -202,7 +215,7 @@ def with_scene(words: Sequence[str]) -> list[str]:
             f"study {words[1]!r} is neither a study ({', '.join(STUDIES)}) nor a scene ({', '.join(scenes)}) nor a "
             f"file{did_you_mean(words[1], [*STUDIES, *scenes])}"
         )
-    return [words[0], SCENE, *words[1:]]
+    return [words[0], SCENE_COMMAND, *words[1:]]
 
 
 def add_profile(commands: Any, add_model: Callable[[argparse.ArgumentParser], None]) -> None:
@@ -218,9 +231,11 @@ def add_profile(commands: Any, add_model: Callable[[argparse.ArgumentParser], No
         epilog=PROFILE_EXAMPLES.replace("@PARTS@", parts),
     )
     add_model(to)
-    to.add_argument("--steps", type=count, default=10, metavar="N", help="steps that are timed, after 2 (default 10)")
+    to.add_argument(
+        "--steps", type=positive_integer, default=10, metavar="N", help="steps that are timed, after 2 (default 10)"
+    )
     out = to.add_argument_group("output (existing files are replaced once the new one is whole)")
     out.add_argument("--png", metavar="FILE", help="picture of the parts (pip install 'warpfea[plots]')")
     out.add_argument("--json", metavar="FILE", help="all numbers, with fixed keys; - for stdout")
-    add_general(to)
-    to.set_defaults(command=call("profile", "profile"))
+    add_general_options(to)
+    to.set_defaults(command=lazy_command("profile", "profile"))

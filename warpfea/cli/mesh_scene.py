@@ -19,28 +19,28 @@ from ..base.names import did_you_mean
 from ..builder.builder import ModelBuilder
 from ..builder.scene import Scene
 from ..model.bodies import Body
-from .arguments import existing, numbers
+from .arguments import existing_file, number_tuple
 from .parser import MATERIAL_HINT
 
-__all__ = ["OPTIONS", "mesh_facts", "mesh_scene", "parse_material"]
+__all__ = ["MESH_OPTIONS", "mesh_facts", "mesh_scene", "parse_material"]
 
-OPTIONS = ("material", "clamp", "traction", "pressure", "gravity", "scale", "up_axis", "quadrature")
-LAWS: dict[str, type[materials.Material]] = {
+MESH_OPTIONS = ("material", "clamp", "traction", "pressure", "gravity", "scale", "up_axis", "quadrature")
+LAW_CLASSES: dict[str, type[materials.Material]] = {
     "svk": materials.SVK,
     "mooney_rivlin": materials.MooneyRivlin,
     "neo_hookean": materials.NeoHookean,
 }
-DAMPING = ("eta", "lambda_v", "form")
+DAMPING_PARAMETERS = ("eta", "lambda_v", "form")
 
 
 def mesh_scene(options: argparse.Namespace) -> tuple[Scene[Any], dict[str, Any]]:
     """Scene of a mesh file, and the parameters of its summary. UsageError, ModelError, MeshError."""
-    path = existing(options.what)
+    path = existing_file(options.what)
     if options.set:
         raise UsageError(f"--set {options.set[0]}: a mesh file has no parameters; --set is for scenes")
     laws = [parse_material(text) for text in options.material]
-    tractions = [_load(text, "--traction", 3) for text in options.traction]
-    pressures = [_load(text, "--pressure", 1) for text in options.pressure]
+    tractions = [_parse_load(text, "--traction", 3) for text in options.traction]
+    pressures = [_parse_load(text, "--pressure", 1) for text in options.pressure]
     up = options.up_axis or "Z"
     gravity = options.gravity or ((0.0, 0.0, -9.81) if up == "Z" else (0.0, -9.81, 0.0))
 
@@ -59,12 +59,12 @@ def mesh_scene(options: argparse.Namespace) -> tuple[Scene[Any], dict[str, Any]]
         for group in dict.fromkeys(group for group, _ in tractions + pressures):
             b.add_probe(group, body.surface(group))
         if not tractions + pressures:
-            b.add_probe("all", _everywhere(body))
+            b.add_probe("all", _all_nodes(body))
         return b
 
     build.__name__ = path.stem
     build.__doc__ = f"The mesh {path.name}."
-    parameters = {name: getattr(options, name) for name in OPTIONS if name not in ("gravity", "up_axis", "scale")}
+    parameters = {name: getattr(options, name) for name in MESH_OPTIONS if name not in ("gravity", "up_axis", "scale")}
     parameters |= {"gravity": list(gravity), "up_axis": up, "scale": options.scale or 1.0}
     return Scene(build, dt=1e-3, t_end=0.5, speed=0.2), parameters
 
@@ -84,17 +84,17 @@ def mesh_facts(mesh: meshes.Mesh) -> dict[str, Any]:
     }
 
 
-def _everywhere(body: Body) -> Any:
+def _all_nodes(body: Body) -> Any:
     return body.nodes(body.mesh.used_nodes)
 
 
-def _load(text: str, option: str, size: int) -> tuple[str, tuple[float, ...]]:
+def _parse_load(text: str, option: str, size: int) -> tuple[str, tuple[float, ...]]:
     """Group and values of `GROUP:values`."""
     group, colon, values = text.rpartition(":")
     if not (colon and group):
         raise UsageError(f"{option} {text}: expected GROUP:{'x,y,z' if size == 3 else 'p'}")
     try:
-        return group, numbers(values, size)
+        return group, number_tuple(values, size)
     except argparse.ArgumentTypeError as error:
         raise UsageError(f"{option} {text}: {error}") from None
 
@@ -126,10 +126,10 @@ def parse_material(text: str) -> tuple[str, materials.Material]:
     where = f"--material {text}"
     head, colon, tail = text.partition(":")
     group, _, name = head.rpartition("=")
-    if not colon or name not in LAWS:
-        hint = did_you_mean(name, LAWS)
+    if not colon or name not in LAW_CLASSES:
+        hint = did_you_mean(name, LAW_CLASSES)
         raise UsageError(
-            f"{where}: expected [GROUP=]LAW:NAME=VALUE,... with LAW one of {', '.join(LAWS)}, such as "
+            f"{where}: expected [GROUP=]LAW:NAME=VALUE,... with LAW one of {', '.join(LAW_CLASSES)}, such as "
             f"svk:E=2.1e11,nu=0.3,density=7850{hint}"
         )
     values: dict[str, Any] = {}
@@ -140,41 +140,43 @@ def parse_material(text: str) -> tuple[str, materials.Material]:
         key, value = match.groups()
         if key in values:
             raise UsageError(f"{where}: {key} is given twice")
-        values[key] = value if key == "form" else _number(where, key, value)
-    damping = {key: values.pop(key) for key in DAMPING if key in values}
-    make = _maker(where, LAWS[name], values)
+        values[key] = value if key == "form" else _parse_number(where, key, value)
+    damping = {key: values.pop(key) for key in DAMPING_PARAMETERS if key in values}
+    make = _law_constructor(where, LAW_CLASSES[name], values)
     try:
-        return group, make(**values, damping=materials.KelvinVoigt(**_damping(where, damping)) if damping else None)
+        return group, make(
+            **values, damping=materials.KelvinVoigt(**_check_damping(where, damping)) if damping else None
+        )
     except Error as error:
         raise UsageError(f"{where}: {error}") from None
 
 
-def _hint(text: str) -> str:
+def _number_hint(text: str) -> str:
     """Hint for a text that is not a number."""
     return "; commas stand between the values" if ";" in text else number_hint(text)
 
 
-def _number(where: str, key: str, text: str) -> float:
+def _parse_number(where: str, key: str, text: str) -> float:
     try:
         value = float(text)
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise UsageError(f"{where}: {key} = {text!r} is not a finite number{_hint(text)}")
+        raise UsageError(f"{where}: {key} = {text!r} is not a finite number{_number_hint(text)}")
     return value
 
 
-def _damping(where: str, values: dict[str, Any]) -> dict[str, Any]:
+def _check_damping(where: str, values: dict[str, Any]) -> dict[str, Any]:
     if "eta" not in values:
         raise UsageError(f"{where}: damping needs eta=")
     return values
 
 
-def _maker(where: str, law: Any, values: dict[str, Any]) -> Callable[..., materials.Material]:
+def _law_constructor(where: str, law: Any, values: dict[str, Any]) -> Callable[..., materials.Material]:
     """Constructor for these names: the law's own, or from_E_nu."""
     makers = [law, law.from_E_nu]
     wanted: list[str] = []
-    known = [*DAMPING]
+    known = [*DAMPING_PARAMETERS]
     for make in makers:
         names = [n for n in inspect.signature(make).parameters if n != "damping"]
         needed = [n for n in names if n not in ("ratio", "density")]  # a missing density is reported by the model

@@ -8,13 +8,13 @@ from ..base.errors import UsageError
 
 __all__ = ["MOVED", "refuse_moved"]
 
-STUDIES = (
+MOVED_STUDIES = (
     "ancf", "conservation", "contact", "contact-integrators", "devices", "floor", "joints", "mechanisms", "precision",
     "spinning",
 )  # fmt: skip
-KINDS = {"cpu": "cpu", "scenes": "scene_costs", "contact": "contact_cost", "price": "price"}
-MOVED: dict[tuple[str, str], str | None] = {("study", name): name.replace("-", "_") for name in STUDIES}
-MOVED |= {("bench", f"--{kind}"): table for kind, table in KINDS.items()}
+MOVED_BENCH_KINDS = {"cpu": "cpu", "scenes": "scene_costs", "contact": "contact_cost", "price": "price"}
+MOVED: dict[tuple[str, str], str | None] = {("study", name): name.replace("-", "_") for name in MOVED_STUDIES}
+MOVED |= {("bench", f"--{kind}"): table for kind, table in MOVED_BENCH_KINDS.items()}
 MOVED |= {("study", name): None for name in ("adaptive", "ancf-tets", "peer-meshes")}
 MOVED |= {("bench", f"--{kind}"): None for kind in ("growth", "pairs", "product")}
 """Command and word -> table; None: none makes its files today."""

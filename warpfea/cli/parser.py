@@ -14,18 +14,18 @@ from ..solvers import SOLVERS
 from .arguments import (
     Parser,
     StoreOnce,
-    add_general,
-    call,
+    add_general_options,
     color_range,
-    count,
+    lazy_command,
     load_steps,
-    pair,
-    positive,
+    number_pair,
+    positive_integer,
+    positive_number,
     size,
     step_size,
     vector,
 )
-from .measuring import add_bench, add_profile, add_stress, add_study, with_scene
+from .measuring import add_bench, add_profile, add_stress, add_study, insert_scene_command
 from .moved import refuse_moved
 
 __all__ = ["parse"]
@@ -72,7 +72,7 @@ A scene file is Python:
 """
 
 
-LATER = {
+LATER_COMMANDS = {
     "sweep": "a sweep over parameters on many devices",
 }
 """Commands of a later version: not offered, but refused with an explanation."""
@@ -97,11 +97,11 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     add_bench(commands)
     add_study(commands)
     add_stress(commands)
-    add_profile(commands, _add_model)
-    if words and words[0] in LATER:
-        raise UsageError(f"{words[0]}: {LATER[words[0]]} is not part of this version")
+    add_profile(commands, _add_model_options)
+    if words and words[0] in LATER_COMMANDS:
+        raise UsageError(f"{words[0]}: {LATER_COMMANDS[words[0]]} is not part of this version")
     refuse_moved(words)
-    arguments, rest = top.parse_known_args(_join_negative(with_scene(words)))
+    arguments, rest = top.parse_known_args(_join_negative_vectors(insert_scene_command(words)))
     if rest:
         known = commands.choices[words[0]]._option_string_actions if words[0] in commands.choices else ()
         hint = did_you_mean(rest[0].partition("=")[0], known) if rest[0].startswith("-") else ""
@@ -114,7 +114,7 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     return arguments
 
 
-def _join_negative(words: Sequence[str]) -> list[str]:
+def _join_negative_vectors(words: Sequence[str]) -> list[str]:
     """`--gravity -1,0,0` as `--gravity=-1,0,0`: argparse treats words that begin with - as options."""
     out: list[str] = []
     for word in words:
@@ -125,7 +125,7 @@ def _join_negative(words: Sequence[str]) -> list[str]:
     return out
 
 
-def _add_model(to: argparse.ArgumentParser) -> None:
+def _add_model_options(to: argparse.ArgumentParser) -> None:
     """Model and solver options common to run and info."""
     to.add_argument("what", metavar="SCENE", help="a scene, file.py or file.py:scene, or a mesh (.msh, .vtu, .inp)")
     to.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="set a parameter of the scene")
@@ -141,7 +141,7 @@ def _add_model(to: argparse.ArgumentParser) -> None:
         "--pressure", action="append", default=[], metavar="GROUP:p", help="follower pressure on a surface, Pa"
     )
     mesh.add_argument("--gravity", type=vector, metavar="x,y,z", help="m/s^2, by default 9.81 downwards")
-    mesh.add_argument("--scale", type=positive, metavar="S", help="metres per unit of the file, 1e-3 for mm")
+    mesh.add_argument("--scale", type=positive_number, metavar="S", help="metres per unit of the file, 1e-3 for mm")
     mesh.add_argument("--up-axis", choices=("Y", "Z"), help="by default Z")
     mesh.add_argument(
         "--quadrature", metavar="RULE", help="force rule: tet4, tet5_paper, tet8, tet14 (T10), tet1, tet4 (T4)"
@@ -150,7 +150,9 @@ def _add_model(to: argparse.ArgumentParser) -> None:
     how.add_argument("--device", help="cpu, cuda:0, ...; by default CUDA where there is one")
     how.add_argument("--dtype", choices=("float64", "float32"), help="precision, by default float64")
     how.add_argument("--dt", type=step_size, metavar="S", help="step, s; auto: as --error asks for")
-    how.add_argument("--error", type=positive, metavar="X", help="of --dt auto: of positions, over the model's size")
+    how.add_argument(
+        "--error", type=positive_number, metavar="X", help="of --dt auto: of positions, over the model's size"
+    )
     how.add_argument(
         "--integrator",
         metavar="NAME",
@@ -163,7 +165,7 @@ def _add_model(to: argparse.ArgumentParser) -> None:
         default="newton-pcg",
         help="of a step, by default newton-pcg; jacobi: few cheap iterations, what is left is told; direct: SuperLU",
     )
-    how.add_argument("--tol", type=positive, metavar="X", help="relative residual at which a step is accepted")
+    how.add_argument("--tol", type=positive_number, metavar="X", help="relative residual at which a step is accepted")
     how.add_argument(
         "--inversion",
         choices=("refuse", "report"),
@@ -185,8 +187,8 @@ def _add_run(commands: Any) -> None:
         description="Simulate a scene, your own scene file, or a mesh.",
         epilog=RUN_EXAMPLES,
     )
-    _add_model(to)
-    to.add_argument("--t-end", type=positive, metavar="S", help="end time, s (default: the scene's)")
+    _add_model_options(to)
+    to.add_argument("--t-end", type=positive_number, metavar="S", help="end time, s (default: the scene's)")
     to.add_argument("--static", action="store_true", help="static equilibrium in place of a motion")
     to.add_argument(
         "--load-steps",
@@ -215,9 +217,9 @@ def _add_run(commands: Any) -> None:
     out.add_argument("--png", action=StoreOnce, metavar="FILE", help="picture")
     out.add_argument("--png-time", type=float, metavar="S", help="time of the picture")
     out.add_argument("--gif", action=StoreOnce, metavar="FILE", help="animation")
-    _add_look(out)
-    out.add_argument("--fps", type=positive, metavar="N", help="frames per simulated second of --usd and --vtu")
-    out.add_argument("--speed", type=positive, metavar="X", help="simulated seconds per second of --gif")
+    _add_picture_options(out)
+    out.add_argument("--fps", type=positive_number, metavar="N", help="frames per simulated second of --usd and --vtu")
+    out.add_argument("--speed", type=positive_number, metavar="X", help="simulated seconds per second of --gif")
     out.add_argument("--json", action=StoreOnce, metavar="FILE", help="summary of the run; - for stdout")
     out.add_argument(
         "--checkpoint",
@@ -225,33 +227,33 @@ def _add_run(commands: Any) -> None:
         metavar="FILE",
         help="state (.npz), written every --every steps and at the end",
     )
-    out.add_argument("--every", type=count, metavar="N", help="steps between checkpoints (default 100)")
+    out.add_argument("--every", type=positive_integer, metavar="N", help="steps between checkpoints (default 100)")
     out.add_argument(
         "--resume",
         metavar="FILE",
         help="go on from a checkpoint, with its integrator and precision, and without --dt its dt; a file of --usd or "
         "a series of --vtu that is there goes on too, if it ends where the checkpoint is",
     )
-    add_general(to)
-    to.set_defaults(command=call("run", "run"))
+    add_general_options(to)
+    to.set_defaults(command=lazy_command("run", "run"))
 
 
-def _add_look(to: Any) -> None:
+def _add_picture_options(to: Any) -> None:
     """Options of pictures."""
     to.add_argument(
         "--field",
         metavar="NAME",
         help="field in colour: von_mises (default), displacement, contact_pressure, gap, or none",
     )
-    to.add_argument("--view", type=pair, metavar="AZIMUTH,ELEVATION", help="of the camera, degrees")
+    to.add_argument("--view", type=number_pair, metavar="AZIMUTH,ELEVATION", help="of the camera, degrees")
     to.add_argument("--range", type=color_range, metavar="LOW,HIGH", help="of the colours, SI units")
 
 
 def _add_scenes(commands: Any) -> None:
     to = commands.add_parser("scenes", help="list scenes, or the parameters of one", description="List scenes.")
     to.add_argument("what", nargs="?", metavar="SCENE", help="a scene, file.py or file.py:scene: show its parameters")
-    add_general(to)
-    to.set_defaults(command=call("show", "scenes"))
+    add_general_options(to)
+    to.set_defaults(command=lazy_command("show", "scenes"))
 
 
 def _add_info(commands: Any) -> None:
@@ -261,10 +263,10 @@ def _add_info(commands: Any) -> None:
         description="What a scene uses and what was left out, with counts, bytes, kernels and launches per step. "
         "Of a mesh its groups and size, with --material also what it costs.",
     )
-    _add_model(to)
+    _add_model_options(to)
     to.add_argument("--json", metavar="FILE", help="the same as JSON; - for stdout")
-    add_general(to)
-    to.set_defaults(command=call("show", "info"))
+    add_general_options(to)
+    to.set_defaults(command=lazy_command("show", "info"))
 
 
 def _add_render(commands: Any) -> None:
@@ -278,9 +280,13 @@ def _add_render(commands: Any) -> None:
     to.add_argument("file", help="the USD file")
     to.add_argument("-o", "--output", required=True, metavar="FILE", help="picture (.png) or animation (.gif)")
     to.add_argument("--time", type=float, metavar="S", help="time of a .png (default: the last)")
-    _add_look(to)
+    _add_picture_options(to)
     to.add_argument("--size", type=size, metavar="WxH", help="pixels")
-    to.add_argument("--fps", type=positive, default=20.0, metavar="N", help="frames per second of a .gif (default 20)")
-    to.add_argument("--speed", type=positive, default=1.0, metavar="X", help="simulated seconds per second of a .gif")
-    add_general(to)
-    to.set_defaults(command=call("show", "render"))
+    to.add_argument(
+        "--fps", type=positive_number, default=20.0, metavar="N", help="frames per second of a .gif (default 20)"
+    )
+    to.add_argument(
+        "--speed", type=positive_number, default=1.0, metavar="X", help="simulated seconds per second of a .gif"
+    )
+    add_general_options(to)
+    to.set_defaults(command=lazy_command("show", "render"))

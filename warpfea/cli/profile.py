@@ -16,12 +16,12 @@ from ..studies.profile.profiling import WARM_UP_STEPS, KernelTime, Profile
 from ..studies.profile.profiling import profile as measure
 from . import DONE
 from .run import check_targets
-from .source import Source, progress, resolve
+from .source import Source, resolve, show_progress
 
-__all__ = ["KEYS", "SCHEMA", "profile"]
+__all__ = ["JSON_KEYS", "SCHEMA", "profile"]
 
 SCHEMA = 1
-KEYS = (
+JSON_KEYS = (
     "schema",
     "scene",
     "parameters",
@@ -48,7 +48,7 @@ KEYS = (
     "machine",
     "versions",
 )
-SHOWN = 15
+MAX_KERNEL_ROWS = 15
 """Maximum number of kernels listed one by one."""
 
 
@@ -63,7 +63,7 @@ def profile(options: argparse.Namespace) -> int:
 
     source = resolve(options)
     with quiet_warp():
-        show = progress(options)
+        show = show_progress(options)
         sim = source.simulation(source.model(), show)
         total, hide = WARM_UP_STEPS + 1 + 2 * options.steps, None if show is None else not show
         with tqdm(desc="profile", unit="step", total=total, leave=False, disable=hide, file=sys.stderr) as bar:
@@ -78,7 +78,7 @@ def profile(options: argparse.Namespace) -> int:
         title += f"{content['step_ms']['median']:.3g} ms per step"
         write_whole(pathlib.Path(options.png), lambda path: draw(found, title, path))
     if not options.quiet and options.json != "-":
-        print(_human(content, found, [name for name in (options.png, options.json) if name]), flush=True)
+        print(_profile_text(content, found, [name for name in (options.png, options.json) if name]), flush=True)
     return DONE
 
 
@@ -112,16 +112,16 @@ def _content(source: Source, sim: Simulation, found: Profile) -> dict[str, Any]:
         "copy_GBps": found.copy_GBps,
         "empty_launch_us": found.empty_launch_us,
         "compile_s": sim.compile_s,
-        "parts": {name: _row(k, found) for name, k in found.parts.items()},
-        "kernels": [{"part": k.part, "kernel": k.kernel} | _row(k, found) for k in found.kernels],
+        "parts": {name: _row_content(k, found) for name, k in found.parts.items()},
+        "kernels": [{"part": k.part, "kernel": k.kernel} | _row_content(k, found) for k in found.kernels],
         "machine": machine(str(sim.model.device)),
         "versions": versions(),
     }
-    assert tuple(content) == KEYS
+    assert tuple(content) == JSON_KEYS
     return {name: to_json(value) for name, value in content.items()}
 
 
-def _row(k: KernelTime, found: Profile) -> dict[str, float | None]:
+def _row_content(k: KernelTime, found: Profile) -> dict[str, float | None]:
     """The numbers of a part or a kernel, per step."""
     return {
         "ms": k.ms,
@@ -133,7 +133,7 @@ def _row(k: KernelTime, found: Profile) -> dict[str, float | None]:
     }
 
 
-def _human(c: dict[str, Any], found: Profile, wrote: list[str]) -> str:
+def _profile_text(c: dict[str, Any], found: Profile, wrote: list[str]) -> str:
     """The profile as tables."""
     step, of_step = c["step_ms"], c["step_ms"]["mean"]
     rows = [
@@ -152,15 +152,15 @@ def _human(c: dict[str, Any], found: Profile, wrote: list[str]) -> str:
         ],
         ["copy", f"{number(c['copy_GBps'], 3)} GB/s, read and written, for a large array"],
     ]
-    parts = [["part", *HEADER, ""]]
+    parts = [["part", *TABLE_HEADER, ""]]
     parts += [[name, *_cells(k, found), found.about.get(name, "")] for name, k in found.parts.items()]
     gap, share = found.between_ms, 100.0 * found.between_ms / found.total_ms
     cells = [number(gap, 3), f"{share:.1f} %"] if gap > 0.0 else ["-", "-"]
     parts.append(["between", *cells, "", "", "", "", BETWEEN_NOTE])
-    kernels = [[*HEADER, "part", "kernel"]]
-    kernels += [[*_cells(k, found), k.part, k.kernel] for k in found.kernels[:SHOWN]]
+    kernels = [[*TABLE_HEADER, "part", "kernel"]]
+    kernels += [[*_cells(k, found), k.part, k.kernel] for k in found.kernels[:MAX_KERNEL_ROWS]]
     lines = [table(rows), "", table(parts, right=range(1, 7)), "", table(kernels, right=range(6))]
-    rest = found.kernels[SHOWN:]
+    rest = found.kernels[MAX_KERNEL_ROWS:]
     if rest:
         lines.append(f"and {len(rest)} more, {number(sum(k.ms for k in rest), 2)} ms together (--json lists them)")
     notes = []
@@ -176,7 +176,7 @@ def _human(c: dict[str, Any], found: Profile, wrote: list[str]) -> str:
 
 
 BETWEEN_NOTE = "starting of kernels, conditions of loops, reading of the report"
-HEADER = ("ms/step", "share", "launches", "MB/step", "GB/s", "of copy")
+TABLE_HEADER = ("ms/step", "share", "launches", "MB/step", "GB/s", "of copy")
 
 
 def _cells(k: KernelTime, found: Profile) -> list[str]:

@@ -22,12 +22,12 @@ from ..simulation.run_loop import interruptible
 from ..simulation.simulation import Simulation
 from ..simulation.statics import run_static
 from . import DONE
-from .source import Source, progress, resolve
-from .summary import human, summarize
+from .source import Source, resolve, show_progress
+from .summary import summarize, summary_text
 
 __all__ = ["run"]
 
-TARGETS: dict[str, Sequence[str]] = {
+OUTPUT_SUFFIXES: dict[str, Sequence[str]] = {
     "usd": (".usdc", ".usda", ".usd"),
     "png": (".png",),
     "gif": (".gif",),
@@ -44,19 +44,19 @@ STATIC_SPEED = 0.5
 def run(options: argparse.Namespace) -> int:
     """Run `warpfea run`."""
     check_targets(options)
-    _check_kind(options)
-    _check_look(options)
+    _check_analysis(options)
+    _check_output_options(options)
     saved = read_meta(options.resume) if options.resume else None
     began = clock.perf_counter()
     source = resolve(options, saved)
     t_end = options.t_end or source.scene.t_end
     _check_times(options, source, t_end)
     outputs = make_outputs(options, source, t_end)
-    before = {file: _file_stamp(file) for file in _files(options).values()}
+    before = {file: _file_stamp(file) for file in _output_files(options).values()}
     with quiet_warp():
         model = source.model()
         _check_field(options.field, model)
-        sim = source.simulation(model, progress(options))
+        sim = source.simulation(model, show_progress(options))
         if options.resume:
             load_checkpoint(sim, options.resume)
             now = float(sim.time.max())
@@ -67,9 +67,9 @@ def run(options: argparse.Namespace) -> int:
         try:
             if options.static:
                 unstable = options.unstable or "warn"
-                run_static(sim, outputs=outputs, progress=progress(options), unstable=unstable)
+                run_static(sim, outputs=outputs, progress=show_progress(options), unstable=unstable)
             else:
-                sim.run(t_end, outputs=outputs, progress=progress(options))
+                sim.run(t_end, outputs=outputs, progress=show_progress(options))
             status = "done"
         except (ConvergenceError, ConstraintError) as error:
             status = "unstable" if isinstance(error, StabilityError) else "not converged"
@@ -83,11 +83,13 @@ def run(options: argparse.Namespace) -> int:
         finally:
             with interruptible():  # only the report remains: Ctrl-C must not discard it
                 wall_s = clock.perf_counter() - began
-                _report(options, sim, summarize(source, sim, status=status, wall_s=wall_s, setup_s=setup_s), before)
+                _report_summary(
+                    options, sim, summarize(source, sim, status=status, wall_s=wall_s, setup_s=setup_s), before
+                )
     return DONE
 
 
-def _report(
+def _report_summary(
     options: argparse.Namespace, sim: Simulation, summary: dict[str, Any], before: dict[pathlib.Path, Any]
 ) -> None:
     """Write and print the summary. A failing output here does not hide the error that ended the run.
@@ -101,13 +103,13 @@ def _report(
             if summary["status"] == "done":
                 raise
     if not options.quiet and options.json != "-":
-        print(human(summary, sim, _written(options, before)))
+        print(summary_text(summary, sim, _written_files(options, before)))
         sys.stdout.flush()
 
 
 def check_targets(options: argparse.Namespace) -> None:
     """Before any work: UsageError for a wrong suffix, OutputError for a missing or read-only folder."""
-    for name, suffixes in TARGETS.items():
+    for name, suffixes in OUTPUT_SUFFIXES.items():
         value = getattr(options, name, None)
         if value is None or (name == "json" and value == "-"):
             continue
@@ -124,7 +126,7 @@ def check_targets(options: argparse.Namespace) -> None:
 MOTION_ONLY = ("t_end", "dt", "error", "integrator", "png_time", "checkpoint", "resume")
 
 
-def _check_kind(options: argparse.Namespace) -> None:
+def _check_analysis(options: argparse.Namespace) -> None:
     """UsageError for options of dynamics with --static, or the reverse."""
     if not options.static:
         if options.load_steps:
@@ -153,7 +155,7 @@ OPTION_OUTPUTS = {
 """Purpose of an option, and the outputs of which one must be given."""
 
 
-def _check_look(options: argparse.Namespace) -> None:
+def _check_output_options(options: argparse.Namespace) -> None:
     """UsageError for options of missing outputs, and for outputs that can't be extended after --resume."""
     for name, (what, uses) in OPTION_OUTPUTS.items():
         if getattr(options, name) is not None and not any(getattr(options, use) for use in uses):
@@ -188,9 +190,9 @@ def make_outputs(options: argparse.Namespace, source: Source, t_end: float) -> l
     fps = options.fps or source.scene.fps
     extend = options.resume is not None
     field = None if options.field == "none" else options.field or "von_mises"
-    look: dict[str, Any] = {"field": field, "color_range": options.range}
+    picture_options: dict[str, Any] = {"field": field, "color_range": options.range}
     if options.view:
-        look["view"] = options.view
+        picture_options["view"] = options.view
     if options.static:
         fps = max(fps, 2.0 * (options.load_steps or 10))  # a frame per load step
     if options.usd:
@@ -207,18 +209,18 @@ def make_outputs(options: argparse.Namespace, source: Source, t_end: float) -> l
         time = source.scene.picture if options.png_time is None else options.png_time
         if options.static or (time is not None and time > t_end):
             time = None
-        out.append(PNGWriter(options.png, time=time, **look))
+        out.append(PNGWriter(options.png, time=time, **picture_options))
     if options.gif:
         from ..outputs.render import GIFWriter
 
         speed = options.speed or (STATIC_SPEED if options.static else source.scene.speed)
-        out.append(GIFWriter(options.gif, speed=speed, progress=progress(options), **look))
+        out.append(GIFWriter(options.gif, speed=speed, progress=show_progress(options), **picture_options))
     if options.checkpoint:
         out.append(Checkpoint(options.checkpoint, every=options.every or CHECKPOINT_STEPS))
     return out
 
 
-def _files(options: argparse.Namespace) -> dict[str, pathlib.Path]:
+def _output_files(options: argparse.Namespace) -> dict[str, pathlib.Path]:
     """File that proves an output was written, by option; of a series its index."""
     names = ("usd", "vtu", "png", "gif", "checkpoint", "json")
     files = {name: pathlib.Path(getattr(options, name)) for name in names if getattr(options, name) not in (None, "-")}
@@ -236,11 +238,11 @@ def _file_stamp(file: pathlib.Path) -> tuple[int, int] | None:
     return stat.st_ino, stat.st_mtime_ns
 
 
-def _written(options: argparse.Namespace, before: dict[pathlib.Path, Any]) -> list[str]:
+def _written_files(options: argparse.Namespace, before: dict[pathlib.Path, Any]) -> list[str]:
     """Outputs written by this run, with their properties; `before`: file identities before it."""
     notes: dict[str, Any] = {"usd": "validated, for usdview, Blender, Omniverse", "vtu": "for ParaView"}
     texts = []
-    for name, file in _files(options).items():
+    for name, file in _output_files(options).items():
         if _file_stamp(file) not in (None, before[file]):
             texts.append(f"{getattr(options, name)}" + (f"  ({notes[name]})" if name in notes else ""))
     return texts

@@ -12,11 +12,11 @@ from ..base.console import number, quiet_warp, size, table, to_json, write_json
 from ..base.errors import UsageError
 from ..builder.scene import Scene, find, names
 from . import DONE
-from .arguments import existing
+from .arguments import existing_file
 from .mesh_scene import mesh_facts
 from .parser import MATERIAL_HINT
 from .run import check_targets
-from .source import find_scene, is_mesh, load, progress, resolve
+from .source import find_scene, is_mesh, load_scenes, resolve, show_progress
 from .summary import MAX_ROWS, box_text, mass_text, model_box
 
 __all__ = ["info", "render", "scenes"]
@@ -28,9 +28,9 @@ def scenes(options: argparse.Namespace) -> int:
     if what is None:
         found = [find(name) for name in names()]
     elif what.endswith(".py"):
-        found = list(load(what).values())
+        found = list(load_scenes(what).values())
     else:
-        print(_one_scene(find_scene(what)))
+        print(_scene_text(find_scene(what)))
         return DONE
     rows = [["scene", "dt", "t_end", ""]]
     rows += [[s.name, f"{number(s.dt, 3)} s", f"{number(s.t_end, 3)} s", s.description] for s in found]
@@ -41,7 +41,7 @@ def scenes(options: argparse.Namespace) -> int:
     return DONE
 
 
-def _one_scene(found: Scene[Any]) -> str:
+def _scene_text(found: Scene[Any]) -> str:
     """Description and parameters of a scene."""
     parts = [found.description]
     if found.details:
@@ -64,7 +64,7 @@ def info(options: argparse.Namespace) -> int:
     source = resolve(options)
     with quiet_warp():
         model = source.model()
-        sim = source.simulation(model, progress(options))
+        sim = source.simulation(model, show_progress(options))
         launcher = sim.stepper.launch
         content = {"scene": source.label, "parameters": source.parameters} | sim.info()
         content |= {"bounding_box": model_box(model)}
@@ -84,7 +84,7 @@ def info(options: argparse.Namespace) -> int:
 
 def _mesh_info(options: argparse.Namespace) -> int:
     """Contents of a mesh file, without a material."""
-    facts = mesh_facts(meshes.read(existing(options.what), scale=options.scale or 1.0))
+    facts = mesh_facts(meshes.read(existing_file(options.what), scale=options.scale or 1.0))
     if options.json:
         write_json(options.json, to_json({"scene": options.what, "mesh": facts}))
     if options.json != "-":
@@ -134,11 +134,11 @@ def _info_table(content: dict[str, Any]) -> str:
     text = ", ".join(f"{key} {size(count)}" for key, count in groups.items())
     rows.append(["memory", f"{size(sum(groups.values()))} ({text}), {c['bytes_per_unknown']:.0f} B per unknown"])
     rows.append(["a step", f"{c['launches']} launches recorded, of {len(c['kernels'])} kernels:"])
-    of_module: dict[str, list[str]] = {}
+    by_module: dict[str, list[str]] = {}
     for name in c["kernels"]:
         module, _, kernel = name.rpartition(".")
-        of_module.setdefault(module, []).append(kernel)
-    rows += [["", f"{module}: {', '.join(kernels)}"] for module, kernels in of_module.items()]
+        by_module.setdefault(module, []).append(kernel)
+    rows += [["", f"{module}: {', '.join(kernels)}"] for module, kernels in by_module.items()]
     return table(rows)
 
 
@@ -151,12 +151,12 @@ def _body_rows(bodies: list[dict[str, Any]]) -> list[list[str]]:
         texts[body["name"]] = what
     if len(bodies) <= MAX_ROWS:
         return [[f"body {name}", what] for name, what in texts.items()]
-    alike: dict[str, list[str]] = {}
+    names_by_text: dict[str, list[str]] = {}
     for name, what in texts.items():
-        alike.setdefault(what, []).append(name)
+        names_by_text.setdefault(what, []).append(name)
     return [
         [f"body {names[0]}", what] if len(names) == 1 else [f"{len(names)} bodies", f"{what} each"]
-        for what, names in alike.items()
+        for what, names in names_by_text.items()
     ]
 
 
@@ -170,7 +170,7 @@ def _joint_rows(joints: list[dict[str, Any]]) -> list[list[str]]:
     return [["joints", ", ".join(f"{len(n)} {kind} ({sum(n)} equations)" for kind, n in counts.items())]]
 
 
-def _bodies(c: dict[str, Any]) -> str:
+def _contact_bodies_text(c: dict[str, Any]) -> str:
     """Bodies and colliders in contact."""
     return f"body {c['body']} on {c['collider'] if 'collider' in c else 'body ' + c['with']}"
 
@@ -179,20 +179,20 @@ def _contact_rows(contacts: list[dict[str, Any]]) -> list[list[str]]:
     """A row for each contact; a count for many."""
     if len(contacts) > MAX_ROWS:
         left = sum(c["left_out"] for c in contacts)
-        return [["contacts", f"{len(contacts)}, {sum(c['points'] for c in contacts)} points{_clamped(left)}"]]
+        return [["contacts", f"{len(contacts)}, {sum(c['points'] for c in contacts)} points{_left_out_text(left)}"]]
     return [
-        [f"contact {c['name']}", f"{_bodies(c)}{_triangles(c)}, law {c['law']}, {c['model']}, "
-         f"{c['points']} points{_clamped(c['left_out'])}"]
+        [f"contact {c['name']}", f"{_contact_bodies_text(c)}{_triangles_text(c)}, law {c['law']}, {c['model']}, "
+         f"{c['points']} points{_left_out_text(c['left_out'])}"]
         for c in contacts
     ]  # fmt: skip
 
 
-def _triangles(contact: dict[str, Any]) -> str:
+def _triangles_text(contact: dict[str, Any]) -> str:
     """Text of a mesh collider."""
     return f" ({contact['triangles']} triangles)" if "triangles" in contact else ""
 
 
-def _clamped(count: int) -> str:
+def _left_out_text(count: int) -> str:
     """Text of unused points."""
     return f", {count} clamped ones left out" if count else ""
 
@@ -204,7 +204,7 @@ def render(options: argparse.Namespace) -> int:
     suffix = pathlib.Path(options.output).suffix.lower()
     if suffix not in (".png", ".gif"):
         raise UsageError(f"--output {options.output}: the file name must end in .png or .gif")
-    source = existing(options.file)
+    source = existing_file(options.file)
     extra: dict[str, Any] = {"color_range": options.range}
     if options.view:
         extra["view"] = options.view
@@ -217,7 +217,7 @@ def render(options: argparse.Namespace) -> int:
             speed=options.speed,
             field=options.field,
             time=options.time,
-            progress=progress(options),
+            progress=show_progress(options),
             **extra,
         )
     if not options.quiet:

@@ -15,12 +15,12 @@ from ..model.model import Model
 from ..simulation.simulation import Simulation
 from ..simulation.statics import begin_static
 from ..solvers import SOLVERS
-from .arguments import existing
-from .mesh_scene import OPTIONS, mesh_scene
+from .arguments import existing_file
+from .mesh_scene import MESH_OPTIONS, mesh_scene
 
-__all__ = ["Source", "find_scene", "is_mesh", "load", "progress", "resolve"]
+__all__ = ["Source", "find_scene", "is_mesh", "load_scenes", "resolve", "show_progress"]
 
-SURFACES = (".stl", ".obj", ".ply", ".off", ".step", ".stp", ".iges", ".igs", ".brep", ".geo", ".3mf")
+SURFACE_SUFFIXES = (".stl", ".obj", ".ply", ".off", ".step", ".stp", ".iges", ".igs", ".brep", ".geo", ".3mf")
 """Formats of surfaces and shapes, without elements."""
 
 
@@ -83,7 +83,7 @@ class Source:
             )
 
 
-def progress(options: argparse.Namespace) -> bool | None:
+def show_progress(options: argparse.Namespace) -> bool | None:
     """True to show bars; None: if stderr is a terminal."""
     return False if options.quiet or options.no_progress else None
 
@@ -93,10 +93,10 @@ def is_mesh(what: str) -> bool:
     return pathlib.Path(what).suffix.lower() in FORMATS
 
 
-def load(file: str) -> dict[str, Scene[Any]]:
+def load_scenes(file: str) -> dict[str, Scene[Any]]:
     """The scenes of a file by name; an error in it is a ModelError with file and line."""
     # absolute: Python stores the file's code under that path, so tracebacks show its lines
-    return load_file(existing(file).absolute())
+    return load_file(existing_file(file).absolute())
 
 
 def find_scene(what: str) -> Scene[Any]:
@@ -105,7 +105,7 @@ def find_scene(what: str) -> Scene[Any]:
     if file is None:
         _check_suffix(what)
     else:
-        existing(file)
+        existing_file(file)
     return locate(what)
 
 
@@ -116,7 +116,7 @@ def _check_suffix(what: str) -> None:
         return
     formats = ", ".join(f"{end} ({name})" for end, name in FORMATS.items())
     text = f"{what}: unsupported file type {suffix}: neither a scene (.py) nor a mesh ({formats})"
-    if suffix.lower() in SURFACES:
+    if suffix.lower() in SURFACE_SUFFIXES:
         text += f"; {suffix} describes a surface or a shape, not elements: fill it with tetrahedra, in Gmsh for example"
     raise UsageError(text)
 
@@ -128,7 +128,7 @@ def resolve(options: argparse.Namespace, checkpoint: dict[str, Any] | None = Non
         found, parameters = mesh_scene(options)
         values: dict[str, Any] = {}
     else:
-        given = [name for name in OPTIONS if getattr(options, name)]
+        given = [name for name in MESH_OPTIONS if getattr(options, name)]
         found = find_scene(options.what)
         if given:
             raise UsageError(f"--{given[0].replace('_', '-')} is for mesh files; {options.what} is a scene, use --set")

@@ -10,11 +10,11 @@ from ..studies.accuracy.options import StudyOptions
 from ..studies.accuracy.settings import parse_over
 from ..studies.accuracy.study import study as measure
 from . import DONE, NOT_CONVERGED
-from .source import find_scene, progress
+from .source import find_scene, show_progress
 
 __all__ = ["accuracy", "study"]
 
-SAME = ("reference", "mesh", "measure", "target", "split", "repeat", "limit", "out", "name", "what", "words")
+SHARED_OPTIONS = ("reference", "mesh", "measure", "target", "split", "repeat", "limit", "out", "name", "what", "words")
 """Fields of StudyOptions that are options of the command line."""
 
 
@@ -43,7 +43,9 @@ def accuracy(options: argparse.Namespace) -> int:
         dtype=options.dtype,
         device=options.device,
         probes=options.probe,
-        options=StudyOptions(finer=finer, progress=progress(options), **{k: getattr(options, k) for k in SAME}),
+        options=StudyOptions(
+            finer=finer, progress=show_progress(options), **{k: getattr(options, k) for k in SHARED_OPTIONS}
+        ),
     )
     if not options.quiet:
         print(result.table(), flush=True)

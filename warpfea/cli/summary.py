@@ -17,10 +17,10 @@ from ..simulation.simulation import Simulation
 from ..solvers import Jacobi
 from .source import Source
 
-__all__ = ["KEYS", "SCHEMA", "box_text", "human", "mass_text", "model_box", "summarize"]
+__all__ = ["SCHEMA", "SUMMARY_KEYS", "box_text", "mass_text", "model_box", "summarize", "summary_text"]
 
 SCHEMA = 1
-KEYS = (
+SUMMARY_KEYS = (
     "schema",
     "scene",
     "analysis",
@@ -137,14 +137,14 @@ def summarize(
         "violation": sim.max_violation,
         "versions": versions(),
         "left_out": sim.model.info()["left_out"],
-        "contacts": _contacts(sim),
+        "contacts": _contact_values(sim),
         "stable": None if sim.last is None or sim.last.stable is None else sim.last.stable[0],
     }
-    assert tuple(content) == KEYS
+    assert tuple(content) == SUMMARY_KEYS
     return {name: to_json(value) for name, value in content.items()}
 
 
-def human(summary: dict[str, Any], sim: Simulation, wrote: Sequence[str]) -> str:
+def summary_text(summary: dict[str, Any], sim: Simulation, wrote: Sequence[str]) -> str:
     """The summary as a table."""
     s, info = summary, sim.model.info()
     steps = max(s["steps"], 1)
@@ -152,7 +152,7 @@ def human(summary: dict[str, Any], sim: Simulation, wrote: Sequence[str]) -> str
     if s["load"] is None:
         done = f"{s['status']} at t = {number(s['t_end'], 6)} s, {_steps(s, sim)}"
     rows = [
-        ["scene", s["scene"] + "".join(f"  {k}={v}" for k, v in _short(s["parameters"]))],
+        ["scene", s["scene"] + "".join(f"  {k}={v}" for k, v in _parameter_pairs(s["parameters"]))],
         ["model", f"{info['elements']} elements, {info['unknowns']} unknowns"],
         ["size", f"{box_text(s['bounding_box'])}, {mass_text(s['mass'])}"],
         ["device", f"{s['device']}, {s['dtype']}, {sim.integrator.label}"],
@@ -162,9 +162,9 @@ def human(summary: dict[str, Any], sim: Simulation, wrote: Sequence[str]) -> str
     ]
     if s["floored_steps"]:
         end = f"{s['floored_steps']} of {s['steps']} steps end where rounding stops the residual"
-        rows.append(["", f"{end}; largest estimated error {_text(s['max_floor'], 2)}"])
+        rows.append(["", f"{end}; largest estimated error {_number_text(s['max_floor'], 2)}"])
     if s["min_J"] is not None and s["min_J"] <= 0.0:
-        rows.append(["WARNING", _inverted(s["min_J"], sim.model)])
+        rows.append(["WARNING", _inversion_text(s["min_J"], sim.model)])
     if s["stable"] is not None:
         rows.append(["", "the equilibrium is stable"] if s["stable"] else ["UNSTABLE", "the equilibrium is unstable"])
     if s["rough_steps"]:
@@ -174,21 +174,25 @@ def human(summary: dict[str, Any], sim: Simulation, wrote: Sequence[str]) -> str
             ["NOT CONVERGED", f"tolerance {tol} reached in {reached} of {s['steps']} steps ({reached / steps:.0%})"]
         )
     e = s["energies"]
-    parts = [f"{name} {_text(e[name])}" for name in ("kinetic", "strain", "potential", "work", "viscous") if name in e]
+    parts = [
+        f"{name} {_number_text(e[name])}" for name in ("kinetic", "strain", "potential", "work", "viscous") if name in e
+    ]
     rows.append(["energy", f"{', '.join(parts)} J"])
     if s["load"] is None:
-        lost, left = _text(e["integrator"]), _text(e["ledger_residual"], 2)
+        lost, left = _number_text(e["integrator"]), _number_text(e["ledger_residual"], 2)
         rows.append(["", f"numerical dissipation {lost} J, energy imbalance {left} J"])
         rows += _suggestion(sim)
         if s["contacts"]:
-            stored = _text((e["contact"] or 0.0) + (e["contact_pairs"] or 0.0))
-            lost = f"dissipated: impact {_text(e['contact_loss'])}, friction {_text(e['friction'])} J"
-            moved = f", done by colliders {_text(e['collider_work'])} J" if sim.model.description.colliders else ""
+            stored = _number_text((e["contact"] or 0.0) + (e["contact_pairs"] or 0.0))
+            lost = f"dissipated: impact {_number_text(e['contact_loss'])}, friction {_number_text(e['friction'])} J"
+            moved = (
+                f", done by colliders {_number_text(e['collider_work'])} J" if sim.model.description.colliders else ""
+            )
             rows.append(["", f"in contact {stored} J, {lost}{moved}"])
     for name, values in s["probes"].items():
-        u = ", ".join(_text(x) for x in values["displacement"])
+        u = ", ".join(_number_text(x) for x in values["displacement"])
         rows.append([f"probe {name}", f"displaced by ({u}) m"])
-    rows += _joints(sim)
+    rows += _joint_rows(sim)
     rows += _contact_rows(s["contacts"])
     rows += [["wrote" if k == 0 else "", text] for k, text in enumerate(wrote)]
     return table(rows)
@@ -235,7 +239,7 @@ def mass_text(mass: float | None) -> str:
     return "no density" if mass is None else f"{number(mass)} kg"
 
 
-def _inverted(J: float, model: Model) -> str:
+def _inversion_text(J: float, model: Model) -> str:
     """Text of J <= 0: laws that need J > 0 forbid it at the quadrature points, not at the vertices."""
     if any(block.key.law in DEFINED_FOR_ANY_J for block in model.blocks):
         advice = "take a finer mesh, smaller loads or a law that forbids it (neo_hookean)"
@@ -247,11 +251,11 @@ def _iterations(s: dict[str, Any], sim: Simulation) -> str:
     """Iterations and residuals."""
     if s["steps"] == 0:
         return "no step was accepted"
-    text = f"{_counts(s, sim)} per step, residual up to {_text(s['max_residual'], 2)}"
-    return text + (f", violation up to {_text(s['violation'], 2)} m" if sim.model.constraints else "")
+    text = f"{_iteration_counts(s, sim)} per step, residual up to {_number_text(s['max_residual'], 2)}"
+    return text + (f", violation up to {_number_text(s['violation'], 2)} m" if sim.model.constraints else "")
 
 
-def _counts(s: dict[str, Any], sim: Simulation) -> str:
+def _iteration_counts(s: dict[str, Any], sim: Simulation) -> str:
     """Iterations per step; accepted ones of adaptive steps."""
     steps = max(s["steps"] if s["substeps"] is None else s["substeps"], 1)
     first = s["newton_iterations"] / steps
@@ -260,25 +264,25 @@ def _counts(s: dict[str, Any], sim: Simulation) -> str:
     return f"{first:.1f} Newton and {s['pcg_iterations'] / steps:.0f} PCG"
 
 
-def _joints(sim: Simulation) -> list[list[str]]:
+def _joint_rows(sim: Simulation) -> list[list[str]]:
     """A row for each joint at the end; of many the most violated ones and a count."""
     joints = sim.model.constraints.joints if sim.model.constraints else []
     violation = np.array([sim.violation(joint)[0] for joint in joints])
     shown = range(len(joints)) if len(joints) <= MAX_ROWS else np.argsort(-violation, kind="stable")[:SHOWN_ROWS]
     rows = []
     for k in shown:
-        text = f"{joints[k].kind}, violation {_text(violation[k], 2)} m"
+        text = f"{joints[k].kind}, violation {_number_text(violation[k], 2)} m"
         record = sim.joint_record(joints[k])
         if record.time.size:
             force, moment = (float(np.linalg.norm(values[0, -1])) for values in (record.force, record.moment))
-            text += f", force {_text(force)} N, moment {_text(moment)} N m"
+            text += f", force {_number_text(force)} N, moment {_number_text(moment)} N m"
         rows.append([f"joint {joints[k].name}", text])
     if len(rows) < len(joints):
         rows.append(["joints", f"{len(joints)} joints; largest violations shown"])
     return rows
 
 
-def _contacts(sim: Simulation) -> dict[str, Any]:
+def _contact_values(sim: Simulation) -> dict[str, Any]:
     """Maximum and last values of each recorded contact."""
     out = {}
     for contact in sim.model.description.all_contacts:
@@ -296,18 +300,19 @@ def _contact_rows(contacts: dict[str, Any]) -> list[list[str]]:
     rows = []
     for name in shown:
         c = contacts[name]
-        text = f"normal force up to {_text(c['normal_force'])} N, penetration up to {_text(c['penetration'])} m"
-        rows.append([f"contact {name}", f"{text}, at the end {_text(c['area'])} m^2 in contact"])
+        text = f"normal force up to {_number_text(c['normal_force'])} N, "
+        text += f"penetration up to {_number_text(c['penetration'])} m"
+        rows.append([f"contact {name}", f"{text}, at the end {_number_text(c['area'])} m^2 in contact"])
     if len(rows) < len(contacts):
         rows.append(["contacts", f"{len(contacts)} in all, of which these have the largest forces"])
     return rows
 
 
-def _text(value: float | None, digits: int = 4) -> str:
+def _number_text(value: float | None, digits: int = 4) -> str:
     return "not finite" if value is None else number(value + 0.0, digits)
 
 
-def _short(parameters: dict[str, Any]) -> list[tuple[str, str]]:
+def _parameter_pairs(parameters: dict[str, Any]) -> list[tuple[str, str]]:
     """Parameters in one line: numbers short, empty ones omitted."""
     out = []
     for name, value in parameters.items():
