@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Parameter", "Scene", "find", "load_file", "locate", "names", "scene", "split_name"]
 
-P = ParamSpec("P")
+Params = ParamSpec("Params")
 REQUIRED = inspect.Parameter.empty
 _BOOL_WORDS = {"true": True, "yes": True, "on": True, "1": True, "false": False, "no": False, "off": False, "0": False}
 
@@ -68,7 +68,7 @@ class Parameter:
         return _parse(text, self.kind)
 
 
-class Scene(Generic[P]):
+class Scene(Generic[Params]):
     """A scene; a call returns its ModelBuilder.
 
     Attributes:
@@ -84,7 +84,7 @@ class Scene(Generic[P]):
 
     def __init__(
         self,
-        function: Callable[P, ModelBuilder],
+        function: Callable[Params, ModelBuilder],
         *,
         dt: float,
         t_end: float,
@@ -110,7 +110,7 @@ class Scene(Generic[P]):
         self.details = text.partition("\n\n")[2].partition("Args:")[0].strip()
         self.parameters = _read_parameters(function, text)
 
-    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> ModelBuilder:
+    def __call__(self, *args: Params.args, **kwargs: Params.kwargs) -> ModelBuilder:
         return self.function(*args, **kwargs)
 
     def __repr__(self) -> str:
@@ -184,7 +184,7 @@ def scene(
     picture: float | None = None,
     reference: Any = None,
     field: Callable[[Any], Any] | None = None,
-) -> Callable[[Callable[P, ModelBuilder]], Scene[P]]:
+) -> Callable[[Callable[Params, ModelBuilder]], Scene[Params]]:
     """Decorator: make a function that returns a ModelBuilder a scene.
 
     Args:
@@ -204,7 +204,7 @@ def scene(
         ModelError: a number that is not positive.
     """
 
-    def decorate(function: Callable[P, ModelBuilder]) -> Scene[P]:
+    def decorate(function: Callable[Params, ModelBuilder]) -> Scene[Params]:
         return Scene(
             function, dt=dt, t_end=t_end, integrator=integrator, tol=tol, fps=fps, speed=speed, picture=picture,
             reference=reference, field=field,

@@ -25,7 +25,7 @@ from .measure import Outcome
 
 __all__ = ["Motion", "known_motion", "motion_errors", "observed_order", "run_motion"]
 
-CURVE_POINTS = 1001
+TRAVEL_SAMPLES = 1001
 """Number of times at which the travel of a reference function is evaluated."""
 END_TIME_TOL = 1e-9
 """Tolerance, relative to the end time, for samples at the end of the run."""
@@ -96,7 +96,7 @@ def known_motion(reference: Reference, chosen: Sequence[str] | None, run: Outcom
             raise ModelError(f"reference {reference.about!r}: its probes must have the same times")
         times = sample_times[inside]
         probes[name] = _sample_lookup(times, x[inside])
-    curve = np.linspace(0.0, t_end, CURVE_POINTS)[1:] if times is None else times
+    curve = np.linspace(0.0, t_end, TRAVEL_SAMPLES)[1:] if times is None else times
     travel = _largest_travel(probes, run.start_positions, curve)
     own_error = reference.error / travel
     fields = None if reference.field is None else np.asarray(reference.field, dtype=float)

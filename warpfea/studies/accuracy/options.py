@@ -20,8 +20,8 @@ from .report import ERROR_MEASURES
 __all__ = ["StudyOptions", "check_positive", "refuse_moved_keywords"]
 
 SPLIT_CHOICES = ("best", "all", "none")
-P = ParamSpec("P")
-R = TypeVar("R")
+Params = ParamSpec("Params")
+Returned = TypeVar("Returned")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,12 +84,12 @@ def check_positive(**values: float | None) -> None:
             raise ModelError(f"study: {option} = {value!r} must be a positive finite number")
 
 
-def refuse_moved_keywords(function: Callable[P, R]) -> Callable[P, R]:
+def refuse_moved_keywords(function: Callable[Params, Returned]) -> Callable[Params, Returned]:
     """The function, with a ModelError for keywords that are fields of StudyOptions."""
     fields = {field.name for field in dataclasses.fields(StudyOptions)}
 
     @functools.wraps(function)
-    def call(*args: P.args, **given: P.kwargs) -> R:
+    def call(*args: Params.args, **given: Params.kwargs) -> Returned:
         moved = [name for name in given if name in fields]
         if moved:
             many = f"{', '.join(moved)} {'is a field' if len(moved) == 1 else 'are fields'}"

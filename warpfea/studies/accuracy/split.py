@@ -48,20 +48,20 @@ def split_error(setting: Setting, axes: SweepAxes, motion: Motion, run: Callable
         reference = run_motion(found, names, "")
         return float(motion_errors(base, reference)["l2"]) * reference.travel / motion.travel
 
-    def times(value: float | None, factor: float) -> float | None:
+    def multiply(value: float | None, factor: float) -> float | None:
         return None if value is None else factor * value
 
     if setting.dt is not None:
         growth = 2.0 ** convergence_order(setting.method)
-        time = times(distance_to(setting.with_changes({"dt": setting.dt / 2})), growth / (growth - 1.0))
+        time = multiply(distance_to(setting.with_changes({"dt": setting.dt / 2})), growth / (growth - 1.0))
     else:
         assert setting.error is not None
         time = distance_to(setting.with_changes({"error": setting.error / 10}))
     finer = {name: scale_counts(setting.values[name], 2) for name in axes.mesh}
-    space = times(distance_to(setting.with_changes(finer)), 2.0) if finer else None
+    space = multiply(distance_to(setting.with_changes(finer)), 2.0) if finer else None
     tol = setting.tol if setting.tol is not None else DEFAULT_TOLS[setting.dtype]
     algebra = distance_to(setting.with_changes({"tol": tol / TIGHTENING}))
     single = setting.dtype == "float32"
     other = distance_to(setting.with_changes({"dtype": "float64" if single else "float32"}))
-    rounding = other if single else times(other, ROUND_OFF_RATIO)
+    rounding = other if single else multiply(other, ROUND_OFF_RATIO)
     return {"time": time, "space": space, "algebra": algebra, "rounding": rounding}

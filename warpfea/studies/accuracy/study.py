@@ -200,7 +200,7 @@ class _StudyRunner:
             rows, references, motions = self.rows(settings)
             rows = self.add_error_parts(rows, motions)
             answer = _cheapest_row(rows, options.target)
-            checks = [] if answer is None else self.checks(answer, motions)
+            checks = [] if answer is None else self.rerun_answer(answer, motions)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(self.store.summary()) from None
         command = None if answer is None else answer.setting.command(options.what, self.scene)
@@ -215,7 +215,7 @@ class _StudyRunner:
             found.write(folder, options.words or ["study", options.what])
         return found
 
-    def run(self, setting: Setting) -> Outcome:
+    def run_extra(self, setting: Setting) -> Outcome:
         """Outcome of a setting besides the sweep."""
         self.bar.total = (self.bar.total or 0) + 1
         return self.run_setting(setting, 1, None)
@@ -248,7 +248,7 @@ class _StudyRunner:
                 known = self.known(group[0])
                 if known is None:
                     best = finer_setting(group, self.axes, self.options.finer or {}, self.base.dt or self.scene.dt)
-                    motions[name] = finer_motion(best, self.axes, self.chosen, self.run)
+                    motions[name] = finer_motion(best, self.axes, self.chosen, self.run_extra)
                 for setting in group:
                     outcomes[id(setting)] = self.run_setting(setting, self.options.repeat, self.options.limit)
                 done = [o for s in group if (o := outcomes[id(s)]).status == DONE]
@@ -300,7 +300,7 @@ class _StudyRunner:
         """Rows with the requested parts of the error, and the mesh error if the cheapest one depends on it."""
         while True:
             answer = _cheapest_row(rows, self.options.target)
-            rows = self.split(rows, motions, answer)
+            rows = self.split_rows(rows, motions, answer)
             answer = _cheapest_row(rows, self.options.target)
             if (
                 answer is None
@@ -320,7 +320,7 @@ class _StudyRunner:
         swept = any(name in self.axes.over for name in self.axes.mesh)
         return self.options.measure in ("l2", "end") and not swept and self.known(row.setting) is None
 
-    def split(self, rows: list[Row], motions: dict[str, Motion], answer: Row | None) -> list[Row]:
+    def split_rows(self, rows: list[Row], motions: dict[str, Motion], answer: Row | None) -> list[Row]:
         """Rows with the requested parts of the error."""
         from tqdm import tqdm
 
@@ -336,11 +336,11 @@ class _StudyRunner:
             for row in rows:
                 if row.error is not None and row.split is None and (which == "all" or row is best):
                     motion = motions[self._problem_key(row.setting)]
-                    row = replace(row, split=split_error(row.setting, self.axes, motion, self.run))
+                    row = replace(row, split=split_error(row.setting, self.axes, motion, self.run_extra))
                 out.append(row)
         return out
 
-    def checks(self, answer: Row, motions: dict[str, Motion]) -> list[Row]:
+    def rerun_answer(self, answer: Row, motions: dict[str, Motion]) -> list[Row]:
         """Reruns of the answer with about 0.9 and 1.1 times its step or requested error; not repeated.
 
         Steps are rounded to divide the duration.
@@ -356,7 +356,7 @@ class _StudyRunner:
                 else:
                     steps = max(1, round(setting.t_end / (factor * setting.dt)))
                     near = setting.with_changes({"dt": setting.t_end / steps})
-                found.append(self._make_row(near, self.run(near), motions[self._problem_key(near)]))
+                found.append(self._make_row(near, self.run_extra(near), motions[self._problem_key(near)]))
         return found
 
 

@@ -14,18 +14,18 @@ from .peer import PEER_KIND
 from .sizes import SIZES_KIND
 from .worlds import WORLDS_KIND
 
-__all__ = ["KINDS", "bench"]
+__all__ = ["BENCH_KINDS", "bench"]
 
-KINDS = {"sizes": SIZES_KIND, "peer": PEER_KIND, "worlds": WORLDS_KIND}
+BENCH_KINDS = {"sizes": SIZES_KIND, "peer": PEER_KIND, "worlds": WORLDS_KIND}
 """By name: its option, but for "sizes", which needs none."""
 
 
 def bench(options: argparse.Namespace) -> None:
     """Do `warpfea bench`. UsageError for options that do not go together, OutputError for an --out in no folder."""
-    name = next((name for name in KINDS if getattr(options, name, False)), "sizes")
-    for option in sorted(set().union(*(kind.options for kind in KINDS.values())) - KINDS[name].options):
+    name = next((name for name in BENCH_KINDS if getattr(options, name, False)), "sizes")
+    for option in sorted(set().union(*(kind.options for kind in BENCH_KINDS.values())) - BENCH_KINDS[name].options):
         if getattr(options, option):
-            others = " or ".join(f"--{k}" for k in KINDS if option in KINDS[k].options)
+            others = " or ".join(f"--{k}" for k in BENCH_KINDS if option in BENCH_KINDS[k].options)
             words = f"goes with {others}" if name == "sizes" else f"does not go with --{name}"
             raise UsageError(f"--{option.replace('_', '-')} {words}")
     if options.out is not None:
@@ -34,4 +34,4 @@ def bench(options: argparse.Namespace) -> None:
         check_target(options.out, (".json",))
     with quiet_warp():
         options.device = str(find_device(options.device))
-        run_kind(KINDS[name], options)
+        run_kind(BENCH_KINDS[name], options)
