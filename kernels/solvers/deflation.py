@@ -26,7 +26,7 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
     vec3, mat33 = p.vec3, p.mat33
     f64, vec3d = wp.float64, wp.vec3d
     Constraints, Multipliers = constraint_struct(), multiplier_struct()
-    directional = constraint_functions(dtype).directional
+    directional_derivative = constraint_functions(dtype).directional_derivative
     row_sum = lane_functions(dtype).row_sum
     module = kernel_module(f"deflation_{dtype}")
 
@@ -186,7 +186,7 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
         """J z."""
         world, row = wp.tid()
         if active[world] != 0:
-            mul.restricted[world, row] = directional(con, mul.gradient, z, world, row)
+            mul.restricted[world, row] = directional_derivative(con, mul.gradient, z, world, row)
 
     @wp.kernel(module=module)
     def solve_clusters(con: Constraints, mul: Multipliers, active: wp.array(dtype=wp.int32)):

@@ -10,11 +10,11 @@ from ..common.types import SHORT_UNROLL, kernel_module, precision
 from .facet_projection import facet_projection_functions
 from .pair_structs import master_struct, pair_scratch_struct
 
-__all__ = ["MARGIN", "broad_phase_kernels"]
+__all__ = ["BOX_MARGIN", "broad_phase_kernels"]
 
-MARGIN = 0.25
+BOX_MARGIN = 0.25
 """Enlargement of the boxes of the tree, as a fraction of a facet's side: they stay valid for several steps."""
-ROUNDING = 2.4e-7
+BOX_ROUNDING = 2.4e-7
 """Relative widening of boxes in float32: twice its unit round-off."""
 
 
@@ -79,9 +79,9 @@ def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
     def round_down(x: vec3d) -> box3:
         """x in single precision, rounded down by more than its largest round-off."""
         return box3(
-            wp.float32(x[0] - wp.abs(x[0]) * f64(ROUNDING)),
-            wp.float32(x[1] - wp.abs(x[1]) * f64(ROUNDING)),
-            wp.float32(x[2] - wp.abs(x[2]) * f64(ROUNDING)),
+            wp.float32(x[0] - wp.abs(x[0]) * f64(BOX_ROUNDING)),
+            wp.float32(x[1] - wp.abs(x[1]) * f64(BOX_ROUNDING)),
+            wp.float32(x[2] - wp.abs(x[2]) * f64(BOX_ROUNDING)),
         )
 
     @wp.func
@@ -131,7 +131,7 @@ def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
         index = world * mas.count + item
         if not contains(pair.lower[index], pair.upper[index], round_down(low), round_up(high)):
             pair.refit_needed[0] = 1
-        room = f64(MARGIN) * mas.size[item]
+        room = f64(BOX_MARGIN) * mas.size[item]
         pad = vec3d(room, room, room)
         pair.refit_lower[index] = round_down(low - pad)
         pair.refit_upper[index] = round_up(high + pad)
@@ -166,7 +166,7 @@ def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
         pair.upper[index] = pair.refit_upper[index]
         if index == 0:
             pair.refit_needed[0] = 0
-            pair.refits[0] = pair.refits[0] + 1
+            pair.refit_count[0] = pair.refit_count[0] + 1
 
     return _types.SimpleNamespace(
         update_coefficients=update_coefficients, initial_coefficients=initial_coefficients, check_boxes=check_boxes,

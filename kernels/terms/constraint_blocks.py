@@ -61,7 +61,7 @@ def constraint_block_kernels(dtype: str) -> _types.SimpleNamespace:
         add_block(topo, pattern.upper[pairs.entry[item]], mat33(A), world, value)
 
     @wp.func
-    def curvature(con: Constraints, mul: Multipliers, world: int, row: int, a: int, b: int) -> wp.mat33d:
+    def second_derivative(con: Constraints, mul: Multipliers, world: int, row: int, a: int, b: int) -> wp.mat33d:
         """d2c / (d vector a  d vector b) of a row, a and b its sides."""
         kind = con.kind[row]
         f = mul.target[world, row]
@@ -104,7 +104,9 @@ def constraint_block_kernels(dtype: str) -> _types.SimpleNamespace:
             row = a / 3
             penalty_part = mul.stiffness[world, row] * wp.outer(mul.gradient[world, a], mul.gradient[world, b])
             curvature_part = (
-                midpoint_factor * mul.trial[world, row] * curvature(con, mul, world, row, a - 3 * row, b - 3 * row)
+                midpoint_factor
+                * mul.trial[world, row]
+                * second_derivative(con, mul, world, row, a - 3 * row, b - 3 * row)
             )
             A += pairs.weight[k] * (penalty_part + curvature_part)
         add_block(topo, pattern.upper[pairs.entry[item]], mat33(dq_dv[world] * A), world, value)

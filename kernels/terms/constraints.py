@@ -35,7 +35,7 @@ DISTANCE = 1
 ANGLE = 2
 JOINT_COLUMNS = 7
 """Columns per joint in the report of a step: force and moment on the child, N and N m, and violation, m."""
-MAX_ROTATION = 1.0
+MAX_DRIVE_ROTATION = 1.0
 """Largest change of a driven angle in a substep, rad: a larger one may crush a body instead of turning it."""
 
 
@@ -138,7 +138,7 @@ def constraint_functions(dtype: str) -> _types.SimpleNamespace:
     Constraints = constraint_struct()
 
     @wp.func
-    def combine(con: Constraints, term: int, x: wp.array2d(dtype=vec3), world: int) -> vec3d:
+    def term_vector(con: Constraints, term: int, x: wp.array2d(dtype=vec3), world: int) -> vec3d:
         """sum_k w_k x_k of a term."""
         s = vec3d()
         for k in range(con.start[term], con.start[term + 1]):
@@ -146,17 +146,17 @@ def constraint_functions(dtype: str) -> _types.SimpleNamespace:
         return s
 
     @wp.func
-    def directional(
+    def directional_derivative(
         con: Constraints, slope: wp.array2d(dtype=vec3d), x: wp.array2d(dtype=vec3), world: int, row: int
     ) -> f64:
         """(J x) of a row."""
-        s = wp.dot(slope[world, 3 * row], combine(con, 3 * row, x, world))
-        s += wp.dot(slope[world, 3 * row + 1], combine(con, 3 * row + 1, x, world))
+        s = wp.dot(slope[world, 3 * row], term_vector(con, 3 * row, x, world))
+        s += wp.dot(slope[world, 3 * row + 1], term_vector(con, 3 * row + 1, x, world))
         if con.kind[row] == ANGLE:
-            s += wp.dot(slope[world, 3 * row + 2], combine(con, 3 * row + 2, x, world))
+            s += wp.dot(slope[world, 3 * row + 2], term_vector(con, 3 * row + 2, x, world))
         return s
 
-    return _types.SimpleNamespace(combine=combine, directional=directional)
+    return _types.SimpleNamespace(term_vector=term_vector, directional_derivative=directional_derivative)
 
 
 @functools.cache
@@ -171,11 +171,11 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
     f64, vec3d = wp.float64, wp.vec3d
     Constraints, Multipliers, Joints = constraint_struct(), multiplier_struct(), joint_struct()
     functions = constraint_functions(dtype)
-    combine, directional = functions.combine, functions.directional
+    term_vector, directional_derivative = functions.term_vector, functions.directional_derivative
     module = kernel_module(f"constraints_{dtype}{'_midpoint' if midpoint else ''}")
 
     @wp.func
-    def gradients(kind: int, scale: f64, f: f64, a: vec3d, b: vec3d, a2: vec3d) -> wp.mat33d:
+    def constraint_gradients(kind: int, scale: f64, f: f64, a: vec3d, b: vec3d, a2: vec3d) -> wp.mat33d:
         """dc/da, dc/db, dc/da2 as rows, linear in the vectors; of a distance a must be a unit vector."""
         if kind == DISTANCE:
             return wp.matrix_from_rows(scale * a, vec3d(), vec3d())
@@ -187,7 +187,7 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
 
     @wp.func
     def store_gradients(into: wp.array2d(dtype=vec3d), world: int, row: int, G: wp.mat33d):
-        """Store the output of `gradients`."""
+        """Store the output of `constraint_gradients`."""
         for side in range(3):
             into[world, 3 * row + side] = G[side]
 
@@ -217,8 +217,8 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
         f = con.fixed[row]
         if con.law[row] >= 0:
             f = f + law_value[world, con.law[row]][con.law_component[row]]
-        da = combine(con, 3 * row, u, world)
-        db = combine(con, 3 * row + 1, u, world)
+        da = term_vector(con, 3 * row, u, world)
+        db = term_vector(con, 3 * row + 1, u, world)
         A = con.reference[3 * row]
         B = con.reference[3 * row + 1]
         a = A + da
@@ -232,30 +232,30 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
             c = scale * (con.constant[row] - f * f + f64(2.0) * wp.dot(A, da) + wp.dot(da, da)) / (size + f)
             slope = a / size
         elif kind == ANGLE:
-            a2 = con.reference[3 * row + 2] + combine(con, 3 * row + 2, u, world)
+            a2 = con.reference[3 * row + 2] + term_vector(con, 3 * row + 2, u, world)
             along = wp.sin(f) * a2 + wp.cos(f) * a
             c = scale * wp.dot(wp.cos(f) * a2 - wp.sin(f) * a, b)
             if wp.dot(along, b) < f64(0.0):
                 # beyond a right angle: the sine also vanishes at a half turn, which is no solution
                 c = wp.sign(c) * f64(2.0) * scale - c
                 scale = -scale
-            if wp.abs(f - mul.last_target[world, row]) > f64(MAX_ROTATION):
+            if wp.abs(f - mul.last_target[world, row]) > f64(MAX_DRIVE_ROTATION):
                 c = f64(2.0) * con.scale[row]  # ambiguous number of turns: the step must be halved
         else:
             c = scale * (con.constant[row] - f + wp.dot(A, db) + wp.dot(da, B) + wp.dot(da, db))
         turn = f
         if wp.static(midpoint):
-            store_gradients(mul.end_gradient, world, row, gradients(kind, scale, f, slope, b, a2))
-            middle = A + combine(con, 3 * row, u_stage, world)
+            store_gradients(mul.end_gradient, world, row, constraint_gradients(kind, scale, f, slope, b, a2))
+            middle = A + term_vector(con, 3 * row, u_stage, world)
             slope = middle
             if kind == DISTANCE:
                 slope = middle * (f64(2.0) / (wp.length(a) + wp.length(f64(2.0) * middle - a)))
-            b = B + combine(con, 3 * row + 1, u_stage, world)
+            b = B + term_vector(con, 3 * row + 1, u_stage, world)
             if kind == ANGLE:
-                a2 = con.reference[3 * row + 2] + combine(con, 3 * row + 2, u_stage, world)
+                a2 = con.reference[3 * row + 2] + term_vector(con, 3 * row + 2, u_stage, world)
                 if wp.isfinite(mul.last_target[world, row]):
                     turn = f64(0.5) * (mul.last_target[world, row] + f)
-        store_gradients(mul.gradient, world, row, gradients(kind, scale, turn, slope, b, a2))
+        store_gradients(mul.gradient, world, row, constraint_gradients(kind, scale, turn, slope, b, a2))
         rho = mul.stiffness[world, row]
         frozen = mul.force[world, row]
         new = frozen
@@ -288,11 +288,11 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
         if active[world] == 0:
             return
         kind = con.kind[row]
-        a = combine(con, 3 * row, p_in, world)
-        b = combine(con, 3 * row + 1, p_in, world)
+        a = term_vector(con, 3 * row, p_in, world)
+        b = term_vector(con, 3 * row + 1, p_in, world)
         a2 = vec3d()
         if kind == ANGLE:
-            a2 = combine(con, 3 * row + 2, p_in, world)
+            a2 = term_vector(con, 3 * row + 2, p_in, world)
         Ga = mul.gradient[world, 3 * row]
         Gb = mul.gradient[world, 3 * row + 1]
         Gc = mul.gradient[world, 3 * row + 2]
@@ -304,7 +304,7 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
             n = Ga / scale
             size = wp.abs(mul.value[world, row] / scale + f)
             a = (a - wp.dot(n, a) * n) / size
-        curvature_part = gradients(kind, scale, f, a, b, a2)
+        curvature_part = constraint_gradients(kind, scale, f, a, b, a2)
         penalty_part = dq_dv[world] * mul.stiffness[world, row] * change
         force = dq_dv[world] * mul.trial[world, row]
         if wp.static(midpoint):  # the gradients move by half of the end's change
@@ -345,13 +345,12 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
             return
         mul.change[world, row] = f64(0.0)
         if quiet[world, con.component[row]] == 0:
-            after = mul.value[world, row] + dq_dv[world] * directional(con, mul.end_gradient, direction, world, row)
-            mul.change[world, row] = mul.stiffness[world, row] * after
+            change = dq_dv[world] * directional_derivative(con, mul.end_gradient, direction, world, row)
+            mul.change[world, row] = mul.stiffness[world, row] * (mul.value[world, row] + change)
 
     @wp.kernel(module=module)
     def accept_trial(flags: wp.array(dtype=wp.int32), mul: Multipliers):
-        """Make the trial's multipliers those of the iterate and clear their change: the iterate may be evaluated
-        again."""
+        """Make the trial's multipliers those of the iterate; clear their change, for another evaluation of it."""
         world, row = wp.tid()
         if flags[world] != 0:
             mul.force[world, row] = mul.trial[world, row]

@@ -11,20 +11,20 @@ import warp as wp
 
 from ..common.lanes import lane_functions
 from ..common.types import SHORT_UNROLL, kernel_module, precision
-from .contact_colliders import MESHES, collider_functions
+from .contact_colliders import MESH_SUFFIX, collider_functions
 from .contact_laws import SMOOTH
 from .contact_point import contact_point_functions
 from .contact_structs import clock_struct, contact_scratch_struct, contact_struct, facet_struct, history_struct
 
-__all__ = ["MAX_ROTATION", "MIN_APPROACH_SPEED", "RELAX_LANES", "contact_kernels"]
+__all__ = ["AITKEN_LANES", "MAX_COLLIDER_ROTATION", "MIN_APPROACH_SPEED", "contact_kernels"]
 
 MIN_APPROACH_SPEED = 1e-3
 """Lower bound of the approach speed in the damping of the default law, m/s."""
 INACTIVE, FORCE_ONLY, WITH_STIFFNESS = 0, 1, 2
 """States of a point: no force; a force without tangent; a force with tangent."""
-MAX_ROTATION = 1.0
+MAX_COLLIDER_ROTATION = 1.0
 """Largest rotation of a touched collider in a step, rad; larger rotations are rejected."""
-RELAX_LANES = 128
+AITKEN_LANES = 128
 SLOW_REDUCTION = 0.35
 """Ratio of successive changes of the friction limits above which they are relaxed."""
 
@@ -39,27 +39,27 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
     lane_sum = lane_functions(dtype).lane_sum
     History, ContactScratch, Clock = history_struct(), contact_scratch_struct(dtype), clock_struct()
     f = contact_point_functions(dtype, meshes)
-    interpolate, history_row, contact_distance, is_acting, acting_shape = (
+    interpolate, history_row, activation_gap, is_acting, acting_shape_value = (
         f.interpolate,
         f.history_row,
-        f.contact_distance,
+        f.activation_gap,
         f.is_acting,
-        f.acting_shape,
+        f.acting_shape_value,
     )
-    set_explicit_force, evaluate_point, with_friction_normal, frozen_values = (
+    set_explicit_force, evaluate_point, with_friction_normal, friction_parameters = (
         f.set_explicit_force,
         f.evaluate_point,
         f.with_friction_normal,
-        f.frozen_values,
+        f.friction_parameters,
     )
     friction_potential, friction_force = f.friction_potential, f.friction_force
     point_stiffness = f.point_stiffness
     g = collider_functions(meshes)
     distance, stored_side, sheet_side = g.distance, g.stored_side, g.sheet_side
-    module = kernel_module(f"contact_{dtype}{MESHES * meshes}", max_unroll=SHORT_UNROLL)
+    module = kernel_module(f"contact_{dtype}{MESH_SUFFIX * meshes}", max_unroll=SHORT_UNROLL)
 
     @wp.kernel(module=module)
-    def poses(
+    def update_poses(
         con: Contacts, his: History, value: wp.array2d(dtype=vec3d), active: wp.array(dtype=wp.int32),
         scr: ContactScratch
     ):  # fmt: skip
@@ -119,12 +119,10 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         side = stored_side(con, k, in_contact, his.contact_state[world, rec])
         d = distance(con, k, y, side)
         scr.start[world, point] = y
-        contact_distance_now = contact_distance(
-            con, his, world, c, point, clock.time[world], his.previous_margin[world, k]
-        )
+        activation_gap_now = activation_gap(con, his, world, c, point, clock.time[world], his.previous_margin[world, k])
         scr.origin[world, point] = interpolate(facets, u_n, world, q, item)
-        scr.contact_distance[world, point] = contact_distance_now
-        scr.depth[world, point] = contact_distance_now - d[3]
+        scr.activation_gap[world, point] = activation_gap_now
+        scr.depth[world, point] = activation_gap_now - d[3]
         speed = wp.max(his.speed[world, rec], f64(MIN_APPROACH_SPEED))
         if clock.still == 0:
             moved = (scr.rotation[world, k] * y + scr.position[world, k] - x) / clock.h[world]
@@ -147,10 +145,8 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         scr.start[world, point] = y
         scr.origin[world, point] = interpolate(facets, u, world, q, item)
         d = distance(con, k, y, -1)
-        scr.contact_distance[world, point] = contact_distance(
-            con, his, world, c, point, time[world], con.margin[world, k]
-        )
-        scr.depth[world, point] = scr.contact_distance[world, point] - d[3]
+        scr.activation_gap[world, point] = activation_gap(con, his, world, c, point, time[world], con.margin[world, k])
+        scr.depth[world, point] = scr.activation_gap[world, point] - d[3]
 
     @wp.kernel(module=module)
     def explicit_forces(
@@ -223,7 +219,7 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
             frozen[2] = f64(1.0)
         t = evaluate_point(con, facets, his, scr, world, q, item, point, u, clock.new_time[world], inv_h, frozen[2])
         if con.is_explicit[c] == 0:
-            new = frozen_values(con, his, scr, world, c, point, t)
+            new = friction_parameters(con, his, scr, world, c, point, t)
             if fresh != 0:  # initial limits: those of the last step, zero for a new contact
                 scr.frozen_normal[world, rec] = t.n
                 frozen = new
@@ -236,7 +232,7 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         if con.spin[con.collider[c]] >= 0:
             turned = wp.abs(scr.angle[world, con.collider[c]] - his.angle[world, con.collider[c]])
         near = t.depth > f64(0.0) or scr.depth[world, point] > f64(0.0)
-        if t.side == -2 or (near and turned > f64(MAX_ROTATION)):
+        if t.side == -2 or (near and turned > f64(MAX_COLLIDER_ROTATION)):
             scr.passed_through[world] = wp.where(t.side == -2, point + 1, -point - 1)
             scr.activity[world, point] = FORCE_ONLY
             scr.force[world, point] = vec3d()
@@ -260,7 +256,7 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
                 T(area_fraction * K[0, 1]))  # fmt: skip
 
     @wp.kernel(module=module)
-    def gather_points(
+    def gather_point_forces(
         facets: Facets, active: wp.array(dtype=wp.int32), lanes: int, scr: ContactScratch, pool: wp.array2d(dtype=vec3),
         rows: wp.array3d(dtype=f64), touching: wp.array(dtype=wp.int32),
     ):  # fmt: skip
@@ -280,7 +276,7 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         if touched != INACTIVE:
             for q in range(lane, facets.points, lanes):
                 if scr.activity[world, first + q] != INACTIVE:
-                    f += acting_shape(facets, scr, world, q, i, item) * vec3(scr.force[world, first + q])
+                    f += acting_shape_value(facets, scr, world, q, i, item) * vec3(scr.force[world, first + q])
         f = lane_sum(f, lanes)
         if lane > 0:
             return
@@ -307,12 +303,12 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def aitken_partial_sums(flags: wp.array(dtype=wp.int32), scr: ContactScratch):
-        """Partial sums, by lanes, of r = limit of the iterate - frozen limit, and of the change of r, for `relax`."""
+        """Partial sums, by lanes, of r = limit of the iterate - frozen limit, and of its change, for relaxation."""
         world, lane = wp.tid()
         if flags[world] == 0:
             return
         out = wp.vec4d()
-        for point in range(lane, scr.aitken_residual.shape[1], RELAX_LANES):
+        for point in range(lane, scr.aitken_residual.shape[1], AITKEN_LANES):
             if scr.activity[world, point] == WITH_STIFFNESS:
                 r = scr.updated[world, point][0] - scr.frozen[world, point][0]
                 old = scr.aitken_residual[world, point]
@@ -321,13 +317,15 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         scr.aitken_sums[world, lane] = out
 
     @wp.kernel(module=module)
-    def relax(flags: wp.array(dtype=wp.int32), tol: f64, scr: ContactScratch, unsettled: wp.array(dtype=wp.int32)):
+    def aitken_relaxation(
+        flags: wp.array(dtype=wp.int32), tol: f64, scr: ContactScratch, unsettled: wp.array(dtype=wp.int32)
+    ):
         """Relaxation factor of the friction limits: 1 while r shrinks, else Aitken's (Irons and Tuck 1969)."""
         world = wp.tid()
         if flags[world] == 0:
             return
         total = wp.vec4d()
-        for lane in range(RELAX_LANES):
+        for lane in range(AITKEN_LANES):
             total += scr.aitken_sums[world, lane]
         omega = f64(1.0)
         slow = total[2] > f64(SLOW_REDUCTION) * f64(SLOW_REDUCTION) * scr.aitken_norm2[world] and total[1] > f64(0.0)
@@ -352,13 +350,13 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
             scr.frozen_normal[world, point] = scr.updated_normal[world, point]
 
     @wp.func
-    def times(k: sym, p: vec3) -> vec3:
+    def multiply_symmetric(k: sym, p: vec3) -> vec3:
         """Product of the symmetric matrix k (Voigt) with p."""
         return vec3(k[0] * p[0] + k[5] * p[1] + k[4] * p[2], k[5] * p[0] + k[1] * p[1] + k[3] * p[2],
                     k[4] * p[0] + k[3] * p[1] + k[2] * p[2])  # fmt: skip
 
     @wp.kernel(module=module)
-    def product_points(
+    def point_products(
         facets: Facets, active: wp.array(dtype=wp.int32), p: wp.array2d(dtype=vec3), scr: ContactScratch
     ):  # fmt: skip
         """K times the displacement of each point."""
@@ -367,12 +365,12 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
             return
         d = vec3()
         for i in range(facets.conn.shape[0]):
-            d += acting_shape(facets, scr, world, q, i, item) * p[world, facets.conn[i, item]]
+            d += acting_shape_value(facets, scr, world, q, i, item) * p[world, facets.conn[i, item]]
         point = facets.point + item * facets.points + q
-        scr.product[world, point] = times(scr.stiffness[world, point], d)
+        scr.product[world, point] = multiply_symmetric(scr.stiffness[world, point], d)
 
     @wp.kernel(module=module)
-    def product_facets(
+    def gather_facet_products(
         facets: Facets, active: wp.array(dtype=wp.int32), lanes: int, scr: ContactScratch, pool: wp.array2d(dtype=vec3)
     ):  # fmt: skip
         """Sums of the point products on the slots of the facets."""
@@ -385,7 +383,7 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         if scr.facet_activity[world, facets.row + item] == WITH_STIFFNESS:
             for q in range(index % lanes, facets.points, lanes):
                 flux = scr.product[world, facets.point + item * facets.points + q]
-                out += acting_shape(facets, scr, world, q, entry / facets.count, item) * flux
+                out += acting_shape_value(facets, scr, world, q, entry / facets.count, item) * flux
         out = lane_sum(out, lanes)
         if index % lanes == 0:
             pool[world, facets.pool + entry] = out
@@ -399,13 +397,13 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         out = sym()
         if scr.facet_activity[world, facets.row + item] == WITH_STIFFNESS:
             for q in range(facets.points):
-                s = acting_shape(facets, scr, world, q, i, item)
+                s = acting_shape_value(facets, scr, world, q, i, item)
                 out += s * s * scr.stiffness[world, facets.point + item * facets.points + q]
         pool[world, facets.pool + i * facets.count + item] = out
 
     return _types.SimpleNamespace(
-        module=module, poses=poses, begin_points=begin_points, points_at_state=points_at_state,
-        explicit_forces=explicit_forces, forces=forces, gather_points=gather_points,
-        aitken_partial_sums=aitken_partial_sums, relax=relax, update_frozen=update_frozen,
-        product_points=product_points, product_facets=product_facets, diagonal=diagonal,
+        module=module, update_poses=update_poses, begin_points=begin_points, points_at_state=points_at_state,
+        explicit_forces=explicit_forces, forces=forces, gather_point_forces=gather_point_forces,
+        aitken_partial_sums=aitken_partial_sums, aitken_relaxation=aitken_relaxation, update_frozen=update_frozen,
+        point_products=point_products, gather_facet_products=gather_facet_products, diagonal=diagonal,
     )  # fmt: skip

@@ -12,14 +12,14 @@ from .contact_mesh import MESH, mesh_functions
 from .contact_shapes import BOX, HALF_SPACE, SPHERE, shape_functions
 from .contact_structs import contact_struct
 
-__all__ = ["MESHES", "collider_functions"]
+__all__ = ["MESH_SUFFIX", "collider_functions"]
 
-MESHES = "_meshes"
+MESH_SUFFIX = "_meshes"
 """Suffix of the names of modules compiled with the mesh code."""
 
 SLIP_FLAG = 16
 """Bit of a point's contact state: slipping; the bits below are the side."""
-NAMES = ("distance", "sweep", "updated_side", "depth_change", "sheet_side")
+MESH_FUNCTIONS = ("distance", "sweep", "updated_side", "depth_change", "sheet_side")
 MESH_SLIP_FLAG = 1 << 30
 """Slipping bit where sides are triangles."""
 
@@ -32,9 +32,9 @@ def collider_functions(meshes: bool) -> _types.SimpleNamespace:
     Contacts = contact_struct(meshes)
     shapes = shape_functions()
     of_shape, sweep_shape = shapes.distance, shapes.sweep
-    mesh = mesh_functions(Contacts) if meshes else _types.SimpleNamespace(**dict.fromkeys(NAMES))
+    mesh = mesh_functions(Contacts) if meshes else _types.SimpleNamespace(**dict.fromkeys(MESH_FUNCTIONS))
     distance_on_mesh, sweep_mesh, side_on_mesh, depth_change_on_mesh, sheet_side_on_mesh = (
-        getattr(mesh, name) for name in NAMES
+        getattr(mesh, name) for name in MESH_FUNCTIONS
     )
 
     @wp.func
@@ -73,7 +73,7 @@ def collider_functions(meshes: bool) -> _types.SimpleNamespace:
         return 0
 
     @wp.func
-    def released_state(con: Contacts, k: int, in_contact: bool, contact_state: int) -> int:
+    def released_contact_state(con: Contacts, k: int, in_contact: bool, contact_state: int) -> int:
         """Contact state of a point that has left contact."""
         if wp.static(meshes):
             if con.kind[k] == MESH and con.size[k][2] == f64(0.0):
@@ -122,5 +122,5 @@ def collider_functions(meshes: bool) -> _types.SimpleNamespace:
 
     return _types.SimpleNamespace(
         distance=distance, sweep=sweep, stored_side=stored_side, updated_side=updated_side, sheet_side=sheet_side,
-        released_state=released_state, depth_change=depth_change, SLIP_FLAG=slips,
+        released_contact_state=released_contact_state, depth_change=depth_change, SLIP_FLAG=slips,
     )  # fmt: skip

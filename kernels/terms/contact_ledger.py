@@ -9,7 +9,7 @@ from ..common.block_entries import add_symmetric_function
 from ..common.structs import pattern_struct, topology_struct
 from ..common.types import SHORT_UNROLL, kernel_module, precision
 from .contact import INACTIVE
-from .contact_colliders import MESHES, collider_functions
+from .contact_colliders import MESH_SUFFIX, collider_functions
 from .contact_laws import PAPER, SMOOTH, law_functions
 from .contact_point import contact_point_functions
 from .contact_structs import (
@@ -19,15 +19,15 @@ from .contact_structs import (
     contact_struct,
     facet_struct,
     history_struct,
-    of_world,
+    world_value,
 )
 
 __all__ = ["ENERGY_COLUMNS", "RECORD_LANES", "contact_block_kernels", "contact_ledger_kernels"]
 
 ENERGY_COLUMNS = 5  # stored, loss, friction, work of the colliders, the integrator's part
 RECORD_LANES = 32
-RECORD_SUMS = len(RECORD) - 1
-AVERAGED = 7
+SUMMED_ROWS = len(RECORD) - 1
+AVERAGED_ROWS = 7
 """Leading rows of the record, averaged over the substeps of a step; area, stick and stored are values at its end."""
 
 
@@ -38,20 +38,24 @@ def contact_ledger_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
     Contacts, Facets = contact_struct(meshes), facet_struct(dtype)
     History, ContactScratch, Clock = history_struct(), contact_scratch_struct(dtype), clock_struct()
     k = contact_point_functions(dtype, meshes)
-    evaluate_point, with_friction_normal, frozen_values, friction_trial, is_acting, PointContact = (
+    evaluate_point, with_friction_normal, friction_parameters, friction_trial, is_acting, PointContact = (
         k.evaluate_point,
         k.with_friction_normal,
-        k.frozen_values,
+        k.friction_parameters,
         k.friction_trial,
         k.is_acting,
         k.PointContact,
     )
     tangential, history_row, friction_force = k.tangential, k.history_row, k.friction_force
-    coefficient, lagrange, overlap_recovery = k.coefficient, k.lagrange, k.overlap_recovery
-    elastic = law_functions().elastic
+    friction_coefficient, lagrange_polynomial, overlap_recovery = (
+        k.friction_coefficient,
+        k.lagrange_polynomial,
+        k.overlap_recovery,
+    )
+    elastic_force = law_functions().elastic_force
     g = collider_functions(meshes)
-    updated_side, released_state, SLIP_FLAG = g.updated_side, g.released_state, g.SLIP_FLAG
-    module = kernel_module(f"contact_{dtype}{MESHES * meshes}", max_unroll=SHORT_UNROLL)
+    updated_side, released_contact_state, SLIP_FLAG = g.updated_side, g.released_contact_state, g.SLIP_FLAG
+    module = kernel_module(f"contact_{dtype}{MESH_SUFFIX * meshes}", max_unroll=SHORT_UNROLL)
 
     @wp.struct
     class PointOutcome:
@@ -110,7 +114,7 @@ def contact_ledger_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         if con.is_explicit[c] == 0:
             t = with_friction_normal(t, scr.frozen_normal[world, rec])
         change = t.depth - scr.depth[world, point]
-        spring = elastic(con.single_point[c], con.scale[world, c] * of_world(con.normal, world, c), t.depth)
+        spring = elastic_force(con.single_point[c], con.scale[world, c] * world_value(con.normal, world, c), t.depth)
         normal = t.law[0]
         tangential_force = friction_force(con, world, c, t, frozen, inv_h)
         w = friction_trial(con, world, c, t, frozen, inv_h)
@@ -125,7 +129,7 @@ def contact_ledger_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
             normal = wp.dot(scr.explicit_force[world, point], t.n)
             tangential_force = normal * t.n - scr.explicit_force[world, point]
             out.friction_spring = scr.explicit_spring[world, point]
-            frozen[0] = coefficient(con, his, world, c, rec) * normal
+            frozen[0] = friction_coefficient(con, his, world, c, rec) * normal
             out.slipping = wp.where(wp.length(tangential_force) >= f64(0.999999) * frozen[0], 1, 0)
         elif normal > f64(0.0) and law != SMOOTH and frozen[1] > f64(0.0):
             out.friction_spring = return_mapping(con, world, c, t, frozen, inv_h, tangential_force)
@@ -169,7 +173,9 @@ def contact_ledger_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
             his.previous_depth[world, rec] = o.point.depth
         kc = con.collider[c]
         if o.point.depth <= f64(0.0):
-            contact_state = released_state(con, kc, his.speed[world, rec] > f64(0.0), his.contact_state[world, rec])
+            contact_state = released_contact_state(
+                con, kc, his.speed[world, rec] > f64(0.0), his.contact_state[world, rec]
+            )
             his.spring[world, rec] = vec3d()
             his.stored[world, rec] = f64(0.0)
             his.friction_limit[world, rec] = f64(0.0)
@@ -209,7 +215,7 @@ def contact_ledger_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         row = facets.row + item
         for j in range(ENERGY_COLUMNS):
             energies[j, world, row] = f64(0.0)
-        for j in range(RECORD_SUMS + 1):
+        for j in range(SUMMED_ROWS + 1):
             scr.rows[j, world, row] = f64(0.0)
         for q in range(facets.points):
             point = facets.point + item * facets.points + q
@@ -250,7 +256,7 @@ def contact_ledger_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         total = f64(0.0)
         for row in range(rows_of[c] + lane, rows_of[c + 1], RECORD_LANES):
             value = scr.rows[j, world, row]
-            if j == RECORD_SUMS:
+            if j == SUMMED_ROWS:
                 total = wp.max(total, value)
             else:
                 total += value
@@ -268,17 +274,17 @@ def contact_ledger_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         past = scr.elapsed[world]
         total = f64(0.0)
         for lane in range(RECORD_LANES):
-            if j == RECORD_SUMS:
+            if j == SUMMED_ROWS:
                 total = wp.max(total, parts[world, c, j, lane])
             else:
                 total += parts[world, c, j, lane]
         old = scr.total[world, c, j]
         if past == f64(0.0):
             old = f64(0.0)
-        if j < AVERAGED:
+        if j < AVERAGED_ROWS:
             if clock.still == 0:
                 total = (past * old + h * total) / (past + h)
-        elif j == RECORD_SUMS:
+        elif j == SUMMED_ROWS:
             total = wp.max(total, old)
         elif j == 7 or j > 10:
             total += old
@@ -307,14 +313,14 @@ def contact_ledger_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         """Record of each contact for the report of the step; slip and stick as averages over the area in contact."""
         world, c = wp.tid()
         area = scr.total[world, c, 8]
-        for j in range(RECORD_SUMS + 1):
+        for j in range(SUMMED_ROWS + 1):
             value = scr.total[world, c, j]
             if j == 7 or j == 9:
                 value = value / wp.max(area, f64(1.0e-300))
-            report[world, first + (RECORD_SUMS + 1) * c + j] = value
+            report[world, first + (SUMMED_ROWS + 1) * c + j] = value
 
     @wp.kernel(module=module)
-    def at_points(
+    def evaluate_at_points(
         con: Contacts, facets: Facets, his: History, u: wp.array2d(dtype=vec3d), time: wp.array(dtype=f64),
         scr: ContactScratch, places: int, gap: wp.array2d(dtype=f64), force: wp.array2d(dtype=vec3d),
     ):  # fmt: skip
@@ -334,20 +340,20 @@ def contact_ledger_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
             area_fraction = f64(0.0)
             acting_point = scr.contact_point[world, c]
             if scr.chosen_facet[world, c] == row:
-                area_fraction = lagrange(facets, q, scr.facet_xi[world, row])
+                area_fraction = lagrange_polynomial(facets, q, scr.facet_xi[world, row])
                 if wp.length_sq(scr.facet_xi[world, row] - facets.coords[acting_point - (point - q)]) == f64(0.0):
                     area_fraction = wp.where(acting_point == point, f64(1.0), f64(0.0))
             if area_fraction == f64(0.0) and acting_point != point:
                 return
         t = evaluate_point(con, facets, his, scr, world, q, item, acting_point, u, time[world], f64(0.0), f64(1.0))
-        frozen = frozen_values(con, his, scr, world, c, acting_point, t)
+        frozen = friction_parameters(con, his, scr, world, c, acting_point, t)
         if acting_point == point and (facets.tracks_deepest == 0 or places != 0):
             gap[world, point] = -t.depth
         force[world, point] = area_fraction * (t.law[0] * t.n - friction_force(con, world, c, t, frozen, f64(0.0)))
 
     return _types.SimpleNamespace(
         module=module, record_substep=record_substep, partial_records=partial_records, total_records=total_records,
-        store_poses=store_poses, write_records=write_records, at_points=at_points,
+        store_poses=store_poses, write_records=write_records, evaluate_at_points=evaluate_at_points,
     )  # fmt: skip
 
 
@@ -363,7 +369,7 @@ def contact_block_kernels(dtype: str) -> _types.SimpleNamespace:
     module = kernel_module(f"contact_blocks_{dtype}", max_unroll=SHORT_UNROLL)
 
     @wp.kernel(module=module)
-    def add_contact(
+    def add_contact_blocks(
         topo: Topology, pattern: Pattern, facets: Facets, entry: wp.array(dtype=wp.int32),
         start: wp.array(dtype=wp.int32), source: wp.array(dtype=wp.vec3i), stiffness: wp.array2d(dtype=sym),
         weight: wp.array3d(dtype=T),
@@ -384,4 +390,4 @@ def contact_block_kernels(dtype: str) -> _types.SimpleNamespace:
                 k6 += s * stiffness[world, facets.point + at[0] * facets.points + q]
         add_symmetric(topo, pattern.upper[entry[index]], T(dq_dv[world]) * k6, world, value)
 
-    return _types.SimpleNamespace(module=module, add_contact=add_contact)
+    return _types.SimpleNamespace(module=module, add_contact_blocks=add_contact_blocks)

@@ -20,9 +20,7 @@ MESH = 5
 """The kind of collider, after those of `contact_shapes`."""
 SHARP, FLAT, BOUNDARY = range(3)
 """Edge between triangles of different planes, of one plane, or of a single triangle."""
-FEATURES = 7
-"""Features of a triangle: face, edges ab, bc, ca, corners a, b, c."""
-STACK = 40
+STACK_SIZE = 40
 """Stack size: at most one box per level of a tree and one more; 2^30 triangles need 30."""
 SAME_SIDE_COSINE = 0.5
 """Minimum cosine between the normals of triangles of one side."""
@@ -36,7 +34,10 @@ MIN_PASSAGE = 1e-6
 
 @functools.cache
 def mesh_struct():
-    """Triangles of all meshes, [collider], [box] or [.., triangle]; the triangles of a leaf are contiguous."""
+    """Triangles of all meshes, [collider], [box] or [.., triangle]; the triangles of a leaf are contiguous.
+
+    Features of a triangle: 0 its face, 1 to 3 the edges ab, bc, ca, 4 to 6 the corners a, b, c.
+    """
 
     @wp.struct
     class Meshes:
@@ -57,7 +58,7 @@ def mesh_struct():
 def mesh_functions(Contacts) -> _types.SimpleNamespace:
     """Device functions for contacts of a struct with `mesh`; `size`: its size, thickness, 1 if closed."""
     f64, vec3d, vec4d = wp.float64, wp.vec3d, wp.vec4d
-    ints = wp.types.vector(length=STACK, dtype=wp.int32)
+    ints = wp.types.vector(length=STACK_SIZE, dtype=wp.int32)
 
     @wp.struct
     class Nearest:
@@ -76,7 +77,7 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
         out_triangle: wp.int32
 
     @wp.func
-    def closest_on(a: vec3d, b: vec3d, c: vec3d, n: vec3d, y: vec3d) -> vec4d:
+    def closest_on_triangle(a: vec3d, b: vec3d, c: vec3d, n: vec3d, y: vec3d) -> vec4d:
         """Nearest position on a triangle to y, and its feature (Ericson, Real-Time Collision Detection, 2005,
         5.1.5)."""
         zero = f64(0.0)
@@ -132,7 +133,7 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
         return side_sign(side) * wp.dot(y - con.mesh.corner[0, t], n) <= f64(0.0)
 
     @wp.func
-    def nearest(con: Contacts, k: int, y: vec3d, side: int) -> Nearest:
+    def nearest_on_mesh(con: Contacts, k: int, y: vec3d, side: int) -> Nearest:
         """Nearest position on a mesh to y; with a side, among the candidate triangles."""
         best = Nearest()
         best.distance_squared = f64(1.0e300)
@@ -160,7 +161,7 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
                     leaf = con.mesh.leaf[k] + i - inner
                     for t in range(con.mesh.start[leaf], con.mesh.start[leaf + 1]):
                         if is_candidate(con, t, y, side):
-                            c = closest_on(con.mesh.corner[0, t], con.mesh.corner[1, t], con.mesh.corner[2, t],
+                            c = closest_on_triangle(con.mesh.corner[0, t], con.mesh.corner[1, t], con.mesh.corner[2, t],
                                            con.mesh.normal[0, t], y)  # fmt: skip
                             place = vec3d(c[0], c[1], c[2])
                             square = wp.length_sq(y - place)
@@ -192,13 +193,13 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
     @wp.func
     def distance(con: Contacts, k: int, y: vec3d, side: int) -> vec4d:
         """Normal towards the side of the point, and signed distance; without a side: outside of a sheet."""
-        s = nearest(con, k, y, -1)
+        s = nearest_on_mesh(con, k, y, -1)
         d = signed_distance(con, k, s, y)
         if con.size[k][2] == f64(0.0) and (side < 0 or on_boundary(con, s)):
             return wp.where(d[3] < f64(0.0), -d, d)
         d = side_sign(side) * d
         if side >= 0 and d[3] < f64(0.0):
-            ahead = nearest(con, k, y, side)
+            ahead = nearest_on_mesh(con, k, y, side)
             if ahead.triangle >= 0:
                 d = side_sign(side) * signed_distance(con, k, ahead, y)
                 if (d[3] > f64(0.0)) != on_boundary(con, ahead):  # away from the boundary it is outside
@@ -210,15 +211,15 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
         """Side of a point at its new position, -1 outside."""
         if distance(con, k, y, side)[3] >= f64(0.0):
             return -1
-        s = nearest(con, k, y, side)
+        s = nearest_on_mesh(con, k, y, side)
         if s.triangle < 0:
-            s = nearest(con, k, y, -1)
+            s = nearest_on_mesh(con, k, y, -1)
         return 2 * s.triangle + wp.max(side, 0) % 2
 
     @wp.func
     def sheet_side(con: Contacts, k: int, y: vec3d, contact_state: int) -> int:
         """1 in front of a sheet, 2 behind, and unchanged within round-off of the sheet."""
-        s = nearest(con, k, y, -1)
+        s = nearest_on_mesh(con, k, y, -1)
         above = wp.dot(y - s.position, con.mesh.normal[s.feature, s.triangle])
         if wp.abs(above) <= f64(SIDE_TOLERANCE) * con.size[k][0]:
             if contact_state == 0 and above < -f64(SURFACE_TOLERANCE) * con.size[k][0]:
@@ -243,7 +244,7 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
         return wp.abs(w[2]) > e[0] * a[1] + e[1] * a[0]
 
     @wp.func
-    def within(con: Contacts, t: int, p: vec3d, tol: f64) -> bool:
+    def within_triangle(con: Contacts, t: int, p: vec3d, tol: f64) -> bool:
         """True if a position in the plane of a triangle is within it or within `tol` of it."""
         n = con.mesh.normal[0, t]
         for k in range(3):
@@ -254,7 +255,7 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
         return True
 
     @wp.func
-    def crossings(con: Contacts, k: int, a: vec3d, b: vec3d, side: int) -> Crossings:
+    def find_crossings(con: Contacts, k: int, a: vec3d, b: vec3d, side: int) -> Crossings:
         """Crossings of the surface by the segment from a to b; `side` at its start: -3 in front, -4 behind."""
         out = Crossings()
         out.into = f64(2.0)
@@ -288,7 +289,7 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
                         leaves = before < level and after >= f64(0.0) and after > before
                         if enters or leaves:
                             part = wp.clamp(before / (before - after), f64(0.0), f64(1.0))
-                            if within(con, t, a + part * (b - a), f64(1000.0) * tol):
+                            if within_triangle(con, t, a + part * (b - a), f64(1000.0) * tol):
                                 if enters and part < out.into:
                                     out.into = part
                                     out.into_triangle = t
@@ -318,7 +319,7 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
     def sweep(con: Contacts, k: int, start: vec3d, end: vec3d, side: int) -> int:
         """Side through which a motion has passed the surface at its end, -1: none or any, -2: it passed through; see
         `contact_shapes`."""
-        h = crossings(con, k, start, end, side)
+        h = find_crossings(con, k, start, end, side)
         d = end - start
         if side >= 0:
             leave = wp.where(side % 2 == 0, h.out, h.into)

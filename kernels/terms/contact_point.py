@@ -16,7 +16,7 @@ from .contact_structs import (
     contact_struct,
     facet_struct,
     history_struct,
-    of_world,
+    world_value,
 )
 
 __all__ = ["contact_point_functions"]
@@ -38,8 +38,8 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         colliders.stored_side,
     )
     SLIP_FLAG = colliders.SLIP_FLAG
-    normal_law, elastic = laws.normal_law, laws.elastic
-    friction, smooth_friction = laws.friction, laws.smooth_friction
+    normal_law, elastic_force = laws.normal_law, laws.elastic_force
+    huber_friction, smooth_friction = laws.huber_friction, laws.smooth_friction
 
     @wp.struct
     class PointContact:
@@ -68,7 +68,7 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         return out
 
     @wp.func
-    def acting_shape(facets: Facets, scr: ContactScratch, world: int, point: int, i: int, item: int) -> T:
+    def acting_shape_value(facets: Facets, scr: ContactScratch, world: int, point: int, i: int, item: int) -> T:
         """Shape value of slot i at the active point: a point of a facet, or that of a lumped contact."""
         if facets.tracks_deepest != 0:
             return scr.shape_values[world, facets.contact[item], i]
@@ -83,7 +83,9 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
             return interpolate(facets, field, world, point, item)
         out = vec3d()
         for i in range(facets.conn.shape[0]):
-            out += f64(acting_shape(facets, scr, world, point, i, item)) * vec3d(field[world, facets.conn[i, item]])
+            out += f64(acting_shape_value(facets, scr, world, point, i, item)) * vec3d(
+                field[world, facets.conn[i, item]]
+            )
         return out
 
     @wp.func
@@ -94,7 +96,7 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         return facets.X[point, item]
 
     @wp.func
-    def monomial(x: f64, power: int, derivative: int) -> f64:
+    def monomial_derivative(x: f64, power: int, derivative: int) -> f64:
         """Derivative of x^power of order `derivative`."""
         out = f64(1.0)
         for j in range(derivative):
@@ -104,11 +106,13 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         return out
 
     @wp.func
-    def lagrange(facets: Facets, q: int, s: wp.vec2d) -> f64:
+    def lagrange_polynomial(facets: Facets, q: int, s: wp.vec2d) -> f64:
         """Lagrange polynomial of a facet: 1 at point q and 0 at the others."""
         out = f64(0.0)
         for m in range(facets.power.shape[0]):
-            out += facets.basis[q, m] * (monomial(s[0], facets.power[m][0], 0) * monomial(s[1], facets.power[m][1], 0))
+            out += facets.basis[q, m] * (
+                monomial_derivative(s[0], facets.power[m][0], 0) * monomial_derivative(s[1], facets.power[m][1], 0)
+            )
         return out
 
     @wp.func
@@ -137,12 +141,12 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         return before - remaining_overlap(con, his, world, c, point, now)
 
     @wp.func
-    def contact_distance(con: Contacts, his: History, world: int, c: int, point: int, time: f64, margin: f64) -> f64:
+    def activation_gap(con: Contacts, his: History, world: int, c: int, point: int, time: f64, margin: f64) -> f64:
         """Gap at which contact begins, m: offset + `margin` - remaining overlap."""
         return con.offset[c] + margin - remaining_overlap(con, his, world, c, point, time)
 
     @wp.func
-    def depth_before(
+    def depth_at_start(
         con: Contacts, facets: Facets, his: History, scr: ContactScratch, world: int, c: int, point: int
     ) -> f64:
         """Depth at the start of the step, m; for a moving point in contact, that of the deepest position then."""
@@ -153,16 +157,16 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         return scr.depth[world, point]
 
     @wp.func
-    def damping_rate(con: Contacts, scr: ContactScratch, world: int, c: int, point: int, inv_h: f64) -> f64:
+    def normal_damping_rate(con: Contacts, scr: ContactScratch, world: int, c: int, point: int, inv_h: f64) -> f64:
         """Damping per depth of the normal law: chi/h, or gamma_n/h."""
         if con.law[c] == DEFAULT:
             return con.damping[world, c] * inv_h / scr.speed[world, point]
-        return con.beta[world, c] * wp.sqrt(con.scale[world, c]) * of_world(con.normal_damping, world, c) * inv_h
+        return con.beta[world, c] * wp.sqrt(con.scale[world, c]) * world_value(con.normal_damping, world, c) * inv_h
 
     @wp.func
     def tangent_damping(con: Contacts, world: int, c: int, stiffness: f64) -> f64:
         """gamma_t of Eq. (80), N s/m."""
-        return f64(1.8257418583505538) * con.beta[world, c] * wp.sqrt(of_world(con.mass, world, c) * stiffness)
+        return f64(1.8257418583505538) * con.beta[world, c] * wp.sqrt(world_value(con.mass, world, c) * stiffness)
 
     @wp.func
     def with_friction_normal(t: PointContact, m: vec3d) -> PointContact:
@@ -190,38 +194,36 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         out.y = wp.transpose(rotation) * (x - scr.position[world, k])
         in_contact = his.speed[world, rec] > f64(0.0)
         side = stored_side(con, k, in_contact, his.contact_state[world, rec])
-        contact_distance_now = contact_distance(con, his, world, c, point, time, con.margin[world, k])
+        activation_gap_now = activation_gap(con, his, world, c, point, time, con.margin[world, k])
         d = wp.vec4d(f64(0.0), f64(0.0), f64(1.0), f64(0.0))
         out.side = -1
         far = bool(False)
         if wp.static(meshes):  # lower bound of the distance, the last one minus the motion: avoids a search of the mesh
             d[3] = (
-                scr.contact_distance[world, point]
-                - scr.depth[world, point]
-                - wp.length(out.y - scr.start[world, point])
+                scr.activation_gap[world, point] - scr.depth[world, point] - wp.length(out.y - scr.start[world, point])
             )
             far = (
                 con.kind[k] == MESH
                 and con.law[c] != SMOOTH
                 and not in_contact
-                and d[3] > wp.max(contact_distance_now, f64(0.0))
+                and d[3] > wp.max(activation_gap_now, f64(0.0))
             )
         if not far:
             out.side = sweep(con, k, scr.start[world, point], out.y, side)
             d = distance(con, k, out.y, out.side)
         out.n = rotation * vec3d(d[0], d[1], d[2])
-        out.depth = contact_distance_now - d[3]
+        out.depth = activation_gap_now - d[3]
         motion = moved - scr.origin[world, point] - scr.translation[world, k]
         if con.spin[k] >= 0:
             motion -= scr.rotation_change[world, k] * (his.rotation[world, k] * scr.start[world, point])
         before = scr.depth[world, point]
         change = depth_change(con, k, out.side, scr.start[world, point], out.y, wp.transpose(rotation) * motion,
-                           scr.contact_distance[world, point] - before, d[3])  # fmt: skip
+                           scr.activation_gap[world, point] - before, d[3])  # fmt: skip
         if change[1] != f64(0.0):
-            out.depth = before + change[0] + (contact_distance_now - scr.contact_distance[world, point])
-        rate = damping_rate(con, scr, world, c, point, inv_h)
-        k_n = con.scale[world, c] * of_world(con.normal, world, c)
-        previous_depth = depth_before(con, facets, his, scr, world, c, point)
+            out.depth = before + change[0] + (activation_gap_now - scr.activation_gap[world, point])
+        rate = normal_damping_rate(con, scr, world, c, point, inv_h)
+        k_n = con.scale[world, c] * world_value(con.normal, world, c)
+        previous_depth = depth_at_start(con, facets, his, scr, world, c, point)
         out.law = normal_law(con.law[c], con.single_point[c], k_n, rate, con.ramp[c], con.force_eps[c], out.depth,
                              previous_depth)  # fmt: skip
         out.depth_increment = out.depth - previous_depth
@@ -235,7 +237,7 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         return with_friction_normal(out, out.n)
 
     @wp.func
-    def coefficient(con: Contacts, his: History, world: int, c: int, rec: int) -> f64:
+    def friction_coefficient(con: Contacts, his: History, world: int, c: int, rec: int) -> f64:
         """Friction coefficient: mu for a contact that slipped in the last step, else mu_static."""
         in_contact = his.speed[world, rec] > f64(0.0)
         if in_contact and his.contact_state[world, rec] >= SLIP_FLAG:
@@ -254,9 +256,9 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         v_t = v - v_n_rel * n
         beta = con.beta[world, c]
         scale = con.scale[world, c]
-        spring = elastic(con.single_point[c], scale * of_world(con.normal, world, c), delta)[0]
-        gamma = beta * wp.sqrt(scale) * of_world(con.normal_damping, world, c)
-        k_t = scale * of_world(con.tangent, world, c)
+        spring = elastic_force(con.single_point[c], scale * world_value(con.normal, world, c), delta)[0]
+        gamma = beta * wp.sqrt(scale) * world_value(con.normal_damping, world, c)
+        k_t = scale * world_value(con.tangent, world, c)
         if con.single_point[c] != 0:
             gamma *= wp.sqrt(wp.sqrt(delta))
             k_t *= wp.sqrt(delta)
@@ -264,7 +266,7 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         s = tangential(n, his.spring[world, rec] + h * v_t)
         gamma_t = tangent_damping(con, world, c, k_t)
         tangential_force = -k_t * s - gamma_t * v_t
-        friction_limit = coefficient(con, his, world, c, rec) * force
+        friction_limit = friction_coefficient(con, his, world, c, rec) * force
         size = wp.length(tangential_force)
         if size > friction_limit:
             tangential_force = (friction_limit / size) * tangential_force
@@ -273,14 +275,14 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         scr.explicit_force[world, point] = force * n + tangential_force
 
     @wp.func
-    def frozen_values(
+    def friction_parameters(
         con: Contacts, his: History, scr: ContactScratch, world: int, c: int, point: int, t: PointContact
     ) -> vec3d:
         """Friction limit, k_t and reduction factor of the spring at an iterate."""
         rec = history_row(con, c, point)
-        mu = coefficient(con, his, world, c, rec)
+        mu = friction_coefficient(con, his, world, c, rec)
         in_contact = his.speed[world, rec] > f64(0.0)
-        stiffness = con.scale[world, c] * of_world(con.tangent, world, c)
+        stiffness = con.scale[world, c] * world_value(con.tangent, world, c)
         shrink = f64(1.0)
         if con.single_point[c] != 0:
             depth = wp.max(t.depth, f64(0.0))
@@ -307,7 +309,7 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         w = friction_trial(con, world, c, t, frozen, inv_h)
         if w[3] <= f64(0.0):
             return f64(0.0)
-        return friction(vec3d(w[0], w[1], w[2]), w[3], frozen[0])[0]
+        return huber_friction(vec3d(w[0], w[1], w[2]), w[3], frozen[0])[0]
 
     @wp.func
     def friction_force(con: Contacts, world: int, c: int, t: PointContact, frozen: vec3d, inv_h: f64) -> vec3d:
@@ -320,7 +322,7 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         if w[3] <= f64(0.0):
             return vec3d()
         trial = vec3d(w[0], w[1], w[2])
-        return friction(trial, w[3], frozen[0])[1] * trial
+        return huber_friction(trial, w[3], frozen[0])[1] * trial
 
     @wp.func
     def point_stiffness(con: Contacts, world: int, c: int, t: PointContact, frozen: vec3d, inv_h: f64) -> mat33d:
@@ -352,10 +354,12 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
     return _types.SimpleNamespace(
         PointContact=PointContact, interpolate=interpolate, tangential=tangential, history_row=history_row,
-        contact_distance=contact_distance, remaining_overlap=remaining_overlap, overlap_recovery=overlap_recovery,
-        damping_rate=damping_rate, depth_before=depth_before, evaluate_point=evaluate_point,
-        with_friction_normal=with_friction_normal, coefficient=coefficient, set_explicit_force=set_explicit_force,
-        frozen_values=frozen_values, friction_trial=friction_trial, friction_potential=friction_potential,
-        friction_force=friction_force, point_stiffness=point_stiffness, is_acting=is_acting, acting_shape=acting_shape,
-        lagrange=lagrange, monomial=monomial,
+        activation_gap=activation_gap, remaining_overlap=remaining_overlap, overlap_recovery=overlap_recovery,
+        normal_damping_rate=normal_damping_rate, depth_at_start=depth_at_start, evaluate_point=evaluate_point,
+        with_friction_normal=with_friction_normal, friction_coefficient=friction_coefficient,
+        set_explicit_force=set_explicit_force,
+        friction_parameters=friction_parameters, friction_trial=friction_trial, friction_potential=friction_potential,
+        friction_force=friction_force, point_stiffness=point_stiffness, is_acting=is_acting,
+        acting_shape_value=acting_shape_value,
+        lagrange_polynomial=lagrange_polynomial, monomial_derivative=monomial_derivative,
     )  # fmt: skip

@@ -6,7 +6,7 @@ import types as _types
 import warp as wp
 
 from ..common.types import SHORT_UNROLL, kernel_module, precision
-from .contact_colliders import MESHES, collider_functions
+from .contact_colliders import MESH_SUFFIX, collider_functions
 from .contact_point import contact_point_functions
 from .contact_structs import contact_scratch_struct, contact_struct, facet_struct
 
@@ -20,10 +20,10 @@ def sheet_kernels(dtype: str) -> _types.SimpleNamespace:
     Contacts, Facets, ContactScratch = contact_struct(True), facet_struct(dtype), contact_scratch_struct(dtype)
     interpolate = contact_point_functions(dtype, True).interpolate
     distance, sweep = collider_functions(True).distance, collider_functions(True).sweep
-    module = kernel_module(f"contact_sheets_{dtype}{MESHES}", max_unroll=SHORT_UNROLL)
+    module = kernel_module(f"contact_sheets_{dtype}{MESH_SUFFIX}", max_unroll=SHORT_UNROLL)
 
     @wp.kernel(module=module)
-    def across(
+    def find_crossed_sheets(
         con: Contacts, facets: Facets, u: wp.array2d(dtype=vec3), tolerance: wp.array(dtype=wp.float64),
         scr: ContactScratch, found: wp.array2d(dtype=wp.int32),
     ):  # fmt: skip
@@ -40,4 +40,4 @@ def sheet_kernels(dtype: str) -> _types.SimpleNamespace:
                     found[world, facets.row + item] = facets.point + item * facets.points + q + 1
             before = y
 
-    return _types.SimpleNamespace(module=module, across=across)
+    return _types.SimpleNamespace(module=module, find_crossed_sheets=find_crossed_sheets)

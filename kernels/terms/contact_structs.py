@@ -14,7 +14,7 @@ __all__ = [
     "contact_struct",
     "facet_struct",
     "history_struct",
-    "of_world",
+    "world_value",
 ]  # fmt: skip
 
 RECORD = ("force_x", "force_y", "force_z", "moment_x", "moment_y", "moment_z", "normal_force", "slip", "area",
@@ -23,7 +23,7 @@ RECORD = ("force_x", "force_y", "force_z", "moment_x", "moment_y", "moment_z", "
 
 
 @wp.func
-def of_world(table: wp.array2d(dtype=wp.float64), world: int, contact: int) -> wp.float64:
+def world_value(table: wp.array2d(dtype=wp.float64), world: int, contact: int) -> wp.float64:
     """Value of a contact in a world from a table [world, contact], or [0, contact] if uniform."""
     return table[world % table.shape[0], contact]
 
@@ -132,7 +132,7 @@ def contact_scratch_struct(dtype: str):
         rotation_change: wp.array2d(dtype=wp.mat33d)  # R - 1 of the rotation R in the attempt
         angle: wp.array2d(dtype=wp.float64)  # rotation angle, rad
         origin: wp.array2d(dtype=wp.vec3d)  # [world, point] displacement at the start of the attempt, m
-        contact_distance: wp.array2d(dtype=wp.float64)  # gap at which contact begins, at the start of the attempt, m
+        activation_gap: wp.array2d(dtype=wp.float64)  # gap at which contact begins, at the start of the attempt, m
         start: wp.array2d(dtype=wp.vec3d)  # [world, point] position at the start of the step in the collider's frame, m
         depth: wp.array2d(dtype=wp.float64)  # depth at the start of the step, m
         speed: wp.array2d(dtype=wp.float64)  # approach speed of the damping, m/s

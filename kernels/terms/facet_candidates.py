@@ -11,11 +11,11 @@ from .contact_structs import clock_struct, contact_scratch_struct, contact_struc
 from .facet_projection import MAX_OVERHANG, OUTSIDE_TOLERANCE, facet_projection_functions
 from .pair_structs import master_struct, pair_scratch_struct
 
-__all__ = ["PASSED_DEPTH", "facet_candidate_functions"]
+__all__ = ["TUNNEL_LIMIT_RATIO", "facet_candidate_functions"]
 
 MIN_NORMAL_COSINE = 0.1
 """Minimum cosine of the normals of two facets that a point in contact passes between: excludes the edge of a box."""
-PASSED_DEPTH = 0.25
+TUNNEL_LIMIT_RATIO = 0.25
 """Depth over the allowed depth above which a point without a facet has passed through."""
 OPPOSING_COSINE = 0.5
 """Cosine of a facet's normal and the slave's reversed normal above which they face each other; below its negative they
@@ -148,7 +148,7 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
         old = unpack_surface_point(pair.centre0[world, f])
         new = unpack_surface_point(pair.centre[world, f])
         position_change = slave.x - slave.x0 - (new.x - old.x)
-        deep = f64(PASSED_DEPTH) * mas.depth_limit[f]
+        deep = f64(TUNNEL_LIMIT_RATIO) * mas.depth_limit[f]
         if wp.length(position_change) <= deep:
             return False
         g0 = wp.dot(slave.x0 - old.x, unit_normal(old))
@@ -184,7 +184,7 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
         return found[3] != f64(0.0) and within and found[2] > slave.pad
 
     @wp.func
-    def opposite_normal(facets: Facets, pair: PairScratch, slave: SlavePoint, corners: wp.vec3i) -> vec3d:
+    def inward_normal(facets: Facets, pair: PairScratch, slave: SlavePoint, corners: wp.vec3i) -> vec3d:
         """Inward normal of a slave facet at the start of the attempt; 0 if undefined."""
         if corners[0] < 0:
             return vec3d()
@@ -209,8 +209,8 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
         bodies = mas.bodies[slave.contact]
         kind = mas.kind[f]
         most = wp.max(pair.deepest_contact[world, bodies[0]], pair.deepest_contact[world, bodies[1]])
-        depth = scr.contact_distance[world, slave.point] - gap
-        if depth > wp.min(f64(MAX_DEPTH_RATIO) * most, f64(PASSED_DEPTH) * mas.depth_limit[f]):
+        depth = scr.activation_gap[world, slave.point] - gap
+        if depth > wp.min(f64(MAX_DEPTH_RATIO) * most, f64(TUNNEL_LIMIT_RATIO) * mas.depth_limit[f]):
             return False
         if distance_outside(mas.corners[kind], xi) > edge_margin(mas, f, xi):
             return False
@@ -317,7 +317,7 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
             f = pair.anchor_facet[world, slave.point] - 1
             slave.facing = unit_normal(surface_point(mas, pair.C, pair.D, world, f, pair.anchor_xi[world, slave.point]))
             depth = scr.depth[world, slave.point] - wp.dot(slave.motion, slave.facing)
-            out.passed_through = depth > f64(PASSED_DEPTH) * mas.depth_limit[f]
+            out.passed_through = depth > f64(TUNNEL_LIMIT_RATIO) * mas.depth_limit[f]
         wide = vec3d(slave.pad, slave.pad, slave.pad)
         low = round_down(wp.min(slave.x, slave.x0) - wide)
         high = round_up(wp.max(slave.x, slave.x0) + wide)
@@ -329,7 +329,7 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
             if is_far(mas, pair, slave, f):
                 continue
             if free and wp.length_sq(slave.facing) == f64(0.0):
-                slave.facing = opposite_normal(facets, pair, slave, corners)
+                slave.facing = inward_normal(facets, pair, slave, corners)
             out = better_candidate(mas, scr, pair, slave, f, out)
             if free and passed_through_facet(mas, pair, slave, f):
                 out.passed_through = True

@@ -8,14 +8,14 @@ import warp as wp
 from ..common.types import SHORT_UNROLL, kernel_module
 from .pair_structs import master_struct, pair_scratch_struct
 
-__all__ = ["FACETS_PER_CHUNK", "list_kernels"]
+__all__ = ["FACETS_PER_CHUNK", "point_list_kernels"]
 
 FACETS_PER_CHUNK = 64
 """Facets per chunk of the prefix sum."""
 
 
 @functools.cache
-def list_kernels(dtype: str) -> _types.SimpleNamespace:
+def point_list_kernels(dtype: str) -> _types.SimpleNamespace:
     """Kernels in the module of `pair_kernels`."""
     Masters, PairScratch = master_struct(dtype), pair_scratch_struct(dtype)
     module = kernel_module(f"pairs_{dtype}", max_unroll=SHORT_UNROLL)
@@ -56,7 +56,7 @@ def list_kernels(dtype: str) -> _types.SimpleNamespace:
             before += here
 
     @wp.kernel(module=module)
-    def place_lists(mas: Masters, pair: PairScratch):
+    def set_list_starts(mas: Masters, pair: PairScratch):
         """Start of each list in each world."""
         world, f = wp.tid()
         start = pair.chunk_offset[world, f / FACETS_PER_CHUNK]
@@ -89,5 +89,5 @@ def list_kernels(dtype: str) -> _types.SimpleNamespace:
 
     return _types.SimpleNamespace(
         clear_lists=clear_lists, count_points=count_points, sum_chunks=sum_chunks, scan_chunks=scan_chunks,
-        place_lists=place_lists, fill_lists=fill_lists, sort_lists=sort_lists,
+        set_list_starts=set_list_starts, fill_lists=fill_lists, sort_lists=sort_lists,
     )  # fmt: skip

@@ -57,7 +57,7 @@ def facet_projection_functions(dtype: str) -> _types.SimpleNamespace:
         return power(xi[0], mas.power[kind, m][0]) * power(xi[1], mas.power[kind, m][1])
 
     @wp.func
-    def power_change(x0: f64, x: f64, n: int) -> f64:
+    def power_quotient(x0: f64, x: f64, n: int) -> f64:
         """(x^n - x0^n)/(x - x0)."""
         if n < 2:
             return f64(n)
@@ -127,8 +127,8 @@ def facet_projection_functions(dtype: str) -> _types.SimpleNamespace:
         for m in range(mas.monomials[kind]):
             i = mas.power[kind, m][0]
             j = mas.power[kind, m][1]
-            p = step[0] * power_change(old[0], new[0], i) * power(new[1], j)
-            p += power(old[0], i) * step[1] * power_change(old[1], new[1], j)
+            p = step[0] * power_quotient(old[0], new[0], i) * power(new[1], j)
+            p += power(old[0], i) * step[1] * power_quotient(old[1], new[1], j)
             rise = mas.N[m, f] + D[world, mas.max_monomials * f + m]
             out += p * (mas.X[m, f] + C[world, mas.max_monomials * f + m] + old[2] * rise)
             out += (power(new[0], i) * power(new[1], j) * step[2]) * rise

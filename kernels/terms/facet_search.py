@@ -10,16 +10,16 @@ import types as _types
 import warp as wp
 
 from ..common.types import SHORT_UNROLL, kernel_module, precision
-from .broad_phase import MARGIN, broad_phase_kernels
+from .broad_phase import BOX_MARGIN, broad_phase_kernels
 from .contact import MIN_APPROACH_SPEED
 from .contact_laws import PAPER
 from .contact_point import contact_point_functions
 from .contact_structs import clock_struct, contact_scratch_struct, contact_struct, facet_struct, history_struct
-from .facet_candidates import PASSED_DEPTH, facet_candidate_functions
+from .facet_candidates import TUNNEL_LIMIT_RATIO, facet_candidate_functions
 from .facet_projection import OUTSIDE_TOLERANCE, facet_projection_functions
 from .pair_structs import master_struct, pair_history_struct, pair_scratch_struct
 
-__all__ = ["MARGIN", "PENETRATED", "facet_search_kernels"]
+__all__ = ["BOX_MARGIN", "PENETRATED", "facet_search_kernels"]
 
 PENETRATED = -2
 """Facet of a point that has left through the opposite side."""
@@ -35,7 +35,7 @@ def facet_search_kernels(dtype: str) -> _types.SimpleNamespace:
     ContactScratch, Clock = contact_scratch_struct(dtype), clock_struct()
     Masters, PairHistory, PairScratch = master_struct(dtype), pair_history_struct(), pair_scratch_struct(dtype)
     k, f = contact_point_functions(dtype, False), facet_projection_functions(dtype)
-    interpolate, contact_distance = k.interpolate, k.contact_distance
+    interpolate, activation_gap = k.interpolate, k.activation_gap
     surface_point, polynomial_value, displacement_change = f.surface_point, f.polynomial_value, f.displacement_change
     distance_outside, inverse_map, project_on_facet = f.distance_outside, f.inverse_map, f.project_on_facet
     SurfacePoint, boxes, candidates = f.SurfacePoint, broad_phase_kernels(dtype), facet_candidate_functions(dtype)
@@ -76,7 +76,7 @@ def facet_search_kernels(dtype: str) -> _types.SimpleNamespace:
         pair.anchor_facet[world, point] = f + 1
         pair.anchor_xi[world, point] = xi
         pair.anchor_gap[world, point] = wp.vec2d(projection.gap_slope, projection.gap_offset)
-        scr.depth[world, point] = scr.contact_distance[world, point] - (
+        scr.depth[world, point] = scr.activation_gap[world, point] - (
             xi[2] * projection.gap_slope + projection.gap_offset
         )
         speed = wp.max(his.speed[world, point], f64(MIN_APPROACH_SPEED))
@@ -110,7 +110,7 @@ def facet_search_kernels(dtype: str) -> _types.SimpleNamespace:
         scr.depth[world, point] = f64(-1.0e30)
         scr.speed[world, point] = f64(MIN_APPROACH_SPEED)
         pair.anchor_facet[world, point] = 0
-        scr.contact_distance[world, point] = contact_distance(con, his, world, c, point, clock.time[world], f64(0.0))
+        scr.activation_gap[world, point] = activation_gap(con, his, world, c, point, clock.time[world], f64(0.0))
         if his.speed[world, point] > f64(0.0):
             slave = slave_point(facets, world, item, q)
             f = pair_his.facet[world, point] - 1
@@ -147,7 +147,7 @@ def facet_search_kernels(dtype: str) -> _types.SimpleNamespace:
             return
         far = search_distance + inside
         pad = vec3d(far, far, far)
-        empty_box_known = pair.empty_box_refit[world, row] == pair.refits[0]
+        empty_box_known = pair.empty_box_refit[world, row] == pair.refit_count[0]
         if empty_box_known and contains(
             pair.empty_box_lower[world, row],
             pair.empty_box_upper[world, row],
@@ -156,7 +156,7 @@ def facet_search_kernels(dtype: str) -> _types.SimpleNamespace:
         ):
             pair.in_reach[world, row] = 0
             return
-        room = f64(2.0) * far + f64(MARGIN) * wp.length(high - low)
+        room = f64(2.0) * far + f64(BOX_MARGIN) * wp.length(high - low)
         wide = vec3d(room, room, room)
         root = wp.bvh_get_group_root(mas.tree, world * mas.surfaces + mas.surface_of[facets.contact[item]])
         query = wp.bvh_query_aabb(mas.tree, round_down(low - wide), round_up(high + wide), root)
@@ -166,12 +166,12 @@ def facet_search_kernels(dtype: str) -> _types.SimpleNamespace:
             pair.empty_box_refit[world, row] = -1
             return
         pair.in_reach[world, row] = 0
-        pair.empty_box_refit[world, row] = pair.refits[0]
+        pair.empty_box_refit[world, row] = pair.refit_count[0]
         pair.empty_box_lower[world, row] = round_down(low - wide)
         pair.empty_box_upper[world, row] = round_up(high + wide)
 
     @wp.func
-    def frame(s: SurfacePoint) -> wp.mat33d:
+    def facet_frame(s: SurfacePoint) -> wp.mat33d:
         """Columns: first tangent of a facet, second tangent, outward normal."""
         n = wp.normalize(wp.cross(s.a, s.b))
         a = wp.normalize(s.a)
@@ -187,7 +187,7 @@ def facet_search_kernels(dtype: str) -> _types.SimpleNamespace:
         point = slave.point
         c = slave.contact
         projection = project_on_facet(mas, pair.C, pair.D, world, f, xi)
-        now = contact_distance(con, his, world, c, point, clock.new_time[world], f64(0.0))
+        now = activation_gap(con, his, world, c, point, clock.new_time[world], f64(0.0))
         pair.facet[world, point] = f
         pair.xi[world, point] = xi
         pair.projection[world, point] = projection.xi
@@ -207,16 +207,16 @@ def facet_search_kernels(dtype: str) -> _types.SimpleNamespace:
                     (xi[2] - from0[2]) * projection.gap_slope + from0[2] * (projection.gap_slope - before[0]) +
                     (projection.gap_offset - before[1])
                 )  # fmt: skip
-                pair.depth[world, point] = scr.depth[world, point] + (now - scr.contact_distance[world, point]) - rise
+                pair.depth[world, point] = scr.depth[world, point] + (now - scr.activation_gap[world, point]) - rise
             pair.initial_depth[world, point] = scr.depth[world, point]
             if his.speed[world, point] > f64(0.0):
                 spring = his.spring[world, point]
                 if con.law[c] != PAPER:
-                    spring = frame(surface_point(mas, pair.C, pair.D, world, first, from0)) * spring
+                    spring = facet_frame(surface_point(mas, pair.C, pair.D, world, first, from0)) * spring
         else:
             motion -= displacement_change(mas, pair.C, pair.D, pair.C0, pair.D0, world, f, xi)
             pair.initial_depth[world, point] = (
-                pair.depth[world, point] + wp.dot(projection.n, motion) - (now - scr.contact_distance[world, point])
+                pair.depth[world, point] + wp.dot(projection.n, motion) - (now - scr.activation_gap[world, point])
             )
         pair.relative_motion[world, point] = motion
         pair.elastic_slip[world, point] = spring + motion
@@ -245,7 +245,7 @@ def facet_search_kernels(dtype: str) -> _types.SimpleNamespace:
         if candidate.facet >= 0:
             set_contact(con, mas, facets, his, clock, scr, pair, v_n, slave, candidate.facet, candidate.xi)
             most = mas.depth_limit[candidate.facet] * wp.where(
-                candidate.outside_distance > f64(OUTSIDE_TOLERANCE), f64(PASSED_DEPTH), f64(1.0)
+                candidate.outside_distance > f64(OUTSIDE_TOLERANCE), f64(TUNNEL_LIMIT_RATIO), f64(1.0)
             )
             if pair.depth[world, point] > most:
                 pair.facet[world, point] = PENETRATED
@@ -254,5 +254,5 @@ def facet_search_kernels(dtype: str) -> _types.SimpleNamespace:
 
     return _types.SimpleNamespace(
         **vars(boxes), module=module, begin_points=begin_points, query_boxes=query_boxes, find_facets=find_facets,
-        frame=frame,
+        facet_frame=facet_frame,
     )  # fmt: skip

@@ -8,7 +8,7 @@ import warp as wp
 from ..common.types import SHORT_UNROLL, kernel_module
 from .contact_laws import PAPER, law_functions
 from .contact_point import contact_point_functions
-from .contact_structs import contact_scratch_struct, contact_struct, facet_struct, history_struct, of_world
+from .contact_structs import contact_scratch_struct, contact_struct, facet_struct, history_struct, world_value
 from .facet_projection import OUTSIDE_TOLERANCE, facet_projection_functions
 from .facet_search import facet_search_kernels
 from .pair_structs import master_struct, pair_history_struct, pair_scratch_struct
@@ -44,11 +44,11 @@ def pair_evaluation_kernels(dtype: str) -> _types.SimpleNamespace:
         facet_projection_functions(dtype),
         facet_search_kernels(dtype),
     )
-    PointContact, interpolate, contact_distance, frozen_values, with_friction_normal = (
+    PointContact, interpolate, activation_gap, friction_parameters, with_friction_normal = (
         k.PointContact,
         k.interpolate,
-        k.contact_distance,
-        k.frozen_values,
+        k.activation_gap,
+        k.friction_parameters,
         k.with_friction_normal,
     )
     friction_force, normal_law = k.friction_force, law_functions().normal_law
@@ -59,17 +59,17 @@ def pair_evaluation_kernels(dtype: str) -> _types.SimpleNamespace:
         places.unit_normal,
         places.facet_centre,
     )
-    project_on_facet, shape_value, frame, round_down, round_up = (
+    project_on_facet, shape_value, facet_frame, round_down, round_up = (
         places.project_on_facet,
         places.shape_value,
-        seek.frame,
+        seek.facet_frame,
         seek.round_down,
         seek.round_up,
     )
-    module = kernel_module(f"pair_survey_{dtype}", max_unroll=SHORT_UNROLL)
+    module = kernel_module(f"pair_evaluation_{dtype}", max_unroll=SHORT_UNROLL)
 
     @wp.func
-    def nearest(mas: Masters, pair: PairScratch, world: int, surface: int, x: vec3d, far: f64) -> wp.vec4d:
+    def closest_facet(mas: Masters, pair: PairScratch, world: int, surface: int, x: vec3d, far: f64) -> wp.vec4d:
         """Coordinates of x on the closest facet of a surface, and that facet; -1: none within `far`."""
         out = wp.vec4d(f64(0.0), f64(0.0), f64(0.0), f64(-1.0))
         height = far
@@ -119,7 +119,7 @@ def pair_evaluation_kernels(dtype: str) -> _types.SimpleNamespace:
             if found[3] == f64(0.0):
                 f = -1
         if f < 0:
-            found = nearest(mas, pair, world, mas.surface_of[c], x, far)
+            found = closest_facet(mas, pair, world, mas.surface_of[c], x, far)
             place = vec3d(found[0], found[1], found[2])
             f = wp.int32(found[3])
         if f < 0:
@@ -127,16 +127,16 @@ def pair_evaluation_kernels(dtype: str) -> _types.SimpleNamespace:
         projection = project_on_facet(mas, pair.C, pair.D, world, f, place)
         s = PointContact()
         s.n = projection.n
-        contact_distance_now = contact_distance(con, his, world, c, point, time[world], f64(0.0))
-        s.depth = contact_distance_now - (place[2] * projection.gap_slope + projection.gap_offset)
-        k_n = con.scale[world, c] * of_world(con.normal, world, c)
+        activation_gap_now = activation_gap(con, his, world, c, point, time[world], f64(0.0))
+        s.depth = activation_gap_now - (place[2] * projection.gap_slope + projection.gap_offset)
+        k_n = con.scale[world, c] * world_value(con.normal, world, c)
         s.law = normal_law(con.law[c], 0, k_n, f64(0.0), con.ramp[c], con.force_eps[c], s.depth, s.depth)
         if in_contact:
             s.elastic_slip = his.spring[world, point]
             if con.law[c] != PAPER:
-                s.elastic_slip = frame(surface_point(mas, pair.C, pair.D, world, f, place)) * s.elastic_slip
+                s.elastic_slip = facet_frame(surface_point(mas, pair.C, pair.D, world, f, place)) * s.elastic_slip
         s = with_friction_normal(s, s.n)
-        frozen = frozen_values(con, his, scr, world, c, point, s)
+        frozen = friction_parameters(con, his, scr, world, c, point, s)
         frozen[2] = f64(1.0)
         pressed = area_fraction * s.law[0] * s.n
         tangential_force = area_fraction * friction_force(con, world, c, s, frozen, f64(0.0))

@@ -9,7 +9,7 @@ from ..common.types import SHORT_UNROLL, kernel_module
 from .contact import INACTIVE
 from .contact_colliders import SLIP_FLAG
 from .contact_laws import PAPER, law_functions
-from .contact_ledger import ENERGY_COLUMNS, RECORD_SUMS
+from .contact_ledger import ENERGY_COLUMNS, SUMMED_ROWS
 from .contact_point import contact_point_functions
 from .contact_structs import (
     clock_struct,
@@ -17,7 +17,7 @@ from .contact_structs import (
     contact_struct,
     facet_struct,
     history_struct,
-    of_world,
+    world_value,
 )
 from .facet_projection import facet_projection_functions
 from .facet_search import facet_search_kernels
@@ -35,18 +35,26 @@ def pair_ledger_kernels(dtype: str) -> _types.SimpleNamespace:
     ContactScratch, Clock = contact_scratch_struct(dtype), clock_struct()
     Masters, PairHistory, PairScratch = master_struct(dtype), pair_history_struct(), pair_scratch_struct(dtype)
     k, surface_point = contact_point_functions(dtype, False), facet_projection_functions(dtype).surface_point
-    PointContact, with_friction_normal, friction_trial, tangential, friction_force, coefficient, overlap_recovery = (
+    (
+        PointContact,
+        with_friction_normal,
+        friction_trial,
+        tangential,
+        friction_force,
+        friction_coefficient,
+        overlap_recovery,
+    ) = (
         k.PointContact,
         k.with_friction_normal,
         k.friction_trial,
         k.tangential,
         k.friction_force,
-        k.coefficient,
+        k.friction_coefficient,
         k.overlap_recovery,
     )
-    elastic = law_functions().elastic
+    elastic_force = law_functions().elastic_force
     evaluate_pair_point = pair_functions(dtype).evaluate_pair_point
-    frame = facet_search_kernels(dtype).frame
+    facet_frame = facet_search_kernels(dtype).facet_frame
     module = kernel_module(f"pairs_{dtype}", max_unroll=SHORT_UNROLL)
 
     @wp.func
@@ -59,7 +67,7 @@ def pair_ledger_kernels(dtype: str) -> _types.SimpleNamespace:
         """Clear the energy increments and the record of a facet."""
         for j in range(ENERGY_COLUMNS):
             energies[j, world, row] = f64(0.0)
-        for j in range(RECORD_SUMS + 1):
+        for j in range(SUMMED_ROWS + 1):
             scr.rows[j, world, row] = f64(0.0)
 
     @wp.func
@@ -171,12 +179,12 @@ def pair_ledger_kernels(dtype: str) -> _types.SimpleNamespace:
                 normal = wp.dot(force, s.m)
                 tangential_force = normal * s.m - force
                 friction_spring = scr.explicit_spring[world, point]
-                k_t = con.scale[world, c] * of_world(con.tangent, world, c)
-                frozen = vec3d(coefficient(con, his, world, c, point) * normal, k_t, f64(1.0))
+                k_t = con.scale[world, c] * world_value(con.tangent, world, c)
+                frozen = vec3d(friction_coefficient(con, his, world, c, point) * normal, k_t, f64(1.0))
                 slipping = wp.where(wp.length(tangential_force) >= f64(0.999999) * frozen[0], 1, 0)
             elif normal > f64(0.0) and frozen[1] > f64(0.0):
                 friction_spring = return_mapping(law, s, frozen, w, tangential_force)
-            spring = elastic(0, con.scale[world, c] * of_world(con.normal, world, c), s.depth)
+            spring = elastic_force(0, con.scale[world, c] * world_value(con.normal, world, c), s.depth)
             stored = spring[1] + f64(0.5) * frozen[1] * wp.dot(friction_spring, friction_spring)
             slip_increment = s.slip - (friction_spring - previous_spring)
             friction_loss = wp.dot(
@@ -196,7 +204,7 @@ def pair_ledger_kernels(dtype: str) -> _types.SimpleNamespace:
                 clear_history(his, pair_his, world, point)
             else:
                 if law != PAPER:
-                    friction_spring = wp.transpose(frame(place)) * friction_spring
+                    friction_spring = wp.transpose(facet_frame(place)) * friction_spring
                 his.spring[world, point] = friction_spring
                 his.stored[world, point] = stored
                 update_history(

@@ -22,7 +22,7 @@ def pair_rigid_mode_kernels(dtype: str) -> _types.SimpleNamespace:
     Bodies, Masters, Facets = bodies_struct(dtype), master_struct(dtype), facet_struct(dtype)
     rigid = rigid_mode_functions(dtype)
     translation_columns, rotation_columns = rigid.translation_columns, rigid.rotation_columns
-    module = kernel_module(f"pair_motions_{dtype}", max_unroll=SHORT_UNROLL)
+    module = kernel_module(f"pair_rigid_modes_{dtype}", max_unroll=SHORT_UNROLL)
 
     @wp.kernel(module=module)
     def cross_term_sums(

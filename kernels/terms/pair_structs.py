@@ -82,7 +82,7 @@ def pair_scratch_struct(dtype: str):
         refit_lower: wp.array(dtype=wp.vec3)
         refit_upper: wp.array(dtype=wp.vec3)
         refit_needed: wp.array(dtype=wp.int32)  # a facet has left its box
-        refits: wp.array(dtype=wp.int32)  # number of refits so far
+        refit_count: wp.array(dtype=wp.int32)  # number of refits so far
         in_reach: wp.array2d(dtype=wp.int32)  # [world, facet row of the slaves] 1 if a master surface is within reach
         empty_box_lower: wp.array2d(dtype=wp.vec3)  # box without master facets, valid for refit `empty_box_refit`
         empty_box_upper: wp.array2d(dtype=wp.vec3)

@@ -22,7 +22,7 @@ from .contact_structs import (
     contact_struct,
     facet_struct,
     history_struct,
-    of_world,
+    world_value,
 )
 from .facet_projection import facet_projection_functions
 from .facet_search import PENETRATED
@@ -41,7 +41,11 @@ def pair_functions(dtype: str) -> _types.SimpleNamespace:
         pair_scratch_struct(dtype),
     )
     k, normal_law = contact_point_functions(dtype, False), law_functions().normal_law
-    PointContact, with_friction_normal, damping_rate = k.PointContact, k.with_friction_normal, k.damping_rate
+    PointContact, with_friction_normal, normal_damping_rate = (
+        k.PointContact,
+        k.with_friction_normal,
+        k.normal_damping_rate,
+    )
 
     @wp.func
     def evaluate_pair_point(
@@ -52,8 +56,8 @@ def pair_functions(dtype: str) -> _types.SimpleNamespace:
         out.n = pair.normal[world, point]
         out.depth = pair.depth[world, point]
         out.depth_increment = out.depth - pair.initial_depth[world, point]
-        k_n = con.scale[world, c] * of_world(con.normal, world, c)
-        rate = damping_rate(con, scr, world, c, point, inv_h)
+        k_n = con.scale[world, c] * world_value(con.normal, world, c)
+        rate = normal_damping_rate(con, scr, world, c, point, inv_h)
         out.law = normal_law(con.law[c], 0, k_n, rate, con.ramp[c], con.force_eps[c], out.depth,
                              pair.initial_depth[world, point])  # fmt: skip
         out.relative_motion = pair.relative_motion[world, point]
@@ -74,9 +78,9 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
     Masters, PairHistory, PairScratch = master_struct(dtype), pair_history_struct(), pair_scratch_struct(dtype)
     k, places = contact_point_functions(dtype, False), facet_projection_functions(dtype)
     PointContact, evaluate_pair_point = k.PointContact, pair_functions(dtype).evaluate_pair_point
-    with_friction_normal, frozen_values, set_explicit_force = (
+    with_friction_normal, friction_parameters, set_explicit_force = (
         k.with_friction_normal,
-        k.frozen_values,
+        k.friction_parameters,
         k.set_explicit_force,
     )
     friction_potential, friction_force, point_stiffness = k.friction_potential, k.friction_force, k.point_stiffness
@@ -192,7 +196,7 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
             pair.shape_values[world, point, i] = T(shape_value(mas, f, i, pair.anchor_xi[world, point]))
 
     @wp.func
-    def refuse_point(scr: ContactScratch, pair: PairScratch, world: int, point: int):
+    def reject_point(scr: ContactScratch, pair: PairScratch, world: int, point: int):
         """Infinite potential of a point that has passed through a body: the iterate is refused."""
         scr.passed_through[world] = point + 1
         scr.activity[world, point] = FORCE_ONLY
@@ -201,12 +205,12 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         scr.energy[world, point] = wp.vec2d(f64(wp.inf), f64(0.0))
 
     @wp.func
-    def freeze_limits(
+    def freeze_friction(
         con: Contacts, his: History, scr: ContactScratch, world: int, c: int, point: int, s: PointContact, fresh: int
     ) -> vec3d:
         """Frozen friction limit, k_t and spring factor of a point; `fresh`: they and the normal are those of s."""
         frozen = scr.frozen[world, point]
-        new = frozen_values(con, his, scr, world, c, point, s)
+        new = friction_parameters(con, his, scr, world, c, point, s)
         if fresh != 0:
             scr.frozen_normal[world, point] = s.m
             frozen = new
@@ -241,7 +245,7 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         scr.activity[world, point] = WITH_STIFFNESS
         pair.tangential_force[world, point] = tangential_force
         set_geometric_stiffness(
-            mas, pair, world, point, f, scr.contact_distance[world, point] - s.depth, area_fraction * s.law[0]
+            mas, pair, world, point, f, scr.activation_gap[world, point] - s.depth, area_fraction * s.law[0]
         )
         scr.force[world, point] = tangential_force - (area_fraction * s.law[0]) * s.n
         scr.energy[world, point] = wp.vec2d(
@@ -252,7 +256,7 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
             T(area_fraction * K[0, 1]))  # fmt: skip
 
     @wp.func
-    def change_list(scr: ContactScratch, pair: PairScratch, world: int, point: int, f: int):
+    def update_listed_facet(scr: ContactScratch, pair: PairScratch, world: int, point: int, f: int):
         """Facet whose list contains a point: its own where it has a force."""
         wanted = wp.int32(0)
         if scr.activity[world, point] != INACTIVE and f >= 0:
@@ -281,14 +285,14 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
                 f = pair_his.facet[world, point] - 1
                 apply_explicit_force(mas, scr, pair, world, point, f, area_fraction)
         elif f == PENETRATED:
-            refuse_point(scr, pair, world, point)
+            reject_point(scr, pair, world, point)
             f = -1
         elif f >= 0 and area_fraction > f64(0.0):
             inv_h = f64(0.0)
             if clock.still == 0:
                 inv_h = f64(1.0) / clock.h[world]
             s = evaluate_pair_point(con, scr, pair, world, c, point, inv_h)
-            frozen = freeze_limits(con, his, scr, world, c, point, s, fresh)
+            frozen = freeze_friction(con, his, scr, world, c, point, s, fresh)
             m = scr.frozen_normal[world, point]
             if wp.dot(m, s.m) <= f64(0.5):  # the point has passed to another facet since
                 m = s.m
@@ -311,10 +315,10 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
             if fresh != 0:
                 scr.frozen[world, point] = frozen
                 scr.frozen_normal[world, point] = frozen
-        change_list(scr, pair, world, point, f)
+        update_listed_facet(scr, pair, world, point, f)
 
     @wp.kernel(module=module)
-    def gather_masters(
+    def gather_master_forces(
         mas: Masters, active: wp.array(dtype=wp.int32), lanes: int, scr: ContactScratch, pair: PairScratch,
         pool: wp.array2d(dtype=vec3),
     ):  # fmt: skip
@@ -337,13 +341,13 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
             pool[world, mas.pool + entry] = total
 
     @wp.func
-    def times(k: sym, p: vec3) -> vec3:
+    def multiply_symmetric(k: sym, p: vec3) -> vec3:
         """The symmetric matrix k (Voigt) times p."""
         return vec3(k[0] * p[0] + k[5] * p[1] + k[4] * p[2], k[5] * p[0] + k[1] * p[1] + k[3] * p[2],
                     k[4] * p[0] + k[3] * p[1] + k[2] * p[2])  # fmt: skip
 
     @wp.kernel(module=module)
-    def product_points(
+    def point_products(
         mas: Masters, facets: Facets, active: wp.array(dtype=wp.int32), p: wp.array2d(dtype=vec3), scr: ContactScratch,
         pair: PairScratch,
     ):  # fmt: skip
@@ -371,14 +375,14 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         g = pair.geometric_curvature[world, point]
         tau = vec2(wp.dot(a, d), wp.dot(b, d))
         scr.product[world, point] = (
-            times(scr.stiffness[world, point], d)
+            multiply_symmetric(scr.stiffness[world, point], d)
             + (e[0] + g[3] * tau[0] + g[5] * tau[1]) * a
             + (e[1] + g[5] * tau[0] + g[4] * tau[1]) * b
         )
         pair.facet_rotation[world, point] = tau + vec2(g[0] * e[0] + g[2] * e[1], g[2] * e[0] + g[1] * e[1])
 
     @wp.kernel(module=module)
-    def product_sides(
+    def gather_pair_products(
         mas: Masters, facets: Facets, active: wp.array(dtype=wp.int32), lanes: int, last: int, scr: ContactScratch,
         pair: PairScratch, pool: wp.array2d(dtype=vec3),
     ):  # fmt: skip
@@ -415,7 +419,7 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
             pool[world, place] = out
 
     @wp.kernel(module=module)
-    def diagonal_masters(
+    def master_diagonal(
         mas: Masters, active: wp.array(dtype=wp.int32), scr: ContactScratch, pair: PairScratch,
         pool: wp.array2d(dtype=sym)
     ):  # fmt: skip
@@ -433,6 +437,7 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
 
     return _types.SimpleNamespace(
         module=module, explicit_forces=explicit_forces, forces=forces, update_friction_shapes=update_friction_shapes,
-        gather_masters=gather_masters, product_points=product_points, product_sides=product_sides,
-        diagonal_masters=diagonal_masters,
+        gather_master_forces=gather_master_forces, point_products=point_products,
+        gather_pair_products=gather_pair_products,
+        master_diagonal=master_diagonal,
     )  # fmt: skip

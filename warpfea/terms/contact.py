@@ -11,7 +11,7 @@ import warp as wp
 from ..base.errors import PenetrationError
 from ..kernels.common.traits import Traits
 from ..kernels.solvers.newton_control import FAIL_FLOOR, FAIL_WORK
-from ..kernels.terms.contact import MAX_ROTATION, RELAX_LANES, contact_kernels
+from ..kernels.terms.contact import AITKEN_LANES, MAX_COLLIDER_ROTATION, contact_kernels
 from ..kernels.terms.contact_ledger import ENERGY_COLUMNS, RECORD_LANES, contact_block_kernels, contact_ledger_kernels
 from ..kernels.terms.contact_structs import RECORD, clock_struct, contact_scratch_struct, history_struct
 from ..model.state import State
@@ -89,7 +89,7 @@ class Contact(Term):
         K, P, C, R = len(t.colliders), t.points, len(t.contacts), t.rows
         shapes: dict[str, tuple[int, ...]] = {
             "passed_through": (B,), "elapsed": (B,), "relaxation": (B,), "limit_updates": (B,), "aitken_norm2": (B,),
-            "aitken_sums": (B, RELAX_LANES), "contact_point": (B, C), "choices": (B, C), "total": (B, C, len(RECORD)),
+            "aitken_sums": (B, AITKEN_LANES), "contact_point": (B, C), "choices": (B, C), "total": (B, C, len(RECORD)),
             "facet_activity": (B, R), "facet_point": (B, R), "facet_xi": (B, R), "facet_depth": (B, R),
             "chosen_facet": (B, C), "point_reference": (B, C),
             "shape_values": (B, C, max(group.conn.shape[1] for group in t.groups)), "rows": (len(RECORD), B, R),
@@ -187,7 +187,7 @@ class Contact(Term):
     def _poses(self, ctx: StepContext, active: wp.array) -> None:
         s = ctx.scratch[self.name]
         args = [self.tables.data, s["history"], ctx.work.time_law_values, active, s["attempt"]]
-        ctx.launch(self.kernels.poses, (self.model.worlds, len(self.tables.colliders)), args)
+        ctx.launch(self.kernels.update_poses, (self.model.worlds, len(self.tables.colliders)), args)
 
     # in a step
 
@@ -225,7 +225,7 @@ class Contact(Term):
             ctx.launch(k.forces, (m.worlds, group.count, group.data.points), [*args, s["attempt"]])
             dim, lanes = group.sides(ctx.launch, m.worlds)
             args = [group.data, active, lanes, s["attempt"], w.pool_force, rows, s["touching"]]
-            ctx.launch(k.gather_points, dim, args)
+            ctx.launch(k.gather_point_forces, dim, args)
 
     def _pick(self, ctx: StepContext, active: wp.array, *, fresh: int) -> None:
         """Select the point of each single-point contact at work.u."""
@@ -239,8 +239,8 @@ class Contact(Term):
     @part("contact")
     def update_frozen(self, ctx: StepContext, flags: wp.array) -> None:
         k, m, attempt = self.kernels, self.model, ctx.scratch[self.name]["attempt"]
-        ctx.launch(k.aitken_partial_sums, (m.worlds, RELAX_LANES), [flags, attempt])
-        ctx.launch(k.relax, m.worlds, [flags, ctx.work.newton.tol, attempt, ctx.work.newton.partly_updated])
+        ctx.launch(k.aitken_partial_sums, (m.worlds, AITKEN_LANES), [flags, attempt])
+        ctx.launch(k.aitken_relaxation, m.worlds, [flags, ctx.work.newton.tol, attempt, ctx.work.newton.partly_updated])
         ctx.launch(k.update_frozen, (m.worlds, self.tables.points), [flags, attempt])
         self._pick(ctx, flags, fresh=0)
 
@@ -249,10 +249,10 @@ class Contact(Term):
         m, k, attempt = self.model, self.kernels, ctx.scratch[self.name]["attempt"]
         for group in self.tables.groups:
             dim = (m.worlds, group.count, group.data.points)
-            ctx.launch(k.product_points, dim, [group.data, active, p, attempt])
+            ctx.launch(k.point_products, dim, [group.data, active, p, attempt])
             sides, lanes = group.sides(ctx.launch, m.worlds)
             args = [group.data, active, lanes, attempt, ctx.work.pool_product]
-            ctx.launch(k.product_facets, sides, args)
+            ctx.launch(k.gather_facet_products, sides, args)
 
     @part("contact")
     def diagonal(self, ctx: StepContext, active: wp.array) -> None:
@@ -320,7 +320,7 @@ class Contact(Term):
         *, projected: bool,
     ) -> None:  # fmt: skip
         """Positive semi-definite stiffness of the points."""
-        m, kernel = self.model, contact_block_kernels(self.model.dtype).add_contact
+        m, kernel = self.model, contact_block_kernels(self.model.dtype).add_contact_blocks
         for group, (entry, start, source, count) in zip(self.tables.groups, m.cache["contact blocks"]):
             args = [m.topology, matrix.pattern.data, group.data, entry, start, source, kept[0]]
             weight = kept[1] if self.tables.moving else ctx.scratch[self.name]["attempt"].shape_values
@@ -339,8 +339,8 @@ class Contact(Term):
         contact = t.contacts[k]
         if found < 0:
             return PenetrationError, (
-                f"contact {contact.name!r}: collider {contact.collider.name!r} turns by more than {MAX_ROTATION:g} rad "
-                "in the step, in which it is touched; take a smaller dt"
+                f"contact {contact.name!r}: collider {contact.collider.name!r} turns by more than "
+                f"{MAX_COLLIDER_ROTATION:g} rad in the step, in which it is touched; take a smaller dt"
             )
         where = reference_place(t, k, number - int(t.first[k]))
         return PenetrationError, (

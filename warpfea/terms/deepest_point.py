@@ -80,7 +80,7 @@ def at_points(term: Any, state: State, history: Any = None, places: bool = True)
     if "contact_position" in state.specs:  # statics resets its time to 0
         attempt.position, attempt.rotation = history.position, history.rotation
     else:
-        launch(term.kernels.poses, (B, K), [t.data, history, value, every, attempt])
+        launch(term.kernels.update_poses, (B, K), [t.data, history, value, every, attempt])
         attempt.translation.zero_()
         attempt.rotation_change.zero_()
     gap, force = zeros((B, P), wp.float64), zeros((B, P), wp.vec3d)
@@ -103,5 +103,5 @@ def at_points(term: Any, state: State, history: Any = None, places: bool = True)
     for group in t.groups:
         dim = (B, group.count, group.data.points)
         args = [t.data, group.data, history, u, state.time, attempt, int(places), gap, force]
-        launch(term.ledger_kernels.at_points, dim, args)
+        launch(term.ledger_kernels.evaluate_at_points, dim, args)
     return gap.numpy(), force.numpy()

@@ -11,10 +11,10 @@ import warp as wp
 from ..base.errors import PenetrationError
 from ..kernels.common.traits import Traits
 from ..kernels.solvers.newton_control import FAIL_FLOOR, FAIL_WORK
-from ..kernels.terms.contact import RELAX_LANES
+from ..kernels.terms.contact import AITKEN_LANES
 from ..kernels.terms.contact_ledger import ENERGY_COLUMNS, RECORD_LANES, contact_ledger_kernels
 from ..kernels.terms.contact_structs import RECORD, clock_struct, contact_scratch_struct, history_struct
-from ..kernels.terms.facet_point_lists import FACETS_PER_CHUNK, list_kernels
+from ..kernels.terms.facet_point_lists import FACETS_PER_CHUNK, point_list_kernels
 from ..kernels.terms.facet_search import facet_search_kernels
 from ..kernels.terms.pair_ledger import pair_ledger_kernels
 from ..kernels.terms.pair_structs import pair_history_struct, pair_scratch_struct
@@ -61,7 +61,7 @@ class Pairs(PairSolves):
         super().__init__(model)
         self.traits = Traits(unilateral=True)
         self.ledger_kernels, self.seek = contact_ledger_kernels(model.dtype, False), facet_search_kernels(model.dtype)
-        self.lists, self.pair_ledger_kernels = list_kernels(model.dtype), pair_ledger_kernels(model.dtype)
+        self.lists, self.pair_ledger_kernels = point_list_kernels(model.dtype), pair_ledger_kernels(model.dtype)
         self.report_columns = len(RECORD) * len(self.tables.contacts)
 
     @classmethod
@@ -97,7 +97,7 @@ class Pairs(PairSolves):
         shapes: dict[str, tuple[int, ...]] = dict.fromkeys(
             (
                 "origin",
-                "contact_distance",
+                "activation_gap",
                 "depth",
                 "speed",
                 "frozen",
@@ -115,7 +115,7 @@ class Pairs(PairSolves):
         )
         shapes |= dict.fromkeys(("explicit_force", "explicit_spring"), point if t.explicit else (1, 1))
         shapes |= dict.fromkeys(("passed_through", "elapsed", "relaxation", "limit_updates", "aitken_norm2"), (B,))
-        shapes |= {"aitken_sums": (B, RELAX_LANES), "total": (B, C, len(RECORD)), "facet_activity": (B, t.rows)}
+        shapes |= {"aitken_sums": (B, AITKEN_LANES), "total": (B, C, len(RECORD)), "facet_activity": (B, t.rows)}
         shapes |= {"rows": (len(RECORD), B, t.rows), "shape_values": (1, 1, 1)}
         out = contact_scratch_struct(self.model.dtype)()
         for name, shape in shapes.items():
@@ -130,7 +130,7 @@ class Pairs(PairSolves):
         F, P, R = t.facets, t.points, t.rows
         shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("C", "D", "C0", "D0", "V0"), (B, F * most))
         shapes |= dict.fromkeys(("lower", "upper", "refit_lower", "refit_upper", "list_count"), (B * F,))
-        shapes |= dict.fromkeys(("refit_needed", "refits", "lists_changed"), (1,))
+        shapes |= dict.fromkeys(("refit_needed", "refit_count", "lists_changed"), (1,))
         shapes |= dict.fromkeys(("in_reach", "empty_box_lower", "empty_box_upper", "empty_box_refit"), (B, R))
         shapes |= dict.fromkeys(("list_size", "list_start", "centre", "centre0", "bulge"), (B, F))
         shapes |= {"chunk_offset": (B, -(-F // FACETS_PER_CHUNK))}
@@ -139,7 +139,7 @@ class Pairs(PairSolves):
         out = pair_scratch_struct(self.model.dtype)()
         for name, var in pair_scratch_struct(self.model.dtype).vars.items():
             setattr(out, name, work.array(f"pairs {name}", shapes.get(name, (B, P)), var.type.dtype))
-        out.refits.fill_(1)
+        out.refit_count.fill_(1)
         return out
 
     def allocate(self, work: Workspace, ctx: StepContext) -> None:
@@ -291,10 +291,10 @@ class Pairs(PairSolves):
         for group in t.groups:
             sides, lanes = group.sides(ctx.launch, m.worlds)
             args = [group.data, active, lanes, s["attempt"], w.pool_force, w.rows_of(self), s["active"]]
-            ctx.launch(self.shared.gather_points, sides, args)
+            ctx.launch(self.shared.gather_point_forces, sides, args)
         lanes = ctx.launch.lanes(LISTED)
         args = [masters, active, lanes, s["attempt"], touching, w.pool_force]
-        ctx.launch(self.kernels.gather_masters, (m.worlds, ctx.launch.padded(lanes * t.master_conn.size)), args)
+        ctx.launch(self.kernels.gather_master_forces, (m.worlds, ctx.launch.padded(lanes * t.master_conn.size)), args)
 
     def _list(self, ctx: StepContext) -> None:
         """Build the point lists of the master facets."""
@@ -304,15 +304,15 @@ class Pairs(PairSolves):
         ctx.launch(k.count_points, (m.worlds, t.points), [masters, touching])
         ctx.launch(k.sum_chunks, touching.chunk_offset.shape, [masters, touching])
         ctx.launch(k.scan_chunks, m.worlds, [touching])
-        ctx.launch(k.place_lists, (m.worlds, t.facets), [masters, touching])
+        ctx.launch(k.set_list_starts, (m.worlds, t.facets), [masters, touching])
         ctx.launch(k.fill_lists, (m.worlds, t.points), [masters, touching])
         ctx.launch(k.sort_lists, (m.worlds, t.facets), [touching])
 
     @part("pairs")
     def update_frozen(self, ctx: StepContext, flags: wp.array) -> None:
         k, m, attempt = self.shared, self.model, ctx.scratch[self.name]["attempt"]
-        ctx.launch(k.aitken_partial_sums, (m.worlds, RELAX_LANES), [flags, attempt])
-        ctx.launch(k.relax, m.worlds, [flags, ctx.work.newton.tol, attempt, ctx.work.newton.partly_updated])
+        ctx.launch(k.aitken_partial_sums, (m.worlds, AITKEN_LANES), [flags, attempt])
+        ctx.launch(k.aitken_relaxation, m.worlds, [flags, ctx.work.newton.tol, attempt, ctx.work.newton.partly_updated])
         ctx.launch(k.update_frozen, (m.worlds, self.tables.points), [flags, attempt])
         s = ctx.scratch[self.name]
         for group in self.tables.groups:
