@@ -86,7 +86,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             term = con.slot_term[k]
             row = term / 3
             d = con.slot_weight[k] * mul.gradient[world, term]
-            constraint_force += mul.trial[world, row] * d
+            constraint_force += mul.trial_multiplier[world, row] * d
             penalty += mul.penalty_force[world, row] * d
             merit += mul.frozen_force[world, row] * d
         return wp.matrix_from_rows(constraint_force, penalty, merit)

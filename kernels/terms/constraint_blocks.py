@@ -65,11 +65,11 @@ def constraint_block_kernels(dtype: str) -> _types.SimpleNamespace:
         """d2c / (d vector a  d vector b) of a row, a and b its sides."""
         kind = con.kind[row]
         f = mul.target[world, row]
-        scale = mul.scale[world, row]
+        scale = mul.signed_scale[world, row]
         one = wp.identity(n=3, dtype=f64)
         if kind == DISTANCE:
             n = mul.gradient[world, 3 * row] / scale
-            size = wp.abs(mul.value[world, row] / scale + f)
+            size = wp.abs(mul.constraint_value[world, row] / scale + f)
             if a == 0 and b == 0:
                 return (scale / size) * (one - wp.outer(n, n))
         elif kind == ANGLE:
@@ -102,10 +102,10 @@ def constraint_block_kernels(dtype: str) -> _types.SimpleNamespace:
             a = pairs.term_a[k]
             b = pairs.term_b[k]
             row = a / 3
-            penalty_part = mul.stiffness[world, row] * wp.outer(mul.gradient[world, a], mul.gradient[world, b])
+            penalty_part = mul.penalty[world, row] * wp.outer(mul.gradient[world, a], mul.gradient[world, b])
             curvature_part = (
                 midpoint_factor
-                * mul.trial[world, row]
+                * mul.trial_multiplier[world, row]
                 * second_derivative(con, mul, world, row, a - 3 * row, b - 3 * row)
             )
             A += pairs.weight[k] * (penalty_part + curvature_part)
