@@ -26,8 +26,8 @@ def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
     mat43 = wp.types.matrix(shape=(4, 3), dtype=f64)
     Masters, PairScratch = master_struct(dtype), pair_scratch_struct(dtype)
     f = facet_projection_functions(dtype)
-    SurfacePoint, surface_point, facet_centre, unit_normal = (
-        f.SurfacePoint,
+    FacetPoint, surface_point, facet_centre, unit_normal = (
+        f.FacetPoint,
         f.surface_point,
         f.facet_centre,
         f.unit_normal,
@@ -56,7 +56,7 @@ def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
     ):  # fmt: skip
         """Coefficients of displacements on master facets in float64, see kernels/terms/double_displacements.py."""
         world, item, m = wp.tid()
-        if active[world] != 0 and m < mas.monomials[mas.kind[item]]:
+        if active[world] != 0 and m < mas.monomial_count[mas.facet_kind[item]]:
             set_coefficient(mas, u, world, item, m, C, D)
 
     @wp.kernel(module=module)
@@ -68,12 +68,12 @@ def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
         world, item, m = wp.tid()
         if active[world] != 0:
             for body in range(
-                mas.max_monomials * item + m, pair.deepest_contact.shape[1], mas.max_monomials * mas.count
+                mas.max_monomials * item + m, pair.deepest_contact.shape[1], mas.max_monomials * mas.facet_count
             ):
                 pair.deepest_contact[world, body] = f64(0.0)
-        if active[world] != 0 and m < mas.monomials[mas.kind[item]]:
-            set_coefficient(mas, v_n, world, item, m, pair.V0, pair.D0)
-            set_coefficient(mas, u_n, world, item, m, pair.C0, pair.D0)
+        if active[world] != 0 and m < mas.monomial_count[mas.facet_kind[item]]:
+            set_coefficient(mas, v_n, world, item, m, pair.start_v_coefs, pair.start_director_coefs)
+            set_coefficient(mas, u_n, world, item, m, pair.start_u_coefs, pair.start_director_coefs)
 
     @wp.func
     def round_down(x: vec3d) -> box3:
@@ -99,14 +99,27 @@ def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
         return inside
 
     @wp.func
-    def pack_surface_point(s: SurfacePoint) -> mat43:
+    def pack_facet_point(s: FacetPoint) -> mat43:
         """Position and derivatives, packed in a matrix."""
-        return mat43(s.x[0], s.x[1], s.x[2], s.a[0], s.a[1], s.a[2], s.b[0], s.b[1], s.b[2], s.c[0], s.c[1], s.c[2])
+        return mat43(
+            s.position[0],
+            s.position[1],
+            s.position[2],
+            s.tangent_a[0],
+            s.tangent_a[1],
+            s.tangent_a[2],
+            s.tangent_b[0],
+            s.tangent_b[1],
+            s.tangent_b[2],
+            s.director[0],
+            s.director[1],
+            s.director[2],
+        )
 
     @wp.func
-    def unpack_surface_point(m: mat43) -> SurfacePoint:
+    def unpack_facet_point(m: mat43) -> FacetPoint:
         """Position and derivatives from their matrix."""
-        return SurfacePoint(m[0], m[1], m[2], m[3])
+        return FacetPoint(m[0], m[1], m[2], m[3])
 
     @wp.kernel(module=module)
     def check_boxes(mas: Masters, active: wp.array(dtype=wp.int32), pair: PairScratch):
@@ -116,22 +129,24 @@ def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
             return
         low = vec3d(f64(1.0e300), f64(1.0e300), f64(1.0e300))
         high = -low
-        kind = mas.kind[item]
-        count = mas.monomials[kind]
+        kind = mas.facet_kind[item]
+        count = mas.monomial_count[kind]
         for q in range(count):
             x = vec3d()
             y = vec3d()
             for m in range(count):
-                part = mas.hull[kind, q, m]
+                part = mas.hull_coefficients[kind, q, m]
                 if part != f64(0.0):
-                    x += part * (mas.X[m, item] + pair.C[world, mas.max_monomials * item + m])
-                    y += part * (mas.X[m, item] + pair.C0[world, mas.max_monomials * item + m])
+                    x += part * (mas.position_coefficients[m, item] + pair.u_coefs[world, mas.max_monomials * item + m])
+                    y += part * (
+                        mas.position_coefficients[m, item] + pair.start_u_coefs[world, mas.max_monomials * item + m]
+                    )
             low = wp.min(low, wp.min(x, y))
             high = wp.max(high, wp.max(x, y))
-        index = world * mas.count + item
-        if not contains(pair.lower[index], pair.upper[index], round_down(low), round_up(high)):
+        index = world * mas.facet_count + item
+        if not contains(pair.box_lower[index], pair.box_upper[index], round_down(low), round_up(high)):
             pair.refit_needed[0] = 1
-        room = f64(BOX_MARGIN) * mas.size[item]
+        room = f64(BOX_MARGIN) * mas.side_length[item]
         pad = vec3d(room, room, room)
         pair.refit_lower[index] = round_down(low - pad)
         pair.refit_upper[index] = round_up(high + pad)
@@ -143,27 +158,31 @@ def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
         world, item = wp.tid()
         if active[world] == 0:
             return
-        kind = mas.kind[item]
-        count = mas.monomials[kind]
-        xi = facet_centre(mas.corners[kind])
-        s = surface_point(mas, pair.C, pair.D, world, item, xi)
+        kind = mas.facet_kind[item]
+        count = mas.monomial_count[kind]
+        xi = facet_centre(mas.corner_count[kind])
+        s = surface_point(mas, pair.u_coefs, pair.director_coefs, world, item, xi)
         n = unit_normal(s)
         bulge = f64(0.0)
         for q in range(count):
             x = vec3d()
             for m in range(count):
-                x += mas.hull[kind, q, m] * (mas.X[m, item] + pair.C[world, mas.max_monomials * item + m])
-            bulge = wp.max(bulge, wp.dot(x - s.x, n))
+                x += mas.hull_coefficients[kind, q, m] * (
+                    mas.position_coefficients[m, item] + pair.u_coefs[world, mas.max_monomials * item + m]
+                )
+            bulge = wp.max(bulge, wp.dot(x - s.position, n))
         pair.bulge[world, item] = bulge
-        pair.centre[world, item] = pack_surface_point(s)
-        pair.centre0[world, item] = pack_surface_point(surface_point(mas, pair.C0, pair.D0, world, item, xi))
+        pair.centre[world, item] = pack_facet_point(s)
+        pair.start_centre[world, item] = pack_facet_point(
+            surface_point(mas, pair.start_u_coefs, pair.start_director_coefs, world, item, xi)
+        )
 
     @wp.kernel(module=module)
     def accept_boxes(pair: PairScratch):
         """Replace the boxes by the new ones."""
         index = wp.tid()
-        pair.lower[index] = pair.refit_lower[index]
-        pair.upper[index] = pair.refit_upper[index]
+        pair.box_lower[index] = pair.refit_lower[index]
+        pair.box_upper[index] = pair.refit_upper[index]
         if index == 0:
             pair.refit_needed[0] = 0
             pair.refit_count[0] = pair.refit_count[0] + 1
@@ -171,5 +190,5 @@ def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
     return _types.SimpleNamespace(
         update_coefficients=update_coefficients, initial_coefficients=initial_coefficients, check_boxes=check_boxes,
         update_centres=update_centres, accept_boxes=accept_boxes, round_down=round_down, round_up=round_up,
-        contains=contains, unpack_surface_point=unpack_surface_point,
+        contains=contains, unpack_facet_point=unpack_facet_point,
     )  # fmt: skip

@@ -45,19 +45,19 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
     class PointContact:
         """A point at an iterate; forces are of the whole region."""
 
-        n: vec3d  # outward normal of the shape
+        normal: vec3d  # outward normal of the shape
         depth: f64
         depth_increment: (
             f64  # change of depth in the step; of a moving contact point, from the depth of the previous one
         )
         side: wp.int32
-        law: wp.vec4d  # normal force, its derivative, its potential, the magnitude of the potential's terms
-        m: vec3d  # normal of the plane of friction
+        normal_response: wp.vec4d  # normal force, its derivative, its potential, the magnitude of the potential's terms
+        friction_normal: vec3d  # normal of the plane of friction
         relative_motion: vec3d  # in the step, relative to the collider, m
-        elastic_slip: vec3d  # motion plus spring, m
-        slip: vec3d  # motion in that plane, m
-        q: vec3d  # spring: tangential slip since it was anchored, m
-        y: vec3d  # position in the collider's frame, m
+        trial_displacement: vec3d  # motion plus spring, m
+        tangential_motion: vec3d  # motion in that plane, m
+        trial_elastic_slip: vec3d  # spring: tangential slip since it was anchored, m
+        local_position: vec3d  # position in the collider's frame, m
 
     @wp.func
     def interpolate(facets: Facets, field: wp.array2d(dtype=Any), world: int, point: int, item: int) -> vec3d:
@@ -109,9 +109,10 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
     def lagrange_polynomial(facets: Facets, q: int, s: wp.vec2d) -> f64:
         """Lagrange polynomial of a facet: 1 at point q and 0 at the others."""
         out = f64(0.0)
-        for m in range(facets.power.shape[0]):
-            out += facets.basis[q, m] * (
-                monomial_derivative(s[0], facets.power[m][0], 0) * monomial_derivative(s[1], facets.power[m][1], 0)
+        for m in range(facets.exponents.shape[0]):
+            out += facets.lagrange_coefficients[q, m] * (
+                monomial_derivative(s[0], facets.exponents[m][0], 0)
+                * monomial_derivative(s[1], facets.exponents[m][1], 0)
             )
         return out
 
@@ -124,13 +125,13 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
     def history_row(con: Contacts, c: int, point: int) -> int:
         """Index of a point's history."""
         if con.single_point[c] != 0:
-            return con.first[c]
+            return con.first_point[c]
         return point
 
     @wp.func
     def remaining_overlap(con: Contacts, his: History, world: int, c: int, point: int, time: f64) -> f64:
         """Remaining part of an initial overlap, m."""
-        left = f64(1.0) - (time - his.overlap_time[world]) / con.decay[c]
+        left = f64(1.0) - (time - his.overlap_time[world]) / con.overlap_decay_time[c]
         return his.overlap[world, point] * wp.clamp(left, f64(0.0), f64(1.0))
 
     @wp.func
@@ -154,28 +155,32 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
             rec = history_row(con, c, point)
             if his.speed[world, rec] > f64(0.0):
                 return his.previous_depth[world, rec]
-        return scr.depth[world, point]
+        return scr.start_depth[world, point]
 
     @wp.func
     def normal_damping_rate(con: Contacts, scr: ContactScratch, world: int, c: int, point: int, inv_h: f64) -> f64:
         """Damping per depth of the normal law: chi/h, or gamma_n/h."""
         if con.law[c] == DEFAULT:
-            return con.damping[world, c] * inv_h / scr.speed[world, point]
+            return con.damping[world, c] * inv_h / scr.approach_speed[world, point]
         return con.beta[world, c] * wp.sqrt(con.scale[world, c]) * world_value(con.normal_damping, world, c) * inv_h
 
     @wp.func
     def tangent_damping(con: Contacts, world: int, c: int, stiffness: f64) -> f64:
         """gamma_t of Eq. (80), N s/m."""
-        return f64(1.8257418583505538) * con.beta[world, c] * wp.sqrt(world_value(con.mass, world, c) * stiffness)
+        return (
+            f64(1.8257418583505538)
+            * con.beta[world, c]
+            * wp.sqrt(world_value(con.effective_mass, world, c) * stiffness)
+        )
 
     @wp.func
     def with_friction_normal(t: PointContact, m: vec3d) -> PointContact:
         """The point with friction in the plane of a normal m, frozen with the friction limits: on a curved shape the
         force would not be the derivative of its potential if the plane turned with the iterate."""
         out = t
-        out.m = m
-        out.slip = tangential(m, t.relative_motion)
-        out.q = tangential(m, t.elastic_slip)
+        out.friction_normal = m
+        out.tangential_motion = tangential(m, t.relative_motion)
+        out.trial_elastic_slip = tangential(m, t.trial_displacement)
         return out
 
     @wp.func
@@ -190,8 +195,8 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         rec = history_row(con, c, point)
         moved = interpolate_acting(facets, scr, u, world, q, item)
         x = reference_position(facets, scr, world, q, item) + moved
-        rotation = scr.rotation[world, k]
-        out.y = wp.transpose(rotation) * (x - scr.position[world, k])
+        rotation = scr.collider_rotation[world, k]
+        out.local_position = wp.transpose(rotation) * (x - scr.collider_position[world, k])
         in_contact = his.speed[world, rec] > f64(0.0)
         side = stored_side(con, k, in_contact, his.contact_state[world, rec])
         activation_gap_now = activation_gap(con, his, world, c, point, time, con.margin[world, k])
@@ -200,32 +205,37 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         far = bool(False)
         if wp.static(meshes):  # lower bound of the distance, the last one minus the motion: avoids a search of the mesh
             d[3] = (
-                scr.activation_gap[world, point] - scr.depth[world, point] - wp.length(out.y - scr.start[world, point])
+                scr.activation_gap[world, point]
+                - scr.start_depth[world, point]
+                - wp.length(out.local_position - scr.start_position[world, point])
             )
             far = (
-                con.kind[k] == MESH
+                con.collider_kind[k] == MESH
                 and con.law[c] != SMOOTH
                 and not in_contact
                 and d[3] > wp.max(activation_gap_now, f64(0.0))
             )
         if not far:
-            out.side = sweep(con, k, scr.start[world, point], out.y, side)
-            d = distance(con, k, out.y, out.side)
-        out.n = rotation * vec3d(d[0], d[1], d[2])
+            out.side = sweep(con, k, scr.start_position[world, point], out.local_position, side)
+            d = distance(con, k, out.local_position, out.side)
+        out.normal = rotation * vec3d(d[0], d[1], d[2])
         out.depth = activation_gap_now - d[3]
-        motion = moved - scr.origin[world, point] - scr.translation[world, k]
-        if con.spin[k] >= 0:
-            motion -= scr.rotation_change[world, k] * (his.rotation[world, k] * scr.start[world, point])
-        before = scr.depth[world, point]
-        change = depth_change(con, k, out.side, scr.start[world, point], out.y, wp.transpose(rotation) * motion,
-                           scr.activation_gap[world, point] - before, d[3])  # fmt: skip
+        motion = moved - scr.start_displacement[world, point] - scr.collider_translation[world, k]
+        if con.rotation_law[k] >= 0:
+            motion -= scr.collider_rotation_change[world, k] * (
+                his.rotation[world, k] * scr.start_position[world, point]
+            )
+        before = scr.start_depth[world, point]
+        change = depth_change(con, k, out.side, scr.start_position[world, point], out.local_position,
+                              wp.transpose(rotation) * motion,
+                              scr.activation_gap[world, point] - before, d[3])  # fmt: skip
         if change[1] != f64(0.0):
             out.depth = before + change[0] + (activation_gap_now - scr.activation_gap[world, point])
         rate = normal_damping_rate(con, scr, world, c, point, inv_h)
-        k_n = con.scale[world, c] * world_value(con.normal, world, c)
+        k_n = con.scale[world, c] * world_value(con.normal_stiffness, world, c)
         previous_depth = depth_at_start(con, facets, his, scr, world, c, point)
-        out.law = normal_law(con.law[c], con.single_point[c], k_n, rate, con.ramp[c], con.force_eps[c], out.depth,
-                             previous_depth)  # fmt: skip
+        out.normal_response = normal_law(con.law[c], con.single_point[c], k_n, rate, con.damping_ramp[c],
+                                         con.force_eps[c], out.depth, previous_depth)  # fmt: skip
         out.depth_increment = out.depth - previous_depth
         out.relative_motion = motion
         spring = vec3d()
@@ -233,8 +243,8 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
             spring = his.spring[world, rec]
             if con.law[c] != PAPER:
                 spring = shrink * (rotation * spring)
-        out.elastic_slip = spring + motion
-        return with_friction_normal(out, out.n)
+        out.trial_displacement = spring + motion
+        return with_friction_normal(out, out.normal)
 
     @wp.func
     def friction_coefficient(con: Contacts, his: History, world: int, c: int, rec: int) -> f64:
@@ -256,9 +266,9 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         v_t = v - v_n_rel * n
         beta = con.beta[world, c]
         scale = con.scale[world, c]
-        spring = elastic_force(con.single_point[c], scale * world_value(con.normal, world, c), delta)[0]
+        spring = elastic_force(con.single_point[c], scale * world_value(con.normal_stiffness, world, c), delta)[0]
         gamma = beta * wp.sqrt(scale) * world_value(con.normal_damping, world, c)
-        k_t = scale * world_value(con.tangent, world, c)
+        k_t = scale * world_value(con.tangential_stiffness, world, c)
         if con.single_point[c] != 0:
             gamma *= wp.sqrt(wp.sqrt(delta))
             k_t *= wp.sqrt(delta)
@@ -271,7 +281,7 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         if size > friction_limit:
             tangential_force = (friction_limit / size) * tangential_force
             s = (f64(-1.0) / k_t) * (tangential_force + gamma_t * v_t)
-        scr.explicit_spring[world, point] = s
+        scr.explicit_elastic_slip[world, point] = s
         scr.explicit_force[world, point] = force * n + tangential_force
 
     @wp.func
@@ -282,7 +292,7 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         rec = history_row(con, c, point)
         mu = friction_coefficient(con, his, world, c, rec)
         in_contact = his.speed[world, rec] > f64(0.0)
-        stiffness = con.scale[world, c] * world_value(con.tangent, world, c)
+        stiffness = con.scale[world, c] * world_value(con.tangential_stiffness, world, c)
         shrink = f64(1.0)
         if con.single_point[c] != 0:
             depth = wp.max(t.depth, f64(0.0))
@@ -290,13 +300,13 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
             before = t.depth - t.depth_increment
             if in_contact and depth < before and con.law[c] == DEFAULT:
                 shrink = wp.sqrt(depth / before)
-        return vec3d(mu * t.law[0], stiffness, shrink)
+        return vec3d(mu * t.normal_response[0], stiffness, shrink)
 
     @wp.func
     def friction_trial(con: Contacts, world: int, c: int, t: PointContact, frozen: vec3d, inv_h: f64) -> wp.vec4d:
         """Friction opposing the motion: trial force, and in w its total stiffness (spring and damper)."""
         gamma = tangent_damping(con, world, c, frozen[1]) * inv_h
-        trial = frozen[1] * t.q + gamma * t.slip
+        trial = frozen[1] * t.trial_elastic_slip + gamma * t.tangential_motion
         return wp.vec4d(trial[0], trial[1], trial[2], frozen[1] + gamma)
 
     @wp.func
@@ -305,7 +315,7 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         if frozen[0] <= f64(0.0):
             return f64(0.0)
         if con.law[c] == SMOOTH:
-            return smooth_friction(t.slip, inv_h, con.speed_eps[c], frozen[0])[0]
+            return smooth_friction(t.tangential_motion, inv_h, con.speed_eps[c], frozen[0])[0]
         w = friction_trial(con, world, c, t, frozen, inv_h)
         if w[3] <= f64(0.0):
             return f64(0.0)
@@ -317,7 +327,7 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         if frozen[0] <= f64(0.0):
             return vec3d()
         if con.law[c] == SMOOTH:
-            return smooth_friction(t.slip, inv_h, con.speed_eps[c], frozen[0])[1] * t.slip
+            return smooth_friction(t.tangential_motion, inv_h, con.speed_eps[c], frozen[0])[1] * t.tangential_motion
         w = friction_trial(con, world, c, t, frozen, inv_h)
         if w[3] <= f64(0.0):
             return vec3d()
@@ -327,12 +337,12 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
     @wp.func
     def point_stiffness(con: Contacts, world: int, c: int, t: PointContact, frozen: vec3d, inv_h: f64) -> mat33d:
         """Derivative of the force that a point adds to the residual, positive; the change of the normal is omitted."""
-        K = wp.max(t.law[1], f64(0.0)) * wp.outer(t.n, t.n)
+        K = wp.max(t.normal_response[1], f64(0.0)) * wp.outer(t.normal, t.normal)
         if frozen[0] > f64(0.0):
-            P = wp.identity(n=3, dtype=f64) - wp.outer(t.m, t.m)
+            P = wp.identity(n=3, dtype=f64) - wp.outer(t.friction_normal, t.friction_normal)
             if con.law[c] == SMOOTH:
-                part = smooth_friction(t.slip, inv_h, con.speed_eps[c], frozen[0])[1]
-                v = inv_h * t.slip
+                part = smooth_friction(t.tangential_motion, inv_h, con.speed_eps[c], frozen[0])[1]
+                v = inv_h * t.tangential_motion
                 root = wp.dot(v, v) + con.speed_eps[c] * con.speed_eps[c]
                 K += part * (P - wp.outer(v, v) / root)
             else:

@@ -31,13 +31,13 @@ def sheet_kernels(dtype: str) -> _types.SimpleNamespace:
         world, item = wp.tid()
         k = con.collider[facets.contact[item]]
         before = vec3d()
-        for q in range(facets.points):
+        for q in range(facets.point_count):
             x = facets.X[q, item] + interpolate(facets, u, world, q, item)
-            y = wp.transpose(scr.rotation[world, k]) * (x - scr.position[world, k])
+            y = wp.transpose(scr.collider_rotation[world, k]) * (x - scr.collider_position[world, k])
             if q > 0:
                 side = sweep(con, k, before, y, -1)
                 if side == -2 or (side >= 0 and distance(con, k, y, side)[3] < -tolerance[world]):
-                    found[world, facets.row + item] = facets.point + item * facets.points + q + 1
+                    found[world, facets.first_row + item] = facets.first_point + item * facets.point_count + q + 1
             before = y
 
     return _types.SimpleNamespace(module=module, find_crossed_sheets=find_crossed_sheets)

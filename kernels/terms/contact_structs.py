@@ -8,7 +8,7 @@ from ..common.types import precision
 from .contact_mesh import mesh_struct
 
 __all__ = [
-    "RECORD",
+    "RECORD_NAMES",
     "clock_struct",
     "contact_scratch_struct",
     "contact_struct",
@@ -17,7 +17,7 @@ __all__ = [
     "world_value",
 ]  # fmt: skip
 
-RECORD = ("force_x", "force_y", "force_z", "moment_x", "moment_y", "moment_z", "normal_force", "slip", "area",
+RECORD_NAMES = ("force_x", "force_y", "force_z", "moment_x", "moment_y", "moment_z", "normal_force", "slip", "area",
           "stick", "stored", "loss", "friction", "collider_work", "penetration")  # fmt: skip
 """Record of a contact, summed over its points (penetration: maximum). Slip and stick are weighted by area."""
 
@@ -37,30 +37,30 @@ def contact_struct(meshes: bool):
         law: wp.array(dtype=wp.int32)
         single_point: wp.array(dtype=wp.int32)  # single contact at the deepest point
         is_explicit: wp.array(dtype=wp.int32)  # explicit force of the last state
-        first: wp.array(dtype=wp.int32)  # [contact + 1] index of its first point
-        normal: wp.array2d(dtype=wp.float64)  # [world or 0, contact] k_n; of lumped contacts over sqrt(delta)
-        tangent: wp.array2d(dtype=wp.float64)  # k_t; of lumped contacts over sqrt(delta)
+        first_point: wp.array(dtype=wp.int32)  # [contact + 1] index of its first point
+        normal_stiffness: wp.array2d(dtype=wp.float64)  # [world or 0, contact] k_n; of lumped contacts over sqrt(delta)
+        tangential_stiffness: wp.array2d(dtype=wp.float64)  # k_t; of lumped contacts over sqrt(delta)
         normal_damping: wp.array2d(dtype=wp.float64)  # gamma_n over -beta; of lumped contacts over delta^(1/4)
-        mass: wp.array2d(dtype=wp.float64)  # m_eff, kg
-        ramp: wp.array(dtype=wp.float64)  # m
+        effective_mass: wp.array2d(dtype=wp.float64)  # m_eff, kg
+        damping_ramp: wp.array(dtype=wp.float64)  # m
         force_eps: wp.array(dtype=wp.float64)  # N
         speed_eps: wp.array(dtype=wp.float64)  # m/s
         offset: wp.array(dtype=wp.float64)  # m
-        decay: wp.array(dtype=wp.float64)  # s, over which a stored overlap vanishes
+        overlap_decay_time: wp.array(dtype=wp.float64)  # s, over which a stored overlap vanishes
         mu: wp.array2d(dtype=wp.float64)  # [world, contact]
         mu_static: wp.array2d(dtype=wp.float64)
         damping: wp.array2d(dtype=wp.float64)  # d of the default law
         beta: wp.array2d(dtype=wp.float64)  # -beta of Eq. (75)
         scale: wp.array2d(dtype=wp.float64)  # on k_n and k_t
         margin: wp.array2d(dtype=wp.float64)  # [world, collider] m, outward offset of its surface
-        kind: wp.array(dtype=wp.int32)  # [collider]
-        size: wp.array(dtype=wp.vec3d)
-        center: wp.array(dtype=wp.vec3d)
-        axes: wp.array(dtype=wp.mat33d)  # columns
-        path: wp.array(dtype=wp.int32)  # time law of its displacement, -1: none
-        spin: wp.array(dtype=wp.int32)  # time law of its angle, -1: none
-        anchor: wp.array(dtype=wp.vec3d)
-        axis: wp.array(dtype=wp.vec3d)
+        collider_kind: wp.array(dtype=wp.int32)  # [collider]
+        collider_size: wp.array(dtype=wp.vec3d)
+        collider_center: wp.array(dtype=wp.vec3d)
+        collider_axes: wp.array(dtype=wp.mat33d)  # columns
+        translation_law: wp.array(dtype=wp.int32)  # time law of its displacement, -1: none
+        rotation_law: wp.array(dtype=wp.int32)  # time law of its angle, -1: none
+        rotation_anchor: wp.array(dtype=wp.vec3d)
+        rotation_axis: wp.array(dtype=wp.vec3d)
 
     if meshes:
         Contacts.__annotations__["mesh"] = mesh_struct()
@@ -80,16 +80,18 @@ def facet_struct(dtype: str):
         area_fraction: wp.array2d(dtype=wp.float64)  # [point, facet] fraction of the area of the region; 0: no contact
         area: wp.array2d(dtype=wp.float64)  # m^2
         contact: wp.array(dtype=wp.int32)  # [facet]
-        pool: wp.int32  # first entry in the pool
-        row: wp.int32  # first row of the potential
-        point: wp.int32  # first point: [facet, point] are numbered in this order
-        count: wp.int32
-        points: wp.int32  # of a facet
+        first_entry: wp.int32  # first entry in the pool
+        first_row: wp.int32  # first row of the potential
+        first_point: wp.int32  # first point: [facet, point] are numbered in this order
+        facet_count: wp.int32
+        point_count: wp.int32  # of a facet
         tracks_deepest: wp.int32  # a single point acts, with the shape values `ContactScratch.shape_values`
-        corners: wp.int32
-        coords: wp.array(dtype=wp.vec2d)  # [point] on the unit triangle or square; with the next two: lumped contacts
-        basis: wp.array2d(dtype=wp.float64)  # [point, monomial] Lagrange polynomials of the points
-        power: wp.array(dtype=wp.vec2i)  # [monomial] exponents
+        corner_count: wp.int32
+        point_coords: wp.array(
+            dtype=wp.vec2d
+        )  # [point] on the unit triangle or square; with the next two: lumped contacts
+        lagrange_coefficients: wp.array2d(dtype=wp.float64)  # [point, monomial] Lagrange polynomials of the points
+        exponents: wp.array(dtype=wp.vec2i)  # [monomial] exponents
 
     return Facets
 
@@ -126,18 +128,20 @@ def contact_scratch_struct(dtype: str):
 
     @wp.struct
     class ContactScratch:
-        position: wp.array2d(dtype=wp.vec3d)  # [world, collider] position at the end of the step, m
-        rotation: wp.array2d(dtype=wp.mat33d)
-        translation: wp.array2d(dtype=wp.vec3d)  # [world, collider] translation in the attempt, m
-        rotation_change: wp.array2d(dtype=wp.mat33d)  # R - 1 of the rotation R in the attempt
-        angle: wp.array2d(dtype=wp.float64)  # rotation angle, rad
-        origin: wp.array2d(dtype=wp.vec3d)  # [world, point] displacement at the start of the attempt, m
+        collider_position: wp.array2d(dtype=wp.vec3d)  # [world, collider] position at the end of the step, m
+        collider_rotation: wp.array2d(dtype=wp.mat33d)
+        collider_translation: wp.array2d(dtype=wp.vec3d)  # [world, collider] translation in the attempt, m
+        collider_rotation_change: wp.array2d(dtype=wp.mat33d)  # R - 1 of the rotation R in the attempt
+        collider_angle: wp.array2d(dtype=wp.float64)  # rotation angle, rad
+        start_displacement: wp.array2d(dtype=wp.vec3d)  # [world, point] displacement at the start of the attempt, m
         activation_gap: wp.array2d(dtype=wp.float64)  # gap at which contact begins, at the start of the attempt, m
-        start: wp.array2d(dtype=wp.vec3d)  # [world, point] position at the start of the step in the collider's frame, m
-        depth: wp.array2d(dtype=wp.float64)  # depth at the start of the step, m
-        speed: wp.array2d(dtype=wp.float64)  # approach speed of the damping, m/s
-        frozen: wp.array2d(dtype=wp.vec3d)  # friction limit, k_t, spring factor; frozen in a line search
-        updated: wp.array2d(dtype=wp.vec3d)  # the same three at the iterate
+        start_position: wp.array2d(
+            dtype=wp.vec3d
+        )  # [world, point] position at the start of the step in the collider's frame, m
+        start_depth: wp.array2d(dtype=wp.float64)  # depth at the start of the step, m
+        approach_speed: wp.array2d(dtype=wp.float64)  # approach speed of the damping, m/s
+        frozen_friction: wp.array2d(dtype=wp.vec3d)  # friction limit, k_t, spring factor; frozen in a line search
+        updated_friction: wp.array2d(dtype=wp.vec3d)  # the same three at the iterate
         frozen_normal: wp.array2d(dtype=wp.vec3d)  # frozen normal of the plane of friction
         updated_normal: wp.array2d(dtype=wp.vec3d)  # normal of the plane of friction at the iterate
         aitken_residual: wp.array2d(dtype=wp.float64)  # r, change of the friction limit at its last update
@@ -149,25 +153,25 @@ def contact_scratch_struct(dtype: str):
         force: wp.array2d(dtype=wp.vec3d)  # on the residual, N, unless INACTIVE
         energy: wp.array2d(dtype=wp.vec2d)  # potential, and the magnitude of its terms, J
         stiffness: wp.array2d(dtype=sym)  # derivative of the force, N/m; 0 unless WITH_STIFFNESS
-        product: wp.array2d(dtype=vec3)  # of a product, N
+        point_product: wp.array2d(dtype=vec3)  # of a product, N
         facet_activity: wp.array2d(dtype=wp.int32)  # [world, facet row] largest activity of its points
         explicit_force: wp.array2d(dtype=wp.vec3d)  # [world, point] explicit force
-        explicit_spring: wp.array2d(dtype=wp.vec3d)
+        explicit_elastic_slip: wp.array2d(dtype=wp.vec3d)
         point_depth: wp.array2d(dtype=wp.float64)  # [world, point] depth; with lumped contacts
-        facet_point: wp.array2d(dtype=wp.int32)  # [world, facet row] deepest point of the facet
-        facet_xi: wp.array2d(dtype=wp.vec2d)  # coordinates of its deepest position
-        facet_depth: wp.array2d(dtype=wp.float64)  # depth there, m
+        facet_deepest_point: wp.array2d(dtype=wp.int32)  # [world, facet row] deepest point of the facet
+        facet_deepest_xi: wp.array2d(dtype=wp.vec2d)  # coordinates of its deepest position
+        facet_max_depth: wp.array2d(dtype=wp.float64)  # depth there, m
         contact_point: wp.array2d(
             dtype=wp.int32
         )  # [world, contact] point nearest to the deepest position; provides its entries
         chosen_facet: wp.array2d(dtype=wp.int32)  # facet row of a newly chosen contact point, or -1
         shape_values: wp.array3d(dtype=T)  # [world, contact, local] shape values at the contact point
         point_reference: wp.array2d(dtype=wp.vec3d)  # [world, contact] its reference position, m
-        choices: wp.array2d(dtype=wp.int32)  # number of choices in the attempt
-        passed_through: wp.array(dtype=wp.int32)  # [world] point that passed through a shape, + 1
-        rows: wp.array3d(dtype=wp.float64)  # [RECORD, world, facet row]
-        total: wp.array3d(dtype=wp.float64)  # [world, contact, RECORD] of the step so far
-        elapsed: wp.array(dtype=wp.float64)  # [world] s of the step so far
+        choice_count: wp.array2d(dtype=wp.int32)  # number of choices in the attempt
+        passed_point: wp.array(dtype=wp.int32)  # [world] point that passed through a shape, + 1
+        record_rows: wp.array3d(dtype=wp.float64)  # [RECORD_NAMES, world, facet row]
+        record_totals: wp.array3d(dtype=wp.float64)  # [world, contact, RECORD_NAMES] of the step so far
+        elapsed_time: wp.array(dtype=wp.float64)  # [world] s of the step so far
 
     return ContactScratch
 
@@ -182,6 +186,6 @@ def clock_struct():
         new_time: wp.array(dtype=wp.float64)  # at its end
         h: wp.array(dtype=wp.float64)
         part: wp.array(dtype=wp.int32)  # index of the substep; 0: first of the step
-        still: wp.int32  # 1 in statics: no rates
+        is_static: wp.int32  # 1 in statics: no rates
 
     return Clock

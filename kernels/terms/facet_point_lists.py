@@ -34,15 +34,15 @@ def point_list_kernels(dtype: str) -> _types.SimpleNamespace:
         world, point = wp.tid()
         f = pair.listed_facet[world, point] - 1
         if f >= 0:
-            wp.atomic_add(pair.list_count, world * mas.count + f, 1)
+            wp.atomic_add(pair.list_count, world * mas.facet_count + f, 1)
 
     @wp.kernel(module=module)
     def sum_chunks(mas: Masters, pair: PairScratch):
         """Number of points in the lists of each chunk of facets."""
         world, chunk = wp.tid()
         total = wp.int32(0)
-        for f in range(chunk * FACETS_PER_CHUNK, wp.min((chunk + 1) * FACETS_PER_CHUNK, mas.count)):
-            total += pair.list_count[world * mas.count + f]
+        for f in range(chunk * FACETS_PER_CHUNK, wp.min((chunk + 1) * FACETS_PER_CHUNK, mas.facet_count)):
+            total += pair.list_count[world * mas.facet_count + f]
         pair.chunk_offset[world, chunk] = total
 
     @wp.kernel(module=module)
@@ -61,7 +61,7 @@ def point_list_kernels(dtype: str) -> _types.SimpleNamespace:
         world, f = wp.tid()
         start = pair.chunk_offset[world, f / FACETS_PER_CHUNK]
         for other in range(f / FACETS_PER_CHUNK * FACETS_PER_CHUNK, f):
-            start += pair.list_count[world * mas.count + other]
+            start += pair.list_count[world * mas.facet_count + other]
         pair.list_start[world, f] = start
         pair.list_size[world, f] = 0
 

@@ -68,7 +68,7 @@ def pair_ledger_kernels(dtype: str) -> _types.SimpleNamespace:
         for j in range(ENERGY_COLUMNS):
             energies[j, world, row] = f64(0.0)
         for j in range(SUMMED_ROWS + 1):
-            scr.rows[j, world, row] = f64(0.0)
+            scr.record_rows[j, world, row] = f64(0.0)
 
     @wp.func
     def add_overlap_work(rows: wp.array3d(dtype=f64), world: int, row: int, work: f64):
@@ -93,18 +93,18 @@ def pair_ledger_kernels(dtype: str) -> _types.SimpleNamespace:
     ):
         """Add slip times area, area and sticking area of a point to the record of a facet; its depth by the maximum."""
         if depth > f64(0.0):
-            add(scr.rows, 7, world, row, area * f64(slipping) * wp.length(slip_increment))
-            add(scr.rows, 8, world, row, area)
-            add(scr.rows, 9, world, row, area * f64(1 - slipping))
-        scr.rows[14, world, row] = wp.max(scr.rows[14, world, row], depth)
+            add(scr.record_rows, 7, world, row, area * f64(slipping) * wp.length(slip_increment))
+            add(scr.record_rows, 8, world, row, area)
+            add(scr.record_rows, 9, world, row, area * f64(1 - slipping))
+        scr.record_rows[14, world, row] = wp.max(scr.record_rows[14, world, row], depth)
 
     @wp.func
     def record_force(scr: ContactScratch, world: int, row: int, force: vec3d, x: vec3d):
         """Add a force and its moment about the origin to the record of a facet."""
         moment = wp.cross(x, force)
         for j in range(3):
-            add(scr.rows, j, world, row, force[j])
-            add(scr.rows, 3 + j, world, row, moment[j])
+            add(scr.record_rows, j, world, row, force[j])
+            add(scr.record_rows, 3 + j, world, row, moment[j])
 
     @wp.func
     def return_mapping(law: int, s: PointContact, frozen: vec3d, w: wp.vec4d, tangential_force: vec3d) -> vec3d:
@@ -112,12 +112,12 @@ def pair_ledger_kernels(dtype: str) -> _types.SimpleNamespace:
         trial = vec3d(w[0], w[1], w[2])
         size = wp.length(trial)
         if size <= frozen[0]:
-            return s.q
+            return s.trial_elastic_slip
         if frozen[0] <= f64(0.0):
             return vec3d()
         if law == PAPER:
-            return (f64(1.0) / frozen[1]) * tangential_force - ((w[3] - frozen[1]) / frozen[1]) * s.slip
-        return s.q - ((size - frozen[0]) / (w[3] * size)) * trial
+            return (f64(1.0) / frozen[1]) * tangential_force - ((w[3] - frozen[1]) / frozen[1]) * s.tangential_motion
+        return s.trial_elastic_slip - ((size - frozen[0]) / (w[3] * size)) * trial
 
     @wp.func
     def update_history(
@@ -126,7 +126,7 @@ def pair_ledger_kernels(dtype: str) -> _types.SimpleNamespace:
     ):  # fmt: skip
         """Store the master facet of a point, its largest approach speed, and its slip state."""
         his.friction_limit[world, point] = friction_limit
-        his.speed[world, point] = wp.max(scr.speed[world, point], closing)
+        his.speed[world, point] = wp.max(scr.approach_speed[world, point], closing)
         contact_state = wp.int32(1)
         if slipping != 0 and friction_limit > f64(0.0):
             contact_state += SLIP_FLAG
@@ -145,13 +145,13 @@ def pair_ledger_kernels(dtype: str) -> _types.SimpleNamespace:
             return
         c = facets.contact[item]
         law = con.law[c]
-        row = facets.row + item
+        row = facets.first_row + item
         clear_rows(energies, scr, world, row)
         inv_h = f64(0.0)
-        if clock.still == 0:
+        if clock.is_static == 0:
             inv_h = f64(1.0) / clock.h[world]
-        for q in range(facets.points):
-            point = facets.point + item * facets.points + q
+        for q in range(facets.point_count):
+            point = facets.first_point + item * facets.point_count + q
             area_fraction = facets.area_fraction[q, item]
             in_contact = his.speed[world, point] > f64(0.0)
             f = pair.facet[world, point]
@@ -164,29 +164,31 @@ def pair_ledger_kernels(dtype: str) -> _types.SimpleNamespace:
                 clear_history(his, pair_his, world, point)
                 continue
             s = evaluate_pair_point(con, scr, pair, world, c, point, inv_h)
-            frozen = scr.frozen[world, point]
+            frozen = scr.frozen_friction[world, point]
             frozen[2] = f64(1.0)
             s = with_friction_normal(s, scr.frozen_normal[world, point])
-            normal = s.law[0]
+            normal = s.normal_response[0]
             tangential_force = friction_force(con, world, c, s, frozen, inv_h)
             w = friction_trial(con, world, c, s, frozen, inv_h)
             slipping = wp.where(wp.length(vec3d(w[0], w[1], w[2])) > frozen[0], 1, 0)
             if in_contact:
-                previous_spring = tangential(s.m, pair.elastic_slip[world, point] - pair.relative_motion[world, point])
-            force = normal * s.n - tangential_force
+                previous_spring = tangential(
+                    s.friction_normal, pair.trial_displacement[world, point] - pair.relative_motion[world, point]
+                )
+            force = normal * s.normal - tangential_force
             if con.is_explicit[c] != 0:
                 force = scr.explicit_force[world, point]
-                normal = wp.dot(force, s.m)
-                tangential_force = normal * s.m - force
-                friction_spring = scr.explicit_spring[world, point]
-                k_t = con.scale[world, c] * world_value(con.tangent, world, c)
+                normal = wp.dot(force, s.friction_normal)
+                tangential_force = normal * s.friction_normal - force
+                friction_spring = scr.explicit_elastic_slip[world, point]
+                k_t = con.scale[world, c] * world_value(con.tangential_stiffness, world, c)
                 frozen = vec3d(friction_coefficient(con, his, world, c, point) * normal, k_t, f64(1.0))
                 slipping = wp.where(wp.length(tangential_force) >= f64(0.999999) * frozen[0], 1, 0)
             elif normal > f64(0.0) and frozen[1] > f64(0.0):
                 friction_spring = return_mapping(law, s, frozen, w, tangential_force)
-            spring = elastic_force(0, con.scale[world, c] * world_value(con.normal, world, c), s.depth)
+            spring = elastic_force(0, con.scale[world, c] * world_value(con.normal_stiffness, world, c), s.depth)
             stored = spring[1] + f64(0.5) * frozen[1] * wp.dot(friction_spring, friction_spring)
-            slip_increment = s.slip - (friction_spring - previous_spring)
+            slip_increment = s.tangential_motion - (friction_spring - previous_spring)
             friction_loss = wp.dot(
                 tangential_force - frozen[1] * friction_spring, friction_spring - previous_spring
             ) + wp.dot(tangential_force, slip_increment)
@@ -196,9 +198,9 @@ def pair_ledger_kernels(dtype: str) -> _types.SimpleNamespace:
             add_overlap_work(
                 energies, world, row, area_fraction * normal * overlap_recovery(con, his, clock, world, c, point)
             )
-            place = surface_point(mas, pair.C, pair.D, world, f, pair.xi[world, point])
-            add(scr.rows, 6, world, row, area_fraction * normal)
-            record_force(scr, world, row, (mas.sign[c] * area_fraction) * force, place.x)
+            place = surface_point(mas, pair.u_coefs, pair.director_coefs, world, f, pair.xi[world, point])
+            add(scr.record_rows, 6, world, row, area_fraction * normal)
+            record_force(scr, world, row, (mas.sign[c] * area_fraction) * force, place.position)
             record_slip(scr, world, row, s.depth, facets.area[q, item], slipping, slip_increment)
             if s.depth <= f64(0.0):
                 clear_history(his, pair_his, world, point)
@@ -211,7 +213,7 @@ def pair_ledger_kernels(dtype: str) -> _types.SimpleNamespace:
                     his, pair_his, scr, pair, world, point, f, frozen[0], slipping, s.depth_increment * inv_h
                 )
         for j in range(4):
-            scr.rows[10 + j, world, row] = energies[j, world, row]
+            scr.record_rows[10 + j, world, row] = energies[j, world, row]
 
     @wp.kernel(module=module)
     def add_energy_bound(
@@ -224,7 +226,7 @@ def pair_ledger_kernels(dtype: str) -> _types.SimpleNamespace:
         if accepted[world] == 0:
             return
         his.pose_time[world] = clock.time[world]
-        scr.elapsed[world] = scr.elapsed[world] + clock.h[world]
+        scr.elapsed_time[world] = scr.elapsed_time[world] + clock.h[world]
         potential[world] = potential[world] + term_sums[1, world]
 
     return _types.SimpleNamespace(record_substep=record_substep, add_energy_bound=add_energy_bound)

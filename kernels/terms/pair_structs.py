@@ -24,26 +24,28 @@ def master_struct(dtype: str):
         surface_of: wp.array(dtype=wp.int32)  # [contact] its master surface
         sign: wp.array(dtype=wp.float64)  # [contact] -1 where the points belong to the second body
         bodies: wp.array(dtype=wp.vec2i)  # [contact] of the points and of the facets, numbered among bodies in pairs
-        surfaces: wp.int32
+        surface_count: wp.int32
         touch_depth: wp.float64  # depth at the start of a step that counts as contact, m
         max_monomials: wp.int32  # maximum number of monomials of a facet
         conn: wp.array2d(dtype=wp.int32)  # [local, facet] slot
         shape: wp.array3d(dtype=T)  # [monomial, local, facet]
         director_shape: wp.array3d(dtype=T)  # 1/m
-        X: wp.array2d(dtype=wp.vec3d)  # [monomial, facet]
-        N: wp.array2d(dtype=wp.vec3d)
-        kind: wp.array(dtype=wp.int32)  # [facet]
-        monomials: wp.array(dtype=wp.int32)  # [kind] number of monomials
-        corners: wp.array(dtype=wp.int32)  # [kind]
-        power: wp.array2d(dtype=wp.vec2i)  # [kind, monomial] exponents
-        hull: wp.array3d(dtype=wp.float64)  # [kind, point, monomial] control points; convex hull of the facet
+        position_coefficients: wp.array2d(dtype=wp.vec3d)  # [monomial, facet]
+        director_coefficients: wp.array2d(dtype=wp.vec3d)
+        facet_kind: wp.array(dtype=wp.int32)  # [facet]
+        monomial_count: wp.array(dtype=wp.int32)  # [kind] number of monomials
+        corner_count: wp.array(dtype=wp.int32)  # [kind]
+        exponents: wp.array2d(dtype=wp.vec2i)  # [kind, monomial] exponents
+        hull_coefficients: wp.array3d(
+            dtype=wp.float64
+        )  # [kind, point, monomial] control points; convex hull of the facet
         depth_limit: wp.array(
             dtype=wp.float64
         )  # [facet] depth beyond which a point would leave through the opposite side, m
-        size: wp.array(dtype=wp.float64)  # [facet] length of a side, m
+        side_length: wp.array(dtype=wp.float64)  # [facet] length of a side, m
         surface: wp.array(dtype=wp.int32)  # [facet]
-        pool: wp.int32  # first entry in the pool
-        count: wp.int32
+        first_entry: wp.int32  # first entry in the pool
+        facet_count: wp.int32
 
     return Masters
 
@@ -69,16 +71,16 @@ def pair_scratch_struct(dtype: str):
 
     @wp.struct
     class PairScratch:
-        C: wp.array2d(dtype=wp.vec3d)  # [world, control] coefficients of displacements at the iterate
-        D: wp.array2d(dtype=wp.vec3d)  # of the outward vector
-        C0: wp.array2d(dtype=wp.vec3d)  # at the start of the attempt
-        D0: wp.array2d(dtype=wp.vec3d)
-        V0: wp.array2d(dtype=wp.vec3d)  # of velocities at the start of the attempt
+        u_coefs: wp.array2d(dtype=wp.vec3d)  # [world, control] coefficients of displacements at the iterate
+        director_coefs: wp.array2d(dtype=wp.vec3d)  # of the outward vector
+        start_u_coefs: wp.array2d(dtype=wp.vec3d)  # at the start of the attempt
+        start_director_coefs: wp.array2d(dtype=wp.vec3d)
+        start_v_coefs: wp.array2d(dtype=wp.vec3d)  # of velocities at the start of the attempt
         centre: wp.array2d(dtype=mat43)  # [world, facet] midpoint and derivatives, rows as of a SurfacePoint
         bulge: wp.array2d(dtype=wp.float64)  # [world, facet] largest height above the tangent plane at the midpoint, m
-        centre0: wp.array2d(dtype=mat43)  # at the start of the attempt
-        lower: wp.array(dtype=wp.vec3)  # [world facet] boxes of the tree
-        upper: wp.array(dtype=wp.vec3)
+        start_centre: wp.array2d(dtype=mat43)  # at the start of the attempt
+        box_lower: wp.array(dtype=wp.vec3)  # [world facet] boxes of the tree
+        box_upper: wp.array(dtype=wp.vec3)
         refit_lower: wp.array(dtype=wp.vec3)
         refit_upper: wp.array(dtype=wp.vec3)
         refit_needed: wp.array(dtype=wp.int32)  # a facet has left its box
@@ -87,7 +89,7 @@ def pair_scratch_struct(dtype: str):
         empty_box_lower: wp.array2d(dtype=wp.vec3)  # box without master facets, valid for refit `empty_box_refit`
         empty_box_upper: wp.array2d(dtype=wp.vec3)
         empty_box_refit: wp.array2d(dtype=wp.int32)
-        x0: wp.array2d(dtype=wp.vec3d)  # [world, point] position at the start of the attempt, m
+        start_position: wp.array2d(dtype=wp.vec3d)  # [world, point] position at the start of the attempt, m
         deepest_contact: wp.array2d(
             dtype=wp.float64
         )  # [world, body] largest depth of its points in contact at the start, m
@@ -101,7 +103,7 @@ def pair_scratch_struct(dtype: str):
         initial_depth: wp.array2d(dtype=wp.float64)  # depth at the start of the attempt, m
         normal: wp.array2d(dtype=wp.vec3d)  # of the facet there, minus the derivative of the depth by the position
         relative_motion: wp.array2d(dtype=wp.vec3d)  # in the step, relative to the master's material, m
-        elastic_slip: wp.array2d(dtype=wp.vec3d)  # motion plus friction spring, m
+        trial_displacement: wp.array2d(dtype=wp.vec3d)  # motion plus friction spring, m
         shape_values: wp.array3d(dtype=T)  # [world, point, local] shape values of the master's slots at the projection
         shape_gradient: wp.array3d(dtype=vec2)  # their derivatives by the facet coordinates
         geometric_tangent: wp.array3d(
@@ -111,7 +113,7 @@ def pair_scratch_struct(dtype: str):
         facet_rotation: wp.array2d(dtype=vec2)  # [world, point] of a product: rotation of the facet
         friction_shape: wp.array3d(dtype=T)  # shape values of friction, frozen with the friction limit
         frozen_motion: wp.array2d(dtype=wp.vec3d)
-        frozen_slip: wp.array2d(dtype=wp.vec3d)  # motion plus spring at freezing, m
+        frozen_trial_displacement: wp.array2d(dtype=wp.vec3d)  # motion plus spring at freezing, m
         frozen_displacement: wp.array2d(
             dtype=wp.vec3d
         )  # relative displacement by the frozen shape values at freezing, m

@@ -46,7 +46,7 @@ class PairSolves(Term):
         s, m, w, t, k = ctx.scratch[self.name], self.model, ctx.work, self.tables, self.kernels
         attempt, touching, masters = s["attempt"], s["touching"], s["masters"]
         for group in t.groups:
-            dim = (m.worlds, group.count, group.data.points)
+            dim = (m.worlds, group.count, group.data.point_count)
             ctx.launch(k.point_products, dim, [masters, group.data, active, p, attempt, touching])
         for group in t.groups:  # the last group includes the master facets
             entries = group.conn.size + (t.master_conn.size if group is t.groups[-1] else 0)
