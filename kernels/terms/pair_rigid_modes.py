@@ -37,7 +37,7 @@ def pair_rigid_mode_kernels(dtype: str) -> _types.SimpleNamespace:
         if active[world] == 0:
             return
         c = contact[index]
-        a = bodies.of_slot[facets.conn[0, (first[c] - facets.first_point) / facets.point_count]]
+        a = bodies.body_of_slot[facets.conn[0, (first[c] - facets.first_point) / facets.point_count]]
         mm = mat33d()
         mt = mat33d()
         tm = mat33d()
@@ -49,7 +49,7 @@ def pair_rigid_mode_kernels(dtype: str) -> _types.SimpleNamespace:
             if f >= 0 and wp.length_sq(k) > T(0.0):
                 item = (point - facets.first_point) / facets.point_count
                 q = (point - facets.first_point) % facets.point_count
-                b = bodies.of_slot[mas.conn[0, f]]
+                b = bodies.body_of_slot[mas.conn[0, f]]
                 sm = mat33d()
                 st = mat33d()
                 for i in range(facets.conn.shape[0]):
