@@ -39,9 +39,7 @@ def topology_struct(dtype: str):
         mass_column: wp.array(dtype=wp.int32)
         mass_value: wp.array2d(dtype=T)  # [world or 0, entry] kg
         free: wp.array(dtype=vec3)  # [slot] 1 where a component is an unknown, 0 where prescribed
-        prescribed_bits: wp.array(
-            dtype=wp.uint8
-        )  # [slot] bit k: component k is prescribed; `free` in one byte
+        prescribed_bits: wp.array(dtype=wp.uint8)  # [slot] bit k: component k is prescribed; `free` in one byte
         pool_start: wp.array(dtype=wp.int32)  # [slot + 1] first pool entry of a slot; with pooled terms
         pool_entry: wp.array(dtype=wp.int32)  # indices into the pool
 

@@ -13,7 +13,14 @@ from .contact_colliders import MESH_SUFFIX, collider_functions
 from .contact_laws import PAPER, SMOOTH, law_functions
 from .contact_point import contact_point_functions
 from .contact_structs import (
+    AREA_ROW,
+    MOMENT_ROW,
+    NORMAL_ROW,
+    PENETRATION_ROW,
     RECORD_NAMES,
+    SLIP_ROW,
+    STICK_ROW,
+    STORED_ROW,
     clock_struct,
     contact_scratch_struct,
     contact_struct,
@@ -22,13 +29,30 @@ from .contact_structs import (
     world_value,
 )
 
-__all__ = ["ENERGY_COLUMNS", "RECORD_LANES", "contact_block_kernels", "contact_ledger_kernels"]
+__all__ = [
+    "COLLIDER_WORK",
+    "ENERGY_COLUMNS",
+    "FRICTION",
+    "INTEGRATOR_WORK",
+    "LOSS",
+    "RECORD_LANES",
+    "STORED",
+    "SUMMED_ROWS",
+    "contact_block_kernels",
+    "contact_ledger_kernels",
+]
 
-ENERGY_COLUMNS = 5  # stored, loss, friction, work of the colliders, the integrator's part
+STORED, LOSS, FRICTION, COLLIDER_WORK, INTEGRATOR_WORK = range(5)
+"""Columns of the energy increments, J: stored energy (its value), lost to restitution, lost to friction, work of the
+colliders, and the part of the contact's work that is due to the integrator."""
+ENERGY_COLUMNS = 5
 RECORD_LANES = 32
+"""Threads that share the sums over the facets of a contact."""
 SUMMED_ROWS = len(RECORD_NAMES) - 1
+"""Rows of the record that are sums; the last one is a maximum."""
 AVERAGED_ROWS = 7
-"""Leading rows of the record, averaged over the substeps of a step; area, stick and stored are values at its end."""
+"""Leading rows of the record (force, moment, normal force), averaged over the substeps of a step; area, stick and
+stored are values at its end."""
 
 
 @functools.cache
@@ -59,31 +83,31 @@ def contact_ledger_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
     @wp.struct
     class PointOutcome:
-        """Result of a point after a substep, for the whole region."""
+        """Result of a point after a substep; forces and energies as if the point had the area of the whole region."""
 
         contact: PointContact
         force: vec3d  # on the body, N
-        normal_force: f64
-        elastic_slip: vec3d  # stretch of its friction spring, m
-        friction_limit: f64
+        normal_force: f64  # N
+        elastic_slip: vec3d  # elastic part of its slip: displacement of the friction spring, m
+        friction_limit: f64  # mu F_n, N
         slipping: wp.int32
         slip_increment: vec3d  # slip in the substep, m
         stored: f64  # J, as are the following
         loss: f64
         friction_loss: f64
-        collider_work: f64  # by the collider
-        integrator_work: f64  # the integrator's part that the ledger does not find by itself
+        collider_work: f64  # work done by the collider
+        integrator_work: f64  # work due to the integrator beyond the ledger's own estimate
 
     @wp.func
     def return_mapping(
         con: Contacts, world: int, c: int, t: PointContact, frozen: vec3d, inv_h: f64, tangential_force: vec3d
     ) -> vec3d:
-        """Friction spring after the force was cut to the friction limit; Eq. (83) for the paper's law."""
+        """Elastic slip, m, after the force was cut to the friction limit; Eq. (83) of Paper I for law PAPER."""
         w = friction_trial(con, world, c, t, frozen, inv_h)
         if wp.length(vec3d(w[0], w[1], w[2])) <= frozen[0]:
             return t.trial_elastic_slip
         trial = vec3d(w[0], w[1], w[2])
-        if con.law[c] != PAPER:  # spring and damper slip together: the stretch is bounded by the motion of the point
+        if con.law[c] != PAPER:  # spring and damper slip together: bounded by the motion of the point
             if frozen[0] <= f64(0.0):
                 return vec3d()
             size = wp.length(trial)
@@ -121,12 +145,12 @@ def contact_ledger_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         tangential_force = friction_force(con, world, c, t, frozen, inv_h)
         w = friction_trial(con, world, c, t, frozen, inv_h)
         out.slipping = wp.where(wp.length(vec3d(w[0], w[1], w[2])) > frozen[0] or law == SMOOTH, 1, 0)
-        previous_spring = vec3d()  # previous spring, in the tangent plane
+        previous_elastic_slip = vec3d()  # previous spring, in the tangent plane
         if his.speed[world, rec] > f64(0.0):
-            previous_spring = his.spring[world, rec]
+            previous_elastic_slip = his.spring[world, rec]
             if law != PAPER:
-                previous_spring = scr.collider_rotation[world, kc] * previous_spring
-            previous_spring = tangential(t.friction_normal, previous_spring)
+                previous_elastic_slip = scr.collider_rotation[world, kc] * previous_elastic_slip
+            previous_elastic_slip = tangential(t.friction_normal, previous_elastic_slip)
         if con.is_explicit[c] != 0:
             normal = wp.dot(scr.explicit_force[world, point], t.normal)
             tangential_force = normal * t.normal - scr.explicit_force[world, point]
@@ -142,11 +166,13 @@ def contact_ledger_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         out.stored = spring[1] + f64(0.5) * frozen[1] * wp.dot(out.elastic_slip, out.elastic_slip)
         gain = out.stored - his.stored[world, rec]
         out.loss = (normal - spring[0]) * t.depth_increment
-        out.slip_increment = t.tangential_motion - (out.elastic_slip - previous_spring)
+        out.slip_increment = t.tangential_motion - (out.elastic_slip - previous_elastic_slip)
         out.friction_loss = wp.dot(
-            tangential_force - frozen[1] * out.elastic_slip, out.elastic_slip - previous_spring
+            tangential_force - frozen[1] * out.elastic_slip, out.elastic_slip - previous_elastic_slip
         ) + wp.dot(tangential_force, out.slip_increment)
-        chord = spring[0] * change + frozen[1] * wp.dot(out.elastic_slip, out.elastic_slip - previous_spring) - gain
+        chord = (
+            spring[0] * change + frozen[1] * wp.dot(out.elastic_slip, out.elastic_slip - previous_elastic_slip) - gain
+        )
         chord += (normal - spring[0]) * (change - t.depth_increment)  # of a moving contact point
         x = scr.collider_rotation[world, kc] * t.local_position + scr.collider_position[world, kc]
         carried = scr.collider_translation[
@@ -189,10 +215,10 @@ def contact_ledger_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         speed = scr.approach_speed[world, point]
         if clock.is_static == 0:
             speed = wp.max(speed, o.contact.depth_increment / clock.h[world])
-        friction_spring = o.elastic_slip
+        elastic_slip = o.elastic_slip
         if con.law[c] != PAPER:
-            friction_spring = wp.transpose(scr.collider_rotation[world, kc]) * friction_spring
-        his.spring[world, rec] = friction_spring
+            elastic_slip = wp.transpose(scr.collider_rotation[world, kc]) * elastic_slip
+        his.spring[world, rec] = elastic_slip
         his.stored[world, rec] = o.stored
         his.friction_limit[world, rec] = o.friction_limit
         his.speed[world, rec] = speed
@@ -202,7 +228,7 @@ def contact_ledger_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         his.contact_state[world, rec] = contact_state
 
     @wp.func
-    def add(rows: wp.array3d(dtype=f64), k: int, world: int, row: int, value: f64):
+    def add_to_row(rows: wp.array3d(dtype=f64), k: int, world: int, row: int, value: f64):
         """rows[k, world, row] += value."""
         rows[k, world, row] = rows[k, world, row] + value
 
@@ -227,28 +253,32 @@ def contact_ledger_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
             idle = scr.activity[world, point] == INACTIVE and his.speed[world, history_row(con, c, point)] == f64(0.0)
             if area_fraction > f64(0.0) and (con.is_explicit[c] != 0 or not idle):
                 o = point_outcome(con, facets, his, clock, scr, world, c, q, item, point, u)
-                add(energies, 0, world, row, area_fraction * o.stored)
-                add(energies, 1, world, row, area_fraction * o.loss)
-                add(energies, 2, world, row, area_fraction * o.friction_loss)
-                add(energies, 3, world, row, area_fraction * o.collider_work)
-                add(energies, 4, world, row, area_fraction * o.integrator_work)
+                add_to_row(energies, STORED, world, row, area_fraction * o.stored)
+                add_to_row(energies, LOSS, world, row, area_fraction * o.loss)
+                add_to_row(energies, FRICTION, world, row, area_fraction * o.friction_loss)
+                add_to_row(energies, COLLIDER_WORK, world, row, area_fraction * o.collider_work)
+                add_to_row(energies, INTEGRATOR_WORK, world, row, area_fraction * o.integrator_work)
                 x = (
                     scr.collider_rotation[world, con.collider[c]] * o.contact.local_position
                     + scr.collider_position[world, con.collider[c]]
                 )
                 moment = wp.cross(x, o.force)
                 for j in range(3):
-                    add(scr.record_rows, j, world, row, area_fraction * o.force[j])
-                    add(scr.record_rows, 3 + j, world, row, area_fraction * moment[j])
-                add(scr.record_rows, 6, world, row, area_fraction * o.normal_force)
+                    add_to_row(scr.record_rows, j, world, row, area_fraction * o.force[j])
+                    add_to_row(scr.record_rows, MOMENT_ROW + j, world, row, area_fraction * moment[j])
+                add_to_row(scr.record_rows, NORMAL_ROW, world, row, area_fraction * o.normal_force)
                 if o.contact.depth > f64(0.0) or con.law[c] == SMOOTH:
                     area = facets.area[q, item]
-                    add(scr.record_rows, 7, world, row, area * f64(o.slipping) * wp.length(o.slip_increment))
-                    add(scr.record_rows, 8, world, row, area)
-                    add(scr.record_rows, 9, world, row, area * f64(1 - o.slipping))
+                    add_to_row(
+                        scr.record_rows, SLIP_ROW, world, row, area * f64(o.slipping) * wp.length(o.slip_increment)
+                    )
+                    add_to_row(scr.record_rows, AREA_ROW, world, row, area)
+                    add_to_row(scr.record_rows, STICK_ROW, world, row, area * f64(1 - o.slipping))
                 for j in range(4):
-                    scr.record_rows[10 + j, world, row] = energies[j, world, row]
-                scr.record_rows[14, world, row] = wp.max(scr.record_rows[14, world, row], o.contact.depth)
+                    scr.record_rows[STORED_ROW + j, world, row] = energies[j, world, row]
+                scr.record_rows[PENETRATION_ROW, world, row] = wp.max(
+                    scr.record_rows[PENETRATION_ROW, world, row], o.contact.depth
+                )
                 update_history(con, facets, his, clock, scr, world, c, point, o)
 
     @wp.kernel(module=module)
@@ -293,7 +323,7 @@ def contact_ledger_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
                 total = (past * old + h * total) / (past + h)
         elif j == SUMMED_ROWS:
             total = wp.max(total, old)
-        elif j == 7 or j > 10:
+        elif j == SLIP_ROW or j > STORED_ROW:
             total += old
         scr.record_totals[world, c, j] = total
 
@@ -319,10 +349,10 @@ def contact_ledger_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
     def write_records(scr: ContactScratch, first: int, report: wp.array2d(dtype=f64)):
         """Record of each contact for the report of the step; slip and stick as averages over the area in contact."""
         world, c = wp.tid()
-        area = scr.record_totals[world, c, 8]
+        area = scr.record_totals[world, c, AREA_ROW]
         for j in range(SUMMED_ROWS + 1):
             value = scr.record_totals[world, c, j]
-            if j == 7 or j == 9:
+            if j == SLIP_ROW or j == STICK_ROW:
                 value = value / wp.max(area, f64(1.0e-300))
             report[world, first + (SUMMED_ROWS + 1) * c + j] = value
 

@@ -8,7 +8,14 @@ from ..common.types import precision
 from .contact_mesh import mesh_struct
 
 __all__ = [
+    "AREA_ROW",
+    "MOMENT_ROW",
+    "NORMAL_ROW",
+    "PENETRATION_ROW",
     "RECORD_NAMES",
+    "SLIP_ROW",
+    "STICK_ROW",
+    "STORED_ROW",
     "clock_struct",
     "contact_scratch_struct",
     "contact_struct",
@@ -19,7 +26,10 @@ __all__ = [
 
 RECORD_NAMES = ("force_x", "force_y", "force_z", "moment_x", "moment_y", "moment_z", "normal_force", "slip", "area",
           "stick", "stored", "loss", "friction", "collider_work", "penetration")  # fmt: skip
-"""Record of a contact, summed over its points (penetration: maximum). Slip and stick are weighted by area."""
+"""Rows of a contact's record, sums over its points (penetration: maximum). Slip and stick are weighted by area."""
+MOMENT_ROW, NORMAL_ROW, SLIP_ROW, AREA_ROW, STICK_ROW, STORED_ROW, PENETRATION_ROW = (
+    RECORD_NAMES.index(name) for name in ("moment_x", "normal_force", "slip", "area", "stick", "stored", "penetration")
+)
 
 
 @wp.func
