@@ -1,4 +1,8 @@
-"""Master facets during an attempt: polynomial coefficients, midpoints, and bounding boxes of the tree."""
+"""Broad phase of contact between bodies: master facets at an iterate and at the start of an attempted step.
+
+Computed are the monomial coefficients of displacements on each facet, its centre, and the bounding boxes of the tree.
+u_coefs, director_coefs: coefficients of the displacement and of the director's displacement, see `master_struct`.
+"""
 
 import functools
 import types as _types
@@ -13,14 +17,14 @@ from .pair_structs import master_struct, pair_scratch_struct
 __all__ = ["BOX_MARGIN", "broad_phase_kernels"]
 
 BOX_MARGIN = 0.25
-"""Enlargement of the boxes of the tree, as a fraction of a facet's side: they stay valid for several steps."""
+"""Enlargement of the boxes of the tree, as a fraction of the facet's side length: they stay valid for several steps."""
 BOX_ROUNDING = 2.4e-7
-"""Relative widening of boxes in float32: twice its unit round-off."""
+"""Relative widening of a box before its conversion to float32: twice the machine epsilon, 1.2e-7."""
 
 
 @functools.cache
 def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
-    """Kernels for displacements of a precision, in the module of `facet_search_kernels`, and functions of boxes."""
+    """Kernels for displacements of type `dtype`, in the module of `facet_search_kernels`; functions of boxes."""
     vec3 = precision(dtype).vec3
     f64, vec3d, box3 = wp.float64, wp.vec3d, wp.vec3
     mat43 = wp.types.matrix(shape=(4, 3), dtype=f64)
@@ -39,7 +43,8 @@ def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
         mas: Masters, u: wp.array2d(dtype=Any), world: int, item: int, m: int, C: wp.array2d(dtype=vec3d),
         D: wp.array2d(dtype=vec3d),
     ):  # fmt: skip
-        """Monomial coefficients m of a field u on facet `item`: C of its value, D of its outward derivative."""
+        """Monomial coefficients m of a field u [world, slot] on facet `item`, [world, control]: C of its value, D of
+        its derivative along the director."""
         c = vec3d()
         d = vec3d()
         for i in range(mas.conn.shape[0]):
@@ -64,14 +69,16 @@ def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
         mas: Masters, u_n: wp.array2d(dtype=vec3), v_n: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32),
         pair: PairScratch,
     ):  # fmt: skip
-        """Coefficients of displacements and velocities at the start of an attempt; resets the largest depths."""
+        """Coefficients of displacements and velocities at the start of an attempt; reset the largest depths."""
         world, item, m = wp.tid()
         if active[world] != 0:
+            # threads of a world share the bodies
             for body in range(
                 mas.max_monomials * item + m, pair.deepest_contact.shape[1], mas.max_monomials * mas.facet_count
             ):
                 pair.deepest_contact[world, body] = f64(0.0)
         if active[world] != 0 and m < mas.monomial_count[mas.facet_kind[item]]:
+            # the director part of the velocity is not used: the next line overwrites it
             set_coefficient(mas, v_n, world, item, m, pair.start_v_coefs, pair.start_director_coefs)
             set_coefficient(mas, u_n, world, item, m, pair.start_u_coefs, pair.start_director_coefs)
 
@@ -100,7 +107,7 @@ def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def pack_facet_point(s: FacetPoint) -> mat43:
-        """Position and derivatives, packed in a matrix."""
+        """Position and derivatives of a facet point as the rows of a matrix."""
         return mat43(
             s.position[0],
             s.position[1],
@@ -118,12 +125,12 @@ def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def unpack_facet_point(m: mat43) -> FacetPoint:
-        """Position and derivatives from their matrix."""
+        """Facet point from the rows of a matrix."""
         return FacetPoint(m[0], m[1], m[2], m[3])
 
     @wp.kernel(module=module)
     def check_boxes(mas: Masters, active: wp.array(dtype=wp.int32), pair: PairScratch):
-        """Flag facets outside of their boxes, at the start of the attempt or now; compute new boxes."""
+        """Request a refit if a facet, at the start of the attempt or now, left its box; compute the enlarged boxes."""
         world, item = wp.tid()
         if active[world] == 0:
             return
@@ -153,8 +160,8 @@ def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def update_centres(mas: Masters, active: wp.array(dtype=wp.int32), pair: PairScratch):
-        """Position and derivatives at the midpoint of each facet, at the start of the attempt and now, and the facet's
-        largest height above the tangent plane there."""
+        """Position and derivatives at the centre of each facet, now and at the start of the attempt; an upper bound, m,
+        of the facet's height above the tangent plane there, from its control points."""
         world, item = wp.tid()
         if active[world] == 0:
             return

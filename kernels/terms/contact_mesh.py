@@ -42,8 +42,8 @@ def mesh_struct():
     @wp.struct
     class Meshes:
         first_box: wp.array(dtype=wp.int32)  # [collider] index of its first box
-        first_leaf: wp.array(dtype=wp.int32)  # index of its first leaf
-        inner_count: wp.array(dtype=wp.int32)  # number of boxes above the leaves
+        first_leaf: wp.array(dtype=wp.int32)  # [collider] index of its first leaf
+        inner_count: wp.array(dtype=wp.int32)  # [collider] number of boxes above the leaves
         box_low: wp.array(dtype=wp.vec3d)  # [box] corners of boxes, m
         box_high: wp.array(dtype=wp.vec3d)
         leaf_start: wp.array(dtype=wp.int32)  # [leaf] index of its first triangle; the next entry ends it
@@ -62,9 +62,9 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
 
     @wp.struct
     class Nearest:
-        position: vec3d
-        distance_squared: f64  # squared distance
-        feature: wp.int32
+        position: vec3d  # closest point, m
+        distance_squared: f64  # m^2
+        feature: wp.int32  # of the triangle, see `mesh_struct`
         triangle: wp.int32  # -1: none
 
     @wp.struct

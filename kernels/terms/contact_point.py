@@ -46,17 +46,18 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         """A point at an iterate; forces are of the whole region."""
 
         normal: vec3d  # outward normal of the shape
-        depth: f64
-        depth_increment: (
-            f64  # change of depth in the step; of a moving contact point, from the depth of the previous one
-        )
-        side: wp.int32
+        depth: f64  # m
+        # change of depth in the step, m; of a moving contact point, from the depth of the previous one
+        depth_increment: f64
+        side: (
+            wp.int32
+        )  # side of the collider through which the point has entered, -1: any or none, -2: it passed through
         normal_response: wp.vec4d  # normal force, its derivative, its potential, the magnitude of the potential's terms
         friction_normal: vec3d  # normal of the plane of friction
         relative_motion: vec3d  # in the step, relative to the collider, m
-        trial_displacement: vec3d  # motion plus spring, m
-        tangential_motion: vec3d  # motion in that plane, m
-        trial_elastic_slip: vec3d  # spring: tangential slip since it was anchored, m
+        trial_displacement: vec3d  # relative motion plus the stored elastic slip, m
+        tangential_motion: vec3d  # tangential part of `relative_motion`, m
+        trial_elastic_slip: vec3d  # tangential part of `trial_displacement`, m
         local_position: vec3d  # position in the collider's frame, m
 
     @wp.func

@@ -1,7 +1,8 @@
-"""Rigid analytic shapes: signed distance, outward normal, and passage of a motion through them.
+"""Rigid analytic shapes: signed distance, outward normal, and a swept test against tunnelling.
 
 All in float64 and in the shape's own frame: half-space z <= 0, sphere about the origin, box along the axes, capsule and
-cylinder along z. `size` as in `warpfea.model.contacts`: radius; half edges; radius and half length.
+cylinder along z. `size` as in `warpfea.model.shapes`, m: radius; half edges; radius and half length (of a
+capsule: of its axis, without the caps).
 """
 
 import functools
@@ -42,14 +43,14 @@ def shape_functions() -> _types.SimpleNamespace:
 
     @wp.func
     def half_size(kind: int, size: vec3d, axis: int) -> f64:
-        """Half the thickness along an axis, of a box or a cylinder."""
+        """Half the thickness of a box or a cylinder along an axis, m."""
         if kind == CYLINDER:
             return wp.where(axis == 2, size[1], size[0])
         return size[axis]
 
     @wp.func
     def depth_below(kind: int, size: vec3d, y: vec3d, side: int) -> f64:
-        """Signed depth of a position under a side of a box or a cylinder."""
+        """Signed depth of a position below a side of a box or a cylinder, m; positive inside."""
         if side == LATERAL_SIDE:
             return size[0] - wp.sqrt(y[0] * y[0] + y[1] * y[1])
         axis = side / 2
@@ -58,7 +59,7 @@ def shape_functions() -> _types.SimpleNamespace:
 
     @wp.func
     def closest_on_axis(size: vec3d, y: vec3d) -> vec3d:
-        """Nearest position to y on a capsule's axis."""
+        """Closest point to y on a capsule's axis."""
         return vec3d(f64(0.0), f64(0.0), wp.clamp(y[2], -size[1], size[1]))
 
     @wp.func
@@ -79,7 +80,10 @@ def shape_functions() -> _types.SimpleNamespace:
 
     @wp.func
     def distance(kind: int, size: vec3d, y: vec3d, side: int) -> wp.vec4d:
-        """Outward unit normal and signed distance; inside a shape with sides from `side`, or from the nearest if -1."""
+        """(n, gap): outward unit normal and signed distance, m, negative inside.
+
+        Inside a box or a cylinder the distance is that from `side`, or from the nearest side if -1.
+        """
         n = vec3d(f64(0.0), f64(0.0), f64(1.0))
         gap = y[2]
         if kind == SPHERE:
@@ -115,7 +119,7 @@ def shape_functions() -> _types.SimpleNamespace:
     @wp.func
     def line_interval(kind: int, size: vec3d, a: vec3d, d: vec3d) -> vec3d:
         """Interval of t with a + t d within a box or a cylinder: t of entry, t of exit, and 16 x side of entry + side
-        of exit; the first is larger than the second if there is none."""
+        of exit; the first is not smaller than the second if there is none."""
         t_in = f64(-1.0e300)
         t_out = f64(1.0e300)
         side_in = wp.int32(0)

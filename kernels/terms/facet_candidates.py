@@ -16,7 +16,7 @@ __all__ = ["TUNNEL_LIMIT_RATIO", "facet_candidate_functions"]
 MIN_NORMAL_COSINE = 0.1
 """Minimum cosine of the normals of two facets that a point in contact passes between: excludes the edge of a box."""
 TUNNEL_LIMIT_RATIO = 0.25
-"""Depth over the allowed depth above which a point without a facet has passed through."""
+"""Ratio to the depth limit of a facet above which a point that left the facet has passed through the body."""
 OPPOSING_COSINE = 0.5
 """Cosine of a facet's normal and the slave's reversed normal above which they face each other; below its negative they
 face the same way."""
@@ -25,7 +25,7 @@ MAX_DEPTH_RATIO = 2.0
 MAX_EDGE_TANGENT = 2.0
 """Maximum tangent of the angle between an outward vector and the normal of its facet, at the edge of a box."""
 TANGENT_PLANE_MARGIN = 0.5
-"""Parametric margin for rejecting a facet by the tangent plane at its midpoint."""
+"""Parametric margin for rejecting a facet by the tangent plane at its centre."""
 
 
 @functools.cache
@@ -53,9 +53,9 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
 
         world: wp.int32
         contact: wp.int32
-        slave_facet: wp.int32  # slave facet
-        number_in_facet: wp.int32  # number among the points of that facet
-        point: wp.int32
+        slave_facet: wp.int32
+        number_in_facet: wp.int32  # number among the points of the slave facet
+        point: wp.int32  # index of the point among all
         displacement: vec3d  # displacement, m
         position: vec3d  # position, m
         start_position: vec3d  # position at the start of the attempt, m
@@ -63,7 +63,7 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
         motion: vec3d  # motion relative to the anchor facet's material, m
         facing_normal: vec3d  # normal of the anchor facet, else inward normal of the slave facet; 0: not yet set
         overlap_limit: f64  # m, > 0: no step; inner points up to that depth are in contact
-        height_limit: f64  # largest height above a facet, m
+        height_limit: f64  # largest height above a facet that is considered, m
         outside_depth: f64  # depth at the start of the attempt up to which a point was outside, m
 
     @wp.struct
@@ -168,8 +168,8 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def is_far(mas: Masters, pair: PairScratch, slave: SlavePoint, f: int) -> bool:
-        """True if a point is above a facet by more than twice `pad`, or moved little and is beside it, by the tangent
-        plane at its midpoint."""
+        """True if a point is above a facet by more than twice `height_limit`, or moved little and is beside it, by
+        the tangent plane at its centre."""
         corners = mas.corner_count[mas.facet_kind[f]]
         s = unpack_facet_point(pair.centre[slave.world, f])
         if (
@@ -186,7 +186,7 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def in_front(mas: Masters, pair: PairScratch, slave: SlavePoint, f: int) -> bool:
-        """True if a point is above a facet by more than `pad` and within its sides."""
+        """True if a point is above a facet by more than `height_limit` and within its sides."""
         corners = mas.corner_count[mas.facet_kind[f]]
         found = inverse_map(
             mas, pair.u_coefs, pair.director_coefs, slave.world, f, slave.position, facet_centre(corners)

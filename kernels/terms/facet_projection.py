@@ -1,4 +1,8 @@
-"""Position of a point on a master facet: polynomials of its coordinates, their derivatives, Newton's method on them."""
+"""Facet coordinates of a point by Newton's method, and its projection on a master facet.
+
+Positions on a facet are polynomials of xi = (a, b, z), see `master_struct`: a, b on the unit triangle or square, z in m
+along the director. C, D: monomial coefficients [world, control] of the displacement and of the director's displacement.
+"""
 
 import functools
 import types as _types
@@ -17,6 +21,7 @@ OUTSIDE_TOLERANCE = 0.05
 """Distance over a side by which a point may lie outside of its facet: outward vectors of two elements differ, and a
 point on a border must not change facets from iterate to iterate."""
 INSIDE_TOLERANCE = 1e-9
+"""Distance over a side within which a point counts as inside of its facet: round-off of Newton's method."""
 QUADRATIC_STEP = 1e-8
 """Step size below which Newton's method stops: the remaining error is its square."""
 MAX_OVERHANG = 0.5
@@ -32,7 +37,7 @@ def facet_projection_functions(dtype: str) -> _types.SimpleNamespace:
 
     @wp.struct
     class FacetPoint:
-        """Position and its derivatives by the three coordinates."""
+        """Position, m, and its derivatives by the coordinates a, b and z; `director` is the outward vector."""
 
         position: vec3d
         tangent_a: vec3d
@@ -58,7 +63,7 @@ def facet_projection_functions(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def power_quotient(x0: f64, x: f64, n: int) -> f64:
-        """(x^n - x0^n)/(x - x0)."""
+        """(x^n - x0^n)/(x - x0), without cancellation."""
         if n < 2:
             return f64(n)
         if n == 2:
@@ -213,15 +218,15 @@ def facet_projection_functions(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def unit_normal(t: FacetPoint) -> vec3d:
-        """Unit normal of the layer through a position."""
+        """Unit normal of the surface of constant z through a position."""
         return wp.normalize(wp.cross(t.tangent_a, t.tangent_b))
 
     @wp.struct
     class Projection:
         """Projection of a point onto a facet: gap = gap_slope x (coordinate along the outward vector) + gap_offset."""
 
-        xi: vec3d
-        normal: vec3d  # normal at the projection
+        xi: vec3d  # coordinates of the projection, z = 0
+        normal: vec3d  # unit normal at the projection
         gap_slope: f64
         gap_offset: f64  # m, nonzero on a curved facet
 
