@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from warpfea.kernels.terms.contact_structs import RECORD
+from warpfea.kernels.terms.contact_structs import RECORD_NAMES
 
 import warpfea as wf
 from warpfea.model.contact_points import contact_points
@@ -38,8 +38,8 @@ def middle(map=None, origin=(0.0, 0.0, 0.0)):
 def record(sim, contact):
     """Fields of the last step's record of a contact, by name."""
     term = sim.model.terms.find(Contact)
-    first = term.report_offset + len(RECORD) * term.tables.number[contact.index]
-    return dict(zip(RECORD, sim.stepper.work.report.numpy()[0, first : first + len(RECORD)]))
+    first = term.report_offset + len(RECORD_NAMES) * term.tables.number[contact.index]
+    return dict(zip(RECORD_NAMES, sim.stepper.work.report.numpy()[0, first : first + len(RECORD_NAMES)]))
 
 
 LOAD = 2e3

@@ -19,7 +19,7 @@ STEP = 1e-6
 @functools.cache
 def _kernels():
     laws = law_functions()
-    normal_law, friction, smooth_friction = laws.normal_law, laws.friction, laws.smooth_friction
+    normal_law, friction, smooth_friction = laws.normal_law, laws.huber_friction, laws.smooth_friction
     f64, vec3d = wp.float64, wp.vec3d
     module = wp.get_module("contact_laws_alone")
     wp.set_module_options({"enable_backward": False}, module=module)

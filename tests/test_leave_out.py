@@ -92,7 +92,7 @@ def test_options_of_the_simulation_come_and_go():
 def test_bare_step_uses_few_modules():
     _, kernels, modules, _, model = cost(ledger=False)
     assert len(modules) <= 13
-    assert not any("follower" in k or "drive" in k or "evaluate_laws" in k or "dead_load" in k for k in kernels)
+    assert not any("follower" in k or "drive" in k or "evaluate_time_laws" in k or "dead_load" in k for k in kernels)
     assert not any("constraint" in name or "contact" in name for name in modules)
     assert {"constraints", "gravity", "body forces", "follower pressure", "driven nodes"} <= set(
         model.info()["left_out"]

@@ -109,8 +109,8 @@ def system(loop):
     for group in term.tables.groups:
         functions = group.data.shape.numpy()
         for item, conn in enumerate(group.conn):
-            for q in range(group.data.points):
-                point = group.data.point + item * group.data.points + q
+            for q in range(group.data.point_count):
+                point = group.data.first_point + item * group.data.point_count + q
                 k = stiffness[point]
                 if listed[point] == 0 or not k.any():
                     continue

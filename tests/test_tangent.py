@@ -139,8 +139,8 @@ def with_mass_product(model, kernel, u, v, p, mass_factor=1e3):
     args += [make_pool(model, sim.stepper.work, midpoint=False), out]
     wp.launch(kernel, dim=(2, count), inputs=args, device="cpu")
     total = np.zeros((2, model.slots, 3))
-    slot = np.repeat(np.arange(model.slots), np.diff(clusters.topology.start.numpy()))
-    np.add.at(total, (slice(None), slot), out.numpy().astype(float)[:, clusters.topology.entry.numpy()])
+    slot = np.repeat(np.arange(model.slots), np.diff(clusters.topology.contribution_start.numpy()))
+    np.add.at(total, (slice(None), slot), out.numpy().astype(float)[:, clusters.topology.contribution_entry.numpy()])
     return total
 
 

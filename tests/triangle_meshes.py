@@ -92,8 +92,8 @@ def search(mesh, ends, starts=None, sides=None, others=(), device="cpu"):
     shapes = [*others, mesh, *others]
     con, k = Contacts(), len(others)
     con.mesh = mesh_tables(Model(device), shapes)
-    con.kind = wp.array([s.kind for s in shapes], dtype=wp.int32, device=device)
-    con.size = wp.array([s.sizes for s in shapes], dtype=wp.vec3d, device=device)
+    con.collider_kind = wp.array([s.kind for s in shapes], dtype=wp.int32, device=device)
+    con.collider_size = wp.array([s.sizes for s in shapes], dtype=wp.vec3d, device=device)
     center = mesh.frame()[0]
     count = len(ends)
     a, b = (

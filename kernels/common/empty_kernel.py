@@ -13,7 +13,7 @@ __all__ = ["empty_kernels"]
 @functools.cache
 def empty_kernels() -> _types.SimpleNamespace:
     """Kernel `empty`."""
-    module = kernel_module("probe")
+    module = kernel_module("empty")
 
     @wp.kernel(module=module)
     def empty(flags: wp.array(dtype=wp.int32)):

@@ -7,9 +7,9 @@ import warp as wp
 
 from .types import precision
 
-__all__ = ["WARP", "block_memory", "lane_functions", "warp_minimum"]
+__all__ = ["WARP_SIZE", "block_memory", "lane_functions", "warp_minimum"]
 
-WARP = 32
+WARP_SIZE = 32
 """Threads of a warp."""
 
 
@@ -72,7 +72,7 @@ def warp_minimum(x: wp.float64, world: int) -> wp.float64:
     ...
 
 
-_SHARED = """
+_SHARED_MEMORY_SNIPPET = """
     #if defined(__CUDA_ARCH__)
     __shared__ {number} memory[{size}];
     return (uint64_t)memory;
@@ -80,7 +80,7 @@ _SHARED = """
     return outside;
     #endif
 """
-_NUMBER = {"float64": "double", "float32": "float"}
+_C_TYPES = {"float64": "double", "float32": "float"}
 
 
 @functools.cache
@@ -90,9 +90,9 @@ def block_memory(dtype: str, size: int) -> _types.SimpleNamespace:
     `open(outside)` is their location: memory of the block or, on the CPU, that at `outside`. `load(at, i)` and
     `store(at, i, x)` access number i.
     """
-    T, number = precision(dtype).T, _NUMBER[dtype]
+    T, number = precision(dtype).T, _C_TYPES[dtype]
 
-    @wp.func_native(snippet=_SHARED.format(number=number, size=size))
+    @wp.func_native(snippet=_SHARED_MEMORY_SNIPPET.format(number=number, size=size))
     def open_memory(outside: wp.uint64) -> wp.uint64:
         """Location of the numbers."""
         ...

@@ -8,11 +8,11 @@ import warp as wp
 from .lanes import lane_sum_float64
 from .types import kernel_module
 
-__all__ = ["CHUNK", "WARP_ROW", "reduce_kernels"]
+__all__ = ["CHUNK", "MAX_WARP_ROW", "reduce_kernels"]
 
-TILE = 1024
+TILE_SIZE = 1024
 """Numbers summed at once by a block."""
-WARP_ROW = 512
+MAX_WARP_ROW = 512
 """Rows up to this length are summed by a warp, which leaves room for many worlds (4096 worlds on an H200, rows of 67: 5
 us for 48)."""
 CHUNK = 16384
@@ -31,9 +31,9 @@ def reduce_kernels() -> _types.SimpleNamespace:
         row, world, chunk = wp.tid()
         if active[world] == 0:
             return
-        acc = wp.tile_zeros(shape=(1, 1, TILE), dtype=f64)
-        for k in range(CHUNK // TILE):
-            acc += wp.tile_load(rows, shape=(1, 1, TILE), offset=(row, world, chunk * CHUNK + k * TILE))
+        acc = wp.tile_zeros(shape=(1, 1, TILE_SIZE), dtype=f64)
+        for k in range(CHUNK // TILE_SIZE):
+            acc += wp.tile_load(rows, shape=(1, 1, TILE_SIZE), offset=(row, world, chunk * CHUNK + k * TILE_SIZE))
         partial[row, world, chunk] = wp.tile_extract(wp.tile_sum(acc), 0)
 
     @wp.kernel(module=module)
@@ -42,9 +42,9 @@ def reduce_kernels() -> _types.SimpleNamespace:
         row, world = wp.tid()
         if active[world] == 0:
             return
-        acc = wp.tile_zeros(shape=(1, 1, TILE), dtype=f64)
-        for k in range((rows.shape[2] + TILE - 1) // TILE):
-            acc += wp.tile_load(rows, shape=(1, 1, TILE), offset=(row, world, k * TILE))
+        acc = wp.tile_zeros(shape=(1, 1, TILE_SIZE), dtype=f64)
+        for k in range((rows.shape[2] + TILE_SIZE - 1) // TILE_SIZE):
+            acc += wp.tile_load(rows, shape=(1, 1, TILE_SIZE), offset=(row, world, k * TILE_SIZE))
         out[row, world] = wp.tile_extract(wp.tile_sum(acc), 0)
 
     @wp.kernel(module=module)

@@ -20,34 +20,34 @@ def bodies_struct(dtype: str):
 
     @wp.struct
     class Bodies:
-        first: wp.array(dtype=wp.int32)  # [body] first slot
-        last: wp.array(dtype=wp.int32)  # [body] last slot + 1
-        size: wp.array(dtype=wp.float64)  # m
-        translations: wp.array(dtype=wp.vec3d)  # [body] 1 for free translations, 0 for prescribed ones
-        rotations: wp.array(dtype=wp.vec3d)  # [body] 1 for free rotations, else 0
+        first_slot: wp.array(dtype=wp.int32)  # [body] first slot
+        end_slot: wp.array(dtype=wp.int32)  # [body] last slot + 1
+        body_size: wp.array(dtype=wp.float64)  # m
+        free_translations: wp.array(dtype=wp.vec3d)  # [body] 1 for free translations, 0 for prescribed ones
+        free_rotations: wp.array(dtype=wp.vec3d)  # [body] 1 for free rotations, else 0
         centre_slots: wp.array2d(dtype=wp.int32)  # [sample, body] slots whose mean position is the centre
-        of_slot: wp.array(dtype=wp.int32)  # [slot] body or -1
+        body_of_slot: wp.array(dtype=wp.int32)  # [slot] body or -1
         is_position: wp.array(dtype=T)  # [slot] 1 for a position, 0 for a gradient
-        X: wp.array(dtype=wp.vec3d)  # [slot] reference position, m, or gradient
-        arm: wp.array2d(dtype=wp.vec3d)  # [world, slot] a
+        slot_reference: wp.array(dtype=wp.vec3d)  # [slot] reference position, m, or gradient
+        lever_arm: wp.array2d(dtype=wp.vec3d)  # [world, slot] a
 
     return Bodies
 
 
 @functools.cache
 def rigid_mode_functions(dtype: str) -> _types.SimpleNamespace:
-    """Device functions for the terms' parts of the matrix."""
+    """Device functions: columns of the matrix of rigid-body modes, R, at a slot."""
     mat33d = wp.mat33d
     Bodies = bodies_struct(dtype)
 
     @wp.func
     def translation_columns(bodies: Bodies, body: int, slot: int) -> mat33d:
         """Motion of a slot by the translations of its body, as columns."""
-        return wp.float64(bodies.is_position[slot]) * wp.diag(bodies.translations[body])
+        return wp.float64(bodies.is_position[slot]) * wp.diag(bodies.free_translations[body])
 
     @wp.func
     def rotation_columns(bodies: Bodies, world: int, body: int, slot: int) -> mat33d:
         """Motion of a slot by the rotations of its body, as columns e_k x a."""
-        return -wp.skew(bodies.arm[world, slot]) @ wp.diag(bodies.rotations[body])
+        return -wp.skew(bodies.lever_arm[world, slot]) @ wp.diag(bodies.free_rotations[body])
 
     return _types.SimpleNamespace(translation_columns=translation_columns, rotation_columns=rotation_columns)

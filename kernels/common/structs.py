@@ -1,4 +1,4 @@
-"""Shared structs: contributions to slots, patterns of matrices, the balance of forces."""
+"""Shared structs: gather tables of slots, sparsity patterns, the balance of forces, the terms of a product H p."""
 
 import functools
 
@@ -6,7 +6,7 @@ import warp as wp
 
 from .types import precision
 
-__all__ = ["additions_struct", "balance_struct", "pattern_struct", "topology_struct"]
+__all__ = ["balance_struct", "pattern_struct", "product_terms_struct", "topology_struct"]
 
 
 @functools.cache
@@ -15,29 +15,32 @@ def pattern_struct():
 
     @wp.struct
     class Pattern:
-        start: wp.array(dtype=wp.int32)  # [slot + 1]
+        start: wp.array(dtype=wp.int32)  # [slot + 1] first entry of a row
         column: wp.array(dtype=wp.int32)  # [entry] slot of the column
-        upper: wp.array(dtype=wp.vec4i)  # (entry, its transpose, row, column); diagonal and above
+        upper: wp.array(dtype=wp.vec4i)  # entries on and above the diagonal: (entry, its transpose, row, column)
 
     return Pattern
 
 
 @functools.cache
 def topology_struct(dtype: str):
-    """Gather data of a slot: its contributions, its row of the mass matrix (CSR), its free components."""
+    """Gather tables of slots (CSR): contributions of elements, rows of the mass matrix, the pool of terms.
+
+    The pool is one array [world, entry] of the contributions of all terms with a potential to their slots.
+    """
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
 
     @wp.struct
     class Topology:
-        start: wp.array(dtype=wp.int32)  # [slot + 1]
-        entry: wp.array(dtype=wp.int32)  # contributions to a slot, in a fixed order
+        contribution_start: wp.array(dtype=wp.int32)  # [slot + 1] first contribution of a slot
+        contribution_entry: wp.array(dtype=wp.int32)  # indices of the contributions, in a fixed order
         mass_start: wp.array(dtype=wp.int32)  # [slot + 1]
         mass_column: wp.array(dtype=wp.int32)
         mass_value: wp.array2d(dtype=T)  # [world or 0, entry] kg
         free: wp.array(dtype=vec3)  # [slot] 1 where a component is an unknown, 0 where prescribed
-        prescribed: wp.array(dtype=wp.uint8)  # [slot] bit k is set if component k is prescribed: `free` in one byte
-        pool_start: wp.array(dtype=wp.int32)  # [slot + 1] of the pool of terms; with pooled terms
+        prescribed_bits: wp.array(dtype=wp.uint8)  # [slot] bit k: component k is prescribed; `free` in one byte
+        pool_start: wp.array(dtype=wp.int32)  # [slot + 1] first pool entry of a slot; with pooled terms
         pool_entry: wp.array(dtype=wp.int32)  # indices into the pool
 
     return Topology
@@ -49,11 +52,11 @@ def mass_function(dtype: str):
     T, Topology = precision(dtype).T, topology_struct(dtype)
 
     @wp.func
-    def mass_at(topo: Topology, world: int, k: int) -> T:
+    def mass_entry(topo: Topology, world: int, k: int) -> T:
         """Entry k in the given world."""
         return topo.mass_value[world % topo.mass_value.shape[0], k]
 
-    return mass_at
+    return mass_entry
 
 
 @functools.cache
@@ -72,33 +75,33 @@ def balance_struct(dtype: str):
         nonpotential_frozen: wp.array2d(dtype=vec3)
         direction: wp.array2d(dtype=vec3)  # p, search direction
         diagonal: wp.array2d(dtype=vec3)  # D, the diagonal of H, which weights the norms
-        inertia: wp.array2d(dtype=vec3)
+        inertia: wp.array2d(dtype=vec3)  # inertia and internal force
         internal: wp.array2d(dtype=vec3)
         g: wp.array2d(dtype=vec3)  # the residual
         gradient: wp.array2d(dtype=vec3)  # of the augmented potential: right side of the Newton step
         pool_force: wp.array2d(dtype=vec3)  # [world, entry] forces of pooled terms
         rows: wp.array3d(dtype=wp.float64)  # [row, world, slot] to be summed
-        mass_factor: wp.array(dtype=wp.float64)  # [world]
-        dq_dv: wp.array(dtype=wp.float64)
+        mass_factor: wp.array(dtype=wp.float64)  # [world] c_M of the inertia term, 1/s
+        dq_dv: wp.array(dtype=wp.float64)  # [world] derivative of the end displacement by the velocity, s
 
     return Balance
 
 
 @functools.cache
-def additions_struct(dtype: str):
-    """Additions to the elements' part of a product: factors, and tangents of the terms."""
+def product_terms_struct(dtype: str):
+    """Parts of a product H p beyond the elements: inertia, and tangents of the terms times p."""
     vec3 = precision(dtype).vec3
 
     @wp.struct
-    class Additions:
-        start: wp.array(dtype=wp.int32)  # of non-conservative forces: [slot + 1]
-        entry: wp.array(dtype=wp.int32)  # indices into their contributions
-        contribution: wp.array2d(dtype=vec3)
+    class ProductTerms:
+        contribution_start: wp.array(dtype=wp.int32)  # [slot + 1] of non-conservative forces
+        contribution_entry: wp.array(dtype=wp.int32)  # indices into their contributions
+        contribution: wp.array2d(dtype=vec3)  # [world, entry] their tangent times p
         pool_start: wp.array(dtype=wp.int32)  # as in Topology; with pooled terms
         pool_entry: wp.array(dtype=wp.int32)
         pool: wp.array2d(dtype=vec3)  # [world, entry] K p of pooled terms
-        mass_factor: wp.array(dtype=wp.float64)  # [world]
-        dq_dv: wp.array(dtype=wp.float64)
-        warp: wp.int32  # number of threads per partial sum
+        mass_factor: wp.array(dtype=wp.float64)  # [world] c_M of the inertia term, 1/s
+        dq_dv: wp.array(dtype=wp.float64)  # [world] derivative of the end displacement by the velocity, s
+        warp_lanes: wp.int32  # number of threads per partial sum
 
-    return Additions
+    return ProductTerms

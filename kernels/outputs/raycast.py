@@ -12,41 +12,41 @@ wp.set_module_options({"enable_backward": False, "max_unroll": 4})
 class Scene:
     """Picture data: mesh, camera, light, ground plane and its shadow map."""
 
-    mesh: wp.uint64
+    mesh: wp.uint64  # id of a wp.Mesh: the surfaces
     corner_normals: wp.array(dtype=wp.vec3)  # [3 * face + corner]
     colors: wp.array(dtype=wp.vec3)  # [vertex]
-    eye: wp.vec3
-    forward: wp.vec3
+    eye: wp.vec3  # position of the camera
+    forward: wp.vec3  # unit vector of the viewing direction
     right: wp.vec3  # half the picture's width at distance one
     up: wp.vec3  # half its height
-    center: wp.vec2  # intersection of the axis `forward` with the picture, in [-1, 1]
-    width: float  # pixels
-    height: float
-    light: wp.vec3  # towards the light
-    ground: float  # height of the ground plane
-    has_ground: int
-    grid: float  # distance of the ground's fine lines; every fifth is strong
-    fade: float  # radius at which the ground has faded into the background
-    focus: wp.vec2  # (x, y) of the middle of the ground
-    shadow: wp.array2d(dtype=float)  # light (0 .. 1) that reaches the ground
-    shadow_low: wp.vec2  # corner of the shadow map
-    shadow_cell: float  # size of its cells
+    principal_point: wp.vec2  # intersection of the axis `forward` with the picture, in [-1, 1]
+    width_pixels: float
+    height_pixels: float
+    light_direction: wp.vec3  # towards the light
+    ground_height: float  # height of the ground plane
+    has_ground: int  # 1: draw the ground plane
+    grid_spacing: float  # distance of the ground's fine lines; every fifth is strong
+    fade_radius: float  # radius at which the ground has faded into the background
+    ground_center: wp.vec2  # (x, y) of the middle of the ground
+    shadow_map: wp.array2d(dtype=float)  # light (0 .. 1) that reaches the ground
+    shadow_map_corner: wp.vec2  # corner of the shadow map
+    shadow_cell_size: float  # size of its cells
 
 
 @wp.func
-def mix(a: wp.vec3, b: wp.vec3, t: float):
+def blend(a: wp.vec3, b: wp.vec3, t: float):
     """a (1 - t) + b t."""
     return a * (1.0 - t) + b * t
 
 
 @wp.func
-def backdrop(height: float):
+def background_color(height: float):
     """Colour of the background at a height in the picture, 0 at the bottom and 1 at the top."""
-    return mix(wp.vec3(0.90, 0.91, 0.92), wp.vec3(0.60, 0.68, 0.78), wp.clamp(height, 0.0, 1.0))
+    return blend(wp.vec3(0.90, 0.91, 0.92), wp.vec3(0.60, 0.68, 0.78), wp.clamp(height, 0.0, 1.0))
 
 
 @wp.func
-def line(x: float, step: float, half_width: float, footprint: float):
+def line_coverage(x: float, step: float, half_width: float, footprint: float):
     """Fraction of a pixel of size `footprint` at x covered by lines at the multiples of `step`."""
     d = wp.abs(x / step - wp.round(x / step)) * step
     w = wp.max(half_width, 0.5 * footprint)
@@ -57,16 +57,16 @@ def line(x: float, step: float, half_width: float, footprint: float):
 @wp.func
 def ground_light(scene: Scene, x: float, y: float):
     """Light (0 to 1) that reaches a point of the ground: the shadow map, bilinear; 1 outside of it."""
-    fx = (x - scene.shadow_low[0]) / scene.shadow_cell - 0.5
-    fy = (y - scene.shadow_low[1]) / scene.shadow_cell - 0.5
+    fx = (x - scene.shadow_map_corner[0]) / scene.shadow_cell_size - 0.5
+    fy = (y - scene.shadow_map_corner[1]) / scene.shadow_cell_size - 0.5
     i = int(wp.floor(fx))
     j = int(wp.floor(fy))
-    if i < 0 or j < 0 or i + 1 >= scene.shadow.shape[0] or j + 1 >= scene.shadow.shape[1]:
+    if i < 0 or j < 0 or i + 1 >= scene.shadow_map.shape[0] or j + 1 >= scene.shadow_map.shape[1]:
         return 1.0
     u = fx - float(i)
     v = fy - float(j)
-    low = scene.shadow[i, j] * (1.0 - u) + scene.shadow[i + 1, j] * u
-    high = scene.shadow[i, j + 1] * (1.0 - u) + scene.shadow[i + 1, j + 1] * u
+    low = scene.shadow_map[i, j] * (1.0 - u) + scene.shadow_map[i + 1, j] * u
+    high = scene.shadow_map[i, j + 1] * (1.0 - u) + scene.shadow_map[i + 1, j + 1] * u
     return low * (1.0 - v) + high * v
 
 
@@ -74,43 +74,43 @@ def ground_light(scene: Scene, x: float, y: float):
 def shade_ground(scene: Scene, p: wp.vec3, distance: float, slope: float, behind: wp.vec3):
     """Colour of the ground at p: a light plane with a grid and the shadow, fading into the colour `behind` it."""
     base = wp.vec3(0.80, 0.81, 0.83)
-    pixel = distance * wp.length(scene.up) * 2.0 / scene.height
+    pixel = distance * wp.length(scene.up) * 2.0 / scene.height_pixels
     footprint = pixel / wp.max(slope, 0.05)
-    fine = wp.max(line(p[0], scene.grid, 0.4 * pixel, footprint), line(p[1], scene.grid, 0.4 * pixel, footprint))
-    big = 5.0 * scene.grid
-    strong = wp.max(line(p[0], big, 0.7 * pixel, footprint), line(p[1], big, 0.7 * pixel, footprint))
-    base = mix(base, wp.vec3(0.50, 0.53, 0.58), wp.max(0.45 * fine, 0.70 * strong))
+    step, big = scene.grid_spacing, 5.0 * scene.grid_spacing
+    fine = wp.max(line_coverage(p[0], step, 0.4 * pixel, footprint), line_coverage(p[1], step, 0.4 * pixel, footprint))
+    strong = wp.max(line_coverage(p[0], big, 0.7 * pixel, footprint), line_coverage(p[1], big, 0.7 * pixel, footprint))
+    base = blend(base, wp.vec3(0.50, 0.53, 0.58), wp.max(0.45 * fine, 0.70 * strong))
     base = base * (0.48 + 0.52 * ground_light(scene, p[0], p[1]))
-    r = wp.length(wp.vec2(p[0], p[1]) - scene.focus) / scene.fade
-    return mix(behind, base, wp.exp(-r * r * r))
+    r = wp.length(wp.vec2(p[0], p[1]) - scene.ground_center) / scene.fade_radius
+    return blend(behind, base, wp.exp(-r * r * r))
 
 
 @wp.func
 def shade_surface(scene: Scene, p: wp.vec3, n: wp.vec3, flat: wp.vec3, albedo: wp.vec3, ray: wp.vec3):
     """Colour of a surface at p: light of sky and ground, a key light with shadow, a head light, a small highlight."""
-    key = wp.max(wp.dot(n, scene.light), 0.0)
+    key = wp.max(wp.dot(n, scene.light_direction), 0.0)
     if key > 0.0:
-        if wp.mesh_query_ray_anyhit(scene.mesh, p + flat * 1.0e-3, scene.light, 10.0):
+        if wp.mesh_query_ray_anyhit(scene.mesh, p + flat * 1.0e-3, scene.light_direction, 10.0):
             key = 0.15 * key
     head = wp.max(-wp.dot(n, ray), 0.0)
     sky = 0.5 + 0.5 * n[2]
-    half = wp.normalize(scene.light - ray)
+    half = wp.normalize(scene.light_direction - ray)
     shine = 0.07 * wp.pow(wp.max(wp.dot(n, half), 0.0), 40.0) * wp.min(key * 4.0, 1.0)
     light = 0.24 + 0.18 * sky + 0.46 * key + 0.26 * head
     return albedo * light + wp.vec3(shine, shine, shine)
 
 
 @wp.kernel
-def cast(scene: Scene, samples: wp.array(dtype=wp.vec2), out: wp.array(dtype=wp.vec3)):
+def cast_rays(scene: Scene, samples: wp.array(dtype=wp.vec2), out: wp.array(dtype=wp.vec3)):
     """Colour (linear light) of each picture position (pixels, y down)."""
     sample = wp.tid()
-    x = 2.0 * samples[sample][0] / scene.width - 1.0 - scene.center[0]
-    y = 1.0 - 2.0 * samples[sample][1] / scene.height - scene.center[1]
+    x = 2.0 * samples[sample][0] / scene.width_pixels - 1.0 - scene.principal_point[0]
+    y = 1.0 - 2.0 * samples[sample][1] / scene.height_pixels - scene.principal_point[1]
     ray = wp.normalize(scene.forward + scene.right * x + scene.up * y)
-    color = backdrop(1.0 - samples[sample][1] / scene.height)
+    color = background_color(1.0 - samples[sample][1] / scene.height_pixels)
     reach = float(1.0e4)
     if scene.has_ground == 1 and ray[2] < -1.0e-4:
-        reach = (scene.ground - scene.eye[2]) / ray[2]
+        reach = (scene.ground_height - scene.eye[2]) / ray[2]
         p = scene.eye + ray * reach
         color = shade_ground(scene, p, reach, -ray[2], color)
     hit = wp.mesh_query_ray(scene.mesh, scene.eye, ray, reach)
@@ -138,9 +138,9 @@ def cast(scene: Scene, samples: wp.array(dtype=wp.vec2), out: wp.array(dtype=wp.
 def cast_shadow(scene: Scene, lights: wp.array(dtype=wp.vec3), shadow: wp.array2d(dtype=float)):
     """Shadow map: fraction of the directions `lights` in which a cell of the ground meets no surface."""
     i, j = wp.tid()
-    x = scene.shadow_low[0] + (float(i) + 0.5) * scene.shadow_cell
-    y = scene.shadow_low[1] + (float(j) + 0.5) * scene.shadow_cell
-    start = wp.vec3(x, y, scene.ground)
+    x = scene.shadow_map_corner[0] + (float(i) + 0.5) * scene.shadow_cell_size
+    y = scene.shadow_map_corner[1] + (float(j) + 0.5) * scene.shadow_cell_size
+    start = wp.vec3(x, y, scene.ground_height)
     seen = float(0.0)
     for k in range(lights.shape[0]):
         if not wp.mesh_query_ray_anyhit(scene.mesh, start, lights[k], 20.0):

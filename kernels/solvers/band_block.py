@@ -16,7 +16,7 @@ import types as _types
 
 import warp as wp
 
-from ..common.lanes import WARP, block_memory, lane_functions
+from ..common.lanes import WARP_SIZE, block_memory, lane_functions
 from ..common.structs import pattern_struct
 from ..common.types import kernel_module, precision
 from .band import BLOCK, band_kernels, column_type
@@ -271,5 +271,5 @@ def band_block_kernels(dtype: str, rows: int, width: int) -> _types.SimpleNamesp
                 s += column[k] * vector.load(at, i - i % BLOCK + k)
             z[world, slot_at[i / 3]][i % 3] = s
 
-    lanes = (4 if width > NARROW else 1) * WARP
+    lanes = (4 if width > NARROW else 1) * WARP_SIZE
     return _types.SimpleNamespace(module=module, lanes=lanes, factor=factor, solve=solve)

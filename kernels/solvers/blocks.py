@@ -69,8 +69,8 @@ def assembly_kernels(dtype: str, slots: int, rows: bool) -> _types.SimpleNamespa
         index = wp.tid()
         at = pattern.upper[index]
         found = wp.int32(0)
-        for k in range(topo.start[at[2]], topo.start[at[2] + 1]):
-            inside = topo.entry[k] - offset
+        for k in range(topo.contribution_start[at[2]], topo.contribution_start[at[2] + 1]):
+            inside = topo.contribution_entry[k] - offset
             if inside >= 0 and inside < NS * count:
                 a = inside / count
                 elem = inside % count

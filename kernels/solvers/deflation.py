@@ -26,7 +26,7 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
     vec3, mat33 = p.vec3, p.mat33
     f64, vec3d = wp.float64, wp.vec3d
     Constraints, Multipliers = constraint_struct(), multiplier_struct()
-    directional = constraint_functions(dtype).directional
+    directional_derivative = constraint_functions(dtype).directional_derivative
     row_sum = lane_functions(dtype).row_sum
     module = kernel_module(f"deflation_{dtype}")
 
@@ -41,7 +41,7 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
         s = wp.mat33d()
         for k in range(con.block_start[block], con.block_start[block + 1]):
             s += con.block_weight[k] * wp.mat33d(inverse[world, con.block_slot[k]])
-        mul.block[world, block] = s
+        mul.compliance_block[world, block] = s
 
     @wp.func
     def pair_sum(con: Constraints, mul: Multipliers, world: int, row: int, column: int, first: int, last: int) -> f64:
@@ -51,7 +51,7 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
             side = con.pair_side[k]
             left = mul.gradient[world, 3 * row + side[0]]
             right = mul.gradient[world, 3 * column + side[1]]
-            s += wp.dot(left, mul.block[world, con.pair_block[k]] * right)
+            s += wp.dot(left, mul.compliance_block[world, con.pair_block[k]] * right)
         return s
 
     @wp.kernel(module=module)
@@ -59,8 +59,8 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
         """J D^-1 J^T between rows of different clusters, one thread per coupling."""
         world, k = wp.tid()
         if active[world] != 0:
-            first, last = con.couple_pair[k], con.couple_pair[k + 1]
-            mul.coupling[world, k] = pair_sum(con, mul, world, con.couple_row[k], con.couple_column[k], first, last)
+            first, last = con.coupling_pair_start[k], con.coupling_pair_start[k + 1]
+            mul.coupling[world, k] = pair_sum(con, mul, world, con.coupling_row[k], con.coupling_column[k], first, last)
 
     @wp.kernel(module=module)
     def assemble_matrix(con: Constraints, active: wp.array(dtype=wp.int32), mul: Multipliers):
@@ -72,8 +72,8 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
         n = con.cluster_start[con.cluster[row] + 1] - first
         base = con.matrix_start[con.cluster[row]] + (row - first) * n
         for column in range(n):
-            start, end = con.pair[base + column], con.pair[base + column + 1]
-            mul.matrix[world, base + column] = pair_sum(con, mul, world, row, first + column, start, end)
+            start, end = con.pair_start[base + column], con.pair_start[base + column + 1]
+            mul.inverse_matrix[world, base + column] = pair_sum(con, mul, world, row, first + column, start, end)
 
     @wp.kernel(module=module)
     def penalty(con: Constraints, dq_dv: wp.array(dtype=f64), active: wp.array(dtype=wp.int32), mul: Multipliers):
@@ -86,11 +86,11 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
             return
         first = con.cluster_start[con.cluster[row]]
         n = con.cluster_start[con.cluster[row] + 1] - first
-        own = mul.matrix[world, con.matrix_start[con.cluster[row]] + (row - first) * (n + 1)]
+        own = mul.inverse_matrix[world, con.matrix_start[con.cluster[row]] + (row - first) * (n + 1)]
         rho = f64(0.0)
         if own > f64(0.0):
-            rho = mul.kappa / (dq_dv[world] * own)
-        mul.stiffness[world, row] = rho
+            rho = mul.penalty_ratio / (dq_dv[world] * own)
+        mul.penalty[world, row] = rho
 
     @wp.func
     def regularise(con: Constraints, mul: Multipliers, dq: f64, world: int, cluster: int):
@@ -99,12 +99,12 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
         n = con.cluster_start[cluster + 1] - first
         base = con.matrix_start[cluster]
         for i in range(n):
-            rho = mul.stiffness[world, first + i]
+            rho = mul.penalty[world, first + i]
             more = f64(1.0)
             if rho > f64(0.0):
                 more = f64(1.0) / (dq * rho)
             k = base + i * (n + 1)
-            mul.matrix[world, k] = mul.matrix[world, k] + more
+            mul.inverse_matrix[world, k] = mul.inverse_matrix[world, k] + more
 
     @wp.kernel(module=module)
     def invert_clusters(
@@ -124,17 +124,20 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
             return
         base = con.matrix_start[cluster]
         for k in range(n):
-            d = f64(1.0) / mul.matrix[world, base + k * (n + 1)]
-            mul.matrix[world, base + k * (n + 1)] = f64(1.0)
+            d = f64(1.0) / mul.inverse_matrix[world, base + k * (n + 1)]
+            mul.inverse_matrix[world, base + k * (n + 1)] = f64(1.0)
             for j in range(n):
-                mul.matrix[world, base + k * n + j] = d * mul.matrix[world, base + k * n + j]
+                mul.inverse_matrix[world, base + k * n + j] = d * mul.inverse_matrix[world, base + k * n + j]
             for i in range(n):
                 if i != k:
-                    x = mul.matrix[world, base + i * n + k]
-                    mul.matrix[world, base + i * n + k] = f64(0.0)
+                    x = mul.inverse_matrix[world, base + i * n + k]
+                    mul.inverse_matrix[world, base + i * n + k] = f64(0.0)
                     for j in range(n):
-                        y = mul.matrix[world, base + i * n + j] - x * mul.matrix[world, base + k * n + j]
-                        mul.matrix[world, base + i * n + j] = y
+                        y = (
+                            mul.inverse_matrix[world, base + i * n + j]
+                            - x * mul.inverse_matrix[world, base + k * n + j]
+                        )
+                        mul.inverse_matrix[world, base + i * n + j] = y
 
     @wp.kernel(module=module)
     def eliminate(
@@ -152,14 +155,14 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
         if active[world] == 0 or pivot >= n or i >= n or i == pivot:
             return
         base = con.matrix_start[cluster]
-        d = mul.matrix[world, base + pivot * (n + 1)]
-        x = mul.matrix[world, base + i * n + pivot] / d
+        d = mul.inverse_matrix[world, base + pivot * (n + 1)]
+        x = mul.inverse_matrix[world, base + i * n + pivot] / d
         for j in range(n):
             if j == pivot:
-                mul.matrix[world, base + i * n + j] = -x
+                mul.inverse_matrix[world, base + i * n + j] = -x
             else:
-                y = mul.matrix[world, base + i * n + j] - x * mul.matrix[world, base + pivot * n + j]
-                mul.matrix[world, base + i * n + j] = y
+                y = mul.inverse_matrix[world, base + i * n + j] - x * mul.inverse_matrix[world, base + pivot * n + j]
+                mul.inverse_matrix[world, base + i * n + j] = y
 
     @wp.kernel(module=module)
     def scale_row(
@@ -176,17 +179,17 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
         if active[world] == 0 or pivot >= n:
             return
         base = con.matrix_start[cluster] + pivot * n
-        d = f64(1.0) / mul.matrix[world, base + pivot]
-        mul.matrix[world, base + pivot] = f64(1.0)
+        d = f64(1.0) / mul.inverse_matrix[world, base + pivot]
+        mul.inverse_matrix[world, base + pivot] = f64(1.0)
         for j in range(n):
-            mul.matrix[world, base + j] = d * mul.matrix[world, base + j]
+            mul.inverse_matrix[world, base + j] = d * mul.inverse_matrix[world, base + j]
 
     @wp.kernel(module=module)
     def restrict(con: Constraints, mul: Multipliers, z: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32)):
         """J z."""
         world, row = wp.tid()
         if active[world] != 0:
-            mul.restricted[world, row] = directional(con, mul.gradient, z, world, row)
+            mul.deflation_rhs[world, row] = directional_derivative(con, mul.gradient, z, world, row)
 
     @wp.kernel(module=module)
     def solve_clusters(con: Constraints, mul: Multipliers, active: wp.array(dtype=wp.int32)):
@@ -199,8 +202,8 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
         base = con.matrix_start[con.cluster[row]] + (row - first) * n
         s = f64(0.0)
         for j in range(n):
-            s += mul.matrix[world, base + j] * mul.restricted[world, first + j]
-        mul.solved[world, row] = s
+            s += mul.inverse_matrix[world, base + j] * mul.deflation_rhs[world, first + j]
+        mul.deflation_solution[world, row] = s
 
     @wp.kernel(module=module)
     def sweep(
@@ -225,21 +228,21 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
         for row in range(first, first + n):
             s = f64(0.0)
             if forward == 1:
-                s = mul.restricted[world, row]
-            for c in range(con.couple_start[row], con.couple_start[row + 1]):
-                other = con.couple_column[c]
+                s = mul.deflation_rhs[world, row]
+            for c in range(con.coupling_start[row], con.coupling_start[row + 1]):
+                other = con.coupling_column[c]
                 rank = con.colour[con.cluster[other]]
                 if (forward == 1 and rank < colour) or (forward == 0 and rank > colour):
-                    s -= mul.coupling[world, c] * mul.solved[world, other]
-            mul.swept[world, row] = s
+                    s -= mul.coupling[world, c] * mul.deflation_solution[world, other]
+            mul.sweep_rhs[world, row] = s
         base = con.matrix_start[cluster]
         for i in range(n):
             s = f64(0.0)
             for j in range(n):
-                s += mul.matrix[world, base + i * n + j] * mul.swept[world, first + j]
+                s += mul.inverse_matrix[world, base + i * n + j] * mul.sweep_rhs[world, first + j]
             if forward == 0:
-                s += mul.solved[world, first + i]
-            mul.solved[world, first + i] = s
+                s += mul.deflation_solution[world, first + i]
+            mul.deflation_solution[world, first + i] = s
 
     @wp.kernel(module=module)
     def project(
@@ -267,7 +270,7 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
                 s = vec3d()
                 for k in range(first, last):
                     term = con.slot_term[k]
-                    s += (con.slot_weight[k] * mul.solved[world, term / 3]) * mul.gradient[world, term]
+                    s += (con.slot_weight[k] * mul.deflation_solution[world, term / 3]) * mul.gradient[world, term]
                 change = y[world, slot] - inverse[world, slot] * vec3(s)
                 if add != 0:
                     change += out

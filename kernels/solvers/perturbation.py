@@ -30,7 +30,7 @@ def perturbation_kernels(dtype: str) -> _types.SimpleNamespace:
     T, vec3 = p.T, p.vec3
     f64 = wp.float64
     Control = control_struct()
-    Topology, mass_at = topology_struct(dtype), mass_function(dtype)
+    Topology, mass_entry = topology_struct(dtype), mass_function(dtype)
     module = kernel_module(f"perturbation_{dtype}")
 
     @wp.kernel(module=module)
@@ -86,7 +86,7 @@ def perturbation_kernels(dtype: str) -> _types.SimpleNamespace:
             return
         a = vec3()
         for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
-            a += mass_at(topo, world, k) * moved[world, topo.mass_column[k]]
+            a += mass_entry(topo, world, k) * moved[world, topo.mass_column[k]]
         stiff = product[world, slot] - T(mass_factor[world]) * a
         gradient[world, slot] = T(SHARE) * (total[world, slot] - stiff)
 

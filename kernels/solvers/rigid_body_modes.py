@@ -38,16 +38,16 @@ def rigid_mode_kernels(dtype: str) -> _types.SimpleNamespace:
     ):  # fmt: skip
         """a of each slot at displacements u."""
         world, slot = wp.tid()
-        body = bodies.of_slot[slot]
+        body = bodies.body_of_slot[slot]
         if active[world] == 0 or body < 0:
             return
         c = vec3d()
         count = bodies.centre_slots.shape[0]
         for k in range(count):
             at = bodies.centre_slots[k, body]
-            c += bodies.X[at] + vec3d(u[world, at])
-        x = bodies.X[slot] + vec3d(u[world, slot]) - (f64(bodies.is_position[slot]) / f64(count)) * c
-        bodies.arm[world, slot] = x / bodies.size[body]
+            c += bodies.slot_reference[at] + vec3d(u[world, at])
+        x = bodies.slot_reference[slot] + vec3d(u[world, slot]) - (f64(bodies.is_position[slot]) / f64(count)) * c
+        bodies.lever_arm[world, slot] = x / bodies.body_size[body]
 
     @wp.kernel(module=module)
     def body_sums(
@@ -65,8 +65,8 @@ def rigid_mode_kernels(dtype: str) -> _types.SimpleNamespace:
         mm = mat33d()
         tm = mat33d()
         tt = mat33d()
-        slot = bodies.first[body] + lane
-        while slot < bodies.last[body]:
+        slot = bodies.first_slot[body] + lane
+        while slot < bodies.end_slot[body]:
             move = mat33d()
             turn = mat33d()
             own_move = translation_columns(bodies, body, slot)
@@ -130,18 +130,18 @@ def rigid_mode_kernels(dtype: str) -> _types.SimpleNamespace:
             return
         move = vec3d()
         turn = vec3d()
-        slot = bodies.first[body] + thread
-        while slot < bodies.last[body]:
+        slot = bodies.first_slot[body] + thread
+        while slot < bodies.end_slot[body]:
             x = vec3d(r[world, slot])
             move += f64(bodies.is_position[slot]) * x
-            turn += wp.cross(bodies.arm[world, slot], x)
+            turn += wp.cross(bodies.lever_arm[world, slot], x)
             slot += wp.block_dim()
         for k in range(3):
             s = wp.tile_extract(wp.tile_sum(wp.tile(move[k])), 0)
             w = wp.tile_extract(wp.tile_sum(wp.tile(turn[k])), 0)
             if thread == 0:
-                out[world, RIGID_MODES * body + k] = T(s * bodies.translations[body][k])
-                out[world, RIGID_MODES * body + 3 + k] = T(w * bodies.rotations[body][k])
+                out[world, RIGID_MODES * body + k] = T(s * bodies.free_translations[body][k])
+                out[world, RIGID_MODES * body + 3 + k] = T(w * bodies.free_rotations[body][k])
 
     @wp.kernel(module=module)
     def prolong(
@@ -150,15 +150,15 @@ def rigid_mode_kernels(dtype: str) -> _types.SimpleNamespace:
     ):  # fmt: skip
         """z += R x on free components."""
         world, slot = wp.tid()
-        body = bodies.of_slot[slot]
+        body = bodies.body_of_slot[slot]
         if active[world] == 0 or body < 0:
             return
         move = vec3d()
         turn = vec3d()
         for k in range(3):
-            move[k] = f64(x[world, RIGID_MODES * body + k]) * bodies.translations[body][k]
-            turn[k] = f64(x[world, RIGID_MODES * body + 3 + k]) * bodies.rotations[body][k]
-        s = f64(bodies.is_position[slot]) * move + wp.cross(turn, bodies.arm[world, slot])
+            move[k] = f64(x[world, RIGID_MODES * body + k]) * bodies.free_translations[body][k]
+            turn[k] = f64(x[world, RIGID_MODES * body + 3 + k]) * bodies.free_rotations[body][k]
+        s = f64(bodies.is_position[slot]) * move + wp.cross(turn, bodies.lever_arm[world, slot])
         z[world, slot] = z[world, slot] + wp.cw_mul(vec3(s), free[slot])
 
     return _types.SimpleNamespace(

@@ -69,7 +69,7 @@ def ledger_kernels(dtype: str, chord: bool, nonpotential: bool, module: wp.Modul
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
     f64 = wp.float64
-    mass_at = mass_function(dtype)
+    mass_entry = mass_function(dtype)
     Step = step_struct()
     Newton = control_struct()
     Topology, Balance = topology_struct(dtype), balance_struct(dtype)
@@ -120,7 +120,7 @@ def ledger_kernels(dtype: str, chord: bool, nonpotential: bool, module: wp.Modul
             return
         Mv = vec3()
         for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
-            Mv += mass_at(topo, world, k) * balance.v[world, topo.mass_column[k]]
+            Mv += mass_entry(topo, world, k) * balance.v[world, topo.mass_column[k]]
         dq = balance.u[world, slot] - u_n[world, slot]
         a = balance.inertia[world, slot]
         dv = balance.v[world, slot] - v_n[world, slot]

@@ -10,7 +10,7 @@ import warp as wp
 
 from ..common.inverse import inverse_function
 from ..common.lanes import lane_functions
-from ..common.structs import additions_struct, balance_struct, mass_function, pattern_struct, topology_struct
+from ..common.structs import balance_struct, mass_function, pattern_struct, product_terms_struct, topology_struct
 from ..common.traits import NO_TERMS, Traits
 from ..common.types import SHORT_UNROLL, kernel_module, precision
 from ..terms.constraints import constraint_struct, multiplier_struct
@@ -42,12 +42,12 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
     p = precision(dtype)
     T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
     Topology = topology_struct(dtype)
-    Balance, Additions = balance_struct(dtype), additions_struct(dtype)
+    Balance, ProductTerms = balance_struct(dtype), product_terms_struct(dtype)
     Constraints, Multipliers = constraint_struct(), multiplier_struct()
     f64 = wp.float64
     Pattern = pattern_struct()
     lane_sum, row_sum = lane_functions(dtype).lane_sum, lane_functions(dtype).row_sum
-    free_inverse, mass_at = inverse_function(dtype), mass_function(dtype)
+    free_inverse, mass_entry = inverse_function(dtype), mass_function(dtype)
     name = f"{dtype}{traits.suffix('nonpotential', 'tangent', 'pooled', 'constraint_rows', 'midpoint')}"
     module = kernel_module(f"gather_{name}", max_unroll=SHORT_UNROLL)
     matrix_module = kernel_module(f"matrix_product_{name}", max_unroll=SHORT_UNROLL)
@@ -86,7 +86,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             term = con.slot_term[k]
             row = term / 3
             d = con.slot_weight[k] * mul.gradient[world, term]
-            constraint_force += mul.trial[world, row] * d
+            constraint_force += mul.trial_multiplier[world, row] * d
             penalty += mul.penalty_force[world, row] * d
             merit += mul.frozen_force[world, row] * d
         return wp.matrix_from_rows(constraint_force, penalty, merit)
@@ -95,8 +95,8 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
     def gathered(topo: Topology, contribution: wp.array2d(dtype=vec3), world: int, slot: int) -> vec3:
         """Sum of the contributions to a slot, in order."""
         f = vec3()
-        for k in range(topo.start[slot], topo.start[slot + 1]):
-            f += contribution[world, topo.entry[k]]
+        for k in range(topo.contribution_start[slot], topo.contribution_start[slot + 1]):
+            f += contribution[world, topo.contribution_entry[k]]
         return f
 
     @wp.func
@@ -161,8 +161,8 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
             j = topo.mass_column[k]
             before = balance.v_tilde[world, j]
-            a += mass_at(topo, world, k) * (balance.v[world, j] - before)
-            past += mass_at(topo, world, k) * before
+            a += mass_entry(topo, world, k) * (balance.v[world, j] - before)
+            past += mass_entry(topo, world, k) * before
         a = T(balance.mass_factor[world]) * a
         load = balance.dead[world, slot]
         magnitude = balance.dead_magnitude[world, slot]
@@ -217,7 +217,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         balance.rows[10, world, slot] = balance.mass_factor[world] * f64(motion)
 
     @wp.func
-    def pool_range(more: Additions, slot: int) -> wp.vec2i:
+    def pool_range(more: ProductTerms, slot: int) -> wp.vec2i:
         """Pool entries of a slot; loaded early to hide the latency."""
         out = wp.vec2i()
         if wp.static(pooled):
@@ -228,7 +228,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
     def add_terms(
         topo: Topology,
         h: vec3,
-        more: Additions,
+        more: ProductTerms,
         pool: wp.vec2i,
         p: vec3,
         con: Constraints,
@@ -241,8 +241,8 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         out = h
         if wp.static(tangent):
             f = vec3()
-            for k in range(more.start[slot], more.start[slot + 1]):
-                f += more.contribution[world, more.entry[k]]
+            for k in range(more.contribution_start[slot], more.contribution_start[slot + 1]):
+                f += more.contribution[world, more.contribution_entry[k]]
             out -= T(more.dq_dv[world]) * f
         if wp.static(pooled):
             stiff = vec3()
@@ -255,7 +255,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             for k in range(con.slot_start[slot], con.slot_start[slot + 1]):
                 constraint_force += con.slot_weight[k] * mul.product[world, con.slot_term[k]]
             out += vec3(constraint_force)
-        held = int(topo.prescribed[slot])
+        held = int(topo.prescribed_bits[slot])
         for k in range(3):
             if held & (1 << k) != 0:
                 out[k] = T(0.0)
@@ -273,7 +273,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
     def product(
         topo: Topology,
         contribution: wp.array2d(dtype=vec3),
-        more: Additions,
+        more: ProductTerms,
         p_in: wp.array2d(dtype=vec3),
         active: wp.array(dtype=wp.int32),
         con: Constraints,
@@ -291,17 +291,17 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             f = gathered(topo, contribution, world, slot)
             a = vec3()
             for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
-                a += mass_at(topo, world, k) * p_in[world, topo.mass_column[k]]
+                a += mass_entry(topo, world, k) * p_in[world, topo.mass_column[k]]
             dq = T(more.dq_dv[world])
             h = T(more.mass_factor[world]) * a + dq * f
             share = add_terms(topo, h, more, pool, p_in[world, slot], con, mul, world, slot, out)
-        store_warp_sum(share, slot, more.warp, world, rows)
+        store_warp_sum(share, slot, more.warp_lanes, world, rows)
 
     @wp.kernel(module=module, launch_bounds=(256, SUM_BLOCKS[dtype]))
     def with_mass_sum(
         topo: Topology,
         contribution: wp.array2d(dtype=vec3),
-        more: Additions,
+        more: ProductTerms,
         p_in: wp.array2d(dtype=vec3),
         active: wp.array(dtype=wp.int32),
         con: Constraints,
@@ -318,7 +318,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             pool = pool_range(more, slot)
             h = gathered(topo, contribution, world, slot)
             share = add_terms(topo, h, more, pool, p_in[world, slot], con, mul, world, slot, out)
-        store_warp_sum(share, slot, more.warp, world, rows)
+        store_warp_sum(share, slot, more.warp_lanes, world, rows)
 
     @wp.kernel(module=matrix_module)
     def matrix_product(
@@ -326,7 +326,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         pattern: Pattern,
         value: wp.array2d(dtype=mat33),
         lanes: int,
-        more: Additions,
+        more: ProductTerms,
         p_in: wp.array2d(dtype=vec3),
         active: wp.array(dtype=wp.int32),
         con: Constraints,
@@ -350,7 +350,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         share = f64(0.0)
         if lane == 0 and slot < out.shape[1]:
             share = add_terms(topo, h, more, pool, p_in[world, slot], con, mul, world, slot, out)
-        store_warp_sum(share, index, more.warp, world, rows)
+        store_warp_sum(share, index, more.warp_lanes, world, rows)
 
     @wp.kernel(module=module)
     def gather_blocks(
@@ -368,15 +368,15 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         if active[world] == 0:
             return
         k6 = sym6()
-        for k in range(topo.start[slot], topo.start[slot + 1]):
-            k6 += contribution[world, topo.entry[k]]
+        for k in range(topo.contribution_start[slot], topo.contribution_start[slot + 1]):
+            k6 += contribution[world, topo.contribution_entry[k]]
         if wp.static(pooled):
             for k in range(topo.pool_start[slot], topo.pool_start[slot + 1]):
                 k6 += pool[world, topo.pool_entry[k]]
         mass = T(0.0)
         for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
             if topo.mass_column[k] == slot:
-                mass = T(mass_factor[world]) * mass_at(topo, world, k)
+                mass = T(mass_factor[world]) * mass_entry(topo, world, k)
         k6 = T(dq_dv[world]) * k6
         A = mat33(k6[0], k6[5], k6[4], k6[5], k6[1], k6[3], k6[4], k6[3], k6[2])
         free = topo.free[slot]
@@ -397,7 +397,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         world, slot = wp.tid()
         s = vec3()
         for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
-            s += mass_at(topo, world, k) * a[world, topo.mass_column[k]]
+            s += mass_entry(topo, world, k) * a[world, topo.mass_column[k]]
         rows[0, world, slot] = f64(0.5) * f64(wp.dot(s, a[world, slot]))
 
     return _types.SimpleNamespace(

@@ -1,4 +1,8 @@
-"""Master facets during an attempt: polynomial coefficients, midpoints, and bounding boxes of the tree."""
+"""Broad phase of contact between bodies: master facets at an iterate and at the start of an attempted step.
+
+Computed are the monomial coefficients of displacements on each facet, its centre, and the bounding boxes of the tree.
+u_coefs, director_coefs: coefficients of the displacement and of the director's displacement, see `master_struct`.
+"""
 
 import functools
 import types as _types
@@ -10,24 +14,24 @@ from ..common.types import SHORT_UNROLL, kernel_module, precision
 from .facet_projection import facet_projection_functions
 from .pair_structs import master_struct, pair_scratch_struct
 
-__all__ = ["MARGIN", "broad_phase_kernels"]
+__all__ = ["BOX_MARGIN", "broad_phase_kernels"]
 
-MARGIN = 0.25
-"""Enlargement of the boxes of the tree, as a fraction of a facet's side: they stay valid for several steps."""
-ROUNDING = 2.4e-7
-"""Relative widening of boxes in float32: twice its unit round-off."""
+BOX_MARGIN = 0.25
+"""Enlargement of the boxes of the tree, as a fraction of the facet's side length: they stay valid for several steps."""
+BOX_ROUNDING = 2.4e-7
+"""Relative widening of a box before its conversion to float32: twice the machine epsilon, 1.2e-7."""
 
 
 @functools.cache
 def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
-    """Kernels for displacements of a precision, in the module of `facet_search_kernels`, and functions of boxes."""
+    """Kernels for displacements of type `dtype`, in the module of `facet_search_kernels`; functions of boxes."""
     vec3 = precision(dtype).vec3
     f64, vec3d, box3 = wp.float64, wp.vec3d, wp.vec3
     mat43 = wp.types.matrix(shape=(4, 3), dtype=f64)
     Masters, PairScratch = master_struct(dtype), pair_scratch_struct(dtype)
     f = facet_projection_functions(dtype)
-    SurfacePoint, surface_point, facet_centre, unit_normal = (
-        f.SurfacePoint,
+    FacetPoint, surface_point, facet_centre, unit_normal = (
+        f.FacetPoint,
         f.surface_point,
         f.facet_centre,
         f.unit_normal,
@@ -39,7 +43,8 @@ def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
         mas: Masters, u: wp.array2d(dtype=Any), world: int, item: int, m: int, C: wp.array2d(dtype=vec3d),
         D: wp.array2d(dtype=vec3d),
     ):  # fmt: skip
-        """Monomial coefficients m of a field u on facet `item`: C of its value, D of its outward derivative."""
+        """Monomial coefficients m of a field u [world, slot] on facet `item`, [world, control]: C of its value, D of
+        its derivative along the director."""
         c = vec3d()
         d = vec3d()
         for i in range(mas.conn.shape[0]):
@@ -56,7 +61,7 @@ def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
     ):  # fmt: skip
         """Coefficients of displacements on master facets in float64, see kernels/terms/double_displacements.py."""
         world, item, m = wp.tid()
-        if active[world] != 0 and m < mas.monomials[mas.kind[item]]:
+        if active[world] != 0 and m < mas.monomial_count[mas.facet_kind[item]]:
             set_coefficient(mas, u, world, item, m, C, D)
 
     @wp.kernel(module=module)
@@ -64,24 +69,26 @@ def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
         mas: Masters, u_n: wp.array2d(dtype=vec3), v_n: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32),
         pair: PairScratch,
     ):  # fmt: skip
-        """Coefficients of displacements and velocities at the start of an attempt; resets the largest depths."""
+        """Coefficients of displacements and velocities at the start of an attempt; reset the largest depths."""
         world, item, m = wp.tid()
         if active[world] != 0:
+            # threads of a world share the bodies
             for body in range(
-                mas.max_monomials * item + m, pair.deepest_contact.shape[1], mas.max_monomials * mas.count
+                mas.max_monomials * item + m, pair.deepest_contact.shape[1], mas.max_monomials * mas.facet_count
             ):
                 pair.deepest_contact[world, body] = f64(0.0)
-        if active[world] != 0 and m < mas.monomials[mas.kind[item]]:
-            set_coefficient(mas, v_n, world, item, m, pair.V0, pair.D0)
-            set_coefficient(mas, u_n, world, item, m, pair.C0, pair.D0)
+        if active[world] != 0 and m < mas.monomial_count[mas.facet_kind[item]]:
+            # the director part of the velocity is not used: the next line overwrites it
+            set_coefficient(mas, v_n, world, item, m, pair.start_v_coefs, pair.start_director_coefs)
+            set_coefficient(mas, u_n, world, item, m, pair.start_u_coefs, pair.start_director_coefs)
 
     @wp.func
     def round_down(x: vec3d) -> box3:
         """x in single precision, rounded down by more than its largest round-off."""
         return box3(
-            wp.float32(x[0] - wp.abs(x[0]) * f64(ROUNDING)),
-            wp.float32(x[1] - wp.abs(x[1]) * f64(ROUNDING)),
-            wp.float32(x[2] - wp.abs(x[2]) * f64(ROUNDING)),
+            wp.float32(x[0] - wp.abs(x[0]) * f64(BOX_ROUNDING)),
+            wp.float32(x[1] - wp.abs(x[1]) * f64(BOX_ROUNDING)),
+            wp.float32(x[2] - wp.abs(x[2]) * f64(BOX_ROUNDING)),
         )
 
     @wp.func
@@ -99,77 +106,96 @@ def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
         return inside
 
     @wp.func
-    def pack_surface_point(s: SurfacePoint) -> mat43:
-        """Position and derivatives, packed in a matrix."""
-        return mat43(s.x[0], s.x[1], s.x[2], s.a[0], s.a[1], s.a[2], s.b[0], s.b[1], s.b[2], s.c[0], s.c[1], s.c[2])
+    def pack_facet_point(s: FacetPoint) -> mat43:
+        """Position and derivatives of a facet point as the rows of a matrix."""
+        return mat43(
+            s.position[0],
+            s.position[1],
+            s.position[2],
+            s.tangent_a[0],
+            s.tangent_a[1],
+            s.tangent_a[2],
+            s.tangent_b[0],
+            s.tangent_b[1],
+            s.tangent_b[2],
+            s.director[0],
+            s.director[1],
+            s.director[2],
+        )
 
     @wp.func
-    def unpack_surface_point(m: mat43) -> SurfacePoint:
-        """Position and derivatives from their matrix."""
-        return SurfacePoint(m[0], m[1], m[2], m[3])
+    def unpack_facet_point(m: mat43) -> FacetPoint:
+        """Facet point from the rows of a matrix."""
+        return FacetPoint(m[0], m[1], m[2], m[3])
 
     @wp.kernel(module=module)
     def check_boxes(mas: Masters, active: wp.array(dtype=wp.int32), pair: PairScratch):
-        """Flag facets outside of their boxes, at the start of the attempt or now; compute new boxes."""
+        """Request a refit if a facet, at the start of the attempt or now, left its box; compute the enlarged boxes."""
         world, item = wp.tid()
         if active[world] == 0:
             return
         low = vec3d(f64(1.0e300), f64(1.0e300), f64(1.0e300))
         high = -low
-        kind = mas.kind[item]
-        count = mas.monomials[kind]
+        kind = mas.facet_kind[item]
+        count = mas.monomial_count[kind]
         for q in range(count):
             x = vec3d()
             y = vec3d()
             for m in range(count):
-                part = mas.hull[kind, q, m]
+                part = mas.hull_coefficients[kind, q, m]
                 if part != f64(0.0):
-                    x += part * (mas.X[m, item] + pair.C[world, mas.max_monomials * item + m])
-                    y += part * (mas.X[m, item] + pair.C0[world, mas.max_monomials * item + m])
+                    x += part * (mas.position_coefficients[m, item] + pair.u_coefs[world, mas.max_monomials * item + m])
+                    y += part * (
+                        mas.position_coefficients[m, item] + pair.start_u_coefs[world, mas.max_monomials * item + m]
+                    )
             low = wp.min(low, wp.min(x, y))
             high = wp.max(high, wp.max(x, y))
-        index = world * mas.count + item
-        if not contains(pair.lower[index], pair.upper[index], round_down(low), round_up(high)):
+        index = world * mas.facet_count + item
+        if not contains(pair.box_lower[index], pair.box_upper[index], round_down(low), round_up(high)):
             pair.refit_needed[0] = 1
-        room = f64(MARGIN) * mas.size[item]
+        room = f64(BOX_MARGIN) * mas.side_length[item]
         pad = vec3d(room, room, room)
         pair.refit_lower[index] = round_down(low - pad)
         pair.refit_upper[index] = round_up(high + pad)
 
     @wp.kernel(module=module)
     def update_centres(mas: Masters, active: wp.array(dtype=wp.int32), pair: PairScratch):
-        """Position and derivatives at the midpoint of each facet, at the start of the attempt and now, and the facet's
-        largest height above the tangent plane there."""
+        """Position and derivatives at the centre of each facet, now and at the start of the attempt; an upper bound, m,
+        of the facet's height above the tangent plane there, from its control points."""
         world, item = wp.tid()
         if active[world] == 0:
             return
-        kind = mas.kind[item]
-        count = mas.monomials[kind]
-        xi = facet_centre(mas.corners[kind])
-        s = surface_point(mas, pair.C, pair.D, world, item, xi)
+        kind = mas.facet_kind[item]
+        count = mas.monomial_count[kind]
+        xi = facet_centre(mas.corner_count[kind])
+        s = surface_point(mas, pair.u_coefs, pair.director_coefs, world, item, xi)
         n = unit_normal(s)
         bulge = f64(0.0)
         for q in range(count):
             x = vec3d()
             for m in range(count):
-                x += mas.hull[kind, q, m] * (mas.X[m, item] + pair.C[world, mas.max_monomials * item + m])
-            bulge = wp.max(bulge, wp.dot(x - s.x, n))
+                x += mas.hull_coefficients[kind, q, m] * (
+                    mas.position_coefficients[m, item] + pair.u_coefs[world, mas.max_monomials * item + m]
+                )
+            bulge = wp.max(bulge, wp.dot(x - s.position, n))
         pair.bulge[world, item] = bulge
-        pair.centre[world, item] = pack_surface_point(s)
-        pair.centre0[world, item] = pack_surface_point(surface_point(mas, pair.C0, pair.D0, world, item, xi))
+        pair.centre[world, item] = pack_facet_point(s)
+        pair.start_centre[world, item] = pack_facet_point(
+            surface_point(mas, pair.start_u_coefs, pair.start_director_coefs, world, item, xi)
+        )
 
     @wp.kernel(module=module)
     def accept_boxes(pair: PairScratch):
         """Replace the boxes by the new ones."""
         index = wp.tid()
-        pair.lower[index] = pair.refit_lower[index]
-        pair.upper[index] = pair.refit_upper[index]
+        pair.box_lower[index] = pair.refit_lower[index]
+        pair.box_upper[index] = pair.refit_upper[index]
         if index == 0:
             pair.refit_needed[0] = 0
-            pair.refits[0] = pair.refits[0] + 1
+            pair.refit_count[0] = pair.refit_count[0] + 1
 
     return _types.SimpleNamespace(
         update_coefficients=update_coefficients, initial_coefficients=initial_coefficients, check_boxes=check_boxes,
         update_centres=update_centres, accept_boxes=accept_boxes, round_down=round_down, round_up=round_up,
-        contains=contains, unpack_surface_point=unpack_surface_point,
+        contains=contains, unpack_facet_point=unpack_facet_point,
     )  # fmt: skip

@@ -61,15 +61,15 @@ def constraint_block_kernels(dtype: str) -> _types.SimpleNamespace:
         add_block(topo, pattern.upper[pairs.entry[item]], mat33(A), world, value)
 
     @wp.func
-    def curvature(con: Constraints, mul: Multipliers, world: int, row: int, a: int, b: int) -> wp.mat33d:
+    def second_derivative(con: Constraints, mul: Multipliers, world: int, row: int, a: int, b: int) -> wp.mat33d:
         """d2c / (d vector a  d vector b) of a row, a and b its sides."""
         kind = con.kind[row]
         f = mul.target[world, row]
-        scale = mul.scale[world, row]
+        scale = mul.signed_scale[world, row]
         one = wp.identity(n=3, dtype=f64)
         if kind == DISTANCE:
             n = mul.gradient[world, 3 * row] / scale
-            size = wp.abs(mul.value[world, row] / scale + f)
+            size = wp.abs(mul.constraint_value[world, row] / scale + f)
             if a == 0 and b == 0:
                 return (scale / size) * (one - wp.outer(n, n))
         elif kind == ANGLE:
@@ -102,9 +102,11 @@ def constraint_block_kernels(dtype: str) -> _types.SimpleNamespace:
             a = pairs.term_a[k]
             b = pairs.term_b[k]
             row = a / 3
-            penalty_part = mul.stiffness[world, row] * wp.outer(mul.gradient[world, a], mul.gradient[world, b])
+            penalty_part = mul.penalty[world, row] * wp.outer(mul.gradient[world, a], mul.gradient[world, b])
             curvature_part = (
-                midpoint_factor * mul.trial[world, row] * curvature(con, mul, world, row, a - 3 * row, b - 3 * row)
+                midpoint_factor
+                * mul.trial_multiplier[world, row]
+                * second_derivative(con, mul, world, row, a - 3 * row, b - 3 * row)
             )
             A += pairs.weight[k] * (penalty_part + curvature_part)
         add_block(topo, pattern.upper[pairs.entry[item]], mat33(dq_dv[world] * A), world, value)

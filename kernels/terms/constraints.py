@@ -35,40 +35,40 @@ DISTANCE = 1
 ANGLE = 2
 JOINT_COLUMNS = 7
 """Columns per joint in the report of a step: force and moment on the child, N and N m, and violation, m."""
-MAX_ROTATION = 1.0
+MAX_DRIVE_ROTATION = 1.0
 """Largest change of a driven angle in a substep, rad: a larger one may crush a body instead of turning it."""
 
 
 @functools.cache
 def constraint_struct():
-    """Constraint rows of a model, their terms, and the terms of each slot."""
+    """Constraint rows, their vectors (terms) as weighted sums of slots, and what rows share with each other."""
 
     @wp.struct
     class Constraints:
-        kind: wp.array(dtype=wp.int32)  # [row]
-        scale: wp.array(dtype=wp.float64)  # [row]
-        constant: wp.array(dtype=wp.float64)  # [row] A.B of the reference, |A|^2 of distances
-        fixed: wp.array(dtype=wp.float64)  # [row] f without a law
-        law: wp.array(dtype=wp.int32)  # [row] or -1
-        law_component: wp.array(dtype=wp.int32)
-        component: wp.array(dtype=wp.int32)  # [row] connected component of the model
-        start: wp.array(dtype=wp.int32)  # [3 row + 1] entries of a term
-        slot: wp.array(dtype=wp.int32)
-        weight: wp.array(dtype=wp.float64)
+        kind: wp.array(dtype=wp.int32)  # [row] DOT, DISTANCE or ANGLE
+        scale: wp.array(dtype=wp.float64)  # [row] m per unit of the bracket: lengths of the model for angles, else 1
+        reference_product: wp.array(dtype=wp.float64)  # [row] A.B in the reference configuration; |A|^2 of a distance
+        constant_target: wp.array(dtype=wp.float64)  # [row] constant part of f: m, rad or a cosine
+        law: wp.array(dtype=wp.int32)  # [row] time law added to f, -1: none
+        law_component: wp.array(dtype=wp.int32)  # [row] component of that law's value
+        connected_component: wp.array(dtype=wp.int32)  # [row] connected component of the model
+        term_start: wp.array(dtype=wp.int32)  # [3 row + 1] first entry (slot, weight) of each term
+        term_slot: wp.array(dtype=wp.int32)
+        term_weight: wp.array(dtype=wp.float64)
         reference: wp.array(dtype=wp.vec3d)  # [3 row] value of a term in the reference configuration
-        slot_start: wp.array(dtype=wp.int32)  # [slot + 1]
+        slot_start: wp.array(dtype=wp.int32)  # [slot + 1] the same entries by slot
         slot_term: wp.array(dtype=wp.int32)
         slot_weight: wp.array(dtype=wp.float64)
         cluster: wp.array(dtype=wp.int32)  # [row] cluster of rows inverted together
         cluster_start: wp.array(dtype=wp.int32)  # [cluster + 1] rows
         matrix_start: wp.array(dtype=wp.int32)  # [cluster] entry of its dense matrix
-        pair: wp.array(dtype=wp.int32)  # [matrix entry] its first pair of terms
+        pair_start: wp.array(dtype=wp.int32)  # [matrix entry + 1] first pair of terms of an entry
         pair_side: wp.array(dtype=wp.vec2i)  # [pair] sides of the row and of the column
         pair_block: wp.array(dtype=wp.int32)  # [pair] block of both vectors
-        couple_start: wp.array(dtype=wp.int32)  # [row + 1] its couplings to rows of other clusters
-        couple_row: wp.array(dtype=wp.int32)  # [coupling] its row
-        couple_column: wp.array(dtype=wp.int32)  # [coupling] its column
-        couple_pair: wp.array(dtype=wp.int32)  # [coupling + 1] its pairs of terms
+        coupling_start: wp.array(dtype=wp.int32)  # [row + 1] first coupling of a row to rows of other clusters
+        coupling_row: wp.array(dtype=wp.int32)  # [coupling]
+        coupling_column: wp.array(dtype=wp.int32)  # [coupling]
+        coupling_pair_start: wp.array(dtype=wp.int32)  # [coupling + 1] first pair of terms
         colour: wp.array(dtype=wp.int32)  # [cluster] colour; coupled clusters differ
         colour_cluster: wp.array(dtype=wp.int32)  # clusters by colour
         block_start: wp.array(dtype=wp.int32)  # [block + 1]
@@ -80,33 +80,33 @@ def constraint_struct():
 
 @functools.cache
 def multiplier_struct():
-    """Variable quantities of constraints: [world, row], [world, term]."""
+    """Values, gradients and multipliers of the constraint rows: [world, row], [world, term]."""
 
     @wp.struct
     class Multipliers:
-        value: wp.array2d(dtype=wp.float64)  # c, m
+        constraint_value: wp.array2d(dtype=wp.float64)  # c, m
         target: wp.array2d(dtype=wp.float64)  # f
         last_target: wp.array2d(dtype=wp.float64)  # f of the last accepted step
         gradient: wp.array2d(dtype=wp.vec3d)  # [world, term] dc / d vector, where forces are evaluated
         end_gradient: wp.array2d(dtype=wp.vec3d)  # dc / d vector at the end of the step, the derivative of c
-        scale: wp.array2d(dtype=wp.float64)  # of the row, negative beyond a right angle of a turn
-        force: wp.array2d(dtype=wp.float64)  # lambda, N
-        change: wp.array2d(dtype=wp.float64)  # of lambda with a full Newton step
-        trial: wp.array2d(dtype=wp.float64)  # lambda at the trial of the line search
+        signed_scale: wp.array2d(dtype=wp.float64)  # `Constraints.scale`, negative beyond a right angle
+        multiplier: wp.array2d(dtype=wp.float64)  # lambda, N
+        multiplier_change: wp.array2d(dtype=wp.float64)  # change of lambda in a full Newton step, N
+        trial_multiplier: wp.array2d(dtype=wp.float64)  # lambda at the trial of the line search, N
         frozen_force: wp.array2d(dtype=wp.float64)  # lambda + rho c with lambda frozen in the line search
         penalty_force: wp.array2d(dtype=wp.float64)  # rho c
-        stiffness: wp.array2d(dtype=wp.float64)  # rho, N/m
+        penalty: wp.array2d(dtype=wp.float64)  # rho, N/m
         product: wp.array2d(dtype=wp.vec3d)  # [world, term] contributions to H p
-        rows: wp.array3d(dtype=wp.float64)  # [TERM_ROWS, world, row]
+        rows: wp.array3d(dtype=wp.float64)  # [TERM_ROWS, world, row] of the potential, J
         violation: wp.array2d(dtype=wp.float64)  # [world, component] largest |c|, m
-        block: wp.array2d(dtype=wp.mat33d)  # [world, block] sum w w D^-1
-        matrix: wp.array2d(dtype=wp.float64)  # [world, entry] (1 / (dq/dv rho) + J D^-1 J^T)^-1
+        compliance_block: wp.array2d(dtype=wp.mat33d)  # [world, block] sum w w D^-1 over common slots
+        inverse_matrix: wp.array2d(dtype=wp.float64)  # [world, entry] of clusters: (1 / (dq/dv rho) + J D^-1 J^T)^-1
         coupling: wp.array2d(dtype=wp.float64)  # [world, coupling] J D^-1 J^T between clusters
-        restricted: wp.array2d(dtype=wp.float64)  # J D^-1 r
-        swept: wp.array2d(dtype=wp.float64)
-        solved: wp.array2d(dtype=wp.float64)  # inverse matrix times J D^-1 r
+        deflation_rhs: wp.array2d(dtype=wp.float64)  # J D^-1 r of a residual r
+        sweep_rhs: wp.array2d(dtype=wp.float64)  # right side of a Gauss-Seidel sweep
+        deflation_solution: wp.array2d(dtype=wp.float64)  # inverse matrix times J D^-1 r, by sweeps
         outer_updates: wp.int32  # 1: multipliers change in the outer loop only
-        kappa: wp.float64
+        penalty_ratio: wp.float64  # kappa, rho over the stiffness of the constrained slots
 
     return Multipliers
 
@@ -117,46 +117,46 @@ def joint_struct():
 
     @wp.struct
     class Joints:
-        first: wp.array(dtype=wp.int32)  # [joint] row
-        last: wp.array(dtype=wp.int32)
+        first_row: wp.array(dtype=wp.int32)  # [joint]
+        end_row: wp.array(dtype=wp.int32)  # last row + 1
         anchor: wp.array(dtype=wp.vec3d)  # [joint] reference position
         anchor_start: wp.array(dtype=wp.int32)  # [joint + 1]
         anchor_slot: wp.array(dtype=wp.int32)
         anchor_weight: wp.array(dtype=wp.float64)
-        role: wp.array(dtype=wp.int32)  # [entry] 1 child's gradient, 2 child's position, negative: a parent's against
-        # a child in space, 0: not counted
-        place: wp.array(dtype=wp.vec3d)  # [entry] reference position of the slot, of a child in space
+        entry_role: wp.array(dtype=wp.int32)  # [entry] of a term: +-1 gradient, +-2 position; > 0: of the
+        # child, < 0: of the parent of a child fixed in space, whose reaction counts; 0: not counted
+        slot_position: wp.array(dtype=wp.vec3d)  # [entry] reference position of its slot, m
 
     return Joints
 
 
 @functools.cache
 def constraint_functions(dtype: str) -> _types.SimpleNamespace:
-    """Functions of terms and rows that several kernels share."""
+    """Device functions `term_vector` and `directional_derivative`."""
     vec3 = precision(dtype).vec3
     f64, vec3d = wp.float64, wp.vec3d
     Constraints = constraint_struct()
 
     @wp.func
-    def combine(con: Constraints, term: int, x: wp.array2d(dtype=vec3), world: int) -> vec3d:
+    def term_vector(con: Constraints, term: int, x: wp.array2d(dtype=vec3), world: int) -> vec3d:
         """sum_k w_k x_k of a term."""
         s = vec3d()
-        for k in range(con.start[term], con.start[term + 1]):
-            s += con.weight[k] * vec3d(x[world, con.slot[k]])
+        for k in range(con.term_start[term], con.term_start[term + 1]):
+            s += con.term_weight[k] * vec3d(x[world, con.term_slot[k]])
         return s
 
     @wp.func
-    def directional(
-        con: Constraints, slope: wp.array2d(dtype=vec3d), x: wp.array2d(dtype=vec3), world: int, row: int
+    def directional_derivative(
+        con: Constraints, gradient: wp.array2d(dtype=vec3d), x: wp.array2d(dtype=vec3), world: int, row: int
     ) -> f64:
         """(J x) of a row."""
-        s = wp.dot(slope[world, 3 * row], combine(con, 3 * row, x, world))
-        s += wp.dot(slope[world, 3 * row + 1], combine(con, 3 * row + 1, x, world))
+        s = wp.dot(gradient[world, 3 * row], term_vector(con, 3 * row, x, world))
+        s += wp.dot(gradient[world, 3 * row + 1], term_vector(con, 3 * row + 1, x, world))
         if con.kind[row] == ANGLE:
-            s += wp.dot(slope[world, 3 * row + 2], combine(con, 3 * row + 2, x, world))
+            s += wp.dot(gradient[world, 3 * row + 2], term_vector(con, 3 * row + 2, x, world))
         return s
 
-    return _types.SimpleNamespace(combine=combine, directional=directional)
+    return _types.SimpleNamespace(term_vector=term_vector, directional_derivative=directional_derivative)
 
 
 @functools.cache
@@ -171,11 +171,11 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
     f64, vec3d = wp.float64, wp.vec3d
     Constraints, Multipliers, Joints = constraint_struct(), multiplier_struct(), joint_struct()
     functions = constraint_functions(dtype)
-    combine, directional = functions.combine, functions.directional
+    term_vector, directional_derivative = functions.term_vector, functions.directional_derivative
     module = kernel_module(f"constraints_{dtype}{'_midpoint' if midpoint else ''}")
 
     @wp.func
-    def gradients(kind: int, scale: f64, f: f64, a: vec3d, b: vec3d, a2: vec3d) -> wp.mat33d:
+    def constraint_gradients(kind: int, scale: f64, f: f64, a: vec3d, b: vec3d, a2: vec3d) -> wp.mat33d:
         """dc/da, dc/db, dc/da2 as rows, linear in the vectors; of a distance a must be a unit vector."""
         if kind == DISTANCE:
             return wp.matrix_from_rows(scale * a, vec3d(), vec3d())
@@ -187,7 +187,7 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
 
     @wp.func
     def store_gradients(into: wp.array2d(dtype=vec3d), world: int, row: int, G: wp.mat33d):
-        """Store the output of `gradients`."""
+        """Store the output of `constraint_gradients`."""
         for side in range(3):
             into[world, 3 * row + side] = G[side]
 
@@ -214,13 +214,12 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
             return
         kind = con.kind[row]
         scale = con.scale[row]
-        f = con.fixed[row]
+        f = con.constant_target[row]
         if con.law[row] >= 0:
             f = f + law_value[world, con.law[row]][con.law_component[row]]
-        da = combine(con, 3 * row, u, world)
-        db = combine(con, 3 * row + 1, u, world)
-        A = con.reference[3 * row]
-        B = con.reference[3 * row + 1]
+        da = term_vector(con, 3 * row, u, world)
+        db = term_vector(con, 3 * row + 1, u, world)
+        A, B = con.reference[3 * row], con.reference[3 * row + 1]
         a = A + da
         b = B + db
         a2 = vec3d()
@@ -229,51 +228,51 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
         if kind == DISTANCE:
             size = wp.length(a)
             # |a| - f without cancellation when f is the reference length
-            c = scale * (con.constant[row] - f * f + f64(2.0) * wp.dot(A, da) + wp.dot(da, da)) / (size + f)
+            c = scale * (con.reference_product[row] - f * f + f64(2.0) * wp.dot(A, da) + wp.dot(da, da)) / (size + f)
             slope = a / size
         elif kind == ANGLE:
-            a2 = con.reference[3 * row + 2] + combine(con, 3 * row + 2, u, world)
+            a2 = con.reference[3 * row + 2] + term_vector(con, 3 * row + 2, u, world)
             along = wp.sin(f) * a2 + wp.cos(f) * a
             c = scale * wp.dot(wp.cos(f) * a2 - wp.sin(f) * a, b)
             if wp.dot(along, b) < f64(0.0):
                 # beyond a right angle: the sine also vanishes at a half turn, which is no solution
                 c = wp.sign(c) * f64(2.0) * scale - c
                 scale = -scale
-            if wp.abs(f - mul.last_target[world, row]) > f64(MAX_ROTATION):
+            if wp.abs(f - mul.last_target[world, row]) > f64(MAX_DRIVE_ROTATION):
                 c = f64(2.0) * con.scale[row]  # ambiguous number of turns: the step must be halved
         else:
-            c = scale * (con.constant[row] - f + wp.dot(A, db) + wp.dot(da, B) + wp.dot(da, db))
-        turn = f
+            c = scale * (con.reference_product[row] - f + wp.dot(A, db) + wp.dot(da, B) + wp.dot(da, db))
+        angle = f  # at which the forces act
         if wp.static(midpoint):
-            store_gradients(mul.end_gradient, world, row, gradients(kind, scale, f, slope, b, a2))
-            middle = A + combine(con, 3 * row, u_stage, world)
+            store_gradients(mul.end_gradient, world, row, constraint_gradients(kind, scale, f, slope, b, a2))
+            middle = A + term_vector(con, 3 * row, u_stage, world)
             slope = middle
             if kind == DISTANCE:
                 slope = middle * (f64(2.0) / (wp.length(a) + wp.length(f64(2.0) * middle - a)))
-            b = B + combine(con, 3 * row + 1, u_stage, world)
+            b = B + term_vector(con, 3 * row + 1, u_stage, world)
             if kind == ANGLE:
-                a2 = con.reference[3 * row + 2] + combine(con, 3 * row + 2, u_stage, world)
+                a2 = con.reference[3 * row + 2] + term_vector(con, 3 * row + 2, u_stage, world)
                 if wp.isfinite(mul.last_target[world, row]):
-                    turn = f64(0.5) * (mul.last_target[world, row] + f)
-        store_gradients(mul.gradient, world, row, gradients(kind, scale, turn, slope, b, a2))
-        rho = mul.stiffness[world, row]
-        frozen = mul.force[world, row]
+                    angle = f64(0.5) * (mul.last_target[world, row] + f)
+        store_gradients(mul.gradient, world, row, constraint_gradients(kind, scale, angle, slope, b, a2))
+        rho = mul.penalty[world, row]
+        frozen = mul.multiplier[world, row]
         new = frozen
-        mul.value[world, row] = c
-        mul.scale[world, row] = scale
+        mul.constraint_value[world, row] = c
+        mul.signed_scale[world, row] = scale
         mul.target[world, row] = f
         mul.frozen_force[world, row] = frozen + rho * c
-        mul.trial[world, row] = frozen + rho * c
+        mul.trial_multiplier[world, row] = frozen + rho * c
         mul.penalty_force[world, row] = f64(0.0)
         if mul.outer_updates == 0:
-            new = frozen + alpha[world] * mul.change[world, row]
-            mul.trial[world, row] = new
+            new = frozen + alpha[world] * mul.multiplier_change[world, row]
+            mul.trial_multiplier[world, row] = new
             mul.penalty_force[world, row] = rho * c
         penalty_energy = f64(0.5) * rho * c * c
         mul.rows[0, world, row] = frozen * c + penalty_energy
         mul.rows[1, world, row] = new * c + penalty_energy
         mul.rows[2, world, row] = wp.max(wp.abs(frozen * c), wp.abs(new * c)) + penalty_energy
-        wp.atomic_max(mul.violation, world, con.component[row], wp.abs(c))
+        wp.atomic_max(mul.violation, world, con.connected_component[row], wp.abs(c))
 
     @wp.kernel(module=module)
     def product_terms(
@@ -288,25 +287,25 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
         if active[world] == 0:
             return
         kind = con.kind[row]
-        a = combine(con, 3 * row, p_in, world)
-        b = combine(con, 3 * row + 1, p_in, world)
+        a = term_vector(con, 3 * row, p_in, world)
+        b = term_vector(con, 3 * row + 1, p_in, world)
         a2 = vec3d()
         if kind == ANGLE:
-            a2 = combine(con, 3 * row + 2, p_in, world)
+            a2 = term_vector(con, 3 * row + 2, p_in, world)
         Ga = mul.gradient[world, 3 * row]
         Gb = mul.gradient[world, 3 * row + 1]
         Gc = mul.gradient[world, 3 * row + 2]
         change = wp.dot(mul.end_gradient[world, 3 * row], a) + wp.dot(mul.end_gradient[world, 3 * row + 1], b)
         change += wp.dot(mul.end_gradient[world, 3 * row + 2], a2)
         f = mul.target[world, row]
-        scale = mul.scale[world, row]
+        scale = mul.signed_scale[world, row]
         if kind == DISTANCE:
             n = Ga / scale
-            size = wp.abs(mul.value[world, row] / scale + f)
+            size = wp.abs(mul.constraint_value[world, row] / scale + f)
             a = (a - wp.dot(n, a) * n) / size
-        curvature_part = gradients(kind, scale, f, a, b, a2)
-        penalty_part = dq_dv[world] * mul.stiffness[world, row] * change
-        force = dq_dv[world] * mul.trial[world, row]
+        curvature_part = constraint_gradients(kind, scale, f, a, b, a2)
+        penalty_part = dq_dv[world] * mul.penalty[world, row] * change
+        force = dq_dv[world] * mul.trial_multiplier[world, row]
         if wp.static(midpoint):  # the gradients move by half of the end's change
             force = f64(0.5) * force
         mul.product[world, 3 * row] = penalty_part * Ga + force * curvature_part[0]
@@ -316,7 +315,7 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
     @wp.kernel(module=module)
     def load_multipliers(
         state: wp.array2d(dtype=f64),
-        travel: wp.array2d(dtype=f64),
+        last_target: wp.array2d(dtype=f64),
         active: wp.array(dtype=wp.int32),
         mul: Multipliers,
     ):
@@ -324,18 +323,18 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
         world, row = wp.tid()
         if active[world] == 0:
             return
-        mul.last_target[world, row] = travel[world, row]
-        mul.force[world, row] = state[world, row]
-        mul.trial[world, row] = state[world, row]
-        mul.change[world, row] = f64(0.0)
-        mul.stiffness[world, row] = f64(0.0)
+        mul.last_target[world, row] = last_target[world, row]
+        mul.multiplier[world, row] = state[world, row]
+        mul.trial_multiplier[world, row] = state[world, row]
+        mul.multiplier_change[world, row] = f64(0.0)
+        mul.penalty[world, row] = f64(0.0)
 
     @wp.kernel(module=module)
     def predict_change(
         con: Constraints,
         mul: Multipliers,
         direction: wp.array2d(dtype=vec3),
-        quiet: wp.array2d(dtype=wp.int32),
+        converged: wp.array2d(dtype=wp.int32),
         dq_dv: wp.array(dtype=f64),
         active: wp.array(dtype=wp.int32),
     ):
@@ -343,30 +342,29 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
         world, row = wp.tid()
         if active[world] == 0:
             return
-        mul.change[world, row] = f64(0.0)
-        if quiet[world, con.component[row]] == 0:
-            after = mul.value[world, row] + dq_dv[world] * directional(con, mul.end_gradient, direction, world, row)
-            mul.change[world, row] = mul.stiffness[world, row] * after
+        mul.multiplier_change[world, row] = f64(0.0)
+        if converged[world, con.connected_component[row]] == 0:
+            change = dq_dv[world] * directional_derivative(con, mul.end_gradient, direction, world, row)
+            mul.multiplier_change[world, row] = mul.penalty[world, row] * (mul.constraint_value[world, row] + change)
 
     @wp.kernel(module=module)
     def accept_trial(flags: wp.array(dtype=wp.int32), mul: Multipliers):
-        """Make the trial's multipliers those of the iterate and clear their change: the iterate may be evaluated
-        again."""
+        """Make the trial's multipliers those of the iterate; clear their change, for another evaluation of it."""
         world, row = wp.tid()
         if flags[world] != 0:
-            mul.force[world, row] = mul.trial[world, row]
-            mul.change[world, row] = f64(0.0)
+            mul.multiplier[world, row] = mul.trial_multiplier[world, row]
+            mul.multiplier_change[world, row] = f64(0.0)
 
     @wp.kernel(module=module)
     def store_multipliers(
         accepted: wp.array(dtype=wp.int32), mul: Multipliers, state: wp.array2d(dtype=f64),
-        travel: wp.array2d(dtype=f64),
+        last_target: wp.array2d(dtype=f64),
     ):  # fmt: skip
         """Store the multipliers and right sides of an accepted step in the state."""
         world, row = wp.tid()
         if accepted[world] != 0:
-            state[world, row] = mul.trial[world, row]
-            travel[world, row] = mul.target[world, row]
+            state[world, row] = mul.trial_multiplier[world, row]
+            last_target[world, row] = mul.target[world, row]
 
     @wp.kernel(module=module)
     def work_terms(
@@ -374,30 +372,30 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
         mul: Multipliers,
         u: wp.array2d(dtype=vec3),
         u_n: wp.array2d(dtype=vec3),
-        travel: wp.array2d(dtype=f64),
+        last_target: wp.array2d(dtype=f64),
         accepted: wp.array(dtype=wp.int32),
     ):
         """Work of a substep per row: of the drive, -lambda scale df, and lambda (J dq - scale df), which is lost.
 
-        A constraint at rest does no work along the exact path, but some along a chord. `midpoint`: a driven row does
-        the work of its drive alone.
+        A fixed constraint does no work along the exact path, but some along a chord. `midpoint`: a driven row does the
+        work of its drive alone.
         """
         world, row = wp.tid()
         if accepted[world] == 0:
             return
-        moved = f64(0.0)
+        moved = f64(0.0)  # J dq
         for term in range(3 * row, 3 * row + 3):
             s = vec3d()
-            for k in range(con.start[term], con.start[term + 1]):
-                slot = con.slot[k]
-                s += con.weight[k] * vec3d(u[world, slot] - u_n[world, slot])
+            for k in range(con.term_start[term], con.term_start[term + 1]):
+                slot = con.term_slot[k]
+                s += con.term_weight[k] * vec3d(u[world, slot] - u_n[world, slot])
             moved += wp.dot(mul.gradient[world, term], s)
-        driven = con.scale[row] * (mul.target[world, row] - travel[world, row])
+        driven = con.scale[row] * (mul.target[world, row] - last_target[world, row])
         if wp.static(midpoint):
             if con.law[row] >= 0:
                 driven = moved
-        mul.rows[0, world, row] = -mul.trial[world, row] * driven
-        mul.rows[1, world, row] = mul.trial[world, row] * (moved - driven)
+        mul.rows[0, world, row] = -mul.trial_multiplier[world, row] * driven
+        mul.rows[1, world, row] = mul.trial_multiplier[world, row] * (moved - driven)
 
     @wp.kernel(module=module)
     def joint_report(
@@ -411,21 +409,21 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
     ):
         """Force and moment about the anchor by each joint on its child, world axes, and its violation."""
         world, joint = wp.tid()
-        anchor = joints.anchor[joint]
+        anchor = joints.anchor[joint]  # current position, m
         for k in range(joints.anchor_start[joint], joints.anchor_start[joint + 1]):
             anchor += joints.anchor_weight[k] * vec3d(u[world, joints.anchor_slot[k]])
         F = vec3d()
         M = vec3d()
-        worst = f64(0.0)
-        for row in range(joints.first[joint], joints.last[joint]):
-            worst = wp.max(worst, wp.abs(mul.value[world, row]))
+        violation = f64(0.0)
+        for row in range(joints.first_row[joint], joints.end_row[joint]):
+            violation = wp.max(violation, wp.abs(mul.constraint_value[world, row]))
             for term in range(3 * row, 3 * row + 3):
-                for k in range(con.start[term], con.start[term + 1]):
-                    role = joints.role[k]
+                for k in range(con.term_start[term], con.term_start[term + 1]):
+                    role = joints.entry_role[k]
                     if role != 0:
-                        f = -(force[world, row] * con.weight[k]) * mul.gradient[world, term]
+                        f = -(force[world, row] * con.term_weight[k]) * mul.gradient[world, term]
                         f = f64(wp.sign(role)) * f
-                        arm = joints.place[k] + vec3d(u[world, con.slot[k]])
+                        arm = joints.slot_position[k] + vec3d(u[world, con.term_slot[k]])
                         if wp.abs(role) == 2:
                             arm = arm - anchor
                             F += f
@@ -434,7 +432,7 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
         for c in range(3):
             report[world, column + c] = F[c]
             report[world, column + 3 + c] = M[c]
-        report[world, column + 6] = worst
+        report[world, column + 6] = violation
 
     return _types.SimpleNamespace(
         module=module,

@@ -11,20 +11,20 @@ import warp as wp
 
 from ..common.lanes import lane_functions
 from ..common.types import SHORT_UNROLL, kernel_module, precision
-from .contact_colliders import MESHES, collider_functions
+from .contact_colliders import MESH_SUFFIX, collider_functions
 from .contact_laws import SMOOTH
 from .contact_point import contact_point_functions
 from .contact_structs import clock_struct, contact_scratch_struct, contact_struct, facet_struct, history_struct
 
-__all__ = ["MAX_ROTATION", "MIN_APPROACH_SPEED", "RELAX_LANES", "contact_kernels"]
+__all__ = ["AITKEN_LANES", "MAX_COLLIDER_ROTATION", "MIN_APPROACH_SPEED", "contact_kernels"]
 
 MIN_APPROACH_SPEED = 1e-3
 """Lower bound of the approach speed in the damping of the default law, m/s."""
 INACTIVE, FORCE_ONLY, WITH_STIFFNESS = 0, 1, 2
 """States of a point: no force; a force without tangent; a force with tangent."""
-MAX_ROTATION = 1.0
+MAX_COLLIDER_ROTATION = 1.0
 """Largest rotation of a touched collider in a step, rad; larger rotations are rejected."""
-RELAX_LANES = 128
+AITKEN_LANES = 128
 SLOW_REDUCTION = 0.35
 """Ratio of successive changes of the friction limits above which they are relaxed."""
 
@@ -39,27 +39,27 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
     lane_sum = lane_functions(dtype).lane_sum
     History, ContactScratch, Clock = history_struct(), contact_scratch_struct(dtype), clock_struct()
     f = contact_point_functions(dtype, meshes)
-    interpolate, history_row, contact_distance, is_acting, acting_shape = (
+    interpolate, history_row, activation_gap, is_acting, acting_shape_value = (
         f.interpolate,
         f.history_row,
-        f.contact_distance,
+        f.activation_gap,
         f.is_acting,
-        f.acting_shape,
+        f.acting_shape_value,
     )
-    set_explicit_force, evaluate_point, with_friction_normal, frozen_values = (
+    set_explicit_force, evaluate_point, with_friction_normal, friction_parameters = (
         f.set_explicit_force,
         f.evaluate_point,
         f.with_friction_normal,
-        f.frozen_values,
+        f.friction_parameters,
     )
     friction_potential, friction_force = f.friction_potential, f.friction_force
     point_stiffness = f.point_stiffness
     g = collider_functions(meshes)
     distance, stored_side, sheet_side = g.distance, g.stored_side, g.sheet_side
-    module = kernel_module(f"contact_{dtype}{MESHES * meshes}", max_unroll=SHORT_UNROLL)
+    module = kernel_module(f"contact_{dtype}{MESH_SUFFIX * meshes}", max_unroll=SHORT_UNROLL)
 
     @wp.kernel(module=module)
-    def poses(
+    def update_poses(
         con: Contacts, his: History, value: wp.array2d(dtype=vec3d), active: wp.array(dtype=wp.int32),
         scr: ContactScratch
     ):  # fmt: skip
@@ -67,26 +67,26 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         world, k = wp.tid()
         if active[world] == 0:
             return
-        position = con.center[k]
-        rotation = con.axes[k]
-        if con.spin[k] >= 0:
-            angle = value[world, con.spin[k]][0]
-            n = con.axis[k]
+        position = con.collider_center[k]
+        rotation = con.collider_axes[k]
+        if con.rotation_law[k] >= 0:
+            angle = value[world, con.rotation_law[k]][0]
+            n = con.rotation_axis[k]
             N = wp.skew(n)
             half = wp.sin(f64(0.5) * angle)
             R = wp.identity(n=3, dtype=f64) + wp.sin(angle) * N + (f64(2.0) * half * half) * (N * N)
-            position = con.anchor[k] + R * (position - con.anchor[k])
+            position = con.rotation_anchor[k] + R * (position - con.rotation_anchor[k])
             rotation = R * rotation
-        if con.path[k] >= 0:
-            position += value[world, con.path[k]]
+        if con.translation_law[k] >= 0:
+            position += value[world, con.translation_law[k]]
         if k == 0:
             scr.limit_updates[world] = 0
-        scr.position[world, k] = position
-        scr.rotation[world, k] = rotation
-        scr.translation[world, k] = position - his.position[world, k]
-        if con.spin[k] >= 0:
-            scr.angle[world, k] = value[world, con.spin[k]][0]
-            scr.rotation_change[world, k] = rotation * wp.transpose(his.rotation[world, k]) - wp.identity(
+        scr.collider_position[world, k] = position
+        scr.collider_rotation[world, k] = rotation
+        scr.collider_translation[world, k] = position - his.position[world, k]
+        if con.rotation_law[k] >= 0:
+            scr.collider_angle[world, k] = value[world, con.rotation_law[k]][0]
+            scr.collider_rotation_change[world, k] = rotation * wp.transpose(his.rotation[world, k]) - wp.identity(
                 n=3, dtype=f64
             )
 
@@ -99,14 +99,14 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         world, item, q = wp.tid()
         if active[world] == 0:
             return
-        if q == 0 and item == 0 and facets.row == 0:
-            scr.passed_through[world] = 0
+        if q == 0 and item == 0 and facets.first_row == 0:
+            scr.passed_point[world] = 0
             if clock.part[world] == 0:
-                scr.elapsed[world] = f64(0.0)
+                scr.elapsed_time[world] = f64(0.0)
         if facets.area_fraction[q, item] == f64(0.0):
             return
         c = facets.contact[item]
-        point = facets.point + item * facets.points + q
+        point = facets.first_point + item * facets.point_count + q
         rec = history_row(con, c, point)
         k = con.collider[c]
         x = facets.X[q, item] + interpolate(facets, u_n, world, q, item)
@@ -118,19 +118,17 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
                 his.contact_state[world, rec] = sheet_side(con, k, y, his.contact_state[world, rec])
         side = stored_side(con, k, in_contact, his.contact_state[world, rec])
         d = distance(con, k, y, side)
-        scr.start[world, point] = y
-        contact_distance_now = contact_distance(
-            con, his, world, c, point, clock.time[world], his.previous_margin[world, k]
-        )
-        scr.origin[world, point] = interpolate(facets, u_n, world, q, item)
-        scr.contact_distance[world, point] = contact_distance_now
-        scr.depth[world, point] = contact_distance_now - d[3]
+        scr.start_position[world, point] = y
+        activation_gap_now = activation_gap(con, his, world, c, point, clock.time[world], his.previous_margin[world, k])
+        scr.start_displacement[world, point] = interpolate(facets, u_n, world, q, item)
+        scr.activation_gap[world, point] = activation_gap_now
+        scr.start_depth[world, point] = activation_gap_now - d[3]
         speed = wp.max(his.speed[world, rec], f64(MIN_APPROACH_SPEED))
-        if clock.still == 0:
-            moved = (scr.rotation[world, k] * y + scr.position[world, k] - x) / clock.h[world]
+        if clock.is_static == 0:
+            moved = (scr.collider_rotation[world, k] * y + scr.collider_position[world, k] - x) / clock.h[world]
             approach = wp.dot(rotation * vec3d(d[0], d[1], d[2]), moved - interpolate(facets, v_n, world, q, item))
             speed = wp.max(speed, approach)
-        scr.speed[world, point] = speed
+        scr.approach_speed[world, point] = speed
 
     @wp.kernel(module=module)
     def points_at_state(
@@ -142,15 +140,13 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         c = facets.contact[item]
         k = con.collider[c]
         x = facets.X[q, item] + interpolate(facets, u, world, q, item)
-        point = facets.point + item * facets.points + q
-        y = wp.transpose(scr.rotation[world, k]) * (x - scr.position[world, k])
-        scr.start[world, point] = y
-        scr.origin[world, point] = interpolate(facets, u, world, q, item)
+        point = facets.first_point + item * facets.point_count + q
+        y = wp.transpose(scr.collider_rotation[world, k]) * (x - scr.collider_position[world, k])
+        scr.start_position[world, point] = y
+        scr.start_displacement[world, point] = interpolate(facets, u, world, q, item)
         d = distance(con, k, y, -1)
-        scr.contact_distance[world, point] = contact_distance(
-            con, his, world, c, point, time[world], con.margin[world, k]
-        )
-        scr.depth[world, point] = scr.contact_distance[world, point] - d[3]
+        scr.activation_gap[world, point] = activation_gap(con, his, world, c, point, time[world], con.margin[world, k])
+        scr.start_depth[world, point] = scr.activation_gap[world, point] - d[3]
 
     @wp.kernel(module=module)
     def explicit_forces(
@@ -164,22 +160,22 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         c = facets.contact[item]
         if con.is_explicit[c] == 0:
             return
-        point = facets.point + item * facets.points + q
+        point = facets.first_point + item * facets.point_count + q
         rec = history_row(con, c, point)
         k = con.collider[c]
         scr.explicit_force[world, point] = vec3d()
-        scr.explicit_spring[world, point] = vec3d()
-        delta = scr.depth[world, point]
+        scr.explicit_elastic_slip[world, point] = vec3d()
+        delta = scr.start_depth[world, point]
         if delta <= f64(0.0):
             return
         rotation = his.rotation[world, k]
-        y = scr.start[world, point]
+        y = scr.start_position[world, point]
         side = stored_side(con, k, True, his.contact_state[world, rec])
         d = distance(con, k, y, side)
         n = rotation * vec3d(d[0], d[1], d[2])
         x = rotation * y + his.position[world, k]
         h = clock.h[world]
-        moved = (scr.rotation[world, k] * y + scr.position[world, k] - x) / h
+        moved = (scr.collider_rotation[world, k] * y + scr.collider_position[world, k] - x) / h
         set_explicit_force(
             con, his, scr, world, c, point, delta, n, interpolate(facets, v_n, world, q, item) - moved, h
         )
@@ -191,7 +187,7 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
     ) -> f64:  # fmt: skip
         """Potential of an explicit force: minus its work on the step so far, J."""
         k = con.collider[c]
-        x_n = his.rotation[world, k] * scr.start[world, point] + his.position[world, k]
+        x_n = his.rotation[world, k] * scr.start_position[world, point] + his.position[world, k]
         x = facets.X[q, item] + interpolate(facets, u, world, q, item)
         return -wp.dot(scr.explicit_force[world, point], x - x_n)
 
@@ -209,35 +205,35 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         if active[world] == 0:
             return
         c = facets.contact[item]
-        point = facets.point + item * facets.points + q
+        point = facets.first_point + item * facets.point_count + q
         area_fraction = facets.area_fraction[q, item] * is_acting(con, scr, world, c, point)
         scr.activity[world, point] = INACTIVE
         if area_fraction == f64(0.0):
             return
         inv_h = f64(0.0)
-        if clock.still == 0:
+        if clock.is_static == 0:
             inv_h = f64(1.0) / clock.h[world]
         rec = history_row(con, c, point)
-        frozen = scr.frozen[world, rec]
+        frozen = scr.frozen_friction[world, rec]
         if fresh != 0:
             frozen[2] = f64(1.0)
         t = evaluate_point(con, facets, his, scr, world, q, item, point, u, clock.new_time[world], inv_h, frozen[2])
         if con.is_explicit[c] == 0:
-            new = frozen_values(con, his, scr, world, c, point, t)
+            new = friction_parameters(con, his, scr, world, c, point, t)
             if fresh != 0:  # initial limits: those of the last step, zero for a new contact
-                scr.frozen_normal[world, rec] = t.n
+                scr.frozen_normal[world, rec] = t.normal
                 frozen = new
                 frozen[0] = wp.min(new[0], his.friction_limit[world, rec])
-                scr.frozen[world, rec] = frozen
-            scr.updated_normal[world, rec] = t.n
+                scr.frozen_friction[world, rec] = frozen
+            scr.updated_normal[world, rec] = t.normal
             t = with_friction_normal(t, scr.frozen_normal[world, rec])
-            scr.updated[world, rec] = new
+            scr.updated_friction[world, rec] = new
         turned = f64(0.0)
-        if con.spin[con.collider[c]] >= 0:
-            turned = wp.abs(scr.angle[world, con.collider[c]] - his.angle[world, con.collider[c]])
-        near = t.depth > f64(0.0) or scr.depth[world, point] > f64(0.0)
-        if t.side == -2 or (near and turned > f64(MAX_ROTATION)):
-            scr.passed_through[world] = wp.where(t.side == -2, point + 1, -point - 1)
+        if con.rotation_law[con.collider[c]] >= 0:
+            turned = wp.abs(scr.collider_angle[world, con.collider[c]] - his.angle[world, con.collider[c]])
+        near = t.depth > f64(0.0) or scr.start_depth[world, point] > f64(0.0)
+        if t.side == -2 or (near and turned > f64(MAX_COLLIDER_ROTATION)):
+            scr.passed_point[world] = wp.where(t.side == -2, point + 1, -point - 1)
             scr.activity[world, point] = FORCE_ONLY
             scr.force[world, point] = vec3d()
             scr.energy[world, point] = wp.vec2d(f64(wp.inf), f64(0.0))
@@ -251,16 +247,19 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
             friction_energy = friction_potential(con, world, c, t, frozen, inv_h)
             K = point_stiffness(con, world, c, t, frozen, inv_h)
             scr.activity[world, point] = WITH_STIFFNESS
-            scr.force[world, point] = area_fraction * (friction_force(con, world, c, t, frozen, inv_h) - t.law[0] * t.n)
+            scr.force[world, point] = area_fraction * (
+                friction_force(con, world, c, t, frozen, inv_h) - t.normal_response[0] * t.normal
+            )
             scr.energy[world, point] = wp.vec2d(
-                area_fraction * (t.law[2] + friction_energy), area_fraction * (t.law[3] + wp.abs(friction_energy))
+                area_fraction * (t.normal_response[2] + friction_energy),
+                area_fraction * (t.normal_response[3] + wp.abs(friction_energy)),
             )
             scr.stiffness[world, point] = sym(T(area_fraction * K[0, 0]), T(area_fraction * K[1, 1]),
                 T(area_fraction * K[2, 2]), T(area_fraction * K[1, 2]), T(area_fraction * K[0, 2]),
                 T(area_fraction * K[0, 1]))  # fmt: skip
 
     @wp.kernel(module=module)
-    def gather_points(
+    def gather_point_forces(
         facets: Facets, active: wp.array(dtype=wp.int32), lanes: int, scr: ContactScratch, pool: wp.array2d(dtype=vec3),
         rows: wp.array3d(dtype=f64), touching: wp.array(dtype=wp.int32),
     ):  # fmt: skip
@@ -268,32 +267,32 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         world, index = wp.tid()
         if active[world] == 0:
             return
-        entry = wp.min(index / lanes, facets.count * facets.conn.shape[0] - 1)
-        item = entry % facets.count
-        i = entry / facets.count
+        entry = wp.min(index / lanes, facets.facet_count * facets.conn.shape[0] - 1)
+        item = entry % facets.facet_count
+        i = entry / facets.facet_count
         lane = index % lanes
-        first = facets.point + item * facets.points
+        first = facets.first_point + item * facets.point_count
         touched = wp.int32(INACTIVE)
-        for q in range(facets.points):
+        for q in range(facets.point_count):
             touched = wp.max(touched, scr.activity[world, first + q])
         f = vec3()
         if touched != INACTIVE:
-            for q in range(lane, facets.points, lanes):
+            for q in range(lane, facets.point_count, lanes):
                 if scr.activity[world, first + q] != INACTIVE:
-                    f += acting_shape(facets, scr, world, q, i, item) * vec3(scr.force[world, first + q])
+                    f += acting_shape_value(facets, scr, world, q, i, item) * vec3(scr.force[world, first + q])
         f = lane_sum(f, lanes)
         if lane > 0:
             return
-        pool[world, facets.pool + entry] = f
+        pool[world, facets.first_entry + entry] = f
         if i > 0:
             return
-        row = facets.row + item
+        row = facets.first_row + item
         before = scr.facet_activity[world, row]
         scr.facet_activity[world, row] = touched
         if wp.max(before, touched) == INACTIVE:
             return  # the rows are already zero
         energy = wp.vec2d()
-        for q in range(facets.points):
+        for q in range(facets.point_count):
             state = scr.activity[world, first + q]
             if state != INACTIVE:
                 energy += scr.energy[world, first + q]
@@ -307,27 +306,29 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def aitken_partial_sums(flags: wp.array(dtype=wp.int32), scr: ContactScratch):
-        """Partial sums, by lanes, of r = limit of the iterate - frozen limit, and of the change of r, for `relax`."""
+        """Partial sums, by lanes, of r = limit of the iterate - frozen limit, and of its change, for relaxation."""
         world, lane = wp.tid()
         if flags[world] == 0:
             return
         out = wp.vec4d()
-        for point in range(lane, scr.aitken_residual.shape[1], RELAX_LANES):
+        for point in range(lane, scr.aitken_residual.shape[1], AITKEN_LANES):
             if scr.activity[world, point] == WITH_STIFFNESS:
-                r = scr.updated[world, point][0] - scr.frozen[world, point][0]
+                r = scr.updated_friction[world, point][0] - scr.frozen_friction[world, point][0]
                 old = scr.aitken_residual[world, point]
-                new = scr.updated[world, point][0]
+                new = scr.updated_friction[world, point][0]
                 out += wp.vec4d(old * (r - old), (r - old) * (r - old), r * r, new * new)
         scr.aitken_sums[world, lane] = out
 
     @wp.kernel(module=module)
-    def relax(flags: wp.array(dtype=wp.int32), tol: f64, scr: ContactScratch, unsettled: wp.array(dtype=wp.int32)):
+    def aitken_relaxation(
+        flags: wp.array(dtype=wp.int32), tol: f64, scr: ContactScratch, unsettled: wp.array(dtype=wp.int32)
+    ):
         """Relaxation factor of the friction limits: 1 while r shrinks, else Aitken's (Irons and Tuck 1969)."""
         world = wp.tid()
         if flags[world] == 0:
             return
         total = wp.vec4d()
-        for lane in range(RELAX_LANES):
+        for lane in range(AITKEN_LANES):
             total += scr.aitken_sums[world, lane]
         omega = f64(1.0)
         slow = total[2] > f64(SLOW_REDUCTION) * f64(SLOW_REDUCTION) * scr.aitken_norm2[world] and total[1] > f64(0.0)
@@ -343,52 +344,52 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         """Update the frozen friction limits by the relaxed change, and the plane of friction."""
         world, point = wp.tid()
         if flags[world] != 0:
-            new = scr.updated[world, point]
-            r = new[0] - scr.frozen[world, point][0]
+            new = scr.updated_friction[world, point]
+            r = new[0] - scr.frozen_friction[world, point][0]
             if scr.relaxation[world] != f64(1.0):
-                new[0] = wp.max(scr.frozen[world, point][0] + scr.relaxation[world] * r, f64(0.0))
+                new[0] = wp.max(scr.frozen_friction[world, point][0] + scr.relaxation[world] * r, f64(0.0))
             scr.aitken_residual[world, point] = r
-            scr.frozen[world, point] = new
+            scr.frozen_friction[world, point] = new
             scr.frozen_normal[world, point] = scr.updated_normal[world, point]
 
     @wp.func
-    def times(k: sym, p: vec3) -> vec3:
+    def multiply_symmetric(k: sym, p: vec3) -> vec3:
         """Product of the symmetric matrix k (Voigt) with p."""
         return vec3(k[0] * p[0] + k[5] * p[1] + k[4] * p[2], k[5] * p[0] + k[1] * p[1] + k[3] * p[2],
                     k[4] * p[0] + k[3] * p[1] + k[2] * p[2])  # fmt: skip
 
     @wp.kernel(module=module)
-    def product_points(
+    def point_products(
         facets: Facets, active: wp.array(dtype=wp.int32), p: wp.array2d(dtype=vec3), scr: ContactScratch
     ):  # fmt: skip
         """K times the displacement of each point."""
         world, item, q = wp.tid()
-        if active[world] == 0 or scr.facet_activity[world, facets.row + item] != WITH_STIFFNESS:
+        if active[world] == 0 or scr.facet_activity[world, facets.first_row + item] != WITH_STIFFNESS:
             return
         d = vec3()
         for i in range(facets.conn.shape[0]):
-            d += acting_shape(facets, scr, world, q, i, item) * p[world, facets.conn[i, item]]
-        point = facets.point + item * facets.points + q
-        scr.product[world, point] = times(scr.stiffness[world, point], d)
+            d += acting_shape_value(facets, scr, world, q, i, item) * p[world, facets.conn[i, item]]
+        point = facets.first_point + item * facets.point_count + q
+        scr.point_product[world, point] = multiply_symmetric(scr.stiffness[world, point], d)
 
     @wp.kernel(module=module)
-    def product_facets(
+    def gather_facet_products(
         facets: Facets, active: wp.array(dtype=wp.int32), lanes: int, scr: ContactScratch, pool: wp.array2d(dtype=vec3)
     ):  # fmt: skip
         """Sums of the point products on the slots of the facets."""
         world, index = wp.tid()
         if active[world] == 0:
             return
-        entry = wp.min(index / lanes, facets.count * facets.conn.shape[0] - 1)
-        item = entry % facets.count
+        entry = wp.min(index / lanes, facets.facet_count * facets.conn.shape[0] - 1)
+        item = entry % facets.facet_count
         out = vec3()
-        if scr.facet_activity[world, facets.row + item] == WITH_STIFFNESS:
-            for q in range(index % lanes, facets.points, lanes):
-                flux = scr.product[world, facets.point + item * facets.points + q]
-                out += acting_shape(facets, scr, world, q, entry / facets.count, item) * flux
+        if scr.facet_activity[world, facets.first_row + item] == WITH_STIFFNESS:
+            for q in range(index % lanes, facets.point_count, lanes):
+                flux = scr.point_product[world, facets.first_point + item * facets.point_count + q]
+                out += acting_shape_value(facets, scr, world, q, entry / facets.facet_count, item) * flux
         out = lane_sum(out, lanes)
         if index % lanes == 0:
-            pool[world, facets.pool + entry] = out
+            pool[world, facets.first_entry + entry] = out
 
     @wp.kernel(module=module)
     def diagonal(facets: Facets, active: wp.array(dtype=wp.int32), scr: ContactScratch, pool: wp.array2d(dtype=sym)):
@@ -397,15 +398,15 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         if active[world] == 0:
             return
         out = sym()
-        if scr.facet_activity[world, facets.row + item] == WITH_STIFFNESS:
-            for q in range(facets.points):
-                s = acting_shape(facets, scr, world, q, i, item)
-                out += s * s * scr.stiffness[world, facets.point + item * facets.points + q]
-        pool[world, facets.pool + i * facets.count + item] = out
+        if scr.facet_activity[world, facets.first_row + item] == WITH_STIFFNESS:
+            for q in range(facets.point_count):
+                s = acting_shape_value(facets, scr, world, q, i, item)
+                out += s * s * scr.stiffness[world, facets.first_point + item * facets.point_count + q]
+        pool[world, facets.first_entry + i * facets.facet_count + item] = out
 
     return _types.SimpleNamespace(
-        module=module, poses=poses, begin_points=begin_points, points_at_state=points_at_state,
-        explicit_forces=explicit_forces, forces=forces, gather_points=gather_points,
-        aitken_partial_sums=aitken_partial_sums, relax=relax, update_frozen=update_frozen,
-        product_points=product_points, product_facets=product_facets, diagonal=diagonal,
+        module=module, update_poses=update_poses, begin_points=begin_points, points_at_state=points_at_state,
+        explicit_forces=explicit_forces, forces=forces, gather_point_forces=gather_point_forces,
+        aitken_partial_sums=aitken_partial_sums, aitken_relaxation=aitken_relaxation, update_frozen=update_frozen,
+        point_products=point_products, gather_facet_products=gather_facet_products, diagonal=diagonal,
     )  # fmt: skip

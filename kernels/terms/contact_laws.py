@@ -29,12 +29,12 @@ DEFAULT, PAPER, SMOOTH = range(3)
 
 @functools.cache
 def law_functions() -> _types.SimpleNamespace:
-    """Device functions `normal_law`, `elastic`, `friction` and `smooth_friction`."""
+    """Device functions `normal_law`, `elastic_force`, `huber_friction` and `smooth_friction`."""
     f64 = wp.float64
     vec3d, vec4d = wp.vec3d, wp.vec4d
 
     @wp.func
-    def elastic(single_point: int, k: f64, delta: f64) -> wp.vec2d:
+    def elastic_force(single_point: int, k: f64, delta: f64) -> wp.vec2d:
         """Elastic force, N, and stored energy, J."""
         if delta <= f64(0.0):
             return wp.vec2d()
@@ -57,24 +57,24 @@ def law_functions() -> _types.SimpleNamespace:
             return vec4d()
         m = wp.where(single_point != 0, f64(1.5), f64(1.0))
         c0 = f64(1.0) - rate * delta_n
-        power = elastic(single_point, k, delta)[0]
+        power = elastic_force(single_point, k, delta)[0]
         force = power * factor
         slope = m * force / delta + power * rate
         psi = power * delta * (c0 / (m + f64(1.0)) + rate * delta / (m + f64(2.0)))
         size = power * delta * ((f64(1.0) + rate * wp.abs(delta_n)) / (m + f64(1.0)) + rate * delta / (m + f64(2.0)))
         if c0 < f64(0.0):  # the force begins at delta_a > 0
             begin = -c0 / rate
-            low = elastic(single_point, k, begin)[0] * begin
+            low = elastic_force(single_point, k, begin)[0] * begin
             psi -= low * (c0 / (m + f64(1.0)) + rate * begin / (m + f64(2.0)))
         return vec4d(force, slope, psi, size)
 
     @wp.func
-    def damped(single_point: int, k: f64, g: f64, ramp: f64, delta: f64, delta_n: f64) -> vec3d:
+    def damped_force(single_point: int, k: f64, g: f64, ramp: f64, delta: f64, delta_n: f64) -> vec3d:
         """k_n delta - gamma_n v_n of Eq. (77) before the cut at 0, its derivative and its integral.
 
         g = gamma_n / h (of spheres gamma_n is g h delta^(1/4)); the damping grows linearly over the depth `ramp`.
         """
-        spring = elastic(single_point, k, delta)
+        spring = elastic_force(single_point, k, delta)
         if single_point != 0:
             root = wp.sqrt(wp.sqrt(delta))
             force = spring[0] + g * root * (delta - delta_n)
@@ -96,20 +96,20 @@ def law_functions() -> _types.SimpleNamespace:
         """Eq. (77): max(0, k_n delta - gamma_n v_n), its derivative, integral, and the magnitude of the integral."""
         if delta <= f64(0.0):
             return vec4d()
-        out = damped(single_point, k, g, ramp, delta, delta_n)
+        out = damped_force(single_point, k, g, ramp, delta, delta_n)
         if out[0] <= f64(0.0):
             return vec4d()
-        size = elastic(single_point, k, delta)[1] + g * delta * (delta + wp.abs(delta_n))
+        size = elastic_force(single_point, k, delta)[1] + g * delta * (delta + wp.abs(delta_n))
         if delta_n > f64(0.0) and g > f64(0.0):
             low = f64(0.0)  # depth at which the force begins: negative below, positive at delta_n
             high = wp.min(delta, delta_n)
             for _ in range(60):
                 middle = f64(0.5) * (low + high)
-                if damped(single_point, k, g, ramp, middle, delta_n)[0] > f64(0.0):
+                if damped_force(single_point, k, g, ramp, middle, delta_n)[0] > f64(0.0):
                     high = middle
                 else:
                     low = middle
-            out[2] = out[2] - damped(single_point, k, g, ramp, low, delta_n)[2]
+            out[2] = out[2] - damped_force(single_point, k, g, ramp, low, delta_n)[2]
         return vec4d(out[0], out[1], out[2], size)
 
     @wp.func
@@ -138,7 +138,7 @@ def law_functions() -> _types.SimpleNamespace:
         return smooth_law(k, g, eps, delta, delta_n)
 
     @wp.func
-    def friction(trial: vec3d, stiffness: f64, friction_limit: f64) -> wp.vec2d:
+    def huber_friction(trial: vec3d, stiffness: f64, friction_limit: f64) -> wp.vec2d:
         """Huber potential, J, of a trial force stiffness x slip cut at `friction_limit`, and the fraction of the trial
         force that acts."""
         size = wp.length(trial)
@@ -158,5 +158,8 @@ def law_functions() -> _types.SimpleNamespace:
         return wp.vec2d(friction_limit * wp.dot(v, v) / (root + v_eps) / inv_h, friction_limit * inv_h / root)
 
     return _types.SimpleNamespace(
-        elastic=elastic, normal_law=normal_law, friction=friction, smooth_friction=smooth_friction
+        elastic_force=elastic_force,
+        normal_law=normal_law,
+        huber_friction=huber_friction,
+        smooth_friction=smooth_friction,
     )

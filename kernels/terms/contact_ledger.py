@@ -9,26 +9,50 @@ from ..common.block_entries import add_symmetric_function
 from ..common.structs import pattern_struct, topology_struct
 from ..common.types import SHORT_UNROLL, kernel_module, precision
 from .contact import INACTIVE
-from .contact_colliders import MESHES, collider_functions
+from .contact_colliders import MESH_SUFFIX, collider_functions
 from .contact_laws import PAPER, SMOOTH, law_functions
 from .contact_point import contact_point_functions
 from .contact_structs import (
-    RECORD,
+    AREA_ROW,
+    MOMENT_ROW,
+    NORMAL_ROW,
+    PENETRATION_ROW,
+    RECORD_NAMES,
+    SLIP_ROW,
+    STICK_ROW,
+    STORED_ROW,
     clock_struct,
     contact_scratch_struct,
     contact_struct,
     facet_struct,
     history_struct,
-    of_world,
+    world_value,
 )
 
-__all__ = ["ENERGY_COLUMNS", "RECORD_LANES", "contact_block_kernels", "contact_ledger_kernels"]
+__all__ = [
+    "COLLIDER_WORK",
+    "ENERGY_COLUMNS",
+    "FRICTION",
+    "INTEGRATOR_WORK",
+    "LOSS",
+    "RECORD_LANES",
+    "STORED",
+    "SUMMED_ROWS",
+    "contact_block_kernels",
+    "contact_ledger_kernels",
+]
 
-ENERGY_COLUMNS = 5  # stored, loss, friction, work of the colliders, the integrator's part
+STORED, LOSS, FRICTION, COLLIDER_WORK, INTEGRATOR_WORK = range(5)
+"""Columns of the energy increments, J: stored energy (its value), lost to restitution, lost to friction, work of the
+colliders, and the part of the contact's work that is due to the integrator."""
+ENERGY_COLUMNS = 5
 RECORD_LANES = 32
-RECORD_SUMS = len(RECORD) - 1
-AVERAGED = 7
-"""Leading rows of the record, averaged over the substeps of a step; area, stick and stored are values at its end."""
+"""Threads that share the sums over the facets of a contact."""
+SUMMED_ROWS = len(RECORD_NAMES) - 1
+"""Rows of the record that are sums; the last one is a maximum."""
+AVERAGED_ROWS = 7
+"""Leading rows of the record (force, moment, normal force), averaged over the substeps of a step; area, stick and
+stored are values at its end."""
 
 
 @functools.cache
@@ -38,54 +62,58 @@ def contact_ledger_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
     Contacts, Facets = contact_struct(meshes), facet_struct(dtype)
     History, ContactScratch, Clock = history_struct(), contact_scratch_struct(dtype), clock_struct()
     k = contact_point_functions(dtype, meshes)
-    evaluate_point, with_friction_normal, frozen_values, friction_trial, is_acting, PointContact = (
+    evaluate_point, with_friction_normal, friction_parameters, friction_trial, is_acting, PointContact = (
         k.evaluate_point,
         k.with_friction_normal,
-        k.frozen_values,
+        k.friction_parameters,
         k.friction_trial,
         k.is_acting,
         k.PointContact,
     )
     tangential, history_row, friction_force = k.tangential, k.history_row, k.friction_force
-    coefficient, lagrange, overlap_recovery = k.coefficient, k.lagrange, k.overlap_recovery
-    elastic = law_functions().elastic
+    friction_coefficient, lagrange_polynomial, overlap_recovery = (
+        k.friction_coefficient,
+        k.lagrange_polynomial,
+        k.overlap_recovery,
+    )
+    elastic_force = law_functions().elastic_force
     g = collider_functions(meshes)
-    updated_side, released_state, SLIP_FLAG = g.updated_side, g.released_state, g.SLIP_FLAG
-    module = kernel_module(f"contact_{dtype}{MESHES * meshes}", max_unroll=SHORT_UNROLL)
+    updated_side, released_contact_state, SLIP_FLAG = g.updated_side, g.released_contact_state, g.SLIP_FLAG
+    module = kernel_module(f"contact_{dtype}{MESH_SUFFIX * meshes}", max_unroll=SHORT_UNROLL)
 
     @wp.struct
     class PointOutcome:
-        """Result of a point after a substep, for the whole region."""
+        """Result of a point after a substep; forces and energies as if the point had the area of the whole region."""
 
-        point: PointContact
+        contact: PointContact
         force: vec3d  # on the body, N
-        normal: f64
-        friction_spring: vec3d  # stretch of its friction spring, m
-        friction_limit: f64
+        normal_force: f64  # N
+        elastic_slip: vec3d  # elastic part of its slip: displacement of the friction spring, m
+        friction_limit: f64  # mu F_n, N
         slipping: wp.int32
         slip_increment: vec3d  # slip in the substep, m
         stored: f64  # J, as are the following
         loss: f64
         friction_loss: f64
-        collider_work: f64  # by the collider
-        integrator_work: f64  # the integrator's part that the ledger does not find by itself
+        collider_work: f64  # work done by the collider
+        integrator_work: f64  # work due to the integrator beyond the ledger's own estimate
 
     @wp.func
     def return_mapping(
         con: Contacts, world: int, c: int, t: PointContact, frozen: vec3d, inv_h: f64, tangential_force: vec3d
     ) -> vec3d:
-        """Friction spring after the force was cut to the friction limit; Eq. (83) for the paper's law."""
+        """Elastic slip, m, after the force was cut to the friction limit; Eq. (83) of Paper I for law PAPER."""
         w = friction_trial(con, world, c, t, frozen, inv_h)
         if wp.length(vec3d(w[0], w[1], w[2])) <= frozen[0]:
-            return t.q
+            return t.trial_elastic_slip
         trial = vec3d(w[0], w[1], w[2])
-        if con.law[c] != PAPER:  # spring and damper slip together: the stretch is bounded by the motion of the point
+        if con.law[c] != PAPER:  # spring and damper slip together: bounded by the motion of the point
             if frozen[0] <= f64(0.0):
                 return vec3d()
             size = wp.length(trial)
-            return t.q - ((size - frozen[0]) / (w[3] * size)) * trial
+            return t.trial_elastic_slip - ((size - frozen[0]) / (w[3] * size)) * trial
         # reverses the spring where gamma_t v exceeds the friction limit
-        return (f64(1.0) / frozen[1]) * tangential_force - ((w[3] - frozen[1]) / frozen[1]) * t.slip
+        return (f64(1.0) / frozen[1]) * tangential_force - ((w[3] - frozen[1]) / frozen[1]) * t.tangential_motion
 
     @wp.func
     def point_outcome(
@@ -103,58 +131,64 @@ def contact_ledger_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         kc = con.collider[c]
         law = con.law[c]
         inv_h = f64(0.0)
-        if clock.still == 0:
+        if clock.is_static == 0:
             inv_h = f64(1.0) / clock.h[world]
-        frozen = scr.frozen[world, rec]
+        frozen = scr.frozen_friction[world, rec]
         t = evaluate_point(con, facets, his, scr, world, q, item, point, u, clock.new_time[world], inv_h, frozen[2])
         if con.is_explicit[c] == 0:
             t = with_friction_normal(t, scr.frozen_normal[world, rec])
-        change = t.depth - scr.depth[world, point]
-        spring = elastic(con.single_point[c], con.scale[world, c] * of_world(con.normal, world, c), t.depth)
-        normal = t.law[0]
+        change = t.depth - scr.start_depth[world, point]
+        spring = elastic_force(
+            con.single_point[c], con.scale[world, c] * world_value(con.normal_stiffness, world, c), t.depth
+        )
+        normal = t.normal_response[0]
         tangential_force = friction_force(con, world, c, t, frozen, inv_h)
         w = friction_trial(con, world, c, t, frozen, inv_h)
         out.slipping = wp.where(wp.length(vec3d(w[0], w[1], w[2])) > frozen[0] or law == SMOOTH, 1, 0)
-        previous_spring = vec3d()  # previous spring, in the tangent plane
+        previous_elastic_slip = vec3d()  # previous spring, in the tangent plane
         if his.speed[world, rec] > f64(0.0):
-            previous_spring = his.spring[world, rec]
+            previous_elastic_slip = his.spring[world, rec]
             if law != PAPER:
-                previous_spring = scr.rotation[world, kc] * previous_spring
-            previous_spring = tangential(t.m, previous_spring)
+                previous_elastic_slip = scr.collider_rotation[world, kc] * previous_elastic_slip
+            previous_elastic_slip = tangential(t.friction_normal, previous_elastic_slip)
         if con.is_explicit[c] != 0:
-            normal = wp.dot(scr.explicit_force[world, point], t.n)
-            tangential_force = normal * t.n - scr.explicit_force[world, point]
-            out.friction_spring = scr.explicit_spring[world, point]
-            frozen[0] = coefficient(con, his, world, c, rec) * normal
+            normal = wp.dot(scr.explicit_force[world, point], t.normal)
+            tangential_force = normal * t.normal - scr.explicit_force[world, point]
+            out.elastic_slip = scr.explicit_elastic_slip[world, point]
+            frozen[0] = friction_coefficient(con, his, world, c, rec) * normal
             out.slipping = wp.where(wp.length(tangential_force) >= f64(0.999999) * frozen[0], 1, 0)
         elif normal > f64(0.0) and law != SMOOTH and frozen[1] > f64(0.0):
-            out.friction_spring = return_mapping(con, world, c, t, frozen, inv_h, tangential_force)
-        out.point = t
-        out.normal = normal
+            out.elastic_slip = return_mapping(con, world, c, t, frozen, inv_h, tangential_force)
+        out.contact = t
+        out.normal_force = normal
         out.friction_limit = frozen[0]
-        out.force = normal * t.n - tangential_force
-        out.stored = spring[1] + f64(0.5) * frozen[1] * wp.dot(out.friction_spring, out.friction_spring)
+        out.force = normal * t.normal - tangential_force
+        out.stored = spring[1] + f64(0.5) * frozen[1] * wp.dot(out.elastic_slip, out.elastic_slip)
         gain = out.stored - his.stored[world, rec]
         out.loss = (normal - spring[0]) * t.depth_increment
-        out.slip_increment = t.slip - (out.friction_spring - previous_spring)
+        out.slip_increment = t.tangential_motion - (out.elastic_slip - previous_elastic_slip)
         out.friction_loss = wp.dot(
-            tangential_force - frozen[1] * out.friction_spring, out.friction_spring - previous_spring
+            tangential_force - frozen[1] * out.elastic_slip, out.elastic_slip - previous_elastic_slip
         ) + wp.dot(tangential_force, out.slip_increment)
         chord = (
-            spring[0] * change + frozen[1] * wp.dot(out.friction_spring, out.friction_spring - previous_spring) - gain
+            spring[0] * change + frozen[1] * wp.dot(out.elastic_slip, out.elastic_slip - previous_elastic_slip) - gain
         )
         chord += (normal - spring[0]) * (change - t.depth_increment)  # of a moving contact point
-        x = scr.rotation[world, kc] * t.y + scr.position[world, kc]
-        carried = scr.translation[world, kc]  # motion of the collider's material at the point, by its last velocity
-        if con.spin[kc] >= 0:
-            angle = scr.angle[world, kc] - his.angle[world, kc]
-            carried = angle * wp.cross(con.axis[kc], x - con.anchor[kc])
+        x = scr.collider_rotation[world, kc] * t.local_position + scr.collider_position[world, kc]
+        carried = scr.collider_translation[
+            world, kc
+        ]  # motion of the collider's material at the point, by its last velocity
+        if con.rotation_law[kc] >= 0:
+            angle = scr.collider_angle[world, kc] - his.angle[world, kc]
+            carried = angle * wp.cross(con.rotation_axis[kc], x - con.rotation_anchor[kc])
         risen = overlap_recovery(con, his, clock, world, c, point)
         out.collider_work = wp.dot(out.force, carried) + normal * risen
         # the ledger attributes the remaining work of the force to the integrator; `left` makes it agree with these
         # formulas
-        x_n = his.rotation[world, kc] * scr.start[world, point] + his.position[world, kc]
-        turned = -wp.dot(out.force, x - x_n - carried) - (normal * (change - risen) + wp.dot(tangential_force, t.slip))
+        x_n = his.rotation[world, kc] * scr.start_position[world, point] + his.position[world, kc]
+        turned = -wp.dot(out.force, x - x_n - carried) - (
+            normal * (change - risen) + wp.dot(tangential_force, t.tangential_motion)
+        )
         out.integrator_work = chord + turned + wp.dot(out.force, x - x_n) + gain + out.loss + out.friction_loss
         return out
 
@@ -166,33 +200,35 @@ def contact_ledger_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         """Store the history of a point."""
         rec = history_row(con, c, point)
         if facets.tracks_deepest != 0:
-            his.previous_depth[world, rec] = o.point.depth
+            his.previous_depth[world, rec] = o.contact.depth
         kc = con.collider[c]
-        if o.point.depth <= f64(0.0):
-            contact_state = released_state(con, kc, his.speed[world, rec] > f64(0.0), his.contact_state[world, rec])
+        if o.contact.depth <= f64(0.0):
+            contact_state = released_contact_state(
+                con, kc, his.speed[world, rec] > f64(0.0), his.contact_state[world, rec]
+            )
             his.spring[world, rec] = vec3d()
             his.stored[world, rec] = f64(0.0)
             his.friction_limit[world, rec] = f64(0.0)
             his.speed[world, rec] = f64(0.0)
             his.contact_state[world, rec] = contact_state
             return
-        speed = scr.speed[world, point]
-        if clock.still == 0:
-            speed = wp.max(speed, o.point.depth_increment / clock.h[world])
-        friction_spring = o.friction_spring
+        speed = scr.approach_speed[world, point]
+        if clock.is_static == 0:
+            speed = wp.max(speed, o.contact.depth_increment / clock.h[world])
+        elastic_slip = o.elastic_slip
         if con.law[c] != PAPER:
-            friction_spring = wp.transpose(scr.rotation[world, kc]) * friction_spring
-        his.spring[world, rec] = friction_spring
+            elastic_slip = wp.transpose(scr.collider_rotation[world, kc]) * elastic_slip
+        his.spring[world, rec] = elastic_slip
         his.stored[world, rec] = o.stored
         his.friction_limit[world, rec] = o.friction_limit
         his.speed[world, rec] = speed
-        contact_state = updated_side(con, kc, o.point.y, o.point.side) + 1
+        contact_state = updated_side(con, kc, o.contact.local_position, o.contact.side) + 1
         if o.slipping != 0 and o.friction_limit > f64(0.0):
             contact_state += SLIP_FLAG
         his.contact_state[world, rec] = contact_state
 
     @wp.func
-    def add(rows: wp.array3d(dtype=f64), k: int, world: int, row: int, value: f64):
+    def add_to_row(rows: wp.array3d(dtype=f64), k: int, world: int, row: int, value: f64):
         """rows[k, world, row] += value."""
         rows[k, world, row] = rows[k, world, row] + value
 
@@ -206,36 +242,43 @@ def contact_ledger_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         if accepted[world] == 0:
             return
         c = facets.contact[item]
-        row = facets.row + item
+        row = facets.first_row + item
         for j in range(ENERGY_COLUMNS):
             energies[j, world, row] = f64(0.0)
-        for j in range(RECORD_SUMS + 1):
-            scr.rows[j, world, row] = f64(0.0)
-        for q in range(facets.points):
-            point = facets.point + item * facets.points + q
+        for j in range(SUMMED_ROWS + 1):
+            scr.record_rows[j, world, row] = f64(0.0)
+        for q in range(facets.point_count):
+            point = facets.first_point + item * facets.point_count + q
             area_fraction = facets.area_fraction[q, item] * is_acting(con, scr, world, c, point)
             idle = scr.activity[world, point] == INACTIVE and his.speed[world, history_row(con, c, point)] == f64(0.0)
             if area_fraction > f64(0.0) and (con.is_explicit[c] != 0 or not idle):
                 o = point_outcome(con, facets, his, clock, scr, world, c, q, item, point, u)
-                add(energies, 0, world, row, area_fraction * o.stored)
-                add(energies, 1, world, row, area_fraction * o.loss)
-                add(energies, 2, world, row, area_fraction * o.friction_loss)
-                add(energies, 3, world, row, area_fraction * o.collider_work)
-                add(energies, 4, world, row, area_fraction * o.integrator_work)
-                x = scr.rotation[world, con.collider[c]] * o.point.y + scr.position[world, con.collider[c]]
+                add_to_row(energies, STORED, world, row, area_fraction * o.stored)
+                add_to_row(energies, LOSS, world, row, area_fraction * o.loss)
+                add_to_row(energies, FRICTION, world, row, area_fraction * o.friction_loss)
+                add_to_row(energies, COLLIDER_WORK, world, row, area_fraction * o.collider_work)
+                add_to_row(energies, INTEGRATOR_WORK, world, row, area_fraction * o.integrator_work)
+                x = (
+                    scr.collider_rotation[world, con.collider[c]] * o.contact.local_position
+                    + scr.collider_position[world, con.collider[c]]
+                )
                 moment = wp.cross(x, o.force)
                 for j in range(3):
-                    add(scr.rows, j, world, row, area_fraction * o.force[j])
-                    add(scr.rows, 3 + j, world, row, area_fraction * moment[j])
-                add(scr.rows, 6, world, row, area_fraction * o.normal)
-                if o.point.depth > f64(0.0) or con.law[c] == SMOOTH:
+                    add_to_row(scr.record_rows, j, world, row, area_fraction * o.force[j])
+                    add_to_row(scr.record_rows, MOMENT_ROW + j, world, row, area_fraction * moment[j])
+                add_to_row(scr.record_rows, NORMAL_ROW, world, row, area_fraction * o.normal_force)
+                if o.contact.depth > f64(0.0) or con.law[c] == SMOOTH:
                     area = facets.area[q, item]
-                    add(scr.rows, 7, world, row, area * f64(o.slipping) * wp.length(o.slip_increment))
-                    add(scr.rows, 8, world, row, area)
-                    add(scr.rows, 9, world, row, area * f64(1 - o.slipping))
+                    add_to_row(
+                        scr.record_rows, SLIP_ROW, world, row, area * f64(o.slipping) * wp.length(o.slip_increment)
+                    )
+                    add_to_row(scr.record_rows, AREA_ROW, world, row, area)
+                    add_to_row(scr.record_rows, STICK_ROW, world, row, area * f64(1 - o.slipping))
                 for j in range(4):
-                    scr.rows[10 + j, world, row] = energies[j, world, row]
-                scr.rows[14, world, row] = wp.max(scr.rows[14, world, row], o.point.depth)
+                    scr.record_rows[STORED_ROW + j, world, row] = energies[j, world, row]
+                scr.record_rows[PENETRATION_ROW, world, row] = wp.max(
+                    scr.record_rows[PENETRATION_ROW, world, row], o.contact.depth
+                )
                 update_history(con, facets, his, clock, scr, world, c, point, o)
 
     @wp.kernel(module=module)
@@ -243,14 +286,14 @@ def contact_ledger_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         con: Contacts, rows_of: wp.array(dtype=wp.int32), accepted: wp.array(dtype=wp.int32), scr: ContactScratch,
         out: wp.array4d(dtype=f64),
     ):  # fmt: skip
-        """Sums over the facets of a contact, by lanes: [world, contact, RECORD, lane]."""
+        """Sums over the facets of a contact, by lanes: [world, contact, RECORD_NAMES, lane]."""
         world, c, j, lane = wp.tid()
         if accepted[world] == 0:
             return
         total = f64(0.0)
         for row in range(rows_of[c] + lane, rows_of[c + 1], RECORD_LANES):
-            value = scr.rows[j, world, row]
-            if j == RECORD_SUMS:
+            value = scr.record_rows[j, world, row]
+            if j == SUMMED_ROWS:
                 total = wp.max(total, value)
             else:
                 total += value
@@ -265,24 +308,24 @@ def contact_ledger_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         if accepted[world] == 0:
             return
         h = clock.h[world]
-        past = scr.elapsed[world]
+        past = scr.elapsed_time[world]
         total = f64(0.0)
         for lane in range(RECORD_LANES):
-            if j == RECORD_SUMS:
+            if j == SUMMED_ROWS:
                 total = wp.max(total, parts[world, c, j, lane])
             else:
                 total += parts[world, c, j, lane]
-        old = scr.total[world, c, j]
+        old = scr.record_totals[world, c, j]
         if past == f64(0.0):
             old = f64(0.0)
-        if j < AVERAGED:
-            if clock.still == 0:
+        if j < AVERAGED_ROWS:
+            if clock.is_static == 0:
                 total = (past * old + h * total) / (past + h)
-        elif j == RECORD_SUMS:
+        elif j == SUMMED_ROWS:
             total = wp.max(total, old)
-        elif j == 7 or j > 10:
+        elif j == SLIP_ROW or j > STORED_ROW:
             total += old
-        scr.total[world, c, j] = total
+        scr.record_totals[world, c, j] = total
 
     @wp.kernel(module=module)
     def store_poses(
@@ -293,35 +336,35 @@ def contact_ledger_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         world, k = wp.tid()
         if accepted[world] == 0:
             return
-        his.position[world, k] = scr.position[world, k]
-        his.rotation[world, k] = scr.rotation[world, k]
-        his.angle[world, k] = scr.angle[world, k]
+        his.position[world, k] = scr.collider_position[world, k]
+        his.rotation[world, k] = scr.collider_rotation[world, k]
+        his.angle[world, k] = scr.collider_angle[world, k]
         his.previous_margin[world, k] = con.margin[world, k]
         if k == 0:
             his.pose_time[world] = clock.time[world]
-            scr.elapsed[world] = scr.elapsed[world] + clock.h[world]
+            scr.elapsed_time[world] = scr.elapsed_time[world] + clock.h[world]
             potential[world] = potential[world] + term_sums[1, world]
 
     @wp.kernel(module=module)
     def write_records(scr: ContactScratch, first: int, report: wp.array2d(dtype=f64)):
         """Record of each contact for the report of the step; slip and stick as averages over the area in contact."""
         world, c = wp.tid()
-        area = scr.total[world, c, 8]
-        for j in range(RECORD_SUMS + 1):
-            value = scr.total[world, c, j]
-            if j == 7 or j == 9:
+        area = scr.record_totals[world, c, AREA_ROW]
+        for j in range(SUMMED_ROWS + 1):
+            value = scr.record_totals[world, c, j]
+            if j == SLIP_ROW or j == STICK_ROW:
                 value = value / wp.max(area, f64(1.0e-300))
-            report[world, first + (RECORD_SUMS + 1) * c + j] = value
+            report[world, first + (SUMMED_ROWS + 1) * c + j] = value
 
     @wp.kernel(module=module)
-    def at_points(
+    def evaluate_at_points(
         con: Contacts, facets: Facets, his: History, u: wp.array2d(dtype=vec3d), time: wp.array(dtype=f64),
         scr: ContactScratch, places: int, gap: wp.array2d(dtype=f64), force: wp.array2d(dtype=vec3d),
     ):  # fmt: skip
         """Gap, m, and elastic force, N, of each point at a state, without rates; with `places` the gap of a moving
         contact point is written at the point next to it."""
         world, item, q = wp.tid()
-        point = facets.point + item * facets.points + q
+        point = facets.first_point + item * facets.point_count + q
         if facets.area_fraction[q, item] == f64(0.0):
             gap[world, point] = f64(1.0e30)
             return
@@ -330,24 +373,28 @@ def contact_ledger_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         acting_point = point
         if facets.tracks_deepest != 0:  # the force at the contact point is written at a point of its facet
             gap[world, point] = -scr.point_depth[world, point]
-            row = facets.row + item
+            row = facets.first_row + item
             area_fraction = f64(0.0)
             acting_point = scr.contact_point[world, c]
             if scr.chosen_facet[world, c] == row:
-                area_fraction = lagrange(facets, q, scr.facet_xi[world, row])
-                if wp.length_sq(scr.facet_xi[world, row] - facets.coords[acting_point - (point - q)]) == f64(0.0):
+                area_fraction = lagrange_polynomial(facets, q, scr.facet_deepest_xi[world, row])
+                if wp.length_sq(
+                    scr.facet_deepest_xi[world, row] - facets.point_coords[acting_point - (point - q)]
+                ) == f64(0.0):
                     area_fraction = wp.where(acting_point == point, f64(1.0), f64(0.0))
             if area_fraction == f64(0.0) and acting_point != point:
                 return
         t = evaluate_point(con, facets, his, scr, world, q, item, acting_point, u, time[world], f64(0.0), f64(1.0))
-        frozen = frozen_values(con, his, scr, world, c, acting_point, t)
+        frozen = friction_parameters(con, his, scr, world, c, acting_point, t)
         if acting_point == point and (facets.tracks_deepest == 0 or places != 0):
             gap[world, point] = -t.depth
-        force[world, point] = area_fraction * (t.law[0] * t.n - friction_force(con, world, c, t, frozen, f64(0.0)))
+        force[world, point] = area_fraction * (
+            t.normal_response[0] * t.normal - friction_force(con, world, c, t, frozen, f64(0.0))
+        )
 
     return _types.SimpleNamespace(
         module=module, record_substep=record_substep, partial_records=partial_records, total_records=total_records,
-        store_poses=store_poses, write_records=write_records, at_points=at_points,
+        store_poses=store_poses, write_records=write_records, evaluate_at_points=evaluate_at_points,
     )  # fmt: skip
 
 
@@ -363,7 +410,7 @@ def contact_block_kernels(dtype: str) -> _types.SimpleNamespace:
     module = kernel_module(f"contact_blocks_{dtype}", max_unroll=SHORT_UNROLL)
 
     @wp.kernel(module=module)
-    def add_contact(
+    def add_contact_blocks(
         topo: Topology, pattern: Pattern, facets: Facets, entry: wp.array(dtype=wp.int32),
         start: wp.array(dtype=wp.int32), source: wp.array(dtype=wp.vec3i), stiffness: wp.array2d(dtype=sym),
         weight: wp.array3d(dtype=T),
@@ -376,12 +423,12 @@ def contact_block_kernels(dtype: str) -> _types.SimpleNamespace:
         k6 = sym()
         for e in range(start[index], start[index + 1]):
             at = source[e]
-            for q in range(facets.points):
+            for q in range(facets.point_count):
                 s = facets.shape[q, at[1], at[0]] * facets.shape[q, at[2], at[0]]
                 if facets.tracks_deepest != 0:
                     c = facets.contact[at[0]]
                     s = weight[world, c, at[1]] * weight[world, c, at[2]]
-                k6 += s * stiffness[world, facets.point + at[0] * facets.points + q]
+                k6 += s * stiffness[world, facets.first_point + at[0] * facets.point_count + q]
         add_symmetric(topo, pattern.upper[entry[index]], T(dq_dv[world]) * k6, world, value)
 
-    return _types.SimpleNamespace(module=module, add_contact=add_contact)
+    return _types.SimpleNamespace(module=module, add_contact_blocks=add_contact_blocks)

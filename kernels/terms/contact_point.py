@@ -16,7 +16,7 @@ from .contact_structs import (
     contact_struct,
     facet_struct,
     history_struct,
-    of_world,
+    world_value,
 )
 
 __all__ = ["contact_point_functions"]
@@ -38,26 +38,27 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         colliders.stored_side,
     )
     SLIP_FLAG = colliders.SLIP_FLAG
-    normal_law, elastic = laws.normal_law, laws.elastic
-    friction, smooth_friction = laws.friction, laws.smooth_friction
+    normal_law, elastic_force = laws.normal_law, laws.elastic_force
+    huber_friction, smooth_friction = laws.huber_friction, laws.smooth_friction
 
     @wp.struct
     class PointContact:
         """A point at an iterate; forces are of the whole region."""
 
-        n: vec3d  # outward normal of the shape
-        depth: f64
-        depth_increment: (
-            f64  # change of depth in the step; of a moving contact point, from the depth of the previous one
-        )
-        side: wp.int32
-        law: wp.vec4d  # normal force, its derivative, its potential, the magnitude of the potential's terms
-        m: vec3d  # normal of the plane of friction
+        normal: vec3d  # outward normal of the shape
+        depth: f64  # m
+        # change of depth in the step, m; of a moving contact point, from the depth of the previous one
+        depth_increment: f64
+        side: (
+            wp.int32
+        )  # side of the collider through which the point has entered, -1: any or none, -2: it passed through
+        normal_response: wp.vec4d  # normal force, its derivative, its potential, the magnitude of the potential's terms
+        friction_normal: vec3d  # normal of the plane of friction
         relative_motion: vec3d  # in the step, relative to the collider, m
-        elastic_slip: vec3d  # motion plus spring, m
-        slip: vec3d  # motion in that plane, m
-        q: vec3d  # spring: tangential slip since it was anchored, m
-        y: vec3d  # position in the collider's frame, m
+        trial_displacement: vec3d  # relative motion plus the stored elastic slip, m
+        tangential_motion: vec3d  # tangential part of `relative_motion`, m
+        trial_elastic_slip: vec3d  # tangential part of `trial_displacement`, m
+        local_position: vec3d  # position in the collider's frame, m
 
     @wp.func
     def interpolate(facets: Facets, field: wp.array2d(dtype=Any), world: int, point: int, item: int) -> vec3d:
@@ -68,7 +69,7 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         return out
 
     @wp.func
-    def acting_shape(facets: Facets, scr: ContactScratch, world: int, point: int, i: int, item: int) -> T:
+    def acting_shape_value(facets: Facets, scr: ContactScratch, world: int, point: int, i: int, item: int) -> T:
         """Shape value of slot i at the active point: a point of a facet, or that of a lumped contact."""
         if facets.tracks_deepest != 0:
             return scr.shape_values[world, facets.contact[item], i]
@@ -83,7 +84,9 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
             return interpolate(facets, field, world, point, item)
         out = vec3d()
         for i in range(facets.conn.shape[0]):
-            out += f64(acting_shape(facets, scr, world, point, i, item)) * vec3d(field[world, facets.conn[i, item]])
+            out += f64(acting_shape_value(facets, scr, world, point, i, item)) * vec3d(
+                field[world, facets.conn[i, item]]
+            )
         return out
 
     @wp.func
@@ -94,7 +97,7 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         return facets.X[point, item]
 
     @wp.func
-    def monomial(x: f64, power: int, derivative: int) -> f64:
+    def monomial_derivative(x: f64, power: int, derivative: int) -> f64:
         """Derivative of x^power of order `derivative`."""
         out = f64(1.0)
         for j in range(derivative):
@@ -104,11 +107,14 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         return out
 
     @wp.func
-    def lagrange(facets: Facets, q: int, s: wp.vec2d) -> f64:
+    def lagrange_polynomial(facets: Facets, q: int, s: wp.vec2d) -> f64:
         """Lagrange polynomial of a facet: 1 at point q and 0 at the others."""
         out = f64(0.0)
-        for m in range(facets.power.shape[0]):
-            out += facets.basis[q, m] * (monomial(s[0], facets.power[m][0], 0) * monomial(s[1], facets.power[m][1], 0))
+        for m in range(facets.exponents.shape[0]):
+            out += facets.lagrange_coefficients[q, m] * (
+                monomial_derivative(s[0], facets.exponents[m][0], 0)
+                * monomial_derivative(s[1], facets.exponents[m][1], 0)
+            )
         return out
 
     @wp.func
@@ -120,13 +126,13 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
     def history_row(con: Contacts, c: int, point: int) -> int:
         """Index of a point's history."""
         if con.single_point[c] != 0:
-            return con.first[c]
+            return con.first_point[c]
         return point
 
     @wp.func
     def remaining_overlap(con: Contacts, his: History, world: int, c: int, point: int, time: f64) -> f64:
         """Remaining part of an initial overlap, m."""
-        left = f64(1.0) - (time - his.overlap_time[world]) / con.decay[c]
+        left = f64(1.0) - (time - his.overlap_time[world]) / con.overlap_decay_time[c]
         return his.overlap[world, point] * wp.clamp(left, f64(0.0), f64(1.0))
 
     @wp.func
@@ -137,12 +143,12 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         return before - remaining_overlap(con, his, world, c, point, now)
 
     @wp.func
-    def contact_distance(con: Contacts, his: History, world: int, c: int, point: int, time: f64, margin: f64) -> f64:
+    def activation_gap(con: Contacts, his: History, world: int, c: int, point: int, time: f64, margin: f64) -> f64:
         """Gap at which contact begins, m: offset + `margin` - remaining overlap."""
         return con.offset[c] + margin - remaining_overlap(con, his, world, c, point, time)
 
     @wp.func
-    def depth_before(
+    def depth_at_start(
         con: Contacts, facets: Facets, his: History, scr: ContactScratch, world: int, c: int, point: int
     ) -> f64:
         """Depth at the start of the step, m; for a moving point in contact, that of the deepest position then."""
@@ -150,28 +156,32 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
             rec = history_row(con, c, point)
             if his.speed[world, rec] > f64(0.0):
                 return his.previous_depth[world, rec]
-        return scr.depth[world, point]
+        return scr.start_depth[world, point]
 
     @wp.func
-    def damping_rate(con: Contacts, scr: ContactScratch, world: int, c: int, point: int, inv_h: f64) -> f64:
+    def normal_damping_rate(con: Contacts, scr: ContactScratch, world: int, c: int, point: int, inv_h: f64) -> f64:
         """Damping per depth of the normal law: chi/h, or gamma_n/h."""
         if con.law[c] == DEFAULT:
-            return con.damping[world, c] * inv_h / scr.speed[world, point]
-        return con.beta[world, c] * wp.sqrt(con.scale[world, c]) * of_world(con.normal_damping, world, c) * inv_h
+            return con.damping[world, c] * inv_h / scr.approach_speed[world, point]
+        return con.beta[world, c] * wp.sqrt(con.scale[world, c]) * world_value(con.normal_damping, world, c) * inv_h
 
     @wp.func
     def tangent_damping(con: Contacts, world: int, c: int, stiffness: f64) -> f64:
         """gamma_t of Eq. (80), N s/m."""
-        return f64(1.8257418583505538) * con.beta[world, c] * wp.sqrt(of_world(con.mass, world, c) * stiffness)
+        return (
+            f64(1.8257418583505538)
+            * con.beta[world, c]
+            * wp.sqrt(world_value(con.effective_mass, world, c) * stiffness)
+        )
 
     @wp.func
     def with_friction_normal(t: PointContact, m: vec3d) -> PointContact:
         """The point with friction in the plane of a normal m, frozen with the friction limits: on a curved shape the
         force would not be the derivative of its potential if the plane turned with the iterate."""
         out = t
-        out.m = m
-        out.slip = tangential(m, t.relative_motion)
-        out.q = tangential(m, t.elastic_slip)
+        out.friction_normal = m
+        out.tangential_motion = tangential(m, t.relative_motion)
+        out.trial_elastic_slip = tangential(m, t.trial_displacement)
         return out
 
     @wp.func
@@ -186,44 +196,47 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         rec = history_row(con, c, point)
         moved = interpolate_acting(facets, scr, u, world, q, item)
         x = reference_position(facets, scr, world, q, item) + moved
-        rotation = scr.rotation[world, k]
-        out.y = wp.transpose(rotation) * (x - scr.position[world, k])
+        rotation = scr.collider_rotation[world, k]
+        out.local_position = wp.transpose(rotation) * (x - scr.collider_position[world, k])
         in_contact = his.speed[world, rec] > f64(0.0)
         side = stored_side(con, k, in_contact, his.contact_state[world, rec])
-        contact_distance_now = contact_distance(con, his, world, c, point, time, con.margin[world, k])
+        activation_gap_now = activation_gap(con, his, world, c, point, time, con.margin[world, k])
         d = wp.vec4d(f64(0.0), f64(0.0), f64(1.0), f64(0.0))
         out.side = -1
         far = bool(False)
         if wp.static(meshes):  # lower bound of the distance, the last one minus the motion: avoids a search of the mesh
             d[3] = (
-                scr.contact_distance[world, point]
-                - scr.depth[world, point]
-                - wp.length(out.y - scr.start[world, point])
+                scr.activation_gap[world, point]
+                - scr.start_depth[world, point]
+                - wp.length(out.local_position - scr.start_position[world, point])
             )
             far = (
-                con.kind[k] == MESH
+                con.collider_kind[k] == MESH
                 and con.law[c] != SMOOTH
                 and not in_contact
-                and d[3] > wp.max(contact_distance_now, f64(0.0))
+                and d[3] > wp.max(activation_gap_now, f64(0.0))
             )
         if not far:
-            out.side = sweep(con, k, scr.start[world, point], out.y, side)
-            d = distance(con, k, out.y, out.side)
-        out.n = rotation * vec3d(d[0], d[1], d[2])
-        out.depth = contact_distance_now - d[3]
-        motion = moved - scr.origin[world, point] - scr.translation[world, k]
-        if con.spin[k] >= 0:
-            motion -= scr.rotation_change[world, k] * (his.rotation[world, k] * scr.start[world, point])
-        before = scr.depth[world, point]
-        change = depth_change(con, k, out.side, scr.start[world, point], out.y, wp.transpose(rotation) * motion,
-                           scr.contact_distance[world, point] - before, d[3])  # fmt: skip
+            out.side = sweep(con, k, scr.start_position[world, point], out.local_position, side)
+            d = distance(con, k, out.local_position, out.side)
+        out.normal = rotation * vec3d(d[0], d[1], d[2])
+        out.depth = activation_gap_now - d[3]
+        motion = moved - scr.start_displacement[world, point] - scr.collider_translation[world, k]
+        if con.rotation_law[k] >= 0:
+            motion -= scr.collider_rotation_change[world, k] * (
+                his.rotation[world, k] * scr.start_position[world, point]
+            )
+        before = scr.start_depth[world, point]
+        change = depth_change(con, k, out.side, scr.start_position[world, point], out.local_position,
+                              wp.transpose(rotation) * motion,
+                              scr.activation_gap[world, point] - before, d[3])  # fmt: skip
         if change[1] != f64(0.0):
-            out.depth = before + change[0] + (contact_distance_now - scr.contact_distance[world, point])
-        rate = damping_rate(con, scr, world, c, point, inv_h)
-        k_n = con.scale[world, c] * of_world(con.normal, world, c)
-        previous_depth = depth_before(con, facets, his, scr, world, c, point)
-        out.law = normal_law(con.law[c], con.single_point[c], k_n, rate, con.ramp[c], con.force_eps[c], out.depth,
-                             previous_depth)  # fmt: skip
+            out.depth = before + change[0] + (activation_gap_now - scr.activation_gap[world, point])
+        rate = normal_damping_rate(con, scr, world, c, point, inv_h)
+        k_n = con.scale[world, c] * world_value(con.normal_stiffness, world, c)
+        previous_depth = depth_at_start(con, facets, his, scr, world, c, point)
+        out.normal_response = normal_law(con.law[c], con.single_point[c], k_n, rate, con.damping_ramp[c],
+                                         con.force_eps[c], out.depth, previous_depth)  # fmt: skip
         out.depth_increment = out.depth - previous_depth
         out.relative_motion = motion
         spring = vec3d()
@@ -231,11 +244,11 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
             spring = his.spring[world, rec]
             if con.law[c] != PAPER:
                 spring = shrink * (rotation * spring)
-        out.elastic_slip = spring + motion
-        return with_friction_normal(out, out.n)
+        out.trial_displacement = spring + motion
+        return with_friction_normal(out, out.normal)
 
     @wp.func
-    def coefficient(con: Contacts, his: History, world: int, c: int, rec: int) -> f64:
+    def friction_coefficient(con: Contacts, his: History, world: int, c: int, rec: int) -> f64:
         """Friction coefficient: mu for a contact that slipped in the last step, else mu_static."""
         in_contact = his.speed[world, rec] > f64(0.0)
         if in_contact and his.contact_state[world, rec] >= SLIP_FLAG:
@@ -254,9 +267,9 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         v_t = v - v_n_rel * n
         beta = con.beta[world, c]
         scale = con.scale[world, c]
-        spring = elastic(con.single_point[c], scale * of_world(con.normal, world, c), delta)[0]
-        gamma = beta * wp.sqrt(scale) * of_world(con.normal_damping, world, c)
-        k_t = scale * of_world(con.tangent, world, c)
+        spring = elastic_force(con.single_point[c], scale * world_value(con.normal_stiffness, world, c), delta)[0]
+        gamma = beta * wp.sqrt(scale) * world_value(con.normal_damping, world, c)
+        k_t = scale * world_value(con.tangential_stiffness, world, c)
         if con.single_point[c] != 0:
             gamma *= wp.sqrt(wp.sqrt(delta))
             k_t *= wp.sqrt(delta)
@@ -264,23 +277,23 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         s = tangential(n, his.spring[world, rec] + h * v_t)
         gamma_t = tangent_damping(con, world, c, k_t)
         tangential_force = -k_t * s - gamma_t * v_t
-        friction_limit = coefficient(con, his, world, c, rec) * force
+        friction_limit = friction_coefficient(con, his, world, c, rec) * force
         size = wp.length(tangential_force)
         if size > friction_limit:
             tangential_force = (friction_limit / size) * tangential_force
             s = (f64(-1.0) / k_t) * (tangential_force + gamma_t * v_t)
-        scr.explicit_spring[world, point] = s
+        scr.explicit_elastic_slip[world, point] = s
         scr.explicit_force[world, point] = force * n + tangential_force
 
     @wp.func
-    def frozen_values(
+    def friction_parameters(
         con: Contacts, his: History, scr: ContactScratch, world: int, c: int, point: int, t: PointContact
     ) -> vec3d:
         """Friction limit, k_t and reduction factor of the spring at an iterate."""
         rec = history_row(con, c, point)
-        mu = coefficient(con, his, world, c, rec)
+        mu = friction_coefficient(con, his, world, c, rec)
         in_contact = his.speed[world, rec] > f64(0.0)
-        stiffness = con.scale[world, c] * of_world(con.tangent, world, c)
+        stiffness = con.scale[world, c] * world_value(con.tangential_stiffness, world, c)
         shrink = f64(1.0)
         if con.single_point[c] != 0:
             depth = wp.max(t.depth, f64(0.0))
@@ -288,13 +301,13 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
             before = t.depth - t.depth_increment
             if in_contact and depth < before and con.law[c] == DEFAULT:
                 shrink = wp.sqrt(depth / before)
-        return vec3d(mu * t.law[0], stiffness, shrink)
+        return vec3d(mu * t.normal_response[0], stiffness, shrink)
 
     @wp.func
     def friction_trial(con: Contacts, world: int, c: int, t: PointContact, frozen: vec3d, inv_h: f64) -> wp.vec4d:
         """Friction opposing the motion: trial force, and in w its total stiffness (spring and damper)."""
         gamma = tangent_damping(con, world, c, frozen[1]) * inv_h
-        trial = frozen[1] * t.q + gamma * t.slip
+        trial = frozen[1] * t.trial_elastic_slip + gamma * t.tangential_motion
         return wp.vec4d(trial[0], trial[1], trial[2], frozen[1] + gamma)
 
     @wp.func
@@ -303,11 +316,11 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         if frozen[0] <= f64(0.0):
             return f64(0.0)
         if con.law[c] == SMOOTH:
-            return smooth_friction(t.slip, inv_h, con.speed_eps[c], frozen[0])[0]
+            return smooth_friction(t.tangential_motion, inv_h, con.speed_eps[c], frozen[0])[0]
         w = friction_trial(con, world, c, t, frozen, inv_h)
         if w[3] <= f64(0.0):
             return f64(0.0)
-        return friction(vec3d(w[0], w[1], w[2]), w[3], frozen[0])[0]
+        return huber_friction(vec3d(w[0], w[1], w[2]), w[3], frozen[0])[0]
 
     @wp.func
     def friction_force(con: Contacts, world: int, c: int, t: PointContact, frozen: vec3d, inv_h: f64) -> vec3d:
@@ -315,22 +328,22 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         if frozen[0] <= f64(0.0):
             return vec3d()
         if con.law[c] == SMOOTH:
-            return smooth_friction(t.slip, inv_h, con.speed_eps[c], frozen[0])[1] * t.slip
+            return smooth_friction(t.tangential_motion, inv_h, con.speed_eps[c], frozen[0])[1] * t.tangential_motion
         w = friction_trial(con, world, c, t, frozen, inv_h)
         if w[3] <= f64(0.0):
             return vec3d()
         trial = vec3d(w[0], w[1], w[2])
-        return friction(trial, w[3], frozen[0])[1] * trial
+        return huber_friction(trial, w[3], frozen[0])[1] * trial
 
     @wp.func
     def point_stiffness(con: Contacts, world: int, c: int, t: PointContact, frozen: vec3d, inv_h: f64) -> mat33d:
         """Derivative of the force that a point adds to the residual, positive; the change of the normal is omitted."""
-        K = wp.max(t.law[1], f64(0.0)) * wp.outer(t.n, t.n)
+        K = wp.max(t.normal_response[1], f64(0.0)) * wp.outer(t.normal, t.normal)
         if frozen[0] > f64(0.0):
-            P = wp.identity(n=3, dtype=f64) - wp.outer(t.m, t.m)
+            P = wp.identity(n=3, dtype=f64) - wp.outer(t.friction_normal, t.friction_normal)
             if con.law[c] == SMOOTH:
-                part = smooth_friction(t.slip, inv_h, con.speed_eps[c], frozen[0])[1]
-                v = inv_h * t.slip
+                part = smooth_friction(t.tangential_motion, inv_h, con.speed_eps[c], frozen[0])[1]
+                v = inv_h * t.tangential_motion
                 root = wp.dot(v, v) + con.speed_eps[c] * con.speed_eps[c]
                 K += part * (P - wp.outer(v, v) / root)
             else:
@@ -352,10 +365,12 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
     return _types.SimpleNamespace(
         PointContact=PointContact, interpolate=interpolate, tangential=tangential, history_row=history_row,
-        contact_distance=contact_distance, remaining_overlap=remaining_overlap, overlap_recovery=overlap_recovery,
-        damping_rate=damping_rate, depth_before=depth_before, evaluate_point=evaluate_point,
-        with_friction_normal=with_friction_normal, coefficient=coefficient, set_explicit_force=set_explicit_force,
-        frozen_values=frozen_values, friction_trial=friction_trial, friction_potential=friction_potential,
-        friction_force=friction_force, point_stiffness=point_stiffness, is_acting=is_acting, acting_shape=acting_shape,
-        lagrange=lagrange, monomial=monomial,
+        activation_gap=activation_gap, remaining_overlap=remaining_overlap, overlap_recovery=overlap_recovery,
+        normal_damping_rate=normal_damping_rate, depth_at_start=depth_at_start, evaluate_point=evaluate_point,
+        with_friction_normal=with_friction_normal, friction_coefficient=friction_coefficient,
+        set_explicit_force=set_explicit_force,
+        friction_parameters=friction_parameters, friction_trial=friction_trial, friction_potential=friction_potential,
+        friction_force=friction_force, point_stiffness=point_stiffness, is_acting=is_acting,
+        acting_shape_value=acting_shape_value,
+        lagrange_polynomial=lagrange_polynomial, monomial_derivative=monomial_derivative,
     )  # fmt: skip

@@ -1,7 +1,8 @@
-"""Rigid analytic shapes: signed distance, outward normal, and passage of a motion through them.
+"""Rigid analytic shapes: signed distance, outward normal, and a swept test against tunnelling.
 
 All in float64 and in the shape's own frame: half-space z <= 0, sphere about the origin, box along the axes, capsule and
-cylinder along z. `size` as in `warpfea.model.contacts`: radius; half edges; radius and half length.
+cylinder along z. `size` as in `warpfea.model.shapes`, m: radius; half edges; radius and half length (of a
+capsule: of its axis, without the caps).
 """
 
 import functools
@@ -12,9 +13,9 @@ import warp as wp
 __all__ = ["BOX", "CAPSULE", "CYLINDER", "HALF_SPACE", "SPHERE", "shape_functions"]
 
 HALF_SPACE, SPHERE, BOX, CAPSULE, CYLINDER = range(5)
-LATERAL = 6
+LATERAL_SIDE = 6
 """Sides: 0 to 5 are the faces -x, +x, -y, +y, -z, +z (ends of a cylinder: 4, 5), 6 the lateral side of a cylinder."""
-PASSED_DEPTH = 0.5
+TUNNEL_DEPTH_RATIO = 0.5
 """A motion passes through a shape if it enters deeper than this fraction of its radius or thickness and leaves
 again."""
 
@@ -26,7 +27,7 @@ def shape_functions() -> _types.SimpleNamespace:
     vec3d = wp.vec3d
 
     @wp.func
-    def unit(v: vec3d) -> vec3d:
+    def unit_vector(v: vec3d) -> vec3d:
         """Unit vector along v; z for v = 0."""
         size = wp.length(v)
         if size > f64(0.0):
@@ -42,23 +43,23 @@ def shape_functions() -> _types.SimpleNamespace:
 
     @wp.func
     def half_size(kind: int, size: vec3d, axis: int) -> f64:
-        """Half the thickness along an axis, of a box or a cylinder."""
+        """Half the thickness of a box or a cylinder along an axis, m."""
         if kind == CYLINDER:
             return wp.where(axis == 2, size[1], size[0])
         return size[axis]
 
     @wp.func
     def depth_below(kind: int, size: vec3d, y: vec3d, side: int) -> f64:
-        """Signed depth of a position under a side of a box or a cylinder."""
-        if side == LATERAL:
+        """Signed depth of a position below a side of a box or a cylinder, m; positive inside."""
+        if side == LATERAL_SIDE:
             return size[0] - wp.sqrt(y[0] * y[0] + y[1] * y[1])
         axis = side / 2
         sign = wp.where(side % 2 == 0, f64(-1.0), f64(1.0))
         return half_size(kind, size, axis) - sign * y[axis]
 
     @wp.func
-    def axis_place(size: vec3d, y: vec3d) -> vec3d:
-        """Nearest position to y on a capsule's axis."""
+    def closest_on_axis(size: vec3d, y: vec3d) -> vec3d:
+        """Closest point to y on a capsule's axis."""
         return vec3d(f64(0.0), f64(0.0), wp.clamp(y[2], -size[1], size[1]))
 
     @wp.func
@@ -73,21 +74,24 @@ def shape_functions() -> _types.SimpleNamespace:
                 least = d
                 best = side
         if kind == CYLINDER:
-            if depth_below(kind, size, y, LATERAL) < least:
-                best = wp.int32(LATERAL)
+            if depth_below(kind, size, y, LATERAL_SIDE) < least:
+                best = wp.int32(LATERAL_SIDE)
         return best
 
     @wp.func
     def distance(kind: int, size: vec3d, y: vec3d, side: int) -> wp.vec4d:
-        """Outward unit normal and signed distance; inside a shape with sides from `side`, or from the nearest if -1."""
+        """(n, gap): outward unit normal and signed distance, m, negative inside.
+
+        Inside a box or a cylinder the distance is that from `side`, or from the nearest side if -1.
+        """
         n = vec3d(f64(0.0), f64(0.0), f64(1.0))
         gap = y[2]
         if kind == SPHERE:
-            n = unit(y)
+            n = unit_vector(y)
             gap = wp.length(y) - size[0]
         elif kind == CAPSULE:
-            arm = y - axis_place(size, y)
-            n = unit(arm)
+            arm = y - closest_on_axis(size, y)
+            n = unit_vector(arm)
             gap = wp.length(arm) - size[0]
         elif kind == BOX or kind == CYLINDER:
             rho = wp.sqrt(y[0] * y[0] + y[1] * y[1])
@@ -106,16 +110,16 @@ def shape_functions() -> _types.SimpleNamespace:
                 if face < 0:
                     face = nearest_side(kind, size, y)
                 gap = -depth_below(kind, size, y, face)
-                if face == LATERAL:
-                    n = unit(vec3d(y[0], y[1], f64(0.0)))
+                if face == LATERAL_SIDE:
+                    n = unit_vector(vec3d(y[0], y[1], f64(0.0)))
                 else:
                     n = face_normal(face)
         return wp.vec4d(n[0], n[1], n[2], gap)
 
     @wp.func
-    def enters(kind: int, size: vec3d, a: vec3d, d: vec3d) -> vec3d:
+    def line_interval(kind: int, size: vec3d, a: vec3d, d: vec3d) -> vec3d:
         """Interval of t with a + t d within a box or a cylinder: t of entry, t of exit, and 16 x side of entry + side
-        of exit; the first is larger than the second if there is none."""
+        of exit; the first is not smaller than the second if there is none."""
         t_in = f64(-1.0e300)
         t_out = f64(1.0e300)
         side_in = wp.int32(0)
@@ -157,14 +161,14 @@ def shape_functions() -> _types.SimpleNamespace:
                 t1 = (-bb + wp.sqrt(root)) / aa
                 if t0 > t_in:
                     t_in = t0
-                    side_in = wp.int32(LATERAL)
+                    side_in = wp.int32(LATERAL_SIDE)
                 if t1 < t_out:
                     t_out = t1
-                    side_out = wp.int32(LATERAL)
+                    side_out = wp.int32(LATERAL_SIDE)
         return vec3d(t_in, t_out, f64(16 * side_in + side_out))
 
     @wp.func
-    def closest_on_chord(kind: int, size: vec3d, a: vec3d, d: vec3d) -> f64:
+    def segment_distance(kind: int, size: vec3d, a: vec3d, d: vec3d) -> f64:
         """Smallest distance of a + t d, 0 <= t <= 1, from a sphere's centre or a capsule's axis."""
         aa = wp.dot(d, d)
         if aa == f64(0.0):
@@ -187,15 +191,15 @@ def shape_functions() -> _types.SimpleNamespace:
             return -1
         d = end - start
         if kind == SPHERE or kind == CAPSULE:
-            near = closest_on_chord(kind, size, start, d)
-            if near < f64(PASSED_DEPTH) * size[0]:
+            near = segment_distance(kind, size, start, d)
+            if near < f64(TUNNEL_DEPTH_RATIO) * size[0]:
                 before = distance(kind, size, start, -1)
                 after = distance(kind, size, end, -1)
                 turned = before[0] * after[0] + before[1] * after[1] + before[2] * after[2]
                 if turned < f64(0.0) or (after[3] > f64(0.0) and before[3] > f64(0.0)):
                     return -2
             return -1
-        cross = enters(kind, size, start, d)
+        cross = line_interval(kind, size, start, d)
         code = int(cross[2])
         entry = code / 16
         leave = code % 16
@@ -209,16 +213,18 @@ def shape_functions() -> _types.SimpleNamespace:
         if cross[1] >= f64(1.0):
             return entry
         if leave == entry:
-            if leave == LATERAL:
-                near = closest_on_chord(SPHERE, vec3d(size[0], f64(0.0), f64(0.0)), vec3d(start[0], start[1], f64(0.0)),
+            if leave == LATERAL_SIDE:
+                near = segment_distance(SPHERE, vec3d(size[0], f64(0.0), f64(0.0)), vec3d(start[0], start[1], f64(0.0)),
                                         vec3d(d[0], d[1], f64(0.0)))  # fmt: skip
-                if near < f64(PASSED_DEPTH) * size[0]:
+                if near < f64(TUNNEL_DEPTH_RATIO) * size[0]:
                     return -2
             return -1
         # it left by another side: over an edge, or through
-        limit = f64(2.0) * f64(PASSED_DEPTH) * half_size(kind, size, wp.where(entry == LATERAL, 0, entry / 2))
+        limit = (
+            f64(2.0) * f64(TUNNEL_DEPTH_RATIO) * half_size(kind, size, wp.where(entry == LATERAL_SIDE, 0, entry / 2))
+        )
         if depth_below(kind, size, start + cross[1] * d, entry) > limit:
             return -2
         return -1
 
-    return _types.SimpleNamespace(distance=distance, sweep=sweep, unit=unit)
+    return _types.SimpleNamespace(distance=distance, sweep=sweep, unit_vector=unit_vector)

@@ -6,7 +6,7 @@ import types as _types
 import warp as wp
 
 from ..common.types import SHORT_UNROLL, kernel_module, precision
-from .contact_colliders import MESHES, collider_functions
+from .contact_colliders import MESH_SUFFIX, collider_functions
 from .contact_point import contact_point_functions
 from .contact_structs import contact_scratch_struct, contact_struct, facet_struct
 
@@ -20,10 +20,10 @@ def sheet_kernels(dtype: str) -> _types.SimpleNamespace:
     Contacts, Facets, ContactScratch = contact_struct(True), facet_struct(dtype), contact_scratch_struct(dtype)
     interpolate = contact_point_functions(dtype, True).interpolate
     distance, sweep = collider_functions(True).distance, collider_functions(True).sweep
-    module = kernel_module(f"contact_sheets_{dtype}{MESHES}", max_unroll=SHORT_UNROLL)
+    module = kernel_module(f"contact_sheets_{dtype}{MESH_SUFFIX}", max_unroll=SHORT_UNROLL)
 
     @wp.kernel(module=module)
-    def across(
+    def find_crossed_sheets(
         con: Contacts, facets: Facets, u: wp.array2d(dtype=vec3), tolerance: wp.array(dtype=wp.float64),
         scr: ContactScratch, found: wp.array2d(dtype=wp.int32),
     ):  # fmt: skip
@@ -31,13 +31,13 @@ def sheet_kernels(dtype: str) -> _types.SimpleNamespace:
         world, item = wp.tid()
         k = con.collider[facets.contact[item]]
         before = vec3d()
-        for q in range(facets.points):
+        for q in range(facets.point_count):
             x = facets.X[q, item] + interpolate(facets, u, world, q, item)
-            y = wp.transpose(scr.rotation[world, k]) * (x - scr.position[world, k])
+            y = wp.transpose(scr.collider_rotation[world, k]) * (x - scr.collider_position[world, k])
             if q > 0:
                 side = sweep(con, k, before, y, -1)
                 if side == -2 or (side >= 0 and distance(con, k, y, side)[3] < -tolerance[world]):
-                    found[world, facets.row + item] = facets.point + item * facets.points + q + 1
+                    found[world, facets.first_row + item] = facets.first_point + item * facets.point_count + q + 1
             before = y
 
-    return _types.SimpleNamespace(module=module, across=across)
+    return _types.SimpleNamespace(module=module, find_crossed_sheets=find_crossed_sheets)

@@ -11,13 +11,13 @@ import warp as wp
 
 from ..common.types import SHORT_UNROLL, kernel_module, precision
 from .contact import MIN_APPROACH_SPEED
-from .contact_colliders import MESHES, collider_functions
+from .contact_colliders import MESH_SUFFIX, collider_functions
 from .contact_point import contact_point_functions
 from .contact_structs import clock_struct, contact_scratch_struct, contact_struct, facet_struct, history_struct
 
 __all__ = ["deepest_point_kernels"]
 
-MAX_CHOICES = 8
+MAX_POINT_CHOICES = 8
 """Choices of the contact point in an attempt."""
 MAX_NEWTON_STEPS = 12
 """Newton steps within a facet."""
@@ -35,16 +35,16 @@ def deepest_point_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
     Contacts, Facets = contact_struct(meshes), facet_struct(dtype)
     History, ContactScratch, Clock = history_struct(), contact_scratch_struct(dtype), clock_struct()
     f = contact_point_functions(dtype, meshes)
-    interpolate, contact_distance, depth_before, history_row, lagrange, monomial = (
+    interpolate, activation_gap, depth_at_start, history_row, lagrange_polynomial, monomial_derivative = (
         f.interpolate,
-        f.contact_distance,
-        f.depth_before,
+        f.activation_gap,
+        f.depth_at_start,
         f.history_row,
-        f.lagrange,
-        f.monomial,
+        f.lagrange_polynomial,
+        f.monomial_derivative,
     )
     distance, stored_side = collider_functions(meshes).distance, collider_functions(meshes).stored_side
-    module = kernel_module(f"contact_place_{dtype}{MESHES * meshes}", max_unroll=SHORT_UNROLL)
+    module = kernel_module(f"deepest_point_{dtype}{MESH_SUFFIX * meshes}", max_unroll=SHORT_UNROLL)
 
     @wp.struct
     class SurfacePoint:
@@ -63,24 +63,24 @@ def deepest_point_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
             s: vec2d) -> SurfacePoint:  # fmt: skip
         """Position and derivatives at coordinates s."""
         out = SurfacePoint()
-        back = wp.transpose(scr.rotation[world, k])
-        for q in range(facets.points):
-            x = back * (facets.X[q, item] + interpolate(facets, u, world, q, item) - scr.position[world, k])
-            for m in range(facets.power.shape[0]):
-                i = facets.power[m][0]
-                j = facets.power[m][1]
-                c = facets.basis[q, m]
+        back = wp.transpose(scr.collider_rotation[world, k])
+        for q in range(facets.point_count):
+            x = back * (facets.X[q, item] + interpolate(facets, u, world, q, item) - scr.collider_position[world, k])
+            for m in range(facets.exponents.shape[0]):
+                i = facets.exponents[m][0]
+                j = facets.exponents[m][1]
+                c = facets.lagrange_coefficients[q, m]
                 if c != f64(0.0):
-                    out.y += (c * monomial(s[0], i, 0) * monomial(s[1], j, 0)) * x
-                    out.a += (c * monomial(s[0], i, 1) * monomial(s[1], j, 0)) * x
-                    out.b += (c * monomial(s[0], i, 0) * monomial(s[1], j, 1)) * x
-                    out.aa += (c * monomial(s[0], i, 2) * monomial(s[1], j, 0)) * x
-                    out.ab += (c * monomial(s[0], i, 1) * monomial(s[1], j, 1)) * x
-                    out.bb += (c * monomial(s[0], i, 0) * monomial(s[1], j, 2)) * x
+                    out.y += (c * monomial_derivative(s[0], i, 0) * monomial_derivative(s[1], j, 0)) * x
+                    out.a += (c * monomial_derivative(s[0], i, 1) * monomial_derivative(s[1], j, 0)) * x
+                    out.b += (c * monomial_derivative(s[0], i, 0) * monomial_derivative(s[1], j, 1)) * x
+                    out.aa += (c * monomial_derivative(s[0], i, 2) * monomial_derivative(s[1], j, 0)) * x
+                    out.ab += (c * monomial_derivative(s[0], i, 1) * monomial_derivative(s[1], j, 1)) * x
+                    out.bb += (c * monomial_derivative(s[0], i, 0) * monomial_derivative(s[1], j, 2)) * x
         return out
 
     @wp.func
-    def edge_of(corners: int, k: int, s: vec2d) -> vec3d:
+    def edge_half_plane(corners: int, k: int, s: vec2d) -> vec3d:
         """Inward normal of an edge of the unit triangle or square, and the distance of s from it."""
         if corners == 3 and k == 2:
             return vec3d(f64(-1.0), f64(-1.0), f64(1.0) - s[0] - s[1])
@@ -93,11 +93,11 @@ def deepest_point_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         return vec3d(f64(0.0), f64(-1.0), f64(1.0) - s[1])
 
     @wp.func
-    def feasible_step(corners: int, s: vec2d, d: vec2d) -> f64:
+    def feasible_fraction(corners: int, s: vec2d, d: vec2d) -> f64:
         """Fraction of a step d, at most 1, that stays within the facet."""
         part = f64(1.0)
         for k in range(corners):
-            edge = edge_of(corners, k, s)
+            edge = edge_half_plane(corners, k, s)
             rate = edge[0] * d[0] + edge[1] * d[1]
             if rate < f64(-1.0e-14) * wp.length(d):
                 part = wp.min(part, wp.max(edge[2], f64(0.0)) / -rate)
@@ -112,11 +112,11 @@ def deepest_point_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         d = g * (f64(-1.0) / wp.max(wp.max(size, wp.length(g)), f64(1.0e-300)))
         if h[0] > f64(0.0) and det > f64(1.0e-10) * size * size:
             d = vec2d(h[1] * g[1] - h[2] * g[0], h[1] * g[0] - h[0] * g[1]) / det
-        part = feasible_step(corners, s, d)
+        part = feasible_fraction(corners, s, d)
         if part > f64(1.0e-12):
             return part * d
         for k in range(corners):
-            edge = edge_of(corners, k, s)
+            edge = edge_half_plane(corners, k, s)
             if edge[2] <= f64(1.0e-12):
                 t = vec2d(-edge[1], edge[0])
                 slope = wp.dot(g, t)
@@ -125,7 +125,7 @@ def deepest_point_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
                 if bend > f64(0.0):
                     way = -slope / bend
                 d = way * t
-                part = feasible_step(corners, s, d)
+                part = feasible_fraction(corners, s, d)
                 if part > f64(1.0e-12) and slope != f64(0.0):
                     return part * d
         return vec2d()
@@ -147,7 +147,7 @@ def deepest_point_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
             mixed = f64(0.5) * (wp.dot(here.a, turn_b) + wp.dot(here.b, turn_a))
             h = vec3d(wp.dot(n, here.aa) + wp.dot(here.a, turn_a), wp.dot(n, here.ab) + mixed,
                       wp.dot(n, here.bb) + wp.dot(here.b, turn_b))  # fmt: skip
-            step = descent_step(g, h, facets.corners, s)
+            step = descent_step(g, h, facets.corner_count, s)
             found = bool(False)
             for _try in range(MAX_HALVINGS):
                 if not found and wp.length(step) > f64(1.0e-9):
@@ -174,16 +174,16 @@ def deepest_point_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         if active[world] == 0:
             return
         c = facets.contact[item]
-        point = facets.point + item * facets.points + q
+        point = facets.first_point + item * facets.point_count + q
         depth = f64(-1.0e300)
         if facets.area_fraction[q, item] > f64(0.0):
             k = con.collider[c]
             x = facets.X[q, item] + interpolate(facets, u, world, q, item)
-            y = wp.transpose(scr.rotation[world, k]) * (x - scr.position[world, k])
+            y = wp.transpose(scr.collider_rotation[world, k]) * (x - scr.collider_position[world, k])
             d = distance(con, k, y, -1)
-            depth = contact_distance(con, his, world, c, point, time[world], con.margin[world, k]) - d[3]
+            depth = activation_gap(con, his, world, c, point, time[world], con.margin[world, k]) - d[3]
             if con.is_explicit[c] != 0:  # explicit: its force is that of the last state
-                depth = scr.depth[world, point]
+                depth = scr.start_depth[world, point]
         scr.point_depth[world, point] = depth
 
     @wp.kernel(module=module)
@@ -196,32 +196,32 @@ def deepest_point_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         if active[world] == 0:
             return
         c = facets.contact[item]
-        row = facets.row + item
-        first = facets.point + item * facets.points
+        row = facets.first_row + item
+        first = facets.first_point + item * facets.point_count
         q = wp.int32(0)
         top = scr.point_depth[world, first]
         low = f64(1.0e300)
-        for j in range(facets.points):
+        for j in range(facets.point_count):
             level = scr.point_depth[world, first + j]
             if level > top:
                 top = level
                 q = j
             if level > f64(-1.0e299):
                 low = wp.min(low, level)
-        scr.facet_point[world, row] = first + q
-        scr.facet_xi[world, row] = facets.coords[q]
-        scr.facet_depth[world, row] = top
+        scr.facet_deepest_point[world, row] = first + q
+        scr.facet_deepest_xi[world, row] = facets.point_coords[q]
+        scr.facet_max_depth[world, row] = top
         highest = top + (top - low)  # upper bound between the points
         known = f64(-1.0e300)
-        if scr.contact_point[world, c] >= con.first[c] and scr.contact_point[world, c] < con.first[c + 1]:
+        if scr.contact_point[world, c] >= con.first_point[c] and scr.contact_point[world, c] < con.first_point[c + 1]:
             known = scr.point_depth[world, scr.contact_point[world, c]]
         if facets.tracks_deepest == 0 or top < f64(-1.0e299) or highest <= f64(0.0) or highest < known:
             return
         k = con.collider[c]
-        found = deepest_in_facet(con, facets, scr, world, k, item, u, facets.coords[q])
-        scr.facet_xi[world, row] = vec2d(found[0], found[1])
-        depth = contact_distance(con, his, world, c, first, time[world], con.margin[world, k]) - found[2]
-        scr.facet_depth[world, row] = wp.max(depth, top)
+        found = deepest_in_facet(con, facets, scr, world, k, item, u, facets.point_coords[q])
+        scr.facet_deepest_xi[world, row] = vec2d(found[0], found[1])
+        depth = activation_gap(con, his, world, c, first, time[world], con.margin[world, k]) - found[2]
+        scr.facet_max_depth[world, row] = wp.max(depth, top)
 
     @wp.kernel(module=module)
     def choose_deepest(
@@ -237,18 +237,18 @@ def deepest_point_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
             return
         scr.chosen_facet[world, c] = -1
         if fresh != 0:
-            scr.choices[world, c] = 0
-        elif scr.choices[world, c] >= MAX_CHOICES:
+            scr.choice_count[world, c] = 0
+        elif scr.choice_count[world, c] >= MAX_POINT_CHOICES:
             return
         best = row_start[c]
         for row in range(best + 1, row_start[c + 1]):
-            if scr.facet_depth[world, row] > scr.facet_depth[world, best]:
+            if scr.facet_max_depth[world, row] > scr.facet_max_depth[world, best]:
                 best = row
         scr.chosen_facet[world, c] = best
-        scr.choices[world, c] = scr.choices[world, c] + 1
-        if fresh != 0 or scr.facet_point[world, best] != scr.contact_point[world, c]:
+        scr.choice_count[world, c] = scr.choice_count[world, c] + 1
+        if fresh != 0 or scr.facet_deepest_point[world, best] != scr.contact_point[world, c]:
             changed[world] = 1
-        scr.contact_point[world, c] = scr.facet_point[world, best]
+        scr.contact_point[world, c] = scr.facet_deepest_point[world, best]
 
     @wp.kernel(module=module)
     def set_contact_point(
@@ -259,12 +259,12 @@ def deepest_point_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         state."""
         world, item = wp.tid()
         c = facets.contact[item]
-        if active[world] == 0 or facets.tracks_deepest == 0 or scr.chosen_facet[world, c] != facets.row + item:
+        if active[world] == 0 or facets.tracks_deepest == 0 or scr.chosen_facet[world, c] != facets.first_row + item:
             return
         point = scr.contact_point[world, c]
-        row = facets.row + item
-        near = point - (facets.point + item * facets.points)
-        moved = wp.length_sq(scr.facet_xi[world, row] - facets.coords[near]) > f64(0.0)
+        row = facets.first_row + item
+        near = point - (facets.first_point + item * facets.point_count)
+        moved = wp.length_sq(scr.facet_deepest_xi[world, row] - facets.point_coords[near]) > f64(0.0)
         X = vec3d()
         origin = vec3d()
         v = vec3d()
@@ -272,8 +272,10 @@ def deepest_point_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
             w = f64(facets.shape[near, i, item])
             if moved:
                 w = f64(0.0)
-                for q in range(facets.points):
-                    w += lagrange(facets, q, scr.facet_xi[world, row]) * f64(facets.shape[q, i, item])
+                for q in range(facets.point_count):
+                    w += lagrange_polynomial(facets, q, scr.facet_deepest_xi[world, row]) * f64(
+                        facets.shape[q, i, item]
+                    )
             scr.shape_values[world, c, i] = T(w)
             w = f64(T(w))
             origin += w * vec3d(u_n[world, facets.conn[i, item]])
@@ -281,8 +283,8 @@ def deepest_point_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         X = facets.X[near, item]
         if moved:
             X = vec3d()
-            for q in range(facets.points):
-                X += lagrange(facets, q, scr.facet_xi[world, row]) * facets.X[q, item]
+            for q in range(facets.point_count):
+                X += lagrange_polynomial(facets, q, scr.facet_deepest_xi[world, row]) * facets.X[q, item]
         scr.point_reference[world, c] = X
         rec = history_row(con, c, point)
         k = con.collider[c]
@@ -290,28 +292,28 @@ def deepest_point_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         position = his.position[world, k]
         margin = his.previous_margin[world, k]
         if settled != 0:
-            rotation = scr.rotation[world, k]
-            position = scr.position[world, k]
+            rotation = scr.collider_rotation[world, k]
+            position = scr.collider_position[world, k]
             margin = con.margin[world, k]
         x = X + origin
         y = wp.transpose(rotation) * (x - position)
         in_contact = settled == 0 and his.speed[world, rec] > f64(0.0)
         side = stored_side(con, k, in_contact, his.contact_state[world, rec])
         d = distance(con, k, y, side)
-        contact_distance_now = contact_distance(con, his, world, c, point, clock.time[world], margin)
-        scr.start[world, point] = y
-        scr.origin[world, point] = origin
-        scr.contact_distance[world, point] = contact_distance_now
-        scr.depth[world, point] = contact_distance_now - d[3]
+        activation_gap_now = activation_gap(con, his, world, c, point, clock.time[world], margin)
+        scr.start_position[world, point] = y
+        scr.start_displacement[world, point] = origin
+        scr.activation_gap[world, point] = activation_gap_now
+        scr.start_depth[world, point] = activation_gap_now - d[3]
         if settled == 0:
             speed = wp.max(his.speed[world, rec], f64(MIN_APPROACH_SPEED))
-            if clock.still == 0:
-                motion = (scr.rotation[world, k] * y + scr.position[world, k] - x) / clock.h[world]
+            if clock.is_static == 0:
+                motion = (scr.collider_rotation[world, k] * y + scr.collider_position[world, k] - x) / clock.h[world]
                 approach = wp.dot(rotation * vec3d(d[0], d[1], d[2]), motion - v)
                 # a rolling contact point descends initially at twice its mean speed
-                rolled = depth_before(con, facets, his, scr, world, c, point) - scr.depth[world, point]
+                rolled = depth_at_start(con, facets, his, scr, world, c, point) - scr.start_depth[world, point]
                 speed = wp.max(speed, approach - f64(2.0) * rolled / clock.h[world])
-            scr.speed[world, point] = speed
+            scr.approach_speed[world, point] = speed
 
     return _types.SimpleNamespace(
         module=module,

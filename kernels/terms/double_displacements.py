@@ -18,7 +18,7 @@ __all__ = ["double_displacement_kernels"]
 def double_displacement_kernels() -> _types.SimpleNamespace:
     """Kernels of float32 models, [world, listed slot]."""
     f64, vec3, vec3d = wp.float64, wp.vec3f, wp.vec3d
-    module = kernel_module("contact_exact")
+    module = kernel_module("double_displacements")
 
     @wp.kernel(module=module)
     def update_displacements(
@@ -32,7 +32,7 @@ def double_displacement_kernels() -> _types.SimpleNamespace:
             u[world, slot] = vec3d(q_tilde[world, slot]) + dq_dv[world] * vec3d(v[world, slot])
 
     @wp.kernel(module=module)
-    def widen(
+    def copy_to_float64(
         slots: wp.array(dtype=wp.int32), u: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32),
         out: wp.array2d(dtype=vec3d),
     ):  # fmt: skip
@@ -42,4 +42,6 @@ def double_displacement_kernels() -> _types.SimpleNamespace:
             slot = slots[i]
             out[world, slot] = vec3d(u[world, slot])
 
-    return _types.SimpleNamespace(module=module, update_displacements=update_displacements, widen=widen)
+    return _types.SimpleNamespace(
+        module=module, update_displacements=update_displacements, copy_to_float64=copy_to_float64
+    )

@@ -11,12 +11,12 @@ from .contact_structs import clock_struct, contact_scratch_struct, contact_struc
 from .facet_projection import MAX_OVERHANG, OUTSIDE_TOLERANCE, facet_projection_functions
 from .pair_structs import master_struct, pair_scratch_struct
 
-__all__ = ["PASSED_DEPTH", "facet_candidate_functions"]
+__all__ = ["TUNNEL_LIMIT_RATIO", "facet_candidate_functions"]
 
 MIN_NORMAL_COSINE = 0.1
 """Minimum cosine of the normals of two facets that a point in contact passes between: excludes the edge of a box."""
-PASSED_DEPTH = 0.25
-"""Depth over the allowed depth above which a point without a facet has passed through."""
+TUNNEL_LIMIT_RATIO = 0.25
+"""Ratio to the depth limit of a facet above which a point that left the facet has passed through the body."""
 OPPOSING_COSINE = 0.5
 """Cosine of a facet's normal and the slave's reversed normal above which they face each other; below its negative they
 face the same way."""
@@ -25,7 +25,7 @@ MAX_DEPTH_RATIO = 2.0
 MAX_EDGE_TANGENT = 2.0
 """Maximum tangent of the angle between an outward vector and the normal of its facet, at the edge of a box."""
 TANGENT_PLANE_MARGIN = 0.5
-"""Parametric margin for rejecting a facet by the tangent plane at its midpoint."""
+"""Parametric margin for rejecting a facet by the tangent plane at its centre."""
 
 
 @functools.cache
@@ -45,7 +45,7 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
         f.track_point, f.unit_normal,
     )  # fmt: skip
     boxes = broad_phase_kernels(dtype)
-    round_down, round_up, unpack_surface_point = boxes.round_down, boxes.round_up, boxes.unpack_surface_point
+    round_down, round_up, unpack_facet_point = boxes.round_down, boxes.round_up, boxes.unpack_facet_point
 
     @wp.struct
     class SlavePoint:
@@ -53,18 +53,18 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
 
         world: wp.int32
         contact: wp.int32
-        item: wp.int32  # slave facet
-        q: wp.int32  # number among the points of that facet
-        point: wp.int32
-        shift: vec3d  # displacement, m
-        x: vec3d  # position, m
-        x0: vec3d  # position at the start of the attempt, m
+        slave_facet: wp.int32
+        number_in_facet: wp.int32  # number among the points of the slave facet
+        point: wp.int32  # index of the point among all
+        displacement: vec3d  # displacement, m
+        position: vec3d  # position, m
+        start_position: vec3d  # position at the start of the attempt, m
         anchored: wp.bool  # it has an anchor facet
         motion: vec3d  # motion relative to the anchor facet's material, m
-        facing: vec3d  # normal of the anchor facet, else inward normal of the slave facet; 0: not yet set
+        facing_normal: vec3d  # normal of the anchor facet, else inward normal of the slave facet; 0: not yet set
         overlap_limit: f64  # m, > 0: no step; inner points up to that depth are in contact
-        pad: f64  # largest height above a facet, m
-        start_depth: f64  # depth at the start of the attempt up to which a point was outside, m
+        height_limit: f64  # largest height above a facet that is considered, m
+        outside_depth: f64  # depth at the start of the attempt up to which a point was outside, m
 
     @wp.struct
     class FacetCandidate:
@@ -86,9 +86,9 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
         out = SlavePoint()
         out.world = world
         out.contact = facets.contact[item]
-        out.item = item
-        out.q = q
-        out.point = facets.point + item * facets.points + q
+        out.slave_facet = item
+        out.number_in_facet = q
+        out.point = facets.first_point + item * facets.point_count + q
         return out
 
     @wp.func
@@ -100,20 +100,22 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
         out = slave_point(facets, world, item, q)
         point = out.point
         offset = con.offset[out.contact]
-        out.shift = interpolate(facets, u, world, q, item)
-        out.x = facets.X[q, item] + out.shift
-        out.x0 = pair.x0[world, point]
+        out.displacement = interpolate(facets, u, world, q, item)
+        out.position = facets.X[q, item] + out.displacement
+        out.start_position = pair.start_position[world, point]
         overlap = remaining_overlap(con, his, world, out.contact, point, clock.time[world])
         out.overlap_limit = overlap_limit
-        out.pad = overlap_limit + overlap + wp.abs(offset) + f64(1.0e-6) * wp.length(out.x)
-        out.start_depth = overlap + mas.touch_depth - wp.min(offset, f64(0.0))
+        out.height_limit = overlap_limit + overlap + wp.abs(offset) + f64(1.0e-6) * wp.length(out.position)
+        out.outside_depth = overlap + mas.touch_depth - wp.min(offset, f64(0.0))
         out.anchored = pair.anchor_facet[world, point] > 0
         if out.anchored:
             f = pair.anchor_facet[world, point] - 1
             xi = pair.anchor_xi[world, point]
-            change = displacement_change(mas, pair.C, pair.D, pair.C0, pair.D0, world, f, xi)
-            out.motion = out.shift - scr.origin[world, point] - change
-            out.pad += f64(2.0) * wp.abs(xi[2])
+            change = displacement_change(
+                mas, pair.u_coefs, pair.director_coefs, pair.start_u_coefs, pair.start_director_coefs, world, f, xi
+            )
+            out.motion = out.displacement - scr.start_displacement[world, point] - change
+            out.height_limit += f64(2.0) * wp.abs(xi[2])
         return out
 
     @wp.func
@@ -127,10 +129,14 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
             out.outside_distance = f64(0.0)  # no tolerance: a point in front of one face may be beside another
         if slave.anchored:
             f = pair.anchor_facet[world, slave.point] - 1
-            corners = mas.corners[mas.kind[f]]
-            found = track_point(mas, pair.C, pair.D, world, f, pair.anchor_xi[world, slave.point], slave.motion)
+            corners = mas.corner_count[mas.facet_kind[f]]
+            found = track_point(
+                mas, pair.u_coefs, pair.director_coefs, world, f, pair.anchor_xi[world, slave.point], slave.motion
+            )
             if found[3] == f64(0.0):
-                found = inverse_map(mas, pair.C, pair.D, world, f, slave.x, facet_centre(corners))
+                found = inverse_map(
+                    mas, pair.u_coefs, pair.director_coefs, world, f, slave.position, facet_centre(corners)
+                )
             xi = vec3d(found[0], found[1], found[2])
             o = distance_outside(corners, xi)
             if found[3] != f64(0.0) and (
@@ -143,61 +149,69 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
     def passed_through_facet(mas: Masters, pair: PairScratch, slave: SlavePoint, f: int) -> bool:
         """True if a point entered through a facet during the step, and deep."""
         world = slave.world
-        kind = mas.kind[f]
-        m = facet_centre(mas.corners[kind])
-        old = unpack_surface_point(pair.centre0[world, f])
-        new = unpack_surface_point(pair.centre[world, f])
-        position_change = slave.x - slave.x0 - (new.x - old.x)
-        deep = f64(PASSED_DEPTH) * mas.depth_limit[f]
+        kind = mas.facet_kind[f]
+        m = facet_centre(mas.corner_count[kind])
+        old = unpack_facet_point(pair.start_centre[world, f])
+        new = unpack_facet_point(pair.centre[world, f])
+        position_change = slave.position - slave.start_position - (new.position - old.position)
+        deep = f64(TUNNEL_LIMIT_RATIO) * mas.depth_limit[f]
         if wp.length(position_change) <= deep:
             return False
-        g0 = wp.dot(slave.x0 - old.x, unit_normal(old))
-        g1 = wp.dot(slave.x - new.x, unit_normal(new))
+        g0 = wp.dot(slave.start_position - old.position, unit_normal(old))
+        g1 = wp.dot(slave.position - new.position, unit_normal(new))
         if g0 <= f64(0.0) or g1 >= -deep:
             return False
-        y = slave.x - (g1 / (g1 - g0)) * position_change
-        there = inverse_map(mas, pair.C, pair.D, world, f, y, m)
+        y = slave.position - (g1 / (g1 - g0)) * position_change
+        there = inverse_map(mas, pair.u_coefs, pair.director_coefs, world, f, y, m)
         xi = vec3d(there[0], there[1], there[2])
-        return there[3] != f64(0.0) and distance_outside(mas.corners[kind], xi) == f64(0.0)
+        return there[3] != f64(0.0) and distance_outside(mas.corner_count[kind], xi) == f64(0.0)
 
     @wp.func
     def is_far(mas: Masters, pair: PairScratch, slave: SlavePoint, f: int) -> bool:
-        """True if a point is above a facet by more than twice `pad`, or moved little and is beside it, by the tangent
-        plane at its midpoint."""
-        corners = mas.corners[mas.kind[f]]
-        s = unpack_surface_point(pair.centre[slave.world, f])
-        if wp.dot(slave.x - s.x, unit_normal(s)) > f64(2.0) * slave.pad + pair.bulge[slave.world, f]:
+        """True if a point is above a facet by more than twice `height_limit`, or moved little and is beside it, by
+        the tangent plane at its centre."""
+        corners = mas.corner_count[mas.facet_kind[f]]
+        s = unpack_facet_point(pair.centre[slave.world, f])
+        if (
+            wp.dot(slave.position - s.position, unit_normal(s))
+            > f64(2.0) * slave.height_limit + pair.bulge[slave.world, f]
+        ):
             return True
-        if distance_outside(corners, facet_centre(corners) + local_components(s, slave.x - s.x)) <= f64(
+        if distance_outside(corners, facet_centre(corners) + local_components(s, slave.position - s.position)) <= f64(
             TANGENT_PLANE_MARGIN
         ):
             return False
-        path = slave.x - slave.x0 - (s.x - pair.centre0[slave.world, f][0])
+        path = slave.position - slave.start_position - (s.position - pair.start_centre[slave.world, f][0])
         return wp.length(path) <= f64(0.5) * mas.depth_limit[f]
 
     @wp.func
     def in_front(mas: Masters, pair: PairScratch, slave: SlavePoint, f: int) -> bool:
-        """True if a point is above a facet by more than `pad` and within its sides."""
-        corners = mas.corners[mas.kind[f]]
-        found = inverse_map(mas, pair.C, pair.D, slave.world, f, slave.x, facet_centre(corners))
+        """True if a point is above a facet by more than `height_limit` and within its sides."""
+        corners = mas.corner_count[mas.facet_kind[f]]
+        found = inverse_map(
+            mas, pair.u_coefs, pair.director_coefs, slave.world, f, slave.position, facet_centre(corners)
+        )
         within = distance_outside(corners, vec3d(found[0], found[1], found[2])) == f64(0.0)
-        return found[3] != f64(0.0) and within and found[2] > slave.pad
+        return found[3] != f64(0.0) and within and found[2] > slave.height_limit
 
     @wp.func
-    def opposite_normal(facets: Facets, pair: PairScratch, slave: SlavePoint, corners: wp.vec3i) -> vec3d:
+    def inward_normal(facets: Facets, pair: PairScratch, slave: SlavePoint, corners: wp.vec3i) -> vec3d:
         """Inward normal of a slave facet at the start of the attempt; 0 if undefined."""
         if corners[0] < 0:
             return vec3d()
-        point = facets.point + slave.item * facets.points
-        x = pair.x0[slave.world, point + corners[0]]
+        point = facets.first_point + slave.slave_facet * facets.point_count
+        x = pair.start_position[slave.world, point + corners[0]]
         return wp.normalize(
-            wp.cross(pair.x0[slave.world, point + corners[2]] - x, pair.x0[slave.world, point + corners[1]] - x)
+            wp.cross(
+                pair.start_position[slave.world, point + corners[2]] - x,
+                pair.start_position[slave.world, point + corners[1]] - x,
+            )
         )
 
     @wp.func
     def edge_margin(mas: Masters, f: int, xi: vec3d) -> f64:
         """Tolerance beyond a side, over its length, for points below an edge, where outward vectors are inclined."""
-        return wp.max(-f64(MAX_EDGE_TANGENT) * xi[2] / mas.size[f], f64(0.0))
+        return wp.max(-f64(MAX_EDGE_TANGENT) * xi[2] / mas.side_length[f], f64(0.0))
 
     @wp.func
     def entered_sideways(
@@ -207,17 +221,19 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
         most the penetration of the bodies' contact: it slid under the edge of a body that has sunk in."""
         world = slave.world
         bodies = mas.bodies[slave.contact]
-        kind = mas.kind[f]
+        kind = mas.facet_kind[f]
         most = wp.max(pair.deepest_contact[world, bodies[0]], pair.deepest_contact[world, bodies[1]])
-        depth = scr.contact_distance[world, slave.point] - gap
-        if depth > wp.min(f64(MAX_DEPTH_RATIO) * most, f64(PASSED_DEPTH) * mas.depth_limit[f]):
+        depth = scr.activation_gap[world, slave.point] - gap
+        if depth > wp.min(f64(MAX_DEPTH_RATIO) * most, f64(TUNNEL_LIMIT_RATIO) * mas.depth_limit[f]):
             return False
-        if distance_outside(mas.corners[kind], xi) > edge_margin(mas, f, xi):
+        if distance_outside(mas.corner_count[kind], xi) > edge_margin(mas, f, xi):
             return False
-        found = inverse_map(mas, pair.C0, pair.D0, world, f, pair.x0[world, slave.point], xi)
-        return found[3] == f64(0.0) or distance_outside(mas.corners[kind], vec3d(found[0], found[1], found[2])) > f64(
-            0.0
+        found = inverse_map(
+            mas, pair.start_u_coefs, pair.start_director_coefs, world, f, pair.start_position[world, slave.point], xi
         )
+        return found[3] == f64(0.0) or distance_outside(
+            mas.corner_count[kind], vec3d(found[0], found[1], found[2])
+        ) > f64(0.0)
 
     @wp.func
     def candidate_rank(
@@ -226,11 +242,13 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
         """Rank of a facet for a point, -1: rejected by depth, by the previous facet, or by the side at the start of the
         attempt. Higher for facets that face the slave's; among others, for one that the point reached from beside."""
         world = slave.world
-        s = surface_point(mas, pair.C, pair.D, world, f, xi)
+        s = surface_point(mas, pair.u_coefs, pair.director_coefs, world, f, xi)
         n = unit_normal(s)
-        cosine = wp.dot(n, slave.facing)
-        gap = xi[2] * wp.dot(n, s.c)
-        if -gap > mas.depth_limit[f] or gap > slave.pad:  # boxes depend on the other worlds: this test does not
+        cosine = wp.dot(n, slave.facing_normal)
+        gap = xi[2] * wp.dot(n, s.director)
+        if (
+            -gap > mas.depth_limit[f] or gap > slave.height_limit
+        ):  # boxes depend on the other worlds: this test does not
             return -1
         if slave.anchored:
             return wp.where(cosine > f64(MIN_NORMAL_COSINE), 0, -1)
@@ -238,9 +256,11 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
         if slave.overlap_limit > f64(0.0):
             rank = 0
         else:
-            projection = surface_point(mas, pair.C0, pair.D0, world, f, vec3d(xi[0], xi[1], f64(0.0)))
-            before = wp.dot(slave.x0 - projection.x, unit_normal(projection))
-            if before < -slave.start_depth:
+            projection = surface_point(
+                mas, pair.start_u_coefs, pair.start_director_coefs, world, f, vec3d(xi[0], xi[1], f64(0.0))
+            )
+            before = wp.dot(slave.start_position - projection.position, unit_normal(projection))
+            if before < -slave.outside_depth:
                 if rank == 0 or not entered_sideways(mas, scr, pair, slave, f, xi, before):
                     return -1
                 rank = wp.where(rank == 4, 3, 2)
@@ -266,8 +286,10 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
     ) -> FacetCandidate:
         """The better of a candidate and another facet for a point."""
         out = candidate
-        corners = mas.corners[mas.kind[f]]
-        found = inverse_map(mas, pair.C, pair.D, slave.world, f, slave.x, facet_centre(corners))
+        corners = mas.corner_count[mas.facet_kind[f]]
+        found = inverse_map(
+            mas, pair.u_coefs, pair.director_coefs, slave.world, f, slave.position, facet_centre(corners)
+        )
         xi = vec3d(found[0], found[1], found[2])
         beyond = distance_outside(corners, xi)
         slack = f64(0.0)
@@ -296,10 +318,10 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
         """True if a point is in front of some facet in a box: outside of the body, and beside any other facet."""
         out = bool(False)
         index = wp.int32(0)
-        root = wp.bvh_get_group_root(mas.tree, slave.world * mas.surfaces + mas.surface_of[slave.contact])
+        root = wp.bvh_get_group_root(mas.tree, slave.world * mas.surface_count + mas.surface_of[slave.contact])
         query = wp.bvh_query_aabb(mas.tree, low, high, root)
         while wp.bvh_query_next(query, index):
-            if in_front(mas, pair, slave, index - slave.world * mas.count):
+            if in_front(mas, pair, slave, index - slave.world * mas.facet_count):
                 out = True
         return out
 
@@ -315,21 +337,23 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
         free = not slave.anchored and slave.overlap_limit == f64(0.0)
         if slave.anchored:
             f = pair.anchor_facet[world, slave.point] - 1
-            slave.facing = unit_normal(surface_point(mas, pair.C, pair.D, world, f, pair.anchor_xi[world, slave.point]))
-            depth = scr.depth[world, slave.point] - wp.dot(slave.motion, slave.facing)
-            out.passed_through = depth > f64(PASSED_DEPTH) * mas.depth_limit[f]
-        wide = vec3d(slave.pad, slave.pad, slave.pad)
-        low = round_down(wp.min(slave.x, slave.x0) - wide)
-        high = round_up(wp.max(slave.x, slave.x0) + wide)
-        root = wp.bvh_get_group_root(mas.tree, world * mas.surfaces + mas.surface_of[slave.contact])
+            slave.facing_normal = unit_normal(
+                surface_point(mas, pair.u_coefs, pair.director_coefs, world, f, pair.anchor_xi[world, slave.point])
+            )
+            depth = scr.start_depth[world, slave.point] - wp.dot(slave.motion, slave.facing_normal)
+            out.passed_through = depth > f64(TUNNEL_LIMIT_RATIO) * mas.depth_limit[f]
+        wide = vec3d(slave.height_limit, slave.height_limit, slave.height_limit)
+        low = round_down(wp.min(slave.position, slave.start_position) - wide)
+        high = round_up(wp.max(slave.position, slave.start_position) + wide)
+        root = wp.bvh_get_group_root(mas.tree, world * mas.surface_count + mas.surface_of[slave.contact])
         query = wp.bvh_query_aabb(mas.tree, low, high, root)
         index = wp.int32(0)
         while wp.bvh_query_next(query, index):
-            f = index - world * mas.count
+            f = index - world * mas.facet_count
             if is_far(mas, pair, slave, f):
                 continue
-            if free and wp.length_sq(slave.facing) == f64(0.0):
-                slave.facing = opposite_normal(facets, pair, slave, corners)
+            if free and wp.length_sq(slave.facing_normal) == f64(0.0):
+                slave.facing_normal = inward_normal(facets, pair, slave, corners)
             out = better_candidate(mas, scr, pair, slave, f, out)
             if free and passed_through_facet(mas, pair, slave, f):
                 out.passed_through = True

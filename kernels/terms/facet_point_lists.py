@@ -8,14 +8,14 @@ import warp as wp
 from ..common.types import SHORT_UNROLL, kernel_module
 from .pair_structs import master_struct, pair_scratch_struct
 
-__all__ = ["FACETS_PER_CHUNK", "list_kernels"]
+__all__ = ["FACETS_PER_CHUNK", "point_list_kernels"]
 
 FACETS_PER_CHUNK = 64
 """Facets per chunk of the prefix sum."""
 
 
 @functools.cache
-def list_kernels(dtype: str) -> _types.SimpleNamespace:
+def point_list_kernels(dtype: str) -> _types.SimpleNamespace:
     """Kernels in the module of `pair_kernels`."""
     Masters, PairScratch = master_struct(dtype), pair_scratch_struct(dtype)
     module = kernel_module(f"pairs_{dtype}", max_unroll=SHORT_UNROLL)
@@ -34,15 +34,15 @@ def list_kernels(dtype: str) -> _types.SimpleNamespace:
         world, point = wp.tid()
         f = pair.listed_facet[world, point] - 1
         if f >= 0:
-            wp.atomic_add(pair.list_count, world * mas.count + f, 1)
+            wp.atomic_add(pair.list_count, world * mas.facet_count + f, 1)
 
     @wp.kernel(module=module)
     def sum_chunks(mas: Masters, pair: PairScratch):
         """Number of points in the lists of each chunk of facets."""
         world, chunk = wp.tid()
         total = wp.int32(0)
-        for f in range(chunk * FACETS_PER_CHUNK, wp.min((chunk + 1) * FACETS_PER_CHUNK, mas.count)):
-            total += pair.list_count[world * mas.count + f]
+        for f in range(chunk * FACETS_PER_CHUNK, wp.min((chunk + 1) * FACETS_PER_CHUNK, mas.facet_count)):
+            total += pair.list_count[world * mas.facet_count + f]
         pair.chunk_offset[world, chunk] = total
 
     @wp.kernel(module=module)
@@ -56,12 +56,12 @@ def list_kernels(dtype: str) -> _types.SimpleNamespace:
             before += here
 
     @wp.kernel(module=module)
-    def place_lists(mas: Masters, pair: PairScratch):
+    def set_list_starts(mas: Masters, pair: PairScratch):
         """Start of each list in each world."""
         world, f = wp.tid()
         start = pair.chunk_offset[world, f / FACETS_PER_CHUNK]
         for other in range(f / FACETS_PER_CHUNK * FACETS_PER_CHUNK, f):
-            start += pair.list_count[world * mas.count + other]
+            start += pair.list_count[world * mas.facet_count + other]
         pair.list_start[world, f] = start
         pair.list_size[world, f] = 0
 
@@ -89,5 +89,5 @@ def list_kernels(dtype: str) -> _types.SimpleNamespace:
 
     return _types.SimpleNamespace(
         clear_lists=clear_lists, count_points=count_points, sum_chunks=sum_chunks, scan_chunks=scan_chunks,
-        place_lists=place_lists, fill_lists=fill_lists, sort_lists=sort_lists,
+        set_list_starts=set_list_starts, fill_lists=fill_lists, sort_lists=sort_lists,
     )  # fmt: skip

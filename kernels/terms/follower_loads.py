@@ -17,37 +17,39 @@ def follower_struct(dtype: str):
     T, vec3 = p.T, p.vec3
 
     @wp.struct
-    class Follower:
+    class FollowerLoads:
         conn: wp.array2d(dtype=wp.int32)  # [local, item] slot
-        law: wp.array(dtype=wp.int32)  # [item]
-        reference: wp.array2d(dtype=vec3)  # [local, item] reference value, positions from the first slot; faces
-        is_position: wp.array2d(dtype=T)  # [local, item]; faces
-        shape: wp.array3d(dtype=T)  # [point, local, item]; faces
-        d_a: wp.array3d(dtype=T)
-        d_b: wp.array3d(dtype=T)
-        weight: wp.array(dtype=T)  # [point]; faces
-        gradient: wp.array2d(dtype=vec3)  # [local, item] c_ki of the point's vectors y_k = sum_i c_ki e_i; moments
-        axes: wp.array(dtype=p.mat33)  # [item] reference values of the vectors (columns); moments
-        fraction: wp.array(dtype=T)  # [item] fraction of the moment; moments
-        offset: wp.int32
-        count: wp.int32
+        time_law: wp.array(dtype=wp.int32)  # [item] index in the table of time laws
+        first_entry: wp.int32  # entry of a contribution: first_entry + local * item_count + item
+        item_count: wp.int32
+        # faces
+        reference: wp.array2d(dtype=vec3)  # [local, item] reference value, m; positions relative to the first slot
+        is_position: wp.array2d(dtype=T)  # [local, item] 1 for a position, 0 for a gradient
+        shape: wp.array3d(dtype=T)  # [point, local, item]
+        shape_da: wp.array3d(dtype=T)  # derivatives along the coordinates a and b of the face
+        shape_db: wp.array3d(dtype=T)
+        weight: wp.array(dtype=T)  # [point] quadrature weight in (a, b), without the area
+        # points with a moment
+        vector_coefficients: wp.array2d(dtype=vec3)  # [local, item] c_ki of the vectors y_k = sum_i c_ki e_i
+        reference_vectors: wp.array(dtype=p.mat33)  # [item] reference values of the vectors y_k, as columns
+        moment_fraction: wp.array(dtype=T)  # [item] fraction of the total moment, 1 / number of points
 
-    return Follower
+    return FollowerLoads
 
 
 @functools.cache
 def pressure_kernels(dtype: str) -> _types.SimpleNamespace:
-    """Kernels of the pressure in one precision."""
+    """Kernels of pressures, Pa, on faces."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
-    Follower = follower_struct(dtype)
+    FollowerLoads = follower_struct(dtype)
     pressure_module = kernel_module(f"pressure_{dtype}")
 
     @wp.func
-    def tangent_vector(
-        data: Follower, table: wp.array3d(dtype=T), u: wp.array2d(dtype=vec3), world: int, point: int, item: int
+    def surface_tangent(
+        data: FollowerLoads, table: wp.array3d(dtype=T), u: wp.array2d(dtype=vec3), world: int, point: int, item: int
     ) -> vec3:
-        """dx/da of a face at a point, positions taken from the first slot."""
+        """dx/da or dx/db of a face at a point, by the table of derivatives."""
         out = vec3()
         first = u[world, data.conn[0, item]]
         for i in range(data.conn.shape[0]):
@@ -56,8 +58,13 @@ def pressure_kernels(dtype: str) -> _types.SimpleNamespace:
         return out
 
     @wp.func
-    def combine(
-        data: Follower, table: wp.array3d(dtype=T), field: wp.array2d(dtype=vec3), world: int, point: int, item: int
+    def interpolate(
+        data: FollowerLoads,
+        table: wp.array3d(dtype=T),
+        field: wp.array2d(dtype=vec3),
+        world: int,
+        point: int,
+        item: int,
     ) -> vec3:
         """sum table_i field_i."""
         out = vec3()
@@ -66,14 +73,14 @@ def pressure_kernels(dtype: str) -> _types.SimpleNamespace:
         return out
 
     @wp.func
-    def clear(data: Follower, world: int, item: int, contribution: wp.array2d(dtype=vec3)):
+    def clear_contribution(data: FollowerLoads, world: int, item: int, contribution: wp.array2d(dtype=vec3)):
         """Zero the entries of an item."""
         for i in range(data.conn.shape[0]):
-            contribution[world, data.offset + i * data.count + item] = vec3()
+            contribution[world, data.first_entry + i * data.item_count + item] = vec3()
 
     @wp.kernel(module=pressure_module)
-    def pressure(
-        data: Follower,
+    def pressure_force(
+        data: FollowerLoads,
         u: wp.array2d(dtype=vec3),
         value: wp.array2d(dtype=wp.vec3d),
         active: wp.array(dtype=wp.int32),
@@ -83,19 +90,20 @@ def pressure_kernels(dtype: str) -> _types.SimpleNamespace:
         world, item = wp.tid()
         if active[world] == 0:
             return
-        clear(data, world, item, contribution)
+        clear_contribution(data, world, item, contribution)
         for q in range(data.weight.shape[0]):
             normal = wp.cross(
-                tangent_vector(data, data.d_a, u, world, q, item), tangent_vector(data, data.d_b, u, world, q, item)
+                surface_tangent(data, data.shape_da, u, world, q, item),
+                surface_tangent(data, data.shape_db, u, world, q, item),
             )
-            f = (-T(value[world, data.law[item]][0]) * data.weight[q]) * normal
+            f = (-T(value[world, data.time_law[item]][0]) * data.weight[q]) * normal
             for i in range(data.conn.shape[0]):
-                k = data.offset + i * data.count + item
+                k = data.first_entry + i * data.item_count + item
                 contribution[world, k] = contribution[world, k] + data.shape[q, i, item] * f
 
     @wp.kernel(module=pressure_module)
-    def pressure_product(
-        data: Follower,
+    def pressure_tangent_product(
+        data: FollowerLoads,
         midpoint_factor: T,
         u: wp.array2d(dtype=vec3),
         value: wp.array2d(dtype=wp.vec3d),
@@ -103,42 +111,46 @@ def pressure_kernels(dtype: str) -> _types.SimpleNamespace:
         direction: wp.array2d(dtype=vec3),
         contribution: wp.array2d(dtype=vec3),
     ):
-        """(K + K^T)/2 p with K = df/dq of the pressure force: its symmetric part; exact on a closed surface.
+        """(K + K^T)/2 d, K = df/dq of the pressure force, d a direction; symmetric on a closed surface at uniform p.
 
-        `midpoint_factor`: factor on the change of u in p.
+        `midpoint_factor`: ratio of the stage's displacement increment to that of the step, 1/2 for midpoint schemes.
         """
         world, item = wp.tid()
         if active[world] == 0:
             return
-        clear(data, world, item, contribution)
+        clear_contribution(data, world, item, contribution)
         for q in range(data.weight.shape[0]):
-            a = tangent_vector(data, data.d_a, u, world, q, item)
-            b = tangent_vector(data, data.d_b, u, world, q, item)
-            da = combine(data, data.d_a, direction, world, q, item)
-            db = combine(data, data.d_b, direction, world, q, item)
-            d = combine(data, data.shape, direction, world, q, item)
-            w = midpoint_factor * T(-0.5) * T(value[world, data.law[item]][0]) * data.weight[q]
+            a = surface_tangent(data, data.shape_da, u, world, q, item)
+            b = surface_tangent(data, data.shape_db, u, world, q, item)
+            da = interpolate(data, data.shape_da, direction, world, q, item)
+            db = interpolate(data, data.shape_db, direction, world, q, item)
+            d = interpolate(data, data.shape, direction, world, q, item)
+            w = midpoint_factor * T(-0.5) * T(value[world, data.time_law[item]][0]) * data.weight[q]
             force = wp.cross(da, b) + wp.cross(a, db)
             left = wp.cross(b, d)
             right = wp.cross(d, a)
             for i in range(data.conn.shape[0]):
-                k = data.offset + i * data.count + item
-                f = data.shape[q, i, item] * force + data.d_a[q, i, item] * left + data.d_b[q, i, item] * right
+                k = data.first_entry + i * data.item_count + item
+                f = (
+                    data.shape[q, i, item] * force
+                    + data.shape_da[q, i, item] * left
+                    + data.shape_db[q, i, item] * right
+                )
                 contribution[world, k] = contribution[world, k] + w * f
 
-    return _types.SimpleNamespace(pressure=pressure, pressure_product=pressure_product)
+    return _types.SimpleNamespace(pressure_force=pressure_force, pressure_tangent_product=pressure_tangent_product)
 
 
 @functools.cache
 def moment_kernels(dtype: str, vectors: int) -> _types.SimpleNamespace:
-    """Kernels of moments on the spin of a point's material vectors y_k = sum_i c_ki e_i.
+    """Kernels of moments, N m, that work on the angular velocity of a point's material vectors y_k = sum_i c_ki e_i.
 
     Args:
         vectors: 3, all of F (solids); 2, those of a beam's section, y_1 and y_2; 1, a shell's director, y_2.
     """
     p = precision(dtype)
     T, vec3, mat33 = p.T, p.vec3, p.mat33
-    Follower = follower_struct(dtype)
+    FollowerLoads = follower_struct(dtype)
     module = kernel_module(f"moment_{dtype}_{vectors}")
     first = 3 - vectors
 
@@ -156,13 +168,13 @@ def moment_kernels(dtype: str, vectors: int) -> _types.SimpleNamespace:
         return out
 
     @wp.func
-    def complete(Y: mat33) -> mat33:
+    def with_section_normal(Y: mat33) -> mat33:
         """Section vectors preceded by their unit normal."""
         return with_column(Y, 0, wp.normalize(wp.cross(column(Y, 1), column(Y, 2))))
 
     @wp.func
-    def spin_force(Y: mat33, m: vec3) -> mat33:
-        """Forces on the vectors (columns) whose work on their spin w is m.w.
+    def vector_forces(Y: mat33, m: vec3) -> mat33:
+        """Forces on the vectors (columns) whose power is m.w, w the angular velocity of the vectors.
 
         3: w is the axial vector of Ydot Y^-1. 2: rotation of the section with its normal, w = axial of Adot A^-1 with A
         = [n, y_1, y_2]. 1: w = y x ydot / y^2.
@@ -173,7 +185,7 @@ def moment_kernels(dtype: str, vectors: int) -> _types.SimpleNamespace:
             for k in range(3):
                 out = with_column(out, k, T(0.5) * wp.cross(m, column(G, k)))
         if wp.static(vectors == 2):
-            A = complete(Y)
+            A = with_section_normal(Y)
             n = column(A, 0)
             G = wp.transpose(wp.inverse(A))
             for k in range(1, 3):
@@ -185,8 +197,8 @@ def moment_kernels(dtype: str, vectors: int) -> _types.SimpleNamespace:
         return out
 
     @wp.func
-    def spin_force_change(Y: mat33, dY: mat33, m: vec3) -> mat33:
-        """Derivative of `spin_force` along dY."""
+    def vector_forces_change(Y: mat33, dY: mat33, m: vec3) -> mat33:
+        """Derivative of `vector_forces` along dY."""
         out = mat33()
         if wp.static(vectors == 3):
             G = wp.transpose(wp.inverse(Y))
@@ -194,7 +206,7 @@ def moment_kernels(dtype: str, vectors: int) -> _types.SimpleNamespace:
             for k in range(3):
                 out = with_column(out, k, T(0.5) * wp.cross(m, column(dG, k)))
         if wp.static(vectors == 2):
-            A = complete(Y)
+            A = with_section_normal(Y)
             n = column(A, 0)
             G = wp.transpose(wp.inverse(A))
             dn = -(wp.dot(n, column(dY, 1)) * column(G, 1) + wp.dot(n, column(dY, 2)) * column(G, 2))
@@ -202,8 +214,8 @@ def moment_kernels(dtype: str, vectors: int) -> _types.SimpleNamespace:
             for k in range(1, 3):
                 g = column(G, k)
                 dg = column(dG, k)
-                turn = wp.dot(m, wp.cross(dn, g)) + wp.dot(m, wp.cross(n, dg))
-                out = with_column(out, k, T(0.5) * (wp.cross(m, dg) - wp.dot(m, wp.cross(n, g)) * dn - turn * n))
+                dm = wp.dot(m, wp.cross(dn, g)) + wp.dot(m, wp.cross(n, dg))
+                out = with_column(out, k, T(0.5) * (wp.cross(m, dg) - wp.dot(m, wp.cross(n, g)) * dn - dm * n))
         if wp.static(vectors == 1):
             d = column(Y, 2)
             dd = column(dY, 2)
@@ -212,38 +224,38 @@ def moment_kernels(dtype: str, vectors: int) -> _types.SimpleNamespace:
         return out
 
     @wp.func
-    def gather(data: Follower, field: wp.array2d(dtype=vec3), world: int, item: int) -> mat33:
+    def interpolate_vectors(data: FollowerLoads, field: wp.array2d(dtype=vec3), world: int, item: int) -> mat33:
         """sum_i c_ki field_i in column k."""
         out = mat33()
         for i in range(data.conn.shape[0]):
-            out += wp.outer(field[world, data.conn[i, item]], data.gradient[i, item])
+            out += wp.outer(field[world, data.conn[i, item]], data.vector_coefficients[i, item])
         return out
 
     @wp.func
-    def current(data: Follower, u: wp.array2d(dtype=vec3), world: int, item: int) -> mat33:
+    def current_vectors(data: FollowerLoads, u: wp.array2d(dtype=vec3), world: int, item: int) -> mat33:
         """Current vectors: their reference values (the axes) plus displacements."""
-        return data.axes[item] + gather(data, u, world, item)
+        return data.reference_vectors[item] + interpolate_vectors(data, u, world, item)
 
     @wp.kernel(module=module)
-    def moment(
-        data: Follower,
+    def moment_force(
+        data: FollowerLoads,
         u: wp.array2d(dtype=vec3),
         value: wp.array2d(dtype=wp.vec3d),
         active: wp.array(dtype=wp.int32),
         contribution: wp.array2d(dtype=vec3),
     ):
-        """f_i = sum_k c_ki phi_k, phi the forces that do the moment's work on the spin of the vectors."""
+        """f_i = sum_k c_ki phi_k with phi of `vector_forces`."""
         world, item = wp.tid()
         if active[world] == 0:
             return
-        m = data.fraction[item] * vec3(value[world, data.law[item]])
-        phi = spin_force(current(data, u, world, item), m)
+        m = data.moment_fraction[item] * vec3(value[world, data.time_law[item]])
+        phi = vector_forces(current_vectors(data, u, world, item), m)
         for i in range(data.conn.shape[0]):
-            contribution[world, data.offset + i * data.count + item] = phi * data.gradient[i, item]
+            contribution[world, data.first_entry + i * data.item_count + item] = phi * data.vector_coefficients[i, item]
 
     @wp.kernel(module=module)
-    def moment_product(
-        data: Follower,
+    def moment_tangent_product(
+        data: FollowerLoads,
         midpoint_factor: T,
         u: wp.array2d(dtype=vec3),
         value: wp.array2d(dtype=wp.vec3d),
@@ -251,20 +263,20 @@ def moment_kernels(dtype: str, vectors: int) -> _types.SimpleNamespace:
         direction: wp.array2d(dtype=vec3),
         contribution: wp.array2d(dtype=vec3),
     ):
-        """(K + K^T)/2 p with K = df/dq; `midpoint_factor`: factor on the change of u in p."""
+        """(K + K^T)/2 d with K = df/dq, d a direction; `midpoint_factor`: as of `pressure_tangent_product`."""
         world, item = wp.tid()
         if active[world] == 0:
             return
-        m = (midpoint_factor * data.fraction[item]) * vec3(value[world, data.law[item]])
-        Y = current(data, u, world, item)
-        D = gather(data, direction, world, item)
-        S = T(0.5) * spin_force_change(Y, D, m)
+        m = (midpoint_factor * data.moment_fraction[item]) * vec3(value[world, data.time_law[item]])
+        Y = current_vectors(data, u, world, item)
+        D = interpolate_vectors(data, direction, world, item)
+        S = T(0.5) * vector_forces_change(Y, D, m)
         for k in range(first, 3):
             for c in range(3):
                 unit = mat33()
                 unit[c, k] = T(1.0)
-                S[c, k] = S[c, k] + T(0.5) * wp.ddot(D, spin_force_change(Y, unit, m))
+                S[c, k] = S[c, k] + T(0.5) * wp.ddot(D, vector_forces_change(Y, unit, m))
         for i in range(data.conn.shape[0]):
-            contribution[world, data.offset + i * data.count + item] = S * data.gradient[i, item]
+            contribution[world, data.first_entry + i * data.item_count + item] = S * data.vector_coefficients[i, item]
 
-    return _types.SimpleNamespace(moment=moment, moment_product=moment_product)
+    return _types.SimpleNamespace(moment_force=moment_force, moment_tangent_product=moment_tangent_product)

@@ -8,18 +8,20 @@ import warp as wp
 from ..common.types import kernel_module, precision
 from ..elements.points import block_struct
 
-__all__ = ["body_force_kernel", "law_function_kernel", "law_struct", "load_kernels"]
+__all__ = ["body_force_kernel", "load_kernels", "time_law_kernel", "time_law_struct"]
 
 
 @functools.cache
-def law_struct():
-    """Time laws: row k is a constant (count 1) or samples of time, piecewise linear, constant beyond both ends."""
+def time_law_struct():
+    """Time laws: each a constant (one sample) or samples in time, piecewise linear, constant beyond both ends."""
 
     @wp.struct
     class TimeLaws:
-        start: wp.array(dtype=wp.int32)  # [law + 1]; no samples: a function fills the value
-        times: wp.array(dtype=wp.float64)
-        values: wp.array(dtype=wp.vec3d)
+        sample_start: wp.array(
+            dtype=wp.int32
+        )  # [law + 1] first sample; without samples a function or control sets the value
+        sample_time: wp.array(dtype=wp.float64)  # s
+        sample_value: wp.array(dtype=wp.vec3d)
 
     return TimeLaws
 
@@ -30,7 +32,7 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
     f64 = wp.float64
-    Laws = law_struct()
+    Laws = time_law_struct()
     # a module per kind of load: a scene compiles only those it uses
     laws_module = kernel_module(f"laws_{dtype}")
     controls_module = kernel_module(f"controls_{dtype}")
@@ -41,7 +43,7 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
     turn_module = kernel_module(f"drive_rotation_{dtype}")
 
     @wp.kernel(module=laws_module)
-    def evaluate_laws(
+    def evaluate_time_laws(
         laws: Laws,
         time: wp.array(dtype=f64),
         ramp: wp.array(dtype=f64),
@@ -52,20 +54,20 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
         world, law = wp.tid()
         if active[world] == 0:
             return
-        first = laws.start[law]
-        last = laws.start[law + 1] - 1
+        first = laws.sample_start[law]
+        last = laws.sample_start[law + 1] - 1
         if last < first:
             return
         if last == first:
-            value[world, law] = ramp[world] * laws.values[first]
+            value[world, law] = ramp[world] * laws.sample_value[first]
             return
         t = time[world]
         k = first
-        while k < last - 1 and laws.times[k + 1] < t:
+        while k < last - 1 and laws.sample_time[k + 1] < t:
             k += 1
-        s = (t - laws.times[k]) / (laws.times[k + 1] - laws.times[k])
+        s = (t - laws.sample_time[k]) / (laws.sample_time[k + 1] - laws.sample_time[k])
         s = wp.clamp(s, f64(0.0), f64(1.0))
-        value[world, law] = (f64(1.0) - s) * laws.values[k] + s * laws.values[k + 1]
+        value[world, law] = (f64(1.0) - s) * laws.sample_value[k] + s * laws.sample_value[k + 1]
 
     @wp.kernel(module=controls_module)
     def evaluate_control(
@@ -114,19 +116,19 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
         magnitude[world, slot] = m
 
     @wp.kernel(module=gravity_module)
-    def take_gravity(
+    def copy_gravity(
         value: wp.array2d(dtype=wp.vec3d),
         law: int,
         active: wp.array(dtype=wp.int32),
         gravity: wp.array(dtype=wp.vec3d),
     ):
-        """Gravity from a time law."""
+        """Gravity, m/s^2, from the value of a time law."""
         world = wp.tid()
         if active[world] != 0:
             gravity[world] = value[world, law]
 
     @wp.kernel(module=explicit_module)
-    def work_rows(
+    def explicit_work_rows(
         a: wp.array2d(dtype=vec3),
         u: wp.array2d(dtype=vec3),
         u_n: wp.array2d(dtype=vec3),
@@ -139,7 +141,7 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
             rows[0, world, slot] = f64(wp.dot(a[world, slot], u[world, slot] - u_n[world, slot]))
 
     @wp.kernel(module=explicit_module)
-    def add_explicit(
+    def subtract_explicit_force(
         explicit_force: wp.array2d(dtype=vec3),
         active: wp.array(dtype=wp.int32),
         force: wp.array2d(dtype=vec3),
@@ -202,24 +204,24 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
         v[world, s] = velocity
 
     return _types.SimpleNamespace(
-        evaluate_laws=evaluate_laws,
+        evaluate_time_laws=evaluate_time_laws,
         evaluate_control=evaluate_control,
         dead_load=dead_load,
-        take_gravity=take_gravity,
-        work_rows=work_rows,
-        add_explicit=add_explicit,
+        copy_gravity=copy_gravity,
+        explicit_work_rows=explicit_work_rows,
+        subtract_explicit_force=subtract_explicit_force,
         drive_displacement=drive_displacement,
         drive_rotation=drive_rotation,
     )
 
 
 @functools.lru_cache(maxsize=256)
-def law_function_kernel(function: wp.Function, scalar: bool, take_dtype: str):
-    """Kernel that fills one law's value from a `wp.func` of t (s)."""
+def time_law_kernel(function: wp.Function, scalar: bool, take_dtype: str):
+    """Kernel that evaluates one time law given as a `wp.func` of t (s)."""
     f64 = wp.float64
     A = precision(take_dtype).T
 
-    def fill(
+    def set_time_law(
         law: int,
         time: wp.array(dtype=f64),
         active: wp.array(dtype=wp.int32),
@@ -234,7 +236,7 @@ def law_function_kernel(function: wp.Function, scalar: bool, take_dtype: str):
         else:
             value[world, law] = wp.vec3d(function(A(time[world])))
 
-    return wp.Kernel(func=fill, module=_unique_module("law", function, scalar, take_dtype))
+    return wp.Kernel(func=set_time_law, module=_unique_module("law", function, scalar, take_dtype))
 
 
 @functools.lru_cache(maxsize=256)
@@ -246,7 +248,7 @@ def body_force_kernel(function: wp.Function, dtype: str, take_dtype: str):
     Block = block_struct(dtype)
     f64 = wp.float64
 
-    def fill(
+    def add_body_force(
         block: Block,
         members: wp.array(dtype=wp.int32),
         reference: wp.array(dtype=vec3),
@@ -280,15 +282,15 @@ def body_force_kernel(function: wp.Function, dtype: str, take_dtype: str):
                 e = offset + i * count + k
                 contribution[world, e] = contribution[world, e] + block.shape[q, i, column] * f
 
-    return wp.Kernel(func=fill, module=_unique_module("field", function, dtype, take_dtype))
+    return wp.Kernel(func=add_body_force, module=_unique_module("field", function, dtype, take_dtype))
 
 
-_names: dict[str, list[wp.Function]] = {}
+_functions_by_key: dict[str, list[wp.Function]] = {}
 
 
 def _unique_module(kind: str, function: wp.Function, *key) -> wp.Module:
     """Module of a user function, with a name reproducible across processes for the kernel cache."""
-    same = _names.setdefault(function.key, [])
+    same = _functions_by_key.setdefault(function.key, [])
     if function not in same:
         same.append(function)
     parts = [kind, function.key, str(same.index(function)), *map(str, key)]

@@ -24,7 +24,7 @@ def pair_block_kernels(dtype: str) -> _types.SimpleNamespace:
     module = kernel_module(f"pair_blocks_{dtype}", max_unroll=SHORT_UNROLL)
 
     @wp.kernel(module=module)
-    def add_masters(
+    def add_master_blocks(
         topo: Topology, pattern: Pattern, entry: wp.array(dtype=wp.int32), start: wp.array(dtype=wp.int32),
         source: wp.array(dtype=wp.vec3i), stiffness: wp.array2d(dtype=sym), weight: wp.array3d(dtype=T),
         lists: PointLists, dq_dv: wp.array(dtype=f64), active: wp.array(dtype=wp.int32), value: wp.array2d(dtype=mat33),
@@ -42,4 +42,4 @@ def pair_block_kernels(dtype: str) -> _types.SimpleNamespace:
                 k6 += (weight[world, point, at[1]] * weight[world, point, at[2]]) * stiffness[world, point]
         add_symmetric(topo, pattern.upper[entry[index]], T(dq_dv[world]) * k6, world, value)
 
-    return _types.SimpleNamespace(module=module, add_masters=add_masters)
+    return _types.SimpleNamespace(module=module, add_master_blocks=add_master_blocks)

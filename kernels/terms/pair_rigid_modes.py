@@ -22,7 +22,7 @@ def pair_rigid_mode_kernels(dtype: str) -> _types.SimpleNamespace:
     Bodies, Masters, Facets = bodies_struct(dtype), master_struct(dtype), facet_struct(dtype)
     rigid = rigid_mode_functions(dtype)
     translation_columns, rotation_columns = rigid.translation_columns, rigid.rotation_columns
-    module = kernel_module(f"pair_motions_{dtype}", max_unroll=SHORT_UNROLL)
+    module = kernel_module(f"pair_rigid_modes_{dtype}", max_unroll=SHORT_UNROLL)
 
     @wp.kernel(module=module)
     def cross_term_sums(
@@ -37,7 +37,7 @@ def pair_rigid_mode_kernels(dtype: str) -> _types.SimpleNamespace:
         if active[world] == 0:
             return
         c = contact[index]
-        a = bodies.of_slot[facets.conn[0, (first[c] - facets.point) / facets.points]]
+        a = bodies.body_of_slot[facets.conn[0, (first[c] - facets.first_point) / facets.point_count]]
         mm = mat33d()
         mt = mat33d()
         tm = mat33d()
@@ -47,9 +47,9 @@ def pair_rigid_mode_kernels(dtype: str) -> _types.SimpleNamespace:
             f = listed[world, point] - 1
             k = stiffness[world, point]
             if f >= 0 and wp.length_sq(k) > T(0.0):
-                item = (point - facets.point) / facets.points
-                q = (point - facets.point) % facets.points
-                b = bodies.of_slot[mas.conn[0, f]]
+                item = (point - facets.first_point) / facets.point_count
+                q = (point - facets.first_point) % facets.point_count
+                b = bodies.body_of_slot[mas.conn[0, f]]
                 sm = mat33d()
                 st = mat33d()
                 for i in range(facets.conn.shape[0]):

@@ -11,10 +11,11 @@ __all__ = ["master_struct", "pair_history_struct", "pair_scratch_struct", "point
 
 @functools.cache
 def master_struct(dtype: str):
-    """Facets of master surfaces: positions are polynomials of two coordinates, linear along an outward vector.
+    """Facets of master surfaces: positions are polynomials of two coordinates s, linear along an outward vector.
 
-    x(s, z) = sum_m s^m ((X_m + sum_i shape_mi u_i) + z (N_m + sum_i director_shape_mi u_i)): the outward vector is a
-    material vector mapped by the deformation gradient, so that a point near a surface depends on one element only.
+    x(s, z) = sum_m s^m ((X_m + sum_i shape_mi u_i) + z (N_m + sum_i director_shape_mi u_i)), X and N the coefficients
+    of the reference position and of the outward vector, the director: a material vector mapped by the deformation
+    gradient, so that a point near a surface depends on one element only.
     """
     T = precision(dtype).T
 
@@ -24,26 +25,28 @@ def master_struct(dtype: str):
         surface_of: wp.array(dtype=wp.int32)  # [contact] its master surface
         sign: wp.array(dtype=wp.float64)  # [contact] -1 where the points belong to the second body
         bodies: wp.array(dtype=wp.vec2i)  # [contact] of the points and of the facets, numbered among bodies in pairs
-        surfaces: wp.int32
+        surface_count: wp.int32  # number of master surfaces
         touch_depth: wp.float64  # depth at the start of a step that counts as contact, m
         max_monomials: wp.int32  # maximum number of monomials of a facet
         conn: wp.array2d(dtype=wp.int32)  # [local, facet] slot
-        shape: wp.array3d(dtype=T)  # [monomial, local, facet]
-        director_shape: wp.array3d(dtype=T)  # 1/m
-        X: wp.array2d(dtype=wp.vec3d)  # [monomial, facet]
-        N: wp.array2d(dtype=wp.vec3d)
-        kind: wp.array(dtype=wp.int32)  # [facet]
-        monomials: wp.array(dtype=wp.int32)  # [kind] number of monomials
-        corners: wp.array(dtype=wp.int32)  # [kind]
-        power: wp.array2d(dtype=wp.vec2i)  # [kind, monomial] exponents
-        hull: wp.array3d(dtype=wp.float64)  # [kind, point, monomial] control points; convex hull of the facet
+        shape: wp.array3d(dtype=T)  # [monomial, local, facet] coefficients of the shape functions on the facet
+        director_shape: wp.array3d(dtype=T)  # coefficients of their derivatives along the director, 1/m
+        position_coefficients: wp.array2d(dtype=wp.vec3d)  # [monomial, facet] X_m, m
+        director_coefficients: wp.array2d(dtype=wp.vec3d)  # [monomial, facet] N_m
+        facet_kind: wp.array(dtype=wp.int32)  # [facet] kind: number of corners and degree
+        monomial_count: wp.array(dtype=wp.int32)  # [kind] number of monomials
+        corner_count: wp.array(dtype=wp.int32)  # [kind] 3 or 4
+        exponents: wp.array2d(dtype=wp.vec2i)  # [kind, monomial] exponents
+        hull_coefficients: wp.array3d(
+            dtype=wp.float64
+        )  # [kind, point, monomial] Bernstein control points: their hull contains the facet
         depth_limit: wp.array(
             dtype=wp.float64
         )  # [facet] depth beyond which a point would leave through the opposite side, m
-        size: wp.array(dtype=wp.float64)  # [facet] length of a side, m
-        surface: wp.array(dtype=wp.int32)  # [facet]
-        pool: wp.int32  # first entry in the pool
-        count: wp.int32
+        side_length: wp.array(dtype=wp.float64)  # [facet] length of a side, m
+        surface: wp.array(dtype=wp.int32)  # [facet] its master surface
+        first_entry: wp.int32  # first entry in the pool of terms
+        facet_count: wp.int32
 
     return Masters
 
@@ -69,49 +72,51 @@ def pair_scratch_struct(dtype: str):
 
     @wp.struct
     class PairScratch:
-        C: wp.array2d(dtype=wp.vec3d)  # [world, control] coefficients of displacements at the iterate
-        D: wp.array2d(dtype=wp.vec3d)  # of the outward vector
-        C0: wp.array2d(dtype=wp.vec3d)  # at the start of the attempt
-        D0: wp.array2d(dtype=wp.vec3d)
-        V0: wp.array2d(dtype=wp.vec3d)  # of velocities at the start of the attempt
-        centre: wp.array2d(dtype=mat43)  # [world, facet] midpoint and derivatives, rows as of a SurfacePoint
-        bulge: wp.array2d(dtype=wp.float64)  # [world, facet] largest height above the tangent plane at the midpoint, m
-        centre0: wp.array2d(dtype=mat43)  # at the start of the attempt
-        lower: wp.array(dtype=wp.vec3)  # [world facet] boxes of the tree
-        upper: wp.array(dtype=wp.vec3)
+        u_coefs: wp.array2d(dtype=wp.vec3d)  # [world, control] sum_i shape_mi u_i at the iterate, m
+        director_coefs: wp.array2d(dtype=wp.vec3d)  # sum_i director_shape_mi u_i
+        start_u_coefs: wp.array2d(dtype=wp.vec3d)  # both at the start of the attempt
+        start_director_coefs: wp.array2d(dtype=wp.vec3d)
+        start_v_coefs: wp.array2d(dtype=wp.vec3d)  # sum_i shape_mi v_i at the start of the attempt, m/s
+        centre: wp.array2d(dtype=mat43)  # [world, facet] centre and derivatives, rows as of a FacetPoint
+        bulge: wp.array2d(dtype=wp.float64)  # [world, facet] largest height above the tangent plane at the centre, m
+        start_centre: wp.array2d(dtype=mat43)  # at the start of the attempt
+        box_lower: wp.array(dtype=wp.vec3)  # [world facet] boxes of the tree
+        box_upper: wp.array(dtype=wp.vec3)
         refit_lower: wp.array(dtype=wp.vec3)
         refit_upper: wp.array(dtype=wp.vec3)
         refit_needed: wp.array(dtype=wp.int32)  # a facet has left its box
-        refits: wp.array(dtype=wp.int32)  # number of refits so far
+        refit_count: wp.array(dtype=wp.int32)  # number of refits so far
         in_reach: wp.array2d(dtype=wp.int32)  # [world, facet row of the slaves] 1 if a master surface is within reach
         empty_box_lower: wp.array2d(dtype=wp.vec3)  # box without master facets, valid for refit `empty_box_refit`
         empty_box_upper: wp.array2d(dtype=wp.vec3)
         empty_box_refit: wp.array2d(dtype=wp.int32)
-        x0: wp.array2d(dtype=wp.vec3d)  # [world, point] position at the start of the attempt, m
+        start_position: wp.array2d(dtype=wp.vec3d)  # [world, point] position at the start of the attempt, m
         deepest_contact: wp.array2d(
             dtype=wp.float64
         )  # [world, body] largest depth of its points in contact at the start, m
         anchor_facet: wp.array2d(dtype=wp.int32)  # facet + 1 that its motion is relative to; 0: not yet set
         anchor_xi: wp.array2d(dtype=wp.vec3d)  # start coordinates on that facet
-        anchor_gap: wp.array2d(dtype=wp.vec2d)  # start value of the gap per outward coordinate, and its remainder, m
+        anchor_gap: wp.array2d(dtype=wp.vec2d)  # start value of (gap_slope, gap_offset), see Projection
         facet: wp.array2d(dtype=wp.int32)  # master facet at the iterate, -1: none; -2: penetrated completely
         xi: wp.array2d(dtype=wp.vec3d)
         projection: wp.array2d(dtype=wp.vec3d)  # coordinates of the projection on the facet
         depth: wp.array2d(dtype=wp.float64)
         initial_depth: wp.array2d(dtype=wp.float64)  # depth at the start of the attempt, m
-        normal: wp.array2d(dtype=wp.vec3d)  # of the facet there, minus the derivative of the depth by the position
+        normal: wp.array2d(dtype=wp.vec3d)  # unit normal of the facet there; -d(depth)/d(position)
         relative_motion: wp.array2d(dtype=wp.vec3d)  # in the step, relative to the master's material, m
-        elastic_slip: wp.array2d(dtype=wp.vec3d)  # motion plus friction spring, m
+        trial_displacement: wp.array2d(dtype=wp.vec3d)  # relative motion plus the stored elastic slip, m
         shape_values: wp.array3d(dtype=T)  # [world, point, local] shape values of the master's slots at the projection
         shape_gradient: wp.array3d(dtype=vec2)  # their derivatives by the facet coordinates
         geometric_tangent: wp.array3d(
             dtype=vec3
         )  # [world, point, 2] geometric stiffness by rotation of the facet, see `set_geometric_stiffness`
         geometric_curvature: wp.array2d(dtype=sym)  # geometric stiffness by change of the projection and by curvature
-        facet_rotation: wp.array2d(dtype=vec2)  # [world, point] of a product: rotation of the facet
+        facet_rotation: wp.array2d(
+            dtype=vec2
+        )  # [world, point] change of the facet's inclination by the direction of a product
         friction_shape: wp.array3d(dtype=T)  # shape values of friction, frozen with the friction limit
         frozen_motion: wp.array2d(dtype=wp.vec3d)
-        frozen_slip: wp.array2d(dtype=wp.vec3d)  # motion plus spring at freezing, m
+        frozen_trial_displacement: wp.array2d(dtype=wp.vec3d)  # `trial_displacement` at freezing, m
         frozen_displacement: wp.array2d(
             dtype=wp.vec3d
         )  # relative displacement by the frozen shape values at freezing, m
@@ -121,7 +126,9 @@ def pair_scratch_struct(dtype: str):
         lists_changed: wp.array(dtype=wp.int32)  # 1 if some point belongs to another list
         list_count: wp.array(dtype=wp.int32)  # [world facet] point counts during list construction
         chunk_offset: wp.array2d(dtype=wp.int32)  # [world, chunk of facets] number of preceding points
-        list_size: wp.array2d(dtype=wp.int32)  # [world, facet] number of points in its list, which begins at `start`
+        list_size: wp.array2d(
+            dtype=wp.int32
+        )  # [world, facet] number of points in its list, which begins at `list_start`
         list_start: wp.array2d(dtype=wp.int32)
         list_point: wp.array2d(dtype=wp.int32)  # [world, point]
 

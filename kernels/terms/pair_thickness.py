@@ -8,7 +8,7 @@ from ..common.types import kernel_module
 
 __all__ = ["depth_kernel", "thickness_kernel"]
 
-SIDES = 8
+MAX_INTERSECTIONS = 8
 """Maximum number of ray intersections."""
 
 
@@ -29,7 +29,7 @@ def thickness_kernel() -> wp.Kernel:
         skip = float(1.0e-5)
         way = skip
         out[i] = float(1.0)
-        for _ in range(SIDES):
+        for _ in range(MAX_INTERSECTIONS):
             hit = wp.mesh_query_ray(mesh, x[i] - way * n[i], -n[i], float(10.0))
             if not hit.result:
                 return

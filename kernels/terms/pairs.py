@@ -22,7 +22,7 @@ from .contact_structs import (
     contact_struct,
     facet_struct,
     history_struct,
-    of_world,
+    world_value,
 )
 from .facet_projection import facet_projection_functions
 from .facet_search import PENETRATED
@@ -41,7 +41,11 @@ def pair_functions(dtype: str) -> _types.SimpleNamespace:
         pair_scratch_struct(dtype),
     )
     k, normal_law = contact_point_functions(dtype, False), law_functions().normal_law
-    PointContact, with_friction_normal, damping_rate = k.PointContact, k.with_friction_normal, k.damping_rate
+    PointContact, with_friction_normal, normal_damping_rate = (
+        k.PointContact,
+        k.with_friction_normal,
+        k.normal_damping_rate,
+    )
 
     @wp.func
     def evaluate_pair_point(
@@ -49,16 +53,16 @@ def pair_functions(dtype: str) -> _types.SimpleNamespace:
     ) -> PointContact:
         """A point on its facet."""
         out = PointContact()
-        out.n = pair.normal[world, point]
+        out.normal = pair.normal[world, point]
         out.depth = pair.depth[world, point]
         out.depth_increment = out.depth - pair.initial_depth[world, point]
-        k_n = con.scale[world, c] * of_world(con.normal, world, c)
-        rate = damping_rate(con, scr, world, c, point, inv_h)
-        out.law = normal_law(con.law[c], 0, k_n, rate, con.ramp[c], con.force_eps[c], out.depth,
+        k_n = con.scale[world, c] * world_value(con.normal_stiffness, world, c)
+        rate = normal_damping_rate(con, scr, world, c, point, inv_h)
+        out.normal_response = normal_law(con.law[c], 0, k_n, rate, con.damping_ramp[c], con.force_eps[c], out.depth,
                              pair.initial_depth[world, point])  # fmt: skip
         out.relative_motion = pair.relative_motion[world, point]
-        out.elastic_slip = pair.elastic_slip[world, point]
-        return with_friction_normal(out, wp.normalize(out.n))
+        out.trial_displacement = pair.trial_displacement[world, point]
+        return with_friction_normal(out, wp.normalize(out.normal))
 
     return _types.SimpleNamespace(evaluate_pair_point=evaluate_pair_point)
 
@@ -74,9 +78,9 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
     Masters, PairHistory, PairScratch = master_struct(dtype), pair_history_struct(), pair_scratch_struct(dtype)
     k, places = contact_point_functions(dtype, False), facet_projection_functions(dtype)
     PointContact, evaluate_pair_point = k.PointContact, pair_functions(dtype).evaluate_pair_point
-    with_friction_normal, frozen_values, set_explicit_force = (
+    with_friction_normal, friction_parameters, set_explicit_force = (
         k.with_friction_normal,
-        k.frozen_values,
+        k.friction_parameters,
         k.set_explicit_force,
     )
     friction_potential, friction_force, point_stiffness = k.friction_potential, k.friction_force, k.point_stiffness
@@ -92,21 +96,21 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         """Forces of explicit contacts at the state that the attempt begins from."""
         world, item, q = wp.tid()
         c = facets.contact[item]
-        point = facets.point + item * facets.points + q
+        point = facets.first_point + item * facets.point_count + q
         if active[world] == 0 or facets.area_fraction[q, item] == f64(0.0) or con.is_explicit[c] == 0:
             return
         scr.explicit_force[world, point] = vec3d()
-        scr.explicit_spring[world, point] = vec3d()
-        delta = scr.depth[world, point]
+        scr.explicit_elastic_slip[world, point] = vec3d()
+        delta = scr.start_depth[world, point]
         if delta <= f64(0.0):
             return
         f = pair_his.facet[world, point] - 1
         xi = pair.anchor_xi[world, point]
-        s = surface_point(mas, pair.C0, pair.D0, world, f, xi)
-        n = wp.normalize(wp.cross(s.a, s.b))
+        s = surface_point(mas, pair.start_u_coefs, pair.start_director_coefs, world, f, xi)
+        n = wp.normalize(wp.cross(s.tangent_a, s.tangent_b))
         projection = vec3d(xi[0], xi[1], f64(0.0))
         v = k.interpolate(facets, v_n, world, q, item) - places.polynomial_value(
-            mas, pair.V0, pair.V0, world, f, projection
+            mas, pair.start_v_coefs, pair.start_v_coefs, world, f, projection
         )
         set_explicit_force(con, his, scr, world, c, point, delta, n, v, clock.h[world])
 
@@ -128,7 +132,7 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
     ):  # fmt: skip
         """Freeze the shape values of friction: store motion and relative displacement at this iterate."""
         pair.frozen_motion[world, point] = pair.relative_motion[world, point]
-        pair.frozen_slip[world, point] = pair.elastic_slip[world, point]
+        pair.frozen_trial_displacement[world, point] = pair.trial_displacement[world, point]
         pair.frozen_displacement[world, point] = relative_displacement(mas, facets, pair, u, world, q, item, point, f)
         pair.frozen_facet[world, point] = f
 
@@ -139,7 +143,7 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
     ):  # fmt: skip
         """Update the shape values of friction to those of the iterate."""
         world, item, q = wp.tid()
-        point = facets.point + item * facets.points + q
+        point = facets.first_point + item * facets.point_count + q
         if flags[world] == 0 or scr.activity[world, point] != WITH_STIFFNESS:
             return
         f = pair.facet[world, point]
@@ -158,9 +162,10 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         """
         xi = pair.projection[world, point]
         n = pair.normal[world, point]
-        s = surface_point(mas, pair.C, pair.D, world, f, xi)
-        b = places.second_derivatives(mas, pair.C, world, f, xi, n)
-        aa, bb, ab = wp.dot(s.a, s.a), wp.dot(s.b, s.b), wp.dot(s.a, s.b)
+        s = surface_point(mas, pair.u_coefs, pair.director_coefs, world, f, xi)
+        b = places.second_derivatives(mas, pair.u_coefs, world, f, xi, n)
+        ta, tb = s.tangent_a, s.tangent_b
+        aa, bb, ab = wp.dot(ta, ta), wp.dot(tb, tb), wp.dot(ta, tb)
         A = wp.mat22d(aa, ab, ab, bb)
         B = wp.mat22d(b[0], b[2], b[2], b[1])
         M = A - gap * B
@@ -171,8 +176,8 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         if force <= f64(0.0) or det <= f64(0.1) * wp.determinant(A):
             return  # no projection beyond the centre of curvature
         m = force * wp.inverse(M)
-        pair.geometric_tangent[world, point, 0] = vec3(m[0, 0] * s.a + m[0, 1] * s.b)
-        pair.geometric_tangent[world, point, 1] = vec3(m[1, 0] * s.a + m[1, 1] * s.b)
+        pair.geometric_tangent[world, point, 0] = vec3(m[0, 0] * ta + m[0, 1] * tb)
+        pair.geometric_tangent[world, point, 1] = vec3(m[1, 0] * ta + m[1, 1] * tb)
         N = (M @ wp.inverse(A) @ B) / force
         pair.geometric_curvature[world, point] = sym(T(gap * m[0, 0]), T(gap * m[1, 1]), T(gap * m[0, 1]), T(N[0, 0]),
             T(N[1, 1]),
@@ -192,30 +197,30 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
             pair.shape_values[world, point, i] = T(shape_value(mas, f, i, pair.anchor_xi[world, point]))
 
     @wp.func
-    def refuse_point(scr: ContactScratch, pair: PairScratch, world: int, point: int):
+    def reject_point(scr: ContactScratch, pair: PairScratch, world: int, point: int):
         """Infinite potential of a point that has passed through a body: the iterate is refused."""
-        scr.passed_through[world] = point + 1
+        scr.passed_point[world] = point + 1
         scr.activity[world, point] = FORCE_ONLY
         scr.force[world, point] = vec3d()
         pair.tangential_force[world, point] = vec3d()
         scr.energy[world, point] = wp.vec2d(f64(wp.inf), f64(0.0))
 
     @wp.func
-    def freeze_limits(
+    def freeze_friction(
         con: Contacts, his: History, scr: ContactScratch, world: int, c: int, point: int, s: PointContact, fresh: int
     ) -> vec3d:
         """Frozen friction limit, k_t and spring factor of a point; `fresh`: they and the normal are those of s."""
-        frozen = scr.frozen[world, point]
-        new = frozen_values(con, his, scr, world, c, point, s)
+        frozen = scr.frozen_friction[world, point]
+        new = friction_parameters(con, his, scr, world, c, point, s)
         if fresh != 0:
-            scr.frozen_normal[world, point] = s.m
+            scr.frozen_normal[world, point] = s.friction_normal
             frozen = new
             frozen[0] = wp.min(new[0], his.friction_limit[world, point])
-            scr.frozen[world, point] = frozen
+            scr.frozen_friction[world, point] = frozen
         frozen[1] = new[1]
         frozen[2] = f64(1.0)
-        scr.updated_normal[world, point] = s.m
-        scr.updated[world, point] = new
+        scr.updated_normal[world, point] = s.friction_normal
+        scr.updated_friction[world, point] = new
         return frozen
 
     @wp.func
@@ -241,18 +246,19 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         scr.activity[world, point] = WITH_STIFFNESS
         pair.tangential_force[world, point] = tangential_force
         set_geometric_stiffness(
-            mas, pair, world, point, f, scr.contact_distance[world, point] - s.depth, area_fraction * s.law[0]
+            mas, pair, world, point, f, scr.activation_gap[world, point] - s.depth, area_fraction * s.normal_response[0]
         )
-        scr.force[world, point] = tangential_force - (area_fraction * s.law[0]) * s.n
+        scr.force[world, point] = tangential_force - (area_fraction * s.normal_response[0]) * s.normal
         scr.energy[world, point] = wp.vec2d(
-            area_fraction * (s.law[2] + friction_energy), area_fraction * (s.law[3] + wp.abs(friction_energy))
+            area_fraction * (s.normal_response[2] + friction_energy),
+            area_fraction * (s.normal_response[3] + wp.abs(friction_energy)),
         )
         scr.stiffness[world, point] = sym(T(area_fraction * K[0, 0]), T(area_fraction * K[1, 1]),
             T(area_fraction * K[2, 2]), T(area_fraction * K[1, 2]), T(area_fraction * K[0, 2]),
             T(area_fraction * K[0, 1]))  # fmt: skip
 
     @wp.func
-    def change_list(scr: ContactScratch, pair: PairScratch, world: int, point: int, f: int):
+    def update_listed_facet(scr: ContactScratch, pair: PairScratch, world: int, point: int, f: int):
         """Facet whose list contains a point: its own where it has a force."""
         wanted = wp.int32(0)
         if scr.activity[world, point] != INACTIVE and f >= 0:
@@ -272,7 +278,7 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         if active[world] == 0:
             return
         c = facets.contact[item]
-        point = facets.point + item * facets.points + q
+        point = facets.first_point + item * facets.point_count + q
         area_fraction = facets.area_fraction[q, item]
         scr.activity[world, point] = INACTIVE
         f = pair.facet[world, point]
@@ -281,17 +287,17 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
                 f = pair_his.facet[world, point] - 1
                 apply_explicit_force(mas, scr, pair, world, point, f, area_fraction)
         elif f == PENETRATED:
-            refuse_point(scr, pair, world, point)
+            reject_point(scr, pair, world, point)
             f = -1
         elif f >= 0 and area_fraction > f64(0.0):
             inv_h = f64(0.0)
-            if clock.still == 0:
+            if clock.is_static == 0:
                 inv_h = f64(1.0) / clock.h[world]
             s = evaluate_pair_point(con, scr, pair, world, c, point, inv_h)
-            frozen = freeze_limits(con, his, scr, world, c, point, s, fresh)
+            frozen = freeze_friction(con, his, scr, world, c, point, s, fresh)
             m = scr.frozen_normal[world, point]
-            if wp.dot(m, s.m) <= f64(0.5):  # the point has passed to another facet since
-                m = s.m
+            if wp.dot(m, s.friction_normal) <= f64(0.5):  # the point has passed to another facet since
+                m = s.friction_normal
                 scr.frozen_normal[world, point] = m
             set_master_shapes(mas, pair, world, point, f, fresh != 0 or frozen[0] <= f64(0.0))
             if fresh != 0:
@@ -301,20 +307,22 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
                     mas, facets, pair, u, world, q, item, point, pair.frozen_facet[world, point]
                 )
                 s.relative_motion = pair.frozen_motion[world, point] + (shift - pair.frozen_displacement[world, point])
-                s.elastic_slip = pair.frozen_slip[world, point] + (shift - pair.frozen_displacement[world, point])
+                s.trial_displacement = pair.frozen_trial_displacement[world, point] + (
+                    shift - pair.frozen_displacement[world, point]
+                )
             s = with_friction_normal(s, m)
             if s.depth > f64(0.0) or frozen[0] > f64(0.0):
                 store_force(con, mas, scr, pair, world, c, point, f, s, frozen, inv_h, area_fraction)
         elif area_fraction > f64(0.0):
             frozen = vec3d()
-            scr.updated[world, point] = frozen
+            scr.updated_friction[world, point] = frozen
             if fresh != 0:
-                scr.frozen[world, point] = frozen
+                scr.frozen_friction[world, point] = frozen
                 scr.frozen_normal[world, point] = frozen
-        change_list(scr, pair, world, point, f)
+        update_listed_facet(scr, pair, world, point, f)
 
     @wp.kernel(module=module)
-    def gather_masters(
+    def gather_master_forces(
         mas: Masters, active: wp.array(dtype=wp.int32), lanes: int, scr: ContactScratch, pair: PairScratch,
         pool: wp.array2d(dtype=vec3),
     ):  # fmt: skip
@@ -322,9 +330,9 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         world, index = wp.tid()
         if active[world] == 0:
             return
-        entry = wp.min(index / lanes, mas.count * mas.conn.shape[0] - 1)
-        f = entry % mas.count
-        i = entry / mas.count
+        entry = wp.min(index / lanes, mas.facet_count * mas.conn.shape[0] - 1)
+        f = entry % mas.facet_count
+        i = entry / mas.facet_count
         total = vec3()
         first = pair.list_start[world, f]
         for k in range(index % lanes, pair.list_size[world, f], lanes):
@@ -334,26 +342,26 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
             total -= pair.friction_shape[world, point, i] * vec3(tangential_force)
         total = lane_sum(total, lanes)
         if index % lanes == 0:
-            pool[world, mas.pool + entry] = total
+            pool[world, mas.first_entry + entry] = total
 
     @wp.func
-    def times(k: sym, p: vec3) -> vec3:
+    def multiply_symmetric(k: sym, p: vec3) -> vec3:
         """The symmetric matrix k (Voigt) times p."""
         return vec3(k[0] * p[0] + k[5] * p[1] + k[4] * p[2], k[5] * p[0] + k[1] * p[1] + k[3] * p[2],
                     k[4] * p[0] + k[3] * p[1] + k[2] * p[2])  # fmt: skip
 
     @wp.kernel(module=module)
-    def product_points(
+    def point_products(
         mas: Masters, facets: Facets, active: wp.array(dtype=wp.int32), p: wp.array2d(dtype=vec3), scr: ContactScratch,
         pair: PairScratch,
     ):  # fmt: skip
         """K times the relative displacement of each point."""
         world, item, q = wp.tid()
-        if active[world] == 0 or scr.facet_activity[world, facets.row + item] != WITH_STIFFNESS:
+        if active[world] == 0 or scr.facet_activity[world, facets.first_row + item] != WITH_STIFFNESS:
             return
-        point = facets.point + item * facets.points + q
+        point = facets.first_point + item * facets.point_count + q
         if scr.activity[world, point] != WITH_STIFFNESS:
-            scr.product[world, point] = vec3()
+            scr.point_product[world, point] = vec3()
             pair.facet_rotation[world, point] = vec2()
             return
         f = pair.listed_facet[world, point] - 1
@@ -370,15 +378,15 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         b = pair.geometric_tangent[world, point, 1]
         g = pair.geometric_curvature[world, point]
         tau = vec2(wp.dot(a, d), wp.dot(b, d))
-        scr.product[world, point] = (
-            times(scr.stiffness[world, point], d)
+        scr.point_product[world, point] = (
+            multiply_symmetric(scr.stiffness[world, point], d)
             + (e[0] + g[3] * tau[0] + g[5] * tau[1]) * a
             + (e[1] + g[5] * tau[0] + g[4] * tau[1]) * b
         )
         pair.facet_rotation[world, point] = tau + vec2(g[0] * e[0] + g[2] * e[1], g[2] * e[0] + g[1] * e[1])
 
     @wp.kernel(module=module)
-    def product_sides(
+    def gather_pair_products(
         mas: Masters, facets: Facets, active: wp.array(dtype=wp.int32), lanes: int, last: int, scr: ContactScratch,
         pair: PairScratch, pool: wp.array2d(dtype=vec3),
     ):  # fmt: skip
@@ -388,25 +396,26 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         if active[world] == 0:
             return
         out = vec3()
-        own = facets.count * facets.conn.shape[0]
+        own = facets.facet_count * facets.conn.shape[0]
         entry = wp.min(index / lanes, last)
         lane = index % lanes
-        place = facets.pool + entry
+        place = facets.first_entry + entry
         if entry < own:
-            item = entry % facets.count
-            i = entry / facets.count
-            if scr.facet_activity[world, facets.row + item] == WITH_STIFFNESS:
-                for q in range(lane, facets.points, lanes):
-                    out += facets.shape[q, i, item] * scr.product[world, facets.point + item * facets.points + q]
+            item = entry % facets.facet_count
+            i = entry / facets.facet_count
+            first_point = facets.first_point + item * facets.point_count
+            if scr.facet_activity[world, facets.first_row + item] == WITH_STIFFNESS:
+                for q in range(lane, facets.point_count, lanes):
+                    out += facets.shape[q, i, item] * scr.point_product[world, first_point + q]
         else:
             entry -= own
-            place = mas.pool + entry
-            f = entry % mas.count
-            i = entry / mas.count
+            place = mas.first_entry + entry
+            f = entry % mas.facet_count
+            i = entry / mas.facet_count
             first = pair.list_start[world, f]
             for k in range(lane, pair.list_size[world, f], lanes):
                 point = pair.list_point[world, first + k]
-                out -= pair.shape_values[world, point, i] * scr.product[world, point]
+                out -= pair.shape_values[world, point, i] * scr.point_product[world, point]
                 out += wp.dot(pair.shape_gradient[world, point, i], pair.facet_rotation[world, point]) * vec3(
                     pair.normal[world, point]
                 )
@@ -415,7 +424,7 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
             pool[world, place] = out
 
     @wp.kernel(module=module)
-    def diagonal_masters(
+    def master_diagonal(
         mas: Masters, active: wp.array(dtype=wp.int32), scr: ContactScratch, pair: PairScratch,
         pool: wp.array2d(dtype=sym)
     ):  # fmt: skip
@@ -429,10 +438,11 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
             if scr.activity[world, point] == WITH_STIFFNESS:
                 s = pair.shape_values[world, point, i]
                 out += s * s * scr.stiffness[world, point]
-        pool[world, mas.pool + i * mas.count + f] = out
+        pool[world, mas.first_entry + i * mas.facet_count + f] = out
 
     return _types.SimpleNamespace(
         module=module, explicit_forces=explicit_forces, forces=forces, update_friction_shapes=update_friction_shapes,
-        gather_masters=gather_masters, product_points=product_points, product_sides=product_sides,
-        diagonal_masters=diagonal_masters,
+        gather_master_forces=gather_master_forces, point_products=point_products,
+        gather_pair_products=gather_pair_products,
+        master_diagonal=master_diagonal,
     )  # fmt: skip

@@ -349,7 +349,7 @@ def turntable_case(law: str, *, turns: int = 10, device: Any = "cpu") -> dict[st
 
 
 SIDE = 0.1
-STACK = {"side": SIDE, "density": DENSITY, "nu": 0.3, "mu": 0.5, "element": "T4", "cells": 1}
+STACK_SIZE = {"side": SIDE, "density": DENSITY, "nu": 0.3, "mu": 0.5, "element": "T4", "cells": 1}
 """Of the cubes; the lowest is clamped below."""
 
 
@@ -424,6 +424,6 @@ TABLE = Table(
         "block": {"E": E, "sphere_radius": 1.0, "contact_radius": A, "even_zone_in_radii": WIDTH, "tol": 1e-8},
         "ball": {"E": BALL_E, "nu": NU, "density": DENSITY, "radius": RADIUS, "speed": THROWN, "tol": 1e-8},
         "cube": CUBE,
-        "stack": STACK,
+        "stack": STACK_SIZE,
     },
 )

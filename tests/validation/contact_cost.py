@@ -30,7 +30,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import warp as wp
-from warpfea.kernels.terms.contact_structs import RECORD
+from warpfea.kernels.terms.contact_structs import RECORD_NAMES
 
 import warpfea as wf
 from warpfea.base.devices import find_device
@@ -80,7 +80,7 @@ class _Runner:
                 self.pcg += int(report.pcg[0])
                 self.halvings += int(report.halvings[0])
                 if self.term is not None:
-                    column = self.term.report_offset + RECORD.index("normal_force")
+                    column = self.term.report_offset + RECORD_NAMES.index("normal_force")
                     self.carried += float(self.sim.stepper.work.report.numpy()[0, column]) / WEIGHT
 
 

@@ -9,7 +9,7 @@ from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar
 
 import warp as wp
 
-from ..kernels.common.lanes import WARP
+from ..kernels.common.lanes import WARP_SIZE
 from .console import quiet_warp
 from .errors import ModelError
 
@@ -72,11 +72,11 @@ class Launcher:
         """Lanes that share a row of the given number of entries: a power of two; one on the CPU."""
         if not self.device.is_cuda:
             return 1
-        return min(WARP, 1 << max(0, max(per_row, 1).bit_length() - 1))
+        return min(WARP_SIZE, 1 << max(0, max(per_row, 1).bit_length() - 1))
 
     def padded(self, threads: int) -> int:
         """Threads rounded up to whole warps, for sums over lanes."""
-        return -(-threads // WARP) * WARP if self.device.is_cuda else threads
+        return -(-threads // WARP_SIZE) * WARP_SIZE if self.device.is_cuda else threads
 
     def tiled(self, kernel: wp.Kernel, dim: Sequence[int], inputs: list[Any], block_dim: int = 256) -> None:
         """Launch one block per item of `dim`."""

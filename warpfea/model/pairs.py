@@ -245,8 +245,8 @@ def contact_constants(
         shear += 2.0 * (2.0 - nu) * (1.0 + nu) / E
     a = contact.radius or math.sqrt(area / math.pi)
     return {
-        "normal": 4.0 / 3.0 * a / compliance,
-        "tangent": 8.0 * a / shear,
+        "normal_stiffness": 4.0 / 3.0 * a / compliance,
+        "tangential_stiffness": 8.0 * a / shear,
         "damping_stiffness": 2.0 * a / compliance,
-        "mass": 1.0 / inverse_mass,
+        "effective_mass": 1.0 / inverse_mass,
     }

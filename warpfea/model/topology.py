@@ -20,13 +20,13 @@ def make_topology(model: Any) -> Any:
     """The Topology struct: contributions of the elements, mass matrix, prescribed components."""
     topo = topology_struct(model.dtype)()
     start, entry = assembly.gather_table([b.connectivity for b in model.blocks], model.slots)
-    topo.start = model.array("topology", start, wp.int32)
-    topo.entry = model.array("topology", entry, wp.int32)
+    topo.contribution_start = model.array("topology", start, wp.int32)
+    topo.contribution_entry = model.array("topology", entry, wp.int32)
     topo.mass_start = model.array("mass", model.mass_host.indptr, wp.int32)
     topo.mass_column = model.array("mass", model.mass_host.indices, wp.int32)
     topo.mass_value = model.masses.values
     topo.free = model.array("slots", model.free_host, model.types.vec3)
-    topo.prescribed = model.array("slots", (model.free_host == 0.0) @ [1, 2, 4], wp.uint8)
+    topo.prescribed_bits = model.array("slots", (model.free_host == 0.0) @ [1, 2, 4], wp.uint8)
     model.terms.join(topo)
     return topo
 

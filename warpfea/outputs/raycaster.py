@@ -201,42 +201,42 @@ class Renderer:
         scene.forward = wp.vec3(*forward)
         scene.right = wp.vec3(*(right * tangent * size[0] / size[1]))
         scene.up = wp.vec3(*(up * tangent))
-        scene.center = wp.vec2(*camera.center)
-        scene.width, scene.height = float(size[0]), float(size[1])
+        scene.principal_point = wp.vec2(*camera.center)
+        scene.width_pixels, scene.height_pixels = float(size[0]), float(size[1])
         side = 0.55 * up - 0.55 * right - 0.45 * forward + np.array([0.0, 0.0, 0.75])
         self._light = side / np.linalg.norm(side)
-        scene.light = wp.vec3(*self._light)
+        scene.light_direction = wp.vec3(*self._light)
         scene.has_ground = 0
         if self.ground is not None and camera.eye[2] > self.ground:
             scene.has_ground = 1
-            scene.ground = float((self.ground - camera.target[2]) / camera.size) - 2e-3
-            scene.grid = nice_number(0.2 * camera.size) / camera.size
-            scene.fade = 2.2
+            scene.ground_height = float((self.ground - camera.target[2]) / camera.size) - 2e-3
+            scene.grid_spacing = nice_number(0.2 * camera.size) / camera.size
+            scene.fade_radius = 2.2
         return scene
 
     def _cast_shadow(self, wp: Any, raycast: Any, scene: Any, unit: Floats, cells: int = 160) -> None:
         """Fill the light map of the ground, over the area of possible shadow."""
-        scene.shadow = wp.ones((1, 1), dtype=float)
-        scene.shadow_cell = 1.0
+        scene.shadow_map = wp.ones((1, 1), dtype=float)
+        scene.shadow_cell_size = 1.0
         if not scene.has_ground:
             return
         lights = cone_directions(self._light, 0.14, 40)
         lights = lights[lights[:, 2] > 0.05]
-        fall = np.maximum(unit[:, 2] - scene.ground, 0.0)[:, None, None]
+        fall = np.maximum(unit[:, 2] - scene.ground_height, 0.0)[:, None, None]
         spots = unit[:, None, :2] - fall * (lights[:, :2] / lights[:, 2:])[None, ::4]
         low, high = spots.min(axis=(0, 1)), spots.max(axis=(0, 1))
         cell = float(max((high - low).max(), 1e-6)) / (cells - 4)
         shape = np.ceil((high - low) / cell).astype(int) + 4
-        scene.shadow_low, scene.shadow_cell = wp.vec2(*(low - 2 * cell)), cell
+        scene.shadow_map_corner, scene.shadow_cell_size = wp.vec2(*(low - 2 * cell)), cell
         shadow = wp.empty(tuple(map(int, shape)), dtype=float)
         wp.launch(raycast.cast_shadow, shadow.shape, [scene, wp.array(lights, dtype=wp.vec3), shadow])
-        scene.shadow = shadow
+        scene.shadow_map = shadow
 
     @staticmethod
     def _cast(wp: Any, raycast: Any, scene: Any, samples: Floats) -> npt.NDArray[np.float32]:
         out = wp.empty(len(samples), dtype=wp.vec3)
         if len(samples):
-            wp.launch(raycast.cast, len(samples), [scene, wp.array(samples, dtype=wp.vec2), out])
+            wp.launch(raycast.cast_rays, len(samples), [scene, wp.array(samples, dtype=wp.vec2), out])
         return out.numpy()
 
 

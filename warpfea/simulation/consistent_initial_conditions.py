@@ -342,7 +342,7 @@ def constraint_rates(
     a, b, a2 = (tables.reference_host + moved).reshape(count, 3, 3).swapaxes(0, 1)
     da, db, da2 = speed.reshape(count, 3, 3).swapaxes(0, 1)
     kind, scale = tables.data.kind.numpy(), tables.scale_host
-    f, df, ddf = tables.data.fixed.numpy().copy(), np.zeros(count), np.zeros(count)
+    f, df, ddf = tables.data.constant_target.numpy().copy(), np.zeros(count), np.zeros(count)
     law, component = tables.data.law.numpy(), tables.data.law_component.numpy()
     on = law >= 0
     f[on] += laws[0][law[on], component[on]]

@@ -157,7 +157,7 @@ def check_initial_constraints(sim: Any, mask: np.ndarray | None = None) -> None:
     """Raise ConstraintError if dynamics starts with violated constraints, in the worlds of the mask (B,)."""
     if sim.model.constraints is None or sim.integrator.static:
         return
-    for world, values in enumerate(sim.stepper.work.multipliers.value.numpy()):
+    for world, values in enumerate(sim.stepper.work.multipliers.constraint_value.numpy()):
         if mask is not None and not mask[world]:
             continue
         names, worst = _violated(sim.model, values, MAX_INITIAL_VIOLATION * sim.model.size)
@@ -173,7 +173,7 @@ def check_initial_constraints(sim: Any, mask: np.ndarray | None = None) -> None:
 def _constraint_error(sim: Any, world: int, time: float, halvings: int) -> ConstraintError:
     """Error of constraints that stay violated at equilibrium."""
     tol = sim.stepper.newton.constraint_tol
-    names, values = _violated(sim.model, sim.stepper.work.multipliers.value.numpy()[world], tol)
+    names, values = _violated(sim.model, sim.stepper.work.multipliers.constraint_value.numpy()[world], tol)
     listed = ", ".join(f"{name!r} by {value:.3g} m" for name, value in zip(names[:4], values[:4]))
     few = "" if isinstance(sim.solver, NewtonPCG) else ", or Jacobi's iterations are too few"
     return ConstraintError(

@@ -11,12 +11,12 @@ from ..base.errors import ModelError
 from ..base.names import did_you_mean, listing
 from ..base.short_repr import lines
 from ..kernels.step.episodes import JOINT_VALUES, MOTION_KINDS, observation_kernels
-from ..kernels.terms.contact_structs import RECORD
+from ..kernels.terms.contact_structs import RECORD_NAMES
 
 __all__ = ["Observations"]
 
 JOINT_REPORT = {"force": (0, 3), "moment": (3, 3), "violation": (6, 1)}
-CONTACT_REPORT = {"force": (0, 3), "moment": (3, 3)} | {name: (k, 1) for k, name in enumerate(RECORD) if k > 5}
+CONTACT_REPORT = {"force": (0, 3), "moment": (3, 3)} | {name: (k, 1) for k, name in enumerate(RECORD_NAMES) if k > 5}
 FORMS = "'time', 'body.NAME.position', 'probe.NAME.velocity', 'joint.NAME.angle' or 'contact.NAME.force'"
 
 

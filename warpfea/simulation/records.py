@@ -10,7 +10,7 @@ from ..base.errors import ModelError
 from ..base.names import did_you_mean, listing
 from ..kernels.step.step_control import REPORT
 from ..kernels.terms.constraints import JOINT_COLUMNS
-from ..kernels.terms.contact_structs import RECORD
+from ..kernels.terms.contact_structs import RECORD_NAMES
 from ..model.contacts import Contact
 from ..model.joints import Joint
 from ..model.pairs import PairContact
@@ -110,9 +110,9 @@ class Records(Results):
     def contact_record(self, contact: Contact | PairContact | str) -> ContactRecord:
         """Record of a contact (handle or name), one entry per step."""
         first = 1 + self._contact_column(contact) - len(REPORT)
-        table = self._table([0, *range(first, first + len(RECORD))])
+        table = self._table([0, *range(first, first + len(RECORD_NAMES))])
         names = ("normal_force", "penetration", "slip", "area", "stick", "stored", "loss", "friction", "collider_work")
-        scalars = {name: table[:, :, 1 + RECORD.index(name)] for name in names}
+        scalars = {name: table[:, :, 1 + RECORD_NAMES.index(name)] for name in names}
         return ContactRecord(self._times(table), table[:, :, 1:4], table[:, :, 4:7], **scalars)
 
     def contact_force(self, contact: Contact | PairContact | str) -> np.ndarray:
@@ -131,7 +131,7 @@ class Records(Results):
         for other in contacts:
             if other is contact or other.name == contact:
                 term: Any = terms.contact if isinstance(other, Contact) else terms.pairs
-                return term.report_offset + len(RECORD) * term.tables.number[other.index]
+                return term.report_offset + len(RECORD_NAMES) * term.tables.number[other.index]
         names = [c.name for c in contacts]
         raise ModelError(
             f"expected a contact of this model (a handle from add_contact, or a name), got {contact!r}; it has: "

@@ -101,8 +101,9 @@ def make_clusters(model: Model) -> ModelClusters:
         offset += len(tables.slot)
     topo = topology_struct(model.dtype)()
     start, entry = assembly.gather_table([of[:, None] for of in slots], model.slots)
-    topo.start, topo.entry = model.array("clusters", start, wp.int32), model.array("clusters", entry, wp.int32)
-    topo.prescribed = model.topology.prescribed
+    topo.contribution_start = model.array("clusters", start, wp.int32)
+    topo.contribution_entry = model.array("clusters", entry, wp.int32)
+    topo.prescribed_bits = model.topology.prescribed_bits
     return ModelClusters(blocks, topo, offset)
 
 

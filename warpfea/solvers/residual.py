@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import warp as wp
 
 from ..base.launch import labelled
-from ..kernels.common.lanes import WARP
-from ..kernels.common.reduce import CHUNK, WARP_ROW, reduce_kernels
-from ..kernels.common.structs import additions_struct
+from ..kernels.common.lanes import WARP_SIZE
+from ..kernels.common.reduce import CHUNK, MAX_WARP_ROW, reduce_kernels
+from ..kernels.common.structs import product_terms_struct
 from ..kernels.solvers.newton import newton_kernels
 from ..kernels.solvers.newton_control import GROUP_ROWS, LANES, TERM_ROWS
 from ..kernels.solvers.vectors import vector_kernels
@@ -54,8 +54,8 @@ class Reducer:
     def __call__(self, rows: wp.array, count: int, active: wp.array, out: wp.array) -> None:
         """out[k] = sum of rows[k], k < count, in the active worlds."""
         n = rows.shape[2]
-        if n <= WARP_ROW:
-            lanes = self.launch.lanes(WARP)
+        if n <= MAX_WARP_ROW:
+            lanes = self.launch.lanes(WARP_SIZE)
             self.launch(self.kernels.short_sums, count * self.worlds * lanes, [rows, lanes, active, out])
             return
         if n > CHUNK:
@@ -141,13 +141,14 @@ class Residual:
     def _additions(self) -> Any:
         """Terms of a product H p beyond the elements' part."""
         m, w = self.model, self.work
-        out = additions_struct(m.dtype)()
+        out = product_terms_struct(m.dtype)()
         of = m.terms.side_topology if m.terms.traits.tangent else m.topology
-        out.start, out.entry, out.contribution = of.start, of.entry, w.nonpotential_tangent
+        out.contribution_start, out.contribution_entry = of.contribution_start, of.contribution_entry
+        out.contribution = w.nonpotential_tangent
         out.pool = w.pool_product
         if m.terms.traits.pooled:
             out.pool_start, out.pool_entry = m.topology.pool_start, m.topology.pool_entry
-        out.mass_factor, out.dq_dv, out.warp = w.step.mass_factor, w.step.dq_dv, w.warp
+        out.mass_factor, out.dq_dv, out.warp_lanes = w.step.mass_factor, w.step.dq_dv, w.warp
         return out
 
     @property

@@ -65,7 +65,7 @@ class RigidBodyModes:
         self.number = mode_bodies(model)
         n, B, T = len(self.number), model.worlds, model.types.T
         self.bodies = self._bodies()
-        self.bodies.arm = work.array("motions arm", (B, model.slots), wp.vec3d)
+        self.bodies.lever_arm = work.array("motions arm", (B, model.slots), wp.vec3d)
         most = max(model.bodies[k].slot_count for k in self.number)
         self.parts = work.array("motions parts", (B, n, lanes_for(most), 3), wp.mat33d)
         self.dense = DenseInverse(model, work, launch, "motions", RIGID_MODES * n)
@@ -87,15 +87,15 @@ class RigidBodyModes:
         allowed = np.array([_free_modes(m, k) for k in self.number])
         out = bodies_struct(m.dtype)()
         tables: dict[str, tuple[Any, Any]] = {
-            "first": ([body.slot_offset for body in chosen], wp.int32),
-            "last": ([body.slot_offset + body.slot_count for body in chosen], wp.int32),
-            "size": (size, wp.float64),
-            "translations": (allowed[:, :3], wp.vec3d),
-            "rotations": (allowed[:, 3:], wp.vec3d),
+            "first_slot": ([body.slot_offset for body in chosen], wp.int32),
+            "end_slot": ([body.slot_offset + body.slot_count for body in chosen], wp.int32),
+            "body_size": (size, wp.float64),
+            "free_translations": (allowed[:, :3], wp.vec3d),
+            "free_rotations": (allowed[:, 3:], wp.vec3d),
             "centre_slots": (np.array(sample).T, wp.int32),
-            "of_slot": (of_slot, wp.int32),
+            "body_of_slot": (of_slot, wp.int32),
             "is_position": (place, m.types.T),
-            "X": (X, wp.vec3d),
+            "slot_reference": (X, wp.vec3d),
         }
         for name, (values, dtype) in tables.items():
             setattr(out, name, m.array("motions", np.ascontiguousarray(values), dtype))

@@ -30,15 +30,15 @@ def mesh_tables(model: Model, shapes: Sequence[Shape]) -> Any:
     def put(name: str, values: Any, dtype: Any) -> None:
         setattr(out, name, model.array("contact", np.ascontiguousarray(values), dtype))
 
-    put("box", [boxes[k] if k >= 0 else 0 for k in index], wp.int32)
-    put("leaf", [leaves[k] if k >= 0 else 0 for k in index], wp.int32)
-    put("inner", [len(parts[k].start) - 2 if k >= 0 else 0 for k in index], wp.int32)
-    put("low", np.concatenate([p.low for p in parts]), wp.vec3d)
-    put("high", np.concatenate([p.high for p in parts]), wp.vec3d)
-    put("start", np.concatenate([p.start + n for p, n in zip(parts, triangles)]), wp.int32)
+    put("first_box", [boxes[k] if k >= 0 else 0 for k in index], wp.int32)
+    put("first_leaf", [leaves[k] if k >= 0 else 0 for k in index], wp.int32)
+    put("inner_count", [len(parts[k].start) - 2 if k >= 0 else 0 for k in index], wp.int32)
+    put("box_low", np.concatenate([p.low for p in parts]), wp.vec3d)
+    put("box_high", np.concatenate([p.high for p in parts]), wp.vec3d)
+    put("leaf_start", np.concatenate([p.start + n for p, n in zip(parts, triangles)]), wp.int32)
     put("corner", np.concatenate([p.corner for p in parts], axis=1), wp.vec3d)
     put("normal", np.concatenate([p.normal for p in parts], axis=1), wp.vec3d)
-    put("border", np.concatenate([p.border for p in parts], axis=1), wp.int32)
+    put("feature_kind", np.concatenate([p.border for p in parts], axis=1), wp.int32)
     return out
 
 

@@ -137,14 +137,14 @@ class ConstraintTables:
         tables: dict[str, tuple[Any, Any]] = {
             "kind": ([r.kind for r in rows], wp.int32),
             "scale": (self.scale_host, wp.float64),
-            "constant": ([r.constant for r in rows], wp.float64),
-            "fixed": ([r.fixed for r in rows], wp.float64),
+            "reference_product": ([r.constant for r in rows], wp.float64),
+            "constant_target": ([r.fixed for r in rows], wp.float64),
             "law": (law, wp.int32),
             "law_component": ([r.component for r in rows], wp.int32),
-            "component": (self.component_host, wp.int32),
-            "start": (start, wp.int32),
-            "slot": (slot, wp.int32),
-            "weight": (weight, wp.float64),
+            "connected_component": (self.component_host, wp.int32),
+            "term_start": (start, wp.int32),
+            "term_slot": (slot, wp.int32),
+            "term_weight": (weight, wp.float64),
             "reference": (self.reference_host, wp.vec3d),
             "slot_start": (slot_start, wp.int32),
             "slot_term": (term[order], wp.int32),
@@ -190,13 +190,13 @@ class ConstraintTables:
             "cluster": (self.cluster_host, wp.int32),
             "cluster_start": (first, wp.int32),
             "matrix_start": (np.concatenate([[0], np.cumsum(n**2)[:-1]]), wp.int32),
-            "pair": (pair_start, wp.int32),
+            "pair_start": (pair_start, wp.int32),
             "pair_side": (np.reshape(pair_side or [(0, 0)], (-1, 2)), wp.vec2i),
             "pair_block": (pair_block or [0], wp.int32),
-            "couple_start": (couple_start, wp.int32),
-            "couple_row": (couple_row if len(couple_row) else [0], wp.int32),
-            "couple_column": (couple_column or [0], wp.int32),
-            "couple_pair": (couple_pair, wp.int32),
+            "coupling_start": (couple_start, wp.int32),
+            "coupling_row": (couple_row if len(couple_row) else [0], wp.int32),
+            "coupling_column": (couple_column or [0], wp.int32),
+            "coupling_pair_start": (couple_pair, wp.int32),
             "colour": (self.colour_host, wp.int32),
             "colour_cluster": (np.argsort(self.colour_host, kind="stable"), wp.int32),
         }
@@ -289,14 +289,14 @@ class ConstraintTables:
             if not self.child_host[own].any():  # child in space: the parent's reaction
                 side[own] = -1
         tables: dict[str, tuple[Any, Any]] = {
-            "first": ([rows[0] for rows in self.rows_of], wp.int32),
-            "last": ([rows[-1] + 1 for rows in self.rows_of], wp.int32),
+            "first_row": ([rows[0] for rows in self.rows_of], wp.int32),
+            "end_row": ([rows[-1] + 1 for rows in self.rows_of], wp.int32),
             "anchor": ([joint.anchor.value for joint in self.joints], wp.vec3d),
             "anchor_start": (np.concatenate([[0], np.cumsum([len(a[0]) for a in anchors])]), wp.int32),
             "anchor_slot": (np.concatenate([a[0] for a in anchors] + [np.zeros(1)]), wp.int32),
             "anchor_weight": (np.concatenate([a[1] for a in anchors] + [np.zeros(1)]), wp.float64),
-            "role": (side * (1 + position[self.slot_host]), wp.int32),
-            "place": (place[self.slot_host], wp.vec3d),
+            "entry_role": (side * (1 + position[self.slot_host]), wp.int32),
+            "slot_position": (place[self.slot_host], wp.vec3d),
         }
         for name, (values, dtype) in tables.items():
             setattr(data, name, m.array("constraints", np.asarray(values), dtype))

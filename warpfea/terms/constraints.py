@@ -100,8 +100,8 @@ class Constraints(Term):
             "end_gradient": ((B, 3 * M), wp.vec3d),
             "product": ((B, 3 * M), wp.vec3d),
             "violation": ((B, model.component_count), wp.float64),
-            "block": ((B, max(con.block_count, 1)), wp.mat33d),
-            "matrix": ((B, con.matrix_entries), wp.float64),
+            "compliance_block": ((B, max(con.block_count, 1)), wp.mat33d),
+            "inverse_matrix": ((B, con.matrix_entries), wp.float64),
             "coupling": ((B, max(con.couple_count, 1)), wp.float64),
         }
         for name, var in multiplier_struct().vars.items():
@@ -122,7 +122,7 @@ class Constraints(Term):
         deflated."""
         ctx.work.newton.violation = ctx.work.multipliers.violation
         mul, options = ctx.work.multipliers, ctx.options
-        mul.outer_updates, mul.kappa = int(options.classical), options.kappa
+        mul.outer_updates, mul.penalty_ratio = int(options.classical), options.kappa
         deflate = bool(options.deflate)
         sizes = self.tables.cluster_sizes
         large = np.flatnonzero(sizes > THREAD_LIMIT)
@@ -235,7 +235,7 @@ class Constraints(Term):
 
     def cached_inputs(self, ctx: StepContext) -> list[tuple[str, wp.array]]:
         mul = ctx.work.multipliers
-        return [("gradient", mul.gradient), ("stiffness", mul.stiffness)]
+        return [("gradient", mul.gradient), ("stiffness", mul.penalty)]
 
     def copy_cached(self, ctx: StepContext, kept: CachedInputs, reuse: Any, accepted: wp.array) -> bool:
         args = [reuse, accepted, *kept.live, *kept.state, *kept.place]
@@ -303,16 +303,16 @@ class Constraints(Term):
         laws.evaluate(launch, state, state.time, wp.ones(B, dtype=wp.float64, device=m.device), every, value)
         mul = multiplier_struct()()
         for name in (
-            "value",
+            "constraint_value",
             "target",
             "last_target",
-            "scale",
-            "force",
-            "change",
-            "trial",
+            "signed_scale",
+            "multiplier",
+            "multiplier_change",
+            "trial_multiplier",
             "frozen_force",
             "penalty_force",
-            "stiffness",
+            "penalty",
         ):
             setattr(mul, name, zeros((B, con.count), wp.float64))
         for name in ("gradient", "product"):
@@ -321,7 +321,7 @@ class Constraints(Term):
         mul.rows = zeros((TERM_ROWS, B, con.count), wp.float64)
         mul.violation = zeros((B, m.component_count), wp.float64)
         if multipliers is not None:
-            mul.force.assign(np.tile(multipliers, (B, 1)))
+            mul.multiplier.assign(np.tile(multipliers, (B, 1)))
         mul.last_target.fill_(np.nan)  # any number of turns is valid
         args = [con.data, state.displacement, state.displacement, value, zeros((B,), wp.float64), every, mul]
         launch(self.kernels.evaluate, self.dim, args)
@@ -330,7 +330,7 @@ class Constraints(Term):
     def values(self, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Values [world, row], gradients [world, 3 row + side, 3] and right-hand sides [world, row] at a state."""
         mul = self.evaluate(state)
-        return mul.value.numpy(), mul.gradient.numpy(), mul.target.numpy()
+        return mul.constraint_value.numpy(), mul.gradient.numpy(), mul.target.numpy()
 
     def jacobian(self, state: State, world: int) -> sp.csr_matrix:
         """dc/dq of one world, (rows, 3 slots) CSR."""

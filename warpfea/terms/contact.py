@@ -11,9 +11,9 @@ import warp as wp
 from ..base.errors import PenetrationError
 from ..kernels.common.traits import Traits
 from ..kernels.solvers.newton_control import FAIL_FLOOR, FAIL_WORK
-from ..kernels.terms.contact import MAX_ROTATION, RELAX_LANES, contact_kernels
+from ..kernels.terms.contact import AITKEN_LANES, MAX_COLLIDER_ROTATION, contact_kernels
 from ..kernels.terms.contact_ledger import ENERGY_COLUMNS, RECORD_LANES, contact_block_kernels, contact_ledger_kernels
-from ..kernels.terms.contact_structs import RECORD, clock_struct, contact_scratch_struct, history_struct
+from ..kernels.terms.contact_structs import RECORD_NAMES, clock_struct, contact_scratch_struct, history_struct
 from ..model.state import State
 from ..model.triangle_mesh import TriMesh
 from .contact_fields import CONTACT_FIELDS, contact_field, nodal_force, obstacle_patches
@@ -61,7 +61,7 @@ class Contact(Term):
             contact_ledger_kernels(model.dtype, meshes),
         )
         self.deepest_points = DeepestPoints(self.tables) if self.tables.lumped else None
-        self.report_columns = len(RECORD) * len(self.tables.contacts)
+        self.report_columns = len(RECORD_NAMES) * len(self.tables.contacts)
 
     @classmethod
     def of(cls, model: Model) -> Contact | None:
@@ -88,18 +88,36 @@ class Contact(Term):
         t, B = self.tables, worlds
         K, P, C, R = len(t.colliders), t.points, len(t.contacts), t.rows
         shapes: dict[str, tuple[int, ...]] = {
-            "passed_through": (B,), "elapsed": (B,), "relaxation": (B,), "limit_updates": (B,), "aitken_norm2": (B,),
-            "aitken_sums": (B, RELAX_LANES), "contact_point": (B, C), "choices": (B, C), "total": (B, C, len(RECORD)),
-            "facet_activity": (B, R), "facet_point": (B, R), "facet_xi": (B, R), "facet_depth": (B, R),
-            "chosen_facet": (B, C), "point_reference": (B, C),
-            "shape_values": (B, C, max(group.conn.shape[1] for group in t.groups)), "rows": (len(RECORD), B, R),
+            "passed_point": (B,), "elapsed_time": (B,), "relaxation": (B,), "limit_updates": (B,), "aitken_norm2": (B,),
+            "aitken_sums": (B, AITKEN_LANES), "contact_point": (B, C), "choice_count": (B, C),
+            "record_totals": (B, C, len(RECORD_NAMES)), "record_rows": (len(RECORD_NAMES), B, R),
+            "facet_activity": (B, R), "facet_deepest_point": (B, R), "facet_deepest_xi": (B, R),
+            "facet_max_depth": (B, R), "chosen_facet": (B, C), "point_reference": (B, C),
+            "shape_values": (B, C, max(group.conn.shape[1] for group in t.groups)),
         }  # fmt: skip
-        shapes |= dict.fromkeys(("position", "rotation", "translation", "rotation_change", "angle"), (B, K))
+        shapes |= dict.fromkeys(
+            (
+                "collider_position",
+                "collider_rotation",
+                "collider_translation",
+                "collider_rotation_change",
+                "collider_angle",
+            ),
+            (B, K),
+        )
         if not t.lumped:
             shapes |= dict.fromkeys(
-                ("point_depth", "facet_point", "facet_xi", "facet_depth", "chosen_facet", "point_reference"), (1, 1)
+                (
+                    "point_depth",
+                    "facet_deepest_point",
+                    "facet_deepest_xi",
+                    "facet_max_depth",
+                    "chosen_facet",
+                    "point_reference",
+                ),
+                (1, 1),
             ) | {"shape_values": (1, 1, 1)}
-        shapes |= {} if t.explicit else dict.fromkeys(("explicit_force", "explicit_spring"), (1, 1))
+        shapes |= {} if t.explicit else dict.fromkeys(("explicit_force", "explicit_elastic_slip"), (1, 1))
         out = contact_scratch_struct(self.model.dtype)()
         for name, var in contact_scratch_struct(self.model.dtype).vars.items():
             setattr(out, name, make(name, shapes.get(name, (B, P)), var.type.dtype))
@@ -125,14 +143,14 @@ class Contact(Term):
         clock = clock_struct()()
         for name in ("time", "new_time", "h", "part"):
             setattr(clock, name, getattr(work.step, name))
-        clock.time, clock.still = ctx.state.time, int(not ctx.inertia)
+        clock.time, clock.is_static = ctx.state.time, int(not ctx.inertia)
         scratch = {
             "attempt": attempt,
             "clock": clock,
             # Newton's method only; unused by Jacobi's iteration
             "touching": work.newton.contact_active,
             "energies": work.array("contact energies", (ENERGY_COLUMNS, B, R), wp.float64),
-            "parts": work.array("contact parts", (B, C, len(RECORD), RECORD_LANES), wp.float64),
+            "parts": work.array("contact parts", (B, C, len(RECORD_NAMES), RECORD_LANES), wp.float64),
             "row_start": self.model.array("contact", t.row_start, wp.int32),
             "u": self.exact.allocate(work, self.name) if self.exact else work.u,
         }
@@ -159,7 +177,7 @@ class Contact(Term):
         fresh = (active.numpy() != 0) & ~known
         self._poses(ctx, active)
         for name in ("position", "rotation", "angle", "previous_margin"):
-            source = self.tables.data.margin if name == "previous_margin" else getattr(s["attempt"], name)
+            source = self.tables.data.margin if name == "previous_margin" else getattr(s["attempt"], f"collider_{name}")
             values = getattr(history, name).numpy()
             values[fresh] = source.numpy()[fresh]
             getattr(history, name).assign(values)
@@ -187,7 +205,7 @@ class Contact(Term):
     def _poses(self, ctx: StepContext, active: wp.array) -> None:
         s = ctx.scratch[self.name]
         args = [self.tables.data, s["history"], ctx.work.time_law_values, active, s["attempt"]]
-        ctx.launch(self.kernels.poses, (self.model.worlds, len(self.tables.colliders)), args)
+        ctx.launch(self.kernels.update_poses, (self.model.worlds, len(self.tables.colliders)), args)
 
     # in a step
 
@@ -198,7 +216,7 @@ class Contact(Term):
         s["finished"] = False
         self._poses(ctx, active)
         for group in self.tables.groups:
-            dim = (m.worlds, group.count, group.data.points)
+            dim = (m.worlds, group.count, group.data.point_count)
             args = [self.tables.data, group.data, s["history"], s["clock"]]
             more = [ctx.state.displacement, ctx.state.velocity, active, s["attempt"]]
             ctx.launch(self.kernels.begin_points, dim, [*args, *more])
@@ -222,10 +240,10 @@ class Contact(Term):
         rows = w.rows_of(self)
         for group in self.tables.groups:
             args = [self.tables.data, group.data, s["history"], s["clock"], s["u"], active, fresh]
-            ctx.launch(k.forces, (m.worlds, group.count, group.data.points), [*args, s["attempt"]])
+            ctx.launch(k.forces, (m.worlds, group.count, group.data.point_count), [*args, s["attempt"]])
             dim, lanes = group.sides(ctx.launch, m.worlds)
             args = [group.data, active, lanes, s["attempt"], w.pool_force, rows, s["touching"]]
-            ctx.launch(k.gather_points, dim, args)
+            ctx.launch(k.gather_point_forces, dim, args)
 
     def _pick(self, ctx: StepContext, active: wp.array, *, fresh: int) -> None:
         """Select the point of each single-point contact at work.u."""
@@ -239,8 +257,8 @@ class Contact(Term):
     @part("contact")
     def update_frozen(self, ctx: StepContext, flags: wp.array) -> None:
         k, m, attempt = self.kernels, self.model, ctx.scratch[self.name]["attempt"]
-        ctx.launch(k.aitken_partial_sums, (m.worlds, RELAX_LANES), [flags, attempt])
-        ctx.launch(k.relax, m.worlds, [flags, ctx.work.newton.tol, attempt, ctx.work.newton.partly_updated])
+        ctx.launch(k.aitken_partial_sums, (m.worlds, AITKEN_LANES), [flags, attempt])
+        ctx.launch(k.aitken_relaxation, m.worlds, [flags, ctx.work.newton.tol, attempt, ctx.work.newton.partly_updated])
         ctx.launch(k.update_frozen, (m.worlds, self.tables.points), [flags, attempt])
         self._pick(ctx, flags, fresh=0)
 
@@ -248,11 +266,11 @@ class Contact(Term):
     def product(self, ctx: StepContext, p: wp.array, active: wp.array) -> None:
         m, k, attempt = self.model, self.kernels, ctx.scratch[self.name]["attempt"]
         for group in self.tables.groups:
-            dim = (m.worlds, group.count, group.data.points)
-            ctx.launch(k.product_points, dim, [group.data, active, p, attempt])
+            dim = (m.worlds, group.count, group.data.point_count)
+            ctx.launch(k.point_products, dim, [group.data, active, p, attempt])
             sides, lanes = group.sides(ctx.launch, m.worlds)
             args = [group.data, active, lanes, attempt, ctx.work.pool_product]
-            ctx.launch(k.product_facets, sides, args)
+            ctx.launch(k.gather_facet_products, sides, args)
 
     @part("contact")
     def diagonal(self, ctx: StepContext, active: wp.array) -> None:
@@ -275,8 +293,8 @@ class Contact(Term):
             args = [self.tables.data, group.data, s["history"], s["clock"], s["u"], accepted, s["attempt"]]
             ctx.launch(k.record_substep, (m.worlds, group.count), [*args, s["energies"]])
         args = [self.tables.data, s["row_start"], accepted, s["attempt"], s["parts"]]
-        ctx.launch(k.partial_records, (m.worlds, C, len(RECORD), RECORD_LANES), args)
-        ctx.launch(k.total_records, (m.worlds, C, len(RECORD)), [s["clock"], accepted, s["parts"], s["attempt"]])
+        ctx.launch(k.partial_records, (m.worlds, C, len(RECORD_NAMES), RECORD_LANES), args)
+        ctx.launch(k.total_records, (m.worlds, C, len(RECORD_NAMES)), [s["clock"], accepted, s["parts"], s["attempt"]])
 
     @part("contact")
     def commit(self, ctx: StepContext, accepted: wp.array) -> None:
@@ -320,7 +338,7 @@ class Contact(Term):
         *, projected: bool,
     ) -> None:  # fmt: skip
         """Positive semi-definite stiffness of the points."""
-        m, kernel = self.model, contact_block_kernels(self.model.dtype).add_contact
+        m, kernel = self.model, contact_block_kernels(self.model.dtype).add_contact_blocks
         for group, (entry, start, source, count) in zip(self.tables.groups, m.cache["contact blocks"]):
             args = [m.topology, matrix.pattern.data, group.data, entry, start, source, kept[0]]
             weight = kept[1] if self.tables.moving else ctx.scratch[self.name]["attempt"].shape_values
@@ -330,7 +348,7 @@ class Contact(Term):
         return {contact_block_kernels(self.model.dtype).module}
 
     def failure_reason(self, ctx: StepContext, world: int) -> tuple[type[PenetrationError], str] | None:
-        found = int(ctx.scratch[self.name]["attempt"].passed_through.numpy()[world])
+        found = int(ctx.scratch[self.name]["attempt"].passed_point.numpy()[world])
         if found == 0 or int(ctx.work.newton.failed.numpy()[world]) in (FAIL_FLOOR, FAIL_WORK):
             return None
         number = abs(found) - 1
@@ -339,8 +357,8 @@ class Contact(Term):
         contact = t.contacts[k]
         if found < 0:
             return PenetrationError, (
-                f"contact {contact.name!r}: collider {contact.collider.name!r} turns by more than {MAX_ROTATION:g} rad "
-                "in the step, in which it is touched; take a smaller dt"
+                f"contact {contact.name!r}: collider {contact.collider.name!r} turns by more than "
+                f"{MAX_COLLIDER_ROTATION:g} rad in the step, in which it is touched; take a smaller dt"
             )
         where = reference_place(t, k, number - int(t.first[k]))
         return PenetrationError, (

@@ -79,7 +79,7 @@ def obstacle_patches(t: ContactTables, body: Any, gap: np.ndarray, force: np.nda
 def _normal_force(t: ContactTables, k: int, gap: np.ndarray, force: np.ndarray) -> np.ndarray:
     """Elastic normal force, N, on the points (worlds, points) of a contact from their gaps, without friction."""
     contact = t.contacts[k]
-    stiffness = t.data.scale.numpy()[:, k, None] * t.data.normal.numpy()[:, k, None]
+    stiffness = t.data.scale.numpy()[:, k, None] * t.data.normal_stiffness.numpy()[:, k, None]
     share = t.shares[k].ravel()
     depth = np.where(share > 0.0, -gap, 0.0)
     if contact.model == "sphere":

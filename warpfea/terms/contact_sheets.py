@@ -48,6 +48,6 @@ def _points_across(
     limit: Any = wp.array(tolerance, dtype=wp.float64, device=m.device)
     for group in tables.groups:
         args = [tables.data, group.data, displacement, limit, attempt, found]
-        launch(sheet_kernels(m.dtype).across, (m.worlds, group.count), args)
+        launch(sheet_kernels(m.dtype).find_crossed_sheets, (m.worlds, group.count), args)
     sheet = [isinstance(c.collider.shape, TriMesh) and not c.collider.shape.closed for c in tables.contacts]
     return np.where(np.repeat(sheet, np.diff(tables.row_start)), found.numpy(), 0)

@@ -99,14 +99,14 @@ class ContactTables(FacetTables[Contact]):
         put("collider", [K.index(c.collider) for c in C], wp.int32)
         put("margin", np.zeros((m.worlds, len(K))), wp.float64)
         frames = [k.shape.frame() for k in K]
-        put("kind", [k.shape.kind for k in K], wp.int32)
-        put("size", [sizes(k.shape, self._touching(k)) for k in K], wp.vec3d)
-        put("center", [center for center, _ in frames], wp.vec3d)
-        put("axes", [axes for _, axes in frames], wp.mat33d)
-        put("path", [laws.add(k.law) if k.law is not None else -1 for k in K], wp.int32)
-        put("spin", [laws.add(k.rotation.angle) if k.rotation is not None else -1 for k in K], wp.int32)
-        put("anchor", [k.rotation.anchor if k.rotation else np.zeros(3) for k in K], wp.vec3d)
-        put("axis", [k.rotation.axis if k.rotation else (0.0, 0.0, 1.0) for k in K], wp.vec3d)
+        put("collider_kind", [k.shape.kind for k in K], wp.int32)
+        put("collider_size", [sizes(k.shape, self._touching(k)) for k in K], wp.vec3d)
+        put("collider_center", [center for center, _ in frames], wp.vec3d)
+        put("collider_axes", [axes for _, axes in frames], wp.mat33d)
+        put("translation_law", [laws.add(k.law) if k.law is not None else -1 for k in K], wp.int32)
+        put("rotation_law", [laws.add(k.rotation.angle) if k.rotation is not None else -1 for k in K], wp.int32)
+        put("rotation_anchor", [k.rotation.anchor if k.rotation else np.zeros(3) for k in K], wp.vec3d)
+        put("rotation_axis", [k.rotation.axis if k.rotation else (0.0, 0.0, 1.0) for k in K], wp.vec3d)
         if self.meshes:
             out.mesh = mesh_tables(m, [k.shape for k in K])
         return out
@@ -162,10 +162,10 @@ def law_numbers(
     a = law_radius(contact) if a is None else a
     mass = body_mass_total(contact.body) if mass is None else mass
     return {
-        "normal": 4.0 / 3.0 * modulus * a,
-        "tangent": 8.0 * shear * a,
+        "normal_stiffness": 4.0 / 3.0 * modulus * a,
+        "tangential_stiffness": 8.0 * shear * a,
         "normal_damping": normal_damping(2.0 * modulus * a, mass),
-        "mass": mass,
+        "effective_mass": mass,
     }
 
 

@@ -58,7 +58,7 @@ class Damping(Term):
         if not ctx.midpoint:  # computes the strains of both ends
             name = "moving_history" if ctx.accelerated else "strain_history"
             out |= {getattr(b.kernels, name).module for b in self.model.blocks if b.key.damping == "incremental"}
-        return out | ({self.kernels.add_explicit.module} if self.explicit else set())
+        return out | ({self.kernels.subtract_explicit_force.module} if self.explicit else set())
 
     @part("loads")
     def begin(self, ctx: StepContext, active: wp.array) -> None:
@@ -82,7 +82,7 @@ class Damping(Term):
         if self.explicit:
             gather = gather_kernels(m.dtype, ctx.traits).gather_force
             launch(gather, (m.worlds, m.slots), [m.topology, w.contribution, active, force])
-            launch(self.kernels.add_explicit, (m.worlds, m.slots), [force, active, w.dead])
+            launch(self.kernels.subtract_explicit_force, (m.worlds, m.slots), [force, active, w.dead])
 
     def energy_increments(self, ctx: StepContext, accepted: wp.array) -> wp.array | None:
         """Viscous loss of the frozen force, J."""
@@ -90,5 +90,7 @@ class Damping(Term):
             return None
         m, w = self.model, ctx.work
         force, _ = ctx.scratch[self.name]
-        ctx.launch(self.kernels.work_rows, (m.worlds, m.slots), [force, w.u, ctx.state.displacement, accepted, w.rows])
+        ctx.launch(
+            self.kernels.explicit_work_rows, (m.worlds, m.slots), [force, w.u, ctx.state.displacement, accepted, w.rows]
+        )
         return w.rows

@@ -84,13 +84,13 @@ class DeadLoads(Term):
         return self.gravity_law is not None or bool(np.any(self.gravity_host))
 
     def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
-        law = [self.kernels.take_gravity.module] * (self.gravity_law is not None)
+        law = [self.kernels.copy_gravity.module] * (self.gravity_law is not None)
         return law + [self.kernels.dead_load.module] * self.present
 
     def take_gravity(self, launch: Launcher, value: wp.array, active: wp.array) -> None:
         """Set gravity at the end of the attempt from the values of the time laws."""
         if self.gravity_law is not None:
-            launch(self.kernels.take_gravity, self.model.worlds, [value, self.number, active, self.gravity])
+            launch(self.kernels.copy_gravity, self.model.worlds, [value, self.number, active, self.gravity])
 
     @part("loads")
     def begin(self, ctx: StepContext, active: wp.array) -> None:

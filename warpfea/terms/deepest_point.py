@@ -47,7 +47,7 @@ class DeepestPoints:
         groups = [group for group in t.groups if group.lumped]
         for group in groups:
             args = [t.data, group.data, s["history"], time, u, active, s["attempt"]]
-            launch(k.point_depths, (B, group.count, group.data.points), args)
+            launch(k.point_depths, (B, group.count, group.data.point_count), args)
             launch(k.find_deepest, (B, group.count), args)
         args = [t.data, s["row_start"], active, fresh, s["attempt"], changed]
         launch(k.choose_deepest, (B, len(t.contacts)), args)
@@ -76,32 +76,32 @@ def at_points(term: Any, state: State, history: Any = None, places: bool = True)
 
         history = term.history_of(set_contact_point)
     attempt = term.attempt_of(B, lambda _, shape, dtype: zeros(shape, dtype))
-    attempt.speed.fill_(1.0)
+    attempt.approach_speed.fill_(1.0)
     if "contact_position" in state.specs:  # statics resets its time to 0
-        attempt.position, attempt.rotation = history.position, history.rotation
+        attempt.collider_position, attempt.collider_rotation = history.position, history.rotation
     else:
-        launch(term.kernels.poses, (B, K), [t.data, history, value, every, attempt])
-        attempt.translation.zero_()
-        attempt.rotation_change.zero_()
+        launch(term.kernels.update_poses, (B, K), [t.data, history, value, every, attempt])
+        attempt.collider_translation.zero_()
+        attempt.collider_rotation_change.zero_()
     gap, force = zeros((B, P), wp.float64), zeros((B, P), wp.vec3d)
     u = state.displacement
     if term.exact:
         u = zeros(u.shape, wp.vec3d)
         term.exact.widen(launch, state.displacement, every, u)
     for group in t.groups:
-        dim = (B, group.count, group.data.points)
+        dim = (B, group.count, group.data.point_count)
         launch(
             term.kernels.points_at_state, dim, [t.data, group.data, history, state.time, state.displacement, attempt]
         )
     if term.deepest_points:
         clock = clock_struct()()
-        clock.time, clock.still = state.time, 1
+        clock.time, clock.is_static = state.time, 1
         row_start = m.array("contact", t.row_start, wp.int32)
         s = {"history": history, "attempt": attempt, "clock": clock, "row_start": row_start}
         before, changed = (state.displacement,) * 2, zeros((B,), wp.int32)
         term.deepest_points.choose(launch, s, state.time, u, before, every, changed, fresh=1, settled=1)
     for group in t.groups:
-        dim = (B, group.count, group.data.points)
+        dim = (B, group.count, group.data.point_count)
         args = [t.data, group.data, history, u, state.time, attempt, int(places), gap, force]
-        launch(term.ledger_kernels.at_points, dim, args)
+        launch(term.ledger_kernels.evaluate_at_points, dim, args)
     return gap.numpy(), force.numpy()

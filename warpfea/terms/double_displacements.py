@@ -45,4 +45,4 @@ class DoubleDisplacements:
 
     def widen(self, launch: Launcher, u: wp.array, active: wp.array, out: wp.array) -> None:
         """Copy u in float64."""
-        launch(self.kernels.widen, (len(out), len(self._slots)), [self._slots, u, active, out])
+        launch(self.kernels.copy_to_float64, (len(out), len(self._slots)), [self._slots, u, active, out])

@@ -30,7 +30,7 @@ SMOOTHING = (1e-3, 1e-4)
 """Default eps, N, and v_eps, m/s, of the smooth law."""
 PER_WORLD = {"mu": "mu", "mu_static": "mu_static", "restitution": "damping", "stiffness": "scale"}
 """Contact parameters of Model.set_parameter and their arrays; the restitution also sets `beta`."""
-FROM_BODIES = ("normal", "tangent", "normal_damping", "mass")
+FROM_BODIES = ("normal_stiffness", "tangential_stiffness", "normal_damping", "effective_mass")
 """Contact constants derived from the bodies' materials."""
 LISTED = 8
 """Threads that share a sum over the points of a facet on CUDA."""
@@ -176,19 +176,19 @@ class FacetTables(Generic[AnyContact]):
         put("area_fraction", np.concatenate([self.shares[k] for k in chosen]).T, wp.float64)
         put("area", np.concatenate([p.area for p in parts]).T, wp.float64)
         put("contact", np.repeat(chosen, [len(p.conn) for p in parts]), wp.int32)
-        data.pool, data.row, data.point = pool, self.rows, self.points
-        _, data.points, acts = kind
-        data.count, data.tracks_deepest, data.corners = (
+        data.first_entry, data.first_row, data.first_point = pool, self.rows, self.points
+        _, data.point_count, acts = kind
+        data.facet_count, data.tracks_deepest, data.corner_count = (
             len(conn),
             int(acts == MOVING),
-            3 if data.points in RULES[3] else 4,
+            3 if data.point_count in RULES[3] else 4,
         )
         if acts != PATCH:
-            points = RULES[data.corners][data.points].points
+            points = RULES[data.corner_count][data.point_count].points
             basis, power = lagrange_basis(points)
-            put("coords", points, wp.vec2d)
-            put("basis", basis, wp.float64)
-            put("power", power, wp.vec2i)
+            put("point_coords", points, wp.vec2d)
+            put("lagrange_coefficients", basis, wp.float64)
+            put("exponents", power, wp.vec2i)
         return FacetGroup(conn, data, acts != PATCH, chosen)
 
     def numbers(self, contact: AnyContact, world: int | None = None) -> dict[str, float]:
@@ -227,7 +227,7 @@ class FacetTables(Generic[AnyContact]):
             getattr(data, name).assign(values)
 
     def _put_laws(self, out: Any, numbers: list[dict[str, float]]) -> None:
-        """Upload the contact law constants; `numbers` per contact: normal, tangent, normal_damping, mass."""
+        """Upload the contact law constants; `numbers` per contact: `FROM_BODIES`."""
         m, C = self.model, self.contacts
 
         def put(name: str, values: Any, dtype: Any = wp.float64) -> None:
@@ -236,15 +236,15 @@ class FacetTables(Generic[AnyContact]):
         put("law", [LAWS[c.law] for c in C], wp.int32)
         put("single_point", [int(c.model == "sphere") for c in C], wp.int32)
         put("is_explicit", [int(c.treatment == "explicit") for c in C], wp.int32)
-        put("first", self.first, wp.int32)
+        put("first_point", self.first, wp.int32)
         for name in FROM_BODIES:
             put(name, [[row[name] for row in numbers]])
         smoothing = [c.smoothing if isinstance(c.smoothing, tuple) else SMOOTHING for c in C]
-        put("ramp", [float(c.smoothing) if isinstance(c.smoothing, (int, float)) else 0.0 for c in C])
+        put("damping_ramp", [float(c.smoothing) if isinstance(c.smoothing, (int, float)) else 0.0 for c in C])
         put("force_eps", [pair[0] for pair in smoothing])
         put("speed_eps", [pair[1] for pair in smoothing])
         put("offset", [c.offset for c in C])
-        put("decay", [c.overlap_time for c in C])
+        put("overlap_decay_time", [c.overlap_time for c in C])
         per_world = {
             "mu": [c.mu for c in C],
             "mu_static": [c.mu_static for c in C],

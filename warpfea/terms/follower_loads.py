@@ -62,8 +62,8 @@ class Followers(Term):
         m = self.model
         data = follower_struct(m.dtype)()
         data.conn = m.array("loads", conn.T, wp.int32)
-        data.law = m.array("loads", np.full(len(conn), laws.add(law)), wp.int32)
-        data.offset, data.count = self.offset + self._entries, len(conn)
+        data.time_law = m.array("loads", np.full(len(conn), laws.add(law)), wp.int32)
+        data.first_entry, data.item_count = self.offset + self._entries, len(conn)
         self.connectivity.append(conn)
         self._entries += conn.size
         return data
@@ -78,20 +78,20 @@ class Followers(Term):
         value = np.where(position[:, :, None], value - value[:, :1], value)
         data.reference = m.array("loads", np.swapaxes(value, 0, 1), m.types.vec3)
         data.is_position = m.array("loads", position.T.astype(float), m.types.T)
-        for name, table in (("shape", t.shape), ("d_a", t.d_a), ("d_b", t.d_b)):
+        for name, table in (("shape", t.shape), ("shape_da", t.d_a), ("shape_db", t.d_b)):
             setattr(data, name, m.array("loads", np.moveaxis(table, 0, 2), m.types.T))
         data.weight = m.array("loads", t.weights[0], m.types.T)
         k = pressure_kernels(m.dtype)
-        return FollowerPart(data, k.pressure, k.pressure_product, len(t.conn))
+        return FollowerPart(data, k.pressure_force, k.pressure_tangent_product, len(t.conn))
 
     def _moment(self, moment: Moment, laws: TimeLawTable) -> FollowerPart:
         m = self.model
         data = self._data(moment.slots + moment.body.slot_offset, moment.law, laws)
-        data.gradient = m.array("loads", np.swapaxes(moment.vectors, 0, 1), m.types.vec3)
-        data.axes = m.array("loads", moment.axes, m.types.mat33)
-        data.fraction = m.array("loads", np.full(len(moment.slots), 1.0 / len(moment.slots)), m.types.T)
+        data.vector_coefficients = m.array("loads", np.swapaxes(moment.vectors, 0, 1), m.types.vec3)
+        data.reference_vectors = m.array("loads", moment.axes, m.types.mat33)
+        data.moment_fraction = m.array("loads", np.full(len(moment.slots), 1.0 / len(moment.slots)), m.types.T)
         k = moment_kernels(m.dtype, moment.body.family.spin_vectors)
-        return FollowerPart(data, k.moment, k.moment_product, len(moment.slots))
+        return FollowerPart(data, k.moment_force, k.moment_tangent_product, len(moment.slots))
 
     def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
         return {kernel.module for item in self.items for kernel in (item.force, item.product)}
@@ -159,8 +159,8 @@ class FollowerMatrix:
             setattr(self.data, name, getattr(item.data, name))
         own = np.arange(size, dtype=np.int32).reshape(conn.shape)
         self.data.conn = wp.array(own, dtype=wp.int32, device=model.device)
-        self.data.offset = 0
-        name = f"direct follower {item.data.offset}"
+        self.data.first_entry = 0
+        name = f"direct follower {item.data.first_entry}"
         vec3, B = model.types.vec3, model.worlds
         self.u = work.array(f"{name} u", (B, size), vec3)
         self.direction = work.array(f"{name} direction", (B, size), vec3)

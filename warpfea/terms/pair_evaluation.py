@@ -106,13 +106,15 @@ def evaluate_pairs(term: Any, state: State) -> PairEvaluation:
 
     masters = t.masters_of(wp.uint64(0))
     arrays: dict[str, tuple[tuple[int, ...], Any]] = dict.fromkeys(
-        "CD", ((B, t.facets * masters.max_monomials), wp.vec3d)
+        ("u_coefs", "director_coefs"), ((B, t.facets * masters.max_monomials), wp.vec3d)
     )
-    arrays |= dict.fromkeys(("lower", "upper", "refit_lower", "refit_upper"), ((B * t.facets,), wp.vec3))
+    arrays |= dict.fromkeys(("box_lower", "box_upper", "refit_lower", "refit_upper"), ((B * t.facets,), wp.vec3))
     touching = fill(pair_scratch_struct(m.dtype)(), arrays | {"refit_needed": ((1,), wp.int32)})
-    touching.C0 = touching.C
+    touching.start_u_coefs = touching.u_coefs
     launch(
-        term.seek.update_coefficients, (B, t.facets, masters.max_monomials), [masters, u, every, touching.C, touching.D]
+        term.seek.update_coefficients,
+        (B, t.facets, masters.max_monomials),
+        [masters, u, every, touching.u_coefs, touching.director_coefs],
     )
     launch(term.seek.check_boxes, (B, t.facets), [masters, every, touching])
     tree = wp.Bvh(touching.refit_lower, touching.refit_upper, groups=t.box_groups)
@@ -122,5 +124,5 @@ def evaluate_pairs(term: Any, state: State) -> PairEvaluation:
     for group in t.groups:
         args = [t.data, t.masters_of(tree.id), group.data, history, seats, state.time, u, t.far]
         args += [contact_scratch_struct(m.dtype)(), touching, found]
-        launch(pair_evaluation_kernels(m.dtype).evaluate_pairs, (B, group.count, group.data.points), args)
+        launch(pair_evaluation_kernels(m.dtype).evaluate_pairs, (B, group.count, group.data.point_count), args)
     return PairEvaluation(t, *(getattr(found, field.name).numpy() for field in fields(PairEvaluation)[1:]))

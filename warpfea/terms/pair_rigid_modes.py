@@ -35,7 +35,7 @@ class PairRigidModes:
         self.first = m.array("motions", t.first, wp.int32)
         self.groups = []
         for group in t.groups:
-            low, high = group.data.point, group.data.point + group.data.count * group.data.points
+            low, high = group.data.first_point, group.data.first_point + group.data.facet_count * group.data.point_count
             own = [k for k in coupled if low <= t.first[k] < high]
             if own:
                 self.groups.append((group, m.array("motions", np.array(own), wp.int32), len(own)))

@@ -46,13 +46,13 @@ class PairSolves(Term):
         s, m, w, t, k = ctx.scratch[self.name], self.model, ctx.work, self.tables, self.kernels
         attempt, touching, masters = s["attempt"], s["touching"], s["masters"]
         for group in t.groups:
-            dim = (m.worlds, group.count, group.data.points)
-            ctx.launch(k.product_points, dim, [masters, group.data, active, p, attempt, touching])
+            dim = (m.worlds, group.count, group.data.point_count)
+            ctx.launch(k.point_products, dim, [masters, group.data, active, p, attempt, touching])
         for group in t.groups:  # the last group includes the master facets
             entries = group.conn.size + (t.master_conn.size if group is t.groups[-1] else 0)
             lanes = ctx.launch.lanes(LISTED)
             args = [masters, group.data, active, lanes, entries - 1, attempt, touching, w.pool_product]
-            ctx.launch(k.product_sides, (m.worlds, ctx.launch.padded(lanes * entries)), args)
+            ctx.launch(k.gather_pair_products, (m.worlds, ctx.launch.padded(lanes * entries)), args)
 
     @part("pairs")
     def diagonal(self, ctx: StepContext, active: wp.array) -> None:
@@ -61,7 +61,7 @@ class PairSolves(Term):
             args = [group.data, active, s["attempt"], w.pool_block]
             ctx.launch(self.shared.diagonal, (m.worlds, group.count, group.conn.shape[1]), args)
         args = [s["masters"], active, s["attempt"], s["touching"], w.pool_block]
-        ctx.launch(self.kernels.diagonal_masters, (m.worlds, t.facets, t.master_conn.shape[1]), args)
+        ctx.launch(self.kernels.master_diagonal, (m.worlds, t.facets, t.master_conn.shape[1]), args)
 
     def cached_inputs(self, ctx: StepContext) -> list[tuple[str, wp.array]]:
         s = ctx.scratch[self.name]
@@ -95,13 +95,13 @@ class PairSolves(Term):
         lists = point_list_struct()()
         stiffness, lists.list_size, lists.list_start, lists.list_point, weight, _ = kept
         *slaves, masters = m.cache["pair blocks"]
-        add = contact_block_kernels(m.dtype).add_contact
+        add = contact_block_kernels(m.dtype).add_contact_blocks
         for group, (index, begin, source, count) in zip(t.groups, slaves):
             args = [m.topology, matrix.pattern.data, group.data, index, begin, source, stiffness, weight]
             ctx.launch(add, (m.worlds, count), [*args, dq_dv, active, out])
         index, begin, source, count = masters
         args = [m.topology, matrix.pattern.data, index, begin, source, stiffness, weight, lists]
-        add = pair_block_kernels(m.dtype).add_masters
+        add = pair_block_kernels(m.dtype).add_master_blocks
         ctx.launch(add, (m.worlds, count), [*args, dq_dv, active, out])
 
     def block_modules(self) -> set[wp.Module]:

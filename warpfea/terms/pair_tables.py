@@ -110,7 +110,7 @@ class PairTables(FacetTables[PairContact]):
         region = self.regions[self.number[contact.index]]
         parameters = self.model.parameters
         row = contact_constants(contact, region, partial(parameters.mass, world=world), parameters.modulus(world))
-        return row | {"normal_damping": normal_damping(row["damping_stiffness"], row["mass"])}
+        return row | {"normal_damping": normal_damping(row["damping_stiffness"], row["effective_mass"])}
 
     @property
     def set_arrays(self) -> dict[str, wp.array]:
@@ -181,21 +181,21 @@ class PairTables(FacetTables[PairContact]):
                 "conn": put(self.master_conn.T, wp.int32),
                 "shape": put(np.moveaxis(whole("shape"), 0, 2), m.types.T),
                 "director_shape": put(np.moveaxis(whole("director_shape"), 0, 2), m.types.T),
-                "X": put(np.swapaxes(whole("X"), 0, 1), wp.vec3d),
-                "N": put(np.swapaxes(whole("N"), 0, 1), wp.vec3d),
-                "kind": put(np.repeat([kinds.index((q.corners, q.degree)) for q in all_of], counts), wp.int32),
-                "monomials": put([len(exponents(*kind)) for kind in kinds], wp.int32),
-                "corners": put([kind[0] for kind in kinds], wp.int32),
-                "power": put(power, wp.vec2i),
-                "hull": put(hull, wp.float64),
+                "position_coefficients": put(np.swapaxes(whole("X"), 0, 1), wp.vec3d),
+                "director_coefficients": put(np.swapaxes(whole("N"), 0, 1), wp.vec3d),
+                "facet_kind": put(np.repeat([kinds.index((q.corners, q.degree)) for q in all_of], counts), wp.int32),
+                "monomial_count": put([len(exponents(*kind)) for kind in kinds], wp.int32),
+                "corner_count": put([kind[0] for kind in kinds], wp.int32),
+                "exponents": put(power, wp.vec2i),
+                "hull_coefficients": put(hull, wp.float64),
                 "depth_limit": put(whole("depth_limit"), wp.float64),
-                "size": put(whole("size"), wp.float64),
+                "side_length": put(whole("size"), wp.float64),
                 "surface": put(np.repeat(np.arange(len(counts)), counts), wp.int32),
                 "max_monomials": most,
-                "surfaces": len(self.surfaces),
+                "surface_count": len(self.surfaces),
                 "touch_depth": TOUCH * self.size,
-                "pool": self.pool,
-                "count": self.facets,
+                "first_entry": self.pool,
+                "facet_count": self.facets,
             }
         out = master_struct(m.dtype)()
         for name, value in m.cache["pair masters"].items():

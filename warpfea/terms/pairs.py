@@ -11,10 +11,10 @@ import warp as wp
 from ..base.errors import PenetrationError
 from ..kernels.common.traits import Traits
 from ..kernels.solvers.newton_control import FAIL_FLOOR, FAIL_WORK
-from ..kernels.terms.contact import RELAX_LANES
+from ..kernels.terms.contact import AITKEN_LANES
 from ..kernels.terms.contact_ledger import ENERGY_COLUMNS, RECORD_LANES, contact_ledger_kernels
-from ..kernels.terms.contact_structs import RECORD, clock_struct, contact_scratch_struct, history_struct
-from ..kernels.terms.facet_point_lists import FACETS_PER_CHUNK, list_kernels
+from ..kernels.terms.contact_structs import RECORD_NAMES, clock_struct, contact_scratch_struct, history_struct
+from ..kernels.terms.facet_point_lists import FACETS_PER_CHUNK, point_list_kernels
 from ..kernels.terms.facet_search import facet_search_kernels
 from ..kernels.terms.pair_ledger import pair_ledger_kernels
 from ..kernels.terms.pair_structs import pair_history_struct, pair_scratch_struct
@@ -61,8 +61,8 @@ class Pairs(PairSolves):
         super().__init__(model)
         self.traits = Traits(unilateral=True)
         self.ledger_kernels, self.seek = contact_ledger_kernels(model.dtype, False), facet_search_kernels(model.dtype)
-        self.lists, self.pair_ledger_kernels = list_kernels(model.dtype), pair_ledger_kernels(model.dtype)
-        self.report_columns = len(RECORD) * len(self.tables.contacts)
+        self.lists, self.pair_ledger_kernels = point_list_kernels(model.dtype), pair_ledger_kernels(model.dtype)
+        self.report_columns = len(RECORD_NAMES) * len(self.tables.contacts)
 
     @classmethod
     def of(cls, model: Model) -> Pairs | None:
@@ -96,12 +96,12 @@ class Pairs(PairSolves):
         point = (B, P)
         shapes: dict[str, tuple[int, ...]] = dict.fromkeys(
             (
-                "origin",
-                "contact_distance",
-                "depth",
-                "speed",
-                "frozen",
-                "updated",
+                "start_displacement",
+                "activation_gap",
+                "start_depth",
+                "approach_speed",
+                "frozen_friction",
+                "updated_friction",
                 "frozen_normal",
                 "updated_normal",
                 "aitken_residual",
@@ -109,14 +109,18 @@ class Pairs(PairSolves):
                 "force",
                 "energy",
                 "stiffness",
-                "product",
+                "point_product",
             ),
             point,
         )
-        shapes |= dict.fromkeys(("explicit_force", "explicit_spring"), point if t.explicit else (1, 1))
-        shapes |= dict.fromkeys(("passed_through", "elapsed", "relaxation", "limit_updates", "aitken_norm2"), (B,))
-        shapes |= {"aitken_sums": (B, RELAX_LANES), "total": (B, C, len(RECORD)), "facet_activity": (B, t.rows)}
-        shapes |= {"rows": (len(RECORD), B, t.rows), "shape_values": (1, 1, 1)}
+        shapes |= dict.fromkeys(("explicit_force", "explicit_elastic_slip"), point if t.explicit else (1, 1))
+        shapes |= dict.fromkeys(("passed_point", "elapsed_time", "relaxation", "limit_updates", "aitken_norm2"), (B,))
+        shapes |= {
+            "aitken_sums": (B, AITKEN_LANES),
+            "record_totals": (B, C, len(RECORD_NAMES)),
+            "facet_activity": (B, t.rows),
+        }
+        shapes |= {"record_rows": (len(RECORD_NAMES), B, t.rows), "shape_values": (1, 1, 1)}
         out = contact_scratch_struct(self.model.dtype)()
         for name, shape in shapes.items():
             dtype = contact_scratch_struct(self.model.dtype).vars[name].type.dtype
@@ -128,18 +132,20 @@ class Pairs(PairSolves):
         t, B = self.tables, self.model.worlds
         most = t.masters_of(wp.uint64(0)).max_monomials
         F, P, R = t.facets, t.points, t.rows
-        shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("C", "D", "C0", "D0", "V0"), (B, F * most))
-        shapes |= dict.fromkeys(("lower", "upper", "refit_lower", "refit_upper", "list_count"), (B * F,))
-        shapes |= dict.fromkeys(("refit_needed", "refits", "lists_changed"), (1,))
+        shapes: dict[str, tuple[int, ...]] = dict.fromkeys(
+            ("u_coefs", "director_coefs", "start_u_coefs", "start_director_coefs", "start_v_coefs"), (B, F * most)
+        )
+        shapes |= dict.fromkeys(("box_lower", "box_upper", "refit_lower", "refit_upper", "list_count"), (B * F,))
+        shapes |= dict.fromkeys(("refit_needed", "refit_count", "lists_changed"), (1,))
         shapes |= dict.fromkeys(("in_reach", "empty_box_lower", "empty_box_upper", "empty_box_refit"), (B, R))
-        shapes |= dict.fromkeys(("list_size", "list_start", "centre", "centre0", "bulge"), (B, F))
+        shapes |= dict.fromkeys(("list_size", "list_start", "centre", "start_centre", "bulge"), (B, F))
         shapes |= {"chunk_offset": (B, -(-F // FACETS_PER_CHUNK))}
         shapes |= dict.fromkeys(("shape_values", "friction_shape", "shape_gradient"), (B, P, t.master_conn.shape[1]))
         shapes |= {"geometric_tangent": (B, P, 2), "deepest_contact": (B, len(t.bodies))}
         out = pair_scratch_struct(self.model.dtype)()
         for name, var in pair_scratch_struct(self.model.dtype).vars.items():
             setattr(out, name, work.array(f"pairs {name}", shapes.get(name, (B, P)), var.type.dtype))
-        out.refits.fill_(1)
+        out.refit_count.fill_(1)
         return out
 
     def allocate(self, work: Workspace, ctx: StepContext) -> None:
@@ -149,7 +155,7 @@ class Pairs(PairSolves):
         clock = clock_struct()()
         for name in ("time", "new_time", "h", "part"):
             setattr(clock, name, getattr(work.step, name))
-        clock.time, clock.still = ctx.state.time, int(not ctx.inertia)
+        clock.time, clock.is_static = ctx.state.time, int(not ctx.inertia)
         tree = self._tree(touching)
         scratch = {
             "attempt": attempt,
@@ -159,7 +165,7 @@ class Pairs(PairSolves):
             "clock": clock,
             "active": work.newton.contact_active,
             "energies": work.array("pairs energies", (ENERGY_COLUMNS, B, R), wp.float64),
-            "parts": work.array("pairs parts", (B, C, len(RECORD), RECORD_LANES), wp.float64),
+            "parts": work.array("pairs parts", (B, C, len(RECORD_NAMES), RECORD_LANES), wp.float64),
             "row_start": m.array("contact", t.row_start, wp.int32),
             "u": self.exact.allocate(work, self.name) if self.exact else work.u,
         }
@@ -168,9 +174,9 @@ class Pairs(PairSolves):
     def _tree(self, touching: Any) -> wp.Bvh:
         """Bounding volume hierarchy of the facets in the reference; one group per world and surface."""
         low, high = self.tables.boxes()
-        touching.lower.assign(np.tile(low, (self.model.worlds, 1)))
-        touching.upper.assign(np.tile(high, (self.model.worlds, 1)))
-        return wp.Bvh(touching.lower, touching.upper, constructor="sah", groups=self.tables.box_groups)
+        touching.box_lower.assign(np.tile(low, (self.model.worlds, 1)))
+        touching.box_upper.assign(np.tile(high, (self.model.worlds, 1)))
+        return wp.Bvh(touching.box_lower, touching.box_upper, constructor="sah", groups=self.tables.box_groups)
 
     def history_of(self, make: Callable[[str, Any, tuple[int, ...]], wp.array]) -> tuple[Any, Any]:
         """Structs of history and facet assignment, with arrays from make(name, dtype, shape per world)."""
@@ -219,7 +225,7 @@ class Pairs(PairSolves):
         depth = np.where((facet != -1) & new[:, None], s["touching"].depth.numpy(), 0.0)
         touching = touching_depth(self.model.size, ctx.state.displacement.numpy())
         store_overlaps(t, depth, touching, overlap)
-        refuse_sunk(t, ctx.state.displacement.numpy(), s["touching"].x0.numpy(), facet, new)
+        refuse_sunk(t, ctx.state.displacement.numpy(), s["touching"].start_position.numpy(), facet, new)
         history.overlap.assign(overlap)
 
     def shift_time(self, state: State) -> None:
@@ -243,7 +249,7 @@ class Pairs(PairSolves):
         ctx.launch(self.seek.initial_coefficients, dim, [masters, u, v, active, touching])
         for group in t.groups:
             args = [t.data, masters, group.data, s["history"], s["seats"], s["clock"]]
-            dim = (m.worlds, group.count, group.data.points)
+            dim = (m.worlds, group.count, group.data.point_count)
             ctx.launch(self.seek.begin_points, dim, [*args, u, v, active, s["attempt"], touching])
             if t.explicit:
                 ctx.launch(self.kernels.explicit_forces, dim, [*args, v, active, s["attempt"], touching])
@@ -258,7 +264,7 @@ class Pairs(PairSolves):
         s, m, t, k = ctx.scratch[self.name], self.model, self.tables, self.seek
         touching, masters = s["touching"], s["masters"]
         dim = (m.worlds, t.facets, masters.max_monomials)
-        ctx.launch(k.update_coefficients, dim, [masters, u, active, touching.C, touching.D])
+        ctx.launch(k.update_coefficients, dim, [masters, u, active, touching.u_coefs, touching.director_coefs])
         ctx.launch(k.check_boxes, (m.worlds, t.facets), [masters, active, touching])
         ctx.launch(k.update_centres, (m.worlds, t.facets), [masters, active, touching])
         wp.capture_if(touching.refit_needed, self._refit, ctx=ctx)
@@ -266,7 +272,7 @@ class Pairs(PairSolves):
             args = [t.data, masters, group.data, s["history"]]
             ctx.launch(k.query_boxes, (m.worlds, group.count), [*args, u, active, t.reaching + overlap_limit, touching])
             args += [s["clock"], u, ctx.state.velocity, active, overlap_limit, s["attempt"], touching, corners]
-            ctx.launch(k.find_facets, (m.worlds, group.count, group.data.points), args)
+            ctx.launch(k.find_facets, (m.worlds, group.count, group.data.point_count), args)
 
     def prepare(self, ctx: StepContext, active: wp.array) -> None:
         """Compute the first friction limits and the stiffness of the blocks."""
@@ -285,16 +291,16 @@ class Pairs(PairSolves):
             self._seek(ctx, s["u"], active, overlap_limit=0.0)
         for group in t.groups:
             args = [t.data, masters, group.data, s["history"], s["seats"], s["clock"], s["u"], active, fresh]
-            dim = (m.worlds, group.count, group.data.points)
+            dim = (m.worlds, group.count, group.data.point_count)
             ctx.launch(self.kernels.forces, dim, [*args, s["attempt"], touching])
         wp.capture_if(touching.lists_changed, self._list, ctx=ctx)
         for group in t.groups:
             sides, lanes = group.sides(ctx.launch, m.worlds)
             args = [group.data, active, lanes, s["attempt"], w.pool_force, w.rows_of(self), s["active"]]
-            ctx.launch(self.shared.gather_points, sides, args)
+            ctx.launch(self.shared.gather_point_forces, sides, args)
         lanes = ctx.launch.lanes(LISTED)
         args = [masters, active, lanes, s["attempt"], touching, w.pool_force]
-        ctx.launch(self.kernels.gather_masters, (m.worlds, ctx.launch.padded(lanes * t.master_conn.size)), args)
+        ctx.launch(self.kernels.gather_master_forces, (m.worlds, ctx.launch.padded(lanes * t.master_conn.size)), args)
 
     def _list(self, ctx: StepContext) -> None:
         """Build the point lists of the master facets."""
@@ -304,20 +310,20 @@ class Pairs(PairSolves):
         ctx.launch(k.count_points, (m.worlds, t.points), [masters, touching])
         ctx.launch(k.sum_chunks, touching.chunk_offset.shape, [masters, touching])
         ctx.launch(k.scan_chunks, m.worlds, [touching])
-        ctx.launch(k.place_lists, (m.worlds, t.facets), [masters, touching])
+        ctx.launch(k.set_list_starts, (m.worlds, t.facets), [masters, touching])
         ctx.launch(k.fill_lists, (m.worlds, t.points), [masters, touching])
         ctx.launch(k.sort_lists, (m.worlds, t.facets), [touching])
 
     @part("pairs")
     def update_frozen(self, ctx: StepContext, flags: wp.array) -> None:
         k, m, attempt = self.shared, self.model, ctx.scratch[self.name]["attempt"]
-        ctx.launch(k.aitken_partial_sums, (m.worlds, RELAX_LANES), [flags, attempt])
-        ctx.launch(k.relax, m.worlds, [flags, ctx.work.newton.tol, attempt, ctx.work.newton.partly_updated])
+        ctx.launch(k.aitken_partial_sums, (m.worlds, AITKEN_LANES), [flags, attempt])
+        ctx.launch(k.aitken_relaxation, m.worlds, [flags, ctx.work.newton.tol, attempt, ctx.work.newton.partly_updated])
         ctx.launch(k.update_frozen, (m.worlds, self.tables.points), [flags, attempt])
         s = ctx.scratch[self.name]
         for group in self.tables.groups:
             args = [s["masters"], group.data, s["u"], flags, attempt, s["touching"]]
-            ctx.launch(self.kernels.update_friction_shapes, (m.worlds, group.count, group.data.points), args)
+            ctx.launch(self.kernels.update_friction_shapes, (m.worlds, group.count, group.data.point_count), args)
 
     def energy_increments(self, ctx: StepContext, accepted: wp.array) -> wp.array:
         self._finish(ctx, accepted)
@@ -335,9 +341,9 @@ class Pairs(PairSolves):
             args += [s["attempt"], s["touching"], s["energies"]]
             ctx.launch(self.pair_ledger_kernels.record_substep, (m.worlds, group.count), args)
         args = [t.data, s["row_start"], accepted, s["attempt"], s["parts"]]
-        ctx.launch(self.ledger_kernels.partial_records, (m.worlds, C, len(RECORD), RECORD_LANES), args)
+        ctx.launch(self.ledger_kernels.partial_records, (m.worlds, C, len(RECORD_NAMES), RECORD_LANES), args)
         args = [s["clock"], accepted, s["parts"], s["attempt"]]
-        ctx.launch(self.ledger_kernels.total_records, (m.worlds, C, len(RECORD)), args)
+        ctx.launch(self.ledger_kernels.total_records, (m.worlds, C, len(RECORD_NAMES)), args)
 
     @part("pairs")
     def commit(self, ctx: StepContext, accepted: wp.array) -> None:
@@ -359,7 +365,7 @@ class Pairs(PairSolves):
     # results
 
     def failure_reason(self, ctx: StepContext, world: int) -> tuple[type[PenetrationError], str] | None:
-        found = int(ctx.scratch[self.name]["attempt"].passed_through.numpy()[world])
+        found = int(ctx.scratch[self.name]["attempt"].passed_point.numpy()[world])
         if found == 0 or int(ctx.work.newton.failed.numpy()[world]) in (FAIL_FLOOR, FAIL_WORK):
             return None
         t = self.tables

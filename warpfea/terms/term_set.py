@@ -171,7 +171,8 @@ class TermSet:
         m = self.model
         start, order = assembly.gather_table(conns, m.slots)
         out = topology_struct(m.dtype)()
-        out.start, out.entry = m.array("loads", start, wp.int32), m.array("loads", order, wp.int32)
+        out.contribution_start = m.array("loads", start, wp.int32)
+        out.contribution_entry = m.array("loads", order, wp.int32)
         return out
 
     def join(self, topology: Any) -> None:
@@ -179,7 +180,7 @@ class TermSet:
         if self.pool_entries:
             conns = [conn for term in self.all if term.potential for conn in term.connectivity]
             pool = self._topology(conns)
-            topology.pool_start, topology.pool_entry = pool.start, pool.entry
+            topology.pool_start, topology.pool_entry = pool.contribution_start, pool.contribution_entry
 
     def mark_constrained(self, free: np.ndarray) -> None:
         """Clear the directions (components, 3) in which terms tie components to the ground."""

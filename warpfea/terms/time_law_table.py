@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from ..base.errors import ModelError
-from ..kernels.terms.loads import law_function_kernel, law_struct, load_kernels
+from ..kernels.terms.loads import load_kernels, time_law_kernel, time_law_struct
 from ..time_laws import Control, TimeLaw
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ class TimeLawTable:
         self.functions: list[tuple[Any, int]] = []
         self.controls: dict[str, Control] = {}
         self.controlled: dict[tuple[str, bool], int] = {}
-        self.data = law_struct()()
+        self.data = time_law_struct()()
 
     def add(self, law: TimeLaw) -> int:
         """Index of a law; a control keeps its first index.
@@ -70,13 +70,15 @@ class TimeLawTable:
         if not laws:
             return
         start = np.concatenate([[0], np.cumsum([len(w.times) for w in laws])])
-        self.data.start = m.array("laws", start, wp.int32)
-        self.data.times = m.array("laws", np.concatenate([w.times for w in laws] + [[0.0]]), wp.float64)
-        self.data.values = m.array("laws", np.concatenate([w.values for w in laws] + [np.zeros((1, 3))]), wp.vec3d)
+        self.data.sample_start = m.array("laws", start, wp.int32)
+        self.data.sample_time = m.array("laws", np.concatenate([w.times for w in laws] + [[0.0]]), wp.float64)
+        self.data.sample_value = m.array(
+            "laws", np.concatenate([w.values for w in laws] + [np.zeros((1, 3))]), wp.vec3d
+        )
         for k, law in enumerate(laws):
             if law.function is not None:
                 take = argument_precision(law.function, m.dtype)
-                self.functions.append((law_function_kernel(law.function, law.scalar, take), k))
+                self.functions.append((time_law_kernel(law.function, law.scalar, take), k))
 
     def evaluate(
         self, launch: Launcher, state: State, time: wp.array, ramp: wp.array, active: wp.array, value: wp.array
@@ -89,7 +91,7 @@ class TimeLawTable:
         if not self.laws:
             return
         B = self.model.worlds
-        launch(self.kernels.evaluate_laws, (B, self.count), [self.data, time, ramp, active, value])
+        launch(self.kernels.evaluate_time_laws, (B, self.count), [self.data, time, ramp, active, value])
         for kernel, law in self.functions:
             launch(kernel, B, [law, time, active, value])
         for (name, ramped), law in self.controlled.items():
@@ -100,7 +102,7 @@ class TimeLawTable:
         """Modules launched by `evaluate`."""
         out = {kernel.module for kernel, _ in self.functions}
         out |= {self.kernels.evaluate_control.module} if self.controls else set()
-        return out | ({self.kernels.evaluate_laws.module} if self.laws else set())
+        return out | ({self.kernels.evaluate_time_laws.module} if self.laws else set())
 
     def hash(self, h: Any) -> None:
         """Hash the laws."""

@@ -10,7 +10,7 @@ import warp as wp
 
 from ..base.errors import ModelError
 from ..base.memory import enough_memory
-from ..kernels.common.lanes import WARP
+from ..kernels.common.lanes import WARP_SIZE
 from ..kernels.common.reduce import CHUNK
 from ..kernels.common.structs import balance_struct
 from ..kernels.solvers.newton_control import FLOOR_LANES, FLOOR_ROWS, GROUP_ROWS, LANES, TERM_ROWS, control_struct
@@ -85,7 +85,7 @@ class Workspace:
         # scratch for kernels whose sums are unused
         self.spare_rows = self.array("spare_rows", (2, B, n) if traits.constraint_rows else (1, 1, 1), wp.float64)
         # PCG sums have one row per warp
-        self.warp = WARP if model.device.is_cuda else 1
+        self.warp = WARP_SIZE if model.device.is_cuda else 1
         self.warp_rows = self.array("warp_rows", (2, B, -(-n // self.warp)), wp.float64)
         self.rows = self.array("rows", (max(RESIDUAL_ROWS, LEDGER_ROWS), B, n), wp.float64)
         self.energy_rows = self.array("energy_rows", (2, B, model.element_count), wp.float64)
