@@ -41,7 +41,7 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
     ROW_BYTES = TILE * wp.types.type_size_in_bytes(T)
     memory, line = block_memory(dtype, TILE * TILE), block_memory(dtype, TILE)
     # a pivot below this fraction of its diagonal entry is round-off: the functions are linearly dependent
-    NEGLIGIBLE = {"float64": 1.0e-12, "float32": 1.0e-5}[storage]
+    NEGLIGIBLE_PIVOT = {"float64": 1.0e-12, "float32": 1.0e-5}[storage]
     # the fraction for a factorisation, which also accepts near-mechanisms
     LEAST_PIVOT = {"float64": 1.0e-14, "float32": 3.0e-7}[dtype]
     module = kernel_module(f"levels_build_{dtype}{'_' + storage if storage != dtype else ''}", max_unroll=SHORT_UNROLL)
@@ -130,7 +130,7 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
             sync()
             pivot = line.load(c, k)
             size = diagonal[world, tile, k]
-            if pivot > T(NEGLIGIBLE) * size and size > T(0.0):
+            if pivot > T(NEGLIGIBLE_PIVOT) * size and size > T(0.0):
                 scale = T(1.0) / pivot
                 for j in range(lane, TILE, lanes):
                     eliminate_column(at, c, k, j, scale)

@@ -36,9 +36,9 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNames
     Control = control_struct()
     stored, unilateral, midpoint, limited = traits.stored, traits.unilateral, traits.midpoint, traits.limited
     has_kinks = unilateral and not midpoint
-    judging = convergence_functions(traits)
-    objective, magnitude, evaluate_norms = judging.objective, judging.magnitude, judging.evaluate_norms
-    check_convergence, fail = judging.check_convergence, judging.fail
+    convergence = convergence_functions(traits)
+    objective, magnitude, evaluate_norms = convergence.objective, convergence.magnitude, convergence.evaluate_norms
+    check_convergence, fail = convergence.check_convergence, convergence.fail
 
     @wp.func
     def tangent_needed(ctl: Control, world: int) -> bool:

@@ -7,7 +7,7 @@ import warp as wp
 
 from ..common.traits import NO_TERMS, Traits
 from ..common.types import kernel_module
-from .augmented_lagrangian import outer_kernels
+from .augmented_lagrangian import outer_loop_kernels
 from .convergence import MAX_ERROR_ESTIMATES, SINGLE_EPS, VELOCITY_ROUNDINGS, convergence_functions
 from .line_search import MAX_TRUST_RADIUS, NOISE, line_search_kernels
 from .newton_control import (
@@ -51,14 +51,18 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         traits.unilateral,
     )
     midpoint = traits.midpoint
-    judging = convergence_functions(traits)
-    objective, magnitude = judging.objective, judging.magnitude
-    evaluate_norms, check_convergence, fail = judging.evaluate_norms, judging.check_convergence, judging.fail
+    convergence = convergence_functions(traits)
+    objective, magnitude = convergence.objective, convergence.magnitude
+    evaluate_norms, check_convergence, fail = (
+        convergence.evaluate_norms,
+        convergence.check_convergence,
+        convergence.fail,
+    )
     accept, give_up, record_residual, iteration_factor = (
-        judging.accept,
-        judging.give_up,
-        judging.record_residual,
-        judging.iteration_factor,
+        convergence.accept,
+        convergence.give_up,
+        convergence.record_residual,
+        convergence.iteration_factor,
     )
     module = kernel_module(
         f"newton{traits.suffix('stored', 'has_constraints', 'limited', 'unilateral', 'midpoint')}", light=True
@@ -293,7 +297,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         else:
             begin_direction(ctl, world)
 
-    outer = outer_kernels(traits, module)
+    outer = outer_loop_kernels(traits, module)
     return _types.SimpleNamespace(
         **vars(outer),
         **vars(searching),

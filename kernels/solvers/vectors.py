@@ -152,7 +152,7 @@ def vector_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNa
             target[world, slot] = source[world, slot]
 
     @wp.kernel(module=module)
-    def dot_rows(
+    def dot_terms(
         a: wp.array2d(dtype=vec3),
         b: wp.array2d(dtype=vec3),
         active: wp.array(dtype=wp.int32),
@@ -179,6 +179,6 @@ def vector_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNa
         copy_active=copy_active,
         set_base=set_base,
         floor_partial=floor_partial,
-        dot_rows=dot_rows,
+        dot_terms=dot_terms,
         any_set=any_set,
     )

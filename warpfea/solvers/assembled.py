@@ -178,10 +178,11 @@ class Assembled:
         """Contribution lists (element entry -> matrix entry) built on the device by `list_contributions`."""
         model = self.model
         kernels = self.assembly(block)
-        if 2 * kernels.places * block.count >= 2**31:
+        if 2 * kernels.blocks_per_element * block.count >= 2**31:
             raise ModelError(
                 f"matrix too large to index: {block.count} elements of {block.slots} slots, at most "
-                f"{2**30 // kernels.places} such elements; use preconditioner='block-jacobi' with operator='elements'"
+                f"{2**30 // kernels.blocks_per_element} such elements; use preconditioner='block-jacobi' with "
+                "operator='elements'"
             )
         upper = len(self.pattern.upper)
         start = wp.zeros(upper + 1, dtype=wp.int32, device=model.device)
@@ -257,7 +258,7 @@ class Assembled:
                 launch(elements.element_matrix, (count, 3 * block.slots * block.count), args)
             args = [m.topology, self.pattern.data, *self.contributions[first], matrix]
             args += [mass, int(first == 0), mass_factor, dq_dv, active, out]
-            launch(self.assembly(block).add_elements, (count, len(self.pattern.upper)), args)
+            launch(self.assembly(block).add_element_matrices, (count, len(self.pattern.upper)), args)
 
     def matrix(self, values: wp.array, world: int = 0) -> sp.csr_matrix:
         """Blocks of one world as CSR (3 slots, 3 slots) on the host."""

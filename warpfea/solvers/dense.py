@@ -114,9 +114,9 @@ class DenseInverse:
     def fill(self, pattern: Pattern, value: Any, flags: wp.array) -> None:
         """Copy a matrix of 3x3 blocks in the flagged worlds."""
         if self.parts:
-            self.launch(self.by_part.spread, self.blocks, [flags, self.flags])
+            self.launch(self.by_part.copy_flags_to_components, self.blocks, [flags, self.flags])
             args = [pattern.data, value, self.parts.slot, self.parts.place_of, self.flags, self.scale, self.matrix]
-            self.launch(self.by_part.fill_parts, (self.blocks, self.size), args)
+            self.launch(self.by_part.fill_components, (self.blocks, self.size), args)
             return
         args = [pattern.data, value, self.unknowns // 3, flags, self.scale, self.matrix]
         self.launch(self.making.fill_dense, (self.worlds, self.size // 3), args)
@@ -146,7 +146,7 @@ class DenseInverse:
             n = self.parts.count * 3 * self.parts.most
             lanes = self.launch.lanes(3 * self.parts.most)
             args = [self.matrix, self.parts.slot, lanes, r, active, x]
-            self.launch(self.by_part.apply_parts, (self.worlds, self.launch.padded(n * lanes)), args)
+            self.launch(self.by_part.apply_component_inverses, (self.worlds, self.launch.padded(n * lanes)), args)
             return
         n = self.unknowns
         lanes = self.launch.lanes(n)

@@ -193,7 +193,7 @@ class JacobiLoop(NewtonLoop):
         active = w.newton.active
         self._compute_step(active)
         if self.limited:
-            launch(self.kernels.free_step, self.model.worlds, [w.newton])
+            launch(self.kernels.reset_step_limit, self.model.worlds, [w.newton])
         for term in self.terms:
             if term.traits.limited:  # other terms predict multipliers, for Newton's method only
                 term.process_direction(self.ctx, active)

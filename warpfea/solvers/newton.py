@@ -342,10 +342,10 @@ class NewtonLoop:
         self.residual.freeze_nonpotential(active)
         self.residual.tangent_curvature(active)
         if self.limited:
-            launch(k.free_step, self.model.worlds, [w.newton])
+            launch(k.reset_step_limit, self.model.worlds, [w.newton])
         self._call_terms("process_direction", active)
         launch(self.vectors.set_base, self.dim, [w.newton, w.v, w.base, w.best])
-        launch(self.vectors.dot_rows, self.dim, [w.gradient, w.direction, active, w.rows])
+        launch(self.vectors.dot_terms, self.dim, [w.gradient, w.direction, active, w.rows])
         self.residual.reduce(w.rows, 1, active, w.newton.slope_sum)
         launch(k.begin_search, self.model.worlds, [w.newton, w.pcg])
         self._reduce_flags(w.newton.searching, self.searching)

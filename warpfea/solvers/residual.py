@@ -339,5 +339,5 @@ class Residual:
                 term.product(self.ctx, w.direction, active)
         args = [self.terms.side_topology, w.nonpotential_tangent, active, w.Hp]
         launch(self.gather.gather_force, self.dim, args)
-        launch(self.vectors.dot_rows, self.dim, [w.Hp, w.direction, active, w.rows])  # p is 0 where prescribed
+        launch(self.vectors.dot_terms, self.dim, [w.Hp, w.direction, active, w.rows])  # p is 0 where prescribed
         self.reduce(w.rows, 1, active, w.newton.tangent_sum)

@@ -319,7 +319,7 @@ class TwoLevel:
             if len(worlds) == B:
                 yield worlds, flags, self.value
                 return
-            self.launch(self.blocks.choose_worlds, B, [flags, worlds.start, worlds.stop, self.chosen])
+            self.launch(self.blocks.select_worlds, B, [flags, worlds.start, worlds.stop, self.chosen])
             yield worlds, self.chosen, self.assembled.view(self.value, first)
 
     def _build(self, *, penalty: bool = False) -> None:
@@ -335,7 +335,7 @@ class TwoLevel:
                 self._copy_cached()
                 self._add(value, flags, penalties=False)
             args = [m.topology, self.assembled.pattern.data, value, flags, w.diagonal, w.inverse]
-            launch(self.blocks.take_diagonal, self.dim, args)
+            launch(self.blocks.invert_diagonal_blocks, self.dim, args)
             if m.terms.traits.has_constraints:
                 if penalty:
                     for term in self.terms:
@@ -370,7 +370,7 @@ class TwoLevel:
             assert level.galerkin is not None
             free = self.all_free if depth else m.topology.free
             args = [*level.galerkin, level.data.weight, free, value, flags, self.arrays[depth + 1].value]
-            self.launch(self.blocks.galerkin, (m.worlds, 16 * level.galerkin[0].shape[0]), args)
+            self.launch(self.blocks.galerkin_product, (m.worlds, 16 * level.galerkin[0].shape[0]), args)
 
     def _invert(self, flags: wp.array) -> None:
         """Invert all levels; the first is already filled."""
