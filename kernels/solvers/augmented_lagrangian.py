@@ -23,9 +23,9 @@ def outer_loop_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamesp
     Control = control_struct()
     convergence = convergence_functions(traits)
     allowed_violation = convergence.allowed_violation
-    objective, magnitude, largest_violation = (
+    objective, objective_magnitude, largest_violation = (
         convergence.objective,
-        convergence.magnitude,
+        convergence.objective_magnitude,
         convergence.largest_violation,
     )
     evaluate_norms, check_convergence, record_residual, give_up = (
@@ -62,7 +62,7 @@ def outer_loop_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamesp
                 # the frozen quantities were the larger error: tighter solves are wasted
                 ctl.forcing[world] = wp.max(ctl.forcing[world], f64(LOOSE_FORCING))
             ctl.phi[world] = objective(ctl, world) + ctl.slot_sums[7, world]
-            ctl.phi_magnitude[world] = magnitude(ctl, world)
+            ctl.phi_magnitude[world] = objective_magnitude(ctl, world)
             ctl.nonmonotone_steps[world] = 0
             ctl.frozen_updated[world] = 1 - ctl.unilateral_changed[world]
             ctl.unilateral_changed[world] = 0

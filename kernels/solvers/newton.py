@@ -8,8 +8,8 @@ import warp as wp
 from ..common.traits import NO_TERMS, Traits
 from ..common.types import kernel_module
 from .augmented_lagrangian import outer_loop_kernels
-from .convergence import MAX_ERROR_ESTIMATES, SINGLE_EPS, VELOCITY_ROUNDINGS, convergence_functions
-from .line_search import MAX_TRUST_RADIUS, NOISE, line_search_kernels
+from .convergence import MAX_ERROR_ESTIMATES, SINGLE_PRECISION_EPS, VELOCITY_ROUNDINGS, convergence_functions
+from .line_search import MAX_TRUST_RADIUS, PHI_NOISE_ROUNDINGS, line_search_kernels
 from .newton_control import (
     FAIL_CURVATURE,
     FAIL_FLOOR,
@@ -22,16 +22,17 @@ from .newton_control import (
     control_struct,
 )
 from .pcg import pcg_struct
-from .perturbation import SCATTER
+from .perturbation import SCATTER_FACTOR
 
 __all__ = ["newton_kernels"]
 
-SOLVES_PER_ITERATION = 3
+MAX_SOLVES_PER_ITERATION = 3
 """Maximum linear solves of an attempt per allowed iteration: bounds solves without a step."""
 DISPLACEMENT_ROUNDINGS = 64.0
 """Roundings of the displacements below which an error is negligible, whatever the reference energy."""
-RESTART_FORCING = 0.1  # of the first solve of a step that starts far from its end: a tighter solution is wasted
-MAX_ENERGY_RATIO = 3.0
+ALTERNATIVE_START_FORCING = 0.1
+"""Forcing term of the first solve after an alternative first iterate, far from the end: a tighter one is wasted."""
+MAX_START_ENERGY_RATIO = 3.0
 """Strain energy increase of a first iterate, in kinetic energies, above which other first iterates are tried."""
 
 
@@ -52,14 +53,14 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
     )
     midpoint = traits.midpoint
     convergence = convergence_functions(traits)
-    objective, magnitude = convergence.objective, convergence.magnitude
-    evaluate_norms, check_convergence, fail = (
+    objective, objective_magnitude = convergence.objective, convergence.objective_magnitude
+    evaluate_norms, check_convergence, handle_failed_search = (
         convergence.evaluate_norms,
         convergence.check_convergence,
-        convergence.fail,
+        convergence.handle_failed_search,
     )
-    accept, give_up, record_residual, iteration_factor = (
-        convergence.accept,
+    accept_iterate, give_up, record_residual, iteration_factor = (
+        convergence.accept_iterate,
         convergence.give_up,
         convergence.record_residual,
         convergence.iteration_factor,
@@ -82,12 +83,12 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
                 ctl.contact_active[world] = 0
 
     @wp.func
-    def start(ctl: Control, world: int):
+    def initialise_iteration(ctl: Control, world: int):
         """Initialise the iteration at its first iterate, and test that for convergence."""
         evaluate_norms(ctl, world)
         phi = objective(ctl, world) + ctl.slot_sums[7, world]
         ctl.phi[world] = phi
-        ctl.phi_magnitude[world] = magnitude(ctl, world)
+        ctl.phi_magnitude[world] = objective_magnitude(ctl, world)
         ctl.forcing[world] = ctl.first_forcing
         ctl.reused[world] = 0
         ctl.nonmonotone_steps[world] = 0
@@ -118,7 +119,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
             check_convergence(ctl, world)
 
     @wp.func
-    def poor_first_iterate(ctl: Control, world: int) -> bool:
+    def is_poor_first_iterate(ctl: Control, world: int) -> bool:
         """True if other first iterates should be tried: Phi exceeds a bound of Phi at q_n, or J <= 0.
 
         At q_n Phi is the strain energy of the state plus a kinetic energy: row 10 of `residual` for backward Euler, a
@@ -127,12 +128,12 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         phi = objective(ctl, world)
         if wp.static(midpoint):
             return not (wp.isfinite(phi) and ctl.min_J[world] > f64(0.0))
-        bound = ctl.potential[world] / ctl.dq_dv[world] + f64(MAX_ENERGY_RATIO) * ctl.slot_sums[10, world]
-        bound += f64(NOISE) * ctl.eps * magnitude(ctl, world)
+        bound = ctl.potential[world] / ctl.dq_dv[world] + f64(MAX_START_ENERGY_RATIO) * ctl.slot_sums[10, world]
+        bound += f64(PHI_NOISE_ROUNDINGS) * ctl.eps * objective_magnitude(ctl, world)
         return not (phi <= bound and wp.isfinite(phi) and ctl.min_J[world] > f64(0.0))
 
     @wp.kernel(module=module)
-    def begin(ctl: Control, stage: int):
+    def begin_iteration(ctl: Control, stage: int):
         """Start with the first iterate; `stage` 0: no alternatives; 1: some follow if it is poor; 2: the best."""
         world = wp.tid()
         if stage != 2:
@@ -140,16 +141,16 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         if ctl.active[world] == 0 or (stage == 2 and ctl.choose_initial[world] == 0):
             return
         if stage == 1:
-            if poor_first_iterate(ctl, world):
+            if is_poor_first_iterate(ctl, world):
                 ctl.choose_initial[world] = 1
                 wp.atomic_max(ctl.any_rare, 0, 1)
                 return
-        start(ctl, world)
+        initialise_iteration(ctl, world)
         if stage == 2 and ctl.fixed_forcing == 0:
-            ctl.forcing[world] = f64(RESTART_FORCING)
+            ctl.forcing[world] = f64(ALTERNATIVE_START_FORCING)
 
     @wp.kernel(module=module)
-    def compare(ctl: Control, first: int, better: wp.array(dtype=wp.int32)):
+    def compare_first_iterates(ctl: Control, first: int, better: wp.array(dtype=wp.int32)):
         """Flag the worlds where the first iterate just evaluated is the best so far: J > 0 before Phi."""
         world = wp.tid()
         better[world] = 0
@@ -167,7 +168,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
                 ctl.predicted[world] = 0
 
     @wp.func
-    def begin_direction(ctl: Control, world: int):
+    def check_direction(ctl: Control, world: int):
         """Check the search direction and start the line search."""
         ctl.met_negative_curvature[world] = wp.max(ctl.met_negative_curvature[world], ctl.negative_curvature[world])
         ctl.searching[world] = 1
@@ -175,9 +176,9 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         if wp.static(limited):
             barred = not ctl.limit[world] > f64(0.0)
         if not wp.isfinite(ctl.slope[world]):
-            fail(ctl, world, FAIL_NAN)
+            handle_failed_search(ctl, world, FAIL_NAN)
         elif barred:
-            fail(ctl, world, FAIL_LIMIT)
+            handle_failed_search(ctl, world, FAIL_LIMIT)
         elif ctl.negative_curvature[world] != 0 and ctl.predicted_stress[world] == 1:
             if ctl.nonmonotone_steps[world] > 0:
                 ctl.restore_best[world] = 1
@@ -191,11 +192,11 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
             elif ctl.nonmonotone_steps[world] > 0:
                 ctl.restore_best[world] = 1
             else:
-                fail(ctl, world, FAIL_CURVATURE)
+                handle_failed_search(ctl, world, FAIL_CURVATURE)
 
     @wp.func
     def part_error(ctl: Control, world: int, part: int, whole: f64, largest: f64) -> f64:
-        """Error estimate of a part, see `check_rounding_floor`.
+        """Error estimate of a part of the model (its residual parts), see `check_rounding_floor`.
 
         `whole`: -g.p of all parts, W; `largest`: the largest length in the round-off bound, m.
         """
@@ -210,12 +211,12 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         eta = f64(1.0e30)
         if ctl.negative_curvature[world] == 0 and wp.isfinite(work) and whole > f64(0.0):
             eta = wp.sqrt(wp.abs(work) * dq / wp.max(f64(2.0) * strain + kinetic * dq, f64(1.0e-300)))
-            if ctl.eps > f64(SINGLE_EPS):  # a soft direction may be invisible to the energy
-                eta = wp.max(eta, f64(SCATTER) * dq * step / wp.max(largest, f64(1.0e-300)))
+            if ctl.eps > f64(SINGLE_PRECISION_EPS):  # a soft direction may be invisible to the energy
+                eta = wp.max(eta, f64(SCATTER_FACTOR) * dq * step / wp.max(largest, f64(1.0e-300)))
             if eta > ctl.max_floor and dq * step <= f64(DISPLACEMENT_ROUNDINGS) * ctl.eps * largest:
                 eta = dq * step / wp.max(largest, f64(1.0e-300))
             slow = step <= f64(VELOCITY_ROUNDINGS) * ctl.eps * speed
-            if eta > ctl.max_floor and slow and ctl.eps < f64(SINGLE_EPS):
+            if eta > ctl.max_floor and slow and ctl.eps < f64(SINGLE_PRECISION_EPS):
                 eta = step / speed
         return eta
 
@@ -230,7 +231,8 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         if ctl.estimate_error[world] != 2:
             return
         ctl.estimate_error[world] = 0
-        if ctl.pcg_unconverged[world] != 0 and ctl.eps > f64(SINGLE_EPS):  # this solve cannot give the error either
+        # this solve cannot give the error either
+        if ctl.pcg_unconverged[world] != 0 and ctl.eps > f64(SINGLE_PRECISION_EPS):
             give_up(ctl, world, FAIL_FLOOR)
             return
         largest, whole = f64(0.0), f64(0.0)
@@ -247,7 +249,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         ctl.error_estimate[world] = worst
         if worst <= ctl.max_floor:
             ctl.floor[world] = wp.max(ctl.floor[world], worst)
-            accept(ctl, world)
+            accept_iterate(ctl, world)
             return
         tries = ctl.error_estimates[world] + 1
         ctl.error_estimates[world] = tries
@@ -256,7 +258,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
             give_up(ctl, world, wp.where(known, FAIL_FLOOR, FAIL_CURVATURE))
             return
         ctl.last_error_estimate[world] = worst
-        begin_direction(ctl, world)
+        check_direction(ctl, world)
 
     @wp.kernel(module=module)
     def begin_search(ctl: Control, pcg: PCG):
@@ -292,10 +294,10 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
             wp.atomic_max(ctl.any_rare, 0, 1)
         elif pcg.total[world] >= pcg.max_work:
             give_up(ctl, world, FAIL_WORK)
-        elif ctl.linear_solves[world] > SOLVES_PER_ITERATION * iteration_factor(ctl, world) * ctl.max_iterations:
+        elif ctl.linear_solves[world] > MAX_SOLVES_PER_ITERATION * iteration_factor(ctl, world) * ctl.max_iterations:
             give_up(ctl, world, FAIL_ITERATIONS)
         else:
-            begin_direction(ctl, world)
+            check_direction(ctl, world)
 
     outer = outer_loop_kernels(traits, module)
     return _types.SimpleNamespace(
@@ -303,11 +305,11 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         **vars(searching),
         module=module,
         evaluate_norms=evaluate_norms,
-        accept=accept,
+        accept_iterate=accept_iterate,
         record_residual=record_residual,
         reset_min_J=reset_min_J,
-        begin=begin,
-        compare=compare,
+        begin_iteration=begin_iteration,
+        compare_first_iterates=compare_first_iterates,
         check_rounding_floor=check_rounding_floor,
         begin_search=begin_search,
     )

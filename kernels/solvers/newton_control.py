@@ -20,8 +20,8 @@ __all__ = [
     "FAIL_WORK",
     "FLOOR_LANES",
     "FLOOR_ROWS",
+    "GROUP_LANES",
     "GROUP_ROWS",
-    "LANES",
     "TERM_ROWS",
     "control_struct",
 ]
@@ -42,7 +42,7 @@ FAIL_ENERGY = 13
 
 GROUP_ROWS = 6  # squared norms of g, f_int, loads, inertia, round-off; strain energy
 FLOOR_ROWS = 6  # -g.p, inertia.(v - v~), strain energy, largest |p|, |u| and |v|
-LANES, FLOOR_LANES = 32, 16
+GROUP_LANES, FLOOR_LANES = 32, 16
 TERM_ROWS = 3
 """Rows summed per world over terms with stored energy: the potential with the quantities frozen in a line search
 (multipliers, friction limits), the potential with their next values, and its magnitude."""

@@ -12,7 +12,7 @@ from ..common.lanes import lane_functions
 from ..common.types import kernel_module, precision
 from .newton_control import control_struct
 
-__all__ = ["LANES", "forcing_functions", "groups_struct", "pcg_kernels", "pcg_struct"]
+__all__ = ["FREE_GROUP_LANES", "forcing_functions", "groups_struct", "pcg_kernels", "pcg_struct"]
 
 CONSTRAINT_FORCING = 0.4
 """Factor on the tolerance of solves with constraints. Of 0.03, 0.18, 0.4 and 1 it avoids the third Newton iteration at
@@ -23,7 +23,7 @@ UNCHECKED_ITERATIONS = 3
 refined by conjugate gradients."""
 STRICT_CHECK, STRICT_GAIN = 10, 0.01
 """An error-estimating solve ends when it gains less than STRICT_GAIN of the energy in STRICT_CHECK iterations."""
-LANES = 128
+FREE_GROUP_LANES = 128
 """Partial sums per group of bodies; fixed, so that results are independent of the number of worlds."""
 
 
@@ -308,12 +308,12 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNames
         active: wp.array(dtype=wp.int32),
         partial: wp.array3d(dtype=vec3),
     ):
-        """Z^T r, in LANES strided partial sums per group."""
+        """Z^T r, in FREE_GROUP_LANES strided partial sums per group."""
         world, group, lane = wp.tid()
         if active[world] == 0:
             return
         s = vec3()
-        for k in range(groups.start[group] + lane, groups.start[group + 1], LANES):
+        for k in range(groups.start[group] + lane, groups.start[group + 1], FREE_GROUP_LANES):
             s += r[world, groups.slot[k]]
         partial[world, group, lane] = s
 
@@ -330,7 +330,7 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNames
         if active[world] == 0:
             return
         s = vec3()
-        for lane in range(LANES):
+        for lane in range(FREE_GROUP_LANES):
             s += partial[world, group, lane]
         scale = T(1.0) / (T(mass_factor[world]) * groups.mass[world % groups.mass.shape[0], group])
         velocity[world, group] = scale * wp.cw_mul(s, groups.free[group])

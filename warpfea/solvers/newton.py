@@ -291,7 +291,7 @@ class NewtonLoop:
         """Newton iteration from the current residual; `first`: first solve of an attempt."""
         w = self.work
         choose = bool(self.first_iterates) and first
-        self.launch(self.kernels.begin, self.model.worlds, [w.newton, int(choose)])
+        self.launch(self.kernels.begin_iteration, self.model.worlds, [w.newton, int(choose)])
         self._if_rare(self._choose_initial if choose else self._check_inversion)
         if self.terms.traits.unilateral:  # the first iterate may be the solution, as in free fall
             self._update_frozen()
@@ -303,17 +303,17 @@ class NewtonLoop:
         """Select the best first iterate (J > 0 first, then lowest Phi)."""
         w, k, launch = self.work, self.kernels, self.launch
         choose, better = w.newton.choose_initial, w.newton.searching
-        launch(k.compare, self.model.worlds, [w.newton, 1, better])
+        launch(k.compare_first_iterates, self.model.worlds, [w.newton, 1, better])
         launch(self.vectors.copy_active, self.dim, [w.v, better, w.best])
         for put in self.first_iterates:
             put()
             self.residual.evaluate(choose, freeze=True)
-            launch(k.compare, self.model.worlds, [w.newton, 0, better])
+            launch(k.compare_first_iterates, self.model.worlds, [w.newton, 0, better])
             launch(self.vectors.copy_active, self.dim, [w.v, better, w.best])
         launch(self.vectors.copy_active, self.dim, [w.best, choose, w.v])
         self.preconditioner.discard(choose)
         self._open(choose)
-        launch(k.begin, self.model.worlds, [w.newton, 2])
+        launch(k.begin_iteration, self.model.worlds, [w.newton, 2])
         self._check_inversion()
 
     def _check_constraints(self) -> None:
@@ -369,7 +369,7 @@ class NewtonLoop:
         launch(k.begin_samples, self.dim, [w.newton, flags, w.p, w.z])
         for sample in range(SAMPLES):
             self.residual.update_positions(flags)
-            launch(k.perturb, self.dim, [w.newton, flags, sample, w.u, w.p])
+            launch(k.perturb_positions, self.dim, [w.newton, flags, sample, w.u, w.p])
             self.residual.evaluate_forces(flags)
             launch(k.add_sample, self.dim, [flags, w.gradient, w.z])
         self.residual.product(w.p, w.Hp, flags)
@@ -399,7 +399,7 @@ class NewtonLoop:
         parts = m.residual_parts
         args = [w.newton, parts.slot_start, parts.slot, parts.element_start, parts.element]
         args += [w.gradient, w.direction, w.inertia, w.v, w.v_tilde, w.u, w.energy_rows]
-        self.launch(self.vectors.floor_partial, (m.worlds, parts.count, FLOOR_LANES), args)
+        self.launch(self.vectors.floor_partials, (m.worlds, parts.count, FLOOR_LANES), args)
         self.launch(k.check_rounding_floor, m.worlds, [w.newton, parts.component])
         if self.perturbation:
             self.residual.evaluate(self.perturbed)
@@ -439,7 +439,7 @@ class NewtonLoop:
 
     def _reduce_flags(self, flags: wp.array, out: wp.array) -> None:
         out.zero_()
-        self.launch(self.vectors.any_set, self.model.worlds, [flags, out])
+        self.launch(self.vectors.set_any_flag, self.model.worlds, [flags, out])
 
     def _clear_direction(self, active: wp.array) -> None:
         self.launch(self.pcg.kernels.start, self.dim, [self.work.g, self.model.topology.free, active,

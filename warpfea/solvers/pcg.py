@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import warp as wp
 
 from ..base.launch import Launcher, labelled
-from ..kernels.solvers.pcg import LANES, pcg_kernels
+from ..kernels.solvers.pcg import FREE_GROUP_LANES, pcg_kernels
 from .preconditioner import Preconditioner
 from .residual import Residual
 
@@ -85,7 +85,7 @@ class PCG:
             return
         m, w, k, launch = self.model, self.work, self.kernels, self.launch
         mass = w.step.mass_factor
-        launch(k.group_partial, (m.worlds, m.group_count, LANES), [m.groups, w.r, active, w.group_partial])
+        launch(k.group_partial, (m.worlds, m.group_count, FREE_GROUP_LANES), [m.groups, w.r, active, w.group_partial])
         args = [m.groups, w.group_partial, mass, active, w.group_velocity]
         launch(k.group_velocity, (m.worlds, m.group_count), args)
         args = [m.groups, w.group_velocity, m.topology.free, mass, active, w.direction, w.r]

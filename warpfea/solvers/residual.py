@@ -12,7 +12,7 @@ from ..kernels.common.lanes import WARP
 from ..kernels.common.reduce import CHUNK, WARP_ROW, reduce_kernels
 from ..kernels.common.structs import additions_struct
 from ..kernels.solvers.newton import newton_kernels
-from ..kernels.solvers.newton_control import GROUP_ROWS, LANES, TERM_ROWS
+from ..kernels.solvers.newton_control import GROUP_LANES, GROUP_ROWS, TERM_ROWS
 from ..kernels.solvers.vectors import vector_kernels
 from ..kernels.step.gather import RESIDUAL_ROWS, gather_kernels
 from ..kernels.step.midpoint import stage_kernels
@@ -265,9 +265,9 @@ class Residual:
         if groups.count > 1:
             args = [groups.slot_start, groups.slot, groups.element_start, groups.element]
             args += [w.rows, w.energy_rows, active, w.residual_group_partial]
-            launch(self.vectors.norm_partial, (m.worlds, groups.count, LANES), args)
+            launch(self.vectors.group_norm_partials, (m.worlds, groups.count, GROUP_LANES), args)
             sums = (GROUP_ROWS, m.worlds, groups.count)
-            launch(self.vectors.norm_sum, sums, [w.residual_group_partial, active, w.newton.group_sums])
+            launch(self.vectors.sum_group_norms, sums, [w.residual_group_partial, active, w.newton.group_sums])
 
     @labelled("loads")
     def freeze_nonpotential(self, active: wp.array) -> None:

@@ -32,7 +32,7 @@ import warp as wp
 
 from ..base.launch import labelled
 from ..kernels.solvers.blocks import block_kernels
-from ..kernels.solvers.levels import TILE, TILE_SLOTS, level_kernels, level_struct
+from ..kernels.solvers.levels import TILE_SLOTS, TILE_UNKNOWNS, level_kernels, level_struct
 from ..kernels.solvers.levels_build import FACTOR_LANES, build_kernels
 from ..kernels.solvers.pcg import pcg_kernels
 from ..model.state import words_of
@@ -239,7 +239,7 @@ class TwoLevel:
             self.body_modes.apply(r, z, active)
         args = [level.data, correct, coarse, m.topology.free, r, w.diagonal, active, w.warp, z, w.warp_rows]
         dim = (m.worlds, launch.padded(m.slots))
-        launch(k.add_coarse, dim, args)
+        launch(k.add_coarse_correction, dim, args)
         if self.has_corrections:
             args = [w.inverse, r, w.diagonal, active, w.warp, w.Hp, w.spare_rows]
             launch(self.jacobi, dim, args)
@@ -259,7 +259,7 @@ class TwoLevel:
             dim = (B, self.launch.padded(3 * n * lanes))
             for upper, given, out in ((0, flat_r, self.half), (1, self.half, flat_x)):
                 args = [dense.stored, dense.root, upper, lanes, given, active, out]
-                self.launch(self.kernels.apply_triangle, dim, args)
+                self.launch(self.kernels.apply_triangular_inverse, dim, args)
             return
         dense.apply(flat_r, flat_x, active)
 
@@ -273,7 +273,7 @@ class TwoLevel:
         lanes = self.launch.lanes(GROUP_SLOTS)
         args = [level.data, arrays.stored, arrays.root, self.by_row, share, lanes, first_group]
         threads = first_group + (0 if last else lanes * level.groups)
-        self.launch(self.kernels.smooth, (self.model.worlds, threads), [*args, r, active, z, coarse])
+        self.launch(self.kernels.smooth_and_restrict, (self.model.worlds, threads), [*args, r, active, z, coarse])
         if last:
             return z
         below = self.arrays[depth + 1].vectors
@@ -296,7 +296,7 @@ class TwoLevel:
         for k in range(CHEBYSHEV_STEPS):
             coarse = self._smooth(depth, v["r"], v["z"], active)
             args = [level.data, 1, coarse, v["z"], keep, step, active, v["d"], v["x"]]
-            self.launch(self.kernels.chebyshev, dim, args)
+            self.launch(self.kernels.chebyshev_step, dim, args)
             if k < CHEBYSHEV_STEPS - 1:
                 lanes = self.launch.lanes(level.pattern.width)
                 args = [level.pattern.data, arrays.value, v["d"], lanes, active, v["r"]]
@@ -369,7 +369,7 @@ class TwoLevel:
         if depth + 1 < len(self.levels):
             assert level.galerkin is not None
             free = self.all_free if depth else m.topology.free
-            args = [*level.galerkin, level.data.weight, free, value, flags, self.arrays[depth + 1].value]
+            args = [*level.galerkin, level.data.affine_values, free, value, flags, self.arrays[depth + 1].value]
             self.launch(self.blocks.galerkin_product, (m.worlds, 16 * level.galerkin[0].shape[0]), args)
 
     def _invert(self, flags: wp.array) -> None:
@@ -433,7 +433,7 @@ class TwoLevel:
         gauss_jordan(self.launch, k, level.tiles, arrays, arrays.matrix, flags, keep=keep)
         if arrays.stored is not arrays.matrix:
             args = [level.tiles, arrays.diagonal, arrays.matrix, flags, arrays.root, arrays.stored]
-            self.launch(k.store_tiles, (B, level.tiles, TILE), args)
+            self.launch(k.store_tile_inverses, (B, level.tiles, TILE_UNKNOWNS), args)
 
 
 def _flat(array: wp.array, dtype: Any, shape: tuple[int, ...]) -> wp.array:

@@ -13,9 +13,8 @@ from ..base.memory import enough_memory
 from ..kernels.common.lanes import WARP
 from ..kernels.common.reduce import CHUNK
 from ..kernels.common.structs import balance_struct
-from ..kernels.solvers.newton_control import FLOOR_LANES, FLOOR_ROWS, GROUP_ROWS, LANES, TERM_ROWS, control_struct
-from ..kernels.solvers.pcg import LANES as GROUP_LANES
-from ..kernels.solvers.pcg import pcg_struct
+from ..kernels.solvers.newton_control import FLOOR_LANES, FLOOR_ROWS, GROUP_LANES, GROUP_ROWS, TERM_ROWS, control_struct
+from ..kernels.solvers.pcg import FREE_GROUP_LANES, pcg_struct
 from ..kernels.step.energy_ledger import LEDGER_ROWS
 from ..kernels.step.gather import RESIDUAL_ROWS
 from ..kernels.step.step_control import step_struct
@@ -98,7 +97,7 @@ class Workspace:
         self.time_law_stage_values = self.time_law_values
         if midpoint:
             self.time_law_stage_values = self.array("law_stage", self.time_law_values.shape, wp.vec3d)
-        self.group_partial = self.array("group_partial", (B, max(model.group_count, 1), GROUP_LANES), vec3)
+        self.group_partial = self.array("group_partial", (B, max(model.group_count, 1), FREE_GROUP_LANES), vec3)
         self.group_velocity = self.array("group_velocity", (B, max(model.group_count, 1)), vec3)
         self.ledger_sums = self.array("ledger_sums", (LEDGER_ROWS if ledger else 1, B), wp.float64)
         self.report = self.array("report", (B, terms.report_width), wp.float64)
@@ -107,7 +106,7 @@ class Workspace:
         groups = model.residual_groups.count
         sums = (GROUP_ROWS, B, groups) if groups > 1 else (1, 1, 1)
         self.residual_group_partial = self.array(
-            "residual_group_partial", (*sums, LANES) if groups > 1 else (1, 1, 1, 1), wp.float64
+            "residual_group_partial", (*sums, GROUP_LANES) if groups > 1 else (1, 1, 1, 1), wp.float64
         )
         skip: tuple[str, ...] = (
             "violation",
