@@ -56,9 +56,9 @@ def outer_loop_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamesp
         """Re-evaluate the iterate of the flagged worlds with the updated frozen quantities."""
         world = wp.tid()
         if ctl.active[world] != 0 and flags[world] != 0:
-            before = ctl.norm[world]
+            before = ctl.residual_norm[world]
             evaluate_norms(ctl, world)
-            if ctl.fixed_forcing == 0 and ctl.norm[world] > f64(RESIDUAL_GROWTH) * before:
+            if ctl.fixed_forcing == 0 and ctl.residual_norm[world] > f64(RESIDUAL_GROWTH) * before:
                 # the frozen quantities were the larger error: tighter solves are wasted
                 ctl.forcing[world] = wp.max(ctl.forcing[world], f64(LOOSE_FORCING))
             ctl.phi[world] = objective(ctl, world) + ctl.slot_sums[7, world]
@@ -84,10 +84,10 @@ def outer_loop_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamesp
             return
         if largest_violation(ctl, world) <= allowed_violation(ctl, world, tol):
             return
-        if ctl.outer[world] >= limit:
+        if ctl.multiplier_updates[world] >= limit:
             ctl.failed[world] = FAIL_CONSTRAINT
             return
-        ctl.outer[world] = ctl.outer[world] + 1
+        ctl.multiplier_updates[world] = ctl.multiplier_updates[world] + 1
         ctl.iterations[world] = 0
         ctl.inversion_suspected[world] = 0
         ctl.inverted[world] = 0

@@ -60,13 +60,13 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> _types.Simple
     f64 = wp.float64
     Newton, Control, Recursion = control_struct(), pcg_struct(), bicgstab_struct()
     forcing = forcing_functions(has_constraints)
-    forced, least_norm = forcing.forced, forcing.least_norm
+    forcing_target, min_target_norm = forcing.forcing_target, forcing.min_target_norm
     module = kernel_module(f"bicgstab_{dtype}{'_gated' if has_constraints else ''}")
 
     @wp.func
     def has_iterations_left(ctl: Control, world: int) -> bool:
         """True if iterations are left, of the solve and of the step."""
-        return ctl.iterations[world] < ctl.max_iterations and ctl.total[world] < ctl.max_work
+        return ctl.iterations[world] < ctl.max_iterations and ctl.step_iterations[world] < ctl.max_work
 
     @wp.kernel(module=module)
     def begin_solve(newton: Newton, ctl: Control, bi: Recursion):
@@ -84,12 +84,12 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> _types.Simple
         bi.best_norm[world] = norm
         bi.halved_norm[world] = norm
         bi.stalled_iterations[world] = 0
-        ctl.target[world] = forced(newton, world, norm)
+        ctl.target_norm[world] = forcing_target(newton, world, norm)
         if newton.estimate_error[world] != 0:
-            ctl.target[world] = f64(ESTIMATE_TOL) * norm
+            ctl.target_norm[world] = f64(ESTIMATE_TOL) * norm
         elif newton.relative_residual[world] > f64(START_STRESS_RESIDUAL) and newton.fixed_forcing == 0:
-            ctl.target[world] = wp.max(f64(START_STRESS_TOL) * norm, least_norm(newton, world))
-        if norm > ctl.target[world] and ctl.max_iterations > 0 and wp.isfinite(norm) and bi.rho[world] != f64(0.0):
+            ctl.target_norm[world] = wp.max(f64(START_STRESS_TOL) * norm, min_target_norm(newton, world))
+        if norm > ctl.target_norm[world] and ctl.max_iterations > 0 and wp.isfinite(norm) and bi.rho[world] != f64(0.0):
             ctl.active[world] = wp.where(newton.relative_residual[world] > f64(START_STRESS_RESIDUAL), 2, 1)
             wp.atomic_max(ctl.any_active, 0, 1)
         elif newton.estimate_error[world] != 0:
@@ -123,7 +123,7 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> _types.Simple
         if ctl.active[world] == 0:
             return
         ctl.iterations[world] = ctl.iterations[world] + 1
-        ctl.total[world] = ctl.total[world] + 1
+        ctl.step_iterations[world] = ctl.step_iterations[world] + 1
         alpha = bi.rho[world] / bi.sums[0, world]
         bi.alpha[world] = alpha
         if not wp.isfinite(alpha):
@@ -154,7 +154,7 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> _types.Simple
         if ctl.active[world] != 0:
             norm = wp.sqrt(ctl.sums[1, world])
             ctl.norm[world] = norm
-            if not norm > ctl.target[world]:
+            if not norm > ctl.target_norm[world]:
                 bi.best_norm[world] = norm
                 ctl.active[world] = 0
 
@@ -200,7 +200,7 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> _types.Simple
         if norm <= f64(0.5) * bi.halved_norm[world]:
             bi.halved_norm[world] = norm
             bi.stalled_iterations[world] = 0
-        more = norm > ctl.target[world] and has_iterations_left(ctl, world)
+        more = norm > ctl.target_norm[world] and has_iterations_left(ctl, world)
         more = more and bi.stalled_iterations[world] < MAX_STALLED_ITERATIONS
         if more and wp.isfinite(beta) and wp.isfinite(norm) and rho != f64(0.0):
             bi.unfinished[world] = 1
@@ -252,7 +252,7 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> _types.Simple
             return
         if not ctl.norm[world] <= bi.best_norm[world]:
             ctl.norm[world] = bi.best_norm[world]
-        if first != 0 and ctl.norm[world] > ctl.target[world] and has_iterations_left(ctl, world):
+        if first != 0 and ctl.norm[world] > ctl.target_norm[world] and has_iterations_left(ctl, world):
             bi.restart_requested[world] = 1
             wp.atomic_max(bi.any_restart_requested, 0, 1)
         elif (

@@ -9,11 +9,11 @@ from ..common.traits import NO_TERMS, Traits
 from .newton_control import (
     FAIL_CONSTRAINT,
     FAIL_CURVATURE,
-    FAIL_FLOOR,
     FAIL_ITERATIONS,
     FAIL_JACOBIAN,
     FAIL_LINE_SEARCH,
     FAIL_NAN,
+    FAIL_ROUNDOFF,
     control_struct,
 )
 
@@ -111,7 +111,7 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
     def largest_violation(ctl: Control, world: int) -> f64:
         """Largest constraint violation over all components, m."""
         largest = f64(0.0)
-        for c in range(ctl.components):
+        for c in range(ctl.component_count):
             largest = wp.max(largest, ctl.violation[world, c])
         return largest
 
@@ -122,7 +122,7 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         A small fraction of the strain energy is included as reactions: a group between others may carry no load of its
         own.
         """
-        if ctl.groups == 1:
+        if ctl.group_count == 1:
             f2 = wp.max(ctl.slot_sums[1, world], wp.max(ctl.slot_sums[2, world], ctl.slot_sums[3, world]))
             return wp.vec3d(ctl.slot_sums[0, world], f2, ctl.slot_sums[8, world])
         f2 = wp.max(
@@ -134,14 +134,14 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
     @wp.func
     def is_unsolved_unlike_stiffness(ctl: Control, world: int) -> bool:
         """True in float32 at a first iterate of motion where bodies have parts of unlike stiffness."""
-        first = ctl.iterations[world] == 0 and ctl.equilibrium == 0
-        return first and ctl.groups > ctl.components and ctl.eps > f64(SINGLE_PRECISION_EPS)
+        first = ctl.iterations[world] == 0 and ctl.is_static == 0
+        return first and ctl.group_count > ctl.component_count and ctl.eps > f64(SINGLE_PRECISION_EPS)
 
     @wp.func
     def component_sum(ctl: Control, world: int, group: int, row: int) -> f64:
         """Sum of a row of `group_sums` over the groups of a group's component."""
         total = f64(0.0)
-        for other in range(ctl.groups):
+        for other in range(ctl.group_count):
             if ctl.component_of_group[other] == ctl.component_of_group[group]:
                 total += ctl.group_sums[row, world, other]
         return total
@@ -151,7 +151,7 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         """True in float64 if a group's residual is position round-off, and within the tolerance of all groups of its
         component: further iterations would not reduce it."""
         if (
-            ctl.groups == ctl.components
+            ctl.group_count == ctl.component_count
             or ctl.eps > f64(SINGLE_PRECISION_EPS)
             or norm > f64(GROUP_ROUNDINGS) * rounding
         ):
@@ -167,16 +167,16 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         whose groups have all converged is excluded from further solves.
         """
         force = wp.sqrt(ctl.slot_sums[9, world])
-        ctl.force[world] = force
+        ctl.residual_force[world] = force
         largest = f64(0.0)
         worst = f64(0.0)
         excess = f64(0.0)
         floor_excess = f64(0.0)
         solve = f64(0.0)
         unconverged_tol = f64(1.0e300)
-        for c in range(ctl.components):
+        for c in range(ctl.component_count):
             ctl.component_converged[world, c] = 1
-        for group in range(ctl.groups):
+        for group in range(ctl.group_count):
             sums = squared_group_norms(ctl, world, group)
             g2 = sums[0]
             norm = wp.sqrt(g2)
@@ -185,7 +185,7 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
             if force > f64(0.0):
                 # the force tolerance in this norm, by their ratio at this iterate
                 accepted_norm = wp.max(accepted_norm, norm * (ctl.force_tol / force))
-            if ctl.predicted[world] != 0:
+            if ctl.extrapolated_start[world] != 0:
                 accepted_norm = f64(EXTRAPOLATED_TOL_FACTOR) * accepted_norm
             elif is_unsolved_unlike_stiffness(ctl, world):
                 accepted_norm = f64(UNSOLVED_TOL_FACTOR) * accepted_norm
@@ -204,10 +204,10 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
                 ctl.component_converged[world, ctl.component_of_group[group]] = 0
                 solve += g2
                 unconverged_tol = wp.min(unconverged_tol, accepted_norm)
-                if ctl.groups > ctl.components:  # forces between groups have the round-off of both
+                if ctl.group_count > ctl.component_count:  # forces between groups have the round-off of both
                     rounding = f64(2.0) * ctl.eps * wp.sqrt(component_sum(ctl, world, group, 4))
                 if wp.static(has_constraints):
-                    if ctl.classical != 0:  # the residual contains rho c: position round-off times kappa
+                    if ctl.classical_multipliers != 0:  # the residual contains rho c: position round-off times kappa
                         rounding = rounding / (ctl.penalty_norm_ratio * ctl.penalty_norm_ratio)
                 floor_excess = wp.max(floor_excess, norm / (rounding + f64(1.0e-300)))
             largest = wp.max(largest, norm / wp.max(scale, f64(1.0e-300)))
@@ -216,7 +216,7 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
             ctl.violation_ratio[world] = largest_violation(ctl, world) / allowed_violation(
                 ctl, world, ctl.constraint_tol
             )
-        ctl.norm[world] = wp.sqrt(ctl.slot_sums[0, world])
+        ctl.residual_norm[world] = wp.sqrt(ctl.slot_sums[0, world])
         ctl.relative_residual[world] = largest
         ctl.residual_ratio[world] = worst
         ctl.convergence_ratio[world] = wp.max(excess, worst)
@@ -228,8 +228,8 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
     def record_residual(ctl: Control, world: int):
         """Store the relative residual of the iterate, for messages."""
         k = ctl.iterations[world]
-        if k < ctl.history.shape[1]:
-            ctl.history[world, k] = ctl.relative_residual[world]
+        if k < ctl.residual_history.shape[1]:
+            ctl.residual_history[world, k] = ctl.relative_residual[world]
 
     @wp.func
     def is_only_constraint_violated(ctl: Control, world: int) -> bool:
@@ -244,7 +244,7 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         ctl.searching[world] = 0
         if ctl.refuse_inversion != 0 and ctl.min_J[world] <= f64(0.0):
             ctl.inversion_suspected[world] = 1
-            wp.atomic_max(ctl.any_rare, 0, 1)
+            wp.atomic_max(ctl.any_rare_branch, 0, 1)
 
     @wp.func
     def request_error_estimate(ctl: Control, world: int):
@@ -257,7 +257,7 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
     def iteration_factor(ctl: Control, world: int) -> int:
         """Factor on `max_iterations` of an attempt: larger for a start far from the solution, or after negative
         curvature with a law that has its own tangent, since shorter steps meet it again."""
-        far = wp.max(ctl.choose_initial[world], ctl.met_negative_curvature[world] * (1 - ctl.linear_stress))
+        far = wp.max(ctl.choose_first_iterate[world], ctl.met_negative_curvature[world] * (1 - ctl.linear_stress))
         return 1 + EXTRA_ITERATION_FACTOR * far
 
     @wp.func
@@ -278,9 +278,9 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
             and drowned
             and ctl.eps > f64(SINGLE_PRECISION_EPS)
             and ctl.iterations[world] > 0
-            and ctl.equilibrium != 0
+            and ctl.is_static != 0
         ):
-            ctl.failed[world] = FAIL_FLOOR
+            ctl.failed[world] = FAIL_ROUNDOFF
         if wp.static(has_constraints):
             if why != FAIL_NAN and why != FAIL_JACOBIAN and is_only_constraint_violated(ctl, world):
                 ctl.failed[world] = FAIL_CONSTRAINT
@@ -301,7 +301,7 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         # predicted energy change of the last step, relative to the energy
         energy = f64(2.0) * wp.abs(ctl.elem_sums[0, world]) + ctl.dq_dv[world] * ctl.slot_sums[5, world]
         step = wp.abs(ctl.slope[world]) * ctl.dq_dv[world]
-        most = f64(MAX_STALL_STEP) * ctl.max_floor
+        most = f64(MAX_STALL_STEP) * ctl.max_floor_error
         limit = ctl.max_iterations * iteration_factor(ctl, world)
         settling = step <= most * most * energy or ctl.iterations[world] + 1 >= limit
         alike = f64(STALL_ENERGY_ROUNDINGS) * ctl.eps
@@ -313,7 +313,7 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
                 near = True
                 settling = True
         near = near and ctl.error_estimates[world] < MAX_ERROR_ESTIMATES
-        still = ctl.reduction[world] > f64(STALL_RATIO) and ctl.reused[world] == 0
+        still = ctl.residual_reduction[world] > f64(STALL_RATIO) and ctl.operator_reused[world] == 0
         if ctl.convergence_ratio[world] <= f64(1.0):
             accept_iterate(ctl, world)
         elif near and ctl.iterations[world] > 0 and still and settling:
@@ -346,7 +346,7 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
             and at_roundoff
             and ctl.error_estimate[world] < f64(1.0e30)
         ):
-            give_up(ctl, world, FAIL_FLOOR)
+            give_up(ctl, world, FAIL_ROUNDOFF)
         else:
             give_up(ctl, world, why)
 

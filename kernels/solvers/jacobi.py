@@ -13,7 +13,14 @@ from ..common.traits import Traits
 from ..common.types import kernel_module, precision
 from .convergence import convergence_functions
 from .newton import newton_kernels
-from .newton_control import FAIL_CONSTRAINT, FAIL_GROWTH, FAIL_JACOBIAN, FAIL_LIMIT, FAIL_NAN, control_struct
+from .newton_control import (
+    FAIL_CONSTRAINT,
+    FAIL_JACOBIAN,
+    FAIL_NAN,
+    FAIL_RESIDUAL_GROWTH,
+    FAIL_STEP_LIMIT,
+    control_struct,
+)
 from .pcg import pcg_struct
 
 __all__ = ["MAX_PAIRS", "jacobi_kernels", "jacobi_struct"]
@@ -67,7 +74,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
     def check_convergence(ctl: Newton, jac: Jacobi, world: int):
         """End a world's iterations on convergence, failure or at the iteration limit."""
         record_residual(ctl, world)
-        finite = wp.isfinite(ctl.norm[world]) and wp.isfinite(ctl.elem_sums[0, world])
+        finite = wp.isfinite(ctl.residual_norm[world]) and wp.isfinite(ctl.elem_sums[0, world])
         if wp.static(traits.stored):
             finite = finite and wp.isfinite(ctl.term_sums[0, world])
         barred = False
@@ -81,18 +88,18 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
             ctl.failed[world] = FAIL_NAN
         elif barred:
             ctl.active[world] = 0
-            ctl.failed[world] = FAIL_LIMIT
+            ctl.failed[world] = FAIL_STEP_LIMIT
         elif ctl.convergence_ratio[world] <= f64(1.0):
             accept_iterate(ctl, world)
         elif ctl.iterations[world] >= ctl.max_iterations:
             ctl.active[world] = 0
-            if ctl.norm[world] > jac.max_growth * jac.first_norm[world]:
-                ctl.failed[world] = FAIL_GROWTH
+            if ctl.residual_norm[world] > jac.max_growth * jac.first_norm[world]:
+                ctl.failed[world] = FAIL_RESIDUAL_GROWTH
             if wp.static(traits.has_constraints):
                 if ctl.violation_ratio[world] * allowed_violation(ctl, world, ctl.constraint_tol) > jac.max_violation:
                     ctl.failed[world] = FAIL_CONSTRAINT
             if ctl.failed[world] == 0:
-                ctl.rough[world] = 1
+                ctl.accepted_unconverged[world] = 1
                 accept_iterate(ctl, world)
 
     @wp.kernel(module=module)
@@ -102,7 +109,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
         if ctl.active[world] == 0:
             return
         evaluate_norms(ctl, world)
-        jac.first_norm[world] = ctl.norm[world]
+        jac.first_norm[world] = ctl.residual_norm[world]
         ctl.alpha[world] = f64(1.0)
         check_convergence(ctl, jac, world)
 
@@ -114,7 +121,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
             return
         evaluate_norms(ctl, world)
         ctl.iterations[world] = ctl.iterations[world] + 1
-        ctl.total_iterations[world] = ctl.total_iterations[world] + 1
+        ctl.step_iterations[world] = ctl.step_iterations[world] + 1
         check_convergence(ctl, jac, world)
 
     @wp.func
@@ -330,7 +337,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
             ctl.active[world] = 1
             pcg.iterations[world] = ctl.iterations[world]
             pcg.first_norm[world] = jac.first_norm[world]
-            pcg.norm[world] = ctl.norm[world]
+            pcg.norm[world] = ctl.residual_norm[world]
 
     return _types.SimpleNamespace(
         module=module,

@@ -68,7 +68,7 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNames
             counts = ctl.nonmonotone_steps[world] == 0 or not ctl.phi[world] < old_phi
         if counts:
             ctl.nonmonotone_steps[world] = ctl.nonmonotone_steps[world] + 1
-        if ctl.norm[world] <= f64(0.5) * ctl.best_norm[world] or ctl.phi[world] < ctl.best_phi[world]:
+        if ctl.residual_norm[world] <= f64(0.5) * ctl.best_norm[world] or ctl.phi[world] < ctl.best_phi[world]:
             ctl.nonmonotone_steps[world] = 0
             ctl.trust_radius[world] = wp.min(f64(2.0) * ctl.trust_radius[world], f64(MAX_TRUST_RADIUS))
         elif ctl.nonmonotone_steps[world] >= MAX_NONMONOTONE and ctl.active[world] != 0:
@@ -91,7 +91,7 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNames
 
         `stands`: the trial is the iterate itself or the best one. `nonmonotone`: it may have raised Phi.
         """
-        old_norm = ctl.norm[world]
+        old_norm = ctl.residual_norm[world]
         old_worst = ctl.residual_ratio[world]
         old_phi = ctl.phi[world]
         ctl.searching[world] = 0
@@ -104,8 +104,8 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNames
             ctl.phi[world] = ctl.phi[world] + more / ctl.dq_dv[world]
         ctl.phi_magnitude[world] = objective_magnitude(ctl, world)
         if stands:
-            if ctl.reused[world] != 0:
-                ctl.reused[world] = 2
+            if ctl.operator_reused[world] != 0:
+                ctl.operator_reused[world] = 2
             if ctl.restore_best[world] != 0:
                 ctl.restore_best[world] = 0
                 ctl.trust_radius[world] = f64(RADIUS_SHRINK) * ctl.trust_radius[world]
@@ -119,11 +119,11 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNames
                 ctl.require_armijo[world] = 0
                 if wp.static(not midpoint):
                     ctl.predicted_stress[world] = wp.where(tangent_needed(ctl, world), 0, 1)
-        ctl.total_iterations[world] = ctl.total_iterations[world] + 1
-        ratio = ctl.norm[world] / wp.max(old_norm, f64(1.0e-300))
-        if ctl.groups > ctl.components:  # one group's forces may dwarf those of the unconverged groups
+        ctl.step_iterations[world] = ctl.step_iterations[world] + 1
+        ratio = ctl.residual_norm[world] / wp.max(old_norm, f64(1.0e-300))
+        if ctl.group_count > ctl.component_count:  # one group's forces may dwarf those of the unconverged groups
             ratio = ctl.residual_ratio[world] / wp.max(old_worst, f64(1.0e-300))
-        ctl.reduction[world] = ratio
+        ctl.residual_reduction[world] = ratio
         eta = f64(0.9) * ratio * ratio
         guard = f64(0.9) * ctl.forcing[world] * ctl.forcing[world]
         if guard > f64(0.1):
@@ -139,12 +139,12 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNames
     def shorten_step(ctl: Control, world: int, reused: bool):
         """Halve the step, or end the search; `reused`: the operator is of an earlier iterate."""
         ctl.nonmonotone_trial[world] = 0
-        ctl.searches[world] = ctl.searches[world] + 1
+        ctl.search_trials[world] = ctl.search_trials[world] + 1
         ctl.alpha[world] = f64(0.5) * ctl.alpha[world]
-        if reused and ctl.searches[world] > MAX_REUSED_BACKTRACKS:
+        if reused and ctl.search_trials[world] > MAX_REUSED_BACKTRACKS:
             # the reused operator is at fault: keep the iterate and solve with its own operator
             ctl.alpha[world] = f64(0.0)
-        if ctl.searches[world] > MAX_BACKTRACKS:
+        if ctl.search_trials[world] > MAX_BACKTRACKS:
             why = FAIL_LINE_SEARCH
             if ctl.domain_J[world] <= f64(0.0):
                 why = FAIL_JACOBIAN
@@ -177,7 +177,7 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNames
         low = wp.vec2d(ctl.bracket_low[world])
         high = wp.vec2d(ctl.bracket_high[world])
         if slope > f64(0.0):
-            if high[0] > f64(0.0) and ctl.searches[world] > 1:
+            if high[0] > f64(0.0) and ctl.search_trials[world] > 1:
                 low[1] = f64(0.5) * low[1]
             high = wp.vec2d(alpha, slope)
         else:
@@ -198,7 +198,7 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNames
             good = change <= f64(ARMIJO_FACTOR) * alpha * ctl.slope[world]
         if wp.static(midpoint):
             good = change <= f64(-2.0) * f64(ARMIJO_FACTOR) * alpha * ctl.phi[world]
-        return good or (ctl.nonpotential != 0 and norm <= f64(0.5) * ctl.norm[world])
+        return good or (ctl.has_nonpotential != 0 and norm <= f64(0.5) * ctl.residual_norm[world])
 
     @wp.func
     def is_good_trial(ctl: Control, world: int, phi: f64, slope: f64, norm: f64) -> bool:
@@ -207,15 +207,19 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNames
         good = wp.isfinite(phi) and wp.isfinite(norm) and not ctl.domain_J[world] <= f64(0.0)
         if good:
             good = sufficient_decrease(ctl, world, phi - ctl.phi[world], slope, norm)
-        if ctl.reused[world] != 0 and ctl.iterations[world] == 0 and not norm <= f64(0.5) * ctl.norm[world]:
+        if (
+            ctl.operator_reused[world] != 0
+            and ctl.iterations[world] == 0
+            and not norm <= f64(0.5) * ctl.residual_norm[world]
+        ):
             good = False  # a step must not start worse than with its own operator
-            ctl.searches[world] = MAX_REUSED_BACKTRACKS
+            ctl.search_trials[world] = MAX_REUSED_BACKTRACKS
         return good
 
     @wp.func
     def is_nonmonotone_allowed(ctl: Control, world: int) -> bool:
         """True if the full step of this search may raise Phi."""
-        out = ctl.searches[world] == 0 and ctl.nonmonotone_trial[world] == 0 and ctl.negative_curvature[world] == 0
+        out = ctl.search_trials[world] == 0 and ctl.nonmonotone_trial[world] == 0 and ctl.negative_curvature[world] == 0
         out = out and (ctl.require_armijo[world] == 0 or ctl.predicted_stress[world] == 2)
         if wp.static(unilateral):  # into an obstacle and back; friction has a convex potential: full steps overshoot
             out = out and ctl.frozen_updated[world] == 0 and ctl.penetrating_steps[world] < MAX_PENETRATING_STEPS
@@ -227,14 +231,14 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNames
         steeply within the bracket. Sets the next step length."""
         if (
             ctl.nonmonotone_trial[world] != 0
-            or ctl.searches[world] >= MAX_KINK_TRIALS
+            or ctl.search_trials[world] >= MAX_KINK_TRIALS
             or not ctl.domain_J[world] > f64(0.0)
         ):
             return False
         steep = f64(KINK_SLOPE_RATIO) * wp.abs(ctl.slope[world])
         beyond = slope > steep or (ctl.bracket_high[world][0] > f64(0.0) and slope < -steep)
         if beyond:
-            ctl.searches[world] = ctl.searches[world] + 1
+            ctl.search_trials[world] = ctl.search_trials[world] + 1
             ctl.alpha[world] = bracket_step(ctl, world, slope)
         return beyond
 
@@ -244,7 +248,7 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNames
         if wants_nonmonotone:
             ctl.nonmonotone_trial[world] = 1
             ctl.searching[world] = 0
-            wp.atomic_max(ctl.any_rare, 0, 1)
+            wp.atomic_max(ctl.any_rare_branch, 0, 1)
         elif ctl.nonmonotone_steps[world] > 0:
             ctl.restore_best[world] = 1
         else:
@@ -264,7 +268,7 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNames
         norm = wp.sqrt(ctl.slot_sums[0, world])
         finite = wp.isfinite(phi) and wp.isfinite(norm)
         good = is_good_trial(ctl, world, phi, slope, norm)
-        reused = ctl.reused[world] != 0
+        reused = ctl.operator_reused[world] != 0
         stands = alpha == f64(0.0) or ctl.restore_best[world] != 0
         usable = finite and not (stands or reused)
         wants_nonmonotone = usable and not good and is_nonmonotone_allowed(ctl, world)

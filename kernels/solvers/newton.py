@@ -12,11 +12,11 @@ from .convergence import MAX_ERROR_ESTIMATES, SINGLE_PRECISION_EPS, VELOCITY_ROU
 from .line_search import MAX_TRUST_RADIUS, PHI_NOISE_ROUNDINGS, line_search_kernels
 from .newton_control import (
     FAIL_CURVATURE,
-    FAIL_FLOOR,
     FAIL_ITERATIONS,
     FAIL_JACOBIAN,
-    FAIL_LIMIT,
     FAIL_NAN,
+    FAIL_ROUNDOFF,
+    FAIL_STEP_LIMIT,
     FAIL_WORK,
     FLOOR_LANES,
     control_struct,
@@ -90,7 +90,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         ctl.phi[world] = phi
         ctl.phi_magnitude[world] = objective_magnitude(ctl, world)
         ctl.forcing[world] = ctl.first_forcing
-        ctl.reused[world] = 0
+        ctl.operator_reused[world] = 0
         ctl.nonmonotone_steps[world] = 0
         ctl.predicted_stress[world] = 0
         ctl.require_armijo[world] = 0
@@ -111,9 +111,9 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
             ctl.penetrating_steps[world] = 0
         if ctl.domain_J[world] <= f64(0.0):
             give_up(ctl, world, FAIL_JACOBIAN)
-        elif not (wp.isfinite(phi) and wp.isfinite(ctl.norm[world])):
+        elif not (wp.isfinite(phi) and wp.isfinite(ctl.residual_norm[world])):
             give_up(ctl, world, FAIL_NAN)
-        elif wp.static(unilateral) and ctl.norm[world] > f64(0.0):
+        elif wp.static(unilateral) and ctl.residual_norm[world] > f64(0.0):
             record_residual(ctl, world)  # frozen quantities are not those of this iterate: it cannot be accepted
         else:
             check_convergence(ctl, world)
@@ -128,7 +128,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         phi = objective(ctl, world)
         if wp.static(midpoint):
             return not (wp.isfinite(phi) and ctl.min_J[world] > f64(0.0))
-        bound = ctl.potential[world] / ctl.dq_dv[world] + f64(MAX_START_ENERGY_RATIO) * ctl.slot_sums[10, world]
+        bound = ctl.strain_energy[world] / ctl.dq_dv[world] + f64(MAX_START_ENERGY_RATIO) * ctl.slot_sums[10, world]
         bound += f64(PHI_NOISE_ROUNDINGS) * ctl.eps * objective_magnitude(ctl, world)
         return not (phi <= bound and wp.isfinite(phi) and ctl.min_J[world] > f64(0.0))
 
@@ -137,13 +137,13 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         """Start with the first iterate; `stage` 0: no alternatives; 1: some follow if it is poor; 2: the best."""
         world = wp.tid()
         if stage != 2:
-            ctl.choose_initial[world] = 0
-        if ctl.active[world] == 0 or (stage == 2 and ctl.choose_initial[world] == 0):
+            ctl.choose_first_iterate[world] = 0
+        if ctl.active[world] == 0 or (stage == 2 and ctl.choose_first_iterate[world] == 0):
             return
         if stage == 1:
             if is_poor_first_iterate(ctl, world):
-                ctl.choose_initial[world] = 1
-                wp.atomic_max(ctl.any_rare, 0, 1)
+                ctl.choose_first_iterate[world] = 1
+                wp.atomic_max(ctl.any_rare_branch, 0, 1)
                 return
         initialise_iteration(ctl, world)
         if stage == 2 and ctl.fixed_forcing == 0:
@@ -154,7 +154,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         """Flag the worlds where the first iterate just evaluated is the best so far: J > 0 before Phi."""
         world = wp.tid()
         better[world] = 0
-        if ctl.choose_initial[world] == 0:
+        if ctl.choose_first_iterate[world] == 0:
             return
         phi = objective(ctl, world)
         if not (wp.isfinite(phi) and ctl.domain_J[world] > f64(0.0)):
@@ -165,7 +165,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
             ctl.best_norm[world] = low
             better[world] = 1
             if first == 0:
-                ctl.predicted[world] = 0
+                ctl.extrapolated_start[world] = 0
 
     @wp.func
     def check_direction(ctl: Control, world: int):
@@ -178,7 +178,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         if not wp.isfinite(ctl.slope[world]):
             handle_failed_search(ctl, world, FAIL_NAN)
         elif barred:
-            handle_failed_search(ctl, world, FAIL_LIMIT)
+            handle_failed_search(ctl, world, FAIL_STEP_LIMIT)
         elif ctl.negative_curvature[world] != 0 and ctl.predicted_stress[world] == 1:
             if ctl.nonmonotone_steps[world] > 0:
                 ctl.restore_best[world] = 1
@@ -187,7 +187,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
                 ctl.require_armijo[world] = 1
                 ctl.alpha[world] = f64(0.0)
         elif ctl.slope[world] >= f64(0.0) and wp.static(not midpoint):  # midpoint: |g| can still fall
-            if ctl.reused[world] != 0:
+            if ctl.operator_reused[world] != 0:
                 ctl.alpha[world] = f64(0.0)
             elif ctl.nonmonotone_steps[world] > 0:
                 ctl.restore_best[world] = 1
@@ -213,10 +213,10 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
             eta = wp.sqrt(wp.abs(work) * dq / wp.max(f64(2.0) * strain + kinetic * dq, f64(1.0e-300)))
             if ctl.eps > f64(SINGLE_PRECISION_EPS):  # a soft direction may be invisible to the energy
                 eta = wp.max(eta, f64(SCATTER_FACTOR) * dq * step / wp.max(largest, f64(1.0e-300)))
-            if eta > ctl.max_floor and dq * step <= f64(DISPLACEMENT_ROUNDINGS) * ctl.eps * largest:
+            if eta > ctl.max_floor_error and dq * step <= f64(DISPLACEMENT_ROUNDINGS) * ctl.eps * largest:
                 eta = dq * step / wp.max(largest, f64(1.0e-300))
             slow = step <= f64(VELOCITY_ROUNDINGS) * ctl.eps * speed
-            if eta > ctl.max_floor and slow and ctl.eps < f64(SINGLE_PRECISION_EPS):
+            if eta > ctl.max_floor_error and slow and ctl.eps < f64(SINGLE_PRECISION_EPS):
                 eta = step / speed
         return eta
 
@@ -233,7 +233,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         ctl.estimate_error[world] = 0
         # this solve cannot give the error either
         if ctl.pcg_unconverged[world] != 0 and ctl.eps > f64(SINGLE_PRECISION_EPS):
-            give_up(ctl, world, FAIL_FLOOR)
+            give_up(ctl, world, FAIL_ROUNDOFF)
             return
         largest, whole = f64(0.0), f64(0.0)
         for part in range(component_of_part.shape[0]):
@@ -241,21 +241,21 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
                 whole += ctl.floor_sums[0, world, part, lane]
                 largest = wp.max(largest, ctl.floor_sums[4, world, part, lane])
         if wp.static(unilateral):  # gaps have position round-off
-            largest = wp.max(largest, ctl.length)
+            largest = wp.max(largest, ctl.model_size)
         worst = f64(0.0)
         for part in range(component_of_part.shape[0]):
             if ctl.component_converged[world, component_of_part[part]] == 0:
                 worst = wp.max(worst, part_error(ctl, world, part, whole, largest))
         ctl.error_estimate[world] = worst
-        if worst <= ctl.max_floor:
-            ctl.floor[world] = wp.max(ctl.floor[world], worst)
+        if worst <= ctl.max_floor_error:
+            ctl.floor_error[world] = wp.max(ctl.floor_error[world], worst)
             accept_iterate(ctl, world)
             return
         tries = ctl.error_estimates[world] + 1
         ctl.error_estimates[world] = tries
         known = worst < f64(1.0e30)
         if tries >= MAX_ERROR_ESTIMATES or (known and tries > 1 and worst > f64(0.5) * ctl.last_error_estimate[world]):
-            give_up(ctl, world, wp.where(known, FAIL_FLOOR, FAIL_CURVATURE))
+            give_up(ctl, world, wp.where(known, FAIL_ROUNDOFF, FAIL_CURVATURE))
             return
         ctl.last_error_estimate[world] = worst
         check_direction(ctl, world)
@@ -272,27 +272,27 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         if wp.static(limited):
             ctl.alpha[world] = wp.min(ctl.limit[world], f64(1.0))
         ctl.linear_solves[world] = ctl.linear_solves[world] + 1
-        ctl.searches[world] = 0
-        ctl.doublings[world] = wp.where(ctl.negative_curvature[world] != 0 and ctl.equilibrium != 0, 0, -1)
+        ctl.search_trials[world] = 0
+        ctl.doublings[world] = wp.where(ctl.negative_curvature[world] != 0 and ctl.is_static != 0, 0, -1)
         if wp.static(unilateral):
             ctl.bracket_low[world] = wp.vec2d(f64(0.0), ctl.slope_sum[0, world])
             ctl.bracket_high[world] = wp.vec2d()
         ctl.nonmonotone_trial[world] = 0
         ctl.direction_gradient[world] = f64(0.0)
         ctl.searching[world] = 1
-        ctl.predicted[world] = 0
+        ctl.extrapolated_start[world] = 0
         ctl.store_best[world] = 0
         if wp.static(stored):
             ctl.trial_accepted[world] = 0
         if wp.static(has_constraints):
-            if ctl.classical == 0:
-                ctl.outer[world] = ctl.outer[world] + 1
-        if ctl.estimate_error[world] != 0 and pcg.total[world] < pcg.max_work:
+            if ctl.classical_multipliers == 0:
+                ctl.multiplier_updates[world] = ctl.multiplier_updates[world] + 1
+        if ctl.estimate_error[world] != 0 and pcg.step_iterations[world] < pcg.max_work:
             # estimate the error before following the direction
             ctl.estimate_error[world] = 2
             ctl.searching[world] = 0
-            wp.atomic_max(ctl.any_rare, 0, 1)
-        elif pcg.total[world] >= pcg.max_work:
+            wp.atomic_max(ctl.any_rare_branch, 0, 1)
+        elif pcg.step_iterations[world] >= pcg.max_work:
             give_up(ctl, world, FAIL_WORK)
         elif ctl.linear_solves[world] > MAX_SOLVES_PER_ITERATION * iteration_factor(ctl, world) * ctl.max_iterations:
             give_up(ctl, world, FAIL_ITERATIONS)

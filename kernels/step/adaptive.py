@@ -23,7 +23,7 @@ from typing import Any
 import warp as wp
 
 from ..common.types import kernel_module, precision
-from ..solvers.newton_control import FAIL_ERROR, FAIL_FLOOR, control_struct
+from ..solvers.newton_control import FAIL_LOCAL_ERROR, FAIL_ROUNDOFF, control_struct
 from ..solvers.pcg import pcg_struct
 from .step_control import step_span, step_struct
 
@@ -251,7 +251,7 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
         round_off = f64(ROUNDING_UNITS) * ctl.eps * ctl.moved[world]
         ctl.round_off_ratio[world] = round_off * ctl.horizon[0] / (f64(RATE_MEMORY) * mean_step * ctl.tolerance)
         if ctl.round_off_ratio[world] > f64(1.0):
-            newton.failed[world] = FAIL_FLOOR  # not halved
+            newton.failed[world] = FAIL_ROUNDOFF  # not halved
             return
         rounding = round_off / span
         rate = wp.max(ctl.rate[world] - rounding, f64(0.0))
@@ -266,7 +266,7 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
         if ctl.counts[world, 0] >= f64(MAX_SUBSTEPS):
             ratio = f64(wp.inf)
         if not ratio <= f64(1.0):
-            newton.failed[world] = FAIL_ERROR
+            newton.failed[world] = FAIL_LOCAL_ERROR
             ctl.counts[world, 1] = ctl.counts[world, 1] + f64(1.0)
             if ctl.counts[world, 0] + ctl.counts[world, 1] > f64(MAX_SUBSTEPS):
                 step.level[world] = MAX_LEVEL  # no more halvings
@@ -280,8 +280,8 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
             ctl.kept[world, 0] = next_step
             return
         ctl.tries[world] = 0
-        ctl.work[world] = ctl.work[world] + pcg.total[world]
-        pcg.total[world] = 0
+        ctl.work[world] = ctl.work[world] + pcg.step_iterations[world]
+        pcg.step_iterations[world] = 0
         double = f64(2.0) * h
         longer = wp.max(double, f64(MIN_STEP_RATIO) * mean_step)
         if effective_rate * (power(f64(2.0), n) * span / longer) <= f64(DOUBLING_RATIO) * limit:
@@ -312,7 +312,7 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
     def close_step(pcg: PCG, ctl: Adaptive):
         """PCG iterations of all substeps, for the report."""
         world = wp.tid()
-        pcg.total[world] = pcg.total[world] + ctl.work[world]
+        pcg.step_iterations[world] = pcg.step_iterations[world] + ctl.work[world]
 
     return _types.SimpleNamespace(
         module=module,

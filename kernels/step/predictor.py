@@ -59,13 +59,13 @@ def predictor_kernels(dtype: str, accelerated: bool, module: wp.Module) -> _type
         world = wp.tid()
         predictor.order[world] = 0
         predictor.count[world] = 0
-        newton.predicted[world] = 0
+        newton.extrapolated_start[world] = 0
         if step.running[world] == 0:
             return
         if predictor.kept[world, 2] == step.h[world] and predictor.kept[world, 3] == step.time[world]:
             predictor.order[world] = int(predictor.kept[world, 0])
             predictor.count[world] = int(predictor.kept[world, 1])
-        newton.predicted[world] = wp.min(predictor.order[world], 1)
+        newton.extrapolated_start[world] = wp.min(predictor.order[world], 1)
 
     @wp.kernel(module=module)
     def extrapolate(

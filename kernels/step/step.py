@@ -13,7 +13,7 @@ import warp as wp
 
 from ..common.traits import NO_TERMS, Traits
 from ..common.types import kernel_module, precision
-from ..solvers.newton_control import FAIL_ENERGY, FAIL_FLOOR, FAIL_INVERTED, FAIL_WORK, control_struct
+from ..solvers.newton_control import FAIL_ELEMENT_INVERTED, FAIL_ENERGY_GROWTH, FAIL_ROUNDOFF, FAIL_WORK, control_struct
 from ..solvers.pcg import pcg_struct
 from .energy_ledger import ledger_kernels
 from .step_control import STATUS, step_span, step_struct
@@ -65,16 +65,16 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         if alive != 0 and step.watched != 0 and step.growth[world, 0] > step.growth_limit:
             alive = 0
             step.status[world] = wp.static(STATUS["failed"])
-            newton.failed[world] = FAIL_ENERGY
+            newton.failed[world] = FAIL_ENERGY_GROWTH
         step.running[world] = alive
         step.refused[world] = 0
-        newton.total_iterations[world] = 0
-        newton.rough[world] = 0
-        newton.step_floor[world] = f64(0.0)
-        newton.potential_start[world] = newton.potential[world]
+        newton.step_iterations[world] = 0
+        newton.accepted_unconverged[world] = 0
+        newton.step_floor_error[world] = f64(0.0)
+        newton.strain_energy_start[world] = newton.strain_energy[world]
         if wp.static(has_constraints):
-            newton.outer[world] = 0
-        pcg.total[world] = 0
+            newton.multiplier_updates[world] = 0
+        pcg.step_iterations[world] = 0
         step.halvings[world] = 0
         if alive == 0:
             return
@@ -97,7 +97,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         step.first_refusal[world] = 0
         newton.active[world] = step.running[world]
         newton.searching[world] = 0
-        newton.floor[world] = f64(0.0)
+        newton.floor_error[world] = f64(0.0)
         newton.inversion_suspected[world] = 0
         newton.inverted[world] = 0
         if step.running[world] == 0:
@@ -212,7 +212,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
     ):
         """Alternative first iterate on the free components: 0: v~ + (dq/dv) g, 1: v_n, 2: the one with q = q_n."""
         world, slot = wp.tid()
-        if newton.choose_initial[world] == 0:
+        if newton.choose_first_iterate[world] == 0:
             return
         dq = T(step.dq_dv[world])
         new = v_n[world, slot]
@@ -239,11 +239,11 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         if step.running[world] == 0:
             return
         if newton.inverted[world] != 0 and newton.failed[world] == 0:
-            newton.failed[world] = FAIL_INVERTED
+            newton.failed[world] = FAIL_ELEMENT_INVERTED
         if newton.failed[world] == 0:
             step.accepted[world] = 1
             step.total_J[world] = wp.min(step.total_J[world], newton.min_J[world])
-            newton.step_floor[world] = wp.max(newton.step_floor[world], newton.floor[world])
+            newton.step_floor_error[world] = wp.max(newton.step_floor_error[world], newton.floor_error[world])
             part = step.part[world] + 1
             level = step.level[world]
             while level > 0 and part % 2 == 0:
@@ -268,8 +268,8 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         level = step.level[world] + 1
         why = newton.failed[world]
         # a shorter step has no better round-off, and changes the motion
-        hopeless = why == FAIL_WORK or why == FAIL_FLOOR
-        if step.newton_budget > 0 and newton.total_iterations[world] >= step.newton_budget:
+        hopeless = why == FAIL_WORK or why == FAIL_ROUNDOFF
+        if step.newton_budget > 0 and newton.step_iterations[world] >= step.newton_budget:
             hopeless = True
         if hopeless or level > step.max_halvings:
             step.status[world] = wp.static(STATUS["failed"])
@@ -287,7 +287,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         flags[world] = 0
         if step.status[world] == wp.static(STATUS["failed"]) and step.refused[world] == 1:
             flags[world] = 1
-            newton.potential[world] = newton.potential_start[world]
+            newton.strain_energy[world] = newton.strain_energy_start[world]
 
     @wp.kernel(module=module)
     def accept_state(
@@ -322,7 +322,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
                 step.previous_end[world] = step.time[world]
         u_n[world, slot] = u[world, slot]
         if slot == 0:
-            newton.potential[world] = newton.elem_sums[0, world]
+            newton.strain_energy[world] = newton.elem_sums[0, world]
         if wp.static(not static):
             v_n[world, slot] = v[world, slot]
 
@@ -331,8 +331,8 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         """Report of a step, one array for the host; columns as `REPORT`."""
         world = wp.tid()
         report[world, 0] = f64(step.status[world])
-        report[world, 1] = f64(newton.total_iterations[world])
-        report[world, 2] = f64(pcg.total[world])
+        report[world, 1] = f64(newton.step_iterations[world])
+        report[world, 2] = f64(pcg.step_iterations[world])
         report[world, 3] = newton.relative_residual[world]
         report[world, 4] = f64(step.halvings[world])
         report[world, 5] = step.total_J[world]
@@ -341,18 +341,18 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         report[world, 8] = step.new_time[world]
         report[world, 9] = f64(0.0)
         report[world, 10] = f64(0.0)
-        report[world, 11] = newton.force[world]
-        report[world, 12] = f64(newton.rough[world])
-        report[world, 13] = newton.step_floor[world]
+        report[world, 11] = newton.residual_force[world]
+        report[world, 12] = f64(newton.accepted_unconverged[world])
+        report[world, 13] = newton.step_floor_error[world]
         report[world, 14] = f64(0.0)
         if step.watched != 0:
             report[world, 14] = step.growth[world, 0]
         if wp.static(has_constraints):
             largest = f64(0.0)
-            for c in range(newton.components):
+            for c in range(newton.component_count):
                 largest = wp.max(largest, newton.violation[world, c])
             report[world, 9] = largest
-            report[world, 10] = f64(newton.outer[world])
+            report[world, 10] = f64(newton.multiplier_updates[world])
 
     @wp.kernel(module=module)
     def probe_values(

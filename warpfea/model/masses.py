@@ -179,7 +179,7 @@ class Masses:
             known["matrix"] = pattern, self._replace_array("matrix pattern", mass, self.of_pattern(pattern))
         if m.group_count:
             m.groups.mass = self._replace_array("groups", m.groups.mass, self.of_groups(*known["free groups"]))
-            m.groups.lumped = self.lumped_values
+            m.groups.lumped_mass = self.lumped_values
         for block in m.blocks:
             if block.det is not None:
                 table = self.of_elements(block.parts, block.det)

@@ -89,7 +89,7 @@ class Stepper:
         self.newton.register(state)
         if model.terms.traits.unilateral:  # contact energy, which is not evaluated at rest
             state.register("predictor_potential", wp.float64)
-            self.work.newton.potential = state.predictor_potential
+            self.work.newton.strain_energy = state.predictor_potential
         self.predictor: Predictor | None = None
         # round-off would accumulate in single precision, and so would the residual of Jacobi steps
         if not integrator.static and model.dtype == "float64" and isinstance(solver, NewtonPCG):
@@ -243,9 +243,11 @@ class Stepper:
             residual.reduce(w.energy_rows, 2, active, w.newton.elem_sums)
         measured = w.newton.elem_sums[0]
         if isinstance(flags, wp.array):
-            self.episodes.copy_flagged(flags, measured, w.newton.potential)
+            self.episodes.copy_flagged(flags, measured, w.newton.strain_energy)
         else:
-            w.newton.potential.assign(np.where(active.numpy() != 0, measured.numpy(), w.newton.potential.numpy()))
+            w.newton.strain_energy.assign(
+                np.where(active.numpy() != 0, measured.numpy(), w.newton.strain_energy.numpy())
+            )
 
     def _flags(self, mask: np.ndarray | None) -> wp.array:
         """Device mask of worlds, by default all."""

@@ -96,7 +96,7 @@ class Direct:
         """Factorise H in the active worlds."""
         residual = self.residual
         own = self.elements_only and residual.uses_matrix
-        worlds = np.flatnonzero((residual.reuse.control.build if own and residual.matrix_reuse else active).numpy())
+        worlds = np.flatnonzero((residual.reuse.control.build_now if own and residual.matrix_reuse else active).numpy())
         if not len(worlds):
             return
         if own:

@@ -227,6 +227,6 @@ class JacobiLoop(NewtonLoop):
             launch(k.conjugate_move, m.worlds, [w.newton, ctl])
         launch(k.combine_move, self.dim, [w.newton, ctl, self.moves, w.z, w.direction])
         if self.pcg.deflate:  # a loose tolerance then conserves the momentum of free bodies
-            args = [w.newton, w.step.mass_factor, m.groups.lumped, w.gradient, m.topology.free, w.direction, w.r]
+            args = [w.newton, w.step.mass_factor, m.groups.lumped_mass, w.gradient, m.topology.free, w.direction, w.r]
             launch(k.residual_after_move, self.dim, args)
             self.pcg.correct_translations(active)

@@ -219,16 +219,16 @@ class NewtonLoop:
         ctl.force_tol = options.force_tol
         ctl.tol = options.tolerance(model.dtype)
         ctl.eps = EPS[model.dtype]
-        ctl.equilibrium = int(not inertia)
-        ctl.length = float(model.size)
+        ctl.is_static = int(not inertia)
+        ctl.model_size = float(model.size)
         ctl.component_of_group = model.residual_groups.component
         ctl.max_iterations = options.max_newton
-        ctl.max_floor = MAX_FLOOR[model.dtype]
+        ctl.max_floor_error = MAX_FLOOR[model.dtype]
         ctl.refuse_inversion = int(inversion == "refuse")
         ctl.linear_stress = int(all(block.key.law in DEFINED_FOR_ANY_J for block in model.blocks))
         rate = inertia and any(b.key.damping == "rate" for b in model.blocks)
-        ctl.nonpotential = int(traits.nonpotential or rate)
-        ctl.classical = int(self.classical)
+        ctl.has_nonpotential = int(traits.nonpotential or rate)
+        ctl.classical_multipliers = int(self.classical)
         ctl.penalty_norm_ratio = 1.0 / math.sqrt(1.0 + options.kappa(model.dtype))
         ctl.constraint_tol = 1e300 if self.classical else constraint_tol  # the classical inner solves converge g only
         if ctx.accelerated and model.dtype == "float64":  # float32 positions have a larger round-off
@@ -302,7 +302,7 @@ class NewtonLoop:
     def _choose_initial(self) -> None:
         """Select the best first iterate (J > 0 first, then lowest Phi)."""
         w, k, launch = self.work, self.kernels, self.launch
-        choose, better = w.newton.choose_initial, w.newton.searching
+        choose, better = w.newton.choose_first_iterate, w.newton.searching
         launch(k.compare_first_iterates, self.model.worlds, [w.newton, 1, better])
         launch(self.vectors.copy_active, self.dim, [w.v, better, w.best])
         for put in self.first_iterates:
@@ -416,7 +416,7 @@ class NewtonLoop:
         """Flag worlds with an element inverted by the accepted iterate."""
         w = self.work
         self.residual.elements.check_inversion(self.ctx, w.newton.inversion_suspected)
-        w.newton.any_rare.zero_()
+        w.newton.any_rare_branch.zero_()
 
     def _search(self) -> None:
         w, k, launch = self.work, self.kernels, self.launch
@@ -430,7 +430,7 @@ class NewtonLoop:
     def _if_rare(self, do: Callable[[], None]) -> None:
         """Run `do` if any world needs the rare branch."""
         with self.launch.rare():
-            wp.capture_if(self.work.newton.any_rare, do)
+            wp.capture_if(self.work.newton.any_rare_branch, do)
 
     def _call_terms(self, what: str, flags: wp.array) -> None:
         """Call one method of all terms."""
@@ -442,5 +442,5 @@ class NewtonLoop:
         self.launch(self.vectors.set_any_flag, self.model.worlds, [flags, out])
 
     def _clear_direction(self, active: wp.array) -> None:
-        self.launch(self.pcg.kernels.start, self.dim, [self.work.g, self.model.topology.free, active,
+        self.launch(self.pcg.kernels.initialise_residual, self.dim, [self.work.g, self.model.topology.free, active,
                                                        self.work.direction, self.work.r])  # fmt: skip

@@ -198,7 +198,7 @@ class Residual:
         args = [control, self.work.newton, self.matrix_reuse]
         self.launch(self.reuse.kernels.check_matrix_reuse, self.model.worlds, args)
         self.reuse.decide_rebuild(active)
-        self.launch(self.reuse.kernels.loosen_tolerance, self.model.worlds, [control, self.work.newton])
+        self.launch(self.reuse.kernels.loosen_forcing, self.model.worlds, [control, self.work.newton])
         wp.capture_if(control.any_build, self._assemble)
 
     @labelled("assembly")
@@ -207,9 +207,11 @@ class Residual:
         control = self.reuse.control
         self.reuse.move_point()
         factors = (control.mass_factor, control.dq_dv)
-        self.assembled.assemble(self.reuse.linearisation_point, factors, control.build, self.matrix, projected=False)
+        self.assembled.assemble(
+            self.reuse.linearisation_point, factors, control.build_now, self.matrix, projected=False
+        )
         if self.on_assembled:
-            self.on_assembled(self.matrix, control.build)
+            self.on_assembled(self.matrix, control.build_now)
         self.reuse.mark_built()
 
     def assemble_matrix(self, active: wp.array) -> None:

@@ -83,7 +83,7 @@ class TwoLevel:
         self.kernels = level_kernels(model.dtype, self.storage)
         self.setup_kernels = build_kernels(model.dtype, self.storage)
         self.blocks = block_kernels(model.dtype)
-        self.jacobi = pcg_kernels(model.dtype, model.terms.traits.has_constraints).block_jacobi
+        self.jacobi = pcg_kernels(model.dtype, model.terms.traits.has_constraints).apply_block_jacobi
         self.dim = (model.worlds, model.slots)
         self.levels = self._levels(kind)
         self.ctx, self.terms = residual.ctx, model.terms
@@ -120,7 +120,7 @@ class TwoLevel:
         self.chosen = work.array("preconditioner chunk", (model.worlds,), wp.int32)
         free = model.group_count > 0  # bodies whose momentum is conserved by the translation correction
         if self.follows_matrix and self.band and model.dtype == "float64" and residual.ctx.inertia and not free:
-            work.pcg.exact = self.band.exact
+            work.pcg.preconditioner_is_exact = self.band.exact
         self.body_modes, self.coupling = self._motions()
         self.by_row = 0 if model.device.is_cuda else 1
         self.has_corrections = not self.levels[0].whole and any(term.preconditions(self.ctx) for term in self.terms)
@@ -153,7 +153,7 @@ class TwoLevel:
 
     def register(self, state: State) -> None:
         """Register the linearisation point and the rule's counts in the state, for resumed runs."""
-        self.reuse.control.limit = self.rebuild_cost
+        self.reuse.control.max_extra_iterations = self.rebuild_cost
         self.reuse.register(state)
         for term in self.terms:
             kept = CachedInputs([], [], [])
@@ -174,7 +174,7 @@ class TwoLevel:
             if kept is not None and not term.copy_cached(self.ctx, kept, reuse.control, flags):
                 for arrays in zip(kept.live, kept.state, kept.place):
                     words = [words_of(array) for array in arrays]
-                    self.launch(reuse.kernels.carry_words, words[0].shape, [reuse.control, flags, *words])
+                    self.launch(reuse.kernels.transfer_words, words[0].shape, [reuse.control, flags, *words])
 
     def modules(self) -> set[wp.Module]:
         """Modules launched."""
@@ -327,7 +327,7 @@ class TwoLevel:
         factors = (reuse.mass_factor, reuse.dq_dv)
         # rows are scaled once the penalties are known
         self.reuse.move_point()
-        for worlds, flags, value in self._chunks(reuse.build):
+        for worlds, flags, value in self._chunks(reuse.build_now):
             self.assembled.assemble(
                 self.reuse.linearisation_point, factors, flags, value, projected=True, worlds=worlds
             )
@@ -345,9 +345,9 @@ class TwoLevel:
             self._factor_or_fill(value, flags)
         self.reuse.mark_built()
         if self.body_modes:
-            self._add_mode_coupling(self.body_modes, reuse.build)
+            self._add_mode_coupling(self.body_modes, reuse.build_now)
         if not (self.follows_matrix or self.band):
-            self._invert(reuse.build)
+            self._invert(reuse.build_now)
 
     def _factor_or_fill(self, value: wp.array, flags: wp.array) -> None:
         """Factor the matrix of some worlds, or fill the tiles and the next level."""

@@ -239,7 +239,7 @@ class Constraints(Term):
 
     def copy_cached(self, ctx: StepContext, kept: CachedInputs, reuse: Any, accepted: wp.array) -> bool:
         args = [reuse, accepted, *kept.live, *kept.state, *kept.place]
-        ctx.launch(reuse_kernels(self.model.dtype).carry_rows, self.dim, args)
+        ctx.launch(reuse_kernels(self.model.dtype).transfer_constraint_rows, self.dim, args)
         return True
 
     def allocate_blocks(self, ctx: StepContext, matrix: Any, *, projected: bool) -> None:

@@ -114,7 +114,7 @@ class Workspace:
             "pcg_unconverged",
             "component_of_group",
         )  # for other solvers
-        skip += () if traits.has_constraints else ("outer", "violation_ratio")
+        skip += () if traits.has_constraints else ("multiplier_updates", "violation_ratio")
         skip += () if traits.stored else ("term_sums", "trial_accepted")
         skip += () if traits.limited else ("limit",)
         skip += (
@@ -132,10 +132,11 @@ class Workspace:
         )
         self.newton = self.struct(
             control_struct(), B, skip=skip,
-            history=(B, max_newton + 1), slot_sums=(RESIDUAL_ROWS, B), group_sums=sums, component_converged=(B, C),
+            residual_history=(B, max_newton + 1), slot_sums=(RESIDUAL_ROWS, B), group_sums=sums,
+            component_converged=(B, C),
             term_sums=(TERM_ROWS, B), floor_sums=(FLOOR_ROWS, B, model.residual_parts.count, FLOOR_LANES),
         )  # fmt: skip
-        self.newton.components, self.newton.groups = C, groups
+        self.newton.component_count, self.newton.group_count = C, groups
         self.multipliers: Any = multiplier_struct()()  # of constraints, if any
         self.pcg = self.struct(pcg_struct(), B, sums=(2, B), curvature=(1, B))
         self.newton.negative_curvature, self.newton.pcg_unconverged = (
@@ -190,7 +191,7 @@ class Workspace:
             "elem_sums": (2, worlds),
             "slope_sum": (1, worlds),
             "tangent_sum": (1, worlds),
-            **dict.fromkeys(("any_active", "any_running", "any_rare", "any_estimate_error"), (1,)),
+            **dict.fromkeys(("any_active", "any_running", "any_rare_branch", "any_estimate_error"), (1,)),
         } | shapes
         for name, var in kind.vars.items():
             if isinstance(var.type, wp.array) and name not in skip:
