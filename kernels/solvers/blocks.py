@@ -11,7 +11,7 @@ import warp as wp
 from ..common.inverse import inverse_function
 from ..common.structs import pattern_struct, topology_struct
 from ..common.types import SHORT_UNROLL, kernel_module, precision
-from ..elements.matrix import panels_of, row_of
+from ..elements.matrix import panel_layout, panel_row
 
 __all__ = ["assembly_kernels", "block_kernels"]
 
@@ -19,14 +19,14 @@ __all__ = ["assembly_kernels", "block_kernels"]
 @functools.cache
 def assembly_kernels(dtype: str, slots: int, rows: bool) -> _types.SimpleNamespace:
     """Assembly from the matrices of elements with a given number of slots, in the layout of `element_matrix` or,
-    `rows`, of `element_rows`."""
+    `rows`, of `element_matrix_panels`."""
     p = precision(dtype)
     T, vec3, mat33 = p.T, p.vec3, p.mat33
     f64 = wp.float64
     Topology = topology_struct(dtype)
     Pattern = pattern_struct()
     NS = slots
-    _, P, ROWS = panels_of(slots)
+    _, P, ROWS = panel_layout(slots)
     BLOCKS_PER_ELEMENT = P * ROWS if rows else NS * (NS + 1) // 2
     Number = T if rows else vec3
     module = kernel_module(f"assembly_{dtype}_{slots}{'_rows' if rows else ''}", max_unroll=SHORT_UNROLL)
@@ -35,7 +35,7 @@ def assembly_kernels(dtype: str, slots: int, rows: bool) -> _types.SimpleNamespa
     def block_index(low: int, high: int) -> int:
         """Index of the block of two slots in an element's matrix."""
         if wp.static(rows):
-            return P * row_of(high / P, P, low) + high % P
+            return P * panel_row(high / P, P, low) + high % P
         else:
             return low * NS - (low * (low - 1)) / 2 + high - low
 

@@ -183,7 +183,7 @@ class Masses:
         for block in m.blocks:
             if block.det is not None:
                 table = self.of_elements(block.parts, block.det)
-                block.data.density = self._replace_array("elements", block.data.density, table)
+                block.data.density_det_J0 = self._replace_array("elements", block.data.density_det_J0, table)
 
     def _replace_array(self, name: str, array: wp.array, values: np.ndarray) -> wp.array:
         """Write values into a device array, or into a new one if the number of worlds differs."""

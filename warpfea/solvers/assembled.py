@@ -15,7 +15,7 @@ import warp as wp
 
 from ..base.errors import ModelError
 from ..kernels.common.structs import pattern_struct
-from ..kernels.elements.matrix import panels_of, rows_type
+from ..kernels.elements.matrix import panel_layout, panel_row_type
 from ..kernels.solvers.blocks import assembly_kernels
 
 if TYPE_CHECKING:
@@ -144,7 +144,9 @@ class Assembled:
 
     def modules(self) -> set[wp.Module]:
         """Modules launched by assembly."""
-        out = {(k.element_rows if self.whole_elements else k.element_matrix).module for k in self.element_kernels}
+        out = {
+            (k.element_matrix_panels if self.whole_elements else k.element_matrix).module for k in self.element_kernels
+        }
         out |= {self.assembly(block).module for block in self.model.blocks}
         return out | {module for term in self.model.terms for module in term.block_modules()}
 
@@ -170,7 +172,7 @@ class Assembled:
     def _size(self, block: Any) -> int:
         """Number of 3-vectors in the matrices of a block's elements."""
         if self.whole_elements:
-            _, width, rows = panels_of(block.slots)
+            _, width, rows = panel_layout(block.slots)
             return 3 * width * rows * block.count
         return 3 * block.slots * (block.slots + 1) // 2 * block.count
 
@@ -242,9 +244,9 @@ class Assembled:
                 data = self.work.data_of(block)
                 given = [data, u, v, base, mixed, history, dq_dv, int(projected), active]
                 if self.whole_elements:
-                    _, width, rows = panels_of(block.slots)
-                    matrix = shaped(self.scratch, (count, block.count, rows), rows_type(m.dtype, width))
-                    launch(elements.element_rows, (count, block.count), [*given, int(k > 0), matrix])
+                    _, width, rows = panel_layout(block.slots)
+                    matrix = shaped(self.scratch, (count, block.count, rows), panel_row_type(m.dtype, width))
+                    launch(elements.element_matrix_panels, (count, block.count), [*given, int(k > 0), matrix])
                     matrix = shaped(self.scratch, (count, block.count, 9 * width * rows), m.types.T)
                     continue
                 pairs = 3 * block.slots * (block.slots + 1) // 2

@@ -100,7 +100,7 @@ class BodyForces(Term):
             per_element = families.get(block.key.family).has_gradients
             shape = np.concatenate(shapes) if per_element else shapes[0]
             block.data.shape = m.array("loads", np.moveaxis(shape, 0, 2), m.types.T)
-            block.data.field_weight = m.array("loads", np.concatenate(weights).T, m.types.T)
+            block.data.mass_weight = m.array("loads", np.concatenate(weights).T, m.types.T)
             block.field_rule = rule
 
     def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
