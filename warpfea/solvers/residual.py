@@ -15,7 +15,7 @@ from ..kernels.solvers.newton import newton_kernels
 from ..kernels.solvers.newton_control import GROUP_LANES, GROUP_ROWS, TERM_ROWS
 from ..kernels.solvers.vectors import vector_kernels
 from ..kernels.step.gather import RESIDUAL_ROWS, gather_kernels
-from ..kernels.step.midpoint import stage_kernels
+from ..kernels.step.midpoint import midpoint_kernels
 from ..kernels.terms.constraints import constraint_struct
 from ..terms.elements import Elements
 from .assembled import Assembled, shaped
@@ -83,7 +83,7 @@ class Residual:
         traits = ctx.traits
         self.gather = gather_kernels(model.dtype, traits)
         self.newton, self.vectors = newton_kernels(traits), vector_kernels(model.dtype, traits.has_constraints)
-        self.stage = stage_kernels(model.dtype)
+        self.stage = midpoint_kernels(model.dtype)
         self.con = model.constraints.data if traits.constraint_rows else constraint_struct()()
         self.dim = (model.worlds, model.slots)
         self.additions = self._additions()
@@ -230,7 +230,7 @@ class Residual:
         self.launch(self.vectors.update_position, self.dim, [w.q_tilde, w.v, w.step.dq_dv, active, w.u])
         if self.ctx.midpoint:
             args = [state.displacement, state.velocity, w.v, w.step.dq_dv, active, w.u_stage, w.v_stage]
-            self.launch(self.stage.take_stage, self.dim, args)
+            self.launch(self.stage.evaluate_midpoint, self.dim, args)
 
     @labelled("residual")
     def reevaluate_frozen(self, active: wp.array) -> None:
@@ -286,7 +286,7 @@ class Residual:
             term.diagonal(self.ctx, active)
         args = [m.topology, w.block_contribution, w.pool_block, w.step.mass_factor, w.step.dq_dv, active]
         args += [w.diagonal, w.inverse]
-        launch(self.gather.gather_blocks, self.dim, args)
+        launch(self.gather.gather_diagonal_blocks, self.dim, args)
 
     @labelled("product")
     def product(self, p: wp.array, out: wp.array, active: wp.array) -> None:
@@ -326,7 +326,7 @@ class Residual:
         else:
             self.curvature_rows = w.warp_rows
             topology = self.clusters.topology if self.clusters else m.topology
-            total = self.gather.with_mass_sum if self.clusters else self.gather.product
+            total = self.gather.with_mass_sum if self.clusters else self.gather.operator_product
             args = [topology, w.contribution, *rest, out, w.warp_rows]
             launch(total, (m.worlds, launch.padded(m.slots)), args)
 

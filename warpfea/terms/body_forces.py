@@ -110,7 +110,7 @@ class BodyForces(Term):
         m, w = self.model, ctx.work
         for field in self.parts_of_fields:
             args = [field.block.data, field.members, m.reference_device, field.origin, w.u_stage, w.stage_time]
-            args += [w.step.ramp, active, self.offset + field.offset, w.nonpotential_contribution]
+            args += [w.step.load_factor, active, self.offset + field.offset, w.nonpotential_contribution]
             ctx.launch(field.kernel, (m.worlds, field.count), args)
 
     def hash(self, h: Any) -> None:

@@ -123,7 +123,7 @@ class Contact(Term):
         attempt = self.attempt_of(B, lambda name, shape, dtype: work.array(f"contact {name}", shape, dtype))
         attempt.relaxation.fill_(1.0)
         clock = clock_struct()()
-        for name in ("time", "new_time", "h", "part"):
+        for name in ("time", "new_time", "h", "substep_index"):
             setattr(clock, name, getattr(work.step, name))
         clock.time, clock.still = ctx.state.time, int(not ctx.inertia)
         scratch = {

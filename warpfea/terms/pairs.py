@@ -147,7 +147,7 @@ class Pairs(PairSolves):
         C, R, B = len(t.contacts), t.rows, m.worlds
         attempt, touching = self._attempt(work), self._touching(work)
         clock = clock_struct()()
-        for name in ("time", "new_time", "h", "part"):
+        for name in ("time", "new_time", "h", "substep_index"):
             setattr(clock, name, getattr(work.step, name))
         clock.time, clock.still = ctx.state.time, int(not ctx.inertia)
         tree = self._tree(touching)

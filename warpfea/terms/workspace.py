@@ -15,7 +15,7 @@ from ..kernels.common.reduce import CHUNK
 from ..kernels.common.structs import balance_struct
 from ..kernels.solvers.newton_control import FLOOR_LANES, FLOOR_ROWS, GROUP_LANES, GROUP_ROWS, TERM_ROWS, control_struct
 from ..kernels.solvers.pcg import FREE_GROUP_LANES, pcg_struct
-from ..kernels.step.energy_ledger import LEDGER_ROWS
+from ..kernels.step.energy_ledger import LEDGER_TERM_ROWS
 from ..kernels.step.gather import RESIDUAL_ROWS
 from ..kernels.step.step_control import step_struct
 from ..kernels.terms.constraints import multiplier_struct
@@ -86,12 +86,12 @@ class Workspace:
         # PCG sums have one row per warp
         self.warp = WARP if model.device.is_cuda else 1
         self.warp_rows = self.array("warp_rows", (2, B, -(-n // self.warp)), wp.float64)
-        self.rows = self.array("rows", (max(RESIDUAL_ROWS, LEDGER_ROWS), B, n), wp.float64)
+        self.rows = self.array("rows", (max(RESIDUAL_ROWS, LEDGER_TERM_ROWS), B, n), wp.float64)
         self.energy_rows = self.array("energy_rows", (2, B, model.element_count), wp.float64)
         longest = max(n, model.element_count, terms.rows, *(term.increment_rows for term in terms))
         chunks = -(-longest // CHUNK) if longest > CHUNK else 1
         self.longest = chunks * CHUNK  # maximum items of a summed row
-        most = max(RESIDUAL_ROWS, LEDGER_ROWS, *(len(term.columns) for term in terms))
+        most = max(RESIDUAL_ROWS, LEDGER_TERM_ROWS, *(len(term.columns) for term in terms))
         self.partial = self.array("partial", (most, B, chunks), wp.float64)
         self.time_law_values = self.array("law_value", (B, max(terms.time_laws.count, 1)), wp.vec3d)
         self.time_law_stage_values = self.time_law_values
@@ -99,7 +99,7 @@ class Workspace:
             self.time_law_stage_values = self.array("law_stage", self.time_law_values.shape, wp.vec3d)
         self.group_partial = self.array("group_partial", (B, max(model.group_count, 1), FREE_GROUP_LANES), vec3)
         self.group_velocity = self.array("group_velocity", (B, max(model.group_count, 1)), vec3)
-        self.ledger_sums = self.array("ledger_sums", (LEDGER_ROWS if ledger else 1, B), wp.float64)
+        self.ledger_sums = self.array("ledger_sums", (LEDGER_TERM_ROWS if ledger else 1, B), wp.float64)
         self.report = self.array("report", (B, terms.report_width), wp.float64)
         self.any_flag = self.array("any_flag", (5,), wp.int32)
         C = model.component_count
@@ -143,9 +143,10 @@ class Workspace:
             self.pcg.negative_curvature,
             self.pcg.pcg_unconverged,
         )
-        unused: tuple[str, ...] = ("b", "q_a", "h_before", "any_refused", "summed", "ends", "growth", "least_energy")
+        unused: tuple[str, ...] = ("b", "q_a", "acceleration_step", "any_rejected", "summed_time", "world_end")
+        unused += ("energy_growth", "min_energy")
         unused += () if midpoint else ("stage_time",)
-        self.step = self.struct(step_struct(), B, skip=unused, stop=(2,))
+        self.step = self.struct(step_struct(), B, skip=unused, run_end=(2,))
         self.stage_time = self.step.stage_time if midpoint else self.step.new_time
         self.balance = balance_struct(model.dtype)()
         for name in balance_struct(model.dtype).vars:
