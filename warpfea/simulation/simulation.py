@@ -301,8 +301,8 @@ class Simulation(RunStatistics):
         else:
             total = max(math.ceil((t_end - now) / self.dt - SAME_TIME_FRACTION), 0)
             if total == 0 and t_end != now and self.steps == 0:
-                raise ModelError(f"t_end = {t_end:g} s is within {SAME_TIME_FRACTION:g} dt of the start at t = {now:g} s, "
-                                 "so no step would be done; take a later t_end")  # fmt: skip
+                raise ModelError(f"t_end = {t_end:g} s is within {SAME_TIME_FRACTION:g} dt of the start at t = {now:g} "
+                                 "s, so no step would be done; take a later t_end")  # fmt: skip
         if not self.integrator.static:
             warn_early_ends(self, t_end)
         self.stepper.episodes.set_run_end(t_end, total)
