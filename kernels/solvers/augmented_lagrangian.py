@@ -6,7 +6,7 @@ import warp as wp
 
 from ..common.traits import Traits
 from .convergence import STALL_ROUNDINGS, convergence_functions
-from .newton_control import FAIL_CONSTRAINT, FAIL_ITERATIONS, control_struct
+from .newton_control import FAIL_CONSTRAINT, FAIL_ITERATIONS, ROW_FROZEN_CHANGE, control_struct
 
 __all__ = ["outer_loop_kernels"]
 
@@ -61,7 +61,7 @@ def outer_loop_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamesp
             if ctl.fixed_forcing == 0 and ctl.residual_norm[world] > f64(RESIDUAL_GROWTH) * before:
                 # the frozen quantities were the larger error: tighter solves are wasted
                 ctl.forcing[world] = wp.max(ctl.forcing[world], f64(LOOSE_FORCING))
-            ctl.phi[world] = objective(ctl, world) + ctl.slot_sums[7, world]
+            ctl.phi[world] = objective(ctl, world) + ctl.slot_sums[ROW_FROZEN_CHANGE, world]
             ctl.phi_magnitude[world] = objective_magnitude(ctl, world)
             ctl.nonmonotone_steps[world] = 0
             ctl.frozen_updated[world] = 1 - ctl.unilateral_changed[world]

@@ -14,6 +14,17 @@ from .newton_control import (
     FAIL_LINE_SEARCH,
     FAIL_NAN,
     FAIL_ROUNDOFF,
+    GROUP_ROUNDOFF,
+    GROUP_STRAIN_ENERGY,
+    ROW_FORCE,
+    ROW_INERTIA,
+    ROW_INTERNAL,
+    ROW_KINETIC,
+    ROW_LOADS,
+    ROW_MAGNITUDE,
+    ROW_OBJECTIVE,
+    ROW_RESIDUAL,
+    ROW_ROUNDOFF,
     control_struct,
 )
 
@@ -78,11 +89,11 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         replaces it.
         """
         if wp.static(midpoint):
-            return ctl.slot_sums[4, world]
+            return ctl.slot_sums[ROW_OBJECTIVE, world]
         energy = ctl.elem_sums[0, world] + ctl.elem_sums[1, world]
         if wp.static(stored):
             energy += ctl.term_sums[0, world]
-        return ctl.slot_sums[4, world] + energy / ctl.dq_dv[world]
+        return ctl.slot_sums[ROW_OBJECTIVE, world] + energy / ctl.dq_dv[world]
 
     @wp.func
     def objective_magnitude(ctl: Control, world: int) -> f64:
@@ -90,7 +101,7 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         energy = wp.abs(ctl.elem_sums[0, world]) + wp.abs(ctl.elem_sums[1, world])
         if wp.static(stored):
             energy += ctl.term_sums[2, world]
-        return ctl.slot_sums[5, world] + energy / ctl.dq_dv[world]
+        return ctl.slot_sums[ROW_MAGNITUDE, world] + energy / ctl.dq_dv[world]
 
     @wp.func
     def allowed_violation(ctl: Control, world: int, tol: f64) -> f64:
@@ -123,13 +134,24 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         own.
         """
         if ctl.group_count == 1:
-            f2 = wp.max(ctl.slot_sums[1, world], wp.max(ctl.slot_sums[2, world], ctl.slot_sums[3, world]))
-            return wp.vec3d(ctl.slot_sums[0, world], f2, ctl.slot_sums[8, world])
+            f2 = wp.max(
+                ctl.slot_sums[ROW_INTERNAL, world],
+                wp.max(ctl.slot_sums[ROW_LOADS, world], ctl.slot_sums[ROW_INERTIA, world]),
+            )
+            return wp.vec3d(ctl.slot_sums[ROW_RESIDUAL, world], f2, ctl.slot_sums[ROW_ROUNDOFF, world])
         f2 = wp.max(
-            ctl.group_sums[1, world, group], wp.max(ctl.group_sums[2, world, group], ctl.group_sums[3, world, group])
+            ctl.group_sums[ROW_INTERNAL, world, group],
+            wp.max(ctl.group_sums[ROW_LOADS, world, group], ctl.group_sums[ROW_INERTIA, world, group]),
         )
-        stress = f64(2.0) * f64(STRAIN_ENERGY_FRACTION) * wp.abs(ctl.group_sums[5, world, group]) / ctl.dq_dv[world]
-        return wp.vec3d(ctl.group_sums[0, world, group], wp.max(f2, stress), ctl.group_sums[4, world, group])
+        stress = (
+            f64(2.0)
+            * f64(STRAIN_ENERGY_FRACTION)
+            * wp.abs(ctl.group_sums[GROUP_STRAIN_ENERGY, world, group])
+            / ctl.dq_dv[world]
+        )
+        return wp.vec3d(
+            ctl.group_sums[ROW_RESIDUAL, world, group], wp.max(f2, stress), ctl.group_sums[GROUP_ROUNDOFF, world, group]
+        )
 
     @wp.func
     def is_unsolved_unlike_stiffness(ctl: Control, world: int) -> bool:
@@ -156,8 +178,8 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
             or norm > f64(GROUP_ROUNDINGS) * rounding
         ):
             return False
-        internal, loads = component_sum(ctl, world, group, 1), component_sum(ctl, world, group, 2)
-        return norm <= ctl.tol * wp.sqrt(wp.max(internal, wp.max(loads, component_sum(ctl, world, group, 3))))
+        internal, loads = component_sum(ctl, world, group, ROW_INTERNAL), component_sum(ctl, world, group, ROW_LOADS)
+        return norm <= ctl.tol * wp.sqrt(wp.max(internal, wp.max(loads, component_sum(ctl, world, group, ROW_INERTIA))))
 
     @wp.func
     def evaluate_norms(ctl: Control, world: int):
@@ -166,7 +188,7 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         The forces of one component or stiff material must not hide the residual of another; a component of the model
         whose groups have all converged is excluded from further solves.
         """
-        force = wp.sqrt(ctl.slot_sums[9, world])
+        force = wp.sqrt(ctl.slot_sums[ROW_FORCE, world])
         ctl.residual_force[world] = force
         largest = f64(0.0)
         worst = f64(0.0)
@@ -205,7 +227,7 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
                 solve += g2
                 unconverged_tol = wp.min(unconverged_tol, accepted_norm)
                 if ctl.group_count > ctl.component_count:  # forces between groups have the round-off of both
-                    rounding = f64(2.0) * ctl.eps * wp.sqrt(component_sum(ctl, world, group, 4))
+                    rounding = f64(2.0) * ctl.eps * wp.sqrt(component_sum(ctl, world, group, GROUP_ROUNDOFF))
                 if wp.static(has_constraints):
                     if ctl.classical_multipliers != 0:  # the residual contains rho c: position round-off times kappa
                         rounding = rounding / (ctl.penalty_norm_ratio * ctl.penalty_norm_ratio)
@@ -216,7 +238,7 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
             ctl.violation_ratio[world] = largest_violation(ctl, world) / allowed_violation(
                 ctl, world, ctl.constraint_tol
             )
-        ctl.residual_norm[world] = wp.sqrt(ctl.slot_sums[0, world])
+        ctl.residual_norm[world] = wp.sqrt(ctl.slot_sums[ROW_RESIDUAL, world])
         ctl.relative_residual[world] = largest
         ctl.residual_ratio[world] = worst
         ctl.convergence_ratio[world] = wp.max(excess, worst)
@@ -291,7 +313,7 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         round-off of their positions, and no other force may act."""
         fine = f64(VELOCITY_ROUNDINGS) * ctl.eps
         step = wp.abs(ctl.slope[world])
-        return ctl.eps < f64(SINGLE_PRECISION_EPS) and step <= fine * fine * ctl.slot_sums[10, world]
+        return ctl.eps < f64(SINGLE_PRECISION_EPS) and step <= fine * fine * ctl.slot_sums[ROW_KINETIC, world]
 
     @wp.func
     def check_convergence(ctl: Control, world: int):
@@ -299,7 +321,7 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         error estimate."""
         record_residual(ctl, world)
         # predicted energy change of the last step, relative to the energy
-        energy = f64(2.0) * wp.abs(ctl.elem_sums[0, world]) + ctl.dq_dv[world] * ctl.slot_sums[5, world]
+        energy = f64(2.0) * wp.abs(ctl.elem_sums[0, world]) + ctl.dq_dv[world] * ctl.slot_sums[ROW_MAGNITUDE, world]
         step = wp.abs(ctl.slope[world]) * ctl.dq_dv[world]
         most = f64(MAX_STALL_STEP) * ctl.max_floor_error
         limit = ctl.max_iterations * iteration_factor(ctl, world)

@@ -6,7 +6,7 @@ import warp as wp
 
 from ..common.traits import Traits
 from .convergence import convergence_functions
-from .newton_control import FAIL_JACOBIAN, FAIL_LINE_SEARCH, control_struct
+from .newton_control import FAIL_JACOBIAN, FAIL_LINE_SEARCH, ROW_FROZEN_CHANGE, ROW_RESIDUAL, ROW_SLOPE, control_struct
 
 __all__ = ["MAX_TRUST_RADIUS", "PHI_NOISE_ROUNDINGS", "line_search_kernels"]
 
@@ -96,7 +96,7 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNames
         old_phi = ctl.phi[world]
         ctl.searching[world] = 0
         evaluate_norms(ctl, world)
-        ctl.phi[world] = objective(ctl, world) + ctl.slot_sums[7, world]
+        ctl.phi[world] = objective(ctl, world) + ctl.slot_sums[ROW_FROZEN_CHANGE, world]
         if wp.static(stored):
             ctl.trial_accepted[world] = 1
         if wp.static(stored and not midpoint):
@@ -264,8 +264,8 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNames
         # frozen forces keep their symmetric tangent: the curvature of Phi then agrees with H
         bend = ctl.dq_dv[world] * ctl.tangent_sum[0, world]
         phi = objective(ctl, world) - f64(0.5) * alpha * alpha * bend
-        slope = ctl.slot_sums[6, world] - alpha * bend
-        norm = wp.sqrt(ctl.slot_sums[0, world])
+        slope = ctl.slot_sums[ROW_SLOPE, world] - alpha * bend
+        norm = wp.sqrt(ctl.slot_sums[ROW_RESIDUAL, world])
         finite = wp.isfinite(phi) and wp.isfinite(norm)
         good = is_good_trial(ctl, world, phi, slope, norm)
         reused = ctl.operator_reused[world] != 0

@@ -19,6 +19,8 @@ from .newton_control import (
     FAIL_STEP_LIMIT,
     FAIL_WORK,
     FLOOR_LANES,
+    ROW_FROZEN_CHANGE,
+    ROW_KINETIC,
     control_struct,
 )
 from .pcg import pcg_struct
@@ -86,7 +88,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
     def initialise_iteration(ctl: Control, world: int):
         """Initialise the iteration at its first iterate, and test that for convergence."""
         evaluate_norms(ctl, world)
-        phi = objective(ctl, world) + ctl.slot_sums[7, world]
+        phi = objective(ctl, world) + ctl.slot_sums[ROW_FROZEN_CHANGE, world]
         ctl.phi[world] = phi
         ctl.phi_magnitude[world] = objective_magnitude(ctl, world)
         ctl.forcing[world] = ctl.first_forcing
@@ -128,7 +130,10 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         phi = objective(ctl, world)
         if wp.static(midpoint):
             return not (wp.isfinite(phi) and ctl.min_J[world] > f64(0.0))
-        bound = ctl.strain_energy[world] / ctl.dq_dv[world] + f64(MAX_START_ENERGY_RATIO) * ctl.slot_sums[10, world]
+        bound = (
+            ctl.strain_energy[world] / ctl.dq_dv[world]
+            + f64(MAX_START_ENERGY_RATIO) * ctl.slot_sums[ROW_KINETIC, world]
+        )
         bound += f64(PHI_NOISE_ROUNDINGS) * ctl.eps * objective_magnitude(ctl, world)
         return not (phi <= bound and wp.isfinite(phi) and ctl.min_J[world] > f64(0.0))
 

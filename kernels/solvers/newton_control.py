@@ -21,7 +21,20 @@ __all__ = [
     "FLOOR_LANES",
     "FLOOR_ROWS",
     "GROUP_LANES",
+    "GROUP_ROUNDOFF",
     "GROUP_ROWS",
+    "GROUP_STRAIN_ENERGY",
+    "ROW_FORCE",
+    "ROW_FROZEN_CHANGE",
+    "ROW_INERTIA",
+    "ROW_INTERNAL",
+    "ROW_KINETIC",
+    "ROW_LOADS",
+    "ROW_MAGNITUDE",
+    "ROW_OBJECTIVE",
+    "ROW_RESIDUAL",
+    "ROW_ROUNDOFF",
+    "ROW_SLOPE",
     "TERM_ROWS",
     "control_struct",
 ]
@@ -41,7 +54,13 @@ FAIL_WORK = 11
 FAIL_LOCAL_ERROR = 12
 FAIL_ENERGY_GROWTH = 13
 
-GROUP_ROWS = 6  # squared norms of g, f_int, loads, inertia, round-off; strain energy
+(
+    ROW_RESIDUAL, ROW_INTERNAL, ROW_LOADS, ROW_INERTIA, ROW_OBJECTIVE, ROW_MAGNITUDE, ROW_SLOPE, ROW_FROZEN_CHANGE,
+    ROW_ROUNDOFF, ROW_FORCE, ROW_KINETIC,
+) = range(11)  # fmt: skip
+"""Rows of a residual's sums, RESIDUAL_ROWS of kernels/step/gather.py."""
+GROUP_ROWS = 6  # squared norms of g, f_int, loads, inertia (the ROW_ constants), of the round-off; strain energy
+GROUP_ROUNDOFF, GROUP_STRAIN_ENERGY = 4, 5
 FLOOR_ROWS = 6  # -g.p, inertia.(v - v~), strain energy, largest |p|, |u| and |v|
 GROUP_LANES, FLOOR_LANES = 32, 16
 """Partial sums per residual group, and per part of an error estimate; fixed: the same for any number of worlds."""

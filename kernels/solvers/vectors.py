@@ -6,7 +6,7 @@ import types as _types
 import warp as wp
 
 from ..common.types import precision
-from .newton_control import FLOOR_LANES, GROUP_LANES, GROUP_ROWS, control_struct
+from .newton_control import FLOOR_LANES, GROUP_LANES, GROUP_ROUNDOFF, GROUP_ROWS, ROW_ROUNDOFF, control_struct
 from .pcg import pcg_kernels
 
 __all__ = ["vector_kernels"]
@@ -37,7 +37,7 @@ def vector_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNa
         if active[world] == 0:
             return
         for row in range(GROUP_ROWS - 1):
-            source = wp.where(row == 4, 8, row)
+            source = wp.where(row == GROUP_ROUNDOFF, ROW_ROUNDOFF, row)
             total = f64(0.0)
             for k in range(start[group] + lane, start[group + 1], GROUP_LANES):
                 total += rows[source, world, slot[k]]

@@ -13,6 +13,19 @@ from ..common.lanes import lane_functions
 from ..common.structs import additions_struct, balance_struct, mass_function, pattern_struct, topology_struct
 from ..common.traits import NO_TERMS, Traits
 from ..common.types import SHORT_UNROLL, kernel_module, precision
+from ..solvers.newton_control import (
+    ROW_FORCE,
+    ROW_FROZEN_CHANGE,
+    ROW_INERTIA,
+    ROW_INTERNAL,
+    ROW_KINETIC,
+    ROW_LOADS,
+    ROW_MAGNITUDE,
+    ROW_OBJECTIVE,
+    ROW_RESIDUAL,
+    ROW_ROUNDOFF,
+    ROW_SLOPE,
+)
 from ..terms.constraints import constraint_struct, multiplier_struct
 
 __all__ = ["RESIDUAL_ROWS", "gather_kernels"]
@@ -193,30 +206,30 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         vs = balance.v[world, slot]
         kinetic = T(0.5) * wp.dot(vs - balance.v_tilde[world, slot], a)
         work = wp.dot(held, vs)
-        balance.rows[0, world, slot] = weighted_square(wp.cw_mul(residual_force, free), D)
+        balance.rows[ROW_RESIDUAL, world, slot] = weighted_square(wp.cw_mul(residual_force, free), D)
         # a prestressed body without loads has only reactions: a small fraction of them is its scale
         reaction = own - wp.cw_mul(own, free)
-        balance.rows[1, world, slot] = weighted_square(wp.cw_mul(own, free), D) + REACTION_FRACTION * weighted_square(
-            reaction, D
-        )
-        balance.rows[2, world, slot] = weighted_square(wp.cw_mul(magnitude, free), D)
-        balance.rows[3, world, slot] = weighted_square(wp.cw_mul(a, free), D)
-        balance.rows[4, world, slot] = f64(kinetic - work)
+        balance.rows[ROW_INTERNAL, world, slot] = weighted_square(
+            wp.cw_mul(own, free), D
+        ) + REACTION_FRACTION * weighted_square(reaction, D)
+        balance.rows[ROW_LOADS, world, slot] = weighted_square(wp.cw_mul(magnitude, free), D)
+        balance.rows[ROW_INERTIA, world, slot] = weighted_square(wp.cw_mul(a, free), D)
+        balance.rows[ROW_OBJECTIVE, world, slot] = f64(kinetic - work)
         if wp.static(midpoint):  # Phi does not exist: half of the squared gradient replaces it
-            balance.rows[4, world, slot] = f64(0.5) * weighted_square(
+            balance.rows[ROW_OBJECTIVE, world, slot] = f64(0.5) * weighted_square(
                 wp.cw_mul(newton_gradient(balance, world, slot), free), D
             )
-        balance.rows[5, world, slot] = f64(wp.abs(kinetic) + wp.abs(work))
-        balance.rows[6, world, slot] = f64(wp.dot(wp.cw_mul(descent, free), balance.direction[world, slot]))
-        balance.rows[7, world, slot] = f64(0.0)
+        balance.rows[ROW_MAGNITUDE, world, slot] = f64(wp.abs(kinetic) + wp.abs(work))
+        balance.rows[ROW_SLOPE, world, slot] = f64(wp.dot(wp.cw_mul(descent, free), balance.direction[world, slot]))
+        balance.rows[ROW_FROZEN_CHANGE, world, slot] = f64(0.0)
         if wp.static(nonpotential and not midpoint):
-            balance.rows[7, world, slot] = f64(
+            balance.rows[ROW_FROZEN_CHANGE, world, slot] = f64(
                 wp.dot(balance.nonpotential_frozen[world, slot] - balance.nonpotential[world, slot], vs)
             )
-        balance.rows[8, world, slot] = position_rounding(balance, free, D, world, slot)
-        balance.rows[9, world, slot] = squared_length(wp.cw_mul(residual_force, free))
+        balance.rows[ROW_ROUNDOFF, world, slot] = position_rounding(balance, free, D, world, slot)
+        balance.rows[ROW_FORCE, world, slot] = squared_length(wp.cw_mul(residual_force, free))
         motion = T(0.5) * wp.dot(balance.v_tilde[world, slot], past)
-        balance.rows[10, world, slot] = balance.mass_factor[world] * f64(motion)
+        balance.rows[ROW_KINETIC, world, slot] = balance.mass_factor[world] * f64(motion)
 
     @wp.func
     def pool_range(more: Additions, slot: int) -> wp.vec2i:
