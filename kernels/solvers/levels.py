@@ -25,7 +25,7 @@ TILE_LANES = 64
 
 @functools.cache
 def level_struct(dtype: str):
-    """Constant data of a level."""
+    """Constant data of a level: its tiles, groups and their affine functions."""
     T = precision(dtype).T
     vec4 = wp.types.vector(length=4, dtype=T)
 

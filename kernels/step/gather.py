@@ -31,9 +31,9 @@ from ..terms.constraints import constraint_struct, multiplier_struct
 __all__ = ["RESIDUAL_ROWS", "gather_kernels"]
 
 RESIDUAL_ROWS = 11
-"""Rows summed per world with a residual: the squared D^-1 norms of g, f_int, loads and inertia; the inertia and load
-part of Phi and its magnitude; g.p with non-conservative forces frozen; change of Phi by their update; squared norm of
-the position round-off; |g|^2; v~.M v~ c_M / 2."""
+"""Rows summed per world with a residual, the ROW_ constants of newton_control.py in this order: the squared D^-1 norms
+of g, f_int, loads and inertia; the inertia and load part of Phi and its magnitude; g.p with non-conservative forces
+frozen; change of Phi by their update; squared norm of the position round-off; |g|^2; v~.M v~ c_M / 2."""
 
 
 MIN_RESIDENT_BLOCKS = {"float64": 6, "float32": 8}

@@ -31,8 +31,12 @@ def predictor_struct():
     class PredictorControl:
         order: wp.array(dtype=wp.int32)  # order of this attempt
         history_count: wp.array(dtype=wp.int32)  # available earlier velocities, from steps of equal size; at most 2
-        history_state: wp.array2d(dtype=wp.float64)  # in the state: next order and count, size and end of the last step
-        sums: wp.array2d(dtype=wp.float64)  # squared errors of orders 0, 1, 2 in the last step; squared velocity
+        history_state: wp.array2d(
+            dtype=wp.float64
+        )  # [world, 4] in the state: next order and count, size and end of the last step
+        sums: wp.array2d(
+            dtype=wp.float64
+        )  # [PREDICTOR_ROWS, world] squared errors of orders 0, 1, 2 in the last step; squared velocity
 
     return PredictorControl
 
