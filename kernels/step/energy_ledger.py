@@ -41,7 +41,9 @@ STORED, WORK, LOSS, NUMERICAL, EXPLICIT_VISCOUS = range(5)
 part; viscous loss of a force among the dead loads."""
 
 LEDGER_TERM_ROWS = 10
-SHARE, LARGEST, TURNOVER, ADDED, SINCE, STEPS, NEXT = range(len(GROWTH_COLUMNS))
+GROWTH_SHARE, GROWTH_LARGEST, GROWTH_TURNOVER, GROWTH_ADDED, GROWTH_SINCE, GROWTH_STEPS, GROWTH_NEXT = range(
+    len(GROWTH_COLUMNS)
+)
 """Columns of GROWTH_COLUMNS."""
 STARTUP_STEPS = 8.0
 """Initial substeps excluded from the energy monitor: relative to the small energy at the onset of a motion, no step
@@ -84,27 +86,27 @@ def ledger_kernels(dtype: str, chord: bool, nonpotential: bool, module: wp.Modul
         Net, since second-order schemes exchange energy with the motion periodically; excluding the first steps from
         rest and those after work that exceeds all energy so far.
         """
-        largest = wp.max(wp.max(step.energy_growth[world, LARGEST], step.min_energy[world]), before)
-        turned = step.energy_growth[world, TURNOVER] + turnover
-        steps = step.energy_growth[world, STEPS] + f64(1.0)
-        if step.energy_growth[world, LARGEST] == f64(0.0) and before > f64(0.5) * energy:  # already in motion
+        largest = wp.max(wp.max(step.energy_growth[world, GROWTH_LARGEST], step.min_energy[world]), before)
+        turned = step.energy_growth[world, GROWTH_TURNOVER] + turnover
+        steps = step.energy_growth[world, GROWTH_STEPS] + f64(1.0)
+        if step.energy_growth[world, GROWTH_LARGEST] == f64(0.0) and before > f64(0.5) * energy:  # already in motion
             steps = f64(STARTUP_STEPS) + f64(1.0)
-            step.energy_growth[world, NEXT] = before
-        if turned > step.energy_growth[world, NEXT]:
+            step.energy_growth[world, GROWTH_NEXT] = before
+        if turned > step.energy_growth[world, GROWTH_NEXT]:
             steps = f64(1.0)
-            step.energy_growth[world, NEXT] = f64(2.0) * turned + largest
+            step.energy_growth[world, GROWTH_NEXT] = f64(2.0) * turned + largest
         largest = wp.max(largest, energy)
-        total = step.energy_growth[world, ADDED]
+        total = step.energy_growth[world, GROWTH_ADDED]
         if steps > f64(STARTUP_STEPS):
             total += added
         share = total / (largest + turned)
-        step.energy_growth[world, SHARE] = share
-        step.energy_growth[world, LARGEST] = largest
-        step.energy_growth[world, TURNOVER] = turned
-        step.energy_growth[world, ADDED] = total
-        step.energy_growth[world, STEPS] = steps
-        if share > step.growth_warn_limit and step.energy_growth[world, SINCE] == f64(0.0):
-            step.energy_growth[world, SINCE] = step.time[world]
+        step.energy_growth[world, GROWTH_SHARE] = share
+        step.energy_growth[world, GROWTH_LARGEST] = largest
+        step.energy_growth[world, GROWTH_TURNOVER] = turned
+        step.energy_growth[world, GROWTH_ADDED] = total
+        step.energy_growth[world, GROWTH_STEPS] = steps
+        if share > step.growth_warn_limit and step.energy_growth[world, GROWTH_SINCE] == f64(0.0):
+            step.energy_growth[world, GROWTH_SINCE] = step.time[world]
 
     @wp.kernel(module=module)
     def ledger_terms(

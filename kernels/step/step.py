@@ -15,7 +15,7 @@ from ..common.traits import NO_TERMS, Traits
 from ..common.types import kernel_module, precision
 from ..solvers.newton_control import FAIL_ELEMENT_INVERTED, FAIL_ENERGY_GROWTH, FAIL_ROUNDOFF, FAIL_WORK, control_struct
 from ..solvers.pcg import pcg_struct
-from .energy_ledger import SHARE, ledger_kernels
+from .energy_ledger import GROWTH_SHARE, ledger_kernels
 from .step_control import STATUS, step_end_functions, step_struct
 
 __all__ = ["step_kernels"]
@@ -62,7 +62,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         alive = wp.where(step.status[world] == wp.static(STATUS["running"]), 1, 0)
         if time >= end_time(step, world) - time_tolerance(step, world):
             alive = 0
-        if alive != 0 and step.growth_monitored != 0 and step.energy_growth[world, SHARE] > step.growth_limit:
+        if alive != 0 and step.growth_monitored != 0 and step.energy_growth[world, GROWTH_SHARE] > step.growth_limit:
             alive = 0
             step.status[world] = wp.static(STATUS["failed"])
             newton.failed[world] = FAIL_ENERGY_GROWTH
@@ -346,7 +346,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         report[world, 13] = newton.step_floor_error[world]
         report[world, 14] = f64(0.0)
         if step.growth_monitored != 0:
-            report[world, 14] = step.energy_growth[world, SHARE]
+            report[world, 14] = step.energy_growth[world, GROWTH_SHARE]
         if wp.static(has_constraints):
             largest = f64(0.0)
             for c in range(newton.component_count):
