@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import warp as wp
 from warpfea.kernels.common.structs import pattern_struct
-from warpfea.kernels.solvers.band import BLOCK, column_type
-from warpfea.kernels.solvers.band_block import band_block_kernels, solution_numbers, window_numbers
+from warpfea.kernels.solvers.band import BLOCK, block_column_type
+from warpfea.kernels.solvers.band_block import band_block_kernels, solution_memory_size, window_size
 
 SLOTS = 37
 ROWS = -(-3 * SLOTS // BLOCK)
@@ -45,11 +45,11 @@ def solved(A, graph, order, r, dtype, shift=0.0):
     blocks = A.reshape(B, SLOTS, 3, SLOTS, 3).transpose(0, 1, 3, 2, 4)[:, rows, columns]
     slot_at, place_of, active = array(order, wp.int32), array(place, wp.int32), array(np.ones(B), wp.int32)
     bad = array(np.zeros(B), wp.int32)
-    band = wp.zeros((B, ROWS, BLOCK * (width + 1)), dtype=column_type(dtype), device="cpu")
-    outside = wp.zeros((B, window_numbers(width)), dtype=scalar, device="cpu")
+    band = wp.zeros((B, ROWS, BLOCK * (width + 1)), dtype=block_column_type(dtype), device="cpu")
+    outside = wp.zeros((B, window_size(width)), dtype=scalar, device="cpu")
     args = [1, outside, pattern, array(blocks, mat33), slot_at, place_of, array(np.full(B, shift), scalar)]
     wp.launch(kernels.factor, B, [*args, active, bad, band], device="cpu")
-    outside = wp.zeros((B, solution_numbers(ROWS, width)), dtype=scalar, device="cpu")
+    outside = wp.zeros((B, solution_memory_size(ROWS, width)), dtype=scalar, device="cpu")
     z = wp.zeros((B, SLOTS), dtype=vec3, device="cpu")
     wp.launch(kernels.solve, B, [1, outside, band, slot_at, array(r, vec3), active, z], device="cpu")
     return z.numpy(), bad.numpy()

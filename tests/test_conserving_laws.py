@@ -114,7 +114,7 @@ def test_the_stress_is_that_of_the_law_where_nothing_changes(name, size, dtype):
 
 def law_stress(name, G):
     """Energy and P by the kernels of the law itself."""
-    law, p = materials.law(name, "float64"), precision("float64")
+    law, p = materials.law_functions(name, "float64"), precision("float64")
     coef = wp.types.vector(length=materials.NCOEF, dtype=p.T)
 
     @wp.kernel(module=kernel_module(f"test_conserving_plain_{name}"))

@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 import pytest
 import warp as wp
-from warpfea.kernels.step.step_control import GROWTH
+from warpfea.kernels.step.step_control import GROWTH_COLUMNS
 
 import warpfea as wf
 from warpfea.cli import main
@@ -84,8 +84,8 @@ def test_residuals_that_were_accepted_count_too():
     assert sim.last.energy_growth[0] == pytest.approx((total(sim)[0] - start) / total(sim)[0], rel=0.05)
     rows = sim.state.energy_growth.numpy()
     # with an older, smaller maximum of energy the same residuals are more than a tenth of it
-    rows[:, GROWTH.index("largest")] *= 0.1
-    rows[:, GROWTH.index("share")] *= 10.0
+    rows[:, GROWTH_COLUMNS.index("largest")] *= 0.1
+    rows[:, GROWTH_COLUMNS.index("share")] *= 10.0
     sim.state.energy_growth.assign(rows)
     with pytest.raises(
         wf.ConvergenceError, match=r"the work of accepted residuals: energy gain [\d.]+% .* smaller tol;"
@@ -111,7 +111,7 @@ def test_each_world_is_watched_where_nothing_is_read_back(device):
         warnings.simplefilter("error", wf.ModelWarning)
         assert calm.step(20).energy_growth.max() < 1e-9
     rows = calm.state.energy_growth.numpy()
-    rows[1, GROWTH.index("share")] = 0.2  # as if it had added a fifth
+    rows[1, GROWTH_COLUMNS.index("share")] = 0.2  # as if it had added a fifth
     calm.state.energy_growth.assign(rows)
     with pytest.warns(wf.ModelWarning, match="bdf2 is gaining energy.* in world 1"):
         assert calm.step().status.tolist() == [0, 1]
@@ -122,7 +122,7 @@ def test_each_world_is_watched_where_nothing_is_read_back(device):
     calm.reset(wp.array([0, 1], dtype=wp.int32, device=model.device))
     calm.step(5)
     assert calm.status.tolist() == [0, 0]
-    assert calm.state.energy_growth.numpy()[1, GROWTH.index("share")] < 1e-9
+    assert calm.state.energy_growth.numpy()[1, GROWTH_COLUMNS.index("share")] < 1e-9
 
 
 def test_worlds_that_grow_fail_and_leave_the_others():

@@ -62,7 +62,7 @@ def test_looking_for_jumps_leaves_the_values_of_the_step():
     sim = crank([0.0, DT, 5.0 * DT, 1.0], 0.2)
     sim.step(2)
     work = sim.stepper.work
-    arrays = (work.step.new_time, work.step.ramp, work.time_law_values)
+    arrays = (work.step.new_time, work.step.load_factor, work.time_law_values)
     before = [array.numpy().copy() for array in arrays]
     np.testing.assert_allclose(sim.stepper.law_values(3.0 * DT)[0, 0, 0], 0.1, rtol=1e-12)
     for array, values in zip(arrays, before):

@@ -22,7 +22,7 @@ pytestmark = pytest.mark.parametrize("name", LAWS)
 @functools.cache
 def kernel(name, dtype):
     """A kernel that evaluates the four functions of a law at one point per thread."""
-    law, p = materials.law(name, dtype), precision(dtype)
+    law, p = materials.law_functions(name, dtype), precision(dtype)
     T, vec3, mat33 = p.T, p.vec3, p.mat33
     coef = wp.types.vector(length=materials.NCOEF, dtype=T)
 

@@ -79,21 +79,21 @@ def replace_points(mesh, points):
 @functools.cache
 def quartic(dtype):
     """Device functions of the law; c = (mu/2, 0, 0, q): the first three are those of its stand-in at rest."""
-    p, t, base = precision(dtype), laws.tensors(dtype), laws.svk(dtype)
+    p, t, base = precision(dtype), laws.tensor_functions(dtype), laws.svk(dtype)
     T, mat33, vec3 = p.T, p.mat33, p.vec3
     coef = wp.types.vector(length=laws.NCOEF, dtype=T)
 
     @wp.func
     def energy(G: mat33, c: coef) -> T:
         """Psi."""
-        E = t.green(G)
+        E = t.green_lagrange(G)
         e = wp.ddot(E, E)
         return c[0] * e + T(0.25) * c[3] * e * e
 
     @wp.func
     def stress(G: mat33, c: coef) -> mat33:
         """P = F S, S = (mu + q E:E) E."""
-        E = t.green(G)
+        E = t.green_lagrange(G)
         S = (T(2.0) * c[0] + c[3] * wp.ddot(E, E)) * E
         return S + G * S
 
@@ -101,7 +101,7 @@ def quartic(dtype):
     def increment(G: mat33, dG: mat33, c: coef) -> mat33:
         """dP = dF S + F dS."""
         F = t.identity() + G
-        E = t.green(G)
+        E = t.green_lagrange(G)
         dE = t.sym(wp.transpose(F) * dG)
         a = T(2.0) * c[0] + c[3] * wp.ddot(E, E)
         return dG * (a * E) + F * (a * dE + (T(2.0) * c[3] * wp.ddot(E, dE)) * E)

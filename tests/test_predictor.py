@@ -84,7 +84,7 @@ def test_the_best_order_is_that_of_the_smallest_error():
     ):
         for k, array in enumerate((w.v, sim.state.velocity, *predictor.previous_velocities)):
             array.assign(velocity(3.0 - k))
-        predictor.control.count.fill_(2)
+        predictor.control.history_count.fill_(2)
         predictor.update_history()
         assert next_order(sim) == expected
         np.testing.assert_array_equal(predictor.previous_velocities[0].numpy(), sim.state.velocity.numpy())

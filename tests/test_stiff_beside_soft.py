@@ -27,7 +27,7 @@ def test_motion_of_a_soft_arm_beside_a_loaded_block_in_float32(kind):
 
 @pytest.mark.parametrize("load", [1.0, 1.013, 1.078])
 def test_a_welded_arm_that_comes_to_rest_in_float32(monkeypatch, load):
-    """Fails without UNSOLVED_TOL at 1.013 and 1.078: steps without an iteration, 1.05 % off."""
+    """Fails without UNSOLVED_TOL_FACTOR at 1.013 and 1.078: steps without an iteration, 1.05 % off."""
     monkeypatch.setattr(pairs, "GRAVITY", load * pairs.GRAVITY)
     exact, _ = settled("weld", "float64", 1e-10, steps=pairs.STEPS)
     found, _ = settled("weld", "float32", steps=pairs.STEPS)

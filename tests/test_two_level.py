@@ -250,7 +250,7 @@ def coarse_functions(sim, depth=0):
     """P of a level from its groups and weights, (3 slots, 3 coarse slots)."""
     level = sim.stepper.newton.preconditioner.levels[depth]
     n = level.slots
-    group, weight = level.data.group_of.numpy(), level.data.weight.numpy()
+    group, weight = level.data.group_of_slot.numpy(), level.data.affine_values.numpy()
     columns = (4 * group[:, None] + np.arange(4)).ravel()
     P = sp.csr_matrix((weight.ravel(), (np.repeat(np.arange(n), 4), columns)), shape=(n, 4 * level.groups))
     return sp.kron(P, sp.eye(3)).tocsr()
@@ -307,20 +307,20 @@ def test_it_is_symmetric_and_positive_through_all_levels(name, size, options):
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_functions_that_depend_on_each_other_are_dropped(dtype):
     """A tile inverse of a singular matrix: positive semi-definite, exact on what is left, and finite."""
-    from warpfea.kernels.solvers.levels import LANES, TILE
+    from warpfea.kernels.solvers.levels import TILE_LANES, TILE_UNKNOWNS
     from warpfea.kernels.solvers.levels_build import build_kernels
 
     rng = np.random.default_rng(0)
-    half = rng.standard_normal((TILE, TILE - 5))
+    half = rng.standard_normal((TILE_UNKNOWNS, TILE_UNKNOWNS - 5))
     half[7] = 0.0  # a row without an unknown
     A = half @ half.T
     T = {"float64": wp.float64, "float32": wp.float32}[dtype]
     matrix = wp.array(A[None, None], dtype=T, device="cpu")
     diagonal = wp.array(np.diag(A)[None, None], dtype=T, device="cpu")
-    column = wp.zeros((1, 1, TILE), dtype=T, device="cpu")
+    column = wp.zeros((1, 1, TILE_UNKNOWNS), dtype=T, device="cpu")
     active = wp.ones(1, dtype=wp.int32, device="cpu")
     args = [1, 1, 0, active, diagonal, column, matrix]
-    wp.launch(build_kernels(dtype).invert_tiles, dim=1, inputs=args, device="cpu", block_dim=LANES)
+    wp.launch(build_kernels(dtype).invert_tiles, dim=1, inputs=args, device="cpu", block_dim=TILE_LANES)
     B = matrix.numpy()[0, 0].astype(float)
     kept = np.diag(B) != 0.0
     assert 0 < np.sum(~kept) <= 6
@@ -333,18 +333,18 @@ def test_functions_that_depend_on_each_other_are_dropped(dtype):
 
 
 def test_a_negative_row_gets_its_diagonal():
-    from warpfea.kernels.solvers.levels import LANES, TILE
+    from warpfea.kernels.solvers.levels import TILE_LANES, TILE_UNKNOWNS
     from warpfea.kernels.solvers.levels_build import build_kernels
 
-    A = np.eye(TILE)
+    A = np.eye(TILE_UNKNOWNS)
     A[3, 3] = -2.0
     matrix = wp.array(A[None, None], dtype=wp.float64, device="cpu")
     diagonal = wp.array(np.diag(A)[None, None], dtype=wp.float64, device="cpu")
-    column = wp.zeros((1, 1, TILE), dtype=wp.float64, device="cpu")
+    column = wp.zeros((1, 1, TILE_UNKNOWNS), dtype=wp.float64, device="cpu")
     active = wp.ones(1, dtype=wp.int32, device="cpu")
     args = [1, 1, 1, active, diagonal, column, matrix]
-    wp.launch(build_kernels("float64").invert_tiles, dim=1, inputs=args, device="cpu", block_dim=LANES)
+    wp.launch(build_kernels("float64").invert_tiles, dim=1, inputs=args, device="cpu", block_dim=TILE_LANES)
     B = matrix.numpy()[0, 0]
-    expected = np.ones(TILE)
+    expected = np.ones(TILE_UNKNOWNS)
     expected[3] = 0.5
     np.testing.assert_allclose(B, np.diag(expected))

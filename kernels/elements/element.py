@@ -11,7 +11,7 @@ import warp as wp
 from ..common.lanes import lane_functions, warp_minimum
 from ..common.types import kernel_module
 from . import materials
-from .matrix import matrix_kernels, stage_name
+from .matrix import matrix_kernels, scheme_suffix
 from .output import output_kernels
 from .points import point_functions
 
@@ -37,7 +37,7 @@ def element_kernels(
         slots: per element.
         affine: straight elements with parent gradients and one J0 each; False: a table of h_i per element and point.
         damping: None, "incremental" or "rate" (implicit Kelvin-Voigt forms).
-        framed: the law has axes of its own at each point, `block.frame`.
+        framed: the law has axes of its own at each point, `block.material_axes`.
         midpoint: conserving scheme, see `point_functions` and kernels/elements/energy_momentum.py; u is that at the
             midpoint of the step and v half of the change of u. Energies and J are those at its end.
         dissipative: its dissipative form.
@@ -47,11 +47,11 @@ def element_kernels(
     t, m, Block, Local = fn.tensors, fn.law, fn.Block, fn.Local
     NS, needs_J = fn.slots, fn.needs_J
     constant = affine and slots == 4  # F of a straight T4 is constant
-    ETA, LAMBDA_V = materials.ETA, materials.LAMBDA_V
+    ETA_INDEX, LAMBDA_V_INDEX = materials.ETA_INDEX, materials.LAMBDA_V_INDEX
     viscous = materials.svk(dtype)
     lane_sum, row_sum = lane_functions(dtype).lane_sum, lane_functions(dtype).row_sum
     form = "affine" if affine else "framed" if framed else "table"
-    name = f"element_{dtype}_{law}_{slots}_{form}_{damping}{stage_name(midpoint, dissipative)}"
+    name = f"element_{dtype}_{law}_{slots}_{form}_{damping}{scheme_suffix(midpoint, dissipative)}"
     module = kernel_module(name)
 
     @wp.kernel(module=module)
@@ -79,24 +79,24 @@ def element_kernels(
         lane = index % lanes
         elem = wp.min(index / lanes, block.count - 1)
         c = fn.coefficients(block, world, elem)
-        U = fn.load(block, u, world, elem)
+        U = fn.load_slots(block, u, world, elem)
         f = Local()
         psi = T(0.0)
         psi_v = T(0.0)
         J_low = T(1.0e30)
         V = Local()
         if wp.static(fn.uses_v):
-            V = fn.load(block, v, world, elem)
+            V = fn.load_slots(block, v, world, elem)
         dq = T(dq_dv[world])
-        for point in range(lane, block.gradient.shape[0], lanes):
-            G = fn.gradient_of(block, U, point, elem)
-            w = fn.weight_of(block, point, elem)
+        for point in range(lane, block.shape_gradient.shape[0], lanes):
+            G = fn.field_gradient(block, U, point, elem)
+            w = fn.point_weight(block, point, elem)
             local = fn.to_material_axes(block, G, point, elem)
             Fdot = fn.velocity_gradient(block, V, point, elem)
             P = mat33()
             if wp.static(midpoint):
                 J_low = wp.min(J_low, T(1.0) + t.volume_change(local + Fdot))
-                mean = fn.step_stress(block, local, Fdot, c)
+                mean = fn.midpoint_stress(block, local, Fdot, c)
                 P = mean + local * mean
                 psi += w * m.energy(local + Fdot, c)
             else:
@@ -105,10 +105,10 @@ def element_kernels(
                 psi += w * m.energy(local, c)
             if wp.static(damping == "incremental" or damping == "rate"):
                 rate = fn.strain_rate(block, local, Fdot, history, dq, world, point, elem)
-                S = t.isotropic(rate, c[LAMBDA_V], c[ETA])
+                S = t.isotropic_stress(rate, c[LAMBDA_V_INDEX], c[ETA_INDEX])
                 P = P + S + local * S
                 psi_v += T(0.5) * dq * w * wp.ddot(S, rate)
-            f = fn.scatter(block, f, fn.to_body_axes(block, P, point, elem), point, elem)
+            f = fn.add_point_forces(block, f, fn.to_body_axes(block, P, point, elem), point, elem)
         for i in range(NS):
             f[i] = lane_sum(f[i], lanes)
         stored = row_sum(wp.float64(psi), lanes)
@@ -126,7 +126,7 @@ def element_kernels(
         if low < min_J[world]:
             wp.atomic_min(min_J, world, low)
         if lane == 0 and index < block.count * lanes:
-            fn.store(block, f, world, elem, contribution)
+            fn.store_forces(block, f, world, elem, contribution)
             energy[0, world, block.element_offset + elem] = stored
             energy[1, world, block.element_offset + elem] = lost
 
@@ -136,36 +136,36 @@ def element_kernels(
         before: wp.array2d(dtype=vec3),
         u: wp.array2d(dtype=vec3),
         active: wp.array(dtype=wp.int32),
-        turned: wp.array(dtype=wp.int32),
+        inverted: wp.array(dtype=wp.int32),
     ):
         """Flag the worlds with a quadrature point that had J > 0 at `before` and has J <= 0 at u."""
         world, elem = wp.tid()
         if active[world] == 0:
             return
-        U = fn.load(block, u, world, elem)
-        past = fn.load(block, before, world, elem)
-        for point in range(block.gradient.shape[0]):
-            if T(1.0) + t.volume_change(fn.gradient_of(block, U, point, elem)) <= T(0.0):
-                if T(1.0) + t.volume_change(fn.gradient_of(block, past, point, elem)) > T(0.0):
-                    turned[world] = 1
+        U = fn.load_slots(block, u, world, elem)
+        past = fn.load_slots(block, before, world, elem)
+        for point in range(block.shape_gradient.shape[0]):
+            if T(1.0) + t.volume_change(fn.field_gradient(block, U, point, elem)) <= T(0.0):
+                if T(1.0) + t.volume_change(fn.field_gradient(block, past, point, elem)) > T(0.0):
+                    inverted[world] = 1
 
     @wp.kernel(module=module)
     def largest_gradient(
         block: Block,
         direction: wp.array2d(dtype=vec3),
         active: wp.array(dtype=wp.int32),
-        turn: wp.array(dtype=wp.float64),
+        gradient_norm: wp.array(dtype=wp.float64),
     ):
         """Largest gradient of a direction at the quadrature points, as a norm: rotation or strain per unit step."""
         world, elem = wp.tid()
         if active[world] == 0:
             return
-        P = fn.load(block, direction, world, elem)
+        P = fn.load_slots(block, direction, world, elem)
         most = T(0.0)
-        for point in range(block.gradient.shape[0]):
-            G = fn.gradient_of(block, P, point, elem)
+        for point in range(block.shape_gradient.shape[0]):
+            G = fn.field_gradient(block, P, point, elem)
             most = wp.max(most, wp.ddot(G, G))
-        wp.atomic_max(turn, world, wp.float64(wp.sqrt(most)))
+        wp.atomic_max(gradient_norm, world, wp.float64(wp.sqrt(most)))
 
     @wp.kernel(module=module)
     def tangent_product(
@@ -185,13 +185,13 @@ def element_kernels(
         world, elem = wp.tid()
         if active[world] == 0:
             return
-        U = fn.load(block, u, world, elem)
-        dU = fn.load(block, direction, world, elem)
+        U = fn.load_slots(block, u, world, elem)
+        dU = fn.load_slots(block, direction, world, elem)
         V = Local()
         if wp.static(fn.uses_v):
-            V = fn.load(block, v, world, elem)
+            V = fn.load_slots(block, v, world, elem)
         f = fn.tangent_force(block, U, dU, V, history, T(dq_dv[world]), active[world], world, elem)
-        fn.store(block, f, world, elem, contribution)
+        fn.store_forces(block, f, world, elem, contribution)
 
     @wp.kernel(module=module)
     def diagonal_blocks(
@@ -207,22 +207,22 @@ def element_kernels(
             return
         c = fn.coefficients(block, world, elem)
         cv = fn.damping_coefficients(c, T(1.0) / T(dq_dv[world]))
-        U = fn.load(block, u, world, elem)
+        U = fn.load_slots(block, u, world, elem)
         for i in range(NS):
             B = sym6()
             contribution[world, block.contribution_offset + i * block.count + elem] = B
-        for point in range(block.gradient.shape[0]):
-            G = fn.gradient_of(block, U, point, elem)
+        for point in range(block.shape_gradient.shape[0]):
+            G = fn.field_gradient(block, U, point, elem)
             w = fn.tangent_weight(block, point, elem)
             for i in range(NS):
                 a = vec3()
                 if wp.static(affine):
-                    a = wp.transpose(fn.inverse_jacobian(block, elem)) * block.gradient[point, i, 0]
+                    a = wp.transpose(fn.inverse_jacobian(block, elem)) * block.shape_gradient[point, i, 0]
                 else:
-                    a = block.gradient[point, i, elem]
+                    a = block.shape_gradient[point, i, elem]
                 K = mat33()
                 if wp.static(framed):
-                    R = block.frame[point, elem]
+                    R = block.material_axes[point, elem]
                     K = fn.to_body_axes(
                         block, m.block(fn.to_material_axes(block, G, point, elem), wp.transpose(R) * a, c), point, elem
                     )

@@ -18,8 +18,8 @@ from ..common.types import precision
 __all__ = [
     "CLUSTER_SIZE",
     "DIRECTION",
-    "U",
-    "V",
+    "DISPLACEMENT",
+    "VELOCITY",
     "cluster_functions",
     "cluster_size",
     "cluster_struct",
@@ -31,15 +31,15 @@ __all__ = [
 
 CLUSTER_SIZE = {"float64": 64, "float32": 128}
 """Elements of a cluster and threads of its block: the size of best GPU occupancy given shared memory and registers."""
-CAPACITY = {32: 24, 64: 32, 128: 46}
+SLOT_CAPACITY_FACTOR = {32: 24, 64: 32, 128: 46}
 """Slot capacity of a cluster, by its number of elements, in multiples of the slots of one element."""
 SHARED_BYTES = 48 * 1024
 """Largest static shared memory of a CUDA block."""
-THREADS = {"float64": 384, "float32": 640}
+RESIDENT_THREADS = {"float64": 384, "float32": 640}
 """Threads that must fit on a multiprocessor at once: bounds the registers of a thread."""
-U, DIRECTION, V = 0, 1, 2
+DISPLACEMENT, DIRECTION, VELOCITY = 0, 1, 2
 """The fields at the slots of a cluster: displacement, direction p, velocity."""
-QUAD = 4
+COPY_WORDS = 4
 """32-bit words of a table copied at once."""
 
 
@@ -48,12 +48,14 @@ def cluster_size(dtype: str, count: int, *, fit: bool) -> int:
 
     `fit`: small element blocks get small clusters, so that few threads idle when thousands of worlds run at once.
     """
-    return min(n for n in CAPACITY if n == CLUSTER_SIZE[dtype] or (fit and count <= n < CLUSTER_SIZE[dtype]))
+    return min(
+        n for n in SLOT_CAPACITY_FACTOR if n == CLUSTER_SIZE[dtype] or (fit and count <= n < CLUSTER_SIZE[dtype])
+    )
 
 
 def slot_capacity(size: int, slots: int) -> int:
     """Maximum number of slots of a cluster of `size` elements with `slots` slots each."""
-    return slots * CAPACITY[size]
+    return slots * SLOT_CAPACITY_FACTOR[size]
 
 
 def pool_size(size: int, slots: int, fields: int) -> int:
@@ -65,7 +67,7 @@ def table_layout(size: int, slots: int) -> tuple[int, int, int]:
     """Layout of a cluster's table: start of `place` and `sum_start` (16-bit numbers), and its 32-bit words."""
     place = slots * size
     words = place + slot_capacity(size, slots) // 2 + 1
-    return place, 2 * place, QUAD * -(-words // QUAD)
+    return place, 2 * place, COPY_WORDS * -(-words // COPY_WORDS)
 
 
 @functools.cache
@@ -79,11 +81,11 @@ def cluster_struct():
 
     @wp.struct
     class Clusters:
-        start: wp.array(dtype=wp.int32)  # [cluster + 1] first element
+        element_start: wp.array(dtype=wp.int32)  # [cluster + 1] first element
         slot_start: wp.array(dtype=wp.int32)  # [cluster + 1] first sum, numbered within the block
         slot: wp.array2d(dtype=wp.int32)  # [cluster, position] slot; rows are padded with their last slot
         table: wp.array(dtype=wp.int32)  # [cluster * words]
-        offset: wp.int32  # of the block's sums among those of all blocks
+        sum_offset: wp.int32  # of the block's sums among those of all blocks
 
     return Clusters
 
@@ -95,7 +97,7 @@ def pool_struct(dtype: str):
 
     @wp.struct
     class Pool:
-        number: wp.array(dtype=T)
+        numbers: wp.array(dtype=T)
         table: wp.array(dtype=wp.int32)
 
     return Pool
@@ -126,16 +128,17 @@ def _pool_access(dtype: str, size: int) -> Callable:
 def _table_access(words: int) -> Callable:
     """Device function access for the table of a cluster.
 
-    access(1, k, first, source, spare) copies its words QUAD k .. QUAD (k + 1) - 1 from the source, where the table
-    begins at word `first`; access(0, k, first, source, spare) returns its 16-bit number k.
+    access(1, k, first, source, spare) copies its words COPY_WORDS k .. COPY_WORDS (k + 1) - 1 from the source, where
+    the table begins at word `first`; access(0, k, first, source, spare) returns its 16-bit number k.
     """
+    n = COPY_WORDS
     snippet = f"""
     #if defined(__CUDA_ARCH__)
     __shared__ __align__(16) int table[{words}];
     if (copy) {{ ((int4*)table)[k] = ((const int4*)(source.data + first))[k]; return 0; }}
     #else
     int* table = spare.data;
-    if (copy) {{ for (int i = {QUAD} * k; i < {QUAD} * k + {QUAD}; ++i) table[i] = source.data[first + i]; return 0; }}
+    if (copy) {{ for (int i = {n} * k; i < {n} * k + {n}; ++i) table[i] = source.data[first + i]; return 0; }}
     #endif
     #if defined(__CUDA_ARCH__)
     return ((const unsigned short*)table)[k];  // the block's barrier stands between this and the copy
@@ -148,7 +151,7 @@ def _table_access(words: int) -> Callable:
 
     @wp.func_native(snippet)
     def access(copy: int, k: int, first: int, source: wp.array(dtype=wp.int32), spare: wp.array(dtype=wp.int32)) -> int:
-        """Copy QUAD words of the table if `copy` is set, else return its 16-bit number k."""
+        """Copy COPY_WORDS words of the table if `copy` is set, else return its 16-bit number k."""
 
     return access
 
@@ -157,9 +160,9 @@ def _table_access(words: int) -> Callable:
 def cluster_functions(dtype: str, size: int, slots: int, fields: int) -> _types.SimpleNamespace:
     """Functions for kernels of elements with `slots` slots each that are processed in clusters of `size` elements.
 
-    On the device, `fetch(pool, field, i, at)` returns a field (U, DIRECTION, V) at slot i of element `at` of the
-    cluster; `set_force` and `add_force(pool, i, at, f)` store and add to the force of that element on its slot i. On
-    the host, `by_clusters(module, Block, product, bounded)` makes the kernel.
+    On the device, `fetch(pool, field, i, at)` returns a field (DISPLACEMENT, DIRECTION, VELOCITY) at slot i of element
+    `at` of the cluster; `set_force` and `add_force(pool, i, at, f)` store and add to the force of that element on its
+    slot i. On the host, `make_product_kernel(module, Block, product, bounded)` makes the kernel.
     """
     p = precision(dtype)
     T, vec3, sym6 = p.T, p.vec3, p.sym
@@ -167,60 +170,60 @@ def cluster_functions(dtype: str, size: int, slots: int, fields: int) -> _types.
     sync = lane_functions(dtype).sync
     NS, ELEMENTS, ROOM = slots, size, slot_capacity(size, slots)
     PLACE, SUM_START, WORDS = table_layout(size, slots)
-    FORCE = 3 * fields * ROOM
+    FORCES_START = 3 * fields * ROOM
     numbers = pool_size(size, slots, fields)
     assert numbers * (8 if dtype == "float64" else 4) + 4 * WORDS < SHARED_BYTES, "a cluster exceeds shared memory"
     number = _pool_access(dtype, numbers)
     bits = _table_access(WORDS)
     # loads in flight per thread before the first use
-    SLOTS_AT_ONCE, QUADS_AT_ONCE = -(-ROOM // ELEMENTS), -(-WORDS // (QUAD * ELEMENTS))
+    SLOTS_AT_ONCE, COPIES_AT_ONCE = -(-ROOM // ELEMENTS), -(-WORDS // (COPY_WORDS * ELEMENTS))
     Slots = wp.types.vector(length=SLOTS_AT_ONCE, dtype=wp.int32)
     Values = wp.types.matrix(shape=(SLOTS_AT_ONCE, 3), dtype=T)
 
     @wp.func
-    def put(first: int, stride: int, at: int, x: vec3, pool: Pool):
+    def store_vector(first: int, stride: int, at: int, x: vec3, pool: Pool):
         """Store x; its component k is number first + k * stride + at of the pool."""
         for k in range(3):
-            number(1, first + k * stride + at, x[k], pool.number)
+            number(1, first + k * stride + at, x[k], pool.numbers)
 
     @wp.func
-    def get(first: int, stride: int, at: int, pool: Pool) -> vec3:
-        """Vector stored by `put`."""
+    def load_vector(first: int, stride: int, at: int, pool: Pool) -> vec3:
+        """Vector stored by `store_vector`."""
         x = vec3()
         for k in range(3):
-            x[k] = number(0, first + k * stride + at, T(0.0), pool.number)
+            x[k] = number(0, first + k * stride + at, T(0.0), pool.numbers)
         return x
 
     @wp.func
-    def entry(k: int, pool: Pool) -> int:
+    def table_entry(k: int, pool: Pool) -> int:
         """16-bit number k of the cluster's table."""
         return bits(0, k, 0, pool.table, pool.table)
 
     @wp.func
     def fetch(pool: Pool, field: int, i: int, at: int) -> vec3:
         """Field value at slot i of element `at` of the cluster."""
-        return get(3 * field * ROOM, ROOM, entry(PLACE + i * ELEMENTS + at, pool), pool)
+        return load_vector(3 * field * ROOM, ROOM, table_entry(PLACE + i * ELEMENTS + at, pool), pool)
 
     @wp.func
     def set_force(pool: Pool, i: int, at: int, f: vec3):
         """Store the force of element `at` on its slot i."""
-        put(FORCE + i * ELEMENTS, NS * ELEMENTS, at, f, pool)
+        store_vector(FORCES_START + i * ELEMENTS, NS * ELEMENTS, at, f, pool)
 
     @wp.func
     def add_force(pool: Pool, i: int, at: int, f: vec3):
         """Add to the force of element `at` on its slot i."""
-        set_force(pool, i, at, get(FORCE + i * ELEMENTS, NS * ELEMENTS, at, pool) + f)
+        set_force(pool, i, at, load_vector(FORCES_START + i * ELEMENTS, NS * ELEMENTS, at, pool) + f)
 
     @wp.func
-    def take_table(clusters: Clusters, cluster: int, lane: int, lanes: int, pool: Pool):
+    def copy_table(clusters: Clusters, cluster: int, lane: int, lanes: int, pool: Pool):
         """Copy the table of a cluster into the memory of the block; the lanes share the work."""
-        for first in range(lane, WORDS / QUAD, QUADS_AT_ONCE * lanes):
-            for j in range(QUADS_AT_ONCE):
-                if first + j * lanes < WORDS / QUAD:
+        for first in range(lane, WORDS / COPY_WORDS, COPIES_AT_ONCE * lanes):
+            for j in range(COPIES_AT_ONCE):
+                if first + j * lanes < WORDS / COPY_WORDS:
                     bits(1, first + j * lanes, cluster * WORDS, clusters.table, pool.table)
 
     @wp.func
-    def slots_from(clusters: Clusters, cluster: int, first: int, lanes: int) -> Slots:
+    def load_slots(clusters: Clusters, cluster: int, first: int, lanes: int) -> Slots:
         """Next SLOTS_AT_ONCE slots of a lane, at the indices first, first + lanes, ... of the cluster."""
         slot = Slots()
         for j in range(SLOTS_AT_ONCE):
@@ -228,7 +231,7 @@ def cluster_functions(dtype: str, size: int, slots: int, fields: int) -> _types.
         return slot
 
     @wp.func
-    def take_field(
+    def copy_field(
         field: wp.array2d(dtype=vec3),
         into: int,
         slot: Slots,
@@ -247,16 +250,16 @@ def cluster_functions(dtype: str, size: int, slots: int, fields: int) -> _types.
             x[j] = field[world, slot[j]]
         for j in range(SLOTS_AT_ONCE):
             if first + j * lanes < count:
-                put(3 * into * ROOM, ROOM, first + j * lanes, x[j], pool)
+                store_vector(3 * into * ROOM, ROOM, first + j * lanes, x[j], pool)
 
-    def by_clusters(module: wp.Module, Block, product: wp.Function, bounded: bool) -> wp.Kernel:
+    def make_product_kernel(module: wp.Module, Block, product: wp.Function, bounded: bool) -> wp.Kernel:
         """Kernel `with_mass_product`.
 
         `product` is the device function that sets the forces of one element; `bounded`: registers per thread are
-        limited so that THREADS threads fit on a multiprocessor.
+        limited so that RESIDENT_THREADS threads fit on a multiprocessor.
         """
 
-        @wp.kernel(module=module, launch_bounds=(ELEMENTS, THREADS[dtype] // ELEMENTS) if bounded else None)
+        @wp.kernel(module=module, launch_bounds=(ELEMENTS, RESIDENT_THREADS[dtype] // ELEMENTS) if bounded else None)
         def with_mass_product(
             block: Block,
             clusters: Clusters,
@@ -281,32 +284,32 @@ def cluster_functions(dtype: str, size: int, slots: int, fields: int) -> _types.
                 return
             cluster = index / lanes
             lane = index % lanes
-            slot = slots_from(clusters, cluster, lane, lanes)
+            slot = load_slots(clusters, cluster, lane, lanes)
             begin = clusters.slot_start[cluster]
             count = clusters.slot_start[cluster + 1] - begin
-            take_table(clusters, cluster, lane, lanes, pool)
+            copy_table(clusters, cluster, lane, lanes, pool)
             for first in range(lane, count, SLOTS_AT_ONCE * lanes):
                 if first != lane:
-                    slot = slots_from(clusters, cluster, first, lanes)
-                take_field(u, U, slot, world, first, lanes, count, pool)
-                take_field(direction, DIRECTION, slot, world, first, lanes, count, pool)
+                    slot = load_slots(clusters, cluster, first, lanes)
+                copy_field(u, DISPLACEMENT, slot, world, first, lanes, count, pool)
+                copy_field(direction, DIRECTION, slot, world, first, lanes, count, pool)
                 if wp.static(fields == 3):
-                    take_field(v, V, slot, world, first, lanes, count, pool)
+                    copy_field(v, VELOCITY, slot, world, first, lanes, count, pool)
             sync()
-            first_elem = clusters.start[cluster]
-            for elem in range(first_elem + lane, clusters.start[cluster + 1], lanes):
+            first_elem = clusters.element_start[cluster]
+            for elem in range(first_elem + lane, clusters.element_start[cluster + 1], lanes):
                 dq = T(dq_dv[world])
-                scale = T(mass_factor[world]) * block.density[world % block.density.shape[0], elem]
+                scale = T(mass_factor[world]) * block.density_det_J0[world % block.density_det_J0.shape[0], elem]
                 product(block, pool, history, dq, scale, active[world], world, elem, elem - first_elem)
             sync()
             for k in range(lane, count, lanes):
                 f = vec3()
-                for e in range(entry(SUM_START + k, pool), entry(SUM_START + k + 1, pool)):
-                    f += get(FORCE, NS * ELEMENTS, entry(e, pool), pool)
-                sums[world, clusters.offset + begin + k] = f
+                for e in range(table_entry(SUM_START + k, pool), table_entry(SUM_START + k + 1, pool)):
+                    f += load_vector(FORCES_START, NS * ELEMENTS, table_entry(e, pool), pool)
+                sums[world, clusters.sum_offset + begin + k] = f
 
         return with_mass_product
 
     return _types.SimpleNamespace(
-        Pool=Pool, fetch=fetch, set_force=set_force, add_force=add_force, by_clusters=by_clusters
+        Pool=Pool, fetch=fetch, set_force=set_force, add_force=add_force, make_product_kernel=make_product_kernel
     )

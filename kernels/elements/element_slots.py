@@ -6,26 +6,26 @@ import warp as wp
 
 from ..common.types import precision
 
-__all__ = ["load_functions", "local_type"]
+__all__ = ["slot_access_functions", "slot_values_type"]
 
 
 @functools.cache
-def local_type(dtype: str, slots: int):
+def slot_values_type(dtype: str, slots: int):
     """Slot values of an element: a matrix with one row per slot."""
     return wp.types.matrix(shape=(slots, 3), dtype=precision(dtype).T)
 
 
 @functools.cache
-def load_functions(dtype: str, slots: int, Block) -> tuple[wp.Function, wp.Function]:
-    """Functions load(block, field, world, elem) and store(block, values, world, elem, contribution).
+def slot_access_functions(dtype: str, slots: int, Block) -> tuple[wp.Function, wp.Function]:
+    """Functions load_slots(block, field, world, elem) and store_forces(block, values, world, elem, contribution).
 
     Args:
         Block: struct of the elements, with conn, is_position, contribution_offset and count.
     """
-    vec3, Local, NS = precision(dtype).vec3, local_type(dtype, slots), slots
+    vec3, Local, NS = precision(dtype).vec3, slot_values_type(dtype, slots), slots
 
     @wp.func
-    def load(block: Block, field: wp.array2d(dtype=vec3), world: int, elem: int) -> Local:
+    def load_slots(block: Block, field: wp.array2d(dtype=vec3), world: int, elem: int) -> Local:
         """Slot values of an element; positions relative to the first slot, so that a translation has no strain."""
         U = Local()
         first = field[world, block.conn[0, elem]]
@@ -34,9 +34,9 @@ def load_functions(dtype: str, slots: int, Block) -> tuple[wp.Function, wp.Funct
         return U
 
     @wp.func
-    def store(block: Block, f: Local, world: int, elem: int, contribution: wp.array2d(dtype=vec3)):
+    def store_forces(block: Block, f: Local, world: int, elem: int, contribution: wp.array2d(dtype=vec3)):
         """Forces on the slots of an element, into its entries of the contributions."""
         for i in range(NS):
             contribution[world, block.contribution_offset + i * block.count + elem] = f[i]
 
-    return load, store
+    return load_slots, store_forces

@@ -21,7 +21,7 @@ from . import materials
 
 __all__ = ["energy_momentum_law"]
 
-TINY = {"float64": 1.0e-60, "float32": 1.0e-30}
+TINY_SQUARED_CHANGE = {"float64": 1.0e-60, "float32": 1.0e-30}
 """|dE|^2 far below round-off: a step without a change of strain uses the stress at the mean strain."""
 
 
@@ -30,9 +30,9 @@ def energy_momentum_law(name: str, dtype: str) -> _types.SimpleNamespace:
     """Device functions of the law `name`.
 
     mean_stress(G, D, c) is S, Pa; mean_increment(G, dE, c) approximates twice dS/dE1 : dE by the moduli at G, Pa;
-    rest_increment(dE, c) is C0 : dE, with moduli C0 that are positive, Pa.
+    rest_moduli_increment(dE, c) is C0 : dE, with moduli C0 that are positive, Pa.
     """
-    p, t, m = precision(dtype), materials.tensors(dtype), materials.law(name, dtype)
+    p, t, m = precision(dtype), materials.tensor_functions(dtype), materials.law_functions(name, dtype)
     T, mat33 = p.T, p.mat33
     coef = wp.types.vector(length=materials.NCOEF, dtype=T)
 
@@ -42,14 +42,16 @@ def energy_momentum_law(name: str, dtype: str) -> _types.SimpleNamespace:
     @wp.func
     def mean_stress(G: mat33, D: mat33, c: coef) -> mat33:
         """S at the mean of the strains at both ends."""
-        return m.pk2_stress(t.green(G) + T(0.5) * wp.transpose(D) * D, c)
+        return m.pk2_stress(t.green_lagrange(G) + T(0.5) * wp.transpose(D) * D, c)
 
     @wp.func
     def mean_increment(G: mat33, dE: mat33, c: coef) -> mat33:
         """Twice dS/dE1 : dE, exact for S linear in E, Pa."""
         return m.pk2_stress(dE, c)
 
-    return _types.SimpleNamespace(mean_stress=mean_stress, mean_increment=mean_increment, rest_increment=m.pk2_stress)
+    return _types.SimpleNamespace(
+        mean_stress=mean_stress, mean_increment=mean_increment, rest_moduli_increment=m.pk2_stress
+    )
 
 
 def _discrete_gradient(dtype: str, second_invariant: bool) -> _types.SimpleNamespace:
@@ -58,11 +60,11 @@ def _discrete_gradient(dtype: str, second_invariant: bool) -> _types.SimpleNames
     S = C^-1 (2 mu10 J^-2/3 dev(2 E) + 2 mu01 J^-4/3 dev((2 + 4 t) E - 4 E^2) + k (J - 1) J I) with t = tr E: the
     Kirchhoff form of `materials.mooney_rivlin` with E instead of b.
     """
-    p, t = precision(dtype), materials.tensors(dtype)
+    p, t = precision(dtype), materials.tensor_functions(dtype)
     T, mat33 = p.T, p.mat33
     coef = wp.types.vector(length=materials.NCOEF, dtype=T)
     third, two_thirds, four_thirds = T(1.0 / 3.0), T(2.0 / 3.0), T(4.0 / 3.0)
-    tiny = T(TINY[dtype])
+    tiny = T(TINY_SQUARED_CHANGE[dtype])
 
     @wp.func
     def dev(A: mat33) -> mat33:
@@ -81,7 +83,7 @@ def _discrete_gradient(dtype: str, second_invariant: bool) -> _types.SimpleNames
         return dev((T(2.0) + T(4.0) * wp.trace(E)) * E - T(4.0) * (E * E))
 
     @wp.func
-    def c_times_stress(E: mat33, c: coef) -> mat33:
+    def cauchy_green_times_stress(E: mat33, c: coef) -> mat33:
         """C S of a strain, in the form of the docstring above."""
         j1 = jacobian_minus_one(E)
         J = T(1.0) + j1
@@ -97,7 +99,7 @@ def _discrete_gradient(dtype: str, second_invariant: bool) -> _types.SimpleNames
         return wp.inverse(t.identity() + T(2.0) * E)
 
     @wp.func
-    def root_change(y: T) -> T:
+    def cube_root_change(y: T) -> T:
         """(1 + y)^(1/3) - 1 to relative accuracy: one Newton step on (1 + r)^3 = 1 + y."""
         r = wp.pow(T(1.0) + y, third) - T(1.0)
         e = T(1.0) + r
@@ -116,7 +118,7 @@ def _discrete_gradient(dtype: str, second_invariant: bool) -> _types.SimpleNames
         i1 = wp.trace(A)
         i23 = T(0.5) * (i1 * i1 - wp.trace(A * A)) + wp.determinant(A)
         y = i1 + i23
-        r = root_change(y)
+        r = cube_root_change(y)
         J0 = T(1.0) + jacobian_minus_one(E0)
         # (1 + y)^(-1/3) - 1 + y/3 = r^2 (1/(1 + r) + 1 + r/3)
         rho = r * r * (T(1.0) / (T(1.0) + r) + T(1.0) + third * r) - third * i23
@@ -146,16 +148,16 @@ def _discrete_gradient(dtype: str, second_invariant: bool) -> _types.SimpleNames
     @wp.func
     def mean_stress(G: mat33, D: mat33, c: coef) -> mat33:
         """The discrete gradient, Pa."""
-        E = t.green(G) + T(0.5) * wp.transpose(D) * D
+        E = t.green_lagrange(G) + T(0.5) * wp.transpose(D) * D
         dE = T(2.0) * t.sym(D + wp.transpose(G) * D)
-        S = t.sym(inverse_cauchy_green(E) * c_times_stress(E, c))
+        S = t.sym(inverse_cauchy_green(E) * cauchy_green_times_stress(E, c))
         rest = energy_change(E - T(0.5) * dE, T(2.0) * dE, c) - wp.ddot(S, dE)
         return S + (rest / (wp.ddot(dE, dE) + tiny)) * dE
 
     @wp.func
     def mean_increment(G: mat33, dE: mat33, c: coef) -> mat33:
         """dS of S(E) along dE at the strain of G, Pa."""
-        E = t.green(G)
+        E = t.green_lagrange(G)
         Ci = inverse_cauchy_green(E)
         j1 = jacobian_minus_one(E)
         J = T(1.0) + j1
@@ -168,12 +170,14 @@ def _discrete_gradient(dtype: str, second_invariant: bool) -> _types.SimpleNames
             s = T(2.0) + T(4.0) * wp.trace(E)
             dA = dev(T(4.0) * wp.trace(dE) * E + s * dE - T(4.0) * (dE * E + E * dE))
             change = change + c2 * (dA - four_thirds * trL * second_invariant_part(E))
-        return t.sym(Ci * (change - T(2.0) * dE * (Ci * c_times_stress(E, c))))
+        return t.sym(Ci * (change - T(2.0) * dE * (Ci * cauchy_green_times_stress(E, c))))
 
     @wp.func
-    def rest_increment(dE: mat33, c: coef) -> mat33:
+    def rest_moduli_increment(dE: mat33, c: coef) -> mat33:
         """C0 : dE with the moduli at rest, Pa."""
         mu = T(2.0) * (c[0] + c[2])
-        return t.isotropic(dE, c[1] - two_thirds * mu, mu)
+        return t.isotropic_stress(dE, c[1] - two_thirds * mu, mu)
 
-    return _types.SimpleNamespace(mean_stress=mean_stress, mean_increment=mean_increment, rest_increment=rest_increment)
+    return _types.SimpleNamespace(
+        mean_stress=mean_stress, mean_increment=mean_increment, rest_moduli_increment=rest_moduli_increment
+    )

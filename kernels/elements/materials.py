@@ -22,17 +22,16 @@ import warp as wp
 
 from ..common.types import precision
 
-__all__ = ["LAWS", "law"]
+__all__ = ["LAWS", "law_functions"]
 
 NCOEF = 11
 """Coefficients per material: up to nine of the law, then eta and lambda_v of Kelvin-Voigt damping."""
-ETA = NCOEF - 2
-LAMBDA_V = NCOEF - 1
+ETA_INDEX, LAMBDA_V_INDEX = NCOEF - 2, NCOEF - 1
 """Indices of eta and lambda_v (Pa s) among the coefficients."""
 
 
 @functools.cache
-def tensors(dtype: str) -> _types.SimpleNamespace:
+def tensor_functions(dtype: str) -> _types.SimpleNamespace:
     """Small tensor functions shared by the laws."""
     p = precision(dtype)
     T, mat33, vec3 = p.T, p.mat33, p.vec3
@@ -44,7 +43,7 @@ def tensors(dtype: str) -> _types.SimpleNamespace:
         return wp.identity(n=3, dtype=T)
 
     @wp.func
-    def green(G: mat33) -> mat33:
+    def green_lagrange(G: mat33) -> mat33:
         """Green-Lagrange strain E = (G + G^T + G^T G)/2, Eq. (56)."""
         Gt = wp.transpose(G)
         return T(0.5) * (G + Gt + Gt * G)
@@ -61,26 +60,26 @@ def tensors(dtype: str) -> _types.SimpleNamespace:
         return tr + T(0.5) * (tr * tr - wp.trace(G * G)) + wp.determinant(G)
 
     @wp.func
-    def isotropic(E: mat33, lam: T, mu: T) -> mat33:
+    def isotropic_stress(E: mat33, lam: T, mu: T) -> mat33:
         """lambda tr(E) I + 2 mu E: S of Eq. (26), and S_vis of Eq. (62) with lambda_v, eta and Edot."""
         return lam * wp.trace(E) * identity() + T(2.0) * mu * E
 
     @wp.func
     def isotropic_moduli(lam: T, mu: T) -> moduli9:
-        """`isotropic` as the nine numbers that the function `moduli` of a law returns."""
+        """`isotropic_stress` as the nine numbers that the function `moduli` of a law returns."""
         d = lam + T(2.0) * mu
         return moduli9(d, d, d, lam, lam, lam, mu, mu, mu)
 
     return _types.SimpleNamespace(
-        identity=identity, green=green, sym=sym, volume_change=volume_change, isotropic=isotropic,
-        isotropic_moduli=isotropic_moduli, moduli9=moduli9, vec3=vec3,
+        identity=identity, green_lagrange=green_lagrange, sym=sym, volume_change=volume_change,
+        isotropic_stress=isotropic_stress, isotropic_moduli=isotropic_moduli, moduli9=moduli9, vec3=vec3,
     )  # fmt: skip
 
 
 @functools.cache
 def svk(dtype: str) -> _types.SimpleNamespace:
     """St. Venant-Kirchhoff, Eqs. (25)-(28) and (35); c = (lambda, mu), Pa."""
-    p, t = precision(dtype), tensors(dtype)
+    p, t = precision(dtype), tensor_functions(dtype)
     T, mat33, vec3 = p.T, p.mat33, p.vec3
     moduli9 = t.moduli9
     coef = wp.types.vector(length=NCOEF, dtype=T)
@@ -88,32 +87,32 @@ def svk(dtype: str) -> _types.SimpleNamespace:
     @wp.func
     def pk2_stress(E: mat33, c: coef) -> mat33:
         """S = lambda tr(E) I + 2 mu E, Eq. (26)."""
-        return t.isotropic(E, c[0], c[1])
+        return t.isotropic_stress(E, c[0], c[1])
 
     @wp.func
     def moduli(c: coef) -> moduli9:
-        """lambda and mu as the nine numbers of an orthotropic stiffness."""
+        """lambda and mu as the nine moduli of an orthotropic law."""
         return t.isotropic_moduli(c[0], c[1])
 
     @wp.func
     def energy(G: mat33, c: coef) -> T:
         """Psi = lambda/2 tr(E)^2 + mu tr(E^2), Eq. (25)."""
-        E = t.green(G)
+        E = t.green_lagrange(G)
         tr = wp.trace(E)
         return T(0.5) * c[0] * tr * tr + c[1] * wp.ddot(E, E)
 
     @wp.func
     def stress(G: mat33, c: coef) -> mat33:
         """P = F S, Eq. (27)."""
-        S = t.isotropic(t.green(G), c[0], c[1])
+        S = t.isotropic_stress(t.green_lagrange(G), c[0], c[1])
         return S + G * S
 
     @wp.func
     def increment(G: mat33, dG: mat33, c: coef) -> mat33:
         """Tangent dP = dF S + F dS. With dF = d h_j^T, dP h_i is the integrand of Eq. (35) times d."""
         F = t.identity() + G
-        S = t.isotropic(t.green(G), c[0], c[1])
-        dS = t.isotropic(t.sym(wp.transpose(F) * dG), c[0], c[1])
+        S = t.isotropic_stress(t.green_lagrange(G), c[0], c[1])
+        dS = t.isotropic_stress(t.sym(wp.transpose(F) * dG), c[0], c[1])
         return dG * S + F * dS
 
     @wp.func
@@ -121,7 +120,7 @@ def svk(dtype: str) -> _types.SimpleNamespace:
         """The integrand of Eq. (35) for i = j and h_i = a, with a negative geometric part a.S a set to zero."""
         F = t.identity() + G
         Fa = F * a
-        S = t.isotropic(t.green(G), c[0], c[1])
+        S = t.isotropic_stress(t.green_lagrange(G), c[0], c[1])
         geometric = wp.max(T(0.0), wp.dot(a, S * a))
         return (c[0] + c[1]) * wp.outer(Fa, Fa) + c[1] * wp.dot(a, a) * (F * wp.transpose(F)) + geometric * t.identity()
 
@@ -138,7 +137,7 @@ def mooney_rivlin(dtype: str, second_invariant: bool = True) -> _types.SimpleNam
     tau = 2 mu10 J^-2/3 dev(2 b) + 2 mu01 J^-4/3 dev((2 + 4 t) b - 4 b^2) + k (J - 1) J I,
     where no term is a difference of nearly equal ones at small strain.
     """
-    p, t = precision(dtype), tensors(dtype)
+    p, t = precision(dtype), tensor_functions(dtype)
     T, mat33, vec3 = p.T, p.mat33, p.vec3
     coef = wp.types.vector(length=NCOEF, dtype=T)
     # constants of this precision: Warp would evaluate an expression of literals in float32
@@ -155,7 +154,7 @@ def mooney_rivlin(dtype: str, second_invariant: bool = True) -> _types.SimpleNam
         return A - third * wp.trace(A) * t.identity()
 
     @wp.func
-    def power_change(j1: T) -> T:
+    def jacobian_power_change(j1: T) -> T:
         """J^(-2/3) - 1 from J - 1, to relative accuracy: one Newton step on (1+d)^3 (1+j)^2 = 1."""
         J = T(1.0) + j1
         d = wp.pow(J, -two_thirds) - T(1.0)
@@ -164,15 +163,15 @@ def mooney_rivlin(dtype: str, second_invariant: bool = True) -> _types.SimpleNam
         return d - f / (T(3.0) * e * e * J * J)
 
     @wp.func
-    def half_left_strain(G: mat33) -> mat33:
-        """b = (F F^T - I)/2 = (G + G^T + G G^T)/2."""
+    def left_cauchy_green_strain(G: mat33) -> mat33:
+        """b = (F F^T - I)/2 = (G + G^T + G G^T)/2, half of the left Cauchy-Green tensor less I."""
         Gt = wp.transpose(G)
         return T(0.5) * (G + Gt + G * Gt)
 
     @wp.func
-    def kirchhoff(G: mat33, c: coef) -> mat33:
+    def kirchhoff_stress(G: mat33, c: coef) -> mat33:
         """Kirchhoff stress tau = P F^T, in the form of the law's docstring."""
-        b = half_left_strain(G)
+        b = left_cauchy_green_strain(G)
         j1 = t.volume_change(G)
         J = T(1.0) + j1
         Jm = wp.pow(J, -two_thirds)
@@ -188,8 +187,8 @@ def mooney_rivlin(dtype: str, second_invariant: bool = True) -> _types.SimpleNam
         # det(I + A) = 1 for A = J^(-2/3) C - I: its trace x = I1bar - 3 follows from second-order terms, without
         # cancellation; then I2bar - 3 = x - det A
         j1 = t.volume_change(G)
-        d = power_change(j1)
-        A = T(2.0) * (T(1.0) + d) * t.green(G) + d * t.identity()
+        d = jacobian_power_change(j1)
+        A = T(2.0) * (T(1.0) + d) * t.green_lagrange(G) + d * t.identity()
         q = T(0.5) * wp.ddot(A, A) - wp.determinant(A)
         x = T(2.0) * q / (T(1.0) + wp.sqrt(wp.max(T(0.0), T(1.0) + T(2.0) * q)))
         psi = T(0.5) * c[1] * j1 * j1 + c[0] * x
@@ -201,14 +200,14 @@ def mooney_rivlin(dtype: str, second_invariant: bool = True) -> _types.SimpleNam
     def stress(G: mat33, c: coef) -> mat33:
         """P = tau F^-T, equal to Eq. (52)."""
         F = t.identity() + G
-        return kirchhoff(G, c) * wp.transpose(wp.inverse(F))
+        return kirchhoff_stress(G, c) * wp.transpose(wp.inverse(F))
 
     @wp.func
     def increment(G: mat33, dG: mat33, c: coef) -> mat33:
         """dP = (dtau - tau L^T) F^-T, L = dF F^-1. With dF = d h_j^T, dP h_i is the integrand of Eq. (54) times d."""
         F = t.identity() + G
         Fi = wp.inverse(F)
-        b = half_left_strain(G)
+        b = left_cauchy_green_strain(G)
         j1 = t.volume_change(G)
         J = T(1.0) + j1
         L = dG * Fi
@@ -269,7 +268,7 @@ def orthotropic(dtype: str) -> _types.SimpleNamespace:
 
     c = (D11, D22, D33, D23, D13, D12, G23, G13, G12): S_ii = sum_j D_ij E_jj, S_ij = 2 G_ij E_ij.
     """
-    p, t = precision(dtype), tensors(dtype)
+    p, t = precision(dtype), tensor_functions(dtype)
     T, mat33, vec3 = p.T, p.mat33, p.vec3
     moduli9 = t.moduli9
     coef = wp.types.vector(length=NCOEF, dtype=T)
@@ -293,20 +292,20 @@ def orthotropic(dtype: str) -> _types.SimpleNamespace:
     @wp.func
     def energy(G: mat33, c: coef) -> T:
         """Psi = E : D : E / 2."""
-        E = t.green(G)
+        E = t.green_lagrange(G)
         return T(0.5) * wp.ddot(E, pk2_stress(E, c))
 
     @wp.func
     def stress(G: mat33, c: coef) -> mat33:
         """P = F S."""
-        S = pk2_stress(t.green(G), c)
+        S = pk2_stress(t.green_lagrange(G), c)
         return S + G * S
 
     @wp.func
     def increment(G: mat33, dG: mat33, c: coef) -> mat33:
         """dP = dF S + F dS."""
         F = t.identity() + G
-        return dG * pk2_stress(t.green(G), c) + F * pk2_stress(t.sym(wp.transpose(F) * dG), c)
+        return dG * pk2_stress(t.green_lagrange(G), c) + F * pk2_stress(t.sym(wp.transpose(F) * dG), c)
 
     @wp.func
     def block(G: mat33, a: vec3, c: coef) -> mat33:
@@ -341,6 +340,6 @@ DEFINED_FOR_ANY_J = ("svk", "orthotropic", "assumed_strain")
 """Laws defined for any F; the others need J > 0."""
 
 
-def law(name: str, dtype: str) -> _types.SimpleNamespace:
+def law_functions(name: str, dtype: str) -> _types.SimpleNamespace:
     """Device functions of the law `name` in one precision."""
     return LAWS[name](dtype)

@@ -14,15 +14,15 @@ from ..common.types import kernel_module, precision
 from . import materials
 from .points import point_functions
 
-__all__ = ["UNROLL", "matrix_kernels", "panels_of", "row_of", "rows_type", "stage_name"]
+__all__ = ["PANEL_UNROLL", "matrix_kernels", "panel_layout", "panel_row", "panel_row_type", "scheme_suffix"]
 
 MAX_PANEL_SLOTS = 8
 """Maximum number of slots of a panel: eight 64-bit numbers fill the widest vector registers."""
-UNROLL = 9
+PANEL_UNROLL = 9
 """`max_unroll` of modules that process panels: with the loops over components unrolled, those over slots vectorise."""
 
 
-def panels_of(slots: int) -> tuple[int, int, int]:
+def panel_layout(slots: int) -> tuple[int, int, int]:
     """Number of panels, slots per panel, and total rows: a panel has a row for each slot up to its last one."""
     panels = -(-slots // MAX_PANEL_SLOTS)
     width = -(-slots // panels)
@@ -30,17 +30,17 @@ def panels_of(slots: int) -> tuple[int, int, int]:
 
 
 @wp.func
-def row_of(panel: int, width: int, a: int) -> int:
+def panel_row(panel: int, width: int, a: int) -> int:
     """Row of an element's matrix with K_ab of slot a for the slots b of a panel, `width` slots wide."""
     return width * ((panel * (panel + 1)) / 2) + a
 
 
-def rows_type(dtype: str, slots: int):
+def panel_row_type(dtype: str, slots: int):
     """Type of a row: component (i, j) of K_ab at [3 i + j, b], for the `slots` slots b of a panel."""
     return wp.types.matrix(shape=(9, slots), dtype=precision(dtype).T)
 
 
-def stage_name(midpoint: bool, dissipative: bool) -> str:
+def scheme_suffix(midpoint: bool, dissipative: bool) -> str:
     """Module name suffix of a midpoint scheme."""
     return "_dissipative" if dissipative else "_midpoint" if midpoint else ""
 
@@ -56,18 +56,18 @@ def matrix_kernels(
     midpoint: bool = False,
     dissipative: bool = False,
 ) -> _types.SimpleNamespace:
-    """Kernels `prepare_matrix`, `element_matrix` and `element_rows` of one kind of element block (see element.py)."""
+    """Kernels `prepare_matrix`, `element_matrix`, `element_matrix_panels`; arguments as those of `element_kernels`."""
     fn = point_functions(dtype, law, slots, affine, damping, framed, midpoint, dissipative)
     T, vec3, mat33, sym6 = fn.types.T, fn.types.vec3, fn.types.mat33, fn.types.sym
     t, m, Block, Local, coef = fn.tensors, fn.law, fn.Block, fn.Local, fn.coef
     NS, needs_J = fn.slots, fn.needs_J
-    ETA, LAMBDA_V = materials.ETA, materials.LAMBDA_V
+    ETA_INDEX, LAMBDA_V_INDEX = materials.ETA_INDEX, materials.LAMBDA_V_INDEX
     form = "affine" if affine else "framed" if framed else "table"
-    name = f"element_{dtype}_{law}_{slots}_{form}_{damping}{stage_name(midpoint, dissipative)}"
+    name = f"element_{dtype}_{law}_{slots}_{form}_{damping}{scheme_suffix(midpoint, dissipative)}"
     module = kernel_module(f"{name}_matrix", max_unroll=16)
-    rows_module = kernel_module(f"{name}_rows", max_unroll=UNROLL)
-    PANELS, P, _ = panels_of(NS)
-    Rows = rows_type(dtype, P)
+    rows_module = kernel_module(f"{name}_rows", max_unroll=PANEL_UNROLL)
+    PANELS, P, _ = panel_layout(NS)
+    Rows = panel_row_type(dtype, P)
     Slots = wp.types.matrix(shape=(3 * PANELS, P), dtype=T)
     Tensor = wp.types.matrix(shape=(9, 9), dtype=T)
     moduli9 = t.moduli9
@@ -91,59 +91,59 @@ def matrix_kernels(
         """F with columns along the law's axes, and the second Piola-Kirchhoff stress S there, Pa.
 
         `form` 0: S with its viscous part; 1: without it, and with compression removed. For laws that need J > 0, S is
-        the viscous part alone; their elastic tangent comes entirely from `increment` or `spd_tangent`. `use_prediction`
-        1: S is that of the linear prediction (mixed integration points, Magisano, Leonetti and Garcea 2017), `step` the
-        last change of the slots, m; see `predicted_stress`. `use_prediction` 2: without compression, as with `form` 1,
-        but with the viscous part.
+        the viscous part alone; their elastic tangent comes entirely from `increment` or `spd_increment`.
+        `use_prediction` 1: S is that of the linear prediction (mixed integration points, Magisano, Leonetti and Garcea
+        2017), `step` the last change of the slots, m; see `predicted_stress_change`. `use_prediction` 2: without
+        compression, as with `form` 1, but with the viscous part.
         """
-        G = fn.gradient_of(block, U, point, elem)
+        G = fn.field_gradient(block, U, point, elem)
         local = fn.to_material_axes(block, G, point, elem)
         F = t.identity() + G
         S = mat33()
         if wp.static(midpoint):
             if form == 0:
-                S = fn.step_stress(block, local, fn.velocity_gradient(block, V, point, elem), c)
+                S = fn.midpoint_stress(block, local, fn.velocity_gradient(block, V, point, elem), c)
         if wp.static(not needs_J):
             if wp.static(midpoint):
                 if form == 1:
-                    S = m.pk2_stress(t.green(local), c)
+                    S = m.pk2_stress(t.green_lagrange(local), c)
                     S += fn.max_compression(S) * t.identity()
             else:
-                S = m.pk2_stress(t.green(local), c)
+                S = m.pk2_stress(t.green_lagrange(local), c)
                 if form == 1:
                     S += fn.max_compression(S) * t.identity()
         if wp.static(damping == "incremental" or damping == "rate"):
             if form == 0:
                 Fdot = fn.velocity_gradient(block, V, point, elem)
                 rate = fn.strain_rate(block, local, Fdot, history, T(dq_dv), world, point, elem)
-                S += t.isotropic(rate, c[LAMBDA_V], c[ETA])
+                S += t.isotropic_stress(rate, c[LAMBDA_V_INDEX], c[ETA_INDEX])
         if use_prediction == 2 and form == 0:
             S += fn.max_compression(S) * t.identity()
         elif use_prediction == 1 and form == 0:
-            ahead = fn.to_material_axes(block, fn.gradient_of(block, step, point, elem), point, elem)
-            S += fn.predicted_stress(local, ahead, c, T(dq_dv))
+            ahead = fn.to_material_axes(block, fn.field_gradient(block, step, point, elem), point, elem)
+            S += fn.predicted_stress_change(local, ahead, c, T(dq_dv))
         if wp.static(framed):
-            F = F * block.frame[point, elem]
+            F = F * block.material_axes[point, elem]
         return F, S
 
     @wp.func
-    def elastic(block: Block, F: mat33, dF: mat33, c: coef) -> mat33:
+    def elastic_increment(block: Block, F: mat33, dF: mat33, c: coef) -> mat33:
         """dP of a law that needs J > 0; `midpoint`: without the part of S, given by `point_state`."""
         if wp.static(midpoint):
-            return F * fn.step_increment(block, F - t.identity(), t.sym(wp.transpose(F) * dF), c)
+            return F * fn.midpoint_stress_increment(block, F - t.identity(), t.sym(wp.transpose(F) * dF), c)
         else:
             return m.increment(F - t.identity(), dF, c)
 
     @wp.func
-    def velocities(block: Block, v: wp.array2d(dtype=vec3), world: int, elem: int) -> Local:
+    def load_velocities(block: Block, v: wp.array2d(dtype=vec3), world: int, elem: int) -> Local:
         """Velocities of an element's slots if needed by damping (form "rate") or `midpoint`, else zeros."""
         if wp.static(fn.uses_v):
-            return fn.load(block, v, world, elem)
+            return fn.load_slots(block, v, world, elem)
         else:
             return Local()
 
     @wp.func
-    def last_change(
+    def load_last_change(
         block: Block,
         v: wp.array2d(dtype=vec3),
         base: wp.array2d(dtype=vec3),
@@ -155,7 +155,7 @@ def matrix_kernels(
         """Change of an element's slots in the last iteration, m; zeros unless requested."""
         step = Local()
         if use_prediction == 1:
-            step = T(dq_dv) * (fn.load(block, v, world, elem) - fn.load(block, base, world, elem))
+            step = T(dq_dv) * (fn.load_slots(block, v, world, elem) - fn.load_slots(block, base, world, elem))
         return step
 
     @wp.kernel(module=module)
@@ -179,9 +179,9 @@ def matrix_kernels(
         world, point, elem = wp.tid()
         if active[world] == 0:
             return
-        U, V = fn.load(block, u, world, elem), velocities(block, v, world, elem)
+        U, V = fn.load_slots(block, u, world, elem), load_velocities(block, v, world, elem)
         c = fn.coefficients(block, world, elem)
-        step = last_change(block, v, base, use_prediction[world], dq_dv[world], world, elem)
+        step = load_last_change(block, v, base, use_prediction[world], dq_dv[world], world, elem)
         F, S = point_state(block, U, V, step, use_prediction[world], history, dq_dv[world], c, form, world, point, elem)
         for i in range(3):
             lines[world, 5 * point + i, elem] = F[i]
@@ -203,11 +203,11 @@ def matrix_kernels(
         """h of a slot at a point, along the law's axes, 1/m."""
         h = vec3()
         if wp.static(affine):
-            h = wp.transpose(fn.inverse_jacobian(block, elem)) * block.gradient[point, slot, 0]
+            h = wp.transpose(fn.inverse_jacobian(block, elem)) * block.shape_gradient[point, slot, 0]
         else:
-            h = block.gradient[point, slot, elem]
+            h = block.shape_gradient[point, slot, elem]
         if wp.static(framed):
-            h = wp.transpose(block.frame[point, elem]) * h
+            h = wp.transpose(block.material_axes[point, elem]) * h
         return h
 
     @wp.kernel(module=module)
@@ -225,7 +225,7 @@ def matrix_kernels(
 
         Args:
             form: 0: K. 1: positive semi-definite at each point: without compression and viscous stress in the
-                geometric part, and with `spd_tangent` for laws that need J > 0; a function of u alone.
+                geometric part, and with `spd_increment` for laws that need J > 0; a function of u alone.
             add: 1: add to `matrix`, which holds K of another part of the energy.
         """
         world, index = wp.tid()
@@ -240,7 +240,7 @@ def matrix_kernels(
         unit = vec3()
         unit[axis] = T(1.0)
         out = Local()
-        for point in range(block.gradient.shape[0]):
+        for point in range(block.shape_gradient.shape[0]):
             F, S = load_point(lines, world, point, elem)
             h = slot_gradient(block, point, b, elem)
             # dF = unit h^T, so that F^T dF is the outer product of a row of F and h
@@ -251,26 +251,26 @@ def matrix_kernels(
                 if wp.static(dissipative):
                     dS = fn.dissipation_factor(block) * dS
                 if wp.static(damping == "incremental" or damping == "rate"):
-                    dS += t.isotropic(B, cv[0], cv[1])
+                    dS += t.isotropic_stress(B, cv[0], cv[1])
                 dP += F * dS
             else:
                 if wp.static(damping == "incremental" or damping == "rate"):
-                    dP += F * t.isotropic(B, cv[0], cv[1])
+                    dP += F * t.isotropic_stress(B, cv[0], cv[1])
                 if form == 1 or use_prediction[world] == 2:
-                    dP += fn.spd_tangent(F, wp.outer(unit, h), c)
+                    dP += fn.spd_increment(F, wp.outer(unit, h), c)
                 else:
-                    dP += elastic(block, F, wp.outer(unit, h), c)
+                    dP += elastic_increment(block, F, wp.outer(unit, h), c)
             if wp.static(framed):
-                dP = dP * wp.transpose(block.frame[point, elem])
+                dP = dP * wp.transpose(block.material_axes[point, elem])
             dP = fn.tangent_weight(block, point, elem) * dP
             if wp.static(affine):
                 dP = dP * wp.transpose(fn.inverse_jacobian(block, elem))
             for a in range(NS):
                 if a <= b:
                     if wp.static(affine):
-                        out[a] = out[a] + dP * block.gradient[point, a, 0]
+                        out[a] = out[a] + dP * block.shape_gradient[point, a, 0]
                     else:
-                        out[a] = out[a] + dP * block.gradient[point, a, elem]
+                        out[a] = out[a] + dP * block.shape_gradient[point, a, elem]
         for a in range(NS):
             if a <= b:
                 pair = a * NS - (a * (a - 1)) / 2 + b - a
@@ -279,7 +279,7 @@ def matrix_kernels(
                 matrix[world, 3 * pair + axis, elem] = out[a]
 
     @wp.func
-    def elasticity(block: Block, F: mat33, S: mat33, moduli: moduli9, c: coef, positive: bool, w: T) -> Tensor:
+    def elasticity_tensor(block: Block, F: mat33, S: mat33, moduli: moduli9, c: coef, positive: bool, w: T) -> Tensor:
         """w dP_ik/dF_jl at [3 i + k, 3 j + l]: of S, of stresses linear in E (`moduli`), and of laws that need J > 0.
 
         With the shear moduli G and the other moduli D of `moduli`, the first two give S_kl delta_ij + D_kl F_ik F_jl +
@@ -313,9 +313,9 @@ def matrix_kernels(
                     dF[j, l] = w
                     dP = mat33()
                     if positive:
-                        dP = fn.spd_tangent(F, dF, c)
+                        dP = fn.spd_increment(F, dF, c)
                     else:
-                        dP = elastic(block, F, dF, c)
+                        dP = elastic_increment(block, F, dF, c)
                     for i in range(3):
                         for k in range(3):
                             A[3 * i + k, 3 * j + l] = A[3 * i + k, 3 * j + l] + dP[i, k]
@@ -335,7 +335,7 @@ def matrix_kernels(
         return moduli
 
     @wp.kernel(module=rows_module)
-    def element_rows(
+    def element_matrix_panels(
         block: Block,
         u: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
@@ -353,7 +353,7 @@ def matrix_kernels(
         A is dP/dF at a point; the rows of D, over b, are A : (e_j h_b^T) of a panel, and K_ab = h_a . D_b.
 
         Args:
-            matrix: [world, elem, row_of(panel, a)], K_ab over the slots b of a panel, see `rows_type`.
+            matrix: [world, elem, panel_row(panel, a)], K_ab over the slots b of a panel, see `panel_row_type`.
             form, add: see `element_matrix`; base, use_prediction: see `prepare_matrix`.
         """
         world, elem = wp.tid()
@@ -361,32 +361,32 @@ def matrix_kernels(
             return
         c = fn.coefficients(block, world, elem)
         moduli = tangent_moduli(block, c, dq_dv[world])
-        U, V = fn.load(block, u, world, elem), velocities(block, v, world, elem)
-        step = last_change(block, v, base, use_prediction[world], dq_dv[world], world, elem)
+        U, V = fn.load_slots(block, u, world, elem), load_velocities(block, v, world, elem)
+        step = load_last_change(block, v, base, use_prediction[world], dq_dv[world], world, elem)
         if add == 0:
             for k in range(matrix.shape[2]):
                 matrix[world, elem, k] = Rows()
         h, H = Local(), Slots()
-        for point in range(block.gradient.shape[0]):
+        for point in range(block.shape_gradient.shape[0]):
             F, S = point_state(
                 block, U, V, step, use_prediction[world], history, dq_dv[world], c, form, world, point, elem
             )
             into = t.identity()
             if wp.static(framed):
-                into = wp.transpose(block.frame[point, elem])
+                into = wp.transpose(block.material_axes[point, elem])
             if wp.static(affine):
                 into = into * wp.transpose(fn.inverse_jacobian(block, elem))
             for a in range(NS):
                 if wp.static(affine):
-                    h[a] = into * block.gradient[point, a, 0]
+                    h[a] = into * block.shape_gradient[point, a, 0]
                 elif wp.static(framed):
-                    h[a] = into * block.gradient[point, a, elem]
+                    h[a] = into * block.shape_gradient[point, a, elem]
                 else:
-                    h[a] = block.gradient[point, a, elem]
+                    h[a] = block.shape_gradient[point, a, elem]
                 for l in range(3):
                     H[3 * (a / P) + l, a % P] = h[a][l]
             w = fn.tangent_weight(block, point, elem)
-            A = elasticity(block, F, S, moduli, c, form == 1 or use_prediction[world] == 2, w)
+            A = elasticity_tensor(block, F, S, moduli, c, form == 1 or use_prediction[world] == 2, w)
             for panel in range((block.conn.shape[0] + P - 1) / P):  # PANELS, but not unrolled
                 D = Products()
                 for i in range(9):
@@ -398,7 +398,7 @@ def matrix_kernels(
                         )
                 for a in range(wp.min(NS, P * (panel + 1))):
                     g = h[a]
-                    row = row_of(panel, P, a)
+                    row = panel_row(panel, P, a)
                     R = matrix[world, elem, row]
                     for i in range(3):
                         for j in range(3):
@@ -407,5 +407,5 @@ def matrix_kernels(
                     matrix[world, elem, row] = R
 
     return _types.SimpleNamespace(
-        prepare_matrix=prepare_matrix, element_matrix=element_matrix, element_rows=element_rows
+        prepare_matrix=prepare_matrix, element_matrix=element_matrix, element_matrix_panels=element_matrix_panels
     )

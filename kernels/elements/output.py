@@ -23,7 +23,7 @@ def output_kernels(fn: _types.SimpleNamespace, name: str) -> _types.SimpleNamesp
     stress_module = kernel_module(f"{name}_stress")
     T, vec3, sym6 = fn.types.T, fn.types.vec3, fn.types.sym
     t, m, Block, Local = fn.tensors, fn.law, fn.Block, fn.Local
-    ETA, LAMBDA_V = materials.ETA, materials.LAMBDA_V
+    ETA_INDEX, LAMBDA_V_INDEX = materials.ETA_INDEX, materials.LAMBDA_V_INDEX
 
     @wp.kernel(module=history_module)
     def strain_history(
@@ -39,18 +39,20 @@ def output_kernels(fn: _types.SimpleNamespace, name: str) -> _types.SimpleNamesp
         world, elem = wp.tid()
         if active[world] == 0:
             return
-        U0 = fn.load(block, u0, world, elem)
-        for point in range(block.gradient.shape[0]):
-            E = T(a0[world]) * t.green(fn.to_material_axes(block, fn.gradient_of(block, U0, point, elem), point, elem))
+        U0 = fn.load_slots(block, u0, world, elem)
+        for point in range(block.shape_gradient.shape[0]):
+            E = T(a0[world]) * t.green_lagrange(
+                fn.to_material_axes(block, fn.field_gradient(block, U0, point, elem), point, elem)
+            )
             if a1[world] != wp.float64(0.0):
-                U1 = fn.load(block, u1, world, elem)
-                E = E - T(a1[world]) * t.green(
-                    fn.to_material_axes(block, fn.gradient_of(block, U1, point, elem), point, elem)
+                U1 = fn.load_slots(block, u1, world, elem)
+                E = E - T(a1[world]) * t.green_lagrange(
+                    fn.to_material_axes(block, fn.field_gradient(block, U1, point, elem), point, elem)
                 )
             history[world, fn.history_index(block, point, elem)] = fn.to_voigt(E)
 
     @wp.kernel(module=moving_module)
-    def moving_history(
+    def strain_history_with_velocity(
         block: Block,
         u: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
@@ -65,17 +67,17 @@ def output_kernels(fn: _types.SimpleNamespace, name: str) -> _types.SimpleNamesp
         world, elem = wp.tid()
         if active[world] == 0:
             return
-        U = fn.load(block, u, world, elem)
-        V = fn.load(block, v, world, elem)
-        A = fn.load(block, a, world, elem)
-        for point in range(block.gradient.shape[0]):
-            G = fn.to_material_axes(block, fn.gradient_of(block, U, point, elem), point, elem)
-            D = fn.to_material_axes(block, fn.gradient_of(block, V, point, elem), point, elem)
+        U = fn.load_slots(block, u, world, elem)
+        V = fn.load_slots(block, v, world, elem)
+        A = fn.load_slots(block, a, world, elem)
+        for point in range(block.shape_gradient.shape[0]):
+            G = fn.to_material_axes(block, fn.field_gradient(block, U, point, elem), point, elem)
+            D = fn.to_material_axes(block, fn.field_gradient(block, V, point, elem), point, elem)
             F = wp.transpose(t.identity() + G)
             bend = wp.transpose(D) * D + F * fn.to_material_axes(
-                block, fn.gradient_of(block, A, point, elem), point, elem
+                block, fn.field_gradient(block, A, point, elem), point, elem
             )
-            E = t.green(G) + T(b[world]) * t.sym(F * D) + T(q_a[world]) * t.sym(bend)
+            E = t.green_lagrange(G) + T(b[world]) * t.sym(F * D) + T(q_a[world]) * t.sym(bend)
             history[world, fn.history_index(block, point, elem)] = fn.to_voigt(E)
 
     @wp.kernel(module=viscous_module)
@@ -92,18 +94,18 @@ def output_kernels(fn: _types.SimpleNamespace, name: str) -> _types.SimpleNamesp
         if active[world] == 0:
             return
         c = fn.coefficients(block, world, elem)
-        U = fn.load(block, u, world, elem)
-        V = fn.load(block, v, world, elem)
+        U = fn.load_slots(block, u, world, elem)
+        V = fn.load_slots(block, v, world, elem)
         f = Local()
         rate_of_work = T(0.0)
-        for point in range(block.gradient.shape[0]):
-            G = fn.gradient_of(block, U, point, elem)
+        for point in range(block.shape_gradient.shape[0]):
+            G = fn.field_gradient(block, U, point, elem)
             F = t.identity() + G
-            rate = t.sym(wp.transpose(F) * fn.gradient_of(block, V, point, elem))
-            S = t.isotropic(rate, c[LAMBDA_V], c[ETA])
-            rate_of_work += fn.weight_of(block, point, elem) * wp.ddot(S, rate)
-            f = fn.scatter(block, f, F * S, point, elem)
-        fn.store(block, f, world, elem, contribution)
+            rate = t.sym(wp.transpose(F) * fn.field_gradient(block, V, point, elem))
+            S = t.isotropic_stress(rate, c[LAMBDA_V_INDEX], c[ETA_INDEX])
+            rate_of_work += fn.point_weight(block, point, elem) * wp.ddot(S, rate)
+            f = fn.add_point_forces(block, f, F * S, point, elem)
+        fn.store_forces(block, f, world, elem, contribution)
         power[world, block.element_offset + elem] = wp.float64(rate_of_work)
 
     @wp.kernel(module=stress_module)
@@ -116,15 +118,15 @@ def output_kernels(fn: _types.SimpleNamespace, name: str) -> _types.SimpleNamesp
         """Cauchy stress P F^T / J (Pa, elastic part, Voigt order) and J at the points, [world, point, elem]."""
         world, elem = wp.tid()
         c = fn.coefficients(block, world, elem)
-        U = fn.load(block, u, world, elem)
-        for point in range(block.gradient.shape[0]):
-            G = fn.gradient_of(block, U, point, elem)
+        U = fn.load_slots(block, u, world, elem)
+        for point in range(block.shape_gradient.shape[0]):
+            G = fn.field_gradient(block, U, point, elem)
             J = T(1.0) + t.volume_change(G)
             P = fn.to_body_axes(block, m.stress(fn.to_material_axes(block, G, point, elem), c), point, elem)
             stress[world, point, elem] = fn.to_voigt((T(1.0) / J) * (P + P * wp.transpose(G)))
             jacobian[world, point, elem] = J
 
     return _types.SimpleNamespace(
-        strain_history=strain_history, moving_history=moving_history, viscous_force=viscous_force,
-        point_stress=point_stress,
+        strain_history=strain_history, strain_history_with_velocity=strain_history_with_velocity,
+        viscous_force=viscous_force, point_stress=point_stress,
     )  # fmt: skip

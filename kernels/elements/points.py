@@ -12,7 +12,7 @@ import warp as wp
 
 from ..common.types import precision
 from . import materials
-from .element_slots import load_functions, local_type
+from .element_slots import slot_access_functions, slot_values_type
 from .energy_momentum import energy_momentum_law
 
 __all__ = ["block_struct", "point_functions"]
@@ -28,21 +28,22 @@ def block_struct(dtype: str, dissipative: bool = False):
     class ElementBlock:
         conn: wp.array2d(dtype=wp.int32)  # [local, elem] slot
         is_position: wp.array(dtype=T)  # [local] 1 for a position slot, 0 for a gradient slot
-        gradient: wp.array3d(dtype=vec3)  # [point, local, elem] h_i; affine: [point, local, 0] parent gradient
-        vertex_gradient: wp.array3d(dtype=vec3)  # h_i at the vertices, where J is tested for laws that need J > 0
+        shape_gradient: wp.array3d(dtype=vec3)  # [point, local, elem] h_i; affine: [point, local, 0] parent gradient
+        vertex_shape_gradient: wp.array3d(dtype=vec3)  # h_i at the vertices, where J is tested for laws that need J > 0
         shape: wp.array3d(dtype=T)  # [point, local, elem or 0] s_i at the points of the mass rule (field loads)
-        field_weight: wp.array2d(dtype=T)  # [point, elem] rho w at those points
+        mass_weight: wp.array2d(dtype=T)  # [point, elem] rho w at those points, kg
         J0_inv: wp.array2d(dtype=T)  # [3 row + column, elem], affine only
-        weight: wp.array2d(dtype=T)  # [point, elem] W det J0; affine: [point, 0] W
+        quadrature_weight: wp.array2d(dtype=T)  # [point, elem] W det J0; affine: [point, 0] W
         det_J0: wp.array(dtype=T)  # [elem], affine only
-        mass: wp.array2d(dtype=T)  # [local, local] int s_i s_j over the parent; affine only
-        density: wp.array2d(
-            dtype=T
-        )  # [world or 0, elem] rho det J0, kg; affine only, with a density constant in each element
-        material: wp.array(dtype=wp.int32)  # [elem]
+        parent_mass: wp.array2d(dtype=T)  # [local, local] int s_i s_j over the parent; affine only
+        # [world or 0, elem] rho det J0, kg; affine only, with a density constant in each element
+        density_det_J0: wp.array2d(dtype=T)
+        material: wp.array(dtype=wp.int32)  # [elem] row of `coefficients`
         coefficients: wp.array3d(dtype=T)  # [world or 0, material, NCOEF]
-        frame: wp.array2d(dtype=mat33)  # [point, elem] axes of the law, framed blocks only
-        contribution_offset: wp.int32  # of the block among the contributions, elements and histories of all blocks
+        material_axes: wp.array2d(dtype=mat33)  # [point, elem] axes of the law, framed blocks only
+        contribution_offset: (
+            wp.int32
+        )  # first entry of the block among the contributions, elements, histories of all blocks
         element_offset: wp.int32
         history_offset: wp.int32
         count: wp.int32  # elements
@@ -72,17 +73,17 @@ def point_functions(
     """
     p = precision(dtype)
     T, mat33, sym6 = p.T, p.mat33, p.sym
-    t = materials.tensors(dtype)
-    m = materials.law(law, dtype)
+    t = materials.tensor_functions(dtype)
+    m = materials.law_functions(law, dtype)
     mean = energy_momentum_law(law, dtype)
     uses_v = midpoint or damping == "rate"
     Block = block_struct(dtype, dissipative)
     NCOEF = materials.NCOEF
     coef = wp.types.vector(length=NCOEF, dtype=T)
-    Local = local_type(dtype, slots)
-    load, store = load_functions(dtype, slots, Block)
+    Local = slot_values_type(dtype, slots)
+    load_slots, store_forces = slot_access_functions(dtype, slots, Block)
     NS, needs_J = slots, law not in materials.DEFINED_FOR_ANY_J
-    ETA, LAMBDA_V = materials.ETA, materials.LAMBDA_V
+    ETA_INDEX, LAMBDA_V_INDEX = materials.ETA_INDEX, materials.LAMBDA_V_INDEX
 
     @wp.func
     def coefficients(block: Block, world: int, elem: int) -> coef:
@@ -98,8 +99,8 @@ def point_functions(
     def damping_coefficients(c: coef, scale: T) -> coef:
         """scale (lambda_v, eta) as the coefficients (lambda, mu) of `materials.svk`, whose form Eq. (62) has."""
         d = coef()
-        d[0] = c[LAMBDA_V] * scale
-        d[1] = c[ETA] * scale
+        d[0] = c[LAMBDA_V_INDEX] * scale
+        d[1] = c[ETA_INDEX] * scale
         return d
 
     @wp.func
@@ -112,46 +113,46 @@ def point_functions(
         )  # fmt: skip
 
     @wp.func
-    def gradient_of(block: Block, U: Local, point: int, elem: int) -> mat33:
+    def field_gradient(block: Block, U: Local, point: int, elem: int) -> mat33:
         """sum_i u_i h_i^T at a point, Eq. (1): F - I of displacements, Fdot of velocities."""
         D = mat33()
         for i in range(NS):
             if wp.static(affine):
-                D += wp.outer(U[i], block.gradient[point, i, 0])
+                D += wp.outer(U[i], block.shape_gradient[point, i, 0])
             else:
-                D += wp.outer(U[i], block.gradient[point, i, elem])
+                D += wp.outer(U[i], block.shape_gradient[point, i, elem])
         if wp.static(affine):
             D = D * inverse_jacobian(block, elem)
         return D
 
     @wp.func
-    def weight_of(block: Block, point: int, elem: int) -> T:
+    def point_weight(block: Block, point: int, elem: int) -> T:
         """w = W_q det J0 of a quadrature point, Eq. (11): its volume, m^3."""
         if wp.static(affine):
-            return block.weight[point, 0] * block.det_J0[elem]
+            return block.quadrature_weight[point, 0] * block.det_J0[elem]
         else:
-            return block.weight[point, elem]
+            return block.quadrature_weight[point, elem]
 
     @wp.func
     def tangent_weight(block: Block, point: int, elem: int) -> T:
         """w of a point in K; `midpoint`: half of it, as midpoint values move by half of the end's change."""
         if wp.static(midpoint):
-            return T(0.5) * weight_of(block, point, elem)
+            return T(0.5) * point_weight(block, point, elem)
         else:
-            return weight_of(block, point, elem)
+            return point_weight(block, point, elem)
 
     @wp.func
-    def scatter(block: Block, f: Local, P: mat33, point: int, elem: int) -> Local:
+    def add_point_forces(block: Block, f: Local, P: mat33, point: int, elem: int) -> Local:
         """f_i += w P h_i: contribution of a point to the forces of Eq. (32)."""
-        Q = weight_of(block, point, elem) * P
+        Q = point_weight(block, point, elem) * P
         if wp.static(affine):
             Q = Q * wp.transpose(inverse_jacobian(block, elem))
         out = f
         for i in range(NS):
             if wp.static(affine):
-                out[i] = out[i] + Q * block.gradient[point, i, 0]
+                out[i] = out[i] + Q * block.shape_gradient[point, i, 0]
             else:
-                out[i] = out[i] + Q * block.gradient[point, i, elem]
+                out[i] = out[i] + Q * block.shape_gradient[point, i, elem]
         return out
 
     @wp.func
@@ -168,7 +169,7 @@ def point_functions(
     def to_material_axes(block: Block, A: mat33, point: int, elem: int) -> mat33:
         """R^T A R: from the body's axes into those of the law, if framed."""
         if wp.static(framed):
-            R = block.frame[point, elem]
+            R = block.material_axes[point, elem]
             return wp.transpose(R) * A * R
         else:
             return A
@@ -177,7 +178,7 @@ def point_functions(
     def to_body_axes(block: Block, A: mat33, point: int, elem: int) -> mat33:
         """R A R^T: from the law's axes into those of the body, if framed."""
         if wp.static(framed):
-            R = block.frame[point, elem]
+            R = block.material_axes[point, elem]
             return R * A * wp.transpose(R)
         else:
             return A
@@ -191,7 +192,7 @@ def point_functions(
     def velocity_gradient(block: Block, V: Local, point: int, elem: int) -> mat33:
         """Fdot in the law's axes (1/s) for damping of the form "rate", Eq. (60); `midpoint`: half of dF; else zero."""
         if wp.static(uses_v):
-            return to_material_axes(block, gradient_of(block, V, point, elem), point, elem)
+            return to_material_axes(block, field_gradient(block, V, point, elem), point, elem)
         else:
             return mat33()
 
@@ -206,7 +207,7 @@ def point_functions(
         """
         if wp.static(damping == "incremental"):
             past = from_voigt(history[world, history_index(block, point, elem)])
-            return (T(1.0) / dq) * (t.green(G) - past)
+            return (T(1.0) / dq) * (t.green_lagrange(G) - past)
         elif wp.static(midpoint):
             return (T(1.0) / dq) * t.sym(Fdot + wp.transpose(G) * Fdot)
         else:
@@ -216,41 +217,41 @@ def point_functions(
     def vertex_jacobian(block: Block, U: Local, elem: int) -> T:
         """Smallest J at the vertices of an element, which lie outside the hull of its quadrature points."""
         J = T(1.0e30)
-        for vertex in range(block.vertex_gradient.shape[0]):
+        for vertex in range(block.vertex_shape_gradient.shape[0]):
             D = mat33()
             for i in range(NS):
                 if wp.static(affine):
-                    D += wp.outer(U[i], block.vertex_gradient[vertex, i, 0])
+                    D += wp.outer(U[i], block.vertex_shape_gradient[vertex, i, 0])
                 else:
-                    D += wp.outer(U[i], block.vertex_gradient[vertex, i, elem])
+                    D += wp.outer(U[i], block.vertex_shape_gradient[vertex, i, elem])
             if wp.static(affine):
                 D = D * inverse_jacobian(block, elem)
             J = wp.min(J, T(1.0) + t.volume_change(D))
         return J
 
     @wp.func
-    def step_stress(block: Block, G: mat33, D: mat33, c: coef) -> mat33:
+    def midpoint_stress(block: Block, G: mat33, D: mat33, c: coef) -> mat33:
         """S of a midpoint step, Pa: that of kernels/elements/energy_momentum.py with its dissipation."""
         S = mean.mean_stress(G, D, c)
         if wp.static(dissipative):
-            S += block.dissipation * mean.rest_increment(t.sym(D + wp.transpose(G) * D), c)
+            S += block.dissipation * mean.rest_moduli_increment(t.sym(D + wp.transpose(G) * D), c)
         return S
 
     @wp.func
-    def step_increment(block: Block, G: mat33, dE: mat33, c: coef) -> mat33:
+    def midpoint_stress_increment(block: Block, G: mat33, dE: mat33, c: coef) -> mat33:
         """Twice the change of S of a midpoint step, Pa, by a change dE of the strain at its end."""
         dS = mean.mean_increment(G, dE, c)
         if wp.static(dissipative):
-            dS += block.dissipation * mean.rest_increment(dE, c)
+            dS += block.dissipation * mean.rest_moduli_increment(dE, c)
         return dS
 
     @wp.func
-    def start_stress(G: mat33, c: coef) -> mat33:
+    def step_start_stress(G: mat33, c: coef) -> mat33:
         """S at the start of a midpoint step, Pa; G is the displacement gradient there."""
         if wp.static(needs_J):
             return t.sym(wp.inverse(t.identity() + G) * m.stress(G, c))
         else:
-            return m.pk2_stress(t.green(G), c)
+            return m.pk2_stress(t.green_lagrange(G), c)
 
     @wp.func
     def dissipation_factor(block: Block) -> T:
@@ -261,7 +262,7 @@ def point_functions(
             return T(1.0)
 
     @wp.func
-    def predicted_stress(G: mat33, dG: mat33, c: coef, dq: T) -> mat33:
+    def predicted_stress_change(G: mat33, dG: mat33, c: coef, dq: T) -> mat33:
         """Linear prediction of S from the previous iterate, G - dG, minus S at G, Pa; both in the law's axes.
 
         For stresses linear in E it is -C : (dG^T dG)/2, the neglected second-order strain; for other laws S + dS - S(G)
@@ -276,7 +277,9 @@ def point_functions(
         else:
             change = -m.pk2_stress(T(0.5) * wp.transpose(dG) * dG, c)
         if wp.static(damping == "incremental"):
-            change = change - t.isotropic(T(0.5) * wp.transpose(dG) * dG, c[LAMBDA_V] / dq, c[ETA] / dq)
+            change = change - t.isotropic_stress(
+                T(0.5) * wp.transpose(dG) * dG, c[LAMBDA_V_INDEX] / dq, c[ETA_INDEX] / dq
+            )
         return change
 
     @wp.func
@@ -288,7 +291,7 @@ def point_functions(
         return low
 
     @wp.func
-    def spd_tangent(F: mat33, dF: mat33, c: coef) -> mat33:
+    def spd_increment(F: mat33, dF: mat33, c: coef) -> mat33:
         """Positive definite dP for laws with an indefinite tangent far from rest: A C0 : sym(A^T dF).
 
         C0 is the stiffness at rest, with c = (mu10, k, mu01), mu = 2 (mu10 + mu01) and lambda = k - 2 mu / 3; A is F
@@ -296,7 +299,7 @@ def point_functions(
         """
         A = wp.sqrt(T(3.0) / wp.ddot(F, F)) * F
         mu = T(2.0) * (c[0] + c[2])
-        return A * t.isotropic(t.sym(wp.transpose(A) * dF), wp.max(c[1] - mu * T(2.0) / T(3.0), T(0.0)), mu)
+        return A * t.isotropic_stress(t.sym(wp.transpose(A) * dF), wp.max(c[1] - mu * T(2.0) / T(3.0), T(0.0)), mu)
 
     @wp.func
     def point_increment(
@@ -325,16 +328,18 @@ def point_functions(
             F = t.identity() + local
             S = mat33()
             if form == 2:
-                S = start_stress(local - Fdot, c)
+                S = step_start_stress(local - Fdot, c)
             else:
-                S = step_stress(block, local, Fdot, c)
-            dP = change * S + F * step_increment(block, local, t.sym(wp.transpose(along) * change), c)
+                S = midpoint_stress(block, local, Fdot, c)
+            dP = change * S + F * midpoint_stress_increment(block, local, t.sym(wp.transpose(along) * change), c)
         else:
             dP = m.increment(local, change, c)
         if wp.static(damping == "incremental" or damping == "rate"):
             F = t.identity() + local
-            S = t.isotropic(strain_rate(block, local, Fdot, history, dq, world, point, elem), c[LAMBDA_V], c[ETA])
-            dS = t.isotropic(t.sym(wp.transpose(along) * change), c[LAMBDA_V] / dq, c[ETA] / dq)
+            S = t.isotropic_stress(
+                strain_rate(block, local, Fdot, history, dq, world, point, elem), c[LAMBDA_V_INDEX], c[ETA_INDEX]
+            )
+            dS = t.isotropic_stress(t.sym(wp.transpose(along) * change), c[LAMBDA_V_INDEX] / dq, c[ETA_INDEX] / dq)
             if wp.static(midpoint):
                 if form == 2:
                     S = mat33()
@@ -361,23 +366,24 @@ def point_functions(
         """
         c = coefficients(block, world, elem)
         f = Local()
-        for point in range(block.gradient.shape[0]):
-            G = gradient_of(block, U, point, elem)
-            dG = gradient_of(block, dU, point, elem)
+        for point in range(block.shape_gradient.shape[0]):
+            G = field_gradient(block, U, point, elem)
+            dG = field_gradient(block, dU, point, elem)
             Fdot = velocity_gradient(block, V, point, elem)
             dP = point_increment(block, G, dG, Fdot, history, c, dq, form, world, point, elem)
-            f = scatter(block, f, dP, point, elem)
+            f = add_point_forces(block, f, dP, point, elem)
         return f
 
     return _types.SimpleNamespace(
         types=p, tensors=t, law=m, Block=Block, Local=Local, coef=coef, slots=slots, affine=affine, damping=damping,
         framed=framed, needs_J=needs_J, midpoint=midpoint, uses_v=uses_v, mean=mean, tangent_weight=tangent_weight,
-        coefficients=coefficients, damping_coefficients=damping_coefficients, load=load, store=store,
-        inverse_jacobian=inverse_jacobian, gradient_of=gradient_of,
-        weight_of=weight_of, scatter=scatter, to_voigt=to_voigt, from_voigt=from_voigt,
+        coefficients=coefficients, damping_coefficients=damping_coefficients, load_slots=load_slots,
+        store_forces=store_forces, inverse_jacobian=inverse_jacobian, field_gradient=field_gradient,
+        point_weight=point_weight, add_point_forces=add_point_forces, to_voigt=to_voigt, from_voigt=from_voigt,
         to_material_axes=to_material_axes, to_body_axes=to_body_axes, history_index=history_index,
         velocity_gradient=velocity_gradient, strain_rate=strain_rate, vertex_jacobian=vertex_jacobian,
-        point_increment=point_increment, predicted_stress=predicted_stress, max_compression=max_compression,
-        spd_tangent=spd_tangent, step_stress=step_stress, step_increment=step_increment,
-        dissipation_factor=dissipation_factor, tangent_force=tangent_force,
+        point_increment=point_increment, predicted_stress_change=predicted_stress_change,
+        max_compression=max_compression, spd_increment=spd_increment, midpoint_stress=midpoint_stress,
+        midpoint_stress_increment=midpoint_stress_increment, dissipation_factor=dissipation_factor,
+        tangent_force=tangent_force,
     )  # fmt: skip

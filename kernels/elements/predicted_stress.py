@@ -1,4 +1,4 @@
-"""K p with the stress of the linear prediction in its geometric part, without a matrix; see `predicted_stress`."""
+"""K p with the stress of the linear prediction in its geometric part, without a matrix: `predicted_stress_change`."""
 
 import functools
 import types as _types
@@ -40,27 +40,27 @@ def predicted_stress_product(dtype: str, law: str, slots: int, affine: bool, fra
             return
         c = fn.coefficients(block, world, elem)
         dq = T(dq_dv[world])
-        U = fn.load(block, u, world, elem)
-        P = fn.load(block, direction, world, elem)
+        U = fn.load_slots(block, u, world, elem)
+        P = fn.load_slots(block, direction, world, elem)
         step = fn.Local()
         if use_prediction[world] == 1:
-            step = dq * (fn.load(block, v, world, elem) - fn.load(block, base, world, elem))
+            step = dq * (fn.load_slots(block, v, world, elem) - fn.load_slots(block, base, world, elem))
         f = fn.Local()
-        for point in range(block.gradient.shape[0]):
-            G = fn.gradient_of(block, U, point, elem)
-            dG = fn.gradient_of(block, P, point, elem)
+        for point in range(block.shape_gradient.shape[0]):
+            G = fn.field_gradient(block, U, point, elem)
+            dG = fn.field_gradient(block, P, point, elem)
             dP = fn.point_increment(block, G, dG, mat33(), history, c, dq, 0, world, point, elem)
             local = fn.to_material_axes(block, G, point, elem)
             if use_prediction[world] == 1:
-                ahead = fn.to_material_axes(block, fn.gradient_of(block, step, point, elem), point, elem)
-                dP += dG * fn.to_body_axes(block, fn.predicted_stress(local, ahead, c, dq), point, elem)
+                ahead = fn.to_material_axes(block, fn.field_gradient(block, step, point, elem), point, elem)
+                dP += dG * fn.to_body_axes(block, fn.predicted_stress_change(local, ahead, c, dq), point, elem)
             elif use_prediction[world] == 2:
                 if wp.static(fn.needs_J):
                     change = fn.to_material_axes(block, dG, point, elem)
-                    dP = fn.to_body_axes(block, fn.spd_tangent(t.identity() + local, change, c), point, elem)
+                    dP = fn.to_body_axes(block, fn.spd_increment(t.identity() + local, change, c), point, elem)
                 else:
-                    dP += fn.max_compression(fn.law.pk2_stress(t.green(local), c)) * dG
-            f = fn.scatter(block, f, dP, point, elem)
-        fn.store(block, f, world, elem, contribution)
+                    dP += fn.max_compression(fn.law.pk2_stress(t.green_lagrange(local), c)) * dG
+            f = fn.add_point_forces(block, f, dP, point, elem)
+        fn.store_forces(block, f, world, elem, contribution)
 
     return product

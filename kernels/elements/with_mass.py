@@ -5,8 +5,8 @@ import functools
 import warp as wp
 
 from ..common.types import kernel_module
-from .element_clusters import DIRECTION, U, V, cluster_functions
-from .matrix import stage_name
+from .element_clusters import DIRECTION, DISPLACEMENT, VELOCITY, cluster_functions
+from .matrix import scheme_suffix
 from .points import point_functions
 from .vertex import vertex_product
 
@@ -43,7 +43,7 @@ def with_mass_kernel(
     Pool = shared.Pool
     # unrolled loops over slots keep them in registers; the loops over points are longer and stay loops
     form = "vertex" if vertex else "affine"
-    name = f"with_mass_{dtype}_{law}_{slots}_{points}_{form}_{damping}_{size}{stage_name(midpoint, dissipative)}"
+    name = f"with_mass_{dtype}_{law}_{slots}_{points}_{form}_{damping}_{size}{scheme_suffix(midpoint, dissipative)}"
     module = kernel_module(name, max_unroll=16, block_dim=size)
 
     if vertex:
@@ -51,7 +51,7 @@ def with_mass_kernel(
     else:
 
         @wp.func
-        def fetch_all(block: Block, pool: Pool, field: int, at: int) -> Local:
+        def fetch_slots(block: Block, pool: Pool, field: int, at: int) -> Local:
             """Slot values of an element; positions relative to the first slot, so that a translation has no strain."""
             out = Local()
             first = shared.fetch(pool, field, 0, at)
@@ -72,21 +72,21 @@ def with_mass_kernel(
             at: int,
         ):
             """Set the forces (scale M + dq K) p of element `at` of a cluster."""
-            u = fetch_all(block, pool, U, at)
-            du = fetch_all(block, pool, DIRECTION, at)
+            u = fetch_slots(block, pool, DISPLACEMENT, at)
+            du = fetch_slots(block, pool, DIRECTION, at)
             v = Local()
             if wp.static(fn.uses_v):
-                v = fetch_all(block, pool, V, at)
+                v = fetch_slots(block, pool, VELOCITY, at)
             f = fn.tangent_force(block, u, du, v, history, dq, form, world, elem)
             first = shared.fetch(pool, DIRECTION, 0, at)
             for i in range(NS):
                 a = vec3()
                 total = T(0.0)
                 for j in range(NS):
-                    a += block.mass[i, j] * du[j]
-                    total += block.mass[i, j]
+                    a += block.parent_mass[i, j] * du[j]
+                    total += block.parent_mass[i, j]
                 shared.set_force(pool, i, at, dq * f[i] + scale * (a + total * first))
 
     # for this kind the bound spills few registers (measured); for others the compiler chooses
     bounded = vertex and law == "svk" and damping is None and not midpoint
-    return shared.by_clusters(module, Block, product, bounded)
+    return shared.make_product_kernel(module, Block, product, bounded)

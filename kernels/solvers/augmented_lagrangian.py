@@ -6,29 +6,33 @@ import warp as wp
 
 from ..common.traits import Traits
 from .convergence import STALL_ROUNDINGS, convergence_functions
-from .newton_control import FAIL_CONSTRAINT, FAIL_ITERATIONS, control_struct
+from .newton_control import FAIL_CONSTRAINT, FAIL_ITERATIONS, ROW_FROZEN_CHANGE, control_struct
 
-__all__ = ["outer_kernels"]
+__all__ = ["outer_loop_kernels"]
 
-RESIDUAL_GROWTH = 3.0
-LOOSE_FORCING = 0.03
-"""Tolerance of linear solves if the residual grows by more than RESIDUAL_GROWTH when frozen quantities are updated."""
-UPDATE_RESIDUAL = 0.1
+RESIDUAL_GROWTH, LOOSE_FORCING = 3.0, 0.03
+"""If the residual grows by more than this factor when frozen quantities are updated, the next linear solve has at least
+this relative tolerance."""
+FROZEN_UPDATE_RESIDUAL = 0.1
 """Relative residual below which frozen quantities (friction limits) are updated at each iterate."""
 
 
-def outer_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
-    """Kernels in the module of Newton's method."""
+def outer_loop_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
+    """Kernels of the outer loop, in the module of Newton's method."""
     f64 = wp.float64
     Control = control_struct()
-    judging = convergence_functions(traits)
-    allowed_violation = judging.allowed_violation
-    objective, magnitude, largest_violation = judging.objective, judging.magnitude, judging.largest_violation
+    convergence = convergence_functions(traits)
+    allowed_violation = convergence.allowed_violation
+    objective, objective_magnitude, largest_violation = (
+        convergence.objective,
+        convergence.objective_magnitude,
+        convergence.largest_violation,
+    )
     evaluate_norms, check_convergence, record_residual, give_up = (
-        judging.evaluate_norms,
-        judging.check_convergence,
-        judging.record_residual,
-        judging.give_up,
+        convergence.evaluate_norms,
+        convergence.check_convergence,
+        convergence.record_residual,
+        convergence.give_up,
     )
 
     @wp.kernel(module=module)
@@ -42,7 +46,7 @@ def outer_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
             last = ctl.iterations[world] + 1 >= ctl.max_iterations
             # within round-off the residual may not fall further
             rounding = ctl.rounding_ratio[world] <= f64(STALL_ROUNDINGS)
-            if ctl.relative_residual[world] <= f64(UPDATE_RESIDUAL) or rounding or last:
+            if ctl.relative_residual[world] <= f64(FROZEN_UPDATE_RESIDUAL) or rounding or last:
                 flags[world] = 1
             else:
                 record_residual(ctl, world)
@@ -52,13 +56,13 @@ def outer_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
         """Re-evaluate the iterate of the flagged worlds with the updated frozen quantities."""
         world = wp.tid()
         if ctl.active[world] != 0 and flags[world] != 0:
-            before = ctl.norm[world]
+            before = ctl.residual_norm[world]
             evaluate_norms(ctl, world)
-            if ctl.fixed_forcing == 0 and ctl.norm[world] > f64(RESIDUAL_GROWTH) * before:
+            if ctl.fixed_forcing == 0 and ctl.residual_norm[world] > f64(RESIDUAL_GROWTH) * before:
                 # the frozen quantities were the larger error: tighter solves are wasted
                 ctl.forcing[world] = wp.max(ctl.forcing[world], f64(LOOSE_FORCING))
-            ctl.phi[world] = objective(ctl, world) + ctl.slot_sums[7, world]
-            ctl.phi_magnitude[world] = magnitude(ctl, world)
+            ctl.phi[world] = objective(ctl, world) + ctl.slot_sums[ROW_FROZEN_CHANGE, world]
+            ctl.phi_magnitude[world] = objective_magnitude(ctl, world)
             ctl.nonmonotone_steps[world] = 0
             ctl.frozen_updated[world] = 1 - ctl.unilateral_changed[world]
             ctl.unilateral_changed[world] = 0
@@ -80,10 +84,10 @@ def outer_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
             return
         if largest_violation(ctl, world) <= allowed_violation(ctl, world, tol):
             return
-        if ctl.outer[world] >= limit:
+        if ctl.multiplier_updates[world] >= limit:
             ctl.failed[world] = FAIL_CONSTRAINT
             return
-        ctl.outer[world] = ctl.outer[world] + 1
+        ctl.multiplier_updates[world] = ctl.multiplier_updates[world] + 1
         ctl.iterations[world] = 0
         ctl.inversion_suspected[world] = 0
         ctl.inverted[world] = 0
@@ -91,14 +95,14 @@ def outer_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
         ctl.trial_accepted[world] = 1
 
     @wp.kernel(module=module)
-    def free_step(ctl: Control):
+    def reset_step_limit(ctl: Control):
         """Reset the step limit to the full step."""
         world = wp.tid()
         if ctl.active[world] != 0:
             ctl.limit[world] = f64(1.0)
 
     return _types.SimpleNamespace(
-        free_step=free_step,
+        reset_step_limit=reset_step_limit,
         check_constraints=check_constraints,
         begin_frozen_update=begin_frozen_update,
         end_frozen_update=end_frozen_update,

@@ -12,14 +12,15 @@ import warp as wp
 from ..common.structs import pattern_struct
 from ..common.types import kernel_module, precision
 
-__all__ = ["BLOCK", "band_kernels", "column_type"]
+__all__ = ["BLOCK", "band_kernels", "block_column_type"]
 
 BLOCK = 4
+"""Rows and columns of a block."""
 SHIFT_GROWTH = 100.0
 """Growth factor of the diagonal shift after each failed factorisation."""
 
 
-def column_type(dtype: str):
+def block_column_type(dtype: str):
     """Type of a column of a block."""
     return wp.types.vector(length=BLOCK, dtype=precision(dtype).T)
 
@@ -30,16 +31,16 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
     p = precision(dtype)
     T, vec3, mat33 = p.T, p.vec3, p.mat33
     Pattern = pattern_struct()
-    Column = column_type(dtype)
+    Column = block_column_type(dtype)
     Block = wp.types.matrix(shape=(BLOCK, BLOCK), dtype=T)
     # a pivot below this fraction of its diagonal entry is round-off, or the matrix is indefinite there
-    NEGLIGIBLE = {"float64": 1.0e-14, "float32": 3.0e-7}[dtype]
+    NEGLIGIBLE_PIVOT = {"float64": 1.0e-14, "float32": 3.0e-7}[dtype]
     # first shift after such a pivot, as a fraction of the diagonal
     FIRST_SHIFT = {"float64": 1.0e-4, "float32": 1.0e-6}[dtype]
     module = kernel_module(f"band_{dtype}", max_unroll=BLOCK)
 
     @wp.kernel(module=module)
-    def clear(slots: int, width: int, active: wp.array(dtype=wp.int32), band: wp.array3d(dtype=Column)):
+    def clear_band(slots: int, width: int, active: wp.array(dtype=wp.int32), band: wp.array3d(dtype=Column)):
         """Set the band to zero, with ones on the diagonal beyond the slots; one thread per block row."""
         world, row = wp.tid()
         if active[world] == 0:
@@ -51,32 +52,32 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
                 band[world, row, BLOCK * width + r][r] = T(1.0)
 
     @wp.kernel(module=module)
-    def fill(
+    def fill_band(
         pattern: Pattern,
         value: wp.array2d(dtype=mat33),
-        place_of: wp.array(dtype=wp.int32),
+        position_of: wp.array(dtype=wp.int32),
         width: int,
         shift: wp.array(dtype=T),
         active: wp.array(dtype=wp.int32),
         band: wp.array3d(dtype=Column),
     ):
-        """Lower half of A + shift |D|, D = diag A, with slots in the order of `place_of`; one thread per slot.
+        """Lower half of A + shift |D|, D = diag A, with slots in the order of `position_of`; one thread per slot.
 
         Negative diagonal entries, as under strong compression, are made positive.
         """
         world, slot = wp.tid()
         if active[world] == 0:
             return
-        place = place_of[slot]
+        position = position_of[slot]
         for k in range(pattern.start[slot], pattern.start[slot + 1]):
-            other = place_of[pattern.column[k]]
-            if other <= place:
+            other = position_of[pattern.column[k]]
+            if other <= position:
                 A = value[world, k]
-                if other == place:
+                if other == position:
                     for a in range(3):
                         A[a, a] = (T(1.0) + shift[world]) * wp.abs(A[a, a])
                 for a in range(3):
-                    i = 3 * place + a
+                    i = 3 * position + a
                     for b in range(3):
                         j = 3 * other + b
                         if j <= i:
@@ -84,10 +85,10 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
                             band[world, i / BLOCK, at][i % BLOCK] = A[a, b]
 
     @wp.func
-    def inverse_factor(A: Block, given: Column) -> Block:
+    def inverse_factor(A: Block, diagonal: Column) -> Block:
         """Columns of L^-1, with A = L L^T.
 
-        A pivot that is not safely positive against the `given` diagonal is replaced by that diagonal and the rest of
+        A pivot that is not safely positive against the given `diagonal` is replaced by that diagonal and the rest of
         the column of L is zero, so that L L^T is positive definite for any A. The diagonal entry of L^-1 is then
         negative, as a flag for the blocks below.
         """
@@ -97,9 +98,9 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
         rows = Block()
         for j in range(BLOCK):
             pivot = S[j][j]
-            size = wp.abs(given[j])
+            size = wp.abs(diagonal[j])
             own = Column()
-            if pivot > T(NEGLIGIBLE) * size and size > T(0.0):
+            if pivot > T(NEGLIGIBLE_PIVOT) * size and size > T(0.0):
                 scale = T(1.0) / wp.sqrt(pivot)
                 column = scale * S[j]
                 # row j of L^-1: remainder of e_j after the rows above, over the root of the pivot
@@ -114,10 +115,13 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
         return wp.transpose(rows)
 
     @wp.kernel(module=module)
-    def factor(
-        width: int, active: wp.array(dtype=wp.int32), bad: wp.array(dtype=wp.int32), band: wp.array3d(dtype=Column)
+    def factor_band(
+        width: int,
+        active: wp.array(dtype=wp.int32),
+        replaced_pivots: wp.array(dtype=wp.int32),
+        band: wp.array3d(dtype=Column),
     ):
-        """Factor A into L, in place; `bad`: number of unknowns whose pivot was replaced."""
+        """Factor A into L, in place; `replaced_pivots`: number of unknowns whose pivot was replaced."""
         world = wp.tid()
         if active[world] == 0:
             return
@@ -127,10 +131,10 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
             for other in range(first, row + 1):
                 at = BLOCK * (other - row + width)
                 S = Block()
-                given = Column()
+                diagonal = Column()
                 for c in range(BLOCK):
                     S[c] = band[world, row, at + c]
-                    given[c] = S[c][c]
+                    diagonal[c] = S[c][c]
                 for m in range(first, other):
                     left = BLOCK * (m - row + width)
                     right = BLOCK * (m - other + width)
@@ -149,28 +153,30 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
                         if band[world, other, BLOCK * width + c][c] < T(0.0):
                             R[c] = Column()
                 else:
-                    R = inverse_factor(S, given)
+                    R = inverse_factor(S, diagonal)
                     for c in range(BLOCK):
                         if R[c][c] < T(0.0):
                             count += 1
                 for c in range(BLOCK):
                     band[world, row, at + c] = R[c]
-        bad[world] = count
+        replaced_pivots[world] = count
 
     @wp.kernel(module=module)
-    def begin(flags: wp.array(dtype=wp.int32), doing: wp.array(dtype=wp.int32), shift: wp.array(dtype=T)):
+    def begin_factorisation(
+        flags: wp.array(dtype=wp.int32), factoring: wp.array(dtype=wp.int32), shift: wp.array(dtype=T)
+    ):
         """Initialise the flagged worlds without shift."""
         world = wp.tid()
-        doing[world] = flags[world]
+        factoring[world] = flags[world]
         if flags[world] != 0:
             shift[world] = T(0.0)
 
     @wp.kernel(module=module)
     def raise_shift(
-        bad: wp.array(dtype=wp.int32),
-        doing: wp.array(dtype=wp.int32),
+        replaced_pivots: wp.array(dtype=wp.int32),
+        factoring: wp.array(dtype=wp.int32),
         shift: wp.array(dtype=T),
-        again: wp.array(dtype=wp.int32),
+        refactor: wp.array(dtype=wp.int32),
         exact: wp.array(dtype=wp.int32),
     ):
         """If A was not positive definite, raise the shift, up to 1, and request another factorisation.
@@ -178,14 +184,14 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
         `exact`: the factors are those of A.
         """
         world = wp.tid()
-        if doing[world] == 0:
+        if factoring[world] == 0:
             return
-        exact[world] = wp.where(bad[world] == 0 and shift[world] == T(0.0), 1, 0)
-        if bad[world] != 0 and shift[world] < T(1.0):
+        exact[world] = wp.where(replaced_pivots[world] == 0 and shift[world] == T(0.0), 1, 0)
+        if replaced_pivots[world] != 0 and shift[world] < T(1.0):
             shift[world] = wp.min(wp.max(T(SHIFT_GROWTH) * shift[world], T(FIRST_SHIFT)), T(1.0))
-            wp.atomic_max(again, 0, 1)
+            wp.atomic_max(refactor, 0, 1)
         else:
-            doing[world] = 0
+            factoring[world] = 0
 
     @wp.kernel(module=module)
     def solve(
@@ -237,10 +243,10 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
 
     return _types.SimpleNamespace(
         module=module,
-        begin=begin,
-        clear=clear,
-        fill=fill,
-        factor=factor,
+        begin_factorisation=begin_factorisation,
+        clear_band=clear_band,
+        fill_band=fill_band,
+        factor_band=factor_band,
         raise_shift=raise_shift,
         solve=solve,
         inverse_factor=inverse_factor,

@@ -19,37 +19,38 @@ import warp as wp
 from ..common.lanes import WARP_SIZE, block_memory, lane_functions
 from ..common.structs import pattern_struct
 from ..common.types import kernel_module, precision
-from .band import BLOCK, band_kernels, column_type
+from .band import BLOCK, band_kernels, block_column_type
 
-__all__ = ["band_block_kernels", "solution_numbers", "window_numbers"]
+__all__ = ["band_block_kernels", "solution_memory_size", "window_size"]
 
-SIZE = BLOCK * BLOCK
-PITCH = SIZE + 1
+BLOCK_ENTRIES = BLOCK * BLOCK
+"""Numbers of a block."""
+BLOCK_STRIDE = BLOCK_ENTRIES + 1
 """Stride of the window's blocks: odd, to avoid bank conflicts."""
-NARROW = 7
-"""Largest number of off-diagonal blocks factored by one warp; wider bands use four."""
-CHUNK_NUMBERS = 3072
-"""Approximate size of a chunk of rows in a solution."""
+MAX_ONE_WARP_WIDTH = 7
+"""Largest number of off-diagonal blocks of a row factored by one warp; wider bands use four."""
+CHUNK_ENTRIES = 3072
+"""Approximate number of entries of the factors that a solution loads at once, as a chunk of rows."""
 
 
-def window_numbers(width: int) -> int:
-    """Size of the window and of the original diagonals of its rows."""
-    return (width + 1) * (_row_numbers(width) + BLOCK)
+def window_size(width: int) -> int:
+    """Numbers in the memory of a factorisation: the window, and the original diagonals of its rows."""
+    return (width + 1) * (_window_row_stride(width) + BLOCK)
 
 
-def _row_numbers(width: int) -> int:
+def _window_row_stride(width: int) -> int:
     """Stride of the window's rows: odd, so that threads of a warp read the blocks of a column from different banks."""
-    return (width + 1) * PITCH | 1
+    return (width + 1) * BLOCK_STRIDE | 1
 
 
-def _chunk(width: int) -> int:
+def _rows_per_chunk(width: int) -> int:
     """Number of rows of a chunk."""
-    return max(1, CHUNK_NUMBERS // (SIZE * width)) if width else 1
+    return max(1, CHUNK_ENTRIES // (BLOCK_ENTRIES * width)) if width else 1
 
 
-def solution_numbers(rows: int, width: int) -> int:
-    """Size of a solution and of a chunk of rows."""
-    return BLOCK * rows + _chunk(width) * SIZE * max(width, 1)
+def solution_memory_size(rows: int, width: int) -> int:
+    """Numbers in the memory of a solution: the unknowns, padded to blocks, and a chunk of rows of the factors."""
+    return BLOCK * rows + _rows_per_chunk(width) * BLOCK_ENTRIES * max(width, 1)
 
 
 @functools.cache
@@ -59,43 +60,43 @@ def band_block_kernels(dtype: str, rows: int, width: int) -> _types.SimpleNamesp
     T, vec3, mat33 = p.T, p.vec3, p.mat33
     f = lane_functions(dtype)
     sync, scalar_sum = f.sync, f.scalar_sum
-    Pattern, Column = pattern_struct(), column_type(dtype)
+    Pattern, Column = pattern_struct(), block_column_type(dtype)
     Block = wp.types.matrix(shape=(BLOCK, BLOCK), dtype=T)
     inverse_factor = band_kernels(dtype).inverse_factor
-    NUMBER = wp.types.type_size_in_bytes(T)
-    M, CHUNK = width + 1, _chunk(width)
-    ROW = _row_numbers(width)
-    GIVEN = M * ROW
-    BESIDE = BLOCK * width  # off-diagonal columns of a block row
-    Y = BLOCK * rows
+    SCALAR_BYTES = wp.types.type_size_in_bytes(T)
+    M, CHUNK = width + 1, _rows_per_chunk(width)
+    WINDOW_ROW_STRIDE = _window_row_stride(width)
+    DIAGONAL_START = M * WINDOW_ROW_STRIDE  # the original diagonals follow the window
+    OFF_DIAGONAL_COLUMNS = BLOCK * width  # off-diagonal columns of a block row
+    PADDED_UNKNOWNS = BLOCK * rows  # the chunk of rows follows them
     module = kernel_module(f"band_block_{dtype}_{rows}_{width}", max_unroll=BLOCK)
-    window, vector = block_memory(dtype, window_numbers(width)), block_memory(dtype, solution_numbers(rows, width))
+    window, vector = block_memory(dtype, window_size(width)), block_memory(dtype, solution_memory_size(rows, width))
 
     @wp.func
-    def place(row: int, other: int) -> int:
+    def window_index(row: int, other: int) -> int:
         """Index of a block in the window."""
-        return (row % M) * ROW + (other % M) * PITCH
+        return (row % M) * WINDOW_ROW_STRIDE + (other % M) * BLOCK_STRIDE
 
     @wp.func
-    def enter(
+    def load_window_row(
         at: wp.uint64, pattern: Pattern, value: wp.array2d(dtype=mat33), slot_at: wp.array(dtype=wp.int32),
-        place_of: wp.array(dtype=wp.int32), shift: T, world: int, row: int, lane: int, lanes: int,
+        position_of: wp.array(dtype=wp.int32), shift: T, world: int, row: int, lane: int, lanes: int,
     ):  # fmt: skip
         """Load a block row of A + shift |diag A| into the window; ones on the diagonal beyond the unknowns."""
-        for k in range(lane, ROW, lanes):
-            window.store(at, (row % M) * ROW + k, T(0.0))
+        for k in range(lane, WINDOW_ROW_STRIDE, lanes):
+            window.store(at, (row % M) * WINDOW_ROW_STRIDE + k, T(0.0))
         sync()
         across = wp.max(lanes / BLOCK, 1)
         for a in range(lane / across, BLOCK, wp.max(lanes / across, 1)):
             i = BLOCK * row + a
             if i / 3 >= slot_at.shape[0]:
                 if lane % across == 0:
-                    window.store(at, place(row, row) + (BLOCK + 1) * a, T(1.0))
-                    window.store(at, GIVEN + BLOCK * (row % M) + a, T(1.0))
+                    window.store(at, window_index(row, row) + (BLOCK + 1) * a, T(1.0))
+                    window.store(at, DIAGONAL_START + BLOCK * (row % M) + a, T(1.0))
             else:
                 slot = slot_at[i / 3]
                 for k in range(pattern.start[slot] + lane % across, pattern.start[slot + 1], across):
-                    first = 3 * place_of[pattern.column[k]]
+                    first = 3 * position_of[pattern.column[k]]
                     A = value[world, k]
                     for b in range(3):
                         j = first + b
@@ -103,8 +104,8 @@ def band_block_kernels(dtype: str, rows: int, width: int) -> _types.SimpleNamesp
                             x = A[i % 3, b]
                             if j == i:
                                 x = (T(1.0) + shift) * wp.abs(x)
-                                window.store(at, GIVEN + BLOCK * (row % M) + a, x)
-                            window.store(at, place(row, j / BLOCK) + BLOCK * a + j % BLOCK, x)
+                                window.store(at, DIAGONAL_START + BLOCK * (row % M) + a, x)
+                            window.store(at, window_index(row, j / BLOCK) + BLOCK * a + j % BLOCK, x)
 
     @wp.func
     def scale_row(at: wp.uint64, R: Block, where: int):
@@ -131,7 +132,7 @@ def band_block_kernels(dtype: str, rows: int, width: int) -> _types.SimpleNamesp
             window.store(at, where + c, s)
 
     @wp.func
-    def eliminate(at: wp.uint64, row: int, below: int, lane: int, lanes: int):
+    def eliminate_column(at: wp.uint64, row: int, below: int, lane: int, lanes: int):
         """Right-looking update by column `row`."""
         for task in range(lane, BLOCK * (below * (below + 1) / 2), lanes):
             pair = task / BLOCK
@@ -143,63 +144,72 @@ def band_block_kernels(dtype: str, rows: int, width: int) -> _types.SimpleNamesp
             one = row + 1 + i
             two = row + 1 + pair - i * (i + 1) / 2
             r = BLOCK * (task % BLOCK)
-            update_row(at, place(one, row) + r, place(two, row), place(one, two) + r)
+            update_row(at, window_index(one, row) + r, window_index(two, row), window_index(one, two) + r)
 
     @wp.kernel(module=module)
     def factor(
-        lanes: int, outside: wp.array2d(dtype=T), pattern: Pattern, value: wp.array2d(dtype=mat33),
-        slot_at: wp.array(dtype=wp.int32), place_of: wp.array(dtype=wp.int32), shift: wp.array(dtype=T),
-        active: wp.array(dtype=wp.int32), bad: wp.array(dtype=wp.int32), band: wp.array3d(dtype=Column),
+        lanes: int, global_memory: wp.array2d(dtype=T), pattern: Pattern, value: wp.array2d(dtype=mat33),
+        slot_at: wp.array(dtype=wp.int32), position_of: wp.array(dtype=wp.int32), shift: wp.array(dtype=T),
+        active: wp.array(dtype=wp.int32), replaced_pivots: wp.array(dtype=wp.int32), band: wp.array3d(dtype=Column),
     ):  # fmt: skip
-        """Factors of A; `bad`: number of unknowns whose pivot was replaced."""
+        """Factors of A; `replaced_pivots`: number of unknowns whose pivot was replaced."""
         thread = wp.tid()
         world = thread / lanes
         lane = thread % lanes
         if active[world] == 0:
             return
-        at = window.open(outside.ptr + wp.uint64(world) * wp.uint64(outside.shape[1]) * wp.uint64(wp.static(NUMBER)))
+        at = window.open(
+            global_memory.ptr
+            + wp.uint64(world) * wp.uint64(global_memory.shape[1]) * wp.uint64(wp.static(SCALAR_BYTES))
+        )
         count = wp.int32(0)
         for row in range(wp.min(M, rows)):
-            enter(at, pattern, value, slot_at, place_of, shift[world], world, row, lane, lanes)
+            load_window_row(at, pattern, value, slot_at, position_of, shift[world], world, row, lane, lanes)
         sync()
         for row in range(rows):
             S = Block()
-            given = Column()
+            diagonal = Column()
             for c in range(BLOCK):
                 for r in range(BLOCK):
-                    S[c, r] = window.load(at, place(row, row) + BLOCK * r + c)
-                given[c] = window.load(at, GIVEN + BLOCK * (row % M) + c)
-            R = inverse_factor(S, given)
+                    S[c, r] = window.load(at, window_index(row, row) + BLOCK * r + c)
+                diagonal[c] = window.load(at, DIAGONAL_START + BLOCK * (row % M) + c)
+            R = inverse_factor(S, diagonal)
             below = wp.min(width, rows - 1 - row)
             sync()
             for task in range(lane, BLOCK * below, lanes):
-                scale_row(at, R, place(row + 1 + task / BLOCK, row) + BLOCK * (task % BLOCK))
-            for task in range(BLOCK * wp.max(width - row, 0) + lane, BESIDE, lanes):  # U = D^-1 L
-                other = place(row, row - width + task / BLOCK) + task % BLOCK
+                scale_row(at, R, window_index(row + 1 + task / BLOCK, row) + BLOCK * (task % BLOCK))
+            for task in range(BLOCK * wp.max(width - row, 0) + lane, OFF_DIAGONAL_COLUMNS, lanes):  # U = D^-1 L
+                other = window_index(row, row - width + task / BLOCK) + task % BLOCK
                 column = Column()
                 for k in range(BLOCK):
                     column += window.load(at, other + BLOCK * k) * R[k]
                 band[world, row, task] = column
             if lane == 0:
                 for c in range(BLOCK):
-                    band[world, row, BESIDE + c] = R[c]
+                    band[world, row, OFF_DIAGONAL_COLUMNS + c] = R[c]
                     if R[c][c] < T(0.0):
                         count += 1
             sync()
-            eliminate(at, row, below, lane, lanes)
+            eliminate_column(at, row, below, lane, lanes)
             if row + M < rows:  # replaces `row`, which is no longer needed
-                enter(at, pattern, value, slot_at, place_of, shift[world], world, row + M, lane, lanes)
+                load_window_row(at, pattern, value, slot_at, position_of, shift[world], world, row + M, lane, lanes)
             sync()
         if lane == 0:
-            bad[world] = count
+            replaced_pivots[world] = count
 
     @wp.func
-    def take_rows(at: wp.uint64, band: wp.array3d(dtype=Column), world: int, first: int, lane: int, lanes: int):
+    def load_factor_rows(at: wp.uint64, band: wp.array3d(dtype=Column), world: int, first: int, lane: int, lanes: int):
         """Copy the off-diagonal blocks of a chunk of block rows, row by row."""
-        for task in range(lane, wp.min(CHUNK, rows - first) * BESIDE, lanes):
-            column = band[world, first + task / BESIDE, task % BESIDE]
+        for task in range(lane, wp.min(CHUNK, rows - first) * OFF_DIAGONAL_COLUMNS, lanes):
+            column = band[world, first + task / OFF_DIAGONAL_COLUMNS, task % OFF_DIAGONAL_COLUMNS]
             for r in range(BLOCK):
-                vector.store(at, Y + BESIDE * (BLOCK * (task / BESIDE) + r) + task % BESIDE, column[r])
+                vector.store(
+                    at,
+                    PADDED_UNKNOWNS
+                    + OFF_DIAGONAL_COLUMNS * (BLOCK * (task / OFF_DIAGONAL_COLUMNS) + r)
+                    + task % OFF_DIAGONAL_COLUMNS,
+                    column[r],
+                )
 
     @wp.func
     def forward(at: wp.uint64, row: int, chunk: int, lane: int, lanes: int):
@@ -207,8 +217,8 @@ def band_block_kernels(dtype: str, rows: int, width: int) -> _types.SimpleNamesp
         across = wp.max(lanes / BLOCK, 1)
         for a in range(lane / across, BLOCK, wp.max(lanes / across, 1)):
             s = T(0.0)
-            for j in range(BLOCK * wp.max(width - row, 0) + lane % across, BESIDE, across):
-                s += vector.load(at, chunk + BESIDE * a + j) * vector.load(at, BLOCK * (row - width) + j)
+            for j in range(BLOCK * wp.max(width - row, 0) + lane % across, OFF_DIAGONAL_COLUMNS, across):
+                s += vector.load(at, chunk + OFF_DIAGONAL_COLUMNS * a + j) * vector.load(at, BLOCK * (row - width) + j)
             s = scalar_sum(s, across)
             if lane % across == 0:
                 vector.store(at, BLOCK * row + a, vector.load(at, BLOCK * row + a) - s)
@@ -219,16 +229,17 @@ def band_block_kernels(dtype: str, rows: int, width: int) -> _types.SimpleNamesp
         x = Column()
         for r in range(BLOCK):
             x[r] = vector.load(at, BLOCK * row + r)
-        for j in range(BLOCK * wp.max(width - row, 0) + lane, BESIDE, lanes):
+        for j in range(BLOCK * wp.max(width - row, 0) + lane, OFF_DIAGONAL_COLUMNS, lanes):
             s = vector.load(at, BLOCK * (row - width) + j)
             for r in range(BLOCK):
-                s -= vector.load(at, chunk + BESIDE * r + j) * x[r]
+                s -= vector.load(at, chunk + OFF_DIAGONAL_COLUMNS * r + j) * x[r]
             vector.store(at, BLOCK * (row - width) + j, s)
 
     @wp.kernel(module=module)
     def solve(
-        lanes: int, outside: wp.array2d(dtype=T), band: wp.array3d(dtype=Column), slot_at: wp.array(dtype=wp.int32),
-        r: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), z: wp.array2d(dtype=vec3),
+        lanes: int, global_memory: wp.array2d(dtype=T), band: wp.array3d(dtype=Column),
+        slot_at: wp.array(dtype=wp.int32), r: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32),
+        z: wp.array2d(dtype=vec3),
     ):  # fmt: skip
         """z = A^-1 r: D^-1, forward and backward substitution with U, D^-T."""
         thread = wp.tid()
@@ -236,40 +247,43 @@ def band_block_kernels(dtype: str, rows: int, width: int) -> _types.SimpleNamesp
         lane = thread % lanes
         if active[world] == 0:
             return
-        at = vector.open(outside.ptr + wp.uint64(world) * wp.uint64(outside.shape[1]) * wp.uint64(wp.static(NUMBER)))
+        at = vector.open(
+            global_memory.ptr
+            + wp.uint64(world) * wp.uint64(global_memory.shape[1]) * wp.uint64(wp.static(SCALAR_BYTES))
+        )
         unknowns = 3 * slot_at.shape[0]
-        for i in range(lane, Y, lanes):
+        for i in range(lane, PADDED_UNKNOWNS, lanes):
             s = T(0.0)
             for k in range(BLOCK):
                 j = i - i % BLOCK + k
                 if j < unknowns:
-                    s += band[world, i / BLOCK, BESIDE + k][i % BLOCK] * r[world, slot_at[j / 3]][j % 3]
+                    s += band[world, i / BLOCK, OFF_DIAGONAL_COLUMNS + k][i % BLOCK] * r[world, slot_at[j / 3]][j % 3]
             vector.store(at, i, s)
         chunks = (rows + CHUNK - 1) / CHUNK
         for chunk in range(chunks):
             sync()
-            take_rows(at, band, world, CHUNK * chunk, lane, lanes)
+            load_factor_rows(at, band, world, CHUNK * chunk, lane, lanes)
             sync()
             for row in range(CHUNK * chunk, wp.min(CHUNK * (chunk + 1), rows)):
-                forward(at, row, Y + SIZE * width * (row - CHUNK * chunk), lane, lanes)
+                forward(at, row, PADDED_UNKNOWNS + BLOCK_ENTRIES * width * (row - CHUNK * chunk), lane, lanes)
                 sync()
         for back in range(chunks):
             chunk = chunks - 1 - back
             if back > 0:  # the last chunk is still loaded
                 sync()
-                take_rows(at, band, world, CHUNK * chunk, lane, lanes)
+                load_factor_rows(at, band, world, CHUNK * chunk, lane, lanes)
             sync()
             last = wp.min(CHUNK * (chunk + 1), rows) - 1
             for k in range(last + 1 - CHUNK * chunk):
                 row = last - k
-                backward(at, row, Y + SIZE * width * (row - CHUNK * chunk), lane, lanes)
+                backward(at, row, PADDED_UNKNOWNS + BLOCK_ENTRIES * width * (row - CHUNK * chunk), lane, lanes)
                 sync()
         for i in range(lane, unknowns, lanes):
-            column = band[world, i / BLOCK, BESIDE + i % BLOCK]
+            column = band[world, i / BLOCK, OFF_DIAGONAL_COLUMNS + i % BLOCK]
             s = T(0.0)
             for k in range(BLOCK):
                 s += column[k] * vector.load(at, i - i % BLOCK + k)
             z[world, slot_at[i / 3]][i % 3] = s
 
-    lanes = (4 if width > NARROW else 1) * WARP_SIZE
+    lanes = (4 if width > MAX_ONE_WARP_WIDTH else 1) * WARP_SIZE
     return _types.SimpleNamespace(module=module, lanes=lanes, factor=factor, solve=solve)

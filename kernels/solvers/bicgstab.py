@@ -23,7 +23,7 @@ START_STRESS_RESIDUAL, START_STRESS_TOL = 0.1, 1.0e-8
 """Relative residual above which the stress of an iterate is unreliable: a rotation error delta strains a stiff body by
 delta^2, and E delta^2 spoils the geometric stiffness. Products then use the stress at the start of the step, and solves
 go to START_STRESS_TOL, as the residual of a rotation is small beside that of strains."""
-STALLED = 50
+MAX_STALLED_ITERATIONS = 50
 """Iterations without halving the best residual after which a solve ends with the best: later residuals may grow."""
 ESTIMATE_RESIDUAL = 0.1
 """Largest final relative residual of a solve that yields an error estimate."""
@@ -41,12 +41,12 @@ def bicgstab_struct():
         alpha: wp.array(dtype=wp.float64)
         beta: wp.array(dtype=wp.float64)
         omega: wp.array(dtype=wp.float64)
-        best: wp.array(dtype=wp.float64)  # smallest D^-1 norm of the residual so far
-        mark: wp.array(dtype=wp.float64)  # norm at its last halving, and the iterations since
-        since: wp.array(dtype=wp.int32)
-        again: wp.array(dtype=wp.int32)  # 1: the solve stalled and restarts once from its best iterate
-        any_again: wp.array(dtype=wp.int32)  # [1]
-        going: wp.array(dtype=wp.int32)  # 1: the solve continues after this iteration
+        best_norm: wp.array(dtype=wp.float64)  # smallest D^-1 norm of the residual so far
+        halved_norm: wp.array(dtype=wp.float64)  # norm at its last halving, and the iterations since
+        stalled_iterations: wp.array(dtype=wp.int32)
+        restart_requested: wp.array(dtype=wp.int32)  # 1: the solve stalled and restarts once from its best iterate
+        any_restart_requested: wp.array(dtype=wp.int32)  # [1]
+        unfinished: wp.array(dtype=wp.int32)  # 1: the solve continues after this iteration
         sums: wp.array2d(dtype=wp.float64)  # [BICGSTAB_ROWS, world]; after the first product r^.v alone
 
     return BiCGStab
@@ -60,16 +60,16 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> _types.Simple
     f64 = wp.float64
     Newton, Control, Recursion = control_struct(), pcg_struct(), bicgstab_struct()
     forcing = forcing_functions(has_constraints)
-    forced, least_norm = forcing.forced, forcing.least_norm
+    forcing_target, min_target_norm = forcing.forcing_target, forcing.min_target_norm
     module = kernel_module(f"bicgstab_{dtype}{'_gated' if has_constraints else ''}")
 
     @wp.func
-    def has_work(ctl: Control, world: int) -> bool:
+    def has_iterations_left(ctl: Control, world: int) -> bool:
         """True if iterations are left, of the solve and of the step."""
-        return ctl.iterations[world] < ctl.max_iterations and ctl.total[world] < ctl.max_work
+        return ctl.iterations[world] < ctl.max_iterations and ctl.step_iterations[world] < ctl.max_work
 
     @wp.kernel(module=module)
-    def begin(newton: Newton, ctl: Control, bi: Recursion):
+    def begin_solve(newton: Newton, ctl: Control, bi: Recursion):
         """Set the target norm of the solve: Eisenstat and Walker, but no tighter than Newton's method needs."""
         world = wp.tid()
         ctl.active[world] = 0
@@ -81,15 +81,15 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> _types.Simple
         ctl.iterations[world] = 0
         ctl.negative_curvature[world] = 0
         bi.rho[world] = ctl.sums[0, world]
-        bi.best[world] = norm
-        bi.mark[world] = norm
-        bi.since[world] = 0
-        ctl.target[world] = forced(newton, world, norm)
+        bi.best_norm[world] = norm
+        bi.halved_norm[world] = norm
+        bi.stalled_iterations[world] = 0
+        ctl.target_norm[world] = forcing_target(newton, world, norm)
         if newton.estimate_error[world] != 0:
-            ctl.target[world] = f64(ESTIMATE_TOL) * norm
+            ctl.target_norm[world] = f64(ESTIMATE_TOL) * norm
         elif newton.relative_residual[world] > f64(START_STRESS_RESIDUAL) and newton.fixed_forcing == 0:
-            ctl.target[world] = wp.max(f64(START_STRESS_TOL) * norm, least_norm(newton, world))
-        if norm > ctl.target[world] and ctl.max_iterations > 0 and wp.isfinite(norm) and bi.rho[world] != f64(0.0):
+            ctl.target_norm[world] = wp.max(f64(START_STRESS_TOL) * norm, min_target_norm(newton, world))
+        if norm > ctl.target_norm[world] and ctl.max_iterations > 0 and wp.isfinite(norm) and bi.rho[world] != f64(0.0):
             ctl.active[world] = wp.where(newton.relative_residual[world] > f64(START_STRESS_RESIDUAL), 2, 1)
             wp.atomic_max(ctl.any_active, 0, 1)
         elif newton.estimate_error[world] != 0:
@@ -115,7 +115,7 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> _types.Simple
             best_r[world, slot] = r[world, slot]
 
     @wp.kernel(module=module)
-    def first_length(ctl: Control, bi: Recursion):
+    def compute_alpha(ctl: Control, bi: Recursion):
         """alpha = rho / r^.v, v = H y; the solve ends on breakdown."""
         world = wp.tid()
         if world == 0:
@@ -123,7 +123,7 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> _types.Simple
         if ctl.active[world] == 0:
             return
         ctl.iterations[world] = ctl.iterations[world] + 1
-        ctl.total[world] = ctl.total[world] + 1
+        ctl.step_iterations[world] = ctl.step_iterations[world] + 1
         alpha = bi.rho[world] / bi.sums[0, world]
         bi.alpha[world] = alpha
         if not wp.isfinite(alpha):
@@ -132,7 +132,7 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> _types.Simple
                 ctl.negative_curvature[world] = 1
 
     @wp.kernel(module=module)
-    def first_step(
+    def half_step(
         ctl: Control,
         bi: Recursion,
         y: wp.array2d(dtype=vec3),
@@ -154,8 +154,8 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> _types.Simple
         if ctl.active[world] != 0:
             norm = wp.sqrt(ctl.sums[1, world])
             ctl.norm[world] = norm
-            if not norm > ctl.target[world]:
-                bi.best[world] = norm
+            if not norm > ctl.target_norm[world]:
+                bi.best_norm[world] = norm
                 ctl.active[world] = 0
 
     @wp.kernel(module=module)
@@ -178,7 +178,7 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> _types.Simple
             rows[3, world, slot] = f64(wp.dot(shadow[world, slot], a))
 
     @wp.kernel(module=module)
-    def second_length(ctl: Control, bi: Recursion):
+    def compute_omega(ctl: Control, bi: Recursion):
         """omega = argmin |r - omega t|, beta of the next direction, and the decision to continue."""
         world = wp.tid()
         if ctl.active[world] == 0:
@@ -194,22 +194,22 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> _types.Simple
         bi.omega[world] = omega
         bi.beta[world] = beta
         bi.rho[world] = rho
-        if norm < bi.best[world]:
-            bi.best[world] = norm
-        bi.since[world] = bi.since[world] + 1
-        if norm <= f64(0.5) * bi.mark[world]:
-            bi.mark[world] = norm
-            bi.since[world] = 0
-        more = norm > ctl.target[world] and has_work(ctl, world)
-        more = more and bi.since[world] < STALLED
+        if norm < bi.best_norm[world]:
+            bi.best_norm[world] = norm
+        bi.stalled_iterations[world] = bi.stalled_iterations[world] + 1
+        if norm <= f64(0.5) * bi.halved_norm[world]:
+            bi.halved_norm[world] = norm
+            bi.stalled_iterations[world] = 0
+        more = norm > ctl.target_norm[world] and has_iterations_left(ctl, world)
+        more = more and bi.stalled_iterations[world] < MAX_STALLED_ITERATIONS
         if more and wp.isfinite(beta) and wp.isfinite(norm) and rho != f64(0.0):
-            bi.going[world] = 1
+            bi.unfinished[world] = 1
             wp.atomic_max(ctl.any_active, 0, 1)
         else:
-            bi.going[world] = 0
+            bi.unfinished[world] = 0
 
     @wp.kernel(module=module)
-    def second_step(
+    def full_step(
         ctl: Control,
         bi: Recursion,
         z: wp.array2d(dtype=vec3),
@@ -230,31 +230,31 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> _types.Simple
         new = r[world, slot] - omega * t[world, slot]
         x[world, slot] = place
         r[world, slot] = new
-        if ctl.norm[world] == bi.best[world]:
+        if ctl.norm[world] == bi.best_norm[world]:
             best_x[world, slot] = place
             best_r[world, slot] = new
-        if bi.going[world] != 0:
+        if bi.unfinished[world] != 0:
             p_out[world, slot] = new + T(bi.beta[world]) * (p_out[world, slot] - omega * v[world, slot])
 
     @wp.kernel(module=module)
     def deactivate_finished(ctl: Control, bi: Recursion):
         """Deactivate finished worlds."""
         world = wp.tid()
-        if bi.going[world] == 0:
+        if bi.unfinished[world] == 0:
             ctl.active[world] = 0
 
     @wp.kernel(module=module)
-    def mark_restarts(newton: Newton, ctl: Control, bi: Recursion, first: int):
+    def request_restarts(newton: Newton, ctl: Control, bi: Recursion, first: int):
         """Mark the worlds that restart; `first`: a restart is allowed."""
         world = wp.tid()
-        bi.again[world] = 0
+        bi.restart_requested[world] = 0
         if newton.active[world] == 0 or ctl.iterations[world] == 0:
             return
-        if not ctl.norm[world] <= bi.best[world]:
-            ctl.norm[world] = bi.best[world]
-        if first != 0 and ctl.norm[world] > ctl.target[world] and has_work(ctl, world):
-            bi.again[world] = 1
-            wp.atomic_max(bi.any_again, 0, 1)
+        if not ctl.norm[world] <= bi.best_norm[world]:
+            ctl.norm[world] = bi.best_norm[world]
+        if first != 0 and ctl.norm[world] > ctl.target_norm[world] and has_iterations_left(ctl, world):
+            bi.restart_requested[world] = 1
+            wp.atomic_max(bi.any_restart_requested, 0, 1)
         elif (
             newton.estimate_error[world] != 0 and not ctl.norm[world] <= f64(ESTIMATE_RESIDUAL) * ctl.first_norm[world]
         ):
@@ -264,15 +264,15 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> _types.Simple
     def restart(newton: Newton, ctl: Control, bi: Recursion):
         """Restart: r^ = B r with r of the best iterate."""
         world = wp.tid()
-        if bi.again[world] != 0 and ctl.sums[0, world] != f64(0.0) and wp.isfinite(ctl.sums[0, world]):
+        if bi.restart_requested[world] != 0 and ctl.sums[0, world] != f64(0.0) and wp.isfinite(ctl.sums[0, world]):
             bi.rho[world] = ctl.sums[0, world]
-            bi.mark[world] = bi.best[world]
-            bi.since[world] = 0
+            bi.halved_norm[world] = bi.best_norm[world]
+            bi.stalled_iterations[world] = 0
             ctl.active[world] = wp.where(newton.relative_residual[world] > f64(START_STRESS_RESIDUAL), 2, 1)
             wp.atomic_max(ctl.any_active, 0, 1)
 
     @wp.kernel(module=module)
-    def take_best(
+    def restore_best_iterate(
         newton: Newton,
         ctl: Control,
         bi: Recursion,
@@ -285,22 +285,22 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> _types.Simple
         world, slot = wp.tid()
         if newton.active[world] == 0 or ctl.iterations[world] == 0:
             return  # no best iterate yet
-        if not ctl.norm[world] <= bi.best[world]:
+        if not ctl.norm[world] <= bi.best_norm[world]:
             x[world, slot] = best_x[world, slot]
             r[world, slot] = best_r[world, slot]
 
     return _types.SimpleNamespace(
         module=module,
-        begin=begin,
+        begin_solve=begin_solve,
         first_direction=first_direction,
-        first_length=first_length,
-        first_step=first_step,
+        compute_alpha=compute_alpha,
+        half_step=half_step,
         check_half_step=check_half_step,
         second_dot_terms=second_dot_terms,
-        second_length=second_length,
-        second_step=second_step,
+        compute_omega=compute_omega,
+        full_step=full_step,
         deactivate_finished=deactivate_finished,
-        take_best=take_best,
-        mark_restarts=mark_restarts,
+        restore_best_iterate=restore_best_iterate,
+        request_restarts=request_restarts,
         restart=restart,
     )

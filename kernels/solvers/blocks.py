@@ -11,7 +11,7 @@ import warp as wp
 from ..common.inverse import inverse_function
 from ..common.structs import pattern_struct, topology_struct
 from ..common.types import SHORT_UNROLL, kernel_module, precision
-from ..elements.matrix import panels_of, row_of
+from ..elements.matrix import panel_layout, panel_row
 
 __all__ = ["assembly_kernels", "block_kernels"]
 
@@ -19,28 +19,28 @@ __all__ = ["assembly_kernels", "block_kernels"]
 @functools.cache
 def assembly_kernels(dtype: str, slots: int, rows: bool) -> _types.SimpleNamespace:
     """Assembly from the matrices of elements with a given number of slots, in the layout of `element_matrix` or,
-    `rows`, of `element_rows`."""
+    `rows`, of `element_matrix_panels`."""
     p = precision(dtype)
     T, vec3, mat33 = p.T, p.vec3, p.mat33
     f64 = wp.float64
     Topology = topology_struct(dtype)
     Pattern = pattern_struct()
     NS = slots
-    _, P, ROWS = panels_of(slots)
-    PLACES = P * ROWS if rows else NS * (NS + 1) // 2
+    _, P, ROWS = panel_layout(slots)
+    BLOCKS_PER_ELEMENT = P * ROWS if rows else NS * (NS + 1) // 2
     Number = T if rows else vec3
     module = kernel_module(f"assembly_{dtype}_{slots}{'_rows' if rows else ''}", max_unroll=SHORT_UNROLL)
 
     @wp.func
-    def place(low: int, high: int) -> int:
+    def block_index(low: int, high: int) -> int:
         """Index of the block of two slots in an element's matrix."""
         if wp.static(rows):
-            return P * row_of(high / P, P, low) + high % P
+            return P * panel_row(high / P, P, low) + high % P
         else:
             return low * NS - (low * (low - 1)) / 2 + high - low
 
     @wp.func
-    def block_at(matrix: wp.array3d(dtype=Number), world: int, elem: int, where: int) -> mat33:
+    def load_block(matrix: wp.array3d(dtype=Number), world: int, elem: int, where: int) -> mat33:
         """3x3 block at an index of an element's matrix."""
         if wp.static(rows):
             first = 9 * P * (where / P) + where % P
@@ -65,7 +65,7 @@ def assembly_kernels(dtype: str, slots: int, rows: bool) -> _types.SimpleNamespa
         source: wp.array(dtype=wp.int32),
     ):
         """Contributions of elements to an entry of Pattern.upper: start[index + 1] = their number, or with `listing`
-        the `source`s from start[index] on, 2 (PLACES elem + place) + 1 for a transposed block."""
+        the `source`s from start[index] on, 2 (BLOCKS_PER_ELEMENT elem + block index) + 1 for a transposed block."""
         index = wp.tid()
         at = pattern.upper[index]
         found = wp.int32(0)
@@ -77,14 +77,14 @@ def assembly_kernels(dtype: str, slots: int, rows: bool) -> _types.SimpleNamespa
                 for b in range(NS):
                     if conn[b, elem] == at[3]:
                         if listing != 0:
-                            where = PLACES * elem + place(wp.min(a, b), wp.max(a, b))
+                            where = BLOCKS_PER_ELEMENT * elem + block_index(wp.min(a, b), wp.max(a, b))
                             source[start[index] + found] = 2 * where + wp.where(a <= b, 0, 1)
                         found += 1
         if listing == 0:
             start[index + 1] = found
 
     @wp.kernel(module=module)
-    def add_elements(
+    def add_element_matrices(
         topo: Topology,
         pattern: Pattern,
         start: wp.array(dtype=wp.int32),
@@ -110,7 +110,7 @@ def assembly_kernels(dtype: str, slots: int, rows: bool) -> _types.SimpleNamespa
         A = mat33()
         for k in range(start[index], start[index + 1]):
             code = source[k]
-            K = block_at(matrix, world, (code / 2) / PLACES, (code / 2) % PLACES)
+            K = load_block(matrix, world, (code / 2) / BLOCKS_PER_ELEMENT, (code / 2) % BLOCKS_PER_ELEMENT)
             if code % 2 == 0:
                 A += K
             else:
@@ -131,7 +131,10 @@ def assembly_kernels(dtype: str, slots: int, rows: bool) -> _types.SimpleNamespa
             value[world, at[1]] = wp.transpose(A)
 
     return _types.SimpleNamespace(
-        module=module, add_elements=add_elements, list_contributions=list_contributions, places=PLACES
+        module=module,
+        add_element_matrices=add_element_matrices,
+        list_contributions=list_contributions,
+        blocks_per_element=BLOCKS_PER_ELEMENT,
     )
 
 
@@ -147,7 +150,7 @@ def block_kernels(dtype: str) -> _types.SimpleNamespace:
     module = kernel_module(f"blocks_{dtype}", max_unroll=SHORT_UNROLL)
 
     @wp.kernel(module=module)
-    def take_diagonal(
+    def invert_diagonal_blocks(
         topo: Topology,
         pattern: Pattern,
         value: wp.array2d(dtype=mat33),
@@ -169,7 +172,7 @@ def block_kernels(dtype: str) -> _types.SimpleNamespace:
                 inverse[world, slot] = free_inverse(A, T(0.0), topo.free[slot])
 
     @wp.kernel(module=module)
-    def galerkin(
+    def galerkin_product(
         pair: wp.array(dtype=wp.vec3i),
         pair_start: wp.array(dtype=wp.int32),
         fine_entry: wp.array(dtype=wp.vec3i),
@@ -205,11 +208,14 @@ def block_kernels(dtype: str) -> _types.SimpleNamespace:
         coarse[world, at[0] + k * at[1] + at[2] + l] = A
 
     @wp.kernel(module=module)
-    def choose_worlds(flags: wp.array(dtype=wp.int32), first: int, last: int, out: wp.array(dtype=wp.int32)):
+    def select_worlds(flags: wp.array(dtype=wp.int32), first: int, last: int, out: wp.array(dtype=wp.int32)):
         """Flags of the worlds first .. last - 1, zero of others."""
         world = wp.tid()
         out[world] = wp.where(world >= first and world < last, flags[world], 0)
 
     return _types.SimpleNamespace(
-        choose_worlds=choose_worlds, module=module, take_diagonal=take_diagonal, galerkin=galerkin
+        select_worlds=select_worlds,
+        module=module,
+        invert_diagonal_blocks=invert_diagonal_blocks,
+        galerkin_product=galerkin_product,
     )

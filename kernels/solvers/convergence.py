@@ -9,43 +9,54 @@ from ..common.traits import NO_TERMS, Traits
 from .newton_control import (
     FAIL_CONSTRAINT,
     FAIL_CURVATURE,
-    FAIL_FLOOR,
     FAIL_ITERATIONS,
     FAIL_JACOBIAN,
     FAIL_LINE_SEARCH,
     FAIL_NAN,
+    FAIL_ROUNDOFF,
+    GROUP_ROUNDOFF,
+    GROUP_STRAIN_ENERGY,
+    ROW_FORCE,
+    ROW_INERTIA,
+    ROW_INTERNAL,
+    ROW_KINETIC,
+    ROW_LOADS,
+    ROW_MAGNITUDE,
+    ROW_OBJECTIVE,
+    ROW_RESIDUAL,
+    ROW_ROUNDOFF,
     control_struct,
 )
 
-__all__ = ["MAX_ERROR_ESTIMATES", "SINGLE_EPS", "VELOCITY_ROUNDINGS", "convergence_functions"]
+__all__ = ["MAX_ERROR_ESTIMATES", "SINGLE_PRECISION_EPS", "VELOCITY_ROUNDINGS", "convergence_functions"]
 
-ROUNDING_TOL = 16.0
-PREDICTED_TOL = 1.0e-3
-UNSOLVED_TOL = 0.1
+TOL_ROUNDINGS = 16.0
+"""Round-off units added to the relative tolerance of the residual."""
+EXTRAPOLATED_TOL_FACTOR, UNSOLVED_TOL_FACTOR = 1.0e-3, 0.1
 """Fractions of the tolerance that a first iterate must meet: extrapolated; in float32 with parts of unlike stiffness.
 The residual of an unsolved iterate lies in the softest directions and accumulates over steps without iterations."""
-STALLED = 0.5
+STALL_RATIO = 0.5
 """Residual ratio above which an iteration counts as stalled."""
-CLOSING_ITERATIONS = 4
+TIGHT_CONSTRAINT_ITERATIONS = 4
 """Iterations in which constraints are closed to the tolerance of accelerations, if `constraint_tol` is looser."""
 STALL_ROUNDINGS = 1.0e3
 """Multiple of the residual of rounded positions below which a stall may be due to round-off."""
 STALL_ROUNDINGS_MIDPOINT = 4.0
 """`STALL_ROUNDINGS` for midpoint schemes, whose unsymmetric linear solves may stall long before round-off."""
-STALL_STEP = 10.0
-"""Largest last step, in accepted errors, of a residual at its round-off floor."""
-PATIENCE = 3
-"""Multiple of the iteration limit added by `iteration_factor`."""
-ENERGY_ROUNDINGS = 64.0
+MAX_STALL_STEP = 10.0
+"""Largest last step of a residual at its round-off floor, in largest accepted errors (`max_floor`)."""
+EXTRA_ITERATION_FACTOR = 3
+"""Multiple of the iteration limit that `iteration_factor` adds."""
+STALL_ENERGY_ROUNDINGS = 64.0
 """Last step in the energy norm, over the round-off unit, below which a stall may also be due to round-off: laws that
 are steep at small J amplify round-off of the positions in the stress."""
-NOISE_ROUNDINGS = 32.0
+NOISE_DOMINATED_ROUNDINGS = 32.0
 """Roundings of the positions below which, for a residual as large as the forces, round-off dominates the residual."""
-SINGLE_EPS = 1.0e-10
+SINGLE_PRECISION_EPS = 1.0e-10
 """Round-off unit above which the precision is single."""
 VELOCITY_ROUNDINGS = 1.0e4
 """Roundings of a body's speed below which, in double precision, a velocity error is negligible."""
-REACTION_FRACTION = 1.0e-6
+STRAIN_ENERGY_FRACTION = 1.0e-6
 """Fraction of twice the strain energy in the squared scale of a residual group."""
 GROUP_ROUNDINGS = 8.0
 """Roundings of the positions below which, in double precision, the residual of one group of several is negligible."""
@@ -64,7 +75,7 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         traits.midpoint,
         traits.unilateral,
     )
-    BOUND = STALL_ROUNDINGS_MIDPOINT if midpoint else STALL_ROUNDINGS
+    MAX_STALL_ROUNDINGS = STALL_ROUNDINGS_MIDPOINT if midpoint else STALL_ROUNDINGS
 
     @wp.func
     def objective(ctl: Control, world: int) -> f64:
@@ -78,19 +89,19 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         replaces it.
         """
         if wp.static(midpoint):
-            return ctl.slot_sums[4, world]
+            return ctl.slot_sums[ROW_OBJECTIVE, world]
         energy = ctl.elem_sums[0, world] + ctl.elem_sums[1, world]
         if wp.static(stored):
             energy += ctl.term_sums[0, world]
-        return ctl.slot_sums[4, world] + energy / ctl.dq_dv[world]
+        return ctl.slot_sums[ROW_OBJECTIVE, world] + energy / ctl.dq_dv[world]
 
     @wp.func
-    def magnitude(ctl: Control, world: int) -> f64:
-        """Sum of the magnitudes of Phi's parts; the round-off of Phi is a few eps of it."""
+    def objective_magnitude(ctl: Control, world: int) -> f64:
+        """Sum of the magnitudes of the parts of Phi, in its unit; the round-off of Phi is a few eps of it."""
         energy = wp.abs(ctl.elem_sums[0, world]) + wp.abs(ctl.elem_sums[1, world])
         if wp.static(stored):
             energy += ctl.term_sums[2, world]
-        return ctl.slot_sums[5, world] + energy / ctl.dq_dv[world]
+        return ctl.slot_sums[ROW_MAGNITUDE, world] + energy / ctl.dq_dv[world]
 
     @wp.func
     def allowed_violation(ctl: Control, world: int, tol: f64) -> f64:
@@ -101,7 +112,7 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         if (
             ctl.constraint_acceleration_tol > f64(0.0)
             and tol < f64(1.0e200)
-            and ctl.iterations[world] < CLOSING_ITERATIONS
+            and ctl.iterations[world] < TIGHT_CONSTRAINT_ITERATIONS
         ):
             tightened = ctl.constraint_acceleration_tol * ctl.dq_dv[world] * ctl.dq_dv[world]
             return wp.min(tol, wp.max(tightened, ctl.constraint_tol_min))
@@ -111,49 +122,64 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
     def largest_violation(ctl: Control, world: int) -> f64:
         """Largest constraint violation over all components, m."""
         largest = f64(0.0)
-        for c in range(ctl.components):
+        for c in range(ctl.component_count):
             largest = wp.max(largest, ctl.violation[world, c])
         return largest
 
     @wp.func
-    def squared_sums(ctl: Control, world: int, group: int):
+    def squared_group_norms(ctl: Control, world: int, group: int):
         """Squared norms of g, of the largest forces, and of the position round-off, of a residual group.
 
         A small fraction of the strain energy is included as reactions: a group between others may carry no load of its
         own.
         """
-        if ctl.groups == 1:
-            f2 = wp.max(ctl.slot_sums[1, world], wp.max(ctl.slot_sums[2, world], ctl.slot_sums[3, world]))
-            return wp.vec3d(ctl.slot_sums[0, world], f2, ctl.slot_sums[8, world])
+        if ctl.group_count == 1:
+            f2 = wp.max(
+                ctl.slot_sums[ROW_INTERNAL, world],
+                wp.max(ctl.slot_sums[ROW_LOADS, world], ctl.slot_sums[ROW_INERTIA, world]),
+            )
+            return wp.vec3d(ctl.slot_sums[ROW_RESIDUAL, world], f2, ctl.slot_sums[ROW_ROUNDOFF, world])
         f2 = wp.max(
-            ctl.group_sums[1, world, group], wp.max(ctl.group_sums[2, world, group], ctl.group_sums[3, world, group])
+            ctl.group_sums[ROW_INTERNAL, world, group],
+            wp.max(ctl.group_sums[ROW_LOADS, world, group], ctl.group_sums[ROW_INERTIA, world, group]),
         )
-        stress = f64(2.0) * f64(REACTION_FRACTION) * wp.abs(ctl.group_sums[5, world, group]) / ctl.dq_dv[world]
-        return wp.vec3d(ctl.group_sums[0, world, group], wp.max(f2, stress), ctl.group_sums[4, world, group])
+        stress = (
+            f64(2.0)
+            * f64(STRAIN_ENERGY_FRACTION)
+            * wp.abs(ctl.group_sums[GROUP_STRAIN_ENERGY, world, group])
+            / ctl.dq_dv[world]
+        )
+        return wp.vec3d(
+            ctl.group_sums[ROW_RESIDUAL, world, group], wp.max(f2, stress), ctl.group_sums[GROUP_ROUNDOFF, world, group]
+        )
 
     @wp.func
-    def is_unsolved_beside_stiff(ctl: Control, world: int) -> bool:
+    def is_unsolved_unlike_stiffness(ctl: Control, world: int) -> bool:
         """True in float32 at a first iterate of motion where bodies have parts of unlike stiffness."""
-        first = ctl.iterations[world] == 0 and ctl.equilibrium == 0
-        return first and ctl.groups > ctl.components and ctl.eps > f64(SINGLE_EPS)
+        first = ctl.iterations[world] == 0 and ctl.is_static == 0
+        return first and ctl.group_count > ctl.component_count and ctl.eps > f64(SINGLE_PRECISION_EPS)
 
     @wp.func
     def component_sum(ctl: Control, world: int, group: int, row: int) -> f64:
         """Sum of a row of `group_sums` over the groups of a group's component."""
         total = f64(0.0)
-        for other in range(ctl.groups):
+        for other in range(ctl.group_count):
             if ctl.component_of_group[other] == ctl.component_of_group[group]:
                 total += ctl.group_sums[row, world, other]
         return total
 
     @wp.func
-    def within_roundoff(ctl: Control, world: int, group: int, norm: f64, rounding: f64) -> bool:
+    def is_group_roundoff(ctl: Control, world: int, group: int, norm: f64, rounding: f64) -> bool:
         """True in float64 if a group's residual is position round-off, and within the tolerance of all groups of its
         component: further iterations would not reduce it."""
-        if ctl.groups == ctl.components or ctl.eps > f64(SINGLE_EPS) or norm > f64(GROUP_ROUNDINGS) * rounding:
+        if (
+            ctl.group_count == ctl.component_count
+            or ctl.eps > f64(SINGLE_PRECISION_EPS)
+            or norm > f64(GROUP_ROUNDINGS) * rounding
+        ):
             return False
-        internal, loads = component_sum(ctl, world, group, 1), component_sum(ctl, world, group, 2)
-        return norm <= ctl.tol * wp.sqrt(wp.max(internal, wp.max(loads, component_sum(ctl, world, group, 3))))
+        internal, loads = component_sum(ctl, world, group, ROW_INTERNAL), component_sum(ctl, world, group, ROW_LOADS)
+        return norm <= ctl.tol * wp.sqrt(wp.max(internal, wp.max(loads, component_sum(ctl, world, group, ROW_INERTIA))))
 
     @wp.func
     def evaluate_norms(ctl: Control, world: int):
@@ -162,33 +188,33 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         The forces of one component or stiff material must not hide the residual of another; a component of the model
         whose groups have all converged is excluded from further solves.
         """
-        force = wp.sqrt(ctl.slot_sums[9, world])
-        ctl.force[world] = force
+        force = wp.sqrt(ctl.slot_sums[ROW_FORCE, world])
+        ctl.residual_force[world] = force
         largest = f64(0.0)
         worst = f64(0.0)
         excess = f64(0.0)
         floor_excess = f64(0.0)
         solve = f64(0.0)
-        solve_accept = f64(1.0e300)
-        for c in range(ctl.components):
+        unconverged_tol = f64(1.0e300)
+        for c in range(ctl.component_count):
             ctl.component_converged[world, c] = 1
-        for group in range(ctl.groups):
-            sums = squared_sums(ctl, world, group)
+        for group in range(ctl.group_count):
+            sums = squared_group_norms(ctl, world, group)
             g2 = sums[0]
             norm = wp.sqrt(g2)
             scale = wp.sqrt(sums[1])
-            accept = (ctl.tol + f64(ROUNDING_TOL) * ctl.eps) * scale
+            accepted_norm = (ctl.tol + f64(TOL_ROUNDINGS) * ctl.eps) * scale
             if force > f64(0.0):
                 # the force tolerance in this norm, by their ratio at this iterate
-                accept = wp.max(accept, norm * (ctl.force_tol / force))
-            if ctl.predicted[world] != 0:
-                accept = f64(PREDICTED_TOL) * accept
-            elif is_unsolved_beside_stiff(ctl, world):
-                accept = f64(UNSOLVED_TOL) * accept
+                accepted_norm = wp.max(accepted_norm, norm * (ctl.force_tol / force))
+            if ctl.extrapolated_start[world] != 0:
+                accepted_norm = f64(EXTRAPOLATED_TOL_FACTOR) * accepted_norm
+            elif is_unsolved_unlike_stiffness(ctl, world):
+                accepted_norm = f64(UNSOLVED_TOL_FACTOR) * accepted_norm
             rounding = f64(2.0) * ctl.eps * wp.sqrt(sums[2])
-            if norm > accept and within_roundoff(ctl, world, group, norm, rounding):
-                accept = norm
-            unconverged = norm > accept
+            if norm > accepted_norm and is_group_roundoff(ctl, world, group, norm, rounding):
+                accepted_norm = norm
+            unconverged = norm > accepted_norm
             if wp.static(has_constraints):
                 allowed = allowed_violation(ctl, world, ctl.constraint_tol)
                 violation = ctl.violation[world, ctl.component_of_group[group]]
@@ -199,48 +225,48 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
             if unconverged:
                 ctl.component_converged[world, ctl.component_of_group[group]] = 0
                 solve += g2
-                solve_accept = wp.min(solve_accept, accept)
-                if ctl.groups > ctl.components:  # forces between groups have the round-off of both
-                    rounding = f64(2.0) * ctl.eps * wp.sqrt(component_sum(ctl, world, group, 4))
+                unconverged_tol = wp.min(unconverged_tol, accepted_norm)
+                if ctl.group_count > ctl.component_count:  # forces between groups have the round-off of both
+                    rounding = f64(2.0) * ctl.eps * wp.sqrt(component_sum(ctl, world, group, GROUP_ROUNDOFF))
                 if wp.static(has_constraints):
-                    if ctl.classical != 0:  # the residual contains rho c: position round-off times kappa
+                    if ctl.classical_multipliers != 0:  # the residual contains rho c: position round-off times kappa
                         rounding = rounding / (ctl.penalty_norm_ratio * ctl.penalty_norm_ratio)
                 floor_excess = wp.max(floor_excess, norm / (rounding + f64(1.0e-300)))
             largest = wp.max(largest, norm / wp.max(scale, f64(1.0e-300)))
-            worst = wp.max(worst, norm / wp.max(accept, f64(1.0e-300)))
+            worst = wp.max(worst, norm / wp.max(accepted_norm, f64(1.0e-300)))
         if wp.static(has_constraints):
             ctl.violation_ratio[world] = largest_violation(ctl, world) / allowed_violation(
                 ctl, world, ctl.constraint_tol
             )
-        ctl.norm[world] = wp.sqrt(ctl.slot_sums[0, world])
+        ctl.residual_norm[world] = wp.sqrt(ctl.slot_sums[ROW_RESIDUAL, world])
         ctl.relative_residual[world] = largest
         ctl.residual_ratio[world] = worst
         ctl.convergence_ratio[world] = wp.max(excess, worst)
         ctl.rounding_ratio[world] = floor_excess
         ctl.unconverged_norm[world] = wp.sqrt(solve)
-        ctl.unconverged_tol[world] = solve_accept
+        ctl.unconverged_tol[world] = unconverged_tol
 
     @wp.func
     def record_residual(ctl: Control, world: int):
         """Store the relative residual of the iterate, for messages."""
         k = ctl.iterations[world]
-        if k < ctl.history.shape[1]:
-            ctl.history[world, k] = ctl.relative_residual[world]
+        if k < ctl.residual_history.shape[1]:
+            ctl.residual_history[world, k] = ctl.relative_residual[world]
 
     @wp.func
-    def unsatisfied(ctl: Control, world: int) -> bool:
+    def is_only_constraint_violated(ctl: Control, world: int) -> bool:
         """True if forces balance but constraints are violated: more iterations only raise the multipliers."""
         balanced = wp.max(ctl.tol, wp.min(f64(1.0e3) * ctl.tol, f64(1.0e-4)))
         return ctl.relative_residual[world] <= balanced and ctl.violation_ratio[world] > f64(1.0)
 
     @wp.func
-    def accept(ctl: Control, world: int):
+    def accept_iterate(ctl: Control, world: int):
         """End the iteration with this iterate; with J <= 0 it is checked again."""
         ctl.active[world] = 0
         ctl.searching[world] = 0
         if ctl.refuse_inversion != 0 and ctl.min_J[world] <= f64(0.0):
             ctl.inversion_suspected[world] = 1
-            wp.atomic_max(ctl.any_rare, 0, 1)
+            wp.atomic_max(ctl.any_rare_branch, 0, 1)
 
     @wp.func
     def request_error_estimate(ctl: Control, world: int):
@@ -253,23 +279,32 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
     def iteration_factor(ctl: Control, world: int) -> int:
         """Factor on `max_iterations` of an attempt: larger for a start far from the solution, or after negative
         curvature with a law that has its own tangent, since shorter steps meet it again."""
-        far = wp.max(ctl.choose_initial[world], ctl.met_negative_curvature[world] * (1 - ctl.linear_stress))
-        return 1 + PATIENCE * far
+        far = wp.max(ctl.choose_first_iterate[world], ctl.met_negative_curvature[world] * (1 - ctl.linear_stress))
+        return 1 + EXTRA_ITERATION_FACTOR * far
 
     @wp.func
     def give_up(ctl: Control, world: int, why: int):
-        """End without convergence. A residual as large as the forces but below `NOISE_ROUNDINGS` roundings is reported
-        as round-off in single-precision statics, whatever the failure: a smaller load has smaller forces with the same
-        noise."""
+        """End without convergence, with the failure code `why`.
+
+        A residual as large as the forces but below `NOISE_DOMINATED_ROUNDINGS` roundings is reported as round-off in
+        single-precision statics, whatever the failure: a smaller load has smaller forces with the same noise.
+        """
         ctl.active[world] = 0
         ctl.searching[world] = 0
         ctl.failed[world] = why
         stuck = why == FAIL_ITERATIONS or why == FAIL_LINE_SEARCH or why == FAIL_CURVATURE
-        drowned = ctl.rounding_ratio[world] <= f64(NOISE_ROUNDINGS) and ctl.relative_residual[world] > f64(0.5)
-        if stuck and drowned and ctl.eps > f64(SINGLE_EPS) and ctl.iterations[world] > 0 and ctl.equilibrium != 0:
-            ctl.failed[world] = FAIL_FLOOR
+        drowned = ctl.rounding_ratio[world] <= f64(NOISE_DOMINATED_ROUNDINGS)
+        drowned = drowned and ctl.relative_residual[world] > f64(0.5)
+        if (
+            stuck
+            and drowned
+            and ctl.eps > f64(SINGLE_PRECISION_EPS)
+            and ctl.iterations[world] > 0
+            and ctl.is_static != 0
+        ):
+            ctl.failed[world] = FAIL_ROUNDOFF
         if wp.static(has_constraints):
-            if why != FAIL_NAN and why != FAIL_JACOBIAN and unsatisfied(ctl, world):
+            if why != FAIL_NAN and why != FAIL_JACOBIAN and is_only_constraint_violated(ctl, world):
                 ctl.failed[world] = FAIL_CONSTRAINT
 
     @wp.func
@@ -278,7 +313,7 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         round-off of their positions, and no other force may act."""
         fine = f64(VELOCITY_ROUNDINGS) * ctl.eps
         step = wp.abs(ctl.slope[world])
-        return ctl.eps < f64(SINGLE_EPS) and step <= fine * fine * ctl.slot_sums[10, world]
+        return ctl.eps < f64(SINGLE_PRECISION_EPS) and step <= fine * fine * ctl.slot_sums[ROW_KINETIC, world]
 
     @wp.func
     def check_convergence(ctl: Control, world: int):
@@ -286,13 +321,13 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         error estimate."""
         record_residual(ctl, world)
         # predicted energy change of the last step, relative to the energy
-        energy = f64(2.0) * wp.abs(ctl.elem_sums[0, world]) + ctl.dq_dv[world] * ctl.slot_sums[5, world]
+        energy = f64(2.0) * wp.abs(ctl.elem_sums[0, world]) + ctl.dq_dv[world] * ctl.slot_sums[ROW_MAGNITUDE, world]
         step = wp.abs(ctl.slope[world]) * ctl.dq_dv[world]
-        most = f64(STALL_STEP) * ctl.max_floor
+        most = f64(MAX_STALL_STEP) * ctl.max_floor_error
         limit = ctl.max_iterations * iteration_factor(ctl, world)
         settling = step <= most * most * energy or ctl.iterations[world] + 1 >= limit
-        alike = f64(ENERGY_ROUNDINGS) * ctl.eps
-        near = ctl.rounding_ratio[world] <= f64(BOUND)
+        alike = f64(STALL_ENERGY_ROUNDINGS) * ctl.eps
+        near = ctl.rounding_ratio[world] <= f64(MAX_STALL_ROUNDINGS)
         if wp.static(not midpoint) and not near and ctl.rounding_ratio[world] < f64(1.0e300):  # g.p: no energy
             near = step <= alike * alike * energy
         if wp.static(unilateral):
@@ -300,31 +335,31 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
                 near = True
                 settling = True
         near = near and ctl.error_estimates[world] < MAX_ERROR_ESTIMATES
-        still = ctl.reduction[world] > f64(STALLED) and ctl.reused[world] == 0
+        still = ctl.residual_reduction[world] > f64(STALL_RATIO) and ctl.operator_reused[world] == 0
         if ctl.convergence_ratio[world] <= f64(1.0):
-            accept(ctl, world)
+            accept_iterate(ctl, world)
         elif near and ctl.iterations[world] > 0 and still and settling:
             request_error_estimate(ctl, world)
         elif ctl.iterations[world] >= limit:
             give_up(ctl, world, FAIL_ITERATIONS)
 
     @wp.func
-    def fail(ctl: Control, world: int, why: int):
-        """Handle a failed search: if round-off may explain it, keep the iterate and request an error estimate."""
-        at_roundoff = ctl.rounding_ratio[world] <= f64(BOUND)
+    def handle_failed_search(ctl: Control, world: int, why: int):
+        """Failed search: if round-off may explain it, keep the iterate and request an error estimate, else give up."""
+        at_roundoff = ctl.rounding_ratio[world] <= f64(MAX_STALL_ROUNDINGS)
         if wp.static(unilateral):
             at_roundoff = at_roundoff or is_velocity_roundoff(ctl, world)
         near = at_roundoff and ctl.error_estimates[world] < MAX_ERROR_ESTIMATES
-        at_roundoff = at_roundoff or ctl.eps > f64(SINGLE_EPS)
+        at_roundoff = at_roundoff or ctl.eps > f64(SINGLE_PRECISION_EPS)
         enough = False
         if wp.static(has_constraints):  # only accelerations need the tighter tolerance, which round-off prevents
             if (
                 ctl.constraint_acceleration_tol > f64(0.0)
-                and ctl.relative_residual[world] <= ctl.tol + f64(ROUNDING_TOL) * ctl.eps
+                and ctl.relative_residual[world] <= ctl.tol + f64(TOL_ROUNDINGS) * ctl.eps
             ):
                 enough = largest_violation(ctl, world) <= ctl.constraint_tol
         if enough and (why == FAIL_LINE_SEARCH or why == FAIL_CURVATURE):
-            accept(ctl, world)
+            accept_iterate(ctl, world)
         elif near and (why == FAIL_LINE_SEARCH or why == FAIL_CURVATURE):
             request_error_estimate(ctl, world)
             ctl.alpha[world] = f64(0.0)
@@ -333,13 +368,13 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
             and at_roundoff
             and ctl.error_estimate[world] < f64(1.0e30)
         ):
-            give_up(ctl, world, FAIL_FLOOR)
+            give_up(ctl, world, FAIL_ROUNDOFF)
         else:
             give_up(ctl, world, why)
 
     return _types.SimpleNamespace(
-        objective=objective, magnitude=magnitude, allowed_violation=allowed_violation,
+        objective=objective, objective_magnitude=objective_magnitude, allowed_violation=allowed_violation,
         largest_violation=largest_violation, evaluate_norms=evaluate_norms, record_residual=record_residual,
-        accept=accept, request_error_estimate=request_error_estimate, iteration_factor=iteration_factor,
-        give_up=give_up, check_convergence=check_convergence, fail=fail,
+        accept_iterate=accept_iterate, request_error_estimate=request_error_estimate, iteration_factor=iteration_factor,
+        give_up=give_up, check_convergence=check_convergence, handle_failed_search=handle_failed_search,
     )  # fmt: skip

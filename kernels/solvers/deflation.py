@@ -31,10 +31,10 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
     module = kernel_module(f"deflation_{dtype}")
 
     @wp.kernel(module=module)
-    def pair_blocks(
+    def assemble_pair_blocks(
         con: Constraints, inverse: wp.array2d(dtype=mat33), active: wp.array(dtype=wp.int32), mul: Multipliers
     ):
-        """sum w w' D^-1 over the common slots of two constraint vectors, with their weights w and w' there."""
+        """Sum of w w' D^-1 over the common slots of two constraint vectors, with their weights w and w' there."""
         world, block = wp.tid()
         if active[world] == 0:
             return
@@ -44,8 +44,10 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
         mul.compliance_block[world, block] = s
 
     @wp.func
-    def pair_sum(con: Constraints, mul: Multipliers, world: int, row: int, column: int, first: int, last: int) -> f64:
-        """Entry of J D^-1 J^T for two rows: sum over the pairs of their vectors with common slots."""
+    def delassus_entry(
+        con: Constraints, mul: Multipliers, world: int, row: int, column: int, first: int, last: int
+    ) -> f64:
+        """Entry of the Delassus matrix J D^-1 J^T of two rows: sum over pairs of their vectors with common slots."""
         s = f64(0.0)
         for k in range(first, last):
             side = con.pair_side[k]
@@ -55,15 +57,17 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
         return s
 
     @wp.kernel(module=module)
-    def assemble_coupling(con: Constraints, active: wp.array(dtype=wp.int32), mul: Multipliers):
+    def assemble_cluster_couplings(con: Constraints, active: wp.array(dtype=wp.int32), mul: Multipliers):
         """J D^-1 J^T between rows of different clusters, one thread per coupling."""
         world, k = wp.tid()
         if active[world] != 0:
             first, last = con.coupling_pair_start[k], con.coupling_pair_start[k + 1]
-            mul.coupling[world, k] = pair_sum(con, mul, world, con.coupling_row[k], con.coupling_column[k], first, last)
+            mul.coupling[world, k] = delassus_entry(
+                con, mul, world, con.coupling_row[k], con.coupling_column[k], first, last
+            )
 
     @wp.kernel(module=module)
-    def assemble_matrix(con: Constraints, active: wp.array(dtype=wp.int32), mul: Multipliers):
+    def assemble_cluster_matrices(con: Constraints, active: wp.array(dtype=wp.int32), mul: Multipliers):
         """J D^-1 J^T within each cluster, one thread per row."""
         world, row = wp.tid()
         if active[world] == 0:
@@ -73,10 +77,12 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
         base = con.matrix_start[con.cluster[row]] + (row - first) * n
         for column in range(n):
             start, end = con.pair_start[base + column], con.pair_start[base + column + 1]
-            mul.inverse_matrix[world, base + column] = pair_sum(con, mul, world, row, first + column, start, end)
+            mul.inverse_matrix[world, base + column] = delassus_entry(con, mul, world, row, first + column, start, end)
 
     @wp.kernel(module=module)
-    def penalty(con: Constraints, dq_dv: wp.array(dtype=f64), active: wp.array(dtype=wp.int32), mul: Multipliers):
+    def compute_penalty(
+        con: Constraints, dq_dv: wp.array(dtype=f64), active: wp.array(dtype=wp.int32), mul: Multipliers
+    ):
         """rho = kappa / ((dq/dv) (J D^-1 J^T)_ii), N/m, constant during a step.
 
         kappa is the ratio of rho to the stiffness of the constrained slots: independent of units, of the mesh and of E.
@@ -93,7 +99,7 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
         mul.penalty[world, row] = rho
 
     @wp.func
-    def regularise(con: Constraints, mul: Multipliers, dq: f64, world: int, cluster: int):
+    def add_penalty_compliance(con: Constraints, mul: Multipliers, dq: f64, world: int, cluster: int):
         """Add 1 / ((dq/dv) rho) to the diagonal of a cluster's matrix; 1 for rows without a free slot (rho = 0)."""
         first = con.cluster_start[cluster]
         n = con.cluster_start[cluster + 1] - first
@@ -118,7 +124,7 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
         world, cluster = wp.tid()
         if active[world] == 0:
             return
-        regularise(con, mul, dq_dv[world], world, cluster)
+        add_penalty_compliance(con, mul, dq_dv[world], world, cluster)
         n = con.cluster_start[cluster + 1] - con.cluster_start[cluster]
         if n > limit:
             return
@@ -140,14 +146,14 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
                         mul.inverse_matrix[world, base + i * n + j] = y
 
     @wp.kernel(module=module)
-    def eliminate(
+    def eliminate_pivot(
         con: Constraints,
         large: wp.array(dtype=wp.int32),
         pivot: int,
         active: wp.array(dtype=wp.int32),
         mul: Multipliers,
     ):
-        """One pivot of Gauss-Jordan in every large cluster, a thread per row; `scale_row` handles the row of the
+        """One pivot of Gauss-Jordan in every large cluster, a thread per row; `scale_pivot_row` handles the row of the
         pivot."""
         world, k, i = wp.tid()
         cluster = large[k]
@@ -165,14 +171,14 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
                 mul.inverse_matrix[world, base + i * n + j] = y
 
     @wp.kernel(module=module)
-    def scale_row(
+    def scale_pivot_row(
         con: Constraints,
         large: wp.array(dtype=wp.int32),
         pivot: int,
         active: wp.array(dtype=wp.int32),
         mul: Multipliers,
     ):
-        """The row of the pivot in a step of Gauss-Jordan, after `eliminate`."""
+        """The row of the pivot in a step of Gauss-Jordan, after `eliminate_pivot`."""
         world, k = wp.tid()
         cluster = large[k]
         n = con.cluster_start[cluster + 1] - con.cluster_start[cluster]
@@ -185,15 +191,17 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
             mul.inverse_matrix[world, base + j] = d * mul.inverse_matrix[world, base + j]
 
     @wp.kernel(module=module)
-    def restrict(con: Constraints, mul: Multipliers, z: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32)):
-        """J z."""
+    def restrict_to_constraints(
+        con: Constraints, mul: Multipliers, z: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32)
+    ):
+        """restricted = J z, one thread per row."""
         world, row = wp.tid()
         if active[world] != 0:
             mul.deflation_rhs[world, row] = directional_derivative(con, mul.gradient, z, world, row)
 
     @wp.kernel(module=module)
-    def solve_clusters(con: Constraints, mul: Multipliers, active: wp.array(dtype=wp.int32)):
-        """s = the inverse of each cluster's matrix times J z, one thread per row."""
+    def apply_cluster_inverses(con: Constraints, mul: Multipliers, active: wp.array(dtype=wp.int32)):
+        """s, `solved` = the inverse of each cluster's matrix times J z, one thread per row."""
         world, row = wp.tid()
         if active[world] == 0:
             return
@@ -206,7 +214,7 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
         mul.deflation_solution[world, row] = s
 
     @wp.kernel(module=module)
-    def sweep(
+    def gauss_seidel_sweep(
         con: Constraints,
         mul: Multipliers,
         first_cluster: int,
@@ -245,7 +253,7 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
             mul.deflation_solution[world, first + i] = s
 
     @wp.kernel(module=module)
-    def project(
+    def subtract_constraint_part(
         con: Constraints,
         mul: Multipliers,
         inverse: wp.array2d(dtype=mat33),
@@ -283,15 +291,15 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
 
     return _types.SimpleNamespace(
         module=module,
-        pair_blocks=pair_blocks,
-        assemble_matrix=assemble_matrix,
-        assemble_coupling=assemble_coupling,
-        penalty=penalty,
+        assemble_pair_blocks=assemble_pair_blocks,
+        assemble_cluster_matrices=assemble_cluster_matrices,
+        assemble_cluster_couplings=assemble_cluster_couplings,
+        compute_penalty=compute_penalty,
         invert_clusters=invert_clusters,
-        eliminate=eliminate,
-        scale_row=scale_row,
-        restrict=restrict,
-        solve_clusters=solve_clusters,
-        sweep=sweep,
-        project=project,
+        eliminate_pivot=eliminate_pivot,
+        scale_pivot_row=scale_pivot_row,
+        restrict_to_constraints=restrict_to_constraints,
+        apply_cluster_inverses=apply_cluster_inverses,
+        gauss_seidel_sweep=gauss_seidel_sweep,
+        subtract_constraint_part=subtract_constraint_part,
     )

@@ -14,7 +14,7 @@ __all__ = ["dense_component_kernels"]
 
 @functools.cache
 def dense_component_kernels(dtype: str) -> _types.SimpleNamespace:
-    """Kernels in one precision. `slot`: [component, position] or -1; `part_of`, `place_of`: [slot]."""
+    """Kernels in one precision. `slot`: [component, position] or -1; `component_of`, `position_of`: [slot]."""
     p = precision(dtype)
     T, mat33 = p.T, p.mat33
     Pattern = pattern_struct()
@@ -22,15 +22,15 @@ def dense_component_kernels(dtype: str) -> _types.SimpleNamespace:
     module = kernel_module(f"parts_{dtype}", max_unroll=SHORT_UNROLL)
 
     @wp.kernel(module=module)
-    def spread(flags: wp.array(dtype=wp.int32), out: wp.array(dtype=wp.int32)):
+    def copy_flags_to_components(flags: wp.array(dtype=wp.int32), out: wp.array(dtype=wp.int32)):
         """World flags copied to each component."""
         block = wp.tid()
         out[block] = flags[block / (out.shape[0] / flags.shape[0])]
 
     @wp.kernel(module=module)
-    def fill_parts(
+    def fill_components(
         pattern: Pattern, value: wp.array2d(dtype=mat33), slot: wp.array2d(dtype=wp.int32),
-        place_of: wp.array(dtype=wp.int32), flags: wp.array(dtype=wp.int32), scale: wp.array2d(dtype=T),
+        position_of: wp.array(dtype=wp.int32), flags: wp.array(dtype=wp.int32), scale: wp.array2d(dtype=T),
         matrix: wp.array3d(dtype=T),
     ):  # fmt: skip
         """A as dense matrices, and its diagonal; rows without a slot are zero."""
@@ -40,11 +40,11 @@ def dense_component_kernels(dtype: str) -> _types.SimpleNamespace:
         for j in range(matrix.shape[2]):
             matrix[block, row, j] = T(0.0)
         scale[block, row] = T(0.0)
-        place = row / 3
-        part = block % slot.shape[0]
-        if place >= slot.shape[1]:
+        position = row / 3
+        component = block % slot.shape[0]
+        if position >= slot.shape[1]:
             return
-        own = slot[part, place]
+        own = slot[component, position]
         if own < 0:
             return
         i = row % 3
@@ -52,12 +52,12 @@ def dense_component_kernels(dtype: str) -> _types.SimpleNamespace:
             A = value[block / slot.shape[0], k]
             other = pattern.column[k]
             for j in range(3):
-                matrix[block, row, 3 * place_of[other] + j] = A[i, j]
+                matrix[block, row, 3 * position_of[other] + j] = A[i, j]
             if other == own:
                 scale[block, row] = A[i, i]
 
     @wp.kernel(module=module)
-    def apply_parts(
+    def apply_component_inverses(
         matrix: wp.array3d(dtype=T), slot: wp.array2d(dtype=wp.int32), lanes: int, r: wp.array2d(dtype=T),
         active: wp.array(dtype=wp.int32), x: wp.array2d(dtype=T),
     ):  # fmt: skip
@@ -67,18 +67,23 @@ def dense_component_kernels(dtype: str) -> _types.SimpleNamespace:
             return
         n = 3 * slot.shape[1]
         row = wp.min(index / lanes, slot.shape[0] * n - 1)
-        part = row / n
+        component = row / n
         i = row % n
-        own = slot[part, i / 3]
-        block = world * slot.shape[0] + part
+        own = slot[component, i / 3]
+        block = world * slot.shape[0] + component
         s = T(0.0)
         if own >= 0:
             for j in range(index % lanes, n, lanes):
-                other = slot[part, j / 3]
+                other = slot[component, j / 3]
                 if other >= 0:
                     s += matrix[block, i, j] * r[world, 3 * other + j % 3]
         s = scalar_sum(s, lanes)
         if index % lanes == 0 and own >= 0:
             x[world, 3 * own + i % 3] = s
 
-    return _types.SimpleNamespace(module=module, spread=spread, fill_parts=fill_parts, apply_parts=apply_parts)
+    return _types.SimpleNamespace(
+        module=module,
+        copy_flags_to_components=copy_flags_to_components,
+        fill_components=fill_components,
+        apply_component_inverses=apply_component_inverses,
+    )

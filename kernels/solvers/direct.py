@@ -10,21 +10,21 @@ from ..common.lanes import lane_functions
 from ..common.structs import pattern_struct, topology_struct
 from ..common.types import kernel_module, precision
 
-__all__ = ["direct_kernels", "followed_struct"]
+__all__ = ["direct_kernels", "follower_pattern_struct"]
 
 
 @functools.cache
-def followed_struct():
-    """Positions of the matrices of follower loads in the pattern."""
+def follower_pattern_struct():
+    """Positions of the matrices of follower loads in the pattern: an entry k gathers start[k] .. start[k + 1] - 1."""
 
     @wp.struct
-    class Followed:
-        entry: wp.array(dtype=wp.int32)  # [k] index into Pattern.upper
+    class FollowerPattern:
+        entry: wp.array(dtype=wp.int32)  # [k] index into Pattern.upper of the block
         start: wp.array(dtype=wp.int32)  # [k + 1]
-        row: wp.array(dtype=wp.int32)  # local slot of an item, local * count + item
-        column: wp.array(dtype=wp.int32)  # local
+        row: wp.array(dtype=wp.int32)  # row of a contribution, as local slot of a load: local * count + load
+        column: wp.array(dtype=wp.int32)  # its column, as local slot
 
-    return Followed
+    return FollowerPattern
 
 
 @functools.cache
@@ -33,13 +33,13 @@ def direct_kernels(dtype: str) -> _types.SimpleNamespace:
     p = precision(dtype)
     T, vec3, mat33 = p.T, p.vec3, p.mat33
     f64 = wp.float64
-    Topology, Pattern, Followed = topology_struct(dtype), pattern_struct(), followed_struct()
+    Topology, Pattern, FollowerPattern = topology_struct(dtype), pattern_struct(), follower_pattern_struct()
     add_block = add_block_function(dtype)
     row_sum = lane_functions(dtype).row_sum
     module = kernel_module(f"direct_{dtype}")
 
     @wp.kernel(module=module)
-    def take_local(
+    def gather_local(
         conn: wp.array2d(dtype=wp.int32),
         u: wp.array2d(dtype=vec3),
         active: wp.array(dtype=wp.int32),
@@ -51,7 +51,7 @@ def direct_kernels(dtype: str) -> _types.SimpleNamespace:
             out[world, local * conn.shape[1] + item] = u[world, conn[local, item]]
 
     @wp.kernel(module=module)
-    def unit_direction(local: int, component: int, count: int, out: wp.array2d(dtype=vec3)):
+    def set_unit_direction(local: int, component: int, count: int, out: wp.array2d(dtype=vec3)):
         """A unit component at one local slot of every item, else 0."""
         world, k = wp.tid()
         e = vec3()
@@ -60,10 +60,10 @@ def direct_kernels(dtype: str) -> _types.SimpleNamespace:
         out[world, k] = e
 
     @wp.kernel(module=module)
-    def add_followers(
+    def add_follower_matrices(
         topo: Topology,
         pattern: Pattern,
-        places: Followed,
+        places: FollowerPattern,
         columns: wp.array3d(dtype=vec3),
         dq_dv: wp.array(dtype=f64),
         active: wp.array(dtype=wp.int32),
@@ -82,7 +82,7 @@ def direct_kernels(dtype: str) -> _types.SimpleNamespace:
         add_block(topo, pattern.upper[places.entry[item]], -T(dq_dv[world]) * A, world, value)
 
     @wp.kernel(module=module)
-    def dot_rows(
+    def dot_partials(
         r: wp.array2d(dtype=vec3),
         z: wp.array2d(dtype=vec3),
         diagonal: wp.array2d(dtype=vec3),
@@ -108,8 +108,8 @@ def direct_kernels(dtype: str) -> _types.SimpleNamespace:
 
     return _types.SimpleNamespace(
         module=module,
-        take_local=take_local,
-        unit_direction=unit_direction,
-        add_followers=add_followers,
-        dot_rows=dot_rows,
+        gather_local=gather_local,
+        set_unit_direction=set_unit_direction,
+        add_follower_matrices=add_follower_matrices,
+        dot_partials=dot_partials,
     )

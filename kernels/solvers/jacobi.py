@@ -13,14 +13,22 @@ from ..common.traits import Traits
 from ..common.types import kernel_module, precision
 from .convergence import convergence_functions
 from .newton import newton_kernels
-from .newton_control import FAIL_CONSTRAINT, FAIL_GROWTH, FAIL_JACOBIAN, FAIL_LIMIT, FAIL_NAN, control_struct
+from .newton_control import (
+    FAIL_CONSTRAINT,
+    FAIL_JACOBIAN,
+    FAIL_NAN,
+    FAIL_RESIDUAL_GROWTH,
+    FAIL_STEP_LIMIT,
+    control_struct,
+)
 from .pcg import pcg_struct
 
-__all__ = ["PAIRS", "jacobi_kernels", "jacobi_struct"]
+__all__ = ["MAX_PAIRS", "jacobi_kernels", "jacobi_struct"]
 
-PAIRS = 4
-"""Stored moves: 1 and 3 to 5 were tried, and beyond 3 the number hardly matters."""
-DEPENDENT = 1.0e-10  # a pivot below this fraction of its diagonal: the move depends linearly on the others
+MAX_PAIRS = 4
+"""Number of stored moves: 1 and 3 to 5 were tried, and beyond 3 the number hardly matters."""
+DEPENDENT_PIVOT_RATIO = 1.0e-10
+"""Pivot of the Gram matrix over its diagonal below which a move depends linearly on the others."""
 
 
 @functools.cache
@@ -29,18 +37,18 @@ def jacobi_struct():
 
     @wp.struct
     class JacobiControl:
-        gram: wp.array3d(dtype=wp.float64)  # [world, pair, pair] s_i . y_j
-        factor: wp.array3d(dtype=wp.float64)  # its Cholesky factor, newest pair first
-        right: wp.array2d(dtype=wp.float64)  # [world, pair] right side, newest first
+        gram_matrix: wp.array3d(dtype=wp.float64)  # [world, pair, pair] s_i . y_j
+        gram_factor: wp.array3d(dtype=wp.float64)  # [world, pair, pair] its Cholesky factor, newest pair first
+        right_side: wp.array2d(dtype=wp.float64)  # [world, pair] of the Gram system, newest first
         gamma: wp.array2d(dtype=wp.float64)  # [world, pair] coefficient of each pair in the move
-        sums: wp.array2d(dtype=wp.float64)  # [2 PAIRS, world]
+        sums: wp.array2d(dtype=wp.float64)  # [2 MAX_PAIRS, world] of the rows of `store_pair`: s_j.y, then s_j.r
         first_norm: wp.array(dtype=wp.float64)  # |g| at the start of the attempt
-        rho: wp.array(dtype=wp.float64)  # of the Chebyshev recursion
-        growth: wp.float64  # largest |g| over that of the start; beyond it a step is rejected
-        gap: wp.float64  # m, largest constraint violation; beyond it a step is rejected
-        step: wp.float64  # factor of B r
-        centre: wp.float64  # of the interval of eigenvalues of B H in the Chebyshev recursion
-        half: wp.float64  # half width of the interval
+        chebyshev_rho: wp.array(dtype=wp.float64)  # of the Chebyshev recursion
+        max_growth: wp.float64  # largest |g| over that of the start; beyond it a step is rejected
+        max_violation: wp.float64  # m, largest constraint violation; beyond it a step is rejected
+        step_length: wp.float64  # factor of B r
+        eigenvalue_centre: wp.float64  # of the interval of eigenvalues of B H in the Chebyshev recursion
+        eigenvalue_half_width: wp.float64  # of the same interval
 
     return JacobiControl
 
@@ -53,7 +61,11 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
     f64 = wp.float64
     Newton, PCG, Jacobi = control_struct(), pcg_struct(), jacobi_struct()
     shared = newton_kernels(traits)
-    evaluate_norms, record_residual, accept = shared.evaluate_norms, shared.record_residual, shared.accept
+    evaluate_norms, record_residual, accept_iterate = (
+        shared.evaluate_norms,
+        shared.record_residual,
+        shared.accept_iterate,
+    )
     allowed_violation = convergence_functions(traits).allowed_violation
     paired = acceleration in ("secants", "anderson")
     module = kernel_module(f"jacobi_{dtype}_{acceleration}{traits.suffix('stored', 'has_constraints', 'limited')}")
@@ -62,7 +74,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
     def check_convergence(ctl: Newton, jac: Jacobi, world: int):
         """End a world's iterations on convergence, failure or at the iteration limit."""
         record_residual(ctl, world)
-        finite = wp.isfinite(ctl.norm[world]) and wp.isfinite(ctl.elem_sums[0, world])
+        finite = wp.isfinite(ctl.residual_norm[world]) and wp.isfinite(ctl.elem_sums[0, world])
         if wp.static(traits.stored):
             finite = finite and wp.isfinite(ctl.term_sums[0, world])
         barred = False
@@ -76,28 +88,28 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
             ctl.failed[world] = FAIL_NAN
         elif barred:
             ctl.active[world] = 0
-            ctl.failed[world] = FAIL_LIMIT
+            ctl.failed[world] = FAIL_STEP_LIMIT
         elif ctl.convergence_ratio[world] <= f64(1.0):
-            accept(ctl, world)
+            accept_iterate(ctl, world)
         elif ctl.iterations[world] >= ctl.max_iterations:
             ctl.active[world] = 0
-            if ctl.norm[world] > jac.growth * jac.first_norm[world]:
-                ctl.failed[world] = FAIL_GROWTH
+            if ctl.residual_norm[world] > jac.max_growth * jac.first_norm[world]:
+                ctl.failed[world] = FAIL_RESIDUAL_GROWTH
             if wp.static(traits.has_constraints):
-                if ctl.violation_ratio[world] * allowed_violation(ctl, world, ctl.constraint_tol) > jac.gap:
+                if ctl.violation_ratio[world] * allowed_violation(ctl, world, ctl.constraint_tol) > jac.max_violation:
                     ctl.failed[world] = FAIL_CONSTRAINT
             if ctl.failed[world] == 0:
-                ctl.rough[world] = 1
-                accept(ctl, world)
+                ctl.accepted_unconverged[world] = 1
+                accept_iterate(ctl, world)
 
     @wp.kernel(module=module)
-    def begin(ctl: Newton, jac: Jacobi):
+    def begin_iteration(ctl: Newton, jac: Jacobi):
         """Evaluate the norms of the first iterate and test convergence."""
         world = wp.tid()
         if ctl.active[world] == 0:
             return
         evaluate_norms(ctl, world)
-        jac.first_norm[world] = ctl.norm[world]
+        jac.first_norm[world] = ctl.residual_norm[world]
         ctl.alpha[world] = f64(1.0)
         check_convergence(ctl, jac, world)
 
@@ -109,13 +121,13 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
             return
         evaluate_norms(ctl, world)
         ctl.iterations[world] = ctl.iterations[world] + 1
-        ctl.total_iterations[world] = ctl.total_iterations[world] + 1
+        ctl.step_iterations[world] = ctl.step_iterations[world] + 1
         check_convergence(ctl, jac, world)
 
     @wp.func
-    def pair_of(k: int, age: int) -> int:
+    def pair_index(k: int, age: int) -> int:
         """Index of the pair of `age` moves ago at iteration k, in a ring buffer."""
-        return (k - 1 - age) % PAIRS
+        return (k - 1 - age) % MAX_PAIRS
 
     @wp.kernel(module=module)
     def store_pair(
@@ -140,58 +152,58 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
         k = ctl.iterations[world]
         change = vec3()
         if k > 0:
-            at = pair_of(k, 0)
+            at = pair_index(k, 0)
             change = before[world, slot] - new
             s[at, world, slot] = move[world, slot]
             y[at, world, slot] = change
         before[world, slot] = new
-        for j in range(PAIRS):
+        for j in range(MAX_PAIRS):
             w = vec3()
             if j < k:
                 w = s[j, world, slot]
             rows[j, world, slot] = f64(wp.dot(w, change))
-            rows[PAIRS + j, world, slot] = f64(wp.dot(w, new))
+            rows[MAX_PAIRS + j, world, slot] = f64(wp.dot(w, new))
 
     @wp.func
     def substitute(jac: Jacobi, world: int, k: int, count: int, add: f64):
         """gamma = add gamma + G^-1 right with the Cholesky factor of G; dependent pairs, of pivot 0, are omitted."""
         for i in range(count):
-            v = jac.right[world, i]
+            v = jac.right_side[world, i]
             for j in range(i):
-                v -= jac.factor[world, i, j] * jac.right[world, j]
-            if jac.factor[world, i, i] > f64(0.0):
-                jac.right[world, i] = v / jac.factor[world, i, i]
+                v -= jac.gram_factor[world, i, j] * jac.right_side[world, j]
+            if jac.gram_factor[world, i, i] > f64(0.0):
+                jac.right_side[world, i] = v / jac.gram_factor[world, i, i]
             else:
-                jac.right[world, i] = f64(0.0)
+                jac.right_side[world, i] = f64(0.0)
         for m in range(count):
             i = count - 1 - m
-            v = jac.right[world, i]
+            v = jac.right_side[world, i]
             for j in range(i + 1, count):
-                v -= jac.factor[world, j, i] * jac.right[world, j]
-            if jac.factor[world, i, i] > f64(0.0):
-                v = v / jac.factor[world, i, i]
+                v -= jac.gram_factor[world, j, i] * jac.right_side[world, j]
+            if jac.gram_factor[world, i, i] > f64(0.0):
+                v = v / jac.gram_factor[world, i, i]
             else:
                 v = f64(0.0)
-            jac.right[world, i] = v
-            at = pair_of(k, i)
+            jac.right_side[world, i] = v
+            at = pair_index(k, i)
             jac.gamma[world, at] = add * jac.gamma[world, at] + v
 
     @wp.kernel(module=module)
-    def recursion(ctl: Newton, jac: Jacobi):
+    def chebyshev_coefficients(ctl: Newton, jac: Jacobi):
         """Factors gamma of the last move and of z in the Chebyshev iteration for eigenvalues in centre -+ half."""
         world = wp.tid()
         if ctl.active[world] == 0:
             return
-        ratio = jac.centre / jac.half
+        ratio = jac.eigenvalue_centre / jac.eigenvalue_half_width
         if ctl.iterations[world] == 0:
-            jac.rho[world] = f64(1.0) / ratio
+            jac.chebyshev_rho[world] = f64(1.0) / ratio
             jac.gamma[world, 0] = f64(0.0)
-            jac.gamma[world, 1] = f64(1.0) / jac.centre
+            jac.gamma[world, 1] = f64(1.0) / jac.eigenvalue_centre
         else:
-            new = f64(1.0) / (f64(2.0) * ratio - jac.rho[world])
-            jac.gamma[world, 0] = new * jac.rho[world]
-            jac.gamma[world, 1] = f64(2.0) * new / jac.half
-            jac.rho[world] = new
+            new = f64(1.0) / (f64(2.0) * ratio - jac.chebyshev_rho[world])
+            jac.gamma[world, 0] = new * jac.chebyshev_rho[world]
+            jac.gamma[world, 1] = f64(2.0) * new / jac.eigenvalue_half_width
+            jac.chebyshev_rho[world] = new
 
     @wp.kernel(module=module)
     def solve_gram(ctl: Newton, jac: Jacobi):
@@ -201,69 +213,71 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
         if ctl.active[world] == 0:
             return
         k = ctl.iterations[world]
-        for j in range(PAIRS):
+        for j in range(MAX_PAIRS):
             jac.gamma[world, j] = f64(0.0)
-        count = wp.min(k, PAIRS)
+        count = wp.min(k, MAX_PAIRS)
         if count == 0:
             return
-        at = pair_of(k, 0)
-        for j in range(PAIRS):
-            jac.gram[world, at, j] = jac.sums[j, world]
-            jac.gram[world, j, at] = jac.sums[j, world]
+        at = pair_index(k, 0)
+        for j in range(MAX_PAIRS):
+            jac.gram_matrix[world, at, j] = jac.sums[j, world]
+            jac.gram_matrix[world, j, at] = jac.sums[j, world]
         for i in range(count):
-            a = pair_of(k, i)
-            jac.right[world, i] = jac.sums[PAIRS + a, world]
+            a = pair_index(k, i)
+            jac.right_side[world, i] = jac.sums[MAX_PAIRS + a, world]
             for j in range(i + 1):
-                v = jac.gram[world, a, pair_of(k, j)]
+                v = jac.gram_matrix[world, a, pair_index(k, j)]
                 for m in range(j):
-                    v -= jac.factor[world, i, m] * jac.factor[world, j, m]
+                    v -= jac.gram_factor[world, i, m] * jac.gram_factor[world, j, m]
                 if j == i:
-                    if v > f64(DEPENDENT) * wp.abs(jac.gram[world, a, a]):
-                        jac.factor[world, i, i] = wp.sqrt(v)
+                    if v > f64(DEPENDENT_PIVOT_RATIO) * wp.abs(jac.gram_matrix[world, a, a]):
+                        jac.gram_factor[world, i, i] = wp.sqrt(v)
                     else:
-                        jac.factor[world, i, i] = f64(0.0)
-                elif jac.factor[world, j, j] > f64(0.0):
-                    jac.factor[world, i, j] = v / jac.factor[world, j, j]
+                        jac.gram_factor[world, i, i] = f64(0.0)
+                elif jac.gram_factor[world, j, j] > f64(0.0):
+                    jac.gram_factor[world, i, j] = v / jac.gram_factor[world, j, j]
                 else:
-                    jac.factor[world, i, j] = f64(0.0)
+                    jac.gram_factor[world, i, j] = f64(0.0)
         substitute(jac, world, k, count, f64(0.0))
 
     @wp.kernel(module=module)
-    def project(ctl: Newton, jac: Jacobi, y: wp.array3d(dtype=vec3), r: wp.array2d(dtype=vec3)):
+    def project_residual(ctl: Newton, jac: Jacobi, y: wp.array3d(dtype=vec3), r: wp.array2d(dtype=vec3)):
         """Residual after the projection on the pairs, r -= Y gamma."""
         world, slot = wp.tid()
         if ctl.active[world] == 0:
             return
         a = r[world, slot]
-        for j in range(wp.min(ctl.iterations[world], PAIRS)):
+        for j in range(wp.min(ctl.iterations[world], MAX_PAIRS)):
             a -= T(jac.gamma[world, j]) * y[j, world, slot]
         r[world, slot] = a
 
     @wp.kernel(module=module)
-    def conjugate_rows(ctl: Newton, y: wp.array3d(dtype=vec3), z: wp.array2d(dtype=vec3), rows: wp.array3d(dtype=f64)):
-        """Rows y_j.z."""
+    def conjugation_dot_terms(
+        ctl: Newton, y: wp.array3d(dtype=vec3), z: wp.array2d(dtype=vec3), rows: wp.array3d(dtype=f64)
+    ):
+        """Rows: y_j.z of all pairs, per slot."""
         world, slot = wp.tid()
         if ctl.active[world] == 0:
             return
-        for j in range(PAIRS):
+        for j in range(MAX_PAIRS):
             rows[j, world, slot] = f64(0.0)
             if j < ctl.iterations[world]:
                 rows[j, world, slot] = f64(wp.dot(y[j, world, slot], z[world, slot]))
 
     @wp.kernel(module=module)
-    def conjugate(ctl: Newton, jac: Jacobi):
+    def conjugate_move(ctl: Newton, jac: Jacobi):
         """gamma -= step G^-1 Y^T z: makes the move conjugate to the pairs."""
         world = wp.tid()
         if ctl.active[world] == 0:
             return
         k = ctl.iterations[world]
-        count = wp.min(k, PAIRS)
+        count = wp.min(k, MAX_PAIRS)
         for i in range(count):
-            jac.right[world, i] = -jac.step * jac.sums[pair_of(k, i), world]
+            jac.right_side[world, i] = -jac.step_length * jac.sums[pair_index(k, i), world]
         substitute(jac, world, k, count, f64(1.0))
 
     @wp.kernel(module=module)
-    def combine(
+    def combine_move(
         ctl: Newton,
         jac: Jacobi,
         s: wp.array3d(dtype=vec3),
@@ -280,14 +294,14 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
                 a += T(jac.gamma[world, 0]) * move[world, slot]
             move[world, slot] = a
         else:
-            a = T(jac.step) * z[world, slot]
+            a = T(jac.step_length) * z[world, slot]
             if wp.static(paired):
-                for j in range(wp.min(ctl.iterations[world], PAIRS)):
+                for j in range(wp.min(ctl.iterations[world], MAX_PAIRS)):
                     a += T(jac.gamma[world, j]) * s[j, world, slot]
             move[world, slot] = a
 
     @wp.kernel(module=module)
-    def remaining_momentum(
+    def residual_after_move(
         ctl: Newton,
         mass_factor: wp.array(dtype=f64),
         lumped: wp.array2d(dtype=T),
@@ -304,7 +318,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
             r[world, slot] = -wp.cw_mul(gradient[world, slot] + m * move[world, slot], free[slot])
 
     @wp.kernel(module=module)
-    def advance(ctl: Newton, move: wp.array2d(dtype=vec3), v: wp.array2d(dtype=vec3)):
+    def apply_move(ctl: Newton, move: wp.array2d(dtype=vec3), v: wp.array2d(dtype=vec3)):
         """v += p, shortened by step limits of terms."""
         world, slot = wp.tid()
         if ctl.active[world] != 0:
@@ -323,20 +337,20 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
             ctl.active[world] = 1
             pcg.iterations[world] = ctl.iterations[world]
             pcg.first_norm[world] = jac.first_norm[world]
-            pcg.norm[world] = ctl.norm[world]
+            pcg.norm[world] = ctl.residual_norm[world]
 
     return _types.SimpleNamespace(
         module=module,
-        begin=begin,
+        begin_iteration=begin_iteration,
         check_iterate=check_iterate,
         store_pair=store_pair,
-        recursion=recursion,
+        chebyshev_coefficients=chebyshev_coefficients,
         solve_gram=solve_gram,
-        project=project,
-        conjugate_rows=conjugate_rows,
-        conjugate=conjugate,
-        combine=combine,
-        remaining_momentum=remaining_momentum,
-        advance=advance,
+        project_residual=project_residual,
+        conjugation_dot_terms=conjugation_dot_terms,
+        conjugate_move=conjugate_move,
+        combine_move=combine_move,
+        residual_after_move=residual_after_move,
+        apply_move=apply_move,
         report_cost=report_cost,
     )

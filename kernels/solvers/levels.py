@@ -14,32 +14,32 @@ from ..common.lanes import lane_functions
 from ..common.structs import pattern_struct
 from ..common.types import SHORT_UNROLL, kernel_module, precision
 
-__all__ = ["LANES", "TILE", "TILE_SLOTS", "level_kernels", "level_struct"]
+__all__ = ["TILE_LANES", "TILE_SLOTS", "TILE_UNKNOWNS", "level_kernels", "level_struct"]
 
 TILE_SLOTS = 16
-TILE = 3 * TILE_SLOTS
+TILE_UNKNOWNS = 3 * TILE_SLOTS
 """Unknowns of a tile."""
-LANES = 64
+TILE_LANES = 64
 """Threads that invert a tile on CUDA."""
 
 
 @functools.cache
 def level_struct(dtype: str):
-    """Constant data of a level."""
+    """Constant data of a level: its tiles, groups and their affine functions."""
     T = precision(dtype).T
     vec4 = wp.types.vector(length=4, dtype=T)
 
     @wp.struct
     class Level:
         tile_slot: wp.array2d(dtype=wp.int32)  # [tile, position] slot or -1
-        tile_of: wp.array(dtype=wp.int32)  # [slot]
-        place_of: wp.array(dtype=wp.int32)  # [slot] in its tile
+        tile_of_slot: wp.array(dtype=wp.int32)  # [slot]
+        position_in_tile: wp.array(dtype=wp.int32)  # [slot]
         group_start: wp.array(dtype=wp.int32)  # [group + 1]
-        group_slot: wp.array(dtype=wp.int32)
-        group_of: wp.array(dtype=wp.int32)  # [slot]
-        weight: wp.array(dtype=vec4)  # [slot] values of the group's affine functions 1, x, y, z
-        tiles: wp.int32
-        groups: wp.int32
+        group_slot: wp.array(dtype=wp.int32)  # slots, group by group
+        group_of_slot: wp.array(dtype=wp.int32)  # [slot]
+        affine_values: wp.array(dtype=vec4)  # [slot] values of the group's affine functions 1, x, y, z
+        tile_count: wp.int32
+        group_count: wp.int32
 
     return Level
 
@@ -60,7 +60,7 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
     module = kernel_module(f"levels_{dtype}{'_' + storage if scaled else ''}", max_unroll=SHORT_UNROLL)
 
     @wp.kernel(module=module)
-    def smooth(
+    def smooth_and_restrict(
         level: Level,
         inverse: wp.array4d(dtype=S),
         root: wp.array3d(dtype=T),
@@ -84,8 +84,8 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
             part = index % share
             place = (index / share) % TILE_SLOTS
             tile = index / (share * TILE_SLOTS)
-            slot = level.tile_slot[wp.min(tile, level.tiles - 1), place]
-            if tile >= level.tiles:
+            slot = level.tile_slot[wp.min(tile, level.tile_count - 1), place]
+            if tile >= level.tile_count:
                 slot = -1
             s = vec3()
             if slot >= 0:
@@ -122,7 +122,7 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         s3 = vec3()
         for e in range(level.group_start[group] + lane, level.group_start[group + 1], lanes):
             slot = level.group_slot[e]
-            w = level.weight[slot]
+            w = level.affine_values[slot]
             x = r[world, slot]
             s0 += w[0] * x
             s1 += w[1] * x
@@ -139,17 +139,17 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
             coarse[world, 4 * group + 3] = s3
 
     @wp.func
-    def prolonged(level: Level, x: wp.array2d(dtype=vec3), world: int, slot: int) -> vec3:
+    def prolong_to_slot(level: Level, x: wp.array2d(dtype=vec3), world: int, slot: int) -> vec3:
         """(P x) at a slot: the affine motion given by its group's coarse unknowns x."""
-        first = 4 * level.group_of[slot]
-        w = level.weight[slot]
+        first = 4 * level.group_of_slot[slot]
+        w = level.affine_values[slot]
         s = vec3()
         for k in range(4):
             s += w[k] * x[world, first + k]
         return s
 
     @wp.kernel(module=module)
-    def add_coarse(
+    def add_coarse_correction(
         level: Level,
         correct: int,
         x: wp.array2d(dtype=vec3),
@@ -171,7 +171,7 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
             a = r[world, slot]
             s = z[world, slot]
             if correct != 0:
-                s += wp.cw_mul(prolonged(level, x, world, slot), free[slot])
+                s += wp.cw_mul(prolong_to_slot(level, x, world, slot), free[slot])
                 z[world, slot] = s
             rz = f64(wp.dot(a, s))
             rr = f64(wp.dot(a, wp.cw_div(a, diagonal[world, slot])))
@@ -182,7 +182,7 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
             rows[1, world, slot / warp] = rr
 
     @wp.kernel(module=module)
-    def chebyshev(
+    def chebyshev_step(
         level: Level,
         correct: int,
         coarse: wp.array2d(dtype=vec3),
@@ -199,7 +199,7 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
             return
         s = z[world, slot]
         if correct != 0:
-            s += prolonged(level, coarse, world, slot)
+            s += prolong_to_slot(level, coarse, world, slot)
         s = step * s
         if keep == T(0.0):
             d[world, slot] = s
@@ -233,7 +233,7 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
             r[world, slot] = r[world, slot] - s
 
     @wp.func
-    def part_of(root: wp.array2d(dtype=T), r: wp.array2d(dtype=T), world: int, k: int) -> T:
+    def scaled_entry(root: wp.array2d(dtype=T), r: wp.array2d(dtype=T), world: int, k: int) -> T:
         """Entry k of r, scaled by `root` for a scaled inverse."""
         if wp.static(scaled):
             return r[world, k] * root[world, k]
@@ -241,11 +241,11 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
             return r[world, k]
 
     @wp.func
-    def row_times(
+    def row_product(
         matrix: wp.array3d(dtype=S), root: wp.array2d(dtype=T), r: wp.array2d(dtype=T), world: int, row: int,
         first: int, n: int, lanes: int,
     ) -> T:  # fmt: skip
-        """A lane's part of a row times r, from `first` to n."""
+        """Sum of a lane's products in a row times r: columns first, first + lanes, ... below n."""
         # four independent sums keep enough loads in flight
         s0 = T(0.0)
         s1 = T(0.0)
@@ -254,18 +254,18 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         last = n - 3 * lanes
         k = first
         while k < last:
-            s0 += T(matrix[world, row, k]) * part_of(root, r, world, k)
-            s1 += T(matrix[world, row, k + lanes]) * part_of(root, r, world, k + lanes)
-            s2 += T(matrix[world, row, k + 2 * lanes]) * part_of(root, r, world, k + 2 * lanes)
-            s3 += T(matrix[world, row, k + 3 * lanes]) * part_of(root, r, world, k + 3 * lanes)
+            s0 += T(matrix[world, row, k]) * scaled_entry(root, r, world, k)
+            s1 += T(matrix[world, row, k + lanes]) * scaled_entry(root, r, world, k + lanes)
+            s2 += T(matrix[world, row, k + 2 * lanes]) * scaled_entry(root, r, world, k + 2 * lanes)
+            s3 += T(matrix[world, row, k + 3 * lanes]) * scaled_entry(root, r, world, k + 3 * lanes)
             k += 4 * lanes
         while k < n:
-            s0 += T(matrix[world, row, k]) * part_of(root, r, world, k)
+            s0 += T(matrix[world, row, k]) * scaled_entry(root, r, world, k)
             k += lanes
         return (s0 + s1) + (s2 + s3)
 
     @wp.func
-    def put_row(root: wp.array2d(dtype=T), s: T, world: int, row: int, x: wp.array2d(dtype=T)):
+    def store_row(root: wp.array2d(dtype=T), s: T, world: int, row: int, x: wp.array2d(dtype=T)):
         """x[row] = s, scaled back for a scaled inverse."""
         if wp.static(scaled):
             x[world, row] = s * root[world, row]
@@ -273,7 +273,7 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
             x[world, row] = s
 
     @wp.kernel(module=module)
-    def apply_dense(
+    def apply_dense_inverse(
         matrix: wp.array3d(dtype=S),
         root: wp.array2d(dtype=T),
         lanes: int,
@@ -287,12 +287,12 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
             return
         lane = index % lanes
         row = wp.min(index / lanes, x.shape[1] - 1)
-        s = scalar_sum(row_times(matrix, root, r, world, row, lane, r.shape[1], lanes), lanes)
+        s = scalar_sum(row_product(matrix, root, r, world, row, lane, r.shape[1], lanes), lanes)
         if lane == 0:
-            put_row(root, s, world, row, x)
+            store_row(root, s, world, row, x)
 
     @wp.kernel(module=module)
-    def apply_triangle(
+    def apply_triangular_inverse(
         matrix: wp.array3d(dtype=S),
         root: wp.array2d(dtype=T),
         upper: int,
@@ -301,7 +301,7 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         active: wp.array(dtype=wp.int32),
         x: wp.array2d(dtype=T),
     ):
-        """`apply_dense` with the lower triangle of a matrix or, `upper`, its upper one, diagonal included."""
+        """`apply_dense_inverse` with the lower triangle of a matrix or, `upper`, its upper one, diagonal included."""
         world, index = wp.tid()
         if active[world] == 0:
             return
@@ -309,16 +309,16 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         row = wp.min(index / lanes, x.shape[1] - 1)
         first = wp.where(upper != 0, row, 0) + lane
         n = wp.where(upper != 0, r.shape[1], row + 1)
-        s = scalar_sum(row_times(matrix, root, r, world, row, first, n, lanes), lanes)
+        s = scalar_sum(row_product(matrix, root, r, world, row, first, n, lanes), lanes)
         if lane == 0:
-            put_row(root, s, world, row, x)
+            store_row(root, s, world, row, x)
 
     return _types.SimpleNamespace(
         module=module,
-        smooth=smooth,
-        add_coarse=add_coarse,
-        chebyshev=chebyshev,
+        smooth_and_restrict=smooth_and_restrict,
+        add_coarse_correction=add_coarse_correction,
+        chebyshev_step=chebyshev_step,
         subtract_product=subtract_product,
-        apply_dense=apply_dense,
-        apply_triangle=apply_triangle,
+        apply_dense_inverse=apply_dense_inverse,
+        apply_triangular_inverse=apply_triangular_inverse,
     )

@@ -11,13 +11,13 @@ import warp as wp
 from ..common.lanes import block_memory, lane_functions
 from ..common.structs import pattern_struct
 from ..common.types import SHORT_UNROLL, kernel_module, precision
-from .levels import TILE, level_struct
+from .levels import TILE_UNKNOWNS, level_struct
 
 __all__ = ["FACTOR_LANES", "build_kernels"]
 
 FACTOR_LANES = 512
 """Threads that factor a dense matrix on CUDA."""
-ACROSS = 128
+ROW_LANES = 128
 """Threads among these along a row of the matrix."""
 
 
@@ -30,7 +30,7 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
     """
     storage = storage or dtype
     S = precision(storage).T
-    ROUNDING = {"float64": 2.0**-53, "float32": 2.0**-24}[storage]
+    STORAGE_ROUNDOFF = {"float64": 2.0**-53, "float32": 2.0**-24}[storage]
     p = precision(dtype)
     T, mat33 = p.T, p.mat33
     f64 = wp.float64
@@ -38,12 +38,12 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
     Level = level_struct(dtype)
     Pattern = pattern_struct()
     sync = lane_functions(dtype).sync
-    ROW_BYTES = TILE * wp.types.type_size_in_bytes(T)
-    memory, line = block_memory(dtype, TILE * TILE), block_memory(dtype, TILE)
+    ROW_BYTES = TILE_UNKNOWNS * wp.types.type_size_in_bytes(T)
+    memory, line = block_memory(dtype, TILE_UNKNOWNS * TILE_UNKNOWNS), block_memory(dtype, TILE_UNKNOWNS)
     # a pivot below this fraction of its diagonal entry is round-off: the functions are linearly dependent
-    NEGLIGIBLE = {"float64": 1.0e-12, "float32": 1.0e-5}[storage]
+    NEGLIGIBLE_PIVOT = {"float64": 1.0e-12, "float32": 1.0e-5}[storage]
     # the fraction for a factorisation, which also accepts near-mechanisms
-    LEAST_PIVOT = {"float64": 1.0e-14, "float32": 3.0e-7}[dtype]
+    MIN_FACTOR_PIVOT = {"float64": 1.0e-14, "float32": 3.0e-7}[dtype]
     module = kernel_module(f"levels_build_{dtype}{'_' + storage if storage != dtype else ''}", max_unroll=SHORT_UNROLL)
 
     @wp.kernel(module=module)
@@ -61,15 +61,15 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
             return
         for a in range(3):
             diagonal[world, tile, 3 * place + a] = T(0.0)
-            for j in range(TILE):
+            for j in range(TILE_UNKNOWNS):
                 matrix[world, tile, 3 * place + a, j] = T(0.0)
         slot = level.tile_slot[tile, place]
         if slot < 0:
             return
         for k in range(pattern.start[slot], pattern.start[slot + 1]):
             other = pattern.column[k]
-            if level.tile_of[other] == tile:
-                b = 3 * level.place_of[other]
+            if level.tile_of_slot[other] == tile:
+                b = 3 * level.position_in_tile[other]
                 A = value[world, k]
                 for i in range(3):
                     for j in range(3):
@@ -78,21 +78,21 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
             diagonal[world, tile, 3 * place + a] = matrix[world, tile, 3 * place + a, 3 * place + a]
 
     @wp.func
-    def eliminate_column(at: wp.uint64, c: wp.uint64, k: int, j: int, scale: T):
+    def eliminate_tile_column(at: wp.uint64, c: wp.uint64, k: int, j: int, scale: T):
         """Column j of a tile after pivot k of Gauss-Jordan, of which c is the column and `scale` the inverse."""
         if j == k:
-            for i in range(TILE):
-                memory.store(at, TILE * i + k, -scale * line.load(c, i))
-            memory.store(at, TILE * k + k, scale)
+            for i in range(TILE_UNKNOWNS):
+                memory.store(at, TILE_UNKNOWNS * i + k, -scale * line.load(c, i))
+            memory.store(at, TILE_UNKNOWNS * k + k, scale)
         else:
-            d = scale * memory.load(at, TILE * k + j)
-            for i in range(0, TILE, 4):  # four rows load at once
+            d = scale * memory.load(at, TILE_UNKNOWNS * k + j)
+            for i in range(0, TILE_UNKNOWNS, 4):  # four rows load at once
                 s = vec4()
                 for a in range(4):
-                    s[a] = memory.load(at, TILE * (i + a) + j) - d * line.load(c, i + a)
+                    s[a] = memory.load(at, TILE_UNKNOWNS * (i + a) + j) - d * line.load(c, i + a)
                 for a in range(4):
-                    memory.store(at, TILE * (i + a) + j, s[a])
-            memory.store(at, TILE * k + j, d)
+                    memory.store(at, TILE_UNKNOWNS * (i + a) + j, s[a])
+            memory.store(at, TILE_UNKNOWNS * k + j, d)
 
     @wp.kernel(module=module)
     def invert_tiles(
@@ -117,39 +117,39 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         if active[world] == 0:
             return
         place = wp.uint64(world * tiles + tile)
-        own = matrix.ptr + place * wp.uint64(wp.static(ROW_BYTES * TILE))
+        own = matrix.ptr + place * wp.uint64(wp.static(ROW_BYTES * TILE_UNKNOWNS))
         at = memory.open(own)
         c = line.open(column.ptr + place * wp.uint64(wp.static(ROW_BYTES)))
         if lanes > 1:
-            for i in range(lane, TILE * TILE, lanes):
+            for i in range(lane, TILE_UNKNOWNS * TILE_UNKNOWNS, lanes):
                 memory.store(at, i, memory.load(own, i))
-        for k in range(TILE):
+        for k in range(TILE_UNKNOWNS):
             sync()
-            for i in range(lane, TILE, lanes):
-                line.store(c, i, memory.load(at, TILE * i + k))
+            for i in range(lane, TILE_UNKNOWNS, lanes):
+                line.store(c, i, memory.load(at, TILE_UNKNOWNS * i + k))
             sync()
             pivot = line.load(c, k)
             size = diagonal[world, tile, k]
-            if pivot > T(NEGLIGIBLE) * size and size > T(0.0):
+            if pivot > T(NEGLIGIBLE_PIVOT) * size and size > T(0.0):
                 scale = T(1.0) / pivot
-                for j in range(lane, TILE, lanes):
-                    eliminate_column(at, c, k, j, scale)
+                for j in range(lane, TILE_UNKNOWNS, lanes):
+                    eliminate_tile_column(at, c, k, j, scale)
             else:
-                for j in range(lane, TILE, lanes):
-                    memory.store(at, TILE * k + j, T(0.0))
-                    memory.store(at, TILE * j + k, T(0.0))
+                for j in range(lane, TILE_UNKNOWNS, lanes):
+                    memory.store(at, TILE_UNKNOWNS * k + j, T(0.0))
+                    memory.store(at, TILE_UNKNOWNS * j + k, T(0.0))
                 sync()
                 if lane == 0 and keep != 0 and wp.abs(size) > T(0.0):
                     # the sign marks the row: it stays zero for later pivots and is filled in at the end
                     diagonal[world, tile, k] = -wp.abs(size)
         sync()
-        for j in range(lane, TILE, lanes):
+        for j in range(lane, TILE_UNKNOWNS, lanes):
             size = diagonal[world, tile, j]
             if size < T(0.0) and keep != 0:
-                memory.store(at, TILE * j + j, -T(1.0) / size)
+                memory.store(at, TILE_UNKNOWNS * j + j, -T(1.0) / size)
         sync()
         if lanes > 1:
-            for i in range(lane, TILE * TILE, lanes):
+            for i in range(lane, TILE_UNKNOWNS * TILE_UNKNOWNS, lanes):
                 memory.store(own, i, memory.load(at, i))
 
     @wp.kernel(module=module)
@@ -181,7 +181,7 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
                     scale[world, 3 * slot + i] = A[i, i]
 
     @wp.kernel(module=module)
-    def take_pivot(
+    def copy_pivot_block(
         matrix: wp.array3d(dtype=T),
         scale: wp.array2d(dtype=T),
         first: int,
@@ -197,7 +197,7 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
                 diagonal[world, 0, i] = scale[world, first + i]
 
     @wp.kernel(module=module)
-    def take_panels(
+    def compute_panels(
         matrix: wp.array3d(dtype=T),
         pivot: wp.array4d(dtype=T),
         first: int,
@@ -210,14 +210,14 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         if active[world] == 0:
             return
         s = T(0.0)
-        for n in range(TILE):
+        for n in range(TILE_UNKNOWNS):
             # A is symmetric beside the pivot except for the sign of eliminated columns
             s += matrix[world, i, first + n] * pivot[world, 0, n, m]
         left[world, m, i] = s
         top[world, m, i] = matrix[world, first + m, i]
 
     @wp.kernel(module=module)
-    def eliminate(
+    def eliminate_pivot_block(
         pivot: wp.array4d(dtype=T),
         left: wp.array3d(dtype=T),
         top: wp.array3d(dtype=T),
@@ -231,8 +231,8 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
             return
         i = 4 * i4
         # a tile's size is a multiple of 4: the four rows are all in the pivot's or all outside
-        in_row = i >= first and i < first + TILE
-        in_column = j >= first and j < first + TILE
+        in_row = i >= first and i < first + TILE_UNKNOWNS
+        in_column = j >= first and j < first + TILE_UNKNOWNS
         s = vec4()
         if in_row and in_column:
             for a in range(4):
@@ -241,14 +241,14 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
             for a in range(4):
                 s[a] = -left[world, j - first, i + a]
         elif in_row:
-            for m in range(TILE):
+            for m in range(TILE_UNKNOWNS):
                 x = top[world, m, j]
                 for a in range(4):
                     s[a] = s[a] + pivot[world, 0, i - first + a, m] * x
         else:
             for a in range(4):
                 s[a] = matrix[world, i + a, j]
-            for m in range(TILE):
+            for m in range(TILE_UNKNOWNS):
                 x = top[world, m, j]
                 for a in range(4):
                     s[a] = s[a] - left[world, m, i + a] * x
@@ -276,7 +276,7 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         if active[world] == 0:
             return
         n = matrix.shape[1]
-        across = wp.min(lanes, ACROSS)  # threads side by side in a row
+        across = wp.min(lanes, ROW_LANES)  # threads side by side in a row
         for k in range(n):
             for i in range(lane, n, lanes):
                 columns[world, 0, i] = matrix[world, i, k]
@@ -284,7 +284,7 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
             sync()
             pivot = columns[world, 0, k]
             size = wp.abs(diagonal[world, k])
-            safe = pivot > T(LEAST_PIVOT) * size and size > T(0.0)
+            safe = pivot > T(MIN_FACTOR_PIVOT) * size and size > T(0.0)
             scale = T(0.0)
             if safe:
                 scale = T(1.0) / wp.sqrt(pivot)
@@ -322,22 +322,22 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
                 matrix[world, i, j] = matrix[world, j, i]
 
     @wp.func
-    def inverse_root(d: T) -> T:
+    def inverse_sqrt(d: T) -> T:
         """1/sqrt|d| of an entry of diag A; 0 without an unknown."""
         return wp.where(d == T(0.0), T(0.0), T(1.0) / wp.sqrt(wp.abs(d)))
 
     @wp.func
-    def scaled_entry(b: T, own: T, other: T, on_diagonal: bool, trace: T) -> S:
+    def storage_entry(b: T, own: T, other: T, on_diagonal: bool, trace: T) -> S:
         """Entry of R B R in the storage's precision; the diagonal includes the shift for its rounding."""
         x = T(0.0)
         if own > T(0.0) and other > T(0.0):
             x = b / (own * other)
             if on_diagonal:
-                x += T(ROUNDING) * trace
+                x += T(STORAGE_ROUNDOFF) * trace
         return S(x)
 
     @wp.kernel(module=module)
-    def store_tiles(
+    def store_tile_inverses(
         tiles: int,
         diagonal: wp.array3d(dtype=T),
         matrix: wp.array4d(dtype=T),
@@ -350,16 +350,16 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         if active[world] == 0:
             return
         trace = T(0.0)
-        for j in range(TILE):
+        for j in range(TILE_UNKNOWNS):
             trace += matrix[world, tile, j, j] * wp.abs(diagonal[world, tile, j])
-        own = inverse_root(diagonal[world, tile, i])
+        own = inverse_sqrt(diagonal[world, tile, i])
         root[world, tile, i] = own
-        for j in range(TILE):
-            other = inverse_root(diagonal[world, tile, j])
-            stored[world, tile, i, j] = scaled_entry(matrix[world, tile, i, j], own, other, i == j, trace)
+        for j in range(TILE_UNKNOWNS):
+            other = inverse_sqrt(diagonal[world, tile, j])
+            stored[world, tile, i, j] = storage_entry(matrix[world, tile, i, j], own, other, i == j, trace)
 
     @wp.kernel(module=module)
-    def store_dense(
+    def store_dense_inverse(
         diagonal: wp.array2d(dtype=T),
         trace: wp.array2d(dtype=f64),
         matrix: wp.array3d(dtype=T),
@@ -371,14 +371,14 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         world, i, j = wp.tid()
         if active[world] == 0:
             return
-        own = inverse_root(diagonal[world, i])
-        other = inverse_root(diagonal[world, j])
-        stored[world, i, j] = scaled_entry(matrix[world, i, j], own, other, i == j, T(trace[0, world]))
+        own = inverse_sqrt(diagonal[world, i])
+        other = inverse_sqrt(diagonal[world, j])
+        stored[world, i, j] = storage_entry(matrix[world, i, j], own, other, i == j, T(trace[0, world]))
         if i == j:
             root[world, i] = own
 
     @wp.kernel(module=module)
-    def dense_traces(
+    def trace_terms(
         diagonal: wp.array2d(dtype=T),
         matrix: wp.array3d(dtype=T),
         active: wp.array(dtype=wp.int32),
@@ -394,11 +394,11 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         fill_tiles=fill_tiles,
         invert_tiles=invert_tiles,
         fill_dense=fill_dense,
-        take_pivot=take_pivot,
-        take_panels=take_panels,
-        eliminate=eliminate,
+        copy_pivot_block=copy_pivot_block,
+        compute_panels=compute_panels,
+        eliminate_pivot_block=eliminate_pivot_block,
         factor_dense=factor_dense,
-        store_tiles=store_tiles,
-        store_dense=store_dense,
-        dense_traces=dense_traces,
+        store_tile_inverses=store_tile_inverses,
+        store_dense_inverse=store_dense_inverse,
+        trace_terms=trace_terms,
     )

@@ -6,15 +6,16 @@ import warp as wp
 
 from ..common.traits import Traits
 from .convergence import convergence_functions
-from .newton_control import FAIL_JACOBIAN, FAIL_LINE_SEARCH, control_struct
+from .newton_control import FAIL_JACOBIAN, FAIL_LINE_SEARCH, ROW_FROZEN_CHANGE, ROW_RESIDUAL, ROW_SLOPE, control_struct
 
-__all__ = ["MAX_TRUST_RADIUS", "NOISE", "line_search_kernels"]
+__all__ = ["MAX_TRUST_RADIUS", "PHI_NOISE_ROUNDINGS", "line_search_kernels"]
 
-ARMIJO = 1.0e-4
-WOLFE = 0.8
-NOISE = 100.0  # roundings of its parts below which changes of Phi are noise
-MAX_SEARCH = 20
-REUSED_SEARCH = 2
+ARMIJO_FACTOR, WOLFE_FACTOR = 1.0e-4, 0.8
+"""Sufficient decrease of Phi, and of |slope|, over the predicted one and over that at the iterate."""
+PHI_NOISE_ROUNDINGS = 100.0
+"""Roundings of the parts of Phi below which its changes are noise."""
+MAX_BACKTRACKS, MAX_REUSED_BACKTRACKS = 20, 2
+"""Maximum halvings of a step; with an operator of an earlier iterate."""
 MAX_NONMONOTONE = 5
 """Consecutive full steps that may raise Phi: with the predicted stress in H, a slender body reaches equilibrium over
 iterates whose membrane energy is far above that of both ends (Magisano, Leonetti and Garcea 2017)."""
@@ -24,10 +25,10 @@ iterate."""
 SOLVES_WITHOUT_STEP = 10  # solves without a step after which the exact tangent is used; with 0 soft solids take longer
 MAX_DOUBLINGS = 30  # maximum doublings of a step along which Phi is concave
 MAX_PENETRATING_STEPS = 1  # maximum deep penetrations by full steps in an attempt: the return may end at the start
-KINK, KINKS = 0.5, 8
-"""Contact: a positive slope of Phi at a trial above KINK times that at the iterate indicates that slipping points have
-reversed and Phi has a kink before. It is located by at most KINKS trials: a step beyond it makes the points slip back,
-again and again, while one that ends near it makes them stick."""
+KINK_SLOPE_RATIO, MAX_KINK_TRIALS = 0.5, 8
+"""Contact: a positive slope of Phi at a trial above KINK_SLOPE_RATIO times that at the iterate indicates that slipping
+points have reversed and Phi has a kink before. It is located by at most MAX_KINK_TRIALS trials: a step beyond it makes
+the points slip back, again and again, while one that ends near it makes them stick."""
 
 
 def line_search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
@@ -36,9 +37,13 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNames
     Control = control_struct()
     stored, unilateral, midpoint, limited = traits.stored, traits.unilateral, traits.midpoint, traits.limited
     has_kinks = unilateral and not midpoint
-    judging = convergence_functions(traits)
-    objective, magnitude, evaluate_norms = judging.objective, judging.magnitude, judging.evaluate_norms
-    check_convergence, fail = judging.check_convergence, judging.fail
+    convergence = convergence_functions(traits)
+    objective, objective_magnitude, evaluate_norms = (
+        convergence.objective,
+        convergence.objective_magnitude,
+        convergence.evaluate_norms,
+    )
+    check_convergence, handle_failed_search = convergence.check_convergence, convergence.handle_failed_search
 
     @wp.func
     def tangent_needed(ctl: Control, world: int) -> bool:
@@ -47,7 +52,7 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNames
         return ctl.linear_stress == 0 and ctl.linear_solves[world] - ctl.iterations[world] > SOLVES_WITHOUT_STEP
 
     @wp.func
-    def track_best(ctl: Control, world: int, old_phi: f64, old_norm: f64):
+    def track_best_iterate(ctl: Control, world: int, old_phi: f64, old_norm: f64):
         """Bookkeeping after a step that raised Phi and the steps that follow it: restore the best iterate if for
         MAX_NONMONOTONE steps neither the residual halved nor Phi fell below its best value."""
         if ctl.nonmonotone_steps[world] == 0:
@@ -63,7 +68,7 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNames
             counts = ctl.nonmonotone_steps[world] == 0 or not ctl.phi[world] < old_phi
         if counts:
             ctl.nonmonotone_steps[world] = ctl.nonmonotone_steps[world] + 1
-        if ctl.norm[world] <= f64(0.5) * ctl.best_norm[world] or ctl.phi[world] < ctl.best_phi[world]:
+        if ctl.residual_norm[world] <= f64(0.5) * ctl.best_norm[world] or ctl.phi[world] < ctl.best_phi[world]:
             ctl.nonmonotone_steps[world] = 0
             ctl.trust_radius[world] = wp.min(f64(2.0) * ctl.trust_radius[world], f64(MAX_TRUST_RADIUS))
         elif ctl.nonmonotone_steps[world] >= MAX_NONMONOTONE and ctl.active[world] != 0:
@@ -86,21 +91,21 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNames
 
         `stands`: the trial is the iterate itself or the best one. `nonmonotone`: it may have raised Phi.
         """
-        old_norm = ctl.norm[world]
+        old_norm = ctl.residual_norm[world]
         old_worst = ctl.residual_ratio[world]
         old_phi = ctl.phi[world]
         ctl.searching[world] = 0
         evaluate_norms(ctl, world)
-        ctl.phi[world] = objective(ctl, world) + ctl.slot_sums[7, world]
+        ctl.phi[world] = objective(ctl, world) + ctl.slot_sums[ROW_FROZEN_CHANGE, world]
         if wp.static(stored):
             ctl.trial_accepted[world] = 1
         if wp.static(stored and not midpoint):
             more = ctl.term_sums[1, world] - ctl.term_sums[0, world]
             ctl.phi[world] = ctl.phi[world] + more / ctl.dq_dv[world]
-        ctl.phi_magnitude[world] = magnitude(ctl, world)
+        ctl.phi_magnitude[world] = objective_magnitude(ctl, world)
         if stands:
-            if ctl.reused[world] != 0:
-                ctl.reused[world] = 2
+            if ctl.operator_reused[world] != 0:
+                ctl.operator_reused[world] = 2
             if ctl.restore_best[world] != 0:
                 ctl.restore_best[world] = 0
                 ctl.trust_radius[world] = f64(RADIUS_SHRINK) * ctl.trust_radius[world]
@@ -114,11 +119,11 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNames
                 ctl.require_armijo[world] = 0
                 if wp.static(not midpoint):
                     ctl.predicted_stress[world] = wp.where(tangent_needed(ctl, world), 0, 1)
-        ctl.total_iterations[world] = ctl.total_iterations[world] + 1
-        ratio = ctl.norm[world] / wp.max(old_norm, f64(1.0e-300))
-        if ctl.groups > ctl.components:  # one group's forces may dwarf those of the unconverged groups
+        ctl.step_iterations[world] = ctl.step_iterations[world] + 1
+        ratio = ctl.residual_norm[world] / wp.max(old_norm, f64(1.0e-300))
+        if ctl.group_count > ctl.component_count:  # one group's forces may dwarf those of the unconverged groups
             ratio = ctl.residual_ratio[world] / wp.max(old_worst, f64(1.0e-300))
-        ctl.reduction[world] = ratio
+        ctl.residual_reduction[world] = ratio
         eta = f64(0.9) * ratio * ratio
         guard = f64(0.9) * ctl.forcing[world] * ctl.forcing[world]
         if guard > f64(0.1):
@@ -128,25 +133,25 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNames
         if wp.static(not unilateral):
             check_convergence(ctl, world)
         if not stands and ctl.estimate_error[world] == 0 and (nonmonotone or ctl.nonmonotone_steps[world] > 0):
-            track_best(ctl, world, old_phi, old_norm)
+            track_best_iterate(ctl, world, old_phi, old_norm)
 
     @wp.func
-    def shorten(ctl: Control, world: int, reused: bool):
+    def shorten_step(ctl: Control, world: int, reused: bool):
         """Halve the step, or end the search; `reused`: the operator is of an earlier iterate."""
         ctl.nonmonotone_trial[world] = 0
-        ctl.searches[world] = ctl.searches[world] + 1
+        ctl.search_trials[world] = ctl.search_trials[world] + 1
         ctl.alpha[world] = f64(0.5) * ctl.alpha[world]
-        if reused and ctl.searches[world] > REUSED_SEARCH:
+        if reused and ctl.search_trials[world] > MAX_REUSED_BACKTRACKS:
             # the reused operator is at fault: keep the iterate and solve with its own operator
             ctl.alpha[world] = f64(0.0)
-        if ctl.searches[world] > MAX_SEARCH:
+        if ctl.search_trials[world] > MAX_BACKTRACKS:
             why = FAIL_LINE_SEARCH
             if ctl.domain_J[world] <= f64(0.0):
                 why = FAIL_JACOBIAN
-            fail(ctl, world, why)
+            handle_failed_search(ctl, world, why)
 
     @wp.func
-    def lengthen(ctl: Control, world: int, good: bool, slope: f64) -> bool:
+    def lengthen_step(ctl: Control, world: int, good: bool, slope: f64) -> bool:
         """Double the step while Phi falls ever faster along it, undo the last doubling if the trial fails: replaces
         solves near a saddle. Statics, after a solve that met negative curvature."""
         alpha = ctl.alpha[world]
@@ -172,7 +177,7 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNames
         low = wp.vec2d(ctl.bracket_low[world])
         high = wp.vec2d(ctl.bracket_high[world])
         if slope > f64(0.0):
-            if high[0] > f64(0.0) and ctl.searches[world] > 1:
+            if high[0] > f64(0.0) and ctl.search_trials[world] > 1:
                 low[1] = f64(0.5) * low[1]
             high = wp.vec2d(alpha, slope)
         else:
@@ -187,30 +192,34 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNames
     def sufficient_decrease(ctl: Control, world: int, change: f64, slope: f64, norm: f64) -> bool:
         """True if a trial is good: Armijo on the change of Phi above its noise, else the sign of the slope."""
         alpha = ctl.alpha[world]
-        noise = f64(NOISE) * ctl.eps * (ctl.phi_magnitude[world] + magnitude(ctl, world))
-        good = slope <= f64(WOLFE) * wp.abs(ctl.slope[world])
+        noise = f64(PHI_NOISE_ROUNDINGS) * ctl.eps * (ctl.phi_magnitude[world] + objective_magnitude(ctl, world))
+        good = slope <= f64(WOLFE_FACTOR) * wp.abs(ctl.slope[world])
         if wp.abs(change) > noise:
-            good = change <= f64(ARMIJO) * alpha * ctl.slope[world]
+            good = change <= f64(ARMIJO_FACTOR) * alpha * ctl.slope[world]
         if wp.static(midpoint):
-            good = change <= f64(-2.0) * f64(ARMIJO) * alpha * ctl.phi[world]
-        return good or (ctl.nonpotential != 0 and norm <= f64(0.5) * ctl.norm[world])
+            good = change <= f64(-2.0) * f64(ARMIJO_FACTOR) * alpha * ctl.phi[world]
+        return good or (ctl.has_nonpotential != 0 and norm <= f64(0.5) * ctl.residual_norm[world])
 
     @wp.func
-    def good_trial(ctl: Control, world: int, phi: f64, slope: f64, norm: f64) -> bool:
+    def is_good_trial(ctl: Control, world: int, phi: f64, slope: f64, norm: f64) -> bool:
         """True for a trial with finite Phi, J > 0 and sufficient decrease; with a reused operator the first one must
         also halve the residual."""
         good = wp.isfinite(phi) and wp.isfinite(norm) and not ctl.domain_J[world] <= f64(0.0)
         if good:
             good = sufficient_decrease(ctl, world, phi - ctl.phi[world], slope, norm)
-        if ctl.reused[world] != 0 and ctl.iterations[world] == 0 and not norm <= f64(0.5) * ctl.norm[world]:
+        if (
+            ctl.operator_reused[world] != 0
+            and ctl.iterations[world] == 0
+            and not norm <= f64(0.5) * ctl.residual_norm[world]
+        ):
             good = False  # a step must not start worse than with its own operator
-            ctl.searches[world] = REUSED_SEARCH
+            ctl.search_trials[world] = MAX_REUSED_BACKTRACKS
         return good
 
     @wp.func
-    def nonmonotone_allowed(ctl: Control, world: int) -> bool:
+    def is_nonmonotone_allowed(ctl: Control, world: int) -> bool:
         """True if the full step of this search may raise Phi."""
-        out = ctl.searches[world] == 0 and ctl.nonmonotone_trial[world] == 0 and ctl.negative_curvature[world] == 0
+        out = ctl.search_trials[world] == 0 and ctl.nonmonotone_trial[world] == 0 and ctl.negative_curvature[world] == 0
         out = out and (ctl.require_armijo[world] == 0 or ctl.predicted_stress[world] == 2)
         if wp.static(unilateral):  # into an obstacle and back; friction has a convex potential: full steps overshoot
             out = out and ctl.frozen_updated[world] == 0 and ctl.penetrating_steps[world] < MAX_PENETRATING_STEPS
@@ -220,26 +229,30 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNames
     def locate_kink(ctl: Control, world: int, slope: f64) -> bool:
         """True if a trial is beside a kink of Phi, where sticking begins: Phi rises steeply there, or still falls
         steeply within the bracket. Sets the next step length."""
-        if ctl.nonmonotone_trial[world] != 0 or ctl.searches[world] >= KINKS or not ctl.domain_J[world] > f64(0.0):
+        if (
+            ctl.nonmonotone_trial[world] != 0
+            or ctl.search_trials[world] >= MAX_KINK_TRIALS
+            or not ctl.domain_J[world] > f64(0.0)
+        ):
             return False
-        steep = f64(KINK) * wp.abs(ctl.slope[world])
+        steep = f64(KINK_SLOPE_RATIO) * wp.abs(ctl.slope[world])
         beyond = slope > steep or (ctl.bracket_high[world][0] > f64(0.0) and slope < -steep)
         if beyond:
-            ctl.searches[world] = ctl.searches[world] + 1
+            ctl.search_trials[world] = ctl.search_trials[world] + 1
             ctl.alpha[world] = bracket_step(ctl, world, slope)
         return beyond
 
     @wp.func
-    def refuse_trial(ctl: Control, world: int, wants_nonmonotone: bool, reused: bool):
+    def choose_next_trial(ctl: Control, world: int, wants_nonmonotone: bool, reused: bool):
         """Next trial after a refused one: a nonmonotone step, the best iterate, or half the step."""
         if wants_nonmonotone:
             ctl.nonmonotone_trial[world] = 1
             ctl.searching[world] = 0
-            wp.atomic_max(ctl.any_rare, 0, 1)
+            wp.atomic_max(ctl.any_rare_branch, 0, 1)
         elif ctl.nonmonotone_steps[world] > 0:
             ctl.restore_best[world] = 1
         else:
-            shorten(ctl, world, reused)
+            shorten_step(ctl, world, reused)
 
     @wp.kernel(module=module)
     def check_trial(ctl: Control):
@@ -251,25 +264,25 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNames
         # frozen forces keep their symmetric tangent: the curvature of Phi then agrees with H
         bend = ctl.dq_dv[world] * ctl.tangent_sum[0, world]
         phi = objective(ctl, world) - f64(0.5) * alpha * alpha * bend
-        slope = ctl.slot_sums[6, world] - alpha * bend
-        norm = wp.sqrt(ctl.slot_sums[0, world])
+        slope = ctl.slot_sums[ROW_SLOPE, world] - alpha * bend
+        norm = wp.sqrt(ctl.slot_sums[ROW_RESIDUAL, world])
         finite = wp.isfinite(phi) and wp.isfinite(norm)
-        good = good_trial(ctl, world, phi, slope, norm)
-        reused = ctl.reused[world] != 0
+        good = is_good_trial(ctl, world, phi, slope, norm)
+        reused = ctl.operator_reused[world] != 0
         stands = alpha == f64(0.0) or ctl.restore_best[world] != 0
         usable = finite and not (stands or reused)
-        wants_nonmonotone = usable and not good and nonmonotone_allowed(ctl, world)
+        wants_nonmonotone = usable and not good and is_nonmonotone_allowed(ctl, world)
         if wp.static(has_kinks):
             if usable and not wants_nonmonotone:
                 if locate_kink(ctl, world, slope):
                     return
-        if lengthen(ctl, world, good and not (stands or reused), slope):
+        if lengthen_step(ctl, world, good and not (stands or reused), slope):
             return
         nonmonotone = ctl.nonmonotone_trial[world] == 2 and finite and ctl.min_J[world] > f64(0.0)
         if good or stands or nonmonotone:
             accept_trial(ctl, world, stands, nonmonotone)
         else:
-            refuse_trial(ctl, world, wants_nonmonotone, reused)
+            choose_next_trial(ctl, world, wants_nonmonotone, reused)
 
     return _types.SimpleNamespace(
         tangent_needed=tangent_needed, limit_nonmonotone_step=limit_nonmonotone_step, check_trial=check_trial

@@ -7,31 +7,34 @@ import warp as wp
 
 from ..common.traits import NO_TERMS, Traits
 from ..common.types import kernel_module
-from .augmented_lagrangian import outer_kernels
-from .convergence import MAX_ERROR_ESTIMATES, SINGLE_EPS, VELOCITY_ROUNDINGS, convergence_functions
-from .line_search import MAX_TRUST_RADIUS, NOISE, line_search_kernels
+from .augmented_lagrangian import outer_loop_kernels
+from .convergence import MAX_ERROR_ESTIMATES, SINGLE_PRECISION_EPS, VELOCITY_ROUNDINGS, convergence_functions
+from .line_search import MAX_TRUST_RADIUS, PHI_NOISE_ROUNDINGS, line_search_kernels
 from .newton_control import (
     FAIL_CURVATURE,
-    FAIL_FLOOR,
     FAIL_ITERATIONS,
     FAIL_JACOBIAN,
-    FAIL_LIMIT,
     FAIL_NAN,
+    FAIL_ROUNDOFF,
+    FAIL_STEP_LIMIT,
     FAIL_WORK,
     FLOOR_LANES,
+    ROW_FROZEN_CHANGE,
+    ROW_KINETIC,
     control_struct,
 )
 from .pcg import pcg_struct
-from .perturbation import SCATTER
+from .perturbation import SCATTER_FACTOR
 
 __all__ = ["newton_kernels"]
 
-SOLVES_PER_ITERATION = 3
+MAX_SOLVES_PER_ITERATION = 3
 """Maximum linear solves of an attempt per allowed iteration: bounds solves without a step."""
 DISPLACEMENT_ROUNDINGS = 64.0
 """Roundings of the displacements below which an error is negligible, whatever the reference energy."""
-RESTART_FORCING = 0.1  # of the first solve of a step that starts far from its end: a tighter solution is wasted
-MAX_ENERGY_RATIO = 3.0
+ALTERNATIVE_START_FORCING = 0.1
+"""Forcing term of the first solve after an alternative first iterate, far from the end: a tighter one is wasted."""
+MAX_START_ENERGY_RATIO = 3.0
 """Strain energy increase of a first iterate, in kinetic energies, above which other first iterates are tried."""
 
 
@@ -51,14 +54,18 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         traits.unilateral,
     )
     midpoint = traits.midpoint
-    judging = convergence_functions(traits)
-    objective, magnitude = judging.objective, judging.magnitude
-    evaluate_norms, check_convergence, fail = judging.evaluate_norms, judging.check_convergence, judging.fail
-    accept, give_up, record_residual, iteration_factor = (
-        judging.accept,
-        judging.give_up,
-        judging.record_residual,
-        judging.iteration_factor,
+    convergence = convergence_functions(traits)
+    objective, objective_magnitude = convergence.objective, convergence.objective_magnitude
+    evaluate_norms, check_convergence, handle_failed_search = (
+        convergence.evaluate_norms,
+        convergence.check_convergence,
+        convergence.handle_failed_search,
+    )
+    accept_iterate, give_up, record_residual, iteration_factor = (
+        convergence.accept_iterate,
+        convergence.give_up,
+        convergence.record_residual,
+        convergence.iteration_factor,
     )
     module = kernel_module(
         f"newton{traits.suffix('stored', 'has_constraints', 'limited', 'unilateral', 'midpoint')}", light=True
@@ -78,14 +85,14 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
                 ctl.contact_active[world] = 0
 
     @wp.func
-    def start(ctl: Control, world: int):
+    def initialise_iteration(ctl: Control, world: int):
         """Initialise the iteration at its first iterate, and test that for convergence."""
         evaluate_norms(ctl, world)
-        phi = objective(ctl, world) + ctl.slot_sums[7, world]
+        phi = objective(ctl, world) + ctl.slot_sums[ROW_FROZEN_CHANGE, world]
         ctl.phi[world] = phi
-        ctl.phi_magnitude[world] = magnitude(ctl, world)
+        ctl.phi_magnitude[world] = objective_magnitude(ctl, world)
         ctl.forcing[world] = ctl.first_forcing
-        ctl.reused[world] = 0
+        ctl.operator_reused[world] = 0
         ctl.nonmonotone_steps[world] = 0
         ctl.predicted_stress[world] = 0
         ctl.require_armijo[world] = 0
@@ -106,15 +113,15 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
             ctl.penetrating_steps[world] = 0
         if ctl.domain_J[world] <= f64(0.0):
             give_up(ctl, world, FAIL_JACOBIAN)
-        elif not (wp.isfinite(phi) and wp.isfinite(ctl.norm[world])):
+        elif not (wp.isfinite(phi) and wp.isfinite(ctl.residual_norm[world])):
             give_up(ctl, world, FAIL_NAN)
-        elif wp.static(unilateral) and ctl.norm[world] > f64(0.0):
+        elif wp.static(unilateral) and ctl.residual_norm[world] > f64(0.0):
             record_residual(ctl, world)  # frozen quantities are not those of this iterate: it cannot be accepted
         else:
             check_convergence(ctl, world)
 
     @wp.func
-    def poor_first_iterate(ctl: Control, world: int) -> bool:
+    def is_poor_first_iterate(ctl: Control, world: int) -> bool:
         """True if other first iterates should be tried: Phi exceeds a bound of Phi at q_n, or J <= 0.
 
         At q_n Phi is the strain energy of the state plus a kinetic energy: row 10 of `residual` for backward Euler, a
@@ -123,33 +130,36 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         phi = objective(ctl, world)
         if wp.static(midpoint):
             return not (wp.isfinite(phi) and ctl.min_J[world] > f64(0.0))
-        bound = ctl.potential[world] / ctl.dq_dv[world] + f64(MAX_ENERGY_RATIO) * ctl.slot_sums[10, world]
-        bound += f64(NOISE) * ctl.eps * magnitude(ctl, world)
+        bound = (
+            ctl.strain_energy[world] / ctl.dq_dv[world]
+            + f64(MAX_START_ENERGY_RATIO) * ctl.slot_sums[ROW_KINETIC, world]
+        )
+        bound += f64(PHI_NOISE_ROUNDINGS) * ctl.eps * objective_magnitude(ctl, world)
         return not (phi <= bound and wp.isfinite(phi) and ctl.min_J[world] > f64(0.0))
 
     @wp.kernel(module=module)
-    def begin(ctl: Control, stage: int):
+    def begin_iteration(ctl: Control, stage: int):
         """Start with the first iterate; `stage` 0: no alternatives; 1: some follow if it is poor; 2: the best."""
         world = wp.tid()
         if stage != 2:
-            ctl.choose_initial[world] = 0
-        if ctl.active[world] == 0 or (stage == 2 and ctl.choose_initial[world] == 0):
+            ctl.choose_first_iterate[world] = 0
+        if ctl.active[world] == 0 or (stage == 2 and ctl.choose_first_iterate[world] == 0):
             return
         if stage == 1:
-            if poor_first_iterate(ctl, world):
-                ctl.choose_initial[world] = 1
-                wp.atomic_max(ctl.any_rare, 0, 1)
+            if is_poor_first_iterate(ctl, world):
+                ctl.choose_first_iterate[world] = 1
+                wp.atomic_max(ctl.any_rare_branch, 0, 1)
                 return
-        start(ctl, world)
+        initialise_iteration(ctl, world)
         if stage == 2 and ctl.fixed_forcing == 0:
-            ctl.forcing[world] = f64(RESTART_FORCING)
+            ctl.forcing[world] = f64(ALTERNATIVE_START_FORCING)
 
     @wp.kernel(module=module)
-    def compare(ctl: Control, first: int, better: wp.array(dtype=wp.int32)):
+    def compare_first_iterates(ctl: Control, first: int, better: wp.array(dtype=wp.int32)):
         """Flag the worlds where the first iterate just evaluated is the best so far: J > 0 before Phi."""
         world = wp.tid()
         better[world] = 0
-        if ctl.choose_initial[world] == 0:
+        if ctl.choose_first_iterate[world] == 0:
             return
         phi = objective(ctl, world)
         if not (wp.isfinite(phi) and ctl.domain_J[world] > f64(0.0)):
@@ -160,10 +170,10 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
             ctl.best_norm[world] = low
             better[world] = 1
             if first == 0:
-                ctl.predicted[world] = 0
+                ctl.extrapolated_start[world] = 0
 
     @wp.func
-    def begin_direction(ctl: Control, world: int):
+    def check_direction(ctl: Control, world: int):
         """Check the search direction and start the line search."""
         ctl.met_negative_curvature[world] = wp.max(ctl.met_negative_curvature[world], ctl.negative_curvature[world])
         ctl.searching[world] = 1
@@ -171,9 +181,9 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         if wp.static(limited):
             barred = not ctl.limit[world] > f64(0.0)
         if not wp.isfinite(ctl.slope[world]):
-            fail(ctl, world, FAIL_NAN)
+            handle_failed_search(ctl, world, FAIL_NAN)
         elif barred:
-            fail(ctl, world, FAIL_LIMIT)
+            handle_failed_search(ctl, world, FAIL_STEP_LIMIT)
         elif ctl.negative_curvature[world] != 0 and ctl.predicted_stress[world] == 1:
             if ctl.nonmonotone_steps[world] > 0:
                 ctl.restore_best[world] = 1
@@ -182,16 +192,16 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
                 ctl.require_armijo[world] = 1
                 ctl.alpha[world] = f64(0.0)
         elif ctl.slope[world] >= f64(0.0) and wp.static(not midpoint):  # midpoint: |g| can still fall
-            if ctl.reused[world] != 0:
+            if ctl.operator_reused[world] != 0:
                 ctl.alpha[world] = f64(0.0)
             elif ctl.nonmonotone_steps[world] > 0:
                 ctl.restore_best[world] = 1
             else:
-                fail(ctl, world, FAIL_CURVATURE)
+                handle_failed_search(ctl, world, FAIL_CURVATURE)
 
     @wp.func
     def part_error(ctl: Control, world: int, part: int, whole: f64, largest: f64) -> f64:
-        """Error estimate of a part, see `check_rounding_floor`.
+        """Error estimate of a part of the model (its residual parts), see `check_rounding_floor`.
 
         `whole`: -g.p of all parts, W; `largest`: the largest length in the round-off bound, m.
         """
@@ -206,12 +216,12 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         eta = f64(1.0e30)
         if ctl.negative_curvature[world] == 0 and wp.isfinite(work) and whole > f64(0.0):
             eta = wp.sqrt(wp.abs(work) * dq / wp.max(f64(2.0) * strain + kinetic * dq, f64(1.0e-300)))
-            if ctl.eps > f64(SINGLE_EPS):  # a soft direction may be invisible to the energy
-                eta = wp.max(eta, f64(SCATTER) * dq * step / wp.max(largest, f64(1.0e-300)))
-            if eta > ctl.max_floor and dq * step <= f64(DISPLACEMENT_ROUNDINGS) * ctl.eps * largest:
+            if ctl.eps > f64(SINGLE_PRECISION_EPS):  # a soft direction may be invisible to the energy
+                eta = wp.max(eta, f64(SCATTER_FACTOR) * dq * step / wp.max(largest, f64(1.0e-300)))
+            if eta > ctl.max_floor_error and dq * step <= f64(DISPLACEMENT_ROUNDINGS) * ctl.eps * largest:
                 eta = dq * step / wp.max(largest, f64(1.0e-300))
             slow = step <= f64(VELOCITY_ROUNDINGS) * ctl.eps * speed
-            if eta > ctl.max_floor and slow and ctl.eps < f64(SINGLE_EPS):
+            if eta > ctl.max_floor_error and slow and ctl.eps < f64(SINGLE_PRECISION_EPS):
                 eta = step / speed
         return eta
 
@@ -226,8 +236,9 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         if ctl.estimate_error[world] != 2:
             return
         ctl.estimate_error[world] = 0
-        if ctl.pcg_unconverged[world] != 0 and ctl.eps > f64(SINGLE_EPS):  # this solve cannot give the error either
-            give_up(ctl, world, FAIL_FLOOR)
+        # this solve cannot give the error either
+        if ctl.pcg_unconverged[world] != 0 and ctl.eps > f64(SINGLE_PRECISION_EPS):
+            give_up(ctl, world, FAIL_ROUNDOFF)
             return
         largest, whole = f64(0.0), f64(0.0)
         for part in range(component_of_part.shape[0]):
@@ -235,24 +246,24 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
                 whole += ctl.floor_sums[0, world, part, lane]
                 largest = wp.max(largest, ctl.floor_sums[4, world, part, lane])
         if wp.static(unilateral):  # gaps have position round-off
-            largest = wp.max(largest, ctl.length)
+            largest = wp.max(largest, ctl.model_size)
         worst = f64(0.0)
         for part in range(component_of_part.shape[0]):
             if ctl.component_converged[world, component_of_part[part]] == 0:
                 worst = wp.max(worst, part_error(ctl, world, part, whole, largest))
         ctl.error_estimate[world] = worst
-        if worst <= ctl.max_floor:
-            ctl.floor[world] = wp.max(ctl.floor[world], worst)
-            accept(ctl, world)
+        if worst <= ctl.max_floor_error:
+            ctl.floor_error[world] = wp.max(ctl.floor_error[world], worst)
+            accept_iterate(ctl, world)
             return
         tries = ctl.error_estimates[world] + 1
         ctl.error_estimates[world] = tries
         known = worst < f64(1.0e30)
         if tries >= MAX_ERROR_ESTIMATES or (known and tries > 1 and worst > f64(0.5) * ctl.last_error_estimate[world]):
-            give_up(ctl, world, wp.where(known, FAIL_FLOOR, FAIL_CURVATURE))
+            give_up(ctl, world, wp.where(known, FAIL_ROUNDOFF, FAIL_CURVATURE))
             return
         ctl.last_error_estimate[world] = worst
-        begin_direction(ctl, world)
+        check_direction(ctl, world)
 
     @wp.kernel(module=module)
     def begin_search(ctl: Control, pcg: PCG):
@@ -266,44 +277,44 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         if wp.static(limited):
             ctl.alpha[world] = wp.min(ctl.limit[world], f64(1.0))
         ctl.linear_solves[world] = ctl.linear_solves[world] + 1
-        ctl.searches[world] = 0
-        ctl.doublings[world] = wp.where(ctl.negative_curvature[world] != 0 and ctl.equilibrium != 0, 0, -1)
+        ctl.search_trials[world] = 0
+        ctl.doublings[world] = wp.where(ctl.negative_curvature[world] != 0 and ctl.is_static != 0, 0, -1)
         if wp.static(unilateral):
             ctl.bracket_low[world] = wp.vec2d(f64(0.0), ctl.slope_sum[0, world])
             ctl.bracket_high[world] = wp.vec2d()
         ctl.nonmonotone_trial[world] = 0
         ctl.direction_gradient[world] = f64(0.0)
         ctl.searching[world] = 1
-        ctl.predicted[world] = 0
+        ctl.extrapolated_start[world] = 0
         ctl.store_best[world] = 0
         if wp.static(stored):
             ctl.trial_accepted[world] = 0
         if wp.static(has_constraints):
-            if ctl.classical == 0:
-                ctl.outer[world] = ctl.outer[world] + 1
-        if ctl.estimate_error[world] != 0 and pcg.total[world] < pcg.max_work:
+            if ctl.classical_multipliers == 0:
+                ctl.multiplier_updates[world] = ctl.multiplier_updates[world] + 1
+        if ctl.estimate_error[world] != 0 and pcg.step_iterations[world] < pcg.max_work:
             # estimate the error before following the direction
             ctl.estimate_error[world] = 2
             ctl.searching[world] = 0
-            wp.atomic_max(ctl.any_rare, 0, 1)
-        elif pcg.total[world] >= pcg.max_work:
+            wp.atomic_max(ctl.any_rare_branch, 0, 1)
+        elif pcg.step_iterations[world] >= pcg.max_work:
             give_up(ctl, world, FAIL_WORK)
-        elif ctl.linear_solves[world] > SOLVES_PER_ITERATION * iteration_factor(ctl, world) * ctl.max_iterations:
+        elif ctl.linear_solves[world] > MAX_SOLVES_PER_ITERATION * iteration_factor(ctl, world) * ctl.max_iterations:
             give_up(ctl, world, FAIL_ITERATIONS)
         else:
-            begin_direction(ctl, world)
+            check_direction(ctl, world)
 
-    outer = outer_kernels(traits, module)
+    outer = outer_loop_kernels(traits, module)
     return _types.SimpleNamespace(
         **vars(outer),
         **vars(searching),
         module=module,
         evaluate_norms=evaluate_norms,
-        accept=accept,
+        accept_iterate=accept_iterate,
         record_residual=record_residual,
         reset_min_J=reset_min_J,
-        begin=begin,
-        compare=compare,
+        begin_iteration=begin_iteration,
+        compare_first_iterates=compare_first_iterates,
         check_rounding_floor=check_rounding_floor,
         begin_search=begin_search,
     )

@@ -12,7 +12,7 @@ from ..common.lanes import lane_functions
 from ..common.types import kernel_module, precision
 from .newton_control import control_struct
 
-__all__ = ["LANES", "forcing_functions", "groups_struct", "pcg_kernels", "pcg_struct"]
+__all__ = ["FREE_GROUP_LANES", "forcing_functions", "free_groups_struct", "pcg_kernels", "pcg_struct"]
 
 CONSTRAINT_FORCING = 0.4
 """Factor on the tolerance of solves with constraints. Of 0.03, 0.18, 0.4 and 1 it avoids the third Newton iteration at
@@ -21,9 +21,9 @@ and 2.55 Newton iterations."""
 UNCHECKED_ITERATIONS = 3
 """Newton iterations whose linear solves rely on factors of the operator's own matrix. Later solves are checked and
 refined by conjugate gradients."""
-STRICT_CHECK, STRICT_GAIN = 10, 0.01
-"""An error-estimating solve ends when it gains less than STRICT_GAIN of the energy in STRICT_CHECK iterations."""
-LANES = 128
+ENERGY_CHECK_INTERVAL, MIN_ENERGY_GAIN = 10, 0.01
+"""An error-estimating solve ends when its energy grows by less than this fraction in this number of iterations."""
+FREE_GROUP_LANES = 128
 """Partial sums per group of bodies; fixed, so that results are independent of the number of worlds."""
 
 
@@ -35,24 +35,25 @@ def pcg_struct():
     class PCGControl:
         active: wp.array(dtype=wp.int32)
         iterations: wp.array(dtype=wp.int32)  # of this solve
-        total: wp.array(dtype=wp.int32)  # of this step
+        step_iterations: wp.array(dtype=wp.int32)  # of this step
         rz: wp.array(dtype=wp.float64)  # r.z of the previous iteration
-        target: wp.array(dtype=wp.float64)  # target norm of the solve
+        target_norm: wp.array(dtype=wp.float64)  # norm at which the solve ends
         norm: wp.array(dtype=wp.float64)  # |r| in the D^-1 norm of Newton's convergence test
         first_norm: wp.array(dtype=wp.float64)  # at the start of the solve
-        sums: wp.array2d(dtype=wp.float64)  # r.z and r.D^-1 r
-        curvature: wp.array2d(dtype=wp.float64)  # p.Hp
-        any_active: wp.array(dtype=wp.int32)
-        estimate_error: wp.array(
-            dtype=wp.int32
-        )  # 1: the solve continues until its energy converges, for an error estimate
-        energy: wp.array(dtype=wp.float64)  # that energy, sum of alpha r.z, and its value at the last check
-        seen: wp.array(dtype=wp.float64)
+        sums: wp.array2d(dtype=wp.float64)  # [2, world] r.z and r.D^-1 r
+        curvature: wp.array2d(dtype=wp.float64)  # [1, world] p.Hp
+        any_active: wp.array(dtype=wp.int32)  # [1]
+        # 1: the solve continues until its energy converges, for an error estimate
+        estimate_error: wp.array(dtype=wp.int32)
+        energy: wp.array(dtype=wp.float64)  # that energy, sum of alpha r.z
+        checked_energy: wp.array(dtype=wp.float64)  # its value at the last check
         negative_curvature: wp.array(dtype=wp.int32)  # the solve met a direction without positive curvature
         pcg_unconverged: wp.array(dtype=wp.int32)  # the last solve ended at max_iterations
-        exact: wp.array(dtype=wp.int32)  # the preconditioner is the inverse of the operator, up to rounding
-        taken: wp.array(dtype=wp.int32)  # 1: its z is the solution
-        flip: wp.array(dtype=wp.int32)  # 1: directions of negative curvature are followed, by its absolute value
+        # 1: the preconditioner is the inverse of the operator, up to rounding
+        preconditioner_is_exact: wp.array(dtype=wp.int32)
+        solved_directly: wp.array(dtype=wp.int32)  # 1: then its z is taken as the solution
+        # 1: directions of negative curvature are followed, by the step of its absolute value
+        follow_negative_curvature: wp.array(dtype=wp.int32)
         max_iterations: wp.int32  # of a solve
         max_work: wp.int32  # of a step
 
@@ -60,7 +61,7 @@ def pcg_struct():
 
 
 @functools.cache
-def groups_struct(dtype: str):
+def free_groups_struct(dtype: str):
     """Groups of bodies with free common translation: Z, the indicator of their position slots."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
@@ -69,11 +70,11 @@ def groups_struct(dtype: str):
     class FreeGroups:
         start: wp.array(dtype=wp.int32)  # [group + 1]
         slot: wp.array(dtype=wp.int32)  # position slots, by group
-        of_slot: wp.array(dtype=wp.int32)  # [slot] group or -1
+        group_of_slot: wp.array(dtype=wp.int32)  # [slot] group or -1
         is_position: wp.array(dtype=T)  # [slot]
-        lumped: wp.array2d(dtype=T)  # [world or 0, slot] (M Z)_slot, kg
+        lumped_mass: wp.array2d(dtype=T)  # [world or 0, slot] (M Z)_slot, kg
         mass: wp.array2d(dtype=T)  # [world or 0, group] kg
-        free: wp.array(dtype=vec3)  # [group] directions in which it is free
+        free_directions: wp.array(dtype=vec3)  # [group] directions in which it is free
 
     return FreeGroups
 
@@ -85,31 +86,31 @@ def forcing_functions(has_constraints: bool) -> _types.SimpleNamespace:
     Newton = control_struct()
 
     @wp.func
-    def least_norm(newton: Newton, world: int) -> f64:
+    def min_target_norm(newton: Newton, world: int) -> f64:
         """Fraction of the accepted residual norm: a smaller residual of the solve gains nothing."""
         least = f64(0.1) * newton.unconverged_tol[world]
         if wp.static(has_constraints):
             # the solve also yields the constraint forces: the residual across constraints is their error
             least = f64(CONSTRAINT_FORCING) * least
-            if newton.classical == 0:
+            if newton.classical_multipliers == 0:
                 # a loose force tolerance must not leave constraints violated
                 least = least / wp.max(f64(10.0) * newton.violation_ratio[world], f64(1.0))
         return least
 
     @wp.func
-    def forced(newton: Newton, world: int, norm: f64) -> f64:
-        """Forcing term times the residual, |r| = norm at the start, and at least `least_norm`."""
+    def forcing_target(newton: Newton, world: int, norm: f64) -> f64:
+        """Forcing term times the residual, |r| = norm at the start, and at least `min_target_norm`."""
         if newton.fixed_forcing != 0:
             return newton.forcing[world] * norm
         goal = newton.forcing[world] * newton.unconverged_norm[world]
         if wp.static(has_constraints):
             # with balanced forces the remaining constraint violation may still require a step
             goal = newton.forcing[world] * wp.min(newton.unconverged_norm[world], norm)
-            if newton.classical == 0:
+            if newton.classical_multipliers == 0:
                 goal = f64(CONSTRAINT_FORCING) * goal
-        return wp.max(goal, least_norm(newton, world))
+        return wp.max(goal, min_target_norm(newton, world))
 
-    return _types.SimpleNamespace(least_norm=least_norm, forced=forced)
+    return _types.SimpleNamespace(min_target_norm=min_target_norm, forcing_target=forcing_target)
 
 
 @functools.cache
@@ -120,12 +121,12 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNames
     f64 = wp.float64
     Newton = control_struct()
     Control = pcg_struct()
-    Groups = groups_struct(dtype)
-    row_sum, forced = lane_functions(dtype).row_sum, forcing_functions(has_constraints).forced
+    Groups = free_groups_struct(dtype)
+    row_sum, forcing_target = lane_functions(dtype).row_sum, forcing_functions(has_constraints).forcing_target
     module = kernel_module(f"pcg_{dtype}{'_gated' if has_constraints else ''}")
 
     @wp.kernel(module=module)
-    def start(
+    def initialise_residual(
         g: wp.array2d(dtype=vec3),
         free: wp.array(dtype=vec3),
         active: wp.array(dtype=wp.int32),
@@ -151,7 +152,7 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNames
             r[world, slot] = vec3()
 
     @wp.kernel(module=module)
-    def block_jacobi(
+    def apply_block_jacobi(
         inverse: wp.array2d(dtype=mat33),
         r: wp.array2d(dtype=vec3),
         diagonal: wp.array2d(dtype=vec3),
@@ -179,11 +180,11 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNames
             rows[1, world, slot / warp] = rr
 
     @wp.kernel(module=module)
-    def begin(newton: Newton, ctl: Control):
+    def begin_solve(newton: Newton, ctl: Control):
         """Set the target norm of the solve: Eisenstat and Walker, but no tighter than Newton's method needs."""
         world = wp.tid()
         ctl.active[world] = 0
-        ctl.taken[world] = 0
+        ctl.solved_directly[world] = 0
         if newton.active[world] == 0:
             return
         rz = ctl.sums[0, world]
@@ -193,7 +194,7 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNames
         ctl.first_norm[world] = norm
         ctl.iterations[world] = 0
         ctl.negative_curvature[world] = 0
-        ctl.flip[world] = 1 - newton.linear_stress
+        ctl.follow_negative_curvature[world] = 1 - newton.linear_stress
         estimate_error = newton.estimate_error[world] != 0
         # a linear prediction must also cover the whole step; other laws are not linear that far
         whole = newton.predicted_stress[world] == 1 and newton.linear_stress != 0
@@ -201,24 +202,24 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNames
         if not estimate_error:
             ctl.pcg_unconverged[world] = 0
         ctl.energy[world] = f64(0.0)
-        ctl.seen[world] = f64(0.0)
-        ctl.target[world] = forced(newton, world, norm)
+        ctl.checked_energy[world] = f64(0.0)
+        ctl.target_norm[world] = forcing_target(newton, world, norm)
         if ctl.estimate_error[world] != 0:
             # round-off in the residual hides the smooth error: its norm is no stopping criterion
-            ctl.target[world] = f64(0.0)
-        if ctl.total[world] >= ctl.max_work:
+            ctl.target_norm[world] = f64(0.0)
+        if ctl.step_iterations[world] >= ctl.max_work:
             return  # the step is given up, see `begin_search`
-        if norm > ctl.target[world] and rz > f64(0.0) and ctl.max_iterations > 0:
+        if norm > ctl.target_norm[world] and rz > f64(0.0) and ctl.max_iterations > 0:
             checked = (
                 newton.iterations[world] >= UNCHECKED_ITERATIONS
                 or newton.predicted_stress[world] != 0
                 or ctl.estimate_error[world] != 0
             )
-            if ctl.exact[world] != 0 and not checked:
-                ctl.taken[world] = 1
+            if ctl.preconditioner_is_exact[world] != 0 and not checked:
+                ctl.solved_directly[world] = 1
                 ctl.norm[world] = f64(0.0)
                 ctl.iterations[world] = 1
-                ctl.total[world] = ctl.total[world] + 1
+                ctl.step_iterations[world] = ctl.step_iterations[world] + 1
             else:
                 ctl.active[world] = 1
                 wp.atomic_max(ctl.any_active, 0, 1)
@@ -233,11 +234,11 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNames
         world, slot = wp.tid()
         if ctl.active[world] != 0:
             p_out[world, slot] = z[world, slot]
-        elif ctl.taken[world] != 0:
+        elif ctl.solved_directly[world] != 0:
             x[world, slot] = x[world, slot] + z[world, slot]
 
     @wp.kernel(module=module)
-    def update(
+    def update_solution(
         ctl: Control,
         p_in: wp.array2d(dtype=vec3),
         Hp: wp.array2d(dtype=vec3),
@@ -247,7 +248,7 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNames
         """x += alpha p, r -= alpha H p with alpha = r.z / p.H p.
 
         A direction without positive curvature ends the solve: followed in full if it is the first, else not at all;
-        with `flip` by the step of the absolute curvature, which leads away from a saddle.
+        with `follow_negative_curvature` by the step of its absolute value, which leads away from a saddle.
         """
         world, slot = wp.tid()
         if world == 0 and slot == 0:
@@ -263,7 +264,7 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNames
             length = rz / pHp
         elif ctl.iterations[world] == 0:
             length = f64(1.0)
-        elif ctl.flip[world] != 0 and pHp < f64(0.0) and wp.isfinite(pHp):
+        elif ctl.follow_negative_curvature[world] != 0 and pHp < f64(0.0) and wp.isfinite(pHp):
             length = -rz / pHp
         if slot == 0:
             ctl.energy[world] = ctl.energy[world] + length * rz
@@ -285,14 +286,18 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNames
             count = ctl.iterations[world] + 1
             ctl.norm[world] = norm
             ctl.iterations[world] = count
-            ctl.total[world] = ctl.total[world] + 1
-            more = norm > ctl.target[world] and count < ctl.max_iterations and ctl.total[world] < ctl.max_work
-            if ctl.estimate_error[world] != 0 and count % STRICT_CHECK == 0:
+            ctl.step_iterations[world] = ctl.step_iterations[world] + 1
+            more = (
+                norm > ctl.target_norm[world]
+                and count < ctl.max_iterations
+                and ctl.step_iterations[world] < ctl.max_work
+            )
+            if ctl.estimate_error[world] != 0 and count % ENERGY_CHECK_INTERVAL == 0:
                 energy = ctl.energy[world]
-                more = more and energy - ctl.seen[world] > f64(STRICT_GAIN) * energy
-                ctl.seen[world] = energy
+                more = more and energy - ctl.checked_energy[world] > f64(MIN_ENERGY_GAIN) * energy
+                ctl.checked_energy[world] = energy
             cut = ctl.estimate_error[world] != 0 and count >= ctl.max_iterations
-            if count >= ctl.max_iterations and norm > ctl.target[world]:
+            if count >= ctl.max_iterations and norm > ctl.target_norm[world]:
                 ctl.pcg_unconverged[world] = 1
             if cut or not (pHp > f64(0.0) and rz >= f64(0.0)):
                 ctl.negative_curvature[world] = 1
@@ -302,18 +307,18 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNames
                 ctl.active[world] = 0  # threads that see this at once leave p unchanged; it is not read again
 
     @wp.kernel(module=module)
-    def group_partial(
+    def free_group_partials(
         groups: Groups,
         r: wp.array2d(dtype=vec3),
         active: wp.array(dtype=wp.int32),
         partial: wp.array3d(dtype=vec3),
     ):
-        """Z^T r, in LANES strided partial sums per group."""
+        """Z^T r, in FREE_GROUP_LANES strided partial sums per group."""
         world, group, lane = wp.tid()
         if active[world] == 0:
             return
         s = vec3()
-        for k in range(groups.start[group] + lane, groups.start[group + 1], LANES):
+        for k in range(groups.start[group] + lane, groups.start[group + 1], FREE_GROUP_LANES):
             s += r[world, groups.slot[k]]
         partial[world, group, lane] = s
 
@@ -330,10 +335,10 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNames
         if active[world] == 0:
             return
         s = vec3()
-        for lane in range(LANES):
+        for lane in range(FREE_GROUP_LANES):
             s += partial[world, group, lane]
         scale = T(1.0) / (T(mass_factor[world]) * groups.mass[world % groups.mass.shape[0], group])
-        velocity[world, group] = scale * wp.cw_mul(s, groups.free[group])
+        velocity[world, group] = scale * wp.cw_mul(s, groups.free_directions[group])
 
     @wp.kernel(module=module)
     def translate_groups(
@@ -349,25 +354,25 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNames
         world, slot = wp.tid()
         if active[world] == 0:
             return
-        group = groups.of_slot[slot]
+        group = groups.group_of_slot[slot]
         if group < 0:
             return
         c = velocity[world, group]
         x[world, slot] = x[world, slot] + groups.is_position[slot] * c
-        r[world, slot] = r[world, slot] - T(mass_factor[world]) * groups.lumped[
-            world % groups.lumped.shape[0], slot
+        r[world, slot] = r[world, slot] - T(mass_factor[world]) * groups.lumped_mass[
+            world % groups.lumped_mass.shape[0], slot
         ] * wp.cw_mul(c, free[slot])
 
     return _types.SimpleNamespace(
         module=module,
-        start=start,
+        initialise_residual=initialise_residual,
         zero_converged=zero_converged,
-        block_jacobi=block_jacobi,
-        begin=begin,
+        apply_block_jacobi=apply_block_jacobi,
+        begin_solve=begin_solve,
         first_direction=first_direction,
-        update=update,
+        update_solution=update_solution,
         new_direction=new_direction,
-        group_partial=group_partial,
+        free_group_partials=free_group_partials,
         group_velocity=group_velocity,
         translate_groups=translate_groups,
     )

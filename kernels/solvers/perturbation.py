@@ -13,13 +13,13 @@ from ..common.structs import mass_function, topology_struct
 from ..common.types import kernel_module, precision
 from .newton_control import control_struct
 
-__all__ = ["SAMPLES", "SCATTER", "perturbation_kernels"]
+__all__ = ["SAMPLES", "SCATTER_FACTOR", "perturbation_kernels"]
 
-SAMPLES, SHARE = 4, 0.25
+SAMPLES, SAMPLE_WEIGHT = 4, 0.25
 """Number of evaluations, and the weight of each."""
-SCATTER = 2.0
+SCATTER_FACTOR = 2.0
 """Factor on a displacement estimated from the mean residual: its scatter is half of the round-off error."""
-MOST = 3
+MAX_PERTURBATION = 3
 """Largest perturbation of a component, in roundings."""
 
 
@@ -35,7 +35,10 @@ def perturbation_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def begin_samples(
-        ctl: Control, flags: wp.array(dtype=wp.int32), moved: wp.array2d(dtype=vec3), total: wp.array2d(dtype=vec3)
+        ctl: Control,
+        flags: wp.array(dtype=wp.int32),
+        perturbation_sum: wp.array2d(dtype=vec3),
+        gradient_sum: wp.array2d(dtype=vec3),
     ):
         """Flag the worlds whose next solve estimates the error; clear both sums there."""
         world, slot = wp.tid()
@@ -43,15 +46,15 @@ def perturbation_kernels(dtype: str) -> _types.SimpleNamespace:
         if slot == 0:
             flags[world] = wp.where(asks, 1, 0)
         if asks:
-            moved[world, slot] = vec3()
-            total[world, slot] = vec3()
+            perturbation_sum[world, slot] = vec3()
+            gradient_sum[world, slot] = vec3()
 
     @wp.kernel(module=module)
-    def perturb(
+    def perturb_positions(
         ctl: Control, flags: wp.array(dtype=wp.int32), sample: int, u: wp.array2d(dtype=vec3),
-        moved: wp.array2d(dtype=vec3),
+        perturbation_sum: wp.array2d(dtype=vec3),
     ):  # fmt: skip
-        """u += d, up to MOST roundings, random per slot and sample; moved += d / (dq/dv)."""
+        """u += d, up to MAX_PERTURBATION roundings, random per slot and sample; perturbation_sum += d / (dq/dv)."""
         world, slot = wp.tid()
         if flags[world] == 0:
             return
@@ -59,25 +62,27 @@ def perturbation_kernels(dtype: str) -> _types.SimpleNamespace:
         y = vec3()
         state = wp.rand_init(sample, slot)
         for k in range(3):
-            y[k] = x[k] + T(f64(wp.randi(state, -MOST, MOST + 1)) * ctl.eps) * x[k]
+            y[k] = x[k] + T(f64(wp.randi(state, -MAX_PERTURBATION, MAX_PERTURBATION + 1)) * ctl.eps) * x[k]
         u[world, slot] = y
-        moved[world, slot] = moved[world, slot] + (y - x) / T(ctl.dq_dv[world])
+        perturbation_sum[world, slot] = perturbation_sum[world, slot] + (y - x) / T(ctl.dq_dv[world])
 
     @wp.kernel(module=module)
-    def add_sample(flags: wp.array(dtype=wp.int32), gradient: wp.array2d(dtype=vec3), total: wp.array2d(dtype=vec3)):
-        """total += gradient."""
+    def add_sample(
+        flags: wp.array(dtype=wp.int32), gradient: wp.array2d(dtype=vec3), gradient_sum: wp.array2d(dtype=vec3)
+    ):
+        """gradient_sum += gradient."""
         world, slot = wp.tid()
         if flags[world] != 0:
-            total[world, slot] = total[world, slot] + gradient[world, slot]
+            gradient_sum[world, slot] = gradient_sum[world, slot] + gradient[world, slot]
 
     @wp.kernel(module=module)
     def mean_gradient(
         topo: Topology,
         mass_factor: wp.array(dtype=f64),
         flags: wp.array(dtype=wp.int32),
-        moved: wp.array2d(dtype=vec3),
+        perturbation_sum: wp.array2d(dtype=vec3),
         product: wp.array2d(dtype=vec3),
-        total: wp.array2d(dtype=vec3),
+        gradient_sum: wp.array2d(dtype=vec3),
         gradient: wp.array2d(dtype=vec3),
     ):
         """Mean over the samples of g(u + d) - (dq/dv) K p, with p = d / (dq/dv) and `product` = H p of their sum."""
@@ -86,10 +91,14 @@ def perturbation_kernels(dtype: str) -> _types.SimpleNamespace:
             return
         a = vec3()
         for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
-            a += mass_entry(topo, world, k) * moved[world, topo.mass_column[k]]
+            a += mass_entry(topo, world, k) * perturbation_sum[world, topo.mass_column[k]]
         stiff = product[world, slot] - T(mass_factor[world]) * a
-        gradient[world, slot] = T(SHARE) * (total[world, slot] - stiff)
+        gradient[world, slot] = T(SAMPLE_WEIGHT) * (gradient_sum[world, slot] - stiff)
 
     return _types.SimpleNamespace(
-        module=module, begin_samples=begin_samples, perturb=perturb, add_sample=add_sample, mean_gradient=mean_gradient
+        module=module,
+        begin_samples=begin_samples,
+        perturb_positions=perturb_positions,
+        add_sample=add_sample,
+        mean_gradient=mean_gradient,
     )

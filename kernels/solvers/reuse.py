@@ -18,13 +18,13 @@ from .pcg import pcg_struct
 
 __all__ = ["reuse_kernels", "reuse_struct"]
 
-NEWTON_DECADES = 3.0
+NEW_MATRIX_DECADES = 3.0
 """Expected residual reduction of a Newton iteration with a new matrix, in decades."""
-RETRY_FACTOR = 0.8
+REDUCTION_FADING = 0.8
 """Factor on `first_reduction` when a step begins with a new matrix: the rule retries an old matrix after some steps."""
 DIAGONAL_AGEING = 0.25
 """Increment of `extra_iterations` per solve if only D, which weights the norms, is kept."""
-FORCING_FACTOR = 0.3
+REUSED_FORCING_FACTOR = 0.3
 """Relative tolerance of a linear solve with a reused matrix, over the reduction by the last Newton iteration."""
 
 
@@ -34,8 +34,8 @@ def reuse_struct():
 
     @wp.struct
     class ReuseControl:
-        build: wp.array(dtype=wp.int32)  # build the object now
-        rebuilt_here: wp.array(dtype=wp.int32)  # 1: build it at this iterate; 0: at its old linearisation point
+        build_now: wp.array(dtype=wp.int32)  # 1: build the object before this solve
+        build_at_iterate: wp.array(dtype=wp.int32)  # 1: build it at this iterate; 0: at its old linearisation point
         point_changed: wp.array(dtype=wp.int32)  # the linearisation point has changed since it was stored in the state
         stale: wp.array(dtype=wp.int32)  # 1: object and counts are not the state's; 2: the object is not
         rebuild_due: wp.array(dtype=wp.int32)  # rebuild it at the next solve
@@ -45,12 +45,12 @@ def reuse_struct():
             dtype=wp.float64
         )  # iterations of its first solve (per decade) or step; 0: not yet known
         extra_iterations: wp.array(dtype=wp.float64)  # iterations beyond that rate since its first solve
-        made_at: wp.array(dtype=wp.int32)  # matrix: Newton iteration of this attempt that built it; -1: kept
+        built_at_iteration: wp.array(dtype=wp.int32)  # matrix: Newton iteration of this attempt that built it; -1: kept
         first_reduction: wp.array(
             dtype=wp.float64
         )  # reduction of the residual by a step's first iteration with a kept matrix
-        kept: wp.array2d(dtype=wp.float64)  # in the state: the six values of `restore_counts`
-        limit: wp.float64  # extra iterations at which a rebuild pays
+        stored_counts: wp.array2d(dtype=wp.float64)  # [world, 6] in the state: the values of `restore_counts`
+        max_extra_iterations: wp.float64  # beyond it a rebuild pays
         any_build: wp.array(dtype=wp.int32)
 
     return ReuseControl
@@ -70,16 +70,16 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
     def restore_counts(reuse: Reuse, world: int):
         """Restore the counts from the state, once, after the state was set externally (reset, checkpoint)."""
         if reuse.stale[world] == 1:
-            reuse.rebuild_due[world] = int(reuse.kept[world, 0])
-            reuse.mass_factor[world] = reuse.kept[world, 1]
-            reuse.dq_dv[world] = reuse.kept[world, 2]
-            reuse.baseline_iterations[world] = reuse.kept[world, 3]
-            reuse.extra_iterations[world] = reuse.kept[world, 4]
-            reuse.first_reduction[world] = reuse.kept[world, 5]
+            reuse.rebuild_due[world] = int(reuse.stored_counts[world, 0])
+            reuse.mass_factor[world] = reuse.stored_counts[world, 1]
+            reuse.dq_dv[world] = reuse.stored_counts[world, 2]
+            reuse.baseline_iterations[world] = reuse.stored_counts[world, 3]
+            reuse.extra_iterations[world] = reuse.stored_counts[world, 4]
+            reuse.first_reduction[world] = reuse.stored_counts[world, 5]
             reuse.stale[world] = 2
 
     @wp.func
-    def gain(reduction: f64) -> f64:
+    def gained_decades(reduction: f64) -> f64:
         """Reduction of the residual in decades."""
         return -wp.log10(wp.max(reduction, f64(1.0e-30)))
 
@@ -94,23 +94,23 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
         """Before a solve: choose the worlds that build the object, at the iterate if it is due or the step has
         changed."""
         world = wp.tid()
-        reuse.build[world] = 0
-        reuse.rebuilt_here[world] = 0
+        reuse.build_now[world] = 0
+        reuse.build_at_iterate[world] = 0
         if active[world] == 0:
             return
         restore_counts(reuse, world)
         same = reuse.mass_factor[world] == mass_factor[world] and reuse.dq_dv[world] == dq_dv[world]
         if reuse.rebuild_due[world] != 0 or not same:
-            reuse.rebuilt_here[world] = 1
+            reuse.build_at_iterate[world] = 1
             reuse.point_changed[world] = 1
             reuse.rebuild_due[world] = 0
             reuse.mass_factor[world] = mass_factor[world]
             reuse.dq_dv[world] = dq_dv[world]
             reuse.baseline_iterations[world] = f64(0.0)
             reuse.extra_iterations[world] = f64(0.0)
-            reuse.made_at[world] = newton.iterations[world]
-        if reuse.rebuilt_here[world] != 0 or reuse.stale[world] != 0:
-            reuse.build[world] = 1
+            reuse.built_at_iteration[world] = newton.iterations[world]
+        if reuse.build_at_iterate[world] != 0 or reuse.stale[world] != 0:
+            reuse.build_now[world] = 1
             wp.atomic_max(reuse.any_build, 0, 1)
 
     @wp.kernel(module=module)
@@ -128,43 +128,45 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
             restore_counts(reuse, world)
         k = newton.iterations[world]
         need = wp.log10(wp.max(newton.convergence_ratio[world], f64(1.0)))
-        fresh = wp.max(need / f64(NEWTON_DECADES), f64(1.0))
+        fresh = wp.max(need / f64(NEW_MATRIX_DECADES), f64(1.0))
         if newton.estimate_error[world] != 0 or newton.predicted_stress[world] != 0:
             reuse.rebuild_due[world] = 1
-        if newton.reused[world] == 2:
+        if newton.operator_reused[world] == 2:
             reuse.rebuild_due[world] = 1
             if k == 0:
                 reuse.first_reduction[world] = f64(1.0)
             return
         if k == 0:
-            reuse.made_at[world] = -1
+            reuse.built_at_iteration[world] = -1
             if keep < 2:
                 reuse.rebuild_due[world] = 1
                 reuse.stale[world] = 0  # the state holds no matrix
                 return
-            if need > gain(reuse.first_reduction[world]) * (fresh + reuse.limit):
+            if need > gained_decades(reuse.first_reduction[world]) * (fresh + reuse.max_extra_iterations):
                 reuse.rebuild_due[world] = 1
-                reuse.first_reduction[world] = f64(RETRY_FACTOR) * reuse.first_reduction[world]
+                reuse.first_reduction[world] = f64(REDUCTION_FADING) * reuse.first_reduction[world]
             return
-        slow = need > gain(newton.reduction[world]) * (fresh + reuse.limit)
+        slow = need > gained_decades(newton.residual_reduction[world]) * (fresh + reuse.max_extra_iterations)
         late = 3 * k >= newton.max_iterations
         if newton.alpha[world] != f64(1.0) or slow or late:
             reuse.rebuild_due[world] = 1
 
     @wp.kernel(module=module)
-    def loosen_tolerance(reuse: Reuse, newton: Newton):
-        """Loosen the tolerance of a solve with a reused matrix to the expected gain of an iteration."""
+    def loosen_forcing(reuse: Reuse, newton: Newton):
+        """Loosen the forcing term of a solve with a reused matrix to the expected reduction by an iteration."""
         world = wp.tid()
-        newton.reused[world] = 1 - reuse.rebuilt_here[world]
+        newton.operator_reused[world] = 1 - reuse.build_at_iterate[world]
         if newton.active[world] == 0:
             return
         reduction = reuse.first_reduction[world]
         if newton.iterations[world] > 0:
-            reduction = newton.reduction[world]
-            if newton.iterations[world] == 1 and reuse.made_at[world] == -1:
+            reduction = newton.residual_reduction[world]
+            if newton.iterations[world] == 1 and reuse.built_at_iteration[world] == -1:
                 reuse.first_reduction[world] = reduction
-        if reuse.rebuilt_here[world] == 0 and newton.fixed_forcing == 0:
-            newton.forcing[world] = wp.max(newton.forcing[world], wp.min(f64(FORCING_FACTOR) * reduction, f64(0.1)))
+        if reuse.build_at_iterate[world] == 0 and newton.fixed_forcing == 0:
+            newton.forcing[world] = wp.max(
+                newton.forcing[world], wp.min(f64(REUSED_FORCING_FACTOR) * reduction, f64(0.1))
+            )
 
     @wp.kernel(module=module)
     def count_step(reuse: Reuse, newton: Newton, accepted: wp.array(dtype=wp.int32)):
@@ -174,16 +176,16 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
             return
         if newton.predicted_stress[world] != 0:
             reuse.rebuild_due[world] = 1  # the state lacks its linearisation point
-        made_at = wp.max(reuse.made_at[world], 0)
+        built_at_iteration = wp.max(reuse.built_at_iteration[world], 0)
         # a step that rebuilt it midway began with another matrix: count one more iteration
-        count = f64(newton.iterations[world] - made_at + wp.min(made_at, 1))
+        count = f64(newton.iterations[world] - built_at_iteration + wp.min(built_at_iteration, 1))
         if reuse.baseline_iterations[world] == f64(0.0):
             reuse.baseline_iterations[world] = wp.max(count, f64(1.0))
         else:
             reuse.extra_iterations[world] = reuse.extra_iterations[world] + wp.max(
                 count - reuse.baseline_iterations[world], f64(0.0)
             )
-            if reuse.extra_iterations[world] > reuse.limit:
+            if reuse.extra_iterations[world] > reuse.max_extra_iterations:
                 reuse.rebuild_due[world] = 1
 
     @wp.kernel(module=module)
@@ -206,7 +208,7 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
             reuse.extra_iterations[world] = reuse.extra_iterations[world] + wp.max(
                 count - reuse.baseline_iterations[world] * decades - f64(1.0), f64(0.0)
             )
-        if reuse.extra_iterations[world] > reuse.limit:
+        if reuse.extra_iterations[world] > reuse.max_extra_iterations:
             reuse.rebuild_due[world] = 1
 
     @wp.kernel(module=module)
@@ -216,12 +218,12 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
         if accepted[world] == 0 or reuse.stale[world] != 0:
             return
         reuse.point_changed[world] = 0
-        reuse.kept[world, 0] = f64(reuse.rebuild_due[world])
-        reuse.kept[world, 1] = reuse.mass_factor[world]
-        reuse.kept[world, 2] = reuse.dq_dv[world]
-        reuse.kept[world, 3] = reuse.baseline_iterations[world]
-        reuse.kept[world, 4] = reuse.extra_iterations[world]
-        reuse.kept[world, 5] = reuse.first_reduction[world]
+        reuse.stored_counts[world, 0] = f64(reuse.rebuild_due[world])
+        reuse.stored_counts[world, 1] = reuse.mass_factor[world]
+        reuse.stored_counts[world, 2] = reuse.dq_dv[world]
+        reuse.stored_counts[world, 3] = reuse.baseline_iterations[world]
+        reuse.stored_counts[world, 4] = reuse.extra_iterations[world]
+        reuse.stored_counts[world, 5] = reuse.first_reduction[world]
 
     @wp.kernel(module=module)
     def mark_stale(flags: wp.array(dtype=wp.int32), reuse: Reuse):
@@ -238,29 +240,29 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
             reuse.rebuild_due[world] = 1
 
     @wp.func
-    def copy_direction(reuse: Reuse, accepted: wp.array(dtype=wp.int32), world: int) -> int:
-        """Copy direction: 1: iterate to linearisation point; 2: state to linearisation point; 3: linearisation point to
+    def transfer_case(reuse: Reuse, accepted: wp.array(dtype=wp.int32), world: int) -> int:
+        """Transfer due: 1: iterate to linearisation point; 2: state to linearisation point; 3: linearisation point to
         state; 0: none.
 
         1 and 2 come before a solve, 3 after a step with the flags `accepted` (else an empty array).
         """
         if accepted.shape[0] > 0:
             return wp.where(accepted[world] != 0 and reuse.point_changed[world] != 0 and reuse.stale[world] == 0, 3, 0)
-        if reuse.rebuilt_here[world] != 0:
+        if reuse.build_at_iterate[world] != 0:
             return 1
         return wp.where(reuse.stale[world] != 0, 2, 0)
 
     @wp.kernel(module=module)
-    def carry_points(
+    def transfer_points(
         reuse: Reuse,
         accepted: wp.array(dtype=wp.int32),
         u: wp.array2d(dtype=vec3),
         kept: wp.array2d(dtype=vec3),
         linearisation_point: wp.array2d(dtype=vec3),
     ):
-        """Copy the displacements of the linearisation point, see `copy_direction`."""
+        """Copy the displacements of the linearisation point, see `transfer_case`."""
         world, slot = wp.tid()
-        to = copy_direction(reuse, accepted, world)
+        to = transfer_case(reuse, accepted, world)
         if to == 1:
             linearisation_point[world, slot] = u[world, slot]
         elif to == 2:
@@ -269,16 +271,16 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
             kept[world, slot] = linearisation_point[world, slot]
 
     @wp.kernel(module=module)
-    def carry_words(
+    def transfer_words(
         reuse: Reuse,
         accepted: wp.array(dtype=wp.int32),
         live: wp.array2d(dtype=wp.uint32),
         kept: wp.array2d(dtype=wp.uint32),
         linearisation_point: wp.array2d(dtype=wp.uint32),
     ):
-        """`carry_points` for an array of a term, as [world, 32-bit word]."""
+        """`transfer_points` for an array of a term, as [world, 32-bit word]."""
         world, word = wp.tid()
-        to = copy_direction(reuse, accepted, world)
+        to = transfer_case(reuse, accepted, world)
         if to == 1:
             linearisation_point[world, word] = live[world, word]
         elif to == 2:
@@ -287,7 +289,7 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
             kept[world, word] = linearisation_point[world, word]
 
     @wp.kernel(module=module)
-    def carry_rows(
+    def transfer_constraint_rows(
         reuse: Reuse,
         accepted: wp.array(dtype=wp.int32),
         gradient: wp.array2d(dtype=wp.vec3d),
@@ -297,9 +299,9 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
         point_gradient: wp.array2d(dtype=wp.vec3d),
         point_stiffness: wp.array2d(dtype=f64),
     ):
-        """`carry_points` for the rows of constraints of the object."""
+        """`transfer_points` for the rows of constraints of the object."""
         world, row = wp.tid()
-        to = copy_direction(reuse, accepted, world)
+        to = transfer_case(reuse, accepted, world)
         if to == 1:
             point_stiffness[world, row] = stiffness[world, row]
         elif to == 2:
@@ -319,7 +321,7 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
     def mark_built(reuse: Reuse):
         """Clear `stale` in the worlds that have built the object."""
         world = wp.tid()
-        if reuse.build[world] != 0:
+        if reuse.build_now[world] != 0:
             reuse.stale[world] = 0
 
     return _types.SimpleNamespace(
@@ -328,12 +330,12 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
         count_solve=count_solve,
         check_matrix_reuse=check_matrix_reuse,
         count_step=count_step,
-        loosen_tolerance=loosen_tolerance,
+        loosen_forcing=loosen_forcing,
         store_counts=store_counts,
         mark_stale=mark_stale,
         mark_built=mark_built,
         request_rebuild=request_rebuild,
-        carry_points=carry_points,
-        carry_rows=carry_rows,
-        carry_words=carry_words,
+        transfer_points=transfer_points,
+        transfer_constraint_rows=transfer_constraint_rows,
+        transfer_words=transfer_words,
     )

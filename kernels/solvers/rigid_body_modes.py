@@ -29,7 +29,7 @@ def rigid_mode_kernels(dtype: str) -> _types.SimpleNamespace:
     Bodies, Pattern = bodies_struct(dtype), pattern_struct()
     rigid = rigid_mode_functions(dtype)
     translation_columns, rotation_columns = rigid.translation_columns, rigid.rotation_columns
-    EPS = {"float64": 2.0**-53, "float32": 2.0**-24}[dtype]
+    UNIT_ROUNDOFF = {"float64": 2.0**-53, "float32": 2.0**-24}[dtype]
     module = kernel_module(f"motions_{dtype}", max_unroll=SHORT_UNROLL)
 
     @wp.kernel(module=module)
@@ -50,7 +50,7 @@ def rigid_mode_kernels(dtype: str) -> _types.SimpleNamespace:
         bodies.lever_arm[world, slot] = x / bodies.body_size[body]
 
     @wp.kernel(module=module)
-    def body_sums(
+    def body_matrix_partials(
         bodies: Bodies, pattern: Pattern, free: wp.array(dtype=vec3), value: wp.array2d(dtype=mat33),
         active: wp.array(dtype=wp.int32), lanes: int, parts: wp.array4d(dtype=mat33d),
     ):  # fmt: skip
@@ -78,8 +78,8 @@ def rigid_mode_kernels(dtype: str) -> _types.SimpleNamespace:
                 move += A @ translation_columns(bodies, body, other)
                 turn += A @ rotation_columns(bodies, world, body, other)
                 if other == slot:
-                    move += f64(EPS) * wp.diag(wp.get_diag(A)) @ own_move
-                    turn += f64(EPS) * wp.diag(wp.get_diag(A)) @ own_turn
+                    move += f64(UNIT_ROUNDOFF) * wp.diag(wp.get_diag(A)) @ own_move
+                    turn += f64(UNIT_ROUNDOFF) * wp.diag(wp.get_diag(A)) @ own_turn
             mm += wp.transpose(own_move) @ move
             tm += wp.transpose(own_turn) @ move
             tt += wp.transpose(own_turn) @ turn
@@ -89,7 +89,7 @@ def rigid_mode_kernels(dtype: str) -> _types.SimpleNamespace:
         parts[world, body, lane, 2] = tt
 
     @wp.kernel(module=module)
-    def fill(
+    def fill_matrix(
         active: wp.array(dtype=wp.int32), parts: wp.array4d(dtype=mat33d), scale: wp.array2d(dtype=T),
         matrix: wp.array3d(dtype=T),
     ):  # fmt: skip
@@ -162,5 +162,10 @@ def rigid_mode_kernels(dtype: str) -> _types.SimpleNamespace:
         z[world, slot] = z[world, slot] + wp.cw_mul(vec3(s), free[slot])
 
     return _types.SimpleNamespace(
-        module=module, update_arms=update_arms, body_sums=body_sums, fill=fill, restrict=restrict, prolong=prolong
+        module=module,
+        update_arms=update_arms,
+        body_matrix_partials=body_matrix_partials,
+        fill_matrix=fill_matrix,
+        restrict=restrict,
+        prolong=prolong,
     )

@@ -6,7 +6,7 @@ import types as _types
 import warp as wp
 
 from ..common.types import precision
-from .newton_control import FLOOR_LANES, GROUP_ROWS, LANES, control_struct
+from .newton_control import FLOOR_LANES, GROUP_LANES, GROUP_ROUNDOFF, GROUP_ROWS, ROW_ROUNDOFF, control_struct
 from .pcg import pcg_kernels
 
 __all__ = ["vector_kernels"]
@@ -22,7 +22,7 @@ def vector_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNa
     module = pcg_kernels(dtype, has_constraints).module
 
     @wp.kernel(module=module)
-    def norm_partial(
+    def group_norm_partials(
         start: wp.array(dtype=wp.int32),
         slot: wp.array(dtype=wp.int32),
         element_start: wp.array(dtype=wp.int32),
@@ -37,24 +37,24 @@ def vector_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNa
         if active[world] == 0:
             return
         for row in range(GROUP_ROWS - 1):
-            source = wp.where(row == 4, 8, row)
+            source = wp.where(row == GROUP_ROUNDOFF, ROW_ROUNDOFF, row)
             total = f64(0.0)
-            for k in range(start[group] + lane, start[group + 1], LANES):
+            for k in range(start[group] + lane, start[group + 1], GROUP_LANES):
                 total += rows[source, world, slot[k]]
             partial[row, world, group, lane] = total
         strain = f64(0.0)
-        for k in range(element_start[group] + lane, element_start[group + 1], LANES):
+        for k in range(element_start[group] + lane, element_start[group + 1], GROUP_LANES):
             strain += energy[0, world, element[k]]
         partial[GROUP_ROWS - 1, world, group, lane] = strain
 
     @wp.kernel(module=module)
-    def norm_sum(partial: wp.array4d(dtype=f64), active: wp.array(dtype=wp.int32), out: wp.array3d(dtype=f64)):
+    def sum_group_norms(partial: wp.array4d(dtype=f64), active: wp.array(dtype=wp.int32), out: wp.array3d(dtype=f64)):
         """Sum of the lanes, in order."""
         row, world, group = wp.tid()
         if active[world] == 0:
             return
         total = f64(0.0)
-        for lane in range(LANES):
+        for lane in range(GROUP_LANES):
             total += partial[row, world, group, lane]
         out[row, world, group] = total
 
@@ -102,7 +102,7 @@ def vector_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNa
             base[world, slot] = v[world, slot]
 
     @wp.kernel(module=module)
-    def floor_partial(
+    def floor_partials(
         ctl: Control,
         start: wp.array(dtype=wp.int32),
         slot: wp.array(dtype=wp.int32),
@@ -152,7 +152,7 @@ def vector_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNa
             target[world, slot] = source[world, slot]
 
     @wp.kernel(module=module)
-    def dot_rows(
+    def dot_terms(
         a: wp.array2d(dtype=vec3),
         b: wp.array2d(dtype=vec3),
         active: wp.array(dtype=wp.int32),
@@ -164,7 +164,7 @@ def vector_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNa
             rows[0, world, slot] = f64(wp.dot(a[world, slot], b[world, slot]))
 
     @wp.kernel(module=module)
-    def any_set(flags: wp.array(dtype=wp.int32), out: wp.array(dtype=wp.int32)):
+    def set_any_flag(flags: wp.array(dtype=wp.int32), out: wp.array(dtype=wp.int32)):
         """out[0] = 1 if any world's flag is set; out must be 0 before."""
         world = wp.tid()
         if flags[world] != 0:
@@ -172,13 +172,13 @@ def vector_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNa
 
     return _types.SimpleNamespace(
         module=module,
-        norm_partial=norm_partial,
-        norm_sum=norm_sum,
+        group_norm_partials=group_norm_partials,
+        sum_group_norms=sum_group_norms,
         update_position=update_position,
         trial_velocity=trial_velocity,
         copy_active=copy_active,
         set_base=set_base,
-        floor_partial=floor_partial,
-        dot_rows=dot_rows,
-        any_set=any_set,
+        floor_partials=floor_partials,
+        dot_terms=dot_terms,
+        set_any_flag=set_any_flag,
     )

@@ -8,12 +8,12 @@ import warp as wp
 from ..common.structs import balance_struct, mass_function, topology_struct
 from ..common.types import precision
 from ..solvers.newton_control import control_struct
-from .step_control import step_struct
+from .step_control import GROWTH_COLUMNS, step_struct
 
 __all__ = [
     "EXPLICIT_VISCOUS",
-    "LEDGER",
-    "LEDGER_ROWS",
+    "LEDGER_COLUMNS",
+    "LEDGER_TERM_ROWS",
     "LOSS",
     "NUMERICAL",
     "STORED",
@@ -22,7 +22,7 @@ __all__ = [
     "term_energies_struct",
 ]
 
-LEDGER = (
+LEDGER_COLUMNS = (
     "kinetic",
     "strain",
     "potential",
@@ -40,7 +40,11 @@ STORED, WORK, LOSS, NUMERICAL, EXPLICIT_VISCOUS = range(5)
 """Kinds of energy increments of a term per substep: stored energy (current value); work on the model; loss; integrator
 part; viscous loss of a force among the dead loads."""
 
-LEDGER_ROWS = 10
+LEDGER_TERM_ROWS = 10
+GROWTH_SHARE, GROWTH_LARGEST, GROWTH_TURNOVER, GROWTH_ADDED, GROWTH_SINCE, GROWTH_STEPS, GROWTH_NEXT = range(
+    len(GROWTH_COLUMNS)
+)
+"""Columns of GROWTH_COLUMNS."""
 STARTUP_STEPS = 8.0
 """Initial substeps excluded from the energy monitor: relative to the small energy at the onset of a motion, no step
 resolves it."""
@@ -54,7 +58,7 @@ def term_energies_struct():
     class TermEnergies:
         kind: wp.array(dtype=wp.int32)  # [row] STORED, WORK, ...
         nonpotential: wp.array(dtype=wp.int32)  # [row] 1: of a force whose work is counted as that of fields
-        column: wp.array(dtype=wp.int32)  # [row] of the ledger, -1: none
+        ledger_column: wp.array(dtype=wp.int32)  # [row] of the ledger, -1: none
         sums: wp.array2d(dtype=wp.float64)  # [row, world] J
 
     return TermEnergies
@@ -76,36 +80,36 @@ def ledger_kernels(dtype: str, chord: bool, nonpotential: bool, module: wp.Modul
     TermEnergies = term_energies_struct()
 
     @wp.func
-    def track_growth(step: Step, world: int, before: f64, energy: f64, turnover: f64, added: f64):
+    def track_energy_growth(step: Step, world: int, before: f64, energy: f64, turnover: f64, added: f64):
         """Net energy added by the integrator and by residuals, over the peak energy plus the sum of |work|.
 
         Net, since second-order schemes exchange energy with the motion periodically; excluding the first steps from
         rest and those after work that exceeds all energy so far.
         """
-        largest = wp.max(wp.max(step.growth[world, 1], step.least_energy[world]), before)
-        turned = step.growth[world, 2] + turnover
-        steps = step.growth[world, 5] + f64(1.0)
-        if step.growth[world, 1] == f64(0.0) and before > f64(0.5) * energy:  # already in motion
+        largest = wp.max(wp.max(step.energy_growth[world, GROWTH_LARGEST], step.min_energy[world]), before)
+        turned = step.energy_growth[world, GROWTH_TURNOVER] + turnover
+        steps = step.energy_growth[world, GROWTH_STEPS] + f64(1.0)
+        if step.energy_growth[world, GROWTH_LARGEST] == f64(0.0) and before > f64(0.5) * energy:  # already in motion
             steps = f64(STARTUP_STEPS) + f64(1.0)
-            step.growth[world, 6] = before
-        if turned > step.growth[world, 6]:
+            step.energy_growth[world, GROWTH_NEXT] = before
+        if turned > step.energy_growth[world, GROWTH_NEXT]:
             steps = f64(1.0)
-            step.growth[world, 6] = f64(2.0) * turned + largest
+            step.energy_growth[world, GROWTH_NEXT] = f64(2.0) * turned + largest
         largest = wp.max(largest, energy)
-        total = step.growth[world, 3]
+        total = step.energy_growth[world, GROWTH_ADDED]
         if steps > f64(STARTUP_STEPS):
             total += added
         share = total / (largest + turned)
-        step.growth[world, 0] = share
-        step.growth[world, 1] = largest
-        step.growth[world, 2] = turned
-        step.growth[world, 3] = total
-        step.growth[world, 5] = steps
-        if share > step.growth_warn_limit and step.growth[world, 4] == f64(0.0):
-            step.growth[world, 4] = step.time[world]
+        step.energy_growth[world, GROWTH_SHARE] = share
+        step.energy_growth[world, GROWTH_LARGEST] = largest
+        step.energy_growth[world, GROWTH_TURNOVER] = turned
+        step.energy_growth[world, GROWTH_ADDED] = total
+        step.energy_growth[world, GROWTH_STEPS] = steps
+        if share > step.growth_warn_limit and step.energy_growth[world, GROWTH_SINCE] == f64(0.0):
+            step.energy_growth[world, GROWTH_SINCE] = step.time[world]
 
     @wp.kernel(module=module)
-    def ledger_rows(
+    def ledger_terms(
         step: Step,
         topo: Topology,
         balance: Balance,
@@ -142,7 +146,7 @@ def ledger_kernels(dtype: str, chord: bool, nonpotential: bool, module: wp.Modul
         balance.rows[9, world, slot] = f64(wp.dot(weight, balance.u[world, slot]))
 
     @wp.kernel(module=module)
-    def ledger_update(
+    def update_ledger(
         step: Step,
         newton: Newton,
         sums: wp.array2d(dtype=f64),
@@ -179,7 +183,7 @@ def ledger_kernels(dtype: str, chord: bool, nonpotential: bool, module: wp.Modul
         energy = kinetic + strain
         for k in range(energies.kind.shape[0]):
             amount = energies.sums[k, world]
-            column = energies.column[k]
+            column = energies.ledger_column[k]
             if energies.kind[k] == STORED:
                 change = amount - ledger[world, column]
                 stored += change
@@ -217,10 +221,10 @@ def ledger_kernels(dtype: str, chord: bool, nonpotential: bool, module: wp.Modul
         balance -= loads + sums[4, world] + fields + work
         ledger[world, 8] = ledger[world, 8] + balance
         ledger[world, 9] = ledger[world, 9] + sums[6, world]
-        if step.watched != 0:
+        if step.growth_monitored != 0:
             turnover += wp.abs(loads) + wp.abs(sums[4, world]) + wp.abs(fields) + wp.abs(viscous)
             # stiff damping: an excess of `viscous` cancels a deficit of `numerical`; `balance`: work of residuals
-            added = step.counted * balance - (numerical + viscous)
-            track_growth(step, world, energy - (change_K + change_W + stored), energy, turnover, added)
+            added = step.residual_work_counted * balance - (numerical + viscous)
+            track_energy_growth(step, world, energy - (change_K + change_W + stored), energy, turnover, added)
 
-    return _types.SimpleNamespace(ledger_rows=ledger_rows, ledger_update=ledger_update)
+    return _types.SimpleNamespace(ledger_terms=ledger_terms, update_ledger=update_ledger)

@@ -7,17 +7,17 @@ import types as _types
 import warp as wp
 
 from ..common.types import kernel_module, precision
-from .step_control import REPORT, SAME_TIME, STATUS
+from .step_control import REPORT_COLUMNS, SAME_TIME_FRACTION, STATUS
 
-__all__ = ["JOINT_VALUES", "MOTION_KINDS", "STATISTICS", "episode_kernels", "observation_kernels"]
+__all__ = ["JOINT_VALUE_KINDS", "MOTION_KINDS", "RUN_STATISTICS", "episode_kernels", "observation_kernels"]
 
-STATISTICS = ("newton", "pcg", "rough", "floored", "residual", "floor", "violation", "energy_growth", "min_J")
+RUN_STATISTICS = ("newton", "pcg", "rough", "floored", "residual", "floor", "violation", "energy_growth", "min_J")
 """Columns of the run statistics: sums, then maxima, then minima."""
-FIRST_MINIMUM = 8
+FIRST_MINIMUM_COLUMN = 8
 MOTION_KINDS = {"position": 0, "displacement": 1, "velocity": 2}
 """Kinds of observed vectors."""
 FULL_TURN = 2.0 * math.pi
-JOINT_VALUES = {"length": 0, "travel": 1, "angle": 2}
+JOINT_VALUE_KINDS = {"length": 0, "travel": 1, "angle": 2}
 """Kinds of values of joints."""
 
 
@@ -26,7 +26,7 @@ def episode_kernels() -> _types.SimpleNamespace:
     """Kernels with one thread per world."""
     f64 = wp.float64
     module = kernel_module("loops", light=True)
-    column = {name: REPORT.index(name) for name in REPORT}
+    column = {name: REPORT_COLUMNS.index(name) for name in REPORT_COLUMNS}
     running = STATUS["running"]
 
     @wp.kernel(module=module)
@@ -35,7 +35,7 @@ def episode_kernels() -> _types.SimpleNamespace:
     ):
         """Freeze the worlds that have reached their end time."""
         world = wp.tid()
-        if status[world] == wp.static(running) and time[world] >= t_end[world] - f64(SAME_TIME) * dt[world]:
+        if status[world] == wp.static(running) and time[world] >= t_end[world] - f64(SAME_TIME_FRACTION) * dt[world]:
             status[world] = wp.static(STATUS["frozen"])
 
     @wp.kernel(module=module)
@@ -63,17 +63,17 @@ def episode_kernels() -> _types.SimpleNamespace:
     def clear_statistics(sums: wp.array2d(dtype=f64)):
         """Reset the run statistics."""
         world, k = wp.tid()
-        sums[world, k] = wp.where(k < wp.static(FIRST_MINIMUM), f64(0.0), f64(wp.inf))
+        sums[world, k] = wp.where(k < wp.static(FIRST_MINIMUM_COLUMN), f64(0.0), f64(wp.inf))
 
     @wp.kernel(module=module)
-    def copy_chosen(flags: wp.array(dtype=wp.int32), source: wp.array(dtype=f64), target: wp.array(dtype=f64)):
+    def copy_flagged(flags: wp.array(dtype=wp.int32), source: wp.array(dtype=f64), target: wp.array(dtype=f64)):
         """Copy a number in the flagged worlds."""
         world = wp.tid()
         if flags[world] != 0:
             target[world] = source[world]
 
     @wp.kernel(module=module)
-    def clear_chosen(flags: wp.array(dtype=wp.int32), target: wp.array(dtype=wp.int32)):
+    def clear_flagged(flags: wp.array(dtype=wp.int32), target: wp.array(dtype=wp.int32)):
         """Clear a flag in the flagged worlds."""
         world = wp.tid()
         if flags[world] != 0:
@@ -81,7 +81,7 @@ def episode_kernels() -> _types.SimpleNamespace:
 
     return _types.SimpleNamespace(
         module=module, end_episodes=end_episodes, add_statistics=add_statistics, clear_statistics=clear_statistics,
-        copy_chosen=copy_chosen, clear_chosen=clear_chosen,
+        copy_flagged=copy_flagged, clear_flagged=clear_flagged,
     )  # fmt: skip
 
 
@@ -113,7 +113,7 @@ def observation_kernels(dtype: str) -> _types.SimpleNamespace:
             out[world, column[k] + c] = T(x[c])
 
     @wp.kernel(module=module)
-    def reports(
+    def report_columns(
         source: wp.array(dtype=wp.int32), column: wp.array(dtype=wp.int32), report: wp.array2d(dtype=f64),
         stepped: wp.array(dtype=wp.int32), out: wp.array2d(dtype=T),
     ):  # fmt: skip
@@ -122,7 +122,7 @@ def observation_kernels(dtype: str) -> _types.SimpleNamespace:
         out[world, column[k]] = wp.where(stepped[world] != 0, T(report[world, source[k]]), T(0.0))
 
     @wp.func
-    def current_vector(
+    def current_joint_vector(
         start: wp.array(dtype=wp.int32), slot: wp.array(dtype=wp.int32), weight: wp.array(dtype=f64),
         place: wp.array(dtype=vec3d), u: wp.array2d(dtype=vec3), world: int, k: int,
     ) -> vec3d:  # fmt: skip
@@ -141,13 +141,13 @@ def observation_kernels(dtype: str) -> _types.SimpleNamespace:
     ):  # fmt: skip
         """Lengths, travels and angles from three vectors each; `row`: of a drive with multiple turns, or -1."""
         world, k = wp.tid()
-        a = current_vector(start, slot, weight, place, u, world, 3 * k)
-        b = current_vector(start, slot, weight, place, u, world, 3 * k + 1)
+        a = current_joint_vector(start, slot, weight, place, u, world, 3 * k)
+        b = current_joint_vector(start, slot, weight, place, u, world, 3 * k + 1)
         x = wp.length(a)
-        if kind[k] == wp.static(JOINT_VALUES["travel"]):
+        if kind[k] == wp.static(JOINT_VALUE_KINDS["travel"]):
             x = wp.dot(a, b)
-        elif kind[k] == wp.static(JOINT_VALUES["angle"]):
-            c = current_vector(start, slot, weight, place, u, world, 3 * k + 2)
+        elif kind[k] == wp.static(JOINT_VALUE_KINDS["angle"]):
+            c = current_joint_vector(start, slot, weight, place, u, world, 3 * k + 2)
             x = wp.atan2(wp.dot(c, b), wp.dot(c, a))
             if row[k] >= 0 and not wp.isnan(target[world, row[k]]):
                 turn = f64(wp.static(FULL_TURN))
@@ -155,10 +155,12 @@ def observation_kernels(dtype: str) -> _types.SimpleNamespace:
         out[world, column[k]] = T(x)
 
     @wp.kernel(module=module)
-    def numbers(values: wp.array(dtype=f64), column: int, out: wp.array2d(dtype=T)):
+    def world_values(values: wp.array(dtype=f64), column: int, out: wp.array2d(dtype=T)):
         """Copy of a number of each world."""
         world = wp.tid()
         out[world, column] = T(values[world])
 
-    return _types.SimpleNamespace(module=module, point_motions=point_motions, reports=reports, numbers=numbers,
-                                  joint_values=joint_values)  # fmt: skip
+    return _types.SimpleNamespace(
+        module=module, point_motions=point_motions, report_columns=report_columns, world_values=world_values,
+        joint_values=joint_values,
+    )  # fmt: skip

@@ -13,19 +13,32 @@ from ..common.lanes import lane_functions
 from ..common.structs import balance_struct, mass_function, pattern_struct, product_terms_struct, topology_struct
 from ..common.traits import NO_TERMS, Traits
 from ..common.types import SHORT_UNROLL, kernel_module, precision
+from ..solvers.newton_control import (
+    ROW_FORCE,
+    ROW_FROZEN_CHANGE,
+    ROW_INERTIA,
+    ROW_INTERNAL,
+    ROW_KINETIC,
+    ROW_LOADS,
+    ROW_MAGNITUDE,
+    ROW_OBJECTIVE,
+    ROW_RESIDUAL,
+    ROW_ROUNDOFF,
+    ROW_SLOPE,
+)
 from ..terms.constraints import constraint_struct, multiplier_struct
 
 __all__ = ["RESIDUAL_ROWS", "gather_kernels"]
 
 RESIDUAL_ROWS = 11
-"""Rows summed per world with a residual: the squared D^-1 norms of g, f_int, loads and inertia; the inertia and load
-part of Phi and its magnitude; g.p with non-conservative forces frozen; change of Phi by their update; squared norm of
-the position round-off; |g|^2; v~.M v~ c_M / 2."""
+"""Rows summed per world with a residual, the ROW_ constants of newton_control.py in this order: the squared D^-1 norms
+of g, f_int, loads and inertia; the inertia and load part of Phi and its magnitude; g.p with non-conservative forces
+frozen; change of Phi by their update; squared norm of the position round-off; |g|^2; v~.M v~ c_M / 2."""
 
 
-SUM_BLOCKS = {"float64": 6, "float32": 8}
+MIN_RESIDENT_BLOCKS = {"float64": 6, "float32": 8}
 """Minimum resident blocks of 256 threads of `with_mass_sum` (register limit): the kernel is memory-latency bound."""
-REACTION = wp.constant(wp.float64(1.0e-6))
+REACTION_FRACTION = wp.constant(wp.float64(1.0e-6))
 """Fraction of the squared reactions in the squared scale of the residual."""
 
 
@@ -53,7 +66,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
     matrix_module = kernel_module(f"matrix_product_{name}", max_unroll=SHORT_UNROLL)
 
     @wp.func
-    def weighted(a: vec3, D: vec3) -> f64:
+    def weighted_square(a: vec3, D: vec3) -> f64:
         """a.D^-1 a, with 0/0 = 0."""
         s = f64(0.0)
         for k in range(3):
@@ -92,7 +105,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         return wp.matrix_from_rows(constraint_force, penalty, merit)
 
     @wp.func
-    def gathered(topo: Topology, contribution: wp.array2d(dtype=vec3), world: int, slot: int) -> vec3:
+    def gather_sum(topo: Topology, contribution: wp.array2d(dtype=vec3), world: int, slot: int) -> vec3:
         """Sum of the contributions to a slot, in order."""
         f = vec3()
         for k in range(topo.contribution_start[slot], topo.contribution_start[slot + 1]):
@@ -116,7 +129,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             return balance.g[world, slot]
 
     @wp.func
-    def square(a: vec3) -> f64:
+    def squared_length(a: vec3) -> f64:
         """a.a in float64, for forces whose square overflows float32."""
         s = f64(0.0)
         for k in range(3):
@@ -134,7 +147,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         world, slot = wp.tid()
         if active[world] == 0:
             return
-        out[world, slot] = gathered(topo, contribution, world, slot)
+        out[world, slot] = gather_sum(topo, contribution, world, slot)
 
     @wp.kernel(module=module)
     def residual(
@@ -152,7 +165,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         world, slot = wp.tid()
         if active[world] == 0:
             return
-        f = gathered(topo, contribution, world, slot)
+        f = gather_sum(topo, contribution, world, slot)
         own = f
         if wp.static(pooled):
             of_pool = pooled_force(topo, balance, world, slot)
@@ -193,28 +206,30 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         vs = balance.v[world, slot]
         kinetic = T(0.5) * wp.dot(vs - balance.v_tilde[world, slot], a)
         work = wp.dot(held, vs)
-        balance.rows[0, world, slot] = weighted(wp.cw_mul(residual_force, free), D)
+        balance.rows[ROW_RESIDUAL, world, slot] = weighted_square(wp.cw_mul(residual_force, free), D)
         # a prestressed body without loads has only reactions: a small fraction of them is its scale
         reaction = own - wp.cw_mul(own, free)
-        balance.rows[1, world, slot] = weighted(wp.cw_mul(own, free), D) + REACTION * weighted(reaction, D)
-        balance.rows[2, world, slot] = weighted(wp.cw_mul(magnitude, free), D)
-        balance.rows[3, world, slot] = weighted(wp.cw_mul(a, free), D)
-        balance.rows[4, world, slot] = f64(kinetic - work)
+        balance.rows[ROW_INTERNAL, world, slot] = weighted_square(
+            wp.cw_mul(own, free), D
+        ) + REACTION_FRACTION * weighted_square(reaction, D)
+        balance.rows[ROW_LOADS, world, slot] = weighted_square(wp.cw_mul(magnitude, free), D)
+        balance.rows[ROW_INERTIA, world, slot] = weighted_square(wp.cw_mul(a, free), D)
+        balance.rows[ROW_OBJECTIVE, world, slot] = f64(kinetic - work)
         if wp.static(midpoint):  # Phi does not exist: half of the squared gradient replaces it
-            balance.rows[4, world, slot] = f64(0.5) * weighted(
+            balance.rows[ROW_OBJECTIVE, world, slot] = f64(0.5) * weighted_square(
                 wp.cw_mul(newton_gradient(balance, world, slot), free), D
             )
-        balance.rows[5, world, slot] = f64(wp.abs(kinetic) + wp.abs(work))
-        balance.rows[6, world, slot] = f64(wp.dot(wp.cw_mul(descent, free), balance.direction[world, slot]))
-        balance.rows[7, world, slot] = f64(0.0)
+        balance.rows[ROW_MAGNITUDE, world, slot] = f64(wp.abs(kinetic) + wp.abs(work))
+        balance.rows[ROW_SLOPE, world, slot] = f64(wp.dot(wp.cw_mul(descent, free), balance.direction[world, slot]))
+        balance.rows[ROW_FROZEN_CHANGE, world, slot] = f64(0.0)
         if wp.static(nonpotential and not midpoint):
-            balance.rows[7, world, slot] = f64(
+            balance.rows[ROW_FROZEN_CHANGE, world, slot] = f64(
                 wp.dot(balance.nonpotential_frozen[world, slot] - balance.nonpotential[world, slot], vs)
             )
-        balance.rows[8, world, slot] = position_rounding(balance, free, D, world, slot)
-        balance.rows[9, world, slot] = square(wp.cw_mul(residual_force, free))
+        balance.rows[ROW_ROUNDOFF, world, slot] = position_rounding(balance, free, D, world, slot)
+        balance.rows[ROW_FORCE, world, slot] = squared_length(wp.cw_mul(residual_force, free))
         motion = T(0.5) * wp.dot(balance.v_tilde[world, slot], past)
-        balance.rows[10, world, slot] = balance.mass_factor[world] * f64(motion)
+        balance.rows[ROW_KINETIC, world, slot] = balance.mass_factor[world] * f64(motion)
 
     @wp.func
     def pool_range(more: ProductTerms, slot: int) -> wp.vec2i:
@@ -225,7 +240,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         return out
 
     @wp.func
-    def add_terms(
+    def add_term_products(
         topo: Topology,
         h: vec3,
         more: ProductTerms,
@@ -270,7 +285,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             rows[0, world, index / warp] = total
 
     @wp.kernel(module=module)
-    def product(
+    def operator_product(
         topo: Topology,
         contribution: wp.array2d(dtype=vec3),
         more: ProductTerms,
@@ -288,16 +303,16 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         share = f64(0.0)
         if slot < out.shape[1]:
             pool = pool_range(more, slot)
-            f = gathered(topo, contribution, world, slot)
+            f = gather_sum(topo, contribution, world, slot)
             a = vec3()
             for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
                 a += mass_entry(topo, world, k) * p_in[world, topo.mass_column[k]]
             dq = T(more.dq_dv[world])
             h = T(more.mass_factor[world]) * a + dq * f
-            share = add_terms(topo, h, more, pool, p_in[world, slot], con, mul, world, slot, out)
+            share = add_term_products(topo, h, more, pool, p_in[world, slot], con, mul, world, slot, out)
         store_warp_sum(share, slot, more.warp_lanes, world, rows)
 
-    @wp.kernel(module=module, launch_bounds=(256, SUM_BLOCKS[dtype]))
+    @wp.kernel(module=module, launch_bounds=(256, MIN_RESIDENT_BLOCKS[dtype]))
     def with_mass_sum(
         topo: Topology,
         contribution: wp.array2d(dtype=vec3),
@@ -316,8 +331,8 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         share = f64(0.0)
         if slot < out.shape[1]:
             pool = pool_range(more, slot)
-            h = gathered(topo, contribution, world, slot)
-            share = add_terms(topo, h, more, pool, p_in[world, slot], con, mul, world, slot, out)
+            h = gather_sum(topo, contribution, world, slot)
+            share = add_term_products(topo, h, more, pool, p_in[world, slot], con, mul, world, slot, out)
         store_warp_sum(share, slot, more.warp_lanes, world, rows)
 
     @wp.kernel(module=matrix_module)
@@ -349,11 +364,11 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         h = lane_sum(h, lanes)
         share = f64(0.0)
         if lane == 0 and slot < out.shape[1]:
-            share = add_terms(topo, h, more, pool, p_in[world, slot], con, mul, world, slot, out)
+            share = add_term_products(topo, h, more, pool, p_in[world, slot], con, mul, world, slot, out)
         store_warp_sum(share, index, more.warp_lanes, world, rows)
 
     @wp.kernel(module=module)
-    def gather_blocks(
+    def gather_diagonal_blocks(
         topo: Topology,
         contribution: wp.array2d(dtype=sym6),
         pool: wp.array2d(dtype=sym6),
@@ -388,7 +403,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         inverse[world, slot] = free_inverse(A, mass, free)
 
     @wp.kernel(module=module)
-    def mass_product(
+    def kinetic_terms(
         topo: Topology,
         a: wp.array2d(dtype=vec3),
         rows: wp.array3d(dtype=f64),
@@ -406,8 +421,8 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         matrix_product=matrix_product,
         gather_force=gather_force,
         residual=residual,
-        product=product,
+        operator_product=operator_product,
         with_mass_sum=with_mass_sum,
-        gather_blocks=gather_blocks,
-        mass_product=mass_product,
+        gather_diagonal_blocks=gather_diagonal_blocks,
+        kinetic_terms=kinetic_terms,
     )

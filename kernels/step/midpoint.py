@@ -7,18 +7,18 @@ import warp as wp
 
 from ..common.types import kernel_module, precision
 
-__all__ = ["stage_kernels"]
+__all__ = ["midpoint_kernels"]
 
 
 @functools.cache
-def stage_kernels(dtype: str) -> _types.SimpleNamespace:
-    """The kernel `take_stage` in one precision of the vectors."""
+def midpoint_kernels(dtype: str) -> _types.SimpleNamespace:
+    """The kernel `evaluate_midpoint` in one precision of the vectors."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
     module = kernel_module(f"stage_{dtype}")
 
     @wp.kernel(module=module)
-    def take_stage(
+    def evaluate_midpoint(
         u_n: wp.array2d(dtype=vec3),
         v_n: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
@@ -34,4 +34,4 @@ def stage_kernels(dtype: str) -> _types.SimpleNamespace:
             u_stage[world, slot] = u_n[world, slot] + half
             v_stage[world, slot] = half
 
-    return _types.SimpleNamespace(module=module, take_stage=take_stage)
+    return _types.SimpleNamespace(module=module, evaluate_midpoint=evaluate_midpoint)

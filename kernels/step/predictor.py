@@ -16,7 +16,7 @@ from .step_control import step_struct
 __all__ = ["PREDICTOR_ROWS", "predictor_kernels", "predictor_struct"]
 
 PREDICTOR_ROWS = 4
-"""Rows of `order_errors` that are summed per world."""
+"""Rows of `order_error_terms` that are summed per world."""
 ORDER_MARGIN = 0.05
 """Squared error ratio to the lower order below which a higher order is chosen."""
 PREDICTOR_ROUNDINGS = 1.0e3
@@ -30,9 +30,13 @@ def predictor_struct():
     @wp.struct
     class PredictorControl:
         order: wp.array(dtype=wp.int32)  # order of this attempt
-        count: wp.array(dtype=wp.int32)  # available earlier velocities, from steps of equal size; at most 2
-        kept: wp.array2d(dtype=wp.float64)  # in the state: next order and count, size and end of the last step
-        sums: wp.array2d(dtype=wp.float64)  # squared errors of orders 0, 1, 2 in the last step; squared velocity
+        history_count: wp.array(dtype=wp.int32)  # available earlier velocities, from steps of equal size; at most 2
+        history_state: wp.array2d(
+            dtype=wp.float64
+        )  # [world, 4] in the state: next order and count, size and end of the last step
+        sums: wp.array2d(
+            dtype=wp.float64
+        )  # [PREDICTOR_ROWS, world] squared errors of orders 0, 1, 2 in the last step; squared velocity
 
     return PredictorControl
 
@@ -44,28 +48,28 @@ def predictor_kernels(dtype: str, accelerated: bool, module: wp.Module) -> _type
     T, vec3 = p.T, p.vec3
     f64 = wp.float64
     Predictor, Step, Newton = predictor_struct(), step_struct(), control_struct()
-    NOISE = (PREDICTOR_ROUNDINGS * {"float64": 2.0**-53, "float32": 2.0**-24}[dtype]) ** 2
+    NEGLIGIBLE_ERROR_RATIO = (PREDICTOR_ROUNDINGS * {"float64": 2.0**-53, "float32": 2.0**-24}[dtype]) ** 2
 
     @wp.func
-    def extrapolated(order: int, v: vec3, before: vec3, first: vec3) -> vec3:
+    def extrapolated_velocity(order: int, v: vec3, before: vec3, first: vec3) -> vec3:
         """Extrapolation of order 1 or 2 from the velocities of the last three steps, m/s."""
         if order == 2:
             return T(3.0) * (v - before) + first
         return T(2.0) * v - before
 
     @wp.kernel(module=module)
-    def begin(predictor: Predictor, step: Step, newton: Newton):
+    def begin_attempt(predictor: Predictor, step: Step, newton: Newton):
         """Choose the order: that of the state, if its last step had this size and ended at the start of the attempt."""
         world = wp.tid()
         predictor.order[world] = 0
-        predictor.count[world] = 0
-        newton.predicted[world] = 0
+        predictor.history_count[world] = 0
+        newton.extrapolated_start[world] = 0
         if step.running[world] == 0:
             return
-        if predictor.kept[world, 2] == step.h[world] and predictor.kept[world, 3] == step.time[world]:
-            predictor.order[world] = int(predictor.kept[world, 0])
-            predictor.count[world] = int(predictor.kept[world, 1])
-        newton.predicted[world] = wp.min(predictor.order[world], 1)
+        if predictor.history_state[world, 2] == step.h[world] and predictor.history_state[world, 3] == step.time[world]:
+            predictor.order[world] = int(predictor.history_state[world, 0])
+            predictor.history_count[world] = int(predictor.history_state[world, 1])
+        newton.extrapolated_start[world] = wp.min(predictor.order[world], 1)
 
     @wp.kernel(module=module)
     def extrapolate(
@@ -82,7 +86,7 @@ def predictor_kernels(dtype: str, accelerated: bool, module: wp.Module) -> _type
         order = predictor.order[world]
         if step.running[world] == 0 or order == 0:
             return
-        new = extrapolated(order, v_n[world, slot], before[world, slot], first[world, slot])
+        new = extrapolated_velocity(order, v_n[world, slot], before[world, slot], first[world, slot])
         f = free[slot]
         old = v[world, slot]
         for k in range(3):
@@ -91,7 +95,7 @@ def predictor_kernels(dtype: str, accelerated: bool, module: wp.Module) -> _type
         v[world, slot] = old
 
     @wp.kernel(module=module)
-    def order_errors(
+    def order_error_terms(
         predictor: Predictor,
         step: Step,
         free: wp.array(dtype=vec3),
@@ -118,10 +122,10 @@ def predictor_kernels(dtype: str, accelerated: bool, module: wp.Module) -> _type
             fall = (T(step.h[world]) * is_position[slot]) * vec3(step.gravity[world])
         e = w - a - fall
         if step.a1[world] > f64(0.0):  # a multistep scheme already extrapolates linearly
-            e = w - extrapolated(1, a, before[world, slot], first[world, slot])
+            e = w - extrapolated_velocity(1, a, before[world, slot], first[world, slot])
         rows[0, world, slot] = f64(wp.dot(D, wp.cw_mul(e, e)))
         for order in range(1, 3):
-            e = w - extrapolated(order, a, before[world, slot], first[world, slot])
+            e = w - extrapolated_velocity(order, a, before[world, slot], first[world, slot])
             rows[order, world, slot] = f64(wp.dot(D, wp.cw_mul(e, e)))
         rows[3, world, slot] = f64(wp.dot(D, wp.cw_mul(w, w)))
 
@@ -146,24 +150,24 @@ def predictor_kernels(dtype: str, accelerated: bool, module: wp.Module) -> _type
         world = wp.tid()
         if step.accepted[world] == 0:
             return
-        count = predictor.count[world]
+        count = predictor.history_count[world]
         best = int(0)  # noqa: RUF046 - a variable of the loop
         least = f64(ORDER_MARGIN) * predictor.sums[0, world]
-        if predictor.sums[0, world] <= f64(NOISE) * predictor.sums[3, world]:
+        if predictor.sums[0, world] <= f64(NEGLIGIBLE_ERROR_RATIO) * predictor.sums[3, world]:
             least = f64(0.0)  # extrapolated round-off would grow from step to step
         for order in range(1, 3):
             if order <= count and predictor.sums[order, world] < least:
                 best = order
                 least = f64(ORDER_MARGIN) * predictor.sums[order, world]
-        predictor.kept[world, 0] = f64(best)
-        predictor.kept[world, 1] = f64(wp.min(count + 1, 2))
-        predictor.kept[world, 2] = step.h[world]
-        predictor.kept[world, 3] = step.time[world]
+        predictor.history_state[world, 0] = f64(best)
+        predictor.history_state[world, 1] = f64(wp.min(count + 1, 2))
+        predictor.history_state[world, 2] = step.h[world]
+        predictor.history_state[world, 3] = step.time[world]
 
     return _types.SimpleNamespace(
-        begin=begin,
+        begin_attempt=begin_attempt,
         extrapolate=extrapolate,
-        order_errors=order_errors,
+        order_error_terms=order_error_terms,
         shift_history=shift_history,
         choose_order=choose_order,
     )

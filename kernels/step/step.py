@@ -13,10 +13,10 @@ import warp as wp
 
 from ..common.traits import NO_TERMS, Traits
 from ..common.types import kernel_module, precision
-from ..solvers.newton_control import FAIL_ENERGY, FAIL_FLOOR, FAIL_INVERTED, FAIL_WORK, control_struct
+from ..solvers.newton_control import FAIL_ELEMENT_INVERTED, FAIL_ENERGY_GROWTH, FAIL_ROUNDOFF, FAIL_WORK, control_struct
 from ..solvers.pcg import pcg_struct
-from .energy_ledger import ledger_kernels
-from .step_control import STATUS, step_span, step_struct
+from .energy_ledger import GROWTH_SHARE, ledger_kernels
+from .step_control import STATUS, step_end_functions, step_struct
 
 __all__ = ["step_kernels"]
 
@@ -43,15 +43,15 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
     f64 = wp.float64
-    Step, limits = step_struct(), step_span()
-    end_of, slack_of, span_of = limits.end, limits.slack, limits.span
+    Step, limits = step_struct(), step_end_functions()
+    end_time, time_tolerance, step_length = limits.end_time, limits.time_tolerance, limits.step_length
     Newton = control_struct()
     PCG = pcg_struct()
     nonpotential, has_constraints = traits.nonpotential, traits.has_constraints
     variant = traits.suffix("nonpotential", "has_constraints")
     coefficients, static, multistep = scheme.coefficients, scheme.static, scheme.multistep
     takes_velocity, accelerated, midpoint = scheme.takes_velocity, scheme.accelerated, scheme.midpoint
-    GROWTH = MAX_STEP_GROWTH[dtype]
+    MAX_GROWTH = MAX_STEP_GROWTH[dtype]
     module = kernel_module(f"step_{dtype}_{scheme.variant}{variant}")
 
     @wp.kernel(module=module)
@@ -60,31 +60,31 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         world = wp.tid()
         time = step.time[world]
         alive = wp.where(step.status[world] == wp.static(STATUS["running"]), 1, 0)
-        if time >= end_of(step, world) - slack_of(step, world):
+        if time >= end_time(step, world) - time_tolerance(step, world):
             alive = 0
-        if alive != 0 and step.watched != 0 and step.growth[world, 0] > step.growth_limit:
+        if alive != 0 and step.growth_monitored != 0 and step.energy_growth[world, GROWTH_SHARE] > step.growth_limit:
             alive = 0
             step.status[world] = wp.static(STATUS["failed"])
-            newton.failed[world] = FAIL_ENERGY
+            newton.failed[world] = FAIL_ENERGY_GROWTH
         step.running[world] = alive
-        step.refused[world] = 0
-        newton.total_iterations[world] = 0
-        newton.rough[world] = 0
-        newton.step_floor[world] = f64(0.0)
-        newton.potential_start[world] = newton.potential[world]
+        step.rejected[world] = 0
+        newton.step_iterations[world] = 0
+        newton.accepted_unconverged[world] = 0
+        newton.step_floor_error[world] = f64(0.0)
+        newton.strain_energy_start[world] = newton.strain_energy[world]
         if wp.static(has_constraints):
-            newton.outer[world] = 0
-        pcg.total[world] = 0
+            newton.multiplier_updates[world] = 0
+        pcg.step_iterations[world] = 0
         step.halvings[world] = 0
         if alive == 0:
             return
         wp.atomic_max(step.any_running, 0, 1)
-        step.level[world] = 0
-        step.part[world] = 0
-        step.step_start[world] = time
-        if wp.abs(step.summed[world] - time) <= slack_of(step, world):
-            step.step_start[world] = step.summed[world]
-        step.total_J[world] = f64(1.0e30)
+        step.halving_level[world] = 0
+        step.substep_index[world] = 0
+        step.step_start_time[world] = time
+        if wp.abs(step.summed_time[world] - time) <= time_tolerance(step, world):
+            step.step_start_time[world] = step.summed_time[world]
+        step.step_min_J[world] = f64(1.0e30)
 
     @wp.kernel(module=module)
     def begin_attempt(step: Step, newton: Newton):
@@ -92,36 +92,36 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         world = wp.tid()
         if world == 0:
             step.any_running[0] = 0
-            step.any_refused[0] = 0
+            step.any_rejected[0] = 0
         step.accepted[world] = 0
-        step.first_refusal[world] = 0
+        step.first_rejection[world] = 0
         newton.active[world] = step.running[world]
         newton.searching[world] = 0
-        newton.floor[world] = f64(0.0)
+        newton.floor_error[world] = f64(0.0)
         newton.inversion_suspected[world] = 0
         newton.inverted[world] = 0
         if step.running[world] == 0:
             return  # `refused` stays set in a world that failed earlier in this step
-        step.refused[world] = 0
+        step.rejected[world] = 0
         newton.failed[world] = 0
         newton.iterations[world] = 0
-        parts = f64(wp.lshift(1, step.level[world]))
-        span = span_of(step, world)
+        parts = f64(wp.lshift(1, step.halving_level[world]))
+        span = step_length(step, world)
         h = span / parts
         step.h[world] = h
-        step.new_time[world] = step.step_start[world] + span * (f64(step.part[world] + 1) / parts)
+        step.new_time[world] = step.step_start_time[world] + span * (f64(step.substep_index[world] + 1) / parts)
         if wp.static(midpoint):
             step.stage_time[world] = step.new_time[world] - f64(0.5) * h
         previous = f64(0.0)
         if wp.static(multistep):
             # a state that was set, reset or advanced by another scheme has no history
-            known = step.previous_end[world] == step.time[world]
-            if known and h <= f64(GROWTH) * step.previous_h[world]:
+            known = step.previous_end_time[world] == step.time[world]
+            if known and h <= f64(MAX_GROWTH) * step.previous_h[world]:
                 previous = step.previous_h[world]
         if wp.static(accelerated):
             previous = wp.max(step.previous_h[world], h / f64(MAX_EXTRAPOLATED_GROWTH))
-            step.h_before[world] = previous
-        c = coefficients(h, previous, step.parameter)
+            step.acceleration_step[world] = previous
+        c = coefficients(h, previous, step.scheme_parameter)
         step.a0[world] = c.a0
         step.a1[world] = c.a1
         if wp.static(takes_velocity):
@@ -130,13 +130,13 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
             step.q_a[world] = c.q_a
         if wp.static(static):
             step.dq_dv[world] = f64(1.0)
-            step.ramp[world] = step.new_time[world]
+            step.load_factor[world] = step.new_time[world]
             short = f64(1.0) - step.new_time[world]
-            step.mass_factor[world] = wp.where(short > f64(FULL_LOAD_TOLERANCE), step.stabilise * short, f64(0.0))
+            step.mass_factor[world] = wp.where(short > f64(FULL_LOAD_TOLERANCE), step.stabilisation * short, f64(0.0))
         else:
             step.dq_dv[world] = c.dq_dv
             step.mass_factor[world] = c.mass_factor
-            step.ramp[world] = f64(1.0)
+            step.load_factor[world] = f64(1.0)
 
     @wp.kernel(module=module)
     def predict(
@@ -171,7 +171,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         if wp.static(takes_velocity):
             q += T(step.b[world]) * v_n[world, slot]
         if wp.static(accelerated):
-            c = coefficients(step.h[world], step.h_before[world], step.parameter)
+            c = coefficients(step.h[world], step.acceleration_step[world], step.scheme_parameter)
             a = u_before[world, slot]
             q += T(c.q_a) * a
             w += T(c.v_a) * a + T(c.v_w) * v_before[world, slot]
@@ -198,7 +198,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         v[world, slot] = first
 
     @wp.kernel(module=module)
-    def candidate(
+    def alternative_first_iterate(
         step: Step,
         newton: Newton,
         kind: int,
@@ -212,7 +212,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
     ):
         """Alternative first iterate on the free components: 0: v~ + (dq/dv) g, 1: v_n, 2: the one with q = q_n."""
         world, slot = wp.tid()
-        if newton.choose_initial[world] == 0:
+        if newton.choose_first_iterate[world] == 0:
             return
         dq = T(step.dq_dv[world])
         new = v_n[world, slot]
@@ -239,55 +239,55 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         if step.running[world] == 0:
             return
         if newton.inverted[world] != 0 and newton.failed[world] == 0:
-            newton.failed[world] = FAIL_INVERTED
+            newton.failed[world] = FAIL_ELEMENT_INVERTED
         if newton.failed[world] == 0:
             step.accepted[world] = 1
-            step.total_J[world] = wp.min(step.total_J[world], newton.min_J[world])
-            newton.step_floor[world] = wp.max(newton.step_floor[world], newton.floor[world])
-            part = step.part[world] + 1
-            level = step.level[world]
+            step.step_min_J[world] = wp.min(step.step_min_J[world], newton.min_J[world])
+            newton.step_floor_error[world] = wp.max(newton.step_floor_error[world], newton.floor_error[world])
+            part = step.substep_index[world] + 1
+            level = step.halving_level[world]
             while level > 0 and part % 2 == 0:
                 part = part / 2
                 level = level - 1
-            step.part[world] = part
-            step.level[world] = level
+            step.substep_index[world] = part
+            step.halving_level[world] = level
             step.time[world] = step.new_time[world]
             if level == 0:
                 step.running[world] = 0
-                step.summed[world] = step.new_time[world]
-                if wp.abs(end_of(step, world) - step.new_time[world]) <= slack_of(step, world):
-                    step.time[world] = end_of(step, world)
+                step.summed_time[world] = step.new_time[world]
+                if wp.abs(end_time(step, world) - step.new_time[world]) <= time_tolerance(step, world):
+                    step.time[world] = end_time(step, world)
             else:
                 wp.atomic_max(step.any_running, 0, 1)
             return
-        step.refused[world] = 1
+        step.rejected[world] = 1
         if step.halvings[world] == 0:
-            step.first_refusal[world] = 1
-            wp.atomic_max(step.any_refused, 0, 1)
+            step.first_rejection[world] = 1
+            wp.atomic_max(step.any_rejected, 0, 1)
         step.halvings[world] = step.halvings[world] + 1
-        level = step.level[world] + 1
+        level = step.halving_level[world] + 1
         why = newton.failed[world]
         # a shorter step has no better round-off, and changes the motion
-        hopeless = why == FAIL_WORK or why == FAIL_FLOOR
-        if step.newton_budget > 0 and newton.total_iterations[world] >= step.newton_budget:
+        hopeless = why == FAIL_WORK or why == FAIL_ROUNDOFF
+        if step.newton_budget > 0 and newton.step_iterations[world] >= step.newton_budget:
             hopeless = True
         if hopeless or level > step.max_halvings:
             step.status[world] = wp.static(STATUS["failed"])
             step.running[world] = 0
-            wp.atomic_max(step.any_refused, 1, 1)
+            wp.atomic_max(step.any_rejected, 1, 1)
         else:
-            step.level[world] = level
-            step.part[world] = step.part[world] * 2
+            step.halving_level[world] = level
+            step.substep_index[world] = step.substep_index[world] * 2
             wp.atomic_max(step.any_running, 0, 1)
 
     @wp.kernel(module=module)
-    def failed_now(step: Step, newton: Newton, flags: wp.array(dtype=wp.int32)):
+    def flag_failed_steps(step: Step, newton: Newton, flags: wp.array(dtype=wp.int32)):
         """Flag the worlds whose step failed finally: its accepted substeps are rolled back."""
         world = wp.tid()
         flags[world] = 0
-        if step.status[world] == wp.static(STATUS["failed"]) and step.refused[world] == 1:
+        if step.status[world] == wp.static(STATUS["failed"]) and step.rejected[world] == 1:
             flags[world] = 1
-            newton.potential[world] = newton.potential_start[world]
+            newton.strain_energy[world] = newton.strain_energy_start[world]
 
     @wp.kernel(module=module)
     def accept_state(
@@ -309,9 +309,9 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
             v_before[world, slot] = v_n[world, slot]
             if slot == 0:
                 step.previous_h[world] = step.h[world]
-                step.previous_end[world] = step.time[world]
+                step.previous_end_time[world] = step.time[world]
         if wp.static(accelerated):
-            c = coefficients(step.h[world], step.h_before[world], step.parameter)
+            c = coefficients(step.h[world], step.acceleration_step[world], step.scheme_parameter)
             a = u_before[world, slot]
             new = v[world, slot]
             before = v_n[world, slot] + T(c.v_a) * a + T(c.v_w) * v_before[world, slot]
@@ -319,40 +319,40 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
             v_before[world, slot] = T(c.mass_factor) * (new - before)
             if slot == 0:
                 step.previous_h[world] = step.h[world]
-                step.previous_end[world] = step.time[world]
+                step.previous_end_time[world] = step.time[world]
         u_n[world, slot] = u[world, slot]
         if slot == 0:
-            newton.potential[world] = newton.elem_sums[0, world]
+            newton.strain_energy[world] = newton.elem_sums[0, world]
         if wp.static(not static):
             v_n[world, slot] = v[world, slot]
 
     @wp.kernel(module=module)
     def write_report(step: Step, newton: Newton, pcg: PCG, report: wp.array2d(dtype=f64)):
-        """Report of a step, one array for the host; columns as `REPORT`."""
+        """Report of a step, one array for the host; columns as `REPORT_COLUMNS`."""
         world = wp.tid()
         report[world, 0] = f64(step.status[world])
-        report[world, 1] = f64(newton.total_iterations[world])
-        report[world, 2] = f64(pcg.total[world])
+        report[world, 1] = f64(newton.step_iterations[world])
+        report[world, 2] = f64(pcg.step_iterations[world])
         report[world, 3] = newton.relative_residual[world]
         report[world, 4] = f64(step.halvings[world])
-        report[world, 5] = step.total_J[world]
+        report[world, 5] = step.step_min_J[world]
         report[world, 6] = step.time[world]
         report[world, 7] = f64(newton.failed[world])
         report[world, 8] = step.new_time[world]
         report[world, 9] = f64(0.0)
         report[world, 10] = f64(0.0)
-        report[world, 11] = newton.force[world]
-        report[world, 12] = f64(newton.rough[world])
-        report[world, 13] = newton.step_floor[world]
+        report[world, 11] = newton.residual_force[world]
+        report[world, 12] = f64(newton.accepted_unconverged[world])
+        report[world, 13] = newton.step_floor_error[world]
         report[world, 14] = f64(0.0)
-        if step.watched != 0:
-            report[world, 14] = step.growth[world, 0]
+        if step.growth_monitored != 0:
+            report[world, 14] = step.energy_growth[world, GROWTH_SHARE]
         if wp.static(has_constraints):
             largest = f64(0.0)
-            for c in range(newton.components):
+            for c in range(newton.component_count):
                 largest = wp.max(largest, newton.violation[world, c])
             report[world, 9] = largest
-            report[world, 10] = f64(newton.outer[world])
+            report[world, 10] = f64(newton.multiplier_updates[world])
 
     @wp.kernel(module=module)
     def probe_values(
@@ -381,9 +381,9 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         begin_step=begin_step,
         begin_attempt=begin_attempt,
         predict=predict,
-        candidate=candidate,
+        alternative_first_iterate=alternative_first_iterate,
         end_attempt=end_attempt,
-        failed_now=failed_now,
+        flag_failed_steps=flag_failed_steps,
         accept_state=accept_state,
         **vars(ledger_kernels(dtype, multistep or midpoint or accelerated, nonpotential, module)),
         write_report=write_report,

@@ -202,7 +202,7 @@ def clock_struct():
         time: wp.array(dtype=wp.float64)  # at its start, s
         new_time: wp.array(dtype=wp.float64)  # at its end
         h: wp.array(dtype=wp.float64)  # its length, s
-        part: wp.array(dtype=wp.int32)  # index of the substep; 0: first of the step
+        substep_index: wp.array(dtype=wp.int32)  # index of the substep; 0: first of the step
         is_static: wp.int32  # 1 in statics: no rates
 
     return Clock

@@ -270,14 +270,14 @@ def body_force_kernel(function: wp.Function, dtype: str, take_dtype: str):
         slots = block.conn.shape[0]
         for i in range(slots):
             contribution[world, offset + i * count + k] = vec3()
-        for q in range(block.field_weight.shape[0]):
+        for q in range(block.mass_weight.shape[0]):
             r = vec3()
             for i in range(slots):
                 s = block.conn[i, elem]
                 r += block.shape[q, i, column] * (reference[s] + u[world, s])
             x = take.vec3(origin + wp.vec3d(r))
             b = vec3(function(x, take.T(time[world])))
-            f = (T(ramp[world]) * block.field_weight[q, elem]) * b
+            f = (T(ramp[world]) * block.mass_weight[q, elem]) * b
             for i in range(slots):
                 e = offset + i * count + k
                 contribution[world, e] = contribution[world, e] + block.shape[q, i, column] * f

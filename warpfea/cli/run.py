@@ -13,7 +13,7 @@ from ..base.console import quiet_warp, write_json
 from ..base.errors import ConstraintError, ConvergenceError, OutputError, StabilityError, UsageError
 from ..base.names import did_you_mean
 from ..base.writer import Output, check_folder, check_target
-from ..kernels.step.step_control import SAME_TIME
+from ..kernels.step.step_control import SAME_TIME_FRACTION
 from ..model.model import Model
 from ..simulation.checkpoint import SUFFIXES as CHECKPOINT_SUFFIXES
 from ..simulation.checkpoint import Checkpoint, load_checkpoint, read_meta
@@ -60,7 +60,7 @@ def run(options: argparse.Namespace) -> int:
         if options.resume:
             load_checkpoint(sim, options.resume)
             now = float(sim.time.max())
-            if now >= t_end - (SAME_TIME * sim.dt if sim.error is None else 0.0):
+            if now >= t_end - (SAME_TIME_FRACTION * sim.dt if sim.error is None else 0.0):
                 raise UsageError(f"{options.resume}: is at t = {now:g} s already, the end is {t_end:g} s; give --t-end")
         setup_s = clock.perf_counter() - began
         status = "failed"
@@ -171,8 +171,10 @@ def _check_output_options(options: argparse.Namespace) -> None:
 def _check_times(options: argparse.Namespace, source: Source, t_end: float) -> None:
     """UsageError for an end at the start, and for a picture after the end."""
     fixed = not (options.static or options.resume or isinstance(source.dt, str))
-    if fixed and t_end <= SAME_TIME * float(source.dt):
-        raise UsageError(f"--t-end {t_end:g}: less than {SAME_TIME:g} of a step after the start: give a later end time")
+    if fixed and t_end <= SAME_TIME_FRACTION * float(source.dt):
+        raise UsageError(
+            f"--t-end {t_end:g}: less than {SAME_TIME_FRACTION:g} of a step after the start: give a later end time"
+        )
     if options.png_time is not None and not 0.0 <= options.png_time <= t_end * (1.0 + 1e-9):
         raise UsageError(f"--png-time {options.png_time:g}: the run lasts from 0 to t = {t_end:g} s")
 

@@ -10,7 +10,7 @@ import numpy as np
 from ..base.console import number, table, to_json
 from ..base.provenance import versions
 from ..kernels.elements.materials import DEFINED_FOR_ANY_J
-from ..kernels.step.step_control import SAME_TIME
+from ..kernels.step.step_control import SAME_TIME_FRACTION
 from ..model.model import Model
 from ..simulation.energy_growth import integrator_share
 from ..simulation.simulation import Simulation
@@ -217,7 +217,7 @@ def _steps(s: dict[str, Any], sim: Simulation) -> str:
     """Numbers of steps by size."""
     if sim.error is None:
         end = s["steps"] * s["dt"] - s["t_end"]
-        shorter = s["status"] == "done" and SAME_TIME * s["dt"] < end < s["dt"]
+        shorter = s["status"] == "done" and SAME_TIME_FRACTION * s["dt"] < end < s["dt"]
         return f"{s['steps']} steps of {number(s['dt'])} s{', the last shorter' * shorter}"
     refused = int(sim.totals["rejected"].sum())
     return f"{int(sim.totals['substeps'].sum())} adaptive steps, {refused} refused, for an error of {number(sim.error)}"

@@ -9,13 +9,13 @@ import numpy as np
 import warp as wp
 
 from .. import elements
+from ..kernels.elements.assumed_strain import assumed_strain_kernels
+from ..kernels.elements.assumed_strain_block import assumed_strain_struct
 from ..kernels.elements.element import element_kernels
 from ..kernels.elements.element_clusters import cluster_size
 from ..kernels.elements.materials import DEFINED_FOR_ANY_J
 from ..kernels.elements.points import block_struct
 from ..kernels.elements.predicted_stress import predicted_stress_product
-from ..kernels.elements.tied import tied_kernels
-from ..kernels.elements.tied_block import tied_struct
 from ..kernels.elements.with_mass import with_mass_kernel
 from . import assembly
 from .tied_tables import tied_tables
@@ -61,7 +61,9 @@ class Block:
         `dissipative`: of its dissipative form."""
         k = self.key
         if k.tying and midpoint:
-            return tied_kernels(dtype, self.slots, self.points, k.tying.width, midpoint, self.coupled, dissipative)
+            return assumed_strain_kernels(
+                dtype, self.slots, self.points, k.tying.width, midpoint, self.coupled, dissipative
+            )
         if k.tying:
             return self.kernels
         if midpoint:
@@ -71,7 +73,7 @@ class Block:
 
     def dissipative_data(self, dtype: str, dissipation: float) -> Any:
         """Constants for the dissipative mid-point scheme with its chi."""
-        kind = tied_struct if self.key.tying else block_struct
+        kind = assumed_strain_struct if self.key.tying else block_struct
         out = kind(dtype, True)()
         for name in kind(dtype).vars:
             setattr(out, name, getattr(self.data, name))
@@ -82,7 +84,7 @@ class Block:
         """Select the kernels that read couplings per world."""
         assert self.key.tying is not None
         self.coupled = True
-        self.kernels = tied_kernels(dtype, self.slots, self.points, self.key.tying.width, False, True)
+        self.kernels = assumed_strain_kernels(dtype, self.slots, self.points, self.key.tying.width, False, True)
 
     def predicted_stress_product(self, dtype: str) -> wp.Kernel:
         """Kernel of K p with the stress of the linear prediction, without viscosity."""
@@ -118,7 +120,7 @@ def build_block(
     """Block of a key; offsets of its contributions, elements and strain history."""
     family = elements.get(key.family)
     conn = np.concatenate([p.conn + p.body.slot_offset for p in parts])
-    data = (tied_struct if key.tying else block_struct)(model.dtype)()
+    data = (assumed_strain_struct if key.tying else block_struct)(model.dtype)()
     data.conn = model.array("elements", conn.T, wp.int32)
     data.is_position = model.array("elements", (family.slot_kind == 0).astype(float), model.types.T)
     rows = [np.full(len(p.elements), p.row) for p in parts]
@@ -130,7 +132,7 @@ def build_block(
     if key.tying:
         _tied_tables(model, data, key, parts)
         points = len(key.tying.points)
-        kernels = tied_kernels(model.dtype, family.slots, points, key.tying.width)
+        kernels = assumed_strain_kernels(model.dtype, family.slots, points, key.tying.width)
     else:
         det = _point_tables(model, data, key, parts)
         points = len(key.rule.weights)
@@ -179,16 +181,16 @@ def _tied_tables(model: Any, data: Any, key: assembly.BlockKey, parts: list[asse
         for members in assembly.chunks(part.body, part.elements, len(key.rule.weights))
     ]
     assert key.tying is not None
-    names = [("first", T), ("X_first", vec3), ("coupling", T)]
+    names = [("derivative_a", T), ("X_a", vec3), ("coupling", T)]
     normal = np.array_equal(*key.tying.pairs.T)
     if not normal:
-        names += [("second", T), ("X_second", vec3)]
+        names += [("derivative_b", T), ("X_b", vec3)]
     for name, dtype in names:
         table = np.concatenate([getattr(t, name) for t in tables])
         axis = 1 if dtype is vec3 else 2
         setattr(data, name, model.element_array(np.moveaxis(table, 0, axis), dtype))
     if normal:  # strains x_a . x_a
-        data.second, data.X_second = data.first, data.X_first
+        data.derivative_b, data.X_b = data.derivative_a, data.X_a
 
 
 def _point_tables(model: Any, data: Any, key: assembly.BlockKey, parts: list[assembly.HostBlock]) -> np.ndarray | None:
@@ -217,16 +219,16 @@ def _point_tables(model: Any, data: Any, key: assembly.BlockKey, parts: list[ass
         data.J0_inv = model.element_array(np.concatenate(J0).reshape(-1, 9).T, T)
         data.det_J0 = model.array("elements", np.concatenate(w), T)
         if not any(callable(p.body.materials[p.material][1].density) for p in parts):
-            data.mass = model.array("elements", assembly.parent_mass(family), T)
+            data.parent_mass = model.array("elements", assembly.parent_mass(family), T)
             det_J0 = np.concatenate(w)
-            data.density = model.array("elements", model.masses.of_elements(parts, det_J0), T)
-        data.weight = model.array("elements", rule.weights[:, None], T)
+            data.density_det_J0 = model.array("elements", model.masses.of_elements(parts, det_J0), T)
+        data.quadrature_weight = model.array("elements", rule.weights[:, None], T)
     else:
         table = np.moveaxis(np.concatenate(h), 0, 2)
-        data.weight = model.element_array(np.concatenate(w).T, T)
-    data.gradient = model.element_array(table[:Q], vec3)
+        data.quadrature_weight = model.element_array(np.concatenate(w).T, T)
+    data.shape_gradient = model.element_array(table[:Q], vec3)
     if key.law not in DEFINED_FOR_ANY_J:
-        data.vertex_gradient = model.element_array(table[Q:], vec3)
+        data.vertex_shape_gradient = model.element_array(table[Q:], vec3)
     if key.framed:
-        data.frame = model.element_array(np.moveaxis(np.concatenate(axes), 0, 1), mat33)
+        data.material_axes = model.element_array(np.moveaxis(np.concatenate(axes), 0, 1), mat33)
     return det_J0

@@ -179,11 +179,11 @@ class Masses:
             known["matrix"] = pattern, self._replace_array("matrix pattern", mass, self.of_pattern(pattern))
         if m.group_count:
             m.groups.mass = self._replace_array("groups", m.groups.mass, self.of_groups(*known["free groups"]))
-            m.groups.lumped = self.lumped_values
+            m.groups.lumped_mass = self.lumped_values
         for block in m.blocks:
             if block.det is not None:
                 table = self.of_elements(block.parts, block.det)
-                block.data.density = self._replace_array("elements", block.data.density, table)
+                block.data.density_det_J0 = self._replace_array("elements", block.data.density_det_J0, table)
 
     def _replace_array(self, name: str, array: wp.array, values: np.ndarray) -> wp.array:
         """Write values into a device array, or into a new one if the number of worlds differs."""

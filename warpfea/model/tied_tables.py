@@ -15,18 +15,18 @@ __all__ = ["TiedTables", "couplings", "tied_tables"]
 
 @dataclass(eq=False)
 class TiedTables:
-    """Tables of elements with tied strains e_t = x_a . x_b - X_a . X_b (see kernels/elements/tied.py).
+    """Tables of elements with tied strains e_t = x_a . x_b - X_a . X_b (see kernels/elements/assumed_strain.py).
 
     Attributes:
-        first, second: (E, n, S) derivatives of s_i along a and b at the tying points.
-        X_first, X_second: (E, n, 3) X_a and X_b.
+        derivative_a, derivative_b: (E, n, S) derivatives of s_i along a and b at the tying points.
+        X_a, X_b: (E, n, 3) X_a and X_b.
         coupling: (E, n, width) A of the energy (mu/2) e.A e.
     """
 
-    first: np.ndarray
-    second: np.ndarray
-    X_first: np.ndarray
-    X_second: np.ndarray
+    derivative_a: np.ndarray
+    derivative_b: np.ndarray
+    X_a: np.ndarray
+    X_b: np.ndarray
     coupling: np.ndarray
 
 
@@ -43,9 +43,9 @@ def tied_tables(host: HostBlock, elements: np.ndarray) -> TiedTables:
     t = np.arange(len(tying.points))
     a, b = tying.pairs.T
     coupling = _coupling(host, elements, J, [body.materials[host.material][1]])[0]
-    first, second = (np.moveaxis(ds[:, t, :, k], 0, 1) for k in (a, b))
-    X_first, X_second = (np.moveaxis(along[:, t, :, k], 0, 1) for k in (a, b))
-    return TiedTables(first, second, X_first, X_second, coupling)
+    derivative_a, derivative_b = (np.moveaxis(ds[:, t, :, k], 0, 1) for k in (a, b))
+    X_a, X_b = (np.moveaxis(along[:, t, :, k], 0, 1) for k in (a, b))
+    return TiedTables(derivative_a, derivative_b, X_a, X_b, coupling)
 
 
 def couplings(host: HostBlock, materials: Sequence[Material]) -> np.ndarray:

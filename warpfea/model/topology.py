@@ -10,7 +10,7 @@ import warp as wp
 
 from ..base.errors import ModelError
 from ..kernels.common.structs import topology_struct
-from ..kernels.solvers.pcg import groups_struct
+from ..kernels.solvers.pcg import free_groups_struct
 from . import assembly
 
 __all__ = ["check_static_supports", "free_groups", "label_components", "make_topology"]
@@ -54,7 +54,7 @@ def free_groups(model: Any) -> tuple[Any, int]:
         free[np.unique(label[model.free_host[:, c] == 0.0]), c] = 0.0
     model.terms.mark_constrained(free)
     keep = np.flatnonzero(free.any(axis=1))
-    groups = groups_struct(model.dtype)()
+    groups = free_groups_struct(model.dtype)()
     if not len(keep):
         return groups, 0
     number = np.full(count, -1)
@@ -65,11 +65,11 @@ def free_groups(model: Any) -> tuple[Any, int]:
     start = np.concatenate([[0], np.cumsum(np.bincount(of_slot[slots], minlength=len(keep)))])
     groups.start = model.array("groups", start, wp.int32)
     groups.slot = model.array("groups", slots, wp.int32)
-    groups.of_slot = model.array("groups", of_slot, wp.int32)
-    groups.is_position, groups.lumped = model.is_position, model.masses.lumped_values
+    groups.group_of_slot = model.array("groups", of_slot, wp.int32)
+    groups.is_position, groups.lumped_mass = model.is_position, model.masses.lumped_values
     model.cache["free groups"] = of_slot, slots, len(keep)
     groups.mass = model.array("groups", model.masses.of_groups(*model.cache["free groups"]), model.types.T)
-    groups.free = model.array("groups", free[keep], model.types.vec3)
+    groups.free_directions = model.array("groups", free[keep], model.types.vec3)
     return groups, len(keep)
 
 

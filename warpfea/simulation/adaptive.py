@@ -127,13 +127,13 @@ class StepSizeControl:
         self.kernels = adaptive_kernels(model.dtype, scheme)
         self.dim = (model.worlds, model.slots)
         self.arm = model.array("adaptive", _lever_arms(model), model.types.T)
-        shapes = {"counts": (model.worlds, len(STEP_STATISTICS)), "horizon": (1,), "first": (1,)}
-        self.control: Any = work.struct(adaptive_struct(), model.worlds, skip=("kept",), **shapes)
-        self.control.kept = ctx.state.register("adaptive", wp.float64, (len(CONTROL_STATE),))
+        shapes = {"statistics": (model.worlds, len(STEP_STATISTICS)), "horizon": (1,), "first_substep": (1,)}
+        self.control: Any = work.struct(adaptive_struct(), model.worlds, skip=("control_state",), **shapes)
+        self.control.control_state = ctx.state.register("adaptive", wp.float64, (len(CONTROL_STATE),))
         self.means = ctx.state.register("adaptive_means", model.types.vec3, (model.slots,))
         self.control.tolerance = options.error * float(model.size)
         self.control.eps = EPS[model.dtype]
-        self.control.max_tries = max_tries
+        self.control.max_retries = max_tries
 
     def set_interval(self, time: np.ndarray) -> None:
         """Set the interval to the next synchronisation point before a step from times (B,), s."""
@@ -141,7 +141,7 @@ class StepSizeControl:
         if not sync_times.is_set:
             sync_times.set_defaults(float(time.min()))
         self.control.horizon.fill_(sync_times.horizon)
-        self.control.first.fill_(FIRST_STEP * sync_times.horizon * self.error ** (1.0 / self.order))
+        self.control.first_substep.fill_(FIRST_STEP * sync_times.horizon * self.error ** (1.0 / self.order))
         self.work.step.dt.assign(sync_times.time_to_next(time))
 
     def count_steps(self, now: float, end: float, outputs: Iterable[Any]) -> int:
@@ -155,7 +155,7 @@ class StepSizeControl:
 
     def begin_interval(self) -> None:
         """Set the substep size from the state, after the kernel `begin_step`."""
-        self.launch(self.kernels.open_step, self.model.worlds, [self.work.step, self.control])
+        self.launch(self.kernels.begin_step_control, self.model.worlds, [self.work.step, self.control])
 
     def check_local_error(self) -> None:
         """Estimate the local error of converged attempts; reject those above tolerance (before the kernel
@@ -163,18 +163,22 @@ class StepSizeControl:
         m, w, k, ctl, launch = self.model, self.work, self.kernels, self.control, self.launch
         launch(k.begin_estimate, m.worlds, [w.step, w.newton, ctl])
         args = [w.step, ctl, self.arm, m.topology.free, w.u, w.v, self.velocity, self.v_before, self.means]
-        launch(k.local_error, self.dim, args)
+        launch(k.max_error_rates, self.dim, args)
         launch(k.control_step_size, m.worlds, [w.step, w.newton, w.pcg, ctl])
 
     def finish_attempt(self) -> None:
         """Compute mean rates and the size of the next substep, after the kernel `end_attempt` and before acceptance."""
         w, launch = self.work, self.launch
-        launch(self.kernels.keep_mean, self.dim, [w.step, self.control, w.v, self.velocity, self.v_before, self.means])
+        launch(
+            self.kernels.update_mean_rates,
+            self.dim,
+            [w.step, self.control, w.v, self.velocity, self.v_before, self.means],
+        )
         launch(self.kernels.refine_substeps, self.model.worlds, [w.step, self.control])
 
     def end_interval(self) -> None:
         """Finish the interval before the report."""
-        self.launch(self.kernels.close_step, self.model.worlds, [self.work.pcg, self.control])
+        self.launch(self.kernels.report_pcg_iterations, self.model.worlds, [self.work.pcg, self.control])
 
     def least_error(self, world: int) -> float:
         """Smallest tolerance, over the model's size, that round-off lets the estimates meet; 0 if they meet theirs."""
@@ -183,5 +187,5 @@ class StepSizeControl:
 
     def counts(self) -> dict[str, np.ndarray]:
         """Counts of the last step, each (B,), see STEP_STATISTICS."""
-        rows = self.control.counts.numpy()
+        rows = self.control.statistics.numpy()
         return {name: rows[:, k].astype(int if k < 2 else float) for k, name in enumerate(STEP_STATISTICS)}

@@ -181,7 +181,7 @@ class ConsistentInitialConditions:
         self._write_flagged(w.step.new_time, flags, time)
         active = self._world_flags(flags)
         m.terms.time_laws.evaluate(
-            self.ctx.launch, self.ctx.state, w.step.new_time, w.step.ramp, active, w.time_law_values
+            self.ctx.launch, self.ctx.state, w.step.new_time, w.step.load_factor, active, w.time_law_values
         )
         return w.time_law_values.numpy().copy()
 
@@ -194,7 +194,7 @@ class ConsistentInitialConditions:
         every, active = np.ones(len(flags)), self._world_flags(flags)
         # strain rates of the state: E~ = E - (dq/dv) dE/dt
         for array, value in (
-            (w.step.ramp, 1.0),
+            (w.step.load_factor, 1.0),
             (w.step.h, dt),
             (w.step.dq_dv, dt),
             (w.step.b, -dt),

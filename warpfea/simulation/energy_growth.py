@@ -18,7 +18,7 @@ import numpy as np
 import warp as wp
 
 from ..base.errors import ModelWarning
-from ..kernels.step.step_control import GROWTH
+from ..kernels.step.step_control import GROWTH_COLUMNS
 from ..model.assembly import element_volumes
 from .drive_jumps import drives
 
@@ -65,17 +65,17 @@ class EnergyGrowth:
         """Bind monitor arrays to the step control; resets the history of a reused state."""
         if not self.watched:
             return
-        rows = state.register("energy_growth", wp.float64, (len(GROWTH),))
+        rows = state.register("energy_growth", wp.float64, (len(GROWTH_COLUMNS),))
         rows.zero_()
-        step.growth, step.watched = rows, 1
-        step.counted = float(not drives(model))
+        step.energy_growth, step.growth_monitored = rows, 1
+        step.residual_work_counted = float(not drives(model))
         self._model, self._rows = model, rows
         self._least_energy = wp.zeros(model.worlds, dtype=wp.float64, device=model.device)
         self._written, self._writes = model.terms.written, model.terms.writes
         self._least_energy.assign(least_energy(model))
         step.growth_warn_limit = WARN_LIMIT
         step.growth_limit = REFUSE_LIMIT if self.choice == "refuse" else np.inf
-        step.least_energy = self._least_energy
+        step.min_energy = self._least_energy
 
     def restart_changed(self) -> None:
         """Restart in worlds whose parameters were set: the energy jump is not the integrator's."""
@@ -95,7 +95,7 @@ class EnergyGrowth:
             return
         self.warned = True
         world = int(np.argmax(shares))
-        since = float(sim.state.energy_growth.numpy()[world, GROWTH.index("since")])
+        since = float(sim.state.energy_growth.numpy()[world, GROWTH_COLUMNS.index("since")])
         refused = f"; steps are refused above {REFUSE_LIMIT:.0%}" if self.choice == "refuse" else ""
         where = f" in world {world}" if sim.model.worlds > 1 else ""
         warnings.warn(
@@ -148,7 +148,7 @@ def integrator_share(sim: Any) -> float:
     if not sim.energy_growth.watched:
         return float("nan")
     rows = sim.state.energy_growth.numpy()
-    scale = rows[:, GROWTH.index("largest")] + rows[:, GROWTH.index("turnover")]
+    scale = rows[:, GROWTH_COLUMNS.index("largest")] + rows[:, GROWTH_COLUMNS.index("turnover")]
     taken = np.abs(sim.energies()["integrator"])
     return float(np.max(np.divide(taken, scale, out=np.zeros_like(taken), where=scale > 0.0)))
 
@@ -156,7 +156,7 @@ def integrator_share(sim: Any) -> float:
 def growth_error(sim: Any, world: int) -> str:
     """Message of a step rejected for energy growth; restarts the monitor of the world."""
     rows = sim.state.energy_growth.numpy()
-    share, since = (float(rows[world, GROWTH.index(name)]) for name in ("share", "since"))
+    share, since = (float(rows[world, GROWTH_COLUMNS.index(name)]) for name in ("share", "since"))
     name, cure = source(sim, world), calmer_schemes_text(sim, world)
     rows[world] = 0.0
     sim.state.energy_growth.assign(rows)

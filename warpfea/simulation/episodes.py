@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from ..kernels.step.episodes import STATISTICS, episode_kernels
+from ..kernels.step.episodes import RUN_STATISTICS, episode_kernels
 
 if TYPE_CHECKING:
     from ..base.launch import Launcher
@@ -23,7 +23,7 @@ class Episodes:
 
     Attributes:
         ends: [world] end times, s, at which worlds are frozen.
-        tally: [world, STATISTICS] run statistics since the last read; stepped: [world] flags since the state was set.
+        tally: [world, RUN_STATISTICS] statistics since the last read; stepped: [world] flags since the state was set.
     """
 
     def __init__(self, model: Model, work: Workspace, launch: Launcher, *, asynchronous: bool, ends: bool) -> None:
@@ -34,9 +34,9 @@ class Episodes:
         self._flags: wp.array | None = None
         self.set_run_end()
         if ends:
-            work.step.ends = self.ends
+            work.step.world_end = self.ends
         if asynchronous:
-            self.tally = work.array("tally", (model.worlds, len(STATISTICS)), wp.float64)
+            self.tally = work.array("tally", (model.worlds, len(RUN_STATISTICS)), wp.float64)
             self.stepped = work.array("stepped", (model.worlds,), wp.int32)
             self._clear()
 
@@ -47,7 +47,7 @@ class Episodes:
     def set_run_end(self, end: float = math.inf, steps: int = 0) -> None:
         """Set the end, s, and the number of steps of a run; inf: no run."""
         # summed steps reach the end up to round-off
-        self.work.step.stop.assign(np.array([end, steps * math.ulp(end) if steps else 0.0]))
+        self.work.step.run_end.assign(np.array([end, steps * math.ulp(end) if steps else 0.0]))
 
     def freeze_finished(self) -> None:
         """Freeze worlds that have reached their end time, at the start of a step or after its report."""
@@ -62,7 +62,7 @@ class Episodes:
         self.freeze_finished()
 
     def read_totals(self) -> tuple[np.ndarray, np.ndarray]:
-        """Read and reset the statistics (worlds, STATISTICS); also the stepped worlds (worlds,)."""
+        """Read and reset the statistics (worlds, RUN_STATISTICS); also the stepped worlds (worlds,)."""
         assert self.tally is not None
         assert self.stepped is not None
         sums = self.tally.numpy().copy()
@@ -88,10 +88,10 @@ class Episodes:
         if self.stepped is None:
             return
         if isinstance(worlds, wp.array):
-            self.launch(episode_kernels().clear_chosen, self.worlds, [worlds, self.stepped])
+            self.launch(episode_kernels().clear_flagged, self.worlds, [worlds, self.stepped])
         else:
             self.stepped.assign(np.where(worlds, 0, self.stepped.numpy()))
 
     def copy_flagged(self, flags: wp.array, source: Any, target: wp.array) -> None:
         """Copy one value of the flagged worlds on the device."""
-        self.launch(episode_kernels().copy_chosen, self.worlds, [flags, source, target])
+        self.launch(episode_kernels().copy_flagged, self.worlds, [flags, source, target])

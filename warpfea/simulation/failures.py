@@ -11,16 +11,16 @@ from ..kernels.solvers.convergence import STALL_ROUNDINGS
 from ..kernels.solvers.newton_control import (
     FAIL_CONSTRAINT,
     FAIL_CURVATURE,
-    FAIL_ENERGY,
-    FAIL_ERROR,
-    FAIL_FLOOR,
-    FAIL_GROWTH,
-    FAIL_INVERTED,
+    FAIL_ELEMENT_INVERTED,
+    FAIL_ENERGY_GROWTH,
     FAIL_ITERATIONS,
     FAIL_JACOBIAN,
-    FAIL_LIMIT,
     FAIL_LINE_SEARCH,
+    FAIL_LOCAL_ERROR,
     FAIL_NAN,
+    FAIL_RESIDUAL_GROWTH,
+    FAIL_ROUNDOFF,
+    FAIL_STEP_LIMIT,
     FAIL_WORK,
 )
 from ..solvers import NewtonPCG
@@ -40,10 +40,10 @@ REASONS = {
     FAIL_JACOBIAN: "an element reached J <= 0, where its law is not defined,",
     FAIL_NAN: "a force or energy was not finite",
     FAIL_CURVATURE: "no descent direction was found",
-    FAIL_LIMIT: "a term allowed no step along Newton's direction",
-    FAIL_GROWTH: "the residual grew more than tenfold",
-    FAIL_INVERTED: "an element inverted (J <= 0)",
-    FAIL_ERROR: "the error tolerance was not met within 65536 substeps",
+    FAIL_STEP_LIMIT: "a term allowed no step along Newton's direction",
+    FAIL_RESIDUAL_GROWTH: "the residual grew more than tenfold",
+    FAIL_ELEMENT_INVERTED: "an element inverted (J <= 0)",
+    FAIL_LOCAL_ERROR: "the error tolerance was not met within 65536 substeps",
 }
 INDEFINITE_FAILURES = (FAIL_ITERATIONS, FAIL_LINE_SEARCH, FAIL_CURVATURE)
 """Failures that an indefinite tangent may explain."""
@@ -61,14 +61,14 @@ def step_error(sim: Any, world: int) -> ConvergenceError | ConstraintError:
     time = float(sim.last.time[world])
     # no halving follows the last rejection
     halvings = min(int(sim.last.halvings[world]) - 1, sim.solver.max_halvings)
-    if code == FAIL_ENERGY:
+    if code == FAIL_ENERGY_GROWTH:
         text = f"{_step_text(sim, time, world)} was not taken in world {world}: {growth_error(sim, world)}"
         return ConvergenceError(text, time=time, world=world, state=sim.state)
     if code == FAIL_CONSTRAINT:
         return _constraint_error(sim, world, time, halvings)
     count = int(work.newton.iterations.numpy()[world]) + 1
-    history = work.newton.history.numpy()[world, :count].tolist()
-    if code in (FAIL_JACOBIAN, FAIL_INVERTED):
+    history = work.newton.residual_history.numpy()[world, :count].tolist()
+    if code in (FAIL_JACOBIAN, FAIL_ELEMENT_INVERTED):
         element, where = lowest_jacobian(sim.model, work.u.numpy()[world].astype(float))
     else:
         element, where = _worst_element(sim.model, work.g.numpy()[world])
@@ -79,12 +79,12 @@ def step_error(sim: Any, world: int) -> ConvergenceError | ConstraintError:
         )
     hint += overload_text(sim.model)
     lumped = [c.name for c in sim.model.description.contacts if c.model == "sphere"] if sim.integrator.static else []
-    if lumped and code != FAIL_FLOOR:
+    if lumped and code != FAIL_ROUNDOFF:
         hint += f"; the single contact point of {lumped[0]!r} jumps as the body rolls: use model='patch' in statics"
     spent, most = int(sim.last.newton[world]), int(work.step.newton_budget)
     if code != FAIL_WORK and most and spent >= most and halvings < sim.solver.max_halvings:
         hint += f"; {spent} Newton iterations used up max_work = {sim.solver.max_work}"
-    jumps = "" if code == FAIL_FLOOR else jumping_drives(sim, world)
+    jumps = "" if code == FAIL_ROUNDOFF else jumping_drives(sim, world)
     kind: type[ConvergenceError] = ConvergenceError
     for term in sim.model.terms:
         if (found := term.failure_reason(sim.stepper.ctx, world)) is not None:
@@ -110,25 +110,25 @@ def _failure_reason(sim: Any, code: int, world: int) -> tuple[str, str]:
     near = float(work.newton.rounding_ratio.numpy()[world]) <= STALL_ROUNDINGS
     finer = "; use float64" if dtype == "float32" else "; use fewer, stouter elements, or check the units"
     adaptive = sim.stepper.adaptive
-    if code == FAIL_FLOOR and adaptive and (least := adaptive.least_error(world)):
+    if code == FAIL_ROUNDOFF and adaptive and (least := adaptive.least_error(world)):
         hides = f"{dtype} round-off of displacements hides the local errors of substeps"
         return hides, f"{finer}, or error = {1.05 * least:.2g} or more"
-    if code == FAIL_ERROR:
+    if code == FAIL_LOCAL_ERROR:
         return REASONS[code], f"; {'use float64, or ' if dtype == 'float32' else 'use '}a larger error"
-    if code == FAIL_FLOOR:
+    if code == FAIL_ROUNDOFF:
         eta = float(work.newton.error_estimate.numpy()[world])
         left = ""
         if eta < NO_ESTIMATE:
             left = f" (estimated error {eta:.2g})"
         return f"{dtype} round-off limit reached{left}", finer
     if code == FAIL_WORK:
-        spent = f"the step took {int(work.pcg.total.numpy()[world])} CG iterations"
+        spent = f"the step took {int(work.pcg.step_iterations.numpy()[world])} CG iterations"
         limit = f"max_work = {sim.solver.max_work}"
         if near and dtype == "float32":
             return f"float32 round-off limit reached: {spent} ({limit})", finer
         slivers = f"; raise {limit} of NewtonPCG, or look for slivers and extreme contrasts of stiffness"
         return spent, "" if overload_text(sim.model) else slivers
-    if code == FAIL_INVERTED:
+    if code == FAIL_ELEMENT_INVERTED:
         return REASONS[code], f"{smaller}, or NeoHookean in place of SVK; inversion='report' lets it pass"
     bent = sim.integrator.static and int(work.newton.met_negative_curvature.numpy()[world])
     if code in INDEFINITE_FAILURES and near and (dtype == "float32" or not bent):

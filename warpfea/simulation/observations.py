@@ -10,7 +10,7 @@ import warp as wp
 from ..base.errors import ModelError
 from ..base.names import did_you_mean, listing
 from ..base.short_repr import lines
-from ..kernels.step.episodes import JOINT_VALUES, MOTION_KINDS, observation_kernels
+from ..kernels.step.episodes import JOINT_VALUE_KINDS, MOTION_KINDS, observation_kernels
 from ..kernels.terms.contact_structs import RECORD_NAMES
 
 __all__ = ["Observations"]
@@ -156,7 +156,8 @@ class Observations:
         self._joint_values = [
             *sums([(slots, weights) for slots, weights, _ in entries]),
             array(np.array([v.value for v in vectors], dtype=float).reshape(-1, 3), wp.vec3d),
-            array([JOINT_VALUES[v[1]] for v in self._values], wp.int32), array([v[2] for v in self._values], wp.int32),
+            array([JOINT_VALUE_KINDS[v[1]] for v in self._values], wp.int32),
+            array([v[2] for v in self._values], wp.int32),
             array([v[3] for v in self._values], wp.int32),
         ] if vectors else []  # fmt: skip
         reports = np.array(self._reports, dtype=np.int32).reshape(-1, 2)
@@ -183,9 +184,9 @@ class Observations:
             if not sim.asynchronous:  # known on the host
                 self._stepped.assign(sim._stepped.astype(np.int32))
             args = [*self._report_columns, sim.stepper.work.report, self._stepped, self.array]
-            launch(k.reports, (B, len(self._reports)), args)
+            launch(k.report_columns, (B, len(self._reports)), args)
         for column in self._times:
-            launch(k.numbers, B, [state.time, column, self.array])
+            launch(k.world_values, B, [state.time, column, self.array])
         return self.array
 
     def __getitem__(self, name: str) -> wp.array:

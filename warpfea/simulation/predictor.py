@@ -30,10 +30,10 @@ class Predictor:
         self.kernels = predictor_kernels(model.dtype, scheme.accelerated, module)
         self.dim = (model.worlds, model.slots)
         self.control: Any = predictor_struct()()
-        for name in ("order", "count"):
+        for name in ("order", "history_count"):
             setattr(self.control, name, work.array(f"predictor {name}", (model.worlds,), wp.int32))
         self.control.sums = work.array("predictor sums", (PREDICTOR_ROWS, model.worlds), wp.float64)
-        self.control.kept = state.register("predictor", wp.float64, (4,))
+        self.control.history_state = state.register("predictor", wp.float64, (4,))
         # multistep schemes store v_{n-1} already
         self.own = not scheme.multistep
         field = model.types.vec3, (model.slots,)
@@ -43,7 +43,7 @@ class Predictor:
     def begin(self) -> None:
         """Write the first iterate to work.v, which holds v_n from the kernel `predict`."""
         m, w, step = self.model, self.work, self.work.step
-        self.launch(self.kernels.begin, m.worlds, [self.control, step, w.newton])
+        self.launch(self.kernels.begin_attempt, m.worlds, [self.control, step, w.newton])
         args = [self.control, step, m.topology.free, self.state.velocity, *self.previous_velocities, w.v]
         self.launch(self.kernels.extrapolate, self.dim, args)
 
@@ -60,7 +60,7 @@ class Predictor:
             self.state.velocity,
             *self.previous_velocities,
         ]
-        self.launch(self.kernels.order_errors, self.dim, [*args, w.rows])
+        self.launch(self.kernels.order_error_terms, self.dim, [*args, w.rows])
         self.reduce(w.rows, PREDICTOR_ROWS, step.accepted, self.control.sums)
         self.launch(
             self.kernels.shift_history, self.dim, [step, int(self.own), self.state.velocity, *self.previous_velocities]

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..base.errors import ModelError
 from ..base.names import did_you_mean, listing
-from ..kernels.step.step_control import REPORT
+from ..kernels.step.step_control import REPORT_COLUMNS
 from ..kernels.terms.constraints import JOINT_COLUMNS
 from ..kernels.terms.contact_structs import RECORD_NAMES
 from ..model.contacts import Contact
@@ -53,7 +53,7 @@ class Records(Results):
 
     def joint_record(self, joint: Joint | str) -> JointRecord:
         """Record of a joint (handle or name), one entry per step."""
-        first = 1 + self._joint_column(joint) - len(REPORT)
+        first = 1 + self._joint_column(joint) - len(REPORT_COLUMNS)
         columns = [0, *range(first, first + JOINT_COLUMNS)]
         table = self._table(columns)
         return JointRecord(self._times(table), table[:, :, 1:4], table[:, :, 4:7], table[:, :, 7])
@@ -109,7 +109,7 @@ class Records(Results):
 
     def contact_record(self, contact: Contact | PairContact | str) -> ContactRecord:
         """Record of a contact (handle or name), one entry per step."""
-        first = 1 + self._contact_column(contact) - len(REPORT)
+        first = 1 + self._contact_column(contact) - len(REPORT_COLUMNS)
         table = self._table([0, *range(first, first + len(RECORD_NAMES))])
         names = ("normal_force", "penetration", "slip", "area", "stick", "stored", "loss", "friction", "collider_work")
         scalars = {name: table[:, :, 1 + RECORD_NAMES.index(name)] for name in names}

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from ..base.errors import ConstraintError, ConvergenceError
-from ..kernels.step.episodes import STATISTICS
-from ..kernels.step.step_control import REPORT, STATUS
+from ..kernels.step.episodes import RUN_STATISTICS
+from ..kernels.step.step_control import REPORT_COLUMNS, STATUS
 from .energy_growth import EnergyGrowth
 from .failures import step_error
 from .records import Records
@@ -83,12 +83,12 @@ class RunStatistics(Records):
         rows = self.stepper.work.report.numpy()
         self.last = self._report_of(rows)
         for name in COUNTERS:
-            self.totals[name] += sums[:, STATISTICS.index(name)].astype(int)
+            self.totals[name] += sums[:, RUN_STATISTICS.index(name)].astype(int)
         for name in ("residual", "floor", "violation"):
             key = f"max_{name}"
-            setattr(self, key, max(getattr(self, key), float(sums[:, STATISTICS.index(name)].max())))
-        self.min_J = min(self.min_J, float(sums[:, STATISTICS.index("min_J")].min()))
-        self.energy_growth.warn_once(self, sums[:, STATISTICS.index("energy_growth")])
+            setattr(self, key, max(getattr(self, key), float(sums[:, RUN_STATISTICS.index(name)].max())))
+        self.min_J = min(self.min_J, float(sums[:, RUN_STATISTICS.index("min_J")].min()))
+        self.energy_growth.warn_once(self, sums[:, RUN_STATISTICS.index("energy_growth")])
         self._stepped = stepped
         if self._recorded:
             self._history = [self._history_row(rows)]
@@ -100,7 +100,7 @@ class RunStatistics(Records):
 
     def _report_of(self, rows: np.ndarray) -> StepReport:
         """Report of a step from its columns (worlds, columns)."""
-        column = {name: rows[:, k].copy() for k, name in enumerate(REPORT)}
+        column = {name: rows[:, k].copy() for k, name in enumerate(REPORT_COLUMNS)}
         status = column["status"].astype(int)
         return StepReport(
             converged=(status == STATUS["running"]) & (column["rough"] == 0.0),
@@ -158,14 +158,14 @@ class RunStatistics(Records):
 
     def _history_row(self, rows: np.ndarray) -> np.ndarray:
         """Recorded columns of a report: time, probes, and term columns, NaN for worlds that did not step."""
-        row = rows[:, [REPORT.index("time"), *range(len(REPORT), rows.shape[1])]].copy()
+        row = rows[:, [REPORT_COLUMNS.index("time"), *range(len(REPORT_COLUMNS), rows.shape[1])]].copy()
         row[~self._stepped, 1 + 6 * len(self.model.probes) :] = np.nan
         return row
 
     @property
     def _recorded(self) -> bool:
         """True if any quantity is recorded per step."""
-        return self.model.terms.report_width > len(REPORT)
+        return self.model.terms.report_width > len(REPORT_COLUMNS)
 
     def _failure(self, world: int) -> ConvergenceError | ConstraintError:
         """Error of a failed world; its status is cleared so that a caller may retry with another dt."""

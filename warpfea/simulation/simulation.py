@@ -16,7 +16,7 @@ from ..base.errors import ModelError
 from ..base.memory import enough_memory
 from ..base.names import listing
 from ..base.worlds import worlds_mask
-from ..kernels.step.step_control import SAME_TIME, STATUS
+from ..kernels.step.step_control import SAME_TIME_FRACTION, STATUS
 from ..model.assembly import require_density
 from ..model.handles import NodeSet
 from ..model.state import State
@@ -294,15 +294,15 @@ class Simulation(RunStatistics):
         alive = self.status == STATUS["running"]
         now = float(self.time[alive].min()) if alive.any() else t_end
         adaptive = self.stepper.adaptive
-        if t_end < now - (0.0 if adaptive else SAME_TIME * self.dt):
+        if t_end < now - (0.0 if adaptive else SAME_TIME_FRACTION * self.dt):
             raise ModelError(f"t_end = {t_end:g} s lies in the past: the simulation is at t = {now:.6g} s")
         if adaptive:
             total = adaptive.count_steps(now, t_end, outputs)
         else:
-            total = max(math.ceil((t_end - now) / self.dt - SAME_TIME), 0)
+            total = max(math.ceil((t_end - now) / self.dt - SAME_TIME_FRACTION), 0)
             if total == 0 and t_end != now and self.steps == 0:
-                raise ModelError(f"t_end = {t_end:g} s is within {SAME_TIME:g} dt of the start at t = {now:g} s, so no "
-                                 "step would be done; take a later t_end")  # fmt: skip
+                raise ModelError(f"t_end = {t_end:g} s is within {SAME_TIME_FRACTION:g} dt of the start at t = {now:g} "
+                                 "s, so no step would be done; take a later t_end")  # fmt: skip
         if not self.integrator.static:
             warn_early_ends(self, t_end)
         self.stepper.episodes.set_run_end(t_end, total)

@@ -13,9 +13,9 @@ from ..base.errors import ModelError
 from ..base.launch import Launcher, labelled
 from ..base.memory import enough_memory
 from ..kernels.step.adaptive import MAX_LEVEL
-from ..kernels.step.energy_ledger import LEDGER_ROWS
+from ..kernels.step.energy_ledger import LEDGER_TERM_ROWS
 from ..kernels.step.step import step_kernels
-from ..kernels.step.step_control import REPORT
+from ..kernels.step.step_control import REPORT_COLUMNS
 from ..model.state import State
 from ..solvers import Jacobi, NewtonPCG, make_loop
 from ..terms.checks import check_stored_energy
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 __all__ = ["Stepper"]
 
 FIRST_ITERATES = (0, 1, 2)
-"""Alternative first iterates, see the kernel `candidate`."""
+"""Alternative first iterates, see the kernel `alternative_first_iterate`."""
 
 
 class Stepper:
@@ -89,7 +89,7 @@ class Stepper:
         self.newton.register(state)
         if model.terms.traits.unilateral:  # contact energy, which is not evaluated at rest
             state.register("predictor_potential", wp.float64)
-            self.work.newton.potential = state.predictor_potential
+            self.work.newton.strain_energy = state.predictor_potential
         self.predictor: Predictor | None = None
         # round-off would accumulate in single precision, and so would the residual of Jacobi steps
         if not integrator.static and model.dtype == "float64" and isinstance(solver, NewtonPCG):
@@ -128,22 +128,22 @@ class Stepper:
     def _bind_structs(self) -> None:
         w, state = self.work, self.state
         w.step.time = state.time
-        w.step.status, w.step.summed = state.status, state.summed_time
+        w.step.status, w.step.summed_time = state.status, state.summed_time
         w.step.gravity = self.terms.dead.gravity
-        w.step.any_running, w.step.any_refused = self.running, w.any_flag[3:5]
+        w.step.any_running, w.step.any_rejected = self.running, w.any_flag[3:5]
         w.step.max_halvings = MAX_LEVEL if self.adaptive else self.solver.max_halvings
         if isinstance(self.solver, NewtonPCG) and not self.adaptive:
             w.step.newton_budget = self.solver.newton_budget(bool(self.terms.traits.unilateral))
-        w.step.stabilise = self.integrator.stabilise
-        w.step.parameter = self.integrator.parameter
+        w.step.stabilisation = self.integrator.stabilise
+        w.step.scheme_parameter = self.integrator.parameter
         if self.integrator.takes_velocity:
             w.step.b = w.array("b", (self.model.worlds,), wp.float64)
         if self.integrator.accelerated:
             w.step.q_a = w.array("q_a", (self.model.worlds,), wp.float64)
-            w.step.h_before = w.array("h_before", (self.model.worlds,), wp.float64)
+            w.step.acceleration_step = w.array("h_before", (self.model.worlds,), wp.float64)
         if self.integrator.multistep or self.integrator.accelerated:
             w.step.previous_h = state.previous_step
-            w.step.previous_end = state.acceleration_end if self.integrator.accelerated else state.previous_end
+            w.step.previous_end_time = state.acceleration_end if self.integrator.accelerated else state.previous_end
         if self.ledger:
             w.step.ledger_time = state.ledger_time
             self.increments = self.terms.increment_table(w)
@@ -157,7 +157,7 @@ class Stepper:
         active = self._flags(mask)
         w.step.new_time.assign(state.time)
         w.stage_time.assign(state.time)
-        w.step.ramp.fill_(0.0 if self.integrator.static else 1.0)
+        w.step.load_factor.fill_(0.0 if self.integrator.static else 1.0)
         self._evaluate_time_laws(active)
         w.u.assign(state.displacement)
         for term in following:
@@ -181,7 +181,7 @@ class Stepper:
         """Kinetic energy, strain energy and gravity potential of the state, (worlds, 3), J."""
         m = self.model
         rows = wp.zeros((1, m.worlds, m.slots), dtype=wp.float64, device=m.device)
-        kernel = self.newton.residual.gather.mass_product
+        kernel = self.newton.residual.gather.kinetic_terms
         Launcher(m.device)(kernel, self.dim, [m.topology, self.state.velocity, rows])
         u = self.state.displacement.numpy().astype(float)
         pull = -np.einsum("bc,bs,bsc->b", m.terms.dead.gravity.numpy(), m.masses.of_worlds(m.worlds), u)
@@ -243,9 +243,11 @@ class Stepper:
             residual.reduce(w.energy_rows, 2, active, w.newton.elem_sums)
         measured = w.newton.elem_sums[0]
         if isinstance(flags, wp.array):
-            self.episodes.copy_flagged(flags, measured, w.newton.potential)
+            self.episodes.copy_flagged(flags, measured, w.newton.strain_energy)
         else:
-            w.newton.potential.assign(np.where(active.numpy() != 0, measured.numpy(), w.newton.potential.numpy()))
+            w.newton.strain_energy.assign(
+                np.where(active.numpy() != 0, measured.numpy(), w.newton.strain_energy.numpy())
+            )
 
     def _flags(self, mask: np.ndarray | None) -> wp.array:
         """Device mask of worlds, by default all."""
@@ -331,7 +333,7 @@ class Stepper:
     def _restore_failed(self) -> None:
         """Restore the state of worlds whose step failed."""
         m, w, launch = self.model, self.work, self.launch
-        launch(self.kernels.failed_now, m.worlds, [w.step, w.newton, w.newton.active])
+        launch(self.kernels.flag_failed_steps, m.worlds, [w.step, w.newton, w.newton.active])
         if self.backup is not None:
             self.state.copy_rows(launch, w.newton.active, self.backup, skip=("status",))
         self.newton.invalidate(w.newton.active)
@@ -340,7 +342,7 @@ class Stepper:
     def _back_up_state(self) -> None:
         """Back up the state, still that of the step's start, before the first halving."""
         assert self.backup is not None
-        self.backup.copy_rows(self.launch, self.work.step.first_refusal, self.state)
+        self.backup.copy_rows(self.launch, self.work.step.first_rejection, self.state)
 
     def _attempt(self) -> None:
         m, w, launch, state = self.model, self.work, self.launch, self.state
@@ -374,7 +376,7 @@ class Stepper:
         """Write an alternative first iterate to work.v in worlds that choose one."""
         m, w, state = self.model, self.work, self.state
         args = [w.step, w.newton, kind, m.is_position, m.topology.free, state.displacement, state.velocity]
-        self.launch(self.kernels.candidate, self.dim, [*args, w.q_tilde, w.v_tilde, w.v])
+        self.launch(self.kernels.alternative_first_iterate, self.dim, [*args, w.q_tilde, w.v_tilde, w.v])
 
     @labelled("commit")
     def accept_attempt(self) -> None:
@@ -398,19 +400,20 @@ class Stepper:
         """Evaluate the time laws at the end of the attempt."""
         w = self.work
         laws = self.terms.time_laws
-        laws.evaluate(self.launch, self.state, w.step.new_time, w.step.ramp, active, w.time_law_values)
+        laws.evaluate(self.launch, self.state, w.step.new_time, w.step.load_factor, active, w.time_law_values)
         if self.ctx.midpoint:
-            laws.evaluate(self.launch, self.state, w.stage_time, w.step.ramp, active, w.time_law_stage_values)
+            laws.evaluate(self.launch, self.state, w.stage_time, w.step.load_factor, active, w.time_law_stage_values)
         self.terms.dead.take_gravity(self.launch, w.time_law_stage_values, active)
 
     def law_values(self, time: float) -> np.ndarray:
         """Values of the time laws at a time, s, or load fraction, (B, laws, 3), without changing those of the step."""
         m, w = self.model, self.work
         kept = [
-            (array, array.numpy().copy()) for array in (w.step.new_time, w.step.ramp, w.time_law_values, w.step.gravity)
+            (array, array.numpy().copy())
+            for array in (w.step.new_time, w.step.load_factor, w.time_law_values, w.step.gravity)
         ]
         w.step.new_time.fill_(time)
-        w.step.ramp.fill_(time if self.integrator.static else 1.0)
+        w.step.load_factor.fill_(time if self.integrator.static else 1.0)
         self._evaluate_time_laws(wp.ones(m.worlds, dtype=wp.int32, device=m.device))
         values = w.time_law_values.numpy().copy()
         for array, before in kept:
@@ -423,11 +426,11 @@ class Stepper:
         reduce = self.newton.residual.reduce
         topo = m.topology
         args = [w.step, topo, w.balance, m.masses.lumped_values, state.displacement, state.velocity]
-        launch(self.kernels.ledger_rows, self.dim, args)
-        reduce(w.rows, LEDGER_ROWS, accepted, w.ledger_sums)
+        launch(self.kernels.ledger_terms, self.dim, args)
+        reduce(w.rows, LEDGER_TERM_ROWS, accepted, w.ledger_sums)
         self.terms.energy_increments(self.ctx, reduce, accepted)
         args = [w.step, w.newton, w.ledger_sums, self.increments, state.ledger]
-        launch(self.kernels.ledger_update, m.worlds, args)
+        launch(self.kernels.update_ledger, m.worlds, args)
 
     def _upload_probes(self) -> list[wp.array]:
         m = self.model
@@ -439,5 +442,5 @@ class Stepper:
 
     def _probe(self) -> None:
         m, w = self.model, self.work
-        args = [*self._probe_tables, self.state.displacement, self.state.velocity, len(REPORT), w.report]
+        args = [*self._probe_tables, self.state.displacement, self.state.velocity, len(REPORT_COLUMNS), w.report]
         self.launch(self.kernels.probe_values, (m.worlds, len(m.probes)), args)

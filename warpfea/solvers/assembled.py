@@ -15,7 +15,7 @@ import warp as wp
 
 from ..base.errors import ModelError
 from ..kernels.common.structs import pattern_struct
-from ..kernels.elements.matrix import panels_of, rows_type
+from ..kernels.elements.matrix import panel_layout, panel_row_type
 from ..kernels.solvers.blocks import assembly_kernels
 
 if TYPE_CHECKING:
@@ -144,7 +144,9 @@ class Assembled:
 
     def modules(self) -> set[wp.Module]:
         """Modules launched by assembly."""
-        out = {(k.element_rows if self.whole_elements else k.element_matrix).module for k in self.element_kernels}
+        out = {
+            (k.element_matrix_panels if self.whole_elements else k.element_matrix).module for k in self.element_kernels
+        }
         out |= {self.assembly(block).module for block in self.model.blocks}
         return out | {module for term in self.model.terms for module in term.block_modules()}
 
@@ -170,7 +172,7 @@ class Assembled:
     def _size(self, block: Any) -> int:
         """Number of 3-vectors in the matrices of a block's elements."""
         if self.whole_elements:
-            _, width, rows = panels_of(block.slots)
+            _, width, rows = panel_layout(block.slots)
             return 3 * width * rows * block.count
         return 3 * block.slots * (block.slots + 1) // 2 * block.count
 
@@ -178,10 +180,11 @@ class Assembled:
         """Contribution lists (element entry -> matrix entry) built on the device by `list_contributions`."""
         model = self.model
         kernels = self.assembly(block)
-        if 2 * kernels.places * block.count >= 2**31:
+        if 2 * kernels.blocks_per_element * block.count >= 2**31:
             raise ModelError(
                 f"matrix too large to index: {block.count} elements of {block.slots} slots, at most "
-                f"{2**30 // kernels.places} such elements; use preconditioner='block-jacobi' with operator='elements'"
+                f"{2**30 // kernels.blocks_per_element} such elements; use preconditioner='block-jacobi' with "
+                "operator='elements'"
             )
         upper = len(self.pattern.upper)
         start = wp.zeros(upper + 1, dtype=wp.int32, device=model.device)
@@ -241,9 +244,9 @@ class Assembled:
                 data = self.work.data_of(block)
                 given = [data, u, v, base, mixed, history, dq_dv, int(projected), active]
                 if self.whole_elements:
-                    _, width, rows = panels_of(block.slots)
-                    matrix = shaped(self.scratch, (count, block.count, rows), rows_type(m.dtype, width))
-                    launch(elements.element_rows, (count, block.count), [*given, int(k > 0), matrix])
+                    _, width, rows = panel_layout(block.slots)
+                    matrix = shaped(self.scratch, (count, block.count, rows), panel_row_type(m.dtype, width))
+                    launch(elements.element_matrix_panels, (count, block.count), [*given, int(k > 0), matrix])
                     matrix = shaped(self.scratch, (count, block.count, 9 * width * rows), m.types.T)
                     continue
                 pairs = 3 * block.slots * (block.slots + 1) // 2
@@ -257,7 +260,7 @@ class Assembled:
                 launch(elements.element_matrix, (count, 3 * block.slots * block.count), args)
             args = [m.topology, self.pattern.data, *self.contributions[first], matrix]
             args += [mass, int(first == 0), mass_factor, dq_dv, active, out]
-            launch(self.assembly(block).add_elements, (count, len(self.pattern.upper)), args)
+            launch(self.assembly(block).add_element_matrices, (count, len(self.pattern.upper)), args)
 
     def matrix(self, values: wp.array, world: int = 0) -> sp.csr_matrix:
         """Blocks of one world as CSR (3 slots, 3 slots) on the host."""

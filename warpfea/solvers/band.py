@@ -19,8 +19,8 @@ import scipy.sparse as sp
 import warp as wp
 
 from ..base.errors import ModelError
-from ..kernels.solvers.band import BLOCK, band_kernels, column_type
-from ..kernels.solvers.band_block import band_block_kernels, window_numbers
+from ..kernels.solvers.band import BLOCK, band_kernels, block_column_type
+from ..kernels.solvers.band_block import band_block_kernels, window_size
 from .assembled import coupled_slots
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def block_band(model: Model) -> Band | None:
         return None
     size = wp.types.type_size_in_bytes(model.types.T)
     factors = band.rows * (band.width + 1) * BLOCK**2 * size
-    return band if factors <= MAX_WORLD_FACTOR_BYTES and window_numbers(band.width) * size < MAX_WINDOW_BYTES else None
+    return band if factors <= MAX_WORLD_FACTOR_BYTES and window_size(band.width) * size < MAX_WINDOW_BYTES else None
 
 
 @dataclass(eq=False)
@@ -131,7 +131,7 @@ class BandFactor:
     def __init__(self, model: Model, work: Workspace, launch: Launcher, band: Band, pattern: Pattern) -> None:
         self.band, self.pattern, self.launch, self.worlds = band, pattern, launch, model.worlds
         self.kernels = band_kernels(model.dtype)
-        column: Any = column_type(model.dtype)
+        column: Any = block_column_type(model.dtype)
         B = model.worlds
         self.factors = work.array("band", (B, band.rows, BLOCK * (band.width + 1)), column)
         self.blocks = model.device.is_cuda
@@ -154,7 +154,7 @@ class BandFactor:
 
         An indefinite matrix is shifted by multiples of its diagonal until it is positive definite.
         """
-        self.launch(self.kernels.begin, self.worlds, [active, self.doing, self.shift])
+        self.launch(self.kernels.begin_factorisation, self.worlds, [active, self.doing, self.shift])
         self._factor(value)
         wp.capture_while(self.again, self._factor, value=value)
 
@@ -168,10 +168,10 @@ class BandFactor:
             launch(self.by_block.factor, self.worlds * lanes, args, block_dim=lanes)
         else:
             slots = self.pattern.graph.shape[0]
-            launch(k.clear, (self.worlds, b.rows), [slots, b.width, self.doing, self.factors])
+            launch(k.clear_band, (self.worlds, b.rows), [slots, b.width, self.doing, self.factors])
             args = [self.pattern.data, value, b.place_of, b.width, self.shift, self.doing, self.factors]
-            launch(k.fill, (self.worlds, slots), args)
-            launch(k.factor, self.worlds, [b.width, self.doing, self.bad, self.factors])
+            launch(k.fill_band, (self.worlds, slots), args)
+            launch(k.factor_band, self.worlds, [b.width, self.doing, self.bad, self.factors])
         launch(k.raise_shift, self.worlds, [self.bad, self.doing, self.shift, self.again, self.exact])
 
     def solve(self, r: wp.array, z: wp.array, active: wp.array) -> None:

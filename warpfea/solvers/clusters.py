@@ -90,9 +90,10 @@ def make_clusters(model: Model) -> ModelClusters:
     for block in model.blocks:
         tables = cluster_tables(block.connectivity, block.cluster)
         data = cluster_struct()()
-        for name in ("start", "slot_start", "table"):
-            setattr(data, name, model.array("clusters", getattr(tables, name), wp.int32))
-        data.offset = offset
+        data.element_start = model.array("clusters", tables.start, wp.int32)
+        data.slot_start = model.array("clusters", tables.slot_start, wp.int32)
+        data.table = model.array("clusters", tables.table, wp.int32)
+        data.sum_offset = offset
         count = np.diff(tables.slot_start)
         place = np.minimum(np.arange(slot_capacity(block.cluster, block.slots)), count[:, None] - 1)
         data.slot = model.array("clusters", tables.slot[tables.slot_start[:-1, None] + place], wp.int32)
@@ -112,6 +113,6 @@ def make_pool(model: Model, work: Workspace, *, midpoint: bool) -> Any:
     pool, to_host = pool_struct(model.dtype)(), not model.device.is_cuda
     numbers = max(pool_size(b.cluster, b.slots, 3 if midpoint or b.key.damping == "rate" else 2) for b in model.blocks)
     words = max(table_layout(b.cluster, b.slots)[2] for b in model.blocks)
-    pool.number = work.array("cluster numbers", (numbers if to_host else 1,), model.types.T)
+    pool.numbers = work.array("cluster numbers", (numbers if to_host else 1,), model.types.T)
     pool.table = work.array("cluster table", (words if to_host else 1,), wp.int32)
     return pool

@@ -12,7 +12,7 @@ import warp as wp
 
 from ..kernels.common.types import precision
 from ..kernels.solvers.dense_components import dense_component_kernels
-from ..kernels.solvers.levels import LANES, TILE, level_kernels
+from ..kernels.solvers.levels import TILE_LANES, TILE_UNKNOWNS, level_kernels
 from ..kernels.solvers.levels_build import build_kernels
 
 if TYPE_CHECKING:
@@ -57,16 +57,16 @@ class DenseComponents:
 
 def padded_size(unknowns: int) -> int:
     """Number of unknowns rounded up to whole tiles."""
-    return TILE * -(-unknowns // TILE)
+    return TILE_UNKNOWNS * -(-unknowns // TILE_UNKNOWNS)
 
 
 def gauss_jordan(
     launch: Launcher, kernels: Any, tiles: int, at: Any, matrix: wp.array, flags: wp.array, *, keep: bool
 ) -> None:
-    """Invert tiles [world, tile, TILE, TILE] in place; `at` holds their `diagonal` and a scratch `column`."""
-    lanes = LANES if launch.device.is_cuda else 1
+    """Invert tiles [world, tile, row, column] in place; `at` holds their `diagonal` and a scratch `column`."""
+    lanes = TILE_LANES if launch.device.is_cuda else 1
     args = [lanes, tiles, int(keep), flags, at.diagonal, at.column, matrix]
-    launch(kernels.invert_tiles, flags.shape[0] * tiles * lanes, args, block_dim=LANES)
+    launch(kernels.invert_tiles, flags.shape[0] * tiles * lanes, args, block_dim=TILE_LANES)
 
 
 class DenseInverse:
@@ -99,12 +99,12 @@ class DenseInverse:
         self.root = work.array(f"{name} root", (B, N if other else 1), T)
         self.rows = work.array(f"{name} rows", (1, B, N if other else 1), wp.float64)
         self.trace = work.array(f"{name} trace", (1, B), wp.float64)
-        self.left = work.array(f"{name} panels", (B, TILE, N), T)
-        self.top = work.array(f"{name} panels 2", (B, TILE, N), T)
+        self.left = work.array(f"{name} panels", (B, TILE_UNKNOWNS, N), T)
+        self.top = work.array(f"{name} panels 2", (B, TILE_UNKNOWNS, N), T)
         self.scale = work.array(f"{name} diagonal", (B, N), T)
-        self.pivot = work.array(f"{name} pivot", (B, 1, TILE, TILE), T)
-        self.diagonal = work.array(f"{name} pivots", (B, 1, TILE), T)
-        self.column = work.array(f"{name} column", (B, 1, TILE), T)
+        self.pivot = work.array(f"{name} pivot", (B, 1, TILE_UNKNOWNS, TILE_UNKNOWNS), T)
+        self.diagonal = work.array(f"{name} pivots", (B, 1, TILE_UNKNOWNS), T)
+        self.column = work.array(f"{name} column", (B, 1, TILE_UNKNOWNS), T)
 
     def modules(self) -> set[wp.Module]:
         """Modules launched."""
@@ -114,9 +114,9 @@ class DenseInverse:
     def fill(self, pattern: Pattern, value: Any, flags: wp.array) -> None:
         """Copy a matrix of 3x3 blocks in the flagged worlds."""
         if self.parts:
-            self.launch(self.by_part.spread, self.blocks, [flags, self.flags])
+            self.launch(self.by_part.copy_flags_to_components, self.blocks, [flags, self.flags])
             args = [pattern.data, value, self.parts.slot, self.parts.place_of, self.flags, self.scale, self.matrix]
-            self.launch(self.by_part.fill_parts, (self.blocks, self.size), args)
+            self.launch(self.by_part.fill_components, (self.blocks, self.size), args)
             return
         args = [pattern.data, value, self.unknowns // 3, flags, self.scale, self.matrix]
         self.launch(self.making.fill_dense, (self.worlds, self.size // 3), args)
@@ -126,19 +126,19 @@ class DenseInverse:
         B, N, k, launch = self.blocks, self.size, self.making, self.launch
         if self.parts:  # scattered by `fill`
             flags = self.flags
-        for first in range(0, N, TILE):
+        for first in range(0, N, TILE_UNKNOWNS):
             args = [self.matrix, self.scale, first, flags, self.diagonal, self.pivot]
-            launch(k.take_pivot, (B, TILE, TILE), args)
+            launch(k.copy_pivot_block, (B, TILE_UNKNOWNS, TILE_UNKNOWNS), args)
             gauss_jordan(launch, k, 1, self, self.pivot, flags, keep=keep)
             args = [self.matrix, self.pivot, first, flags, self.left, self.top]
-            launch(k.take_panels, (B, TILE, N), args)
+            launch(k.compute_panels, (B, TILE_UNKNOWNS, N), args)
             args = [self.pivot, self.left, self.top, first, flags, self.matrix]
-            launch(k.eliminate, (B, N // 4, N), args)
+            launch(k.eliminate_pivot_block, (B, N // 4, N), args)
         if self.stored is not self.matrix:
-            launch(k.dense_traces, (B, N), [self.scale, self.matrix, flags, self.rows])
+            launch(k.trace_terms, (B, N), [self.scale, self.matrix, flags, self.rows])
             reduce(self.rows, 1, flags, self.trace)
             args = [self.scale, self.trace, self.matrix, flags, self.root, self.stored]
-            launch(k.store_dense, (B, N, N), args)
+            launch(k.store_dense_inverse, (B, N, N), args)
 
     def apply(self, r: wp.array, x: wp.array, active: wp.array) -> None:
         """x = A^-1 r, [world, unknown]."""
@@ -146,9 +146,9 @@ class DenseInverse:
             n = self.parts.count * 3 * self.parts.most
             lanes = self.launch.lanes(3 * self.parts.most)
             args = [self.matrix, self.parts.slot, lanes, r, active, x]
-            self.launch(self.by_part.apply_parts, (self.worlds, self.launch.padded(n * lanes)), args)
+            self.launch(self.by_part.apply_component_inverses, (self.worlds, self.launch.padded(n * lanes)), args)
             return
         n = self.unknowns
         lanes = self.launch.lanes(n)
         dim = (self.worlds, self.launch.padded(n * lanes))
-        self.launch(self.kernels.apply_dense, dim, [self.stored, self.root, lanes, r, active, x])
+        self.launch(self.kernels.apply_dense_inverse, dim, [self.stored, self.root, lanes, r, active, x])

@@ -96,7 +96,7 @@ class Direct:
         """Factorise H in the active worlds."""
         residual = self.residual
         own = self.elements_only and residual.uses_matrix
-        worlds = np.flatnonzero((residual.reuse.control.build if own and residual.matrix_reuse else active).numpy())
+        worlds = np.flatnonzero((residual.reuse.control.build_now if own and residual.matrix_reuse else active).numpy())
         if not len(worlds):
             return
         if own:
@@ -141,7 +141,7 @@ class Direct:
         for world in map(int, np.flatnonzero(active.numpy())):
             if not self._solve(r, z, world):
                 z[world].zero_()
-        self.launch(self.kernels.dot_rows, self.dim, [r, z, w.diagonal, active, w.warp, w.warp_rows])
+        self.launch(self.kernels.dot_partials, self.dim, [r, z, w.diagonal, active, w.warp, w.warp_rows])
 
     def _solve(self, r: wp.array, z: wp.array, world: int) -> bool:
         """Solve in one world. False if the factorisation failed; the first solve verifies it (r.z >= 0)."""

@@ -34,7 +34,7 @@ import warp as wp
 from ..base.checks import is_count, is_number
 from ..base.errors import ModelError
 from ..base.launch import labelled
-from ..kernels.solvers.jacobi import PAIRS, jacobi_kernels, jacobi_struct
+from ..kernels.solvers.jacobi import MAX_PAIRS, jacobi_kernels, jacobi_struct
 from .newton import NewtonLoop, NewtonPCG
 from .twolevel import TwoLevel
 
@@ -153,23 +153,26 @@ class JacobiLoop(NewtonLoop):
         self.acceleration = options.acceleration
         self.uses_secants = options.acceleration in ("secants", "anderson")
         self.descent_kernels = jacobi_kernels(model.dtype, model.terms.traits, options.acceleration)
-        B, m = model.worlds, PAIRS
+        B, m = model.worlds, MAX_PAIRS
         shape = (m, B, model.slots) if self.uses_secants else (1, 1, 1)
         self.moves = work.array("jacobi moves", shape, model.types.vec3)
         self.changes = work.array("jacobi changes", shape, model.types.vec3)
         shapes: dict[str, Any] = {
-            "gram": (B, m, m),
-            "factor": (B, m, m),
-            "right": (B, m),
+            "gram_matrix": (B, m, m),
+            "gram_factor": (B, m, m),
+            "right_side": (B, m),
             "gamma": (B, m),
             "sums": (2 * m, B),
         }
         self.control = work.struct(jacobi_struct(), B, **shapes)
-        self.control.growth = MAX_GROWTH
-        self.control.gap = MAX_VIOLATION * model.size
-        self.control.step = STEP_LENGTH[options.acceleration]
+        self.control.max_growth = MAX_GROWTH
+        self.control.max_violation = MAX_VIOLATION * model.size
+        self.control.step_length = STEP_LENGTH[options.acceleration]
         least = LARGEST_EIGENVALUE / max(4.0, 0.25 * options.iterations**2)
-        self.control.centre, self.control.half = 0.5 * (LARGEST_EIGENVALUE + least), 0.5 * (LARGEST_EIGENVALUE - least)
+        self.control.eigenvalue_centre, self.control.eigenvalue_half_width = (
+            0.5 * (LARGEST_EIGENVALUE + least),
+            0.5 * (LARGEST_EIGENVALUE - least),
+        )
 
     def modules(self) -> set[wp.Module]:
         """Modules launched by the loop, except those of reductions and constraints."""
@@ -178,7 +181,7 @@ class JacobiLoop(NewtonLoop):
     def _solve(self, first: bool = False) -> None:
         """Iterate and report cost and reduction to the reuse rule."""
         w = self.work
-        self.launch(self.descent_kernels.begin, self.model.worlds, [w.newton, self.control])
+        self.launch(self.descent_kernels.begin_iteration, self.model.worlds, [w.newton, self.control])
         self._reduce_flags(w.newton.active, self.iterating)
         wp.capture_while(self.iterating, self._iterate)
         self._if_rare(self._check_inversion)
@@ -193,11 +196,11 @@ class JacobiLoop(NewtonLoop):
         active = w.newton.active
         self._compute_step(active)
         if self.limited:
-            launch(self.kernels.free_step, self.model.worlds, [w.newton])
+            launch(self.kernels.reset_step_limit, self.model.worlds, [w.newton])
         for term in self.terms:
             if term.traits.limited:  # other terms predict multipliers, for Newton's method only
                 term.process_direction(self.ctx, active)
-        launch(k.advance, self.dim, [w.newton, w.direction, w.v])
+        launch(k.apply_move, self.dim, [w.newton, w.direction, w.v])
         self.residual.evaluate(active)
         launch(k.check_iterate, self.model.worlds, [w.newton, self.control])
         if self.terms.traits.stored:
@@ -212,18 +215,18 @@ class JacobiLoop(NewtonLoop):
         args = [w.newton, w.gradient, m.topology.free, w.direction, w.p, w.r, self.moves, self.changes, w.rows]
         launch(k.store_pair, self.dim, args)
         if self.uses_secants:
-            self.residual.reduce(w.rows, 2 * PAIRS, active, ctl.sums)
+            self.residual.reduce(w.rows, 2 * MAX_PAIRS, active, ctl.sums)
             launch(k.solve_gram, m.worlds, [w.newton, ctl])
-            launch(k.project, self.dim, [w.newton, ctl, self.changes, w.r])
+            launch(k.project_residual, self.dim, [w.newton, ctl, self.changes, w.r])
         elif self.acceleration == "chebyshev":
-            launch(k.recursion, m.worlds, [w.newton, ctl])
+            launch(k.chebyshev_coefficients, m.worlds, [w.newton, ctl])
         self.preconditioner.apply(w.r, w.z, active)
         if self.acceleration == "secants":
-            launch(k.conjugate_rows, self.dim, [w.newton, self.changes, w.z, w.rows])
-            self.residual.reduce(w.rows, PAIRS, active, ctl.sums)
-            launch(k.conjugate, m.worlds, [w.newton, ctl])
-        launch(k.combine, self.dim, [w.newton, ctl, self.moves, w.z, w.direction])
+            launch(k.conjugation_dot_terms, self.dim, [w.newton, self.changes, w.z, w.rows])
+            self.residual.reduce(w.rows, MAX_PAIRS, active, ctl.sums)
+            launch(k.conjugate_move, m.worlds, [w.newton, ctl])
+        launch(k.combine_move, self.dim, [w.newton, ctl, self.moves, w.z, w.direction])
         if self.pcg.deflate:  # a loose tolerance then conserves the momentum of free bodies
-            args = [w.newton, w.step.mass_factor, m.groups.lumped, w.gradient, m.topology.free, w.direction, w.r]
-            launch(k.remaining_momentum, self.dim, args)
+            args = [w.newton, w.step.mass_factor, m.groups.lumped_mass, w.gradient, m.topology.free, w.direction, w.r]
+            launch(k.residual_after_move, self.dim, args)
             self.pcg.correct_translations(active)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import warp as wp
 
 from ..kernels.common.types import precision
-from ..kernels.solvers.levels import TILE
+from ..kernels.solvers.levels import TILE_UNKNOWNS
 from .dense import DenseInverse
 
 if TYPE_CHECKING:
@@ -36,12 +36,12 @@ class LevelArrays:
         parts = level.parts if by_component else None
         self.dense = DenseInverse(model, work, launch, name, 3 * n, storage, parts) if level.dense else None
         if not level.dense:
-            shape = (B, level.tiles, TILE, TILE)
+            shape = (B, level.tiles, TILE_UNKNOWNS, TILE_UNKNOWNS)
             self.matrix = work.array(f"{name} inverse", shape, T)
             self.stored = work.array(f"{name} stored", shape, S) if other else self.matrix
             self.root = work.array(f"{name} root", shape[:3] if other else (1, 1, 1), T)
-            self.diagonal = work.array(f"{name} pivots", (B, level.tiles, TILE), T)
-            self.column = work.array(f"{name} column", (B, level.tiles, TILE), T)
+            self.diagonal = work.array(f"{name} pivots", (B, level.tiles, TILE_UNKNOWNS), T)
+            self.column = work.array(f"{name} column", (B, level.tiles, TILE_UNKNOWNS), T)
         self.vectors: dict[str, wp.array] = {}
         if depth:
             names = ("r", "x") if level.dense else ("r", "x", "z", "d")

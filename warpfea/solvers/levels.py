@@ -147,16 +147,16 @@ def _make_level(
     vec4 = wp.types.vector(length=4, dtype=model.types.T)
     tables: dict[str, tuple[Any, Any]] = {
         "tile_slot": (table, wp.int32),
-        "tile_of": (tile, wp.int32),
-        "place_of": (place, wp.int32),
+        "tile_of_slot": (tile, wp.int32),
+        "position_in_tile": (place, wp.int32),
         "group_start": (np.concatenate([[0], np.cumsum(np.bincount(group))]), wp.int32),
         "group_slot": (by_group, wp.int32),
-        "group_of": (group, wp.int32),
-        "weight": (weight, vec4),
+        "group_of_slot": (group, wp.int32),
+        "affine_values": (weight, vec4),
     }
     for name, (values, dtype) in tables.items():
         setattr(data, name, model.array("levels", values, dtype))
-    data.tiles, data.groups = tiles, groups
+    data.tile_count, data.group_count = tiles, groups
     coarse, galerkin = _galerkin(model, pattern, group, groups)
     level = Level(pattern, n, False, data, tiles, groups, galerkin)
     value = np.zeros((groups, 4, 3))

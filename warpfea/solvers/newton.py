@@ -219,16 +219,16 @@ class NewtonLoop:
         ctl.force_tol = options.force_tol
         ctl.tol = options.tolerance(model.dtype)
         ctl.eps = EPS[model.dtype]
-        ctl.equilibrium = int(not inertia)
-        ctl.length = float(model.size)
+        ctl.is_static = int(not inertia)
+        ctl.model_size = float(model.size)
         ctl.component_of_group = model.residual_groups.component
         ctl.max_iterations = options.max_newton
-        ctl.max_floor = MAX_FLOOR[model.dtype]
+        ctl.max_floor_error = MAX_FLOOR[model.dtype]
         ctl.refuse_inversion = int(inversion == "refuse")
         ctl.linear_stress = int(all(block.key.law in DEFINED_FOR_ANY_J for block in model.blocks))
         rate = inertia and any(b.key.damping == "rate" for b in model.blocks)
-        ctl.nonpotential = int(traits.nonpotential or rate)
-        ctl.classical = int(self.classical)
+        ctl.has_nonpotential = int(traits.nonpotential or rate)
+        ctl.classical_multipliers = int(self.classical)
         ctl.penalty_norm_ratio = 1.0 / math.sqrt(1.0 + options.kappa(model.dtype))
         ctl.constraint_tol = 1e300 if self.classical else constraint_tol  # the classical inner solves converge g only
         if ctx.accelerated and model.dtype == "float64":  # float32 positions have a larger round-off
@@ -291,7 +291,7 @@ class NewtonLoop:
         """Newton iteration from the current residual; `first`: first solve of an attempt."""
         w = self.work
         choose = bool(self.first_iterates) and first
-        self.launch(self.kernels.begin, self.model.worlds, [w.newton, int(choose)])
+        self.launch(self.kernels.begin_iteration, self.model.worlds, [w.newton, int(choose)])
         self._if_rare(self._choose_initial if choose else self._check_inversion)
         if self.terms.traits.unilateral:  # the first iterate may be the solution, as in free fall
             self._update_frozen()
@@ -302,18 +302,18 @@ class NewtonLoop:
     def _choose_initial(self) -> None:
         """Select the best first iterate (J > 0 first, then lowest Phi)."""
         w, k, launch = self.work, self.kernels, self.launch
-        choose, better = w.newton.choose_initial, w.newton.searching
-        launch(k.compare, self.model.worlds, [w.newton, 1, better])
+        choose, better = w.newton.choose_first_iterate, w.newton.searching
+        launch(k.compare_first_iterates, self.model.worlds, [w.newton, 1, better])
         launch(self.vectors.copy_active, self.dim, [w.v, better, w.best])
         for put in self.first_iterates:
             put()
             self.residual.evaluate(choose, freeze=True)
-            launch(k.compare, self.model.worlds, [w.newton, 0, better])
+            launch(k.compare_first_iterates, self.model.worlds, [w.newton, 0, better])
             launch(self.vectors.copy_active, self.dim, [w.v, better, w.best])
         launch(self.vectors.copy_active, self.dim, [w.best, choose, w.v])
         self.preconditioner.discard(choose)
         self._open(choose)
-        launch(k.begin, self.model.worlds, [w.newton, 2])
+        launch(k.begin_iteration, self.model.worlds, [w.newton, 2])
         self._check_inversion()
 
     def _check_constraints(self) -> None:
@@ -342,10 +342,10 @@ class NewtonLoop:
         self.residual.freeze_nonpotential(active)
         self.residual.tangent_curvature(active)
         if self.limited:
-            launch(k.free_step, self.model.worlds, [w.newton])
+            launch(k.reset_step_limit, self.model.worlds, [w.newton])
         self._call_terms("process_direction", active)
         launch(self.vectors.set_base, self.dim, [w.newton, w.v, w.base, w.best])
-        launch(self.vectors.dot_rows, self.dim, [w.gradient, w.direction, active, w.rows])
+        launch(self.vectors.dot_terms, self.dim, [w.gradient, w.direction, active, w.rows])
         self.residual.reduce(w.rows, 1, active, w.newton.slope_sum)
         launch(k.begin_search, self.model.worlds, [w.newton, w.pcg])
         self._reduce_flags(w.newton.searching, self.searching)
@@ -369,7 +369,7 @@ class NewtonLoop:
         launch(k.begin_samples, self.dim, [w.newton, flags, w.p, w.z])
         for sample in range(SAMPLES):
             self.residual.update_positions(flags)
-            launch(k.perturb, self.dim, [w.newton, flags, sample, w.u, w.p])
+            launch(k.perturb_positions, self.dim, [w.newton, flags, sample, w.u, w.p])
             self.residual.evaluate_forces(flags)
             launch(k.add_sample, self.dim, [flags, w.gradient, w.z])
         self.residual.product(w.p, w.Hp, flags)
@@ -399,7 +399,7 @@ class NewtonLoop:
         parts = m.residual_parts
         args = [w.newton, parts.slot_start, parts.slot, parts.element_start, parts.element]
         args += [w.gradient, w.direction, w.inertia, w.v, w.v_tilde, w.u, w.energy_rows]
-        self.launch(self.vectors.floor_partial, (m.worlds, parts.count, FLOOR_LANES), args)
+        self.launch(self.vectors.floor_partials, (m.worlds, parts.count, FLOOR_LANES), args)
         self.launch(k.check_rounding_floor, m.worlds, [w.newton, parts.component])
         if self.perturbation:
             self.residual.evaluate(self.perturbed)
@@ -416,7 +416,7 @@ class NewtonLoop:
         """Flag worlds with an element inverted by the accepted iterate."""
         w = self.work
         self.residual.elements.check_inversion(self.ctx, w.newton.inversion_suspected)
-        w.newton.any_rare.zero_()
+        w.newton.any_rare_branch.zero_()
 
     def _search(self) -> None:
         w, k, launch = self.work, self.kernels, self.launch
@@ -430,7 +430,7 @@ class NewtonLoop:
     def _if_rare(self, do: Callable[[], None]) -> None:
         """Run `do` if any world needs the rare branch."""
         with self.launch.rare():
-            wp.capture_if(self.work.newton.any_rare, do)
+            wp.capture_if(self.work.newton.any_rare_branch, do)
 
     def _call_terms(self, what: str, flags: wp.array) -> None:
         """Call one method of all terms."""
@@ -439,8 +439,8 @@ class NewtonLoop:
 
     def _reduce_flags(self, flags: wp.array, out: wp.array) -> None:
         out.zero_()
-        self.launch(self.vectors.any_set, self.model.worlds, [flags, out])
+        self.launch(self.vectors.set_any_flag, self.model.worlds, [flags, out])
 
     def _clear_direction(self, active: wp.array) -> None:
-        self.launch(self.pcg.kernels.start, self.dim, [self.work.g, self.model.topology.free, active,
+        self.launch(self.pcg.kernels.initialise_residual, self.dim, [self.work.g, self.model.topology.free, active,
                                                        self.work.direction, self.work.r])  # fmt: skip

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import warp as wp
 
 from ..base.launch import Launcher, labelled
-from ..kernels.solvers.pcg import LANES, pcg_kernels
+from ..kernels.solvers.pcg import FREE_GROUP_LANES, pcg_kernels
 from .preconditioner import Preconditioner
 from .residual import Residual
 
@@ -42,7 +42,7 @@ class PCG:
     def solve(self, active: wp.array) -> None:
         """Solve and write p to work.direction."""
         m, w, k, launch = self.model, self.work, self.kernels, self.launch
-        launch(k.start, self.dim, [w.gradient, m.topology.free, active, w.direction, w.r])
+        launch(k.initialise_residual, self.dim, [w.gradient, m.topology.free, active, w.direction, w.r])
         if m.component_count > 1:
             launch(k.zero_converged, self.dim, [w.newton, m.component_of_slot, active, w.r])
         self.correct_translations(active)
@@ -60,7 +60,7 @@ class PCG:
     def _run(self) -> None:
         """Iterate from r and z = B r."""
         m, w, k, launch = self.model, self.work, self.kernels, self.launch
-        launch(k.begin, m.worlds, [w.newton, w.pcg])
+        launch(k.begin_solve, m.worlds, [w.newton, w.pcg])
         launch(k.first_direction, self.dim, [w.pcg, w.z, w.p, w.direction])
         wp.capture_while(w.pcg.any_active, self._iterate)
 
@@ -69,7 +69,7 @@ class PCG:
         active = w.pcg.active
         self.residual.product(w.p, w.Hp, active)
         self.residual.reduce(self.residual.curvature_rows, 1, active, w.pcg.curvature)
-        launch(k.update, self.dim, [w.pcg, w.p, w.Hp, w.direction, w.r])
+        launch(k.update_solution, self.dim, [w.pcg, w.p, w.Hp, w.direction, w.r])
         self._precondition(w.r, w.z, active)
         launch(k.new_direction, self.dim, [w.pcg, w.z, w.p])
 
@@ -85,7 +85,9 @@ class PCG:
             return
         m, w, k, launch = self.model, self.work, self.kernels, self.launch
         mass = w.step.mass_factor
-        launch(k.group_partial, (m.worlds, m.group_count, LANES), [m.groups, w.r, active, w.group_partial])
+        launch(
+            k.free_group_partials, (m.worlds, m.group_count, FREE_GROUP_LANES), [m.groups, w.r, active, w.group_partial]
+        )
         args = [m.groups, w.group_partial, mass, active, w.group_velocity]
         launch(k.group_velocity, (m.worlds, m.group_count), args)
         args = [m.groups, w.group_velocity, m.topology.free, mass, active, w.direction, w.r]

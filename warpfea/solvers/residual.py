@@ -12,10 +12,10 @@ from ..kernels.common.lanes import WARP_SIZE
 from ..kernels.common.reduce import CHUNK, MAX_WARP_ROW, reduce_kernels
 from ..kernels.common.structs import product_terms_struct
 from ..kernels.solvers.newton import newton_kernels
-from ..kernels.solvers.newton_control import GROUP_ROWS, LANES, TERM_ROWS
+from ..kernels.solvers.newton_control import GROUP_LANES, GROUP_ROWS, TERM_ROWS
 from ..kernels.solvers.vectors import vector_kernels
 from ..kernels.step.gather import RESIDUAL_ROWS, gather_kernels
-from ..kernels.step.midpoint import stage_kernels
+from ..kernels.step.midpoint import midpoint_kernels
 from ..kernels.terms.constraints import constraint_struct
 from ..terms.elements import Elements
 from .assembled import Assembled, shaped
@@ -83,7 +83,7 @@ class Residual:
         traits = ctx.traits
         self.gather = gather_kernels(model.dtype, traits)
         self.newton, self.vectors = newton_kernels(traits), vector_kernels(model.dtype, traits.has_constraints)
-        self.stage = stage_kernels(model.dtype)
+        self.stage = midpoint_kernels(model.dtype)
         self.con = model.constraints.data if traits.constraint_rows else constraint_struct()()
         self.dim = (model.worlds, model.slots)
         self.additions = self._additions()
@@ -199,7 +199,7 @@ class Residual:
         args = [control, self.work.newton, self.matrix_reuse]
         self.launch(self.reuse.kernels.check_matrix_reuse, self.model.worlds, args)
         self.reuse.decide_rebuild(active)
-        self.launch(self.reuse.kernels.loosen_tolerance, self.model.worlds, [control, self.work.newton])
+        self.launch(self.reuse.kernels.loosen_forcing, self.model.worlds, [control, self.work.newton])
         wp.capture_if(control.any_build, self._assemble)
 
     @labelled("assembly")
@@ -208,9 +208,11 @@ class Residual:
         control = self.reuse.control
         self.reuse.move_point()
         factors = (control.mass_factor, control.dq_dv)
-        self.assembled.assemble(self.reuse.linearisation_point, factors, control.build, self.matrix, projected=False)
+        self.assembled.assemble(
+            self.reuse.linearisation_point, factors, control.build_now, self.matrix, projected=False
+        )
         if self.on_assembled:
-            self.on_assembled(self.matrix, control.build)
+            self.on_assembled(self.matrix, control.build_now)
         self.reuse.mark_built()
 
     def assemble_matrix(self, active: wp.array) -> None:
@@ -229,7 +231,7 @@ class Residual:
         self.launch(self.vectors.update_position, self.dim, [w.q_tilde, w.v, w.step.dq_dv, active, w.u])
         if self.ctx.midpoint:
             args = [state.displacement, state.velocity, w.v, w.step.dq_dv, active, w.u_stage, w.v_stage]
-            self.launch(self.stage.take_stage, self.dim, args)
+            self.launch(self.stage.evaluate_midpoint, self.dim, args)
 
     @labelled("residual")
     def reevaluate_frozen(self, active: wp.array) -> None:
@@ -266,9 +268,9 @@ class Residual:
         if groups.count > 1:
             args = [groups.slot_start, groups.slot, groups.element_start, groups.element]
             args += [w.rows, w.energy_rows, active, w.residual_group_partial]
-            launch(self.vectors.norm_partial, (m.worlds, groups.count, LANES), args)
+            launch(self.vectors.group_norm_partials, (m.worlds, groups.count, GROUP_LANES), args)
             sums = (GROUP_ROWS, m.worlds, groups.count)
-            launch(self.vectors.norm_sum, sums, [w.residual_group_partial, active, w.newton.group_sums])
+            launch(self.vectors.sum_group_norms, sums, [w.residual_group_partial, active, w.newton.group_sums])
 
     @labelled("loads")
     def freeze_nonpotential(self, active: wp.array) -> None:
@@ -285,7 +287,7 @@ class Residual:
             term.diagonal(self.ctx, active)
         args = [m.topology, w.block_contribution, w.pool_block, w.step.mass_factor, w.step.dq_dv, active]
         args += [w.diagonal, w.inverse]
-        launch(self.gather.gather_blocks, self.dim, args)
+        launch(self.gather.gather_diagonal_blocks, self.dim, args)
 
     @labelled("product")
     def product(self, p: wp.array, out: wp.array, active: wp.array) -> None:
@@ -325,7 +327,7 @@ class Residual:
         else:
             self.curvature_rows = w.warp_rows
             topology = self.clusters.topology if self.clusters else m.topology
-            total = self.gather.with_mass_sum if self.clusters else self.gather.product
+            total = self.gather.with_mass_sum if self.clusters else self.gather.operator_product
             args = [topology, w.contribution, *rest, out, w.warp_rows]
             launch(total, (m.worlds, launch.padded(m.slots)), args)
 
@@ -340,5 +342,5 @@ class Residual:
                 term.product(self.ctx, w.direction, active)
         args = [self.terms.side_topology, w.nonpotential_tangent, active, w.Hp]
         launch(self.gather.gather_force, self.dim, args)
-        launch(self.vectors.dot_rows, self.dim, [w.Hp, w.direction, active, w.rows])  # p is 0 where prescribed
+        launch(self.vectors.dot_terms, self.dim, [w.Hp, w.direction, active, w.rows])  # p is 0 where prescribed
         self.reduce(w.rows, 1, active, w.newton.tangent_sum)

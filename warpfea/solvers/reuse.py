@@ -21,7 +21,7 @@ class ReuseRule:
     """Reuse rule of kernels/solvers/reuse.py for one object (preconditioner or matrix), with its linearisation point.
 
     Attributes:
-        control: counts of the rule on the device; `build` flags the worlds that build the object before a solve.
+        control: counts of the rule on the device; `build_now` flags the worlds that build the object before a solve.
         linearisation_point: displacements of the linearisation point, [world, slot], m.
     """
 
@@ -32,19 +32,20 @@ class ReuseRule:
         self.no_flags = wp.zeros(0, dtype=wp.int32, device=model.device)
         self.control: Any = reuse_struct()()
         for field, var in reuse_struct().vars.items():
-            if isinstance(var.type, wp.array) and field != "kept":
+            if isinstance(var.type, wp.array) and field != "stored_counts":
                 size = 1 if field == "any_build" else model.worlds
                 setattr(self.control, field, work.array(f"{name} {field}", (size,), var.type.dtype))
-        self.control.limit = limit
+        self.control.max_extra_iterations = limit
         self.control.stale.fill_(1)
         self.control.mass_factor.fill_(-1.0)
         self.linearisation_point = work.array(f"{name} place", self.dim, model.types.vec3)
         # no state owns it before `register`
-        self.control.kept, self.kept = wp.zeros((0, 0), dtype=wp.float64, device=model.device), self.linearisation_point
+        self.control.stored_counts = wp.zeros((0, 0), dtype=wp.float64, device=model.device)
+        self.kept = self.linearisation_point
 
     def register(self, state: State) -> None:
         """Register the linearisation point and counts in the state, so that a resumed run takes the same decisions."""
-        self.control.kept = state.register(self.name, wp.float64, (6,), (0.0, -1.0, -1.0, 0.0, 0.0, 0.0))
+        self.control.stored_counts = state.register(self.name, wp.float64, (6,), (0.0, -1.0, -1.0, 0.0, 0.0, 0.0))
         self.kept = state.register(f"{self.name}_displacement", self.model.types.vec3, (self.model.slots,))
 
     def invalidate(self, flags: wp.array) -> None:
@@ -52,7 +53,7 @@ class ReuseRule:
         self.launch(self.kernels.mark_stale, self.model.worlds, [flags, self.control])
 
     def decide_rebuild(self, active: wp.array) -> None:
-        """Flag the worlds that build the object before this solve, in `control.build`."""
+        """Flag the worlds that build the object before this solve, in `control.build_now`."""
         w = self.work
         self.control.any_build.zero_()
         args = [self.control, w.newton, w.step.mass_factor, w.step.dq_dv, active]
@@ -70,7 +71,7 @@ class ReuseRule:
             self.kept,
             self.linearisation_point,
         ]
-        self.launch(self.kernels.carry_points, self.dim, args)
+        self.launch(self.kernels.transfer_points, self.dim, args)
 
     def mark_built(self) -> None:
         """Mark the object of the flagged worlds as built."""

@@ -115,8 +115,8 @@ class RigidBodyModes:
         self.launch(k.update_arms, (m.worlds, m.slots), [self.bodies, u, flags])
         lanes = self.parts.shape[2]
         args = [self.bodies, self.pattern.data, m.topology.free, value, flags, lanes, self.parts]
-        self.launch(k.body_sums, self.parts.shape[:3], args)
-        self.launch(k.fill, (m.worlds, dense.size), [flags, self.parts, dense.scale, dense.matrix])
+        self.launch(k.body_matrix_partials, self.parts.shape[:3], args)
+        self.launch(k.fill_matrix, (m.worlds, dense.size), [flags, self.parts, dense.scale, dense.matrix])
 
     def invert(self, flags: wp.array) -> None:
         """Invert the matrix after terms have added to it."""

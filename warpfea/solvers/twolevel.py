@@ -32,7 +32,7 @@ import warp as wp
 
 from ..base.launch import labelled
 from ..kernels.solvers.blocks import block_kernels
-from ..kernels.solvers.levels import TILE, TILE_SLOTS, level_kernels, level_struct
+from ..kernels.solvers.levels import TILE_SLOTS, TILE_UNKNOWNS, level_kernels, level_struct
 from ..kernels.solvers.levels_build import FACTOR_LANES, build_kernels
 from ..kernels.solvers.pcg import pcg_kernels
 from ..model.state import words_of
@@ -83,7 +83,7 @@ class TwoLevel:
         self.kernels = level_kernels(model.dtype, self.storage)
         self.setup_kernels = build_kernels(model.dtype, self.storage)
         self.blocks = block_kernels(model.dtype)
-        self.jacobi = pcg_kernels(model.dtype, model.terms.traits.has_constraints).block_jacobi
+        self.jacobi = pcg_kernels(model.dtype, model.terms.traits.has_constraints).apply_block_jacobi
         self.dim = (model.worlds, model.slots)
         self.levels = self._levels(kind)
         self.ctx, self.terms = residual.ctx, model.terms
@@ -120,7 +120,7 @@ class TwoLevel:
         self.chosen = work.array("preconditioner chunk", (model.worlds,), wp.int32)
         free = model.group_count > 0  # bodies whose momentum is conserved by the translation correction
         if self.follows_matrix and self.band and model.dtype == "float64" and residual.ctx.inertia and not free:
-            work.pcg.exact = self.band.exact
+            work.pcg.preconditioner_is_exact = self.band.exact
         self.body_modes, self.coupling = self._motions()
         self.by_row = 0 if model.device.is_cuda else 1
         self.has_corrections = not self.levels[0].whole and any(term.preconditions(self.ctx) for term in self.terms)
@@ -153,7 +153,7 @@ class TwoLevel:
 
     def register(self, state: State) -> None:
         """Register the linearisation point and the rule's counts in the state, for resumed runs."""
-        self.reuse.control.limit = self.rebuild_cost
+        self.reuse.control.max_extra_iterations = self.rebuild_cost
         self.reuse.register(state)
         for term in self.terms:
             kept = CachedInputs([], [], [])
@@ -174,7 +174,7 @@ class TwoLevel:
             if kept is not None and not term.copy_cached(self.ctx, kept, reuse.control, flags):
                 for arrays in zip(kept.live, kept.state, kept.place):
                     words = [words_of(array) for array in arrays]
-                    self.launch(reuse.kernels.carry_words, words[0].shape, [reuse.control, flags, *words])
+                    self.launch(reuse.kernels.transfer_words, words[0].shape, [reuse.control, flags, *words])
 
     def modules(self) -> set[wp.Module]:
         """Modules launched."""
@@ -239,7 +239,7 @@ class TwoLevel:
             self.body_modes.apply(r, z, active)
         args = [level.data, correct, coarse, m.topology.free, r, w.diagonal, active, w.warp, z, w.warp_rows]
         dim = (m.worlds, launch.padded(m.slots))
-        launch(k.add_coarse, dim, args)
+        launch(k.add_coarse_correction, dim, args)
         if self.has_corrections:
             args = [w.inverse, r, w.diagonal, active, w.warp, w.Hp, w.spare_rows]
             launch(self.jacobi, dim, args)
@@ -259,7 +259,7 @@ class TwoLevel:
             dim = (B, self.launch.padded(3 * n * lanes))
             for upper, given, out in ((0, flat_r, self.half), (1, self.half, flat_x)):
                 args = [dense.stored, dense.root, upper, lanes, given, active, out]
-                self.launch(self.kernels.apply_triangle, dim, args)
+                self.launch(self.kernels.apply_triangular_inverse, dim, args)
             return
         dense.apply(flat_r, flat_x, active)
 
@@ -273,7 +273,7 @@ class TwoLevel:
         lanes = self.launch.lanes(GROUP_SLOTS)
         args = [level.data, arrays.stored, arrays.root, self.by_row, share, lanes, first_group]
         threads = first_group + (0 if last else lanes * level.groups)
-        self.launch(self.kernels.smooth, (self.model.worlds, threads), [*args, r, active, z, coarse])
+        self.launch(self.kernels.smooth_and_restrict, (self.model.worlds, threads), [*args, r, active, z, coarse])
         if last:
             return z
         below = self.arrays[depth + 1].vectors
@@ -296,7 +296,7 @@ class TwoLevel:
         for k in range(CHEBYSHEV_STEPS):
             coarse = self._smooth(depth, v["r"], v["z"], active)
             args = [level.data, 1, coarse, v["z"], keep, step, active, v["d"], v["x"]]
-            self.launch(self.kernels.chebyshev, dim, args)
+            self.launch(self.kernels.chebyshev_step, dim, args)
             if k < CHEBYSHEV_STEPS - 1:
                 lanes = self.launch.lanes(level.pattern.width)
                 args = [level.pattern.data, arrays.value, v["d"], lanes, active, v["r"]]
@@ -319,7 +319,7 @@ class TwoLevel:
             if len(worlds) == B:
                 yield worlds, flags, self.value
                 return
-            self.launch(self.blocks.choose_worlds, B, [flags, worlds.start, worlds.stop, self.chosen])
+            self.launch(self.blocks.select_worlds, B, [flags, worlds.start, worlds.stop, self.chosen])
             yield worlds, self.chosen, self.assembled.view(self.value, first)
 
     def _build(self, *, penalty: bool = False) -> None:
@@ -327,7 +327,7 @@ class TwoLevel:
         factors = (reuse.mass_factor, reuse.dq_dv)
         # rows are scaled once the penalties are known
         self.reuse.move_point()
-        for worlds, flags, value in self._chunks(reuse.build):
+        for worlds, flags, value in self._chunks(reuse.build_now):
             self.assembled.assemble(
                 self.reuse.linearisation_point, factors, flags, value, projected=True, worlds=worlds
             )
@@ -335,7 +335,7 @@ class TwoLevel:
                 self._copy_cached()
                 self._add(value, flags, penalties=False)
             args = [m.topology, self.assembled.pattern.data, value, flags, w.diagonal, w.inverse]
-            launch(self.blocks.take_diagonal, self.dim, args)
+            launch(self.blocks.invert_diagonal_blocks, self.dim, args)
             if m.terms.traits.has_constraints:
                 if penalty:
                     for term in self.terms:
@@ -345,9 +345,9 @@ class TwoLevel:
             self._factor_or_fill(value, flags)
         self.reuse.mark_built()
         if self.body_modes:
-            self._add_mode_coupling(self.body_modes, reuse.build)
+            self._add_mode_coupling(self.body_modes, reuse.build_now)
         if not (self.follows_matrix or self.band):
-            self._invert(reuse.build)
+            self._invert(reuse.build_now)
 
     def _factor_or_fill(self, value: wp.array, flags: wp.array) -> None:
         """Factor the matrix of some worlds, or fill the tiles and the next level."""
@@ -369,8 +369,8 @@ class TwoLevel:
         if depth + 1 < len(self.levels):
             assert level.galerkin is not None
             free = self.all_free if depth else m.topology.free
-            args = [*level.galerkin, level.data.weight, free, value, flags, self.arrays[depth + 1].value]
-            self.launch(self.blocks.galerkin, (m.worlds, 16 * level.galerkin[0].shape[0]), args)
+            args = [*level.galerkin, level.data.affine_values, free, value, flags, self.arrays[depth + 1].value]
+            self.launch(self.blocks.galerkin_product, (m.worlds, 16 * level.galerkin[0].shape[0]), args)
 
     def _invert(self, flags: wp.array) -> None:
         """Invert all levels; the first is already filled."""
@@ -433,7 +433,7 @@ class TwoLevel:
         gauss_jordan(self.launch, k, level.tiles, arrays, arrays.matrix, flags, keep=keep)
         if arrays.stored is not arrays.matrix:
             args = [level.tiles, arrays.diagonal, arrays.matrix, flags, arrays.root, arrays.stored]
-            self.launch(k.store_tiles, (B, level.tiles, TILE), args)
+            self.launch(k.store_tile_inverses, (B, level.tiles, TILE_UNKNOWNS), args)
 
 
 def _flat(array: wp.array, dtype: Any, shape: tuple[int, ...]) -> wp.array:

@@ -100,7 +100,7 @@ class BodyForces(Term):
             per_element = families.get(block.key.family).has_gradients
             shape = np.concatenate(shapes) if per_element else shapes[0]
             block.data.shape = m.array("loads", np.moveaxis(shape, 0, 2), m.types.T)
-            block.data.field_weight = m.array("loads", np.concatenate(weights).T, m.types.T)
+            block.data.mass_weight = m.array("loads", np.concatenate(weights).T, m.types.T)
             block.field_rule = rule
 
     def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
@@ -110,7 +110,7 @@ class BodyForces(Term):
         m, w = self.model, ctx.work
         for field in self.parts_of_fields:
             args = [field.block.data, field.members, m.reference_device, field.origin, w.u_stage, w.stage_time]
-            args += [w.step.ramp, active, self.offset + field.offset, w.nonpotential_contribution]
+            args += [w.step.load_factor, active, self.offset + field.offset, w.nonpotential_contribution]
             ctx.launch(field.kernel, (m.worlds, field.count), args)
 
     def hash(self, h: Any) -> None:

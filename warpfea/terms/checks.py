@@ -9,7 +9,7 @@ import numpy as np
 
 from ..base.errors import ModelError
 from ..kernels.common.traits import Traits
-from ..kernels.step.energy_ledger import EXPLICIT_VISCOUS, LEDGER, LOSS, NUMERICAL, STORED, WORK
+from ..kernels.step.energy_ledger import EXPLICIT_VISCOUS, LEDGER_COLUMNS, LOSS, NUMERICAL, STORED, WORK
 from .term import Term
 
 if TYPE_CHECKING:
@@ -136,7 +136,7 @@ def check_columns(term: Term, *, own: bool) -> None:
             continue
         if column.kind == EXPLICIT_VISCOUS:
             raise ModelError(f"{where}: EXPLICIT_VISCOUS is reserved for explicit damping terms of warpfea")
-        if column.name in (*LEDGER, *RESERVED):
+        if column.name in (*LEDGER_COLUMNS, *RESERVED):
             raise ModelError(f"{where}: the ledger has a column of its own by this name")
         if column.kind == WORK and not column.name.startswith("work_"):
             raise ModelError(f"{where}: name columns of work work_..., they count in energies()['work']")

@@ -173,19 +173,19 @@ class Constraints(Term):
             return
         m, w, con, k, launch = self.model, ctx.work, self.tables, deflation_kernels(self.model.dtype), ctx.launch
         data, mul = con.data, w.multipliers
-        launch(k.pair_blocks, (m.worlds, con.block_count), [data, w.inverse, active, mul])
-        launch(k.assemble_matrix, self.dim, [data, active, mul])
-        launch(k.assemble_coupling, (m.worlds, con.couple_count), [data, active, mul])
+        launch(k.assemble_pair_blocks, (m.worlds, con.block_count), [data, w.inverse, active, mul])
+        launch(k.assemble_cluster_matrices, self.dim, [data, active, mul])
+        launch(k.assemble_cluster_couplings, (m.worlds, con.couple_count), [data, active, mul])
         if penalty:
-            launch(k.penalty, self.dim, [data, w.step.dq_dv, active, mul])
+            launch(k.compute_penalty, self.dim, [data, w.step.dq_dv, active, mul])
         if not deflation.on:
             return
         clusters = len(con.cluster_sizes)
         launch(k.invert_clusters, (m.worlds, clusters), [data, w.step.dq_dv, THREAD_LIMIT, active, mul])
         for pivot in range(deflation.largest):
             dim = (m.worlds, deflation.count, deflation.largest)
-            launch(k.eliminate, dim, [data, deflation.large, pivot, active, mul])
-            launch(k.scale_row, dim[:2], [data, deflation.large, pivot, active, mul])
+            launch(k.eliminate_pivot, dim, [data, deflation.large, pivot, active, mul])
+            launch(k.scale_pivot_row, dim[:2], [data, deflation.large, pivot, active, mul])
 
     def product(self, ctx: StepContext, p: wp.array, active: wp.array) -> None:
         """Constraint part of H p, for the gather."""
@@ -239,7 +239,7 @@ class Constraints(Term):
 
     def copy_cached(self, ctx: StepContext, kept: CachedInputs, reuse: Any, accepted: wp.array) -> bool:
         args = [reuse, accepted, *kept.live, *kept.state, *kept.place]
-        ctx.launch(reuse_kernels(self.model.dtype).carry_rows, self.dim, args)
+        ctx.launch(reuse_kernels(self.model.dtype).transfer_constraint_rows, self.dim, args)
         return True
 
     def allocate_blocks(self, ctx: StepContext, matrix: Any, *, projected: bool) -> None:
@@ -275,18 +275,22 @@ class Constraints(Term):
         """
         m, w, k, launch = self.model, ctx.work, deflation_kernels(self.model.dtype), ctx.launch
         data, mul = self.tables.data, w.multipliers
-        launch(k.restrict, self.dim, [data, mul, z, active])
+        launch(k.restrict_to_constraints, self.dim, [data, mul, z, active])
         sizes = self.tables.colour_sizes
         if len(sizes) == 1:
-            launch(k.solve_clusters, self.dim, [data, mul, active])
+            launch(k.apply_cluster_inverses, self.dim, [data, mul, active])
         else:
             first = np.concatenate([[0], np.cumsum(sizes)])
             for c in range(len(sizes)):
-                launch(k.sweep, (m.worlds, int(sizes[c])), [data, mul, int(first[c]), 1, active])
+                launch(k.gauss_seidel_sweep, (m.worlds, int(sizes[c])), [data, mul, int(first[c]), 1, active])
             for c in range(len(sizes) - 2, -1, -1):
-                launch(k.sweep, (m.worlds, int(sizes[c])), [data, mul, int(first[c]), 0, active])
+                launch(k.gauss_seidel_sweep, (m.worlds, int(sizes[c])), [data, mul, int(first[c]), 0, active])
         args = [data, mul, w.inverse, r, z, int(into is not None), active, w.warp]
-        launch(k.project, (m.worlds, launch.padded(m.slots)), [*args, z if into is None else into, w.warp_rows])
+        launch(
+            k.subtract_constraint_part,
+            (m.worlds, launch.padded(m.slots)),
+            [*args, z if into is None else into, w.warp_rows],
+        )
 
     # evaluation at a state
 

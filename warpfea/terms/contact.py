@@ -10,7 +10,7 @@ import warp as wp
 
 from ..base.errors import PenetrationError
 from ..kernels.common.traits import Traits
-from ..kernels.solvers.newton_control import FAIL_FLOOR, FAIL_WORK
+from ..kernels.solvers.newton_control import FAIL_ROUNDOFF, FAIL_WORK
 from ..kernels.terms.contact import AITKEN_LANES, MAX_COLLIDER_ROTATION, contact_kernels
 from ..kernels.terms.contact_ledger import ENERGY_COLUMNS, RECORD_LANES, contact_block_kernels, contact_ledger_kernels
 from ..kernels.terms.contact_structs import RECORD_NAMES, clock_struct, contact_scratch_struct, history_struct
@@ -141,7 +141,7 @@ class Contact(Term):
         attempt = self.attempt_of(B, lambda name, shape, dtype: work.array(f"contact {name}", shape, dtype))
         attempt.relaxation.fill_(1.0)
         clock = clock_struct()()
-        for name in ("time", "new_time", "h", "part"):
+        for name in ("time", "new_time", "h", "substep_index"):
             setattr(clock, name, getattr(work.step, name))
         clock.time, clock.is_static = ctx.state.time, int(not ctx.inertia)
         scratch = {
@@ -301,7 +301,7 @@ class Contact(Term):
         s, m, w = ctx.scratch[self.name], self.model, ctx.work
         if not s["finished"]:  # no ledger, `energy_increments` not called
             self._finish(ctx, accepted)
-        args = [self.tables.data, s["clock"], w.newton.potential, w.newton.term_sums, accepted, s["history"]]
+        args = [self.tables.data, s["clock"], w.newton.strain_energy, w.newton.term_sums, accepted, s["history"]]
         ctx.launch(self.ledger_kernels.store_poses, (m.worlds, len(self.tables.colliders)), [*args, s["attempt"]])
 
     def report(self, ctx: StepContext) -> None:
@@ -349,7 +349,7 @@ class Contact(Term):
 
     def failure_reason(self, ctx: StepContext, world: int) -> tuple[type[PenetrationError], str] | None:
         found = int(ctx.scratch[self.name]["attempt"].passed_point.numpy()[world])
-        if found == 0 or int(ctx.work.newton.failed.numpy()[world]) in (FAIL_FLOOR, FAIL_WORK):
+        if found == 0 or int(ctx.work.newton.failed.numpy()[world]) in (FAIL_ROUNDOFF, FAIL_WORK):
             return None
         number = abs(found) - 1
         t = self.tables

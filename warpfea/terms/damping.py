@@ -56,7 +56,7 @@ class Damping(Term):
             return set()
         out = {b.kernels.viscous_force.module for b in self.model.blocks if b.key.damping == "explicit"}
         if not ctx.midpoint:  # computes the strains of both ends
-            name = "moving_history" if ctx.accelerated else "strain_history"
+            name = "strain_history_with_velocity" if ctx.accelerated else "strain_history"
             out |= {getattr(b.kernels, name).module for b in self.model.blocks if b.key.damping == "incremental"}
         return out | ({self.kernels.subtract_explicit_force.module} if self.explicit else set())
 
@@ -72,7 +72,7 @@ class Damping(Term):
             dim = (m.worlds, block.count)
             if block.key.damping == "incremental" and ctx.accelerated:
                 args = [block.data, state.displacement, state.velocity, ctx.u_before, w.step.b, w.step.q_a, active]
-                launch(block.kernels.moving_history, dim, [*args, w.history])
+                launch(block.kernels.strain_history_with_velocity, dim, [*args, w.history])
             elif block.key.damping == "incremental" and not ctx.midpoint:
                 args = [block.data, state.displacement, ctx.u_before, w.step.a0, w.step.a1, active, w.history]
                 launch(block.kernels.strain_history, dim, args)

@@ -105,7 +105,7 @@ class DeadLoads(Term):
             w.time_law_stage_values,
             m.masses.lumped_values,
             self.constant,
-            w.step.ramp,
+            w.step.load_factor,
             active,
         ]
         ctx.launch(self.kernels.dead_load, (m.worlds, m.slots), [*args, w.dead, w.dead_magnitude])

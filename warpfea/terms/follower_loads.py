@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from ..kernels.solvers.direct import direct_kernels, followed_struct
+from ..kernels.solvers.direct import direct_kernels, follower_pattern_struct
 from ..kernels.terms.follower_loads import follower_struct, moment_kernels, pressure_kernels
 from ..model import assembly
 from ..model.description import Moment, Pressure
@@ -174,7 +174,7 @@ class FollowerMatrix:
         chosen = np.flatnonzero(index >= 0)
         chosen = chosen[np.argsort(index[chosen], kind="stable")]
         entry, count = np.unique(index[chosen], return_counts=True)
-        places = followed_struct()()
+        places = follower_pattern_struct()()
         values = (entry, np.concatenate([[0], np.cumsum(count)]), (i * self.count + item)[chosen], j[chosen])
         for name, value in zip(("entry", "start", "row", "column"), values):
             setattr(places, name, self.model.array("matrix pattern", value, wp.int32))
@@ -183,13 +183,13 @@ class FollowerMatrix:
     def add(self, ctx: StepContext, matrix: Any, dq_dv: wp.array, active: wp.array, out: wp.array) -> None:
         """out -= (dq/dv) times the items' matrices."""
         B, k, w, launch = self.model.worlds, self.kernels, ctx.work, ctx.launch
-        launch(k.take_local, (B, self.slots, self.count), [self.item.data.conn, w.u_stage, active, self.u])
+        launch(k.gather_local, (B, self.slots, self.count), [self.item.data.conn, w.u_stage, active, self.u])
         for local in range(self.slots):
             for axis in range(3):
                 args = [local, axis, self.count, self.direction]
-                launch(k.unit_direction, (B, self.slots * self.count), args)
+                launch(k.set_unit_direction, (B, self.slots * self.count), args)
                 column = self.columns[3 * local + axis]
                 args = [self.data, ctx.midpoint_factor, self.u, w.time_law_stage_values, active, self.direction, column]
                 launch(self.item.product, (B, self.count), args)
         args = [self.model.topology, matrix.pattern.data, self.places, self.columns, dq_dv, active, out]
-        launch(k.add_followers, (B, self.entries), args)
+        launch(k.add_follower_matrices, (B, self.entries), args)

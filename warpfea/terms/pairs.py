@@ -10,7 +10,7 @@ import warp as wp
 
 from ..base.errors import PenetrationError
 from ..kernels.common.traits import Traits
-from ..kernels.solvers.newton_control import FAIL_FLOOR, FAIL_WORK
+from ..kernels.solvers.newton_control import FAIL_ROUNDOFF, FAIL_WORK
 from ..kernels.terms.contact import AITKEN_LANES
 from ..kernels.terms.contact_ledger import ENERGY_COLUMNS, RECORD_LANES, contact_ledger_kernels
 from ..kernels.terms.contact_structs import RECORD_NAMES, clock_struct, contact_scratch_struct, history_struct
@@ -153,7 +153,7 @@ class Pairs(PairSolves):
         C, R, B = len(t.contacts), t.rows, m.worlds
         attempt, touching = self._attempt(work), self._touching(work)
         clock = clock_struct()()
-        for name in ("time", "new_time", "h", "part"):
+        for name in ("time", "new_time", "h", "substep_index"):
             setattr(clock, name, getattr(work.step, name))
         clock.time, clock.is_static = ctx.state.time, int(not ctx.inertia)
         tree = self._tree(touching)
@@ -350,7 +350,7 @@ class Pairs(PairSolves):
         s, w = ctx.scratch[self.name], ctx.work
         if not s["finished"]:  # no ledger, `energy_increments` not called
             self._finish(ctx, accepted)
-        args = [s["clock"], w.newton.potential, w.newton.term_sums, accepted, s["history"], s["attempt"]]
+        args = [s["clock"], w.newton.strain_energy, w.newton.term_sums, accepted, s["history"], s["attempt"]]
         ctx.launch(self.pair_ledger_kernels.add_energy_bound, self.model.worlds, args)
 
     def report(self, ctx: StepContext) -> None:
@@ -366,7 +366,7 @@ class Pairs(PairSolves):
 
     def failure_reason(self, ctx: StepContext, world: int) -> tuple[type[PenetrationError], str] | None:
         found = int(ctx.scratch[self.name]["attempt"].passed_point.numpy()[world])
-        if found == 0 or int(ctx.work.newton.failed.numpy()[world]) in (FAIL_FLOOR, FAIL_WORK):
+        if found == 0 or int(ctx.work.newton.failed.numpy()[world]) in (FAIL_ROUNDOFF, FAIL_WORK):
             return None
         t = self.tables
         k = int(np.searchsorted(t.first, found - 1, side="right")) - 1

@@ -14,8 +14,8 @@ from ..base.launch import PARTS
 from ..base.names import did_you_mean, listing
 from ..base.worlds import worlds_mask
 from ..kernels.common.traits import Traits
-from ..kernels.step.energy_ledger import LEDGER, term_energies_struct
-from ..kernels.step.step_control import REPORT
+from ..kernels.step.energy_ledger import LEDGER_COLUMNS, term_energies_struct
+from ..kernels.step.step_control import REPORT_COLUMNS
 from ..model import assembly
 from ..model.state import SOLVER_MEMORY
 from .body_forces import BodyForces
@@ -149,7 +149,7 @@ class TermSet:
         self.traits = Traits(*map(any, zip(*(derived_traits(term) for term in self.all))))
         self.side_entries, self.pool_entries = self._entries(self.all, False), self._entries(self.all, True)
         self.rows = 0
-        column = len(REPORT) + 6 * len(self.model.description.probes)
+        column = len(REPORT_COLUMNS) + 6 * len(self.model.description.probes)
         for term in self.all:
             term.row_offset, term.report_offset = self.rows, column
             self.rows += term.rows
@@ -158,7 +158,7 @@ class TermSet:
         if self.side_entries:
             self.side_topology = self._topology([c for t in self.all if not t.potential for c in t.connectivity])
         named = [column.name for term in self.all for column in term.columns if column.name]
-        self.ledger = (*LEDGER, *dict.fromkeys(name for name in named if name not in LEDGER))
+        self.ledger = (*LEDGER_COLUMNS, *dict.fromkeys(name for name in named if name not in LEDGER_COLUMNS))
 
     @staticmethod
     def _entries(terms: list[Term], potential: bool) -> int:
@@ -314,7 +314,7 @@ class TermSet:
         held = [int(not term.potential) for term in self.booking for _ in term.columns]
         out.nonpotential = wp.array(held, dtype=wp.int32, device=device)
         numbers = [self.ledger.index(c.name) if c.name else -1 for c in columns]
-        out.column = wp.array(numbers, dtype=wp.int32, device=device)
+        out.ledger_column = wp.array(numbers, dtype=wp.int32, device=device)
         out.sums = work.increment_sums
         return out
 

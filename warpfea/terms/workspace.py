@@ -13,10 +13,9 @@ from ..base.memory import enough_memory
 from ..kernels.common.lanes import WARP_SIZE
 from ..kernels.common.reduce import CHUNK
 from ..kernels.common.structs import balance_struct
-from ..kernels.solvers.newton_control import FLOOR_LANES, FLOOR_ROWS, GROUP_ROWS, LANES, TERM_ROWS, control_struct
-from ..kernels.solvers.pcg import LANES as GROUP_LANES
-from ..kernels.solvers.pcg import pcg_struct
-from ..kernels.step.energy_ledger import LEDGER_ROWS
+from ..kernels.solvers.newton_control import FLOOR_LANES, FLOOR_ROWS, GROUP_LANES, GROUP_ROWS, TERM_ROWS, control_struct
+from ..kernels.solvers.pcg import FREE_GROUP_LANES, pcg_struct
+from ..kernels.step.energy_ledger import LEDGER_TERM_ROWS
 from ..kernels.step.gather import RESIDUAL_ROWS
 from ..kernels.step.step_control import step_struct
 from ..kernels.terms.constraints import multiplier_struct
@@ -87,27 +86,27 @@ class Workspace:
         # PCG sums have one row per warp
         self.warp = WARP_SIZE if model.device.is_cuda else 1
         self.warp_rows = self.array("warp_rows", (2, B, -(-n // self.warp)), wp.float64)
-        self.rows = self.array("rows", (max(RESIDUAL_ROWS, LEDGER_ROWS), B, n), wp.float64)
+        self.rows = self.array("rows", (max(RESIDUAL_ROWS, LEDGER_TERM_ROWS), B, n), wp.float64)
         self.energy_rows = self.array("energy_rows", (2, B, model.element_count), wp.float64)
         longest = max(n, model.element_count, terms.rows, *(term.increment_rows for term in terms))
         chunks = -(-longest // CHUNK) if longest > CHUNK else 1
         self.longest = chunks * CHUNK  # maximum items of a summed row
-        most = max(RESIDUAL_ROWS, LEDGER_ROWS, *(len(term.columns) for term in terms))
+        most = max(RESIDUAL_ROWS, LEDGER_TERM_ROWS, *(len(term.columns) for term in terms))
         self.partial = self.array("partial", (most, B, chunks), wp.float64)
         self.time_law_values = self.array("law_value", (B, max(terms.time_laws.count, 1)), wp.vec3d)
         self.time_law_stage_values = self.time_law_values
         if midpoint:
             self.time_law_stage_values = self.array("law_stage", self.time_law_values.shape, wp.vec3d)
-        self.group_partial = self.array("group_partial", (B, max(model.group_count, 1), GROUP_LANES), vec3)
+        self.group_partial = self.array("group_partial", (B, max(model.group_count, 1), FREE_GROUP_LANES), vec3)
         self.group_velocity = self.array("group_velocity", (B, max(model.group_count, 1)), vec3)
-        self.ledger_sums = self.array("ledger_sums", (LEDGER_ROWS if ledger else 1, B), wp.float64)
+        self.ledger_sums = self.array("ledger_sums", (LEDGER_TERM_ROWS if ledger else 1, B), wp.float64)
         self.report = self.array("report", (B, terms.report_width), wp.float64)
         self.any_flag = self.array("any_flag", (5,), wp.int32)
         C = model.component_count
         groups = model.residual_groups.count
         sums = (GROUP_ROWS, B, groups) if groups > 1 else (1, 1, 1)
         self.residual_group_partial = self.array(
-            "residual_group_partial", (*sums, LANES) if groups > 1 else (1, 1, 1, 1), wp.float64
+            "residual_group_partial", (*sums, GROUP_LANES) if groups > 1 else (1, 1, 1, 1), wp.float64
         )
         skip: tuple[str, ...] = (
             "violation",
@@ -115,7 +114,7 @@ class Workspace:
             "pcg_unconverged",
             "component_of_group",
         )  # for other solvers
-        skip += () if traits.has_constraints else ("outer", "violation_ratio")
+        skip += () if traits.has_constraints else ("multiplier_updates", "violation_ratio")
         skip += () if traits.stored else ("term_sums", "trial_accepted")
         skip += () if traits.limited else ("limit",)
         skip += (
@@ -133,19 +132,21 @@ class Workspace:
         )
         self.newton = self.struct(
             control_struct(), B, skip=skip,
-            history=(B, max_newton + 1), slot_sums=(RESIDUAL_ROWS, B), group_sums=sums, component_converged=(B, C),
+            residual_history=(B, max_newton + 1), slot_sums=(RESIDUAL_ROWS, B), group_sums=sums,
+            component_converged=(B, C),
             term_sums=(TERM_ROWS, B), floor_sums=(FLOOR_ROWS, B, model.residual_parts.count, FLOOR_LANES),
         )  # fmt: skip
-        self.newton.components, self.newton.groups = C, groups
+        self.newton.component_count, self.newton.group_count = C, groups
         self.multipliers: Any = multiplier_struct()()  # of constraints, if any
         self.pcg = self.struct(pcg_struct(), B, sums=(2, B), curvature=(1, B))
         self.newton.negative_curvature, self.newton.pcg_unconverged = (
             self.pcg.negative_curvature,
             self.pcg.pcg_unconverged,
         )
-        unused: tuple[str, ...] = ("b", "q_a", "h_before", "any_refused", "summed", "ends", "growth", "least_energy")
+        unused: tuple[str, ...] = ("b", "q_a", "acceleration_step", "any_rejected", "summed_time", "world_end")
+        unused += ("energy_growth", "min_energy")
         unused += () if midpoint else ("stage_time",)
-        self.step = self.struct(step_struct(), B, skip=unused, stop=(2,))
+        self.step = self.struct(step_struct(), B, skip=unused, run_end=(2,))
         self.stage_time = self.step.stage_time if midpoint else self.step.new_time
         self.balance = balance_struct(model.dtype)()
         for name in balance_struct(model.dtype).vars:
@@ -191,7 +192,7 @@ class Workspace:
             "elem_sums": (2, worlds),
             "slope_sum": (1, worlds),
             "tangent_sum": (1, worlds),
-            **dict.fromkeys(("any_active", "any_running", "any_rare", "any_estimate_error"), (1,)),
+            **dict.fromkeys(("any_active", "any_running", "any_rare_branch", "any_estimate_error"), (1,)),
         } | shapes
         for name, var in kind.vars.items():
             if isinstance(var.type, wp.array) and name not in skip:

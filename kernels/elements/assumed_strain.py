@@ -1,4 +1,4 @@
-"""Elements with assumed natural strain (Dvorkin and Bathe 1984): force, energy, tangent product and matrices.
+"""Elements with assumed natural strain (Dvorkin and Bathe 1984), integration="tied": force, energy, products, matrices.
 
 Strains e_t = 2 E_ab = x_a . x_b - X_a . X_b, mostly shears, are taken at tying points ("ties") t, where x_a and x_b are
 the derivatives of the position along two parent directions or two axes of the element. Interpolation, metric and
@@ -11,15 +11,15 @@ import types as _types
 import warp as wp
 
 from ..common.types import kernel_module, precision
-from .element_slots import load_functions
-from .matrix import UNROLL, panels_of, row_of, rows_type, stage_name
-from .tied_block import coupling_function, shear_functions, tied_struct
+from .assumed_strain_block import assumed_shear_functions, assumed_strain_struct, coupling_entry_function
+from .element_slots import slot_access_functions
+from .matrix import PANEL_UNROLL, panel_layout, panel_row, panel_row_type, scheme_suffix
 
-__all__ = ["tied_kernels"]
+__all__ = ["assumed_strain_kernels"]
 
 
 @functools.cache
-def tied_kernels(
+def assumed_strain_kernels(
     dtype: str,
     slots: int,
     ties: int,
@@ -28,39 +28,38 @@ def tied_kernels(
     worlds: bool = False,
     dissipative: bool = False,
 ) -> _types.SimpleNamespace:
-    """Kernels of tied elements; they take the arguments of `element_kernels`, so that one loop launches both.
+    """Kernels of elements with assumed strains, with the arguments of `element_kernels`: one loop launches both.
 
     Args:
         dtype: precision.
         slots, ties: slots and tying points per element.
         width: A couples the ties of each run of `width`.
         midpoint: conserving scheme: u is that at the midpoint of the step, v half of the change of u; the shears in
-        forces
-            and products are the mean of those at both ends, and the energy is that at the end.
+            forces and products are the mean of those at both ends, and the energy is that at the end.
         dissipative: with (chi/2) of the shears' change added to the mean, see kernels/elements/energy_momentum.py.
         worlds: A differs between worlds, stored side by side.
     """
     p = precision(dtype)
     T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
-    Block = tied_struct(dtype, dissipative)
-    name = f"tied_{dtype}_{slots}_{ties}_{width}{stage_name(midpoint, dissipative)}{'_worlds' if worlds else ''}"
+    Block = assumed_strain_struct(dtype, dissipative)
+    name = f"tied_{dtype}_{slots}_{ties}_{width}{scheme_suffix(midpoint, dissipative)}{'_worlds' if worlds else ''}"
     module = kernel_module(name)
     matrix_module = kernel_module(f"{name}_matrix", max_unroll=8)
-    coupled = coupling_function(dtype, worlds, dissipative)
-    shears = shear_functions(dtype, slots, ties, dissipative)
+    coupling_entry = coupling_entry_function(dtype, worlds, dissipative)
+    shears = assumed_shear_functions(dtype, slots, ties, dissipative)
     Local, Ties, TieVectors = shears.Local, shears.Ties, shears.TieVectors
     directional_derivative, kinematics = shears.directional_derivative, shears.kinematics
     predicted_shears, step_shears = shears.predicted_shears, shears.step_shears
-    load, store = load_functions(dtype, slots, Block)
+    load_slots, store_forces = slot_access_functions(dtype, slots, Block)
     NS, NT, W = slots, ties, width
-    PANELS, P, _ = panels_of(NS)
+    PANELS, P, _ = panel_layout(NS)
     Row = wp.types.vector(length=P, dtype=T)
-    GROUP = 4 if NT % 4 == 0 else 1  # ties added to a row of the matrix between its load and its store
-    Rows = rows_type(dtype, P)
+    TIES_PER_LOAD = 4 if NT % 4 == 0 else 1  # ties added to a row of the matrix between its load and its store
+    Rows = panel_row_type(dtype, P)
     Slots = wp.types.matrix(shape=(NT * PANELS, P), dtype=T)
     Changes = wp.types.matrix(shape=(3 * NT * PANELS, P), dtype=T)
     Products = wp.types.matrix(shape=(3 * NT, P), dtype=T)
-    rows_module = kernel_module(f"{name}_rows", max_unroll=UNROLL)
+    rows_module = kernel_module(f"{name}_rows", max_unroll=PANEL_UNROLL)
     prediction_module = kernel_module(f"{name}_mixed")
 
     @wp.func
@@ -80,7 +79,7 @@ def tied_kernels(
             return midpoint_weight(mu)
 
     @wp.func
-    def stresses(block: Block, e: Ties, world: int, elem: int) -> Ties:
+    def tying_stresses(block: Block, e: Ties, world: int, elem: int) -> Ties:
         """s = mu A e, the derivative of the energy by the shears, N/m."""
         mu = block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0]
         s = Ties()
@@ -88,7 +87,7 @@ def tied_kernels(
             total = T(0.0)
             first = (t / W) * W
             for k in range(W):
-                total += coupled(block, t, k, world, elem) * e[first + k]
+                total += coupling_entry(block, t, k, world, elem) * e[first + k]
             s[t] = mu * total
         return s
 
@@ -105,21 +104,21 @@ def tied_kernels(
             a = x1[t]
             d = x2[t]
             if wp.static(midpoint):
-                a += directional_derivative(block.first, D, t, elem)
-                d += directional_derivative(block.second, D, t, elem)
-            de[t] = wp.dot(a, directional_derivative(block.second, P, t, elem)) + wp.dot(
-                d, directional_derivative(block.first, P, t, elem)
+                a += directional_derivative(block.derivative_a, D, t, elem)
+                d += directional_derivative(block.derivative_b, D, t, elem)
+            de[t] = wp.dot(a, directional_derivative(block.derivative_b, P, t, elem)) + wp.dot(
+                d, directional_derivative(block.derivative_a, P, t, elem)
             )
             if wp.static(dissipative):
                 de[t] = (T(1.0) + block.dissipation) * de[t]
-        s = stresses(block, e, world, elem)
-        ds = stresses(block, de, world, elem)
+        s = tying_stresses(block, e, world, elem)
+        ds = tying_stresses(block, de, world, elem)
         f = Local()
         for t in range(NT):
-            da = ds[t] * x1[t] + s[t] * directional_derivative(block.first, P, t, elem)
-            dd = ds[t] * x2[t] + s[t] * directional_derivative(block.second, P, t, elem)
+            da = ds[t] * x1[t] + s[t] * directional_derivative(block.derivative_a, P, t, elem)
+            dd = ds[t] * x2[t] + s[t] * directional_derivative(block.derivative_b, P, t, elem)
             for i in range(NS):
-                f[i] = f[i] + block.first[t, i, elem] * dd + block.second[t, i, elem] * da
+                f[i] = f[i] + block.derivative_a[t, i, elem] * dd + block.derivative_b[t, i, elem] * da
         if wp.static(midpoint):
             f = T(0.5) * f
         return f
@@ -130,28 +129,28 @@ def tied_kernels(
         wp.array(dtype=wp.float64), active: wp.array(dtype=wp.int32), lanes: int, contribution: wp.array2d(dtype=vec3),
         energy: wp.array3d(dtype=wp.float64), min_J: wp.array(dtype=wp.float64), domain_J: wp.array(dtype=wp.float64),
     ):  # fmt: skip
-        """f_i = sum_t s_t (first_ti x_b + second_ti x_a), N, and the energy e.s/2, J; one thread per element."""
+        """f_i = sum_t s_t (s_i,a x_b + s_i,b x_a), N, and the energy e.s/2, J; one thread per element."""
         world, elem = wp.tid()
         if active[world] == 0 or elem >= block.count:
             return
-        U = load(block, u, world, elem)
+        U = load_slots(block, u, world, elem)
         x1, x2, e = kinematics(block, U, elem)
         s = Ties()
         if wp.static(midpoint):
-            D = load(block, v, world, elem)
-            s = stresses(block, step_shears(block, x1, x2, D, e, elem), world, elem)
+            D = load_slots(block, v, world, elem)
+            s = tying_stresses(block, step_shears(block, x1, x2, D, e, elem), world, elem)
             _, _, e = kinematics(block, U + D, elem)
         else:
-            s = stresses(block, e, world, elem)
+            s = tying_stresses(block, e, world, elem)
         f = Local()
         for t in range(NT):
             a = s[t] * x1[t]
             d = s[t] * x2[t]
             for i in range(NS):
-                f[i] = f[i] + block.first[t, i, elem] * d + block.second[t, i, elem] * a
-        store(block, f, world, elem, contribution)
+                f[i] = f[i] + block.derivative_a[t, i, elem] * d + block.derivative_b[t, i, elem] * a
+        store_forces(block, f, world, elem, contribution)
         if wp.static(midpoint):
-            s = stresses(block, e, world, elem)
+            s = tying_stresses(block, e, world, elem)
         energy[0, world, block.element_offset + elem] = wp.float64(T(0.5) * wp.dot(e, s))
         energy[1, world, block.element_offset + elem] = wp.float64(0.0)
 
@@ -170,17 +169,17 @@ def tied_kernels(
         world, elem = wp.tid()
         if active[world] == 0:
             return
-        U = load(block, u, world, elem)
-        P = load(block, direction, world, elem)
+        U = load_slots(block, u, world, elem)
+        P = load_slots(block, direction, world, elem)
         x1, x2, e = kinematics(block, U, elem)
         D = Local()
         if wp.static(midpoint):
-            D = load(block, v, world, elem)
+            D = load_slots(block, v, world, elem)
             if active[world] == 2:
                 _, _, e = kinematics(block, U - D, elem)
             else:
                 e = step_shears(block, x1, x2, D, e, elem)
-        store(block, tangent_force(block, P, D, x1, x2, e, world, elem), world, elem, contribution)
+        store_forces(block, tangent_force(block, P, D, x1, x2, e, world, elem), world, elem, contribution)
 
     @wp.kernel(module=prediction_module)
     def predicted_stress_product(
@@ -200,15 +199,15 @@ def tied_kernels(
         world, elem = wp.tid()
         if active[world] == 0:
             return
-        U = load(block, u, world, elem)
+        U = load_slots(block, u, world, elem)
         x1, x2, e = kinematics(block, U, elem)
         if use_prediction[world] == 1:
-            change = load(block, v, world, elem) - load(block, base, world, elem)
+            change = load_slots(block, v, world, elem) - load_slots(block, base, world, elem)
             e = predicted_shears(block, T(dq_dv[world]) * change, e, elem)
         if use_prediction[world] == 2:
             e = Ties()
-        P = load(block, direction, world, elem)
-        store(block, tangent_force(block, P, Local(), x1, x2, e, world, elem), world, elem, contribution)
+        P = load_slots(block, direction, world, elem)
+        store_forces(block, tangent_force(block, P, Local(), x1, x2, e, world, elem), world, elem, contribution)
 
     @wp.kernel(module=module)
     def diagonal_blocks(
@@ -222,20 +221,20 @@ def tied_kernels(
         world, elem = wp.tid()
         if active[world] == 0:
             return
-        U = load(block, u, world, elem)
+        U = load_slots(block, u, world, elem)
         mu = block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0]
         for i in range(NS):
             b = TieVectors()
             for t in range(NT):
-                a = block.X_first[t, elem] + directional_derivative(block.first, U, t, elem)
-                d = block.X_second[t, elem] + directional_derivative(block.second, U, t, elem)
-                b[t] = block.first[t, i, elem] * d + block.second[t, i, elem] * a
+                a = block.X_a[t, elem] + directional_derivative(block.derivative_a, U, t, elem)
+                d = block.X_b[t, elem] + directional_derivative(block.derivative_b, U, t, elem)
+                b[t] = block.derivative_a[t, i, elem] * d + block.derivative_b[t, i, elem] * a
             K = mat33()
             for t in range(NT):
                 row = vec3()
                 first = (t / W) * W
                 for k in range(W):
-                    row += coupled(block, t, k, world, elem) * b[first + k]
+                    row += coupling_entry(block, t, k, world, elem) * b[first + k]
                 K += wp.outer(b[t], row)
             entry = block.contribution_offset + i * block.count + elem
             contribution[world, entry] = matrix_modulus(block, mu) * sym6(
@@ -255,7 +254,7 @@ def tied_kernels(
         active: wp.array(dtype=wp.int32),
         lines: wp.array3d(dtype=vec3),
     ):
-        """Tie data common to all columns of an element's matrix, [world, row, elem].
+        """Data of the ties common to all columns of an element's matrix, [world, row, elem].
 
         Row `tie` holds x_a, row NT + tie x_b, and row 2 NT + tie the shear e_t in its first component.
         """
@@ -267,24 +266,24 @@ def tied_kernels(
         first = u[world, block.conn[0, elem]]
         for i in range(NS):
             x = u[world, block.conn[i, elem]] - block.is_position[i] * first
-            da += block.first[tie, i, elem] * x
-            dd += block.second[tie, i, elem] * x
-        a = block.X_first[tie, elem] + da
-        d = block.X_second[tie, elem] + dd
-        shear = wp.dot(block.X_first[tie, elem], dd) + wp.dot(da, d)
+            da += block.derivative_a[tie, i, elem] * x
+            dd += block.derivative_b[tie, i, elem] * x
+        a = block.X_a[tie, elem] + da
+        d = block.X_b[tie, elem] + dd
+        shear = wp.dot(block.X_a[tie, elem], dd) + wp.dot(da, d)
         if wp.static(midpoint):
-            D = load(block, v, world, elem)
-            half_a = directional_derivative(block.first, D, tie, elem)
-            half_d = directional_derivative(block.second, D, tie, elem)
+            D = load_slots(block, v, world, elem)
+            half_a = directional_derivative(block.derivative_a, D, tie, elem)
+            half_d = directional_derivative(block.derivative_b, D, tie, elem)
             shear += wp.dot(half_a, half_d)
             if wp.static(dissipative):
                 shear += block.dissipation * (wp.dot(a, half_d) + wp.dot(d, half_a))
         if use_prediction[world] == 1:
-            change = load(block, v, world, elem) - load(block, base, world, elem)
+            change = load_slots(block, v, world, elem) - load_slots(block, base, world, elem)
             factor = T(dq_dv[world]) * T(dq_dv[world])
             shear -= factor * wp.dot(
-                directional_derivative(block.first, change, tie, elem),
-                directional_derivative(block.second, change, tie, elem),
+                directional_derivative(block.derivative_a, change, tie, elem),
+                directional_derivative(block.derivative_b, change, tie, elem),
             )
         lines[world, tie, elem] = a
         lines[world, NT + tie, elem] = d
@@ -304,7 +303,7 @@ def tied_kernels(
         first = (tie / W) * W
         s = T(0.0)
         for k in range(W):
-            s += coupled(block, tie, k, world, elem) * lines[world, 2 * NT + first + k, elem][0]
+            s += coupling_entry(block, tie, k, world, elem) * lines[world, 2 * NT + first + k, elem][0]
         mu = block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0]
         if use_prediction[world] == 2:
             mu = T(0.0)  # no geometric part
@@ -336,22 +335,22 @@ def tied_kernels(
         for t in range(NT):
             x = lines[world, t, elem][axis]
             y = lines[world, NT + t, elem][axis]
-            change[t] = mu * (block.first[t, b, elem] * y + block.second[t, b, elem] * x)
+            change[t] = mu * (block.derivative_a[t, b, elem] * y + block.derivative_b[t, b, elem] * x)
         out = Local()
         for t in range(NT):
             first = (t / W) * W
             s = T(0.0)
             for k in range(W):
-                s += coupled(block, t, k, world, elem) * change[first + k]
+                s += coupling_entry(block, t, k, world, elem) * change[first + k]
             da = s * lines[world, t, elem]
             dd = s * lines[world, NT + t, elem]
             if form != 1:
                 stress = lines[world, 3 * NT + t, elem][0]
-                da += (stress * block.first[t, b, elem]) * unit
-                dd += (stress * block.second[t, b, elem]) * unit
+                da += (stress * block.derivative_a[t, b, elem]) * unit
+                dd += (stress * block.derivative_b[t, b, elem]) * unit
             for a in range(NS):
                 if a <= b:
-                    out[a] = out[a] + block.first[t, a, elem] * dd + block.second[t, a, elem] * da
+                    out[a] = out[a] + block.derivative_a[t, a, elem] * dd + block.derivative_b[t, a, elem] * da
         for a in range(NS):
             if a <= b:
                 pair = a * NS - (a * (a - 1)) / 2 + b - a
@@ -360,7 +359,7 @@ def tied_kernels(
                 matrix[world, 3 * pair + axis, elem] = out[a]
 
     @wp.kernel(module=rows_module)
-    def element_rows(
+    def element_matrix_panels(
         block: Block,
         u: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
@@ -378,28 +377,28 @@ def tied_kernels(
         if active[world] == 0:
             return
         mu = matrix_modulus(block, block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0])
-        U = load(block, u, world, elem)
+        U = load_slots(block, u, world, elem)
         x1, x2, e = kinematics(block, U, elem)
         first, second, B = Slots(), Slots(), Changes()
         for t in range(NT):
             d1 = x1[t]
             d2 = x2[t]
             for a in range(NS):
-                f = block.first[t, a, elem]
-                s = block.second[t, a, elem]
+                f = block.derivative_a[t, a, elem]
+                s = block.derivative_b[t, a, elem]
                 row = NT * (a / P) + t
                 first[row, a % P] = f
                 second[row, a % P] = s
                 for i in range(3):
                     B[3 * row + i, a % P] = f * d2[i] + s * d1[i]
         if use_prediction[world] == 1:
-            change = load(block, v, world, elem) - load(block, base, world, elem)
+            change = load_slots(block, v, world, elem) - load_slots(block, base, world, elem)
             e = predicted_shears(block, T(dq_dv[world]) * change, e, elem)
         stress = Ties()
         if wp.static(midpoint):
-            e = step_shears(block, x1, x2, load(block, v, world, elem), e, elem)
+            e = step_shears(block, x1, x2, load_slots(block, v, world, elem), e, elem)
         if form != 1 and use_prediction[world] != 2:
-            stress = stresses(block, e, world, elem)
+            stress = tying_stresses(block, e, world, elem)
         if add == 0:
             for k in range(matrix.shape[2]):
                 matrix[world, elem, k] = Rows()
@@ -409,21 +408,21 @@ def tied_kernels(
                 x, y, z = Row(), Row(), Row()
                 for k in range(W):
                     other = 3 * (NT * panel + (t / W) * W + k)
-                    c = mu * coupled(block, t, k, world, elem)
+                    c = mu * coupling_entry(block, t, k, world, elem)
                     x = x + c * B[other]
                     y = y + c * B[other + 1]
                     z = z + c * B[other + 2]
                 AB[3 * t] = x
                 AB[3 * t + 1] = y
                 AB[3 * t + 2] = z
-            for group in range(NT / GROUP):
+            for group in range(NT / TIES_PER_LOAD):
                 for a in range(wp.min(NS, P * (panel + 1))):
-                    at = row_of(panel, P, a)
+                    at = panel_row(panel, P, a)
                     R = matrix[world, elem, at]
-                    row = NT * (a / P) + GROUP * group
+                    row = NT * (a / P) + TIES_PER_LOAD * group
                     n = a % P
-                    for o in range(GROUP):
-                        t = GROUP * group + o
+                    for o in range(TIES_PER_LOAD):
+                        t = TIES_PER_LOAD * group + o
                         for i in range(3):
                             c = B[3 * (row + o) + i, n]
                             for j in range(3):
@@ -437,7 +436,7 @@ def tied_kernels(
 
     return _types.SimpleNamespace(
         module=module,
-        element_rows=element_rows,
+        element_matrix_panels=element_matrix_panels,
         prepare_matrix=prepare_matrix,
         prepare_stress=prepare_stress,
         element_matrix=element_matrix,

@@ -1,4 +1,4 @@
-"""Tables of elements with tied shears, see tied.py, and the shears at their tying points."""
+"""Tables of elements with assumed shears, see assumed_strain.py, and the shears at their tying points."""
 
 import functools
 import types as _types
@@ -6,26 +6,26 @@ import types as _types
 import warp as wp
 
 from ..common.types import precision
-from .element_slots import local_type
+from .element_slots import slot_values_type
 
-__all__ = ["coupling_function", "shear_functions", "tied_struct"]
+__all__ = ["assumed_shear_functions", "assumed_strain_struct", "coupling_entry_function"]
 
 
 @functools.cache
-def tied_struct(dtype: str, dissipative: bool = False):
-    """Constant data of a block of tied elements, in one precision; `dissipative`: see `tied_kernels`."""
+def assumed_strain_struct(dtype: str, dissipative: bool = False):
+    """Constant data of a block of such elements, in one precision; `dissipative`: see `assumed_strain_kernels`."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
 
     @wp.struct
-    class TiedBlock:
+    class AssumedStrainBlock:
         conn: wp.array2d(dtype=wp.int32)  # [local, elem] slot
         is_position: wp.array(dtype=T)  # [local]
-        first: wp.array3d(dtype=T)  # [tie, local, elem] ds_i/dxi_a
-        second: wp.array3d(dtype=T)  # [tie, local, elem] ds_i/dxi_b
-        X_first: wp.array2d(dtype=vec3)  # [tie, elem] reference X_a
-        X_second: wp.array2d(dtype=vec3)  # [tie, elem] reference X_b
-        coupling: wp.array3d(dtype=T)  # [tie, k, elem] A, k within the tie's run of coupled ties; or world by world
+        derivative_a: wp.array3d(dtype=T)  # [tie, local, elem] ds_i/dxi_a
+        derivative_b: wp.array3d(dtype=T)  # [tie, local, elem] ds_i/dxi_b
+        X_a: wp.array2d(dtype=vec3)  # [tie, elem] reference X_a
+        X_b: wp.array2d(dtype=vec3)  # [tie, elem] reference X_b
+        coupling: wp.array3d(dtype=T)  # [tie, k, elem] A, k within the tie's run of ties; or world by world
         material: wp.array(dtype=wp.int32)  # [elem]
         coefficients: wp.array3d(dtype=T)  # [world or 0, material, NCOEF]; the first is mu
         contribution_offset: wp.int32
@@ -35,31 +35,31 @@ def tied_struct(dtype: str, dissipative: bool = False):
         if dissipative:
             dissipation: T  # chi of kernels/elements/energy_momentum.py
 
-    return TiedBlock
+    return AssumedStrainBlock
 
 
 @functools.cache
-def coupling_function(dtype: str, worlds: bool, dissipative: bool = False) -> wp.Function:
+def coupling_entry_function(dtype: str, worlds: bool, dissipative: bool = False) -> wp.Function:
     """Device function of an entry of A; `worlds`: A differs between worlds."""
-    T, Block = precision(dtype).T, tied_struct(dtype, dissipative)
+    T, Block = precision(dtype).T, assumed_strain_struct(dtype, dissipative)
 
     @wp.func
-    def coupled(block: Block, tie: int, k: int, world: int, elem: int) -> T:
-        """Entry k of a tie's run."""
+    def coupling_entry(block: Block, tie: int, k: int, world: int, elem: int) -> T:
+        """Entry k of a tie's row of A, within its run of coupled ties."""
         if wp.static(worlds):
             return block.coupling[tie, k, world * block.count + elem]
         else:
             return block.coupling[tie, k, elem]
 
-    return coupled
+    return coupling_entry
 
 
 @functools.cache
-def shear_functions(dtype: str, slots: int, ties: int, dissipative: bool = False) -> _types.SimpleNamespace:
-    """Device functions of the shears; arguments as those of `tied_kernels`."""
+def assumed_shear_functions(dtype: str, slots: int, ties: int, dissipative: bool = False) -> _types.SimpleNamespace:
+    """Device functions of the shears; arguments as those of `assumed_strain_kernels`."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
-    Block, Local = tied_struct(dtype, dissipative), local_type(dtype, slots)
+    Block, Local = assumed_strain_struct(dtype, dissipative), slot_values_type(dtype, slots)
     Ties = wp.types.vector(length=ties, dtype=T)
     TieVectors = wp.types.matrix(shape=(ties, 3), dtype=T)
     NS, NT = slots, ties
@@ -78,11 +78,11 @@ def shear_functions(dtype: str, slots: int, ties: int, dissipative: bool = False
         first, second = TieVectors(), TieVectors()
         e = Ties()
         for t in range(NT):
-            a = directional_derivative(block.first, U, t, elem)
-            d = directional_derivative(block.second, U, t, elem)
-            first[t] = block.X_first[t, elem] + a
-            second[t] = block.X_second[t, elem] + d
-            e[t] = wp.dot(block.X_first[t, elem], d) + wp.dot(a, second[t])
+            a = directional_derivative(block.derivative_a, U, t, elem)
+            d = directional_derivative(block.derivative_b, U, t, elem)
+            first[t] = block.X_a[t, elem] + a
+            second[t] = block.X_b[t, elem] + d
+            e[t] = wp.dot(block.X_a[t, elem], d) + wp.dot(a, second[t])
         return first, second, e
 
     @wp.func
@@ -91,7 +91,8 @@ def shear_functions(dtype: str, slots: int, ties: int, dissipative: bool = False
         out = e
         for t in range(NT):
             out[t] = out[t] - wp.dot(
-                directional_derivative(block.first, step, t, elem), directional_derivative(block.second, step, t, elem)
+                directional_derivative(block.derivative_a, step, t, elem),
+                directional_derivative(block.derivative_b, step, t, elem),
             )
         return out
 
@@ -101,7 +102,8 @@ def shear_functions(dtype: str, slots: int, ties: int, dissipative: bool = False
         out = e
         for t in range(NT):
             out[t] = out[t] + wp.dot(
-                directional_derivative(block.first, D, t, elem), directional_derivative(block.second, D, t, elem)
+                directional_derivative(block.derivative_a, D, t, elem),
+                directional_derivative(block.derivative_b, D, t, elem),
             )
         return out
 
@@ -111,8 +113,8 @@ def shear_functions(dtype: str, slots: int, ties: int, dissipative: bool = False
         out = mean_shears(block, D, e, elem)
         if wp.static(dissipative):
             for t in range(NT):
-                change = wp.dot(x1[t], directional_derivative(block.second, D, t, elem)) + wp.dot(
-                    x2[t], directional_derivative(block.first, D, t, elem)
+                change = wp.dot(x1[t], directional_derivative(block.derivative_b, D, t, elem)) + wp.dot(
+                    x2[t], directional_derivative(block.derivative_a, D, t, elem)
                 )
                 out[t] = out[t] + block.dissipation * change
         return out
