@@ -49,9 +49,9 @@ def take(sim: wf.Simulation, strain: float, on: list[int]) -> list[np.ndarray]:
     w.step.mass_factor.zero_()
     residual.assemble_matrix(wp.array(on, dtype=wp.int32, device="cpu"))
     free = np.flatnonzero(sim.model.free_host.ravel())
-    assert residual.assembled is not None
+    assert residual.assembler is not None
     worlds = range(sim.model.worlds)
-    return [residual.assembled.matrix(residual.matrix, k)[free][:, free].toarray() for k in worlds]
+    return [residual.assembler.host_csr(residual.matrix, k)[free][:, free].toarray() for k in worlds]
 
 
 def applied(sim: wf.Simulation) -> list[np.ndarray]:

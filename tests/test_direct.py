@@ -82,7 +82,7 @@ def test_all_of_H_is_factorised(operator):
     newton.residual.evaluate(active)
     newton.residual.assemble_matrix(active)
     newton.direct._assemble(active, newton.direct.value, projected=False)
-    matrix = newton.direct.assembled.matrix(newton.direct.value)
+    matrix = newton.direct.assembler.host_csr(newton.direct.value)
     v = np.random.default_rng(0).normal(size=(model.slots, 3)) * model.free_host
     work.p.assign(v[None])
     newton.residual.product(work.p, work.Hp, active)

@@ -97,7 +97,7 @@ def motions_of(model, u, bodies):
 def system(loop):
     """H that the preconditioner is made from, with what couples the bodies, from the points one by one."""
     model, at = loop.model, loop.residual.ctx
-    pre, graph = loop.preconditioner, loop.preconditioner.assembled.pattern.graph
+    pre, graph = loop.preconditioner, loop.preconditioner.assembler.pattern.graph
     shape = (3 * model.slots,) * 2
     own = sp.bsr_matrix((pre.value.numpy()[0], graph.indices, graph.indptr), shape=shape).toarray()
     term = model.terms.find(Pairs)

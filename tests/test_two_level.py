@@ -8,7 +8,7 @@ from two_level_models import bar
 
 import warpfea as wf
 from warpfea.model.partition import bisect, connected_groups, morton_order
-from warpfea.solvers.assembled import Assembled
+from warpfea.solvers.matrix_assembly import MatrixAssembler
 from warpfea.studies.bench.problems import PROBLEMS
 
 
@@ -40,13 +40,13 @@ def product(sim, p):
 
 def assembled(sim, *, projected, whole=None):
     work, residual = sim.stepper.work, sim.stepper.newton.residual
-    matrix = residual.assembled
+    matrix = residual.assembler
     if whole is not None:
-        matrix = Assembled(sim.model, work, sim.stepper.launch, residual.block_kernels, whole)
-    out = matrix.values("test")
+        matrix = MatrixAssembler(sim.model, work, sim.stepper.launch, residual.block_kernels, whole)
+    out = matrix.allocate_values("test")
     factors = (work.step.mass_factor, work.step.dq_dv)
     matrix.assemble(work.u, factors, on(sim), out, projected=projected)
-    return matrix.matrix(out)
+    return matrix.host_csr(out)
 
 
 def apply(sim, r):

@@ -136,7 +136,7 @@ class Masses:
         )
 
     def of_pattern(self, pattern: Any) -> np.ndarray:
-        """(worlds or 1, upper entries) masses of a pattern of blocks (solvers/assembled.py), kg."""
+        """(worlds or 1, upper entries) masses of a pattern of blocks (solvers/matrix_assembly.py), kg."""
         upper = pattern.upper
         if len(self.matrix.indices) == pattern.entries:
             return self.table[:, upper[:, 0]]

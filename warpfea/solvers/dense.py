@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from ..base.launch import Launcher
     from ..model.model import Model
     from ..terms.workspace import Workspace
-    from .assembled import Pattern
+    from .matrix_assembly import Pattern
 
 __all__ = ["DenseComponents", "DenseInverse", "gauss_jordan"]
 

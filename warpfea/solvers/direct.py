@@ -40,14 +40,14 @@ class Direct:
         model = ctx.model
         self.ctx, self.model, self.work, self.launch, self.residual = ctx, model, ctx.work, ctx.launch, residual
         ctx.work.reserve_blocks()
-        assert residual.assembled is not None
-        self.assembled = residual.assembled
+        assert residual.assembler is not None
+        self.assembler = residual.assembler
         self.kernels = direct_kernels(model.dtype)
         self.dim = (model.worlds, ctx.launch.padded(model.slots))
-        self.factors = make_factors(model, self.assembled.pattern.graph)
+        self.factors = make_factors(model, self.assembler.pattern.graph)
         self.elements_only = not model.terms.products
         for term in model.terms:
-            term.allocate_blocks(ctx, self.assembled, projected=False)
+            term.allocate_blocks(ctx, self.assembler, projected=False)
         self.matrix_storage: wp.array | None = None
         self.unverified: set[int] = set()
         self.singular: set[int] = set()
@@ -60,7 +60,7 @@ class Direct:
 
     def modules(self) -> set[wp.Module]:
         """Modules launched."""
-        return {self.kernels.module} | self.assembled.modules()
+        return {self.kernels.module} | self.assembler.modules()
 
     @labelled("build")
     def start(self, active: wp.array) -> None:
@@ -88,7 +88,7 @@ class Direct:
     def value(self) -> wp.array:
         """Array of the matrix H, allocated on first use."""
         if self.matrix_storage is None:
-            self.matrix_storage = self.assembled.values("direct matrix")
+            self.matrix_storage = self.assembler.allocate_values("direct matrix")
         return self.matrix_storage
 
     @labelled("build")
@@ -110,10 +110,10 @@ class Direct:
     def _assemble(self, flags: wp.array, value: wp.array, *, projected: bool) -> None:
         """Assemble H or, with `projected`, its positive definite approximation."""
         w = self.work
-        self.assembled.assemble(w.u_stage, (w.step.mass_factor, w.step.dq_dv), flags, value, projected=projected)
+        self.assembler.assemble(w.u_stage, (w.step.mass_factor, w.step.dq_dv), flags, value, projected=projected)
         for term in self.model.terms:
             live = [array for _, array in term.cached_inputs(self.ctx)]
-            term.blocks(self.ctx, self.assembled, live, w.step.dq_dv, flags, value, projected=projected)
+            term.blocks(self.ctx, self.assembler, live, w.step.dq_dv, flags, value, projected=projected)
 
     def _factorise(self, world: int, value: wp.array) -> None:
         self.singular.discard(world)

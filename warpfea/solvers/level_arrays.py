@@ -30,7 +30,7 @@ class LevelArrays:
         S = precision(storage).T
         other = storage != model.dtype
         name = f"level {depth}"
-        self.value = work.array(f"{name} matrix", (B, level.pattern.entries), model.types.mat33) if depth else None
+        self.value = work.array(f"{name} matrix", (B, level.pattern.entry_count), model.types.mat33) if depth else None
         if level.band is not None:
             return
         parts = level.parts if by_component else None

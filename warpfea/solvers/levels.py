@@ -11,9 +11,9 @@ import warp as wp
 
 from ..kernels.solvers.levels import TILE_SLOTS, level_struct
 from ..model.partition import bisect, connected_groups
-from .assembled import Pattern, make_pattern
 from .band import MAX_FULL_FACTOR_SLOTS, Band
 from .dense import DenseComponents
+from .matrix_assembly import Pattern, make_pattern
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -205,4 +205,4 @@ def _galerkin(
     coarse = sp.csr_matrix((np.ones(len(pairs), dtype=np.int8), second, start), shape=(groups, groups))
     blocks = sp.kron(coarse, np.ones((4, 4), dtype=np.int8), format="csr")
     blocks.sort_indices()
-    return make_pattern(model, blocks, mirrored=False), galerkin
+    return make_pattern(model, blocks, with_upper=False), galerkin

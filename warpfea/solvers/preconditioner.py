@@ -9,7 +9,7 @@ import warp as wp
 from ..base.errors import ModelError
 from ..base.launch import labelled
 from ..kernels.solvers.pcg import pcg_kernels
-from .band import MAX_FULL_FACTOR_SLOTS, block_band, find_band
+from .band import MAX_FULL_FACTOR_SLOTS, find_band, thread_block_band
 from .residual import Residual
 from .twolevel import TwoLevel
 
@@ -117,7 +117,7 @@ def choose(name: str, storage: str | None, model: Model) -> str:
         ModelError: "banded" for a larger model on a GPU, or with a storage precision other than the model's.
     """
     kept = storage in (None, model.dtype)
-    banded = kept and (not model.device.is_cuda or block_band(model) is not None)
+    banded = kept and (not model.device.is_cuda or thread_block_band(model) is not None)
     if name == "banded" and kept and not banded:
         raise ModelError(
             "NewtonPCG: preconditioner = 'banded' is for the CPU, and on a GPU for small models with a narrow band; "

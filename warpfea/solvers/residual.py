@@ -18,8 +18,8 @@ from ..kernels.step.gather import RESIDUAL_ROWS, gather_kernels
 from ..kernels.step.midpoint import stage_kernels
 from ..kernels.terms.constraints import constraint_struct
 from ..terms.elements import Elements
-from .assembled import Assembled, shaped
 from .clusters import ModelClusters, make_clusters, make_pool
+from .matrix_assembly import MatrixAssembler, leading_view
 from .reuse import ReuseRule
 
 if TYPE_CHECKING:
@@ -114,12 +114,12 @@ class Residual:
             ]
         self.matrix_reuse, self.reuse_across_steps = 0, False
         self.on_assembled: Callable[[wp.array, wp.array], None] | None = None
-        self.assembled: Assembled | None = None
+        self.assembler: MatrixAssembler | None = None
         if assembled or self.uses_matrix:
-            self.assembled = Assembled(model, work, launch, self.elements.kernels(ctx))
+            self.assembler = MatrixAssembler(model, work, launch, self.elements.kernels(ctx))
         if self.uses_matrix:
-            assert self.assembled is not None
-            self.matrix = self.assembled.values("operator matrix")
+            assert self.assembler is not None
+            self.matrix = self.assembler.allocate_values("operator matrix")
             # not in statics (large steps) nor with damping (the viscous stress is no function of the state of a resumed
             # run) nor constraints (their forces are only as accurate as the solve); a GPU assembles a small matrix at
             # negligible cost
@@ -159,8 +159,8 @@ class Residual:
         """Modules of the gather and of an assembled matrix; terms list their own."""
         out = {self.gather.module, self.vectors.module} | ({self.stage.module} if self.ctx.midpoint else set())
         if self.uses_matrix:
-            assert self.assembled is not None
-            out |= {self.gather.matrix_module} | self.assembled.modules()
+            assert self.assembler is not None
+            out |= {self.gather.matrix_module} | self.assembler.modules()
             out |= {self.reuse.kernels.module} if self.matrix_reuse else set()
         elif self.clusters:
             out |= {kernel.module for kernel in self.products}
@@ -203,11 +203,11 @@ class Residual:
 
     @labelled("assembly")
     def _assemble(self) -> None:
-        assert self.assembled is not None
+        assert self.assembler is not None
         control = self.reuse.control
         self.reuse.move_point()
         factors = (control.mass_factor, control.dq_dv)
-        self.assembled.assemble(self.reuse.linearisation_point, factors, control.build, self.matrix, projected=False)
+        self.assembler.assemble(self.reuse.linearisation_point, factors, control.build, self.matrix, projected=False)
         if self.on_assembled:
             self.on_assembled(self.matrix, control.build)
         self.reuse.mark_built()
@@ -216,9 +216,9 @@ class Residual:
         """Assemble the operator matrix at the iterate unconditionally."""
         w = self.work
         if self.uses_matrix:
-            assert self.assembled is not None
+            assert self.assembler is not None
             factors = (w.step.mass_factor, w.step.dq_dv)
-            self.assembled.assemble(w.u_stage, factors, active, self.matrix, projected=False)
+            self.assembler.assemble(w.u_stage, factors, active, self.matrix, projected=False)
             if self.on_assembled:
                 self.on_assembled(self.matrix, active)
 
@@ -314,11 +314,11 @@ class Residual:
             term.product(self.ctx, p, active)
         rest = [self.additions, p, active, self.con, w.multipliers]
         if self.uses_matrix:
-            assert self.assembled is not None
-            pattern = self.assembled.pattern
-            lanes = launch.lanes(pattern.width)
+            assert self.assembler is not None
+            pattern = self.assembler.pattern
+            lanes = launch.lanes(pattern.mean_row_length)
             threads = launch.padded(m.slots * lanes)
-            self.curvature_rows = shaped(w.rows, (1, m.worlds, threads // w.warp))
+            self.curvature_rows = leading_view(w.rows, (1, m.worlds, threads // w.warp))
             args = [m.topology, pattern.data, self.matrix, lanes, *rest, out, self.curvature_rows]
             launch(self.gather.matrix_product, (m.worlds, threads), args)
         else:

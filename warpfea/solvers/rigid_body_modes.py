@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from ..base.launch import Launcher
     from ..model.model import Model
     from ..terms.workspace import Workspace
-    from .assembled import Pattern
+    from .matrix_assembly import Pattern
     from .residual import Residual
 
 __all__ = ["RigidBodyModes", "lanes_for", "mode_bodies"]

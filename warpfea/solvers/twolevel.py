@@ -37,11 +37,11 @@ from ..kernels.solvers.levels_build import FACTOR_LANES, build_kernels
 from ..kernels.solvers.pcg import pcg_kernels
 from ..model.state import words_of
 from ..terms.term import CachedInputs
-from .assembled import chunk_of, shaped
 from .band import MAX_FULL_FACTOR_SLOTS, BandFactor, find_band
 from .dense import gauss_jordan
 from .level_arrays import LevelArrays
 from .levels import GROUP_SLOTS, Level, make_levels
+from .matrix_assembly import leading_view, worlds_per_chunk
 from .reuse import ReuseRule
 from .rigid_body_modes import RigidBodyModes, mode_bodies
 
@@ -78,8 +78,8 @@ class TwoLevel:
     ) -> None:
         self.model, self.work, self.launch, self.residual = model, work, launch, residual
         self.storage = storage or model.dtype
-        assert residual.assembled is not None
-        self.assembled = residual.assembled
+        assert residual.assembler is not None
+        self.assembler = residual.assembler
         self.kernels = level_kernels(model.dtype, self.storage)
         self.setup_kernels = build_kernels(model.dtype, self.storage)
         self.blocks = block_kernels(model.dtype)
@@ -88,9 +88,9 @@ class TwoLevel:
         self.levels = self._levels(kind)
         self.ctx, self.terms = residual.ctx, model.terms
         for term in self.terms:
-            term.allocate_blocks(self.ctx, self.assembled, projected=True)
+            term.allocate_blocks(self.ctx, self.assembler, projected=True)
         self.terms_add = model.terms.traits.pooled or model.terms.traits.constraint_rows  # terms add to the matrix
-        first, pattern = self.levels[0], self.assembled.pattern
+        first, pattern = self.levels[0], self.assembler.pattern
         band = first.band
         self.band = BandFactor(model, work, launch, band, pattern) if band is not None else None
         # factors of the operator's matrix if cheap, or for static equilibria of beams (the matrix made here then only
@@ -98,7 +98,7 @@ class TwoLevel:
         one = self.storage == model.dtype and not residual.ctx.inertia and first.slots <= MAX_FULL_FACTOR_SLOTS
         order = find_band(model) if first.dense and one else band
         # (a GPU factors the band of a small model, joint terms included, in about the time of its matrix)
-        quick = order is not None and (order.cheap or (band is not None and model.device.is_cuda))
+        quick = order is not None and (order.cheap_to_factorise or (band is not None and model.device.is_cuda))
         traits = model.terms.traits
         whole = not self.terms_add or (model.device.is_cuda and not traits.pooled and residual.matrix_reuse == 0)
         self.follows_matrix = quick and residual.uses_matrix and whole and not traits.tangent
@@ -112,11 +112,11 @@ class TwoLevel:
             self.half = work.array("level 0 half", (model.worlds, 3 * model.slots if first.dense else 0), model.types.T)
         # matrix of a chunk of worlds; with factors a GPU needs more worlds at once to be busy
         share = 2 if self.follows_matrix and self.terms_add else 1
-        self.chunk = model.worlds
+        self.worlds_per_chunk = model.worlds
         if not mode_bodies(model):
-            work.chunks["preconditioner matrix"] = lambda worlds: min(worlds, share * chunk_of(worlds))
-            self.chunk = work.chunks["preconditioner matrix"](model.worlds)
-        self.value = self.assembled.values("preconditioner matrix", self.chunk)
+            work.chunks["preconditioner matrix"] = lambda worlds: min(worlds, share * worlds_per_chunk(worlds))
+            self.worlds_per_chunk = work.chunks["preconditioner matrix"](model.worlds)
+        self.value = self.assembler.allocate_values("preconditioner matrix", self.worlds_per_chunk)
         self.chosen = work.array("preconditioner chunk", (model.worlds,), wp.int32)
         free = model.group_count > 0  # bodies whose momentum is conserved by the translation correction
         if self.follows_matrix and self.band and model.dtype == "float64" and residual.ctx.inertia and not free:
@@ -136,12 +136,12 @@ class TwoLevel:
         """Rigid body modes of bodies coupled by terms, and the term modules that they need."""
         if not mode_bodies(self.model):
             return None, set()
-        out = RigidBodyModes(self.model, self.work, self.launch, self.residual, self.assembled.pattern)
+        out = RigidBodyModes(self.model, self.work, self.launch, self.residual, self.assembler.pattern)
         return out, out.modules().union(*(term.allocate_mode_coupling(self.ctx, out) for term in self.terms))
 
     def _levels(self, kind: str) -> list[Level]:
         """Levels of a kind of preconditioner: "two-level", "tiles" (without a coarse space) or "banded"."""
-        model, pattern = self.model, self.assembled.pattern
+        model, pattern = self.model, self.assembler.pattern
         if kind == "banded":
             band = find_band(model) or find_band(model, any_width=True)
             return [Level(pattern, model.slots, False, level_struct(model.dtype)(), band=band)]
@@ -179,7 +179,7 @@ class TwoLevel:
     def modules(self) -> set[wp.Module]:
         """Modules launched."""
         k = self.kernels
-        out = {k.module, self.reuse.kernels.module, self.blocks.module} | self.assembled.modules() | self.coupling
+        out = {k.module, self.reuse.kernels.module, self.blocks.module} | self.assembler.modules() | self.coupling
         out |= self.band.modules() if self.band else {self.setup_kernels.module}
         return out.union(*(arrays.dense.modules() for arrays in self.arrays if not self.band and arrays.dense))
 
@@ -298,7 +298,7 @@ class TwoLevel:
             args = [level.data, 1, coarse, v["z"], keep, step, active, v["d"], v["x"]]
             self.launch(self.kernels.chebyshev, dim, args)
             if k < CHEBYSHEV_STEPS - 1:
-                lanes = self.launch.lanes(level.pattern.width)
+                lanes = self.launch.lanes(level.pattern.mean_row_length)
                 args = [level.pattern.data, arrays.value, v["d"], lanes, active, v["r"]]
                 threads = self.launch.padded(level.slots * lanes)
                 self.launch(self.kernels.subtract_product, (self.model.worlds, threads), args)
@@ -314,13 +314,13 @@ class TwoLevel:
     def _chunks(self, flags: wp.array) -> Iterator[tuple[range, wp.array, wp.array]]:
         """Worlds of each chunk, flags of the worlds chosen by `flags`, and `value` indexed over all worlds."""
         B = self.model.worlds
-        for first in range(0, B, self.chunk):
-            worlds = range(first, min(first + self.chunk, B))
+        for first in range(0, B, self.worlds_per_chunk):
+            worlds = range(first, min(first + self.worlds_per_chunk, B))
             if len(worlds) == B:
                 yield worlds, flags, self.value
                 return
             self.launch(self.blocks.choose_worlds, B, [flags, worlds.start, worlds.stop, self.chosen])
-            yield worlds, self.chosen, self.assembled.view(self.value, first)
+            yield worlds, self.chosen, self.assembler.chunk_view(self.value, first)
 
     def _build(self, *, penalty: bool = False) -> None:
         m, w, launch, reuse = self.model, self.work, self.launch, self.reuse.control
@@ -328,13 +328,13 @@ class TwoLevel:
         # rows are scaled once the penalties are known
         self.reuse.move_point()
         for worlds, flags, value in self._chunks(reuse.build):
-            self.assembled.assemble(
+            self.assembler.assemble(
                 self.reuse.linearisation_point, factors, flags, value, projected=True, worlds=worlds
             )
             if self.terms_add and m.terms.traits.pooled:
                 self._copy_cached()
                 self._add(value, flags, penalties=False)
-            args = [m.topology, self.assembled.pattern.data, value, flags, w.diagonal, w.inverse]
+            args = [m.topology, self.assembler.pattern.data, value, flags, w.diagonal, w.inverse]
             launch(self.blocks.take_diagonal, self.dim, args)
             if m.terms.traits.has_constraints:
                 if penalty:
@@ -355,7 +355,7 @@ class TwoLevel:
         if self.follows_matrix:
             return
         if self.band:
-            self.band.make(value, flags)
+            self.band.factorise(value, flags)
         elif arrays.dense is not None:
             arrays.dense.fill(level.pattern, value, flags)
         else:
@@ -399,17 +399,17 @@ class TwoLevel:
         for term in self.terms:
             if term.penalty == penalties:
                 kept = self.kept[term.name].place if term.name in self.kept else []
-                term.blocks(self.ctx, self.assembled, kept, reuse.dq_dv, flags, value, projected=True)
+                term.blocks(self.ctx, self.assembler, kept, reuse.dq_dv, flags, value, projected=True)
 
     @labelled("build")
     def _factor(self, value: wp.array, flags: wp.array) -> None:
         if self.band and not self.terms_add:
-            self.band.make(value, flags)
+            self.band.factorise(value, flags)
             return
         if self.band:
             for worlds, chosen, out in self._chunks(flags):
                 self._add_to_copy(value, worlds, chosen, out)
-                self.band.make(out, chosen)
+                self.band.factorise(out, chosen)
             return
         dense = self.arrays[0].dense
         assert dense is not None
@@ -420,13 +420,13 @@ class TwoLevel:
 
     def _add_to_copy(self, value: wp.array, worlds: range, flags: wp.array, out: wp.array) -> None:
         """Operator matrix of some worlds with all term contributions."""
-        w, dim = self.work, (len(worlds), 3 * self.assembled.pattern.entries)
+        w, dim = self.work, (len(worlds), 3 * self.assembler.pattern.entry_count)
         rows = slice(worlds.start, worlds.stop)
-        given, copy = (shaped(a, dim, self.model.types.vec3) for a in (value[rows], self.value))
+        given, copy = (leading_view(a, dim, self.model.types.vec3) for a in (value[rows], self.value))
         self.launch(self.residual.vectors.copy_active, dim, [given, flags[rows], copy])
         for term in self.terms:
             live = [array for _, array in term.cached_inputs(self.ctx)]
-            term.blocks(self.ctx, self.assembled, live, w.step.dq_dv, flags, out, projected=False)
+            term.blocks(self.ctx, self.assembler, live, w.step.dq_dv, flags, out, projected=False)
 
     def _invert_tiles(self, level: Level, arrays: LevelArrays, flags: wp.array, *, keep: bool) -> None:
         B, k = self.model.worlds, self.setup_kernels
