@@ -81,8 +81,8 @@ def test_all_of_H_is_factorised(operator):
     work.newton.iterations.zero_()
     newton.residual.evaluate(active)
     newton.residual.assemble_matrix(active)
-    newton.direct._assemble(active, newton.direct.value, projected=False)
-    matrix = newton.direct.assembler.host_csr(newton.direct.value)
+    newton.direct._assemble(active, newton.direct.matrix, projected=False)
+    matrix = newton.direct.assembler.host_csr(newton.direct.matrix)
     v = np.random.default_rng(0).normal(size=(model.slots, 3)) * model.free_host
     work.p.assign(v[None])
     newton.residual.product(work.p, work.Hp, active)
@@ -127,11 +127,13 @@ def test_statics_of_a_slender_beam(data):
 @pytest.mark.slow
 def test_a_column_beyond_its_critical_load(data, monkeypatch):
     """The positive matrix replaces an indefinite H, whose inverse may lead uphill."""
-    from warpfea.solvers.direct import Direct
+    from warpfea.solvers.direct import DirectSolver
 
     uphill = []
-    retreat = Direct._factorise_positive
-    monkeypatch.setattr(Direct, "_factorise_positive", lambda self, world: (uphill.append(world), retreat(self, world)))
+    retreat = DirectSolver._factorise_positive
+    monkeypatch.setattr(
+        DirectSolver, "_factorise_positive", lambda self, world: (uphill.append(world), retreat(self, world))
+    )
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     column = b.add_beam(
         [(0, 0, 0), (0, 0, 1)], elements=6, section=wf.Rectangle(0.1, 0.1), normal=(1, 0, 0),

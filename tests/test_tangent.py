@@ -12,7 +12,7 @@ from warpfea.kernels.elements.with_mass import with_mass_kernel
 
 import warpfea as wf
 from warpfea.mesh.cells import TET_EDGES
-from warpfea.solvers.clusters import make_clusters, make_pool
+from warpfea.solvers.clusters import make_cluster_memory, make_clusters
 
 RHO = 1000.0
 LAWS = {
@@ -136,7 +136,7 @@ def with_mass_product(model, kernel, u, v, p, mass_factor=1e3):
     sim = wf.Simulation(model, dt=1e-3, solver=wf.NewtonPCG(operator="elements"))
     out = wp.zeros((2, clusters.sums), dtype=model.types.vec3, device="cpu")
     args = [block.data, data, *fields_of(model, u, v, p, mass_factor), 1]
-    args += [make_pool(model, sim.stepper.work, midpoint=False), out]
+    args += [make_cluster_memory(model, sim.stepper.work, midpoint=False), out]
     wp.launch(kernel, dim=(2, count), inputs=args, device="cpu")
     total = np.zeros((2, model.slots, 3))
     slot = np.repeat(np.arange(model.slots), np.diff(clusters.topology.start.numpy()))

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from ..model.model import Model
     from ..terms.workspace import Workspace
 
-__all__ = ["ClusterTables", "ModelClusters", "cluster_tables", "make_clusters", "make_pool"]
+__all__ = ["ClusterTables", "ModelClusters", "cluster_tables", "make_cluster_memory", "make_clusters"]
 
 
 @dataclass(eq=False)
@@ -76,7 +76,7 @@ class ModelClusters:
     Attributes:
         blocks: device struct and number of clusters of each block.
         topology: device struct of the slot gather, with the cluster sums as contributions.
-        sums: number of cluster sums.
+        sum_count: number of cluster sums.
     """
 
     blocks: list[tuple[Any, int]]
@@ -106,7 +106,7 @@ def make_clusters(model: Model) -> ModelClusters:
     return ModelClusters(blocks, topo, offset)
 
 
-def make_pool(model: Model, work: Workspace, *, midpoint: bool) -> Any:
+def make_cluster_memory(model: Model, work: Workspace, *, midpoint: bool) -> Any:
     """Device struct of the arrays that replace shared memory on the CPU; empty on CUDA."""
     pool, to_host = pool_struct(model.dtype)(), not model.device.is_cuda
     numbers = max(pool_size(b.cluster, b.slots, 3 if midpoint or b.key.damping == "rate" else 2) for b in model.blocks)

@@ -19,21 +19,22 @@ import warp as wp
 from ..base.launch import labelled
 from ..kernels.solvers.direct import direct_kernels
 from ..terms.follower_loads import FollowerMatrix, Followers
-from .factor import Singular, make_factors
+from .factor import SingularMatrix, make_factors
 
 if TYPE_CHECKING:
     from ..model.state import State
     from ..terms.term import StepContext
     from .residual import Residual
 
-__all__ = ["Direct"]
+__all__ = ["DirectSolver"]
 
 
-class Direct:
-    """See the module. Runs on the host between launches: a step can't be captured as a graph.
+class DirectSolver:
+    """Preconditioner that solves with sparse factors, see the module. Runs on the host between launches: a step can't be captured as a graph.
 
     Attributes:
-        singular: worlds whose last factorisation failed.
+        unverified_worlds: worlds whose new factors have not been used yet: the first solve checks r.H^-1 r >= 0.
+        singular_worlds: worlds whose last factorisation failed.
     """
 
     def __init__(self, ctx: StepContext, residual: Residual) -> None:
@@ -49,8 +50,8 @@ class Direct:
         for term in model.terms:
             term.allocate_blocks(ctx, self.assembler, projected=False)
         self.matrix_storage: wp.array | None = None
-        self.unverified: set[int] = set()
-        self.singular: set[int] = set()
+        self.unverified_worlds: set[int] = set()
+        self.singular_worlds: set[int] = set()
 
     def register(self, state: State) -> None:
         """Stateless."""
@@ -80,12 +81,12 @@ class Direct:
         """No reuse rule."""
 
     @property
-    def followers(self) -> list[FollowerMatrix]:
+    def follower_matrices(self) -> list[FollowerMatrix]:
         """Matrices of the follower loads' items, built on first use."""
         return self.ctx.scratch.get(Followers.name, [])
 
     @property
-    def value(self) -> wp.array:
+    def matrix(self) -> wp.array:
         """Array of the matrix H, allocated on first use."""
         if self.matrix_storage is None:
             self.matrix_storage = self.assembler.allocate_values("direct matrix")
@@ -102,7 +103,7 @@ class Direct:
         if own:
             value = residual.matrix
         else:
-            value = self.value
+            value = self.matrix
             self._assemble(active, value, projected=False)
         for world in worlds:
             self._factorise(int(world), value)
@@ -116,23 +117,23 @@ class Direct:
             term.blocks(self.ctx, self.assembler, live, w.step.dq_dv, flags, value, projected=projected)
 
     def _factorise(self, world: int, value: wp.array) -> None:
-        self.singular.discard(world)
-        self.unverified.add(world)
+        self.singular_worlds.discard(world)
+        self.unverified_worlds.add(world)
         try:
             self.factors.factorise(value, world)
-        except Singular:
-            self._factorise_positive(world)
+        except SingularMatrix:
+            self._factorise_projected(world)
 
-    def _factorise_positive(self, world: int) -> None:
+    def _factorise_projected(self, world: int) -> None:
         """Factorise the positive definite approximation."""
-        self.unverified.discard(world)
+        self.unverified_worlds.discard(world)
         flags = np.zeros(self.model.worlds, dtype=np.int32)
         flags[world] = 1
-        self._assemble(wp.array(flags, dtype=wp.int32, device=self.model.device), self.value, projected=True)
+        self._assemble(wp.array(flags, dtype=wp.int32, device=self.model.device), self.matrix, projected=True)
         try:
-            self.factors.factorise(self.value, world)
-        except Singular:
-            self.singular.add(world)
+            self.factors.factorise(self.matrix, world)
+        except SingularMatrix:
+            self.singular_worlds.add(world)
 
     @labelled("preconditioner")
     def apply(self, r: wp.array, z: wp.array, active: wp.array) -> None:
@@ -145,15 +146,15 @@ class Direct:
 
     def _solve(self, r: wp.array, z: wp.array, world: int) -> bool:
         """Solve in one world. False if the factorisation failed; the first solve verifies it (r.z >= 0)."""
-        if world in self.singular:
+        if world in self.singular_worlds:
             return False
         r_dot_z = self.factors.solve(r, z, world)
-        if world in self.unverified and not r_dot_z >= 0.0:
-            self._factorise_positive(world)
-            if world in self.singular:
+        if world in self.unverified_worlds and not r_dot_z >= 0.0:
+            self._factorise_projected(world)
+            if world in self.singular_worlds:
                 return False
             r_dot_z = self.factors.solve(r, z, world)
-        self.unverified.discard(world)
+        self.unverified_worlds.discard(world)
         if not np.isfinite(r_dot_z):
-            self.singular.add(world)
+            self.singular_worlds.add(world)
         return bool(np.isfinite(r_dot_z))

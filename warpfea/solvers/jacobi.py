@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 __all__ = ["Jacobi", "JacobiLoop"]
 
 ACCELERATIONS = ("secants", "anderson", "chebyshev", "none")
-MAX_GROWTH = 10.0
+MAX_RESIDUAL_GROWTH = 10.0
 """Largest accepted ratio of the final to the initial residual of a step."""
 MAX_VIOLATION = 1e-3
 """Largest accepted constraint violation over the model's size."""
@@ -107,7 +107,7 @@ class Jacobi:
             raise ModelError(f"Jacobi: penalty = {self.penalty!r} must be positive")
 
     @property
-    def newton(self) -> NewtonPCG:
+    def newton_options(self) -> NewtonPCG:
         """Options of the Newton loop that this loop inherits."""
         return NewtonPCG(
             tol=self.tol,
@@ -128,7 +128,7 @@ class Jacobi:
 
     def tolerance(self, dtype: str) -> float:
         """Relative tolerance for precision "float64" or "float32"."""
-        return self.newton.tolerance(dtype)
+        return self.newton_options.tolerance(dtype)
 
 
 class JacobiLoop(NewtonLoop):
@@ -142,7 +142,7 @@ class JacobiLoop(NewtonLoop):
         constraint_tol: float,
         inversion: str = "refuse",
     ) -> None:
-        super().__init__(ctx, options.newton, constraint_tol=constraint_tol, inversion=inversion)
+        super().__init__(ctx, options.newton_options, constraint_tol=constraint_tol, inversion=inversion)
         model, work = ctx.model, ctx.work
         self.methods = {"solver": "jacobi"}
         # multipliers are updated once, on acceptance: no outer loop, and convergence includes violations
@@ -155,8 +155,8 @@ class JacobiLoop(NewtonLoop):
         self.descent_kernels = jacobi_kernels(model.dtype, model.terms.traits, options.acceleration)
         B, m = model.worlds, PAIRS
         shape = (m, B, model.slots) if self.uses_secants else (1, 1, 1)
-        self.moves = work.array("jacobi moves", shape, model.types.vec3)
-        self.changes = work.array("jacobi changes", shape, model.types.vec3)
+        self.previous_moves = work.array("jacobi moves", shape, model.types.vec3)
+        self.residual_changes = work.array("jacobi changes", shape, model.types.vec3)
         shapes: dict[str, Any] = {
             "gram": (B, m, m),
             "factor": (B, m, m),
@@ -165,7 +165,7 @@ class JacobiLoop(NewtonLoop):
             "sums": (2 * m, B),
         }
         self.control = work.struct(jacobi_struct(), B, **shapes)
-        self.control.growth = MAX_GROWTH
+        self.control.growth = MAX_RESIDUAL_GROWTH
         self.control.gap = MAX_VIOLATION * model.size
         self.control.step = STEP_LENGTH[options.acceleration]
         least = LARGEST_EIGENVALUE / max(4.0, 0.25 * options.iterations**2)
@@ -209,20 +209,30 @@ class JacobiLoop(NewtonLoop):
     def _compute_step(self, active: wp.array) -> None:
         """Write the next move p to work.direction."""
         m, w, k, launch, ctl = self.model, self.work, self.descent_kernels, self.launch, self.control
-        args = [w.newton, w.gradient, m.topology.free, w.direction, w.p, w.r, self.moves, self.changes, w.rows]
+        args = [
+            w.newton,
+            w.gradient,
+            m.topology.free,
+            w.direction,
+            w.p,
+            w.r,
+            self.previous_moves,
+            self.residual_changes,
+            w.rows,
+        ]
         launch(k.store_pair, self.dim, args)
         if self.uses_secants:
             self.residual.reduce(w.rows, 2 * PAIRS, active, ctl.sums)
             launch(k.solve_gram, m.worlds, [w.newton, ctl])
-            launch(k.project, self.dim, [w.newton, ctl, self.changes, w.r])
+            launch(k.project, self.dim, [w.newton, ctl, self.residual_changes, w.r])
         elif self.acceleration == "chebyshev":
             launch(k.recursion, m.worlds, [w.newton, ctl])
         self.preconditioner.apply(w.r, w.z, active)
         if self.acceleration == "secants":
-            launch(k.conjugate_rows, self.dim, [w.newton, self.changes, w.z, w.rows])
+            launch(k.conjugate_rows, self.dim, [w.newton, self.residual_changes, w.z, w.rows])
             self.residual.reduce(w.rows, PAIRS, active, ctl.sums)
             launch(k.conjugate, m.worlds, [w.newton, ctl])
-        launch(k.combine, self.dim, [w.newton, ctl, self.moves, w.z, w.direction])
+        launch(k.combine, self.dim, [w.newton, ctl, self.previous_moves, w.z, w.direction])
         if self.pcg.deflate:  # a loose tolerance then conserves the momentum of free bodies
             args = [w.newton, w.step.mass_factor, m.groups.lumped, w.gradient, m.topology.free, w.direction, w.r]
             launch(k.remaining_momentum, self.dim, args)

@@ -33,15 +33,15 @@ class LevelArrays:
         self.value = work.array(f"{name} matrix", (B, level.pattern.entry_count), model.types.mat33) if depth else None
         if level.band is not None:
             return
-        parts = level.parts if by_component else None
-        self.dense = DenseInverse(model, work, launch, name, 3 * n, storage, parts) if level.dense else None
+        components = level.components if by_component else None
+        self.dense = DenseInverse(model, work, launch, name, 3 * n, storage, components) if level.dense else None
         if not level.dense:
             shape = (B, level.tiles, TILE, TILE)
             self.matrix = work.array(f"{name} inverse", shape, T)
-            self.stored = work.array(f"{name} stored", shape, S) if other else self.matrix
-            self.root = work.array(f"{name} root", shape[:3] if other else (1, 1, 1), T)
-            self.diagonal = work.array(f"{name} pivots", (B, level.tiles, TILE), T)
-            self.column = work.array(f"{name} column", (B, level.tiles, TILE), T)
+            self.stored_inverse = work.array(f"{name} stored", shape, S) if other else self.matrix
+            self.inverse_root_diagonal = work.array(f"{name} root", shape[:3] if other else (1, 1, 1), T)
+            self.pivot_diagonal = work.array(f"{name} pivots", (B, level.tiles, TILE), T)
+            self.pivot_column = work.array(f"{name} column", (B, level.tiles, TILE), T)
         self.vectors: dict[str, wp.array] = {}
         if depth:
             names = ("r", "x") if level.dense else ("r", "x", "z", "d")

@@ -42,7 +42,7 @@ class Level:
         pattern: pattern of its matrix.
         slots: number of slots.
         dense: bottom level, inverted as a whole; no tiles, no groups.
-        parts: uncoupled components of a dense level.
+        components: uncoupled components of a dense level.
         band: the only level, factored as a whole; no tiles, no groups.
         data: device struct of tiles and groups.
         tiles, groups: their numbers; 0 groups: no level below.
@@ -57,7 +57,7 @@ class Level:
     groups: int = 0
     galerkin: tuple[wp.array, wp.array, wp.array] | None = None
     band: Band | None = None
-    parts: DenseComponents | None = None
+    components: DenseComponents | None = None
 
     @property
     def whole(self) -> bool:
@@ -98,13 +98,15 @@ def make_levels(model: Model, pattern: Pattern, *, coarse: bool = True, by_compo
     bottom = BOTTOM_SLOTS["cuda" if model.device.is_cuda else "cpu"]
     for depth in range(MAX_LEVELS):
         n = pattern.graph.shape[0]
-        parts = DenseComponents.of(model, pattern) if by_component else None
+        components = DenseComponents.from_pattern(model, pattern) if by_component else None
         small = n <= (bottom if depth else MAX_FULL_FACTOR_SLOTS)
-        if parts and not small:  # one matrix per component
-            entries = parts.count * parts.most**2
-            small = entries <= (bottom**2 if depth else COMPONENT_PAIRS if parts.most <= MAX_FULL_FACTOR_SLOTS else 0)
+        if components and not small:  # one matrix per component
+            entries = components.count * components.max_slots**2
+            small = entries <= (
+                bottom**2 if depth else COMPONENT_PAIRS if components.max_slots <= MAX_FULL_FACTOR_SLOTS else 0
+            )
         if small:
-            levels.append(Level(pattern, n, True, level_struct(model.dtype)(), parts=parts))
+            levels.append(Level(pattern, n, True, level_struct(model.dtype)(), components=components))
             return levels
         # larger groups if the next level then becomes the bottom: one dense product costs less than more levels
         large = 2 * GROUP_SLOTS

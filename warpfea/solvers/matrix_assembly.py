@@ -44,7 +44,7 @@ class Pattern:
 
     graph: sp.csr_matrix
     data: Any
-    upper: np.ndarray
+    upper_entries: np.ndarray
 
     def find_upper(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """Indices into `upper` of entries (row, column) on or above the diagonal; -1 for others."""
@@ -55,7 +55,7 @@ class Pattern:
         return np.where(key[at] == wanted, at, -1)
 
     @property
-    def width(self) -> int:
+    def mean_row_length(self) -> int:
         """Mean number of blocks in a row."""
         return self.entry_count // max(self.graph.shape[0], 1)
 

@@ -18,7 +18,7 @@ from ..kernels.solvers.newton_control import FLOOR_LANES
 from ..kernels.solvers.perturbation import SAMPLES, perturbation_kernels
 from ..kernels.solvers.vectors import vector_kernels
 from .bicgstab import BiCGStab
-from .direct import Direct
+from .direct import DirectSolver
 from .pcg import PCG
 from .preconditioner import NAMES, choose, make
 from .residual import Residual
@@ -189,7 +189,7 @@ class NewtonLoop:
         banded = kind == "banded" and model.device.is_cuda
         assembled = kind not in ("deflated", "block-jacobi")
         self.residual = Residual(ctx, operator=operator, assembled=assembled, banded=banded)
-        self.direct = Direct(ctx, self.residual) if direct else None
+        self.direct = DirectSolver(ctx, self.residual) if direct else None
         self.preconditioner = self.direct or make(
             kind, options.preconditioner_dtype, model, work, launch, self.residual
         )

@@ -18,7 +18,7 @@ from ..kernels.step.gather import RESIDUAL_ROWS, gather_kernels
 from ..kernels.step.midpoint import stage_kernels
 from ..kernels.terms.constraints import constraint_struct
 from ..terms.elements import Elements
-from .clusters import ModelClusters, make_clusters, make_pool
+from .clusters import ModelClusters, make_cluster_memory, make_clusters
 from .matrix_assembly import MatrixAssembler, leading_view
 from .reuse import ReuseRule
 
@@ -106,7 +106,7 @@ class Residual:
             if "clusters" not in model.cache:
                 model.cache["clusters"] = make_clusters(model)
             self.clusters = model.cache["clusters"]
-            self.pool = make_pool(model, work, midpoint=ctx.midpoint)
+            self.cluster_memory = make_cluster_memory(model, work, midpoint=ctx.midpoint)
             forms = [block.key.damping if ctx.inertia else None for block in model.blocks]
             self.products = [
                 block.with_mass_product(model.dtype, form, ctx.midpoint, ctx.dissipation > 0.0)
@@ -304,7 +304,7 @@ class Residual:
                     active,
                     p,
                 ]
-                args += [lanes, self.pool, w.contribution]
+                args += [lanes, self.cluster_memory, w.contribution]
                 launch(kernel, (m.worlds, count * lanes), args, block_dim=block.cluster)
         elif self.uses_predicted_stress:
             self.elements.predicted_stress_tangent(self.ctx, p, active)

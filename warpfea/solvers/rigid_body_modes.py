@@ -116,7 +116,7 @@ class RigidBodyModes:
         lanes = self.parts.shape[2]
         args = [self.bodies, self.pattern.data, m.topology.free, value, flags, lanes, self.parts]
         self.launch(k.body_sums, self.parts.shape[:3], args)
-        self.launch(k.fill, (m.worlds, dense.size), [flags, self.parts, dense.scale, dense.matrix])
+        self.launch(k.fill, (m.worlds, dense.padded_size), [flags, self.parts, dense.matrix_diagonal, dense.matrix])
 
     def invert(self, flags: wp.array) -> None:
         """Invert the matrix after terms have added to it."""

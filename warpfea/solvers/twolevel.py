@@ -258,7 +258,7 @@ class TwoLevel:
             lanes = self.launch.lanes(3 * n)
             dim = (B, self.launch.padded(3 * n * lanes))
             for upper, given, out in ((0, flat_r, self.half), (1, self.half, flat_x)):
-                args = [dense.stored, dense.root, upper, lanes, given, active, out]
+                args = [dense.stored_inverse, dense.inverse_root_diagonal, upper, lanes, given, active, out]
                 self.launch(self.kernels.apply_triangle, dim, args)
             return
         dense.apply(flat_r, flat_x, active)
@@ -271,7 +271,7 @@ class TwoLevel:
         share = 4 if self.model.device.is_cuda else 1
         first_group = self.launch.padded(share * TILE_SLOTS * level.tiles)
         lanes = self.launch.lanes(GROUP_SLOTS)
-        args = [level.data, arrays.stored, arrays.root, self.by_row, share, lanes, first_group]
+        args = [level.data, arrays.stored_inverse, arrays.inverse_root_diagonal, self.by_row, share, lanes, first_group]
         threads = first_group + (0 if last else lanes * level.groups)
         self.launch(self.kernels.smooth, (self.model.worlds, threads), [*args, r, active, z, coarse])
         if last:
@@ -364,7 +364,7 @@ class TwoLevel:
     def _fill(self, depth: int, value: wp.array, flags: wp.array) -> None:
         """Fill the tiles of a level and the matrix of the next one."""
         m, level, arrays = self.model, self.levels[depth], self.arrays[depth]
-        args = [level.data, level.pattern.data, value, flags, arrays.diagonal, arrays.matrix]
+        args = [level.data, level.pattern.data, value, flags, arrays.pivot_diagonal, arrays.matrix]
         self.launch(self.setup_kernels.fill_tiles, (m.worlds, level.tiles, TILE_SLOTS), args)
         if depth + 1 < len(self.levels):
             assert level.galerkin is not None
@@ -415,7 +415,7 @@ class TwoLevel:
         assert dense is not None
         lanes = FACTOR_LANES if self.model.device.is_cuda else 1
         dense.fill(self.levels[0].pattern, value, flags)
-        args = [lanes, dense.scale, flags, dense.left, dense.top, dense.matrix]
+        args = [lanes, dense.matrix_diagonal, flags, dense.left_panel, dense.top_panel, dense.matrix]
         self.launch(self.setup_kernels.factor_dense, self.model.worlds * lanes, args, block_dim=FACTOR_LANES)
 
     def _add_to_copy(self, value: wp.array, worlds: range, flags: wp.array, out: wp.array) -> None:
@@ -431,8 +431,15 @@ class TwoLevel:
     def _invert_tiles(self, level: Level, arrays: LevelArrays, flags: wp.array, *, keep: bool) -> None:
         B, k = self.model.worlds, self.setup_kernels
         gauss_jordan(self.launch, k, level.tiles, arrays, arrays.matrix, flags, keep=keep)
-        if arrays.stored is not arrays.matrix:
-            args = [level.tiles, arrays.diagonal, arrays.matrix, flags, arrays.root, arrays.stored]
+        if arrays.stored_inverse is not arrays.matrix:
+            args = [
+                level.tiles,
+                arrays.pivot_diagonal,
+                arrays.matrix,
+                flags,
+                arrays.inverse_root_diagonal,
+                arrays.stored_inverse,
+            ]
             self.launch(k.store_tiles, (B, level.tiles, TILE), args)
 
 
