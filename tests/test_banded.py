@@ -12,7 +12,7 @@ import warpfea as wf
 from warpfea.builder.scene import find
 from warpfea.simulation.checkpoint import save_checkpoint
 from warpfea.solvers.band import MAX_AUTO_WIDTH, Band, find_band
-from warpfea.solvers.preconditioner import choose
+from warpfea.solvers.preconditioner import choose_preconditioner
 from warpfea.studies.bench.problems import PROBLEMS
 
 SIZES = {"bar": (12, 1, 1), "beam": 60, "plate": (12, 1)}
@@ -164,7 +164,7 @@ def test_on_a_gpu_it_is_for_small_models():
         return b.finalize(device="cpu")
 
     small, large = beam(16), beam(200)
-    assert choose("auto", None, small) == "banded"
+    assert choose_preconditioner("auto", None, small) == "banded"
     cuda = SimpleNamespace(is_cuda=True)
     with pytest.MonkeyPatch.context() as patch:
         for model in (small, large):
@@ -174,10 +174,10 @@ def test_on_a_gpu_it_is_for_small_models():
         patch.setattr(
             type(small), "array", lambda self, name, values, dtype: wp.array(values, dtype=dtype, device="cpu")
         )
-        assert choose("banded", None, small) == "banded"
-        assert choose("auto", None, small) == "two-level"
+        assert choose_preconditioner("banded", None, small) == "banded"
+        assert choose_preconditioner("auto", None, small) == "two-level"
         with pytest.raises(wf.ModelError, match=r"on a GPU for small models with a narrow band; .* take 'auto' or"):
-            choose("banded", None, large)
+            choose_preconditioner("banded", None, large)
 
 
 def test_wider_bands_are_kept_for_longer():

@@ -12,7 +12,7 @@ import warp as wp
 from ..base.checks import is_number, number_hint
 from ..base.errors import ModelError
 from ..kernels.step.adaptive import CONTROL_STATE, STEP_STATISTICS, adaptive_kernels, adaptive_struct
-from ..solvers.newton import EPS, NewtonPCG
+from ..solvers.newton import MACHINE_EPSILON, NewtonPCG
 from .integrators import INTEGRATORS, Integrator
 from .sync_times import SyncTimes
 
@@ -132,7 +132,7 @@ class StepSizeControl:
         self.control.kept = ctx.state.register("adaptive", wp.float64, (len(CONTROL_STATE),))
         self.means = ctx.state.register("adaptive_means", model.types.vec3, (model.slots,))
         self.control.tolerance = options.error * float(model.size)
-        self.control.eps = EPS[model.dtype]
+        self.control.eps = MACHINE_EPSILON[model.dtype]
         self.control.max_tries = max_tries
 
     def set_interval(self, time: np.ndarray) -> None:

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from ..base.launch import Launcher
     from ..model.model import Model
     from ..model.state import State
-    from ..solvers.residual import Reducer
+    from ..solvers.residual import RowReducer
     from ..terms.workspace import Workspace
     from .integrators import Integrator
 
@@ -23,7 +23,7 @@ class Predictor:
     """Velocity extrapolation in the order with the smallest error in the last step; the history is in the state."""
 
     def __init__(
-        self, model: Model, work: Workspace, launch: Launcher, reduce: Reducer, state: State, module: wp.Module,
+        self, model: Model, work: Workspace, launch: Launcher, reduce: RowReducer, state: State, module: wp.Module,
         *, scheme: Integrator,
     ) -> None:  # fmt: skip
         self.model, self.work, self.launch, self.reduce, self.state = model, work, launch, reduce, state

@@ -115,7 +115,7 @@ class Simulation(RunStatistics):
         energy_growth: str = "refuse",
         on_compile: Callable[[int, int, str], None] | None = None,
     ) -> None:
-        scheme, options = integrators.get(integrator), solvers.get(solver)
+        scheme, options = integrators.get(integrator), solvers.solver_options(solver)
         check_model(model)
         if not scheme.static:
             require_density(model.bodies, "motion")

@@ -225,7 +225,7 @@ class TangentOperator:
         if not terms:
             return np.zeros(m.worlds, dtype=bool)
         every, u = self.flags(np.ones(m.worlds)), w.u.numpy().copy()  # a view on the CPU
-        gather = self.residual.gather.gather_force
+        gather = self.residual.gather_kernels.gather_force
 
         def gathered(call: str, pool: wp.array, *more: Any) -> np.ndarray:
             pool.zero_()
@@ -268,7 +268,7 @@ def _find_negative_curvature(
     """
     m = probe.model
     solver = probe.sim.solver
-    kappa = solver.kappa(m.dtype) if m.constraints and isinstance(solver, NewtonPCG) else 0.0
+    kappa = solver.penalty_ratio(m.dtype) if m.constraints and isinstance(solver, NewtonPCG) else 0.0
     rounding = (roundings or CURVATURE_ROUNDINGS) * (1.0 + kappa) * float(np.finfo(m.dtype).eps)
     going = np.array([not reason for reason in out.reasons])
     random = np.random.default_rng(1).standard_normal((m.slots, 3))

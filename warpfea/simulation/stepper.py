@@ -17,7 +17,7 @@ from ..kernels.step.energy_ledger import LEDGER_ROWS
 from ..kernels.step.step import step_kernels
 from ..kernels.step.step_control import REPORT
 from ..model.state import State
-from ..solvers import Jacobi, NewtonPCG, make_loop
+from ..solvers import Jacobi, NewtonPCG, make_solver_loop
 from ..terms.checks import check_stored_energy
 from ..terms.term import StepContext, Term
 from ..terms.workspace import Workspace
@@ -85,7 +85,7 @@ class Stepper:
             midpoint=midpoint, dissipation=loss, accelerated=integrator.accelerated,
         )  # fmt: skip
         self.terms.allocate(self.work, self.ctx)
-        self.newton = make_loop(self.ctx, solver, constraint_tol=constraint_tol, inversion=inversion)
+        self.newton = make_solver_loop(self.ctx, solver, constraint_tol=constraint_tol, inversion=inversion)
         self.newton.register(state)
         if model.terms.traits.unilateral:  # contact energy, which is not evaluated at rest
             state.register("predictor_potential", wp.float64)
@@ -97,7 +97,9 @@ class Stepper:
             self.predictor = Predictor(model, self.work, self.launch, *more, scheme=integrator)
         self.dim = (model.worlds, model.slots)
         if not integrator.static and isinstance(solver, NewtonPCG):
-            self.newton.first_iterates = [partial(self._start_from_candidate, kind) for kind in FIRST_ITERATES]
+            self.newton.first_iterate_candidates = [
+                partial(self._start_from_candidate, kind) for kind in FIRST_ITERATES
+            ]
         self.initial_conditions = (
             ConsistentInitialConditions(self.ctx, self.newton.residual, integrator) if integrator.accelerated else None
         )
@@ -181,7 +183,7 @@ class Stepper:
         """Kinetic energy, strain energy and gravity potential of the state, (worlds, 3), J."""
         m = self.model
         rows = wp.zeros((1, m.worlds, m.slots), dtype=wp.float64, device=m.device)
-        kernel = self.newton.residual.gather.mass_product
+        kernel = self.newton.residual.gather_kernels.mass_product
         Launcher(m.device)(kernel, self.dim, [m.topology, self.state.velocity, rows])
         u = self.state.displacement.numpy().astype(float)
         pull = -np.einsum("bc,bs,bsc->b", m.terms.dead.gravity.numpy(), m.masses.of_worlds(m.worlds), u)

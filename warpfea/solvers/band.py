@@ -159,10 +159,10 @@ class BandFactor:
         An indefinite matrix is shifted by multiples of its diagonal until it is positive definite.
         """
         self.launch(self.kernels.begin, self.worlds, [active, self.pending, self.diagonal_shift])
-        self._factor(value)
-        wp.capture_while(self.any_retry, self._factor, value=value)
+        self._try_to_factorise(value)
+        wp.capture_while(self.any_retry, self._try_to_factorise, value=value)
 
-    def _factor(self, value: wp.array) -> None:
+    def _try_to_factorise(self, value: wp.array) -> None:
         b, k, launch = self.band, self.kernels, self.launch
         self.any_retry.zero_()
         if self.by_thread_block:

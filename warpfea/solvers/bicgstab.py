@@ -63,7 +63,7 @@ class BiCGStab(PCG):
         m, active, reduce = self.model, w.pcg.active, self.residual.reduce
         self._precondition(w.p, self.y, active)
         self.residual.product(self.y, w.Hp, active)
-        launch(self.residual.vectors.dot_rows, self.dim, [self.shadow_residual, w.Hp, active, w.rows])
+        launch(self.residual.vector_kernels.dot_rows, self.dim, [self.shadow_residual, w.Hp, active, w.rows])
         reduce(w.rows, 1, active, bi.sums)
         launch(k.first_length, m.worlds, [w.pcg, bi])
         launch(k.first_step, self.dim, [w.pcg, bi, self.y, w.Hp, w.direction, w.r])

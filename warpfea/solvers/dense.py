@@ -132,7 +132,7 @@ class DenseInverse:
         self.launch(self.setup_kernels.fill_dense, (self.worlds, self.padded_size // 3), args)
 
     def invert(self, flags: wp.array, *, keep: bool, reduce: Any) -> None:
-        """Invert in the flagged worlds; `reduce` sums rows (residual.Reducer)."""
+        """Invert in the flagged worlds; `reduce` sums rows (residual.RowReducer)."""
         B, N, k, launch = self.matrix_count, self.padded_size, self.setup_kernels, self.launch
         if self.components:  # scattered by `fill`
             flags = self.component_flags

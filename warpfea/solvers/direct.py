@@ -30,7 +30,7 @@ __all__ = ["DirectSolver"]
 
 
 class DirectSolver:
-    """Preconditioner that solves with sparse factors, see the module. Runs on the host between launches: a step can't be captured as a graph.
+    """Preconditioner by sparse factors, see the module; on the host: a step can't be captured as a graph.
 
     Attributes:
         unverified_worlds: worlds whose new factors have not been used yet: the first solve checks r.H^-1 r >= 0.
@@ -97,11 +97,13 @@ class DirectSolver:
         """Factorise H in the active worlds."""
         residual = self.residual
         own = self.elements_only and residual.uses_matrix
-        worlds = np.flatnonzero((residual.reuse.control.build if own and residual.matrix_reuse else active).numpy())
+        worlds = np.flatnonzero(
+            (residual.matrix_reuse_rule.control.build if own and residual.matrix_reuse_level else active).numpy()
+        )
         if not len(worlds):
             return
         if own:
-            value = residual.matrix
+            value = residual.operator_matrix
         else:
             value = self.matrix
             self._assemble(active, value, projected=False)

@@ -146,7 +146,7 @@ class JacobiLoop(NewtonLoop):
         model, work = ctx.model, ctx.work
         self.methods = {"solver": "jacobi"}
         # multipliers are updated once, on acceptance: no outer loop, and convergence includes violations
-        self.classical = False
+        self.outer_multipliers = False
         work.newton.constraint_tol = constraint_tol
         assert isinstance(self.preconditioner, TwoLevel)
         self.preconditioner.rebuild_cost = REBUILD_COST
@@ -179,9 +179,9 @@ class JacobiLoop(NewtonLoop):
         """Iterate and report cost and reduction to the reuse rule."""
         w = self.work
         self.launch(self.descent_kernels.begin, self.model.worlds, [w.newton, self.control])
-        self._reduce_flags(w.newton.active, self.iterating)
-        wp.capture_while(self.iterating, self._iterate)
-        self._if_rare(self._check_inversion)
+        self._reduce_flags(w.newton.active, self.any_iterating)
+        wp.capture_while(self.any_iterating, self._iterate)
+        self._run_if_rare(self._check_inversion)
         self.launch(
             self.descent_kernels.report_cost, self.model.worlds, [w.newton, self.control, w.pcg, w.step.running]
         )
@@ -192,7 +192,7 @@ class JacobiLoop(NewtonLoop):
         w, k, launch = self.work, self.descent_kernels, self.launch
         active = w.newton.active
         self._compute_step(active)
-        if self.limited:
+        if self.limits_step:
             launch(self.kernels.free_step, self.model.worlds, [w.newton])
         for term in self.terms:
             if term.traits.limited:  # other terms predict multipliers, for Newton's method only
@@ -203,7 +203,7 @@ class JacobiLoop(NewtonLoop):
         if self.terms.traits.stored:
             self._call_terms("accept_trial", active)
             self._call_terms("update_frozen", active)
-        self._reduce_flags(active, self.iterating)
+        self._reduce_flags(active, self.any_iterating)
 
     @labelled("vectors")
     def _compute_step(self, active: wp.array) -> None:
@@ -233,7 +233,7 @@ class JacobiLoop(NewtonLoop):
             self.residual.reduce(w.rows, PAIRS, active, ctl.sums)
             launch(k.conjugate, m.worlds, [w.newton, ctl])
         launch(k.combine, self.dim, [w.newton, ctl, self.previous_moves, w.z, w.direction])
-        if self.pcg.deflate:  # a loose tolerance then conserves the momentum of free bodies
+        if self.pcg.deflate_translations:  # a loose tolerance then conserves the momentum of free bodies
             args = [w.newton, w.step.mass_factor, m.groups.lumped, w.gradient, m.topology.free, w.direction, w.r]
             launch(k.remaining_momentum, self.dim, args)
             self.pcg.correct_translations(active)

@@ -18,18 +18,18 @@ from .matrix_assembly import Pattern, make_pattern
 if TYPE_CHECKING:
     from ..model.model import Model
 
-__all__ = ["BOTTOM_SLOTS", "GROUP_SLOTS", "Level", "make_levels"]
+__all__ = ["GROUP_SLOTS", "MAX_BOTTOM_SLOTS", "Level", "make_levels"]
 
 GROUP_SLOTS = 64
 """Maximum slots of a group. Its affine functions are 4 slots of the next level, about 1/16 of the unknowns."""
-SMALL_GROUPS = (16, 32)
-SMALL_COARSE = 48
+SMALL_GROUP_SLOTS = (16, 32)
+MAX_SMALL_COARSE_SLOTS = 48
 """Coarse level size up to which smaller groups are used: a small slender body has too few groups of 64 slots to bend (a
 cantilever of 180 slots takes half the iterations)."""
-BOTTOM_SLOTS = {"cpu": 160, "cuda": 1344}
+MAX_BOTTOM_SLOTS = {"cpu": 160, "cuda": 1344}
 """Largest coarse level inverted as one dense matrix, slots by device; on CUDA this is cheaper than the launches of
 further levels."""
-COMPONENT_PAIRS = 1344**2
+MAX_COMPONENT_PAIRS = 1344**2
 """Maximum slot pairs in components of up to MAX_FULL_FACTOR_SLOTS slots that are each inverted as a whole."""
 MAX_LEVELS = 12
 
@@ -41,28 +41,28 @@ class Level:
     Attributes:
         pattern: pattern of its matrix.
         slots: number of slots.
-        dense: bottom level, inverted as a whole; no tiles, no groups.
+        is_dense: bottom level, inverted as a whole; no tiles, no groups.
         components: uncoupled components of a dense level.
         band: the only level, factored as a whole; no tiles, no groups.
-        data: device struct of tiles and groups.
-        tiles, groups: their numbers; 0 groups: no level below.
-        galerkin: device tables of the product that forms the next level's matrix.
+        device_data: device struct of tiles and groups.
+        tile_count, group_count: their numbers; 0 groups: no level below.
+        galerkin_tables: device tables of the product that forms the next level's matrix.
     """
 
     pattern: Pattern
     slots: int
-    dense: bool
-    data: Any
-    tiles: int = 0
-    groups: int = 0
-    galerkin: tuple[wp.array, wp.array, wp.array] | None = None
+    is_dense: bool
+    device_data: Any
+    tile_count: int = 0
+    group_count: int = 0
+    galerkin_tables: tuple[wp.array, wp.array, wp.array] | None = None
     band: Band | None = None
     components: DenseComponents | None = None
 
     @property
-    def whole(self) -> bool:
+    def solved_directly(self) -> bool:
         """True if the level is inverted or factored as a whole (no level below)."""
-        return self.dense or self.band is not None
+        return self.is_dense or self.band is not None
 
 
 @dataclass(eq=False)
@@ -70,16 +70,16 @@ class ReferencePoints:
     """Reference configuration of a level's slots, at which affine functions are evaluated.
 
     Attributes:
-        value: (slots, 3) reference value of a slot: a position (m) or a gradient.
-        position: (slots,) True for a position slot.
-        node: (slots,) slots of one node share a tile and a group.
-        label: (slots,) slots of different labels never share a tile or group.
+        reference: (slots, 3) reference value of a slot: a position (m) or a gradient.
+        is_position: (slots,) True for a position slot.
+        node_index: (slots,) slots of one node share a tile and a group.
+        separate_label: (slots,) slots of different labels never share a tile or group.
     """
 
-    value: np.ndarray
-    position: np.ndarray
-    node: np.ndarray
-    label: np.ndarray
+    reference: np.ndarray
+    is_position: np.ndarray
+    node_index: np.ndarray
+    separate_label: np.ndarray
 
 
 def make_levels(model: Model, pattern: Pattern, *, coarse: bool = True, by_component: bool = True) -> list[Level]:
@@ -95,7 +95,7 @@ def make_levels(model: Model, pattern: Pattern, *, coarse: bool = True, by_compo
     if not coarse:
         return [_make_level(model, pattern, points, GROUP_SLOTS)[0]]
     levels = []
-    bottom = BOTTOM_SLOTS["cuda" if model.device.is_cuda else "cpu"]
+    bottom = MAX_BOTTOM_SLOTS["cuda" if model.device.is_cuda else "cpu"]
     for depth in range(MAX_LEVELS):
         n = pattern.graph.shape[0]
         components = DenseComponents.from_pattern(model, pattern) if by_component else None
@@ -103,7 +103,7 @@ def make_levels(model: Model, pattern: Pattern, *, coarse: bool = True, by_compo
         if components and not small:  # one matrix per component
             entries = components.count * components.max_slots**2
             small = entries <= (
-                bottom**2 if depth else COMPONENT_PAIRS if components.max_slots <= MAX_FULL_FACTOR_SLOTS else 0
+                bottom**2 if depth else MAX_COMPONENT_PAIRS if components.max_slots <= MAX_FULL_FACTOR_SLOTS else 0
             )
         if small:
             levels.append(Level(pattern, n, True, level_struct(model.dtype)(), components=components))
@@ -111,31 +111,31 @@ def make_levels(model: Model, pattern: Pattern, *, coarse: bool = True, by_compo
         # larger groups if the next level then becomes the bottom: one dense product costs less than more levels
         large = 2 * GROUP_SLOTS
         capacity = large if 4 * n / GROUP_SLOTS > bottom >= 4.05 * n / large else GROUP_SLOTS
-        capacity = next((c for c in SMALL_GROUPS if 4.05 * n / c <= SMALL_COARSE), capacity)
+        capacity = next((c for c in SMALL_GROUP_SLOTS if 4.05 * n / c <= MAX_SMALL_COARSE_SLOTS), capacity)
         level, points, pattern = _make_level(model, pattern, points, capacity)
         levels.append(level)
         # below the first level groups may span bodies connected by joints and, where they hardly shrink, any bodies
-        points.label = points.label if depth else model.component[_first_members(level)]
-        if level.groups * 4 > n // 2:
-            points.label = np.zeros_like(points.label)
+        points.separate_label = points.separate_label if depth else model.component[_representative_slots(level)]
+        if level.group_count * 4 > n // 2:
+            points.separate_label = np.zeros_like(points.separate_label)
     raise AssertionError("groups do not shrink")
 
 
-def _first_members(level: Level) -> np.ndarray:
+def _representative_slots(level: Level) -> np.ndarray:
     """One representative slot of its group for each slot of the next level."""
-    start, slot = level.data.group_start.numpy(), level.data.group_slot.numpy()
+    start, slot = level.device_data.group_start.numpy(), level.device_data.group_slot.numpy()
     return np.repeat(slot[start[:-1]], 4)
 
 
 def _make_level(
     model: Model, pattern: Pattern, points: ReferencePoints, capacity: int
 ) -> tuple[Level, ReferencePoints, Pattern]:
-    n = len(points.value)
-    first = np.flatnonzero(np.diff(points.node, prepend=-1))
+    n = len(points.reference)
+    first = np.flatnonzero(np.diff(points.node_index, prepend=-1))
     sizes = np.diff(first, append=n)
-    args = points.value[first], sizes, points.label[first]
-    tile = bisect(*args, TILE_SLOTS)[points.node]
-    group = connected_groups(bisect(*args, capacity)[points.node], pattern.graph)
+    args = points.reference[first], sizes, points.separate_label[first]
+    tile = bisect(*args, TILE_SLOTS)[points.node_index]
+    group = connected_groups(bisect(*args, capacity)[points.node_index], pattern.graph)
     tiles, groups = int(tile.max()) + 1, int(group.max()) + 1
     data = level_struct(model.dtype)()
     order = np.argsort(tile, kind="stable")
@@ -145,7 +145,7 @@ def _make_level(
     table = np.full((tiles, TILE_SLOTS), -1)
     table[tile, place] = np.arange(n)
     by_group = np.argsort(group, kind="stable")
-    weight, centre, size = _affine(points, group, groups)
+    weight, centre, size = _affine_functions(points, group, groups)
     vec4 = wp.types.vector(length=4, dtype=model.types.T)
     tables: dict[str, tuple[Any, Any]] = {
         "tile_slot": (table, wp.int32),
@@ -159,33 +159,35 @@ def _make_level(
     for name, (values, dtype) in tables.items():
         setattr(data, name, model.array("levels", values, dtype))
     data.tiles, data.groups = tiles, groups
-    coarse, galerkin = _galerkin(model, pattern, group, groups)
+    coarse, galerkin = _galerkin_product(model, pattern, group, groups)
     level = Level(pattern, n, False, data, tiles, groups, galerkin)
     value = np.zeros((groups, 4, 3))
     value[:, 0] = centre
     value[:, 1:] = size[:, None, None] * np.eye(3)
     position = np.tile([True, False, False, False], groups)
     node = np.repeat(np.arange(groups), 4)
-    label = np.repeat(points.label[by_group[np.flatnonzero(np.diff(group[by_group], prepend=-1))]], 4)
+    label = np.repeat(points.separate_label[by_group[np.flatnonzero(np.diff(group[by_group], prepend=-1))]], 4)
     return level, ReferencePoints(value.reshape(-1, 3), position, node, label), coarse
 
 
-def _affine(points: ReferencePoints, group: np.ndarray, groups: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _affine_functions(
+    points: ReferencePoints, group: np.ndarray, groups: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Values (slots, 4) of the affine functions 1, x, y, z of each slot's group, with the groups' origins and scales.
 
     x, y, z are relative to the centre (groups, 3), m, divided by the size (groups,), m.
     """
-    at = np.flatnonzero(points.position)
+    at = np.flatnonzero(points.is_position)
     count = np.maximum(np.bincount(group[at], minlength=groups), 1)
-    centre = np.stack([np.bincount(group[at], points.value[at, k], groups) / count for k in range(3)], axis=1)
-    arm = points.value - points.position[:, None] * centre[group]
+    centre = np.stack([np.bincount(group[at], points.reference[at, k], groups) / count for k in range(3)], axis=1)
+    arm = points.reference - points.is_position[:, None] * centre[group]
     size = np.zeros(groups)
     np.maximum.at(size, group, np.linalg.norm(arm, axis=1))
     size = np.where(size > 0.0, size, 1.0)
-    return np.column_stack([points.position.astype(float), arm / size[group][:, None]]), centre, size
+    return np.column_stack([points.is_position.astype(float), arm / size[group][:, None]]), centre, size
 
 
-def _galerkin(
+def _galerkin_product(
     model: Model, pattern: Pattern, group: np.ndarray, groups: int
 ) -> tuple[Pattern, tuple[wp.array, wp.array, wp.array]]:
     """Pattern of the Galerkin matrix P^T A P, and the tables of `galerkin` in kernels/solvers/blocks.py."""

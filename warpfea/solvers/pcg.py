@@ -34,7 +34,7 @@ class PCG:
         self.preconditioner = preconditioner
         self.kernels = pcg_kernels(model.dtype, model.terms.traits.has_constraints)
         self.dim = (model.worlds, model.slots)
-        self.deflate = deflate and model.group_count > 0
+        self.deflate_translations = deflate and model.group_count > 0
         work.pcg.max_iterations = max_iterations
         work.pcg.max_work = max_work
 
@@ -81,7 +81,7 @@ class PCG:
 
     def correct_translations(self, active: wp.array) -> None:
         """Galerkin correction for the translations Z of free groups: x += Z (Z^T H Z)^-1 Z^T r, r updated."""
-        if not self.deflate:
+        if not self.deflate_translations:
             return
         m, w, k, launch = self.model, self.work, self.kernels, self.launch
         mass = w.step.mass_factor

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from ..model.state import State
     from ..terms.workspace import Workspace
 
-__all__ = ["NAMES", "BlockJacobi", "Preconditioner", "choose", "make"]
+__all__ = ["PRECONDITIONERS", "BlockJacobi", "Preconditioner", "choose_preconditioner", "make_preconditioner"]
 
 
 class Preconditioner(Protocol):
@@ -105,13 +105,14 @@ class BlockJacobi:
                 term.precondition(ctx, r, z, active)
 
 
-NAMES = ("two-level", "tiles", "banded", "deflated", "block-jacobi")
-SMALL_BODY = 64
+PRECONDITIONERS = ("two-level", "tiles", "banded", "deflated", "block-jacobi")
+SMALL_BODY_SLOTS = 64
+"""Mean number of slots of a body below which bodies on joints take block Jacobi."""
 
 
-def choose(name: str, storage: str | None, model: Model) -> str:
-    """Resolve a name of NAMES or "auto": banded factors for a narrow band, else block Jacobi if bodies on joints are
-    too small for several groups of nodes.
+def choose_preconditioner(name: str, storage: str | None, model: Model) -> str:
+    """Resolve a name of PRECONDITIONERS or "auto": banded factors for a narrow band, else block Jacobi if bodies on
+    joints are too small for several groups of nodes.
 
     Raises:
         ModelError: "banded" for a larger model on a GPU, or with a storage precision other than the model's.
@@ -132,7 +133,7 @@ def choose(name: str, storage: str | None, model: Model) -> str:
         return name
     if banded and not model.device.is_cuda and find_band(model) is not None:
         return "banded"
-    small = model.slots < SMALL_BODY * (int(model.part.max()) + 1)
+    small = model.slots < SMALL_BODY_SLOTS * (int(model.part.max()) + 1)
     return (
         "deflated"
         if model.terms.traits.has_constraints and small and model.slots > MAX_FULL_FACTOR_SLOTS
@@ -140,10 +141,10 @@ def choose(name: str, storage: str | None, model: Model) -> str:
     )
 
 
-def make(
+def make_preconditioner(
     name: str, storage: str | None, model: Model, work: Workspace, launch: Launcher, residual: Residual
 ) -> Preconditioner:
-    """Construct the preconditioner `name` of NAMES."""
+    """Construct the preconditioner `name` of PRECONDITIONERS."""
     if name in ("block-jacobi", "deflated"):
         return BlockJacobi(model, work, launch, residual)
     return TwoLevel(model, work, launch, residual, storage, kind=name)
