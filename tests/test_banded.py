@@ -74,7 +74,7 @@ def test_the_band_holds_all_of_the_pattern():
         _, matrix, _ = parts(sim)
         band = find_band(sim.model)
         place = band.place_of.numpy()
-        np.testing.assert_array_equal(place[band.slot_at.numpy()], np.arange(sim.model.slots))
+        np.testing.assert_array_equal(place[band.slot_order.numpy()], np.arange(sim.model.slots))
         entries = matrix.pattern.graph.tocoo()
         reach = (3 * place[entries.row] + 2) // BLOCK - (3 * place[entries.col]) // BLOCK
         assert reach.max() == band.half_bandwidth
@@ -186,8 +186,8 @@ def test_wider_bands_are_kept_for_longer():
 
     costs = [band(width).rebuild_cost for width in (5, 20, MAX_AUTO_WIDTH)]
     assert costs[2] > 2.0 * costs[0]
-    assert band(5).cheap
-    assert not band(MAX_AUTO_WIDTH).cheap
+    assert band(5).cheap_to_factorise
+    assert not band(MAX_AUTO_WIDTH).cheap_to_factorise
 
 
 @pytest.mark.parametrize("links", [10, 40])

@@ -106,7 +106,7 @@ def test_several_blocks_and_worlds_against_the_plain_sum(dtype, tol):
     for clusters in (residual.clusters, None):
         residual.clusters = clusters
         w.contribution.fill_(np.nan)
-        residual.pool.number.fill_(np.nan)
+        residual.cluster_memory.number.fill_(np.nan)
         w.Hp.fill_(7.0)
         residual.product(w.p, w.Hp, active)
         got.append(w.Hp.numpy().astype(float))

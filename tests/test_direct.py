@@ -87,7 +87,7 @@ def test_all_of_H_is_factorised(operator):
     work.p.assign(v[None])
     newton.residual.product(work.p, work.Hp, active)
     expected = work.Hp.numpy().ravel()
-    parts = [abs(work.multipliers.trial.numpy()).max(), abs(newton.direct.followers[0].columns.numpy()).max()]
+    parts = [abs(work.multipliers.trial.numpy()).max(), abs(newton.direct.follower_matrices[0].columns.numpy()).max()]
     assert min(parts) > 0.0
     assert np.abs(matrix @ v.ravel() - expected).max() < 1e-12 * np.abs(expected).max()
     assert abs(matrix - matrix.T).max() < 1e-12 * abs(matrix).max()

@@ -218,14 +218,14 @@ def test_order(rho, order):
 
 
 def test_names_and_options():
-    assert integrators.get("energy_momentum").rho_inf == 1.0
-    assert integrators.get("energy_momentum").order == 2
-    scheme = integrators.get(" energy_momentum ( rho_inf = 0.5 )")
+    assert integrators.find_integrator("energy_momentum").rho_inf == 1.0
+    assert integrators.find_integrator("energy_momentum").order == 2
+    scheme = integrators.find_integrator(" energy_momentum ( rho_inf = 0.5 )")
     assert (scheme.rho_inf, scheme.order, scheme.label) == (0.5, 1, "energy_momentum(rho_inf=0.5)")
     assert scheme.dissipation == pytest.approx(1 / 3)
     assert repr(wf.EnergyMomentum(rho_inf=0.3)) == "EnergyMomentum(rho_inf=0.3)"
     with pytest.raises(wf.ModelError, match="did you mean 'rho_inf'"):
-        integrators.get("energy_momentum(rho_in=0.5)")
+        integrators.find_integrator("energy_momentum(rho_in=0.5)")
     for rho in (-0.1, 1.1, np.nan, "half", True):
         with pytest.raises(wf.ModelError, match=r"rho_inf.*between 0 and 1"):
             wf.EnergyMomentum(rho_inf=rho)

@@ -148,7 +148,7 @@ def test_accelerations_of_a_state_that_another_scheme_advanced_are_computed_agai
     for start in (state, fresh):
         sim = wf.Simulation(model, start, dt=1e-3, integrator="generalized_alpha", solver=EXACT)
         sim.step(2)
-        assert sim.stepper.initial_conditions.count == 1
+        assert sim.stepper.initial_conditions.restart_count == 1
         found.append(sim.state.displacement.numpy())
     assert np.abs(found[0] - found[1]).max() < 1e-12 * np.abs(found[0]).max()
 
@@ -178,7 +178,7 @@ def test_order_across_a_kink(load):
     for h in (2e-4, 1e-4, 1.25e-5):
         sim = wf.Simulation(model, dt=h, integrator="generalized_alpha", solver=EXACT)
         sim.step(round(3 * JUMP / h))
-        assert sim.stepper.initial_conditions.count == 2
+        assert sim.stepper.initial_conditions.restart_count == 2
         ends.append(np.concatenate([sim.probe("tip").displacement[0, -1], 1e-2 * sim.probe("tip").velocity[0, -1]]))
         if not load:  # exactly as driven, without an oscillation
             k = round(JUMP / h)

@@ -137,8 +137,8 @@ class Masses:
 
     def of_pattern(self, pattern: Any) -> np.ndarray:
         """(worlds or 1, upper entries) masses of a pattern of blocks (solvers/matrix_assembly.py), kg."""
-        upper = pattern.upper
-        if len(self.matrix.indices) == pattern.entries:
+        upper = pattern.upper_entries
+        if len(self.matrix.indices) == pattern.entry_count:
             return self.table[:, upper[:, 0]]
         key = _keys(self.matrix)
         wanted = upper[:, 2].astype(np.int64) * self.matrix.shape[0] + upper[:, 3]

@@ -48,16 +48,16 @@ class Checkpoint(Output):
     def open(self, sim: Any) -> None:
         check_target(self.path, SUFFIXES)
         self._open = True
-        self._calls = 0
-        self._written = -1
+        self._write_calls = 0
+        self._saved_at_step = -1
 
     def write(self, sim: Any) -> None:
-        if self._calls and self._calls % self.every == 0:
+        if self._write_calls and self._write_calls % self.every == 0:
             self._save(sim)
-        self._calls += 1
+        self._write_calls += 1
 
     def close(self, sim: Any) -> None:
-        if self._open and self._written != sim.steps:
+        if self._open and self._saved_at_step != sim.steps:
             self._save(sim)
         self._open = False
 
@@ -67,7 +67,7 @@ class Checkpoint(Output):
 
     def _save(self, sim: Any) -> None:
         save_checkpoint(sim, self.path)
-        self._written = sim.steps
+        self._saved_at_step = sim.steps
 
 
 def save_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
@@ -113,7 +113,7 @@ def save_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
 
 def read_meta(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Checkpoint metadata: dtype, worlds, integrator, dt (s), steps, ... CheckpointError if unreadable."""
-    return _read(pathlib.Path(path))[0]
+    return _read_arrays(pathlib.Path(path))[0]
 
 
 def load_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
@@ -125,8 +125,8 @@ def load_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
             simulation is unchanged then.
     """
     file = pathlib.Path(path)
-    meta, arrays = _read(file)
-    _compare(file, meta, sim)
+    meta, arrays = _read_arrays(file)
+    _check_compatible(file, meta, sim)
     state = {name.removeprefix("state."): a for name, a in arrays.items() if name.startswith("state.")}
     for name in ("rough", "floored"):  # files older than these counts
         arrays.setdefault(f"total.{name}", np.zeros(sim.model.worlds, int))
@@ -165,7 +165,7 @@ def load_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
     sim.last = idle_report(sim)
 
 
-def _compare(file: pathlib.Path, meta: dict[str, Any], sim: Any) -> None:
+def _check_compatible(file: pathlib.Path, meta: dict[str, Any], sim: Any) -> None:
     """Raise CheckpointError naming the first difference between checkpoint and simulation."""
     expected = {
         "dtype": ("precision", sim.model.dtype),
@@ -192,7 +192,7 @@ def _compare(file: pathlib.Path, meta: dict[str, Any], sim: Any) -> None:
         raise CheckpointError(f"{file}: dt of the checkpoint is {meta.get('dt')!r}, of the simulation 'auto'")
 
 
-def _read(file: pathlib.Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def _read_arrays(file: pathlib.Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     if not file.is_file():
         raise CheckpointError(f"{file}: no such checkpoint")
     try:

@@ -35,9 +35,9 @@ class Predictor:
         self.control.sums = work.array("predictor sums", (PREDICTOR_ROWS, model.worlds), wp.float64)
         self.control.kept = state.register("predictor", wp.float64, (4,))
         # multistep schemes store v_{n-1} already
-        self.own = not scheme.multistep
+        self.stores_velocity = not scheme.multistep
         field = model.types.vec3, (model.slots,)
-        before = state.register("predictor_before", *field) if self.own else state.previous_velocity
+        before = state.register("predictor_before", *field) if self.stores_velocity else state.previous_velocity
         self.previous_velocities = before, state.register("predictor_first", *field)
 
     def begin(self) -> None:
@@ -63,6 +63,8 @@ class Predictor:
         self.launch(self.kernels.order_errors, self.dim, [*args, w.rows])
         self.reduce(w.rows, PREDICTOR_ROWS, step.accepted, self.control.sums)
         self.launch(
-            self.kernels.shift_history, self.dim, [step, int(self.own), self.state.velocity, *self.previous_velocities]
+            self.kernels.shift_history,
+            self.dim,
+            [step, int(self.stores_velocity), self.state.velocity, *self.previous_velocities],
         )
         self.launch(self.kernels.choose_order, m.worlds, [self.control, step])

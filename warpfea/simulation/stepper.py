@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Stepper"]
 
-FIRST_ITERATES = (0, 1, 2)
+CANDIDATE_FIRST_ITERATES = (0, 1, 2)
 """Alternative first iterates, see the kernel `candidate`."""
 
 
@@ -98,7 +98,7 @@ class Stepper:
         self.dim = (model.worlds, model.slots)
         if not integrator.static and isinstance(solver, NewtonPCG):
             self.newton.first_iterate_candidates = [
-                partial(self._start_from_candidate, kind) for kind in FIRST_ITERATES
+                partial(self._start_from_candidate, kind) for kind in CANDIDATE_FIRST_ITERATES
             ]
         self.initial_conditions = (
             ConsistentInitialConditions(self.ctx, self.newton.residual, integrator) if integrator.accelerated else None
@@ -110,7 +110,7 @@ class Stepper:
             tries = solver.max_halvings
             self.adaptive = StepSizeControl(self.ctx, self.v_before, integrator, adapt, max_tries=tries)
         self._bind_structs()
-        self.growth = growth
+        self.energy_growth = growth
         if growth:
             growth.bind(self.work.step, model, state)
         self.episodes = Episodes(model, self.work, self.launch, **(episodes or {"asynchronous": False, "ends": False}))
@@ -120,7 +120,7 @@ class Stepper:
         self._load_modules()
         self.start_terms()
         self._evaluate_potential(None)
-        self._version, self._changes = model.parameters.version, model.parameters.changes.copy()
+        self._parameter_version, self._changes_applied = model.parameters.version, model.parameters.changes.copy()
         if ledger:
             fresh = ~self.state.ledger.numpy().any(axis=1)
             self.restart_ledger(fresh | (self.state.ledger_time.numpy() != self.state.time.numpy()))
@@ -148,7 +148,7 @@ class Stepper:
             w.step.previous_end = state.acceleration_end if self.integrator.accelerated else state.previous_end
         if self.ledger:
             w.step.ledger_time = state.ledger_time
-            self.increments = self.terms.increment_table(w)
+            self.increment_table = self.terms.increment_table(w)
 
     def start_terms(self, mask: np.ndarray | None = None) -> None:
         """Reinitialise terms after the state of the masked worlds was set."""
@@ -156,7 +156,7 @@ class Stepper:
         if not following and self.terms.dead.gravity_law is None:
             return
         w, state = self.work, self.state
-        active = self._flags(mask)
+        active = self._world_flags(mask)
         w.step.new_time.assign(state.time)
         w.stage_time.assign(state.time)
         w.step.ramp.fill_(0.0 if self.integrator.static else 1.0)
@@ -194,21 +194,21 @@ class Stepper:
 
         `potential`: also the stored potential of the state.
         """
-        self.newton.invalidate(self._flags(mask))
+        self.newton.invalidate(self._world_flags(mask))
         if potential or "predictor_potential" not in self.state.names:
             self._evaluate_potential(mask)
         chosen = slice(None) if mask is None else np.asarray(mask, dtype=bool)
-        self._changes[chosen] = self.model.parameters.changes[chosen]
+        self._changes_applied[chosen] = self.model.parameters.changes[chosen]
 
     def update_parameters(self) -> None:
         """Apply parameters set since the last step; the energy jump counts as work of fields."""
-        if self.growth:
-            self.growth.restart_changed()
+        if self.energy_growth:
+            self.energy_growth.restart_changed()
         parameters = self.model.parameters
-        if self._version == parameters.version:
+        if self._parameter_version == parameters.version:
             return
-        self._version = parameters.version
-        mask = parameters.changes > self._changes
+        self._parameter_version = parameters.version
+        mask = parameters.changes > self._changes_applied
         if not mask.any():
             return
         self.invalidate(mask)
@@ -235,7 +235,7 @@ class Stepper:
     def _evaluate_potential(self, flags: np.ndarray | wp.array | None) -> None:
         """Evaluate the strain energy of the state in the chosen worlds, for the choice of first iterates."""
         w = self.work
-        active: wp.array = flags if isinstance(flags, wp.array) else self._flags(flags)
+        active: wp.array = flags if isinstance(flags, wp.array) else self._world_flags(flags)
         w.u_stage.assign(self.state.displacement)
         if self.ctx.midpoint:
             w.v_stage.zero_()
@@ -249,7 +249,7 @@ class Stepper:
         else:
             w.newton.potential.assign(np.where(active.numpy() != 0, measured.numpy(), w.newton.potential.numpy()))
 
-    def _flags(self, mask: np.ndarray | None) -> wp.array:
+    def _world_flags(self, mask: np.ndarray | None) -> wp.array:
         """Device mask of worlds, by default all."""
         flags = np.ones(self.model.worlds) if mask is None else np.asarray(mask)
         return wp.array(flags.astype(np.int32), dtype=wp.int32, device=self.model.device)
@@ -314,17 +314,17 @@ class Stepper:
         wp.capture_while(self.running, self._attempt)
         if self.adaptive:
             self.adaptive.end_interval()
-        self._report()
+        self._write_report()
 
     @labelled("commit")
-    def _report(self) -> None:
+    def _write_report(self) -> None:
         """Roll back failed worlds; write the step report."""
         m, w, launch = self.model, self.work, self.launch
         with launch.rare():
             wp.capture_if(self.failed, self._restore_failed)
         launch(self.kernels.write_report, m.worlds, [w.step, w.newton, w.pcg, w.report])
         if m.probes:
-            self._probe()
+            self._write_probes()
         for term in self.terms:
             term.report(self.ctx)
         self.episodes.end_step()
@@ -428,7 +428,7 @@ class Stepper:
         launch(self.kernels.ledger_rows, self.dim, args)
         reduce(w.rows, LEDGER_ROWS, accepted, w.ledger_sums)
         self.terms.energy_increments(self.ctx, reduce, accepted)
-        args = [w.step, w.newton, w.ledger_sums, self.increments, state.ledger]
+        args = [w.step, w.newton, w.ledger_sums, self.increment_table, state.ledger]
         launch(self.kernels.ledger_update, m.worlds, args)
 
     def _upload_probes(self) -> list[wp.array]:
@@ -439,7 +439,7 @@ class Stepper:
         values = ((start, wp.int32), (slot, wp.int32), (weight, m.types.T))
         return [wp.array(a, dtype=dtype, device=m.device) for a, dtype in values]
 
-    def _probe(self) -> None:
+    def _write_probes(self) -> None:
         m, w = self.model, self.work
         args = [*self._probe_tables, self.state.displacement, self.state.velocity, len(REPORT), w.report]
         self.launch(self.kernels.probe_values, (m.worlds, len(m.probes)), args)
