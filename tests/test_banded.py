@@ -73,7 +73,7 @@ def test_the_band_holds_all_of_the_pattern():
         sim = simulation(PROBLEMS[name].build(size))
         _, matrix, _ = parts(sim)
         band = find_band(sim.model)
-        place = band.place_of.numpy()
+        place = band.slot_position.numpy()
         np.testing.assert_array_equal(place[band.slot_order.numpy()], np.arange(sim.model.slots))
         entries = matrix.pattern.graph.tocoo()
         reach = (3 * place[entries.row] + 2) // BLOCK - (3 * place[entries.col]) // BLOCK

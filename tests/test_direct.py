@@ -130,9 +130,9 @@ def test_a_column_beyond_its_critical_load(data, monkeypatch):
     from warpfea.solvers.direct import DirectSolver
 
     uphill = []
-    retreat = DirectSolver._factorise_positive
+    retreat = DirectSolver._factorise_projected
     monkeypatch.setattr(
-        DirectSolver, "_factorise_positive", lambda self, world: (uphill.append(world), retreat(self, world))
+        DirectSolver, "_factorise_projected", lambda self, world: (uphill.append(world), retreat(self, world))
     )
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     column = b.add_beam(

@@ -7,7 +7,7 @@ import warp as wp
 from validation.conservation import RATE, Conserved, tumble
 
 import warpfea as wf
-from warpfea.model.assembly import geometry, gradients
+from warpfea.model.assembly import shape_and_jacobian, shape_gradients
 from warpfea.simulation import integrators
 from warpfea.studies.stress.case import Setting
 from warpfea.studies.stress.cases import rotation
@@ -98,8 +98,8 @@ def test_a_rotor_on_a_joint_gains_no_energy(turn):
 def strains(body, u, rule):
     """Green's strain (E, Q, 3, 3) and volumes (E, Q) at the points of a rule, from displacements alone."""
     elements = np.arange(len(body.connectivity))
-    _, ds, J0, det = geometry(body, elements, rule.points)
-    F = np.eye(3) + np.einsum("esk,eqsl->eqkl", u[body.connectivity], gradients(ds, J0))
+    _, ds, J0, det = shape_and_jacobian(body, elements, rule.points)
+    F = np.eye(3) + np.einsum("esk,eqsl->eqkl", u[body.connectivity], shape_gradients(ds, J0))
     return 0.5 * (np.swapaxes(F, 2, 3) @ F - np.eye(3)), det * rule.weights
 
 

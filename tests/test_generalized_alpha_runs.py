@@ -59,9 +59,7 @@ def test_other_solvers_and_precisions_agree(options):
     }
     for given in ({}, options):
         model = mechanism(dtype=given.get("dtype", "float64"))
-        sim = wf.Simulation(
-            model, dt=1e-3, integrator="generalized_alpha", solver=solvers.solver_options(given.get("solver"))
-        )
+        sim = wf.Simulation(model, dt=1e-3, integrator="generalized_alpha", solver=solvers.get(given.get("solver")))
         sim.step(20)
         found.append(sim.probe("tip").displacement[0])
     assert np.abs(found[1] - found[0]).max() < 2e-3 * np.abs(found[0]).max()

@@ -252,7 +252,7 @@ def step_force(model, block, u0, u1, h):
     wp.launch(block.kernels.internal_force, dim=(1, block.count), inputs=args, device="cpu")
     rows = contribution.numpy()[0].reshape(block.slots, block.count, 3)
     force = np.zeros((model.slots, 3))
-    np.add.at(force, block.parts[0].conn.T, rows)
+    np.add.at(force, block.host_blocks[0].conn.T, rows)
     return force, energy.numpy()[1].sum()
 
 

@@ -22,12 +22,12 @@ from .masses import Masses
 from .parameters import MaterialParameters
 from .residual_groups import slot_groups
 from .state import State
-from .topology import free_groups, label_components, make_topology
+from .topology import label_components, make_free_groups, make_topology
 
 __all__ = ["Block", "Model"]
 
 
-SHOWN = 3
+MAX_LISTED_BODIES = 3
 """Maximum number of bodies listed by a repr."""
 
 
@@ -94,22 +94,22 @@ class Model:
 
     def _build(self, builder: ModelSource, tables: bool) -> None:
         """Number, assemble and upload the description."""
-        self._number()
+        self._number_slots()
         self._assemble_mass()
         self._build_blocks(tables)
         self.gravity = np.asarray(builder.gravity, dtype=float)
         self.probes = list(builder.description.probes)
         self.terms, self.evaluation = builder.make_terms(self)
-        self.part, self.component = label_components(self.graph(), self.terms.tied_slots())
+        self.mesh_component, self.component = label_components(self.graph(), self.terms.tied_slots())
         self.component_count = int(self.component.max()) + 1
         self.terms.build()
         self.topology = make_topology(self)
         self._upload_components()
-        self.groups, self.group_count = free_groups(self)
+        self.free_groups, self.free_group_count = make_free_groups(self)
 
     def __repr__(self) -> str:
         names = ", ".join(repr(body.name) for body in self.bodies)
-        what = names if len(self.bodies) <= SHOWN else f"{len(self.bodies)} bodies"
+        what = names if len(self.bodies) <= MAX_LISTED_BODIES else f"{len(self.bodies)} bodies"
         mass = "no density" if self.mass is None else f"{self.mass:.4g} kg"
         worlds = f", {self.worlds} worlds" if self.worlds > 1 else ""
         return f"Model({what}, {int(self.free_slots.sum())} unknowns, {mass}, {self.device}, {self.dtype}{worlds})"
@@ -127,15 +127,15 @@ class Model:
     def array(self, name: str, values: Any, dtype: Any) -> wp.array:
         """Upload a constant array; its bytes are counted under `name`."""
         out: Any = wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device)
-        self.count(name, out)
+        self.count_bytes(name, out)
         return out
 
-    def count(self, name: str, *arrays: wp.array) -> None:
+    def count_bytes(self, name: str, *arrays: wp.array) -> None:
         """Count the bytes of device arrays under `name`."""
         for array in arrays:
             self._memory[name] = self._memory.get(name, 0) + array.size * wp.types.type_size_in_bytes(array.dtype)
 
-    def forget(self, name: str, *arrays: wp.array) -> None:
+    def uncount_bytes(self, name: str, *arrays: wp.array) -> None:
         """Subtract the bytes of released arrays under `name`."""
         for array in arrays:
             self._memory[name] -= array.size * wp.types.type_size_in_bytes(array.dtype)
@@ -148,7 +148,7 @@ class Model:
         out = self.array("elements", np.moveaxis(values, last, 0), dtype)
         return out.transpose((*range(1, out.ndim), 0))
 
-    def _number(self) -> None:
+    def _number_slots(self) -> None:
         offset, elements_before = 0, 0
         for body in self.bodies:
             body.element_offset = elements_before
@@ -190,11 +190,11 @@ class Model:
         for body in self.bodies:
             for host in assembly.host_blocks(body, tables=tables):
                 groups.setdefault(host.key, []).append(host)
-                host.row = len(rows)
+                host.coefficient_row = len(rows)
                 rows.append(assembly.coefficient_rows(host.coefficients, body.materials[host.material][1]))
         self.coefficient_table = np.array(rows).reshape(1, -1, NCOEF)
         self.coefficients = self.array("materials", self.coefficient_table, self.types.T)
-        self._built_of = self.coefficients.numpy().tobytes()
+        self._initial_coefficients = self.coefficients.numpy().tobytes()
         self.blocks: list[Block] = []
         contribution, element, history = 0, 0, 0
         for key, parts in groups.items():
@@ -215,7 +215,7 @@ class Model:
     def _upload_components(self) -> None:
         """Residual groups (component and stiffness), and groups of parts for the error estimate."""
         self.residual_groups = slot_groups(self, self.component)
-        self.residual_parts = slot_groups(self, self.part)
+        self.error_estimate_groups = slot_groups(self, self.mesh_component)
         if self.component_count > 1:
             self.component_of_slot = self.array("components", self.component, wp.int32)
 
@@ -240,7 +240,7 @@ class Model:
         """Optional features used by the scene."""
         return self.terms.features | {
             "driven nodes": any(s.law or s.node_laws for s in self.description.supports),
-            "free groups": self.group_count > 0,
+            "free groups": self.free_group_count > 0,
             "separate components": self.component_count > 1,
             "probes": bool(self.probes),
         }
@@ -258,7 +258,9 @@ class Model:
                 {
                     "name": b.name,
                     "element": b.family.name,
-                    "quadrature": sorted({k.key.scheme for k in self.blocks if any(p.body is b for p in k.parts)}),
+                    "quadrature": sorted(
+                        {k.key.scheme for k in self.blocks if any(p.body is b for p in k.host_blocks)}
+                    ),
                     "elements": len(b.mesh.cells),
                     "nodes": len(b.mesh.used_nodes),
                     "materials": [type(m).__name__ + (f" ({g})" if g else "") for g, m in b.materials],
@@ -319,7 +321,7 @@ class Model:
             ModelError: a material without a density.
         """
         assembly.require_density(self.bodies, "mass_matrix")
-        return sp.kron(self.masses.of_world(world), sp.identity(3), format="csr")
+        return sp.kron(self.masses.world_matrix(world), sp.identity(3), format="csr")
 
     def internal_force(self, state: State) -> np.ndarray:
         """Elastic internal force, Eq. (32), [world, slot, 3], N."""
@@ -403,7 +405,7 @@ class Model:
         h = hashlib.sha256(f"{self.dtype} {self.worlds} {self.slots}".encode())
         for block in self.blocks:
             h.update(repr(block.key).encode())
-            for part in block.parts:
+            for part in block.host_blocks:
                 h.update(np.ascontiguousarray(part.conn).tobytes())
         for body in self.bodies:
             h.update(repr(body.section).encode())
@@ -412,6 +414,6 @@ class Model:
         h.update(self.reference.tobytes())
         h.update(self.free_host.tobytes())
         h.update(self.mass_host.data.tobytes())
-        h.update(self._built_of)
+        h.update(self._initial_coefficients)
         self.terms.hash(h)
         return h.hexdigest()

@@ -146,7 +146,7 @@ class ConsistentInitialConditions:
     def _kinetic_energy(self, v: np.ndarray) -> np.ndarray:
         """1/2 v.M v, (B,), J."""
         masses = self.model.masses
-        return np.array([0.5 * np.sum(one * (masses.of_world(world) @ one)) for world, one in enumerate(v)])
+        return np.array([0.5 * np.sum(one * (masses.world_matrix(world) @ one)) for world, one in enumerate(v)])
 
     def _record_impulse(self, flags: np.ndarray, change: np.ndarray) -> None:
         """Add the kinetic energy of the velocity correction to the integrator column of the ledger."""
@@ -287,7 +287,7 @@ class ConsistentInitialConditions:
     ) -> np.ndarray:
         """Solve M x + J^T m = force on free components, x = prescribed on others, J x = constraint_rhs; (slots, 3)."""
         m = self.model
-        x = self._solve_mass(force - m.masses.of_world(self._world) @ prescribed) + prescribed
+        x = self._solve_mass(force - m.masses.world_matrix(self._world) @ prescribed) + prescribed
         if J is None:
             return x
         free = m.free_host.ravel() != 0.0
@@ -299,7 +299,7 @@ class ConsistentInitialConditions:
 
     def _solve_mass(self, force: np.ndarray) -> np.ndarray:
         """M^-1 force on the free components, 0 on others."""
-        world = self._world if self.model.masses.varied else 0
+        world = self._world if self.model.masses.varies_by_world else 0
         if world not in self._mass:
             self._mass[world] = [mass_solver(self.model, c, world) for c in range(3)]
         out = np.zeros_like(force)
@@ -312,7 +312,7 @@ class ConsistentInitialConditions:
 def mass_solver(model: Model, component: int, world: int = 0) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
     """Free slots of a component, and a solver for their mass matrix."""
     free = np.flatnonzero(model.free_host[:, component])
-    M = model.masses.of_world(world)[free][:, free].astype(float).tocsc()
+    M = model.masses.world_matrix(world)[free][:, free].astype(float).tocsc()
     if len(free) <= MAX_FACTORED_SLOTS:
         return free, spl.splu(M).solve if len(free) else lambda f: f
     scale = sp.diags(1.0 / M.diagonal())

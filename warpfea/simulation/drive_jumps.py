@@ -72,7 +72,7 @@ def _element_size(model: Model) -> float:
     """Median diagonal of the elements' bounding boxes, m."""
     sizes = []
     for block in model.blocks:
-        for part in block.parts:
+        for part in block.host_blocks:
             points = part.body.reference[part.conn]
             place = (part.body.slot_kind[part.conn] == 0)[:, :, None]
             low, high = np.where(place, points, np.inf).min(axis=1), np.where(place, points, -np.inf).max(axis=1)

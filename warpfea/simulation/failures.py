@@ -199,7 +199,7 @@ def _worst_element(m: Model, residual: np.ndarray) -> tuple[int, str]:
     g = np.where(np.isfinite(g), g, np.inf)
     best, index, text = -1.0, -1, "element unknown"
     for block in m.blocks:
-        for part in block.parts:
+        for part in block.host_blocks:
             values = g[part.conn + part.body.slot_offset].max(axis=1)
             k = int(np.argmax(values))
             if values[k] > best:

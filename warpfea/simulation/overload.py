@@ -44,7 +44,7 @@ def overload_text(model: Model) -> str:
     g = float(np.linalg.norm(model.terms.dead.gravity.numpy(), axis=1).max())
     for body in model.bodies if g > 0.0 else ():
         side = float(np.ptp(body.mesh.bounding_box(), axis=0).max())
-        weight = model.masses.of_body(body) / float(element_volumes(body).sum()) * g * side
+        weight = model.masses.total_of_body(body) / float(element_volumes(body).sum()) * g * side
         found.append(_load_entry(body, "weight", weight, weight, "Pa"))
     ratio, what, value, unit, name = max(found)
     if ratio < MIN_OVERLOAD_RATIO:

@@ -36,7 +36,7 @@ def spring_stiffness(model: Model, stabilise: Any) -> float:
     if stabilise is not True:
         return float(stabilise)
     stiffest = max(
-        effective_modulus(b)[0] * float(element_volumes(b).sum()) / model.masses.of_body(b) for b in model.bodies
+        effective_modulus(b)[0] * float(element_volumes(b).sum()) / model.masses.total_of_body(b) for b in model.bodies
     )
     return DEFAULT_STIFFNESS * stiffest / model.size**2
 

@@ -23,7 +23,7 @@ import scipy.linalg
 import warp as wp
 
 from ..base.errors import StabilityError, StabilityWarning
-from ..model.state import is_solver_memory
+from ..model.state import is_solver_history
 from ..solvers import NewtonPCG
 from ..terms.term import Term
 from .simulation import Simulation
@@ -339,7 +339,7 @@ def _unstable_modes(probe: TangentOperator, chosen: np.ndarray, x: np.ndarray) -
     """Modes of least p.H p / p.M p (worlds, slots, 3), largest displacement 1 m, from directions x."""
     m = probe.model
     x = np.where(chosen[:, None, None], x, 0.0)
-    masses = [m.masses.of_world(world) if m.masses.varied else m.mass_host for world in range(m.worlds)]
+    masses = [m.masses.world_matrix(world) if m.masses.varies_by_world else m.mass_host for world in range(m.worlds)]
 
     def mass(v: np.ndarray) -> np.ndarray:
         return np.stack([masses[b] @ v[b] if chosen[b] else v[b] for b in range(m.worlds)]) * probe.free_components
@@ -382,7 +382,7 @@ def _float64_copy(sim: Simulation) -> Simulation:
         model.cache["float64"] = model.resized(model.worlds, dtype="float64")
     twin = model.cache["float64"]
     if model.terms.written:
-        twin.parameters.take(model.parameters.values)
+        twin.parameters.copy_values(model.parameters.values)
         arrays = twin.terms.parameter_arrays()
         for name, array in model.terms.parameter_arrays().items():
             arrays[name].assign(array.numpy().astype(arrays[name].numpy().dtype))
@@ -393,7 +393,7 @@ def _float64_copy(sim: Simulation) -> Simulation:
     solver = NewtonPCG(multipliers=sim.solver.multipliers, penalty=sim.solver.penalty)
     out = Simulation(twin, state, dt=sim.dt, integrator=sim.integrator, solver=solver, ledger=False, capture=False)
     for name in state.names:
-        if name in sim.state.names and not is_solver_memory(name):
+        if name in sim.state.names and not is_solver_history(name):
             array = getattr(state, name)
             array.assign(getattr(sim.state, name).numpy().astype(array.numpy().dtype))
     out.stepper.start_terms()

@@ -186,7 +186,7 @@ class Stepper:
         kernel = self.newton.residual.gather_kernels.mass_product
         Launcher(m.device)(kernel, self.dim, [m.topology, self.state.velocity, rows])
         u = self.state.displacement.numpy().astype(float)
-        pull = -np.einsum("bc,bs,bsc->b", m.terms.dead.gravity.numpy(), m.masses.of_worlds(m.worlds), u)
+        pull = -np.einsum("bc,bs,bsc->b", m.terms.dead.gravity.numpy(), m.masses.lumped_in_worlds(m.worlds), u)
         return np.stack([rows.numpy()[0].sum(axis=1), m.strain_energy(self.state), pull], axis=1)
 
     def invalidate(self, mask: np.ndarray | None = None, *, potential: bool = True) -> None:

@@ -234,6 +234,6 @@ class JacobiLoop(NewtonLoop):
             launch(k.conjugate, m.worlds, [w.newton, ctl])
         launch(k.combine, self.dim, [w.newton, ctl, self.previous_moves, w.z, w.direction])
         if self.pcg.deflate_translations:  # a loose tolerance then conserves the momentum of free bodies
-            args = [w.newton, w.step.mass_factor, m.groups.lumped, w.gradient, m.topology.free, w.direction, w.r]
+            args = [w.newton, w.step.mass_factor, m.free_groups.lumped, w.gradient, m.topology.free, w.direction, w.r]
             launch(k.remaining_momentum, self.dim, args)
             self.pcg.correct_translations(active)

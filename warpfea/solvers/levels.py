@@ -10,7 +10,7 @@ import scipy.sparse as sp
 import warp as wp
 
 from ..kernels.solvers.levels import TILE_SLOTS, level_struct
-from ..model.partition import bisect, connected_groups
+from ..model.partition import bisect_groups, connected_groups
 from .band import MAX_FULL_FACTOR_SLOTS, Band
 from .dense import DenseComponents
 from .matrix_assembly import Pattern, make_pattern
@@ -91,7 +91,7 @@ def make_levels(model: Model, pattern: Pattern, *, coarse: bool = True, by_compo
     origin = np.concatenate([np.tile(body.origin, (body.slot_count, 1)) for body in model.bodies])
     position = model.slot_kind == 0
     place = model.reference + origin * position[:, None]
-    points = ReferencePoints(place, position, np.cumsum(position) - 1, model.part)
+    points = ReferencePoints(place, position, np.cumsum(position) - 1, model.mesh_component)
     if not coarse:
         return [_make_level(model, pattern, points, GROUP_SLOTS)[0]]
     levels = []
@@ -134,8 +134,8 @@ def _make_level(
     first = np.flatnonzero(np.diff(points.node_index, prepend=-1))
     sizes = np.diff(first, append=n)
     args = points.reference[first], sizes, points.separate_label[first]
-    tile = bisect(*args, TILE_SLOTS)[points.node_index]
-    group = connected_groups(bisect(*args, capacity)[points.node_index], pattern.graph)
+    tile = bisect_groups(*args, TILE_SLOTS)[points.node_index]
+    group = connected_groups(bisect_groups(*args, capacity)[points.node_index], pattern.graph)
     tiles, groups = int(tile.max()) + 1, int(group.max()) + 1
     data = level_struct(model.dtype)()
     order = np.argsort(tile, kind="stable")

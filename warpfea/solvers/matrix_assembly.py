@@ -140,7 +140,7 @@ class MatrixAssembler:
         """Build the pattern and the masses of its upper entries."""
         model = self.model
         pattern = make_pattern(model, coupling_pattern(model))
-        return pattern, model.array("matrix pattern", model.masses.of_pattern(pattern), model.types.T)
+        return pattern, model.array("matrix pattern", model.masses.pattern_masses(pattern), model.types.T)
 
     def modules(self) -> set[wp.Module]:
         """Modules launched by assembly."""
@@ -192,7 +192,7 @@ class MatrixAssembler:
         wp.utils.array_scan(start, start, inclusive=True)
         source = wp.empty(int(start[-1:].numpy()[0]), dtype=wp.int32, device=model.device)
         wp.launch(find, upper, inputs=[*args, 1, start, source], device=model.device)
-        model.count("matrix pattern", start, source)
+        model.count_bytes("matrix pattern", start, source)
         return start, source
 
     def allocate_values(self, name: str, worlds: int | None = None) -> wp.array:
@@ -226,7 +226,7 @@ class MatrixAssembler:
             if last - first == self.model.worlds:
                 self._assemble(last, state, projected)
                 continue
-            with self.model.parameters.window(first, last):
+            with self.model.parameters.restricted_to_worlds(first, last):
                 self._assemble(last - first, [a[first:last] for a in state], projected, first)
 
     def _assemble(self, count: int, state: list[wp.array], projected: bool, first_world: int = 0) -> None:

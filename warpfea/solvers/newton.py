@@ -400,7 +400,7 @@ class NewtonLoop:
     def _run_rare_branch(self) -> None:
         """Rare branch: error estimate, step length of non-monotone trials, further searches, inversion check."""
         m, w, k = self.model, self.work, self.kernels
-        parts = m.residual_parts
+        parts = m.error_estimate_groups
         args = [w.newton, parts.slot_start, parts.slot, parts.element_start, parts.element]
         args += [w.gradient, w.direction, w.inertia, w.v, w.v_tilde, w.u, w.energy_rows]
         self.launch(self.vector_kernels.floor_partial, (m.worlds, parts.count, FLOOR_LANES), args)

@@ -34,7 +34,7 @@ class PCG:
         self.preconditioner = preconditioner
         self.kernels = pcg_kernels(model.dtype, model.terms.traits.has_constraints)
         self.dim = (model.worlds, model.slots)
-        self.deflate_translations = deflate and model.group_count > 0
+        self.deflate_translations = deflate and model.free_group_count > 0
         work.pcg.max_iterations = max_iterations
         work.pcg.max_work = max_work
 
@@ -85,8 +85,8 @@ class PCG:
             return
         m, w, k, launch = self.model, self.work, self.kernels, self.launch
         mass = w.step.mass_factor
-        launch(k.group_partial, (m.worlds, m.group_count, LANES), [m.groups, w.r, active, w.group_partial])
-        args = [m.groups, w.group_partial, mass, active, w.group_velocity]
-        launch(k.group_velocity, (m.worlds, m.group_count), args)
-        args = [m.groups, w.group_velocity, m.topology.free, mass, active, w.direction, w.r]
+        launch(k.group_partial, (m.worlds, m.free_group_count, LANES), [m.free_groups, w.r, active, w.group_partial])
+        args = [m.free_groups, w.group_partial, mass, active, w.group_velocity]
+        launch(k.group_velocity, (m.worlds, m.free_group_count), args)
+        args = [m.free_groups, w.group_velocity, m.topology.free, mass, active, w.direction, w.r]
         launch(k.translate_groups, self.dim, args)

@@ -31,7 +31,7 @@ from ..kernels.solvers.blocks import block_kernels
 from ..kernels.solvers.levels import TILE, TILE_SLOTS, level_kernels, level_struct
 from ..kernels.solvers.levels_build import FACTOR_LANES, build_kernels
 from ..kernels.solvers.pcg import pcg_kernels
-from ..model.state import words_of
+from ..model.state import view_as_words
 from ..terms.term import CachedInputs
 from .band import MAX_FULL_FACTOR_SLOTS, BandFactor, find_band
 from .dense import gauss_jordan
@@ -125,7 +125,7 @@ class TwoLevel:
             self.worlds_per_chunk = work.chunks["preconditioner matrix"](model.worlds)
         self.block_values = self.assembler.allocate_values("preconditioner matrix", self.worlds_per_chunk)
         self.chunk_flags = work.array("preconditioner chunk", (model.worlds,), wp.int32)
-        free = model.group_count > 0  # bodies whose momentum is conserved by the translation correction
+        free = model.free_group_count > 0  # bodies whose momentum is conserved by the translation correction
         if self.factors_operator and self.band and model.dtype == "float64" and residual.ctx.inertia and not free:
             work.pcg.exact = self.band.exact
         self.body_modes, self.mode_coupling_modules = self._make_body_modes()
@@ -181,7 +181,7 @@ class TwoLevel:
             kept = self.cached_inputs.get(term.name)
             if kept is not None and not term.copy_cached(self.ctx, kept, reuse.control, flags):
                 for arrays in zip(kept.live, kept.state, kept.place):
-                    words = [words_of(array) for array in arrays]
+                    words = [view_as_words(array) for array in arrays]
                     self.launch(reuse.kernels.carry_words, words[0].shape, [reuse.control, flags, *words])
 
     def modules(self) -> set[wp.Module]:
