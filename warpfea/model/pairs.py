@@ -178,7 +178,9 @@ def master_facets(surface: SurfaceSet) -> MasterFacets:
     body, faces = surface.body, surface.faces
     kinds = {len(body.family.faces[int(k)]) for k in np.unique(faces[:, 1])}
     if len(kinds) > 1:
-        raise ModelError(f"body {body.name!r}: a master surface of triangles and squares; name surfaces of one kind")
+        raise ModelError(
+            f"body {body.name!r}: a master surface must not mix triangles and quadrilaterals; name surfaces of one"
+        )
     corners = kinds.pop()
     check = PAIR_RULES[corners][16].points
     wanted = _shape_functions(surface, check)[0]
@@ -190,7 +192,7 @@ def master_facets(surface: SurfaceSet) -> MasterFacets:
         if np.abs(fitted - wanted).max() <= 1e-10 * np.abs(wanted).max():
             break
     else:
-        raise ModelError(f"body {body.name!r}: faces of {body.family.name} are no polynomials of degree 3")
+        raise ModelError(f"body {body.name!r}: shape functions of {body.family.name} on a face are of degree above 3")
     conn = body.connectivity[faces[:, 0]]
     e = body.reference[conn]
     positions = np.einsum("fqs,fsk->fqk", shape, e) + body.origin
