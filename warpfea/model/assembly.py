@@ -40,7 +40,7 @@ MAX_CHUNK_ENTRIES = 20_000_000
 
 
 def element_chunks(body: Discretisation, elements: np.ndarray, points: int) -> Iterator[np.ndarray]:
-    """Runs of elements with small tables at `points` points."""
+    """Runs of elements short enough for a table at `points` points."""
     per_element = points * body.family.slots if body.family.has_gradients else 1
     size = max(1, min(MAX_CHUNK_ELEMENTS, MAX_CHUNK_ENTRIES // per_element))
     for first in range(0, len(elements), size):
@@ -49,7 +49,13 @@ def element_chunks(body: Discretisation, elements: np.ndarray, points: int) -> I
 
 @dataclass(frozen=True)
 class BlockKey:
-    """Key of an element block: elements with equal keys share a kernel."""
+    """Key of an element block: elements with equal keys share a kernel.
+
+    Attributes:
+        scheme, part: name of the integration scheme of the family, and index of the part of the strain energy in it.
+        law, damping: names of the device law and of the form of damping, None without.
+        affine: J0 is constant in each element. framed: strains are taken in local orthonormal axes.
+    """
 
     family: str
     scheme: str
@@ -121,7 +127,7 @@ class HostBlock:
 def shape_and_jacobian(
     body: Discretisation, elements: np.ndarray, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Functions and J0 at parent points.
+    """Shape functions s_i and Jacobian J0 = dX/dxi at parent points.
 
     Returns:
         s (E or 1, Q, S), ds (E or 1, Q, S, 3), J0 (E, Q, 3, 3) = sum E_i ds_i^T, det J0 (E, Q).
@@ -310,11 +316,11 @@ def _first_elements(conn: list[np.ndarray]) -> Iterator[tuple[int, np.ndarray]]:
 
 @dataclass(eq=False)
 class FacetTables:
-    """Functions of the faces of a surface, for the slots with functions that do not vanish there.
+    """Shape functions of the faces of a surface, of the slots whose functions do not vanish there.
 
     Attributes:
         conn: (F, n) body slots; faces that have fewer repeat their first one with functions of zero.
-        shape, d_a, d_b: (F, Q, n) functions and their derivatives along the two sides of a face, whose cross product
+        shape, d_a, d_b: (F, Q, n) functions and their derivatives by the two face coordinates a and b: dx/da x dx/db
             points outward.
         weights: (F, Q) of the face rules; faces with fewer points repeat their last one with weight 0.
     """

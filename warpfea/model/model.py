@@ -43,7 +43,7 @@ class ModelSource(Protocol):
         """Bodies in the order of addition."""
 
     def make_terms(self, model: Model) -> tuple[Any, Any]:
-        """TermSet of a model and its evaluation at a state."""
+        """Terms of a model (forces, contact, constraints), and the evaluator of its quantities at a state."""
 
 
 class Model:
@@ -51,10 +51,12 @@ class Model:
 
     Attributes:
         bodies: the bodies, in the order they were added.
-        worlds, dtype, device, up_axis: as given.
-        slots: number of slots of all bodies.
+        worlds: number of copies of the model stepped together; dtype, device, up_axis: as given.
+        slots: number of slots (3-vector unknowns: node positions and gradients) of all bodies.
         size: diagonal of the box of all nodes, m; reference length of constraint tolerances.
         blocks: element blocks.
+        mesh_component, component: (slots,) connected component, by elements alone and also by constraints.
+        free_groups, free_group_count: components with an unconstrained translation: device struct and number.
         cache: tables shared by solvers.
         mass_host: scalar mass matrix (slots, slots), CSR on the host, kg.
     """
@@ -89,7 +91,8 @@ class Model:
             self._build(builder, tables)
 
     def resized(self, worlds: int, dtype: str | None = None) -> Model:
-        """Model of the same description, without values set since, with another number of worlds or precision."""
+        """New model of the same description with another number of worlds or precision; values set by `set_parameter`
+        are not carried over."""
         return Model(self._source, device=self.device, dtype=dtype or self.dtype, worlds=worlds, tables=self._tables)
 
     def _build(self, builder: ModelSource, tables: bool) -> None:
@@ -213,7 +216,8 @@ class Model:
         return term and term.tables
 
     def _upload_components(self) -> None:
-        """Residual groups (component and stiffness), and groups of parts for the error estimate."""
+        """Upload the groups of slots whose residuals are measured together: of one connected component and similar
+        stiffness for the solver, of one mesh component and similar stiffness for the error estimate."""
         self.residual_groups = slot_groups(self, self.component)
         self.error_estimate_groups = slot_groups(self, self.mesh_component)
         if self.component_count > 1:
@@ -348,11 +352,11 @@ class Model:
         return self.evaluation.tangent_matrix(state, world)
 
     def constraint_values(self, state: State) -> np.ndarray:
-        """Values c of all rows of the constraints, [world, row], m; rows of a joint: constraints.rows_of."""
+        """Values c of all rows of the constraints, [world, row], m; those of joint k: model.constraints.rows_of[k]."""
         return self.evaluation.constraints(state)[0]
 
     def constraint_jacobian(self, state: State, world: int = 0) -> sp.csr_matrix:
-        """dc/dq of one world, (rows, 3 slots) CSR, with the gradients that the device computes."""
+        """dc/dq of one world, (rows, 3 slots) CSR, evaluated on the device."""
         return self.evaluation.constraint_jacobian(state, world)
 
     def constraint_curvature(self, state: State, multipliers: Any, direction: Any) -> np.ndarray:
@@ -369,7 +373,7 @@ class Model:
         self.set_parameter("gravity", gravity, mask=mask)
 
     def contact_force(self, state: State) -> np.ndarray:
-        """Elastic part of the forces of contact at a state, without damping, [world, slot, 3], N; on the bodies.
+        """Nodal contact forces on the bodies at a state, without contact damping, [world, slot, 3], N.
 
         The state of a simulation has the friction springs and collider positions; for another state colliders follow
         their paths at its time, without friction.
@@ -385,9 +389,9 @@ class Model:
 
         Args:
             name: "B.E" with the name B of a body, or "B.G.E" with a group G that has a material of its own: a constant
-                of the material (E and nu if made from them, else those of the law), eta and lambda_v of its damping,
-                kept if 0, or density, kg/m^3; density_factor for densities given as a function or per element. Set
-                such a name for the first time before making simulations.
+                of the material (E and nu if made from them, else those of the law), eta and lambda_v of its damping
+                (KelvinVoigt(eta=0) makes them settable from 0), or density, kg/m^3; density_factor for densities given as
+                a function or per element. Set such a name for the first time before making simulations.
                 "C.mu", "C.mu_static", "C.restitution" or "C.stiffness" with the name C of a contact, as of
                 ModelBuilder.add_contact; mu_static follows mu if equal to it. "K.offset" with the name K of a
                 collider: of a HalfSpace the offset of its plane, m; of other shapes the outward offset of the
@@ -396,7 +400,7 @@ class Model:
             mask: (worlds,), on the host or on a device: the worlds to set. None: all.
 
         Raises:
-            ModelError: an unknown or shared name, a wrong shape, or a value out of range.
+            ModelError: an unknown name, a quantity that all worlds share, a wrong shape, or a value out of range.
         """
         self.terms.set_parameter(name, values, mask)
 

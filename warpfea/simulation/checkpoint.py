@@ -118,7 +118,7 @@ def read_meta(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 def load_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
     """Continue from a checkpoint: state, records and totals. The step dt remains the simulation's own, and so does the
-        error of dt = "auto"; interval and horizon are the checkpoint's.
+    error of dt = "auto"; interval and horizon are the checkpoint's.
 
     Raises:
         CheckpointError: unreadable or truncated, or of another model, precision, number of worlds or integrator. The

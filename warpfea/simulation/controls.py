@@ -84,11 +84,11 @@ class ControlValue:
         """Write the values of all worlds.
 
         Args:
-                values: broadcastable to (worlds, size), or (worlds,) for a scalar control; or a Warp array (worlds,
-                    size) of float64, copied on the device without a check for non-finite values.
+            values: broadcastable to (worlds, size), or (worlds,) for a scalar control; or a Warp array (worlds, size)
+                of float64, copied on the device without a check for non-finite values.
 
-            Raises:
-                ModelError: another shape or type, or a non-finite value; nothing is written then.
+        Raises:
+            ModelError: another shape or type, or a non-finite value; nothing is written then.
         """
         if not isinstance(values, wp.array):
             self[:] = values

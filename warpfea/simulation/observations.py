@@ -30,11 +30,11 @@ class Observations:
         probe.NAME.position, .displacement, .velocity     3: m, m/s
         joint.NAME.angle, .travel, .length                1: rad, m; as `sim.joint_value`
         joint.NAME.force, .moment, .violation             3, 3, 1: N, N m, m; as `sim.joint_force`
-            contact.NAME.force, .moment, .normal_force, ...   3, 3, 1: as `ContactRecord`, over the last step
+        contact.NAME.force, .moment, .normal_force, ...   3, 3, 1: as `ContactRecord`, over the last step
 
-        Forces are 0 in worlds without a step since construction or reset. Nothing is read back: `update()` launches
-        kernels, and `array` keeps its memory, which `wp.to_torch(obs.array)`, `torch.from_dlpack(obs)` and, on the CPU,
-        `obs.array.numpy()` share without a copy.
+    Forces are 0 in worlds without a step since construction or reset. Nothing is read back: `update()` launches
+    kernels, and `array` keeps its memory, which `wp.to_torch(obs.array)`, `torch.from_dlpack(obs)` and, on the CPU,
+    `obs.array.numpy()` share without a copy.
 
     Attributes:
         array: Warp array [world, column] in the model's precision.

@@ -33,8 +33,8 @@ class SyncTimes:
         horizon: time over which the error accumulates, s.
         origin: s; synchronisation points are whole numbers of intervals from it.
         end: end of the run, s; a synchronisation point.
-        fixed: (n,) s: kinks of time laws, and single output times.
-        rates: 1/s, of outputs with frames at its multiples.
+        fixed_times: (n,) s: kinks of time laws, and single output times.
+        output_rates: 1/s, of outputs with frames at its multiples.
     """
 
     def __init__(self, laws: Iterable[TimeLaw], interval: float | None, horizon: float | None) -> None:

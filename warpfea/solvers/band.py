@@ -34,7 +34,8 @@ __all__ = ["Band", "BandFactor", "find_band", "thread_block_band"]
 MAX_AUTO_WIDTH = 112
 """Widest band chosen automatically, blocks beside the diagonal; beyond it the two-level preconditioner is cheaper."""
 MAX_FULL_FACTOR_SLOTS = 160
-"""Largest number of slots of a model factored as a whole: here in a band of any width, or else as a dense matrix."""
+"""Largest number of slots (3-vector unknowns) of a model factored as a whole: here in a band of any width, or else as
+a dense matrix."""
 MAX_FACTOR_BYTES = 2**31
 """Size of the factors of one world above which 32-bit indices overflow, bytes."""
 MAX_WINDOW_BYTES, MAX_WORLD_FACTOR_BYTES = 48 * 1024, 200_000
