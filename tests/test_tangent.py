@@ -179,7 +179,7 @@ def test_both_forms_of_the_product_agree(material, form, dtype, rule, data):
     body, model = straight_model(material, form, dtype, rule)
     (block,) = model.blocks
     assert block.key.vertex
-    general = with_mass_kernel(dtype, material, 10, block.points, form, False, block.cluster)
+    general = with_mass_kernel(dtype, material, 10, block.points, form, False, block.cluster_size)
     kernels = [general, block.with_mass_product(dtype, form)]
     u = np.stack([deformed(body), deformed(body, seed=1)])
     v, p = np.random.default_rng(2).uniform(-1, 1, (2, *u.shape))
@@ -196,7 +196,7 @@ def test_the_size_of_clusters_changes_nothing(data):
     (block,) = model.blocks
     u, v, p = np.random.default_rng(2).uniform(-0.1, 0.1, (3, 2, *body.reference.shape))
     expected = with_mass_product(model, block.with_mass_product("float64", None), u, v, p)
-    block.cluster = 32
+    block.cluster_size = 32
     got = with_mass_product(model, block.with_mass_product("float64", None), u, v, p)
     assert data.error(got, expected) < 1e-14
 

@@ -249,7 +249,7 @@ def test_a_small_model_is_inverted_as_a_whole(scene):
 def coarse_functions(sim, depth=0):
     """P of a level from its groups and weights, (3 slots, 3 coarse slots)."""
     level = sim.stepper.newton.preconditioner.levels[depth]
-    n = level.slots
+    n = level.slot_count
     group, weight = level.device_data.group_of.numpy(), level.device_data.weight.numpy()
     columns = (4 * group[:, None] + np.arange(4)).ravel()
     P = sp.csr_matrix((weight.ravel(), (np.repeat(np.arange(n), 4), columns)), shape=(n, 4 * level.group_count))

@@ -40,9 +40,9 @@ class Block:
     slots: int
     contribution_offset: int
     element_offset: int
-    cluster: int
-    field_rule: Any = None
-    output: Any = None
+    cluster_size: int
+    body_force_rule: Any = None
+    stress_output: Any = None
     couplings_per_world: bool = False
     det_J0: np.ndarray | None = None
 
@@ -99,9 +99,11 @@ class Block:
         """Kernel of the product of a with_mass block, with a form of damping; others: see `kernels_for`."""
         k = self.key
         if midpoint:
-            kind = (k.law, self.slots, self.points, tangent_damping(mean_damping(damping)), k.vertex, self.cluster)
+            kind = (k.law, self.slots, self.points, tangent_damping(mean_damping(damping)), k.vertex, self.cluster_size)
             return with_mass_kernel(dtype, *kind, midpoint, dissipative)
-        return with_mass_kernel(dtype, k.law, self.slots, self.points, tangent_damping(damping), k.vertex, self.cluster)
+        return with_mass_kernel(
+            dtype, k.law, self.slots, self.points, tangent_damping(damping), k.vertex, self.cluster_size
+        )
 
 
 def tangent_damping(damping: str | None) -> str | None:
@@ -155,7 +157,7 @@ def output_block(model: Any, block: Block, scheme: str) -> Block:
     _point_tables(model, data, key, parts)
     points = len(key.rule.weights)
     kernels = element_kernels(model.dtype, key.law, block.slots, False, None, True)
-    return Block(key, data, kernels, parts, block.count, points, block.slots, 0, 0, block.cluster)
+    return Block(key, data, kernels, parts, block.count, points, block.slots, 0, 0, block.cluster_size)
 
 
 def output_rows(model: Any, block: Block) -> np.ndarray:

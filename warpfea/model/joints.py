@@ -77,13 +77,13 @@ class ConstraintRow:
     angular: bool = False
 
     @property
-    def terms(self) -> tuple[Vector, Vector, Vector]:
+    def vectors(self) -> tuple[Vector, Vector, Vector]:
         """The three vectors; missing ones are constant."""
         none = constant_vector(np.zeros(3))
         return self.a, self.b, self.a2 or none
 
     @property
-    def constant(self) -> float:
+    def reference_product(self) -> float:
         """A.B of the reference, |A|^2 of a distance; exactly 0 for vectors made perpendicular."""
         A, B = self.a.value, self.b.value
         if self.kind == DISTANCE:

@@ -390,8 +390,8 @@ class Model:
         Args:
             name: "B.E" with the name B of a body, or "B.G.E" with a group G that has a material of its own: a constant
                 of the material (E and nu if made from them, else those of the law), eta and lambda_v of its damping
-                (KelvinVoigt(eta=0) makes them settable from 0), or density, kg/m^3; density_factor for densities given as
-                a function or per element. Set such a name for the first time before making simulations.
+                (KelvinVoigt(eta=0) makes them settable from 0), or density, kg/m^3; density_factor for densities
+                given as a function or per element. Set such a name for the first time before making simulations.
                 "C.mu", "C.mu_static", "C.restitution" or "C.stiffness" with the name C of a contact, as of
                 ModelBuilder.add_contact; mu_static follows mu if equal to it. "K.offset" with the name K of a
                 collider: of a HalfSpace the offset of its plane, m; of other shapes the outward offset of the

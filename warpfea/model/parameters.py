@@ -217,8 +217,8 @@ class MaterialParameters:
             tying = block.key.tying
             if mine and tying and name in tying.uses:
                 self._update_couplings(block, mask)
-            if mine and block.output:
-                block.output.data.coefficients = m.array("output", output_rows(m, block), m.types.T)
+            if mine and block.stress_output:
+                block.stress_output.data.coefficients = m.array("output", output_rows(m, block), m.types.T)
         if m.coefficients.shape[0] == m.worlds:
             m.coefficients.assign(m.coefficient_table)
             return

@@ -70,8 +70,8 @@ def adaptive_options(
         value = given[name]
         if value is not None and not (is_number(value) and value > 0.0):
             raise ModelError(f"{name} = {value!r} must be a positive finite time (s)")
-    if scheme.estimate is None:
-        able = [name for name, known in INTEGRATORS.items() if known.estimate is not None]
+    if scheme.error_weights is None:
+        able = [name for name, known in INTEGRATORS.items() if known.error_weights is not None]
         raise ModelError(
             f"dt = 'auto': integrator {scheme.name!r} has no estimate of its error; there are {', '.join(able)}"
         )

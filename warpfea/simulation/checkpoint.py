@@ -90,8 +90,8 @@ def save_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
         "min_J": sim.min_J if math.isfinite(sim.min_J) else None,
         "probes": [probe.name for probe in sim.model.probes],
     }
-    if sim.stepper.adaptive:
-        sync_times = sim.stepper.adaptive.sync_times
+    if sim.stepper.step_size_control:
+        sync_times = sim.stepper.step_size_control.sync_times
         meta["error"] = sim.error
         meta["instants"] = [sync_times.interval, sync_times.horizon, sync_times.origin] if sync_times.is_set else None
     arrays: dict[str, Any] = {f"state.{name}": values for name, values in sim.state.numpy().items()}
@@ -153,8 +153,8 @@ def load_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
         sim.stepper.start_terms()
     except CheckpointError as error:
         raise CheckpointError(f"{file}: {error}") from None
-    if sim.stepper.adaptive and meta.get("instants"):
-        sim.stepper.adaptive.sync_times.load(*meta["instants"])
+    if sim.stepper.step_size_control and meta.get("instants"):
+        sim.stepper.step_size_control.sync_times.load(*meta["instants"])
     sim.totals = {name: np.array(a) for name, a in totals.items()}
     sim.steps = int(meta["steps"])
     sim.max_residual = float(meta["max_residual"])
@@ -188,7 +188,7 @@ def _check_compatible(file: pathlib.Path, meta: dict[str, Any], sim: Any) -> Non
         raise CheckpointError(
             f"{file}: {what} of the checkpoint is {meta.get(key)!r}, of the simulation {value!r}{hint}"
         )
-    if sim.stepper.adaptive and meta.get("dt") != "auto":
+    if sim.stepper.step_size_control and meta.get("dt") != "auto":
         raise CheckpointError(f"{file}: dt of the checkpoint is {meta.get('dt')!r}, of the simulation 'auto'")
 
 

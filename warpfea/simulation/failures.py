@@ -109,7 +109,7 @@ def _failure_reason(sim: Any, code: int, world: int) -> tuple[str, str]:
         return "singular tangent matrix (unconstrained body or mechanism?)", ""
     near = float(work.newton.rounding_ratio.numpy()[world]) <= STALL_ROUNDINGS
     finer = "; use float64" if dtype == "float32" else "; use fewer, stouter elements, or check the units"
-    adaptive = sim.stepper.adaptive
+    adaptive = sim.stepper.step_size_control
     if code == FAIL_FLOOR and adaptive and (least := adaptive.smallest_resolved_error(world)):
         hides = f"{dtype} round-off of displacements hides the local errors of substeps"
         return hides, f"{finer}, or error = {1.05 * least:.2g} or more"

@@ -67,7 +67,7 @@ class RunStatistics(Records):
         self.steps = 0
         self.last = None
         self.totals = {name: np.zeros(B, int) for name in COUNTED_TOTALS}
-        if self.stepper.adaptive:
+        if self.stepper.step_size_control:
             self.totals |= {name: np.zeros(B, int) for name in ("substeps", "rejected")}
         self.max_residual = self.max_floor = self.max_violation = 0.0
         self.min_J = math.inf
@@ -117,7 +117,7 @@ class RunStatistics(Records):
             residual_force=column["residual_force"],
             floor=column["floor"],
             energy_growth=column["energy_growth"],
-            **(self.stepper.adaptive.step_statistics() if self.stepper.adaptive else {}),
+            **(self.stepper.step_size_control.step_statistics() if self.stepper.step_size_control else {}),
         )
 
     def _record_step(self, rows: np.ndarray) -> None:
@@ -130,7 +130,7 @@ class RunStatistics(Records):
         self._stepped_worlds |= good
         self._stepped_worlds &= last.status != STATUS["failed"]
         totals = self.totals
-        if self.stepper.adaptive:
+        if self.stepper.step_size_control:
             totals["substeps"] += last.substeps
             totals["rejected"] += last.rejected
         totals["newton"] += last.newton

@@ -182,13 +182,13 @@ class Simulation(RunStatistics):
     def dt(self) -> Any:
         """Step, s, or (worlds,) if set per world; for dt="auto" the synchronisation interval, NaN before the first run
         or step sets it; a longer run sets it again."""
-        if self.stepper.adaptive:
-            return self.stepper.adaptive.sync_times.interval
+        if self.stepper.step_size_control:
+            return self.stepper.step_size_control.sync_times.interval
         return self.stepper.work.step.dt.numpy().copy() if self._dt is None else self._dt
 
     @dt.setter
     def dt(self, value: Any) -> None:
-        if self.stepper.adaptive:
+        if self.stepper.step_size_control:
             raise ModelError(f"dt = {value!r}: this simulation was made with dt = 'auto'")
         check_times("dt", value, self.model, positive=True)
         one = isinstance(value, (int, float, np.floating))
@@ -250,8 +250,8 @@ class Simulation(RunStatistics):
         """
         check_steps(count)
         for _ in range(count):
-            if self.stepper.adaptive:
-                self.stepper.adaptive.set_interval(self.time)
+            if self.stepper.step_size_control:
+                self.stepper.step_size_control.set_interval(self.time)
             self.stepper.update_parameters()
             self.stepper.run()
             if self.asynchronous:
@@ -293,7 +293,7 @@ class Simulation(RunStatistics):
             raise ModelError("run: worlds have times of their own; take step(count), and t_end of Simulation")
         alive = self.status == STATUS["running"]
         now = float(self.time[alive].min()) if alive.any() else t_end
-        adaptive = self.stepper.adaptive
+        adaptive = self.stepper.step_size_control
         if t_end < now - (0.0 if adaptive else SAME_TIME * self.dt):
             raise ModelError(f"t_end = {t_end:g} s lies in the past: the simulation is at t = {now:.6g} s")
         if adaptive:

@@ -105,10 +105,10 @@ class Stepper:
         )
         flags = self.work.any_flag
         self.running, self.refused, self.failed = flags[2:3], flags[3:4], flags[4:5]
-        self.adaptive: StepSizeControl | None = None
+        self.step_size_control: StepSizeControl | None = None
         if adapt:
             tries = solver.max_halvings
-            self.adaptive = StepSizeControl(self.ctx, self.v_before, integrator, adapt, max_tries=tries)
+            self.step_size_control = StepSizeControl(self.ctx, self.v_before, integrator, adapt, max_tries=tries)
         self._bind_structs()
         self.energy_growth = growth
         if growth:
@@ -116,7 +116,7 @@ class Stepper:
         self.episodes = Episodes(model, self.work, self.launch, **(episodes or {"asynchronous": False, "ends": False}))
         self._probe_tables = self._upload_probes() if model.probes else []
         state.sealed = True
-        self.backup = state.copy() if solver.max_halvings > 0 or self.adaptive else None
+        self.backup = state.copy() if solver.max_halvings > 0 or self.step_size_control else None
         self._load_modules()
         self.start_terms()
         self._evaluate_potential(None)
@@ -133,8 +133,8 @@ class Stepper:
         w.step.status, w.step.summed = state.status, state.summed_time
         w.step.gravity = self.terms.dead.gravity
         w.step.any_running, w.step.any_refused = self.running, w.any_flag[3:5]
-        w.step.max_halvings = MAX_LEVEL if self.adaptive else self.solver.max_halvings
-        if isinstance(self.solver, NewtonPCG) and not self.adaptive:
+        w.step.max_halvings = MAX_LEVEL if self.step_size_control else self.solver.max_halvings
+        if isinstance(self.solver, NewtonPCG) and not self.step_size_control:
             w.step.newton_budget = self.solver.newton_budget(bool(self.terms.traits.unilateral))
         w.step.stabilise = self.integrator.stabilise
         w.step.parameter = self.integrator.parameter
@@ -268,8 +268,8 @@ class Stepper:
         out |= self.newton.modules() | self.terms.modules(self.ctx)
         if self.backup is not None:
             out.add(state_kernels().module)
-        if self.adaptive:
-            out.add(self.adaptive.kernels.module)
+        if self.step_size_control:
+            out.add(self.step_size_control.kernels.module)
         out |= self.episodes.modules()
         return sorted(out, key=lambda module: module.name)
 
@@ -307,13 +307,13 @@ class Stepper:
         w.any_flag[2:5].zero_()
         self.episodes.freeze_finished()
         launch(self.kernels.begin_step, m.worlds, [w.step, w.newton, w.pcg])
-        if self.adaptive:
+        if self.step_size_control:
             assert self.backup is not None
             self.backup.copy_rows(launch, w.step.running, self.state)
-            self.adaptive.begin_interval()
+            self.step_size_control.begin_interval()
         wp.capture_while(self.running, self._attempt)
-        if self.adaptive:
-            self.adaptive.end_interval()
+        if self.step_size_control:
+            self.step_size_control.end_interval()
         self._write_report()
 
     @labelled("commit")
@@ -365,11 +365,11 @@ class Stepper:
         for term in self.terms:
             term.begin(self.ctx, running)
         self.newton.run()
-        if self.adaptive:
-            self.adaptive.check_local_error()
+        if self.step_size_control:
+            self.step_size_control.check_local_error()
         launch(self.kernels.end_attempt, m.worlds, [w.step, w.newton])
-        if self.adaptive:
-            self.adaptive.finish_attempt()
+        if self.step_size_control:
+            self.step_size_control.finish_attempt()
         self.accept_attempt()
 
     def _start_from_candidate(self, kind: int) -> None:

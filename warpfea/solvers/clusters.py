@@ -88,13 +88,13 @@ def make_clusters(model: Model) -> ModelClusters:
     """Clusters of a model with straight elements only, mass included in the product."""
     blocks, slots, offset = [], [], 0
     for block in model.blocks:
-        tables = cluster_tables(block.connectivity, block.cluster)
+        tables = cluster_tables(block.connectivity, block.cluster_size)
         data = cluster_struct()()
         for name in ("start", "slot_start", "table"):
             setattr(data, name, model.array("clusters", getattr(tables, name), wp.int32))
         data.offset = offset
         count = np.diff(tables.slot_start)
-        place = np.minimum(np.arange(slot_capacity(block.cluster, block.slots)), count[:, None] - 1)
+        place = np.minimum(np.arange(slot_capacity(block.cluster_size, block.slots)), count[:, None] - 1)
         data.slot = model.array("clusters", tables.slot[tables.slot_start[:-1, None] + place], wp.int32)
         blocks.append((data, len(count)))
         slots.append(tables.slot)
@@ -109,8 +109,10 @@ def make_clusters(model: Model) -> ModelClusters:
 def make_cluster_memory(model: Model, work: Workspace, *, midpoint: bool) -> Any:
     """Device struct of the arrays that replace shared memory on the CPU; empty on CUDA."""
     pool, to_host = pool_struct(model.dtype)(), not model.device.is_cuda
-    numbers = max(pool_size(b.cluster, b.slots, 3 if midpoint or b.key.damping == "rate" else 2) for b in model.blocks)
-    words = max(table_layout(b.cluster, b.slots)[2] for b in model.blocks)
+    numbers = max(
+        pool_size(b.cluster_size, b.slots, 3 if midpoint or b.key.damping == "rate" else 2) for b in model.blocks
+    )
+    words = max(table_layout(b.cluster_size, b.slots)[2] for b in model.blocks)
     pool.number = work.array("cluster numbers", (numbers if to_host else 1,), model.types.T)
     pool.table = work.array("cluster table", (words if to_host else 1,), wp.int32)
     return pool

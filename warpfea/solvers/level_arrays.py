@@ -26,7 +26,7 @@ class LevelArrays:
         self, model: Model, work: Workspace, launch: Launcher, level: Level, depth: int, storage: str,
         by_component: bool
     ) -> None:  # fmt: skip
-        B, n, T = model.worlds, level.slots, model.types.T
+        B, n, T = model.worlds, level.slot_count, model.types.T
         S = precision(storage).T
         other = storage != model.dtype
         name = f"level {depth}"

@@ -40,7 +40,7 @@ class Level:
 
     Attributes:
         pattern: pattern of its matrix.
-        slots: number of slots.
+        slot_count: number of slots.
         is_dense: bottom level, inverted as a whole; no tiles, no groups.
         components: uncoupled components of a dense level.
         band: the only level, factored as a whole; no tiles, no groups.
@@ -50,7 +50,7 @@ class Level:
     """
 
     pattern: Pattern
-    slots: int
+    slot_count: int
     is_dense: bool
     device_data: Any
     tile_count: int = 0

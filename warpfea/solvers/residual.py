@@ -300,7 +300,7 @@ class Residual:
         m, w, launch = self.model, self.work, self.launch
         if self.clusters:
             for block, kernel, (data, count) in zip(m.blocks, self.product_kernels, self.clusters.blocks):
-                lanes = block.cluster if m.device.is_cuda else 1
+                lanes = block.cluster_size if m.device.is_cuda else 1
                 args = [
                     w.data_of(block),
                     data,
@@ -313,7 +313,7 @@ class Residual:
                     p,
                 ]
                 args += [lanes, self.cluster_memory, w.contribution]
-                launch(kernel, (m.worlds, count * lanes), args, block_dim=block.cluster)
+                launch(kernel, (m.worlds, count * lanes), args, block_dim=block.cluster_size)
         elif self.uses_predicted_stress:
             self.elements.predicted_stress_tangent(self.ctx, p, active)
         elif not self.uses_matrix:

@@ -99,7 +99,9 @@ class TwoLevel:
         self.band = BandFactor(model, work, launch, band, pattern) if band is not None else None
         # factors of the operator's matrix if cheap, or for static equilibria of beams (the matrix made here then only
         # serves D); wider bands are reused for longer
-        one = self.storage_dtype == model.dtype and not residual.ctx.inertia and first.slots <= MAX_FULL_FACTOR_SLOTS
+        one = (
+            self.storage_dtype == model.dtype and not residual.ctx.inertia and first.slot_count <= MAX_FULL_FACTOR_SLOTS
+        )
         order = find_band(model) if first.is_dense and one else band
         # (a GPU factors the band of a small model, joint terms included, in about the time of its matrix)
         quick = order is not None and (order.cheap_to_factorise or (band is not None and model.device.is_cuda))
@@ -137,7 +139,7 @@ class TwoLevel:
         # iteration counts are not comparable; separate key
         name = "preconditioner" if band is None else "preconditioner_banded"
         self.reuse = ReuseRule(model, work, launch, name, self.rebuild_cost)
-        most = max([level.slots for level in self.levels[1:]], default=1)
+        most = max([level.slot_count for level in self.levels[1:]], default=1)
         self.all_free = wp.full(most, 1.0, dtype=model.types.vec3, device=model.device)
 
     def _make_body_modes(self) -> tuple[RigidBodyModes | None, set[wp.Module]]:
@@ -261,7 +263,7 @@ class TwoLevel:
     # application
 
     def _apply_dense(self, depth: int, r: wp.array, x: wp.array, active: wp.array) -> None:
-        n, B = self.levels[depth].slots, self.model.worlds
+        n, B = self.levels[depth].slot_count, self.model.worlds
         flat_r, flat_x = (leading_view(a, (B, 3 * n), self.model.types.T) for a in (r, x))
         dense = self.level_arrays[depth].dense_inverse
         assert dense is not None
@@ -299,7 +301,7 @@ class TwoLevel:
         """x = C r on an intermediate level by Chebyshev steps; overwrites r."""
         level, arrays = self.levels[depth], self.level_arrays[depth]
         v = arrays.vectors
-        dim = (self.model.worlds, level.slots)
+        dim = (self.model.worlds, level.slot_count)
         low = LARGEST_EIGENVALUE / EIGENVALUE_RATIO
         centre, half = 0.5 * (LARGEST_EIGENVALUE + low), 0.5 * (LARGEST_EIGENVALUE - low)
         ratio = centre / half
@@ -312,7 +314,7 @@ class TwoLevel:
             if k < CHEBYSHEV_STEPS - 1:
                 lanes = self.launch.lanes(level.pattern.mean_row_length)
                 args = [level.pattern.data, arrays.block_values, v["d"], lanes, active, v["r"]]
-                threads = self.launch.padded(level.slots * lanes)
+                threads = self.launch.padded(level.slot_count * lanes)
                 self.launch(self.kernels.subtract_product, (self.model.worlds, threads), args)
             new = 1.0 / (2.0 * ratio - rho)
             keep, step = new * rho, 2.0 * new / half

@@ -89,7 +89,7 @@ class BodyForces(Term):
         m = self.model
         rules = [assembly.mass_rule(p.body, block.key.affine) for p in block.host_blocks]
         rule = max(rules, key=lambda r: r.degree)
-        if block.field_rule is None:
+        if block.body_force_rule is None:
             weights, shapes = [], []
             for host in block.host_blocks:
                 for elems in assembly.element_chunks(host.body, host.elements, len(rule.weights)):
@@ -101,7 +101,7 @@ class BodyForces(Term):
             shape = np.concatenate(shapes) if per_element else shapes[0]
             block.data.shape = m.array("loads", np.moveaxis(shape, 0, 2), m.types.T)
             block.data.field_weight = m.array("loads", np.concatenate(weights).T, m.types.T)
-            block.field_rule = rule
+            block.body_force_rule = rule
 
     def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
         return {field.kernel.module for field in self.parts_of_fields}

@@ -157,8 +157,8 @@ class Evaluation:
                 scheme = block.key.output_scheme
                 if scheme is None:
                     continue  # a shell's transverse shear stress vanishes at its faces, the output points
-                block.output = block.output or output_block(m, block, scheme)
-                block = block.output
+                block.stress_output = block.stress_output or output_block(m, block, scheme)
+                block = block.stress_output
             stress = self._zeros((m.worlds, block.points, block.count), m.types.sym)
             J = self._zeros((m.worlds, block.points, block.count), m.types.T)
             kernel = block.kernels_for(m.dtype, None).point_stress
