@@ -7,7 +7,7 @@ from soft_links import EXACT, JUMP, double_pendulum, links, pulled, swing, turni
 
 import warpfea as wf
 from warpfea.simulation.consistent_initial_conditions import constraint_rates
-from warpfea.simulation.discontinuities import jumps, kinks
+from warpfea.simulation.discontinuities import jump_intervals, kink_times
 
 
 def series(make, h, rho, end=0.016, halved=False):
@@ -164,12 +164,12 @@ def test_kinks_of_a_law():
         "sine": wf.time_laws.time_law((smooth, np.sin(6 * smooth)), "x", scalar=True),
         "constant": wf.time_laws.time_law(2.0, "x", scalar=True),
     }
-    assert kinks(laws["ramp"], 1e-3).tolist() == [0.0, 0.5]
-    assert jumps(laws["ramp"], 1e-3).size == 0
-    assert jumps(laws["jump"], 1e-3).tolist() == [[0.5, 0.5 + 1e-9]]
-    assert kinks(laws["jump"], 1e-3).size == 0
-    assert set(kinks(laws["sine"], 1e-3)) <= {0.0, 1.0}
-    assert kinks(laws["constant"], 1e-3).size == jumps(laws["constant"], 1e-3).size == 0
+    assert kink_times(laws["ramp"], 1e-3).tolist() == [0.0, 0.5]
+    assert jump_intervals(laws["ramp"], 1e-3).size == 0
+    assert jump_intervals(laws["jump"], 1e-3).tolist() == [[0.5, 0.5 + 1e-9]]
+    assert kink_times(laws["jump"], 1e-3).size == 0
+    assert set(kink_times(laws["sine"], 1e-3)) <= {0.0, 1.0}
+    assert kink_times(laws["constant"], 1e-3).size == jump_intervals(laws["constant"], 1e-3).size == 0
 
 
 @pytest.mark.parametrize("load", [True, False], ids=["load", "drive"])

@@ -7,7 +7,7 @@ import warp as wp
 from two_level_models import bar
 
 import warpfea as wf
-from warpfea.model.partition import bisect, connected_groups, morton_order
+from warpfea.model.partition import bisect_groups, connected_groups, morton_order
 from warpfea.solvers.matrix_assembly import MatrixAssembler
 from warpfea.studies.bench.problems import PROBLEMS
 
@@ -117,7 +117,7 @@ SCENES = {
 def test_groups_fit_and_stay_within_their_label(weight):
     rng = np.random.default_rng(0)
     X, labels = rng.random((500, 3)), rng.integers(0, 3, 500)
-    group = bisect(X, np.full(500, weight), labels, 16)
+    group = bisect_groups(X, np.full(500, weight), labels, 16)
     sizes = np.bincount(group, minlength=0) * weight
     assert sizes.min() > 0
     assert sizes.max() <= 16
@@ -130,7 +130,7 @@ def test_groups_fit_and_stay_within_their_label(weight):
 
 def test_items_larger_than_a_group_are_refused():
     with pytest.raises(ValueError, match="does not fit"):
-        bisect(np.zeros((2, 3)), np.array([4, 20]), np.zeros(2), 16)
+        bisect_groups(np.zeros((2, 3)), np.array([4, 20]), np.zeros(2), 16)
 
 
 def test_groups_are_split_into_connected_parts():

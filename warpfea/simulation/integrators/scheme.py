@@ -21,8 +21,8 @@ class Integrator:
         midpoint: forces are those of the middle of the step, and conserve energy and momenta.
         accelerated: acceleration-level scheme, with algorithmic accelerations a_n and those of the equilibrium w_n;
             needs consistent initial values.
-        error_weights: wp.func (h, previous h) -> vec3d, the weights (s) of v_{n+1}, v_n and v_{n-1}, of sum 0, that give
-            the local error in position, m; None: no adaptive steps.
+        error_weights: wp.func (h, previous h) -> vec3d, the weights (s) of v_{n+1}, v_n and v_{n-1}, of sum 0, that
+            give the local error in position, m; None: no adaptive steps.
         static: no inertia; v is the displacement increment of a load step.
         parameter: argument of `coefficients`, such as a spectral radius.
         stabilise: N/m per kg, statics: springs from the last equilibrium to the next, fading with the load.
