@@ -22,8 +22,8 @@ from .reports import idle_report
 __all__ = ["Checkpoint", "load_checkpoint", "read_meta", "save_checkpoint"]
 
 SCHEMA = 3
-"""1: constraints were registered with the solver, and the ledger had a column of joints in every model; 2: other names
-of history arrays and of the attributes of terms, which `Term.hash` reads."""
+"""Version of the file format. 1: constraints were registered with the solver, and the ledger had a column of joints in
+every model; 2: other names of history arrays and of the attributes of terms, which `Term.hash` reads."""
 SUFFIXES = (".npz",)
 
 

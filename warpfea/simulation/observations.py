@@ -15,6 +15,7 @@ from ..kernels.terms.contact_structs import RECORD
 
 __all__ = ["Observations"]
 
+# first column after that of the joint or contact, and number of columns, by quantity
 JOINT_REPORT_COLUMNS = {"force": (0, 3), "moment": (3, 3), "violation": (6, 1)}
 CONTACT_REPORT_COLUMNS = {"force": (0, 3), "moment": (3, 3)} | {name: (k, 1) for k, name in enumerate(RECORD) if k > 5}
 NAME_FORMS = "'time', 'body.NAME.position', 'probe.NAME.velocity', 'joint.NAME.angle' or 'contact.NAME.force'"

@@ -18,6 +18,7 @@ from .reports import StepReport
 __all__ = ["RunStatistics"]
 
 COUNTED_TOTALS = ("newton", "pcg", "rough", "floored")
+"""Keys of `totals`: Newton and PCG iterations, steps accepted above the tolerance, and at the round-off limit."""
 
 
 class SyncedAttribute:

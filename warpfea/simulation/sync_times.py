@@ -23,6 +23,7 @@ FRAME_INTERVAL = 1.0 / 60.0
 TIME_TOL = 1e-9
 """Relative tolerance of equal times, over an interval; at least `TIME_TOL_ROUNDINGS` roundings of the time."""
 TIME_TOL_ROUNDINGS = 64.0
+"""Smallest tolerance of equal times, in units in the last place of the time."""
 
 
 class SyncTimes:

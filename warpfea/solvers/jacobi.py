@@ -44,6 +44,7 @@ if TYPE_CHECKING:
 __all__ = ["Jacobi", "JacobiLoop"]
 
 ACCELERATIONS = ("secants", "anderson", "chebyshev", "none")
+"""Accelerations of the module docstring."""
 MAX_RESIDUAL_GROWTH = 10.0
 """Largest accepted ratio of the final to the initial residual of a step."""
 MAX_VIOLATION = 1e-3

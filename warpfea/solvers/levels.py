@@ -23,6 +23,7 @@ __all__ = ["GROUP_SLOTS", "MAX_BOTTOM_SLOTS", "Level", "make_levels"]
 GROUP_SLOTS = 64
 """Maximum slots of a group. Its affine functions are 4 slots of the next level, about 1/16 of the unknowns."""
 SMALL_GROUP_SLOTS = (16, 32)
+"""Group sizes tried first in a small model, see MAX_SMALL_COARSE_SLOTS."""
 MAX_SMALL_COARSE_SLOTS = 48
 """Coarse level size up to which smaller groups are used: a small slender body has too few groups of 64 slots to bend (a
 cantilever of 180 slots takes half the iterations)."""
@@ -32,6 +33,7 @@ further levels."""
 MAX_COMPONENT_PAIRS = 1344**2
 """Maximum slot pairs in components of up to MAX_FULL_FACTOR_SLOTS slots that are each inverted as a whole."""
 MAX_LEVELS = 12
+"""Bound of the number of levels; each has about a sixteenth of the unknowns of the one above."""
 
 
 @dataclass(eq=False)
