@@ -189,13 +189,13 @@ def test_cubics_between_steps_are_of_fourth_order():
 
 
 def test_methods_with_options():
-    assert integrators.get("generalized_alpha(rho_inf=.5)").parameter == 0.5
-    assert integrators.get(" bdf2 ").name == "bdf2"
+    assert integrators.find_integrator("generalized_alpha(rho_inf=.5)").parameter == 0.5
+    assert integrators.find_integrator(" bdf2 ").name == "bdf2"
     assert split_methods("bdf2,my_scheme(rho=.5, a=1),x") == ["bdf2", "my_scheme(rho=.5, a=1)", "x"]
     for text, named in (("generalized_alpha(tau=1)", "tau"), ("generalized_alpha(rho_inf)", "not a number"),
                         ("bdf2(rho=1)", "no option"), ("bdf3", "bdf2")):  # fmt: skip
         with pytest.raises(wf.ModelError, match=named):
-            integrators.get(text)
+            integrators.find_integrator(text)
 
 
 def test_what_is_swept_is_sorted_out():

@@ -21,8 +21,8 @@ def test_kinks_of_tables_are_instants_and_samples_of_curves_are_not():
     t = np.linspace(0.0, 1.0, 201)
     smooth = time_law((t, np.column_stack([np.sin(20.0 * t), 0 * t, 0 * t])), "curve")
     ramp = time_law(([0.0, 0.1, 0.100001, 5.0], [(0, 0, 0), (0, 0, 0), (1, 0, 0), (1, 0, 0)]), "ramp")
-    assert SyncTimes([smooth], 1.0, 1.0).kinks.tolist() == [0.0, 1.0]  # where it begins and ends
-    assert SyncTimes([ramp, time_law((1, 0, 0), "constant")], 1.0, 1.0).kinks.tolist() == [0.1, 0.100001]
+    assert SyncTimes([smooth], 1.0, 1.0).kink_times.tolist() == [0.0, 1.0]  # where it begins and ends
+    assert SyncTimes([ramp, time_law((1, 0, 0), "constant")], 1.0, 1.0).kink_times.tolist() == [0.1, 0.100001]
 
 
 def test_a_short_pulse_is_seen_beside_a_jump():
@@ -31,7 +31,7 @@ def test_a_short_pulse_is_seen_beside_a_jump():
     times = [0.0, start, start + half, start + 2 * half, 0.5, 0.5 + 1e-7, 1.0]
     load = np.outer([0, 0, 1e5, 0, 0, 1e5, 1e5], [1.0, 0, 0])
     law = time_law((times, load), "pull")
-    assert set(times[1:4]) <= set(SyncTimes([law], 1.0, 1.0).kinks)
+    assert set(times[1:4]) <= set(SyncTimes([law], 1.0, 1.0).kink_times)
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     body = b.add_solid(wf.mesh.box((1, 1, 1), cells=(1, 1, 1)), material=LAW)
     b.add_traction(body.surface("x+"), (times, load))
@@ -79,7 +79,7 @@ def test_instants_are_intervals_frames_moments_and_the_end():
     sync_times.add_outputs([Frames()])
     sync_times.set_defaults(0.0, 0.1)
     assert (1.0 / 30.0 / sync_times.interval) % 1.0 == pytest.approx(0.0, abs=1e-12)
-    count = sync_times.count(0.0, 0.1)
+    count = sync_times.count_between(0.0, 0.1)
     times = [0.0]
     while times[-1] < 0.1 - 1e-12:
         times.append(sync_times.next_after(times[-1]))

@@ -136,7 +136,7 @@ def test_pressure_on_a_closed_surface(name):
     assert np.abs(moment_of(body, u, f)).max() < 1e-13 * scale * 4
     # a uniform growth about the origin: - p 3 V, with V in the deformed place by the mass rule
     rule = body.family.curved_mass_rule
-    _, ds, _, _ = assembly.geometry(body, np.arange(len(body.mesh.cells)), rule.points)
+    _, ds, _, _ = assembly.shape_and_jacobian(body, np.arange(len(body.mesh.cells)), rule.points)
     det = np.linalg.det(np.einsum("esk,eqsl->eqkl", (body.reference + u)[body.connectivity], ds))
     assert np.sum(f * (body.reference + u)) == pytest.approx(-3e3 * np.sum(det * rule.weights), rel=1e-10)
     d = np.random.default_rng(5).uniform(-1, 1, u.shape)

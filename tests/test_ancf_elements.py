@@ -21,8 +21,8 @@ WITH_RULES = SPLIT + [(name, None) for name in SHAPES if (name, "split") not in 
 
 def tables(body, xi):
     """s (E, Q, S), h (E, Q, S, 3), J0 (E, Q, 3, 3) at parent points."""
-    s, ds, J0, _ = assembly.geometry(body, np.arange(len(body.mesh.cells)), xi)
-    return s, assembly.gradients(ds, J0), J0
+    s, ds, J0, _ = assembly.shape_and_jacobian(body, np.arange(len(body.mesh.cells)), xi)
+    return s, assembly.shape_gradients(ds, J0), J0
 
 
 # functions
@@ -251,9 +251,9 @@ def test_rigid_motion_costs_nothing(name, integration, angle):
     """Any rotation and a far translation: no force on the scale of E w |h|, no energy on that of E V."""
     body, model = build(name, integration)
     rule = body.family.rule(None) if integration is None else body.family.rules["full"]
-    _, ds, J0, det = assembly.geometry(body, np.arange(len(body.mesh.cells)), rule.points)
+    _, ds, J0, det = assembly.shape_and_jacobian(body, np.arange(len(body.mesh.cells)), rule.points)
     w = det * rule.weights
-    size = np.einsum("eq,eqs->es", w, np.linalg.norm(assembly.gradients(ds, J0), axis=3))
+    size = np.einsum("eq,eqs->es", w, np.linalg.norm(assembly.shape_gradients(ds, J0), axis=3))
     scale = E_MODULUS * np.bincount(body.connectivity.ravel(), weights=size.ravel())
     state = state_of(model, affine(body, rotation(angle), (30.0, -40.0, 50.0)))
     assert np.abs(model.internal_force(state)[0] / scale[:, None]).max() < 1e-12

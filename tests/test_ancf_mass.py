@@ -44,7 +44,7 @@ def test_mass_matrix(name, data):
     body, model = build(name, n=2)
     parent = body.family.parent
     rule = conical_tet(7) if parent.low is None else box_rule((10, 8, 6), tuple(zip(parent.low, parent.high)))
-    s, _, _, det = assembly.geometry(body, np.arange(len(body.mesh.cells)), rule.points)
+    s, _, _, det = assembly.shape_and_jacobian(body, np.arange(len(body.mesh.cells)), rule.points)
     local = np.einsum("eq,eqi,eqj->eij", RHO * det * rule.weights, s, s, optimize=True)
     expected = np.zeros((model.slots, model.slots))
     for conn, m in zip(body.connectivity, local):

@@ -4,7 +4,7 @@ import pytest
 
 import warpfea as wf
 from warpfea.simulation import capacity
-from warpfea.solvers import assembled
+from warpfea.solvers import matrix_assembly
 
 
 def build(worlds, *, contact=False):
@@ -26,14 +26,14 @@ def taken(worlds, **options):
 
 @pytest.mark.parametrize("options", [{}, {"integrator": "bdf2", "ledger": False}], ids=["default", "bdf2"])
 def test_what_fits_is_told_and_does(options, monkeypatch):
-    monkeypatch.setattr(assembled, "CHUNK", 2)
+    monkeypatch.setattr(matrix_assembly, "MIN_CHUNK_WORLDS", 2)
     room = (taken(7, **options) + taken(8, **options)) // 2
     monkeypatch.setattr(capacity, "free_bytes", lambda device: int(room / (1.0 - capacity.RESERVED_FRACTION)) + 1)
     text = r"bytes per world, and cpu has .*free; maximum: 7 worlds; take fewer worlds, a coarser mesh"
     with pytest.raises(wf.CapacityError, match=text) as refused:
         wf.Simulation(build(9, contact=True), dt=1e-3, **options)
     monkeypatch.undo()
-    monkeypatch.setattr(assembled, "CHUNK", 2)
+    monkeypatch.setattr(matrix_assembly, "MIN_CHUNK_WORLDS", 2)
     assert refused.value.worlds == 7
     assert refused.value.bytes == taken(9, **options)
     assert refused.value.per_world == refused.value.bytes // 9

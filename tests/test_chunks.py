@@ -5,7 +5,7 @@ import pytest
 
 import warpfea as wf
 from scenes import double_pendulum, pendulum
-from warpfea.solvers import assembled
+from warpfea.solvers import matrix_assembly
 
 WORLDS = 5
 
@@ -46,8 +46,8 @@ def test_chunks_change_no_bit(build, preconditioner, monkeypatch):
         return sim.state.numpy(), sim.bytes()
 
     whole, bytes_whole = run()
-    monkeypatch.setattr(assembled, "CHUNK", 2)
-    monkeypatch.setattr(assembled, "CHUNKS", 3)
+    monkeypatch.setattr(matrix_assembly, "MIN_CHUNK_WORLDS", 2)
+    monkeypatch.setattr(matrix_assembly, "MAX_CHUNKS", 3)
     state, bytes_now = run()
     for name, values in whole.items():
         assert np.array_equal(state[name], values, equal_nan=True), name

@@ -74,7 +74,7 @@ def test_product_of_elements_in_any_order(element, dtype, tol):
     model = b.finalize(device="cpu", dtype=dtype)
     sim, residual = prepare(model, "elements")
     ((_, clusters),) = residual.clusters.blocks
-    assert (clusters > 1 + len(mesh.cells) // model.blocks[0].cluster) == (element == "T10")  # some were halved
+    assert (clusters > 1 + len(mesh.cells) // model.blocks[0].cluster_size) == (element == "T10")  # some were halved
     direction, out = apply(model, residual)
     p, dt = direction.numpy()[0].astype(float), DT
     exact = b.finalize(device="cpu") if dtype == "float32" else model
@@ -106,7 +106,7 @@ def test_several_blocks_and_worlds_against_the_plain_sum(dtype, tol):
     for clusters in (residual.clusters, None):
         residual.clusters = clusters
         w.contribution.fill_(np.nan)
-        residual.pool.numbers.fill_(np.nan)
+        residual.cluster_memory.numbers.fill_(np.nan)
         w.Hp.fill_(7.0)
         residual.product(w.p, w.Hp, active)
         got.append(w.Hp.numpy().astype(float))

@@ -27,8 +27,8 @@ def by_hand(model, u):
     target = model.evaluation.constraints(state_at(model, u))[2][0]
     J = np.zeros((model.constraints.count, model.slots, 3))
     for k, row in enumerate(model.constraints.rows):
-        entries = [vector.entries() for vector in row.terms]
-        a, b, a2 = (vector.value + e[1] @ u[e[0]] for vector, e in zip(row.terms, entries))
+        entries = [vector.entries() for vector in row.vectors]
+        a, b, a2 = (vector.value + e[1] @ u[e[0]] for vector, e in zip(row.vectors, entries))
         s, c = np.sin(target[k]), np.cos(target[k])
         G = {0: (b, a, 0 * a), 1: (a / np.linalg.norm(a), 0 * a, 0 * a), 2: (-s * b, c * a2 - s * a, c * b)}[row.kind]
         for (slots, weights, _), g in zip(entries, G):

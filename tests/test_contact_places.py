@@ -9,13 +9,13 @@ import pytest
 from pairwise import covering
 
 import warpfea as wf
-from warpfea.model.contact_points import RULES, lagrange_basis
+from warpfea.model.contact_points import CONTACT_RULES, lagrange_basis
 
 
 @pytest.mark.parametrize("count", [3, 4, 7, 9, 16, 25])
 def test_polynomials_of_the_points(count):
     """1 at their own point and 0 at the others, a sum of 1 anywhere; on an edge only its points count."""
-    rule = next(known[count] for known in RULES.values() if count in known)
+    rule = next(known[count] for known in CONTACT_RULES.values() if count in known)
     basis, power = lagrange_basis(rule.points)
 
     def functions(s):

@@ -197,7 +197,7 @@ def test_curved_faces_of_a_ball(element):
     body = wf.ModelBuilder().add_solid(mesh, material=LAW, element=element)
     p = contact_points(whole(body))
     fine = assembly.facet_tables(whole(body), rules={3: conical_triangle(7)})
-    X, area = assembly.facet_places(body, fine)
+    X, area = assembly.facet_positions_and_areas(body, fine)
     if element == "T10":
         assert np.abs((p.normal * p.area[:, :, None]).sum(axis=(0, 1))).max() < 1e-13
     assert p.area.sum() == pytest.approx(area.sum(), rel=2e-5)

@@ -81,15 +81,15 @@ def test_all_of_H_is_factorised(operator):
     work.newton.iterations.zero_()
     newton.residual.evaluate(active)
     newton.residual.assemble_matrix(active)
-    newton.direct._assemble(active, newton.direct.value, projected=False)
-    matrix = newton.direct.assembled.matrix(newton.direct.value)
+    newton.direct._assemble(active, newton.direct.matrix, projected=False)
+    matrix = newton.direct.assembler.host_csr(newton.direct.matrix)
     v = np.random.default_rng(0).normal(size=(model.slots, 3)) * model.free_host
     work.p.assign(v[None])
     newton.residual.product(work.p, work.Hp, active)
     expected = work.Hp.numpy().ravel()
     parts = [
         abs(work.multipliers.trial_multiplier.numpy()).max(),
-        abs(newton.direct.followers[0].columns.numpy()).max(),
+        abs(newton.direct.follower_matrices[0].columns.numpy()).max(),
     ]
     assert min(parts) > 0.0
     assert np.abs(matrix @ v.ravel() - expected).max() < 1e-12 * np.abs(expected).max()
@@ -130,11 +130,13 @@ def test_statics_of_a_slender_beam(data):
 @pytest.mark.slow
 def test_a_column_beyond_its_critical_load(data, monkeypatch):
     """The positive matrix replaces an indefinite H, whose inverse may lead uphill."""
-    from warpfea.solvers.direct import Direct
+    from warpfea.solvers.direct import DirectSolver
 
     uphill = []
-    retreat = Direct._factorise_positive
-    monkeypatch.setattr(Direct, "_factorise_positive", lambda self, world: (uphill.append(world), retreat(self, world)))
+    retreat = DirectSolver._factorise_projected
+    monkeypatch.setattr(
+        DirectSolver, "_factorise_projected", lambda self, world: (uphill.append(world), retreat(self, world))
+    )
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     column = b.add_beam(
         [(0, 0, 0), (0, 0, 1)], elements=6, section=wf.Rectangle(0.1, 0.1), normal=(1, 0, 0),

@@ -7,7 +7,7 @@ import warp as wp
 from validation.conservation import RATE, Conserved, tumble
 
 import warpfea as wf
-from warpfea.model.assembly import geometry, gradients
+from warpfea.model.assembly import shape_and_jacobian, shape_gradients
 from warpfea.simulation import integrators
 from warpfea.studies.stress.case import Setting
 from warpfea.studies.stress.cases import rotation
@@ -98,8 +98,8 @@ def test_a_rotor_on_a_joint_gains_no_energy(turn):
 def strains(body, u, rule):
     """Green's strain (E, Q, 3, 3) and volumes (E, Q) at the points of a rule, from displacements alone."""
     elements = np.arange(len(body.connectivity))
-    _, ds, J0, det = geometry(body, elements, rule.points)
-    F = np.eye(3) + np.einsum("esk,eqsl->eqkl", u[body.connectivity], gradients(ds, J0))
+    _, ds, J0, det = shape_and_jacobian(body, elements, rule.points)
+    F = np.eye(3) + np.einsum("esk,eqsl->eqkl", u[body.connectivity], shape_gradients(ds, J0))
     return 0.5 * (np.swapaxes(F, 2, 3) @ F - np.eye(3)), det * rule.weights
 
 
@@ -218,14 +218,14 @@ def test_order(rho, order):
 
 
 def test_names_and_options():
-    assert integrators.get("energy_momentum").rho_inf == 1.0
-    assert integrators.get("energy_momentum").order == 2
-    scheme = integrators.get(" energy_momentum ( rho_inf = 0.5 )")
+    assert integrators.find_integrator("energy_momentum").rho_inf == 1.0
+    assert integrators.find_integrator("energy_momentum").order == 2
+    scheme = integrators.find_integrator(" energy_momentum ( rho_inf = 0.5 )")
     assert (scheme.rho_inf, scheme.order, scheme.label) == (0.5, 1, "energy_momentum(rho_inf=0.5)")
     assert scheme.dissipation == pytest.approx(1 / 3)
     assert repr(wf.EnergyMomentum(rho_inf=0.3)) == "EnergyMomentum(rho_inf=0.3)"
     with pytest.raises(wf.ModelError, match="did you mean 'rho_inf'"):
-        integrators.get("energy_momentum(rho_in=0.5)")
+        integrators.find_integrator("energy_momentum(rho_in=0.5)")
     for rho in (-0.1, 1.1, np.nan, "half", True):
         with pytest.raises(wf.ModelError, match=r"rho_inf.*between 0 and 1"):
             wf.EnergyMomentum(rho_inf=rho)

@@ -7,7 +7,7 @@ from soft_links import EXACT, JUMP, double_pendulum, links, pulled, swing, turni
 
 import warpfea as wf
 from warpfea.simulation.consistent_initial_conditions import constraint_rates
-from warpfea.simulation.discontinuities import jumps, kinks
+from warpfea.simulation.discontinuities import jump_intervals, kink_times
 
 
 def series(make, h, rho, end=0.016, halved=False):
@@ -148,7 +148,7 @@ def test_accelerations_of_a_state_that_another_scheme_advanced_are_computed_agai
     for start in (state, fresh):
         sim = wf.Simulation(model, start, dt=1e-3, integrator="generalized_alpha", solver=EXACT)
         sim.step(2)
-        assert sim.stepper.initial_conditions.count == 1
+        assert sim.stepper.initial_conditions.restart_count == 1
         found.append(sim.state.displacement.numpy())
     assert np.abs(found[0] - found[1]).max() < 1e-12 * np.abs(found[0]).max()
 
@@ -164,12 +164,12 @@ def test_kinks_of_a_law():
         "sine": wf.time_laws.time_law((smooth, np.sin(6 * smooth)), "x", scalar=True),
         "constant": wf.time_laws.time_law(2.0, "x", scalar=True),
     }
-    assert kinks(laws["ramp"], 1e-3).tolist() == [0.0, 0.5]
-    assert jumps(laws["ramp"], 1e-3).size == 0
-    assert jumps(laws["jump"], 1e-3).tolist() == [[0.5, 0.5 + 1e-9]]
-    assert kinks(laws["jump"], 1e-3).size == 0
-    assert set(kinks(laws["sine"], 1e-3)) <= {0.0, 1.0}
-    assert kinks(laws["constant"], 1e-3).size == jumps(laws["constant"], 1e-3).size == 0
+    assert kink_times(laws["ramp"], 1e-3).tolist() == [0.0, 0.5]
+    assert jump_intervals(laws["ramp"], 1e-3).size == 0
+    assert jump_intervals(laws["jump"], 1e-3).tolist() == [[0.5, 0.5 + 1e-9]]
+    assert kink_times(laws["jump"], 1e-3).size == 0
+    assert set(kink_times(laws["sine"], 1e-3)) <= {0.0, 1.0}
+    assert kink_times(laws["constant"], 1e-3).size == jump_intervals(laws["constant"], 1e-3).size == 0
 
 
 @pytest.mark.parametrize("load", [True, False], ids=["load", "drive"])
@@ -178,7 +178,7 @@ def test_order_across_a_kink(load):
     for h in (2e-4, 1e-4, 1.25e-5):
         sim = wf.Simulation(model, dt=h, integrator="generalized_alpha", solver=EXACT)
         sim.step(round(3 * JUMP / h))
-        assert sim.stepper.initial_conditions.count == 2
+        assert sim.stepper.initial_conditions.restart_count == 2
         ends.append(np.concatenate([sim.probe("tip").displacement[0, -1], 1e-2 * sim.probe("tip").velocity[0, -1]]))
         if not load:  # exactly as driven, without an oscillation
             k = round(JUMP / h)

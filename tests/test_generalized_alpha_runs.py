@@ -84,13 +84,15 @@ def test_the_undamped_scheme_is_refused_with_joints_and_drives():
 
 
 def test_integrators_by_their_words():
-    assert integrators.get("generalized_alpha").rho_inf == 0.2
-    assert integrators.get(" generalized_alpha ( rho_inf = 0.25 )").label == "generalized_alpha(rho_inf=0.25)"
-    assert integrators.get("bdf2()") is integrators.get("bdf2")
+    assert integrators.find_integrator("generalized_alpha").rho_inf == 0.2
+    assert (
+        integrators.find_integrator(" generalized_alpha ( rho_inf = 0.25 )").label == "generalized_alpha(rho_inf=0.25)"
+    )
+    assert integrators.find_integrator("bdf2()") is integrators.find_integrator("bdf2")
     scheme = wf.GeneralizedAlpha(rho_inf=0.3)
-    assert integrators.get(scheme) is scheme
+    assert integrators.find_integrator(scheme) is scheme
     for rho in (0.3, 1.0 / 3.0, 0.0):
-        assert integrators.get(wf.GeneralizedAlpha(rho_inf=rho).label).rho_inf == rho  # to the last digit
+        assert integrators.find_integrator(wf.GeneralizedAlpha(rho_inf=rho).label).rho_inf == rho  # to the last digit
     for text, words in (
         ("generalised_alpha", "did you mean 'generalized_alpha'"),
         ("generalized_alpha(rho_in=0.5)", "did you mean 'rho_inf'"),
@@ -101,5 +103,5 @@ def test_integrators_by_their_words():
         ("static", "unknown"),
     ):
         with pytest.raises(wf.ModelError) as found:
-            integrators.get(text)
+            integrators.find_integrator(text)
         assert words in str(found.value)

@@ -65,13 +65,13 @@ ROWS = {0: "integrator's inertia", 1: "f_int.dq", 2: "loads", 3: "gravity", 4: "
 @pytest.mark.parametrize("row", ROWS)
 def test_a_wrong_sign_on_the_device_shows(row, monkeypatch):
     """Each sum that the ledger is made of, with its sign turned before it is booked."""
-    from warpfea.solvers.residual import Reducer
+    from warpfea.solvers.residual import RowReducer
 
     def run(turned):
         b, _ = scene("incremental")
         sim = wf.Simulation(b.finalize(device="cpu"), dt=4e-3, solver=wf.NewtonPCG(tol=1e-8), capture=False)
         if turned is not None:
-            plain = Reducer.__call__
+            plain = RowReducer.__call__
 
             def wrong(self, rows, count, active, out):
                 plain(self, rows, count, active, out)
@@ -80,7 +80,7 @@ def test_a_wrong_sign_on_the_device_shows(row, monkeypatch):
                     values[turned] *= -1.0
                     out.assign(values)
 
-            monkeypatch.setattr(Reducer, "__call__", wrong)
+            monkeypatch.setattr(RowReducer, "__call__", wrong)
         sim.step(5)
         e = {name: values[0] for name, values in sim.energies().items()}
         size = max(abs(e[name]) for name in COLUMNS)

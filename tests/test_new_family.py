@@ -97,7 +97,7 @@ def test_new_family_assembly(gradient_body, data):
     assert model.blocks[0].slots == 16
     np.testing.assert_array_equal(body.slot_kind, np.tile(KINDS, 27))
     np.testing.assert_array_equal(body.reference[1:4], np.eye(3))
-    _, _, J0, det = assembly.geometry(body, np.arange(48), gauss_tetrahedron(3)[0])
+    _, _, J0, det = assembly.shape_and_jacobian(body, np.arange(48), gauss_tetrahedron(3)[0])
     x = body.mesh.points[body.mesh.cells]
     edges = np.moveaxis(x[:, 1:] - x[:, :1], 1, 2)
     assert data.error(J0, np.broadcast_to(edges[:, None], J0.shape)) < 1e-13

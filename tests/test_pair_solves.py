@@ -97,9 +97,9 @@ def motions_of(model, u, bodies):
 def system(loop):
     """H that the preconditioner is made from, with what couples the bodies, from the points one by one."""
     model, at = loop.model, loop.residual.ctx
-    pre, graph = loop.preconditioner, loop.preconditioner.assembled.pattern.graph
+    pre, graph = loop.preconditioner, loop.preconditioner.assembler.pattern.graph
     shape = (3 * model.slots,) * 2
-    own = sp.bsr_matrix((pre.value.numpy()[0], graph.indices, graph.indptr), shape=shape).toarray()
+    own = sp.bsr_matrix((pre.block_values.numpy()[0], graph.indices, graph.indptr), shape=shape).toarray()
     term = model.terms.find(Pairs)
     touching, attempt = at.scratch["pairs"]["touching"], at.scratch["pairs"]["attempt"]
     stiffness, listed, weight = (

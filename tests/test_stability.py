@@ -226,7 +226,7 @@ def test_what_can_be_known(make, stable, reason):
 
 
 def test_large_models_in_single_precision_are_judged_on_demand(monkeypatch):
-    monkeypatch.setattr(stability, "FLOAT64_SLOTS", 1)
+    monkeypatch.setattr(stability, "MAX_FLOAT64_SLOTS", 1)
     model, _ = column(1.01, "float32")
     found = wf.solve_static(model)
     assert found.report.stable.tolist() == [None]
@@ -247,13 +247,13 @@ def test_the_search_takes_no_more_than_a_share_of_the_solve(monkeypatch):
 
 
 def test_the_sign_of_rounding_is_not_told(monkeypatch):
-    monkeypatch.setattr(stability, "CURVATURE_ROUNDINGS", 1e12)
+    monkeypatch.setattr(stability, "MIN_CURVATURE_ROUNDINGS", 1e12)
     model, _ = column(1.1)
     assert wf.solve_static(model).report.stable.tolist() == [None]
 
 
 def test_a_change_by_rounding_the_state_is_not_told(monkeypatch):
-    monkeypatch.setattr(stability, "ROUNDOFF_CHANGES", 1e15)
+    monkeypatch.setattr(stability, "MIN_ROUND_OFF_CHANGES", 1e15)
     model, _ = column(0.9, "float32", across=1e-5)
     found = wf.solve_static(model)
     assert found.report.stable.tolist() == [None]

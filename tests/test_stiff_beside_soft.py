@@ -61,7 +61,7 @@ def test_groups_are_materials_of_like_stiffness_in_what_is_joined():
     models = [pairs.block_and_arm(kind).finalize(device="cpu") for kind in pairs.CONNECTIONS]
     assert [model.residual_groups.count for model in models] == [2, 2, 2, 2]
     model = pairs.block_and_arm("materials").finalize(device="cpu")
-    assert model.part.max() == 0
+    assert model.mesh_component.max() == 0
     start, slot = (a.numpy() for a in (model.residual_groups.slot_start, model.residual_groups.slot))
     x = (model.reference + model.bodies[0].origin)[:, 0]
     soft, hard = x[slot[: start[1]]], x[slot[start[1] :]]
@@ -70,7 +70,7 @@ def test_groups_are_materials_of_like_stiffness_in_what_is_joined():
     elements = np.diff(model.residual_groups.element_start.numpy())
     assert elements.sum() == model.element_count
     assert elements[0] == pytest.approx(2 * elements[1])  # eight cells of twelve
-    assert model.residual_parts.count == 2
+    assert model.error_estimate_groups.count == 2
 
 
 def series(kind, moduli):
@@ -136,6 +136,6 @@ def test_bodies_alike_are_one_group_and_cost_nothing():
         above = link.end
     sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-2)
     assert sim.model.residual_groups.count == 1
-    assert sim.model.residual_parts.count == 2
+    assert sim.model.error_estimate_groups.count == 2
     assert sim.stepper.work.newton.group_sums.size == 1
     assert not any("perturbation" in module.name for module in sim.stepper.newton.modules())

@@ -12,7 +12,7 @@ from warpfea.kernels.elements.with_mass import with_mass_kernel
 
 import warpfea as wf
 from warpfea.mesh.cells import TET_EDGES
-from warpfea.solvers.clusters import make_clusters, make_pool
+from warpfea.solvers.clusters import make_cluster_memory, make_clusters
 
 RHO = 1000.0
 LAWS = {
@@ -136,7 +136,7 @@ def with_mass_product(model, kernel, u, v, p, mass_factor=1e3):
     sim = wf.Simulation(model, dt=1e-3, solver=wf.NewtonPCG(operator="elements"))
     out = wp.zeros((2, clusters.sums), dtype=model.types.vec3, device="cpu")
     args = [block.data, data, *fields_of(model, u, v, p, mass_factor), 1]
-    args += [make_pool(model, sim.stepper.work, midpoint=False), out]
+    args += [make_cluster_memory(model, sim.stepper.work, midpoint=False), out]
     wp.launch(kernel, dim=(2, count), inputs=args, device="cpu")
     total = np.zeros((2, model.slots, 3))
     slot = np.repeat(np.arange(model.slots), np.diff(clusters.topology.contribution_start.numpy()))
@@ -179,7 +179,7 @@ def test_both_forms_of_the_product_agree(material, form, dtype, rule, data):
     body, model = straight_model(material, form, dtype, rule)
     (block,) = model.blocks
     assert block.key.vertex
-    general = with_mass_kernel(dtype, material, 10, block.points, form, False, block.cluster)
+    general = with_mass_kernel(dtype, material, 10, block.points, form, False, block.cluster_size)
     kernels = [general, block.with_mass_product(dtype, form)]
     u = np.stack([deformed(body), deformed(body, seed=1)])
     v, p = np.random.default_rng(2).uniform(-1, 1, (2, *u.shape))
@@ -196,7 +196,7 @@ def test_the_size_of_clusters_changes_nothing(data):
     (block,) = model.blocks
     u, v, p = np.random.default_rng(2).uniform(-0.1, 0.1, (3, 2, *body.reference.shape))
     expected = with_mass_product(model, block.with_mass_product("float64", None), u, v, p)
-    block.cluster = 32
+    block.cluster_size = 32
     got = with_mass_product(model, block.with_mass_product("float64", None), u, v, p)
     assert data.error(got, expected) < 1e-14
 
@@ -252,7 +252,7 @@ def step_force(model, block, u0, u1, h):
     wp.launch(block.kernels.internal_force, dim=(1, block.count), inputs=args, device="cpu")
     rows = contribution.numpy()[0].reshape(block.slots, block.count, 3)
     force = np.zeros((model.slots, 3))
-    np.add.at(force, block.parts[0].conn.T, rows)
+    np.add.at(force, block.host_blocks[0].conn.T, rows)
     return force, energy.numpy()[1].sum()
 
 

@@ -7,8 +7,8 @@ import warp as wp
 from two_level_models import bar
 
 import warpfea as wf
-from warpfea.model.partition import bisect, connected_groups, morton_order
-from warpfea.solvers.assembled import Assembled
+from warpfea.model.partition import bisect_groups, connected_groups, morton_order
+from warpfea.solvers.matrix_assembly import MatrixAssembler
 from warpfea.studies.bench.problems import PROBLEMS
 
 
@@ -40,13 +40,13 @@ def product(sim, p):
 
 def assembled(sim, *, projected, whole=None):
     work, residual = sim.stepper.work, sim.stepper.newton.residual
-    matrix = residual.assembled
+    matrix = residual.assembler
     if whole is not None:
-        matrix = Assembled(sim.model, work, sim.stepper.launch, residual.block_kernels, whole)
-    out = matrix.values("test")
+        matrix = MatrixAssembler(sim.model, work, sim.stepper.launch, residual.block_kernels, whole)
+    out = matrix.allocate_values("test")
     factors = (work.step.mass_factor, work.step.dq_dv)
     matrix.assemble(work.u, factors, on(sim), out, projected=projected)
-    return matrix.matrix(out)
+    return matrix.host_csr(out)
 
 
 def apply(sim, r):
@@ -117,7 +117,7 @@ SCENES = {
 def test_groups_fit_and_stay_within_their_label(weight):
     rng = np.random.default_rng(0)
     X, labels = rng.random((500, 3)), rng.integers(0, 3, 500)
-    group = bisect(X, np.full(500, weight), labels, 16)
+    group = bisect_groups(X, np.full(500, weight), labels, 16)
     sizes = np.bincount(group, minlength=0) * weight
     assert sizes.min() > 0
     assert sizes.max() <= 16
@@ -130,7 +130,7 @@ def test_groups_fit_and_stay_within_their_label(weight):
 
 def test_items_larger_than_a_group_are_refused():
     with pytest.raises(ValueError, match="does not fit"):
-        bisect(np.zeros((2, 3)), np.array([4, 20]), np.zeros(2), 16)
+        bisect_groups(np.zeros((2, 3)), np.array([4, 20]), np.zeros(2), 16)
 
 
 def test_groups_are_split_into_connected_parts():
@@ -237,7 +237,7 @@ def dense_apply(sim):
 @pytest.mark.parametrize("scene", ["T10", "3243"])
 def test_a_small_model_is_inverted_as_a_whole(scene):
     sim = simulation(SCENES[scene]())
-    assert sim.stepper.newton.preconditioner.levels[0].dense
+    assert sim.stepper.newton.preconditioner.levels[0].is_dense
     free = sim.model.free_host.ravel() > 0
     place = sim.stepper.newton.preconditioner.reuse.linearisation_point
     sim.stepper.work.u.assign(place)
@@ -249,10 +249,10 @@ def test_a_small_model_is_inverted_as_a_whole(scene):
 def coarse_functions(sim, depth=0):
     """P of a level from its groups and weights, (3 slots, 3 coarse slots)."""
     level = sim.stepper.newton.preconditioner.levels[depth]
-    n = level.slots
-    group, weight = level.data.group_of_slot.numpy(), level.data.affine_values.numpy()
+    n = level.slot_count
+    group, weight = level.device_data.group_of_slot.numpy(), level.device_data.affine_values.numpy()
     columns = (4 * group[:, None] + np.arange(4)).ravel()
-    P = sp.csr_matrix((weight.ravel(), (np.repeat(np.arange(n), 4), columns)), shape=(n, 4 * level.groups))
+    P = sp.csr_matrix((weight.ravel(), (np.repeat(np.arange(n), 4), columns)), shape=(n, 4 * level.group_count))
     return sp.kron(P, sp.eye(3)).tocsr()
 
 
@@ -261,8 +261,8 @@ def test_tiles_and_coarse_space_against_numpy(name, size):
     sim = simulation(PROBLEMS[name].build(size))
     pre = sim.stepper.newton.preconditioner
     level, below = pre.levels
-    assert not level.dense
-    assert below.dense
+    assert not level.is_dense
+    assert below.is_dense
     model = sim.model
     free = model.free_host.ravel()
     sim.stepper.work.u.assign(pre.reuse.linearisation_point)
@@ -276,7 +276,7 @@ def test_tiles_and_coarse_space_against_numpy(name, size):
     # the coarse matrix, and the sum of both parts
     F = sp.diags(free)
     A = (P.T @ F @ H @ F @ P).toarray()
-    value = pre.arrays[1].value.numpy()[0]
+    value = pre.level_arrays[1].block_values.numpy()[0]
     graph = below.pattern.graph
     device = sp.bsr_matrix((value, graph.indices, graph.indptr), shape=A.shape).toarray()
     np.testing.assert_allclose(device, A, rtol=0, atol=1e-12 * np.abs(A).max())
@@ -284,7 +284,7 @@ def test_tiles_and_coarse_space_against_numpy(name, size):
     scale = 1.0 / np.sqrt(np.where(np.diag(A) > 0, np.diag(A), 1.0))
     coarse = scale * (np.linalg.pinv(scale[:, None] * A * scale, rcond=1e-11, hermitian=True) @ (scale * (P.T @ r)))
     expected = free * (P @ coarse)
-    for tile in level.data.tile_slot.numpy():
+    for tile in level.device_data.tile_slot.numpy():
         dofs = (3 * tile[tile >= 0][:, None] + np.arange(3)).ravel()
         expected[dofs] += np.linalg.solve(H[dofs][:, dofs].toarray(), r[dofs])
     np.testing.assert_allclose(apply(sim, r), expected, rtol=0, atol=1e-6 * np.abs(expected).max())

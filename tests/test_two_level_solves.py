@@ -5,7 +5,7 @@ import pytest
 from two_level_models import bar
 
 import warpfea as wf
-from warpfea.solvers.preconditioner import choose
+from warpfea.solvers.preconditioner import choose_preconditioner
 from warpfea.studies.bench.problems import PROBLEMS
 
 
@@ -171,8 +171,8 @@ def test_many_small_bodies_on_joints_take_the_deflated_blocks(links, kind):
     scene = find("chain")
     model = scene.build(scene.resolve({"links": links})).finalize(device="cpu")
     counts = {}
-    assert choose("auto", None, model) == "banded"
-    assert choose("auto", "float32", model) == kind  # as on CUDA, where there are no factors
+    assert choose_preconditioner("auto", None, model) == "banded"
+    assert choose_preconditioner("auto", "float32", model) == kind  # as on CUDA, where there are no factors
     for name in (kind, "block-jacobi"):
         sim = wf.Simulation(model, dt=1e-3, solver=wf.NewtonPCG(preconditioner=name, max_pcg=20000), ledger=False)
         counts[name] = sum(int(sim.step().pcg[0]) for _ in range(3))

@@ -98,8 +98,8 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
     f64 = wp.float64
     step_length = step_end_functions().step_length
     Step, Newton, PCG, Adaptive = step_struct(), control_struct(), pcg_struct(), adaptive_struct()
-    estimate, order, multistep = scheme.estimate, scheme.order, scheme.multistep
-    module = kernel_module(f"adaptive_{dtype}_{scheme.variant}")
+    estimate, order, multistep = scheme.error_weights, scheme.order, scheme.multistep
+    module = kernel_module(f"adaptive_{dtype}_{scheme.kernel_variant}")
 
     @wp.func
     def refine_level(step: Step, next_step: f64, world: int):

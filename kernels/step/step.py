@@ -52,7 +52,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
     coefficients, static, multistep = scheme.coefficients, scheme.static, scheme.multistep
     takes_velocity, accelerated, midpoint = scheme.takes_velocity, scheme.accelerated, scheme.midpoint
     MAX_GROWTH = MAX_STEP_GROWTH[dtype]
-    module = kernel_module(f"step_{dtype}_{scheme.variant}{variant}")
+    module = kernel_module(f"step_{dtype}_{scheme.kernel_variant}{variant}")
 
     @wp.kernel(module=module)
     def begin_step(step: Step, newton: Newton, pcg: PCG):

@@ -18,7 +18,7 @@ import scipy.sparse.linalg as linalg
 import warp as wp
 
 import warpfea as wf
-from warpfea.model.assembly import geometry
+from warpfea.model.assembly import shape_and_jacobian
 from warpfea.simulation.statics import StaticResult
 from warpfea.studies.checkout import reference_data
 
@@ -279,7 +279,7 @@ def _mean_square_error(body, state):
     """Error of the displacement in the mean square over the body, over that of the exact one."""
     rule = body.family.curved_mass_rule
     every = np.arange(len(body.mesh.cells))
-    s, _, _, det = geometry(body, every, rule.points)
+    s, _, _, det = shape_and_jacobian(body, every, rule.points)
     conn = body.connectivity
     u = state.displacement.numpy()[0, body.slot_offset : body.slot_offset + body.slot_count]  # as connectivity counts
     position = (body.slot_kind[conn] == 0)[:, :, None]

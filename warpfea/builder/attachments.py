@@ -12,7 +12,7 @@ from ..model import assembly
 from ..model.description import support_slots
 from ..model.discretisation import Discretisation
 from ..model.handles import MaterialPoint, NodeSet, SurfaceSet
-from ..model.joints import Vector, VectorPart, constant
+from ..model.joints import Vector, VectorPart, constant_vector
 from .checks import vector
 
 __all__ = ["COINCIDENCE_TOL", "GROUND", "UNKNOWN_WEAKNESS", "Attachment", "Ground", "make_attachment"]
@@ -68,7 +68,7 @@ class Attachment:
         """Current position x + F (at - X) of the reference point `at` (3,), m."""
         arm = at - self.X
         if self.body is None:
-            return constant(at)
+            return constant_vector(at)
         weights = self.weights
         if np.linalg.norm(arm) > COINCIDENCE_TOL * self.size:
             self._check(arm / np.linalg.norm(arm), what)
@@ -78,7 +78,7 @@ class Attachment:
     def direction(self, n: np.ndarray, what: str) -> Vector:
         """Material direction F n of the reference direction n (3,)."""
         if self.body is None:
-            return constant(n)
+            return constant_vector(n)
         self._check(n, what)
         return Vector(n, (VectorPart(self.body, self.slots, self.gradients @ n, self.child),))
 
@@ -191,7 +191,7 @@ def _surface_attachment(surface: SurfaceSet, child: bool) -> Attachment:
     body = surface.body
     label = f"surface {surface.name!r} of body {body.name!r}" if surface.name else f"a surface of body {body.name!r}"
     t = assembly.facet_tables(surface)
-    X, dA = assembly.facet_places(body, t)
+    X, dA = assembly.facet_positions_and_areas(body, t)
     share = (dA / dA.sum()).ravel()
     X = X.reshape(-1, 3)
     mean, at_points, span = _affine_fit(share, X, FLAT_SURFACE)
@@ -207,8 +207,8 @@ def _surface_attachment(surface: SurfaceSet, child: bool) -> Attachment:
             rows = np.flatnonzero(surface.faces[:, 1] == face)
             members = surface.faces[rows, 0]
             xi, _ = body.family.face_points(int(face), rule.points)
-            _, ds, J, _ = assembly.geometry(body, members, xi)
-            h = np.einsum("fq,fqsk->fsk", dA[rows] / dA.sum(), assembly.gradients(ds, J)) @ rest
+            _, ds, J, _ = assembly.shape_and_jacobian(body, members, xi)
+            h = np.einsum("fq,fqsk->fsk", dA[rows] / dA.sum(), assembly.shape_gradients(ds, J)) @ rest
             np.add.at(gradients, body.connectivity[members], h)
             weak = rest @ _weak_projector(body, assembly.orthonormal(J[0, 0])) @ rest
         if body.family.solid:  # the mean of F normal to a face includes the local strain; the in-plane fit does not

@@ -10,7 +10,7 @@ from ..base.checks import is_count, is_number
 from ..base.errors import ModelError
 from ..base.names import did_you_mean
 from ..model.bodies import Body
-from ..model.contact_points import check_points
+from ..model.contact_points import check_contact_points
 from ..model.contacts import Collider, ColliderRotation, Contact
 from ..model.description import Description, Rotation
 from ..model.handles import SurfaceSet
@@ -170,7 +170,7 @@ def _checked_options(what: str, surface: SurfaceSet, o: dict[str, Any]) -> dict[
     o["offset"] = _number(what, "offset", o["offset"], "a finite number, m", low=-np.inf)
     o["overlap_time"] = _number(what, "overlap_time", o["overlap_time"], "positive, s")
     try:
-        check_points(surface, o["points"])
+        check_contact_points(surface, o["points"])
     except ModelError as error:
         raise ModelError(f"{what}: {error}") from None
     o["points"] = None if o["points"] is None else int(o["points"])

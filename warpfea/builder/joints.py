@@ -19,7 +19,7 @@ import numpy as np
 from ..base.errors import ModelError
 from ..base.names import did_you_mean
 from ..kernels.terms.constraints import ANGLE, DISTANCE, DOT
-from ..model.joints import Joint, Row, Vector, constant
+from ..model.joints import ConstraintRow, Joint, Vector, constant_vector
 from ..time_laws import TimeLaw, time_law
 from .attachments import COINCIDENCE_TOL, GROUND, UNKNOWN_WEAKNESS, Attachment, Ground, make_attachment
 from .checks import vector
@@ -88,7 +88,7 @@ def _attachments(what: str, kind: str, parent: Any, child: Any) -> tuple[Attachm
     return P, Q
 
 
-def _cross_row(n: np.ndarray, axis2: Any, P: Attachment, Q: Attachment, what: str) -> Row:
+def _cross_row(n: np.ndarray, axis2: Any, P: Attachment, Q: Attachment, what: str) -> ConstraintRow:
     """Perpendicular axes of a universal joint, n on the parent and axis2 on the child."""
     m = _perpendicular_to(n) if axis2 is None else _unit_vector(axis2, f"{what}: axis2")
     if abs(n @ m) > 1e-6:
@@ -99,7 +99,7 @@ def _cross_row(n: np.ndarray, axis2: Any, P: Attachment, Q: Attachment, what: st
 
 def _guide_rows(
     kind: str, n: np.ndarray, gap: Vector, P: Attachment, Q: Attachment, what: str
-) -> tuple[list[Row], AngleVectors | None, tuple[Vector, Vector] | None]:
+) -> tuple[list[ConstraintRow], AngleVectors | None, tuple[Vector, Vector] | None]:
     """Rows of a revolute, cylindrical or translational joint besides its pin; vectors of its angle and travel."""
     u, w = _perpendicular_pair(n, P, Q)
     if P.weakness(n) + Q.weakness(u) + Q.weakness(w) <= Q.weakness(n) + P.weakness(u) + P.weakness(w):
@@ -108,7 +108,7 @@ def _guide_rows(
         rows = [_dot_row(P.direction(d, what), Q.direction(n, what)) for d in (u, w)]
     travel = None
     if kind != "revolute":
-        rows += [Row(DOT, gap, P.direction(d, what)) for d in (u, w)]
+        rows += [ConstraintRow(DOT, gap, P.direction(d, what)) for d in (u, w)]
         travel = (gap, P.direction(n, what))
     if kind != "translational":
         return rows, _angle_vectors(n, u, w, P, Q, what), travel
@@ -119,27 +119,27 @@ def _guide_rows(
 def _drive_row(
     kind: str, angle: AngleVectors | None, travel: tuple[Vector, Vector] | None, law: TimeLaw, P: Attachment,
     Q: Attachment, what: str,
-) -> Row:  # fmt: skip
+) -> ConstraintRow:  # fmt: skip
     """Row of the prescribed angle of a revolute joint, or of the travel of a translational one."""
     if kind != "revolute":
         assert travel is not None
-        return Row(DOT, *travel, law=law)
+        return ConstraintRow(DOT, *travel, law=law)
     if angle is None:
         raise ModelError(
             f"{what}: rotation angle about the axis undetermined by {P.label} and {Q.label}: give more nodes"
         )
     first, second, turned = angle
-    return Row(ANGLE, first, turned, 1.0, second, law, angular=True)
+    return ConstraintRow(ANGLE, first, turned, 1.0, second, law, angular=True)
 
 
 def _pair_label(P: Attachment, Q: Attachment) -> str:
     return f"{P.label} and {Q.label}"
 
 
-def pin_rows(gap: Vector, law: TimeLaw | None = None) -> list[Row]:
+def pin_rows(gap: Vector, law: TimeLaw | None = None) -> list[ConstraintRow]:
     """Three rows that constrain a vector to zero or the law's value."""
     options = [_right_side(law, k) for k in range(3)]
-    return [Row(DOT, gap, constant(e), component=k, **options[k]) for k, e in enumerate(np.eye(3))]
+    return [ConstraintRow(DOT, gap, constant_vector(e), component=k, **options[k]) for k, e in enumerate(np.eye(3))]
 
 
 def _right_side(law: TimeLaw | None, component: int = 0) -> dict[str, Any]:
@@ -149,16 +149,16 @@ def _right_side(law: TimeLaw | None, component: int = 0) -> dict[str, Any]:
     return {"law": replace(law, ramped=False) if law is not None and law.control is not None else law}
 
 
-def _dot_row(a: Vector, b: Vector) -> Row:
+def _dot_row(a: Vector, b: Vector) -> ConstraintRow:
     """Perpendicular directions; the cosine times the model's size is the violation."""
-    return Row(DOT, a, b, _inverse_lengths(a, b), angular=True)
+    return ConstraintRow(DOT, a, b, _inverse_lengths(a, b), angular=True)
 
 
 def _inverse_lengths(a: Vector, b: Vector) -> float:
     return 1.0 / float(np.linalg.norm(a.value) * np.linalg.norm(b.value))
 
 
-def _fixed_rotation_rows(P: Attachment, Q: Attachment, what: str) -> list[Row]:
+def _fixed_rotation_rows(P: Attachment, Q: Attachment, what: str) -> list[ConstraintRow]:
     """Three DP1 between two aligned triads, the pairs chosen among directions that both sides carry."""
     triads = [np.eye(3)]
     for side in (Q, P):
@@ -228,7 +228,7 @@ def _distance_joint(what: str, name: str, P: Attachment, Q: Attachment, anchor: 
         if side.body is None and np.isnan(side.X).any():
             if anchor is None:
                 raise ModelError(f"{what}: missing anchor=: the end point of the rod on the ground")
-            ends.append(constant(vector(anchor, f"{what}: anchor")))
+            ends.append(constant_vector(vector(anchor, f"{what}: anchor")))
         else:
             ends.append(side.position(side.X, what))
     if anchor is not None and P.body is not None and Q.body is not None:
@@ -238,7 +238,7 @@ def _distance_joint(what: str, name: str, P: Attachment, Q: Attachment, anchor: 
     )
 
 
-def _distance_row(what: str, p: Vector, q: Vector, law: TimeLaw | None, size: float) -> Row:
+def _distance_row(what: str, p: Vector, q: Vector, law: TimeLaw | None, size: float) -> ConstraintRow:
     gap = q - p
     length = float(np.linalg.norm(gap.value))
     if length <= COINCIDENCE_TOL * size:
@@ -250,7 +250,9 @@ def _distance_row(what: str, p: Vector, q: Vector, law: TimeLaw | None, size: fl
             f"{what}: the distance must be positive, control {law.control.name!r} begins at "
             f"{law.control.initial[0]:g} m; give it an initial value"
         )
-    return Row(DISTANCE, gap, constant(np.zeros(3)), **(_right_side(law) if law else {"fixed": length}))
+    return ConstraintRow(
+        DISTANCE, gap, constant_vector(np.zeros(3)), **(_right_side(law) if law else {"fixed": length})
+    )
 
 
 def _unit_vector(value: Any, what: str) -> np.ndarray:
@@ -297,7 +299,9 @@ def make_constraint(kind: str, points: Any, value: Any, name: str) -> Joint:
     for label, v in (("P and Q", a), ("R and T", b)):
         if np.linalg.norm(v.value) <= COINCIDENCE_TOL * size:
             raise ModelError(f"{what}: its points {label} coincide, so that it has no direction")
-    return Joint(name, kind, [Row(DOT, a, b, _inverse_lengths(a, b), angular=True, **_right_side(law))], x[3], between)
+    return Joint(
+        name, kind, [ConstraintRow(DOT, a, b, _inverse_lengths(a, b), angular=True, **_right_side(law))], x[3], between
+    )
 
 
 def _constraint_points(what: str, kind: str, points: Any) -> list[Attachment]:
@@ -323,7 +327,7 @@ def _constraint_points(what: str, kind: str, points: Any) -> list[Attachment]:
     return attachments
 
 
-def _coincidence_rows(what: str, gap: Vector, value: Any, size: float) -> list[Row]:
+def _coincidence_rows(what: str, gap: Vector, value: Any, size: float) -> list[ConstraintRow]:
     """Rows of P - Q = value, or of coincident points. ModelError for distinct points without a value."""
     if value is not None:
         return pin_rows(gap, time_law(value, f"{what}: value"))

@@ -12,7 +12,7 @@ from ..base.provenance import versions
 from ..kernels.elements.materials import DEFINED_FOR_ANY_J
 from ..kernels.step.step_control import SAME_TIME_FRACTION
 from ..model.model import Model
-from ..simulation.energy_growth import integrator_share
+from ..simulation.energy_growth import integrator_energy_ratio
 from ..simulation.simulation import Simulation
 from ..solvers import Jacobi
 from .source import Source
@@ -206,7 +206,7 @@ def _times(s: dict[str, Any]) -> str:
 
 def _suggestion(sim: Simulation) -> list[list[str]]:
     """A row suggesting other schemes if the integrator dissipates or adds much of the energy exchanged."""
-    share, name = integrator_share(sim), sim.integrator.name
+    share, name = integrator_energy_ratio(sim), sim.integrator.name
     if not share > INTEGRATOR_SHARE:
         return []
     text = ADDED_ENERGY if name == "generalized_alpha" and sim.energy_growth.warned else LESS_DISSIPATION[name]

@@ -24,7 +24,7 @@ __all__ = [
     "FacetTables",
     "HostBlock",
     "density_of",
-    "facet_places",
+    "facet_positions_and_areas",
     "facet_tables",
     "gather_table",
     "host_blocks",
@@ -33,23 +33,29 @@ __all__ = [
     "surface_weights",
 ]
 
-CHUNK_ELEMENTS = 20000
+MAX_CHUNK_ELEMENTS = 20000
 """Maximum elements per pass for tables with one row per element."""
-CHUNK_ENTRIES = 20_000_000
+MAX_CHUNK_ENTRIES = 20_000_000
 """Maximum entries (elements x points x slots) of a table computed at once."""
 
 
-def chunks(body: Discretisation, elements: np.ndarray, points: int) -> Iterator[np.ndarray]:
-    """Runs of elements with small tables at `points` points."""
+def element_chunks(body: Discretisation, elements: np.ndarray, points: int) -> Iterator[np.ndarray]:
+    """Runs of elements short enough for a table at `points` points."""
     per_element = points * body.family.slots if body.family.has_gradients else 1
-    size = max(1, min(CHUNK_ELEMENTS, CHUNK_ENTRIES // per_element))
+    size = max(1, min(MAX_CHUNK_ELEMENTS, MAX_CHUNK_ENTRIES // per_element))
     for first in range(0, len(elements), size):
         yield elements[first : first + size]
 
 
 @dataclass(frozen=True)
 class BlockKey:
-    """Key of an element block: elements with equal keys share a kernel."""
+    """Key of an element block: elements with equal keys share a kernel.
+
+    Attributes:
+        scheme, part: name of the integration scheme of the family, and index of the part of the strain energy in it.
+        law, damping: names of the device law and of the form of damping, None without.
+        affine: J0 is constant in each element. framed: strains are taken in local orthonormal axes.
+    """
 
     family: str
     scheme: str
@@ -97,7 +103,7 @@ class HostBlock:
         elements: (E,) element indices in the body.
         material: index into the body's materials.
         coefficients: of the device law.
-        row: of the model's table of coefficients, set by the model.
+        coefficient_row: of the model's table of coefficients, set by the model.
     """
 
     key: BlockKey
@@ -105,7 +111,7 @@ class HostBlock:
     elements: np.ndarray
     material: int
     coefficients: tuple[float, ...]
-    row: int = -1
+    coefficient_row: int = -1
 
     @property
     def conn(self) -> np.ndarray:
@@ -118,10 +124,10 @@ class HostBlock:
         return self.body.mesh.points[self.body.mesh.cells[self.elements]] - self.body.origin
 
 
-def geometry(
+def shape_and_jacobian(
     body: Discretisation, elements: np.ndarray, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Functions and J0 at parent points.
+    """Shape functions s_i and Jacobian J0 = dX/dxi at parent points.
 
     Returns:
         s (E or 1, Q, S), ds (E or 1, Q, S, 3), J0 (E, Q, 3, 3) = sum E_i ds_i^T, det J0 (E, Q).
@@ -133,13 +139,13 @@ def geometry(
     return s, ds, J0, np.linalg.det(J0)
 
 
-def gradients(ds: np.ndarray, J0: np.ndarray) -> np.ndarray:
+def shape_gradients(ds: np.ndarray, J0: np.ndarray) -> np.ndarray:
     """h_i = J0^-T ds_i/dxi, (E, Q, S, 3)."""
     inverse = np.linalg.inv(J0)
     return np.einsum("eqlk,eqsl->eqsk", inverse, np.broadcast_to(ds, (len(J0), *ds.shape[1:])), optimize=True)
 
 
-def straight(body: Discretisation) -> np.ndarray:
+def is_straight(body: Discretisation) -> np.ndarray:
     """(E,) True for elements with constant J0."""
     if not body.family.affine:
         return np.zeros(len(body.mesh.cells), dtype=bool)
@@ -208,7 +214,7 @@ def parent_mass(family: Any) -> np.ndarray:
     return np.einsum("q,qi,qj->ij", family.mass_rule.weights, table, table)
 
 
-def law_of(integral: EnergyPart, material: Material) -> tuple[str, tuple[Any, ...]]:
+def law_and_coefficients(integral: EnergyPart, material: Material) -> tuple[str, tuple[Any, ...]]:
     """Device law of a part of the energy, and its coefficients; arrays if those of the material are."""
     law, values = integral.law(material) if integral.law else (material.law, material.coefficients())
     assert law is not None
@@ -227,7 +233,7 @@ def coefficient_rows(values: Sequence[Any], material: Material, worlds: int = 1)
 
 def host_blocks(body: Discretisation, *, tables: bool) -> Iterator[HostBlock]:
     """Elements of a body by key; `tables`: tables of h_i for straight elements, too."""
-    flat = straight(body)
+    flat = is_straight(body)
     for k, (_, material) in enumerate(body.materials):
         damping = material.damping.form if material.damping else None
         for is_flat, rule in ((True, body.rule), (False, body.curved_rule)):
@@ -235,7 +241,7 @@ def host_blocks(body: Discretisation, *, tables: bool) -> Iterator[HostBlock]:
             members = body.element_order[chosen[body.element_order]]
             if len(members):
                 for part, integral in enumerate(body.family.scheme(rule)):
-                    law, values = law_of(integral, material)
+                    law, values = law_and_coefficients(integral, material)
                     key = BlockKey(
                         body.family.name,
                         rule,
@@ -252,7 +258,10 @@ def element_volumes(body: Discretisation) -> np.ndarray:
     """(E,) reference volumes of the elements, section and thickness included, m^3."""
     rule = body.family.rule(None)
     every = np.arange(len(body.mesh.cells))
-    parts = [geometry(body, part, rule.points)[3] @ rule.weights for part in chunks(body, every, len(rule.weights))]
+    parts = [
+        shape_and_jacobian(body, part, rule.points)[3] @ rule.weights
+        for part in element_chunks(body, every, len(rule.weights))
+    ]
     return np.concatenate(parts)
 
 
@@ -269,8 +278,8 @@ def check_orientation(body: Discretisation, integral: EnergyPart) -> None:
     points = integral.rule.points
     if integral.tying:
         points = np.vstack([points, integral.tying.points])
-    for part in chunks(body, np.arange(len(body.mesh.cells)), len(points)):
-        det = geometry(body, part, points)[3]
+    for part in element_chunks(body, np.arange(len(body.mesh.cells)), len(points)):
+        det = shape_and_jacobian(body, part, points)[3]
         bad = np.flatnonzero((det <= 0.0).any(axis=1))
         if len(bad):
             raise MeshError(
@@ -292,13 +301,13 @@ def gather_table(conn: list[np.ndarray], slots: int) -> tuple[np.ndarray, np.nda
 
 def slot_graph(conn: list[np.ndarray], slots: int) -> sp.csr_matrix:
     """Pairs of slots that share an element. The mass matrix is no substitute: some of its entries are zero."""
-    rows = np.concatenate([np.repeat(first + np.arange(len(c)), c.shape[1]) for first, c in _offsets(conn)])
+    rows = np.concatenate([np.repeat(first + np.arange(len(c)), c.shape[1]) for first, c in _first_elements(conn)])
     columns = np.concatenate([c.ravel() for c in conn])
     incidence = sp.csr_matrix((np.ones(len(rows), dtype=np.int32), (rows, columns)), shape=(rows.max() + 1, slots))
     return sp.csr_matrix(incidence.T @ incidence)
 
 
-def _offsets(conn: list[np.ndarray]) -> Iterator[tuple[int, np.ndarray]]:
+def _first_elements(conn: list[np.ndarray]) -> Iterator[tuple[int, np.ndarray]]:
     first = 0
     for c in conn:
         yield first, c
@@ -307,11 +316,11 @@ def _offsets(conn: list[np.ndarray]) -> Iterator[tuple[int, np.ndarray]]:
 
 @dataclass(eq=False)
 class FacetTables:
-    """Functions of the faces of a surface, for the slots with functions that do not vanish there.
+    """Shape functions of the faces of a surface, of the slots whose functions do not vanish there.
 
     Attributes:
         conn: (F, n) body slots; faces that have fewer repeat their first one with functions of zero.
-        shape, d_a, d_b: (F, Q, n) functions and their derivatives along the two sides of a face, whose cross product
+        shape, d_a, d_b: (F, Q, n) functions and their derivatives by the two face coordinates a and b: dx/da x dx/db
             points outward.
         weights: (F, Q) of the face rules; faces with fewer points repeat their last one with weight 0.
     """
@@ -357,7 +366,7 @@ def facet_tables(surface: SurfaceSet, parts: int = 1, rules: Mapping[int, Rule] 
     return FacetTables(conn, table[0], table[1], table[2], weights)
 
 
-def facet_places(body: Discretisation, t: FacetTables) -> tuple[np.ndarray, np.ndarray]:
+def facet_positions_and_areas(body: Discretisation, t: FacetTables) -> tuple[np.ndarray, np.ndarray]:
     """Reference positions X (F, Q, 3), m, of face points, and their areas (F, Q), m^2."""
     x = body.reference[t.conn]
     normal = np.cross(np.einsum("fqi,fik->fqk", t.d_a, x), np.einsum("fqi,fik->fqk", t.d_b, x))
@@ -368,7 +377,7 @@ def facet_places(body: Discretisation, t: FacetTables) -> tuple[np.ndarray, np.n
 def surface_weights(surface: SurfaceSet) -> tuple[np.ndarray, np.ndarray]:
     """Body slots, and integrals of their functions over a surface, curved or flat (m^2; m^3 for gradients)."""
     t = facet_tables(surface)
-    _, dA = facet_places(surface.body, t)
+    _, dA = facet_positions_and_areas(surface.body, t)
     weights = np.einsum("fq,fqi->fi", dA, t.shape)
     slots, inverse = np.unique(t.conn, return_inverse=True)
     return slots, np.bincount(inverse.ravel(), weights=weights.ravel(), minlength=len(slots))
@@ -388,6 +397,6 @@ def rigid_modes(x: np.ndarray, kind: np.ndarray) -> np.ndarray:
     return modes
 
 
-def components_of(graph: Any) -> np.ndarray:
+def connected_components(graph: Any) -> np.ndarray:
     """(n,) connected component of each row of a symmetric sparse matrix."""
     return sp.csgraph.connected_components(graph, directed=False)[1]

@@ -27,34 +27,34 @@ __all__ = ["Block", "build_block", "output_block", "output_rows"]
 class Block:
     """Element block: kind, device data, source elements; one kernel launch.
 
-    `coupled`: couplings of assumed strains per world. `det`: det J0 of straight elements, whose mass is det J0 times
-    one table.
+    `couplings_per_world`: couplings of assumed strains differ between worlds. `det_J0`: det J0 of straight elements,
+    whose mass is det J0 times one table.
     """
 
     key: assembly.BlockKey
     data: Any
     kernels: Any
-    parts: list[assembly.HostBlock]
+    host_blocks: list[assembly.HostBlock]
     count: int
     points: int
     slots: int
     contribution_offset: int
     element_offset: int
-    cluster: int
-    field_rule: Any = None
-    output: Any = None
-    coupled: bool = False
-    det: np.ndarray | None = None
+    cluster_size: int
+    body_force_rule: Any = None
+    stress_output: Any = None
+    couplings_per_world: bool = False
+    det_J0: np.ndarray | None = None
 
     @property
     def connectivity(self) -> np.ndarray:
         """(elements, slots per element) slots of the model, on the host."""
-        return np.concatenate([p.conn + p.body.slot_offset for p in self.parts])
+        return np.concatenate([p.conn + p.body.slot_offset for p in self.host_blocks])
 
     @property
     def with_mass(self) -> bool:
         """True if the element mass is a number times one table."""
-        return self.key.affine and not any(callable(p.body.materials[p.material][1].density) for p in self.parts)
+        return self.key.affine and not any(callable(p.body.materials[p.material][1].density) for p in self.host_blocks)
 
     def kernels_for(self, dtype: str, damping: str | None, midpoint: bool = False, dissipative: bool = False) -> Any:
         """The kernels of this kind of element with another form of damping; `midpoint`: of the conserving scheme,
@@ -62,7 +62,7 @@ class Block:
         k = self.key
         if k.tying and midpoint:
             return assumed_strain_kernels(
-                dtype, self.slots, self.points, k.tying.width, midpoint, self.coupled, dissipative
+                dtype, self.slots, self.points, k.tying.width, midpoint, self.couplings_per_world, dissipative
             )
         if k.tying:
             return self.kernels
@@ -80,10 +80,10 @@ class Block:
         out.dissipation = dissipation
         return out
 
-    def take_couplings(self, dtype: str) -> None:
+    def use_couplings_per_world(self, dtype: str) -> None:
         """Select the kernels that read couplings per world."""
         assert self.key.tying is not None
-        self.coupled = True
+        self.couplings_per_world = True
         self.kernels = assumed_strain_kernels(dtype, self.slots, self.points, self.key.tying.width, False, True)
 
     def predicted_stress_product(self, dtype: str) -> wp.Kernel:
@@ -99,9 +99,11 @@ class Block:
         """Kernel of the product of a with_mass block, with a form of damping; others: see `kernels_for`."""
         k = self.key
         if midpoint:
-            kind = (k.law, self.slots, self.points, tangent_damping(mean_damping(damping)), k.vertex, self.cluster)
+            kind = (k.law, self.slots, self.points, tangent_damping(mean_damping(damping)), k.vertex, self.cluster_size)
             return with_mass_kernel(dtype, *kind, midpoint, dissipative)
-        return with_mass_kernel(dtype, k.law, self.slots, self.points, tangent_damping(damping), k.vertex, self.cluster)
+        return with_mass_kernel(
+            dtype, k.law, self.slots, self.points, tangent_damping(damping), k.vertex, self.cluster_size
+        )
 
 
 def tangent_damping(damping: str | None) -> str | None:
@@ -123,7 +125,7 @@ def build_block(
     data = (assumed_strain_struct if key.tying else block_struct)(model.dtype)()
     data.conn = model.array("elements", conn.T, wp.int32)
     data.is_position = model.array("elements", (family.slot_kind == 0).astype(float), model.types.T)
-    rows = [np.full(len(p.elements), p.row) for p in parts]
+    rows = [np.full(len(p.elements), p.coefficient_row) for p in parts]
     data.material = model.array("elements", np.concatenate(rows), wp.int32)
     data.coefficients = model.coefficients
     data.contribution_offset, data.element_offset, data.history_offset = contribution, element, history
@@ -140,13 +142,13 @@ def build_block(
         kernels = element_kernels(model.dtype, *kind)
     cluster = cluster_size(model.dtype, len(conn), fit=model.device.is_cuda)
     sizes = len(conn), points, family.slots
-    return Block(key, data, kernels, parts, *sizes, contribution, element, cluster, det=det)
+    return Block(key, data, kernels, parts, *sizes, contribution, element, cluster, det_J0=det)
 
 
 def output_block(model: Any, block: Block, scheme: str) -> Block:
     """Elements of a tied block with their strains at the points of an output scheme."""
     key = replace(block.key, scheme=scheme, part=0, law="orthotropic", framed=True)
-    parts = [assembly.HostBlock(key, host.body, host.elements, host.material, ()) for host in block.parts]
+    parts = [assembly.HostBlock(key, host.body, host.elements, host.material, ()) for host in block.host_blocks]
     data = block_struct(model.dtype)()
     data.conn, data.is_position, data.count = block.data.conn, block.data.is_position, block.count
     data.coefficients = model.array("output", output_rows(model, block), model.types.T)
@@ -155,7 +157,7 @@ def output_block(model: Any, block: Block, scheme: str) -> Block:
     _point_tables(model, data, key, parts)
     points = len(key.rule.weights)
     kernels = element_kernels(model.dtype, key.law, block.slots, False, None, True)
-    return Block(key, data, kernels, parts, block.count, points, block.slots, 0, 0, block.cluster)
+    return Block(key, data, kernels, parts, block.count, points, block.slots, 0, 0, block.cluster_size)
 
 
 def output_rows(model: Any, block: Block) -> np.ndarray:
@@ -165,9 +167,9 @@ def output_rows(model: Any, block: Block) -> np.ndarray:
     integral = replace(block.key, scheme=scheme, part=0).integral
     worlds = model.coefficients.shape[0]
     rows = []
-    for host in block.parts:
-        material = model.parameters.of_worlds(host.body, host.material)
-        _, values = assembly.law_of(integral, material)
+    for host in block.host_blocks:
+        material = model.parameters.material_of_worlds(host.body, host.material)
+        _, values = assembly.law_and_coefficients(integral, material)
         rows.append(assembly.coefficient_rows(values, material, worlds))
     return np.stack(rows, axis=1)
 
@@ -178,7 +180,7 @@ def _tied_tables(model: Any, data: Any, key: assembly.BlockKey, parts: list[asse
     tables = [
         tied_tables(part, members)
         for part in parts
-        for members in assembly.chunks(part.body, part.elements, len(key.rule.weights))
+        for members in assembly.element_chunks(part.body, part.elements, len(key.rule.weights))
     ]
     assert key.tying is not None
     names = [("derivative_a", T), ("X_a", vec3), ("coupling", T)]
@@ -202,14 +204,14 @@ def _point_tables(model: Any, data: Any, key: assembly.BlockKey, parts: list[ass
     h, w, J0, axes = [], [], [], []
     det_J0 = None
     for part in parts:
-        for members in assembly.chunks(part.body, part.elements, len(points)):
+        for members in assembly.element_chunks(part.body, part.elements, len(points)):
             if key.affine:
-                _, _, J, det = assembly.geometry(part.body, members, family.vertices[:1])
+                _, _, J, det = assembly.shape_and_jacobian(part.body, members, family.vertices[:1])
                 J0.append(np.linalg.inv(J[:, 0]))
                 w.append(det[:, 0])
             else:
-                _, ds, J, det = assembly.geometry(part.body, members, points)
-                h.append(assembly.gradients(ds, J))
+                _, ds, J, det = assembly.shape_and_jacobian(part.body, members, points)
+                h.append(assembly.shape_gradients(ds, J))
                 w.append(det[:, :Q] * rule.weights)
                 if key.framed:
                     axes.append(assembly.orthonormal(J[:, :Q]))
@@ -221,7 +223,7 @@ def _point_tables(model: Any, data: Any, key: assembly.BlockKey, parts: list[ass
         if not any(callable(p.body.materials[p.material][1].density) for p in parts):
             data.parent_mass = model.array("elements", assembly.parent_mass(family), T)
             det_J0 = np.concatenate(w)
-            data.density_det_J0 = model.array("elements", model.masses.of_elements(parts, det_J0), T)
+            data.density_det_J0 = model.array("elements", model.masses.element_masses(parts, det_J0), T)
         data.quadrature_weight = model.array("elements", rule.weights[:, None], T)
     else:
         table = np.moveaxis(np.concatenate(h), 0, 2)

@@ -20,11 +20,11 @@ from .handles import SurfaceSet
 from .masses import mass_parts
 
 __all__ = [
-    "RULES",
+    "CONTACT_RULES",
     "ContactPoints",
     "Modulus",
     "body_mass_total",
-    "check_points",
+    "check_contact_points",
     "contact_points",
     "corner_points",
     "effective_modulus",
@@ -34,12 +34,12 @@ __all__ = [
 
 Modulus = Callable[[Discretisation, SurfaceSet | None], tuple[float, float]]
 """Young's modulus, Pa, and Poisson's ratio of a body at a surface."""
-RULES: Mapping[int, Mapping[int, Rule]] = {
+CONTACT_RULES: Mapping[int, Mapping[int, Rule]] = {
     3: {3: triangle_3(), 7: triangle_7()},
     4: {n * n: lobatto_square(n) for n in (2, 3, 4, 5)},
 }
 """Rules including the face corners, by the numbers of corners and of points."""
-DEFAULT = {3: 7, 4: 16}
+DEFAULT_POINTS = {3: 7, 4: 16}
 """Points of a face by the number of its corners."""
 
 
@@ -79,8 +79,8 @@ def contact_points(surface: SurfaceSet, points: int | None = None) -> ContactPoi
     Raises:
         ModelError: another number, or one without a rule for all faces.
     """
-    check_points(surface, points)
-    return points_by_rules(surface, RULES, DEFAULT, points)
+    check_contact_points(surface, points)
+    return points_by_rules(surface, CONTACT_RULES, DEFAULT_POINTS, points)
 
 
 def points_by_rules(
@@ -91,7 +91,7 @@ def points_by_rules(
     rules = {corners: those[default[corners] if points is None else points] for corners, those in known.items()
              if points is None or points in those}  # fmt: skip
     t = assembly.facet_tables(surface, rules=rules)
-    X, area = assembly.facet_places(body, t)
+    X, area = assembly.facet_positions_and_areas(body, t)
     x = body.reference[t.conn]
     cross = np.cross(np.einsum("fqi,fik->fqk", t.d_a, x), np.einsum("fqi,fik->fqk", t.d_b, x))
     length = np.linalg.norm(cross, axis=2, keepdims=True)
@@ -117,7 +117,7 @@ def corner_points(p: ContactPoints) -> np.ndarray:
 
 
 def lagrange_basis(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lagrange polynomials of the points of a rule in `RULES`, equal on common edges.
+    """Lagrange polynomials of the points of a rule in `CONTACT_RULES`, equal on common edges.
 
     Returns:
         Coefficients (P, M), and the exponents (M, 2) of the monomials; of 7 points all of degree 2 and the bubble
@@ -140,19 +140,19 @@ def lagrange_basis(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.linalg.solve((values @ functions.T).T, functions), exponents
 
 
-def check_points(surface: SurfaceSet, points: Any) -> None:
+def check_contact_points(surface: SurfaceSet, points: Any) -> None:
     """Raise ModelError unless `points` is None or has a rule for all faces."""
     if points is None:
         return
     family = surface.body.family
     for corners in sorted({len(family.faces[face]) for face in np.unique(surface.faces[:, 1])}):
-        known = RULES[corners]
+        known = CONTACT_RULES[corners]
         if not is_count(points) or points not in known:
             faces = {3: "triangles", 4: "quadrilaterals"}[corners]
             numbers = ", ".join(map(str, known))
             raise ModelError(
                 f"points = {points!r}: the faces of body {surface.body.name!r} ({family.name}) are {faces}, which have "
-                f"rules of {numbers} points; None takes {DEFAULT[corners]}"
+                f"rules of {numbers} points; None takes {DEFAULT_POINTS[corners]}"
             )
 
 
@@ -177,4 +177,4 @@ def body_mass_total(body: Discretisation) -> float:
     """Mass of a body as built, kg; 0 for a material without density (statics only)."""
     if any(material.density is None for _, material in body.materials):
         return 0.0
-    return sum(part.scale * part.total for part in mass_parts(body))
+    return sum(part.scale * part.scaled_mass for part in mass_parts(body))

@@ -22,7 +22,9 @@ ORDERED_NODES = 20000
 
 @dataclass(eq=False)
 class Discretisation:
-    """Meshed body with its slots; nodes and elements are numbered as in its mesh.
+    """Meshed body with its slots (3-vector unknowns: node positions and position gradients).
+
+    Nodes and elements are numbered as in its mesh.
 
     Attributes:
         name: unique in its model.
@@ -90,7 +92,7 @@ class Discretisation:
 
     @property
     def slot_count(self) -> int:
-        """Slots of the body."""
+        """Number of slots of the body."""
         return int(self.node_slot_count.sum())
 
     @cached_property

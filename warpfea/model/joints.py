@@ -11,7 +11,7 @@ from ..kernels.terms.constraints import DISTANCE
 from ..time_laws import TimeLaw
 from .discretisation import Discretisation
 
-__all__ = ["WEIGHT_TOL", "Joint", "Row", "Vector", "VectorPart", "constant"]
+__all__ = ["WEIGHT_TOL", "ConstraintRow", "Joint", "Vector", "VectorPart", "constant_vector"]
 
 WEIGHT_TOL = 1e-13
 """Weights below this fraction of a vector's largest are round-off of vanishing functions."""
@@ -19,12 +19,12 @@ WEIGHT_TOL = 1e-13
 
 @dataclass(frozen=True, eq=False)
 class VectorPart:
-    """One body's part of a vector: sum_i w_i e_i; `child`: on the joint's child side."""
+    """One body's part of a vector: sum_i w_i e_i; `on_child_side`: on the joint's child side."""
 
     body: Discretisation
     slots: np.ndarray
     weights: np.ndarray
-    child: bool
+    on_child_side: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +35,7 @@ class Vector:
     parts: tuple[VectorPart, ...] = ()
 
     def __sub__(self, other: Vector) -> Vector:
-        flipped = tuple(VectorPart(p.body, p.slots, -p.weights, p.child) for p in other.parts)
+        flipped = tuple(VectorPart(p.body, p.slots, -p.weights, p.on_child_side) for p in other.parts)
         return Vector(self.value - other.value, self.parts + flipped)
 
     def entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -44,18 +44,18 @@ class Vector:
             return np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0, dtype=bool)
         slots = np.concatenate([p.body.slot_offset + p.slots for p in self.parts])
         weights = np.concatenate([p.weights for p in self.parts])
-        child = np.concatenate([np.full(len(p.slots), p.child) for p in self.parts])
+        child = np.concatenate([np.full(len(p.slots), p.on_child_side) for p in self.parts])
         keep = np.abs(weights) > WEIGHT_TOL * np.abs(weights).max()
         return slots[keep], weights[keep], child[keep]
 
 
-def constant(value: Any) -> Vector:
+def constant_vector(value: Any) -> Vector:
     """Constant vector."""
     return Vector(np.asarray(value, dtype=float))
 
 
 @dataclass(frozen=True, eq=False)
-class Row:
+class ConstraintRow:
     """A scalar constraint; see kernels/terms/constraints.py for the kinds.
 
     Attributes:
@@ -77,13 +77,13 @@ class Row:
     angular: bool = False
 
     @property
-    def terms(self) -> tuple[Vector, Vector, Vector]:
+    def vectors(self) -> tuple[Vector, Vector, Vector]:
         """The three vectors; missing ones are constant."""
-        none = constant(np.zeros(3))
+        none = constant_vector(np.zeros(3))
         return self.a, self.b, self.a2 or none
 
     @property
-    def constant(self) -> float:
+    def reference_product(self) -> float:
         """A.B of the reference, |A|^2 of a distance; exactly 0 for vectors made perpendicular."""
         A, B = self.a.value, self.b.value
         if self.kind == DISTANCE:
@@ -108,7 +108,7 @@ class Joint:
 
     name: str
     kind: str
-    rows: list[Row] = field(repr=False)
+    rows: list[ConstraintRow] = field(repr=False)
     anchor: Vector = field(repr=False)
     between: str = ""
     angle: tuple[Vector, Vector, Vector] | None = field(default=None, repr=False)

@@ -29,7 +29,7 @@ def locate(body: Discretisation, X: Any, slack: float = 1e-9) -> MaterialPoint:
     if x.shape != (3,) or not np.all(np.isfinite(x)):
         raise ModelError(f"body {body.name!r}: a point must be three finite numbers (m), got {X!r}")
     parent = body.family.parent
-    near, size = _near(body, x)
+    near, size = _nearby_elements(body, x)
     best = (np.inf, -1, np.zeros(3))
     if len(near):
         E = (
@@ -38,14 +38,14 @@ def locate(body: Discretisation, X: Any, slack: float = 1e-9) -> MaterialPoint:
         )
         xi = np.tile(parent.center, (len(near), 1))
         for _ in range(20):
-            s, ds = _own_point(body, near, xi)
+            s, ds = _shape_at_own_points(body, near, xi)
             residual = np.einsum("es,esk->ek", s, E) - x
             J = np.einsum("esk,esl->ekl", E, ds)
             step = np.linalg.solve(J, residual[:, :, None])[:, :, 0]
             last, xi = xi, np.clip(xi - step, -2.0, 3.0)
             if np.abs(xi - last).max() < 1e-14:
                 break
-        s, _ = _own_point(body, near, xi)
+        s, _ = _shape_at_own_points(body, near, xi)
         miss = np.linalg.norm(np.einsum("es,esk->ek", s, E) - x, axis=1) / size
         outside = parent.outside(xi) + miss
         k = int(np.argmin(outside))
@@ -56,19 +56,19 @@ def locate(body: Discretisation, X: Any, slack: float = 1e-9) -> MaterialPoint:
             f"body {body.name!r}: point {x.tolist()} lies outside of it (its nodes fill the box "
             f"{np.asarray(low).tolist()} to {np.asarray(high).tolist()} m)"
         )
-    return point_of(body, best[1], best[2], x)
+    return material_point_at(body, best[1], best[2], x)
 
 
-def point_of(body: Discretisation, element: int, xi: np.ndarray, X: np.ndarray) -> MaterialPoint:
+def material_point_at(body: Discretisation, element: int, xi: np.ndarray, X: np.ndarray) -> MaterialPoint:
     """The material point at parent coordinates xi (3,) of an element."""
-    s, ds = _own_point(body, np.array([element]), xi[None])
+    s, ds = _shape_at_own_points(body, np.array([element]), xi[None])
     conn = body.connectivity[element]
     J0 = body.reference[conn].T @ ds[0]
     axes = np.eye(3) if body.family.solid else orthonormal(J0)
     return MaterialPoint(body, conn, s[0].copy(), X, ds[0] @ np.linalg.inv(J0), axes, element)
 
 
-def _own_point(body: Discretisation, elements: np.ndarray, xi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _shape_at_own_points(body: Discretisation, elements: np.ndarray, xi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Functions (E, S), (E, S, 3) of each element at its own point (E, 3)."""
     s, ds = element_functions(body, elements[:1], xi)
     if s.shape[0] == 1 and not body.family.has_gradients:
@@ -77,7 +77,7 @@ def _own_point(body: Discretisation, elements: np.ndarray, xi: np.ndarray) -> tu
     return np.stack([p[0][0, 0] for p in parts]), np.stack([p[1][0, 0] for p in parts])
 
 
-def _near(body: Discretisation, x: np.ndarray) -> tuple[np.ndarray, float]:
+def _nearby_elements(body: Discretisation, x: np.ndarray) -> tuple[np.ndarray, float]:
     """Elements whose bounding box, enlarged by a tenth of the largest, contains x; and the largest size (m)."""
     low, high, size = body.element_boxes
     return np.flatnonzero(np.all((low - 0.1 * size <= x) & (high + 0.1 * size >= x), axis=1)), size

@@ -15,10 +15,10 @@ from . import assembly
 if TYPE_CHECKING:
     from .discretisation import Discretisation
 
-__all__ = ["MassPart", "Masses", "body_mass", "center_of_mass", "is_number", "mass_parts"]
+__all__ = ["MassPart", "Masses", "body_mass", "center_of_mass", "has_constant_density", "mass_parts"]
 
 
-def _keys(matrix: sp.csr_matrix) -> np.ndarray:
+def _entry_keys(matrix: sp.csr_matrix) -> np.ndarray:
     """Row-major indices of the entries."""
     n = np.int64(matrix.shape[0])
     return np.repeat(np.arange(n), np.diff(matrix.indptr)) * n + matrix.indices
@@ -31,33 +31,35 @@ class MassPart:
     Attributes:
         scale: the density, kg/m^3, or 1 if it is a function or given per element.
         matrix: scalar mass matrix / scale, (slots, slots) CSR of the body.
-        total: mass / scale.
+        scaled_mass: mass / scale.
     """
 
     scale: float
     matrix: sp.csr_matrix
-    total: float
+    scaled_mass: float
 
 
-def is_number(material: Material) -> bool:
+def has_constant_density(material: Material) -> bool:
     """True if the density of a material is one number."""
     return not callable(assembly.density_of(material)) and np.ndim(assembly.density_of(material)) == 0
 
 
 def mass_parts(body: Discretisation) -> list[MassPart]:
     """Consistent scalar mass m_ij = int rho s_i s_j dV (Eq. 20) of each material of a body."""
-    flat = assembly.straight(body)
+    flat = assembly.is_straight(body)
     n = body.slot_count
-    scales = [float(assembly.density_of(m)) if is_number(m) else assembly.UNIT_DENSITY for _, m in body.materials]
+    scales = [
+        float(assembly.density_of(m)) if has_constant_density(m) else assembly.UNIT_DENSITY for _, m in body.materials
+    ]
     out = []
     for k, scale in enumerate(scales):
         total, mass = sp.csr_matrix((n, n)), 0.0
         for affine in (True, False):
             chosen = np.flatnonzero((flat == affine) & (body.material_of == k))
             rule = assembly.mass_rule(body, affine)
-            for part in assembly.chunks(body, chosen, len(rule.weights)):
+            for part in assembly.element_chunks(body, chosen, len(rule.weights)):
                 conn = body.connectivity[part]
-                s, _, _, det = assembly.geometry(body, part, rule.points)
+                s, _, _, det = assembly.shape_and_jacobian(body, part, rule.points)
                 w = assembly.density_at(body, part, s, conn, assembly.UNIT_DENSITY) * det * rule.weights
                 mass += float(w.sum())
                 subscripts = "eq,qi,qj->eij" if len(s) == 1 else "eq,eqi,eqj->eij"
@@ -91,7 +93,7 @@ class Masses:
 
     Attributes:
         matrix: (slots, slots) CSR as the bodies were built, kg.
-        table, lumped: (worlds or 1, entries), its entries; (worlds or 1, slots), its sums over position slots.
+        entry_values, lumped: (worlds or 1, entries), its entries; (worlds or 1, slots), its sums over position slots.
         values, lumped_values: device copies.
     """
 
@@ -104,52 +106,52 @@ class Masses:
         ]
         self.matrix = sp.block_diag(patterns, format="csr")
         self.matrix.sort_indices()
-        self.entries = {key: self._entry_indices(key, patterns[key[0]]) for key in self.parts}
+        self.entry_indices = {key: self._entry_indices(key, patterns[key[0]]) for key in self.parts}
         self.scales = {key: np.array([part.scale]) for key, part in self.parts.items()}
-        self._sum()
+        self._sum_over_materials()
         self.matrix = self._csr(0)
-        self.values = model.array("mass", self.table, model.types.T)
+        self.values = model.array("mass", self.entry_values, model.types.T)
         self.lumped_values = model.array("slots", self.lumped, model.types.T)
 
     @property
-    def varied(self) -> bool:
+    def varies_by_world(self) -> bool:
         """True with one mass matrix per world."""
-        return len(self.table) != 1
+        return len(self.entry_values) != 1
 
-    def of_world(self, world: int) -> sp.csr_matrix:
+    def world_matrix(self, world: int) -> sp.csr_matrix:
         """(slots, slots) CSR, kg."""
-        return self._csr(world % len(self.table))
+        return self._csr(world % len(self.entry_values))
 
-    def of_worlds(self, worlds: int) -> np.ndarray:
+    def lumped_in_worlds(self, worlds: int) -> np.ndarray:
         """(worlds, slots) lumped masses, kg."""
         return np.broadcast_to(self.lumped, (worlds, self.lumped.shape[1]))
 
-    def of_body(self, body: Discretisation, world: int = 0) -> float:
+    def total_of_body(self, body: Discretisation, world: int = 0) -> float:
         """Mass of a body, kg; 0 for a material without density (statics only)."""
         if any(material.density is None for _, material in body.materials):
             return 0.0
         index = self.model.bodies.index(body)
         return sum(
-            float(self.scales[key][world % len(self.scales[key])]) * part.total
+            float(self.scales[key][world % len(self.scales[key])]) * part.scaled_mass
             for key, part in self.parts.items()
             if key[0] == index
         )
 
-    def of_pattern(self, pattern: Any) -> np.ndarray:
-        """(worlds or 1, upper entries) masses of a pattern of blocks (solvers/assembled.py), kg."""
-        upper = pattern.upper
-        if len(self.matrix.indices) == pattern.entries:
-            return self.table[:, upper[:, 0]]
-        key = _keys(self.matrix)
+    def pattern_masses(self, pattern: Any) -> np.ndarray:
+        """(worlds or 1, upper entries) masses of a pattern of blocks (solvers/matrix_assembly.py), kg."""
+        upper = pattern.upper_entries
+        if len(self.matrix.indices) == pattern.entry_count:
+            return self.entry_values[:, upper[:, 0]]
+        key = _entry_keys(self.matrix)
         wanted = upper[:, 2].astype(np.int64) * self.matrix.shape[0] + upper[:, 3]
         at = np.minimum(np.searchsorted(key, wanted), len(key) - 1)
-        return np.where(key[at] == wanted, self.table[:, at], 0.0)
+        return np.where(key[at] == wanted, self.entry_values[:, at], 0.0)
 
-    def of_groups(self, of_slot: np.ndarray, slots: np.ndarray, count: int) -> np.ndarray:
+    def group_masses(self, of_slot: np.ndarray, slots: np.ndarray, count: int) -> np.ndarray:
         """(worlds or 1, groups) masses of groups of position slots, kg."""
         return np.array([np.bincount(of_slot[slots], weights=row[slots], minlength=count) for row in self.lumped])
 
-    def of_elements(self, parts: list[assembly.HostBlock], det: np.ndarray) -> np.ndarray:
+    def element_masses(self, parts: list[assembly.HostBlock], det: np.ndarray) -> np.ndarray:
         """(worlds or 1, elements) density times det J0 of a block of straight elements, kg."""
         rows, first = [], 0
         for part in parts:
@@ -157,7 +159,7 @@ class Masses:
             material = part.body.materials[part.material][1]
             own = (
                 assembly.UNIT_DENSITY
-                if is_number(material)
+                if has_constant_density(material)
                 else np.asarray(material.density, dtype=float)[part.elements]
             )
             scale = self.scales[self.model.bodies.index(part.body), part.material]
@@ -166,23 +168,25 @@ class Masses:
         worlds = max(len(row) for row in rows)
         return np.concatenate([np.broadcast_to(row, (worlds, row.shape[1])) for row in rows], axis=1)
 
-    def set(self, scales: dict[tuple[int, int], np.ndarray]) -> None:
+    def set_densities(self, scales: dict[tuple[int, int], np.ndarray]) -> None:
         """Set densities, or factors on them, (worlds,), by body index and material index."""
         self.scales |= scales
-        self._sum()
+        self._sum_over_materials()
         m, known = self.model, self.model.cache
-        self.values = self._replace_array("mass", self.values, self.table)
+        self.values = self._replace_array("mass", self.values, self.entry_values)
         self.lumped_values = self._replace_array("slots", self.lumped_values, self.lumped)
         m.topology.mass_value = self.values
         if "matrix" in known:
             pattern, mass = known["matrix"]
-            known["matrix"] = pattern, self._replace_array("matrix pattern", mass, self.of_pattern(pattern))
-        if m.group_count:
-            m.groups.mass = self._replace_array("groups", m.groups.mass, self.of_groups(*known["free groups"]))
-            m.groups.lumped_mass = self.lumped_values
+            known["matrix"] = pattern, self._replace_array("matrix pattern", mass, self.pattern_masses(pattern))
+        if m.free_group_count:
+            m.free_groups.mass = self._replace_array(
+                "groups", m.free_groups.mass, self.group_masses(*known["free groups"])
+            )
+            m.free_groups.lumped_mass = self.lumped_values
         for block in m.blocks:
-            if block.det is not None:
-                table = self.of_elements(block.parts, block.det)
+            if block.det_J0 is not None:
+                table = self.element_masses(block.host_blocks, block.det_J0)
                 block.data.density_det_J0 = self._replace_array("elements", block.data.density_det_J0, table)
 
     def _replace_array(self, name: str, array: wp.array, values: np.ndarray) -> wp.array:
@@ -190,17 +194,17 @@ class Masses:
         if array.shape == values.shape:
             array.assign(values)
             return array
-        self.model.forget(name, array)
+        self.model.uncount_bytes(name, array)
         return self.model.array(name, values, self.model.types.T)
 
-    def _sum(self) -> None:
+    def _sum_over_materials(self) -> None:
         """Sum the tables over materials, in the same order for any number of worlds."""
         worlds = max(len(scale) for scale in self.scales.values())
-        self.table = np.zeros((worlds, self.matrix.nnz))
+        self.entry_values = np.zeros((worlds, self.matrix.nnz))
         self.lumped = np.zeros((worlds, self.matrix.shape[0]))
         for key, scale in self.scales.items():
             body, part = self.model.bodies[key[0]], self.parts[key]
-            self.table[:, self.entries[key]] += scale[:, None] * part.matrix.data
+            self.entry_values[:, self.entry_indices[key]] += scale[:, None] * part.matrix.data
             rows = slice(body.slot_offset, body.slot_offset + body.slot_count)
             self.lumped[:, rows] += scale[:, None] * (part.matrix @ self.model.is_position_host[rows])
 
@@ -212,7 +216,9 @@ class Masses:
         first = int(self.matrix.indptr[self.model.bodies[key[0]].slot_offset])
         if part.nnz == pattern.nnz:  # all of the body
             return slice(first, first + part.nnz)
-        return first + np.searchsorted(_keys(pattern), _keys(part))
+        return first + np.searchsorted(_entry_keys(pattern), _entry_keys(part))
 
     def _csr(self, world: int) -> sp.csr_matrix:
-        return sp.csr_matrix((self.table[world], self.matrix.indices, self.matrix.indptr), shape=self.matrix.shape)
+        return sp.csr_matrix(
+            (self.entry_values[world], self.matrix.indices, self.matrix.indptr), shape=self.matrix.shape
+        )

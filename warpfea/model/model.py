@@ -22,12 +22,12 @@ from .masses import Masses
 from .parameters import MaterialParameters
 from .residual_groups import slot_groups
 from .state import State
-from .topology import free_groups, label_components, make_topology
+from .topology import label_components, make_free_groups, make_topology
 
 __all__ = ["Block", "Model"]
 
 
-SHOWN = 3
+MAX_LISTED_BODIES = 3
 """Maximum number of bodies listed by a repr."""
 
 
@@ -43,7 +43,7 @@ class ModelSource(Protocol):
         """Bodies in the order of addition."""
 
     def make_terms(self, model: Model) -> tuple[Any, Any]:
-        """TermSet of a model and its evaluation at a state."""
+        """Terms of a model (forces, contact, constraints), and the evaluator of its quantities at a state."""
 
 
 class Model:
@@ -51,10 +51,12 @@ class Model:
 
     Attributes:
         bodies: the bodies, in the order they were added.
-        worlds, dtype, device, up_axis: as given.
-        slots: number of slots of all bodies.
+        worlds: number of copies of the model stepped together; dtype, device, up_axis: as given.
+        slots: number of slots (3-vector unknowns: node positions and gradients) of all bodies.
         size: diagonal of the box of all nodes, m; reference length of constraint tolerances.
         blocks: element blocks.
+        mesh_component, component: (slots,) connected component, by elements alone and also by constraints.
+        free_groups, free_group_count: components with an unconstrained translation: device struct and number.
         cache: tables shared by solvers.
         mass_host: scalar mass matrix (slots, slots), CSR on the host, kg.
     """
@@ -89,27 +91,28 @@ class Model:
             self._build(builder, tables)
 
     def resized(self, worlds: int, dtype: str | None = None) -> Model:
-        """Model of the same description, without values set since, with another number of worlds or precision."""
+        """New model of the same description with another number of worlds or precision; values set by `set_parameter`
+        are not carried over."""
         return Model(self._source, device=self.device, dtype=dtype or self.dtype, worlds=worlds, tables=self._tables)
 
     def _build(self, builder: ModelSource, tables: bool) -> None:
         """Number, assemble and upload the description."""
-        self._number()
+        self._number_slots()
         self._assemble_mass()
         self._build_blocks(tables)
         self.gravity = np.asarray(builder.gravity, dtype=float)
         self.probes = list(builder.description.probes)
         self.terms, self.evaluation = builder.make_terms(self)
-        self.part, self.component = label_components(self.graph(), self.terms.tied_slots())
+        self.mesh_component, self.component = label_components(self.graph(), self.terms.tied_slots())
         self.component_count = int(self.component.max()) + 1
         self.terms.build()
         self.topology = make_topology(self)
         self._upload_components()
-        self.groups, self.group_count = free_groups(self)
+        self.free_groups, self.free_group_count = make_free_groups(self)
 
     def __repr__(self) -> str:
         names = ", ".join(repr(body.name) for body in self.bodies)
-        what = names if len(self.bodies) <= SHOWN else f"{len(self.bodies)} bodies"
+        what = names if len(self.bodies) <= MAX_LISTED_BODIES else f"{len(self.bodies)} bodies"
         mass = "no density" if self.mass is None else f"{self.mass:.4g} kg"
         worlds = f", {self.worlds} worlds" if self.worlds > 1 else ""
         return f"Model({what}, {int(self.free_slots.sum())} unknowns, {mass}, {self.device}, {self.dtype}{worlds})"
@@ -127,15 +130,15 @@ class Model:
     def array(self, name: str, values: Any, dtype: Any) -> wp.array:
         """Upload a constant array; its bytes are counted under `name`."""
         out: Any = wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device)
-        self.count(name, out)
+        self.count_bytes(name, out)
         return out
 
-    def count(self, name: str, *arrays: wp.array) -> None:
+    def count_bytes(self, name: str, *arrays: wp.array) -> None:
         """Count the bytes of device arrays under `name`."""
         for array in arrays:
             self._memory[name] = self._memory.get(name, 0) + array.size * wp.types.type_size_in_bytes(array.dtype)
 
-    def forget(self, name: str, *arrays: wp.array) -> None:
+    def uncount_bytes(self, name: str, *arrays: wp.array) -> None:
         """Subtract the bytes of released arrays under `name`."""
         for array in arrays:
             self._memory[name] -= array.size * wp.types.type_size_in_bytes(array.dtype)
@@ -148,7 +151,7 @@ class Model:
         out = self.array("elements", np.moveaxis(values, last, 0), dtype)
         return out.transpose((*range(1, out.ndim), 0))
 
-    def _number(self) -> None:
+    def _number_slots(self) -> None:
         offset, elements_before = 0, 0
         for body in self.bodies:
             body.element_offset = elements_before
@@ -190,11 +193,11 @@ class Model:
         for body in self.bodies:
             for host in assembly.host_blocks(body, tables=tables):
                 groups.setdefault(host.key, []).append(host)
-                host.row = len(rows)
+                host.coefficient_row = len(rows)
                 rows.append(assembly.coefficient_rows(host.coefficients, body.materials[host.material][1]))
         self.coefficient_table = np.array(rows).reshape(1, -1, NCOEF)
         self.coefficients = self.array("materials", self.coefficient_table, self.types.T)
-        self._built_of = self.coefficients.numpy().tobytes()
+        self._initial_coefficients = self.coefficients.numpy().tobytes()
         self.blocks: list[Block] = []
         contribution, element, history = 0, 0, 0
         for key, parts in groups.items():
@@ -213,9 +216,10 @@ class Model:
         return term and term.tables
 
     def _upload_components(self) -> None:
-        """Residual groups (component and stiffness), and groups of parts for the error estimate."""
+        """Upload the groups of slots whose residuals are measured together: of one connected component and similar
+        stiffness for the solver, of one mesh component and similar stiffness for the error estimate."""
         self.residual_groups = slot_groups(self, self.component)
-        self.residual_parts = slot_groups(self, self.part)
+        self.error_estimate_groups = slot_groups(self, self.mesh_component)
         if self.component_count > 1:
             self.component_of_slot = self.array("components", self.component, wp.int32)
 
@@ -240,7 +244,7 @@ class Model:
         """Optional features used by the scene."""
         return self.terms.features | {
             "driven nodes": any(s.law or s.node_laws for s in self.description.supports),
-            "free groups": self.group_count > 0,
+            "free groups": self.free_group_count > 0,
             "separate components": self.component_count > 1,
             "probes": bool(self.probes),
         }
@@ -258,7 +262,9 @@ class Model:
                 {
                     "name": b.name,
                     "element": b.family.name,
-                    "quadrature": sorted({k.key.scheme for k in self.blocks if any(p.body is b for p in k.parts)}),
+                    "quadrature": sorted(
+                        {k.key.scheme for k in self.blocks if any(p.body is b for p in k.host_blocks)}
+                    ),
                     "elements": len(b.mesh.cells),
                     "nodes": len(b.mesh.used_nodes),
                     "materials": [type(m).__name__ + (f" ({g})" if g else "") for g, m in b.materials],
@@ -319,7 +325,7 @@ class Model:
             ModelError: a material without a density.
         """
         assembly.require_density(self.bodies, "mass_matrix")
-        return sp.kron(self.masses.of_world(world), sp.identity(3), format="csr")
+        return sp.kron(self.masses.world_matrix(world), sp.identity(3), format="csr")
 
     def internal_force(self, state: State) -> np.ndarray:
         """Elastic internal force, Eq. (32), [world, slot, 3], N."""
@@ -346,11 +352,11 @@ class Model:
         return self.evaluation.tangent_matrix(state, world)
 
     def constraint_values(self, state: State) -> np.ndarray:
-        """Values c of all rows of the constraints, [world, row], m; rows of a joint: constraints.rows_of."""
+        """Values c of all rows of the constraints, [world, row], m; those of joint k: model.constraints.rows_of[k]."""
         return self.evaluation.constraints(state)[0]
 
     def constraint_jacobian(self, state: State, world: int = 0) -> sp.csr_matrix:
-        """dc/dq of one world, (rows, 3 slots) CSR, with the gradients that the device computes."""
+        """dc/dq of one world, (rows, 3 slots) CSR, evaluated on the device."""
         return self.evaluation.constraint_jacobian(state, world)
 
     def constraint_curvature(self, state: State, multipliers: Any, direction: Any) -> np.ndarray:
@@ -367,7 +373,7 @@ class Model:
         self.set_parameter("gravity", gravity, mask=mask)
 
     def contact_force(self, state: State) -> np.ndarray:
-        """Elastic part of the forces of contact at a state, without damping, [world, slot, 3], N; on the bodies.
+        """Nodal contact forces on the bodies at a state, without contact damping, [world, slot, 3], N.
 
         The state of a simulation has the friction springs and collider positions; for another state colliders follow
         their paths at its time, without friction.
@@ -383,9 +389,9 @@ class Model:
 
         Args:
             name: "B.E" with the name B of a body, or "B.G.E" with a group G that has a material of its own: a constant
-                of the material (E and nu if made from them, else those of the law), eta and lambda_v of its damping,
-                kept if 0, or density, kg/m^3; density_factor for densities given as a function or per element. Set
-                such a name for the first time before making simulations.
+                of the material (E and nu if made from them, else those of the law), eta and lambda_v of its damping
+                (KelvinVoigt(eta=0) makes them settable from 0), or density, kg/m^3; density_factor for densities
+                given as a function or per element. Set such a name for the first time before making simulations.
                 "C.mu", "C.mu_static", "C.restitution" or "C.stiffness" with the name C of a contact, as of
                 ModelBuilder.add_contact; mu_static follows mu if equal to it. "K.offset" with the name K of a
                 collider: of a HalfSpace the offset of its plane, m; of other shapes the outward offset of the
@@ -394,7 +400,7 @@ class Model:
             mask: (worlds,), on the host or on a device: the worlds to set. None: all.
 
         Raises:
-            ModelError: an unknown or shared name, a wrong shape, or a value out of range.
+            ModelError: an unknown name, a quantity that all worlds share, a wrong shape, or a value out of range.
         """
         self.terms.set_parameter(name, values, mask)
 
@@ -403,7 +409,7 @@ class Model:
         h = hashlib.sha256(f"{self.dtype} {self.worlds} {self.slots}".encode())
         for block in self.blocks:
             h.update(repr(block.key).encode())
-            for part in block.parts:
+            for part in block.host_blocks:
                 h.update(np.ascontiguousarray(part.conn).tobytes())
         for body in self.bodies:
             h.update(repr(body.section).encode())
@@ -412,6 +418,6 @@ class Model:
         h.update(self.reference.tobytes())
         h.update(self.free_host.tobytes())
         h.update(self.mass_host.data.tobytes())
-        h.update(self._built_of)
+        h.update(self._initial_coefficients)
         self.terms.hash(h)
         return h.hexdigest()

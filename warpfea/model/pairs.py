@@ -22,7 +22,7 @@ PAIR_RULES: dict[int, dict[int, Rule]] = {
     3: {7: triangle_7(), 16: triangle_16()},
     4: {n * n: lobatto_square(n) for n in (2, 3, 4, 5)},
 }
-"""Slave point rules: 16 by default, since meshes need not match."""
+"""Quadrature rules of slave faces, by the numbers of corners and of points."""
 MASTER_SIZE_RATIO = 1.25
 """Ratio of element sizes beyond which the coarser surface is the master."""
 MAX_CORNER_LENGTH = 2.0
@@ -63,7 +63,8 @@ class MasterFacets:
         conn: (F, L) body slots of the facets' elements.
         shape, director_shape: (F, M, L) monomial coefficients of the L slots' shape functions, and of their outward
             derivatives, 1/m.
-        X, N: (F, M, 3) monomial coefficients of the reference position, m, and of the outward vector.
+        position_coefficients, normal_coefficients: (F, M, 3) monomial coefficients of the reference position, m, and of
+            the outward vector (mitred unit normals).
         corners, degree: 3 or 4, of each facet; of the polynomials.
         size: (F,) length of a side, m.
         depth_limit: (F,) half the thickness of the body behind it, m.
@@ -72,8 +73,8 @@ class MasterFacets:
     conn: np.ndarray
     shape: np.ndarray
     director_shape: np.ndarray
-    X: np.ndarray
-    N: np.ndarray
+    position_coefficients: np.ndarray
+    normal_coefficients: np.ndarray
     corners: int
     degree: int
     size: np.ndarray
@@ -81,12 +82,12 @@ class MasterFacets:
 
 
 def pair_points(surface: SurfaceSet, points: int | None = None) -> ContactPoints:
-    """Points of a slave surface: 16 per face, corners included."""
+    """Quadrature points of a slave surface, corners included: `points` per face, or 16, since meshes need not match."""
     return points_by_rules(surface, PAIR_RULES, {3: 16, 4: 16}, points)
 
 
 def slave_and_master(first: SurfaceSet, second: SurfaceSet) -> tuple[SurfaceSet, SurfaceSet]:
-    """Master selection: the coarser surface; at equal size the stiffer, then the second."""
+    """(slave, master): the coarser surface is the master; at equal size the stiffer, then the second."""
     sides = []
     for surface in (first, second):
         area = pair_points(surface).area.sum(axis=1)
@@ -97,24 +98,24 @@ def slave_and_master(first: SurfaceSet, second: SurfaceSet) -> tuple[SurfaceSet,
     return first, second
 
 
-def exponents(corners: int, degree: int) -> np.ndarray:
-    """(M, 2) of the monomials: of triangles up to a total degree, of squares up to a degree in each direction."""
+def monomial_exponents(corners: int, degree: int) -> np.ndarray:
+    """(M, 2) exponents of the monomials: triangles to a total degree, quadrilaterals to one per direction."""
     return np.array([(i, j) for i in range(degree + 1) for j in range(degree + 1) if corners == 4 or i + j <= degree])
 
 
 def interpolation_nodes(corners: int, degree: int) -> np.ndarray:
-    """(M, 2) interpolation points of such a polynomial."""
-    return exponents(corners, degree) / degree
+    """(M, 2) equidistant interpolation points of a polynomial with these monomials."""
+    return monomial_exponents(corners, degree) / degree
 
 
 def monomials(points: np.ndarray, corners: int, degree: int) -> np.ndarray:
     """(Q, M) values at points."""
-    return np.asarray(np.prod(points[:, None, :] ** exponents(corners, degree), axis=2))
+    return np.asarray(np.prod(points[:, None, :] ** monomial_exponents(corners, degree), axis=2))
 
 
-def bernstein(corners: int, degree: int) -> np.ndarray:
+def bernstein_from_monomials(corners: int, degree: int) -> np.ndarray:
     """(M, M): control points of Bernstein's form, whose convex hull holds the facet, from monomial coefficients."""
-    powers = exponents(corners, degree)
+    powers = monomial_exponents(corners, degree)
     nodes = interpolation_nodes(corners, degree)
     if corners == 4:
         values = [math.comb(degree, i) * math.comb(degree, j) * nodes[:, 0] ** i * (1 - nodes[:, 0]) ** (degree - i)
@@ -126,9 +127,9 @@ def bernstein(corners: int, degree: int) -> np.ndarray:
     return np.linalg.solve(np.stack(values, axis=1), monomials(nodes, corners, degree))
 
 
-def _functions(surface: SurfaceSet, ab: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Functions (F, Q, S) of all slots of the elements at points of their faces, their gradients (F, Q, S, 3) by the
-    reference, and outward unit normals (F, Q, 3)."""
+def _shape_functions(surface: SurfaceSet, ab: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Shape functions (F, Q, S) of all slots of the elements at face coordinates ab (Q, 2), their gradients dN/dX
+    (F, Q, S, 3), 1/m, and outward unit normals (F, Q, 3)."""
     body, faces = surface.body, surface.faces
     S = body.family.slots
     shape = np.zeros((len(faces), len(ab), S))
@@ -148,9 +149,9 @@ def _functions(surface: SurfaceSet, ab: np.ndarray) -> tuple[np.ndarray, np.ndar
     return shape, gradient, normal
 
 
-def _outward(places: np.ndarray, normal: np.ndarray, size: float) -> np.ndarray:
+def _mitred_normals(positions: np.ndarray, normal: np.ndarray, size: float) -> np.ndarray:
     """(F, Q, 3) node vectors with unit product with the normal of each facet at the node (mitred normals)."""
-    key = np.round(places.reshape(-1, 3) / (1e-7 * size)).astype(np.int64)
+    key = np.round(positions.reshape(-1, 3) / (1e-7 * size)).astype(np.int64)
     _, inverse = np.unique(key, axis=0, return_inverse=True)
     inverse = inverse.ravel()
     flat = normal.reshape(-1, 3)
@@ -172,39 +173,43 @@ def master_facets(surface: SurfaceSet) -> MasterFacets:
     """Facets of a surface as polynomials of the lowest exact degree.
 
     Raises:
-        ModelError: faces of triangles and squares in one surface, or functions of degree above 3.
+        ModelError: triangles and quadrilaterals in one surface, or shape functions of degree above 3 on a face.
     """
     body, faces = surface.body, surface.faces
     kinds = {len(body.family.faces[int(k)]) for k in np.unique(faces[:, 1])}
     if len(kinds) > 1:
-        raise ModelError(f"body {body.name!r}: a master surface of triangles and squares; name surfaces of one kind")
+        raise ModelError(
+            f"body {body.name!r}: a master surface must not mix triangles and quadrilaterals; name surfaces of one"
+        )
     corners = kinds.pop()
     check = PAIR_RULES[corners][16].points
-    wanted = _functions(surface, check)[0]
+    wanted = _shape_functions(surface, check)[0]
     for degree in (1, 2, 3):
         ab = interpolation_nodes(corners, degree)
         inverse = np.linalg.inv(monomials(ab, corners, degree))
-        shape, gradient, normal = _functions(surface, ab)
+        shape, gradient, normal = _shape_functions(surface, ab)
         fitted = np.einsum("qm,mn,fns->fqs", monomials(check, corners, degree), inverse, shape)
         if np.abs(fitted - wanted).max() <= 1e-10 * np.abs(wanted).max():
             break
     else:
-        raise ModelError(f"body {body.name!r}: faces of {body.family.name} are no polynomials of degree 3")
+        raise ModelError(f"body {body.name!r}: shape functions of {body.family.name} on a face are of degree above 3")
     conn = body.connectivity[faces[:, 0]]
     e = body.reference[conn]
-    places = np.einsum("fqs,fsk->fqk", shape, e) + body.origin
+    positions = np.einsum("fqs,fsk->fqk", shape, e) + body.origin
     area = pair_points(surface).area.sum(axis=1)
-    outward = _outward(places, normal, float(np.sqrt(area.max())))
+    outward = _mitred_normals(positions, normal, float(np.sqrt(area.max())))
     director_shape = np.einsum("fqsk,fqk->fqs", gradient, outward)
     used = (np.abs(shape).max(axis=(0, 1)) > 0.0) | (np.abs(director_shape).max(axis=(0, 1)) > 0.0)
     conn, e, shape, director_shape = conn[:, used], e[:, used], shape[:, :, used], director_shape[:, :, used]
     shape, director_shape = (np.einsum("mq,fqs->fms", inverse, x) for x in (shape, director_shape))
-    X = np.einsum("mq,fqk->fmk", inverse, places)
+    X = np.einsum("mq,fqk->fmk", inverse, positions)
     N = np.einsum("fms,fsk->fmk", director_shape, e)
-    return MasterFacets(conn, shape, director_shape, X, N, corners, degree, np.sqrt(area), 0.5 * thickness(surface))
+    return MasterFacets(
+        conn, shape, director_shape, X, N, corners, degree, np.sqrt(area), 0.5 * facet_thickness(surface)
+    )
 
 
-def thickness(surface: SurfaceSet) -> np.ndarray:
+def facet_thickness(surface: SurfaceSet) -> np.ndarray:
     """(F,) thickness, m: inward distance from the middle of each facet to the opposite side of its body."""
     import warp as wp
 
@@ -214,9 +219,9 @@ def thickness(surface: SurfaceSet) -> np.ndarray:
     body = surface.body
     corners = len(body.family.faces[int(surface.faces[0, 1])])
     middle = np.full((1, 2), 1.0 / 3.0 if corners == 3 else 0.5)
-    shape, _, normal = _functions(surface, middle)
+    shape, _, normal = _shape_functions(surface, middle)
     e = body.reference[body.connectivity[surface.faces[:, 0]]]
-    places = np.einsum("fqs,fsk->fqk", shape, e)[:, 0] + body.origin
+    positions = np.einsum("fqs,fsk->fqk", shape, e)[:, 0] + body.origin
     skin = make_skin(body)
     points = reference_points(body, skin.slot_weights)
     center, size = points.mean(axis=0), float(np.ptp(points, axis=0).max())
@@ -225,28 +230,31 @@ def thickness(surface: SurfaceSet) -> np.ndarray:
             wp.array((points - center) / size, dtype=wp.vec3),
             wp.array(skin.triangles.ravel(), dtype=wp.int32),
         )
-        out = wp.zeros(len(places), dtype=float)
-        x: wp.array = wp.array((places - center) / size, dtype=wp.vec3)
+        out = wp.zeros(len(positions), dtype=float)
+        x: wp.array = wp.array((positions - center) / size, dtype=wp.vec3)
         n: wp.array = wp.array(normal[:, 0], dtype=wp.vec3)
-        wp.launch(thickness_kernel(), len(places), [mesh.id, x, n, out], device="cpu")
+        wp.launch(thickness_kernel(), len(positions), [mesh.id, x, n, out], device="cpu")
         return np.asarray(out.numpy(), dtype=float) * size
 
 
 def contact_constants(
     contact: PairContact, area: float, mass_of: Callable[[Discretisation], float], modulus_of: Modulus
 ) -> dict[str, float]:
-    """Constants of Eqs. (74)-(76), (79), (80) of two bodies whose region has an area, m^2, and the effective mass."""
-    compliance = shear = inverse_mass = 0.0
+    """Contact constants of Eqs. (74)-(76), (79), (80) for a contact region of `area`, m^2.
+
+    Normal and tangential stiffness 4/3 E* a and 8 G* a, N/m; 2 E* a, N/m, for the damping; effective mass, kg.
+    """
+    compliance = shear_compliance = inverse_mass = 0.0
     for surface in (contact.slave, contact.master):
         total = mass_of(surface.body)
         inverse_mass += 1.0 / total if total > 0.0 else math.inf
         E, nu = modulus_of(surface.body, surface)
         compliance += (1.0 - nu**2) / E
-        shear += 2.0 * (2.0 - nu) * (1.0 + nu) / E
+        shear_compliance += 2.0 * (2.0 - nu) * (1.0 + nu) / E
     a = contact.radius or math.sqrt(area / math.pi)
     return {
         "normal_stiffness": 4.0 / 3.0 * a / compliance,
-        "tangential_stiffness": 8.0 * a / shear,
+        "tangential_stiffness": 8.0 * a / shear_compliance,
         "damping_stiffness": 2.0 * a / compliance,
         "effective_mass": 1.0 / inverse_mass,
     }

@@ -28,8 +28,8 @@ __all__ = ["MaterialParameters"]
 
 Owner = tuple["Discretisation", int]
 """A body and the index of one of its materials."""
-RATES = ("eta", "lambda_v")
-SHARED = {
+DAMPING_CONSTANTS = ("eta", "lambda_v")
+SHARED_DATA = {
     "cells": "the mesh",
     "elements": "the mesh",
     "form": "the kernels of damping",
@@ -105,9 +105,9 @@ class MaterialParameters:
             return None
         laws = [body.materials[k][1] for body, k in owners[owner]]
         kinds = " and ".join(dict.fromkeys(type(law).__name__ for law in laws))
-        if what in SHARED:
-            return f"shared by all worlds ({SHARED[what]}): build a separate model"
-        if what in RATES:
+        if what in SHARED_DATA:
+            return f"shared by all worlds ({SHARED_DATA[what]}): build a separate model"
+        if what in DAMPING_CONSTANTS:
             return f"the material {kinds} has no damping, so its kernels were left out; give it KelvinVoigt(eta=0)"
         for law in laws:
             if what in {"E", "nu", *law.own} - set(law.constants):
@@ -118,7 +118,7 @@ class MaterialParameters:
 
     # values
 
-    def in_world(self, body: Discretisation, k: int, world: int) -> Material:
+    def material_in_world(self, body: Discretisation, k: int, world: int) -> Material:
         """Material of a body in one world."""
         return self._material((body, k), self.values, world)
 
@@ -129,7 +129,7 @@ class MaterialParameters:
     def mass(self, body: Discretisation, world: int | None) -> float:
         """Mass of a body in a world or as built, kg; 0 for a material without density."""
         masses = self.model.masses
-        return masses.of_body(body) if world is None else masses.of_body(body, world)
+        return masses.total_of_body(body) if world is None else masses.total_of_body(body, world)
 
     def modulus(self, world: int | None) -> Modulus:
         """`effective_modulus` in a world, or as built."""
@@ -137,11 +137,13 @@ class MaterialParameters:
             return effective_modulus
 
         def of(body: Discretisation, surface: SurfaceSet | None) -> tuple[float, float]:
-            return effective_modulus(body, surface, [self.in_world(body, k, world) for k in range(len(body.materials))])
+            return effective_modulus(
+                body, surface, [self.material_in_world(body, k, world) for k in range(len(body.materials))]
+            )
 
         return of
 
-    def of_worlds(self, body: Discretisation, k: int) -> Material:
+    def material_of_worlds(self, body: Discretisation, k: int) -> Material:
         """Material of a body, with arrays for constants that differ between worlds."""
         return self._material((body, k), self.values)
 
@@ -174,7 +176,7 @@ class MaterialParameters:
             before = fresh.get(key, np.full(self.model.worlds, body.materials[k][1].constants[name]))
             fresh[key] = np.where(mask, wanted, before)
         self.values = fresh
-        self._write(members, name, mask)
+        self._update_tables(members, name, mask)
         for term in self.model.terms:
             term.update_materials(mask)
         self.changes[mask] += 1
@@ -196,31 +198,31 @@ class MaterialParameters:
 
     # tables
 
-    def _write(self, members: list[Owner], name: str, mask: np.ndarray) -> None:
+    def _update_tables(self, members: list[Owner], name: str, mask: np.ndarray) -> None:
         """Update the device tables of some materials."""
         m = self.model
         if name in DENSITIES:
             keys = [(self._index(body), k) for body, k in members]
-            m.masses.set({key: self.values[(*key, name)] for key in keys})
+            m.masses.set_densities({key: self.values[(*key, name)] for key in keys})
             return
         if len(m.coefficient_table) != m.worlds:
             m.coefficient_table = np.tile(m.coefficient_table, (m.worlds, 1, 1))
         chosen = {(self._index(body), k) for body, k in members}
         for block in m.blocks:
-            mine = [part for part in block.parts if (self._index(part.body), part.material) in chosen]
+            mine = [part for part in block.host_blocks if (self._index(part.body), part.material) in chosen]
             for part in mine:
-                material = self.of_worlds(part.body, part.material)
-                _, values = assembly.law_of(part.key.integral, material)
-                m.coefficient_table[:, part.row] = assembly.coefficient_rows(values, material, m.worlds)
+                material = self.material_of_worlds(part.body, part.material)
+                _, values = assembly.law_and_coefficients(part.key.integral, material)
+                m.coefficient_table[:, part.coefficient_row] = assembly.coefficient_rows(values, material, m.worlds)
             tying = block.key.tying
             if mine and tying and name in tying.uses:
                 self._update_couplings(block, mask)
-            if mine and block.output:
-                block.output.data.coefficients = m.array("output", output_rows(m, block), m.types.T)
+            if mine and block.stress_output:
+                block.stress_output.data.coefficients = m.array("output", output_rows(m, block), m.types.T)
         if m.coefficients.shape[0] == m.worlds:
             m.coefficients.assign(m.coefficient_table)
             return
-        m.forget("materials", m.coefficients)
+        m.uncount_bytes("materials", m.coefficients)
         m.coefficients = m.array("materials", m.coefficient_table, m.types.T)
         for block in m.blocks:
             block.data.coefficients = m.coefficients
@@ -232,11 +234,11 @@ class MaterialParameters:
         """
         m, tying = self.model, block.key.tying
         assert tying is not None
-        first = not block.coupled
+        first = not block.couplings_per_world
         worlds = range(m.worlds) if first else np.flatnonzero(mask).tolist()
         table = self._couplings.get(block.contribution_offset)
         row = 0
-        for part in block.parts:
+        for part in block.host_blocks:
             owner = self._index(part.body), part.material
             own = {name: self.values[(*owner, name)] for name in tying.uses if (*owner, name) in self.values}
             numbers = [tuple(float(values[world]) for values in own.values()) for world in worlds]
@@ -255,12 +257,12 @@ class MaterialParameters:
         if not first:
             block.data.coupling.assign(np.ascontiguousarray(values))
             return
-        m.forget("elements", block.data.coupling)
+        m.uncount_bytes("elements", block.data.coupling)
         block.data.coupling = m.element_array(values, m.types.T)
-        block.take_couplings(m.dtype)
+        block.use_couplings_per_world(m.dtype)
 
     @contextmanager
-    def window(self, first: int, last: int) -> Iterator[None]:
+    def restricted_to_worlds(self, first: int, last: int) -> Iterator[None]:
         """Context: tables restricted to some worlds, for launches over them."""
         blocks = self.model.blocks if self.values else []
         kept: list[tuple[Block, Any, Any]]
@@ -269,13 +271,13 @@ class MaterialParameters:
             for block, coefficients, coupling in kept:
                 if coefficients.shape[0] == self.model.worlds:
                     block.data.coefficients = coefficients[first:last]
-                if block.coupled:
+                if block.couplings_per_world:
                     block.data.coupling = coupling[:, :, first * block.count : last * block.count]
             yield
         finally:
             for block, coefficients, coupling in kept:
                 block.data.coefficients = coefficients
-                if block.coupled:
+                if block.couplings_per_world:
                     block.data.coupling = coupling
 
     # checkpoints
@@ -304,9 +306,9 @@ class MaterialParameters:
 
     def load(self, saved: Mapping[str, np.ndarray]) -> None:
         """Restore the values of `numpy`."""
-        self.take({owner: saved[key] for owner, key in zip(list(self.values), self.numpy())})
+        self.copy_values({owner: saved[key] for owner, key in zip(list(self.values), self.numpy())})
 
-    def take(self, values: Mapping[tuple[int, int, str], np.ndarray]) -> None:
+    def copy_values(self, values: Mapping[tuple[int, int, str], np.ndarray]) -> None:
         """Copy `values` of the same model, or of one in another precision."""
         every = np.ones(self.model.worlds, dtype=bool)
         for (b, k, name), of_worlds in values.items():

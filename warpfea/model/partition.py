@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import scipy.sparse as sp
 
-__all__ = ["bisect", "connected_groups", "morton_order"]
+__all__ = ["bisect_groups", "connected_groups", "morton_order"]
 
 
-def bisect(places: np.ndarray, weights: np.ndarray, labels: np.ndarray, capacity: int) -> np.ndarray:
+def bisect_groups(places: np.ndarray, weights: np.ndarray, labels: np.ndarray, capacity: int) -> np.ndarray:
     """Group of each item: groups are compact, of one label, and of a total weight up to `capacity`.
 
     Groups are halved across their longest side until they fit; those of twice the capacity are unions of those of

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
-from .assembly import components_of
+from .assembly import connected_components
 
 __all__ = ["SlotGroups", "slot_groups"]
 
@@ -32,10 +32,10 @@ def slenderness(model: Any) -> np.ndarray:
     With x = sum_i s_i E_i the second moments of a part are E^T M E.
     """
     E, M = model.reference, model.mass_host
-    count = int(model.part.max()) + 1
+    count = int(model.mesh_component.max()) + 1
     rows = np.column_stack([np.ones(model.slots) * model.is_position_host, E])
     moments = np.zeros((count, 4, 4))
-    np.add.at(moments, model.part, rows[:, :, None] * (M @ rows)[:, None, :])
+    np.add.at(moments, model.mesh_component, rows[:, :, None] * (M @ rows)[:, None, :])
     mass, centre = moments[:, 0, 0], moments[:, 0, 1:] / moments[:, :1, 0]
     second = moments[:, 1:, 1:] / mass[:, None, None] - centre[:, :, None] * centre[:, None, :]
     least, _, largest = np.linalg.eigvalsh(second).T
@@ -50,10 +50,10 @@ def stiffness_pieces(model: Any) -> tuple[np.ndarray, np.ndarray]:
     between materials belongs to the stiffest, which dominates its forces; an element to its softest slot. Moduli are
     those of the model as built.
     """
-    parts = [host for block in model.blocks for host in block.parts]
+    parts = [host for block in model.blocks for host in block.host_blocks]
     first = np.concatenate([host.conn[:, 0] + host.body.slot_offset for host in parts])
     mu = np.concatenate([np.full(len(host.conn), host.body.materials[host.material][1].lame[1]) for host in parts])
-    of_element = stiffness_classes(mu * slenderness(model)[model.part[first]], model.component[first])
+    of_element = stiffness_classes(mu * slenderness(model)[model.mesh_component[first]], model.component[first])
     of_slot = np.zeros(model.slots, dtype=np.int64)
     connectivity = [block.connectivity for block in model.blocks]
     ends = np.cumsum([len(conn) for conn in connectivity])[:-1]
@@ -75,7 +75,7 @@ def connected_slots(sets: list[np.ndarray], slots: int) -> np.ndarray:
     slot = np.concatenate([rows.ravel() for rows in sets])
     row, slot = row[slot >= 0] + slots, slot[slot >= 0]
     n = slots + count[-1]
-    return components_of(sp.coo_matrix((np.ones(len(row)), (row, slot)), shape=(n, n)).tocsr())[:slots]
+    return connected_components(sp.coo_matrix((np.ones(len(row)), (row, slot)), shape=(n, n)).tocsr())[:slots]
 
 
 @dataclass(frozen=True)

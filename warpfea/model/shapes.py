@@ -88,7 +88,7 @@ class HalfSpace(Shape):
     kind: ClassVar[int] = HALF_SPACE
 
     def __post_init__(self) -> None:
-        set_checked(self, normal=_direction(self, "normal"), offset=_number(self, "offset"))
+        set_checked(self, normal=_unit_vector(self, "normal"), offset=_checked_number(self, "offset"))
 
     def frame(self) -> tuple[np.ndarray, np.ndarray]:
         """Point of the plane closest to the origin, and axes with the normal as third."""
@@ -130,7 +130,7 @@ class Sphere(Shape):
     kind: ClassVar[int] = SPHERE
 
     def __post_init__(self) -> None:
-        set_checked(self, center=_vector(self, "center"), radius=_positive(self, "radius"))
+        set_checked(self, center=_checked_vector(self, "center"), radius=_checked_positive(self, "radius"))
 
     def frame(self) -> tuple[np.ndarray, np.ndarray]:
         """Centre, and global axes."""
@@ -147,7 +147,7 @@ class Sphere(Shape):
     def mesh(self, resolution: int = 24) -> tuple[np.ndarray, np.ndarray]:
         """See Shape."""
         n = _segments(self, resolution)
-        return _revolved(self, _arc(-np.pi / 2, np.pi / 2, max(2, n // 2)) * self.radius, n)
+        return _surface_of_revolution(self, _unit_arc(-np.pi / 2, np.pi / 2, max(2, n // 2)) * self.radius, n)
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,10 +170,10 @@ class Box(Shape):
     kind: ClassVar[int] = BOX
 
     def __post_init__(self) -> None:
-        set_checked(self, center=_vector(self, "center"), size=_vector(self, "size"))
+        set_checked(self, center=_checked_vector(self, "center"), size=_checked_vector(self, "size"))
         if not np.all(self.size > 0.0):
             raise ModelError(f"Box: size = {self.size.tolist()} must be three positive lengths of edges, m")
-        set_checked(self, axes=_rows(self, "axes"))
+        set_checked(self, axes=_checked_axes(self, "axes"))
 
     def frame(self) -> tuple[np.ndarray, np.ndarray]:
         """The centre, and the directions of the edges as columns."""
@@ -196,7 +196,7 @@ class Box(Shape):
 
 
 @dataclass(frozen=True, eq=False)
-class _Round(Shape):
+class _AxisShape(Shape):
     """Common parts of capsules and cylinders: axis from start to end, and radius."""
 
     start: Any
@@ -204,10 +204,15 @@ class _Round(Shape):
     radius: float
 
     def __post_init__(self) -> None:
-        set_checked(self, start=_vector(self, "start"), end=_vector(self, "end"), radius=_positive(self, "radius"))
+        set_checked(
+            self,
+            start=_checked_vector(self, "start"),
+            end=_checked_vector(self, "end"),
+            radius=_checked_positive(self, "radius"),
+        )
         if not np.linalg.norm(self.end - self.start) > 0.0:
             raise ModelError(
-                f"{_name(self)}: end = {self.end.tolist()} is the start; the two ends of the axis must be apart"
+                f"{_shape_name(self)}: end = {self.end.tolist()} is the start; the two ends of the axis must be apart"
             )
 
     def frame(self) -> tuple[np.ndarray, np.ndarray]:
@@ -225,7 +230,7 @@ class _Round(Shape):
 
 
 @dataclass(frozen=True, eq=False)
-class Capsule(_Round):
+class Capsule(_AxisShape):
     """Cylinder with hemispherical ends: all points within `radius` of the segment from start to end.
 
     Args:
@@ -243,12 +248,12 @@ class Capsule(_Round):
         n = _segments(self, resolution)
         radius, half, _ = self.sizes
         quarter = max(1, n // 4)
-        low, high = (radius * _arc(*span, quarter) for span in ((-np.pi / 2, 0.0), (0.0, np.pi / 2)))
-        return _revolved(self, np.concatenate([low - (0.0, half), high + (0.0, half)]), n)
+        low, high = (radius * _unit_arc(*span, quarter) for span in ((-np.pi / 2, 0.0), (0.0, np.pi / 2)))
+        return _surface_of_revolution(self, np.concatenate([low - (0.0, half), high + (0.0, half)]), n)
 
 
 @dataclass(frozen=True, eq=False)
-class Cylinder(_Round):
+class Cylinder(_AxisShape):
     """A cylinder with flat ends.
 
     Args:
@@ -265,13 +270,13 @@ class Cylinder(_Round):
         """See Shape."""
         radius, half, _ = self.sizes
         profile = np.array([(0.0, -half), (radius, -half), (radius, half), (0.0, half)])
-        return _revolved(self, profile, _segments(self, resolution))
+        return _surface_of_revolution(self, profile, _segments(self, resolution))
 
 
 # checks; each returns the stored value
 
 
-def _name(shape: Shape) -> str:
+def _shape_name(shape: Shape) -> str:
     return type(shape).__name__
 
 
@@ -283,7 +288,7 @@ def set_checked(shape: Shape, **values: Any) -> None:
         object.__setattr__(shape, name, value)
 
 
-def _array(shape: Shape, name: str, size: tuple[int, ...], wanted: str) -> np.ndarray:
+def _checked_array(shape: Shape, name: str, size: tuple[int, ...], wanted: str) -> np.ndarray:
     value = getattr(shape, name)
     try:
         out = np.array(value, dtype=float)
@@ -291,50 +296,50 @@ def _array(shape: Shape, name: str, size: tuple[int, ...], wanted: str) -> np.nd
         out = np.full(1, np.nan)
     if out.shape != size or not np.all(np.isfinite(out)):
         shown = value.tolist() if isinstance(value, np.ndarray) else value
-        raise ModelError(f"{_name(shape)}: {name} = {shown!r} must be {wanted}")
+        raise ModelError(f"{_shape_name(shape)}: {name} = {shown!r} must be {wanted}")
     return out
 
 
-def _vector(shape: Shape, name: str) -> np.ndarray:
-    return _array(shape, name, (3,), "three finite numbers, m")
+def _checked_vector(shape: Shape, name: str) -> np.ndarray:
+    return _checked_array(shape, name, (3,), "three finite numbers, m")
 
 
-def _direction(shape: Shape, name: str) -> np.ndarray:
-    out = _array(shape, name, (3,), "three finite numbers that are not all zero")
+def _unit_vector(shape: Shape, name: str) -> np.ndarray:
+    out = _checked_array(shape, name, (3,), "three finite numbers that are not all zero")
     length = np.linalg.norm(out)
     if not length > 0.0:
-        raise ModelError(f"{_name(shape)}: {name} = {out.tolist()} is zero; give the outward normal")
+        raise ModelError(f"{_shape_name(shape)}: {name} = {out.tolist()} is zero; give the outward normal")
     return out / length
 
 
-def _rows(shape: Shape, name: str) -> np.ndarray:
+def _checked_axes(shape: Shape, name: str) -> np.ndarray:
     if getattr(shape, name) is None:
         return np.eye(3)
     wanted = "(3, 3) rows that are orthonormal and right-handed, the directions of the edges"
-    out = _array(shape, name, (3, 3), wanted)
+    out = _checked_array(shape, name, (3, 3), wanted)
     if np.abs(out @ out.T - np.eye(3)).max() > ORTHONORMAL or np.linalg.det(out) < 0.0:
-        raise ModelError(f"{_name(shape)}: {name} = {out.tolist()} must be {wanted}")
+        raise ModelError(f"{_shape_name(shape)}: {name} = {out.tolist()} must be {wanted}")
     u, _, v = np.linalg.svd(out)
     return u @ v
 
 
-def _number(shape: Shape, name: str) -> float:
+def _checked_number(shape: Shape, name: str) -> float:
     value = getattr(shape, name)
     if not is_number(value):
-        raise ModelError(f"{_name(shape)}: {name} = {value!r} must be a finite number, m")
+        raise ModelError(f"{_shape_name(shape)}: {name} = {value!r} must be a finite number, m")
     return float(value)
 
 
-def _positive(shape: Shape, name: str) -> float:
+def _checked_positive(shape: Shape, name: str) -> float:
     value = getattr(shape, name)
     if not is_number(value) or value <= 0.0:
-        raise ModelError(f"{_name(shape)}: {name} = {value!r} must be a positive finite number, m")
+        raise ModelError(f"{_shape_name(shape)}: {name} = {value!r} must be a positive finite number, m")
     return float(value)
 
 
 def _segments(shape: Shape, resolution: Any) -> int:
     if not is_count(resolution) or resolution < 3:
-        raise ModelError(f"{_name(shape)}: resolution = {resolution!r} must be a whole number of at least 3")
+        raise ModelError(f"{_shape_name(shape)}: resolution = {resolution!r} must be a whole number of at least 3")
     return int(resolution)
 
 
@@ -349,7 +354,7 @@ def _axes_along(n: np.ndarray) -> np.ndarray:
     return np.column_stack([first, np.cross(n, first), n])
 
 
-def _arc(start: float, end: float, parts: int) -> np.ndarray:
+def _unit_arc(start: float, end: float, parts: int) -> np.ndarray:
     """(parts + 1, 2) distance from the axis, and height, on a unit circle, from low to high."""
     angle = np.linspace(start, end, parts + 1)
     distance = np.cos(angle)
@@ -357,7 +362,7 @@ def _arc(start: float, end: float, parts: int) -> np.ndarray:
     return np.column_stack([distance, np.sin(angle)])
 
 
-def _revolved(shape: Shape, profile: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
+def _surface_of_revolution(shape: Shape, profile: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
     """Surface of revolution of a profile (k, 2) of radii and heights about the local z axis; its ends lie on the
     axis.
     """

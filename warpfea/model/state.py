@@ -20,11 +20,11 @@ from ..kernels.common.state import state_kernels
 if TYPE_CHECKING:
     from ..base.launch import Launcher
 
-__all__ = ["ArraySpec", "State", "words_of"]
+__all__ = ["ArraySpec", "State", "view_as_words"]
 
-SOLVER_MEMORY = ("preconditioner", "operator", "predictor", "summed")
+SOLVER_HISTORY_PREFIXES = ("preconditioner", "operator", "predictor", "summed")
 """Name prefixes of optional state arrays (solver history, summed time)."""
-WATCH_ARRAYS = ("energy_growth",)
+MONITOR_ARRAYS = ("energy_growth",)
 """Monitor arrays, optional in a checkpoint."""
 
 
@@ -59,7 +59,7 @@ class State:
         self._arrays: dict[str, wp.array] = {}
         self._words: dict[str, wp.array] = {}
         self.sealed = False
-        self.asked: list[str] = []  # names in the order of `register`
+        self.requested_names: list[str] = []  # names in the order of `register`
 
     def __repr__(self) -> str:
         worlds = f"{self.worlds} world{'s' * (self.worlds != 1)}"
@@ -78,7 +78,7 @@ class State:
             ModelError: an existing array of another kind, or rows that are not a multiple of 4 bytes.
         """
         spec = ArraySpec(name, dtype, tuple(shape), initial)
-        self.asked.append(name)
+        self.requested_names.append(name)
         if name in self.specs:
             old = self.specs[name]
             if (old.dtype, old.shape) != (spec.dtype, spec.shape):
@@ -134,7 +134,7 @@ class State:
     def words(self, name: str) -> wp.array:
         """Array viewed as [world, 32-bit word]."""
         if name not in self._words:
-            self._words[name] = words_of(self._arrays[name])
+            self._words[name] = view_as_words(self._arrays[name])
         return self._words[name]
 
     def numpy(self) -> dict[str, np.ndarray]:
@@ -149,7 +149,7 @@ class State:
             CheckpointError: a missing name or another shape; nothing is set then.
         """
         own, given = (
-            {name for name in names if not (is_solver_memory(name) or name in WATCH_ARRAYS)}
+            {name for name in names if not (is_solver_history(name) or name in MONITOR_ARRAYS)}
             for names in (self._arrays, values)
         )
         if own != given:
@@ -158,8 +158,8 @@ class State:
                 "with the integrator, the ledger and the constraints that it was made with"
             )
         host = {name: array.numpy() for name, array in self._arrays.items()}
-        memory = [name for name in host if is_solver_memory(name)]
-        for group in (memory, *([name] for name in WATCH_ARRAYS if name in host)):
+        memory = [name for name in host if is_solver_history(name)]
+        for group in (memory, *([name] for name in MONITOR_ARRAYS if name in host)):
             if any(name not in values or values[name].shape != host[name].shape for name in group):
                 fresh = {name: np.full_like(host[name], self.specs[name].initial) for name in group}
                 values = values | fresh
@@ -174,12 +174,12 @@ class State:
             array.assign(values[name])
 
 
-def is_solver_memory(name: str) -> bool:
+def is_solver_history(name: str) -> bool:
     """True for arrays of solver history."""
-    return name.partition("_")[0] in SOLVER_MEMORY
+    return name.partition("_")[0] in SOLVER_HISTORY_PREFIXES
 
 
-def words_of(array: wp.array) -> wp.array:
+def view_as_words(array: wp.array) -> wp.array:
     """Array viewed as [world, 32-bit word]."""
     size = array.size * wp.types.type_size_in_bytes(array.dtype) // 4
     out: Any = wp.array(

@@ -106,7 +106,7 @@ def select_faces(body: Discretisation, selection: Any) -> np.ndarray:
 def face_centroids(body: Discretisation, faces: np.ndarray) -> np.ndarray:
     """(K, 3) reference point in the middle of each face, m."""
     out = np.empty((len(faces), 3))
-    for face, rows in _by_face(faces):
+    for face, rows in _rows_by_local_face(faces):
         middle = np.full((1, 2), 1.0 / 3.0 if len(body.family.faces[face]) == 3 else 0.5)
         xi, _ = body.family.face_points(face, middle)
         s, _ = element_functions(body, faces[rows, 0], xi)
@@ -115,11 +115,11 @@ def face_centroids(body: Discretisation, faces: np.ndarray) -> np.ndarray:
     return out
 
 
-def _by_face(faces: np.ndarray) -> list[tuple[int, np.ndarray]]:
+def _rows_by_local_face(faces: np.ndarray) -> list[tuple[int, np.ndarray]]:
     return [(int(k), np.flatnonzero(faces[:, 1] == k)) for k in np.unique(faces[:, 1])]
 
 
-def _cut(corners: int, parts: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+def _subdivide(corners: int, parts: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     """Points (P, 2) of the unit triangle or square cut into parts, and the triangles (T, 3) over them."""
     na, nb = parts
     if corners == 4:
@@ -146,8 +146,8 @@ class _PointMerger:
         low, high = body.mesh.bounding_box()
         size = float(np.max(high - low)) or 1.0
         hashes = np.random.default_rng(0).integers(1, 2**62, body.slot_count, dtype=np.int64)
-        self._hash = hashes.astype(np.uint64)
-        self._unit = np.where(body.slot_kind > 0, size, 1.0)
+        self._slot_hashes = hashes.astype(np.uint64)
+        self._slot_scale = np.where(body.slot_kind > 0, size, 1.0)
         self._parts: list[tuple[np.ndarray, ...]] = []
         self._keys: list[np.ndarray] = []
         self.count = 0
@@ -163,8 +163,8 @@ class _PointMerger:
         E, P, S = len(elements), len(xi), conn.shape[1]
         w = np.broadcast_to(s, (E, P, S))
         slots = np.broadcast_to(conn[:, None, :], (E, P, S))
-        rounded = np.round(w / self._unit[slots] * 1e6).astype(np.int64).astype(np.uint64)
-        key = (rounded * self._hash[slots]).sum(axis=2, dtype=np.uint64) + np.uint64(label << 56)
+        rounded = np.round(w / self._slot_scale[slots] * 1e6).astype(np.int64).astype(np.uint64)
+        key = (rounded * self._slot_hashes[slots]).sum(axis=2, dtype=np.uint64) + np.uint64(label << 56)
         samples = body.family.sample_weights(xi)
         k = body.family.node_samples.shape[1]
         at = (body.mesh.cells[elements][:, :, None] * k + np.arange(k)).reshape(E, 1, -1)
@@ -191,12 +191,12 @@ class _PointMerger:
         nodes = len(self.body.mesh.points) * self.body.family.node_samples.shape[1]
         return (
             rank[inverse.ravel()],
-            _sparse(w, slots, self.body.slot_count),
-            _sparse(samples, at, nodes),
+            _sparse_weights(w, slots, self.body.slot_count),
+            _sparse_weights(samples, at, nodes),
         )
 
 
-def _sparse(values: np.ndarray, columns: np.ndarray, width: int) -> sp.csr_matrix:
+def _sparse_weights(values: np.ndarray, columns: np.ndarray, width: int) -> sp.csr_matrix:
     values = np.where(np.abs(values) < 1e-14, 0.0, values)
     rows = np.repeat(np.arange(len(values)), values.shape[1])
     out = sp.csr_matrix((values.ravel(), (rows, columns.ravel())), shape=(len(values), width))
@@ -208,9 +208,9 @@ def make_skin(body: Discretisation) -> Skin:
     """Outer faces as triangles; faces of beams and shells share no points, for sharp edges."""
     points = _PointMerger(body)
     triangles = []
-    for face, rows in _by_face(body.boundary):
+    for face, rows in _rows_by_local_face(body.boundary):
         corners = body.family.faces[face]
-        ab, cut = _cut(len(corners), body.family.divisions[face])
+        ab, cut = _subdivide(len(corners), body.family.divisions[face])
         xi, _ = body.family.face_points(face, ab)
         number = points.add(body.boundary[rows, 0], xi, 0 if body.family.solid else face + 1)
         triangles.append(number[:, cut].reshape(-1, 3))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..materials import Material
-from .assembly import HostBlock, chunks, geometry, gradients, orthonormal
+from .assembly import HostBlock, element_chunks, orthonormal, shape_and_jacobian, shape_gradients
 
 __all__ = ["TiedTables", "couplings", "tied_tables"]
 
@@ -35,11 +35,11 @@ def tied_tables(host: HostBlock, elements: np.ndarray) -> TiedTables:
     part, body = host.key.integral, host.body
     tying = part.tying
     assert tying is not None
-    _, ds, J, _ = geometry(body, elements, tying.points)
+    _, ds, J, _ = shape_and_jacobian(body, elements, tying.points)
     along = J
     if part.framed:
         along = orthonormal(J)
-        ds = gradients(ds, J) @ along
+        ds = shape_gradients(ds, J) @ along
     t = np.arange(len(tying.points))
     a, b = tying.pairs.T
     coupling = _coupling(host, elements, J, [body.materials[host.material][1]])[0]
@@ -52,8 +52,8 @@ def couplings(host: HostBlock, materials: Sequence[Material]) -> np.ndarray:
     """(materials, E, n, width) A of the tied elements of a block for other materials."""
     tying, rule = host.key.tying, host.key.rule
     assert tying is not None
-    members = chunks(host.body, host.elements, len(rule.weights))
-    tables = [_coupling(host, e, geometry(host.body, e, tying.points)[2], materials) for e in members]
+    members = element_chunks(host.body, host.elements, len(rule.weights))
+    tables = [_coupling(host, e, shape_and_jacobian(host.body, e, tying.points)[2], materials) for e in members]
     return np.concatenate(tables, axis=1)
 
 
@@ -61,5 +61,5 @@ def _coupling(host: HostBlock, elements: np.ndarray, J: np.ndarray, materials: S
     part, body = host.key.integral, host.body
     tying = part.tying
     assert tying is not None
-    _, _, J_rule, det = geometry(body, elements, part.rule.points)
+    _, _, J_rule, det = shape_and_jacobian(body, elements, part.rule.points)
     return np.stack([tying.coupling(J, J_rule, det, part.rule, material, body.section) for material in materials])

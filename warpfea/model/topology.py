@@ -13,7 +13,7 @@ from ..kernels.common.structs import topology_struct
 from ..kernels.solvers.pcg import free_groups_struct
 from . import assembly
 
-__all__ = ["check_static_supports", "free_groups", "label_components", "make_topology"]
+__all__ = ["check_static_supports", "label_components", "make_free_groups", "make_topology"]
 
 
 def make_topology(model: Any) -> Any:
@@ -33,17 +33,17 @@ def make_topology(model: Any) -> Any:
 
 def label_components(graph: sp.csr_matrix, groups: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Connected component of each slot: by elements alone, and with constraints, given as `groups` of slots."""
-    part = assembly.components_of(graph)
+    part = assembly.connected_components(graph)
     if not groups:
         return part, part
     ties = sp.lil_matrix((part.max() + 1, part.max() + 1))
     for slots in groups:
         parts = np.unique(part[slots])
         ties[parts[0], parts] = 1.0
-    return part, assembly.components_of(ties.tocsr())[part]
+    return part, assembly.connected_components(ties.tocsr())[part]
 
 
-def free_groups(model: Any) -> tuple[Any, int]:
+def make_free_groups(model: Any) -> tuple[Any, int]:
     """Components with an unconstrained translation, on the device, and their number (DESIGN 5).
 
     Only the mass resists their translations: each solve is corrected for them, so that momentum is conserved.
@@ -68,7 +68,7 @@ def free_groups(model: Any) -> tuple[Any, int]:
     groups.group_of_slot = model.array("groups", of_slot, wp.int32)
     groups.is_position, groups.lumped_mass = model.is_position, model.masses.lumped_values
     model.cache["free groups"] = of_slot, slots, len(keep)
-    groups.mass = model.array("groups", model.masses.of_groups(*model.cache["free groups"]), model.types.T)
+    groups.mass = model.array("groups", model.masses.group_masses(*model.cache["free groups"]), model.types.T)
     groups.free_directions = model.array("groups", free[keep], model.types.vec3)
     return groups, len(keep)
 
@@ -80,7 +80,7 @@ def check_static_supports(model: Any) -> None:
     held_by = "hold what rests on contact with solve_static(stabilise=True), " if touches else ""
     for label in range(model.component_count):
         slots = np.flatnonzero(model.component == label)
-        parts, part = np.unique(model.part[slots], return_inverse=True)
+        parts, part = np.unique(model.mesh_component[slots], return_inverse=True)
         motions = np.zeros((len(parts), 6, len(slots), 3))
         for k in range(len(parts)):
             own = np.flatnonzero(part == k)
@@ -109,13 +109,13 @@ def check_static_supports(model: Any) -> None:
             first = loose[0]
             body = next(b for b in model.bodies if b.slot_offset <= first < b.slot_offset + b.slot_count)
             raise ModelError(
-                f"{_piece(body, loose)} has {free} unconstrained rigid-body mode{'s' * (free > 1)}: no unique static "
-                f"equilibrium (gravity does not count as a support): clamp or drive more nodes, {held_by}or let a "
-                "damped dynamic run come to rest"
+                f"{_piece_text(body, loose)} has {free} unconstrained rigid-body mode{'s' * (free > 1)}: no unique "
+                f"static equilibrium (gravity does not count as a support): clamp or drive more nodes, {held_by}or "
+                "let a damped dynamic run come to rest"
             )
 
 
-def _piece(body: Any, slots: np.ndarray) -> str:
+def _piece_text(body: Any, slots: np.ndarray) -> str:
     """Text of a body, or of a disconnected piece of it, with these model slots."""
     inside = np.zeros(body.slot_count, dtype=bool)
     inside[slots - body.slot_offset] = True

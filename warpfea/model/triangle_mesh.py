@@ -19,11 +19,11 @@ __all__ = ["TriMesh", "TriangleTables"]
 
 MIN_HEIGHT_RATIO = 1e-10
 """Minimum height of a triangle over its longest edge."""
-FLAT_COSINE = 1e-12
+MAX_FLAT_SINE = 1e-12
 """Sine of the angle up to which triangles count as coplanar."""
-FOLD_COSINE = 1e-6
+MIN_FOLD_NORMAL_SUM = 1e-6
 """Minimum length of the sum of the normals at an edge."""
-LEAF_TRIANGLES = 4
+MAX_LEAF_TRIANGLES = 4
 """Maximum triangles per leaf."""
 
 
@@ -108,7 +108,7 @@ class TriMesh(Shape):
         """(3,) diagonal of the bounding box, thickness 2 V/A (of a sheet the diagonal), m, and 1 if closed."""
         used = self.points[self.triangles.ravel()]
         size = float(np.linalg.norm(used.max(axis=0) - used.min(axis=0)))
-        area = 0.5 * float(np.linalg.norm(self._cross, axis=1).sum())
+        area = 0.5 * float(np.linalg.norm(self._double_area_normals, axis=1).sum())
         return np.array([size, 2.0 * self.volume / area if self.closed else size, float(self.closed)])
 
     @property
@@ -136,13 +136,13 @@ class TriMesh(Shape):
         return self.points[self.triangles] - self.frame()[0]
 
     @property
-    def _cross(self) -> np.ndarray:
+    def _double_area_normals(self) -> np.ndarray:
         """(m, 3) normals of length 2 x area, m^2."""
         p = self._corners
         return np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
 
     @cached_property
-    def _welded(self) -> np.ndarray:
+    def _merged_triangles(self) -> np.ndarray:
         """(m, 3) triangles by merged point indices."""
         _, number = np.unique(self.points, axis=0, return_inverse=True)
         return number.reshape(-1)[self.triangles]
@@ -150,7 +150,7 @@ class TriMesh(Shape):
     @cached_property
     def _neighbours(self) -> np.ndarray:
         """(m, 3) neighbour across each edge ab, bc, ca, or -1. ModelError names an invalid edge."""
-        t = self._welded
+        t = self._merged_triangles
         start, end = t.ravel(), np.roll(t, -1, axis=1).ravel()
         low, high = np.minimum(start, end), np.maximum(start, end)
         order = np.lexsort((high, low))
@@ -158,23 +158,23 @@ class TriMesh(Shape):
         same = (low[1:] == low[:-1]) & (high[1:] == high[:-1])
         for k in np.flatnonzero(same[1:] & same[:-1])[:1]:
             found = ", ".join(str(int(e) // 3) for e in order[k : k + 3])
-            raise ModelError(f"TriMesh: {self._edge(order[k])} has more than two triangles ({found}, ...)")
+            raise ModelError(f"TriMesh: {self._edge_text(order[k])} has more than two triangles ({found}, ...)")
         one, other = order[:-1][same], order[1:][same]
         for k in np.flatnonzero(start[one] == start[other])[:1]:
             raise ModelError(
                 f"TriMesh: inconsistent orientation of triangles {one[k] // 3} and {other[k] // 3} at "
-                f"{self._edge(one[k])}: flip one"
+                f"{self._edge_text(one[k])}: flip one"
             )
-        normal = self._cross / np.linalg.norm(self._cross, axis=1, keepdims=True)
-        folded = np.linalg.norm(normal[one // 3] + normal[other // 3], axis=1) < FOLD_COSINE
+        normal = self._double_area_normals / np.linalg.norm(self._double_area_normals, axis=1, keepdims=True)
+        folded = np.linalg.norm(normal[one // 3] + normal[other // 3], axis=1) < MIN_FOLD_NORMAL_SUM
         for k in np.flatnonzero(folded)[:1]:
             raise ModelError(f"TriMesh: coincident triangles {one[k] // 3} and {other[k] // 3} at "
-                             f"{self._edge(one[k])}: the surface folds back on itself")  # fmt: skip
+                             f"{self._edge_text(one[k])}: the surface folds back on itself")  # fmt: skip
         out = np.full(t.size, -1)
         out[one], out[other] = other // 3, one // 3
         return out.reshape(-1, 3)
 
-    def _edge(self, number: int) -> str:
+    def _edge_text(self, number: int) -> str:
         """Text of an edge (3 x triangle + edge): the points at its ends."""
         triangle, k = divmod(int(number), 3)
         a, b = self.triangles[triangle, [k, (k + 1) % 3]]
@@ -183,15 +183,15 @@ class TriMesh(Shape):
     @cached_property
     def tables(self) -> TriangleTables:
         """Contact search tables."""
-        normal, border = self._parts()
-        order, start, low, high = tree(self._corners)
+        normal, border = self._feature_normals()
+        order, start, low, high = build_bvh(self._corners)
         corner = np.moveaxis(self._corners[order], 1, 0)
         return TriangleTables(low, high, start, corner, normal[:, order], border[:, order])
 
-    def _parts(self) -> tuple[np.ndarray, np.ndarray]:
+    def _feature_normals(self) -> tuple[np.ndarray, np.ndarray]:
         """Unit normals (7, m, 3), of edges and corners by the angles of their faces, and kinds of border (7, m)."""
-        face = self._cross / np.linalg.norm(self._cross, axis=1, keepdims=True)
-        beyond, t, p = self._neighbours, self._welded, self._corners
+        face = self._double_area_normals / np.linalg.norm(self._double_area_normals, axis=1, keepdims=True)
+        beyond, t, p = self._neighbours, self._merged_triangles, self._corners
         normal, border = np.repeat(face[None], 7, axis=0), np.full((7, len(face)), FLAT)
         places = int(t.max()) + 1
         first = np.zeros((places, 3))
@@ -201,11 +201,11 @@ class TriMesh(Shape):
             out, back = p[:, (k + 1) % 3] - p[:, k], p[:, (k + 2) % 3] - p[:, k]
             angle = np.arctan2(np.linalg.norm(np.cross(out, back), axis=1), np.einsum("ij,ij->i", out, back))
             np.add.at(total, t[:, k], angle[:, None] * face)
-            bent[t[np.linalg.norm(face - first[t[:, k]], axis=1) > FLAT_COSINE, k]] = True
+            bent[t[np.linalg.norm(face - first[t[:, k]], axis=1) > MAX_FLAT_SINE, k]] = True
             alone = beyond[:, k] < 0
             rim[t[alone][:, [k, (k + 1) % 3]].ravel()] = True
             other = np.where(alone[:, None], face, face[beyond[:, k]])
-            sharp = np.linalg.norm(face - other, axis=1) > FLAT_COSINE
+            sharp = np.linalg.norm(face - other, axis=1) > MAX_FLAT_SINE
             mean = 0.5 * (face + other)
             normal[1 + k] = np.where(sharp[:, None], mean / np.linalg.norm(mean, axis=1, keepdims=True), face)
             border[1 + k] = np.where(alone, BOUNDARY, np.where(sharp, SHARP, FLAT))
@@ -218,7 +218,7 @@ class TriMesh(Shape):
         return normal, border
 
 
-def tree(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def build_bvh(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Balanced bounding volume hierarchy: order of the triangles, start of leaves, low and high corners of boxes.
 
     Each box is split at the median triangle centre along the longest axis.
@@ -227,7 +227,7 @@ def tree(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nd
         corners: (m, 3, 3) m.
     """
     count = len(corners)
-    levels = max(0, int(np.ceil(np.log2(count / LEAF_TRIANGLES))))
+    levels = max(0, int(np.ceil(np.log2(count / MAX_LEAF_TRIANGLES))))
     middle, order = corners.mean(axis=1), np.arange(count)
     for level in range(levels):
         start = np.arange((1 << level) + 1) * count >> level

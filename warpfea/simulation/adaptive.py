@@ -12,7 +12,7 @@ import warp as wp
 from ..base.checks import is_number, number_hint
 from ..base.errors import ModelError
 from ..kernels.step.adaptive import CONTROL_STATE, STEP_STATISTICS, adaptive_kernels, adaptive_struct
-from ..solvers.newton import EPS, NewtonPCG
+from ..solvers.newton import MACHINE_EPSILON, NewtonPCG
 from .integrators import INTEGRATORS, Integrator
 from .sync_times import SyncTimes
 
@@ -24,9 +24,9 @@ __all__ = ["AdaptiveOptions", "StepSizeControl", "adaptive_options", "algebraic_
 
 MIN_ERROR = {"float64": 1e-9, "float32": 1e-5}
 """Smallest admissible error over the model's size; below it round-off is significant."""
-ALGEBRAIC_FRACTION = 0.1
+MAX_ALGEBRAIC_FRACTION = 0.1
 """Largest default tolerance of Newton's method, over the requested error."""
-FIRST_STEP = 0.125
+FIRST_STEP_RATIO = 0.125
 """First substep over horizon error^(1/order)."""
 
 
@@ -70,8 +70,8 @@ def adaptive_options(
         value = given[name]
         if value is not None and not (is_number(value) and value > 0.0):
             raise ModelError(f"{name} = {value!r} must be a positive finite time (s)")
-    if scheme.estimate is None:
-        able = [name for name, known in INTEGRATORS.items() if known.estimate is not None]
+    if scheme.error_weights is None:
+        able = [name for name, known in INTEGRATORS.items() if known.error_weights is not None]
         raise ModelError(
             f"dt = 'auto': integrator {scheme.name!r} has no estimate of its error; there are {', '.join(able)}"
         )
@@ -93,10 +93,10 @@ def algebraic_tolerance(solver: Any, options: AdaptiveOptions | None, dtype: str
     """
     if options is None or solver.tol is not None:
         return solver
-    return replace(solver, tol=min(solver.tolerance(dtype), ALGEBRAIC_FRACTION * options.error))
+    return replace(solver, tol=min(solver.tolerance(dtype), MAX_ALGEBRAIC_FRACTION * options.error))
 
 
-def _lever_arms(model: Model) -> np.ndarray:
+def _displacement_factors(model: Model) -> np.ndarray:
     """Lever arm (slots,), m, that converts an unknown to displacement: 1 for positions, half the section for gradients
     across beams and shells, 0 for gradients whose motion the adjacent positions represent."""
     out = model.is_position_host.astype(float)
@@ -126,13 +126,13 @@ class StepSizeControl:
         self.sync_times = SyncTimes(model.terms.time_laws.laws, options.interval, options.horizon)
         self.kernels = adaptive_kernels(model.dtype, scheme)
         self.dim = (model.worlds, model.slots)
-        self.arm = model.array("adaptive", _lever_arms(model), model.types.T)
+        self.displacement_factor = model.array("adaptive", _displacement_factors(model), model.types.T)
         shapes = {"statistics": (model.worlds, len(STEP_STATISTICS)), "horizon": (1,), "first_substep": (1,)}
         self.control: Any = work.struct(adaptive_struct(), model.worlds, skip=("control_state",), **shapes)
         self.control.control_state = ctx.state.register("adaptive", wp.float64, (len(CONTROL_STATE),))
-        self.means = ctx.state.register("adaptive_means", model.types.vec3, (model.slots,))
+        self.mean_rates = ctx.state.register("adaptive_means", model.types.vec3, (model.slots,))
         self.control.tolerance = options.error * float(model.size)
-        self.control.eps = EPS[model.dtype]
+        self.control.eps = MACHINE_EPSILON[model.dtype]
         self.control.max_retries = max_tries
 
     def set_interval(self, time: np.ndarray) -> None:
@@ -141,7 +141,7 @@ class StepSizeControl:
         if not sync_times.is_set:
             sync_times.set_defaults(float(time.min()))
         self.control.horizon.fill_(sync_times.horizon)
-        self.control.first_substep.fill_(FIRST_STEP * sync_times.horizon * self.error ** (1.0 / self.order))
+        self.control.first_substep.fill_(FIRST_STEP_RATIO * sync_times.horizon * self.error ** (1.0 / self.order))
         self.work.step.dt.assign(sync_times.time_to_next(time))
 
     def count_steps(self, now: float, end: float, outputs: Iterable[Any]) -> int:
@@ -151,7 +151,7 @@ class StepSizeControl:
         self.sync_times.add_outputs(outputs)
         if end > now:
             self.sync_times.begin_run(now, end)
-        return self.sync_times.count(now, end) if end > now else 0
+        return self.sync_times.count_between(now, end) if end > now else 0
 
     def begin_interval(self) -> None:
         """Set the substep size from the state, after the kernel `begin_step`."""
@@ -162,7 +162,17 @@ class StepSizeControl:
         `end_attempt`)."""
         m, w, k, ctl, launch = self.model, self.work, self.kernels, self.control, self.launch
         launch(k.begin_estimate, m.worlds, [w.step, w.newton, ctl])
-        args = [w.step, ctl, self.arm, m.topology.free, w.u, w.v, self.velocity, self.v_before, self.means]
+        args = [
+            w.step,
+            ctl,
+            self.displacement_factor,
+            m.topology.free,
+            w.u,
+            w.v,
+            self.velocity,
+            self.v_before,
+            self.mean_rates,
+        ]
         launch(k.max_error_rates, self.dim, args)
         launch(k.control_step_size, m.worlds, [w.step, w.newton, w.pcg, ctl])
 
@@ -172,7 +182,7 @@ class StepSizeControl:
         launch(
             self.kernels.update_mean_rates,
             self.dim,
-            [w.step, self.control, w.v, self.velocity, self.v_before, self.means],
+            [w.step, self.control, w.v, self.velocity, self.v_before, self.mean_rates],
         )
         launch(self.kernels.refine_substeps, self.model.worlds, [w.step, self.control])
 
@@ -180,12 +190,12 @@ class StepSizeControl:
         """Finish the interval before the report."""
         self.launch(self.kernels.report_pcg_iterations, self.model.worlds, [self.work.pcg, self.control])
 
-    def least_error(self, world: int) -> float:
+    def smallest_resolved_error(self, world: int) -> float:
         """Smallest tolerance, over the model's size, that round-off lets the estimates meet; 0 if they meet theirs."""
         round_off_ratio = float(self.control.round_off_ratio.numpy()[world])
         return round_off_ratio * self.error if round_off_ratio > 1.0 else 0.0
 
-    def counts(self) -> dict[str, np.ndarray]:
+    def step_statistics(self) -> dict[str, np.ndarray]:
         """Counts of the last step, each (B,), see STEP_STATISTICS."""
         rows = self.control.statistics.numpy()
         return {name: rows[:, k].astype(int if k < 2 else float) for k, name in enumerate(STEP_STATISTICS)}

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 __all__ = ["check_capacity", "free_bytes"]
 
-SLOT_VECTORS_BOUND = 3000
+MAX_SCRATCH_VECTORS_PER_SLOT = 3000
 """Upper bound of scratch vectors per slot (pendulums 200 to 600, solids of T10 300, piles of bodies 2000)."""
 RESERVED_FRACTION = 0.02
 """Memory fraction reserved for uncounted allocations (code, graphs, pools)."""
@@ -53,14 +53,14 @@ def check_capacity(model: Model, make: Callable[[Model, State], Stepper]) -> Non
     """
     free = free_bytes(model.device)
     item = 3 * wp.types.type_size_in_bytes(model.types.T)
-    if free is None or model.worlds <= 2 or model.worlds * model.slots * SLOT_VECTORS_BOUND * item < free:
+    if free is None or model.worlds <= 2 or model.worlds * model.slots * MAX_SCRATCH_VECTORS_PER_SLOT * item < free:
         return
-    small = ByteCounts(*(_arrays(model, worlds, make) for worlds in (1, 2)))
+    small = ByteCounts(*(_array_bytes(model, worlds, make) for worlds in (1, 2)))
     room = int((1.0 - RESERVED_FRACTION) * free)
-    need = small.for_worlds(model.worlds)
+    need = small.total_bytes(model.worlds)
     if need <= room:
         return
-    fit = bisect.bisect_right(range(1, model.worlds), room, key=small.for_worlds)
+    fit = bisect.bisect_right(range(1, model.worlds), room, key=small.total_bytes)
     per_world = need // model.worlds
     raise CapacityError(
         f"a simulation of {model.worlds} worlds takes {size(need)}, {per_world} bytes per world, and {model.device} "
@@ -76,7 +76,7 @@ class ByteCounts:
     one_world: tuple[dict[str, int], dict[str, Callable[[int], int]]]
     two_worlds: tuple[dict[str, int], dict[str, Callable[[int], int]]]
 
-    def for_worlds(self, worlds: int) -> int:
+    def total_bytes(self, worlds: int) -> int:
         """Bytes for a number of worlds."""
         out = 0
         for name, count in self.one_world[0].items():
@@ -85,7 +85,7 @@ class ByteCounts:
         return out
 
 
-def _arrays(
+def _array_bytes(
     model: Model, worlds: int, make: Callable[[Model, State], Stepper]
 ) -> tuple[dict[str, int], dict[str, Callable[[int], int]]]:
     """Arrays of the state and scratch of a simulation of a number of worlds."""

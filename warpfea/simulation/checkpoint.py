@@ -22,8 +22,8 @@ from .reports import idle_report
 __all__ = ["Checkpoint", "load_checkpoint", "read_meta", "save_checkpoint"]
 
 SCHEMA = 3
-"""1: constraints were registered with the solver, and the ledger had a column of joints in every model; 2: other names
-of history arrays and of the attributes of terms, which `Term.hash` reads."""
+"""Version of the file format. 1: constraints were registered with the solver, and the ledger had a column of joints in
+every model; 2: other names of history arrays and of the attributes of terms, which `Term.hash` reads."""
 SUFFIXES = (".npz",)
 
 
@@ -48,16 +48,16 @@ class Checkpoint(Output):
     def open(self, sim: Any) -> None:
         check_target(self.path, SUFFIXES)
         self._open = True
-        self._calls = 0
-        self._written = -1
+        self._write_calls = 0
+        self._saved_at_step = -1
 
     def write(self, sim: Any) -> None:
-        if self._calls and self._calls % self.every == 0:
+        if self._write_calls and self._write_calls % self.every == 0:
             self._save(sim)
-        self._calls += 1
+        self._write_calls += 1
 
     def close(self, sim: Any) -> None:
-        if self._open and self._written != sim.steps:
+        if self._open and self._saved_at_step != sim.steps:
             self._save(sim)
         self._open = False
 
@@ -67,7 +67,7 @@ class Checkpoint(Output):
 
     def _save(self, sim: Any) -> None:
         save_checkpoint(sim, self.path)
-        self._written = sim.steps
+        self._saved_at_step = sim.steps
 
 
 def save_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
@@ -90,8 +90,8 @@ def save_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
         "min_J": sim.min_J if math.isfinite(sim.min_J) else None,
         "probes": [probe.name for probe in sim.model.probes],
     }
-    if sim.stepper.adaptive:
-        sync_times = sim.stepper.adaptive.sync_times
+    if sim.stepper.step_size_control:
+        sync_times = sim.stepper.step_size_control.sync_times
         meta["error"] = sim.error
         meta["instants"] = [sync_times.interval, sync_times.horizon, sync_times.origin] if sync_times.is_set else None
     arrays: dict[str, Any] = {f"state.{name}": values for name, values in sim.state.numpy().items()}
@@ -113,20 +113,20 @@ def save_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
 
 def read_meta(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Checkpoint metadata: dtype, worlds, integrator, dt (s), steps, ... CheckpointError if unreadable."""
-    return _read(pathlib.Path(path))[0]
+    return _read_arrays(pathlib.Path(path))[0]
 
 
 def load_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
     """Continue from a checkpoint: state, records and totals. The step dt remains the simulation's own, and so does the
-        error of dt = "auto"; interval and horizon are the checkpoint's.
+    error of dt = "auto"; interval and horizon are the checkpoint's.
 
     Raises:
         CheckpointError: unreadable or truncated, or of another model, precision, number of worlds or integrator. The
             simulation is unchanged then.
     """
     file = pathlib.Path(path)
-    meta, arrays = _read(file)
-    _compare(file, meta, sim)
+    meta, arrays = _read_arrays(file)
+    _check_compatible(file, meta, sim)
     state = {name.removeprefix("state."): a for name, a in arrays.items() if name.startswith("state.")}
     for name in ("rough", "floored"):  # files older than these counts
         arrays.setdefault(f"total.{name}", np.zeros(sim.model.worlds, int))
@@ -153,8 +153,8 @@ def load_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
         sim.stepper.start_terms()
     except CheckpointError as error:
         raise CheckpointError(f"{file}: {error}") from None
-    if sim.stepper.adaptive and meta.get("instants"):
-        sim.stepper.adaptive.sync_times.load(*meta["instants"])
+    if sim.stepper.step_size_control and meta.get("instants"):
+        sim.stepper.step_size_control.sync_times.load(*meta["instants"])
     sim.totals = {name: np.array(a) for name, a in totals.items()}
     sim.steps = int(meta["steps"])
     sim.max_residual = float(meta["max_residual"])
@@ -165,7 +165,7 @@ def load_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
     sim.last = idle_report(sim)
 
 
-def _compare(file: pathlib.Path, meta: dict[str, Any], sim: Any) -> None:
+def _check_compatible(file: pathlib.Path, meta: dict[str, Any], sim: Any) -> None:
     """Raise CheckpointError naming the first difference between checkpoint and simulation."""
     expected = {
         "dtype": ("precision", sim.model.dtype),
@@ -188,11 +188,11 @@ def _compare(file: pathlib.Path, meta: dict[str, Any], sim: Any) -> None:
         raise CheckpointError(
             f"{file}: {what} of the checkpoint is {meta.get(key)!r}, of the simulation {value!r}{hint}"
         )
-    if sim.stepper.adaptive and meta.get("dt") != "auto":
+    if sim.stepper.step_size_control and meta.get("dt") != "auto":
         raise CheckpointError(f"{file}: dt of the checkpoint is {meta.get('dt')!r}, of the simulation 'auto'")
 
 
-def _read(file: pathlib.Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def _read_arrays(file: pathlib.Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     if not file.is_file():
         raise CheckpointError(f"{file}: no such checkpoint")
     try:

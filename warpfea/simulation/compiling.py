@@ -28,12 +28,12 @@ def load_modules(modules: dict[str, wp.Module], device: Any, on_compile: OnCompi
         load = partial(wp.force_load, device, max_workers=0)
         waiting = {pool.submit(load, [module]): name for name, module in modules.items()}
         for done, future in enumerate(as_completed(waiting)):
-            _raise_of(future, waiting[future])
+            _raise_compile_error(future, waiting[future])
             if on_compile:
                 on_compile(done + 1, len(waiting), waiting[future])
 
 
-def _raise_of(future: Future[Any], name: str) -> None:
+def _raise_compile_error(future: Future[Any], name: str) -> None:
     """Re-raise compilation errors; those of a user's function as ModelError."""
     try:
         future.result()

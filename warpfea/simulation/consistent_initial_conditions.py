@@ -23,7 +23,7 @@ from ..base.errors import ModelError
 from ..kernels.step.step_control import STATUS
 from ..kernels.terms.constraints import ANGLE, DISTANCE
 from ..time_laws import TimeLaw
-from .discontinuities import jumps, kinks
+from .discontinuities import jump_intervals, kink_times
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -35,7 +35,7 @@ __all__ = ["ConsistentInitialConditions"]
 
 TIME_TOL = 1e-6
 """Tolerance of equal times, over a step."""
-FACTORED_SLOTS = 20_000
+MAX_FACTORED_SLOTS = 20_000
 """Maximum slots of a factorised mass matrix; larger ones are solved iteratively."""
 FIRST_DERIVATIVE = np.array([-25.0, 48.0, -36.0, 16.0, -3.0]) / 12.0
 SECOND_DERIVATIVE = np.array([35.0, -104.0, 114.0, -56.0, 11.0]) / 12.0
@@ -49,20 +49,20 @@ class ConsistentInitialConditions:
     """Recompute consistent initial accelerations after a reset or a discontinuity.
 
     Attributes:
-        count: number of restarts per world.
+        restart_count: number of restarts per world.
     """
 
     def __init__(self, ctx: StepContext, residual: Residual, integrator: Integrator) -> None:
         self.ctx, self.residual, self.integrator = ctx, residual, integrator
         self.model = ctx.model
         supports = ctx.model.terms.supports
-        self.driven = supports.displaced is not None or supports.rotated is not None
-        self.count = 0
+        self.has_drives = supports.displaced is not None or supports.rotated is not None
+        self.restart_count = 0
         self._discontinuities: tuple[float, np.ndarray, np.ndarray] = (0.0, np.zeros(0), np.zeros((2, 0)))
         self._mass: dict[int, list[tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]]] = {}
-        self._version = -1  # parameter version of the factors in _mass
+        self._parameter_version = -1  # parameter version of the factors in _mass
         self._world = 0  # the world being restarted
-        check_rho_inf(ctx.model, integrator, self.driven)
+        check_rho_inf(ctx.model, integrator, self.has_drives)
 
     def prepare(self, dt: float) -> None:
         """Restart the worlds that need it, before a step of size dt, s."""
@@ -71,7 +71,7 @@ class ConsistentInitialConditions:
         after_jump, slope_jump = self._discontinuities_at(time, dt)
         flags = (state.status.numpy() == STATUS["running"]) & ((known != time) | slope_jump)  # type: ignore[attr-defined]
         if flags.any():
-            self._start(flags, time, after_jump, dt)
+            self._restart_worlds(flags, time, after_jump, dt)
 
     def _discontinuities_at(self, time: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
         """Times (B,) just after a jump at the state, else its own; and flags of a kink within the previous step."""
@@ -88,9 +88,9 @@ class ConsistentInitialConditions:
     def _find_discontinuities(self, dt: float) -> tuple[np.ndarray, np.ndarray]:
         """Times of all kinks, and starts and ends of jumps (2, n), for a step dt, s."""
         laws = self.model.terms.time_laws.laws
-        steep = np.concatenate([np.zeros((0, 2)), *(jumps(law, dt) for law in laws)])
+        steep = np.concatenate([np.zeros((0, 2)), *(jump_intervals(law, dt) for law in laws)])
         # accelerations stay continuous across force kinks
-        bent = [kinks(law, dt) for number, law in enumerate(laws) if number in self._drive_law_numbers()]
+        bent = [kink_times(law, dt) for number, law in enumerate(laws) if number in self._drive_law_numbers()]
         return np.concatenate([steep[:, 0], *bent]), steep.T
 
     def _drive_law_numbers(self) -> set[int]:
@@ -105,17 +105,17 @@ class ConsistentInitialConditions:
             out |= set(terms.constraints.tables.data.law.numpy().tolist())
         return out
 
-    def _start(self, flags: np.ndarray, time: np.ndarray, after_jump: np.ndarray, dt: float) -> None:
+    def _restart_worlds(self, flags: np.ndarray, time: np.ndarray, after_jump: np.ndarray, dt: float) -> None:
         state: Any = self.ctx.state
-        if self._version != self.model.parameters.version:
-            self._version = self.model.parameters.version
+        if self._parameter_version != self.model.parameters.version:
+            self._parameter_version = self.model.parameters.version
             self._mass.clear()
         laws = self._law_derivatives(flags, after_jump, dt)
         u, v = state.displacement.numpy().astype(float), state.velocity.numpy().astype(float)
-        before = self._kinetic(v)
+        before = self._kinetic_energy(v)
         for world in np.flatnonzero(flags).tolist():
             self._world = world
-            v[world] += self._impulse(u[world], v[world], laws[:, world])
+            v[world] += self._velocity_correction(u[world], v[world], laws[:, world])
         self._write_flagged(state.velocity, flags, v)
         g = self._unbalanced_force(flags, after_jump, dt)
         w, a = np.zeros_like(v), np.zeros_like(v)
@@ -130,12 +130,12 @@ class ConsistentInitialConditions:
             a[world] = w[world] + early * dt * jerk
             v[world] += late * dt**2 * jerk  # prescribed: the limit of a scheme with constant steps
         self._write_flagged(state.velocity, flags, v)
-        self._record_impulse(flags, self._kinetic(v) - before)
+        self._record_impulse(flags, self._kinetic_energy(v) - before)
         self._write_flagged(state.acceleration, flags, w)
         self._write_flagged(state.algorithmic_acceleration, flags, a)
         self._write_flagged(state.previous_step, flags, np.full(len(time), dt))
         self._write_flagged(state.acceleration_end, flags, time)
-        self.count += 1
+        self.restart_count += 1
 
     @staticmethod
     def _write_flagged(array: wp.array, flags: np.ndarray, values: np.ndarray) -> None:
@@ -143,10 +143,10 @@ class ConsistentInitialConditions:
         host[flags] = values[flags]
         array.assign(host)
 
-    def _kinetic(self, v: np.ndarray) -> np.ndarray:
+    def _kinetic_energy(self, v: np.ndarray) -> np.ndarray:
         """1/2 v.M v, (B,), J."""
         masses = self.model.masses
-        return np.array([0.5 * np.sum(one * (masses.of_world(world) @ one)) for world, one in enumerate(v)])
+        return np.array([0.5 * np.sum(one * (masses.world_matrix(world) @ one)) for world, one in enumerate(v)])
 
     def _record_impulse(self, flags: np.ndarray, change: np.ndarray) -> None:
         """Add the kinetic energy of the velocity correction to the integrator column of the ledger."""
@@ -245,7 +245,7 @@ class ConsistentInitialConditions:
 
     # linear algebra
 
-    def _impulse(self, u: np.ndarray, v: np.ndarray, laws: np.ndarray) -> np.ndarray:
+    def _velocity_correction(self, u: np.ndarray, v: np.ndarray, laws: np.ndarray) -> np.ndarray:
         """Velocity correction dv, m/s; zero if consistent."""
         jump = self._prescribed_rates(laws)[0] - np.where(self.model.free_host == 0.0, v, 0.0)
         if self.model.constraints is None:
@@ -266,7 +266,7 @@ class ConsistentInitialConditions:
 
         Elastic jerk is omitted: it is unresolved for stiff bodies.
         """
-        if self.model.constraints is None and not self.driven:
+        if self.model.constraints is None and not self.has_drives:
             return np.zeros_like(w)
         prescribed, constraint_rhs, rows = np.zeros_like(w), None, None
         for sign in (-0.5 / s, 0.5 / s):
@@ -287,7 +287,7 @@ class ConsistentInitialConditions:
     ) -> np.ndarray:
         """Solve M x + J^T m = force on free components, x = prescribed on others, J x = constraint_rhs; (slots, 3)."""
         m = self.model
-        x = self._solve_mass(force - m.masses.of_world(self._world) @ prescribed) + prescribed
+        x = self._solve_mass(force - m.masses.world_matrix(self._world) @ prescribed) + prescribed
         if J is None:
             return x
         free = m.free_host.ravel() != 0.0
@@ -299,7 +299,7 @@ class ConsistentInitialConditions:
 
     def _solve_mass(self, force: np.ndarray) -> np.ndarray:
         """M^-1 force on the free components, 0 on others."""
-        world = self._world if self.model.masses.varied else 0
+        world = self._world if self.model.masses.varies_by_world else 0
         if world not in self._mass:
             self._mass[world] = [mass_solver(self.model, c, world) for c in range(3)]
         out = np.zeros_like(force)
@@ -312,8 +312,8 @@ class ConsistentInitialConditions:
 def mass_solver(model: Model, component: int, world: int = 0) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
     """Free slots of a component, and a solver for their mass matrix."""
     free = np.flatnonzero(model.free_host[:, component])
-    M = model.masses.of_world(world)[free][:, free].astype(float).tocsc()
-    if len(free) <= FACTORED_SLOTS:
+    M = model.masses.world_matrix(world)[free][:, free].astype(float).tocsc()
+    if len(free) <= MAX_FACTORED_SLOTS:
         return free, spl.splu(M).solve if len(free) else lambda f: f
     scale = sp.diags(1.0 / M.diagonal())
     return free, lambda f: spl.cg(M, f, rtol=1e-14, atol=0.0, maxiter=2000, M=scale)[0]

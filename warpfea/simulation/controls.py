@@ -84,18 +84,18 @@ class ControlValue:
         """Write the values of all worlds.
 
         Args:
-                values: broadcastable to (worlds, size), or (worlds,) for a scalar control; or a Warp array (worlds,
-                    size) of float64, copied on the device without a check for non-finite values.
+            values: broadcastable to (worlds, size), or (worlds,) for a scalar control; or a Warp array (worlds, size)
+                of float64, copied on the device without a check for non-finite values.
 
-            Raises:
-                ModelError: another shape or type, or a non-finite value; nothing is written then.
+        Raises:
+            ModelError: another shape or type, or a non-finite value; nothing is written then.
         """
         if not isinstance(values, wp.array):
             self[:] = values
             return
         if values.shape != self.shape or values.dtype != wp.float64:
             got = f"{values.dtype.__name__}{values.shape}"
-            raise ModelError(f"{self._what} takes a Warp array float64{self.shape}, got {got}")
+            raise ModelError(f"{self._description} takes a Warp array float64{self.shape}, got {got}")
         wp.copy(self.array, values)
 
     def __setitem__(self, key: Any, values: Any) -> None:
@@ -108,12 +108,12 @@ class ControlValue:
                 given = given[:, None]
             target[key] = given
         except (TypeError, ValueError, IndexError) as error:
-            raise ModelError(f"{self._what} has values {self.shape}: {error}") from error
+            raise ModelError(f"{self._description} has values {self.shape}: {error}") from error
         # unwritten values may stay non-finite: a failed world can be repaired alone
         if not np.all(np.isfinite(given)) and not np.all(np.isfinite(target)):
             world, component = map(int, np.argwhere(~np.isfinite(target))[0])
             where = f"world {world}" + (f", component {component}" if self.shape[1] > 1 else "")
-            raise ModelError(f"{self._what}: {target[world, component]} of {where} is not finite")
+            raise ModelError(f"{self._description}: {target[world, component]} of {where} is not finite")
         self.array.assign(target)
 
     def __getitem__(self, key: Any) -> Any:
@@ -130,7 +130,7 @@ class ControlValue:
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         if copy is False:
-            raise ValueError(f"{self._what} is copied from the device; take .array")
+            raise ValueError(f"{self._description} is copied from the device; take .array")
         return self.numpy().astype(dtype or float)
 
     def __dlpack__(self, stream: Any = None) -> Any:
@@ -145,5 +145,5 @@ class ControlValue:
         return f"ControlValue({self.control.name!r}, {shown})"
 
     @property
-    def _what(self) -> str:
+    def _description(self) -> str:
         return f"control {self.control.name!r}"

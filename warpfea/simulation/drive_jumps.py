@@ -12,20 +12,20 @@ if TYPE_CHECKING:
     from ..model.model import Model
     from ..time_laws import TimeLaw
 
-__all__ = ["drives", "jumping_drives"]
+__all__ = ["discontinuous_drives_text", "list_drives"]
 
-JUMP_RATIO = 10.0
+MIN_JUMP_RATIO = 10.0
 """Smallest ratio of a drive's jump to its motion in the preceding equal time."""
 MIN_JUMP_ANGLE = 0.1
 """Smallest jump of an angle, rad."""
 
 
-def jumping_drives(sim: Any, world: int) -> str:
+def discontinuous_drives_text(sim: Any, world: int) -> str:
     """Description of the drives that jump within the last attempt of a world's rejected step; "" without any.
 
     Thresholds: an element size for displacements, m, `MIN_JUMP_ANGLE` for angles.
     """
-    driven = drives(sim.model)
+    driven = list_drives(sim.model)
     if not driven:
         return ""
     step = sim.stepper.work.step
@@ -38,7 +38,7 @@ def jumping_drives(sim: Any, world: int) -> str:
             max(float(np.linalg.norm((b[number] - a[number]) * mask)) for number, mask in entries)
             for a, b in ((start, late), (early, start))
         )
-        if moved > max(JUMP_RATIO * before, MIN_JUMP_ANGLE if angular else least):
+        if moved > max(MIN_JUMP_RATIO * before, MIN_JUMP_ANGLE if angular else least):
             texts.append(f"{name} by {moved:.3g} {'rad' if angular else 'm'}")
     if not texts:
         return ""
@@ -46,7 +46,7 @@ def jumping_drives(sim: Any, world: int) -> str:
     return f"; discontinuous drive within {span}: {', '.join(texts[:4])}{', ...' if len(texts) > 4 else ''}: use a ramp"
 
 
-def drives(model: Model) -> list[tuple[str, bool, list[tuple[int, np.ndarray]]]]:
+def list_drives(model: Model) -> list[tuple[str, bool, list[tuple[int, np.ndarray]]]]:
     """Name of each drive, True if angular, and its law indices with their prescribed components."""
     number = {id(law): k for k, law in enumerate(model.terms.time_laws.laws)}
     out: list[tuple[str, bool, list[tuple[int, np.ndarray]]]] = []
@@ -72,7 +72,7 @@ def _element_size(model: Model) -> float:
     """Median diagonal of the elements' bounding boxes, m."""
     sizes = []
     for block in model.blocks:
-        for part in block.parts:
+        for part in block.host_blocks:
             points = part.body.reference[part.conn]
             place = (part.body.slot_kind[part.conn] == 0)[:, :, None]
             low, high = np.where(place, points, np.inf).min(axis=1), np.where(place, points, -np.inf).max(axis=1)

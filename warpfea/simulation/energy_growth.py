@@ -20,24 +20,31 @@ import warp as wp
 from ..base.errors import ModelWarning
 from ..kernels.step.step_control import GROWTH_COLUMNS
 from ..model.assembly import element_volumes
-from .drive_jumps import drives
+from .drive_jumps import list_drives
 
 if TYPE_CHECKING:
     from ..model.model import Model
     from ..model.state import State
 
-__all__ = ["CHOICES", "REFUSE_LIMIT", "WARN_LIMIT", "EnergyGrowth", "growth_error", "integrator_share"]
+__all__ = [
+    "ENERGY_GROWTH_CHOICES",
+    "REFUSE_LIMIT",
+    "WARN_LIMIT",
+    "EnergyGrowth",
+    "growth_error_text",
+    "integrator_energy_ratio",
+]
 
-CHOICES = ("refuse", "warn", "ignore")
+ENERGY_GROWTH_CHOICES = ("refuse", "warn", "ignore")
 WARN_LIMIT, REFUSE_LIMIT = 0.01, 0.1
 """Energy gain of the integrator over the energy, for a warning and for rejection of steps."""
-MORE_DISSIPATIVE = {
+MORE_DISSIPATIVE_SCHEMES = {
     "generalized_alpha": ("bdf2", "energy_momentum(rho_inf=0.8)", "backward_euler"),
     "energy_momentum": ("energy_momentum(rho_inf=0.8)", "bdf2", "backward_euler"),
     "bdf2": ("energy_momentum", "backward_euler"),
 }
 """Alternative schemes to one that gains energy."""
-STRAIN_ROUNDINGS = 100.0
+ROUND_OFF_STRAIN = 100.0
 """Strain in units of round-off whose energy counts as round-off."""
 
 
@@ -45,49 +52,49 @@ class EnergyGrowth:
     """Energy growth monitor of a simulation.
 
     Args:
-        choice: one of CHOICES.
+        choice: one of ENERGY_GROWTH_CHOICES.
         ledger: True with an energy ledger, which monitoring requires.
     """
 
     def __init__(self, choice: str, *, ledger: bool, static: bool) -> None:
         self.choice = choice
-        self.watched = ledger and not static and choice != "ignore"
+        self.monitored = ledger and not static and choice != "ignore"
         self.warned = False
         self._ledger = ledger
 
     def __str__(self) -> str:
-        if not self.watched:
+        if not self.monitored:
             return "not watched" + ("" if self._ledger else " (ledger=False)")
         refused = f", refused above {REFUSE_LIMIT:.0%}" if self.choice == "refuse" else ""
         return f"watched: warned of above {WARN_LIMIT:.0%}{refused}"
 
     def bind(self, step: Any, model: Model, state: State) -> None:
         """Bind monitor arrays to the step control; resets the history of a reused state."""
-        if not self.watched:
+        if not self.monitored:
             return
         rows = state.register("energy_growth", wp.float64, (len(GROWTH_COLUMNS),))
         rows.zero_()
         step.energy_growth, step.growth_monitored = rows, 1
-        step.residual_work_counted = float(not drives(model))
+        step.residual_work_counted = float(not list_drives(model))
         self._model, self._rows = model, rows
-        self._least_energy = wp.zeros(model.worlds, dtype=wp.float64, device=model.device)
-        self._written, self._writes = model.terms.written, model.terms.writes
-        self._least_energy.assign(least_energy(model))
+        self._round_off_energy = wp.zeros(model.worlds, dtype=wp.float64, device=model.device)
+        self._parameter_writes_seen, self._writes = model.terms.written, model.terms.writes
+        self._round_off_energy.assign(round_off_energy(model))
         step.growth_warn_limit = WARN_LIMIT
         step.growth_limit = REFUSE_LIMIT if self.choice == "refuse" else np.inf
-        step.min_energy = self._least_energy
+        step.min_energy = self._round_off_energy
 
     def restart_changed(self) -> None:
         """Restart in worlds whose parameters were set: the energy jump is not the integrator's."""
-        if not self.watched or self._written == self._model.terms.written:
+        if not self.monitored or self._parameter_writes_seen == self._model.terms.written:
             return
         writes = self._model.terms.writes
         chosen, self._writes = writes > self._writes, writes
-        self._written = self._model.terms.written
+        self._parameter_writes_seen = self._model.terms.written
         rows = self._rows.numpy()
         rows[chosen] = 0.0
         self._rows.assign(rows)
-        self._least_energy.assign(least_energy(self._model))
+        self._round_off_energy.assign(round_off_energy(self._model))
 
     def warn_once(self, sim: Any, shares: np.ndarray) -> None:
         """Warn once if a world's energy gain (worlds,) exceeds WARN_LIMIT."""
@@ -99,16 +106,16 @@ class EnergyGrowth:
         refused = f"; steps are refused above {REFUSE_LIMIT:.0%}" if self.choice == "refuse" else ""
         where = f" in world {world}" if sim.model.worlds > 1 else ""
         warnings.warn(
-            f"{source(sim, world)} is gaining energy: {worst:.1%} of the peak energy{where} (above {WARN_LIMIT:.0%} "
-            f"since t = {since:.6g} s){refused}; {calmer_schemes_text(sim, world)}",
+            f"{energy_source(sim, world)} is gaining energy: {worst:.1%} of the peak energy{where} (above "
+            f"{WARN_LIMIT:.0%} since t = {since:.6g} s){refused}; {remedy_text(sim, world)}",
             ModelWarning,
             stacklevel=4,
         )
 
 
-def least_energy(model: Model) -> np.ndarray:
-    """Round-off level of the energy (worlds,), J: strain of STRAIN_ROUNDINGS eps everywhere."""
-    unit, out = STRAIN_ROUNDINGS * float(np.finfo(model.dtype).eps), np.zeros(model.worlds)
+def round_off_energy(model: Model) -> np.ndarray:
+    """Round-off level of the energy (worlds,), J: strain of ROUND_OFF_STRAIN eps everywhere."""
+    unit, out = ROUND_OFF_STRAIN * float(np.finfo(model.dtype).eps), np.zeros(model.worlds)
     for body in model.bodies:
         volume = float(element_volumes(body).sum())
         worlds = range(model.worlds) if model.parameters.varies(body) else [None]
@@ -117,35 +124,35 @@ def least_energy(model: Model) -> np.ndarray:
     return out
 
 
-def by_residuals(sim: Any, world: int) -> bool:
+def caused_by_residuals(sim: Any, world: int) -> bool:
     """True if accepted residuals have added more than half of the energy; never for generalized-alpha, which is
     unstable by itself."""
-    if drives(sim.model) or sim.integrator.name == "generalized_alpha":
+    if list_drives(sim.model) or sim.integrator.name == "generalized_alpha":
         return False
     share, largest, turnover = sim.state.energy_growth.numpy()[world, :3]
     added = share * (largest + turnover)
     return float(sim.energies()["ledger_residual"][world]) > 0.5 * added
 
 
-def source(sim: Any, world: int) -> str:
+def energy_source(sim: Any, world: int) -> str:
     """Source of the energy: the integrator, or accepted residuals."""
-    return "the work of accepted residuals" if by_residuals(sim, world) else sim.integrator.label
+    return "the work of accepted residuals" if caused_by_residuals(sim, world) else sim.integrator.label
 
 
-def calmer_schemes_text(sim: Any, world: int) -> str:
+def remedy_text(sim: Any, world: int) -> str:
     """Alternative integrators or tolerance, as text."""
-    if by_residuals(sim, world):
+    if caused_by_residuals(sim, world):
         return "take a smaller tol" + (", or dtype='float64'" if sim.model.dtype == "float32" else "")
-    others = [f"{other!r}" for other in MORE_DISSIPATIVE.get(sim.integrator.name, ())]
+    others = [f"{other!r}" for other in MORE_DISSIPATIVE_SCHEMES.get(sim.integrator.name, ())]
     return f"take integrator={', '.join(others)} or a smaller dt" if others else "take a smaller dt"
 
 
-def integrator_share(sim: Any) -> float:
+def integrator_energy_ratio(sim: Any) -> float:
     """Integrator loss or gain of the ledger over the energy exchanged, in the worst world.
 
     NaN without monitoring; 0 before any exchange, as after a rejected step.
     """
-    if not sim.energy_growth.watched:
+    if not sim.energy_growth.monitored:
         return float("nan")
     rows = sim.state.energy_growth.numpy()
     scale = rows[:, GROWTH_COLUMNS.index("largest")] + rows[:, GROWTH_COLUMNS.index("turnover")]
@@ -153,11 +160,11 @@ def integrator_share(sim: Any) -> float:
     return float(np.max(np.divide(taken, scale, out=np.zeros_like(taken), where=scale > 0.0)))
 
 
-def growth_error(sim: Any, world: int) -> str:
+def growth_error_text(sim: Any, world: int) -> str:
     """Message of a step rejected for energy growth; restarts the monitor of the world."""
     rows = sim.state.energy_growth.numpy()
     share, since = (float(rows[world, GROWTH_COLUMNS.index(name)]) for name in ("share", "since"))
-    name, cure = source(sim, world), calmer_schemes_text(sim, world)
+    name, cure = energy_source(sim, world), remedy_text(sim, world)
     rows[world] = 0.0
     sim.state.energy_growth.assign(rows)
     return (

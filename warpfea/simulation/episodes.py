@@ -23,26 +23,27 @@ class Episodes:
 
     Attributes:
         ends: [world] end times, s, at which worlds are frozen.
-        tally: [world, RUN_STATISTICS] statistics since the last read; stepped: [world] flags since the state was set.
+        statistics: [world, RUN_STATISTICS] statistics since the last read.
+        stepped_flags: [world] flags of worlds stepped since their state was set.
     """
 
     def __init__(self, model: Model, work: Workspace, launch: Launcher, *, asynchronous: bool, ends: bool) -> None:
         self.worlds, self.work, self.launch = model.worlds, work, launch
         self.ends: wp.array | None = work.array("t_end", (model.worlds,), wp.float64) if ends else None
-        self.tally: wp.array | None = None
-        self.stepped: wp.array | None = None
+        self.statistics: wp.array | None = None
+        self.stepped_flags: wp.array | None = None
         self._flags: wp.array | None = None
         self.set_run_end()
         if ends:
             work.step.world_end = self.ends
         if asynchronous:
-            self.tally = work.array("tally", (model.worlds, len(RUN_STATISTICS)), wp.float64)
-            self.stepped = work.array("stepped", (model.worlds,), wp.int32)
+            self.statistics = work.array("tally", (model.worlds, len(RUN_STATISTICS)), wp.float64)
+            self.stepped_flags = work.array("stepped", (model.worlds,), wp.int32)
             self._clear()
 
     def modules(self) -> set[wp.Module]:
         """Modules launched."""
-        return set() if self.tally is None and self.ends is None else {episode_kernels().module}
+        return set() if self.statistics is None and self.ends is None else {episode_kernels().module}
 
     def set_run_end(self, end: float = math.inf, steps: int = 0) -> None:
         """Set the end, s, and the number of steps of a run; inf: no run."""
@@ -57,23 +58,25 @@ class Episodes:
 
     def end_step(self) -> None:
         """Accumulate the statistics of a reported step."""
-        if self.tally is not None:
-            self.launch(episode_kernels().add_statistics, self.worlds, [self.work.report, self.tally, self.stepped])
+        if self.statistics is not None:
+            self.launch(
+                episode_kernels().add_statistics, self.worlds, [self.work.report, self.statistics, self.stepped_flags]
+            )
         self.freeze_finished()
 
     def read_totals(self) -> tuple[np.ndarray, np.ndarray]:
         """Read and reset the statistics (worlds, RUN_STATISTICS); also the stepped worlds (worlds,)."""
-        assert self.tally is not None
-        assert self.stepped is not None
-        sums = self.tally.numpy().copy()
+        assert self.statistics is not None
+        assert self.stepped_flags is not None
+        sums = self.statistics.numpy().copy()
         self._clear()
-        return sums, self.stepped.numpy() != 0
+        return sums, self.stepped_flags.numpy() != 0
 
     def _clear(self) -> None:
-        assert self.tally is not None
-        self.launch(episode_kernels().clear_statistics, self.tally.shape, [self.tally])
+        assert self.statistics is not None
+        self.launch(episode_kernels().clear_statistics, self.statistics.shape, [self.statistics])
 
-    def as_flags(self, mask: wp.array) -> wp.array:
+    def copy_mask_to_flags(self, mask: wp.array) -> wp.array:
         """Copy a mask of int32 or bool to a persistent int32 array: the mask itself may be reset."""
         if self._flags is None:
             self._flags = wp.zeros(self.worlds, dtype=wp.int32, device=mask.device)
@@ -85,12 +88,12 @@ class Episodes:
 
     def clear_stepped(self, worlds: np.ndarray | wp.array) -> None:
         """Mark the chosen worlds (host mask or device flags) as not stepped since their state was set."""
-        if self.stepped is None:
+        if self.stepped_flags is None:
             return
         if isinstance(worlds, wp.array):
-            self.launch(episode_kernels().clear_flagged, self.worlds, [worlds, self.stepped])
+            self.launch(episode_kernels().clear_flagged, self.worlds, [worlds, self.stepped_flags])
         else:
-            self.stepped.assign(np.where(worlds, 0, self.stepped.numpy()))
+            self.stepped_flags.assign(np.where(worlds, 0, self.stepped_flags.numpy()))
 
     def copy_flagged(self, flags: wp.array, source: Any, target: wp.array) -> None:
         """Copy one value of the flagged worlds on the device."""

@@ -25,8 +25,8 @@ from ..kernels.solvers.newton_control import (
 )
 from ..solvers import NewtonPCG
 from ..terms.evaluation import lowest_jacobian
-from .drive_jumps import jumping_drives
-from .energy_growth import growth_error
+from .drive_jumps import discontinuous_drives_text
+from .energy_growth import growth_error_text
 from .overload import overload_text
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 __all__ = ["check_initial_constraints", "step_error"]
 
-REASONS = {
+FAILURE_REASONS = {
     FAIL_ITERATIONS: "Newton's method did not converge",
     FAIL_LINE_SEARCH: "the line search found no decrease",
     FAIL_JACOBIAN: "an element reached J <= 0, where its law is not defined,",
@@ -47,7 +47,7 @@ REASONS = {
 }
 INDEFINITE_FAILURES = (FAIL_ITERATIONS, FAIL_LINE_SEARCH, FAIL_CURVATURE)
 """Failures that an indefinite tangent may explain."""
-NO_ESTIMATE = 1e30
+NO_ERROR_ESTIMATE = 1e30
 """Value of an unavailable error estimate."""
 MAX_INITIAL_VIOLATION = 1e-4
 """Largest initial constraint violation (over the model size) accepted by dynamics."""
@@ -62,7 +62,7 @@ def step_error(sim: Any, world: int) -> ConvergenceError | ConstraintError:
     # no halving follows the last rejection
     halvings = min(int(sim.last.halvings[world]) - 1, sim.solver.max_halvings)
     if code == FAIL_ENERGY_GROWTH:
-        text = f"{_step_text(sim, time, world)} was not taken in world {world}: {growth_error(sim, world)}"
+        text = f"{_step_text(sim, time, world)} was not taken in world {world}: {growth_error_text(sim, world)}"
         return ConvergenceError(text, time=time, world=world, state=sim.state)
     if code == FAIL_CONSTRAINT:
         return _constraint_error(sim, world, time, halvings)
@@ -84,7 +84,7 @@ def step_error(sim: Any, world: int) -> ConvergenceError | ConstraintError:
     spent, most = int(sim.last.newton[world]), int(work.step.newton_budget)
     if code != FAIL_WORK and most and spent >= most and halvings < sim.solver.max_halvings:
         hint += f"; {spent} Newton iterations used up max_work = {sim.solver.max_work}"
-    jumps = "" if code == FAIL_ROUNDOFF else jumping_drives(sim, world)
+    jumps = "" if code == FAIL_ROUNDOFF else discontinuous_drives_text(sim, world)
     kind: type[ConvergenceError] = ConvergenceError
     for term in sim.model.terms:
         if (found := term.failure_reason(sim.stepper.ctx, world)) is not None:
@@ -105,20 +105,20 @@ def _failure_reason(sim: Any, code: int, world: int) -> tuple[str, str]:
     work, dtype = sim.stepper.work, sim.model.dtype
     smaller = "; try more load steps" if sim.integrator.static else "; try a smaller dt"
     direct = sim.stepper.newton.direct
-    if code == FAIL_CURVATURE and direct is not None and world in direct.singular:
+    if code == FAIL_CURVATURE and direct is not None and world in direct.singular_worlds:
         return "singular tangent matrix (unconstrained body or mechanism?)", ""
     near = float(work.newton.rounding_ratio.numpy()[world]) <= STALL_ROUNDINGS
     finer = "; use float64" if dtype == "float32" else "; use fewer, stouter elements, or check the units"
-    adaptive = sim.stepper.adaptive
-    if code == FAIL_ROUNDOFF and adaptive and (least := adaptive.least_error(world)):
+    adaptive = sim.stepper.step_size_control
+    if code == FAIL_ROUNDOFF and adaptive and (least := adaptive.smallest_resolved_error(world)):
         hides = f"{dtype} round-off of displacements hides the local errors of substeps"
         return hides, f"{finer}, or error = {1.05 * least:.2g} or more"
     if code == FAIL_LOCAL_ERROR:
-        return REASONS[code], f"; {'use float64, or ' if dtype == 'float32' else 'use '}a larger error"
+        return FAILURE_REASONS[code], f"; {'use float64, or ' if dtype == 'float32' else 'use '}a larger error"
     if code == FAIL_ROUNDOFF:
         eta = float(work.newton.error_estimate.numpy()[world])
         left = ""
-        if eta < NO_ESTIMATE:
+        if eta < NO_ERROR_ESTIMATE:
             left = f" (estimated error {eta:.2g})"
         return f"{dtype} round-off limit reached{left}", finer
     if code == FAIL_WORK:
@@ -129,19 +129,19 @@ def _failure_reason(sim: Any, code: int, world: int) -> tuple[str, str]:
         slivers = f"; raise {limit} of NewtonPCG, or look for slivers and extreme contrasts of stiffness"
         return spent, "" if overload_text(sim.model) else slivers
     if code == FAIL_ELEMENT_INVERTED:
-        return REASONS[code], f"{smaller}, or NeoHookean in place of SVK; inversion='report' lets it pass"
+        return FAILURE_REASONS[code], f"{smaller}, or NeoHookean in place of SVK; inversion='report' lets it pass"
     bent = sim.integrator.static and int(work.newton.met_negative_curvature.numpy()[world])
     if code in INDEFINITE_FAILURES and near and (dtype == "float32" or not bent):
         return f"{dtype} round-off limit reached", finer
     if code in INDEFINITE_FAILURES and bent and dtype == "float32":
-        return f"{REASONS[code]}: forces in float32 have a direction without stiffness", (
+        return f"{FAILURE_REASONS[code]}: forces in float32 have a direction without stiffness", (
             f"{finer}, which says whether the equilibrium is unstable, or more load steps"
         )
     if code in INDEFINITE_FAILURES and bent:
-        return f"{REASONS[code]}: unstable equilibrium (buckling or snap-through)", (
+        return f"{FAILURE_REASONS[code]}: unstable equilibrium (buckling or snap-through)", (
             "; follow the post-critical path by damped dynamics or displacement control"
         )
-    return REASONS.get(code, "unknown reason"), smaller
+    return FAILURE_REASONS.get(code, "unknown reason"), smaller
 
 
 def _step_text(sim: Any, time: float, world: int) -> str:
@@ -160,7 +160,7 @@ def check_initial_constraints(sim: Any, mask: np.ndarray | None = None) -> None:
     for world, values in enumerate(sim.stepper.work.multipliers.constraint_value.numpy()):
         if mask is not None and not mask[world]:
             continue
-        names, worst = _violated(sim.model, values, MAX_INITIAL_VIOLATION * sim.model.size)
+        names, worst = _violated_joints(sim.model, values, MAX_INITIAL_VIOLATION * sim.model.size)
         if names:
             time = float(sim.time[world])
             raise ConstraintError(
@@ -173,18 +173,18 @@ def check_initial_constraints(sim: Any, mask: np.ndarray | None = None) -> None:
 def _constraint_error(sim: Any, world: int, time: float, halvings: int) -> ConstraintError:
     """Error of constraints that stay violated at equilibrium."""
     tol = sim.stepper.newton.constraint_tol
-    names, values = _violated(sim.model, sim.stepper.work.multipliers.constraint_value.numpy()[world], tol)
+    names, values = _violated_joints(sim.model, sim.stepper.work.multipliers.constraint_value.numpy()[world], tol)
     listed = ", ".join(f"{name!r} by {value:.3g} m" for name, value in zip(names[:4], values[:4]))
     few = "" if isinstance(sim.solver, NewtonPCG) else ", or Jacobi's iterations are too few"
     return ConstraintError(
         f"{_step_text(sim, time, world)}: constraints could not be satisfied in world {world} after "
         f"{halvings} halvings: {listed}{', ...' if len(names) > 4 else ''}; conflicting with each other or with "
-        f"supports, or not reachable (tolerance {tol:.3g} m){few}{jumping_drives(sim, world)}",
+        f"supports, or not reachable (tolerance {tol:.3g} m){few}{discontinuous_drives_text(sim, world)}",
         joints=names, violations=values, time=time, world=world, state=sim.state,
     )  # fmt: skip
 
 
-def _violated(model: Model, values: np.ndarray, tol: float) -> tuple[list[str], list[float]]:
+def _violated_joints(model: Model, values: np.ndarray, tol: float) -> tuple[list[str], list[float]]:
     """Names of the joints whose rows (rows,) exceed the tolerance, worst first, and their violations, m."""
     constraints = model.constraints
     assert constraints is not None
@@ -199,7 +199,7 @@ def _worst_element(m: Model, residual: np.ndarray) -> tuple[int, str]:
     g = np.where(np.isfinite(g), g, np.inf)
     best, index, text = -1.0, -1, "element unknown"
     for block in m.blocks:
-        for part in block.parts:
+        for part in block.host_blocks:
             values = g[part.conn + part.body.slot_offset].max(axis=1)
             k = int(np.argmax(values))
             if values[k] > best:

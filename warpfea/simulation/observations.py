@@ -15,9 +15,12 @@ from ..kernels.terms.contact_structs import RECORD_NAMES
 
 __all__ = ["Observations"]
 
-JOINT_REPORT = {"force": (0, 3), "moment": (3, 3), "violation": (6, 1)}
-CONTACT_REPORT = {"force": (0, 3), "moment": (3, 3)} | {name: (k, 1) for k, name in enumerate(RECORD_NAMES) if k > 5}
-FORMS = "'time', 'body.NAME.position', 'probe.NAME.velocity', 'joint.NAME.angle' or 'contact.NAME.force'"
+# first column after that of the joint or contact, and number of columns, by quantity
+JOINT_REPORT_COLUMNS = {"force": (0, 3), "moment": (3, 3), "violation": (6, 1)}
+CONTACT_REPORT_COLUMNS = {"force": (0, 3), "moment": (3, 3)} | {
+    name: (k, 1) for k, name in enumerate(RECORD_NAMES) if k > 5
+}
+NAME_FORMS = "'time', 'body.NAME.position', 'probe.NAME.velocity', 'joint.NAME.angle' or 'contact.NAME.force'"
 
 
 class Observations:
@@ -30,11 +33,11 @@ class Observations:
         probe.NAME.position, .displacement, .velocity     3: m, m/s
         joint.NAME.angle, .travel, .length                1: rad, m; as `sim.joint_value`
         joint.NAME.force, .moment, .violation             3, 3, 1: N, N m, m; as `sim.joint_force`
-            contact.NAME.force, .moment, .normal_force, ...   3, 3, 1: as `ContactRecord`, over the last step
+        contact.NAME.force, .moment, .normal_force, ...   3, 3, 1: as `ContactRecord`, over the last step
 
-        Forces are 0 in worlds without a step since construction or reset. Nothing is read back: `update()` launches
-        kernels, and `array` keeps its memory, which `wp.to_torch(obs.array)`, `torch.from_dlpack(obs)` and, on the CPU,
-        `obs.array.numpy()` share without a copy.
+    Forces are 0 in worlds without a step since construction or reset. Nothing is read back: `update()` launches
+    kernels, and `array` keeps its memory, which `wp.to_torch(obs.array)`, `torch.from_dlpack(obs)` and, on the CPU,
+    `obs.array.numpy()` share without a copy.
 
     Attributes:
         array: Warp array [world, column] in the model's precision.
@@ -44,91 +47,96 @@ class Observations:
     def __init__(self, sim: Any, names: tuple[str, ...]) -> None:
         self._sim, self._model = sim, sim.model
         if not names:
-            raise ModelError(f"observe: name what to observe, such as {FORMS}")
+            raise ModelError(f"observe: name what to observe, such as {NAME_FORMS}")
         self.columns: dict[str, slice] = {}
         self._points: list[tuple[Any, Any, str, Any, int]] = []
         self._values: list[tuple[list[Any], str, int, int]] = []
         self._reports: list[tuple[int, int]] = []
         self._times: list[int] = []
-        self._width = 0
+        self._column_count = 0
         for name in names:
-            first = self._width
-            self._add(name)
-            self.columns[name] = slice(first, self._width)
-        self.array: wp.array = wp.zeros((self._model.worlds, self._width), dtype=self._model.types.T,
+            first = self._column_count
+            self._add_columns(name)
+            self.columns[name] = slice(first, self._column_count)
+        self.array: wp.array = wp.zeros((self._model.worlds, self._column_count), dtype=self._model.types.T,
                                         device=self._model.device)  # fmt: skip
         self._kernels = observation_kernels(self._model.dtype)
         self._upload()
 
     # names
 
-    def _add(self, name: Any) -> None:
+    def _add_columns(self, name: Any) -> None:
         if not isinstance(name, str) or name in self.columns:
             twice = "is there twice" if isinstance(name, str) else "is no name"
             raise ModelError(f"observe: {name!r} {twice}")
         if name == "time":
-            self._times.append(self._width)
-            self._width += 1
+            self._times.append(self._column_count)
+            self._column_count += 1
             return
         kind, _, rest = name.partition(".")
         owner, _, what = rest.rpartition(".")
-        makers = {"body": self._body, "probe": self._probe, "joint": self._joint, "contact": self._contact}
+        makers = {
+            "body": self._add_body,
+            "probe": self._add_probe,
+            "joint": self._add_joint,
+            "contact": self._add_contact,
+        }
         if kind not in makers or not owner:
-            raise ModelError(f"observe: {name!r} is unknown{did_you_mean(kind, list(makers))}; names are {FORMS}")
+            raise ModelError(f"observe: {name!r} is unknown{did_you_mean(kind, list(makers))}; names are {NAME_FORMS}")
         makers[kind](name, owner, what)
 
-    def _choose(self, name: str, what: str, known: Any) -> None:
+    def _check_quantity(self, name: str, what: str, known: Any) -> None:
         if what not in known:
             hint = did_you_mean(what, list(known))
             raise ModelError(f"observe: {name!r} is unknown; of {name.rpartition('.')[0]!r} there are: "
                              f"{listing(known)}{hint}")  # fmt: skip
 
-    def _body(self, name: str, owner: str, what: str) -> None:
+    def _add_body(self, name: str, owner: str, what: str) -> None:
         bodies = {body.name: body for body in self._model.bodies}
         if owner not in bodies:
             raise ModelError(f"observe: body {owner!r} is unknown; there are: {listing(bodies)}"
                              f"{did_you_mean(owner, list(bodies))}")  # fmt: skip
-        self._choose(name, what, MOTION_KINDS)
+        self._check_quantity(name, what, MOTION_KINDS)
         body = bodies[owner]
         for node, X in enumerate(body.mesh.points):
             slot = int(body.node_slot[node])
             slots = [body.slot_offset + slot] if slot >= 0 else []
-            self._points.append((slots, [1.0] * len(slots), what, X, self._width))
-            self._width += 3
+            self._points.append((slots, [1.0] * len(slots), what, X, self._column_count))
+            self._column_count += 3
 
-    def _probe(self, name: str, owner: str, what: str) -> None:
+    def _add_probe(self, name: str, owner: str, what: str) -> None:
         probes = {probe.name: probe for probe in self._model.probes}
         if owner not in probes:
             raise ModelError(f"observe: probe {owner!r} is unknown; there are: {listing(probes)}"
                              f"{did_you_mean(owner, list(probes))}")  # fmt: skip
-        self._choose(name, what, MOTION_KINDS)
+        self._check_quantity(name, what, MOTION_KINDS)
         probe = probes[owner]
-        self._points.append((probe.body.slot_offset + probe.slots, probe.weights, what, probe.X, self._width))
-        self._width += 3
+        self._points.append((probe.body.slot_offset + probe.slots, probe.weights, what, probe.X, self._column_count))
+        self._column_count += 3
 
-    def _joint(self, name: str, owner: str, what: str) -> None:
+    def _add_joint(self, name: str, owner: str, what: str) -> None:
         first = self._sim._joint_column(owner)
         tables = self._model.constraints
         assert tables is not None
         joint = self._sim._joint(owner)
         has = tables.vectors_of(joint)
-        self._choose(name, what, [*has, *JOINT_REPORT])
+        self._check_quantity(name, what, [*has, *JOINT_REPORT_COLUMNS])
         if what in has:
-            self._values.append((has[what], what, tables.turn_of(joint), self._width))
-            self._width += 1
+            self._values.append((has[what], what, tables.turn_of(joint), self._column_count))
+            self._column_count += 1
             return
-        self._report(first, JOINT_REPORT[what])
+        self._add_report(first, JOINT_REPORT_COLUMNS[what])
 
-    def _contact(self, name: str, owner: str, what: str) -> None:
+    def _add_contact(self, name: str, owner: str, what: str) -> None:
         first = self._sim._contact_column(owner)
-        self._choose(name, what, CONTACT_REPORT)
-        self._report(first, CONTACT_REPORT[what])
+        self._check_quantity(name, what, CONTACT_REPORT_COLUMNS)
+        self._add_report(first, CONTACT_REPORT_COLUMNS[what])
 
-    def _report(self, first: int, columns: tuple[int, int]) -> None:
+    def _add_report(self, first: int, columns: tuple[int, int]) -> None:
         begin, count = columns
         for k in range(count):
-            self._reports.append((first + begin + k, self._width))
-            self._width += 1
+            self._reports.append((first + begin + k, self._column_count))
+            self._column_count += 1
 
     # tables
 
@@ -145,7 +153,7 @@ class Observations:
             return [array(start, wp.int32), array(slot, wp.int32), array(weight, wp.float64)]
 
         points = self._points
-        self._motion = [
+        self._motion_tables = [
             *sums([(slots, weights) for slots, weights, *_ in points]),
             array([MOTION_KINDS[p[2]] for p in points], wp.int32),
             array(np.array([p[3] for p in points], dtype=float).reshape(-1, 3), wp.vec3d),
@@ -153,7 +161,7 @@ class Observations:
         ] if points else []  # fmt: skip
         vectors = [v for entry in self._values for v in (entry[0] + [entry[0][0]] * 2)[:3]]
         entries = [vector.entries() for vector in vectors]
-        self._joint_values = [
+        self._joint_value_tables = [
             *sums([(slots, weights) for slots, weights, _ in entries]),
             array(np.array([v.value for v in vectors], dtype=float).reshape(-1, 3), wp.vec3d),
             array([JOINT_VALUE_KINDS[v[1]] for v in self._values], wp.int32),
@@ -162,10 +170,10 @@ class Observations:
         ] if vectors else []  # fmt: skip
         reports = np.array(self._reports, dtype=np.int32).reshape(-1, 2)
         self._report_columns = [array(reports[:, k].copy(), wp.int32) for k in range(2)] if len(reports) else []
-        self._stepped: wp.array | None = None
+        self._stepped_flags: wp.array | None = None
         if self._report_columns:
-            own = self._sim.stepper.episodes.stepped
-            self._stepped = wp.zeros(m.worlds, dtype=wp.int32, device=m.device) if own is None else own
+            own = self._sim.stepper.episodes.stepped_flags
+            self._stepped_flags = wp.zeros(m.worlds, dtype=wp.int32, device=m.device) if own is None else own
 
     # use
 
@@ -173,17 +181,17 @@ class Observations:
         """Fill the table from the present state and the last step; returns `array`."""
         sim, k, B = self._sim, self._kernels, self._model.worlds
         state, launch = sim.state, sim.stepper.launch
-        if self._motion:
-            args = [*self._motion, state.displacement, state.velocity, self.array]
+        if self._motion_tables:
+            args = [*self._motion_tables, state.displacement, state.velocity, self.array]
             launch(k.point_motions, (B, len(self._points)), args)
-        if self._joint_values:
-            args = [*self._joint_values, state.displacement, state.constraint_target, self.array]
+        if self._joint_value_tables:
+            args = [*self._joint_value_tables, state.displacement, state.constraint_target, self.array]
             launch(k.joint_values, (B, len(self._values)), args)
         if self._report_columns:
-            assert self._stepped is not None
+            assert self._stepped_flags is not None
             if not sim.asynchronous:  # known on the host
-                self._stepped.assign(sim._stepped.astype(np.int32))
-            args = [*self._report_columns, sim.stepper.work.report, self._stepped, self.array]
+                self._stepped_flags.assign(sim._stepped_worlds.astype(np.int32))
+            args = [*self._report_columns, sim.stepper.work.report, self._stepped_flags, self.array]
             launch(k.report_columns, (B, len(self._reports)), args)
         for column in self._times:
             launch(k.world_values, B, [state.time, column, self.array])
@@ -203,4 +211,4 @@ class Observations:
         return self.array.__dlpack_device__()
 
     def __repr__(self) -> str:
-        return lines(f"Observations({', '.join(self.columns)}: {self._model.worlds} x {self._width})")
+        return lines(f"Observations({', '.join(self.columns)}: {self._model.worlds} x {self._column_count})")

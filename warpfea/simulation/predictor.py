@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from ..base.launch import Launcher
     from ..model.model import Model
     from ..model.state import State
-    from ..solvers.residual import Reducer
+    from ..solvers.residual import RowReducer
     from ..terms.workspace import Workspace
     from .integrators import Integrator
 
@@ -23,7 +23,7 @@ class Predictor:
     """Velocity extrapolation in the order with the smallest error in the last step; the history is in the state."""
 
     def __init__(
-        self, model: Model, work: Workspace, launch: Launcher, reduce: Reducer, state: State, module: wp.Module,
+        self, model: Model, work: Workspace, launch: Launcher, reduce: RowReducer, state: State, module: wp.Module,
         *, scheme: Integrator,
     ) -> None:  # fmt: skip
         self.model, self.work, self.launch, self.reduce, self.state = model, work, launch, reduce, state
@@ -35,9 +35,9 @@ class Predictor:
         self.control.sums = work.array("predictor sums", (PREDICTOR_ROWS, model.worlds), wp.float64)
         self.control.history_state = state.register("predictor", wp.float64, (4,))
         # multistep schemes store v_{n-1} already
-        self.own = not scheme.multistep
+        self.stores_velocity = not scheme.multistep
         field = model.types.vec3, (model.slots,)
-        before = state.register("predictor_before", *field) if self.own else state.previous_velocity
+        before = state.register("predictor_before", *field) if self.stores_velocity else state.previous_velocity
         self.previous_velocities = before, state.register("predictor_first", *field)
 
     def begin(self) -> None:
@@ -63,6 +63,8 @@ class Predictor:
         self.launch(self.kernels.order_error_terms, self.dim, [*args, w.rows])
         self.reduce(w.rows, PREDICTOR_ROWS, step.accepted, self.control.sums)
         self.launch(
-            self.kernels.shift_history, self.dim, [step, int(self.own), self.state.velocity, *self.previous_velocities]
+            self.kernels.shift_history,
+            self.dim,
+            [step, int(self.stores_velocity), self.state.velocity, *self.previous_velocities],
         )
         self.launch(self.kernels.choose_order, m.worlds, [self.control, step])

@@ -28,8 +28,8 @@ class Records(Results):
 
     stepper: Stepper
     _history: Any
-    _stepped: Any
-    _own_times: bool
+    _stepped_worlds: Any
+    _times_differ: bool
 
     def probe(self, name: str) -> ProbeRecord:
         """Record of the probe `name`, one entry per step. Raises ModelError listing the probes."""
@@ -37,26 +37,26 @@ class Records(Results):
         if name not in names:
             raise ModelError(f"probe {name!r} is unknown; there are: {listing(names)}{did_you_mean(name, names)}")
         k = names.index(name)
-        table = self._table([0, *range(1 + 6 * k, 7 + 6 * k)])
+        table = self._recorded_table([0, *range(1 + 6 * k, 7 + 6 * k)])
         d, v = table[:, :, 1:4], table[:, :, 4:7]
-        return ProbeRecord(self._times(table), self.model.probes[k].X + d, d, v)
+        return ProbeRecord(self._recorded_times(table), self.model.probes[k].X + d, d, v)
 
-    def _table(self, columns: list[int]) -> np.ndarray:
+    def _recorded_table(self, columns: list[int]) -> np.ndarray:
         """Recorded table (B, steps, columns): time, then the columns of the report from the probes on."""
         if self._history:
             return np.stack([rows[:, columns] for rows in self._history], axis=1)
         return np.zeros((self.model.worlds, 0, len(columns)))
 
-    def _times(self, table: np.ndarray) -> np.ndarray:
+    def _recorded_times(self, table: np.ndarray) -> np.ndarray:
         """Recorded times (steps,), s, or (B, steps) with times per world."""
-        return table[:, :, 0] if self._own_times else table[:, :, 0].max(axis=0)
+        return table[:, :, 0] if self._times_differ else table[:, :, 0].max(axis=0)
 
     def joint_record(self, joint: Joint | str) -> JointRecord:
         """Record of a joint (handle or name), one entry per step."""
         first = 1 + self._joint_column(joint) - len(REPORT_COLUMNS)
         columns = [0, *range(first, first + JOINT_COLUMNS)]
-        table = self._table(columns)
-        return JointRecord(self._times(table), table[:, :, 1:4], table[:, :, 4:7], table[:, :, 7])
+        table = self._recorded_table(columns)
+        return JointRecord(self._recorded_times(table), table[:, :, 1:4], table[:, :, 4:7], table[:, :, 7])
 
     def joint_force(self, joint: Joint | str) -> np.ndarray:
         """Force (N) and moment about the anchor (N m) that a joint exerts on its child at the last accepted step.
@@ -65,7 +65,7 @@ class Records(Results):
         """
         first = self._joint_column(joint)
         out = self.stepper.work.report.numpy()[:, first : first + 6].copy()
-        out[~self._stepped] = np.nan
+        out[~self._stepped_worlds] = np.nan
         return out
 
     def violation(self, joint: Joint | str) -> np.ndarray:
@@ -77,7 +77,7 @@ class Records(Results):
         values = np.abs(self.model.constraint_values(self.state)[:, constraints.rows_of[k]]).max(axis=1)
         # right-hand sides of the last step if it led to this state: statics resets its time
         column = self._joint_column(joint) + 6
-        return np.where(self._stepped, self.stepper.work.report.numpy()[:, column], values)
+        return np.where(self._stepped_worlds, self.stepper.work.report.numpy()[:, column], values)
 
     def joint_value(self, joint: Joint | str, what: str | None = None) -> np.ndarray:
         """Angle (rad) of a revolute or cylindrical joint, travel (m) of a translational, length (m) of a distance.
@@ -110,10 +110,10 @@ class Records(Results):
     def contact_record(self, contact: Contact | PairContact | str) -> ContactRecord:
         """Record of a contact (handle or name), one entry per step."""
         first = 1 + self._contact_column(contact) - len(REPORT_COLUMNS)
-        table = self._table([0, *range(first, first + len(RECORD_NAMES))])
+        table = self._recorded_table([0, *range(first, first + len(RECORD_NAMES))])
         names = ("normal_force", "penetration", "slip", "area", "stick", "stored", "loss", "friction", "collider_work")
         scalars = {name: table[:, :, 1 + RECORD_NAMES.index(name)] for name in names}
-        return ContactRecord(self._times(table), table[:, :, 1:4], table[:, :, 4:7], **scalars)
+        return ContactRecord(self._recorded_times(table), table[:, :, 1:4], table[:, :, 4:7], **scalars)
 
     def contact_force(self, contact: Contact | PairContact | str) -> np.ndarray:
         """Force (N) and moment about the origin (N m) of a contact on its body over the last accepted step.
@@ -122,7 +122,7 @@ class Records(Results):
         """
         first = self._contact_column(contact)
         out = self.stepper.work.report.numpy()[:, first : first + 6].copy()
-        out[~self._stepped] = np.nan
+        out[~self._stepped_worlds] = np.nan
         return out
 
     def _contact_column(self, contact: Contact | PairContact | str) -> int:

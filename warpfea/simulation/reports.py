@@ -10,8 +10,16 @@ import numpy as np
 from ..base.errors import ModelError
 from ..base.short_repr import use_short_repr
 
-__all__ = ["ContactRecord", "JointRecord", "PendingReport", "ProbeRecord", "StepReport", "describe", "idle_report",
-           "step_text"]  # fmt: skip
+__all__ = [
+    "ContactRecord",
+    "JointRecord",
+    "PendingReport",
+    "ProbeRecord",
+    "StepReport",
+    "idle_report",
+    "simulation_text",
+    "step_text",
+]  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +174,7 @@ def step_text(dt: Any) -> str:
     return f"{low:g} s" if low == high else f"{low:g} to {high:g} s"
 
 
-def describe(sim: Any) -> str:
+def simulation_text(sim: Any) -> str:
     """One-line description of a simulation."""
     m, steps = sim.model, sim.steps
     dt = step_text(sim.dt) if sim.error is None else f"auto, error = {sim.error:g}"

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = ["FIELDS", "Results"]
 
-SHOWN = 5
+MAX_NAMED_BODIES = 5
 """Maximum number of bodies named in a message."""
 
 FIELDS = {"von_mises": FieldSpec("von Mises stress", "Pa"), "displacement": FieldSpec("displacement", "m")}
@@ -42,8 +42,12 @@ class Results:
     def check_body(self, body: Any, what: str) -> None:
         """Raise ModelError unless `body` is the handle of a body of this model; the text begins with `what`."""
         if not isinstance(body, Body):
-            names = ", ".join(repr(b.name) for b in self.model.bodies[:SHOWN])
-            names += f" and {len(self.model.bodies) - SHOWN} more" if len(self.model.bodies) > SHOWN else ""
+            names = ", ".join(repr(b.name) for b in self.model.bodies[:MAX_NAMED_BODIES])
+            names += (
+                f" and {len(self.model.bodies) - MAX_NAMED_BODIES} more"
+                if len(self.model.bodies) > MAX_NAMED_BODIES
+                else ""
+            )
             raise ModelError(
                 f"{what}: expected a body, by the handle that add_solid, add_beam or add_shell returned (of {names}), "
                 f"got {body!r}"
@@ -51,7 +55,7 @@ class Results:
         if body not in self.model.bodies:
             raise ModelError(f"{what}: body {body.name!r} is not of this model")
 
-    def _rows(self, body: Body, values: np.ndarray) -> np.ndarray:
+    def _at_mesh_nodes(self, body: Body, values: np.ndarray) -> np.ndarray:
         """Slot values at mesh nodes, (B, nodes, 3); 0 at nodes without an element."""
         out = np.zeros((self.model.worlds, len(body.mesh.points), 3))
         used = body.mesh.used_nodes
@@ -62,7 +66,7 @@ class Results:
         """Nodal displacements (B, nodes, 3), m, in the mesh file's node order. ModelError for a body of another
         model."""
         self.check_body(body, "displacements")
-        return self._rows(body, self.state.displacement.numpy())
+        return self._at_mesh_nodes(body, self.state.displacement.numpy())
 
     def positions(self, body: Body) -> np.ndarray:
         """Nodal positions (B, nodes, 3), m. ModelError for a body of another model."""
@@ -72,7 +76,7 @@ class Results:
     def velocities(self, body: Body) -> np.ndarray:
         """Nodal velocities (B, nodes, 3), m/s. ModelError for a body of another model."""
         self.check_body(body, "velocities")
-        return self._rows(body, self.state.velocity.numpy())
+        return self._at_mesh_nodes(body, self.state.velocity.numpy())
 
     def point_positions(self, body: Body, weights: Any) -> np.ndarray:
         """Current positions (B, P, 3), m, of material points given by sparse weights (P, slots of the body)."""

@@ -32,7 +32,7 @@ def run_steps(
     opened: list[Any] = []
     cut = False
 
-    def each(do: Callable[[Any], Any], outs: Sequence[Any]) -> None:
+    def call_each(do: Callable[[Any], Any], outs: Sequence[Any]) -> None:
         began = clock.perf_counter()
         try:
             for out in outs:
@@ -40,14 +40,14 @@ def run_steps(
         finally:
             sim.output_s += clock.perf_counter() - began
 
-    def open_one(out: Any) -> None:
+    def open_output(out: Any) -> None:
         opened.append(out)
         out.open(sim)
 
     with interruptible() as interrupted, step_bar(total, t_end, progress, static=sim.load is not None) as bar:
         try:
-            each(open_one, outputs)
-            each(lambda out: out.write(sim), opened)
+            call_each(open_output, outputs)
+            call_each(lambda out: out.write(sim), opened)
         except BaseException:  # interrupted before the first step: discard the files
             for out in opened:
                 out.abort()
@@ -55,7 +55,7 @@ def run_steps(
         try:
             for done in range(1, total + 1):
                 report = sim.step()
-                each(lambda out: out.write(sim), opened)
+                call_each(lambda out: out.write(sim), opened)
                 bar(report)
                 answer = None if on_step is None else on_step(sim)
                 if isinstance(answer, (bool, np.bool_)) and not answer:
@@ -66,7 +66,7 @@ def run_steps(
         except BaseException:
             close_all(opened, sim)
             raise
-        each(lambda out: close_all(out, sim, quiet=False), [opened])
+        call_each(lambda out: close_all(out, sim, quiet=False), [opened])
         if cut:
             raise KeyboardInterrupt
 

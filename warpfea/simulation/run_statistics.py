@@ -17,7 +17,8 @@ from .reports import StepReport
 
 __all__ = ["RunStatistics"]
 
-COUNTERS = ("newton", "pcg", "rough", "floored")
+COUNTED_TOTALS = ("newton", "pcg", "rough", "floored")
+"""Keys of `totals`: Newton and PCG iterations, steps accepted above the tolerance, and at the round-off limit."""
 
 
 class SyncedAttribute:
@@ -54,8 +55,8 @@ class RunStatistics(Records):
     max_floor: Any = SyncedAttribute()
     max_violation: Any = SyncedAttribute()
     min_J: Any = SyncedAttribute()
-    _stepped: Any = SyncedAttribute()
-    _failed: np.ndarray
+    _stepped_worlds: Any = SyncedAttribute()
+    _failed_worlds: np.ndarray
     _history: Any = SyncedAttribute()
     on_failure: str | None
     record: bool
@@ -63,15 +64,15 @@ class RunStatistics(Records):
 
     def _reset_statistics(self, asynchronous: bool) -> None:
         B = self.model.worlds
-        self.asynchronous, self._unsynced, self._own_times = asynchronous, False, False
+        self.asynchronous, self._unsynced, self._times_differ = asynchronous, False, False
         self.steps = 0
         self.last = None
-        self.totals = {name: np.zeros(B, int) for name in COUNTERS}
-        if self.stepper.adaptive:
+        self.totals = {name: np.zeros(B, int) for name in COUNTED_TOTALS}
+        if self.stepper.step_size_control:
             self.totals |= {name: np.zeros(B, int) for name in ("substeps", "rejected")}
         self.max_residual = self.max_floor = self.max_violation = 0.0
         self.min_J = math.inf
-        self._stepped, self._failed = (np.zeros(B, dtype=bool) for _ in range(2))
+        self._stepped_worlds, self._failed_worlds = (np.zeros(B, dtype=bool) for _ in range(2))
         self._history = []
 
     def _sync_from_device(self) -> None:
@@ -81,24 +82,24 @@ class RunStatistics(Records):
         self._unsynced = False
         sums, stepped = self.stepper.episodes.read_totals()
         rows = self.stepper.work.report.numpy()
-        self.last = self._report_of(rows)
-        for name in COUNTERS:
+        self.last = self._make_report(rows)
+        for name in COUNTED_TOTALS:
             self.totals[name] += sums[:, RUN_STATISTICS.index(name)].astype(int)
         for name in ("residual", "floor", "violation"):
             key = f"max_{name}"
             setattr(self, key, max(getattr(self, key), float(sums[:, RUN_STATISTICS.index(name)].max())))
         self.min_J = min(self.min_J, float(sums[:, RUN_STATISTICS.index("min_J")].min()))
         self.energy_growth.warn_once(self, sums[:, RUN_STATISTICS.index("energy_growth")])
-        self._stepped = stepped
-        if self._recorded:
+        self._stepped_worlds = stepped
+        if self._records_columns:
             self._history = [self._history_row(rows)]
 
     def _clear_stepped(self, mask: np.ndarray) -> None:
         """Mark worlds as not stepped since their state was set."""
-        self._stepped[mask] = False
+        self._stepped_worlds[mask] = False
         self.stepper.episodes.clear_stepped(mask)
 
-    def _report_of(self, rows: np.ndarray) -> StepReport:
+    def _make_report(self, rows: np.ndarray) -> StepReport:
         """Report of a step from its columns (worlds, columns)."""
         column = {name: rows[:, k].copy() for k, name in enumerate(REPORT_COLUMNS)}
         status = column["status"].astype(int)
@@ -117,20 +118,20 @@ class RunStatistics(Records):
             residual_force=column["residual_force"],
             floor=column["floor"],
             energy_growth=column["energy_growth"],
-            **(self.stepper.adaptive.counts() if self.stepper.adaptive else {}),
+            **(self.stepper.step_size_control.step_statistics() if self.stepper.step_size_control else {}),
         )
 
     def _record_step(self, rows: np.ndarray) -> None:
         """Accumulate the statistics of a step (worlds, columns); raise for failed worlds if requested."""
-        last = self.last = self._report_of(rows)
+        last = self.last = self._make_report(rows)
         failed = last.status == STATUS["failed"]
-        fresh, self._failed = failed & ~self._failed, failed
+        fresh, self._failed_worlds = failed & ~self._failed_worlds, failed
         self.steps += 1
         good = last.status == STATUS["running"]
-        self._stepped |= good
-        self._stepped &= last.status != STATUS["failed"]
+        self._stepped_worlds |= good
+        self._stepped_worlds &= last.status != STATUS["failed"]
         totals = self.totals
-        if self.stepper.adaptive:
+        if self.stepper.step_size_control:
             totals["substeps"] += last.substeps
             totals["rejected"] += last.rejected
         totals["newton"] += last.newton
@@ -142,7 +143,7 @@ class RunStatistics(Records):
             self.max_floor = max(self.max_floor, float(last.floor[good].max()))
             self.max_violation = max(self.max_violation, float(last.violation[good].max()))
             self.min_J = min(self.min_J, float(last.min_J[good].min()))
-        if self._recorded:
+        if self._records_columns:
             if not self.record:
                 self._history.clear()
             self._history.append(self._history_row(rows))
@@ -152,26 +153,26 @@ class RunStatistics(Records):
             if fatal:
                 if not good.any():  # no world advanced
                     self.steps -= 1
-                    if self._recorded:
+                    if self._records_columns:
                         self._history.pop()
-                raise self._failure(int(np.flatnonzero(fresh)[0]))
+                raise self._failure_error(int(np.flatnonzero(fresh)[0]))
 
     def _history_row(self, rows: np.ndarray) -> np.ndarray:
         """Recorded columns of a report: time, probes, and term columns, NaN for worlds that did not step."""
         row = rows[:, [REPORT_COLUMNS.index("time"), *range(len(REPORT_COLUMNS), rows.shape[1])]].copy()
-        row[~self._stepped, 1 + 6 * len(self.model.probes) :] = np.nan
+        row[~self._stepped_worlds, 1 + 6 * len(self.model.probes) :] = np.nan
         return row
 
     @property
-    def _recorded(self) -> bool:
+    def _records_columns(self) -> bool:
         """True if any quantity is recorded per step."""
         return self.model.terms.report_width > len(REPORT_COLUMNS)
 
-    def _failure(self, world: int) -> ConvergenceError | ConstraintError:
+    def _failure_error(self, world: int) -> ConvergenceError | ConstraintError:
         """Error of a failed world; its status is cleared so that a caller may retry with another dt."""
         error = step_error(self, world)
         status = self.state.status.numpy()
         status[status == STATUS["failed"]] = STATUS["running"]
         self.state.status.assign(status)
-        self._failed[:] = False
+        self._failed_worlds[:] = False
         return error

@@ -36,10 +36,10 @@ from .checks import (
     write_times,
 )
 from .controls import Controls
-from .energy_growth import CHOICES, EnergyGrowth
+from .energy_growth import ENERGY_GROWTH_CHOICES, EnergyGrowth
 from .failures import check_initial_constraints
 from .observations import Observations
-from .reports import ContactRecord, JointRecord, PendingReport, ProbeRecord, StepReport, describe, idle_report
+from .reports import ContactRecord, JointRecord, PendingReport, ProbeRecord, StepReport, idle_report, simulation_text
 from .run_loop import run_steps
 from .run_statistics import RunStatistics
 from .stepper import Stepper
@@ -115,12 +115,12 @@ class Simulation(RunStatistics):
         energy_growth: str = "refuse",
         on_compile: Callable[[int, int, str], None] | None = None,
     ) -> None:
-        scheme, options = integrators.get(integrator), solvers.get(solver)
+        scheme, options = integrators.find_integrator(integrator), solvers.solver_options(solver)
         check_model(model)
         if not scheme.static:
             require_density(model.bodies, "motion")
         check_choice("inversion", inversion, "refuse", "report")
-        check_choice("energy_growth", energy_growth, *CHOICES)
+        check_choice("energy_growth", energy_growth, *ENERGY_GROWTH_CHOICES)
         self.energy_growth = EnergyGrowth(energy_growth, ledger=ledger, static=scheme.static)
         if on_failure is not None:
             check_choice("on_failure", on_failure, "raise", "freeze")
@@ -163,8 +163,8 @@ class Simulation(RunStatistics):
         self.compile_s, self.output_s = clock.perf_counter() - began, 0.0
         self.error = adapt.error if adapt else None
         self._reset_statistics(asynchronous)
-        self._start: State | None = None
-        self._start_of = -1
+        self._initial_state: State | None = None
+        self._initial_state_writes = -1
         if not isinstance(dt, str):
             self.dt = dt
         if t_end is not None:
@@ -174,7 +174,7 @@ class Simulation(RunStatistics):
         self._load: np.ndarray | None = None
 
     def __repr__(self) -> str:
-        return describe(self)
+        return simulation_text(self)
 
     # stepping
 
@@ -182,20 +182,20 @@ class Simulation(RunStatistics):
     def dt(self) -> Any:
         """Step, s, or (worlds,) if set per world; for dt="auto" the synchronisation interval, NaN before the first run
         or step sets it; a longer run sets it again."""
-        if self.stepper.adaptive:
-            return self.stepper.adaptive.sync_times.interval
+        if self.stepper.step_size_control:
+            return self.stepper.step_size_control.sync_times.interval
         return self.stepper.work.step.dt.numpy().copy() if self._dt is None else self._dt
 
     @dt.setter
     def dt(self, value: Any) -> None:
-        if self.stepper.adaptive:
+        if self.stepper.step_size_control:
             raise ModelError(f"dt = {value!r}: this simulation was made with dt = 'auto'")
         check_times("dt", value, self.model, positive=True)
         one = isinstance(value, (int, float, np.floating))
         if not one and (self.integrator.static or self.integrator.accelerated):
             raise ModelError(f"dt = {value!r}: integrator {self.integrator.name!r} takes one step for all worlds")
         self._dt = float(value) if one else None
-        self._own_times |= not one
+        self._times_differ |= not one
         self.stepper.set_dt(self._dt if one else value)
 
     @property
@@ -210,7 +210,7 @@ class Simulation(RunStatistics):
         if ends is None:
             raise ModelError(f"t_end = {value!r}: this simulation was made without; give t_end to Simulation")
         check_times("t_end", value, self.model)
-        self._own_times |= not isinstance(value, (int, float, np.floating))
+        self._times_differ |= not isinstance(value, (int, float, np.floating))
         write_times(ends, value)
 
     @property
@@ -250,8 +250,8 @@ class Simulation(RunStatistics):
         """
         check_steps(count)
         for _ in range(count):
-            if self.stepper.adaptive:
-                self.stepper.adaptive.set_interval(self.time)
+            if self.stepper.step_size_control:
+                self.stepper.step_size_control.set_interval(self.time)
             self.stepper.update_parameters()
             self.stepper.run()
             if self.asynchronous:
@@ -293,7 +293,7 @@ class Simulation(RunStatistics):
             raise ModelError("run: worlds have times of their own; take step(count), and t_end of Simulation")
         alive = self.status == STATUS["running"]
         now = float(self.time[alive].min()) if alive.any() else t_end
-        adaptive = self.stepper.adaptive
+        adaptive = self.stepper.step_size_control
         if t_end < now - (0.0 if adaptive else SAME_TIME_FRACTION * self.dt):
             raise ModelError(f"t_end = {t_end:g} s lies in the past: the simulation is at t = {now:.6g} s")
         if adaptive:
@@ -346,7 +346,7 @@ class Simulation(RunStatistics):
         mask = worlds_mask("reset", mask, self.model.worlds)
         source = self.model.state() if state is None else state
         check_state(self.model, source)
-        self._own_times |= bool(mask.any() and not mask.all())
+        self._times_differ |= bool(mask.any() and not mask.all())
         fresh = source.numpy()
         values = self.state.numpy()
         for name, array in values.items():
@@ -365,26 +365,26 @@ class Simulation(RunStatistics):
         check_mask(mask, self.model)
         if state is None:
             written = self.model.terms.written
-            if self._start is None or self._start_of != written:
-                self._start, self._start_of = self._initial(), written
-            state = self._start
+            if self._initial_state is None or self._initial_state_writes != written:
+                self._initial_state, self._initial_state_writes = self._make_initial_state(), written
+            state = self._initial_state
         check_state(self.model, state)
         if lacks := [name for name in self.state.names if name not in state.names]:
             raise ModelError(f"reset: state lacks {listing(lacks)}: pass a copy of sim.state")
-        self._own_times = True
-        flags = self.stepper.episodes.as_flags(mask)
+        self._times_differ = True
+        flags = self.stepper.episodes.copy_mask_to_flags(mask)
         self.state.copy_rows(self.stepper.launch, flags, state)
         self.stepper.accept_device_reset(flags)
         if self.asynchronous:
             self.stepper.episodes.clear_stepped(flags)
             self._unsynced = True
         else:
-            self._stepped[flags.numpy() != 0] = False
+            self._stepped_worlds[flags.numpy() != 0] = False
 
-    def _initial(self) -> State:
+    def _make_initial_state(self) -> State:
         """Initial state of a simulation from the model's initial state, without changing the present one."""
         self.stepper.update_parameters()
-        now, stepped = self.state.copy(), self._stepped.copy()
+        now, stepped = self.state.copy(), self._stepped_worlds.copy()
         everyone = wp.ones(self.model.worlds, dtype=wp.int32, device=self.model.device)
         try:
             self.reset()
@@ -392,9 +392,9 @@ class Simulation(RunStatistics):
         finally:
             self.state.copy_rows(self.stepper.launch, everyone, now)
             self.stepper.accept_device_reset(everyone, restart=False)
-            self._stepped = stepped
-            if self.stepper.episodes.stepped is not None:
-                self.stepper.episodes.stepped.assign(stepped.astype(np.int32))
+            self._stepped_worlds = stepped
+            if self.stepper.episodes.stepped_flags is not None:
+                self.stepper.episodes.stepped_flags.assign(stepped.astype(np.int32))
 
     def observe(self, *names: str) -> Observations:
         """Observation table of all worlds on the device, see Observations."""
@@ -429,7 +429,7 @@ class Simulation(RunStatistics):
         first = nodes.body.node_slot[nodes.indices]
         rows = nodes.body.slot_offset + first[first >= 0]
         total = g[:, rows].sum(axis=1).astype(float)
-        total[~self._stepped] = np.nan
+        total[~self._stepped_worlds] = np.nan
         return total
 
     def resume(self, path: Any) -> None:
@@ -437,7 +437,7 @@ class Simulation(RunStatistics):
         from .checkpoint import load_checkpoint
 
         load_checkpoint(self, path)
-        self._start = None
+        self._initial_state = None
         self._clear_stepped(np.ones(self.model.worlds, bool))
 
     def bytes(self) -> dict[str, int]:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Springs", "spring_stiffness"]
 
-DEFAULT_STIFFNESS = 1e-3
+DEFAULT_STIFFNESS_RATIO = 1e-3
 """Default stiffness, over E / (density size^2) of the stiffest body."""
 
 
@@ -36,9 +36,9 @@ def spring_stiffness(model: Model, stabilise: Any) -> float:
     if stabilise is not True:
         return float(stabilise)
     stiffest = max(
-        effective_modulus(b)[0] * float(element_volumes(b).sum()) / model.masses.of_body(b) for b in model.bodies
+        effective_modulus(b)[0] * float(element_volumes(b).sum()) / model.masses.total_of_body(b) for b in model.bodies
     )
-    return DEFAULT_STIFFNESS * stiffest / model.size**2
+    return DEFAULT_STIFFNESS_RATIO * stiffest / model.size**2
 
 
 class Springs(Output):

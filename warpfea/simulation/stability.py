@@ -3,9 +3,9 @@
 Conjugate gradients on H from a random force r_0, preconditioned by B as in the solves (Lanczos' method in the inner
 product of B). A direction p with p.H p < 0 proves an equilibrium unstable. If all curvatures are positive, a mode phi
 with H phi = -mu B^-1 phi, mu > 0, has phi.r_k = phi.r_0 prod(1 + mu / theta_i) with positive Ritz values theta_i: its
-part of the residual never decreases. Once the residual norm has fallen to REDUCTION, such a mode would have held less
-than that fraction of the random force (Kuczynski and Wozniakowski 1992 bound the probability). The coefficients of the
-solves themselves don't suffice: a load may not excite the mode.
+part of the residual never decreases. Once the residual norm has fallen to RESIDUAL_REDUCTION, such a mode would have
+held less than that fraction of the random force (Kuczynski and Wozniakowski 1992 bound the probability). The
+coefficients of the solves themselves don't suffice: a load may not excite the mode.
 
 The mode of least w = p.H p / p.M p follows by locally optimal conjugate gradients (Knyazev 2001), from the direction
 found. A float32 state uses the float64 tangent of a copy of the model unless all float32 curvatures are far above
@@ -23,28 +23,28 @@ import scipy.linalg
 import warp as wp
 
 from ..base.errors import StabilityError, StabilityWarning
-from ..model.state import is_solver_memory
+from ..model.state import is_solver_history
 from ..solvers import NewtonPCG
 from ..terms.term import Term
 from .simulation import Simulation
 
 __all__ = ["Stability", "check_stability", "report_unstable"]
 
-REDUCTION = 1e-4
+RESIDUAL_REDUCTION = 1e-4
 """Relative residual, B norm, at which the search ends."""
 ITERATIONS, SOLVE_FACTOR, MAX_ITERATIONS = 500, 0.3, 20_000
 """Iteration limits: larger of ITERATIONS and SOLVE_FACTOR times the solve's; with unstable="refuse" MAX_ITERATIONS."""
-CURVATURE_ROUNDINGS = 64.0
+MIN_CURVATURE_ROUNDINGS = 64.0
 """Round-off units of p.D p (D: diagonal of H) below which the sign of p.H p is unknown."""
-CLEAR_ROUNDINGS = 1024.0
+MIN_CLEAR_ROUNDINGS = 1024.0
 """The same units: float32 curvatures above need no float64 tangent."""
-ROUNDOFF_CHANGES = 4.0
+MIN_ROUND_OFF_CHANGES = 4.0
 """Smallest float32 |p.H p| of known sign, over its change by one more rounding of the state."""
 MODE_ITERATIONS, MODE_CHANGE = 60, 1e-4
 """Iteration limit of the mode search, and the relative change of w at which it ends."""
 TANGENT_TOL = 1e-3
 """Largest accepted relative difference between the true tangent of non-potential forces and that in H."""
-FLOAT64_SLOTS = 200_000
+MAX_FLOAT64_SLOTS = 200_000
 """Largest number of slots of all worlds for a float64 copy (about 7 kB each) of a float32 model."""
 
 
@@ -118,11 +118,11 @@ def check_stability(sim: Simulation, *, every: bool = False) -> Stability:
     for world, contact in _friction_contacts(sim):
         out.reasons[world] = f"contact {contact!r} has friction"
     single = model.dtype == "float32"
-    if single and not every and model.worlds * model.slots > FLOAT64_SLOTS:
+    if single and not every and model.worlds * model.slots > MAX_FLOAT64_SLOTS:
         out.reasons[:] = [text or "the float32 model is large; unstable='refuse' judges it" for text in out.reasons]
     if all(out.reasons):
         return out
-    if single and not sim.stepper.newton.direct and _clear(sim, out):
+    if single and not sim.stepper.newton.direct and _stable_in_float32(sim, out):
         return out
     # an inverse of an indefinite H is no preconditioner
     probe = TangentOperator(_float64_copy(sim) if single or sim.stepper.newton.direct else sim)
@@ -141,21 +141,21 @@ def check_stability(sim: Simulation, *, every: bool = False) -> Stability:
         _check_roundoff(probe, sim, out, curvature, p)
     unstable = np.array([s is False for s in out.stable])
     if unstable.any():
-        out.mode[unstable] = _mode(probe, unstable, p)[unstable]
+        out.mode[unstable] = _unstable_modes(probe, unstable, p)[unstable]
     return out
 
 
-def _clear(sim: Simulation, out: Stability) -> bool:
+def _stable_in_float32(sim: Simulation, out: Stability) -> bool:
     """Decide by the float32 tangent if all its curvatures are far above round-off; False if float64 is needed.
 
-    H in float32 is off by some roundings of p.D p: a world whose curvature exceeds CLEAR_ROUNDINGS of them in each
+    H in float32 is off by some roundings of p.D p: a world whose curvature exceeds MIN_CLEAR_ROUNDINGS of them in each
     direction of the search is stable. Unstable worlds and forces without a potential need float64.
     """
     if any(not term.potential for term in sim.model.terms):
         return False
     found = Stability(out.stable.copy(), list(out.reasons), out.mode, out.iterations.copy())
     most = np.full(sim.model.worlds, ITERATIONS)
-    _find_negative_curvature(TangentOperator(sim), found, most, CLEAR_ROUNDINGS)
+    _find_negative_curvature(TangentOperator(sim), found, most, MIN_CLEAR_ROUNDINGS)
     if any(s is not True and not reason for s, reason in zip(found.stable, out.reasons)):
         return False
     out.stable[:], out.iterations[:] = found.stable, found.iterations
@@ -182,7 +182,7 @@ class TangentOperator:
     def __init__(self, sim: Simulation) -> None:
         self.sim, self.model, self.stepper = sim, sim.model, sim.stepper
         self.residual, self.work = sim.stepper.newton.residual, sim.stepper.work
-        self.free = self.model.free_host[None]
+        self.free_components = self.model.free_host[None]
         self.linearise()
 
     def linearise(self) -> None:
@@ -194,7 +194,7 @@ class TangentOperator:
         w.newton.predicted_stress.zero_()
         self.residual.assemble_matrix(every)
         self.stepper.newton.preconditioner.prepare(every)
-        self.diagonal = np.where(self.free > 0.0, w.diagonal.numpy().astype(float), 1.0)
+        self.diagonal = np.where(self.free_components > 0.0, w.diagonal.numpy().astype(float), 1.0)
 
     def flags(self, chosen: np.ndarray) -> wp.array:
         """Device mask of worlds."""
@@ -205,17 +205,17 @@ class TangentOperator:
         w = self.work
         w.p.assign(p)
         self.residual.product(w.p, w.Hp, self.flags(chosen))
-        return self._read(w.Hp, chosen)
+        return self._host_values(w.Hp, chosen)
 
     def precondition(self, r: np.ndarray, chosen: np.ndarray) -> np.ndarray:
         """Preconditioner application B r."""
         w = self.work
         w.r.assign(r)
         self.stepper.newton.preconditioner.apply(w.r, w.z, self.flags(chosen))
-        return self._read(w.z, chosen)
+        return self._host_values(w.z, chosen)
 
-    def _read(self, array: wp.array, chosen: np.ndarray) -> np.ndarray:
-        return np.where(chosen[:, None, None], array.numpy().astype(float) * self.free, 0.0)
+    def _host_values(self, array: wp.array, chosen: np.ndarray) -> np.ndarray:
+        return np.where(chosen[:, None, None], array.numpy().astype(float) * self.free_components, 0.0)
 
     def unsymmetric_forces(self) -> np.ndarray:
         """Flags (worlds,) of non-potential forces whose tangent differs from that in H: unsymmetric (pressure on an
@@ -225,7 +225,7 @@ class TangentOperator:
         if not terms:
             return np.zeros(m.worlds, dtype=bool)
         every, u = self.flags(np.ones(m.worlds)), w.u.numpy().copy()  # a view on the CPU
-        gather = self.residual.gather.gather_force
+        gather = self.residual.gather_kernels.gather_force
 
         def gathered(call: str, pool: wp.array, *more: Any) -> np.ndarray:
             pool.zero_()
@@ -233,10 +233,10 @@ class TangentOperator:
                 if call != "product" or type(term).product is not Term.product:
                     getattr(term, call)(ctx, *more, every)
             ctx.launch(gather, (m.worlds, m.slots), [m.terms.side_topology, pool, every, w.Hp])
-            return self._read(w.Hp, np.ones(m.worlds, dtype=bool))
+            return self._host_values(w.Hp, np.ones(m.worlds, dtype=bool))
 
         step = 1e-5 * m.size
-        p = step * np.random.default_rng(2).standard_normal(u.shape) * self.free
+        p = step * np.random.default_rng(2).standard_normal(u.shape) * self.free_components
         forces = []
         for sign in (1.0, -1.0, 0.0):
             w.u.assign(u + sign * p)
@@ -262,17 +262,17 @@ def _find_negative_curvature(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Lanczos search for p.H p < 0 in undecided worlds, at most `most` (worlds,) iterations; sets `stable`, `reasons`.
 
-    Curvatures below `roundings` round-off units, by default CURVATURE_ROUNDINGS, have no sign.
+    Curvatures below `roundings` round-off units, by default MIN_CURVATURE_ROUNDINGS, have no sign.
 
     Returns p.H p (worlds,) and the deciding directions p: the first negative one or the softest.
     """
     m = probe.model
     solver = probe.sim.solver
-    kappa = solver.kappa(m.dtype) if m.constraints and isinstance(solver, NewtonPCG) else 0.0
-    rounding = (roundings or CURVATURE_ROUNDINGS) * (1.0 + kappa) * float(np.finfo(m.dtype).eps)
+    kappa = solver.penalty_ratio(m.dtype) if m.constraints and isinstance(solver, NewtonPCG) else 0.0
+    rounding = (roundings or MIN_CURVATURE_ROUNDINGS) * (1.0 + kappa) * float(np.finfo(m.dtype).eps)
     going = np.array([not reason for reason in out.reasons])
     random = np.random.default_rng(1).standard_normal((m.slots, 3))
-    r = np.where(going[:, None, None], random * probe.free, 0.0)  # equal in all worlds
+    r = np.where(going[:, None, None], random * probe.free_components, 0.0)  # equal in all worlds
     z = probe.precondition(r, going)
     p, rz = z.copy(), _dot(r, z)
     first, softest, curvature = rz.copy(), np.full(m.worlds, np.inf), np.zeros(m.worlds)
@@ -295,7 +295,7 @@ def _find_negative_curvature(
         r = r - alpha * Hp
         z = probe.precondition(r, going)
         new = _dot(r, z)
-        done = going & (new <= REDUCTION**2 * first)
+        done = going & (new <= RESIDUAL_REDUCTION**2 * first)
         out.stable[done] = True
         going = going & ~done
         for world in np.flatnonzero(going & (count >= most)):
@@ -315,13 +315,18 @@ def _check_roundoff(
 ) -> None:
     """Set the sign of p.H p to unknown if float32 round-off of the state can change it."""
     state, u = probe.sim.state, sim.state.displacement.numpy().astype(float)
-    shift = np.random.default_rng(3).uniform(-0.5, 0.5, u.shape) * np.finfo("float32").eps * np.abs(u) * probe.free
+    shift = (
+        np.random.default_rng(3).uniform(-0.5, 0.5, u.shape)
+        * np.finfo("float32").eps
+        * np.abs(u)
+        * probe.free_components
+    )
     state.displacement.assign(u + shift)
     _evaluate_state(probe.stepper)
     probe.linearise()
     change = np.abs(_dot(p, probe.product(p, np.ones(len(u), dtype=bool))) - curvature)
     for world in range(len(u)):
-        if out.stable[world] is not None and abs(curvature[world]) <= ROUNDOFF_CHANGES * change[world]:
+        if out.stable[world] is not None and abs(curvature[world]) <= MIN_ROUND_OFF_CHANGES * change[world]:
             out.stable[world], out.reasons[world] = None, "within the rounding of float32"
     if all(s is not False for s in out.stable):
         return
@@ -330,14 +335,14 @@ def _check_roundoff(
     probe.linearise()
 
 
-def _mode(probe: TangentOperator, chosen: np.ndarray, x: np.ndarray) -> np.ndarray:
+def _unstable_modes(probe: TangentOperator, chosen: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Modes of least p.H p / p.M p (worlds, slots, 3), largest displacement 1 m, from directions x."""
     m = probe.model
     x = np.where(chosen[:, None, None], x, 0.0)
-    masses = [m.masses.of_world(world) if m.masses.varied else m.mass_host for world in range(m.worlds)]
+    masses = [m.masses.world_matrix(world) if m.masses.varies_by_world else m.mass_host for world in range(m.worlds)]
 
     def mass(v: np.ndarray) -> np.ndarray:
-        return np.stack([masses[b] @ v[b] if chosen[b] else v[b] for b in range(m.worlds)]) * probe.free
+        return np.stack([masses[b] @ v[b] if chosen[b] else v[b] for b in range(m.worlds)]) * probe.free_components
 
     before, basis, going = np.full(m.worlds, np.finfo(float).max), [x], chosen.copy()
     H, M = [probe.product(x, going)], [mass(x)]
@@ -377,7 +382,7 @@ def _float64_copy(sim: Simulation) -> Simulation:
         model.cache["float64"] = model.resized(model.worlds, dtype="float64")
     twin = model.cache["float64"]
     if model.terms.written:
-        twin.parameters.take(model.parameters.values)
+        twin.parameters.copy_values(model.parameters.values)
         arrays = twin.terms.parameter_arrays()
         for name, array in model.terms.parameter_arrays().items():
             arrays[name].assign(array.numpy().astype(arrays[name].numpy().dtype))
@@ -388,7 +393,7 @@ def _float64_copy(sim: Simulation) -> Simulation:
     solver = NewtonPCG(multipliers=sim.solver.multipliers, penalty=sim.solver.penalty)
     out = Simulation(twin, state, dt=sim.dt, integrator=sim.integrator, solver=solver, ledger=False, capture=False)
     for name in state.names:
-        if name in sim.state.names and not is_solver_memory(name):
+        if name in sim.state.names and not is_solver_history(name):
             array = getattr(state, name)
             array.assign(getattr(sim.state, name).numpy().astype(array.numpy().dtype))
     out.stepper.start_terms()
@@ -412,4 +417,4 @@ def _evaluate_state(stepper: Any) -> None:
     for term in m.terms:
         term.begin(stepper.ctx, running)
     stepper.newton._clear_direction(running)
-    stepper.newton._open(running)
+    stepper.newton._evaluate_first_iterate(running)

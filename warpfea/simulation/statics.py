@@ -65,7 +65,7 @@ class StaticResult:
         if self.stability is None:
             raise ModelError("no stability analysis was done (unstable='ignore')")
         self.simulation.check_body(body, "mode")
-        return self.simulation._rows(body, self.stability.mode)
+        return self.simulation._at_mesh_nodes(body, self.stability.mode)
 
     def perturbed(self, size: float) -> State:
         """Copy of the state displaced by the unstable mode times a size, m: start of a motion off the equilibrium."""

@@ -17,7 +17,7 @@ from ..kernels.step.energy_ledger import LEDGER_TERM_ROWS
 from ..kernels.step.step import step_kernels
 from ..kernels.step.step_control import REPORT_COLUMNS
 from ..model.state import State
-from ..solvers import Jacobi, NewtonPCG, make_loop
+from ..solvers import Jacobi, NewtonPCG, make_solver_loop
 from ..terms.checks import check_stored_energy
 from ..terms.term import StepContext, Term
 from ..terms.workspace import Workspace
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Stepper"]
 
-FIRST_ITERATES = (0, 1, 2)
+CANDIDATE_FIRST_ITERATES = (0, 1, 2)
 """Alternative first iterates, see the kernel `alternative_first_iterate`."""
 
 
@@ -85,7 +85,7 @@ class Stepper:
             midpoint=midpoint, dissipation=loss, accelerated=integrator.accelerated,
         )  # fmt: skip
         self.terms.allocate(self.work, self.ctx)
-        self.newton = make_loop(self.ctx, solver, constraint_tol=constraint_tol, inversion=inversion)
+        self.newton = make_solver_loop(self.ctx, solver, constraint_tol=constraint_tol, inversion=inversion)
         self.newton.register(state)
         if model.terms.traits.unilateral:  # contact energy, which is not evaluated at rest
             state.register("predictor_potential", wp.float64)
@@ -97,28 +97,30 @@ class Stepper:
             self.predictor = Predictor(model, self.work, self.launch, *more, scheme=integrator)
         self.dim = (model.worlds, model.slots)
         if not integrator.static and isinstance(solver, NewtonPCG):
-            self.newton.first_iterates = [partial(self._start_from_candidate, kind) for kind in FIRST_ITERATES]
+            self.newton.first_iterate_candidates = [
+                partial(self._start_from_candidate, kind) for kind in CANDIDATE_FIRST_ITERATES
+            ]
         self.initial_conditions = (
             ConsistentInitialConditions(self.ctx, self.newton.residual, integrator) if integrator.accelerated else None
         )
         flags = self.work.any_flag
         self.running, self.refused, self.failed = flags[2:3], flags[3:4], flags[4:5]
-        self.adaptive: StepSizeControl | None = None
+        self.step_size_control: StepSizeControl | None = None
         if adapt:
             tries = solver.max_halvings
-            self.adaptive = StepSizeControl(self.ctx, self.v_before, integrator, adapt, max_tries=tries)
+            self.step_size_control = StepSizeControl(self.ctx, self.v_before, integrator, adapt, max_tries=tries)
         self._bind_structs()
-        self.growth = growth
+        self.energy_growth = growth
         if growth:
             growth.bind(self.work.step, model, state)
         self.episodes = Episodes(model, self.work, self.launch, **(episodes or {"asynchronous": False, "ends": False}))
         self._probe_tables = self._upload_probes() if model.probes else []
         state.sealed = True
-        self.backup = state.copy() if solver.max_halvings > 0 or self.adaptive else None
+        self.backup = state.copy() if solver.max_halvings > 0 or self.step_size_control else None
         self._load_modules()
         self.start_terms()
         self._evaluate_potential(None)
-        self._version, self._changes = model.parameters.version, model.parameters.changes.copy()
+        self._parameter_version, self._changes_applied = model.parameters.version, model.parameters.changes.copy()
         if ledger:
             fresh = ~self.state.ledger.numpy().any(axis=1)
             self.restart_ledger(fresh | (self.state.ledger_time.numpy() != self.state.time.numpy()))
@@ -131,8 +133,8 @@ class Stepper:
         w.step.status, w.step.summed_time = state.status, state.summed_time
         w.step.gravity = self.terms.dead.gravity
         w.step.any_running, w.step.any_rejected = self.running, w.any_flag[3:5]
-        w.step.max_halvings = MAX_LEVEL if self.adaptive else self.solver.max_halvings
-        if isinstance(self.solver, NewtonPCG) and not self.adaptive:
+        w.step.max_halvings = MAX_LEVEL if self.step_size_control else self.solver.max_halvings
+        if isinstance(self.solver, NewtonPCG) and not self.step_size_control:
             w.step.newton_budget = self.solver.newton_budget(bool(self.terms.traits.unilateral))
         w.step.stabilisation = self.integrator.stabilise
         w.step.scheme_parameter = self.integrator.parameter
@@ -146,7 +148,7 @@ class Stepper:
             w.step.previous_end_time = state.acceleration_end if self.integrator.accelerated else state.previous_end
         if self.ledger:
             w.step.ledger_time = state.ledger_time
-            self.increments = self.terms.increment_table(w)
+            self.increment_table = self.terms.increment_table(w)
 
     def start_terms(self, mask: np.ndarray | None = None) -> None:
         """Reinitialise terms after the state of the masked worlds was set."""
@@ -154,7 +156,7 @@ class Stepper:
         if not following and self.terms.dead.gravity_law is None:
             return
         w, state = self.work, self.state
-        active = self._flags(mask)
+        active = self._world_flags(mask)
         w.step.new_time.assign(state.time)
         w.stage_time.assign(state.time)
         w.step.load_factor.fill_(0.0 if self.integrator.static else 1.0)
@@ -181,10 +183,10 @@ class Stepper:
         """Kinetic energy, strain energy and gravity potential of the state, (worlds, 3), J."""
         m = self.model
         rows = wp.zeros((1, m.worlds, m.slots), dtype=wp.float64, device=m.device)
-        kernel = self.newton.residual.gather.kinetic_terms
+        kernel = self.newton.residual.gather_kernels.kinetic_terms
         Launcher(m.device)(kernel, self.dim, [m.topology, self.state.velocity, rows])
         u = self.state.displacement.numpy().astype(float)
-        pull = -np.einsum("bc,bs,bsc->b", m.terms.dead.gravity.numpy(), m.masses.of_worlds(m.worlds), u)
+        pull = -np.einsum("bc,bs,bsc->b", m.terms.dead.gravity.numpy(), m.masses.lumped_in_worlds(m.worlds), u)
         return np.stack([rows.numpy()[0].sum(axis=1), m.strain_energy(self.state), pull], axis=1)
 
     def invalidate(self, mask: np.ndarray | None = None, *, potential: bool = True) -> None:
@@ -192,21 +194,21 @@ class Stepper:
 
         `potential`: also the stored potential of the state.
         """
-        self.newton.invalidate(self._flags(mask))
+        self.newton.invalidate(self._world_flags(mask))
         if potential or "predictor_potential" not in self.state.names:
             self._evaluate_potential(mask)
         chosen = slice(None) if mask is None else np.asarray(mask, dtype=bool)
-        self._changes[chosen] = self.model.parameters.changes[chosen]
+        self._changes_applied[chosen] = self.model.parameters.changes[chosen]
 
     def update_parameters(self) -> None:
         """Apply parameters set since the last step; the energy jump counts as work of fields."""
-        if self.growth:
-            self.growth.restart_changed()
+        if self.energy_growth:
+            self.energy_growth.restart_changed()
         parameters = self.model.parameters
-        if self._version == parameters.version:
+        if self._parameter_version == parameters.version:
             return
-        self._version = parameters.version
-        mask = parameters.changes > self._changes
+        self._parameter_version = parameters.version
+        mask = parameters.changes > self._changes_applied
         if not mask.any():
             return
         self.invalidate(mask)
@@ -233,7 +235,7 @@ class Stepper:
     def _evaluate_potential(self, flags: np.ndarray | wp.array | None) -> None:
         """Evaluate the strain energy of the state in the chosen worlds, for the choice of first iterates."""
         w = self.work
-        active: wp.array = flags if isinstance(flags, wp.array) else self._flags(flags)
+        active: wp.array = flags if isinstance(flags, wp.array) else self._world_flags(flags)
         w.u_stage.assign(self.state.displacement)
         if self.ctx.midpoint:
             w.v_stage.zero_()
@@ -249,7 +251,7 @@ class Stepper:
                 np.where(active.numpy() != 0, measured.numpy(), w.newton.strain_energy.numpy())
             )
 
-    def _flags(self, mask: np.ndarray | None) -> wp.array:
+    def _world_flags(self, mask: np.ndarray | None) -> wp.array:
         """Device mask of worlds, by default all."""
         flags = np.ones(self.model.worlds) if mask is None else np.asarray(mask)
         return wp.array(flags.astype(np.int32), dtype=wp.int32, device=self.model.device)
@@ -268,8 +270,8 @@ class Stepper:
         out |= self.newton.modules() | self.terms.modules(self.ctx)
         if self.backup is not None:
             out.add(state_kernels().module)
-        if self.adaptive:
-            out.add(self.adaptive.kernels.module)
+        if self.step_size_control:
+            out.add(self.step_size_control.kernels.module)
         out |= self.episodes.modules()
         return sorted(out, key=lambda module: module.name)
 
@@ -307,24 +309,24 @@ class Stepper:
         w.any_flag[2:5].zero_()
         self.episodes.freeze_finished()
         launch(self.kernels.begin_step, m.worlds, [w.step, w.newton, w.pcg])
-        if self.adaptive:
+        if self.step_size_control:
             assert self.backup is not None
             self.backup.copy_rows(launch, w.step.running, self.state)
-            self.adaptive.begin_interval()
+            self.step_size_control.begin_interval()
         wp.capture_while(self.running, self._attempt)
-        if self.adaptive:
-            self.adaptive.end_interval()
-        self._report()
+        if self.step_size_control:
+            self.step_size_control.end_interval()
+        self._write_report()
 
     @labelled("commit")
-    def _report(self) -> None:
+    def _write_report(self) -> None:
         """Roll back failed worlds; write the step report."""
         m, w, launch = self.model, self.work, self.launch
         with launch.rare():
             wp.capture_if(self.failed, self._restore_failed)
         launch(self.kernels.write_report, m.worlds, [w.step, w.newton, w.pcg, w.report])
         if m.probes:
-            self._probe()
+            self._write_probes()
         for term in self.terms:
             term.report(self.ctx)
         self.episodes.end_step()
@@ -365,11 +367,11 @@ class Stepper:
         for term in self.terms:
             term.begin(self.ctx, running)
         self.newton.run()
-        if self.adaptive:
-            self.adaptive.check_local_error()
+        if self.step_size_control:
+            self.step_size_control.check_local_error()
         launch(self.kernels.end_attempt, m.worlds, [w.step, w.newton])
-        if self.adaptive:
-            self.adaptive.finish_attempt()
+        if self.step_size_control:
+            self.step_size_control.finish_attempt()
         self.accept_attempt()
 
     def _start_from_candidate(self, kind: int) -> None:
@@ -429,7 +431,7 @@ class Stepper:
         launch(self.kernels.ledger_terms, self.dim, args)
         reduce(w.rows, LEDGER_TERM_ROWS, accepted, w.ledger_sums)
         self.terms.energy_increments(self.ctx, reduce, accepted)
-        args = [w.step, w.newton, w.ledger_sums, self.increments, state.ledger]
+        args = [w.step, w.newton, w.ledger_sums, self.increment_table, state.ledger]
         launch(self.kernels.update_ledger, m.worlds, args)
 
     def _upload_probes(self) -> list[wp.array]:
@@ -440,7 +442,7 @@ class Stepper:
         values = ((start, wp.int32), (slot, wp.int32), (weight, m.types.T))
         return [wp.array(a, dtype=dtype, device=m.device) for a, dtype in values]
 
-    def _probe(self) -> None:
+    def _write_probes(self) -> None:
         m, w = self.model, self.work
         args = [*self._probe_tables, self.state.displacement, self.state.velocity, len(REPORT_COLUMNS), w.report]
         self.launch(self.kernels.probe_values, (m.worlds, len(m.probes)), args)

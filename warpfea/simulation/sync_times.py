@@ -9,20 +9,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..base.errors import ModelError
-from .discontinuities import kinks
+from .discontinuities import kink_times
 
 if TYPE_CHECKING:
     from ..time_laws import TimeLaw
 
 __all__ = ["SyncTimes"]
 
-DEFAULT_INTERVALS = 64
+DEFAULT_INTERVAL_COUNT = 64
 """Default number of intervals per run."""
 FRAME_INTERVAL = 1.0 / 60.0
 """Default interval of steps without a run, s: one animation frame."""
 TIME_TOL = 1e-9
-"""Relative tolerance of equal times, over an interval; at least `MIN_ROUNDINGS` roundings of the time."""
-MIN_ROUNDINGS = 64.0
+"""Relative tolerance of equal times, over an interval; at least `TIME_TOL_ROUNDINGS` roundings of the time."""
+TIME_TOL_ROUNDINGS = 64.0
+"""Smallest tolerance of equal times, in units in the last place of the time."""
 
 
 class SyncTimes:
@@ -33,16 +34,16 @@ class SyncTimes:
         horizon: time over which the error accumulates, s.
         origin: s; synchronisation points are whole numbers of intervals from it.
         end: end of the run, s; a synchronisation point.
-        fixed: (n,) s: kinks of time laws, and single output times.
-        rates: 1/s, of outputs with frames at its multiples.
+        fixed_times: (n,) s: kinks of time laws, and single output times.
+        output_rates: 1/s, of outputs with frames at its multiples.
     """
 
     def __init__(self, laws: Iterable[TimeLaw], interval: float | None, horizon: float | None) -> None:
-        self.given = interval, horizon
+        self.given_options = interval, horizon
         self.interval = self.horizon = math.nan
         self.origin, self.end = 0.0, math.inf
-        found = [kinks(law, 0.0) for law in laws]  # both ends of a jump
-        self.kinks = self.fixed_times = np.unique(np.concatenate([*found, np.zeros(0)]))
+        found = [kink_times(law, 0.0) for law in laws]  # both ends of a jump
+        self.kink_times = self.fixed_times = np.unique(np.concatenate([*found, np.zeros(0)]))
         self.output_rates: list[float] = []
 
     @property
@@ -60,13 +61,13 @@ class SyncTimes:
 
         The interval divides that of the frames, which then coincide with synchronisation points.
         """
-        interval, horizon = self.given
+        interval, horizon = self.given_options
         if end is None:
             interval = interval or min(FRAME_INTERVAL, horizon or FRAME_INTERVAL)
-        self.horizon = horizon or (DEFAULT_INTERVALS * (interval or FRAME_INTERVAL) if end is None else end - now)
+        self.horizon = horizon or (DEFAULT_INTERVAL_COUNT * (interval or FRAME_INTERVAL) if end is None else end - now)
         self.origin = now
         if interval is None:
-            interval = ((now if end is None else end) - now) / DEFAULT_INTERVALS
+            interval = ((now if end is None else end) - now) / DEFAULT_INTERVAL_COUNT
             if self.output_rates:
                 frame = 1.0 / max(self.output_rates)
                 interval = frame / math.ceil(frame / interval - TIME_TOL)
@@ -78,7 +79,7 @@ class SyncTimes:
         rates = [getattr(out, "rate", None) for out in outputs]
         self.output_rates = [rate for rate in rates if rate]
         moments = [time for out in outputs for time in getattr(out, "moments", ())]
-        self.fixed_times = np.unique(np.concatenate([self.kinks, np.array(moments, dtype=float)]))
+        self.fixed_times = np.unique(np.concatenate([self.kink_times, np.array(moments, dtype=float)]))
 
     def load(self, interval: float, horizon: float, origin: float) -> None:
         """Restore the schedule of a checkpoint."""
@@ -108,14 +109,14 @@ class SyncTimes:
         Raises:
             ModelError: an interval below the round-off of the time.
         """
-        rounded = MIN_ROUNDINGS * math.ulp(time)
+        rounded = TIME_TOL_ROUNDINGS * math.ulp(time)
         if 2.0 * rounded > self.interval:
             raise ModelError(
                 f"dt = 'auto': interval {self.interval:g} s is below the round-off of t = {time:g} s: use a longer one"
             )
         return max(TIME_TOL * self.interval, rounded)
 
-    def count(self, now: float, end: float) -> int:
+    def count_between(self, now: float, end: float) -> int:
         """Number of synchronisation points from `now` to `end`, both s, the end included."""
         self._time_tolerance(end)  # checks the interval
         self.end = end

@@ -69,7 +69,7 @@ def warn_initial_jumps(sim: Any) -> None:
     if sim.integrator.static or not laws:
         return
     time = float(sim.time[0])
-    values = _values(sim, laws, time)
+    values = _law_values_by_id(sim, laws, time)
     u = sim.state.displacement.numpy()[0].astype(float)
     for support in sim.model.description.supports:
         law = support.law or (support.node_laws or [None])[0]
@@ -87,7 +87,7 @@ def warn_initial_jumps(sim: Any) -> None:
         return
 
 
-def _values(sim: Any, laws: dict[int, TimeLaw], time: float) -> dict[int, np.ndarray]:
+def _law_values_by_id(sim: Any, laws: dict[int, TimeLaw], time: float) -> dict[int, np.ndarray]:
     """Values (3,) of each law at a time, s, by `id`; functions are evaluated on the device."""
     if any(law.function is not None for law in laws.values()):
         found = sim.stepper.law_values(time)[0]

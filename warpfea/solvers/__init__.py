@@ -15,7 +15,7 @@ from .newton import NewtonLoop, NewtonPCG
 if TYPE_CHECKING:
     from ..model.model import Model
 
-__all__ = ["SOLVERS", "Jacobi", "NewtonPCG", "get", "make_loop"]
+__all__ = ["SOLVERS", "Jacobi", "NewtonPCG", "make_solver_loop", "solver_options"]
 
 SOLVERS: dict[str, Callable[..., NewtonPCG | Jacobi]] = {
     "newton-pcg": NewtonPCG,
@@ -25,7 +25,7 @@ SOLVERS: dict[str, Callable[..., NewtonPCG | Jacobi]] = {
 """Solver option classes by name."""
 
 
-def get(solver: Any) -> NewtonPCG | Jacobi:
+def solver_options(solver: Any) -> NewtonPCG | Jacobi:
     """Solver options from a name, options, or None for the default. Raises ModelError listing the names."""
     if solver is None:
         return NewtonPCG()
@@ -38,7 +38,7 @@ def get(solver: Any) -> NewtonPCG | Jacobi:
     raise ModelError(f"solver = {solver!r} is unknown; there are {names}, or options such as wf.NewtonPCG(...){hint}")
 
 
-def make_loop(ctx: StepContext, options: NewtonPCG | Jacobi, **more: Any) -> NewtonLoop:
+def make_solver_loop(ctx: StepContext, options: NewtonPCG | Jacobi, **more: Any) -> NewtonLoop:
     """The solver loop of the given options.
 
     Raises:

@@ -21,20 +21,21 @@ import warp as wp
 from ..base.errors import ModelError
 from ..kernels.solvers.band import BLOCK, band_kernels, block_column_type
 from ..kernels.solvers.band_block import band_block_kernels, window_size
-from .assembled import coupled_slots
+from .matrix_assembly import coupling_pattern
 
 if TYPE_CHECKING:
     from ..base.launch import Launcher
     from ..model.model import Model
     from ..terms.workspace import Workspace
-    from .assembled import Pattern
+    from .matrix_assembly import Pattern
 
-__all__ = ["Band", "BandFactor", "block_band", "find_band"]
+__all__ = ["Band", "BandFactor", "find_band", "thread_block_band"]
 
 MAX_AUTO_WIDTH = 112
 """Widest band chosen automatically, blocks beside the diagonal; beyond it the two-level preconditioner is cheaper."""
 MAX_FULL_FACTOR_SLOTS = 160
-"""Largest number of slots of a model factored as a whole: here in a band of any width, or else as a dense matrix."""
+"""Largest number of slots (3-vector unknowns) of a model factored as a whole: here in a band of any width, or else as
+a dense matrix."""
 MAX_FACTOR_BYTES = 2**31
 """Size of the factors of one world above which 32-bit indices overflow, bytes."""
 MAX_WINDOW_BYTES, MAX_WORLD_FACTOR_BYTES = 48 * 1024, 200_000
@@ -45,14 +46,18 @@ PRODUCT_TIME, SOLUTION_TIME = 0.06, 5.4e-4
 """us per unknown on one core: H p; forward and backward substitution, per bandwidth."""
 
 
-def block_band(model: Model) -> Band | None:
+def thread_block_band(model: Model) -> Band | None:
     """Narrow band of a small model on CUDA, factored by one thread block per world, or None."""
     band = find_band(model) if model.device.is_cuda else None
     if band is None:
         return None
     size = wp.types.type_size_in_bytes(model.types.T)
-    factors = band.rows * (band.width + 1) * BLOCK**2 * size
-    return band if factors <= MAX_WORLD_FACTOR_BYTES and window_size(band.width) * size < MAX_WINDOW_BYTES else None
+    factors = band.block_rows * (band.half_bandwidth + 1) * BLOCK**2 * size
+    return (
+        band
+        if factors <= MAX_WORLD_FACTOR_BYTES and window_size(band.half_bandwidth) * size < MAX_WINDOW_BYTES
+        else None
+    )
 
 
 @dataclass(eq=False)
@@ -60,26 +65,26 @@ class Band:
     """Slot order in which the pattern is a band.
 
     Attributes:
-        slot_at, place_of: device tables (slots,), the order and its inverse.
-        rows: number of 4 x 4 block rows.
-        width: blocks beside the diagonal per row.
+        slot_order, slot_position: device tables (slots,), the order and its inverse.
+        block_rows: number of 4 x 4 block rows.
+        half_bandwidth: blocks beside the diagonal per row.
     """
 
-    slot_at: wp.array
-    place_of: wp.array
-    rows: int
-    width: int
+    slot_order: wp.array
+    slot_position: wp.array
+    block_rows: int
+    half_bandwidth: int
 
     @property
     def rebuild_cost(self) -> float:
         """Cost of assembly and factorisation, in PCG iterations."""
-        b = BLOCK * self.width
+        b = BLOCK * self.half_bandwidth
         return (ASSEMBLY_TIME + FACTORISATION_TIME * b * b) / (PRODUCT_TIME + SOLUTION_TIME * b)
 
     @property
-    def cheap(self) -> bool:
+    def cheap_to_factorise(self) -> bool:
         """True if factorisation is cheap relative to assembly."""
-        return FACTORISATION_TIME * (BLOCK * self.width) ** 2 < 0.2 * ASSEMBLY_TIME
+        return FACTORISATION_TIME * (BLOCK * self.half_bandwidth) ** 2 < 0.2 * ASSEMBLY_TIME
 
 
 def find_band(model: Model, *, any_width: bool = False) -> Band | None:
@@ -95,7 +100,7 @@ def find_band(model: Model, *, any_width: bool = False) -> Band | None:
 
 
 def _find_band(model: Model, any_width: bool) -> Band | None:
-    graph = coupled_slots(model)
+    graph = coupling_pattern(model)
     n = graph.shape[0]
     free = any_width or n <= MAX_FULL_FACTOR_SLOTS
     # lower bound of the bandwidth in any order: half the number of a row's neighbours
@@ -133,53 +138,73 @@ class BandFactor:
         self.kernels = band_kernels(model.dtype)
         column: Any = block_column_type(model.dtype)
         B = model.worlds
-        self.factors = work.array("band", (B, band.rows, BLOCK * (band.width + 1)), column)
-        self.blocks = model.device.is_cuda
-        if self.blocks:  # a block of threads per world
-            self.by_block = band_block_kernels(model.dtype, band.rows, band.width)
-            self.outside = work.array("band outside", (1, 1), model.types.T)
+        self.factors = work.array("band", (B, band.block_rows, BLOCK * (band.half_bandwidth + 1)), column)
+        self.by_thread_block = model.device.is_cuda
+        if self.by_thread_block:  # a block of threads per world
+            self.thread_block_kernels = band_block_kernels(model.dtype, band.block_rows, band.half_bandwidth)
+            self.window_memory = work.array("band outside", (1, 1), model.types.T)
         else:
-            self.y = work.array("band vector", (B, band.rows), column)
-        self.shift = work.array("band shift", (B,), model.types.T)
+            self.half_solution = work.array("band vector", (B, band.block_rows), column)
+        self.diagonal_shift = work.array("band shift", (B,), model.types.T)
         names = ("bad", "doing", "exact")
-        self.bad, self.doing, self.exact = (work.array(f"band {name}", (B,), wp.int32) for name in names)
-        self.again = work.array("band again", (1,), wp.int32)
+        self.failed, self.pending, self.exact = (work.array(f"band {name}", (B,), wp.int32) for name in names)
+        self.any_retry = work.array("band again", (1,), wp.int32)
 
     def modules(self) -> set[wp.Module]:
         """Modules launched."""
-        return {self.kernels.module} | ({self.by_block.module} if self.blocks else set())
+        return {self.kernels.module} | ({self.thread_block_kernels.module} if self.by_thread_block else set())
 
-    def make(self, value: wp.array, active: wp.array) -> None:
+    def factorise(self, value: wp.array, active: wp.array) -> None:
         """Factor the blocks `value` [world, entry] of the active worlds.
 
         An indefinite matrix is shifted by multiples of its diagonal until it is positive definite.
         """
-        self.launch(self.kernels.begin_factorisation, self.worlds, [active, self.doing, self.shift])
-        self._factor(value)
-        wp.capture_while(self.again, self._factor, value=value)
+        self.launch(self.kernels.begin_factorisation, self.worlds, [active, self.pending, self.diagonal_shift])
+        self._try_to_factorise(value)
+        wp.capture_while(self.any_retry, self._try_to_factorise, value=value)
 
-    def _factor(self, value: wp.array) -> None:
+    def _try_to_factorise(self, value: wp.array) -> None:
         b, k, launch = self.band, self.kernels, self.launch
-        self.again.zero_()
-        if self.blocks:
-            lanes = self.by_block.lanes
-            args = [lanes, self.outside, self.pattern.data, value, b.slot_at, b.place_of, self.shift]
-            args += [self.doing, self.bad, self.factors]
-            launch(self.by_block.factor, self.worlds * lanes, args, block_dim=lanes)
+        self.any_retry.zero_()
+        if self.by_thread_block:
+            lanes = self.thread_block_kernels.lanes
+            args = [
+                lanes,
+                self.window_memory,
+                self.pattern.data,
+                value,
+                b.slot_order,
+                b.slot_position,
+                self.diagonal_shift,
+            ]
+            args += [self.pending, self.failed, self.factors]
+            launch(self.thread_block_kernels.factor, self.worlds * lanes, args, block_dim=lanes)
         else:
             slots = self.pattern.graph.shape[0]
-            launch(k.clear_band, (self.worlds, b.rows), [slots, b.width, self.doing, self.factors])
-            args = [self.pattern.data, value, b.place_of, b.width, self.shift, self.doing, self.factors]
+            launch(k.clear_band, (self.worlds, b.block_rows), [slots, b.half_bandwidth, self.pending, self.factors])
+            args = [
+                self.pattern.data,
+                value,
+                b.slot_position,
+                b.half_bandwidth,
+                self.diagonal_shift,
+                self.pending,
+                self.factors,
+            ]
             launch(k.fill_band, (self.worlds, slots), args)
-            launch(k.factor_band, self.worlds, [b.width, self.doing, self.bad, self.factors])
-        launch(k.raise_shift, self.worlds, [self.bad, self.doing, self.shift, self.again, self.exact])
+            launch(k.factor_band, self.worlds, [b.half_bandwidth, self.pending, self.failed, self.factors])
+        launch(k.raise_shift, self.worlds, [self.failed, self.pending, self.diagonal_shift, self.any_retry, self.exact])
 
     def solve(self, r: wp.array, z: wp.array, active: wp.array) -> None:
         """z = A^-1 r, [world, slot]."""
         b = self.band
-        if self.blocks:
-            lanes = self.by_block.lanes
-            args = [lanes, self.outside, self.factors, b.slot_at, r, active, z]
-            self.launch(self.by_block.solve, self.worlds * lanes, args, block_dim=lanes)
+        if self.by_thread_block:
+            lanes = self.thread_block_kernels.lanes
+            args = [lanes, self.window_memory, self.factors, b.slot_order, r, active, z]
+            self.launch(self.thread_block_kernels.solve, self.worlds * lanes, args, block_dim=lanes)
             return
-        self.launch(self.kernels.solve, self.worlds, [b.width, self.factors, b.slot_at, r, active, self.y, z])
+        self.launch(
+            self.kernels.solve,
+            self.worlds,
+            [b.half_bandwidth, self.factors, b.slot_order, r, active, self.half_solution, z],
+        )

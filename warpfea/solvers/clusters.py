@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from ..model.model import Model
     from ..terms.workspace import Workspace
 
-__all__ = ["ClusterTables", "ModelClusters", "cluster_tables", "make_clusters", "make_pool"]
+__all__ = ["ClusterTables", "ModelClusters", "cluster_tables", "make_cluster_memory", "make_clusters"]
 
 
 @dataclass(eq=False)
@@ -76,7 +76,7 @@ class ModelClusters:
     Attributes:
         blocks: device struct and number of clusters of each block.
         topology: device struct of the slot gather, with the cluster sums as contributions.
-        sums: number of cluster sums.
+        sum_count: number of cluster sums.
     """
 
     blocks: list[tuple[Any, int]]
@@ -88,14 +88,14 @@ def make_clusters(model: Model) -> ModelClusters:
     """Clusters of a model with straight elements only, mass included in the product."""
     blocks, slots, offset = [], [], 0
     for block in model.blocks:
-        tables = cluster_tables(block.connectivity, block.cluster)
+        tables = cluster_tables(block.connectivity, block.cluster_size)
         data = cluster_struct()()
         data.element_start = model.array("clusters", tables.start, wp.int32)
         data.slot_start = model.array("clusters", tables.slot_start, wp.int32)
         data.table = model.array("clusters", tables.table, wp.int32)
         data.sum_offset = offset
         count = np.diff(tables.slot_start)
-        place = np.minimum(np.arange(slot_capacity(block.cluster, block.slots)), count[:, None] - 1)
+        place = np.minimum(np.arange(slot_capacity(block.cluster_size, block.slots)), count[:, None] - 1)
         data.slot = model.array("clusters", tables.slot[tables.slot_start[:-1, None] + place], wp.int32)
         blocks.append((data, len(count)))
         slots.append(tables.slot)
@@ -108,11 +108,13 @@ def make_clusters(model: Model) -> ModelClusters:
     return ModelClusters(blocks, topo, offset)
 
 
-def make_pool(model: Model, work: Workspace, *, midpoint: bool) -> Any:
+def make_cluster_memory(model: Model, work: Workspace, *, midpoint: bool) -> Any:
     """Device struct of the arrays that replace shared memory on the CPU; empty on CUDA."""
     pool, to_host = pool_struct(model.dtype)(), not model.device.is_cuda
-    numbers = max(pool_size(b.cluster, b.slots, 3 if midpoint or b.key.damping == "rate" else 2) for b in model.blocks)
-    words = max(table_layout(b.cluster, b.slots)[2] for b in model.blocks)
+    numbers = max(
+        pool_size(b.cluster_size, b.slots, 3 if midpoint or b.key.damping == "rate" else 2) for b in model.blocks
+    )
+    words = max(table_layout(b.cluster_size, b.slots)[2] for b in model.blocks)
     pool.numbers = work.array("cluster numbers", (numbers if to_host else 1,), model.types.T)
     pool.table = work.array("cluster table", (words if to_host else 1,), wp.int32)
     return pool

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from ..base.launch import Launcher
     from ..model.model import Model
     from ..terms.workspace import Workspace
-    from .assembled import Pattern
+    from .matrix_assembly import Pattern
 
 __all__ = ["DenseComponents", "DenseInverse", "gauss_jordan"]
 
@@ -29,30 +29,30 @@ class DenseComponents:
     """Uncoupled components of a pattern.
 
     Attributes:
-        count: their number; most: slots of the largest.
-        slot: device table [component, position], -1 if unused; place_of: its inverse, [slot].
+        count: number of components; max_slots: slots of the largest.
+        slot_table: device table [component, position], -1 if unused; slot_position: its inverse, [slot].
     """
 
     count: int
-    most: int
-    slot: wp.array
-    place_of: wp.array
+    max_slots: int
+    slot_table: wp.array
+    slot_position: wp.array
 
     @classmethod
-    def of(cls, model: Model, pattern: Pattern) -> DenseComponents | None:
-        """None if splitting saves no memory."""
+    def from_pattern(cls, model: Model, pattern: Pattern) -> DenseComponents | None:
+        """Components of a pattern, or None if splitting the matrix saves no memory."""
         count, label = sp.csgraph.connected_components(pattern.graph, directed=False)
         slots = len(label)
-        most = int(np.bincount(label).max())
-        if count * padded_size(3 * most) ** 2 >= padded_size(3 * slots) ** 2:
+        max_slots = int(np.bincount(label).max())
+        if count * padded_size(3 * max_slots) ** 2 >= padded_size(3 * slots) ** 2:
             return None
         order = np.argsort(label, kind="stable")
         start = np.concatenate([[0], np.cumsum(np.bincount(label))])
         place = np.empty(slots, dtype=np.int64)
         place[order] = np.arange(slots) - start[label[order]]
-        table = np.full((count, most), -1)
+        table = np.full((count, max_slots), -1)
         table[label, place] = np.arange(slots)
-        return cls(count, most, model.array("levels", table, wp.int32), model.array("levels", place, wp.int32))
+        return cls(count, max_slots, model.array("levels", table, wp.int32), model.array("levels", place, wp.int32))
 
 
 def padded_size(unknowns: int) -> int:
@@ -61,94 +61,119 @@ def padded_size(unknowns: int) -> int:
 
 
 def gauss_jordan(
-    launch: Launcher, kernels: Any, tiles: int, at: Any, matrix: wp.array, flags: wp.array, *, keep: bool
+    launch: Launcher, kernels: Any, tiles: int, scratch: Any, matrix: wp.array, flags: wp.array, *, keep: bool
 ) -> None:
-    """Invert tiles [world, tile, row, column] in place; `at` holds their `diagonal` and a scratch `column`."""
+    """Invert tiles [world, tile, row, column] in place; `scratch` holds `pivot_diagonal` and `pivot_column`."""
     lanes = TILE_LANES if launch.device.is_cuda else 1
-    args = [lanes, tiles, int(keep), flags, at.diagonal, at.column, matrix]
+    args = [lanes, tiles, int(keep), flags, scratch.pivot_diagonal, scratch.pivot_column, matrix]
     launch(kernels.invert_tiles, flags.shape[0] * tiles * lanes, args, block_dim=TILE_LANES)
 
 
 class DenseInverse:
-    """Matrix [world, row, column] and its inverse in place, stored in `stored` with precision `storage`.
+    """Matrix [world, row, column] and its inverse in place; `stored_inverse` is a copy with precision `storage`.
 
     Attributes:
-        unknowns: matrix size; size: the same rounded up to whole tiles.
-        matrix, scale: filled before `invert`: the matrix and its diagonal; zero beyond the unknowns.
+        unknowns: matrix size; padded_size: the same rounded up to whole tiles.
+        matrix, matrix_diagonal: filled before `invert`, zero beyond the unknowns; `matrix` is then the inverse.
+        inverse_root_diagonal: scaling of `stored_inverse` to a unit diagonal, if its precision is another.
+        matrix_count: worlds x components.
     """
 
     def __init__(
         self, model: Model, work: Workspace, launch: Launcher, name: str, unknowns: int, storage: str | None = None,
-        parts: DenseComponents | None = None,
+        components: DenseComponents | None = None,
     ) -> None:  # fmt: skip
         B, T = model.worlds, model.types.T
         storage = storage or model.dtype
         S, other = precision(storage).T, storage != model.dtype
-        assert not (other and parts)
-        self.worlds, self.launch, self.unknowns, self.parts = B, launch, unknowns, parts
-        self.kernels, self.making = level_kernels(model.dtype, storage), build_kernels(model.dtype, storage)
-        if parts:
-            self.by_part = dense_component_kernels(model.dtype)
-            B *= parts.count
-            unknowns = 3 * parts.most
-            self.flags = work.array(f"{name} flags", (B,), wp.int32)
-        self.blocks, self.size = B, padded_size(unknowns)
-        N = self.size
+        assert not (other and components)
+        self.worlds, self.launch, self.unknowns, self.components = B, launch, unknowns, components
+        self.kernels, self.setup_kernels = level_kernels(model.dtype, storage), build_kernels(model.dtype, storage)
+        if components:
+            self.component_kernels = dense_component_kernels(model.dtype)
+            B *= components.count
+            unknowns = 3 * components.max_slots
+            self.component_flags = work.array(f"{name} flags", (B,), wp.int32)
+        self.matrix_count, self.padded_size = B, padded_size(unknowns)
+        N = self.padded_size
         self.matrix = work.array(f"{name} inverse", (B, N, N), T)
-        self.stored = work.array(f"{name} stored", (B, N, N), S) if other else self.matrix
-        self.root = work.array(f"{name} root", (B, N if other else 1), T)
-        self.rows = work.array(f"{name} rows", (1, B, N if other else 1), wp.float64)
+        self.stored_inverse = work.array(f"{name} stored", (B, N, N), S) if other else self.matrix
+        self.inverse_root_diagonal = work.array(f"{name} root", (B, N if other else 1), T)
+        self.trace_terms = work.array(f"{name} rows", (1, B, N if other else 1), wp.float64)
         self.trace = work.array(f"{name} trace", (1, B), wp.float64)
-        self.left = work.array(f"{name} panels", (B, TILE_UNKNOWNS, N), T)
-        self.top = work.array(f"{name} panels 2", (B, TILE_UNKNOWNS, N), T)
-        self.scale = work.array(f"{name} diagonal", (B, N), T)
-        self.pivot = work.array(f"{name} pivot", (B, 1, TILE_UNKNOWNS, TILE_UNKNOWNS), T)
-        self.diagonal = work.array(f"{name} pivots", (B, 1, TILE_UNKNOWNS), T)
-        self.column = work.array(f"{name} column", (B, 1, TILE_UNKNOWNS), T)
+        self.left_panel = work.array(f"{name} panels", (B, TILE_UNKNOWNS, N), T)
+        self.top_panel = work.array(f"{name} panels 2", (B, TILE_UNKNOWNS, N), T)
+        self.matrix_diagonal = work.array(f"{name} diagonal", (B, N), T)
+        self.pivot_tile = work.array(f"{name} pivot", (B, 1, TILE_UNKNOWNS, TILE_UNKNOWNS), T)
+        self.pivot_diagonal = work.array(f"{name} pivots", (B, 1, TILE_UNKNOWNS), T)
+        self.pivot_column = work.array(f"{name} column", (B, 1, TILE_UNKNOWNS), T)
 
     def modules(self) -> set[wp.Module]:
         """Modules launched."""
-        more = {self.by_part.module} if self.parts else set()
-        return {self.making.module, self.kernels.module} | more
+        more = {self.component_kernels.module} if self.components else set()
+        return {self.setup_kernels.module, self.kernels.module} | more
 
     def fill(self, pattern: Pattern, value: Any, flags: wp.array) -> None:
         """Copy a matrix of 3x3 blocks in the flagged worlds."""
-        if self.parts:
-            self.launch(self.by_part.copy_flags_to_components, self.blocks, [flags, self.flags])
-            args = [pattern.data, value, self.parts.slot, self.parts.place_of, self.flags, self.scale, self.matrix]
-            self.launch(self.by_part.fill_components, (self.blocks, self.size), args)
+        if self.components:
+            self.launch(
+                self.component_kernels.copy_flags_to_components, self.matrix_count, [flags, self.component_flags]
+            )
+            args = [
+                pattern.data,
+                value,
+                self.components.slot_table,
+                self.components.slot_position,
+                self.component_flags,
+                self.matrix_diagonal,
+                self.matrix,
+            ]
+            self.launch(self.component_kernels.fill_components, (self.matrix_count, self.padded_size), args)
             return
-        args = [pattern.data, value, self.unknowns // 3, flags, self.scale, self.matrix]
-        self.launch(self.making.fill_dense, (self.worlds, self.size // 3), args)
+        args = [pattern.data, value, self.unknowns // 3, flags, self.matrix_diagonal, self.matrix]
+        self.launch(self.setup_kernels.fill_dense, (self.worlds, self.padded_size // 3), args)
 
     def invert(self, flags: wp.array, *, keep: bool, reduce: Any) -> None:
-        """Invert in the flagged worlds; `reduce` sums rows (residual.Reducer)."""
-        B, N, k, launch = self.blocks, self.size, self.making, self.launch
-        if self.parts:  # scattered by `fill`
-            flags = self.flags
+        """Invert in the flagged worlds; `reduce` sums rows (residual.RowReducer)."""
+        B, N, k, launch = self.matrix_count, self.padded_size, self.setup_kernels, self.launch
+        if self.components:  # scattered by `fill`
+            flags = self.component_flags
         for first in range(0, N, TILE_UNKNOWNS):
-            args = [self.matrix, self.scale, first, flags, self.diagonal, self.pivot]
+            args = [self.matrix, self.matrix_diagonal, first, flags, self.pivot_diagonal, self.pivot_tile]
             launch(k.copy_pivot_block, (B, TILE_UNKNOWNS, TILE_UNKNOWNS), args)
-            gauss_jordan(launch, k, 1, self, self.pivot, flags, keep=keep)
-            args = [self.matrix, self.pivot, first, flags, self.left, self.top]
+            gauss_jordan(launch, k, 1, self, self.pivot_tile, flags, keep=keep)
+            args = [self.matrix, self.pivot_tile, first, flags, self.left_panel, self.top_panel]
             launch(k.compute_panels, (B, TILE_UNKNOWNS, N), args)
-            args = [self.pivot, self.left, self.top, first, flags, self.matrix]
+            args = [self.pivot_tile, self.left_panel, self.top_panel, first, flags, self.matrix]
             launch(k.eliminate_pivot_block, (B, N // 4, N), args)
-        if self.stored is not self.matrix:
-            launch(k.trace_terms, (B, N), [self.scale, self.matrix, flags, self.rows])
-            reduce(self.rows, 1, flags, self.trace)
-            args = [self.scale, self.trace, self.matrix, flags, self.root, self.stored]
+        if self.stored_inverse is not self.matrix:
+            launch(k.trace_terms, (B, N), [self.matrix_diagonal, self.matrix, flags, self.trace_terms])
+            reduce(self.trace_terms, 1, flags, self.trace)
+            args = [
+                self.matrix_diagonal,
+                self.trace,
+                self.matrix,
+                flags,
+                self.inverse_root_diagonal,
+                self.stored_inverse,
+            ]
             launch(k.store_dense_inverse, (B, N, N), args)
 
     def apply(self, r: wp.array, x: wp.array, active: wp.array) -> None:
         """x = A^-1 r, [world, unknown]."""
-        if self.parts:
-            n = self.parts.count * 3 * self.parts.most
-            lanes = self.launch.lanes(3 * self.parts.most)
-            args = [self.matrix, self.parts.slot, lanes, r, active, x]
-            self.launch(self.by_part.apply_component_inverses, (self.worlds, self.launch.padded(n * lanes)), args)
+        if self.components:
+            n = self.components.count * 3 * self.components.max_slots
+            lanes = self.launch.lanes(3 * self.components.max_slots)
+            args = [self.matrix, self.components.slot_table, lanes, r, active, x]
+            self.launch(
+                self.component_kernels.apply_component_inverses, (self.worlds, self.launch.padded(n * lanes)), args
+            )
             return
         n = self.unknowns
         lanes = self.launch.lanes(n)
         dim = (self.worlds, self.launch.padded(n * lanes))
-        self.launch(self.kernels.apply_dense_inverse, dim, [self.stored, self.root, lanes, r, active, x])
+        self.launch(
+            self.kernels.apply_dense_inverse,
+            dim,
+            [self.stored_inverse, self.inverse_root_diagonal, lanes, r, active, x],
+        )

@@ -19,38 +19,39 @@ import warp as wp
 from ..base.launch import labelled
 from ..kernels.solvers.direct import direct_kernels
 from ..terms.follower_loads import FollowerMatrix, Followers
-from .factor import Singular, make_factors
+from .factor import SingularMatrix, make_factors
 
 if TYPE_CHECKING:
     from ..model.state import State
     from ..terms.term import StepContext
     from .residual import Residual
 
-__all__ = ["Direct"]
+__all__ = ["DirectSolver"]
 
 
-class Direct:
-    """See the module. Runs on the host between launches: a step can't be captured as a graph.
+class DirectSolver:
+    """Preconditioner by sparse factors, see the module; on the host: a step can't be captured as a graph.
 
     Attributes:
-        singular: worlds whose last factorisation failed.
+        unverified_worlds: worlds whose new factors have not been used yet: the first solve checks r.H^-1 r >= 0.
+        singular_worlds: worlds whose last factorisation failed.
     """
 
     def __init__(self, ctx: StepContext, residual: Residual) -> None:
         model = ctx.model
         self.ctx, self.model, self.work, self.launch, self.residual = ctx, model, ctx.work, ctx.launch, residual
         ctx.work.reserve_blocks()
-        assert residual.assembled is not None
-        self.assembled = residual.assembled
+        assert residual.assembler is not None
+        self.assembler = residual.assembler
         self.kernels = direct_kernels(model.dtype)
         self.dim = (model.worlds, ctx.launch.padded(model.slots))
-        self.factors = make_factors(model, self.assembled.pattern.graph)
+        self.factors = make_factors(model, self.assembler.pattern.graph)
         self.elements_only = not model.terms.products
         for term in model.terms:
-            term.allocate_blocks(ctx, self.assembled, projected=False)
+            term.allocate_blocks(ctx, self.assembler, projected=False)
         self.matrix_storage: wp.array | None = None
-        self.unverified: set[int] = set()
-        self.singular: set[int] = set()
+        self.unverified_worlds: set[int] = set()
+        self.singular_worlds: set[int] = set()
 
     def register(self, state: State) -> None:
         """Stateless."""
@@ -60,7 +61,7 @@ class Direct:
 
     def modules(self) -> set[wp.Module]:
         """Modules launched."""
-        return {self.kernels.module} | self.assembled.modules()
+        return {self.kernels.module} | self.assembler.modules()
 
     @labelled("build")
     def start(self, active: wp.array) -> None:
@@ -80,15 +81,15 @@ class Direct:
         """No reuse rule."""
 
     @property
-    def followers(self) -> list[FollowerMatrix]:
+    def follower_matrices(self) -> list[FollowerMatrix]:
         """Matrices of the follower loads' items, built on first use."""
         return self.ctx.scratch.get(Followers.name, [])
 
     @property
-    def value(self) -> wp.array:
+    def matrix(self) -> wp.array:
         """Array of the matrix H, allocated on first use."""
         if self.matrix_storage is None:
-            self.matrix_storage = self.assembled.values("direct matrix")
+            self.matrix_storage = self.assembler.allocate_values("direct matrix")
         return self.matrix_storage
 
     @labelled("build")
@@ -96,13 +97,15 @@ class Direct:
         """Factorise H in the active worlds."""
         residual = self.residual
         own = self.elements_only and residual.uses_matrix
-        worlds = np.flatnonzero((residual.reuse.control.build_now if own and residual.matrix_reuse else active).numpy())
+        worlds = np.flatnonzero(
+            (residual.matrix_reuse_rule.control.build_now if own and residual.matrix_reuse_level else active).numpy()
+        )
         if not len(worlds):
             return
         if own:
-            value = residual.matrix
+            value = residual.operator_matrix
         else:
-            value = self.value
+            value = self.matrix
             self._assemble(active, value, projected=False)
         for world in worlds:
             self._factorise(int(world), value)
@@ -110,29 +113,29 @@ class Direct:
     def _assemble(self, flags: wp.array, value: wp.array, *, projected: bool) -> None:
         """Assemble H or, with `projected`, its positive definite approximation."""
         w = self.work
-        self.assembled.assemble(w.u_stage, (w.step.mass_factor, w.step.dq_dv), flags, value, projected=projected)
+        self.assembler.assemble(w.u_stage, (w.step.mass_factor, w.step.dq_dv), flags, value, projected=projected)
         for term in self.model.terms:
             live = [array for _, array in term.cached_inputs(self.ctx)]
-            term.blocks(self.ctx, self.assembled, live, w.step.dq_dv, flags, value, projected=projected)
+            term.blocks(self.ctx, self.assembler, live, w.step.dq_dv, flags, value, projected=projected)
 
     def _factorise(self, world: int, value: wp.array) -> None:
-        self.singular.discard(world)
-        self.unverified.add(world)
+        self.singular_worlds.discard(world)
+        self.unverified_worlds.add(world)
         try:
             self.factors.factorise(value, world)
-        except Singular:
-            self._factorise_positive(world)
+        except SingularMatrix:
+            self._factorise_projected(world)
 
-    def _factorise_positive(self, world: int) -> None:
+    def _factorise_projected(self, world: int) -> None:
         """Factorise the positive definite approximation."""
-        self.unverified.discard(world)
+        self.unverified_worlds.discard(world)
         flags = np.zeros(self.model.worlds, dtype=np.int32)
         flags[world] = 1
-        self._assemble(wp.array(flags, dtype=wp.int32, device=self.model.device), self.value, projected=True)
+        self._assemble(wp.array(flags, dtype=wp.int32, device=self.model.device), self.matrix, projected=True)
         try:
-            self.factors.factorise(self.value, world)
-        except Singular:
-            self.singular.add(world)
+            self.factors.factorise(self.matrix, world)
+        except SingularMatrix:
+            self.singular_worlds.add(world)
 
     @labelled("preconditioner")
     def apply(self, r: wp.array, z: wp.array, active: wp.array) -> None:
@@ -145,15 +148,15 @@ class Direct:
 
     def _solve(self, r: wp.array, z: wp.array, world: int) -> bool:
         """Solve in one world. False if the factorisation failed; the first solve verifies it (r.z >= 0)."""
-        if world in self.singular:
+        if world in self.singular_worlds:
             return False
         r_dot_z = self.factors.solve(r, z, world)
-        if world in self.unverified and not r_dot_z >= 0.0:
-            self._factorise_positive(world)
-            if world in self.singular:
+        if world in self.unverified_worlds and not r_dot_z >= 0.0:
+            self._factorise_projected(world)
+            if world in self.singular_worlds:
                 return False
             r_dot_z = self.factors.solve(r, z, world)
-        self.unverified.discard(world)
+        self.unverified_worlds.discard(world)
         if not np.isfinite(r_dot_z):
-            self.singular.add(world)
+            self.singular_worlds.add(world)
         return bool(np.isfinite(r_dot_z))

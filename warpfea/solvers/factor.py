@@ -17,13 +17,13 @@ from ..base.errors import ModelError
 if TYPE_CHECKING:
     from ..model.model import Model
 
-__all__ = ["CuDSS", "Factors", "FreeMatrix", "Singular", "SuperLU", "make_factors"]
+__all__ = ["CuDSS", "FreeMatrix", "SingularMatrix", "SparseFactors", "SuperLU", "make_factors"]
 
 PIVOT_THRESHOLD = 1e-3
 """Smallest accepted diagonal pivot over its column maximum (matrix scaled to unit diagonal)."""
 
 
-class Singular(Exception):
+class SingularMatrix(Exception):
     """The factorisation failed."""
 
 
@@ -32,22 +32,22 @@ class FreeMatrix:
     """Free components of a symmetric matrix of 3x3 blocks; by symmetry the tables are both CSR and CSC.
 
     Attributes:
-        free: (n,) components, 3 slot + axis, in row order.
-        start, index: (n + 1,) and (m,), the rows.
+        free_components: (n,) components, 3 slot + axis, in row order.
+        row_start, column_index: (n + 1,) and (m,), rows of the matrix in CSR.
         value_index: (m,) index of each entry in the flattened blocks.
-        row: (m,) row of each entry.
-        diagonal: (n,) diagonal entries.
+        row_index: (m,) row of each entry.
+        diagonal_entry: (n,) indices of the diagonal entries.
     """
 
-    free: np.ndarray
-    start: np.ndarray
-    index: np.ndarray
+    free_components: np.ndarray
+    row_start: np.ndarray
+    column_index: np.ndarray
     value_index: np.ndarray
-    row: np.ndarray
-    diagonal: np.ndarray
+    row_index: np.ndarray
+    diagonal_entry: np.ndarray
 
     @classmethod
-    def of(cls, graph: sp.csr_matrix, free: np.ndarray, *, ordered: bool) -> FreeMatrix:
+    def from_pattern(cls, graph: sp.csr_matrix, free: np.ndarray, *, ordered: bool) -> FreeMatrix:
         """Tables of a slot pattern and a (slots, 3) mask of free components; `ordered`: in minimum degree order."""
         count = len(graph.indices)
         place = np.arange(1.0, 9 * count + 1).reshape(count, 3, 3)
@@ -61,12 +61,12 @@ class FreeMatrix:
         matrix.sort_indices()
         row = np.repeat(np.arange(len(chosen)), np.diff(matrix.indptr))
         return cls(
-            free=chosen,
-            start=matrix.indptr.astype(np.int32),
-            index=matrix.indices.astype(np.int32),
+            free_components=chosen,
+            row_start=matrix.indptr.astype(np.int32),
+            column_index=matrix.indices.astype(np.int32),
             value_index=matrix.data.astype(np.int64) - 1,
-            row=row,
-            diagonal=np.flatnonzero(row == matrix.indices),
+            row_index=row,
+            diagonal_entry=np.flatnonzero(row == matrix.indices),
         )
 
 
@@ -82,11 +82,11 @@ def minimum_degree(pattern: sp.csr_matrix) -> np.ndarray:
     return np.argsort(lu.perm_c)
 
 
-class Factors(Protocol):
+class SparseFactors(Protocol):
     """Interface of sparse factors of the matrices of several worlds."""
 
     def factorise(self, values: wp.array, world: int) -> None:
-        """Factorise one world's matrix from the blocks `values` [world, entry]. Raises Singular."""
+        """Factorise one world's matrix from the blocks `values` [world, entry]. Raises SingularMatrix."""
 
     def solve(self, r: wp.array, z: wp.array, world: int) -> float:
         """z = A^-1 r in one world, 0 on prescribed components; returns r.z, possibly nan."""
@@ -101,22 +101,22 @@ class SuperLU:
 
     def __init__(self, model: Model, graph: sp.csr_matrix) -> None:
         if "direct order" not in model.cache:
-            model.cache["direct order"] = FreeMatrix.of(graph, model.free_host, ordered=True)
+            model.cache["direct order"] = FreeMatrix.from_pattern(graph, model.free_host, ordered=True)
         self.matrix: FreeMatrix = model.cache["direct order"]
         self.factors: dict[int, tuple[Any, np.ndarray]] = {}
         self.size, self.dtype = model.slots, np.dtype(model.dtype)
 
     def factorise(self, values: wp.array, world: int) -> None:
-        """See Factors."""
+        """See SparseFactors."""
         m = self.matrix
         data = values[world].numpy().reshape(-1)[m.value_index].astype(float)
-        diagonal = np.abs(data[m.diagonal])
+        diagonal = np.abs(data[m.diagonal_entry])
         scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
-        data *= scale[m.row] * scale[m.index]
+        data *= scale[m.row_index] * scale[m.column_index]
         self.factors.pop(world, None)
         if not np.isfinite(data).all():
-            raise Singular
-        matrix = sp.csc_matrix((data, m.index, m.start), shape=(len(m.free),) * 2)
+            raise SingularMatrix
+        matrix = sp.csc_matrix((data, m.column_index, m.row_start), shape=(len(m.free_components),) * 2)
         try:
             lu = spla.splu(
                 matrix, permc_spec="NATURAL", diag_pivot_thresh=PIVOT_THRESHOLD, options={"SymmetricMode": True}
@@ -124,12 +124,12 @@ class SuperLU:
         except RuntimeError as error:
             if "singular" not in str(error):
                 raise
-            raise Singular from error
+            raise SingularMatrix from error
         self.factors[world] = lu, scale
 
     def solve(self, r: wp.array, z: wp.array, world: int) -> float:
-        """See Factors."""
-        free = self.matrix.free
+        """See SparseFactors."""
+        free = self.matrix.free_components
         lu, scale = self.factors[world]
         b = r[world].numpy().reshape(-1)[free].astype(float)
         x = scale * lu.solve(scale * b)
@@ -146,40 +146,43 @@ class CuDSS:
         import cupy
 
         self.device, self.cupy = model.device, cupy
-        self.matrix = FreeMatrix.of(graph, model.free_host, ordered=False)
+        self.matrix = FreeMatrix.from_pattern(graph, model.free_host, ordered=False)
         with cupy.cuda.Device(self.device.ordinal):
-            self.value_index, self.free = cupy.asarray(self.matrix.value_index), cupy.asarray(self.matrix.free)
+            self.value_index, self.free = (
+                cupy.asarray(self.matrix.value_index),
+                cupy.asarray(self.matrix.free_components),
+            )
         self.solvers: dict[int, Any] = {}
 
-    def _make(self, data: Any) -> Any:
+    def _plan_solver(self, data: Any) -> Any:
         """Planned solver, its matrix with the values `data`, and its right-hand side."""
         import cupyx.scipy.sparse as csp
         from nvmath.sparse.advanced import DirectSolver, DirectSolverMatrixType, DirectSolverOptions
 
         m, cp = self.matrix, self.cupy
-        n = len(m.free)
-        a = csp.csr_matrix((data, cp.asarray(m.index), cp.asarray(m.start)), shape=(n, n))
+        n = len(m.free_components)
+        a = csp.csr_matrix((data, cp.asarray(m.column_index), cp.asarray(m.row_start)), shape=(n, n))
         b = cp.zeros(n)
         solver = DirectSolver(a, b, options=DirectSolverOptions(sparse_system_type=DirectSolverMatrixType.SYMMETRIC))
         solver.plan()
         return solver, a, b
 
     def factorise(self, values: wp.array, world: int) -> None:
-        """See Factors."""
+        """See SparseFactors."""
         cp = self.cupy
         wp.synchronize_device(self.device)
         with cp.cuda.Device(self.device.ordinal):
             data = cp.asarray(values)[world].reshape(-1)[self.value_index].astype(cp.float64)
             if not bool(cp.isfinite(data).all()):
-                raise Singular
+                raise SingularMatrix
             if world not in self.solvers:
-                self.solvers[world] = self._make(data)
+                self.solvers[world] = self._plan_solver(data)
             solver, a, _ = self.solvers[world]
             a.data[:] = data
             solver.factorize()
 
     def solve(self, r: wp.array, z: wp.array, world: int) -> float:
-        """See Factors."""
+        """See SparseFactors."""
         cp = self.cupy
         wp.synchronize_device(self.device)
         with cp.cuda.Device(self.device.ordinal):
@@ -192,7 +195,7 @@ class CuDSS:
             return float(b @ x)
 
 
-def make_factors(model: Model, graph: sp.csr_matrix) -> Factors:
+def make_factors(model: Model, graph: sp.csr_matrix) -> SparseFactors:
     """cuDSS on a GPU if installed, else SuperLU with a warning on a GPU.
 
     Raises:

@@ -44,7 +44,8 @@ if TYPE_CHECKING:
 __all__ = ["Jacobi", "JacobiLoop"]
 
 ACCELERATIONS = ("secants", "anderson", "chebyshev", "none")
-MAX_GROWTH = 10.0
+"""Accelerations of the module docstring."""
+MAX_RESIDUAL_GROWTH = 10.0
 """Largest accepted ratio of the final to the initial residual of a step."""
 MAX_VIOLATION = 1e-3
 """Largest accepted constraint violation over the model's size."""
@@ -107,7 +108,7 @@ class Jacobi:
             raise ModelError(f"Jacobi: penalty = {self.penalty!r} must be positive")
 
     @property
-    def newton(self) -> NewtonPCG:
+    def newton_options(self) -> NewtonPCG:
         """Options of the Newton loop that this loop inherits."""
         return NewtonPCG(
             tol=self.tol,
@@ -128,7 +129,7 @@ class Jacobi:
 
     def tolerance(self, dtype: str) -> float:
         """Relative tolerance for precision "float64" or "float32"."""
-        return self.newton.tolerance(dtype)
+        return self.newton_options.tolerance(dtype)
 
 
 class JacobiLoop(NewtonLoop):
@@ -142,11 +143,11 @@ class JacobiLoop(NewtonLoop):
         constraint_tol: float,
         inversion: str = "refuse",
     ) -> None:
-        super().__init__(ctx, options.newton, constraint_tol=constraint_tol, inversion=inversion)
+        super().__init__(ctx, options.newton_options, constraint_tol=constraint_tol, inversion=inversion)
         model, work = ctx.model, ctx.work
         self.methods = {"solver": "jacobi"}
         # multipliers are updated once, on acceptance: no outer loop, and convergence includes violations
-        self.classical = False
+        self.outer_multipliers = False
         work.newton.constraint_tol = constraint_tol
         assert isinstance(self.preconditioner, TwoLevel)
         self.preconditioner.rebuild_cost = REBUILD_COST
@@ -155,8 +156,8 @@ class JacobiLoop(NewtonLoop):
         self.descent_kernels = jacobi_kernels(model.dtype, model.terms.traits, options.acceleration)
         B, m = model.worlds, MAX_PAIRS
         shape = (m, B, model.slots) if self.uses_secants else (1, 1, 1)
-        self.moves = work.array("jacobi moves", shape, model.types.vec3)
-        self.changes = work.array("jacobi changes", shape, model.types.vec3)
+        self.previous_moves = work.array("jacobi moves", shape, model.types.vec3)
+        self.residual_changes = work.array("jacobi changes", shape, model.types.vec3)
         shapes: dict[str, Any] = {
             "gram_matrix": (B, m, m),
             "gram_factor": (B, m, m),
@@ -165,7 +166,7 @@ class JacobiLoop(NewtonLoop):
             "sums": (2 * m, B),
         }
         self.control = work.struct(jacobi_struct(), B, **shapes)
-        self.control.max_growth = MAX_GROWTH
+        self.control.max_growth = MAX_RESIDUAL_GROWTH
         self.control.max_violation = MAX_VIOLATION * model.size
         self.control.step_length = STEP_LENGTH[options.acceleration]
         least = LARGEST_EIGENVALUE / max(4.0, 0.25 * options.iterations**2)
@@ -182,9 +183,9 @@ class JacobiLoop(NewtonLoop):
         """Iterate and report cost and reduction to the reuse rule."""
         w = self.work
         self.launch(self.descent_kernels.begin_iteration, self.model.worlds, [w.newton, self.control])
-        self._reduce_flags(w.newton.active, self.iterating)
-        wp.capture_while(self.iterating, self._iterate)
-        self._if_rare(self._check_inversion)
+        self._reduce_flags(w.newton.active, self.any_iterating)
+        wp.capture_while(self.any_iterating, self._iterate)
+        self._run_if_rare(self._check_inversion)
         self.launch(
             self.descent_kernels.report_cost, self.model.worlds, [w.newton, self.control, w.pcg, w.step.running]
         )
@@ -195,7 +196,7 @@ class JacobiLoop(NewtonLoop):
         w, k, launch = self.work, self.descent_kernels, self.launch
         active = w.newton.active
         self._compute_step(active)
-        if self.limited:
+        if self.limits_step:
             launch(self.kernels.reset_step_limit, self.model.worlds, [w.newton])
         for term in self.terms:
             if term.traits.limited:  # other terms predict multipliers, for Newton's method only
@@ -206,27 +207,45 @@ class JacobiLoop(NewtonLoop):
         if self.terms.traits.stored:
             self._call_terms("accept_trial", active)
             self._call_terms("update_frozen", active)
-        self._reduce_flags(active, self.iterating)
+        self._reduce_flags(active, self.any_iterating)
 
     @labelled("vectors")
     def _compute_step(self, active: wp.array) -> None:
         """Write the next move p to work.direction."""
         m, w, k, launch, ctl = self.model, self.work, self.descent_kernels, self.launch, self.control
-        args = [w.newton, w.gradient, m.topology.free, w.direction, w.p, w.r, self.moves, self.changes, w.rows]
+        args = [
+            w.newton,
+            w.gradient,
+            m.topology.free,
+            w.direction,
+            w.p,
+            w.r,
+            self.previous_moves,
+            self.residual_changes,
+            w.rows,
+        ]
         launch(k.store_pair, self.dim, args)
         if self.uses_secants:
             self.residual.reduce(w.rows, 2 * MAX_PAIRS, active, ctl.sums)
             launch(k.solve_gram, m.worlds, [w.newton, ctl])
-            launch(k.project_residual, self.dim, [w.newton, ctl, self.changes, w.r])
+            launch(k.project_residual, self.dim, [w.newton, ctl, self.residual_changes, w.r])
         elif self.acceleration == "chebyshev":
             launch(k.chebyshev_coefficients, m.worlds, [w.newton, ctl])
         self.preconditioner.apply(w.r, w.z, active)
         if self.acceleration == "secants":
-            launch(k.conjugation_dot_terms, self.dim, [w.newton, self.changes, w.z, w.rows])
+            launch(k.conjugation_dot_terms, self.dim, [w.newton, self.residual_changes, w.z, w.rows])
             self.residual.reduce(w.rows, MAX_PAIRS, active, ctl.sums)
             launch(k.conjugate_move, m.worlds, [w.newton, ctl])
-        launch(k.combine_move, self.dim, [w.newton, ctl, self.moves, w.z, w.direction])
-        if self.pcg.deflate:  # a loose tolerance then conserves the momentum of free bodies
-            args = [w.newton, w.step.mass_factor, m.groups.lumped_mass, w.gradient, m.topology.free, w.direction, w.r]
+        launch(k.combine_move, self.dim, [w.newton, ctl, self.previous_moves, w.z, w.direction])
+        if self.pcg.deflate_translations:  # a loose tolerance then conserves the momentum of free bodies
+            args = [
+                w.newton,
+                w.step.mass_factor,
+                m.free_groups.lumped_mass,
+                w.gradient,
+                m.topology.free,
+                w.direction,
+                w.r,
+            ]
             launch(k.residual_after_move, self.dim, args)
             self.pcg.correct_translations(active)

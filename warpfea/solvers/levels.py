@@ -10,28 +10,30 @@ import scipy.sparse as sp
 import warp as wp
 
 from ..kernels.solvers.levels import TILE_SLOTS, level_struct
-from ..model.partition import bisect, connected_groups
-from .assembled import Pattern, make_pattern
+from ..model.partition import bisect_groups, connected_groups
 from .band import MAX_FULL_FACTOR_SLOTS, Band
 from .dense import DenseComponents
+from .matrix_assembly import Pattern, make_pattern
 
 if TYPE_CHECKING:
     from ..model.model import Model
 
-__all__ = ["BOTTOM_SLOTS", "GROUP_SLOTS", "Level", "make_levels"]
+__all__ = ["GROUP_SLOTS", "MAX_BOTTOM_SLOTS", "Level", "make_levels"]
 
 GROUP_SLOTS = 64
 """Maximum slots of a group. Its affine functions are 4 slots of the next level, about 1/16 of the unknowns."""
-SMALL_GROUPS = (16, 32)
-SMALL_COARSE = 48
+SMALL_GROUP_SLOTS = (16, 32)
+"""Group sizes tried first in a small model, see MAX_SMALL_COARSE_SLOTS."""
+MAX_SMALL_COARSE_SLOTS = 48
 """Coarse level size up to which smaller groups are used: a small slender body has too few groups of 64 slots to bend (a
 cantilever of 180 slots takes half the iterations)."""
-BOTTOM_SLOTS = {"cpu": 160, "cuda": 1344}
+MAX_BOTTOM_SLOTS = {"cpu": 160, "cuda": 1344}
 """Largest coarse level inverted as one dense matrix, slots by device; on CUDA this is cheaper than the launches of
 further levels."""
-COMPONENT_PAIRS = 1344**2
+MAX_COMPONENT_PAIRS = 1344**2
 """Maximum slot pairs in components of up to MAX_FULL_FACTOR_SLOTS slots that are each inverted as a whole."""
 MAX_LEVELS = 12
+"""Bound of the number of levels; each has about a sixteenth of the unknowns of the one above."""
 
 
 @dataclass(eq=False)
@@ -40,29 +42,29 @@ class Level:
 
     Attributes:
         pattern: pattern of its matrix.
-        slots: number of slots.
-        dense: bottom level, inverted as a whole; no tiles, no groups.
-        parts: uncoupled components of a dense level.
+        slot_count: number of slots.
+        is_dense: bottom level, inverted as a whole; no tiles, no groups.
+        components: uncoupled components of a dense level.
         band: the only level, factored as a whole; no tiles, no groups.
-        data: device struct of tiles and groups.
-        tiles, groups: their numbers; 0 groups: no level below.
-        galerkin: device tables of the product that forms the next level's matrix.
+        device_data: device struct of tiles and groups.
+        tile_count, group_count: their numbers; 0 groups: no level below.
+        galerkin_tables: device tables of the product that forms the next level's matrix.
     """
 
     pattern: Pattern
-    slots: int
-    dense: bool
-    data: Any
-    tiles: int = 0
-    groups: int = 0
-    galerkin: tuple[wp.array, wp.array, wp.array] | None = None
+    slot_count: int
+    is_dense: bool
+    device_data: Any
+    tile_count: int = 0
+    group_count: int = 0
+    galerkin_tables: tuple[wp.array, wp.array, wp.array] | None = None
     band: Band | None = None
-    parts: DenseComponents | None = None
+    components: DenseComponents | None = None
 
     @property
-    def whole(self) -> bool:
+    def solved_directly(self) -> bool:
         """True if the level is inverted or factored as a whole (no level below)."""
-        return self.dense or self.band is not None
+        return self.is_dense or self.band is not None
 
 
 @dataclass(eq=False)
@@ -70,16 +72,16 @@ class ReferencePoints:
     """Reference configuration of a level's slots, at which affine functions are evaluated.
 
     Attributes:
-        value: (slots, 3) reference value of a slot: a position (m) or a gradient.
-        position: (slots,) True for a position slot.
-        node: (slots,) slots of one node share a tile and a group.
-        label: (slots,) slots of different labels never share a tile or group.
+        reference: (slots, 3) reference value of a slot: a position (m) or a gradient.
+        is_position: (slots,) True for a position slot.
+        node_index: (slots,) slots of one node share a tile and a group.
+        separate_label: (slots,) slots of different labels never share a tile or group.
     """
 
-    value: np.ndarray
-    position: np.ndarray
-    node: np.ndarray
-    label: np.ndarray
+    reference: np.ndarray
+    is_position: np.ndarray
+    node_index: np.ndarray
+    separate_label: np.ndarray
 
 
 def make_levels(model: Model, pattern: Pattern, *, coarse: bool = True, by_component: bool = True) -> list[Level]:
@@ -91,49 +93,51 @@ def make_levels(model: Model, pattern: Pattern, *, coarse: bool = True, by_compo
     origin = np.concatenate([np.tile(body.origin, (body.slot_count, 1)) for body in model.bodies])
     position = model.slot_kind == 0
     place = model.reference + origin * position[:, None]
-    points = ReferencePoints(place, position, np.cumsum(position) - 1, model.part)
+    points = ReferencePoints(place, position, np.cumsum(position) - 1, model.mesh_component)
     if not coarse:
         return [_make_level(model, pattern, points, GROUP_SLOTS)[0]]
     levels = []
-    bottom = BOTTOM_SLOTS["cuda" if model.device.is_cuda else "cpu"]
+    bottom = MAX_BOTTOM_SLOTS["cuda" if model.device.is_cuda else "cpu"]
     for depth in range(MAX_LEVELS):
         n = pattern.graph.shape[0]
-        parts = DenseComponents.of(model, pattern) if by_component else None
+        components = DenseComponents.from_pattern(model, pattern) if by_component else None
         small = n <= (bottom if depth else MAX_FULL_FACTOR_SLOTS)
-        if parts and not small:  # one matrix per component
-            entries = parts.count * parts.most**2
-            small = entries <= (bottom**2 if depth else COMPONENT_PAIRS if parts.most <= MAX_FULL_FACTOR_SLOTS else 0)
+        if components and not small:  # one matrix per component
+            entries = components.count * components.max_slots**2
+            small = entries <= (
+                bottom**2 if depth else MAX_COMPONENT_PAIRS if components.max_slots <= MAX_FULL_FACTOR_SLOTS else 0
+            )
         if small:
-            levels.append(Level(pattern, n, True, level_struct(model.dtype)(), parts=parts))
+            levels.append(Level(pattern, n, True, level_struct(model.dtype)(), components=components))
             return levels
         # larger groups if the next level then becomes the bottom: one dense product costs less than more levels
         large = 2 * GROUP_SLOTS
         capacity = large if 4 * n / GROUP_SLOTS > bottom >= 4.05 * n / large else GROUP_SLOTS
-        capacity = next((c for c in SMALL_GROUPS if 4.05 * n / c <= SMALL_COARSE), capacity)
+        capacity = next((c for c in SMALL_GROUP_SLOTS if 4.05 * n / c <= MAX_SMALL_COARSE_SLOTS), capacity)
         level, points, pattern = _make_level(model, pattern, points, capacity)
         levels.append(level)
         # below the first level groups may span bodies connected by joints and, where they hardly shrink, any bodies
-        points.label = points.label if depth else model.component[_first_members(level)]
-        if level.groups * 4 > n // 2:
-            points.label = np.zeros_like(points.label)
+        points.separate_label = points.separate_label if depth else model.component[_representative_slots(level)]
+        if level.group_count * 4 > n // 2:
+            points.separate_label = np.zeros_like(points.separate_label)
     raise AssertionError("groups do not shrink")
 
 
-def _first_members(level: Level) -> np.ndarray:
+def _representative_slots(level: Level) -> np.ndarray:
     """One representative slot of its group for each slot of the next level."""
-    start, slot = level.data.group_start.numpy(), level.data.group_slot.numpy()
+    start, slot = level.device_data.group_start.numpy(), level.device_data.group_slot.numpy()
     return np.repeat(slot[start[:-1]], 4)
 
 
 def _make_level(
     model: Model, pattern: Pattern, points: ReferencePoints, capacity: int
 ) -> tuple[Level, ReferencePoints, Pattern]:
-    n = len(points.value)
-    first = np.flatnonzero(np.diff(points.node, prepend=-1))
+    n = len(points.reference)
+    first = np.flatnonzero(np.diff(points.node_index, prepend=-1))
     sizes = np.diff(first, append=n)
-    args = points.value[first], sizes, points.label[first]
-    tile = bisect(*args, TILE_SLOTS)[points.node]
-    group = connected_groups(bisect(*args, capacity)[points.node], pattern.graph)
+    args = points.reference[first], sizes, points.separate_label[first]
+    tile = bisect_groups(*args, TILE_SLOTS)[points.node_index]
+    group = connected_groups(bisect_groups(*args, capacity)[points.node_index], pattern.graph)
     tiles, groups = int(tile.max()) + 1, int(group.max()) + 1
     data = level_struct(model.dtype)()
     order = np.argsort(tile, kind="stable")
@@ -143,7 +147,7 @@ def _make_level(
     table = np.full((tiles, TILE_SLOTS), -1)
     table[tile, place] = np.arange(n)
     by_group = np.argsort(group, kind="stable")
-    weight, centre, size = _affine(points, group, groups)
+    weight, centre, size = _affine_functions(points, group, groups)
     vec4 = wp.types.vector(length=4, dtype=model.types.T)
     tables: dict[str, tuple[Any, Any]] = {
         "tile_slot": (table, wp.int32),
@@ -157,33 +161,35 @@ def _make_level(
     for name, (values, dtype) in tables.items():
         setattr(data, name, model.array("levels", values, dtype))
     data.tile_count, data.group_count = tiles, groups
-    coarse, galerkin = _galerkin(model, pattern, group, groups)
+    coarse, galerkin = _galerkin_product(model, pattern, group, groups)
     level = Level(pattern, n, False, data, tiles, groups, galerkin)
     value = np.zeros((groups, 4, 3))
     value[:, 0] = centre
     value[:, 1:] = size[:, None, None] * np.eye(3)
     position = np.tile([True, False, False, False], groups)
     node = np.repeat(np.arange(groups), 4)
-    label = np.repeat(points.label[by_group[np.flatnonzero(np.diff(group[by_group], prepend=-1))]], 4)
+    label = np.repeat(points.separate_label[by_group[np.flatnonzero(np.diff(group[by_group], prepend=-1))]], 4)
     return level, ReferencePoints(value.reshape(-1, 3), position, node, label), coarse
 
 
-def _affine(points: ReferencePoints, group: np.ndarray, groups: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _affine_functions(
+    points: ReferencePoints, group: np.ndarray, groups: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Values (slots, 4) of the affine functions 1, x, y, z of each slot's group, with the groups' origins and scales.
 
     x, y, z are relative to the centre (groups, 3), m, divided by the size (groups,), m.
     """
-    at = np.flatnonzero(points.position)
+    at = np.flatnonzero(points.is_position)
     count = np.maximum(np.bincount(group[at], minlength=groups), 1)
-    centre = np.stack([np.bincount(group[at], points.value[at, k], groups) / count for k in range(3)], axis=1)
-    arm = points.value - points.position[:, None] * centre[group]
+    centre = np.stack([np.bincount(group[at], points.reference[at, k], groups) / count for k in range(3)], axis=1)
+    arm = points.reference - points.is_position[:, None] * centre[group]
     size = np.zeros(groups)
     np.maximum.at(size, group, np.linalg.norm(arm, axis=1))
     size = np.where(size > 0.0, size, 1.0)
-    return np.column_stack([points.position.astype(float), arm / size[group][:, None]]), centre, size
+    return np.column_stack([points.is_position.astype(float), arm / size[group][:, None]]), centre, size
 
 
-def _galerkin(
+def _galerkin_product(
     model: Model, pattern: Pattern, group: np.ndarray, groups: int
 ) -> tuple[Pattern, tuple[wp.array, wp.array, wp.array]]:
     """Pattern of the Galerkin matrix P^T A P, and the tables of `galerkin` in kernels/solvers/blocks.py."""
@@ -205,4 +211,4 @@ def _galerkin(
     coarse = sp.csr_matrix((np.ones(len(pairs), dtype=np.int8), second, start), shape=(groups, groups))
     blocks = sp.kron(coarse, np.ones((4, 4), dtype=np.int8), format="csr")
     blocks.sort_indices()
-    return make_pattern(model, blocks, mirrored=False), galerkin
+    return make_pattern(model, blocks, with_upper=False), galerkin

@@ -18,9 +18,9 @@ from ..kernels.solvers.newton_control import FLOOR_LANES
 from ..kernels.solvers.perturbation import SAMPLES, perturbation_kernels
 from ..kernels.solvers.vectors import vector_kernels
 from .bicgstab import BiCGStab
-from .direct import Direct
+from .direct import DirectSolver
 from .pcg import PCG
-from .preconditioner import NAMES, choose, make
+from .preconditioner import PRECONDITIONERS, choose_preconditioner, make_preconditioner
 from .residual import Residual
 
 if TYPE_CHECKING:
@@ -29,17 +29,17 @@ if TYPE_CHECKING:
 
 __all__ = ["NewtonLoop", "NewtonPCG"]
 
-EPS = {"float64": 2.0**-52, "float32": 2.0**-23}
-MAX_FLOOR = {"float64": 1e-4, "float32": 2e-3}
+MACHINE_EPSILON = {"float64": 2.0**-52, "float32": 2.0**-23}
+MAX_ROUND_OFF_ERROR = {"float64": 1e-4, "float32": 2e-3}
 """Largest accepted error estimate (relative, energy norm) when round-off stops the residual."""
-NEWTON_COST = {False: 20, True: 100}
+NEWTON_ITERATION_COST = {False: 20, True: 100}
 """CG iterations equivalent to one Newton iteration in `max_work`, without and with contact (line searches take many
 evaluations). A slender column perturbed by 1e-4 of its load takes 8037 of the 10 000 in the load step that buckles it;
 steps with contact rejected after 8 halvings take 500 to 800 of the 2000."""
-GRAVITY_SCALE = 9.81
-"""Acceleration scale, m/s^2, of the constraint tolerance of acceleration-level schemes: `GRAVITY_SCALE` (dq/dv)^2 tol,
-m."""
-MIN_VIOLATION = 1e-14
+ACCELERATION_SCALE = 9.81
+"""Acceleration scale, m/s^2, of the constraint tolerance of acceleration-level schemes: `ACCELERATION_SCALE` (dq/dv)^2
+tol, m."""
+MIN_CONSTRAINT_TOL = 1e-14
 """Smallest constraint tolerance of acceleration-level schemes, over the model's size."""
 
 
@@ -123,8 +123,10 @@ class NewtonPCG:
         for name, default in idle.items() if self.linear == "direct" else ():
             if getattr(self, name) != default:
                 raise ModelError(f"NewtonPCG: {name} = {getattr(self, name)!r} is not for linear = 'direct'")
-        if self.preconditioner not in ("auto", *NAMES):
-            raise ModelError(f"preconditioner {self.preconditioner!r} is unknown; there are auto, {', '.join(NAMES)}")
+        if self.preconditioner not in ("auto", *PRECONDITIONERS):
+            raise ModelError(
+                f"preconditioner {self.preconditioner!r} is unknown; there are auto, {', '.join(PRECONDITIONERS)}"
+            )
         if self.preconditioner_dtype not in (None, "float32", "float64"):
             raise ModelError(
                 f"NewtonPCG: preconditioner_dtype = {self.preconditioner_dtype!r} is none of 'float32', 'float64', None"
@@ -136,14 +138,14 @@ class NewtonPCG:
 
     def newton_budget(self, contact: bool) -> int:
         """Newton iterations in a step, with or without contact, that use up `max_work`."""
-        return max(self.max_work // NEWTON_COST[contact], 1)
+        return max(self.max_work // NEWTON_ITERATION_COST[contact], 1)
 
     def tolerance(self, dtype: str) -> float:
         """Relative tolerance for precision "float64" or "float32"."""
         return self.tol if self.tol is not None else {"float64": 1e-8, "float32": 1e-4}[dtype]
 
-    def kappa(self, dtype: str) -> float:
-        """Constraint penalty ratio kappa for one precision."""
+    def penalty_ratio(self, dtype: str) -> float:
+        """Constraint penalty ratio kappa, the penalty over the stiffness of the tied slots, for one precision."""
         return self.penalty if self.penalty is not None else {"float64": 1000.0, "float32": 100.0}[dtype]
 
 
@@ -152,14 +154,14 @@ class TermOptions:
     """Solver options that terms need.
 
     Attributes:
-        classical: multipliers are updated in an outer loop.
-        kappa: penalty of a constraint over the stiffness of the tied slots.
-        deflate: the preconditioner lacks the penalties; terms correct it.
+        outer_multipliers: multipliers are updated in an outer loop.
+        penalty_ratio: kappa, penalty of a constraint over the stiffness of the tied slots.
+        deflate_constraints: the preconditioner lacks the penalties; terms correct it.
     """
 
-    classical: bool
-    kappa: float
-    deflate: bool
+    outer_multipliers: bool
+    penalty_ratio: float
+    deflate_constraints: bool
 
 
 class NewtonLoop:
@@ -172,15 +174,18 @@ class NewtonLoop:
         self.ctx, self.model, self.work, self.launch, self.terms = ctx, model, work, launch, model.terms
         self.constraint_tol = constraint_tol
         traits = ctx.traits
-        self.kernels, self.vectors = newton_kernels(traits), vector_kernels(model.dtype, traits.has_constraints)
-        self.limited = traits.limited
-        self.classical = traits.has_constraints and options.multipliers == "outer"
+        self.kernels, self.vector_kernels = newton_kernels(traits), vector_kernels(model.dtype, traits.has_constraints)
+        self.limits_step = traits.limited
+        self.outer_multipliers = traits.has_constraints and options.multipliers == "outer"
         self.max_outer = options.max_outer
         direct = options.linear == "direct"
-        kind = "direct" if direct else choose(options.preconditioner, options.preconditioner_dtype, model)
+        kind = (
+            "direct" if direct else choose_preconditioner(options.preconditioner, options.preconditioner_dtype, model)
+        )
         # factors include the penalties
         deflate = kind not in ("block-jacobi", "banded") and not direct
-        ctx.options = TermOptions(classical=self.classical, kappa=options.kappa(model.dtype), deflate=deflate)
+        penalty_ratio = options.penalty_ratio(model.dtype)
+        ctx.options = TermOptions(self.outer_multipliers, penalty_ratio, deflate_constraints=deflate)
         for term in self.terms:
             term.configure(ctx)
         operator = options.operator
@@ -189,12 +194,12 @@ class NewtonLoop:
         banded = kind == "banded" and model.device.is_cuda
         assembled = kind not in ("deflated", "block-jacobi")
         self.residual = Residual(ctx, operator=operator, assembled=assembled, banded=banded)
-        self.direct = Direct(ctx, self.residual) if direct else None
-        self.preconditioner = self.direct or make(
+        self.direct = DirectSolver(ctx, self.residual) if direct else None
+        self.preconditioner = self.direct or make_preconditioner(
             kind, options.preconditioner_dtype, model, work, launch, self.residual
         )
-        kind_of_solver = BiCGStab if ctx.midpoint else PCG  # unsymmetric operator of mid-point schemes
-        self.pcg = kind_of_solver(
+        linear_solver = BiCGStab if ctx.midpoint else PCG  # unsymmetric operator of mid-point schemes
+        self.pcg = linear_solver(
             model, work, launch, self.residual, self.preconditioner,
             max_iterations=options.max_pcg, max_work=options.max_work, deflate=inertia,
         )  # fmt: skip
@@ -218,31 +223,31 @@ class NewtonLoop:
             ctl.first_forcing = options.forcing
         ctl.force_tol = options.force_tol
         ctl.tol = options.tolerance(model.dtype)
-        ctl.eps = EPS[model.dtype]
+        ctl.eps = MACHINE_EPSILON[model.dtype]
         ctl.is_static = int(not inertia)
         ctl.model_size = float(model.size)
         ctl.component_of_group = model.residual_groups.component
         ctl.max_iterations = options.max_newton
-        ctl.max_floor_error = MAX_FLOOR[model.dtype]
+        ctl.max_floor_error = MAX_ROUND_OFF_ERROR[model.dtype]
         ctl.refuse_inversion = int(inversion == "refuse")
         ctl.linear_stress = int(all(block.key.law in DEFINED_FOR_ANY_J for block in model.blocks))
         rate = inertia and any(b.key.damping == "rate" for b in model.blocks)
         ctl.has_nonpotential = int(traits.nonpotential or rate)
-        ctl.classical_multipliers = int(self.classical)
-        ctl.penalty_norm_ratio = 1.0 / math.sqrt(1.0 + options.kappa(model.dtype))
-        ctl.constraint_tol = 1e300 if self.classical else constraint_tol  # the classical inner solves converge g only
+        ctl.classical_multipliers = int(self.outer_multipliers)
+        ctl.penalty_norm_ratio = 1.0 / math.sqrt(1.0 + penalty_ratio)
+        ctl.constraint_tol = 1e300 if self.outer_multipliers else constraint_tol  # inner solves converge g only
         if ctx.accelerated and model.dtype == "float64":  # float32 positions have a larger round-off
-            ctl.constraint_acceleration_tol = max(constraint_tol / model.size, ctl.tol) * GRAVITY_SCALE
-            ctl.constraint_tol_min = MIN_VIOLATION * model.size
+            ctl.constraint_acceleration_tol = max(constraint_tol / model.size, ctl.tol) * ACCELERATION_SCALE
+            ctl.constraint_tol_min = MIN_CONSTRAINT_TOL * model.size
         # in double precision round-off is far below the errors for which steps are rejected; forces at a mid-point are
         # not those of the positions
-        self.perturbation = None
+        self.perturbation_kernels = None
         if model.dtype == "float32" and not ctx.midpoint:
-            self.perturbation = perturbation_kernels(model.dtype)
-            self.perturbed = work.array("perturbed", (model.worlds,), wp.int32)
-        self.first_iterates: Sequence[Callable[[], None]] = ()
-        self.iterating = work.any_flag[0:1]
-        self.searching = work.any_flag[1:2]
+            self.perturbation_kernels = perturbation_kernels(model.dtype)
+            self.perturbed_worlds = work.array("perturbed", (model.worlds,), wp.int32)
+        self.first_iterate_candidates: Sequence[Callable[[], None]] = ()
+        self.any_iterating = work.any_flag[0:1]
+        self.any_searching = work.any_flag[1:2]
 
     def register(self, state: State) -> None:
         """Register the solver history in the state."""
@@ -262,25 +267,24 @@ class NewtonLoop:
     def modules(self) -> set[wp.Module]:
         """Modules launched by the loop, except those of reductions and terms."""
         out = {self.kernels.module} | self.pcg.modules()
-        out |= {self.perturbation.module} if self.perturbation else set()
+        out |= {self.perturbation_kernels.module} if self.perturbation_kernels else set()
         return out | self.preconditioner.modules() | self.residual.modules()
 
     def run(self) -> None:
         """Iterate from work.v until every active world has converged or failed.
 
-        `first_iterates` write other first iterates to work.v in the worlds flagged by `choose_initial`.
+        `first_iterate_candidates` write other first iterates to work.v in the worlds flagged by `choose_initial`.
         """
         w = self.work
         self._clear_direction(w.newton.active)
-        self._open(w.newton.active)
+        self._evaluate_first_iterate(w.newton.active)
         self._solve(first=True)
-        if self.classical:
+        if self.outer_multipliers:
             self._check_constraints()
-            wp.capture_while(self.iterating, self._update_multipliers)
+            wp.capture_while(self.any_iterating, self._update_multipliers)
 
-    def _open(self, flags: wp.array) -> None:
-        """Evaluate the first iterate."""
-        # its check needs D, so the blocks come first
+    def _evaluate_first_iterate(self, flags: wp.array) -> None:
+        """Evaluate the first iterate; its convergence check needs D, so the blocks come first."""
         self.residual.update_positions(flags)
         self._call_terms("prepare", flags)
         self.preconditioner.start(flags)
@@ -290,29 +294,29 @@ class NewtonLoop:
     def _solve(self, first: bool = False) -> None:
         """Newton iteration from the current residual; `first`: first solve of an attempt."""
         w = self.work
-        choose = bool(self.first_iterates) and first
+        choose = bool(self.first_iterate_candidates) and first
         self.launch(self.kernels.begin_iteration, self.model.worlds, [w.newton, int(choose)])
-        self._if_rare(self._choose_initial if choose else self._check_inversion)
+        self._run_if_rare(self._choose_first_iterate if choose else self._check_inversion)
         if self.terms.traits.unilateral:  # the first iterate may be the solution, as in free fall
             self._update_frozen()
-        self._reduce_flags(w.newton.active, self.iterating)
-        wp.capture_while(self.iterating, self._iterate)
+        self._reduce_flags(w.newton.active, self.any_iterating)
+        wp.capture_while(self.any_iterating, self._iterate)
 
     @labelled("control")
-    def _choose_initial(self) -> None:
+    def _choose_first_iterate(self) -> None:
         """Select the best first iterate (J > 0 first, then lowest Phi)."""
         w, k, launch = self.work, self.kernels, self.launch
         choose, better = w.newton.choose_first_iterate, w.newton.searching
         launch(k.compare_first_iterates, self.model.worlds, [w.newton, 1, better])
-        launch(self.vectors.copy_active, self.dim, [w.v, better, w.best])
-        for put in self.first_iterates:
+        launch(self.vector_kernels.copy_active, self.dim, [w.v, better, w.best])
+        for put in self.first_iterate_candidates:
             put()
             self.residual.evaluate(choose, freeze=True)
             launch(k.compare_first_iterates, self.model.worlds, [w.newton, 0, better])
-            launch(self.vectors.copy_active, self.dim, [w.v, better, w.best])
-        launch(self.vectors.copy_active, self.dim, [w.best, choose, w.v])
+            launch(self.vector_kernels.copy_active, self.dim, [w.v, better, w.best])
+        launch(self.vector_kernels.copy_active, self.dim, [w.best, choose, w.v])
         self.preconditioner.discard(choose)
-        self._open(choose)
+        self._evaluate_first_iterate(choose)
         launch(k.begin_iteration, self.model.worlds, [w.newton, 2])
         self._check_inversion()
 
@@ -320,7 +324,7 @@ class NewtonLoop:
         w = self.work
         args = [w.newton, w.step.running, self.constraint_tol, self.max_outer]
         self.launch(self.kernels.check_constraints, self.model.worlds, args)
-        self._reduce_flags(w.newton.active, self.iterating)
+        self._reduce_flags(w.newton.active, self.any_iterating)
 
     def _update_multipliers(self) -> None:
         """Update multipliers, lambda += rho c, in worlds with violated constraints, for another solve from the current
@@ -335,36 +339,36 @@ class NewtonLoop:
         w, k, launch = self.work, self.kernels, self.launch
         active = w.newton.active
         self.residual.linearise(active)
-        if self.perturbation:
+        if self.perturbation_kernels:
             with launch.rare():
-                wp.capture_if(w.newton.any_estimate_error, self._perturb)
+                wp.capture_if(w.newton.any_estimate_error, self._average_perturbed_residuals)
         self.pcg.solve(active)
         self.residual.freeze_nonpotential(active)
         self.residual.tangent_curvature(active)
-        if self.limited:
+        if self.limits_step:
             launch(k.reset_step_limit, self.model.worlds, [w.newton])
         self._call_terms("process_direction", active)
-        launch(self.vectors.set_base, self.dim, [w.newton, w.v, w.base, w.best])
-        launch(self.vectors.dot_terms, self.dim, [w.gradient, w.direction, active, w.rows])
+        launch(self.vector_kernels.set_base, self.dim, [w.newton, w.v, w.base, w.best])
+        launch(self.vector_kernels.dot_terms, self.dim, [w.gradient, w.direction, active, w.rows])
         self.residual.reduce(w.rows, 1, active, w.newton.slope_sum)
         launch(k.begin_search, self.model.worlds, [w.newton, w.pcg])
-        self._reduce_flags(w.newton.searching, self.searching)
-        wp.capture_while(self.searching, self._search)
-        self._if_rare(self._rare_steps)
+        self._reduce_flags(w.newton.searching, self.any_searching)
+        wp.capture_while(self.any_searching, self._try_step_length)
+        self._run_if_rare(self._run_rare_branch)
         if self.terms.traits.unilateral:
             self._update_frozen()
         self.preconditioner.update(active)
         self._call_terms("prepare_solve", active)
-        self._reduce_flags(active, self.iterating)
+        self._reduce_flags(active, self.any_iterating)
 
     @labelled("control")
-    def _perturb(self) -> None:
+    def _average_perturbed_residuals(self) -> None:
         """Replace the residual by its mean over perturbed positions before the error estimate.
 
-        The round-off of the residual is a function of the bits of the iterate. Newton's method converges to its zero,
-        which hides the error, most of all along soft directions.
+        The round-off of the residual depends on the bits of the iterate. Newton's method converges to iterates where it
+        cancels, which hides the error, most of all along soft directions.
         """
-        w, k, launch, flags = self.work, self.perturbation, self.launch, self.perturbed
+        w, k, launch, flags = self.work, self.perturbation_kernels, self.launch, self.perturbed_worlds
         assert k is not None
         launch(k.begin_samples, self.dim, [w.newton, flags, w.p, w.z])
         for sample in range(SAMPLES):
@@ -382,34 +386,34 @@ class NewtonLoop:
         """Update lagged term data (friction limits, multipliers) after convergence with frozen values."""
         w, flags = self.work, self.work.newton.trial_accepted
         self.launch(self.kernels.begin_frozen_update, self.model.worlds, [w.newton, flags])
-        self._reduce_flags(flags, self.searching)
-        wp.capture_if(self.searching, self._reevaluate_frozen)
+        self._reduce_flags(flags, self.any_searching)
+        wp.capture_if(self.any_searching, self._reevaluate_frozen)
 
     def _reevaluate_frozen(self) -> None:
         w, flags = self.work, self.work.newton.trial_accepted
         self._call_terms("update_frozen", flags)
         self.residual.reevaluate_frozen(flags)
         self.launch(self.kernels.end_frozen_update, self.model.worlds, [w.newton, flags])
-        self._if_rare(self._check_inversion)
+        self._run_if_rare(self._check_inversion)
 
     @labelled("control")
-    def _rare_steps(self) -> None:
+    def _run_rare_branch(self) -> None:
         """Rare branch: error estimate, step length of non-monotone trials, further searches, inversion check."""
         m, w, k = self.model, self.work, self.kernels
-        parts = m.residual_parts
+        parts = m.error_estimate_groups
         args = [w.newton, parts.slot_start, parts.slot, parts.element_start, parts.element]
         args += [w.gradient, w.direction, w.inertia, w.v, w.v_tilde, w.u, w.energy_rows]
-        self.launch(self.vectors.floor_partials, (m.worlds, parts.count, FLOOR_LANES), args)
+        self.launch(self.vector_kernels.floor_partials, (m.worlds, parts.count, FLOOR_LANES), args)
         self.launch(k.check_rounding_floor, m.worlds, [w.newton, parts.component])
-        if self.perturbation:
-            self.residual.evaluate(self.perturbed)
-            self.perturbed.zero_()
-        self._reduce_flags(w.newton.searching, self.searching)
-        wp.capture_while(self.searching, self._search)
+        if self.perturbation_kernels:
+            self.residual.evaluate(self.perturbed_worlds)
+            self.perturbed_worlds.zero_()
+        self._reduce_flags(w.newton.searching, self.any_searching)
+        wp.capture_while(self.any_searching, self._try_step_length)
         self.residual.elements.measure_direction_gradient(self.ctx, w.direction, w.newton.active)
         self.launch(k.limit_nonmonotone_step, m.worlds, [w.newton])
-        self._reduce_flags(w.newton.searching, self.searching)
-        wp.capture_while(self.searching, self._search)
+        self._reduce_flags(w.newton.searching, self.any_searching)
+        wp.capture_while(self.any_searching, self._try_step_length)
         self._check_inversion()
 
     def _check_inversion(self) -> None:
@@ -418,16 +422,16 @@ class NewtonLoop:
         self.residual.elements.check_inversion(self.ctx, w.newton.inversion_suspected)
         w.newton.any_rare_branch.zero_()
 
-    def _search(self) -> None:
+    def _try_step_length(self) -> None:
         w, k, launch = self.work, self.kernels, self.launch
-        launch(self.vectors.trial_velocity, self.dim, [w.newton, w.base, w.direction, w.best, w.v])
+        launch(self.vector_kernels.trial_velocity, self.dim, [w.newton, w.base, w.direction, w.best, w.v])
         self.residual.evaluate(w.newton.searching)
         launch(k.check_trial, self.model.worlds, [w.newton])
         if self.terms.traits.stored:
             self._call_terms("accept_trial", w.newton.trial_accepted)
-        self._reduce_flags(w.newton.searching, self.searching)
+        self._reduce_flags(w.newton.searching, self.any_searching)
 
-    def _if_rare(self, do: Callable[[], None]) -> None:
+    def _run_if_rare(self, do: Callable[[], None]) -> None:
         """Run `do` if any world needs the rare branch."""
         with self.launch.rare():
             wp.capture_if(self.work.newton.any_rare_branch, do)
@@ -439,7 +443,7 @@ class NewtonLoop:
 
     def _reduce_flags(self, flags: wp.array, out: wp.array) -> None:
         out.zero_()
-        self.launch(self.vectors.set_any_flag, self.model.worlds, [flags, out])
+        self.launch(self.vector_kernels.set_any_flag, self.model.worlds, [flags, out])
 
     def _clear_direction(self, active: wp.array) -> None:
         self.launch(self.pcg.kernels.initialise_residual, self.dim, [self.work.g, self.model.topology.free, active,

@@ -34,7 +34,7 @@ class PCG:
         self.preconditioner = preconditioner
         self.kernels = pcg_kernels(model.dtype, model.terms.traits.has_constraints)
         self.dim = (model.worlds, model.slots)
-        self.deflate = deflate and model.group_count > 0
+        self.deflate_translations = deflate and model.free_group_count > 0
         work.pcg.max_iterations = max_iterations
         work.pcg.max_work = max_work
 
@@ -81,14 +81,16 @@ class PCG:
 
     def correct_translations(self, active: wp.array) -> None:
         """Galerkin correction for the translations Z of free groups: x += Z (Z^T H Z)^-1 Z^T r, r updated."""
-        if not self.deflate:
+        if not self.deflate_translations:
             return
         m, w, k, launch = self.model, self.work, self.kernels, self.launch
         mass = w.step.mass_factor
         launch(
-            k.free_group_partials, (m.worlds, m.group_count, FREE_GROUP_LANES), [m.groups, w.r, active, w.group_partial]
+            k.free_group_partials,
+            (m.worlds, m.free_group_count, FREE_GROUP_LANES),
+            [m.free_groups, w.r, active, w.group_partial],
         )
-        args = [m.groups, w.group_partial, mass, active, w.group_velocity]
-        launch(k.group_velocity, (m.worlds, m.group_count), args)
-        args = [m.groups, w.group_velocity, m.topology.free, mass, active, w.direction, w.r]
+        args = [m.free_groups, w.group_partial, mass, active, w.group_velocity]
+        launch(k.group_velocity, (m.worlds, m.free_group_count), args)
+        args = [m.free_groups, w.group_velocity, m.topology.free, mass, active, w.direction, w.r]
         launch(k.translate_groups, self.dim, args)

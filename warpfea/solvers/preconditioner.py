@@ -9,7 +9,7 @@ import warp as wp
 from ..base.errors import ModelError
 from ..base.launch import labelled
 from ..kernels.solvers.pcg import pcg_kernels
-from .band import MAX_FULL_FACTOR_SLOTS, block_band, find_band
+from .band import MAX_FULL_FACTOR_SLOTS, find_band, thread_block_band
 from .residual import Residual
 from .twolevel import TwoLevel
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from ..model.state import State
     from ..terms.workspace import Workspace
 
-__all__ = ["NAMES", "BlockJacobi", "Preconditioner", "choose", "make"]
+__all__ = ["PRECONDITIONERS", "BlockJacobi", "Preconditioner", "choose_preconditioner", "make_preconditioner"]
 
 
 class Preconditioner(Protocol):
@@ -107,19 +107,20 @@ class BlockJacobi:
                 term.precondition(ctx, r, z, active)
 
 
-NAMES = ("two-level", "tiles", "banded", "deflated", "block-jacobi")
-SMALL_BODY = 64
+PRECONDITIONERS = ("two-level", "tiles", "banded", "deflated", "block-jacobi")
+SMALL_BODY_SLOTS = 64
+"""Mean number of slots of a body below which bodies on joints take block Jacobi."""
 
 
-def choose(name: str, storage: str | None, model: Model) -> str:
-    """Resolve a name of NAMES or "auto": banded factors for a narrow band, else block Jacobi if bodies on joints are
-    too small for several groups of nodes.
+def choose_preconditioner(name: str, storage: str | None, model: Model) -> str:
+    """Resolve a name of PRECONDITIONERS or "auto": banded factors for a narrow band, else block Jacobi if bodies on
+    joints are too small for several groups of nodes.
 
     Raises:
         ModelError: "banded" for a larger model on a GPU, or with a storage precision other than the model's.
     """
     kept = storage in (None, model.dtype)
-    banded = kept and (not model.device.is_cuda or block_band(model) is not None)
+    banded = kept and (not model.device.is_cuda or thread_block_band(model) is not None)
     if name == "banded" and kept and not banded:
         raise ModelError(
             "NewtonPCG: preconditioner = 'banded' is for the CPU, and on a GPU for small models with a narrow band; "
@@ -134,7 +135,7 @@ def choose(name: str, storage: str | None, model: Model) -> str:
         return name
     if banded and not model.device.is_cuda and find_band(model) is not None:
         return "banded"
-    small = model.slots < SMALL_BODY * (int(model.part.max()) + 1)
+    small = model.slots < SMALL_BODY_SLOTS * (int(model.mesh_component.max()) + 1)
     return (
         "deflated"
         if model.terms.traits.has_constraints and small and model.slots > MAX_FULL_FACTOR_SLOTS
@@ -142,10 +143,10 @@ def choose(name: str, storage: str | None, model: Model) -> str:
     )
 
 
-def make(
+def make_preconditioner(
     name: str, storage: str | None, model: Model, work: Workspace, launch: Launcher, residual: Residual
 ) -> Preconditioner:
-    """Construct the preconditioner `name` of NAMES."""
+    """Construct the preconditioner `name` of PRECONDITIONERS."""
     if name in ("block-jacobi", "deflated"):
         return BlockJacobi(model, work, launch, residual)
     return TwoLevel(model, work, launch, residual, storage, kind=name)

@@ -18,8 +18,8 @@ from ..kernels.step.gather import RESIDUAL_ROWS, gather_kernels
 from ..kernels.step.midpoint import midpoint_kernels
 from ..kernels.terms.constraints import constraint_struct
 from ..terms.elements import Elements
-from .assembled import Assembled, shaped
-from .clusters import ModelClusters, make_clusters, make_pool
+from .clusters import ModelClusters, make_cluster_memory, make_clusters
+from .matrix_assembly import MatrixAssembler, leading_view
 from .reuse import ReuseRule
 
 if TYPE_CHECKING:
@@ -28,21 +28,21 @@ if TYPE_CHECKING:
     from ..terms.term import StepContext
     from ..terms.workspace import Workspace
 
-__all__ = ["Reducer", "Residual"]
+__all__ = ["Residual", "RowReducer"]
 
-MATRIX_SLOTS = 10
+MAX_MATRIX_FREE_SLOTS = 10
 """Slots per element up to which H p from elements is cheaper than from their matrix, on a GPU."""
 MATRIX_REBUILD_COST = {False: 2.0, True: 0.5}
 """Assembly cost in Newton iterations, on the CPU and on CUDA."""
 BAND_REBUILD_COST = 3.0
 """Assembly cost in Newton iterations of matrices factored in a band on a GPU. 4096 pendulums take 8.5, 8.1 and 8.2 ms
 per step with 0.5, 1.5 and 3 at a tolerance of 1e-8, and 6.9, 5.7 and 4.2 ms at 1e-4."""
-FAST_MATRIX_SLOTS = 16384
+MAX_FAST_ASSEMBLY_SLOTS = 16384
 """Slots up to which a GPU assembles a matrix faster than it solves with one."""
 
 
-class Reducer:
-    """Sum of rows [row, world, item] into [row, world], in an order that depends on the row length only."""
+class RowReducer:
+    """Sums of rows [row, world, item] into [row, world], in an order that depends on the row length only."""
 
     def __init__(self, launch: Launcher, work: Workspace, worlds: int) -> None:
         self.launch = launch
@@ -72,6 +72,7 @@ class Residual:
 
     Attributes:
         uses_matrix: H p is a product with the assembled matrix.
+        matrix_reuse_level: reuse of that matrix: 0 none, 1 over the iterates of a step, 2 also over steps.
         on_assembled: called with that matrix and the flags of worlds that reassembled it.
     """
 
@@ -79,19 +80,22 @@ class Residual:
         model, work, launch = ctx.model, ctx.work, ctx.launch
         self.ctx, self.model, self.work, self.launch, self.terms = ctx, model, work, launch, model.terms
         self.elements: Elements = model.terms.find(Elements)
-        self.reduce = Reducer(launch, work, model.worlds)
+        self.reduce = RowReducer(launch, work, model.worlds)
         traits = ctx.traits
-        self.gather = gather_kernels(model.dtype, traits)
-        self.newton, self.vectors = newton_kernels(traits), vector_kernels(model.dtype, traits.has_constraints)
-        self.stage = midpoint_kernels(model.dtype)
-        self.con = model.constraints.data if traits.constraint_rows else constraint_struct()()
+        self.gather_kernels = gather_kernels(model.dtype, traits)
+        self.newton_kernels, self.vector_kernels = (
+            newton_kernels(traits),
+            vector_kernels(model.dtype, traits.has_constraints),
+        )
+        self.stage_kernels = midpoint_kernels(model.dtype)
+        self.constraint_data = model.constraints.data if traits.constraint_rows else constraint_struct()()
         self.dim = (model.worlds, model.slots)
-        self.additions = self._additions()
-        self.with_mass = all(block.with_mass for block in model.blocks)
+        self.product_terms = self._make_product_terms()
+        self.products_include_mass = all(block.with_mass for block in model.blocks)
         # elements with many points per slot cost more than their matrix. On the CPU it is used whenever the
         # preconditioner needs one anyway: one core assembles H in the time of 2 to 7 products of ANCF elements, and of
         # 15 of straight tetrahedra
-        cheaper = any(block.slots > MATRIX_SLOTS or block.key.tying for block in model.blocks)
+        cheaper = any(block.slots > MAX_MATRIX_FREE_SLOTS or block.key.tying for block in model.blocks)
         if not model.device.is_cuda:
             cheaper = assembled
         elif banded:  # their factors solve with the matrix
@@ -102,35 +106,35 @@ class Residual:
         self.clusters: ModelClusters | None = None
         # an equilibrium takes few products per iterate, and fewer iterates with the predicted stress
         self.uses_predicted_stress = not ctx.inertia and not self.uses_matrix
-        if self.with_mass and not self.uses_matrix and ctx.inertia:
+        if self.products_include_mass and not self.uses_matrix and ctx.inertia:
             if "clusters" not in model.cache:
                 model.cache["clusters"] = make_clusters(model)
             self.clusters = model.cache["clusters"]
-            self.pool = make_pool(model, work, midpoint=ctx.midpoint)
+            self.cluster_memory = make_cluster_memory(model, work, midpoint=ctx.midpoint)
             forms = [block.key.damping if ctx.inertia else None for block in model.blocks]
-            self.products = [
+            self.product_kernels = [
                 block.with_mass_product(model.dtype, form, ctx.midpoint, ctx.dissipation > 0.0)
                 for block, form in zip(model.blocks, forms)
             ]
-        self.matrix_reuse, self.reuse_across_steps = 0, False
+        self.matrix_reuse_level, self.reuse_across_steps = 0, False
         self.on_assembled: Callable[[wp.array, wp.array], None] | None = None
-        self.assembled: Assembled | None = None
+        self.assembler: MatrixAssembler | None = None
         if assembled or self.uses_matrix:
-            self.assembled = Assembled(model, work, launch, self.elements.kernels(ctx))
+            self.assembler = MatrixAssembler(model, work, launch, self.elements.kernels(ctx))
         if self.uses_matrix:
-            assert self.assembled is not None
-            self.matrix = self.assembled.values("operator matrix")
+            assert self.assembler is not None
+            self.operator_matrix = self.assembler.allocate_values("operator matrix")
             # not in statics (large steps) nor with damping (the viscous stress is no function of the state of a resumed
             # run) nor constraints (their forces are only as accurate as the solve); a GPU assembles a small matrix at
             # negligible cost
             damped = ctx.midpoint or any(block.key.damping in ("incremental", "rate") for block in model.blocks)
-            small = model.device.is_cuda and model.slots <= FAST_MATRIX_SLOTS
-            self.matrix_reuse = 2 if ctx.inertia and not damped else 0 if small else 1
+            small = model.device.is_cuda and model.slots <= MAX_FAST_ASSEMBLY_SLOTS
+            self.matrix_reuse_level = 2 if ctx.inertia and not damped else 0 if small else 1
             if traits.has_constraints:
-                self.matrix_reuse = 0
-            self.reuse_across_steps = self.matrix_reuse == 2
-            if self.matrix_reuse:
-                self.reuse = ReuseRule(
+                self.matrix_reuse_level = 0
+            self.reuse_across_steps = self.matrix_reuse_level == 2
+            if self.matrix_reuse_level:
+                self.matrix_reuse_rule = ReuseRule(
                     model,
                     work,
                     launch,
@@ -138,7 +142,7 @@ class Residual:
                     BAND_REBUILD_COST if banded else MATRIX_REBUILD_COST[model.device.is_cuda],
                 )
 
-    def _additions(self) -> Any:
+    def _make_product_terms(self) -> Any:
         """Terms of a product H p beyond the elements' part."""
         m, w = self.model, self.work
         out = product_terms_struct(m.dtype)()
@@ -158,13 +162,15 @@ class Residual:
 
     def modules(self) -> set[wp.Module]:
         """Modules of the gather and of an assembled matrix; terms list their own."""
-        out = {self.gather.module, self.vectors.module} | ({self.stage.module} if self.ctx.midpoint else set())
+        out = {self.gather_kernels.module, self.vector_kernels.module} | (
+            {self.stage_kernels.module} if self.ctx.midpoint else set()
+        )
         if self.uses_matrix:
-            assert self.assembled is not None
-            out |= {self.gather.matrix_module} | self.assembled.modules()
-            out |= {self.reuse.kernels.module} if self.matrix_reuse else set()
+            assert self.assembler is not None
+            out |= {self.gather_kernels.matrix_module} | self.assembler.modules()
+            out |= {self.matrix_reuse_rule.kernels.module} if self.matrix_reuse_level else set()
         elif self.clusters:
-            out |= {kernel.module for kernel in self.products}
+            out |= {kernel.module for kernel in self.product_kernels}
         elif self.uses_predicted_stress:
             out |= {kernel.module for kernel in self.elements.predicted_stress_kernels()}
         return out
@@ -172,66 +178,70 @@ class Residual:
     def register(self, state: State) -> None:
         """Register the reuse data of the operator matrix in the state."""
         if self.reuse_across_steps:
-            self.reuse.register(state)
+            self.matrix_reuse_rule.register(state)
 
     def invalidate(self, flags: wp.array) -> None:
         """Invalidate history of worlds whose state was set externally."""
         if self.reuse_across_steps:
-            self.reuse.invalidate(flags)
+            self.matrix_reuse_rule.invalidate(flags)
 
     def store_history(self, accepted: wp.array) -> None:
         """Store the reuse data of the operator matrix in the state."""
         if self.reuse_across_steps:
-            args = [self.reuse.control, self.work.newton, accepted]
-            self.launch(self.reuse.kernels.count_step, self.model.worlds, args)
-            self.reuse.move_point(accepted)
-            self.reuse.store_counts(accepted)
+            args = [self.matrix_reuse_rule.control, self.work.newton, accepted]
+            self.launch(self.matrix_reuse_rule.kernels.count_step, self.model.worlds, args)
+            self.matrix_reuse_rule.move_point(accepted)
+            self.matrix_reuse_rule.store_counts(accepted)
 
     @labelled("assembly")
     def linearise(self, active: wp.array) -> None:
         """Assemble the operator matrix at the iterate if its reuse rule requires it."""
         if not self.uses_matrix:
             return
-        if self.matrix_reuse == 0:
+        if self.matrix_reuse_level == 0:
             self.assemble_matrix(active)
             return
-        control = self.reuse.control
-        args = [control, self.work.newton, self.matrix_reuse]
-        self.launch(self.reuse.kernels.check_matrix_reuse, self.model.worlds, args)
-        self.reuse.decide_rebuild(active)
-        self.launch(self.reuse.kernels.loosen_forcing, self.model.worlds, [control, self.work.newton])
+        control = self.matrix_reuse_rule.control
+        args = [control, self.work.newton, self.matrix_reuse_level]
+        self.launch(self.matrix_reuse_rule.kernels.check_matrix_reuse, self.model.worlds, args)
+        self.matrix_reuse_rule.decide_rebuild(active)
+        self.launch(self.matrix_reuse_rule.kernels.loosen_forcing, self.model.worlds, [control, self.work.newton])
         wp.capture_if(control.any_build, self._assemble)
 
     @labelled("assembly")
     def _assemble(self) -> None:
-        assert self.assembled is not None
-        control = self.reuse.control
-        self.reuse.move_point()
+        assert self.assembler is not None
+        control = self.matrix_reuse_rule.control
+        self.matrix_reuse_rule.move_point()
         factors = (control.mass_factor, control.dq_dv)
-        self.assembled.assemble(
-            self.reuse.linearisation_point, factors, control.build_now, self.matrix, projected=False
+        self.assembler.assemble(
+            self.matrix_reuse_rule.linearisation_point,
+            factors,
+            control.build_now,
+            self.operator_matrix,
+            projected=False,
         )
         if self.on_assembled:
-            self.on_assembled(self.matrix, control.build_now)
-        self.reuse.mark_built()
+            self.on_assembled(self.operator_matrix, control.build_now)
+        self.matrix_reuse_rule.mark_built()
 
     def assemble_matrix(self, active: wp.array) -> None:
         """Assemble the operator matrix at the iterate unconditionally."""
         w = self.work
         if self.uses_matrix:
-            assert self.assembled is not None
+            assert self.assembler is not None
             factors = (w.step.mass_factor, w.step.dq_dv)
-            self.assembled.assemble(w.u_stage, factors, active, self.matrix, projected=False)
+            self.assembler.assemble(w.u_stage, factors, active, self.operator_matrix, projected=False)
             if self.on_assembled:
-                self.on_assembled(self.matrix, active)
+                self.on_assembled(self.operator_matrix, active)
 
     def update_positions(self, active: wp.array) -> None:
         """Positions q~ + (dq/dv) v, and stage positions of mid-point schemes."""
         w, state = self.work, self.ctx.state
-        self.launch(self.vectors.update_position, self.dim, [w.q_tilde, w.v, w.step.dq_dv, active, w.u])
+        self.launch(self.vector_kernels.update_position, self.dim, [w.q_tilde, w.v, w.step.dq_dv, active, w.u])
         if self.ctx.midpoint:
             args = [state.displacement, state.velocity, w.v, w.step.dq_dv, active, w.u_stage, w.v_stage]
-            self.launch(self.stage.evaluate_midpoint, self.dim, args)
+            self.launch(self.stage_kernels.evaluate_midpoint, self.dim, args)
 
     @labelled("residual")
     def reevaluate_frozen(self, active: wp.array) -> None:
@@ -244,7 +254,7 @@ class Residual:
     def evaluate(self, active: wp.array, *, freeze: bool = False) -> None:
         """Evaluate q, forces, g and all sums at the iterate v; `freeze`: Phi freezes the non-potential forces there."""
         w, launch = self.work, self.launch
-        launch(self.newton.reset_min_J, self.model.worlds, [w.newton, active])
+        launch(self.newton_kernels.reset_min_J, self.model.worlds, [w.newton, active])
         self.update_positions(active)
         self.evaluate_forces(active, freeze=freeze)
 
@@ -255,29 +265,29 @@ class Residual:
             term.force(self.ctx, active)
         if self.terms.traits.nonpotential:
             args = [self.terms.side_topology, w.nonpotential_contribution, active, w.nonpotential]
-            launch(self.gather.gather_force, self.dim, args)
+            launch(self.gather_kernels.gather_force, self.dim, args)
         if freeze:
             self.freeze_nonpotential(active)
         if w.term_rows is not None:
             self.reduce(w.term_rows, TERM_ROWS, active, w.newton.term_sums)
-        args = [m.topology, w.contribution, w.balance, active, self.con, w.multipliers]
-        launch(self.gather.residual, self.dim, args)
+        args = [m.topology, w.contribution, w.balance, active, self.constraint_data, w.multipliers]
+        launch(self.gather_kernels.residual, self.dim, args)
         self.reduce(w.rows, RESIDUAL_ROWS, active, w.newton.slot_sums)
         self.reduce(w.energy_rows, 2, active, w.newton.elem_sums)
         groups = m.residual_groups
         if groups.count > 1:
             args = [groups.slot_start, groups.slot, groups.element_start, groups.element]
             args += [w.rows, w.energy_rows, active, w.residual_group_partial]
-            launch(self.vectors.group_norm_partials, (m.worlds, groups.count, GROUP_LANES), args)
+            launch(self.vector_kernels.group_norm_partials, (m.worlds, groups.count, GROUP_LANES), args)
             sums = (GROUP_ROWS, m.worlds, groups.count)
-            launch(self.vectors.sum_group_norms, sums, [w.residual_group_partial, active, w.newton.group_sums])
+            launch(self.vector_kernels.sum_group_norms, sums, [w.residual_group_partial, active, w.newton.group_sums])
 
     @labelled("loads")
     def freeze_nonpotential(self, active: wp.array) -> None:
         """Freeze the non-potential forces of Phi at this iterate."""
         if self.terms.traits.nonpotential:
             args = [self.work.nonpotential, active, self.work.nonpotential_frozen]
-            self.launch(self.vectors.copy_active, self.dim, args)
+            self.launch(self.vector_kernels.copy_active, self.dim, args)
 
     @labelled("build")
     def diagonal_blocks(self, active: wp.array) -> None:
@@ -287,15 +297,15 @@ class Residual:
             term.diagonal(self.ctx, active)
         args = [m.topology, w.block_contribution, w.pool_block, w.step.mass_factor, w.step.dq_dv, active]
         args += [w.diagonal, w.inverse]
-        launch(self.gather.gather_diagonal_blocks, self.dim, args)
+        launch(self.gather_kernels.gather_diagonal_blocks, self.dim, args)
 
     @labelled("product")
     def product(self, p: wp.array, out: wp.array, active: wp.array) -> None:
         """out = H p at the iterate; partial sums of p.Hp in `curvature_rows`."""
         m, w, launch = self.model, self.work, self.launch
         if self.clusters:
-            for block, kernel, (data, count) in zip(m.blocks, self.products, self.clusters.blocks):
-                lanes = block.cluster if m.device.is_cuda else 1
+            for block, kernel, (data, count) in zip(m.blocks, self.product_kernels, self.clusters.blocks):
+                lanes = block.cluster_size if m.device.is_cuda else 1
                 args = [
                     w.data_of(block),
                     data,
@@ -307,27 +317,27 @@ class Residual:
                     active,
                     p,
                 ]
-                args += [lanes, self.pool, w.contribution]
-                launch(kernel, (m.worlds, count * lanes), args, block_dim=block.cluster)
+                args += [lanes, self.cluster_memory, w.contribution]
+                launch(kernel, (m.worlds, count * lanes), args, block_dim=block.cluster_size)
         elif self.uses_predicted_stress:
             self.elements.predicted_stress_tangent(self.ctx, p, active)
         elif not self.uses_matrix:
             self.elements.tangent(self.ctx, p, active)
         for term in self.terms:
             term.product(self.ctx, p, active)
-        rest = [self.additions, p, active, self.con, w.multipliers]
+        rest = [self.product_terms, p, active, self.constraint_data, w.multipliers]
         if self.uses_matrix:
-            assert self.assembled is not None
-            pattern = self.assembled.pattern
-            lanes = launch.lanes(pattern.width)
+            assert self.assembler is not None
+            pattern = self.assembler.pattern
+            lanes = launch.lanes(pattern.mean_row_length)
             threads = launch.padded(m.slots * lanes)
-            self.curvature_rows = shaped(w.rows, (1, m.worlds, threads // w.warp))
-            args = [m.topology, pattern.data, self.matrix, lanes, *rest, out, self.curvature_rows]
-            launch(self.gather.matrix_product, (m.worlds, threads), args)
+            self.curvature_rows = leading_view(w.rows, (1, m.worlds, threads // w.warp))
+            args = [m.topology, pattern.data, self.operator_matrix, lanes, *rest, out, self.curvature_rows]
+            launch(self.gather_kernels.matrix_product, (m.worlds, threads), args)
         else:
             self.curvature_rows = w.warp_rows
             topology = self.clusters.topology if self.clusters else m.topology
-            total = self.gather.with_mass_sum if self.clusters else self.gather.operator_product
+            total = self.gather_kernels.with_mass_sum if self.clusters else self.gather_kernels.operator_product
             args = [topology, w.contribution, *rest, out, w.warp_rows]
             launch(total, (m.worlds, launch.padded(m.slots)), args)
 
@@ -341,6 +351,6 @@ class Residual:
             if not term.potential:
                 term.product(self.ctx, w.direction, active)
         args = [self.terms.side_topology, w.nonpotential_tangent, active, w.Hp]
-        launch(self.gather.gather_force, self.dim, args)
-        launch(self.vectors.dot_terms, self.dim, [w.Hp, w.direction, active, w.rows])  # p is 0 where prescribed
+        launch(self.gather_kernels.gather_force, self.dim, args)
+        launch(self.vector_kernels.dot_terms, self.dim, [w.Hp, w.direction, active, w.rows])  # p is 0 where prescribed
         self.reduce(w.rows, 1, active, w.newton.tangent_sum)

@@ -41,12 +41,12 @@ class ReuseRule:
         self.linearisation_point = work.array(f"{name} place", self.dim, model.types.vec3)
         # no state owns it before `register`
         self.control.stored_counts = wp.zeros((0, 0), dtype=wp.float64, device=model.device)
-        self.kept = self.linearisation_point
+        self.accepted_point = self.linearisation_point
 
     def register(self, state: State) -> None:
         """Register the linearisation point and counts in the state, so that a resumed run takes the same decisions."""
         self.control.stored_counts = state.register(self.name, wp.float64, (6,), (0.0, -1.0, -1.0, 0.0, 0.0, 0.0))
-        self.kept = state.register(f"{self.name}_displacement", self.model.types.vec3, (self.model.slots,))
+        self.accepted_point = state.register(f"{self.name}_displacement", self.model.types.vec3, (self.model.slots,))
 
     def invalidate(self, flags: wp.array) -> None:
         """Flag worlds whose state was set externally: the object is rebuilt at the stored linearisation point."""
@@ -68,7 +68,7 @@ class ReuseRule:
             self.control,
             self.no_flags if accepted is None else accepted,
             self.work.u_stage,
-            self.kept,
+            self.accepted_point,
             self.linearisation_point,
         ]
         self.launch(self.kernels.transfer_points, self.dim, args)

@@ -10,13 +10,13 @@ import warp as wp
 from ..kernels.common.rigid import RIGID_MODES, bodies_struct
 from ..kernels.solvers.rigid_body_modes import rigid_mode_kernels
 from .dense import DenseInverse
-from .levels import BOTTOM_SLOTS
+from .levels import MAX_BOTTOM_SLOTS
 
 if TYPE_CHECKING:
     from ..base.launch import Launcher
     from ..model.model import Model
     from ..terms.workspace import Workspace
-    from .assembled import Pattern
+    from .matrix_assembly import Pattern
     from .residual import Residual
 
 __all__ = ["RigidBodyModes", "lanes_for", "mode_bodies"]
@@ -40,7 +40,7 @@ def mode_bodies(model: Model) -> dict[int, int]:
     free = [bool(allowed.any()) for allowed in map(_free_modes, [model] * len(model.bodies), range(len(model.bodies)))]
     pairs = [(a, b) for term in model.terms for a, b in term.coupled_bodies() if a != b and free[a] and free[b]]
     chosen = sorted({body for pair in pairs for body in pair})
-    most = BOTTOM_SLOTS["cuda" if model.device.is_cuda else "cpu"]
+    most = MAX_BOTTOM_SLOTS["cuda" if model.device.is_cuda else "cpu"]
     return {body: k for k, body in enumerate(chosen)} if 2 * len(chosen) <= most else {}
 
 
@@ -55,24 +55,24 @@ class RigidBodyModes:
     """Rigid body modes R of `mode_bodies`, the matrix R^T H R and its inverse.
 
     Attributes:
-        bodies: device struct. number: mode index of a body of the model.
-        dense: the inverse; a term's `add_mode_coupling` adds to its `matrix`.
+        bodies: device struct of the bodies. mode_index: {index of a body in the model: its index here}.
+        dense_inverse: inverse of R^T H R; a term's `add_mode_coupling` adds to its `matrix`.
     """
 
     def __init__(self, model: Model, work: Workspace, launch: Launcher, residual: Residual, pattern: Pattern) -> None:
         self.model, self.launch, self.residual, self.pattern = model, launch, residual, pattern
         self.kernels = rigid_mode_kernels(model.dtype)
-        self.number = mode_bodies(model)
-        n, B, T = len(self.number), model.worlds, model.types.T
-        self.bodies = self._bodies()
+        self.mode_index = mode_bodies(model)
+        n, B, T = len(self.mode_index), model.worlds, model.types.T
+        self.bodies = self._make_bodies_struct()
         self.bodies.lever_arm = work.array("motions arm", (B, model.slots), wp.vec3d)
-        most = max(model.bodies[k].slot_count for k in self.number)
-        self.parts = work.array("motions parts", (B, n, lanes_for(most), 3), wp.mat33d)
-        self.dense = DenseInverse(model, work, launch, "motions", RIGID_MODES * n)
+        most = max(model.bodies[k].slot_count for k in self.mode_index)
+        self.partial_sums = work.array("motions parts", (B, n, lanes_for(most), 3), wp.mat33d)
+        self.dense_inverse = DenseInverse(model, work, launch, "motions", RIGID_MODES * n)
         self.r, self.x = (work.array(f"motions {name}", (B, RIGID_MODES * n), T) for name in "rx")
 
-    def _bodies(self) -> Any:
-        m, chosen = self.model, [self.model.bodies[k] for k in self.number]
+    def _make_bodies_struct(self) -> Any:
+        m, chosen = self.model, [self.model.bodies[k] for k in self.mode_index]
         of_slot = np.full(m.slots, -1)
         place = m.slot_kind == 0
         X = np.array(m.reference, dtype=float)
@@ -84,7 +84,7 @@ class RigidBodyModes:
             at = body.slot_offset + np.flatnonzero(place[own])
             sample.append(at[np.linspace(0, len(at) - 1, CENTRE_SAMPLES).round().astype(int)])
             size.append(float(np.ptp(X[at], axis=0).max()))
-        allowed = np.array([_free_modes(m, k) for k in self.number])
+        allowed = np.array([_free_modes(m, k) for k in self.mode_index])
         out = bodies_struct(m.dtype)()
         tables: dict[str, tuple[Any, Any]] = {
             "first_slot": ([body.slot_offset for body in chosen], wp.int32),
@@ -107,25 +107,29 @@ class RigidBodyModes:
 
     def modules(self) -> set[wp.Module]:
         """Modules launched."""
-        return {self.kernels.module} | self.dense.modules()
+        return {self.kernels.module} | self.dense_inverse.modules()
 
     def assemble(self, u: wp.array, value: wp.array, flags: wp.array) -> None:
         """Assemble the uncoupled matrix R^T H R at displacements u; `value`: H without the coupling terms."""
-        m, k, dense = self.model, self.kernels, self.dense
+        m, k, dense = self.model, self.kernels, self.dense_inverse
         self.launch(k.update_arms, (m.worlds, m.slots), [self.bodies, u, flags])
-        lanes = self.parts.shape[2]
-        args = [self.bodies, self.pattern.data, m.topology.free, value, flags, lanes, self.parts]
-        self.launch(k.body_matrix_partials, self.parts.shape[:3], args)
-        self.launch(k.fill_matrix, (m.worlds, dense.size), [flags, self.parts, dense.scale, dense.matrix])
+        lanes = self.partial_sums.shape[2]
+        args = [self.bodies, self.pattern.data, m.topology.free, value, flags, lanes, self.partial_sums]
+        self.launch(k.body_matrix_partials, self.partial_sums.shape[:3], args)
+        self.launch(
+            k.fill_matrix,
+            (m.worlds, dense.padded_size),
+            [flags, self.partial_sums, dense.matrix_diagonal, dense.matrix],
+        )
 
     def invert(self, flags: wp.array) -> None:
         """Invert the matrix after terms have added to it."""
-        self.dense.invert(flags, keep=False, reduce=self.residual.reduce)
+        self.dense_inverse.invert(flags, keep=False, reduce=self.residual.reduce)
 
     def apply(self, r: wp.array, z: wp.array, active: wp.array) -> None:
         """z += R (R^T H R)^-1 R^T r."""
         m, k, launch = self.model, self.kernels, self.launch
         args = [self.bodies, r, active, self.r]
-        launch.tiled(k.restrict, (m.worlds, len(self.number)), args)
-        self.dense.apply(self.r, self.x, active)
+        launch.tiled(k.restrict, (m.worlds, len(self.mode_index)), args)
+        self.dense_inverse.apply(self.r, self.x, active)
         launch(k.prolong, (m.worlds, m.slots), [self.bodies, self.x, m.topology.free, active, z])

@@ -6,10 +6,7 @@ approximates the inverse of P^T H P. C is a dense inverse if that matrix is smal
 Chebyshev iteration, preconditioned by the same construction one level down. An additive sum of all levels is cheaper
 per iteration, but its iterations grow with the mesh.
 
-Measured and rejected as slower: overlapping tiles (16 of 64 slots owned: 93 iterations in place of 172 with nu = 0.49,
-but inverses 16 times as large), and the ten quadratic functions of groups for shells (in statics 42 iterations in place
-of 105; 50k unknowns in dynamics on the CPU 32 for 48, but 8.6 ms for 3.0 each, 593 ms per step for 478; in groups of
-160 slots at equal cost statics gain a third and dynamics nothing).
+Rejected variants: NOTES.md.
 
 If some slot order makes H a narrow band, H itself is the only level, factored as a band (band.py).
 
@@ -25,9 +22,8 @@ With constraints, tiles and coarse matrices contain the penalties. As a constrai
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import numpy as np
 import warp as wp
 
 from ..base.launch import labelled
@@ -35,13 +31,13 @@ from ..kernels.solvers.blocks import block_kernels
 from ..kernels.solvers.levels import TILE_SLOTS, TILE_UNKNOWNS, level_kernels, level_struct
 from ..kernels.solvers.levels_build import FACTOR_LANES, build_kernels
 from ..kernels.solvers.pcg import pcg_kernels
-from ..model.state import words_of
+from ..model.state import view_as_words
 from ..terms.term import CachedInputs
-from .assembled import chunk_of, shaped
 from .band import MAX_FULL_FACTOR_SLOTS, BandFactor, find_band
 from .dense import gauss_jordan
 from .level_arrays import LevelArrays
 from .levels import GROUP_SLOTS, Level, make_levels
+from .matrix_assembly import leading_view, worlds_per_chunk
 from .reuse import ReuseRule
 from .rigid_body_modes import RigidBodyModes, mode_bodies
 
@@ -64,7 +60,13 @@ REBUILD_COST = 40.0
 
 
 class TwoLevel:
-    """See the module. Rebuilt by the reuse rule (kernels/solvers/reuse.py)."""
+    """Preconditioner of the module docstring, rebuilt by the reuse rule (kernels/solvers/reuse.py).
+
+    Attributes:
+        factors_operator: triangular factors of every matrix of the operator, in place of inverses.
+        block_values: matrix of the first level [world of a chunk, entry].
+        cached_inputs: by term, the inputs of its blocks at the linearisation point.
+    """
 
     def __init__(
         self,
@@ -77,75 +79,83 @@ class TwoLevel:
         kind: str = "two-level",
     ) -> None:
         self.model, self.work, self.launch, self.residual = model, work, launch, residual
-        self.storage = storage or model.dtype
-        assert residual.assembled is not None
-        self.assembled = residual.assembled
-        self.kernels = level_kernels(model.dtype, self.storage)
-        self.setup_kernels = build_kernels(model.dtype, self.storage)
-        self.blocks = block_kernels(model.dtype)
-        self.jacobi = pcg_kernels(model.dtype, model.terms.traits.has_constraints).apply_block_jacobi
+        self.storage_dtype = storage or model.dtype
+        assert residual.assembler is not None
+        self.assembler = residual.assembler
+        self.kernels = level_kernels(model.dtype, self.storage_dtype)
+        self.setup_kernels = build_kernels(model.dtype, self.storage_dtype)
+        self.block_kernels = block_kernels(model.dtype)
+        self.block_jacobi = pcg_kernels(model.dtype, model.terms.traits.has_constraints).apply_block_jacobi
         self.dim = (model.worlds, model.slots)
-        self.levels = self._levels(kind)
+        self.levels = self._make_levels(kind)
         self.ctx, self.terms = residual.ctx, model.terms
         for term in self.terms:
-            term.allocate_blocks(self.ctx, self.assembled, projected=True)
-        self.terms_add = model.terms.traits.pooled or model.terms.traits.constraint_rows  # terms add to the matrix
-        first, pattern = self.levels[0], self.assembled.pattern
+            term.allocate_blocks(self.ctx, self.assembler, projected=True)
+        self.terms_add_blocks = (
+            model.terms.traits.pooled or model.terms.traits.constraint_rows
+        )  # terms add to the matrix
+        first, pattern = self.levels[0], self.assembler.pattern
         band = first.band
         self.band = BandFactor(model, work, launch, band, pattern) if band is not None else None
         # factors of the operator's matrix if cheap, or for static equilibria of beams (the matrix made here then only
         # serves D); wider bands are reused for longer
-        one = self.storage == model.dtype and not residual.ctx.inertia and first.slots <= MAX_FULL_FACTOR_SLOTS
-        order = find_band(model) if first.dense and one else band
+        one = (
+            self.storage_dtype == model.dtype and not residual.ctx.inertia and first.slot_count <= MAX_FULL_FACTOR_SLOTS
+        )
+        order = find_band(model) if first.is_dense and one else band
         # (a GPU factors the band of a small model, joint terms included, in about the time of its matrix)
-        quick = order is not None and (order.cheap or (band is not None and model.device.is_cuda))
+        quick = order is not None and (order.cheap_to_factorise or (band is not None and model.device.is_cuda))
         traits = model.terms.traits
-        whole = not self.terms_add or (model.device.is_cuda and not traits.pooled and residual.matrix_reuse == 0)
-        self.follows_matrix = quick and residual.uses_matrix and whole and not traits.tangent
-        by_component = not self.follows_matrix
-        self.arrays = [
-            LevelArrays(model, work, launch, level, k, self.storage, by_component)
+        whole = not self.terms_add_blocks or (
+            model.device.is_cuda and not traits.pooled and residual.matrix_reuse_level == 0
+        )
+        self.factors_operator = quick and residual.uses_matrix and whole and not traits.tangent
+        by_component = not self.factors_operator
+        self.level_arrays = [
+            LevelArrays(model, work, launch, level, k, self.storage_dtype, by_component)
             for k, level in enumerate(self.levels)
         ]
-        if self.follows_matrix:
-            residual.on_assembled = self._factor
-            self.half = work.array("level 0 half", (model.worlds, 3 * model.slots if first.dense else 0), model.types.T)
+        if self.factors_operator:
+            residual.on_assembled = self._factorise
+            unknowns = 3 * model.slots if first.is_dense else 0
+            self.half_solution = work.array("level 0 half", (model.worlds, unknowns), model.types.T)
         # matrix of a chunk of worlds; with factors a GPU needs more worlds at once to be busy
-        share = 2 if self.follows_matrix and self.terms_add else 1
-        self.chunk = model.worlds
+        share = 2 if self.factors_operator and self.terms_add_blocks else 1
+        self.worlds_per_chunk = model.worlds
         if not mode_bodies(model):
-            work.chunks["preconditioner matrix"] = lambda worlds: min(worlds, share * chunk_of(worlds))
-            self.chunk = work.chunks["preconditioner matrix"](model.worlds)
-        self.value = self.assembled.values("preconditioner matrix", self.chunk)
-        self.chosen = work.array("preconditioner chunk", (model.worlds,), wp.int32)
-        free = model.group_count > 0  # bodies whose momentum is conserved by the translation correction
-        if self.follows_matrix and self.band and model.dtype == "float64" and residual.ctx.inertia and not free:
+            work.chunks["preconditioner matrix"] = lambda worlds: min(worlds, share * worlds_per_chunk(worlds))
+            self.worlds_per_chunk = work.chunks["preconditioner matrix"](model.worlds)
+        self.block_values = self.assembler.allocate_values("preconditioner matrix", self.worlds_per_chunk)
+        self.chunk_flags = work.array("preconditioner chunk", (model.worlds,), wp.int32)
+        free = model.free_group_count > 0  # bodies whose momentum is conserved by the translation correction
+        if self.factors_operator and self.band and model.dtype == "float64" and residual.ctx.inertia and not free:
             work.pcg.preconditioner_is_exact = self.band.exact
-        self.body_modes, self.coupling = self._motions()
-        self.by_row = 0 if model.device.is_cuda else 1
-        self.has_corrections = not self.levels[0].whole and any(term.preconditions(self.ctx) for term in self.terms)
-        self.kept: dict[str, CachedInputs] = {}
-        self.rebuild_cost = band.rebuild_cost if band is not None and not self.follows_matrix else REBUILD_COST
+        self.body_modes, self.mode_coupling_modules = self._make_body_modes()
+        self.one_thread_per_row = 0 if model.device.is_cuda else 1
+        corrects = (term.preconditions(self.ctx) for term in self.terms)
+        self.has_corrections = not first.solved_directly and any(corrects)
+        self.cached_inputs: dict[str, CachedInputs] = {}
+        self.rebuild_cost = band.rebuild_cost if band is not None and not self.factors_operator else REBUILD_COST
         # iteration counts are not comparable; separate key
         name = "preconditioner" if band is None else "preconditioner_banded"
         self.reuse = ReuseRule(model, work, launch, name, self.rebuild_cost)
-        most = max([level.slots for level in self.levels[1:]], default=1)
+        most = max([level.slot_count for level in self.levels[1:]], default=1)
         self.all_free = wp.full(most, 1.0, dtype=model.types.vec3, device=model.device)
 
-    def _motions(self) -> tuple[RigidBodyModes | None, set[wp.Module]]:
+    def _make_body_modes(self) -> tuple[RigidBodyModes | None, set[wp.Module]]:
         """Rigid body modes of bodies coupled by terms, and the term modules that they need."""
         if not mode_bodies(self.model):
             return None, set()
-        out = RigidBodyModes(self.model, self.work, self.launch, self.residual, self.assembled.pattern)
+        out = RigidBodyModes(self.model, self.work, self.launch, self.residual, self.assembler.pattern)
         return out, out.modules().union(*(term.allocate_mode_coupling(self.ctx, out) for term in self.terms))
 
-    def _levels(self, kind: str) -> list[Level]:
+    def _make_levels(self, kind: str) -> list[Level]:
         """Levels of a kind of preconditioner: "two-level", "tiles" (without a coarse space) or "banded"."""
-        model, pattern = self.model, self.assembled.pattern
+        model, pattern = self.model, self.assembler.pattern
         if kind == "banded":
             band = find_band(model) or find_band(model, any_width=True)
             return [Level(pattern, model.slots, False, level_struct(model.dtype)(), band=band)]
-        by_component = self.storage == model.dtype
+        by_component = self.storage_dtype == model.dtype
         key = kind if by_component else f"{kind} whole"
         if key not in model.cache:
             model.cache[key] = make_levels(model, pattern, coarse=kind != "tiles", by_component=by_component)
@@ -163,31 +173,34 @@ class TwoLevel:
                 kept.place.append(self.work.array(f"preconditioner {name}", array.shape, array.dtype))
                 kept.state.append(state.register(f"preconditioner_{name}", array.dtype, array.shape[1:]))
             if kept.live:
-                self.kept[term.name] = kept
+                self.cached_inputs[term.name] = kept
 
     def _copy_cached(self, accepted: wp.array | None = None) -> None:
         reuse = self.reuse
         reuse.move_point(accepted)
         flags = reuse.no_flags if accepted is None else accepted
         for term in self.terms:
-            kept = self.kept.get(term.name)
+            kept = self.cached_inputs.get(term.name)
             if kept is not None and not term.copy_cached(self.ctx, kept, reuse.control, flags):
                 for arrays in zip(kept.live, kept.state, kept.place):
-                    words = [words_of(array) for array in arrays]
+                    words = [view_as_words(array) for array in arrays]
                     self.launch(reuse.kernels.transfer_words, words[0].shape, [reuse.control, flags, *words])
 
     def modules(self) -> set[wp.Module]:
         """Modules launched."""
         k = self.kernels
-        out = {k.module, self.reuse.kernels.module, self.blocks.module} | self.assembled.modules() | self.coupling
+        out = (
+            {k.module, self.reuse.kernels.module, self.block_kernels.module}
+            | self.assembler.modules()
+            | self.mode_coupling_modules
+        )
         out |= self.band.modules() if self.band else {self.setup_kernels.module}
-        return out.union(*(arrays.dense.modules() for arrays in self.arrays if not self.band and arrays.dense))
-
-    # interface of Preconditioner
+        dense = [] if self.band else [arrays.dense_inverse for arrays in self.level_arrays]
+        return out.union(*(inverse.modules() for inverse in dense if inverse))
 
     def discard(self, active: wp.array) -> None:
         """Request a rebuild at the new start iterate; with factors that follow the operator's matrix, D only."""
-        if self.follows_matrix and self.model.device.is_cuda:
+        if self.factors_operator and self.model.device.is_cuda:
             return
         self.launch(self.reuse.kernels.request_rebuild, self.model.worlds, [active, self.reuse.control])
 
@@ -208,7 +221,7 @@ class TwoLevel:
     def start(self, active: wp.array) -> None:
         """Rebuild where due, with D and the penalties that follow from D."""
         self.reuse.decide_rebuild(active)
-        wp.capture_if(self.reuse.control.any_build, self._build_first)
+        wp.capture_if(self.reuse.control.any_build, self._build_with_penalties)
 
     @labelled("build")
     def prepare(self, active: wp.array) -> None:
@@ -219,7 +232,7 @@ class TwoLevel:
     @labelled("build")
     def record_cost(self, active: wp.array) -> None:
         """Record the iteration count of the solve."""
-        args = [self.reuse.control, self.work.newton, self.work.pcg, int(self.follows_matrix)]
+        args = [self.reuse.control, self.work.newton, self.work.pcg, int(self.factors_operator)]
         self.launch(self.reuse.kernels.count_solve, self.model.worlds, args)
 
     @labelled("preconditioner")
@@ -227,7 +240,7 @@ class TwoLevel:
         """z = B r; partial sums r.z and r.D^-1 r in rows."""
         m, w, launch, k = self.model, self.work, self.launch, self.kernels
         level = self.levels[0]
-        if level.whole:
+        if level.solved_directly:
             if self.band:
                 self.band.solve(r, z, active)
             else:
@@ -237,12 +250,12 @@ class TwoLevel:
             coarse, correct = self._smooth(0, r, z, active), int(len(self.levels) > 1)
         if self.body_modes:
             self.body_modes.apply(r, z, active)
-        args = [level.data, correct, coarse, m.topology.free, r, w.diagonal, active, w.warp, z, w.warp_rows]
+        args = [level.device_data, correct, coarse, m.topology.free, r, w.diagonal, active, w.warp, z, w.warp_rows]
         dim = (m.worlds, launch.padded(m.slots))
         launch(k.add_coarse_correction, dim, args)
         if self.has_corrections:
             args = [w.inverse, r, w.diagonal, active, w.warp, w.Hp, w.spare_rows]
-            launch(self.jacobi, dim, args)
+            launch(self.block_jacobi, dim, args)
             for term in self.terms:
                 if term.preconditions(self.ctx):
                     term.precondition(self.ctx, r, w.Hp, active, into=z)
@@ -250,34 +263,35 @@ class TwoLevel:
     # application
 
     def _apply_dense(self, depth: int, r: wp.array, x: wp.array, active: wp.array) -> None:
-        n, B = self.levels[depth].slots, self.model.worlds
-        flat_r, flat_x = (_flat(a, self.model.types.T, (B, 3 * n)) for a in (r, x))
-        dense = self.arrays[depth].dense
+        n, B = self.levels[depth].slot_count, self.model.worlds
+        flat_r, flat_x = (leading_view(a, (B, 3 * n), self.model.types.T) for a in (r, x))
+        dense = self.level_arrays[depth].dense_inverse
         assert dense is not None
-        if self.follows_matrix:  # z = L^-T (L^-1 r)
+        if self.factors_operator:  # z = L^-T (L^-1 r)
             lanes = self.launch.lanes(3 * n)
             dim = (B, self.launch.padded(3 * n * lanes))
-            for upper, given, out in ((0, flat_r, self.half), (1, self.half, flat_x)):
-                args = [dense.stored, dense.root, upper, lanes, given, active, out]
+            for upper, given, out in ((0, flat_r, self.half_solution), (1, self.half_solution, flat_x)):
+                args = [dense.stored_inverse, dense.inverse_root_diagonal, upper, lanes, given, active, out]
                 self.launch(self.kernels.apply_triangular_inverse, dim, args)
             return
         dense.apply(flat_r, flat_x, active)
 
     def _smooth(self, depth: int, r: wp.array, z: wp.array, active: wp.array) -> wp.array:
         """z = T r on a level; returns the coarse correction C P^T r, not yet interpolated by P."""
-        level, arrays = self.levels[depth], self.arrays[depth]
+        level, arrays = self.levels[depth], self.level_arrays[depth]
         last = depth + 1 == len(self.levels)  # tiles alone
-        coarse = z if last else self.arrays[depth + 1].vectors["r"]
+        coarse = z if last else self.level_arrays[depth + 1].vectors["r"]
         share = 4 if self.model.device.is_cuda else 1
-        first_group = self.launch.padded(share * TILE_SLOTS * level.tiles)
+        first_group = self.launch.padded(share * TILE_SLOTS * level.tile_count)
         lanes = self.launch.lanes(GROUP_SLOTS)
-        args = [level.data, arrays.stored, arrays.root, self.by_row, share, lanes, first_group]
-        threads = first_group + (0 if last else lanes * level.groups)
-        self.launch(self.kernels.smooth_and_restrict, (self.model.worlds, threads), [*args, r, active, z, coarse])
+        args = [level.device_data, arrays.stored_inverse, arrays.inverse_root_diagonal, self.one_thread_per_row]
+        args += [share, lanes, first_group, r, active, z, coarse]
+        threads = first_group + (0 if last else lanes * level.group_count)
+        self.launch(self.kernels.smooth_and_restrict, (self.model.worlds, threads), args)
         if last:
             return z
-        below = self.arrays[depth + 1].vectors
-        if self.levels[depth + 1].dense:
+        below = self.level_arrays[depth + 1].vectors
+        if self.levels[depth + 1].is_dense:
             self._apply_dense(depth + 1, below["r"], below["x"], active)
         else:
             self._chebyshev(depth + 1, active)
@@ -285,9 +299,9 @@ class TwoLevel:
 
     def _chebyshev(self, depth: int, active: wp.array) -> None:
         """x = C r on an intermediate level by Chebyshev steps; overwrites r."""
-        level, arrays = self.levels[depth], self.arrays[depth]
+        level, arrays = self.levels[depth], self.level_arrays[depth]
         v = arrays.vectors
-        dim = (self.model.worlds, level.slots)
+        dim = (self.model.worlds, level.slot_count)
         low = LARGEST_EIGENVALUE / EIGENVALUE_RATIO
         centre, half = 0.5 * (LARGEST_EIGENVALUE + low), 0.5 * (LARGEST_EIGENVALUE - low)
         ratio = centre / half
@@ -295,32 +309,30 @@ class TwoLevel:
         keep, step = 0.0, 1.0 / centre
         for k in range(CHEBYSHEV_STEPS):
             coarse = self._smooth(depth, v["r"], v["z"], active)
-            args = [level.data, 1, coarse, v["z"], keep, step, active, v["d"], v["x"]]
+            args = [level.device_data, 1, coarse, v["z"], keep, step, active, v["d"], v["x"]]
             self.launch(self.kernels.chebyshev_step, dim, args)
             if k < CHEBYSHEV_STEPS - 1:
-                lanes = self.launch.lanes(level.pattern.width)
-                args = [level.pattern.data, arrays.value, v["d"], lanes, active, v["r"]]
-                threads = self.launch.padded(level.slots * lanes)
+                lanes = self.launch.lanes(level.pattern.mean_row_length)
+                args = [level.pattern.data, arrays.block_values, v["d"], lanes, active, v["r"]]
+                threads = self.launch.padded(level.slot_count * lanes)
                 self.launch(self.kernels.subtract_product, (self.model.worlds, threads), args)
             new = 1.0 / (2.0 * ratio - rho)
             keep, step = new * rho, 2.0 * new / half
             rho = new
 
-    # setup
-
-    def _build_first(self) -> None:
+    def _build_with_penalties(self) -> None:
         self._build(penalty=True)
 
     def _chunks(self, flags: wp.array) -> Iterator[tuple[range, wp.array, wp.array]]:
         """Worlds of each chunk, flags of the worlds chosen by `flags`, and `value` indexed over all worlds."""
         B = self.model.worlds
-        for first in range(0, B, self.chunk):
-            worlds = range(first, min(first + self.chunk, B))
+        for first in range(0, B, self.worlds_per_chunk):
+            worlds = range(first, min(first + self.worlds_per_chunk, B))
             if len(worlds) == B:
-                yield worlds, flags, self.value
+                yield worlds, flags, self.block_values
                 return
-            self.launch(self.blocks.select_worlds, B, [flags, worlds.start, worlds.stop, self.chosen])
-            yield worlds, self.chosen, self.assembled.view(self.value, first)
+            self.launch(self.block_kernels.select_worlds, B, [flags, worlds.start, worlds.stop, self.chunk_flags])
+            yield worlds, self.chunk_flags, self.assembler.chunk_view(self.block_values, first)
 
     def _build(self, *, penalty: bool = False) -> None:
         m, w, launch, reuse = self.model, self.work, self.launch, self.reuse.control
@@ -328,119 +340,111 @@ class TwoLevel:
         # rows are scaled once the penalties are known
         self.reuse.move_point()
         for worlds, flags, value in self._chunks(reuse.build_now):
-            self.assembled.assemble(
+            self.assembler.assemble(
                 self.reuse.linearisation_point, factors, flags, value, projected=True, worlds=worlds
             )
-            if self.terms_add and m.terms.traits.pooled:
+            if self.terms_add_blocks and m.terms.traits.pooled:
                 self._copy_cached()
-                self._add(value, flags, penalties=False)
-            args = [m.topology, self.assembled.pattern.data, value, flags, w.diagonal, w.inverse]
-            launch(self.blocks.invert_diagonal_blocks, self.dim, args)
+                self._add_term_blocks(value, flags, penalties=False)
+            args = [m.topology, self.assembler.pattern.data, value, flags, w.diagonal, w.inverse]
+            launch(self.block_kernels.invert_diagonal_blocks, self.dim, args)
             if m.terms.traits.has_constraints:
                 if penalty:
                     for term in self.terms:
                         term.scale(self.ctx, flags)
                 self._copy_cached()
-                self._add(value, flags, penalties=True)
-            self._factor_or_fill(value, flags)
+                self._add_term_blocks(value, flags, penalties=True)
+            self._factorise_or_fill(value, flags)
         self.reuse.mark_built()
         if self.body_modes:
             self._add_mode_coupling(self.body_modes, reuse.build_now)
-        if not (self.follows_matrix or self.band):
+        if not (self.factors_operator or self.band):
             self._invert(reuse.build_now)
 
-    def _factor_or_fill(self, value: wp.array, flags: wp.array) -> None:
+    def _factorise_or_fill(self, value: wp.array, flags: wp.array) -> None:
         """Factor the matrix of some worlds, or fill the tiles and the next level."""
-        level, arrays = self.levels[0], self.arrays[0]
-        if self.follows_matrix:
+        level, arrays = self.levels[0], self.level_arrays[0]
+        if self.factors_operator:
             return
         if self.band:
-            self.band.make(value, flags)
-        elif arrays.dense is not None:
-            arrays.dense.fill(level.pattern, value, flags)
+            self.band.factorise(value, flags)
+        elif arrays.dense_inverse is not None:
+            arrays.dense_inverse.fill(level.pattern, value, flags)
         else:
             self._fill(0, value, flags)
 
     def _fill(self, depth: int, value: wp.array, flags: wp.array) -> None:
         """Fill the tiles of a level and the matrix of the next one."""
-        m, level, arrays = self.model, self.levels[depth], self.arrays[depth]
-        args = [level.data, level.pattern.data, value, flags, arrays.diagonal, arrays.matrix]
-        self.launch(self.setup_kernels.fill_tiles, (m.worlds, level.tiles, TILE_SLOTS), args)
+        m, level, arrays = self.model, self.levels[depth], self.level_arrays[depth]
+        args = [level.device_data, level.pattern.data, value, flags, arrays.pivot_diagonal, arrays.tile_inverse]
+        self.launch(self.setup_kernels.fill_tiles, (m.worlds, level.tile_count, TILE_SLOTS), args)
         if depth + 1 < len(self.levels):
-            assert level.galerkin is not None
+            assert level.galerkin_tables is not None
             free = self.all_free if depth else m.topology.free
-            args = [*level.galerkin, level.data.affine_values, free, value, flags, self.arrays[depth + 1].value]
-            self.launch(self.blocks.galerkin_product, (m.worlds, 16 * level.galerkin[0].shape[0]), args)
+            out = self.level_arrays[depth + 1].block_values
+            args = [*level.galerkin_tables, level.device_data.affine_values, free, value, flags, out]
+            self.launch(self.block_kernels.galerkin_product, (m.worlds, 16 * level.galerkin_tables[0].shape[0]), args)
 
     def _invert(self, flags: wp.array) -> None:
         """Invert all levels; the first is already filled."""
-        for depth, (level, arrays) in enumerate(zip(self.levels, self.arrays)):
-            if arrays.dense is not None:
+        for depth, (level, arrays) in enumerate(zip(self.levels, self.level_arrays)):
+            if arrays.dense_inverse is not None:
                 if depth:
-                    arrays.dense.fill(level.pattern, arrays.value, flags)
-                arrays.dense.invert(flags, keep=depth == 0, reduce=self.residual.reduce)
+                    arrays.dense_inverse.fill(level.pattern, arrays.block_values, flags)
+                arrays.dense_inverse.invert(flags, keep=depth == 0, reduce=self.residual.reduce)
                 return
-            if arrays.value is not None:
-                self._fill(depth, arrays.value, flags)
+            if arrays.block_values is not None:
+                self._fill(depth, arrays.block_values, flags)
             self._invert_tiles(level, arrays, flags, keep=depth == 0)
 
     def _add_mode_coupling(self, motions: RigidBodyModes, flags: wp.array) -> None:
         """Assemble and invert the matrix of the rigid body modes."""
-        motions.assemble(self.reuse.linearisation_point, self.value, flags)
+        motions.assemble(self.reuse.linearisation_point, self.block_values, flags)
         for term in self.terms:
-            kept = self.kept[term.name].place if term.name in self.kept else []
+            kept = self.cached_inputs[term.name].place if term.name in self.cached_inputs else []
             if term.coupled_bodies():
                 term.add_mode_coupling(self.ctx, kept, self.reuse.control.dq_dv, flags)
         motions.invert(flags)
 
-    def _add(self, value: wp.array, flags: wp.array, *, penalties: bool) -> None:
+    def _add_term_blocks(self, value: wp.array, flags: wp.array, *, penalties: bool) -> None:
         """Add the terms' blocks to the matrix of some worlds: those that D is taken from, or the penalties."""
         reuse = self.reuse.control
         for term in self.terms:
             if term.penalty == penalties:
-                kept = self.kept[term.name].place if term.name in self.kept else []
-                term.blocks(self.ctx, self.assembled, kept, reuse.dq_dv, flags, value, projected=True)
+                kept = self.cached_inputs[term.name].place if term.name in self.cached_inputs else []
+                term.blocks(self.ctx, self.assembler, kept, reuse.dq_dv, flags, value, projected=True)
 
     @labelled("build")
-    def _factor(self, value: wp.array, flags: wp.array) -> None:
-        if self.band and not self.terms_add:
-            self.band.make(value, flags)
+    def _factorise(self, value: wp.array, flags: wp.array) -> None:
+        if self.band and not self.terms_add_blocks:
+            self.band.factorise(value, flags)
             return
         if self.band:
             for worlds, chosen, out in self._chunks(flags):
-                self._add_to_copy(value, worlds, chosen, out)
-                self.band.make(out, chosen)
+                self._copy_with_term_blocks(value, worlds, chosen, out)
+                self.band.factorise(out, chosen)
             return
-        dense = self.arrays[0].dense
+        dense = self.level_arrays[0].dense_inverse
         assert dense is not None
         lanes = FACTOR_LANES if self.model.device.is_cuda else 1
         dense.fill(self.levels[0].pattern, value, flags)
-        args = [lanes, dense.scale, flags, dense.left, dense.top, dense.matrix]
+        args = [lanes, dense.matrix_diagonal, flags, dense.left_panel, dense.top_panel, dense.matrix]
         self.launch(self.setup_kernels.factor_dense, self.model.worlds * lanes, args, block_dim=FACTOR_LANES)
 
-    def _add_to_copy(self, value: wp.array, worlds: range, flags: wp.array, out: wp.array) -> None:
+    def _copy_with_term_blocks(self, value: wp.array, worlds: range, flags: wp.array, out: wp.array) -> None:
         """Operator matrix of some worlds with all term contributions."""
-        w, dim = self.work, (len(worlds), 3 * self.assembled.pattern.entries)
+        w, dim = self.work, (len(worlds), 3 * self.assembler.pattern.entry_count)
         rows = slice(worlds.start, worlds.stop)
-        given, copy = (shaped(a, dim, self.model.types.vec3) for a in (value[rows], self.value))
-        self.launch(self.residual.vectors.copy_active, dim, [given, flags[rows], copy])
+        given, copy = (leading_view(a, dim, self.model.types.vec3) for a in (value[rows], self.block_values))
+        self.launch(self.residual.vector_kernels.copy_active, dim, [given, flags[rows], copy])
         for term in self.terms:
             live = [array for _, array in term.cached_inputs(self.ctx)]
-            term.blocks(self.ctx, self.assembled, live, w.step.dq_dv, flags, out, projected=False)
+            term.blocks(self.ctx, self.assembler, live, w.step.dq_dv, flags, out, projected=False)
 
     def _invert_tiles(self, level: Level, arrays: LevelArrays, flags: wp.array, *, keep: bool) -> None:
         B, k = self.model.worlds, self.setup_kernels
-        gauss_jordan(self.launch, k, level.tiles, arrays, arrays.matrix, flags, keep=keep)
-        if arrays.stored is not arrays.matrix:
-            args = [level.tiles, arrays.diagonal, arrays.matrix, flags, arrays.root, arrays.stored]
-            self.launch(k.store_tile_inverses, (B, level.tiles, TILE_UNKNOWNS), args)
-
-
-def _flat(array: wp.array, dtype: Any, shape: tuple[int, ...]) -> wp.array:
-    """A view of vectors as scalars."""
-    out: Any = wp.array(ptr=array.ptr, dtype=dtype, shape=shape, device=array.device)
-    out._owner = array
-    assert int(np.prod(shape)) * wp.types.type_size_in_bytes(dtype) == array.size * wp.types.type_size_in_bytes(
-        array.dtype
-    )
-    return out
+        gauss_jordan(self.launch, k, level.tile_count, arrays, arrays.tile_inverse, flags, keep=keep)
+        if arrays.stored_inverse is not arrays.tile_inverse:
+            args = [level.tile_count, arrays.pivot_diagonal, arrays.tile_inverse, flags]
+            args += [arrays.inverse_root_diagonal, arrays.stored_inverse]
+            self.launch(k.store_tile_inverses, (B, level.tile_count, TILE_UNKNOWNS), args)

@@ -66,7 +66,7 @@ class BodyForces(Term):
         out = []
         for block in m.blocks:
             first = 0
-            for host in block.parts:
+            for host in block.host_blocks:
                 members = np.arange(first, first + len(host.elements))
                 first += len(host.elements)
                 if host.body not in force.bodies or block.key.part:  # one part of the energy represents the element
@@ -87,13 +87,13 @@ class BodyForces(Term):
     def _tables(self, block: Any) -> None:
         """Tables of shape functions and rho w at the points of the mass rule, built once per block."""
         m = self.model
-        rules = [assembly.mass_rule(p.body, block.key.affine) for p in block.parts]
+        rules = [assembly.mass_rule(p.body, block.key.affine) for p in block.host_blocks]
         rule = max(rules, key=lambda r: r.degree)
-        if block.field_rule is None:
+        if block.body_force_rule is None:
             weights, shapes = [], []
-            for host in block.parts:
-                for elems in assembly.chunks(host.body, host.elements, len(rule.weights)):
-                    s, _, _, det = assembly.geometry(host.body, elems, rule.points)
+            for host in block.host_blocks:
+                for elems in assembly.element_chunks(host.body, host.elements, len(rule.weights)):
+                    s, _, _, det = assembly.shape_and_jacobian(host.body, elems, rule.points)
                     rho = assembly.density_at(host.body, elems, s, host.body.connectivity[elems])
                     weights.append(rho * det * rule.weights)
                     shapes.append(s)
@@ -101,7 +101,7 @@ class BodyForces(Term):
             shape = np.concatenate(shapes) if per_element else shapes[0]
             block.data.shape = m.array("loads", np.moveaxis(shape, 0, 2), m.types.T)
             block.data.mass_weight = m.array("loads", np.concatenate(weights).T, m.types.T)
-            block.field_rule = rule
+            block.body_force_rule = rule
 
     def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
         return {field.kernel.module for field in self.parts_of_fields}

@@ -59,7 +59,7 @@ class ConstraintTables:
     def slot_groups(self) -> list[np.ndarray]:
         """Model slots tied by the rows of each joint."""
         return [
-            np.unique(np.concatenate([v.entries()[0] for row in joint.rows for v in row.terms]))
+            np.unique(np.concatenate([v.entries()[0] for row in joint.rows for v in row.vectors]))
             for joint in self.joints
         ]
 
@@ -115,7 +115,7 @@ class ConstraintTables:
 
     def _fill_terms(self, laws: TimeLawTable) -> None:
         m, rows = self.model, self.rows
-        entries = [vector.entries() for row in rows for vector in row.terms]
+        entries = [vector.entries() for row in rows for vector in row.vectors]
         start = np.concatenate([[0], np.cumsum([len(e[0]) for e in entries])])
         slot = np.concatenate([e[0] for e in entries])
         weight = np.concatenate([e[1] for e in entries])
@@ -133,11 +133,11 @@ class ConstraintTables:
         self.scale_host = np.array([r.scale * (m.size if r.angular else 1.0) for r in rows])
         order = np.argsort(slot, kind="stable")
         slot_start = np.concatenate([[0], np.cumsum(np.bincount(slot, minlength=m.slots))])
-        self.reference_host = np.array([vector.value for row in rows for vector in row.terms])
+        self.reference_host = np.array([vector.value for row in rows for vector in row.vectors])
         tables: dict[str, tuple[Any, Any]] = {
             "kind": ([r.kind for r in rows], wp.int32),
             "scale": (self.scale_host, wp.float64),
-            "reference_product": ([r.constant for r in rows], wp.float64),
+            "reference_product": ([r.reference_product for r in rows], wp.float64),
             "constant_target": ([r.fixed for r in rows], wp.float64),
             "law": (law, wp.int32),
             "law_component": ([r.component for r in rows], wp.int32),
@@ -363,7 +363,7 @@ class ConstraintTables:
     def hash(self, h: Any) -> None:
         """Hash the definition of the rows."""
         for row in self.rows:
-            h.update(f"{row.kind} {row.scale!r} {row.constant!r} {row.fixed!r} {row.component}".encode())
+            h.update(f"{row.kind} {row.scale!r} {row.reference_product!r} {row.fixed!r} {row.component}".encode())
         for values in (self.slot_host, self.weight_host, self.start_host, self.reference_host):
             h.update(np.ascontiguousarray(values).tobytes())
 

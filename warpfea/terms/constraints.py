@@ -122,8 +122,8 @@ class Constraints(Term):
         deflated."""
         ctx.work.newton.violation = ctx.work.multipliers.violation
         mul, options = ctx.work.multipliers, ctx.options
-        mul.outer_updates, mul.penalty_ratio = int(options.classical), options.kappa
-        deflate = bool(options.deflate)
+        mul.outer_updates, mul.penalty_ratio = int(options.outer_multipliers), options.penalty_ratio
+        deflate = bool(options.deflate_constraints)
         sizes = self.tables.cluster_sizes
         large = np.flatnonzero(sizes > THREAD_LIMIT)
         largest = int(sizes[large].max()) if len(large) and deflate else 0
@@ -202,7 +202,7 @@ class Constraints(Term):
 
     def accept_trial(self, ctx: StepContext, flags: wp.array) -> None:
         """Accept the trial's multipliers with every Newton step; the classical method uses its outer loop."""
-        if not ctx.options.classical:
+        if not ctx.options.outer_multipliers:
             self.update_multipliers(ctx, flags)
 
     @part("constraints")

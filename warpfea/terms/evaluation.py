@@ -18,7 +18,7 @@ from ..kernels.common.types import precision
 from ..kernels.elements.materials import DEFINED_FOR_ANY_J
 from ..kernels.step.gather import gather_kernels
 from ..model import assembly
-from ..model.assembly import chunks, geometry, gradients
+from ..model.assembly import element_chunks, shape_and_jacobian, shape_gradients
 from ..model.blocks import output_block
 from ..model.state import State
 from .elements import Elements
@@ -126,7 +126,7 @@ class Evaluation:
                 host = np.zeros((1, m.slots, 3), dtype=precision(m.dtype).T._type_)
                 host[0, colour == c, axis] = 1.0
                 direction.assign(host)
-                with m.parameters.window(world, world + 1):
+                with m.parameters.restricted_to_worlds(world, world + 1):
                     self.elements.tangent(ctx, direction, flag)
                 out = ctx.work.contribution.numpy()[0]
                 for block, conn in zip(m.blocks, conns):
@@ -151,14 +151,14 @@ class Evaluation:
         m = self.model
         out = []
         for block in m.blocks:
-            if body is not None and all(part.body is not body for part in block.parts):
+            if body is not None and all(part.body is not body for part in block.host_blocks):
                 continue
             if block.key.tying:
                 scheme = block.key.output_scheme
                 if scheme is None:
                     continue  # a shell's transverse shear stress vanishes at its faces, the output points
-                block.output = block.output or output_block(m, block, scheme)
-                block = block.output
+                block.stress_output = block.stress_output or output_block(m, block, scheme)
+                block = block.stress_output
             stress = self._zeros((m.worlds, block.points, block.count), m.types.sym)
             J = self._zeros((m.worlds, block.points, block.count), m.types.T)
             kernel = block.kernels_for(m.dtype, None).point_stress
@@ -181,7 +181,7 @@ class Evaluation:
         for block, stress in self.stresses(state, body):
             first = 0
             to_samples = _extrapolation(block.key.rule, family.node_samples.reshape(-1, 3))
-            for part in block.parts:
+            for part in block.host_blocks:
                 members = slice(first, first + len(part.elements))
                 first += len(part.elements)
                 if part.body is not body:
@@ -202,14 +202,14 @@ def lowest_jacobian(model: Model, u: np.ndarray) -> tuple[int, str]:
     for block in model.blocks:
         if model.needs_positive_J and block.key.law in DEFINED_FOR_ANY_J:
             continue  # J <= 0 is admissible
-        for part in block.parts:
+        for part in block.host_blocks:
             body = part.body
             rule = block.key.rule
             points = np.vstack([rule.points, body.family.vertices])
-            for members in chunks(body, part.elements, len(points)):
-                _, ds, J0, _ = geometry(body, members, points)
+            for members in element_chunks(body, part.elements, len(points)):
+                _, ds, J0, _ = shape_and_jacobian(body, members, points)
                 U = u[body.slot_offset + body.connectivity[members]]
-                F = np.eye(3) + np.einsum("esk,eqsl->eqkl", U, gradients(ds, J0))
+                F = np.eye(3) + np.einsum("esk,eqsl->eqkl", U, shape_gradients(ds, J0))
                 J = np.linalg.det(F).min(axis=1)
                 low = int(np.argmin(np.where(np.isnan(J), -np.inf, J)))
                 if not J[low] >= best:

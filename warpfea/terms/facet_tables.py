@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 
 from ..kernels.terms.contact_laws import DEFAULT, PAPER, SMOOTH
 from ..kernels.terms.contact_structs import facet_struct
-from ..model.contact_points import RULES, ContactPoints, lagrange_basis
+from ..model.contact_points import CONTACT_RULES, ContactPoints, lagrange_basis
 from ..model.contacts import Contact
 from ..model.pairs import PairContact
 
@@ -181,10 +181,10 @@ class FacetTables(Generic[AnyContact]):
         data.facet_count, data.tracks_deepest, data.corner_count = (
             len(conn),
             int(acts == MOVING),
-            3 if data.point_count in RULES[3] else 4,
+            3 if data.point_count in CONTACT_RULES[3] else 4,
         )
         if acts != PATCH:
-            points = RULES[data.corner_count][data.point_count].points
+            points = CONTACT_RULES[data.corner_count][data.point_count].points
             basis, power = lagrange_basis(points)
             put("point_coords", points, wp.vec2d)
             put("lagrange_coefficients", basis, wp.float64)
@@ -215,7 +215,7 @@ class FacetTables(Generic[AnyContact]):
         for name in FROM_BODIES:
             if getattr(data, name).shape[0] != m.worlds:
                 old = getattr(data, name)
-                m.forget("contact", old)
+                m.uncount_bytes("contact", old)
                 setattr(data, name, m.array("contact", np.tile(old.numpy(), (m.worlds, 1)), wp.float64))
         host = {name: getattr(data, name).numpy() for name in FROM_BODIES}
         for world in np.flatnonzero(mask).tolist():

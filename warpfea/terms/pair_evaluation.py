@@ -12,7 +12,7 @@ from ..base.launch import Launcher
 from ..kernels.terms.contact_structs import contact_scratch_struct
 from ..kernels.terms.pair_evaluation import pair_evaluation_kernels, pair_results_struct
 from ..kernels.terms.pair_structs import pair_scratch_struct
-from ..model.pairs import exponents
+from ..model.pairs import monomial_exponents
 from ..model.state import State
 from .contact_fields import Patch, nearest_samples, nodal_force
 
@@ -74,9 +74,9 @@ class PairEvaluation:
         first = 0
         for mas in t.masters:
             mine = (facet >= first) & (facet < first + len(mas.conn))
-            power = exponents(mas.corners, mas.degree)
+            power = monomial_exponents(mas.corners, mas.degree)
             value = np.prod(xi[mine][:, None, :2] ** power, axis=2)
-            out[mine] = np.einsum("pm,pmk->pk", value, mas.X[facet[mine] - first])
+            out[mine] = np.einsum("pm,pmk->pk", value, mas.position_coefficients[facet[mine] - first])
             first += len(mas.conn)
         return out
 

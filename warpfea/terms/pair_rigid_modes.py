@@ -23,7 +23,7 @@ class PairRigidModes:
         m, t = ctx.model, tables
         self.ctx, self.tables, self.masters, self.motions = ctx, tables, masters, motions
         self.kernels = pair_rigid_mode_kernels(m.dtype)
-        number = {id(body): motions.number.get(k, -1) for k, body in enumerate(m.bodies)}
+        number = {id(body): motions.mode_index.get(k, -1) for k, body in enumerate(m.bodies)}
         sides = [(number[id(c.slave.body)], number[id(c.master.body)]) for c in t.contacts]
         coupled = [k for k, (a, b) in enumerate(sides) if min(a, b) >= 0 and a != b]
         pairs = sorted({(min(sides[k]), max(sides[k])) for k in coupled})
@@ -49,5 +49,5 @@ class PairRigidModes:
         for group, contact, count in self.groups:
             args = [bodies, self.masters, group.data, contact, self.first, stiffness, weight, listed, active, lanes]
             launch(self.kernels.cross_term_sums, (B, count, lanes), [*args, self.parts])
-        args = [self.pair, self.start, self.source, self.parts, dq_dv, active, self.motions.dense.matrix]
+        args = [self.pair, self.start, self.source, self.parts, dq_dv, active, self.motions.dense_inverse.matrix]
         launch(self.kernels.add_cross_terms, (B, self.count, 4), args)

@@ -13,7 +13,7 @@ from ..kernels.terms.contact_ledger import contact_block_kernels
 from ..kernels.terms.pair_blocks import pair_block_kernels
 from ..kernels.terms.pair_structs import point_list_struct
 from ..kernels.terms.pairs import pair_kernels
-from ..model.state import words_of
+from ..model.state import view_as_words
 from .contact_tables import block_entries
 from .facet_tables import LISTED
 from .pair_rigid_modes import PairRigidModes
@@ -78,7 +78,7 @@ class PairSolves(Term):
     def reset_scratch(self, ctx: StepContext, flags: wp.array) -> None:
         # lists are longer than their contents, and a preconditioner copies all of them
         for _, array in self.cached_inputs(ctx):
-            words = words_of(array)
+            words = view_as_words(array)
             ctx.launch(state_kernels().clear_rows, words.shape, [flags, words])
 
     def allocate_blocks(self, ctx: StepContext, matrix: Any, *, projected: bool) -> None:

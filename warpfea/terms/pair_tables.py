@@ -17,10 +17,10 @@ from ..model.handles import SurfaceSet
 from ..model.pairs import (
     MasterFacets,
     PairContact,
-    bernstein,
+    bernstein_from_monomials,
     contact_constants,
-    exponents,
     master_facets,
+    monomial_exponents,
     pair_points,
 )
 from .facet_tables import PER_WORLD, FacetTables, clamped_slots, normal_damping
@@ -119,7 +119,10 @@ class PairTables(FacetTables[PairContact]):
 
     def boxes(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper corners (facets, 3) of the reference bounding boxes."""
-        nodes = [np.einsum("qm,fmk->fqk", bernstein(mas.corners, mas.degree), mas.X) for mas in self.masters]
+        nodes = [
+            np.einsum("qm,fmk->fqk", bernstein_from_monomials(mas.corners, mas.degree), mas.position_coefficients)
+            for mas in self.masters
+        ]
         low, high = ([getattr(x, name)(axis=1) for x in nodes] for name in ("min", "max"))
         return np.concatenate(low).astype(np.float32), np.concatenate(high).astype(np.float32)
 
@@ -152,7 +155,7 @@ class PairTables(FacetTables[PairContact]):
         if "pair masters" not in m.cache:
             width = self.master_conn.shape[1]
             kinds = sorted({(mas.corners, mas.degree) for mas in all_of})
-            most = max(len(exponents(*kind)) for kind in kinds)
+            most = max(len(monomial_exponents(*kind)) for kind in kinds)
 
             def whole(name: str) -> np.ndarray:
                 values = [getattr(mas, name) for mas in all_of]
@@ -168,9 +171,9 @@ class PairTables(FacetTables[PairContact]):
             power = np.zeros((len(kinds), most, 2), dtype=np.int32)
             hull = np.zeros((len(kinds), most, most))
             for k, kind in enumerate(kinds):
-                count = len(exponents(*kind))
-                power[k, :count] = exponents(*kind)
-                hull[k, :count, :count] = bernstein(*kind)
+                count = len(monomial_exponents(*kind))
+                power[k, :count] = monomial_exponents(*kind)
+                hull[k, :count, :count] = bernstein_from_monomials(*kind)
             counts = [len(mas.conn) for mas in all_of]
             m.cache["pair masters"] = {
                 "surface_of": put(self.of, wp.int32),
@@ -181,10 +184,10 @@ class PairTables(FacetTables[PairContact]):
                 "conn": put(self.master_conn.T, wp.int32),
                 "shape": put(np.moveaxis(whole("shape"), 0, 2), m.types.T),
                 "director_shape": put(np.moveaxis(whole("director_shape"), 0, 2), m.types.T),
-                "position_coefficients": put(np.swapaxes(whole("X"), 0, 1), wp.vec3d),
-                "director_coefficients": put(np.swapaxes(whole("N"), 0, 1), wp.vec3d),
+                "position_coefficients": put(np.swapaxes(whole("position_coefficients"), 0, 1), wp.vec3d),
+                "director_coefficients": put(np.swapaxes(whole("normal_coefficients"), 0, 1), wp.vec3d),
                 "facet_kind": put(np.repeat([kinds.index((q.corners, q.degree)) for q in all_of], counts), wp.int32),
-                "monomial_count": put([len(exponents(*kind)) for kind in kinds], wp.int32),
+                "monomial_count": put([len(monomial_exponents(*kind)) for kind in kinds], wp.int32),
                 "corner_count": put([kind[0] for kind in kinds], wp.int32),
                 "exponents": put(power, wp.vec2i),
                 "hull_coefficients": put(hull, wp.float64),

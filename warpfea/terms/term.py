@@ -335,8 +335,8 @@ class Term:
         self, ctx: StepContext, matrix: Any, kept: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,
         *, projected: bool,
     ) -> None:  # fmt: skip
-        """out += (dq/dv) K, with the pattern of `matrix` (see solvers.assembled.Assembled), from the arrays of
-        `cached_inputs`.
+        """out += (dq/dv) K, with the pattern of `matrix` (see solvers.matrix_assembly.MatrixAssembler), from the
+        arrays of `cached_inputs`.
 
         `projected`: the positive semi-definite part only. Omitted stiffness costs iterations: both D and the
         preconditioner lack it then.

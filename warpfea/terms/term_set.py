@@ -17,7 +17,7 @@ from ..kernels.common.traits import Traits
 from ..kernels.step.energy_ledger import LEDGER_COLUMNS, term_energies_struct
 from ..kernels.step.step_control import REPORT_COLUMNS
 from ..model import assembly
-from ..model.state import SOLVER_MEMORY
+from ..model.state import SOLVER_HISTORY_PREFIXES
 from .body_forces import BodyForces
 from .checks import (
     check_columns,
@@ -291,10 +291,10 @@ class TermSet:
         owner: dict[str, str] = {}
         controls = [control_array(name) for name in self.time_laws.controls]
         for term in self.all:
-            before = len(ctx.state.asked)
+            before = len(ctx.state.requested_names)
             term.register(ctx)
-            for name in ctx.state.asked[before:]:
-                if name in owner or name in STATE or name in controls or name.startswith(SOLVER_MEMORY):
+            for name in ctx.state.requested_names[before:]:
+                if name in owner or name in STATE or name in controls or name.startswith(SOLVER_HISTORY_PREFIXES):
                     taken = f"term {owner[name]!r}" if name in owner else "the state itself"
                     raise ModelError(f"term {term.name!r}: the state's array {name!r} is that of {taken}; rename it")
                 owner[name] = term.name

@@ -22,15 +22,15 @@ from .energy_momentum import EnergyMomentum
 from .generalized_alpha import GeneralizedAlpha
 from .scheme import Integrator
 
-__all__ = ["INTEGRATORS", "EnergyMomentum", "GeneralizedAlpha", "Integrator", "get"]
+__all__ = ["INTEGRATORS", "EnergyMomentum", "GeneralizedAlpha", "Integrator", "find_integrator"]
 
 SCHEMES = (BACKWARD_EULER, BDF2, EnergyMomentum(), GeneralizedAlpha(), STATIC)
 INTEGRATORS = {scheme.name: scheme for scheme in SCHEMES}
-CALL = re.compile(r"(\w+)\s*\((.*)\)")
+NAME_WITH_OPTIONS = re.compile(r"(\w+)\s*\((.*)\)")
 """Pattern of a name with options."""
 
 
-def get(name: str | Integrator) -> Integrator:
+def find_integrator(name: str | Integrator) -> Integrator:
     """Integrator from an instance, a name, or a name with options: "generalized_alpha(rho_inf=0.8)".
 
     Raises:
@@ -38,7 +38,7 @@ def get(name: str | Integrator) -> Integrator:
     """
     if isinstance(name, Integrator):
         return name
-    call = CALL.fullmatch(name.strip()) if isinstance(name, str) else None
+    call = NAME_WITH_OPTIONS.fullmatch(name.strip()) if isinstance(name, str) else None
     word = call[1] if call else name.strip() if isinstance(name, str) else name
     if word not in INTEGRATORS or word == "static":
         names = [n for n in INTEGRATORS if n != "static"]

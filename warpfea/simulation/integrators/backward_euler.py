@@ -25,5 +25,5 @@ def euler_error(h: wp.float64, previous: wp.float64):
     return wp.vec3d(half, -half, wp.float64(0.0))
 
 
-BACKWARD_EULER = Integrator("backward_euler", backward_euler, order=1, estimate=euler_error)
+BACKWARD_EULER = Integrator("backward_euler", backward_euler, order=1, error_weights=euler_error)
 STATIC = Integrator("static", backward_euler, order=0, static=True)

@@ -40,4 +40,4 @@ def bdf2_error(h: wp.float64, previous: wp.float64):
     return c
 
 
-BDF2 = Integrator("bdf2", bdf2, order=2, multistep=True, estimate=bdf2_error)
+BDF2 = Integrator("bdf2", bdf2, order=2, multistep=True, error_weights=bdf2_error)

@@ -21,8 +21,8 @@ class Integrator:
         midpoint: forces are those of the middle of the step, and conserve energy and momenta.
         accelerated: acceleration-level scheme, with algorithmic accelerations a_n and those of the equilibrium w_n;
             needs consistent initial values.
-        estimate: wp.func (h, previous h) -> vec3d, the weights of v_{n+1}, v_n and v_{n-1}, of sum 0, that give the
-            local error in position, m; None: no adaptive steps.
+        error_weights: wp.func (h, previous h) -> vec3d, the weights (s) of v_{n+1}, v_n and v_{n-1}, of sum 0, that
+            give the local error in position, m; None: no adaptive steps.
         static: no inertia; v is the displacement increment of a load step.
         parameter: argument of `coefficients`, such as a spectral radius.
         stabilise: N/m per kg, statics: springs from the last equilibrium to the next, fading with the load.
@@ -36,7 +36,7 @@ class Integrator:
     midpoint: bool = False
     accelerated: bool = False
     static: bool = False
-    estimate: Any = field(default=None, compare=False)  # follows from the coefficients
+    error_weights: Any = field(default=None, compare=False)  # follows from the coefficients
     # no kernel depends on these
     parameter: float = field(default=0.0, compare=False)
     stabilise: float = field(default=0.0, compare=False)
@@ -59,8 +59,8 @@ class Integrator:
         return ("previous_displacement", "previous_velocity") if self.multistep else ("displacement", "velocity")
 
     @property
-    def variant(self) -> str:
-        """Name of its kernels."""
+    def kernel_variant(self) -> str:
+        """Name of the variant of the kernels that it takes."""
         names = ("multistep", "takes_velocity", "midpoint", "accelerated", "static")
         flags = [name for name in names if getattr(self, name)]
         return "_".join([self.coefficients.key, *flags])

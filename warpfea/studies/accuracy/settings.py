@@ -138,13 +138,13 @@ def split_methods(text: str) -> list[str]:
 
 def method_text(given: str | integrators.Integrator) -> str:
     """An integrator as text; names are unchanged. ModelError for an unknown one."""
-    label = integrators.get(given).label
+    label = integrators.find_integrator(given).label
     return given if isinstance(given, str) else label
 
 
 def convergence_order(text: str) -> int:
     """Order of convergence of an integrator."""
-    return integrators.get(text).order
+    return integrators.find_integrator(text).order
 
 
 def parse_over(scene: Scene[Any], texts: Iterable[str], option: str = "--over") -> dict[str, list[Any]]:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from ..model.model import Model
     from ..terms.workspace import Workspace
 
-__all__ = ["Assembled", "Pattern", "chunk_of", "coupled_slots", "make_pattern", "shaped"]
+__all__ = ["MatrixAssembler", "Pattern", "coupling_pattern", "leading_view", "make_pattern", "worlds_per_chunk"]
 
 
 def transposed_entries(graph: sp.csr_matrix) -> np.ndarray:
@@ -38,40 +38,40 @@ class Pattern:
 
     Attributes:
         graph: the pattern on the host, rows sorted.
-        data: the device struct.
-        upper: (m, 4) (entry, its transpose, row, column) of the blocks on the diagonal and above.
+        data: device struct of the same tables.
+        upper_entries: (m, 4) (entry, its transpose, row, column) of the blocks on the diagonal and above.
     """
 
     graph: sp.csr_matrix
     data: Any
-    upper: np.ndarray
+    upper_entries: np.ndarray
 
     def find_upper(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """Indices into `upper` of entries (row, column) on or above the diagonal; -1 for others."""
         n = np.int64(self.graph.shape[0])
-        key = self.upper[:, 2].astype(np.int64) * n + self.upper[:, 3]
+        key = self.upper_entries[:, 2].astype(np.int64) * n + self.upper_entries[:, 3]
         wanted = np.asarray(rows).astype(np.int64) * n + columns
         at = np.minimum(np.searchsorted(key, wanted), len(key) - 1)
         return np.where(key[at] == wanted, at, -1)
 
     @property
-    def width(self) -> int:
+    def mean_row_length(self) -> int:
         """Mean number of blocks in a row."""
-        return self.entries // max(self.graph.shape[0], 1)
+        return self.entry_count // max(self.graph.shape[0], 1)
 
     @property
-    def entries(self) -> int:
+    def entry_count(self) -> int:
         """Number of blocks."""
         return len(self.graph.indices)
 
 
-def make_pattern(model: Model, graph: sp.csr_matrix, *, mirrored: bool = True) -> Pattern:
-    """Pattern and its device struct; `mirrored=False` omits `upper`, which only assembly needs."""
+def make_pattern(model: Model, graph: sp.csr_matrix, *, with_upper: bool = True) -> Pattern:
+    """Pattern and its device struct; `with_upper=False` omits `upper_entries`, which only assembly needs."""
     data = pattern_struct()()
     data.start = model.array("matrix pattern", graph.indptr, wp.int32)
     data.column = model.array("matrix pattern", graph.indices, wp.int32)
     upper = np.zeros((0, 4), dtype=np.int32)
-    if mirrored:
+    if with_upper:
         rows = np.repeat(np.arange(graph.shape[0], dtype=np.int32), np.diff(graph.indptr))
         chosen = np.flatnonzero(rows <= graph.indices)
         mirror = transposed_entries(graph)[chosen]
@@ -80,7 +80,7 @@ def make_pattern(model: Model, graph: sp.csr_matrix, *, mirrored: bool = True) -
     return Pattern(graph, data, upper)
 
 
-def coupled_slots(model: Model) -> sp.csr_matrix:
+def coupling_pattern(model: Model) -> sp.csr_matrix:
     """Pattern (slots, slots) of slots that share an element or an item of a term, rows sorted."""
     if "coupled slots" not in model.cache:
         graph = model.graph()
@@ -94,16 +94,16 @@ def coupled_slots(model: Model) -> sp.csr_matrix:
     return model.cache["coupled slots"]
 
 
-CHUNK, CHUNKS = 512, 16
-"""Worlds assembled at once: at least CHUNK, and enough for at most CHUNKS passes."""
+MIN_CHUNK_WORLDS, MAX_CHUNKS = 512, 16
+"""Worlds assembled at once: at least MIN_CHUNK_WORLDS, and enough for at most MAX_CHUNKS passes."""
 
 
-def chunk_of(worlds: int) -> int:
+def worlds_per_chunk(worlds: int) -> int:
     """Number of worlds assembled at once."""
-    return min(worlds, max(CHUNK, -(-worlds // CHUNKS)))
+    return min(worlds, max(MIN_CHUNK_WORLDS, -(-worlds // MAX_CHUNKS)))
 
 
-class Assembled:
+class MatrixAssembler:
     """Assembly of the elements' part of H, c_M M + (dq/dv) K; terms add their `blocks` to it.
 
     Rows and columns of prescribed components are zero.
@@ -111,82 +111,82 @@ class Assembled:
     Scratch covers a chunk of worlds; worlds are independent, so chunking is bitwise neutral.
 
     Attributes:
-        chunk: worlds assembled at once.
-        whole: one thread computes a whole element matrix (CPU), else one column of it (GPU).
+        worlds_per_chunk: worlds assembled at once.
+        whole_elements: one thread computes a whole element matrix (CPU), else one column of it (GPU).
     """
 
     def __init__(
-        self, model: Model, work: Workspace, launch: Launcher, block_kernels_of: list[Any], whole: bool | None = None
+        self, model: Model, work: Workspace, launch: Launcher, element_kernels: list[Any], whole: bool | None = None
     ) -> None:
         self.model, self.work, self.launch = model, work, launch
-        self.element_kernels = block_kernels_of
+        self.element_kernels = element_kernels
         self.whole_elements = not model.device.is_cuda if whole is None else whole
         if "matrix" not in model.cache:
-            model.cache["matrix"] = self._make_tables()
+            model.cache["matrix"] = self._make_pattern_and_mass()
         self.pattern: Pattern = model.cache["matrix"][0]
-        self.block_groups = self._group_blocks()
+        self.blocks_by_elements = self._group_blocks_by_elements()
         name = f"contributions to the matrix, {'whole elements' if self.whole_elements else 'columns'}"
         if name not in model.cache:
-            model.cache[name] = [self._contributions(parts[0][0]) for parts in self.block_groups]
+            model.cache[name] = [self._list_contributions(parts[0][0]) for parts in self.blocks_by_elements]
         self.contributions: list[tuple[wp.array, wp.array]] = model.cache[name]
-        self.chunk = chunk_of(model.worlds)
-        S = max(self._size(block) for block in model.blocks)
+        self.worlds_per_chunk = worlds_per_chunk(model.worlds)
+        vectors = max(self._element_matrices_size(block) for block in model.blocks)
         points = 0 if self.whole_elements else max(5 * block.points * block.count for block in model.blocks)
-        work.chunks |= dict.fromkeys(("element gradients", "element matrices"), chunk_of)
-        self.lines = work.array("element gradients", (self.chunk, points), model.types.vec3)
-        self.scratch = work.array("element matrices", (self.chunk, S), model.types.vec3)
+        work.chunks |= dict.fromkeys(("element gradients", "element matrices"), worlds_per_chunk)
+        self.element_gradients = work.array("element gradients", (self.worlds_per_chunk, points), model.types.vec3)
+        self.element_matrices = work.array("element matrices", (self.worlds_per_chunk, vectors), model.types.vec3)
 
-    def _make_tables(self) -> tuple[Pattern, wp.array]:
+    def _make_pattern_and_mass(self) -> tuple[Pattern, wp.array]:
         """Build the pattern and the masses of its upper entries."""
         model = self.model
-        pattern = make_pattern(model, coupled_slots(model))
-        return pattern, model.array("matrix pattern", model.masses.of_pattern(pattern), model.types.T)
+        pattern = make_pattern(model, coupling_pattern(model))
+        return pattern, model.array("matrix pattern", model.masses.pattern_masses(pattern), model.types.T)
 
     def modules(self) -> set[wp.Module]:
         """Modules launched by assembly."""
         out = {
             (k.element_matrix_panels if self.whole_elements else k.element_matrix).module for k in self.element_kernels
         }
-        out |= {self.assembly(block).module for block in self.model.blocks}
+        out |= {self._assembly_kernels(block).module for block in self.model.blocks}
         return out | {module for term in self.model.terms for module in term.block_modules()}
 
-    def _group_blocks(self) -> list[list[tuple[Any, Any]]]:
-        """Blocks and their kernels, grouped: parts of one energy share elements."""
-        runs: list[list[tuple[Any, Any]]] = []
-        seen: list[np.ndarray] = []
+    def _group_blocks_by_elements(self) -> list[list[tuple[Any, Any]]]:
+        """Element blocks and their kernels, those of the same elements together (parts of one energy, as of ANCF)."""
+        groups: list[list[tuple[Any, Any]]] = []
+        connectivities: list[np.ndarray] = []
         for block, kernels in zip(self.model.blocks, self.element_kernels):
             conn = block.connectivity
-            for k, other in enumerate(seen):
+            for k, other in enumerate(connectivities):
                 if np.array_equal(conn, other):
-                    runs[k].append((block, kernels))
+                    groups[k].append((block, kernels))
                     break
             else:
-                seen.append(conn)
-                runs.append([(block, kernels)])
-        return runs
+                connectivities.append(conn)
+                groups.append([(block, kernels)])
+        return groups
 
-    def assembly(self, block: Any) -> Any:
+    def _assembly_kernels(self, block: Any) -> Any:
         """Kernels that add a block's elements."""
         return assembly_kernels(self.model.dtype, block.slots, self.whole_elements)
 
-    def _size(self, block: Any) -> int:
+    def _element_matrices_size(self, block: Any) -> int:
         """Number of 3-vectors in the matrices of a block's elements."""
         if self.whole_elements:
             _, width, rows = panel_layout(block.slots)
             return 3 * width * rows * block.count
         return 3 * block.slots * (block.slots + 1) // 2 * block.count
 
-    def _contributions(self, block: Any) -> tuple[wp.array, wp.array]:
+    def _list_contributions(self, block: Any) -> tuple[wp.array, wp.array]:
         """Contribution lists (element entry -> matrix entry) built on the device by `list_contributions`."""
         model = self.model
-        kernels = self.assembly(block)
+        kernels = self._assembly_kernels(block)
         if 2 * kernels.blocks_per_element * block.count >= 2**31:
             raise ModelError(
                 f"matrix too large to index: {block.count} elements of {block.slots} slots, at most "
                 f"{2**30 // kernels.blocks_per_element} such elements; use preconditioner='block-jacobi' with "
                 "operator='elements'"
             )
-        upper = len(self.pattern.upper)
+        upper = len(self.pattern.upper_entries)
         start = wp.zeros(upper + 1, dtype=wp.int32, device=model.device)
         source = wp.zeros(0, dtype=wp.int32, device=model.device)
         find = kernels.list_contributions
@@ -195,18 +195,18 @@ class Assembled:
         wp.utils.array_scan(start, start, inclusive=True)
         source = wp.empty(int(start[-1:].numpy()[0]), dtype=wp.int32, device=model.device)
         wp.launch(find, upper, inputs=[*args, 1, start, source], device=model.device)
-        model.count("matrix pattern", start, source)
+        model.count_bytes("matrix pattern", start, source)
         return start, source
 
-    def values(self, name: str, worlds: int | None = None) -> wp.array:
-        """New array of block values [world, entry]; `worlds`: the size of a chunk, see `view`."""
-        return self.work.array(name, (worlds or self.model.worlds, self.pattern.entries), self.model.types.mat33)
+    def allocate_values(self, name: str, worlds: int | None = None) -> wp.array:
+        """New array of block values [world, entry]; `worlds`: the size of a chunk, see `chunk_view`."""
+        return self.work.array(name, (worlds or self.model.worlds, self.pattern.entry_count), self.model.types.mat33)
 
-    def view(self, values: wp.array, first: int) -> wp.array:
+    def chunk_view(self, values: wp.array, first: int) -> wp.array:
         """Chunk array indexed as [world, entry] over all worlds; only rows from `first` on exist."""
         out: Any = wp.array(
             ptr=values.ptr - first * values.strides[0], dtype=values.dtype, device=values.device,
-            shape=(self.model.worlds, self.pattern.entries),
+            shape=(self.model.worlds, self.pattern.entry_count),
         )  # fmt: skip
         out._owner = values
         return out
@@ -224,12 +224,12 @@ class Assembled:
         w = self.work
         every = worlds or range(self.model.worlds)
         state = [u, w.v_stage, w.base, w.newton.predicted_stress, w.history, *factors, active, out]
-        for first in range(every.start, every.stop, self.chunk):
-            last = min(first + self.chunk, every.stop)
+        for first in range(every.start, every.stop, self.worlds_per_chunk):
+            last = min(first + self.worlds_per_chunk, every.stop)
             if last - first == self.model.worlds:
                 self._assemble(last, state, projected)
                 continue
-            with self.model.parameters.window(first, last):
+            with self.model.parameters.restricted_to_worlds(first, last):
                 self._assemble(last - first, [a[first:last] for a in state], projected, first)
 
     def _assemble(self, count: int, state: list[wp.array], projected: bool, first_world: int = 0) -> None:
@@ -239,30 +239,32 @@ class Assembled:
         mass = m.cache["matrix"][1]
         if mass.shape[0] != 1:
             mass = mass[first_world : first_world + count]
-        for first, parts in enumerate(self.block_groups):
+        for first, parts in enumerate(self.blocks_by_elements):
             for k, (block, elements) in enumerate(parts):
                 data = self.work.data_of(block)
                 given = [data, u, v, base, mixed, history, dq_dv, int(projected), active]
                 if self.whole_elements:
                     _, width, rows = panel_layout(block.slots)
-                    matrix = shaped(self.scratch, (count, block.count, rows), panel_row_type(m.dtype, width))
+                    matrix = leading_view(
+                        self.element_matrices, (count, block.count, rows), panel_row_type(m.dtype, width)
+                    )
                     launch(elements.element_matrix_panels, (count, block.count), [*given, int(k > 0), matrix])
-                    matrix = shaped(self.scratch, (count, block.count, 9 * width * rows), m.types.T)
+                    matrix = leading_view(self.element_matrices, (count, block.count, 9 * width * rows), m.types.T)
                     continue
                 pairs = 3 * block.slots * (block.slots + 1) // 2
-                matrix = shaped(self.scratch, (count, pairs, block.count))
-                lines = shaped(self.lines, (count, 5 * block.points, block.count))
+                matrix = leading_view(self.element_matrices, (count, pairs, block.count))
+                gradients = leading_view(self.element_gradients, (count, 5 * block.points, block.count))
                 points = (count, block.points, block.count)
-                launch(elements.prepare_matrix, points, [*given, lines])
+                launch(elements.prepare_matrix, points, [*given, gradients])
                 if block.key.tying and not projected:
-                    launch(elements.prepare_stress, points, [data, mixed, active, lines])
-                args = [data, dq_dv, lines, mixed, int(projected), int(k > 0), active, matrix]
+                    launch(elements.prepare_stress, points, [data, mixed, active, gradients])
+                args = [data, dq_dv, gradients, mixed, int(projected), int(k > 0), active, matrix]
                 launch(elements.element_matrix, (count, 3 * block.slots * block.count), args)
             args = [m.topology, self.pattern.data, *self.contributions[first], matrix]
             args += [mass, int(first == 0), mass_factor, dq_dv, active, out]
-            launch(self.assembly(block).add_element_matrices, (count, len(self.pattern.upper)), args)
+            launch(self._assembly_kernels(block).add_element_matrices, (count, len(self.pattern.upper_entries)), args)
 
-    def matrix(self, values: wp.array, world: int = 0) -> sp.csr_matrix:
+    def host_csr(self, values: wp.array, world: int = 0) -> sp.csr_matrix:
         """Blocks of one world as CSR (3 slots, 3 slots) on the host."""
         graph = self.pattern.graph
         data = values.numpy()[world].astype(float)
@@ -270,7 +272,7 @@ class Assembled:
         return sp.bsr_matrix((data, graph.indices, graph.indptr), shape=(n, n)).tocsr()
 
 
-def shaped(array: wp.array, shape: tuple[int, ...], dtype: Any = None) -> wp.array:
+def leading_view(array: wp.array, shape: tuple[int, ...], dtype: Any = None) -> wp.array:
     """The leading entries of an array as a view of another shape and type."""
     out: Any = wp.array(ptr=array.ptr, dtype=dtype or array.dtype, shape=shape, device=array.device)
     out._owner = array
