@@ -11,7 +11,7 @@ import numpy as np
 
 from ..base.errors import CheckpointError, ModelError
 from ..base.names import listing
-from ..base.worlds import per_world, refuse
+from ..base.worlds import check_values_per_world, values_per_world
 from ..materials import DENSITIES, LIMITS, Material
 from . import assembly
 from .blocks import Block, output_rows
@@ -158,9 +158,9 @@ class MaterialParameters:
 
     def _set(self, owner: str, members: list[Owner], name: str, values: Any, mask: np.ndarray) -> None:
         """Set a constant of some materials to values (worlds,) in the chosen worlds."""
-        wanted = per_world(owner, name, values, self.model.worlds)
+        wanted = values_per_world(owner, name, values, self.model.worlds)
         good, text = LIMITS.get(name, (np.isfinite, "finite"))
-        refuse(owner, name, wanted, ~mask | (np.isfinite(wanted) & good(wanted)), text)
+        check_values_per_world(owner, name, wanted, ~mask | (np.isfinite(wanted) & good(wanted)), text)
         if name in DENSITIES:
             self._refuse_density(f"{owner}.{name}", [body for body, _ in members])
         keys = [(self._index(body), k, name) for body, k in members]

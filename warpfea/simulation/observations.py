@@ -9,7 +9,7 @@ import warp as wp
 
 from ..base.errors import ModelError
 from ..base.names import did_you_mean, listing
-from ..base.short_repr import lines
+from ..base.short_repr import truncated_lines
 from ..kernels.step.episodes import JOINT_VALUES, MOTION_KINDS, observation_kernels
 from ..kernels.terms.contact_structs import RECORD
 
@@ -202,4 +202,4 @@ class Observations:
         return self.array.__dlpack_device__()
 
     def __repr__(self) -> str:
-        return lines(f"Observations({', '.join(self.columns)}: {self._model.worlds} x {self._width})")
+        return truncated_lines(f"Observations({', '.join(self.columns)}: {self._model.worlds} x {self._width})")

@@ -10,8 +10,8 @@ import numpy as np
 import warp as wp
 
 from ..base.errors import ModelError
-from ..base.launch import Launcher, labelled
-from ..base.memory import enough_memory
+from ..base.launch import Launcher, launch_part
+from ..base.memory import convert_memory_errors
 from ..kernels.step.adaptive import MAX_LEVEL
 from ..kernels.step.energy_ledger import LEDGER_ROWS
 from ..kernels.step.step import step_kernels
@@ -291,7 +291,7 @@ class Stepper:
         """Take one step in every running world."""
         if self.initial_conditions is not None:
             self.initial_conditions.prepare(self._dt)
-        with enough_memory("a step", self.model.device):
+        with convert_memory_errors("a step", self.model.device):
             if self.graph is not None:
                 wp.capture_launch(self.graph)
             else:
@@ -314,7 +314,7 @@ class Stepper:
             self.adaptive.end_interval()
         self._report()
 
-    @labelled("commit")
+    @launch_part("commit")
     def _report(self) -> None:
         """Roll back failed worlds; write the step report."""
         m, w, launch = self.model, self.work, self.launch
@@ -327,7 +327,7 @@ class Stepper:
             term.report(self.ctx)
         self.episodes.end_step()
 
-    @labelled("commit")
+    @launch_part("commit")
     def _restore_failed(self) -> None:
         """Restore the state of worlds whose step failed."""
         m, w, launch = self.model, self.work, self.launch
@@ -336,7 +336,7 @@ class Stepper:
             self.state.copy_rows(launch, w.newton.active, self.backup, skip=("status",))
         self.newton.invalidate(w.newton.active)
 
-    @labelled("commit")
+    @launch_part("commit")
     def _back_up_state(self) -> None:
         """Back up the state, still that of the step's start, before the first halving."""
         assert self.backup is not None
@@ -376,7 +376,7 @@ class Stepper:
         args = [w.step, w.newton, kind, m.is_position, m.topology.free, state.displacement, state.velocity]
         self.launch(self.kernels.candidate, self.dim, [*args, w.q_tilde, w.v_tilde, w.v])
 
-    @labelled("commit")
+    @launch_part("commit")
     def accept_attempt(self) -> None:
         """Accept a converged attempt."""
         w, launch, state = self.work, self.launch, self.state
@@ -393,7 +393,7 @@ class Stepper:
             term.commit(self.ctx, w.step.accepted)
         self.newton.store_history(w.step.accepted)
 
-    @labelled("loads")
+    @launch_part("loads")
     def _evaluate_time_laws(self, active: wp.array) -> None:
         """Evaluate the time laws at the end of the attempt."""
         w = self.work

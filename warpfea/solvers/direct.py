@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
-from ..base.launch import labelled
+from ..base.launch import launch_part
 from ..kernels.solvers.direct import direct_kernels
 from ..terms.follower_loads import FollowerMatrix, Followers
 from .factor import Singular, make_factors
@@ -62,7 +62,7 @@ class Direct:
         """Modules launched."""
         return {self.kernels.module} | self.assembled.modules()
 
-    @labelled("build")
+    @launch_part("build")
     def start(self, active: wp.array) -> None:
         """Compute D and the inverses of its blocks."""
         self.residual.diagonal_blocks(active)
@@ -91,7 +91,7 @@ class Direct:
             self.matrix_storage = self.assembled.values("direct matrix")
         return self.matrix_storage
 
-    @labelled("build")
+    @launch_part("build")
     def prepare(self, active: wp.array) -> None:
         """Factorise H in the active worlds."""
         residual = self.residual
@@ -134,7 +134,7 @@ class Direct:
         except Singular:
             self.singular.add(world)
 
-    @labelled("preconditioner")
+    @launch_part("preconditioner")
     def apply(self, r: wp.array, z: wp.array, active: wp.array) -> None:
         """z = H^-1 r; partial sums of r.z and r.D^-1 r."""
         w = self.work

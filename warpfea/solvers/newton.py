@@ -11,7 +11,7 @@ import warp as wp
 
 from ..base.checks import is_count, is_number
 from ..base.errors import ModelError
-from ..base.launch import labelled
+from ..base.launch import launch_part
 from ..kernels.elements.materials import DEFINED_FOR_ANY_J
 from ..kernels.solvers.newton import newton_kernels
 from ..kernels.solvers.newton_control import FLOOR_LANES
@@ -298,7 +298,7 @@ class NewtonLoop:
         self._reduce_flags(w.newton.active, self.iterating)
         wp.capture_while(self.iterating, self._iterate)
 
-    @labelled("control")
+    @launch_part("control")
     def _choose_initial(self) -> None:
         """Select the best first iterate (J > 0 first, then lowest Phi)."""
         w, k, launch = self.work, self.kernels, self.launch
@@ -357,7 +357,7 @@ class NewtonLoop:
         self._call_terms("prepare_solve", active)
         self._reduce_flags(active, self.iterating)
 
-    @labelled("control")
+    @launch_part("control")
     def _perturb(self) -> None:
         """Replace the residual by its mean over perturbed positions before the error estimate.
 
@@ -377,7 +377,7 @@ class NewtonLoop:
         launch(k.mean_gradient, self.dim, args)
         w.newton.any_estimate_error.zero_()
 
-    @labelled("control")
+    @launch_part("control")
     def _update_frozen(self) -> None:
         """Update lagged term data (friction limits, multipliers) after convergence with frozen values."""
         w, flags = self.work, self.work.newton.trial_accepted
@@ -392,7 +392,7 @@ class NewtonLoop:
         self.launch(self.kernels.end_frozen_update, self.model.worlds, [w.newton, flags])
         self._if_rare(self._check_inversion)
 
-    @labelled("control")
+    @launch_part("control")
     def _rare_steps(self) -> None:
         """Rare branch: error estimate, step length of non-monotone trials, further searches, inversion check."""
         m, w, k = self.model, self.work, self.kernels

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
-from ..base.launch import labelled
+from ..base.launch import launch_part
 from ..kernels.common.lanes import WARP
 from ..kernels.common.reduce import CHUNK, WARP_ROW, reduce_kernels
 from ..kernels.common.structs import additions_struct
@@ -50,7 +50,7 @@ class Reducer:
         self.worlds = worlds
         self.kernels = reduce_kernels()
 
-    @labelled("vectors")
+    @launch_part("vectors")
     def __call__(self, rows: wp.array, count: int, active: wp.array, out: wp.array) -> None:
         """out[k] = sum of rows[k], k < count, in the active worlds."""
         n = rows.shape[2]
@@ -186,7 +186,7 @@ class Residual:
             self.reuse.move_point(accepted)
             self.reuse.store_counts(accepted)
 
-    @labelled("assembly")
+    @launch_part("assembly")
     def linearise(self, active: wp.array) -> None:
         """Assemble the operator matrix at the iterate if its reuse rule requires it."""
         if not self.uses_matrix:
@@ -201,7 +201,7 @@ class Residual:
         self.launch(self.reuse.kernels.loosen_tolerance, self.model.worlds, [control, self.work.newton])
         wp.capture_if(control.any_build, self._assemble)
 
-    @labelled("assembly")
+    @launch_part("assembly")
     def _assemble(self) -> None:
         assert self.assembled is not None
         control = self.reuse.control
@@ -230,14 +230,14 @@ class Residual:
             args = [state.displacement, state.velocity, w.v, w.step.dq_dv, active, w.u_stage, w.v_stage]
             self.launch(self.stage.take_stage, self.dim, args)
 
-    @labelled("residual")
+    @launch_part("residual")
     def reevaluate_frozen(self, active: wp.array) -> None:
         """Re-evaluate forces, g and sums after an update of lagged term data."""
         self.ctx.positions_changed = False
         self.evaluate_forces(active, freeze=True)
         self.ctx.positions_changed = True
 
-    @labelled("residual")
+    @launch_part("residual")
     def evaluate(self, active: wp.array, *, freeze: bool = False) -> None:
         """Evaluate q, forces, g and all sums at the iterate v; `freeze`: Phi freezes the non-potential forces there."""
         w, launch = self.work, self.launch
@@ -269,14 +269,14 @@ class Residual:
             sums = (GROUP_ROWS, m.worlds, groups.count)
             launch(self.vectors.norm_sum, sums, [w.residual_group_partial, active, w.newton.group_sums])
 
-    @labelled("loads")
+    @launch_part("loads")
     def freeze_nonpotential(self, active: wp.array) -> None:
         """Freeze the non-potential forces of Phi at this iterate."""
         if self.terms.traits.nonpotential:
             args = [self.work.nonpotential, active, self.work.nonpotential_frozen]
             self.launch(self.vectors.copy_active, self.dim, args)
 
-    @labelled("build")
+    @launch_part("build")
     def diagonal_blocks(self, active: wp.array) -> None:
         """Diagonal blocks of H at the iterate: D for the norms, inverses for the preconditioner."""
         m, w, launch = self.model, self.work, self.launch
@@ -286,7 +286,7 @@ class Residual:
         args += [w.diagonal, w.inverse]
         launch(self.gather.gather_blocks, self.dim, args)
 
-    @labelled("product")
+    @launch_part("product")
     def product(self, p: wp.array, out: wp.array, active: wp.array) -> None:
         """out = H p at the iterate; partial sums of p.Hp in `curvature_rows`."""
         m, w, launch = self.model, self.work, self.launch
@@ -328,7 +328,7 @@ class Residual:
             args = [topology, w.contribution, *rest, out, w.warp_rows]
             launch(total, (m.worlds, launch.padded(m.slots)), args)
 
-    @labelled("loads")
+    @launch_part("loads")
     def tangent_curvature(self, active: wp.array) -> None:
         """p.K p of the non-potential forces along the direction p, into the Newton control."""
         w, launch = self.work, self.launch

@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from ..base.launch import labelled
+from ..base.launch import launch_part
 from ..kernels.solvers.blocks import block_kernels
 from ..kernels.solvers.levels import TILE, TILE_SLOTS, level_kernels, level_struct
 from ..kernels.solvers.levels_build import FACTOR_LANES, build_kernels
@@ -194,7 +194,7 @@ class TwoLevel:
     def update(self, active: wp.array) -> None:
         """No-op: reused at later iterates."""
 
-    @labelled("build")
+    @launch_part("build")
     def invalidate(self, flags: wp.array) -> None:
         """Invalidate history of worlds whose state was set externally."""
         self.reuse.invalidate(flags)
@@ -204,25 +204,25 @@ class TwoLevel:
         self._copy_cached(accepted)
         self.reuse.store_counts(accepted)
 
-    @labelled("build")
+    @launch_part("build")
     def start(self, active: wp.array) -> None:
         """Rebuild where due, with D and the penalties that follow from D."""
         self.reuse.decide_rebuild(active)
         wp.capture_if(self.reuse.control.any_build, self._build_first)
 
-    @labelled("build")
+    @launch_part("build")
     def prepare(self, active: wp.array) -> None:
         """Rebuild where due, with the constraint penalties of the step."""
         self.reuse.decide_rebuild(active)
         wp.capture_if(self.reuse.control.any_build, self._build)
 
-    @labelled("build")
+    @launch_part("build")
     def record_cost(self, active: wp.array) -> None:
         """Record the iteration count of the solve."""
         args = [self.reuse.control, self.work.newton, self.work.pcg, int(self.follows_matrix)]
         self.launch(self.reuse.kernels.count_solve, self.model.worlds, args)
 
-    @labelled("preconditioner")
+    @launch_part("preconditioner")
     def apply(self, r: wp.array, z: wp.array, active: wp.array) -> None:
         """z = B r; partial sums r.z and r.D^-1 r in rows."""
         m, w, launch, k = self.model, self.work, self.launch, self.kernels
@@ -401,7 +401,7 @@ class TwoLevel:
                 kept = self.kept[term.name].place if term.name in self.kept else []
                 term.blocks(self.ctx, self.assembled, kept, reuse.dq_dv, flags, value, projected=True)
 
-    @labelled("build")
+    @launch_part("build")
     def _factor(self, value: wp.array, flags: wp.array) -> None:
         if self.band and not self.terms_add:
             self.band.make(value, flags)

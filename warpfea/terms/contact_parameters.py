@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from ..base.worlds import per_world, refuse
+from ..base.worlds import check_values_per_world, values_per_world
 from ..model.contacts import Collider, Contact
 from ..model.pairs import PairContact
 from ..model.shapes import HalfSpace
@@ -48,7 +48,7 @@ def _set_contact(
 ) -> None:
     """Write one value of a contact in the chosen worlds."""
     what, k, data = f"contact {contact.name!r}", tables.number[contact.index], tables.data
-    wanted = per_world(what, name, values, tables.model.worlds)
+    wanted = values_per_world(what, name, values, tables.model.worlds)
     mu, mu_static = data.mu.numpy()[:, k], data.mu_static.numpy()[:, k]
     check = partial(_check, what, name, wanted, ~mask)
     check(np.isfinite(wanted))
@@ -73,7 +73,7 @@ def _set_contact(
 def _set_offset(tables: ContactTables, collider: Collider, values: Any, mask: np.ndarray) -> None:
     """Offset the surface of a collider along its normals in the chosen worlds."""
     what = f"collider {collider.name!r}"
-    wanted = per_world(what, "offset", values, tables.model.worlds)
+    wanted = values_per_world(what, "offset", values, tables.model.worlds)
     _check(what, "offset", wanted, ~mask, np.isfinite(wanted))
     if isinstance(collider.shape, HalfSpace):
         wanted = wanted - collider.shape.offset
@@ -85,7 +85,7 @@ def _check(
 ) -> None:  # fmt: skip
     """Raise ModelError for the first chosen world with an invalid value."""
     for world in np.flatnonzero(~(good | left))[:1]:
-        refuse(what, name, values, good | left, text.format(limit[world]) if text else WANTED[name])
+        check_values_per_world(what, name, values, good | left, text.format(limit[world]) if text else WANTED[name])
 
 
 def _write(array: wp.array, column: int, values: np.ndarray, mask: np.ndarray) -> None:

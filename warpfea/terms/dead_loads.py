@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from ..base.errors import ModelError
-from ..base.worlds import per_world, refuse
+from ..base.worlds import check_values_per_world, values_per_world
 from ..kernels.terms.loads import load_kernels
 from ..model.assembly import require_density
 from .term import StepContext, Term, part
@@ -119,8 +119,8 @@ class DeadLoads(Term):
         """
         if self.gravity_law is not None:
             raise ModelError("the model was built with a time law of gravity, which set_gravity can't replace")
-        values = per_world("set_gravity", "gravity", gravity, self.model.worlds, (3,))
-        refuse("set_gravity", "gravity", values, ~mask | np.isfinite(values).all(axis=1), "finite")
+        values = values_per_world("set_gravity", "gravity", gravity, self.model.worlds, (3,))
+        check_values_per_world("set_gravity", "gravity", values, ~mask | np.isfinite(values).all(axis=1), "finite")
         values = np.where(mask[:, None], values, self.gravity_host)
         if np.any(values):
             require_density(self.model.bodies, "gravity")

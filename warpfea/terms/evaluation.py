@@ -12,7 +12,7 @@ import warp as wp
 
 from ..base.errors import ModelError
 from ..base.launch import Launcher
-from ..base.memory import enough_memory
+from ..base.memory import convert_memory_errors
 from ..elements import Rule
 from ..kernels.common.types import precision
 from ..kernels.elements.materials import DEFINED_FOR_ANY_J
@@ -39,7 +39,7 @@ class Evaluation:
         self.elements = Elements(model)
 
     def _zeros(self, shape: tuple[int, ...], dtype: Any) -> wp.array:
-        with enough_memory("an evaluation at a state", self.model.device):
+        with convert_memory_errors("an evaluation at a state", self.model.device):
             return wp.zeros(shape, dtype=dtype, device=self.model.device)
 
     def _gather(self, contribution: wp.array) -> np.ndarray:

@@ -128,15 +128,15 @@ class CachedInputs:
 def part(name: str) -> Callable[[F], F]:
     """Decorator: attribute a method's launches to profile part `name`."""
 
-    def mark(method: F) -> F:
+    def decorate(method: F) -> F:
         @functools.wraps(method)
-        def marked(self: Any, ctx: StepContext, *args: Any, **options: Any) -> Any:
+        def wrapper(self: Any, ctx: StepContext, *args: Any, **options: Any) -> Any:
             with ctx.launch.part(name):
                 return method(self, ctx, *args, **options)
 
-        return marked  # type: ignore[return-value]
+        return wrapper  # type: ignore[return-value]
 
-    return mark
+    return decorate
 
 
 class Term:

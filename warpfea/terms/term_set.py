@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from ..base.errors import ModelError
-from ..base.launch import PARTS
+from ..base.launch import LAUNCH_PARTS
 from ..base.names import did_you_mean, listing
 from ..base.worlds import worlds_mask
 from ..kernels.common.traits import Traits
@@ -58,7 +58,7 @@ FIELDS = ("von_mises", "displacement")
 
 def all_parts() -> dict[str, str]:
     """Profile parts of every step and of all kinds of terms, each with a description."""
-    return PARTS | {name: text for kind in KINDS for name, text in kind.parts.items()}
+    return LAUNCH_PARTS | {name: text for kind in KINDS for name, text in kind.parts.items()}
 
 
 class TermSet:
@@ -107,7 +107,7 @@ class TermSet:
                     raise ModelError(f"term {term.name!r} declares the trait {trait!r}, which belongs to constraints")
         check_stored(self.all)
         check_names(self.all, FIELDS, "a field", lambda term: term.fields)
-        check_names(self.all, tuple(PARTS), "a part of profiles", lambda term: term.parts)
+        check_names(self.all, tuple(LAUNCH_PARTS), "a part of profiles", lambda term: term.parts)
 
     @property
     def added(self) -> list[Term]:

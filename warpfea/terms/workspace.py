@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from ..base.errors import ModelError
-from ..base.memory import enough_memory
+from ..base.memory import convert_memory_errors
 from ..kernels.common.lanes import WARP
 from ..kernels.common.reduce import CHUNK
 from ..kernels.common.structs import balance_struct
@@ -179,7 +179,7 @@ class Workspace:
                     f"{name}: an array of {' x '.join(map(str, shape))} items has {step / 2**30:.1f} GiB between two "
                     "neighbours, and at most 2 can be addressed: take fewer worlds, or smaller bodies"
                 )
-        with enough_memory(f"array {name!r} of {' x '.join(map(str, shape))} items", self.device):
+        with convert_memory_errors(f"array {name!r} of {' x '.join(map(str, shape))} items", self.device):
             out = wp.zeros(shape, dtype=dtype, device=self.device)
         self.bytes[name] = int(np.prod(shape, dtype=np.int64)) * wp.types.type_size_in_bytes(dtype)
         return out
