@@ -17,7 +17,7 @@ UNIT_FACTORS = {
     **dict.fromkeys(("kPa", "kN", "g/cm^3", "g/cm3"), 1e3),
     **{"cm": 1e-2, "MPa": 1e6, "GPa": 1e9},
 }
-"""Units written after numbers, in SI units."""
+"""Factors to SI units of the units that users write after numbers."""
 
 
 def is_number(value: Any) -> bool:

@@ -10,8 +10,7 @@ __all__ = ["did_you_mean", "listing"]
 SIMILARITY_CUTOFF = 0.6
 """Similarity, 0 to 1, from which a known name is suggested."""
 MAX_SHORT_LENGTH, SHORT_CUTOFF = 5, 0.75
-"""Maximum length of a short name, and its cutoff: one common letter is weaker evidence."""
-
+"""Maximum length of a short name, and its similarity cutoff: one common letter is weaker evidence."""
 
 SYNONYMS = {
     "rho": "density",

@@ -1,4 +1,4 @@
-"""Parsing of per-world values."""
+"""Parsing and validation of values given for all worlds or one per world."""
 
 from __future__ import annotations
 

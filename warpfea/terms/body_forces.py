@@ -97,7 +97,7 @@ class BodyForces(Term):
                     rho = assembly.density_at(host.body, elems, s, host.body.connectivity[elems])
                     weights.append(rho * det * rule.weights)
                     shapes.append(s)
-            per_element = families.get(block.key.family).has_gradients
+            per_element = families.get_family(block.key.family).has_gradients
             shape = np.concatenate(shapes) if per_element else shapes[0]
             block.data.shape = m.array("loads", np.moveaxis(shape, 0, 2), m.types.T)
             block.data.field_weight = m.array("loads", np.concatenate(weights).T, m.types.T)
