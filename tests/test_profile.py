@@ -17,7 +17,7 @@ from warpfea.cli import main
 from warpfea.cli.profile import KEYS
 from warpfea.studies.profile import profiling
 from warpfea.studies.profile.profiling import Recorder, launch_bytes, profile
-from warpfea.terms.term_set import all_parts
+from warpfea.terms.term_set import profile_parts
 
 WORDS = ["profile", "cantilever", "--set", "cells=2", "--device", "cpu", "--steps", "2"]
 
@@ -66,7 +66,7 @@ def check(found, steps):
     assert len(found.step_ms) == steps
     own = [name for name in LAUNCH_PARTS if name in found.parts]
     assert list(found.parts)[: len(own)] == own
-    assert set(found.parts) <= set(all_parts())
+    assert set(found.parts) <= set(profile_parts())
     assert {"residual", "product", "preconditioner", "build", "vectors", "control", "commit"} <= set(found.parts)
     for key in ("ms", "launches", "bytes"):
         assert sum(getattr(p, key) for p in found.parts.values()) == pytest.approx(

@@ -188,7 +188,7 @@ class MaterialParameters:
                 f"set_parameter: {name!r} can't be set: all worlds share what add_body_force does to a body, which is "
                 "per mass; build a model of its own for another density"
             )
-        if self.model.terms.dead.gravity_law is not None:
+        if self.model.terms.dead_loads.gravity_law is not None:
             raise ModelError(
                 f"set_parameter: {name!r} can't be set: all worlds share the weights of a time law of gravity; take "
                 "constant gravity, which set_gravity sets in each world"

@@ -111,10 +111,10 @@ class Observations:
         tables = self._model.constraints
         assert tables is not None
         joint = self._sim._joint(owner)
-        has = tables.vectors_of(joint)
+        has = tables.coordinate_vectors(joint)
         self._choose(name, what, [*has, *JOINT_REPORT])
         if what in has:
-            self._values.append((has[what], what, tables.turn_of(joint), self._width))
+            self._values.append((has[what], what, tables.angle_row(joint), self._width))
             self._width += 1
             return
         self._report(first, JOINT_REPORT[what])

@@ -35,7 +35,7 @@ def overload_text(model: Model) -> str:
             found.append(_of(load.body, load.name, _size(load.law), _size(load.law) / section, "N"))
     for pressure in d.pressures:
         found.append(_of(pressure.surface.body, "pressure", _size(pressure.law), _size(pressure.law), "Pa"))
-    g = float(np.linalg.norm(model.terms.dead.gravity.numpy(), axis=1).max())
+    g = float(np.linalg.norm(model.terms.dead_loads.gravity.numpy(), axis=1).max())
     for body in model.bodies if g > 0.0 else ():
         side = float(np.ptp(body.mesh.bounding_box(), axis=0).max())
         weight = model.masses.of_body(body) / float(element_volumes(body).sum()) * g * side

@@ -364,7 +364,7 @@ class Simulation(RunStatistics):
     def _reset_on_device(self, mask: wp.array, state: State | None) -> None:
         check_mask(mask, self.model)
         if state is None:
-            written = self.model.terms.written
+            written = self.model.terms.parameter_updates
             if self._start is None or self._start_of != written:
                 self._start, self._start_of = self._initial(), written
             state = self._start

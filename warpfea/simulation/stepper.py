@@ -129,7 +129,7 @@ class Stepper:
         w, state = self.work, self.state
         w.step.time = state.time
         w.step.status, w.step.summed = state.status, state.summed_time
-        w.step.gravity = self.terms.dead.gravity
+        w.step.gravity = self.terms.dead_loads.gravity
         w.step.any_running, w.step.any_refused = self.running, w.any_flag[3:5]
         w.step.max_halvings = MAX_LEVEL if self.adaptive else self.solver.max_halvings
         if isinstance(self.solver, NewtonPCG) and not self.adaptive:
@@ -151,7 +151,7 @@ class Stepper:
     def start_terms(self, mask: np.ndarray | None = None) -> None:
         """Reinitialise terms after the state of the masked worlds was set."""
         following = [term for term in self.terms if type(term).start is not Term.start]
-        if not following and self.terms.dead.gravity_law is None:
+        if not following and self.terms.dead_loads.gravity_law is None:
             return
         w, state = self.work, self.state
         active = self._flags(mask)
@@ -184,7 +184,7 @@ class Stepper:
         kernel = self.newton.residual.gather.mass_product
         Launcher(m.device)(kernel, self.dim, [m.topology, self.state.velocity, rows])
         u = self.state.displacement.numpy().astype(float)
-        pull = -np.einsum("bc,bs,bsc->b", m.terms.dead.gravity.numpy(), m.masses.of_worlds(m.worlds), u)
+        pull = -np.einsum("bc,bs,bsc->b", m.terms.dead_loads.gravity.numpy(), m.masses.of_worlds(m.worlds), u)
         return np.stack([rows.numpy()[0].sum(axis=1), m.strain_energy(self.state), pull], axis=1)
 
     def invalidate(self, mask: np.ndarray | None = None, *, potential: bool = True) -> None:
@@ -401,7 +401,7 @@ class Stepper:
         laws.evaluate(self.launch, self.state, w.step.new_time, w.step.ramp, active, w.time_law_values)
         if self.ctx.midpoint:
             laws.evaluate(self.launch, self.state, w.stage_time, w.step.ramp, active, w.time_law_stage_values)
-        self.terms.dead.take_gravity(self.launch, w.time_law_stage_values, active)
+        self.terms.dead_loads.take_gravity(self.launch, w.time_law_stage_values, active)
 
     def law_values(self, time: float) -> np.ndarray:
         """Values of the time laws at a time, s, or load fraction, (B, laws, 3), without changing those of the step."""

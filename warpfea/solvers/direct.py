@@ -18,7 +18,7 @@ import warp as wp
 
 from ..base.launch import launch_part
 from ..kernels.solvers.direct import direct_kernels
-from ..terms.follower_loads import FollowerMatrix, Followers
+from ..terms.follower_loads import FollowerLoads, FollowerMatrix
 from .factor import Singular, make_factors
 
 if TYPE_CHECKING:
@@ -39,13 +39,13 @@ class Direct:
     def __init__(self, ctx: StepContext, residual: Residual) -> None:
         model = ctx.model
         self.ctx, self.model, self.work, self.launch, self.residual = ctx, model, ctx.work, ctx.launch, residual
-        ctx.work.reserve_blocks()
+        ctx.work.allocate_diagonal_blocks()
         assert residual.assembled is not None
         self.assembled = residual.assembled
         self.kernels = direct_kernels(model.dtype)
         self.dim = (model.worlds, ctx.launch.padded(model.slots))
         self.factors = make_factors(model, self.assembled.pattern.graph)
-        self.elements_only = not model.terms.products
+        self.elements_only = not model.terms.has_tangents
         for term in model.terms:
             term.allocate_blocks(ctx, self.assembled, projected=False)
         self.matrix_storage: wp.array | None = None
@@ -82,7 +82,7 @@ class Direct:
     @property
     def followers(self) -> list[FollowerMatrix]:
         """Matrices of the follower loads' items, built on first use."""
-        return self.ctx.scratch.get(Followers.name, [])
+        return self.ctx.scratch.get(FollowerLoads.name, [])
 
     @property
     def value(self) -> wp.array:

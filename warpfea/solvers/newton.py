@@ -185,7 +185,7 @@ class NewtonLoop:
             term.configure(ctx)
         operator = options.operator
         if direct and operator == "auto":  # factors live as long as the matrix, unless terms add to it
-            operator = "elements" if model.terms.products or ctx.midpoint else "matrix"
+            operator = "elements" if model.terms.has_tangents or ctx.midpoint else "matrix"
         banded = kind == "banded" and model.device.is_cuda
         assembled = kind not in ("deflated", "block-jacobi")
         self.residual = Residual(ctx, operator=operator, assembled=assembled, banded=banded)

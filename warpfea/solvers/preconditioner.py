@@ -61,7 +61,7 @@ class BlockJacobi:
 
     def __init__(self, model: Model, work: Workspace, launch: Launcher, residual: Residual) -> None:
         self.work, self.launch, self.residual = work, launch, residual
-        work.reserve_blocks()
+        work.allocate_diagonal_blocks()
         self.kernels = pcg_kernels(model.dtype, model.terms.traits.has_constraints)
         self.dim = (model.worlds, launch.padded(model.slots))
 

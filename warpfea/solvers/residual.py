@@ -142,7 +142,7 @@ class Residual:
         """Terms of a product H p beyond the elements' part."""
         m, w = self.model, self.work
         out = additions_struct(m.dtype)()
-        of = m.terms.side_topology if m.terms.traits.tangent else m.topology
+        of = m.terms.nonpotential_topology if m.terms.traits.tangent else m.topology
         out.start, out.entry, out.contribution = of.start, of.entry, w.nonpotential_tangent
         out.pool = w.pool_product
         if m.terms.traits.pooled:
@@ -251,7 +251,7 @@ class Residual:
         for term in self.terms:
             term.force(self.ctx, active)
         if self.terms.traits.nonpotential:
-            args = [self.terms.side_topology, w.nonpotential_contribution, active, w.nonpotential]
+            args = [self.terms.nonpotential_topology, w.nonpotential_contribution, active, w.nonpotential]
             launch(self.gather.gather_force, self.dim, args)
         if freeze:
             self.freeze_nonpotential(active)
@@ -337,7 +337,7 @@ class Residual:
         for term in self.terms:
             if not term.potential:
                 term.product(self.ctx, w.direction, active)
-        args = [self.terms.side_topology, w.nonpotential_tangent, active, w.Hp]
+        args = [self.terms.nonpotential_topology, w.nonpotential_tangent, active, w.Hp]
         launch(self.gather.gather_force, self.dim, args)
         launch(self.vectors.dot_rows, self.dim, [w.Hp, w.direction, active, w.rows])  # p is 0 where prescribed
         self.reduce(w.rows, 1, active, w.newton.tangent_sum)

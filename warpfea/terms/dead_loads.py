@@ -47,7 +47,7 @@ class DeadLoads(Term):
     @classmethod
     def features(cls, model: Model) -> dict[str, bool]:
         return {
-            "gravity": model.terms.dead.pulls,
+            "gravity": model.terms.dead_loads.has_gravity,
             "dead loads": bool(model.description.dead_loads),
         }
 
@@ -71,21 +71,21 @@ class DeadLoads(Term):
         law = np.concatenate(numbers) if numbers else np.zeros(0)
         weight = np.concatenate(weights) if weights else np.zeros(0)
         explicit = any(b.key.damping == "explicit" for b in m.blocks)  # adds its force to the dead loads
-        self.present = bool(len(slots)) or self.pulls or explicit
-        self.start_of_slot = m.array("loads", start, wp.int32)
+        self.has_loads = bool(len(slots)) or self.has_gravity or explicit
+        self.slot_start = m.array("loads", start, wp.int32)
         self.law = m.array("loads", law[order] if len(order) else np.zeros(1), wp.int32)
         table = np.repeat(weight[order][:, None], 3, axis=1) if len(order) else np.zeros((1, 3))
         self.weight = m.array("loads", table, m.types.vec3)
-        self._defined_by = (slot, law, weight)
+        self._definition = (slot, law, weight)
 
     @property
-    def pulls(self) -> bool:
+    def has_gravity(self) -> bool:
         """True with gravity or a time law of it."""
         return self.gravity_law is not None or bool(np.any(self.gravity_host))
 
     def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
         law = [self.kernels.take_gravity.module] * (self.gravity_law is not None)
-        return law + [self.kernels.dead_load.module] * self.present
+        return law + [self.kernels.dead_load.module] * self.has_loads
 
     def take_gravity(self, launch: Launcher, value: wp.array, active: wp.array) -> None:
         """Set gravity at the end of the attempt from the values of the time laws."""
@@ -95,11 +95,11 @@ class DeadLoads(Term):
     @part("loads")
     def begin(self, ctx: StepContext, active: wp.array) -> None:
         """Assemble force and magnitude of all dead loads per slot."""
-        if not self.present:
+        if not self.has_loads:
             return
         m, w = self.model, ctx.work
         args = [
-            self.start_of_slot,
+            self.slot_start,
             self.law,
             self.weight,
             w.time_law_stage_values,
@@ -124,7 +124,7 @@ class DeadLoads(Term):
         values = np.where(mask[:, None], values, self.gravity_host)
         if np.any(values):
             require_density(self.model.bodies, "gravity")
-        if not self.present and np.any(values):
+        if not self.has_loads and np.any(values):
             raise ModelError(
                 "the model was built without gravity or dead loads, so their kernels were left out: build it with a "
                 "gravity that is not zero"
@@ -140,5 +140,5 @@ class DeadLoads(Term):
             self.gravity_host = self.gravity.numpy().copy()
 
     def hash(self, h: Any) -> None:
-        for values in self._defined_by:
+        for values in self._definition:
             h.update(np.ascontiguousarray(values).tobytes())

@@ -25,7 +25,7 @@ class DeepestPoints:
 
     def __init__(self, tables: ContactTables) -> None:
         self.tables = tables
-        self.kernels = deepest_point_kernels(tables.model.dtype, tables.meshes)
+        self.kernels = deepest_point_kernels(tables.model.dtype, tables.has_meshes)
 
     def choose(
         self, launch: Launcher, s: dict[str, Any], time: wp.array, u: wp.array, state: tuple[wp.array, wp.array],
@@ -74,8 +74,8 @@ def at_points(term: Any, state: State, history: Any = None, places: bool = True)
         def set_contact_point(name: str, dtype: Any, shape: tuple[int, ...]) -> wp.array:
             return getattr(state, name) if name in state.specs else zeros((B, *shape), dtype)
 
-        history = term.history_of(set_contact_point)
-    attempt = term.attempt_of(B, lambda _, shape, dtype: zeros(shape, dtype))
+        history = term.make_history(set_contact_point)
+    attempt = term.make_scratch(B, lambda _, shape, dtype: zeros(shape, dtype))
     attempt.speed.fill_(1.0)
     if "contact_position" in state.specs:  # statics resets its time to 0
         attempt.position, attempt.rotation = history.position, history.rotation
@@ -85,9 +85,9 @@ def at_points(term: Any, state: State, history: Any = None, places: bool = True)
         attempt.rotation_change.zero_()
     gap, force = zeros((B, P), wp.float64), zeros((B, P), wp.vec3d)
     u = state.displacement
-    if term.exact:
+    if term.double_displacements:
         u = zeros(u.shape, wp.vec3d)
-        term.exact.widen(launch, state.displacement, every, u)
+        term.double_displacements.widen(launch, state.displacement, every, u)
     for group in t.groups:
         dim = (B, group.count, group.data.points)
         launch(

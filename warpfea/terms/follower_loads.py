@@ -20,12 +20,13 @@ from .time_law_table import TimeLawTable
 if TYPE_CHECKING:
     from ..model.model import Model
 
-__all__ = ["FollowerMatrix", "FollowerPart", "Followers"]
+__all__ = ["FollowerLoad", "FollowerLoads", "FollowerMatrix"]
 
 
 @dataclass(eq=False)
-class FollowerPart:
-    """Pressure on faces or moment at points: device data, kernels of the force and of its symmetric tangent."""
+class FollowerLoad:
+    """Pressure on faces or moment at points: device data, kernels of the force and of its symmetric tangent, and the
+    number of faces or points."""
 
     data: Any
     force: Any
@@ -33,7 +34,7 @@ class FollowerPart:
     count: int
 
 
-class Followers(Term):
+class FollowerLoads(Term):
     """Pressures and moments, non-potential in general; H contains the symmetric part of their tangent."""
 
     name = "followers"
@@ -41,11 +42,11 @@ class Followers(Term):
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
-        self.items: list[FollowerPart] = []
-        self._entries = 0
+        self.items: list[FollowerLoad] = []
+        self._entry_count = 0
 
     @classmethod
-    def of(cls, model: Model) -> Followers | None:
+    def of(cls, model: Model) -> FollowerLoads | None:
         d = model.description
         return cls(model) if d.pressures or d.moments else None
 
@@ -57,22 +58,22 @@ class Followers(Term):
         self.items = [self._pressure(p, laws) for p in self.model.description.pressures]
         self.items += [self._moment(p, laws) for p in self.model.description.moments]
 
-    def _data(self, conn: np.ndarray, law: TimeLaw, laws: TimeLawTable) -> Any:
+    def _load_data(self, conn: np.ndarray, law: TimeLaw, laws: TimeLawTable) -> Any:
         """Common device data; conn (items, local) in model slots."""
         m = self.model
         data = follower_struct(m.dtype)()
         data.conn = m.array("loads", conn.T, wp.int32)
         data.law = m.array("loads", np.full(len(conn), laws.add(law)), wp.int32)
-        data.offset, data.count = self.offset + self._entries, len(conn)
+        data.offset, data.count = self.offset + self._entry_count, len(conn)
         self.connectivity.append(conn)
-        self._entries += conn.size
+        self._entry_count += conn.size
         return data
 
-    def _pressure(self, pressure: Pressure, laws: TimeLawTable) -> FollowerPart:
+    def _pressure(self, pressure: Pressure, laws: TimeLawTable) -> FollowerLoad:
         m = self.model
         body = pressure.surface.body
         t = assembly.facet_tables(pressure.surface)
-        data = self._data(t.conn + body.slot_offset, pressure.law, laws)
+        data = self._load_data(t.conn + body.slot_offset, pressure.law, laws)
         position = body.slot_kind[t.conn] == 0
         value = body.reference[t.conn]
         value = np.where(position[:, :, None], value - value[:, :1], value)
@@ -82,16 +83,16 @@ class Followers(Term):
             setattr(data, name, m.array("loads", np.moveaxis(table, 0, 2), m.types.T))
         data.weight = m.array("loads", t.weights[0], m.types.T)
         k = pressure_kernels(m.dtype)
-        return FollowerPart(data, k.pressure, k.pressure_product, len(t.conn))
+        return FollowerLoad(data, k.pressure, k.pressure_product, len(t.conn))
 
-    def _moment(self, moment: Moment, laws: TimeLawTable) -> FollowerPart:
+    def _moment(self, moment: Moment, laws: TimeLawTable) -> FollowerLoad:
         m = self.model
-        data = self._data(moment.slots + moment.body.slot_offset, moment.law, laws)
+        data = self._load_data(moment.slots + moment.body.slot_offset, moment.law, laws)
         data.gradient = m.array("loads", np.swapaxes(moment.vectors, 0, 1), m.types.vec3)
         data.axes = m.array("loads", moment.axes, m.types.mat33)
         data.fraction = m.array("loads", np.full(len(moment.slots), 1.0 / len(moment.slots)), m.types.T)
         k = moment_kernels(m.dtype, moment.body.family.spin_vectors)
-        return FollowerPart(data, k.moment, k.moment_product, len(moment.slots))
+        return FollowerLoad(data, k.moment, k.moment_product, len(moment.slots))
 
     def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
         return {kernel.module for item in self.items for kernel in (item.force, item.product)}
@@ -147,7 +148,7 @@ class Followers(Term):
 class FollowerMatrix:
     """Matrices of a follower load's items, built by columns as products with unit vectors at local slots."""
 
-    def __init__(self, term: Followers, ctx: StepContext, item: FollowerPart, pattern: Any) -> None:
+    def __init__(self, term: FollowerLoads, ctx: StepContext, item: FollowerLoad, pattern: Any) -> None:
         model, work = term.model, ctx.work
         self.model, self.item = model, item
         self.kernels = direct_kernels(model.dtype)
@@ -165,9 +166,9 @@ class FollowerMatrix:
         self.u = work.array(f"{name} u", (B, size), vec3)
         self.direction = work.array(f"{name} direction", (B, size), vec3)
         self.columns = work.array(f"{name} columns", (3 * self.slots, B, size), vec3)
-        self.places, self.entries = self._find(conn, pattern)
+        self.places, self.entries = self._pattern_entries(conn, pattern)
 
-    def _find(self, conn: np.ndarray, pattern: Any) -> tuple[Any, int]:
+    def _pattern_entries(self, conn: np.ndarray, pattern: Any) -> tuple[Any, int]:
         """Pattern entries of the items' matrices."""
         i, j, item = (a.ravel() for a in np.indices((self.slots, self.slots, self.count)))
         index = pattern.find_upper(conn[i, item], conn[j, item])

@@ -14,7 +14,7 @@ from ..kernels.terms.pair_evaluation import pair_evaluation_kernels, pair_result
 from ..kernels.terms.pair_structs import pair_scratch_struct
 from ..model.pairs import exponents
 from ..model.state import State
-from .contact_fields import Patch, nearest_samples, nodal_force
+from .contact_fields import BodyContactPoints, nearest_samples, nodal_force
 
 if TYPE_CHECKING:
     from .pair_tables import PairTables
@@ -48,7 +48,7 @@ class PairEvaluation:
             np.add.at(out[world], slots, self.reaction[world, point])
         return out
 
-    def patches(self, body: Any) -> list[Patch]:
+    def contact_points(self, body: Any) -> list[BodyContactPoints]:
         """Contact points of a body, as slave or as master."""
         t, out = self.tables, []
         for k, contact in enumerate(t.contacts):
@@ -56,17 +56,17 @@ class PairEvaluation:
             gap, normal, area = self.gap[:, points], self.normal[:, points], t.host[k].area.ravel()
             if contact.slave.body is body:
                 nearest = np.broadcast_to(nearest_samples(t, k, contact.slave.body), gap.shape)
-                out.append(Patch(nearest, np.broadcast_to(area, gap.shape), normal, gap))
+                out.append(BodyContactPoints(nearest, np.broadcast_to(area, gap.shape), normal, gap))
             if contact.master.body is body:
-                X = self._places(points)
+                X = self._master_positions(points)
                 nearest = np.full(gap.shape, -1)
                 seated = self.facet[:, points] >= 0
                 nearest[seated] = nearest_samples(t, k, contact.master.body, X[seated])
                 # master area: the loaded part only, without the area beside the slave
-                out.append(Patch(nearest, np.where(normal > 0.0, area, 0.0), normal, gap))
+                out.append(BodyContactPoints(nearest, np.where(normal > 0.0, area, 0.0), normal, gap))
         return out
 
-    def _places(self, points: slice) -> np.ndarray:
+    def _master_positions(self, points: slice) -> np.ndarray:
         """Reference positions (worlds, points, 3) on master facets, m."""
         t = self.tables
         facet, xi = self.facet[:, points], self.xi[:, points]
@@ -92,19 +92,19 @@ def evaluate_pairs(term: Any, state: State) -> PairEvaluation:
     def take(name: str, dtype: Any, shape: tuple[int, ...]) -> wp.array:
         return getattr(state, name) if name in state.specs else zeros((B, *shape), dtype)
 
-    history, seats = term.history_of(take)
+    history, pair_history = term.make_history(take)
     every = wp.ones(B, dtype=wp.int32, device=m.device)
     u = state.displacement
-    if term.exact:
+    if term.double_displacements:
         u = zeros(u.shape, wp.vec3d)
-        term.exact.widen(launch, state.displacement, every, u)
+        term.double_displacements.widen(launch, state.displacement, every, u)
 
     def fill(struct: Any, arrays: dict[str, tuple[tuple[int, ...], Any]]) -> Any:
         for name, (shape, dtype) in arrays.items():
             setattr(struct, name, zeros(shape, dtype))
         return struct
 
-    masters = t.masters_of(wp.uint64(0))
+    masters = t.master_data(wp.uint64(0))
     arrays: dict[str, tuple[tuple[int, ...], Any]] = dict.fromkeys(
         "CD", ((B, t.facets * masters.max_monomials), wp.vec3d)
     )
@@ -112,15 +112,17 @@ def evaluate_pairs(term: Any, state: State) -> PairEvaluation:
     touching = fill(pair_scratch_struct(m.dtype)(), arrays | {"refit_needed": ((1,), wp.int32)})
     touching.C0 = touching.C
     launch(
-        term.seek.update_coefficients, (B, t.facets, masters.max_monomials), [masters, u, every, touching.C, touching.D]
+        term.search_kernels.update_coefficients,
+        (B, t.facets, masters.max_monomials),
+        [masters, u, every, touching.C, touching.D],
     )
-    launch(term.seek.check_boxes, (B, t.facets), [masters, every, touching])
+    launch(term.search_kernels.check_boxes, (B, t.facets), [masters, every, touching])
     tree = wp.Bvh(touching.refit_lower, touching.refit_upper, groups=t.box_groups)
     P, L = t.points, t.master_conn.shape[1]
     arrays = dict.fromkeys(("gap", "normal"), ((B, P), wp.float64)) | dict.fromkeys(("force", "xi"), ((B, P), wp.vec3d))
     found = fill(pair_results_struct()(), arrays | {"facet": ((B, P), wp.int32), "reaction": ((B, P, L), wp.vec3d)})
     for group in t.groups:
-        args = [t.data, t.masters_of(tree.id), group.data, history, seats, state.time, u, t.far]
+        args = [t.data, t.master_data(tree.id), group.data, history, pair_history, state.time, u, t.max_gap]
         args += [contact_scratch_struct(m.dtype)(), touching, found]
         launch(pair_evaluation_kernels(m.dtype).evaluate_pairs, (B, group.count, group.data.points), args)
     return PairEvaluation(t, *(getattr(found, field.name).numpy() for field in fields(PairEvaluation)[1:]))

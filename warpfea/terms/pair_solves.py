@@ -14,8 +14,8 @@ from ..kernels.terms.pair_blocks import pair_block_kernels
 from ..kernels.terms.pair_structs import point_list_struct
 from ..kernels.terms.pairs import pair_kernels
 from ..model.state import words_of
-from .contact_tables import block_entries
-from .facet_tables import LISTED
+from .contact_tables import facet_pattern_entries
+from .facet_tables import POINT_SUM_LANES
 from .pair_rigid_modes import PairRigidModes
 from .pair_tables import PairTables
 from .term import StepContext, Term, part
@@ -50,7 +50,7 @@ class PairSolves(Term):
             ctx.launch(k.product_points, dim, [masters, group.data, active, p, attempt, touching])
         for group in t.groups:  # the last group includes the master facets
             entries = group.conn.size + (t.master_conn.size if group is t.groups[-1] else 0)
-            lanes = ctx.launch.lanes(LISTED)
+            lanes = ctx.launch.lanes(POINT_SUM_LANES)
             args = [masters, group.data, active, lanes, entries - 1, attempt, touching, w.pool_product]
             ctx.launch(k.product_sides, (m.worlds, ctx.launch.padded(lanes * entries)), args)
 
@@ -84,7 +84,9 @@ class PairSolves(Term):
     def allocate_blocks(self, ctx: StepContext, matrix: Any, *, projected: bool) -> None:
         if "pair blocks" not in self.model.cache:
             conns = [group.conn for group in self.tables.groups] + [self.tables.master_conn]
-            self.model.cache["pair blocks"] = [block_entries(self.model, conn, matrix.pattern) for conn in conns]
+            self.model.cache["pair blocks"] = [
+                facet_pattern_entries(self.model, conn, matrix.pattern) for conn in conns
+            ]
 
     def blocks(
         self, ctx: StepContext, matrix: Any, kept: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,

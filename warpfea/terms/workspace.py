@@ -64,7 +64,7 @@ class Workspace:
         # for a preconditioner of diagonal blocks only
         self.block_contribution: wp.array = wp.zeros((0, 0), dtype=model.types.sym, device=model.device)
         none = self.array("none", (1, 1), vec3)
-        side = (B, terms.side_entries)
+        side = (B, terms.nonpotential_entries)
         self.nonpotential = field("nonpotential") if traits.nonpotential else none
         self.nonpotential_frozen = field("nonpotential_frozen") if traits.nonpotential else none
         self.nonpotential_contribution = (
@@ -89,9 +89,9 @@ class Workspace:
         self.warp_rows = self.array("warp_rows", (2, B, -(-n // self.warp)), wp.float64)
         self.rows = self.array("rows", (max(RESIDUAL_ROWS, LEDGER_ROWS), B, n), wp.float64)
         self.energy_rows = self.array("energy_rows", (2, B, model.element_count), wp.float64)
-        longest = max(n, model.element_count, terms.rows, *(term.increment_rows for term in terms))
-        chunks = -(-longest // CHUNK) if longest > CHUNK else 1
-        self.longest = chunks * CHUNK  # maximum items of a summed row
+        max_summed_items = max(n, model.element_count, terms.rows, *(term.increment_rows for term in terms))
+        chunks = -(-max_summed_items // CHUNK) if max_summed_items > CHUNK else 1
+        self.max_summed_items = chunks * CHUNK  # maximum items of a summed row
         most = max(RESIDUAL_ROWS, LEDGER_ROWS, *(len(term.columns) for term in terms))
         self.partial = self.array("partial", (most, B, chunks), wp.float64)
         self.time_law_values = self.array("law_value", (B, max(terms.time_laws.count, 1)), wp.vec3d)
@@ -156,7 +156,7 @@ class Workspace:
         """Constants of an element block in the form that the scheme's kernels take."""
         return block.dissipative_data(self._dtype, self.dissipation) if self.dissipation else block.data
 
-    def reserve_blocks(self) -> None:
+    def allocate_diagonal_blocks(self) -> None:
         """Allocate the diagonal blocks of element matrices."""
         if self.block_contribution.shape != self.blocks_shape:
             self.block_contribution = self.array("block_contribution", self.blocks_shape, self.sym)
