@@ -141,7 +141,7 @@ class Direct:
         for world in map(int, np.flatnonzero(active.numpy())):
             if not self._solve(r, z, world):
                 z[world].zero_()
-        self.launch(self.kernels.dot_rows, self.dim, [r, z, w.diagonal, active, w.warp, w.warp_rows])
+        self.launch(self.kernels.dot_rows, self.dim, [r, z, w.diagonal, active, w.warp_size, w.warp_rows])
 
     def _solve(self, r: wp.array, z: wp.array, world: int) -> bool:
         """Solve in one world. False if the factorisation failed; the first solve verifies it (r.z >= 0)."""

@@ -304,13 +304,13 @@ class NewtonLoop:
         w, k, launch = self.work, self.kernels, self.launch
         choose, better = w.newton.choose_initial, w.newton.searching
         launch(k.compare, self.model.worlds, [w.newton, 1, better])
-        launch(self.vectors.copy_active, self.dim, [w.v, better, w.best])
+        launch(self.vectors.copy_active, self.dim, [w.v, better, w.best_velocity])
         for put in self.first_iterates:
             put()
             self.residual.evaluate(choose, freeze=True)
             launch(k.compare, self.model.worlds, [w.newton, 0, better])
-            launch(self.vectors.copy_active, self.dim, [w.v, better, w.best])
-        launch(self.vectors.copy_active, self.dim, [w.best, choose, w.v])
+            launch(self.vectors.copy_active, self.dim, [w.v, better, w.best_velocity])
+        launch(self.vectors.copy_active, self.dim, [w.best_velocity, choose, w.v])
         self.preconditioner.discard(choose)
         self._open(choose)
         launch(k.begin, self.model.worlds, [w.newton, 2])
@@ -344,7 +344,7 @@ class NewtonLoop:
         if self.limited:
             launch(k.free_step, self.model.worlds, [w.newton])
         self._call_terms("process_direction", active)
-        launch(self.vectors.set_base, self.dim, [w.newton, w.v, w.base, w.best])
+        launch(self.vectors.set_base, self.dim, [w.newton, w.v, w.base_velocity, w.best_velocity])
         launch(self.vectors.dot_rows, self.dim, [w.gradient, w.direction, active, w.rows])
         self.residual.reduce(w.rows, 1, active, w.newton.slope_sum)
         launch(k.begin_search, self.model.worlds, [w.newton, w.pcg])
@@ -420,7 +420,7 @@ class NewtonLoop:
 
     def _search(self) -> None:
         w, k, launch = self.work, self.kernels, self.launch
-        launch(self.vectors.trial_velocity, self.dim, [w.newton, w.base, w.direction, w.best, w.v])
+        launch(self.vectors.trial_velocity, self.dim, [w.newton, w.base_velocity, w.direction, w.best_velocity, w.v])
         self.residual.evaluate(w.newton.searching)
         launch(k.check_trial, self.model.worlds, [w.newton])
         if self.terms.traits.stored:

@@ -98,7 +98,9 @@ class BlockJacobi:
     def apply(self, r: wp.array, z: wp.array, active: wp.array) -> None:
         """z = D^-1 r, with constraints (D + (dq/dv) J^T rho J)^-1 r."""
         w = self.work
-        self.launch(self.kernels.block_jacobi, self.dim, [w.inverse, r, w.diagonal, active, w.warp, z, w.warp_rows])
+        self.launch(
+            self.kernels.block_jacobi, self.dim, [w.inverse, r, w.diagonal, active, w.warp_size, z, w.warp_rows]
+        )
         ctx = self.residual.ctx
         for term in self.residual.terms:
             if term.preconditions(ctx):

@@ -59,7 +59,7 @@ class Reducer:
             self.launch(self.kernels.short_sums, count * self.worlds * lanes, [rows, lanes, active, out])
             return
         if n > CHUNK:
-            partial = self.work.partial
+            partial = self.work.chunk_sums
             # all chunks of the scratch are written: zeros beyond the row's end
             dim = (count, self.worlds, partial.shape[2])
             self.launch.tiled(self.kernels.partial_sums, dim, [rows, active, partial])
@@ -147,7 +147,7 @@ class Residual:
         out.pool = w.pool_product
         if m.terms.traits.pooled:
             out.pool_start, out.pool_entry = m.topology.pool_start, m.topology.pool_entry
-        out.mass_factor, out.dq_dv, out.warp = w.step.mass_factor, w.step.dq_dv, w.warp
+        out.mass_factor, out.dq_dv, out.warp = w.step.mass_factor, w.step.dq_dv, w.warp_size
         return out
 
     @property
@@ -318,7 +318,7 @@ class Residual:
             pattern = self.assembled.pattern
             lanes = launch.lanes(pattern.width)
             threads = launch.padded(m.slots * lanes)
-            self.curvature_rows = shaped(w.rows, (1, m.worlds, threads // w.warp))
+            self.curvature_rows = shaped(w.rows, (1, m.worlds, threads // w.warp_size))
             args = [m.topology, pattern.data, self.matrix, lanes, *rest, out, self.curvature_rows]
             launch(self.gather.matrix_product, (m.worlds, threads), args)
         else:

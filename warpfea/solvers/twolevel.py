@@ -160,7 +160,7 @@ class TwoLevel:
             for key, array in term.cached_inputs(self.ctx):
                 name = f"{term.name}_{key}".replace(" ", "_")
                 kept.live.append(array)
-                kept.place.append(self.work.array(f"preconditioner {name}", array.shape, array.dtype))
+                kept.cached.append(self.work.array(f"preconditioner {name}", array.shape, array.dtype))
                 kept.state.append(state.register(f"preconditioner_{name}", array.dtype, array.shape[1:]))
             if kept.live:
                 self.kept[term.name] = kept
@@ -172,7 +172,7 @@ class TwoLevel:
         for term in self.terms:
             kept = self.kept.get(term.name)
             if kept is not None and not term.copy_cached(self.ctx, kept, reuse.control, flags):
-                for arrays in zip(kept.live, kept.state, kept.place):
+                for arrays in zip(kept.live, kept.state, kept.cached):
                     words = [words_of(array) for array in arrays]
                     self.launch(reuse.kernels.carry_words, words[0].shape, [reuse.control, flags, *words])
 
@@ -237,11 +237,11 @@ class TwoLevel:
             coarse, correct = self._smooth(0, r, z, active), int(len(self.levels) > 1)
         if self.body_modes:
             self.body_modes.apply(r, z, active)
-        args = [level.data, correct, coarse, m.topology.free, r, w.diagonal, active, w.warp, z, w.warp_rows]
+        args = [level.data, correct, coarse, m.topology.free, r, w.diagonal, active, w.warp_size, z, w.warp_rows]
         dim = (m.worlds, launch.padded(m.slots))
         launch(k.add_coarse, dim, args)
         if self.has_corrections:
-            args = [w.inverse, r, w.diagonal, active, w.warp, w.Hp, w.spare_rows]
+            args = [w.inverse, r, w.diagonal, active, w.warp_size, w.Hp, w.spare_rows]
             launch(self.jacobi, dim, args)
             for term in self.terms:
                 if term.preconditions(self.ctx):
@@ -388,7 +388,7 @@ class TwoLevel:
         """Assemble and invert the matrix of the rigid body modes."""
         motions.assemble(self.reuse.linearisation_point, self.value, flags)
         for term in self.terms:
-            kept = self.kept[term.name].place if term.name in self.kept else []
+            kept = self.kept[term.name].cached if term.name in self.kept else []
             if term.coupled_bodies():
                 term.add_mode_coupling(self.ctx, kept, self.reuse.control.dq_dv, flags)
         motions.invert(flags)
@@ -398,7 +398,7 @@ class TwoLevel:
         reuse = self.reuse.control
         for term in self.terms:
             if term.penalty == penalties:
-                kept = self.kept[term.name].place if term.name in self.kept else []
+                kept = self.kept[term.name].cached if term.name in self.kept else []
                 term.blocks(self.ctx, self.assembled, kept, reuse.dq_dv, flags, value, projected=True)
 
     @launch_part("build")

@@ -238,7 +238,7 @@ class Constraints(Term):
         return [("gradient", mul.gradient), ("stiffness", mul.stiffness)]
 
     def copy_cached(self, ctx: StepContext, kept: CachedInputs, reuse: Any, accepted: wp.array) -> bool:
-        args = [reuse, accepted, *kept.live, *kept.state, *kept.place]
+        args = [reuse, accepted, *kept.live, *kept.state, *kept.cached]
         ctx.launch(reuse_kernels(self.model.dtype).carry_rows, self.dim, args)
         return True
 
@@ -285,7 +285,7 @@ class Constraints(Term):
                 launch(k.sweep, (m.worlds, int(sizes[c])), [data, mul, int(first[c]), 1, active])
             for c in range(len(sizes) - 2, -1, -1):
                 launch(k.sweep, (m.worlds, int(sizes[c])), [data, mul, int(first[c]), 0, active])
-        args = [data, mul, w.inverse, r, z, int(into is not None), active, w.warp]
+        args = [data, mul, w.inverse, r, z, int(into is not None), active, w.warp_size]
         launch(k.project, (m.worlds, launch.padded(m.slots)), [*args, z if into is None else into, w.warp_rows])
 
     # evaluation at a state

@@ -132,7 +132,7 @@ class Contact(Term):
             "attempt": attempt,
             "clock": clock,
             # Newton's method only; unused by Jacobi's iteration
-            "touching": work.newton.contact_active,
+            "contact_active": work.newton.contact_active,
             "energies": work.array("contact energies", (ENERGY_COLUMNS, B, R), wp.float64),
             "parts": work.array("contact parts", (B, C, len(RECORD), RECORD_LANES), wp.float64),
             "row_start": self.model.array("contact", t.row_start, wp.int32),
@@ -226,7 +226,7 @@ class Contact(Term):
             args = [self.tables.data, group.data, s["history"], s["clock"], s["u"], active, fresh]
             ctx.launch(k.forces, (m.worlds, group.count, group.data.points), [*args, s["attempt"]])
             dim, lanes = group.sides(ctx.launch, m.worlds)
-            args = [group.data, active, lanes, s["attempt"], w.pool_force, rows, s["touching"]]
+            args = [group.data, active, lanes, s["attempt"], w.pool_force, rows, s["contact_active"]]
             ctx.launch(k.gather_points, dim, args)
 
     def _choose_deepest(self, ctx: StepContext, active: wp.array, *, fresh: int) -> None:

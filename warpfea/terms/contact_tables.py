@@ -28,7 +28,7 @@ class ContactTables(FacetTables[Contact]):
 
     Attributes:
         colliders: descriptions.
-        region_radii: see `region_radius`, by contact index.
+        region_radii: `region_radius` by contact index.
         clamped_point_counts: number of points per contact excluded because all their slots are clamped.
     """
 

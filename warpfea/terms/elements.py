@@ -92,7 +92,7 @@ class Elements(Term):
                 block.data,
                 w.u,
                 w.v,
-                w.base,
+                w.base_velocity,
                 w.newton.predicted_stress,
                 w.history,
                 w.step.dq_dv,

@@ -1,4 +1,4 @@
-"""Common contact tables: facet groups with points, contact law numbers."""
+"""Tables common to contact with colliders and between bodies: groups of facets with their points, law constants."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ WORLD_PARAMETERS = {"mu": "mu", "mu_static": "mu_static", "restitution": "dampin
 MATERIAL_CONSTANTS = ("normal", "tangent", "normal_damping", "mass")
 """Contact constants derived from the bodies' materials."""
 POINT_SUM_LANES = 8
-"""Threads that share a sum over the points of a facet on CUDA."""
+"""Largest number of threads that share a sum over the points of a facet on CUDA."""
 PATCH, LUMPED, MOVING = range(3)
 """Contact kinds of a facet: all points, at most one point, or at most one moving position."""
 

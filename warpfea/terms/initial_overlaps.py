@@ -106,8 +106,8 @@ def refuse_deep_overlaps(
                 raise ModelError(
                     f"contact {contact.name!r}: body {contact.slave.body.name!r} begins within body {body.name!r} "
                     f"(world {world}, reference point {reference_position_text(tables, k, point)}, "
-                    f"{depth.max():.3g} m deep), where no facet of the contact reaches; move one of them, or leave these "
-                    "faces out of the contact"
+                    f"{depth.max():.3g} m deep), where no facet of the contact reaches; move one of them, or leave "
+                    "these faces out of the contact"
                 )
 
 

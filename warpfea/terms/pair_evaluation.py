@@ -109,20 +109,20 @@ def evaluate_pairs(term: Any, state: State) -> PairEvaluation:
         "CD", ((B, t.facets * masters.max_monomials), wp.vec3d)
     )
     arrays |= dict.fromkeys(("lower", "upper", "refit_lower", "refit_upper"), ((B * t.facets,), wp.vec3))
-    touching = fill(pair_scratch_struct(m.dtype)(), arrays | {"refit_needed": ((1,), wp.int32)})
-    touching.C0 = touching.C
+    pair = fill(pair_scratch_struct(m.dtype)(), arrays | {"refit_needed": ((1,), wp.int32)})
+    pair.C0 = pair.C
     launch(
         term.search_kernels.update_coefficients,
         (B, t.facets, masters.max_monomials),
-        [masters, u, every, touching.C, touching.D],
+        [masters, u, every, pair.C, pair.D],
     )
-    launch(term.search_kernels.check_boxes, (B, t.facets), [masters, every, touching])
-    tree = wp.Bvh(touching.refit_lower, touching.refit_upper, groups=t.box_groups)
+    launch(term.search_kernels.check_boxes, (B, t.facets), [masters, every, pair])
+    tree = wp.Bvh(pair.refit_lower, pair.refit_upper, groups=t.box_groups)
     P, L = t.points, t.master_conn.shape[1]
     arrays = dict.fromkeys(("gap", "normal"), ((B, P), wp.float64)) | dict.fromkeys(("force", "xi"), ((B, P), wp.vec3d))
     found = fill(pair_results_struct()(), arrays | {"facet": ((B, P), wp.int32), "reaction": ((B, P, L), wp.vec3d)})
     for group in t.groups:
         args = [t.data, t.master_data(tree.id), group.data, history, pair_history, state.time, u, t.max_gap]
-        args += [contact_scratch_struct(m.dtype)(), touching, found]
+        args += [contact_scratch_struct(m.dtype)(), pair, found]
         launch(pair_evaluation_kernels(m.dtype).evaluate_pairs, (B, group.count, group.data.points), args)
     return PairEvaluation(t, *(getattr(found, field.name).numpy() for field in fields(PairEvaluation)[1:]))

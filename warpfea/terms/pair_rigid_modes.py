@@ -17,7 +17,16 @@ __all__ = ["PairRigidModes"]
 
 
 class PairRigidModes:
-    """Couplings by contacts between the bodies with rigid body modes, `motions`, with sums over their points."""
+    """Couplings by contacts between the bodies with rigid body modes, with sums over their points.
+
+    Args:
+        motions: rigid body modes of the preconditioner (solvers/rigid_body_modes.py).
+
+    Attributes:
+        pair: coupled bodies, [pair]; start, source: contacts of each pair, with 1 where the slave comes second.
+        first: first point of each contact. groups: (facet group, its coupled contacts, their number).
+        parts: partial sums [world, contact, lane, 4].
+    """
 
     def __init__(self, ctx: StepContext, tables: PairTables, masters: Any, motions: Any) -> None:
         m, t = ctx.model, tables

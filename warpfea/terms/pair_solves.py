@@ -44,14 +44,14 @@ class PairSolves(Term):
     @part("pairs")
     def product(self, ctx: StepContext, p: wp.array, active: wp.array) -> None:
         s, m, w, t, k = ctx.scratch[self.name], self.model, ctx.work, self.tables, self.kernels
-        attempt, touching, masters = s["attempt"], s["touching"], s["masters"]
+        attempt, pair, masters = s["attempt"], s["pair"], s["masters"]
         for group in t.groups:
             dim = (m.worlds, group.count, group.data.points)
-            ctx.launch(k.product_points, dim, [masters, group.data, active, p, attempt, touching])
+            ctx.launch(k.product_points, dim, [masters, group.data, active, p, attempt, pair])
         for group in t.groups:  # the last group includes the master facets
             entries = group.conn.size + (t.master_conn.size if group is t.groups[-1] else 0)
             lanes = ctx.launch.lanes(POINT_SUM_LANES)
-            args = [masters, group.data, active, lanes, entries - 1, attempt, touching, w.pool_product]
+            args = [masters, group.data, active, lanes, entries - 1, attempt, pair, w.pool_product]
             ctx.launch(k.product_sides, (m.worlds, ctx.launch.padded(lanes * entries)), args)
 
     @part("pairs")
@@ -60,12 +60,12 @@ class PairSolves(Term):
         for group in t.groups:
             args = [group.data, active, s["attempt"], w.pool_block]
             ctx.launch(self.shared.diagonal, (m.worlds, group.count, group.conn.shape[1]), args)
-        args = [s["masters"], active, s["attempt"], s["touching"], w.pool_block]
+        args = [s["masters"], active, s["attempt"], s["pair"], w.pool_block]
         ctx.launch(self.kernels.diagonal_masters, (m.worlds, t.facets, t.master_conn.shape[1]), args)
 
     def cached_inputs(self, ctx: StepContext) -> list[tuple[str, wp.array]]:
         s = ctx.scratch[self.name]
-        t = s["touching"]
+        t = s["pair"]
         arrays = {
             "list_size": t.list_size,
             "list_start": t.list_start,

@@ -150,19 +150,19 @@ class Pairs(PairSolves):
     def allocate(self, work: Workspace, ctx: StepContext) -> None:
         t, m = self.tables, self.model
         C, R, B = len(t.contacts), t.rows, m.worlds
-        attempt, touching = self._make_scratch(work), self._make_pair_scratch(work)
+        attempt, pair = self._make_scratch(work), self._make_pair_scratch(work)
         clock = clock_struct()()
         for name in ("time", "new_time", "h", "part"):
             setattr(clock, name, getattr(work.step, name))
         clock.time, clock.still = ctx.state.time, int(not ctx.inertia)
-        tree = self._build_tree(touching)
+        tree = self._build_tree(pair)
         scratch = {
             "attempt": attempt,
-            "touching": touching,
+            "pair": pair,
             "tree": tree,
             "masters": t.master_data(tree.id),
             "clock": clock,
-            "active": work.newton.contact_active,
+            "contact_active": work.newton.contact_active,
             "energies": work.array("pairs energies", (ENERGY_COLUMNS, B, R), wp.float64),
             "parts": work.array("pairs parts", (B, C, len(RECORD), RECORD_LANES), wp.float64),
             "row_start": m.array("contact", t.row_start, wp.int32),
@@ -170,12 +170,12 @@ class Pairs(PairSolves):
         }
         ctx.scratch[self.name] = scratch | ctx.scratch.get(self.name, {})
 
-    def _build_tree(self, touching: Any) -> wp.Bvh:
+    def _build_tree(self, pair: Any) -> wp.Bvh:
         """Bounding volume hierarchy of the facets in the reference; one group per world and surface."""
         low, high = self.tables.reference_boxes()
-        touching.lower.assign(np.tile(low, (self.model.worlds, 1)))
-        touching.upper.assign(np.tile(high, (self.model.worlds, 1)))
-        return wp.Bvh(touching.lower, touching.upper, constructor="sah", groups=self.tables.box_groups)
+        pair.lower.assign(np.tile(low, (self.model.worlds, 1)))
+        pair.upper.assign(np.tile(high, (self.model.worlds, 1)))
+        return wp.Bvh(pair.lower, pair.upper, constructor="sah", groups=self.tables.box_groups)
 
     def make_history(self, make: Callable[[str, Any, tuple[int, ...]], wp.array]) -> tuple[Any, Any]:
         """Structs of history and facet assignment, with arrays from make(name, dtype, shape per world)."""
@@ -220,11 +220,11 @@ class Pairs(PairSolves):
             u = s["u"]
             self.double_displacements.widen(ctx.launch, ctx.state.displacement, flags, u)
         self._search_facets(ctx, u, flags, overlap_limit=t.max_overlap_depth)
-        facet = s["touching"].facet.numpy()
-        depth = np.where((facet != -1) & new[:, None], s["touching"].depth.numpy(), 0.0)
+        facet = s["pair"].facet.numpy()
+        depth = np.where((facet != -1) & new[:, None], s["pair"].depth.numpy(), 0.0)
         touching = touching_depth(self.model.size, ctx.state.displacement.numpy())
         store_overlaps(t, depth, touching, overlap)
-        refuse_deep_overlaps(t, ctx.state.displacement.numpy(), s["touching"].x0.numpy(), facet, new)
+        refuse_deep_overlaps(t, ctx.state.displacement.numpy(), s["pair"].x0.numpy(), facet, new)
         history.overlap.assign(overlap)
 
     def shift_time(self, state: State) -> None:
@@ -242,37 +242,37 @@ class Pairs(PairSolves):
 
     def _begin_points(self, ctx: StepContext, active: wp.array) -> None:
         s, m, t = ctx.scratch[self.name], self.model, self.tables
-        touching, masters = s["touching"], s["masters"]
+        pair, masters = s["pair"], s["masters"]
         u, v = ctx.state.displacement, ctx.state.velocity
         dim = (m.worlds, t.facets, masters.max_monomials)
-        ctx.launch(self.search_kernels.initial_coefficients, dim, [masters, u, v, active, touching])
+        ctx.launch(self.search_kernels.initial_coefficients, dim, [masters, u, v, active, pair])
         for group in t.groups:
             args = [t.data, masters, group.data, s["history"], s["pair_history"], s["clock"]]
             dim = (m.worlds, group.count, group.data.points)
-            ctx.launch(self.search_kernels.begin_points, dim, [*args, u, v, active, s["attempt"], touching])
+            ctx.launch(self.search_kernels.begin_points, dim, [*args, u, v, active, s["attempt"], pair])
             if t.explicit:
-                ctx.launch(self.kernels.explicit_forces, dim, [*args, v, active, s["attempt"], touching])
+                ctx.launch(self.kernels.explicit_forces, dim, [*args, v, active, s["attempt"], pair])
 
     def _refit_tree(self, ctx: StepContext) -> None:
         s = ctx.scratch[self.name]
-        ctx.launch(self.search_kernels.accept_boxes, self.model.worlds * self.tables.facets, [s["touching"]])
+        ctx.launch(self.search_kernels.accept_boxes, self.model.worlds * self.tables.facets, [s["pair"]])
         s["tree"].refit()
 
     def _search_facets(self, ctx: StepContext, u: wp.array, active: wp.array, *, overlap_limit: float) -> None:
         """Assign all points to facets at u."""
         s, m, t, k = ctx.scratch[self.name], self.model, self.tables, self.search_kernels
-        touching, masters = s["touching"], s["masters"]
+        pair, masters = s["pair"], s["masters"]
         dim = (m.worlds, t.facets, masters.max_monomials)
-        ctx.launch(k.update_coefficients, dim, [masters, u, active, touching.C, touching.D])
-        ctx.launch(k.check_boxes, (m.worlds, t.facets), [masters, active, touching])
-        ctx.launch(k.update_centres, (m.worlds, t.facets), [masters, active, touching])
-        wp.capture_if(touching.refit_needed, self._refit_tree, ctx=ctx)
+        ctx.launch(k.update_coefficients, dim, [masters, u, active, pair.C, pair.D])
+        ctx.launch(k.check_boxes, (m.worlds, t.facets), [masters, active, pair])
+        ctx.launch(k.update_centres, (m.worlds, t.facets), [masters, active, pair])
+        wp.capture_if(pair.refit_needed, self._refit_tree, ctx=ctx)
         for group, corners in zip(t.groups, t.corners):
             args = [t.data, masters, group.data, s["history"]]
             ctx.launch(
-                k.query_boxes, (m.worlds, group.count), [*args, u, active, t.reach_distance + overlap_limit, touching]
+                k.query_boxes, (m.worlds, group.count), [*args, u, active, t.reach_distance + overlap_limit, pair]
             )
-            args += [s["clock"], u, ctx.state.velocity, active, overlap_limit, s["attempt"], touching, corners]
+            args += [s["clock"], u, ctx.state.velocity, active, overlap_limit, s["attempt"], pair, corners]
             ctx.launch(k.find_facets, (m.worlds, group.count, group.data.points), args)
 
     def prepare(self, ctx: StepContext, active: wp.array) -> None:
@@ -285,7 +285,7 @@ class Pairs(PairSolves):
     @part("pairs")
     def _evaluate_forces(self, ctx: StepContext, active: wp.array, *, fresh: int) -> None:
         s, m, w, t = ctx.scratch[self.name], self.model, ctx.work, self.tables
-        touching, masters = s["touching"], s["masters"]
+        pair, masters = s["pair"], s["masters"]
         if ctx.positions_changed:
             if self.double_displacements:
                 self.double_displacements.update(ctx, s["u"], active)
@@ -293,27 +293,27 @@ class Pairs(PairSolves):
         for group in t.groups:
             args = [t.data, masters, group.data, s["history"], s["pair_history"], s["clock"], s["u"], active, fresh]
             dim = (m.worlds, group.count, group.data.points)
-            ctx.launch(self.kernels.forces, dim, [*args, s["attempt"], touching])
-        wp.capture_if(touching.lists_changed, self._build_point_lists, ctx=ctx)
+            ctx.launch(self.kernels.forces, dim, [*args, s["attempt"], pair])
+        wp.capture_if(pair.lists_changed, self._build_point_lists, ctx=ctx)
         for group in t.groups:
             sides, lanes = group.sides(ctx.launch, m.worlds)
-            args = [group.data, active, lanes, s["attempt"], w.pool_force, w.rows_of(self), s["active"]]
+            args = [group.data, active, lanes, s["attempt"], w.pool_force, w.rows_of(self), s["contact_active"]]
             ctx.launch(self.shared.gather_points, sides, args)
         lanes = ctx.launch.lanes(POINT_SUM_LANES)
-        args = [masters, active, lanes, s["attempt"], touching, w.pool_force]
+        args = [masters, active, lanes, s["attempt"], pair, w.pool_force]
         ctx.launch(self.kernels.gather_masters, (m.worlds, ctx.launch.padded(lanes * t.master_conn.size)), args)
 
     def _build_point_lists(self, ctx: StepContext) -> None:
         """Build the point lists of the master facets."""
         s, m, t, k = ctx.scratch[self.name], self.model, self.tables, self.lists
-        touching, masters = s["touching"], s["masters"]
-        ctx.launch(k.clear_lists, m.worlds * t.facets, [touching])
-        ctx.launch(k.count_points, (m.worlds, t.points), [masters, touching])
-        ctx.launch(k.sum_chunks, touching.chunk_offset.shape, [masters, touching])
-        ctx.launch(k.scan_chunks, m.worlds, [touching])
-        ctx.launch(k.place_lists, (m.worlds, t.facets), [masters, touching])
-        ctx.launch(k.fill_lists, (m.worlds, t.points), [masters, touching])
-        ctx.launch(k.sort_lists, (m.worlds, t.facets), [touching])
+        pair, masters = s["pair"], s["masters"]
+        ctx.launch(k.clear_lists, m.worlds * t.facets, [pair])
+        ctx.launch(k.count_points, (m.worlds, t.points), [masters, pair])
+        ctx.launch(k.sum_chunks, pair.chunk_offset.shape, [masters, pair])
+        ctx.launch(k.scan_chunks, m.worlds, [pair])
+        ctx.launch(k.place_lists, (m.worlds, t.facets), [masters, pair])
+        ctx.launch(k.fill_lists, (m.worlds, t.points), [masters, pair])
+        ctx.launch(k.sort_lists, (m.worlds, t.facets), [pair])
 
     @part("pairs")
     def update_frozen(self, ctx: StepContext, flags: wp.array) -> None:
@@ -323,7 +323,7 @@ class Pairs(PairSolves):
         ctx.launch(k.update_frozen, (m.worlds, self.tables.points), [flags, attempt])
         s = ctx.scratch[self.name]
         for group in self.tables.groups:
-            args = [s["masters"], group.data, s["u"], flags, attempt, s["touching"]]
+            args = [s["masters"], group.data, s["u"], flags, attempt, s["pair"]]
             ctx.launch(self.kernels.update_friction_shapes, (m.worlds, group.count, group.data.points), args)
 
     def energy_increments(self, ctx: StepContext, accepted: wp.array) -> wp.array:
@@ -339,7 +339,7 @@ class Pairs(PairSolves):
         self._search_facets(ctx, s["u"], accepted, overlap_limit=0.0)
         for group in t.groups:
             args = [t.data, s["masters"], group.data, s["history"], s["pair_history"], s["clock"], accepted]
-            args += [s["attempt"], s["touching"], s["energies"]]
+            args += [s["attempt"], s["pair"], s["energies"]]
             ctx.launch(self.pair_ledger_kernels.record_substep, (m.worlds, group.count), args)
         args = [t.data, s["row_start"], accepted, s["attempt"], s["parts"]]
         ctx.launch(self.ledger_kernels.partial_records, (m.worlds, C, len(RECORD), RECORD_LANES), args)

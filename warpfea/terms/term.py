@@ -117,11 +117,15 @@ class FieldSpec:
 
 @dataclass(eq=False)
 class CachedInputs:
-    """Inputs of a term's blocks at linearisation, besides displacements: live, cached and state arrays, [world,
-    ...]."""
+    """Inputs of a term's blocks besides displacements, arrays [world, ...].
+
+    Attributes:
+        live: as the term evaluates them; cached: copies at the linearisation of the preconditioner; state: copies saved
+            with the state, from which a resumed run rebuilds the preconditioner.
+    """
 
     live: list[wp.array]
-    place: list[wp.array]
+    cached: list[wp.array]
     state: list[wp.array]
 
 

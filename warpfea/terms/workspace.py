@@ -29,7 +29,10 @@ __all__ = ["Workspace"]
 
 
 class Workspace:
-    """Scratch of a simulation. Unused features get an array of one item."""
+    """Scratch of a simulation. Unused features get an array of one item.
+
+    Notation of the step: v velocities, u displacements, g residual, H its derivative; r, z, p, Hp vectors of PCG.
+    """
 
     def __init__(
         self, model: Model, *, max_newton: int, ledger: bool, midpoint: bool = False, dissipation: float = 0.0
@@ -45,8 +48,8 @@ class Workspace:
         def field(name: str) -> wp.array:
             return self.array(name, (B, n), vec3)
 
-        # iterate, base point of its displacements, best iterate
-        self.v, self.u, self.base, self.best = field("v"), field("u"), field("base"), field("best")
+        # iterate, base point of the line search, best iterate
+        self.v, self.u, self.base_velocity, self.best_velocity = field("v"), field("u"), field("base"), field("best")
         # stage positions, and stage velocities of the elements
         self.u_stage, self.v_stage = (field("u_stage"), field("v_stage")) if midpoint else (self.u, self.v)
         self.q_tilde, self.v_tilde = field("q_tilde"), field("v_tilde")
@@ -85,15 +88,15 @@ class Workspace:
         # scratch for kernels whose sums are unused
         self.spare_rows = self.array("spare_rows", (2, B, n) if traits.constraint_rows else (1, 1, 1), wp.float64)
         # PCG sums have one row per warp
-        self.warp = WARP if model.device.is_cuda else 1
-        self.warp_rows = self.array("warp_rows", (2, B, -(-n // self.warp)), wp.float64)
+        self.warp_size = WARP if model.device.is_cuda else 1
+        self.warp_rows = self.array("warp_rows", (2, B, -(-n // self.warp_size)), wp.float64)
         self.rows = self.array("rows", (max(RESIDUAL_ROWS, LEDGER_ROWS), B, n), wp.float64)
         self.energy_rows = self.array("energy_rows", (2, B, model.element_count), wp.float64)
         max_summed_items = max(n, model.element_count, terms.rows, *(term.increment_rows for term in terms))
         chunks = -(-max_summed_items // CHUNK) if max_summed_items > CHUNK else 1
         self.max_summed_items = chunks * CHUNK  # maximum items of a summed row
         most = max(RESIDUAL_ROWS, LEDGER_ROWS, *(len(term.columns) for term in terms))
-        self.partial = self.array("partial", (most, B, chunks), wp.float64)
+        self.chunk_sums = self.array("partial", (most, B, chunks), wp.float64)
         self.time_law_values = self.array("law_value", (B, max(terms.time_laws.count, 1)), wp.vec3d)
         self.time_law_stage_values = self.time_law_values
         if midpoint:
