@@ -298,9 +298,9 @@ class Constraints(Term):
         def zeros(shape: tuple[int, ...], dtype: Any) -> wp.array:
             return wp.zeros(shape, dtype=dtype, device=m.device)
 
-        every = wp.ones(B, dtype=wp.int32, device=m.device)
+        all_worlds = wp.ones(B, dtype=wp.int32, device=m.device)
         value = zeros((B, max(laws.count, 1)), wp.vec3d)
-        laws.evaluate(launch, state, state.time, wp.ones(B, dtype=wp.float64, device=m.device), every, value)
+        laws.evaluate(launch, state, state.time, wp.ones(B, dtype=wp.float64, device=m.device), all_worlds, value)
         mul = multiplier_struct()()
         for name in (
             "value",
@@ -323,7 +323,7 @@ class Constraints(Term):
         if multipliers is not None:
             mul.force.assign(np.tile(multipliers, (B, 1)))
         mul.last_target.fill_(np.nan)  # any number of turns is valid
-        args = [con.data, state.displacement, state.displacement, value, zeros((B,), wp.float64), every, mul]
+        args = [con.data, state.displacement, state.displacement, value, zeros((B,), wp.float64), all_worlds, mul]
         launch(self.kernels.evaluate, self.dim, args)
         return mul
 
@@ -343,8 +343,8 @@ class Constraints(Term):
         host = np.tile(direction, (m.worlds, 1, 1))
         p: Any = wp.array(host.astype(np.dtype(m.dtype)), dtype=m.types.vec3, device=m.device)
         one = wp.ones(m.worlds, dtype=wp.float64, device=m.device)
-        every = wp.ones(m.worlds, dtype=wp.int32, device=m.device)
-        Launcher(m.device)(self.kernels.product_terms, self.dim, [con.data, mul, p, one, every])
+        all_worlds = wp.ones(m.worlds, dtype=wp.int32, device=m.device)
+        Launcher(m.device)(self.kernels.product_terms, self.dim, [con.data, mul, p, one, all_worlds])
         out = np.zeros((m.worlds, m.slots, 3))
         terms = mul.product.numpy()
         for world in range(m.worlds):

@@ -225,7 +225,7 @@ class Contact(Term):
         for group in self.tables.groups:
             args = [self.tables.data, group.data, s["history"], s["clock"], s["u"], active, fresh]
             ctx.launch(k.forces, (m.worlds, group.count, group.data.points), [*args, s["attempt"]])
-            dim, lanes = group.sides(ctx.launch, m.worlds)
+            dim, lanes = group.sum_threads(ctx.launch, m.worlds)
             args = [group.data, active, lanes, s["attempt"], w.pool_force, rows, s["contact_active"]]
             ctx.launch(k.gather_points, dim, args)
 
@@ -252,7 +252,7 @@ class Contact(Term):
         for group in self.tables.groups:
             dim = (m.worlds, group.count, group.data.points)
             ctx.launch(k.product_points, dim, [group.data, active, p, attempt])
-            sides, lanes = group.sides(ctx.launch, m.worlds)
+            sides, lanes = group.sum_threads(ctx.launch, m.worlds)
             args = [group.data, active, lanes, attempt, ctx.work.pool_product]
             ctx.launch(k.product_facets, sides, args)
 

@@ -95,7 +95,7 @@ class ContactTables(FacetTables[Contact]):
         def upload(name: str, values: Any, dtype: Any) -> None:
             setattr(out, name, m.array("contact", np.asarray(values), dtype))
 
-        self._upload_laws(out, [self.numbers(c) for c in C])
+        self._upload_laws(out, [self.law_constants(c) for c in C])
         upload("collider", [K.index(c.collider) for c in C], wp.int32)
         upload("margin", np.zeros((m.worlds, len(K))), wp.float64)
         frames = [k.shape.frame() for k in K]
@@ -111,7 +111,7 @@ class ContactTables(FacetTables[Contact]):
             out.mesh = upload_collider_meshes(m, [k.shape for k in K])
         return out
 
-    def numbers(self, contact: Contact, world: int | None = None) -> dict[str, float]:
+    def law_constants(self, contact: Contact, world: int | None = None) -> dict[str, float]:
         if contact.index not in self.region_radii:
             self.region_radii[contact.index] = region_radius(contact)
         parameters = self.model.parameters

@@ -26,7 +26,7 @@ class DeadLoads(Term):
     """Dead loads: assembled once per attempt into work.dead.
 
     Gravity, [world] on the device, is part of every model; without any load nothing is launched. With a time law of
-    gravity `gravity` follows the law, and `constant`, which the load of a static path scales, is zero.
+    gravity `gravity` follows the law, and `constant_gravity`, which the load of a static path scales, is zero.
     """
 
     name = "dead loads"
@@ -37,7 +37,7 @@ class DeadLoads(Term):
         self.gravity_host = np.tile(model.gravity, (model.worlds, 1))
         self.gravity = model.array("loads", self.gravity_host, wp.vec3d)
         self.gravity_law = model.description.gravity
-        self.constant = self.gravity
+        self.constant_gravity = self.gravity
 
     @classmethod
     def of(cls, model: Model) -> DeadLoads:
@@ -60,10 +60,10 @@ class DeadLoads(Term):
             numbers.append(np.full(len(load.slots), index))
             weights.append(load.weights)
         if self.gravity_law is not None:
-            self.constant = m.array("loads", self.gravity_host, wp.vec3d)
-            self.number = laws.add(self.gravity_law)
+            self.constant_gravity = m.array("loads", self.gravity_host, wp.vec3d)
+            self.gravity_law_index = laws.add(self.gravity_law)
             slots.append(np.arange(m.slots))
-            numbers.append(np.full(m.slots, self.number))
+            numbers.append(np.full(m.slots, self.gravity_law_index))
             weights.append(m.lumped_host)
         slot = np.concatenate(slots) if slots else np.zeros(0, dtype=np.int64)
         order = np.argsort(slot, kind="stable")
@@ -90,7 +90,7 @@ class DeadLoads(Term):
     def take_gravity(self, launch: Launcher, value: wp.array, active: wp.array) -> None:
         """Set gravity at the end of the attempt from the values of the time laws."""
         if self.gravity_law is not None:
-            launch(self.kernels.take_gravity, self.model.worlds, [value, self.number, active, self.gravity])
+            launch(self.kernels.take_gravity, self.model.worlds, [value, self.gravity_law_index, active, self.gravity])
 
     @part("loads")
     def begin(self, ctx: StepContext, active: wp.array) -> None:
@@ -104,7 +104,7 @@ class DeadLoads(Term):
             self.weight,
             w.time_law_stage_values,
             m.masses.lumped_values,
-            self.constant,
+            self.constant_gravity,
             w.step.ramp,
             active,
         ]

@@ -112,7 +112,7 @@ class FacetGroup:
         """Number of facets."""
         return len(self.conn)
 
-    def sides(self, launch: Launcher, worlds: int) -> tuple[tuple[int, int], int]:
+    def sum_threads(self, launch: Launcher, worlds: int) -> tuple[tuple[int, int], int]:
         """Threads that sum over the points of a facet for each of its slots, and threads per slot."""
         lanes = launch.lanes(POINT_SUM_LANES)
         return (worlds, launch.padded(lanes * self.conn.size)), lanes
@@ -200,7 +200,7 @@ class FacetTables(Generic[AnyContact]):
             upload("power", power, wp.vec2i)
         return FacetGroup(conn, data, acts != PATCH, chosen)
 
-    def numbers(self, contact: AnyContact, world: int | None = None) -> dict[str, float]:
+    def law_constants(self, contact: AnyContact, world: int | None = None) -> dict[str, float]:
         """Constants `MATERIAL_CONSTANTS` of a contact, as built or in one world."""
         raise NotImplementedError
 
@@ -229,14 +229,14 @@ class FacetTables(Generic[AnyContact]):
         host = {name: getattr(data, name).numpy() for name in MATERIAL_CONSTANTS}
         for world in np.flatnonzero(mask).tolist():
             for k in touched:
-                for name, value in self.numbers(self.contacts[k], world).items():
+                for name, value in self.law_constants(self.contacts[k], world).items():
                     if name in host:
                         host[name][world, k] = value
         for name, values in host.items():
             getattr(data, name).assign(values)
 
-    def _upload_laws(self, out: Any, numbers: list[dict[str, float]]) -> None:
-        """Upload the contact law constants; `numbers` per contact: normal, tangent, normal_damping, mass."""
+    def _upload_laws(self, out: Any, law_constants: list[dict[str, float]]) -> None:
+        """Upload the contact law constants; `law_constants` per contact: normal, tangent, normal_damping, mass."""
         m, C = self.model, self.contacts
 
         def upload(name: str, values: Any, dtype: Any = wp.float64) -> None:
@@ -247,7 +247,7 @@ class FacetTables(Generic[AnyContact]):
         upload("is_explicit", [int(c.treatment == "explicit") for c in C], wp.int32)
         upload("first", self.first, wp.int32)
         for name in MATERIAL_CONSTANTS:
-            upload(name, [[row[name] for row in numbers]])
+            upload(name, [[row[name] for row in law_constants]])
         smoothing = [c.smoothing if isinstance(c.smoothing, tuple) else DEFAULT_SMOOTHING for c in C]
         upload("ramp", [float(c.smoothing) if isinstance(c.smoothing, (int, float)) else 0.0 for c in C])
         upload("force_eps", [pair[0] for pair in smoothing])

@@ -42,7 +42,7 @@ class FollowerLoads(Term):
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
-        self.items: list[FollowerLoad] = []
+        self.loads: list[FollowerLoad] = []
         self._entry_count = 0
 
     @classmethod
@@ -55,8 +55,8 @@ class FollowerLoads(Term):
         return {"follower pressure": bool(model.description.pressures), "moments": bool(model.description.moments)}
 
     def build(self, laws: TimeLawTable) -> None:
-        self.items = [self._pressure(p, laws) for p in self.model.description.pressures]
-        self.items += [self._moment(p, laws) for p in self.model.description.moments]
+        self.loads = [self._pressure(p, laws) for p in self.model.description.pressures]
+        self.loads += [self._moment(p, laws) for p in self.model.description.moments]
 
     def _load_data(self, conn: np.ndarray, law: TimeLaw, laws: TimeLawTable) -> Any:
         """Common device data; conn (items, local) in model slots."""
@@ -95,20 +95,20 @@ class FollowerLoads(Term):
         return FollowerLoad(data, k.moment, k.moment_product, len(moment.slots))
 
     def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
-        return {kernel.module for item in self.items for kernel in (item.force, item.product)}
+        return {kernel.module for load in self.loads for kernel in (load.force, load.product)}
 
     def force(self, ctx: StepContext, active: wp.array) -> None:
         m, w = self.model, ctx.work
-        for item in self.items:
-            args = [item.data, w.u_stage, w.time_law_stage_values, active, w.nonpotential_contribution]
-            ctx.launch(item.force, (m.worlds, item.count), args)
+        for load in self.loads:
+            args = [load.data, w.u_stage, w.time_law_stage_values, active, w.nonpotential_contribution]
+            ctx.launch(load.force, (m.worlds, load.count), args)
 
     def product(self, ctx: StepContext, p: wp.array, active: wp.array) -> None:
         """Symmetric tangent of the force times p."""
         m, w = self.model, ctx.work
-        for item in self.items:
+        for load in self.loads:
             args = [
-                item.data,
+                load.data,
                 ctx.midpoint_factor,
                 w.u_stage,
                 w.time_law_stage_values,
@@ -116,15 +116,15 @@ class FollowerLoads(Term):
                 p,
                 w.nonpotential_tangent,
             ]
-            ctx.launch(item.product, (m.worlds, item.count), args)
+            ctx.launch(load.product, (m.worlds, load.count), args)
 
     def mark_constrained(self, free: np.ndarray) -> None:
         """No-op: pressures and moments are translation invariant."""
 
     def allocate_blocks(self, ctx: StepContext, matrix: Any, *, projected: bool) -> None:
         if not projected:
-            items = self.items
-            ctx.scratch[self.name] = [FollowerMatrix(self, ctx, item, matrix.pattern) for item in items]
+            loads = self.loads
+            ctx.scratch[self.name] = [FollowerMatrix(self, ctx, load, matrix.pattern) for load in loads]
 
     def blocks(
         self, ctx: StepContext, matrix: Any, kept: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,
@@ -133,8 +133,8 @@ class FollowerLoads(Term):
         """Minus the symmetric tangent of the force; indefinite, so nothing if projected."""
         if projected:
             return
-        for item in ctx.scratch[self.name]:
-            item.add(ctx, matrix, dq_dv, active, out)
+        for matrices in ctx.scratch[self.name]:
+            matrices.add(ctx, matrix, dq_dv, active, out)
 
     def hash(self, h: Any) -> None:
         for conn in self.connectivity:
@@ -148,27 +148,27 @@ class FollowerLoads(Term):
 class FollowerMatrix:
     """Matrices of a follower load's items, built by columns as products with unit vectors at local slots."""
 
-    def __init__(self, term: FollowerLoads, ctx: StepContext, item: FollowerLoad, pattern: Any) -> None:
+    def __init__(self, term: FollowerLoads, ctx: StepContext, load: FollowerLoad, pattern: Any) -> None:
         model, work = term.model, ctx.work
-        self.model, self.item = model, item
+        self.model, self.load = model, load
         self.kernels = direct_kernels(model.dtype)
-        conn = item.data.conn.numpy()
+        conn = load.data.conn.numpy()
         self.slots, self.count = conn.shape
         size = conn.size
         self.data = follower_struct(model.dtype)()
         for name in follower_struct(model.dtype).vars:
-            setattr(self.data, name, getattr(item.data, name))
+            setattr(self.data, name, getattr(load.data, name))
         own = np.arange(size, dtype=np.int32).reshape(conn.shape)
         self.data.conn = wp.array(own, dtype=wp.int32, device=model.device)
         self.data.offset = 0
-        name = f"direct follower {item.data.offset}"
+        name = f"direct follower {load.data.offset}"
         vec3, B = model.types.vec3, model.worlds
         self.u = work.array(f"{name} u", (B, size), vec3)
         self.direction = work.array(f"{name} direction", (B, size), vec3)
         self.columns = work.array(f"{name} columns", (3 * self.slots, B, size), vec3)
-        self.places, self.entries = self._pattern_entries(conn, pattern)
+        self.pattern_entries, self.entry_count = self._find_pattern_entries(conn, pattern)
 
-    def _pattern_entries(self, conn: np.ndarray, pattern: Any) -> tuple[Any, int]:
+    def _find_pattern_entries(self, conn: np.ndarray, pattern: Any) -> tuple[Any, int]:
         """Pattern entries of the items' matrices."""
         i, j, item = (a.ravel() for a in np.indices((self.slots, self.slots, self.count)))
         index = pattern.find_upper(conn[i, item], conn[j, item])
@@ -184,13 +184,13 @@ class FollowerMatrix:
     def add(self, ctx: StepContext, matrix: Any, dq_dv: wp.array, active: wp.array, out: wp.array) -> None:
         """out -= (dq/dv) times the items' matrices."""
         B, k, w, launch = self.model.worlds, self.kernels, ctx.work, ctx.launch
-        launch(k.take_local, (B, self.slots, self.count), [self.item.data.conn, w.u_stage, active, self.u])
+        launch(k.take_local, (B, self.slots, self.count), [self.load.data.conn, w.u_stage, active, self.u])
         for local in range(self.slots):
             for axis in range(3):
                 args = [local, axis, self.count, self.direction]
                 launch(k.unit_direction, (B, self.slots * self.count), args)
                 column = self.columns[3 * local + axis]
                 args = [self.data, ctx.midpoint_factor, self.u, w.time_law_stage_values, active, self.direction, column]
-                launch(self.item.product, (B, self.count), args)
-        args = [self.model.topology, matrix.pattern.data, self.places, self.columns, dq_dv, active, out]
-        launch(k.add_followers, (B, self.entries), args)
+                launch(self.load.product, (B, self.count), args)
+        args = [self.model.topology, matrix.pattern.data, self.pattern_entries, self.columns, dq_dv, active, out]
+        launch(k.add_followers, (B, self.entry_count), args)

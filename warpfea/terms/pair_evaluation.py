@@ -89,17 +89,17 @@ def evaluate_pairs(term: Any, state: State) -> PairEvaluation:
     def zeros(shape: tuple[int, ...], dtype: Any) -> wp.array:
         return wp.zeros(shape, dtype=dtype, device=m.device)
 
-    def take(name: str, dtype: Any, shape: tuple[int, ...]) -> wp.array:
+    def state_or_zeros(name: str, dtype: Any, shape: tuple[int, ...]) -> wp.array:
         return getattr(state, name) if name in state.specs else zeros((B, *shape), dtype)
 
-    history, pair_history = term.make_history(take)
-    every = wp.ones(B, dtype=wp.int32, device=m.device)
+    history, pair_history = term.make_history(state_or_zeros)
+    all_worlds = wp.ones(B, dtype=wp.int32, device=m.device)
     u = state.displacement
     if term.double_displacements:
         u = zeros(u.shape, wp.vec3d)
-        term.double_displacements.widen(launch, state.displacement, every, u)
+        term.double_displacements.widen(launch, state.displacement, all_worlds, u)
 
-    def fill(struct: Any, arrays: dict[str, tuple[tuple[int, ...], Any]]) -> Any:
+    def allocate_fields(struct: Any, arrays: dict[str, tuple[tuple[int, ...], Any]]) -> Any:
         for name, (shape, dtype) in arrays.items():
             setattr(struct, name, zeros(shape, dtype))
         return struct
@@ -109,18 +109,20 @@ def evaluate_pairs(term: Any, state: State) -> PairEvaluation:
         "CD", ((B, t.facets * masters.max_monomials), wp.vec3d)
     )
     arrays |= dict.fromkeys(("lower", "upper", "refit_lower", "refit_upper"), ((B * t.facets,), wp.vec3))
-    pair = fill(pair_scratch_struct(m.dtype)(), arrays | {"refit_needed": ((1,), wp.int32)})
+    pair = allocate_fields(pair_scratch_struct(m.dtype)(), arrays | {"refit_needed": ((1,), wp.int32)})
     pair.C0 = pair.C
     launch(
         term.search_kernels.update_coefficients,
         (B, t.facets, masters.max_monomials),
-        [masters, u, every, pair.C, pair.D],
+        [masters, u, all_worlds, pair.C, pair.D],
     )
-    launch(term.search_kernels.check_boxes, (B, t.facets), [masters, every, pair])
+    launch(term.search_kernels.check_boxes, (B, t.facets), [masters, all_worlds, pair])
     tree = wp.Bvh(pair.refit_lower, pair.refit_upper, groups=t.box_groups)
     P, L = t.points, t.master_conn.shape[1]
     arrays = dict.fromkeys(("gap", "normal"), ((B, P), wp.float64)) | dict.fromkeys(("force", "xi"), ((B, P), wp.vec3d))
-    found = fill(pair_results_struct()(), arrays | {"facet": ((B, P), wp.int32), "reaction": ((B, P, L), wp.vec3d)})
+    found = allocate_fields(
+        pair_results_struct()(), arrays | {"facet": ((B, P), wp.int32), "reaction": ((B, P, L), wp.vec3d)}
+    )
     for group in t.groups:
         args = [t.data, t.master_data(tree.id), group.data, history, pair_history, state.time, u, t.max_gap]
         args += [contact_scratch_struct(m.dtype)(), pair, found]

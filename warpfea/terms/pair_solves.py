@@ -31,7 +31,7 @@ class PairSolves(Term):
 
     Attributes:
         tables: points and facets on the device.
-        shared, kernels: kernels common with obstacle contact, and those of contact between bodies.
+        obstacle_kernels, kernels: kernels common with obstacle contact, and those of contact between bodies.
     """
 
     name = "pairs"
@@ -39,7 +39,7 @@ class PairSolves(Term):
     def __init__(self, model: Model) -> None:
         super().__init__(model)
         self.tables = PairTables(model)
-        self.shared, self.kernels = contact_kernels(model.dtype, False), pair_kernels(model.dtype)
+        self.obstacle_kernels, self.kernels = contact_kernels(model.dtype, False), pair_kernels(model.dtype)
 
     @part("pairs")
     def product(self, ctx: StepContext, p: wp.array, active: wp.array) -> None:
@@ -59,7 +59,7 @@ class PairSolves(Term):
         s, m, w, t = ctx.scratch[self.name], self.model, ctx.work, self.tables
         for group in t.groups:
             args = [group.data, active, s["attempt"], w.pool_block]
-            ctx.launch(self.shared.diagonal, (m.worlds, group.count, group.conn.shape[1]), args)
+            ctx.launch(self.obstacle_kernels.diagonal, (m.worlds, group.count, group.conn.shape[1]), args)
         args = [s["masters"], active, s["attempt"], s["pair"], w.pool_block]
         ctx.launch(self.kernels.diagonal_masters, (m.worlds, t.facets, t.master_conn.shape[1]), args)
 

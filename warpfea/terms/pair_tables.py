@@ -96,7 +96,7 @@ class PairTables(FacetTables[PairContact]):
             corners = np.concatenate([corner_points(self.host[k]) for k in group.contacts])
             self.corners.append(self.model.array("contact", corners, wp.vec3i))
         self.data = contact_struct(False)()
-        self._upload_laws(self.data, [self.numbers(c) for c in self.contacts])
+        self._upload_laws(self.data, [self.law_constants(c) for c in self.contacts])
         self.store_built_values()
         self.reach_distance = 1e-3 * max(float(mas.size.mean()) for mas in self.masters) + max(
             abs(contact.offset) for contact in self.contacts
@@ -106,7 +106,7 @@ class PairTables(FacetTables[PairContact]):
         self.master_conn = self._master_conn()
         self.size = self.model.size
 
-    def numbers(self, contact: PairContact, world: int | None = None) -> dict[str, float]:
+    def law_constants(self, contact: PairContact, world: int | None = None) -> dict[str, float]:
         region = self.region_areas[self.number[contact.index]]
         parameters = self.model.parameters
         row = contact_constants(contact, region, partial(parameters.mass, world=world), parameters.modulus(world))

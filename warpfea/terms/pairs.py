@@ -64,7 +64,7 @@ class Pairs(PairSolves):
             contact_ledger_kernels(model.dtype, False),
             facet_search_kernels(model.dtype),
         )
-        self.lists, self.pair_ledger_kernels = list_kernels(model.dtype), pair_ledger_kernels(model.dtype)
+        self.list_kernels, self.pair_ledger_kernels = list_kernels(model.dtype), pair_ledger_kernels(model.dtype)
         self.report_columns = len(RECORD) * len(self.tables.contacts)
 
     @classmethod
@@ -195,7 +195,7 @@ class Pairs(PairSolves):
 
     def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
         double_displacements = [self.double_displacements.kernels.module] if self.double_displacements else []
-        return [self.shared.module, self.search_kernels.module, self.kernels.module, *double_displacements]
+        return [self.obstacle_kernels.module, self.search_kernels.module, self.kernels.module, *double_displacements]
 
     def start(self, ctx: StepContext, active: wp.array) -> None:
         """Initial overlaps at the state.
@@ -296,16 +296,16 @@ class Pairs(PairSolves):
             ctx.launch(self.kernels.forces, dim, [*args, s["attempt"], pair])
         wp.capture_if(pair.lists_changed, self._build_point_lists, ctx=ctx)
         for group in t.groups:
-            sides, lanes = group.sides(ctx.launch, m.worlds)
+            sides, lanes = group.sum_threads(ctx.launch, m.worlds)
             args = [group.data, active, lanes, s["attempt"], w.pool_force, w.rows_of(self), s["contact_active"]]
-            ctx.launch(self.shared.gather_points, sides, args)
+            ctx.launch(self.obstacle_kernels.gather_points, sides, args)
         lanes = ctx.launch.lanes(POINT_SUM_LANES)
         args = [masters, active, lanes, s["attempt"], pair, w.pool_force]
         ctx.launch(self.kernels.gather_masters, (m.worlds, ctx.launch.padded(lanes * t.master_conn.size)), args)
 
     def _build_point_lists(self, ctx: StepContext) -> None:
         """Build the point lists of the master facets."""
-        s, m, t, k = ctx.scratch[self.name], self.model, self.tables, self.lists
+        s, m, t, k = ctx.scratch[self.name], self.model, self.tables, self.list_kernels
         pair, masters = s["pair"], s["masters"]
         ctx.launch(k.clear_lists, m.worlds * t.facets, [pair])
         ctx.launch(k.count_points, (m.worlds, t.points), [masters, pair])
@@ -317,7 +317,7 @@ class Pairs(PairSolves):
 
     @part("pairs")
     def update_frozen(self, ctx: StepContext, flags: wp.array) -> None:
-        k, m, attempt = self.shared, self.model, ctx.scratch[self.name]["attempt"]
+        k, m, attempt = self.obstacle_kernels, self.model, ctx.scratch[self.name]["attempt"]
         ctx.launch(k.aitken_partial_sums, (m.worlds, RELAX_LANES), [flags, attempt])
         ctx.launch(k.relax, m.worlds, [flags, ctx.work.newton.tol, attempt, ctx.work.newton.partly_updated])
         ctx.launch(k.update_frozen, (m.worlds, self.tables.points), [flags, attempt])
