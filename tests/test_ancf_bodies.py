@@ -102,7 +102,7 @@ def _launched(model, state, what, *fields):
     active = wp.ones(1, dtype=wp.int32, device="cpu")
     out = wp.zeros((1, terms.nonpotential_entries), dtype=vec3, device="cpu")
     extra = [wp.array(f[None], dtype=vec3, device="cpu") for f in fields]
-    for part in terms.find(FollowerLoads).items:
+    for part in terms.find(FollowerLoads).loads:
         share = [1.0] if what == "product" else []
         args = [part.data, *share, state.displacement, values, active, *extra, out]
         wp.launch(getattr(part, what), dim=(1, part.count), inputs=args, device="cpu")
