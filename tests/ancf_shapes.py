@@ -100,7 +100,10 @@ SHAPES = {
     "H3843 skew": solid("H3843", lambda X: placed(skew(X))),
     "H3843 distorted": solid("H3843", corner_moved),
 }
-INTEGRATIONS = {"beam": (*elements.get("3243").schemes, "full"), "shell": (*elements.get("3443").schemes, "full")}
+INTEGRATIONS = {
+    "beam": (*elements.get_family("3243").schemes, "full"),
+    "shell": (*elements.get_family("3443").schemes, "full"),
+}
 SPLIT = [(name, i) for name in SHAPES for i in INTEGRATIONS.get(name.split()[0], ())]
 
 

@@ -6,7 +6,7 @@ here and from 1 in the paper. Conventions:
 - Volume coordinates ``lam`` (Q, 4) = (xi, eta, zeta, chi), one per corner, of sum 1; dimensionless.
 - Volume slots: at corner i the position r, then the derivatives along the edges to corners i+1, i+2, i+3 (modulo 4),
   dr/dlam_j - dr/dlam_i for the edge i -> j, in the unit of r: edge i -> j is slot 4 i + (j - i) % 4. Then, ENMC only,
-  the positions at the centroids of faces 123, 124, 234, 134: the order of `ancf_solid.FACES`.
+  the positions at the centroids of faces 123, 124, 234, 134: the order of `ancf_solid.TET_FACES`.
 - Cartesian slots: at corner i r, r_x, r_y, r_z, then the same centroids: the library's order already.
 
 The appendix leaves out the definition of the volume gradients, the g_k of A.1, the matrix T of S* = S T and the
@@ -22,7 +22,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from warpfea.elements.ancf_solid import CORNERS, FACES
+from warpfea.elements.ancf_solid import TET_CORNERS, TET_FACES
 
 PRINTED = 2.0 / 81.0
 """Face-centroid coefficient c of A.2, A.4 and A.5; 1/18 in its place reproduces all quadratics (FN18)."""
@@ -44,7 +44,7 @@ PAIRS = ((0, 1), (1, 0), (1, 2), (2, 1), (0, 2), (2, 0), (0, 3), (3, 0), (1, 3),
 LATTICE = np.array(
     [[3 * (i == n) for n in range(4)] for i in range(4)]
     + [[2 * (i == n) + (j == n) for n in range(4)] for i, j in PAIRS]
-    + [[int(n in face) for n in range(4)] for face in FACES]
+    + [[int(n in face) for n in range(4)] for face in TET_FACES]
 )
 """(20, 4) exponents of g_k; LATTICE / 3 are the points of the control net."""
 _MULTIPLICITY = np.array([1.0] * 4 + [3.0] * 12 + [6.0] * 4)  # 3! / (exponents' factorials)
@@ -131,7 +131,7 @@ def bezier_map(c: float | None = None) -> np.ndarray:
     for k, (i, j) in enumerate(PAIRS, start=4):
         M[k, 4 * i] = 1.0
         M[k, _edge(i, j)] = 1.0 / 3.0
-    for k, face in enumerate(FACES, start=16):
+    for k, face in enumerate(TET_FACES, start=16):
         # at the centroid g is 1/27, 3/27, 6/27: p = (27 r_c - sum of corners - 3 sum of edge points) / 6
         if c is None:
             M[k, k] = 27.0 / 6.0
@@ -192,7 +192,7 @@ def _cartesian(lam: np.ndarray, corners: np.ndarray, pairs: float, side: float) 
 
 def enmc_cartesian(lam: np.ndarray, corners: np.ndarray) -> np.ndarray:
     """ENMC by A.3, Cartesian slots: (Q, 4), (4, 3) -> (Q, 20); slots of gradients in length, others dimensionless."""
-    faces = [27.0 * np.prod(lam[:, list(face)], axis=1) for face in FACES]
+    faces = [27.0 * np.prod(lam[:, list(face)], axis=1) for face in TET_FACES]
     return np.stack(_cartesian(lam, corners, -7.0, -1.0) + faces, axis=1)
 
 
@@ -212,7 +212,7 @@ def fn_from_enmc_cartesian(lam: np.ndarray, corners: np.ndarray, c: float = PRIN
     j != h; A.5 uses distinct indices only.
     """
     s = enmc_cartesian(lam, corners)
-    for f, face in enumerate(FACES, start=16):
+    for f, face in enumerate(TET_FACES, start=16):
         for i in face:
             s[:, 4 * i] += s[:, f] / 3.0
             alpha = corners[list(face)].sum(axis=0) - 3.0 * corners[i]
@@ -240,7 +240,7 @@ def transformation(corners: np.ndarray, slots: int = 20) -> np.ndarray:
 
 def library_transformation(slots: int = 20) -> np.ndarray:
     """(slots, slots) L with tet_functions = S L: parent gradients are Cartesian ones on the unit tetrahedron."""
-    return transformation(CORNERS, slots)
+    return transformation(TET_CORNERS, slots)
 
 
 # --- incomplete polynomials ---------------------------------------------------------------------------------------

@@ -73,7 +73,7 @@ def test_a_checkpoint_of_fixed_steps_is_refused(tmp_path):
 def test_instants_are_intervals_frames_moments_and_the_end():
     class Frames:
         rate = 30.0
-        moments = (0.0101,)
+        output_times = (0.0101,)
 
     sync_times = SyncTimes([], None, None)
     sync_times.add_outputs([Frames()])

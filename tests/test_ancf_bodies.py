@@ -30,7 +30,7 @@ from ancf_bodies import (
 
 import warpfea as wf
 from warpfea.model import assembly
-from warpfea.terms.follower_loads import Followers
+from warpfea.terms.follower_loads import FollowerLoads
 
 FLAT = [name for name in BODIES if name not in ("arc", "roof", "ball")]
 SIDES = ("beam", "arc", "plate", "roof", "ENMC", "ball", "H3843")
@@ -100,14 +100,14 @@ def _launched(model, state, what, *fields):
     values = np.array([law.values[-1] for law in terms.time_laws.laws])[None]
     values = wp.array(values, dtype=wp.vec3d, device="cpu")
     active = wp.ones(1, dtype=wp.int32, device="cpu")
-    out = wp.zeros((1, terms.side_entries), dtype=vec3, device="cpu")
+    out = wp.zeros((1, terms.nonpotential_entries), dtype=vec3, device="cpu")
     extra = [wp.array(f[None], dtype=vec3, device="cpu") for f in fields]
-    for part in terms.find(Followers).items:
+    for part in terms.find(FollowerLoads).loads:
         share = [1.0] if what == "product" else []
         args = [part.data, *share, state.displacement, values, active, *extra, out]
         wp.launch(getattr(part, what), dim=(1, part.count), inputs=args, device="cpu")
     force = np.zeros((model.slots, 3))
-    start, entry = terms.side_topology.contribution_start.numpy(), terms.side_topology.contribution_entry.numpy()
+    start, entry = terms.nonpotential_topology.contribution_start.numpy(), terms.nonpotential_topology.contribution_entry.numpy()
     np.add.at(force, np.repeat(np.arange(model.slots), np.diff(start)), out.numpy()[0][entry])
     return force
 

@@ -75,14 +75,14 @@ def test_paper_bases(data):
         assert np.abs(mine - expected).max() < 1e-13
     ref = data.json("S6_i_iii_shell_basis_tet_rules")["i_shell3443"]
     square = np.array([(-1.0, -1, 0), (1.0, -1, 0), (1.0, 1, 0), (-1.0, 1, 0)])
-    s, _ = ancf.nodal_functions(ancf_shell.POWERS, ancf.nodal_basis(ancf_shell.POWERS, square), xi)
+    s, _ = ancf.nodal_functions(ancf_shell.SHELL_EXPONENTS, ancf.nodal_basis(ancf_shell.SHELL_EXPONENTS, square), xi)
     u, w, v = xi.T
     expected = [eval(f, {"u": u, "v": v, "w": w}) for f in ref["nodes_u-w_plane"]["shape_functions"]]  # r, u, v, w
     order = (np.arange(16).reshape(4, 4)[:, [0, 1, 3, 2]]).ravel()
     assert np.abs(s - np.array(expected).T[:, order]).max() < 1e-13
     for plane in ([0, 2, 1], [2, 1, 0]):  # u-v, v-w
         with pytest.raises(wf.ModelError, match=r"rank 10 at these 4 nodes; .* u-w plane"):
-            ancf.nodal_basis(ancf_shell.POWERS, square[:, plane])
+            ancf.nodal_basis(ancf_shell.SHELL_EXPONENTS, square[:, plane])
 
 
 def polynomials(degree, dimension=3):
@@ -135,7 +135,7 @@ def test_reference_geometry_is_the_mesh(name):
     s, _, _ = tables(body, xi)
     X = np.einsum("eqs,esk->eqk", s, body.reference[body.connectivity]) + body.origin
     if "curved" in name:
-        T10 = elements.get("T10")
+        T10 = elements.get_family("T10")
         mesh = ball()
         expected = np.einsum("qs,esk->eqk", T10.shape(xi, mesh.points[:1])[0][0], mesh.points[mesh.cells])
     elif "beam" in name:

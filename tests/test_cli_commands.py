@@ -13,7 +13,7 @@ import pytest
 from cli_runs import SHORT, SVK, run, working_folder
 
 import warpfea as wf
-from warpfea.base.console import compile_bar
+from warpfea.base.console import compile_progress_bar
 from warpfea.builder.scene import find
 
 
@@ -192,13 +192,13 @@ def test_the_bar_of_the_compilation_goes_to_stderr(capfd):
     assert done == tuple(range(1, total[0] + 1))
     assert "warpfea.kernels.reduce" in names
     capfd.readouterr()
-    with compile_bar(True) as update:
+    with compile_progress_bar(True) as update:
         for news in ready:
             update(*news)
     out, err = capfd.readouterr()
     assert out == ""
     assert "compiling kernels" in err
-    with compile_bar(None) as update:  # not a terminal
+    with compile_progress_bar(None) as update:  # not a terminal
         update(*ready[0])
     assert capfd.readouterr() == ("", "")
 

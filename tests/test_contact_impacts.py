@@ -9,15 +9,15 @@ import pytest
 from contact_cubes import G, cube, everywhere, middle, record, tilted
 
 import warpfea as wf
-from warpfea.terms.contact_tables import law_numbers
-from warpfea.terms.facet_tables import beta_of
+from warpfea.terms.contact_tables import contact_law_constants
+from warpfea.terms.facet_tables import restitution_beta
 
 WANTED = np.array([0.1, 0.3, 0.5, 0.7, 0.9])
 
 
 def impact_step(contact, model, v0):
     """Half a period of the contact, s, with a mass of 1 kg."""
-    k = contact.stiffness * law_numbers(contact)["normal"]
+    k = contact.stiffness * contact_law_constants(contact)["normal"]
     return math.pi / math.sqrt(k) if model == "patch" else 2.943 * (1.25 * v0**2 / k) ** 0.4 / v0
 
 
@@ -98,7 +98,7 @@ def impacts(count, steps, law, per_contact, e=0.5, smoothing=None):
     solver = wf.NewtonPCG(tol=1e-10, max_halvings=0)
     sim = wf.Simulation(model, state, dt=h, solver=solver, on_failure="freeze", record=False)
     sim.step(steps)
-    gamma = math.sqrt(contact.stiffness) * law_numbers(contact)["normal_damping"] * beta_of(e)
+    gamma = math.sqrt(contact.stiffness) * contact_law_constants(contact)["normal_damping"] * restitution_beta(e)
     inside = h * speed + G * h * h - gap
     return sim, (inside > 0.0) & (inside < gamma * h * gap)
 

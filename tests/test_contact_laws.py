@@ -8,7 +8,7 @@ import pytest
 import warp as wp
 from warpfea.kernels.terms.contact_laws import DEFAULT, PAPER, SMOOTH, law_functions
 
-from warpfea.terms.facet_tables import beta_of, hunt_crossley_damping
+from warpfea.terms.facet_tables import hunt_crossley_damping, restitution_beta
 
 COUNT = 4000
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
@@ -183,7 +183,7 @@ def impact(lumped, law, e, per_contact):
     if law == DEFAULT:
         return h, hunt_crossley_damping(e) / h
     # Eq. (76), S_n = 2 E a = 1.5 k_n
-    return h, 2.0 * math.sqrt(5.0 / 6.0) * beta_of(e) * math.sqrt(1.5) / h
+    return h, 2.0 * math.sqrt(5.0 / 6.0) * restitution_beta(e) * math.sqrt(1.5) / h
 
 
 def run_explicit(lumped, e, per_contact):

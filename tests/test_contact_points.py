@@ -229,7 +229,7 @@ def test_faces_of_both_kinds():
     corner = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (0, 1, 1)], dtype=float)
     sides = [(0, 2, 1), (3, 4, 5), (0, 1, 4, 3), (1, 2, 5, 4), (2, 0, 3, 5)]
     family = replace(
-        families.get("T4"),
+        families.get_family("T4"),
         name="prism",
         node_slots=((0,),) * 6,
         shape=shape,

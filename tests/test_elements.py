@@ -63,7 +63,7 @@ def test_rule_is_exact_up_to_its_degree_and_no_further(name):
 
 def test_default_rules_have_positive_weights():
     for name in ("T4", "T10"):
-        family = elements.get(name)
+        family = elements.get_family(name)
         for rule in (
             family.rule(None),
             family.curved_rule,
@@ -72,9 +72,9 @@ def test_default_rules_have_positive_weights():
             quadrature.triangle_6(),
         ):
             assert rule.weights.min() > 0, (name, rule.name)
-    assert [elements.get(name).rule(None).name for name in ("T10", "T4")] == ["tet4", "tet1"]
+    assert [elements.get_family(name).rule(None).name for name in ("T10", "T4")] == ["tet4", "tet1"]
     assert elements.TET_RULES["tet5_paper"].weights.min() == pytest.approx(-0.8 / 6, rel=1e-15)
-    assert list(elements.get("T10").rules) == ["tet4", "tet5_paper", "tet8", "tet14"]
+    assert list(elements.get_family("T10").rules) == ["tet4", "tet5_paper", "tet8", "tet14"]
 
 
 # shape functions
@@ -82,7 +82,7 @@ def test_default_rules_have_positive_weights():
 
 @pytest.mark.parametrize("name", ["T4", "T10"])
 def test_shape_functions(name):
-    family = elements.get(name)
+    family = elements.get_family(name)
     xi = np.random.default_rng(0).uniform(-0.2, 0.8, (50, 3))
     nodes = np.zeros((1, len(family.node_points), 3))
     s, ds = (a[0] for a in family.shape(xi, nodes))
@@ -98,7 +98,7 @@ def test_shape_functions(name):
 
 def test_t10_follows_meshio_node_order():
     """Mid-edge nodes 12, 23, 31, 14, 24, 34 of corners 1-4."""
-    nodes = elements.get("T10").node_points
+    nodes = elements.get_family("T10").node_points
     pairs = [(0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3)]
     np.testing.assert_array_equal(nodes[4:], [(nodes[a] + nodes[b]) / 2 for a, b in pairs])
     np.testing.assert_array_equal(nodes[:4], [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
@@ -128,7 +128,7 @@ def lagrange(xi, nodes):
 def independent_mass(mesh, density):
     """Dense scalar mass matrix (nodes, nodes) and volume."""
     xi, w = gauss_tetrahedron()
-    s, ds = lagrange(xi, elements.get("T4" if mesh.cells.shape[1] == 4 else "T10").node_points)
+    s, ds = lagrange(xi, elements.get_family("T4" if mesh.cells.shape[1] == 4 else "T10").node_points)
     M, volume = np.zeros((len(mesh.points),) * 2), 0.0
     for cell in mesh.cells:
         x = mesh.points[cell]
@@ -174,7 +174,7 @@ def test_t10_mass_of_one_tetrahedron(data, device):
     assert data.error(scalar, ref["exact_times_1_over_volume"]) < 1e-14
     assert data.error(np.linalg.eigvalsh(scalar), ref["eig_exact"]) < 1e-14
     rule = elements.TET_RULES["tet5_paper"]  # why it may not integrate the mass
-    s = elements.get("T10").shape(rule.points, np.zeros((1, 10, 3)))[0][0]
+    s = elements.get_family("T10").shape(rule.points, np.zeros((1, 10, 3)))[0][0]
     five = np.einsum("q,qi,qj->ij", 6 * rule.weights, s, s)
     assert data.error(np.linalg.eigvalsh(five), ref["eig_5pt"]) < 1e-14
     assert np.linalg.eigvalsh(five).min() < -0.006

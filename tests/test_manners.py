@@ -15,7 +15,7 @@ import pytest
 import warp as wp
 
 import warpfea as wf
-from warpfea.base.console import compile_bar, quiet_warp
+from warpfea.base.console import compile_progress_bar, quiet_warp
 from warpfea.base.names import did_you_mean
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
@@ -110,7 +110,7 @@ def test_the_bar_of_the_compilation_is_shown_on_a_terminal_only(capfd, monkeypat
     assert "compiling kernels" in err
     wf.Simulation(model, dt=1e-3, on_compile=lambda *_: None)  # who draws a bar of their own gets one only
     assert capfd.readouterr() == ("", "")
-    with compile_bar(False) as update:
+    with compile_progress_bar(False) as update:
         update(1, 2, "warpfea.kernels.x")
     assert capfd.readouterr() == ("", "")
 

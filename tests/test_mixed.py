@@ -35,7 +35,7 @@ def placed(sim: wf.Simulation, mixed: int, amount: float = 0.02) -> np.ndarray:
     free = sim.model.free_host
     before = amount * rng.standard_normal(shape) * free
     now = before + amount * rng.standard_normal(shape) * free
-    w.base.assign(before.astype(kind))
+    w.base_velocity.assign(before.astype(kind))
     w.v.assign(now.astype(kind))
     w.u.assign(now.astype(kind))
     w.step.dq_dv.fill_(1.0)
@@ -76,10 +76,10 @@ def test_stress_is_that_of_the_linear_prediction(kind: str) -> None:
     sim = static(kind, "matrix")
     p = placed(sim, 1, amount=1e-3)
     w = sim.stepper.work
-    now, before = w.v.numpy(), w.base.numpy()
+    now, before = w.v.numpy(), w.base_velocity.numpy()
     difference = []
     for part in (1.0, 0.5):
-        w.base.assign(now - part * (now - before))
+        w.base_velocity.assign(now - part * (now - before))
         w.newton.predicted_stress.fill_(1)
         mixed = product(sim, p)
         w.newton.predicted_stress.zero_()
@@ -98,7 +98,7 @@ def test_positive_matrix_has_no_negative_curvature(kind: str) -> None:
         squeezed[..., 1::4, 0] = -0.2  # the axial gradients
     squeezed[..., 0] -= 0.2 * _places(sim)
     squeezed *= sim.model.free_host
-    for array in (w.u, w.v, w.base):
+    for array in (w.u, w.v, w.base_velocity):
         array.assign(squeezed.astype(array.numpy().dtype))
     lowest = {}
     for mixed in (2, 0):

@@ -31,7 +31,7 @@ def hermite_basis(xi):
 
 def hermite_shape(xi, nodes, frames=None):
     """Functions of the nodal values and gradients d/dX in the global frame, one row per element."""
-    corners = elements.get("T4").node_points
+    corners = elements.get_family("T4").node_points
     at_nodes, slopes_at_nodes = hermite_basis(corners)
     values, slopes = hermite_basis(xi)
     s, ds = np.empty((len(nodes), len(xi), 16)), np.empty((len(nodes), len(xi), 16, 3))
@@ -47,7 +47,7 @@ def hermite_shape(xi, nodes, frames=None):
     return s, ds
 
 
-SHARED_WITH_T4 = ("parent", "faces", "face_rule", "divisions", "node_samples", "vtk_subdivision")
+SHARED_WITH_T4 = ("parent", "faces", "face_rule", "face_divisions", "node_samples", "vtk_subdivision")
 
 
 @pytest.fixture(scope="module")
@@ -62,9 +62,9 @@ def hermite():
             curved_rule=elements.TET_RULES["tet14"],
             mass_rule=quadrature.conical_tet(4),
             curved_mass_rule=quadrature.conical_tet(4),
-            vertices=elements.get("T4").vertices,
+            vertices=elements.get_family("T4").vertices,
             affine=False,
-            **{key: getattr(elements.get("T4"), key) for key in SHARED_WITH_T4},
+            **{key: getattr(elements.get_family("T4"), key) for key in SHARED_WITH_T4},
         )
     )
     yield family.name

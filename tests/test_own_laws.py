@@ -19,7 +19,7 @@ from warpfea.elements.quadrature import box_rule
 
 
 def _trilinear(xi, nodes):
-    corner = elements.get("H3843").node_samples[:, 0]
+    corner = elements.get_family("H3843").node_samples[:, 0]
     factor = np.where(corner > 0.5, xi[:, None, :], 1.0 - xi[:, None, :])
     slope = np.where(corner > 0.5, 1.0, -1.0)
     s = factor.prod(axis=2)
@@ -30,7 +30,7 @@ def _trilinear(xi, nodes):
 @functools.cache
 def brick():
     """H8 is H3843 without gradients: other slots, functions and rules."""
-    unit, old = ((0.0, 1.0),) * 3, elements.get("H3843")
+    unit, old = ((0.0, 1.0),) * 3, elements.get_family("H3843")
     rule = box_rule((2, 2, 2), unit)
     return elements.register(
         replace(

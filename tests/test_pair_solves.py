@@ -101,7 +101,7 @@ def system(loop):
     shape = (3 * model.slots,) * 2
     own = sp.bsr_matrix((pre.block_values.numpy()[0], graph.indices, graph.indptr), shape=shape).toarray()
     term = model.terms.find(Pairs)
-    touching, attempt = at.scratch["pairs"]["touching"], at.scratch["pairs"]["attempt"]
+    touching, attempt = at.scratch["pairs"]["pair"], at.scratch["pairs"]["attempt"]
     stiffness, listed, weight = (
         x.numpy()[0] for x in (attempt.stiffness, touching.listed_facet, touching.shape_values)
     )

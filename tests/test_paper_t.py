@@ -9,10 +9,10 @@ import numpy as np
 import paper_t as T
 import pytest
 
-from warpfea.elements.ancf_solid import CORNERS, FACES, tet_functions
+from warpfea.elements.ancf_solid import TET_CORNERS, TET_FACES, tet_functions
 
 FACTORS = (2.0 / 81.0, 1.0 / 18.0)  # FN as printed, FN18
-CENTROIDS = np.array([[n in face for n in range(4)] for face in FACES]) / 3.0  # volume coordinates
+CENTROIDS = np.array([[n in face for n in range(4)] for face in TET_FACES]) / 3.0  # volume coordinates
 LAMBDA = np.random.default_rng(1).dirichlet(np.ones(4), 40)
 TOLERANCE = 1e-13
 
@@ -22,7 +22,7 @@ def _tets():
     rng = np.random.default_rng(2)
     out = []
     for k in range(4):
-        corners = CORNERS @ (np.eye(3) + 0.4 * rng.uniform(-1, 1, (3, 3))) + rng.uniform(-1, 1, 3)
+        corners = TET_CORNERS @ (np.eye(3) + 0.4 * rng.uniform(-1, 1, (3, 3))) + rng.uniform(-1, 1, 3)
         out += [corners, corners[np.roll([0, 2, 1, 3], k)]]
     return out
 
@@ -144,7 +144,7 @@ def test_volume_functions_interpolate(c, data):
     nodal = volume_slots(functools.partial(T.fn_volume, c=c))
     assert data.error(nodal[:16], np.eye(16)) < TOLERANCE
     # the constraint that FN's centroids obey, in numbers: face 1, 2, 3 leaves out corner 4, and so on
-    for row, face in zip(nodal[16:], FACES):
+    for row, face in zip(nodal[16:], TET_FACES):
         expected = np.zeros(16)
         for i, j in itertools.permutations(face, 2):
             expected[4 * i] = 1.0 / 3.0
@@ -246,8 +246,8 @@ def test_reproduction_of_polynomials(corners, c, degree):
 def test_quadratics_that_fn_misses(ref, data):
     """FN applied to monomials on the unit tetrahedron, against the symbolic result."""
     x, y, z = LAMBDA[:, 1:].T
-    s = T.fn_cartesian(LAMBDA, CORNERS)
-    slots = cartesian_slots(T.power_basis, CORNERS)[:16]
+    s = T.fn_cartesian(LAMBDA, TET_CORNERS)
+    slots = cartesian_slots(T.power_basis, TET_CORNERS)[:16]
     names = ("1", "x", "y", "z", "x**2", "y**2", "z**2", "x*y", "y*z", "x*z")  # A.15's order
     listed = ref["FN_interp_minus_exact_on_reference_tet"]
     assert set(listed) == set(names)
@@ -270,7 +270,7 @@ def test_continuity_across_a_face(c, data):
         e = np.concatenate([nodal[n] for n in nodes])
         if c is None:
             # the centroid's value goes to the face that leaves corner 0 or the apex out
-            shared = [{nodes[n] for n in face} == {1, 2, 3} for face in FACES]
+            shared = [{nodes[n] for n in face} == {1, 2, 3} for face in TET_FACES]
             e = np.concatenate([e, np.where(shared, centroid, rng.uniform(-1, 1, 4))])
         return cartesian(c, corners)(points) @ e
 

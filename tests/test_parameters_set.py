@@ -191,7 +191,7 @@ def test_gravity_by_name_and_mask():
     m = model(solid(), material(), worlds=2)
     m.set_parameter("gravity", wp.array([(0.0, 0.0, -1.0), (0.0, 2.0, 0.0)], dtype=wp.vec3d, device="cpu"))
     m.set_gravity((1.0, 0.0, 0.0), mask=[False, True])
-    assert np.array_equal(m.terms.dead.gravity.numpy(), [(0.0, 0.0, -1.0), (1.0, 0.0, 0.0)])
+    assert np.array_equal(m.terms.dead_loads.gravity.numpy(), [(0.0, 0.0, -1.0), (1.0, 0.0, 0.0)])
 
 
 def test_what_is_made_of_a_density_is_refused():

@@ -11,13 +11,13 @@ import warp as wp
 from warpfea.kernels.common.state import state_kernels
 
 import warpfea as wf
-from warpfea.base.launch import PARTS, Launcher, labelled
+from warpfea.base.launch import LAUNCH_PARTS, Launcher, launch_part
 from warpfea.builder.scene import find
 from warpfea.cli import main
 from warpfea.cli.profile import JSON_KEYS
 from warpfea.studies.profile import profiling
 from warpfea.studies.profile.profiling import LaunchRecorder, launch_bytes, profile
-from warpfea.terms.term_set import all_parts
+from warpfea.terms.term_set import profile_parts
 
 WORDS = ["profile", "cantilever", "--set", "cells=2", "--device", "cpu", "--steps", "2"]
 
@@ -64,9 +64,9 @@ def launches_of(name, device, steps, after, **values):
 def check(found, steps):
     """Properties of any profile."""
     assert len(found.step_ms) == steps
-    own = [name for name in PARTS if name in found.parts]
+    own = [name for name in LAUNCH_PARTS if name in found.parts]
     assert list(found.parts)[: len(own)] == own
-    assert set(found.parts) <= set(all_parts())
+    assert set(found.parts) <= set(profile_parts())
     assert {"residual", "product", "preconditioner", "build", "vectors", "control", "commit"} <= set(found.parts)
     for key in ("ms", "launches", "bytes"):
         assert sum(getattr(p, key) for p in found.parts.values()) == pytest.approx(
@@ -169,7 +169,7 @@ def test_the_innermost_label_counts_and_ends_with_its_block(device):
         def __init__(self):
             self.launch = launch
 
-        @labelled("loads")
+        @launch_part("loads")
         def do(self, *, fail=False):
             """A step of its own."""
             launch(state_kernels().copy_rows, (1, 1), [flags, rows, rows])

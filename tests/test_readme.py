@@ -238,13 +238,13 @@ def test_launches_come_in_the_order_of_the_table(name, monkeypatch):
     from warpfea.builder.scene import find
 
     seen = []
-    count = Launcher._count
+    count = Launcher._count_launch
 
     def watch(self, kernel):
         seen.append((pathlib.Path(kernel.func.__code__.co_filename).stem, kernel.func.__name__))
         count(self, kernel)
 
-    monkeypatch.setattr(Launcher, "_count", watch)
+    monkeypatch.setattr(Launcher, "_count_launch", watch)
     scene = find(name)
     model = scene.build(scene.resolve({})).finalize(device="cpu")
     sim = wf.Simulation(model, dt=scene.dt, integrator=scene.integrator, capture=False)

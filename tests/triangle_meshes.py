@@ -10,7 +10,7 @@ from warpfea.kernels.terms.contact_structs import contact_struct
 
 import warpfea as wf
 from warpfea.base.launch import Launcher
-from warpfea.terms.collider_meshes import mesh_tables
+from warpfea.terms.collider_meshes import upload_collider_meshes
 
 SIDE, DT = 0.1, 1e-3
 
@@ -91,7 +91,7 @@ def search(mesh, ends, starts=None, sides=None, others=(), device="cpu"):
     probe, Contacts = probing()
     shapes = [*others, mesh, *others]
     con, k = Contacts(), len(others)
-    con.mesh = mesh_tables(Model(device), shapes)
+    con.mesh = upload_collider_meshes(Model(device), shapes)
     con.collider_kind = wp.array([s.kind for s in shapes], dtype=wp.int32, device=device)
     con.collider_size = wp.array([s.sizes for s in shapes], dtype=wp.vec3d, device=device)
     center = mesh.frame()[0]

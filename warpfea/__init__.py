@@ -5,9 +5,9 @@ b = wf.ModelBuilder(); body = b.add_solid(...); model = b.finalize(); sim = wf.S
 
 import importlib as _importlib
 
-from .base.checkout import map_checkout as _map_checkout
+from .base.checkout import bind_checkout_packages as _bind_checkout_packages
 
-_map_checkout(__name__)
+_bind_checkout_packages(__name__)
 
 from . import mesh  # noqa: E402
 from .base.errors import (  # noqa: E402

@@ -18,13 +18,13 @@ from .base.short_repr import use_short_repr
 
 __all__ = ["SVK", "KelvinVoigt", "Material", "MooneyRivlin", "NeoHookean"]
 
-FORMS = ("incremental", "rate", "explicit")
+DAMPING_FORMS = ("incremental", "rate", "explicit")
 """Evaluation of the damping force within a step."""
 
 Density = float | np.ndarray | Callable[[np.ndarray], np.ndarray] | None
 
 
-LIMITS: dict[str, tuple[Callable[[Any], Any], str]] = {
+ADMISSIBLE_VALUES: dict[str, tuple[Callable[[Any], Any], str]] = {
     "nu": (lambda v: (v > -1.0) & (v < 0.5), "between -1 and 0.5, both excluded"),
     **dict.fromkeys(("E", "mu", "mu10", "k"), (lambda v: v > 0.0, "positive, Pa")),
     "mu01": (lambda v: v >= 0.0, "0 or above, Pa"),
@@ -33,7 +33,7 @@ LIMITS: dict[str, tuple[Callable[[Any], Any], str]] = {
     "density_factor": (lambda v: v > 0.0, "positive"),
 }
 """Admissible finite values of a constant, and the text for others."""
-DENSITIES = ("density", "density_factor")
+DENSITY_CONSTANTS = ("density", "density_factor")
 """Constants of the mass: the density if it is one number, else a factor on the given one."""
 
 
@@ -96,8 +96,8 @@ class KelvinVoigt:
 
     def __post_init__(self) -> None:
         _non_negative("KelvinVoigt", eta=self.eta, lambda_v=self.lambda_v)
-        if self.form not in FORMS:
-            hint = did_you_mean(self.form, FORMS)
+        if self.form not in DAMPING_FORMS:
+            hint = did_you_mean(self.form, DAMPING_FORMS)
             raise ModelError(f"KelvinVoigt: form = {self.form!r} is none of 'incremental', 'rate', 'explicit'{hint}")
 
 
@@ -105,13 +105,13 @@ class KelvinVoigt:
 class Material:
     """Base of the laws: density (optional in statics without gravity) and optional damping.
 
-    `own` names the constants that may differ between worlds: `coefficients` follows from them by operations valid
-    for arrays.
+    `constant_names`: constants that may differ between worlds; `coefficients` follows from them by operations valid for
+    arrays. `_given_constants`: E and nu of a law made by `from_E_nu`, with its other arguments in `_options`.
     """
 
     law: ClassVar[str]
-    own: ClassVar[tuple[str, ...]] = ()
-    _made_of: ClassVar[dict[str, Any]] = {}
+    constant_names: ClassVar[tuple[str, ...]] = ()
+    _given_constants: ClassVar[dict[str, Any]] = {}
     _options: ClassVar[dict[str, Any]] = {}
     density: Any = field(default=None, kw_only=True)
     damping: KelvinVoigt | None = field(default=None, kw_only=True)
@@ -143,7 +143,7 @@ class Material:
         """Constants of the law and of the damping by name; a law made by `from_E_nu` has E and nu in place of its
         own.
         """
-        out = self._made_of or {name: getattr(self, name) for name in self.own}
+        out = self._given_constants or {name: getattr(self, name) for name in self.constant_names}
         out = out | ({"eta": self.damping.eta, "lambda_v": self.damping.lambda_v} if self.damping else {})
         if self.density is None:
             return out
@@ -160,22 +160,24 @@ class Material:
             damping = copy.copy(self.damping)
             vars(damping).update(rates)
             vars(out)["damping"] = damping
-        mine = {name: value for name, value in values.items() if name not in {*rates, *DENSITIES}}
-        if self._made_of:
-            vars(out)["_made_of"] = self._made_of | mine
-            mine = self._from_E_nu(**out._made_of, **self._options)
+        mine = {name: value for name, value in values.items() if name not in {*rates, *DENSITY_CONSTANTS}}
+        if self._given_constants:
+            vars(out)["_given_constants"] = self._given_constants | mine
+            mine = self._constants_from_E_nu(**out._given_constants, **self._options)
         vars(out).update(mine)
         return out
 
     @classmethod
-    def _made(cls, E: float, nu: float, *, density: Any, damping: KelvinVoigt | None, **options: float) -> Self:
+    def _create_from_E_nu(
+        cls, E: float, nu: float, *, density: Any, damping: KelvinVoigt | None, **options: float
+    ) -> Self:
         """Material from E and nu at rest, which it stores."""
-        out = cls(**cls._from_E_nu(E, nu, **options), density=density, damping=damping)
-        vars(out).update(_made_of={"E": E, "nu": nu}, _options=options)
+        out = cls(**cls._constants_from_E_nu(E, nu, **options), density=density, damping=damping)
+        vars(out).update(_given_constants={"E": E, "nu": nu}, _options=options)
         return out
 
     @staticmethod
-    def _from_E_nu(E: Any, nu: Any, **options: float) -> dict[str, Any]:
+    def _constants_from_E_nu(E: Any, nu: Any, **options: float) -> dict[str, Any]:
         """A law's own constants."""
         raise NotImplementedError
 
@@ -211,7 +213,7 @@ class SVK(Material):
     E: float
     nu: float
     law: ClassVar[str] = "svk"
-    own: ClassVar[tuple[str, ...]] = ("E", "nu")
+    constant_names: ClassVar[tuple[str, ...]] = ("E", "nu")
 
     def __post_init__(self) -> None:
         _positive("SVK", E=self.E)
@@ -226,7 +228,7 @@ class SVK(Material):
 
     @property
     def lame(self) -> tuple[float, float]:
-        return lame(self.E, self.nu)
+        return lame_constants(self.E, self.nu)
 
     def coefficients(self) -> tuple[float, float, float]:
         lam, mu = self.lame
@@ -252,7 +254,7 @@ class MooneyRivlin(Material):
     mu01: float
     k: float
     law: ClassVar[str] = "mooney_rivlin"
-    own: ClassVar[tuple[str, ...]] = ("mu10", "mu01", "k")
+    constant_names: ClassVar[tuple[str, ...]] = ("mu10", "mu01", "k")
 
     def __post_init__(self) -> None:
         _positive("MooneyRivlin", k=self.k, mu10=self.mu10)
@@ -269,10 +271,10 @@ class MooneyRivlin(Material):
         _check_nu("MooneyRivlin", nu)
         if not 0.0 <= ratio < 1.0:
             raise ModelError(f"MooneyRivlin: ratio = {ratio!r} must lie in [0, 1)")
-        return cls._made(E, nu, ratio=ratio, density=density, damping=damping)
+        return cls._create_from_E_nu(E, nu, ratio=ratio, density=density, damping=damping)
 
     @staticmethod
-    def _from_E_nu(E: Any, nu: Any, **options: float) -> dict[str, Any]:
+    def _constants_from_E_nu(E: Any, nu: Any, **options: float) -> dict[str, Any]:
         ratio, half = options["ratio"], E / (4.0 * (1.0 + nu))
         return {"mu10": half * (1 - ratio), "mu01": half * ratio, "k": E / (3.0 * (1.0 - 2.0 * nu))}
 
@@ -301,7 +303,7 @@ class NeoHookean(Material):
     mu: float
     k: float
     law: ClassVar[str] = "neo_hookean"
-    own: ClassVar[tuple[str, ...]] = ("mu", "k")
+    constant_names: ClassVar[tuple[str, ...]] = ("mu", "k")
 
     def __post_init__(self) -> None:
         _positive("NeoHookean", mu=self.mu, k=self.k)
@@ -313,10 +315,10 @@ class NeoHookean(Material):
         """From Young's modulus and Poisson's ratio at rest."""
         _positive("NeoHookean", E=E)
         _check_nu("NeoHookean", nu)
-        return cls._made(E, nu, density=density, damping=damping)
+        return cls._create_from_E_nu(E, nu, density=density, damping=damping)
 
     @staticmethod
-    def _from_E_nu(E: Any, nu: Any, **options: float) -> dict[str, Any]:
+    def _constants_from_E_nu(E: Any, nu: Any, **options: float) -> dict[str, Any]:
         return {"mu": E / (2.0 * (1.0 + nu)), "k": E / (3.0 * (1.0 - 2.0 * nu))}
 
     @property
@@ -327,6 +329,6 @@ class NeoHookean(Material):
         return 0.5 * self.mu, self.k, 0.0
 
 
-def lame(E: float, nu: float) -> tuple[float, float]:
+def lame_constants(E: float, nu: float) -> tuple[float, float]:
     """Lame constants (lambda, mu), Pa."""
     return E * nu / ((1.0 + nu) * (1.0 - 2.0 * nu)), E / (2.0 * (1.0 + nu))

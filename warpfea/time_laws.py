@@ -13,19 +13,21 @@ from .base.errors import ModelError
 
 __all__ = ["Control", "TimeLaw", "time_law"]
 
-SIZES = {1: "a scalar", 3: "a vector"}
+SIZE_NAMES = {1: "a scalar", 3: "a vector"}
+"""Sizes of a control, as text."""
 
 
 @dataclass(frozen=True)
 class Control:
     """A time law whose values the caller writes between steps, in each world its own: `sim.controls[name]`.
 
-    Zero-order hold during a step; drives reach the value at its end. In statics it grows with the load like a
-    constant. The same control may drive several things.
+    Zero-order hold during a step; prescribed displacements and joint drives reach the value at the end of the step. In
+    statics it is scaled by the load factor, as a constant load is; right-hand sides of joints are not. The same control
+    may drive several things.
 
     Args:
         name: key in `sim.controls`; unique in a model.
-        size: 1 for a scalar (pressure, angle, travel), 3 for a vector.
+        size: 1 for a scalar (pressure, angle, displacement along an axis), 3 for a vector.
         initial: number, or (size,): the value at the start and after `sim.reset`, in the unit of what it drives.
 
     Raises:
@@ -39,7 +41,7 @@ class Control:
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
             raise ModelError(f"a control needs a name, got {self.name!r}")
-        if isinstance(self.size, bool) or not isinstance(self.size, (int, np.integer)) or self.size not in SIZES:
+        if isinstance(self.size, bool) or not isinstance(self.size, (int, np.integer)) or self.size not in SIZE_NAMES:
             raise ModelError(f"control {self.name!r}: size = {self.size!r} must be 1 (number) or 3 (vector)")
         try:
             value = np.asarray(self.initial, dtype=float)
@@ -62,7 +64,7 @@ class TimeLaw:
         function: wp.func of t (s), or None.
         scalar: True for a scalar value.
         control: source of the values, or None.
-        ramped: a control grows with the load of statics.
+        ramped: True: in statics the value of a control is multiplied by the load factor.
         name: of the driven quantity, for messages.
     """
 
@@ -75,7 +77,8 @@ class TimeLaw:
     name: str = ""
 
 
-def _widen(values: np.ndarray, scalar: bool) -> np.ndarray:
+def _as_vectors(values: np.ndarray, scalar: bool) -> np.ndarray:
+    """(n, 3) values; those (n,) of a scalar law in the first column."""
     if not scalar:
         return values
     out = np.zeros((len(values), 3))
@@ -83,7 +86,7 @@ def _widen(values: np.ndarray, scalar: bool) -> np.ndarray:
     return out
 
 
-def _is_row(value: Any) -> bool:
+def _is_flat_list(value: Any) -> bool:
     """True for a flat list of entries, False for a ragged one."""
     try:
         return np.ndim(value) == 1
@@ -91,7 +94,7 @@ def _is_row(value: Any) -> bool:
         return False
 
 
-def _samples(value: Any, what: str, width: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+def _parse_samples(value: Any, what: str, width: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Times (n,) and values (n, *width) of a pair (times, values)."""
     try:
         times, values = np.asarray(value[0], dtype=float), np.asarray(value[1], dtype=float)
@@ -109,7 +112,7 @@ def _samples(value: Any, what: str, width: tuple[int, ...]) -> tuple[np.ndarray,
     return times, values
 
 
-def _constant(value: Any, what: str, width: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+def _parse_constant(value: Any, what: str, width: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Time 0 (1,) and the value (1, *width)."""
     try:
         values = np.asarray(value, dtype=float)[None]
@@ -139,7 +142,7 @@ def time_law(value: Any, what: str, *, scalar: bool = False) -> TimeLaw:
     """
     if isinstance(value, Control):
         if value.size != (1 if scalar else 3):
-            needed = SIZES[1 if scalar else 3]
+            needed = SIZE_NAMES[1 if scalar else 3]
             raise ModelError(f"{what}: control {value.name!r} has size {value.size}, but {needed} is to be driven")
         return TimeLaw(np.zeros(0), np.zeros((0, 3)), scalar=scalar, control=value, name=what)
     if isinstance(value, wp.Function):
@@ -150,8 +153,9 @@ def time_law(value: Any, what: str, *, scalar: bool = False) -> TimeLaw:
             f"{what}: {name} is a Python function; Python functions do not run on the device: sample it, "
             "(times, [f(t) for t in times]) with times = np.linspace(0, t_end, 201), or define it with @wp.func"
         )
-    read = _samples if isinstance(value, (tuple, list)) and len(value) == 2 and _is_row(value[0]) else _constant
-    times, values = read(value, what, () if scalar else (3,))
+    sampled = isinstance(value, (tuple, list)) and len(value) == 2 and _is_flat_list(value[0])
+    parse = _parse_samples if sampled else _parse_constant
+    times, values = parse(value, what, () if scalar else (3,))
     if not (np.all(np.isfinite(times)) and np.all(np.isfinite(values))):
         raise ModelError(f"{what}: {value!r} holds a value that is not finite")
-    return TimeLaw(times, _widen(values, scalar), None, scalar, name=what)
+    return TimeLaw(times, _as_vectors(values, scalar), None, scalar, name=what)

@@ -19,7 +19,7 @@ from warpfea.base.console import quiet_warp, to_json, write_json
 from warpfea.base.devices import find_device
 from warpfea.base.errors import UsageError
 from warpfea.base.names import did_you_mean
-from warpfea.base.provenance import origin
+from warpfea.base.provenance import provenance_of
 from warpfea.base.writer import check_target
 
 from .table import Part, Row, Run, Table
@@ -183,7 +183,7 @@ def _origin(words: Sequence[str], given: Run, table: Table) -> dict[str, Any]:
     """Command, commit, machine, versions and settings."""
     command = shlex.join(["python", "-m", "tests.validation", *words])
     settings = {**table.settings, **given.options} | ({"quick": True} if given.quick else {})
-    return origin([], given.device) | {"command": command} | ({"settings": settings} if settings else {})
+    return provenance_of([], given.device) | {"command": command} | ({"settings": settings} if settings else {})
 
 
 def _doc(part: Part) -> str | None:

@@ -4,10 +4,10 @@ import importlib.util
 import pathlib
 import sys
 
-__all__ = ["map_checkout"]
+__all__ = ["bind_checkout_packages"]
 
 
-def map_checkout(package: str) -> None:
+def bind_checkout_packages(package: str) -> None:
     """Bind the two folders of a checkout as sub-packages; no effect on an installed package."""
     root = pathlib.Path(__file__).resolve().parents[2]
     if not (root / "pyproject.toml").is_file():

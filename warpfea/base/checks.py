@@ -10,14 +10,14 @@ import numpy as np
 
 __all__ = ["is_count", "is_number", "number_hint"]
 
-UNITS = {
+UNIT_FACTORS = {
     **dict.fromkeys(("", "s", "m", "Pa", "N", "kg", "kg/m^3", "kg/m3"), 1.0),
     **dict.fromkeys(("ms", "mm"), 1e-3),
     **dict.fromkeys(("us", "um"), 1e-6),
     **dict.fromkeys(("kPa", "kN", "g/cm^3", "g/cm3"), 1e3),
     **{"cm": 1e-2, "MPa": 1e6, "GPa": 1e9},
 }
-"""Units written after numbers, in SI units."""
+"""Factors to SI units of the units that users write after numbers."""
 
 
 def is_number(value: Any) -> bool:
@@ -37,7 +37,7 @@ def is_count(value: Any) -> bool:
 def number_hint(value: Any) -> str:
     """The text "; write 0.005, a bare number in SI units" for a text such as "5 ms", else nothing."""
     found = re.fullmatch(r"\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*(\D.*)?", value) if isinstance(value, str) else None
-    factor = UNITS.get((found[2] or "").strip()) if found else None
+    factor = UNIT_FACTORS.get((found[2] or "").strip()) if found else None
     if found is None or factor is None:
         return ""
     try:

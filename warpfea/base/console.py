@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from .writer import write_whole
+from .writer import write_atomically
 
-__all__ = ["compile_bar", "number", "quiet_warp", "size", "table", "write_json"]
+__all__ = ["compile_progress_bar", "format_bytes", "format_number", "format_table", "quiet_warp", "write_json"]
 
 _NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
 
@@ -34,17 +34,17 @@ class quiet_warp:
         asked = self.before < wp.LOG_INFO or bool(getattr(wp.config, "verbose", False))
         if not asked:
             wp.config.log_level = max(self.before, wp.LOG_WARNING)
-        if not _started:
-            _start()
+        if not _warp_initialised:
+            _init_warp()
 
     def __exit__(self, *_: object) -> None:
         wp.config.log_level = self.before
 
 
-_started: list[bool] = []
+_warp_initialised: list[bool] = []
 
 
-def _start() -> None:
+def _init_warp() -> None:
     """wp.init; suppresses the native library's message (descriptor 2) about a missing CUDA driver."""
     sys.stderr.flush()
     with tempfile.TemporaryFile() as file:
@@ -59,11 +59,11 @@ def _start() -> None:
         for line in file:
             if _NO_DRIVER not in line:
                 os.write(2, line)
-    _started.append(True)
+    _warp_initialised.append(True)
 
 
 @contextlib.contextmanager
-def compile_bar(show: bool | None) -> Iterator[Callable[[int, int, str], None]]:
+def compile_progress_bar(show: bool | None) -> Iterator[Callable[[int, int, str], None]]:
     """Progress bar "compiling kernels" on stderr with the number of loaded modules; None: if stderr is a terminal."""
     if show is None:
         show = sys.stderr.isatty()
@@ -82,7 +82,7 @@ def compile_bar(show: bool | None) -> Iterator[Callable[[int, int, str], None]]:
         yield update
 
 
-def table(rows: Sequence[Sequence[str]], *, indent: str = "", right: Sequence[int] = ()) -> str:
+def format_table(rows: Sequence[Sequence[str]], *, indent: str = "", right: Sequence[int] = ()) -> str:
     """Rows in columns two spaces apart; the columns in `right` are right-aligned."""
     widths = [max(len(row[k]) for row in rows if k < len(row)) for k in range(max(map(len, rows)))]
     lines = []
@@ -92,12 +92,12 @@ def table(rows: Sequence[Sequence[str]], *, indent: str = "", right: Sequence[in
     return "\n".join(lines)
 
 
-def number(value: float, digits: int = 4) -> str:
+def format_number(value: float, digits: int = 4) -> str:
     """Readable number."""
     return f"{value:.{digits}g}"
 
 
-def size(count: int) -> str:
+def format_bytes(count: int) -> str:
     """Readable size in bytes."""
     for unit, factor in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
         if count >= factor:
@@ -112,7 +112,7 @@ def write_json(target: str, content: dict[str, Any]) -> None:
         sys.stdout.write(text)
         sys.stdout.flush()
     else:
-        write_whole(pathlib.Path(target), lambda path: path.write_text(text))
+        write_atomically(pathlib.Path(target), lambda path: path.write_text(text))
 
 
 def to_json(value: Any) -> Any:

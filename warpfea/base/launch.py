@@ -13,13 +13,13 @@ from ..kernels.common.lanes import WARP_SIZE
 from .console import quiet_warp
 from .errors import ModelError
 
-__all__ = ["PARTS", "Launcher", "Recorder", "kernel_name", "labelled"]
+__all__ = ["LAUNCH_PARTS", "Launcher", "Recorder", "kernel_name", "launch_part"]
 
 P = ParamSpec("P")
 R = TypeVar("R")
 S = TypeVar("S")
 
-PARTS = {
+LAUNCH_PARTS = {
     "residual": "forces of the elements and their sum at the nodes",
     "product": "the operator H v of the linear solve",
     "assembly": "H as a matrix, where products are made with it",
@@ -47,7 +47,7 @@ class Launcher:
 
     Attributes:
         recorder: executes the launches if set; they are then not counted.
-        label: current part. parts: `PARTS` and those added by terms.
+        label: current part. parts: `LAUNCH_PARTS` and those added by terms.
         rare_launches: launches in rarely taken branches, not counted in `launches`.
     """
 
@@ -55,18 +55,18 @@ class Launcher:
         self.device = device
         self.launches = 0
         self.rare_launches = 0
-        self.rarely = False
+        self.in_rare_branch = False
         self.kernels: set[str] = set()
         self.modules: set[str] = set()
         self.recorder: Recorder | None = None
         self.label = "control"
-        self.parts = dict(PARTS)
+        self.parts = dict(LAUNCH_PARTS)
 
     def __call__(self, kernel: wp.Kernel, dim: int | Sequence[int], inputs: list[Any], block_dim: int = 256) -> None:
         """Launch one thread per item of `dim`; empty launches are skipped."""
         if min([dim] if isinstance(dim, int) else dim) == 0:
             return
-        self._do(wp.launch, kernel, [dim] if isinstance(dim, int) else dim, inputs, block_dim)
+        self._launch(wp.launch, kernel, [dim] if isinstance(dim, int) else dim, inputs, block_dim)
 
     def lanes(self, per_row: int) -> int:
         """Lanes that share a row of the given number of entries: a power of two; one on the CPU."""
@@ -80,7 +80,7 @@ class Launcher:
 
     def tiled(self, kernel: wp.Kernel, dim: Sequence[int], inputs: list[Any], block_dim: int = 256) -> None:
         """Launch one block per item of `dim`."""
-        self._do(wp.launch_tiled, kernel, dim, inputs, block_dim)
+        self._launch(wp.launch_tiled, kernel, dim, inputs, block_dim)
 
     @contextmanager
     def part(self, name: str) -> Iterator[None]:
@@ -96,25 +96,25 @@ class Launcher:
     @contextmanager
     def rare(self) -> Iterator[None]:
         """Context for launches inside a rarely taken device branch (not counted)."""
-        outer, self.rarely = self.rarely, True
+        outer, self.in_rare_branch = self.in_rare_branch, True
         try:
             yield
         finally:
-            self.rarely = outer
+            self.in_rare_branch = outer
 
-    def _do(
+    def _launch(
         self, launch: Callable[..., Any], kernel: wp.Kernel, dim: Sequence[int], inputs: list[Any], block_dim: int
     ) -> None:
         do = functools.partial(launch, kernel, dim=dim, inputs=inputs, device=self.device, block_dim=block_dim)
         if self.recorder is not None:
             self.recorder(self.label, kernel, (*dim, block_dim), inputs, functools.partial(do, record_cmd=True))
             return
-        self._count(kernel)
+        self._count_launch(kernel)
         with quiet_warp():  # load a module that no Simulation has loaded yet
             do()
 
-    def _count(self, kernel: wp.Kernel) -> None:
-        if self.rarely:
+    def _count_launch(self, kernel: wp.Kernel) -> None:
+        if self.in_rare_branch:
             self.rare_launches += 1
             return
         self.launches += 1
@@ -127,15 +127,15 @@ def kernel_name(kernel: wp.Kernel) -> str:
     return f"{kernel.module.name.removeprefix('warpfea.kernels.')}.{kernel.key.rsplit('__locals__', 1)[-1]}"
 
 
-def labelled(name: str) -> Callable[[Callable[Concatenate[S, P], R]], Callable[Concatenate[S, P], R]]:
-    """Decorator: attribute a method's launches to profile part `name`, see `PARTS`."""
+def launch_part(name: str) -> Callable[[Callable[Concatenate[S, P], R]], Callable[Concatenate[S, P], R]]:
+    """Decorator: attribute a method's launches to profile part `name`, see `LAUNCH_PARTS`."""
 
-    def mark(method: Callable[Concatenate[S, P], R]) -> Callable[Concatenate[S, P], R]:
+    def decorate(method: Callable[Concatenate[S, P], R]) -> Callable[Concatenate[S, P], R]:
         @functools.wraps(method)
-        def marked(self: S, *args: P.args, **options: P.kwargs) -> R:
+        def wrapper(self: S, *args: P.args, **options: P.kwargs) -> R:
             with self.launch.part(name):  # type: ignore[attr-defined]
                 return method(self, *args, **options)
 
-        return marked
+        return wrapper
 
-    return mark
+    return decorate

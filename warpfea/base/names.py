@@ -7,11 +7,10 @@ from collections.abc import Iterable
 
 __all__ = ["did_you_mean", "listing"]
 
-CUTOFF = 0.6
+SIMILARITY_CUTOFF = 0.6
 """Similarity, 0 to 1, from which a known name is suggested."""
-WARP_ROW, SHORT_CUTOFF = 5, 0.75
-"""Maximum length of a short name, and its cutoff: one common letter is weaker evidence."""
-
+MAX_SHORT_LENGTH, SHORT_CUTOFF = 5, 0.75
+"""Maximum length of a short name, and its similarity cutoff: one common letter is weaker evidence."""
 
 SYNONYMS = {
     "rho": "density",
@@ -33,13 +32,15 @@ def did_you_mean(name: object, known: Iterable[object]) -> str:
     Case, hyphens for underscores and leading hyphens are ignored. A short name also matches a permutation of its
     letters, and synonyms (`SYNONYMS`) match their name.
     """
-    wanted = _plain(str(name))
+    wanted = _normalise(str(name))
     plain: dict[str, str] = {}
     for text in map(str, known):
-        plain.setdefault(_plain(text), text)
+        plain.setdefault(_normalise(text), text)
     if SYNONYMS.get(wanted) in plain.values():
         return f"; did you mean {SYNONYMS[wanted]!r}?"
-    found = difflib.get_close_matches(wanted, plain, n=1, cutoff=SHORT_CUTOFF if len(wanted) <= WARP_ROW else CUTOFF)
+    found = difflib.get_close_matches(
+        wanted, plain, n=1, cutoff=SHORT_CUTOFF if len(wanted) <= MAX_SHORT_LENGTH else SIMILARITY_CUTOFF
+    )
     found = found or [text for text in plain if sorted(text) == sorted(wanted)]
     return f"; did you mean {plain[found[0]]!r}?" if found else ""
 
@@ -49,5 +50,5 @@ def listing(known: Iterable[object]) -> str:
     return ", ".join(repr(str(name)) for name in known) or "none"
 
 
-def _plain(text: str) -> str:
+def _normalise(text: str) -> str:
     return text.casefold().lstrip("-").replace("-", "_")

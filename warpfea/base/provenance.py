@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-__all__ = ["commit", "machine", "origin", "versions"]
+__all__ = ["git_commit", "machine", "provenance_of", "versions"]
 
 
-def origin(words: Sequence[str], device: Any) -> dict[str, Any]:
+def provenance_of(words: Sequence[str], device: Any) -> dict[str, Any]:
     """Provenance of a result file: command, commit, machine and versions.
 
     Args:
@@ -27,7 +27,7 @@ def origin(words: Sequence[str], device: Any) -> dict[str, Any]:
     """
     return {
         "command": shlex.join(["warpfea", *words]),
-        "commit": commit(),
+        "commit": git_commit(),
         "machine": machine(device),
         "versions": versions(),
     }
@@ -67,19 +67,19 @@ def cpu_name() -> str:
 
 
 @functools.cache
-def commit() -> str | None:
+def git_commit() -> str | None:
     """Commit of this checkout, with + if files differ; None without git or outside a checkout.
 
     Evaluated once, before results are written into the checkout.
     """
     root = pathlib.Path(__file__).resolve().parents[2]
 
-    def ask(*words: str) -> str:
+    def run_git(*words: str) -> str:
         return subprocess.run(["git", *words], cwd=root, capture_output=True, text=True, check=True).stdout.strip()
 
     if not (root / "pyproject.toml").is_file():  # installed: a surrounding repository is unrelated
         return os.environ.get("WARPFEA_COMMIT")
     try:
-        return ask("rev-parse", "HEAD") + ("+" if ask("status", "--porcelain", "--untracked-files=no") else "")
+        return run_git("rev-parse", "HEAD") + ("+" if run_git("status", "--porcelain", "--untracked-files=no") else "")
     except (OSError, subprocess.CalledProcessError):
         return os.environ.get("WARPFEA_COMMIT")  # the commit is passed to a copy without history

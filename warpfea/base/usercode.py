@@ -8,11 +8,11 @@ from contextlib import contextmanager
 
 from .errors import Error, ModelError
 
-__all__ = ["user_code"]
+__all__ = ["convert_user_errors"]
 
 
 @contextmanager
-def user_code(what: str) -> Iterator[None]:
+def convert_user_errors(what: str) -> Iterator[None]:
     """Convert an error of the user code within to a ModelError about `what`; errors of warpfea pass."""
     try:
         yield

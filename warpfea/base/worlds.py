@@ -1,4 +1,4 @@
-"""Parsing of per-world values."""
+"""Parsing and validation of values given for all worlds or one per world."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import warp as wp
 
 from .errors import ModelError
 
-__all__ = ["per_world", "refuse", "to_host", "worlds_mask"]
+__all__ = ["check_values_per_world", "to_host", "values_per_world", "worlds_mask"]
 
 
 def to_host(values: Any) -> np.ndarray:
@@ -55,7 +55,7 @@ def worlds_mask(what: str, mask: Any, worlds: int) -> np.ndarray:
     )
 
 
-def per_world(what: str, name: str, values: Any, worlds: int, row: tuple[int, ...] = ()) -> np.ndarray:
+def values_per_world(what: str, name: str, values: Any, worlds: int, row: tuple[int, ...] = ()) -> np.ndarray:
     """(worlds, *row) array of one value for all worlds, or one per world. ModelError for another shape."""
     one, each = f"{row}" if row else "a number", (worlds, *row)
     try:
@@ -67,7 +67,7 @@ def per_world(what: str, name: str, values: Any, worlds: int, row: tuple[int, ..
     return np.broadcast_to(out, each).astype(float)
 
 
-def refuse(what: str, name: str, values: np.ndarray, good: np.ndarray, wanted: str) -> None:
+def check_values_per_world(what: str, name: str, values: np.ndarray, good: np.ndarray, wanted: str) -> None:
     """Raise ModelError for the first world with an invalid value; `wanted`: the requirement."""
     for world in np.flatnonzero(~good)[:1]:
         raise ModelError(f"{what}: {name} = {values[world].tolist()!r} in world {world} must be {wanted}")

@@ -12,7 +12,7 @@ from typing import Any
 
 from .errors import OutputError
 
-__all__ = ["Output", "check_folder", "check_target", "progress_bar", "temporary_beside", "write_whole"]
+__all__ = ["Output", "check_folder", "check_target", "progress_bar", "temporary_path", "write_atomically"]
 
 
 class Output:
@@ -22,12 +22,12 @@ class Output:
     `close` completes the file, also after an interrupted run. `abort` discards the output of the run and keeps an
     older target file. A writer may be reopened after either.
 
-    Adaptive steps end where a frame is due: `rate` is frames per simulated second, None without a rate; `moments` are
-    single times, s.
+    Adaptive steps end where a frame is due: `rate` is frames per simulated second, None without a rate; `output_times`
+    are single times, s.
     """
 
     rate: float | None = None
-    moments: Sequence[float] = ()
+    output_times: Sequence[float] = ()
 
     def open(self, sim: Any) -> None:
         """Check the target and start. OutputError if the target can't be written."""
@@ -66,7 +66,7 @@ def check_folder(folder: pathlib.Path, target: pathlib.Path) -> None:
         raise OutputError(f"{target}: the folder {folder} does not exist")
     if not os.access(folder, os.W_OK | os.X_OK):
         raise OutputError(f"{target}: the folder {folder} is not writable")
-    probe = folder / temporary_beside(target).name
+    probe = folder / temporary_path(target).name
     try:  # a full disk or a read-only file system is detected only by writing
         probe.touch()
         probe.unlink()
@@ -74,14 +74,14 @@ def check_folder(folder: pathlib.Path, target: pathlib.Path) -> None:
         raise OutputError(f"{target}: cannot write to folder {folder} ({error.strerror or error})") from error
 
 
-def temporary_beside(target: pathlib.Path) -> pathlib.Path:
+def temporary_path(target: pathlib.Path) -> pathlib.Path:
     """An unused hidden name in the target's folder with the target's suffix."""
     return target.with_name(f".{target.stem}.{os.getpid()}-{next(_counter)}.part{target.suffix}")
 
 
-def write_whole(target: pathlib.Path, write: Callable[[pathlib.Path], object]) -> None:
+def write_atomically(target: pathlib.Path, write: Callable[[pathlib.Path], object]) -> None:
     """Call `write(temporary)` and rename the result to `target`. OutputError for errors of the system."""
-    temporary = temporary_beside(target)
+    temporary = temporary_path(target)
     try:
         write(temporary)
         os.replace(temporary, target)

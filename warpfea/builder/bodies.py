@@ -46,7 +46,7 @@ def make_solid(name: str, mesh: Mesh, material: Any, element: str | None, quadra
             f"body {name!r}: {mesh.label} is a surface of {mesh.cell_type} cells, not a solid; use add_shell(mesh, "
             "thickness=...)"
         )
-    family = element_families.get(element) if element else element_families.for_cell(mesh.cell_type)
+    family = element_families.get_family(element) if element else element_families.family_for_cell(mesh.cell_type)
     mesh, frames = solid_geometry(name, mesh, family)
     rule = family.rule(quadrature).name
     curved = family.curved_rule.name if quadrature is None else rule
@@ -65,7 +65,7 @@ def make_structure(
 ) -> Body:
     """A beam or shell with the axes and frames of its geometry; see ModelBuilder.add_beam and add_shell."""
     materials, index = assign_materials(name, mesh, material)
-    family = element_families.get(element)
+    family = element_families.get_family(element)
     split = all(law.law == "svk" for _, law in materials)
     scheme = integration or ("tied" if split else "full")
     known = [*family.schemes, *family.rules]

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..base.errors import ModelError
-from ..base.usercode import user_code
+from ..base.usercode import convert_user_errors
 
 __all__ = ["Reference", "make_reference", "read_reference"]
 
@@ -71,7 +71,7 @@ def make_reference(given: Any, parameters: Mapping[str, Any]) -> Reference | Non
         missing = [name for name, p in wanted.items() if name not in parameters and p.default is p.empty]
         if missing:
             raise ModelError(f"reference {given.__name__!r}: {missing[0]!r} is no parameter of the scene")
-        with user_code(f"reference {given.__name__!r}"):
+        with convert_user_errors(f"reference {given.__name__!r}"):
             given = given(**{name: parameters[name] for name in wanted if name in parameters})
     if given is None or isinstance(given, Reference):
         return given

@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING, Any, Generic, ParamSpec
 from ..base.checks import number_hint
 from ..base.errors import ModelError
 from ..base.names import did_you_mean
-from ..base.usercode import user_code
+from ..base.usercode import convert_user_errors
 
 if TYPE_CHECKING:
     from .builder import ModelBuilder
@@ -160,7 +160,7 @@ class Scene(Generic[Params]):
         """
         from .builder import ModelBuilder
 
-        with user_code(f"scene {self.name!r}"):
+        with convert_user_errors(f"scene {self.name!r}"):
             out = self.function(**given)  # type: ignore[call-arg]
         if not isinstance(out, ModelBuilder):
             raise ModelError(f"scene {self.name!r} must return a ModelBuilder, it returned {type(out).__name__}")

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..base.errors import ModelError
 from ..elements import Family
-from ..elements.lagrange import CORNERS, FACES, T10
+from ..elements.lagrange import T10, TET_CORNERS, TET_FACES
 from ..mesh import Mesh, linear
 from ..mesh.cells import CELL_TYPES
 from ..mesh.convert import with_face_nodes
@@ -38,13 +38,13 @@ def solid_geometry(name: str, mesh: Mesh, family: Family) -> tuple[Mesh, np.ndar
         return mesh, _node_frames(mesh, CELL_TYPES["hexahedron"].gradients(family.node_points))
     if mesh.cell_type not in ("tetra", "tetra10"):
         raise ModelError(f"{label}: element {family.name} needs tetrahedra, {mesh.label} has {mesh.cell_type}")
-    frames = _node_frames(mesh, CELL_TYPES[mesh.cell_type].gradients(CORNERS))
+    frames = _node_frames(mesh, CELL_TYPES[mesh.cell_type].gradients(TET_CORNERS))
     corner = linear(mesh)
     if family.cell_type == "tetra":
         return corner, frames
     centroids = None
     if mesh.cell_type == "tetra10":
-        middle = np.array([CORNERS[list(face)].mean(axis=0) for face in FACES])
+        middle = np.array([TET_CORNERS[list(face)].mean(axis=0) for face in TET_FACES])
         s, _ = T10.shape(middle, mesh.points[:1])
         centroids = np.einsum("ps,esk->epk", s[0], mesh.points[mesh.cells])
     full = with_face_nodes(corner, centroids)

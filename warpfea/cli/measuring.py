@@ -220,9 +220,9 @@ def insert_scene_command(words: Sequence[str]) -> list[str]:
 
 def add_profile(commands: Any, add_model: Callable[[argparse.ArgumentParser], None]) -> None:
     """`warpfea profile`; `add_model` adds the options of the model."""
-    from ..terms.term_set import all_parts
+    from ..terms.term_set import profile_parts
 
-    parts = "\n".join(f"  {name:14}  {text}" for name, text in all_parts().items())
+    parts = "\n".join(f"  {name:14}  {text}" for name, text in profile_parts().items())
     to = commands.add_parser(
         "profile",
         help="where the time of a step goes",

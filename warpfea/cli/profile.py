@@ -8,9 +8,9 @@ import statistics
 import sys
 from typing import Any
 
-from ..base.console import number, quiet_warp, table, to_json, write_json
+from ..base.console import format_number, format_table, quiet_warp, to_json, write_json
 from ..base.provenance import machine, versions
-from ..base.writer import write_whole
+from ..base.writer import write_atomically
 from ..simulation.simulation import Simulation
 from ..studies.profile.profiling import WARM_UP_STEPS, KernelTime, Profile
 from ..studies.profile.profiling import profile as measure
@@ -76,7 +76,7 @@ def profile(options: argparse.Namespace) -> int:
 
         title = f"{source.label}: {content['unknowns']} unknowns, {content['device']}, {content['dtype']}, "
         title += f"{content['step_ms']['median']:.3g} ms per step"
-        write_whole(pathlib.Path(options.png), lambda path: draw(found, title, path))
+        write_atomically(pathlib.Path(options.png), lambda path: draw(found, title, path))
     if not options.quiet and options.json != "-":
         print(_profile_text(content, found, [name for name in (options.png, options.json) if name]), flush=True)
     return DONE
@@ -138,31 +138,33 @@ def _profile_text(c: dict[str, Any], found: Profile, wrote: list[str]) -> str:
     step, of_step = c["step_ms"], c["step_ms"]["mean"]
     rows = [
         ["scene", f"{c['scene']}: {c['elements']} elements, {c['unknowns']} unknowns"],
-        ["device", f"{c['device']}, {c['dtype']}, {c['integrator']}, dt = {number(c['dt'])} s"],
+        ["device", f"{c['device']}, {c['dtype']}, {c['integrator']}, dt = {format_number(c['dt'])} s"],
         [
             "a step",
-            f"{number(step['median'])} ms as one graph (median of {c['steps']}, {number(step['min'])} to "
-            f"{number(step['max'])} ms); kernels and set-up before took {c['compile_s']:.1f} s",
+            f"{format_number(step['median'])} ms as one graph (median of {c['steps']}, {format_number(step['min'])} to "
+            f"{format_number(step['max'])} ms); kernels and set-up before took {c['compile_s']:.1f} s",
         ],
         ["iterations", f"{c['newton_per_step']:.1f} Newton and {c['pcg_per_step']:.0f} PCG per step"],
         [
             "launches",
             f"{c['launches_per_step']:.0f} per step of {len({k.kernel for k in found.kernels})} kernels; an empty one "
-            f"takes {number(c['empty_launch_us'], 2)} us, which is taken off each",
+            f"takes {format_number(c['empty_launch_us'], 2)} us, which is taken off each",
         ],
-        ["copy", f"{number(c['copy_GBps'], 3)} GB/s, read and written, for a large array"],
+        ["copy", f"{format_number(c['copy_GBps'], 3)} GB/s, read and written, for a large array"],
     ]
     parts = [["part", *TABLE_HEADER, ""]]
     parts += [[name, *_cells(k, found), found.about.get(name, "")] for name, k in found.parts.items()]
     gap, share = found.between_ms, 100.0 * found.between_ms / found.total_ms
-    cells = [number(gap, 3), f"{share:.1f} %"] if gap > 0.0 else ["-", "-"]
+    cells = [format_number(gap, 3), f"{share:.1f} %"] if gap > 0.0 else ["-", "-"]
     parts.append(["between", *cells, "", "", "", "", BETWEEN_NOTE])
     kernels = [[*TABLE_HEADER, "part", "kernel"]]
     kernels += [[*_cells(k, found), k.part, k.kernel] for k in found.kernels[:MAX_KERNEL_ROWS]]
-    lines = [table(rows), "", table(parts, right=range(1, 7)), "", table(kernels, right=range(6))]
+    lines = [format_table(rows), "", format_table(parts, right=range(1, 7)), "", format_table(kernels, right=range(6))]
     rest = found.kernels[MAX_KERNEL_ROWS:]
     if rest:
-        lines.append(f"and {len(rest)} more, {number(sum(k.ms for k in rest), 2)} ms together (--json lists them)")
+        lines.append(
+            f"and {len(rest)} more, {format_number(sum(k.ms for k in rest), 2)} ms together (--json lists them)"
+        )
     notes = []
     if found.kernels_ms > 1.02 * of_step:
         longer = 100.0 * (found.kernels_ms / of_step - 1.0)
@@ -183,10 +185,10 @@ def _cells(k: KernelTime, found: Profile) -> list[str]:
     """The texts under `HEADER`."""
     rate = k.GBps
     return [
-        number(k.ms, 3),
+        format_number(k.ms, 3),
         f"{100.0 * k.ms / found.total_ms:.1f} %",
         f"{k.launches:.0f}" if k.launches >= 10.0 or k.launches % 1.0 == 0.0 else f"{k.launches:.1f}",
-        number(1e-6 * k.bytes, 3),
-        "-" if rate is None else number(rate, 3),
+        format_number(1e-6 * k.bytes, 3),
+        "-" if rate is None else format_number(rate, 3),
         "-" if rate is None else f"{100.0 * rate / found.copy_GBps:.0f} %",
     ]

@@ -8,7 +8,7 @@ import sys
 from typing import Any
 
 from .. import mesh as meshes
-from ..base.console import number, quiet_warp, size, table, to_json, write_json
+from ..base.console import format_bytes, format_number, format_table, quiet_warp, to_json, write_json
 from ..base.errors import UsageError
 from ..builder.scene import Scene, find, names
 from . import DONE
@@ -33,8 +33,8 @@ def scenes(options: argparse.Namespace) -> int:
         print(_scene_text(find_scene(what)))
         return DONE
     rows = [["scene", "dt", "t_end", ""]]
-    rows += [[s.name, f"{number(s.dt, 3)} s", f"{number(s.t_end, 3)} s", s.description] for s in found]
-    print(table(rows))
+    rows += [[s.name, f"{format_number(s.dt, 3)} s", f"{format_number(s.t_end, 3)} s", s.description] for s in found]
+    print(format_table(rows))
     if not options.quiet:
         where = f"{what}:NAME" if what else "NAME"
         print(f"\nwarpfea scenes {where} shows its parameters, warpfea run {where} runs it.")
@@ -46,13 +46,13 @@ def _scene_text(found: Scene[Any]) -> str:
     parts = [found.description]
     if found.details:
         parts.append(found.details)
-    tol = f", tol = {number(found.tol)}" if found.tol else ""
-    parts.append(f"dt = {number(found.dt)} s, t_end = {number(found.t_end)} s, {found.integrator}{tol}")
+    tol = f", tol = {format_number(found.tol)}" if found.tol else ""
+    parts.append(f"dt = {format_number(found.dt)} s, t_end = {format_number(found.t_end)} s, {found.integrator}{tol}")
     rows = []
     for p in found.parameters.values():
         default = "(required)" if p.required else f"= {p.default}"
         rows.append([f"--set {p.name}", default, p.kind_name, p.doc])
-    parts.append(table(rows) if rows else "It has no parameters.")
+    parts.append(format_table(rows) if rows else "It has no parameters.")
     return "\n\n".join(parts)
 
 
@@ -88,7 +88,7 @@ def _mesh_info(options: argparse.Namespace) -> int:
     if options.json:
         write_json(options.json, to_json({"scene": options.what, "mesh": facts}))
     if options.json != "-":
-        print(table([["mesh", options.what], *_mesh_rows(facts)]))
+        print(format_table([["mesh", options.what], *_mesh_rows(facts)]))
         if not options.quiet:
             more = f"with --material {MATERIAL_HINT.removeprefix('e.g. ')} also what a simulation of it costs"
             if facts["cells"] == "quad":
@@ -102,7 +102,7 @@ def _mesh_rows(facts: dict[str, Any]) -> list[list[str]]:
     what, unit = ("area", "m^2") if facts["cells"] == "quad" else ("volume", "m^3")
     rows = [
         ["cells", f"{facts['elements']} {facts['cells']}, {facts['nodes']} nodes"],
-        ["size", f"{box_text(facts['bounding_box'])}, {what} {number(facts['volume'])} {unit}"],
+        ["size", f"{box_text(facts['bounding_box'])}, {what} {format_number(facts['volume'])} {unit}"],
     ]
     items = {"element": "elements", "surface": "faces", "node": "nodes"}
     for kind, counted in items.items():
@@ -131,15 +131,17 @@ def _info_table(content: dict[str, Any]) -> str:
     for name, count in c["bytes"].items():
         key = name.partition(".")[0]
         groups[key] = groups.get(key, 0) + count
-    text = ", ".join(f"{key} {size(count)}" for key, count in groups.items())
-    rows.append(["memory", f"{size(sum(groups.values()))} ({text}), {c['bytes_per_unknown']:.0f} B per unknown"])
+    text = ", ".join(f"{key} {format_bytes(count)}" for key, count in groups.items())
+    rows.append(
+        ["memory", f"{format_bytes(sum(groups.values()))} ({text}), {c['bytes_per_unknown']:.0f} B per unknown"]
+    )
     rows.append(["a step", f"{c['launches']} launches recorded, of {len(c['kernels'])} kernels:"])
     by_module: dict[str, list[str]] = {}
     for name in c["kernels"]:
         module, _, kernel = name.rpartition(".")
         by_module.setdefault(module, []).append(kernel)
     rows += [["", f"{module}: {', '.join(kernels)}"] for module, kernels in by_module.items()]
-    return table(rows)
+    return format_table(rows)
 
 
 def _body_rows(bodies: list[dict[str, Any]]) -> list[list[str]]:

@@ -7,7 +7,7 @@ import pathlib
 from dataclasses import dataclass
 from typing import Any
 
-from ..base.console import compile_bar
+from ..base.console import compile_progress_bar
 from ..base.errors import UsageError
 from ..builder.scene import Scene, load_file, locate, split_name
 from ..mesh import FORMATS
@@ -60,7 +60,7 @@ class Source:
     def simulation(self, model: Model, show: bool | None) -> Simulation:
         """The simulation (dynamic, or static with load steps); shows a bar while kernels compile."""
         if self.load_steps is not None:
-            with compile_bar(show) as bar:
+            with compile_progress_bar(show) as bar:
                 return begin_static(
                     model,
                     load_steps=self.load_steps,
@@ -70,7 +70,7 @@ class Source:
                     on_compile=bar,
                 )
         solver = SOLVERS[self.solver](tol=self.tol)
-        with compile_bar(show) as bar:
+        with compile_progress_bar(show) as bar:
             return Simulation(
                 model,
                 dt=self.dt,

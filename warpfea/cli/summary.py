@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..base.console import number, table, to_json
+from ..base.console import format_number, format_table, to_json
 from ..base.provenance import versions
 from ..kernels.elements.materials import DEFINED_FOR_ANY_J
 from ..kernels.step.step_control import SAME_TIME_FRACTION
@@ -148,9 +148,11 @@ def summary_text(summary: dict[str, Any], sim: Simulation, wrote: Sequence[str])
     """The summary as a table."""
     s, info = summary, sim.model.info()
     steps = max(s["steps"], 1)
-    done = f"{s['status']}, static, at {number(100.0 * (s['load'] or 0.0))} % of the load, {s['steps']} load steps"
+    done = (
+        f"{s['status']}, static, at {format_number(100.0 * (s['load'] or 0.0))} % of the load, {s['steps']} load steps"
+    )
     if s["load"] is None:
-        done = f"{s['status']} at t = {number(s['t_end'], 6)} s, {_steps(s, sim)}"
+        done = f"{s['status']} at t = {format_number(s['t_end'], 6)} s, {_steps(s, sim)}"
     rows = [
         ["scene", s["scene"] + "".join(f"  {k}={v}" for k, v in _parameter_pairs(s["parameters"]))],
         ["model", f"{info['elements']} elements, {info['unknowns']} unknowns"],
@@ -169,7 +171,7 @@ def summary_text(summary: dict[str, Any], sim: Simulation, wrote: Sequence[str])
         rows.append(["", "the equilibrium is stable"] if s["stable"] else ["UNSTABLE", "the equilibrium is unstable"])
     if s["rough_steps"]:
         reached = s["steps"] - s["rough_steps"]
-        tol = number(sim.solver.tolerance(s["dtype"]))
+        tol = format_number(sim.solver.tolerance(s["dtype"]))
         rows.append(
             ["NOT CONVERGED", f"tolerance {tol} reached in {reached} of {s['steps']} steps ({reached / steps:.0%})"]
         )
@@ -195,7 +197,7 @@ def summary_text(summary: dict[str, Any], sim: Simulation, wrote: Sequence[str])
     rows += _joint_rows(sim)
     rows += _contact_rows(s["contacts"])
     rows += [["wrote" if k == 0 else "", text] for k, text in enumerate(wrote)]
-    return table(rows)
+    return format_table(rows)
 
 
 def _times(s: dict[str, Any]) -> str:
@@ -218,9 +220,10 @@ def _steps(s: dict[str, Any], sim: Simulation) -> str:
     if sim.error is None:
         end = s["steps"] * s["dt"] - s["t_end"]
         shorter = s["status"] == "done" and SAME_TIME_FRACTION * s["dt"] < end < s["dt"]
-        return f"{s['steps']} steps of {number(s['dt'])} s{', the last shorter' * shorter}"
+        return f"{s['steps']} steps of {format_number(s['dt'])} s{', the last shorter' * shorter}"
     refused = int(sim.totals["rejected"].sum())
-    return f"{int(sim.totals['substeps'].sum())} adaptive steps, {refused} refused, for an error of {number(sim.error)}"
+    substeps, error = int(sim.totals["substeps"].sum()), format_number(sim.error)
+    return f"{substeps} adaptive steps, {refused} refused, for an error of {error}"
 
 
 def model_box(model: Model) -> list[list[float]]:
@@ -231,20 +234,20 @@ def model_box(model: Model) -> list[list[float]]:
 
 def box_text(box: Sequence[Sequence[float]]) -> str:
     """Readable sides of a box."""
-    return " x ".join(number(high - low) for low, high in zip(*box)) + " m"
+    return " x ".join(format_number(high - low) for low, high in zip(*box)) + " m"
 
 
 def mass_text(mass: float | None) -> str:
     """Readable mass."""
-    return "no density" if mass is None else f"{number(mass)} kg"
+    return "no density" if mass is None else f"{format_number(mass)} kg"
 
 
 def _inversion_text(J: float, model: Model) -> str:
     """Text of J <= 0: laws that need J > 0 forbid it at the quadrature points, not at the vertices."""
     if any(block.key.law in DEFINED_FOR_ANY_J for block in model.blocks):
         advice = "take a finer mesh, smaller loads or a law that forbids it (neo_hookean)"
-        return f"an element turned inside out: J = {number(J, 3)}; {advice}"
-    return f"J = {number(J, 3)} at a vertex of an element: take a finer mesh or smaller loads"
+        return f"an element turned inside out: J = {format_number(J, 3)}; {advice}"
+    return f"J = {format_number(J, 3)} at a vertex of an element: take a finer mesh or smaller loads"
 
 
 def _iterations(s: dict[str, Any], sim: Simulation) -> str:
@@ -309,7 +312,7 @@ def _contact_rows(contacts: dict[str, Any]) -> list[list[str]]:
 
 
 def _number_text(value: float | None, digits: int = 4) -> str:
-    return "not finite" if value is None else number(value + 0.0, digits)
+    return "not finite" if value is None else format_number(value + 0.0, digits)
 
 
 def _parameter_pairs(parameters: dict[str, Any]) -> list[tuple[str, str]]:
@@ -317,6 +320,6 @@ def _parameter_pairs(parameters: dict[str, Any]) -> list[tuple[str, str]]:
     out = []
     for name, value in parameters.items():
         if value not in (None, [], ""):
-            text = number(value, 6) if isinstance(value, float) else str(value)
+            text = format_number(value, 6) if isinstance(value, float) else str(value)
             out.append((name, text.replace(" ", "")))
     return out

@@ -5,8 +5,8 @@ from .family import (
     EnergyPart,
     Family,
     families,
-    for_cell,
-    get,
+    family_for_cell,
+    get_family,
     register,
 )
 from .quadrature import TET_RULES, Rule
@@ -20,8 +20,8 @@ __all__ = [
     "ancf_shell",
     "ancf_solid",
     "families",
-    "for_cell",
-    "get",
+    "family_for_cell",
+    "get_family",
     "lagrange",
     "register",
 ]

@@ -35,10 +35,10 @@ from ..base.errors import ModelError
 from ..materials import SVK, Material
 from .ancf import to_node_axes
 from .family import (
+    AssumedStrain,
     EnergyPart,
     Family,
-    Parent,
-    Tying,
+    ParentDomain,
     VtkSubdivision,
     register,
 )
@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 __all__ = ["BEAM", "parent_functions", "svk_only"]
 
 LOW, HIGH = (0.0, -0.5, -0.5), (1.0, 0.5, 0.5)
-RANGES = tuple(zip(LOW, HIGH))
+PARENT_RANGES = tuple(zip(LOW, HIGH))
 
 
 def parent_functions(xi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -66,7 +66,7 @@ def parent_functions(xi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.stack(s, axis=1), np.moveaxis(np.array(ds), 2, 0)
 
 
-def _shape(xi: np.ndarray, nodes: np.ndarray, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _shape_functions(xi: np.ndarray, nodes: np.ndarray, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return to_node_axes(*parent_functions(xi), frames)
 
 
@@ -77,14 +77,14 @@ def svk_only(material: Material) -> SVK:
     return material
 
 
-def _poisson_free(material: Material) -> tuple[str, tuple[float, ...]]:
+def _uncoupled_law(material: Material) -> tuple[str, tuple[float, ...]]:
     """D0: Young's modulus in each direction without coupling, and the shear modulus."""
     m = svk_only(material)
     _, mu = m.lame
     return "orthotropic", (m.E, m.E, m.E, 0.0, 0.0, 0.0, mu, mu, mu)
 
 
-def _poisson_part(material: Material) -> tuple[str, tuple[float, ...]]:
+def _normal_coupling_law(material: Material) -> tuple[str, tuple[float, ...]]:
     """D - D0: the coupling of the normal strains."""
     m = svk_only(material)
     lam, _ = m.lame
@@ -92,7 +92,7 @@ def _poisson_part(material: Material) -> tuple[str, tuple[float, ...]]:
     return "orthotropic", (d, d, d, lam, lam, lam, 0.0, 0.0, 0.0)
 
 
-def box_corners(low: tuple[float, ...], high: tuple[float, ...]) -> tuple[np.ndarray, ...]:
+def box_faces(low: tuple[float, ...], high: tuple[float, ...]) -> tuple[np.ndarray, ...]:
     """Faces of a box in the order -x, +x, -y, +y, -z, +z: (4, 3) corners, outward, the first side along x if it can."""
     (x0, y0, z0), (x1, y1, z1) = low, high
     return tuple(
@@ -108,7 +108,7 @@ def box_corners(low: tuple[float, ...], high: tuple[float, ...]) -> tuple[np.nda
     )
 
 
-def box_lattice(low: tuple[float, ...], high: tuple[float, ...], parts: tuple[int, int, int]) -> VtkSubdivision:
+def box_subdivision(low: tuple[float, ...], high: tuple[float, ...], parts: tuple[int, int, int]) -> VtkSubdivision:
     """A box cut into parts[0] x parts[1] x parts[2] hexahedra, for drawing."""
     axes = [np.linspace(a, b, n + 1) for a, b, n in zip(low, high, parts)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -118,26 +118,27 @@ def box_lattice(low: tuple[float, ...], high: tuple[float, ...], parts: tuple[in
     return VtkSubdivision(points, "hexahedron", np.stack(corner, axis=-1).reshape(-1, 8))
 
 
-SECTION = [(y, z) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]
-GAUSS = [(y, z) for y in (-0.5 / 3**0.5, 0.5 / 3**0.5) for z in (-0.5 / 3**0.5, 0.5 / 3**0.5)]
+# (eta, zeta) in the section
+SECTION_CORNERS = [(y, z) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]
+SECTION_GAUSS_POINTS = [(y, z) for y in (-0.5 / 3**0.5, 0.5 / 3**0.5) for z in (-0.5 / 3**0.5, 0.5 / 3**0.5)]
 
 
-def _axial_part(material: Material) -> tuple[str, tuple[float, ...]]:
+def _axial_law(material: Material) -> tuple[str, tuple[float, ...]]:
     """D0 along the axis."""
     return "orthotropic", (svk_only(material).E, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-def _section_part(material: Material) -> tuple[str, tuple[float, ...]]:
+def _section_law(material: Material) -> tuple[str, tuple[float, ...]]:
     """D0 in the section."""
     m = svk_only(material)
     return "orthotropic", (0.0, m.E, m.E, 0.0, 0.0, 0.0, m.lame[1], 0.0, 0.0)
 
 
-def _shear_part(material: Material) -> tuple[str, tuple[float, ...]]:
+def _shear_law(material: Material) -> tuple[str, tuple[float, ...]]:
     return "assumed_strain", (svk_only(material).lame[1],)
 
 
-def _shear_stress(material: Material) -> tuple[str, tuple[float, ...]]:
+def _shear_output_law(material: Material) -> tuple[str, tuple[float, ...]]:
     """Transverse shears at quadrature points, for the stress output of "tied"."""
     _, mu = svk_only(material).lame
     return "orthotropic", (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, mu, mu)
@@ -155,12 +156,13 @@ def _shear_coupling(
     """
     m = svk_only(material)
     size = np.linalg.norm(at, axis=2)
-    a, b = SHEAR.pairs.T
+    a, b = SHEAR_TYING.pairs.T
     t = np.arange(len(a))
     scale = 1.0 / (size[:, t, a] * size[:, t, b])
     volume = det @ rule.weights
     length = size[:, :, 0].mean(axis=1)
-    modes = np.array([np.ones(4), *np.sign(np.array(GAUSS).T), np.sign(np.prod(GAUSS, axis=1))]) / 4.0
+    gauss = np.array(SECTION_GAUSS_POINTS)
+    modes = np.array([np.ones(4), *np.sign(gauss.T), np.sign(np.prod(gauss, axis=1))]) / 4.0
     ends, deviation = 0.5 * np.diag([1.0, 0.0, 1.0]), np.array([-0.5, 1.0, -0.5])
     out = np.empty((len(at), len(a), 12))
     for direction in (0, 1):
@@ -177,11 +179,17 @@ def _shear_coupling(
     return out
 
 
-STATIONS = [(x, y, z) for y, z in GAUSS for x in (0.0, 0.5, 1.0)]
-SHEAR = Tying(np.array(2 * STATIONS), np.repeat([(0, 1), (0, 2)], 12, axis=0), _shear_coupling, width=12, uses=("nu",))
+SHEAR_TYING_POINTS = [(x, y, z) for y, z in SECTION_GAUSS_POINTS for x in (0.0, 0.5, 1.0)]
+SHEAR_TYING = AssumedStrain(
+    np.array(2 * SHEAR_TYING_POINTS),
+    np.repeat([(0, 1), (0, 2)], 12, axis=0),
+    _shear_coupling,
+    width=12,
+    material_constants=("nu",),
+)
 
 
-def at_ends(rule: Rule) -> Rule:
+def end_point_rule(rule: Rule) -> Rule:
     """A rule of two points along the axis with the points moved to the ends of the element (trapezoidal rule)."""
     points = rule.points.copy()
     points[:, 0] = np.round(points[:, 0])
@@ -193,34 +201,36 @@ BEAM = register(
         name="3243",
         cell_type="line",
         node_slots=((0, 1, 2, 3),) * 2,
-        shape=_shape,
-        rules={"full": box_rule((5, 3, 3), RANGES), "3x2x2": box_rule((3, 2, 2), RANGES)},
-        curved_rule=box_rule((5, 3, 3), RANGES),
-        mass_rule=box_rule((4, 2, 2), RANGES),
+        shape=_shape_functions,
+        rules={"full": box_rule((5, 3, 3), PARENT_RANGES), "3x2x2": box_rule((3, 2, 2), PARENT_RANGES)},
+        curved_rule=box_rule((5, 3, 3), PARENT_RANGES),
+        mass_rule=box_rule((4, 2, 2), PARENT_RANGES),
         # degree 14 along a curved axis: two cubics, and det J0 of degree 8
-        curved_mass_rule=box_rule((8, 4, 4), RANGES),
+        curved_mass_rule=box_rule((8, 4, 4), PARENT_RANGES),
         vertices=np.array([(0.0, -0.5, -0.5), (0.0, 0.5, 0.5), (1.0, -0.5, 0.5), (1.0, 0.5, -0.5)]),
         affine=False,
-        parent=Parent(LOW, HIGH),
-        faces=box_corners(LOW, HIGH),
+        parent=ParentDomain(LOW, HIGH),
+        faces=box_faces(LOW, HIGH),
         face_rule=square_rule(5),
-        divisions=((2, 2), (2, 2), (6, 2), (6, 2), (6, 2), (6, 2)),
-        node_samples=np.array([[(x, y, z) for y, z in SECTION] for x in (0.0, 1.0)]),
-        vtk_subdivision=box_lattice(LOW, HIGH, (4, 1, 1)),
+        face_divisions=((2, 2), (2, 2), (6, 2), (6, 2), (6, 2), (6, 2)),
+        node_samples=np.array([[(x, y, z) for y, z in SECTION_CORNERS] for x in (0.0, 1.0)]),
+        vtk_subdivision=box_subdivision(LOW, HIGH, (4, 1, 1)),
         schemes={
             "tied": (
-                EnergyPart("axis", box_rule((3, 2, 2), RANGES), _axial_part, framed=True),
-                EnergyPart("section", at_ends(box_rule((2, 2, 2), RANGES)), _section_part, framed=True),
-                EnergyPart("D_nu", at_ends(box_rule((2, 1, 1), RANGES)), _poisson_part, framed=True),
-                EnergyPart("shear", box_rule((3, 2, 2), RANGES), _shear_part, tying=SHEAR),
+                EnergyPart("axis", box_rule((3, 2, 2), PARENT_RANGES), _axial_law, framed=True),
+                EnergyPart("section", end_point_rule(box_rule((2, 2, 2), PARENT_RANGES)), _section_law, framed=True),
+                EnergyPart(
+                    "D_nu", end_point_rule(box_rule((2, 1, 1), PARENT_RANGES)), _normal_coupling_law, framed=True
+                ),
+                EnergyPart("shear", box_rule((3, 2, 2), PARENT_RANGES), _shear_law, tying=SHEAR_TYING),
             ),
             "split": (
-                EnergyPart("D0", box_rule((3, 2, 2), RANGES), _poisson_free, framed=True),
-                EnergyPart("D_nu", box_rule((3, 1, 1), RANGES), _poisson_part, framed=True),
+                EnergyPart("D0", box_rule((3, 2, 2), PARENT_RANGES), _uncoupled_law, framed=True),
+                EnergyPart("D_nu", box_rule((3, 1, 1), PARENT_RANGES), _normal_coupling_law, framed=True),
             ),
         },
         output_schemes={
-            "shear stress": (EnergyPart("shear", box_rule((3, 2, 2), RANGES), _shear_stress, framed=True),)
+            "shear stress": (EnergyPart("shear", box_rule((3, 2, 2), PARENT_RANGES), _shear_output_law, framed=True),)
         },
         slot_sets={"axis": (1,), "section": (2, 3)},
         spin_vectors=2,

@@ -40,32 +40,32 @@ import numpy as np
 
 from ..materials import Material
 from .ancf import nodal_basis, nodal_functions, to_node_axes
-from .ancf_beam import box_corners, box_lattice, svk_only
-from .family import EnergyPart, Family, Parent, Tying, register
+from .ancf_beam import box_faces, box_subdivision, svk_only
+from .family import AssumedStrain, EnergyPart, Family, ParentDomain, register
 from .quadrature import Rule, box_rule, square_rule
 
-__all__ = ["POWERS", "SHELL"]
+__all__ = ["SHELL", "SHELL_EXPONENTS"]
 
 # exponents of (xi, eta, zeta) in Paper I's order with u = xi, w = eta, v = zeta
-POWERS = np.array(
+SHELL_EXPONENTS = np.array(
     [(0, 0, 0), (1, 0, 0), (0, 0, 1), (0, 1, 0), (1, 1, 0), (0, 1, 1), (1, 0, 1), (2, 0, 0), (0, 2, 0), (3, 0, 0)]
     + [(0, 3, 0), (2, 1, 0), (1, 2, 0), (1, 1, 1), (3, 1, 0), (1, 3, 0)]
 )
-NODES = np.array([(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (1.0, 1.0, 0.0), (0.0, 1.0, 0.0)])
+SHELL_NODES = np.array([(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (1.0, 1.0, 0.0), (0.0, 1.0, 0.0)])
 LOW, HIGH = (0.0, 0.0, -0.5), (1.0, 1.0, 0.5)
-RANGES = tuple(zip(LOW, HIGH))
+PARENT_RANGES = tuple(zip(LOW, HIGH))
 
 
 @functools.cache
-def _inverse() -> np.ndarray:
-    return nodal_basis(POWERS, NODES)
+def _inverse_nodal_basis() -> np.ndarray:
+    return nodal_basis(SHELL_EXPONENTS, SHELL_NODES)
 
 
-def _shape(xi: np.ndarray, nodes: np.ndarray, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return to_node_axes(*nodal_functions(POWERS, _inverse(), xi), frames)
+def _shape_functions(xi: np.ndarray, nodes: np.ndarray, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return to_node_axes(*nodal_functions(SHELL_EXPONENTS, _inverse_nodal_basis(), xi), frames)
 
 
-def _plane_stress(material: Material) -> tuple[str, tuple[float, ...]]:
+def _plane_stress_law(material: Material) -> tuple[str, tuple[float, ...]]:
     """Part integrated through the thickness: plane stress, without thickness strain and transverse shear."""
     m = svk_only(material)
     _, mu = m.lame
@@ -73,14 +73,14 @@ def _plane_stress(material: Material) -> tuple[str, tuple[float, ...]]:
     return "orthotropic", (c, c, 0.0, 0.0, 0.0, m.nu * c, 0.0, 0.0, mu)
 
 
-def _thickness_part(material: Material) -> tuple[str, tuple[float, ...]]:
+def _thickness_law(material: Material) -> tuple[str, tuple[float, ...]]:
     """Remainder, (d/2) (E_33 + k (E_11 + E_22))^2 with d = lambda + 2 mu and k = nu/(1 - nu): 0 in plane stress."""
     lam, mu = svk_only(material).lame
     return "assumed_strain", (lam + 2.0 * mu,)
 
 
-def _thickness_stress(material: Material) -> tuple[str, tuple[float, ...]]:
-    """Law of `_thickness_part` at points, for stress output."""
+def _thickness_output_law(material: Material) -> tuple[str, tuple[float, ...]]:
+    """Law of `_thickness_law` at points, for stress output."""
     m = svk_only(material)
     lam, mu = m.lame
     c = m.E / (1.0 - m.nu * m.nu)
@@ -88,29 +88,29 @@ def _thickness_stress(material: Material) -> tuple[str, tuple[float, ...]]:
     return "orthotropic", (d - c, d - c, d, lam, lam, lam - m.nu * c, 0.0, 0.0, 0.0)
 
 
-def _shear_part(material: Material) -> tuple[str, tuple[float, ...]]:
+def _shear_law(material: Material) -> tuple[str, tuple[float, ...]]:
     """Transverse shear at tying points."""
     _, mu = svk_only(material).lame
     return "assumed_strain", (mu,)
 
 
-def _tie_weights(xi: np.ndarray) -> np.ndarray:
+def _tying_weights(xi: np.ndarray) -> np.ndarray:
     """(Q, 12) interpolation from the tying points: quadratic along a shear's own direction, linear across it."""
 
-    def across(x: np.ndarray) -> list[np.ndarray]:
+    def linear_basis(x: np.ndarray) -> list[np.ndarray]:
         return [1.0 - x, x]
 
-    def along(x: np.ndarray) -> list[np.ndarray]:
+    def quadratic_basis(x: np.ndarray) -> list[np.ndarray]:
         return [(1.0 - x) * (1.0 - 2.0 * x), 4.0 * x * (1.0 - x), x * (2.0 * x - 1.0)]
 
     x, y = xi[:, 0], xi[:, 1]
-    first = [a * b for b in across(y) for a in along(x)]
-    second = [a * b for a in across(x) for b in along(y)]
+    first = [a * b for b in linear_basis(y) for a in quadratic_basis(x)]
+    second = [a * b for a in linear_basis(x) for b in quadratic_basis(y)]
     return np.stack(first + second, axis=1)
 
 
 def _corner_weights(xi: np.ndarray) -> np.ndarray:
-    """(Q, 4) bilinear interpolation from the corners, in the order of `CORNERS`."""
+    """(Q, 4) bilinear interpolation from the corners, in the order of `CORNER_RULE`."""
     x, y = xi[:, 0], xi[:, 1]
     return np.stack([(1.0 - x) * (1.0 - y), (1.0 - x) * y, x * (1.0 - y), x * y], axis=1)
 
@@ -121,8 +121,8 @@ def _shear_coupling(
     """A (E, 12, 12) of (mu/2) e.A e = (5/6) (mu/2) int e_a e_b (g^ab g^33 + g^a3 g^b3) dV, with e interpolated."""
     g = np.linalg.inv(np.swapaxes(J, 2, 3) @ J)
     metric = g[:, :, :2, :2] * g[:, :, 2, 2][:, :, None, None] + g[:, :, :2, 2, None] * g[:, :, None, :2, 2]
-    D = SHEAR.pairs[:, 0]
-    N = _tie_weights(rule.points)
+    D = SHEAR_TYING.pairs[:, 0]
+    N = _tying_weights(rule.points)
     w = 5.0 / 6.0 * det * rule.weights
     return np.einsum("eq,qs,qt,eqst->est", w, N, N, metric[:, :, D[:, None], D[None, :]], optimize=True)
 
@@ -137,7 +137,7 @@ def _thickness_coupling(
     return np.einsum("eq,qs,qt->est", det * rule.weights, theta, theta)
 
 
-SHEAR = Tying(
+SHEAR_TYING = AssumedStrain(
     points=np.array(
         [(x, y, 0.0) for y in (0.0, 1.0) for x in (0.0, 0.5, 1.0)]
         + [(x, y, 0.0) for x in (0.0, 1.0) for y in (0.0, 0.5, 1.0)]
@@ -147,44 +147,46 @@ SHEAR = Tying(
     width=12,
 )
 
-CORNERS = Rule("corners", NODES[[0, 3, 1, 2]], np.full(4, 0.25), 1, (2, 2, 1))
-SURFACE = box_rule((2, 2, 1), RANGES)  # exact for the derivatives of the cubic functions over any flat quad
-THICKNESS = Tying(
-    points=np.vstack([CORNERS.points, np.repeat(SURFACE.points, 2, axis=0)]),
+CORNER_RULE = Rule("corners", SHELL_NODES[[0, 3, 1, 2]], np.full(4, 0.25), 1, (2, 2, 1))
+SURFACE_RULE = box_rule((2, 2, 1), PARENT_RANGES)  # exact for the derivatives of the cubic functions over any flat quad
+THICKNESS_TYING = AssumedStrain(
+    points=np.vstack([CORNER_RULE.points, np.repeat(SURFACE_RULE.points, 2, axis=0)]),
     pairs=np.array([(2, 2)] * 4 + [(0, 0), (1, 1)] * 4),
     coupling=_thickness_coupling,
     width=12,
-    uses=("nu",),
+    material_constants=("nu",),
 )
-_SIDES = box_corners(LOW, HIGH)
+_BOX_FACES = box_faces(LOW, HIGH)
 
 SHELL = register(
     Family(
         name="3443",
         cell_type="quad",
         node_slots=((0, 1, 2, 3),) * 4,
-        shape=_shape,
-        rules={"full": box_rule((4, 4, 2), RANGES)},
-        curved_rule=box_rule((4, 4, 2), RANGES),
-        mass_rule=box_rule((4, 4, 2), RANGES),
-        curved_mass_rule=box_rule((8, 8, 3), RANGES),
-        vertices=NODES,
+        shape=_shape_functions,
+        rules={"full": box_rule((4, 4, 2), PARENT_RANGES)},
+        curved_rule=box_rule((4, 4, 2), PARENT_RANGES),
+        mass_rule=box_rule((4, 4, 2), PARENT_RANGES),
+        curved_mass_rule=box_rule((8, 8, 3), PARENT_RANGES),
+        vertices=SHELL_NODES,
         affine=False,
-        parent=Parent(LOW, HIGH),
+        parent=ParentDomain(LOW, HIGH),
         # bottom, top, then the strips over the edges 01, 12, 23, 30 of the quad
-        faces=(_SIDES[4], _SIDES[5], _SIDES[2], _SIDES[1], _SIDES[3], _SIDES[0]),
+        faces=(_BOX_FACES[4], _BOX_FACES[5], _BOX_FACES[2], _BOX_FACES[1], _BOX_FACES[3], _BOX_FACES[0]),
         face_rule=square_rule(5),
-        divisions=((3, 3), (3, 3), (3, 2), (3, 2), (3, 2), (2, 3)),
-        node_samples=NODES[:, None] + np.array([(0.0, 0.0, -0.5), (0.0, 0.0, 0.5)]),
-        vtk_subdivision=box_lattice(LOW, HIGH, (2, 2, 1)),
+        face_divisions=((3, 3), (3, 3), (3, 2), (3, 2), (3, 2), (2, 3)),
+        node_samples=SHELL_NODES[:, None] + np.array([(0.0, 0.0, -0.5), (0.0, 0.0, 0.5)]),
+        vtk_subdivision=box_subdivision(LOW, HIGH, (2, 2, 1)),
         schemes={
             "tied": (
-                EnergyPart("surface", box_rule((4, 4, 2), RANGES), _plane_stress, framed=True),
-                EnergyPart("thickness", SURFACE, _thickness_part, framed=True, tying=THICKNESS),
-                EnergyPart("shear", box_rule((4, 4, 2), RANGES), _shear_part, tying=SHEAR),
+                EnergyPart("surface", box_rule((4, 4, 2), PARENT_RANGES), _plane_stress_law, framed=True),
+                EnergyPart("thickness", SURFACE_RULE, _thickness_law, framed=True, tying=THICKNESS_TYING),
+                EnergyPart("shear", box_rule((4, 4, 2), PARENT_RANGES), _shear_law, tying=SHEAR_TYING),
             ),
         },
-        output_schemes={"thickness stress": (EnergyPart("thickness", CORNERS, _thickness_stress, framed=True),)},
+        output_schemes={
+            "thickness stress": (EnergyPart("thickness", CORNER_RULE, _thickness_output_law, framed=True),)
+        },
         slot_sets={"surface": (1, 2), "director": (3,)},
         spin_vectors=1,
         solid=False,

@@ -15,35 +15,36 @@ import itertools
 import numpy as np
 
 from .ancf import monomials, nodal_basis, nodal_functions, to_node_axes
-from .ancf_beam import box_lattice
-from .family import Family, Parent, register
-from .lagrange import CORNERS, FACES, QUADRATIC, TET_SIDES
+from .ancf_beam import box_subdivision
+from .family import Family, ParentDomain, register
+from .lagrange import QUADRATIC_SUBDIVISION, TET_CORNERS, TET_FACE_CORNERS, TET_FACES
 from .quadrature import TET_RULES, box_rule, conical_tet, conical_triangle, square_rule
 
-__all__ = ["BRICK", "CORNERS", "ENMC", "FACES", "FN", "FN18", "tet_functions"]
+__all__ = ["BRICK", "ENMC", "FN", "FN18", "TET_CORNERS", "TET_FACES", "tet_functions"]
 
-GRADIENTS = {"gradients": (1, 2, 3), "gradient-x": (1,), "gradient-y": (2,), "gradient-z": (3,)}
-CENTROIDS = np.array([CORNERS[list(f)].mean(axis=0) for f in FACES])
-CUBIC = np.array([p for p in itertools.product(range(4), repeat=3) if sum(p) <= 3])
-
-
-@functools.cache
-def _enmc_inverse() -> np.ndarray:
-    b, db = monomials(CUBIC, CORNERS)
-    corner = np.moveaxis(np.concatenate([b[:, :, None], db], axis=2), 1, 0).reshape(len(CUBIC), -1)
-    return np.linalg.inv(np.concatenate([corner, monomials(CUBIC, CENTROIDS)[0].T], axis=1))
+GRADIENT_SLOT_SETS = {"gradients": (1, 2, 3), "gradient-x": (1,), "gradient-y": (2,), "gradient-z": (3,)}
+FACE_CENTROIDS = np.array([TET_CORNERS[list(f)].mean(axis=0) for f in TET_FACES])
+CUBIC_EXPONENTS = np.array([p for p in itertools.product(range(4), repeat=3) if sum(p) <= 3])
+"""Exponents (20, 3) of the monomials of the complete cubic."""
 
 
 @functools.cache
-def _elimination(c: float) -> np.ndarray:
+def _enmc_inverse_basis() -> np.ndarray:
+    b, db = monomials(CUBIC_EXPONENTS, TET_CORNERS)
+    corner = np.moveaxis(np.concatenate([b[:, :, None], db], axis=2), 1, 0).reshape(len(CUBIC_EXPONENTS), -1)
+    return np.linalg.inv(np.concatenate([corner, monomials(CUBIC_EXPONENTS, FACE_CENTROIDS)[0].T], axis=1))
+
+
+@functools.cache
+def _centroid_elimination(c: float) -> np.ndarray:
     """(20, 16) ENMC slots from FN slots, in parent gradients."""
     out = np.vstack([np.eye(16), np.zeros((4, 16))])
-    for k, face in enumerate(FACES):
+    for k, face in enumerate(TET_FACES):
         for a in face:
             out[16 + k, 4 * a] = 1.0 / 3.0
             for b in face:
                 if b != a:
-                    out[16 + k, 4 * a + 1 : 4 * a + 4] += c * (CORNERS[b] - CORNERS[a])
+                    out[16 + k, 4 * a + 1 : 4 * a + 4] += c * (TET_CORNERS[b] - TET_CORNERS[a])
     return out
 
 
@@ -57,13 +58,13 @@ def tet_functions(xi: np.ndarray, elimination: float | None = None) -> tuple[np.
     Returns:
         s (Q, S) and ds/dxi (Q, S, 3), with S = 20 or 16.
     """
-    C = _enmc_inverse()
+    C = _enmc_inverse_basis()
     if elimination is not None:
-        C = _elimination(elimination).T @ C
-    return nodal_functions(CUBIC, C, xi)
+        C = _centroid_elimination(elimination).T @ C
+    return nodal_functions(CUBIC_EXPONENTS, C, xi)
 
 
-def _tet_shape(
+def _tet_shape_functions(
     elimination: float | None, xi: np.ndarray, nodes: np.ndarray, frames: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     s, ds = tet_functions(xi, elimination)
@@ -77,45 +78,47 @@ def _tet_shape(
     )
 
 
-def _tet(name: str, cell: str, elimination: float | None) -> Family:
-    points = np.vstack([CORNERS, CENTROIDS]) if elimination is None else CORNERS
+def _register_tet(name: str, cell: str, elimination: float | None) -> Family:
+    points = np.vstack([TET_CORNERS, FACE_CENTROIDS]) if elimination is None else TET_CORNERS
     return register(
         Family(
             name=name,
             cell_type=cell,
             node_slots=((0, 1, 2, 3),) * 4 + (((0,),) * 4 if elimination is None else ()),
-            shape=functools.partial(_tet_shape, elimination),
+            shape=functools.partial(_tet_shape_functions, elimination),
             rules={"tet14": TET_RULES["tet14"], "conical4": conical_tet(4)},
             curved_rule=TET_RULES["tet14"],
             mass_rule=conical_tet(4),
             # on a curved body the cubic map makes degree 12 with FN, degree 9 with the others
             curved_mass_rule=conical_tet(7) if name == "FN" else conical_tet(5),
-            vertices=CORNERS,
+            vertices=TET_CORNERS,
             affine=False,
-            parent=Parent(),
-            faces=TET_SIDES,
+            parent=ParentDomain(),
+            faces=TET_FACE_CORNERS,
             face_rule=conical_triangle(4),
-            divisions=((3, 3),) * 4,
+            face_divisions=((3, 3),) * 4,
             node_samples=points[:, None],
-            vtk_subdivision=QUADRATIC,
-            slot_sets=GRADIENTS,
+            vtk_subdivision=QUADRATIC_SUBDIVISION,
+            slot_sets=GRADIENT_SLOT_SETS,
         )
     )
 
 
-ENMC = _tet("ENMC", "tetra_faces", None)
-FN = _tet("FN", "tetra", 2.0 / 81.0)
-FN18 = _tet("FN18", "tetra", 1.0 / 18.0)
+ENMC = _register_tet("ENMC", "tetra_faces", None)
+FN = _register_tet("FN", "tetra", 2.0 / 81.0)
+FN18 = _register_tet("FN18", "tetra", 1.0 / 18.0)
 
-HEX = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)], dtype=float)
-HEX_SIDES = tuple(
-    HEX[list(f)] for f in ((0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7))
+HEX_NODES = np.array(
+    [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)], dtype=float
+)
+HEX_FACES = tuple(
+    HEX_NODES[list(f)] for f in ((0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7))
 )
 LOW, HIGH = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
-UNIT = tuple(zip(LOW, HIGH))
+UNIT_RANGES = tuple(zip(LOW, HIGH))
 
 
-def _brick_powers() -> np.ndarray:
+def _brick_exponents() -> np.ndarray:
     """Exponents (32, 3): the trilinear monomials, and for each direction its square and cube times the bilinear ones of
     the two others."""
     out = list(itertools.product((0, 1), repeat=3))
@@ -128,16 +131,16 @@ def _brick_powers() -> np.ndarray:
     return np.array(out)
 
 
-BRICK_POWERS = _brick_powers()
+BRICK_EXPONENTS = _brick_exponents()
 
 
 @functools.cache
-def _brick_inverse() -> np.ndarray:
-    return nodal_basis(BRICK_POWERS, HEX)
+def _brick_inverse_basis() -> np.ndarray:
+    return nodal_basis(BRICK_EXPONENTS, HEX_NODES)
 
 
-def _brick_shape(xi: np.ndarray, nodes: np.ndarray, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return to_node_axes(*nodal_functions(BRICK_POWERS, _brick_inverse(), xi), frames)
+def _brick_shape_functions(xi: np.ndarray, nodes: np.ndarray, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return to_node_axes(*nodal_functions(BRICK_EXPONENTS, _brick_inverse_basis(), xi), frames)
 
 
 BRICK = register(
@@ -145,19 +148,19 @@ BRICK = register(
         name="H3843",
         cell_type="hexahedron",
         node_slots=((0, 1, 2, 3),) * 8,
-        shape=_brick_shape,
-        rules={"3x3x3": box_rule((3, 3, 3), UNIT), "4x4x4": box_rule((4, 4, 4), UNIT)},
-        curved_rule=box_rule((4, 4, 4), UNIT),
-        mass_rule=box_rule((5, 5, 5), UNIT),
-        curved_mass_rule=box_rule((5, 5, 5), UNIT),
-        vertices=HEX[[0, 2, 5, 7]],
+        shape=_brick_shape_functions,
+        rules={"3x3x3": box_rule((3, 3, 3), UNIT_RANGES), "4x4x4": box_rule((4, 4, 4), UNIT_RANGES)},
+        curved_rule=box_rule((4, 4, 4), UNIT_RANGES),
+        mass_rule=box_rule((5, 5, 5), UNIT_RANGES),
+        curved_mass_rule=box_rule((5, 5, 5), UNIT_RANGES),
+        vertices=HEX_NODES[[0, 2, 5, 7]],
         affine=False,
-        parent=Parent(LOW, HIGH),
-        faces=HEX_SIDES,
+        parent=ParentDomain(LOW, HIGH),
+        faces=HEX_FACES,
         face_rule=square_rule(5),
-        divisions=((3, 3),) * 6,
-        node_samples=HEX[:, None],
-        vtk_subdivision=box_lattice(LOW, HIGH, (2, 2, 2)),
-        slot_sets=GRADIENTS,
+        face_divisions=((3, 3),) * 6,
+        node_samples=HEX_NODES[:, None],
+        vtk_subdivision=box_subdivision(LOW, HIGH, (2, 2, 2)),
+        slot_sets=GRADIENT_SLOT_SETS,
     )
 )

@@ -13,11 +13,21 @@ from ..base.errors import ModelError
 from ..base.names import did_you_mean
 from .quadrature import Rule
 
-__all__ = ["EnergyPart", "Family", "Parent", "Tying", "VtkSubdivision", "families", "for_cell", "get", "register"]
+__all__ = [
+    "AssumedStrain",
+    "EnergyPart",
+    "Family",
+    "ParentDomain",
+    "VtkSubdivision",
+    "families",
+    "family_for_cell",
+    "get_family",
+    "register",
+]
 
 
 @dataclass(frozen=True, eq=False)
-class Tying:
+class AssumedStrain:
     """Assumed strains e = 2 E_ab at tying points, and their energy (mu/2) e.A e in an element, J.
 
     Attributes:
@@ -26,14 +36,14 @@ class Tying:
         coupling: function (J0 at the points (E, n, 3, 3), J0 and det J0 at the part's rule (E, Q, 3, 3) and (E, Q), the
             rule, the material, the body's section) -> A (E, n, width).
         width: A couples the points of each run of `width` points.
-        uses: material constants in A.
+        material_constants: material constants in A.
     """
 
     points: np.ndarray
     pairs: np.ndarray
     coupling: Callable[[np.ndarray, np.ndarray, np.ndarray, Rule, Any, Any], np.ndarray]
     width: int
-    uses: tuple[str, ...] = ()
+    material_constants: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,11 +63,11 @@ class EnergyPart:
     rule: Rule
     law: Callable[[Any], tuple[str, tuple[float, ...]]] | None = None
     framed: bool = False
-    tying: Tying | None = None
+    tying: AssumedStrain | None = None
 
 
 @dataclass(frozen=True)
-class Parent:
+class ParentDomain:
     """The parent domain: the unit tetrahedron, or a box.
 
     Attributes:
@@ -72,7 +82,7 @@ class Parent:
         """(3,) parent coordinates of the middle."""
         return np.full(3, 0.25) if self.low is None else 0.5 * (np.array(self.low) + np.array(self.high))
 
-    def outside(self, xi: np.ndarray) -> np.ndarray:
+    def outside_distance(self, xi: np.ndarray) -> np.ndarray:
         """Outside distance of points (..., 3), (...,) in parent units; 0 inside."""
         if self.low is None:
             least = np.minimum(xi.min(axis=-1), 1.0 - xi.sum(axis=-1))
@@ -109,7 +119,7 @@ class Family:
         faces: parent corners of each face, (3, 3) triangles or (4, 3) quadrilaterals, outward; mesh cells of solids
             count their faces in the same order.
         face_rule: rule on the unit triangle or square, exact for a pressure on a flat face.
-        divisions: parts (a, b) into which each face is cut along its two sides for drawing; triangles take the first.
+        face_divisions: numbers (a, b) of parts of each face along its two sides for drawing; triangles take the first.
         node_samples: (n, k, 3) parent points at each element node where fields are evaluated for drawing.
         vtk_subdivision: drawing of an element in VTK.
         schemes: integrations of several parts by name; each force rule is also one of a single part.
@@ -130,10 +140,10 @@ class Family:
     curved_mass_rule: Rule
     vertices: np.ndarray
     affine: bool
-    parent: Parent
+    parent: ParentDomain
     faces: tuple[np.ndarray, ...]
     face_rule: Rule
-    divisions: tuple[tuple[int, int], ...]
+    face_divisions: tuple[tuple[int, int], ...]
     node_samples: np.ndarray
     vtk_subdivision: VtkSubdivision
     schemes: dict[str, tuple[EnergyPart, ...]] = field(default_factory=dict)
@@ -167,7 +177,7 @@ class Family:
         """True if nodes carry gradient slots."""
         return any(k > 0 for kinds in self.node_slots for k in kinds)
 
-    def kinds(self, names: str) -> set[int]:
+    def slot_kinds_of(self, names: str) -> set[int]:
         """Slot kinds of names joined by "+", e.g. "position+axis". Raises ModelError listing the names."""
         known = {"position": (0,), **self.slot_sets, "all": (0, 1, 2, 3)}
         out: set[int] = set()
@@ -241,14 +251,14 @@ def families() -> Sequence[str]:
     return tuple(_families)
 
 
-def get(name: str) -> Family:
+def get_family(name: str) -> Family:
     """The family `name`. Raises ModelError listing the names."""
     if name in _families:
         return _families[name]
     raise ModelError(f"element {name!r} is unknown; there are {', '.join(_families)}{did_you_mean(name, _families)}")
 
 
-def for_cell(cell_type: str) -> Family:
+def family_for_cell(cell_type: str) -> Family:
     """The default solid family of a cell type: the one with the fewest slots. Raises ModelError."""
     fits = [f for f in _families.values() if f.cell_type == cell_type and f.solid]
     if fits:

@@ -12,7 +12,7 @@ __all__ = [
     "TET_RULES",
     "Rule",
     "box_rule",
-    "composite",
+    "composite_rule",
     "conical_tet",
     "conical_triangle",
     "lobatto_square",
@@ -43,7 +43,7 @@ class Rule:
     counts: tuple[int, ...] = ()
 
     @property
-    def radial(self) -> bool:
+    def points_on_medians(self) -> bool:
         """True if a tetrahedron's rule has a point on each line from the centroid to vertices 0-3, in this order.
 
         The centroid may precede them.
@@ -56,7 +56,7 @@ class Rule:
         return bool(near != 0.0 and np.allclose(own[-4:], towards, 0, 1e-14) and np.allclose(own[:-4], 0.25, 0, 1e-14))
 
 
-def _barycentric(name: str, degree: int, orbits: list[tuple[float, np.ndarray]]) -> Rule:
+def _rule_from_orbits(name: str, degree: int, orbits: list[tuple[float, np.ndarray]]) -> Rule:
     """Rule on the tetrahedron from orbits (weight of a point over the volume, barycentric points (n, 4))."""
     points = np.concatenate([bary[:, 1:] for _, bary in orbits])
     weights = np.concatenate([np.full(len(bary), w / 6.0) for w, bary in orbits])
@@ -81,12 +81,12 @@ def _orbit6(a: float) -> np.ndarray:
 def _tet8() -> Rule:
     """Eight points, degree 3, positive weights, interior (Jaskowiec and Sukumar, symmetric tetrahedron rules, 2020)."""
     orbits = [(0.1385279665118621, _orbit4(0.3280546967114266)), (0.1114720334881379, _orbit4(0.1069522739329306))]
-    return _barycentric("tet8", 3, orbits)
+    return _rule_from_orbits("tet8", 3, orbits)
 
 
 def _tet14() -> Rule:
     """Walkington's 14 points, degree 5, positive weights (J. N. Walkington, quadrature on simplices, 2000)."""
-    return _barycentric(
+    return _rule_from_orbits(
         "tet14",
         5,
         [
@@ -99,15 +99,15 @@ def _tet14() -> Rule:
 
 TET_RULES: dict[str, Rule] = {
     "tet1": Rule("tet1", np.full((1, 3), 0.25), np.array([1.0 / 6.0]), 1),
-    "tet4": _barycentric("tet4", 2, [(0.25, _orbit4((5.0 - np.sqrt(5.0)) / 20.0))]),
+    "tet4": _rule_from_orbits("tet4", 2, [(0.25, _orbit4((5.0 - np.sqrt(5.0)) / 20.0))]),
     # Paper I's rule, Eq. (11); its negative weight makes the T10 mass matrix indefinite
-    "tet5_paper": _barycentric("tet5_paper", 3, [(-0.8, np.full((1, 4), 0.25)), (0.45, _orbit4(1.0 / 6.0))]),
+    "tet5_paper": _rule_from_orbits("tet5_paper", 3, [(-0.8, np.full((1, 4), 0.25)), (0.45, _orbit4(1.0 / 6.0))]),
     "tet8": _tet8(),
     "tet14": _tet14(),
 }
 
 
-def _gauss(n: int, alpha: int) -> tuple[np.ndarray, np.ndarray]:
+def _gauss_jacobi(n: int, alpha: int) -> tuple[np.ndarray, np.ndarray]:
     """Gauss-Jacobi points and weights (n,) on [0, 1] for the weight function (1 - x)^alpha."""
     x, w = roots_jacobi(n, alpha, 0)
     return (1.0 + x) / 2.0, w / 2.0 ** (alpha + 1)
@@ -116,7 +116,7 @@ def _gauss(n: int, alpha: int) -> tuple[np.ndarray, np.ndarray]:
 @functools.cache
 def conical_tet(n: int) -> Rule:
     """Conical product rule (Stroud 1971): n^3 points, positive weights, degree 2n - 1."""
-    (a, wa), (b, wb), (c, wc) = _gauss(n, 2), _gauss(n, 1), _gauss(n, 0)
+    (a, wa), (b, wb), (c, wc) = _gauss_jacobi(n, 2), _gauss_jacobi(n, 1), _gauss_jacobi(n, 0)
     A, B, C = np.meshgrid(a, b, c, indexing="ij")
     points = np.stack([A, B * (1 - A), C * (1 - A) * (1 - B)], axis=-1).reshape(-1, 3)
     weights = np.einsum("i,j,k->ijk", wa, wb, wc).ravel()
@@ -126,7 +126,7 @@ def conical_tet(n: int) -> Rule:
 @functools.cache
 def conical_triangle(n: int) -> Rule:
     """Conical product rule on the triangle: n^2 points, positive weights, degree 2n - 1."""
-    (a, wa), (b, wb) = _gauss(n, 1), _gauss(n, 0)
+    (a, wa), (b, wb) = _gauss_jacobi(n, 1), _gauss_jacobi(n, 0)
     A, B = np.meshgrid(a, b, indexing="ij")
     points = np.stack([A, B * (1 - A)], axis=-1).reshape(-1, 2)
     return Rule(f"conical_triangle{n}", points, np.einsum("i,j->ij", wa, wb).ravel(), 2 * n - 1)
@@ -179,7 +179,7 @@ def triangle_16() -> Rule:
 Ranges = tuple[tuple[float, float], ...]
 
 
-def _product(name: str, counts: tuple[int, ...], ranges: Ranges) -> Rule:
+def _gauss_product_rule(name: str, counts: tuple[int, ...], ranges: Ranges) -> Rule:
     points, weights = [], []
     for n, (low, high) in zip(counts, ranges):
         x, w = np.polynomial.legendre.leggauss(n)
@@ -195,13 +195,13 @@ def _product(name: str, counts: tuple[int, ...], ranges: Ranges) -> Rule:
 @functools.cache
 def box_rule(counts: tuple[int, int, int], ranges: Ranges) -> Rule:
     """Product Gauss rule on a box, named e.g. "3x2x2"; a single point lies in the middle, its weight is the length."""
-    return _product("x".join(map(str, counts)), counts, ranges)
+    return _gauss_product_rule("x".join(map(str, counts)), counts, ranges)
 
 
 @functools.cache
 def square_rule(n: int) -> Rule:
     """Product Gauss rule of n^2 points on the unit square."""
-    return _product(f"square{n}", (n, n), ((0.0, 1.0), (0.0, 1.0)))
+    return _gauss_product_rule(f"square{n}", (n, n), ((0.0, 1.0), (0.0, 1.0)))
 
 
 @functools.cache
@@ -215,7 +215,7 @@ def lobatto_square(n: int) -> Rule:
     return Rule(f"lobatto{n}", grid, np.outer(w, w).ravel(), 2 * n - 3, (n, n))
 
 
-def composite(rule: Rule, parts: int) -> Rule:
+def composite_rule(rule: Rule, parts: int) -> Rule:
     """Composite rule: a rule on the unit square or triangle on parts x parts equal parts, for integrands with kinks."""
     if parts == 1:
         return rule

@@ -12,8 +12,8 @@ import scipy.sparse as sp
 from .. import elements as families
 from ..base.errors import MeshError, ModelError
 from ..elements import EnergyPart, Rule
-from ..elements.family import Tying
-from ..elements.quadrature import composite
+from ..elements.family import AssumedStrain
+from ..elements.quadrature import composite_rule
 from ..kernels.elements.materials import NCOEF
 from ..materials import Material
 from .discretisation import Discretisation, element_functions
@@ -69,12 +69,12 @@ class BlockKey:
     def output_scheme(self) -> str | None:
         """Integration of stress output in place of a tied part, if the family has one."""
         name = f"{self.integral.name} stress"
-        return name if name in families.get(self.family).output_schemes else None
+        return name if name in families.get_family(self.family).output_schemes else None
 
     @property
     def integral(self) -> EnergyPart:
         """Part of the strain energy integrated by the block."""
-        return families.get(self.family).scheme(self.scheme)[self.part]
+        return families.get_family(self.family).scheme(self.scheme)[self.part]
 
     @property
     def rule(self) -> Rule:
@@ -84,12 +84,12 @@ class BlockKey:
     @property
     def vertex(self) -> bool:
         """True if kernels/elements/vertex.py applies: straight T10 with points on lines to the vertices."""
-        family = families.get(self.family)
+        family = families.get_family(self.family)
         quadratic = family.cell_type == "tetra10" and family.slots == 10
-        return self.affine and quadratic and not self.framed and self.rule.radial
+        return self.affine and quadratic and not self.framed and self.rule.points_on_medians
 
     @property
-    def tying(self) -> Tying | None:
+    def tying(self) -> AssumedStrain | None:
         """Tying of assumed strains of parts that have them; else None."""
         return self.integral.tying
 
@@ -342,7 +342,9 @@ def facet_tables(surface: SurfaceSet, parts: int = 1, rules: Mapping[int, Rule] 
     """
     body, faces = surface.body, surface.faces
     kinds = [int(face) for face in np.unique(faces[:, 1])]
-    rule = {k: composite(rules[len(body.family.faces[k])] if rules else body.family.face_rule, parts) for k in kinds}
+    rule = {
+        k: composite_rule(rules[len(body.family.faces[k])] if rules else body.family.face_rule, parts) for k in kinds
+    }
     Q, S = max((len(r.weights) for r in rule.values()), default=0), body.family.slots
     values = np.zeros((3, len(faces), Q, S))
     weights = np.zeros((len(faces), Q))

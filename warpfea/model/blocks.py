@@ -120,7 +120,7 @@ def build_block(
     model: Any, key: assembly.BlockKey, parts: list[assembly.HostBlock], contribution: int, element: int, history: int
 ) -> Block:
     """Block of a key; offsets of its contributions, elements and strain history."""
-    family = elements.get(key.family)
+    family = elements.get_family(key.family)
     conn = np.concatenate([p.conn + p.body.slot_offset for p in parts])
     data = (assumed_strain_struct if key.tying else block_struct)(model.dtype)()
     data.conn = model.array("elements", conn.T, wp.int32)
@@ -198,7 +198,7 @@ def _tied_tables(model: Any, data: Any, key: assembly.BlockKey, parts: list[asse
 def _point_tables(model: Any, data: Any, key: assembly.BlockKey, parts: list[assembly.HostBlock]) -> np.ndarray | None:
     """Gradients, weights, maps and axes at the points of elements; det J0 if the mass is det J0 times a table."""
     T, vec3, mat33 = model.types.T, model.types.vec3, model.types.mat33
-    family, rule = elements.get(key.family), key.rule
+    family, rule = elements.get_family(key.family), key.rule
     Q = len(rule.weights)
     points = np.vstack([rule.points, family.vertices])
     h, w, J0, axes = [], [], [], []

@@ -152,7 +152,7 @@ def support_slots(nodes: NodeSet, which: str) -> np.ndarray:
     """Body slots of a node set, of the named kinds (see Family.kinds)."""
     body = nodes.body
     try:
-        kinds = body.family.kinds(which)
+        kinds = body.family.slot_kinds_of(which)
     except ModelError as error:
         raise ModelError(f"body {body.name!r}: {error}") from None
     first = body.node_slot[nodes.indices]

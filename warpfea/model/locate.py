@@ -47,9 +47,9 @@ def locate(body: Discretisation, X: Any, slack: float = 1e-9) -> MaterialPoint:
                 break
         s, _ = _shape_at_own_points(body, near, xi)
         miss = np.linalg.norm(np.einsum("es,esk->ek", s, E) - x, axis=1) / size
-        outside = parent.outside(xi) + miss
-        k = int(np.argmin(outside))
-        best = (float(outside[k]), int(near[k]), xi[k])
+        outside_distance = parent.outside_distance(xi) + miss
+        k = int(np.argmin(outside_distance))
+        best = (float(outside_distance[k]), int(near[k]), xi[k])
     if best[0] > max(slack, 1e-12 * float(np.abs(x).max()) / size):
         low, high = body.mesh.bounding_box()
         raise ModelError(

@@ -11,7 +11,7 @@ import warp as wp
 
 from ..base.devices import find_device
 from ..base.errors import ModelError
-from ..base.memory import enough_memory
+from ..base.memory import convert_memory_errors
 from ..kernels.common.types import precision
 from ..kernels.elements.materials import DEFINED_FOR_ANY_J, NCOEF
 from . import assembly
@@ -87,7 +87,7 @@ class Model:
         self.cache: dict[str, Any] = {}
         self.parameters = MaterialParameters(self)
         self._source, self._tables = builder, tables
-        with enough_memory(f"a model with {self.worlds} worlds", self.device):
+        with convert_memory_errors(f"a model with {self.worlds} worlds", self.device):
             self._build(builder, tables)
 
     def resized(self, worlds: int, dtype: str | None = None) -> Model:

@@ -11,8 +11,8 @@ import numpy as np
 
 from ..base.errors import CheckpointError, ModelError
 from ..base.names import listing
-from ..base.worlds import per_world, refuse
-from ..materials import DENSITIES, LIMITS, Material
+from ..base.worlds import check_values_per_world, values_per_world
+from ..materials import ADMISSIBLE_VALUES, DENSITY_CONSTANTS, Material
 from . import assembly
 from .blocks import Block, output_rows
 from .contact_points import Modulus, effective_modulus
@@ -110,8 +110,8 @@ class MaterialParameters:
         if what in DAMPING_CONSTANTS:
             return f"the material {kinds} has no damping, so its kernels were left out; give it KelvinVoigt(eta=0)"
         for law in laws:
-            if what in {"E", "nu", *law.own} - set(law.constants):
-                made = [constant for constant in law.constants if constant not in DENSITIES]
+            if what in {"E", "nu", *law.constant_names} - set(law.constants):
+                made = [constant for constant in law.constants if constant not in DENSITY_CONSTANTS]
                 other = "from_E_nu" if what in ("E", "nu") else "its constructor"
                 return f"the material {type(law).__name__} was made of {listing(made)}; {other} takes {what!r}"
         return None
@@ -160,10 +160,10 @@ class MaterialParameters:
 
     def _set(self, owner: str, members: list[Owner], name: str, values: Any, mask: np.ndarray) -> None:
         """Set a constant of some materials to values (worlds,) in the chosen worlds."""
-        wanted = per_world(owner, name, values, self.model.worlds)
-        good, text = LIMITS.get(name, (np.isfinite, "finite"))
-        refuse(owner, name, wanted, ~mask | (np.isfinite(wanted) & good(wanted)), text)
-        if name in DENSITIES:
+        wanted = values_per_world(owner, name, values, self.model.worlds)
+        good, text = ADMISSIBLE_VALUES.get(name, (np.isfinite, "finite"))
+        check_values_per_world(owner, name, wanted, ~mask | (np.isfinite(wanted) & good(wanted)), text)
+        if name in DENSITY_CONSTANTS:
             self._refuse_density(f"{owner}.{name}", [body for body, _ in members])
         keys = [(self._index(body), k, name) for body, k in members]
         if self.simulated and any(key not in self.values for key in keys):
@@ -190,7 +190,7 @@ class MaterialParameters:
                 f"set_parameter: {name!r} can't be set: all worlds share what add_body_force does to a body, which is "
                 "per mass; build a model of its own for another density"
             )
-        if self.model.terms.dead.gravity_law is not None:
+        if self.model.terms.dead_loads.gravity_law is not None:
             raise ModelError(
                 f"set_parameter: {name!r} can't be set: all worlds share the weights of a time law of gravity; take "
                 "constant gravity, which set_gravity sets in each world"
@@ -201,7 +201,7 @@ class MaterialParameters:
     def _update_tables(self, members: list[Owner], name: str, mask: np.ndarray) -> None:
         """Update the device tables of some materials."""
         m = self.model
-        if name in DENSITIES:
+        if name in DENSITY_CONSTANTS:
             keys = [(self._index(body), k) for body, k in members]
             m.masses.set_densities({key: self.values[(*key, name)] for key in keys})
             return
@@ -215,7 +215,7 @@ class MaterialParameters:
                 _, values = assembly.law_and_coefficients(part.key.integral, material)
                 m.coefficient_table[:, part.coefficient_row] = assembly.coefficient_rows(values, material, m.worlds)
             tying = block.key.tying
-            if mine and tying and name in tying.uses:
+            if mine and tying and name in tying.material_constants:
                 self._update_couplings(block, mask)
             if mine and block.stress_output:
                 block.stress_output.data.coefficients = m.array("output", output_rows(m, block), m.types.T)
@@ -240,7 +240,9 @@ class MaterialParameters:
         row = 0
         for part in block.host_blocks:
             owner = self._index(part.body), part.material
-            own = {name: self.values[(*owner, name)] for name in tying.uses if (*owner, name) in self.values}
+            own = {
+                name: self.values[(*owner, name)] for name in tying.material_constants if (*owner, name) in self.values
+            }
             numbers = [tuple(float(values[world]) for values in own.values()) for world in worlds]
             distinct = {key: k for k, key in enumerate(dict.fromkeys(numbers))}
             material = part.body.materials[part.material][1]
@@ -300,7 +302,7 @@ class MaterialParameters:
                 "before the Simulation of both or of none"
             )
         for name, values in saved.items():
-            good, _ = LIMITS.get(name.rsplit(".", 1)[1], (np.isfinite, ""))
+            good, _ = ADMISSIBLE_VALUES.get(name.rsplit(".", 1)[1], (np.isfinite, ""))
             if values.shape != (self.model.worlds,) or not np.all(np.isfinite(values) & good(values)):
                 raise CheckpointError(f"the values of {name!r} are damaged")
 

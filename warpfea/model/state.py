@@ -13,8 +13,8 @@ import numpy as np
 import warp as wp
 
 from ..base.errors import CheckpointError, ModelError
-from ..base.memory import enough_memory
-from ..base.short_repr import lines
+from ..base.memory import convert_memory_errors
+from ..base.short_repr import truncated_lines
 from ..kernels.common.state import state_kernels
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ class State:
 
     def __repr__(self) -> str:
         worlds = f"{self.worlds} world{'s' * (self.worlds != 1)}"
-        return lines(f"State({worlds} on {self.device}: {', '.join(self.specs)})")
+        return truncated_lines(f"State({worlds} on {self.device}: {', '.join(self.specs)})")
 
     def __getattr__(self, name: str) -> wp.array:
         arrays = self.__dict__.get("_arrays", {})
@@ -92,7 +92,7 @@ class State:
         if row % 4:
             raise ModelError(f"state array {name!r}: a row has {row} bytes, which is no multiple of 4")
         shape = (self.worlds, *spec.shape)
-        with enough_memory(f"state array {name!r} of {' x '.join(map(str, shape))} items", self.device):
+        with convert_memory_errors(f"state array {name!r} of {' x '.join(map(str, shape))} items", self.device):
             array = wp.zeros(shape, dtype=dtype, device=self.device)
             values = np.asarray(initial)
             if values.ndim or values != 0:
@@ -117,7 +117,7 @@ class State:
         """Copy of the state with the same registry."""
         out = State(self.worlds, self.device)
         out.specs = dict(self.specs)
-        with enough_memory(f"a copy of a state with {self.worlds} worlds", self.device):
+        with convert_memory_errors(f"a copy of a state with {self.worlds} worlds", self.device):
             out._arrays = {name: wp.clone(array) for name, array in self._arrays.items()}
         return out
 

@@ -210,7 +210,7 @@ def make_skin(body: Discretisation) -> Skin:
     triangles = []
     for face, rows in _rows_by_local_face(body.boundary):
         corners = body.family.faces[face]
-        ab, cut = _subdivide(len(corners), body.family.divisions[face])
+        ab, cut = _subdivide(len(corners), body.family.face_divisions[face])
         xi, _ = body.family.face_points(face, ab)
         number = points.add(body.boundary[rows, 0], xi, 0 if body.family.solid else face + 1)
         triangles.append(number[:, cut].reshape(-1, 3))

@@ -27,7 +27,7 @@ def make_topology(model: Any) -> Any:
     topo.mass_value = model.masses.values
     topo.free = model.array("slots", model.free_host, model.types.vec3)
     topo.prescribed_bits = model.array("slots", (model.free_host == 0.0) @ [1, 2, 4], wp.uint8)
-    model.terms.join(topo)
+    model.terms.add_pool_topology(topo)
     return topo
 
 

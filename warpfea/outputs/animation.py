@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from warpfea.base.writer import progress_bar, write_whole
+from warpfea.base.writer import progress_bar, write_atomically
 from warpfea.outputs.colormap import map_colors
 from warpfea.outputs.obstacles import OBSTACLE_COLOR, clip_to_box
 from warpfea.outputs.raycaster import Camera, Image, Renderer, to_z_up
@@ -150,7 +150,7 @@ class Animation:
         from PIL import Image as Pictures
 
         image = next(self.draw(size, view, [len(self.frames) - 1], ground))
-        write_whole(target, lambda path: Pictures.fromarray(image).save(path, format="PNG"))
+        write_atomically(target, lambda path: Pictures.fromarray(image).save(path, format="PNG"))
 
     def save_gif(
         self,
@@ -176,7 +176,7 @@ class Animation:
         def save(path: pathlib.Path) -> None:
             pictures[0].save(path, format="GIF", save_all=True, append_images=pictures[1:], duration=durations, loop=0)
 
-        write_whole(target, save)
+        write_atomically(target, save)
 
 
 def draw_labels(image: Image, time: str, bar: tuple[float, float, str, str] | None) -> Image:

@@ -133,7 +133,7 @@ class PNGWriter(_PictureWriter):
             path, field=field, size=size, view=view, color_range=color_range, spacing=spacing, ground=ground
         )
         self.time = time
-        self.moments = () if time is None else (time,)
+        self.output_times = () if time is None else (time,)
 
     def write(self, sim: Any) -> None:
         if self._animation is None or self.time is None or self._animation.frames:

@@ -26,7 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from warpfea.base.errors import ModelError, OutputError
-from warpfea.base.writer import Output, check_target, temporary_beside
+from warpfea.base.writer import Output, check_target, temporary_path
 from warpfea.outputs.colormap import map_colors
 from warpfea.outputs.frames import (
     DrawnSurface,
@@ -110,7 +110,7 @@ class USDWriter(Output):
         self._field_ranges = {name: (np.inf, -np.inf) for name in self.fields}
         self._bounding_box = (np.full(3, np.inf), np.full(3, -np.inf))
         self._unsaved_bytes = 0
-        self._temporary = temporary_beside(target)
+        self._temporary = temporary_path(target)
         extending = self.extend and target.is_file()
         try:
             if extending:

@@ -14,7 +14,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from warpfea.base.errors import OutputError
-from warpfea.base.writer import Output, check_folder, write_whole
+from warpfea.base.writer import Output, check_folder, write_atomically
 from warpfea.model.surfaces import reference_points
 from warpfea.outputs.frames import FrameClock, check_fields, frame_time
 from warpfea.outputs.obstacles import Obstacles
@@ -166,7 +166,7 @@ class VTUWriter(Output):
             for world in range(int(sim.model.worlds)):
                 file = f"{name}_{world:04d}_{frame:06d}.vtu"
                 of_world = {key: np.ascontiguousarray(value[world]) for key, value in data.items()}
-                write_whole(self.folder / file, functools.partial(_write_vtu, cells, points[world], of_world))
+                write_atomically(self.folder / file, functools.partial(_write_vtu, cells, points[world], of_world))
                 files.append(file)
         if len(self._obstacles):
             self._colliders.append((time, self._collider_files(frame)))
@@ -183,7 +183,7 @@ class VTUWriter(Output):
                 before, file = self._last_written.get((k, world), (None, ""))
                 if before is None or not np.array_equal(before, points[world]):
                     file = f"{name}_{world:04d}_{frame:06d}.vtu"
-                    write_whole(self.folder / file, functools.partial(_write_vtu, cells, points[world], {}))
+                    write_atomically(self.folder / file, functools.partial(_write_vtu, cells, points[world], {}))
                     self._last_written[k, world] = (points[world], file)
                 files.append(file)
         return files
@@ -260,7 +260,7 @@ def _write_pvd(target: pathlib.Path, frames: list[tuple[float, list[str]]]) -> N
             for part, file in enumerate(files)
         ]
     lines += ["</Collection>", "</VTKFile>", ""]
-    write_whole(target, lambda path: path.write_text("\n".join(lines), encoding="utf-8"))
+    write_atomically(target, lambda path: path.write_text("\n".join(lines), encoding="utf-8"))
 
 
 def _element_set_flags(mesh: Any, element: np.ndarray) -> dict[str, np.ndarray]:

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
-from ..base.console import size
+from ..base.console import format_bytes
 from ..base.errors import CapacityError
-from ..base.memory import REMEDY
+from ..base.memory import MEMORY_REMEDY
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -63,8 +63,8 @@ def check_capacity(model: Model, make: Callable[[Model, State], Stepper]) -> Non
     fit = bisect.bisect_right(range(1, model.worlds), room, key=small.total_bytes)
     per_world = need // model.worlds
     raise CapacityError(
-        f"a simulation of {model.worlds} worlds takes {size(need)}, {per_world} bytes per world, and {model.device} "
-        f"has {size(free)} free; maximum: {fit} worlds{REMEDY}",
+        f"a simulation of {model.worlds} worlds takes {format_bytes(need)}, {per_world} bytes per world, and "
+        f"{model.device} has {format_bytes(free)} free; maximum: {fit} worlds{MEMORY_REMEDY}",
         bytes=need, per_world=per_world, worlds=fit,
     )  # fmt: skip
 

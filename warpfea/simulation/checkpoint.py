@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from ..base.errors import CheckpointError, OutputError
-from ..base.writer import Output, check_target, write_whole
+from ..base.writer import Output, check_target, write_atomically
 from .reports import idle_report
 
 __all__ = ["Checkpoint", "load_checkpoint", "read_meta", "save_checkpoint"]
@@ -108,7 +108,7 @@ def save_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
             file.flush()
             os.fsync(file.fileno())
 
-    write_whole(target, write)
+    write_atomically(target, write)
 
 
 def read_meta(path: str | os.PathLike[str]) -> dict[str, Any]:

@@ -56,7 +56,7 @@ class ConsistentInitialConditions:
         self.ctx, self.residual, self.integrator = ctx, residual, integrator
         self.model = ctx.model
         supports = ctx.model.terms.supports
-        self.has_drives = supports.displaced is not None or supports.rotated is not None
+        self.has_drives = supports.displacement_drives is not None or supports.rotation_drives is not None
         self.restart_count = 0
         self._discontinuities: tuple[float, np.ndarray, np.ndarray] = (0.0, np.zeros(0), np.zeros((2, 0)))
         self._mass: dict[int, list[tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]]] = {}
@@ -97,10 +97,10 @@ class ConsistentInitialConditions:
         """Indices of the laws that prescribe positions."""
         terms = self.model.terms
         out = set()
-        if terms.supports.displaced is not None:
-            out |= set(terms.supports.displaced.law.numpy().ravel().tolist())
-        if terms.supports.rotated is not None:
-            out |= set(terms.supports.rotated.law.numpy().tolist())
+        if terms.supports.displacement_drives is not None:
+            out |= set(terms.supports.displacement_drives.law.numpy().ravel().tolist())
+        if terms.supports.rotation_drives is not None:
+            out |= set(terms.supports.rotation_drives.law.numpy().tolist())
         if self.model.constraints is not None:
             out |= set(terms.constraints.tables.data.law.numpy().tolist())
         return out
@@ -203,7 +203,7 @@ class ConsistentInitialConditions:
             self._write_flagged(array, flags, value * every)
         self._write_flagged(w.step.mass_factor, flags, every / dt)
         self._law_values(flags, time)
-        m.terms.dead.take_gravity(ctx.launch, w.time_law_values, active)
+        m.terms.dead_loads.take_gravity(ctx.launch, w.time_law_values, active)
         u, v = ctx.state.displacement.numpy(), ctx.state.velocity.numpy()
         for array, values in ((w.u, u), (w.v, v), (w.v_tilde, v), (w.q_tilde, u - dt * v)):
             self._write_flagged(array, flags, values)
@@ -220,18 +220,18 @@ class ConsistentInitialConditions:
         """J (rows, 3 slots), c' and c'' without J w (rows,)."""
         tables = self.model.constraints
         gradients, first, second = constraint_rates(tables, u, v, laws)
-        return tables.expand(gradients), first, second
+        return tables.expand_jacobian(gradients), first, second
 
     def _prescribed_rates(self, laws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Velocities and accelerations (slots, 3) of prescribed components, 0 for others."""
         rate, acceleration = np.zeros((2, self.model.slots, 3))
         supports = self.model.terms.supports
-        if (d := supports.displaced) is not None:
+        if (d := supports.displacement_drives) is not None:
             slot, law = d.slot.numpy(), d.law.numpy()
             k, c = np.nonzero(law >= 0)
             rate[slot[k], c] = laws[1][law[k, c], c]
             acceleration[slot[k], c] = laws[2][law[k, c], c]
-        if (d := supports.rotated) is not None:
+        if (d := supports.rotation_drives) is not None:
             slot, law, on = d.slot.numpy(), d.law.numpy(), d.components.numpy() != 0.0
             angle, first, second = (laws[k][law, 0][:, None] for k in range(3))
             turn = np.cross(d.axis.numpy(), d.arm.numpy())

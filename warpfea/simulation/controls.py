@@ -10,7 +10,7 @@ import warp as wp
 
 from ..base.errors import ModelError
 from ..base.names import did_you_mean, listing
-from ..base.short_repr import MAX_ITEMS, lines, short_repr
+from ..base.short_repr import MAX_ITEMS, short_repr, truncated_lines
 from ..terms.time_law_table import control_array
 from ..time_laws import Control
 
@@ -50,7 +50,7 @@ class Controls(Mapping[str, "ControlValue"]):
         return len(self._values)
 
     def __repr__(self) -> str:
-        return lines(f"Controls({', '.join(map(repr, self._values.values()))})")
+        return truncated_lines(f"Controls({', '.join(map(repr, self._values.values()))})")
 
 
 class ControlValue:

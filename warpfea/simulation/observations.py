@@ -9,7 +9,7 @@ import warp as wp
 
 from ..base.errors import ModelError
 from ..base.names import did_you_mean, listing
-from ..base.short_repr import lines
+from ..base.short_repr import truncated_lines
 from ..kernels.step.episodes import JOINT_VALUE_KINDS, MOTION_KINDS, observation_kernels
 from ..kernels.terms.contact_structs import RECORD_NAMES
 
@@ -119,10 +119,10 @@ class Observations:
         tables = self._model.constraints
         assert tables is not None
         joint = self._sim._joint(owner)
-        has = tables.vectors_of(joint)
+        has = tables.coordinate_vectors(joint)
         self._check_quantity(name, what, [*has, *JOINT_REPORT_COLUMNS])
         if what in has:
-            self._values.append((has[what], what, tables.turn_of(joint), self._column_count))
+            self._values.append((has[what], what, tables.angle_row(joint), self._column_count))
             self._column_count += 1
             return
         self._add_report(first, JOINT_REPORT_COLUMNS[what])
@@ -211,4 +211,4 @@ class Observations:
         return self.array.__dlpack_device__()
 
     def __repr__(self) -> str:
-        return lines(f"Observations({', '.join(self.columns)}: {self._model.worlds} x {self._column_count})")
+        return truncated_lines(f"Observations({', '.join(self.columns)}: {self._model.worlds} x {self._column_count})")

@@ -41,7 +41,7 @@ def overload_text(model: Model) -> str:
                 pressure.surface.body, "pressure", _largest_value(pressure.law), _largest_value(pressure.law), "Pa"
             )
         )
-    g = float(np.linalg.norm(model.terms.dead.gravity.numpy(), axis=1).max())
+    g = float(np.linalg.norm(model.terms.dead_loads.gravity.numpy(), axis=1).max())
     for body in model.bodies if g > 0.0 else ():
         side = float(np.ptp(body.mesh.bounding_box(), axis=0).max())
         weight = model.masses.total_of_body(body) / float(element_volumes(body).sum()) * g * side

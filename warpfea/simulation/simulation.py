@@ -11,9 +11,9 @@ import numpy as np
 import warp as wp
 
 from .. import solvers
-from ..base.console import compile_bar, quiet_warp
+from ..base.console import compile_progress_bar, quiet_warp
 from ..base.errors import ModelError
-from ..base.memory import enough_memory
+from ..base.memory import convert_memory_errors
 from ..base.names import listing
 from ..base.worlds import worlds_mask
 from ..kernels.step.step_control import SAME_TIME_FRACTION, STATUS
@@ -149,14 +149,14 @@ class Simulation(RunStatistics):
 
         self.model = model
         began = clock.perf_counter()
-        with quiet_warp(), compile_bar(None if on_compile is None else False) as bar:
+        with quiet_warp(), compile_progress_bar(None if on_compile is None else False) as bar:
             check_capacity(model, stepper)
         self.state = model.state() if state is None else state
         check_state(model, self.state)
         self.integrator, self.solver = scheme, options
         self.on_failure, self.record, self.ended_laws = on_failure, record, set[int]()
-        room = enough_memory(f"a simulation of {model.worlds} worlds", model.device)
-        with quiet_warp(), room, compile_bar(None if on_compile is None else False) as bar:
+        room = convert_memory_errors(f"a simulation of {model.worlds} worlds", model.device)
+        with quiet_warp(), room, compile_progress_bar(None if on_compile is None else False) as bar:
             self.stepper = stepper(model, self.state, capture)
         model.parameters.simulated = True
         self.controls = Controls(model, self.state)
@@ -364,7 +364,7 @@ class Simulation(RunStatistics):
     def _reset_on_device(self, mask: wp.array, state: State | None) -> None:
         check_mask(mask, self.model)
         if state is None:
-            written = self.model.terms.written
+            written = self.model.terms.parameter_updates
             if self._initial_state is None or self._initial_state_writes != written:
                 self._initial_state, self._initial_state_writes = self._make_initial_state(), written
             state = self._initial_state

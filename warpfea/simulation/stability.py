@@ -232,7 +232,7 @@ class TangentOperator:
             for term in terms:
                 if call != "product" or type(term).product is not Term.product:
                     getattr(term, call)(ctx, *more, every)
-            ctx.launch(gather, (m.worlds, m.slots), [m.terms.side_topology, pool, every, w.Hp])
+            ctx.launch(gather, (m.worlds, m.slots), [m.terms.nonpotential_topology, pool, every, w.Hp])
             return self._host_values(w.Hp, np.ones(m.worlds, dtype=bool))
 
         step = 1e-5 * m.size
@@ -381,7 +381,7 @@ def _float64_copy(sim: Simulation) -> Simulation:
     if "float64" not in model.cache:  # half of the time of a check of a small model
         model.cache["float64"] = model.resized(model.worlds, dtype="float64")
     twin = model.cache["float64"]
-    if model.terms.written:
+    if model.terms.parameter_updates:
         twin.parameters.copy_values(model.parameters.values)
         arrays = twin.terms.parameter_arrays()
         for name, array in model.terms.parameter_arrays().items():

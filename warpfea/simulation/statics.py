@@ -184,7 +184,7 @@ def begin_static(
     if isinstance(count, (bool, str)) or not (isinstance(count, (int, np.integer)) and count >= 1):
         raise ModelError(f"solve_static: load_steps = {load_steps!r} must be a positive whole number, or 'auto'")
     check_model(model)
-    if model.terms.dead.pulls:
+    if model.terms.dead_loads.has_gravity:
         require_density(model.bodies, "gravity")
     for contact in model.description.all_contacts:
         if contact.treatment == "explicit":

@@ -10,8 +10,8 @@ import numpy as np
 import warp as wp
 
 from ..base.errors import ModelError
-from ..base.launch import Launcher, labelled
-from ..base.memory import enough_memory
+from ..base.launch import Launcher, launch_part
+from ..base.memory import convert_memory_errors
 from ..kernels.step.adaptive import MAX_LEVEL
 from ..kernels.step.energy_ledger import LEDGER_TERM_ROWS
 from ..kernels.step.step import step_kernels
@@ -131,7 +131,7 @@ class Stepper:
         w, state = self.work, self.state
         w.step.time = state.time
         w.step.status, w.step.summed_time = state.status, state.summed_time
-        w.step.gravity = self.terms.dead.gravity
+        w.step.gravity = self.terms.dead_loads.gravity
         w.step.any_running, w.step.any_rejected = self.running, w.any_flag[3:5]
         w.step.max_halvings = MAX_LEVEL if self.step_size_control else self.solver.max_halvings
         if isinstance(self.solver, NewtonPCG) and not self.step_size_control:
@@ -153,7 +153,7 @@ class Stepper:
     def start_terms(self, mask: np.ndarray | None = None) -> None:
         """Reinitialise terms after the state of the masked worlds was set."""
         following = [term for term in self.terms if type(term).start is not Term.start]
-        if not following and self.terms.dead.gravity_law is None:
+        if not following and self.terms.dead_loads.gravity_law is None:
             return
         w, state = self.work, self.state
         active = self._world_flags(mask)
@@ -186,7 +186,7 @@ class Stepper:
         kernel = self.newton.residual.gather_kernels.kinetic_terms
         Launcher(m.device)(kernel, self.dim, [m.topology, self.state.velocity, rows])
         u = self.state.displacement.numpy().astype(float)
-        pull = -np.einsum("bc,bs,bsc->b", m.terms.dead.gravity.numpy(), m.masses.lumped_in_worlds(m.worlds), u)
+        pull = -np.einsum("bc,bs,bsc->b", m.terms.dead_loads.gravity.numpy(), m.masses.lumped_in_worlds(m.worlds), u)
         return np.stack([rows.numpy()[0].sum(axis=1), m.strain_energy(self.state), pull], axis=1)
 
     def invalidate(self, mask: np.ndarray | None = None, *, potential: bool = True) -> None:
@@ -295,7 +295,7 @@ class Stepper:
         """Take one step in every running world."""
         if self.initial_conditions is not None:
             self.initial_conditions.prepare(self._dt)
-        with enough_memory("a step", self.model.device):
+        with convert_memory_errors("a step", self.model.device):
             if self.graph is not None:
                 wp.capture_launch(self.graph)
             else:
@@ -318,7 +318,7 @@ class Stepper:
             self.step_size_control.end_interval()
         self._write_report()
 
-    @labelled("commit")
+    @launch_part("commit")
     def _write_report(self) -> None:
         """Roll back failed worlds; write the step report."""
         m, w, launch = self.model, self.work, self.launch
@@ -331,7 +331,7 @@ class Stepper:
             term.report(self.ctx)
         self.episodes.end_step()
 
-    @labelled("commit")
+    @launch_part("commit")
     def _restore_failed(self) -> None:
         """Restore the state of worlds whose step failed."""
         m, w, launch = self.model, self.work, self.launch
@@ -340,7 +340,7 @@ class Stepper:
             self.state.copy_rows(launch, w.newton.active, self.backup, skip=("status",))
         self.newton.invalidate(w.newton.active)
 
-    @labelled("commit")
+    @launch_part("commit")
     def _back_up_state(self) -> None:
         """Back up the state, still that of the step's start, before the first halving."""
         assert self.backup is not None
@@ -380,7 +380,7 @@ class Stepper:
         args = [w.step, w.newton, kind, m.is_position, m.topology.free, state.displacement, state.velocity]
         self.launch(self.kernels.alternative_first_iterate, self.dim, [*args, w.q_tilde, w.v_tilde, w.v])
 
-    @labelled("commit")
+    @launch_part("commit")
     def accept_attempt(self) -> None:
         """Accept a converged attempt."""
         w, launch, state = self.work, self.launch, self.state
@@ -397,7 +397,7 @@ class Stepper:
             term.commit(self.ctx, w.step.accepted)
         self.newton.store_history(w.step.accepted)
 
-    @labelled("loads")
+    @launch_part("loads")
     def _evaluate_time_laws(self, active: wp.array) -> None:
         """Evaluate the time laws at the end of the attempt."""
         w = self.work
@@ -405,7 +405,7 @@ class Stepper:
         laws.evaluate(self.launch, self.state, w.step.new_time, w.step.load_factor, active, w.time_law_values)
         if self.ctx.midpoint:
             laws.evaluate(self.launch, self.state, w.stage_time, w.step.load_factor, active, w.time_law_stage_values)
-        self.terms.dead.take_gravity(self.launch, w.time_law_stage_values, active)
+        self.terms.dead_loads.take_gravity(self.launch, w.time_law_stage_values, active)
 
     def law_values(self, time: float) -> np.ndarray:
         """Values of the time laws at a time, s, or load fraction, (B, laws, 3), without changing those of the step."""

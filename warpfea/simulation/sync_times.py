@@ -78,8 +78,8 @@ class SyncTimes:
         """Add the times of a run's outputs."""
         rates = [getattr(out, "rate", None) for out in outputs]
         self.output_rates = [rate for rate in rates if rate]
-        moments = [time for out in outputs for time in getattr(out, "moments", ())]
-        self.fixed_times = np.unique(np.concatenate([self.kink_times, np.array(moments, dtype=float)]))
+        output_times = [time for out in outputs for time in getattr(out, "output_times", ())]
+        self.fixed_times = np.unique(np.concatenate([self.kink_times, np.array(output_times, dtype=float)]))
 
     def load(self, interval: float, horizon: float, origin: float) -> None:
         """Restore the schedule of a checkpoint."""

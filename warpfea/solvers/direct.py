@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
-from ..base.launch import labelled
+from ..base.launch import launch_part
 from ..kernels.solvers.direct import direct_kernels
-from ..terms.follower_loads import FollowerMatrix, Followers
+from ..terms.follower_loads import FollowerLoads, FollowerMatrix
 from .factor import SingularMatrix, make_factors
 
 if TYPE_CHECKING:
@@ -40,13 +40,13 @@ class DirectSolver:
     def __init__(self, ctx: StepContext, residual: Residual) -> None:
         model = ctx.model
         self.ctx, self.model, self.work, self.launch, self.residual = ctx, model, ctx.work, ctx.launch, residual
-        ctx.work.reserve_blocks()
+        ctx.work.allocate_diagonal_blocks()
         assert residual.assembler is not None
         self.assembler = residual.assembler
         self.kernels = direct_kernels(model.dtype)
         self.dim = (model.worlds, ctx.launch.padded(model.slots))
         self.factors = make_factors(model, self.assembler.pattern.graph)
-        self.elements_only = not model.terms.products
+        self.elements_only = not model.terms.has_tangents
         for term in model.terms:
             term.allocate_blocks(ctx, self.assembler, projected=False)
         self.matrix_storage: wp.array | None = None
@@ -63,7 +63,7 @@ class DirectSolver:
         """Modules launched."""
         return {self.kernels.module} | self.assembler.modules()
 
-    @labelled("build")
+    @launch_part("build")
     def start(self, active: wp.array) -> None:
         """Compute D and the inverses of its blocks."""
         self.residual.diagonal_blocks(active)
@@ -83,7 +83,7 @@ class DirectSolver:
     @property
     def follower_matrices(self) -> list[FollowerMatrix]:
         """Matrices of the follower loads' items, built on first use."""
-        return self.ctx.scratch.get(Followers.name, [])
+        return self.ctx.scratch.get(FollowerLoads.name, [])
 
     @property
     def matrix(self) -> wp.array:
@@ -92,7 +92,7 @@ class DirectSolver:
             self.matrix_storage = self.assembler.allocate_values("direct matrix")
         return self.matrix_storage
 
-    @labelled("build")
+    @launch_part("build")
     def prepare(self, active: wp.array) -> None:
         """Factorise H in the active worlds."""
         residual = self.residual
@@ -137,14 +137,14 @@ class DirectSolver:
         except SingularMatrix:
             self.singular_worlds.add(world)
 
-    @labelled("preconditioner")
+    @launch_part("preconditioner")
     def apply(self, r: wp.array, z: wp.array, active: wp.array) -> None:
         """z = H^-1 r; partial sums of r.z and r.D^-1 r."""
         w = self.work
         for world in map(int, np.flatnonzero(active.numpy())):
             if not self._solve(r, z, world):
                 z[world].zero_()
-        self.launch(self.kernels.dot_partials, self.dim, [r, z, w.diagonal, active, w.warp, w.warp_rows])
+        self.launch(self.kernels.dot_partials, self.dim, [r, z, w.diagonal, active, w.warp_size, w.warp_rows])
 
     def _solve(self, r: wp.array, z: wp.array, world: int) -> bool:
         """Solve in one world. False if the factorisation failed; the first solve verifies it (r.z >= 0)."""

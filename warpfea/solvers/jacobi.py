@@ -33,7 +33,7 @@ import warp as wp
 
 from ..base.checks import is_count, is_number
 from ..base.errors import ModelError
-from ..base.launch import labelled
+from ..base.launch import launch_part
 from ..kernels.solvers.jacobi import MAX_PAIRS, jacobi_kernels, jacobi_struct
 from .newton import NewtonLoop, NewtonPCG
 from .twolevel import TwoLevel
@@ -209,7 +209,7 @@ class JacobiLoop(NewtonLoop):
             self._call_terms("update_frozen", active)
         self._reduce_flags(active, self.any_iterating)
 
-    @labelled("vectors")
+    @launch_part("vectors")
     def _compute_step(self, active: wp.array) -> None:
         """Write the next move p to work.direction."""
         m, w, k, launch, ctl = self.model, self.work, self.descent_kernels, self.launch, self.control

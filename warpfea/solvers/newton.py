@@ -11,7 +11,7 @@ import warp as wp
 
 from ..base.checks import is_count, is_number
 from ..base.errors import ModelError
-from ..base.launch import labelled
+from ..base.launch import launch_part
 from ..kernels.elements.materials import DEFINED_FOR_ANY_J
 from ..kernels.solvers.newton import newton_kernels
 from ..kernels.solvers.newton_control import FLOOR_LANES
@@ -190,7 +190,7 @@ class NewtonLoop:
             term.configure(ctx)
         operator = options.operator
         if direct and operator == "auto":  # factors live as long as the matrix, unless terms add to it
-            operator = "elements" if model.terms.products or ctx.midpoint else "matrix"
+            operator = "elements" if model.terms.has_tangents or ctx.midpoint else "matrix"
         banded = kind == "banded" and model.device.is_cuda
         assembled = kind not in ("deflated", "block-jacobi")
         self.residual = Residual(ctx, operator=operator, assembled=assembled, banded=banded)
@@ -302,19 +302,19 @@ class NewtonLoop:
         self._reduce_flags(w.newton.active, self.any_iterating)
         wp.capture_while(self.any_iterating, self._iterate)
 
-    @labelled("control")
+    @launch_part("control")
     def _choose_first_iterate(self) -> None:
         """Select the best first iterate (J > 0 first, then lowest Phi)."""
         w, k, launch = self.work, self.kernels, self.launch
         choose, better = w.newton.choose_first_iterate, w.newton.searching
         launch(k.compare_first_iterates, self.model.worlds, [w.newton, 1, better])
-        launch(self.vector_kernels.copy_active, self.dim, [w.v, better, w.best])
+        launch(self.vector_kernels.copy_active, self.dim, [w.v, better, w.best_velocity])
         for put in self.first_iterate_candidates:
             put()
             self.residual.evaluate(choose, freeze=True)
             launch(k.compare_first_iterates, self.model.worlds, [w.newton, 0, better])
-            launch(self.vector_kernels.copy_active, self.dim, [w.v, better, w.best])
-        launch(self.vector_kernels.copy_active, self.dim, [w.best, choose, w.v])
+            launch(self.vector_kernels.copy_active, self.dim, [w.v, better, w.best_velocity])
+        launch(self.vector_kernels.copy_active, self.dim, [w.best_velocity, choose, w.v])
         self.preconditioner.discard(choose)
         self._evaluate_first_iterate(choose)
         launch(k.begin_iteration, self.model.worlds, [w.newton, 2])
@@ -348,7 +348,7 @@ class NewtonLoop:
         if self.limits_step:
             launch(k.reset_step_limit, self.model.worlds, [w.newton])
         self._call_terms("process_direction", active)
-        launch(self.vector_kernels.set_base, self.dim, [w.newton, w.v, w.base, w.best])
+        launch(self.vector_kernels.set_base, self.dim, [w.newton, w.v, w.base_velocity, w.best_velocity])
         launch(self.vector_kernels.dot_terms, self.dim, [w.gradient, w.direction, active, w.rows])
         self.residual.reduce(w.rows, 1, active, w.newton.slope_sum)
         launch(k.begin_search, self.model.worlds, [w.newton, w.pcg])
@@ -361,7 +361,7 @@ class NewtonLoop:
         self._call_terms("prepare_solve", active)
         self._reduce_flags(active, self.any_iterating)
 
-    @labelled("control")
+    @launch_part("control")
     def _average_perturbed_residuals(self) -> None:
         """Replace the residual by its mean over perturbed positions before the error estimate.
 
@@ -381,7 +381,7 @@ class NewtonLoop:
         launch(k.mean_gradient, self.dim, args)
         w.newton.any_estimate_error.zero_()
 
-    @labelled("control")
+    @launch_part("control")
     def _update_frozen(self) -> None:
         """Update lagged term data (friction limits, multipliers) after convergence with frozen values."""
         w, flags = self.work, self.work.newton.trial_accepted
@@ -396,7 +396,7 @@ class NewtonLoop:
         self.launch(self.kernels.end_frozen_update, self.model.worlds, [w.newton, flags])
         self._run_if_rare(self._check_inversion)
 
-    @labelled("control")
+    @launch_part("control")
     def _run_rare_branch(self) -> None:
         """Rare branch: error estimate, step length of non-monotone trials, further searches, inversion check."""
         m, w, k = self.model, self.work, self.kernels
@@ -424,7 +424,7 @@ class NewtonLoop:
 
     def _try_step_length(self) -> None:
         w, k, launch = self.work, self.kernels, self.launch
-        launch(self.vector_kernels.trial_velocity, self.dim, [w.newton, w.base, w.direction, w.best, w.v])
+        launch(self.vector_kernels.trial_velocity, self.dim, [w.newton, w.base_velocity, w.direction, w.best_velocity, w.v])
         self.residual.evaluate(w.newton.searching)
         launch(k.check_trial, self.model.worlds, [w.newton])
         if self.terms.traits.stored:

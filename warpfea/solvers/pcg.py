@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
-from ..base.launch import Launcher, labelled
+from ..base.launch import Launcher, launch_part
 from ..kernels.solvers.pcg import FREE_GROUP_LANES, pcg_kernels
 from .preconditioner import Preconditioner
 from .residual import Residual
@@ -38,7 +38,7 @@ class PCG:
         work.pcg.max_iterations = max_iterations
         work.pcg.max_work = max_work
 
-    @labelled("vectors")
+    @launch_part("vectors")
     def solve(self, active: wp.array) -> None:
         """Solve and write p to work.direction."""
         m, w, k, launch = self.model, self.work, self.kernels, self.launch

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Protocol
 import warp as wp
 
 from ..base.errors import ModelError
-from ..base.launch import labelled
+from ..base.launch import launch_part
 from ..kernels.solvers.pcg import pcg_kernels
 from .band import MAX_FULL_FACTOR_SLOTS, find_band, thread_block_band
 from .residual import Residual
@@ -61,7 +61,7 @@ class BlockJacobi:
 
     def __init__(self, model: Model, work: Workspace, launch: Launcher, residual: Residual) -> None:
         self.work, self.launch, self.residual = work, launch, residual
-        work.reserve_blocks()
+        work.allocate_diagonal_blocks()
         self.kernels = pcg_kernels(model.dtype, model.terms.traits.has_constraints)
         self.dim = (model.worlds, launch.padded(model.slots))
 
@@ -75,7 +75,7 @@ class BlockJacobi:
         """Module of the PCG kernel launched here."""
         return {self.kernels.module}
 
-    @labelled("build")
+    @launch_part("build")
     def start(self, active: wp.array) -> None:
         """Assemble and invert the blocks."""
         self.residual.diagonal_blocks(active)
@@ -94,12 +94,12 @@ class BlockJacobi:
     def record_cost(self, active: wp.array) -> None:
         """No reuse rule."""
 
-    @labelled("preconditioner")
+    @launch_part("preconditioner")
     def apply(self, r: wp.array, z: wp.array, active: wp.array) -> None:
         """z = D^-1 r, with constraints (D + (dq/dv) J^T rho J)^-1 r."""
         w = self.work
         self.launch(
-            self.kernels.apply_block_jacobi, self.dim, [w.inverse, r, w.diagonal, active, w.warp, z, w.warp_rows]
+            self.kernels.apply_block_jacobi, self.dim, [w.inverse, r, w.diagonal, active, w.warp_size, z, w.warp_rows]
         )
         ctx = self.residual.ctx
         for term in self.residual.terms:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
-from ..base.launch import labelled
+from ..base.launch import launch_part
 from ..kernels.common.lanes import WARP_SIZE
 from ..kernels.common.reduce import CHUNK, MAX_WARP_ROW, reduce_kernels
 from ..kernels.common.structs import product_terms_struct
@@ -50,7 +50,7 @@ class RowReducer:
         self.worlds = worlds
         self.kernels = reduce_kernels()
 
-    @labelled("vectors")
+    @launch_part("vectors")
     def __call__(self, rows: wp.array, count: int, active: wp.array, out: wp.array) -> None:
         """out[k] = sum of rows[k], k < count, in the active worlds."""
         n = rows.shape[2]
@@ -59,7 +59,7 @@ class RowReducer:
             self.launch(self.kernels.short_sums, count * self.worlds * lanes, [rows, lanes, active, out])
             return
         if n > CHUNK:
-            partial = self.work.partial
+            partial = self.work.chunk_sums
             # all chunks of the scratch are written: zeros beyond the row's end
             dim = (count, self.worlds, partial.shape[2])
             self.launch.tiled(self.kernels.partial_sums, dim, [rows, active, partial])
@@ -146,13 +146,13 @@ class Residual:
         """Terms of a product H p beyond the elements' part."""
         m, w = self.model, self.work
         out = product_terms_struct(m.dtype)()
-        of = m.terms.side_topology if m.terms.traits.tangent else m.topology
+        of = m.terms.nonpotential_topology if m.terms.traits.tangent else m.topology
         out.contribution_start, out.contribution_entry = of.contribution_start, of.contribution_entry
         out.contribution = w.nonpotential_tangent
         out.pool = w.pool_product
         if m.terms.traits.pooled:
             out.pool_start, out.pool_entry = m.topology.pool_start, m.topology.pool_entry
-        out.mass_factor, out.dq_dv, out.warp_lanes = w.step.mass_factor, w.step.dq_dv, w.warp
+        out.mass_factor, out.dq_dv, out.warp_lanes = w.step.mass_factor, w.step.dq_dv, w.warp_size
         return out
 
     @property
@@ -193,7 +193,7 @@ class Residual:
             self.matrix_reuse_rule.move_point(accepted)
             self.matrix_reuse_rule.store_counts(accepted)
 
-    @labelled("assembly")
+    @launch_part("assembly")
     def linearise(self, active: wp.array) -> None:
         """Assemble the operator matrix at the iterate if its reuse rule requires it."""
         if not self.uses_matrix:
@@ -208,7 +208,7 @@ class Residual:
         self.launch(self.matrix_reuse_rule.kernels.loosen_forcing, self.model.worlds, [control, self.work.newton])
         wp.capture_if(control.any_build, self._assemble)
 
-    @labelled("assembly")
+    @launch_part("assembly")
     def _assemble(self) -> None:
         assert self.assembler is not None
         control = self.matrix_reuse_rule.control
@@ -243,14 +243,14 @@ class Residual:
             args = [state.displacement, state.velocity, w.v, w.step.dq_dv, active, w.u_stage, w.v_stage]
             self.launch(self.stage_kernels.evaluate_midpoint, self.dim, args)
 
-    @labelled("residual")
+    @launch_part("residual")
     def reevaluate_frozen(self, active: wp.array) -> None:
         """Re-evaluate forces, g and sums after an update of lagged term data."""
         self.ctx.positions_changed = False
         self.evaluate_forces(active, freeze=True)
         self.ctx.positions_changed = True
 
-    @labelled("residual")
+    @launch_part("residual")
     def evaluate(self, active: wp.array, *, freeze: bool = False) -> None:
         """Evaluate q, forces, g and all sums at the iterate v; `freeze`: Phi freezes the non-potential forces there."""
         w, launch = self.work, self.launch
@@ -264,7 +264,7 @@ class Residual:
         for term in self.terms:
             term.force(self.ctx, active)
         if self.terms.traits.nonpotential:
-            args = [self.terms.side_topology, w.nonpotential_contribution, active, w.nonpotential]
+            args = [self.terms.nonpotential_topology, w.nonpotential_contribution, active, w.nonpotential]
             launch(self.gather_kernels.gather_force, self.dim, args)
         if freeze:
             self.freeze_nonpotential(active)
@@ -282,14 +282,14 @@ class Residual:
             sums = (GROUP_ROWS, m.worlds, groups.count)
             launch(self.vector_kernels.sum_group_norms, sums, [w.residual_group_partial, active, w.newton.group_sums])
 
-    @labelled("loads")
+    @launch_part("loads")
     def freeze_nonpotential(self, active: wp.array) -> None:
         """Freeze the non-potential forces of Phi at this iterate."""
         if self.terms.traits.nonpotential:
             args = [self.work.nonpotential, active, self.work.nonpotential_frozen]
             self.launch(self.vector_kernels.copy_active, self.dim, args)
 
-    @labelled("build")
+    @launch_part("build")
     def diagonal_blocks(self, active: wp.array) -> None:
         """Diagonal blocks of H at the iterate: D for the norms, inverses for the preconditioner."""
         m, w, launch = self.model, self.work, self.launch
@@ -299,7 +299,7 @@ class Residual:
         args += [w.diagonal, w.inverse]
         launch(self.gather_kernels.gather_diagonal_blocks, self.dim, args)
 
-    @labelled("product")
+    @launch_part("product")
     def product(self, p: wp.array, out: wp.array, active: wp.array) -> None:
         """out = H p at the iterate; partial sums of p.Hp in `curvature_rows`."""
         m, w, launch = self.model, self.work, self.launch
@@ -331,7 +331,7 @@ class Residual:
             pattern = self.assembler.pattern
             lanes = launch.lanes(pattern.mean_row_length)
             threads = launch.padded(m.slots * lanes)
-            self.curvature_rows = leading_view(w.rows, (1, m.worlds, threads // w.warp))
+            self.curvature_rows = leading_view(w.rows, (1, m.worlds, threads // w.warp_size))
             args = [m.topology, pattern.data, self.operator_matrix, lanes, *rest, out, self.curvature_rows]
             launch(self.gather_kernels.matrix_product, (m.worlds, threads), args)
         else:
@@ -341,7 +341,7 @@ class Residual:
             args = [topology, w.contribution, *rest, out, w.warp_rows]
             launch(total, (m.worlds, launch.padded(m.slots)), args)
 
-    @labelled("loads")
+    @launch_part("loads")
     def tangent_curvature(self, active: wp.array) -> None:
         """p.K p of the non-potential forces along the direction p, into the Newton control."""
         w, launch = self.work, self.launch
@@ -350,7 +350,7 @@ class Residual:
         for term in self.terms:
             if not term.potential:
                 term.product(self.ctx, w.direction, active)
-        args = [self.terms.side_topology, w.nonpotential_tangent, active, w.Hp]
+        args = [self.terms.nonpotential_topology, w.nonpotential_tangent, active, w.Hp]
         launch(self.gather_kernels.gather_force, self.dim, args)
         launch(self.vector_kernels.dot_terms, self.dim, [w.Hp, w.direction, active, w.rows])  # p is 0 where prescribed
         self.reduce(w.rows, 1, active, w.newton.tangent_sum)

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
-from ..base.launch import labelled
+from ..base.launch import launch_part
 from ..kernels.solvers.blocks import block_kernels
 from ..kernels.solvers.levels import TILE_SLOTS, TILE_UNKNOWNS, level_kernels, level_struct
 from ..kernels.solvers.levels_build import FACTOR_LANES, build_kernels
@@ -170,7 +170,7 @@ class TwoLevel:
             for key, array in term.cached_inputs(self.ctx):
                 name = f"{term.name}_{key}".replace(" ", "_")
                 kept.live.append(array)
-                kept.place.append(self.work.array(f"preconditioner {name}", array.shape, array.dtype))
+                kept.cached.append(self.work.array(f"preconditioner {name}", array.shape, array.dtype))
                 kept.state.append(state.register(f"preconditioner_{name}", array.dtype, array.shape[1:]))
             if kept.live:
                 self.cached_inputs[term.name] = kept
@@ -182,7 +182,7 @@ class TwoLevel:
         for term in self.terms:
             kept = self.cached_inputs.get(term.name)
             if kept is not None and not term.copy_cached(self.ctx, kept, reuse.control, flags):
-                for arrays in zip(kept.live, kept.state, kept.place):
+                for arrays in zip(kept.live, kept.state, kept.cached):
                     words = [view_as_words(array) for array in arrays]
                     self.launch(reuse.kernels.transfer_words, words[0].shape, [reuse.control, flags, *words])
 
@@ -207,7 +207,7 @@ class TwoLevel:
     def update(self, active: wp.array) -> None:
         """No-op: reused at later iterates."""
 
-    @labelled("build")
+    @launch_part("build")
     def invalidate(self, flags: wp.array) -> None:
         """Invalidate history of worlds whose state was set externally."""
         self.reuse.invalidate(flags)
@@ -217,25 +217,25 @@ class TwoLevel:
         self._copy_cached(accepted)
         self.reuse.store_counts(accepted)
 
-    @labelled("build")
+    @launch_part("build")
     def start(self, active: wp.array) -> None:
         """Rebuild where due, with D and the penalties that follow from D."""
         self.reuse.decide_rebuild(active)
         wp.capture_if(self.reuse.control.any_build, self._build_with_penalties)
 
-    @labelled("build")
+    @launch_part("build")
     def prepare(self, active: wp.array) -> None:
         """Rebuild where due, with the constraint penalties of the step."""
         self.reuse.decide_rebuild(active)
         wp.capture_if(self.reuse.control.any_build, self._build)
 
-    @labelled("build")
+    @launch_part("build")
     def record_cost(self, active: wp.array) -> None:
         """Record the iteration count of the solve."""
         args = [self.reuse.control, self.work.newton, self.work.pcg, int(self.factors_operator)]
         self.launch(self.reuse.kernels.count_solve, self.model.worlds, args)
 
-    @labelled("preconditioner")
+    @launch_part("preconditioner")
     def apply(self, r: wp.array, z: wp.array, active: wp.array) -> None:
         """z = B r; partial sums r.z and r.D^-1 r in rows."""
         m, w, launch, k = self.model, self.work, self.launch, self.kernels
@@ -250,11 +250,11 @@ class TwoLevel:
             coarse, correct = self._smooth(0, r, z, active), int(len(self.levels) > 1)
         if self.body_modes:
             self.body_modes.apply(r, z, active)
-        args = [level.device_data, correct, coarse, m.topology.free, r, w.diagonal, active, w.warp, z, w.warp_rows]
+        args = [level.device_data, correct, coarse, m.topology.free, r, w.diagonal, active, w.warp_size, z, w.warp_rows]
         dim = (m.worlds, launch.padded(m.slots))
         launch(k.add_coarse_correction, dim, args)
         if self.has_corrections:
-            args = [w.inverse, r, w.diagonal, active, w.warp, w.Hp, w.spare_rows]
+            args = [w.inverse, r, w.diagonal, active, w.warp_size, w.Hp, w.spare_rows]
             launch(self.block_jacobi, dim, args)
             for term in self.terms:
                 if term.preconditions(self.ctx):
@@ -401,7 +401,7 @@ class TwoLevel:
         """Assemble and invert the matrix of the rigid body modes."""
         motions.assemble(self.reuse.linearisation_point, self.block_values, flags)
         for term in self.terms:
-            kept = self.cached_inputs[term.name].place if term.name in self.cached_inputs else []
+            kept = self.cached_inputs[term.name].cached if term.name in self.cached_inputs else []
             if term.coupled_bodies():
                 term.add_mode_coupling(self.ctx, kept, self.reuse.control.dq_dv, flags)
         motions.invert(flags)
@@ -411,10 +411,10 @@ class TwoLevel:
         reuse = self.reuse.control
         for term in self.terms:
             if term.penalty == penalties:
-                kept = self.cached_inputs[term.name].place if term.name in self.cached_inputs else []
+                kept = self.cached_inputs[term.name].cached if term.name in self.cached_inputs else []
                 term.blocks(self.ctx, self.assembler, kept, reuse.dq_dv, flags, value, projected=True)
 
-    @labelled("build")
+    @launch_part("build")
     def _factorise(self, value: wp.array, flags: wp.array) -> None:
         if self.band and not self.terms_add_blocks:
             self.band.factorise(value, flags)

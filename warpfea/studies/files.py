@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ..base.errors import OutputError
-from ..base.writer import check_folder, write_whole
+from ..base.writer import check_folder, write_atomically
 
 __all__ = ["make_folder", "require_matplotlib", "write_csv"]
 
@@ -38,7 +38,7 @@ def write_csv(path: pathlib.Path, columns: Sequence[str], rows: Sequence[Mapping
             for row in rows:
                 writer.writerow([text(row.get(name)) for name in columns])
 
-    write_whole(path, write)
+    write_atomically(path, write)
 
 
 def require_matplotlib() -> Any:

@@ -22,9 +22,9 @@ from scipy.optimize import differential_evolution
 
 import warpfea as wf
 
-from ..base.console import number, quiet_warp, to_json, write_json
+from ..base.console import format_number, quiet_warp, to_json, write_json
 from ..base.devices import find_device
-from ..base.provenance import origin
+from ..base.provenance import provenance_of
 from ..base.writer import check_target
 
 __all__ = ["Identification", "identify", "record_tip", "run"]
@@ -143,8 +143,8 @@ def run(options: argparse.Namespace) -> None:
     settings = {**given, "truth": TRUE_CONSTANTS, "bounds": SEARCH_BOUNDS, "noise": NOISE_RATIO}
     settings |= {"dt": DT, "t_end": T_END}
     with quiet_warp():
-        content = {"schema": 1, **origin(options.words, device), "settings": settings}
+        content = {"schema": 1, **provenance_of(options.words, device), "settings": settings}
         found = asdict(identify(record_tip(device), device=device, **given))
-    print("  ".join(f"{name} {number(v) if isinstance(v, float) else v}" for name, v in found.items()), flush=True)
+    print("  ".join(f"{k} {format_number(v) if isinstance(v, float) else v}" for k, v in found.items()), flush=True)
     if options.out is not None:
         write_json(options.out, to_json(content | {"rows": [found]}))

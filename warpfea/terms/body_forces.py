@@ -23,8 +23,15 @@ __all__ = ["BodyForces"]
 
 
 @dataclass(eq=False)
-class FieldPart:
-    """Body force on the elements of one block that belong to one body; `offset` into the term's own entries."""
+class BodyForceBlock:
+    """Body force on the elements of one block that belong to one body.
+
+    Attributes:
+        kernel: device code of the force, specialised for the user's field.
+        block: element block. members: indices (count,) of the body's elements in it.
+        origin: position of the body's reference origin, m.
+        offset: first entry of the block in the term's own pool entries. count: number of elements.
+    """
 
     kernel: Any
     block: Any
@@ -42,7 +49,7 @@ class BodyForces(Term):
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
-        self.parts_of_fields: list[FieldPart] = []
+        self.block_forces: list[BodyForceBlock] = []
 
     @classmethod
     def of(cls, model: Model) -> BodyForces | None:
@@ -55,13 +62,13 @@ class BodyForces(Term):
     def build(self, laws: TimeLawTable) -> None:
         offset = 0
         for force in self.model.description.body_forces:
-            for field, conn in self._parts(force):
+            for field, conn in self._block_forces(force):
                 field.offset = offset
                 offset += conn.size
-                self.parts_of_fields.append(field)
+                self.block_forces.append(field)
                 self.connectivity.append(conn)
 
-    def _parts(self, force: BodyForce) -> list[tuple[FieldPart, np.ndarray]]:
+    def _block_forces(self, force: BodyForce) -> list[tuple[BodyForceBlock, np.ndarray]]:
         m = self.model
         out = []
         for block in m.blocks:
@@ -71,9 +78,9 @@ class BodyForces(Term):
                 first += len(host.elements)
                 if host.body not in force.bodies or block.key.part:  # one part of the energy represents the element
                     continue
-                self._tables(block)
+                self._upload_shape_tables(block)
                 take = argument_precision(force.function, m.dtype)
-                field = FieldPart(
+                field = BodyForceBlock(
                     kernel=body_force_kernel(force.function, m.dtype, take),
                     block=block,
                     members=m.array("loads", members, wp.int32),
@@ -84,7 +91,7 @@ class BodyForces(Term):
                 out.append((field, host.conn + host.body.slot_offset))
         return out
 
-    def _tables(self, block: Any) -> None:
+    def _upload_shape_tables(self, block: Any) -> None:
         """Tables of shape functions and rho w at the points of the mass rule, built once per block."""
         m = self.model
         rules = [assembly.mass_rule(p.body, block.key.affine) for p in block.host_blocks]
@@ -97,18 +104,18 @@ class BodyForces(Term):
                     rho = assembly.density_at(host.body, elems, s, host.body.connectivity[elems])
                     weights.append(rho * det * rule.weights)
                     shapes.append(s)
-            per_element = families.get(block.key.family).has_gradients
+            per_element = families.get_family(block.key.family).has_gradients
             shape = np.concatenate(shapes) if per_element else shapes[0]
             block.data.shape = m.array("loads", np.moveaxis(shape, 0, 2), m.types.T)
             block.data.mass_weight = m.array("loads", np.concatenate(weights).T, m.types.T)
             block.body_force_rule = rule
 
     def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
-        return {field.kernel.module for field in self.parts_of_fields}
+        return {field.kernel.module for field in self.block_forces}
 
     def force(self, ctx: StepContext, active: wp.array) -> None:
         m, w = self.model, ctx.work
-        for field in self.parts_of_fields:
+        for field in self.block_forces:
             args = [field.block.data, field.members, m.reference_device, field.origin, w.u_stage, w.stage_time]
             args += [w.step.load_factor, active, self.offset + field.offset, w.nonpotential_contribution]
             ctx.launch(field.kernel, (m.worlds, field.count), args)

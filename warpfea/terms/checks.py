@@ -16,23 +16,29 @@ if TYPE_CHECKING:
     from ..model.model import Model
 
 __all__ = [
-    "check_columns",
+    "check_constructed",
     "check_energy_increments",
-    "check_made",
-    "check_names",
-    "check_stored",
+    "check_ledger_columns",
+    "check_stored_columns",
     "check_stored_energy",
     "check_tables",
+    "check_unique_names",
     "derived_traits",
     "stored_columns",
 ]
 
-KINDS = {STORED: "STORED", WORK: "WORK", LOSS: "LOSS", NUMERICAL: "NUMERICAL", EXPLICIT_VISCOUS: "EXPLICIT_VISCOUS"}
-RESERVED = ("work",)
+COLUMN_KINDS = {
+    STORED: "STORED",
+    WORK: "WORK",
+    LOSS: "LOSS",
+    NUMERICAL: "NUMERICAL",
+    EXPLICIT_VISCOUS: "EXPLICIT_VISCOUS",
+}
+RESERVED_ENERGY_KEYS = ("work",)
 """Keys of energies() reserved for sums of columns."""
 
 
-def check_made(term: Any, make: Any, model: Model) -> None:
+def check_constructed(term: Any, make: Any, model: Model) -> None:
     """Raise ModelError unless the function given to add_term returned a named term of this model."""
     if not isinstance(term, Term):
         raise ModelError(f"add_term: {make!r} returned {term!r}; expected a warpfea.terms.Term, or None")
@@ -44,7 +50,7 @@ def check_made(term: Any, make: Any, model: Model) -> None:
         raise ModelError(f"term {term.name!r} was made for another model: make one in the function given to add_term")
 
 
-def check_names(terms: Sequence[Term], taken: Sequence[str], what: str, names: Any) -> None:
+def check_unique_names(terms: Sequence[Term], taken: Sequence[str], what: str, names: Any) -> None:
     """Raise ModelError for a duplicate or reserved name; `names(term)`: dict of name and specification.
 
     Two terms may share a field whose specification says how their values are merged (`join`).
@@ -84,7 +90,7 @@ def derived_traits(term: Term) -> Traits:
 
 def check_tables(term: Term, model: Model) -> None:
     """Raise ModelError unless connectivity and rows of a built term are valid."""
-    for k, conn in enumerate(_arrays(term)):
+    for k, conn in enumerate(_connectivity_arrays(term)):
         where = f"term {term.name!r}, connectivity[{k}]"
         if not (isinstance(conn, np.ndarray) and conn.ndim == 2 and np.issubdtype(conn.dtype, np.integer)):
             found = f"{conn.dtype}{list(conn.shape)}" if isinstance(conn, np.ndarray) else repr(conn)
@@ -97,13 +103,13 @@ def check_tables(term: Term, model: Model) -> None:
             raise ModelError(f"term {term.name!r}: {name} = {value!r} must be a whole number, 0 or more")
 
 
-def _arrays(term: Term) -> Sequence[Any]:
+def _connectivity_arrays(term: Term) -> Sequence[Any]:
     if not isinstance(term.connectivity, (list, tuple)):
         raise ModelError(f"term {term.name!r}: connectivity must be a list of arrays, got {term.connectivity!r}")
     return term.connectivity
 
 
-def check_stored(terms: Sequence[Term]) -> None:
+def check_stored_columns(terms: Sequence[Term]) -> None:
     """Raise ModelError for a column of stored energy of two terms: it holds a current value, J, not an increment."""
     every = [(column.name, term.name) for term in terms for column in term.columns if column.name]
     for name in (name for term in terms for name in stored_columns(term)):
@@ -119,24 +125,24 @@ def stored_columns(term: Term) -> list[str]:
     return [column.name for column in term.columns if column.kind == STORED]
 
 
-def check_columns(term: Term, *, own: bool) -> None:
+def check_ledger_columns(term: Term, *, own: bool) -> None:
     """Raise ModelError unless a term's ledger columns are valid; `own`: a built-in term."""
     kind = type(term)
     if term.columns and kind.energy_increments is Term.energy_increments:
         raise ModelError(f"term {term.name!r} has columns, but does not override energy_increments")
     for column in term.columns:
         where = f"term {term.name!r}, column {column.name!r}"
-        if column.kind not in KINDS:
-            raise ModelError(f"{where}: kind {column.kind!r} is none of {', '.join(KINDS.values())}")
+        if column.kind not in COLUMN_KINDS:
+            raise ModelError(f"{where}: kind {column.kind!r} is none of {', '.join(COLUMN_KINDS.values())}")
         if column.kind in (STORED, WORK, LOSS) and not column.name:
-            raise ModelError(f"{where}: {KINDS[column.kind]} needs a name, the column of energies()")
+            raise ModelError(f"{where}: {COLUMN_KINDS[column.kind]} needs a name, the column of energies()")
         if column.kind == STORED and kind.stored_energy is Term.stored_energy:
             raise ModelError(f"{where}: override stored_energy: the ledger restarts from its value after a reset")
         if own:
             continue
         if column.kind == EXPLICIT_VISCOUS:
             raise ModelError(f"{where}: EXPLICIT_VISCOUS is reserved for explicit damping terms of warpfea")
-        if column.name in (*LEDGER_COLUMNS, *RESERVED):
+        if column.name in (*LEDGER_COLUMNS, *RESERVED_ENERGY_KEYS):
             raise ModelError(f"{where}: the ledger has a column of its own by this name")
         if column.kind == WORK and not column.name.startswith("work_"):
             raise ModelError(f"{where}: name columns of work work_..., they count in energies()['work']")

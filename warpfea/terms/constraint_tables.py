@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 __all__ = ["ConstraintTables"]
 
-DENSE = 64
+MAX_DENSE_ROWS = 64
 """Maximum coupled rows of several joints with one inverse matrix; beyond, joints are swept colour by colour."""
 
 
@@ -41,6 +41,11 @@ class ConstraintTables:
         count: number of rows.
         rows_of: row indices of each joint.
         data: device tables.
+        component_host, cluster_host: component and cluster of each row; colour_host: colour of each cluster.
+        term_host, slot_host, weight_host, on_child_host: weighted slots of the vectors: index 3 row + side of the
+            vector, slot, weight, flag of the joint's child; start_host: first of each vector.
+        reference_host: constant part of each vector.
+        scale_host: factor of each row, which makes c a length, m.
     """
 
     def __init__(self, model: Model, joints: Sequence[Joint]) -> None:
@@ -56,7 +61,7 @@ class ConstraintTables:
 
     # connectivity, before components are known
 
-    def slot_groups(self) -> list[np.ndarray]:
+    def joint_slots(self) -> list[np.ndarray]:
         """Model slots tied by the rows of each joint."""
         return [
             np.unique(np.concatenate([v.entries()[0] for row in joint.rows for v in row.vectors]))
@@ -69,7 +74,7 @@ class ConstraintTables:
         for k, row in enumerate(self.rows):
             felt = False
             for side in range(3):
-                slots, weights, _ = self._entries[3 * k + side]
+                slots, weights, _ = self._vector_entries[3 * k + side]
                 size = np.abs(weights).sum()
                 felt |= bool(abs(weights[position[slots]].sum()) > 1e-9 * size) if len(slots) else False
             if felt:
@@ -80,14 +85,14 @@ class ConstraintTables:
 
     def build(self, component: np.ndarray, laws: TimeLawTable) -> None:
         """Upload the tables; `component` of each slot."""
-        self._order(component)
-        self._fill_terms(laws)
-        self._fill_pairs()
-        self._fill_joints()
+        self._order_rows(component)
+        self._upload_vectors(laws)
+        self._upload_row_pairs()
+        self._upload_joints()
 
-    def _order(self, component: np.ndarray) -> None:
+    def _order_rows(self, component: np.ndarray) -> None:
         """Sort joints by component and cluster."""
-        groups = self.slot_groups()
+        groups = self.joint_slots()
         free = np.any(self.model.free_host > 0.0, axis=1)
         joint_of = np.concatenate([np.full(len(g), k) for k, g in enumerate(groups)])
         slot = np.concatenate(groups)
@@ -109,17 +114,17 @@ class ConstraintTables:
             components += [own[k]] * n
         self.rows = rows
         # renumber in order of appearance: clusters become ranges of rows
-        seen: dict[int, int] = {}
-        self.cluster_host = np.array([seen.setdefault(int(c), len(seen)) for c in clusters])
+        new_number: dict[int, int] = {}
+        self.cluster_host = np.array([new_number.setdefault(int(c), len(new_number)) for c in clusters])
         self.component_host = np.array(components)
 
-    def _fill_terms(self, laws: TimeLawTable) -> None:
+    def _upload_vectors(self, laws: TimeLawTable) -> None:
         m, rows = self.model, self.rows
         entries = [vector.entries() for row in rows for vector in row.vectors]
         start = np.concatenate([[0], np.cumsum([len(e[0]) for e in entries])])
         slot = np.concatenate([e[0] for e in entries])
         weight = np.concatenate([e[1] for e in entries])
-        self.child_host = np.concatenate([e[2] for e in entries])
+        self.on_child_host = np.concatenate([e[2] for e in entries])
         term = np.repeat(np.arange(len(entries)), np.diff(start))
         self.term_host, self.slot_host, self.weight_host, self.start_host = term, slot, weight, start
         numbers: dict[TimeLaw, int] = {}
@@ -153,11 +158,11 @@ class ConstraintTables:
         for name, (values, dtype) in tables.items():
             setattr(data, name, m.array("constraints", np.asarray(values), dtype))
         self.data = data
-        self._entries = entries
+        self._vector_entries = entries
 
-    def _fill_pairs(self) -> None:
+    def _upload_row_pairs(self) -> None:
         """Pairs of shared vectors for each pair of rows that share slots: dense within clusters, else couplings."""
-        first = self._cluster_rows()
+        first = self._split_large_clusters()
         shared = self._shared_vectors()
         n = np.diff(first)
         pair_start, pair_side, pair_block = [0], [], []
@@ -181,7 +186,7 @@ class ConstraintTables:
             pair_side += [side for side, _ in pairs]
             pair_block += [block for _, block in pairs]
             couple_pair.append(len(pair_block))
-        self.couple_count = len(couple_column)
+        self.coupling_count = len(couple_column)
         self.matrix_entries = int((n**2).sum())
         self.cluster_sizes = n
         couple_row = np.repeat(np.arange(self.count), np.diff(couple_start))
@@ -203,13 +208,13 @@ class ConstraintTables:
         for name, (values, dtype) in tables.items():
             setattr(self.data, name, self.model.array("constraints", np.asarray(values), dtype))
 
-    def _cluster_rows(self) -> np.ndarray:
+    def _split_large_clusters(self) -> np.ndarray:
         """First row of each cluster, after splitting clusters too large for a dense inverse into joints."""
         sizes = np.bincount(self.cluster_host)
         joint = np.zeros(self.count, dtype=np.int64)
         for k, rows in enumerate(self.rows_of):
             joint[rows] = k
-        split = (sizes > DENSE)[self.cluster_host]
+        split = (sizes > MAX_DENSE_ROWS)[self.cluster_host]
         label = np.where(split, self.count + joint, self.cluster_host)
         starts = np.flatnonzero(np.concatenate([[True], label[1:] != label[:-1]]))
         self.cluster_host = np.cumsum(np.concatenate([[0], (label[1:] != label[:-1]).astype(int)]))
@@ -220,13 +225,13 @@ class ConstraintTables:
 
         Blocks sum w w' D^-1 over the slots; rows share vectors (the three rows of a pin use one), so blocks are few.
         """
-        weights, rows_of_vector, sides = self._vectors()
-        near, block_start, block_slot, block_weight = _shared_blocks(weights)
+        weights, rows_of_vector, sides = self._vector_weights()
+        neighbours, block_start, block_slot, block_weight = _shared_blocks(weights)
         out: list[dict[int, list[tuple[tuple[int, int], int]]]] = []
         for own in sides:
             columns: dict[int, list[tuple[tuple[int, int], int]]] = {}
             for side, u in own:
-                for v, block in near[u]:
+                for v, block in neighbours[u]:
                     for other, other_side in rows_of_vector[v]:
                         columns.setdefault(other, []).append(((side, other_side), block))
             out.append(columns)
@@ -237,7 +242,9 @@ class ConstraintTables:
         self.data.block_weight = m.array("constraints", np.asarray(block_weight or [0.0]), wp.float64)
         return out
 
-    def _vectors(self) -> tuple[list[dict[int, float]], list[list[tuple[int, int]]], list[list[tuple[int, int]]]]:
+    def _vector_weights(
+        self,
+    ) -> tuple[list[dict[int, float]], list[list[tuple[int, int]]], list[list[tuple[int, int]]]]:
         """Weights of each vector by free slot; its (row, side); and of each row its (side, vector)."""
         free = np.any(self.model.free_host > 0.0, axis=1)
         number: dict[Vector, int] = {}
@@ -250,7 +257,7 @@ class ConstraintTables:
                 if vector is None or not vector.parts:
                     continue
                 if vector not in number:
-                    slots, w, _ = self._entries[3 * k + side]
+                    slots, w, _ = self._vector_entries[3 * k + side]
                     merged: dict[int, float] = {}
                     for s, x in zip(slots.tolist(), w.tolist()):
                         if free[s]:
@@ -266,27 +273,27 @@ class ConstraintTables:
     def _colour_clusters(self, row: np.ndarray, column: np.ndarray) -> None:
         """Greedy colouring of coupled clusters; `colour_sizes` counts the clusters per colour."""
         n = len(self.cluster_sizes)
-        near: list[set[int]] = [set() for _ in range(n)]
+        neighbours: list[set[int]] = [set() for _ in range(n)]
         for a, b in zip(self.cluster_host[row].tolist(), self.cluster_host[column].tolist()):
-            near[a].add(b)
+            neighbours[a].add(b)
         colour = np.full(n, -1)
         for k in range(n):
-            taken = {int(colour[j]) for j in near[k]}
+            taken = {int(colour[j]) for j in neighbours[k]}
             colour[k] = next(c for c in itertools.count() if c not in taken)
         self.colour_host = colour
         self.colour_sizes = np.bincount(colour)
 
-    def _fill_joints(self) -> None:
+    def _upload_joints(self) -> None:
         m = self.model
         position = m.slot_kind == 0
         origin = np.concatenate([np.tile(b.origin, (b.slot_count, 1)) for b in m.bodies])
         place = m.reference + position[:, None] * origin
         anchors = [joint.anchor.entries() for joint in self.joints]
         data = joint_struct()()
-        side = np.where(self.child_host, 1, 0)
+        side = np.where(self.on_child_host, 1, 0)
         for rows in self.rows_of:
             own = slice(self.start_host[3 * rows[0]], self.start_host[3 * rows[-1] + 3])
-            if not self.child_host[own].any():  # child in space: the parent's reaction
+            if not self.on_child_host[own].any():  # child in space: the parent's reaction
                 side[own] = -1
         tables: dict[str, tuple[Any, Any]] = {
             "first_row": ([rows[0] for rows in self.rows_of], wp.int32),
@@ -306,7 +313,7 @@ class ConstraintTables:
 
     # host evaluation for supports, tests and users
 
-    def expand(self, G: np.ndarray) -> sp.csr_matrix:
+    def expand_jacobian(self, G: np.ndarray) -> sp.csr_matrix:
         """Rows of the Jacobian, CSR, from the gradients (rows, 3, 3) of their vectors."""
         data = self.weight_host[:, None] * G.reshape(-1, 3)[self.term_host]
         rows = np.repeat(self.term_host // 3, 3)
@@ -315,14 +322,14 @@ class ConstraintTables:
 
     def measure(self, joint: Joint, what: str | None, state: Any) -> np.ndarray:
         """Joint coordinate (worlds,): "angle" (rad), "travel" or "length" (m); ModelError if undefined."""
-        has = self.vectors_of(joint)
+        has = self.coordinate_vectors(joint)
         what = what or next(iter(has), None)
         if what not in has:
             raise ModelError(f"joint {joint.name!r}: a {joint.kind} joint has no {what or 'angle, travel or length'}")
-        target, turn = self.targets(state), self.turn_of(joint)
+        target, turn = self.targets(state), self.angle_row(joint)
         out = []
         for world, u in enumerate(state.displacement.numpy().astype(float)):
-            vectors = [self._present(v, u) for v in has[what]]
+            vectors = [self._current_vector(v, u) for v in has[what]]
             if what == "length":
                 out.append(np.linalg.norm(vectors[0]))
             elif what == "travel":
@@ -337,13 +344,13 @@ class ConstraintTables:
         return np.array(out)
 
     @staticmethod
-    def vectors_of(joint: Joint) -> dict[str, list[Vector]]:
+    def coordinate_vectors(joint: Joint) -> dict[str, list[Vector]]:
         """Vectors of a joint that define its "angle" (three), "travel" (two) and "length" (one), if any."""
         length = [joint.rows[0].a] if joint.rows[0].kind == DISTANCE else []
         has = {"angle": list(joint.angle or ()), "travel": list(joint.travel or ()), "length": length}
         return {name: vectors for name, vectors in has.items() if vectors}
 
-    def turn_of(self, joint: Joint) -> int:
+    def angle_row(self, joint: Joint) -> int:
         """Row of the drive that counts the full turns of a joint's angle, or -1."""
         return next((int(k) for k in self.rows_of[joint.index] if self.rows[k].kind == ANGLE), -1)
 
@@ -356,7 +363,7 @@ class ConstraintTables:
         return np.where(np.isnan(reached), at_time, reached)
 
     @staticmethod
-    def _present(vector: Vector, u: np.ndarray) -> np.ndarray:
+    def _current_vector(vector: Vector, u: np.ndarray) -> np.ndarray:
         slots, weights, _ = vector.entries()
         return vector.value + weights @ u[slots]
 
@@ -367,7 +374,7 @@ class ConstraintTables:
         for values in (self.slot_host, self.weight_host, self.start_host, self.reference_host):
             h.update(np.ascontiguousarray(values).tobytes())
 
-    def couplings(self, pattern: Any) -> tuple[Any, int]:
+    def pattern_couplings(self, pattern: Any) -> tuple[Any, int]:
         """Upper pattern entries that the rows contribute to, their pairs of vectors, and the number of entries."""
         items, term_a, term_b, weight = [], [], [], []
         for row in range(self.count):
@@ -401,7 +408,7 @@ def _shared_blocks(
         for s in merged:
             of_slot.setdefault(s, []).append(v)
     blocks: dict[tuple[int, int], int] = {}
-    near: list[list[tuple[int, int]]] = []
+    neighbours: list[list[tuple[int, int]]] = []
     start, slots, products = [0], [], []
     for u, merged in enumerate(weights):
         own = []
@@ -414,5 +421,5 @@ def _shared_blocks(
                 products += [x for _, x in common]
                 start.append(len(slots))
             own.append((v, blocks[key]))
-        near.append(own)
-    return near, start, slots, products
+        neighbours.append(own)
+    return neighbours, start, slots, products

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Constraints"]
 
-THREAD_LIMIT = 16
+MAX_THREAD_ROWS = 16
 """Maximum rows of a cluster whose matrix one thread inverts; larger ones take a launch per pivot."""
 
 
@@ -67,7 +67,7 @@ class Constraints(Term):
         return {"constraints": bool(model.description.joints)}
 
     def tied_slots(self) -> list[np.ndarray]:
-        return self.tables.slot_groups()
+        return self.tables.joint_slots()
 
     def build(self, laws: TimeLawTable) -> None:
         self.tables.build(self.model.component, laws)
@@ -86,7 +86,7 @@ class Constraints(Term):
 
     # simulation setup
 
-    def kernels_of(self, ctx: StepContext) -> Any:
+    def integrator_kernels(self, ctx: StepContext) -> Any:
         """Kernels specialised for the integrator of a simulation."""
         return constraint_kernels(self.model.dtype, ctx.midpoint)
 
@@ -102,7 +102,7 @@ class Constraints(Term):
             "violation": ((B, model.component_count), wp.float64),
             "compliance_block": ((B, max(con.block_count, 1)), wp.mat33d),
             "inverse_matrix": ((B, con.matrix_entries), wp.float64),
-            "coupling": ((B, max(con.couple_count, 1)), wp.float64),
+            "coupling": ((B, max(con.coupling_count, 1)), wp.float64),
         }
         for name, var in multiplier_struct().vars.items():
             if name == "end_gradient" and not ctx.midpoint:
@@ -125,13 +125,13 @@ class Constraints(Term):
         mul.outer_updates, mul.penalty_ratio = int(options.outer_multipliers), options.penalty_ratio
         deflate = bool(options.deflate_constraints)
         sizes = self.tables.cluster_sizes
-        large = np.flatnonzero(sizes > THREAD_LIMIT)
+        large = np.flatnonzero(sizes > MAX_THREAD_ROWS)
         largest = int(sizes[large].max()) if len(large) and deflate else 0
         table = self.model.array("constraints", large, wp.int32) if largest else None
         ctx.scratch[self.name] = Deflation(deflate, largest, table, len(large))
 
     def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
-        return {self.kernels_of(ctx).module, deflation_kernels(self.model.dtype).module}
+        return {self.integrator_kernels(ctx).module, deflation_kernels(self.model.dtype).module}
 
     def start(self, ctx: StepContext, active: wp.array) -> None:
         """Initialise right-hand sides missing in the state, and the violation at the start."""
@@ -147,12 +147,12 @@ class Constraints(Term):
     def begin(self, ctx: StepContext, active: wp.array) -> None:
         """Warm start of an attempt from the multipliers and right-hand sides of the state; rho is not known yet."""
         args = [ctx.state.constraint_force, ctx.state.constraint_target, active, ctx.work.multipliers]
-        ctx.launch(self.kernels_of(ctx).load_multipliers, self.dim, args)
+        ctx.launch(self.integrator_kernels(ctx).load_multipliers, self.dim, args)
 
     @part("constraints")
     def force(self, ctx: StepContext, active: wp.array) -> None:
         """Evaluate c, J and the rows of the augmented potential at work.u."""
-        m, w, k = self.model, ctx.work, self.kernels_of(ctx)
+        m, w, k = self.model, ctx.work, self.integrator_kernels(ctx)
         ctx.launch(k.reset_violation, (m.worlds, m.component_count), [active, w.multipliers])
         args = [self.tables.data, w.u, w.u_stage, w.time_law_values, w.newton.alpha, active, w.multipliers]
         ctx.launch(k.evaluate, self.dim, args)
@@ -160,13 +160,13 @@ class Constraints(Term):
     prepare = force  # J, for rho
 
     def scale(self, ctx: StepContext, active: wp.array) -> None:
-        self.invert(ctx, active, penalty=True)
+        self.invert_cluster_matrices(ctx, active, penalty=True)
 
     def prepare_solve(self, ctx: StepContext, active: wp.array) -> None:
-        self.invert(ctx, active)
+        self.invert_cluster_matrices(ctx, active)
 
     @part("build")
-    def invert(self, ctx: StepContext, active: wp.array, *, penalty: bool = False) -> None:
+    def invert_cluster_matrices(self, ctx: StepContext, active: wp.array, *, penalty: bool = False) -> None:
         """Assemble and invert the cluster matrices from the inverse diagonal blocks; `penalty`: set rho from them."""
         deflation: Deflation = ctx.scratch[self.name]
         if not (deflation.on or penalty):
@@ -175,13 +175,13 @@ class Constraints(Term):
         data, mul = con.data, w.multipliers
         launch(k.assemble_pair_blocks, (m.worlds, con.block_count), [data, w.inverse, active, mul])
         launch(k.assemble_cluster_matrices, self.dim, [data, active, mul])
-        launch(k.assemble_cluster_couplings, (m.worlds, con.couple_count), [data, active, mul])
+        launch(k.assemble_cluster_couplings, (m.worlds, con.coupling_count), [data, active, mul])
         if penalty:
             launch(k.compute_penalty, self.dim, [data, w.step.dq_dv, active, mul])
         if not deflation.on:
             return
         clusters = len(con.cluster_sizes)
-        launch(k.invert_clusters, (m.worlds, clusters), [data, w.step.dq_dv, THREAD_LIMIT, active, mul])
+        launch(k.invert_clusters, (m.worlds, clusters), [data, w.step.dq_dv, MAX_THREAD_ROWS, active, mul])
         for pivot in range(deflation.largest):
             dim = (m.worlds, deflation.count, deflation.largest)
             launch(k.eliminate_pivot, dim, [data, deflation.large, pivot, active, mul])
@@ -191,14 +191,14 @@ class Constraints(Term):
         """Constraint part of H p, for the gather."""
         w = ctx.work
         args = [self.tables.data, w.multipliers, p, w.step.dq_dv, active]
-        ctx.launch(self.kernels_of(ctx).product_terms, self.dim, args)
+        ctx.launch(self.integrator_kernels(ctx).product_terms, self.dim, args)
 
     @part("constraints")
     def process_direction(self, ctx: StepContext, active: wp.array) -> None:
         """Multiplier part of the Newton step in work.direction."""
         w = ctx.work
         args = [self.tables.data, w.multipliers, w.direction, w.newton.component_converged, w.step.dq_dv, active]
-        ctx.launch(self.kernels_of(ctx).predict_change, self.dim, args)
+        ctx.launch(self.integrator_kernels(ctx).predict_change, self.dim, args)
 
     def accept_trial(self, ctx: StepContext, flags: wp.array) -> None:
         """Accept the trial's multipliers with every Newton step; the classical method uses its outer loop."""
@@ -208,28 +208,28 @@ class Constraints(Term):
     @part("constraints")
     def update_multipliers(self, ctx: StepContext, flags: wp.array) -> None:
         """Accept the trial's multipliers."""
-        ctx.launch(self.kernels_of(ctx).accept_trial, self.dim, [flags, ctx.work.multipliers])
+        ctx.launch(self.integrator_kernels(ctx).accept_trial, self.dim, [flags, ctx.work.multipliers])
 
     @part("constraints")
     def energy_increments(self, ctx: StepContext, accepted: wp.array) -> wp.array:
         """Work of drives and the constraint work of the chord at rest, J, over an accepted substep."""
         w, state = ctx.work, ctx.state
         args = [self.tables.data, w.multipliers, w.u, state.displacement, state.constraint_target, accepted]
-        ctx.launch(self.kernels_of(ctx).work_terms, self.dim, args)
+        ctx.launch(self.integrator_kernels(ctx).work_terms, self.dim, args)
         return w.multipliers.rows
 
     @part("constraints")
     def commit(self, ctx: StepContext, accepted: wp.array) -> None:
         """Store multipliers and right-hand sides of an accepted substep."""
         args = [accepted, ctx.work.multipliers, ctx.state.constraint_force, ctx.state.constraint_target]
-        ctx.launch(self.kernels_of(ctx).store_multipliers, self.dim, args)
+        ctx.launch(self.integrator_kernels(ctx).store_multipliers, self.dim, args)
 
     def report(self, ctx: StepContext) -> None:
         """Report the force and moment on the child and the violation of each joint."""
         w, con, state = ctx.work, self.tables, ctx.state
         args = [con.data, w.multipliers, con.joint_data, state.displacement, state.constraint_force]
         dim = (self.model.worlds, len(con.joints))
-        ctx.launch(self.kernels_of(ctx).joint_report, dim, [*args, self.report_offset, w.report])
+        ctx.launch(self.integrator_kernels(ctx).joint_report, dim, [*args, self.report_offset, w.report])
 
     # in a linear solve
 
@@ -238,13 +238,13 @@ class Constraints(Term):
         return [("gradient", mul.gradient), ("stiffness", mul.penalty)]
 
     def copy_cached(self, ctx: StepContext, kept: CachedInputs, reuse: Any, accepted: wp.array) -> bool:
-        args = [reuse, accepted, *kept.live, *kept.state, *kept.place]
+        args = [reuse, accepted, *kept.live, *kept.state, *kept.cached]
         ctx.launch(reuse_kernels(self.model.dtype).transfer_constraint_rows, self.dim, args)
         return True
 
     def allocate_blocks(self, ctx: StepContext, matrix: Any, *, projected: bool) -> None:
         if "couplings" not in self.model.cache:
-            self.model.cache["couplings"] = self.tables.couplings(matrix.pattern)
+            self.model.cache["couplings"] = self.tables.pattern_couplings(matrix.pattern)
 
     def blocks(
         self, ctx: StepContext, matrix: Any, kept: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,
@@ -285,7 +285,7 @@ class Constraints(Term):
                 launch(k.gauss_seidel_sweep, (m.worlds, int(sizes[c])), [data, mul, int(first[c]), 1, active])
             for c in range(len(sizes) - 2, -1, -1):
                 launch(k.gauss_seidel_sweep, (m.worlds, int(sizes[c])), [data, mul, int(first[c]), 0, active])
-        args = [data, mul, w.inverse, r, z, int(into is not None), active, w.warp]
+        args = [data, mul, w.inverse, r, z, int(into is not None), active, w.warp_size]
         launch(
             k.subtract_constraint_part,
             (m.worlds, launch.padded(m.slots)),
@@ -302,9 +302,9 @@ class Constraints(Term):
         def zeros(shape: tuple[int, ...], dtype: Any) -> wp.array:
             return wp.zeros(shape, dtype=dtype, device=m.device)
 
-        every = wp.ones(B, dtype=wp.int32, device=m.device)
+        all_worlds = wp.ones(B, dtype=wp.int32, device=m.device)
         value = zeros((B, max(laws.count, 1)), wp.vec3d)
-        laws.evaluate(launch, state, state.time, wp.ones(B, dtype=wp.float64, device=m.device), every, value)
+        laws.evaluate(launch, state, state.time, wp.ones(B, dtype=wp.float64, device=m.device), all_worlds, value)
         mul = multiplier_struct()()
         for name in (
             "constraint_value",
@@ -327,7 +327,7 @@ class Constraints(Term):
         if multipliers is not None:
             mul.multiplier.assign(np.tile(multipliers, (B, 1)))
         mul.last_target.fill_(np.nan)  # any number of turns is valid
-        args = [con.data, state.displacement, state.displacement, value, zeros((B,), wp.float64), every, mul]
+        args = [con.data, state.displacement, state.displacement, value, zeros((B,), wp.float64), all_worlds, mul]
         launch(self.kernels.evaluate, self.dim, args)
         return mul
 
@@ -338,7 +338,7 @@ class Constraints(Term):
 
     def jacobian(self, state: State, world: int) -> sp.csr_matrix:
         """dc/dq of one world, (rows, 3 slots) CSR."""
-        return self.tables.expand(self.values(state)[1][world].reshape(-1, 3, 3))
+        return self.tables.expand_jacobian(self.values(state)[1][world].reshape(-1, 3, 3))
 
     def curvature(self, state: State, multipliers: np.ndarray, direction: np.ndarray) -> np.ndarray:
         """sum_i multipliers_i d2c_i/dq2 direction, [world, slot, 3]; multipliers (rows,), direction (slots, 3)."""
@@ -347,8 +347,8 @@ class Constraints(Term):
         host = np.tile(direction, (m.worlds, 1, 1))
         p: Any = wp.array(host.astype(np.dtype(m.dtype)), dtype=m.types.vec3, device=m.device)
         one = wp.ones(m.worlds, dtype=wp.float64, device=m.device)
-        every = wp.ones(m.worlds, dtype=wp.int32, device=m.device)
-        Launcher(m.device)(self.kernels.product_terms, self.dim, [con.data, mul, p, one, every])
+        all_worlds = wp.ones(m.worlds, dtype=wp.int32, device=m.device)
+        Launcher(m.device)(self.kernels.product_terms, self.dim, [con.data, mul, p, one, all_worlds])
         out = np.zeros((m.worlds, m.slots, 3))
         terms = mul.product.numpy()
         for world in range(m.worlds):

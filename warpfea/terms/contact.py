@@ -16,13 +16,13 @@ from ..kernels.terms.contact_ledger import ENERGY_COLUMNS, RECORD_LANES, contact
 from ..kernels.terms.contact_structs import RECORD_NAMES, clock_struct, contact_scratch_struct, history_struct
 from ..model.state import State
 from ..model.triangle_mesh import TriMesh
-from .contact_fields import CONTACT_FIELDS, contact_field, nodal_force, obstacle_patches
+from .contact_fields import CONTACT_FIELDS, contact_field, nodal_force, obstacle_contact_points
 from .contact_parameters import collider_parameters, contact_parameters
-from .contact_sheets import refuse_across
-from .contact_starts import reference_place, store_overlaps, touching_depth
-from .contact_tables import ContactTables, block_entries
+from .contact_sheets import check_sheet_sides
+from .contact_tables import ContactTables, facet_pattern_entries
 from .deepest_point import DeepestPoints, at_points
 from .double_displacements import DoubleDisplacements
+from .initial_overlaps import reference_position_text, store_overlaps, touching_depth
 from .term import LOSS, NUMERICAL, STORED, WORK, Column, StepContext, Term, part
 from .time_law_table import TimeLawTable
 
@@ -55,12 +55,12 @@ class Contact(Term):
         super().__init__(model)
         self.traits = Traits(unilateral=True)
         self.tables = ContactTables(model)
-        meshes = self.tables.meshes
+        has_meshes = self.tables.has_meshes
         self.kernels, self.ledger_kernels = (
-            contact_kernels(model.dtype, meshes),
-            contact_ledger_kernels(model.dtype, meshes),
+            contact_kernels(model.dtype, has_meshes),
+            contact_ledger_kernels(model.dtype, has_meshes),
         )
-        self.deepest_points = DeepestPoints(self.tables) if self.tables.lumped else None
+        self.deepest_points = DeepestPoints(self.tables) if self.tables.has_single_point else None
         self.report_columns = len(RECORD_NAMES) * len(self.tables.contacts)
 
     @classmethod
@@ -75,7 +75,9 @@ class Contact(Term):
     def build(self, laws: TimeLawTable) -> None:
         self.tables.build(laws, self.offset)
         self.connectivity = [group.conn for group in self.tables.groups]
-        self.exact = DoubleDisplacements(self.model, self.connectivity) if self.model.dtype == "float32" else None
+        self.double_displacements = (
+            DoubleDisplacements(self.model, self.connectivity) if self.model.dtype == "float32" else None
+        )
         self.rows = self.increment_rows = self.tables.rows
 
     def hash(self, h: Any) -> None:
@@ -83,7 +85,7 @@ class Contact(Term):
 
     # simulation setup
 
-    def attempt_of(self, worlds: int, make: Callable[[str, tuple[int, ...], Any], wp.array]) -> Any:
+    def make_scratch(self, worlds: int, make: Callable[[str, tuple[int, ...], Any], wp.array]) -> Any:
         """Attempt struct with arrays from make(name, shape, dtype)."""
         t, B = self.tables, worlds
         K, P, C, R = len(t.colliders), t.points, len(t.contacts), t.rows
@@ -105,7 +107,7 @@ class Contact(Term):
             ),
             (B, K),
         )
-        if not t.lumped:
+        if not t.has_single_point:
             shapes |= dict.fromkeys(
                 (
                     "point_depth",
@@ -123,13 +125,13 @@ class Contact(Term):
             setattr(out, name, make(name, shapes.get(name, (B, P)), var.type.dtype))
         return out
 
-    def history_of(self, make: Callable[[str, Any, tuple[int, ...]], wp.array]) -> Any:
+    def make_history(self, make: Callable[[str, Any, tuple[int, ...]], wp.array]) -> Any:
         """History struct with arrays from make(name, dtype, shape per world)."""
         out = history_struct()()
         shapes: dict[str, tuple[int, ...]] = {"overlap_time": (), "pose_time": ()}
         shapes |= dict.fromkeys(("position", "rotation", "angle", "previous_margin"), (len(self.tables.colliders),))
         for name, var in history_struct().vars.items():
-            if name == "previous_depth" and not self.tables.moving:
+            if name == "previous_depth" and not self.tables.tracks_deepest:
                 continue
             shape = shapes.get(name, (self.tables.points,))
             setattr(out, name, make(f"contact_{name}", var.type.dtype, shape))
@@ -138,7 +140,7 @@ class Contact(Term):
     def allocate(self, work: Workspace, ctx: StepContext) -> None:
         t, B = self.tables, self.model.worlds
         C, R = len(t.contacts), t.rows
-        attempt = self.attempt_of(B, lambda name, shape, dtype: work.array(f"contact {name}", shape, dtype))
+        attempt = self.make_scratch(B, lambda name, shape, dtype: work.array(f"contact {name}", shape, dtype))
         attempt.relaxation.fill_(1.0)
         clock = clock_struct()()
         for name in ("time", "new_time", "h", "substep_index"):
@@ -148,19 +150,19 @@ class Contact(Term):
             "attempt": attempt,
             "clock": clock,
             # Newton's method only; unused by Jacobi's iteration
-            "touching": work.newton.contact_active,
+            "contact_active": work.newton.contact_active,
             "energies": work.array("contact energies", (ENERGY_COLUMNS, B, R), wp.float64),
             "parts": work.array("contact parts", (B, C, len(RECORD_NAMES), RECORD_LANES), wp.float64),
             "row_start": self.model.array("contact", t.row_start, wp.int32),
-            "u": self.exact.allocate(work, self.name) if self.exact else work.u,
+            "u": self.double_displacements.allocate(work, self.name) if self.double_displacements else work.u,
         }
         ctx.scratch[self.name] = scratch | ctx.scratch.get(self.name, {})
 
     def register(self, ctx: StepContext) -> None:
-        ctx.scratch[self.name] = {"history": self.history_of(ctx.state.register)}
+        ctx.scratch[self.name] = {"history": self.make_history(ctx.state.register)}
 
     def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
-        others = (part.kernels.module for part in (self.deepest_points, self.exact) if part)
+        others = (part.kernels.module for part in (self.deepest_points, self.double_displacements) if part)
         return [self.kernels.module, *others]
 
     def start(self, ctx: StepContext, active: wp.array) -> None:
@@ -175,7 +177,7 @@ class Contact(Term):
         # with a history at this time colliders continue from it: a control may have changed since
         known = history.rotation.numpy().any(axis=(1, 2, 3)) & (history.pose_time.numpy() == time)
         fresh = (active.numpy() != 0) & ~known
-        self._poses(ctx, active)
+        self._update_poses(ctx, active)
         for name in ("position", "rotation", "angle", "previous_margin"):
             source = self.tables.data.margin if name == "previous_margin" else getattr(s["attempt"], f"collider_{name}")
             values = getattr(history, name).numpy()
@@ -192,8 +194,8 @@ class Contact(Term):
         history.overlap_time.assign(born)
         gap, _ = self.at_points(state, history, places=False)
         touching = touching_depth(self.model.size, state.displacement.numpy())
-        if self.tables.sheets and new.any():
-            refuse_across(self, s["attempt"], state.displacement, touching, new, ctx.launch)
+        if self.tables.has_sheets and new.any():
+            check_sheet_sides(self, s["attempt"], state.displacement, touching, new, ctx.launch)
         store_overlaps(self.tables, np.where(new[:, None], -gap, 0.0), touching, overlap)
         history.overlap.assign(overlap)
 
@@ -202,7 +204,7 @@ class Contact(Term):
         if "contact_overlap_time" in state.specs:
             state.contact_overlap_time.assign(state.contact_overlap_time.numpy() - state.time.numpy())  # type: ignore[attr-defined]
 
-    def _poses(self, ctx: StepContext, active: wp.array) -> None:
+    def _update_poses(self, ctx: StepContext, active: wp.array) -> None:
         s = ctx.scratch[self.name]
         args = [self.tables.data, s["history"], ctx.work.time_law_values, active, s["attempt"]]
         ctx.launch(self.kernels.update_poses, (self.model.worlds, len(self.tables.colliders)), args)
@@ -214,7 +216,7 @@ class Contact(Term):
         """Poses of the colliders at the end of the attempt, points at its start."""
         s, m = ctx.scratch[self.name], self.model
         s["finished"] = False
-        self._poses(ctx, active)
+        self._update_poses(ctx, active)
         for group in self.tables.groups:
             dim = (m.worlds, group.count, group.data.point_count)
             args = [self.tables.data, group.data, s["history"], s["clock"]]
@@ -225,27 +227,27 @@ class Contact(Term):
 
     def prepare(self, ctx: StepContext, active: wp.array) -> None:
         """Compute the first friction limits and the stiffness of the blocks."""
-        self._forces(ctx, active, fresh=1)
+        self._evaluate_forces(ctx, active, fresh=1)
 
     def force(self, ctx: StepContext, active: wp.array) -> None:
-        self._forces(ctx, active, fresh=0)
+        self._evaluate_forces(ctx, active, fresh=0)
 
     @part("contact")
-    def _forces(self, ctx: StepContext, active: wp.array, *, fresh: int) -> None:
+    def _evaluate_forces(self, ctx: StepContext, active: wp.array, *, fresh: int) -> None:
         s, m, w, k = ctx.scratch[self.name], self.model, ctx.work, self.kernels
-        if self.exact and ctx.positions_changed:
-            self.exact.update(ctx, s["u"], active)
+        if self.double_displacements and ctx.positions_changed:
+            self.double_displacements.update(ctx, s["u"], active)
         if fresh:
-            self._pick(ctx, active, fresh=1)
+            self._choose_deepest(ctx, active, fresh=1)
         rows = w.rows_of(self)
         for group in self.tables.groups:
             args = [self.tables.data, group.data, s["history"], s["clock"], s["u"], active, fresh]
             ctx.launch(k.forces, (m.worlds, group.count, group.data.point_count), [*args, s["attempt"]])
-            dim, lanes = group.sides(ctx.launch, m.worlds)
-            args = [group.data, active, lanes, s["attempt"], w.pool_force, rows, s["touching"]]
+            dim, lanes = group.sum_threads(ctx.launch, m.worlds)
+            args = [group.data, active, lanes, s["attempt"], w.pool_force, rows, s["contact_active"]]
             ctx.launch(k.gather_point_forces, dim, args)
 
-    def _pick(self, ctx: StepContext, active: wp.array, *, fresh: int) -> None:
+    def _choose_deepest(self, ctx: StepContext, active: wp.array, *, fresh: int) -> None:
         """Select the point of each single-point contact at work.u."""
         if not self.deepest_points:
             return
@@ -260,7 +262,7 @@ class Contact(Term):
         ctx.launch(k.aitken_partial_sums, (m.worlds, AITKEN_LANES), [flags, attempt])
         ctx.launch(k.aitken_relaxation, m.worlds, [flags, ctx.work.newton.tol, attempt, ctx.work.newton.partly_updated])
         ctx.launch(k.update_frozen, (m.worlds, self.tables.points), [flags, attempt])
-        self._pick(ctx, flags, fresh=0)
+        self._choose_deepest(ctx, flags, fresh=0)
 
     @part("contact")
     def product(self, ctx: StepContext, p: wp.array, active: wp.array) -> None:
@@ -268,7 +270,7 @@ class Contact(Term):
         for group in self.tables.groups:
             dim = (m.worlds, group.count, group.data.point_count)
             ctx.launch(k.point_products, dim, [group.data, active, p, attempt])
-            sides, lanes = group.sides(ctx.launch, m.worlds)
+            sides, lanes = group.sum_threads(ctx.launch, m.worlds)
             args = [group.data, active, lanes, attempt, ctx.work.pool_product]
             ctx.launch(k.gather_facet_products, sides, args)
 
@@ -280,12 +282,12 @@ class Contact(Term):
             ctx.launch(self.kernels.diagonal, (m.worlds, group.count, group.conn.shape[1]), args)
 
     def energy_increments(self, ctx: StepContext, accepted: wp.array) -> wp.array:
-        self._finish(ctx, accepted)
+        self._record_substep(ctx, accepted)
         ctx.scratch[self.name]["finished"] = True
         return ctx.scratch[self.name]["energies"]
 
     @part("contact")
-    def _finish(self, ctx: StepContext, accepted: wp.array) -> None:
+    def _record_substep(self, ctx: StepContext, accepted: wp.array) -> None:
         """Update history, ledger rows and records of an accepted substep."""
         s, m, k = ctx.scratch[self.name], self.model, self.ledger_kernels
         C = len(self.tables.contacts)
@@ -300,7 +302,7 @@ class Contact(Term):
     def commit(self, ctx: StepContext, accepted: wp.array) -> None:
         s, m, w = ctx.scratch[self.name], self.model, ctx.work
         if not s["finished"]:  # no ledger, `energy_increments` not called
-            self._finish(ctx, accepted)
+            self._record_substep(ctx, accepted)
         args = [self.tables.data, s["clock"], w.newton.strain_energy, w.newton.term_sums, accepted, s["history"]]
         ctx.launch(self.ledger_kernels.store_poses, (m.worlds, len(self.tables.colliders)), [*args, s["attempt"]])
 
@@ -316,7 +318,7 @@ class Contact(Term):
     @property
     def weights(self) -> np.ndarray:
         """Fraction (points,) of the contact area represented by each point."""
-        out = np.concatenate([share.ravel() for share in self.tables.shares])
+        out = np.concatenate([share.ravel() for share in self.tables.area_fractions])
         for k, contact in enumerate(self.tables.contacts):
             if contact.model == "sphere":
                 out[self.tables.first[k]] = 1.0
@@ -326,12 +328,16 @@ class Contact(Term):
 
     def cached_inputs(self, ctx: StepContext) -> list[tuple[str, wp.array]]:
         attempt = ctx.scratch[self.name]["attempt"]
-        return [("stiffness", attempt.stiffness)] + ([("weight", attempt.shape_values)] if self.tables.moving else [])
+        return [("stiffness", attempt.stiffness)] + (
+            [("weight", attempt.shape_values)] if self.tables.tracks_deepest else []
+        )
 
     def allocate_blocks(self, ctx: StepContext, matrix: Any, *, projected: bool) -> None:
         if "contact blocks" not in self.model.cache:
             conns = [group.conn for group in self.tables.groups]
-            self.model.cache["contact blocks"] = [block_entries(self.model, conn, matrix.pattern) for conn in conns]
+            self.model.cache["contact blocks"] = [
+                facet_pattern_entries(self.model, conn, matrix.pattern) for conn in conns
+            ]
 
     def blocks(
         self, ctx: StepContext, matrix: Any, kept: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,
@@ -341,7 +347,7 @@ class Contact(Term):
         m, kernel = self.model, contact_block_kernels(self.model.dtype).add_contact_blocks
         for group, (entry, start, source, count) in zip(self.tables.groups, m.cache["contact blocks"]):
             args = [m.topology, matrix.pattern.data, group.data, entry, start, source, kept[0]]
-            weight = kept[1] if self.tables.moving else ctx.scratch[self.name]["attempt"].shape_values
+            weight = kept[1] if self.tables.tracks_deepest else ctx.scratch[self.name]["attempt"].shape_values
             ctx.launch(kernel, (m.worlds, count), [*args, weight, dq_dv, active, out])
 
     def block_modules(self) -> set[wp.Module]:
@@ -360,7 +366,7 @@ class Contact(Term):
                 f"contact {contact.name!r}: collider {contact.collider.name!r} turns by more than "
                 f"{MAX_COLLIDER_ROTATION:g} rad in the step, in which it is touched; take a smaller dt"
             )
-        where = reference_place(t, k, number - int(t.first[k]))
+        where = reference_position_text(t, k, number - int(t.first[k]))
         return PenetrationError, (
             f"contact {contact.name!r}: a point of body {contact.body.name!r} (reference place "
             f"{where}) went through collider {contact.collider.name!r}; take a larger "
@@ -379,7 +385,7 @@ class Contact(Term):
         return f"; in touch: contact {', '.join(pairs[:3])}{more}" if pairs else ""
 
     def parameter_arrays(self) -> dict[str, wp.array]:
-        return self.tables.set_arrays
+        return self.tables.parameter_arrays
 
     def update_materials(self, mask: np.ndarray) -> None:
         self.tables.update_materials(mask)
@@ -394,7 +400,7 @@ class Contact(Term):
         for contact in self.model.description.contacts:
             k = t.number[contact.index]
             facts = {"name": contact.name, "body": contact.body.name, "collider": contact.collider.name}
-            numbers = {"points": int((t.shares[k] > 0.0).sum()), "left_out": t.left_out[k]}
+            numbers = {"points": int((t.area_fractions[k] > 0.0).sum()), "left_out": t.clamped_point_counts[k]}
             if isinstance(contact.collider.shape, TriMesh):
                 numbers["triangles"] = len(contact.collider.shape.triangles)
             out.append(facts | {"law": contact.law, "model": contact.model} | numbers)
@@ -415,8 +421,8 @@ class Contact(Term):
 
     def samples(self, field: str, body: Any, state: State) -> np.ndarray:
         mine = any(contact.body is body for contact in self.tables.contacts)
-        patches = obstacle_patches(self.tables, body, *self.at_points(state)) if mine else []
-        return contact_field(field, body, state.worlds, patches)
+        contact_points = obstacle_contact_points(self.tables, body, *self.at_points(state)) if mine else []
+        return contact_field(field, body, state.worlds, contact_points)
 
     def at_points(self, state: State, history: Any = None, *, places: bool = True) -> tuple[np.ndarray, np.ndarray]:
         """Gap (worlds, points), m, and elastic force on each point (worlds, points, 3), N, at a state; with `places`

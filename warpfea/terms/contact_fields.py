@@ -17,7 +17,14 @@ from .term import FieldSpec
 if TYPE_CHECKING:
     from .pair_tables import PairTables
 
-__all__ = ["CONTACT_FIELDS", "Patch", "contact_field", "nearest_samples", "nodal_force", "obstacle_patches"]
+__all__ = [
+    "CONTACT_FIELDS",
+    "BodyContactPoints",
+    "contact_field",
+    "nearest_samples",
+    "nodal_force",
+    "obstacle_contact_points",
+]
 
 CONTACT_FIELDS = {
     "contact_pressure": FieldSpec("contact pressure", "Pa", np.add, np.maximum),
@@ -27,7 +34,7 @@ CONTACT_FIELDS = {
 
 
 @dataclass(frozen=True, eq=False)
-class Patch:
+class BodyContactPoints:
     """Contact points of a body, each (worlds, points).
 
     Attributes:
@@ -41,7 +48,7 @@ class Patch:
     gap: np.ndarray
 
 
-def contact_field(name: str, body: Any, worlds: int, patches: list[Patch]) -> np.ndarray:
+def contact_field(name: str, body: Any, worlds: int, contact_points: list[BodyContactPoints]) -> np.ndarray:
     """Field "contact_pressure" or "gap" (worlds, nodes x samples) at the samples of each node of a body.
 
     Every contact point is assigned to the sample closest to it in the reference. Pressure is the elastic normal force
@@ -50,7 +57,7 @@ def contact_field(name: str, body: Any, worlds: int, patches: list[Patch]) -> np
     """
     nodes = len(body.mesh.points) * body.family.node_samples.shape[1]
     pressure, least = np.zeros((worlds, nodes)), np.full((worlds, nodes), np.inf)
-    for patch in patches:
+    for patch in contact_points:
         for world in range(worlds):
             known = patch.nearest[world] >= 0
             at = patch.nearest[world, known]
@@ -63,7 +70,7 @@ def contact_field(name: str, body: Any, worlds: int, patches: list[Patch]) -> np
     return pressure if name == "contact_pressure" else np.where(least < 1e29, least, np.nan)
 
 
-def obstacle_patches(t: ContactTables, body: Any, gap: np.ndarray, force: np.ndarray) -> list[Patch]:
+def obstacle_contact_points(t: ContactTables, body: Any, gap: np.ndarray, force: np.ndarray) -> list[BodyContactPoints]:
     """Contact points of a body with obstacles, from gaps and forces of all points."""
     out = []
     for k, contact in enumerate(t.contacts):
@@ -72,7 +79,9 @@ def obstacle_patches(t: ContactTables, body: Any, gap: np.ndarray, force: np.nda
             normal = _normal_force(t, k, gap[:, points], force[:, points])
             nearest, area = nearest_samples(t, k, body), t.host[k].area.ravel()
             shape = normal.shape
-            out.append(Patch(np.broadcast_to(nearest, shape), np.broadcast_to(area, shape), normal, gap[:, points]))
+            out.append(
+                BodyContactPoints(np.broadcast_to(nearest, shape), np.broadcast_to(area, shape), normal, gap[:, points])
+            )
     return out
 
 
@@ -80,7 +89,7 @@ def _normal_force(t: ContactTables, k: int, gap: np.ndarray, force: np.ndarray) 
     """Elastic normal force, N, on the points (worlds, points) of a contact from their gaps, without friction."""
     contact = t.contacts[k]
     stiffness = t.data.scale.numpy()[:, k, None] * t.data.normal_stiffness.numpy()[:, k, None]
-    share = t.shares[k].ravel()
+    share = t.area_fractions[k].ravel()
     depth = np.where(share > 0.0, -gap, 0.0)
     if contact.model == "sphere":
         deepest = np.arange(depth.shape[1]) == depth.argmax(axis=1)[:, None]
@@ -107,17 +116,17 @@ def nearest_samples(
             used = np.zeros(body.slot_count, dtype=bool)
             used[p.conn[np.any(np.abs(p.shape) > 1e-12, axis=1)]] = True
         else:
-            used = _on_surface(body)
+            used = _surface_slots(body)
         nodes = nodes[used[body.node_slot[nodes]]]
         samples = (nodes[:, None] * count + np.arange(count)).ravel()
-        tree = cKDTree(_sample_places(body)[samples])
+        tree = cKDTree(_sample_positions(body)[samples])
         fixed = None if X is not None else samples[tree.query(t.host[k].X.reshape(-1, 3))[1]]
         t.model.cache[key] = (samples, tree, fixed)
     samples, tree, fixed = t.model.cache[key]
     return fixed if X is None else samples[tree.query(X)[1]]
 
 
-def _on_surface(body: Discretisation) -> np.ndarray:
+def _surface_slots(body: Discretisation) -> np.ndarray:
     """Mask (slots,) of slots on an outer face."""
     out = np.zeros(body.slot_count, dtype=bool)
     for face in np.unique(body.boundary[:, 1]):
@@ -129,7 +138,7 @@ def _on_surface(body: Discretisation) -> np.ndarray:
     return out
 
 
-def _sample_places(body: Discretisation) -> np.ndarray:
+def _sample_positions(body: Discretisation) -> np.ndarray:
     """Reference positions (nodes x samples, 3), m; NaN for nodes without an element."""
     samples = body.family.node_samples
     cells = np.asarray(body.mesh.cells)

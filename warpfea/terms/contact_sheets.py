@@ -11,13 +11,13 @@ from ..base.errors import ModelError
 from ..base.launch import Launcher
 from ..kernels.terms.contact_sheets import sheet_kernels
 from ..model.triangle_mesh import TriMesh
-from .contact_starts import reference_place
 from .contact_tables import ContactTables
+from .initial_overlaps import reference_position_text
 
-__all__ = ["refuse_across"]
+__all__ = ["check_sheet_sides"]
 
 
-def refuse_across(
+def check_sheet_sides(
     term: Any, attempt: Any, displacement: wp.array, tolerance: np.ndarray, new: np.ndarray, launch: Launcher
 ) -> None:  # fmt: skip
     """Raise ModelError for a body that begins on both sides of a sheet.
@@ -28,10 +28,10 @@ def refuse_across(
         tolerance, new: (worlds,) m, and flags of the worlds to check.
     """
     t = term.tables
-    points = _points_across(t, attempt, displacement, tolerance, launch)
+    points = _points_behind(t, attempt, displacement, tolerance, launch)
     for world, row in np.argwhere((points > 0) & new[:, None])[:1]:
         k = int(np.searchsorted(t.row_start, row, side="right")) - 1
-        contact, where = t.contacts[k], reference_place(t, k, int(points[world, row]) - 1 - int(t.first[k]))
+        contact, where = t.contacts[k], reference_position_text(t, k, int(points[world, row]) - 1 - int(t.first[k]))
         raise ModelError(
             f"contact {contact.name!r}: body {contact.body.name!r} begins on both sides of collider "
             f"{contact.collider.name!r}, or on it and behind (world {world}, reference point {where}); move one of "
@@ -39,7 +39,7 @@ def refuse_across(
         )
 
 
-def _points_across(
+def _points_behind(
     tables: ContactTables, attempt: Any, displacement: wp.array, tolerance: np.ndarray, launch: Launcher
 ) -> np.ndarray:  # fmt: skip
     """One point (worlds, facets) of each facet, + 1, behind a sheet while others are in front, or 0."""

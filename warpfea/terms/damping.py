@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Damping"]
 
-FORMS = ("incremental", "rate", "explicit")
+DAMPING_FORMS = ("incremental", "rate", "explicit")
 
 
 class Damping(Term):
@@ -42,7 +42,7 @@ class Damping(Term):
     @classmethod
     def features(cls, model: Model) -> dict[str, bool]:
         forms = {b.key.damping for b in model.blocks}
-        return {f"damping {form}": form in forms for form in FORMS}
+        return {f"damping {form}": form in forms for form in DAMPING_FORMS}
 
     def allocate(self, work: Workspace, ctx: StepContext) -> None:
         if self.explicit:

@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from ..base.errors import ModelError
-from ..base.worlds import per_world, refuse
+from ..base.worlds import check_values_per_world, values_per_world
 from ..kernels.terms.loads import load_kernels
 from ..model.assembly import require_density
 from .term import StepContext, Term, part
@@ -26,7 +26,7 @@ class DeadLoads(Term):
     """Dead loads: assembled once per attempt into work.dead.
 
     Gravity, [world] on the device, is part of every model; without any load nothing is launched. With a time law of
-    gravity `gravity` follows the law, and `constant`, which the load of a static path scales, is zero.
+    gravity `gravity` follows the law, and `constant_gravity`, which the load of a static path scales, is zero.
     """
 
     name = "dead loads"
@@ -37,7 +37,7 @@ class DeadLoads(Term):
         self.gravity_host = np.tile(model.gravity, (model.worlds, 1))
         self.gravity = model.array("loads", self.gravity_host, wp.vec3d)
         self.gravity_law = model.description.gravity
-        self.constant = self.gravity
+        self.constant_gravity = self.gravity
 
     @classmethod
     def of(cls, model: Model) -> DeadLoads:
@@ -47,7 +47,7 @@ class DeadLoads(Term):
     @classmethod
     def features(cls, model: Model) -> dict[str, bool]:
         return {
-            "gravity": model.terms.dead.pulls,
+            "gravity": model.terms.dead_loads.has_gravity,
             "dead loads": bool(model.description.dead_loads),
         }
 
@@ -60,10 +60,10 @@ class DeadLoads(Term):
             numbers.append(np.full(len(load.slots), index))
             weights.append(load.weights)
         if self.gravity_law is not None:
-            self.constant = m.array("loads", self.gravity_host, wp.vec3d)
-            self.number = laws.add(self.gravity_law)
+            self.constant_gravity = m.array("loads", self.gravity_host, wp.vec3d)
+            self.gravity_law_index = laws.add(self.gravity_law)
             slots.append(np.arange(m.slots))
-            numbers.append(np.full(m.slots, self.number))
+            numbers.append(np.full(m.slots, self.gravity_law_index))
             weights.append(m.lumped_host)
         slot = np.concatenate(slots) if slots else np.zeros(0, dtype=np.int64)
         order = np.argsort(slot, kind="stable")
@@ -71,40 +71,40 @@ class DeadLoads(Term):
         law = np.concatenate(numbers) if numbers else np.zeros(0)
         weight = np.concatenate(weights) if weights else np.zeros(0)
         explicit = any(b.key.damping == "explicit" for b in m.blocks)  # adds its force to the dead loads
-        self.present = bool(len(slots)) or self.pulls or explicit
-        self.start_of_slot = m.array("loads", start, wp.int32)
+        self.has_loads = bool(len(slots)) or self.has_gravity or explicit
+        self.slot_start = m.array("loads", start, wp.int32)
         self.law = m.array("loads", law[order] if len(order) else np.zeros(1), wp.int32)
         table = np.repeat(weight[order][:, None], 3, axis=1) if len(order) else np.zeros((1, 3))
         self.weight = m.array("loads", table, m.types.vec3)
-        self._defined_by = (slot, law, weight)
+        self._definition = (slot, law, weight)
 
     @property
-    def pulls(self) -> bool:
+    def has_gravity(self) -> bool:
         """True with gravity or a time law of it."""
         return self.gravity_law is not None or bool(np.any(self.gravity_host))
 
     def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
         law = [self.kernels.copy_gravity.module] * (self.gravity_law is not None)
-        return law + [self.kernels.dead_load.module] * self.present
+        return law + [self.kernels.dead_load.module] * self.has_loads
 
     def take_gravity(self, launch: Launcher, value: wp.array, active: wp.array) -> None:
         """Set gravity at the end of the attempt from the values of the time laws."""
         if self.gravity_law is not None:
-            launch(self.kernels.copy_gravity, self.model.worlds, [value, self.number, active, self.gravity])
+            launch(self.kernels.copy_gravity, self.model.worlds, [value, self.gravity_law_index, active, self.gravity])
 
     @part("loads")
     def begin(self, ctx: StepContext, active: wp.array) -> None:
         """Assemble force and magnitude of all dead loads per slot."""
-        if not self.present:
+        if not self.has_loads:
             return
         m, w = self.model, ctx.work
         args = [
-            self.start_of_slot,
+            self.slot_start,
             self.law,
             self.weight,
             w.time_law_stage_values,
             m.masses.lumped_values,
-            self.constant,
+            self.constant_gravity,
             w.step.load_factor,
             active,
         ]
@@ -119,12 +119,12 @@ class DeadLoads(Term):
         """
         if self.gravity_law is not None:
             raise ModelError("the model was built with a time law of gravity, which set_gravity can't replace")
-        values = per_world("set_gravity", "gravity", gravity, self.model.worlds, (3,))
-        refuse("set_gravity", "gravity", values, ~mask | np.isfinite(values).all(axis=1), "finite")
+        values = values_per_world("set_gravity", "gravity", gravity, self.model.worlds, (3,))
+        check_values_per_world("set_gravity", "gravity", values, ~mask | np.isfinite(values).all(axis=1), "finite")
         values = np.where(mask[:, None], values, self.gravity_host)
         if np.any(values):
             require_density(self.model.bodies, "gravity")
-        if not self.present and np.any(values):
+        if not self.has_loads and np.any(values):
             raise ModelError(
                 "the model was built without gravity or dead loads, so their kernels were left out: build it with a "
                 "gravity that is not zero"
@@ -140,5 +140,5 @@ class DeadLoads(Term):
             self.gravity_host = self.gravity.numpy().copy()
 
     def hash(self, h: Any) -> None:
-        for values in self._defined_by:
+        for values in self._definition:
             h.update(np.ascontiguousarray(values).tobytes())

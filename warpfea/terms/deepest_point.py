@@ -25,7 +25,7 @@ class DeepestPoints:
 
     def __init__(self, tables: ContactTables) -> None:
         self.tables = tables
-        self.kernels = deepest_point_kernels(tables.model.dtype, tables.meshes)
+        self.kernels = deepest_point_kernels(tables.model.dtype, tables.has_meshes)
 
     def choose(
         self, launch: Launcher, s: dict[str, Any], time: wp.array, u: wp.array, state: tuple[wp.array, wp.array],
@@ -66,28 +66,28 @@ def at_points(term: Any, state: State, history: Any = None, places: bool = True)
     def zeros(shape: tuple[int, ...], dtype: Any) -> wp.array:
         return wp.zeros(shape, dtype=dtype, device=m.device)
 
-    every = wp.ones(B, dtype=wp.int32, device=m.device)
+    all_worlds = wp.ones(B, dtype=wp.int32, device=m.device)
     value = zeros((B, max(laws.count, 1)), wp.vec3d)
-    laws.evaluate(launch, state, state.time, wp.ones(B, dtype=wp.float64, device=m.device), every, value)
+    laws.evaluate(launch, state, state.time, wp.ones(B, dtype=wp.float64, device=m.device), all_worlds, value)
     if history is None:
 
-        def set_contact_point(name: str, dtype: Any, shape: tuple[int, ...]) -> wp.array:
+        def state_or_zeros(name: str, dtype: Any, shape: tuple[int, ...]) -> wp.array:
             return getattr(state, name) if name in state.specs else zeros((B, *shape), dtype)
 
-        history = term.history_of(set_contact_point)
-    attempt = term.attempt_of(B, lambda _, shape, dtype: zeros(shape, dtype))
+        history = term.make_history(state_or_zeros)
+    attempt = term.make_scratch(B, lambda _, shape, dtype: zeros(shape, dtype))
     attempt.approach_speed.fill_(1.0)
     if "contact_position" in state.specs:  # statics resets its time to 0
         attempt.collider_position, attempt.collider_rotation = history.position, history.rotation
     else:
-        launch(term.kernels.update_poses, (B, K), [t.data, history, value, every, attempt])
+        launch(term.kernels.update_poses, (B, K), [t.data, history, value, all_worlds, attempt])
         attempt.collider_translation.zero_()
         attempt.collider_rotation_change.zero_()
     gap, force = zeros((B, P), wp.float64), zeros((B, P), wp.vec3d)
     u = state.displacement
-    if term.exact:
+    if term.double_displacements:
         u = zeros(u.shape, wp.vec3d)
-        term.exact.widen(launch, state.displacement, every, u)
+        term.double_displacements.widen(launch, state.displacement, all_worlds, u)
     for group in t.groups:
         dim = (B, group.count, group.data.point_count)
         launch(
@@ -99,7 +99,7 @@ def at_points(term: Any, state: State, history: Any = None, places: bool = True)
         row_start = m.array("contact", t.row_start, wp.int32)
         s = {"history": history, "attempt": attempt, "clock": clock, "row_start": row_start}
         before, changed = (state.displacement,) * 2, zeros((B,), wp.int32)
-        term.deepest_points.choose(launch, s, state.time, u, before, every, changed, fresh=1, settled=1)
+        term.deepest_points.choose(launch, s, state.time, u, before, all_worlds, changed, fresh=1, settled=1)
     for group in t.groups:
         dim = (B, group.count, group.data.point_count)
         args = [t.data, group.data, history, u, state.time, attempt, int(places), gap, force]

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Elements"]
 
-MANY_POINTS = 8
+MIN_LANE_POINTS = 8
 """Points per element from which lanes of a warp share an element."""
 
 
@@ -50,7 +50,7 @@ class Elements(Term):
             return
         m, w, launch = self.model, ctx.work, ctx.launch
         for block, kernels in zip(m.blocks, self.kernels(ctx)):
-            lanes = launch.lanes(block.points // 2) if block.points >= MANY_POINTS and not block.key.tying else 1
+            lanes = launch.lanes(block.points // 2) if block.points >= MIN_LANE_POINTS and not block.key.tying else 1
             args = [
                 w.data_of(block),
                 w.u_stage,
@@ -92,7 +92,7 @@ class Elements(Term):
                 block.data,
                 w.u,
                 w.v,
-                w.base,
+                w.base_velocity,
                 w.newton.predicted_stress,
                 w.history,
                 w.step.dq_dv,

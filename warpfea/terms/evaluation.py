@@ -12,7 +12,7 @@ import warp as wp
 
 from ..base.errors import ModelError
 from ..base.launch import Launcher
-from ..base.memory import enough_memory
+from ..base.memory import convert_memory_errors
 from ..elements import Rule
 from ..kernels.common.types import precision
 from ..kernels.elements.materials import DEFINED_FOR_ANY_J
@@ -39,20 +39,20 @@ class Evaluation:
         self.elements = Elements(model)
 
     def _zeros(self, shape: tuple[int, ...], dtype: Any) -> wp.array:
-        with enough_memory("an evaluation at a state", self.model.device):
+        with convert_memory_errors("an evaluation at a state", self.model.device):
             return wp.zeros(shape, dtype=dtype, device=self.model.device)
 
     def _gather(self, contribution: wp.array) -> np.ndarray:
         m = self.model
         out = self._zeros((m.worlds, m.slots), m.types.vec3)
         kernel = gather_kernels(m.dtype).gather_force
-        self.launch(kernel, (m.worlds, m.slots), [m.topology, contribution, self._all(), out])
+        self.launch(kernel, (m.worlds, m.slots), [m.topology, contribution, self._all_worlds(), out])
         return out.numpy()
 
-    def _all(self) -> wp.array:
+    def _all_worlds(self) -> wp.array:
         return wp.ones(self.model.worlds, dtype=wp.int32, device=self.model.device)
 
-    def _at(self, u: wp.array) -> StepContext:
+    def _step_context(self, u: wp.array) -> StepContext:
         """Step context of the element term: the elastic part at displacements u (worlds, slots)."""
         m, B = self.model, u.shape[0]
         least = [wp.full(B, 1e30, dtype=wp.float64, device=m.device) for _ in range(2)]
@@ -72,9 +72,9 @@ class Evaluation:
 
     def internal_force(self, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Elastic force [world, slot, 3], strain energy [world], smallest J [world]."""
-        ctx = self._at(state.displacement)
+        ctx = self._step_context(state.displacement)
         w = ctx.work
-        self.elements.force(ctx, self._all())
+        self.elements.force(ctx, self._all_worlds())
         return self._gather(w.contribution), w.energy_rows.numpy()[0].sum(axis=1), w.newton.min_J.numpy()
 
     def viscous_force(self, state: State) -> tuple[np.ndarray, np.ndarray]:
@@ -84,7 +84,7 @@ class Evaluation:
         power = self._zeros((m.worlds, m.element_count), wp.float64)
         for block in m.blocks:
             if block.key.damping:
-                args = [block.data, state.displacement, state.velocity, self._all(), contribution, power]
+                args = [block.data, state.displacement, state.velocity, self._all_worlds(), contribution, power]
                 self.launch(block.kernels.viscous_force, (m.worlds, block.count), args)
         return self._gather(contribution), power.numpy().sum(axis=1)
 
@@ -95,17 +95,17 @@ class Evaluation:
         Raises:
             ModelError: a model without constraints.
         """
-        return self._constraints().values(state)
+        return self._require_constraints().values(state)
 
     def constraint_jacobian(self, state: State, world: int) -> sp.csr_matrix:
         """dc/dq of one world, (rows, 3 slots) CSR."""
-        return self._constraints().jacobian(state, world)
+        return self._require_constraints().jacobian(state, world)
 
     def constraint_curvature(self, state: State, multipliers: np.ndarray, direction: np.ndarray) -> np.ndarray:
         """sum_i multipliers_i d2c_i/dq2 direction, [world, slot, 3]; multipliers (rows,), direction (slots, 3)."""
-        return self._constraints().curvature(state, multipliers, direction)
+        return self._require_constraints().curvature(state, multipliers, direction)
 
-    def _constraints(self) -> Any:
+    def _require_constraints(self) -> Any:
         term = self.model.terms.constraints
         if term is None:
             raise ModelError("the model has no constraints")
@@ -115,11 +115,11 @@ class Evaluation:
         """df_int/dq as CSR, by one product per colour and axis; no element has two slots of one colour."""
         m = self.model
         row = state.displacement.numpy()[world : world + 1]
-        ctx = self._at(wp.array(row, dtype=m.types.vec3, device=m.device))
+        ctx = self._step_context(wp.array(row, dtype=m.types.vec3, device=m.device))
         direction = self._zeros((1, m.slots), m.types.vec3)
         flag = wp.ones(1, dtype=wp.int32, device=m.device)
         conns = [b.connectivity for b in m.blocks]
-        colour = _colours(m.graph())
+        colour = _greedy_colouring(m.graph())
         rows, cols, values = [], [], []
         for c in range(int(colour.max()) + 1):
             for axis in range(3):
@@ -180,7 +180,7 @@ class Evaluation:
         volumes = assembly.element_volumes(body)
         for block, stress in self.stresses(state, body):
             first = 0
-            to_samples = _extrapolation(block.key.rule, family.node_samples.reshape(-1, 3))
+            to_samples = _extrapolation_matrix(block.key.rule, family.node_samples.reshape(-1, 3))
             for part in block.host_blocks:
                 members = slice(first, first + len(part.elements))
                 first += len(part.elements)
@@ -218,7 +218,7 @@ def lowest_jacobian(model: Model, u: np.ndarray) -> tuple[int, str]:
     return index, text
 
 
-def _extrapolation(rule: Rule, at: np.ndarray) -> np.ndarray:
+def _extrapolation_matrix(rule: Rule, at: np.ndarray) -> np.ndarray:
     """Extrapolation matrix (n, Q) from the points of a rule to parent points (n, 3).
 
     Product of Lagrange polynomials on a box; on the simplex a linear least-squares fit, or a constant with too few
@@ -248,7 +248,7 @@ def von_mises(s: np.ndarray) -> np.ndarray:
     return np.sqrt(normal + 3.0 * (yz**2 + xz**2 + xy**2))
 
 
-def _colours(graph: sp.csr_matrix) -> np.ndarray:
+def _greedy_colouring(graph: sp.csr_matrix) -> np.ndarray:
     """Greedy colouring: slots that share an element differ."""
     n = graph.shape[0]
     colour = np.full(n, -1)

@@ -1,4 +1,4 @@
-"""Common contact tables: facet groups with points, contact law numbers."""
+"""Tables common to contact with colliders and between bodies: groups of facets with their points, law constants."""
 
 from __future__ import annotations
 
@@ -21,24 +21,33 @@ if TYPE_CHECKING:
     from ..base.launch import Launcher
     from ..model.model import Model
 
-__all__ = ["LAWS", "LISTED", "PER_WORLD", "FacetGroup", "FacetTables", "beta_of", "clamped_slots",
-           "hunt_crossley_damping", "normal_damping"]  # fmt: skip
+__all__ = [
+    "LAWS",
+    "POINT_SUM_LANES",
+    "WORLD_PARAMETERS",
+    "FacetGroup",
+    "FacetTables",
+    "clamped_slots",
+    "hunt_crossley_damping",
+    "normal_damping",
+    "restitution_beta",
+]  # fmt: skip
 
 AnyContact = TypeVar("AnyContact", Contact, PairContact)
 LAWS = {"default": DEFAULT, "paper": PAPER, "smooth": SMOOTH}
-SMOOTHING = (1e-3, 1e-4)
+DEFAULT_SMOOTHING = (1e-3, 1e-4)
 """Default eps, N, and v_eps, m/s, of the smooth law."""
-PER_WORLD = {"mu": "mu", "mu_static": "mu_static", "restitution": "damping", "stiffness": "scale"}
+WORLD_PARAMETERS = {"mu": "mu", "mu_static": "mu_static", "restitution": "damping", "stiffness": "scale"}
 """Contact parameters of Model.set_parameter and their arrays; the restitution also sets `beta`."""
-FROM_BODIES = ("normal_stiffness", "tangential_stiffness", "normal_damping", "effective_mass")
+MATERIAL_CONSTANTS = ("normal_stiffness", "tangential_stiffness", "normal_damping", "effective_mass")
 """Contact constants derived from the bodies' materials."""
-LISTED = 8
-"""Threads that share a sum over the points of a facet on CUDA."""
+POINT_SUM_LANES = 8
+"""Largest number of threads that share a sum over the points of a facet on CUDA."""
 PATCH, LUMPED, MOVING = range(3)
 """Contact kinds of a facet: all points, at most one point, or at most one moving position."""
 
 
-def beta_of(restitution: float) -> float:
+def restitution_beta(restitution: float) -> float:
     """-beta of Eq. (75), positive."""
     log = math.log(restitution)
     return -log / math.hypot(log, math.pi)
@@ -103,9 +112,9 @@ class FacetGroup:
         """Number of facets."""
         return len(self.conn)
 
-    def sides(self, launch: Launcher, worlds: int) -> tuple[tuple[int, int], int]:
+    def sum_threads(self, launch: Launcher, worlds: int) -> tuple[tuple[int, int], int]:
         """Threads that sum over the points of a facet for each of its slots, and threads per slot."""
-        lanes = launch.lanes(LISTED)
+        lanes = launch.lanes(POINT_SUM_LANES)
         return (worlds, launch.padded(lanes * self.conn.size)), lanes
 
 
@@ -119,18 +128,18 @@ class FacetTables(Generic[AnyContact]):
         groups: facet groups.
         points, rows: total numbers of points and facets.
         first, row_start: first point and first facet of each contact.
-        shares: (F, P) of each contact: area of each point over that of the region; 0: inactive.
+        area_fractions: (F, P) of each contact: area of each point over that of the region; 0: inactive.
     """
 
     data: Any
-    built: bytes
+    built_values: bytes
     first: np.ndarray
     row_start: np.ndarray
-    shares: list[np.ndarray]
+    area_fractions: list[np.ndarray]
 
     def __init__(self, model: Model, contacts: Sequence[AnyContact], points: Sequence[ContactPoints]) -> None:
         self.model = model
-        kinds = [_kind(*pair) for pair in zip(contacts, points)]
+        kinds = [_facet_kind(*pair) for pair in zip(contacts, points)]
         order = sorted(range(len(kinds)), key=lambda k: (kinds[k], k))
         self.kinds = sorted(set(kinds))
         self.contacts: list[AnyContact] = [contacts[k] for k in order]
@@ -148,11 +157,11 @@ class FacetTables(Generic[AnyContact]):
         """Upload the facets, starting at pool entry `pool`; returns the next free entry."""
         first, row_start = (np.zeros(len(self.contacts) + 1, dtype=np.int64) for _ in range(2))
         for kind in self.kinds:
-            chosen = [k for k, pair in enumerate(zip(self.contacts, self.host)) if _kind(*pair) == kind]
+            chosen = [k for k, pair in enumerate(zip(self.contacts, self.host)) if _facet_kind(*pair) == kind]
             for k in chosen:
                 first[k + 1] = first[k] + self.host[k].area.size
                 row_start[k + 1] = row_start[k] + len(self.host[k].conn)
-            group = self._group(kind, chosen, pool)
+            group = self._facet_group(kind, chosen, pool)
             self.groups.append(group)
             pool += group.conn.size
             self.rows += group.count
@@ -160,22 +169,22 @@ class FacetTables(Generic[AnyContact]):
         self.first, self.row_start = first, row_start
         return pool
 
-    def _group(self, kind: tuple[int, int, int], chosen: list[int], pool: int) -> FacetGroup:
+    def _facet_group(self, kind: tuple[int, int, int], chosen: list[int], pool: int) -> FacetGroup:
         """Facet group of one kind for the chosen contacts."""
         m = self.model
         parts = [self.host[k] for k in chosen]
         conn = np.concatenate([self.host[k].conn + self.contacts[k].body.slot_offset for k in chosen])
         data = facet_struct(m.dtype)()
 
-        def put(name: str, values: Any, dtype: Any) -> None:
+        def upload(name: str, values: Any, dtype: Any) -> None:
             setattr(data, name, m.array("contact", np.ascontiguousarray(values), dtype))
 
-        put("conn", conn.T, wp.int32)
-        put("shape", np.moveaxis(np.concatenate([p.shape for p in parts]), 0, 2), m.types.T)
-        put("X", np.swapaxes(np.concatenate([p.X for p in parts]), 0, 1), wp.vec3d)
-        put("area_fraction", np.concatenate([self.shares[k] for k in chosen]).T, wp.float64)
-        put("area", np.concatenate([p.area for p in parts]).T, wp.float64)
-        put("contact", np.repeat(chosen, [len(p.conn) for p in parts]), wp.int32)
+        upload("conn", conn.T, wp.int32)
+        upload("shape", np.moveaxis(np.concatenate([p.shape for p in parts]), 0, 2), m.types.T)
+        upload("X", np.swapaxes(np.concatenate([p.X for p in parts]), 0, 1), wp.vec3d)
+        upload("area_fraction", np.concatenate([self.area_fractions[k] for k in chosen]).T, wp.float64)
+        upload("area", np.concatenate([p.area for p in parts]).T, wp.float64)
+        upload("contact", np.repeat(chosen, [len(p.conn) for p in parts]), wp.int32)
         data.first_entry, data.first_row, data.first_point = pool, self.rows, self.points
         _, data.point_count, acts = kind
         data.facet_count, data.tracks_deepest, data.corner_count = (
@@ -186,23 +195,23 @@ class FacetTables(Generic[AnyContact]):
         if acts != PATCH:
             points = CONTACT_RULES[data.corner_count][data.point_count].points
             basis, power = lagrange_basis(points)
-            put("point_coords", points, wp.vec2d)
-            put("lagrange_coefficients", basis, wp.float64)
-            put("exponents", power, wp.vec2i)
+            upload("point_coords", points, wp.vec2d)
+            upload("lagrange_coefficients", basis, wp.float64)
+            upload("exponents", power, wp.vec2i)
         return FacetGroup(conn, data, acts != PATCH, chosen)
 
-    def numbers(self, contact: AnyContact, world: int | None = None) -> dict[str, float]:
-        """Constants `FROM_BODIES` of a contact, as built or in one world."""
+    def law_constants(self, contact: AnyContact, world: int | None = None) -> dict[str, float]:
+        """Constants `MATERIAL_CONSTANTS` of a contact, as built or in one world."""
         raise NotImplementedError
 
     @property
-    def set_arrays(self) -> dict[str, wp.array]:
+    def parameter_arrays(self) -> dict[str, wp.array]:
         """Arrays written by `Model.set_parameter`."""
-        return {name: getattr(self.data, name) for name in (*PER_WORLD.values(), "beta")}
+        return {name: getattr(self.data, name) for name in (*WORLD_PARAMETERS.values(), "beta")}
 
-    def remember(self) -> None:
+    def store_built_values(self) -> None:
         """Store the built values: checkpoints compare them to identify the model."""
-        self.built = b"".join(array.numpy().tobytes() for array in self.set_arrays.values())
+        self.built_values = b"".join(array.numpy().tobytes() for array in self.parameter_arrays.values())
 
     def update_materials(self, mask: np.ndarray) -> None:
         """Recompute the derived constants after material parameters were set in the chosen worlds."""
@@ -212,48 +221,48 @@ class FacetTables(Generic[AnyContact]):
         ]
         if not touched:
             return
-        for name in FROM_BODIES:
+        for name in MATERIAL_CONSTANTS:
             if getattr(data, name).shape[0] != m.worlds:
                 old = getattr(data, name)
                 m.uncount_bytes("contact", old)
                 setattr(data, name, m.array("contact", np.tile(old.numpy(), (m.worlds, 1)), wp.float64))
-        host = {name: getattr(data, name).numpy() for name in FROM_BODIES}
+        host = {name: getattr(data, name).numpy() for name in MATERIAL_CONSTANTS}
         for world in np.flatnonzero(mask).tolist():
             for k in touched:
-                for name, value in self.numbers(self.contacts[k], world).items():
+                for name, value in self.law_constants(self.contacts[k], world).items():
                     if name in host:
                         host[name][world, k] = value
         for name, values in host.items():
             getattr(data, name).assign(values)
 
-    def _put_laws(self, out: Any, numbers: list[dict[str, float]]) -> None:
-        """Upload the contact law constants; `numbers` per contact: `FROM_BODIES`."""
+    def _upload_laws(self, out: Any, law_constants: list[dict[str, float]]) -> None:
+        """Upload the contact law constants; `law_constants` per contact: `FROM_BODIES`."""
         m, C = self.model, self.contacts
 
-        def put(name: str, values: Any, dtype: Any = wp.float64) -> None:
+        def upload(name: str, values: Any, dtype: Any = wp.float64) -> None:
             setattr(out, name, m.array("contact", np.asarray(values), dtype))
 
-        put("law", [LAWS[c.law] for c in C], wp.int32)
-        put("single_point", [int(c.model == "sphere") for c in C], wp.int32)
-        put("is_explicit", [int(c.treatment == "explicit") for c in C], wp.int32)
-        put("first_point", self.first, wp.int32)
-        for name in FROM_BODIES:
-            put(name, [[row[name] for row in numbers]])
-        smoothing = [c.smoothing if isinstance(c.smoothing, tuple) else SMOOTHING for c in C]
-        put("damping_ramp", [float(c.smoothing) if isinstance(c.smoothing, (int, float)) else 0.0 for c in C])
-        put("force_eps", [pair[0] for pair in smoothing])
-        put("speed_eps", [pair[1] for pair in smoothing])
-        put("offset", [c.offset for c in C])
-        put("overlap_decay_time", [c.overlap_time for c in C])
+        upload("law", [LAWS[c.law] for c in C], wp.int32)
+        upload("single_point", [int(c.model == "sphere") for c in C], wp.int32)
+        upload("is_explicit", [int(c.treatment == "explicit") for c in C], wp.int32)
+        upload("first_point", self.first, wp.int32)
+        for name in MATERIAL_CONSTANTS:
+            upload(name, [[row[name] for row in law_constants]])
+        smoothing = [c.smoothing if isinstance(c.smoothing, tuple) else DEFAULT_SMOOTHING for c in C]
+        upload("damping_ramp", [float(c.smoothing) if isinstance(c.smoothing, (int, float)) else 0.0 for c in C])
+        upload("force_eps", [pair[0] for pair in smoothing])
+        upload("speed_eps", [pair[1] for pair in smoothing])
+        upload("offset", [c.offset for c in C])
+        upload("overlap_decay_time", [c.overlap_time for c in C])
         per_world = {
             "mu": [c.mu for c in C],
             "mu_static": [c.mu_static for c in C],
             "damping": [hunt_crossley_damping(c.restitution) for c in C],
-            "beta": [beta_of(c.restitution) for c in C],
+            "beta": [restitution_beta(c.restitution) for c in C],
             "scale": [c.stiffness for c in C],
         }
         for name, values in per_world.items():
-            put(name, np.tile(values, (m.worlds, 1)))
+            upload(name, np.tile(values, (m.worlds, 1)))
 
 
 def bodies_of(contact: Contact | PairContact) -> list[Any]:
@@ -261,7 +270,7 @@ def bodies_of(contact: Contact | PairContact) -> list[Any]:
     return [contact.body] if isinstance(contact, Contact) else [contact.first.body, contact.second.body]
 
 
-def _kind(contact: Contact | PairContact, p: ContactPoints) -> tuple[int, int, int]:
+def _facet_kind(contact: Contact | PairContact, p: ContactPoints) -> tuple[int, int, int]:
     """Contact kind of a facet: slots, points, and PATCH, LUMPED or MOVING."""
     lumped = LUMPED if contact.treatment == "explicit" else MOVING
     return p.conn.shape[1], p.area.shape[1], PATCH if contact.model == "patch" else lumped

@@ -20,12 +20,13 @@ from .time_law_table import TimeLawTable
 if TYPE_CHECKING:
     from ..model.model import Model
 
-__all__ = ["FollowerMatrix", "FollowerPart", "Followers"]
+__all__ = ["FollowerLoad", "FollowerLoads", "FollowerMatrix"]
 
 
 @dataclass(eq=False)
-class FollowerPart:
-    """Pressure on faces or moment at points: device data, kernels of the force and of its symmetric tangent."""
+class FollowerLoad:
+    """Pressure on faces or moment at points: device data, kernels of the force and of its symmetric tangent, and the
+    number of faces or points."""
 
     data: Any
     force: Any
@@ -33,7 +34,7 @@ class FollowerPart:
     count: int
 
 
-class Followers(Term):
+class FollowerLoads(Term):
     """Pressures and moments, non-potential in general; H contains the symmetric part of their tangent."""
 
     name = "followers"
@@ -41,11 +42,11 @@ class Followers(Term):
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
-        self.items: list[FollowerPart] = []
-        self._entries = 0
+        self.loads: list[FollowerLoad] = []
+        self._entry_count = 0
 
     @classmethod
-    def of(cls, model: Model) -> Followers | None:
+    def of(cls, model: Model) -> FollowerLoads | None:
         d = model.description
         return cls(model) if d.pressures or d.moments else None
 
@@ -54,25 +55,25 @@ class Followers(Term):
         return {"follower pressure": bool(model.description.pressures), "moments": bool(model.description.moments)}
 
     def build(self, laws: TimeLawTable) -> None:
-        self.items = [self._pressure(p, laws) for p in self.model.description.pressures]
-        self.items += [self._moment(p, laws) for p in self.model.description.moments]
+        self.loads = [self._pressure(p, laws) for p in self.model.description.pressures]
+        self.loads += [self._moment(p, laws) for p in self.model.description.moments]
 
-    def _data(self, conn: np.ndarray, law: TimeLaw, laws: TimeLawTable) -> Any:
+    def _load_data(self, conn: np.ndarray, law: TimeLaw, laws: TimeLawTable) -> Any:
         """Common device data; conn (items, local) in model slots."""
         m = self.model
         data = follower_struct(m.dtype)()
         data.conn = m.array("loads", conn.T, wp.int32)
         data.time_law = m.array("loads", np.full(len(conn), laws.add(law)), wp.int32)
-        data.first_entry, data.item_count = self.offset + self._entries, len(conn)
+        data.first_entry, data.item_count = self.offset + self._entry_count, len(conn)
         self.connectivity.append(conn)
-        self._entries += conn.size
+        self._entry_count += conn.size
         return data
 
-    def _pressure(self, pressure: Pressure, laws: TimeLawTable) -> FollowerPart:
+    def _pressure(self, pressure: Pressure, laws: TimeLawTable) -> FollowerLoad:
         m = self.model
         body = pressure.surface.body
         t = assembly.facet_tables(pressure.surface)
-        data = self._data(t.conn + body.slot_offset, pressure.law, laws)
+        data = self._load_data(t.conn + body.slot_offset, pressure.law, laws)
         position = body.slot_kind[t.conn] == 0
         value = body.reference[t.conn]
         value = np.where(position[:, :, None], value - value[:, :1], value)
@@ -82,32 +83,32 @@ class Followers(Term):
             setattr(data, name, m.array("loads", np.moveaxis(table, 0, 2), m.types.T))
         data.weight = m.array("loads", t.weights[0], m.types.T)
         k = pressure_kernels(m.dtype)
-        return FollowerPart(data, k.pressure_force, k.pressure_tangent_product, len(t.conn))
+        return FollowerLoad(data, k.pressure_force, k.pressure_tangent_product, len(t.conn))
 
-    def _moment(self, moment: Moment, laws: TimeLawTable) -> FollowerPart:
+    def _moment(self, moment: Moment, laws: TimeLawTable) -> FollowerLoad:
         m = self.model
-        data = self._data(moment.slots + moment.body.slot_offset, moment.law, laws)
+        data = self._load_data(moment.slots + moment.body.slot_offset, moment.law, laws)
         data.vector_coefficients = m.array("loads", np.swapaxes(moment.vectors, 0, 1), m.types.vec3)
         data.reference_vectors = m.array("loads", moment.axes, m.types.mat33)
         data.moment_fraction = m.array("loads", np.full(len(moment.slots), 1.0 / len(moment.slots)), m.types.T)
         k = moment_kernels(m.dtype, moment.body.family.spin_vectors)
-        return FollowerPart(data, k.moment_force, k.moment_tangent_product, len(moment.slots))
+        return FollowerLoad(data, k.moment_force, k.moment_tangent_product, len(moment.slots))
 
     def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
-        return {kernel.module for item in self.items for kernel in (item.force, item.product)}
+        return {kernel.module for load in self.loads for kernel in (load.force, load.product)}
 
     def force(self, ctx: StepContext, active: wp.array) -> None:
         m, w = self.model, ctx.work
-        for item in self.items:
-            args = [item.data, w.u_stage, w.time_law_stage_values, active, w.nonpotential_contribution]
-            ctx.launch(item.force, (m.worlds, item.count), args)
+        for load in self.loads:
+            args = [load.data, w.u_stage, w.time_law_stage_values, active, w.nonpotential_contribution]
+            ctx.launch(load.force, (m.worlds, load.count), args)
 
     def product(self, ctx: StepContext, p: wp.array, active: wp.array) -> None:
         """Symmetric tangent of the force times p."""
         m, w = self.model, ctx.work
-        for item in self.items:
+        for load in self.loads:
             args = [
-                item.data,
+                load.data,
                 ctx.midpoint_factor,
                 w.u_stage,
                 w.time_law_stage_values,
@@ -115,15 +116,15 @@ class Followers(Term):
                 p,
                 w.nonpotential_tangent,
             ]
-            ctx.launch(item.product, (m.worlds, item.count), args)
+            ctx.launch(load.product, (m.worlds, load.count), args)
 
     def mark_constrained(self, free: np.ndarray) -> None:
         """No-op: pressures and moments are translation invariant."""
 
     def allocate_blocks(self, ctx: StepContext, matrix: Any, *, projected: bool) -> None:
         if not projected:
-            items = self.items
-            ctx.scratch[self.name] = [FollowerMatrix(self, ctx, item, matrix.pattern) for item in items]
+            loads = self.loads
+            ctx.scratch[self.name] = [FollowerMatrix(self, ctx, load, matrix.pattern) for load in loads]
 
     def blocks(
         self, ctx: StepContext, matrix: Any, kept: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,
@@ -132,8 +133,8 @@ class Followers(Term):
         """Minus the symmetric tangent of the force; indefinite, so nothing if projected."""
         if projected:
             return
-        for item in ctx.scratch[self.name]:
-            item.add(ctx, matrix, dq_dv, active, out)
+        for matrices in ctx.scratch[self.name]:
+            matrices.add(ctx, matrix, dq_dv, active, out)
 
     def hash(self, h: Any) -> None:
         for conn in self.connectivity:
@@ -147,27 +148,27 @@ class Followers(Term):
 class FollowerMatrix:
     """Matrices of a follower load's items, built by columns as products with unit vectors at local slots."""
 
-    def __init__(self, term: Followers, ctx: StepContext, item: FollowerPart, pattern: Any) -> None:
+    def __init__(self, term: FollowerLoads, ctx: StepContext, load: FollowerLoad, pattern: Any) -> None:
         model, work = term.model, ctx.work
-        self.model, self.item = model, item
+        self.model, self.load = model, load
         self.kernels = direct_kernels(model.dtype)
-        conn = item.data.conn.numpy()
+        conn = load.data.conn.numpy()
         self.slots, self.count = conn.shape
         size = conn.size
         self.data = follower_struct(model.dtype)()
         for name in follower_struct(model.dtype).vars:
-            setattr(self.data, name, getattr(item.data, name))
+            setattr(self.data, name, getattr(load.data, name))
         own = np.arange(size, dtype=np.int32).reshape(conn.shape)
         self.data.conn = wp.array(own, dtype=wp.int32, device=model.device)
         self.data.first_entry = 0
-        name = f"direct follower {item.data.first_entry}"
+        name = f"direct follower {load.data.first_entry}"
         vec3, B = model.types.vec3, model.worlds
         self.u = work.array(f"{name} u", (B, size), vec3)
         self.direction = work.array(f"{name} direction", (B, size), vec3)
         self.columns = work.array(f"{name} columns", (3 * self.slots, B, size), vec3)
-        self.places, self.entries = self._find(conn, pattern)
+        self.pattern_entries, self.entry_count = self._find_pattern_entries(conn, pattern)
 
-    def _find(self, conn: np.ndarray, pattern: Any) -> tuple[Any, int]:
+    def _find_pattern_entries(self, conn: np.ndarray, pattern: Any) -> tuple[Any, int]:
         """Pattern entries of the items' matrices."""
         i, j, item = (a.ravel() for a in np.indices((self.slots, self.slots, self.count)))
         index = pattern.find_upper(conn[i, item], conn[j, item])
@@ -183,13 +184,13 @@ class FollowerMatrix:
     def add(self, ctx: StepContext, matrix: Any, dq_dv: wp.array, active: wp.array, out: wp.array) -> None:
         """out -= (dq/dv) times the items' matrices."""
         B, k, w, launch = self.model.worlds, self.kernels, ctx.work, ctx.launch
-        launch(k.gather_local, (B, self.slots, self.count), [self.item.data.conn, w.u_stage, active, self.u])
+        launch(k.gather_local, (B, self.slots, self.count), [self.load.data.conn, w.u_stage, active, self.u])
         for local in range(self.slots):
             for axis in range(3):
                 args = [local, axis, self.count, self.direction]
                 launch(k.set_unit_direction, (B, self.slots * self.count), args)
                 column = self.columns[3 * local + axis]
                 args = [self.data, ctx.midpoint_factor, self.u, w.time_law_stage_values, active, self.direction, column]
-                launch(self.item.product, (B, self.count), args)
-        args = [self.model.topology, matrix.pattern.data, self.places, self.columns, dq_dv, active, out]
-        launch(k.add_follower_matrices, (B, self.entries), args)
+                launch(self.load.product, (B, self.count), args)
+        args = [self.model.topology, matrix.pattern.data, self.pattern_entries, self.columns, dq_dv, active, out]
+        launch(k.add_follower_matrices, (B, self.entry_count), args)

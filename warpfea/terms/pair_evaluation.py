@@ -14,7 +14,7 @@ from ..kernels.terms.pair_evaluation import pair_evaluation_kernels, pair_result
 from ..kernels.terms.pair_structs import pair_scratch_struct
 from ..model.pairs import monomial_exponents
 from ..model.state import State
-from .contact_fields import Patch, nearest_samples, nodal_force
+from .contact_fields import BodyContactPoints, nearest_samples, nodal_force
 
 if TYPE_CHECKING:
     from .pair_tables import PairTables
@@ -48,7 +48,7 @@ class PairEvaluation:
             np.add.at(out[world], slots, self.reaction[world, point])
         return out
 
-    def patches(self, body: Any) -> list[Patch]:
+    def contact_points(self, body: Any) -> list[BodyContactPoints]:
         """Contact points of a body, as slave or as master."""
         t, out = self.tables, []
         for k, contact in enumerate(t.contacts):
@@ -56,17 +56,17 @@ class PairEvaluation:
             gap, normal, area = self.gap[:, points], self.normal[:, points], t.host[k].area.ravel()
             if contact.slave.body is body:
                 nearest = np.broadcast_to(nearest_samples(t, k, contact.slave.body), gap.shape)
-                out.append(Patch(nearest, np.broadcast_to(area, gap.shape), normal, gap))
+                out.append(BodyContactPoints(nearest, np.broadcast_to(area, gap.shape), normal, gap))
             if contact.master.body is body:
-                X = self._places(points)
+                X = self._master_positions(points)
                 nearest = np.full(gap.shape, -1)
                 seated = self.facet[:, points] >= 0
                 nearest[seated] = nearest_samples(t, k, contact.master.body, X[seated])
                 # master area: the loaded part only, without the area beside the slave
-                out.append(Patch(nearest, np.where(normal > 0.0, area, 0.0), normal, gap))
+                out.append(BodyContactPoints(nearest, np.where(normal > 0.0, area, 0.0), normal, gap))
         return out
 
-    def _places(self, points: slice) -> np.ndarray:
+    def _master_positions(self, points: slice) -> np.ndarray:
         """Reference positions (worlds, points, 3) on master facets, m."""
         t = self.tables
         facet, xi = self.facet[:, points], self.xi[:, points]
@@ -89,40 +89,42 @@ def evaluate_pairs(term: Any, state: State) -> PairEvaluation:
     def zeros(shape: tuple[int, ...], dtype: Any) -> wp.array:
         return wp.zeros(shape, dtype=dtype, device=m.device)
 
-    def take(name: str, dtype: Any, shape: tuple[int, ...]) -> wp.array:
+    def state_or_zeros(name: str, dtype: Any, shape: tuple[int, ...]) -> wp.array:
         return getattr(state, name) if name in state.specs else zeros((B, *shape), dtype)
 
-    history, seats = term.history_of(take)
-    every = wp.ones(B, dtype=wp.int32, device=m.device)
+    history, pair_history = term.make_history(state_or_zeros)
+    all_worlds = wp.ones(B, dtype=wp.int32, device=m.device)
     u = state.displacement
-    if term.exact:
+    if term.double_displacements:
         u = zeros(u.shape, wp.vec3d)
-        term.exact.widen(launch, state.displacement, every, u)
+        term.double_displacements.widen(launch, state.displacement, all_worlds, u)
 
-    def fill(struct: Any, arrays: dict[str, tuple[tuple[int, ...], Any]]) -> Any:
+    def allocate_fields(struct: Any, arrays: dict[str, tuple[tuple[int, ...], Any]]) -> Any:
         for name, (shape, dtype) in arrays.items():
             setattr(struct, name, zeros(shape, dtype))
         return struct
 
-    masters = t.masters_of(wp.uint64(0))
+    masters = t.master_data(wp.uint64(0))
     arrays: dict[str, tuple[tuple[int, ...], Any]] = dict.fromkeys(
         ("u_coefs", "director_coefs"), ((B, t.facets * masters.max_monomials), wp.vec3d)
     )
     arrays |= dict.fromkeys(("box_lower", "box_upper", "refit_lower", "refit_upper"), ((B * t.facets,), wp.vec3))
-    touching = fill(pair_scratch_struct(m.dtype)(), arrays | {"refit_needed": ((1,), wp.int32)})
-    touching.start_u_coefs = touching.u_coefs
+    pair = allocate_fields(pair_scratch_struct(m.dtype)(), arrays | {"refit_needed": ((1,), wp.int32)})
+    pair.start_u_coefs = pair.u_coefs
     launch(
-        term.seek.update_coefficients,
+        term.search_kernels.update_coefficients,
         (B, t.facets, masters.max_monomials),
-        [masters, u, every, touching.u_coefs, touching.director_coefs],
+        [masters, u, all_worlds, pair.u_coefs, pair.director_coefs],
     )
-    launch(term.seek.check_boxes, (B, t.facets), [masters, every, touching])
-    tree = wp.Bvh(touching.refit_lower, touching.refit_upper, groups=t.box_groups)
+    launch(term.search_kernels.check_boxes, (B, t.facets), [masters, all_worlds, pair])
+    tree = wp.Bvh(pair.refit_lower, pair.refit_upper, groups=t.box_groups)
     P, L = t.points, t.master_conn.shape[1]
     arrays = dict.fromkeys(("gap", "normal"), ((B, P), wp.float64)) | dict.fromkeys(("force", "xi"), ((B, P), wp.vec3d))
-    found = fill(pair_results_struct()(), arrays | {"facet": ((B, P), wp.int32), "reaction": ((B, P, L), wp.vec3d)})
+    found = allocate_fields(
+        pair_results_struct()(), arrays | {"facet": ((B, P), wp.int32), "reaction": ((B, P, L), wp.vec3d)}
+    )
     for group in t.groups:
-        args = [t.data, t.masters_of(tree.id), group.data, history, seats, state.time, u, t.far]
-        args += [contact_scratch_struct(m.dtype)(), touching, found]
+        args = [t.data, t.master_data(tree.id), group.data, history, pair_history, state.time, u, t.max_gap]
+        args += [contact_scratch_struct(m.dtype)(), pair, found]
         launch(pair_evaluation_kernels(m.dtype).evaluate_pairs, (B, group.count, group.data.point_count), args)
     return PairEvaluation(t, *(getattr(found, field.name).numpy() for field in fields(PairEvaluation)[1:]))

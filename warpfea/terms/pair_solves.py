@@ -14,8 +14,8 @@ from ..kernels.terms.pair_blocks import pair_block_kernels
 from ..kernels.terms.pair_structs import point_list_struct
 from ..kernels.terms.pairs import pair_kernels
 from ..model.state import view_as_words
-from .contact_tables import block_entries
-from .facet_tables import LISTED
+from .contact_tables import facet_pattern_entries
+from .facet_tables import POINT_SUM_LANES
 from .pair_rigid_modes import PairRigidModes
 from .pair_tables import PairTables
 from .term import StepContext, Term, part
@@ -31,7 +31,7 @@ class PairSolves(Term):
 
     Attributes:
         tables: points and facets on the device.
-        shared, kernels: kernels common with obstacle contact, and those of contact between bodies.
+        obstacle_kernels, kernels: kernels common with obstacle contact, and those of contact between bodies.
     """
 
     name = "pairs"
@@ -39,19 +39,19 @@ class PairSolves(Term):
     def __init__(self, model: Model) -> None:
         super().__init__(model)
         self.tables = PairTables(model)
-        self.shared, self.kernels = contact_kernels(model.dtype, False), pair_kernels(model.dtype)
+        self.obstacle_kernels, self.kernels = contact_kernels(model.dtype, False), pair_kernels(model.dtype)
 
     @part("pairs")
     def product(self, ctx: StepContext, p: wp.array, active: wp.array) -> None:
         s, m, w, t, k = ctx.scratch[self.name], self.model, ctx.work, self.tables, self.kernels
-        attempt, touching, masters = s["attempt"], s["touching"], s["masters"]
+        attempt, pair, masters = s["attempt"], s["pair"], s["masters"]
         for group in t.groups:
             dim = (m.worlds, group.count, group.data.point_count)
-            ctx.launch(k.point_products, dim, [masters, group.data, active, p, attempt, touching])
+            ctx.launch(k.point_products, dim, [masters, group.data, active, p, attempt, pair])
         for group in t.groups:  # the last group includes the master facets
             entries = group.conn.size + (t.master_conn.size if group is t.groups[-1] else 0)
-            lanes = ctx.launch.lanes(LISTED)
-            args = [masters, group.data, active, lanes, entries - 1, attempt, touching, w.pool_product]
+            lanes = ctx.launch.lanes(POINT_SUM_LANES)
+            args = [masters, group.data, active, lanes, entries - 1, attempt, pair, w.pool_product]
             ctx.launch(k.gather_pair_products, (m.worlds, ctx.launch.padded(lanes * entries)), args)
 
     @part("pairs")
@@ -59,13 +59,13 @@ class PairSolves(Term):
         s, m, w, t = ctx.scratch[self.name], self.model, ctx.work, self.tables
         for group in t.groups:
             args = [group.data, active, s["attempt"], w.pool_block]
-            ctx.launch(self.shared.diagonal, (m.worlds, group.count, group.conn.shape[1]), args)
-        args = [s["masters"], active, s["attempt"], s["touching"], w.pool_block]
+            ctx.launch(self.obstacle_kernels.diagonal, (m.worlds, group.count, group.conn.shape[1]), args)
+        args = [s["masters"], active, s["attempt"], s["pair"], w.pool_block]
         ctx.launch(self.kernels.master_diagonal, (m.worlds, t.facets, t.master_conn.shape[1]), args)
 
     def cached_inputs(self, ctx: StepContext) -> list[tuple[str, wp.array]]:
         s = ctx.scratch[self.name]
-        t = s["touching"]
+        t = s["pair"]
         arrays = {
             "list_size": t.list_size,
             "list_start": t.list_start,
@@ -84,7 +84,9 @@ class PairSolves(Term):
     def allocate_blocks(self, ctx: StepContext, matrix: Any, *, projected: bool) -> None:
         if "pair blocks" not in self.model.cache:
             conns = [group.conn for group in self.tables.groups] + [self.tables.master_conn]
-            self.model.cache["pair blocks"] = [block_entries(self.model, conn, matrix.pattern) for conn in conns]
+            self.model.cache["pair blocks"] = [
+                facet_pattern_entries(self.model, conn, matrix.pattern) for conn in conns
+            ]
 
     def blocks(
         self, ctx: StepContext, matrix: Any, kept: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,

@@ -23,7 +23,7 @@ from ..model.pairs import (
     monomial_exponents,
     pair_points,
 )
-from .facet_tables import PER_WORLD, FacetTables, clamped_slots, normal_damping
+from .facet_tables import WORLD_PARAMETERS, FacetTables, clamped_slots, normal_damping
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -38,27 +38,27 @@ class PairTables(FacetTables[PairContact]):
     """Contacts between bodies of a model; points lie on the slave surfaces.
 
     Attributes:
-        surfaces, masters: distinct master surfaces and their facets; of: master surface of each contact.
-        regions: contact area of each contact, m^2.
+        surfaces, masters: distinct master surfaces and their facets; master_of: master surface of each contact.
+        region_areas: contact area of each contact, m^2.
         facets: number of master facets. bodies: bodies in a pair. corners: of the slave facets of each group.
-        far: largest reported gap, m. deepest: search depth of initial overlaps, m.
+        max_gap: largest reported gap, m. max_overlap_depth: search depth of initial overlaps, m.
     """
 
     def __init__(self, model: Model) -> None:
         contacts = list(model.description.pairs)
         super().__init__(model, contacts, [pair_points(contact.slave, contact.points) for contact in contacts])
         self.surfaces: list[SurfaceSet] = []
-        self.of: list[int] = []
+        self.master_of: list[int] = []
         for contact in self.contacts:
             same = [k for k, other in enumerate(self.surfaces) if other.body is contact.master.body
                     and np.array_equal(other.faces, contact.master.faces)]  # fmt: skip
             if not same:
                 self.surfaces.append(contact.master)
-            self.of.append(same[0] if same else len(self.surfaces) - 1)
+            self.master_of.append(same[0] if same else len(self.surfaces) - 1)
         self.masters: list[MasterFacets] = [master_facets(surface) for surface in self.surfaces]
         self._check_clamped()
-        self.regions = [self._region(contact) for contact in self.contacts]
-        self.shares = [p.area / region for p, region in zip(self.host, self.regions)]
+        self.region_areas = [self._region_area(contact) for contact in self.contacts]
+        self.area_fractions = [p.area / region for p, region in zip(self.host, self.region_areas)]
         self.facets = sum(len(m.conn) for m in self.masters)
         self.bodies = sorted({surface.body.index for c in self.contacts for surface in (c.slave, c.master)})
         self.corners: list[wp.array] = []
@@ -73,7 +73,7 @@ class PairTables(FacetTables[PairContact]):
                     f"{contact.second.body.name!r} is clamped; leave the contact out, or free one of them"
                 )
 
-    def _region(self, contact: PairContact) -> float:
+    def _region_area(self, contact: PairContact) -> float:
         """Area that the contact stiffness is distributed over, m^2: the smaller of both surfaces."""
         if contact.radius:
             return math.pi * contact.radius**2
@@ -83,7 +83,7 @@ class PairTables(FacetTables[PairContact]):
     def slots(self) -> list[np.ndarray]:
         """Model slots of both surfaces of each contact."""
         out = []
-        for contact, p, k in zip(self.contacts, self.host, self.of):
+        for contact, p, k in zip(self.contacts, self.host, self.master_of):
             slave = np.unique(p.conn) + contact.slave.body.slot_offset
             master = np.unique(self.masters[k].conn) + contact.master.body.slot_offset
             out.append(np.concatenate([slave, master]))
@@ -96,28 +96,28 @@ class PairTables(FacetTables[PairContact]):
             corners = np.concatenate([corner_points(self.host[k]) for k in group.contacts])
             self.corners.append(self.model.array("contact", corners, wp.vec3i))
         self.data = contact_struct(False)()
-        self._put_laws(self.data, [self.numbers(c) for c in self.contacts])
-        self.remember()
-        self.reaching = 1e-3 * max(float(mas.size.mean()) for mas in self.masters) + max(
+        self._upload_laws(self.data, [self.law_constants(c) for c in self.contacts])
+        self.store_built_values()
+        self.reach_distance = 1e-3 * max(float(mas.size.mean()) for mas in self.masters) + max(
             abs(contact.offset) for contact in self.contacts
         )
-        self.deepest = max(float(mas.depth_limit.max()) for mas in self.masters)
-        self.far = max(float(mas.size.max()) for mas in self.masters)
+        self.max_overlap_depth = max(float(mas.depth_limit.max()) for mas in self.masters)
+        self.max_gap = max(float(mas.size.max()) for mas in self.masters)
         self.master_conn = self._master_conn()
         self.size = self.model.size
 
-    def numbers(self, contact: PairContact, world: int | None = None) -> dict[str, float]:
-        region = self.regions[self.number[contact.index]]
+    def law_constants(self, contact: PairContact, world: int | None = None) -> dict[str, float]:
+        region = self.region_areas[self.number[contact.index]]
         parameters = self.model.parameters
         row = contact_constants(contact, region, partial(parameters.mass, world=world), parameters.modulus(world))
         return row | {"normal_damping": normal_damping(row["damping_stiffness"], row["effective_mass"])}
 
     @property
-    def set_arrays(self) -> dict[str, wp.array]:
-        found = super().set_arrays
+    def parameter_arrays(self) -> dict[str, wp.array]:
+        found = super().parameter_arrays
         return {name: found[name] for name in ("mu", "mu_static", "damping", "beta", "scale")}  # hash order
 
-    def boxes(self) -> tuple[np.ndarray, np.ndarray]:
+    def reference_boxes(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper corners (facets, 3) of the reference bounding boxes."""
         nodes = [
             np.einsum("qm,fmk->fqk", bernstein_from_monomials(mas.corners, mas.degree), mas.position_coefficients)
@@ -134,7 +134,7 @@ class PairTables(FacetTables[PairContact]):
         groups = (np.arange(self.model.worlds)[:, None] * len(counts) + group).ravel()
         return wp.array(groups, dtype=wp.int32, device=self.model.device)
 
-    def _padded(self, values: list[np.ndarray], axis: int, width: int, mode: str = "constant") -> np.ndarray:
+    def _pad_facets(self, values: list[np.ndarray], axis: int, width: int, mode: str = "constant") -> np.ndarray:
         """Facet arrays of all surfaces, padded along one axis."""
         out = []
         for x in values:
@@ -147,9 +147,9 @@ class PairTables(FacetTables[PairContact]):
         """Model slots (facets, L); smaller facets repeat their last slot, with zero shape functions."""
         width = max(mas.conn.shape[1] for mas in self.masters)
         conns = [mas.conn + surface.body.slot_offset for mas, surface in zip(self.masters, self.surfaces)]
-        return self._padded(conns, 1, width, "edge")
+        return self._pad_facets(conns, 1, width, "edge")
 
-    def masters_of(self, tree: Any) -> Any:
+    def master_data(self, tree: Any) -> Any:
         """Device struct for a bounding volume hierarchy."""
         m, all_of = self.model, self.masters
         if "pair masters" not in m.cache:
@@ -157,7 +157,7 @@ class PairTables(FacetTables[PairContact]):
             kinds = sorted({(mas.corners, mas.degree) for mas in all_of})
             most = max(len(monomial_exponents(*kind)) for kind in kinds)
 
-            def whole(name: str) -> np.ndarray:
+            def concatenated(name: str) -> np.ndarray:
                 values = [getattr(mas, name) for mas in all_of]
                 if values[0].ndim == 3 and name in ("shape", "director_shape"):
                     values = [np.pad(x, ((0, 0), (0, most - x.shape[1]), (0, width - x.shape[2]))) for x in values]
@@ -165,7 +165,7 @@ class PairTables(FacetTables[PairContact]):
                     values = [np.pad(x, ((0, 0), (0, most - x.shape[1]), (0, 0))) for x in values]
                 return np.concatenate(values)
 
-            def put(values: Any, dtype: Any) -> wp.array:
+            def upload(values: Any, dtype: Any) -> wp.array:
                 return m.array("contact", np.ascontiguousarray(values), dtype)
 
             power = np.zeros((len(kinds), most, 2), dtype=np.int32)
@@ -176,24 +176,24 @@ class PairTables(FacetTables[PairContact]):
                 hull[k, :count, :count] = bernstein_from_monomials(*kind)
             counts = [len(mas.conn) for mas in all_of]
             m.cache["pair masters"] = {
-                "surface_of": put(self.of, wp.int32),
-                "sign": put([1.0 if c.slave is c.first else -1.0 for c in self.contacts], wp.float64),
-                "bodies": put(
+                "surface_of": upload(self.master_of, wp.int32),
+                "sign": upload([1.0 if c.slave is c.first else -1.0 for c in self.contacts], wp.float64),
+                "bodies": upload(
                     [[self.bodies.index(s.body.index) for s in (c.slave, c.master)] for c in self.contacts], wp.vec2i
                 ),
-                "conn": put(self.master_conn.T, wp.int32),
-                "shape": put(np.moveaxis(whole("shape"), 0, 2), m.types.T),
-                "director_shape": put(np.moveaxis(whole("director_shape"), 0, 2), m.types.T),
-                "position_coefficients": put(np.swapaxes(whole("position_coefficients"), 0, 1), wp.vec3d),
-                "director_coefficients": put(np.swapaxes(whole("normal_coefficients"), 0, 1), wp.vec3d),
-                "facet_kind": put(np.repeat([kinds.index((q.corners, q.degree)) for q in all_of], counts), wp.int32),
-                "monomial_count": put([len(monomial_exponents(*kind)) for kind in kinds], wp.int32),
-                "corner_count": put([kind[0] for kind in kinds], wp.int32),
-                "exponents": put(power, wp.vec2i),
-                "hull_coefficients": put(hull, wp.float64),
-                "depth_limit": put(whole("depth_limit"), wp.float64),
-                "side_length": put(whole("size"), wp.float64),
-                "surface": put(np.repeat(np.arange(len(counts)), counts), wp.int32),
+                "conn": upload(self.master_conn.T, wp.int32),
+                "shape": upload(np.moveaxis(concatenated("shape"), 0, 2), m.types.T),
+                "director_shape": upload(np.moveaxis(concatenated("director_shape"), 0, 2), m.types.T),
+                "position_coefficients": upload(np.swapaxes(concatenated("position_coefficients"), 0, 1), wp.vec3d),
+                "director_coefficients": upload(np.swapaxes(concatenated("normal_coefficients"), 0, 1), wp.vec3d),
+                "facet_kind": upload(np.repeat([kinds.index((q.corners, q.degree)) for q in all_of], counts), wp.int32),
+                "monomial_count": upload([len(monomial_exponents(*kind)) for kind in kinds], wp.int32),
+                "corner_count": upload([kind[0] for kind in kinds], wp.int32),
+                "exponents": upload(power, wp.vec2i),
+                "hull_coefficients": upload(hull, wp.float64),
+                "depth_limit": upload(concatenated("depth_limit"), wp.float64),
+                "side_length": upload(concatenated("size"), wp.float64),
+                "surface": upload(np.repeat(np.arange(len(counts)), counts), wp.int32),
                 "max_monomials": most,
                 "surface_count": len(self.surfaces),
                 "touch_depth": TOUCH * self.size,
@@ -208,9 +208,9 @@ class PairTables(FacetTables[PairContact]):
 
     def hash(self, h: Any) -> None:
         """Hash the definition of the contacts."""
-        for contact, p, k in zip(self.contacts, self.host, self.of):
-            fixed = ("first", "second", "slave", "master", *PER_WORLD)
+        for contact, p, k in zip(self.contacts, self.host, self.master_of):
+            fixed = ("first", "second", "slave", "master", *WORLD_PARAMETERS)
             values = {name: v for name, v in vars(contact).items() if name not in fixed}
             h.update(f"{contact.first.body.name} {contact.second.body.name} {sorted(values.items())}".encode())
             h.update(np.ascontiguousarray(p.faces).tobytes() + np.ascontiguousarray(self.surfaces[k].faces).tobytes())
-        h.update(self.built)
+        h.update(self.built_values)

@@ -21,9 +21,9 @@ from ..kernels.terms.pair_structs import pair_history_struct, pair_scratch_struc
 from ..model.state import State
 from .contact_fields import CONTACT_FIELDS, contact_field
 from .contact_parameters import contact_parameters
-from .contact_starts import reference_place, refuse_sunk, store_overlaps, touching_depth
 from .double_displacements import DoubleDisplacements
-from .facet_tables import LISTED
+from .facet_tables import POINT_SUM_LANES
+from .initial_overlaps import reference_position_text, refuse_deep_overlaps, store_overlaps, touching_depth
 from .pair_evaluation import evaluate_pairs
 from .pair_solves import PairSolves
 from .term import LOSS, NUMERICAL, STORED, WORK, Column, StepContext, part
@@ -60,8 +60,11 @@ class Pairs(PairSolves):
     def __init__(self, model: Model) -> None:
         super().__init__(model)
         self.traits = Traits(unilateral=True)
-        self.ledger_kernels, self.seek = contact_ledger_kernels(model.dtype, False), facet_search_kernels(model.dtype)
-        self.lists, self.pair_ledger_kernels = point_list_kernels(model.dtype), pair_ledger_kernels(model.dtype)
+        self.ledger_kernels, self.search_kernels = (
+            contact_ledger_kernels(model.dtype, False),
+            facet_search_kernels(model.dtype),
+        )
+        self.list_kernels, self.pair_ledger_kernels = point_list_kernels(model.dtype), pair_ledger_kernels(model.dtype)
         self.report_columns = len(RECORD_NAMES) * len(self.tables.contacts)
 
     @classmethod
@@ -82,7 +85,9 @@ class Pairs(PairSolves):
     def build(self, laws: TimeLawTable) -> None:
         self.tables.build(self.offset)
         self.connectivity = [group.conn for group in self.tables.groups] + [self.tables.master_conn]
-        self.exact = DoubleDisplacements(self.model, self.connectivity) if self.model.dtype == "float32" else None
+        self.double_displacements = (
+            DoubleDisplacements(self.model, self.connectivity) if self.model.dtype == "float32" else None
+        )
         self.rows = self.increment_rows = self.tables.rows
 
     def hash(self, h: Any) -> None:
@@ -90,7 +95,7 @@ class Pairs(PairSolves):
 
     # simulation setup
 
-    def _attempt(self, work: Workspace) -> Any:
+    def _make_scratch(self, work: Workspace) -> Any:
         t, B = self.tables, self.model.worlds
         C, P = len(t.contacts), t.points
         point = (B, P)
@@ -128,9 +133,9 @@ class Pairs(PairSolves):
         out.relaxation.fill_(1.0)
         return out
 
-    def _touching(self, work: Workspace) -> Any:
+    def _make_pair_scratch(self, work: Workspace) -> Any:
         t, B = self.tables, self.model.worlds
-        most = t.masters_of(wp.uint64(0)).max_monomials
+        most = t.master_data(wp.uint64(0)).max_monomials
         F, P, R = t.facets, t.points, t.rows
         shapes: dict[str, tuple[int, ...]] = dict.fromkeys(
             ("u_coefs", "director_coefs", "start_u_coefs", "start_director_coefs", "start_v_coefs"), (B, F * most)
@@ -151,52 +156,52 @@ class Pairs(PairSolves):
     def allocate(self, work: Workspace, ctx: StepContext) -> None:
         t, m = self.tables, self.model
         C, R, B = len(t.contacts), t.rows, m.worlds
-        attempt, touching = self._attempt(work), self._touching(work)
+        attempt, pair = self._make_scratch(work), self._make_pair_scratch(work)
         clock = clock_struct()()
         for name in ("time", "new_time", "h", "substep_index"):
             setattr(clock, name, getattr(work.step, name))
         clock.time, clock.is_static = ctx.state.time, int(not ctx.inertia)
-        tree = self._tree(touching)
+        tree = self._build_tree(pair)
         scratch = {
             "attempt": attempt,
-            "touching": touching,
+            "pair": pair,
             "tree": tree,
-            "masters": t.masters_of(tree.id),
+            "masters": t.master_data(tree.id),
             "clock": clock,
-            "active": work.newton.contact_active,
+            "contact_active": work.newton.contact_active,
             "energies": work.array("pairs energies", (ENERGY_COLUMNS, B, R), wp.float64),
             "parts": work.array("pairs parts", (B, C, len(RECORD_NAMES), RECORD_LANES), wp.float64),
             "row_start": m.array("contact", t.row_start, wp.int32),
-            "u": self.exact.allocate(work, self.name) if self.exact else work.u,
+            "u": self.double_displacements.allocate(work, self.name) if self.double_displacements else work.u,
         }
         ctx.scratch[self.name] = scratch | ctx.scratch.get(self.name, {})
 
-    def _tree(self, touching: Any) -> wp.Bvh:
+    def _build_tree(self, pair: Any) -> wp.Bvh:
         """Bounding volume hierarchy of the facets in the reference; one group per world and surface."""
-        low, high = self.tables.boxes()
-        touching.box_lower.assign(np.tile(low, (self.model.worlds, 1)))
-        touching.box_upper.assign(np.tile(high, (self.model.worlds, 1)))
-        return wp.Bvh(touching.box_lower, touching.box_upper, constructor="sah", groups=self.tables.box_groups)
+        low, high = self.tables.reference_boxes()
+        pair.box_lower.assign(np.tile(low, (self.model.worlds, 1)))
+        pair.box_upper.assign(np.tile(high, (self.model.worlds, 1)))
+        return wp.Bvh(pair.box_lower, pair.box_upper, constructor="sah", groups=self.tables.box_groups)
 
-    def history_of(self, make: Callable[[str, Any, tuple[int, ...]], wp.array]) -> tuple[Any, Any]:
+    def make_history(self, make: Callable[[str, Any, tuple[int, ...]], wp.array]) -> tuple[Any, Any]:
         """Structs of history and facet assignment, with arrays from make(name, dtype, shape per world)."""
-        history, seats = history_struct()(), pair_history_struct()()
+        history, pair_history = history_struct()(), pair_history_struct()()
         points = (self.tables.points,)
         for name, var in history_struct().vars.items():
             if name not in UNUSED_HISTORY:
                 shape = () if name in ("overlap_time", "pose_time") else points
                 setattr(history, name, make(f"pairs_{name}", var.type.dtype, shape))
         for name, var in pair_history_struct().vars.items():
-            setattr(seats, name, make(f"pairs_{name}", var.type.dtype, points))
-        return history, seats
+            setattr(pair_history, name, make(f"pairs_{name}", var.type.dtype, points))
+        return history, pair_history
 
     def register(self, ctx: StepContext) -> None:
-        history, seats = self.history_of(ctx.state.register)
-        ctx.scratch[self.name] = {"history": history, "seats": seats}
+        history, pair_history = self.make_history(ctx.state.register)
+        ctx.scratch[self.name] = {"history": history, "pair_history": pair_history}
 
     def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
-        exact = [self.exact.kernels.module] if self.exact else []
-        return [self.shared.module, self.seek.module, self.kernels.module, *exact]
+        double_displacements = [self.double_displacements.kernels.module] if self.double_displacements else []
+        return [self.obstacle_kernels.module, self.search_kernels.module, self.kernels.module, *double_displacements]
 
     def start(self, ctx: StepContext, active: wp.array) -> None:
         """Initial overlaps at the state.
@@ -215,17 +220,17 @@ class Pairs(PairSolves):
         born[new] = ctx.state.time.numpy()[new]
         history.overlap.assign(overlap)
         history.overlap_time.assign(born)
-        self._begin(ctx, flags)
+        self._begin_points(ctx, flags)
         u = ctx.state.displacement
-        if self.exact:
+        if self.double_displacements:
             u = s["u"]
-            self.exact.widen(ctx.launch, ctx.state.displacement, flags, u)
-        self._seek(ctx, u, flags, overlap_limit=t.deepest)
-        facet = s["touching"].facet.numpy()
-        depth = np.where((facet != -1) & new[:, None], s["touching"].depth.numpy(), 0.0)
+            self.double_displacements.widen(ctx.launch, ctx.state.displacement, flags, u)
+        self._search_facets(ctx, u, flags, overlap_limit=t.max_overlap_depth)
+        facet = s["pair"].facet.numpy()
+        depth = np.where((facet != -1) & new[:, None], s["pair"].depth.numpy(), 0.0)
         touching = touching_depth(self.model.size, ctx.state.displacement.numpy())
         store_overlaps(t, depth, touching, overlap)
-        refuse_sunk(t, ctx.state.displacement.numpy(), s["touching"].start_position.numpy(), facet, new)
+        refuse_deep_overlaps(t, ctx.state.displacement.numpy(), s["pair"].start_position.numpy(), facet, new)
         history.overlap.assign(overlap)
 
     def shift_time(self, state: State) -> None:
@@ -239,106 +244,108 @@ class Pairs(PairSolves):
     def begin(self, ctx: StepContext, active: wp.array) -> None:
         """Update facets and points at the start of the attempt."""
         ctx.scratch[self.name]["finished"] = False
-        self._begin(ctx, active)
+        self._begin_points(ctx, active)
 
-    def _begin(self, ctx: StepContext, active: wp.array) -> None:
+    def _begin_points(self, ctx: StepContext, active: wp.array) -> None:
         s, m, t = ctx.scratch[self.name], self.model, self.tables
-        touching, masters = s["touching"], s["masters"]
+        pair, masters = s["pair"], s["masters"]
         u, v = ctx.state.displacement, ctx.state.velocity
         dim = (m.worlds, t.facets, masters.max_monomials)
-        ctx.launch(self.seek.initial_coefficients, dim, [masters, u, v, active, touching])
+        ctx.launch(self.search_kernels.initial_coefficients, dim, [masters, u, v, active, pair])
         for group in t.groups:
-            args = [t.data, masters, group.data, s["history"], s["seats"], s["clock"]]
+            args = [t.data, masters, group.data, s["history"], s["pair_history"], s["clock"]]
             dim = (m.worlds, group.count, group.data.point_count)
-            ctx.launch(self.seek.begin_points, dim, [*args, u, v, active, s["attempt"], touching])
+            ctx.launch(self.search_kernels.begin_points, dim, [*args, u, v, active, s["attempt"], pair])
             if t.explicit:
-                ctx.launch(self.kernels.explicit_forces, dim, [*args, v, active, s["attempt"], touching])
+                ctx.launch(self.kernels.explicit_forces, dim, [*args, v, active, s["attempt"], pair])
 
-    def _refit(self, ctx: StepContext) -> None:
+    def _refit_tree(self, ctx: StepContext) -> None:
         s = ctx.scratch[self.name]
-        ctx.launch(self.seek.accept_boxes, self.model.worlds * self.tables.facets, [s["touching"]])
+        ctx.launch(self.search_kernels.accept_boxes, self.model.worlds * self.tables.facets, [s["pair"]])
         s["tree"].refit()
 
-    def _seek(self, ctx: StepContext, u: wp.array, active: wp.array, *, overlap_limit: float) -> None:
+    def _search_facets(self, ctx: StepContext, u: wp.array, active: wp.array, *, overlap_limit: float) -> None:
         """Assign all points to facets at u."""
-        s, m, t, k = ctx.scratch[self.name], self.model, self.tables, self.seek
-        touching, masters = s["touching"], s["masters"]
+        s, m, t, k = ctx.scratch[self.name], self.model, self.tables, self.search_kernels
+        pair, masters = s["pair"], s["masters"]
         dim = (m.worlds, t.facets, masters.max_monomials)
-        ctx.launch(k.update_coefficients, dim, [masters, u, active, touching.u_coefs, touching.director_coefs])
-        ctx.launch(k.check_boxes, (m.worlds, t.facets), [masters, active, touching])
-        ctx.launch(k.update_centres, (m.worlds, t.facets), [masters, active, touching])
-        wp.capture_if(touching.refit_needed, self._refit, ctx=ctx)
+        ctx.launch(k.update_coefficients, dim, [masters, u, active, pair.u_coefs, pair.director_coefs])
+        ctx.launch(k.check_boxes, (m.worlds, t.facets), [masters, active, pair])
+        ctx.launch(k.update_centres, (m.worlds, t.facets), [masters, active, pair])
+        wp.capture_if(pair.refit_needed, self._refit_tree, ctx=ctx)
         for group, corners in zip(t.groups, t.corners):
             args = [t.data, masters, group.data, s["history"]]
-            ctx.launch(k.query_boxes, (m.worlds, group.count), [*args, u, active, t.reaching + overlap_limit, touching])
-            args += [s["clock"], u, ctx.state.velocity, active, overlap_limit, s["attempt"], touching, corners]
+            ctx.launch(
+                k.query_boxes, (m.worlds, group.count), [*args, u, active, t.reach_distance + overlap_limit, pair]
+            )
+            args += [s["clock"], u, ctx.state.velocity, active, overlap_limit, s["attempt"], pair, corners]
             ctx.launch(k.find_facets, (m.worlds, group.count, group.data.point_count), args)
 
     def prepare(self, ctx: StepContext, active: wp.array) -> None:
         """Compute the first friction limits and the stiffness of the blocks."""
-        self._forces(ctx, active, fresh=1)
+        self._evaluate_forces(ctx, active, fresh=1)
 
     def force(self, ctx: StepContext, active: wp.array) -> None:
-        self._forces(ctx, active, fresh=0)
+        self._evaluate_forces(ctx, active, fresh=0)
 
     @part("pairs")
-    def _forces(self, ctx: StepContext, active: wp.array, *, fresh: int) -> None:
+    def _evaluate_forces(self, ctx: StepContext, active: wp.array, *, fresh: int) -> None:
         s, m, w, t = ctx.scratch[self.name], self.model, ctx.work, self.tables
-        touching, masters = s["touching"], s["masters"]
+        pair, masters = s["pair"], s["masters"]
         if ctx.positions_changed:
-            if self.exact:
-                self.exact.update(ctx, s["u"], active)
-            self._seek(ctx, s["u"], active, overlap_limit=0.0)
+            if self.double_displacements:
+                self.double_displacements.update(ctx, s["u"], active)
+            self._search_facets(ctx, s["u"], active, overlap_limit=0.0)
         for group in t.groups:
-            args = [t.data, masters, group.data, s["history"], s["seats"], s["clock"], s["u"], active, fresh]
+            args = [t.data, masters, group.data, s["history"], s["pair_history"], s["clock"], s["u"], active, fresh]
             dim = (m.worlds, group.count, group.data.point_count)
-            ctx.launch(self.kernels.forces, dim, [*args, s["attempt"], touching])
-        wp.capture_if(touching.lists_changed, self._list, ctx=ctx)
+            ctx.launch(self.kernels.forces, dim, [*args, s["attempt"], pair])
+        wp.capture_if(pair.lists_changed, self._build_point_lists, ctx=ctx)
         for group in t.groups:
-            sides, lanes = group.sides(ctx.launch, m.worlds)
-            args = [group.data, active, lanes, s["attempt"], w.pool_force, w.rows_of(self), s["active"]]
-            ctx.launch(self.shared.gather_point_forces, sides, args)
-        lanes = ctx.launch.lanes(LISTED)
-        args = [masters, active, lanes, s["attempt"], touching, w.pool_force]
+            sides, lanes = group.sum_threads(ctx.launch, m.worlds)
+            args = [group.data, active, lanes, s["attempt"], w.pool_force, w.rows_of(self), s["contact_active"]]
+            ctx.launch(self.obstacle_kernels.gather_point_forces, sides, args)
+        lanes = ctx.launch.lanes(POINT_SUM_LANES)
+        args = [masters, active, lanes, s["attempt"], pair, w.pool_force]
         ctx.launch(self.kernels.gather_master_forces, (m.worlds, ctx.launch.padded(lanes * t.master_conn.size)), args)
 
-    def _list(self, ctx: StepContext) -> None:
+    def _build_point_lists(self, ctx: StepContext) -> None:
         """Build the point lists of the master facets."""
-        s, m, t, k = ctx.scratch[self.name], self.model, self.tables, self.lists
-        touching, masters = s["touching"], s["masters"]
-        ctx.launch(k.clear_lists, m.worlds * t.facets, [touching])
-        ctx.launch(k.count_points, (m.worlds, t.points), [masters, touching])
-        ctx.launch(k.sum_chunks, touching.chunk_offset.shape, [masters, touching])
-        ctx.launch(k.scan_chunks, m.worlds, [touching])
-        ctx.launch(k.set_list_starts, (m.worlds, t.facets), [masters, touching])
-        ctx.launch(k.fill_lists, (m.worlds, t.points), [masters, touching])
-        ctx.launch(k.sort_lists, (m.worlds, t.facets), [touching])
+        s, m, t, k = ctx.scratch[self.name], self.model, self.tables, self.list_kernels
+        pair, masters = s["pair"], s["masters"]
+        ctx.launch(k.clear_lists, m.worlds * t.facets, [pair])
+        ctx.launch(k.count_points, (m.worlds, t.points), [masters, pair])
+        ctx.launch(k.sum_chunks, pair.chunk_offset.shape, [masters, pair])
+        ctx.launch(k.scan_chunks, m.worlds, [pair])
+        ctx.launch(k.set_list_starts, (m.worlds, t.facets), [masters, pair])
+        ctx.launch(k.fill_lists, (m.worlds, t.points), [masters, pair])
+        ctx.launch(k.sort_lists, (m.worlds, t.facets), [pair])
 
     @part("pairs")
     def update_frozen(self, ctx: StepContext, flags: wp.array) -> None:
-        k, m, attempt = self.shared, self.model, ctx.scratch[self.name]["attempt"]
+        k, m, attempt = self.obstacle_kernels, self.model, ctx.scratch[self.name]["attempt"]
         ctx.launch(k.aitken_partial_sums, (m.worlds, AITKEN_LANES), [flags, attempt])
         ctx.launch(k.aitken_relaxation, m.worlds, [flags, ctx.work.newton.tol, attempt, ctx.work.newton.partly_updated])
         ctx.launch(k.update_frozen, (m.worlds, self.tables.points), [flags, attempt])
         s = ctx.scratch[self.name]
         for group in self.tables.groups:
-            args = [s["masters"], group.data, s["u"], flags, attempt, s["touching"]]
+            args = [s["masters"], group.data, s["u"], flags, attempt, s["pair"]]
             ctx.launch(self.kernels.update_friction_shapes, (m.worlds, group.count, group.data.point_count), args)
 
     def energy_increments(self, ctx: StepContext, accepted: wp.array) -> wp.array:
-        self._finish(ctx, accepted)
+        self._record_substep(ctx, accepted)
         ctx.scratch[self.name]["finished"] = True
         return ctx.scratch[self.name]["energies"]
 
     @part("pairs")
-    def _finish(self, ctx: StepContext, accepted: wp.array) -> None:
+    def _record_substep(self, ctx: StepContext, accepted: wp.array) -> None:
         """Update history, ledger rows and records of an accepted substep."""
         s, m, t = ctx.scratch[self.name], self.model, self.tables
         C = len(t.contacts)
-        self._seek(ctx, s["u"], accepted, overlap_limit=0.0)
+        self._search_facets(ctx, s["u"], accepted, overlap_limit=0.0)
         for group in t.groups:
-            args = [t.data, s["masters"], group.data, s["history"], s["seats"], s["clock"], accepted]
-            args += [s["attempt"], s["touching"], s["energies"]]
+            args = [t.data, s["masters"], group.data, s["history"], s["pair_history"], s["clock"], accepted]
+            args += [s["attempt"], s["pair"], s["energies"]]
             ctx.launch(self.pair_ledger_kernels.record_substep, (m.worlds, group.count), args)
         args = [t.data, s["row_start"], accepted, s["attempt"], s["parts"]]
         ctx.launch(self.ledger_kernels.partial_records, (m.worlds, C, len(RECORD_NAMES), RECORD_LANES), args)
@@ -349,7 +356,7 @@ class Pairs(PairSolves):
     def commit(self, ctx: StepContext, accepted: wp.array) -> None:
         s, w = ctx.scratch[self.name], ctx.work
         if not s["finished"]:  # no ledger, `energy_increments` not called
-            self._finish(ctx, accepted)
+            self._record_substep(ctx, accepted)
         args = [s["clock"], w.newton.strain_energy, w.newton.term_sums, accepted, s["history"], s["attempt"]]
         ctx.launch(self.pair_ledger_kernels.add_energy_bound, self.model.worlds, args)
 
@@ -359,7 +366,7 @@ class Pairs(PairSolves):
 
     def stored_energy(self, ctx: StepContext) -> dict[str, np.ndarray]:
         """Stored energy according to the history, by points."""
-        weights = np.concatenate([share.ravel() for share in self.tables.shares])
+        weights = np.concatenate([share.ravel() for share in self.tables.area_fractions])
         return {"contact_pairs": ctx.scratch[self.name]["history"].stored.numpy() @ weights}
 
     # results
@@ -370,7 +377,7 @@ class Pairs(PairSolves):
             return None
         t = self.tables
         k = int(np.searchsorted(t.first, found - 1, side="right")) - 1
-        contact, where = t.contacts[k], reference_place(t, k, found - 1 - int(t.first[k]))
+        contact, where = t.contacts[k], reference_position_text(t, k, found - 1 - int(t.first[k]))
         return PenetrationError, (
             f"contact {contact.name!r}: a point of body {contact.slave.body.name!r} (reference place "
             f"{where}) went through body {contact.master.body.name!r}; take a larger "
@@ -385,7 +392,7 @@ class Pairs(PairSolves):
         return f"; in touch: contact {', '.join(names[:3])}{more}" if names else ""
 
     def parameter_arrays(self) -> dict[str, wp.array]:
-        return self.tables.set_arrays
+        return self.tables.parameter_arrays
 
     def update_materials(self, mask: np.ndarray) -> None:
         self.tables.update_materials(mask)
@@ -399,7 +406,11 @@ class Pairs(PairSolves):
         for contact in self.model.description.pairs:
             k = t.number[contact.index]
             names = {"name": contact.name, "body": contact.first.body.name, "with": contact.second.body.name}
-            numbers = {"points": int((t.shares[k] > 0.0).sum()), "facets": len(t.masters[t.of[k]].conn), "left_out": 0}
+            numbers = {
+                "points": int((t.area_fractions[k] > 0.0).sum()),
+                "facets": len(t.masters[t.master_of[k]].conn),
+                "left_out": 0,
+            }
             out.append(names | {"law": contact.law, "model": contact.model} | numbers)
         return out
 
@@ -411,5 +422,5 @@ class Pairs(PairSolves):
 
     def samples(self, field: str, body: Any, state: State) -> np.ndarray:
         bodies = [side.body for contact in self.tables.contacts for side in (contact.slave, contact.master)]
-        patches = evaluate_pairs(self, state).patches(body) if body in bodies else []
-        return contact_field(field, body, state.worlds, patches)
+        contact_points = evaluate_pairs(self, state).contact_points(body) if body in bodies else []
+        return contact_field(field, body, state.worlds, contact_points)

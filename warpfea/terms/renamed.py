@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-__all__ = ["RENAMED", "check_methods"]
+__all__ = ["FORMER_MEMBERS", "check_methods"]
 
-RENAMED = {
+FORMER_MEMBERS = {
     "adopt": "accept_trial",
     "aim": "process_direction",
     "book": "energy_increments",
@@ -34,5 +34,5 @@ RENAMED = {
 def check_methods(kind: type, base: type) -> None:
     """TypeError where a subclass of `base` defines a member by a former name."""
     for name in vars(kind):
-        if name in RENAMED and not hasattr(base, name):
-            raise TypeError(f"{kind.__qualname__}.{name}: this member of a Term is called {RENAMED[name]!r} now")
+        if name in FORMER_MEMBERS and not hasattr(base, name):
+            raise TypeError(f"{kind.__qualname__}.{name}: this member of a Term is called {FORMER_MEMBERS[name]!r} now")

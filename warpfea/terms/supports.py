@@ -25,8 +25,15 @@ __all__ = ["Supports"]
 
 
 @dataclass(eq=False)
-class Drives:
-    """Driven slots on the device; `arm` and `axis` for rotations."""
+class DrivenSlots:
+    """Driven slots on the device.
+
+    Attributes:
+        slot: (count,) model slots.
+        law: indices of time laws: three per slot for displacements (-1: free component), one for rotations.
+        components: flags of the driven components; arm: reference value relative to the anchor, m; axis: unit vector;
+            (count, 3), for rotations only.
+    """
 
     slot: Any
     law: Any
@@ -37,13 +44,13 @@ class Drives:
 
 
 class Supports:
-    """Driven slots of a model: `displaced` by displacement laws, `rotated` by rotations; None if unused."""
+    """Driven slots of a model, by displacement laws and by rotations; None if unused."""
 
     def __init__(self, model: Model) -> None:
         self.model = model
         self.kernels = load_kernels(model.dtype)
-        self.displaced: Drives | None = None
-        self.rotated: Drives | None = None
+        self.displacement_drives: DrivenSlots | None = None
+        self.rotation_drives: DrivenSlots | None = None
 
     def build(self, laws: TimeLawTable) -> None:
         """Build one row per driven slot with a law for each component; contradictory laws are rejected.
@@ -52,11 +59,11 @@ class Supports:
             ModelError: two supports prescribe a component differently.
         """
         taken: dict[tuple[int, int], Any] = {}
-        moved: dict[int, list[int]] = {}
-        turned: list[tuple[int, int, np.ndarray, np.ndarray, np.ndarray]] = []
+        displacement_rows: dict[int, list[int]] = {}
+        rotation_rows: list[tuple[int, int, np.ndarray, np.ndarray, np.ndarray]] = []
         for support in self.model.description.supports:
             slots = support.body.slot_offset + support.slots
-            arms = _arms(support, support.rotation[0]) if support.rotation else None
+            arms = _lever_arms(support, support.rotation[0]) if support.rotation else None
             index = laws.add(support.law) if support.law is not None else -1
             for k, slot in enumerate(slots):
                 node_law = support.node_laws[k] if support.node_laws else None
@@ -65,23 +72,23 @@ class Supports:
                 _check_conflict(taken, support, int(slot), (node_law or support.law, turn))
                 if arms is not None:
                     assert support.rotation is not None
-                    turned.append((slot, own, support.components, arms[k], support.rotation[1]))
+                    rotation_rows.append((slot, own, support.components, arms[k], support.rotation[1]))
                 elif own >= 0:
-                    row = moved.setdefault(int(slot), [-1, -1, -1])
+                    row = displacement_rows.setdefault(int(slot), [-1, -1, -1])
                     for c in np.flatnonzero(support.components):
                         row[c] = own
         m = self.model
-        if moved:
-            rows = np.array([[slot, *numbers] for slot, numbers in moved.items()])
-            self.displaced = Drives(
+        if displacement_rows:
+            rows = np.array([[slot, *numbers] for slot, numbers in displacement_rows.items()])
+            self.displacement_drives = DrivenSlots(
                 m.array("drives", rows[:, 0], wp.int32), m.array("drives", rows[:, 1:], wp.vec3i), len(rows)
             )
-        if turned:
-            slot, law, components, arm, axis = (np.array(column) for column in zip(*turned))
-            self.rotated = Drives(
+        if rotation_rows:
+            slot, law, components, arm, axis = (np.array(column) for column in zip(*rotation_rows))
+            self.rotation_drives = DrivenSlots(
                 m.array("drives", slot, wp.int32),
                 m.array("drives", law, wp.int32),
-                len(turned),
+                len(rotation_rows),
                 components=m.array("drives", components, wp.vec3d),
                 arm=m.array("drives", arm, wp.vec3d),
                 axis=m.array("drives", axis, wp.vec3d),
@@ -91,24 +98,26 @@ class Supports:
     def drive(self, ctx: StepContext, active: wp.array) -> None:
         """Write the velocities of the driven components to work.v."""
         w, launch, k, B = ctx.work, ctx.launch, self.kernels, self.model.worlds
-        if self.displaced:
-            d = self.displaced
+        if self.displacement_drives:
+            d = self.displacement_drives
             args = [d.slot, d.law, w.time_law_values, w.q_tilde, w.step.dq_dv, active, w.v]
             launch(k.drive_displacement, (B, d.count), args)
-        if self.rotated:
-            d = self.rotated
+        if self.rotation_drives:
+            d = self.rotation_drives
             args = [d.slot, d.law, d.components, d.arm, d.axis, w.time_law_values, w.q_tilde, w.step.dq_dv, active, w.v]
             launch(k.drive_rotation, (B, d.count), args)
 
     def modules(self) -> set[wp.Module]:
         """Modules launched by `drive`."""
         k = self.kernels
-        kernels = [k.drive_displacement] * bool(self.displaced) + [k.drive_rotation] * bool(self.rotated)
+        kernels = [k.drive_displacement] * bool(self.displacement_drives) + [k.drive_rotation] * bool(
+            self.rotation_drives
+        )
         return {kernel.module for kernel in kernels}
 
     def hash(self, h: Any) -> None:
         """Hash the drives."""
-        for drive in (self.displaced, self.rotated):
+        for drive in (self.displacement_drives, self.rotation_drives):
             for values in (drive.slot, drive.law, drive.components, drive.arm, drive.axis) if drive else ():
                 if values is not None:
                     h.update(values.numpy().tobytes())
@@ -128,7 +137,7 @@ def _check_conflict(taken: dict[tuple[int, int], Any], support: Support, slot: i
         )
 
 
-def _arms(support: Support, anchor: np.ndarray) -> np.ndarray:
+def _lever_arms(support: Support, anchor: np.ndarray) -> np.ndarray:
     """Reference values of the slots; positions relative to the anchor."""
     body = support.body
     arms = body.reference[support.slots].copy()

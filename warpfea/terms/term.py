@@ -117,26 +117,30 @@ class FieldSpec:
 
 @dataclass(eq=False)
 class CachedInputs:
-    """Inputs of a term's blocks at linearisation, besides displacements: live, cached and state arrays, [world,
-    ...]."""
+    """Inputs of a term's blocks besides displacements, arrays [world, ...].
+
+    Attributes:
+        live: as the term evaluates them; cached: copies at the linearisation of the preconditioner; state: copies saved
+            with the state, from which a resumed run rebuilds the preconditioner.
+    """
 
     live: list[wp.array]
-    place: list[wp.array]
+    cached: list[wp.array]
     state: list[wp.array]
 
 
 def part(name: str) -> Callable[[F], F]:
     """Decorator: attribute a method's launches to profile part `name`."""
 
-    def mark(method: F) -> F:
+    def decorate(method: F) -> F:
         @functools.wraps(method)
-        def marked(self: Any, ctx: StepContext, *args: Any, **options: Any) -> Any:
+        def wrapper(self: Any, ctx: StepContext, *args: Any, **options: Any) -> Any:
             with ctx.launch.part(name):
                 return method(self, ctx, *args, **options)
 
-        return marked  # type: ignore[return-value]
+        return wrapper  # type: ignore[return-value]
 
-    return mark
+    return decorate
 
 
 class Term:

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from ..base.errors import ModelError
-from ..base.launch import PARTS
+from ..base.launch import LAUNCH_PARTS
 from ..base.names import did_you_mean, listing
 from ..base.worlds import worlds_mask
 from ..kernels.common.traits import Traits
@@ -20,12 +20,12 @@ from ..model import assembly
 from ..model.state import SOLVER_HISTORY_PREFIXES
 from .body_forces import BodyForces
 from .checks import (
-    check_columns,
+    check_constructed,
     check_energy_increments,
-    check_made,
-    check_names,
-    check_stored,
+    check_ledger_columns,
+    check_stored_columns,
     check_tables,
+    check_unique_names,
     derived_traits,
 )
 from .constraints import Constraints
@@ -33,7 +33,7 @@ from .contact import Contact
 from .damping import Damping
 from .dead_loads import DeadLoads
 from .elements import Elements
-from .follower_loads import Followers
+from .follower_loads import FollowerLoads
 from .pairs import Pairs
 from .supports import Supports
 from .term import FieldSpec, StepContext, Term
@@ -44,75 +44,84 @@ if TYPE_CHECKING:
     from ..model.state import State
     from .workspace import Workspace
 
-__all__ = ["KINDS", "TermSet", "all_parts"]
+__all__ = ["TERM_TYPES", "TermSet", "profile_parts"]
 
-KINDS: tuple[type[Term], ...] = (Elements, DeadLoads, Damping, Followers, BodyForces, Contact, Pairs, Constraints)
+TERM_TYPES: tuple[type[Term], ...] = (
+    Elements,
+    DeadLoads,
+    Damping,
+    FollowerLoads,
+    BodyForces,
+    Contact,
+    Pairs,
+    Constraints,
+)
 """All kinds of terms in launch order, that in which the forces of an attempt are evaluated."""
-STATE = ("displacement", "velocity", "time", "status", "ledger", "ledger_time", "previous_displacement",
+STATE_ARRAYS = ("displacement", "velocity", "time", "status", "ledger", "ledger_time", "previous_displacement",
          "previous_velocity", "previous_step", "previous_end", "summed_time",
          "energy_growth")  # fmt: skip
 """State arrays owned by no term."""
-FIELDS = ("von_mises", "displacement")
+COMMON_FIELDS = ("von_mises", "displacement")
 """Fields of every model, see simulation.results."""
 
 
-def all_parts() -> dict[str, str]:
+def profile_parts() -> dict[str, str]:
     """Profile parts of every step and of all kinds of terms, each with a description."""
-    return PARTS | {name: text for kind in KINDS for name, text in kind.parts.items()}
+    return LAUNCH_PARTS | {name: text for kind in TERM_TYPES for name, text in kind.parts.items()}
 
 
 class TermSet:
     """Terms of a model in order; iterable.
 
     Attributes:
-        laws: table of time laws.
+        time_laws: table of time laws.
         supports: prescribed motion.
-        dead: dead loads and gravity.
+        dead_loads: dead loads and gravity.
         traits: traits of the terms for the kernels of a step.
-        side_entries: pool entries of non-potential forces; pool_entries: of potential ones.
-        side_topology: gather table of the non-potential pool, or None.
+        nonpotential_entries: pool entries of non-potential forces; pool_entries: of potential ones.
+        nonpotential_topology: gather table of the non-potential pool, or None.
         rows: rows of potentials.
-        written: number of parameter updates.
+        parameter_updates: number of calls of set_parameter, for all worlds; world_updates: per world.
         ledger: columns of the energy ledger. report: columns of the step report.
     """
 
     def __init__(self, model: Model, more: list[Callable[[Model], Term | None]] | None = None) -> None:
         self.model = model
         self.time_laws, self.supports = TimeLawTable(model), Supports(model)
-        makers = [kind.of for kind in KINDS] + list(more or ())
+        makers = [kind.of for kind in TERM_TYPES] + list(more or ())
         self.all: list[Term] = []
         for make in makers:
             term = make(model)
             if term is not None:
-                check_made(term, make, model)
+                check_constructed(term, make, model)
                 self.all.append(term)
-        self.dead = self.find(DeadLoads)
-        self.side_topology: Any = None
-        self.written = 0
-        self.writes: np.ndarray = np.zeros(1, dtype=np.int64)  # (worlds,) once a parameter was set
-        self._check()
+        self.dead_loads = self.find(DeadLoads)
+        self.nonpotential_topology: Any = None
+        self.parameter_updates = 0
+        self.world_updates: np.ndarray = np.zeros(1, dtype=np.int64)  # (worlds,) once a parameter was set
+        self._check_terms()
 
-    def _check(self) -> None:
+    def _check_terms(self) -> None:
         """Raise ModelError for added terms with duplicate names or reserved traits."""
         first = [f"name {term.name!r}" for term in self.all]
         for name in first:
             if first.count(name) > 1:
                 raise ModelError(f"two terms have the {name}; give each its own")
-        added = self.added
+        added = self.added_terms
         for term in self.all:
-            check_columns(term, own=term not in added)
+            check_ledger_columns(term, own=term not in added)
         for term in added:
             for trait in ("constraint_rows", "has_constraints"):
                 if getattr(term.traits, trait):
                     raise ModelError(f"term {term.name!r} declares the trait {trait!r}, which belongs to constraints")
-        check_stored(self.all)
-        check_names(self.all, FIELDS, "a field", lambda term: term.fields)
-        check_names(self.all, tuple(PARTS), "a part of profiles", lambda term: term.parts)
+        check_stored_columns(self.all)
+        check_unique_names(self.all, COMMON_FIELDS, "a field", lambda term: term.fields)
+        check_unique_names(self.all, tuple(LAUNCH_PARTS), "a part of profiles", lambda term: term.parts)
 
     @property
-    def added(self) -> list[Term]:
+    def added_terms(self) -> list[Term]:
         """Terms added by the user."""
-        return [term for term in self.all if type(term) not in KINDS]
+        return [term for term in self.all if type(term) not in TERM_TYPES]
 
     def __iter__(self) -> Iterator[Term]:
         return iter(self.all)
@@ -127,7 +136,7 @@ class TermSet:
         return self.find(Constraints)
 
     @property
-    def products(self) -> bool:
+    def has_tangents(self) -> bool:
         """True if terms besides the elements contribute to H."""
         return self.traits.tangent or self.traits.pooled or self.traits.constraint_rows
 
@@ -140,14 +149,14 @@ class TermSet:
     def build(self) -> None:
         """Build the terms' tables, once components are known, and their pool offsets."""
         for term in self.all:
-            term.offset = self._entries(self.all, term.potential)
+            term.offset = self._pool_size(self.all, term.potential)
             term.build(self.time_laws)
             check_tables(term, self.model)
-            if term is self.dead:  # time laws are numbered in this order
+            if term is self.dead_loads:  # time laws are numbered in this order
                 self.supports.build(self.time_laws)
         self.time_laws.upload()
         self.traits = Traits(*map(any, zip(*(derived_traits(term) for term in self.all))))
-        self.side_entries, self.pool_entries = self._entries(self.all, False), self._entries(self.all, True)
+        self.nonpotential_entries, self.pool_entries = self._pool_size(self.all, False), self._pool_size(self.all, True)
         self.rows = 0
         column = len(REPORT_COLUMNS) + 6 * len(self.model.description.probes)
         for term in self.all:
@@ -155,17 +164,19 @@ class TermSet:
             self.rows += term.rows
             column += term.report_columns
         self.report_width = column
-        if self.side_entries:
-            self.side_topology = self._topology([c for t in self.all if not t.potential for c in t.connectivity])
+        if self.nonpotential_entries:
+            self.nonpotential_topology = self._gather_topology(
+                [c for t in self.all if not t.potential for c in t.connectivity]
+            )
         named = [column.name for term in self.all for column in term.columns if column.name]
         self.ledger = (*LEDGER_COLUMNS, *dict.fromkeys(name for name in named if name not in LEDGER_COLUMNS))
 
     @staticmethod
-    def _entries(terms: list[Term], potential: bool) -> int:
+    def _pool_size(terms: list[Term], potential: bool) -> int:
         """Number of pool entries used so far."""
         return sum(conn.size for term in terms if term.potential == potential for conn in term.connectivity)
 
-    def _topology(self, conns: list[np.ndarray]) -> Any:
+    def _gather_topology(self, conns: list[np.ndarray]) -> Any:
         from ..kernels.common.structs import topology_struct
 
         m = self.model
@@ -175,11 +186,11 @@ class TermSet:
         out.contribution_entry = m.array("loads", order, wp.int32)
         return out
 
-    def join(self, topology: Any) -> None:
+    def add_pool_topology(self, topology: Any) -> None:
         """Add the gather table of the potential pool to the model's topology."""
         if self.pool_entries:
             conns = [conn for term in self.all if term.potential for conn in term.connectivity]
-            pool = self._topology(conns)
+            pool = self._gather_topology(conns)
             topology.pool_start, topology.pool_entry = pool.contribution_start, pool.contribution_entry
 
     def mark_constrained(self, free: np.ndarray) -> None:
@@ -190,11 +201,11 @@ class TermSet:
     @property
     def features(self) -> dict[str, bool]:
         """Optional features of all kinds of terms: used by the model or not."""
-        kinds = [*KINDS, *(type(term) for term in self.all if type(term) not in KINDS)]
+        kinds = [*TERM_TYPES, *(type(term) for term in self.all if type(term) not in TERM_TYPES)]
         out: dict[str, bool] = {}
         for kind in kinds:
             out |= kind.features(self.model)
-        out |= {term.name: True for term in self.all if type(term) not in KINDS}
+        out |= {term.name: True for term in self.all if type(term) not in TERM_TYPES}
         return out | {"controls": bool(self.time_laws.controls)}
 
     def shift_time(self, state: State) -> None:
@@ -208,7 +219,7 @@ class TermSet:
         self.time_laws.hash(h)
         self.supports.hash(h)
         for term in self.all:
-            if term in self.added:
+            if term in self.added_terms:
                 columns = [(column.name, column.kind) for column in term.columns]
                 h.update(f"term {term.name} {type(term).__qualname__} {columns} {term.rows}".encode())
                 for conn in term.connectivity:
@@ -263,13 +274,16 @@ class TermSet:
     def set_parameter(self, name: Any, values: Any, mask: Any) -> None:
         """See Model.set_parameter."""
         materials = self.model.parameters
-        owners = [term.parameters() for term in self.all] + [materials.setters(), {"gravity": self.dead.set_gravity}]
+        owners = [term.parameters() for term in self.all] + [
+            materials.setters(),
+            {"gravity": self.dead_loads.set_gravity},
+        ]
         found = [known[name] for known in owners if name in known]
         if len(found) == 1:
             chosen = worlds_mask("set_parameter", mask, self.model.worlds)
             found[0](values, chosen)
-            self.written += 1
-            self.writes = self.writes + chosen
+            self.parameter_updates += 1
+            self.world_updates = self.world_updates + chosen
             return
         if found:
             raise ModelError(f"set_parameter: {name!r} is a parameter of {len(found)} things of that name; rename one")
@@ -294,24 +308,24 @@ class TermSet:
             before = len(ctx.state.requested_names)
             term.register(ctx)
             for name in ctx.state.requested_names[before:]:
-                if name in owner or name in STATE or name in controls or name.startswith(SOLVER_HISTORY_PREFIXES):
+                if name in owner or name in STATE_ARRAYS or name in controls or name.startswith(SOLVER_HISTORY_PREFIXES):
                     taken = f"term {owner[name]!r}" if name in owner else "the state itself"
                     raise ModelError(f"term {term.name!r}: the state's array {name!r} is that of {taken}; rename it")
                 owner[name] = term.name
             term.allocate(work, ctx)
 
     @property
-    def booking(self) -> list[Term]:
+    def ledger_terms(self) -> list[Term]:
         """Terms with ledger rows."""
         return [term for term in self.all if term.columns]
 
     def increment_table(self, work: Any) -> Any:
         """Device table of the ledger columns of the terms; `energy_increments` fills their sums."""
-        columns = [column for term in self.booking for column in term.columns]
+        columns = [column for term in self.ledger_terms for column in term.columns]
         out = term_energies_struct()()
         device = self.model.device
         out.kind = wp.array([c.kind for c in columns], dtype=wp.int32, device=device)
-        held = [int(not term.potential) for term in self.booking for _ in term.columns]
+        held = [int(not term.potential) for term in self.ledger_terms for _ in term.columns]
         out.nonpotential = wp.array(held, dtype=wp.int32, device=device)
         numbers = [self.ledger.index(c.name) if c.name else -1 for c in columns]
         out.ledger_column = wp.array(numbers, dtype=wp.int32, device=device)
@@ -321,10 +335,10 @@ class TermSet:
     def energy_increments(self, ctx: StepContext, reduce: Any, accepted: wp.array) -> None:
         """Evaluate and sum the terms' ledger rows for an accepted substep."""
         first = 0
-        for term in self.booking:
+        for term in self.ledger_terms:
             rows, count = term.energy_increments(ctx, accepted), len(term.columns)
             if rows is not None:
-                check_energy_increments(term, rows, self.model.worlds, ctx.work.longest)
+                check_energy_increments(term, rows, self.model.worlds, ctx.work.max_summed_items)
                 reduce(rows, count, accepted, ctx.work.increment_sums[first : first + count])
             first += count
 
@@ -338,7 +352,7 @@ class TermSet:
     def energies(self, ledger: np.ndarray) -> dict[str, np.ndarray]:
         """Columns of the ledger (worlds, columns) by name; zeros for unused kinds of terms."""
         out = {name: ledger[:, k].copy() for k, name in enumerate(self.ledger)}
-        known = [column.name for kind in KINDS for column in kind.columns if column.name]
+        known = [column.name for kind in TERM_TYPES for column in kind.columns if column.name]
         for name in known:
             out.setdefault(name, np.zeros(len(ledger)))
         out["work"] = np.sum([values for name, values in out.items() if name.startswith("work_")], axis=0)

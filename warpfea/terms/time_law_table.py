@@ -32,7 +32,7 @@ class TimeLawTable:
         self.laws: list[TimeLaw] = []
         self.functions: list[tuple[Any, int]] = []
         self.controls: dict[str, Control] = {}
-        self.controlled: dict[tuple[str, bool], int] = {}
+        self.control_laws: dict[tuple[str, bool], int] = {}
         self.data = time_law_struct()()
 
     def add(self, law: TimeLaw) -> int:
@@ -48,9 +48,9 @@ class TimeLawTable:
                     f"two controls have the name {known.name!r}: {known} and {law.control}; give each its own, or use "
                     "one for both"
                 )
-            if (known.name, law.ramped) in self.controlled:
-                return self.controlled[known.name, law.ramped]
-            self.controlled[known.name, law.ramped] = len(self.laws)
+            if (known.name, law.ramped) in self.control_laws:
+                return self.control_laws[known.name, law.ramped]
+            self.control_laws[known.name, law.ramped] = len(self.laws)
         self.laws.append(law)
         return len(self.laws) - 1
 
@@ -94,7 +94,7 @@ class TimeLawTable:
         launch(self.kernels.evaluate_time_laws, (B, self.count), [self.data, time, ramp, active, value])
         for kernel, law in self.functions:
             launch(kernel, B, [law, time, active, value])
-        for (name, ramped), law in self.controlled.items():
+        for (name, ramped), law in self.control_laws.items():
             args = [getattr(state, control_array(name)), law, int(ramped), ramp, active, value]
             launch(self.kernels.evaluate_control, B, args)
 

@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from ..base.errors import ModelError
-from ..base.memory import enough_memory
+from ..base.memory import convert_memory_errors
 from ..kernels.common.lanes import WARP_SIZE
 from ..kernels.common.reduce import CHUNK
 from ..kernels.common.structs import balance_struct
@@ -28,7 +28,10 @@ __all__ = ["Workspace"]
 
 
 class Workspace:
-    """Scratch of a simulation. Unused features get an array of one item."""
+    """Scratch of a simulation. Unused features get an array of one item.
+
+    Notation of the step: v velocities, u displacements, g residual, H its derivative; r, z, p, Hp vectors of PCG.
+    """
 
     def __init__(
         self, model: Model, *, max_newton: int, ledger: bool, midpoint: bool = False, dissipation: float = 0.0
@@ -44,8 +47,8 @@ class Workspace:
         def field(name: str) -> wp.array:
             return self.array(name, (B, n), vec3)
 
-        # iterate, base point of its displacements, best iterate
-        self.v, self.u, self.base, self.best = field("v"), field("u"), field("base"), field("best")
+        # iterate, base point of the line search, best iterate
+        self.v, self.u, self.base_velocity, self.best_velocity = field("v"), field("u"), field("base"), field("best")
         # stage positions, and stage velocities of the elements
         self.u_stage, self.v_stage = (field("u_stage"), field("v_stage")) if midpoint else (self.u, self.v)
         self.q_tilde, self.v_tilde = field("q_tilde"), field("v_tilde")
@@ -63,7 +66,7 @@ class Workspace:
         # for a preconditioner of diagonal blocks only
         self.block_contribution: wp.array = wp.zeros((0, 0), dtype=model.types.sym, device=model.device)
         none = self.array("none", (1, 1), vec3)
-        side = (B, terms.side_entries)
+        side = (B, terms.nonpotential_entries)
         self.nonpotential = field("nonpotential") if traits.nonpotential else none
         self.nonpotential_frozen = field("nonpotential_frozen") if traits.nonpotential else none
         self.nonpotential_contribution = (
@@ -84,15 +87,15 @@ class Workspace:
         # scratch for kernels whose sums are unused
         self.spare_rows = self.array("spare_rows", (2, B, n) if traits.constraint_rows else (1, 1, 1), wp.float64)
         # PCG sums have one row per warp
-        self.warp = WARP_SIZE if model.device.is_cuda else 1
-        self.warp_rows = self.array("warp_rows", (2, B, -(-n // self.warp)), wp.float64)
+        self.warp_size = WARP_SIZE if model.device.is_cuda else 1
+        self.warp_rows = self.array("warp_rows", (2, B, -(-n // self.warp_size)), wp.float64)
         self.rows = self.array("rows", (max(RESIDUAL_ROWS, LEDGER_TERM_ROWS), B, n), wp.float64)
         self.energy_rows = self.array("energy_rows", (2, B, model.element_count), wp.float64)
-        longest = max(n, model.element_count, terms.rows, *(term.increment_rows for term in terms))
-        chunks = -(-longest // CHUNK) if longest > CHUNK else 1
-        self.longest = chunks * CHUNK  # maximum items of a summed row
+        max_summed_items = max(n, model.element_count, terms.rows, *(term.increment_rows for term in terms))
+        chunks = -(-max_summed_items // CHUNK) if max_summed_items > CHUNK else 1
+        self.max_summed_items = chunks * CHUNK  # maximum items of a summed row
         most = max(RESIDUAL_ROWS, LEDGER_TERM_ROWS, *(len(term.columns) for term in terms))
-        self.partial = self.array("partial", (most, B, chunks), wp.float64)
+        self.chunk_sums = self.array("partial", (most, B, chunks), wp.float64)
         self.time_law_values = self.array("law_value", (B, max(terms.time_laws.count, 1)), wp.vec3d)
         self.time_law_stage_values = self.time_law_values
         if midpoint:
@@ -157,7 +160,7 @@ class Workspace:
         """Constants of an element block in the form that the scheme's kernels take."""
         return block.dissipative_data(self._dtype, self.dissipation) if self.dissipation else block.data
 
-    def reserve_blocks(self) -> None:
+    def allocate_diagonal_blocks(self) -> None:
         """Allocate the diagonal blocks of element matrices."""
         if self.block_contribution.shape != self.blocks_shape:
             self.block_contribution = self.array("block_contribution", self.blocks_shape, self.sym)
@@ -180,7 +183,7 @@ class Workspace:
                     f"{name}: an array of {' x '.join(map(str, shape))} items has {step / 2**30:.1f} GiB between two "
                     "neighbours, and at most 2 can be addressed: take fewer worlds, or smaller bodies"
                 )
-        with enough_memory(f"array {name!r} of {' x '.join(map(str, shape))} items", self.device):
+        with convert_memory_errors(f"array {name!r} of {' x '.join(map(str, shape))} items", self.device):
             out = wp.zeros(shape, dtype=dtype, device=self.device)
         self.bytes[name] = int(np.prod(shape, dtype=np.int64)) * wp.types.type_size_in_bytes(dtype)
         return out

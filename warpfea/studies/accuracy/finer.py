@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import Any
 
 from ...base.checks import is_number
-from ...base.console import number
 from ...base.errors import ConvergenceError, ModelError
 from .measure import DONE, REFUSED, Outcome
 from .motion import Motion, motion_errors, observed_order, run_motion
@@ -99,7 +98,7 @@ def finer_motion(
         check_steps(one.dt or 0.0, one.t_end)
     best = _finished_run(run, setting)
     names = list(chosen) if chosen is not None else list(best.probes)
-    about = f"a run with {setting.method}, dt = {number(setting.dt or 0.0)} s, tol = {number(setting.tol or 0.0)}"
+    about = f"a run with {setting.method}, dt = {setting.dt or 0.0:.4g} s, tol = {setting.tol or 0.0:.4g}"
     swept = [name for name in axes.mesh if name in axes.over]
     about += "".join(f", {name} = {setting.values[name]}" for name in (*swept, *axes.choices))
     motion = run_motion(best, names, about)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ...base.errors import CapacityError, ConstraintError, ConvergenceError, Error
-from ...base.usercode import user_code
+from ...base.usercode import convert_user_errors
 from ...builder.scene import Scene
 from ...model.model import Model
 from ...simulation.simulation import Simulation
@@ -107,7 +107,7 @@ def measure(scene: Scene[Any], setting: Setting, *, repeat: int, limit: float | 
     times = next(iter(probes.values())).time
     values = None
     if scene.field is not None:
-        with user_code(f"field of scene {scene.name!r}"):
+        with convert_user_errors(f"field of scene {scene.name!r}"):
             values = np.asarray(scene.field(first.sim), dtype=float)
     motions = {name: (record.position[0], record.velocity[0]) for name, record in probes.items()}
     return Outcome(DONE, "", cost, np.ravel(times), motions, _start_positions(model), values)

@@ -19,7 +19,7 @@ import numpy as np
 
 from ...base.errors import ModelError
 from ...base.names import did_you_mean, listing
-from ...base.usercode import user_code
+from ...base.usercode import convert_user_errors
 from ...builder.reference import Reference
 from .measure import Outcome
 
@@ -105,7 +105,7 @@ def known_motion(reference: Reference, chosen: Sequence[str] | None, run: Outcom
 
 def _validated_function(function: Callable[[np.ndarray], Any], what: str) -> Callable[[np.ndarray], np.ndarray]:
     def call(times: np.ndarray) -> np.ndarray:
-        with user_code(what):
+        with convert_user_errors(what):
             out = np.asarray(function(times), dtype=float)
         if out.shape != (len(times), 3) or not np.isfinite(out).all():
             raise ModelError(f"{what}: must give finite positions {(len(times), 3)} of times, it gave {out.shape}")

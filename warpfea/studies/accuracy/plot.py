@@ -7,7 +7,7 @@ import pathlib
 import textwrap
 from typing import Any
 
-from ...base.console import number
+from ...base.console import format_number
 from ..files import require_matplotlib
 from .measure import DONE, REFUSED
 from .motion import RESOLVED_RATIO
@@ -86,7 +86,7 @@ def _draw_reference_limit(axes: Any, study: Any) -> None:
     """Line below which the reference does not resolve errors."""
     own = max((ref["own_error"].get(study.measure, 0.0) for ref in study.references), default=0.0)
     if RESOLVED_RATIO * own > axes.get_ylim()[0]:
-        text = f"{RESOLVED_RATIO:g} times the error of the reference ({number(own, 2)})"
+        text = f"{RESOLVED_RATIO:g} times the error of the reference ({format_number(own, 2)})"
         axes.axhline(RESOLVED_RATIO * own, color="0.4", linestyle=":", linewidth=1.2, label=text)
 
 

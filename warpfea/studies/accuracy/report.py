@@ -12,11 +12,11 @@ from typing import Any, overload
 
 import numpy as np
 
-from ...base.console import number, size, table, to_json, write_json
+from ...base.console import format_bytes, format_number, format_table, to_json, write_json
 from ...base.errors import OutputError
-from ...base.provenance import machine, origin, versions
+from ...base.provenance import machine, provenance_of, versions
 from ...base.short_repr import use_short_repr
-from ...base.writer import write_whole
+from ...base.writer import write_atomically
 from ..files import make_folder, require_matplotlib, write_csv
 from .measure import DONE
 from .motion import RESOLVED_RATIO
@@ -243,17 +243,17 @@ class Study(Sequence[Row]):
                 self.axes.sizes), "end" if self.measure != "end" else "l2", "energy"]  # fmt: skip
         head += ["s", "s min", "digits", "steps", "Newton", "PCG", "memory", ""]
         lines = [head, *([*self._row_texts(row, head)] for row in self.rows)]
-        text = [table(lines, right=range(1, len(head) - 1)), ""]
+        text = [format_table(lines, right=range(1, len(head) - 1)), ""]
         for ref in self.references:
             at = ", ".join(f"{k} = {cli_text(v)}" for k, v in ref["values"].items())
-            own = ", ".join(f"{k} {number(v, 2)}" for k, v in ref["own_error"].items())
+            own = ", ".join(f"{k} {format_number(v, 2)}" for k, v in ref["own_error"].items())
             text.append(f"reference{f' at {at}' if at else ''}: {ref['about']}; its own error: {own or 'none'}")
-        travel = ", ".join(number(r["travel"]) for r in self.references)
+        travel = ", ".join(format_number(r["travel"]) for r in self.references)
         text.append(f"errors {self.kind}, over the largest travel, {travel} m")
         text += [f"order {f['order']:.2f} in {f['size']} of {f['curve']}, {f['rows']} rows" for f in self.fits()]
         for row in self.rows:
             if row.split is not None:
-                parts = ", ".join(f"{k} {'-' if v is None else number(v, 2)}" for k, v in row.split.items())
+                parts = ", ".join(f"{k} {'-' if v is None else format_number(v, 2)}" for k, v in row.split.items())
                 text.append(f"parts of the error of {self.label(row)}: {parts}")
         text += [f"left out: {line}" for line in self.omissions()]
         done = [r for r in self.rows if r.compile_s is not None]
@@ -271,26 +271,26 @@ class Study(Sequence[Row]):
         """The answer to the target."""
         if self.answer is not None:
             r = self.answer
-            found = f"error {number(r.error or 0.0, 3)} in {number(r.seconds or 0.0, 3)} s"
+            found = f"error {format_number(r.error or 0.0, 3)} in {format_number(r.seconds or 0.0, 3)} s"
             if self.kind == "in time":
-                mesh = "not estimated" if r.mesh_error is None else f"of {number(r.mesh_error, 2)} included"
+                mesh = "not estimated" if r.mesh_error is None else f"of {format_number(r.mesh_error, 2)} included"
                 found += f" (in time; mesh error {mesh})"
             text = f"cheapest that reaches {self.target:g}: {self.label(r)}: {found}\n  {self.command}"
             for c in self.checks:
                 size = f"error={cli_text(c.setting.error)}" if c.setting.error else f"dt={cli_text(c.setting.dt)}"
-                text += f"\nchecked with {size}: " + (c.why if c.error is None else f"error {number(c.error, 3)}")
+                text += f"\nchecked with {size}: " + (c.why if c.error is None else f"error {c.error:.3g}")
             return text
         near = min(self.rows, key=lambda r: r.total_error)
         if near.error is None:
             return f"no setting was measured to reach {self.target:g}"
         if near.mesh_error is not None and near.error + near.own_error <= (self.target or 0.0):
-            missed = f"mesh error {number(near.mesh_error, 2)}"
+            missed = f"mesh error {format_number(near.mesh_error, 2)}"
             if near.mesh_error <= (self.target or 0.0):
-                missed = f"with {missed} the sum {number(near.total_error, 3)}"
-            found = f"error {number(near.error, 3)} in {number(near.seconds or 0.0, 3)} s"
+                missed = f"with {missed} the sum {format_number(near.total_error, 3)}"
+            found = f"error {format_number(near.error, 3)} in {format_number(near.seconds or 0.0, 3)} s"
             more = f"refine {', '.join(self.axes.mesh)}"
             return f"reached in time; {missed} misses {self.target:g}: {self.label(near)}: {found}; {more}"
-        own = f" (and {number(near.own_error, 2)} of the reference)" if near.own_error else ""
+        own = f" (and {format_number(near.own_error, 2)} of the reference)" if near.own_error else ""
         return f"no setting was measured to reach {self.target:g}; nearest: {self.label(near)}: {near.error:.3g}{own}"
 
     def _row_texts(self, row: Row, head: Sequence[str]) -> Iterator[str]:
@@ -309,7 +309,7 @@ class Study(Sequence[Row]):
         values["digits"] = "-" if row.efficacy is None else f"{row.efficacy:.2f}"
         values |= {k: "-" if v is None else str(v) for k, v in
                    (("steps", row.steps), ("Newton", row.newton), ("PCG", row.pcg))}  # fmt: skip
-        values["memory"] = "-" if row.bytes is None else size(row.bytes)
+        values["memory"] = "-" if row.bytes is None else format_bytes(row.bytes)
         marks = ["Pareto"] * row.pareto + ["not resolved"] * (row.status == DONE and not row.resolved)
         marks += [] if row.status == DONE else [row.status.upper()]
         values[""] = ", ".join(marks + ["target"] * (row is self.answer))
@@ -318,7 +318,7 @@ class Study(Sequence[Row]):
     def content(self, words: Sequence[str]) -> dict[str, Any]:
         """Contents of the JSON file."""
         return {
-            "schema": SCHEMA, **origin(words, self.rows[0].setting.device), "scene": self.what,
+            "schema": SCHEMA, **provenance_of(words, self.rows[0].setting.device), "scene": self.what,
             "measure": self.measure, "target": self.target, "settings": to_json(self.settings),
             "over": to_json(self.axes.over), "references": to_json(self.references), "orders": self.fits(),
             "answer": None if self.answer is None else {"row": self.rows.index(self.answer), "command": self.command},
@@ -345,7 +345,7 @@ class Study(Sequence[Row]):
             require_matplotlib()
         except OutputError:
             return paths[:2]
-        write_whole(paths[2], lambda path: draw(self, path))
+        write_atomically(paths[2], lambda path: draw(self, path))
         return paths
 
     def _flat_row(self, row: Row) -> dict[str, Any]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from ...base.console import write_json
 from ...base.errors import UsageError
-from ...base.provenance import origin
+from ...base.provenance import provenance_of
 from ...model.model import Model
 from ...simulation.simulation import Simulation
 from ...solvers import NewtonPCG
@@ -72,7 +72,7 @@ def run_kind(kind: Kind, options: argparse.Namespace) -> None:
     cases = kind.cases(options)
     about = {
         "schema": SCHEMA,
-        **origin(options.words or ["bench"], options.device),
+        **provenance_of(options.words or ["bench"], options.device),
         "settings": kind.settings(options, cases),
     }
     rows: list[Row] = []

@@ -26,7 +26,7 @@ import warp as wp
 from ...base.checks import is_count
 from ...base.console import quiet_warp
 from ...base.errors import ModelError
-from ...base.launch import PARTS, kernel_name
+from ...base.launch import LAUNCH_PARTS, kernel_name
 from ...kernels.common.empty_kernel import empty_kernels
 from ...simulation.simulation import Simulation
 
@@ -43,7 +43,7 @@ class KernelTime:
     """Launches of one kernel for one part, per step.
 
     Attributes:
-        part: purpose, see `PARTS`. kernel: module.kernel.
+        part: purpose, see `LAUNCH_PARTS`. kernel: module.kernel.
         launches: per step. ms: time per step beyond that of empty launches. bytes: of accessible arrays, per step.
     """
 
@@ -82,9 +82,9 @@ class Profile:
 
     @property
     def parts(self) -> dict[str, KernelTime]:
-        """Sums over the kernels of each part with launches: `PARTS` in order, then those of terms."""
+        """Sums over the kernels of each part with launches: `LAUNCH_PARTS` in order, then those of terms."""
         out = {}
-        for name in dict.fromkeys([*PARTS, *(k.part for k in self.kernels)]):
+        for name in dict.fromkeys([*LAUNCH_PARTS, *(k.part for k in self.kernels)]):
             rows = [k for k in self.kernels if k.part == name]
             if rows:
                 sums = {key: sum(getattr(k, key) for k in rows) for key in ("launches", "ms", "bytes")}

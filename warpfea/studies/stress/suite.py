@@ -15,11 +15,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ...base.console import number, quiet_warp, table, to_json, write_json
+from ...base.console import format_number, format_table, quiet_warp, to_json, write_json
 from ...base.devices import find_device
 from ...base.errors import Error, UsageError
 from ...base.names import did_you_mean
-from ...base.provenance import origin
+from ...base.provenance import provenance_of
 from ...base.writer import check_target
 from .case import CASES, DTYPES, Answer, Case, Setting, Skipped, label
 from .misses import known_miss_reason
@@ -91,7 +91,7 @@ def list_cases(cases: Mapping[str, Case]) -> str:
             if case.group == group:
                 values = ", ".join(label("", value)[1:] for value in case.values if value is not None)
                 out.append([f"  {case.name}", case.quick, f"{case.description}{f' [{values}]' if values else ''}"])
-    return table([["case", "quick", "what is tried [values]"], *out])
+    return format_table([["case", "quick", "what is tried [values]"], *out])
 
 
 def run_row(row: Row, setting: Setting, debug: bool = False) -> dict[str, Any]:
@@ -142,10 +142,10 @@ def _evaluate_answer(case: Case, answer: Answer) -> tuple[str, bool, str]:
         return FAILED, False, f"accepted what is to be refused; {answer.note}".rstrip("; ")
     if answer.passed:
         return DONE, True, answer.note
-    over = [f"{name} {number(value)} > {number(bound)}" for name, (value, bound) in answer.limits.items()
+    over = [f"{name} {format_number(value)} > {format_number(bound)}" for name, (value, bound) in answer.limits.items()
             if not value <= bound]  # fmt: skip
     if not answer.error <= answer.bound:
-        over.insert(0, f"accepted wrong: error {number(answer.error)} > {number(answer.bound)}")
+        over.insert(0, f"accepted wrong: error {format_number(answer.error)} > {format_number(answer.bound)}")
     return FAILED, False, "; ".join([*over, answer.note]).rstrip("; ")
 
 
@@ -188,7 +188,7 @@ def _row_texts(row: Mapping[str, Any]) -> dict[str, str]:
         value = row.get(name)
         if value is None:
             return "nan" if name == "error" and "bound" in row else "-"
-        return str(value) if isinstance(value, int) else number(value, 3)
+        return str(value) if isinstance(value, int) else format_number(value, 3)
 
     return {
         "case": row["case"], "precision": row["precision"], "outcome": row["outcome"], "error": text("error"),
@@ -208,7 +208,7 @@ def _print_row(options: argparse.Namespace, cells: Mapping[str, str], width: int
 
 def _initial_content(options: argparse.Namespace, settings: Mapping[str, Any], device: str) -> dict[str, Any]:
     """Contents of --json before the first row: the rows of the file to resume, or none. UsageError."""
-    content = {"schema": SCHEMA, **origin(options.words, device), "settings": dict(settings), "rows": []}
+    content = {"schema": SCHEMA, **provenance_of(options.words, device), "settings": dict(settings), "rows": []}
     path = pathlib.Path(options.json) if options.json and options.json != STDOUT else None
     if not options.resume:
         return content

@@ -16,22 +16,22 @@ if TYPE_CHECKING:
     from .contact_tables import ContactTables
     from .pair_tables import PairTables
 
-__all__ = ["reference_place", "refuse_sunk", "store_overlaps", "touching_depth"]
+__all__ = ["reference_position_text", "refuse_deep_overlaps", "store_overlaps", "touching_depth"]
 
-TOUCH_TOL = 1e-9
+TOUCHING_DEPTH_RATIO = 1e-9
 """Initial depth over the model's size treated as touching; round-off of displacements is added."""
 
-MIN_SUNK_RATIO = 0.1
+MIN_DEEP_OVERLAP_RATIO = 0.1
 """Smallest depth, over the depth limit of the body's thinnest facet, at which an unassigned point counts as inside: the
 inside test uses flat triangles."""
 
 
 def touching_depth(size: float, u: np.ndarray) -> np.ndarray:
     """Largest depth (worlds,), m, treated as touching, at displacements u (worlds, slots, 3)."""
-    return np.asarray(TOUCH_TOL * size + 4.0 * np.finfo(u.dtype).eps * np.abs(u).max(axis=(1, 2)))
+    return np.asarray(TOUCHING_DEPTH_RATIO * size + 4.0 * np.finfo(u.dtype).eps * np.abs(u).max(axis=(1, 2)))
 
 
-def reference_place(tables: ContactTables | PairTables, k: int, point: int) -> str:
+def reference_position_text(tables: ContactTables | PairTables, k: int, point: int) -> str:
     """Reference position of a contact point, as text."""
     X = tables.host[k].X.reshape(-1, 3)[point]
     return "(" + ", ".join(f"{x:.4g}" for x in X) + ")"
@@ -60,14 +60,16 @@ def store_overlaps(
                 other = f"collider {contact.collider.name!r}"
             raise ModelError(
                 f"contact {contact.name!r}: body {contact.body.name!r} begins {mine.max():.3g} m inside {other} "
-                f"(world {world}, reference point {reference_place(tables, k, int(point))}); move one of them, or take "
-                "overlap='offset', which stores the overlap and lets it decay"
+                f"(world {world}, reference point {reference_position_text(tables, k, int(point))}); move one of them, "
+                "or take overlap='offset', which stores the overlap and lets it decay"
             )
         kept = np.maximum(mine[deep], 0.0)
         overlap[deep, points] = kept.max(axis=1, keepdims=True) if contact.model == "sphere" else kept
 
 
-def refuse_sunk(tables: PairTables, u: np.ndarray, places: np.ndarray, facets: np.ndarray, new: np.ndarray) -> None:
+def refuse_deep_overlaps(
+    tables: PairTables, u: np.ndarray, places: np.ndarray, facets: np.ndarray, new: np.ndarray
+) -> None:
     """Reject bodies that begin deeper in another body than any of its facets reaches.
 
     Args:
@@ -83,8 +85,8 @@ def refuse_sunk(tables: PairTables, u: np.ndarray, places: np.ndarray, facets: n
         if contact.overlap != "refuse":
             continue
         body, points = contact.master.body, slice(tables.first[k], tables.first[k + 1])
-        limit = tables.masters[tables.of[k]].depth_limit
-        least = MIN_SUNK_RATIO * float(limit.min())
+        limit = tables.masters[tables.master_of[k]].depth_limit
+        least = MIN_DEEP_OVERLAP_RATIO * float(limit.min())
         beyond = (0.0 if body.family.solid else float(limit.max())) - least  # margin of the nodal bounding box
         nodes = body.slot_kind == 0
         spans = body.reference[nodes] + body.origin + u[:, body.slots[nodes]]
@@ -98,17 +100,18 @@ def refuse_sunk(tables: PairTables, u: np.ndarray, places: np.ndarray, facets: n
             if key in seen:
                 continue
             seen.add(key)
-            depth = _depths(body, u[world, body.slots], x[world, near[world]])
+            depth = _depths_in_body(body, u[world, body.slots], x[world, near[world]])
             if depth.max() > least:
                 point = int(np.flatnonzero(near[world])[depth.argmax()])
                 raise ModelError(
                     f"contact {contact.name!r}: body {contact.slave.body.name!r} begins within body {body.name!r} "
-                    f"(world {world}, reference point {reference_place(tables, k, point)}, {depth.max():.3g} m deep), "
-                    "where no facet of the contact reaches; move one of them, or leave these faces out of the contact"
+                    f"(world {world}, reference point {reference_position_text(tables, k, point)}, "
+                    f"{depth.max():.3g} m deep), where no facet of the contact reaches; move one of them, or leave "
+                    "these faces out of the contact"
                 )
 
 
-def _depths(body: Discretisation, u: np.ndarray, x: np.ndarray) -> np.ndarray:
+def _depths_in_body(body: Discretisation, u: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Distance, m, of interior points to the skin of a body at displacements of its slots; 0 outside."""
     import warp as wp
 
