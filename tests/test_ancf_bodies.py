@@ -107,7 +107,10 @@ def _launched(model, state, what, *fields):
         args = [part.data, *share, state.displacement, values, active, *extra, out]
         wp.launch(getattr(part, what), dim=(1, part.count), inputs=args, device="cpu")
     force = np.zeros((model.slots, 3))
-    start, entry = terms.nonpotential_topology.contribution_start.numpy(), terms.nonpotential_topology.contribution_entry.numpy()
+    start, entry = (
+        terms.nonpotential_topology.contribution_start.numpy(),
+        terms.nonpotential_topology.contribution_entry.numpy(),
+    )
     np.add.at(force, np.repeat(np.arange(model.slots), np.diff(start)), out.numpy()[0][entry])
     return force
 

@@ -1,21 +1,23 @@
-"""Former names of members of a term are refused by name: they would be defined, and never called."""
+"""Former names of members that a subclass defines are refused."""
 
 import pytest
 
-from warpfea.terms.renamed import FORMER_MEMBERS
+from warpfea.base.renamed import FORMER_MEMBERS
+from warpfea.base.writer import Output
+from warpfea.materials import Material
 from warpfea.terms.term import Term
 
-
-@pytest.mark.parametrize("old", sorted(FORMER_MEMBERS))
-def test_a_former_name_is_refused(old):
-    with pytest.raises(TypeError, match=f"^Own.{old}: .* called '{FORMER_MEMBERS[old]}' now"):
-        type("Own", (Term,), {old: lambda self, *args: None})
+BASES = {base.__name__: base for base in (Term, Output, Material)}
 
 
-def test_names_of_today_exist():
-    made = dir(Term) + list(vars(Term(None)))
-    assert not set(FORMER_MEMBERS.values()) - {*made}
+@pytest.mark.parametrize(("base", "old"), [(base, old) for base in BASES for old in sorted(FORMER_MEMBERS[base])])
+def test_a_former_name_is_refused(base, old):
+    with pytest.raises(TypeError, match=f"^Own.{old}: .* called '{FORMER_MEMBERS[base][old]}' now"):
+        type("Own", (BASES[base],), {old: lambda self, *args: None})
 
 
-def test_names_of_today_are_accepted():
-    assert type("Own", (Term,), {name: lambda self, *args: None for name in FORMER_MEMBERS.values()}).__base__ is Term
+@pytest.mark.parametrize("base", BASES)
+def test_names_of_today_are_accepted(base):
+    names = FORMER_MEMBERS[base].values()
+    assert not {*names} - {*dir(BASES[base]), *(vars(Term(None)) if base == "Term" else ())}
+    assert type("Own", (BASES[base],), dict.fromkeys(names, ())).__base__ is BASES[base]

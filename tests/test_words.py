@@ -15,7 +15,7 @@ RENAMED = ("pushed", "massive", "lagged", "guess")
 
 FORMER = ROOT / "tests" / "data" / "renames.csv"
 """kind, old, new, where: former names, which may not come back in the folders named, and former files."""
-FORMER_TOLD = ("warpfea/terms/renamed.py",)
+FORMER_TOLD = ("warpfea/base/renamed.py",)
 """Files that name former names to refuse them."""
 
 # to be done: this set may only shrink

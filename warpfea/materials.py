@@ -14,6 +14,7 @@ import numpy as np
 from .base.checks import number_hint
 from .base.errors import ModelError
 from .base.names import did_you_mean
+from .base.renamed import check_members
 from .base.short_repr import use_short_repr
 
 __all__ = ["SVK", "KelvinVoigt", "Material", "MooneyRivlin", "NeoHookean"]
@@ -117,6 +118,11 @@ class Material:
     damping: KelvinVoigt | None = field(default=None, kw_only=True)
 
     __repr__ = use_short_repr
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Refuse members by former names, see base/renamed.py."""
+        super().__init_subclass__(**options)
+        check_members(cls, Material)
 
     def __new__(cls, *values: Any, **options: Any) -> Self:
         """ModelError for unknown arguments of a law; suggests from_E_nu if E or nu is given."""

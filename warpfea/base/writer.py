@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from .errors import OutputError
+from .renamed import check_members
 
 __all__ = ["Output", "check_folder", "check_target", "progress_bar", "temporary_path", "write_atomically"]
 
@@ -28,6 +29,11 @@ class Output:
 
     rate: float | None = None
     output_times: Sequence[float] = ()
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Refuse members by former names, see base/renamed.py."""
+        super().__init_subclass__(**options)
+        check_members(cls, Output)
 
     def open(self, sim: Any) -> None:
         """Check the target and start. OutputError if the target can't be written."""

@@ -352,8 +352,7 @@ class NewtonLoop:
         launch(self.vector_kernels.dot_terms, self.dim, [w.gradient, w.direction, active, w.rows])
         self.residual.reduce(w.rows, 1, active, w.newton.slope_sum)
         launch(k.begin_search, self.model.worlds, [w.newton, w.pcg])
-        self._reduce_flags(w.newton.searching, self.any_searching)
-        wp.capture_while(self.any_searching, self._try_step_length)
+        self._search()
         self._run_if_rare(self._run_rare_branch)
         if self.terms.traits.unilateral:
             self._update_frozen()
@@ -408,12 +407,10 @@ class NewtonLoop:
         if self.perturbation_kernels:
             self.residual.evaluate(self.perturbed_worlds)
             self.perturbed_worlds.zero_()
-        self._reduce_flags(w.newton.searching, self.any_searching)
-        wp.capture_while(self.any_searching, self._try_step_length)
+        self._search()
         self.residual.elements.measure_direction_gradient(self.ctx, w.direction, w.newton.active)
         self.launch(k.limit_nonmonotone_step, m.worlds, [w.newton])
-        self._reduce_flags(w.newton.searching, self.any_searching)
-        wp.capture_while(self.any_searching, self._try_step_length)
+        self._search()
         self._check_inversion()
 
     def _check_inversion(self) -> None:
@@ -422,9 +419,15 @@ class NewtonLoop:
         self.residual.elements.check_inversion(self.ctx, w.newton.inversion_suspected)
         w.newton.any_rare_branch.zero_()
 
+    def _search(self) -> None:
+        """Try step lengths until no world searches."""
+        self._reduce_flags(self.work.newton.searching, self.any_searching)
+        wp.capture_while(self.any_searching, self._try_step_length)
+
     def _try_step_length(self) -> None:
         w, k, launch = self.work, self.kernels, self.launch
-        launch(self.vector_kernels.trial_velocity, self.dim, [w.newton, w.base_velocity, w.direction, w.best_velocity, w.v])
+        args = [w.newton, w.base_velocity, w.direction, w.best_velocity, w.v]
+        launch(self.vector_kernels.trial_velocity, self.dim, args)
         self.residual.evaluate(w.newton.searching)
         launch(k.check_trial, self.model.worlds, [w.newton])
         if self.terms.traits.stored:

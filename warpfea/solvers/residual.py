@@ -87,7 +87,7 @@ class Residual:
             newton_kernels(traits),
             vector_kernels(model.dtype, traits.has_constraints),
         )
-        self.stage_kernels = midpoint_kernels(model.dtype)
+        self.midpoint_kernels = midpoint_kernels(model.dtype)
         self.constraint_data = model.constraints.data if traits.constraint_rows else constraint_struct()()
         self.dim = (model.worlds, model.slots)
         self.product_terms = self._make_product_terms()
@@ -163,7 +163,7 @@ class Residual:
     def modules(self) -> set[wp.Module]:
         """Modules of the gather and of an assembled matrix; terms list their own."""
         out = {self.gather_kernels.module, self.vector_kernels.module} | (
-            {self.stage_kernels.module} if self.ctx.midpoint else set()
+            {self.midpoint_kernels.module} if self.ctx.midpoint else set()
         )
         if self.uses_matrix:
             assert self.assembler is not None
@@ -241,7 +241,7 @@ class Residual:
         self.launch(self.vector_kernels.update_position, self.dim, [w.q_tilde, w.v, w.step.dq_dv, active, w.u])
         if self.ctx.midpoint:
             args = [state.displacement, state.velocity, w.v, w.step.dq_dv, active, w.u_stage, w.v_stage]
-            self.launch(self.stage_kernels.evaluate_midpoint, self.dim, args)
+            self.launch(self.midpoint_kernels.evaluate_midpoint, self.dim, args)
 
     @launch_part("residual")
     def reevaluate_frozen(self, active: wp.array) -> None:

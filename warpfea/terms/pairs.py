@@ -60,11 +60,10 @@ class Pairs(PairSolves):
     def __init__(self, model: Model) -> None:
         super().__init__(model)
         self.traits = Traits(unilateral=True)
-        self.ledger_kernels, self.search_kernels = (
-            contact_ledger_kernels(model.dtype, False),
-            facet_search_kernels(model.dtype),
-        )
-        self.list_kernels, self.pair_ledger_kernels = point_list_kernels(model.dtype), pair_ledger_kernels(model.dtype)
+        self.ledger_kernels = contact_ledger_kernels(model.dtype, False)
+        self.search_kernels = facet_search_kernels(model.dtype)
+        self.point_list_kernels = point_list_kernels(model.dtype)
+        self.pair_ledger_kernels = pair_ledger_kernels(model.dtype)
         self.report_columns = len(RECORD_NAMES) * len(self.tables.contacts)
 
     @classmethod
@@ -311,7 +310,7 @@ class Pairs(PairSolves):
 
     def _build_point_lists(self, ctx: StepContext) -> None:
         """Build the point lists of the master facets."""
-        s, m, t, k = ctx.scratch[self.name], self.model, self.tables, self.list_kernels
+        s, m, t, k = ctx.scratch[self.name], self.model, self.tables, self.point_list_kernels
         pair, masters = s["pair"], s["masters"]
         ctx.launch(k.clear_lists, m.worlds * t.facets, [pair])
         ctx.launch(k.count_points, (m.worlds, t.points), [masters, pair])

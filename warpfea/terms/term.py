@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 import numpy as np
 import warp as wp
 
+from ..base.renamed import check_members
 from ..kernels.common.traits import Traits
 from ..kernels.step.energy_ledger import EXPLICIT_VISCOUS, LOSS, NUMERICAL, STORED, WORK
-from .renamed import check_methods
 
 if TYPE_CHECKING:
     from ..base.errors import ConvergenceError
@@ -177,9 +177,9 @@ class Term:
     penalty: ClassVar[bool] = False
 
     def __init_subclass__(cls, **options: Any) -> None:
-        """Refuse members by former names, see renamed.py."""
+        """Refuse members by former names, see base/renamed.py."""
         super().__init_subclass__(**options)
-        check_methods(cls, Term)
+        check_members(cls, Term)
 
     def __init__(self, model: Model) -> None:
         self.model = model

@@ -308,7 +308,12 @@ class TermSet:
             before = len(ctx.state.requested_names)
             term.register(ctx)
             for name in ctx.state.requested_names[before:]:
-                if name in owner or name in STATE_ARRAYS or name in controls or name.startswith(SOLVER_HISTORY_PREFIXES):
+                if (
+                    name in owner
+                    or name in STATE_ARRAYS
+                    or name in controls
+                    or name.startswith(SOLVER_HISTORY_PREFIXES)
+                ):
                     taken = f"term {owner[name]!r}" if name in owner else "the state itself"
                     raise ModelError(f"term {term.name!r}: the state's array {name!r} is that of {taken}; rename it")
                 owner[name] = term.name
