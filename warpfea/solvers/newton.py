@@ -37,8 +37,7 @@ NEWTON_ITERATION_COST = {False: 20, True: 100}
 evaluations). A slender column perturbed by 1e-4 of its load takes 8037 of the 10 000 in the load step that buckles it;
 steps with contact rejected after 8 halvings take 500 to 800 of the 2000."""
 ACCELERATION_SCALE = 9.81
-"""Acceleration scale, m/s^2, of the constraint tolerance of acceleration-level schemes: `ACCELERATION_SCALE` (dq/dv)^2
-tol, m."""
+"""Acceleration a, m/s^2, in the constraint tolerance a (dq/dv)^2 tol, m, of acceleration-level schemes."""
 MIN_CONSTRAINT_TOL = 1e-14
 """Smallest constraint tolerance of acceleration-level schemes, over the model's size."""
 
@@ -327,8 +326,7 @@ class NewtonLoop:
         self._reduce_flags(w.newton.active, self.any_iterating)
 
     def _update_multipliers(self) -> None:
-        """Update multipliers, lambda += rho c, in worlds with violated constraints, for another solve from the current
-        v."""
+        """Update multipliers, lambda += rho c, in worlds with violated constraints; solve again from the current v."""
         w = self.work
         self._call_terms("update_multipliers", w.newton.trial_accepted)
         self.residual.evaluate(w.newton.active, freeze=True)
@@ -352,7 +350,7 @@ class NewtonLoop:
         launch(self.vector_kernels.dot_terms, self.dim, [w.gradient, w.direction, active, w.rows])
         self.residual.reduce(w.rows, 1, active, w.newton.slope_sum)
         launch(k.begin_search, self.model.worlds, [w.newton, w.pcg])
-        self._search()
+        self._line_search()
         self._run_if_rare(self._run_rare_branch)
         if self.terms.traits.unilateral:
             self._update_frozen()
@@ -407,10 +405,10 @@ class NewtonLoop:
         if self.perturbation_kernels:
             self.residual.evaluate(self.perturbed_worlds)
             self.perturbed_worlds.zero_()
-        self._search()
+        self._line_search()
         self.residual.elements.measure_direction_gradient(self.ctx, w.direction, w.newton.active)
         self.launch(k.limit_nonmonotone_step, m.worlds, [w.newton])
-        self._search()
+        self._line_search()
         self._check_inversion()
 
     def _check_inversion(self) -> None:
@@ -419,7 +417,7 @@ class NewtonLoop:
         self.residual.elements.check_inversion(self.ctx, w.newton.inversion_suspected)
         w.newton.any_rare_branch.zero_()
 
-    def _search(self) -> None:
+    def _line_search(self) -> None:
         """Try step lengths until no world searches."""
         self._reduce_flags(self.work.newton.searching, self.any_searching)
         wp.capture_while(self.any_searching, self._try_step_length)
