@@ -57,7 +57,14 @@ def _mesh(name):
     return wf.mesh.read(DATA / f"{name}.msh")
 
 
+COSTLY = set((Path(__file__).parent / "data/slow.txt").read_text().splitlines())
+"""Tests with kernel modules or steps of their own, most CPU time first until the rest met its limit: slow, too."""
+
+
 def pytest_collection_modifyitems(items):
+    for item in items:
+        if item.nodeid in COSTLY:
+            item.add_marker(pytest.mark.slow)
     marked = [item for item in items if "cuda" in item.keywords]
     if marked and not wp.is_cuda_available():
         for item in marked:

@@ -234,13 +234,13 @@ def test_ctrl_c_after_the_last_step_is_too_late_to_interrupt(folder, capfd, monk
 def test_ctrl_c_during_the_report_does_not_take_it_away(folder, capfd, monkeypatch):
     from warpfea.cli import run as command
 
-    human = command.human
+    summary_text = command.summary_text
 
     def late(*args):
         signal.raise_signal(signal.SIGINT)
-        return human(*args)
+        return summary_text(*args)
 
-    monkeypatch.setattr(command, "human", late)
+    monkeypatch.setattr(command, "summary_text", late)
     code, out, err = run(capfd, *SHORT)
     assert (code, err) == (0, "")
     assert "done at t = 0.01 s" in out

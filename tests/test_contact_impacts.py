@@ -17,7 +17,7 @@ WANTED = np.array([0.1, 0.3, 0.5, 0.7, 0.9])
 
 def impact_step(contact, model, v0):
     """Half a period of the contact, s, with a mass of 1 kg."""
-    k = contact.stiffness * contact_law_constants(contact)["normal"]
+    k = contact.stiffness * contact_law_constants(contact)["normal_stiffness"]
     return math.pi / math.sqrt(k) if model == "patch" else 2.943 * (1.25 * v0**2 / k) ** 0.4 / v0
 
 

@@ -95,7 +95,7 @@ def carried(turn, depth, cells):
     term = model.terms.find(Contact)
     _, force = term.at_points(state)
     assert np.abs(force[0, :, :2]).max() == 0.0
-    return force[0, :, 2].sum() * term.tables.host[0].area.sum() / contact_law_constants(contact)["normal"]
+    return force[0, :, 2].sum() * term.tables.host[0].area.sum() / contact_law_constants(contact)["normal_stiffness"]
 
 
 def test_a_corner_and_an_edge_carry_what_their_area_says():

@@ -123,9 +123,8 @@ class NewtonPCG:
             if getattr(self, name) != default:
                 raise ModelError(f"NewtonPCG: {name} = {getattr(self, name)!r} is not for linear = 'direct'")
         if self.preconditioner not in ("auto", *PRECONDITIONERS):
-            raise ModelError(
-                f"preconditioner {self.preconditioner!r} is unknown; there are auto, {', '.join(PRECONDITIONERS)}"
-            )
+            known = ", ".join(PRECONDITIONERS)
+            raise ModelError(f"preconditioner {self.preconditioner!r} is unknown; there are auto, {known}")
         if self.preconditioner_dtype not in (None, "float32", "float64"):
             raise ModelError(
                 f"NewtonPCG: preconditioner_dtype = {self.preconditioner_dtype!r} is none of 'float32', 'float64', None"
