@@ -29,7 +29,7 @@ def remember_structs():
     """
     walk = APICapture._walk_value_pointers
 
-    def is_solver_memory(self, arg_type, original, packed, base, out):
+    def walk_value_pointers(self, arg_type, original, packed, base, out):
         if base != 0 or not isinstance(arg_type, Struct):
             return walk(self, arg_type, original, packed, base, out)
         known = self.__dict__.setdefault("known_structs", {})
@@ -40,7 +40,7 @@ def remember_structs():
         out.extend(known[key])
         return None
 
-    APICapture._walk_value_pointers = is_solver_memory
+    APICapture._walk_value_pointers = walk_value_pointers
     return lambda: setattr(APICapture, "_walk_value_pointers", walk)
 
 

@@ -67,11 +67,11 @@ def test_docstring_becomes_description_and_parameter_texts():
 
 def test_settings_are_read_by_type():
     given = ["length=2e-1", "cells=4", "damped=yes", "force=1,-2,3.5", "kind=T4", "limit=3", "label=a=b"]
-    values = sample.parse(given)
+    values = sample.parse_settings(given)
     assert [values[name] for name in ("length", "cells", "damped", "kind")] == [0.2, 4, True, "T4"]
     assert [values[name] for name in ("force", "limit", "label")] == [(1.0, -2.0, 3.5), 3.0, "a=b"]
     assert isinstance(values["cells"], int)
-    assert sample.parse(["limit=none"]) == {"limit": None}
+    assert sample.parse_settings(["limit=none"]) == {"limit": None}
     resolved = sample.resolve({"cells": 4})
     assert resolved["cells"] == 4
     assert resolved["length"] == 1.0
@@ -94,14 +94,14 @@ def test_settings_are_read_by_type():
 )
 def test_bad_settings_name_the_parameter(setting, words):
     with pytest.raises(wf.ModelError) as error:
-        sample.parse([setting])
+        sample.parse_settings([setting])
     for word in words:
         assert word in str(error.value)
 
 
 def test_a_parameter_given_twice_is_refused():
     with pytest.raises(wf.ModelError, match="length: given twice"):
-        sample.parse(["length=1", "length=2"])
+        sample.parse_settings(["length=1", "length=2"])
 
 
 def test_a_parameter_without_default_is_asked_for():

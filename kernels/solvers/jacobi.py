@@ -125,7 +125,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
         check_convergence(ctl, jac, world)
 
     @wp.func
-    def pair_index(k: int, age: int) -> int:
+    def history_index(k: int, age: int) -> int:
         """Index of the pair of `age` moves ago at iteration k, in a ring buffer."""
         return (k - 1 - age) % MAX_PAIRS
 
@@ -152,7 +152,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
         k = ctl.iterations[world]
         change = vec3()
         if k > 0:
-            at = pair_index(k, 0)
+            at = history_index(k, 0)
             change = before[world, slot] - new
             s[at, world, slot] = move[world, slot]
             y[at, world, slot] = change
@@ -185,7 +185,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
             else:
                 v = f64(0.0)
             jac.right_side[world, i] = v
-            at = pair_index(k, i)
+            at = history_index(k, i)
             jac.gamma[world, at] = add * jac.gamma[world, at] + v
 
     @wp.kernel(module=module)
@@ -218,15 +218,15 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
         count = wp.min(k, MAX_PAIRS)
         if count == 0:
             return
-        at = pair_index(k, 0)
+        at = history_index(k, 0)
         for j in range(MAX_PAIRS):
             jac.gram_matrix[world, at, j] = jac.sums[j, world]
             jac.gram_matrix[world, j, at] = jac.sums[j, world]
         for i in range(count):
-            a = pair_index(k, i)
+            a = history_index(k, i)
             jac.right_side[world, i] = jac.sums[MAX_PAIRS + a, world]
             for j in range(i + 1):
-                v = jac.gram_matrix[world, a, pair_index(k, j)]
+                v = jac.gram_matrix[world, a, history_index(k, j)]
                 for m in range(j):
                     v -= jac.gram_factor[world, i, m] * jac.gram_factor[world, j, m]
                 if j == i:
@@ -273,7 +273,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
         k = ctl.iterations[world]
         count = wp.min(k, MAX_PAIRS)
         for i in range(count):
-            jac.right_side[world, i] = -jac.step_length * jac.sums[pair_index(k, i), world]
+            jac.right_side[world, i] = -jac.step_length * jac.sums[history_index(k, i), world]
         substitute(jac, world, k, count, f64(1.0))
 
     @wp.kernel(module=module)

@@ -101,7 +101,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         newton.inversion_suspected[world] = 0
         newton.inverted[world] = 0
         if step.running[world] == 0:
-            return  # `refused` stays set in a world that failed earlier in this step
+            return  # `rejected` stays set in a world that failed earlier in this step
         step.rejected[world] = 0
         newton.failed[world] = 0
         newton.iterations[world] = 0

@@ -1,7 +1,7 @@
 """Broad phase of contact between bodies: master facets at an iterate and at the start of an attempted step.
 
 Computed are the monomial coefficients of displacements on each facet, its centre, and the bounding boxes of the tree.
-u_coefs, director_coefs: coefficients of the displacement and of the director's displacement, see `master_struct`.
+u_coefs, director_u_coefs: coefficients of the displacement and of the director's displacement, see `master_struct`.
 """
 
 import functools
@@ -79,8 +79,8 @@ def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
                 pair.deepest_contact[world, body] = f64(0.0)
         if active[world] != 0 and m < mas.monomial_count[mas.facet_kind[item]]:
             # the director part of the velocity is not used: the next line overwrites it
-            set_coefficient(mas, v_n, world, item, m, pair.start_v_coefs, pair.start_director_coefs)
-            set_coefficient(mas, u_n, world, item, m, pair.start_u_coefs, pair.start_director_coefs)
+            set_coefficient(mas, v_n, world, item, m, pair.start_v_coefs, pair.start_director_u_coefs)
+            set_coefficient(mas, u_n, world, item, m, pair.start_u_coefs, pair.start_director_u_coefs)
 
     @wp.func
     def round_down(x: vec3d) -> box3:
@@ -144,9 +144,12 @@ def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
             for m in range(count):
                 part = mas.hull_coefficients[kind, q, m]
                 if part != f64(0.0):
-                    x += part * (mas.position_coefficients[m, item] + pair.u_coefs[world, mas.max_monomials * item + m])
+                    x += part * (
+                        mas.reference_position_coefficients[m, item] + pair.u_coefs[world, mas.max_monomials * item + m]
+                    )
                     y += part * (
-                        mas.position_coefficients[m, item] + pair.start_u_coefs[world, mas.max_monomials * item + m]
+                        mas.reference_position_coefficients[m, item]
+                        + pair.start_u_coefs[world, mas.max_monomials * item + m]
                     )
             low = wp.min(low, wp.min(x, y))
             high = wp.max(high, wp.max(x, y))
@@ -168,20 +171,20 @@ def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
         kind = mas.facet_kind[item]
         count = mas.monomial_count[kind]
         xi = facet_centre(mas.corner_count[kind])
-        s = surface_point(mas, pair.u_coefs, pair.director_coefs, world, item, xi)
+        s = surface_point(mas, pair.u_coefs, pair.director_u_coefs, world, item, xi)
         n = unit_normal(s)
         bulge = f64(0.0)
         for q in range(count):
             x = vec3d()
             for m in range(count):
                 x += mas.hull_coefficients[kind, q, m] * (
-                    mas.position_coefficients[m, item] + pair.u_coefs[world, mas.max_monomials * item + m]
+                    mas.reference_position_coefficients[m, item] + pair.u_coefs[world, mas.max_monomials * item + m]
                 )
             bulge = wp.max(bulge, wp.dot(x - s.position, n))
         pair.bulge[world, item] = bulge
-        pair.centre[world, item] = pack_facet_point(s)
-        pair.start_centre[world, item] = pack_facet_point(
-            surface_point(mas, pair.start_u_coefs, pair.start_director_coefs, world, item, xi)
+        pair.facet_centre[world, item] = pack_facet_point(s)
+        pair.start_facet_centre[world, item] = pack_facet_point(
+            surface_point(mas, pair.start_u_coefs, pair.start_director_u_coefs, world, item, xi)
         )
 
     @wp.kernel(module=module)

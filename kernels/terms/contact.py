@@ -248,11 +248,11 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
             K = point_stiffness(con, world, c, t, frozen, inv_h)
             scr.activity[world, point] = WITH_STIFFNESS
             scr.force[world, point] = area_fraction * (
-                friction_force(con, world, c, t, frozen, inv_h) - t.normal_response[0] * t.normal
+                friction_force(con, world, c, t, frozen, inv_h) - t.normal_values[0] * t.normal
             )
             scr.energy[world, point] = wp.vec2d(
-                area_fraction * (t.normal_response[2] + friction_energy),
-                area_fraction * (t.normal_response[3] + wp.abs(friction_energy)),
+                area_fraction * (t.normal_values[2] + friction_energy),
+                area_fraction * (t.normal_values[3] + wp.abs(friction_energy)),
             )
             scr.stiffness[world, point] = sym(T(area_fraction * K[0, 0]), T(area_fraction * K[1, 1]),
                 T(area_fraction * K[2, 2]), T(area_fraction * K[1, 2]), T(area_fraction * K[0, 2]),

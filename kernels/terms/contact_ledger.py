@@ -141,7 +141,7 @@ def contact_ledger_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         spring = elastic_force(
             con.single_point[c], con.scale[world, c] * world_value(con.normal_stiffness, world, c), t.depth
         )
-        normal = t.normal_response[0]
+        normal = t.normal_values[0]
         tangential_force = friction_force(con, world, c, t, frozen, inv_h)
         w = friction_trial(con, world, c, t, frozen, inv_h)
         out.slipping = wp.where(wp.length(vec3d(w[0], w[1], w[2])) > frozen[0] or law == SMOOTH, 1, 0)
@@ -389,7 +389,7 @@ def contact_ledger_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         if acting_point == point and (facets.tracks_deepest == 0 or places != 0):
             gap[world, point] = -t.depth
         force[world, point] = area_fraction * (
-            t.normal_response[0] * t.normal - friction_force(con, world, c, t, frozen, f64(0.0))
+            t.normal_values[0] * t.normal - friction_force(con, world, c, t, frozen, f64(0.0))
         )
 
     return _types.SimpleNamespace(

@@ -52,7 +52,7 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         side: (
             wp.int32
         )  # side of the collider through which the point has entered, -1: any or none, -2: it passed through
-        normal_response: wp.vec4d  # normal force, its derivative, its potential, the magnitude of the potential's terms
+        normal_values: wp.vec4d  # normal force, its derivative, its potential, the magnitude of the potential's terms
         friction_normal: vec3d  # normal of the plane of friction
         relative_motion: vec3d  # in the step, relative to the collider, m
         trial_displacement: vec3d  # relative motion plus the stored elastic slip, m
@@ -235,7 +235,7 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         rate = normal_damping_rate(con, scr, world, c, point, inv_h)
         k_n = con.scale[world, c] * world_value(con.normal_stiffness, world, c)
         previous_depth = depth_at_start(con, facets, his, scr, world, c, point)
-        out.normal_response = normal_law(con.law[c], con.single_point[c], k_n, rate, con.damping_ramp[c],
+        out.normal_values = normal_law(con.law[c], con.single_point[c], k_n, rate, con.damping_ramp[c],
                                          con.force_eps[c], out.depth, previous_depth)  # fmt: skip
         out.depth_increment = out.depth - previous_depth
         out.relative_motion = motion
@@ -301,7 +301,7 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
             before = t.depth - t.depth_increment
             if in_contact and depth < before and con.law[c] == DEFAULT:
                 shrink = wp.sqrt(depth / before)
-        return vec3d(mu * t.normal_response[0], stiffness, shrink)
+        return vec3d(mu * t.normal_values[0], stiffness, shrink)
 
     @wp.func
     def friction_trial(con: Contacts, world: int, c: int, t: PointContact, frozen: vec3d, inv_h: f64) -> wp.vec4d:
@@ -338,7 +338,7 @@ def contact_point_functions(dtype: str, meshes: bool) -> _types.SimpleNamespace:
     @wp.func
     def point_stiffness(con: Contacts, world: int, c: int, t: PointContact, frozen: vec3d, inv_h: f64) -> mat33d:
         """Derivative of the force that a point adds to the residual, positive; the change of the normal is omitted."""
-        K = wp.max(t.normal_response[1], f64(0.0)) * wp.outer(t.normal, t.normal)
+        K = wp.max(t.normal_values[1], f64(0.0)) * wp.outer(t.normal, t.normal)
         if frozen[0] > f64(0.0):
             P = wp.identity(n=3, dtype=f64) - wp.outer(t.friction_normal, t.friction_normal)
             if con.law[c] == SMOOTH:

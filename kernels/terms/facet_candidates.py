@@ -112,7 +112,7 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
             f = pair.anchor_facet[world, point] - 1
             xi = pair.anchor_xi[world, point]
             change = displacement_change(
-                mas, pair.u_coefs, pair.director_coefs, pair.start_u_coefs, pair.start_director_coefs, world, f, xi
+                mas, pair.u_coefs, pair.director_u_coefs, pair.start_u_coefs, pair.start_director_u_coefs, world, f, xi
             )
             out.motion = out.displacement - scr.start_displacement[world, point] - change
             out.height_limit += f64(2.0) * wp.abs(xi[2])
@@ -131,11 +131,11 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
             f = pair.anchor_facet[world, slave.point] - 1
             corners = mas.corner_count[mas.facet_kind[f]]
             found = track_point(
-                mas, pair.u_coefs, pair.director_coefs, world, f, pair.anchor_xi[world, slave.point], slave.motion
+                mas, pair.u_coefs, pair.director_u_coefs, world, f, pair.anchor_xi[world, slave.point], slave.motion
             )
             if found[3] == f64(0.0):
                 found = inverse_map(
-                    mas, pair.u_coefs, pair.director_coefs, world, f, slave.position, facet_centre(corners)
+                    mas, pair.u_coefs, pair.director_u_coefs, world, f, slave.position, facet_centre(corners)
                 )
             xi = vec3d(found[0], found[1], found[2])
             o = distance_outside(corners, xi)
@@ -151,8 +151,8 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
         world = slave.world
         kind = mas.facet_kind[f]
         m = facet_centre(mas.corner_count[kind])
-        old = unpack_facet_point(pair.start_centre[world, f])
-        new = unpack_facet_point(pair.centre[world, f])
+        old = unpack_facet_point(pair.start_facet_centre[world, f])
+        new = unpack_facet_point(pair.facet_centre[world, f])
         position_change = slave.position - slave.start_position - (new.position - old.position)
         deep = f64(TUNNEL_LIMIT_RATIO) * mas.depth_limit[f]
         if wp.length(position_change) <= deep:
@@ -162,7 +162,7 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
         if g0 <= f64(0.0) or g1 >= -deep:
             return False
         y = slave.position - (g1 / (g1 - g0)) * position_change
-        there = inverse_map(mas, pair.u_coefs, pair.director_coefs, world, f, y, m)
+        there = inverse_map(mas, pair.u_coefs, pair.director_u_coefs, world, f, y, m)
         xi = vec3d(there[0], there[1], there[2])
         return there[3] != f64(0.0) and distance_outside(mas.corner_count[kind], xi) == f64(0.0)
 
@@ -171,7 +171,7 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
         """True if a point is above a facet by more than twice `height_limit`, or moved little and is beside it, by
         the tangent plane at its centre."""
         corners = mas.corner_count[mas.facet_kind[f]]
-        s = unpack_facet_point(pair.centre[slave.world, f])
+        s = unpack_facet_point(pair.facet_centre[slave.world, f])
         if (
             wp.dot(slave.position - s.position, unit_normal(s))
             > f64(2.0) * slave.height_limit + pair.bulge[slave.world, f]
@@ -181,7 +181,7 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
             TANGENT_PLANE_MARGIN
         ):
             return False
-        path = slave.position - slave.start_position - (s.position - pair.start_centre[slave.world, f][0])
+        path = slave.position - slave.start_position - (s.position - pair.start_facet_centre[slave.world, f][0])
         return wp.length(path) <= f64(0.5) * mas.depth_limit[f]
 
     @wp.func
@@ -189,7 +189,7 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
         """True if a point is above a facet by more than `height_limit` and within its sides."""
         corners = mas.corner_count[mas.facet_kind[f]]
         found = inverse_map(
-            mas, pair.u_coefs, pair.director_coefs, slave.world, f, slave.position, facet_centre(corners)
+            mas, pair.u_coefs, pair.director_u_coefs, slave.world, f, slave.position, facet_centre(corners)
         )
         within = distance_outside(corners, vec3d(found[0], found[1], found[2])) == f64(0.0)
         return found[3] != f64(0.0) and within and found[2] > slave.height_limit
@@ -229,7 +229,7 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
         if distance_outside(mas.corner_count[kind], xi) > edge_margin(mas, f, xi):
             return False
         found = inverse_map(
-            mas, pair.start_u_coefs, pair.start_director_coefs, world, f, pair.start_position[world, slave.point], xi
+            mas, pair.start_u_coefs, pair.start_director_u_coefs, world, f, pair.start_position[world, slave.point], xi
         )
         return found[3] == f64(0.0) or distance_outside(
             mas.corner_count[kind], vec3d(found[0], found[1], found[2])
@@ -242,7 +242,7 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
         """Rank of a facet for a point, -1: rejected by depth, by the previous facet, or by the side at the start of the
         attempt. Higher for facets that face the slave's; among others, for one that the point reached from beside."""
         world = slave.world
-        s = surface_point(mas, pair.u_coefs, pair.director_coefs, world, f, xi)
+        s = surface_point(mas, pair.u_coefs, pair.director_u_coefs, world, f, xi)
         n = unit_normal(s)
         cosine = wp.dot(n, slave.facing_normal)
         gap = xi[2] * wp.dot(n, s.director)
@@ -257,7 +257,7 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
             rank = 0
         else:
             projection = surface_point(
-                mas, pair.start_u_coefs, pair.start_director_coefs, world, f, vec3d(xi[0], xi[1], f64(0.0))
+                mas, pair.start_u_coefs, pair.start_director_u_coefs, world, f, vec3d(xi[0], xi[1], f64(0.0))
             )
             before = wp.dot(slave.start_position - projection.position, unit_normal(projection))
             if before < -slave.outside_depth:
@@ -288,7 +288,7 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
         out = candidate
         corners = mas.corner_count[mas.facet_kind[f]]
         found = inverse_map(
-            mas, pair.u_coefs, pair.director_coefs, slave.world, f, slave.position, facet_centre(corners)
+            mas, pair.u_coefs, pair.director_u_coefs, slave.world, f, slave.position, facet_centre(corners)
         )
         xi = vec3d(found[0], found[1], found[2])
         beyond = distance_outside(corners, xi)
@@ -338,7 +338,7 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
         if slave.anchored:
             f = pair.anchor_facet[world, slave.point] - 1
             slave.facing_normal = unit_normal(
-                surface_point(mas, pair.u_coefs, pair.director_coefs, world, f, pair.anchor_xi[world, slave.point])
+                surface_point(mas, pair.u_coefs, pair.director_u_coefs, world, f, pair.anchor_xi[world, slave.point])
             )
             depth = scr.start_depth[world, slave.point] - wp.dot(slave.motion, slave.facing_normal)
             out.passed_through = depth > f64(TUNNEL_LIMIT_RATIO) * mas.depth_limit[f]

@@ -85,8 +85,8 @@ def facet_projection_functions(dtype: str) -> _types.SimpleNamespace:
             j = mas.exponents[kind, m][1]
             p = power(xi[0], i)
             q = power(xi[1], j)
-            rise = mas.director_coefficients[m, f] + D[world, mas.max_monomials * f + m]
-            g = mas.position_coefficients[m, f] + C[world, mas.max_monomials * f + m] + xi[2] * rise
+            rise = mas.reference_director_coefficients[m, f] + D[world, mas.max_monomials * f + m]
+            g = mas.reference_position_coefficients[m, f] + C[world, mas.max_monomials * f + m] + xi[2] * rise
             out.position += (p * q) * g
             out.director += (p * q) * rise
             if i > 0:
@@ -134,8 +134,8 @@ def facet_projection_functions(dtype: str) -> _types.SimpleNamespace:
             j = mas.exponents[kind, m][1]
             p = step[0] * power_quotient(old[0], new[0], i) * power(new[1], j)
             p += power(old[0], i) * step[1] * power_quotient(old[1], new[1], j)
-            rise = mas.director_coefficients[m, f] + D[world, mas.max_monomials * f + m]
-            out += p * (mas.position_coefficients[m, f] + C[world, mas.max_monomials * f + m] + old[2] * rise)
+            rise = mas.reference_director_coefficients[m, f] + D[world, mas.max_monomials * f + m]
+            out += p * (mas.reference_position_coefficients[m, f] + C[world, mas.max_monomials * f + m] + old[2] * rise)
             out += (power(new[0], i) * power(new[1], j) * step[2]) * rise
         return out
 
@@ -264,7 +264,7 @@ def facet_projection_functions(dtype: str) -> _types.SimpleNamespace:
         for m in range(mas.monomial_count[kind]):
             i = mas.exponents[kind, m][0]
             j = mas.exponents[kind, m][1]
-            h = wp.dot(n, mas.position_coefficients[m, f] + C[world, mas.max_monomials * f + m])
+            h = wp.dot(n, mas.reference_position_coefficients[m, f] + C[world, mas.max_monomials * f + m])
             if i > 1:
                 out[0] = out[0] + f64(i * (i - 1)) * power(xi[0], i - 2) * power(xi[1], j) * h
             if j > 1:

@@ -66,7 +66,7 @@ def facet_search_kernels(dtype: str) -> _types.SimpleNamespace:
         world = slave.world
         point = slave.point
         found = inverse_map(
-            mas, pair.start_u_coefs, pair.start_director_coefs, world, f, pair.start_position[world, point], start
+            mas, pair.start_u_coefs, pair.start_director_u_coefs, world, f, pair.start_position[world, point], start
         )
         xi = vec3d(found[0], found[1], found[2])
         in_contact = his.speed[world, point] > f64(0.0)
@@ -76,7 +76,7 @@ def facet_search_kernels(dtype: str) -> _types.SimpleNamespace:
             xi = start
         if in_contact and distance_outside(mas.corner_count[mas.facet_kind[f]], xi) > f64(OUTSIDE_TOLERANCE):
             return  # it has left the surface
-        projection = project_on_facet(mas, pair.start_u_coefs, pair.start_director_coefs, world, f, xi)
+        projection = project_on_facet(mas, pair.start_u_coefs, pair.start_director_u_coefs, world, f, xi)
         pair.anchor_facet[world, point] = f + 1
         pair.anchor_xi[world, point] = xi
         pair.anchor_gap[world, point] = wp.vec2d(projection.gap_slope, projection.gap_offset)
@@ -190,7 +190,7 @@ def facet_search_kernels(dtype: str) -> _types.SimpleNamespace:
         world = slave.world
         point = slave.point
         c = slave.contact
-        projection = project_on_facet(mas, pair.u_coefs, pair.director_coefs, world, f, xi)
+        projection = project_on_facet(mas, pair.u_coefs, pair.director_u_coefs, world, f, xi)
         now = activation_gap(con, his, world, c, point, clock.new_time[world], f64(0.0))
         pair.facet[world, point] = f
         pair.xi[world, point] = xi
@@ -207,9 +207,9 @@ def facet_search_kernels(dtype: str) -> _types.SimpleNamespace:
             motion -= displacement_change(
                 mas,
                 pair.u_coefs,
-                pair.director_coefs,
+                pair.director_u_coefs,
                 pair.start_u_coefs,
-                pair.start_director_coefs,
+                pair.start_director_u_coefs,
                 world,
                 first,
                 from0,
@@ -228,11 +228,12 @@ def facet_search_kernels(dtype: str) -> _types.SimpleNamespace:
                 spring = his.spring[world, point]
                 if con.law[c] != PAPER:
                     spring = (
-                        facet_frame(surface_point(mas, pair.u_coefs, pair.director_coefs, world, first, from0)) * spring
+                        facet_frame(surface_point(mas, pair.u_coefs, pair.director_u_coefs, world, first, from0))
+                        * spring
                     )
         else:
             motion -= displacement_change(
-                mas, pair.u_coefs, pair.director_coefs, pair.start_u_coefs, pair.start_director_coefs, world, f, xi
+                mas, pair.u_coefs, pair.director_u_coefs, pair.start_u_coefs, pair.start_director_u_coefs, world, f, xi
             )
             pair.initial_depth[world, point] = (
                 pair.depth[world, point] + wp.dot(projection.normal, motion) - (now - scr.activation_gap[world, point])

@@ -81,11 +81,11 @@ def pair_evaluation_kernels(dtype: str) -> _types.SimpleNamespace:
         while wp.bvh_query_next(query, index):
             f = index - world * mas.facet_count
             corners = mas.corner_count[mas.facet_kind[f]]
-            found = inverse_map(mas, pair.u_coefs, pair.director_coefs, world, f, x, facet_centre(corners))
+            found = inverse_map(mas, pair.u_coefs, pair.director_u_coefs, world, f, x, facet_centre(corners))
             xi = vec3d(found[0], found[1], found[2])
             o = distance_outside(corners, xi)
             if found[3] != f64(0.0) and o <= off:
-                s = surface_point(mas, pair.u_coefs, pair.director_coefs, world, f, xi)
+                s = surface_point(mas, pair.u_coefs, pair.director_u_coefs, world, f, xi)
                 gap = xi[2] * wp.dot(unit_normal(s), s.director)
                 closer = wp.abs(gap) < height or (wp.abs(gap) == height and f64(f) < out[3])
                 if gap >= -mas.depth_limit[f] and (o < off or closer) and wp.abs(gap) <= far:
@@ -114,7 +114,7 @@ def pair_evaluation_kernels(dtype: str) -> _types.SimpleNamespace:
         place = vec3d()
         if in_contact:
             f = pair_his.facet[world, point] - 1
-            found = inverse_map(mas, pair.u_coefs, pair.director_coefs, world, f, x, pair_his.xi[world, point])
+            found = inverse_map(mas, pair.u_coefs, pair.director_u_coefs, world, f, x, pair_his.xi[world, point])
             place = vec3d(found[0], found[1], found[2])
             if found[3] == f64(0.0):
                 f = -1
@@ -124,29 +124,29 @@ def pair_evaluation_kernels(dtype: str) -> _types.SimpleNamespace:
             f = wp.int32(found[3])
         if f < 0:
             return
-        projection = project_on_facet(mas, pair.u_coefs, pair.director_coefs, world, f, place)
+        projection = project_on_facet(mas, pair.u_coefs, pair.director_u_coefs, world, f, place)
         s = PointContact()
         s.normal = projection.normal
         activation_gap_now = activation_gap(con, his, world, c, point, time[world], f64(0.0))
         s.depth = activation_gap_now - (place[2] * projection.gap_slope + projection.gap_offset)
         k_n = con.scale[world, c] * world_value(con.normal_stiffness, world, c)
-        s.normal_response = normal_law(
+        s.normal_values = normal_law(
             con.law[c], 0, k_n, f64(0.0), con.damping_ramp[c], con.force_eps[c], s.depth, s.depth
         )
         if in_contact:
             s.trial_displacement = his.spring[world, point]
             if con.law[c] != PAPER:
                 s.trial_displacement = (
-                    facet_frame(surface_point(mas, pair.u_coefs, pair.director_coefs, world, f, place))
+                    facet_frame(surface_point(mas, pair.u_coefs, pair.director_u_coefs, world, f, place))
                     * s.trial_displacement
                 )
         s = with_friction_normal(s, s.normal)
         frozen = friction_parameters(con, his, scr, world, c, point, s)
         frozen[2] = f64(1.0)
-        pressed = area_fraction * s.normal_response[0] * s.normal
+        pressed = area_fraction * s.normal_values[0] * s.normal
         tangential_force = area_fraction * friction_force(con, world, c, s, frozen, f64(0.0))
         out.gap[world, point] = -s.depth
-        out.normal[world, point] = area_fraction * s.normal_response[0]
+        out.normal[world, point] = area_fraction * s.normal_values[0]
         out.force[world, point] = pressed - tangential_force
         out.facet[world, point] = f
         out.xi[world, point] = place

@@ -177,7 +177,7 @@ def pair_ledger_kernels(dtype: str) -> _types.SimpleNamespace:
             frozen = scr.frozen_friction[world, point]
             frozen[2] = f64(1.0)
             s = with_friction_normal(s, scr.frozen_normal[world, point])
-            normal = s.normal_response[0]
+            normal = s.normal_values[0]
             tangential_force = friction_force(con, world, c, s, frozen, inv_h)
             w = friction_trial(con, world, c, s, frozen, inv_h)
             slipping = wp.where(wp.length(vec3d(w[0], w[1], w[2])) > frozen[0], 1, 0)
@@ -208,7 +208,7 @@ def pair_ledger_kernels(dtype: str) -> _types.SimpleNamespace:
             add_overlap_work(
                 energies, world, row, area_fraction * normal * overlap_recovery(con, his, clock, world, c, point)
             )
-            place = surface_point(mas, pair.u_coefs, pair.director_coefs, world, f, pair.xi[world, point])
+            place = surface_point(mas, pair.u_coefs, pair.director_u_coefs, world, f, pair.xi[world, point])
             add_to_row(scr.record_rows, NORMAL_ROW, world, row, area_fraction * normal)
             record_force(scr, world, row, (mas.sign[c] * area_fraction) * force, place.position)
             record_slip(scr, world, row, s.depth, facets.area[q, item], slipping, slip_increment)

@@ -31,8 +31,8 @@ def master_struct(dtype: str):
         conn: wp.array2d(dtype=wp.int32)  # [local, facet] slot
         shape: wp.array3d(dtype=T)  # [monomial, local, facet] coefficients of the shape functions on the facet
         director_shape: wp.array3d(dtype=T)  # coefficients of their derivatives along the director, 1/m
-        position_coefficients: wp.array2d(dtype=wp.vec3d)  # [monomial, facet] X_m, m
-        director_coefficients: wp.array2d(dtype=wp.vec3d)  # [monomial, facet] N_m
+        reference_position_coefficients: wp.array2d(dtype=wp.vec3d)  # [monomial, facet] X_m, m
+        reference_director_coefficients: wp.array2d(dtype=wp.vec3d)  # [monomial, facet] N_m
         facet_kind: wp.array(dtype=wp.int32)  # [facet] kind: number of corners and degree
         monomial_count: wp.array(dtype=wp.int32)  # [kind] number of monomials
         corner_count: wp.array(dtype=wp.int32)  # [kind] 3 or 4
@@ -73,13 +73,13 @@ def pair_scratch_struct(dtype: str):
     @wp.struct
     class PairScratch:
         u_coefs: wp.array2d(dtype=wp.vec3d)  # [world, control] sum_i shape_mi u_i at the iterate, m
-        director_coefs: wp.array2d(dtype=wp.vec3d)  # sum_i director_shape_mi u_i
+        director_u_coefs: wp.array2d(dtype=wp.vec3d)  # sum_i director_shape_mi u_i
         start_u_coefs: wp.array2d(dtype=wp.vec3d)  # both at the start of the attempt
-        start_director_coefs: wp.array2d(dtype=wp.vec3d)
+        start_director_u_coefs: wp.array2d(dtype=wp.vec3d)
         start_v_coefs: wp.array2d(dtype=wp.vec3d)  # sum_i shape_mi v_i at the start of the attempt, m/s
-        centre: wp.array2d(dtype=mat43)  # [world, facet] centre and derivatives, rows as of a FacetPoint
+        facet_centre: wp.array2d(dtype=mat43)  # [world, facet] centre and derivatives, rows as of a FacetPoint
         bulge: wp.array2d(dtype=wp.float64)  # [world, facet] largest height above the tangent plane at the centre, m
-        start_centre: wp.array2d(dtype=mat43)  # at the start of the attempt
+        start_facet_centre: wp.array2d(dtype=mat43)  # at the start of the attempt
         box_lower: wp.array(dtype=wp.vec3)  # [world facet] boxes of the tree
         box_upper: wp.array(dtype=wp.vec3)
         refit_lower: wp.array(dtype=wp.vec3)

@@ -58,7 +58,7 @@ def pair_functions(dtype: str) -> _types.SimpleNamespace:
         out.depth_increment = out.depth - pair.initial_depth[world, point]
         k_n = con.scale[world, c] * world_value(con.normal_stiffness, world, c)
         rate = normal_damping_rate(con, scr, world, c, point, inv_h)
-        out.normal_response = normal_law(con.law[c], 0, k_n, rate, con.damping_ramp[c], con.force_eps[c], out.depth,
+        out.normal_values = normal_law(con.law[c], 0, k_n, rate, con.damping_ramp[c], con.force_eps[c], out.depth,
                              pair.initial_depth[world, point])  # fmt: skip
         out.relative_motion = pair.relative_motion[world, point]
         out.trial_displacement = pair.trial_displacement[world, point]
@@ -106,7 +106,7 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
             return
         f = pair_his.facet[world, point] - 1
         xi = pair.anchor_xi[world, point]
-        s = surface_point(mas, pair.start_u_coefs, pair.start_director_coefs, world, f, xi)
+        s = surface_point(mas, pair.start_u_coefs, pair.start_director_u_coefs, world, f, xi)
         n = wp.normalize(wp.cross(s.tangent_a, s.tangent_b))
         projection = vec3d(xi[0], xi[1], f64(0.0))
         v = k.interpolate(facets, v_n, world, q, item) - places.polynomial_value(
@@ -162,7 +162,7 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         """
         xi = pair.projection[world, point]
         n = pair.normal[world, point]
-        s = surface_point(mas, pair.u_coefs, pair.director_coefs, world, f, xi)
+        s = surface_point(mas, pair.u_coefs, pair.director_u_coefs, world, f, xi)
         b = places.second_derivatives(mas, pair.u_coefs, world, f, xi, n)
         ta, tb = s.tangent_a, s.tangent_b
         aa, bb, ab = wp.dot(ta, ta), wp.dot(tb, tb), wp.dot(ta, tb)
@@ -246,12 +246,12 @@ def pair_kernels(dtype: str) -> _types.SimpleNamespace:
         scr.activity[world, point] = WITH_STIFFNESS
         pair.tangential_force[world, point] = tangential_force
         set_geometric_stiffness(
-            mas, pair, world, point, f, scr.activation_gap[world, point] - s.depth, area_fraction * s.normal_response[0]
+            mas, pair, world, point, f, scr.activation_gap[world, point] - s.depth, area_fraction * s.normal_values[0]
         )
-        scr.force[world, point] = tangential_force - (area_fraction * s.normal_response[0]) * s.normal
+        scr.force[world, point] = tangential_force - (area_fraction * s.normal_values[0]) * s.normal
         scr.energy[world, point] = wp.vec2d(
-            area_fraction * (s.normal_response[2] + friction_energy),
-            area_fraction * (s.normal_response[3] + wp.abs(friction_energy)),
+            area_fraction * (s.normal_values[2] + friction_energy),
+            area_fraction * (s.normal_values[3] + wp.abs(friction_energy)),
         )
         scr.stiffness[world, point] = sym(T(area_fraction * K[0, 0]), T(area_fraction * K[1, 1]),
             T(area_fraction * K[2, 2]), T(area_fraction * K[1, 2]), T(area_fraction * K[0, 2]),

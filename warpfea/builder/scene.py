@@ -116,7 +116,7 @@ class Scene(Generic[Params]):
     def __repr__(self) -> str:
         return f"Scene({self.name!r}, dt={self.dt:g}, t_end={self.t_end:g})"
 
-    def parse(self, settings: Iterable[str]) -> dict[str, Any]:
+    def parse_settings(self, settings: Iterable[str]) -> dict[str, Any]:
         """Parameter values from `name=value` texts.
 
         Raises:

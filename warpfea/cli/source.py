@@ -132,7 +132,7 @@ def resolve(options: argparse.Namespace, checkpoint: dict[str, Any] | None = Non
         found = find_scene(options.what)
         if given:
             raise UsageError(f"--{given[0].replace('_', '-')} is for mesh files; {options.what} is a scene, use --set")
-        values = found.resolve(found.parse(options.set))
+        values = found.resolve(found.parse_settings(options.set))
         parameters = values
     dt = options.dt or saved.get("dt") or found.dt
     error = options.error or (saved.get("error") if dt == "auto" else None)

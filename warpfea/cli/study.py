@@ -35,7 +35,7 @@ def accuracy(options: argparse.Namespace) -> int:
     result = measure(
         scene,
         over=parse_over(scene, texts),
-        parameters=scene.parse(options.set),
+        parameters=scene.parse_settings(options.set),
         dt=options.dt,
         t_end=options.t_end,
         solver=options.solver,

@@ -275,7 +275,8 @@ class Mesh:
         if name not in sets:
             elsewhere = self._set_kinds(name)
             hint = f"; {name!r} is a set of {' and '.join(elsewhere)}" if elsewhere else did_you_mean(name, sets)
-            raise MeshError(f"{self.label}: no {what} set named {name!r}; there are: {listing(sorted(sets))}{hint}")
+            found = listing(sorted(sets)) if sets else "none; give a function of the positions instead, X -> mask"
+            raise MeshError(f"{self.label}: no {what} set named {name!r}; there are: {found}{hint}")
         return sets[name]
 
     def _set_kinds(self, name: str) -> list[str]:

@@ -63,8 +63,8 @@ class MasterFacets:
         conn: (F, L) body slots of the facets' elements.
         shape, director_shape: (F, M, L) monomial coefficients of the L slots' shape functions, and of their outward
             derivatives, 1/m.
-        position_coefficients, normal_coefficients: (F, M, 3) monomial coefficients of the reference position, m, and of
-            the outward vector (mitred unit normals).
+        reference_position_coefficients, normal_coefficients: (F, M, 3) monomial coefficients of the reference position,
+            m, and of the outward vector (mitred unit normals).
         corners, degree: 3 or 4, of each facet; of the polynomials.
         size: (F,) length of a side, m.
         depth_limit: (F,) half the thickness of the body behind it, m.
@@ -73,7 +73,7 @@ class MasterFacets:
     conn: np.ndarray
     shape: np.ndarray
     director_shape: np.ndarray
-    position_coefficients: np.ndarray
+    reference_position_coefficients: np.ndarray
     normal_coefficients: np.ndarray
     corners: int
     degree: int

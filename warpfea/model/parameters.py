@@ -264,7 +264,7 @@ class MaterialParameters:
         block.use_couplings_per_world(m.dtype)
 
     @contextmanager
-    def restricted_to_worlds(self, first: int, last: int) -> Iterator[None]:
+    def temporarily_restricted_to_worlds(self, first: int, last: int) -> Iterator[None]:
         """Context: tables restricted to some worlds, for launches over them."""
         blocks = self.model.blocks if self.values else []
         kept: list[tuple[Block, Any, Any]]

@@ -58,7 +58,7 @@ class Animation:
 
     triangles: npt.NDArray[np.integer[Any]]
     up_axis: str
-    reference: Floats
+    start_points: Floats
     title: str = ""
     units: str = ""
     color_range: tuple[float, float] | None = None
@@ -71,7 +71,7 @@ class Animation:
         self, size: tuple[int, int], view: tuple[float, float], chosen: list[int], ground: bool = True
     ) -> Iterator[Image]:
         """Pictures of the chosen frames; camera, ground and colours are those of all frames."""
-        n = self.body_points or len(self.reference)
+        n = self.body_points or len(self.start_points)
         stride = max(1, n * len(self.frames) // 50_000)
         swept = np.concatenate([frame.points[k % stride : n : stride] for k, frame in enumerate(self.frames)])
         swept = np.concatenate([swept, *self._obstacle_points(swept.min(axis=0), swept.max(axis=0))])
@@ -86,7 +86,7 @@ class Animation:
         used, triangles = np.unique(self.triangles[shown], return_inverse=True)
         renderer = Renderer(
             triangles.reshape(-1, 3),
-            reference=self.reference[used],
+            reference=self.start_points[used],
             up_axis=self.up_axis,
             ground=height if ground else None,
         )
@@ -106,7 +106,7 @@ class Animation:
 
     def _obstacle_points(self, low: Floats, high: Floats) -> list[Floats]:
         """Points of the obstacles, clamped to the neighbourhood of the bodies' bounding box, for the camera."""
-        first = self.body_points or len(self.reference)
+        first = self.body_points or len(self.start_points)
         return [
             clip_to_box(frame.points[first:], low, high, 0.15) for frame in self.frames if len(frame.points) > first
         ]

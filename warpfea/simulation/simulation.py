@@ -374,7 +374,7 @@ class Simulation(RunStatistics):
         self._times_differ = True
         flags = self.stepper.episodes.copy_mask_to_flags(mask)
         self.state.copy_rows(self.stepper.launch, flags, state)
-        self.stepper.accept_device_reset(flags)
+        self.stepper.finish_device_reset(flags)
         if self.asynchronous:
             self.stepper.episodes.clear_stepped(flags)
             self._unsynced = True
@@ -391,7 +391,7 @@ class Simulation(RunStatistics):
             return self.state.copy()
         finally:
             self.state.copy_rows(self.stepper.launch, everyone, now)
-            self.stepper.accept_device_reset(everyone, restart=False)
+            self.stepper.finish_device_reset(everyone, restart=False)
             self._stepped_worlds = stepped
             if self.stepper.episodes.stepped_flags is not None:
                 self.stepper.episodes.stepped_flags.assign(stepped.astype(np.int32))

@@ -221,7 +221,7 @@ class Stepper:
             ledger[mask, :3] = stored[mask]
             self.state.ledger.assign(ledger)
 
-    def accept_device_reset(self, flags: wp.array, *, restart: bool = True) -> None:
+    def finish_device_reset(self, flags: wp.array, *, restart: bool = True) -> None:
         """Complete a device-side reset; terms and ledger already match the state.
 
         `restart`: also reset scratch, for a state other than the one it belongs to.

@@ -229,7 +229,7 @@ class MatrixAssembler:
             if last - first == self.model.worlds:
                 self._assemble(last, state, projected)
                 continue
-            with self.model.parameters.restricted_to_worlds(first, last):
+            with self.model.parameters.temporarily_restricted_to_worlds(first, last):
                 self._assemble(last - first, [a[first:last] for a in state], projected, first)
 
     def _assemble(self, count: int, state: list[wp.array], projected: bool, first_world: int = 0) -> None:

@@ -126,7 +126,7 @@ class Evaluation:
                 host = np.zeros((1, m.slots, 3), dtype=precision(m.dtype).T._type_)
                 host[0, colour == c, axis] = 1.0
                 direction.assign(host)
-                with m.parameters.restricted_to_worlds(world, world + 1):
+                with m.parameters.temporarily_restricted_to_worlds(world, world + 1):
                     self.elements.tangent(ctx, direction, flag)
                 out = ctx.work.contribution.numpy()[0]
                 for block, conn in zip(m.blocks, conns):

@@ -76,7 +76,7 @@ class PairEvaluation:
             mine = (facet >= first) & (facet < first + len(mas.conn))
             power = monomial_exponents(mas.corners, mas.degree)
             value = np.prod(xi[mine][:, None, :2] ** power, axis=2)
-            out[mine] = np.einsum("pm,pmk->pk", value, mas.position_coefficients[facet[mine] - first])
+            out[mine] = np.einsum("pm,pmk->pk", value, mas.reference_position_coefficients[facet[mine] - first])
             first += len(mas.conn)
         return out
 
@@ -106,7 +106,7 @@ def evaluate_pairs(term: Any, state: State) -> PairEvaluation:
 
     masters = t.master_data(wp.uint64(0))
     arrays: dict[str, tuple[tuple[int, ...], Any]] = dict.fromkeys(
-        ("u_coefs", "director_coefs"), ((B, t.facets * masters.max_monomials), wp.vec3d)
+        ("u_coefs", "director_u_coefs"), ((B, t.facets * masters.max_monomials), wp.vec3d)
     )
     arrays |= dict.fromkeys(("box_lower", "box_upper", "refit_lower", "refit_upper"), ((B * t.facets,), wp.vec3))
     pair = allocate_fields(pair_scratch_struct(m.dtype)(), arrays | {"refit_needed": ((1,), wp.int32)})
@@ -114,7 +114,7 @@ def evaluate_pairs(term: Any, state: State) -> PairEvaluation:
     launch(
         term.search_kernels.update_coefficients,
         (B, t.facets, masters.max_monomials),
-        [masters, u, all_worlds, pair.u_coefs, pair.director_coefs],
+        [masters, u, all_worlds, pair.u_coefs, pair.director_u_coefs],
     )
     launch(term.search_kernels.check_boxes, (B, t.facets), [masters, all_worlds, pair])
     tree = wp.Bvh(pair.refit_lower, pair.refit_upper, groups=t.box_groups)

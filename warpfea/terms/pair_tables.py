@@ -120,7 +120,9 @@ class PairTables(FacetTables[PairContact]):
     def reference_boxes(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper corners (facets, 3) of the reference bounding boxes."""
         nodes = [
-            np.einsum("qm,fmk->fqk", bernstein_from_monomials(mas.corners, mas.degree), mas.position_coefficients)
+            np.einsum(
+                "qm,fmk->fqk", bernstein_from_monomials(mas.corners, mas.degree), mas.reference_position_coefficients
+            )
             for mas in self.masters
         ]
         low, high = ([getattr(x, name)(axis=1) for x in nodes] for name in ("min", "max"))
@@ -184,8 +186,12 @@ class PairTables(FacetTables[PairContact]):
                 "conn": upload(self.master_conn.T, wp.int32),
                 "shape": upload(np.moveaxis(concatenated("shape"), 0, 2), m.types.T),
                 "director_shape": upload(np.moveaxis(concatenated("director_shape"), 0, 2), m.types.T),
-                "position_coefficients": upload(np.swapaxes(concatenated("position_coefficients"), 0, 1), wp.vec3d),
-                "director_coefficients": upload(np.swapaxes(concatenated("normal_coefficients"), 0, 1), wp.vec3d),
+                "reference_position_coefficients": upload(
+                    np.swapaxes(concatenated("reference_position_coefficients"), 0, 1), wp.vec3d
+                ),
+                "reference_director_coefficients": upload(
+                    np.swapaxes(concatenated("normal_coefficients"), 0, 1), wp.vec3d
+                ),
                 "facet_kind": upload(np.repeat([kinds.index((q.corners, q.degree)) for q in all_of], counts), wp.int32),
                 "monomial_count": upload([len(monomial_exponents(*kind)) for kind in kinds], wp.int32),
                 "corner_count": upload([kind[0] for kind in kinds], wp.int32),

@@ -137,12 +137,12 @@ class Pairs(PairSolves):
         most = t.master_data(wp.uint64(0)).max_monomials
         F, P, R = t.facets, t.points, t.rows
         shapes: dict[str, tuple[int, ...]] = dict.fromkeys(
-            ("u_coefs", "director_coefs", "start_u_coefs", "start_director_coefs", "start_v_coefs"), (B, F * most)
+            ("u_coefs", "director_u_coefs", "start_u_coefs", "start_director_u_coefs", "start_v_coefs"), (B, F * most)
         )
         shapes |= dict.fromkeys(("box_lower", "box_upper", "refit_lower", "refit_upper", "list_count"), (B * F,))
         shapes |= dict.fromkeys(("refit_needed", "refit_count", "lists_changed"), (1,))
         shapes |= dict.fromkeys(("in_reach", "empty_box_lower", "empty_box_upper", "empty_box_refit"), (B, R))
-        shapes |= dict.fromkeys(("list_size", "list_start", "centre", "start_centre", "bulge"), (B, F))
+        shapes |= dict.fromkeys(("list_size", "list_start", "facet_centre", "start_facet_centre", "bulge"), (B, F))
         shapes |= {"chunk_offset": (B, -(-F // FACETS_PER_CHUNK))}
         shapes |= dict.fromkeys(("shape_values", "friction_shape", "shape_gradient"), (B, P, t.master_conn.shape[1]))
         shapes |= {"geometric_tangent": (B, P, 2), "deepest_contact": (B, len(t.bodies))}
@@ -268,7 +268,7 @@ class Pairs(PairSolves):
         s, m, t, k = ctx.scratch[self.name], self.model, self.tables, self.search_kernels
         pair, masters = s["pair"], s["masters"]
         dim = (m.worlds, t.facets, masters.max_monomials)
-        ctx.launch(k.update_coefficients, dim, [masters, u, active, pair.u_coefs, pair.director_coefs])
+        ctx.launch(k.update_coefficients, dim, [masters, u, active, pair.u_coefs, pair.director_u_coefs])
         ctx.launch(k.check_boxes, (m.worlds, t.facets), [masters, active, pair])
         ctx.launch(k.update_centres, (m.worlds, t.facets), [masters, active, pair])
         wp.capture_if(pair.refit_needed, self._refit_tree, ctx=ctx)

@@ -106,13 +106,13 @@ class FieldSpec:
     Attributes:
         title, units: for legends.
         join: combines the samples of two terms with this field; None: one term only.
-        at_node: reduces the samples of a node; None: `samples` gives one value per node.
+        node_reduction: reduces the samples of a node; None: `samples` gives one value per node.
     """
 
     title: str
     units: str
     join: np.ufunc | None = None
-    at_node: np.ufunc | None = None
+    node_reduction: np.ufunc | None = None
 
 
 @dataclass(eq=False)
@@ -401,5 +401,5 @@ class Term:
 
     def samples(self, field: str, body: Any, state: State) -> np.ndarray:
         """Values (worlds, nodes x samples of a node) of one of `fields`, on sections and faces; of one without
-        `at_node` (worlds, nodes of the body's mesh)."""
+        `node_reduction` (worlds, nodes of the body's mesh)."""
         raise NotImplementedError

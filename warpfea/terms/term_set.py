@@ -246,17 +246,17 @@ class TermSet:
         found = []
         for term in (term for term in self.all if name in term.fields):
             values = np.asarray(term.samples(name, body, state))
-            expected = (self.model.worlds, len(body.mesh.points) * (count if spec.at_node else 1))
+            expected = (self.model.worlds, len(body.mesh.points) * (count if spec.node_reduction else 1))
             if values.shape != expected:
                 raise ModelError(f"term {term.name!r}: samples({name!r}) gave {values.shape}; expected {expected}")
-            found.append(values if spec.at_node else np.repeat(values, count, axis=1))
+            found.append(values if spec.node_reduction else np.repeat(values, count, axis=1))
         return functools.reduce(spec.join, found) if spec.join else found[0]
 
     def at_nodes(self, name: str, body: Any, state: State) -> np.ndarray:
         """Values (worlds, nodes) of a field."""
         values = self.samples(name, body, state)
         values = values.reshape(len(values), len(body.mesh.points), -1)
-        reduce = self.fields[name].at_node
+        reduce = self.fields[name].node_reduction
         return np.asarray(reduce.reduce(values, axis=2) if reduce else values[:, :, 0])
 
     # parameters and fields

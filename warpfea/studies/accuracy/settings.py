@@ -165,7 +165,7 @@ def parse_over(scene: Scene[Any], texts: Iterable[str], option: str = "--over") 
             parts = out[name]
             if typing.get_origin(scene.parameters[name].kind) is tuple:  # 6x2x1: commas separate values
                 parts = [part.replace("x", ",") for part in parts]
-            out[name] = [scene.parse([f"{name}={part}"])[name] for part in parts]
+            out[name] = [scene.parse_settings([f"{name}={part}"])[name] for part in parts]
     return out
 
 
