@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from warpfea.kernels.terms.contact_structs import RECORD_NAMES
+from warpfea.kernels.contact.structs import RECORD_NAMES
 
 import warpfea as wf
+from warpfea.contact.colliders import ColliderContact
 from warpfea.model.contact_points import contact_points
 from warpfea.model.handles import SurfaceSet
-from warpfea.terms.contact import Contact
 
 G = 9.81
 STIFF = wf.SVK(E=1e9, nu=0.3, density=1000.0)
@@ -37,7 +37,7 @@ def middle(map=None, origin=(0.0, 0.0, 0.0)):
 
 def record(sim, contact):
     """Fields of the last step's record of a contact, by name."""
-    term = sim.model.terms.find(Contact)
+    term = sim.model.terms.find(ColliderContact)
     first = term.report_offset + len(RECORD_NAMES) * term.tables.number[contact.index]
     return dict(zip(RECORD_NAMES, sim.stepper.work.report.numpy()[0, first : first + len(RECORD_NAMES)]))
 
@@ -62,7 +62,7 @@ def pressed(make, nu=0.3, **options):
     model = b.finalize(device="cpu")
     sim = wf.Simulation(model, dt=0.02, solver=wf.NewtonPCG(tol=1e-10), record=False)
     sim.step(600)  # what is left of the motion falls tenfold in 62 steps
-    term = model.terms.find(Contact)
+    term = model.terms.find(ColliderContact)
     gap, force = term.at_points(sim.state)
     area = term.tables.host[0].area.ravel()
     used = area > 0.0

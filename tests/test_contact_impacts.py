@@ -9,8 +9,8 @@ import pytest
 from contact_cubes import G, cube, everywhere, middle, record, tilted
 
 import warpfea as wf
-from warpfea.terms.contact_tables import contact_law_constants
-from warpfea.terms.facet_tables import restitution_beta
+from warpfea.contact.collider_tables import contact_law_constants
+from warpfea.contact.tables import restitution_beta
 
 WANTED = np.array([0.1, 0.3, 0.5, 0.7, 0.9])
 

@@ -6,9 +6,9 @@ import math
 import numpy as np
 import pytest
 import warp as wp
-from warpfea.kernels.terms.contact_laws import DEFAULT, PAPER, SMOOTH, law_functions
+from warpfea.kernels.contact.laws import DEFAULT, PAPER, SMOOTH, law_functions
 
-from warpfea.terms.facet_tables import hunt_crossley_damping, restitution_beta
+from warpfea.contact.tables import hunt_crossley_damping, restitution_beta
 
 COUNT = 4000
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]

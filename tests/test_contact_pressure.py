@@ -10,8 +10,8 @@ import pytest
 from contact_cubes import LOAD, STIFF, flat_side, pressed
 
 import warpfea as wf
-from warpfea.terms.contact import Contact
-from warpfea.terms.contact_tables import contact_law_constants
+from warpfea.contact.collider_tables import contact_law_constants
+from warpfea.contact.colliders import ColliderContact
 
 SIZE = np.array([0.3, 0.24, 0.12])
 
@@ -92,7 +92,7 @@ def carried(turn, depth, cells):
     u = state.displacement.numpy()
     u[:, :, 2] = -depth - mesh.points[:, 2].min()
     state.displacement.assign(u)
-    term = model.terms.find(Contact)
+    term = model.terms.find(ColliderContact)
     _, force = term.at_points(state)
     assert np.abs(force[0, :, :2]).max() == 0.0
     return force[0, :, 2].sum() * term.tables.host[0].area.sum() / contact_law_constants(contact)["normal_stiffness"]

@@ -8,8 +8,8 @@ import scipy.sparse as sp
 import warp as wp
 
 import warpfea as wf
+from warpfea.contact.facets import FacetContact
 from warpfea.solvers import twolevel
-from warpfea.terms.pairs import Pairs
 
 SIDE = 0.2
 
@@ -100,7 +100,7 @@ def system(loop):
     pre, graph = loop.preconditioner, loop.preconditioner.assembler.pattern.graph
     shape = (3 * model.slots,) * 2
     own = sp.bsr_matrix((pre.block_values.numpy()[0], graph.indices, graph.indptr), shape=shape).toarray()
-    term = model.terms.find(Pairs)
+    term = model.terms.find(FacetContact)
     touching, attempt = at.scratch["pairs"]["pair"], at.scratch["pairs"]["attempt"]
     stiffness, listed, weight = (
         x.numpy()[0] for x in (attempt.stiffness, touching.listed_facet, touching.shape_values)

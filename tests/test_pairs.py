@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import warpfea as wf
-from warpfea.terms.pairs import Pairs
+from warpfea.contact.facets import FacetContact
 
 SOFT = wf.SVK(E=2e5, nu=0.3, density=1000.0)
 DT = 1e-3
@@ -58,7 +58,7 @@ TIGHT = wf.NewtonPCG(tol=1e-12, max_newton=60)
 def balance(sim, u=None):
     """|Sum| and |moment| of a pair's forces on all slots, at the displacements of the state or others; and sum |F|."""
     model, work = sim.model, sim.stepper.work
-    term = model.terms.find(Pairs)
+    term = model.terms.find(FacetContact)
     pool = work.pool_force.numpy()[0].astype(float)
     kind = np.concatenate([x.slot_kind for x in model.description.bodies])
     shift = np.concatenate([np.where(x.slot_kind[:, None] == 0, x.origin, 0.0) for x in model.description.bodies])

@@ -5,12 +5,12 @@ import math
 
 import numpy as np
 import warp as wp
-from warpfea.kernels.terms.contact_colliders import collider_functions
-from warpfea.kernels.terms.contact_structs import contact_struct
+from warpfea.kernels.contact.colliders import collider_functions
+from warpfea.kernels.contact.structs import contact_struct
 
 import warpfea as wf
 from warpfea.base.launch import Launcher
-from warpfea.terms.collider_meshes import upload_collider_meshes
+from warpfea.contact.collider_meshes import upload_collider_meshes
 
 SIDE, DT = 0.1, 1e-3
 

@@ -13,11 +13,12 @@ __all__ = ["add_block_function", "add_symmetric_function"]
 @functools.cache
 def add_block_function(dtype: str) -> wp.Function:
     """Function add_block(topo, at, A, world, value), with `at` a row of Pattern.upper."""
-    mat33 = precision(dtype).mat33
+    p = precision(dtype)
+    mat33 = p.mat33
     Topology = topology_struct(dtype)
 
     @wp.func
-    def add_block(topo: Topology, at: wp.vec4i, A: mat33, world: int, value: wp.array2d(dtype=mat33)):
+    def add_block(topo: Topology, at: wp.vec4i, A: mat33, world: int, value: p.mat33_2d):
         """Add A to an entry and its transpose to the mirrored one, on the free components."""
         row_free = topo.free[at[2]]
         column_free = topo.free[at[3]]
@@ -42,7 +43,7 @@ def add_symmetric_function(dtype: str) -> wp.Function:
     add_block = add_block_function(dtype)
 
     @wp.func
-    def add_symmetric(topo: Topology, at: wp.vec4i, k6: sym, world: int, value: wp.array2d(dtype=mat33)):
+    def add_symmetric(topo: Topology, at: wp.vec4i, k6: sym, world: int, value: p.mat33_2d):
         """Add a symmetric block xx yy zz yz xz xy to an entry."""
         A = mat33(k6[0], k6[5], k6[4], k6[5], k6[1], k6[3], k6[4], k6[3], k6[2])
         add_block(topo, at, A, world, value)

@@ -5,7 +5,7 @@ import types as _types
 
 import warp as wp
 
-from .types import kernel_module
+from .types import int_1d, kernel_module, kernel_set
 
 __all__ = ["empty_kernels"]
 
@@ -16,9 +16,9 @@ def empty_kernels() -> _types.SimpleNamespace:
     module = kernel_module("empty")
 
     @wp.kernel(module=module)
-    def empty(flags: wp.array(dtype=wp.int32)):
+    def empty(flags: int_1d):
         """Read one flag, write nothing."""
         if flags[0] > 1:
             flags[0] = 0
 
-    return _types.SimpleNamespace(module=module, empty=empty)
+    return kernel_set(locals())

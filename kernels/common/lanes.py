@@ -5,7 +5,7 @@ import types as _types
 
 import warp as wp
 
-from .types import precision
+from .types import double_3d, kernel_set, precision
 
 __all__ = ["WARP_SIZE", "block_memory", "lane_functions", "warp_minimum"]
 
@@ -24,27 +24,21 @@ def sync():
     """Barrier for the threads of a block; nothing on the CPU."""
 
 
-@wp.func_native(
-    snippet="""
+_SUM_SNIPPET = """
     #if defined(__CUDA_ARCH__)
     for (int o = lanes / 2; o > 0; o /= 2) x += __shfl_down_sync(0xffffffffu, x, o, lanes);
     #endif
     return x;
     """
-)
+
+
+@wp.func_native(snippet=_SUM_SNIPPET)
 def lane_sum_float64(x: wp.float64, lanes: int) -> wp.float64:
     """Sum of x over a run of `lanes` threads, in its first thread; x itself on the CPU."""
     ...
 
 
-@wp.func_native(
-    snippet="""
-    #if defined(__CUDA_ARCH__)
-    for (int o = lanes / 2; o > 0; o /= 2) x += __shfl_down_sync(0xffffffffu, x, o, lanes);
-    #endif
-    return x;
-    """
-)
+@wp.func_native(snippet=_SUM_SNIPPET)
 def lane_sum_float32(x: wp.float32, lanes: int) -> wp.float32:
     """Sum of x over a run of `lanes` threads, in its first thread; x itself on the CPU."""
     ...
@@ -117,8 +111,10 @@ def lane_functions(dtype: str) -> _types.SimpleNamespace:
     `sync()` is the barrier of a block. `lane_sum(v, lanes)` sums vectors, `row_sum(x, lanes)` float64 numbers and
     `scalar_sum(x, lanes)` numbers of this precision over runs of `lanes` threads, a power of two up to WARP. The first
     thread of a run gets the sum. Every thread of a warp must participate, so launches pad their rows to whole warps.
+    `store_sum(row, x, index, lanes, world, rows)` stores row sums as `rows[row, world, run]`; `store_products` stores
+    the pair of `residual_products(r, z, D)` as rows 0 and 1.
     """
-    vec3 = precision(dtype).vec3
+    vec3, f64 = precision(dtype).vec3, wp.float64
     scalar_sum = {"float64": lane_sum_float64, "float32": lane_sum_float32}[dtype]
 
     @wp.func
@@ -126,4 +122,22 @@ def lane_functions(dtype: str) -> _types.SimpleNamespace:
         """Sum of v over a run of `lanes` threads, in its first thread; v itself on the CPU."""
         return vec3(scalar_sum(v[0], lanes), scalar_sum(v[1], lanes), scalar_sum(v[2], lanes))
 
-    return _types.SimpleNamespace(sync=sync, lane_sum=lane_sum, row_sum=lane_sum_float64, scalar_sum=scalar_sum)
+    @wp.func
+    def store_sum(row: int, x: wp.float64, index: int, lanes: int, world: int, rows: double_3d):
+        """Store the sum of x over each run of `lanes` threads."""
+        total = lane_sum_float64(x, lanes)
+        if index % lanes == 0:
+            rows[row, world, index / lanes] = total
+
+    @wp.func
+    def residual_products(r: vec3, z: vec3, D: vec3) -> wp.vec2d:
+        """r.z and r.D^-1 r."""
+        return wp.vec2d(f64(wp.dot(r, z)), f64(wp.dot(r, wp.cw_div(r, D))))
+
+    @wp.func
+    def store_products(x: wp.vec2d, index: int, lanes: int, world: int, rows: double_3d):
+        """Store both sums of `residual_products` over each run of `lanes` threads."""
+        store_sum(0, x[0], index, lanes, world, rows)
+        store_sum(1, x[1], index, lanes, world, rows)
+
+    return kernel_set(locals() | {"sync": sync, "row_sum": lane_sum_float64})

@@ -6,7 +6,7 @@ import types as _types
 import warp as wp
 
 from .lanes import lane_sum_float64
-from .types import kernel_module
+from .types import double_2d, double_3d, int_1d, kernel_module, kernel_set
 
 __all__ = ["CHUNK", "MAX_WARP_ROW", "reduce_kernels"]
 
@@ -26,7 +26,7 @@ def reduce_kernels() -> _types.SimpleNamespace:
     module = kernel_module("reduce")
 
     @wp.kernel(module=module)
-    def partial_sums(rows: wp.array3d(dtype=f64), active: wp.array(dtype=wp.int32), partial: wp.array3d(dtype=f64)):
+    def partial_sums(rows: double_3d, active: int_1d, partial: double_3d):
         """One block sums one chunk of one row of one world."""
         row, world, chunk = wp.tid()
         if active[world] == 0:
@@ -37,7 +37,7 @@ def reduce_kernels() -> _types.SimpleNamespace:
         partial[row, world, chunk] = wp.tile_extract(wp.tile_sum(acc), 0)
 
     @wp.kernel(module=module)
-    def final_sums(rows: wp.array3d(dtype=f64), active: wp.array(dtype=wp.int32), out: wp.array2d(dtype=f64)):
+    def final_sums(rows: double_3d, active: int_1d, out: double_2d):
         """One block sums one row of one world."""
         row, world = wp.tid()
         if active[world] == 0:
@@ -48,9 +48,7 @@ def reduce_kernels() -> _types.SimpleNamespace:
         out[row, world] = wp.tile_extract(wp.tile_sum(acc), 0)
 
     @wp.kernel(module=module)
-    def short_sums(
-        rows: wp.array3d(dtype=f64), lanes: int, active: wp.array(dtype=wp.int32), out: wp.array2d(dtype=f64)
-    ):
+    def short_sums(rows: double_3d, lanes: int, active: int_1d, out: double_2d):
         """One warp sums one row of one world; on the CPU one thread, `lanes` is 1."""
         item = wp.tid() / lanes
         lane = wp.tid() % lanes
@@ -65,6 +63,4 @@ def reduce_kernels() -> _types.SimpleNamespace:
         if lane == 0:
             out[row, world] = s
 
-    return _types.SimpleNamespace(
-        module=module, partial_sums=partial_sums, final_sums=final_sums, short_sums=short_sums
-    )
+    return kernel_set(locals())

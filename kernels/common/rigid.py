@@ -5,7 +5,7 @@ import types as _types
 
 import warp as wp
 
-from .types import precision
+from .types import kernel_set, precision
 
 __all__ = ["RIGID_MODES", "bodies_struct", "rigid_mode_functions"]
 
@@ -50,4 +50,4 @@ def rigid_mode_functions(dtype: str) -> _types.SimpleNamespace:
         """Motion of a slot by the rotations of its body, as columns e_k x a."""
         return -wp.skew(bodies.lever_arm[world, slot]) @ wp.diag(bodies.free_rotations[body])
 
-    return _types.SimpleNamespace(translation_columns=translation_columns, rotation_columns=rotation_columns)
+    return kernel_set(locals())

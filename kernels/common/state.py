@@ -5,7 +5,7 @@ import types as _types
 
 import warp as wp
 
-from .types import kernel_module
+from .types import int_1d, kernel_module, kernel_set
 
 __all__ = ["state_kernels"]
 
@@ -16,19 +16,17 @@ def state_kernels() -> _types.SimpleNamespace:
     module = kernel_module("state")
 
     @wp.kernel(module=module)
-    def copy_rows(
-        flags: wp.array(dtype=wp.int32), source: wp.array2d(dtype=wp.uint32), target: wp.array2d(dtype=wp.uint32)
-    ):
+    def copy_rows(flags: int_1d, source: wp.array2d(dtype=wp.uint32), target: wp.array2d(dtype=wp.uint32)):
         """Copy the rows of the flagged worlds."""
         world, word = wp.tid()
         if flags[world] != 0:
             target[world, word] = source[world, word]
 
     @wp.kernel(module=module)
-    def clear_rows(flags: wp.array(dtype=wp.int32), target: wp.array2d(dtype=wp.uint32)):
+    def clear_rows(flags: int_1d, target: wp.array2d(dtype=wp.uint32)):
         """Set the rows of the flagged worlds to zero."""
         world, word = wp.tid()
         if flags[world] != 0:
             target[world, word] = wp.uint32(0)
 
-    return _types.SimpleNamespace(module=module, copy_rows=copy_rows, clear_rows=clear_rows)
+    return kernel_set(locals())

@@ -60,6 +60,23 @@ def mass_function(dtype: str):
 
 
 @functools.cache
+def free_components_function(dtype: str):
+    """Device function: components of a vector by `Topology.free`."""
+    T, vec3 = precision(dtype).T, precision(dtype).vec3
+
+    @wp.func
+    def free_components(free: vec3, new: vec3, old: vec3) -> vec3:
+        """Components of `new` where free, else those of `old`."""
+        out = new
+        for k in range(3):
+            if free[k] == T(0.0):
+                out[k] = old[k]
+        return out
+
+    return free_components
+
+
+@functools.cache
 def balance_struct(dtype: str):
     """Balance of forces at an iterate, Eq. (17): inputs and parts, [world, slot]; forces in N."""
     vec3 = precision(dtype).vec3

@@ -10,10 +10,18 @@ import types as _types
 
 import warp as wp
 
-from ..common.types import kernel_module, precision
+from ..common.types import double_1d, double_3d, int_1d, kernel_module, kernel_set, precision
 from .assumed_strain_block import assumed_shear_functions, assumed_strain_struct, coupling_entry_function
 from .element_slots import slot_access_functions
-from .matrix import PANEL_UNROLL, panel_layout, panel_row, panel_row_type, scheme_suffix
+from .matrix import (
+    PANEL_UNROLL,
+    matrix_column,
+    panel_layout,
+    panel_row,
+    panel_row_type,
+    scheme_suffix,
+    store_column_function,
+)
 
 __all__ = ["assumed_strain_kernels"]
 
@@ -51,6 +59,7 @@ def assumed_strain_kernels(
     directional_derivative, kinematics = shears.directional_derivative, shears.kinematics
     predicted_shears, step_shears = shears.predicted_shears, shears.step_shears
     load_slots, store_forces = slot_access_functions(dtype, slots, Block)
+    store_column = store_column_function(dtype, slots)
     NS, NT, W = slots, ties, width
     PANELS, P, _ = panel_layout(NS)
     Row = wp.types.vector(length=P, dtype=T)
@@ -125,9 +134,9 @@ def assumed_strain_kernels(
 
     @wp.kernel(module=module)
     def internal_force(
-        block: Block, u: wp.array2d(dtype=vec3), v: wp.array2d(dtype=vec3), history: wp.array2d(dtype=sym6), dq_dv:
-        wp.array(dtype=wp.float64), active: wp.array(dtype=wp.int32), lanes: int, contribution: wp.array2d(dtype=vec3),
-        energy: wp.array3d(dtype=wp.float64), min_J: wp.array(dtype=wp.float64), domain_J: wp.array(dtype=wp.float64),
+        block: Block, u: p.vec3_2d, v: p.vec3_2d, history: p.sym_2d, dq_dv:
+        double_1d, active: int_1d, lanes: int, contribution: p.vec3_2d,
+        energy: double_3d, min_J: double_1d, domain_J: double_1d,
     ):  # fmt: skip
         """f_i = sum_t s_t (s_i,a x_b + s_i,b x_a), N, and the energy e.s/2, J; one thread per element."""
         world, elem = wp.tid()
@@ -157,13 +166,13 @@ def assumed_strain_kernels(
     @wp.kernel(module=module)
     def tangent_product(
         block: Block,
-        u: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        history: wp.array2d(dtype=sym6),
-        dq_dv: wp.array(dtype=wp.float64),
-        active: wp.array(dtype=wp.int32),
-        direction: wp.array2d(dtype=vec3),
-        contribution: wp.array2d(dtype=vec3),
+        u: p.vec3_2d,
+        v: p.vec3_2d,
+        history: p.sym_2d,
+        dq_dv: double_1d,
+        active: int_1d,
+        direction: p.vec3_2d,
+        contribution: p.vec3_2d,
     ):
         """K p (N): the change of `internal_force` with a change p of the slots; `active` 2: see `point_increment`."""
         world, elem = wp.tid()
@@ -184,15 +193,15 @@ def assumed_strain_kernels(
     @wp.kernel(module=prediction_module)
     def predicted_stress_product(
         block: Block,
-        u: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        base: wp.array2d(dtype=vec3),
-        use_prediction: wp.array(dtype=wp.int32),
-        history: wp.array2d(dtype=sym6),
-        dq_dv: wp.array(dtype=wp.float64),
-        active: wp.array(dtype=wp.int32),
-        direction: wp.array2d(dtype=vec3),
-        contribution: wp.array2d(dtype=vec3),
+        u: p.vec3_2d,
+        v: p.vec3_2d,
+        base: p.vec3_2d,
+        use_prediction: int_1d,
+        history: p.sym_2d,
+        dq_dv: double_1d,
+        active: int_1d,
+        direction: p.vec3_2d,
+        contribution: p.vec3_2d,
     ):
         """`tangent_product` with the shear stress of the linear prediction; see
         kernels/elements/predicted_stress.py."""
@@ -210,13 +219,7 @@ def assumed_strain_kernels(
         store_forces(block, tangent_force(block, P, Local(), x1, x2, e, world, elem), world, elem, contribution)
 
     @wp.kernel(module=module)
-    def diagonal_blocks(
-        block: Block,
-        u: wp.array2d(dtype=vec3),
-        dq_dv: wp.array(dtype=wp.float64),
-        active: wp.array(dtype=wp.int32),
-        contribution: wp.array2d(dtype=sym6),
-    ):
+    def diagonal_blocks(block: Block, u: p.vec3_2d, dq_dv: double_1d, active: int_1d, contribution: p.sym_2d):
         """The 3x3 diagonal blocks of K in Voigt order, without the geometric part: positive semi-definite, as A is."""
         world, elem = wp.tid()
         if active[world] == 0:
@@ -244,15 +247,15 @@ def assumed_strain_kernels(
     @wp.kernel(module=matrix_module)
     def prepare_matrix(
         block: Block,
-        u: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        base: wp.array2d(dtype=vec3),
-        use_prediction: wp.array(dtype=wp.int32),
-        history: wp.array2d(dtype=sym6),
-        dq_dv: wp.array(dtype=wp.float64),
+        u: p.vec3_2d,
+        v: p.vec3_2d,
+        base: p.vec3_2d,
+        use_prediction: int_1d,
+        history: p.sym_2d,
+        dq_dv: double_1d,
         form: int,
-        active: wp.array(dtype=wp.int32),
-        lines: wp.array3d(dtype=vec3),
+        active: int_1d,
+        lines: p.vec3_3d,
     ):
         """Data of the ties common to all columns of an element's matrix, [world, row, elem].
 
@@ -290,12 +293,7 @@ def assumed_strain_kernels(
         lines[world, 2 * NT + tie, elem] = vec3(shear, T(0.0), T(0.0))
 
     @wp.kernel(module=matrix_module)
-    def prepare_stress(
-        block: Block,
-        use_prediction: wp.array(dtype=wp.int32),
-        active: wp.array(dtype=wp.int32),
-        lines: wp.array3d(dtype=vec3),
-    ):
+    def prepare_stress(block: Block, use_prediction: int_1d, active: int_1d, lines: p.vec3_3d):
         """s = mu A e of the ties, in the first components of the rows 3 NT + tie."""
         world, tie, elem = wp.tid()
         if active[world] == 0:
@@ -312,22 +310,19 @@ def assumed_strain_kernels(
     @wp.kernel(module=matrix_module)
     def element_matrix(
         block: Block,
-        dq_dv: wp.array(dtype=wp.float64),
-        lines: wp.array3d(dtype=vec3),
-        use_prediction: wp.array(dtype=wp.int32),
+        dq_dv: double_1d,
+        lines: p.vec3_3d,
+        use_prediction: int_1d,
         form: int,
         add: int,
-        active: wp.array(dtype=wp.int32),
-        matrix: wp.array3d(dtype=vec3),
+        active: int_1d,
+        matrix: p.vec3_3d,
     ):
         """K of each element by columns, stored as by `element_kernels`; `form` 1: without the geometric part."""
         world, index = wp.tid()
         if active[world] == 0:
             return
-        column = index / block.count
-        elem = index % block.count
-        b = column / 3
-        axis = column % 3
+        elem, b, axis = matrix_column(index, block.count)
         mu = matrix_modulus(block, block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0])
         unit = vec3()
         unit[axis] = T(1.0)
@@ -351,24 +346,19 @@ def assumed_strain_kernels(
             for a in range(NS):
                 if a <= b:
                     out[a] = out[a] + block.derivative_a[t, a, elem] * dd + block.derivative_b[t, a, elem] * da
-        for a in range(NS):
-            if a <= b:
-                pair = a * NS - (a * (a - 1)) / 2 + b - a
-                if add != 0:
-                    out[a] = out[a] + matrix[world, 3 * pair + axis, elem]
-                matrix[world, 3 * pair + axis, elem] = out[a]
+        store_column(out, b, axis, add, world, elem, matrix)
 
     @wp.kernel(module=rows_module)
     def element_matrix_panels(
         block: Block,
-        u: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        base: wp.array2d(dtype=vec3),
-        use_prediction: wp.array(dtype=wp.int32),
-        history: wp.array2d(dtype=sym6),
-        dq_dv: wp.array(dtype=wp.float64),
+        u: p.vec3_2d,
+        v: p.vec3_2d,
+        base: p.vec3_2d,
+        use_prediction: int_1d,
+        history: p.sym_2d,
+        dq_dv: double_1d,
         form: int,
-        active: wp.array(dtype=wp.int32),
+        active: int_1d,
         add: int,
         matrix: wp.array3d(dtype=Rows),
     ):
@@ -434,14 +424,4 @@ def assumed_strain_kernels(
                             R[4 * i] = R[4 * i] + G
                     matrix[world, elem, at] = R
 
-    return _types.SimpleNamespace(
-        module=module,
-        element_matrix_panels=element_matrix_panels,
-        prepare_matrix=prepare_matrix,
-        prepare_stress=prepare_stress,
-        element_matrix=element_matrix,
-        internal_force=internal_force,
-        tangent_product=tangent_product,
-        predicted_stress_product=predicted_stress_product,
-        diagonal_blocks=diagonal_blocks,
-    )
+    return kernel_set(locals())

@@ -5,7 +5,7 @@ import types as _types
 
 import warp as wp
 
-from ..common.types import precision
+from ..common.types import kernel_set, precision
 from .element_slots import slot_values_type
 
 __all__ = ["assumed_shear_functions", "assumed_strain_struct", "coupling_entry_function"]
@@ -65,7 +65,7 @@ def assumed_shear_functions(dtype: str, slots: int, ties: int, dissipative: bool
     NS, NT = slots, ties
 
     @wp.func
-    def directional_derivative(table: wp.array3d(dtype=T), U: Local, tie: int, elem: int) -> vec3:
+    def directional_derivative(table: p.scalar_3d, U: Local, tie: int, elem: int) -> vec3:
         """sum_i s_i,a u_i at a tie, with `table` the derivatives along one direction: contribution of U to x_a, m."""
         out = vec3()
         for i in range(NS):
@@ -119,7 +119,4 @@ def assumed_shear_functions(dtype: str, slots: int, ties: int, dissipative: bool
                 out[t] = out[t] + block.dissipation * change
         return out
 
-    return _types.SimpleNamespace(
-        Local=Local, Ties=Ties, TieVectors=TieVectors, directional_derivative=directional_derivative,
-        kinematics=kinematics, predicted_shears=predicted_shears, step_shears=step_shears,
-    )  # fmt: skip
+    return kernel_set(locals())

@@ -9,7 +9,7 @@ import types as _types
 import warp as wp
 
 from ..common.lanes import lane_functions, warp_minimum
-from ..common.types import kernel_module
+from ..common.types import double_1d, double_3d, int_1d, kernel_module, kernel_set
 from . import materials
 from .matrix import matrix_kernels, scheme_suffix
 from .output import output_kernels
@@ -43,7 +43,8 @@ def element_kernels(
         dissipative: its dissipative form.
     """
     fn = point_functions(dtype, law, slots, affine, damping, framed, midpoint, dissipative)
-    T, vec3, mat33, sym6 = fn.types.T, fn.types.vec3, fn.types.mat33, fn.types.sym
+    p = fn.types
+    T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
     t, m, Block, Local = fn.tensors, fn.law, fn.Block, fn.Local
     NS, needs_J = fn.slots, fn.needs_J
     constant = affine and slots == 4  # F of a straight T4 is constant
@@ -57,16 +58,16 @@ def element_kernels(
     @wp.kernel(module=module)
     def internal_force(
         block: Block,
-        u: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        history: wp.array2d(dtype=sym6),
-        dq_dv: wp.array(dtype=wp.float64),
-        active: wp.array(dtype=wp.int32),
+        u: p.vec3_2d,
+        v: p.vec3_2d,
+        history: p.sym_2d,
+        dq_dv: double_1d,
+        active: int_1d,
         lanes: int,
-        contribution: wp.array2d(dtype=vec3),
-        energy: wp.array3d(dtype=wp.float64),
-        min_J: wp.array(dtype=wp.float64),
-        domain_J: wp.array(dtype=wp.float64),
+        contribution: p.vec3_2d,
+        energy: double_3d,
+        min_J: double_1d,
+        domain_J: double_1d,
     ):
         """Internal force contributions (N), Eqs. (32) and (70), strain energy and viscous potential (J) by element.
 
@@ -131,13 +132,7 @@ def element_kernels(
             energy[1, world, block.element_offset + elem] = lost
 
     @wp.kernel(module=module)
-    def inverted_elements(
-        block: Block,
-        before: wp.array2d(dtype=vec3),
-        u: wp.array2d(dtype=vec3),
-        active: wp.array(dtype=wp.int32),
-        inverted: wp.array(dtype=wp.int32),
-    ):
+    def inverted_elements(block: Block, before: p.vec3_2d, u: p.vec3_2d, active: int_1d, inverted: int_1d):
         """Flag the worlds with a quadrature point that had J > 0 at `before` and has J <= 0 at u."""
         world, elem = wp.tid()
         if active[world] == 0:
@@ -150,12 +145,7 @@ def element_kernels(
                     inverted[world] = 1
 
     @wp.kernel(module=module)
-    def largest_gradient(
-        block: Block,
-        direction: wp.array2d(dtype=vec3),
-        active: wp.array(dtype=wp.int32),
-        gradient_norm: wp.array(dtype=wp.float64),
-    ):
+    def largest_gradient(block: Block, direction: p.vec3_2d, active: int_1d, gradient_norm: double_1d):
         """Largest gradient of a direction at the quadrature points, as a norm: rotation or strain per unit step."""
         world, elem = wp.tid()
         if active[world] == 0:
@@ -170,13 +160,13 @@ def element_kernels(
     @wp.kernel(module=module)
     def tangent_product(
         block: Block,
-        u: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        history: wp.array2d(dtype=sym6),
-        dq_dv: wp.array(dtype=wp.float64),
-        active: wp.array(dtype=wp.int32),
-        direction: wp.array2d(dtype=vec3),
-        contribution: wp.array2d(dtype=vec3),
+        u: p.vec3_2d,
+        v: p.vec3_2d,
+        history: p.sym_2d,
+        dq_dv: double_1d,
+        active: int_1d,
+        direction: p.vec3_2d,
+        contribution: p.vec3_2d,
     ):
         """K p (N) with K = df_int/dq at u, Eqs. (35) and (54); only the symmetric part for damping of the rate form.
 
@@ -194,13 +184,7 @@ def element_kernels(
         fn.store_forces(block, f, world, elem, contribution)
 
     @wp.kernel(module=module)
-    def diagonal_blocks(
-        block: Block,
-        u: wp.array2d(dtype=vec3),
-        dq_dv: wp.array(dtype=wp.float64),
-        active: wp.array(dtype=wp.int32),
-        contribution: wp.array2d(dtype=sym6),
-    ):
+    def diagonal_blocks(block: Block, u: p.vec3_2d, dq_dv: double_1d, active: int_1d, contribution: p.sym_2d):
         """The 3x3 diagonal blocks of K in Voigt order, positive semi-definite at each point, for preconditioners."""
         world, elem = wp.tid()
         if active[world] == 0:
@@ -235,13 +219,4 @@ def element_kernels(
                 entry = block.contribution_offset + i * block.count + elem
                 contribution[world, entry] = contribution[world, entry] + w * fn.to_voigt(K)
 
-    return _types.SimpleNamespace(
-        module=module,
-        internal_force=internal_force,
-        inverted_elements=inverted_elements,
-        largest_gradient=largest_gradient,
-        tangent_product=tangent_product,
-        diagonal_blocks=diagonal_blocks,
-        **vars(matrix_kernels(dtype, law, slots, affine, damping, framed, midpoint, dissipative)),
-        **vars(output_kernels(fn, name)),
-    )
+    return kernel_set(vars(matrix_kernels(fn, name)) | vars(output_kernels(fn, name)) | locals())

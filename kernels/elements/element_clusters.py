@@ -13,7 +13,7 @@ from collections.abc import Callable
 import warp as wp
 
 from ..common.lanes import lane_functions
-from ..common.types import precision
+from ..common.types import double_1d, int_1d, kernel_set, precision
 
 __all__ = [
     "CLUSTER_SIZE",
@@ -150,7 +150,7 @@ def _table_access(words: int) -> Callable:
     """
 
     @wp.func_native(snippet)
-    def access(copy: int, k: int, first: int, source: wp.array(dtype=wp.int32), spare: wp.array(dtype=wp.int32)) -> int:
+    def access(copy: int, k: int, first: int, source: int_1d, spare: int_1d) -> int:
         """Copy COPY_WORDS words of the table if `copy` is set, else return its 16-bit number k."""
 
     return access
@@ -232,14 +232,7 @@ def cluster_functions(dtype: str, size: int, slots: int, fields: int) -> _types.
 
     @wp.func
     def copy_field(
-        field: wp.array2d(dtype=vec3),
-        into: int,
-        slot: Slots,
-        world: int,
-        first: int,
-        lanes: int,
-        count: int,
-        pool: Pool,
+        field: p.vec3_2d, into: int, slot: Slots, world: int, first: int, lanes: int, count: int, pool: Pool
     ):
         """Copy a field at these slots into the memory of the block, as field number `into`.
 
@@ -263,16 +256,16 @@ def cluster_functions(dtype: str, size: int, slots: int, fields: int) -> _types.
         def with_mass_product(
             block: Block,
             clusters: Clusters,
-            u: wp.array2d(dtype=vec3),
-            v: wp.array2d(dtype=vec3),
-            history: wp.array2d(dtype=sym6),
-            mass_factor: wp.array(dtype=wp.float64),
-            dq_dv: wp.array(dtype=wp.float64),
-            active: wp.array(dtype=wp.int32),
-            direction: wp.array2d(dtype=vec3),
+            u: p.vec3_2d,
+            v: p.vec3_2d,
+            history: p.sym_2d,
+            mass_factor: double_1d,
+            dq_dv: double_1d,
+            active: int_1d,
+            direction: p.vec3_2d,
             lanes: int,
             pool: Pool,
-            sums: wp.array2d(dtype=vec3),
+            sums: p.vec3_2d,
         ):
             """(c_M M + (dq/dv) K) p of straight elements, one sum per slot of each cluster.
 
@@ -310,6 +303,4 @@ def cluster_functions(dtype: str, size: int, slots: int, fields: int) -> _types.
 
         return with_mass_product
 
-    return _types.SimpleNamespace(
-        Pool=Pool, fetch=fetch, set_force=set_force, add_force=add_force, make_product_kernel=make_product_kernel
-    )
+    return kernel_set(locals())

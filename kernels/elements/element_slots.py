@@ -22,10 +22,10 @@ def slot_access_functions(dtype: str, slots: int, Block) -> tuple[wp.Function, w
     Args:
         Block: struct of the elements, with conn, is_position, contribution_offset and count.
     """
-    vec3, Local, NS = precision(dtype).vec3, slot_values_type(dtype, slots), slots
+    p, Local, NS = precision(dtype), slot_values_type(dtype, slots), slots
 
     @wp.func
-    def load_slots(block: Block, field: wp.array2d(dtype=vec3), world: int, elem: int) -> Local:
+    def load_slots(block: Block, field: p.vec3_2d, world: int, elem: int) -> Local:
         """Slot values of an element; positions relative to the first slot, so that a translation has no strain."""
         U = Local()
         first = field[world, block.conn[0, elem]]
@@ -34,7 +34,7 @@ def slot_access_functions(dtype: str, slots: int, Block) -> tuple[wp.Function, w
         return U
 
     @wp.func
-    def store_forces(block: Block, f: Local, world: int, elem: int, contribution: wp.array2d(dtype=vec3)):
+    def store_forces(block: Block, f: Local, world: int, elem: int, contribution: p.vec3_2d):
         """Forces on the slots of an element, into its entries of the contributions."""
         for i in range(NS):
             contribution[world, block.contribution_offset + i * block.count + elem] = f[i]

@@ -16,7 +16,7 @@ import types as _types
 
 import warp as wp
 
-from ..common.types import precision
+from ..common.types import kernel_set, precision
 from . import materials
 
 __all__ = ["energy_momentum_law"]
@@ -178,6 +178,4 @@ def _discrete_gradient(dtype: str, second_invariant: bool) -> _types.SimpleNames
         mu = T(2.0) * (c[0] + c[2])
         return t.isotropic_stress(dE, c[1] - two_thirds * mu, mu)
 
-    return _types.SimpleNamespace(
-        mean_stress=mean_stress, mean_increment=mean_increment, rest_moduli_increment=rest_moduli_increment
-    )
+    return kernel_set(locals())

@@ -20,7 +20,7 @@ import types as _types
 
 import warp as wp
 
-from ..common.types import precision
+from ..common.types import kernel_set, precision
 
 __all__ = ["LAWS", "law_functions"]
 
@@ -70,10 +70,7 @@ def tensor_functions(dtype: str) -> _types.SimpleNamespace:
         d = lam + T(2.0) * mu
         return moduli9(d, d, d, lam, lam, lam, mu, mu, mu)
 
-    return _types.SimpleNamespace(
-        identity=identity, green_lagrange=green_lagrange, sym=sym, volume_change=volume_change,
-        isotropic_stress=isotropic_stress, isotropic_moduli=isotropic_moduli, moduli9=moduli9, vec3=vec3,
-    )  # fmt: skip
+    return kernel_set(locals())
 
 
 @functools.cache
@@ -124,9 +121,7 @@ def svk(dtype: str) -> _types.SimpleNamespace:
         geometric = wp.max(T(0.0), wp.dot(a, S * a))
         return (c[0] + c[1]) * wp.outer(Fa, Fa) + c[1] * wp.dot(a, a) * (F * wp.transpose(F)) + geometric * t.identity()
 
-    return _types.SimpleNamespace(
-        energy=energy, stress=stress, increment=increment, block=block, pk2_stress=pk2_stress, moduli=moduli
-    )
+    return kernel_set(locals())
 
 
 @functools.cache
@@ -253,7 +248,7 @@ def mooney_rivlin(dtype: str, second_invariant: bool = True) -> _types.SimpleNam
             )
         return H
 
-    return _types.SimpleNamespace(energy=energy, stress=stress, increment=increment, block=block)
+    return kernel_set(locals())
 
 
 @functools.cache
@@ -327,9 +322,7 @@ def orthotropic(dtype: str) -> _types.SimpleNamespace:
         M[2, 1] = M[1, 2]
         return F * M * wp.transpose(F)
 
-    return _types.SimpleNamespace(
-        energy=energy, stress=stress, increment=increment, block=block, pk2_stress=pk2_stress, moduli=moduli
-    )
+    return kernel_set(locals())
 
 
 LAWS = {"orthotropic": orthotropic, "svk": svk, "mooney_rivlin": mooney_rivlin, "neo_hookean": neo_hookean}

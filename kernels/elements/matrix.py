@@ -10,11 +10,20 @@ import types as _types
 
 import warp as wp
 
-from ..common.types import kernel_module, precision
+from ..common.types import double_1d, int_1d, kernel_module, kernel_set, precision
 from . import materials
-from .points import point_functions
+from .element_slots import slot_values_type
 
-__all__ = ["PANEL_UNROLL", "matrix_kernels", "panel_layout", "panel_row", "panel_row_type", "scheme_suffix"]
+__all__ = [
+    "PANEL_UNROLL",
+    "matrix_column",
+    "matrix_kernels",
+    "panel_layout",
+    "panel_row",
+    "panel_row_type",
+    "scheme_suffix",
+    "store_column_function",
+]
 
 MAX_PANEL_SLOTS = 8
 """Maximum number of slots of a panel: eight 64-bit numbers fill the widest vector registers."""
@@ -45,29 +54,49 @@ def scheme_suffix(midpoint: bool, dissipative: bool) -> str:
     return "_dissipative" if dissipative else "_midpoint" if midpoint else ""
 
 
+@wp.func
+def matrix_column(index: int, count: int):
+    """Element, slot b and component of the column that a thread computes, for `count` elements."""
+    return index % count, index / count / 3, (index / count) % 3
+
+
 @functools.cache
-def matrix_kernels(
-    dtype: str,
-    law: str,
-    slots: int,
-    affine: bool,
-    damping: str | None,
-    framed: bool,
-    midpoint: bool = False,
-    dissipative: bool = False,
-) -> _types.SimpleNamespace:
-    """Kernels `prepare_matrix`, `element_matrix`, `element_matrix_panels`; arguments as those of `element_kernels`."""
-    fn = point_functions(dtype, law, slots, affine, damping, framed, midpoint, dissipative)
-    T, vec3, mat33, sym6 = fn.types.T, fn.types.vec3, fn.types.mat33, fn.types.sym
+def store_column_function(dtype: str, slots: int) -> wp.Function:
+    """Device function that stores a column of an element's matrix."""
+    Local, NS, vec3_3d = slot_values_type(dtype, slots), slots, precision(dtype).vec3_3d
+
+    @wp.func
+    def store_column(K: Local, b: int, axis: int, add: int, world: int, elem: int, matrix: vec3_3d):
+        """Column `axis` of the 3x3 blocks K_ab, a <= b; `add`: see `element_matrix`."""
+        for a in range(NS):
+            if a <= b:
+                pair = a * NS - (a * (a - 1)) / 2 + b - a
+                f = K[a]
+                if add != 0:
+                    f = f + matrix[world, 3 * pair + axis, elem]
+                matrix[world, 3 * pair + axis, elem] = f
+
+    return store_column
+
+
+def matrix_kernels(fn: _types.SimpleNamespace, name: str) -> _types.SimpleNamespace:
+    """Kernels `prepare_matrix`, `element_matrix`, `element_matrix_panels` of one kind of element block.
+
+    Args:
+        fn: the functions of points.py for this kind.
+        name: beginning of the names of the modules.
+    """
+    p = fn.types
+    T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
     t, m, Block, Local, coef = fn.tensors, fn.law, fn.Block, fn.Local, fn.coef
-    NS, needs_J = fn.slots, fn.needs_J
+    NS, needs_J, affine, damping, framed = fn.slots, fn.needs_J, fn.affine, fn.damping, fn.framed
+    midpoint, dissipative = fn.midpoint, fn.dissipative
+    store_column = store_column_function(p.name, NS)
     ETA_INDEX, LAMBDA_V_INDEX = materials.ETA_INDEX, materials.LAMBDA_V_INDEX
-    form = "affine" if affine else "framed" if framed else "table"
-    name = f"element_{dtype}_{law}_{slots}_{form}_{damping}{scheme_suffix(midpoint, dissipative)}"
     module = kernel_module(f"{name}_matrix", max_unroll=16)
     rows_module = kernel_module(f"{name}_rows", max_unroll=PANEL_UNROLL)
     PANELS, P, _ = panel_layout(NS)
-    Rows = panel_row_type(dtype, P)
+    Rows = panel_row_type(p.name, P)
     Slots = wp.types.matrix(shape=(3 * PANELS, P), dtype=T)
     Tensor = wp.types.matrix(shape=(9, 9), dtype=T)
     moduli9 = t.moduli9
@@ -80,7 +109,7 @@ def matrix_kernels(
         V: Local,
         step: Local,
         use_prediction: int,
-        history: wp.array2d(dtype=sym6),
+        history: p.sym_2d,
         dq_dv: wp.float64,
         c: coef,
         form: int,
@@ -135,7 +164,7 @@ def matrix_kernels(
             return m.increment(F - t.identity(), dF, c)
 
     @wp.func
-    def load_velocities(block: Block, v: wp.array2d(dtype=vec3), world: int, elem: int) -> Local:
+    def load_velocities(block: Block, v: p.vec3_2d, world: int, elem: int) -> Local:
         """Velocities of an element's slots if needed by damping (form "rate") or `midpoint`, else zeros."""
         if wp.static(fn.uses_v):
             return fn.load_slots(block, v, world, elem)
@@ -144,13 +173,7 @@ def matrix_kernels(
 
     @wp.func
     def load_last_change(
-        block: Block,
-        v: wp.array2d(dtype=vec3),
-        base: wp.array2d(dtype=vec3),
-        use_prediction: int,
-        dq_dv: wp.float64,
-        world: int,
-        elem: int,
+        block: Block, v: p.vec3_2d, base: p.vec3_2d, use_prediction: int, dq_dv: wp.float64, world: int, elem: int
     ) -> Local:
         """Change of an element's slots in the last iteration, m; zeros unless requested."""
         step = Local()
@@ -161,15 +184,15 @@ def matrix_kernels(
     @wp.kernel(module=module)
     def prepare_matrix(
         block: Block,
-        u: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        base: wp.array2d(dtype=vec3),
-        use_prediction: wp.array(dtype=wp.int32),
-        history: wp.array2d(dtype=sym6),
-        dq_dv: wp.array(dtype=wp.float64),
+        u: p.vec3_2d,
+        v: p.vec3_2d,
+        base: p.vec3_2d,
+        use_prediction: int_1d,
+        history: p.sym_2d,
+        dq_dv: double_1d,
         form: int,
-        active: wp.array(dtype=wp.int32),
-        lines: wp.array3d(dtype=vec3),
+        active: int_1d,
+        lines: p.vec3_3d,
     ):
         """F and S of `point_state`, common to all columns of an element's matrix: [world, 5 point + row, elem].
 
@@ -189,7 +212,7 @@ def matrix_kernels(
         lines[world, 5 * point + 4, elem] = vec3(S[1, 2], S[0, 2], S[0, 1])
 
     @wp.func
-    def load_point(lines: wp.array3d(dtype=vec3), world: int, point: int, elem: int):
+    def load_point(lines: p.vec3_3d, world: int, point: int, elem: int):
         """F and S of a point from the rows of `prepare_matrix`."""
         F = wp.matrix_from_rows(
             lines[world, 5 * point, elem], lines[world, 5 * point + 1, elem], lines[world, 5 * point + 2, elem]
@@ -213,13 +236,13 @@ def matrix_kernels(
     @wp.kernel(module=module)
     def element_matrix(
         block: Block,
-        dq_dv: wp.array(dtype=wp.float64),
-        lines: wp.array3d(dtype=vec3),
-        use_prediction: wp.array(dtype=wp.int32),
+        dq_dv: double_1d,
+        lines: p.vec3_3d,
+        use_prediction: int_1d,
         form: int,
         add: int,
-        active: wp.array(dtype=wp.int32),
-        matrix: wp.array3d(dtype=vec3),
+        active: int_1d,
+        matrix: p.vec3_3d,
     ):
         """K of each element, Eqs. (35) and (54), as the columns of its 3x3 blocks K_ab, a <= b; one thread per column.
 
@@ -231,10 +254,7 @@ def matrix_kernels(
         world, index = wp.tid()
         if active[world] == 0:
             return
-        column = index / block.count
-        elem = index % block.count
-        b = column / 3
-        axis = column % 3
+        elem, b, axis = matrix_column(index, block.count)
         c = fn.coefficients(block, world, elem)
         cv = fn.damping_coefficients(c, T(1.0) / T(dq_dv[world]))
         unit = vec3()
@@ -271,12 +291,7 @@ def matrix_kernels(
                         out[a] = out[a] + dP * block.shape_gradient[point, a, 0]
                     else:
                         out[a] = out[a] + dP * block.shape_gradient[point, a, elem]
-        for a in range(NS):
-            if a <= b:
-                pair = a * NS - (a * (a - 1)) / 2 + b - a
-                if add != 0:
-                    out[a] = out[a] + matrix[world, 3 * pair + axis, elem]
-                matrix[world, 3 * pair + axis, elem] = out[a]
+        store_column(out, b, axis, add, world, elem, matrix)
 
     @wp.func
     def elasticity_tensor(block: Block, F: mat33, S: mat33, moduli: moduli9, c: coef, positive: bool, w: T) -> Tensor:
@@ -337,14 +352,14 @@ def matrix_kernels(
     @wp.kernel(module=rows_module)
     def element_matrix_panels(
         block: Block,
-        u: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        base: wp.array2d(dtype=vec3),
-        use_prediction: wp.array(dtype=wp.int32),
-        history: wp.array2d(dtype=sym6),
-        dq_dv: wp.array(dtype=wp.float64),
+        u: p.vec3_2d,
+        v: p.vec3_2d,
+        base: p.vec3_2d,
+        use_prediction: int_1d,
+        history: p.sym_2d,
+        dq_dv: double_1d,
         form: int,
-        active: wp.array(dtype=wp.int32),
+        active: int_1d,
         add: int,
         matrix: wp.array3d(dtype=Rows),
     ):
@@ -406,6 +421,4 @@ def matrix_kernels(
                             R[k] = R[k] + g[0] * D[6 * i + k] + g[1] * D[6 * i + 3 + k] + g[2] * D[6 * i + 6 + k]
                     matrix[world, elem, row] = R
 
-    return _types.SimpleNamespace(
-        prepare_matrix=prepare_matrix, element_matrix=element_matrix, element_matrix_panels=element_matrix_panels
-    )
+    return kernel_set(locals())

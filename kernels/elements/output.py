@@ -4,7 +4,7 @@ import types as _types
 
 import warp as wp
 
-from ..common.types import kernel_module
+from ..common.types import double_1d, double_2d, int_1d, kernel_module, kernel_set
 from . import materials
 
 __all__ = ["output_kernels"]
@@ -21,19 +21,14 @@ def output_kernels(fn: _types.SimpleNamespace, name: str) -> _types.SimpleNamesp
     moving_module = kernel_module(f"{name}_history_moving")
     viscous_module = kernel_module(f"{name}_viscous")
     stress_module = kernel_module(f"{name}_stress")
-    T, vec3, sym6 = fn.types.T, fn.types.vec3, fn.types.sym
+    p = fn.types
+    T, vec3, sym6 = p.T, p.vec3, p.sym
     t, m, Block, Local = fn.tensors, fn.law, fn.Block, fn.Local
     ETA_INDEX, LAMBDA_V_INDEX = materials.ETA_INDEX, materials.LAMBDA_V_INDEX
 
     @wp.kernel(module=history_module)
     def strain_history(
-        block: Block,
-        u0: wp.array2d(dtype=vec3),
-        u1: wp.array2d(dtype=vec3),
-        a0: wp.array(dtype=wp.float64),
-        a1: wp.array(dtype=wp.float64),
-        active: wp.array(dtype=wp.int32),
-        history: wp.array2d(dtype=sym6),
+        block: Block, u0: p.vec3_2d, u1: p.vec3_2d, a0: double_1d, a1: double_1d, active: int_1d, history: p.sym_2d
     ):
         """a0 E(u0) - a1 E(u1) per point in the law's axes: reference of incremental strain rates."""
         world, elem = wp.tid()
@@ -54,13 +49,13 @@ def output_kernels(fn: _types.SimpleNamespace, name: str) -> _types.SimpleNamesp
     @wp.kernel(module=moving_module)
     def strain_history_with_velocity(
         block: Block,
-        u: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        a: wp.array2d(dtype=vec3),
-        b: wp.array(dtype=wp.float64),
-        q_a: wp.array(dtype=wp.float64),
-        active: wp.array(dtype=wp.int32),
-        history: wp.array2d(dtype=sym6),
+        u: p.vec3_2d,
+        v: p.vec3_2d,
+        a: p.vec3_2d,
+        b: double_1d,
+        q_a: double_1d,
+        active: int_1d,
+        history: p.sym_2d,
     ):
         """E + b dE/dt + q_a d2E/dt2 per point in the law's axes: reference of strain rates for schemes with velocity
         and a."""
@@ -82,12 +77,7 @@ def output_kernels(fn: _types.SimpleNamespace, name: str) -> _types.SimpleNamesp
 
     @wp.kernel(module=viscous_module)
     def viscous_force(
-        block: Block,
-        u: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        active: wp.array(dtype=wp.int32),
-        contribution: wp.array2d(dtype=vec3),
-        power: wp.array2d(dtype=wp.float64),
+        block: Block, u: p.vec3_2d, v: p.vec3_2d, active: int_1d, contribution: p.vec3_2d, power: double_2d
     ):
         """Kelvin-Voigt force (N), Eqs. (58)-(70), at a given state, and the power S_vis : Edot (W) lost."""
         world, elem = wp.tid()
@@ -109,12 +99,7 @@ def output_kernels(fn: _types.SimpleNamespace, name: str) -> _types.SimpleNamesp
         power[world, block.element_offset + elem] = wp.float64(rate_of_work)
 
     @wp.kernel(module=stress_module)
-    def point_stress(
-        block: Block,
-        u: wp.array2d(dtype=vec3),
-        stress: wp.array3d(dtype=sym6),
-        jacobian: wp.array3d(dtype=T),
-    ):
+    def point_stress(block: Block, u: p.vec3_2d, stress: wp.array3d(dtype=sym6), jacobian: p.scalar_3d):
         """Cauchy stress P F^T / J (Pa, elastic part, Voigt order) and J at the points, [world, point, elem]."""
         world, elem = wp.tid()
         c = fn.coefficients(block, world, elem)
@@ -126,7 +111,4 @@ def output_kernels(fn: _types.SimpleNamespace, name: str) -> _types.SimpleNamesp
             stress[world, point, elem] = fn.to_voigt((T(1.0) / J) * (P + P * wp.transpose(G)))
             jacobian[world, point, elem] = J
 
-    return _types.SimpleNamespace(
-        strain_history=strain_history, strain_history_with_velocity=strain_history_with_velocity,
-        viscous_force=viscous_force, point_stress=point_stress,
-    )  # fmt: skip
+    return kernel_set(locals())

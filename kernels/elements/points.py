@@ -10,7 +10,7 @@ import types as _types
 
 import warp as wp
 
-from ..common.types import precision
+from ..common.types import kernel_set, precision
 from . import materials
 from .element_slots import slot_access_functions, slot_values_type
 from .energy_momentum import energy_momentum_law
@@ -198,7 +198,7 @@ def point_functions(
 
     @wp.func
     def strain_rate(
-        block: Block, G: mat33, Fdot: mat33, history: wp.array2d(dtype=sym6), dq: T, world: int, point: int, elem: int
+        block: Block, G: mat33, Fdot: mat33, history: p.sym_2d, dq: T, world: int, point: int, elem: int
     ) -> mat33:
         """Edot at a point in the law's axes, 1/s.
 
@@ -307,7 +307,7 @@ def point_functions(
         G: mat33,
         dG: mat33,
         Fdot: mat33,
-        history: wp.array2d(dtype=sym6),
+        history: p.sym_2d,
         c: coef,
         dq: T,
         form: int,
@@ -350,15 +350,7 @@ def point_functions(
 
     @wp.func
     def tangent_force(
-        block: Block,
-        U: Local,
-        dU: Local,
-        V: Local,
-        history: wp.array2d(dtype=sym6),
-        dq: T,
-        form: int,
-        world: int,
-        elem: int,
+        block: Block, U: Local, dU: Local, V: Local, history: p.sym_2d, dq: T, form: int, world: int, elem: int
     ) -> Local:
         """K dU of an element: its forces for a change dU of its slots, Eqs. (35) and (54) applied to a vector.
 
@@ -374,16 +366,4 @@ def point_functions(
             f = add_point_forces(block, f, dP, point, elem)
         return f
 
-    return _types.SimpleNamespace(
-        types=p, tensors=t, law=m, Block=Block, Local=Local, coef=coef, slots=slots, affine=affine, damping=damping,
-        framed=framed, needs_J=needs_J, midpoint=midpoint, uses_v=uses_v, mean=mean, tangent_weight=tangent_weight,
-        coefficients=coefficients, damping_coefficients=damping_coefficients, load_slots=load_slots,
-        store_forces=store_forces, inverse_jacobian=inverse_jacobian, field_gradient=field_gradient,
-        point_weight=point_weight, add_point_forces=add_point_forces, to_voigt=to_voigt, from_voigt=from_voigt,
-        to_material_axes=to_material_axes, to_body_axes=to_body_axes, history_index=history_index,
-        velocity_gradient=velocity_gradient, strain_rate=strain_rate, vertex_jacobian=vertex_jacobian,
-        point_increment=point_increment, predicted_stress_change=predicted_stress_change,
-        max_compression=max_compression, spd_increment=spd_increment, midpoint_stress=midpoint_stress,
-        midpoint_stress_increment=midpoint_stress_increment, dissipation_factor=dissipation_factor,
-        tangent_force=tangent_force,
-    )  # fmt: skip
+    return kernel_set(locals() | {"types": p, "tensors": t, "law": m})

@@ -5,7 +5,7 @@ import types as _types
 
 import warp as wp
 
-from ..common.types import kernel_module
+from ..common.types import double_1d, int_1d, kernel_module
 from .points import point_functions
 
 __all__ = ["predicted_stress_product"]
@@ -15,7 +15,8 @@ __all__ = ["predicted_stress_product"]
 def predicted_stress_product(dtype: str, law: str, slots: int, affine: bool, framed: bool) -> wp.Kernel:
     """Kernel for one kind of element block, without viscosity; arguments as those of `element_kernels`."""
     fn: _types.SimpleNamespace = point_functions(dtype, law, slots, affine, None, framed)
-    T, vec3, mat33, sym6 = fn.types.T, fn.types.vec3, fn.types.mat33, fn.types.sym
+    p = fn.types
+    T, mat33 = p.T, p.mat33
     Block, t = fn.Block, fn.tensors
     form = "affine" if affine else "framed" if framed else "table"
     module = kernel_module(f"element_{dtype}_{law}_{slots}_{form}_mixed")
@@ -23,15 +24,15 @@ def predicted_stress_product(dtype: str, law: str, slots: int, affine: bool, fra
     @wp.kernel(module=module)
     def product(
         block: Block,
-        u: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        base: wp.array2d(dtype=vec3),
-        use_prediction: wp.array(dtype=wp.int32),
-        history: wp.array2d(dtype=sym6),
-        dq_dv: wp.array(dtype=wp.float64),
-        active: wp.array(dtype=wp.int32),
-        direction: wp.array2d(dtype=vec3),
-        contribution: wp.array2d(dtype=vec3),
+        u: p.vec3_2d,
+        v: p.vec3_2d,
+        base: p.vec3_2d,
+        use_prediction: int_1d,
+        history: p.sym_2d,
+        dq_dv: double_1d,
+        active: int_1d,
+        direction: p.vec3_2d,
+        contribution: p.vec3_2d,
     ):
         """K p (N); `base`: v at the previous iterate, for worlds with `use_prediction` 1; `use_prediction` 2: positive
         semi-definite form."""

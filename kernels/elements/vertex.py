@@ -51,14 +51,9 @@ def vertex_product(points: int, fn: _types.SimpleNamespace, shared: _types.Simpl
         shared: functions of kernels/elements/element_clusters.py.
     """
     p, rate = fn.types, fn.uses_v
-    T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
+    T, vec3, mat33 = p.T, p.vec3, p.mat33
     Pool, fetch, set_force, add_force = shared.Pool, shared.fetch, shared.set_force, shared.add_force
-    Block, coefficients, inverse_jacobian, point_increment = (
-        fn.Block,
-        fn.coefficients,
-        fn.inverse_jacobian,
-        fn.point_increment,
-    )
+    Block, inverse_jacobian, point_increment = fn.Block, fn.inverse_jacobian, fn.point_increment
     Local = wp.types.matrix(shape=(10, 3), dtype=T)
     FIRST_VERTEX_POINT = points - 4
 
@@ -67,9 +62,7 @@ def vertex_product(points: int, fn: _types.SimpleNamespace, shared: _types.Simpl
         """sum_b u_e(b) dL_b^T of a field: E_v with e = e(v, .), C with the corners."""
         o = fetch(pool, field, e[0], at)
         return wp.matrix_from_cols(
-            fetch(pool, field, e[1], at) - o,
-            fetch(pool, field, e[2], at) - o,
-            fetch(pool, field, e[3], at) - o,
+            fetch(pool, field, e[1], at) - o, fetch(pool, field, e[2], at) - o, fetch(pool, field, e[3], at) - o
         )
 
     @wp.func
@@ -128,21 +121,13 @@ def vertex_product(points: int, fn: _types.SimpleNamespace, shared: _types.Simpl
 
     @wp.func
     def product(
-        block: Block,
-        pool: Pool,
-        history: wp.array2d(dtype=sym6),
-        dq: T,
-        scale: T,
-        form: int,
-        world: int,
-        elem: int,
-        at: int,
+        block: Block, pool: Pool, history: p.sym_2d, dq: T, scale: T, form: int, world: int, elem: int, at: int
     ):
         """Set the forces (scale M + dq K) p of element `at` of a cluster.
 
         Slots are read again at each vertex and forces are stored in the pool, to save registers.
         """
-        c = coefficients(block, world, elem)
+        c = fn.coefficients(block, world, elem)
         # the first function's gradient at the first vertex's point is 3 s dL_0
         s = -block.shape_gradient[FIRST_VERTEX_POINT, 0, 0][0] / T(3.0)
         H = gradient_common_part(pool, DISPLACEMENT, at, s)

@@ -37,7 +37,8 @@ def with_mass_kernel(
         midpoint, dissipative: of the conserving scheme, see `point_functions`.
     """
     fn = point_functions(dtype, law, slots, True, damping, False, midpoint, dissipative)
-    T, vec3, sym6 = fn.types.T, fn.types.vec3, fn.types.sym
+    p = fn.types
+    T, vec3 = p.T, p.vec3
     Block, Local, NS = fn.Block, fn.Local, fn.slots
     shared = cluster_functions(dtype, size, slots, 3 if fn.uses_v else 2)
     Pool = shared.Pool
@@ -61,15 +62,7 @@ def with_mass_kernel(
 
         @wp.func
         def product(
-            block: Block,
-            pool: Pool,
-            history: wp.array2d(dtype=sym6),
-            dq: T,
-            scale: T,
-            form: int,
-            world: int,
-            elem: int,
-            at: int,
+            block: Block, pool: Pool, history: p.sym_2d, dq: T, scale: T, form: int, world: int, elem: int, at: int
         ):
             """Set the forces (scale M + dq K) p of element `at` of a cluster."""
             u = fetch_slots(block, pool, DISPLACEMENT, at)

@@ -5,6 +5,7 @@ import types as _types
 import warp as wp
 
 from ..common.traits import Traits
+from ..common.types import int_1d, kernel_set
 from .convergence import STALL_ROUNDINGS, convergence_functions
 from .newton_control import FAIL_CONSTRAINT, FAIL_ITERATIONS, ROW_FROZEN_CHANGE, control_struct
 
@@ -36,7 +37,7 @@ def outer_loop_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamesp
     )
 
     @wp.kernel(module=module)
-    def begin_frozen_update(ctl: Control, flags: wp.array(dtype=wp.int32)):
+    def begin_frozen_update(ctl: Control, flags: int_1d):
         """Flag the worlds whose frozen quantities are due for an update: the residual is small enough."""
         world = wp.tid()
         flags[world] = 0
@@ -52,7 +53,7 @@ def outer_loop_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamesp
                 record_residual(ctl, world)
 
     @wp.kernel(module=module)
-    def end_frozen_update(ctl: Control, flags: wp.array(dtype=wp.int32)):
+    def end_frozen_update(ctl: Control, flags: int_1d):
         """Re-evaluate the iterate of the flagged worlds with the updated frozen quantities."""
         world = wp.tid()
         if ctl.active[world] != 0 and flags[world] != 0:
@@ -76,7 +77,7 @@ def outer_loop_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamesp
                     give_up(ctl, world, FAIL_ITERATIONS)
 
     @wp.kernel(module=module)
-    def check_constraints(ctl: Control, running: wp.array(dtype=wp.int32), tol: f64, limit: int):
+    def check_constraints(ctl: Control, running: int_1d, tol: f64, limit: int):
         """Classical multiplier updates: start another inner solve if a constraint is still violated."""
         world = wp.tid()
         ctl.trial_accepted[world] = 0
@@ -101,9 +102,4 @@ def outer_loop_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamesp
         if ctl.active[world] != 0:
             ctl.limit[world] = f64(1.0)
 
-    return _types.SimpleNamespace(
-        reset_step_limit=reset_step_limit,
-        check_constraints=check_constraints,
-        begin_frozen_update=begin_frozen_update,
-        end_frozen_update=end_frozen_update,
-    )
+    return kernel_set(locals())

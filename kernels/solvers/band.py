@@ -10,7 +10,7 @@ import types as _types
 import warp as wp
 
 from ..common.structs import pattern_struct
-from ..common.types import kernel_module, precision
+from ..common.types import int_1d, kernel_module, kernel_set, precision
 
 __all__ = ["BLOCK", "band_kernels", "block_column_type"]
 
@@ -40,7 +40,7 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
     module = kernel_module(f"band_{dtype}", max_unroll=BLOCK)
 
     @wp.kernel(module=module)
-    def clear_band(slots: int, width: int, active: wp.array(dtype=wp.int32), band: wp.array3d(dtype=Column)):
+    def clear_band(slots: int, width: int, active: int_1d, band: wp.array3d(dtype=Column)):
         """Set the band to zero, with ones on the diagonal beyond the slots; one thread per block row."""
         world, row = wp.tid()
         if active[world] == 0:
@@ -54,11 +54,11 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
     @wp.kernel(module=module)
     def fill_band(
         pattern: Pattern,
-        value: wp.array2d(dtype=mat33),
-        position_of: wp.array(dtype=wp.int32),
+        value: p.mat33_2d,
+        position_of: int_1d,
         width: int,
-        shift: wp.array(dtype=T),
-        active: wp.array(dtype=wp.int32),
+        shift: p.scalar_1d,
+        active: int_1d,
         band: wp.array3d(dtype=Column),
     ):
         """Lower half of A + shift |D|, D = diag A, with slots in the order of `position_of`; one thread per slot.
@@ -115,12 +115,7 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
         return wp.transpose(rows)
 
     @wp.kernel(module=module)
-    def factor_band(
-        width: int,
-        active: wp.array(dtype=wp.int32),
-        replaced_pivots: wp.array(dtype=wp.int32),
-        band: wp.array3d(dtype=Column),
-    ):
+    def factor_band(width: int, active: int_1d, replaced_pivots: int_1d, band: wp.array3d(dtype=Column)):
         """Factor A into L, in place; `replaced_pivots`: number of unknowns whose pivot was replaced."""
         world = wp.tid()
         if active[world] == 0:
@@ -162,9 +157,7 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
         replaced_pivots[world] = count
 
     @wp.kernel(module=module)
-    def begin_factorisation(
-        flags: wp.array(dtype=wp.int32), factoring: wp.array(dtype=wp.int32), shift: wp.array(dtype=T)
-    ):
+    def begin_factorisation(flags: int_1d, factoring: int_1d, shift: p.scalar_1d):
         """Initialise the flagged worlds without shift."""
         world = wp.tid()
         factoring[world] = flags[world]
@@ -172,13 +165,7 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
             shift[world] = T(0.0)
 
     @wp.kernel(module=module)
-    def raise_shift(
-        replaced_pivots: wp.array(dtype=wp.int32),
-        factoring: wp.array(dtype=wp.int32),
-        shift: wp.array(dtype=T),
-        refactor: wp.array(dtype=wp.int32),
-        exact: wp.array(dtype=wp.int32),
-    ):
+    def raise_shift(replaced_pivots: int_1d, factoring: int_1d, shift: p.scalar_1d, refactor: int_1d, exact: int_1d):
         """If A was not positive definite, raise the shift, up to 1, and request another factorisation.
 
         `exact`: the factors are those of A.
@@ -197,11 +184,11 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
     def solve(
         width: int,
         band: wp.array3d(dtype=Column),
-        slot_at: wp.array(dtype=wp.int32),
-        r: wp.array2d(dtype=vec3),
-        active: wp.array(dtype=wp.int32),
+        slot_at: int_1d,
+        r: p.vec3_2d,
+        active: int_1d,
         y: wp.array2d(dtype=Column),
-        z: wp.array2d(dtype=vec3),
+        z: p.vec3_2d,
     ):
         """z = A^-1 r by forward and backward substitution; y holds the forward solution."""
         world = wp.tid()
@@ -241,13 +228,4 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
                     t[k] = t[k] - wp.dot(band[world, row, at + k], x)
                 y[world, other] = t
 
-    return _types.SimpleNamespace(
-        module=module,
-        begin_factorisation=begin_factorisation,
-        clear_band=clear_band,
-        fill_band=fill_band,
-        factor_band=factor_band,
-        raise_shift=raise_shift,
-        solve=solve,
-        inverse_factor=inverse_factor,
-    )
+    return kernel_set(locals())

@@ -18,7 +18,7 @@ import warp as wp
 
 from ..common.lanes import WARP_SIZE, block_memory, lane_functions
 from ..common.structs import pattern_struct
-from ..common.types import kernel_module, precision
+from ..common.types import int_1d, kernel_module, kernel_set, precision
 from .band import BLOCK, band_kernels, block_column_type
 
 __all__ = ["band_block_kernels", "solution_memory_size", "window_size"]
@@ -79,8 +79,8 @@ def band_block_kernels(dtype: str, rows: int, width: int) -> _types.SimpleNamesp
 
     @wp.func
     def load_window_row(
-        at: wp.uint64, pattern: Pattern, value: wp.array2d(dtype=mat33), slot_at: wp.array(dtype=wp.int32),
-        position_of: wp.array(dtype=wp.int32), shift: T, world: int, row: int, lane: int, lanes: int,
+        at: wp.uint64, pattern: Pattern, value: p.mat33_2d, slot_at: int_1d,
+        position_of: int_1d, shift: T, world: int, row: int, lane: int, lanes: int,
     ):  # fmt: skip
         """Load a block row of A + shift |diag A| into the window; ones on the diagonal beyond the unknowns."""
         for k in range(lane, WINDOW_ROW_STRIDE, lanes):
@@ -148,9 +148,9 @@ def band_block_kernels(dtype: str, rows: int, width: int) -> _types.SimpleNamesp
 
     @wp.kernel(module=module)
     def factor(
-        lanes: int, global_memory: wp.array2d(dtype=T), pattern: Pattern, value: wp.array2d(dtype=mat33),
-        slot_at: wp.array(dtype=wp.int32), position_of: wp.array(dtype=wp.int32), shift: wp.array(dtype=T),
-        active: wp.array(dtype=wp.int32), replaced_pivots: wp.array(dtype=wp.int32), band: wp.array3d(dtype=Column),
+        lanes: int, global_memory: p.scalar_2d, pattern: Pattern, value: p.mat33_2d,
+        slot_at: int_1d, position_of: int_1d, shift: p.scalar_1d,
+        active: int_1d, replaced_pivots: int_1d, band: wp.array3d(dtype=Column),
     ):  # fmt: skip
         """Factors of A; `replaced_pivots`: number of unknowns whose pivot was replaced."""
         thread = wp.tid()
@@ -237,9 +237,9 @@ def band_block_kernels(dtype: str, rows: int, width: int) -> _types.SimpleNamesp
 
     @wp.kernel(module=module)
     def solve(
-        lanes: int, global_memory: wp.array2d(dtype=T), band: wp.array3d(dtype=Column),
-        slot_at: wp.array(dtype=wp.int32), r: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32),
-        z: wp.array2d(dtype=vec3),
+        lanes: int, global_memory: p.scalar_2d, band: wp.array3d(dtype=Column),
+        slot_at: int_1d, r: p.vec3_2d, active: int_1d,
+        z: p.vec3_2d,
     ):  # fmt: skip
         """z = A^-1 r: D^-1, forward and backward substitution with U, D^-T."""
         thread = wp.tid()
@@ -286,4 +286,4 @@ def band_block_kernels(dtype: str, rows: int, width: int) -> _types.SimpleNamesp
             z[world, slot_at[i / 3]][i % 3] = s
 
     lanes = (4 if width > MAX_ONE_WARP_WIDTH else 1) * WARP_SIZE
-    return _types.SimpleNamespace(module=module, lanes=lanes, factor=factor, solve=solve)
+    return kernel_set(locals())

@@ -11,7 +11,7 @@ import types as _types
 
 import warp as wp
 
-from ..common.types import kernel_module, precision
+from ..common.types import double_3d, kernel_module, kernel_set, precision
 from .newton_control import control_struct
 from .pcg import forcing_functions, pcg_struct
 
@@ -98,13 +98,13 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> _types.Simple
     @wp.kernel(module=module)
     def first_direction(
         ctl: Control,
-        z: wp.array2d(dtype=vec3),
-        r: wp.array2d(dtype=vec3),
-        x: wp.array2d(dtype=vec3),
-        shadow: wp.array2d(dtype=vec3),
-        p_out: wp.array2d(dtype=vec3),
-        best_x: wp.array2d(dtype=vec3),
-        best_r: wp.array2d(dtype=vec3),
+        z: p.vec3_2d,
+        r: p.vec3_2d,
+        x: p.vec3_2d,
+        shadow: p.vec3_2d,
+        p_out: p.vec3_2d,
+        best_x: p.vec3_2d,
+        best_r: p.vec3_2d,
     ):
         """r^ = B r, p = r; the start is the initial best."""
         world, slot = wp.tid()
@@ -132,14 +132,7 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> _types.Simple
                 ctl.negative_curvature[world] = 1
 
     @wp.kernel(module=module)
-    def half_step(
-        ctl: Control,
-        bi: Recursion,
-        y: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        x: wp.array2d(dtype=vec3),
-        r: wp.array2d(dtype=vec3),
-    ):
+    def half_step(ctl: Control, bi: Recursion, y: p.vec3_2d, v: p.vec3_2d, x: p.vec3_2d, r: p.vec3_2d):
         """x += alpha y, r -= alpha v."""
         world, slot = wp.tid()
         if ctl.active[world] != 0:
@@ -160,12 +153,7 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> _types.Simple
 
     @wp.kernel(module=module)
     def second_dot_terms(
-        ctl: Control,
-        diagonal: wp.array2d(dtype=vec3),
-        r: wp.array2d(dtype=vec3),
-        t: wp.array2d(dtype=vec3),
-        shadow: wp.array2d(dtype=vec3),
-        rows: wp.array3d(dtype=f64),
+        ctl: Control, diagonal: p.vec3_2d, r: p.vec3_2d, t: p.vec3_2d, shadow: p.vec3_2d, rows: double_3d
     ):
         """t.D^-1 r, t.D^-1 t, r^.r, r^.t per slot."""
         world, slot = wp.tid()
@@ -212,14 +200,14 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> _types.Simple
     def full_step(
         ctl: Control,
         bi: Recursion,
-        z: wp.array2d(dtype=vec3),
-        t: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        x: wp.array2d(dtype=vec3),
-        r: wp.array2d(dtype=vec3),
-        p_out: wp.array2d(dtype=vec3),
-        best_x: wp.array2d(dtype=vec3),
-        best_r: wp.array2d(dtype=vec3),
+        z: p.vec3_2d,
+        t: p.vec3_2d,
+        v: p.vec3_2d,
+        x: p.vec3_2d,
+        r: p.vec3_2d,
+        p_out: p.vec3_2d,
+        best_x: p.vec3_2d,
+        best_r: p.vec3_2d,
     ):
         """x += omega z, r -= omega t, p = r + beta (p - omega v) while the solve continues."""
         world, slot = wp.tid()
@@ -273,13 +261,7 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> _types.Simple
 
     @wp.kernel(module=module)
     def restore_best_iterate(
-        newton: Newton,
-        ctl: Control,
-        bi: Recursion,
-        best_x: wp.array2d(dtype=vec3),
-        best_r: wp.array2d(dtype=vec3),
-        x: wp.array2d(dtype=vec3),
-        r: wp.array2d(dtype=vec3),
+        newton: Newton, ctl: Control, bi: Recursion, best_x: p.vec3_2d, best_r: p.vec3_2d, x: p.vec3_2d, r: p.vec3_2d
     ):
         """x and r of the smallest residual."""
         world, slot = wp.tid()
@@ -289,18 +271,4 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> _types.Simple
             x[world, slot] = best_x[world, slot]
             r[world, slot] = best_r[world, slot]
 
-    return _types.SimpleNamespace(
-        module=module,
-        begin_solve=begin_solve,
-        first_direction=first_direction,
-        compute_alpha=compute_alpha,
-        half_step=half_step,
-        check_half_step=check_half_step,
-        second_dot_terms=second_dot_terms,
-        compute_omega=compute_omega,
-        full_step=full_step,
-        deactivate_finished=deactivate_finished,
-        restore_best_iterate=restore_best_iterate,
-        request_restarts=request_restarts,
-        restart=restart,
-    )
+    return kernel_set(locals())

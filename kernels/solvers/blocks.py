@@ -10,7 +10,7 @@ import warp as wp
 
 from ..common.inverse import inverse_function
 from ..common.structs import pattern_struct, topology_struct
-from ..common.types import SHORT_UNROLL, kernel_module, precision
+from ..common.types import SHORT_UNROLL, double_1d, int_1d, int_2d, kernel_module, kernel_set, precision
 from ..elements.matrix import panel_layout, panel_row
 
 __all__ = ["assembly_kernels", "block_kernels"]
@@ -22,7 +22,6 @@ def assembly_kernels(dtype: str, slots: int, rows: bool) -> _types.SimpleNamespa
     `rows`, of `element_matrix_panels`."""
     p = precision(dtype)
     T, vec3, mat33 = p.T, p.vec3, p.mat33
-    f64 = wp.float64
     Topology = topology_struct(dtype)
     Pattern = pattern_struct()
     NS = slots
@@ -57,12 +56,12 @@ def assembly_kernels(dtype: str, slots: int, rows: bool) -> _types.SimpleNamespa
     def list_contributions(
         topo: Topology,
         pattern: Pattern,
-        conn: wp.array2d(dtype=wp.int32),
+        conn: int_2d,
         offset: int,
         count: int,
         listing: int,
-        start: wp.array(dtype=wp.int32),
-        source: wp.array(dtype=wp.int32),
+        start: int_1d,
+        source: int_1d,
     ):
         """Contributions of elements to an entry of Pattern.upper: start[index + 1] = their number, or with `listing`
         the `source`s from start[index] on, 2 (BLOCKS_PER_ELEMENT elem + block index) + 1 for a transposed block."""
@@ -87,15 +86,15 @@ def assembly_kernels(dtype: str, slots: int, rows: bool) -> _types.SimpleNamespa
     def add_element_matrices(
         topo: Topology,
         pattern: Pattern,
-        start: wp.array(dtype=wp.int32),
-        source: wp.array(dtype=wp.int32),
+        start: int_1d,
+        source: int_1d,
         matrix: wp.array3d(dtype=Number),
-        mass: wp.array2d(dtype=T),
+        mass: p.scalar_2d,
         first: int,
-        mass_factor: wp.array(dtype=f64),
-        dq_dv: wp.array(dtype=f64),
-        active: wp.array(dtype=wp.int32),
-        value: wp.array2d(dtype=mat33),
+        mass_factor: double_1d,
+        dq_dv: double_1d,
+        active: int_1d,
+        value: p.mat33_2d,
     ):
         """value += (dq/dv) K of an element block; `first`: = c_M M + (dq/dv) K.
 
@@ -151,12 +150,7 @@ def block_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def invert_diagonal_blocks(
-        topo: Topology,
-        pattern: Pattern,
-        value: wp.array2d(dtype=mat33),
-        active: wp.array(dtype=wp.int32),
-        diagonal: wp.array2d(dtype=vec3),
-        inverse: wp.array2d(dtype=mat33),
+        topo: Topology, pattern: Pattern, value: p.mat33_2d, active: int_1d, diagonal: p.vec3_2d, inverse: p.mat33_2d
     ):
         """Diagonal D and inverses of the diagonal blocks on the free components."""
         world, slot = wp.tid()
@@ -174,13 +168,13 @@ def block_kernels(dtype: str) -> _types.SimpleNamespace:
     @wp.kernel(module=module)
     def galerkin_product(
         pair: wp.array(dtype=wp.vec3i),
-        pair_start: wp.array(dtype=wp.int32),
+        pair_start: int_1d,
         fine_entry: wp.array(dtype=wp.vec3i),
         weight: wp.array(dtype=vec4),
-        free: wp.array(dtype=vec3),
-        fine: wp.array2d(dtype=mat33),
-        active: wp.array(dtype=wp.int32),
-        coarse: wp.array2d(dtype=mat33),
+        free: p.vec3_1d,
+        fine: p.mat33_2d,
+        active: int_1d,
+        coarse: p.mat33_2d,
     ):
         """P^T A P: for two groups and two of their functions the sum of w w' A over the entries between them.
 
@@ -208,14 +202,9 @@ def block_kernels(dtype: str) -> _types.SimpleNamespace:
         coarse[world, at[0] + k * at[1] + at[2] + l] = A
 
     @wp.kernel(module=module)
-    def select_worlds(flags: wp.array(dtype=wp.int32), first: int, last: int, out: wp.array(dtype=wp.int32)):
+    def select_worlds(flags: int_1d, first: int, last: int, out: int_1d):
         """Flags of the worlds first .. last - 1, zero of others."""
         world = wp.tid()
         out[world] = wp.where(world >= first and world < last, flags[world], 0)
 
-    return _types.SimpleNamespace(
-        select_worlds=select_worlds,
-        module=module,
-        invert_diagonal_blocks=invert_diagonal_blocks,
-        galerkin_product=galerkin_product,
-    )
+    return kernel_set(locals())

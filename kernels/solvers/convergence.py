@@ -6,6 +6,7 @@ import types as _types
 import warp as wp
 
 from ..common.traits import NO_TERMS, Traits
+from ..common.types import kernel_set
 from .newton_control import (
     FAIL_CONSTRAINT,
     FAIL_CURVATURE,
@@ -372,9 +373,4 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         else:
             give_up(ctl, world, why)
 
-    return _types.SimpleNamespace(
-        objective=objective, objective_magnitude=objective_magnitude, allowed_violation=allowed_violation,
-        largest_violation=largest_violation, evaluate_norms=evaluate_norms, record_residual=record_residual,
-        accept_iterate=accept_iterate, request_error_estimate=request_error_estimate, iteration_factor=iteration_factor,
-        give_up=give_up, check_convergence=check_convergence, handle_failed_search=handle_failed_search,
-    )  # fmt: skip
+    return kernel_set(locals())

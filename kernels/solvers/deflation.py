@@ -12,7 +12,7 @@ import types as _types
 import warp as wp
 
 from ..common.lanes import lane_functions
-from ..common.types import kernel_module, precision
+from ..common.types import double_1d, double_3d, int_1d, kernel_module, kernel_set, precision
 from ..terms.constraints import constraint_functions, constraint_struct, multiplier_struct
 
 __all__ = ["deflation_kernels"]
@@ -27,13 +27,11 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
     f64, vec3d = wp.float64, wp.vec3d
     Constraints, Multipliers = constraint_struct(), multiplier_struct()
     directional_derivative = constraint_functions(dtype).directional_derivative
-    row_sum = lane_functions(dtype).row_sum
+    store_sum = lane_functions(dtype).store_sum
     module = kernel_module(f"deflation_{dtype}")
 
     @wp.kernel(module=module)
-    def assemble_pair_blocks(
-        con: Constraints, inverse: wp.array2d(dtype=mat33), active: wp.array(dtype=wp.int32), mul: Multipliers
-    ):
+    def assemble_pair_blocks(con: Constraints, inverse: p.mat33_2d, active: int_1d, mul: Multipliers):
         """Sum of w w' D^-1 over the common slots of two constraint vectors, with their weights w and w' there."""
         world, block = wp.tid()
         if active[world] == 0:
@@ -56,8 +54,14 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
             s += wp.dot(left, mul.compliance_block[world, con.pair_block[k]] * right)
         return s
 
+    @wp.func
+    def cluster_rows(con: Constraints, cluster: int):
+        """First row and number of rows of a cluster."""
+        first = con.cluster_start[cluster]
+        return first, con.cluster_start[cluster + 1] - first
+
     @wp.kernel(module=module)
-    def assemble_cluster_couplings(con: Constraints, active: wp.array(dtype=wp.int32), mul: Multipliers):
+    def assemble_cluster_couplings(con: Constraints, active: int_1d, mul: Multipliers):
         """J D^-1 J^T between rows of different clusters, one thread per coupling."""
         world, k = wp.tid()
         if active[world] != 0:
@@ -67,22 +71,19 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
             )
 
     @wp.kernel(module=module)
-    def assemble_cluster_matrices(con: Constraints, active: wp.array(dtype=wp.int32), mul: Multipliers):
+    def assemble_cluster_matrices(con: Constraints, active: int_1d, mul: Multipliers):
         """J D^-1 J^T within each cluster, one thread per row."""
         world, row = wp.tid()
         if active[world] == 0:
             return
-        first = con.cluster_start[con.cluster[row]]
-        n = con.cluster_start[con.cluster[row] + 1] - first
+        first, n = cluster_rows(con, con.cluster[row])
         base = con.matrix_start[con.cluster[row]] + (row - first) * n
         for column in range(n):
             start, end = con.pair_start[base + column], con.pair_start[base + column + 1]
             mul.inverse_matrix[world, base + column] = delassus_entry(con, mul, world, row, first + column, start, end)
 
     @wp.kernel(module=module)
-    def compute_penalty(
-        con: Constraints, dq_dv: wp.array(dtype=f64), active: wp.array(dtype=wp.int32), mul: Multipliers
-    ):
+    def compute_penalty(con: Constraints, dq_dv: double_1d, active: int_1d, mul: Multipliers):
         """rho = kappa / ((dq/dv) (J D^-1 J^T)_ii), N/m, constant during a step.
 
         kappa is the ratio of rho to the stiffness of the constrained slots: independent of units, of the mesh and of E.
@@ -90,8 +91,7 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
         world, row = wp.tid()
         if active[world] == 0:
             return
-        first = con.cluster_start[con.cluster[row]]
-        n = con.cluster_start[con.cluster[row] + 1] - first
+        first, n = cluster_rows(con, con.cluster[row])
         own = mul.inverse_matrix[world, con.matrix_start[con.cluster[row]] + (row - first) * (n + 1)]
         rho = f64(0.0)
         if own > f64(0.0):
@@ -101,8 +101,7 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
     @wp.func
     def add_penalty_compliance(con: Constraints, mul: Multipliers, dq: f64, world: int, cluster: int):
         """Add 1 / ((dq/dv) rho) to the diagonal of a cluster's matrix; 1 for rows without a free slot (rho = 0)."""
-        first = con.cluster_start[cluster]
-        n = con.cluster_start[cluster + 1] - first
+        first, n = cluster_rows(con, cluster)
         base = con.matrix_start[cluster]
         for i in range(n):
             rho = mul.penalty[world, first + i]
@@ -113,13 +112,7 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
             mul.inverse_matrix[world, k] = mul.inverse_matrix[world, k] + more
 
     @wp.kernel(module=module)
-    def invert_clusters(
-        con: Constraints,
-        dq_dv: wp.array(dtype=f64),
-        limit: int,
-        active: wp.array(dtype=wp.int32),
-        mul: Multipliers,
-    ):
+    def invert_clusters(con: Constraints, dq_dv: double_1d, limit: int, active: int_1d, mul: Multipliers):
         """Inverse of the matrix of each cluster up to `limit` rows, in place (Gauss-Jordan; positive definite)."""
         world, cluster = wp.tid()
         if active[world] == 0:
@@ -146,13 +139,7 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
                         mul.inverse_matrix[world, base + i * n + j] = y
 
     @wp.kernel(module=module)
-    def eliminate_pivot(
-        con: Constraints,
-        large: wp.array(dtype=wp.int32),
-        pivot: int,
-        active: wp.array(dtype=wp.int32),
-        mul: Multipliers,
-    ):
+    def eliminate_pivot(con: Constraints, large: int_1d, pivot: int, active: int_1d, mul: Multipliers):
         """One pivot of Gauss-Jordan in every large cluster, a thread per row; `scale_pivot_row` handles the row of the
         pivot."""
         world, k, i = wp.tid()
@@ -171,13 +158,7 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
                 mul.inverse_matrix[world, base + i * n + j] = y
 
     @wp.kernel(module=module)
-    def scale_pivot_row(
-        con: Constraints,
-        large: wp.array(dtype=wp.int32),
-        pivot: int,
-        active: wp.array(dtype=wp.int32),
-        mul: Multipliers,
-    ):
+    def scale_pivot_row(con: Constraints, large: int_1d, pivot: int, active: int_1d, mul: Multipliers):
         """The row of the pivot in a step of Gauss-Jordan, after `eliminate_pivot`."""
         world, k = wp.tid()
         cluster = large[k]
@@ -191,22 +172,19 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
             mul.inverse_matrix[world, base + j] = d * mul.inverse_matrix[world, base + j]
 
     @wp.kernel(module=module)
-    def restrict_to_constraints(
-        con: Constraints, mul: Multipliers, z: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32)
-    ):
+    def restrict_to_constraints(con: Constraints, mul: Multipliers, z: p.vec3_2d, active: int_1d):
         """restricted = J z, one thread per row."""
         world, row = wp.tid()
         if active[world] != 0:
             mul.deflation_rhs[world, row] = directional_derivative(con, mul.gradient, z, world, row)
 
     @wp.kernel(module=module)
-    def apply_cluster_inverses(con: Constraints, mul: Multipliers, active: wp.array(dtype=wp.int32)):
+    def apply_cluster_inverses(con: Constraints, mul: Multipliers, active: int_1d):
         """s, `solved` = the inverse of each cluster's matrix times J z, one thread per row."""
         world, row = wp.tid()
         if active[world] == 0:
             return
-        first = con.cluster_start[con.cluster[row]]
-        n = con.cluster_start[con.cluster[row] + 1] - first
+        first, n = cluster_rows(con, con.cluster[row])
         base = con.matrix_start[con.cluster[row]] + (row - first) * n
         s = f64(0.0)
         for j in range(n):
@@ -214,13 +192,7 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
         mul.deflation_solution[world, row] = s
 
     @wp.kernel(module=module)
-    def gauss_seidel_sweep(
-        con: Constraints,
-        mul: Multipliers,
-        first_cluster: int,
-        forward: int,
-        active: wp.array(dtype=wp.int32),
-    ):
+    def gauss_seidel_sweep(con: Constraints, mul: Multipliers, first_cluster: int, forward: int, active: int_1d):
         """One colour of a symmetric block Gauss-Seidel sweep over coupled clusters.
 
         Both sweeps together invert (G + L) G^-1 (G + L^T), with G the clusters' own matrices and L the couplings to
@@ -231,8 +203,7 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
             return
         cluster = con.colour_cluster[first_cluster + k]
         colour = con.colour[cluster]
-        first = con.cluster_start[cluster]
-        n = con.cluster_start[cluster + 1] - first
+        first, n = cluster_rows(con, cluster)
         for row in range(first, first + n):
             s = f64(0.0)
             if forward == 1:
@@ -256,14 +227,14 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
     def subtract_constraint_part(
         con: Constraints,
         mul: Multipliers,
-        inverse: wp.array2d(dtype=mat33),
-        r: wp.array2d(dtype=vec3),
-        y: wp.array2d(dtype=vec3),
+        inverse: p.mat33_2d,
+        r: p.vec3_2d,
+        y: p.vec3_2d,
         add: int,
-        active: wp.array(dtype=wp.int32),
+        active: int_1d,
         warp: int,
-        z: wp.array2d(dtype=vec3),
-        rows: wp.array3d(dtype=f64),
+        z: p.vec3_2d,
+        rows: double_3d,
     ):
         """z = y - D^-1 J^T s on slots with constraints, y = D^-1 r; with `add` added to z. Rows: r.z per warp."""
         world, slot = wp.tid()
@@ -285,21 +256,6 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
                 out = change
                 z[world, slot] = out
             rz = f64(wp.dot(r[world, slot], out))
-        rz = row_sum(rz, warp)
-        if slot % warp == 0:
-            rows[0, world, slot / warp] = rz
+        store_sum(0, rz, slot, warp, world, rows)
 
-    return _types.SimpleNamespace(
-        module=module,
-        assemble_pair_blocks=assemble_pair_blocks,
-        assemble_cluster_matrices=assemble_cluster_matrices,
-        assemble_cluster_couplings=assemble_cluster_couplings,
-        compute_penalty=compute_penalty,
-        invert_clusters=invert_clusters,
-        eliminate_pivot=eliminate_pivot,
-        scale_pivot_row=scale_pivot_row,
-        restrict_to_constraints=restrict_to_constraints,
-        apply_cluster_inverses=apply_cluster_inverses,
-        gauss_seidel_sweep=gauss_seidel_sweep,
-        subtract_constraint_part=subtract_constraint_part,
-    )
+    return kernel_set(locals())

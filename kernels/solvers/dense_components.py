@@ -7,7 +7,7 @@ import warp as wp
 
 from ..common.lanes import lane_functions
 from ..common.structs import pattern_struct
-from ..common.types import SHORT_UNROLL, kernel_module, precision
+from ..common.types import SHORT_UNROLL, int_1d, int_2d, kernel_module, kernel_set, precision
 
 __all__ = ["dense_component_kernels"]
 
@@ -22,16 +22,16 @@ def dense_component_kernels(dtype: str) -> _types.SimpleNamespace:
     module = kernel_module(f"parts_{dtype}", max_unroll=SHORT_UNROLL)
 
     @wp.kernel(module=module)
-    def copy_flags_to_components(flags: wp.array(dtype=wp.int32), out: wp.array(dtype=wp.int32)):
+    def copy_flags_to_components(flags: int_1d, out: int_1d):
         """World flags copied to each component."""
         block = wp.tid()
         out[block] = flags[block / (out.shape[0] / flags.shape[0])]
 
     @wp.kernel(module=module)
     def fill_components(
-        pattern: Pattern, value: wp.array2d(dtype=mat33), slot: wp.array2d(dtype=wp.int32),
-        position_of: wp.array(dtype=wp.int32), flags: wp.array(dtype=wp.int32), scale: wp.array2d(dtype=T),
-        matrix: wp.array3d(dtype=T),
+        pattern: Pattern, value: p.mat33_2d, slot: int_2d,
+        position_of: int_1d, flags: int_1d, scale: p.scalar_2d,
+        matrix: p.scalar_3d,
     ):  # fmt: skip
         """A as dense matrices, and its diagonal; rows without a slot are zero."""
         block, row = wp.tid()
@@ -58,8 +58,8 @@ def dense_component_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def apply_component_inverses(
-        matrix: wp.array3d(dtype=T), slot: wp.array2d(dtype=wp.int32), lanes: int, r: wp.array2d(dtype=T),
-        active: wp.array(dtype=wp.int32), x: wp.array2d(dtype=T),
+        matrix: p.scalar_3d, slot: int_2d, lanes: int, r: p.scalar_2d,
+        active: int_1d, x: p.scalar_2d,
     ):  # fmt: skip
         """x = A^-1 r with dense inverses, `lanes` threads per row."""
         world, index = wp.tid()
@@ -81,9 +81,4 @@ def dense_component_kernels(dtype: str) -> _types.SimpleNamespace:
         if index % lanes == 0 and own >= 0:
             x[world, 3 * own + i % 3] = s
 
-    return _types.SimpleNamespace(
-        module=module,
-        copy_flags_to_components=copy_flags_to_components,
-        fill_components=fill_components,
-        apply_component_inverses=apply_component_inverses,
-    )
+    return kernel_set(locals())

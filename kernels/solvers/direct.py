@@ -8,7 +8,7 @@ import warp as wp
 from ..common.block_entries import add_block_function
 from ..common.lanes import lane_functions
 from ..common.structs import pattern_struct, topology_struct
-from ..common.types import kernel_module, precision
+from ..common.types import double_1d, double_3d, int_1d, int_2d, kernel_module, kernel_set, precision
 
 __all__ = ["direct_kernels", "follower_pattern_struct"]
 
@@ -35,23 +35,18 @@ def direct_kernels(dtype: str) -> _types.SimpleNamespace:
     f64 = wp.float64
     Topology, Pattern, FollowerPattern = topology_struct(dtype), pattern_struct(), follower_pattern_struct()
     add_block = add_block_function(dtype)
-    row_sum = lane_functions(dtype).row_sum
+    residual_products, store_products = lane_functions(dtype).residual_products, lane_functions(dtype).store_products
     module = kernel_module(f"direct_{dtype}")
 
     @wp.kernel(module=module)
-    def gather_local(
-        conn: wp.array2d(dtype=wp.int32),
-        u: wp.array2d(dtype=vec3),
-        active: wp.array(dtype=wp.int32),
-        out: wp.array2d(dtype=vec3),
-    ):
+    def gather_local(conn: int_2d, u: p.vec3_2d, active: int_1d, out: p.vec3_2d):
         """Gather values at the slots of each item, local * count + item."""
         world, local, item = wp.tid()
         if active[world] != 0:
             out[world, local * conn.shape[1] + item] = u[world, conn[local, item]]
 
     @wp.kernel(module=module)
-    def set_unit_direction(local: int, component: int, count: int, out: wp.array2d(dtype=vec3)):
+    def set_unit_direction(local: int, component: int, count: int, out: p.vec3_2d):
         """A unit component at one local slot of every item, else 0."""
         world, k = wp.tid()
         e = vec3()
@@ -64,10 +59,10 @@ def direct_kernels(dtype: str) -> _types.SimpleNamespace:
         topo: Topology,
         pattern: Pattern,
         places: FollowerPattern,
-        columns: wp.array3d(dtype=vec3),
-        dq_dv: wp.array(dtype=f64),
-        active: wp.array(dtype=wp.int32),
-        value: wp.array2d(dtype=mat33),
+        columns: p.vec3_3d,
+        dq_dv: double_1d,
+        active: int_1d,
+        value: p.mat33_2d,
     ):
         """value -= (dq/dv) K, K from its products with unit vectors."""
         world, item = wp.tid()
@@ -82,34 +77,14 @@ def direct_kernels(dtype: str) -> _types.SimpleNamespace:
         add_block(topo, pattern.upper[places.entry[item]], -T(dq_dv[world]) * A, world, value)
 
     @wp.kernel(module=module)
-    def dot_partials(
-        r: wp.array2d(dtype=vec3),
-        z: wp.array2d(dtype=vec3),
-        diagonal: wp.array2d(dtype=vec3),
-        active: wp.array(dtype=wp.int32),
-        warp: int,
-        rows: wp.array3d(dtype=f64),
-    ):
+    def dot_partials(r: p.vec3_2d, z: p.vec3_2d, diagonal: p.vec3_2d, active: int_1d, warp: int, rows: double_3d):
         """r.z and r.D^-1 r per warp of slots."""
         world, slot = wp.tid()
         if active[world] == 0:
             return
-        rz = f64(0.0)
-        rr = f64(0.0)
+        products = wp.vec2d()
         if slot < z.shape[1]:
-            a = r[world, slot]
-            rz = f64(wp.dot(a, z[world, slot]))
-            rr = f64(wp.dot(a, wp.cw_div(a, diagonal[world, slot])))
-        rz = row_sum(rz, warp)
-        rr = row_sum(rr, warp)
-        if slot % warp == 0:
-            rows[0, world, slot / warp] = rz
-            rows[1, world, slot / warp] = rr
+            products = residual_products(r[world, slot], z[world, slot], diagonal[world, slot])
+        store_products(products, slot, warp, world, rows)
 
-    return _types.SimpleNamespace(
-        module=module,
-        gather_local=gather_local,
-        set_unit_direction=set_unit_direction,
-        add_follower_matrices=add_follower_matrices,
-        dot_partials=dot_partials,
-    )
+    return kernel_set(locals())

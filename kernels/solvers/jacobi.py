@@ -10,7 +10,7 @@ import types as _types
 import warp as wp
 
 from ..common.traits import Traits
-from ..common.types import kernel_module, precision
+from ..common.types import double_1d, double_3d, int_1d, kernel_module, kernel_set, precision
 from .convergence import convergence_functions
 from .newton import newton_kernels
 from .newton_control import (
@@ -132,14 +132,14 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
     @wp.kernel(module=module)
     def store_pair(
         ctl: Newton,
-        gradient: wp.array2d(dtype=vec3),
-        free: wp.array(dtype=vec3),
-        move: wp.array2d(dtype=vec3),
-        before: wp.array2d(dtype=vec3),
-        r: wp.array2d(dtype=vec3),
-        s: wp.array3d(dtype=vec3),
-        y: wp.array3d(dtype=vec3),
-        rows: wp.array3d(dtype=f64),
+        gradient: p.vec3_2d,
+        free: p.vec3_1d,
+        move: p.vec3_2d,
+        before: p.vec3_2d,
+        r: p.vec3_2d,
+        s: p.vec3_3d,
+        y: p.vec3_3d,
+        rows: double_3d,
     ):
         """r = -g on the free components; store the newest pair; rows: s_j.y and s_j.r of all pairs."""
         world, slot = wp.tid()
@@ -241,7 +241,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
         substitute(jac, world, k, count, f64(0.0))
 
     @wp.kernel(module=module)
-    def project_residual(ctl: Newton, jac: Jacobi, y: wp.array3d(dtype=vec3), r: wp.array2d(dtype=vec3)):
+    def project_residual(ctl: Newton, jac: Jacobi, y: p.vec3_3d, r: p.vec3_2d):
         """Residual after the projection on the pairs, r -= Y gamma."""
         world, slot = wp.tid()
         if ctl.active[world] == 0:
@@ -252,9 +252,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
         r[world, slot] = a
 
     @wp.kernel(module=module)
-    def conjugation_dot_terms(
-        ctl: Newton, y: wp.array3d(dtype=vec3), z: wp.array2d(dtype=vec3), rows: wp.array3d(dtype=f64)
-    ):
+    def conjugation_dot_terms(ctl: Newton, y: p.vec3_3d, z: p.vec3_2d, rows: double_3d):
         """Rows: y_j.z of all pairs, per slot."""
         world, slot = wp.tid()
         if ctl.active[world] == 0:
@@ -277,13 +275,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
         substitute(jac, world, k, count, f64(1.0))
 
     @wp.kernel(module=module)
-    def combine_move(
-        ctl: Newton,
-        jac: Jacobi,
-        s: wp.array3d(dtype=vec3),
-        z: wp.array2d(dtype=vec3),
-        move: wp.array2d(dtype=vec3),
-    ):
+    def combine_move(ctl: Newton, jac: Jacobi, s: p.vec3_3d, z: p.vec3_2d, move: p.vec3_2d):
         """Move p = S gamma + step z; in the Chebyshev iteration gamma_0 times the last move + gamma_1 z."""
         world, slot = wp.tid()
         if ctl.active[world] == 0:
@@ -303,12 +295,12 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
     @wp.kernel(module=module)
     def residual_after_move(
         ctl: Newton,
-        mass_factor: wp.array(dtype=f64),
-        lumped: wp.array2d(dtype=T),
-        gradient: wp.array2d(dtype=vec3),
-        free: wp.array(dtype=vec3),
-        move: wp.array2d(dtype=vec3),
-        r: wp.array2d(dtype=vec3),
+        mass_factor: double_1d,
+        lumped: p.scalar_2d,
+        gradient: p.vec3_2d,
+        free: p.vec3_1d,
+        move: p.vec3_2d,
+        r: p.vec3_2d,
     ):
         """r = -g - c_M M p with the lumped mass, exact for the sum over a body: the remaining force on its
         translation."""
@@ -318,7 +310,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
             r[world, slot] = -wp.cw_mul(gradient[world, slot] + m * move[world, slot], free[slot])
 
     @wp.kernel(module=module)
-    def apply_move(ctl: Newton, move: wp.array2d(dtype=vec3), v: wp.array2d(dtype=vec3)):
+    def apply_move(ctl: Newton, move: p.vec3_2d, v: p.vec3_2d):
         """v += p, shortened by step limits of terms."""
         world, slot = wp.tid()
         if ctl.active[world] != 0:
@@ -328,7 +320,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
             v[world, slot] = v[world, slot] + move[world, slot]
 
     @wp.kernel(module=module)
-    def report_cost(ctl: Newton, jac: Jacobi, pcg: PCG, running: wp.array(dtype=wp.int32)):
+    def report_cost(ctl: Newton, jac: Jacobi, pcg: PCG, running: int_1d):
         """Report cost and gain of the attempt to the rule of kernels/solvers/reuse.py; flag the worlds that
         iterated."""
         world = wp.tid()
@@ -339,18 +331,4 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
             pcg.first_norm[world] = jac.first_norm[world]
             pcg.norm[world] = ctl.residual_norm[world]
 
-    return _types.SimpleNamespace(
-        module=module,
-        begin_iteration=begin_iteration,
-        check_iterate=check_iterate,
-        store_pair=store_pair,
-        chebyshev_coefficients=chebyshev_coefficients,
-        solve_gram=solve_gram,
-        project_residual=project_residual,
-        conjugation_dot_terms=conjugation_dot_terms,
-        conjugate_move=conjugate_move,
-        combine_move=combine_move,
-        residual_after_move=residual_after_move,
-        apply_move=apply_move,
-        report_cost=report_cost,
-    )
+    return kernel_set(locals())

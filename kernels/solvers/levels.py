@@ -12,7 +12,7 @@ import warp as wp
 
 from ..common.lanes import lane_functions
 from ..common.structs import pattern_struct
-from ..common.types import SHORT_UNROLL, kernel_module, precision
+from ..common.types import SHORT_UNROLL, double_3d, int_1d, kernel_module, kernel_set, precision
 
 __all__ = ["TILE_LANES", "TILE_SLOTS", "TILE_UNKNOWNS", "level_kernels", "level_struct"]
 
@@ -56,22 +56,23 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
     Level = level_struct(dtype)
     Pattern = pattern_struct()
     lanes_of = lane_functions(dtype)
-    lane_sum, row_sum, scalar_sum = lanes_of.lane_sum, lanes_of.row_sum, lanes_of.scalar_sum
+    lane_sum, scalar_sum = lanes_of.lane_sum, lanes_of.scalar_sum
+    residual_products, store_products = lanes_of.residual_products, lanes_of.store_products
     module = kernel_module(f"levels_{dtype}{'_' + storage if scaled else ''}", max_unroll=SHORT_UNROLL)
 
     @wp.kernel(module=module)
     def smooth_and_restrict(
         level: Level,
         inverse: wp.array4d(dtype=S),
-        root: wp.array3d(dtype=T),
+        root: p.scalar_3d,
         by_row: int,
         share: int,
         lanes: int,
         first_group: int,
-        r: wp.array2d(dtype=vec3),
-        active: wp.array(dtype=wp.int32),
-        z: wp.array2d(dtype=vec3),
-        coarse: wp.array2d(dtype=vec3),
+        r: p.vec3_2d,
+        active: int_1d,
+        z: p.vec3_2d,
+        coarse: p.vec3_2d,
     ):
         """z = tile inverse times r, `share` lanes per slot; threads from `first_group` on: P^T r, `lanes` per group.
 
@@ -139,7 +140,7 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
             coarse[world, 4 * group + 3] = s3
 
     @wp.func
-    def prolong_to_slot(level: Level, x: wp.array2d(dtype=vec3), world: int, slot: int) -> vec3:
+    def prolong_to_slot(level: Level, x: p.vec3_2d, world: int, slot: int) -> vec3:
         """(P x) at a slot: the affine motion given by its group's coarse unknowns x."""
         first = 4 * level.group_of_slot[slot]
         w = level.affine_values[slot]
@@ -152,46 +153,39 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
     def add_coarse_correction(
         level: Level,
         correct: int,
-        x: wp.array2d(dtype=vec3),
-        free: wp.array(dtype=vec3),
-        r: wp.array2d(dtype=vec3),
-        diagonal: wp.array2d(dtype=vec3),
-        active: wp.array(dtype=wp.int32),
+        x: p.vec3_2d,
+        free: p.vec3_1d,
+        r: p.vec3_2d,
+        diagonal: p.vec3_2d,
+        active: int_1d,
         warp: int,
-        z: wp.array2d(dtype=vec3),
-        rows: wp.array3d(dtype=f64),
+        z: p.vec3_2d,
+        rows: double_3d,
     ):
         """z += P x on free components if `correct`; rows: r.z and r.D^-1 r, one sum per warp of slots."""
         world, slot = wp.tid()
         if active[world] == 0:
             return
-        rz = f64(0.0)
-        rr = f64(0.0)
+        products = wp.vec2d()
         if slot < z.shape[1]:
-            a = r[world, slot]
             s = z[world, slot]
             if correct != 0:
                 s += wp.cw_mul(prolong_to_slot(level, x, world, slot), free[slot])
                 z[world, slot] = s
-            rz = f64(wp.dot(a, s))
-            rr = f64(wp.dot(a, wp.cw_div(a, diagonal[world, slot])))
-        rz = row_sum(rz, warp)
-        rr = row_sum(rr, warp)
-        if slot % warp == 0:
-            rows[0, world, slot / warp] = rz
-            rows[1, world, slot / warp] = rr
+            products = residual_products(r[world, slot], s, diagonal[world, slot])
+        store_products(products, slot, warp, world, rows)
 
     @wp.kernel(module=module)
     def chebyshev_step(
         level: Level,
         correct: int,
-        coarse: wp.array2d(dtype=vec3),
-        z: wp.array2d(dtype=vec3),
+        coarse: p.vec3_2d,
+        z: p.vec3_2d,
         keep: T,
         step: T,
-        active: wp.array(dtype=wp.int32),
-        d: wp.array2d(dtype=vec3),
-        x: wp.array2d(dtype=vec3),
+        active: int_1d,
+        d: p.vec3_2d,
+        x: p.vec3_2d,
     ):
         """A Chebyshev step: d = keep d + step (z + P coarse), x += d; with keep = 0 both start from zero."""
         world, slot = wp.tid()
@@ -210,14 +204,7 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
             x[world, slot] = x[world, slot] + s
 
     @wp.kernel(module=module)
-    def subtract_product(
-        pattern: Pattern,
-        value: wp.array2d(dtype=mat33),
-        d: wp.array2d(dtype=vec3),
-        lanes: int,
-        active: wp.array(dtype=wp.int32),
-        r: wp.array2d(dtype=vec3),
-    ):
+    def subtract_product(pattern: Pattern, value: p.mat33_2d, d: p.vec3_2d, lanes: int, active: int_1d, r: p.vec3_2d):
         """r -= A d, `lanes` threads per row."""
         world, index = wp.tid()
         if active[world] == 0:
@@ -233,7 +220,7 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
             r[world, slot] = r[world, slot] - s
 
     @wp.func
-    def scaled_entry(root: wp.array2d(dtype=T), r: wp.array2d(dtype=T), world: int, k: int) -> T:
+    def scaled_entry(root: p.scalar_2d, r: p.scalar_2d, world: int, k: int) -> T:
         """Entry k of r, scaled by `root` for a scaled inverse."""
         if wp.static(scaled):
             return r[world, k] * root[world, k]
@@ -242,7 +229,7 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
 
     @wp.func
     def row_product(
-        matrix: wp.array3d(dtype=S), root: wp.array2d(dtype=T), r: wp.array2d(dtype=T), world: int, row: int,
+        matrix: wp.array3d(dtype=S), root: p.scalar_2d, r: p.scalar_2d, world: int, row: int,
         first: int, n: int, lanes: int,
     ) -> T:  # fmt: skip
         """Sum of a lane's products in a row times r: columns first, first + lanes, ... below n."""
@@ -265,7 +252,7 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         return (s0 + s1) + (s2 + s3)
 
     @wp.func
-    def store_row(root: wp.array2d(dtype=T), s: T, world: int, row: int, x: wp.array2d(dtype=T)):
+    def store_row(root: p.scalar_2d, s: T, world: int, row: int, x: p.scalar_2d):
         """x[row] = s, scaled back for a scaled inverse."""
         if wp.static(scaled):
             x[world, row] = s * root[world, row]
@@ -274,12 +261,7 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
 
     @wp.kernel(module=module)
     def apply_dense_inverse(
-        matrix: wp.array3d(dtype=S),
-        root: wp.array2d(dtype=T),
-        lanes: int,
-        r: wp.array2d(dtype=T),
-        active: wp.array(dtype=wp.int32),
-        x: wp.array2d(dtype=T),
+        matrix: wp.array3d(dtype=S), root: p.scalar_2d, lanes: int, r: p.scalar_2d, active: int_1d, x: p.scalar_2d
     ):
         """x = A^-1 r with a dense inverse, `lanes` threads per row."""
         world, index = wp.tid()
@@ -294,12 +276,12 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
     @wp.kernel(module=module)
     def apply_triangular_inverse(
         matrix: wp.array3d(dtype=S),
-        root: wp.array2d(dtype=T),
+        root: p.scalar_2d,
         upper: int,
         lanes: int,
-        r: wp.array2d(dtype=T),
-        active: wp.array(dtype=wp.int32),
-        x: wp.array2d(dtype=T),
+        r: p.scalar_2d,
+        active: int_1d,
+        x: p.scalar_2d,
     ):
         """`apply_dense_inverse` with the lower triangle of a matrix or, `upper`, its upper one, diagonal included."""
         world, index = wp.tid()
@@ -313,12 +295,4 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         if lane == 0:
             store_row(root, s, world, row, x)
 
-    return _types.SimpleNamespace(
-        module=module,
-        smooth_and_restrict=smooth_and_restrict,
-        add_coarse_correction=add_coarse_correction,
-        chebyshev_step=chebyshev_step,
-        subtract_product=subtract_product,
-        apply_dense_inverse=apply_dense_inverse,
-        apply_triangular_inverse=apply_triangular_inverse,
-    )
+    return kernel_set(locals())

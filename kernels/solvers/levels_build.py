@@ -10,7 +10,7 @@ import warp as wp
 
 from ..common.lanes import block_memory, lane_functions
 from ..common.structs import pattern_struct
-from ..common.types import SHORT_UNROLL, kernel_module, precision
+from ..common.types import SHORT_UNROLL, double_2d, double_3d, int_1d, kernel_module, kernel_set, precision
 from .levels import TILE_UNKNOWNS, level_struct
 
 __all__ = ["FACTOR_LANES", "build_kernels"]
@@ -50,9 +50,9 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
     def fill_tiles(
         level: Level,
         pattern: Pattern,
-        value: wp.array2d(dtype=mat33),
-        active: wp.array(dtype=wp.int32),
-        diagonal: wp.array3d(dtype=T),
+        value: p.mat33_2d,
+        active: int_1d,
+        diagonal: p.scalar_3d,
         matrix: wp.array4d(dtype=T),
     ):
         """Block of A for each tile, and its diagonal; one thread per slot, rows without an unknown are zero."""
@@ -99,9 +99,9 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         lanes: int,
         tiles: int,
         keep: int,
-        active: wp.array(dtype=wp.int32),
-        diagonal: wp.array3d(dtype=T),
-        column: wp.array3d(dtype=T),
+        active: int_1d,
+        diagonal: p.scalar_3d,
+        column: p.scalar_3d,
         matrix: wp.array4d(dtype=T),
     ):
         """Inverse of each tile in place, by Gauss-Jordan; a block of threads works in its shared memory.
@@ -154,12 +154,7 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
 
     @wp.kernel(module=module)
     def fill_dense(
-        pattern: Pattern,
-        value: wp.array2d(dtype=mat33),
-        slots: int,
-        active: wp.array(dtype=wp.int32),
-        scale: wp.array2d(dtype=T),
-        matrix: wp.array3d(dtype=T),
+        pattern: Pattern, value: p.mat33_2d, slots: int, active: int_1d, scale: p.scalar_2d, matrix: p.scalar_3d
     ):
         """A as a dense matrix, and its diagonal; one thread per slot, rows beyond the slots are zero."""
         world, slot = wp.tid()
@@ -182,11 +177,11 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
 
     @wp.kernel(module=module)
     def copy_pivot_block(
-        matrix: wp.array3d(dtype=T),
-        scale: wp.array2d(dtype=T),
+        matrix: p.scalar_3d,
+        scale: p.scalar_2d,
         first: int,
-        active: wp.array(dtype=wp.int32),
-        diagonal: wp.array3d(dtype=T),
+        active: int_1d,
+        diagonal: p.scalar_3d,
         pivot: wp.array4d(dtype=T),
     ):
         """Copy of the pivot block and of the diagonal of A there."""
@@ -198,12 +193,7 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
 
     @wp.kernel(module=module)
     def compute_panels(
-        matrix: wp.array3d(dtype=T),
-        pivot: wp.array4d(dtype=T),
-        first: int,
-        active: wp.array(dtype=wp.int32),
-        left: wp.array3d(dtype=T),
-        top: wp.array3d(dtype=T),
+        matrix: p.scalar_3d, pivot: wp.array4d(dtype=T), first: int, active: int_1d, left: p.scalar_3d, top: p.scalar_3d
     ):
         """left = A_ik P with P the inverse pivot block, top = A_kj: panels of the rank update."""
         world, m, i = wp.tid()
@@ -218,12 +208,7 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
 
     @wp.kernel(module=module)
     def eliminate_pivot_block(
-        pivot: wp.array4d(dtype=T),
-        left: wp.array3d(dtype=T),
-        top: wp.array3d(dtype=T),
-        first: int,
-        active: wp.array(dtype=wp.int32),
-        matrix: wp.array3d(dtype=T),
+        pivot: wp.array4d(dtype=T), left: p.scalar_3d, top: p.scalar_3d, first: int, active: int_1d, matrix: p.scalar_3d
     ):
         """One pivot of block Gauss-Jordan; a thread updates four rows of a column, which share their loads."""
         world, i4, j = wp.tid()
@@ -257,12 +242,7 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
 
     @wp.kernel(module=module)
     def factor_dense(
-        lanes: int,
-        diagonal: wp.array2d(dtype=T),
-        active: wp.array(dtype=wp.int32),
-        columns: wp.array3d(dtype=T),
-        rows: wp.array3d(dtype=T),
-        matrix: wp.array3d(dtype=T),
+        lanes: int, diagonal: p.scalar_2d, active: int_1d, columns: p.scalar_3d, rows: p.scalar_3d, matrix: p.scalar_3d
     ):
         """L^-1 of A = L L^T in place of A, and L^-T above the diagonal; one block per world.
 
@@ -339,10 +319,10 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
     @wp.kernel(module=module)
     def store_tile_inverses(
         tiles: int,
-        diagonal: wp.array3d(dtype=T),
+        diagonal: p.scalar_3d,
         matrix: wp.array4d(dtype=T),
-        active: wp.array(dtype=wp.int32),
-        root: wp.array3d(dtype=T),
+        active: int_1d,
+        root: p.scalar_3d,
         stored: wp.array4d(dtype=S),
     ):
         """Store the inverses of tiles, one thread per row."""
@@ -360,11 +340,11 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
 
     @wp.kernel(module=module)
     def store_dense_inverse(
-        diagonal: wp.array2d(dtype=T),
-        trace: wp.array2d(dtype=f64),
-        matrix: wp.array3d(dtype=T),
-        active: wp.array(dtype=wp.int32),
-        root: wp.array2d(dtype=T),
+        diagonal: p.scalar_2d,
+        trace: double_2d,
+        matrix: p.scalar_3d,
+        active: int_1d,
+        root: p.scalar_2d,
         stored: wp.array3d(dtype=S),
     ):
         """Store the dense inverse, one thread per entry."""
@@ -378,27 +358,10 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
             root[world, i] = own
 
     @wp.kernel(module=module)
-    def trace_terms(
-        diagonal: wp.array2d(dtype=T),
-        matrix: wp.array3d(dtype=T),
-        active: wp.array(dtype=wp.int32),
-        rows: wp.array3d(dtype=f64),
-    ):
+    def trace_terms(diagonal: p.scalar_2d, matrix: p.scalar_3d, active: int_1d, rows: double_3d):
         """Terms of the trace of R B R."""
         world, i = wp.tid()
         if active[world] != 0:
             rows[0, world, i] = f64(matrix[world, i, i] * wp.abs(diagonal[world, i]))
 
-    return _types.SimpleNamespace(
-        module=module,
-        fill_tiles=fill_tiles,
-        invert_tiles=invert_tiles,
-        fill_dense=fill_dense,
-        copy_pivot_block=copy_pivot_block,
-        compute_panels=compute_panels,
-        eliminate_pivot_block=eliminate_pivot_block,
-        factor_dense=factor_dense,
-        store_tile_inverses=store_tile_inverses,
-        store_dense_inverse=store_dense_inverse,
-        trace_terms=trace_terms,
-    )
+    return kernel_set(locals())

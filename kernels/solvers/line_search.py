@@ -5,6 +5,7 @@ import types as _types
 import warp as wp
 
 from ..common.traits import Traits
+from ..common.types import kernel_set
 from .convergence import convergence_functions
 from .newton_control import FAIL_JACOBIAN, FAIL_LINE_SEARCH, ROW_FROZEN_CHANGE, ROW_RESIDUAL, ROW_SLOPE, control_struct
 
@@ -284,6 +285,4 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNames
         else:
             choose_next_trial(ctl, world, wants_nonmonotone, reused)
 
-    return _types.SimpleNamespace(
-        tangent_needed=tangent_needed, limit_nonmonotone_step=limit_nonmonotone_step, check_trial=check_trial
-    )
+    return kernel_set(locals())

@@ -6,7 +6,7 @@ import types as _types
 import warp as wp
 
 from ..common.traits import NO_TERMS, Traits
-from ..common.types import kernel_module
+from ..common.types import int_1d, kernel_module, kernel_set
 from .augmented_lagrangian import outer_loop_kernels
 from .convergence import MAX_ERROR_ESTIMATES, SINGLE_PRECISION_EPS, VELOCITY_ROUNDINGS, convergence_functions
 from .line_search import MAX_TRUST_RADIUS, PHI_NOISE_ROUNDINGS, line_search_kernels
@@ -75,7 +75,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
     tangent_needed = searching.tangent_needed
 
     @wp.kernel(module=module)
-    def reset_min_J(ctl: Control, active: wp.array(dtype=wp.int32)):
+    def reset_min_J(ctl: Control, active: int_1d):
         """Reset the smallest J before an evaluation."""
         world = wp.tid()
         if active[world] != 0:
@@ -155,7 +155,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
             ctl.forcing[world] = f64(ALTERNATIVE_START_FORCING)
 
     @wp.kernel(module=module)
-    def compare_first_iterates(ctl: Control, first: int, better: wp.array(dtype=wp.int32)):
+    def compare_first_iterates(ctl: Control, first: int, better: int_1d):
         """Flag the worlds where the first iterate just evaluated is the best so far: J > 0 before Phi."""
         world = wp.tid()
         better[world] = 0
@@ -226,7 +226,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         return eta
 
     @wp.kernel(module=module)
-    def check_rounding_floor(ctl: Control, component_of_part: wp.array(dtype=wp.int32)):
+    def check_rounding_floor(ctl: Control, component_of_part: int_1d):
         """Error estimate of a stalled residual, relative to the solution, of the worst part.
 
         With H p = -g in the energy norm: eta = sqrt(-g.p dq/dv) / sqrt(2 strain energy + dv.M dv); for each part
@@ -305,16 +305,4 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
             check_direction(ctl, world)
 
     outer = outer_loop_kernels(traits, module)
-    return _types.SimpleNamespace(
-        **vars(outer),
-        **vars(searching),
-        module=module,
-        evaluate_norms=evaluate_norms,
-        accept_iterate=accept_iterate,
-        record_residual=record_residual,
-        reset_min_J=reset_min_J,
-        begin_iteration=begin_iteration,
-        compare_first_iterates=compare_first_iterates,
-        check_rounding_floor=check_rounding_floor,
-        begin_search=begin_search,
-    )
+    return kernel_set(vars(outer) | vars(searching) | locals())

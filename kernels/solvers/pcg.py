@@ -9,7 +9,7 @@ import types as _types
 import warp as wp
 
 from ..common.lanes import lane_functions
-from ..common.types import kernel_module, precision
+from ..common.types import double_1d, double_3d, int_1d, kernel_module, kernel_set, precision
 from .newton_control import control_struct
 
 __all__ = ["FREE_GROUP_LANES", "forcing_functions", "free_groups_struct", "pcg_kernels", "pcg_struct"]
@@ -110,7 +110,7 @@ def forcing_functions(has_constraints: bool) -> _types.SimpleNamespace:
                 goal = f64(CONSTRAINT_FORCING) * goal
         return wp.max(goal, min_target_norm(newton, world))
 
-    return _types.SimpleNamespace(min_target_norm=min_target_norm, forcing_target=forcing_target)
+    return kernel_set(locals())
 
 
 @functools.cache
@@ -122,17 +122,12 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNames
     Newton = control_struct()
     Control = pcg_struct()
     Groups = free_groups_struct(dtype)
-    row_sum, forcing_target = lane_functions(dtype).row_sum, forcing_functions(has_constraints).forcing_target
+    residual_products, store_products = lane_functions(dtype).residual_products, lane_functions(dtype).store_products
+    forcing_target = forcing_functions(has_constraints).forcing_target
     module = kernel_module(f"pcg_{dtype}{'_gated' if has_constraints else ''}")
 
     @wp.kernel(module=module)
-    def initialise_residual(
-        g: wp.array2d(dtype=vec3),
-        free: wp.array(dtype=vec3),
-        active: wp.array(dtype=wp.int32),
-        x: wp.array2d(dtype=vec3),
-        r: wp.array2d(dtype=vec3),
-    ):
+    def initialise_residual(g: p.vec3_2d, free: p.vec3_1d, active: int_1d, x: p.vec3_2d, r: p.vec3_2d):
         """x = 0, r = -g on the free components."""
         world, slot = wp.tid()
         if active[world] != 0:
@@ -140,12 +135,7 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNames
             r[world, slot] = -wp.cw_mul(g[world, slot], free[slot])
 
     @wp.kernel(module=module)
-    def zero_converged(
-        newton: Newton,
-        of_slot: wp.array(dtype=wp.int32),
-        active: wp.array(dtype=wp.int32),
-        r: wp.array2d(dtype=vec3),
-    ):
+    def zero_converged(newton: Newton, of_slot: int_1d, active: int_1d, r: p.vec3_2d):
         """r = 0 on converged components of the model: the solve for the others must not move them."""
         world, slot = wp.tid()
         if active[world] != 0 and newton.component_converged[world, of_slot[slot]] != 0:
@@ -153,31 +143,19 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNames
 
     @wp.kernel(module=module)
     def apply_block_jacobi(
-        inverse: wp.array2d(dtype=mat33),
-        r: wp.array2d(dtype=vec3),
-        diagonal: wp.array2d(dtype=vec3),
-        active: wp.array(dtype=wp.int32),
-        warp: int,
-        z: wp.array2d(dtype=vec3),
-        rows: wp.array3d(dtype=f64),
+        inverse: p.mat33_2d, r: p.vec3_2d, diagonal: p.vec3_2d, active: int_1d, warp: int, z: p.vec3_2d, rows: double_3d
     ):
         """z = B r with 3x3 blocks B; rows: r.z and r.D^-1 r, one sum per warp of slots."""
         world, slot = wp.tid()
         if active[world] == 0:
             return
-        rz = f64(0.0)
-        rr = f64(0.0)
+        products = wp.vec2d()
         if slot < z.shape[1]:
             a = r[world, slot]
             b = inverse[world, slot] * a
             z[world, slot] = b
-            rz = f64(wp.dot(a, b))
-            rr = f64(wp.dot(a, wp.cw_div(a, diagonal[world, slot])))
-        rz = row_sum(rz, warp)
-        rr = row_sum(rr, warp)
-        if slot % warp == 0:
-            rows[0, world, slot / warp] = rz
-            rows[1, world, slot / warp] = rr
+            products = residual_products(a, b, diagonal[world, slot])
+        store_products(products, slot, warp, world, rows)
 
     @wp.kernel(module=module)
     def begin_solve(newton: Newton, ctl: Control):
@@ -227,9 +205,7 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNames
             ctl.negative_curvature[world] = 1  # no error estimate with an indefinite preconditioner
 
     @wp.kernel(module=module)
-    def first_direction(
-        ctl: Control, z: wp.array2d(dtype=vec3), p_out: wp.array2d(dtype=vec3), x: wp.array2d(dtype=vec3)
-    ):
+    def first_direction(ctl: Control, z: p.vec3_2d, p_out: p.vec3_2d, x: p.vec3_2d):
         """p = z, or x += z if z is the solution."""
         world, slot = wp.tid()
         if ctl.active[world] != 0:
@@ -238,13 +214,7 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNames
             x[world, slot] = x[world, slot] + z[world, slot]
 
     @wp.kernel(module=module)
-    def update_solution(
-        ctl: Control,
-        p_in: wp.array2d(dtype=vec3),
-        Hp: wp.array2d(dtype=vec3),
-        x: wp.array2d(dtype=vec3),
-        r: wp.array2d(dtype=vec3),
-    ):
+    def update_solution(ctl: Control, p_in: p.vec3_2d, Hp: p.vec3_2d, x: p.vec3_2d, r: p.vec3_2d):
         """x += alpha p, r -= alpha H p with alpha = r.z / p.H p.
 
         A direction without positive curvature ends the solve: followed in full if it is the first, else not at all;
@@ -273,7 +243,7 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNames
         r[world, slot] = r[world, slot] - alpha * Hp[world, slot]
 
     @wp.kernel(module=module)
-    def new_direction(ctl: Control, z: wp.array2d(dtype=vec3), p_out: wp.array2d(dtype=vec3)):
+    def new_direction(ctl: Control, z: p.vec3_2d, p_out: p.vec3_2d):
         """p = z + beta p with beta = (r.z)_new / (r.z)_old; the first thread of a world decides whether to continue."""
         world, slot = wp.tid()
         if ctl.active[world] == 0:
@@ -307,12 +277,7 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNames
                 ctl.active[world] = 0  # threads that see this at once leave p unchanged; it is not read again
 
     @wp.kernel(module=module)
-    def free_group_partials(
-        groups: Groups,
-        r: wp.array2d(dtype=vec3),
-        active: wp.array(dtype=wp.int32),
-        partial: wp.array3d(dtype=vec3),
-    ):
+    def free_group_partials(groups: Groups, r: p.vec3_2d, active: int_1d, partial: p.vec3_3d):
         """Z^T r, in FREE_GROUP_LANES strided partial sums per group."""
         world, group, lane = wp.tid()
         if active[world] == 0:
@@ -323,13 +288,7 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNames
         partial[world, group, lane] = s
 
     @wp.kernel(module=module)
-    def group_velocity(
-        groups: Groups,
-        partial: wp.array3d(dtype=vec3),
-        mass_factor: wp.array(dtype=f64),
-        active: wp.array(dtype=wp.int32),
-        velocity: wp.array2d(dtype=vec3),
-    ):
+    def group_velocity(groups: Groups, partial: p.vec3_3d, mass_factor: double_1d, active: int_1d, velocity: p.vec3_2d):
         """c = (Z^T H Z)^-1 Z^T r; a free translation has no stiffness, so Z^T H Z is c_M times the mass of a group."""
         world, group = wp.tid()
         if active[world] == 0:
@@ -343,12 +302,12 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNames
     @wp.kernel(module=module)
     def translate_groups(
         groups: Groups,
-        velocity: wp.array2d(dtype=vec3),
-        free: wp.array(dtype=vec3),
-        mass_factor: wp.array(dtype=f64),
-        active: wp.array(dtype=wp.int32),
-        x: wp.array2d(dtype=vec3),
-        r: wp.array2d(dtype=vec3),
+        velocity: p.vec3_2d,
+        free: p.vec3_1d,
+        mass_factor: double_1d,
+        active: int_1d,
+        x: p.vec3_2d,
+        r: p.vec3_2d,
     ):
         """x += Z c, r -= H Z c, where H Z = c_M M Z."""
         world, slot = wp.tid()
@@ -363,16 +322,4 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNames
             world % groups.lumped_mass.shape[0], slot
         ] * wp.cw_mul(c, free[slot])
 
-    return _types.SimpleNamespace(
-        module=module,
-        initialise_residual=initialise_residual,
-        zero_converged=zero_converged,
-        apply_block_jacobi=apply_block_jacobi,
-        begin_solve=begin_solve,
-        first_direction=first_direction,
-        update_solution=update_solution,
-        new_direction=new_direction,
-        free_group_partials=free_group_partials,
-        group_velocity=group_velocity,
-        translate_groups=translate_groups,
-    )
+    return kernel_set(locals())

@@ -10,7 +10,7 @@ import types as _types
 import warp as wp
 
 from ..common.structs import mass_function, topology_struct
-from ..common.types import kernel_module, precision
+from ..common.types import double_1d, int_1d, kernel_module, kernel_set, precision
 from .newton_control import control_struct
 
 __all__ = ["SAMPLES", "SCATTER_FACTOR", "perturbation_kernels"]
@@ -34,12 +34,7 @@ def perturbation_kernels(dtype: str) -> _types.SimpleNamespace:
     module = kernel_module(f"perturbation_{dtype}")
 
     @wp.kernel(module=module)
-    def begin_samples(
-        ctl: Control,
-        flags: wp.array(dtype=wp.int32),
-        perturbation_sum: wp.array2d(dtype=vec3),
-        gradient_sum: wp.array2d(dtype=vec3),
-    ):
+    def begin_samples(ctl: Control, flags: int_1d, perturbation_sum: p.vec3_2d, gradient_sum: p.vec3_2d):
         """Flag the worlds whose next solve estimates the error; clear both sums there."""
         world, slot = wp.tid()
         asks = ctl.active[world] != 0 and ctl.estimate_error[world] == 1  # finished worlds keep their positions
@@ -51,8 +46,8 @@ def perturbation_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def perturb_positions(
-        ctl: Control, flags: wp.array(dtype=wp.int32), sample: int, u: wp.array2d(dtype=vec3),
-        perturbation_sum: wp.array2d(dtype=vec3),
+        ctl: Control, flags: int_1d, sample: int, u: p.vec3_2d,
+        perturbation_sum: p.vec3_2d,
     ):  # fmt: skip
         """u += d, up to MAX_PERTURBATION roundings, random per slot and sample; perturbation_sum += d / (dq/dv)."""
         world, slot = wp.tid()
@@ -67,9 +62,7 @@ def perturbation_kernels(dtype: str) -> _types.SimpleNamespace:
         perturbation_sum[world, slot] = perturbation_sum[world, slot] + (y - x) / T(ctl.dq_dv[world])
 
     @wp.kernel(module=module)
-    def add_sample(
-        flags: wp.array(dtype=wp.int32), gradient: wp.array2d(dtype=vec3), gradient_sum: wp.array2d(dtype=vec3)
-    ):
+    def add_sample(flags: int_1d, gradient: p.vec3_2d, gradient_sum: p.vec3_2d):
         """gradient_sum += gradient."""
         world, slot = wp.tid()
         if flags[world] != 0:
@@ -78,12 +71,12 @@ def perturbation_kernels(dtype: str) -> _types.SimpleNamespace:
     @wp.kernel(module=module)
     def mean_gradient(
         topo: Topology,
-        mass_factor: wp.array(dtype=f64),
-        flags: wp.array(dtype=wp.int32),
-        perturbation_sum: wp.array2d(dtype=vec3),
-        product: wp.array2d(dtype=vec3),
-        gradient_sum: wp.array2d(dtype=vec3),
-        gradient: wp.array2d(dtype=vec3),
+        mass_factor: double_1d,
+        flags: int_1d,
+        perturbation_sum: p.vec3_2d,
+        product: p.vec3_2d,
+        gradient_sum: p.vec3_2d,
+        gradient: p.vec3_2d,
     ):
         """Mean over the samples of g(u + d) - (dq/dv) K p, with p = d / (dq/dv) and `product` = H p of their sum."""
         world, slot = wp.tid()
@@ -95,10 +88,4 @@ def perturbation_kernels(dtype: str) -> _types.SimpleNamespace:
         stiff = product[world, slot] - T(mass_factor[world]) * a
         gradient[world, slot] = T(SAMPLE_WEIGHT) * (gradient_sum[world, slot] - stiff)
 
-    return _types.SimpleNamespace(
-        module=module,
-        begin_samples=begin_samples,
-        perturb_positions=perturb_positions,
-        add_sample=add_sample,
-        mean_gradient=mean_gradient,
-    )
+    return kernel_set(locals())

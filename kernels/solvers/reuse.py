@@ -8,10 +8,11 @@ linearisation point (displacements).
 
 import functools
 import types as _types
+from typing import Any
 
 import warp as wp
 
-from ..common.types import precision
+from ..common.types import double_1d, double_2d, int_1d, kernel_set, precision, vec3d_2d
 from .blocks import block_kernels
 from .newton_control import control_struct
 from .pcg import pcg_struct
@@ -84,13 +85,7 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
         return -wp.log10(wp.max(reduction, f64(1.0e-30)))
 
     @wp.kernel(module=module)
-    def decide_rebuild(
-        reuse: Reuse,
-        newton: Newton,
-        mass_factor: wp.array(dtype=f64),
-        dq_dv: wp.array(dtype=f64),
-        active: wp.array(dtype=wp.int32),
-    ):
+    def decide_rebuild(reuse: Reuse, newton: Newton, mass_factor: double_1d, dq_dv: double_1d, active: int_1d):
         """Before a solve: choose the worlds that build the object, at the iterate if it is due or the step has
         changed."""
         world = wp.tid()
@@ -169,7 +164,7 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
             )
 
     @wp.kernel(module=module)
-    def count_step(reuse: Reuse, newton: Newton, accepted: wp.array(dtype=wp.int32)):
+    def count_step(reuse: Reuse, newton: Newton, accepted: int_1d):
         """After an accepted step: count its iterations beyond those of the first step with this matrix."""
         world = wp.tid()
         if accepted[world] == 0 or reuse.stale[world] != 0:
@@ -212,7 +207,7 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
             reuse.rebuild_due[world] = 1
 
     @wp.kernel(module=module)
-    def store_counts(reuse: Reuse, accepted: wp.array(dtype=wp.int32)):
+    def store_counts(reuse: Reuse, accepted: int_1d):
         """After an accepted step: store the counts in the state, unless there was no solve."""
         world = wp.tid()
         if accepted[world] == 0 or reuse.stale[world] != 0:
@@ -226,21 +221,21 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
         reuse.stored_counts[world, 5] = reuse.first_reduction[world]
 
     @wp.kernel(module=module)
-    def mark_stale(flags: wp.array(dtype=wp.int32), reuse: Reuse):
+    def mark_stale(flags: int_1d, reuse: Reuse):
         """Flag the worlds whose state was set externally."""
         world = wp.tid()
         if flags[world] != 0:
             reuse.stale[world] = 1
 
     @wp.kernel(module=module)
-    def request_rebuild(flags: wp.array(dtype=wp.int32), reuse: Reuse):
+    def request_rebuild(flags: int_1d, reuse: Reuse):
         """Request a rebuild before the next solve in the flagged worlds."""
         world = wp.tid()
         if flags[world] != 0:
             reuse.rebuild_due[world] = 1
 
     @wp.func
-    def transfer_case(reuse: Reuse, accepted: wp.array(dtype=wp.int32), world: int) -> int:
+    def transfer_case(reuse: Reuse, accepted: int_1d, world: int) -> int:
         """Transfer due: 1: iterate to linearisation point; 2: state to linearisation point; 3: linearisation point to
         state; 0: none.
 
@@ -252,28 +247,29 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
             return 1
         return wp.where(reuse.stale[world] != 0, 2, 0)
 
+    values = wp.array2d(dtype=Any)
+
+    @wp.func
+    def transfer_entry(to: int, live: values, kept: values, linearisation_point: values, world: int, k: int):
+        """Copy an entry according to `transfer_case`."""
+        if to == 1:
+            linearisation_point[world, k] = live[world, k]
+        elif to == 2:
+            linearisation_point[world, k] = kept[world, k]
+        elif to == 3:
+            kept[world, k] = linearisation_point[world, k]
+
     @wp.kernel(module=module)
-    def transfer_points(
-        reuse: Reuse,
-        accepted: wp.array(dtype=wp.int32),
-        u: wp.array2d(dtype=vec3),
-        kept: wp.array2d(dtype=vec3),
-        linearisation_point: wp.array2d(dtype=vec3),
-    ):
+    def transfer_points(reuse: Reuse, accepted: int_1d, u: p.vec3_2d, kept: p.vec3_2d, linearisation_point: p.vec3_2d):
         """Copy the displacements of the linearisation point, see `transfer_case`."""
         world, slot = wp.tid()
         to = transfer_case(reuse, accepted, world)
-        if to == 1:
-            linearisation_point[world, slot] = u[world, slot]
-        elif to == 2:
-            linearisation_point[world, slot] = kept[world, slot]
-        elif to == 3:
-            kept[world, slot] = linearisation_point[world, slot]
+        transfer_entry(to, u, kept, linearisation_point, world, slot)
 
     @wp.kernel(module=module)
     def transfer_words(
         reuse: Reuse,
-        accepted: wp.array(dtype=wp.int32),
+        accepted: int_1d,
         live: wp.array2d(dtype=wp.uint32),
         kept: wp.array2d(dtype=wp.uint32),
         linearisation_point: wp.array2d(dtype=wp.uint32),
@@ -281,41 +277,25 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
         """`transfer_points` for an array of a term, as [world, 32-bit word]."""
         world, word = wp.tid()
         to = transfer_case(reuse, accepted, world)
-        if to == 1:
-            linearisation_point[world, word] = live[world, word]
-        elif to == 2:
-            linearisation_point[world, word] = kept[world, word]
-        elif to == 3:
-            kept[world, word] = linearisation_point[world, word]
+        transfer_entry(to, live, kept, linearisation_point, world, word)
 
     @wp.kernel(module=module)
     def transfer_constraint_rows(
         reuse: Reuse,
-        accepted: wp.array(dtype=wp.int32),
-        gradient: wp.array2d(dtype=wp.vec3d),
-        stiffness: wp.array2d(dtype=f64),
-        kept_gradient: wp.array2d(dtype=wp.vec3d),
-        kept_stiffness: wp.array2d(dtype=f64),
-        point_gradient: wp.array2d(dtype=wp.vec3d),
-        point_stiffness: wp.array2d(dtype=f64),
+        accepted: int_1d,
+        gradient: vec3d_2d,
+        stiffness: double_2d,
+        kept_gradient: vec3d_2d,
+        kept_stiffness: double_2d,
+        point_gradient: vec3d_2d,
+        point_stiffness: double_2d,
     ):
         """`transfer_points` for the rows of constraints of the object."""
         world, row = wp.tid()
         to = transfer_case(reuse, accepted, world)
-        if to == 1:
-            point_stiffness[world, row] = stiffness[world, row]
-        elif to == 2:
-            point_stiffness[world, row] = kept_stiffness[world, row]
-        elif to == 3:
-            kept_stiffness[world, row] = point_stiffness[world, row]
+        transfer_entry(to, stiffness, kept_stiffness, point_stiffness, world, row)
         for side in range(3):
-            k = 3 * row + side
-            if to == 1:
-                point_gradient[world, k] = gradient[world, k]
-            elif to == 2:
-                point_gradient[world, k] = kept_gradient[world, k]
-            elif to == 3:
-                kept_gradient[world, k] = point_gradient[world, k]
+            transfer_entry(to, gradient, kept_gradient, point_gradient, world, 3 * row + side)
 
     @wp.kernel(module=module)
     def mark_built(reuse: Reuse):
@@ -324,18 +304,4 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
         if reuse.build_now[world] != 0:
             reuse.stale[world] = 0
 
-    return _types.SimpleNamespace(
-        module=module,
-        decide_rebuild=decide_rebuild,
-        count_solve=count_solve,
-        check_matrix_reuse=check_matrix_reuse,
-        count_step=count_step,
-        loosen_forcing=loosen_forcing,
-        store_counts=store_counts,
-        mark_stale=mark_stale,
-        mark_built=mark_built,
-        request_rebuild=request_rebuild,
-        transfer_points=transfer_points,
-        transfer_constraint_rows=transfer_constraint_rows,
-        transfer_words=transfer_words,
-    )
+    return kernel_set(locals())

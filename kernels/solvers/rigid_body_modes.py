@@ -15,7 +15,7 @@ import warp as wp
 
 from ..common.rigid import RIGID_MODES, bodies_struct, rigid_mode_functions
 from ..common.structs import pattern_struct
-from ..common.types import SHORT_UNROLL, kernel_module, precision
+from ..common.types import SHORT_UNROLL, int_1d, kernel_module, kernel_set, precision
 
 __all__ = ["rigid_mode_kernels"]
 
@@ -34,7 +34,7 @@ def rigid_mode_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def update_arms(
-        bodies: Bodies, u: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32)
+        bodies: Bodies, u: p.vec3_2d, active: int_1d
     ):  # fmt: skip
         """a of each slot at displacements u."""
         world, slot = wp.tid()
@@ -51,8 +51,8 @@ def rigid_mode_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def body_matrix_partials(
-        bodies: Bodies, pattern: Pattern, free: wp.array(dtype=vec3), value: wp.array2d(dtype=mat33),
-        active: wp.array(dtype=wp.int32), lanes: int, parts: wp.array4d(dtype=mat33d),
+        bodies: Bodies, pattern: Pattern, free: p.vec3_1d, value: p.mat33_2d,
+        active: int_1d, lanes: int, parts: wp.array4d(dtype=mat33d),
     ):  # fmt: skip
         """R^T H R of each body, H its own blocks `value`: partial sums of a lane over slots, [world, body, lane].
 
@@ -90,8 +90,8 @@ def rigid_mode_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def fill_matrix(
-        active: wp.array(dtype=wp.int32), parts: wp.array4d(dtype=mat33d), scale: wp.array2d(dtype=T),
-        matrix: wp.array3d(dtype=T),
+        active: int_1d, parts: wp.array4d(dtype=mat33d), scale: p.scalar_2d,
+        matrix: p.scalar_3d,
     ):  # fmt: skip
         """Block-diagonal part of the matrix, and its diagonal; rows beyond the bodies are zero."""
         world, row = wp.tid()
@@ -122,7 +122,7 @@ def rigid_mode_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def restrict(
-        bodies: Bodies, r: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), out: wp.array2d(dtype=T)
+        bodies: Bodies, r: p.vec3_2d, active: int_1d, out: p.scalar_2d
     ):  # fmt: skip
         """R^T r; a block of threads per body. r is zero at prescribed components."""
         world, body, thread = wp.tid()
@@ -145,8 +145,8 @@ def rigid_mode_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def prolong(
-        bodies: Bodies, x: wp.array2d(dtype=T), free: wp.array(dtype=vec3), active: wp.array(dtype=wp.int32),
-        z: wp.array2d(dtype=vec3),
+        bodies: Bodies, x: p.scalar_2d, free: p.vec3_1d, active: int_1d,
+        z: p.vec3_2d,
     ):  # fmt: skip
         """z += R x on free components."""
         world, slot = wp.tid()
@@ -161,11 +161,4 @@ def rigid_mode_kernels(dtype: str) -> _types.SimpleNamespace:
         s = f64(bodies.is_position[slot]) * move + wp.cross(turn, bodies.lever_arm[world, slot])
         z[world, slot] = z[world, slot] + wp.cw_mul(vec3(s), free[slot])
 
-    return _types.SimpleNamespace(
-        module=module,
-        update_arms=update_arms,
-        body_matrix_partials=body_matrix_partials,
-        fill_matrix=fill_matrix,
-        restrict=restrict,
-        prolong=prolong,
-    )
+    return kernel_set(locals())

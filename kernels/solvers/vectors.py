@@ -5,7 +5,7 @@ import types as _types
 
 import warp as wp
 
-from ..common.types import precision
+from ..common.types import double_1d, double_3d, int_1d, kernel_set, precision
 from .newton_control import FLOOR_LANES, GROUP_LANES, GROUP_ROUNDOFF, GROUP_ROWS, ROW_ROUNDOFF, control_struct
 from .pcg import pcg_kernels
 
@@ -23,13 +23,13 @@ def vector_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNa
 
     @wp.kernel(module=module)
     def group_norm_partials(
-        start: wp.array(dtype=wp.int32),
-        slot: wp.array(dtype=wp.int32),
-        element_start: wp.array(dtype=wp.int32),
-        element: wp.array(dtype=wp.int32),
-        rows: wp.array3d(dtype=f64),
-        energy: wp.array3d(dtype=f64),
-        active: wp.array(dtype=wp.int32),
+        start: int_1d,
+        slot: int_1d,
+        element_start: int_1d,
+        element: int_1d,
+        rows: double_3d,
+        energy: double_3d,
+        active: int_1d,
         partial: wp.array4d(dtype=f64),
     ):
         """Strided partial sums of GROUP_ROWS over the slots and elements of a residual group."""
@@ -48,7 +48,7 @@ def vector_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNa
         partial[GROUP_ROWS - 1, world, group, lane] = strain
 
     @wp.kernel(module=module)
-    def sum_group_norms(partial: wp.array4d(dtype=f64), active: wp.array(dtype=wp.int32), out: wp.array3d(dtype=f64)):
+    def sum_group_norms(partial: wp.array4d(dtype=f64), active: int_1d, out: double_3d):
         """Sum of the lanes, in order."""
         row, world, group = wp.tid()
         if active[world] == 0:
@@ -59,26 +59,14 @@ def vector_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNa
         out[row, world, group] = total
 
     @wp.kernel(module=module)
-    def update_position(
-        q_tilde: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        dq_dv: wp.array(dtype=f64),
-        active: wp.array(dtype=wp.int32),
-        u: wp.array2d(dtype=vec3),
-    ):
+    def update_position(q_tilde: p.vec3_2d, v: p.vec3_2d, dq_dv: double_1d, active: int_1d, u: p.vec3_2d):
         """q = q~ + (dq/dv) v."""
         world, slot = wp.tid()
         if active[world] != 0:
             u[world, slot] = q_tilde[world, slot] + T(dq_dv[world]) * v[world, slot]
 
     @wp.kernel(module=module)
-    def trial_velocity(
-        ctl: Control,
-        base: wp.array2d(dtype=vec3),
-        direction: wp.array2d(dtype=vec3),
-        best: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-    ):
+    def trial_velocity(ctl: Control, base: p.vec3_2d, direction: p.vec3_2d, best: p.vec3_2d, v: p.vec3_2d):
         """v = base + alpha p, or the best iterate if that is to be restored."""
         world, slot = wp.tid()
         if ctl.searching[world] != 0:
@@ -88,12 +76,7 @@ def vector_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNa
                 v[world, slot] = base[world, slot] + T(ctl.alpha[world]) * direction[world, slot]
 
     @wp.kernel(module=module)
-    def set_base(
-        ctl: Control,
-        v: wp.array2d(dtype=vec3),
-        base: wp.array2d(dtype=vec3),
-        best: wp.array2d(dtype=vec3),
-    ):
+    def set_base(ctl: Control, v: p.vec3_2d, base: p.vec3_2d, best: p.vec3_2d):
         """base = v; before that, best iterate = base in the marked worlds."""
         world, slot = wp.tid()
         if ctl.active[world] != 0:
@@ -104,17 +87,17 @@ def vector_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNa
     @wp.kernel(module=module)
     def floor_partials(
         ctl: Control,
-        start: wp.array(dtype=wp.int32),
-        slot: wp.array(dtype=wp.int32),
-        element_start: wp.array(dtype=wp.int32),
-        element: wp.array(dtype=wp.int32),
-        gradient: wp.array2d(dtype=vec3),
-        direction: wp.array2d(dtype=vec3),
-        inertia: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        v_tilde: wp.array2d(dtype=vec3),
-        u: wp.array2d(dtype=vec3),
-        energy: wp.array3d(dtype=f64),
+        start: int_1d,
+        slot: int_1d,
+        element_start: int_1d,
+        element: int_1d,
+        gradient: p.vec3_2d,
+        direction: p.vec3_2d,
+        inertia: p.vec3_2d,
+        v: p.vec3_2d,
+        v_tilde: p.vec3_2d,
+        u: p.vec3_2d,
+        energy: double_3d,
     ):
         """Strided partial sums of FLOOR_ROWS over the slots and elements of a part; empty lists: all."""
         world, part, lane = wp.tid()
@@ -145,40 +128,24 @@ def vector_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNa
         ctl.floor_sums[5, world, part, lane] = speed
 
     @wp.kernel(module=module)
-    def copy_active(source: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), target: wp.array2d(dtype=vec3)):
+    def copy_active(source: p.vec3_2d, active: int_1d, target: p.vec3_2d):
         """target = source in the active worlds."""
         world, slot = wp.tid()
         if active[world] != 0:
             target[world, slot] = source[world, slot]
 
     @wp.kernel(module=module)
-    def dot_terms(
-        a: wp.array2d(dtype=vec3),
-        b: wp.array2d(dtype=vec3),
-        active: wp.array(dtype=wp.int32),
-        rows: wp.array3d(dtype=f64),
-    ):
+    def dot_terms(a: p.vec3_2d, b: p.vec3_2d, active: int_1d, rows: double_3d):
         """a.b per slot."""
         world, slot = wp.tid()
         if active[world] != 0:
             rows[0, world, slot] = f64(wp.dot(a[world, slot], b[world, slot]))
 
     @wp.kernel(module=module)
-    def set_any_flag(flags: wp.array(dtype=wp.int32), out: wp.array(dtype=wp.int32)):
+    def set_any_flag(flags: int_1d, out: int_1d):
         """out[0] = 1 if any world's flag is set; out must be 0 before."""
         world = wp.tid()
         if flags[world] != 0:
             wp.atomic_max(out, 0, 1)
 
-    return _types.SimpleNamespace(
-        module=module,
-        group_norm_partials=group_norm_partials,
-        sum_group_norms=sum_group_norms,
-        update_position=update_position,
-        trial_velocity=trial_velocity,
-        copy_active=copy_active,
-        set_base=set_base,
-        floor_partials=floor_partials,
-        dot_terms=dot_terms,
-        set_any_flag=set_any_flag,
-    )
+    return kernel_set(locals())

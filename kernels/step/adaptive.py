@@ -22,7 +22,7 @@ from typing import Any
 
 import warp as wp
 
-from ..common.types import kernel_module, precision
+from ..common.types import kernel_module, kernel_set, precision
 from ..solvers.newton_control import FAIL_LOCAL_ERROR, FAIL_ROUNDOFF, control_struct
 from ..solvers.pcg import pcg_struct
 from .step_control import step_end_functions, step_struct
@@ -173,13 +173,13 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
     def max_error_rates(
         step: Step,
         ctl: Adaptive,
-        displacement_factor: wp.array(dtype=T),
-        free: wp.array(dtype=vec3),
-        u: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        v_n: wp.array2d(dtype=vec3),
-        v_before: wp.array2d(dtype=vec3),
-        means: wp.array2d(dtype=vec3),
+        displacement_factor: p.scalar_1d,
+        free: p.vec3_1d,
+        u: p.vec3_2d,
+        v: p.vec3_2d,
+        v_n: p.vec3_2d,
+        v_before: p.vec3_2d,
+        means: p.vec3_2d,
     ):
         """Largest rate, mean of rates and displacement over free slots. The maximum is independent of the order.
 
@@ -207,12 +207,7 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def update_mean_rates(
-        step: Step,
-        ctl: Adaptive,
-        v: wp.array2d(dtype=vec3),
-        v_n: wp.array2d(dtype=vec3),
-        v_before: wp.array2d(dtype=vec3),
-        means: wp.array2d(dtype=vec3),
+        step: Step, ctl: Adaptive, v: p.vec3_2d, v_n: p.vec3_2d, v_before: p.vec3_2d, means: p.vec3_2d
     ):
         """Update the mean with the rate of an accepted substep; reset it after a substep of order 1."""
         world, slot = wp.tid()
@@ -311,13 +306,4 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
         world = wp.tid()
         pcg.step_iterations[world] = pcg.step_iterations[world] + ctl.pcg_iterations[world]
 
-    return _types.SimpleNamespace(
-        module=module,
-        begin_step_control=begin_step_control,
-        begin_estimate=begin_estimate,
-        max_error_rates=max_error_rates,
-        update_mean_rates=update_mean_rates,
-        control_step_size=control_step_size,
-        refine_substeps=refine_substeps,
-        report_pcg_iterations=report_pcg_iterations,
-    )
+    return kernel_set(locals())

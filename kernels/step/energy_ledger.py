@@ -6,7 +6,7 @@ import types as _types
 import warp as wp
 
 from ..common.structs import balance_struct, mass_function, topology_struct
-from ..common.types import precision
+from ..common.types import double_2d, kernel_set, precision
 from ..solvers.newton_control import control_struct
 from .step_control import GROWTH_COLUMNS, step_struct
 
@@ -109,14 +109,7 @@ def ledger_kernels(dtype: str, chord: bool, nonpotential: bool, module: wp.Modul
             step.energy_growth[world, GROWTH_SINCE] = step.time[world]
 
     @wp.kernel(module=module)
-    def ledger_terms(
-        step: Step,
-        topo: Topology,
-        balance: Balance,
-        lumped: wp.array2d(dtype=T),
-        u_n: wp.array2d(dtype=vec3),
-        v_n: wp.array2d(dtype=vec3),
-    ):
+    def ledger_terms(step: Step, topo: Topology, balance: Balance, lumped: p.scalar_2d, u_n: p.vec3_2d, v_n: p.vec3_2d):
         """Per slot: integrator's inertia part, f_int.dq, loads.dq, gravity.dq, supports.dq, kinetic, free g.dq,
         nonpotential.dq, inertia.dq, gravity.u."""
         world, slot = wp.tid()
@@ -146,13 +139,7 @@ def ledger_kernels(dtype: str, chord: bool, nonpotential: bool, module: wp.Modul
         balance.rows[9, world, slot] = f64(wp.dot(weight, balance.u[world, slot]))
 
     @wp.kernel(module=module)
-    def update_ledger(
-        step: Step,
-        newton: Newton,
-        sums: wp.array2d(dtype=f64),
-        energies: TermEnergies,
-        ledger: wp.array2d(dtype=f64),
-    ):
+    def update_ledger(step: Step, newton: Newton, sums: double_2d, energies: TermEnergies, ledger: double_2d):
         """Add a substep to the ledger; the integrator part by its own formula, never as the remainder.
 
         The force of a term does the work f.dq on a substep. Its stored energy and loss have columns; the remainder is
@@ -227,4 +214,4 @@ def ledger_kernels(dtype: str, chord: bool, nonpotential: bool, module: wp.Modul
             added = step.residual_work_counted * balance - (numerical + viscous)
             track_energy_growth(step, world, energy - (change_K + change_W + stored), energy, turnover, added)
 
-    return _types.SimpleNamespace(ledger_terms=ledger_terms, update_ledger=update_ledger)
+    return kernel_set(locals())

@@ -6,7 +6,7 @@ import types as _types
 
 import warp as wp
 
-from ..common.types import kernel_module, precision
+from ..common.types import double_1d, double_2d, int_1d, kernel_module, kernel_set, precision, vec3d_1d
 from .step_control import REPORT_COLUMNS, SAME_TIME_FRACTION, STATUS
 
 __all__ = ["JOINT_VALUE_KINDS", "MOTION_KINDS", "RUN_STATISTICS", "episode_kernels", "observation_kernels"]
@@ -30,16 +30,14 @@ def episode_kernels() -> _types.SimpleNamespace:
     running = STATUS["running"]
 
     @wp.kernel(module=module)
-    def end_episodes(
-        time: wp.array(dtype=f64), t_end: wp.array(dtype=f64), dt: wp.array(dtype=f64), status: wp.array(dtype=wp.int32)
-    ):
+    def end_episodes(time: double_1d, t_end: double_1d, dt: double_1d, status: int_1d):
         """Freeze the worlds that have reached their end time."""
         world = wp.tid()
         if status[world] == wp.static(running) and time[world] >= t_end[world] - f64(SAME_TIME_FRACTION) * dt[world]:
             status[world] = wp.static(STATUS["frozen"])
 
     @wp.kernel(module=module)
-    def add_statistics(report: wp.array2d(dtype=f64), sums: wp.array2d(dtype=f64), stepped: wp.array(dtype=wp.int32)):
+    def add_statistics(report: double_2d, sums: double_2d, stepped: int_1d):
         """Add a step to the run statistics."""
         world = wp.tid()
         status = wp.int32(report[world, wp.static(column["status"])])
@@ -60,29 +58,26 @@ def episode_kernels() -> _types.SimpleNamespace:
         sums[world, 8] = wp.min(sums[world, 8], report[world, wp.static(column["min_J"])])
 
     @wp.kernel(module=module)
-    def clear_statistics(sums: wp.array2d(dtype=f64)):
+    def clear_statistics(sums: double_2d):
         """Reset the run statistics."""
         world, k = wp.tid()
         sums[world, k] = wp.where(k < wp.static(FIRST_MINIMUM_COLUMN), f64(0.0), f64(wp.inf))
 
     @wp.kernel(module=module)
-    def copy_flagged(flags: wp.array(dtype=wp.int32), source: wp.array(dtype=f64), target: wp.array(dtype=f64)):
+    def copy_flagged(flags: int_1d, source: double_1d, target: double_1d):
         """Copy a number in the flagged worlds."""
         world = wp.tid()
         if flags[world] != 0:
             target[world] = source[world]
 
     @wp.kernel(module=module)
-    def clear_flagged(flags: wp.array(dtype=wp.int32), target: wp.array(dtype=wp.int32)):
+    def clear_flagged(flags: int_1d, target: int_1d):
         """Clear a flag in the flagged worlds."""
         world = wp.tid()
         if flags[world] != 0:
             target[world] = 0
 
-    return _types.SimpleNamespace(
-        module=module, end_episodes=end_episodes, add_statistics=add_statistics, clear_statistics=clear_statistics,
-        copy_flagged=copy_flagged, clear_flagged=clear_flagged,
-    )  # fmt: skip
+    return kernel_set(locals())
 
 
 @functools.cache
@@ -95,9 +90,9 @@ def observation_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def point_motions(
-        start: wp.array(dtype=wp.int32), slot: wp.array(dtype=wp.int32), weight: wp.array(dtype=f64),
-        kind: wp.array(dtype=wp.int32), place: wp.array(dtype=vec3d), column: wp.array(dtype=wp.int32),
-        u: wp.array2d(dtype=vec3), v: wp.array2d(dtype=vec3), out: wp.array2d(dtype=T),
+        start: int_1d, slot: int_1d, weight: double_1d,
+        kind: int_1d, place: vec3d_1d, column: int_1d,
+        u: p.vec3_2d, v: p.vec3_2d, out: p.scalar_2d,
     ):  # fmt: skip
         """Positions, displacements and velocities of points, sums of s_i u_i."""
         world, k = wp.tid()
@@ -114,8 +109,8 @@ def observation_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def report_columns(
-        source: wp.array(dtype=wp.int32), column: wp.array(dtype=wp.int32), report: wp.array2d(dtype=f64),
-        stepped: wp.array(dtype=wp.int32), out: wp.array2d(dtype=T),
+        source: int_1d, column: int_1d, report: double_2d,
+        stepped: int_1d, out: p.scalar_2d,
     ):  # fmt: skip
         """Columns of the report of the last step; 0 without a step."""
         world, k = wp.tid()
@@ -123,8 +118,8 @@ def observation_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def current_joint_vector(
-        start: wp.array(dtype=wp.int32), slot: wp.array(dtype=wp.int32), weight: wp.array(dtype=f64),
-        place: wp.array(dtype=vec3d), u: wp.array2d(dtype=vec3), world: int, k: int,
+        start: int_1d, slot: int_1d, weight: double_1d,
+        place: vec3d_1d, u: p.vec3_2d, world: int, k: int,
     ) -> vec3d:  # fmt: skip
         """Current vector of a joint: its reference value plus the sum of w_i u_i."""
         x = place[k]
@@ -134,10 +129,10 @@ def observation_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def joint_values(
-        start: wp.array(dtype=wp.int32), slot: wp.array(dtype=wp.int32), weight: wp.array(dtype=f64),
-        place: wp.array(dtype=vec3d), kind: wp.array(dtype=wp.int32), row: wp.array(dtype=wp.int32),
-        column: wp.array(dtype=wp.int32), u: wp.array2d(dtype=vec3), target: wp.array2d(dtype=f64),
-        out: wp.array2d(dtype=T),
+        start: int_1d, slot: int_1d, weight: double_1d,
+        place: vec3d_1d, kind: int_1d, row: int_1d,
+        column: int_1d, u: p.vec3_2d, target: double_2d,
+        out: p.scalar_2d,
     ):  # fmt: skip
         """Lengths, travels and angles from three vectors each; `row`: of a drive with multiple turns, or -1."""
         world, k = wp.tid()
@@ -155,12 +150,9 @@ def observation_kernels(dtype: str) -> _types.SimpleNamespace:
         out[world, column[k]] = T(x)
 
     @wp.kernel(module=module)
-    def world_values(values: wp.array(dtype=f64), column: int, out: wp.array2d(dtype=T)):
+    def world_values(values: double_1d, column: int, out: p.scalar_2d):
         """Copy of a number of each world."""
         world = wp.tid()
         out[world, column] = T(values[world])
 
-    return _types.SimpleNamespace(
-        module=module, point_motions=point_motions, report_columns=report_columns, world_values=world_values,
-        joint_values=joint_values,
-    )  # fmt: skip
+    return kernel_set(locals())

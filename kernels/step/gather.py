@@ -12,7 +12,7 @@ from ..common.inverse import inverse_function
 from ..common.lanes import lane_functions
 from ..common.structs import balance_struct, mass_function, pattern_struct, product_terms_struct, topology_struct
 from ..common.traits import NO_TERMS, Traits
-from ..common.types import SHORT_UNROLL, kernel_module, precision
+from ..common.types import SHORT_UNROLL, double_1d, double_3d, int_1d, kernel_module, kernel_set, precision
 from ..solvers.newton_control import (
     ROW_FORCE,
     ROW_FROZEN_CHANGE,
@@ -59,7 +59,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
     Constraints, Multipliers = constraint_struct(), multiplier_struct()
     f64 = wp.float64
     Pattern = pattern_struct()
-    lane_sum, row_sum = lane_functions(dtype).lane_sum, lane_functions(dtype).row_sum
+    lane_sum, store_sum = lane_functions(dtype).lane_sum, lane_functions(dtype).store_sum
     free_inverse, mass_entry = inverse_function(dtype), mass_function(dtype)
     name = f"{dtype}{traits.suffix('nonpotential', 'tangent', 'pooled', 'constraint_rows', 'midpoint')}"
     module = kernel_module(f"gather_{name}", max_unroll=SHORT_UNROLL)
@@ -105,7 +105,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         return wp.matrix_from_rows(constraint_force, penalty, merit)
 
     @wp.func
-    def gather_sum(topo: Topology, contribution: wp.array2d(dtype=vec3), world: int, slot: int) -> vec3:
+    def gather_sum(topo: Topology, contribution: p.vec3_2d, world: int, slot: int) -> vec3:
         """Sum of the contributions to a slot, in order."""
         f = vec3()
         for k in range(topo.contribution_start[slot], topo.contribution_start[slot + 1]):
@@ -137,12 +137,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         return s
 
     @wp.kernel(module=module)
-    def gather_force(
-        topo: Topology,
-        contribution: wp.array2d(dtype=vec3),
-        active: wp.array(dtype=wp.int32),
-        out: wp.array2d(dtype=vec3),
-    ):
+    def gather_force(topo: Topology, contribution: p.vec3_2d, active: int_1d, out: p.vec3_2d):
         """out = sum of contributions."""
         world, slot = wp.tid()
         if active[world] == 0:
@@ -151,12 +146,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
 
     @wp.kernel(module=module)
     def residual(
-        topo: Topology,
-        contribution: wp.array2d(dtype=vec3),
-        balance: Balance,
-        active: wp.array(dtype=wp.int32),
-        con: Constraints,
-        mul: Multipliers,
+        topo: Topology, contribution: p.vec3_2d, balance: Balance, active: int_1d, con: Constraints, mul: Multipliers
     ):
         """Eq. (17): g = M (v - v~) c_M + f_int - f_dead - f_nonpotential + J^T lambda, and the rows of `RESIDUAL_ROWS`.
 
@@ -250,7 +240,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         mul: Multipliers,
         world: int,
         slot: int,
-        result: wp.array2d(dtype=vec3),
+        result: p.vec3_2d,
     ) -> f64:
         """H p on the free components: adds the terms' part to the elements' part. Returns p.Hp."""
         out = h
@@ -278,76 +268,79 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         return f64(wp.dot(out, p))
 
     @wp.func
-    def store_warp_sum(share: f64, index: int, warp: int, world: int, rows: wp.array3d(dtype=f64)):
-        """Store the sum of p.Hp over a warp's rows."""
-        total = row_sum(share, warp)
-        if index % warp == 0:
-            rows[0, world, index / warp] = total
-
-    @wp.kernel(module=module)
-    def operator_product(
+    def slot_product(
         topo: Topology,
-        contribution: wp.array2d(dtype=vec3),
+        contribution: p.vec3_2d,
+        mass: bool,
         more: ProductTerms,
-        p_in: wp.array2d(dtype=vec3),
-        active: wp.array(dtype=wp.int32),
+        p_in: p.vec3_2d,
         con: Constraints,
         mul: Multipliers,
-        out: wp.array2d(dtype=vec3),
-        rows: wp.array3d(dtype=f64),
+        world: int,
+        slot: int,
+        out: p.vec3_2d,
+        rows: double_3d,
     ):
-        """H p = c_M M p + (dq/dv) K p on the free components, constraints included, and p.Hp per warp of slots."""
-        world, slot = wp.tid()
-        if active[world] == 0:
-            return
-        share = f64(0.0)
-        if slot < out.shape[1]:
-            pool = pool_range(more, slot)
-            f = gather_sum(topo, contribution, world, slot)
-            a = vec3()
-            for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
-                a += mass_entry(topo, world, k) * p_in[world, topo.mass_column[k]]
-            dq = T(more.dq_dv[world])
-            h = T(more.mass_factor[world]) * a + dq * f
-            share = add_term_products(topo, h, more, pool, p_in[world, slot], con, mul, world, slot, out)
-        store_warp_sum(share, slot, more.warp_lanes, world, rows)
-
-    @wp.kernel(module=module, launch_bounds=(256, MIN_RESIDENT_BLOCKS[dtype]))
-    def with_mass_sum(
-        topo: Topology,
-        contribution: wp.array2d(dtype=vec3),
-        more: ProductTerms,
-        p_in: wp.array2d(dtype=vec3),
-        active: wp.array(dtype=wp.int32),
-        con: Constraints,
-        mul: Multipliers,
-        out: wp.array2d(dtype=vec3),
-        rows: wp.array3d(dtype=f64),
-    ):
-        """H p from contributions that include the mass and the factors."""
-        world, slot = wp.tid()
-        if active[world] == 0:
-            return
+        """H p at a slot, with c_M M p and factor dq/dv if `mass`, and p.Hp per warp of slots."""
         share = f64(0.0)
         if slot < out.shape[1]:
             pool = pool_range(more, slot)
             h = gather_sum(topo, contribution, world, slot)
+            if mass:
+                a = vec3()
+                for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
+                    a += mass_entry(topo, world, k) * p_in[world, topo.mass_column[k]]
+                h = T(more.mass_factor[world]) * a + T(more.dq_dv[world]) * h
             share = add_term_products(topo, h, more, pool, p_in[world, slot], con, mul, world, slot, out)
-        store_warp_sum(share, slot, more.warp_lanes, world, rows)
+        store_sum(0, share, slot, more.warp_lanes, world, rows)
+
+    @wp.kernel(module=module)
+    def operator_product(
+        topo: Topology,
+        contribution: p.vec3_2d,
+        more: ProductTerms,
+        p_in: p.vec3_2d,
+        active: int_1d,
+        con: Constraints,
+        mul: Multipliers,
+        out: p.vec3_2d,
+        rows: double_3d,
+    ):
+        """H p = c_M M p + (dq/dv) K p on the free components, constraints included, and p.Hp per warp of slots."""
+        world, slot = wp.tid()
+        if active[world] != 0:
+            slot_product(topo, contribution, True, more, p_in, con, mul, world, slot, out, rows)
+
+    @wp.kernel(module=module, launch_bounds=(256, MIN_RESIDENT_BLOCKS[dtype]))
+    def with_mass_sum(
+        topo: Topology,
+        contribution: p.vec3_2d,
+        more: ProductTerms,
+        p_in: p.vec3_2d,
+        active: int_1d,
+        con: Constraints,
+        mul: Multipliers,
+        out: p.vec3_2d,
+        rows: double_3d,
+    ):
+        """H p from contributions that include the mass and the factors."""
+        world, slot = wp.tid()
+        if active[world] != 0:
+            slot_product(topo, contribution, False, more, p_in, con, mul, world, slot, out, rows)
 
     @wp.kernel(module=matrix_module)
     def matrix_product(
         topo: Topology,
         pattern: Pattern,
-        value: wp.array2d(dtype=mat33),
+        value: p.mat33_2d,
         lanes: int,
         more: ProductTerms,
-        p_in: wp.array2d(dtype=vec3),
-        active: wp.array(dtype=wp.int32),
+        p_in: p.vec3_2d,
+        active: int_1d,
         con: Constraints,
         mul: Multipliers,
-        out: wp.array2d(dtype=vec3),
-        rows: wp.array3d(dtype=f64),
+        out: p.vec3_2d,
+        rows: double_3d,
     ):
         """H p with the elements' part and the mass as one matrix, `lanes` threads per row."""
         world, index = wp.tid()
@@ -365,18 +358,18 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         share = f64(0.0)
         if lane == 0 and slot < out.shape[1]:
             share = add_term_products(topo, h, more, pool, p_in[world, slot], con, mul, world, slot, out)
-        store_warp_sum(share, index, more.warp_lanes, world, rows)
+        store_sum(0, share, index, more.warp_lanes, world, rows)
 
     @wp.kernel(module=module)
     def gather_diagonal_blocks(
         topo: Topology,
-        contribution: wp.array2d(dtype=sym6),
-        pool: wp.array2d(dtype=sym6),
-        mass_factor: wp.array(dtype=f64),
-        dq_dv: wp.array(dtype=f64),
-        active: wp.array(dtype=wp.int32),
-        diagonal: wp.array2d(dtype=vec3),
-        inverse: wp.array2d(dtype=mat33),
+        contribution: p.sym_2d,
+        pool: p.sym_2d,
+        mass_factor: double_1d,
+        dq_dv: double_1d,
+        active: int_1d,
+        diagonal: p.vec3_2d,
+        inverse: p.mat33_2d,
     ):
         """Diagonal blocks of H: their diagonal D and their inverse on the free components."""
         world, slot = wp.tid()
@@ -403,11 +396,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         inverse[world, slot] = free_inverse(A, mass, free)
 
     @wp.kernel(module=module)
-    def kinetic_terms(
-        topo: Topology,
-        a: wp.array2d(dtype=vec3),
-        rows: wp.array3d(dtype=f64),
-    ):
+    def kinetic_terms(topo: Topology, a: p.vec3_2d, rows: double_3d):
         """a.M a / 2 per slot, for every world."""
         world, slot = wp.tid()
         s = vec3()
@@ -415,14 +404,4 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             s += mass_entry(topo, world, k) * a[world, topo.mass_column[k]]
         rows[0, world, slot] = f64(0.5) * f64(wp.dot(s, a[world, slot]))
 
-    return _types.SimpleNamespace(
-        module=module,
-        matrix_module=matrix_module,
-        matrix_product=matrix_product,
-        gather_force=gather_force,
-        residual=residual,
-        operator_product=operator_product,
-        with_mass_sum=with_mass_sum,
-        gather_diagonal_blocks=gather_diagonal_blocks,
-        kinetic_terms=kinetic_terms,
-    )
+    return kernel_set(locals())

@@ -5,7 +5,7 @@ import types as _types
 
 import warp as wp
 
-from ..common.types import kernel_module, precision
+from ..common.types import double_1d, int_1d, kernel_module, kernel_set, precision
 
 __all__ = ["midpoint_kernels"]
 
@@ -19,13 +19,13 @@ def midpoint_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def evaluate_midpoint(
-        u_n: wp.array2d(dtype=vec3),
-        v_n: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        dq_dv: wp.array(dtype=wp.float64),
-        active: wp.array(dtype=wp.int32),
-        u_stage: wp.array2d(dtype=vec3),
-        v_stage: wp.array2d(dtype=vec3),
+        u_n: p.vec3_2d,
+        v_n: p.vec3_2d,
+        v: p.vec3_2d,
+        dq_dv: double_1d,
+        active: int_1d,
+        u_stage: p.vec3_2d,
+        v_stage: p.vec3_2d,
     ):
         """Half of the change of u, (dq/dv) (v_n + v)/2, and u at the midpoint, m; without differences of positions."""
         world, slot = wp.tid()
@@ -34,4 +34,4 @@ def midpoint_kernels(dtype: str) -> _types.SimpleNamespace:
             u_stage[world, slot] = u_n[world, slot] + half
             v_stage[world, slot] = half
 
-    return _types.SimpleNamespace(module=module, evaluate_midpoint=evaluate_midpoint)
+    return kernel_set(locals())

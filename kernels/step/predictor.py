@@ -9,7 +9,8 @@ import types as _types
 
 import warp as wp
 
-from ..common.types import precision
+from ..common.structs import free_components_function
+from ..common.types import double_3d, kernel_set, precision
 from ..solvers.newton_control import control_struct
 from .step_control import step_struct
 
@@ -44,7 +45,7 @@ def predictor_struct():
 @functools.cache
 def predictor_kernels(dtype: str, accelerated: bool, module: wp.Module) -> _types.SimpleNamespace:
     """Kernels in one precision, compiled into the module of the step kernels; `accelerated`: see `step_kernels`."""
-    p = precision(dtype)
+    p, free_components = precision(dtype), free_components_function(dtype)
     T, vec3 = p.T, p.vec3
     f64 = wp.float64
     Predictor, Step, Newton = predictor_struct(), step_struct(), control_struct()
@@ -75,11 +76,11 @@ def predictor_kernels(dtype: str, accelerated: bool, module: wp.Module) -> _type
     def extrapolate(
         predictor: Predictor,
         step: Step,
-        free: wp.array(dtype=vec3),
-        v_n: wp.array2d(dtype=vec3),
-        before: wp.array2d(dtype=vec3),
-        first: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
+        free: p.vec3_1d,
+        v_n: p.vec3_2d,
+        before: p.vec3_2d,
+        first: p.vec3_2d,
+        v: p.vec3_2d,
     ):
         """Extrapolated first iterate on free components if the order is above 0; else v_n is kept."""
         world, slot = wp.tid()
@@ -87,25 +88,20 @@ def predictor_kernels(dtype: str, accelerated: bool, module: wp.Module) -> _type
         if step.running[world] == 0 or order == 0:
             return
         new = extrapolated_velocity(order, v_n[world, slot], before[world, slot], first[world, slot])
-        f = free[slot]
-        old = v[world, slot]
-        for k in range(3):
-            if f[k] != T(0.0):
-                old[k] = new[k]
-        v[world, slot] = old
+        v[world, slot] = free_components(free[slot], new, v[world, slot])
 
     @wp.kernel(module=module)
     def order_error_terms(
         predictor: Predictor,
         step: Step,
-        free: wp.array(dtype=vec3),
-        is_position: wp.array(dtype=T),
-        diagonal: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        v_n: wp.array2d(dtype=vec3),
-        before: wp.array2d(dtype=vec3),
-        first: wp.array2d(dtype=vec3),
-        rows: wp.array3d(dtype=f64),
+        free: p.vec3_1d,
+        is_position: p.scalar_1d,
+        diagonal: p.vec3_2d,
+        v: p.vec3_2d,
+        v_n: p.vec3_2d,
+        before: p.vec3_2d,
+        first: p.vec3_2d,
+        rows: double_3d,
     ):
         """Squared errors of the orders in an accepted step, in the norm of D.
 
@@ -130,13 +126,7 @@ def predictor_kernels(dtype: str, accelerated: bool, module: wp.Module) -> _type
         rows[3, world, slot] = f64(wp.dot(D, wp.cw_mul(w, w)))
 
     @wp.kernel(module=module)
-    def shift_history(
-        step: Step,
-        own: int,
-        v_n: wp.array2d(dtype=vec3),
-        before: wp.array2d(dtype=vec3),
-        first: wp.array2d(dtype=vec3),
-    ):
+    def shift_history(step: Step, own: int, v_n: p.vec3_2d, before: p.vec3_2d, first: p.vec3_2d):
         """Shift the stored velocities by a step; `own`: v_{n-1} too, which multistep schemes store themselves."""
         world, slot = wp.tid()
         if step.accepted[world] != 0:
@@ -164,10 +154,4 @@ def predictor_kernels(dtype: str, accelerated: bool, module: wp.Module) -> _type
         predictor.history_state[world, 2] = step.h[world]
         predictor.history_state[world, 3] = step.time[world]
 
-    return _types.SimpleNamespace(
-        begin_attempt=begin_attempt,
-        extrapolate=extrapolate,
-        order_error_terms=order_error_terms,
-        shift_history=shift_history,
-        choose_order=choose_order,
-    )
+    return kernel_set(locals())

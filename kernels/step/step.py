@@ -11,8 +11,9 @@ from typing import Any
 
 import warp as wp
 
+from ..common.structs import free_components_function
 from ..common.traits import NO_TERMS, Traits
-from ..common.types import kernel_module, precision
+from ..common.types import double_2d, int_1d, kernel_module, kernel_set, precision
 from ..solvers.newton_control import FAIL_ELEMENT_INVERTED, FAIL_ENERGY_GROWTH, FAIL_ROUNDOFF, FAIL_WORK, control_struct
 from ..solvers.pcg import pcg_struct
 from .energy_ledger import GROWTH_SHARE, ledger_kernels
@@ -40,7 +41,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
             state before the last), midpoint (forces at the midpoint), variant (their name).
         traits: of the model; depends on "nonpotential" and "has_constraints".
     """
-    p = precision(dtype)
+    p, free_components = precision(dtype), free_components_function(dtype)
     T, vec3 = p.T, p.vec3
     f64 = wp.float64
     Step, limits = step_struct(), step_end_functions()
@@ -141,15 +142,15 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
     @wp.kernel(module=module)
     def predict(
         step: Step,
-        is_position: wp.array(dtype=T),
-        free: wp.array(dtype=vec3),
-        u_n: wp.array2d(dtype=vec3),
-        v_n: wp.array2d(dtype=vec3),
-        u_before: wp.array2d(dtype=vec3),
-        v_before: wp.array2d(dtype=vec3),
-        q_tilde: wp.array2d(dtype=vec3),
-        v_tilde: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
+        is_position: p.scalar_1d,
+        free: p.vec3_1d,
+        u_n: p.vec3_2d,
+        v_n: p.vec3_2d,
+        u_before: p.vec3_2d,
+        v_before: p.vec3_2d,
+        q_tilde: p.vec3_2d,
+        v_tilde: p.vec3_2d,
+        v: p.vec3_2d,
     ):
         """q~, v~ and the first iterate; prescribed components keep their positions.
 
@@ -191,24 +192,20 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
             if wp.static(accelerated):
                 first = v_n[world, slot] + (T(step.h[world]) * is_position[slot]) * vec3(step.gravity[world])
         keep = (T(1.0) / dq) * (u_n[world, slot] - q)
-        f = free[slot]
-        for k in range(3):
-            if f[k] == T(0.0):
-                first[k] = keep[k]
-        v[world, slot] = first
+        v[world, slot] = free_components(free[slot], first, keep)
 
     @wp.kernel(module=module)
     def alternative_first_iterate(
         step: Step,
         newton: Newton,
         kind: int,
-        is_position: wp.array(dtype=T),
-        free: wp.array(dtype=vec3),
-        u_n: wp.array2d(dtype=vec3),
-        v_n: wp.array2d(dtype=vec3),
-        q_tilde: wp.array2d(dtype=vec3),
-        v_tilde: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
+        is_position: p.scalar_1d,
+        free: p.vec3_1d,
+        u_n: p.vec3_2d,
+        v_n: p.vec3_2d,
+        q_tilde: p.vec3_2d,
+        v_tilde: p.vec3_2d,
+        v: p.vec3_2d,
     ):
         """Alternative first iterate on the free components: 0: v~ + (dq/dv) g, 1: v_n, 2: the one with q = q_n."""
         world, slot = wp.tid()
@@ -225,12 +222,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
                 new = v_n[world, slot] + (T(step.h[world]) * is_position[slot]) * vec3(step.gravity[world])
         elif kind == 2:
             new = (T(1.0) / dq) * (u_n[world, slot] - q_tilde[world, slot])
-        f = free[slot]
-        old = v[world, slot]
-        for k in range(3):
-            if f[k] != T(0.0):
-                old[k] = new[k]
-        v[world, slot] = old
+        v[world, slot] = free_components(free[slot], new, v[world, slot])
 
     @wp.kernel(module=module)
     def end_attempt(step: Step, newton: Newton):
@@ -281,7 +273,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
             wp.atomic_max(step.any_running, 0, 1)
 
     @wp.kernel(module=module)
-    def flag_failed_steps(step: Step, newton: Newton, flags: wp.array(dtype=wp.int32)):
+    def flag_failed_steps(step: Step, newton: Newton, flags: int_1d):
         """Flag the worlds whose step failed finally: its accepted substeps are rolled back."""
         world = wp.tid()
         flags[world] = 0
@@ -293,12 +285,12 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
     def accept_state(
         step: Step,
         newton: Newton,
-        u: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        u_n: wp.array2d(dtype=vec3),
-        v_n: wp.array2d(dtype=vec3),
-        u_before: wp.array2d(dtype=vec3),
-        v_before: wp.array2d(dtype=vec3),
+        u: p.vec3_2d,
+        v: p.vec3_2d,
+        u_n: p.vec3_2d,
+        v_n: p.vec3_2d,
+        u_before: p.vec3_2d,
+        v_before: p.vec3_2d,
     ):
         """Store the accepted iterate in the state."""
         world, slot = wp.tid()
@@ -327,7 +319,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
             v_n[world, slot] = v[world, slot]
 
     @wp.kernel(module=module)
-    def write_report(step: Step, newton: Newton, pcg: PCG, report: wp.array2d(dtype=f64)):
+    def write_report(step: Step, newton: Newton, pcg: PCG, report: double_2d):
         """Report of a step, one array for the host; columns as `REPORT_COLUMNS`."""
         world = wp.tid()
         report[world, 0] = f64(step.status[world])
@@ -356,13 +348,13 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
 
     @wp.kernel(module=module)
     def probe_values(
-        start: wp.array(dtype=wp.int32),
-        slot: wp.array(dtype=wp.int32),
-        weight: wp.array(dtype=T),
-        u: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
+        start: int_1d,
+        slot: int_1d,
+        weight: p.scalar_1d,
+        u: p.vec3_2d,
+        v: p.vec3_2d,
         first_column: int,
-        report: wp.array2d(dtype=f64),
+        report: double_2d,
     ):
         """Displacement and velocity of each probe, sum of s_i u_i, into the report."""
         world, probe = wp.tid()
@@ -376,16 +368,5 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
             report[world, first_column + 6 * probe + c] = d[c]
             report[world, first_column + 6 * probe + 3 + c] = w[c]
 
-    return _types.SimpleNamespace(
-        module=module,
-        begin_step=begin_step,
-        begin_attempt=begin_attempt,
-        predict=predict,
-        alternative_first_iterate=alternative_first_iterate,
-        end_attempt=end_attempt,
-        flag_failed_steps=flag_failed_steps,
-        accept_state=accept_state,
-        **vars(ledger_kernels(dtype, multistep or midpoint or accelerated, nonpotential, module)),
-        write_report=write_report,
-        probe_values=probe_values,
-    )
+    ledger = ledger_kernels(dtype, multistep or midpoint or accelerated, nonpotential, module)
+    return kernel_set(vars(ledger) | locals())

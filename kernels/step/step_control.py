@@ -5,6 +5,8 @@ import types as _types
 
 import warp as wp
 
+from ..common.types import kernel_set
+
 __all__ = [
     "GROWTH_COLUMNS",
     "REPORT_COLUMNS",
@@ -143,4 +145,4 @@ def step_end_functions() -> _types.SimpleNamespace:
             return left
         return step.dt[world]
 
-    return _types.SimpleNamespace(end_time=end_time, time_tolerance=time_tolerance, step_length=step_length)
+    return kernel_set(locals())

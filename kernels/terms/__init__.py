@@ -1,1 +1,1 @@
-"""Forces besides those of elements: loads, follower loads, constraints, contact."""
+"""Forces besides those of elements: loads, follower loads, constraints."""

@@ -7,7 +7,7 @@ import warp as wp
 
 from ..common.block_entries import add_block_function
 from ..common.structs import pattern_struct, topology_struct
-from ..common.types import SHORT_UNROLL, kernel_module, precision
+from ..common.types import SHORT_UNROLL, double_1d, double_2d, int_1d, kernel_module, kernel_set, precision, vec3d_2d
 from .constraints import ANGLE, DISTANCE, constraint_struct, multiplier_struct
 
 __all__ = ["constraint_block_kernels", "coupling_struct"]
@@ -31,7 +31,8 @@ def coupling_struct():
 @functools.cache
 def constraint_block_kernels(dtype: str) -> _types.SimpleNamespace:
     """Kernels that add the constraints' part to a matrix, in one precision of its blocks."""
-    mat33 = precision(dtype).mat33
+    p = precision(dtype)
+    mat33 = p.mat33
     f64 = wp.float64
     Topology, Pattern, Couplings = topology_struct(dtype), pattern_struct(), coupling_struct()
     Constraints, Multipliers = constraint_struct(), multiplier_struct()
@@ -43,11 +44,11 @@ def constraint_block_kernels(dtype: str) -> _types.SimpleNamespace:
         topo: Topology,
         pattern: Pattern,
         pairs: Couplings,
-        gradient: wp.array2d(dtype=wp.vec3d),
-        stiffness: wp.array2d(dtype=f64),
-        dq_dv: wp.array(dtype=f64),
-        active: wp.array(dtype=wp.int32),
-        value: wp.array2d(dtype=mat33),
+        gradient: vec3d_2d,
+        stiffness: double_2d,
+        dq_dv: double_1d,
+        active: int_1d,
+        value: p.mat33_2d,
     ):
         """value += (dq/dv) J^T rho J."""
         world, item = wp.tid()
@@ -55,9 +56,8 @@ def constraint_block_kernels(dtype: str) -> _types.SimpleNamespace:
             return
         A = wp.mat33d()
         for k in range(pairs.start[item], pairs.start[item + 1]):
-            a = pairs.term_a[k]
-            factor = pairs.weight[k] * dq_dv[world] * stiffness[world, a / 3]
-            A += factor * wp.outer(gradient[world, a], gradient[world, pairs.term_b[k]])
+            factor = pairs.weight[k] * dq_dv[world] * stiffness[world, pairs.term_a[k] / 3]
+            A += factor * wp.outer(gradient[world, pairs.term_a[k]], gradient[world, pairs.term_b[k]])
         add_block(topo, pattern.upper[pairs.entry[item]], mat33(A), world, value)
 
     @wp.func
@@ -89,9 +89,9 @@ def constraint_block_kernels(dtype: str) -> _types.SimpleNamespace:
         con: Constraints,
         mul: Multipliers,
         midpoint_factor: f64,
-        dq_dv: wp.array(dtype=f64),
-        active: wp.array(dtype=wp.int32),
-        value: wp.array2d(dtype=mat33),
+        dq_dv: double_1d,
+        active: int_1d,
+        value: p.mat33_2d,
     ):
         """value += (dq/dv) (J^T rho J + midpoint_factor sum lambda d2c/dq2), as gradients move with u."""
         world, item = wp.tid()
@@ -111,4 +111,4 @@ def constraint_block_kernels(dtype: str) -> _types.SimpleNamespace:
             A += pairs.weight[k] * (penalty_part + curvature_part)
         add_block(topo, pattern.upper[pairs.entry[item]], mat33(dq_dv[world] * A), world, value)
 
-    return _types.SimpleNamespace(module=module, add_penalties=add_penalties, add_tangent=add_tangent)
+    return kernel_set(locals())

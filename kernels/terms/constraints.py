@@ -16,7 +16,7 @@ import types as _types
 
 import warp as wp
 
-from ..common.types import kernel_module, precision
+from ..common.types import double_1d, double_2d, int_1d, int_2d, kernel_module, kernel_set, precision, vec3d_2d
 
 __all__ = [
     "ANGLE",
@@ -133,12 +133,13 @@ def joint_struct():
 @functools.cache
 def constraint_functions(dtype: str) -> _types.SimpleNamespace:
     """Device functions `term_vector` and `directional_derivative`."""
-    vec3 = precision(dtype).vec3
+    p = precision(dtype)
+    vec3 = p.vec3
     f64, vec3d = wp.float64, wp.vec3d
     Constraints = constraint_struct()
 
     @wp.func
-    def term_vector(con: Constraints, term: int, x: wp.array2d(dtype=vec3), world: int) -> vec3d:
+    def term_vector(con: Constraints, term: int, x: p.vec3_2d, world: int) -> vec3d:
         """sum_k w_k x_k of a term."""
         s = vec3d()
         for k in range(con.term_start[term], con.term_start[term + 1]):
@@ -146,9 +147,7 @@ def constraint_functions(dtype: str) -> _types.SimpleNamespace:
         return s
 
     @wp.func
-    def directional_derivative(
-        con: Constraints, gradient: wp.array2d(dtype=vec3d), x: wp.array2d(dtype=vec3), world: int, row: int
-    ) -> f64:
+    def directional_derivative(con: Constraints, gradient: vec3d_2d, x: p.vec3_2d, world: int, row: int) -> f64:
         """(J x) of a row."""
         s = wp.dot(gradient[world, 3 * row], term_vector(con, 3 * row, x, world))
         s += wp.dot(gradient[world, 3 * row + 1], term_vector(con, 3 * row + 1, x, world))
@@ -156,7 +155,7 @@ def constraint_functions(dtype: str) -> _types.SimpleNamespace:
             s += wp.dot(gradient[world, 3 * row + 2], term_vector(con, 3 * row + 2, x, world))
         return s
 
-    return _types.SimpleNamespace(term_vector=term_vector, directional_derivative=directional_derivative)
+    return kernel_set(locals())
 
 
 @functools.cache
@@ -186,13 +185,13 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
         return wp.matrix_from_rows(scale * b, scale * a, vec3d())
 
     @wp.func
-    def store_gradients(into: wp.array2d(dtype=vec3d), world: int, row: int, G: wp.mat33d):
+    def store_gradients(into: vec3d_2d, world: int, row: int, G: wp.mat33d):
         """Store the output of `constraint_gradients`."""
         for side in range(3):
             into[world, 3 * row + side] = G[side]
 
     @wp.kernel(module=module)
-    def reset_violation(active: wp.array(dtype=wp.int32), mul: Multipliers):
+    def reset_violation(active: int_1d, mul: Multipliers):
         """Reset the largest violations before an evaluation."""
         world, component = wp.tid()
         if active[world] != 0:
@@ -201,11 +200,11 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
     @wp.kernel(module=module)
     def evaluate(
         con: Constraints,
-        u: wp.array2d(dtype=vec3),
-        u_stage: wp.array2d(dtype=vec3),
-        law_value: wp.array2d(dtype=vec3d),
-        alpha: wp.array(dtype=f64),
-        active: wp.array(dtype=wp.int32),
+        u: p.vec3_2d,
+        u_stage: p.vec3_2d,
+        law_value: vec3d_2d,
+        alpha: double_1d,
+        active: int_1d,
         mul: Multipliers,
     ):
         """c at u, its gradients at u_stage; multipliers of the trial step; the rows of the augmented potential."""
@@ -275,13 +274,7 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
         wp.atomic_max(mul.violation, world, con.connected_component[row], wp.abs(c))
 
     @wp.kernel(module=module)
-    def product_terms(
-        con: Constraints,
-        mul: Multipliers,
-        p_in: wp.array2d(dtype=vec3),
-        dq_dv: wp.array(dtype=f64),
-        active: wp.array(dtype=wp.int32),
-    ):
+    def product_terms(con: Constraints, mul: Multipliers, p_in: p.vec3_2d, dq_dv: double_1d, active: int_1d):
         """Contributions to (dq/dv) (rho J^T J + sum lambda d2c/dq2) p, one vector per term."""
         world, row = wp.tid()
         if active[world] == 0:
@@ -313,12 +306,7 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
         mul.product[world, 3 * row + 2] = penalty_part * Gc + force * curvature_part[2]
 
     @wp.kernel(module=module)
-    def load_multipliers(
-        state: wp.array2d(dtype=f64),
-        last_target: wp.array2d(dtype=f64),
-        active: wp.array(dtype=wp.int32),
-        mul: Multipliers,
-    ):
+    def load_multipliers(state: double_2d, last_target: double_2d, active: int_1d, mul: Multipliers):
         """Warm start: multipliers and right sides of the last accepted step."""
         world, row = wp.tid()
         if active[world] == 0:
@@ -331,12 +319,7 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
 
     @wp.kernel(module=module)
     def predict_change(
-        con: Constraints,
-        mul: Multipliers,
-        direction: wp.array2d(dtype=vec3),
-        converged: wp.array2d(dtype=wp.int32),
-        dq_dv: wp.array(dtype=f64),
-        active: wp.array(dtype=wp.int32),
+        con: Constraints, mul: Multipliers, direction: p.vec3_2d, converged: int_2d, dq_dv: double_1d, active: int_1d
     ):
         """Change of lambda in a full Newton step, rho (c + (dq/dv) J p); 0 in converged components."""
         world, row = wp.tid()
@@ -348,7 +331,7 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
             mul.multiplier_change[world, row] = mul.penalty[world, row] * (mul.constraint_value[world, row] + change)
 
     @wp.kernel(module=module)
-    def accept_trial(flags: wp.array(dtype=wp.int32), mul: Multipliers):
+    def accept_trial(flags: int_1d, mul: Multipliers):
         """Make the trial's multipliers those of the iterate; clear their change, for another evaluation of it."""
         world, row = wp.tid()
         if flags[world] != 0:
@@ -357,8 +340,8 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
 
     @wp.kernel(module=module)
     def store_multipliers(
-        accepted: wp.array(dtype=wp.int32), mul: Multipliers, state: wp.array2d(dtype=f64),
-        last_target: wp.array2d(dtype=f64),
+        accepted: int_1d, mul: Multipliers, state: double_2d,
+        last_target: double_2d,
     ):  # fmt: skip
         """Store the multipliers and right sides of an accepted step in the state."""
         world, row = wp.tid()
@@ -368,12 +351,7 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
 
     @wp.kernel(module=module)
     def work_terms(
-        con: Constraints,
-        mul: Multipliers,
-        u: wp.array2d(dtype=vec3),
-        u_n: wp.array2d(dtype=vec3),
-        last_target: wp.array2d(dtype=f64),
-        accepted: wp.array(dtype=wp.int32),
+        con: Constraints, mul: Multipliers, u: p.vec3_2d, u_n: p.vec3_2d, last_target: double_2d, accepted: int_1d
     ):
         """Work of a substep per row: of the drive, -lambda scale df, and lambda (J dq - scale df), which is lost.
 
@@ -402,10 +380,10 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
         con: Constraints,
         mul: Multipliers,
         joints: Joints,
-        u: wp.array2d(dtype=vec3),
-        force: wp.array2d(dtype=f64),
+        u: p.vec3_2d,
+        force: double_2d,
         first_column: int,
-        report: wp.array2d(dtype=f64),
+        report: double_2d,
     ):
         """Force and moment about the anchor by each joint on its child, world axes, and its violation."""
         world, joint = wp.tid()
@@ -434,15 +412,4 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
             report[world, column + 3 + c] = M[c]
         report[world, column + 6] = violation
 
-    return _types.SimpleNamespace(
-        module=module,
-        reset_violation=reset_violation,
-        evaluate=evaluate,
-        product_terms=product_terms,
-        load_multipliers=load_multipliers,
-        predict_change=predict_change,
-        accept_trial=accept_trial,
-        store_multipliers=store_multipliers,
-        work_terms=work_terms,
-        joint_report=joint_report,
-    )
+    return kernel_set(locals())

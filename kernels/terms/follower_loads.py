@@ -5,7 +5,7 @@ import types as _types
 
 import warp as wp
 
-from ..common.types import kernel_module, precision
+from ..common.types import int_1d, kernel_module, kernel_set, precision, vec3d_2d
 
 __all__ = ["follower_struct", "moment_kernels", "pressure_kernels"]
 
@@ -47,7 +47,7 @@ def pressure_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def surface_tangent(
-        data: FollowerLoads, table: wp.array3d(dtype=T), u: wp.array2d(dtype=vec3), world: int, point: int, item: int
+        data: FollowerLoads, table: p.scalar_3d, u: p.vec3_2d, world: int, point: int, item: int
     ) -> vec3:
         """dx/da or dx/db of a face at a point, by the table of derivatives."""
         out = vec3()
@@ -59,12 +59,7 @@ def pressure_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def interpolate(
-        data: FollowerLoads,
-        table: wp.array3d(dtype=T),
-        field: wp.array2d(dtype=vec3),
-        world: int,
-        point: int,
-        item: int,
+        data: FollowerLoads, table: p.scalar_3d, field: p.vec3_2d, world: int, point: int, item: int
     ) -> vec3:
         """sum table_i field_i."""
         out = vec3()
@@ -73,19 +68,13 @@ def pressure_kernels(dtype: str) -> _types.SimpleNamespace:
         return out
 
     @wp.func
-    def clear_contribution(data: FollowerLoads, world: int, item: int, contribution: wp.array2d(dtype=vec3)):
+    def clear_contribution(data: FollowerLoads, world: int, item: int, contribution: p.vec3_2d):
         """Zero the entries of an item."""
         for i in range(data.conn.shape[0]):
             contribution[world, data.first_entry + i * data.item_count + item] = vec3()
 
     @wp.kernel(module=pressure_module)
-    def pressure_force(
-        data: FollowerLoads,
-        u: wp.array2d(dtype=vec3),
-        value: wp.array2d(dtype=wp.vec3d),
-        active: wp.array(dtype=wp.int32),
-        contribution: wp.array2d(dtype=vec3),
-    ):
+    def pressure_force(data: FollowerLoads, u: p.vec3_2d, value: vec3d_2d, active: int_1d, contribution: p.vec3_2d):
         """f_i = - int p s_i (x_a x x_b): pressure p against the current outward normal of a face."""
         world, item = wp.tid()
         if active[world] == 0:
@@ -105,11 +94,11 @@ def pressure_kernels(dtype: str) -> _types.SimpleNamespace:
     def pressure_tangent_product(
         data: FollowerLoads,
         midpoint_factor: T,
-        u: wp.array2d(dtype=vec3),
-        value: wp.array2d(dtype=wp.vec3d),
-        active: wp.array(dtype=wp.int32),
-        direction: wp.array2d(dtype=vec3),
-        contribution: wp.array2d(dtype=vec3),
+        u: p.vec3_2d,
+        value: vec3d_2d,
+        active: int_1d,
+        direction: p.vec3_2d,
+        contribution: p.vec3_2d,
     ):
         """(K + K^T)/2 d, K = df/dq of the pressure force, d a direction; symmetric on a closed surface at uniform p.
 
@@ -138,7 +127,7 @@ def pressure_kernels(dtype: str) -> _types.SimpleNamespace:
                 )
                 contribution[world, k] = contribution[world, k] + w * f
 
-    return _types.SimpleNamespace(pressure_force=pressure_force, pressure_tangent_product=pressure_tangent_product)
+    return kernel_set(locals())
 
 
 @functools.cache
@@ -224,7 +213,7 @@ def moment_kernels(dtype: str, vectors: int) -> _types.SimpleNamespace:
         return out
 
     @wp.func
-    def interpolate_vectors(data: FollowerLoads, field: wp.array2d(dtype=vec3), world: int, item: int) -> mat33:
+    def interpolate_vectors(data: FollowerLoads, field: p.vec3_2d, world: int, item: int) -> mat33:
         """sum_i c_ki field_i in column k."""
         out = mat33()
         for i in range(data.conn.shape[0]):
@@ -232,18 +221,12 @@ def moment_kernels(dtype: str, vectors: int) -> _types.SimpleNamespace:
         return out
 
     @wp.func
-    def current_vectors(data: FollowerLoads, u: wp.array2d(dtype=vec3), world: int, item: int) -> mat33:
+    def current_vectors(data: FollowerLoads, u: p.vec3_2d, world: int, item: int) -> mat33:
         """Current vectors: their reference values (the axes) plus displacements."""
         return data.reference_vectors[item] + interpolate_vectors(data, u, world, item)
 
     @wp.kernel(module=module)
-    def moment_force(
-        data: FollowerLoads,
-        u: wp.array2d(dtype=vec3),
-        value: wp.array2d(dtype=wp.vec3d),
-        active: wp.array(dtype=wp.int32),
-        contribution: wp.array2d(dtype=vec3),
-    ):
+    def moment_force(data: FollowerLoads, u: p.vec3_2d, value: vec3d_2d, active: int_1d, contribution: p.vec3_2d):
         """f_i = sum_k c_ki phi_k with phi of `vector_forces`."""
         world, item = wp.tid()
         if active[world] == 0:
@@ -257,11 +240,11 @@ def moment_kernels(dtype: str, vectors: int) -> _types.SimpleNamespace:
     def moment_tangent_product(
         data: FollowerLoads,
         midpoint_factor: T,
-        u: wp.array2d(dtype=vec3),
-        value: wp.array2d(dtype=wp.vec3d),
-        active: wp.array(dtype=wp.int32),
-        direction: wp.array2d(dtype=vec3),
-        contribution: wp.array2d(dtype=vec3),
+        u: p.vec3_2d,
+        value: vec3d_2d,
+        active: int_1d,
+        direction: p.vec3_2d,
+        contribution: p.vec3_2d,
     ):
         """(K + K^T)/2 d with K = df/dq, d a direction; `midpoint_factor`: as of `pressure_tangent_product`."""
         world, item = wp.tid()
@@ -279,4 +262,4 @@ def moment_kernels(dtype: str, vectors: int) -> _types.SimpleNamespace:
         for i in range(data.conn.shape[0]):
             contribution[world, data.first_entry + i * data.item_count + item] = S * data.vector_coefficients[i, item]
 
-    return _types.SimpleNamespace(moment_force=moment_force, moment_tangent_product=moment_tangent_product)
+    return kernel_set(locals())

@@ -5,7 +5,17 @@ import types as _types
 
 import warp as wp
 
-from ..common.types import kernel_module, precision
+from ..common.types import (
+    double_1d,
+    double_2d,
+    double_3d,
+    int_1d,
+    kernel_module,
+    kernel_set,
+    precision,
+    vec3d_1d,
+    vec3d_2d,
+)
 from ..elements.points import block_struct
 
 __all__ = ["body_force_kernel", "load_kernels", "time_law_kernel", "time_law_struct"]
@@ -43,13 +53,7 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
     turn_module = kernel_module(f"drive_rotation_{dtype}")
 
     @wp.kernel(module=laws_module)
-    def evaluate_time_laws(
-        laws: Laws,
-        time: wp.array(dtype=f64),
-        ramp: wp.array(dtype=f64),
-        active: wp.array(dtype=wp.int32),
-        value: wp.array2d(dtype=wp.vec3d),
-    ):
+    def evaluate_time_laws(laws: Laws, time: double_1d, ramp: double_1d, active: int_1d, value: vec3d_2d):
         """Value of each law at the new time; constants are scaled by the ramp of a static load path."""
         world, law = wp.tid()
         if active[world] == 0:
@@ -70,14 +74,7 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
         value[world, law] = (f64(1.0) - s) * laws.sample_value[k] + s * laws.sample_value[k + 1]
 
     @wp.kernel(module=controls_module)
-    def evaluate_control(
-        control: wp.array2d(dtype=f64),
-        law: int,
-        ramped: int,
-        ramp: wp.array(dtype=f64),
-        active: wp.array(dtype=wp.int32),
-        value: wp.array2d(dtype=wp.vec3d),
-    ):
+    def evaluate_control(control: double_2d, law: int, ramped: int, ramp: double_1d, active: int_1d, value: vec3d_2d):
         """Value of a law that is a control; scaled by the ramp of a static load path if a constant would be."""
         world = wp.tid()
         if active[world] == 0:
@@ -91,16 +88,16 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=dead_module)
     def dead_load(
-        start: wp.array(dtype=wp.int32),
-        law: wp.array(dtype=wp.int32),
-        weight: wp.array(dtype=vec3),
-        value: wp.array2d(dtype=wp.vec3d),
-        lumped: wp.array2d(dtype=T),
-        gravity: wp.array(dtype=wp.vec3d),
-        ramp: wp.array(dtype=f64),
-        active: wp.array(dtype=wp.int32),
-        force: wp.array2d(dtype=vec3),
-        magnitude: wp.array2d(dtype=vec3),
+        start: int_1d,
+        law: int_1d,
+        weight: p.vec3_1d,
+        value: vec3d_2d,
+        lumped: p.scalar_2d,
+        gravity: vec3d_1d,
+        ramp: double_1d,
+        active: int_1d,
+        force: p.vec3_2d,
+        magnitude: p.vec3_2d,
     ):
         """Sum of weight x value per slot (Eq. 72), gravity included (Eq. 24), and of the magnitudes."""
         world, slot = wp.tid()
@@ -116,36 +113,21 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
         magnitude[world, slot] = m
 
     @wp.kernel(module=gravity_module)
-    def copy_gravity(
-        value: wp.array2d(dtype=wp.vec3d),
-        law: int,
-        active: wp.array(dtype=wp.int32),
-        gravity: wp.array(dtype=wp.vec3d),
-    ):
+    def copy_gravity(value: vec3d_2d, law: int, active: int_1d, gravity: vec3d_1d):
         """Gravity, m/s^2, from the value of a time law."""
         world = wp.tid()
         if active[world] != 0:
             gravity[world] = value[world, law]
 
     @wp.kernel(module=explicit_module)
-    def explicit_work_rows(
-        a: wp.array2d(dtype=vec3),
-        u: wp.array2d(dtype=vec3),
-        u_n: wp.array2d(dtype=vec3),
-        accepted: wp.array(dtype=wp.int32),
-        rows: wp.array3d(dtype=f64),
-    ):
+    def explicit_work_rows(a: p.vec3_2d, u: p.vec3_2d, u_n: p.vec3_2d, accepted: int_1d, rows: double_3d):
         """Work of an explicit force on a substep, a.dq per slot."""
         world, slot = wp.tid()
         if accepted[world] != 0:
             rows[0, world, slot] = f64(wp.dot(a[world, slot], u[world, slot] - u_n[world, slot]))
 
     @wp.kernel(module=explicit_module)
-    def subtract_explicit_force(
-        explicit_force: wp.array2d(dtype=vec3),
-        active: wp.array(dtype=wp.int32),
-        force: wp.array2d(dtype=vec3),
-    ):
+    def subtract_explicit_force(explicit_force: p.vec3_2d, active: int_1d, force: p.vec3_2d):
         """Dead force -= explicit internal force."""
         world, slot = wp.tid()
         if active[world] != 0:
@@ -153,13 +135,13 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=drive_module)
     def drive_displacement(
-        slot: wp.array(dtype=wp.int32),
+        slot: int_1d,
         law: wp.array(dtype=wp.vec3i),
-        value: wp.array2d(dtype=wp.vec3d),
-        q_tilde: wp.array2d(dtype=vec3),
-        dq_dv: wp.array(dtype=f64),
-        active: wp.array(dtype=wp.int32),
-        v: wp.array2d(dtype=vec3),
+        value: vec3d_2d,
+        q_tilde: p.vec3_2d,
+        dq_dv: double_1d,
+        active: int_1d,
+        v: p.vec3_2d,
     ):
         """v = (u(t) - q~)/(dq/dv) on the driven components, u(t) the value of a law per component (-1: not driven)."""
         world, k = wp.tid()
@@ -175,16 +157,16 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=turn_module)
     def drive_rotation(
-        slot: wp.array(dtype=wp.int32),
-        law: wp.array(dtype=wp.int32),
-        components: wp.array(dtype=wp.vec3d),
-        arm: wp.array(dtype=wp.vec3d),
-        axis: wp.array(dtype=wp.vec3d),
-        value: wp.array2d(dtype=wp.vec3d),
-        q_tilde: wp.array2d(dtype=vec3),
-        dq_dv: wp.array(dtype=f64),
-        active: wp.array(dtype=wp.int32),
-        v: wp.array2d(dtype=vec3),
+        slot: int_1d,
+        law: int_1d,
+        components: vec3d_1d,
+        arm: vec3d_1d,
+        axis: vec3d_1d,
+        value: vec3d_2d,
+        q_tilde: p.vec3_2d,
+        dq_dv: double_1d,
+        active: int_1d,
+        v: p.vec3_2d,
     ):
         """`drive_displacement` for u(t) = (R(angle) - I) arm, arm the slot's reference position relative to the anchor
         (Rodrigues)."""
@@ -203,16 +185,7 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
                 velocity[c] = T((target[c] - f64(q_tilde[world, s][c])) / dq_dv[world])
         v[world, s] = velocity
 
-    return _types.SimpleNamespace(
-        evaluate_time_laws=evaluate_time_laws,
-        evaluate_control=evaluate_control,
-        dead_load=dead_load,
-        copy_gravity=copy_gravity,
-        explicit_work_rows=explicit_work_rows,
-        subtract_explicit_force=subtract_explicit_force,
-        drive_displacement=drive_displacement,
-        drive_rotation=drive_rotation,
-    )
+    return kernel_set(locals())
 
 
 @functools.lru_cache(maxsize=256)
@@ -222,10 +195,7 @@ def time_law_kernel(function: wp.Function, scalar: bool, take_dtype: str):
     A = precision(take_dtype).T
 
     def set_time_law(
-        law: int,
-        time: wp.array(dtype=f64),
-        active: wp.array(dtype=wp.int32),
-        value: wp.array2d(dtype=wp.vec3d),
+        law: int, time: wp.array(dtype=f64), active: wp.array(dtype=wp.int32), value: wp.array2d(dtype=wp.vec3d)
     ):
         """Value of a law given as a function of t."""
         world = wp.tid()

@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 
 import warpfea as wf
+from warpfea.contact.colliders import ColliderContact
 from warpfea.simulation.statics import begin_static, run_static
-from warpfea.terms.contact import Contact
 
 from .table import Part, Row, Table, cases
 
@@ -84,7 +84,7 @@ def block(
 
 def point_pressures(sim: wf.Simulation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Distance to the axis (points,), m, pressure, Pa, and area, m^2, of the contact's points."""
-    (term,) = (term for term in sim.model.terms.all if isinstance(term, Contact))
+    (term,) = (term for term in sim.model.terms.all if isinstance(term, ColliderContact))
     _, force = term.at_points(sim.state)
     (p,) = term.tables.host
     u = sim.state.displacement.numpy()[0][p.conn]

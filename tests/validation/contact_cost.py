@@ -30,14 +30,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import warp as wp
-from warpfea.kernels.terms.contact_structs import RECORD_NAMES
+from warpfea.kernels.contact.structs import RECORD_NAMES
 
 import warpfea as wf
 from warpfea.base.devices import find_device
+from warpfea.contact.colliders import ColliderContact
 from warpfea.simulation.simulation import Simulation
 from warpfea.solvers.twolevel import TwoLevel
 from warpfea.studies.bench.measure import solver
-from warpfea.terms.contact import Contact
 
 from .table import Row, Run, Table
 
@@ -63,7 +63,7 @@ SOLVE_BAR = 1.3
 @dataclass
 class _Runner:
     sim: Simulation
-    term: Contact | None
+    term: ColliderContact | None
     times: list[float]
     carried: float = 0.0
     newton: int = 0
@@ -116,7 +116,7 @@ def start(
 ) -> _Runner:  # fmt: skip
     """A scene, stepped to where it counts."""
     model = build(scene, cells, stiffness).finalize(device=device, dtype=dtype)
-    term = next((term for term in model.terms if isinstance(term, Contact)), None)
+    term = next((term for term in model.terms if isinstance(term, ColliderContact)), None)
     sim = Simulation(model, dt=DT, solver=solver(tol), ledger=False)
     out = _Runner(sim, term, [])
     if scene in MOVING:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from .. import contact as _contact  # noqa: F401 - registers its terms
 from ..base.checks import is_count, is_number
 from ..base.errors import ModelError
 from ..base.names import did_you_mean

@@ -57,7 +57,7 @@ class PairContact(ContactOptions):
 
 @dataclass(frozen=True, eq=False)
 class MasterFacets:
-    """Facets as polynomials, see kernels/terms/pair_structs.py.
+    """Facets as polynomials, see kernels/contact/facet_structs.py.
 
     Attributes:
         conn: (F, L) body slots of the facets' elements.
@@ -213,7 +213,7 @@ def facet_thickness(surface: SurfaceSet) -> np.ndarray:
     """(F,) thickness, m: inward distance from the middle of each facet to the opposite side of its body."""
     import warp as wp
 
-    from ..kernels.terms.pair_thickness import thickness_kernel
+    from ..kernels.contact.thickness import thickness_kernel
     from .surfaces import make_skin, reference_points
 
     body = surface.body

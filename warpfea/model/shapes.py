@@ -9,7 +9,7 @@ import numpy as np
 
 from ..base.checks import is_count, is_number
 from ..base.errors import ModelError
-from ..kernels.terms.contact_shapes import BOX, CAPSULE, CYLINDER, HALF_SPACE, SPHERE
+from ..kernels.contact.collider_shapes import BOX, CAPSULE, CYLINDER, HALF_SPACE, SPHERE
 
 __all__ = [
     "BOX",

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..base.checks import is_number
 from ..base.errors import MeshError, ModelError
-from ..kernels.terms.contact_mesh import BOUNDARY, FLAT, MESH, SHARP
+from ..kernels.contact.collider_mesh import BOUNDARY, FLAT, MESH, SHARP
 from ..mesh.adapter import read_triangles
 from .shapes import Shape, set_checked
 
@@ -30,7 +30,7 @@ MAX_LEAF_TRIANGLES = 4
 @dataclass(frozen=True)
 class TriangleTables:
     """Device tables of a triangle mesh in local coordinates (BVH, normals, edge kinds); see
-    kernels/terms/contact_mesh.py.
+    kernels/contact/collider_mesh.py.
 
     Attributes:
         low, high: (boxes, 3) m, of a balanced tree.

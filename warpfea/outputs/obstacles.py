@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from warpfea.kernels.terms.contact_mesh import MESH
+from warpfea.kernels.contact.collider_mesh import MESH
 from warpfea.model.shapes import BOX, CAPSULE, CYLINDER, HALF_SPACE
 from warpfea.outputs.normals import smooth_corners, vertex_normals
 

@@ -10,8 +10,8 @@ import warp as wp
 from ..base.errors import ModelError
 from ..base.names import did_you_mean, listing
 from ..base.short_repr import truncated_lines
+from ..kernels.contact.structs import RECORD_NAMES
 from ..kernels.step.episodes import JOINT_VALUE_KINDS, MOTION_KINDS, observation_kernels
-from ..kernels.terms.contact_structs import RECORD_NAMES
 
 __all__ = ["Observations"]
 

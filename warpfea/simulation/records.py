@@ -8,9 +8,9 @@ import numpy as np
 
 from ..base.errors import ModelError
 from ..base.names import did_you_mean, listing
+from ..kernels.contact.structs import RECORD_NAMES
 from ..kernels.step.step_control import REPORT_COLUMNS
 from ..kernels.terms.constraints import JOINT_COLUMNS
-from ..kernels.terms.contact_structs import RECORD_NAMES
 from ..model.contacts import Contact
 from ..model.joints import Joint
 from ..model.pairs import PairContact

@@ -11,7 +11,6 @@ from ..base.names import did_you_mean
 from ..model.bodies import Body
 from ..model.state import State
 from ..model.surfaces import reference_points
-from ..terms.contact import Contact
 from ..terms.evaluation import von_mises
 from ..terms.term import FieldSpec
 
@@ -94,10 +93,8 @@ class Results:
     def collider_poses(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
         """Collider poses: positions (B, K, 3), m, rotations (B, K, 3, 3) with the shape's axes in the world as columns,
         and surface offsets (B, K), m; None for a model without contact."""
-        for term in self.model.terms.all:
-            if isinstance(term, Contact):
-                return term.poses(self.state)
-        return None
+        term = self.model.terms.contact
+        return term.poses(self.state) if term else None
 
     @property
     def fields(self) -> dict[str, FieldSpec]:

@@ -129,13 +129,13 @@ class CachedInputs:
     state: list[wp.array]
 
 
-def part(name: str) -> Callable[[F], F]:
-    """Decorator: attribute a method's launches to profile part `name`."""
+def part(name: str = "") -> Callable[[F], F]:
+    """Decorator: attribute a method's launches to profile part `name`, by default that of the term's name."""
 
     def decorate(method: F) -> F:
         @functools.wraps(method)
         def wrapper(self: Any, ctx: StepContext, *args: Any, **options: Any) -> Any:
-            with ctx.launch.part(name):
+            with ctx.launch.part(name or self.name):
                 return method(self, ctx, *args, **options)
 
         return wrapper  # type: ignore[return-value]

@@ -29,12 +29,10 @@ from .checks import (
     derived_traits,
 )
 from .constraints import Constraints
-from .contact import Contact
 from .damping import Damping
 from .dead_loads import DeadLoads
 from .elements import Elements
 from .follower_loads import FollowerLoads
-from .pairs import Pairs
 from .supports import Supports
 from .term import FieldSpec, StepContext, Term
 from .time_law_table import TimeLawTable, control_array
@@ -44,18 +42,9 @@ if TYPE_CHECKING:
     from ..model.state import State
     from .workspace import Workspace
 
-__all__ = ["TERM_TYPES", "TermSet", "profile_parts"]
+__all__ = ["TERM_TYPES", "TermSet", "profile_parts", "register"]
 
-TERM_TYPES: tuple[type[Term], ...] = (
-    Elements,
-    DeadLoads,
-    Damping,
-    FollowerLoads,
-    BodyForces,
-    Contact,
-    Pairs,
-    Constraints,
-)
+TERM_TYPES: list[type[Term]] = [Elements, DeadLoads, Damping, FollowerLoads, BodyForces, Constraints]
 """All kinds of terms in launch order, that in which the forces of an attempt are evaluated."""
 STATE_ARRAYS = ("displacement", "velocity", "time", "status", "ledger", "ledger_time", "previous_displacement",
          "previous_velocity", "previous_step", "previous_end", "summed_time",
@@ -63,6 +52,11 @@ STATE_ARRAYS = ("displacement", "velocity", "time", "status", "ledger", "ledger_
 """State arrays owned by no term."""
 COMMON_FIELDS = ("von_mises", "displacement")
 """Fields of every model, see simulation.results."""
+
+
+def register(*kinds: type[Term]) -> None:
+    """Add kinds of terms of a floor above, evaluated before the constraints."""
+    TERM_TYPES[-1:-1] = kinds
 
 
 def profile_parts() -> dict[str, str]:
@@ -125,6 +119,10 @@ class TermSet:
 
     def __iter__(self) -> Iterator[Term]:
         return iter(self.all)
+
+    def named(self, name: str) -> Any:
+        """Term of one name, or None."""
+        return next((term for term in self.all if term.name == name), None)
 
     def find(self, kind: type[Any]) -> Any:
         """Term of one kind, or None."""
@@ -262,14 +260,14 @@ class TermSet:
     # parameters and fields
 
     @property
-    def contact(self) -> Contact | None:
+    def contact(self) -> Any:
         """Term of contact with obstacles, or None."""
-        return self.find(Contact)
+        return self.named("contact")
 
     @property
-    def pairs(self) -> Pairs | None:
+    def pairs(self) -> Any:
         """Term of contact between bodies, or None."""
-        return self.find(Pairs)
+        return self.named("pairs")
 
     def set_parameter(self, name: Any, values: Any, mask: Any) -> None:
         """See Model.set_parameter."""

@@ -1,0 +1,200 @@
+"""Broad phase of contact between bodies: master facets at an iterate and at the start of an attempted step.
+
+Computed are the monomial coefficients of displacements on each facet, its centre, and the bounding boxes of the tree.
+u_coefs, director_u_coefs: coefficients of the displacement and of the director's displacement, see `master_struct`.
+"""
+
+import functools
+import types as _types
+from typing import Any
+
+import warp as wp
+
+from ..common.types import SHORT_UNROLL, kernel_module, kernel_set, precision
+from .facet_structs import master_struct, pair_scratch_struct
+from .projection import facet_projection_functions
+
+__all__ = ["BOX_MARGIN", "broad_phase_kernels"]
+
+BOX_MARGIN = 0.25
+"""Enlargement of the boxes of the tree, as a fraction of the facet's side length: they stay valid for several steps."""
+BOX_ROUNDING = 2.4e-7
+"""Relative widening of a box before its conversion to float32: twice the machine epsilon, 1.2e-7."""
+
+
+@functools.cache
+def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
+    """Kernels for displacements of type `dtype`, in the module of `facet_search_kernels`; functions of boxes."""
+    vec3 = precision(dtype).vec3
+    f64, vec3d, box3 = wp.float64, wp.vec3d, wp.vec3
+    mat43 = wp.types.matrix(shape=(4, 3), dtype=f64)
+    Masters, PairScratch = master_struct(dtype), pair_scratch_struct(dtype)
+    f = facet_projection_functions(dtype)
+    FacetPoint, surface_point, facet_centre, unit_normal = (
+        f.FacetPoint,
+        f.surface_point,
+        f.facet_centre,
+        f.unit_normal,
+    )
+    module = kernel_module(f"facet_search_{dtype}", max_unroll=SHORT_UNROLL)
+
+    @wp.func
+    def set_coefficient(
+        mas: Masters, u: wp.array2d(dtype=Any), world: int, item: int, m: int, C: wp.array2d(dtype=vec3d),
+        D: wp.array2d(dtype=vec3d),
+    ):  # fmt: skip
+        """Monomial coefficients m of a field u [world, slot] on facet `item`, [world, control]: C of its value, D of
+        its derivative along the director."""
+        c = vec3d()
+        d = vec3d()
+        for i in range(mas.conn.shape[0]):
+            value = vec3d(u[world, mas.conn[i, item]])
+            c += f64(mas.shape[m, i, item]) * value
+            d += f64(mas.director_shape[m, i, item]) * value
+        C[world, mas.max_monomials * item + m] = c
+        D[world, mas.max_monomials * item + m] = d
+
+    @wp.kernel(module=module)
+    def update_coefficients(
+        mas: Masters, u: wp.array2d(dtype=vec3d), active: wp.array(dtype=wp.int32), C: wp.array2d(dtype=vec3d),
+        D: wp.array2d(dtype=vec3d),
+    ):  # fmt: skip
+        """Coefficients of displacements on master facets in float64, see kernels/contact/double_displacements.py."""
+        world, item, m = wp.tid()
+        if active[world] != 0 and m < mas.monomial_count[mas.facet_kind[item]]:
+            set_coefficient(mas, u, world, item, m, C, D)
+
+    @wp.kernel(module=module)
+    def initial_coefficients(
+        mas: Masters, u_n: wp.array2d(dtype=vec3), v_n: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32),
+        pair: PairScratch,
+    ):  # fmt: skip
+        """Coefficients of displacements and velocities at the start of an attempt; reset the largest depths."""
+        world, item, m = wp.tid()
+        if active[world] != 0:
+            # threads of a world share the bodies
+            for body in range(
+                mas.max_monomials * item + m, pair.deepest_contact.shape[1], mas.max_monomials * mas.facet_count
+            ):
+                pair.deepest_contact[world, body] = f64(0.0)
+        if active[world] != 0 and m < mas.monomial_count[mas.facet_kind[item]]:
+            # the director part of the velocity is not used: the next line overwrites it
+            set_coefficient(mas, v_n, world, item, m, pair.start_v_coefs, pair.start_director_u_coefs)
+            set_coefficient(mas, u_n, world, item, m, pair.start_u_coefs, pair.start_director_u_coefs)
+
+    @wp.func
+    def round_down(x: vec3d) -> box3:
+        """x in single precision, rounded down by more than its largest round-off."""
+        return box3(
+            wp.float32(x[0] - wp.abs(x[0]) * f64(BOX_ROUNDING)),
+            wp.float32(x[1] - wp.abs(x[1]) * f64(BOX_ROUNDING)),
+            wp.float32(x[2] - wp.abs(x[2]) * f64(BOX_ROUNDING)),
+        )
+
+    @wp.func
+    def round_up(x: vec3d) -> box3:
+        """x in single precision, rounded up."""
+        return -round_down(-x)
+
+    @wp.func
+    def contains(low: box3, high: box3, other_low: box3, other_high: box3) -> bool:
+        """True if a box contains another one."""
+        inside = bool(True)
+        for j in range(3):
+            if other_low[j] < low[j] or other_high[j] > high[j]:
+                inside = False
+        return inside
+
+    @wp.func
+    def pack_facet_point(s: FacetPoint) -> mat43:
+        """Position and derivatives of a facet point as the rows of a matrix."""
+        return mat43(
+            s.position[0],
+            s.position[1],
+            s.position[2],
+            s.tangent_a[0],
+            s.tangent_a[1],
+            s.tangent_a[2],
+            s.tangent_b[0],
+            s.tangent_b[1],
+            s.tangent_b[2],
+            s.director[0],
+            s.director[1],
+            s.director[2],
+        )
+
+    @wp.func
+    def unpack_facet_point(m: mat43) -> FacetPoint:
+        """Facet point from the rows of a matrix."""
+        return FacetPoint(m[0], m[1], m[2], m[3])
+
+    @wp.kernel(module=module)
+    def check_boxes(mas: Masters, active: wp.array(dtype=wp.int32), pair: PairScratch):
+        """Request a refit if a facet, at the start of the attempt or now, left its box; compute the enlarged boxes."""
+        world, item = wp.tid()
+        if active[world] == 0:
+            return
+        low = vec3d(f64(1.0e300), f64(1.0e300), f64(1.0e300))
+        high = -low
+        kind = mas.facet_kind[item]
+        count = mas.monomial_count[kind]
+        for q in range(count):
+            x = vec3d()
+            y = vec3d()
+            for m in range(count):
+                part = mas.hull_coefficients[kind, q, m]
+                if part != f64(0.0):
+                    x += part * (
+                        mas.reference_position_coefficients[m, item] + pair.u_coefs[world, mas.max_monomials * item + m]
+                    )
+                    y += part * (
+                        mas.reference_position_coefficients[m, item]
+                        + pair.start_u_coefs[world, mas.max_monomials * item + m]
+                    )
+            low = wp.min(low, wp.min(x, y))
+            high = wp.max(high, wp.max(x, y))
+        index = world * mas.facet_count + item
+        if not contains(pair.box_lower[index], pair.box_upper[index], round_down(low), round_up(high)):
+            pair.refit_needed[0] = 1
+        room = f64(BOX_MARGIN) * mas.side_length[item]
+        pad = vec3d(room, room, room)
+        pair.refit_lower[index] = round_down(low - pad)
+        pair.refit_upper[index] = round_up(high + pad)
+
+    @wp.kernel(module=module)
+    def update_centres(mas: Masters, active: wp.array(dtype=wp.int32), pair: PairScratch):
+        """Position and derivatives at the centre of each facet, now and at the start of the attempt; an upper bound, m,
+        of the facet's height above the tangent plane there, from its control points."""
+        world, item = wp.tid()
+        if active[world] == 0:
+            return
+        kind = mas.facet_kind[item]
+        count = mas.monomial_count[kind]
+        xi = facet_centre(mas.corner_count[kind])
+        s = surface_point(mas, pair.u_coefs, pair.director_u_coefs, world, item, xi)
+        n = unit_normal(s)
+        bulge = f64(0.0)
+        for q in range(count):
+            x = vec3d()
+            for m in range(count):
+                x += mas.hull_coefficients[kind, q, m] * (
+                    mas.reference_position_coefficients[m, item] + pair.u_coefs[world, mas.max_monomials * item + m]
+                )
+            bulge = wp.max(bulge, wp.dot(x - s.position, n))
+        pair.bulge[world, item] = bulge
+        pair.facet_centre[world, item] = pack_facet_point(s)
+        pair.start_facet_centre[world, item] = pack_facet_point(
+            surface_point(mas, pair.start_u_coefs, pair.start_director_u_coefs, world, item, xi)
+        )
+
+    @wp.kernel(module=module)
+    def accept_boxes(pair: PairScratch):
+        """Replace the boxes by the new ones."""
+        index = wp.tid()
+        pair.box_lower[index] = pair.refit_lower[index]
+        pair.box_upper[index] = pair.refit_upper[index]
+        if index == 0:
+            pair.refit_needed[0] = 0
+            pair.refit_count[0] = pair.refit_count[0] + 1
+
+    return kernel_set(locals())

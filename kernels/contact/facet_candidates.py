@@ -1,0 +1,368 @@
+"""Master facets near a slave point: depth, side and motion decide which one it is in contact with."""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from ..common.types import kernel_set
+from .broad_phase import broad_phase_kernels
+from .facet_structs import master_struct, pair_scratch_struct
+from .point import contact_point_functions
+from .projection import MAX_OVERHANG, OUTSIDE_TOLERANCE, facet_projection_functions
+from .structs import clock_struct, contact_scratch_struct, contact_struct, facet_struct, history_struct
+
+__all__ = ["TUNNEL_LIMIT_RATIO", "facet_candidate_functions"]
+
+MIN_NORMAL_COSINE = 0.1
+"""Minimum cosine of the normals of two facets that a point in contact passes between: excludes the edge of a box."""
+TUNNEL_LIMIT_RATIO = 0.25
+"""Ratio to the depth limit of a facet above which a point that left the facet has passed through the body."""
+OPPOSING_COSINE = 0.5
+"""Cosine of a facet's normal and the slave's reversed normal above which they face each other; below its negative they
+face the same way."""
+MAX_DEPTH_RATIO = 2.0
+"""Largest depth of a point that enters from beside a facet, over the deepest active penetration."""
+MAX_EDGE_TANGENT = 2.0
+"""Maximum tangent of the angle between an outward vector and the normal of its facet, at the edge of a box."""
+TANGENT_PLANE_MARGIN = 0.5
+"""Parametric margin for rejecting a facet by the tangent plane at its centre."""
+
+
+@functools.cache
+def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
+    """Device functions in one precision of the displacements."""
+    f64, vec3d = wp.float64, wp.vec3d
+    Contacts, Facets, History = contact_struct(False), facet_struct(dtype), history_struct()
+    ContactScratch, Clock = contact_scratch_struct(dtype), clock_struct()
+    Masters, PairScratch = master_struct(dtype), pair_scratch_struct(dtype)
+    k, f = contact_point_functions(dtype, False), facet_projection_functions(dtype)
+    interpolate, remaining_overlap = k.interpolate, k.remaining_overlap
+    (
+        surface_point, displacement_change, local_components, distance_outside, facet_centre, inverse_map, track_point,
+        unit_normal,
+    ) = (
+        f.surface_point, f.displacement_change, f.local_components, f.distance_outside, f.facet_centre, f.inverse_map,
+        f.track_point, f.unit_normal,
+    )  # fmt: skip
+    boxes = broad_phase_kernels(dtype)
+    round_down, round_up, unpack_facet_point = boxes.round_down, boxes.round_up, boxes.unpack_facet_point
+
+    @wp.struct
+    class SlavePoint:
+        """Slave point at an iterate, and the bounds of the search of its facet."""
+
+        world: wp.int32
+        contact: wp.int32
+        slave_facet: wp.int32
+        number_in_facet: wp.int32  # number among the points of the slave facet
+        point: wp.int32  # index of the point among all
+        displacement: vec3d  # displacement, m
+        position: vec3d  # position, m
+        start_position: vec3d  # position at the start of the attempt, m
+        anchored: wp.bool  # it has an anchor facet
+        motion: vec3d  # motion relative to the anchor facet's material, m
+        facing_normal: vec3d  # normal of the anchor facet, else inward normal of the slave facet; 0: not yet set
+        overlap_limit: f64  # m, > 0: no step; inner points up to that depth are in contact
+        height_limit: f64  # largest height above a facet that is considered, m
+        outside_depth: f64  # depth at the start of the attempt up to which a point was outside, m
+
+    @wp.struct
+    class FacetCandidate:
+        """Candidate facet of a point."""
+
+        facet: wp.int32  # -1: none
+        xi: vec3d
+        outside_distance: f64  # distance beyond the sides of the facet; 0 within its `edge_margin`
+        total_outside_distance: f64  # distance beyond the sides without that margin
+        height: f64  # height above the facet
+        rank: wp.int32  # see `candidate_rank`
+        entered: wp.bool  # the point passed a side of the body
+        needs_entry: wp.bool  # the facet is accepted only with `entered`
+        passed_through: wp.bool  # without another facet the point has left through one
+
+    @wp.func
+    def slave_point(facets: Facets, world: int, item: int, q: int) -> SlavePoint:
+        """A point of a slave facet, without its state."""
+        out = SlavePoint()
+        out.world = world
+        out.contact = facets.contact[item]
+        out.slave_facet = item
+        out.number_in_facet = q
+        out.point = facets.first_point + item * facets.point_count + q
+        return out
+
+    @wp.func
+    def slave_point_at(
+        con: Contacts, mas: Masters, facets: Facets, his: History, clock: Clock, scr: ContactScratch, pair: PairScratch,
+        u: wp.array2d(dtype=vec3d), world: int, item: int, q: int, overlap_limit: f64,
+    ) -> SlavePoint:  # fmt: skip
+        """A point of a slave facet at displacements u, its motion relative to its anchor, and bounds of the search."""
+        out = slave_point(facets, world, item, q)
+        point = out.point
+        offset = con.offset[out.contact]
+        out.displacement = interpolate(facets, u, world, q, item)
+        out.position = facets.X[q, item] + out.displacement
+        out.start_position = pair.start_position[world, point]
+        overlap = remaining_overlap(con, his, world, out.contact, point, clock.time[world])
+        out.overlap_limit = overlap_limit
+        out.height_limit = overlap_limit + overlap + wp.abs(offset) + f64(1.0e-6) * wp.length(out.position)
+        out.outside_depth = overlap + mas.touch_depth - wp.min(offset, f64(0.0))
+        out.anchored = pair.anchor_facet[world, point] > 0
+        if out.anchored:
+            f = pair.anchor_facet[world, point] - 1
+            xi = pair.anchor_xi[world, point]
+            change = displacement_change(
+                mas, pair.u_coefs, pair.director_u_coefs, pair.start_u_coefs, pair.start_director_u_coefs, world, f, xi
+            )
+            out.motion = out.displacement - scr.start_displacement[world, point] - change
+            out.height_limit += f64(2.0) * wp.abs(xi[2])
+        return out
+
+    @wp.func
+    def anchor_candidate(mas: Masters, his: History, pair: PairScratch, slave: SlavePoint) -> FacetCandidate:
+        """The anchor facet, with the coordinates that the point's motion leads to; none if the point has left it."""
+        world = slave.world
+        out = FacetCandidate(
+            -1, vec3d(), f64(OUTSIDE_TOLERANCE), f64(OUTSIDE_TOLERANCE), f64(1.0e300), -1, False, False, False
+        )
+        if slave.overlap_limit > f64(0.0):
+            out.outside_distance = f64(0.0)  # no tolerance: a point in front of one face may be beside another
+        if slave.anchored:
+            f = pair.anchor_facet[world, slave.point] - 1
+            corners = mas.corner_count[mas.facet_kind[f]]
+            found = track_point(
+                mas, pair.u_coefs, pair.director_u_coefs, world, f, pair.anchor_xi[world, slave.point], slave.motion
+            )
+            if found[3] == f64(0.0):
+                found = inverse_map(
+                    mas, pair.u_coefs, pair.director_u_coefs, world, f, slave.position, facet_centre(corners)
+                )
+            xi = vec3d(found[0], found[1], found[2])
+            o = distance_outside(corners, xi)
+            if found[3] != f64(0.0) and (
+                o <= out.outside_distance or (o <= f64(MAX_OVERHANG) and his.speed[world, slave.point] > f64(0.0))
+            ):
+                out = FacetCandidate(f, xi, o, o, wp.abs(xi[2]), -1, False, False, False)
+        return out
+
+    @wp.func
+    def passed_through_facet(mas: Masters, pair: PairScratch, slave: SlavePoint, f: int) -> bool:
+        """True if a point entered through a facet during the step, and deep."""
+        world = slave.world
+        kind = mas.facet_kind[f]
+        m = facet_centre(mas.corner_count[kind])
+        old = unpack_facet_point(pair.start_facet_centre[world, f])
+        new = unpack_facet_point(pair.facet_centre[world, f])
+        position_change = slave.position - slave.start_position - (new.position - old.position)
+        deep = f64(TUNNEL_LIMIT_RATIO) * mas.depth_limit[f]
+        if wp.length(position_change) <= deep:
+            return False
+        g0 = wp.dot(slave.start_position - old.position, unit_normal(old))
+        g1 = wp.dot(slave.position - new.position, unit_normal(new))
+        if g0 <= f64(0.0) or g1 >= -deep:
+            return False
+        y = slave.position - (g1 / (g1 - g0)) * position_change
+        there = inverse_map(mas, pair.u_coefs, pair.director_u_coefs, world, f, y, m)
+        xi = vec3d(there[0], there[1], there[2])
+        return there[3] != f64(0.0) and distance_outside(mas.corner_count[kind], xi) == f64(0.0)
+
+    @wp.func
+    def is_far(mas: Masters, pair: PairScratch, slave: SlavePoint, f: int) -> bool:
+        """True if a point is above a facet by more than twice `height_limit`, or moved little and is beside it, by
+        the tangent plane at its centre."""
+        corners = mas.corner_count[mas.facet_kind[f]]
+        s = unpack_facet_point(pair.facet_centre[slave.world, f])
+        if (
+            wp.dot(slave.position - s.position, unit_normal(s))
+            > f64(2.0) * slave.height_limit + pair.bulge[slave.world, f]
+        ):
+            return True
+        if distance_outside(corners, facet_centre(corners) + local_components(s, slave.position - s.position)) <= f64(
+            TANGENT_PLANE_MARGIN
+        ):
+            return False
+        path = slave.position - slave.start_position - (s.position - pair.start_facet_centre[slave.world, f][0])
+        return wp.length(path) <= f64(0.5) * mas.depth_limit[f]
+
+    @wp.func
+    def in_front(mas: Masters, pair: PairScratch, slave: SlavePoint, f: int) -> bool:
+        """True if a point is above a facet by more than `height_limit` and within its sides."""
+        corners = mas.corner_count[mas.facet_kind[f]]
+        found = inverse_map(
+            mas, pair.u_coefs, pair.director_u_coefs, slave.world, f, slave.position, facet_centre(corners)
+        )
+        within = distance_outside(corners, vec3d(found[0], found[1], found[2])) == f64(0.0)
+        return found[3] != f64(0.0) and within and found[2] > slave.height_limit
+
+    @wp.func
+    def inward_normal(facets: Facets, pair: PairScratch, slave: SlavePoint, corners: wp.vec3i) -> vec3d:
+        """Inward normal of a slave facet at the start of the attempt; 0 if undefined."""
+        if corners[0] < 0:
+            return vec3d()
+        point = facets.first_point + slave.slave_facet * facets.point_count
+        x = pair.start_position[slave.world, point + corners[0]]
+        return wp.normalize(
+            wp.cross(
+                pair.start_position[slave.world, point + corners[2]] - x,
+                pair.start_position[slave.world, point + corners[1]] - x,
+            )
+        )
+
+    @wp.func
+    def edge_margin(mas: Masters, f: int, xi: vec3d) -> f64:
+        """Tolerance beyond a side, over its length, for points below an edge, where outward vectors are inclined."""
+        return wp.max(-f64(MAX_EDGE_TANGENT) * xi[2] / mas.side_length[f], f64(0.0))
+
+    @wp.func
+    def entered_sideways(
+        mas: Masters, scr: ContactScratch, pair: PairScratch, slave: SlavePoint, f: int, xi: vec3d, gap: f64
+    ) -> bool:
+        """True if a point is at a facet now, was beside it at the start of the attempt, and was below its plane by at
+        most the penetration of the bodies' contact: it slid under the edge of a body that has sunk in."""
+        world = slave.world
+        bodies = mas.bodies[slave.contact]
+        kind = mas.facet_kind[f]
+        most = wp.max(pair.deepest_contact[world, bodies[0]], pair.deepest_contact[world, bodies[1]])
+        depth = scr.activation_gap[world, slave.point] - gap
+        if depth > wp.min(f64(MAX_DEPTH_RATIO) * most, f64(TUNNEL_LIMIT_RATIO) * mas.depth_limit[f]):
+            return False
+        if distance_outside(mas.corner_count[kind], xi) > edge_margin(mas, f, xi):
+            return False
+        found = inverse_map(
+            mas, pair.start_u_coefs, pair.start_director_u_coefs, world, f, pair.start_position[world, slave.point], xi
+        )
+        return found[3] == f64(0.0) or distance_outside(
+            mas.corner_count[kind], vec3d(found[0], found[1], found[2])
+        ) > f64(0.0)
+
+    @wp.func
+    def candidate_rank(
+        mas: Masters, scr: ContactScratch, pair: PairScratch, slave: SlavePoint, f: int, xi: vec3d
+    ) -> int:
+        """Rank of a facet for a point, -1: rejected by depth, by the previous facet, or by the side at the start of the
+        attempt. Higher for facets that face the slave's; among others, for one that the point reached from beside."""
+        world = slave.world
+        s = surface_point(mas, pair.u_coefs, pair.director_u_coefs, world, f, xi)
+        n = unit_normal(s)
+        cosine = wp.dot(n, slave.facing_normal)
+        gap = xi[2] * wp.dot(n, s.director)
+        if (
+            -gap > mas.depth_limit[f] or gap > slave.height_limit
+        ):  # boxes depend on the other worlds: this test does not
+            return -1
+        if slave.anchored:
+            return wp.where(cosine > f64(MIN_NORMAL_COSINE), 0, -1)
+        rank = wp.where(cosine > f64(OPPOSING_COSINE), 4, wp.where(cosine > -f64(OPPOSING_COSINE), 1, 0))
+        if slave.overlap_limit > f64(0.0):
+            rank = 0
+        else:
+            projection = surface_point(
+                mas, pair.start_u_coefs, pair.start_director_u_coefs, world, f, vec3d(xi[0], xi[1], f64(0.0))
+            )
+            before = wp.dot(slave.start_position - projection.position, unit_normal(projection))
+            if before < -slave.outside_depth:
+                if rank == 0 or not entered_sideways(mas, scr, pair, slave, f, xi, before):
+                    return -1
+                rank = wp.where(rank == 4, 3, 2)
+        return rank
+
+    @wp.func
+    def precedes(new: FacetCandidate, old: FacetCandidate) -> bool:
+        """True if a candidate is better: by its distance outside, then rank, total distance, height and number."""
+        closer = new.height < old.height or (new.height == old.height and new.facet < old.facet)
+        closer = new.total_outside_distance < old.total_outside_distance or (
+            closer and new.total_outside_distance == old.total_outside_distance
+        )
+        closer = new.rank > old.rank or (closer and new.rank == old.rank)
+        return (
+            new.outside_distance < old.outside_distance
+            or old.facet < 0
+            or (new.outside_distance == old.outside_distance and closer)
+        )
+
+    @wp.func
+    def better_candidate(
+        mas: Masters, scr: ContactScratch, pair: PairScratch, slave: SlavePoint, f: int, candidate: FacetCandidate
+    ) -> FacetCandidate:
+        """The better of a candidate and another facet for a point."""
+        out = candidate
+        corners = mas.corner_count[mas.facet_kind[f]]
+        found = inverse_map(
+            mas, pair.u_coefs, pair.director_u_coefs, slave.world, f, slave.position, facet_centre(corners)
+        )
+        xi = vec3d(found[0], found[1], found[2])
+        beyond = distance_outside(corners, xi)
+        slack = f64(0.0)
+        if not slave.anchored and slave.overlap_limit == f64(0.0):
+            slack = edge_margin(mas, f, xi)
+        most = wp.min(wp.max(candidate.outside_distance, slack), f64(OUTSIDE_TOLERANCE))
+        if found[3] == f64(0.0) or beyond > most:
+            return out
+        rank = candidate_rank(mas, scr, pair, slave, f, xi)
+        if rank < 0:
+            return out
+        beside = rank == 2 or rank == 3
+        out.entered = out.entered or not beside
+        o = beyond
+        if rank > 1 and beyond <= slack:
+            o = f64(0.0)
+        new = FacetCandidate(
+            f, xi, o, beyond, wp.abs(xi[2]), rank, out.entered, beside and beyond > f64(0.0), out.passed_through
+        )
+        if precedes(new, out):
+            out = new
+        return out
+
+    @wp.func
+    def is_beside_body(mas: Masters, pair: PairScratch, slave: SlavePoint, low: wp.vec3, high: wp.vec3) -> bool:
+        """True if a point is in front of some facet in a box: outside of the body, and beside any other facet."""
+        out = bool(False)
+        index = wp.int32(0)
+        root = wp.bvh_get_group_root(mas.tree, slave.world * mas.surface_count + mas.surface_of[slave.contact])
+        query = wp.bvh_query_aabb(mas.tree, low, high, root)
+        while wp.bvh_query_next(query, index):
+            if in_front(mas, pair, slave, index - slave.world * mas.facet_count):
+                out = True
+        return out
+
+    @wp.func
+    def search_facets(
+        mas: Masters, facets: Facets, scr: ContactScratch, pair: PairScratch, point: SlavePoint, first: FacetCandidate,
+        corners: wp.vec3i,
+    ) -> FacetCandidate:  # fmt: skip
+        """The best facet near a point's path in the attempt; `corners`: three points of its slave facet, or -1."""
+        out = first
+        slave = point
+        world = slave.world
+        free = not slave.anchored and slave.overlap_limit == f64(0.0)
+        if slave.anchored:
+            f = pair.anchor_facet[world, slave.point] - 1
+            slave.facing_normal = unit_normal(
+                surface_point(mas, pair.u_coefs, pair.director_u_coefs, world, f, pair.anchor_xi[world, slave.point])
+            )
+            depth = scr.start_depth[world, slave.point] - wp.dot(slave.motion, slave.facing_normal)
+            out.passed_through = depth > f64(TUNNEL_LIMIT_RATIO) * mas.depth_limit[f]
+        wide = vec3d(slave.height_limit, slave.height_limit, slave.height_limit)
+        low = round_down(wp.min(slave.position, slave.start_position) - wide)
+        high = round_up(wp.max(slave.position, slave.start_position) + wide)
+        root = wp.bvh_get_group_root(mas.tree, world * mas.surface_count + mas.surface_of[slave.contact])
+        query = wp.bvh_query_aabb(mas.tree, low, high, root)
+        index = wp.int32(0)
+        while wp.bvh_query_next(query, index):
+            f = index - world * mas.facet_count
+            if is_far(mas, pair, slave, f):
+                continue
+            if free and wp.length_sq(slave.facing_normal) == f64(0.0):
+                slave.facing_normal = inward_normal(facets, pair, slave, corners)
+            out = better_candidate(mas, scr, pair, slave, f, out)
+            if free and passed_through_facet(mas, pair, slave, f):
+                out.passed_through = True
+        if out.needs_entry and not out.entered:
+            out.facet = -1  # it passed no side of the body
+        if out.facet >= 0 and out.outside_distance > f64(0.0) and not slave.anchored:
+            if is_beside_body(mas, pair, slave, low, high):
+                out.facet = -1
+        return out
+
+    return kernel_set(locals())

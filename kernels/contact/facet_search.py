@@ -1,0 +1,275 @@
+"""Master facet and coordinates of each slave point, and its motion relative to it.
+
+A point in contact stays on its facet, or passes to the one that contains it. Another point is in contact if it is
+inside of a facet now and was outside of it at the start of the step; only boxes persist from step to step.
+"""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from ..common.types import SHORT_UNROLL, kernel_module, kernel_set, precision
+from .assembly import MIN_APPROACH_SPEED
+from .broad_phase import BOX_MARGIN, broad_phase_kernels
+from .facet_candidates import TUNNEL_LIMIT_RATIO, facet_candidate_functions
+from .facet_structs import master_struct, pair_history_struct, pair_scratch_struct
+from .laws import PAPER
+from .point import contact_point_functions
+from .projection import OUTSIDE_TOLERANCE, facet_projection_functions
+from .structs import clock_struct, contact_scratch_struct, contact_struct, facet_struct, history_struct
+
+__all__ = ["BOX_MARGIN", "PENETRATED", "facet_search_kernels"]
+
+PENETRATED = -2
+"""Facet of a point that has left through the opposite side."""
+
+
+@functools.cache
+def facet_search_kernels(dtype: str) -> _types.SimpleNamespace:
+    """Kernels in one precision of the displacements."""
+    p = precision(dtype)
+    vec3 = p.vec3
+    f64, vec3d = wp.float64, wp.vec3d
+    Contacts, Facets, History = contact_struct(False), facet_struct(dtype), history_struct()
+    ContactScratch, Clock = contact_scratch_struct(dtype), clock_struct()
+    Masters, PairHistory, PairScratch = master_struct(dtype), pair_history_struct(), pair_scratch_struct(dtype)
+    k, f = contact_point_functions(dtype, False), facet_projection_functions(dtype)
+    interpolate, activation_gap = k.interpolate, k.activation_gap
+    surface_point, polynomial_value, displacement_change = f.surface_point, f.polynomial_value, f.displacement_change
+    distance_outside, inverse_map, project_on_facet = f.distance_outside, f.inverse_map, f.project_on_facet
+    FacetPoint, boxes, candidates = f.FacetPoint, broad_phase_kernels(dtype), facet_candidate_functions(dtype)
+    round_down, round_up, contains = boxes.round_down, boxes.round_up, boxes.contains
+    SlavePoint, slave_point, slave_point_at = candidates.SlavePoint, candidates.slave_point, candidates.slave_point_at
+    anchor_candidate, search_facets = candidates.anchor_candidate, candidates.search_facets
+    module = kernel_module(f"facet_search_{dtype}", max_unroll=SHORT_UNROLL)
+
+    @wp.func
+    def approach_speed(
+        mas: Masters, facets: Facets, pair: PairScratch, v: wp.array2d(dtype=vec3), slave: SlavePoint, f: int,
+        xi: vec3d, n: vec3d,
+    ) -> f64:  # fmt: skip
+        """Approach speed of a point towards a facet at the start of the attempt, m/s."""
+        projection = vec3d(xi[0], xi[1], f64(0.0))
+        own = interpolate(facets, v, slave.world, slave.number_in_facet, slave.slave_facet)
+        return wp.dot(
+            n, polynomial_value(mas, pair.start_v_coefs, pair.start_v_coefs, slave.world, f, projection) - own
+        )
+
+    @wp.func
+    def set_anchor(
+        mas: Masters, facets: Facets, his: History, clock: Clock, scr: ContactScratch, pair: PairScratch,
+        v_n: wp.array2d(dtype=vec3), slave: SlavePoint, f: int, start: vec3d,
+    ):  # fmt: skip
+        """Set the facet that a point's motion is relative to: start coordinates on it, depth and approach speed at the
+        start."""
+        world = slave.world
+        point = slave.point
+        found = inverse_map(
+            mas, pair.start_u_coefs, pair.start_director_u_coefs, world, f, pair.start_position[world, point], start
+        )
+        xi = vec3d(found[0], found[1], found[2])
+        in_contact = his.speed[world, point] > f64(0.0)
+        if found[3] == f64(0.0):
+            if not in_contact:
+                return
+            xi = start
+        if in_contact and distance_outside(mas.corner_count[mas.facet_kind[f]], xi) > f64(OUTSIDE_TOLERANCE):
+            return  # it has left the surface
+        projection = project_on_facet(mas, pair.start_u_coefs, pair.start_director_u_coefs, world, f, xi)
+        pair.anchor_facet[world, point] = f + 1
+        pair.anchor_xi[world, point] = xi
+        pair.anchor_gap[world, point] = wp.vec2d(projection.gap_slope, projection.gap_offset)
+        scr.start_depth[world, point] = scr.activation_gap[world, point] - (
+            xi[2] * projection.gap_slope + projection.gap_offset
+        )
+        speed = wp.max(his.speed[world, point], f64(MIN_APPROACH_SPEED))
+        if clock.is_static == 0:
+            speed = wp.max(speed, approach_speed(mas, facets, pair, v_n, slave, f, xi, projection.normal))
+        scr.approach_speed[world, point] = speed
+
+    @wp.kernel(module=module)
+    def begin_points(
+        con: Contacts, mas: Masters, facets: Facets, his: History, pair_his: PairHistory, clock: Clock,
+        u_n: wp.array2d(dtype=vec3), v_n: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), scr: ContactScratch,
+        pair: PairScratch,
+    ):  # fmt: skip
+        """Start positions of the points; depth and approach speed of those in contact."""
+        world, item, q = wp.tid()
+        if active[world] == 0:
+            return
+        if q == 0 and item == 0 and facets.first_row == 0:
+            scr.passed_point[world] = 0
+            scr.limit_updates[world] = 0
+            if clock.substep_index[world] == 0:
+                scr.elapsed_time[world] = f64(0.0)
+        if facets.area_fraction[q, item] == f64(0.0):
+            return
+        c = facets.contact[item]
+        point = facets.first_point + item * facets.point_count + q
+        shift = interpolate(facets, u_n, world, q, item)
+        x = facets.X[q, item] + shift
+        pair.start_position[world, point] = x
+        scr.start_displacement[world, point] = shift
+        scr.start_depth[world, point] = f64(-1.0e30)
+        scr.approach_speed[world, point] = f64(MIN_APPROACH_SPEED)
+        pair.anchor_facet[world, point] = 0
+        scr.activation_gap[world, point] = activation_gap(con, his, world, c, point, clock.time[world], f64(0.0))
+        if his.speed[world, point] > f64(0.0):
+            slave = slave_point(facets, world, item, q)
+            f = pair_his.facet[world, point] - 1
+            set_anchor(mas, facets, his, clock, scr, pair, v_n, slave, f, pair_his.xi[world, point])
+            if pair.anchor_facet[world, point] > 0:
+                depth = scr.start_depth[world, point]
+                for i in range(2):
+                    body = mas.bodies[c][i]
+                    if depth > pair.deepest_contact[world, body]:
+                        wp.atomic_max(pair.deepest_contact, world, body, depth)
+
+    @wp.kernel(module=module)
+    def query_boxes(
+        con: Contacts, mas: Masters, facets: Facets, his: History, u: wp.array2d(dtype=vec3d),
+        active: wp.array(dtype=wp.int32), search_distance: f64, pair: PairScratch,
+    ):  # fmt: skip
+        """Flag slave facets with a master facet's box nearby; for the others store the box without master facets."""
+        world, item = wp.tid()
+        if active[world] == 0:
+            return
+        row = facets.first_row + item
+        low = vec3d(f64(1.0e300), f64(1.0e300), f64(1.0e300))
+        high = -low
+        inside = f64(0.0)
+        for q in range(facets.point_count):
+            x = facets.X[q, item] + interpolate(facets, u, world, q, item)
+            y = pair.start_position[world, facets.first_point + item * facets.point_count + q]
+            if facets.area_fraction[q, item] > f64(0.0):
+                low = wp.min(low, wp.min(x, y))
+                high = wp.max(high, wp.max(x, y))
+                inside = wp.max(inside, his.overlap[world, facets.first_point + item * facets.point_count + q])
+        if low[0] > high[0]:
+            pair.in_reach[world, row] = 0
+            return
+        far = search_distance + inside
+        pad = vec3d(far, far, far)
+        empty_box_known = pair.empty_box_refit[world, row] == pair.refit_count[0]
+        if empty_box_known and contains(
+            pair.empty_box_lower[world, row],
+            pair.empty_box_upper[world, row],
+            round_down(low - pad),
+            round_up(high + pad),
+        ):
+            pair.in_reach[world, row] = 0
+            return
+        room = f64(2.0) * far + f64(BOX_MARGIN) * wp.length(high - low)
+        wide = vec3d(room, room, room)
+        root = wp.bvh_get_group_root(mas.tree, world * mas.surface_count + mas.surface_of[facets.contact[item]])
+        query = wp.bvh_query_aabb(mas.tree, round_down(low - wide), round_up(high + wide), root)
+        index = wp.int32(0)
+        if wp.bvh_query_next(query, index):
+            pair.in_reach[world, row] = 1
+            pair.empty_box_refit[world, row] = -1
+            return
+        pair.in_reach[world, row] = 0
+        pair.empty_box_refit[world, row] = pair.refit_count[0]
+        pair.empty_box_lower[world, row] = round_down(low - wide)
+        pair.empty_box_upper[world, row] = round_up(high + wide)
+
+    @wp.func
+    def facet_frame(s: FacetPoint) -> wp.mat33d:
+        """Columns: first tangent of a facet, second tangent, outward normal."""
+        n = wp.normalize(wp.cross(s.tangent_a, s.tangent_b))
+        a = wp.normalize(s.tangent_a)
+        return wp.matrix_from_cols(a, wp.cross(n, a), n)
+
+    @wp.func
+    def set_contact(
+        con: Contacts, mas: Masters, facets: Facets, his: History, clock: Clock, scr: ContactScratch, pair: PairScratch,
+        v_n: wp.array2d(dtype=vec3), slave: SlavePoint, f: int, xi: vec3d,
+    ):  # fmt: skip
+        """Contact data of a point on a facet: depth now and at the start of the attempt, normal, motion."""
+        world = slave.world
+        point = slave.point
+        c = slave.contact
+        projection = project_on_facet(mas, pair.u_coefs, pair.director_u_coefs, world, f, xi)
+        now = activation_gap(con, his, world, c, point, clock.new_time[world], f64(0.0))
+        pair.facet[world, point] = f
+        pair.xi[world, point] = xi
+        pair.projection[world, point] = projection.xi
+        pair.normal[world, point] = projection.normal
+        pair.depth[world, point] = now - (xi[2] * projection.gap_slope + projection.gap_offset)
+        if pair.anchor_facet[world, point] == 0 and slave.overlap_limit == f64(0.0):
+            set_anchor(mas, facets, his, clock, scr, pair, v_n, slave, f, xi)
+        motion = slave.displacement - scr.start_displacement[world, point]
+        spring = vec3d()
+        if pair.anchor_facet[world, point] > 0:
+            first = pair.anchor_facet[world, point] - 1
+            from0 = pair.anchor_xi[world, point]
+            motion -= displacement_change(
+                mas,
+                pair.u_coefs,
+                pair.director_u_coefs,
+                pair.start_u_coefs,
+                pair.start_director_u_coefs,
+                world,
+                first,
+                from0,
+            )
+            if f == first:  # sum of motions: a difference of positions would lose digits
+                before = pair.anchor_gap[world, point]
+                rise = (
+                    (xi[2] - from0[2]) * projection.gap_slope + from0[2] * (projection.gap_slope - before[0]) +
+                    (projection.gap_offset - before[1])
+                )  # fmt: skip
+                pair.depth[world, point] = (
+                    scr.start_depth[world, point] + (now - scr.activation_gap[world, point]) - rise
+                )
+            pair.initial_depth[world, point] = scr.start_depth[world, point]
+            if his.speed[world, point] > f64(0.0):
+                spring = his.spring[world, point]
+                if con.law[c] != PAPER:
+                    spring = (
+                        facet_frame(surface_point(mas, pair.u_coefs, pair.director_u_coefs, world, first, from0))
+                        * spring
+                    )
+        else:
+            motion -= displacement_change(
+                mas, pair.u_coefs, pair.director_u_coefs, pair.start_u_coefs, pair.start_director_u_coefs, world, f, xi
+            )
+            pair.initial_depth[world, point] = (
+                pair.depth[world, point] + wp.dot(projection.normal, motion) - (now - scr.activation_gap[world, point])
+            )
+        pair.relative_motion[world, point] = motion
+        pair.trial_displacement[world, point] = spring + motion
+
+    @wp.kernel(module=module)
+    def find_facets(
+        con: Contacts, mas: Masters, facets: Facets, his: History, clock: Clock, u: wp.array2d(dtype=vec3d),
+        v_n: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), overlap_limit: f64, scr: ContactScratch,
+        pair: PairScratch, corner_points: wp.array(dtype=wp.vec3i),
+    ):  # fmt: skip
+        """Facet of each point at an iterate. `overlap_limit` > 0: no step; inner points up to that depth, m, are in
+        contact. `corner_points`: three points of each slave facet, or -1."""
+        world, item, q = wp.tid()
+        if active[world] == 0:
+            return
+        point = facets.first_point + item * facets.point_count + q
+        pair.facet[world, point] = -1
+        if facets.area_fraction[q, item] == f64(0.0):
+            return
+        if his.speed[world, point] <= f64(0.0) and pair.in_reach[world, facets.first_row + item] == 0:
+            return
+        slave = slave_point_at(con, mas, facets, his, clock, scr, pair, u, world, item, q, overlap_limit)
+        candidate = anchor_candidate(mas, his, pair, slave)
+        if candidate.facet < 0 or candidate.outside_distance > f64(OUTSIDE_TOLERANCE):
+            candidate = search_facets(mas, facets, scr, pair, slave, candidate, corner_points[item])
+        if candidate.facet >= 0:
+            set_contact(con, mas, facets, his, clock, scr, pair, v_n, slave, candidate.facet, candidate.xi)
+            most = mas.depth_limit[candidate.facet] * wp.where(
+                candidate.outside_distance > f64(OUTSIDE_TOLERANCE), f64(TUNNEL_LIMIT_RATIO), f64(1.0)
+            )
+            if pair.depth[world, point] > most:
+                pair.facet[world, point] = PENETRATED
+        elif candidate.passed_through:
+            pair.facet[world, point] = PENETRATED
+
+    return kernel_set(vars(boxes) | locals())

@@ -1,0 +1,162 @@
+"""Contact laws of one point as derivatives of scalars: normal force of the depth, friction of the anchored slip.
+
+delta is the depth, m; delta_n that at the start of the step; all in float64. The elastic force is k delta^1.5 for a
+lumped contact ("sphere"), else k delta.
+
+"default": Hunt and Crossley's normal force and an anchored friction spring. In patches with mu_static > mu the points
+begin to slip one after another, the least loaded first, and slipping points carry only mu: a stiff body slides before
+mu_static.
+
+"paper": Paper I, Eqs. (73)-(83), unmodified. Known properties: with max(0, .) rebounds for e = 0.1, 0.3, 0.5, 0.7, 0.9
+are 0.2527, 0.3971, 0.5503, 0.7182, 0.9020 (spheres) and 0.2242, 0.3635, 0.5174, 0.6926, 0.8914 (patches). The implicit
+patch force jumps at first contact, and some impacts have no solution (`smoothing` ramps it). With k_t ~ sqrt(delta) and
+a persistent spring, energy is created when the normal load rises (Elata and Berryman 1996). Eq. (83) reverses the
+spring where gamma_t v exceeds mu F_n. Eq. (78) does not rotate it with the bodies: a sticking block walks on a rotating
+plate.
+
+"smooth": Paper I, 6.2.
+"""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from ..common.types import kernel_set
+
+__all__ = ["DEFAULT", "PAPER", "SMOOTH", "law_functions"]
+
+DEFAULT, PAPER, SMOOTH = range(3)
+
+
+@functools.cache
+def law_functions() -> _types.SimpleNamespace:
+    """Device functions `normal_law`, `elastic_force`, `huber_friction` and `smooth_friction`."""
+    f64 = wp.float64
+    vec3d, vec4d = wp.vec3d, wp.vec4d
+
+    @wp.func
+    def elastic_force(single_point: int, k: f64, delta: f64) -> wp.vec2d:
+        """Elastic force, N, and stored energy, J."""
+        if delta <= f64(0.0):
+            return wp.vec2d()
+        if single_point != 0:
+            force = k * delta * wp.sqrt(delta)
+            return wp.vec2d(force, f64(0.4) * force * delta)
+        return wp.vec2d(k * delta, f64(0.5) * k * delta * delta)
+
+    @wp.func
+    def hunt_crossley(single_point: int, k: f64, rate: f64, delta: f64, delta_n: f64) -> vec4d:
+        """F = F_el (1 + rate (delta - delta_n)), not below 0 (Hunt and Crossley 1975), its derivative, its integral,
+        and the magnitude of the terms that the integral is the difference of (for its round-off).
+
+        rate = chi / h, 1/m. F increases with delta wherever it is positive, so its integral is convex.
+        """
+        if delta <= f64(0.0):
+            return vec4d()
+        factor = f64(1.0) + rate * (delta - delta_n)
+        if factor <= f64(0.0):
+            return vec4d()
+        m = wp.where(single_point != 0, f64(1.5), f64(1.0))
+        c0 = f64(1.0) - rate * delta_n
+        power = elastic_force(single_point, k, delta)[0]
+        force = power * factor
+        slope = m * force / delta + power * rate
+        psi = power * delta * (c0 / (m + f64(1.0)) + rate * delta / (m + f64(2.0)))
+        size = power * delta * ((f64(1.0) + rate * wp.abs(delta_n)) / (m + f64(1.0)) + rate * delta / (m + f64(2.0)))
+        if c0 < f64(0.0):  # the force begins at delta_a > 0
+            begin = -c0 / rate
+            low = elastic_force(single_point, k, begin)[0] * begin
+            psi -= low * (c0 / (m + f64(1.0)) + rate * begin / (m + f64(2.0)))
+        return vec4d(force, slope, psi, size)
+
+    @wp.func
+    def damped_force(single_point: int, k: f64, g: f64, ramp: f64, delta: f64, delta_n: f64) -> vec3d:
+        """k_n delta - gamma_n v_n of Eq. (77) before the cut at 0, its derivative and its integral.
+
+        g = gamma_n / h (of spheres gamma_n is g h delta^(1/4)); the damping grows linearly over the depth `ramp`.
+        """
+        spring = elastic_force(single_point, k, delta)
+        if single_point != 0:
+            root = wp.sqrt(wp.sqrt(delta))
+            force = spring[0] + g * root * (delta - delta_n)
+            slope = f64(0.25) * force / wp.max(delta, f64(1.0e-300)) + root * (f64(1.25) * k * root + g)
+            psi = spring[1] + g * root * delta * (delta / f64(2.25) - delta_n / f64(1.25))
+            return vec3d(force, slope, psi)
+        if delta < ramp:
+            part = delta / ramp
+            force = spring[0] + g * part * (delta - delta_n)
+            psi = spring[1] + g * part * delta * (delta / f64(3.0) - f64(0.5) * delta_n)
+            return vec3d(force, k + g * part + g / ramp * (delta - delta_n), psi)
+        psi = spring[1] + g * (f64(0.5) * delta * delta - delta_n * delta)
+        # reduction of the integral by the ramp
+        psi += g * ramp * (f64(0.5) * delta_n - ramp / f64(6.0))
+        return vec3d(spring[0] + g * (delta - delta_n), k + g, psi)
+
+    @wp.func
+    def paper_law(single_point: int, k: f64, g: f64, ramp: f64, delta: f64, delta_n: f64) -> vec4d:
+        """Eq. (77): max(0, k_n delta - gamma_n v_n), its derivative, integral, and the magnitude of the integral."""
+        if delta <= f64(0.0):
+            return vec4d()
+        out = damped_force(single_point, k, g, ramp, delta, delta_n)
+        if out[0] <= f64(0.0):
+            return vec4d()
+        size = elastic_force(single_point, k, delta)[1] + g * delta * (delta + wp.abs(delta_n))
+        if delta_n > f64(0.0) and g > f64(0.0):
+            low = f64(0.0)  # depth at which the force begins: negative below, positive at delta_n
+            high = wp.min(delta, delta_n)
+            for _ in range(60):
+                middle = f64(0.5) * (low + high)
+                if damped_force(single_point, k, g, ramp, middle, delta_n)[0] > f64(0.0):
+                    high = middle
+                else:
+                    low = middle
+            out[2] = out[2] - damped_force(single_point, k, g, ramp, low, delta_n)[2]
+        return vec4d(out[0], out[1], out[2], size)
+
+    @wp.func
+    def smooth_law(k: f64, g: f64, eps: f64, delta: f64, delta_n: f64) -> vec4d:
+        """(y + sqrt(y^2 + eps^2)) / 2 in place of max(0, y) (Paper I, 6.2), y = k delta - gamma v, at any gap."""
+        y = k * delta + g * (delta - delta_n)
+        root = wp.sqrt(y * y + eps * eps)
+        total = y + root
+        if y < f64(0.0):
+            total = eps * eps / (root - y)
+        bend = k + g
+        logarithm = wp.log((wp.abs(y) + root) / eps) * wp.sign(y)
+        psi = f64(0.25) * (y * total + eps * eps * logarithm) / bend
+        return vec4d(f64(0.5) * total, f64(0.5) * total / root * bend, psi, wp.abs(psi) + k * delta * delta)
+
+    @wp.func
+    def normal_law(
+        law: int, single_point: int, k: f64, g: f64, ramp: f64, eps: f64, delta: f64, delta_n: f64
+    ) -> vec4d:  # fmt: skip
+        """Normal force, N, its derivative by the depth, N/m, its integral, J, and the magnitude of its terms; g is
+        chi/h or gamma_n/h."""
+        if law == DEFAULT:
+            return hunt_crossley(single_point, k, g, delta, delta_n)
+        if law == PAPER:
+            return paper_law(single_point, k, g, ramp, delta, delta_n)
+        return smooth_law(k, g, eps, delta, delta_n)
+
+    @wp.func
+    def huber_friction(trial: vec3d, stiffness: f64, friction_limit: f64) -> wp.vec2d:
+        """Huber potential, J, of a trial force stiffness x slip cut at `friction_limit`, and the fraction of the trial
+        force that acts."""
+        size = wp.length(trial)
+        if size <= friction_limit:
+            return wp.vec2d(f64(0.5) * size * size / stiffness, f64(1.0))
+        return wp.vec2d(
+            (friction_limit * size - f64(0.5) * friction_limit * friction_limit) / stiffness, friction_limit / size
+        )
+
+    @wp.func
+    def smooth_friction(slip: vec3d, inv_h: f64, v_eps: f64, friction_limit: f64) -> wp.vec2d:
+        """friction_limit v / sqrt(v^2 + v_eps^2) (Paper I, 6.2), v = slip/h: potential, J, and force over slip, N/m."""
+        v = inv_h * slip
+        root = wp.sqrt(wp.dot(v, v) + v_eps * v_eps)
+        if inv_h == f64(0.0):
+            return wp.vec2d()
+        return wp.vec2d(friction_limit * wp.dot(v, v) / (root + v_eps) / inv_h, friction_limit * inv_h / root)
+
+    return kernel_set(locals())

@@ -1,0 +1,184 @@
+"""Tables of contacts and colliders on the device, and contact law constants."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from ..base.errors import ModelError
+from ..kernels.contact.structs import contact_struct
+from ..model.contact_points import ContactPoints, Modulus, body_mass_total, contact_points, effective_modulus
+from ..model.contacts import Collider, Contact
+from ..model.triangle_mesh import TriMesh
+from ..terms.time_law_table import TimeLawTable
+from .collider_meshes import shape_sizes, upload_collider_meshes
+from .tables import WORLD_PARAMETERS, FacetTables, clamped_slots, normal_damping
+
+if TYPE_CHECKING:
+    from ..model.model import Model
+
+__all__ = ["ContactTables", "contact_law_constants", "facet_pattern_entries"]
+
+
+class ContactTables(FacetTables[Contact]):
+    """Contacts with colliders of a model, and the colliders.
+
+    Attributes:
+        colliders: descriptions.
+        region_radii: `region_radius` by contact index.
+        clamped_point_counts: number of points per contact excluded because all their slots are clamped.
+    """
+
+    def __init__(self, model: Model) -> None:
+        contacts = list(model.description.contacts)
+        super().__init__(model, contacts, [contact_points(contact.surface, contact.points) for contact in contacts])
+        self.colliders: list[Collider] = list(model.description.colliders)
+        self.clamped = clamped_slots(model)
+        self.clamped_point_counts: list[int] = []
+        self.region_radii: dict[int, float] = {}
+        self.area_fractions = [self._area_fraction(c, p) for c, p in zip(self.contacts, self.host)]
+
+    @property
+    def has_single_point(self) -> bool:
+        """True if a contact acts at its deepest point only."""
+        return any(contact.model == "sphere" for contact in self.contacts)
+
+    @property
+    def tracks_deepest(self) -> bool:
+        """True if a contact acts at its deepest position anywhere on its facets."""
+        return any(group.data.tracks_deepest for group in self.groups)
+
+    @property
+    def has_meshes(self) -> bool:
+        """True if a collider is a triangle mesh."""
+        return any(isinstance(collider.shape, TriMesh) for collider in self.colliders)
+
+    @property
+    def has_sheets(self) -> bool:
+        """True if a collider mesh is a sheet (no inside)."""
+        return any(isinstance(k.shape, TriMesh) and not k.shape.closed for k in self.colliders)
+
+    def _area_fraction(self, contact: Contact, p: ContactPoints) -> np.ndarray:
+        """Area fraction (F, P) of each point in the contact region; 0 if all its slots are clamped."""
+        slots = p.conn + contact.body.slot_offset
+        moves = np.any((np.abs(p.shape) > 1e-12) & ~self.clamped[slots][:, None, :], axis=2)
+        used = moves & (p.area > 0.0)
+        self.clamped_point_counts.append(int((~used & (p.area > 0.0)).sum()))
+        if not used.any():
+            raise ModelError(
+                f"contact {contact.name!r}: all points of the surface of body {contact.body.name!r} are clamped; "
+                "choose another surface, or leave the contact out"
+            )
+        if contact.model == "sphere":
+            return used.astype(float)
+        region = math.pi * contact.radius**2 if contact.radius else float(p.area.sum())
+        return np.where(used, p.area / region, 0.0)
+
+    def build(self, laws: TimeLawTable, pool: int) -> None:
+        """Upload the tables; `pool`: first pool entry of the term."""
+        self._build_facets(pool)
+        self.data = self._upload_contacts(laws)
+        self.store_built_values()
+
+    @property
+    def parameter_arrays(self) -> dict[str, wp.array]:
+        return super().parameter_arrays | {"margin": self.data.margin}
+
+    def _upload_contacts(self, laws: TimeLawTable) -> Any:
+        """Device struct of the contacts."""
+        m, C, K = self.model, self.contacts, self.colliders
+        out = contact_struct(self.has_meshes)()
+
+        def upload(name: str, values: Any, dtype: Any) -> None:
+            setattr(out, name, m.array("contact", np.asarray(values), dtype))
+
+        self._upload_laws(out, [self.law_constants(c) for c in C])
+        upload("collider", [K.index(c.collider) for c in C], wp.int32)
+        upload("margin", np.zeros((m.worlds, len(K))), wp.float64)
+        frames = [k.shape.frame() for k in K]
+        upload("collider_kind", [k.shape.kind for k in K], wp.int32)
+        upload("collider_size", [shape_sizes(k.shape, self._contact_positions(k)) for k in K], wp.vec3d)
+        upload("collider_center", [center for center, _ in frames], wp.vec3d)
+        upload("collider_axes", [axes for _, axes in frames], wp.mat33d)
+        upload("translation_law", [laws.add(k.law) if k.law is not None else -1 for k in K], wp.int32)
+        upload("rotation_law", [laws.add(k.rotation.angle) if k.rotation is not None else -1 for k in K], wp.int32)
+        upload("rotation_anchor", [k.rotation.anchor if k.rotation else np.zeros(3) for k in K], wp.vec3d)
+        upload("rotation_axis", [k.rotation.axis if k.rotation else (0.0, 0.0, 1.0) for k in K], wp.vec3d)
+        if self.has_meshes:
+            out.mesh = upload_collider_meshes(m, [k.shape for k in K])
+        return out
+
+    def law_constants(self, contact: Contact, world: int | None = None) -> dict[str, float]:
+        if contact.index not in self.region_radii:
+            self.region_radii[contact.index] = region_radius(contact)
+        parameters = self.model.parameters
+        mass = parameters.mass(contact.body, world)
+        return contact_law_constants(contact, parameters.modulus(world), self.region_radii[contact.index], mass)
+
+    def _contact_positions(self, collider: Collider) -> list[np.ndarray]:
+        """Points (n, 3), m, of the surfaces in contact with a collider."""
+        return [p.X.reshape(-1, 3) for c, p in zip(self.contacts, self.host) if c.collider is collider]
+
+    def hash(self, h: Any) -> None:
+        """Hash the definition of the contacts."""
+        for collider in self.colliders:
+            center, axes = collider.shape.frame()
+            h.update(f"{collider.name} {collider.shape.kind}".encode())
+            h.update(np.concatenate([collider.shape.sizes, center, axes.ravel()]).tobytes())
+            if isinstance(collider.shape, TriMesh):
+                h.update(collider.shape.points.tobytes() + collider.shape.triangles.tobytes())
+            if collider.rotation is not None:
+                h.update(np.concatenate([collider.rotation.anchor, collider.rotation.axis]).tobytes())
+        for contact, p in zip(self.contacts, self.host):
+            fixed = ("surface", "collider", *WORLD_PARAMETERS)
+            values = {k: v for k, v in vars(contact).items() if k not in fixed}
+            h.update(f"{contact.collider.name} {sorted(values.items())}".encode())
+            h.update(np.ascontiguousarray(p.faces).tobytes())
+        h.update(self.built_values)
+
+
+def region_radius(contact: Contact) -> float:
+    """Radius of the region of a contact, m; for single-point contacts over the root of the depth."""
+    if contact.model == "sphere":
+        # 1/R_eff = 1/R_A + 1/R_B, with a = sqrt(R_eff depth)
+        assert contact.radius is not None
+        return math.sqrt(1.0 / (1.0 / contact.radius + 1.0 / contact.collider.shape.radius_of_curvature))
+    if contact.radius:
+        return contact.radius
+    return math.sqrt(float(contact_points(contact.surface, contact.points).area.sum()) / math.pi)
+
+
+def contact_law_constants(
+    contact: Contact, modulus_of: Modulus = effective_modulus, a: float | None = None, mass: float | None = None
+) -> dict[str, float]:
+    """Constants of Eqs. (74)-(76), (79) and (80) with a rigid obstacle; for single-point contacts over powers of the
+    depth."""
+    E, nu = modulus_of(contact.body, contact.surface)
+    modulus = E / (1.0 - nu**2)
+    shear = E / (2.0 * (1.0 + nu)) / (2.0 - nu)
+    a = region_radius(contact) if a is None else a
+    mass = body_mass_total(contact.body) if mass is None else mass
+    return {
+        "normal_stiffness": 4.0 / 3.0 * modulus * a,
+        "tangential_stiffness": 8.0 * shear * a,
+        "normal_damping": normal_damping(2.0 * modulus * a, mass),
+        "effective_mass": mass,
+    }
+
+
+def facet_pattern_entries(model: Model, conn: np.ndarray, pattern: Any) -> tuple[wp.array, wp.array, wp.array, int]:
+    """Pattern entries of the facets: entry indices, start of each item, and (facet, slot, slot)."""
+    a, b = (x.ravel() for x in np.indices((conn.shape[1],) * 2))
+    facet = np.repeat(np.arange(len(conn)), len(a))
+    a, b = np.tile(a, len(conn)), np.tile(b, len(conn))
+    index = pattern.find_upper(conn[facet, a], conn[facet, b])
+    chosen = np.flatnonzero(index >= 0)
+    chosen = chosen[np.argsort(index[chosen], kind="stable")]
+    entry, count = np.unique(index[chosen], return_counts=True)
+    source = np.stack([facet[chosen], a[chosen], b[chosen]], axis=1)
+    start = np.concatenate([[0], np.cumsum(count)])
+    arrays = (model.array("contact", x, t) for x, t in ((entry, wp.int32), (start, wp.int32), (source, wp.vec3i)))
+    return (*arrays, len(entry))  # type: ignore[return-value]

@@ -1,0 +1,228 @@
+"""Tables of contacts between bodies on the device: points of slave surfaces, facets of master surfaces."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from ..base.errors import ModelError
+from ..kernels.contact.facet_structs import master_struct
+from ..kernels.contact.structs import contact_struct
+from ..model.contact_points import corner_points
+from ..model.handles import SurfaceSet
+from ..model.pairs import (
+    MasterFacets,
+    PairContact,
+    bernstein_from_monomials,
+    contact_constants,
+    master_facets,
+    monomial_exponents,
+    pair_points,
+)
+from .tables import WORLD_PARAMETERS, FacetTables, clamped_slots, normal_damping
+
+if TYPE_CHECKING:
+    from ..model.model import Model
+    from ..terms.time_law_table import TimeLawTable
+
+__all__ = ["PairTables"]
+
+TOUCH = 1e-9
+"""Depth over the size of a model treated as touching at the start of a step."""
+
+
+class PairTables(FacetTables[PairContact]):
+    """Contacts between bodies of a model; points lie on the slave surfaces.
+
+    Attributes:
+        surfaces, masters: distinct master surfaces and their facets; master_of: master surface of each contact.
+        region_areas: contact area of each contact, m^2.
+        facets: number of master facets. bodies: bodies in a pair. corners: of the slave facets of each group.
+        max_gap: largest reported gap, m. max_overlap_depth: search depth of initial overlaps, m.
+    """
+
+    def __init__(self, model: Model) -> None:
+        contacts = list(model.description.pairs)
+        super().__init__(model, contacts, [pair_points(contact.slave, contact.points) for contact in contacts])
+        self.surfaces: list[SurfaceSet] = []
+        self.master_of: list[int] = []
+        for contact in self.contacts:
+            same = [k for k, other in enumerate(self.surfaces) if other.body is contact.master.body
+                    and np.array_equal(other.faces, contact.master.faces)]  # fmt: skip
+            if not same:
+                self.surfaces.append(contact.master)
+            self.master_of.append(same[0] if same else len(self.surfaces) - 1)
+        self.masters: list[MasterFacets] = [master_facets(surface) for surface in self.surfaces]
+        self._check_clamped()
+        self.region_areas = [self._region_area(contact) for contact in self.contacts]
+        self.area_fractions = [p.area / region for p, region in zip(self.host, self.region_areas)]
+        self.facets = sum(len(m.conn) for m in self.masters)
+        self.bodies = sorted({surface.body.index for c in self.contacts for surface in (c.slave, c.master)})
+        self.corners: list[wp.array] = []
+
+    def _check_clamped(self) -> None:
+        """Raise ModelError for a contact whose slots are all clamped."""
+        clamped = clamped_slots(self.model)
+        for contact, slots in zip(self.contacts, self.slots):
+            if clamped[slots].all():
+                raise ModelError(
+                    f"contact {contact.name!r}: all of the surfaces of bodies {contact.first.body.name!r} and "
+                    f"{contact.second.body.name!r} is clamped; leave the contact out, or free one of them"
+                )
+
+    def _region_area(self, contact: PairContact) -> float:
+        """Area that the contact stiffness is distributed over, m^2: the smaller of both surfaces."""
+        if contact.radius:
+            return math.pi * contact.radius**2
+        return min(float(pair_points(surface).area.sum()) for surface in (contact.slave, contact.master))
+
+    @property
+    def connectivity(self) -> list[np.ndarray]:
+        """Slots of the facets of each group, and of the master facets."""
+        return [*super().connectivity, self.master_conn]
+
+    @property
+    def slots(self) -> list[np.ndarray]:
+        """Model slots of both surfaces of each contact."""
+        out = []
+        for contact, p, k in zip(self.contacts, self.host, self.master_of):
+            slave = np.unique(p.conn) + contact.slave.body.slot_offset
+            master = np.unique(self.masters[k].conn) + contact.master.body.slot_offset
+            out.append(np.concatenate([slave, master]))
+        return out
+
+    def build(self, laws: TimeLawTable, pool: int) -> None:
+        """Upload the tables; `pool`: first pool entry of the term."""
+        self.pool = self._build_facets(pool)
+        for group in self.groups:
+            corners = np.concatenate([corner_points(self.host[k]) for k in group.contacts])
+            self.corners.append(self.model.array("contact", corners, wp.vec3i))
+        self.data = contact_struct(False)()
+        self._upload_laws(self.data, [self.law_constants(c) for c in self.contacts])
+        self.store_built_values()
+        self.reach_distance = 1e-3 * max(float(mas.size.mean()) for mas in self.masters) + max(
+            abs(contact.offset) for contact in self.contacts
+        )
+        self.max_overlap_depth = max(float(mas.depth_limit.max()) for mas in self.masters)
+        self.max_gap = max(float(mas.size.max()) for mas in self.masters)
+        self.master_conn = self._master_conn()
+        self.size = self.model.size
+
+    def law_constants(self, contact: PairContact, world: int | None = None) -> dict[str, float]:
+        region = self.region_areas[self.number[contact.index]]
+        parameters = self.model.parameters
+        row = contact_constants(contact, region, partial(parameters.mass, world=world), parameters.modulus(world))
+        return row | {"normal_damping": normal_damping(row["damping_stiffness"], row["effective_mass"])}
+
+    @property
+    def parameter_arrays(self) -> dict[str, wp.array]:
+        found = super().parameter_arrays
+        return {name: found[name] for name in ("mu", "mu_static", "damping", "beta", "scale")}  # hash order
+
+    def reference_boxes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper corners (facets, 3) of the reference bounding boxes."""
+        nodes = [
+            np.einsum(
+                "qm,fmk->fqk", bernstein_from_monomials(mas.corners, mas.degree), mas.reference_position_coefficients
+            )
+            for mas in self.masters
+        ]
+        low, high = ([getattr(x, name)(axis=1) for x in nodes] for name in ("min", "max"))
+        return np.concatenate(low).astype(np.float32), np.concatenate(high).astype(np.float32)
+
+    @property
+    def box_groups(self) -> wp.array:
+        """Groups of the boxes of [world, facet]: one per world and surface."""
+        counts = [len(mas.conn) for mas in self.masters]
+        group = np.repeat(np.arange(len(counts)), counts)
+        groups = (np.arange(self.model.worlds)[:, None] * len(counts) + group).ravel()
+        return wp.array(groups, dtype=wp.int32, device=self.model.device)
+
+    def _pad_facets(self, values: list[np.ndarray], axis: int, width: int, mode: str = "constant") -> np.ndarray:
+        """Facet arrays of all surfaces, padded along one axis."""
+        out = []
+        for x in values:
+            pad = [(0, 0)] * x.ndim
+            pad[axis] = (0, width - x.shape[axis])
+            out.append(np.pad(x, pad, mode=mode))  # type: ignore[call-overload]
+        return np.concatenate(out)
+
+    def _master_conn(self) -> np.ndarray:
+        """Model slots (facets, L); smaller facets repeat their last slot, with zero shape functions."""
+        width = max(mas.conn.shape[1] for mas in self.masters)
+        conns = [mas.conn + surface.body.slot_offset for mas, surface in zip(self.masters, self.surfaces)]
+        return self._pad_facets(conns, 1, width, "edge")
+
+    def master_data(self, tree: Any) -> Any:
+        """Device struct for a bounding volume hierarchy."""
+        m, all_of = self.model, self.masters
+        if "pair masters" not in m.cache:
+            width = self.master_conn.shape[1]
+            kinds = sorted({(mas.corners, mas.degree) for mas in all_of})
+            most = max(len(monomial_exponents(*kind)) for kind in kinds)
+
+            def concatenated(name: str) -> np.ndarray:
+                values = [getattr(mas, name) for mas in all_of]
+                if values[0].ndim == 3 and name in ("shape", "director_shape"):
+                    values = [np.pad(x, ((0, 0), (0, most - x.shape[1]), (0, width - x.shape[2]))) for x in values]
+                elif values[0].ndim == 3:
+                    values = [np.pad(x, ((0, 0), (0, most - x.shape[1]), (0, 0))) for x in values]
+                return np.concatenate(values)
+
+            def upload(values: Any, dtype: Any) -> wp.array:
+                return m.array("contact", np.ascontiguousarray(values), dtype)
+
+            power = np.zeros((len(kinds), most, 2), dtype=np.int32)
+            hull = np.zeros((len(kinds), most, most))
+            for k, kind in enumerate(kinds):
+                count = len(monomial_exponents(*kind))
+                power[k, :count] = monomial_exponents(*kind)
+                hull[k, :count, :count] = bernstein_from_monomials(*kind)
+            counts = [len(mas.conn) for mas in all_of]
+            m.cache["pair masters"] = {
+                "surface_of": upload(self.master_of, wp.int32),
+                "sign": upload([1.0 if c.slave is c.first else -1.0 for c in self.contacts], wp.float64),
+                "bodies": upload(
+                    [[self.bodies.index(s.body.index) for s in (c.slave, c.master)] for c in self.contacts], wp.vec2i
+                ),
+                "conn": upload(self.master_conn.T, wp.int32),
+                "shape": upload(np.moveaxis(concatenated("shape"), 0, 2), m.types.T),
+                "director_shape": upload(np.moveaxis(concatenated("director_shape"), 0, 2), m.types.T),
+                "reference_position_coefficients": upload(
+                    np.swapaxes(concatenated("reference_position_coefficients"), 0, 1), wp.vec3d
+                ),
+                "reference_director_coefficients": upload(
+                    np.swapaxes(concatenated("normal_coefficients"), 0, 1), wp.vec3d
+                ),
+                "facet_kind": upload(np.repeat([kinds.index((q.corners, q.degree)) for q in all_of], counts), wp.int32),
+                "monomial_count": upload([len(monomial_exponents(*kind)) for kind in kinds], wp.int32),
+                "corner_count": upload([kind[0] for kind in kinds], wp.int32),
+                "exponents": upload(power, wp.vec2i),
+                "hull_coefficients": upload(hull, wp.float64),
+                "depth_limit": upload(concatenated("depth_limit"), wp.float64),
+                "side_length": upload(concatenated("size"), wp.float64),
+                "surface": upload(np.repeat(np.arange(len(counts)), counts), wp.int32),
+                "max_monomials": most,
+                "surface_count": len(self.surfaces),
+                "touch_depth": TOUCH * self.size,
+                "first_entry": self.pool,
+                "facet_count": self.facets,
+            }
+        out = master_struct(m.dtype)()
+        for name, value in m.cache["pair masters"].items():
+            setattr(out, name, value)
+        out.tree = tree
+        return out
+
+    def hash(self, h: Any) -> None:
+        """Hash the definition of the contacts."""
+        for contact, p, k in zip(self.contacts, self.host, self.master_of):
+            fixed = ("first", "second", "slave", "master", *WORLD_PARAMETERS)
+            values = {name: v for name, v in vars(contact).items() if name not in fixed}
+            h.update(f"{contact.first.body.name} {contact.second.body.name} {sorted(values.items())}".encode())
+            h.update(np.ascontiguousarray(p.faces).tobytes() + np.ascontiguousarray(self.surfaces[k].faces).tobytes())
+        h.update(self.built_values)

@@ -1,0 +1,326 @@
+"""Contact between bodies, with a potential per slave surface point, see kernels/contact/facet_assembly.py."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from ..kernels.common.state import state_kernels
+from ..kernels.contact.facet_assembly import pair_kernels
+from ..kernels.contact.facet_blocks import pair_block_kernels
+from ..kernels.contact.facet_ledger import pair_ledger_kernels
+from ..kernels.contact.facet_point_lists import FACETS_PER_CHUNK, point_list_kernels
+from ..kernels.contact.facet_search import facet_search_kernels
+from ..kernels.contact.facet_structs import pair_history_struct, pair_scratch_struct, point_list_struct
+from ..model.state import State, view_as_words
+from ..terms.term import StepContext, part
+from .evaluation import evaluate_pairs
+from .facet_tables import PairTables
+from .fields import contact_field
+from .initial_overlaps import refuse_deep_overlaps, store_overlaps, touching_depth
+from .rigid_modes import PairRigidModes
+from .tables import POINT_SUM_LANES
+from .term import ContactTerm, contact_columns
+
+if TYPE_CHECKING:
+    from ..model.model import Model
+    from ..terms.workspace import Workspace
+
+__all__ = ["FacetContact"]
+
+
+class FacetContact(ContactTerm):
+    """Contacts of a model between its bodies.
+
+    Attributes:
+        tables: points and facets on the device.
+    """
+
+    name = "pairs"
+    columns = contact_columns("contact_pairs")
+    parts = {"pairs": "contact between bodies: search, forces, products, history"}
+    unused_history = ("angle", "previous_margin", "previous_depth", "position", "rotation")
+    unused_scratch = (
+        "collider_position", "collider_rotation", "collider_translation", "collider_rotation_change", "collider_angle",
+        "start_position", "point_depth", "facet_deepest_point", "facet_deepest_xi", "facet_max_depth", "contact_point",
+        "chosen_facet", "point_reference", "choice_count",
+    )  # fmt: skip
+
+    def __init__(self, model: Model) -> None:
+        super().__init__(model, PairTables(model))
+        self.kernels = pair_kernels(model.dtype)
+        self.search_kernels = facet_search_kernels(model.dtype)
+        self.point_list_kernels = point_list_kernels(model.dtype)
+        self.pair_ledger_kernels = pair_ledger_kernels(model.dtype)
+
+    @classmethod
+    def of(cls, model: Model) -> FacetContact | None:
+        return cls(model) if model.description.pairs else None
+
+    @classmethod
+    def features(cls, model: Model) -> dict[str, bool]:
+        return {"contact between bodies": bool(model.description.pairs)}
+
+    def tied_slots(self) -> list[np.ndarray]:
+        """Bodies in contact form one component."""
+        return self.tables.slots
+
+    def mark_constrained(self, free: np.ndarray) -> None:
+        """No-op: the forces of a pair are self-equilibrated under translations."""
+
+    # simulation setup
+
+    def _make_pair_scratch(self, work: Workspace) -> Any:
+        t, B = self.tables, self.model.worlds
+        most = t.master_data(wp.uint64(0)).max_monomials
+        F, P, R = t.facets, t.points, t.rows
+        shapes: dict[str, tuple[int, ...]] = dict.fromkeys(
+            ("u_coefs", "director_u_coefs", "start_u_coefs", "start_director_u_coefs", "start_v_coefs"), (B, F * most)
+        )
+        shapes |= dict.fromkeys(("box_lower", "box_upper", "refit_lower", "refit_upper", "list_count"), (B * F,))
+        shapes |= dict.fromkeys(("refit_needed", "refit_count", "lists_changed"), (1,))
+        shapes |= dict.fromkeys(("in_reach", "empty_box_lower", "empty_box_upper", "empty_box_refit"), (B, R))
+        shapes |= dict.fromkeys(("list_size", "list_start", "facet_centre", "start_facet_centre", "bulge"), (B, F))
+        shapes |= {"chunk_offset": (B, -(-F // FACETS_PER_CHUNK))}
+        shapes |= dict.fromkeys(("shape_values", "friction_shape", "shape_gradient"), (B, P, t.master_conn.shape[1]))
+        shapes |= {"geometric_tangent": (B, P, 2), "deepest_contact": (B, len(t.bodies))}
+        out = pair_scratch_struct(self.model.dtype)()
+        for name, var in pair_scratch_struct(self.model.dtype).vars.items():
+            setattr(out, name, work.array(f"pairs {name}", shapes.get(name, (B, P)), var.type.dtype))
+        out.refit_count.fill_(1)
+        return out
+
+    def allocate(self, work: Workspace, ctx: StepContext) -> None:
+        super().allocate(work, ctx)
+        pair = self._make_pair_scratch(work)
+        tree = self._build_tree(pair)
+        ctx.scratch[self.name] |= {"pair": pair, "tree": tree, "masters": self.tables.master_data(tree.id)}
+
+    def _build_tree(self, pair: Any) -> wp.Bvh:
+        """Bounding volume hierarchy of the facets in the reference; one group per world and surface."""
+        low, high = self.tables.reference_boxes()
+        pair.box_lower.assign(np.tile(low, (self.model.worlds, 1)))
+        pair.box_upper.assign(np.tile(high, (self.model.worlds, 1)))
+        return wp.Bvh(pair.box_lower, pair.box_upper, constructor="sah", groups=self.tables.box_groups)
+
+    def make_pair_history(self, make: Callable[[str, Any, tuple[int, ...]], wp.array]) -> Any:
+        """Struct of the facets of the points, with arrays from make(name, dtype, shape per world)."""
+        out = pair_history_struct()()
+        for name, var in pair_history_struct().vars.items():
+            setattr(out, name, make(f"{self.name}_{name}", var.type.dtype, (self.tables.points,)))
+        return out
+
+    def register(self, ctx: StepContext) -> None:
+        super().register(ctx)
+        ctx.scratch[self.name]["pair_history"] = self.make_pair_history(ctx.state.register)
+
+    def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
+        double_displacements = [self.double_displacements.kernels.module] if self.double_displacements else []
+        return [self.point_kernels.module, self.search_kernels.module, self.kernels.module, *double_displacements]
+
+    def start(self, ctx: StepContext, active: wp.array) -> None:
+        """Initial overlaps at the state.
+
+        Raises:
+            ModelError: a new contact overlaps, and `overlap` is "refuse".
+        """
+        s, t = ctx.scratch[self.name], self.tables
+        history = s["history"]
+        new = (active.numpy() != 0) & ~(history.speed.numpy() > 0.0).any(axis=1)
+        if not new.any():
+            return
+        flags: wp.array = wp.array(new.astype(np.int32), dtype=wp.int32, device=self.model.device)
+        overlap = self.forget_overlaps(ctx, new)
+        self._begin_points(ctx, flags)
+        u = ctx.state.displacement
+        if self.double_displacements:
+            u = s["u"]
+            self.double_displacements.widen(ctx.launch, ctx.state.displacement, flags, u)
+        self._search_facets(ctx, u, flags, overlap_limit=t.max_overlap_depth)
+        facet = s["pair"].facet.numpy()
+        depth = np.where((facet != -1) & new[:, None], s["pair"].depth.numpy(), 0.0)
+        touching = touching_depth(self.model.size, ctx.state.displacement.numpy())
+        store_overlaps(t, depth, touching, overlap)
+        refuse_deep_overlaps(t, ctx.state.displacement.numpy(), s["pair"].start_position.numpy(), facet, new)
+        history.overlap.assign(overlap)
+
+    # in a step
+
+    def _begin_points(self, ctx: StepContext, active: wp.array) -> None:
+        s, m, t = ctx.scratch[self.name], self.model, self.tables
+        pair, masters = s["pair"], s["masters"]
+        u, v = ctx.state.displacement, ctx.state.velocity
+        dim = (m.worlds, t.facets, masters.max_monomials)
+        ctx.launch(self.search_kernels.initial_coefficients, dim, [masters, u, v, active, pair])
+        for group in t.groups:
+            args = [t.data, masters, group.data, s["history"], s["pair_history"], s["clock"]]
+            dim = (m.worlds, group.count, group.data.point_count)
+            ctx.launch(self.search_kernels.begin_points, dim, [*args, u, v, active, s["attempt"], pair])
+            if t.explicit:
+                ctx.launch(self.kernels.explicit_forces, dim, [*args, v, active, s["attempt"], pair])
+
+    def _refit_tree(self, ctx: StepContext) -> None:
+        s = ctx.scratch[self.name]
+        ctx.launch(self.search_kernels.accept_boxes, self.model.worlds * self.tables.facets, [s["pair"]])
+        s["tree"].refit()
+
+    def _search_facets(self, ctx: StepContext, u: wp.array, active: wp.array, *, overlap_limit: float) -> None:
+        """Assign all points to facets at u."""
+        s, m, t, k = ctx.scratch[self.name], self.model, self.tables, self.search_kernels
+        pair, masters = s["pair"], s["masters"]
+        dim = (m.worlds, t.facets, masters.max_monomials)
+        ctx.launch(k.update_coefficients, dim, [masters, u, active, pair.u_coefs, pair.director_u_coefs])
+        ctx.launch(k.check_boxes, (m.worlds, t.facets), [masters, active, pair])
+        ctx.launch(k.update_centres, (m.worlds, t.facets), [masters, active, pair])
+        wp.capture_if(pair.refit_needed, self._refit_tree, ctx=ctx)
+        for group, corners in zip(t.groups, t.corners):
+            args = [t.data, masters, group.data, s["history"]]
+            ctx.launch(
+                k.query_boxes, (m.worlds, group.count), [*args, u, active, t.reach_distance + overlap_limit, pair]
+            )
+            args += [s["clock"], u, ctx.state.velocity, active, overlap_limit, s["attempt"], pair, corners]
+            ctx.launch(k.find_facets, (m.worlds, group.count, group.data.point_count), args)
+
+    @part()
+    def _evaluate_forces(self, ctx: StepContext, active: wp.array, *, fresh: int) -> None:
+        s, m, w, t = ctx.scratch[self.name], self.model, ctx.work, self.tables
+        pair, masters = s["pair"], s["masters"]
+        if ctx.positions_changed:
+            if self.double_displacements:
+                self.double_displacements.update(ctx, s["u"], active)
+            self._search_facets(ctx, s["u"], active, overlap_limit=0.0)
+        for group in t.groups:
+            args = [t.data, masters, group.data, s["history"], s["pair_history"], s["clock"], s["u"], active, fresh]
+            dim = (m.worlds, group.count, group.data.point_count)
+            ctx.launch(self.kernels.forces, dim, [*args, s["attempt"], pair])
+        wp.capture_if(pair.lists_changed, self._build_point_lists, ctx=ctx)
+        for group in t.groups:
+            self._gather_point_forces(ctx, group, active)
+        lanes = ctx.launch.lanes(POINT_SUM_LANES)
+        args = [masters, active, lanes, s["attempt"], pair, w.pool_force]
+        ctx.launch(self.kernels.gather_master_forces, (m.worlds, ctx.launch.padded(lanes * t.master_conn.size)), args)
+
+    def _build_point_lists(self, ctx: StepContext) -> None:
+        """Build the point lists of the master facets."""
+        s, m, t, k = ctx.scratch[self.name], self.model, self.tables, self.point_list_kernels
+        pair, masters = s["pair"], s["masters"]
+        ctx.launch(k.clear_lists, m.worlds * t.facets, [pair])
+        ctx.launch(k.count_points, (m.worlds, t.points), [masters, pair])
+        ctx.launch(k.sum_chunks, pair.chunk_offset.shape, [masters, pair])
+        ctx.launch(k.scan_chunks, m.worlds, [pair])
+        ctx.launch(k.set_list_starts, (m.worlds, t.facets), [masters, pair])
+        ctx.launch(k.fill_lists, (m.worlds, t.points), [masters, pair])
+        ctx.launch(k.sort_lists, (m.worlds, t.facets), [pair])
+
+    @part()
+    def update_frozen(self, ctx: StepContext, flags: wp.array) -> None:
+        super().update_frozen(ctx, flags)
+        s = ctx.scratch[self.name]
+        for group in self.tables.groups:
+            args = [s["masters"], group.data, s["u"], flags, s["attempt"], s["pair"]]
+            ctx.launch(
+                self.kernels.update_friction_shapes, (self.model.worlds, group.count, group.data.point_count), args
+            )
+
+    def _record_points(self, ctx: StepContext, accepted: wp.array) -> None:
+        s, t = ctx.scratch[self.name], self.tables
+        self._search_facets(ctx, s["u"], accepted, overlap_limit=0.0)
+        for group in t.groups:
+            args = [t.data, s["masters"], group.data, s["history"], s["pair_history"], s["clock"], accepted]
+            args += [s["attempt"], s["pair"], s["energies"]]
+            ctx.launch(self.pair_ledger_kernels.record_substep, (self.model.worlds, group.count), args)
+
+    def _store_state(self, ctx: StepContext, accepted: wp.array) -> None:
+        s, newton = ctx.scratch[self.name], ctx.work.newton
+        args = [s["clock"], newton.strain_energy, newton.term_sums, accepted, s["history"], s["attempt"]]
+        ctx.launch(self.pair_ledger_kernels.add_energy_bound, self.model.worlds, args)
+
+    # in a linear solve
+
+    @part()
+    def product(self, ctx: StepContext, p: wp.array, active: wp.array) -> None:
+        s, m, w, t, k = ctx.scratch[self.name], self.model, ctx.work, self.tables, self.kernels
+        attempt, pair, masters = s["attempt"], s["pair"], s["masters"]
+        for group in t.groups:
+            dim = (m.worlds, group.count, group.data.point_count)
+            ctx.launch(k.point_products, dim, [masters, group.data, active, p, attempt, pair])
+        for group in t.groups:  # the last group includes the master facets
+            entries = group.conn.size + (t.master_conn.size if group is t.groups[-1] else 0)
+            lanes = ctx.launch.lanes(POINT_SUM_LANES)
+            args = [masters, group.data, active, lanes, entries - 1, attempt, pair, w.pool_product]
+            ctx.launch(k.gather_pair_products, (m.worlds, ctx.launch.padded(lanes * entries)), args)
+
+    @part()
+    def diagonal(self, ctx: StepContext, active: wp.array) -> None:
+        s, m, w, t = ctx.scratch[self.name], self.model, ctx.work, self.tables
+        super().diagonal(ctx, active)
+        args = [s["masters"], active, s["attempt"], s["pair"], w.pool_block]
+        ctx.launch(self.kernels.master_diagonal, (m.worlds, t.facets, t.master_conn.shape[1]), args)
+
+    def cached_inputs(self, ctx: StepContext) -> list[tuple[str, wp.array]]:
+        s = ctx.scratch[self.name]
+        t = s["pair"]
+        arrays = {
+            "list_size": t.list_size,
+            "list_start": t.list_start,
+            "list_point": t.list_point,
+            "shape_values": t.shape_values,
+            "listed_facet": t.listed_facet,
+        }
+        return [("stiffness", s["attempt"].stiffness), *arrays.items()]
+
+    def reset_scratch(self, ctx: StepContext, flags: wp.array) -> None:
+        # lists are longer than their contents, and a preconditioner copies all of them
+        for _, array in self.cached_inputs(ctx):
+            words = view_as_words(array)
+            ctx.launch(state_kernels().clear_rows, words.shape, [flags, words])
+
+    def blocks(
+        self, ctx: StepContext, matrix: Any, kept: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,
+        *, projected: bool,
+    ) -> None:  # fmt: skip
+        """Stiffness of the points on their own facets and on master facets, without the coupling of both."""
+        m = self.model
+        lists = point_list_struct()()
+        stiffness, lists.list_size, lists.list_start, lists.list_point, weight, _ = kept
+        self._add_facet_blocks(ctx, matrix, stiffness, weight, dq_dv, active, out)
+        index, begin, source, count = m.cache["pairs blocks"][-1]
+        args = [m.topology, matrix.pattern.data, index, begin, source, stiffness, weight, lists]
+        add = pair_block_kernels(m.dtype).add_master_blocks
+        ctx.launch(add, (m.worlds, count), [*args, dq_dv, active, out])
+
+    def block_modules(self) -> set[wp.Module]:
+        return super().block_modules() | {pair_block_kernels(self.model.dtype).module}
+
+    def coupled_bodies(self) -> list[tuple[int, int]]:
+        number = {id(body): k for k, body in enumerate(self.model.bodies)}
+        return [(number[id(c.first.body)], number[id(c.second.body)]) for c in self.tables.contacts]
+
+    def allocate_mode_coupling(self, ctx: StepContext, motions: Any) -> Iterable[wp.Module]:
+        s = ctx.scratch[self.name]
+        s["motions"] = PairRigidModes(ctx, self.tables, s["masters"], motions)
+        return {s["motions"].kernels.module}
+
+    def add_mode_coupling(self, ctx: StepContext, kept: list[wp.array], dq_dv: wp.array, active: wp.array) -> None:
+        ctx.scratch[self.name]["motions"].add(kept, dq_dv, active)
+
+    def _sides_text(self, contact: Any) -> tuple[str, str, str]:
+        return contact.slave.body.name, f"body {contact.master.body.name!r}", "body"
+
+    def _contact_info(self, contact: Any, k: int) -> tuple[dict[str, Any], dict[str, Any]]:
+        names = {"body": contact.first.body.name, "with": contact.second.body.name}
+        return names, {"facets": len(self.tables.masters[self.tables.master_of[k]].conn), "left_out": 0}
+
+    # at a state
+
+    def nodal_force(self, state: State) -> np.ndarray:
+        """Elastic nodal forces of all contacts at a state, both bodies, (worlds, slots, 3), N."""
+        return evaluate_pairs(self, state).nodal_force()
+
+    def samples(self, field: str, body: Any, state: State) -> np.ndarray:
+        bodies = [side.body for contact in self.tables.contacts for side in (contact.slave, contact.master)]
+        contact_points = evaluate_pairs(self, state).contact_points(body) if body in bodies else []
+        return contact_field(field, body, state.worlds, contact_points)

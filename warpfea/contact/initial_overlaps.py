@@ -1,0 +1,132 @@
+"""Initial overlaps: rejected or stored as offsets."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..base.errors import ModelError
+from ..model.contacts import Contact
+from ..model.pairs import PairContact
+from ..model.surfaces import make_skin, reference_points
+
+if TYPE_CHECKING:
+    from ..model.discretisation import Discretisation
+    from .collider_tables import ContactTables
+    from .facet_tables import PairTables
+
+__all__ = ["reference_position_text", "refuse_deep_overlaps", "store_overlaps", "touching_depth"]
+
+TOUCHING_DEPTH_RATIO = 1e-9
+"""Initial depth over the model's size treated as touching; round-off of displacements is added."""
+
+MIN_DEEP_OVERLAP_RATIO = 0.1
+"""Smallest depth, over the depth limit of the body's thinnest facet, at which an unassigned point counts as inside: the
+inside test uses flat triangles."""
+
+
+def touching_depth(size: float, u: np.ndarray) -> np.ndarray:
+    """Largest depth (worlds,), m, treated as touching, at displacements u (worlds, slots, 3)."""
+    return np.asarray(TOUCHING_DEPTH_RATIO * size + 4.0 * np.finfo(u.dtype).eps * np.abs(u).max(axis=(1, 2)))
+
+
+def reference_position_text(tables: ContactTables | PairTables, k: int, point: int) -> str:
+    """Reference position of a contact point, as text."""
+    X = tables.host[k].X.reshape(-1, 3)[point]
+    return "(" + ", ".join(f"{x:.4g}" for x in X) + ")"
+
+
+def store_overlaps(
+    tables: ContactTables | PairTables, depth: np.ndarray, touching: np.ndarray, overlap: np.ndarray
+) -> None:  # fmt: skip
+    """Store depths (worlds, points), m, above the touching depth in `overlap` (worlds, points).
+
+    Raises:
+        ModelError: an overlap with `overlap` "refuse".
+    """
+    contacts: list[Contact | PairContact] = [*tables.contacts]
+    for k, contact in enumerate(contacts):
+        points = slice(tables.first[k], tables.first[k + 1])
+        mine = depth[:, points]
+        deep = mine.max(axis=1) > touching
+        if not deep.any():
+            continue
+        if contact.overlap == "refuse":
+            world, point = np.unravel_index(int(mine.argmax()), mine.shape)
+            if isinstance(contact, PairContact):
+                other = f"body {contact.master.body.name!r}"
+            else:
+                other = f"collider {contact.collider.name!r}"
+            raise ModelError(
+                f"contact {contact.name!r}: body {contact.body.name!r} begins {mine.max():.3g} m inside {other} "
+                f"(world {world}, reference point {reference_position_text(tables, k, int(point))}); move one of them, "
+                "or take overlap='offset', which stores the overlap and lets it decay"
+            )
+        kept = np.maximum(mine[deep], 0.0)
+        overlap[deep, points] = kept.max(axis=1, keepdims=True) if contact.model == "sphere" else kept
+
+
+def refuse_deep_overlaps(
+    tables: PairTables, u: np.ndarray, places: np.ndarray, facets: np.ndarray, new: np.ndarray
+) -> None:
+    """Reject bodies that begin deeper in another body than any of its facets reaches.
+
+    Args:
+        u: displacements (worlds, slots, 3), m.
+        places: positions of the points (worlds, points, 3), m.
+        facets: facets that the points are assigned to, -1 for none, (worlds, points).
+        new: (worlds,) flags of the worlds that begin.
+
+    Raises:
+        ModelError: such a point in a contact with `overlap` "refuse".
+    """
+    for k, contact in enumerate(tables.contacts):
+        if contact.overlap != "refuse":
+            continue
+        body, points = contact.master.body, slice(tables.first[k], tables.first[k + 1])
+        limit = tables.masters[tables.master_of[k]].depth_limit
+        least = MIN_DEEP_OVERLAP_RATIO * float(limit.min())
+        beyond = (0.0 if body.family.solid else float(limit.max())) - least  # margin of the nodal bounding box
+        nodes = body.slot_kind == 0
+        spans = body.reference[nodes] + body.origin + u[:, body.slots[nodes]]
+        low, high = (end(axis=1)[:, None] for end in (spans.min, spans.max))
+        x = places[:, points]
+        near = ((x > low - beyond) & (x < high + beyond)).all(axis=2) & (facets[:, points] < 0)
+        near &= new[:, None] & (tables.host[k].area.ravel() > 0.0)
+        seen = set()
+        for world in np.flatnonzero(near.any(axis=1)):
+            key = (u[world, body.slots].tobytes(), x[world, near[world]].tobytes())
+            if key in seen:
+                continue
+            seen.add(key)
+            depth = _depths_in_body(body, u[world, body.slots], x[world, near[world]])
+            if depth.max() > least:
+                point = int(np.flatnonzero(near[world])[depth.argmax()])
+                raise ModelError(
+                    f"contact {contact.name!r}: body {contact.slave.body.name!r} begins within body {body.name!r} "
+                    f"(world {world}, reference point {reference_position_text(tables, k, point)}, "
+                    f"{depth.max():.3g} m deep), where no facet of the contact reaches; move one of them, or leave "
+                    "these faces out of the contact"
+                )
+
+
+def _depths_in_body(body: Discretisation, u: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Distance, m, of interior points to the skin of a body at displacements of its slots; 0 outside."""
+    import warp as wp
+
+    from ..kernels.contact.thickness import depth_kernel
+
+    drawn = make_skin(body)
+    skin = reference_points(body, drawn.slot_weights) + drawn.slot_weights @ u.astype(float)
+    center, size = skin.mean(axis=0), float(np.ptp(skin, axis=0).max())
+    with wp.ScopedDevice("cpu"):
+        mesh = wp.Mesh(
+            wp.array((skin - center) / size, dtype=wp.vec3),
+            wp.array(drawn.triangles.ravel(), dtype=wp.int32),
+            support_winding_number=True,
+        )
+        out = wp.zeros(len(x), dtype=float)
+        places: wp.array = wp.array((x - center) / size, dtype=wp.vec3)
+        wp.launch(depth_kernel(), len(x), [mesh.id, places, out], device="cpu")
+        return np.asarray(out.numpy(), dtype=float) * size

@@ -1,0 +1,281 @@
+"""Tables common to contact with colliders and between bodies: groups of facets with their points, law constants."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
+
+import numpy as np
+import warp as wp
+from scipy.optimize import brentq
+
+from ..kernels.contact.laws import DEFAULT, PAPER, SMOOTH
+from ..kernels.contact.structs import facet_struct
+from ..model.contact_points import CONTACT_RULES, ContactPoints, lagrange_basis
+from ..model.contacts import Contact
+from ..model.pairs import PairContact
+
+if TYPE_CHECKING:
+    from ..base.launch import Launcher
+    from ..model.model import Model
+
+__all__ = [
+    "LAWS",
+    "POINT_SUM_LANES",
+    "WORLD_PARAMETERS",
+    "FacetGroup",
+    "FacetTables",
+    "clamped_slots",
+    "hunt_crossley_damping",
+    "normal_damping",
+    "restitution_beta",
+]  # fmt: skip
+
+AnyContact = TypeVar("AnyContact", Contact, PairContact)
+LAWS = {"default": DEFAULT, "paper": PAPER, "smooth": SMOOTH}
+DEFAULT_SMOOTHING = (1e-3, 1e-4)
+"""Default eps, N, and v_eps, m/s, of the smooth law."""
+WORLD_PARAMETERS = {"mu": "mu", "mu_static": "mu_static", "restitution": "damping", "stiffness": "scale"}
+"""Contact parameters of Model.set_parameter and their arrays; the restitution also sets `beta`."""
+MATERIAL_CONSTANTS = ("normal_stiffness", "tangential_stiffness", "normal_damping", "effective_mass")
+"""Contact constants derived from the bodies' materials."""
+POINT_SUM_LANES = 8
+"""Largest number of threads that share a sum over the points of a facet on CUDA."""
+PATCH, LUMPED, MOVING = range(3)
+"""Contact kinds of a facet: all points, at most one point, or at most one moving position."""
+
+
+def restitution_beta(restitution: float) -> float:
+    """-beta of Eq. (75), positive."""
+    log = math.log(restitution)
+    return -log / math.hypot(log, math.pi)
+
+
+def hunt_crossley_damping(restitution: float) -> float:
+    """chi v_i of the default law: the d of (1 + e) d = ln((1 + d)/(1 - e d)), 0 for e = 1.
+
+    Exact for the impact of a mass on the spring, undamped at rest, for any exponent; DESIGN 8.
+    """
+    e = restitution
+    if e >= 1.0:
+        return 0.0
+
+    def excess(d: float) -> float:
+        return (1.0 + e) * d - math.log1p(d) + math.log1p(-e * d)
+
+    top = 1.0 / e
+    low = 1e-9
+    while excess(low) <= 0.0 and low < 0.5 * top:  # round-off, for e close to 1
+        low *= 2.0
+    high = top * (1.0 - 1e-15)
+    if excess(low) <= 0.0:
+        return 0.0
+    # below e of about 0.02 the root is within round-off of 1/e
+    return float(brentq(excess, low, high, xtol=1e-15)) if excess(high) < 0.0 else high
+
+
+def normal_damping(stiffness: float, mass: float) -> float:
+    """gamma_n over -beta of Eq. (76), N s/m, for S_n = 2 E* a in N/m and m_eff in kg."""
+    return 2.0 * math.sqrt(5.0 / 6.0) * math.sqrt(stiffness * mass)
+
+
+def clamped_slots(model: Model) -> np.ndarray:
+    """Mask (slots,) of slots clamped in all directions by supports that never move."""
+    held = np.zeros((model.slots, 3))
+    for support in model.description.supports:
+        if support.law is None and support.node_laws is None and support.rotation is None:
+            held[support.body.slot_offset + support.slots] += support.components
+    return np.asarray((held > 0).all(axis=1))
+
+
+@dataclass(eq=False)
+class FacetGroup:
+    """Facets with equal numbers of slots and points; those of a contact are contiguous.
+
+    Attributes:
+        conn: (F, L) model slots.
+        points: (F, P) point indices.
+        data: device struct.
+        lumped: True if at most one position of a facet acts.
+        contacts: in device order.
+    """
+
+    conn: np.ndarray
+    data: Any
+    lumped: bool
+    contacts: list[int]
+
+    @property
+    def count(self) -> int:
+        """Number of facets."""
+        return len(self.conn)
+
+    def sum_threads(self, launch: Launcher, worlds: int) -> tuple[tuple[int, int], int]:
+        """Threads that sum over the points of a facet for each of its slots, and threads per slot."""
+        lanes = launch.lanes(POINT_SUM_LANES)
+        return (worlds, launch.padded(lanes * self.conn.size)), lanes
+
+
+class FacetTables(Generic[AnyContact]):
+    """Contacts and the points of their surfaces in device order, sorted by facet kind.
+
+    Attributes:
+        contacts: handles in that order; number: position of a handle's index.
+        host: shape functions, areas, slots and positions of each contact, for fields and checks.
+        kinds: slots and points per facet, and the contact kind.
+        groups: facet groups.
+        points, rows: total numbers of points and facets.
+        first, row_start: first point and first facet of each contact.
+        area_fractions: (F, P) of each contact: area of each point over that of the region; 0: inactive.
+    """
+
+    data: Any
+    built_values: bytes
+    first: np.ndarray
+    row_start: np.ndarray
+    area_fractions: list[np.ndarray]
+
+    def __init__(self, model: Model, contacts: Sequence[AnyContact], points: Sequence[ContactPoints]) -> None:
+        self.model = model
+        kinds = [_facet_kind(*pair) for pair in zip(contacts, points)]
+        order = sorted(range(len(kinds)), key=lambda k: (kinds[k], k))
+        self.kinds = sorted(set(kinds))
+        self.contacts: list[AnyContact] = [contacts[k] for k in order]
+        self.host: list[ContactPoints] = [points[k] for k in order]
+        self.number = {contact.index: k for k, contact in enumerate(self.contacts)}
+        self.groups: list[FacetGroup] = []
+        self.points = self.rows = 0
+
+    @property
+    def connectivity(self) -> list[np.ndarray]:
+        """Slots (F, L) of the facets of each group."""
+        return [group.conn for group in self.groups]
+
+    @property
+    def explicit(self) -> bool:
+        """True if a contact uses the force of the last state."""
+        return any(contact.treatment == "explicit" for contact in self.contacts)
+
+    def _build_facets(self, pool: int) -> int:
+        """Upload the facets, starting at pool entry `pool`; returns the next free entry."""
+        first, row_start = (np.zeros(len(self.contacts) + 1, dtype=np.int64) for _ in range(2))
+        for kind in self.kinds:
+            chosen = [k for k, pair in enumerate(zip(self.contacts, self.host)) if _facet_kind(*pair) == kind]
+            for k in chosen:
+                first[k + 1] = first[k] + self.host[k].area.size
+                row_start[k + 1] = row_start[k] + len(self.host[k].conn)
+            group = self._facet_group(kind, chosen, pool)
+            self.groups.append(group)
+            pool += group.conn.size
+            self.rows += group.count
+            self.points += group.count * kind[1]
+        self.first, self.row_start = first, row_start
+        return pool
+
+    def _facet_group(self, kind: tuple[int, int, int], chosen: list[int], pool: int) -> FacetGroup:
+        """Facet group of one kind for the chosen contacts."""
+        m = self.model
+        parts = [self.host[k] for k in chosen]
+        conn = np.concatenate([self.host[k].conn + self.contacts[k].body.slot_offset for k in chosen])
+        data = facet_struct(m.dtype)()
+
+        def upload(name: str, values: Any, dtype: Any) -> None:
+            setattr(data, name, m.array("contact", np.ascontiguousarray(values), dtype))
+
+        upload("conn", conn.T, wp.int32)
+        upload("shape", np.moveaxis(np.concatenate([p.shape for p in parts]), 0, 2), m.types.T)
+        upload("X", np.swapaxes(np.concatenate([p.X for p in parts]), 0, 1), wp.vec3d)
+        upload("area_fraction", np.concatenate([self.area_fractions[k] for k in chosen]).T, wp.float64)
+        upload("area", np.concatenate([p.area for p in parts]).T, wp.float64)
+        upload("contact", np.repeat(chosen, [len(p.conn) for p in parts]), wp.int32)
+        data.first_entry, data.first_row, data.first_point = pool, self.rows, self.points
+        _, data.point_count, acts = kind
+        data.facet_count, data.tracks_deepest, data.corner_count = (
+            len(conn),
+            int(acts == MOVING),
+            3 if data.point_count in CONTACT_RULES[3] else 4,
+        )
+        if acts != PATCH:
+            points = CONTACT_RULES[data.corner_count][data.point_count].points
+            basis, power = lagrange_basis(points)
+            upload("point_coords", points, wp.vec2d)
+            upload("lagrange_coefficients", basis, wp.float64)
+            upload("exponents", power, wp.vec2i)
+        return FacetGroup(conn, data, acts != PATCH, chosen)
+
+    def law_constants(self, contact: AnyContact, world: int | None = None) -> dict[str, float]:
+        """Constants `MATERIAL_CONSTANTS` of a contact, as built or in one world."""
+        raise NotImplementedError
+
+    @property
+    def parameter_arrays(self) -> dict[str, wp.array]:
+        """Arrays written by `Model.set_parameter`."""
+        return {name: getattr(self.data, name) for name in (*WORLD_PARAMETERS.values(), "beta")}
+
+    def store_built_values(self) -> None:
+        """Store the built values: checkpoints compare them to identify the model."""
+        self.built_values = b"".join(array.numpy().tobytes() for array in self.parameter_arrays.values())
+
+    def update_materials(self, mask: np.ndarray) -> None:
+        """Recompute the derived constants after material parameters were set in the chosen worlds."""
+        m, data = self.model, self.data
+        touched = [
+            k for k, contact in enumerate(self.contacts) if any(m.parameters.varies(b) for b in bodies_of(contact))
+        ]
+        if not touched:
+            return
+        for name in MATERIAL_CONSTANTS:
+            if getattr(data, name).shape[0] != m.worlds:
+                old = getattr(data, name)
+                m.uncount_bytes("contact", old)
+                setattr(data, name, m.array("contact", np.tile(old.numpy(), (m.worlds, 1)), wp.float64))
+        host = {name: getattr(data, name).numpy() for name in MATERIAL_CONSTANTS}
+        for world in np.flatnonzero(mask).tolist():
+            for k in touched:
+                for name, value in self.law_constants(self.contacts[k], world).items():
+                    if name in host:
+                        host[name][world, k] = value
+        for name, values in host.items():
+            getattr(data, name).assign(values)
+
+    def _upload_laws(self, out: Any, law_constants: list[dict[str, float]]) -> None:
+        """Upload the contact law constants; `law_constants` per contact: `FROM_BODIES`."""
+        m, C = self.model, self.contacts
+
+        def upload(name: str, values: Any, dtype: Any = wp.float64) -> None:
+            setattr(out, name, m.array("contact", np.asarray(values), dtype))
+
+        upload("law", [LAWS[c.law] for c in C], wp.int32)
+        upload("single_point", [int(c.model == "sphere") for c in C], wp.int32)
+        upload("is_explicit", [int(c.treatment == "explicit") for c in C], wp.int32)
+        upload("first_point", self.first, wp.int32)
+        for name in MATERIAL_CONSTANTS:
+            upload(name, [[row[name] for row in law_constants]])
+        smoothing = [c.smoothing if isinstance(c.smoothing, tuple) else DEFAULT_SMOOTHING for c in C]
+        upload("damping_ramp", [float(c.smoothing) if isinstance(c.smoothing, (int, float)) else 0.0 for c in C])
+        upload("force_eps", [pair[0] for pair in smoothing])
+        upload("speed_eps", [pair[1] for pair in smoothing])
+        upload("offset", [c.offset for c in C])
+        upload("overlap_decay_time", [c.overlap_time for c in C])
+        per_world = {
+            "mu": [c.mu for c in C],
+            "mu_static": [c.mu_static for c in C],
+            "damping": [hunt_crossley_damping(c.restitution) for c in C],
+            "beta": [restitution_beta(c.restitution) for c in C],
+            "scale": [c.stiffness for c in C],
+        }
+        for name, values in per_world.items():
+            upload(name, np.tile(values, (m.worlds, 1)))
+
+
+def bodies_of(contact: Contact | PairContact) -> list[Any]:
+    """Bodies of a contact."""
+    return [contact.body] if isinstance(contact, Contact) else [contact.first.body, contact.second.body]
+
+
+def _facet_kind(contact: Contact | PairContact, p: ContactPoints) -> tuple[int, int, int]:
+    """Contact kind of a facet: slots, points, and PATCH, LUMPED or MOVING."""
+    lumped = LUMPED if contact.treatment == "explicit" else MOVING
+    return p.conn.shape[1], p.area.shape[1], PATCH if contact.model == "patch" else lumped

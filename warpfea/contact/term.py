@@ -1,0 +1,318 @@
+"""Contact of surface points with another side, a potential per point, in the order of its stages, written once.
+
+A subclass is one geometry: it finds the other side of each point (`_begin_points`, `_forces_of_points`), and gathers on
+its slots. Law, friction, history, ledger, records, parameters and fields are those of every geometry.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+import warp as wp
+
+from ..base.errors import PenetrationError
+from ..kernels.common.traits import Traits
+from ..kernels.contact.assembly import AITKEN_LANES, contact_kernels
+from ..kernels.contact.ledger import ENERGY_COLUMNS, RECORD_LANES, contact_block_kernels, contact_ledger_kernels
+from ..kernels.contact.structs import RECORD_NAMES, clock_struct, contact_scratch_struct, history_struct
+from ..kernels.solvers.newton_control import FAIL_ROUNDOFF, FAIL_WORK
+from ..model.state import State
+from ..terms.term import LOSS, NUMERICAL, STORED, WORK, Column, StepContext, Term, part
+from .collider_tables import facet_pattern_entries
+from .double_displacements import DoubleDisplacements
+from .fields import CONTACT_FIELDS
+from .initial_overlaps import reference_position_text
+from .parameters import contact_parameters
+
+if TYPE_CHECKING:
+    from ..model.model import Model
+    from ..terms.time_law_table import TimeLawTable
+    from ..terms.workspace import Workspace
+    from .tables import FacetTables
+
+__all__ = ["ContactTerm", "contact_columns"]
+
+MAX_NAMED_CONTACTS = 3
+"""Maximum number of contacts named in a message."""
+
+
+def contact_columns(stored: str) -> tuple[Column, ...]:
+    """Ledger columns of a contact term that stores its energy in column `stored`."""
+    shared = (Column("contact_loss", LOSS), Column("friction", LOSS), Column("collider_work", WORK))
+    return (Column(stored, STORED), *shared, Column("", NUMERICAL))
+
+
+class ContactTerm(Term):
+    """Contacts of a model with one geometry of the other side.
+
+    Attributes:
+        tables: contacts, points and facets on the device.
+        point_kernels, ledger_kernels: kernels of the points, and of their energies and records.
+        unused_scratch, unused_history: arrays that the geometry doesn't use.
+    """
+
+    fields = CONTACT_FIELDS
+    unused_scratch: ClassVar[tuple[str, ...]] = ()
+    unused_history: ClassVar[tuple[str, ...]] = ()
+
+    def __init__(self, model: Model, tables: FacetTables[Any], *, meshes: bool = False) -> None:
+        super().__init__(model)
+        self.traits = Traits(unilateral=True)
+        self.tables: Any = tables
+        self.point_kernels = contact_kernels(model.dtype, meshes)
+        self.ledger_kernels = contact_ledger_kernels(model.dtype, meshes)
+        self.report_columns = len(RECORD_NAMES) * len(tables.contacts)
+
+    def build(self, laws: TimeLawTable) -> None:
+        self.tables.build(laws, self.offset)
+        self.connectivity = self.tables.connectivity
+        self.double_displacements = (
+            DoubleDisplacements(self.model, self.connectivity) if self.model.dtype == "float32" else None
+        )
+        self.rows = self.increment_rows = self.tables.rows
+
+    def hash(self, h: Any) -> None:
+        self.tables.hash(h)
+
+    # simulation setup
+
+    def scratch_shapes(self, worlds: int) -> dict[str, tuple[int, ...]]:
+        """Shapes of the arrays of an attempt that are not (worlds, points)."""
+        t, B = self.tables, worlds
+        shapes: dict[str, tuple[int, ...]] = {
+            "aitken_sums": (B, AITKEN_LANES), "record_totals": (B, len(t.contacts), len(RECORD_NAMES)),
+            "record_rows": (len(RECORD_NAMES), B, t.rows), "facet_activity": (B, t.rows), "shape_values": (1, 1, 1),
+        }  # fmt: skip
+        shapes |= dict.fromkeys(("passed_point", "elapsed_time", "relaxation", "limit_updates", "aitken_norm2"), (B,))
+        return shapes | ({} if t.explicit else dict.fromkeys(("explicit_force", "explicit_elastic_slip"), (1, 1)))
+
+    def make_scratch(self, worlds: int, make: Callable[[str, tuple[int, ...], Any], wp.array]) -> Any:
+        """Attempt struct with arrays from make(name, shape, dtype)."""
+        struct, shapes = contact_scratch_struct(self.model.dtype), self.scratch_shapes(worlds)
+        out = struct()
+        for name, var in struct.vars.items():
+            if name not in self.unused_scratch:
+                setattr(out, name, make(name, shapes.get(name, (worlds, self.tables.points)), var.type.dtype))
+        return out
+
+    def history_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shapes per world of the history arrays that are not (points,)."""
+        return {"overlap_time": (), "pose_time": ()}
+
+    def make_history(self, make: Callable[[str, Any, tuple[int, ...]], wp.array]) -> Any:
+        """History struct with arrays from make(name, dtype, shape per world)."""
+        out, shapes = history_struct()(), self.history_shapes()
+        for name, var in history_struct().vars.items():
+            if name not in self.unused_history:
+                shape = shapes.get(name, (self.tables.points,))
+                setattr(out, name, make(f"{self.name}_{name}", var.type.dtype, shape))
+        return out
+
+    def allocate(self, work: Workspace, ctx: StepContext) -> None:
+        t, B = self.tables, self.model.worlds
+        attempt = self.make_scratch(B, lambda name, shape, dtype: work.array(f"{self.name} {name}", shape, dtype))
+        attempt.relaxation.fill_(1.0)
+        clock = clock_struct()()
+        for name in ("new_time", "h", "substep_index"):
+            setattr(clock, name, getattr(work.step, name))
+        clock.time, clock.is_static = ctx.state.time, int(not ctx.inertia)
+        parts = (B, len(t.contacts), len(RECORD_NAMES), RECORD_LANES)
+        scratch = {
+            "attempt": attempt,
+            "clock": clock,
+            # Newton's method only; unused by Jacobi's iteration
+            "contact_active": work.newton.contact_active,
+            "energies": work.array(f"{self.name} energies", (ENERGY_COLUMNS, B, t.rows), wp.float64),
+            "parts": work.array(f"{self.name} parts", parts, wp.float64),
+            "row_start": self.model.array("contact", t.row_start, wp.int32),
+            "u": self.double_displacements.allocate(work, self.name) if self.double_displacements else work.u,
+        }
+        ctx.scratch[self.name] = scratch | ctx.scratch.get(self.name, {})
+
+    def register(self, ctx: StepContext) -> None:
+        ctx.scratch[self.name] = {"history": self.make_history(ctx.state.register)}
+
+    def forget_overlaps(self, ctx: StepContext, new: np.ndarray) -> np.ndarray:
+        """Clear the stored overlaps of the `new` worlds, which begin now; returns a host copy of all."""
+        history = ctx.scratch[self.name]["history"]
+        overlap, begins = history.overlap.numpy(), history.overlap_time.numpy()
+        overlap[new] = 0.0
+        begins[new] = ctx.state.time.numpy()[new]
+        history.overlap.assign(overlap)
+        history.overlap_time.assign(begins)
+        return overlap
+
+    def shift_time(self, state: State) -> None:
+        """Shift the start times of stored overlaps."""
+        if f"{self.name}_overlap_time" in state.specs:
+            begins = getattr(state, f"{self.name}_overlap_time")
+            begins.assign(begins.numpy() - state.time.numpy())
+
+    # in a step
+
+    def prepare(self, ctx: StepContext, active: wp.array) -> None:
+        """Compute the first friction limits and the stiffness of the blocks."""
+        self._evaluate_forces(ctx, active, fresh=1)
+
+    def force(self, ctx: StepContext, active: wp.array) -> None:
+        self._evaluate_forces(ctx, active, fresh=0)
+
+    def _evaluate_forces(self, ctx: StepContext, active: wp.array, *, fresh: int) -> None:
+        raise NotImplementedError
+
+    def _gather_point_forces(self, ctx: StepContext, group: Any, active: wp.array) -> None:
+        """Forces of the points of a group on the slots of their own facets, and rows of the potential."""
+        s, w = ctx.scratch[self.name], ctx.work
+        dim, lanes = group.sum_threads(ctx.launch, self.model.worlds)
+        args = [group.data, active, lanes, s["attempt"], w.pool_force, w.rows_of(self), s["contact_active"]]
+        ctx.launch(self.point_kernels.gather_point_forces, dim, args)
+
+    @part()
+    def update_frozen(self, ctx: StepContext, flags: wp.array) -> None:
+        k, m, newton = self.point_kernels, self.model, ctx.work.newton
+        attempt = ctx.scratch[self.name]["attempt"]
+        ctx.launch(k.aitken_partial_sums, (m.worlds, AITKEN_LANES), [flags, attempt])
+        ctx.launch(k.aitken_relaxation, m.worlds, [flags, newton.tol, attempt, newton.partly_updated])
+        ctx.launch(k.update_frozen, (m.worlds, self.tables.points), [flags, attempt])
+
+    @part()
+    def diagonal(self, ctx: StepContext, active: wp.array) -> None:
+        for group in self.tables.groups:
+            args = [group.data, active, ctx.scratch[self.name]["attempt"], ctx.work.pool_block]
+            dim = (self.model.worlds, group.count, group.conn.shape[1])
+            ctx.launch(self.point_kernels.diagonal, dim, args)
+
+    def _record_points(self, ctx: StepContext, accepted: wp.array) -> None:
+        """Update history, ledger rows and record rows of the points after an accepted substep."""
+        raise NotImplementedError
+
+    @part()
+    def _record_substep(self, ctx: StepContext, accepted: wp.array) -> None:
+        """Update history, ledger rows and records of an accepted substep."""
+        self._record_points(ctx, accepted)
+        s, k = ctx.scratch[self.name], self.ledger_kernels
+        sums = (self.model.worlds, len(self.tables.contacts), len(RECORD_NAMES))
+        args = [self.tables.data, s["row_start"], accepted, s["attempt"], s["parts"]]
+        ctx.launch(k.partial_records, (*sums, RECORD_LANES), args)
+        ctx.launch(k.total_records, sums, [s["clock"], accepted, s["parts"], s["attempt"]])
+
+    @part()
+    def begin(self, ctx: StepContext, active: wp.array) -> None:
+        ctx.scratch[self.name]["finished"] = False
+        self._begin_points(ctx, active)
+
+    def _begin_points(self, ctx: StepContext, active: wp.array) -> None:
+        """Update the other side and the points at the start of the attempt."""
+        raise NotImplementedError
+
+    def energy_increments(self, ctx: StepContext, accepted: wp.array) -> wp.array:
+        self._record_substep(ctx, accepted)
+        ctx.scratch[self.name]["finished"] = True
+        return ctx.scratch[self.name]["energies"]
+
+    @part()
+    def commit(self, ctx: StepContext, accepted: wp.array) -> None:
+        if not ctx.scratch[self.name]["finished"]:  # no ledger, `energy_increments` not called
+            self._record_substep(ctx, accepted)
+        self._store_state(ctx, accepted)
+
+    def _store_state(self, ctx: StepContext, accepted: wp.array) -> None:
+        """Store the time of the accepted state and the pose of the other side."""
+        raise NotImplementedError
+
+    def report(self, ctx: StepContext) -> None:
+        args = [ctx.scratch[self.name]["attempt"], self.report_offset, ctx.work.report]
+        ctx.launch(self.ledger_kernels.write_records, (self.model.worlds, len(self.tables.contacts)), args)
+
+    def stored_energy(self, ctx: StepContext) -> dict[str, np.ndarray]:
+        """Stored energy according to the history, by points."""
+        return {self.columns[0].name: ctx.scratch[self.name]["history"].stored.numpy() @ self.weights}
+
+    @property
+    def weights(self) -> np.ndarray:
+        """Fraction (points,) of the contact area represented by each point."""
+        return np.concatenate([fraction.ravel() for fraction in self.tables.area_fractions])
+
+    # in a linear solve
+
+    def allocate_blocks(self, ctx: StepContext, matrix: Any, *, projected: bool) -> None:
+        if f"{self.name} blocks" not in self.model.cache:
+            entries = [facet_pattern_entries(self.model, conn, matrix.pattern) for conn in self.connectivity]
+            self.model.cache[f"{self.name} blocks"] = entries
+
+    def _add_facet_blocks(
+        self, ctx: StepContext, matrix: Any, stiffness: wp.array, weight: wp.array, *target: wp.array
+    ) -> None:
+        """Positive semi-definite stiffness of the points on their own facets."""
+        m = self.model
+        for group, (entry, start, source, count) in zip(self.tables.groups, m.cache[f"{self.name} blocks"]):
+            args = [m.topology, matrix.pattern.data, group.data, entry, start, source, stiffness, weight]
+            kernel = contact_block_kernels(m.dtype).add_contact_blocks
+            ctx.launch(kernel, (m.worlds, count), [*args, *target])
+
+    def block_modules(self) -> set[wp.Module]:
+        return {contact_block_kernels(self.model.dtype).module}
+
+    # failures
+
+    def failure_reason(self, ctx: StepContext, world: int) -> tuple[type[PenetrationError], str] | None:
+        found = int(ctx.scratch[self.name]["attempt"].passed_point.numpy()[world])
+        if found == 0 or int(ctx.work.newton.failed.numpy()[world]) in (FAIL_ROUNDOFF, FAIL_WORK):
+            return None
+        t, point = self.tables, abs(found) - 1
+        k = int(np.searchsorted(t.first, point, side="right")) - 1
+        contact = t.contacts[k]
+        if found < 0:
+            return PenetrationError, f"contact {contact.name!r}: {self._turn_text(contact)}"
+        body, other, thicker = self._sides_text(contact)
+        return PenetrationError, (
+            f"contact {contact.name!r}: a point of body {body!r} (reference place "
+            f"{reference_position_text(t, k, point - int(t.first[k]))}) went through {other}; take a larger "
+            f"stiffness= of the contact or a thicker {thicker}, or a smaller dt where it moves that far in a step"
+        )
+
+    def _sides_text(self, contact: Any) -> tuple[str, str, str]:
+        """Body of the points, the other side, and the noun of what could be thicker, for messages."""
+        raise NotImplementedError
+
+    def _turn_text(self, contact: Any) -> str:
+        """Reason of a refused rotation of the other side."""
+        raise NotImplementedError
+
+    def failure_note(self, ctx: StepContext, world: int) -> str:
+        touched = ctx.scratch[self.name]["attempt"].facet_activity.numpy()[world] > 0
+        t, most = self.tables, MAX_NAMED_CONTACTS
+        names = [self._contact_text(contact) for k, contact in enumerate(t.contacts)
+                 if touched[t.row_start[k] : t.row_start[k + 1]].any()]  # fmt: skip
+        more = f" and {len(names) - most} more" if len(names) > most else ""
+        return f"; in touch: contact {', '.join(names[:most])}{more}" if names else ""
+
+    def _contact_text(self, contact: Any) -> str:
+        return repr(contact.name)
+
+    # parameters and info
+
+    def parameter_arrays(self) -> dict[str, wp.array]:
+        return self.tables.parameter_arrays
+
+    def update_materials(self, mask: np.ndarray) -> None:
+        self.tables.update_materials(mask)
+
+    def parameters(self) -> dict[str, Callable[[Any, np.ndarray], None]]:
+        return contact_parameters(self.tables)
+
+    def info(self) -> list[dict[str, Any]]:
+        """Entries of `Model.info` per contact, in the order of addition."""
+        t, out = self.tables, []
+        for contact in sorted(t.contacts, key=lambda c: c.index):
+            k = t.number[contact.index]
+            names, numbers = self._contact_info(contact, k)
+            points = {"points": int((t.area_fractions[k] > 0.0).sum())}
+            out.append({"name": contact.name} | names | {"law": contact.law, "model": contact.model} | points | numbers)
+        return out
+
+    def _contact_info(self, contact: Any, k: int) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Names of both sides, and further numbers."""
+        raise NotImplementedError
