@@ -100,7 +100,7 @@ def floor_kernels(dtype):
         room = height[item] + u[world, slot[item]][2] + depth
         fall = -T(newton.dq_dv[world]) * p[world, slot[item]][2]
         if room > T(0.0) and fall > room:
-            wp.atomic_min(newton.limit, world, wp.max(f64(room / fall), f64(1.0e-3)))
+            wp.atomic_min(newton.search.limit, world, wp.max(f64(room / fall), f64(1.0e-3)))
 
     @wp.kernel(module=module)
     def energy_increments(

@@ -40,7 +40,7 @@ def placed(sim: wf.Simulation, mixed: int, amount: float = 0.02) -> np.ndarray:
     w.u.assign(now.astype(kind))
     w.step.dq_dv.fill_(1.0)
     w.step.mass_factor.zero_()
-    w.newton.predicted_stress.fill_(mixed)
+    w.newton.solve.predicted_stress.fill_(mixed)
     return rng.standard_normal(shape) * free
 
 
@@ -63,7 +63,7 @@ def test_matrix_and_elements_agree(kind: str, mixed: int) -> None:
         sim = static(kind, operator)
         p = placed(sim, mixed)
         results[operator] = product(sim, p)
-        sim.stepper.work.newton.predicted_stress.zero_()
+        sim.stepper.work.newton.solve.predicted_stress.zero_()
         results[operator, "plain"] = product(sim, p)
     size = np.abs(results["matrix"]).max()
     np.testing.assert_allclose(results["elements"], results["matrix"], atol=1e-12 * size)
@@ -80,9 +80,9 @@ def test_stress_is_that_of_the_linear_prediction(kind: str) -> None:
     difference = []
     for part in (1.0, 0.5):
         w.base_velocity.assign(now - part * (now - before))
-        w.newton.predicted_stress.fill_(1)
+        w.newton.solve.predicted_stress.fill_(1)
         mixed = product(sim, p)
-        w.newton.predicted_stress.zero_()
+        w.newton.solve.predicted_stress.zero_()
         difference.append(np.sum(p * (mixed - product(sim, p))))
     assert difference[0] / difference[1] == pytest.approx(4.0, rel=0.05)
 
@@ -102,7 +102,7 @@ def test_positive_matrix_has_no_negative_curvature(kind: str) -> None:
         array.assign(squeezed.astype(array.numpy().dtype))
     lowest = {}
     for mixed in (2, 0):
-        w.newton.predicted_stress.fill_(mixed)
+        w.newton.solve.predicted_stress.fill_(mixed)
         residual = sim.stepper.newton.residual
         residual.assemble_matrix(wp.ones(1, dtype=wp.int32))
         dense = residual.assembler.host_csr(residual.operator_matrix).toarray()

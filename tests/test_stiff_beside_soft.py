@@ -137,5 +137,5 @@ def test_bodies_alike_are_one_group_and_cost_nothing():
     sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-2)
     assert sim.model.residual_groups.count == 1
     assert sim.model.error_estimate_groups.count == 2
-    assert sim.stepper.work.newton.group_sums.size == 1
+    assert sim.stepper.work.newton.norms.group_sums.size == 1
     assert not any("perturbation" in module.name for module in sim.stepper.newton.modules())

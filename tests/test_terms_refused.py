@@ -150,7 +150,7 @@ def test_booked_rows_may_be_longer_than_anything_else():
 @pytest.mark.parametrize("limit", [0.0, -1.0, np.nan])
 @pytest.mark.parametrize("solver", [wf.NewtonPCG(max_halvings=2), wf.Jacobi(max_halvings=2)])
 def test_a_term_that_allows_no_step_is_told(limit, solver):
-    odd = kind(process_direction=lambda self, ctx, active: ctx.work.newton.limit.fill_(limit))
+    odd = kind(process_direction=lambda self, ctx, active: ctx.work.newton.search.limit.fill_(limit))
     sim = wf.Simulation(model_with(odd, height=-2e-3), dt=1e-3, solver=solver)
     before = sim.state.numpy()
     with pytest.raises(wf.ConvergenceError, match="a term allowed no step"):
@@ -160,7 +160,7 @@ def test_a_term_that_allows_no_step_is_told(limit, solver):
 
 def test_jacobi_keeps_to_the_limit():
     """No node moves by more than a tenth of what the descent asks for: it gets less far in the same iterations."""
-    odd = kind(process_direction=lambda self, ctx, active: ctx.work.newton.limit.fill_(0.1))
+    odd = kind(process_direction=lambda self, ctx, active: ctx.work.newton.search.limit.fill_(0.1))
     left = [
         wf.Simulation(model_with(make, height=-2e-3), dt=1e-3, solver=wf.Jacobi(iterations=3)).step().residual[0]
         for make in (Floor, odd)

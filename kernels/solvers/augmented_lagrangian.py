@@ -41,13 +41,13 @@ def outer_loop_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamesp
         """Flag the worlds whose frozen quantities are due for an update: the residual is small enough."""
         world = wp.tid()
         flags[world] = 0
-        if ctl.active[world] != 0 and ctl.contact_active[world] == 0:
+        if ctl.active[world] != 0 and ctl.frozen.contact_active[world] == 0:
             check_convergence(ctl, world)  # nothing is frozen
         elif ctl.active[world] != 0:
             last = ctl.iterations[world] + 1 >= ctl.max_iterations
             # within round-off the residual may not fall further
-            rounding = ctl.rounding_ratio[world] <= f64(STALL_ROUNDINGS)
-            if ctl.relative_residual[world] <= f64(FROZEN_UPDATE_RESIDUAL) or rounding or last:
+            rounding = ctl.floor.rounding_ratio[world] <= f64(STALL_ROUNDINGS)
+            if ctl.norms.relative_residual[world] <= f64(FROZEN_UPDATE_RESIDUAL) or rounding or last:
                 flags[world] = 1
             else:
                 record_residual(ctl, world)
@@ -57,18 +57,18 @@ def outer_loop_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamesp
         """Re-evaluate the iterate of the flagged worlds with the updated frozen quantities."""
         world = wp.tid()
         if ctl.active[world] != 0 and flags[world] != 0:
-            before = ctl.residual_norm[world]
+            before = ctl.norms.residual_norm[world]
             evaluate_norms(ctl, world)
-            if ctl.fixed_forcing == 0 and ctl.residual_norm[world] > f64(RESIDUAL_GROWTH) * before:
+            if ctl.solve.fixed_forcing == 0 and ctl.norms.residual_norm[world] > f64(RESIDUAL_GROWTH) * before:
                 # the frozen quantities were the larger error: tighter solves are wasted
-                ctl.forcing[world] = wp.max(ctl.forcing[world], f64(LOOSE_FORCING))
-            ctl.phi[world] = objective(ctl, world) + ctl.slot_sums[ROW_FROZEN_CHANGE, world]
-            ctl.phi_magnitude[world] = objective_magnitude(ctl, world)
-            ctl.nonmonotone_steps[world] = 0
-            ctl.frozen_updated[world] = 1 - ctl.unilateral_changed[world]
-            ctl.unilateral_changed[world] = 0
-            part = ctl.partly_updated[world] != 0
-            ctl.partly_updated[world] = 0
+                ctl.solve.forcing[world] = wp.max(ctl.solve.forcing[world], f64(LOOSE_FORCING))
+            ctl.search.phi[world] = objective(ctl, world) + ctl.slot_sums[ROW_FROZEN_CHANGE, world]
+            ctl.search.phi_magnitude[world] = objective_magnitude(ctl, world)
+            ctl.nonmonotone.steps[world] = 0
+            ctl.frozen.updated[world] = 1 - ctl.frozen.unilateral_changed[world]
+            ctl.frozen.unilateral_changed[world] = 0
+            part = ctl.frozen.partly_updated[world] != 0
+            ctl.frozen.partly_updated[world] = 0
             if not part:
                 check_convergence(ctl, world)
             else:
@@ -80,7 +80,7 @@ def outer_loop_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamesp
     def check_constraints(ctl: Control, running: int_1d, tol: f64, limit: int):
         """Classical multiplier updates: start another inner solve if a constraint is still violated."""
         world = wp.tid()
-        ctl.trial_accepted[world] = 0
+        ctl.search.trial_accepted[world] = 0
         if running[world] == 0 or ctl.failed[world] != 0:
             return
         if largest_violation(ctl, world) <= allowed_violation(ctl, world, tol):
@@ -93,13 +93,13 @@ def outer_loop_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamesp
         ctl.inversion_suspected[world] = 0
         ctl.inverted[world] = 0
         ctl.active[world] = 1
-        ctl.trial_accepted[world] = 1
+        ctl.search.trial_accepted[world] = 1
 
     @wp.kernel(module=module)
     def reset_step_limit(ctl: Control):
         """Reset the step limit to the full step."""
         world = wp.tid()
         if ctl.active[world] != 0:
-            ctl.limit[world] = f64(1.0)
+            ctl.search.limit[world] = f64(1.0)
 
     return kernel_set(locals())

@@ -85,14 +85,14 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> _types.Simple
         bi.halved_norm[world] = norm
         bi.stalled_iterations[world] = 0
         ctl.target_norm[world] = forcing_target(newton, world, norm)
-        if newton.estimate_error[world] != 0:
+        if newton.floor.estimate_error[world] != 0:
             ctl.target_norm[world] = f64(ESTIMATE_TOL) * norm
-        elif newton.relative_residual[world] > f64(START_STRESS_RESIDUAL) and newton.fixed_forcing == 0:
+        elif newton.norms.relative_residual[world] > f64(START_STRESS_RESIDUAL) and newton.solve.fixed_forcing == 0:
             ctl.target_norm[world] = wp.max(f64(START_STRESS_TOL) * norm, min_target_norm(newton, world))
         if norm > ctl.target_norm[world] and ctl.max_iterations > 0 and wp.isfinite(norm) and bi.rho[world] != f64(0.0):
-            ctl.active[world] = wp.where(newton.relative_residual[world] > f64(START_STRESS_RESIDUAL), 2, 1)
+            ctl.active[world] = wp.where(newton.norms.relative_residual[world] > f64(START_STRESS_RESIDUAL), 2, 1)
             wp.atomic_max(ctl.any_active, 0, 1)
-        elif newton.estimate_error[world] != 0:
+        elif newton.floor.estimate_error[world] != 0:
             ctl.negative_curvature[world] = 1  # no error estimate
 
     @wp.kernel(module=module)
@@ -244,7 +244,8 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> _types.Simple
             bi.restart_requested[world] = 1
             wp.atomic_max(bi.any_restart_requested, 0, 1)
         elif (
-            newton.estimate_error[world] != 0 and not ctl.norm[world] <= f64(ESTIMATE_RESIDUAL) * ctl.first_norm[world]
+            newton.floor.estimate_error[world] != 0
+            and not ctl.norm[world] <= f64(ESTIMATE_RESIDUAL) * ctl.first_norm[world]
         ):
             ctl.negative_curvature[world] = 1
 
@@ -256,7 +257,7 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> _types.Simple
             bi.rho[world] = ctl.sums[0, world]
             bi.halved_norm[world] = bi.best_norm[world]
             bi.stalled_iterations[world] = 0
-            ctl.active[world] = wp.where(newton.relative_residual[world] > f64(START_STRESS_RESIDUAL), 2, 1)
+            ctl.active[world] = wp.where(newton.norms.relative_residual[world] > f64(START_STRESS_RESIDUAL), 2, 1)
             wp.atomic_max(ctl.any_active, 0, 1)
 
     @wp.kernel(module=module)

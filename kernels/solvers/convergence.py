@@ -111,20 +111,20 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         Only in the first iterations: far from the reference the round-off of positions prevents tighter values.
         """
         if (
-            ctl.constraint_acceleration_tol > f64(0.0)
+            ctl.norms.constraint_acceleration_tol > f64(0.0)
             and tol < f64(1.0e200)
             and ctl.iterations[world] < TIGHT_CONSTRAINT_ITERATIONS
         ):
-            tightened = ctl.constraint_acceleration_tol * ctl.dq_dv[world] * ctl.dq_dv[world]
-            return wp.min(tol, wp.max(tightened, ctl.constraint_tol_min))
+            tightened = ctl.norms.constraint_acceleration_tol * ctl.dq_dv[world] * ctl.dq_dv[world]
+            return wp.min(tol, wp.max(tightened, ctl.norms.constraint_tol_min))
         return tol
 
     @wp.func
     def largest_violation(ctl: Control, world: int) -> f64:
         """Largest constraint violation over all components, m."""
         largest = f64(0.0)
-        for c in range(ctl.component_count):
-            largest = wp.max(largest, ctl.violation[world, c])
+        for c in range(ctl.norms.component_count):
+            largest = wp.max(largest, ctl.norms.violation[world, c])
         return largest
 
     @wp.func
@@ -134,39 +134,41 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         A small fraction of the strain energy is included as reactions: a group between others may carry no load of its
         own.
         """
-        if ctl.group_count == 1:
+        if ctl.norms.group_count == 1:
             f2 = wp.max(
                 ctl.slot_sums[ROW_INTERNAL, world],
                 wp.max(ctl.slot_sums[ROW_LOADS, world], ctl.slot_sums[ROW_INERTIA, world]),
             )
             return wp.vec3d(ctl.slot_sums[ROW_RESIDUAL, world], f2, ctl.slot_sums[ROW_ROUNDOFF, world])
         f2 = wp.max(
-            ctl.group_sums[ROW_INTERNAL, world, group],
-            wp.max(ctl.group_sums[ROW_LOADS, world, group], ctl.group_sums[ROW_INERTIA, world, group]),
+            ctl.norms.group_sums[ROW_INTERNAL, world, group],
+            wp.max(ctl.norms.group_sums[ROW_LOADS, world, group], ctl.norms.group_sums[ROW_INERTIA, world, group]),
         )
         stress = (
             f64(2.0)
             * f64(STRAIN_ENERGY_FRACTION)
-            * wp.abs(ctl.group_sums[GROUP_STRAIN_ENERGY, world, group])
+            * wp.abs(ctl.norms.group_sums[GROUP_STRAIN_ENERGY, world, group])
             / ctl.dq_dv[world]
         )
         return wp.vec3d(
-            ctl.group_sums[ROW_RESIDUAL, world, group], wp.max(f2, stress), ctl.group_sums[GROUP_ROUNDOFF, world, group]
+            ctl.norms.group_sums[ROW_RESIDUAL, world, group],
+            wp.max(f2, stress),
+            ctl.norms.group_sums[GROUP_ROUNDOFF, world, group],
         )
 
     @wp.func
     def is_unsolved_unlike_stiffness(ctl: Control, world: int) -> bool:
         """True in float32 at a first iterate of motion where bodies have parts of unlike stiffness."""
         first = ctl.iterations[world] == 0 and ctl.is_static == 0
-        return first and ctl.group_count > ctl.component_count and ctl.eps > f64(SINGLE_PRECISION_EPS)
+        return first and ctl.norms.group_count > ctl.norms.component_count and ctl.floor.eps > f64(SINGLE_PRECISION_EPS)
 
     @wp.func
     def component_sum(ctl: Control, world: int, group: int, row: int) -> f64:
         """Sum of a row of `group_sums` over the groups of a group's component."""
         total = f64(0.0)
-        for other in range(ctl.group_count):
-            if ctl.component_of_group[other] == ctl.component_of_group[group]:
-                total += ctl.group_sums[row, world, other]
+        for other in range(ctl.norms.group_count):
+            if ctl.norms.component_of_group[other] == ctl.norms.component_of_group[group]:
+                total += ctl.norms.group_sums[row, world, other]
         return total
 
     @wp.func
@@ -174,13 +176,15 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         """True in float64 if a group's residual is position round-off, and within the tolerance of all groups of its
         component: further iterations would not reduce it."""
         if (
-            ctl.group_count == ctl.component_count
-            or ctl.eps > f64(SINGLE_PRECISION_EPS)
+            ctl.norms.group_count == ctl.norms.component_count
+            or ctl.floor.eps > f64(SINGLE_PRECISION_EPS)
             or norm > f64(GROUP_ROUNDINGS) * rounding
         ):
             return False
         internal, loads = component_sum(ctl, world, group, ROW_INTERNAL), component_sum(ctl, world, group, ROW_LOADS)
-        return norm <= ctl.tol * wp.sqrt(wp.max(internal, wp.max(loads, component_sum(ctl, world, group, ROW_INERTIA))))
+        return norm <= ctl.norms.tol * wp.sqrt(
+            wp.max(internal, wp.max(loads, component_sum(ctl, world, group, ROW_INERTIA)))
+        )
 
     @wp.func
     def evaluate_norms(ctl: Control, world: int):
@@ -190,81 +194,82 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         whose groups have all converged is excluded from further solves.
         """
         force = wp.sqrt(ctl.slot_sums[ROW_FORCE, world])
-        ctl.residual_force[world] = force
+        ctl.norms.residual_force[world] = force
         largest = f64(0.0)
         worst = f64(0.0)
         excess = f64(0.0)
         floor_excess = f64(0.0)
         solve = f64(0.0)
         unconverged_tol = f64(1.0e300)
-        for c in range(ctl.component_count):
-            ctl.component_converged[world, c] = 1
-        for group in range(ctl.group_count):
+        for c in range(ctl.norms.component_count):
+            ctl.norms.component_converged[world, c] = 1
+        for group in range(ctl.norms.group_count):
             sums = squared_group_norms(ctl, world, group)
             g2 = sums[0]
             norm = wp.sqrt(g2)
             scale = wp.sqrt(sums[1])
-            accepted_norm = (ctl.tol + f64(TOL_ROUNDINGS) * ctl.eps) * scale
+            accepted_norm = (ctl.norms.tol + f64(TOL_ROUNDINGS) * ctl.floor.eps) * scale
             if force > f64(0.0):
                 # the force tolerance in this norm, by their ratio at this iterate
-                accepted_norm = wp.max(accepted_norm, norm * (ctl.force_tol / force))
-            if ctl.extrapolated_start[world] != 0:
+                accepted_norm = wp.max(accepted_norm, norm * (ctl.norms.force_tol / force))
+            if ctl.start.extrapolated[world] != 0:
                 accepted_norm = f64(EXTRAPOLATED_TOL_FACTOR) * accepted_norm
             elif is_unsolved_unlike_stiffness(ctl, world):
                 accepted_norm = f64(UNSOLVED_TOL_FACTOR) * accepted_norm
-            rounding = f64(2.0) * ctl.eps * wp.sqrt(sums[2])
+            rounding = f64(2.0) * ctl.floor.eps * wp.sqrt(sums[2])
             if norm > accepted_norm and is_group_roundoff(ctl, world, group, norm, rounding):
                 accepted_norm = norm
             unconverged = norm > accepted_norm
             if wp.static(has_constraints):
-                allowed = allowed_violation(ctl, world, ctl.constraint_tol)
-                violation = ctl.violation[world, ctl.component_of_group[group]]
+                allowed = allowed_violation(ctl, world, ctl.norms.constraint_tol)
+                violation = ctl.norms.violation[world, ctl.norms.component_of_group[group]]
                 if violation > allowed:
                     unconverged = True
                     excess = wp.max(excess, violation / allowed)
                     floor_excess = f64(1.0e300)
             if unconverged:
-                ctl.component_converged[world, ctl.component_of_group[group]] = 0
+                ctl.norms.component_converged[world, ctl.norms.component_of_group[group]] = 0
                 solve += g2
                 unconverged_tol = wp.min(unconverged_tol, accepted_norm)
-                if ctl.group_count > ctl.component_count:  # forces between groups have the round-off of both
-                    rounding = f64(2.0) * ctl.eps * wp.sqrt(component_sum(ctl, world, group, GROUP_ROUNDOFF))
+                if ctl.norms.group_count > ctl.norms.component_count:
+                    # forces between groups have the round-off of both
+                    rounding = f64(2.0) * ctl.floor.eps * wp.sqrt(component_sum(ctl, world, group, GROUP_ROUNDOFF))
                 if wp.static(has_constraints):
                     if ctl.classical_multipliers != 0:  # the residual contains rho c: position round-off times kappa
-                        rounding = rounding / (ctl.penalty_norm_ratio * ctl.penalty_norm_ratio)
+                        rounding = rounding / (ctl.norms.penalty_norm_ratio * ctl.norms.penalty_norm_ratio)
                 floor_excess = wp.max(floor_excess, norm / (rounding + f64(1.0e-300)))
             largest = wp.max(largest, norm / wp.max(scale, f64(1.0e-300)))
             worst = wp.max(worst, norm / wp.max(accepted_norm, f64(1.0e-300)))
         if wp.static(has_constraints):
-            ctl.violation_ratio[world] = largest_violation(ctl, world) / allowed_violation(
-                ctl, world, ctl.constraint_tol
+            ctl.norms.violation_ratio[world] = largest_violation(ctl, world) / allowed_violation(
+                ctl, world, ctl.norms.constraint_tol
             )
-        ctl.residual_norm[world] = wp.sqrt(ctl.slot_sums[ROW_RESIDUAL, world])
-        ctl.relative_residual[world] = largest
-        ctl.residual_ratio[world] = worst
-        ctl.convergence_ratio[world] = wp.max(excess, worst)
-        ctl.rounding_ratio[world] = floor_excess
-        ctl.unconverged_norm[world] = wp.sqrt(solve)
-        ctl.unconverged_tol[world] = unconverged_tol
+        ctl.norms.residual_norm[world] = wp.sqrt(ctl.slot_sums[ROW_RESIDUAL, world])
+        ctl.norms.relative_residual[world] = largest
+        ctl.norms.residual_ratio[world] = worst
+        ctl.norms.ratio[world] = wp.max(excess, worst)
+        ctl.floor.rounding_ratio[world] = floor_excess
+        ctl.norms.unconverged_norm[world] = wp.sqrt(solve)
+        ctl.norms.unconverged_tol[world] = unconverged_tol
 
     @wp.func
     def record_residual(ctl: Control, world: int):
         """Store the relative residual of the iterate, for messages."""
         k = ctl.iterations[world]
-        if k < ctl.residual_history.shape[1]:
-            ctl.residual_history[world, k] = ctl.relative_residual[world]
+        if k < ctl.norms.residual_history.shape[1]:
+            ctl.norms.residual_history[world, k] = ctl.norms.relative_residual[world]
 
     @wp.func
     def is_only_constraint_violated(ctl: Control, world: int) -> bool:
         """True if forces balance but constraints are violated: more iterations only raise the multipliers."""
-        balanced = wp.max(ctl.tol, wp.min(f64(1.0e3) * ctl.tol, f64(1.0e-4)))
-        return ctl.relative_residual[world] <= balanced and ctl.violation_ratio[world] > f64(1.0)
+        balanced = wp.max(ctl.norms.tol, wp.min(f64(1.0e3) * ctl.norms.tol, f64(1.0e-4)))
+        return ctl.norms.relative_residual[world] <= balanced and ctl.norms.violation_ratio[world] > f64(1.0)
 
     @wp.func
     def accept_iterate(ctl: Control, world: int):
         """End the iteration with this iterate; with J <= 0 it is checked again."""
         ctl.active[world] = 0
-        ctl.searching[world] = 0
+        ctl.search.active[world] = 0
         if ctl.refuse_inversion != 0 and ctl.min_J[world] <= f64(0.0):
             ctl.inversion_suspected[world] = 1
             wp.atomic_max(ctl.any_rare_branch, 0, 1)
@@ -272,15 +277,15 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
     @wp.func
     def request_error_estimate(ctl: Control, world: int):
         """Request an error estimate from the next solve, see `check_rounding_floor`."""
-        ctl.estimate_error[world] = 1
-        wp.atomic_max(ctl.any_estimate_error, 0, 1)
-        ctl.predicted_stress[world] = 0
+        ctl.floor.estimate_error[world] = 1
+        wp.atomic_max(ctl.floor.any_estimate_error, 0, 1)
+        ctl.solve.predicted_stress[world] = 0
 
     @wp.func
     def iteration_factor(ctl: Control, world: int) -> int:
         """Factor on `max_iterations` of an attempt: larger for a start far from the solution, or after negative
         curvature with a law that has its own tangent, since shorter steps meet it again."""
-        far = wp.max(ctl.choose_first_iterate[world], ctl.met_negative_curvature[world] * (1 - ctl.linear_stress))
+        far = wp.max(ctl.start.choose[world], ctl.solve.met_negative_curvature[world] * (1 - ctl.linear_stress))
         return 1 + EXTRA_ITERATION_FACTOR * far
 
     @wp.func
@@ -291,15 +296,15 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         single-precision statics, whatever the failure: a smaller load has smaller forces with the same noise.
         """
         ctl.active[world] = 0
-        ctl.searching[world] = 0
+        ctl.search.active[world] = 0
         ctl.failed[world] = why
         stuck = why == FAIL_ITERATIONS or why == FAIL_LINE_SEARCH or why == FAIL_CURVATURE
-        drowned = ctl.rounding_ratio[world] <= f64(NOISE_DOMINATED_ROUNDINGS)
-        drowned = drowned and ctl.relative_residual[world] > f64(0.5)
+        drowned = ctl.floor.rounding_ratio[world] <= f64(NOISE_DOMINATED_ROUNDINGS)
+        drowned = drowned and ctl.norms.relative_residual[world] > f64(0.5)
         if (
             stuck
             and drowned
-            and ctl.eps > f64(SINGLE_PRECISION_EPS)
+            and ctl.floor.eps > f64(SINGLE_PRECISION_EPS)
             and ctl.iterations[world] > 0
             and ctl.is_static != 0
         ):
@@ -312,9 +317,9 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
     def is_velocity_roundoff(ctl: Control, world: int) -> bool:
         """True in float64 if the last step changes velocities by their round-off: gaps of moving bodies have the
         round-off of their positions, and no other force may act."""
-        fine = f64(VELOCITY_ROUNDINGS) * ctl.eps
-        step = wp.abs(ctl.slope[world])
-        return ctl.eps < f64(SINGLE_PRECISION_EPS) and step <= fine * fine * ctl.slot_sums[ROW_KINETIC, world]
+        fine = f64(VELOCITY_ROUNDINGS) * ctl.floor.eps
+        step = wp.abs(ctl.search.slope[world])
+        return ctl.floor.eps < f64(SINGLE_PRECISION_EPS) and step <= fine * fine * ctl.slot_sums[ROW_KINETIC, world]
 
     @wp.func
     def check_convergence(ctl: Control, world: int):
@@ -323,21 +328,21 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         record_residual(ctl, world)
         # predicted energy change of the last step, relative to the energy
         energy = f64(2.0) * wp.abs(ctl.elem_sums[0, world]) + ctl.dq_dv[world] * ctl.slot_sums[ROW_MAGNITUDE, world]
-        step = wp.abs(ctl.slope[world]) * ctl.dq_dv[world]
-        most = f64(MAX_STALL_STEP) * ctl.max_floor_error
+        step = wp.abs(ctl.search.slope[world]) * ctl.dq_dv[world]
+        most = f64(MAX_STALL_STEP) * ctl.floor.max_error
         limit = ctl.max_iterations * iteration_factor(ctl, world)
         settling = step <= most * most * energy or ctl.iterations[world] + 1 >= limit
-        alike = f64(STALL_ENERGY_ROUNDINGS) * ctl.eps
-        near = ctl.rounding_ratio[world] <= f64(MAX_STALL_ROUNDINGS)
-        if wp.static(not midpoint) and not near and ctl.rounding_ratio[world] < f64(1.0e300):  # g.p: no energy
+        alike = f64(STALL_ENERGY_ROUNDINGS) * ctl.floor.eps
+        near = ctl.floor.rounding_ratio[world] <= f64(MAX_STALL_ROUNDINGS)
+        if wp.static(not midpoint) and not near and ctl.floor.rounding_ratio[world] < f64(1.0e300):  # g.p: no energy
             near = step <= alike * alike * energy
         if wp.static(unilateral):
             if is_velocity_roundoff(ctl, world):
                 near = True
                 settling = True
-        near = near and ctl.error_estimates[world] < MAX_ERROR_ESTIMATES
-        still = ctl.residual_reduction[world] > f64(STALL_RATIO) and ctl.operator_reused[world] == 0
-        if ctl.convergence_ratio[world] <= f64(1.0):
+        near = near and ctl.floor.estimates[world] < MAX_ERROR_ESTIMATES
+        still = ctl.norms.residual_reduction[world] > f64(STALL_RATIO) and ctl.solve.operator_reused[world] == 0
+        if ctl.norms.ratio[world] <= f64(1.0):
             accept_iterate(ctl, world)
         elif near and ctl.iterations[world] > 0 and still and settling:
             request_error_estimate(ctl, world)
@@ -347,27 +352,27 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
     @wp.func
     def handle_failed_search(ctl: Control, world: int, why: int):
         """Failed search: if round-off may explain it, keep the iterate and request an error estimate, else give up."""
-        at_roundoff = ctl.rounding_ratio[world] <= f64(MAX_STALL_ROUNDINGS)
+        at_roundoff = ctl.floor.rounding_ratio[world] <= f64(MAX_STALL_ROUNDINGS)
         if wp.static(unilateral):
             at_roundoff = at_roundoff or is_velocity_roundoff(ctl, world)
-        near = at_roundoff and ctl.error_estimates[world] < MAX_ERROR_ESTIMATES
-        at_roundoff = at_roundoff or ctl.eps > f64(SINGLE_PRECISION_EPS)
+        near = at_roundoff and ctl.floor.estimates[world] < MAX_ERROR_ESTIMATES
+        at_roundoff = at_roundoff or ctl.floor.eps > f64(SINGLE_PRECISION_EPS)
         enough = False
         if wp.static(has_constraints):  # only accelerations need the tighter tolerance, which round-off prevents
             if (
-                ctl.constraint_acceleration_tol > f64(0.0)
-                and ctl.relative_residual[world] <= ctl.tol + f64(TOL_ROUNDINGS) * ctl.eps
+                ctl.norms.constraint_acceleration_tol > f64(0.0)
+                and ctl.norms.relative_residual[world] <= ctl.norms.tol + f64(TOL_ROUNDINGS) * ctl.floor.eps
             ):
-                enough = largest_violation(ctl, world) <= ctl.constraint_tol
+                enough = largest_violation(ctl, world) <= ctl.norms.constraint_tol
         if enough and (why == FAIL_LINE_SEARCH or why == FAIL_CURVATURE):
             accept_iterate(ctl, world)
         elif near and (why == FAIL_LINE_SEARCH or why == FAIL_CURVATURE):
             request_error_estimate(ctl, world)
-            ctl.alpha[world] = f64(0.0)
+            ctl.search.alpha[world] = f64(0.0)
         elif (
             (why == FAIL_LINE_SEARCH or why == FAIL_CURVATURE)
             and at_roundoff
-            and ctl.error_estimate[world] < f64(1.0e30)
+            and ctl.floor.error_estimate[world] < f64(1.0e30)
         ):
             give_up(ctl, world, FAIL_ROUNDOFF)
         else:

@@ -74,12 +74,12 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
     def check_convergence(ctl: Newton, jac: Jacobi, world: int):
         """End a world's iterations on convergence, failure or at the iteration limit."""
         record_residual(ctl, world)
-        finite = wp.isfinite(ctl.residual_norm[world]) and wp.isfinite(ctl.elem_sums[0, world])
+        finite = wp.isfinite(ctl.norms.residual_norm[world]) and wp.isfinite(ctl.elem_sums[0, world])
         if wp.static(traits.stored):
             finite = finite and wp.isfinite(ctl.term_sums[0, world])
         barred = False
         if wp.static(traits.limited):
-            barred = ctl.iterations[world] > 0 and not ctl.limit[world] > f64(0.0)
+            barred = ctl.iterations[world] > 0 and not ctl.search.limit[world] > f64(0.0)
         if ctl.domain_J[world] <= f64(0.0):
             ctl.active[world] = 0
             ctl.failed[world] = FAIL_JACOBIAN
@@ -89,17 +89,20 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
         elif barred:
             ctl.active[world] = 0
             ctl.failed[world] = FAIL_STEP_LIMIT
-        elif ctl.convergence_ratio[world] <= f64(1.0):
+        elif ctl.norms.ratio[world] <= f64(1.0):
             accept_iterate(ctl, world)
         elif ctl.iterations[world] >= ctl.max_iterations:
             ctl.active[world] = 0
-            if ctl.residual_norm[world] > jac.max_growth * jac.first_norm[world]:
+            if ctl.norms.residual_norm[world] > jac.max_growth * jac.first_norm[world]:
                 ctl.failed[world] = FAIL_RESIDUAL_GROWTH
             if wp.static(traits.has_constraints):
-                if ctl.violation_ratio[world] * allowed_violation(ctl, world, ctl.constraint_tol) > jac.max_violation:
+                if (
+                    ctl.norms.violation_ratio[world] * allowed_violation(ctl, world, ctl.norms.constraint_tol)
+                    > jac.max_violation
+                ):
                     ctl.failed[world] = FAIL_CONSTRAINT
             if ctl.failed[world] == 0:
-                ctl.accepted_unconverged[world] = 1
+                ctl.floor.accepted_unconverged[world] = 1
                 accept_iterate(ctl, world)
 
     @wp.kernel(module=module)
@@ -109,8 +112,8 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
         if ctl.active[world] == 0:
             return
         evaluate_norms(ctl, world)
-        jac.first_norm[world] = ctl.residual_norm[world]
-        ctl.alpha[world] = f64(1.0)
+        jac.first_norm[world] = ctl.norms.residual_norm[world]
+        ctl.search.alpha[world] = f64(1.0)
         check_convergence(ctl, jac, world)
 
     @wp.kernel(module=module)
@@ -315,7 +318,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
         world, slot = wp.tid()
         if ctl.active[world] != 0:
             if wp.static(traits.limited):
-                share = wp.clamp(ctl.limit[world], f64(0.0), f64(1.0))
+                share = wp.clamp(ctl.search.limit[world], f64(0.0), f64(1.0))
                 move[world, slot] = T(share) * move[world, slot]
             v[world, slot] = v[world, slot] + move[world, slot]
 
@@ -329,6 +332,6 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
             ctl.active[world] = 1
             pcg.iterations[world] = ctl.iterations[world]
             pcg.first_norm[world] = jac.first_norm[world]
-            pcg.norm[world] = ctl.residual_norm[world]
+            pcg.norm[world] = ctl.norms.residual_norm[world]
 
     return kernel_set(locals())

@@ -50,41 +50,48 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNames
     def tangent_needed(ctl: Control, world: int) -> bool:
         """True if solves with matrices other than the tangent have failed too often, for laws with their own tangent:
         beyond a bifurcation only the exact tangent gives descent."""
-        return ctl.linear_stress == 0 and ctl.linear_solves[world] - ctl.iterations[world] > SOLVES_WITHOUT_STEP
+        return ctl.linear_stress == 0 and ctl.solve.count[world] - ctl.iterations[world] > SOLVES_WITHOUT_STEP
 
     @wp.func
     def track_best_iterate(ctl: Control, world: int, old_phi: f64, old_norm: f64):
         """Bookkeeping after a step that raised Phi and the steps that follow it: restore the best iterate if for
         MAX_NONMONOTONE steps neither the residual halved nor Phi fell below its best value."""
-        if ctl.nonmonotone_steps[world] == 0:
-            ctl.store_best[world] = 1
-            ctl.best_phi[world] = old_phi
+        if ctl.nonmonotone.steps[world] == 0:
+            ctl.nonmonotone.store_best[world] = 1
+            ctl.nonmonotone.best_phi[world] = old_phi
             if wp.static(unilateral):
-                ctl.penetrating_steps[world] = ctl.penetrating_steps[world] + 1
-            ctl.best_norm[world] = old_norm
+                ctl.nonmonotone.penetrating_steps[world] = ctl.nonmonotone.penetrating_steps[world] + 1
+            ctl.nonmonotone.best_norm[world] = old_norm
         if wp.static(not midpoint):
-            ctl.predicted_stress[world] = 1
+            ctl.solve.predicted_stress[world] = 1
         counts = True
         if wp.static(unilateral):  # Phi decreases monotonically on the way back out of an obstacle
-            counts = ctl.nonmonotone_steps[world] == 0 or not ctl.phi[world] < old_phi
+            counts = ctl.nonmonotone.steps[world] == 0 or not ctl.search.phi[world] < old_phi
         if counts:
-            ctl.nonmonotone_steps[world] = ctl.nonmonotone_steps[world] + 1
-        if ctl.residual_norm[world] <= f64(0.5) * ctl.best_norm[world] or ctl.phi[world] < ctl.best_phi[world]:
-            ctl.nonmonotone_steps[world] = 0
-            ctl.trust_radius[world] = wp.min(f64(2.0) * ctl.trust_radius[world], f64(MAX_TRUST_RADIUS))
-        elif ctl.nonmonotone_steps[world] >= MAX_NONMONOTONE and ctl.active[world] != 0:
-            ctl.restore_best[world] = 1
-            ctl.searching[world] = 1
+            ctl.nonmonotone.steps[world] = ctl.nonmonotone.steps[world] + 1
+        if (
+            ctl.norms.residual_norm[world] <= f64(0.5) * ctl.nonmonotone.best_norm[world]
+            or ctl.search.phi[world] < ctl.nonmonotone.best_phi[world]
+        ):
+            ctl.nonmonotone.steps[world] = 0
+            ctl.nonmonotone.trust_radius[world] = wp.min(
+                f64(2.0) * ctl.nonmonotone.trust_radius[world], f64(MAX_TRUST_RADIUS)
+            )
+        elif ctl.nonmonotone.steps[world] >= MAX_NONMONOTONE and ctl.active[world] != 0:
+            ctl.nonmonotone.restore_best[world] = 1
+            ctl.search.active[world] = 1
 
     @wp.kernel(module=module)
     def limit_nonmonotone_step(ctl: Control):
         """Length of a nonmonotone step: the rotation and stretch of elements stay below the trust radius."""
         world = wp.tid()
-        if ctl.active[world] != 0 and ctl.nonmonotone_trial[world] == 1:
-            ctl.nonmonotone_trial[world] = 2
-            ctl.searching[world] = 1
-            most = ctl.dq_dv[world] * ctl.direction_gradient[world]
-            ctl.alpha[world] = wp.min(ctl.alpha[world], ctl.trust_radius[world] / wp.max(most, f64(1.0e-300)))
+        if ctl.active[world] != 0 and ctl.nonmonotone.trial[world] == 1:
+            ctl.nonmonotone.trial[world] = 2
+            ctl.search.active[world] = 1
+            most = ctl.dq_dv[world] * ctl.nonmonotone.direction_gradient[world]
+            ctl.search.alpha[world] = wp.min(
+                ctl.search.alpha[world], ctl.nonmonotone.trust_radius[world] / wp.max(most, f64(1.0e-300))
+            )
 
     @wp.func
     def accept_trial(ctl: Control, world: int, stands: bool, nonmonotone: bool):
@@ -92,60 +99,61 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNames
 
         `stands`: the trial is the iterate itself or the best one. `nonmonotone`: it may have raised Phi.
         """
-        old_norm = ctl.residual_norm[world]
-        old_worst = ctl.residual_ratio[world]
-        old_phi = ctl.phi[world]
-        ctl.searching[world] = 0
+        old_norm = ctl.norms.residual_norm[world]
+        old_worst = ctl.norms.residual_ratio[world]
+        old_phi = ctl.search.phi[world]
+        ctl.search.active[world] = 0
         evaluate_norms(ctl, world)
-        ctl.phi[world] = objective(ctl, world) + ctl.slot_sums[ROW_FROZEN_CHANGE, world]
+        ctl.search.phi[world] = objective(ctl, world) + ctl.slot_sums[ROW_FROZEN_CHANGE, world]
         if wp.static(stored):
-            ctl.trial_accepted[world] = 1
+            ctl.search.trial_accepted[world] = 1
         if wp.static(stored and not midpoint):
             more = ctl.term_sums[1, world] - ctl.term_sums[0, world]
-            ctl.phi[world] = ctl.phi[world] + more / ctl.dq_dv[world]
-        ctl.phi_magnitude[world] = objective_magnitude(ctl, world)
+            ctl.search.phi[world] = ctl.search.phi[world] + more / ctl.dq_dv[world]
+        ctl.search.phi_magnitude[world] = objective_magnitude(ctl, world)
         if stands:
-            if ctl.operator_reused[world] != 0:
-                ctl.operator_reused[world] = 2
-            if ctl.restore_best[world] != 0:
-                ctl.restore_best[world] = 0
-                ctl.trust_radius[world] = f64(RADIUS_SHRINK) * ctl.trust_radius[world]
-                ctl.nonmonotone_steps[world] = 0
+            if ctl.solve.operator_reused[world] != 0:
+                ctl.solve.operator_reused[world] = 2
+            if ctl.nonmonotone.restore_best[world] != 0:
+                ctl.nonmonotone.restore_best[world] = 0
+                ctl.nonmonotone.trust_radius[world] = f64(RADIUS_SHRINK) * ctl.nonmonotone.trust_radius[world]
+                ctl.nonmonotone.steps[world] = 0
                 if wp.static(not midpoint):
-                    ctl.predicted_stress[world] = wp.where(tangent_needed(ctl, world), 0, 2)
-                ctl.require_armijo[world] = 1
+                    ctl.solve.predicted_stress[world] = wp.where(tangent_needed(ctl, world), 0, 2)
+                ctl.nonmonotone.require_armijo[world] = 1
         else:
             ctl.iterations[world] = ctl.iterations[world] + 1
-            if ctl.require_armijo[world] != 0:
-                ctl.require_armijo[world] = 0
+            if ctl.nonmonotone.require_armijo[world] != 0:
+                ctl.nonmonotone.require_armijo[world] = 0
                 if wp.static(not midpoint):
-                    ctl.predicted_stress[world] = wp.where(tangent_needed(ctl, world), 0, 1)
+                    ctl.solve.predicted_stress[world] = wp.where(tangent_needed(ctl, world), 0, 1)
         ctl.step_iterations[world] = ctl.step_iterations[world] + 1
-        ratio = ctl.residual_norm[world] / wp.max(old_norm, f64(1.0e-300))
-        if ctl.group_count > ctl.component_count:  # one group's forces may dwarf those of the unconverged groups
-            ratio = ctl.residual_ratio[world] / wp.max(old_worst, f64(1.0e-300))
-        ctl.residual_reduction[world] = ratio
+        ratio = ctl.norms.residual_norm[world] / wp.max(old_norm, f64(1.0e-300))
+        if ctl.norms.group_count > ctl.norms.component_count:
+            # one group's forces may dwarf those of the unconverged groups
+            ratio = ctl.norms.residual_ratio[world] / wp.max(old_worst, f64(1.0e-300))
+        ctl.norms.residual_reduction[world] = ratio
         eta = f64(0.9) * ratio * ratio
-        guard = f64(0.9) * ctl.forcing[world] * ctl.forcing[world]
+        guard = f64(0.9) * ctl.solve.forcing[world] * ctl.solve.forcing[world]
         if guard > f64(0.1):
             eta = wp.max(eta, guard)
-        if ctl.fixed_forcing == 0 and not stands:
-            ctl.forcing[world] = wp.clamp(eta, f64(1.0e-6), f64(0.1))
+        if ctl.solve.fixed_forcing == 0 and not stands:
+            ctl.solve.forcing[world] = wp.clamp(eta, f64(1.0e-6), f64(0.1))
         if wp.static(not unilateral):
             check_convergence(ctl, world)
-        if not stands and ctl.estimate_error[world] == 0 and (nonmonotone or ctl.nonmonotone_steps[world] > 0):
+        if not stands and ctl.floor.estimate_error[world] == 0 and (nonmonotone or ctl.nonmonotone.steps[world] > 0):
             track_best_iterate(ctl, world, old_phi, old_norm)
 
     @wp.func
     def shorten_step(ctl: Control, world: int, reused: bool):
         """Halve the step, or end the search; `reused`: the operator is of an earlier iterate."""
-        ctl.nonmonotone_trial[world] = 0
-        ctl.search_trials[world] = ctl.search_trials[world] + 1
-        ctl.alpha[world] = f64(0.5) * ctl.alpha[world]
-        if reused and ctl.search_trials[world] > MAX_REUSED_BACKTRACKS:
+        ctl.nonmonotone.trial[world] = 0
+        ctl.search.trials[world] = ctl.search.trials[world] + 1
+        ctl.search.alpha[world] = f64(0.5) * ctl.search.alpha[world]
+        if reused and ctl.search.trials[world] > MAX_REUSED_BACKTRACKS:
             # the reused operator is at fault: keep the iterate and solve with its own operator
-            ctl.alpha[world] = f64(0.0)
-        if ctl.search_trials[world] > MAX_BACKTRACKS:
+            ctl.search.alpha[world] = f64(0.0)
+        if ctl.search.trials[world] > MAX_BACKTRACKS:
             why = FAIL_LINE_SEARCH
             if ctl.domain_J[world] <= f64(0.0):
                 why = FAIL_JACOBIAN
@@ -155,18 +163,21 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNames
     def lengthen_step(ctl: Control, world: int, good: bool, slope: f64) -> bool:
         """Double the step while Phi falls ever faster along it, undo the last doubling if the trial fails: replaces
         solves near a saddle. Statics, after a solve that met negative curvature."""
-        alpha = ctl.alpha[world]
+        alpha = ctl.search.alpha[world]
         longer = (
-            good and slope <= ctl.slope[world] and ctl.doublings[world] >= 0 and ctl.doublings[world] < MAX_DOUBLINGS
+            good
+            and slope <= ctl.search.slope[world]
+            and ctl.search.doublings[world] >= 0
+            and ctl.search.doublings[world] < MAX_DOUBLINGS
         )
         if wp.static(limited):
-            longer = longer and f64(2.0) * alpha <= ctl.limit[world]
+            longer = longer and f64(2.0) * alpha <= ctl.search.limit[world]
         if longer:
-            ctl.doublings[world] = ctl.doublings[world] + 1
-            ctl.alpha[world] = f64(2.0) * alpha
-        elif not good and ctl.doublings[world] > 0:
-            ctl.doublings[world] = -1
-            ctl.alpha[world] = f64(0.5) * alpha
+            ctl.search.doublings[world] = ctl.search.doublings[world] + 1
+            ctl.search.alpha[world] = f64(2.0) * alpha
+        elif not good and ctl.search.doublings[world] > 0:
+            ctl.search.doublings[world] = -1
+            ctl.search.alpha[world] = f64(0.5) * alpha
             longer = True
         return longer
 
@@ -174,32 +185,36 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNames
     def bracket_step(ctl: Control, world: int, slope: f64) -> f64:
         """Next step length when the trial is beyond a kink of Phi, or still steep before it: Illinois method on slopes
         (Dowell and Jarratt 1971)."""
-        alpha = ctl.alpha[world]
-        low = wp.vec2d(ctl.bracket_low[world])
-        high = wp.vec2d(ctl.bracket_high[world])
+        alpha = ctl.search.alpha[world]
+        low = wp.vec2d(ctl.search.bracket_low[world])
+        high = wp.vec2d(ctl.search.bracket_high[world])
         if slope > f64(0.0):
-            if high[0] > f64(0.0) and ctl.search_trials[world] > 1:
+            if high[0] > f64(0.0) and ctl.search.trials[world] > 1:
                 low[1] = f64(0.5) * low[1]
             high = wp.vec2d(alpha, slope)
         else:
             high[1] = f64(0.5) * high[1]
             low = wp.vec2d(alpha, slope)
-        ctl.bracket_low[world] = low
-        ctl.bracket_high[world] = high
+        ctl.search.bracket_low[world] = low
+        ctl.search.bracket_high[world] = high
         part = wp.clamp(low[1] / (low[1] - high[1]), f64(0.05), f64(0.95))
         return low[0] + part * (high[0] - low[0])
 
     @wp.func
     def sufficient_decrease(ctl: Control, world: int, change: f64, slope: f64, norm: f64) -> bool:
         """True if a trial is good: Armijo on the change of Phi above its noise, else the sign of the slope."""
-        alpha = ctl.alpha[world]
-        noise = f64(PHI_NOISE_ROUNDINGS) * ctl.eps * (ctl.phi_magnitude[world] + objective_magnitude(ctl, world))
-        good = slope <= f64(WOLFE_FACTOR) * wp.abs(ctl.slope[world])
+        alpha = ctl.search.alpha[world]
+        noise = (
+            f64(PHI_NOISE_ROUNDINGS)
+            * ctl.floor.eps
+            * (ctl.search.phi_magnitude[world] + objective_magnitude(ctl, world))
+        )
+        good = slope <= f64(WOLFE_FACTOR) * wp.abs(ctl.search.slope[world])
         if wp.abs(change) > noise:
-            good = change <= f64(ARMIJO_FACTOR) * alpha * ctl.slope[world]
+            good = change <= f64(ARMIJO_FACTOR) * alpha * ctl.search.slope[world]
         if wp.static(midpoint):
-            good = change <= f64(-2.0) * f64(ARMIJO_FACTOR) * alpha * ctl.phi[world]
-        return good or (ctl.has_nonpotential != 0 and norm <= f64(0.5) * ctl.residual_norm[world])
+            good = change <= f64(-2.0) * f64(ARMIJO_FACTOR) * alpha * ctl.search.phi[world]
+        return good or (ctl.has_nonpotential != 0 and norm <= f64(0.5) * ctl.norms.residual_norm[world])
 
     @wp.func
     def is_good_trial(ctl: Control, world: int, phi: f64, slope: f64, norm: f64) -> bool:
@@ -207,23 +222,31 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNames
         also halve the residual."""
         good = wp.isfinite(phi) and wp.isfinite(norm) and not ctl.domain_J[world] <= f64(0.0)
         if good:
-            good = sufficient_decrease(ctl, world, phi - ctl.phi[world], slope, norm)
+            good = sufficient_decrease(ctl, world, phi - ctl.search.phi[world], slope, norm)
         if (
-            ctl.operator_reused[world] != 0
+            ctl.solve.operator_reused[world] != 0
             and ctl.iterations[world] == 0
-            and not norm <= f64(0.5) * ctl.residual_norm[world]
+            and not norm <= f64(0.5) * ctl.norms.residual_norm[world]
         ):
             good = False  # a step must not start worse than with its own operator
-            ctl.search_trials[world] = MAX_REUSED_BACKTRACKS
+            ctl.search.trials[world] = MAX_REUSED_BACKTRACKS
         return good
 
     @wp.func
     def is_nonmonotone_allowed(ctl: Control, world: int) -> bool:
         """True if the full step of this search may raise Phi."""
-        out = ctl.search_trials[world] == 0 and ctl.nonmonotone_trial[world] == 0 and ctl.negative_curvature[world] == 0
-        out = out and (ctl.require_armijo[world] == 0 or ctl.predicted_stress[world] == 2)
+        out = (
+            ctl.search.trials[world] == 0
+            and ctl.nonmonotone.trial[world] == 0
+            and ctl.solve.negative_curvature[world] == 0
+        )
+        out = out and (ctl.nonmonotone.require_armijo[world] == 0 or ctl.solve.predicted_stress[world] == 2)
         if wp.static(unilateral):  # into an obstacle and back; friction has a convex potential: full steps overshoot
-            out = out and ctl.frozen_updated[world] == 0 and ctl.penetrating_steps[world] < MAX_PENETRATING_STEPS
+            out = (
+                out
+                and ctl.frozen.updated[world] == 0
+                and ctl.nonmonotone.penetrating_steps[world] < MAX_PENETRATING_STEPS
+            )
         return out
 
     @wp.func
@@ -231,27 +254,27 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNames
         """True if a trial is beside a kink of Phi, where sticking begins: Phi rises steeply there, or still falls
         steeply within the bracket. Sets the next step length."""
         if (
-            ctl.nonmonotone_trial[world] != 0
-            or ctl.search_trials[world] >= MAX_KINK_TRIALS
+            ctl.nonmonotone.trial[world] != 0
+            or ctl.search.trials[world] >= MAX_KINK_TRIALS
             or not ctl.domain_J[world] > f64(0.0)
         ):
             return False
-        steep = f64(KINK_SLOPE_RATIO) * wp.abs(ctl.slope[world])
-        beyond = slope > steep or (ctl.bracket_high[world][0] > f64(0.0) and slope < -steep)
+        steep = f64(KINK_SLOPE_RATIO) * wp.abs(ctl.search.slope[world])
+        beyond = slope > steep or (ctl.search.bracket_high[world][0] > f64(0.0) and slope < -steep)
         if beyond:
-            ctl.search_trials[world] = ctl.search_trials[world] + 1
-            ctl.alpha[world] = bracket_step(ctl, world, slope)
+            ctl.search.trials[world] = ctl.search.trials[world] + 1
+            ctl.search.alpha[world] = bracket_step(ctl, world, slope)
         return beyond
 
     @wp.func
     def choose_next_trial(ctl: Control, world: int, wants_nonmonotone: bool, reused: bool):
         """Next trial after a refused one: a nonmonotone step, the best iterate, or half the step."""
         if wants_nonmonotone:
-            ctl.nonmonotone_trial[world] = 1
-            ctl.searching[world] = 0
+            ctl.nonmonotone.trial[world] = 1
+            ctl.search.active[world] = 0
             wp.atomic_max(ctl.any_rare_branch, 0, 1)
-        elif ctl.nonmonotone_steps[world] > 0:
-            ctl.restore_best[world] = 1
+        elif ctl.nonmonotone.steps[world] > 0:
+            ctl.nonmonotone.restore_best[world] = 1
         else:
             shorten_step(ctl, world, reused)
 
@@ -259,18 +282,18 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNames
     def check_trial(ctl: Control):
         """Acceptance of a trial, Armijo on Phi, Eq. (18), or the next step length; then convergence."""
         world = wp.tid()
-        if ctl.searching[world] == 0:
+        if ctl.search.active[world] == 0:
             return
-        alpha = ctl.alpha[world]
+        alpha = ctl.search.alpha[world]
         # frozen forces keep their symmetric tangent: the curvature of Phi then agrees with H
-        bend = ctl.dq_dv[world] * ctl.tangent_sum[0, world]
+        bend = ctl.dq_dv[world] * ctl.search.tangent_sum[0, world]
         phi = objective(ctl, world) - f64(0.5) * alpha * alpha * bend
         slope = ctl.slot_sums[ROW_SLOPE, world] - alpha * bend
         norm = wp.sqrt(ctl.slot_sums[ROW_RESIDUAL, world])
         finite = wp.isfinite(phi) and wp.isfinite(norm)
         good = is_good_trial(ctl, world, phi, slope, norm)
-        reused = ctl.operator_reused[world] != 0
-        stands = alpha == f64(0.0) or ctl.restore_best[world] != 0
+        reused = ctl.solve.operator_reused[world] != 0
+        stands = alpha == f64(0.0) or ctl.nonmonotone.restore_best[world] != 0
         usable = finite and not (stands or reused)
         wants_nonmonotone = usable and not good and is_nonmonotone_allowed(ctl, world)
         if wp.static(has_kinks):
@@ -279,7 +302,7 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNames
                     return
         if lengthen_step(ctl, world, good and not (stands or reused), slope):
             return
-        nonmonotone = ctl.nonmonotone_trial[world] == 2 and finite and ctl.min_J[world] > f64(0.0)
+        nonmonotone = ctl.nonmonotone.trial[world] == 2 and finite and ctl.min_J[world] > f64(0.0)
         if good or stands or nonmonotone:
             accept_trial(ctl, world, stands, nonmonotone)
         else:

@@ -82,40 +82,40 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
             ctl.min_J[world] = f64(1.0e30)
             ctl.domain_J[world] = f64(1.0e30)
             if wp.static(unilateral):
-                ctl.contact_active[world] = 0
+                ctl.frozen.contact_active[world] = 0
 
     @wp.func
     def initialise_iteration(ctl: Control, world: int):
         """Initialise the iteration at its first iterate, and test that for convergence."""
         evaluate_norms(ctl, world)
         phi = objective(ctl, world) + ctl.slot_sums[ROW_FROZEN_CHANGE, world]
-        ctl.phi[world] = phi
-        ctl.phi_magnitude[world] = objective_magnitude(ctl, world)
-        ctl.forcing[world] = ctl.first_forcing
-        ctl.operator_reused[world] = 0
-        ctl.nonmonotone_steps[world] = 0
-        ctl.predicted_stress[world] = 0
-        ctl.require_armijo[world] = 0
-        ctl.store_best[world] = 0
-        ctl.restore_best[world] = 0
-        ctl.trust_radius[world] = f64(MAX_TRUST_RADIUS)
-        ctl.estimate_error[world] = 0
-        ctl.error_estimates[world] = 0
-        ctl.negative_curvature[world] = 0
-        ctl.pcg_unconverged[world] = 0
-        ctl.met_negative_curvature[world] = 0
-        ctl.linear_solves[world] = 0
-        ctl.error_estimate[world] = f64(1.0e30)
-        ctl.slope[world] = f64(0.0)
+        ctl.search.phi[world] = phi
+        ctl.search.phi_magnitude[world] = objective_magnitude(ctl, world)
+        ctl.solve.forcing[world] = ctl.solve.first_forcing
+        ctl.solve.operator_reused[world] = 0
+        ctl.nonmonotone.steps[world] = 0
+        ctl.solve.predicted_stress[world] = 0
+        ctl.nonmonotone.require_armijo[world] = 0
+        ctl.nonmonotone.store_best[world] = 0
+        ctl.nonmonotone.restore_best[world] = 0
+        ctl.nonmonotone.trust_radius[world] = f64(MAX_TRUST_RADIUS)
+        ctl.floor.estimate_error[world] = 0
+        ctl.floor.estimates[world] = 0
+        ctl.solve.negative_curvature[world] = 0
+        ctl.solve.pcg_unconverged[world] = 0
+        ctl.solve.met_negative_curvature[world] = 0
+        ctl.solve.count[world] = 0
+        ctl.floor.error_estimate[world] = f64(1.0e30)
+        ctl.search.slope[world] = f64(0.0)
         if wp.static(unilateral):
-            ctl.frozen_updated[world] = 0
-            ctl.unilateral_changed[world] = 0
-            ctl.penetrating_steps[world] = 0
+            ctl.frozen.updated[world] = 0
+            ctl.frozen.unilateral_changed[world] = 0
+            ctl.nonmonotone.penetrating_steps[world] = 0
         if ctl.domain_J[world] <= f64(0.0):
             give_up(ctl, world, FAIL_JACOBIAN)
-        elif not (wp.isfinite(phi) and wp.isfinite(ctl.residual_norm[world])):
+        elif not (wp.isfinite(phi) and wp.isfinite(ctl.norms.residual_norm[world])):
             give_up(ctl, world, FAIL_NAN)
-        elif wp.static(unilateral) and ctl.residual_norm[world] > f64(0.0):
+        elif wp.static(unilateral) and ctl.norms.residual_norm[world] > f64(0.0):
             record_residual(ctl, world)  # frozen quantities are not those of this iterate: it cannot be accepted
         else:
             check_convergence(ctl, world)
@@ -134,7 +134,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
             ctl.strain_energy[world] / ctl.dq_dv[world]
             + f64(MAX_START_ENERGY_RATIO) * ctl.slot_sums[ROW_KINETIC, world]
         )
-        bound += f64(PHI_NOISE_ROUNDINGS) * ctl.eps * objective_magnitude(ctl, world)
+        bound += f64(PHI_NOISE_ROUNDINGS) * ctl.floor.eps * objective_magnitude(ctl, world)
         return not (phi <= bound and wp.isfinite(phi) and ctl.min_J[world] > f64(0.0))
 
     @wp.kernel(module=module)
@@ -142,60 +142,66 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         """Start with the first iterate; `stage` 0: no alternatives; 1: some follow if it is poor; 2: the best."""
         world = wp.tid()
         if stage != 2:
-            ctl.choose_first_iterate[world] = 0
-        if ctl.active[world] == 0 or (stage == 2 and ctl.choose_first_iterate[world] == 0):
+            ctl.start.choose[world] = 0
+        if ctl.active[world] == 0 or (stage == 2 and ctl.start.choose[world] == 0):
             return
         if stage == 1:
             if is_poor_first_iterate(ctl, world):
-                ctl.choose_first_iterate[world] = 1
+                ctl.start.choose[world] = 1
                 wp.atomic_max(ctl.any_rare_branch, 0, 1)
                 return
         initialise_iteration(ctl, world)
-        if stage == 2 and ctl.fixed_forcing == 0:
-            ctl.forcing[world] = f64(ALTERNATIVE_START_FORCING)
+        if stage == 2 and ctl.solve.fixed_forcing == 0:
+            ctl.solve.forcing[world] = f64(ALTERNATIVE_START_FORCING)
 
     @wp.kernel(module=module)
     def compare_first_iterates(ctl: Control, first: int, better: int_1d):
         """Flag the worlds where the first iterate just evaluated is the best so far: J > 0 before Phi."""
         world = wp.tid()
         better[world] = 0
-        if ctl.choose_first_iterate[world] == 0:
+        if ctl.start.choose[world] == 0:
             return
         phi = objective(ctl, world)
         if not (wp.isfinite(phi) and ctl.domain_J[world] > f64(0.0)):
             phi = f64(1.0e300)
         low = wp.min(ctl.min_J[world], f64(0.0))
-        if first != 0 or low > ctl.best_norm[world] or (low == ctl.best_norm[world] and phi < ctl.best_phi[world]):
-            ctl.best_phi[world] = phi
-            ctl.best_norm[world] = low
+        if (
+            first != 0
+            or low > ctl.nonmonotone.best_norm[world]
+            or (low == ctl.nonmonotone.best_norm[world] and phi < ctl.nonmonotone.best_phi[world])
+        ):
+            ctl.nonmonotone.best_phi[world] = phi
+            ctl.nonmonotone.best_norm[world] = low
             better[world] = 1
             if first == 0:
-                ctl.extrapolated_start[world] = 0
+                ctl.start.extrapolated[world] = 0
 
     @wp.func
     def check_direction(ctl: Control, world: int):
         """Check the search direction and start the line search."""
-        ctl.met_negative_curvature[world] = wp.max(ctl.met_negative_curvature[world], ctl.negative_curvature[world])
-        ctl.searching[world] = 1
+        ctl.solve.met_negative_curvature[world] = wp.max(
+            ctl.solve.met_negative_curvature[world], ctl.solve.negative_curvature[world]
+        )
+        ctl.search.active[world] = 1
         barred = False
         if wp.static(limited):
-            barred = not ctl.limit[world] > f64(0.0)
-        if not wp.isfinite(ctl.slope[world]):
+            barred = not ctl.search.limit[world] > f64(0.0)
+        if not wp.isfinite(ctl.search.slope[world]):
             handle_failed_search(ctl, world, FAIL_NAN)
         elif barred:
             handle_failed_search(ctl, world, FAIL_STEP_LIMIT)
-        elif ctl.negative_curvature[world] != 0 and ctl.predicted_stress[world] == 1:
-            if ctl.nonmonotone_steps[world] > 0:
-                ctl.restore_best[world] = 1
+        elif ctl.solve.negative_curvature[world] != 0 and ctl.solve.predicted_stress[world] == 1:
+            if ctl.nonmonotone.steps[world] > 0:
+                ctl.nonmonotone.restore_best[world] = 1
             else:
-                ctl.predicted_stress[world] = wp.where(tangent_needed(ctl, world), 0, 2)
-                ctl.require_armijo[world] = 1
-                ctl.alpha[world] = f64(0.0)
-        elif ctl.slope[world] >= f64(0.0) and wp.static(not midpoint):  # midpoint: |g| can still fall
-            if ctl.operator_reused[world] != 0:
-                ctl.alpha[world] = f64(0.0)
-            elif ctl.nonmonotone_steps[world] > 0:
-                ctl.restore_best[world] = 1
+                ctl.solve.predicted_stress[world] = wp.where(tangent_needed(ctl, world), 0, 2)
+                ctl.nonmonotone.require_armijo[world] = 1
+                ctl.search.alpha[world] = f64(0.0)
+        elif ctl.search.slope[world] >= f64(0.0) and wp.static(not midpoint):  # midpoint: |g| can still fall
+            if ctl.solve.operator_reused[world] != 0:
+                ctl.search.alpha[world] = f64(0.0)
+            elif ctl.nonmonotone.steps[world] > 0:
+                ctl.nonmonotone.restore_best[world] = 1
             else:
                 handle_failed_search(ctl, world, FAIL_CURVATURE)
 
@@ -208,20 +214,20 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         dq = ctl.dq_dv[world]
         work, kinetic, strain, step, speed = f64(0.0), f64(0.0), f64(0.0), f64(0.0), f64(0.0)
         for lane in range(FLOOR_LANES):
-            work += ctl.floor_sums[0, world, part, lane]
-            kinetic += ctl.floor_sums[1, world, part, lane]
-            strain += ctl.floor_sums[2, world, part, lane]
-            step = wp.max(step, ctl.floor_sums[3, world, part, lane])
-            speed = wp.max(speed, ctl.floor_sums[5, world, part, lane])
+            work += ctl.floor.sums[0, world, part, lane]
+            kinetic += ctl.floor.sums[1, world, part, lane]
+            strain += ctl.floor.sums[2, world, part, lane]
+            step = wp.max(step, ctl.floor.sums[3, world, part, lane])
+            speed = wp.max(speed, ctl.floor.sums[5, world, part, lane])
         eta = f64(1.0e30)
-        if ctl.negative_curvature[world] == 0 and wp.isfinite(work) and whole > f64(0.0):
+        if ctl.solve.negative_curvature[world] == 0 and wp.isfinite(work) and whole > f64(0.0):
             eta = wp.sqrt(wp.abs(work) * dq / wp.max(f64(2.0) * strain + kinetic * dq, f64(1.0e-300)))
-            if ctl.eps > f64(SINGLE_PRECISION_EPS):  # a soft direction may be invisible to the energy
+            if ctl.floor.eps > f64(SINGLE_PRECISION_EPS):  # a soft direction may be invisible to the energy
                 eta = wp.max(eta, f64(SCATTER_FACTOR) * dq * step / wp.max(largest, f64(1.0e-300)))
-            if eta > ctl.max_floor_error and dq * step <= f64(DISPLACEMENT_ROUNDINGS) * ctl.eps * largest:
+            if eta > ctl.floor.max_error and dq * step <= f64(DISPLACEMENT_ROUNDINGS) * ctl.floor.eps * largest:
                 eta = dq * step / wp.max(largest, f64(1.0e-300))
-            slow = step <= f64(VELOCITY_ROUNDINGS) * ctl.eps * speed
-            if eta > ctl.max_floor_error and slow and ctl.eps < f64(SINGLE_PRECISION_EPS):
+            slow = step <= f64(VELOCITY_ROUNDINGS) * ctl.floor.eps * speed
+            if eta > ctl.floor.max_error and slow and ctl.floor.eps < f64(SINGLE_PRECISION_EPS):
                 eta = step / speed
         return eta
 
@@ -233,36 +239,38 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         separately, since a stiff part would hide the error of a soft one joined to it.
         """
         world = wp.tid()
-        if ctl.estimate_error[world] != 2:
+        if ctl.floor.estimate_error[world] != 2:
             return
-        ctl.estimate_error[world] = 0
+        ctl.floor.estimate_error[world] = 0
         # this solve cannot give the error either
-        if ctl.pcg_unconverged[world] != 0 and ctl.eps > f64(SINGLE_PRECISION_EPS):
+        if ctl.solve.pcg_unconverged[world] != 0 and ctl.floor.eps > f64(SINGLE_PRECISION_EPS):
             give_up(ctl, world, FAIL_ROUNDOFF)
             return
         largest, whole = f64(0.0), f64(0.0)
         for part in range(component_of_part.shape[0]):
             for lane in range(FLOOR_LANES):
-                whole += ctl.floor_sums[0, world, part, lane]
-                largest = wp.max(largest, ctl.floor_sums[4, world, part, lane])
+                whole += ctl.floor.sums[0, world, part, lane]
+                largest = wp.max(largest, ctl.floor.sums[4, world, part, lane])
         if wp.static(unilateral):  # gaps have position round-off
             largest = wp.max(largest, ctl.model_size)
         worst = f64(0.0)
         for part in range(component_of_part.shape[0]):
-            if ctl.component_converged[world, component_of_part[part]] == 0:
+            if ctl.norms.component_converged[world, component_of_part[part]] == 0:
                 worst = wp.max(worst, part_error(ctl, world, part, whole, largest))
-        ctl.error_estimate[world] = worst
-        if worst <= ctl.max_floor_error:
-            ctl.floor_error[world] = wp.max(ctl.floor_error[world], worst)
+        ctl.floor.error_estimate[world] = worst
+        if worst <= ctl.floor.max_error:
+            ctl.floor.error[world] = wp.max(ctl.floor.error[world], worst)
             accept_iterate(ctl, world)
             return
-        tries = ctl.error_estimates[world] + 1
-        ctl.error_estimates[world] = tries
+        tries = ctl.floor.estimates[world] + 1
+        ctl.floor.estimates[world] = tries
         known = worst < f64(1.0e30)
-        if tries >= MAX_ERROR_ESTIMATES or (known and tries > 1 and worst > f64(0.5) * ctl.last_error_estimate[world]):
+        if tries >= MAX_ERROR_ESTIMATES or (
+            known and tries > 1 and worst > f64(0.5) * ctl.floor.last_error_estimate[world]
+        ):
             give_up(ctl, world, wp.where(known, FAIL_ROUNDOFF, FAIL_CURVATURE))
             return
-        ctl.last_error_estimate[world] = worst
+        ctl.floor.last_error_estimate[world] = worst
         check_direction(ctl, world)
 
     @wp.kernel(module=module)
@@ -270,36 +278,36 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         """Slope along the new direction; the first trial is the full step."""
         world = wp.tid()
         if ctl.active[world] == 0:
-            ctl.searching[world] = 0
+            ctl.search.active[world] = 0
             return
-        ctl.slope[world] = ctl.slope_sum[0, world]
-        ctl.alpha[world] = f64(1.0)
+        ctl.search.slope[world] = ctl.search.slope_sum[0, world]
+        ctl.search.alpha[world] = f64(1.0)
         if wp.static(limited):
-            ctl.alpha[world] = wp.min(ctl.limit[world], f64(1.0))
-        ctl.linear_solves[world] = ctl.linear_solves[world] + 1
-        ctl.search_trials[world] = 0
-        ctl.doublings[world] = wp.where(ctl.negative_curvature[world] != 0 and ctl.is_static != 0, 0, -1)
+            ctl.search.alpha[world] = wp.min(ctl.search.limit[world], f64(1.0))
+        ctl.solve.count[world] = ctl.solve.count[world] + 1
+        ctl.search.trials[world] = 0
+        ctl.search.doublings[world] = wp.where(ctl.solve.negative_curvature[world] != 0 and ctl.is_static != 0, 0, -1)
         if wp.static(unilateral):
-            ctl.bracket_low[world] = wp.vec2d(f64(0.0), ctl.slope_sum[0, world])
-            ctl.bracket_high[world] = wp.vec2d()
-        ctl.nonmonotone_trial[world] = 0
-        ctl.direction_gradient[world] = f64(0.0)
-        ctl.searching[world] = 1
-        ctl.extrapolated_start[world] = 0
-        ctl.store_best[world] = 0
+            ctl.search.bracket_low[world] = wp.vec2d(f64(0.0), ctl.search.slope_sum[0, world])
+            ctl.search.bracket_high[world] = wp.vec2d()
+        ctl.nonmonotone.trial[world] = 0
+        ctl.nonmonotone.direction_gradient[world] = f64(0.0)
+        ctl.search.active[world] = 1
+        ctl.start.extrapolated[world] = 0
+        ctl.nonmonotone.store_best[world] = 0
         if wp.static(stored):
-            ctl.trial_accepted[world] = 0
+            ctl.search.trial_accepted[world] = 0
         if wp.static(has_constraints):
             if ctl.classical_multipliers == 0:
                 ctl.multiplier_updates[world] = ctl.multiplier_updates[world] + 1
-        if ctl.estimate_error[world] != 0 and pcg.step_iterations[world] < pcg.max_work:
+        if ctl.floor.estimate_error[world] != 0 and pcg.step_iterations[world] < pcg.max_work:
             # estimate the error before following the direction
-            ctl.estimate_error[world] = 2
-            ctl.searching[world] = 0
+            ctl.floor.estimate_error[world] = 2
+            ctl.search.active[world] = 0
             wp.atomic_max(ctl.any_rare_branch, 0, 1)
         elif pcg.step_iterations[world] >= pcg.max_work:
             give_up(ctl, world, FAIL_WORK)
-        elif ctl.linear_solves[world] > MAX_SOLVES_PER_ITERATION * iteration_factor(ctl, world) * ctl.max_iterations:
+        elif ctl.solve.count[world] > MAX_SOLVES_PER_ITERATION * iteration_factor(ctl, world) * ctl.max_iterations:
             give_up(ctl, world, FAIL_ITERATIONS)
         else:
             check_direction(ctl, world)

@@ -88,24 +88,24 @@ def forcing_functions(has_constraints: bool) -> _types.SimpleNamespace:
     @wp.func
     def min_target_norm(newton: Newton, world: int) -> f64:
         """Fraction of the accepted residual norm: a smaller residual of the solve gains nothing."""
-        least = f64(0.1) * newton.unconverged_tol[world]
+        least = f64(0.1) * newton.norms.unconverged_tol[world]
         if wp.static(has_constraints):
             # the solve also yields the constraint forces: the residual across constraints is their error
             least = f64(CONSTRAINT_FORCING) * least
             if newton.classical_multipliers == 0:
                 # a loose force tolerance must not leave constraints violated
-                least = least / wp.max(f64(10.0) * newton.violation_ratio[world], f64(1.0))
+                least = least / wp.max(f64(10.0) * newton.norms.violation_ratio[world], f64(1.0))
         return least
 
     @wp.func
     def forcing_target(newton: Newton, world: int, norm: f64) -> f64:
         """Forcing term times the residual, |r| = norm at the start, and at least `min_target_norm`."""
-        if newton.fixed_forcing != 0:
-            return newton.forcing[world] * norm
-        goal = newton.forcing[world] * newton.unconverged_norm[world]
+        if newton.solve.fixed_forcing != 0:
+            return newton.solve.forcing[world] * norm
+        goal = newton.solve.forcing[world] * newton.norms.unconverged_norm[world]
         if wp.static(has_constraints):
             # with balanced forces the remaining constraint violation may still require a step
-            goal = newton.forcing[world] * wp.min(newton.unconverged_norm[world], norm)
+            goal = newton.solve.forcing[world] * wp.min(newton.norms.unconverged_norm[world], norm)
             if newton.classical_multipliers == 0:
                 goal = f64(CONSTRAINT_FORCING) * goal
         return wp.max(goal, min_target_norm(newton, world))
@@ -138,7 +138,7 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNames
     def zero_converged(newton: Newton, of_slot: int_1d, active: int_1d, r: p.vec3_2d):
         """r = 0 on converged components of the model: the solve for the others must not move them."""
         world, slot = wp.tid()
-        if active[world] != 0 and newton.component_converged[world, of_slot[slot]] != 0:
+        if active[world] != 0 and newton.norms.component_converged[world, of_slot[slot]] != 0:
             r[world, slot] = vec3()
 
     @wp.kernel(module=module)
@@ -173,9 +173,9 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNames
         ctl.iterations[world] = 0
         ctl.negative_curvature[world] = 0
         ctl.follow_negative_curvature[world] = 1 - newton.linear_stress
-        estimate_error = newton.estimate_error[world] != 0
+        estimate_error = newton.floor.estimate_error[world] != 0
         # a linear prediction must also cover the whole step; other laws are not linear that far
-        whole = newton.predicted_stress[world] == 1 and newton.linear_stress != 0
+        whole = newton.solve.predicted_stress[world] == 1 and newton.linear_stress != 0
         ctl.estimate_error[world] = wp.where(estimate_error or whole, 1, 0)
         if not estimate_error:
             ctl.pcg_unconverged[world] = 0
@@ -190,7 +190,7 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNames
         if norm > ctl.target_norm[world] and rz > f64(0.0) and ctl.max_iterations > 0:
             checked = (
                 newton.iterations[world] >= UNCHECKED_ITERATIONS
-                or newton.predicted_stress[world] != 0
+                or newton.solve.predicted_stress[world] != 0
                 or ctl.estimate_error[world] != 0
             )
             if ctl.preconditioner_is_exact[world] != 0 and not checked:

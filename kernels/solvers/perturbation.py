@@ -37,7 +37,7 @@ def perturbation_kernels(dtype: str) -> _types.SimpleNamespace:
     def begin_samples(ctl: Control, flags: int_1d, perturbation_sum: p.vec3_2d, gradient_sum: p.vec3_2d):
         """Flag the worlds whose next solve estimates the error; clear both sums there."""
         world, slot = wp.tid()
-        asks = ctl.active[world] != 0 and ctl.estimate_error[world] == 1  # finished worlds keep their positions
+        asks = ctl.active[world] != 0 and ctl.floor.estimate_error[world] == 1  # finished worlds keep their positions
         if slot == 0:
             flags[world] = wp.where(asks, 1, 0)
         if asks:
@@ -57,7 +57,7 @@ def perturbation_kernels(dtype: str) -> _types.SimpleNamespace:
         y = vec3()
         state = wp.rand_init(sample, slot)
         for k in range(3):
-            y[k] = x[k] + T(f64(wp.randi(state, -MAX_PERTURBATION, MAX_PERTURBATION + 1)) * ctl.eps) * x[k]
+            y[k] = x[k] + T(f64(wp.randi(state, -MAX_PERTURBATION, MAX_PERTURBATION + 1)) * ctl.floor.eps) * x[k]
         u[world, slot] = y
         perturbation_sum[world, slot] = perturbation_sum[world, slot] + (y - x) / T(ctl.dq_dv[world])
 

@@ -122,11 +122,11 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
         if keep == 2:
             restore_counts(reuse, world)
         k = newton.iterations[world]
-        need = wp.log10(wp.max(newton.convergence_ratio[world], f64(1.0)))
+        need = wp.log10(wp.max(newton.norms.ratio[world], f64(1.0)))
         fresh = wp.max(need / f64(NEW_MATRIX_DECADES), f64(1.0))
-        if newton.estimate_error[world] != 0 or newton.predicted_stress[world] != 0:
+        if newton.floor.estimate_error[world] != 0 or newton.solve.predicted_stress[world] != 0:
             reuse.rebuild_due[world] = 1
-        if newton.operator_reused[world] == 2:
+        if newton.solve.operator_reused[world] == 2:
             reuse.rebuild_due[world] = 1
             if k == 0:
                 reuse.first_reduction[world] = f64(1.0)
@@ -141,26 +141,26 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
                 reuse.rebuild_due[world] = 1
                 reuse.first_reduction[world] = f64(REDUCTION_FADING) * reuse.first_reduction[world]
             return
-        slow = need > gained_decades(newton.residual_reduction[world]) * (fresh + reuse.max_extra_iterations)
+        slow = need > gained_decades(newton.norms.residual_reduction[world]) * (fresh + reuse.max_extra_iterations)
         late = 3 * k >= newton.max_iterations
-        if newton.alpha[world] != f64(1.0) or slow or late:
+        if newton.search.alpha[world] != f64(1.0) or slow or late:
             reuse.rebuild_due[world] = 1
 
     @wp.kernel(module=module)
     def loosen_forcing(reuse: Reuse, newton: Newton):
         """Loosen the forcing term of a solve with a reused matrix to the expected reduction by an iteration."""
         world = wp.tid()
-        newton.operator_reused[world] = 1 - reuse.build_at_iterate[world]
+        newton.solve.operator_reused[world] = 1 - reuse.build_at_iterate[world]
         if newton.active[world] == 0:
             return
         reduction = reuse.first_reduction[world]
         if newton.iterations[world] > 0:
-            reduction = newton.residual_reduction[world]
+            reduction = newton.norms.residual_reduction[world]
             if newton.iterations[world] == 1 and reuse.built_at_iteration[world] == -1:
                 reuse.first_reduction[world] = reduction
-        if reuse.build_at_iterate[world] == 0 and newton.fixed_forcing == 0:
-            newton.forcing[world] = wp.max(
-                newton.forcing[world], wp.min(f64(REUSED_FORCING_FACTOR) * reduction, f64(0.1))
+        if reuse.build_at_iterate[world] == 0 and newton.solve.fixed_forcing == 0:
+            newton.solve.forcing[world] = wp.max(
+                newton.solve.forcing[world], wp.min(f64(REUSED_FORCING_FACTOR) * reduction, f64(0.1))
             )
 
     @wp.kernel(module=module)
@@ -169,7 +169,7 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
         world = wp.tid()
         if accepted[world] == 0 or reuse.stale[world] != 0:
             return
-        if newton.predicted_stress[world] != 0:
+        if newton.solve.predicted_stress[world] != 0:
             reuse.rebuild_due[world] = 1  # the state lacks its linearisation point
         built_at_iteration = wp.max(reuse.built_at_iteration[world], 0)
         # a step that rebuilt it midway began with another matrix: count one more iteration

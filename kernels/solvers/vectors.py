@@ -69,18 +69,18 @@ def vector_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNa
     def trial_velocity(ctl: Control, base: p.vec3_2d, direction: p.vec3_2d, best: p.vec3_2d, v: p.vec3_2d):
         """v = base + alpha p, or the best iterate if that is to be restored."""
         world, slot = wp.tid()
-        if ctl.searching[world] != 0:
-            if ctl.restore_best[world] != 0:
+        if ctl.search.active[world] != 0:
+            if ctl.nonmonotone.restore_best[world] != 0:
                 v[world, slot] = best[world, slot]
             else:
-                v[world, slot] = base[world, slot] + T(ctl.alpha[world]) * direction[world, slot]
+                v[world, slot] = base[world, slot] + T(ctl.search.alpha[world]) * direction[world, slot]
 
     @wp.kernel(module=module)
     def set_base(ctl: Control, v: p.vec3_2d, base: p.vec3_2d, best: p.vec3_2d):
         """base = v; before that, best iterate = base in the marked worlds."""
         world, slot = wp.tid()
         if ctl.active[world] != 0:
-            if ctl.store_best[world] != 0:
+            if ctl.nonmonotone.store_best[world] != 0:
                 best[world, slot] = base[world, slot]
             base[world, slot] = v[world, slot]
 
@@ -101,7 +101,7 @@ def vector_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNa
     ):
         """Strided partial sums of FLOOR_ROWS over the slots and elements of a part; empty lists: all."""
         world, part, lane = wp.tid()
-        if ctl.estimate_error[world] != 2:
+        if ctl.floor.estimate_error[world] != 2:
             return
         work, kinetic, strain = f64(0.0), f64(0.0), f64(0.0)
         step, size, speed = f64(0.0), f64(0.0), f64(0.0)
@@ -120,12 +120,12 @@ def vector_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNa
             if element.shape[0] > 0:
                 e = element[k]
             strain += energy[0, world, e]
-        ctl.floor_sums[0, world, part, lane] = work
-        ctl.floor_sums[1, world, part, lane] = kinetic
-        ctl.floor_sums[2, world, part, lane] = strain
-        ctl.floor_sums[3, world, part, lane] = step
-        ctl.floor_sums[4, world, part, lane] = size
-        ctl.floor_sums[5, world, part, lane] = speed
+        ctl.floor.sums[0, world, part, lane] = work
+        ctl.floor.sums[1, world, part, lane] = kinetic
+        ctl.floor.sums[2, world, part, lane] = strain
+        ctl.floor.sums[3, world, part, lane] = step
+        ctl.floor.sums[4, world, part, lane] = size
+        ctl.floor.sums[5, world, part, lane] = speed
 
     @wp.kernel(module=module)
     def copy_active(source: p.vec3_2d, active: int_1d, target: p.vec3_2d):

@@ -70,8 +70,8 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         step.running[world] = alive
         step.rejected[world] = 0
         newton.step_iterations[world] = 0
-        newton.accepted_unconverged[world] = 0
-        newton.step_floor_error[world] = f64(0.0)
+        newton.floor.accepted_unconverged[world] = 0
+        newton.floor.step_error[world] = f64(0.0)
         newton.strain_energy_start[world] = newton.strain_energy[world]
         if wp.static(has_constraints):
             newton.multiplier_updates[world] = 0
@@ -97,8 +97,8 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         step.accepted[world] = 0
         step.first_rejection[world] = 0
         newton.active[world] = step.running[world]
-        newton.searching[world] = 0
-        newton.floor_error[world] = f64(0.0)
+        newton.search.active[world] = 0
+        newton.floor.error[world] = f64(0.0)
         newton.inversion_suspected[world] = 0
         newton.inverted[world] = 0
         if step.running[world] == 0:
@@ -209,7 +209,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
     ):
         """Alternative first iterate on the free components: 0: v~ + (dq/dv) g, 1: v_n, 2: the one with q = q_n."""
         world, slot = wp.tid()
-        if newton.choose_first_iterate[world] == 0:
+        if newton.start.choose[world] == 0:
             return
         dq = T(step.dq_dv[world])
         new = v_n[world, slot]
@@ -235,7 +235,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         if newton.failed[world] == 0:
             step.accepted[world] = 1
             step.step_min_J[world] = wp.min(step.step_min_J[world], newton.min_J[world])
-            newton.step_floor_error[world] = wp.max(newton.step_floor_error[world], newton.floor_error[world])
+            newton.floor.step_error[world] = wp.max(newton.floor.step_error[world], newton.floor.error[world])
             part = step.substep_index[world] + 1
             level = step.halving_level[world]
             while level > 0 and part % 2 == 0:
@@ -325,7 +325,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         report[world, 0] = f64(step.status[world])
         report[world, 1] = f64(newton.step_iterations[world])
         report[world, 2] = f64(pcg.step_iterations[world])
-        report[world, 3] = newton.relative_residual[world]
+        report[world, 3] = newton.norms.relative_residual[world]
         report[world, 4] = f64(step.halvings[world])
         report[world, 5] = step.step_min_J[world]
         report[world, 6] = step.time[world]
@@ -333,16 +333,16 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         report[world, 8] = step.new_time[world]
         report[world, 9] = f64(0.0)
         report[world, 10] = f64(0.0)
-        report[world, 11] = newton.residual_force[world]
-        report[world, 12] = f64(newton.accepted_unconverged[world])
-        report[world, 13] = newton.step_floor_error[world]
+        report[world, 11] = newton.norms.residual_force[world]
+        report[world, 12] = f64(newton.floor.accepted_unconverged[world])
+        report[world, 13] = newton.floor.step_error[world]
         report[world, 14] = f64(0.0)
         if step.growth_monitored != 0:
             report[world, 14] = step.energy_growth[world, GROWTH_SHARE]
         if wp.static(has_constraints):
             largest = f64(0.0)
-            for c in range(newton.component_count):
-                largest = wp.max(largest, newton.violation[world, c])
+            for c in range(newton.norms.component_count):
+                largest = wp.max(largest, newton.norms.violation[world, c])
             report[world, 9] = largest
             report[world, 10] = f64(newton.multiplier_updates[world])
 

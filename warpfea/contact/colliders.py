@@ -145,7 +145,7 @@ class ColliderContact(ContactTerm):
         s, w = ctx.scratch[self.name], ctx.work
         state = (ctx.state.displacement, ctx.state.velocity)
         place = self.deepest_points.choose
-        place(ctx.launch, s, w.step.new_time, s["u"], state, active, w.newton.unilateral_changed, fresh=fresh)
+        place(ctx.launch, s, w.step.new_time, s["u"], state, active, w.newton.frozen.unilateral_changed, fresh=fresh)
 
     @part()
     def update_frozen(self, ctx: StepContext, flags: wp.array) -> None:

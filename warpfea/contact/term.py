@@ -123,7 +123,7 @@ class ContactTerm(Term):
             "attempt": attempt,
             "clock": clock,
             # Newton's method only; unused by Jacobi's iteration
-            "contact_active": work.newton.contact_active,
+            "contact_active": work.newton.frozen.contact_active,
             "energies": work.array(f"{self.name} energies", (ENERGY_COLUMNS, B, t.rows), wp.float64),
             "parts": work.array(f"{self.name} parts", parts, wp.float64),
             "row_start": self.model.array("contact", t.row_start, wp.int32),
@@ -174,7 +174,7 @@ class ContactTerm(Term):
         k, m, newton = self.point_kernels, self.model, ctx.work.newton
         attempt = ctx.scratch[self.name]["attempt"]
         ctx.launch(k.aitken_partial_sums, (m.worlds, AITKEN_LANES), [flags, attempt])
-        ctx.launch(k.aitken_relaxation, m.worlds, [flags, newton.tol, attempt, newton.partly_updated])
+        ctx.launch(k.aitken_relaxation, m.worlds, [flags, newton.norms.tol, attempt, newton.frozen.partly_updated])
         ctx.launch(k.update_frozen, (m.worlds, self.tables.points), [flags, attempt])
 
     @part()

@@ -67,7 +67,7 @@ def step_error(sim: Any, world: int) -> ConvergenceError | ConstraintError:
     if code == FAIL_CONSTRAINT:
         return _constraint_error(sim, world, time, halvings)
     count = int(work.newton.iterations.numpy()[world]) + 1
-    history = work.newton.residual_history.numpy()[world, :count].tolist()
+    history = work.newton.norms.residual_history.numpy()[world, :count].tolist()
     if code in (FAIL_JACOBIAN, FAIL_ELEMENT_INVERTED):
         element, where = lowest_jacobian(sim.model, work.u.numpy()[world].astype(float))
     else:
@@ -107,7 +107,7 @@ def _failure_reason(sim: Any, code: int, world: int) -> tuple[str, str]:
     direct = sim.stepper.newton.direct
     if code == FAIL_CURVATURE and direct is not None and world in direct.singular_worlds:
         return "singular tangent matrix (unconstrained body or mechanism?)", ""
-    near = float(work.newton.rounding_ratio.numpy()[world]) <= STALL_ROUNDINGS
+    near = float(work.newton.floor.rounding_ratio.numpy()[world]) <= STALL_ROUNDINGS
     finer = "; use float64" if dtype == "float32" else "; use fewer, stouter elements, or check the units"
     adaptive = sim.stepper.step_size_control
     if code == FAIL_ROUNDOFF and adaptive and (least := adaptive.smallest_resolved_error(world)):
@@ -116,7 +116,7 @@ def _failure_reason(sim: Any, code: int, world: int) -> tuple[str, str]:
     if code == FAIL_LOCAL_ERROR:
         return FAILURE_REASONS[code], f"; {'use float64, or ' if dtype == 'float32' else 'use '}a larger error"
     if code == FAIL_ROUNDOFF:
-        eta = float(work.newton.error_estimate.numpy()[world])
+        eta = float(work.newton.floor.error_estimate.numpy()[world])
         left = ""
         if eta < NO_ERROR_ESTIMATE:
             left = f" (estimated error {eta:.2g})"
@@ -130,7 +130,7 @@ def _failure_reason(sim: Any, code: int, world: int) -> tuple[str, str]:
         return spent, "" if overload_text(sim.model) else slivers
     if code == FAIL_ELEMENT_INVERTED:
         return FAILURE_REASONS[code], f"{smaller}, or NeoHookean in place of SVK; inversion='report' lets it pass"
-    bent = sim.integrator.static and int(work.newton.met_negative_curvature.numpy()[world])
+    bent = sim.integrator.static and int(work.newton.solve.met_negative_curvature.numpy()[world])
     if code in INDEFINITE_FAILURES and near and (dtype == "float32" or not bent):
         return f"{dtype} round-off limit reached", finer
     if code in INDEFINITE_FAILURES and bent and dtype == "float32":

@@ -190,8 +190,8 @@ class TangentOperator:
         w = self.work
         every = self.flags(np.ones(self.model.worlds))
         w.newton.active.fill_(1)
-        w.newton.component_converged.zero_()
-        w.newton.predicted_stress.zero_()
+        w.newton.norms.component_converged.zero_()
+        w.newton.solve.predicted_stress.zero_()
         self.residual.assemble_matrix(every)
         self.stepper.newton.preconditioner.prepare(every)
         self.diagonal = np.where(self.free_components > 0.0, w.diagonal.numpy().astype(float), 1.0)

@@ -148,7 +148,7 @@ class JacobiLoop(NewtonLoop):
         self.methods = {"solver": "jacobi"}
         # multipliers are updated once, on acceptance: no outer loop, and convergence includes violations
         self.outer_multipliers = False
-        work.newton.constraint_tol = constraint_tol
+        work.newton.norms.constraint_tol = constraint_tol
         assert isinstance(self.preconditioner, TwoLevel)
         self.preconditioner.rebuild_cost = REBUILD_COST
         self.acceleration = options.acceleration

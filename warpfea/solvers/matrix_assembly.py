@@ -223,7 +223,7 @@ class MatrixAssembler:
         """
         w = self.work
         every = worlds or range(self.model.worlds)
-        state = [u, w.v_stage, w.base_velocity, w.newton.predicted_stress, w.history, *factors, active, out]
+        state = [u, w.v_stage, w.base_velocity, w.newton.solve.predicted_stress, w.history, *factors, active, out]
         for first in range(every.start, every.stop, self.worlds_per_chunk):
             last = min(first + self.worlds_per_chunk, every.stop)
             if last - first == self.model.worlds:

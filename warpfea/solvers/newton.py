@@ -213,30 +213,30 @@ class NewtonLoop:
         ctl.dq_dv = work.step.dq_dv
         # a good preconditioner makes a decade of PCG cheaper than another Newton iteration
         # (in statics the first iterates are far off: solving them tightly is wasted)
-        ctl.first_forcing = 0.1 if kind in ("block-jacobi", "deflated") or not inertia else 0.001
+        ctl.solve.first_forcing = 0.1 if kind in ("block-jacobi", "deflated") or not inertia else 0.001
         if traits.has_constraints:  # constraints are stiff: a loose first solve costs more iterations than it saves
-            ctl.first_forcing = min(ctl.first_forcing, 0.01)
-        ctl.fixed_forcing = int(options.forcing is not None)
+            ctl.solve.first_forcing = min(ctl.solve.first_forcing, 0.01)
+        ctl.solve.fixed_forcing = int(options.forcing is not None)
         if options.forcing is not None:
-            ctl.first_forcing = options.forcing
-        ctl.force_tol = options.force_tol
-        ctl.tol = options.tolerance(model.dtype)
-        ctl.eps = MACHINE_EPSILON[model.dtype]
+            ctl.solve.first_forcing = options.forcing
+        ctl.norms.force_tol = options.force_tol
+        ctl.norms.tol = options.tolerance(model.dtype)
+        ctl.floor.eps = MACHINE_EPSILON[model.dtype]
         ctl.is_static = int(not inertia)
         ctl.model_size = float(model.size)
-        ctl.component_of_group = model.residual_groups.component
+        ctl.norms.component_of_group = model.residual_groups.component
         ctl.max_iterations = options.max_newton
-        ctl.max_floor_error = MAX_ROUND_OFF_ERROR[model.dtype]
+        ctl.floor.max_error = MAX_ROUND_OFF_ERROR[model.dtype]
         ctl.refuse_inversion = int(inversion == "refuse")
         ctl.linear_stress = int(all(block.key.law in DEFINED_FOR_ANY_J for block in model.blocks))
         rate = inertia and any(b.key.damping == "rate" for b in model.blocks)
         ctl.has_nonpotential = int(traits.nonpotential or rate)
         ctl.classical_multipliers = int(self.outer_multipliers)
-        ctl.penalty_norm_ratio = 1.0 / math.sqrt(1.0 + penalty_ratio)
-        ctl.constraint_tol = 1e300 if self.outer_multipliers else constraint_tol  # inner solves converge g only
+        ctl.norms.penalty_norm_ratio = 1.0 / math.sqrt(1.0 + penalty_ratio)
+        ctl.norms.constraint_tol = 1e300 if self.outer_multipliers else constraint_tol  # inner solves converge g only
         if ctx.accelerated and model.dtype == "float64":  # float32 positions have a larger round-off
-            ctl.constraint_acceleration_tol = max(constraint_tol / model.size, ctl.tol) * ACCELERATION_SCALE
-            ctl.constraint_tol_min = MIN_CONSTRAINT_TOL * model.size
+            ctl.norms.constraint_acceleration_tol = max(constraint_tol / model.size, ctl.norms.tol) * ACCELERATION_SCALE
+            ctl.norms.constraint_tol_min = MIN_CONSTRAINT_TOL * model.size
         # in double precision round-off is far below the errors for which steps are rejected; forces at a mid-point are
         # not those of the positions
         self.perturbation_kernels = None
@@ -304,7 +304,7 @@ class NewtonLoop:
     def _choose_first_iterate(self) -> None:
         """Select the best first iterate (J > 0 first, then lowest Phi)."""
         w, k, launch = self.work, self.kernels, self.launch
-        choose, better = w.newton.choose_first_iterate, w.newton.searching
+        choose, better = w.newton.start.choose, w.newton.search.active
         launch(k.compare_first_iterates, self.model.worlds, [w.newton, 1, better])
         launch(self.vector_kernels.copy_active, self.dim, [w.v, better, w.best_velocity])
         for put in self.first_iterate_candidates:
@@ -327,7 +327,7 @@ class NewtonLoop:
     def _update_multipliers(self) -> None:
         """Update multipliers, lambda += rho c, in worlds with violated constraints; solve again from the current v."""
         w = self.work
-        self._call_terms("update_multipliers", w.newton.trial_accepted)
+        self._call_terms("update_multipliers", w.newton.search.trial_accepted)
         self.residual.evaluate(w.newton.active, freeze=True)
         self._solve()
         self._check_constraints()
@@ -338,7 +338,7 @@ class NewtonLoop:
         self.residual.linearise(active)
         if self.perturbation_kernels:
             with launch.rare():
-                wp.capture_if(w.newton.any_estimate_error, self._average_perturbed_residuals)
+                wp.capture_if(w.newton.floor.any_estimate_error, self._average_perturbed_residuals)
         self.pcg.solve(active)
         self.residual.freeze_nonpotential(active)
         self.residual.tangent_curvature(active)
@@ -347,7 +347,7 @@ class NewtonLoop:
         self._call_terms("process_direction", active)
         launch(self.vector_kernels.set_base, self.dim, [w.newton, w.v, w.base_velocity, w.best_velocity])
         launch(self.vector_kernels.dot_terms, self.dim, [w.gradient, w.direction, active, w.rows])
-        self.residual.reduce(w.rows, 1, active, w.newton.slope_sum)
+        self.residual.reduce(w.rows, 1, active, w.newton.search.slope_sum)
         launch(k.begin_search, self.model.worlds, [w.newton, w.pcg])
         self._line_search()
         self._run_if_rare(self._run_rare_branch)
@@ -375,18 +375,18 @@ class NewtonLoop:
         self.residual.product(w.p, w.Hp, flags)
         args = [self.model.topology, w.step.mass_factor, flags, w.p, w.Hp, w.z, w.gradient]
         launch(k.mean_gradient, self.dim, args)
-        w.newton.any_estimate_error.zero_()
+        w.newton.floor.any_estimate_error.zero_()
 
     @launch_part("control")
     def _update_frozen(self) -> None:
         """Update lagged term data (friction limits, multipliers) after convergence with frozen values."""
-        w, flags = self.work, self.work.newton.trial_accepted
+        w, flags = self.work, self.work.newton.search.trial_accepted
         self.launch(self.kernels.begin_frozen_update, self.model.worlds, [w.newton, flags])
         self._reduce_flags(flags, self.any_searching)
         wp.capture_if(self.any_searching, self._reevaluate_frozen)
 
     def _reevaluate_frozen(self) -> None:
-        w, flags = self.work, self.work.newton.trial_accepted
+        w, flags = self.work, self.work.newton.search.trial_accepted
         self._call_terms("update_frozen", flags)
         self.residual.reevaluate_frozen(flags)
         self.launch(self.kernels.end_frozen_update, self.model.worlds, [w.newton, flags])
@@ -418,18 +418,18 @@ class NewtonLoop:
 
     def _line_search(self) -> None:
         """Try step lengths until no world searches."""
-        self._reduce_flags(self.work.newton.searching, self.any_searching)
+        self._reduce_flags(self.work.newton.search.active, self.any_searching)
         wp.capture_while(self.any_searching, self._try_step_length)
 
     def _try_step_length(self) -> None:
         w, k, launch = self.work, self.kernels, self.launch
         args = [w.newton, w.base_velocity, w.direction, w.best_velocity, w.v]
         launch(self.vector_kernels.trial_velocity, self.dim, args)
-        self.residual.evaluate(w.newton.searching)
+        self.residual.evaluate(w.newton.search.active)
         launch(k.check_trial, self.model.worlds, [w.newton])
         if self.terms.traits.stored:
-            self._call_terms("accept_trial", w.newton.trial_accepted)
-        self._reduce_flags(w.newton.searching, self.any_searching)
+            self._call_terms("accept_trial", w.newton.search.trial_accepted)
+        self._reduce_flags(w.newton.search.active, self.any_searching)
 
     def _run_if_rare(self, do: Callable[[], None]) -> None:
         """Run `do` if any world needs the rare branch."""

@@ -280,7 +280,9 @@ class Residual:
             args += [w.rows, w.energy_rows, active, w.residual_group_partial]
             launch(self.vector_kernels.group_norm_partials, (m.worlds, groups.count, GROUP_LANES), args)
             sums = (GROUP_ROWS, m.worlds, groups.count)
-            launch(self.vector_kernels.sum_group_norms, sums, [w.residual_group_partial, active, w.newton.group_sums])
+            launch(
+                self.vector_kernels.sum_group_norms, sums, [w.residual_group_partial, active, w.newton.norms.group_sums]
+            )
 
     @launch_part("loads")
     def freeze_nonpotential(self, active: wp.array) -> None:
@@ -353,4 +355,4 @@ class Residual:
         args = [self.terms.nonpotential_topology, w.nonpotential_tangent, active, w.Hp]
         launch(self.gather_kernels.gather_force, self.dim, args)
         launch(self.vector_kernels.dot_terms, self.dim, [w.Hp, w.direction, active, w.rows])  # p is 0 where prescribed
-        self.reduce(w.rows, 1, active, w.newton.tangent_sum)
+        self.reduce(w.rows, 1, active, w.newton.search.tangent_sum)

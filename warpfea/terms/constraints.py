@@ -120,7 +120,7 @@ class Constraints(Term):
     def configure(self, ctx: StepContext) -> None:
         """Read the solver's options: classical updates or not, kappa, and whether constraint directions are
         deflated."""
-        ctx.work.newton.violation = ctx.work.multipliers.violation
+        ctx.work.newton.norms.violation = ctx.work.multipliers.violation
         mul, options = ctx.work.multipliers, ctx.options
         mul.outer_updates, mul.penalty_ratio = int(options.outer_multipliers), options.penalty_ratio
         deflate = bool(options.deflate_constraints)
@@ -154,7 +154,7 @@ class Constraints(Term):
         """Evaluate c, J and the rows of the augmented potential at work.u."""
         m, w, k = self.model, ctx.work, self.integrator_kernels(ctx)
         ctx.launch(k.reset_violation, (m.worlds, m.component_count), [active, w.multipliers])
-        args = [self.tables.data, w.u, w.u_stage, w.time_law_values, w.newton.alpha, active, w.multipliers]
+        args = [self.tables.data, w.u, w.u_stage, w.time_law_values, w.newton.search.alpha, active, w.multipliers]
         ctx.launch(k.evaluate, self.dim, args)
 
     prepare = force  # J, for rho
@@ -197,7 +197,7 @@ class Constraints(Term):
     def process_direction(self, ctx: StepContext, active: wp.array) -> None:
         """Multiplier part of the Newton step in work.direction."""
         w = ctx.work
-        args = [self.tables.data, w.multipliers, w.direction, w.newton.component_converged, w.step.dq_dv, active]
+        args = [self.tables.data, w.multipliers, w.direction, w.newton.norms.component_converged, w.step.dq_dv, active]
         ctx.launch(self.integrator_kernels(ctx).predict_change, self.dim, args)
 
     def accept_trial(self, ctx: StepContext, flags: wp.array) -> None:

@@ -77,7 +77,7 @@ class Elements(Term):
         """Maximum gradient of a direction, into newton.direction_gradient."""
         for block, kernels in zip(self.model.blocks, self.kernels(ctx)):
             if not block.key.tying:
-                args = [ctx.work.data_of(block), p, active, ctx.work.newton.direction_gradient]
+                args = [ctx.work.data_of(block), p, active, ctx.work.newton.nonmonotone.direction_gradient]
                 ctx.launch(kernels.largest_gradient, (p.shape[0], block.count), args)
 
     def predicted_stress_kernels(self) -> list[wp.Kernel]:
@@ -93,7 +93,7 @@ class Elements(Term):
                 w.u,
                 w.v,
                 w.base_velocity,
-                w.newton.predicted_stress,
+                w.newton.solve.predicted_stress,
                 w.history,
                 w.step.dq_dv,
                 active,

@@ -273,7 +273,7 @@ class Term:
         """Forces and potential rows at work.u, work.v; in statics work.v is the load step increment, m."""
 
     def process_direction(self, ctx: StepContext, active: wp.array) -> None:
-        """Process the Newton direction work.direction. To limit the step, lower work.newton.limit.
+        """Process the Newton direction work.direction. To limit the step, lower work.newton.search.limit.
 
         A limit <= 0 allows no step: the attempt fails and is halved.
         """

@@ -111,41 +111,23 @@ class Workspace:
         self.residual_group_partial = self.array(
             "residual_group_partial", (*sums, GROUP_LANES) if groups > 1 else (1, 1, 1, 1), wp.float64
         )
-        skip: tuple[str, ...] = (
-            "violation",
-            "negative_curvature",
-            "pcg_unconverged",
-            "component_of_group",
-        )  # for other solvers
+        skip = ("violation", "negative_curvature", "pcg_unconverged", "component_of_group")  # for other solvers
         skip += () if traits.has_constraints else ("multiplier_updates", "violation_ratio")
         skip += () if traits.stored else ("term_sums", "trial_accepted")
         skip += () if traits.limited else ("limit",)
-        skip += (
-            ()
-            if traits.unilateral
-            else (
-                "frozen_updated",
-                "unilateral_changed",
-                "penetrating_steps",
-                "partly_updated",
-                "contact_active",
-                "bracket_low",
-                "bracket_high",
-            )
-        )
+        of_contact = ("updated", "unilateral_changed", "penetrating_steps", "partly_updated", "contact_active")
+        skip += () if traits.unilateral else (*of_contact, "bracket_low", "bracket_high")
         self.newton = self.struct(
             control_struct(), B, skip=skip,
             residual_history=(B, max_newton + 1), slot_sums=(RESIDUAL_ROWS, B), group_sums=sums,
             component_converged=(B, C),
-            term_sums=(TERM_ROWS, B), floor_sums=(FLOOR_ROWS, B, model.error_estimate_groups.count, FLOOR_LANES),
+            term_sums=(TERM_ROWS, B), sums=(FLOOR_ROWS, B, model.error_estimate_groups.count, FLOOR_LANES),
         )  # fmt: skip
-        self.newton.component_count, self.newton.group_count = C, groups
+        self.newton.norms.component_count, self.newton.norms.group_count = C, groups
         self.multipliers: Any = multiplier_struct()()  # of constraints, if any
         self.pcg = self.struct(pcg_struct(), B, sums=(2, B), curvature=(1, B))
-        self.newton.negative_curvature, self.newton.pcg_unconverged = (
-            self.pcg.negative_curvature,
-            self.pcg.pcg_unconverged,
-        )
+        solve = self.newton.solve
+        solve.negative_curvature, solve.pcg_unconverged = self.pcg.negative_curvature, self.pcg.pcg_unconverged
         unused: tuple[str, ...] = ("b", "q_a", "acceleration_step", "any_rejected", "summed_time", "world_end")
         unused += ("energy_growth", "min_energy")
         unused += () if midpoint else ("stage_time",)
@@ -189,7 +171,7 @@ class Workspace:
         return out
 
     def struct(self, kind: Any, worlds: int, skip: tuple[str, ...] = (), **shapes: tuple[int, ...]) -> Any:
-        """Control struct with one array [world] per array field, or of the given shape."""
+        """Control struct with one array [world] per array field of it and its structs, or of the given shape."""
         out = kind()
         special = {
             "elem_sums": (2, worlds),
@@ -198,6 +180,9 @@ class Workspace:
             **dict.fromkeys(("any_active", "any_running", "any_rare_branch", "any_estimate_error"), (1,)),
         } | shapes
         for name, var in kind.vars.items():
-            if isinstance(var.type, wp.array) and name not in skip:
-                setattr(out, name, self.array(f"{kind.key}.{name}", special.get(name, (worlds,)), var.type.dtype))
+            if isinstance(var.type, wp.array):
+                if name not in skip:
+                    setattr(out, name, self.array(f"{kind.key}.{name}", special.get(name, (worlds,)), var.type.dtype))
+            elif hasattr(var.type, "vars"):
+                setattr(out, name, self.struct(var.type, worlds, skip, **shapes))
         return out
