@@ -212,7 +212,7 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
             if force > f64(0.0):
                 # the force tolerance in this norm, by their ratio at this iterate
                 accepted_norm = wp.max(accepted_norm, norm * (ctl.norms.force_tol / force))
-            if ctl.start.extrapolated[world] != 0:
+            if ctl.start.is_extrapolated[world] != 0:
                 accepted_norm = f64(EXTRAPOLATED_TOL_FACTOR) * accepted_norm
             elif is_unsolved_unlike_stiffness(ctl, world):
                 accepted_norm = f64(UNSOLVED_TOL_FACTOR) * accepted_norm
@@ -285,7 +285,9 @@ def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
     def iteration_factor(ctl: Control, world: int) -> int:
         """Factor on `max_iterations` of an attempt: larger for a start far from the solution, or after negative
         curvature with a law that has its own tangent, since shorter steps meet it again."""
-        far = wp.max(ctl.start.choose[world], ctl.solve.met_negative_curvature[world] * (1 - ctl.linear_stress))
+        far = wp.max(
+            ctl.start.has_alternatives[world], ctl.solve.met_negative_curvature[world] * (1 - ctl.linear_stress)
+        )
         return 1 + EXTRA_ITERATION_FACTOR * far
 
     @wp.func

@@ -142,12 +142,12 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         """Start with the first iterate; `stage` 0: no alternatives; 1: some follow if it is poor; 2: the best."""
         world = wp.tid()
         if stage != 2:
-            ctl.start.choose[world] = 0
-        if ctl.active[world] == 0 or (stage == 2 and ctl.start.choose[world] == 0):
+            ctl.start.has_alternatives[world] = 0
+        if ctl.active[world] == 0 or (stage == 2 and ctl.start.has_alternatives[world] == 0):
             return
         if stage == 1:
             if is_poor_first_iterate(ctl, world):
-                ctl.start.choose[world] = 1
+                ctl.start.has_alternatives[world] = 1
                 wp.atomic_max(ctl.any_rare_branch, 0, 1)
                 return
         initialise_iteration(ctl, world)
@@ -159,7 +159,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         """Flag the worlds where the first iterate just evaluated is the best so far: J > 0 before Phi."""
         world = wp.tid()
         better[world] = 0
-        if ctl.start.choose[world] == 0:
+        if ctl.start.has_alternatives[world] == 0:
             return
         phi = objective(ctl, world)
         if not (wp.isfinite(phi) and ctl.domain_J[world] > f64(0.0)):
@@ -174,7 +174,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
             ctl.nonmonotone.best_norm[world] = low
             better[world] = 1
             if first == 0:
-                ctl.start.extrapolated[world] = 0
+                ctl.start.is_extrapolated[world] = 0
 
     @wp.func
     def check_direction(ctl: Control, world: int):
@@ -293,7 +293,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
         ctl.nonmonotone.trial[world] = 0
         ctl.nonmonotone.direction_gradient[world] = f64(0.0)
         ctl.search.active[world] = 1
-        ctl.start.extrapolated[world] = 0
+        ctl.start.is_extrapolated[world] = 0
         ctl.nonmonotone.store_best[world] = 0
         if wp.static(stored):
             ctl.search.trial_accepted[world] = 0

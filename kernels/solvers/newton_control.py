@@ -135,8 +135,8 @@ def control_struct():
 
     @wp.struct
     class FirstIterate:
-        choose: i1  # 1: among alternatives
-        extrapolated: i1  # 1: the first iterate is extrapolated, and not yet solved for
+        has_alternatives: i1  # 1: choose among alternatives
+        is_extrapolated: i1  # 1: the first iterate is extrapolated, and not yet solved for
 
     @wp.struct
     class NonmonotoneSteps:  # the globalisation, see kernels/solvers/line_search.py

@@ -64,13 +64,13 @@ def predictor_kernels(dtype: str, accelerated: bool, module: wp.Module) -> _type
         world = wp.tid()
         predictor.order[world] = 0
         predictor.history_count[world] = 0
-        newton.start.extrapolated[world] = 0
+        newton.start.is_extrapolated[world] = 0
         if step.running[world] == 0:
             return
         if predictor.history_state[world, 2] == step.h[world] and predictor.history_state[world, 3] == step.time[world]:
             predictor.order[world] = int(predictor.history_state[world, 0])
             predictor.history_count[world] = int(predictor.history_state[world, 1])
-        newton.start.extrapolated[world] = wp.min(predictor.order[world], 1)
+        newton.start.is_extrapolated[world] = wp.min(predictor.order[world], 1)
 
     @wp.kernel(module=module)
     def extrapolate(

@@ -209,7 +209,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
     ):
         """Alternative first iterate on the free components: 0: v~ + (dq/dv) g, 1: v_n, 2: the one with q = q_n."""
         world, slot = wp.tid()
-        if newton.start.choose[world] == 0:
+        if newton.start.has_alternatives[world] == 0:
             return
         dq = T(step.dq_dv[world])
         new = v_n[world, slot]

@@ -304,7 +304,7 @@ class NewtonLoop:
     def _choose_first_iterate(self) -> None:
         """Select the best first iterate (J > 0 first, then lowest Phi)."""
         w, k, launch = self.work, self.kernels, self.launch
-        choose, better = w.newton.start.choose, w.newton.search.active
+        choose, better = w.newton.start.has_alternatives, w.newton.search.active
         launch(k.compare_first_iterates, self.model.worlds, [w.newton, 1, better])
         launch(self.vector_kernels.copy_active, self.dim, [w.v, better, w.best_velocity])
         for put in self.first_iterate_candidates:
