@@ -12,11 +12,11 @@ import numpy as np
 import warp as wp
 from warpfea.kernels.common.block_entries import add_block_function
 from warpfea.kernels.common.structs import pattern_struct, topology_struct
-from warpfea.kernels.common.traits import Traits
 from warpfea.kernels.common.types import kernel_module, precision
 from warpfea.kernels.solvers.newton_control import control_struct
 
-from warpfea.terms.term import LOSS, STORED, Column, FieldSpec, Term
+from warpfea.terms.protocols import Preconditioned, Tied, Updated
+from warpfea.terms.term import LOSS, STORED, Column, FieldSpec
 
 
 @functools.cache
@@ -143,7 +143,7 @@ def floor_kernels(dtype):
     return types.SimpleNamespace(module=module, **{kernel.key.rsplit("__", 1)[-1]: kernel for kernel in kernels})
 
 
-class Floor(Term):
+class Floor(Updated, Tied, Preconditioned):
     """A penalty half-space z >= 0 under all nodes of a model, k and kt in N/m."""
 
     name = "floor"
@@ -153,7 +153,6 @@ class Floor(Term):
 
     def __init__(self, model, k=2e4, kt=1e4, depth=5e-3):
         super().__init__(model)
-        self.traits = Traits(pooled=True, stored=True, limited=True)
         self.k, self.kt, self.depth = k, kt, depth
         self.kernels = floor_kernels(model.dtype)
 

@@ -13,6 +13,7 @@ from warpfea.kernels.common.types import kernel_module, precision
 
 import warpfea as wf
 from warpfea.simulation.checkpoint import load_checkpoint, save_checkpoint
+from warpfea.terms.protocols import PROTOCOLS, Constrained, Tied
 from warpfea.terms.term import LOSS, STORED, WORK, Column, FieldSpec, Term
 
 
@@ -26,9 +27,9 @@ def model_with(*makers, gravity=(0, 0, -9.81), velocity=(1.0, 0.0, -1.0), worlds
     return b.finalize(worlds=worlds)
 
 
-def kind(**members):
+def kind(*bases, **members):
     """A floor with other attributes or methods."""
-    return type("Odd", (Floor,), members)
+    return type("Odd", (*bases, Floor), members)
 
 
 def connected(change):
@@ -63,9 +64,11 @@ ODD = {
     "a list of numbers": (connected(lambda t: [t.slots]), r"\(items, slots of an item\), got int64\[225\]"),
     "fractions": (connected(lambda t: [t.slots[:, None].astype(float)]), r"array of ints.*got float64"),
     "a bare array": (connected(lambda t: t.slots[:, None]), "must be a list of arrays"),
-    "no entries": (connected(lambda t: []), "declares the trait 'pooled', but it sets no connectivity"),
-    "constraint's traits": (declaring(has_constraints=True), "'has_constraints', which belongs to constraints"),
-    "tangent of a potential": (declaring(tangent=True), "'tangent', but its potential is True"),
+    "no entries": (connected(lambda t: []), "rows of a potential, but it sets no connectivity"),
+    "constraint's traits": (declaring(has_constraints=True), "'floor' sets traits: they follow from its tables"),
+    "tangent of a potential": (declaring(tangent=True), "'floor' sets traits"),
+    "traits of a class": (kind(traits=Traits(limited=True)), "'floor' sets traits"),
+    "multipliers": (kind(Constrained), "'floor' derives from Constrained: register a kind of constraints"),
     "kind of column": (kind(columns=(Column("x", 17),)), "kind 17 is none of STORED"),
     "column without a name": (kind(columns=(Column("", STORED),)), "STORED needs a name"),
     "column of the ledger": (kind(columns=(Column("kinetic", LOSS),)), "the ledger has a column"),
@@ -86,6 +89,15 @@ def test_a_term_that_does_not_fit_is_refused_by_the_model(case):
     make, message = ODD[case]
     with pytest.raises(wf.ModelError, match=message):
         model_with(make)
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_a_method_of_a_protocol_needs_its_base(protocol):
+    """Nothing would call it: the refusal names method, protocol and class."""
+    for method in (name for name in vars(protocol) if not name.startswith("_")):
+        Odd = type("Odd", (Term,), {"name": "odd", method: lambda self, *args: None})
+        with pytest.raises(wf.ModelError, match=f"'odd': {method} is a method of {protocol.__name__}.*derive Odd"):
+            model_with(Odd)
 
 
 LATER = {
@@ -170,8 +182,8 @@ def test_jacobi_keeps_to_the_limit():
 
 def test_what_holds_a_body_is_found_from_its_slots():
     """Without `mark_constrained` the correction by translations is left out where a tangent touches a component."""
-    free = kind(mark_constrained=lambda self, free: None)
-    default = kind(mark_constrained=Term.mark_constrained)
+    free = kind(mark_constrained=lambda self, free: None, translation_invariant=True)
+    default = kind(mark_constrained=Tied.mark_constrained)
     counts = []
     for make in (default, free):
         sim = wf.Simulation(model_with(make), dt=1e-3)

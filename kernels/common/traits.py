@@ -6,7 +6,7 @@ __all__ = ["NO_TERMS", "Traits"]
 
 
 class Traits(NamedTuple):
-    """Terms present besides the elements.
+    """Terms present besides the elements, derived by warpfea/terms/checks.py from what each term is and does.
 
     Attributes:
         nonpotential: non-conservative forces; Phi freezes those of the last iterate in a line search.

@@ -16,6 +16,7 @@ from ..kernels.contact.facet_point_lists import FACETS_PER_CHUNK, point_list_ker
 from ..kernels.contact.facet_search import facet_search_kernels
 from ..kernels.contact.facet_structs import pair_history_struct, pair_scratch_struct, point_list_struct
 from ..model.state import State, view_as_words
+from ..terms.protocols import Coupled, Tied
 from ..terms.term import StepContext, part
 from .evaluation import evaluate_pairs
 from .facet_tables import PairTables
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 __all__ = ["FacetContact"]
 
 
-class FacetContact(ContactTerm):
+class FacetContact(ContactTerm, Tied, Coupled):
     """Contacts of a model between its bodies.
 
     Attributes:
@@ -40,6 +41,7 @@ class FacetContact(ContactTerm):
     """
 
     name = "pairs"
+    translation_invariant = True  # a pair's forces are self-equilibrated
     columns = contact_columns("contact_pairs")
     parts = {"pairs": "contact between bodies: search, forces, products, history"}
     unused_history = ("angle", "previous_margin", "previous_depth", "position", "rotation")
@@ -67,9 +69,6 @@ class FacetContact(ContactTerm):
     def tied_slots(self) -> list[np.ndarray]:
         """Bodies in contact form one component."""
         return self.tables.slots
-
-    def mark_constrained(self, free: np.ndarray) -> None:
-        """No-op: the forces of a pair are self-equilibrated under translations."""
 
     # simulation setup
 

@@ -13,13 +13,13 @@ import numpy as np
 import warp as wp
 
 from ..base.errors import PenetrationError
-from ..kernels.common.traits import Traits
 from ..kernels.contact.assembly import AITKEN_LANES, contact_kernels
 from ..kernels.contact.ledger import ENERGY_COLUMNS, RECORD_LANES, contact_block_kernels, contact_ledger_kernels
 from ..kernels.contact.structs import RECORD_NAMES, clock_struct, contact_scratch_struct, history_struct
 from ..kernels.solvers.newton_control import FAIL_ROUNDOFF, FAIL_WORK
 from ..model.state import State
-from ..terms.term import LOSS, NUMERICAL, STORED, WORK, Column, StepContext, Term, part
+from ..terms.protocols import Diagnosed, Parametrised, Preconditioned, Updated
+from ..terms.term import LOSS, NUMERICAL, STORED, WORK, Column, StepContext, part
 from .collider_tables import facet_pattern_entries
 from .double_displacements import DoubleDisplacements
 from .fields import CONTACT_FIELDS
@@ -44,7 +44,7 @@ def contact_columns(stored: str) -> tuple[Column, ...]:
     return (Column(stored, STORED), *shared, Column("", NUMERICAL))
 
 
-class ContactTerm(Term):
+class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed):
     """Contacts of a model with one geometry of the other side.
 
     Attributes:
@@ -59,7 +59,6 @@ class ContactTerm(Term):
 
     def __init__(self, model: Model, tables: FacetTables[Any], *, meshes: bool = False) -> None:
         super().__init__(model)
-        self.traits = Traits(unilateral=True)
         self.tables: Any = tables
         self.point_kernels = contact_kernels(model.dtype, meshes)
         self.ledger_kernels = contact_ledger_kernels(model.dtype, meshes)

@@ -177,8 +177,7 @@ class MaterialParameters:
             fresh[key] = np.where(mask, wanted, before)
         self.values = fresh
         self._update_tables(members, name, mask)
-        for term in self.model.terms:
-            term.update_materials(mask)
+        self.model.terms.update_materials(mask)
         self.changes[mask] += 1
         self.version += 1
 

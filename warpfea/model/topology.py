@@ -89,14 +89,7 @@ def check_static_supports(model: Any) -> None:
         modes /= np.linalg.norm(modes, axis=1)[:, None]
         held = modes[:, (model.free_host[slots] == 0.0).ravel()]
         columns = (3 * slots[:, None] + np.arange(3)).ravel()
-        for term in model.terms:
-            rows = term.restraints(state, label)
-            if rows is None:
-                continue
-            if rows.shape[1:] != (3 * model.slots,):
-                raise ModelError(
-                    f"term {term.name!r}: restraints gave {rows.shape}; expected (rows, {3 * model.slots}), CSR"
-                )
+        for rows in model.terms.restraints(state, label):
             held = np.hstack([held, (rows[:, columns] @ modes.T).T / model.size])
         turned, values, _ = (
             np.linalg.svd(held, full_matrices=True) if held.size else (np.eye(len(modes)), np.zeros(0), 0)

@@ -147,8 +147,6 @@ def load_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
         for name, array in set_arrays.items():
             if f"set.{name}" in arrays:  # absent in older files
                 array.assign(arrays[f"set.{name}"])
-        for term in sim.model.terms:
-            term.parameters_restored()
         sim.stepper.invalidate(potential="predictor_potential" not in state)
         sim.stepper.start_terms()
     except CheckpointError as error:

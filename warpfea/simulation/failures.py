@@ -25,6 +25,7 @@ from ..kernels.solvers.newton_control import (
 )
 from ..solvers import NewtonPCG
 from ..terms.evaluation import lowest_jacobian
+from ..terms.protocols import Diagnosed
 from .drive_jumps import discontinuous_drives_text
 from .energy_growth import growth_error_text
 from .overload import overload_text
@@ -86,7 +87,7 @@ def step_error(sim: Any, world: int) -> ConvergenceError | ConstraintError:
         hint += f"; {spent} Newton iterations used up max_work = {sim.solver.max_work}"
     jumps = "" if code == FAIL_ROUNDOFF else discontinuous_drives_text(sim, world)
     kind: type[ConvergenceError] = ConvergenceError
-    for term in sim.model.terms:
+    for term in sim.model.terms.having(Diagnosed):
         if (found := term.failure_reason(sim.stepper.ctx, world)) is not None:
             kind, text = found
             reason, hint = f"{text}; {reason}", ""

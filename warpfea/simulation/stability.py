@@ -386,8 +386,6 @@ def _float64_copy(sim: Simulation) -> Simulation:
         arrays = twin.terms.parameter_arrays()
         for name, array in model.terms.parameter_arrays().items():
             arrays[name].assign(array.numpy().astype(arrays[name].numpy().dtype))
-        for term in twin.terms:
-            term.parameters_restored()
     state = twin.state()
     assert isinstance(sim.solver, NewtonPCG)
     solver = NewtonPCG(multipliers=sim.solver.multipliers, penalty=sim.solver.penalty)

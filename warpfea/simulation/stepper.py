@@ -19,6 +19,7 @@ from ..kernels.step.step_control import REPORT_COLUMNS
 from ..model.state import State
 from ..solvers import Jacobi, NewtonPCG, make_solver_loop
 from ..terms.checks import check_stored_energy
+from ..terms.protocols import Preconditioned
 from ..terms.term import StepContext, Term
 from ..terms.workspace import Workspace
 from .adaptive import AdaptiveOptions, StepSizeControl
@@ -229,7 +230,7 @@ class Stepper:
         self.newton.invalidate(flags)
         if "predictor_potential" not in self.state.names:
             self._evaluate_potential(flags)
-        for term in self.terms if restart else ():
+        for term in self.terms.having(Preconditioned) if restart else ():
             term.reset_scratch(self.ctx, flags)
 
     def _evaluate_potential(self, flags: np.ndarray | wp.array | None) -> None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..base.errors import ModelError
 from ..base.names import did_you_mean
+from ..terms.protocols import Coupled
 from ..terms.term import StepContext
 from .jacobi import Jacobi, JacobiLoop
 from .newton import NewtonLoop, NewtonPCG
@@ -53,7 +54,7 @@ def make_solver_loop(ctx: StepContext, options: NewtonPCG | Jacobi, **more: Any)
 
 def refuse_couplings(model: Model, name: str) -> None:
     """Raise ModelError for a term that couples bodies without a shared element: the matrix has a fixed pattern."""
-    found = [(term.name, couples) for term in model.terms if (couples := term.coupled_bodies())]
+    found = [(term.name, couples) for term in model.terms.having(Coupled) if (couples := term.coupled_bodies())]
     if found:
         kind, couples = found[0]
         a, b = (repr(model.bodies[k].name) for k in couples[0])

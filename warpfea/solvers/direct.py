@@ -19,6 +19,7 @@ import warp as wp
 from ..base.launch import launch_part
 from ..kernels.solvers.direct import direct_kernels
 from ..terms.follower_loads import FollowerLoads, FollowerMatrix
+from ..terms.protocols import Preconditioned
 from .factor import SingularMatrix, make_factors
 
 if TYPE_CHECKING:
@@ -47,7 +48,7 @@ class DirectSolver:
         self.dim = (model.worlds, ctx.launch.padded(model.slots))
         self.factors = make_factors(model, self.assembler.pattern.graph)
         self.elements_only = not model.terms.has_tangents
-        for term in model.terms:
+        for term in model.terms.having(Preconditioned):
             term.allocate_blocks(ctx, self.assembler, projected=False)
         self.matrix_storage: wp.array | None = None
         self.unverified_worlds: set[int] = set()
@@ -114,7 +115,7 @@ class DirectSolver:
         """Assemble H or, with `projected`, its positive definite approximation."""
         w = self.work
         self.assembler.assemble(w.u_stage, (w.step.mass_factor, w.step.dq_dv), flags, value, projected=projected)
-        for term in self.model.terms:
+        for term in self.model.terms.having(Preconditioned):
             live = [array for _, array in term.cached_inputs(self.ctx)]
             term.blocks(self.ctx, self.assembler, live, w.step.dq_dv, flags, value, projected=projected)
 

@@ -35,6 +35,7 @@ from ..base.checks import is_count, is_number
 from ..base.errors import ModelError
 from ..base.launch import launch_part
 from ..kernels.solvers.jacobi import MAX_PAIRS, jacobi_kernels, jacobi_struct
+from ..terms.protocols import Updated
 from .newton import NewtonLoop, NewtonPCG
 from .twolevel import TwoLevel
 
@@ -198,15 +199,13 @@ class JacobiLoop(NewtonLoop):
         self._compute_step(active)
         if self.limits_step:
             launch(self.kernels.reset_step_limit, self.model.worlds, [w.newton])
-        for term in self.terms:
-            if term.traits.limited:  # other terms predict multipliers, for Newton's method only
-                term.process_direction(self.ctx, active)
+        self._call_terms(Updated, "process_direction", active)
         launch(k.apply_move, self.dim, [w.newton, w.direction, w.v])
         self.residual.evaluate(active)
         launch(k.check_iterate, self.model.worlds, [w.newton, self.control])
         if self.terms.traits.stored:
-            self._call_terms("accept_trial", active)
-            self._call_terms("update_frozen", active)
+            self._call_terms(Updated, "accept_trial", active)
+            self._call_terms(Updated, "update_frozen", active)
         self._reduce_flags(active, self.any_iterating)
 
     @launch_part("vectors")

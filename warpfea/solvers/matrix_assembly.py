@@ -17,6 +17,7 @@ from ..base.errors import ModelError
 from ..kernels.common.structs import pattern_struct
 from ..kernels.elements.matrix import panel_layout, panel_row_type
 from ..kernels.solvers.blocks import assembly_kernels
+from ..terms.protocols import Preconditioned
 
 if TYPE_CHECKING:
     from ..base.launch import Launcher
@@ -84,7 +85,7 @@ def coupling_pattern(model: Model) -> sp.csr_matrix:
     """Pattern (slots, slots) of slots that share an element or an item of a term, rows sorted."""
     if "coupled slots" not in model.cache:
         graph = model.graph()
-        for item, slot, count in filter(None, (term.incidence() for term in model.terms)):
+        for item, slot, count in filter(None, (term.incidence() for term in model.terms.having(Preconditioned))):
             touched = sp.csr_matrix((np.ones(len(item), dtype=np.int8), (item, slot)), (count, model.slots))
             touched.data[:] = 1
             graph = graph + sp.csr_matrix(touched.T.astype(np.int32) @ touched.astype(np.int32)).astype(np.int8)
@@ -148,7 +149,7 @@ class MatrixAssembler:
             (k.element_matrix_panels if self.whole_elements else k.element_matrix).module for k in self.element_kernels
         }
         out |= {self._assembly_kernels(block).module for block in self.model.blocks}
-        return out | {module for term in self.model.terms for module in term.block_modules()}
+        return out.union(*(term.block_modules() for term in self.model.terms.having(Preconditioned)))
 
     def _group_blocks_by_elements(self) -> list[list[tuple[Any, Any]]]:
         """Element blocks and their kernels, those of the same elements together (parts of one energy, as of ANCF)."""

@@ -17,6 +17,8 @@ from ..kernels.solvers.newton import newton_kernels
 from ..kernels.solvers.newton_control import FLOOR_LANES
 from ..kernels.solvers.perturbation import SAMPLES, perturbation_kernels
 from ..kernels.solvers.vectors import vector_kernels
+from ..terms.protocols import Constrained, Updated
+from ..terms.term import Term
 from .bicgstab import BiCGStab
 from .direct import DirectSolver
 from .pcg import PCG
@@ -184,7 +186,7 @@ class NewtonLoop:
         deflate = kind not in ("block-jacobi", "banded") and not direct
         penalty_ratio = options.penalty_ratio(model.dtype)
         ctx.options = TermOptions(self.outer_multipliers, penalty_ratio, deflate_constraints=deflate)
-        for term in self.terms:
+        for term in self.terms.having(Constrained):
             term.configure(ctx)
         operator = options.operator
         if direct and operator == "auto":  # factors live as long as the matrix, unless terms add to it
@@ -284,9 +286,9 @@ class NewtonLoop:
     def _evaluate_first_iterate(self, flags: wp.array) -> None:
         """Evaluate the first iterate; its convergence check needs D, so the blocks come first."""
         self.residual.update_positions(flags)
-        self._call_terms("prepare", flags)
+        self._call_terms(Term, "prepare", flags)
         self.preconditioner.start(flags)
-        self._call_terms("scale", flags)
+        self._call_terms(Constrained, "scale", flags)
         self.residual.evaluate(flags, freeze=True)
 
     def _solve(self, first: bool = False) -> None:
@@ -344,7 +346,8 @@ class NewtonLoop:
         self.residual.tangent_curvature(active)
         if self.limits_step:
             launch(k.reset_step_limit, self.model.worlds, [w.newton])
-        self._call_terms("process_direction", active)
+        self._call_terms(Updated, "process_direction", active)
+        self._call_terms(Constrained, "predict_multipliers", active)
         launch(self.vector_kernels.set_base, self.dim, [w.newton, w.v, w.base_velocity, w.best_velocity])
         launch(self.vector_kernels.dot_terms, self.dim, [w.gradient, w.direction, active, w.rows])
         self.residual.reduce(w.rows, 1, active, w.newton.search.slope_sum)
@@ -354,7 +357,7 @@ class NewtonLoop:
         if self.terms.traits.unilateral:
             self._update_frozen()
         self.preconditioner.update(active)
-        self._call_terms("prepare_solve", active)
+        self._call_terms(Constrained, "prepare_solve", active)
         self._reduce_flags(active, self.any_iterating)
 
     @launch_part("control")
@@ -387,7 +390,7 @@ class NewtonLoop:
 
     def _reevaluate_frozen(self) -> None:
         w, flags = self.work, self.work.newton.search.trial_accepted
-        self._call_terms("update_frozen", flags)
+        self._call_terms(Updated, "update_frozen", flags)
         self.residual.reevaluate_frozen(flags)
         self.launch(self.kernels.end_frozen_update, self.model.worlds, [w.newton, flags])
         self._run_if_rare(self._check_inversion)
@@ -428,7 +431,7 @@ class NewtonLoop:
         self.residual.evaluate(w.newton.search.active)
         launch(k.check_trial, self.model.worlds, [w.newton])
         if self.terms.traits.stored:
-            self._call_terms("accept_trial", w.newton.search.trial_accepted)
+            self._call_terms(Updated, "accept_trial", w.newton.search.trial_accepted)
         self._reduce_flags(w.newton.search.active, self.any_searching)
 
     def _run_if_rare(self, do: Callable[[], None]) -> None:
@@ -436,9 +439,9 @@ class NewtonLoop:
         with self.launch.rare():
             wp.capture_if(self.work.newton.any_rare_branch, do)
 
-    def _call_terms(self, what: str, flags: wp.array) -> None:
-        """Call one method of all terms."""
-        for term in self.terms:
+    def _call_terms(self, protocol: type[Term], what: str, flags: wp.array) -> None:
+        """Call one method of all terms that have a protocol."""
+        for term in self.terms.having(protocol):
             getattr(term, what)(self.ctx, flags)
 
     def _reduce_flags(self, flags: wp.array, out: wp.array) -> None:

@@ -9,6 +9,7 @@ import warp as wp
 from ..base.errors import ModelError
 from ..base.launch import launch_part
 from ..kernels.solvers.pcg import pcg_kernels
+from ..terms.protocols import Constrained
 from .band import MAX_FULL_FACTOR_SLOTS, find_band, thread_block_band
 from .residual import Residual
 from .twolevel import TwoLevel
@@ -102,9 +103,8 @@ class BlockJacobi:
             self.kernels.apply_block_jacobi, self.dim, [w.inverse, r, w.diagonal, active, w.warp_size, z, w.warp_rows]
         )
         ctx = self.residual.ctx
-        for term in self.residual.terms:
-            if term.preconditions(ctx):
-                term.precondition(ctx, r, z, active)
+        for term in self.residual.terms.having(Constrained) if ctx.options.deflate_constraints else ():
+            term.precondition(ctx, r, z, active)
 
 
 PRECONDITIONERS = ("two-level", "tiles", "banded", "deflated", "block-jacobi")

@@ -9,6 +9,7 @@ import warp as wp
 
 from ..kernels.common.rigid import RIGID_MODES, bodies_struct
 from ..kernels.solvers.rigid_body_modes import rigid_mode_kernels
+from ..terms.protocols import Coupled
 from .dense import DenseInverse
 from .levels import MAX_BOTTOM_SLOTS
 
@@ -38,7 +39,8 @@ def mode_bodies(model: Model) -> dict[int, int]:
     Bodies without free modes are omitted; the map is empty if the matrix would be too large to invert.
     """
     free = [bool(allowed.any()) for allowed in map(_free_modes, [model] * len(model.bodies), range(len(model.bodies)))]
-    pairs = [(a, b) for term in model.terms for a, b in term.coupled_bodies() if a != b and free[a] and free[b]]
+    terms = model.terms.having(Coupled)
+    pairs = [(a, b) for term in terms for a, b in term.coupled_bodies() if a != b and free[a] and free[b]]
     chosen = sorted({body for pair in pairs for body in pair})
     most = MAX_BOTTOM_SLOTS["cuda" if model.device.is_cuda else "cpu"]
     return {body: k for k, body in enumerate(chosen)} if 2 * len(chosen) <= most else {}

@@ -32,7 +32,7 @@ from ..kernels.solvers.levels import TILE_SLOTS, TILE_UNKNOWNS, level_kernels, l
 from ..kernels.solvers.levels_build import FACTOR_LANES, build_kernels
 from ..kernels.solvers.pcg import pcg_kernels
 from ..model.state import view_as_words
-from ..terms.term import CachedInputs
+from ..terms.protocols import CachedInputs, Constrained, Coupled, Preconditioned
 from .band import MAX_FULL_FACTOR_SLOTS, BandFactor, find_band
 from .dense import gauss_jordan
 from .level_arrays import LevelArrays
@@ -89,7 +89,7 @@ class TwoLevel:
         self.dim = (model.worlds, model.slots)
         self.levels = self._make_levels(kind)
         self.ctx, self.terms = residual.ctx, model.terms
-        for term in self.terms:
+        for term in self.terms.having(Preconditioned):
             term.allocate_blocks(self.ctx, self.assembler, projected=True)
         self.terms_add_blocks = (
             model.terms.traits.pooled or model.terms.traits.constraint_rows
@@ -132,8 +132,8 @@ class TwoLevel:
             work.pcg.preconditioner_is_exact = self.band.exact
         self.body_modes, self.mode_coupling_modules = self._make_body_modes()
         self.one_thread_per_row = 0 if model.device.is_cuda else 1
-        corrects = (term.preconditions(self.ctx) for term in self.terms)
-        self.has_corrections = not first.solved_directly and any(corrects)
+        deflates = not first.solved_directly and self.ctx.options.deflate_constraints
+        self.corrections = self.terms.having(Constrained) if deflates else []
         self.cached_inputs: dict[str, CachedInputs] = {}
         self.rebuild_cost = band.rebuild_cost if band is not None and not self.factors_operator else REBUILD_COST
         # iteration counts are not comparable; separate key
@@ -147,7 +147,9 @@ class TwoLevel:
         if not mode_bodies(self.model):
             return None, set()
         out = RigidBodyModes(self.model, self.work, self.launch, self.residual, self.assembler.pattern)
-        return out, out.modules().union(*(term.allocate_mode_coupling(self.ctx, out) for term in self.terms))
+        return out, out.modules().union(
+            *(term.allocate_mode_coupling(self.ctx, out) for term in self.terms.having(Coupled))
+        )
 
     def _make_levels(self, kind: str) -> list[Level]:
         """Levels of a kind of preconditioner: "two-level", "tiles" (without a coarse space) or "banded"."""
@@ -165,7 +167,7 @@ class TwoLevel:
         """Register the linearisation point and the rule's counts in the state, for resumed runs."""
         self.reuse.control.max_extra_iterations = self.rebuild_cost
         self.reuse.register(state)
-        for term in self.terms:
+        for term in self.terms.having(Preconditioned):
             kept = CachedInputs([], [], [])
             for key, array in term.cached_inputs(self.ctx):
                 name = f"{term.name}_{key}".replace(" ", "_")
@@ -179,7 +181,7 @@ class TwoLevel:
         reuse = self.reuse
         reuse.move_point(accepted)
         flags = reuse.no_flags if accepted is None else accepted
-        for term in self.terms:
+        for term in self.terms.having(Preconditioned):
             kept = self.cached_inputs.get(term.name)
             if kept is not None and not term.copy_cached(self.ctx, kept, reuse.control, flags):
                 for arrays in zip(kept.live, kept.state, kept.cached):
@@ -253,12 +255,11 @@ class TwoLevel:
         args = [level.device_data, correct, coarse, m.topology.free, r, w.diagonal, active, w.warp_size, z, w.warp_rows]
         dim = (m.worlds, launch.padded(m.slots))
         launch(k.add_coarse_correction, dim, args)
-        if self.has_corrections:
+        if self.corrections:
             args = [w.inverse, r, w.diagonal, active, w.warp_size, w.Hp, w.spare_rows]
             launch(self.block_jacobi, dim, args)
-            for term in self.terms:
-                if term.preconditions(self.ctx):
-                    term.precondition(self.ctx, r, w.Hp, active, into=z)
+            for term in self.corrections:
+                term.precondition(self.ctx, r, w.Hp, active, into=z)
 
     # application
 
@@ -350,7 +351,7 @@ class TwoLevel:
             launch(self.block_kernels.invert_diagonal_blocks, self.dim, args)
             if m.terms.traits.has_constraints:
                 if penalty:
-                    for term in self.terms:
+                    for term in self.terms.having(Constrained):
                         term.scale(self.ctx, flags)
                 self._copy_cached()
                 self._add_term_blocks(value, flags, penalties=True)
@@ -400,17 +401,16 @@ class TwoLevel:
     def _add_mode_coupling(self, motions: RigidBodyModes, flags: wp.array) -> None:
         """Assemble and invert the matrix of the rigid body modes."""
         motions.assemble(self.reuse.linearisation_point, self.block_values, flags)
-        for term in self.terms:
+        for term in (term for term in self.terms.having(Coupled) if term.coupled_bodies()):
             kept = self.cached_inputs[term.name].cached if term.name in self.cached_inputs else []
-            if term.coupled_bodies():
-                term.add_mode_coupling(self.ctx, kept, self.reuse.control.dq_dv, flags)
+            term.add_mode_coupling(self.ctx, kept, self.reuse.control.dq_dv, flags)
         motions.invert(flags)
 
     def _add_term_blocks(self, value: wp.array, flags: wp.array, *, penalties: bool) -> None:
         """Add the terms' blocks to the matrix of some worlds: those that D is taken from, or the penalties."""
         reuse = self.reuse.control
-        for term in self.terms:
-            if term.penalty == penalties:
+        for term in self.terms.having(Preconditioned):
+            if isinstance(term, Constrained) == penalties:
                 kept = self.cached_inputs[term.name].cached if term.name in self.cached_inputs else []
                 term.blocks(self.ctx, self.assembler, kept, reuse.dq_dv, flags, value, projected=True)
 
@@ -437,7 +437,7 @@ class TwoLevel:
         rows = slice(worlds.start, worlds.stop)
         given, copy = (leading_view(a, dim, self.model.types.vec3) for a in (value[rows], self.block_values))
         self.launch(self.residual.vector_kernels.copy_active, dim, [given, flags[rows], copy])
-        for term in self.terms:
+        for term in self.terms.having(Preconditioned):
             live = [array for _, array in term.cached_inputs(self.ctx)]
             term.blocks(self.ctx, self.assembler, live, w.step.dq_dv, flags, out, projected=False)
 

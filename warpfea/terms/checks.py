@@ -10,6 +10,7 @@ import numpy as np
 from ..base.errors import ModelError
 from ..kernels.common.traits import Traits
 from ..kernels.step.energy_ledger import EXPLICIT_VISCOUS, LEDGER_COLUMNS, LOSS, NUMERICAL, STORED, WORK
+from .protocols import PROTOCOLS, Constrained, Updated
 from .term import Term
 
 if TYPE_CHECKING:
@@ -24,6 +25,7 @@ __all__ = [
     "check_tables",
     "check_unique_names",
     "derived_traits",
+    "overrides",
     "stored_columns",
 ]
 
@@ -48,6 +50,13 @@ def check_constructed(term: Any, make: Any, model: Model) -> None:
         raise ModelError(f"term {term.name!r}: its __init__ must call super().__init__(model)")
     if term.model is not model:
         raise ModelError(f"term {term.name!r} was made for another model: make one in the function given to add_term")
+    kind = type(term)
+    for protocol in (protocol for protocol in PROTOCOLS if not isinstance(term, protocol)):
+        for method in (name for name in vars(protocol) if not name.startswith("_") and hasattr(kind, name)):
+            raise ModelError(
+                f"term {term.name!r}: {method} is a method of {protocol.__name__}, see warpfea.terms.protocols: derive "
+                f"{kind.__name__} from it"
+            )
 
 
 def check_unique_names(terms: Sequence[Term], taken: Sequence[str], what: str, names: Any) -> None:
@@ -66,25 +75,23 @@ def check_unique_names(terms: Sequence[Term], taken: Sequence[str], what: str, n
             owner[name] = term
 
 
+def overrides(term: Term, method: Any) -> bool:
+    """True if a term overrides a method of Term or of a protocol."""
+    return getattr(type(term), method.__name__, method) is not method
+
+
 def derived_traits(term: Term) -> Traits:
-    """Traits of a term, from its tables and overridden methods; ModelError if they contradict the declared ones."""
-    kind = type(term)
-    declared = {"pooled": term.potential, "nonpotential": not term.potential, "tangent": not term.potential}
-    for name, possible in declared.items():
-        if getattr(term.traits, name) and not (possible and term.connectivity):
-            why = "it sets no connectivity" if possible else f"its potential is {term.potential}"
-            raise ModelError(f"term {term.name!r} declares the trait {name!r}, but {why}")
-    if term.traits.tangent and kind.product is Term.product:
-        raise ModelError(f"term {term.name!r} declares the trait 'tangent', but does not override product")
-    if term.traits.stored and term.connectivity and not term.rows:
-        raise ModelError(f"term {term.name!r} declares the trait 'stored', but has rows = 0 (rows of stored energy)")
-    entries = any(conn.size for conn in term.connectivity)
-    tangent = entries and not term.potential and kind.product is not Term.product
-    return term.traits._replace(
+    """Traits of a term, from its tables, protocols and overridden methods."""
+    entries, constrained = any(conn.size for conn in term.connectivity), isinstance(term, Constrained)
+    return Traits(
         pooled=entries and term.potential,
         nonpotential=entries and not term.potential,
-        tangent=tangent,
+        tangent=entries and not term.potential and overrides(term, Term.product),
         stored=term.rows > 0,
+        constraint_rows=constrained,
+        has_constraints=constrained,
+        limited=overrides(term, Updated.process_direction),
+        unilateral=overrides(term, Updated.update_frozen),
     )
 
 
@@ -101,6 +108,10 @@ def check_tables(term: Term, model: Model) -> None:
         value = getattr(term, name)
         if not isinstance(value, (int, np.integer)) or value < 0:
             raise ModelError(f"term {term.name!r}: {name} = {value!r} must be a whole number, 0 or more")
+    if term.rows and not term.connectivity and not isinstance(term, Constrained):
+        raise ModelError(f"term {term.name!r} has rows of a potential, but it sets no connectivity")
+    if hasattr(term, "traits"):
+        raise ModelError(f"term {term.name!r} sets traits: they follow from its tables, protocols and methods")
 
 
 def _connectivity_arrays(term: Term) -> Sequence[Any]:
@@ -127,8 +138,7 @@ def stored_columns(term: Term) -> list[str]:
 
 def check_ledger_columns(term: Term, *, own: bool) -> None:
     """Raise ModelError unless a term's ledger columns are valid; `own`: a built-in term."""
-    kind = type(term)
-    if term.columns and kind.energy_increments is Term.energy_increments:
+    if term.columns and not overrides(term, Term.energy_increments):
         raise ModelError(f"term {term.name!r} has columns, but does not override energy_increments")
     for column in term.columns:
         where = f"term {term.name!r}, column {column.name!r}"
@@ -136,7 +146,7 @@ def check_ledger_columns(term: Term, *, own: bool) -> None:
             raise ModelError(f"{where}: kind {column.kind!r} is none of {', '.join(COLUMN_KINDS.values())}")
         if column.kind in (STORED, WORK, LOSS) and not column.name:
             raise ModelError(f"{where}: {COLUMN_KINDS[column.kind]} needs a name, the column of energies()")
-        if column.kind == STORED and kind.stored_energy is Term.stored_energy:
+        if column.kind == STORED and not overrides(term, Term.stored_energy):
             raise ModelError(f"{where}: override stored_energy: the ledger restarts from its value after a reset")
         if own:
             continue

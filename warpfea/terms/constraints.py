@@ -16,14 +16,14 @@ import scipy.sparse as sp
 import warp as wp
 
 from ..base.launch import Launcher
-from ..kernels.common.traits import Traits
 from ..kernels.solvers.deflation import deflation_kernels
 from ..kernels.solvers.newton_control import TERM_ROWS
 from ..kernels.solvers.reuse import reuse_kernels
 from ..kernels.terms.constraint_blocks import constraint_block_kernels
 from ..kernels.terms.constraints import JOINT_COLUMNS, constraint_kernels, multiplier_struct
 from .constraint_tables import ConstraintTables
-from .term import NUMERICAL, WORK, CachedInputs, Column, StepContext, Term, part
+from .protocols import CachedInputs, Constrained, Preconditioned, Tied, Updated
+from .term import NUMERICAL, WORK, Column, StepContext, part
 from .time_law_table import TimeLawTable
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ MAX_THREAD_ROWS = 16
 """Maximum rows of a cluster whose matrix one thread inverts; larger ones take a launch per pivot."""
 
 
-class Constraints(Term):
+class Constraints(Constrained, Updated, Tied, Preconditioned):
     """Joints, welds and single constraints of a model.
 
     Attributes:
@@ -47,11 +47,9 @@ class Constraints(Term):
     name = "constraints"
     columns = (Column("work_joints", WORK), Column("", NUMERICAL))
     parts = {"constraints": "values, multipliers and work of joints"}
-    penalty = True
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
-        self.traits = Traits(constraint_rows=True, has_constraints=True)
         self.tables = ConstraintTables(model, model.description.joints)
         self.kernels = self.tables.kernels
         self.rows = self.tables.count
@@ -194,7 +192,7 @@ class Constraints(Term):
         ctx.launch(self.integrator_kernels(ctx).product_terms, self.dim, args)
 
     @part("constraints")
-    def process_direction(self, ctx: StepContext, active: wp.array) -> None:
+    def predict_multipliers(self, ctx: StepContext, active: wp.array) -> None:
         """Multiplier part of the Newton step in work.direction."""
         w = ctx.work
         args = [self.tables.data, w.multipliers, w.direction, w.newton.norms.component_converged, w.step.dq_dv, active]
@@ -261,9 +259,6 @@ class Constraints(Term):
 
     def block_modules(self) -> set[wp.Module]:
         return {constraint_block_kernels(self.model.dtype).module}
-
-    def preconditions(self, ctx: StepContext) -> bool:
-        return ctx.scratch[self.name].on
 
     @part("preconditioner")
     def precondition(

@@ -12,7 +12,8 @@ from ..base.errors import ModelError
 from ..base.worlds import check_values_per_world, values_per_world
 from ..kernels.terms.loads import load_kernels
 from ..model.assembly import require_density
-from .term import StepContext, Term, part
+from .protocols import Parametrised
+from .term import StepContext, part
 from .time_law_table import TimeLawTable
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 __all__ = ["DeadLoads"]
 
 
-class DeadLoads(Term):
+class DeadLoads(Parametrised):
     """Dead loads: assembled once per attempt into work.dead.
 
     Gravity, [world] on the device, is part of every model; without any load nothing is launched. With a time law of
@@ -34,8 +35,7 @@ class DeadLoads(Term):
     def __init__(self, model: Model) -> None:
         super().__init__(model)
         self.kernels = load_kernels(model.dtype)
-        self.gravity_host = np.tile(model.gravity, (model.worlds, 1))
-        self.gravity = model.array("loads", self.gravity_host, wp.vec3d)
+        self.gravity = model.array("loads", np.tile(model.gravity, (model.worlds, 1)), wp.vec3d)
         self.gravity_law = model.description.gravity
         self.constant_gravity = self.gravity
 
@@ -60,7 +60,7 @@ class DeadLoads(Term):
             numbers.append(np.full(len(load.slots), index))
             weights.append(load.weights)
         if self.gravity_law is not None:
-            self.constant_gravity = m.array("loads", self.gravity_host, wp.vec3d)
+            self.constant_gravity = m.array("loads", self.gravity.numpy(), wp.vec3d)
             self.gravity_law_index = laws.add(self.gravity_law)
             slots.append(np.arange(m.slots))
             numbers.append(np.full(m.slots, self.gravity_law_index))
@@ -81,7 +81,7 @@ class DeadLoads(Term):
     @property
     def has_gravity(self) -> bool:
         """True with gravity or a time law of it."""
-        return self.gravity_law is not None or bool(np.any(self.gravity_host))
+        return self.gravity_law is not None or bool(np.any(self.gravity.numpy()))
 
     def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
         law = [self.kernels.copy_gravity.module] * (self.gravity_law is not None)
@@ -121,7 +121,7 @@ class DeadLoads(Term):
             raise ModelError("the model was built with a time law of gravity, which set_gravity can't replace")
         values = values_per_world("set_gravity", "gravity", gravity, self.model.worlds, (3,))
         check_values_per_world("set_gravity", "gravity", values, ~mask | np.isfinite(values).all(axis=1), "finite")
-        values = np.where(mask[:, None], values, self.gravity_host)
+        values = np.where(mask[:, None], values, self.gravity.numpy())
         if np.any(values):
             require_density(self.model.bodies, "gravity")
         if not self.has_loads and np.any(values):
@@ -129,15 +129,10 @@ class DeadLoads(Term):
                 "the model was built without gravity or dead loads, so their kernels were left out: build it with a "
                 "gravity that is not zero"
             )
-        self.gravity_host = values
         self.gravity.assign(values)
 
     def parameter_arrays(self) -> dict[str, wp.array]:
         return {} if self.gravity_law is not None else {"gravity": self.gravity}
-
-    def parameters_restored(self) -> None:
-        if self.gravity_law is None:
-            self.gravity_host = self.gravity.numpy().copy()
 
     def hash(self, h: Any) -> None:
         for values in self._definition:

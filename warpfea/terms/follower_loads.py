@@ -14,7 +14,8 @@ from ..kernels.terms.follower_loads import follower_struct, moment_kernels, pres
 from ..model import assembly
 from ..model.description import Moment, Pressure
 from ..time_laws import TimeLaw
-from .term import StepContext, Term
+from .protocols import Preconditioned
+from .term import StepContext
 from .time_law_table import TimeLawTable
 
 if TYPE_CHECKING:
@@ -34,11 +35,12 @@ class FollowerLoad:
     count: int
 
 
-class FollowerLoads(Term):
+class FollowerLoads(Preconditioned):
     """Pressures and moments, non-potential in general; H contains the symmetric part of their tangent."""
 
     name = "followers"
     potential = False
+    translation_invariant = True
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
@@ -117,9 +119,6 @@ class FollowerLoads(Term):
                 w.nonpotential_tangent,
             ]
             ctx.launch(load.product, (m.worlds, load.count), args)
-
-    def mark_constrained(self, free: np.ndarray) -> None:
-        """No-op: pressures and moments are translation invariant."""
 
     def allocate_blocks(self, ctx: StepContext, matrix: Any, *, projected: bool) -> None:
         if not projected:

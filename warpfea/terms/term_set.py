@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import warp as wp
@@ -27,12 +27,14 @@ from .checks import (
     check_tables,
     check_unique_names,
     derived_traits,
+    overrides,
 )
 from .constraints import Constraints
 from .damping import Damping
 from .dead_loads import DeadLoads
 from .elements import Elements
 from .follower_loads import FollowerLoads
+from .protocols import Constrained, Parametrised, Tied
 from .supports import Supports
 from .term import FieldSpec, StepContext, Term
 from .time_law_table import TimeLawTable, control_array
@@ -44,6 +46,7 @@ if TYPE_CHECKING:
 
 __all__ = ["TERM_TYPES", "TermSet", "profile_parts", "register"]
 
+T = TypeVar("T", bound=Term)
 TERM_TYPES: list[type[Term]] = [Elements, DeadLoads, Damping, FollowerLoads, BodyForces, Constraints]
 """All kinds of terms in launch order, that in which the forces of an attempt are evaluated."""
 STATE_ARRAYS = ("displacement", "velocity", "time", "status", "ledger", "ledger_time", "previous_displacement",
@@ -89,6 +92,7 @@ class TermSet:
             if term is not None:
                 check_constructed(term, make, model)
                 self.all.append(term)
+        self._having: dict[type[Term], list[Any]] = {}
         self.dead_loads = self.find(DeadLoads)
         self.nonpotential_topology: Any = None
         self.parameter_updates = 0
@@ -96,7 +100,7 @@ class TermSet:
         self._check_terms()
 
     def _check_terms(self) -> None:
-        """Raise ModelError for added terms with duplicate names or reserved traits."""
+        """Raise ModelError for added terms with duplicate names or with multipliers."""
         first = [f"name {term.name!r}" for term in self.all]
         for name in first:
             if first.count(name) > 1:
@@ -105,9 +109,8 @@ class TermSet:
         for term in self.all:
             check_ledger_columns(term, own=term not in added)
         for term in added:
-            for trait in ("constraint_rows", "has_constraints"):
-                if getattr(term.traits, trait):
-                    raise ModelError(f"term {term.name!r} declares the trait {trait!r}, which belongs to constraints")
+            if isinstance(term, Constrained):
+                raise ModelError(f"term {term.name!r} derives from Constrained: register a kind of constraints instead")
         check_stored_columns(self.all)
         check_unique_names(self.all, COMMON_FIELDS, "a field", lambda term: term.fields)
         check_unique_names(self.all, tuple(LAUNCH_PARTS), "a part of profiles", lambda term: term.parts)
@@ -124,9 +127,15 @@ class TermSet:
         """Term of one name, or None."""
         return next((term for term in self.all if term.name == name), None)
 
+    def having(self, protocol: type[T]) -> list[T]:
+        """Terms that derive from a protocol, or are of a kind, in order."""
+        if protocol not in self._having:
+            self._having[protocol] = [term for term in self.all if isinstance(term, protocol)]
+        return self._having[protocol]
+
     def find(self, kind: type[Any]) -> Any:
         """Term of one kind, or None."""
-        return next((term for term in self.all if isinstance(term, kind)), None)
+        return next(iter(self.having(kind)), None)
 
     @property
     def constraints(self) -> Constraints | None:
@@ -142,7 +151,7 @@ class TermSet:
 
     def tied_slots(self) -> list[np.ndarray]:
         """Sets of slots tied by terms."""
-        return [slots for term in self.all for slots in term.tied_slots()]
+        return [slots for term in self.having(Tied) for slots in term.tied_slots()]
 
     def build(self) -> None:
         """Build the terms' tables, once components are known, and their pool offsets."""
@@ -192,9 +201,31 @@ class TermSet:
             topology.pool_start, topology.pool_entry = pool.contribution_start, pool.contribution_entry
 
     def mark_constrained(self, free: np.ndarray) -> None:
-        """Clear the directions (components, 3) in which terms tie components to the ground."""
+        """Clear the directions (components, 3) in which terms tie components to the ground.
+
+        Translations of a free component involve elements and mass only. A solve can't be corrected along translations
+        that a term resists: all those of components in its tangent, unless it is `translation_invariant`.
+        """
         for term in self.all:
+            if not term.translation_invariant and (term.potential or overrides(term, Term.product)):
+                for conn in term.connectivity:
+                    free[np.unique(self.model.component[conn])] = 0.0
+        for term in self.having(Tied):
             term.mark_constrained(free)
+
+    def restraints(self, state: State, component: int) -> list[Any]:
+        """Rows (n, 3 slots), CSR, of directions in which terms resist motion of a component.
+
+        Raises:
+            ModelError: a term gives another number of columns.
+        """
+        found = [(term, term.restraints(state, component)) for term in self.having(Tied)]
+        for term, rows in found:
+            if rows is not None and rows.shape[1:] != (3 * self.model.slots,):
+                raise ModelError(
+                    f"term {term.name!r}: restraints gave {rows.shape}; expected (rows, {3 * self.model.slots}), CSR"
+                )
+        return [rows for _, rows in found if rows is not None]
 
     @property
     def features(self) -> dict[str, bool]:
@@ -272,7 +303,7 @@ class TermSet:
     def set_parameter(self, name: Any, values: Any, mask: Any) -> None:
         """See Model.set_parameter."""
         materials = self.model.parameters
-        owners = [term.parameters() for term in self.all] + [
+        owners = [term.parameters() for term in self.having(Parametrised)] + [
             materials.setters(),
             {"gravity": self.dead_loads.set_gravity},
         ]
@@ -294,7 +325,13 @@ class TermSet:
 
     def parameter_arrays(self) -> dict[str, wp.array]:
         """Arrays of the terms' parameters, by "term name"."""
-        return {f"{term.name}.{name}": a for term in self.all for name, a in term.parameter_arrays().items()}
+        owners = self.having(Parametrised)
+        return {f"{term.name}.{name}": a for term in owners for name, a in term.parameter_arrays().items()}
+
+    def update_materials(self, mask: np.ndarray) -> None:
+        """Update the terms after material constants were set in the chosen worlds (worlds,)."""
+        for term in self.having(Parametrised):
+            term.update_materials(mask)
 
     # simulation setup
 

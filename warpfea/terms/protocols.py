@@ -1,0 +1,196 @@
+"""Protocols of terms: methods that few terms need, each group a base class with methods that do nothing.
+
+A solver iterates over `TermSet.having(protocol)`: the terms that lack it cost nothing. A term that defines a method of
+a protocol without deriving from it is refused by name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from .term import StepContext, Term
+
+if TYPE_CHECKING:
+    from ..base.errors import ConvergenceError
+    from ..model.state import State
+
+__all__ = [
+    "PROTOCOLS",
+    "CachedInputs",
+    "Constrained",
+    "Coupled",
+    "Diagnosed",
+    "Parametrised",
+    "Preconditioned",
+    "Tied",
+    "Updated",
+]
+
+
+class Tied(Term):
+    """Term that ties slots to each other or to the ground."""
+
+    def tied_slots(self) -> list[np.ndarray]:
+        """Sets of model slots tied to each other: each becomes one component. Called before `build`."""
+        return []
+
+    def mark_constrained(self, free: np.ndarray) -> None:
+        """Clear directions (components, 3) in which it constrains a component to the ground or another component,
+        besides those that follow from its connectivity."""
+
+    def restraints(self, state: State, component: int) -> Any:
+        """Rows (n, 3 slots), CSR, of directions in which it resists motion of a component, for statics; None: none."""
+        return None
+
+
+class Updated(Term):
+    """Term with quantities that are frozen inside Newton's method, or that limits its steps."""
+
+    def process_direction(self, ctx: StepContext, active: wp.array) -> None:
+        """Process the Newton direction work.direction. To limit the step, lower work.newton.search.limit.
+
+        A limit <= 0 allows no step: the attempt fails and is halved.
+        """
+
+    def accept_trial(self, ctx: StepContext, flags: wp.array) -> None:
+        """Accept a trial in the flagged worlds: freeze its multipliers, friction limits, ... for the next search."""
+
+    def update_frozen(self, ctx: StepContext, flags: wp.array) -> None:
+        """Update lagged quantities in the flagged worlds, such as the limits of unilateral forces.
+
+        Forces and residual are re-evaluated and checked with the updated values.
+        """
+
+
+class Constrained(Term):
+    """Term of constraint rows with multipliers and penalties; its blocks are added to a matrix after D is taken
+    from it. The slots gather from its rows in work.multipliers: a model has at most one such term."""
+
+    def configure(self, ctx: StepContext) -> None:
+        """Configure for the solver and state, both known here."""
+
+    def scale(self, ctx: StepContext, active: wp.array) -> None:
+        """Scale by D of the first iterate; penalties are known."""
+
+    def prepare_solve(self, ctx: StepContext, active: wp.array) -> None:
+        """Prepare a linear solve at a new iterate."""
+
+    def precondition(
+        self, ctx: StepContext, r: wp.array, z: wp.array, active: wp.array, into: wp.array | None = None
+    ) -> None:  # fmt: skip
+        """Correct z = D^-1 r on the slots that it couples; with `into` add the result there instead.
+
+        Called if constraint directions are deflated (ctx.options.deflate_constraints).
+        """
+
+    def predict_multipliers(self, ctx: StepContext, active: wp.array) -> None:
+        """Multiplier part of the Newton step in work.direction."""
+
+    def update_multipliers(self, ctx: StepContext, flags: wp.array) -> None:
+        """Update multipliers after the inner solve of a classical multiplier method in the flagged worlds."""
+
+
+@dataclass(eq=False)
+class CachedInputs:
+    """Inputs of a term's blocks besides displacements, arrays [world, ...].
+
+    Attributes:
+        live: as the term evaluates them; cached: copies at the linearisation of the preconditioner; state: copies saved
+            with the state, from which a resumed run rebuilds the preconditioner.
+    """
+
+    live: list[wp.array]
+    cached: list[wp.array]
+    state: list[wp.array]
+
+
+class Preconditioned(Term):
+    """Term with blocks of H in matrices and preconditioners, as stiff terms need."""
+
+    def incidence(self) -> tuple[np.ndarray, np.ndarray, int] | None:
+        """Entries (item, slot, number of items) outside the elements' pattern: the slots of an item couple."""
+        return None
+
+    def cached_inputs(self, ctx: StepContext) -> list[tuple[str, wp.array]]:
+        """Names and arrays [world, ...] that `blocks(projected=True)` depends on besides the displacements.
+
+        A preconditioner stores copies, so that a resumed run rebuilds the same one.
+        """
+        return []
+
+    def copy_cached(self, ctx: StepContext, kept: CachedInputs, reuse: Any, accepted: wp.array) -> bool:
+        """Copy the cached inputs with a kernel of its own; False: the caller copies array by array."""
+        return False
+
+    def reset_scratch(self, ctx: StepContext, flags: wp.array) -> None:
+        """Reset persistent scratch of the flagged worlds after a device-side reset."""
+
+    def allocate_blocks(self, ctx: StepContext, matrix: Any, *, projected: bool) -> None:
+        """Allocate for `blocks` before launches are captured; `projected`: no other blocks are needed."""
+
+    def block_modules(self) -> Iterable[wp.Module]:
+        """Modules launched by `blocks`."""
+        return ()
+
+    def blocks(
+        self, ctx: StepContext, matrix: Any, kept: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,
+        *, projected: bool,
+    ) -> None:  # fmt: skip
+        """out += (dq/dv) K, with the pattern of `matrix` (see solvers.matrix_assembly.MatrixAssembler), from the
+        arrays of `cached_inputs`.
+
+        `projected`: the positive semi-definite part only. Omitted stiffness costs iterations: both D and the
+        preconditioner lack it then.
+        """
+
+
+class Coupled(Term):
+    """Term whose tangent couples bodies that share no element."""
+
+    def coupled_bodies(self) -> list[tuple[int, int]]:
+        """Body pairs coupled by the tangent but not by `blocks`: the rest is added by `add_mode_coupling`."""
+        return []
+
+    def allocate_mode_coupling(self, ctx: StepContext, motions: Any) -> Iterable[wp.Module]:
+        """Allocate for `add_mode_coupling` before launches are captured; returns its modules."""
+        return ()
+
+    def add_mode_coupling(self, ctx: StepContext, kept: list[wp.array], dq_dv: wp.array, active: wp.array) -> None:
+        """Add the coupling of bodies to the rigid body mode matrix (solvers/rigid_body_modes.py)."""
+
+
+class Parametrised(Term):
+    """Term with parameters of `Model.set_parameter`, or with constants that follow from materials."""
+
+    def parameters(self) -> Mapping[str, Callable[[Any, np.ndarray], None]]:
+        """Setters of `Model.set_parameter` by name: each validates the user's value and sets it in the worlds of the
+        mask (worlds,)."""
+        return {}
+
+    def parameter_arrays(self) -> Mapping[str, wp.array]:
+        """Arrays written by `parameters`, by the term's own names: saved in checkpoints and restored."""
+        return {}
+
+    def update_materials(self, mask: np.ndarray) -> None:
+        """Update in place after material constants (see `model.parameters`) were set in the chosen worlds (worlds,);
+        before the first simulation arrays may be replaced by longer ones."""
+
+
+class Diagnosed(Term):
+    """Term that explains rejected attempts."""
+
+    def failure_reason(self, ctx: StepContext, world: int) -> tuple[type[ConvergenceError], str] | None:
+        """Error class and reason of the last rejected attempt of a world, or None if unknown to the term."""
+        return None
+
+    def failure_note(self, ctx: StepContext, world: int) -> str:
+        """Additional note on the last rejected attempt of a world; "" for none."""
+        return ""
+
+
+PROTOCOLS = (Tied, Updated, Constrained, Preconditioned, Coupled, Parametrised, Diagnosed)
