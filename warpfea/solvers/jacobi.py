@@ -199,13 +199,13 @@ class JacobiLoop(NewtonLoop):
         self._compute_step(active)
         if self.limits_step:
             launch(self.kernels.reset_step_limit, self.model.worlds, [w.newton])
-        self._call_terms(Updated, "process_direction", active)
+        self.terms.call(self.ctx, Updated, "process_direction", active)
         launch(k.apply_move, self.dim, [w.newton, w.direction, w.v])
         self.residual.evaluate(active)
         launch(k.check_iterate, self.model.worlds, [w.newton, self.control])
         if self.terms.traits.stored:
-            self._call_terms(Updated, "accept_trial", active)
-            self._call_terms(Updated, "update_frozen", active)
+            self.terms.call(self.ctx, Updated, "accept_trial", active)
+            self.terms.call(self.ctx, Updated, "update_frozen", active)
         self._reduce_flags(active, self.any_iterating)
 
     @launch_part("vectors")

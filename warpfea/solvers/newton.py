@@ -186,8 +186,7 @@ class NewtonLoop:
         deflate = kind not in ("block-jacobi", "banded") and not direct
         penalty_ratio = options.penalty_ratio(model.dtype)
         ctx.options = TermOptions(self.outer_multipliers, penalty_ratio, deflate_constraints=deflate)
-        for term in self.terms.having(Constrained):
-            term.configure(ctx)
+        self.terms.call(ctx, Constrained, "configure")
         operator = options.operator
         if direct and operator == "auto":  # factors live as long as the matrix, unless terms add to it
             operator = "elements" if model.terms.has_tangents or ctx.midpoint else "matrix"
@@ -286,9 +285,9 @@ class NewtonLoop:
     def _evaluate_first_iterate(self, flags: wp.array) -> None:
         """Evaluate the first iterate; its convergence check needs D, so the blocks come first."""
         self.residual.update_positions(flags)
-        self._call_terms(Term, "prepare", flags)
+        self.terms.call(self.ctx, Term, "prepare", flags)
         self.preconditioner.start(flags)
-        self._call_terms(Constrained, "scale", flags)
+        self.terms.call(self.ctx, Constrained, "scale", flags)
         self.residual.evaluate(flags, freeze=True)
 
     def _solve(self, first: bool = False) -> None:
@@ -329,7 +328,7 @@ class NewtonLoop:
     def _update_multipliers(self) -> None:
         """Update multipliers, lambda += rho c, in worlds with violated constraints; solve again from the current v."""
         w = self.work
-        self._call_terms("update_multipliers", w.newton.search.trial_accepted)
+        self.terms.call(self.ctx, Constrained, "update_multipliers", w.newton.search.trial_accepted)
         self.residual.evaluate(w.newton.active, freeze=True)
         self._solve()
         self._check_constraints()
@@ -346,8 +345,8 @@ class NewtonLoop:
         self.residual.tangent_curvature(active)
         if self.limits_step:
             launch(k.reset_step_limit, self.model.worlds, [w.newton])
-        self._call_terms(Updated, "process_direction", active)
-        self._call_terms(Constrained, "predict_multipliers", active)
+        self.terms.call(self.ctx, Updated, "process_direction", active)
+        self.terms.call(self.ctx, Constrained, "predict_multipliers", active)
         launch(self.vector_kernels.set_base, self.dim, [w.newton, w.v, w.base_velocity, w.best_velocity])
         launch(self.vector_kernels.dot_terms, self.dim, [w.gradient, w.direction, active, w.rows])
         self.residual.reduce(w.rows, 1, active, w.newton.search.slope_sum)
@@ -357,7 +356,7 @@ class NewtonLoop:
         if self.terms.traits.unilateral:
             self._update_frozen()
         self.preconditioner.update(active)
-        self._call_terms(Constrained, "prepare_solve", active)
+        self.terms.call(self.ctx, Constrained, "prepare_solve", active)
         self._reduce_flags(active, self.any_iterating)
 
     @launch_part("control")
@@ -390,7 +389,7 @@ class NewtonLoop:
 
     def _reevaluate_frozen(self) -> None:
         w, flags = self.work, self.work.newton.search.trial_accepted
-        self._call_terms(Updated, "update_frozen", flags)
+        self.terms.call(self.ctx, Updated, "update_frozen", flags)
         self.residual.reevaluate_frozen(flags)
         self.launch(self.kernels.end_frozen_update, self.model.worlds, [w.newton, flags])
         self._run_if_rare(self._check_inversion)
@@ -431,18 +430,13 @@ class NewtonLoop:
         self.residual.evaluate(w.newton.search.active)
         launch(k.check_trial, self.model.worlds, [w.newton])
         if self.terms.traits.stored:
-            self._call_terms(Updated, "accept_trial", w.newton.search.trial_accepted)
+            self.terms.call(self.ctx, Updated, "accept_trial", w.newton.search.trial_accepted)
         self._reduce_flags(w.newton.search.active, self.any_searching)
 
     def _run_if_rare(self, do: Callable[[], None]) -> None:
         """Run `do` if any world needs the rare branch."""
         with self.launch.rare():
             wp.capture_if(self.work.newton.any_rare_branch, do)
-
-    def _call_terms(self, protocol: type[Term], what: str, flags: wp.array) -> None:
-        """Call one method of all terms that have a protocol."""
-        for term in self.terms.having(protocol):
-            getattr(term, what)(self.ctx, flags)
 
     def _reduce_flags(self, flags: wp.array, out: wp.array) -> None:
         out.zero_()

@@ -133,6 +133,11 @@ class TermSet:
             self._having[protocol] = [term for term in self.all if isinstance(term, protocol)]
         return self._having[protocol]
 
+    def call(self, ctx: StepContext, protocol: type[Term], method: str, *flags: wp.array) -> None:
+        """Call a method of a protocol of all terms that have it, in order."""
+        for term in self.having(protocol):
+            getattr(term, method)(ctx, *flags)
+
     def find(self, kind: type[Any]) -> Any:
         """Term of one kind, or None."""
         return next(iter(self.having(kind)), None)
