@@ -1,0 +1,317 @@
+"""Removal of one mechanism or constant at a time: rows of the stress suite and random cases that are lost without it.
+
+Each variant is a copy of the sources with a mechanism switched off (`MECHANISMS`: a text in place of another) or a
+constant without effect (`CONSTANTS`: a value that disables it). The stress suite and 200 seeded random cases
+(random_cases.py) are run with the copy and with the unchanged sources, in processes side by side. A row is lost if it
+met its criterion before and does not now; it is touched if its iterations or its error differ. With a GPU
+(--device cuda:0) only rows that a file of the CPU names as touched are run, see `touched`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import pathlib
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+from .random_cases import same
+from .table import Row, Run, Table
+
+__all__ = ["CONSTANTS", "MECHANISMS", "TABLE", "Constant", "constant_file", "disabled", "variants"]
+
+ROOT = pathlib.Path(__file__).resolve().parents[2]
+COPIED = ("kernels", "warpfea", "scenes", "tests/validation")
+SEARCH, CONVERGENCE, NEWTON = (f"kernels/solvers/{name}.py" for name in ("line_search", "convergence", "newton"))
+RANDOM_CASES = 200
+LONG_ROWS = ("rest-1e6", "soft-")
+"""Beginnings of rows left out: a million steps, and meshes that the package does not contain."""
+
+Change = tuple[str, str, str]
+"""File, text, and the text in its place."""
+
+MECHANISMS: dict[str, tuple[Change, ...]] = {
+    "Armijo": ((SEARCH, "good = change <= f64(ARMIJO_FACTOR) * alpha * ctl.slope[world]", "good = True"),),
+    "slope fallback": ((SEARCH, "if wp.abs(change) > noise:", "if True:"),),
+    "nonmonotone trials": ((SEARCH, "out = ctl.search_trials[world] == 0 and", "out = False and"),),
+    "watchdog": ((SEARCH, "elif ctl.nonmonotone_steps[world] >= MAX_NONMONOTONE and", "elif False and"),),
+    "predicted stress": (
+        (SEARCH, "            ctl.predicted_stress[world] = 1\n", "            ctl.predicted_stress[world] = 0\n"),
+        (SEARCH, "wp.where(tangent_needed(ctl, world), 0, 1)", "0"),
+        (SEARCH, "wp.where(tangent_needed(ctl, world), 0, 2)", "0"),
+        (NEWTON, "wp.where(tangent_needed(ctl, world), 0, 2)", "0"),
+    ),
+    "kink search": ((SEARCH, "has_kinks = unilateral and not midpoint", "has_kinks = False"),),
+    "excursions": ((SEARCH, "ctl.penetrating_steps[world] < MAX_PENETRATING_STEPS", "False"),),
+    "floor estimate": (
+        (CONVERGENCE, "near = near and ctl.error_estimates[world] < MAX_ERROR_ESTIMATES", "near = False"),
+        (CONVERGENCE, "near = at_roundoff and ctl.error_estimates[world] < MAX_ERROR_ESTIMATES", "near = False"),
+    ),
+    "candidate starts": ((NEWTON, "if is_poor_first_iterate(ctl, world):", "if False:"),),
+    "doublings": ((SEARCH, "longer = (\n            good and", "longer = (\n            False and good and"),),
+}
+"""Mechanisms of globalisation -> changes that switch them off."""
+
+
+@dataclass(frozen=True)
+class Constant:
+    """A tuned constant.
+
+    Attributes:
+        area: "Newton and PCG", "reuse", "adaptive and predictor" or "contact".
+        unit: of its value.
+        disabled: value that takes its effect away.
+        rows: part of the stress suite that it can act on: a beginning of groups; empty: all.
+    """
+
+    area: str
+    unit: str
+    disabled: float
+    rows: str = ""
+
+
+NEWTON_PCG, REUSE, ADAPTIVE, CONTACT = "Newton and PCG", "reuse", "adaptive and predictor", "contact"
+CONSTANTS: dict[str, Constant] = {
+    "TOL_ROUNDINGS": Constant(NEWTON_PCG, "eps", 0.0),
+    "EXTRAPOLATED_TOL_FACTOR": Constant(NEWTON_PCG, "tol", 1.0),
+    "UNSOLVED_TOL_FACTOR": Constant(NEWTON_PCG, "tol", 1.0),
+    "STALL_RATIO": Constant(NEWTON_PCG, "1", 0.0),
+    "TIGHT_CONSTRAINT_ITERATIONS": Constant(NEWTON_PCG, "iterations", 0),
+    "STALL_ROUNDINGS": Constant(NEWTON_PCG, "roundings of the positions", 1.0),
+    "STALL_ROUNDINGS_MIDPOINT": Constant(NEWTON_PCG, "roundings of the positions", 1.0e3),
+    "MAX_STALL_STEP": Constant(NEWTON_PCG, "accepted errors", 1.0e300),
+    "EXTRA_ITERATION_FACTOR": Constant(NEWTON_PCG, "max_newton", 0),
+    "STALL_ENERGY_ROUNDINGS": Constant(NEWTON_PCG, "eps", 0.0),
+    "NOISE_DOMINATED_ROUNDINGS": Constant(NEWTON_PCG, "roundings of the positions", 0.0),
+    "VELOCITY_ROUNDINGS": Constant(NEWTON_PCG, "roundings of the velocities", 0.0),
+    "STRAIN_ENERGY_FRACTION": Constant(NEWTON_PCG, "1", 0.0),
+    "GROUP_ROUNDINGS": Constant(NEWTON_PCG, "roundings of the positions", 0.0),
+    "MAX_REUSED_BACKTRACKS": Constant(NEWTON_PCG, "halvings", 20),
+    "RADIUS_SHRINK": Constant(NEWTON_PCG, "1", 1.0),
+    "MAX_TRUST_RADIUS": Constant(NEWTON_PCG, "1", 1.0e300),
+    "SOLVES_WITHOUT_STEP": Constant(NEWTON_PCG, "solves", 1000000),
+    "DISPLACEMENT_ROUNDINGS": Constant(NEWTON_PCG, "roundings of the displacements", 0.0),
+    "ALTERNATIVE_START_FORCING": Constant(NEWTON_PCG, "1", 1.0e-3),
+    "MAX_START_ENERGY_RATIO": Constant(NEWTON_PCG, "kinetic energies", 1.0),
+    "CONSTRAINT_FORCING": Constant(NEWTON_PCG, "1", 1.0),
+    "UNCHECKED_ITERATIONS": Constant(NEWTON_PCG, "iterations", 0),
+    "MIN_ENERGY_GAIN": Constant(NEWTON_PCG, "1", 0.0),
+    "SCATTER_FACTOR": Constant(NEWTON_PCG, "1", 0.0),
+    "STIFFNESS_RATIO": Constant(NEWTON_PCG, "1", 1.0e300),
+    "RESIDUAL_GROWTH": Constant(NEWTON_PCG, "1", 1.0e300),
+    "FROZEN_UPDATE_RESIDUAL": Constant(NEWTON_PCG, "1", 1.0e300),
+    "ESTIMATE_RESIDUAL": Constant(NEWTON_PCG, "1", 1.0e-8),
+    "MAX_STALLED_ITERATIONS": Constant(NEWTON_PCG, "iterations", 1000000),
+    "START_STRESS_RESIDUAL": Constant(NEWTON_PCG, "1", 0.0),
+    "NEW_MATRIX_DECADES": Constant(REUSE, "decades", 1.0e3),
+    "REDUCTION_FADING": Constant(REUSE, "1", 1.0),
+    "DIAGONAL_AGEING": Constant(REUSE, "iterations", 0.0),
+    "REUSED_FORCING_FACTOR": Constant(REUSE, "1", 1.0),
+    "ORDER_MARGIN": Constant(ADAPTIVE, "1", 1.0),
+    "PREDICTOR_ROUNDINGS": Constant(ADAPTIVE, "roundings of the velocity", 0.0),
+    "MAX_EXTRAPOLATED_GROWTH": Constant(ADAPTIVE, "1", 1.0e300),
+    "STARTUP_STEPS": Constant(ADAPTIVE, "steps", 0.0),
+    "SLOW_REDUCTION": Constant(CONTACT, "1", 1.0e300, "contact"),
+    "MIN_APPROACH_SPEED": Constant(CONTACT, "m/s", 1.0e-30, "contact"),
+    "MIN_NORMAL_COSINE": Constant(CONTACT, "1", -2.0, "contact"),
+    "TUNNEL_LIMIT_RATIO": Constant(CONTACT, "depth limit", 1.0e300, "contact"),
+    "OPPOSING_COSINE": Constant(CONTACT, "1", 2.0, "contact"),
+    "MAX_DEPTH_RATIO": Constant(CONTACT, "deepest penetration", 1.0e300, "contact"),
+    "MAX_EDGE_TANGENT": Constant(CONTACT, "1", 0.0, "contact"),
+    "TANGENT_PLANE_MARGIN": Constant(CONTACT, "facets", 1.0e300, "contact"),
+    "OUTSIDE_TOLERANCE": Constant(CONTACT, "facets", 1.0e-9, "contact"),
+    "MAX_OVERHANG": Constant(CONTACT, "facets", 0.0, "contact"),
+    "MASTER_SIZE_RATIO": Constant(CONTACT, "1", 1.0e300, "contact"),
+    "MAX_CORNER_LENGTH": Constant(CONTACT, "facets", 0.0, "contact"),
+}
+"""Tuned constants by name, unique among the sources."""
+
+
+def constant_file(name: str, root: pathlib.Path = ROOT) -> tuple[pathlib.Path, Any]:
+    """File that defines a constant, and its value. KeyError where there is none, or several."""
+    found = []
+    for folder in ("kernels", "warpfea"):
+        for path in sorted((root / folder).rglob("*.py")):
+            for line in re.findall(rf"^(?:[A-Z_0-9]+, )*{name}(?:, [A-Z_0-9]+)* = .+$", path.read_text(), re.MULTILINE):
+                names, _, values = line.partition(" = ")
+                scope: dict[str, Any] = {}
+                exec(f"{names} = {values}", {}, scope)
+                found.append((path, scope[name]))
+    if len(found) != 1:
+        raise KeyError(f"{name}: {len(found)} definitions")
+    return found[0]
+
+
+def variants() -> dict[str, str]:
+    """Labels of all variants, with their area; "" is the unchanged code."""
+    return {"": ""} | dict.fromkeys(MECHANISMS, "globalisation") | {k: c.area for k, c in CONSTANTS.items()}
+
+
+def disabled(variant: str, root: pathlib.Path) -> None:
+    """Change the sources under `root` to a variant. KeyError where a text to replace is not there."""
+    if variant in CONSTANTS:
+        path, _ = constant_file(variant, root)
+        path.write_text(f"{path.read_text()}\n{variant} = {CONSTANTS[variant].disabled!r}\n")
+    for file, old, new in MECHANISMS.get(variant, ()):
+        path = root / file
+        text = path.read_text()
+        if old not in text:
+            raise KeyError(f"{variant}: {file} has no {old!r}")
+        path.write_text(text.replace(old, new))
+
+
+def _tree(variant: str, folder: pathlib.Path) -> pathlib.Path:
+    """A copy of the sources as a variant."""
+    out = folder / (variant.replace(" ", "_") or "unchanged")
+    for name in COPIED:
+        shutil.copytree(ROOT / name, out / name, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(ROOT / "pyproject.toml", out)
+    disabled(variant, out)
+    return out
+
+
+def _parts(labels: Mapping[str, float], count: int) -> list[list[str]]:
+    """Labels in groups of about equal cost, those of a case together as they share kernels."""
+    groups: dict[str, list[str]] = {}
+    for label in labels:
+        groups.setdefault(label.partition("/")[0], []).append(label)
+    pieces = [words[k : k + 12] for words in groups.values() for k in range(0, len(words), 12)]
+    pieces.sort(key=lambda piece: -math.fsum(labels[label] for label in piece))
+    out: list[list[str]] = [[] for _ in range(count)]
+    cost = [0.0] * count
+    for piece in pieces:
+        k = cost.index(min(cost))
+        out[k] += piece
+        cost[k] += math.fsum(labels[label] + 0.2 for label in piece)
+    return [part for part in out if part]
+
+
+def _child(tree: pathlib.Path, words: Sequence[str], out: pathlib.Path) -> list[Row]:
+    """Rows that a command of a variant's tree writes."""
+    env = os.environ | {"PYTHONPATH": os.pathsep.join([str(tree), *filter(None, [os.environ.get("PYTHONPATH")])])}
+    env |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONSAFEPATH": "1"}
+    done = subprocess.run([sys.executable, *words], cwd=tree, env=env, capture_output=True, text=True)
+    if not out.exists():
+        return [{"case": " ".join(words[-6:]), "precision": "", "passed": False, "outcome": "crashed",
+                 "note": done.stderr[-500:]}]  # fmt: skip
+    return list(json.loads(out.read_text())["rows"])
+
+
+def _stress_rows(run: Run) -> dict[str, tuple[str, float]]:
+    """Rows of the stress suite that are run: label -> group and seconds measured."""
+    known = json.loads((ROOT / "tests" / "results" / "stress_cpu.json").read_text())["rows"]
+    out: dict[str, tuple[str, float]] = {}
+    for row in known:
+        if not row["case"].startswith(LONG_ROWS) and run.wants(row["case"]):
+            out[row["case"]] = (row["group"], out.get(row["case"], ("", 0.0))[1] + row["wall_s"])
+    return dict(list(out.items())[:20]) if run.quick else out
+
+
+def _tasks(
+    run: Run, variant: str, jobs: int, random: bool, touched: Mapping[str, Sequence[str]]
+) -> Iterator[list[str]]:
+    """Commands of a variant, without the file of their rows."""
+    if random:
+        share = -(-RANDOM_CASES // jobs)
+        for first in range(0, RANDOM_CASES, share):
+            last = min(first + share, RANDOM_CASES)
+            yield ["-m", "tests.validation.random_cases", "--device", run.device, "--seeds", f"{first}:{last}", "--out"]
+        return
+    part = CONSTANTS[variant].rows if variant in CONSTANTS else ""
+    wanted = set().union(*touched.values()) if variant == "" else set(touched.get(variant, ()))
+    rows = {label: seconds for label, (group, seconds) in _stress_rows(run).items()
+            if group.startswith(part) and (not touched or label in wanted)}  # fmt: skip
+    for labels in _parts(rows, max(jobs, 1)):
+        cases = [word for label in labels for word in ("--case", label)]
+        yield ["-m", "warpfea", "stress", "--quiet", "--device", run.device, *cases, "--json"]
+
+
+def _compare(before: Sequence[Row], after: Sequence[Row]) -> Row:
+    """Lost and touched rows, and the ratio of iterations over the touched rows and over all that pass in both."""
+    old = {(row["case"], row["precision"]): row for row in before}
+    lost, touched, regained = [], set(), []
+    sums = {name: [0, 0] for name in ("newton", "pcg")}
+    for row in after:
+        was = old.get((row["case"], row["precision"]))
+        name = f"{row['case']} {row['precision']}"
+        if was is None:
+            lost.append(f"{name}: {row.get('note', '')[:200]}")
+            continue
+        if any(was.get(key) != row.get(key) for key in ("newton", "pcg", "error", "outcome", "answer")):
+            touched.add(row["case"])
+        if was["passed"] and not row["passed"]:
+            lost.append(f"{name}: {row['outcome']}: {row['note'][:160]}")
+        elif row["passed"] and not was["passed"]:
+            regained.append(name)
+        if was["passed"] and row["passed"]:
+            if isinstance(was.get("error"), list) and not same(was["error"], row["error"], row["precision"]):
+                lost.append(f"{name}: another answer")
+            for key, pair in sums.items():
+                pair[0] += was.get(key) or 0
+                pair[1] += row.get(key) or 0
+    ratio = {key: pair[1] / pair[0] if pair[0] else 1.0 for key, pair in sums.items()}
+    return {"rows": len(after), "touched": sorted(touched), "lost": lost, "regained": regained, **ratio}
+
+
+def _study(run: Run, *, random: bool) -> Iterator[Row]:
+    """A row per variant."""
+    asked, areas = run.options["variants"].split("+"), variants()
+    chosen = [name for name in areas if name and (asked == ["all"] or name in asked or areas[name] in asked)]
+    touched: Mapping[str, Sequence[str]] = {}
+    if run.options["touched"]:
+        known = json.loads(pathlib.Path(run.options["touched"]).read_text())
+        touched = {row["variant"]: row["touched"] for row in known["stress"]}
+        chosen = [name for name in chosen if touched.get(name)]
+    jobs = run.options["jobs"]
+    with tempfile.TemporaryDirectory() as name, ThreadPoolExecutor(jobs) as pool:
+        folder = pathlib.Path(name)
+
+        def submit(variant: str) -> list[Any]:
+            tree = _tree(variant, folder)
+            files = enumerate(_tasks(run, variant, jobs, random, touched))
+            return [pool.submit(_child, tree, [*words, str(out := tree / f"rows{k}.json")], out) for k, words in files]
+
+        base = [row for task in submit("") for row in task.result()]  # first: compiles what all share
+        running = {variant: submit(variant) for variant in chosen}
+        for variant, tasks in running.items():
+            rows = [row for task in tasks for row in task.result()]
+            label: Row = {"variant": variant, "area": variants()[variant]}
+            if variant in CONSTANTS:
+                constant = CONSTANTS[variant]
+                value = constant_file(variant)[1]
+                label |= {"value": value, "unit": constant.unit, "disabled": constant.disabled}
+            yield label | _compare(base, rows)
+
+
+def stress(run: Run) -> Iterator[Row]:
+    """Rows of the stress suite lost without a mechanism or constant."""
+    return _study(run, random=False)
+
+
+def random_cases(run: Run) -> Iterator[Row]:
+    """Random cases refused, or answered otherwise, without a mechanism or constant."""
+    return _study(run, random=True)
+
+
+TABLE = Table(
+    __doc__,
+    {"stress": stress, "random": random_cases},
+    {
+        "ablation_cpu.json": "ablation --set jobs=16 --out tests/results/ablation_cpu.json",
+        "ablation_h200.json": "ablation --device cuda:0 --set jobs=14 --set touched=tests/results/ablation_cpu.json "
+        "--out tests/results/ablation_h200.json",
+    },
+    options={"jobs": 2, "variants": "all", "touched": ""},
+    settings={"random cases": RANDOM_CASES, "left out": list(LONG_ROWS)},
+    columns=("variant", "area", "value", "rows", "newton", "pcg", "lost"),
+    takes="an hour on 16 cores",
+    apart=True,
+)
