@@ -39,24 +39,24 @@ Change = tuple[str, str, str]
 """File, text, and the text in its place."""
 
 MECHANISMS: dict[str, tuple[Change, ...]] = {
-    "Armijo": ((SEARCH, "good = change <= f64(ARMIJO_FACTOR) * alpha * ctl.slope[world]", "good = True"),),
+    "Armijo": ((SEARCH, "good = change <= f64(ARMIJO_FACTOR)", "good = True or change <= f64(ARMIJO_FACTOR)"),),
     "slope fallback": ((SEARCH, "if wp.abs(change) > noise:", "if True:"),),
-    "nonmonotone trials": ((SEARCH, "out = ctl.search_trials[world] == 0 and", "out = False and"),),
-    "watchdog": ((SEARCH, "elif ctl.nonmonotone_steps[world] >= MAX_NONMONOTONE and", "elif False and"),),
+    "nonmonotone trials": ((SEARCH, "            ctl.search.trials[world] == 0\n", "            False\n"),),
+    "watchdog": ((SEARCH, "elif ctl.nonmonotone.steps[world] >= MAX_NONMONOTONE and", "elif False and"),),
     "predicted stress": (
-        (SEARCH, "            ctl.predicted_stress[world] = 1\n", "            ctl.predicted_stress[world] = 0\n"),
+        (SEARCH, "predicted_stress[world] = 1\n", "predicted_stress[world] = 0\n"),
         (SEARCH, "wp.where(tangent_needed(ctl, world), 0, 1)", "0"),
         (SEARCH, "wp.where(tangent_needed(ctl, world), 0, 2)", "0"),
         (NEWTON, "wp.where(tangent_needed(ctl, world), 0, 2)", "0"),
     ),
     "kink search": ((SEARCH, "has_kinks = unilateral and not midpoint", "has_kinks = False"),),
-    "excursions": ((SEARCH, "ctl.penetrating_steps[world] < MAX_PENETRATING_STEPS", "False"),),
+    "excursions": ((SEARCH, "ctl.nonmonotone.penetrating_steps[world] < MAX_PENETRATING_STEPS", "False"),),
     "floor estimate": (
-        (CONVERGENCE, "near = near and ctl.error_estimates[world] < MAX_ERROR_ESTIMATES", "near = False"),
-        (CONVERGENCE, "near = at_roundoff and ctl.error_estimates[world] < MAX_ERROR_ESTIMATES", "near = False"),
+        (CONVERGENCE, "near = near and ctl.floor.estimates[world] < MAX_ERROR_ESTIMATES", "near = False"),
+        (CONVERGENCE, "near = at_roundoff and ctl.floor.estimates[world] < MAX_ERROR_ESTIMATES", "near = False"),
     ),
     "candidate starts": ((NEWTON, "if is_poor_first_iterate(ctl, world):", "if False:"),),
-    "doublings": ((SEARCH, "longer = (\n            good and", "longer = (\n            False and good and"),),
+    "doublings": ((SEARCH, "longer = (\n            good\n", "longer = (\n            False\n"),),
 }
 """Mechanisms of globalisation -> changes that switch them off."""
 
