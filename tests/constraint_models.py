@@ -68,9 +68,9 @@ def centre(body):
 
 def places(model):
     """(slots, 3) slot values in space, of the reference."""
-    position = (model.slot_kind == 0)[:, None]
+    position = (model.slot_table.kind == 0)[:, None]
     origin = np.concatenate([np.tile(b.origin, (b.slot_count, 1)) for b in model.bodies])
-    return model.reference + position * origin, position
+    return model.slot_table.reference + position * origin, position
 
 
 def moved(model, motions):

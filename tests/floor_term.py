@@ -158,9 +158,9 @@ class Floor(Updated, Tied, Preconditioned):
 
     def build(self, laws):
         m = self.model
-        slots = np.flatnonzero(m.slot_kind == 0)
+        slots = np.flatnonzero(m.slot_table.kind == 0)
         origin = np.concatenate([np.tile(b.origin, (b.slot_count, 1)) for b in m.bodies])
-        self.height_host = (m.reference + origin)[slots, 2]
+        self.height_host = (m.slot_table.reference + origin)[slots, 2]
         self.slots, self.dim = slots, (m.worlds, len(slots))
         self.slot, self.height = m.array("floor", slots, wp.int32), m.array("floor", self.height_host, m.types.T)
         self.connectivity, self.rows = [slots[:, None]], len(slots)

@@ -17,8 +17,8 @@ def prepare(model, operator):
     sim = Simulation(model, dt=DT, solver=solver(None, operator=operator), ledger=False, capture=False)
     w, residual = sim.stepper.work, sim.stepper.newton.residual
     elements = sum(len(body.mesh.cells) for body in model.bodies)
-    length = (model.lumped_host.sum() / DENSITY / elements) ** (1.0 / 3.0)
-    scale = DISPLACEMENT * np.where(model.is_position_host > 0.0, length, 1.0)
+    length = (model.masses.lumped[0].sum() / DENSITY / elements) ** (1.0 / 3.0)
+    scale = DISPLACEMENT * np.where(model.slot_table.is_position > 0.0, length, 1.0)
     _assign(model, w.u, scale[:, None] * _random(model, 1))
     w.step.dq_dv.fill_(DT)
     w.step.mass_factor.fill_(1.0 / DT)
@@ -36,7 +36,7 @@ def apply(model, residual):
 
 def _random(model, seed):
     """(slots, 3) numbers, 0 where a component is prescribed."""
-    return np.random.default_rng(seed).standard_normal((model.slots, 3)) * model.free_host
+    return np.random.default_rng(seed).standard_normal((model.slots, 3)) * model.slot_table.free
 
 
 def _assign(model, field, values):

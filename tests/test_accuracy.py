@@ -256,7 +256,7 @@ def test_problems_are_described_and_their_motions_begin_where_the_probes_are(nam
     reference = make_reference(scene.reference, scene.resolve({}))
     if reference is None:
         return
-    probes = {p.name: p for p in model.probes}
+    probes = {p.name: p for p in model.description.probes}
     for key, motion in reference.probes.items():
         first = motion(np.array([1e-6]))[0] if callable(motion) else np.asarray(motion[1])[0]
         np.testing.assert_allclose(first, probes[key].X, atol=1e-4)

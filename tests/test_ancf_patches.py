@@ -33,7 +33,7 @@ def test_tangent_and_force_are_derivatives(name, integration, data):
     u, d = strained(body), np.random.default_rng(5).uniform(-1, 1, body.reference.shape)
     d[body.slot_kind == 0] *= 0.1
     state = state_of(model, u)
-    assert 0.3 < model.minimum_jacobian(state)[0] < 2.0
+    assert 0.3 < model.evaluation.minimum_jacobian(state)[0] < 2.0
     force = model.internal_force(state)[0]
     K = model.tangent_matrix(state)
     assert abs(K - K.T).max() < 1e-14 * abs(K).max()
@@ -180,7 +180,7 @@ def fall(load, h, steps):
 
 def fall_error(sim, bodies, exact):
     u = sim.state.displacement.numpy()[0]
-    kind = sim.model.slot_kind[:, None]
+    kind = sim.model.slot_table.kind[:, None]
     rows = np.concatenate([body.slots for body in bodies])
     return np.abs(u - np.where(kind == 0, exact, 0.0))[rows].max() / np.abs(exact).max()
 

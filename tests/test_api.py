@@ -148,6 +148,25 @@ def test_statics_and_worlds():
     assert list(s.time > 0) == [False, True, True, False]
 
 
+def test_a_model_has_few_public_names():
+    """The rest belongs to its parts: slot_table, components, memory, masses, parameters, terms, evaluation."""
+    b = wf.ModelBuilder()
+    b.add_solid(wf.mesh.box((1, 0.1, 0.1), cells=(2, 1, 1)), material=wf.NeoHookean(mu=4e5, k=1e7, density=1000.0))
+    names = [name for name in dir(b.finalize(device="cpu")) if not name.startswith("_")]
+    assert len(names) <= 40, names
+
+
+def test_later_additions_leave_a_model_as_it_is():
+    b = wf.ModelBuilder()
+    body = b.add_solid(wf.mesh.box((1, 0.1, 0.1), cells=(2, 1, 1)), material=wf.SVK(E=1e6, nu=0.3, density=1000.0))
+    model = b.finalize(device="cpu")
+    b.clamp(body.nodes("x-"))
+    b.add_probe("tip", body.surface("x+"))
+    assert model.description.probes == []
+    assert model.resized(2).free_slots.all()
+    assert not b.finalize(device="cpu").free_slots.all()
+
+
 def test_contact():
     b = wf.ModelBuilder(gravity=(0, 0, -9.81))
     soft = wf.NeoHookean(mu=4e5, k=1e7, density=1000.0)

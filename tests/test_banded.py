@@ -62,7 +62,7 @@ def test_factors_against_scipy(name, dtype):
     band.factorise(value, on)
     assert not band.diagonal_shift.numpy().any()
     H = matrix.host_csr(value).tocsc().astype(float)
-    r = np.random.default_rng(0).standard_normal(H.shape[0]) * sim.model.free_host.ravel()
+    r = np.random.default_rng(0).standard_normal(H.shape[0]) * sim.model.slot_table.free.ravel()
     expected = spl.spsolve(H, r)
     limit = {"float64": 1e-9, "float32": 2e-2}[dtype]
     assert np.linalg.norm(solved(sim, r)[0] - expected) < limit * np.linalg.norm(expected)
@@ -93,7 +93,7 @@ def test_of_a_matrix_that_is_not_positive_they_still_are():
     sim = simulation(column(), dt=1.0)
     sim.step()
     u = sim.stepper.work.u.numpy()
-    u[0, :, 0] -= 0.3 * (sim.model.reference[:, 0] - sim.model.reference[:, 0].min())
+    u[0, :, 0] -= 0.3 * (sim.model.slot_table.reference[:, 0] - sim.model.slot_table.reference[:, 0].min())
     band, matrix, on = parts(sim)
     value = assembled(sim, wp.array(u, dtype=sim.model.types.vec3, device="cpu"), projected=False)
     assert np.linalg.eigvalsh(matrix.host_csr(value).toarray())[0] < 0.0

@@ -59,16 +59,17 @@ def test_single_constraints_match_their_definition_and_differences(case, sort):
         scale = model.size / np.prod([np.linalg.norm(v.value) for v in (joint.rows[0].a, joint.rows[0].b)])
         expected = [scale * ((P[1] - P[0]) @ (P[3] - P[2]) - f)]
     state = state_at(model, u)
-    assert model.constraint_values(state)[0] == pytest.approx(np.array(expected), abs=1e-12)
+    assert model.evaluation.constraint_values(state)[0] == pytest.approx(np.array(expected), abs=1e-12)
     d = rng.normal(size=u.shape)
     h = 1e-5
     ahead, behind = (state_at(model, u + k * h * d) for k in (1, -1))
-    J = model.constraint_jacobian(state)
-    slope = (model.constraint_values(ahead) - model.constraint_values(behind))[0] / (2 * h)
+    J = model.evaluation.constraint_jacobian(state)
+    slope = (model.evaluation.constraint_values(ahead) - model.evaluation.constraint_values(behind))[0] / (2 * h)
     assert J @ d.ravel() == pytest.approx(slope, abs=1e-8 * np.abs(slope).max())
     lam = rng.normal(size=model.constraints.count)
-    bend = (model.constraint_jacobian(ahead) - model.constraint_jacobian(behind)).T @ lam / (2 * h)
-    product = model.constraint_curvature(state, lam, d)[0].ravel()
+    change = model.evaluation.constraint_jacobian(ahead) - model.evaluation.constraint_jacobian(behind)
+    bend = change.T @ lam / (2 * h)
+    product = model.evaluation.constraint_curvature(state, lam, d)[0].ravel()
     assert product == pytest.approx(bend, abs=1e-8 * max(np.abs(bend).max(), 1e-3))
 
 

@@ -149,7 +149,7 @@ def test_rows_are_sparse():
         b.add_joint("revolute", parent=end, child=whole, anchor=(k, 0.1, 0.1), axis=(0, 1, 0))
         end = whole
     model = b.finalize(device="cpu")
-    J = model.constraint_jacobian(model.state())
+    J = model.evaluation.constraint_jacobian(model.state())
     assert isinstance(J, sp.csr_matrix)
     assert np.diff(J.indptr).max() <= 3 * 2 * 27
     constraints = model.constraints

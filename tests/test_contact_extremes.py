@@ -81,9 +81,9 @@ def momentum_left(integrator: str, E: float, h: float, speed: float) -> float:
     sim = wf.Simulation(model, state, dt=h, integrator=integrator)
     worst = 0.0
     for _ in range(10):
-        before = model.lumped_host @ sim.state.velocity.numpy()[0].astype(float)
+        before = model.masses.lumped[0] @ sim.state.velocity.numpy()[0].astype(float)
         sim.step()
-        after = model.lumped_host @ sim.state.velocity.numpy()[0].astype(float)
+        after = model.masses.lumped[0] @ sim.state.velocity.numpy()[0].astype(float)
         impulse = h * (sim.contact_record(contact).force[0, -1] + [0.0, 0.0, -G])
         worst = max(worst, float(np.abs(after - before - impulse).max()))
     return worst / max(h * G, speed)

@@ -167,7 +167,7 @@ def momentum_error(solver, *args, **options):
     """Largest change of momentum in a step that is not the impulse of the records, over the largest change."""
     model = thrown(*args, **options)[2]
     sim = wf.Simulation(model, dt=DT, solver=solver)
-    mass = model.lumped_host
+    mass = model.masses.lumped[0]
     momentum = [mass @ sim.state.velocity.numpy()[0]]
     for _ in range(40):
         sim.step()
@@ -193,7 +193,7 @@ def test_momentum_in_single_precision(device, law):
 def test_halved_steps_keep_momentum_and_energy(device, max_newton):
     model = thrown(device=device)[2]
     sim = wf.Simulation(model, dt=4e-3, solver=wf.NewtonPCG(tol=1e-12, max_newton=max_newton))
-    mass = model.lumped_host
+    mass = model.masses.lumped[0]
     begin = mass @ sim.state.velocity.numpy()[0]
     halvings = sum(int(sim.step().halvings[0]) for _ in range(10))
     assert (halvings > 0) == (max_newton == 6)

@@ -41,14 +41,14 @@ def take(sim: wf.Simulation, strain: float, on: list[int]) -> list[np.ndarray]:
     """Make H of the worlds `on` where the beam is stretched; returns H of all worlds on the free components."""
     w, residual = sim.stepper.work, sim.stepper.newton.residual
     shake = 1e-4 * np.random.default_rng(0).standard_normal(w.u.numpy().shape)
-    reference, places = sim.model.reference.copy(), sim.model.slot_kind == 0
+    reference, places = sim.model.slot_table.reference.copy(), sim.model.slot_table.kind == 0
     reference[places] -= reference[places].min(axis=0)  # the held end stays
     at = strain * reference[:, :1] * np.eye(3)[0]
-    w.u.assign(((at + shake) * sim.model.free_host).astype(w.u.numpy().dtype))
+    w.u.assign(((at + shake) * sim.model.slot_table.free).astype(w.u.numpy().dtype))
     w.step.dq_dv.fill_(1.0)
     w.step.mass_factor.zero_()
     residual.assemble_matrix(wp.array(on, dtype=wp.int32, device="cpu"))
-    free = np.flatnonzero(sim.model.free_host.ravel())
+    free = np.flatnonzero(sim.model.slot_table.free.ravel())
     assert residual.assembler is not None
     worlds = range(sim.model.worlds)
     return [residual.assembler.host_csr(residual.operator_matrix, k)[free][:, free].toarray() for k in worlds]
@@ -57,7 +57,7 @@ def take(sim: wf.Simulation, strain: float, on: list[int]) -> list[np.ndarray]:
 def applied(sim: wf.Simulation) -> list[np.ndarray]:
     """B of each world on the free components, column by column."""
     w = sim.stepper.work
-    free = np.flatnonzero(sim.model.free_host.ravel())
+    free = np.flatnonzero(sim.model.slot_table.free.ravel())
     on = wp.ones(sim.model.worlds, dtype=wp.int32, device="cpu")
     out = np.zeros((sim.model.worlds, len(free), len(free)))
     for k, component in enumerate(free):

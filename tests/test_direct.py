@@ -83,7 +83,7 @@ def test_all_of_H_is_factorised(operator):
     newton.residual.assemble_matrix(active)
     newton.direct._assemble(active, newton.direct.matrix, projected=False)
     matrix = newton.direct.assembler.host_csr(newton.direct.matrix)
-    v = np.random.default_rng(0).normal(size=(model.slots, 3)) * model.free_host
+    v = np.random.default_rng(0).normal(size=(model.slots, 3)) * model.slot_table.free
     work.p.assign(v[None])
     newton.residual.product(work.p, work.Hp, active)
     expected = work.Hp.numpy().ravel()
@@ -180,11 +180,16 @@ def test_bad_options_are_refused(options):
 def test_a_gpu_without_cudss_solves_on_the_host_and_says_so():
     from types import SimpleNamespace
 
+    from warpfea.model.assembly import slot_graph
     from warpfea.solvers.factor import SuperLU, make_factors
 
     model = bar()
     like = SimpleNamespace(
-        device=SimpleNamespace(is_cuda=True), free_host=model.free_host, cache={}, slots=model.slots, dtype=model.dtype
+        device=SimpleNamespace(is_cuda=True),
+        slot_table=model.slot_table,
+        cache={},
+        slots=model.slots,
+        dtype=model.dtype,
     )
     with pytest.warns(UserWarning, match=r"warpfea\[cudss\]"):
-        assert isinstance(make_factors(like, model.graph()), SuperLU)
+        assert isinstance(make_factors(like, slot_graph(model.blocks, model.slots)), SuperLU)

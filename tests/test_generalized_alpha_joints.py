@@ -73,7 +73,7 @@ def test_rates_of_constraints_equal_differences():
     def value(when):
         state.displacement.assign((u + (when - t) * v)[None])
         state.time.fill_(when)
-        return model.constraint_values(state)[0]
+        return model.evaluation.constraint_values(state)[0]
 
     def law(when):
         return np.array([0.25 * np.sin(20 * when) + 20 * when**2 + 800 * when**3, 0, 0])[None]

@@ -105,7 +105,7 @@ def test_what_is_left_is_told(soft):
     assert not report.converged[0]
     assert report.status[0] == 0
     assert report.residual[0] > 1e-3
-    g = sim.stepper.work.g.numpy()[0] * model.free_host
+    g = sim.stepper.work.g.numpy()[0] * model.slot_table.free
     assert report.residual_force[0] == pytest.approx(np.linalg.norm(g), rel=1e-12)
     assert sim.totals["rough"][0] == 5
     assert sim.max_residual >= report.residual[0]
@@ -143,7 +143,7 @@ def test_a_free_body_keeps_its_momentum():
     sim = wf.Simulation(model, dt=5e-3, solver=wf.Jacobi(iterations=2))
     report = sim.step(10)
     assert report.residual[0] > 1e-6
-    momentum = np.einsum("s,sc->c", model.lumped_host, sim.state.velocity.numpy()[0])
+    momentum = np.einsum("s,sc->c", model.masses.lumped[0], sim.state.velocity.numpy()[0])
     assert momentum == pytest.approx([500.0 * 0.04 * 0.05, 0, 0], abs=1e-12)
 
 

@@ -104,8 +104,8 @@ def test_a_scene_without_contact_has_nothing_of_it():
     more, with_kernels, with_modules, _, touching = cost("contact")
     assert not any("contact" in name for name in modules)
     assert any("contact" in name for name in with_modules)
-    assert not {name for name in model.bytes if "contact" in name}
-    assert "contact" in touching.bytes
+    assert not {name for name in model.memory.bytes if "contact" in name}
+    assert "contact" in touching.memory.bytes
     assert {"contact", "friction"} <= set(model.info()["left_out"])
     assert "contact" not in touching.info()["left_out"]
     assert more > launches

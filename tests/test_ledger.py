@@ -96,7 +96,7 @@ def test_columns_have_their_own_definitions():
     h = 4e-3
     sim = wf.Simulation(model, dt=h)
     M = model.mass_matrix()
-    weights = {"potential": model.lumped_host}
+    weights = {"potential": model.masses.lumped[0]}
     integrator = supports = viscous = 0.0
     for _ in range(10):
         u0, v0 = (getattr(sim.state, n).numpy()[0].copy() for n in ("displacement", "velocity"))

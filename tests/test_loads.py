@@ -19,7 +19,7 @@ def loads_of(b, steps=1, dt=1e-3):
     model = b.finalize(device="cpu")
     sim = wf.Simulation(model, dt=dt)
     sim.step(steps)
-    return model.lumped_host @ sim.state.velocity.numpy()[0] / (dt * steps), sim
+    return model.masses.lumped[0] @ sim.state.velocity.numpy()[0] / (dt * steps), sim
 
 
 def test_traction_is_force_per_area():

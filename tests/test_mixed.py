@@ -32,7 +32,7 @@ def placed(sim: wf.Simulation, mixed: int, amount: float = 0.02) -> np.ndarray:
     w, rng = sim.stepper.work, np.random.default_rng(3)
     shape = w.u.numpy().shape
     kind = w.u.numpy().dtype
-    free = sim.model.free_host
+    free = sim.model.slot_table.free
     before = amount * rng.standard_normal(shape) * free
     now = before + amount * rng.standard_normal(shape) * free
     w.base_velocity.assign(before.astype(kind))
@@ -51,7 +51,7 @@ def product(sim: wf.Simulation, direction: np.ndarray) -> np.ndarray:
     w.p.assign(direction.astype(w.p.numpy().dtype))
     residual.assemble_matrix(on)
     residual.product(w.p, w.Hp, on)
-    return w.Hp.numpy().astype(float) * sim.model.free_host
+    return w.Hp.numpy().astype(float) * sim.model.slot_table.free
 
 
 @pytest.mark.parametrize("mixed", [1, 2])
@@ -97,7 +97,7 @@ def test_positive_matrix_has_no_negative_curvature(kind: str) -> None:
     if kind == "beam":
         squeezed[..., 1::4, 0] = -0.2  # the axial gradients
     squeezed[..., 0] -= 0.2 * _places(sim)
-    squeezed *= sim.model.free_host
+    squeezed *= sim.model.slot_table.free
     for array in (w.u, w.v, w.base_velocity):
         array.assign(squeezed.astype(array.numpy().dtype))
     lowest = {}

@@ -77,7 +77,7 @@ def gradient_body(hermite, device):
         b = wf.ModelBuilder(gravity=gravity)
         m = lift(wf.mesh.box((1, 1, 1), cells=(2, 2, 2), element="T4", origin=(2, 0, -1)))
         body = b.add_solid(m, material=LAWS[law], element=hermite)
-        return body, wf.Model(b, device=device, **options)
+        return body, wf.Model(b.description, b.term_factory(), device=device, **options)
 
     return build
 

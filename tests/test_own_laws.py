@@ -49,7 +49,7 @@ def test_an_element():
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     body = b.add_solid(replace_points(mesh, points), element="H8", material=wf.SVK(E=1e5, nu=0.3, density=700.0))
     model = b.finalize(device="cpu")
-    assert model.mass_host.sum() == pytest.approx(700.0, rel=1e-12)
+    assert model.masses.matrix.sum() == pytest.approx(700.0, rel=1e-12)
     F = np.array([[0.1, 0.02, 0.0], [0.0, -0.05, 0.03], [0.01, 0.0, 0.04]])
     state = model.state()
     state.displacement.assign((body.reference @ F.T)[None])

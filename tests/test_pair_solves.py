@@ -75,9 +75,9 @@ def test_without_the_motions_they_do(monkeypatch):
 
 def place(model, u):
     """Places of slots (m), or their gradients, and which are places."""
-    is_place = model.slot_kind == 0
+    is_place = model.slot_table.kind == 0
     origin = np.concatenate([np.tile(body.origin, (body.slot_count, 1)) for body in model.bodies])
-    return model.reference + origin * is_place[:, None] + u, is_place
+    return model.slot_table.reference + origin * is_place[:, None] + u, is_place
 
 
 def motions_of(model, u, bodies):
@@ -119,7 +119,7 @@ def system(loop):
                     for j, c in enumerate(term.tables.master_conn[listed[point] - 1]):
                         block = functions[q, i, item] * weight[point, j] * K
                         cross[3 * a : 3 * a + 3, 3 * c : 3 * c + 3] -= block
-    free = model.free_host.ravel()
+    free = model.slot_table.free.ravel()
     cross = free[:, None] * cross * free * float(at.work.step.dq_dv.numpy()[0])
     return own * (free[:, None] * free), cross + cross.T
 
@@ -139,7 +139,7 @@ def test_the_correction_is_that_of_the_coupled_motions(element, held):
         R = motions_of(model, u, ([] if held == "xyz" else [plate]) + cubes)
         if held == "z":  # the plate slides, and does not turn
             R = R[:, [0, 1, *range(6, R.shape[1])]]
-        r = rng.standard_normal((model.slots, 3)) * model.free_host
+        r = rng.standard_normal((model.slots, 3)) * model.slot_table.free
         wanted = R @ np.linalg.solve(R.T @ (own + cross) @ R, R.T @ r.ravel())
         z = wp.zeros((1, model.slots), dtype=model.types.vec3, device="cpu")
         given = wp.array(r[None], dtype=model.types.vec3, device="cpu")

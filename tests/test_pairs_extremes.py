@@ -26,7 +26,7 @@ def box(b, name, size, cells, origin, E=1e6, nu=0.3, element="T10"):
 
 def mean_velocity(sim: wf.Simulation, body: wf.Body) -> np.ndarray:
     """Of the mass of a body of positions, m/s."""
-    m = sim.model.lumped_host[body.slots]
+    m = sim.model.masses.lumped[0][body.slots]
     return np.asarray(m @ sim.state.velocity.numpy()[0, body.slots] / m.sum())
 
 

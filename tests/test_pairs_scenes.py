@@ -36,8 +36,8 @@ def test_ball_bends_the_plate_and_comes_up_again():
     # the impulse of the plate turns the ball round
     impulse = 2e-3 * (record.force[0] @ np.array((0, 0, 1))).cumsum()
     slots = sim.model.bodies[1].slots
-    mass = sim.model.lumped_host[slots].sum()
-    momentum = sim.model.lumped_host[slots] @ sim.state.velocity.numpy()[0, slots]
+    mass = sim.model.masses.lumped[0][slots].sum()
+    momentum = sim.model.masses.lumped[0][slots] @ sim.state.velocity.numpy()[0, slots]
     assert momentum[2] == pytest.approx(impulse[-1] - mass * G * 0.24, abs=1e-4)
 
 

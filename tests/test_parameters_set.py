@@ -106,12 +106,12 @@ def test_what_no_world_varies_costs_nothing():
     add, law = CASES["3443"]
     uniform, many = model(add, material(**law), worlds=3), varied(add, names=("E",))
     assert all(block.data.coefficients.shape[0] == 1 for block in uniform.blocks)
-    size = np.dtype(float).itemsize * uniform.coefficients.size
-    assert many.bytes["materials"] - uniform.bytes["materials"] == 2 * size
-    assert many.bytes["elements"] == uniform.bytes["elements"]
+    size = np.dtype(float).itemsize * uniform.parameters.coefficients.size
+    assert many.memory.bytes["materials"] - uniform.memory.bytes["materials"] == 2 * size
+    assert many.memory.bytes["elements"] == uniform.memory.bytes["elements"]
     assert many.info()["kernels"] == uniform.info()["kernels"]
     coupled = varied(add, names=("nu",))
-    assert coupled.bytes["elements"] > uniform.bytes["elements"]
+    assert coupled.memory.bytes["elements"] > uniform.memory.bytes["elements"]
 
 
 BAD = {
@@ -139,10 +139,15 @@ BAD = {
 def test_bad_values_leave_nothing_behind(case):
     name, value, text = BAD[case]
     m = model(CASES["T10"][0], material(), worlds=3)
-    before = m.bytes, m.fingerprint(), m.coefficients.numpy().tobytes(), m.parameters.numpy()
+    before = m.memory.bytes, m.fingerprint(), m.parameters.coefficients.numpy().tobytes(), m.parameters.numpy()
     with pytest.raises(wf.ModelError, match=text):
         m.set_parameter(name, value)
-    assert (m.bytes, m.fingerprint(), m.coefficients.numpy().tobytes(), m.parameters.numpy()) == before
+    assert (
+        m.memory.bytes,
+        m.fingerprint(),
+        m.parameters.coefficients.numpy().tobytes(),
+        m.parameters.numpy(),
+    ) == before
 
 
 @pytest.mark.parametrize("mask", [[True], [0.5, 1, 0], "all", [True, False, None]])

@@ -27,8 +27,8 @@ def test_both_operators_are_the_matrix_of_the_step(name):
     state.displacement.assign(sim.stepper.work.u)
     assert np.abs(sim.stepper.work.u.numpy()).max() > 0.0
     p, dt = direction.numpy()[0], DT
-    expected = model.mass_host @ p / dt + dt * (model.tangent_matrix(state) @ p.ravel()).reshape(-1, 3)
-    expected *= model.free_host
+    expected = model.masses.matrix @ p / dt + dt * (model.tangent_matrix(state) @ p.ravel()).reshape(-1, 3)
+    expected *= model.slot_table.free
     for value in got.values():
         assert np.abs(value - expected).max() < 1e-11 * np.abs(expected).max()
 

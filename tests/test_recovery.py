@@ -110,7 +110,7 @@ def test_partly_done_step_is_taken_back(worlds):
     Also where another world goes on; a registered array that an accepted substep had changed is restored as well.
     """
     b, body = box(SOFT)
-    b.gravity[:] = (0.0, 0.0, -1.0)
+    b.description.gravity[:] = (0.0, 0.0, -1.0)
     b.clamp(body.nodes("x-"))
     b.set_initial(body, velocity=(0.0, 0.0, 1.0))
     b.add_traction(body.surface("x+"), ([0.0, 6e-3, 7e-3], [(0, 0, 0), (0, 0, 0), (-1e9, 0, 0)]))

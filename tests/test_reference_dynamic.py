@@ -58,7 +58,7 @@ def test_backward_euler_sequence(cantilever, data, name, form, h):
         report = sim.step(every)
         assert not report.halvings.any()
         energies.append(sim.energies())
-        dissipation.append(float(model.dissipation_rate(sim.state)[0]))
+        dissipation.append(float(model.evaluation.dissipation_rate(sim.state)[0]))
     np.testing.assert_allclose(sim.probe("tip").time[every - 1 :: every], expected["t"][1:], rtol=1e-12)
 
     travel = np.abs(expected["tip_mean"]).max()

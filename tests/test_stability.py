@@ -53,11 +53,11 @@ def lowest(model, state, multipliers=None):
     free = model.free_slots.ravel()
     K = model.tangent_matrix(state).toarray()[np.ix_(free, free)]
     if model.constraints:
-        J = model.constraint_jacobian(state).toarray()[:, free]
+        J = model.evaluation.constraint_jacobian(state).toarray()[:, free]
         for k, column in enumerate(np.flatnonzero(free)):
             unit = np.zeros((model.slots, 3))
             unit.ravel()[column] = 1.0
-            K[:, k] += model.constraint_curvature(state, multipliers, unit)[0].ravel()[free]
+            K[:, k] += model.evaluation.constraint_curvature(state, multipliers, unit)[0].ravel()[free]
         Z = scipy.linalg.null_space(J)
         K = Z.T @ K @ Z
     return scipy.linalg.eigvalsh(0.5 * (K + K.T), subset_by_index=(0, 0))[0]

@@ -59,18 +59,19 @@ def test_a_slender_strip_beside_a_loaded_block_is_refused_in_float32():
 
 def test_groups_are_materials_of_like_stiffness_in_what_is_joined():
     models = [pairs.block_and_arm(kind).finalize(device="cpu") for kind in pairs.CONNECTIONS]
-    assert [model.residual_groups.count for model in models] == [2, 2, 2, 2]
+    assert [model.components.residual_groups.count for model in models] == [2, 2, 2, 2]
     model = pairs.block_and_arm("materials").finalize(device="cpu")
-    assert model.mesh_component.max() == 0
-    start, slot = (a.numpy() for a in (model.residual_groups.slot_start, model.residual_groups.slot))
-    x = (model.reference + model.bodies[0].origin)[:, 0]
+    assert model.components.mesh_of_slot.max() == 0
+    groups = model.components.residual_groups
+    start, slot = (a.numpy() for a in (groups.slot_start, groups.slot))
+    x = (model.slot_table.reference + model.bodies[0].origin)[:, 0]
     soft, hard = x[slot[: start[1]]], x[slot[start[1] :]]
     assert hard.max() == pytest.approx(0.2)  # slots between both belong to the steel
     assert soft.min() > 0.2 + 1e-6
-    elements = np.diff(model.residual_groups.element_start.numpy())
+    elements = np.diff(groups.element_start.numpy())
     assert elements.sum() == model.element_count
     assert elements[0] == pytest.approx(2 * elements[1])  # eight cells of twelve
-    assert model.error_estimate_groups.count == 2
+    assert model.components.error_estimate_groups.count == 2
 
 
 def series(kind, moduli):
@@ -94,7 +95,7 @@ def test_stiff_blocks_on_both_sides_of_a_soft_one_are_judged_apart():
     """Fails with one group of both stiff blocks: the free end of 1e12 Pa has an error of 0.43, converged, floor 0."""
     b, blocks = series("weld", (1e8, 1e6, 1e8))
     model = b.finalize(device="cpu", dtype="float32")
-    assert model.residual_groups.count == 3
+    assert model.components.residual_groups.count == 3
     result = wf.solve_static(model, unstable="ignore")
     exact = result.displacements(blocks[0])[0, :, 0].max()
     assert exact == pytest.approx(0.3 * 1e-4, rel=1e-3)
@@ -105,7 +106,7 @@ def test_stiff_blocks_on_both_sides_of_a_soft_one_are_judged_apart():
 
 
 def test_stiff_blocks_that_a_joint_ties_are_one_group():
-    counts = [series("joint", moduli)[0].finalize(device="cpu").residual_groups.count
+    counts = [series("joint", moduli)[0].finalize(device="cpu").components.residual_groups.count
               for moduli in ((1e9, 1e9, 1e5), (1e9, 1e5, 1e9), (1e9, 1e9, 1e9), (1e5, 1e9, 1e5))]  # fmt: skip
     assert counts == [2, 3, 1, 3]
 
@@ -135,7 +136,7 @@ def test_bodies_alike_are_one_group_and_cost_nothing():
         b.add_joint("revolute", parent=above, child=link.start, axis=(0, 1, 0))
         above = link.end
     sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-2)
-    assert sim.model.residual_groups.count == 1
-    assert sim.model.error_estimate_groups.count == 2
+    assert sim.model.components.residual_groups.count == 1
+    assert sim.model.components.error_estimate_groups.count == 2
     assert sim.stepper.work.newton.norms.group_sums.size == 1
     assert not any("perturbation" in module.name for module in sim.stepper.newton.modules())

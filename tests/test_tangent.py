@@ -66,7 +66,7 @@ def test_tangent_is_the_derivative_of_the_force(name, material, data):
     _, body, model = make(name, law(material))
     u = deformed(body)
     state = state_of(model, u)
-    assert 0.1 < model.minimum_jacobian(state)[0] < 2.0
+    assert 0.1 < model.evaluation.minimum_jacobian(state)[0] < 2.0
     K = model.tangent_matrix(state)
     assert abs(K - K.T).max() < 1e-14 * abs(K).max()
     for seed in range(3):
@@ -152,7 +152,7 @@ def separate_product(model, u, v, p, mass_factor):
     args = [block.data, u, v, history, dq, on, p, out]
     wp.launch(block.kernels.tangent_product, dim=(2, block.count), inputs=args, device="cpu")
     force = out.numpy().astype(float)
-    total = np.stack([m * (model.mass_host @ x) for m, x in zip(mass.numpy(), p.numpy().astype(float))])
+    total = np.stack([m * (model.masses.matrix @ x) for m, x in zip(mass.numpy(), p.numpy().astype(float))])
     np.add.at(total, (slice(None), block.data.conn.numpy().ravel()), dq.numpy()[:, None, None] * force)
     return total
 

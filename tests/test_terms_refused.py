@@ -227,7 +227,7 @@ def test_a_squeezed_body_has_a_force_scale():
     model = model_with(Squeeze, gravity=(0, 0, 0), velocity=(0, 0, 0), damping=wf.KelvinVoigt(eta=3e3, lambda_v=0.0))
     sim = wf.Simulation(model, dt=5e-3, energy_growth="ignore")  # the springs' energy is set by hand below
     term = model.terms.find(Squeeze)
-    x = model.reference[term.slots][:, 0]
+    x = model.slot_table.reference[term.slots][:, 0]
     ends = np.isin(x, (x.min(), x.max()))
     sim.state.floor_stuck.assign(ends.astype(np.int32)[None])
     sim.state.floor_anchor.assign(np.where(ends, np.sign(x.mean() - x) * 5e-3, 0.0)[None, :, None] * [1.0, 0.0, 0.0])
@@ -278,7 +278,7 @@ class Drag(Term):
         self.kernels = drag_kernels(model.dtype)
 
     def build(self, laws):
-        slots = np.flatnonzero(self.model.slot_kind == 0)
+        slots = np.flatnonzero(self.model.slot_table.kind == 0)
         self.slot, self.connectivity = self.model.array("drag", slots, wp.int32), [slots[:, None]]
         self.dim = (self.model.worlds, len(slots))
 

@@ -21,7 +21,7 @@ def simulation(builder, *, device="cpu", dtype="float64", dt=1e-3, shake=0.0, **
     work = sim.stepper.work
     if shake:
         u = work.u.numpy()
-        u += shake * np.random.default_rng(0).standard_normal(u.shape) * (model.free_host > 0)
+        u += shake * np.random.default_rng(0).standard_normal(u.shape) * (model.slot_table.free > 0)
         work.u.assign(u)
     return sim
 
@@ -57,7 +57,7 @@ def apply(sim, r):
 
 
 def random_free(sim, seed=1):
-    free = sim.model.free_host.ravel()
+    free = sim.model.slot_table.free.ravel()
     return np.random.default_rng(seed).standard_normal(free.size) * free
 
 
@@ -188,7 +188,7 @@ def test_the_matrix_is_the_operator(scene, operator):
     sim = simulation(SCENES[scene](), shake=1e-3, operator=operator)
     p = random_free(sim)
     H = assembled(sim, projected=False)
-    expected = (H @ p) * sim.model.free_host.ravel()
+    expected = (H @ p) * sim.model.slot_table.free.ravel()
     np.testing.assert_allclose(product(sim, p), expected, rtol=0, atol=1e-12 * np.abs(expected).max())
 
 
@@ -238,7 +238,7 @@ def dense_apply(sim):
 def test_a_small_model_is_inverted_as_a_whole(scene):
     sim = simulation(SCENES[scene]())
     assert sim.stepper.newton.preconditioner.levels[0].is_dense
-    free = sim.model.free_host.ravel() > 0
+    free = sim.model.slot_table.free.ravel() > 0
     place = sim.stepper.newton.preconditioner.reuse.linearisation_point
     sim.stepper.work.u.assign(place)
     H = assembled(sim, projected=True).toarray()[free][:, free]
@@ -264,13 +264,13 @@ def test_tiles_and_coarse_space_against_numpy(name, size):
     assert not level.is_dense
     assert below.is_dense
     model = sim.model
-    free = model.free_host.ravel()
+    free = model.slot_table.free.ravel()
     sim.stepper.work.u.assign(pre.reuse.linearisation_point)
     H = assembled(sim, projected=True)
     # any affine motion of the whole body is one of the coarse space: it moves gradient slots by B E
     P = coarse_functions(sim)
     B = np.random.default_rng(0).standard_normal((3, 3))
-    motion = model.reference @ B.T + np.outer(model.slot_kind == 0, [1.0, 2.0, 3.0])
+    motion = model.slot_table.reference @ B.T + np.outer(model.slot_table.kind == 0, [1.0, 2.0, 3.0])
     fit = sp.linalg.lsqr(P, motion.ravel(), atol=1e-15, btol=1e-15)[0]
     np.testing.assert_allclose(P @ fit, motion.ravel(), rtol=0, atol=1e-8 * np.abs(motion).max())
     # the coarse matrix, and the sum of both parts
@@ -301,7 +301,7 @@ def test_it_is_symmetric_and_positive_through_all_levels(name, size, options):
     assert a @ Bb == pytest.approx(b @ Ba, abs=tolerance * np.sqrt((a @ Ba) * (b @ Bb)))
     assert a @ Ba > 0.0
     assert b @ Bb > 0.0
-    assert np.abs(Ba[sim.model.free_host.ravel() == 0]).max() == 0.0
+    assert np.abs(Ba[sim.model.slot_table.free.ravel() == 0]).max() == 0.0
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])

@@ -125,7 +125,7 @@ def test_a_tolerance_in_newtons():
         solver = wf.NewtonPCG(tol=1e-12, force_tol=tol, preconditioner="block-jacobi")
         sim = wf.Simulation(bar(300).finalize(device="cpu"), dt=1e-3, solver=solver, ledger=False)
         reports.append(sim.step())
-        free = sim.model.free_host
+        free = sim.model.slot_table.free
         g = np.linalg.norm(sim.stepper.work.g.numpy()[0] * free)
         assert reports[-1].residual_force[0] == pytest.approx(g, rel=1e-12)
     assert reports[0].residual_force[0] < 1e-6 < reports[1].residual_force[0] <= 5e-4

@@ -102,7 +102,7 @@ def solved(
         sim = wf.solve_static(model, load_steps=2, tol=tol).simulation
         floors.append(float(sim.last.floor[0]))
         stable = tol is None or positive(sim)
-    u = sim.state.displacement.numpy()[0].astype(float)[model.slot_kind == 0]
+    u = sim.state.displacement.numpy()[0].astype(float)[model.slot_table.kind == 0]
     totals = {name: int(sim.totals[name][0]) for name in ("newton", "pcg")}
     return u, {"stable": stable, "floor": sum(floors), **totals}
 

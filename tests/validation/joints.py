@@ -130,7 +130,7 @@ def simulate(
         "residual": float(sim.max_residual),
         "ledger_residual": float(energies["ledger_residual"][0]) / max(scale, 1e-300),
     }  # fmt: skip
-    if model.probes and done:
+    if model.description.probes and done:
         row["tip"] = sim.probe("tip").position[0, -1].tolist()
     return row
 

@@ -355,20 +355,20 @@ class Pair:
     def _center(self, model):
         x = self._places(model, np.zeros((model.slots, 3)))
         own = np.concatenate([body.slots for body in self.bodies])
-        m = model.lumped_host[own]
-        return m @ x[own] / m[model.slot_kind[own] == 0].sum()
+        m = model.masses.lumped[0][own]
+        return m @ x[own] / m[model.slot_table.kind[own] == 0].sum()
 
     @staticmethod
     def _places(model, u):
-        position = (model.slot_kind == 0)[:, None]
+        position = (model.slot_table.kind == 0)[:, None]
         origin = np.concatenate([np.tile(body.origin, (body.slot_count, 1)) for body in model.bodies])
-        return model.reference + position * origin + u
+        return model.slot_table.reference + position * origin + u
 
     def motion(self, state):
         """Displacement and velocity of the centre of mass; positions and velocities (slots, 3) about it; L about it."""
         m, own = self.model, self.mask
         u, v = (array.numpy()[0].astype(float) for array in (state.displacement, state.velocity))
-        lumped, position = m.lumped_host[own], (m.slot_kind[own] == 0)[:, None]
+        lumped, position = m.masses.lumped[0][own], (m.slot_table.kind[own] == 0)[:, None]
         mass = lumped[position[:, 0]].sum()
         moved, pace = lumped @ u[own] / mass, lumped @ v[own] / mass
         x = self._places(m, u)[own]

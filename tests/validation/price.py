@@ -156,7 +156,7 @@ def measure(scene: Scene, *, device: Any, steps: int, repeat: int) -> Row:
     left = list(full.model.info()["left_out"])
     own, everything = shipped.side(), full.side()
     ratio, iterations = everything["ms_per_step"] / own["ms_per_step"], own["newton_per_step"]
-    probes = [probe.name for probe in shipped.model.probes]
+    probes = [probe.name for probe in shipped.model.description.probes]
     path, other = shipped.path(probes), full.path(probes)
     return {
         "scene": scene.name,

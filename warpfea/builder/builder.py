@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from ..base.console import quiet_warp
@@ -17,7 +18,6 @@ from ..model.joints import Joint
 from ..model.model import Model
 from ..model.pairs import PairContact
 from ..model.shapes import Shape
-from ..terms.evaluation import Evaluation
 from ..terms.term import Term
 from ..terms.term_set import TermSet
 from . import loads
@@ -46,11 +46,10 @@ class ModelBuilder:
     """
 
     def __init__(self, gravity: Any = (0.0, 0.0, -9.81), up_axis: str = "Z") -> None:
-        self.gravity, law = parse_gravity(gravity)
+        constant, law = parse_gravity(gravity)
         if up_axis not in ("Z", "Y"):
             raise ModelError(f"up_axis = {up_axis!r} is neither 'Z' nor 'Y'")
-        self.up_axis = up_axis
-        self.description = Description(gravity=law)
+        self.description = Description(gravity=constant, gravity_law=law, up_axis=up_axis)
         self._terms: list[Callable[[Model], Term | None]] = []
 
     def __repr__(self) -> str:
@@ -425,9 +424,9 @@ class ModelBuilder:
             ModelWarning: a size, mass, density or E that suggests a wrong unit (MeshWarning: first three), or a nu
                 with volumetric locking.
         """
-        check_densities(self.gravity, self.description)
+        check_densities(self.description)
         with quiet_warp():
-            model = Model(self, device=device, dtype=dtype, worlds=worlds)
+            model = Model(self.description, self.term_factory(), device=device, dtype=dtype, worlds=worlds)
         warn_implausible(model)
         return model
 
@@ -441,9 +440,9 @@ class ModelBuilder:
             raise ModelError(f"add_term: expected a function or class that takes the Model, got {make!r}")
         self._terms.append(make)
 
-    def make_terms(self, model: Model) -> tuple[TermSet, Evaluation]:
-        """The terms of a model, for Model itself."""
-        return TermSet(model, self._terms), Evaluation(model)
+    def term_factory(self) -> Callable[[Model], TermSet]:
+        """Factory of a model's terms: those of the package and the added ones."""
+        return partial(TermSet, more=tuple(self._terms))
 
     def _check_owner(self, thing: Any, what: str, *kinds: type) -> Body:
         """Body of a handle, which must be of one of the kinds and of this builder."""

@@ -88,10 +88,10 @@ def parse_gravity(value: Any) -> tuple[np.ndarray, TimeLaw | None]:
     return vector(value, "gravity"), None
 
 
-def check_densities(gravity: np.ndarray, d: Description) -> None:
+def check_densities(d: Description) -> None:
     """Raise ModelError for gravity or a body force on a material without density."""
     bodies, forces = d.bodies, d.body_forces
-    if np.any(gravity) or d.gravity is not None:
+    if np.any(d.gravity) or d.gravity_law is not None:
         require_density(bodies, "gravity, and by any motion")  # no hint "or gravity=(0, 0, 0)"
     for force in forces:
         require_density(force.bodies, "add_body_force")
@@ -106,7 +106,7 @@ def warn_implausible(model: Any) -> None:
         size = float(np.max(high - low))
         mass = None
         if all(material.density is not None for _, material in body.materials):
-            mass = float(model.lumped_host[body.slots][body.slot_kind == 0].sum())
+            mass = float(model.masses.lumped[0][body.slots][body.slot_kind == 0].sum())
         large = size > SIZE_RANGE[1] or (mass is not None and mass > MASS_RANGE[1])
         small = size < SIZE_RANGE[0] or (mass is not None and mass < MASS_RANGE[0])
         if not (large or small):

@@ -95,7 +95,7 @@ def summarize(
     setup_s = min(sim.compile_s if setup_s is None else setup_s, wall_s)
     output_s = min(sim.output_s, wall_s - setup_s)
     probes = {}
-    for probe in sim.model.probes:
+    for probe in sim.model.description.probes:
         record = sim.probe(probe.name)
         names = ("position", "displacement", "velocity")
         if record.time.size:

@@ -229,7 +229,7 @@ class FacetTables(Generic[AnyContact]):
         for name in MATERIAL_CONSTANTS:
             if getattr(data, name).shape[0] != m.worlds:
                 old = getattr(data, name)
-                m.uncount_bytes("contact", old)
+                m.memory.uncount("contact", old)
                 setattr(data, name, m.array("contact", np.tile(old.numpy(), (m.worlds, 1)), wp.float64))
         host = {name: getattr(data, name).numpy() for name in MATERIAL_CONSTANTS}
         for world in np.flatnonzero(mask).tolist():

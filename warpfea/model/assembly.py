@@ -103,7 +103,7 @@ class HostBlock:
         elements: (E,) element indices in the body.
         material: index into the body's materials.
         coefficients: of the device law.
-        coefficient_row: of the model's table of coefficients, set by the model.
+        coefficient_row: of the model's table of coefficients, set by MaterialParameters.
     """
 
     key: BlockKey
@@ -299,8 +299,9 @@ def gather_table(conn: list[np.ndarray], slots: int) -> tuple[np.ndarray, np.nda
     return start.astype(np.int32), order.astype(np.int32)
 
 
-def slot_graph(conn: list[np.ndarray], slots: int) -> sp.csr_matrix:
+def slot_graph(blocks: Iterable[Any], slots: int) -> sp.csr_matrix:
     """Pairs of slots that share an element. The mass matrix is no substitute: some of its entries are zero."""
+    conn = [block.connectivity for block in blocks]
     rows = np.concatenate([np.repeat(first + np.arange(len(c)), c.shape[1]) for first, c in _first_elements(conn)])
     columns = np.concatenate([c.ravel() for c in conn])
     incidence = sp.csr_matrix((np.ones(len(rows), dtype=np.int32), (rows, columns)), shape=(rows.max() + 1, slots))

@@ -116,10 +116,8 @@ def mean_damping(damping: str | None) -> str | None:
     return "rate" if damping == "incremental" else damping
 
 
-def build_block(
-    model: Any, key: assembly.BlockKey, parts: list[assembly.HostBlock], contribution: int, element: int, history: int
-) -> Block:
-    """Block of a key; offsets of its contributions, elements and strain history."""
+def build_block(model: Any, key: assembly.BlockKey, parts: list[assembly.HostBlock]) -> Block:
+    """Block of a key; its contributions, elements and strain history follow those of the model's blocks so far."""
     family = elements.get_family(key.family)
     conn = np.concatenate([p.conn + p.body.slot_offset for p in parts])
     data = (assumed_strain_struct if key.tying else block_struct)(model.dtype)()
@@ -127,8 +125,9 @@ def build_block(
     data.is_position = model.array("elements", (family.slot_kind == 0).astype(float), model.types.T)
     rows = [np.full(len(p.elements), p.coefficient_row) for p in parts]
     data.material = model.array("elements", np.concatenate(rows), wp.int32)
-    data.coefficients = model.coefficients
-    data.contribution_offset, data.element_offset, data.history_offset = contribution, element, history
+    data.coefficients = model.parameters.coefficients
+    data.contribution_offset, data.element_offset = model.contributions, model.element_count
+    data.history_offset = model.history_count
     data.count = len(conn)
     det = None
     if key.tying:
@@ -142,7 +141,7 @@ def build_block(
         kernels = element_kernels(model.dtype, *kind)
     cluster = cluster_size(model.dtype, len(conn), fit=model.device.is_cuda)
     sizes = len(conn), points, family.slots
-    return Block(key, data, kernels, parts, *sizes, contribution, element, cluster, det_J0=det)
+    return Block(key, data, kernels, parts, *sizes, model.contributions, model.element_count, cluster, det_J0=det)
 
 
 def output_block(model: Any, block: Block, scheme: str) -> Block:
@@ -165,7 +164,7 @@ def output_rows(model: Any, block: Block) -> np.ndarray:
     scheme = block.key.output_scheme
     assert scheme is not None
     integral = replace(block.key, scheme=scheme, part=0).integral
-    worlds = model.coefficients.shape[0]
+    worlds = model.parameters.coefficients.shape[0]
     rows = []
     for host in block.host_blocks:
         material = model.parameters.material_of_worlds(host.body, host.material)
@@ -190,7 +189,7 @@ def _tied_tables(model: Any, data: Any, key: assembly.BlockKey, parts: list[asse
     for name, dtype in names:
         table = np.concatenate([getattr(t, name) for t in tables])
         axis = 1 if dtype is vec3 else 2
-        setattr(data, name, model.element_array(np.moveaxis(table, 0, axis), dtype))
+        setattr(data, name, model.memory.element_array(np.moveaxis(table, 0, axis), dtype))
     if normal:  # strains x_a . x_a
         data.derivative_b, data.X_b = data.derivative_a, data.X_a
 
@@ -218,7 +217,7 @@ def _point_tables(model: Any, data: Any, key: assembly.BlockKey, parts: list[ass
     if key.affine:
         _, ds = family.shape(points, np.zeros((1, len(family.node_slots), 3)))
         table = ds[0][:, :, None, :]
-        data.J0_inv = model.element_array(np.concatenate(J0).reshape(-1, 9).T, T)
+        data.J0_inv = model.memory.element_array(np.concatenate(J0).reshape(-1, 9).T, T)
         data.det_J0 = model.array("elements", np.concatenate(w), T)
         if not any(callable(p.body.materials[p.material][1].density) for p in parts):
             data.parent_mass = model.array("elements", assembly.parent_mass(family), T)
@@ -227,10 +226,10 @@ def _point_tables(model: Any, data: Any, key: assembly.BlockKey, parts: list[ass
         data.quadrature_weight = model.array("elements", rule.weights[:, None], T)
     else:
         table = np.moveaxis(np.concatenate(h), 0, 2)
-        data.quadrature_weight = model.element_array(np.concatenate(w).T, T)
-    data.shape_gradient = model.element_array(table[:Q], vec3)
+        data.quadrature_weight = model.memory.element_array(np.concatenate(w).T, T)
+    data.shape_gradient = model.memory.element_array(table[:Q], vec3)
     if key.law not in DEFINED_FOR_ANY_J:
-        data.vertex_shape_gradient = model.element_array(table[Q:], vec3)
+        data.vertex_shape_gradient = model.memory.element_array(table[Q:], vec3)
     if key.framed:
-        data.material_axes = model.element_array(np.moveaxis(np.concatenate(axes), 0, 1), mat33)
+        data.material_axes = model.memory.element_array(np.moveaxis(np.concatenate(axes), 0, 1), mat33)
     return det_J0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -115,7 +115,12 @@ class Probe:
 
 @dataclass(eq=False)
 class Description:
-    """All data collected by a builder."""
+    """All data collected by a builder.
+
+    Attributes:
+        gravity: (3,) m/s^2, zero with `gravity_law`, a time law of it.
+        up_axis: "Z" or "Y", for outputs.
+    """
 
     bodies: list[Body] = field(default_factory=list)
     supports: list[Support] = field(default_factory=list)
@@ -128,7 +133,15 @@ class Description:
     colliders: list[Collider] = field(default_factory=list)
     contacts: list[Contact] = field(default_factory=list)
     pairs: list[PairContact] = field(default_factory=list)
-    gravity: TimeLaw | None = None
+    gravity: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    gravity_law: TimeLaw | None = None
+    up_axis: str = "Z"
+
+    def copy(self) -> Description:
+        """Copy whose lists and gravity are its own; what they hold is shared."""
+        own = {entry.name: getattr(self, entry.name) for entry in fields(self)}
+        lists = {name: list(value) for name, value in own.items() if isinstance(value, list)}
+        return replace(self, gravity=np.array(self.gravity, dtype=float), **lists)
 
     @property
     def all_contacts(self) -> list[Contact | PairContact]:

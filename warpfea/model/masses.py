@@ -179,11 +179,11 @@ class Masses:
         if "matrix" in known:
             pattern, mass = known["matrix"]
             known["matrix"] = pattern, self._replace_array("matrix pattern", mass, self.pattern_masses(pattern))
-        if m.free_group_count:
-            m.free_groups.mass = self._replace_array(
-                "groups", m.free_groups.mass, self.group_masses(*known["free groups"])
+        if m.components.free_group_count:
+            m.components.free_groups.mass = self._replace_array(
+                "groups", m.components.free_groups.mass, self.group_masses(*known["free groups"])
             )
-            m.free_groups.lumped_mass = self.lumped_values
+            m.components.free_groups.lumped_mass = self.lumped_values
         for block in m.blocks:
             if block.det_J0 is not None:
                 table = self.element_masses(block.host_blocks, block.det_J0)
@@ -194,7 +194,7 @@ class Masses:
         if array.shape == values.shape:
             array.assign(values)
             return array
-        self.model.uncount_bytes(name, array)
+        self.model.memory.uncount(name, array)
         return self.model.array(name, values, self.model.types.T)
 
     def _sum_over_materials(self) -> None:
@@ -206,7 +206,7 @@ class Masses:
             body, part = self.model.bodies[key[0]], self.parts[key]
             self.entry_values[:, self.entry_indices[key]] += scale[:, None] * part.matrix.data
             rows = slice(body.slot_offset, body.slot_offset + body.slot_count)
-            self.lumped[:, rows] += scale[:, None] * (part.matrix @ self.model.is_position_host[rows])
+            self.lumped[:, rows] += scale[:, None] * (part.matrix @ self.model.slot_table.is_position[rows])
 
     def _entry_indices(self, key: tuple[int, int], pattern: sp.csr_matrix) -> slice | np.ndarray:
         """Entry indices of a part in `matrix`, whose rows of a body have the body's pattern."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from typing import Any, Protocol
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -13,16 +14,17 @@ from ..base.devices import find_device
 from ..base.errors import ModelError
 from ..base.memory import convert_memory_errors
 from ..kernels.common.types import precision
-from ..kernels.elements.materials import DEFINED_FOR_ANY_J, NCOEF
 from . import assembly
 from .blocks import Block, build_block
 from .bodies import Body
+from .components import Components
 from .description import Description
 from .masses import Masses
+from .memory import Memory
 from .parameters import MaterialParameters
-from .residual_groups import slot_groups
+from .slot_table import SlotTable
 from .state import State
-from .topology import label_components, make_free_groups, make_topology
+from .topology import make_topology
 
 __all__ = ["Block", "Model"]
 
@@ -31,39 +33,37 @@ MAX_LISTED_BODIES = 3
 """Maximum number of bodies listed by a repr."""
 
 
-class ModelSource(Protocol):
-    """Source of a Model: a ModelBuilder."""
-
-    description: Description
-    gravity: np.ndarray
-    up_axis: str
-
-    @property
-    def bodies(self) -> list[Body]:
-        """Bodies in the order of addition."""
-
-    def make_terms(self, model: Model) -> tuple[Any, Any]:
-        """Terms of a model (forces, contact, constraints), and the evaluator of its quantities at a state."""
-
-
 class Model:
     """Made by ModelBuilder.finalize; constant except for `set_gravity` and `set_parameter`.
 
+    Args:
+        description: the scene; later additions to it do not change the model.
+        terms: makes the set of terms (forces, contact, constraints) of a model, see terms.term_set.
+        device, dtype, worlds: see ModelBuilder.finalize.
+        tables: tables of shape gradients for straight elements, too.
+
     Attributes:
         bodies: the bodies, in the order they were added.
-        worlds: number of copies of the model stepped together; dtype, device, up_axis: as given.
+        worlds: number of copies of the model stepped together; dtype, device: as given.
         slots: number of slots (3-vector unknowns: node positions and gradients) of all bodies.
         size: diagonal of the box of all nodes, m; reference length of constraint tolerances.
-        blocks: element blocks.
-        mesh_component, component: (slots,) connected component, by elements alone and also by constraints.
-        free_groups, free_group_count: components with an unconstrained translation: device struct and number.
-        cache: tables shared by solvers.
-        mass_host: scalar mass matrix (slots, slots), CSR on the host, kg.
+        slot_table: kinds, reference values and free components of the slots.
+        blocks: element blocks; contributions, element_count, history_count: numbers of their contributions to slots,
+            elements, and points with a history of damping.
+        masses: mass matrix. parameters: material constants.
+        terms: what adds to the residual. evaluation: forces, stresses and constraints at a state.
+        components: connected components. topology: device tables that gather the contributions.
+        memory: constant device arrays and their bytes. cache: tables shared by solvers.
+
+    Raises:
+        ModelError: no bodies, or an unknown device or precision.
+        CapacityError: the device has too little memory.
     """
 
     def __init__(
         self,
-        builder: ModelSource,
+        description: Description,
+        terms: Callable[[Model], Any],
         *,
         device: Any = None,
         dtype: str = "float64",
@@ -74,41 +74,49 @@ class Model:
             raise ModelError(f"dtype = {dtype!r} is neither 'float64' nor 'float32'")
         if not isinstance(worlds, (int, np.integer)) or worlds < 1:
             raise ModelError(f"worlds = {worlds!r} must be a positive whole number")
-        if not builder.bodies:
+        if not description.bodies:
             raise ModelError("the model has no body: call add_solid, add_beam or add_shell first")
         self.device = find_device(device)
         self.dtype = dtype
         self.worlds = int(worlds)
-        self.up_axis = builder.up_axis
-        self.description = builder.description
-        self.bodies: list[Body] = list(builder.bodies)
+        self.description = description.copy()
         self.types = precision(dtype)
-        self._memory: dict[str, int] = {}
+        self.memory = Memory(self.device, self.types)
         self.cache: dict[str, Any] = {}
-        self.parameters = MaterialParameters(self)
-        self._source, self._tables = builder, tables
+        self._make_terms, self._tables = terms, tables
         with convert_memory_errors(f"a model with {self.worlds} worlds", self.device):
-            self._build(builder, tables)
+            self._build()
 
     def resized(self, worlds: int, dtype: str | None = None) -> Model:
         """New model of the same description with another number of worlds or precision; values set by `set_parameter`
         are not carried over."""
-        return Model(self._source, device=self.device, dtype=dtype or self.dtype, worlds=worlds, tables=self._tables)
+        options = dict(device=self.device, dtype=dtype or self.dtype, worlds=worlds, tables=self._tables)
+        return Model(self.description, self._make_terms, **options)
 
-    def _build(self, builder: ModelSource, tables: bool) -> None:
+    def _build(self) -> None:
         """Number, assemble and upload the description."""
-        self._number_slots()
-        self._assemble_mass()
-        self._build_blocks(tables)
-        self.gravity = np.asarray(builder.gravity, dtype=float)
-        self.probes = list(builder.description.probes)
-        self.terms, self.evaluation = builder.make_terms(self)
-        self.mesh_component, self.component = label_components(self.graph(), self.terms.tied_slots())
-        self.component_count = int(self.component.max()) + 1
+        self.slot_table = SlotTable(self.description, self.memory)
+        self.slots = self.slot_table.count
+        boxes = np.array([body.mesh.bounding_box() for body in self.bodies])
+        self.size = float(np.linalg.norm(boxes[:, 1].max(axis=0) - boxes[:, 0].min(axis=0)))
+        self.masses = Masses(self)
+        hosts = [host for body in self.bodies for host in assembly.host_blocks(body, tables=self._tables)]
+        self.parameters = MaterialParameters(self, hosts)
+        self.blocks: list[Block] = []
+        self.contributions, self.element_count, self.history_count = 0, 0, 0
+        for key in dict.fromkeys(host.key for host in hosts):
+            block = build_block(self, key, [host for host in hosts if host.key == key])
+            self.blocks.append(block)
+            self.contributions += block.count * block.slots
+            self.element_count += block.count
+            if key.damping == "incremental":
+                self.history_count += block.count * block.points
+        self.terms = self._make_terms(self)
+        self.evaluation = self.terms.evaluation
+        self.components = Components(self)
         self.terms.build()
         self.topology = make_topology(self)
-        self._upload_components()
-        self.free_groups, self.free_group_count = make_free_groups(self)
+        self.components.upload(self)
 
     def __repr__(self) -> str:
         names = ", ".join(repr(body.name) for body in self.bodies)
@@ -123,91 +131,16 @@ class Model:
         laws = [law for body in self.bodies for _, law in body.materials]
         if any(law.density is None for law in laws):
             return None
-        return float(self.masses.lumped[0][self.slot_kind == 0].sum())
+        return float(self.masses.lumped[0][self.slot_table.kind == 0].sum())
 
-    # construction
+    @property
+    def bodies(self) -> list[Body]:
+        """Bodies, in the order they were added."""
+        return self.description.bodies
 
     def array(self, name: str, values: Any, dtype: Any) -> wp.array:
         """Upload a constant array; its bytes are counted under `name`."""
-        out: Any = wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device)
-        self.count_bytes(name, out)
-        return out
-
-    def count_bytes(self, name: str, *arrays: wp.array) -> None:
-        """Count the bytes of device arrays under `name`."""
-        for array in arrays:
-            self._memory[name] = self._memory.get(name, 0) + array.size * wp.types.type_size_in_bytes(array.dtype)
-
-    def uncount_bytes(self, name: str, *arrays: wp.array) -> None:
-        """Subtract the bytes of released arrays under `name`."""
-        for array in arrays:
-            self._memory[name] -= array.size * wp.types.type_size_in_bytes(array.dtype)
-
-    def element_array(self, values: np.ndarray, dtype: Any) -> wp.array:
-        """Upload element data [..., element]: coalesced on a GPU, contiguous per element on the CPU."""
-        if self.device.is_cuda:
-            return self.array("elements", values, dtype)
-        last = np.ndim(values) - (2 if dtype is self.types.mat33 else 1 if dtype is self.types.vec3 else 0) - 1
-        out = self.array("elements", np.moveaxis(values, last, 0), dtype)
-        return out.transpose((*range(1, out.ndim), 0))
-
-    def _number_slots(self) -> None:
-        offset, elements_before = 0, 0
-        for body in self.bodies:
-            body.element_offset = elements_before
-            elements_before += len(body.mesh.cells)
-            for rule in {body.rule, body.curved_rule}:
-                for part in body.family.scheme(rule):
-                    assembly.check_orientation(body, part)
-            body.slot_offset = offset
-            offset += body.slot_count
-        self.slots = offset
-        boxes = np.array([body.mesh.bounding_box() for body in self.bodies])
-        self.size = float(np.linalg.norm(boxes[:, 1].max(axis=0) - boxes[:, 0].min(axis=0)))
-        self.slot_kind = np.concatenate([body.slot_kind for body in self.bodies])
-        self.reference = np.concatenate([body.reference for body in self.bodies])
-        self.is_position_host = (self.slot_kind == 0).astype(float)
-        T, vec3 = self.types.T, self.types.vec3
-        self.is_position = self.array("slots", self.is_position_host, T)
-        self.reference_device = None
-        if self.description.body_forces:
-            self.reference_device = self.array("reference", self.reference, vec3)
-        self.free_host = np.ones((self.slots, 3))
-        self.clamped_host = np.zeros((self.slots, 3), dtype=bool)
-        for support in self.description.supports:
-            rows = support.body.slot_offset + support.slots
-            self.free_host[rows] *= 1.0 - support.components
-            if support.law is None and support.node_laws is None:
-                self.clamped_host[rows] |= support.components.astype(bool)
-        if not self.free_host.any() and not self.description.all_contacts:
-            raise ModelError("every component of every node is prescribed: nothing is left to solve for")
-
-    def _assemble_mass(self) -> None:
-        self.masses = Masses(self)
-        self.mass_host, self.lumped_host = self.masses.matrix, self.masses.lumped[0]
-
-    def _build_blocks(self, tables: bool) -> None:
-        groups: dict[assembly.BlockKey, list[assembly.HostBlock]] = {}
-        rows: list[np.ndarray] = []
-        self.materials = [(body, group, material) for body in self.bodies for group, material in body.materials]
-        for body in self.bodies:
-            for host in assembly.host_blocks(body, tables=tables):
-                groups.setdefault(host.key, []).append(host)
-                host.coefficient_row = len(rows)
-                rows.append(assembly.coefficient_rows(host.coefficients, body.materials[host.material][1]))
-        self.coefficient_table = np.array(rows).reshape(1, -1, NCOEF)
-        self.coefficients = self.array("materials", self.coefficient_table, self.types.T)
-        self._initial_coefficients = self.coefficients.numpy().tobytes()
-        self.blocks: list[Block] = []
-        contribution, element, history = 0, 0, 0
-        for key, parts in groups.items():
-            block = build_block(self, key, parts, contribution, element, history)
-            self.blocks.append(block)
-            contribution += block.count * block.slots
-            element += block.count
-            if key.damping == "incremental":
-                history += block.count * block.points
-        self.contributions, self.element_count, self.history_count = contribution, element, history
+        return self.memory.array(name, values, dtype)
 
     @property
     def constraints(self) -> Any:
@@ -215,44 +148,22 @@ class Model:
         term = self.terms.constraints
         return term and term.tables
 
-    def _upload_components(self) -> None:
-        """Upload the groups of slots whose residuals are measured together: of one connected component and similar
-        stiffness for the solver, of one mesh component and similar stiffness for the error estimate."""
-        self.residual_groups = slot_groups(self, self.component)
-        self.error_estimate_groups = slot_groups(self, self.mesh_component)
-        if self.component_count > 1:
-            self.component_of_slot = self.array("components", self.component, wp.int32)
-
-    def graph(self) -> sp.csr_matrix:
-        """Pairs of slots that share an element."""
-        return assembly.slot_graph([b.connectivity for b in self.blocks], self.slots)
-
     # public methods
 
     @property
     def free_slots(self) -> np.ndarray:
         """(slots, 3) mask of the components that are unknowns."""
-        return self.free_host.astype(bool)
-
-    @property
-    def needs_positive_J(self) -> bool:
-        """True if a law of the model requires J > 0."""
-        return any(b.key.law not in DEFINED_FOR_ANY_J for b in self.blocks)
+        return self.slot_table.free.astype(bool)
 
     @property
     def features(self) -> dict[str, bool]:
         """Optional features used by the scene."""
         return self.terms.features | {
             "driven nodes": any(s.law or s.node_laws for s in self.description.supports),
-            "free groups": self.free_group_count > 0,
-            "separate components": self.component_count > 1,
-            "probes": bool(self.probes),
+            "free groups": self.components.free_group_count > 0,
+            "separate components": self.components.count > 1,
+            "probes": bool(self.description.probes),
         }
-
-    @property
-    def bytes(self) -> dict[str, int]:
-        """Bytes of the constant arrays by purpose."""
-        return dict(self._memory)
 
     def info(self) -> dict[str, Any]:
         """Features used and unused, counts, contacts, bytes of the constants, kernel modules of the elements."""
@@ -295,7 +206,7 @@ class Model:
                 }
                 for b in self.blocks
             ],
-            "bytes": self.bytes | {"total": sum(self._memory.values())},
+            "bytes": self.memory.bytes | {"total": sum(self.memory.bytes.values())},
             "kernels": sorted({b.kernels.module.name.removeprefix("warpfea.kernels.") for b in self.blocks}),
         }
 
@@ -311,7 +222,7 @@ class Model:
                 u[rows] = body.initial_displacement
             if body.velocity is not None:
                 v[rows] = body.velocity
-        v[self.clamped_host] = 0.0  # driven components keep the user's initial velocities
+        v[self.slot_table.clamped] = 0.0  # driven components keep the user's initial velocities
         out.register("displacement", vec3, (self.slots,), u)
         out.register("velocity", vec3, (self.slots,), v)
         out.register("time", wp.float64)
@@ -335,33 +246,13 @@ class Model:
         """Kelvin-Voigt force of Eqs. (58)-(70) at the state's displacement and velocity, [world, slot, 3], N."""
         return self.evaluation.viscous_force(state)[0]
 
-    def dissipation_rate(self, state: State) -> np.ndarray:
-        """Viscous dissipation, the integral of S_vis : Edot, [world], W."""
-        return self.evaluation.viscous_force(state)[1]
-
     def strain_energy(self, state: State) -> np.ndarray:
         """[world], J."""
         return self.evaluation.internal_force(state)[1]
 
-    def minimum_jacobian(self, state: State) -> np.ndarray:
-        """Smallest det F at the points (and vertices, for laws that need J > 0), [world]."""
-        return self.evaluation.internal_force(state)[2]
-
     def tangent_matrix(self, state: State, world: int = 0) -> sp.csr_matrix:
         """Elastic tangent df_int/dq of one world, (3 slots, 3 slots) CSR, N/m; clamped rows included."""
         return self.evaluation.tangent_matrix(state, world)
-
-    def constraint_values(self, state: State) -> np.ndarray:
-        """Values c of all rows of the constraints, [world, row], m; those of joint k: model.constraints.rows_of[k]."""
-        return self.evaluation.constraints(state)[0]
-
-    def constraint_jacobian(self, state: State, world: int = 0) -> sp.csr_matrix:
-        """dc/dq of one world, (rows, 3 slots) CSR, evaluated on the device."""
-        return self.evaluation.constraint_jacobian(state, world)
-
-    def constraint_curvature(self, state: State, multipliers: Any, direction: Any) -> np.ndarray:
-        """sum multipliers_i d2c_i/dq2 times a direction (slots, 3), [world, slot, 3]; multipliers (rows,), N."""
-        return self.evaluation.constraint_curvature(state, np.asarray(multipliers), np.asarray(direction))
 
     def set_gravity(self, gravity: Any, *, mask: Any = None) -> None:
         """Gravity of all worlds (3,) or per world (worlds, 3), m/s^2; for the worlds of `mask` (worlds,).
@@ -415,9 +306,9 @@ class Model:
             h.update(repr(body.section).encode())
             if body.frames is not None:
                 h.update(np.ascontiguousarray(body.frames).tobytes())
-        h.update(self.reference.tobytes())
-        h.update(self.free_host.tobytes())
-        h.update(self.mass_host.data.tobytes())
-        h.update(self._initial_coefficients)
+        h.update(self.slot_table.reference.tobytes())
+        h.update(self.slot_table.free.tobytes())
+        h.update(self.masses.matrix.data.tobytes())
+        h.update(self.parameters.initial_coefficients)
         self.terms.hash(h)
         return h.hexdigest()

@@ -12,6 +12,7 @@ import numpy as np
 from ..base.errors import CheckpointError, ModelError
 from ..base.names import listing
 from ..base.worlds import check_values_per_world, values_per_world
+from ..kernels.elements.materials import NCOEF
 from ..materials import ADMISSIBLE_VALUES, DENSITY_CONSTANTS, Material
 from . import assembly
 from .blocks import Block, output_rows
@@ -59,10 +60,19 @@ class MaterialParameters:
         values: (worlds,) set values by (body index, material index, name).
         simulated: True once a simulation of the model exists.
         version: number of writes.
+        coefficient_table: (worlds or 1, rows, NCOEF) coefficients of the device laws, one row per host block;
+            coefficients: device copy; initial_coefficients: its bytes as built.
     """
 
-    def __init__(self, model: Any) -> None:
+    def __init__(self, model: Any, hosts: list[assembly.HostBlock]) -> None:
         self.model = model
+        rows = []
+        for row, host in enumerate(hosts):
+            host.coefficient_row = row
+            rows.append(assembly.coefficient_rows(host.coefficients, host.body.materials[host.material][1]))
+        self.coefficient_table = np.array(rows).reshape(1, -1, NCOEF)
+        self.coefficients = model.array("materials", self.coefficient_table, model.types.T)
+        self.initial_coefficients = self.coefficients.numpy().tobytes()
         self.values: dict[tuple[int, int, str], np.ndarray] = {}
         self.simulated = False
         self.version = 0
@@ -204,27 +214,27 @@ class MaterialParameters:
             keys = [(self._index(body), k) for body, k in members]
             m.masses.set_densities({key: self.values[(*key, name)] for key in keys})
             return
-        if len(m.coefficient_table) != m.worlds:
-            m.coefficient_table = np.tile(m.coefficient_table, (m.worlds, 1, 1))
+        if len(self.coefficient_table) != m.worlds:
+            self.coefficient_table = np.tile(self.coefficient_table, (m.worlds, 1, 1))
         chosen = {(self._index(body), k) for body, k in members}
         for block in m.blocks:
             mine = [part for part in block.host_blocks if (self._index(part.body), part.material) in chosen]
             for part in mine:
                 material = self.material_of_worlds(part.body, part.material)
                 _, values = assembly.law_and_coefficients(part.key.integral, material)
-                m.coefficient_table[:, part.coefficient_row] = assembly.coefficient_rows(values, material, m.worlds)
+                self.coefficient_table[:, part.coefficient_row] = assembly.coefficient_rows(values, material, m.worlds)
             tying = block.key.tying
             if mine and tying and name in tying.material_constants:
                 self._update_couplings(block, mask)
             if mine and block.stress_output:
                 block.stress_output.data.coefficients = m.array("output", output_rows(m, block), m.types.T)
-        if m.coefficients.shape[0] == m.worlds:
-            m.coefficients.assign(m.coefficient_table)
+        if self.coefficients.shape[0] == m.worlds:
+            self.coefficients.assign(self.coefficient_table)
             return
-        m.uncount_bytes("materials", m.coefficients)
-        m.coefficients = m.array("materials", m.coefficient_table, m.types.T)
+        m.memory.uncount("materials", self.coefficients)
+        self.coefficients = m.array("materials", self.coefficient_table, m.types.T)
         for block in m.blocks:
-            block.data.coefficients = m.coefficients
+            block.data.coefficients = self.coefficients
 
     def _update_couplings(self, block: Block, mask: np.ndarray) -> None:
         """Couplings of assumed strains of a block in the chosen worlds, per world.
@@ -258,8 +268,8 @@ class MaterialParameters:
         if not first:
             block.data.coupling.assign(np.ascontiguousarray(values))
             return
-        m.uncount_bytes("elements", block.data.coupling)
-        block.data.coupling = m.element_array(values, m.types.T)
+        m.memory.uncount("elements", block.data.coupling)
+        block.data.coupling = m.memory.element_array(values, m.types.T)
         block.use_couplings_per_world(m.dtype)
 
     @contextmanager

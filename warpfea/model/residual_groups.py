@@ -31,11 +31,11 @@ def slenderness(model: Any) -> np.ndarray:
 
     With x = sum_i s_i E_i the second moments of a part are E^T M E.
     """
-    E, M = model.reference, model.mass_host
-    count = int(model.mesh_component.max()) + 1
-    rows = np.column_stack([np.ones(model.slots) * model.is_position_host, E])
+    E, M = model.slot_table.reference, model.masses.matrix
+    count = int(model.components.mesh_of_slot.max()) + 1
+    rows = np.column_stack([np.ones(model.slots) * model.slot_table.is_position, E])
     moments = np.zeros((count, 4, 4))
-    np.add.at(moments, model.mesh_component, rows[:, :, None] * (M @ rows)[:, None, :])
+    np.add.at(moments, model.components.mesh_of_slot, rows[:, :, None] * (M @ rows)[:, None, :])
     mass, centre = moments[:, 0, 0], moments[:, 0, 1:] / moments[:, :1, 0]
     second = moments[:, 1:, 1:] / mass[:, None, None] - centre[:, :, None] * centre[:, None, :]
     least, _, largest = np.linalg.eigvalsh(second).T
@@ -53,7 +53,8 @@ def stiffness_pieces(model: Any) -> tuple[np.ndarray, np.ndarray]:
     parts = [host for block in model.blocks for host in block.host_blocks]
     first = np.concatenate([host.conn[:, 0] + host.body.slot_offset for host in parts])
     mu = np.concatenate([np.full(len(host.conn), host.body.materials[host.material][1].lame[1]) for host in parts])
-    of_element = stiffness_classes(mu * slenderness(model)[model.mesh_component[first]], model.component[first])
+    parts_of = model.components
+    of_element = stiffness_classes(mu * slenderness(model)[parts_of.mesh_of_slot[first]], parts_of.of_slot[first])
     of_slot = np.zeros(model.slots, dtype=np.int64)
     connectivity = [block.connectivity for block in model.blocks]
     ends = np.cumsum([len(conn) for conn in connectivity])[:-1]
@@ -108,7 +109,7 @@ def slot_groups(model: Any, label: np.ndarray) -> SlotGroups:
         return model.array("components", edges, wp.int32), model.array("components", order, wp.int32)
 
     component = np.zeros(len(keys))
-    component[of.ravel()] = model.component
+    component[of.ravel()] = model.components.of_slot
     return SlotGroups(
         len(keys), *listed(of.ravel()), *listed(of_element), model.array("components", component, wp.int32)
     )

@@ -1,19 +1,17 @@
-"""Gather topology, connected components, free bodies, static support check."""
+"""Gather topology, static support check."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
 import warp as wp
 
 from ..base.errors import ModelError
 from ..kernels.common.structs import topology_struct
-from ..kernels.solvers.pcg import free_groups_struct
 from . import assembly
 
-__all__ = ["check_static_supports", "label_components", "make_free_groups", "make_topology"]
+__all__ = ["check_static_supports", "make_topology"]
 
 
 def make_topology(model: Any) -> Any:
@@ -22,72 +20,31 @@ def make_topology(model: Any) -> Any:
     start, entry = assembly.gather_table([b.connectivity for b in model.blocks], model.slots)
     topo.contribution_start = model.array("topology", start, wp.int32)
     topo.contribution_entry = model.array("topology", entry, wp.int32)
-    topo.mass_start = model.array("mass", model.mass_host.indptr, wp.int32)
-    topo.mass_column = model.array("mass", model.mass_host.indices, wp.int32)
+    topo.mass_start = model.array("mass", model.masses.matrix.indptr, wp.int32)
+    topo.mass_column = model.array("mass", model.masses.matrix.indices, wp.int32)
     topo.mass_value = model.masses.values
-    topo.free = model.array("slots", model.free_host, model.types.vec3)
-    topo.prescribed_bits = model.array("slots", (model.free_host == 0.0) @ [1, 2, 4], wp.uint8)
+    free = model.slot_table.free
+    topo.free = model.array("slots", free, model.types.vec3)
+    topo.prescribed_bits = model.array("slots", (free == 0.0) @ [1, 2, 4], wp.uint8)
     model.terms.add_pool_topology(topo)
     return topo
 
 
-def label_components(graph: sp.csr_matrix, groups: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Connected component of each slot: by elements alone, and with constraints, given as `groups` of slots."""
-    part = assembly.connected_components(graph)
-    if not groups:
-        return part, part
-    ties = sp.lil_matrix((part.max() + 1, part.max() + 1))
-    for slots in groups:
-        parts = np.unique(part[slots])
-        ties[parts[0], parts] = 1.0
-    return part, assembly.connected_components(ties.tocsr())[part]
-
-
-def make_free_groups(model: Any) -> tuple[Any, int]:
-    """Components with an unconstrained translation, on the device, and their number (DESIGN 5).
-
-    Only the mass resists their translations: each solve is corrected for them, so that momentum is conserved.
-    """
-    label, count = model.component, model.component_count
-    free = np.ones((count, 3))
-    for c in range(3):
-        free[np.unique(label[model.free_host[:, c] == 0.0]), c] = 0.0
-    model.terms.mark_constrained(free)
-    keep = np.flatnonzero(free.any(axis=1))
-    groups = free_groups_struct(model.dtype)()
-    if not len(keep):
-        return groups, 0
-    number = np.full(count, -1)
-    number[keep] = np.arange(len(keep))
-    of_slot = number[label]
-    slots = np.flatnonzero((of_slot >= 0) & (model.slot_kind == 0))
-    slots = slots[np.argsort(of_slot[slots], kind="stable")]
-    start = np.concatenate([[0], np.cumsum(np.bincount(of_slot[slots], minlength=len(keep)))])
-    groups.start = model.array("groups", start, wp.int32)
-    groups.slot = model.array("groups", slots, wp.int32)
-    groups.group_of_slot = model.array("groups", of_slot, wp.int32)
-    groups.is_position, groups.lumped_mass = model.is_position, model.masses.lumped_values
-    model.cache["free groups"] = of_slot, slots, len(keep)
-    groups.mass = model.array("groups", model.masses.group_masses(*model.cache["free groups"]), model.types.T)
-    groups.free_directions = model.array("groups", free[keep], model.types.vec3)
-    return groups, len(keep)
-
-
 def check_static_supports(model: Any) -> None:
     """Raise ModelError for an unconstrained rigid-body mode."""
-    state = model.state()
+    state, table = model.state(), model.slot_table
     touches = model.description.all_contacts
     held_by = "hold what rests on contact with solve_static(stabilise=True), " if touches else ""
-    for label in range(model.component_count):
-        slots = np.flatnonzero(model.component == label)
-        parts, part = np.unique(model.mesh_component[slots], return_inverse=True)
+    for label in range(model.components.count):
+        slots = np.flatnonzero(model.components.of_slot == label)
+        parts, part = np.unique(model.components.mesh_of_slot[slots], return_inverse=True)
         motions = np.zeros((len(parts), 6, len(slots), 3))
         for k in range(len(parts)):
             own = np.flatnonzero(part == k)
-            motions[k][:, own] = assembly.rigid_modes(model.reference[slots[own]], model.slot_kind[slots[own]])
+            motions[k][:, own] = assembly.rigid_modes(table.reference[slots[own]], table.kind[slots[own]])
         modes = motions.reshape(6 * len(parts), -1)
         modes /= np.linalg.norm(modes, axis=1)[:, None]
-        held = modes[:, (model.free_host[slots] == 0.0).ravel()]
+        held = modes[:, (table.free[slots] == 0.0).ravel()]
         columns = (3 * slots[:, None] + np.arange(3)).ravel()
         for rows in model.terms.restraints(state, label):
             held = np.hstack([held, (rows[:, columns] @ modes.T).T / model.size])

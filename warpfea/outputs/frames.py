@@ -1,8 +1,8 @@
 """Common parts of output writers: protocol, frame times, file replacement, drawn surface.
 
 A writer receives the simulation and reads `time` (B,), of statics `load` (B,), `dt`, `model.bodies`,
-`model.worlds`, `model.up_axis`, `skin_points(body)` (B, P, 3), `skin_field(name, body)` (B, P) and, for nodal formats,
-`positions`, `displacements`, `velocities` and `field`. Bodies without a skin are not drawn.
+`model.worlds`, `model.description.up_axis`, `skin_points(body)` (B, P, 3), `skin_field(name, body)` (B, P) and, for
+nodal formats, `positions`, `displacements`, `velocities` and `field`. Bodies without a skin are not drawn.
 """
 
 from __future__ import annotations
@@ -133,7 +133,7 @@ class DrawnSurface:
     def __init__(self, sim: Any, spacing: float | tuple[float, float] | None = None) -> None:
         self.bodies = [body for body in sim.model.bodies if getattr(body, "skin", None) is not None]
         self.worlds = int(sim.model.worlds)
-        self.up_axis = str(sim.model.up_axis).upper()
+        self.up_axis = str(sim.model.description.up_axis).upper()
         if not self.bodies:
             raise OutputError("nothing to draw: no body has a surface")
         start = [self.skin_points(sim, body) for body in self.bodies]

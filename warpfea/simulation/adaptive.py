@@ -99,12 +99,12 @@ def algebraic_tolerance(solver: Any, options: AdaptiveOptions | None, dtype: str
 def _displacement_factors(model: Model) -> np.ndarray:
     """Lever arm (slots,), m, that converts an unknown to displacement: 1 for positions, half the section for gradients
     across beams and shells, 0 for gradients whose motion the adjacent positions represent."""
-    out = model.is_position_host.astype(float)
-    mass = model.mass_host.diagonal()
+    out = model.slot_table.is_position.astype(float)
+    mass = model.masses.matrix.diagonal()
     for body in model.bodies:
         sets = body.family.slot_sets
         for kind in sets.get("section", sets.get("director", ())):
-            slot = body.slots[model.slot_kind[body.slots] == kind]
+            slot = body.slots[model.slot_table.kind[body.slots] == kind]
             out[slot] = np.sqrt(3.0 * mass[slot] / mass[slot - kind])  # for a uniform section
     return out
 

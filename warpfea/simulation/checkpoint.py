@@ -81,14 +81,14 @@ def save_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
         "worlds": sim.model.worlds,
         "slots": sim.model.slots,
         "integrator": sim.integrator.label,
-        "gravity": sim.model.gravity.tolist(),
+        "gravity": sim.model.description.gravity.tolist(),
         "dt": np.asarray(sim.dt).tolist() if sim.error is None else "auto",
         "steps": sim.steps,
         "max_residual": sim.max_residual,
         "max_floor": sim.max_floor,
         "max_violation": sim.max_violation,
         "min_J": sim.min_J if math.isfinite(sim.min_J) else None,
-        "probes": [probe.name for probe in sim.model.probes],
+        "probes": [probe.name for probe in sim.model.description.probes],
     }
     if sim.stepper.step_size_control:
         sync_times = sim.stepper.step_size_control.sync_times
@@ -170,9 +170,9 @@ def _check_compatible(file: pathlib.Path, meta: dict[str, Any], sim: Any) -> Non
         "worlds": ("number of worlds", sim.model.worlds),
         "integrator": ("integrator", sim.integrator.label),
         "slots": ("number of slots", sim.model.slots),
-        "probes": ("probes", [probe.name for probe in sim.model.probes]),
+        "probes": ("probes", [probe.name for probe in sim.model.description.probes]),
         "fingerprint": ("model", sim.model.fingerprint()),
-        "gravity": ("gravity", sim.model.gravity.tolist()),
+        "gravity": ("gravity", sim.model.description.gravity.tolist()),
     }
     for key, (what, value) in expected.items():
         if meta.get(key) == value:

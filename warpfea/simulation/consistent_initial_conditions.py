@@ -240,14 +240,14 @@ class ConsistentInitialConditions:
             across = np.cos(angle) * twice - np.sin(angle) * turn
             for target, values in ((rate, first * along), (acceleration, second * along + first**2 * across)):
                 target[slot] = np.where(on, values, target[slot])
-        prescribed = self.model.free_host == 0.0
+        prescribed = self.model.slot_table.free == 0.0
         return np.where(prescribed, rate, 0.0), np.where(prescribed, acceleration, 0.0)
 
     # linear algebra
 
     def _velocity_correction(self, u: np.ndarray, v: np.ndarray, laws: np.ndarray) -> np.ndarray:
         """Velocity correction dv, m/s; zero if consistent."""
-        jump = self._prescribed_rates(laws)[0] - np.where(self.model.free_host == 0.0, v, 0.0)
+        jump = self._prescribed_rates(laws)[0] - np.where(self.model.slot_table.free == 0.0, v, 0.0)
         if self.model.constraints is None:
             return self._solve_saddle_point(np.zeros_like(v), jump) if jump.any() else jump
         J, first, _ = self._constraint_rows(u, v, laws)
@@ -290,7 +290,7 @@ class ConsistentInitialConditions:
         x = self._solve_mass(force - m.masses.world_matrix(self._world) @ prescribed) + prescribed
         if J is None:
             return x
-        free = m.free_host.ravel() != 0.0
+        free = m.slot_table.free.ravel() != 0.0
         columns = (J.toarray() * free).reshape(-1, m.slots, 3)
         inverse = np.array([self._solve_mass(row).ravel() for row in columns])  # rows of J M^-1
         matrix = J @ inverse.T
@@ -311,7 +311,7 @@ class ConsistentInitialConditions:
 
 def mass_solver(model: Model, component: int, world: int = 0) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
     """Free slots of a component, and a solver for their mass matrix."""
-    free = np.flatnonzero(model.free_host[:, component])
+    free = np.flatnonzero(model.slot_table.free[:, component])
     M = model.masses.world_matrix(world)[free][:, free].astype(float).tocsc()
     if len(free) <= MAX_FACTORED_SLOTS:
         return free, spl.splu(M).solve if len(free) else lambda f: f

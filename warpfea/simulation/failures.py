@@ -196,7 +196,7 @@ def _violated_joints(model: Model, values: np.ndarray, tol: float) -> tuple[list
 
 def _worst_element(m: Model, residual: np.ndarray) -> tuple[int, str]:
     """Model index and description of the element with the largest residual (slots, 3) on its slots."""
-    g = np.abs(residual * m.free_host).max(axis=1)
+    g = np.abs(residual * m.slot_table.free).max(axis=1)
     g = np.where(np.isfinite(g), g, np.inf)
     best, index, text = -1.0, -1, "element unknown"
     for block in m.blocks:

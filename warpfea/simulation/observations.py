@@ -105,7 +105,7 @@ class Observations:
             self._column_count += 3
 
     def _add_probe(self, name: str, owner: str, what: str) -> None:
-        probes = {probe.name: probe for probe in self._model.probes}
+        probes = {probe.name: probe for probe in self._model.description.probes}
         if owner not in probes:
             raise ModelError(f"observe: probe {owner!r} is unknown; there are: {listing(probes)}"
                              f"{did_you_mean(owner, list(probes))}")  # fmt: skip

@@ -54,7 +54,7 @@ class Predictor:
             self.control,
             step,
             m.topology.free,
-            m.is_position,
+            m.slot_table.is_position_array,
             w.diagonal,
             w.v,
             self.state.velocity,

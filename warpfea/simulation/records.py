@@ -33,13 +33,13 @@ class Records(Results):
 
     def probe(self, name: str) -> ProbeRecord:
         """Record of the probe `name`, one entry per step. Raises ModelError listing the probes."""
-        names = [p.name for p in self.model.probes]
+        names = [p.name for p in self.model.description.probes]
         if name not in names:
             raise ModelError(f"probe {name!r} is unknown; there are: {listing(names)}{did_you_mean(name, names)}")
         k = names.index(name)
         table = self._recorded_table([0, *range(1 + 6 * k, 7 + 6 * k)])
         d, v = table[:, :, 1:4], table[:, :, 4:7]
-        return ProbeRecord(self._recorded_times(table), self.model.probes[k].X + d, d, v)
+        return ProbeRecord(self._recorded_times(table), self.model.description.probes[k].X + d, d, v)
 
     def _recorded_table(self, columns: list[int]) -> np.ndarray:
         """Recorded table (B, steps, columns): time, then the columns of the report from the probes on."""
@@ -74,7 +74,7 @@ class Records(Results):
         k = self._joint(joint).index
         constraints = self.model.constraints
         assert constraints is not None
-        values = np.abs(self.model.constraint_values(self.state)[:, constraints.rows_of[k]]).max(axis=1)
+        values = np.abs(self.model.evaluation.constraint_values(self.state)[:, constraints.rows_of[k]]).max(axis=1)
         # right-hand sides of the last step if it led to this state: statics resets its time
         column = self._joint_column(joint) + 6
         return np.where(self._stepped_worlds, self.stepper.work.report.numpy()[:, column], values)

@@ -160,7 +160,7 @@ class RunStatistics(Records):
     def _history_row(self, rows: np.ndarray) -> np.ndarray:
         """Recorded columns of a report: time, probes, and term columns, NaN for worlds that did not step."""
         row = rows[:, [REPORT_COLUMNS.index("time"), *range(len(REPORT_COLUMNS), rows.shape[1])]].copy()
-        row[~self._stepped_worlds, 1 + 6 * len(self.model.probes) :] = np.nan
+        row[~self._stepped_worlds, 1 + 6 * len(self.model.description.probes) :] = np.nan
         return row
 
     @property

@@ -425,7 +425,7 @@ class Simulation(RunStatistics):
         if not isinstance(nodes, NodeSet):
             raise ModelError(f"reaction: expected nodes (body.nodes), got {nodes!r}")
         self.check_body(nodes.body, "reaction")
-        g = self.stepper.work.g.numpy() * (1.0 - self.model.free_host)
+        g = self.stepper.work.g.numpy() * (1.0 - self.model.slot_table.free)
         first = nodes.body.node_slot[nodes.indices]
         rows = nodes.body.slot_offset + first[first >= 0]
         total = g[:, rows].sum(axis=1).astype(float)
@@ -442,7 +442,7 @@ class Simulation(RunStatistics):
 
     def bytes(self) -> dict[str, int]:
         """Bytes on the device: constants, scratch, and each array of the state (twice if steps may be halved)."""
-        out = {f"model.{k}": v for k, v in self.model.bytes.items()}
+        out = {f"model.{k}": v for k, v in self.model.memory.bytes.items()}
         out |= {f"work.{k}": v for k, v in self.stepper.work.bytes.items()}
         for label, state in (("state", self.state), ("backup", self.stepper.backup)):
             if state is not None:

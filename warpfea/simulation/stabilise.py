@@ -76,7 +76,7 @@ class Springs(Output):
         work = sim.stepper.work
         pull = work.inertia.numpy().astype(float)
         moved = work.v.numpy().astype(float)
-        force = -np.einsum("bsc,s->bc", pull, sim.model.is_position_host)
+        force = -np.einsum("bsc,s->bc", pull, sim.model.slot_table.is_position)
         self._rows.append((force, 0.5 * np.einsum("bsc,bsc->b", pull, moved)))
 
     def close(self, sim: Any) -> None:

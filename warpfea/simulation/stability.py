@@ -83,10 +83,10 @@ def report_unstable(result: Any, *, refuse: bool) -> None:
     if not worlds:
         return
     m, world = sim.model, worlds[0]
-    size = np.linalg.norm(found.mode[world], axis=1) * m.is_position_host
+    size = np.linalg.norm(found.mode[world], axis=1) * m.slot_table.is_position
     slot = int(np.argmax(size))
     body = next(b for b in m.bodies if b.slot_offset <= slot < b.slot_offset + b.slot_count)
-    place = m.reference[slot] + body.origin + sim.state.displacement.numpy()[world, slot]
+    place = m.slot_table.reference[slot] + body.origin + sim.state.displacement.numpy()[world, slot]
     where = ", ".join(f"{x + 0.0:.3g}" for x in np.round(place, 12))
     way = ", ".join(f"{x + 0.0:.2g}" for x in np.round(found.mode[world, slot], 3))
     many = f"{len(worlds)} of {m.worlds} worlds, the first of them {world}" if len(worlds) > 1 else f"world {world}"
@@ -182,7 +182,7 @@ class TangentOperator:
     def __init__(self, sim: Simulation) -> None:
         self.sim, self.model, self.stepper = sim, sim.model, sim.stepper
         self.residual, self.work = sim.stepper.newton.residual, sim.stepper.work
-        self.free_components = self.model.free_host[None]
+        self.free_components = self.model.slot_table.free[None]
         self.linearise()
 
     def linearise(self) -> None:
@@ -339,7 +339,8 @@ def _unstable_modes(probe: TangentOperator, chosen: np.ndarray, x: np.ndarray) -
     """Modes of least p.H p / p.M p (worlds, slots, 3), largest displacement 1 m, from directions x."""
     m = probe.model
     x = np.where(chosen[:, None, None], x, 0.0)
-    masses = [m.masses.world_matrix(world) if m.masses.varies_by_world else m.mass_host for world in range(m.worlds)]
+    own = m.masses.varies_by_world
+    masses = [m.masses.world_matrix(world) if own else m.masses.matrix for world in range(m.worlds)]
 
     def mass(v: np.ndarray) -> np.ndarray:
         return np.stack([masses[b] @ v[b] if chosen[b] else v[b] for b in range(m.worlds)]) * probe.free_components
@@ -371,7 +372,7 @@ def _unstable_modes(probe: TangentOperator, chosen: np.ndarray, x: np.ndarray) -
         r = Hx - value[:, None, None] * Mx
         w = probe.precondition(r, going)
         basis, H, M = [x, w, p], [Hx, probe.product(w, going), Hp], [Mx, mass(w), Mp]
-    largest = (np.linalg.norm(x, axis=2) * m.is_position_host).max(axis=1)
+    largest = (np.linalg.norm(x, axis=2) * m.slot_table.is_position).max(axis=1)
     return x / np.where(largest > 0.0, largest, 1.0)[:, None, None]
 
 
@@ -408,7 +409,7 @@ def _evaluate_state(stepper: Any) -> None:
     launch(k.begin_attempt, m.worlds, [w.step, w.newton])
     running = w.step.running
     stepper._evaluate_time_laws(running)
-    args = [w.step, m.is_position, m.topology.free, state.displacement, state.velocity]
+    args = [w.step, m.slot_table.is_position_array, m.topology.free, state.displacement, state.velocity]
     args += [stepper.u_before, stepper.v_before, w.q_tilde, w.v_tilde, w.v]
     launch(k.predict, stepper.dim, args)
     m.terms.supports.drive(stepper.ctx, running)

@@ -115,7 +115,7 @@ class Stepper:
         if growth:
             growth.bind(self.work.step, model, state)
         self.episodes = Episodes(model, self.work, self.launch, **(episodes or {"asynchronous": False, "ends": False}))
-        self._probe_tables = self._upload_probes() if model.probes else []
+        self._probe_tables = self._upload_probes() if model.description.probes else []
         state.sealed = True
         self.backup = state.copy() if solver.max_halvings > 0 or self.step_size_control else None
         self._load_modules()
@@ -326,7 +326,7 @@ class Stepper:
         with launch.rare():
             wp.capture_if(self.failed, self._restore_failed)
         launch(self.kernels.write_report, m.worlds, [w.step, w.newton, w.pcg, w.report])
-        if m.probes:
+        if m.description.probes:
             self._write_probes()
         for term in self.terms:
             term.report(self.ctx)
@@ -354,7 +354,7 @@ class Stepper:
         self._evaluate_time_laws(running)
         args = [
             w.step,
-            m.is_position,
+            m.slot_table.is_position_array,
             m.topology.free,
             state.displacement,
             state.velocity,
@@ -378,7 +378,8 @@ class Stepper:
     def _start_from_candidate(self, kind: int) -> None:
         """Write an alternative first iterate to work.v in worlds that choose one."""
         m, w, state = self.model, self.work, self.state
-        args = [w.step, w.newton, kind, m.is_position, m.topology.free, state.displacement, state.velocity]
+        args = [w.step, w.newton, kind, m.slot_table.is_position_array, m.topology.free]
+        args += [state.displacement, state.velocity]
         self.launch(self.kernels.alternative_first_iterate, self.dim, [*args, w.q_tilde, w.v_tilde, w.v])
 
     @launch_part("commit")
@@ -437,13 +438,13 @@ class Stepper:
 
     def _upload_probes(self) -> list[wp.array]:
         m = self.model
-        start = np.concatenate([[0], np.cumsum([len(p.slots) for p in m.probes])])
-        slot = np.concatenate([p.body.slot_offset + p.slots for p in m.probes])
-        weight = np.concatenate([p.weights for p in m.probes])
+        start = np.concatenate([[0], np.cumsum([len(p.slots) for p in m.description.probes])])
+        slot = np.concatenate([p.body.slot_offset + p.slots for p in m.description.probes])
+        weight = np.concatenate([p.weights for p in m.description.probes])
         values = ((start, wp.int32), (slot, wp.int32), (weight, m.types.T))
         return [wp.array(a, dtype=dtype, device=m.device) for a, dtype in values]
 
     def _write_probes(self) -> None:
         m, w = self.model, self.work
         args = [*self._probe_tables, self.state.displacement, self.state.velocity, len(REPORT_COLUMNS), w.report]
-        self.launch(self.kernels.probe_values, (m.worlds, len(m.probes)), args)
+        self.launch(self.kernels.probe_values, (m.worlds, len(m.description.probes)), args)

@@ -101,7 +101,7 @@ class SuperLU:
 
     def __init__(self, model: Model, graph: sp.csr_matrix) -> None:
         if "direct order" not in model.cache:
-            model.cache["direct order"] = FreeMatrix.from_pattern(graph, model.free_host, ordered=True)
+            model.cache["direct order"] = FreeMatrix.from_pattern(graph, model.slot_table.free, ordered=True)
         self.matrix: FreeMatrix = model.cache["direct order"]
         self.factors: dict[int, tuple[Any, np.ndarray]] = {}
         self.size, self.dtype = model.slots, np.dtype(model.dtype)
@@ -146,7 +146,7 @@ class CuDSS:
         import cupy
 
         self.device, self.cupy = model.device, cupy
-        self.matrix = FreeMatrix.from_pattern(graph, model.free_host, ordered=False)
+        self.matrix = FreeMatrix.from_pattern(graph, model.slot_table.free, ordered=False)
         with cupy.cuda.Device(self.device.ordinal):
             self.value_index, self.free = (
                 cupy.asarray(self.matrix.value_index),
@@ -201,7 +201,7 @@ def make_factors(model: Model, graph: sp.csr_matrix) -> SparseFactors:
     Raises:
         ModelError: a model without free components.
     """
-    if not model.free_host.any():
+    if not model.slot_table.free.any():
         raise ModelError("linear='direct': every component of the model is prescribed, there is nothing to solve for")
     if not model.device.is_cuda:
         return SuperLU(model, graph)

@@ -240,7 +240,7 @@ class JacobiLoop(NewtonLoop):
             args = [
                 w.newton,
                 w.step.mass_factor,
-                m.free_groups.lumped_mass,
+                m.components.free_groups.lumped_mass,
                 w.gradient,
                 m.topology.free,
                 w.direction,

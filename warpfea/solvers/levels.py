@@ -91,9 +91,9 @@ def make_levels(model: Model, pattern: Pattern, *, coarse: bool = True, by_compo
     components.
     """
     origin = np.concatenate([np.tile(body.origin, (body.slot_count, 1)) for body in model.bodies])
-    position = model.slot_kind == 0
-    place = model.reference + origin * position[:, None]
-    points = ReferencePoints(place, position, np.cumsum(position) - 1, model.mesh_component)
+    position = model.slot_table.kind == 0
+    place = model.slot_table.reference + origin * position[:, None]
+    points = ReferencePoints(place, position, np.cumsum(position) - 1, model.components.mesh_of_slot)
     if not coarse:
         return [_make_level(model, pattern, points, GROUP_SLOTS)[0]]
     levels = []
@@ -117,7 +117,8 @@ def make_levels(model: Model, pattern: Pattern, *, coarse: bool = True, by_compo
         level, points, pattern = _make_level(model, pattern, points, capacity)
         levels.append(level)
         # below the first level groups may span bodies connected by joints and, where they hardly shrink, any bodies
-        points.separate_label = points.separate_label if depth else model.component[_representative_slots(level)]
+        if not depth:
+            points.separate_label = model.components.of_slot[_representative_slots(level)]
         if level.group_count * 4 > n // 2:
             points.separate_label = np.zeros_like(points.separate_label)
     raise AssertionError("groups do not shrink")

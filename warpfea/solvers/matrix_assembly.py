@@ -17,6 +17,7 @@ from ..base.errors import ModelError
 from ..kernels.common.structs import pattern_struct
 from ..kernels.elements.matrix import panel_layout, panel_row_type
 from ..kernels.solvers.blocks import assembly_kernels
+from ..model.assembly import slot_graph
 from ..terms.protocols import Preconditioned
 
 if TYPE_CHECKING:
@@ -84,7 +85,7 @@ def make_pattern(model: Model, graph: sp.csr_matrix, *, with_upper: bool = True)
 def coupling_pattern(model: Model) -> sp.csr_matrix:
     """Pattern (slots, slots) of slots that share an element or an item of a term, rows sorted."""
     if "coupled slots" not in model.cache:
-        graph = model.graph()
+        graph = slot_graph(model.blocks, model.slots)
         for item, slot, count in filter(None, (term.incidence() for term in model.terms.having(Preconditioned))):
             touched = sp.csr_matrix((np.ones(len(item), dtype=np.int8), (item, slot)), (count, model.slots))
             touched.data[:] = 1
@@ -196,7 +197,7 @@ class MatrixAssembler:
         wp.utils.array_scan(start, start, inclusive=True)
         source = wp.empty(int(start[-1:].numpy()[0]), dtype=wp.int32, device=model.device)
         wp.launch(find, upper, inputs=[*args, 1, start, source], device=model.device)
-        model.count_bytes("matrix pattern", start, source)
+        model.memory.count("matrix pattern", start, source)
         return start, source
 
     def allocate_values(self, name: str, worlds: int | None = None) -> wp.array:

@@ -225,7 +225,7 @@ class NewtonLoop:
         ctl.floor.eps = MACHINE_EPSILON[model.dtype]
         ctl.is_static = int(not inertia)
         ctl.model_size = float(model.size)
-        ctl.norms.component_of_group = model.residual_groups.component
+        ctl.norms.component_of_group = model.components.residual_groups.component
         ctl.max_iterations = options.max_newton
         ctl.floor.max_error = MAX_ROUND_OFF_ERROR[model.dtype]
         ctl.refuse_inversion = int(inversion == "refuse")
@@ -398,7 +398,7 @@ class NewtonLoop:
     def _run_rare_branch(self) -> None:
         """Rare branch: error estimate, step length of non-monotone trials, further searches, inversion check."""
         m, w, k = self.model, self.work, self.kernels
-        parts = m.error_estimate_groups
+        parts = m.components.error_estimate_groups
         args = [w.newton, parts.slot_start, parts.slot, parts.element_start, parts.element]
         args += [w.gradient, w.direction, w.inertia, w.v, w.v_tilde, w.u, w.energy_rows]
         self.launch(self.vector_kernels.floor_partials, (m.worlds, parts.count, FLOOR_LANES), args)

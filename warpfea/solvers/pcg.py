@@ -34,7 +34,7 @@ class PCG:
         self.preconditioner = preconditioner
         self.kernels = pcg_kernels(model.dtype, model.terms.traits.has_constraints)
         self.dim = (model.worlds, model.slots)
-        self.deflate_translations = deflate and model.free_group_count > 0
+        self.deflate_translations = deflate and model.components.free_group_count > 0
         work.pcg.max_iterations = max_iterations
         work.pcg.max_work = max_work
 
@@ -43,8 +43,8 @@ class PCG:
         """Solve and write p to work.direction."""
         m, w, k, launch = self.model, self.work, self.kernels, self.launch
         launch(k.initialise_residual, self.dim, [w.gradient, m.topology.free, active, w.direction, w.r])
-        if m.component_count > 1:
-            launch(k.zero_converged, self.dim, [w.newton, m.component_of_slot, active, w.r])
+        if m.components.count > 1:
+            launch(k.zero_converged, self.dim, [w.newton, m.components.of_slot_array, active, w.r])
         self.correct_translations(active)
         self.preconditioner.prepare(active)
         self._precondition(w.r, w.z, active)
@@ -87,10 +87,10 @@ class PCG:
         mass = w.step.mass_factor
         launch(
             k.free_group_partials,
-            (m.worlds, m.free_group_count, FREE_GROUP_LANES),
-            [m.free_groups, w.r, active, w.group_partial],
+            (m.worlds, m.components.free_group_count, FREE_GROUP_LANES),
+            [m.components.free_groups, w.r, active, w.group_partial],
         )
-        args = [m.free_groups, w.group_partial, mass, active, w.group_velocity]
-        launch(k.group_velocity, (m.worlds, m.free_group_count), args)
-        args = [m.free_groups, w.group_velocity, m.topology.free, mass, active, w.direction, w.r]
+        args = [m.components.free_groups, w.group_partial, mass, active, w.group_velocity]
+        launch(k.group_velocity, (m.worlds, m.components.free_group_count), args)
+        args = [m.components.free_groups, w.group_velocity, m.topology.free, mass, active, w.direction, w.r]
         launch(k.translate_groups, self.dim, args)

@@ -135,7 +135,7 @@ def choose_preconditioner(name: str, storage: str | None, model: Model) -> str:
         return name
     if banded and not model.device.is_cuda and find_band(model) is not None:
         return "banded"
-    small = model.slots < SMALL_BODY_SLOTS * (int(model.mesh_component.max()) + 1)
+    small = model.slots < SMALL_BODY_SLOTS * (int(model.components.mesh_of_slot.max()) + 1)
     return (
         "deflated"
         if model.terms.traits.has_constraints and small and model.slots > MAX_FULL_FACTOR_SLOTS

@@ -274,7 +274,7 @@ class Residual:
         launch(self.gather_kernels.residual, self.dim, args)
         self.reduce(w.rows, RESIDUAL_ROWS, active, w.newton.slot_sums)
         self.reduce(w.energy_rows, 2, active, w.newton.elem_sums)
-        groups = m.residual_groups
+        groups = m.components.residual_groups
         if groups.count > 1:
             args = [groups.slot_start, groups.slot, groups.element_start, groups.element]
             args += [w.rows, w.energy_rows, active, w.residual_group_partial]

@@ -49,7 +49,7 @@ def mode_bodies(model: Model) -> dict[int, int]:
 def _free_modes(model: Model, body: int) -> np.ndarray:
     """Free modes (6,): unprescribed translations, and rotations of a body without prescribed components."""
     b = model.bodies[body]
-    free = model.free_host[b.slot_offset : b.slot_offset + b.slot_count]
+    free = model.slot_table.free[b.slot_offset : b.slot_offset + b.slot_count]
     return np.concatenate([free.min(axis=0), np.full(3, free.min())])
 
 
@@ -76,8 +76,8 @@ class RigidBodyModes:
     def _make_bodies_struct(self) -> Any:
         m, chosen = self.model, [self.model.bodies[k] for k in self.mode_index]
         of_slot = np.full(m.slots, -1)
-        place = m.slot_kind == 0
-        X = np.array(m.reference, dtype=float)
+        place = m.slot_table.kind == 0
+        X = np.array(m.slot_table.reference, dtype=float)
         sample, size = [], []
         for k, body in enumerate(chosen):
             own = slice(body.slot_offset, body.slot_offset + body.slot_count)

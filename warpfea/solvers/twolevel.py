@@ -127,7 +127,7 @@ class TwoLevel:
             self.worlds_per_chunk = work.chunks["preconditioner matrix"](model.worlds)
         self.block_values = self.assembler.allocate_values("preconditioner matrix", self.worlds_per_chunk)
         self.chunk_flags = work.array("preconditioner chunk", (model.worlds,), wp.int32)
-        free = model.free_group_count > 0  # bodies whose momentum is conserved by the translation correction
+        free = model.components.free_group_count > 0  # bodies whose momentum is conserved by the translation correction
         if self.factors_operator and self.band and model.dtype == "float64" and residual.ctx.inertia and not free:
             work.pcg.preconditioner_is_exact = self.band.exact
         self.body_modes, self.mode_coupling_modules = self._make_body_modes()

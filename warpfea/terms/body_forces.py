@@ -116,8 +116,15 @@ class BodyForces(Term):
     def force(self, ctx: StepContext, active: wp.array) -> None:
         m, w = self.model, ctx.work
         for field in self.block_forces:
-            args = [field.block.data, field.members, m.reference_device, field.origin, w.u_stage, w.stage_time]
-            args += [w.step.load_factor, active, self.offset + field.offset, w.nonpotential_contribution]
+            args = [field.block.data, field.members, m.slot_table.reference_array, field.origin]
+            args += [
+                w.u_stage,
+                w.stage_time,
+                w.step.load_factor,
+                active,
+                self.offset + field.offset,
+                w.nonpotential_contribution,
+            ]
             ctx.launch(field.kernel, (m.worlds, field.count), args)
 
     def hash(self, h: Any) -> None:

@@ -70,7 +70,7 @@ class ConstraintTables:
 
     def mark_constrained(self, free: np.ndarray) -> None:
         """Clear the directions (components, 3) in which a component is tied to the ground."""
-        position = self.model.slot_kind == 0
+        position = self.model.slot_table.kind == 0
         for k, row in enumerate(self.rows):
             felt = False
             for side in range(3):
@@ -93,7 +93,7 @@ class ConstraintTables:
     def _order_rows(self, component: np.ndarray) -> None:
         """Sort joints by component and cluster."""
         groups = self.joint_slots()
-        free = np.any(self.model.free_host > 0.0, axis=1)
+        free = np.any(self.model.slot_table.free > 0.0, axis=1)
         joint_of = np.concatenate([np.full(len(g), k) for k, g in enumerate(groups)])
         slot = np.concatenate(groups)
         keep = free[slot]
@@ -246,7 +246,7 @@ class ConstraintTables:
         self,
     ) -> tuple[list[dict[int, float]], list[list[tuple[int, int]]], list[list[tuple[int, int]]]]:
         """Weights of each vector by free slot; its (row, side); and of each row its (side, vector)."""
-        free = np.any(self.model.free_host > 0.0, axis=1)
+        free = np.any(self.model.slot_table.free > 0.0, axis=1)
         number: dict[Vector, int] = {}
         weights: list[dict[int, float]] = []
         rows_of_vector: list[list[tuple[int, int]]] = []
@@ -285,9 +285,9 @@ class ConstraintTables:
 
     def _upload_joints(self) -> None:
         m = self.model
-        position = m.slot_kind == 0
+        position = m.slot_table.kind == 0
         origin = np.concatenate([np.tile(b.origin, (b.slot_count, 1)) for b in m.bodies])
-        place = m.reference + position[:, None] * origin
+        place = m.slot_table.reference + position[:, None] * origin
         anchors = [joint.anchor.entries() for joint in self.joints]
         data = joint_struct()()
         side = np.where(self.on_child_host, 1, 0)

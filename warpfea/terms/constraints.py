@@ -68,7 +68,7 @@ class Constraints(Constrained, Updated, Tied, Preconditioned):
         return self.tables.joint_slots()
 
     def build(self, laws: TimeLawTable) -> None:
-        self.tables.build(self.model.component, laws)
+        self.tables.build(self.model.components.of_slot, laws)
 
     def mark_constrained(self, free: np.ndarray) -> None:
         self.tables.mark_constrained(free)
@@ -97,7 +97,7 @@ class Constraints(Constrained, Updated, Tied, Preconditioned):
             "gradient": ((B, 3 * M), wp.vec3d),
             "end_gradient": ((B, 3 * M), wp.vec3d),
             "product": ((B, 3 * M), wp.vec3d),
-            "violation": ((B, model.component_count), wp.float64),
+            "violation": ((B, model.components.count), wp.float64),
             "compliance_block": ((B, max(con.block_count, 1)), wp.mat33d),
             "inverse_matrix": ((B, con.matrix_entries), wp.float64),
             "coupling": ((B, max(con.coupling_count, 1)), wp.float64),
@@ -151,7 +151,7 @@ class Constraints(Constrained, Updated, Tied, Preconditioned):
     def force(self, ctx: StepContext, active: wp.array) -> None:
         """Evaluate c, J and the rows of the augmented potential at work.u."""
         m, w, k = self.model, ctx.work, self.integrator_kernels(ctx)
-        ctx.launch(k.reset_violation, (m.worlds, m.component_count), [active, w.multipliers])
+        ctx.launch(k.reset_violation, (m.worlds, m.components.count), [active, w.multipliers])
         args = [self.tables.data, w.u, w.u_stage, w.time_law_values, w.newton.search.alpha, active, w.multipliers]
         ctx.launch(k.evaluate, self.dim, args)
 
@@ -318,7 +318,7 @@ class Constraints(Constrained, Updated, Tied, Preconditioned):
             setattr(mul, name, zeros((B, 3 * con.count), wp.vec3d))
         mul.end_gradient = mul.gradient
         mul.rows = zeros((TERM_ROWS, B, con.count), wp.float64)
-        mul.violation = zeros((B, m.component_count), wp.float64)
+        mul.violation = zeros((B, m.components.count), wp.float64)
         if multipliers is not None:
             mul.multiplier.assign(np.tile(multipliers, (B, 1)))
         mul.last_target.fill_(np.nan)  # any number of turns is valid

@@ -35,8 +35,8 @@ class DeadLoads(Parametrised):
     def __init__(self, model: Model) -> None:
         super().__init__(model)
         self.kernels = load_kernels(model.dtype)
-        self.gravity = model.array("loads", np.tile(model.gravity, (model.worlds, 1)), wp.vec3d)
-        self.gravity_law = model.description.gravity
+        self.gravity = model.array("loads", np.tile(model.description.gravity, (model.worlds, 1)), wp.vec3d)
+        self.gravity_law = model.description.gravity_law
         self.constant_gravity = self.gravity
 
     @classmethod
@@ -64,7 +64,7 @@ class DeadLoads(Parametrised):
             self.gravity_law_index = laws.add(self.gravity_law)
             slots.append(np.arange(m.slots))
             numbers.append(np.full(m.slots, self.gravity_law_index))
-            weights.append(m.lumped_host)
+            weights.append(m.masses.lumped[0])
         slot = np.concatenate(slots) if slots else np.zeros(0, dtype=np.int64)
         order = np.argsort(slot, kind="stable")
         start = np.concatenate([[0], np.cumsum(np.bincount(slot, minlength=m.slots))])

@@ -18,7 +18,7 @@ from ..kernels.common.types import precision
 from ..kernels.elements.materials import DEFINED_FOR_ANY_J
 from ..kernels.step.gather import gather_kernels
 from ..model import assembly
-from ..model.assembly import element_chunks, shape_and_jacobian, shape_gradients
+from ..model.assembly import element_chunks, shape_and_jacobian, shape_gradients, slot_graph
 from ..model.blocks import output_block
 from ..model.state import State
 from .elements import Elements
@@ -88,6 +88,14 @@ class Evaluation:
                 self.launch(block.kernels.viscous_force, (m.worlds, block.count), args)
         return self._gather(contribution), power.numpy().sum(axis=1)
 
+    def minimum_jacobian(self, state: State) -> np.ndarray:
+        """Smallest det F at the points (and vertices, for laws that need J > 0), [world]."""
+        return self.internal_force(state)[2]
+
+    def dissipation_rate(self, state: State) -> np.ndarray:
+        """Viscous dissipation, the integral of S_vis : Edot, [world], W."""
+        return self.viscous_force(state)[1]
+
     def constraints(self, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Constraint values [world, row], gradients [world, 3 row + side, 3] and right-hand sides [world, row] at a
         state.
@@ -97,13 +105,17 @@ class Evaluation:
         """
         return self._require_constraints().values(state)
 
-    def constraint_jacobian(self, state: State, world: int) -> sp.csr_matrix:
-        """dc/dq of one world, (rows, 3 slots) CSR."""
+    def constraint_values(self, state: State) -> np.ndarray:
+        """Values c of all rows of the constraints, [world, row], m; those of joint k: model.constraints.rows_of[k]."""
+        return self.constraints(state)[0]
+
+    def constraint_jacobian(self, state: State, world: int = 0) -> sp.csr_matrix:
+        """dc/dq of one world, (rows, 3 slots) CSR, evaluated on the device."""
         return self._require_constraints().jacobian(state, world)
 
-    def constraint_curvature(self, state: State, multipliers: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """sum_i multipliers_i d2c_i/dq2 direction, [world, slot, 3]; multipliers (rows,), direction (slots, 3)."""
-        return self._require_constraints().curvature(state, multipliers, direction)
+    def constraint_curvature(self, state: State, multipliers: Any, direction: Any) -> np.ndarray:
+        """sum multipliers_i d2c_i/dq2 times a direction (slots, 3), [world, slot, 3]; multipliers (rows,), N."""
+        return self._require_constraints().curvature(state, np.asarray(multipliers), np.asarray(direction))
 
     def _require_constraints(self) -> Any:
         term = self.model.terms.constraints
@@ -119,7 +131,7 @@ class Evaluation:
         direction = self._zeros((1, m.slots), m.types.vec3)
         flag = wp.ones(1, dtype=wp.int32, device=m.device)
         conns = [b.connectivity for b in m.blocks]
-        colour = _greedy_colouring(m.graph())
+        colour = _greedy_colouring(slot_graph(m.blocks, m.slots))
         rows, cols, values = [], [], []
         for c in range(int(colour.max()) + 1):
             for axis in range(3):
@@ -199,8 +211,9 @@ class Evaluation:
 def lowest_jacobian(model: Model, u: np.ndarray) -> tuple[int, str]:
     """Model index and description of the element with the smallest J at points and vertices; u (slots, 3), m."""
     best, index, text = np.inf, -1, "no element"
+    needs_positive_J = any(block.key.law not in DEFINED_FOR_ANY_J for block in model.blocks)
     for block in model.blocks:
-        if model.needs_positive_J and block.key.law in DEFINED_FOR_ANY_J:
+        if needs_positive_J and block.key.law in DEFINED_FOR_ANY_J:
             continue  # J <= 0 is admissible
         for part in block.host_blocks:
             body = part.body

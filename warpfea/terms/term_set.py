@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -33,6 +33,7 @@ from .constraints import Constraints
 from .damping import Damping
 from .dead_loads import DeadLoads
 from .elements import Elements
+from .evaluation import Evaluation
 from .follower_loads import FollowerLoads
 from .protocols import Constrained, Parametrised, Tied
 from .supports import Supports
@@ -73,6 +74,7 @@ class TermSet:
     Attributes:
         time_laws: table of time laws.
         supports: prescribed motion.
+        evaluation: quantities of the model at a state.
         dead_loads: dead loads and gravity.
         traits: traits of the terms for the kernels of a step.
         nonpotential_entries: pool entries of non-potential forces; pool_entries: of potential ones.
@@ -82,10 +84,10 @@ class TermSet:
         ledger: columns of the energy ledger. report: columns of the step report.
     """
 
-    def __init__(self, model: Model, more: list[Callable[[Model], Term | None]] | None = None) -> None:
+    def __init__(self, model: Model, more: Sequence[Callable[[Model], Term | None]] = ()) -> None:
         self.model = model
         self.time_laws, self.supports = TimeLawTable(model), Supports(model)
-        makers = [kind.of for kind in TERM_TYPES] + list(more or ())
+        makers = [*(kind.of for kind in TERM_TYPES), *more]
         self.all: list[Term] = []
         for make in makers:
             term = make(model)
@@ -97,6 +99,7 @@ class TermSet:
         self.nonpotential_topology: Any = None
         self.parameter_updates = 0
         self.world_updates: np.ndarray = np.zeros(1, dtype=np.int64)  # (worlds,) once a parameter was set
+        self.evaluation = Evaluation(model)
         self._check_terms()
 
     def _check_terms(self) -> None:
@@ -214,7 +217,7 @@ class TermSet:
         for term in self.all:
             if not term.translation_invariant and (term.potential or overrides(term, Term.product)):
                 for conn in term.connectivity:
-                    free[np.unique(self.model.component[conn])] = 0.0
+                    free[np.unique(self.model.components.of_slot[conn])] = 0.0
         for term in self.having(Tied):
             term.mark_constrained(free)
 

@@ -100,13 +100,14 @@ class Workspace:
         self.time_law_stage_values = self.time_law_values
         if midpoint:
             self.time_law_stage_values = self.array("law_stage", self.time_law_values.shape, wp.vec3d)
-        self.group_partial = self.array("group_partial", (B, max(model.free_group_count, 1), FREE_GROUP_LANES), vec3)
-        self.group_velocity = self.array("group_velocity", (B, max(model.free_group_count, 1)), vec3)
+        translations = max(model.components.free_group_count, 1)
+        self.group_partial = self.array("group_partial", (B, translations, FREE_GROUP_LANES), vec3)
+        self.group_velocity = self.array("group_velocity", (B, translations), vec3)
         self.ledger_sums = self.array("ledger_sums", (LEDGER_TERM_ROWS if ledger else 1, B), wp.float64)
         self.report = self.array("report", (B, terms.report_width), wp.float64)
         self.any_flag = self.array("any_flag", (5,), wp.int32)
-        C = model.component_count
-        groups = model.residual_groups.count
+        C = model.components.count
+        groups = model.components.residual_groups.count
         sums = (GROUP_ROWS, B, groups) if groups > 1 else (1, 1, 1)
         self.residual_group_partial = self.array(
             "residual_group_partial", (*sums, GROUP_LANES) if groups > 1 else (1, 1, 1, 1), wp.float64
@@ -121,7 +122,7 @@ class Workspace:
             control_struct(), B, skip=skip,
             residual_history=(B, max_newton + 1), slot_sums=(RESIDUAL_ROWS, B), group_sums=sums,
             component_converged=(B, C),
-            term_sums=(TERM_ROWS, B), sums=(FLOOR_ROWS, B, model.error_estimate_groups.count, FLOOR_LANES),
+            term_sums=(TERM_ROWS, B), sums=(FLOOR_ROWS, B, model.components.error_estimate_groups.count, FLOOR_LANES),
         )  # fmt: skip
         self.newton.norms.component_count, self.newton.norms.group_count = C, groups
         self.multipliers: Any = multiplier_struct()()  # of constraints, if any

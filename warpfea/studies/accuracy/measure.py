@@ -103,7 +103,7 @@ def measure(scene: Scene[Any], setting: Setting, *, repeat: int, limit: float | 
     cost |= {"asked": repeat, "limit": limit}
     if first.status != DONE:
         return Outcome(first.status, first.why, cost)
-    probes = {p.name: first.sim.probe(p.name) for p in model.probes}
+    probes = {p.name: first.sim.probe(p.name) for p in model.description.probes}
     times = next(iter(probes.values())).time
     values = None
     if scene.field is not None:
@@ -120,7 +120,7 @@ def _one_line(error: BaseException) -> str:
 def _start_positions(model: Model) -> dict[str, np.ndarray]:
     """Initial positions of the probes, m."""
     u = model.state().displacement.numpy()[0].astype(float)
-    return {p.name: np.asarray(p.X + p.weights @ u[p.slots], dtype=float) for p in model.probes}
+    return {p.name: np.asarray(p.X + p.weights @ u[p.slots], dtype=float) for p in model.description.probes}
 
 
 class _Run:

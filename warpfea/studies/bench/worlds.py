@@ -152,7 +152,7 @@ class ReferenceTips(dict[str, list[Any]]):
             whole = 0
             while whole < max(steps) and not sim.step().halvings.any():
                 whole += 1
-            moved = sim.probe(model.probes[0].name).displacement[0]
+            moved = sim.probe(model.description.probes[0].name).displacement[0]
             found = [moved[k - 1] if f is None and k <= whole else f for k, f in zip(steps, found)]
             if whole == max(steps):
                 break
@@ -206,7 +206,7 @@ def _measure(case: Case, dtype: str, options: argparse.Namespace) -> Row:
     before = {name: int(sim.totals[name][0]) for name in ("newton", "pcg")}
     ms = row["ms_per_step"] = _ms_per_step(sim)
     row |= {f"{name}_per_step": (int(sim.totals[name][0]) - count) / TIMED for name, count in before.items()}
-    name = model.probes[0].name
+    name = model.description.probes[0].name
     row["tip_error"] = references.error(case.scene, 0, sim.probe(name).displacement[0, -1])
     sim.step(LATER - WARM - TIMED)
     row["later_ms"] = _ms_per_step(sim)

@@ -79,12 +79,12 @@ def momentum(sim: wf.Simulation, body: wf.Body) -> np.ndarray:
     """Linear momentum (3,), kg m/s."""
     model = sim.model
     v = sim.state.velocity.numpy()[0].astype(float)
-    return np.asarray(model.lumped_host[body.slots] @ v[body.slots])
+    return np.asarray(model.masses.lumped[0][body.slots] @ v[body.slots])
 
 
 def center_of_mass(sim: wf.Simulation, s: ContactScene) -> np.ndarray:
     """Centre of mass (3,), m."""
-    m = sim.model.lumped_host[s.body.slots]
+    m = sim.model.masses.lumped[0][s.body.slots]
     return np.asarray(m @ sim.positions(s.body)[0] / m.sum())
 
 
@@ -124,7 +124,7 @@ class ContactMotion:
 def simulate(sim: wf.Simulation, s: ContactScene, steps: int, *, mu: float = 0.0, moves: bool = False) -> ContactMotion:
     """Step and measure; `moves`: obstacles do work, and energies are not compared."""
     out = ContactMotion(StepStats())
-    weight = s.mass * np.asarray(s.builder.gravity)
+    weight = s.mass * np.asarray(s.builder.description.gravity)
     p = momentum(sim, s.body)
     scale = float(np.linalg.norm(p))
     first, most = total_energy(sim), float(np.linalg.norm(weight)) * SIDE

@@ -72,7 +72,7 @@ def one_failing_world(setting: Setting, value: str) -> Answer:
             array = state.velocity if value == "nan" else state.displacement
             values = array.numpy()
             free = model.free_slots.reshape(values.shape[1:])
-            wrong = np.nan if value == "nan" else -1.5 * model.reference * (1.0, 0.0, 0.0)
+            wrong = np.nan if value == "nan" else -1.5 * model.slot_table.reference * (1.0, 0.0, 0.0)
             values[bad] = np.where(free, wrong, values[bad])
             array.assign(values)
         before = {k: v[bad].tobytes() for k, v in state.numpy().items()}

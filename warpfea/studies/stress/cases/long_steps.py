@@ -55,7 +55,7 @@ def linear_tip(h: float, device: str) -> np.ndarray:
         u = u + h * v
     full = np.zeros(3 * model.slots)
     full[free] = u
-    tip = model.probes[0]
+    tip = model.description.probes[0]
     return tip.weights @ full.reshape(-1, 3)[tip.slots]
 
 
@@ -100,7 +100,7 @@ def stay_in_equilibrium(setting: Setting, h: float) -> Answer:
 
 def tip_displacement(model: wf.Model, state: wf.State) -> np.ndarray:
     """Displacement of the first probe of a model at a state (3,), m."""
-    probe = model.probes[0]
+    probe = model.description.probes[0]
     return np.asarray(probe.weights @ state.displacement.numpy()[0, probe.slots].astype(float))
 
 

@@ -92,7 +92,7 @@ class PairMotion(ContactMotion):
 
 def center_of_mass(sim: wf.Simulation, body: wf.Body) -> np.ndarray:
     """Centre of mass (3,), m."""
-    m = sim.model.lumped_host[body.slots] * (body.slot_kind == 0)
+    m = sim.model.masses.lumped[0][body.slots] * (body.slot_kind == 0)
     x = body.reference + np.where(body.slot_kind[:, None] == 0, body.origin, 0.0)
     return np.asarray(m @ (x + sim.state.displacement.numpy()[0, body.slots]) / m.sum())
 
@@ -101,8 +101,8 @@ def simulate(sim: wf.Simulation, s: BodyPair, steps: int, *, mu: float | None = 
     """Step and measure; with `mu` friction in the plane z = 0 is compared with mu N."""
     out = PairMotion(StepStats())
     bodies = [(s.upper, 1.0)] + ([] if s.clamped else [(s.lower, -1.0)])
-    gravity = np.asarray(s.builder.gravity, dtype=float)
-    mass = [float(sim.model.lumped_host[body.slots] @ (body.slot_kind == 0)) for body, _ in bodies]
+    gravity = np.asarray(s.builder.description.gravity, dtype=float)
+    mass = [float(sim.model.masses.lumped[0][body.slots] @ (body.slot_kind == 0)) for body, _ in bodies]
     p = [momentum(sim, body) for body, _ in bodies]
     scale = max(float(np.linalg.norm(x)) for x in p)
     first, most = total_energy(sim), mass[0] * GRAVITY * SIDE

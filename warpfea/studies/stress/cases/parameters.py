@@ -48,9 +48,10 @@ def _dissipation_error(setting: Setting, stats: StepStats) -> float:
     model.set_parameter("body.eta", NEW_VALUES["eta"])
     state = model.state()
     v = np.zeros((1, model.slots, 3))
-    v[0, :, 0] = 2.0 * model.reference[:, 0]
+    v[0, :, 0] = 2.0 * model.slot_table.reference[:, 0]
     state.velocity.assign(v.astype(setting.dtype))
-    return abs(float(model.dissipation_rate(state)[0]) / (float(np.prod(SIZE)) * NEW_VALUES["eta"] * 2.0 * 4.0) - 1.0)
+    rate = float(model.evaluation.dissipation_rate(state)[0])
+    return abs(rate / (float(np.prod(SIZE)) * NEW_VALUES["eta"] * 2.0 * 4.0) - 1.0)
 
 
 def _momentum_error(setting: Setting, integrator: str, stats: StepStats) -> float:
