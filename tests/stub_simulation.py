@@ -64,7 +64,7 @@ class StubSim:
             body("bar", (1.0, 0.2, 0.2), (8, 2, 2), np.zeros(3), order=2),
             body("2nd box", (0.3, 0.3, 0.3), (2, 2, 2), np.asarray(far)),
         ]
-        self.model = SimpleNamespace(bodies=self.bodies, worlds=worlds, up_axis=up_axis)
+        self.model = SimpleNamespace(bodies=self.bodies, worlds=worlds, description=SimpleNamespace(up_axis=up_axis))
         self.time = np.zeros(worlds)
         self.spoil = None
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
+from copy import copy
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -139,9 +140,11 @@ class Description:
 
     def copy(self) -> Description:
         """Copy whose lists and gravity are its own; what they hold is shared."""
-        own = {entry.name: getattr(self, entry.name) for entry in fields(self)}
-        lists = {name: list(value) for name, value in own.items() if isinstance(value, list)}
-        return replace(self, gravity=np.array(self.gravity, dtype=float), **lists)
+        out = copy(self)
+        for name, value in vars(self).items():
+            if isinstance(value, (list, np.ndarray)):
+                setattr(out, name, copy(value))
+        return out
 
     @property
     def all_contacts(self) -> list[Contact | PairContact]:

@@ -90,8 +90,10 @@ class Model:
     def resized(self, worlds: int, dtype: str | None = None) -> Model:
         """New model of the same description with another number of worlds or precision; values set by `set_parameter`
         are not carried over."""
-        options = dict(device=self.device, dtype=dtype or self.dtype, worlds=worlds, tables=self._tables)
-        return Model(self.description, self._make_terms, **options)
+        return Model(
+            self.description, self._make_terms, device=self.device, dtype=dtype or self.dtype, worlds=worlds,
+            tables=self._tables,
+        )  # fmt: skip
 
     def _build(self) -> None:
         """Number, assemble and upload the description."""
