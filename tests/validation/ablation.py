@@ -35,9 +35,6 @@ RANDOM_CASES = 200
 LONG_ROWS = ("rest-1e6", "soft-")
 """Beginnings of rows left out: a million steps, and meshes that the package does not contain."""
 
-MAX_SECONDS = 6.0
-"""Longest rows that are run for constants, s in both precisions together; mechanisms are tried on all."""
-
 Change = tuple[str, str, str]
 """File, text, and the text in its place."""
 
@@ -232,9 +229,9 @@ def _tasks(
     wanted = set().union(*touched.values()) if variant == "" else set(touched.get(variant, ()))
     rows = {label: seconds for label, (group, seconds) in _stress_rows(run).items()
             if group.startswith(part) and (not touched or label in wanted)}  # fmt: skip
-    if variant in CONSTANTS:
-        rows = {label: seconds for label, seconds in rows.items() if seconds <= MAX_SECONDS}
-    for labels in _parts(rows, max(jobs // 2, 1)):
+    low, high = run.options["seconds"]
+    rows = {label: seconds for label, seconds in rows.items() if low <= seconds < high}
+    for labels in _parts(rows, jobs if variant == "" else max(jobs // 2, 1)):
         cases = [word for label in labels for word in ("--case", label)]
         yield ["-m", "warpfea", "stress", "--quiet", "--device", run.device, *cases, "--json"]
 
@@ -318,7 +315,7 @@ TABLE = Table(
         "ablation_h200.json": "ablation --device cuda:0 --set jobs=14 --set touched=tests/results/ablation_cpu.json "
         "--out tests/results/ablation_h200.json",
     },
-    options={"jobs": 2, "variants": "all", "touched": ""},
+    options={"jobs": 2, "variants": "all", "touched": "", "seconds": [0.0, 1e9]},
     settings={"random cases": RANDOM_CASES, "left out": list(LONG_ROWS)},
     columns=("variant", "area", "value", "rows", "newton", "pcg", "lost"),
     takes="an hour on 16 cores",
