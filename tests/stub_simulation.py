@@ -8,6 +8,8 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from warpfea.terms.fields import ELEMENT_FIELDS
+
 FAR = np.array([1.0e4, -2.0e4, 3.0e3])
 
 
@@ -67,6 +69,7 @@ class StubSim:
         self.model = SimpleNamespace(bodies=self.bodies, worlds=worlds, description=SimpleNamespace(up_axis=up_axis))
         self.time = np.zeros(worlds)
         self.spoil = None
+        self.fields = ELEMENT_FIELDS
 
     def step(self):
         self.time = self.time + self.dt

@@ -77,7 +77,7 @@ ODD = {
     "no measure": (kind(stored_energy=Term.stored_energy), "override stored_energy"),
     "no book": (kind(energy_increments=Term.energy_increments), "does not override energy_increments"),
     "no name": (kind(name=None), "Odd: `name` must be a non-empty string"),
-    "field of every model": (kind(fields={"von_mises": FieldSpec("x", "m")}), "a field 'von_mises' is taken"),
+    "field of every model": (kind(fields={"von_mises": FieldSpec("x", "m")}), "both have a field 'von_mises'"),
     "part of every model": (kind(parts={"vectors": "x"}), "a part of profiles 'vectors' is taken"),
     "a class": (lambda model: Floor, "expected a warpfea.terms.Term"),
     "a number": (lambda model: 3, "returned 3"),

@@ -243,7 +243,8 @@ def _add_picture_options(to: Any) -> None:
     to.add_argument(
         "--field",
         metavar="NAME",
-        help="field in colour: von_mises (default), displacement, contact_pressure, gap, or none",
+        help="field in colour: von_mises (default), displacement, J, strain_energy_density, contact_pressure, gap, or "
+        "none",
     )
     to.add_argument("--view", type=number_pair, metavar="AZIMUTH,ELEVATION", help="of the camera, degrees")
     to.add_argument("--range", type=color_range, metavar="LOW,HIGH", help="of the colours, SI units")

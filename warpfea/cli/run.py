@@ -17,7 +17,6 @@ from ..kernels.step.step_control import SAME_TIME_FRACTION
 from ..model.model import Model
 from ..simulation.checkpoint import SUFFIXES as CHECKPOINT_SUFFIXES
 from ..simulation.checkpoint import Checkpoint, load_checkpoint, read_meta
-from ..simulation.results import FIELDS
 from ..simulation.run_loop import interruptible
 from ..simulation.simulation import Simulation
 from ..simulation.statics import run_static
@@ -181,7 +180,7 @@ def _check_times(options: argparse.Namespace, source: Source, t_end: float) -> N
 
 def _check_field(name: str | None, model: Model) -> None:
     """UsageError unless --field is a field of the model or none."""
-    known = [*FIELDS, *model.terms.fields, "none"]
+    known = [*model.terms.fields, "none"]
     if name is not None and name not in known:
         raise UsageError(f"--field {name}: is unknown; there are {', '.join(known)}{did_you_mean(name, known)}")
 

@@ -28,7 +28,7 @@ __all__ = [
 
 CONTACT_FIELDS = {
     "contact_pressure": FieldSpec("contact pressure", "Pa", np.add, np.maximum),
-    "gap": FieldSpec("gap to the nearest obstacle or body in contact", "m", np.fmin, np.fmin),
+    "gap": FieldSpec("gap", "m", np.fmin, np.fmin),
 }
 """Fields of both contact terms: pressures add up, the smallest gap counts."""
 

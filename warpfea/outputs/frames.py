@@ -1,8 +1,9 @@
 """Common parts of output writers: protocol, frame times, file replacement, drawn surface.
 
 A writer receives the simulation and reads `time` (B,), of statics `load` (B,), `dt`, `model.bodies`,
-`model.worlds`, `model.description.up_axis`, `skin_points(body)` (B, P, 3), `skin_field(name, body)` (B, P) and, for
-nodal formats, `positions`, `displacements`, `velocities` and `field`. Bodies without a skin are not drawn.
+`model.worlds`, `model.description.up_axis`, `fields` by name, `skin_points(body)` (B, P, 3), `skin_field(name, body)`
+(B, P) and, for nodal formats, `positions`, `displacements`, `velocities` and `field`. Bodies without a skin are not
+drawn.
 """
 
 from __future__ import annotations
@@ -29,21 +30,11 @@ __all__ = [
 
 Array = npt.NDArray[Any]
 
-# name -> (title, units) of known fields
-FIELD_LABELS: dict[str, tuple[str, str]] = {
-    "von_mises": ("von Mises stress", "Pa"),
-    "displacement": ("displacement", "m"),
-    "velocity": ("velocity", "m/s"),
-    "strain_energy_density": ("strain energy density", "J/m3"),
-    "contact_pressure": ("contact pressure", "Pa"),
-    "gap": ("gap", "m"),
-    "J": ("volume ratio J", ""),
-}
 
-
-def field_label(name: str) -> tuple[str, str]:
-    """(title, units) of a field; an unknown name is its own title, without units."""
-    return FIELD_LABELS.get(name, (name.replace("_", " "), ""))
+def field_label(sim: Any, name: str) -> tuple[str, str]:
+    """(title, units) of a field; one that the simulation lacks is its own title, without units."""
+    spec = sim.fields.get(name)
+    return (spec.title, spec.units) if spec else (name.replace("_", " "), "")
 
 
 def frame_time(sim: Any) -> float:

@@ -77,7 +77,7 @@ class _PictureWriter(Output):
         start = self._surface.points(sim)
         body_points = start[: self._surface.body_points]
         self._origin = 0.5 * (body_points.min(axis=0) + body_points.max(axis=0))
-        title, units = field_label(self.field) if self.field else ("", "")
+        title, units = field_label(sim, self.field) if self.field else ("", "")
         self._animation = Animation(
             self._surface.triangles(),
             self._surface.up_axis,

@@ -292,7 +292,7 @@ class USDWriter(Output):
         data["static"] = is_static(sim)
         data["colorRange"] = _vec2d(shown)
         data["fields"] = {
-            name: {"title": field_label(name)[0], "units": field_label(name)[1], "range": _vec2d(ranges[name])}
+            name: dict(zip(("title", "units"), field_label(sim, name))) | {"range": _vec2d(ranges[name])}
             for name in self.fields
         }
         stage.GetDefaultPrim().SetCustomDataByKey("warpfea", data)

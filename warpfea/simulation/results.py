@@ -7,23 +7,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..base.errors import ModelError
-from ..base.names import did_you_mean
 from ..model.bodies import Body
 from ..model.state import State
 from ..model.surfaces import reference_points
-from ..terms.evaluation import von_mises
+from ..terms.fields import field_at_nodes, field_at_points, find_field
 from ..terms.term import FieldSpec
 
 if TYPE_CHECKING:
     from ..model.model import Model
 
-__all__ = ["FIELDS", "Results"]
+__all__ = ["Results"]
 
 MAX_NAMED_BODIES = 5
 """Maximum number of bodies named in a message."""
-
-FIELDS = {"von_mises": FieldSpec("von Mises stress", "Pa"), "displacement": FieldSpec("displacement", "m")}
-"""Scalar fields of every model; terms add their own."""
 
 
 class Results:
@@ -99,46 +95,25 @@ class Results:
     @property
     def fields(self) -> dict[str, FieldSpec]:
         """Available scalar fields, by name."""
-        return FIELDS | self.model.terms.fields
+        return self.model.terms.fields
 
     def check_field(self, name: str) -> None:
         """Raise ModelError, listing the available names, unless `name` is a field."""
-        known = self.fields
-        if name not in known:
-            raise ModelError(f"field {name!r} is unknown; there are {', '.join(known)}{did_you_mean(name, known)}")
+        find_field(self.model.terms, name)
 
     def field_on(self, name: str, body: Body, drawn: Any) -> np.ndarray:
         """Scalar field (B, P) at the points of a Skin or Drawing of the body."""
-        self.check_field(name)
-        if name == "displacement":
-            moved = self.point_positions(body, drawn.slot_weights) - reference_points(body, drawn.slot_weights)
-            return np.linalg.norm(moved, axis=2)
-        if name != "von_mises":
-            values = self.model.terms.samples(name, body, self.state)
-            return np.stack([drawn.node_weights @ row for row in values])
-        stress = self._stress(name, body)  # interpolate the tensor: a bent section then shows its neutral axis
-        return von_mises(np.stack([drawn.node_weights @ row for row in stress]))
+        return field_at_points(self.model.terms, name, body, self.state, drawn)
 
     def field(self, name: str, body: Body) -> np.ndarray:
-        """Scalar nodal field (B, nodes): "von_mises" (Pa, of the elastic Cauchy stress), "displacement" (m), or one of
-        a term: with contact "contact_pressure" (Pa, elastic, 0 away from contact) and "gap" (m, NaN off surfaces in
-        contact).
+        """Scalar nodal field (B, nodes): "von_mises" (Pa, of the elastic Cauchy stress), "displacement" (m), "J"
+        (det F), "strain_energy_density" (J/m^3, mean of the elements at a node), or one of a term: with contact
+        "contact_pressure" (Pa, elastic, 0 away from contact) and "gap" (m, NaN off surfaces in contact).
 
         The stress at a beam node is the maximum over the corners of its section, at a shell node over its two faces.
         """
         self.check_body(body, "field(name, body)")
-        self.check_field(name)
-        if name == "displacement":
-            return np.linalg.norm(self.displacements(body), axis=2)
-        if name != "von_mises":
-            return self.model.terms.at_nodes(name, body, self.state)
-        samples = von_mises(self._stress(name, body))
-        return samples.reshape(len(samples), len(body.mesh.points), -1).max(axis=2)
-
-    def _stress(self, name: str, body: Body) -> np.ndarray:
-        """Cauchy stress (B, nodes x samples, 6), Pa, of a stress field."""
-        assert name == "von_mises"
-        return self.model.evaluation.sample_stress(self.state, body)
+        return field_at_nodes(self.model.terms, name, body, self.state)
 
     def node_gradients(self, body: Body) -> np.ndarray:
         """Deformation gradient F (B, nodes, 3, 3) at the nodes of a body with gradient slots; NaN at others.

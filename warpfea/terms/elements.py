@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import warp as wp
 
+from .fields import ELEMENT_FIELDS
 from .term import StepContext, Term
 
 if TYPE_CHECKING:
     from ..model.model import Model
+    from ..model.state import State
 
 __all__ = ["Elements"]
 
@@ -22,6 +25,7 @@ class Elements(Term):
     """Element blocks of a model. Writes work.contribution and, for energies, work.energy_rows."""
 
     name = "elements"
+    fields = ELEMENT_FIELDS
 
     @classmethod
     def of(cls, model: Model) -> Elements:
@@ -114,3 +118,12 @@ class Elements(Term):
         for block, kernels in zip(m.blocks, self.kernels(ctx)):
             args = [w.data_of(block), w.u_stage, w.step.dq_dv, active, w.block_contribution]
             ctx.launch(kernels.diagonal_blocks, (m.worlds, block.count), args)
+
+    def samples(self, field: str, body: Any, state: State) -> np.ndarray:
+        if field == "displacement":
+            return state.displacement.numpy()[:, body.slots].astype(float)
+        evaluation = self.model.evaluation
+        if field == "von_mises":
+            return evaluation.sample_stress(state, body)
+        sample = evaluation.sample_jacobian if field == "J" else evaluation.sample_energy_density
+        return sample(state, body)[:, :, 0]

@@ -13,7 +13,7 @@ import warp as wp
 from ..base.errors import ModelError
 from ..base.launch import Launcher
 from ..base.memory import convert_memory_errors
-from ..elements import Rule
+from ..elements import Rule, get_family
 from ..kernels.common.types import precision
 from ..kernels.elements.materials import DEFINED_FOR_ANY_J
 from ..kernels.step.gather import gather_kernels
@@ -160,6 +160,10 @@ class Evaluation:
 
         With an energy in parts each block has the stress of its part; parts add up.
         """
+        return [(block, stress) for block, stress, _ in self._at_points(state, body)]
+
+    def _at_points(self, state: State, body: Any) -> list[tuple[Any, np.ndarray, np.ndarray]]:
+        """Block, Cauchy stress and J [world, point, elem] of `stresses`."""
         m = self.model
         out = []
         for block in m.blocks:
@@ -175,7 +179,7 @@ class Evaluation:
             J = self._zeros((m.worlds, block.points, block.count), m.types.T)
             kernel = block.kernels_for(m.dtype, None).point_stress
             self.launch(kernel, (m.worlds, block.count), [block.data, state.displacement, stress, J])
-            out.append((block, stress.numpy()))
+            out.append((block, stress.numpy(), J.numpy()))
         return out
 
     def sample_stress(self, state: State, body: Any) -> np.ndarray:
@@ -184,28 +188,58 @@ class Evaluation:
         Each part of the energy is fitted per element and evaluated at the samples; parts add up, elements are averaged
         by volume.
         """
-        m = self.model
-        family = body.family
+        return self._at_samples(body, [(block, stress) for block, stress, _ in self._at_points(state, body)])
+
+    def sample_jacobian(self, state: State, body: Any) -> np.ndarray:
+        """J = det F at the samples of each mesh node, [world, node x sample, 1], from the points of the first part of
+        the energy, as `sample_stress`."""
+        found = self._at_points(state, body)
+        return self._at_samples(body, [(b, J[..., None]) for b, _, J in found if _is_first(b)])
+
+    def sample_energy_density(self, state: State, body: Any) -> np.ndarray:
+        """Strain energy density at the samples of each mesh node, [world, node x sample, 1], J/m^3: mean of the
+        elements at the node, weighted by volume."""
+        ctx = self._step_context(state.displacement)
+        self.elements.force(ctx, self._all_worlds())
+        energy = ctx.work.energy_rows.numpy()[0]
+        found = []
+        for block in self.model.blocks:
+            volumes = [assembly.element_volumes(part.body)[part.elements] for part in block.host_blocks]
+            own = energy[:, block.element_offset : block.element_offset + block.count]
+            found.append((block, (own / np.concatenate(volumes))[:, None, :, None]))
+        return self._at_samples(body, found)
+
+    def _at_samples(self, body: Any, values: list[tuple[Any, np.ndarray]]) -> np.ndarray:
+        """Values at the samples of each mesh node, [world, node x sample, k], from those of blocks: [world, point,
+        elem, k], or [world, 1, elem, k] constant in each element."""
+        m, family = self.model, body.family
         k = family.node_samples.shape[1]
-        total = np.zeros((m.worlds, len(body.mesh.points) * k, 6))
+        total = np.zeros((m.worlds, len(body.mesh.points) * k, values[0][1].shape[3]))
         weight = np.zeros(total.shape[1])
         volumes = assembly.element_volumes(body)
-        for block, stress in self.stresses(state, body):
+        for block, at_points in values:
             first = 0
-            to_samples = _extrapolation_matrix(block.key.rule, family.node_samples.reshape(-1, 3))
+            fit = _extrapolation_matrix(block.key.rule, family.node_samples.reshape(-1, 3))
+            if at_points.shape[1] == 1:
+                fit = np.ones((len(fit), 1))
             for part in block.host_blocks:
                 members = slice(first, first + len(part.elements))
                 first += len(part.elements)
                 if part.body is not body:
                     continue
-                at_samples = np.einsum("nq,bqek->benk", to_samples, stress[:, :, members].astype(float))
+                at_samples = np.einsum("nq,bqek->benk", fit, at_points[:, :, members].astype(float))
                 rows = (body.mesh.cells[part.elements][:, :, None] * k + np.arange(k)).reshape(len(part.elements), -1)
                 v = volumes[part.elements]
-                if block.key.part == 0 and block.key.scheme not in family.output_schemes:
+                if _is_first(block):
                     np.add.at(weight, rows, v[:, None])
                 for b in range(m.worlds):
                     np.add.at(total[b], rows, at_samples[b] * v[:, None, None])
         return total / np.where(weight > 0.0, weight, 1.0)[None, :, None]
+
+
+def _is_first(block: Any) -> bool:
+    """True for blocks of the first part of the energy, which has each element once; not for stress output."""
+    return block.key.part == 0 and block.key.scheme not in get_family(block.key.family).output_schemes
 
 
 def lowest_jacobian(model: Model, u: np.ndarray) -> tuple[int, str]:
@@ -252,13 +286,6 @@ def _extrapolation_matrix(rule: Rule, at: np.ndarray) -> np.ndarray:
         return np.full((len(at), len(points)), 1.0 / len(points))
     A = np.column_stack([np.ones(len(points)), points])
     return np.column_stack([np.ones(len(at)), at]) @ np.linalg.pinv(A)
-
-
-def von_mises(s: np.ndarray) -> np.ndarray:
-    """Von Mises stress of Voigt stresses [..., 6]."""
-    xx, yy, zz, yz, xz, xy = np.moveaxis(s, -1, 0)
-    normal = 0.5 * ((xx - yy) ** 2 + (yy - zz) ** 2 + (zz - xx) ** 2)
-    return np.sqrt(normal + 3.0 * (yz**2 + xz**2 + xy**2))
 
 
 def _greedy_colouring(graph: sp.csr_matrix) -> np.ndarray:

@@ -105,12 +105,16 @@ class FieldSpec:
         title, units: for legends.
         join: combines the samples of two terms with this field; None: one term only.
         node_reduction: reduces the samples of a node; None: `samples` gives one value per node.
+        of_slots: `samples` gives values (worlds, slots of the body), interpolated by the shape functions.
+        scalar: the scalar of samples with components (worlds, n, k), after interpolation; None: samples are scalars.
     """
 
     title: str
     units: str
     join: np.ufunc | None = None
     node_reduction: np.ufunc | None = None
+    of_slots: bool = False
+    scalar: Callable[[np.ndarray], np.ndarray] | None = None
 
 
 def part(name: str = "") -> Callable[[F], F]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -54,8 +53,6 @@ STATE_ARRAYS = ("displacement", "velocity", "time", "status", "ledger", "ledger_
          "previous_velocity", "previous_step", "previous_end", "summed_time",
          "energy_growth")  # fmt: skip
 """State arrays owned by no term."""
-COMMON_FIELDS = ("von_mises", "displacement")
-"""Fields of every model, see simulation.results."""
 
 
 def register(*kinds: type[Term]) -> None:
@@ -115,7 +112,7 @@ class TermSet:
             if isinstance(term, Constrained):
                 raise ModelError(f"term {term.name!r} derives from Constrained: register a kind of constraints instead")
         check_stored_columns(self.all)
-        check_unique_names(self.all, COMMON_FIELDS, "a field", lambda term: term.fields)
+        check_unique_names(self.all, (), "a field", lambda term: term.fields)
         check_unique_names(self.all, tuple(LAUNCH_PARTS), "a part of profiles", lambda term: term.parts)
 
     @property
@@ -270,31 +267,8 @@ class TermSet:
 
     @property
     def fields(self) -> dict[str, FieldSpec]:
-        """Fields available besides those of the elements."""
+        """Scalar fields of all terms, see terms.fields."""
         return {name: spec for term in self.all for name, spec in term.fields.items()}
-
-    def samples(self, name: str, body: Any, state: State) -> np.ndarray:
-        """Values (worlds, nodes x samples) of a field; terms with nodal values only repeat them at each sample.
-
-        Raises:
-            ModelError: a term returns another shape.
-        """
-        spec, count = self.fields[name], body.family.node_samples.shape[1]
-        found = []
-        for term in (term for term in self.all if name in term.fields):
-            values = np.asarray(term.samples(name, body, state))
-            expected = (self.model.worlds, len(body.mesh.points) * (count if spec.node_reduction else 1))
-            if values.shape != expected:
-                raise ModelError(f"term {term.name!r}: samples({name!r}) gave {values.shape}; expected {expected}")
-            found.append(values if spec.node_reduction else np.repeat(values, count, axis=1))
-        return functools.reduce(spec.join, found) if spec.join else found[0]
-
-    def at_nodes(self, name: str, body: Any, state: State) -> np.ndarray:
-        """Values (worlds, nodes) of a field."""
-        values = self.samples(name, body, state)
-        values = values.reshape(len(values), len(body.mesh.points), -1)
-        reduce = self.fields[name].node_reduction
-        return np.asarray(reduce.reduce(values, axis=2) if reduce else values[:, :, 0])
 
     # parameters and fields
 
