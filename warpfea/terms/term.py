@@ -114,7 +114,7 @@ class FieldSpec:
     join: np.ufunc | None = None
     node_reduction: np.ufunc | None = None
     of_slots: bool = False
-    scalar: Callable[[np.ndarray], np.ndarray] | None = None
+    scalar: Callable[[np.ndarray], Any] | None = None
 
 
 def part(name: str = "") -> Callable[[F], F]:
