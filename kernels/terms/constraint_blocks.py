@@ -8,7 +8,7 @@ import warp as wp
 from ..common.block_entries import add_block_function
 from ..common.structs import pattern_struct, topology_struct
 from ..common.types import SHORT_UNROLL, double_1d, double_2d, int_1d, kernel_module, kernel_set, precision, vec3d_2d
-from .constraints import ANGLE, DISTANCE, constraint_struct, multiplier_struct
+from .constraints import ANGLE, DISTANCE, FORMULA, constraint_struct, multiplier_struct
 
 __all__ = ["constraint_block_kernels", "coupling_struct"]
 
@@ -67,6 +67,8 @@ def constraint_block_kernels(dtype: str) -> _types.SimpleNamespace:
         f = mul.target[world, row]
         scale = mul.signed_scale[world, row]
         one = wp.identity(n=3, dtype=f64)
+        if kind >= FORMULA:
+            return mul.curvature[world, 9 * row + 3 * a + b]
         if kind == DISTANCE:
             n = mul.gradient[world, 3 * row] / scale
             size = wp.abs(mul.constraint_value[world, row] / scale + f)

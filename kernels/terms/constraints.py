@@ -6,6 +6,7 @@ direction, a constant), at most three per row:
     DOT       c = scale (a.b - f)                       DP1, DP2; PIN with b a constant axis
     DISTANCE  c = scale (|a| - f)                       DIST
     ANGLE     c = scale (cos f a2 - sin f a).b          the sine of the angle between b and the direction f of (a, a2)
+    FORMULA+  c = scale (h(a, b, a2) - f)               device functions of one's own, see constraint_formulas.py
 
 Vectors are the terms 3 row + side, sides a, b, a2. Rows are evaluated in float64 from displacements, so that c is free
 of the round-off of large coordinates. One thread per (world, row); slots gather from terms in a fixed order.
@@ -22,6 +23,7 @@ __all__ = [
     "ANGLE",
     "DISTANCE",
     "DOT",
+    "FORMULA",
     "JOINT_COLUMNS",
     "constraint_functions",
     "constraint_kernels",
@@ -33,6 +35,8 @@ __all__ = [
 DOT = 0
 DISTANCE = 1
 ANGLE = 2
+FORMULA = 3
+"""Kind of the rows of a model's first formula; the others follow."""
 JOINT_COLUMNS = 7
 """Columns per joint in the report of a step: force and moment on the child, N and N m, and violation, m."""
 MAX_DRIVE_ROTATION = 1.0
@@ -45,7 +49,7 @@ def constraint_struct():
 
     @wp.struct
     class Constraints:
-        kind: wp.array(dtype=wp.int32)  # [row] DOT, DISTANCE or ANGLE
+        kind: wp.array(dtype=wp.int32)  # [row] DOT, DISTANCE, ANGLE, or FORMULA + the index of a formula
         scale: wp.array(dtype=wp.float64)  # [row] m per unit of the bracket: lengths of the model for angles, else 1
         reference_product: wp.array(dtype=wp.float64)  # [row] A.B in the reference configuration; |A|^2 of a distance
         constant_target: wp.array(dtype=wp.float64)  # [row] constant part of f: m, rad or a cosine
@@ -97,6 +101,7 @@ def multiplier_struct():
         penalty_force: wp.array2d(dtype=wp.float64)  # rho c
         penalty: wp.array2d(dtype=wp.float64)  # rho, N/m
         product: wp.array2d(dtype=wp.vec3d)  # [world, term] contributions to H p
+        curvature: wp.array2d(dtype=wp.mat33d)  # [world, 9 row + 3 side + other] d2c / (d vector d other), by formulas
         rows: wp.array3d(dtype=wp.float64)  # [TERM_ROWS, world, row] of the potential, J
         violation: wp.array2d(dtype=wp.float64)  # [world, component] largest |c|, m
         compliance_block: wp.array2d(dtype=wp.mat33d)  # [world, block] sum w w D^-1 over common slots
@@ -132,11 +137,11 @@ def joint_struct():
 
 @functools.cache
 def constraint_functions(dtype: str) -> _types.SimpleNamespace:
-    """Device functions `term_vector` and `directional_derivative`."""
+    """Device functions of the vectors, values and gradients of rows."""
     p = precision(dtype)
     vec3 = p.vec3
     f64, vec3d = wp.float64, wp.vec3d
-    Constraints = constraint_struct()
+    Constraints, Multipliers = constraint_struct(), multiplier_struct()
 
     @wp.func
     def term_vector(con: Constraints, term: int, x: p.vec3_2d, world: int) -> vec3d:
@@ -151,9 +156,45 @@ def constraint_functions(dtype: str) -> _types.SimpleNamespace:
         """(J x) of a row."""
         s = wp.dot(gradient[world, 3 * row], term_vector(con, 3 * row, x, world))
         s += wp.dot(gradient[world, 3 * row + 1], term_vector(con, 3 * row + 1, x, world))
-        if con.kind[row] == ANGLE:
+        if con.kind[row] >= ANGLE:
             s += wp.dot(gradient[world, 3 * row + 2], term_vector(con, 3 * row + 2, x, world))
         return s
+
+    @wp.func
+    def right_side(con: Constraints, law_value: vec3d_2d, world: int, row: int) -> f64:
+        """f of a row."""
+        f = con.constant_target[row]
+        if con.law[row] >= 0:
+            f = f + law_value[world, con.law[row]][con.law_component[row]]
+        return f
+
+    @wp.func
+    def store_gradients(into: vec3d_2d, world: int, row: int, G: wp.mat33d):
+        """Store the output of `constraint_gradients`."""
+        for side in range(3):
+            into[world, 3 * row + side] = G[side]
+
+    @wp.func
+    def store_value(con: Constraints, mul: Multipliers, alpha: f64, world: int, row: int, scale: f64, f: f64, c: f64):
+        """Store c and f of a row, its multiplier at the trial step, and its part of the augmented potential."""
+        rho = mul.penalty[world, row]
+        frozen = mul.multiplier[world, row]
+        new = frozen
+        mul.constraint_value[world, row] = c
+        mul.signed_scale[world, row] = scale
+        mul.target[world, row] = f
+        mul.frozen_force[world, row] = frozen + rho * c
+        mul.trial_multiplier[world, row] = frozen + rho * c
+        mul.penalty_force[world, row] = f64(0.0)
+        if mul.outer_updates == 0:
+            new = frozen + alpha * mul.multiplier_change[world, row]
+            mul.trial_multiplier[world, row] = new
+            mul.penalty_force[world, row] = rho * c
+        penalty_energy = f64(0.5) * rho * c * c
+        mul.rows[0, world, row] = frozen * c + penalty_energy
+        mul.rows[1, world, row] = new * c + penalty_energy
+        mul.rows[2, world, row] = wp.max(wp.abs(frozen * c), wp.abs(new * c)) + penalty_energy
+        wp.atomic_max(mul.violation, world, con.connected_component[row], wp.abs(c))
 
     return kernel_set(locals())
 
@@ -171,6 +212,7 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
     Constraints, Multipliers, Joints = constraint_struct(), multiplier_struct(), joint_struct()
     functions = constraint_functions(dtype)
     term_vector, directional_derivative = functions.term_vector, functions.directional_derivative
+    right_side, store_gradients, store_value = functions.right_side, functions.store_gradients, functions.store_value
     module = kernel_module(f"constraints_{dtype}{'_midpoint' if midpoint else ''}")
 
     @wp.func
@@ -183,12 +225,6 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
             c = scale * wp.cos(f)
             return wp.matrix_from_rows(-s * b, c * a2 - s * a, c * b)
         return wp.matrix_from_rows(scale * b, scale * a, vec3d())
-
-    @wp.func
-    def store_gradients(into: vec3d_2d, world: int, row: int, G: wp.mat33d):
-        """Store the output of `constraint_gradients`."""
-        for side in range(3):
-            into[world, 3 * row + side] = G[side]
 
     @wp.kernel(module=module)
     def reset_violation(active: int_1d, mul: Multipliers):
@@ -209,13 +245,11 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
     ):
         """c at u, its gradients at u_stage; multipliers of the trial step; the rows of the augmented potential."""
         world, row = wp.tid()
-        if active[world] == 0:
-            return
         kind = con.kind[row]
+        if active[world] == 0 or kind >= FORMULA:
+            return
         scale = con.scale[row]
-        f = con.constant_target[row]
-        if con.law[row] >= 0:
-            f = f + law_value[world, con.law[row]][con.law_component[row]]
+        f = right_side(con, law_value, world, row)
         da = term_vector(con, 3 * row, u, world)
         db = term_vector(con, 3 * row + 1, u, world)
         A, B = con.reference[3 * row], con.reference[3 * row + 1]
@@ -254,24 +288,7 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
                 if wp.isfinite(mul.last_target[world, row]):
                     angle = f64(0.5) * (mul.last_target[world, row] + f)
         store_gradients(mul.gradient, world, row, constraint_gradients(kind, scale, angle, slope, b, a2))
-        rho = mul.penalty[world, row]
-        frozen = mul.multiplier[world, row]
-        new = frozen
-        mul.constraint_value[world, row] = c
-        mul.signed_scale[world, row] = scale
-        mul.target[world, row] = f
-        mul.frozen_force[world, row] = frozen + rho * c
-        mul.trial_multiplier[world, row] = frozen + rho * c
-        mul.penalty_force[world, row] = f64(0.0)
-        if mul.outer_updates == 0:
-            new = frozen + alpha[world] * mul.multiplier_change[world, row]
-            mul.trial_multiplier[world, row] = new
-            mul.penalty_force[world, row] = rho * c
-        penalty_energy = f64(0.5) * rho * c * c
-        mul.rows[0, world, row] = frozen * c + penalty_energy
-        mul.rows[1, world, row] = new * c + penalty_energy
-        mul.rows[2, world, row] = wp.max(wp.abs(frozen * c), wp.abs(new * c)) + penalty_energy
-        wp.atomic_max(mul.violation, world, con.connected_component[row], wp.abs(c))
+        store_value(con, mul, alpha[world], world, row, scale, f, c)
 
     @wp.kernel(module=module)
     def product_terms(con: Constraints, mul: Multipliers, p_in: p.vec3_2d, dq_dv: double_1d, active: int_1d):
@@ -283,7 +300,7 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
         a = term_vector(con, 3 * row, p_in, world)
         b = term_vector(con, 3 * row + 1, p_in, world)
         a2 = vec3d()
-        if kind == ANGLE:
+        if kind >= ANGLE:
             a2 = term_vector(con, 3 * row + 2, p_in, world)
         Ga = mul.gradient[world, 3 * row]
         Gb = mul.gradient[world, 3 * row + 1]
@@ -297,6 +314,12 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
             size = wp.abs(mul.constraint_value[world, row] / scale + f)
             a = (a - wp.dot(n, a) * n) / size
         curvature_part = constraint_gradients(kind, scale, f, a, b, a2)
+        if kind >= FORMULA:
+            for side in range(3):
+                k = 9 * row + 3 * side
+                curvature_part[side] = (
+                    mul.curvature[world, k] * a + mul.curvature[world, k + 1] * b + mul.curvature[world, k + 2] * a2
+                )
         penalty_part = dq_dv[world] * mul.penalty[world, row] * change
         force = dq_dv[world] * mul.trial_multiplier[world, row]
         if wp.static(midpoint):  # the gradients move by half of the end's change

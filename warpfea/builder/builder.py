@@ -305,7 +305,7 @@ class ModelBuilder:
 
         Args:
             kind: "DP1", (Q - P).(T - R) = f m^2; "DP2", the same with R on the body of P and Q; "DIST", |P - Q| = f m,
-                positive; "PIN", P - Q = f (3,) m.
+                positive; "PIN", P - Q = f (3,) m; or another of `warpfea.builder.joints.CONSTRAINT_KINDS`.
             points: P, Q (, R, T): material points, nodes or surfaces (their mean), or fixed places (x, y, z), m.
             value: f, a time law; by default 0 of DP1, DP2 and PIN, and the reference distance of DIST.
             name: unique name.

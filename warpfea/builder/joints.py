@@ -10,8 +10,10 @@ A material direction n of a body is F n, linear in the slots, in place of a chor
 
 from __future__ import annotations
 
+import functools
 import itertools
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,14 +26,15 @@ from ..time_laws import TimeLaw, time_law
 from .attachments import COINCIDENCE_TOL, GROUND, UNKNOWN_WEAKNESS, Attachment, Ground, make_attachment
 from .checks import vector
 
-__all__ = ["GROUND", "JOINT_KINDS", "Ground", "make_constraint", "make_joint", "pin_rows"]
+__all__ = [
+    "CONSTRAINT_KINDS", "GROUND", "JOINT_KINDS", "ConstraintKind", "ConstraintPoints", "Ground", "make_constraint",
+    "make_joint", "pin_rows",
+]  # fmt: skip
 
 JOINT_KINDS = ("spherical", "universal", "revolute", "cylindrical", "translational", "fixed", "distance")
 KINDS_WITH_AXIS = ("universal", "revolute", "cylindrical", "translational")
 DRIVABLE_KINDS = ("revolute", "translational", "distance")
 KINDS_WITH_PIN = ("spherical", "universal", "revolute", "fixed")
-CONSTRAINT_POINTS = {"DP1": 4, "DP2": 4, "DIST": 2, "PIN": 2}
-"""Number of points of each kind."""
 AngleVectors = tuple[Vector, Vector, Vector]
 """Vectors (a, a2, b) of the angle atan2(a2.b, a.b), see `_angle_vectors`."""
 
@@ -233,9 +236,8 @@ def _distance_joint(what: str, name: str, P: Attachment, Q: Attachment, anchor: 
             ends.append(side.position(side.X, what))
     if anchor is not None and P.body is not None and Q.body is not None:
         raise ModelError(f"{what}: a distance joint between two bodies ends at their points; it has no anchor")
-    return Joint(
-        name, "distance", [_distance_row(what, ends[0], ends[1], law, max(P.size, Q.size))], ends[1], _pair_label(P, Q)
-    )
+    row = _distance_row(what, ends[0], ends[1], law, max(P.size, Q.size))
+    return Joint(name, "distance", [row], ends[1], _pair_label(P, Q))
 
 
 def _distance_row(what: str, p: Vector, q: Vector, law: TimeLaw | None, size: float) -> ConstraintRow:
@@ -277,41 +279,91 @@ def _perpendicular_to(n: np.ndarray) -> np.ndarray:
 # single constraints
 
 
+@dataclass(frozen=True)
+class ConstraintPoints:
+    """Points of a single constraint.
+
+    Attributes:
+        what: the constraint, for messages.
+        attachments: the points with their bodies.
+        value: right side as the user gave it, or None.
+    """
+
+    what: str
+    attachments: list[Attachment]
+    value: Any
+
+    @functools.cached_property
+    def x(self) -> list[Vector]:
+        """Position of each point."""
+        return [point.position(point.X, self.what) for point in self.attachments]
+
+    @property
+    def size(self) -> float:
+        """Largest size of a body, m."""
+        return max(point.size for point in self.attachments)
+
+    @property
+    def law(self) -> TimeLaw | None:
+        """Right side as a scalar time law, or None."""
+        return None if self.value is None else time_law(self.value, f"{self.what}: value", scalar=True)
+
+    def right_side(self, default: float) -> dict[str, Any]:
+        """Keywords of a ConstraintRow for its right side; `default` if the user gave no value."""
+        law = self.law
+        return {"fixed": default} if law is None else _right_side(law)
+
+
+@dataclass(frozen=True)
+class ConstraintKind:
+    """Kind of single constraint.
+
+    Attributes:
+        points: number of points.
+        rows: function of the ConstraintPoints that returns the rows; the last point carries the reaction.
+    """
+
+    points: int
+    rows: Callable[[ConstraintPoints], list[ConstraintRow]]
+
+
 def make_constraint(kind: str, points: Any, value: Any, name: str) -> Joint:
-    """A single DP1, DP2, DIST or PIN between points: material points, nodes, surfaces (means), fixed points (3,).
+    """A single constraint of CONSTRAINT_KINDS between points: material points, nodes, surfaces (means), fixed points
+    (3,).
 
     Raises:
         ModelError: an unknown kind, a wrong number of points, or points that coincide where a direction is needed.
     """
     what = f"constraint {name!r} ({kind})"
-    attachments = _constraint_points(what, kind, points)
-    size = max(p.size for p in attachments)
-    x = [p.position(p.X, what) for p in attachments]
-    between = ", ".join(p.label for p in attachments)
-    if kind == "PIN":
-        return Joint(name, kind, _coincidence_rows(what, x[0] - x[1], value, size), x[1], between)
-    law = None if value is None else time_law(value, f"{what}: value", scalar=True)
-    if kind == "DIST":
-        return Joint(name, kind, [_distance_row(what, x[0], x[1], law, size)], x[1], between)
-    a, b = x[1] - x[0], x[3] - x[2]
-    if kind == "DP2" and attachments[2].body is not attachments[0].body:
-        raise ModelError(f"{what}: its third point must be on the body of the first two; use DP1")
+    at = ConstraintPoints(what, _constraint_points(what, kind, points), value)
+    between = ", ".join(point.label for point in at.attachments)
+    return Joint(name, kind, CONSTRAINT_KINDS[kind].rows(at), at.x[-1], between)
+
+
+def _direction_rows(at: ConstraintPoints) -> list[ConstraintRow]:
+    """DP1 and DP2: (Q - P).(T - R) = f."""
+    P, Q, R, T = at.x
+    a, b = Q - P, T - R
     for label, v in (("P and Q", a), ("R and T", b)):
-        if np.linalg.norm(v.value) <= COINCIDENCE_TOL * size:
-            raise ModelError(f"{what}: its points {label} coincide, so that it has no direction")
-    return Joint(
-        name, kind, [ConstraintRow(DOT, a, b, _inverse_lengths(a, b), angular=True, **_right_side(law))], x[3], between
-    )
+        if np.linalg.norm(v.value) <= COINCIDENCE_TOL * at.size:
+            raise ModelError(f"{at.what}: its points {label} coincide, so that it has no direction")
+    return [ConstraintRow(DOT, a, b, _inverse_lengths(a, b), angular=True, **at.right_side(0.0))]
+
+
+def _own_direction_rows(at: ConstraintPoints) -> list[ConstraintRow]:
+    if at.attachments[2].body is not at.attachments[0].body:
+        raise ModelError(f"{at.what}: its third point must be on the body of the first two; use DP1")
+    return _direction_rows(at)
 
 
 def _constraint_points(what: str, kind: str, points: Any) -> list[Attachment]:
     """Points of a single constraint. ModelError for an unknown kind, a wrong number, or no point on a body."""
-    if kind not in CONSTRAINT_POINTS:
+    if kind not in CONSTRAINT_KINDS:
         raise ModelError(
-            f"{what}: the kind is unknown; there are {', '.join(CONSTRAINT_POINTS)}"
-            f"{did_you_mean(kind, CONSTRAINT_POINTS)}"
+            f"{what}: the kind is unknown; there are {', '.join(CONSTRAINT_KINDS)}"
+            f"{did_you_mean(kind, CONSTRAINT_KINDS)}"
         )
-    count = CONSTRAINT_POINTS[kind]
+    count = CONSTRAINT_KINDS[kind].points
     if not isinstance(points, (tuple, list)) or len(points) != count:
         raise ModelError(f"{what}: points must be {count} points, got {points!r}")
     attachments = []
@@ -327,13 +379,24 @@ def _constraint_points(what: str, kind: str, points: Any) -> list[Attachment]:
     return attachments
 
 
-def _coincidence_rows(what: str, gap: Vector, value: Any, size: float) -> list[ConstraintRow]:
+def _coincidence_rows(at: ConstraintPoints) -> list[ConstraintRow]:
     """Rows of P - Q = value, or of coincident points. ModelError for distinct points without a value."""
-    if value is not None:
-        return pin_rows(gap, time_law(value, f"{what}: value"))
+    P, Q = at.x
+    gap = P - Q
+    if at.value is not None:
+        return pin_rows(gap, time_law(at.value, f"{at.what}: value"))
     apart = float(np.linalg.norm(gap.value))
-    if apart > COINCIDENCE_TOL * size:
+    if apart > COINCIDENCE_TOL * at.size:
         raise ModelError(
-            f"{what}: its points are {apart:.6g} m apart in the reference; value=(x, y, z) prescribes P - Q"
+            f"{at.what}: its points are {apart:.6g} m apart in the reference; value=(x, y, z) prescribes P - Q"
         )
     return pin_rows(Vector(np.zeros(3), gap.parts))
+
+
+CONSTRAINT_KINDS = {
+    "DP1": ConstraintKind(4, _direction_rows),
+    "DP2": ConstraintKind(4, _own_direction_rows),
+    "DIST": ConstraintKind(2, lambda at: [_distance_row(at.what, *at.x, at.law, at.size)]),
+    "PIN": ConstraintKind(2, _coincidence_rows),
+}
+"""Kinds of single constraints; another is an entry here."""

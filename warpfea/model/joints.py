@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ..kernels.terms.constraint_formulas import Formula
 from ..kernels.terms.constraints import DISTANCE
 from ..time_laws import TimeLaw
 from .discretisation import Discretisation
@@ -59,14 +60,14 @@ class ConstraintRow:
     """A scalar constraint; see kernels/terms/constraints.py for the kinds.
 
     Attributes:
-        kind: DOT, DISTANCE or ANGLE.
+        kind: DOT, DISTANCE, ANGLE, or a Formula.
         a, b, a2: its vectors.
         scale: factor to metres; with `angular` times the model's size.
         law: right side over time, or None: `fixed`.
         component: of the law's value.
     """
 
-    kind: int
+    kind: int | Formula
     a: Vector
     b: Vector
     scale: float = 1.0

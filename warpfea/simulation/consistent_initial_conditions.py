@@ -21,7 +21,7 @@ import warp as wp
 
 from ..base.errors import ModelError
 from ..kernels.step.step_control import STATUS
-from ..kernels.terms.constraints import ANGLE, DISTANCE
+from ..kernels.terms.constraints import ANGLE, DISTANCE, FORMULA
 from ..time_laws import TimeLaw
 from .discontinuities import jump_intervals, kink_times
 
@@ -367,7 +367,14 @@ def constraint_rates(
     G[turn] = np.stack([-s * b, d, c * b], axis=1)[turn]
     first[turn] = (dot(rate, b) + dot(d, db))[turn]
     second[turn] = (dot(bend, b) + 2.0 * dot(rate, db))[turn]
-    return scale[:, None, None] * G, scale * first, scale * second
+    G, first, second = scale[:, None, None] * G, scale * first, scale * second
+    if tables.formulas:
+        own, v = kind >= FORMULA, np.stack([da, db, da2], axis=1)
+        gradients, curvature = tables.formula_derivatives(np.stack([a, b, a2], axis=1))
+        G[own] = gradients[own]
+        first[own] = (np.einsum("rsc,rsc->r", gradients, v) - scale * df)[own]
+        second[own] = (np.einsum("rsc,rstcd,rtd->r", v, curvature, v) - scale * ddf)[own]
+    return G, first, second
 
 
 def check_rho_inf(model: Model, integrator: Integrator, driven: bool) -> None:

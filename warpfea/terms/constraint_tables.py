@@ -11,16 +11,19 @@ import scipy.sparse as sp
 import warp as wp
 
 from ..base.errors import ModelError
+from ..base.launch import Launcher
 from ..kernels.terms.constraint_blocks import coupling_struct
+from ..kernels.terms.constraint_formulas import Formula, formula_kernels
 from ..kernels.terms.constraints import (
     ANGLE,
     DISTANCE,
     DOT,
+    FORMULA,
     constraint_kernels,
     constraint_struct,
     joint_struct,
 )
-from ..model.joints import Joint, Vector
+from ..model.joints import ConstraintRow, Joint, Vector
 from ..time_laws import TimeLaw
 from .time_law_table import TimeLawTable
 
@@ -39,6 +42,7 @@ class ConstraintTables:
     Attributes:
         joints: in the order of addition.
         count: number of rows.
+        formulas: of the rows that have one; number k is the row kind FORMULA + k.
         rows_of: row indices of each joint.
         data: device tables.
         component_host, cluster_host: component and cluster of each row; colour_host: colour of each cluster.
@@ -58,6 +62,10 @@ class ConstraintTables:
         self.colour_host = self.cluster_host = np.zeros(0, dtype=np.int64)
         self.rows = [row for joint in self.joints for row in joint.rows]
         self.count = len(self.rows)
+        self.formulas = list(dict.fromkeys(row.kind for row in self.rows if isinstance(row.kind, Formula)))
+        names = [formula.name for formula in self.formulas]
+        if len({*names}) < len(names):
+            raise ModelError(f"two formulas of constraints have one name among {', '.join(names)}: rename one")
 
     # connectivity, before components are known
 
@@ -89,6 +97,11 @@ class ConstraintTables:
         self._upload_vectors(laws)
         self._upload_row_pairs()
         self._upload_joints()
+
+    def _upload(self, data: Any, tables: dict[str, tuple[Any, Any]]) -> None:
+        """Set the arrays of a struct from (values, dtype) by name."""
+        for name, (values, dtype) in tables.items():
+            setattr(data, name, self.model.array("constraints", np.asarray(values), dtype))
 
     def _order_rows(self, component: np.ndarray) -> None:
         """Sort joints by component and cluster."""
@@ -139,8 +152,8 @@ class ConstraintTables:
         order = np.argsort(slot, kind="stable")
         slot_start = np.concatenate([[0], np.cumsum(np.bincount(slot, minlength=m.slots))])
         self.reference_host = np.array([vector.value for row in rows for vector in row.vectors])
-        tables: dict[str, tuple[Any, Any]] = {
-            "kind": ([r.kind for r in rows], wp.int32),
+        tables = {
+            "kind": ([self._kind_number(row) for row in rows], wp.int32),
             "scale": (self.scale_host, wp.float64),
             "reference_product": ([r.reference_product for r in rows], wp.float64),
             "constant_target": ([r.fixed for r in rows], wp.float64),
@@ -155,10 +168,17 @@ class ConstraintTables:
             "slot_term": (term[order], wp.int32),
             "slot_weight": (weight[order], wp.float64),
         }
-        for name, (values, dtype) in tables.items():
-            setattr(data, name, m.array("constraints", np.asarray(values), dtype))
+        self._upload(data, tables)
         self.data = data
         self._vector_entries = entries
+
+    def _kind_number(self, row: ConstraintRow) -> int:
+        return FORMULA + self.formulas.index(row.kind) if isinstance(row.kind, Formula) else row.kind
+
+    def formula_kernels(self, midpoint: bool = False) -> list[tuple[int, Any]]:
+        """Row kind and kernels of each formula."""
+        kernels = [formula_kernels(self.model.dtype, midpoint, formula) for formula in self.formulas]
+        return list(enumerate(kernels, FORMULA))
 
     def _upload_row_pairs(self) -> None:
         """Pairs of shared vectors for each pair of rows that share slots: dense within clusters, else couplings."""
@@ -191,7 +211,7 @@ class ConstraintTables:
         self.cluster_sizes = n
         couple_row = np.repeat(np.arange(self.count), np.diff(couple_start))
         self._colour_clusters(couple_row, np.array(couple_column, dtype=np.int64))
-        tables: dict[str, tuple[Any, Any]] = {
+        tables = {
             "cluster": (self.cluster_host, wp.int32),
             "cluster_start": (first, wp.int32),
             "matrix_start": (np.concatenate([[0], np.cumsum(n**2)[:-1]]), wp.int32),
@@ -205,8 +225,7 @@ class ConstraintTables:
             "colour": (self.colour_host, wp.int32),
             "colour_cluster": (np.argsort(self.colour_host, kind="stable"), wp.int32),
         }
-        for name, (values, dtype) in tables.items():
-            setattr(self.data, name, self.model.array("constraints", np.asarray(values), dtype))
+        self._upload(self.data, tables)
 
     def _split_large_clusters(self) -> np.ndarray:
         """First row of each cluster, after splitting clusters too large for a dense inverse into joints."""
@@ -236,10 +255,8 @@ class ConstraintTables:
                         columns.setdefault(other, []).append(((side, other_side), block))
             out.append(columns)
         self.block_count = len(block_start) - 1
-        m = self.model
-        self.data.block_start = m.array("constraints", np.asarray(block_start), wp.int32)
-        self.data.block_slot = m.array("constraints", np.asarray(block_slot or [0]), wp.int32)
-        self.data.block_weight = m.array("constraints", np.asarray(block_weight or [0.0]), wp.float64)
+        tables = {"block_start": (block_start, wp.int32), "block_slot": (block_slot or [0], wp.int32)}
+        self._upload(self.data, tables | {"block_weight": (block_weight or [0.0], wp.float64)})
         return out
 
     def _vector_weights(
@@ -295,7 +312,7 @@ class ConstraintTables:
             own = slice(self.start_host[3 * rows[0]], self.start_host[3 * rows[-1] + 3])
             if not self.on_child_host[own].any():  # child in space: the parent's reaction
                 side[own] = -1
-        tables: dict[str, tuple[Any, Any]] = {
+        tables = {
             "first_row": ([rows[0] for rows in self.rows_of], wp.int32),
             "end_row": ([rows[-1] + 1 for rows in self.rows_of], wp.int32),
             "anchor": ([joint.anchor.value for joint in self.joints], wp.vec3d),
@@ -305,8 +322,7 @@ class ConstraintTables:
             "entry_role": (side * (1 + position[self.slot_host]), wp.int32),
             "slot_position": (place[self.slot_host], wp.vec3d),
         }
-        for name, (values, dtype) in tables.items():
-            setattr(data, name, m.array("constraints", np.asarray(values), dtype))
+        self._upload(data, tables)
         self.joint_data = data
         for k, joint in enumerate(self.joints):
             joint.index = k
@@ -320,6 +336,18 @@ class ConstraintTables:
         columns = (3 * self.slot_host[:, None] + np.arange(3)).ravel()
         return sp.csr_matrix((data.ravel(), (rows, columns)), shape=(self.count, 3 * self.model.slots))
 
+    def formula_derivatives(self, vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """First and second derivatives (rows, 3, 3) and (rows, 3, 3, 3, 3), indices side, side, component, component,
+        of the rows with formulas at given vectors (rows, 3, 3); of other rows 0."""
+        device, n = self.model.device, self.count
+        v: Any = wp.array(vectors.reshape(1, 3 * n, 3), dtype=wp.vec3d, device=device)
+        gradient = wp.zeros((1, 3 * n), dtype=wp.vec3d, device=device)
+        curvature = wp.zeros((1, 9 * n), dtype=wp.mat33d, device=device)
+        for kind, k in self.formula_kernels():
+            args = [kind, self.data.kind, self.data.scale, v, gradient, curvature]
+            Launcher(device)(k.derivatives, (1, n), args)
+        return gradient.numpy().reshape(n, 3, 3), curvature.numpy().reshape(n, 3, 3, 3, 3)
+
     def measure(self, joint: Joint, what: str | None, state: Any) -> np.ndarray:
         """Joint coordinate (worlds,): "angle" (rad), "travel" or "length" (m); ModelError if undefined."""
         has = self.coordinate_vectors(joint)
@@ -329,7 +357,8 @@ class ConstraintTables:
         target, turn = self.targets(state), self.angle_row(joint)
         out = []
         for world, u in enumerate(state.displacement.numpy().astype(float)):
-            vectors = [self._current_vector(v, u) for v in has[what]]
+            entries = [vector.entries() for vector in has[what]]
+            vectors = [vector.value + w @ u[slots] for vector, (slots, w, _) in zip(has[what], entries)]
             if what == "length":
                 out.append(np.linalg.norm(vectors[0]))
             elif what == "travel":
@@ -361,11 +390,6 @@ class ConstraintTables:
             return at_time
         reached = state.constraint_target.numpy()
         return np.where(np.isnan(reached), at_time, reached)
-
-    @staticmethod
-    def _current_vector(vector: Vector, u: np.ndarray) -> np.ndarray:
-        slots, weights, _ = vector.entries()
-        return vector.value + weights @ u[slots]
 
     def hash(self, h: Any) -> None:
         """Hash the definition of the rows."""

@@ -99,13 +99,14 @@ class Constraints(Constrained, Updated, Tied, Preconditioned):
             "product": ((B, 3 * M), wp.vec3d),
             "violation": ((B, model.components.count), wp.float64),
             "compliance_block": ((B, max(con.block_count, 1)), wp.mat33d),
+            "curvature": ((B, 9 * M), wp.mat33d),
             "inverse_matrix": ((B, con.matrix_entries), wp.float64),
             "coupling": ((B, max(con.coupling_count, 1)), wp.float64),
         }
         for name, var in multiplier_struct().vars.items():
             if name == "end_gradient" and not ctx.midpoint:
                 mul.end_gradient = mul.gradient
-            elif isinstance(var.type, wp.array) and name != "rows":
+            elif isinstance(var.type, wp.array) and name != "rows" and (name != "curvature" or con.formulas):
                 shape, dtype = shapes.get(name, ((B, M), wp.float64))
                 setattr(mul, name, work.array(f"Multipliers.{name}", shape, dtype))
         mul.rows = work.rows_of(self)
@@ -129,7 +130,8 @@ class Constraints(Constrained, Updated, Tied, Preconditioned):
         ctx.scratch[self.name] = Deflation(deflate, largest, table, len(large))
 
     def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
-        return {self.integrator_kernels(ctx).module, deflation_kernels(self.model.dtype).module}
+        formulas = {kernels.module for _, kernels in self.tables.formula_kernels(ctx.midpoint)}
+        return {self.integrator_kernels(ctx).module, deflation_kernels(self.model.dtype).module} | formulas
 
     def start(self, ctx: StepContext, active: wp.array) -> None:
         """Initialise right-hand sides missing in the state, and the violation at the start."""
@@ -153,7 +155,12 @@ class Constraints(Constrained, Updated, Tied, Preconditioned):
         m, w, k = self.model, ctx.work, self.integrator_kernels(ctx)
         ctx.launch(k.reset_violation, (m.worlds, m.components.count), [active, w.multipliers])
         args = [self.tables.data, w.u, w.u_stage, w.time_law_values, w.newton.search.alpha, active, w.multipliers]
-        ctx.launch(k.evaluate, self.dim, args)
+        self._evaluate_rows(ctx.launch, ctx.midpoint, args)
+
+    def _evaluate_rows(self, launch: Launcher, midpoint: bool, args: list[Any]) -> None:
+        launch(constraint_kernels(self.model.dtype, midpoint).evaluate, self.dim, args)
+        for kind, kernels in self.tables.formula_kernels(midpoint):
+            launch(kernels.evaluate, self.dim, [kind, *args])
 
     prepare = force  # J, for rho
 
@@ -316,6 +323,8 @@ class Constraints(Constrained, Updated, Tied, Preconditioned):
             setattr(mul, name, zeros((B, con.count), wp.float64))
         for name in ("gradient", "product"):
             setattr(mul, name, zeros((B, 3 * con.count), wp.vec3d))
+        if con.formulas:
+            mul.curvature = zeros((B, 9 * con.count), wp.mat33d)
         mul.end_gradient = mul.gradient
         mul.rows = zeros((TERM_ROWS, B, con.count), wp.float64)
         mul.violation = zeros((B, m.components.count), wp.float64)
@@ -323,7 +332,7 @@ class Constraints(Constrained, Updated, Tied, Preconditioned):
             mul.multiplier.assign(np.tile(multipliers, (B, 1)))
         mul.last_target.fill_(np.nan)  # any number of turns is valid
         args = [con.data, state.displacement, state.displacement, value, zeros((B,), wp.float64), all_worlds, mul]
-        launch(self.kernels.evaluate, self.dim, args)
+        self._evaluate_rows(launch, False, args)
         return mul
 
     def values(self, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
