@@ -139,7 +139,7 @@ def test_a_swinging_rope_keeps_length_and_energy():
 
 def test_two_formulas_of_one_name_are_refused(monkeypatch):
     b = wf.ModelBuilder()
-    other = Formula("rope", rope_length, rope_directions, rope_turns)
+    other = Formula("rope", rope_length, rope_directions, None)
     cube = b.add_solid(wf.mesh.box((0.1, 0.1, 0.1), cells=(1, 1, 1)), material=wf.SVK(E=1e8, nu=0.3, density=1000.0))
     for formula in (ROPE, other):
         kind = ConstraintKind(2, lambda at, formula=formula: [ConstraintRow(formula, at.x[0], at.x[1])])

@@ -2,8 +2,7 @@
 
 import functools
 import types as _types
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import warp as wp
 
@@ -13,8 +12,7 @@ from .constraints import constraint_functions, constraint_struct, multiplier_str
 __all__ = ["Formula", "formula_kernels"]
 
 
-@dataclass(frozen=True, eq=False)
-class Formula:
+class Formula(NamedTuple):
     """Scalar function h of three vectors, each linear in the slots (kernels/terms/constraints.py), in float64.
 
     Attributes:

@@ -396,7 +396,7 @@ def _coincidence_rows(at: ConstraintPoints) -> list[ConstraintRow]:
 CONSTRAINT_KINDS = {
     "DP1": ConstraintKind(4, _direction_rows),
     "DP2": ConstraintKind(4, _own_direction_rows),
-    "DIST": ConstraintKind(2, lambda at: [_distance_row(at.what, *at.x, at.law, at.size)]),
+    "DIST": ConstraintKind(2, lambda at: [_distance_row(at.what, at.x[0], at.x[1], at.law, at.size)]),
     "PIN": ConstraintKind(2, _coincidence_rows),
 }
 """Kinds of single constraints; another is an entry here."""
