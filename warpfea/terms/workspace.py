@@ -112,6 +112,7 @@ class Workspace:
         self.residual_group_partial = self.array(
             "residual_group_partial", (*sums, GROUP_LANES) if groups > 1 else (1, 1, 1, 1), wp.float64
         )
+        skip: tuple[str, ...]
         skip = ("violation", "negative_curvature", "pcg_unconverged", "component_of_group")  # for other solvers
         skip += () if traits.has_constraints else ("multiplier_updates", "violation_ratio")
         skip += () if traits.stored else ("term_sums", "trial_accepted")
