@@ -207,12 +207,17 @@ def _child(tree: pathlib.Path, words: Sequence[str], out: pathlib.Path) -> list[
 
 def _stress_rows(run: Run) -> dict[str, tuple[str, float]]:
     """Rows of the stress suite that are run: label -> group and seconds measured."""
+    from warpfea.studies.stress.suite import load_cases, select_rows
+
     known = json.loads((ROOT / "tests" / "results" / "stress_cpu.json").read_text())["rows"]
+    seconds = {(row["case"], row["precision"]): row["wall_s"] for row in known}
     out: dict[str, tuple[str, float]] = {}
-    for row in known:
-        if not row["case"].startswith(LONG_ROWS) and run.wants(row["case"]):
-            out[row["case"]] = (row["group"], out.get(row["case"], ("", 0.0))[1] + row["wall_s"])
-    return dict(list(out.items())[:20]) if run.quick else out
+    for row in select_rows(load_cases(), (), run.options["suite"] == "quick", ("float64", "float32")):
+        if not row.label.startswith(LONG_ROWS) and run.wants(row.label):
+            before = out.get(row.label, ("", 0.0))[1]
+            out[row.label] = (row.case.group, before + seconds.get((row.label, row.dtype), 1.0))
+    low, high = run.options["seconds"]
+    return {label: found for label, found in out.items() if low <= found[1] < high}
 
 
 def _tasks(
@@ -229,11 +234,10 @@ def _tasks(
     wanted = set().union(*touched.values()) if variant == "" else set(touched.get(variant, ()))
     rows = {label: seconds for label, (group, seconds) in _stress_rows(run).items()
             if group.startswith(part) and (not touched or label in wanted)}  # fmt: skip
-    low, high = run.options["seconds"]
-    rows = {label: seconds for label, seconds in rows.items() if low <= seconds < high}
+    quick = ["--quick"] if run.options["suite"] == "quick" else []
     for labels in _parts(rows, jobs if variant == "" else max(jobs // 2, 1)):
         cases = [word for label in labels for word in ("--case", label)]
-        yield ["-m", "warpfea", "stress", "--quiet", "--device", run.device, *cases, "--json"]
+        yield ["-m", "warpfea", "stress", "--quiet", *quick, "--device", run.device, *cases, "--json"]
 
 
 def _compare(before: Sequence[Row], after: Sequence[Row]) -> Row:
@@ -272,7 +276,11 @@ def _study(run: Run, *, random: bool) -> Iterator[Row]:
         known = json.loads(pathlib.Path(run.options["touched"]).read_text())
         touched = {row["variant"]: row["touched"] for row in known["stress"]}
         chosen = [name for name in chosen if touched.get(name)]
-    jobs = run.options["jobs"]
+    jobs, kept = run.options["jobs"], run.out and run.out.with_suffix(".jsonl")
+    if kept is not None and kept.exists():
+        done = [json.loads(line) for line in kept.read_text().splitlines()]
+        yield from (row for row in done if row["random"] == random)
+        chosen = [name for name in chosen if name not in {row["variant"] for row in done if row["random"] == random}]
     with tempfile.TemporaryDirectory() as name, ThreadPoolExecutor(jobs) as pool:
         folder = pathlib.Path(name)
 
@@ -285,14 +293,14 @@ def _study(run: Run, *, random: bool) -> Iterator[Row]:
         running = {variant: submit(variant) for variant in chosen}
         for variant, tasks in running.items():
             rows = [row for task in tasks for row in task.result()]
-            label: Row = {"variant": variant, "area": variants()[variant]}
+            label: Row = {"variant": variant, "area": variants()[variant], "random": random}
             if variant in CONSTANTS:
                 constant = CONSTANTS[variant]
                 value = constant_file(variant)[1]
                 label |= {"value": value, "unit": constant.unit, "disabled": constant.disabled}
             found = label | _compare(base, rows)
-            if run.out is not None:
-                with run.out.with_suffix(".jsonl").open("a") as file:  # a run that is cut short keeps what it has
+            if kept is not None:
+                with kept.open("a") as file:  # a run that is cut short keeps what it has
                     file.write(json.dumps(found) + "\n")
             yield found
 
@@ -315,7 +323,7 @@ TABLE = Table(
         "ablation_h200.json": "ablation --device cuda:0 --set jobs=14 --set touched=tests/results/ablation_cpu.json "
         "--out tests/results/ablation_h200.json",
     },
-    options={"jobs": 2, "variants": "all", "touched": "", "seconds": [0.0, 1e9]},
+    options={"jobs": 2, "variants": "all", "touched": "", "suite": "all", "seconds": [0.0, 1e9]},
     settings={"random cases": RANDOM_CASES, "left out": list(LONG_ROWS)},
     columns=("variant", "area", "value", "rows", "newton", "pcg", "lost"),
     takes="an hour on 16 cores",
