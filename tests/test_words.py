@@ -9,7 +9,7 @@ import pathlib
 import pytest
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
-DEVICE = {"wp.func", "wp.func_native", "wp.kernel"}
+DEVICE = {"wp.func", "wp.func_native", "wp.kernel", "masked_kernel"}
 RENAMED = ("pushed", "massive", "lagged", "guess")
 """Words for which the code has terms of the field: nonpotential, with_mass, reused, predictor."""
 

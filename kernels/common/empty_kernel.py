@@ -1,17 +1,17 @@
 """Empty kernel, to measure the cost of a launch."""
 
 import functools
-import types as _types
 
 import warp as wp
 
-from .types import int_1d, kernel_module, kernel_set
+from .modules import KernelSet, kernel_module, kernel_set
+from .types import int_1d
 
 __all__ = ["empty_kernels"]
 
 
 @functools.cache
-def empty_kernels() -> _types.SimpleNamespace:
+def empty_kernels() -> KernelSet:
     """Kernel `empty`."""
     module = kernel_module("empty")
 

@@ -1,11 +1,11 @@
 """Sums over the threads (lanes) that share a row, in a fixed order; on the CPU one thread does a whole row."""
 
 import functools
-import types as _types
 
 import warp as wp
 
-from .types import double_3d, kernel_set, precision
+from .modules import KernelSet, kernel_set
+from .types import double_3d, precision
 
 __all__ = ["WARP_SIZE", "block_memory", "lane_functions", "warp_minimum"]
 
@@ -78,7 +78,7 @@ _C_TYPES = {"float64": "double", "float32": "float"}
 
 
 @functools.cache
-def block_memory(dtype: str, size: int) -> _types.SimpleNamespace:
+def block_memory(dtype: str, size: int) -> KernelSet:
     """Device functions for `size` numbers shared by the threads of a block.
 
     `open(outside)` is their location: memory of the block or, on the CPU, that at `outside`. `load(at, i)` and
@@ -101,11 +101,11 @@ def block_memory(dtype: str, size: int) -> _types.SimpleNamespace:
         """Number i = x."""
         ...
 
-    return _types.SimpleNamespace(open=open_memory, load=load, store=store)
+    return KernelSet(open=open_memory, load=load, store=store)
 
 
 @functools.cache
-def lane_functions(dtype: str) -> _types.SimpleNamespace:
+def lane_functions(dtype: str) -> KernelSet:
     """Device functions for threads that share a row.
 
     `sync()` is the barrier of a block. `lane_sum(v, lanes)` sums vectors, `row_sum(x, lanes)` float64 numbers and

@@ -1,12 +1,12 @@
 """Sums per world, in an order that depends on the row length only, not on the number of worlds."""
 
 import functools
-import types as _types
 
 import warp as wp
 
 from .lanes import lane_sum_float64
-from .types import double_2d, double_3d, int_1d, kernel_module, kernel_set
+from .modules import KernelSet, kernel_module, kernel_set, masked_kernel
+from .types import double_2d, double_3d, int_1d
 
 __all__ = ["CHUNK", "MAX_WARP_ROW", "reduce_kernels"]
 
@@ -20,28 +20,24 @@ CHUNK = 16384
 
 
 @functools.cache
-def reduce_kernels() -> _types.SimpleNamespace:
+def reduce_kernels() -> KernelSet:
     """Kernels that sum rows [row, world, item] of float64."""
     f64 = wp.float64
     module = kernel_module("reduce")
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def partial_sums(rows: double_3d, active: int_1d, partial: double_3d):
         """One block sums one chunk of one row of one world."""
         row, world, chunk = wp.tid()
-        if active[world] == 0:
-            return
         acc = wp.tile_zeros(shape=(1, 1, TILE_SIZE), dtype=f64)
         for k in range(CHUNK // TILE_SIZE):
             acc += wp.tile_load(rows, shape=(1, 1, TILE_SIZE), offset=(row, world, chunk * CHUNK + k * TILE_SIZE))
         partial[row, world, chunk] = wp.tile_extract(wp.tile_sum(acc), 0)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def final_sums(rows: double_3d, active: int_1d, out: double_2d):
         """One block sums one row of one world."""
         row, world = wp.tid()
-        if active[world] == 0:
-            return
         acc = wp.tile_zeros(shape=(1, 1, TILE_SIZE), dtype=f64)
         for k in range((rows.shape[2] + TILE_SIZE - 1) // TILE_SIZE):
             acc += wp.tile_load(rows, shape=(1, 1, TILE_SIZE), offset=(row, world, k * TILE_SIZE))

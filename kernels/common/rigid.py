@@ -1,11 +1,11 @@
 """Rigid-body modes (kernels/solvers/rigid_body_modes.py): shared data and functions for terms."""
 
 import functools
-import types as _types
 
 import warp as wp
 
-from .types import kernel_set, precision
+from .modules import KernelSet, kernel_set
+from .types import precision
 
 __all__ = ["RIGID_MODES", "bodies_struct", "rigid_mode_functions"]
 
@@ -35,7 +35,7 @@ def bodies_struct(dtype: str):
 
 
 @functools.cache
-def rigid_mode_functions(dtype: str) -> _types.SimpleNamespace:
+def rigid_mode_functions(dtype: str) -> KernelSet:
     """Device functions: columns of the matrix of rigid-body modes, R, at a slot."""
     mat33d = wp.mat33d
     Bodies = bodies_struct(dtype)

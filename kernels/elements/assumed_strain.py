@@ -6,11 +6,11 @@ quadrature are one symmetric matrix A per element, made on the host: the energy 
 """
 
 import functools
-import types as _types
 
 import warp as wp
 
-from ..common.types import double_1d, double_3d, int_1d, kernel_module, kernel_set, precision
+from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
+from ..common.types import double_1d, double_3d, int_1d, precision
 from .assumed_strain_block import assumed_shear_functions, assumed_strain_struct, coupling_entry_function
 from .element_slots import slot_access_functions
 from .matrix import (
@@ -35,7 +35,7 @@ def assumed_strain_kernels(
     midpoint: bool = False,
     worlds: bool = False,
     dissipative: bool = False,
-) -> _types.SimpleNamespace:
+) -> KernelSet:
     """Kernels of elements with assumed strains, with the arguments of `element_kernels`: one loop launches both.
 
     Args:
@@ -163,7 +163,7 @@ def assumed_strain_kernels(
         energy[0, world, block.element_offset + elem] = wp.float64(T(0.5) * wp.dot(e, s))
         energy[1, world, block.element_offset + elem] = wp.float64(0.0)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def tangent_product(
         block: Block,
         u: p.vec3_2d,
@@ -176,8 +176,6 @@ def assumed_strain_kernels(
     ):
         """K p (N): the change of `internal_force` with a change p of the slots; `active` 2: see `point_increment`."""
         world, elem = wp.tid()
-        if active[world] == 0:
-            return
         U = load_slots(block, u, world, elem)
         P = load_slots(block, direction, world, elem)
         x1, x2, e = kinematics(block, U, elem)
@@ -190,7 +188,7 @@ def assumed_strain_kernels(
                 e = step_shears(block, x1, x2, D, e, elem)
         store_forces(block, tangent_force(block, P, D, x1, x2, e, world, elem), world, elem, contribution)
 
-    @wp.kernel(module=prediction_module)
+    @masked_kernel(prediction_module, "active")
     def predicted_stress_product(
         block: Block,
         u: p.vec3_2d,
@@ -206,8 +204,6 @@ def assumed_strain_kernels(
         """`tangent_product` with the shear stress of the linear prediction; see
         kernels/elements/predicted_stress.py."""
         world, elem = wp.tid()
-        if active[world] == 0:
-            return
         U = load_slots(block, u, world, elem)
         x1, x2, e = kinematics(block, U, elem)
         if use_prediction[world] == 1:
@@ -218,12 +214,10 @@ def assumed_strain_kernels(
         P = load_slots(block, direction, world, elem)
         store_forces(block, tangent_force(block, P, Local(), x1, x2, e, world, elem), world, elem, contribution)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def diagonal_blocks(block: Block, u: p.vec3_2d, dq_dv: double_1d, active: int_1d, contribution: p.sym_2d):
         """The 3x3 diagonal blocks of K in Voigt order, without the geometric part: positive semi-definite, as A is."""
         world, elem = wp.tid()
-        if active[world] == 0:
-            return
         U = load_slots(block, u, world, elem)
         mu = block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0]
         for i in range(NS):
@@ -244,7 +238,7 @@ def assumed_strain_kernels(
                 K[0, 0], K[1, 1], K[2, 2], K[1, 2], K[0, 2], K[0, 1]
             )
 
-    @wp.kernel(module=matrix_module)
+    @masked_kernel(matrix_module, "active")
     def prepare_matrix(
         block: Block,
         u: p.vec3_2d,
@@ -262,8 +256,6 @@ def assumed_strain_kernels(
         Row `tie` holds x_a, row NT + tie x_b, and row 2 NT + tie the shear e_t in its first component.
         """
         world, tie, elem = wp.tid()
-        if active[world] == 0:
-            return
         da = vec3()
         dd = vec3()
         first = u[world, block.conn[0, elem]]
@@ -292,12 +284,10 @@ def assumed_strain_kernels(
         lines[world, NT + tie, elem] = d
         lines[world, 2 * NT + tie, elem] = vec3(shear, T(0.0), T(0.0))
 
-    @wp.kernel(module=matrix_module)
+    @masked_kernel(matrix_module, "active")
     def prepare_stress(block: Block, use_prediction: int_1d, active: int_1d, lines: p.vec3_3d):
         """s = mu A e of the ties, in the first components of the rows 3 NT + tie."""
         world, tie, elem = wp.tid()
-        if active[world] == 0:
-            return
         first = (tie / W) * W
         s = T(0.0)
         for k in range(W):
@@ -307,7 +297,7 @@ def assumed_strain_kernels(
             mu = T(0.0)  # no geometric part
         lines[world, 3 * NT + tie, elem] = vec3(midpoint_weight(mu) * s, T(0.0), T(0.0))
 
-    @wp.kernel(module=matrix_module)
+    @masked_kernel(matrix_module, "active")
     def element_matrix(
         block: Block,
         dq_dv: double_1d,
@@ -320,8 +310,6 @@ def assumed_strain_kernels(
     ):
         """K of each element by columns, stored as by `element_kernels`; `form` 1: without the geometric part."""
         world, index = wp.tid()
-        if active[world] == 0:
-            return
         elem, b, axis = matrix_column(index, block.count)
         mu = matrix_modulus(block, block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0])
         unit = vec3()
@@ -348,7 +336,7 @@ def assumed_strain_kernels(
                     out[a] = out[a] + block.derivative_a[t, a, elem] * dd + block.derivative_b[t, a, elem] * da
         store_column(out, b, axis, add, world, elem, matrix)
 
-    @wp.kernel(module=rows_module)
+    @masked_kernel(rows_module, "active")
     def element_matrix_panels(
         block: Block,
         u: p.vec3_2d,
@@ -364,8 +352,6 @@ def assumed_strain_kernels(
     ):
         """K = mu B^T A B + geometric part of each element by one thread, stored by panels as by `element_kernels`."""
         world, elem = wp.tid()
-        if active[world] == 0:
-            return
         mu = matrix_modulus(block, block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0])
         U = load_slots(block, u, world, elem)
         x1, x2, e = kinematics(block, U, elem)

@@ -1,11 +1,11 @@
 """Tables of elements with assumed shears, see assumed_strain.py, and the shears at their tying points."""
 
 import functools
-import types as _types
 
 import warp as wp
 
-from ..common.types import kernel_set, precision
+from ..common.modules import KernelSet, kernel_set
+from ..common.types import precision
 from .element_slots import slot_values_type
 
 __all__ = ["assumed_shear_functions", "assumed_strain_struct", "coupling_entry_function"]
@@ -55,7 +55,7 @@ def coupling_entry_function(dtype: str, worlds: bool, dissipative: bool = False)
 
 
 @functools.cache
-def assumed_shear_functions(dtype: str, slots: int, ties: int, dissipative: bool = False) -> _types.SimpleNamespace:
+def assumed_shear_functions(dtype: str, slots: int, ties: int, dissipative: bool = False) -> KernelSet:
     """Device functions of the shears; arguments as those of `assumed_strain_kernels`."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3

@@ -4,12 +4,12 @@ One thread processes one element of one world, with the functions of points.py.
 """
 
 import functools
-import types as _types
 
 import warp as wp
 
 from ..common.lanes import lane_functions, warp_minimum
-from ..common.types import double_1d, double_3d, int_1d, kernel_module, kernel_set
+from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
+from ..common.types import double_1d, double_3d, int_1d
 from . import materials
 from .matrix import matrix_kernels, scheme_suffix
 from .output import output_kernels
@@ -28,7 +28,7 @@ def element_kernels(
     framed: bool = False,
     midpoint: bool = False,
     dissipative: bool = False,
-) -> _types.SimpleNamespace:
+) -> KernelSet:
     """Kernels of one kind of element block.
 
     Args:
@@ -55,7 +55,7 @@ def element_kernels(
     name = f"element_{dtype}_{law}_{slots}_{form}_{damping}{scheme_suffix(midpoint, dissipative)}"
     module = kernel_module(name)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def internal_force(
         block: Block,
         u: p.vec3_2d,
@@ -75,8 +75,6 @@ def element_kernels(
         need J > 0 that of the points to `domain_J`: the vertices, included in `min_J`, have no energy barrier.
         """
         world, index = wp.tid()
-        if active[world] == 0:
-            return
         lane = index % lanes
         elem = wp.min(index / lanes, block.count - 1)
         c = fn.coefficients(block, world, elem)
@@ -131,12 +129,10 @@ def element_kernels(
             energy[0, world, block.element_offset + elem] = stored
             energy[1, world, block.element_offset + elem] = lost
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def inverted_elements(block: Block, before: p.vec3_2d, u: p.vec3_2d, active: int_1d, inverted: int_1d):
         """Flag the worlds with a quadrature point that had J > 0 at `before` and has J <= 0 at u."""
         world, elem = wp.tid()
-        if active[world] == 0:
-            return
         U = fn.load_slots(block, u, world, elem)
         past = fn.load_slots(block, before, world, elem)
         for point in range(block.shape_gradient.shape[0]):
@@ -144,12 +140,10 @@ def element_kernels(
                 if T(1.0) + t.volume_change(fn.field_gradient(block, past, point, elem)) > T(0.0):
                     inverted[world] = 1
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def largest_gradient(block: Block, direction: p.vec3_2d, active: int_1d, gradient_norm: double_1d):
         """Largest gradient of a direction at the quadrature points, as a norm: rotation or strain per unit step."""
         world, elem = wp.tid()
-        if active[world] == 0:
-            return
         P = fn.load_slots(block, direction, world, elem)
         most = T(0.0)
         for point in range(block.shape_gradient.shape[0]):
@@ -157,7 +151,7 @@ def element_kernels(
             most = wp.max(most, wp.ddot(G, G))
         wp.atomic_max(gradient_norm, world, wp.float64(wp.sqrt(most)))
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def tangent_product(
         block: Block,
         u: p.vec3_2d,
@@ -173,8 +167,6 @@ def element_kernels(
         `active` 2: see `point_increment`.
         """
         world, elem = wp.tid()
-        if active[world] == 0:
-            return
         U = fn.load_slots(block, u, world, elem)
         dU = fn.load_slots(block, direction, world, elem)
         V = Local()
@@ -183,12 +175,10 @@ def element_kernels(
         f = fn.tangent_force(block, U, dU, V, history, T(dq_dv[world]), active[world], world, elem)
         fn.store_forces(block, f, world, elem, contribution)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def diagonal_blocks(block: Block, u: p.vec3_2d, dq_dv: double_1d, active: int_1d, contribution: p.sym_2d):
         """The 3x3 diagonal blocks of K in Voigt order, positive semi-definite at each point, for preconditioners."""
         world, elem = wp.tid()
-        if active[world] == 0:
-            return
         c = fn.coefficients(block, world, elem)
         cv = fn.damping_coefficients(c, T(1.0) / T(dq_dv[world]))
         U = fn.load_slots(block, u, world, elem)

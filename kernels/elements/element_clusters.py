@@ -7,13 +7,13 @@ cluster, and arrays replace the shared memory.
 """
 
 import functools
-import types as _types
 from collections.abc import Callable
 
 import warp as wp
 
 from ..common.lanes import lane_functions
-from ..common.types import double_1d, int_1d, kernel_set, precision
+from ..common.modules import KernelSet, kernel_set
+from ..common.types import double_1d, int_1d, precision
 
 __all__ = [
     "CLUSTER_SIZE",
@@ -157,7 +157,7 @@ def _table_access(words: int) -> Callable:
 
 
 @functools.cache
-def cluster_functions(dtype: str, size: int, slots: int, fields: int) -> _types.SimpleNamespace:
+def cluster_functions(dtype: str, size: int, slots: int, fields: int) -> KernelSet:
     """Functions for kernels of elements with `slots` slots each that are processed in clusters of `size` elements.
 
     On the device, `fetch(pool, field, i, at)` returns a field (DISPLACEMENT, DIRECTION, VELOCITY) at slot i of element

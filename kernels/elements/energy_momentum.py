@@ -12,11 +12,11 @@ step, nothing in a rigid motion, and conserves both momenta, as any S does.
 """
 
 import functools
-import types as _types
 
 import warp as wp
 
-from ..common.types import kernel_set, precision
+from ..common.modules import KernelSet, kernel_set
+from ..common.types import precision
 from . import materials
 
 __all__ = ["energy_momentum_law"]
@@ -26,7 +26,7 @@ TINY_SQUARED_CHANGE = {"float64": 1.0e-60, "float32": 1.0e-30}
 
 
 @functools.cache
-def energy_momentum_law(name: str, dtype: str) -> _types.SimpleNamespace:
+def energy_momentum_law(name: str, dtype: str) -> KernelSet:
     """Device functions of the law `name`.
 
     mean_stress(G, D, c) is S, Pa; mean_increment(G, dE, c) approximates twice dS/dE1 : dE by the moduli at G, Pa;
@@ -49,12 +49,10 @@ def energy_momentum_law(name: str, dtype: str) -> _types.SimpleNamespace:
         """Twice dS/dE1 : dE, exact for S linear in E, Pa."""
         return m.pk2_stress(dE, c)
 
-    return _types.SimpleNamespace(
-        mean_stress=mean_stress, mean_increment=mean_increment, rest_moduli_increment=m.pk2_stress
-    )
+    return KernelSet(mean_stress=mean_stress, mean_increment=mean_increment, rest_moduli_increment=m.pk2_stress)
 
 
-def _discrete_gradient(dtype: str, second_invariant: bool) -> _types.SimpleNamespace:
+def _discrete_gradient(dtype: str, second_invariant: bool) -> KernelSet:
     """Discrete gradient of Mooney-Rivlin or neo-Hookean; c = (mu10, k, mu01), Pa.
 
     S = C^-1 (2 mu10 J^-2/3 dev(2 E) + 2 mu01 J^-4/3 dev((2 + 4 t) E - 4 E^2) + k (J - 1) J I) with t = tr E: the

@@ -16,11 +16,11 @@ can be added to any law; Eq. (62) has the form of St. Venant-Kirchhoff's Eq. (26
 """
 
 import functools
-import types as _types
 
 import warp as wp
 
-from ..common.types import kernel_set, precision
+from ..common.modules import KernelSet, kernel_set
+from ..common.types import precision
 
 __all__ = ["LAWS", "law_functions"]
 
@@ -31,7 +31,7 @@ ETA_INDEX, LAMBDA_V_INDEX = NCOEF - 2, NCOEF - 1
 
 
 @functools.cache
-def tensor_functions(dtype: str) -> _types.SimpleNamespace:
+def tensor_functions(dtype: str) -> KernelSet:
     """Small tensor functions shared by the laws."""
     p = precision(dtype)
     T, mat33, vec3 = p.T, p.mat33, p.vec3
@@ -74,7 +74,7 @@ def tensor_functions(dtype: str) -> _types.SimpleNamespace:
 
 
 @functools.cache
-def svk(dtype: str) -> _types.SimpleNamespace:
+def svk(dtype: str) -> KernelSet:
     """St. Venant-Kirchhoff, Eqs. (25)-(28) and (35); c = (lambda, mu), Pa."""
     p, t = precision(dtype), tensor_functions(dtype)
     T, mat33, vec3 = p.T, p.mat33, p.vec3
@@ -125,7 +125,7 @@ def svk(dtype: str) -> _types.SimpleNamespace:
 
 
 @functools.cache
-def mooney_rivlin(dtype: str, second_invariant: bool = True) -> _types.SimpleNamespace:
+def mooney_rivlin(dtype: str, second_invariant: bool = True) -> KernelSet:
     """Mooney-Rivlin, Eqs. (36)-(54), or with `second_invariant=False` neo-Hookean; c = (mu10, k, mu01), Pa.
 
     Written with the Kirchhoff stress tau, P = tau F^-T. With b = (F F^T - I)/2 and t = tr b,
@@ -252,13 +252,13 @@ def mooney_rivlin(dtype: str, second_invariant: bool = True) -> _types.SimpleNam
 
 
 @functools.cache
-def neo_hookean(dtype: str) -> _types.SimpleNamespace:
+def neo_hookean(dtype: str) -> KernelSet:
     """Neo-Hookean: Mooney-Rivlin without the second invariant; c = (mu/2, k)."""
     return mooney_rivlin(dtype, second_invariant=False)
 
 
 @functools.cache
-def orthotropic(dtype: str) -> _types.SimpleNamespace:
+def orthotropic(dtype: str) -> KernelSet:
     """Psi = E : D : E / 2 with D orthotropic in the axes of G: the remainder of an SVK law, integrated separately.
 
     c = (D11, D22, D33, D23, D13, D12, G23, G13, G12): S_ii = sum_j D_ij E_jj, S_ij = 2 G_ij E_ij.
@@ -333,6 +333,6 @@ DEFINED_FOR_ANY_J = ("svk", "orthotropic", "assumed_strain")
 """Laws defined for any F; the others need J > 0."""
 
 
-def law_functions(name: str, dtype: str) -> _types.SimpleNamespace:
+def law_functions(name: str, dtype: str) -> KernelSet:
     """Device functions of the law `name` in one precision."""
     return LAWS[name](dtype)

@@ -6,11 +6,11 @@ computes whole elements: it forms dP/dF once per quadrature point, and its vecto
 """
 
 import functools
-import types as _types
 
 import warp as wp
 
-from ..common.types import double_1d, int_1d, kernel_module, kernel_set, precision
+from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
+from ..common.types import double_1d, int_1d, precision
 from . import materials
 from .element_slots import slot_values_type
 
@@ -79,7 +79,7 @@ def store_column_function(dtype: str, slots: int) -> wp.Function:
     return store_column
 
 
-def matrix_kernels(fn: _types.SimpleNamespace, name: str) -> _types.SimpleNamespace:
+def matrix_kernels(fn: KernelSet, name: str) -> KernelSet:
     """Kernels `prepare_matrix`, `element_matrix`, `element_matrix_panels` of one kind of element block.
 
     Args:
@@ -181,7 +181,7 @@ def matrix_kernels(fn: _types.SimpleNamespace, name: str) -> _types.SimpleNamesp
             step = T(dq_dv) * (fn.load_slots(block, v, world, elem) - fn.load_slots(block, base, world, elem))
         return step
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def prepare_matrix(
         block: Block,
         u: p.vec3_2d,
@@ -200,8 +200,6 @@ def matrix_kernels(fn: _types.SimpleNamespace, name: str) -> _types.SimpleNamesp
         `element_matrix`; `base`: v at the previous iterate, for worlds with `use_prediction`.
         """
         world, point, elem = wp.tid()
-        if active[world] == 0:
-            return
         U, V = fn.load_slots(block, u, world, elem), load_velocities(block, v, world, elem)
         c = fn.coefficients(block, world, elem)
         step = load_last_change(block, v, base, use_prediction[world], dq_dv[world], world, elem)
@@ -233,7 +231,7 @@ def matrix_kernels(fn: _types.SimpleNamespace, name: str) -> _types.SimpleNamesp
             h = wp.transpose(block.material_axes[point, elem]) * h
         return h
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def element_matrix(
         block: Block,
         dq_dv: double_1d,
@@ -252,8 +250,6 @@ def matrix_kernels(fn: _types.SimpleNamespace, name: str) -> _types.SimpleNamesp
             add: 1: add to `matrix`, which holds K of another part of the energy.
         """
         world, index = wp.tid()
-        if active[world] == 0:
-            return
         elem, b, axis = matrix_column(index, block.count)
         c = fn.coefficients(block, world, elem)
         cv = fn.damping_coefficients(c, T(1.0) / T(dq_dv[world]))
@@ -349,7 +345,7 @@ def matrix_kernels(fn: _types.SimpleNamespace, name: str) -> _types.SimpleNamesp
             moduli += t.isotropic_moduli(cv[0], cv[1])
         return moduli
 
-    @wp.kernel(module=rows_module)
+    @masked_kernel(rows_module, "active")
     def element_matrix_panels(
         block: Block,
         u: p.vec3_2d,
@@ -372,8 +368,6 @@ def matrix_kernels(fn: _types.SimpleNamespace, name: str) -> _types.SimpleNamesp
             form, add: see `element_matrix`; base, use_prediction: see `prepare_matrix`.
         """
         world, elem = wp.tid()
-        if active[world] == 0:
-            return
         c = fn.coefficients(block, world, elem)
         moduli = tangent_moduli(block, c, dq_dv[world])
         U, V = fn.load_slots(block, u, world, elem), load_velocities(block, v, world, elem)

@@ -1,16 +1,15 @@
 """Kernels of table elements for particular scenes or outputs, one module each: history, viscous force, stress."""
 
-import types as _types
-
 import warp as wp
 
-from ..common.types import double_1d, double_2d, int_1d, kernel_module, kernel_set
+from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
+from ..common.types import double_1d, double_2d, int_1d
 from . import materials
 
 __all__ = ["output_kernels"]
 
 
-def output_kernels(fn: _types.SimpleNamespace, name: str) -> _types.SimpleNamespace:
+def output_kernels(fn: KernelSet, name: str) -> KernelSet:
     """Kernels of one kind of element block.
 
     Args:
@@ -26,14 +25,12 @@ def output_kernels(fn: _types.SimpleNamespace, name: str) -> _types.SimpleNamesp
     t, m, Block, Local = fn.tensors, fn.law, fn.Block, fn.Local
     ETA_INDEX, LAMBDA_V_INDEX = materials.ETA_INDEX, materials.LAMBDA_V_INDEX
 
-    @wp.kernel(module=history_module)
+    @masked_kernel(history_module, "active")
     def strain_history(
         block: Block, u0: p.vec3_2d, u1: p.vec3_2d, a0: double_1d, a1: double_1d, active: int_1d, history: p.sym_2d
     ):
         """a0 E(u0) - a1 E(u1) per point in the law's axes: reference of incremental strain rates."""
         world, elem = wp.tid()
-        if active[world] == 0:
-            return
         U0 = fn.load_slots(block, u0, world, elem)
         for point in range(block.shape_gradient.shape[0]):
             E = T(a0[world]) * t.green_lagrange(
@@ -46,7 +43,7 @@ def output_kernels(fn: _types.SimpleNamespace, name: str) -> _types.SimpleNamesp
                 )
             history[world, fn.history_index(block, point, elem)] = fn.to_voigt(E)
 
-    @wp.kernel(module=moving_module)
+    @masked_kernel(moving_module, "active")
     def strain_history_with_velocity(
         block: Block,
         u: p.vec3_2d,
@@ -60,8 +57,6 @@ def output_kernels(fn: _types.SimpleNamespace, name: str) -> _types.SimpleNamesp
         """E + b dE/dt + q_a d2E/dt2 per point in the law's axes: reference of strain rates for schemes with velocity
         and a."""
         world, elem = wp.tid()
-        if active[world] == 0:
-            return
         U = fn.load_slots(block, u, world, elem)
         V = fn.load_slots(block, v, world, elem)
         A = fn.load_slots(block, a, world, elem)
@@ -75,14 +70,12 @@ def output_kernels(fn: _types.SimpleNamespace, name: str) -> _types.SimpleNamesp
             E = t.green_lagrange(G) + T(b[world]) * t.sym(F * D) + T(q_a[world]) * t.sym(bend)
             history[world, fn.history_index(block, point, elem)] = fn.to_voigt(E)
 
-    @wp.kernel(module=viscous_module)
+    @masked_kernel(viscous_module, "active")
     def viscous_force(
         block: Block, u: p.vec3_2d, v: p.vec3_2d, active: int_1d, contribution: p.vec3_2d, power: double_2d
     ):
         """Kelvin-Voigt force (N), Eqs. (58)-(70), at a given state, and the power S_vis : Edot (W) lost."""
         world, elem = wp.tid()
-        if active[world] == 0:
-            return
         c = fn.coefficients(block, world, elem)
         U = fn.load_slots(block, u, world, elem)
         V = fn.load_slots(block, v, world, elem)

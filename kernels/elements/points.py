@@ -6,11 +6,11 @@ relative to the first slot of the element, which is a position: a rigid translat
 """
 
 import functools
-import types as _types
 
 import warp as wp
 
-from ..common.types import kernel_set, precision
+from ..common.modules import KernelSet, kernel_set
+from ..common.types import precision
 from . import materials
 from .element_slots import slot_access_functions, slot_values_type
 from .energy_momentum import energy_momentum_law
@@ -63,7 +63,7 @@ def point_functions(
     framed: bool,
     midpoint: bool = False,
     dissipative: bool = False,
-) -> _types.SimpleNamespace:
+) -> KernelSet:
     """Device functions for one kind of element block; the arguments are those of `element_kernels`.
 
     With `midpoint` the slots' values are those at the midpoint of a step, and velocities are replaced by half of the

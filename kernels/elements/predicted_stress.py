@@ -1,11 +1,11 @@
 """K p with the stress of the linear prediction in its geometric part, without a matrix: `predicted_stress_change`."""
 
 import functools
-import types as _types
 
 import warp as wp
 
-from ..common.types import double_1d, int_1d, kernel_module
+from ..common.modules import KernelSet, kernel_module, masked_kernel
+from ..common.types import double_1d, int_1d
 from .points import point_functions
 
 __all__ = ["predicted_stress_product"]
@@ -14,14 +14,14 @@ __all__ = ["predicted_stress_product"]
 @functools.cache
 def predicted_stress_product(dtype: str, law: str, slots: int, affine: bool, framed: bool) -> wp.Kernel:
     """Kernel for one kind of element block, without viscosity; arguments as those of `element_kernels`."""
-    fn: _types.SimpleNamespace = point_functions(dtype, law, slots, affine, None, framed)
+    fn: KernelSet = point_functions(dtype, law, slots, affine, None, framed)
     p = fn.types
     T, mat33 = p.T, p.mat33
     Block, t = fn.Block, fn.tensors
     form = "affine" if affine else "framed" if framed else "table"
     module = kernel_module(f"element_{dtype}_{law}_{slots}_{form}_mixed")
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def product(
         block: Block,
         u: p.vec3_2d,
@@ -37,8 +37,6 @@ def predicted_stress_product(dtype: str, law: str, slots: int, affine: bool, fra
         """K p (N); `base`: v at the previous iterate, for worlds with `use_prediction` 1; `use_prediction` 2: positive
         semi-definite form."""
         world, elem = wp.tid()
-        if active[world] == 0:
-            return
         c = fn.coefficients(block, world, elem)
         dq = T(dq_dv[world])
         U = fn.load_slots(block, u, world, elem)

@@ -16,10 +16,9 @@ Forces are the transpose: of the stress Q_v at a point slot e(v, b) takes 4 s Q_
 From one point to the next only H of each field and B are kept; forces lie beside the fields in the memory of a cluster.
 """
 
-import types as _types
-
 import warp as wp
 
+from ..common.modules import KernelSet
 from .element_clusters import DIRECTION, DISPLACEMENT, VELOCITY
 
 __all__ = ["vertex_product"]
@@ -42,7 +41,7 @@ def register_barrier():
     """Discard values held in registers: fewer registers let more blocks run at once."""
 
 
-def vertex_product(points: int, fn: _types.SimpleNamespace, shared: _types.SimpleNamespace) -> wp.Function:
+def vertex_product(points: int, fn: KernelSet, shared: KernelSet) -> wp.Function:
     """Device function `product`, which sets the forces of an element in this form.
 
     Args:

@@ -4,7 +4,7 @@ import functools
 
 import warp as wp
 
-from ..common.types import kernel_module
+from ..common.modules import kernel_module
 from .element_clusters import DIRECTION, DISPLACEMENT, VELOCITY, cluster_functions
 from .matrix import scheme_suffix
 from .points import point_functions

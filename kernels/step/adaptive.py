@@ -17,12 +17,12 @@ times that after 0.1, 0.2 and 0.4 s.
 """
 
 import functools
-import types as _types
 from typing import Any
 
 import warp as wp
 
-from ..common.types import kernel_module, kernel_set, precision
+from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
+from ..common.types import precision
 from ..solvers.newton_control import FAIL_LOCAL_ERROR, FAIL_ROUNDOFF, control_struct
 from ..solvers.pcg import pcg_struct
 from .step_control import step_end_functions, step_struct
@@ -85,7 +85,7 @@ def adaptive_struct():
 
 
 @functools.cache
-def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
+def adaptive_kernels(dtype: str, scheme: Any) -> KernelSet:
     """Kernels in one precision.
 
     Args:
@@ -205,14 +205,12 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
                 return 1
         return 0
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "step.accepted")
     def update_mean_rates(
         step: Step, ctl: Adaptive, v: p.vec3_2d, v_n: p.vec3_2d, v_before: p.vec3_2d, means: p.vec3_2d
     ):
         """Update the mean with the rate of an accepted substep; reset it after a substep of order 1."""
         world, slot = wp.tid()
-        if step.accepted[world] == 0:
-            return
         mean = vec3()
         if is_first_substep(step, world) == 0:
             rate = error_rate(step, ctl, world, v[world, slot], v_n[world, slot], v_before[world, slot])
@@ -227,12 +225,10 @@ def adaptive_kernels(dtype: str, scheme: Any) -> _types.SimpleNamespace:
             out = out * x
         return out
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "step.running")
     def control_step_size(step: Step, newton: Newton, pcg: PCG, ctl: Adaptive):
         """Reject a substep with too large an error; choose the size of the next."""
         world = wp.tid()
-        if step.running[world] == 0:
-            return
         h = step.h[world]
         if ctl.estimate_requested[world] == 0:
             ctl.control_state[world, 0] = f64(0.5) * h

@@ -1,12 +1,12 @@
 """Energy ledger of a step: stored energy, losses, and work of loads, supports and fields."""
 
 import functools
-import types as _types
 
 import warp as wp
 
+from ..common.modules import KernelSet, kernel_set, masked_kernel
 from ..common.structs import balance_struct, mass_function, topology_struct
-from ..common.types import double_2d, kernel_set, precision
+from ..common.types import double_2d, precision
 from ..solvers.newton_control import control_struct
 from .step_control import GROWTH_COLUMNS, step_struct
 
@@ -65,7 +65,7 @@ def term_energies_struct():
 
 
 @functools.cache
-def ledger_kernels(dtype: str, chord: bool, nonpotential: bool, module: wp.Module) -> _types.SimpleNamespace:
+def ledger_kernels(dtype: str, chord: bool, nonpotential: bool, module: wp.Module) -> KernelSet:
     """Kernels of the energy ledger, in the module of the step's; arguments as those of `step_kernels`.
 
     `chord`: the inertia's part of the integrator work is its work along the chord less the change of kinetic energy.
@@ -108,13 +108,11 @@ def ledger_kernels(dtype: str, chord: bool, nonpotential: bool, module: wp.Modul
         if share > step.growth_warn_limit and step.energy_growth[world, GROWTH_SINCE] == f64(0.0):
             step.energy_growth[world, GROWTH_SINCE] = step.time[world]
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "step.accepted")
     def ledger_terms(step: Step, topo: Topology, balance: Balance, lumped: p.scalar_2d, u_n: p.vec3_2d, v_n: p.vec3_2d):
         """Per slot: integrator's inertia part, f_int.dq, loads.dq, gravity.dq, supports.dq, kinetic, free g.dq,
         nonpotential.dq, inertia.dq, gravity.u."""
         world, slot = wp.tid()
-        if step.accepted[world] == 0:
-            return
         Mv = vec3()
         for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
             Mv += mass_entry(topo, world, k) * balance.v[world, topo.mass_column[k]]
@@ -138,7 +136,7 @@ def ledger_kernels(dtype: str, chord: bool, nonpotential: bool, module: wp.Modul
         balance.rows[8, world, slot] = f64(wp.dot(a, dq))
         balance.rows[9, world, slot] = f64(wp.dot(weight, balance.u[world, slot]))
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "step.accepted")
     def update_ledger(step: Step, newton: Newton, sums: double_2d, energies: TermEnergies, ledger: double_2d):
         """Add a substep to the ledger; the integrator part by its own formula, never as the remainder.
 
@@ -146,8 +144,6 @@ def ledger_kernels(dtype: str, chord: bool, nonpotential: bool, module: wp.Modul
         the integrator's, or for a non-conservative force the work of fields.
         """
         world = wp.tid()
-        if step.accepted[world] == 0:
-            return
         kinetic = sums[5, world]
         strain = newton.elem_sums[0, world]
         change_K = kinetic - ledger[world, 0]

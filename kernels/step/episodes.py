@@ -2,11 +2,11 @@
 
 import functools
 import math
-import types as _types
 
 import warp as wp
 
-from ..common.types import double_1d, double_2d, int_1d, kernel_module, kernel_set, precision, vec3d_1d
+from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
+from ..common.types import double_1d, double_2d, int_1d, precision, vec3d_1d
 from .step_control import REPORT_COLUMNS, SAME_TIME_FRACTION, STATUS
 
 __all__ = ["JOINT_VALUE_KINDS", "MOTION_KINDS", "RUN_STATISTICS", "episode_kernels", "observation_kernels"]
@@ -22,7 +22,7 @@ JOINT_VALUE_KINDS = {"length": 0, "travel": 1, "angle": 2}
 
 
 @functools.cache
-def episode_kernels() -> _types.SimpleNamespace:
+def episode_kernels() -> KernelSet:
     """Kernels with one thread per world."""
     f64 = wp.float64
     module = kernel_module("loops", light=True)
@@ -63,25 +63,23 @@ def episode_kernels() -> _types.SimpleNamespace:
         world, k = wp.tid()
         sums[world, k] = wp.where(k < wp.static(FIRST_MINIMUM_COLUMN), f64(0.0), f64(wp.inf))
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "flags")
     def copy_flagged(flags: int_1d, source: double_1d, target: double_1d):
         """Copy a number in the flagged worlds."""
         world = wp.tid()
-        if flags[world] != 0:
-            target[world] = source[world]
+        target[world] = source[world]
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "flags")
     def clear_flagged(flags: int_1d, target: int_1d):
         """Clear a flag in the flagged worlds."""
         world = wp.tid()
-        if flags[world] != 0:
-            target[world] = 0
+        target[world] = 0
 
     return kernel_set(locals())
 
 
 @functools.cache
-def observation_kernels(dtype: str) -> _types.SimpleNamespace:
+def observation_kernels(dtype: str) -> KernelSet:
     """Kernels in one precision that fill a table [world, column]."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3

@@ -4,15 +4,15 @@ Contributions are gathered per slot in a fixed order, not added atomically: repr
 """
 
 import functools
-import types as _types
 
 import warp as wp
 
 from ..common.inverse import inverse_function
 from ..common.lanes import lane_functions
+from ..common.modules import SHORT_UNROLL, KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.structs import balance_struct, mass_function, pattern_struct, product_terms_struct, topology_struct
 from ..common.traits import NO_TERMS, Traits
-from ..common.types import SHORT_UNROLL, double_1d, double_3d, int_1d, kernel_module, kernel_set, precision
+from ..common.types import double_1d, double_3d, int_1d, precision
 from ..solvers.newton_control import (
     ROW_FORCE,
     ROW_FROZEN_CHANGE,
@@ -43,7 +43,7 @@ REACTION_FRACTION = wp.constant(wp.float64(1.0e-6))
 
 
 @functools.cache
-def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
+def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> KernelSet:
     """Kernels over slots; traits used: "nonpotential", "tangent", "pooled", "constraint_rows" and "midpoint"."""
     nonpotential, tangent, pooled, constraint_rows = (
         traits.nonpotential,
@@ -136,15 +136,13 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             s += f64(a[k]) * f64(a[k])
         return s
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def gather_force(topo: Topology, contribution: p.vec3_2d, active: int_1d, out: p.vec3_2d):
         """out = sum of contributions."""
         world, slot = wp.tid()
-        if active[world] == 0:
-            return
         out[world, slot] = gather_sum(topo, contribution, world, slot)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def residual(
         topo: Topology, contribution: p.vec3_2d, balance: Balance, active: int_1d, con: Constraints, mul: Multipliers
     ):
@@ -153,8 +151,6 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         `gradient` is that of the augmented potential, g + J^T rho c, the right side of the next Newton step.
         """
         world, slot = wp.tid()
-        if active[world] == 0:
-            return
         f = gather_sum(topo, contribution, world, slot)
         own = f
         if wp.static(pooled):
@@ -294,7 +290,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             share = add_term_products(topo, h, more, pool, p_in[world, slot], con, mul, world, slot, out)
         store_sum(0, share, slot, more.warp_lanes, world, rows)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def operator_product(
         topo: Topology,
         contribution: p.vec3_2d,
@@ -308,8 +304,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
     ):
         """H p = c_M M p + (dq/dv) K p on the free components, constraints included, and p.Hp per warp of slots."""
         world, slot = wp.tid()
-        if active[world] != 0:
-            slot_product(topo, contribution, True, more, p_in, con, mul, world, slot, out, rows)
+        slot_product(topo, contribution, True, more, p_in, con, mul, world, slot, out, rows)
 
     @wp.kernel(module=module, launch_bounds=(256, MIN_RESIDENT_BLOCKS[dtype]))
     def with_mass_sum(
@@ -328,7 +323,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
         if active[world] != 0:
             slot_product(topo, contribution, False, more, p_in, con, mul, world, slot, out, rows)
 
-    @wp.kernel(module=matrix_module)
+    @masked_kernel(matrix_module, "active")
     def matrix_product(
         topo: Topology,
         pattern: Pattern,
@@ -344,8 +339,6 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
     ):
         """H p with the elements' part and the mass as one matrix, `lanes` threads per row."""
         world, index = wp.tid()
-        if active[world] == 0:
-            return
         slot = index / lanes
         lane = index % lanes
         h = vec3()
@@ -360,7 +353,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
             share = add_term_products(topo, h, more, pool, p_in[world, slot], con, mul, world, slot, out)
         store_sum(0, share, index, more.warp_lanes, world, rows)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def gather_diagonal_blocks(
         topo: Topology,
         contribution: p.sym_2d,
@@ -373,8 +366,6 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> _types.SimpleNamesp
     ):
         """Diagonal blocks of H: their diagonal D and their inverse on the free components."""
         world, slot = wp.tid()
-        if active[world] == 0:
-            return
         k6 = sym6()
         for k in range(topo.contribution_start[slot], topo.contribution_start[slot + 1]):
             k6 += contribution[world, topo.contribution_entry[k]]

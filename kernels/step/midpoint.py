@@ -1,23 +1,23 @@
 """Midpoint of a step, where the conserving scheme evaluates its forces."""
 
 import functools
-import types as _types
 
 import warp as wp
 
-from ..common.types import double_1d, int_1d, kernel_module, kernel_set, precision
+from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
+from ..common.types import double_1d, int_1d, precision
 
 __all__ = ["midpoint_kernels"]
 
 
 @functools.cache
-def midpoint_kernels(dtype: str) -> _types.SimpleNamespace:
+def midpoint_kernels(dtype: str) -> KernelSet:
     """The kernel `evaluate_midpoint` in one precision of the vectors."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
     module = kernel_module(f"stage_{dtype}")
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def evaluate_midpoint(
         u_n: p.vec3_2d,
         v_n: p.vec3_2d,
@@ -29,9 +29,8 @@ def midpoint_kernels(dtype: str) -> _types.SimpleNamespace:
     ):
         """Half of the change of u, (dq/dv) (v_n + v)/2, and u at the midpoint, m; without differences of positions."""
         world, slot = wp.tid()
-        if active[world] != 0:
-            half = (T(0.5) * T(dq_dv[world])) * (v_n[world, slot] + v[world, slot])
-            u_stage[world, slot] = u_n[world, slot] + half
-            v_stage[world, slot] = half
+        half = (T(0.5) * T(dq_dv[world])) * (v_n[world, slot] + v[world, slot])
+        u_stage[world, slot] = u_n[world, slot] + half
+        v_stage[world, slot] = half
 
     return kernel_set(locals())

@@ -5,12 +5,12 @@ the best for the last step. It saves a third of the PCG iterations in smooth mot
 """
 
 import functools
-import types as _types
 
 import warp as wp
 
+from ..common.modules import KernelSet, kernel_set, masked_kernel
 from ..common.structs import free_components_function
-from ..common.types import double_3d, kernel_set, precision
+from ..common.types import double_3d, precision
 from ..solvers.newton_control import control_struct
 from .step_control import step_struct
 
@@ -43,7 +43,7 @@ def predictor_struct():
 
 
 @functools.cache
-def predictor_kernels(dtype: str, accelerated: bool, module: wp.Module) -> _types.SimpleNamespace:
+def predictor_kernels(dtype: str, accelerated: bool, module: wp.Module) -> KernelSet:
     """Kernels in one precision, compiled into the module of the step kernels; `accelerated`: see `step_kernels`."""
     p, free_components = precision(dtype), free_components_function(dtype)
     T, vec3 = p.T, p.vec3
@@ -90,7 +90,7 @@ def predictor_kernels(dtype: str, accelerated: bool, module: wp.Module) -> _type
         new = extrapolated_velocity(order, v_n[world, slot], before[world, slot], first[world, slot])
         v[world, slot] = free_components(free[slot], new, v[world, slot])
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "step.accepted")
     def order_error_terms(
         predictor: Predictor,
         step: Step,
@@ -108,8 +108,6 @@ def predictor_kernels(dtype: str, accelerated: bool, module: wp.Module) -> _type
         Rows 0 to 2: the orders; row 3: the squared velocity.
         """
         world, slot = wp.tid()
-        if step.accepted[world] == 0:
-            return
         D = wp.cw_mul(diagonal[world, slot], free[slot])
         w = v[world, slot]
         a = v_n[world, slot]
@@ -125,21 +123,18 @@ def predictor_kernels(dtype: str, accelerated: bool, module: wp.Module) -> _type
             rows[order, world, slot] = f64(wp.dot(D, wp.cw_mul(e, e)))
         rows[3, world, slot] = f64(wp.dot(D, wp.cw_mul(w, w)))
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "step.accepted")
     def shift_history(step: Step, own: int, v_n: p.vec3_2d, before: p.vec3_2d, first: p.vec3_2d):
         """Shift the stored velocities by a step; `own`: v_{n-1} too, which multistep schemes store themselves."""
         world, slot = wp.tid()
-        if step.accepted[world] != 0:
-            first[world, slot] = before[world, slot]
-            if own != 0:
-                before[world, slot] = v_n[world, slot]
+        first[world, slot] = before[world, slot]
+        if own != 0:
+            before[world, slot] = v_n[world, slot]
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "step.accepted")
     def choose_order(predictor: Predictor, step: Step):
         """Order of the next step: the smallest error, with a margin for higher orders."""
         world = wp.tid()
-        if step.accepted[world] == 0:
-            return
         count = predictor.history_count[world]
         best = int(0)  # noqa: RUF046 - a variable of the loop
         least = f64(ORDER_MARGIN) * predictor.sums[0, world]

@@ -6,14 +6,14 @@ fraction of dt.
 """
 
 import functools
-import types as _types
 from typing import Any
 
 import warp as wp
 
+from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.structs import free_components_function
 from ..common.traits import NO_TERMS, Traits
-from ..common.types import double_2d, int_1d, kernel_module, kernel_set, precision
+from ..common.types import double_2d, int_1d, precision
 from ..solvers.newton_control import FAIL_ELEMENT_INVERTED, FAIL_ENERGY_GROWTH, FAIL_ROUNDOFF, FAIL_WORK, control_struct
 from ..solvers.pcg import pcg_struct
 from .energy_ledger import GROWTH_SHARE, ledger_kernels
@@ -30,7 +30,7 @@ MAX_EXTRAPOLATED_GROWTH = 4.0
 
 
 @functools.cache
-def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
+def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSet:
     """Kernels of the step loop.
 
     Args:
@@ -139,7 +139,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
             step.mass_factor[world] = c.mass_factor
             step.load_factor[world] = f64(1.0)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "step.running")
     def predict(
         step: Step,
         is_position: p.scalar_1d,
@@ -158,8 +158,6 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         then of second order in h, as stiff rotating bodies require. With accelerations it is v_n + h g.
         """
         world, slot = wp.tid()
-        if step.running[world] == 0:
-            return
         q = u_n[world, slot]
         w = v_n[world, slot]
         if wp.static(static):
@@ -194,7 +192,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
         keep = (T(1.0) / dq) * (u_n[world, slot] - q)
         v[world, slot] = free_components(free[slot], first, keep)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "newton.start.has_alternatives")
     def alternative_first_iterate(
         step: Step,
         newton: Newton,
@@ -209,8 +207,6 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
     ):
         """Alternative first iterate on the free components: 0: v~ + (dq/dv) g, 1: v_n, 2: the one with q = q_n."""
         world, slot = wp.tid()
-        if newton.start.has_alternatives[world] == 0:
-            return
         dq = T(step.dq_dv[world])
         new = v_n[world, slot]
         if kind == 0:
@@ -224,12 +220,10 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
             new = (T(1.0) / dq) * (u_n[world, slot] - q_tilde[world, slot])
         v[world, slot] = free_components(free[slot], new, v[world, slot])
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "step.running")
     def end_attempt(step: Step, newton: Newton):
         """Accept the substep, or refuse and halve it."""
         world = wp.tid()
-        if step.running[world] == 0:
-            return
         if newton.inverted[world] != 0 and newton.failed[world] == 0:
             newton.failed[world] = FAIL_ELEMENT_INVERTED
         if newton.failed[world] == 0:
@@ -281,7 +275,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
             flags[world] = 1
             newton.strain_energy[world] = newton.strain_energy_start[world]
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "step.accepted")
     def accept_state(
         step: Step,
         newton: Newton,
@@ -294,8 +288,6 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> _types.S
     ):
         """Store the accepted iterate in the state."""
         world, slot = wp.tid()
-        if step.accepted[world] == 0:
-            return
         if wp.static(multistep):
             u_before[world, slot] = u_n[world, slot]
             v_before[world, slot] = v_n[world, slot]

@@ -1,11 +1,10 @@
 """Step control data of each world, report columns, time integration coefficients."""
 
 import functools
-import types as _types
 
 import warp as wp
 
-from ..common.types import kernel_set
+from ..common.modules import KernelSet, kernel_set
 
 __all__ = [
     "GROWTH_COLUMNS",
@@ -119,7 +118,7 @@ def step_struct():
 
 
 @functools.cache
-def step_end_functions() -> _types.SimpleNamespace:
+def step_end_functions() -> KernelSet:
     """Device functions: time at which a run or world ends, its tolerance, and the step that matches it."""
     f64 = wp.float64
     Step = step_struct()

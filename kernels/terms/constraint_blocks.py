@@ -1,13 +1,13 @@
 """Contributions of constraints to the matrix of H."""
 
 import functools
-import types as _types
 
 import warp as wp
 
 from ..common.block_entries import add_block_function
+from ..common.modules import SHORT_UNROLL, KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.structs import pattern_struct, topology_struct
-from ..common.types import SHORT_UNROLL, double_1d, double_2d, int_1d, kernel_module, kernel_set, precision, vec3d_2d
+from ..common.types import double_1d, double_2d, int_1d, precision, vec3d_2d
 from .constraints import ANGLE, DISTANCE, FORMULA, constraint_struct, multiplier_struct
 
 __all__ = ["constraint_block_kernels", "coupling_struct"]
@@ -29,7 +29,7 @@ def coupling_struct():
 
 
 @functools.cache
-def constraint_block_kernels(dtype: str) -> _types.SimpleNamespace:
+def constraint_block_kernels(dtype: str) -> KernelSet:
     """Kernels that add the constraints' part to a matrix, in one precision of its blocks."""
     p = precision(dtype)
     mat33 = p.mat33
@@ -39,7 +39,7 @@ def constraint_block_kernels(dtype: str) -> _types.SimpleNamespace:
     add_block = add_block_function(dtype)
     module = kernel_module(f"couplings_{dtype}", max_unroll=SHORT_UNROLL)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def add_penalties(
         topo: Topology,
         pattern: Pattern,
@@ -52,8 +52,6 @@ def constraint_block_kernels(dtype: str) -> _types.SimpleNamespace:
     ):
         """value += (dq/dv) J^T rho J."""
         world, item = wp.tid()
-        if active[world] == 0:
-            return
         A = wp.mat33d()
         for k in range(pairs.start[item], pairs.start[item + 1]):
             factor = pairs.weight[k] * dq_dv[world] * stiffness[world, pairs.term_a[k] / 3]
@@ -83,7 +81,7 @@ def constraint_block_kernels(dtype: str) -> _types.SimpleNamespace:
             return scale * one
         return wp.mat33d()
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def add_tangent(
         topo: Topology,
         pattern: Pattern,
@@ -97,8 +95,6 @@ def constraint_block_kernels(dtype: str) -> _types.SimpleNamespace:
     ):
         """value += (dq/dv) (J^T rho J + midpoint_factor sum lambda d2c/dq2), as gradients move with u."""
         world, item = wp.tid()
-        if active[world] == 0:
-            return
         A = wp.mat33d()
         for k in range(pairs.start[item], pairs.start[item + 1]):
             a = pairs.term_a[k]

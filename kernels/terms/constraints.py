@@ -13,11 +13,11 @@ of the round-off of large coordinates. One thread per (world, row); slots gather
 """
 
 import functools
-import types as _types
 
 import warp as wp
 
-from ..common.types import double_1d, double_2d, int_1d, int_2d, kernel_module, kernel_set, precision, vec3d_2d
+from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
+from ..common.types import double_1d, double_2d, int_1d, int_2d, precision, vec3d_2d
 
 __all__ = [
     "ANGLE",
@@ -136,7 +136,7 @@ def joint_struct():
 
 
 @functools.cache
-def constraint_functions(dtype: str) -> _types.SimpleNamespace:
+def constraint_functions(dtype: str) -> KernelSet:
     """Device functions of the vectors, values and gradients of rows."""
     p = precision(dtype)
     vec3 = p.vec3
@@ -200,7 +200,7 @@ def constraint_functions(dtype: str) -> _types.SimpleNamespace:
 
 
 @functools.cache
-def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNamespace:
+def constraint_kernels(dtype: str, midpoint: bool = False) -> KernelSet:
     """Kernels of the constraints for one precision of the slots.
 
     `midpoint`: rows hold at the end of a step; forces act along a midpoint gradient, (a0 + a1) / (|a0| + |a1|) of a
@@ -226,12 +226,11 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
             return wp.matrix_from_rows(-s * b, c * a2 - s * a, c * b)
         return wp.matrix_from_rows(scale * b, scale * a, vec3d())
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def reset_violation(active: int_1d, mul: Multipliers):
         """Reset the largest violations before an evaluation."""
         world, component = wp.tid()
-        if active[world] != 0:
-            mul.violation[world, component] = f64(0.0)
+        mul.violation[world, component] = f64(0.0)
 
     @wp.kernel(module=module)
     def evaluate(
@@ -290,12 +289,10 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
         store_gradients(mul.gradient, world, row, constraint_gradients(kind, scale, angle, slope, b, a2))
         store_value(con, mul, alpha[world], world, row, scale, f, c)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def product_terms(con: Constraints, mul: Multipliers, p_in: p.vec3_2d, dq_dv: double_1d, active: int_1d):
         """Contributions to (dq/dv) (rho J^T J + sum lambda d2c/dq2) p, one vector per term."""
         world, row = wp.tid()
-        if active[world] == 0:
-            return
         kind = con.kind[row]
         a = term_vector(con, 3 * row, p_in, world)
         b = term_vector(con, 3 * row + 1, p_in, world)
@@ -328,51 +325,45 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
         mul.product[world, 3 * row + 1] = penalty_part * Gb + force * curvature_part[1]
         mul.product[world, 3 * row + 2] = penalty_part * Gc + force * curvature_part[2]
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def load_multipliers(state: double_2d, last_target: double_2d, active: int_1d, mul: Multipliers):
         """Warm start: multipliers and right sides of the last accepted step."""
         world, row = wp.tid()
-        if active[world] == 0:
-            return
         mul.last_target[world, row] = last_target[world, row]
         mul.multiplier[world, row] = state[world, row]
         mul.trial_multiplier[world, row] = state[world, row]
         mul.multiplier_change[world, row] = f64(0.0)
         mul.penalty[world, row] = f64(0.0)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def predict_change(
         con: Constraints, mul: Multipliers, direction: p.vec3_2d, converged: int_2d, dq_dv: double_1d, active: int_1d
     ):
         """Change of lambda in a full Newton step, rho (c + (dq/dv) J p); 0 in converged components."""
         world, row = wp.tid()
-        if active[world] == 0:
-            return
         mul.multiplier_change[world, row] = f64(0.0)
         if converged[world, con.connected_component[row]] == 0:
             change = dq_dv[world] * directional_derivative(con, mul.end_gradient, direction, world, row)
             mul.multiplier_change[world, row] = mul.penalty[world, row] * (mul.constraint_value[world, row] + change)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "flags")
     def accept_trial(flags: int_1d, mul: Multipliers):
         """Make the trial's multipliers those of the iterate; clear their change, for another evaluation of it."""
         world, row = wp.tid()
-        if flags[world] != 0:
-            mul.multiplier[world, row] = mul.trial_multiplier[world, row]
-            mul.multiplier_change[world, row] = f64(0.0)
+        mul.multiplier[world, row] = mul.trial_multiplier[world, row]
+        mul.multiplier_change[world, row] = f64(0.0)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "accepted")
     def store_multipliers(
         accepted: int_1d, mul: Multipliers, state: double_2d,
         last_target: double_2d,
     ):  # fmt: skip
         """Store the multipliers and right sides of an accepted step in the state."""
         world, row = wp.tid()
-        if accepted[world] != 0:
-            state[world, row] = mul.trial_multiplier[world, row]
-            last_target[world, row] = mul.target[world, row]
+        state[world, row] = mul.trial_multiplier[world, row]
+        last_target[world, row] = mul.target[world, row]
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "accepted")
     def work_terms(
         con: Constraints, mul: Multipliers, u: p.vec3_2d, u_n: p.vec3_2d, last_target: double_2d, accepted: int_1d
     ):
@@ -382,8 +373,6 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> _types.SimpleNames
         work of its drive alone.
         """
         world, row = wp.tid()
-        if accepted[world] == 0:
-            return
         moved = f64(0.0)  # J dq
         for term in range(3 * row, 3 * row + 3):
             s = vec3d()

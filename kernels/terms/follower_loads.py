@@ -1,11 +1,11 @@
 """Follower loads: pressure on faces, moments, and the symmetric part of their tangents."""
 
 import functools
-import types as _types
 
 import warp as wp
 
-from ..common.types import int_1d, kernel_module, kernel_set, precision, vec3d_2d
+from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
+from ..common.types import int_1d, precision, vec3d_2d
 
 __all__ = ["follower_struct", "moment_kernels", "pressure_kernels"]
 
@@ -38,7 +38,7 @@ def follower_struct(dtype: str):
 
 
 @functools.cache
-def pressure_kernels(dtype: str) -> _types.SimpleNamespace:
+def pressure_kernels(dtype: str) -> KernelSet:
     """Kernels of pressures, Pa, on faces."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
@@ -73,12 +73,10 @@ def pressure_kernels(dtype: str) -> _types.SimpleNamespace:
         for i in range(data.conn.shape[0]):
             contribution[world, data.first_entry + i * data.item_count + item] = vec3()
 
-    @wp.kernel(module=pressure_module)
+    @masked_kernel(pressure_module, "active")
     def pressure_force(data: FollowerLoads, u: p.vec3_2d, value: vec3d_2d, active: int_1d, contribution: p.vec3_2d):
         """f_i = - int p s_i (x_a x x_b): pressure p against the current outward normal of a face."""
         world, item = wp.tid()
-        if active[world] == 0:
-            return
         clear_contribution(data, world, item, contribution)
         for q in range(data.weight.shape[0]):
             normal = wp.cross(
@@ -90,7 +88,7 @@ def pressure_kernels(dtype: str) -> _types.SimpleNamespace:
                 k = data.first_entry + i * data.item_count + item
                 contribution[world, k] = contribution[world, k] + data.shape[q, i, item] * f
 
-    @wp.kernel(module=pressure_module)
+    @masked_kernel(pressure_module, "active")
     def pressure_tangent_product(
         data: FollowerLoads,
         midpoint_factor: T,
@@ -105,8 +103,6 @@ def pressure_kernels(dtype: str) -> _types.SimpleNamespace:
         `midpoint_factor`: ratio of the stage's displacement increment to that of the step, 1/2 for midpoint schemes.
         """
         world, item = wp.tid()
-        if active[world] == 0:
-            return
         clear_contribution(data, world, item, contribution)
         for q in range(data.weight.shape[0]):
             a = surface_tangent(data, data.shape_da, u, world, q, item)
@@ -131,7 +127,7 @@ def pressure_kernels(dtype: str) -> _types.SimpleNamespace:
 
 
 @functools.cache
-def moment_kernels(dtype: str, vectors: int) -> _types.SimpleNamespace:
+def moment_kernels(dtype: str, vectors: int) -> KernelSet:
     """Kernels of moments, N m, that work on the angular velocity of a point's material vectors y_k = sum_i c_ki e_i.
 
     Args:
@@ -225,18 +221,16 @@ def moment_kernels(dtype: str, vectors: int) -> _types.SimpleNamespace:
         """Current vectors: their reference values (the axes) plus displacements."""
         return data.reference_vectors[item] + interpolate_vectors(data, u, world, item)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def moment_force(data: FollowerLoads, u: p.vec3_2d, value: vec3d_2d, active: int_1d, contribution: p.vec3_2d):
         """f_i = sum_k c_ki phi_k with phi of `vector_forces`."""
         world, item = wp.tid()
-        if active[world] == 0:
-            return
         m = data.moment_fraction[item] * vec3(value[world, data.time_law[item]])
         phi = vector_forces(current_vectors(data, u, world, item), m)
         for i in range(data.conn.shape[0]):
             contribution[world, data.first_entry + i * data.item_count + item] = phi * data.vector_coefficients[i, item]
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def moment_tangent_product(
         data: FollowerLoads,
         midpoint_factor: T,
@@ -248,8 +242,6 @@ def moment_kernels(dtype: str, vectors: int) -> _types.SimpleNamespace:
     ):
         """(K + K^T)/2 d with K = df/dq, d a direction; `midpoint_factor`: as of `pressure_tangent_product`."""
         world, item = wp.tid()
-        if active[world] == 0:
-            return
         m = (midpoint_factor * data.moment_fraction[item]) * vec3(value[world, data.time_law[item]])
         Y = current_vectors(data, u, world, item)
         D = interpolate_vectors(data, direction, world, item)

@@ -1,21 +1,11 @@
 """Loads on the device: time laws, dead loads Eq. (72), body forces Eq. (23), driven nodes."""
 
 import functools
-import types as _types
 
 import warp as wp
 
-from ..common.types import (
-    double_1d,
-    double_2d,
-    double_3d,
-    int_1d,
-    kernel_module,
-    kernel_set,
-    precision,
-    vec3d_1d,
-    vec3d_2d,
-)
+from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
+from ..common.types import double_1d, double_2d, double_3d, int_1d, precision, vec3d_1d, vec3d_2d
 from ..elements.points import block_struct
 
 __all__ = ["body_force_kernel", "load_kernels", "time_law_kernel", "time_law_struct"]
@@ -37,7 +27,7 @@ def time_law_struct():
 
 
 @functools.cache
-def load_kernels(dtype: str) -> _types.SimpleNamespace:
+def load_kernels(dtype: str) -> KernelSet:
     """Kernels of the loads in one precision."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
@@ -52,12 +42,10 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
     drive_module = kernel_module(f"drive_{dtype}")
     turn_module = kernel_module(f"drive_rotation_{dtype}")
 
-    @wp.kernel(module=laws_module)
+    @masked_kernel(laws_module, "active")
     def evaluate_time_laws(laws: Laws, time: double_1d, ramp: double_1d, active: int_1d, value: vec3d_2d):
         """Value of each law at the new time; constants are scaled by the ramp of a static load path."""
         world, law = wp.tid()
-        if active[world] == 0:
-            return
         first = laws.sample_start[law]
         last = laws.sample_start[law + 1] - 1
         if last < first:
@@ -73,12 +61,10 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
         s = wp.clamp(s, f64(0.0), f64(1.0))
         value[world, law] = (f64(1.0) - s) * laws.sample_value[k] + s * laws.sample_value[k + 1]
 
-    @wp.kernel(module=controls_module)
+    @masked_kernel(controls_module, "active")
     def evaluate_control(control: double_2d, law: int, ramped: int, ramp: double_1d, active: int_1d, value: vec3d_2d):
         """Value of a law that is a control; scaled by the ramp of a static load path if a constant would be."""
         world = wp.tid()
-        if active[world] == 0:
-            return
         x = wp.vec3d()
         for c in range(control.shape[1]):
             x[c] = control[world, c]
@@ -86,7 +72,7 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
             x = ramp[world] * x
         value[world, law] = x
 
-    @wp.kernel(module=dead_module)
+    @masked_kernel(dead_module, "active")
     def dead_load(
         start: int_1d,
         law: int_1d,
@@ -101,8 +87,6 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
     ):
         """Sum of weight x value per slot (Eq. 72), gravity included (Eq. 24), and of the magnitudes."""
         world, slot = wp.tid()
-        if active[world] == 0:
-            return
         f = (T(ramp[world]) * lumped[world % lumped.shape[0], slot]) * vec3(gravity[world])
         m = wp.cw_mul(f, wp.sign(f))
         for k in range(start[slot], start[slot + 1]):
@@ -112,28 +96,25 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
         force[world, slot] = f
         magnitude[world, slot] = m
 
-    @wp.kernel(module=gravity_module)
+    @masked_kernel(gravity_module, "active")
     def copy_gravity(value: vec3d_2d, law: int, active: int_1d, gravity: vec3d_1d):
         """Gravity, m/s^2, from the value of a time law."""
         world = wp.tid()
-        if active[world] != 0:
-            gravity[world] = value[world, law]
+        gravity[world] = value[world, law]
 
-    @wp.kernel(module=explicit_module)
+    @masked_kernel(explicit_module, "accepted")
     def explicit_work_rows(a: p.vec3_2d, u: p.vec3_2d, u_n: p.vec3_2d, accepted: int_1d, rows: double_3d):
         """Work of an explicit force on a substep, a.dq per slot."""
         world, slot = wp.tid()
-        if accepted[world] != 0:
-            rows[0, world, slot] = f64(wp.dot(a[world, slot], u[world, slot] - u_n[world, slot]))
+        rows[0, world, slot] = f64(wp.dot(a[world, slot], u[world, slot] - u_n[world, slot]))
 
-    @wp.kernel(module=explicit_module)
+    @masked_kernel(explicit_module, "active")
     def subtract_explicit_force(explicit_force: p.vec3_2d, active: int_1d, force: p.vec3_2d):
         """Dead force -= explicit internal force."""
         world, slot = wp.tid()
-        if active[world] != 0:
-            force[world, slot] = force[world, slot] - explicit_force[world, slot]
+        force[world, slot] = force[world, slot] - explicit_force[world, slot]
 
-    @wp.kernel(module=drive_module)
+    @masked_kernel(drive_module, "active")
     def drive_displacement(
         slot: int_1d,
         law: wp.array(dtype=wp.vec3i),
@@ -145,8 +126,6 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
     ):
         """v = (u(t) - q~)/(dq/dv) on the driven components, u(t) the value of a law per component (-1: not driven)."""
         world, k = wp.tid()
-        if active[world] == 0:
-            return
         s = slot[k]
         velocity = v[world, s]
         for c in range(3):
@@ -155,7 +134,7 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
                 velocity[c] = T((value[world, row][c] - f64(q_tilde[world, s][c])) / dq_dv[world])
         v[world, s] = velocity
 
-    @wp.kernel(module=turn_module)
+    @masked_kernel(turn_module, "active")
     def drive_rotation(
         slot: int_1d,
         law: int_1d,
@@ -171,8 +150,6 @@ def load_kernels(dtype: str) -> _types.SimpleNamespace:
         """`drive_displacement` for u(t) = (R(angle) - I) arm, arm the slot's reference position relative to the anchor
         (Rodrigues)."""
         world, k = wp.tid()
-        if active[world] == 0:
-            return
         s = slot[k]
         angle = value[world, law[k]][0]
         n = axis[k]
