@@ -13,15 +13,8 @@ from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.types import double_1d, double_3d, int_1d, precision
 from .assumed_strain_block import assumed_shear_functions, assumed_strain_struct, coupling_entry_function
 from .element_slots import slot_access_functions
-from .matrix import (
-    PANEL_UNROLL,
-    matrix_column,
-    panel_layout,
-    panel_row,
-    panel_row_type,
-    scheme_suffix,
-    store_column_function,
-)
+from .matrix import PANEL_UNROLL, column_kernel, panel_kernel, panel_layout, panel_row, panel_row_type, scheme_suffix
+from .products import predicted_stress_kernel, tangent_kernel
 
 __all__ = ["assumed_strain_kernels"]
 
@@ -47,8 +40,8 @@ def assumed_strain_kernels(
         dissipative: with (chi/2) of the shears' change added to the mean, see kernels/elements/energy_momentum.py.
         worlds: A differs between worlds, stored side by side.
     """
-    p = precision(dtype)
-    T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
+    types = p = precision(dtype)
+    T, vec3, mat33, sym6, sym_2d = p.T, p.vec3, p.mat33, p.sym, p.sym_2d
     Block = assumed_strain_struct(dtype, dissipative)
     name = f"tied_{dtype}_{slots}_{ties}_{width}{scheme_suffix(midpoint, dissipative)}{'_worlds' if worlds else ''}"
     module = kernel_module(name)
@@ -57,19 +50,17 @@ def assumed_strain_kernels(
     shears = assumed_shear_functions(dtype, slots, ties, dissipative)
     Local, Ties, TieVectors = shears.Local, shears.Ties, shears.TieVectors
     directional_derivative, kinematics = shears.directional_derivative, shears.kinematics
-    predicted_shears, step_shears = shears.predicted_shears, shears.step_shears
-    load_slots, store_forces = slot_access_functions(dtype, slots, Block)
-    store_column = store_column_function(dtype, slots)
+    add_second_order, step_shears = shears.add_second_order, shears.step_shears
+    load_slots, load_last_change, store_forces = slot_access_functions(dtype, slots, Block)
     NS, NT, W = slots, ties, width
     PANELS, P, _ = panel_layout(NS)
     Row = wp.types.vector(length=P, dtype=T)
     TIES_PER_LOAD = 4 if NT % 4 == 0 else 1  # ties added to a row of the matrix between its load and its store
-    Rows = panel_row_type(dtype, P)
+    Rows = wp.array3d(dtype=panel_row_type(dtype, P))
     Slots = wp.types.matrix(shape=(NT * PANELS, P), dtype=T)
     Changes = wp.types.matrix(shape=(3 * NT * PANELS, P), dtype=T)
     Products = wp.types.matrix(shape=(3 * NT, P), dtype=T)
     rows_module = kernel_module(f"{name}_rows", max_unroll=PANEL_UNROLL)
-    prediction_module = kernel_module(f"{name}_mixed")
 
     @wp.func
     def midpoint_weight(x: T) -> T:
@@ -101,7 +92,15 @@ def assumed_strain_kernels(
         return s
 
     @wp.func
-    def tangent_force(
+    def load_velocities(block: Block, v: p.vec3_2d, world: int, elem: int) -> Local:
+        """Half change of an element's slots if `midpoint`, else zeros."""
+        if wp.static(midpoint):
+            return load_slots(block, v, world, elem)
+        else:
+            return Local()
+
+    @wp.func
+    def change_of_force(
         block: Block, P: Local, D: Local, x1: TieVectors, x2: TieVectors, e: Ties, world: int, elem: int
     ) -> Local:
         """Forces for a change P of the slots, with x_a, x_b and the shears e of the geometric part, N.
@@ -163,56 +162,30 @@ def assumed_strain_kernels(
         energy[0, world, block.element_offset + elem] = wp.float64(T(0.5) * wp.dot(e, s))
         energy[1, world, block.element_offset + elem] = wp.float64(0.0)
 
-    @masked_kernel(module, "active")
-    def tangent_product(
-        block: Block,
-        u: p.vec3_2d,
-        v: p.vec3_2d,
-        history: p.sym_2d,
-        dq_dv: double_1d,
-        active: int_1d,
-        direction: p.vec3_2d,
-        contribution: p.vec3_2d,
-    ):
-        """K p (N): the change of `internal_force` with a change p of the slots; `active` 2: see `point_increment`."""
-        world, elem = wp.tid()
-        U = load_slots(block, u, world, elem)
-        P = load_slots(block, direction, world, elem)
+    @wp.func
+    def tangent_force(
+        block: Block, U: Local, dU: Local, V: Local, history: p.sym_2d, dq: T, form: int, world: int, elem: int
+    ) -> Local:
+        """K dU: the change of `internal_force` with a change dU of the slots; `form` 2: see `point_increment`."""
         x1, x2, e = kinematics(block, U, elem)
-        D = Local()
         if wp.static(midpoint):
-            D = load_slots(block, v, world, elem)
-            if active[world] == 2:
-                _, _, e = kinematics(block, U - D, elem)
+            if form == 2:
+                _, _, e = kinematics(block, U - V, elem)
             else:
-                e = step_shears(block, x1, x2, D, e, elem)
-        store_forces(block, tangent_force(block, P, D, x1, x2, e, world, elem), world, elem, contribution)
+                e = step_shears(block, x1, x2, V, e, elem)
+        return change_of_force(block, dU, V, x1, x2, e, world, elem)
 
-    @masked_kernel(prediction_module, "active")
-    def predicted_stress_product(
-        block: Block,
-        u: p.vec3_2d,
-        v: p.vec3_2d,
-        base: p.vec3_2d,
-        use_prediction: int_1d,
-        history: p.sym_2d,
-        dq_dv: double_1d,
-        active: int_1d,
-        direction: p.vec3_2d,
-        contribution: p.vec3_2d,
-    ):
-        """`tangent_product` with the shear stress of the linear prediction; see
-        kernels/elements/predicted_stress.py."""
-        world, elem = wp.tid()
-        U = load_slots(block, u, world, elem)
+    @wp.func
+    def predicted_force(
+        block: Block, U: Local, dU: Local, step: Local, history: p.sym_2d, dq: T, form: int, world: int, elem: int
+    ) -> Local:
+        """K dU with the shear stress of the linear prediction; `form`: `use_prediction` of the kernel."""
         x1, x2, e = kinematics(block, U, elem)
-        if use_prediction[world] == 1:
-            change = load_slots(block, v, world, elem) - load_slots(block, base, world, elem)
-            e = predicted_shears(block, T(dq_dv[world]) * change, e, elem)
-        if use_prediction[world] == 2:
+        if form == 1:
+            e = add_second_order(block, step, e, T(-1.0), elem)
+        if form == 2:
             e = Ties()
-        P = load_slots(block, direction, world, elem)
-        store_forces(block, tangent_force(block, P, Local(), x1, x2, e, world, elem), world, elem, contribution)
+        return change_of_force(block, dU, Local(), x1, x2, e, world, elem)
 
     @masked_kernel(module, "active")
     def diagonal_blocks(block: Block, u: p.vec3_2d, dq_dv: double_1d, active: int_1d, contribution: p.sym_2d):
@@ -297,20 +270,11 @@ def assumed_strain_kernels(
             mu = T(0.0)  # no geometric part
         lines[world, 3 * NT + tie, elem] = vec3(midpoint_weight(mu) * s, T(0.0), T(0.0))
 
-    @masked_kernel(matrix_module, "active")
-    def element_matrix(
-        block: Block,
-        dq_dv: double_1d,
-        lines: p.vec3_3d,
-        use_prediction: int_1d,
-        form: int,
-        add: int,
-        active: int_1d,
-        matrix: p.vec3_3d,
-    ):
-        """K of each element by columns, stored as by `element_kernels`; `form` 1: without the geometric part."""
-        world, index = wp.tid()
-        elem, b, axis = matrix_column(index, block.count)
+    @wp.func
+    def matrix_column(
+        block: Block, dq: T, lines: p.vec3_3d, form: int, b: int, axis: int, world: int, elem: int
+    ) -> Local:
+        """Column `axis` of the blocks K_ab, a <= b; `form` 1: without the geometric part."""
         mu = matrix_modulus(block, block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0])
         unit = vec3()
         unit[axis] = T(1.0)
@@ -334,26 +298,14 @@ def assumed_strain_kernels(
             for a in range(NS):
                 if a <= b:
                     out[a] = out[a] + block.derivative_a[t, a, elem] * dd + block.derivative_b[t, a, elem] * da
-        store_column(out, b, axis, add, world, elem, matrix)
+        return out
 
-    @masked_kernel(rows_module, "active")
-    def element_matrix_panels(
-        block: Block,
-        u: p.vec3_2d,
-        v: p.vec3_2d,
-        base: p.vec3_2d,
-        use_prediction: int_1d,
-        history: p.sym_2d,
-        dq_dv: double_1d,
-        form: int,
-        active: int_1d,
-        add: int,
-        matrix: wp.array3d(dtype=Rows),
+    @wp.func
+    def add_panels(
+        block: Block, U: Local, V: Local, step: Local, history: sym_2d, dq: T, form: int, world: int, elem: int, K: Rows
     ):
-        """K = mu B^T A B + geometric part of each element by one thread, stored by panels as by `element_kernels`."""
-        world, elem = wp.tid()
+        """Add K = mu B^T A B + geometric part by panels; `form`: see `point_state`."""
         mu = matrix_modulus(block, block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0])
-        U = load_slots(block, u, world, elem)
         x1, x2, e = kinematics(block, U, elem)
         first, second, B = Slots(), Slots(), Changes()
         for t in range(NT):
@@ -367,17 +319,13 @@ def assumed_strain_kernels(
                 second[row, a % P] = s
                 for i in range(3):
                     B[3 * row + i, a % P] = f * d2[i] + s * d1[i]
-        if use_prediction[world] == 1:
-            change = load_slots(block, v, world, elem) - load_slots(block, base, world, elem)
-            e = predicted_shears(block, T(dq_dv[world]) * change, e, elem)
+        if form == 2:
+            e = add_second_order(block, step, e, T(-1.0), elem)
         stress = Ties()
         if wp.static(midpoint):
-            e = step_shears(block, x1, x2, load_slots(block, v, world, elem), e, elem)
-        if form != 1 and use_prediction[world] != 2:
+            e = step_shears(block, x1, x2, V, e, elem)
+        if form != 1 and form != 3:
             stress = tying_stresses(block, e, world, elem)
-        if add == 0:
-            for k in range(matrix.shape[2]):
-                matrix[world, elem, k] = Rows()
         for panel in range((block.conn.shape[0] + P - 1) / P):  # PANELS, but not unrolled
             AB = Products()
             for t in range(NT):
@@ -394,7 +342,7 @@ def assumed_strain_kernels(
             for group in range(NT / TIES_PER_LOAD):
                 for a in range(wp.min(NS, P * (panel + 1))):
                     at = panel_row(panel, P, a)
-                    R = matrix[world, elem, at]
+                    R = K[world, elem, at]
                     row = NT * (a / P) + TIES_PER_LOAD * group
                     n = a % P
                     for o in range(TIES_PER_LOAD):
@@ -408,6 +356,10 @@ def assumed_strain_kernels(
                         )
                         for i in range(3):
                             R[4 * i] = R[4 * i] + G
-                    matrix[world, elem, at] = R
+                    K[world, elem, at] = R
 
+    fn = kernel_set(locals())
+    tangent_product = tangent_kernel(fn, module)
+    predicted_stress_product = predicted_stress_kernel(fn, kernel_module(f"{name}_mixed"))
+    element_matrix, element_matrix_panels = column_kernel(fn, matrix_module), panel_kernel(fn, rows_module)
     return kernel_set(locals())

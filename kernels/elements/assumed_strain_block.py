@@ -86,22 +86,15 @@ def assumed_shear_functions(dtype: str, slots: int, ties: int, dissipative: bool
         return first, second, e
 
     @wp.func
-    def predicted_shears(block: Block, step: Local, e: Ties, elem: int) -> Ties:
-        """Shears of the linear prediction from the previous iterate, m^2; `step`: the last change of the slots, m."""
-        out = e
-        for t in range(NT):
-            out[t] = out[t] - wp.dot(
-                directional_derivative(block.derivative_a, step, t, elem),
-                directional_derivative(block.derivative_b, step, t, elem),
-            )
-        return out
+    def add_second_order(block: Block, D: Local, e: Ties, sign: T, elem: int) -> Ties:
+        """Shears e plus `sign` times those of second order in a change D of the slots, m^2.
 
-    @wp.func
-    def mean_shears(block: Block, D: Local, e: Ties, elem: int) -> Ties:
-        """Mean of the shears at both ends of a step, m^2, from the midpoint shears e and the slots' half change D."""
+        1, with the half change of a step and the shears at its midpoint: the mean of those at both ends. -1, with the
+        last change: the linear prediction from the previous iterate.
+        """
         out = e
         for t in range(NT):
-            out[t] = out[t] + wp.dot(
+            out[t] = out[t] + sign * wp.dot(
                 directional_derivative(block.derivative_a, D, t, elem),
                 directional_derivative(block.derivative_b, D, t, elem),
             )
@@ -110,7 +103,7 @@ def assumed_shear_functions(dtype: str, slots: int, ties: int, dissipative: bool
     @wp.func
     def step_shears(block: Block, x1: TieVectors, x2: TieVectors, D: Local, e: Ties, elem: int) -> Ties:
         """Shears in the stresses of a step, m^2: the mean, plus chi/2 of their change."""
-        out = mean_shears(block, D, e, elem)
+        out = add_second_order(block, D, e, T(1.0), elem)
         if wp.static(dissipative):
             for t in range(NT):
                 change = wp.dot(x1[t], directional_derivative(block.derivative_b, D, t, elem)) + wp.dot(

@@ -14,6 +14,7 @@ from . import materials
 from .matrix import matrix_kernels, scheme_suffix
 from .output import output_kernels
 from .points import point_functions
+from .products import tangent_kernel
 
 __all__ = ["element_kernels"]
 
@@ -83,9 +84,7 @@ def element_kernels(
         psi = T(0.0)
         psi_v = T(0.0)
         J_low = T(1.0e30)
-        V = Local()
-        if wp.static(fn.uses_v):
-            V = fn.load_slots(block, v, world, elem)
+        V = fn.load_velocities(block, v, world, elem)
         dq = T(dq_dv[world])
         for point in range(lane, block.shape_gradient.shape[0], lanes):
             G = fn.field_gradient(block, U, point, elem)
@@ -102,7 +101,7 @@ def element_kernels(
                 J_low = wp.min(J_low, T(1.0) + t.volume_change(G))
                 P = m.stress(local, c)
                 psi += w * m.energy(local, c)
-            if wp.static(damping == "incremental" or damping == "rate"):
+            if wp.static(fn.viscous):
                 rate = fn.strain_rate(block, local, Fdot, history, dq, world, point, elem)
                 S = t.isotropic_stress(rate, c[LAMBDA_V_INDEX], c[ETA_INDEX])
                 P = P + S + local * S
@@ -151,29 +150,7 @@ def element_kernels(
             most = wp.max(most, wp.ddot(G, G))
         wp.atomic_max(gradient_norm, world, wp.float64(wp.sqrt(most)))
 
-    @masked_kernel(module, "active")
-    def tangent_product(
-        block: Block,
-        u: p.vec3_2d,
-        v: p.vec3_2d,
-        history: p.sym_2d,
-        dq_dv: double_1d,
-        active: int_1d,
-        direction: p.vec3_2d,
-        contribution: p.vec3_2d,
-    ):
-        """K p (N) with K = df_int/dq at u, Eqs. (35) and (54); only the symmetric part for damping of the rate form.
-
-        `active` 2: see `point_increment`.
-        """
-        world, elem = wp.tid()
-        U = fn.load_slots(block, u, world, elem)
-        dU = fn.load_slots(block, direction, world, elem)
-        V = Local()
-        if wp.static(fn.uses_v):
-            V = fn.load_slots(block, v, world, elem)
-        f = fn.tangent_force(block, U, dU, V, history, T(dq_dv[world]), active[world], world, elem)
-        fn.store_forces(block, f, world, elem, contribution)
+    tangent_product = tangent_kernel(fn, module)
 
     @masked_kernel(module, "active")
     def diagonal_blocks(block: Block, u: p.vec3_2d, dq_dv: double_1d, active: int_1d, contribution: p.sym_2d):
@@ -189,11 +166,7 @@ def element_kernels(
             G = fn.field_gradient(block, U, point, elem)
             w = fn.tangent_weight(block, point, elem)
             for i in range(NS):
-                a = vec3()
-                if wp.static(affine):
-                    a = wp.transpose(fn.inverse_jacobian(block, elem)) * block.shape_gradient[point, i, 0]
-                else:
-                    a = block.shape_gradient[point, i, elem]
+                a = fn.slot_gradient(block, point, i, elem)
                 K = mat33()
                 if wp.static(framed):
                     R = block.material_axes[point, elem]
@@ -204,7 +177,7 @@ def element_kernels(
                     K = m.block(G, a, c)
                 if wp.static(dissipative):
                     K = fn.dissipation_factor(block) * K
-                if wp.static(damping == "incremental" or damping == "rate"):
+                if wp.static(fn.viscous):
                     K = K + viscous.block(mat33() + G, a, cv)
                 entry = block.contribution_offset + i * block.count + elem
                 contribution[world, entry] = contribution[world, entry] + w * fn.to_voigt(K)

@@ -16,8 +16,8 @@ def slot_values_type(dtype: str, slots: int):
 
 
 @functools.cache
-def slot_access_functions(dtype: str, slots: int, Block) -> tuple[wp.Function, wp.Function]:
-    """Functions load_slots(block, field, world, elem) and store_forces(block, values, world, elem, contribution).
+def slot_access_functions(dtype: str, slots: int, Block) -> tuple[wp.Function, wp.Function, wp.Function]:
+    """Functions load_slots(block, field, world, elem), load_last_change and store_forces, see below.
 
     Args:
         Block: struct of the elements, with conn, is_position, contribution_offset and count.
@@ -34,9 +34,19 @@ def slot_access_functions(dtype: str, slots: int, Block) -> tuple[wp.Function, w
         return U
 
     @wp.func
+    def load_last_change(
+        block: Block, v: p.vec3_2d, base: p.vec3_2d, use_prediction: int, dq: p.T, world: int, elem: int
+    ) -> Local:
+        """Change of an element's slots in the last iteration, m, if `use_prediction` is 1; else zeros."""
+        step = Local()
+        if use_prediction == 1:
+            step = dq * (load_slots(block, v, world, elem) - load_slots(block, base, world, elem))
+        return step
+
+    @wp.func
     def store_forces(block: Block, f: Local, world: int, elem: int, contribution: p.vec3_2d):
         """Forces on the slots of an element, into its entries of the contributions."""
         for i in range(NS):
             contribution[world, block.contribution_offset + i * block.count + elem] = f[i]
 
-    return load_slots, store_forces
+    return load_slots, load_last_change, store_forces

@@ -33,14 +33,10 @@ def output_kernels(fn: KernelSet, name: str) -> KernelSet:
         world, elem = wp.tid()
         U0 = fn.load_slots(block, u0, world, elem)
         for point in range(block.shape_gradient.shape[0]):
-            E = T(a0[world]) * t.green_lagrange(
-                fn.to_material_axes(block, fn.field_gradient(block, U0, point, elem), point, elem)
-            )
+            E = T(a0[world]) * t.green_lagrange(fn.material_gradient(block, U0, point, elem))
             if a1[world] != wp.float64(0.0):
                 U1 = fn.load_slots(block, u1, world, elem)
-                E = E - T(a1[world]) * t.green_lagrange(
-                    fn.to_material_axes(block, fn.field_gradient(block, U1, point, elem), point, elem)
-                )
+                E = E - T(a1[world]) * t.green_lagrange(fn.material_gradient(block, U1, point, elem))
             history[world, fn.history_index(block, point, elem)] = fn.to_voigt(E)
 
     @masked_kernel(moving_module, "active")
@@ -61,12 +57,10 @@ def output_kernels(fn: KernelSet, name: str) -> KernelSet:
         V = fn.load_slots(block, v, world, elem)
         A = fn.load_slots(block, a, world, elem)
         for point in range(block.shape_gradient.shape[0]):
-            G = fn.to_material_axes(block, fn.field_gradient(block, U, point, elem), point, elem)
-            D = fn.to_material_axes(block, fn.field_gradient(block, V, point, elem), point, elem)
+            G = fn.material_gradient(block, U, point, elem)
+            D = fn.material_gradient(block, V, point, elem)
             F = wp.transpose(t.identity() + G)
-            bend = wp.transpose(D) * D + F * fn.to_material_axes(
-                block, fn.field_gradient(block, A, point, elem), point, elem
-            )
+            bend = wp.transpose(D) * D + F * fn.material_gradient(block, A, point, elem)
             E = t.green_lagrange(G) + T(b[world]) * t.sym(F * D) + T(q_a[world]) * t.sym(bend)
             history[world, fn.history_index(block, point, elem)] = fn.to_voigt(E)
 

@@ -72,16 +72,16 @@ def point_functions(
     use the former for both, and are symmetric.
     """
     p = precision(dtype)
-    T, mat33, sym6 = p.T, p.mat33, p.sym
+    T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
     t = materials.tensor_functions(dtype)
     m = materials.law_functions(law, dtype)
     mean = energy_momentum_law(law, dtype)
-    uses_v = midpoint or damping == "rate"
+    viscous, uses_v = damping is not None, midpoint or damping == "rate"
     Block = block_struct(dtype, dissipative)
     NCOEF = materials.NCOEF
     coef = wp.types.vector(length=NCOEF, dtype=T)
     Local = slot_values_type(dtype, slots)
-    load_slots, store_forces = slot_access_functions(dtype, slots, Block)
+    load_slots, load_last_change, store_forces = slot_access_functions(dtype, slots, Block)
     NS, needs_J = slots, law not in materials.DEFINED_FOR_ANY_J
     ETA_INDEX, LAMBDA_V_INDEX = materials.ETA_INDEX, materials.LAMBDA_V_INDEX
 
@@ -113,17 +113,30 @@ def point_functions(
         )  # fmt: skip
 
     @wp.func
-    def field_gradient(block: Block, U: Local, point: int, elem: int) -> mat33:
-        """sum_i u_i h_i^T at a point, Eq. (1): F - I of displacements, Fdot of velocities."""
+    def tabulated_gradient(block: Block, table: p.vec3_3d, U: Local, point: int, elem: int) -> mat33:
+        """`field_gradient` with the gradients of the shape functions in `table`."""
         D = mat33()
         for i in range(NS):
             if wp.static(affine):
-                D += wp.outer(U[i], block.shape_gradient[point, i, 0])
+                D += wp.outer(U[i], table[point, i, 0])
             else:
-                D += wp.outer(U[i], block.shape_gradient[point, i, elem])
+                D += wp.outer(U[i], table[point, i, elem])
         if wp.static(affine):
             D = D * inverse_jacobian(block, elem)
         return D
+
+    @wp.func
+    def field_gradient(block: Block, U: Local, point: int, elem: int) -> mat33:
+        """sum_i u_i h_i^T at a point, Eq. (1): F - I of displacements, Fdot of velocities."""
+        return tabulated_gradient(block, block.shape_gradient, U, point, elem)
+
+    @wp.func
+    def slot_gradient(block: Block, point: int, slot: int, elem: int) -> vec3:
+        """h of a slot at a point, 1/m."""
+        if wp.static(affine):
+            return wp.transpose(inverse_jacobian(block, elem)) * block.shape_gradient[point, slot, 0]
+        else:
+            return block.shape_gradient[point, slot, elem]
 
     @wp.func
     def point_weight(block: Block, point: int, elem: int) -> T:
@@ -189,10 +202,23 @@ def point_functions(
         return block.history_offset + point * block.count + elem
 
     @wp.func
+    def material_gradient(block: Block, U: Local, point: int, elem: int) -> mat33:
+        """`field_gradient` in the law's axes."""
+        return to_material_axes(block, field_gradient(block, U, point, elem), point, elem)
+
+    @wp.func
+    def load_velocities(block: Block, v: p.vec3_2d, world: int, elem: int) -> Local:
+        """Velocities of an element's slots if needed by damping (form "rate") or `midpoint`, else zeros."""
+        if wp.static(uses_v):
+            return load_slots(block, v, world, elem)
+        else:
+            return Local()
+
+    @wp.func
     def velocity_gradient(block: Block, V: Local, point: int, elem: int) -> mat33:
         """Fdot in the law's axes (1/s) for damping of the form "rate", Eq. (60); `midpoint`: half of dF; else zero."""
         if wp.static(uses_v):
-            return to_material_axes(block, field_gradient(block, V, point, elem), point, elem)
+            return material_gradient(block, V, point, elem)
         else:
             return mat33()
 
@@ -214,18 +240,19 @@ def point_functions(
             return t.sym(wp.transpose(t.identity() + G) * Fdot)
 
     @wp.func
+    def viscous_stress(
+        block: Block, G: mat33, Fdot: mat33, history: p.sym_2d, c: coef, dq: T, world: int, point: int, elem: int
+    ) -> mat33:
+        """S_vis, Eq. (62), with `strain_rate`, Pa."""
+        rate = strain_rate(block, G, Fdot, history, dq, world, point, elem)
+        return t.isotropic_stress(rate, c[LAMBDA_V_INDEX], c[ETA_INDEX])
+
+    @wp.func
     def vertex_jacobian(block: Block, U: Local, elem: int) -> T:
         """Smallest J at the vertices of an element, which lie outside the hull of its quadrature points."""
         J = T(1.0e30)
         for vertex in range(block.vertex_shape_gradient.shape[0]):
-            D = mat33()
-            for i in range(NS):
-                if wp.static(affine):
-                    D += wp.outer(U[i], block.vertex_shape_gradient[vertex, i, 0])
-                else:
-                    D += wp.outer(U[i], block.vertex_shape_gradient[vertex, i, elem])
-            if wp.static(affine):
-                D = D * inverse_jacobian(block, elem)
+            D = tabulated_gradient(block, block.vertex_shape_gradient, U, vertex, elem)
             J = wp.min(J, T(1.0) + t.volume_change(D))
         return J
 
@@ -334,11 +361,9 @@ def point_functions(
             dP = change * S + F * midpoint_stress_increment(block, local, t.sym(wp.transpose(along) * change), c)
         else:
             dP = m.increment(local, change, c)
-        if wp.static(damping == "incremental" or damping == "rate"):
+        if wp.static(viscous):
             F = t.identity() + local
-            S = t.isotropic_stress(
-                strain_rate(block, local, Fdot, history, dq, world, point, elem), c[LAMBDA_V_INDEX], c[ETA_INDEX]
-            )
+            S = viscous_stress(block, local, Fdot, history, c, dq, world, point, elem)
             dS = t.isotropic_stress(t.sym(wp.transpose(along) * change), c[LAMBDA_V_INDEX] / dq, c[ETA_INDEX] / dq)
             if wp.static(midpoint):
                 if form == 2:
@@ -363,6 +388,33 @@ def point_functions(
             dG = field_gradient(block, dU, point, elem)
             Fdot = velocity_gradient(block, V, point, elem)
             dP = point_increment(block, G, dG, Fdot, history, c, dq, form, world, point, elem)
+            f = add_point_forces(block, f, dP, point, elem)
+        return f
+
+    @wp.func
+    def predicted_force(
+        block: Block, U: Local, dU: Local, step: Local, history: p.sym_2d, dq: T, form: int, world: int, elem: int
+    ) -> Local:
+        """K dU without viscosity, with the stress of the linear prediction in the geometric part.
+
+        `step`: the last change of the slots, m; `form`: `use_prediction` of the kernel.
+        """
+        c = coefficients(block, world, elem)
+        f = Local()
+        for point in range(block.shape_gradient.shape[0]):
+            G = field_gradient(block, U, point, elem)
+            dG = field_gradient(block, dU, point, elem)
+            dP = point_increment(block, G, dG, mat33(), history, c, dq, 0, world, point, elem)
+            local = to_material_axes(block, G, point, elem)
+            if form == 1:
+                ahead = material_gradient(block, step, point, elem)
+                dP += dG * to_body_axes(block, predicted_stress_change(local, ahead, c, dq), point, elem)
+            elif form == 2:
+                if wp.static(needs_J):
+                    change = to_material_axes(block, dG, point, elem)
+                    dP = to_body_axes(block, spd_increment(t.identity() + local, change, c), point, elem)
+                else:
+                    dP += max_compression(m.pk2_stress(t.green_lagrange(local), c)) * dG
             f = add_point_forces(block, f, dP, point, elem)
         return f
 

@@ -15,7 +15,7 @@ from ..kernels.elements.element import element_kernels
 from ..kernels.elements.element_clusters import cluster_size
 from ..kernels.elements.materials import DEFINED_FOR_ANY_J
 from ..kernels.elements.points import block_struct
-from ..kernels.elements.predicted_stress import predicted_stress_product
+from ..kernels.elements.products import predicted_stress_product
 from ..kernels.elements.with_mass import with_mass_kernel
 from . import assembly
 from .tied_tables import tied_tables
