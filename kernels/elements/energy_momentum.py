@@ -33,8 +33,7 @@ def energy_momentum_law(name: str, dtype: str) -> KernelSet:
     rest_moduli_increment(dE, c) is C0 : dE, with moduli C0 that are positive, Pa.
     """
     p, t, m = precision(dtype), materials.tensor_functions(dtype), materials.law_functions(name, dtype)
-    T, mat33 = p.T, p.mat33
-    coef = wp.types.vector(length=materials.NCOEF, dtype=T)
+    T, mat33, coef = p.T, p.mat33, t.coef
 
     if name not in materials.DEFINED_FOR_ANY_J:
         return _discrete_gradient(dtype, name == "mooney_rivlin")
@@ -59,15 +58,11 @@ def _discrete_gradient(dtype: str, second_invariant: bool) -> KernelSet:
     Kirchhoff form of `materials.mooney_rivlin` with E instead of b.
     """
     p, t = precision(dtype), materials.tensor_functions(dtype)
-    T, mat33 = p.T, p.mat33
-    coef = wp.types.vector(length=materials.NCOEF, dtype=T)
-    third, two_thirds, four_thirds = T(1.0 / 3.0), T(2.0 / 3.0), T(4.0 / 3.0)
+    T, mat33, coef, dev = p.T, p.mat33, t.coef, t.dev
+    isochoric = materials.isochoric_functions(dtype, second_invariant)
+    second_invariant_part = isochoric.second_invariant_part
+    third, two_thirds = T(1.0 / 3.0), T(2.0 / 3.0)
     tiny = T(TINY_SQUARED_CHANGE[dtype])
-
-    @wp.func
-    def dev(A: mat33) -> mat33:
-        """Deviator A - tr(A)/3 I."""
-        return A - third * wp.trace(A) * t.identity()
 
     @wp.func
     def jacobian_minus_one(E: mat33) -> T:
@@ -76,20 +71,10 @@ def _discrete_gradient(dtype: str, second_invariant: bool) -> KernelSet:
         return y / (T(1.0) + wp.sqrt(T(1.0) + y))
 
     @wp.func
-    def second_invariant_part(E: mat33) -> mat33:
-        """dev((2 + 4 t) E - 4 E^2), of the second invariant."""
-        return dev((T(2.0) + T(4.0) * wp.trace(E)) * E - T(4.0) * (E * E))
-
-    @wp.func
     def cauchy_green_times_stress(E: mat33, c: coef) -> mat33:
         """C S of a strain, in the form of the docstring above."""
         j1 = jacobian_minus_one(E)
-        J = T(1.0) + j1
-        Jm = wp.pow(J, -two_thirds)
-        out = c[1] * j1 * J * t.identity() + T(4.0) * c[0] * Jm * dev(E)
-        if wp.static(second_invariant):
-            out = out + T(2.0) * c[2] * Jm * Jm * second_invariant_part(E)
-        return out
+        return isochoric.form(E, j1, wp.pow(T(1.0) + j1, -two_thirds), c)
 
     @wp.func
     def inverse_cauchy_green(E: mat33) -> mat33:
@@ -158,16 +143,8 @@ def _discrete_gradient(dtype: str, second_invariant: bool) -> KernelSet:
         E = t.green_lagrange(G)
         Ci = inverse_cauchy_green(E)
         j1 = jacobian_minus_one(E)
-        J = T(1.0) + j1
-        trL = wp.ddot(Ci, dE)
-        Jm = wp.pow(J, -two_thirds)
-        c1 = T(4.0) * c[0] * Jm
-        change = c[1] * (T(2.0) * J - T(1.0)) * J * trL * t.identity() + c1 * (dev(dE) - two_thirds * trL * dev(E))
-        if wp.static(second_invariant):
-            c2 = T(2.0) * c[2] * Jm * Jm
-            s = T(2.0) + T(4.0) * wp.trace(E)
-            dA = dev(T(4.0) * wp.trace(dE) * E + s * dE - T(4.0) * (dE * E + E * dE))
-            change = change + c2 * (dA - four_thirds * trL * second_invariant_part(E))
+        Jm = wp.pow(T(1.0) + j1, -two_thirds)
+        change = isochoric.form_change(E, dE, j1, Jm, wp.ddot(Ci, dE), c)
         return t.sym(Ci * (change - T(2.0) * dE * (Ci * cauchy_green_times_stress(E, c))))
 
     @wp.func

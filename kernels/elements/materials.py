@@ -34,8 +34,9 @@ ETA_INDEX, LAMBDA_V_INDEX = NCOEF - 2, NCOEF - 1
 def tensor_functions(dtype: str) -> KernelSet:
     """Small tensor functions shared by the laws."""
     p = precision(dtype)
-    T, mat33, vec3 = p.T, p.mat33, p.vec3
-    moduli9 = wp.types.vector(length=9, dtype=T)
+    T, mat33 = p.T, p.mat33
+    moduli9, coef = wp.types.vector(length=9, dtype=T), wp.types.vector(length=NCOEF, dtype=T)
+    third = T(1.0 / 3.0)
 
     @wp.func
     def identity() -> mat33:
@@ -52,6 +53,11 @@ def tensor_functions(dtype: str) -> KernelSet:
     def sym(A: mat33) -> mat33:
         """(A + A^T)/2."""
         return T(0.5) * (A + wp.transpose(A))
+
+    @wp.func
+    def dev(A: mat33) -> mat33:
+        """Deviator A - tr(A)/3 I."""
+        return A - third * wp.trace(A) * identity()
 
     @wp.func
     def volume_change(G: mat33) -> T:
@@ -73,13 +79,32 @@ def tensor_functions(dtype: str) -> KernelSet:
     return kernel_set(locals())
 
 
+def linear_law(dtype: str, pk2_stress: wp.Function) -> KernelSet:
+    """`stress` and `increment` of a law whose S is linear in E, `pk2_stress`."""
+    p, t = precision(dtype), tensor_functions(dtype)
+    mat33, coef = p.mat33, t.coef
+
+    @wp.func
+    def stress(G: mat33, c: coef) -> mat33:
+        """P = F S, Eq. (27)."""
+        S = pk2_stress(t.green_lagrange(G), c)
+        return S + G * S
+
+    @wp.func
+    def increment(G: mat33, dG: mat33, c: coef) -> mat33:
+        """Tangent dP = dF S + F dS. With dF = d h_j^T, dP h_i is the integrand of Eq. (35) times d."""
+        F = t.identity() + G
+        return dG * pk2_stress(t.green_lagrange(G), c) + F * pk2_stress(t.sym(wp.transpose(F) * dG), c)
+
+    return kernel_set(locals())
+
+
 @functools.cache
 def svk(dtype: str) -> KernelSet:
     """St. Venant-Kirchhoff, Eqs. (25)-(28) and (35); c = (lambda, mu), Pa."""
     p, t = precision(dtype), tensor_functions(dtype)
     T, mat33, vec3 = p.T, p.mat33, p.vec3
-    moduli9 = t.moduli9
-    coef = wp.types.vector(length=NCOEF, dtype=T)
+    moduli9, coef = t.moduli9, t.coef
 
     @wp.func
     def pk2_stress(E: mat33, c: coef) -> mat33:
@@ -99,20 +124,6 @@ def svk(dtype: str) -> KernelSet:
         return T(0.5) * c[0] * tr * tr + c[1] * wp.ddot(E, E)
 
     @wp.func
-    def stress(G: mat33, c: coef) -> mat33:
-        """P = F S, Eq. (27)."""
-        S = t.isotropic_stress(t.green_lagrange(G), c[0], c[1])
-        return S + G * S
-
-    @wp.func
-    def increment(G: mat33, dG: mat33, c: coef) -> mat33:
-        """Tangent dP = dF S + F dS. With dF = d h_j^T, dP h_i is the integrand of Eq. (35) times d."""
-        F = t.identity() + G
-        S = t.isotropic_stress(t.green_lagrange(G), c[0], c[1])
-        dS = t.isotropic_stress(t.sym(wp.transpose(F) * dG), c[0], c[1])
-        return dG * S + F * dS
-
-    @wp.func
     def block(G: mat33, a: vec3, c: coef) -> mat33:
         """The integrand of Eq. (35) for i = j and h_i = a, with a negative geometric part a.S a set to zero."""
         F = t.identity() + G
@@ -120,6 +131,47 @@ def svk(dtype: str) -> KernelSet:
         S = t.isotropic_stress(t.green_lagrange(G), c[0], c[1])
         geometric = wp.max(T(0.0), wp.dot(a, S * a))
         return (c[0] + c[1]) * wp.outer(Fa, Fa) + c[1] * wp.dot(a, a) * (F * wp.transpose(F)) + geometric * t.identity()
+
+    return kernel_set(locals() | vars(linear_law(dtype, pk2_stress)))
+
+
+@functools.cache
+def isochoric_functions(dtype: str, second_invariant: bool) -> KernelSet:
+    """Functions of a strain A, b of the Kirchhoff stress or E of C S; arguments: see `mooney_rivlin`.
+
+    `form(A, j1, Jm, c)` is tau as in the docstring of `mooney_rivlin` with A in place of b, j1 = J - 1, Jm = J^-2/3;
+    `form_change(A, dA, j1, Jm, tr, c)` its change by dA with dJ = tr J; `second_invariant_part(A)` that of mu01.
+    """
+    p, t = precision(dtype), tensor_functions(dtype)
+    T, mat33, coef, dev = p.T, p.mat33, t.coef, t.dev
+    two_thirds, four_thirds = T(2.0 / 3.0), T(4.0 / 3.0)
+
+    @wp.func
+    def second_invariant_part(A: mat33) -> mat33:
+        """dev((2 + 4 t) A - 4 A^2), of the second invariant."""
+        return dev((T(2.0) + T(4.0) * wp.trace(A)) * A - T(4.0) * (A * A))
+
+    @wp.func
+    def form(A: mat33, j1: T, Jm: T, c: coef) -> mat33:
+        """tau or C S, Pa."""
+        J = T(1.0) + j1
+        out = c[1] * j1 * J * t.identity() + T(4.0) * c[0] * Jm * dev(A)
+        if wp.static(second_invariant):
+            out = out + T(2.0) * c[2] * Jm * Jm * second_invariant_part(A)
+        return out
+
+    @wp.func
+    def form_change(A: mat33, dA: mat33, j1: T, Jm: T, tr: T, c: coef) -> mat33:
+        """Change of `form`, Pa."""
+        J = T(1.0) + j1
+        c1 = T(4.0) * c[0] * Jm
+        out = c[1] * (T(2.0) * J - T(1.0)) * J * tr * t.identity() + c1 * (dev(dA) - two_thirds * tr * dev(A))
+        if wp.static(second_invariant):
+            c2 = T(2.0) * c[2] * Jm * Jm
+            s = T(2.0) + T(4.0) * wp.trace(A)
+            change = dev(T(4.0) * wp.trace(dA) * A + s * dA - T(4.0) * (dA * A + A * dA))
+            out = out + c2 * (change - four_thirds * tr * second_invariant_part(A))
+        return out
 
     return kernel_set(locals())
 
@@ -134,19 +186,13 @@ def mooney_rivlin(dtype: str, second_invariant: bool = True) -> KernelSet:
     """
     p, t = precision(dtype), tensor_functions(dtype)
     T, mat33, vec3 = p.T, p.mat33, p.vec3
-    coef = wp.types.vector(length=NCOEF, dtype=T)
+    coef, isochoric = t.coef, isochoric_functions(dtype, second_invariant)
     # constants of this precision: Warp would evaluate an expression of literals in float32
-    third = T(1.0 / 3.0)
     two_thirds = T(2.0 / 3.0)
     four_thirds = T(4.0 / 3.0)
     eight_thirds = T(8.0 / 3.0)
     ten_ninths = T(10.0 / 9.0)
     rank_one_2 = T(28.0 / 9.0)
-
-    @wp.func
-    def dev(A: mat33) -> mat33:
-        """Deviator A - tr(A)/3 I."""
-        return A - third * wp.trace(A) * t.identity()
 
     @wp.func
     def jacobian_power_change(j1: T) -> T:
@@ -166,15 +212,8 @@ def mooney_rivlin(dtype: str, second_invariant: bool = True) -> KernelSet:
     @wp.func
     def kirchhoff_stress(G: mat33, c: coef) -> mat33:
         """Kirchhoff stress tau = P F^T, in the form of the law's docstring."""
-        b = left_cauchy_green_strain(G)
         j1 = t.volume_change(G)
-        J = T(1.0) + j1
-        Jm = wp.pow(J, -two_thirds)
-        tau = c[1] * j1 * J * t.identity() + T(4.0) * c[0] * Jm * dev(b)
-        if wp.static(second_invariant):
-            tr = wp.trace(b)
-            tau = tau + T(2.0) * c[2] * Jm * Jm * dev((T(2.0) + T(4.0) * tr) * b - T(4.0) * (b * b))
-        return tau
+        return isochoric.form(left_cauchy_green_strain(G), j1, wp.pow(T(1.0) + j1, -two_thirds), c)
 
     @wp.func
     def energy(G: mat33, c: coef) -> T:
@@ -204,21 +243,10 @@ def mooney_rivlin(dtype: str, second_invariant: bool = True) -> KernelSet:
         Fi = wp.inverse(F)
         b = left_cauchy_green_strain(G)
         j1 = t.volume_change(G)
-        J = T(1.0) + j1
+        Jm = wp.pow(T(1.0) + j1, -two_thirds)
         L = dG * Fi
-        trL = wp.trace(L)
-        db = t.sym(dG * wp.transpose(F))
-        Jm = wp.pow(J, -two_thirds)
-        c1 = T(4.0) * c[0] * Jm
-        tau = c[1] * j1 * J * t.identity() + c1 * dev(b)
-        dtau = c[1] * (T(2.0) * J - T(1.0)) * J * trL * t.identity() + c1 * (dev(db) - two_thirds * trL * dev(b))
-        if wp.static(second_invariant):
-            c2 = T(2.0) * c[2] * Jm * Jm
-            s = T(2.0) + T(4.0) * wp.trace(b)
-            A = dev(s * b - T(4.0) * (b * b))
-            dA = dev(T(4.0) * wp.trace(db) * b + s * db - T(4.0) * (db * b + b * db))
-            tau = tau + c2 * A
-            dtau = dtau + c2 * (dA - four_thirds * trL * A)
+        tau = isochoric.form(b, j1, Jm, c)
+        dtau = isochoric.form_change(b, t.sym(dG * wp.transpose(F)), j1, Jm, wp.trace(L), c)
         return (dtau - tau * wp.transpose(L)) * wp.transpose(Fi)
 
     @wp.func
@@ -265,8 +293,7 @@ def orthotropic(dtype: str) -> KernelSet:
     """
     p, t = precision(dtype), tensor_functions(dtype)
     T, mat33, vec3 = p.T, p.mat33, p.vec3
-    moduli9 = t.moduli9
-    coef = wp.types.vector(length=NCOEF, dtype=T)
+    moduli9, coef = t.moduli9, t.coef
 
     @wp.func
     def pk2_stress(E: mat33, c: coef) -> mat33:
@@ -291,18 +318,6 @@ def orthotropic(dtype: str) -> KernelSet:
         return T(0.5) * wp.ddot(E, pk2_stress(E, c))
 
     @wp.func
-    def stress(G: mat33, c: coef) -> mat33:
-        """P = F S."""
-        S = pk2_stress(t.green_lagrange(G), c)
-        return S + G * S
-
-    @wp.func
-    def increment(G: mat33, dG: mat33, c: coef) -> mat33:
-        """dP = dF S + F dS."""
-        F = t.identity() + G
-        return dG * pk2_stress(t.green_lagrange(G), c) + F * pk2_stress(t.sym(wp.transpose(F) * dG), c)
-
-    @wp.func
     def block(G: mat33, a: vec3, c: coef) -> mat33:
         """F M F^T with M d = (D : sym(d a^T)) a, without the possibly indefinite parts of D."""
         # the couplings D_ij alone may be indefinite, and so may the geometric stiffness: both are omitted
@@ -322,7 +337,7 @@ def orthotropic(dtype: str) -> KernelSet:
         M[2, 1] = M[1, 2]
         return F * M * wp.transpose(F)
 
-    return kernel_set(locals())
+    return kernel_set(locals() | vars(linear_law(dtype, pk2_stress)))
 
 
 LAWS = {"orthotropic": orthotropic, "svk": svk, "mooney_rivlin": mooney_rivlin, "neo_hookean": neo_hookean}

@@ -79,7 +79,7 @@ def point_functions(
     viscous, uses_v = damping is not None, midpoint or damping == "rate"
     Block = block_struct(dtype, dissipative)
     NCOEF = materials.NCOEF
-    coef = wp.types.vector(length=NCOEF, dtype=T)
+    coef = t.coef
     Local = slot_values_type(dtype, slots)
     load_slots, load_last_change, store_forces = slot_access_functions(dtype, slots, Block)
     NS, needs_J = slots, law not in materials.DEFINED_FOR_ANY_J
