@@ -52,7 +52,9 @@ class _Mask:
         return tree
 
 
-def masked_kernel(module: wp.Module, flags: str) -> Callable[[Callable], wp.Kernel]:
+def masked_kernel(
+    module: wp.Module, flags: str, key: str | None = None, **options: Any
+) -> Callable[[Callable], wp.Kernel]:
     """Decorator: a kernel that does nothing in the worlds where `flags` is 0.
 
     `if flags[world] == 0: return` stands behind its line `world, ... = wp.tid()`.
@@ -61,8 +63,10 @@ def masked_kernel(module: wp.Module, flags: str) -> Callable[[Callable], wp.Kern
         module: see `kernel_module`.
         flags: [world] an argument of the kernel, "active", or a member of one, "step.accepted". A literal: Warp's cache
             knows the kernel by its source, decorators included.
+        key: name, if not that of the function.
+        options: as `launch_bounds` of `wp.kernel`.
     """
-    return lambda function: wp.Kernel(function, module=module, code_transformers=[_Mask(flags)])
+    return lambda function: wp.Kernel(function, key, module, options, [_Mask(flags)])
 
 
 def kernel_set(names: dict[str, Any]) -> KernelSet:

@@ -4,7 +4,8 @@ import functools
 
 import warp as wp
 
-from .types import precision
+from .modules import KernelSet, kernel_set
+from .types import int_1d, precision
 
 __all__ = ["balance_struct", "pattern_struct", "product_terms_struct", "topology_struct"]
 
@@ -47,16 +48,42 @@ def topology_struct(dtype: str):
 
 
 @functools.cache
-def mass_function(dtype: str):
-    """Device function: an entry of the mass matrix of a world, kg."""
-    T, Topology = precision(dtype).T, topology_struct(dtype)
+def entry_sum_function(dtype: str) -> wp.Function:
+    """Device function: sum of the entries of a slot by a gather table."""
+    p = precision(dtype)
+    vec3 = p.vec3
+
+    @wp.func
+    def entry_sum(start: int_1d, entry: int_1d, values: p.vec3_2d, world: int, slot: int) -> vec3:
+        """Sum of `values` [world, entry] over a slot's entries, in order."""
+        s = vec3()
+        for k in range(start[slot], start[slot + 1]):
+            s += values[world, entry[k]]
+        return s
+
+    return entry_sum
+
+
+@functools.cache
+def mass_functions(dtype: str) -> KernelSet:
+    """Device functions of the mass matrix of a world."""
+    p = precision(dtype)
+    T, vec3, Topology = p.T, p.vec3, topology_struct(dtype)
 
     @wp.func
     def mass_entry(topo: Topology, world: int, k: int) -> T:
-        """Entry k in the given world."""
+        """Entry k of the matrix, kg."""
         return topo.mass_value[world % topo.mass_value.shape[0], k]
 
-    return mass_entry
+    @wp.func
+    def mass_times(topo: Topology, x: p.vec3_2d, world: int, slot: int) -> vec3:
+        """M x at a slot."""
+        s = vec3()
+        for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
+            s += mass_entry(topo, world, k) * x[world, topo.mass_column[k]]
+        return s
+
+    return kernel_set(locals())
 
 
 @functools.cache

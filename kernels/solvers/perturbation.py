@@ -9,7 +9,7 @@ import types as _types
 
 import warp as wp
 
-from ..common.structs import mass_function, topology_struct
+from ..common.structs import mass_functions, topology_struct
 from ..common.types import double_1d, int_1d, kernel_module, kernel_set, precision
 from .newton_control import control_struct
 
@@ -30,7 +30,7 @@ def perturbation_kernels(dtype: str) -> _types.SimpleNamespace:
     T, vec3 = p.T, p.vec3
     f64 = wp.float64
     Control = control_struct()
-    Topology, mass_entry = topology_struct(dtype), mass_function(dtype)
+    Topology, mass_entry = topology_struct(dtype), mass_functions(dtype).mass_entry
     module = kernel_module(f"perturbation_{dtype}")
 
     @wp.kernel(module=module)

@@ -5,7 +5,7 @@ import functools
 import warp as wp
 
 from ..common.modules import KernelSet, kernel_set, masked_kernel
-from ..common.structs import balance_struct, mass_function, topology_struct
+from ..common.structs import balance_struct, mass_functions, topology_struct
 from ..common.types import double_2d, precision
 from ..solvers.newton_control import control_struct
 from .step_control import GROWTH_COLUMNS, step_struct
@@ -73,7 +73,7 @@ def ledger_kernels(dtype: str, chord: bool, nonpotential: bool, module: wp.Modul
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
     f64 = wp.float64
-    mass_entry = mass_function(dtype)
+    mass_times = mass_functions(dtype).mass_times
     Step = step_struct()
     Newton = control_struct()
     Topology, Balance = topology_struct(dtype), balance_struct(dtype)
@@ -113,9 +113,7 @@ def ledger_kernels(dtype: str, chord: bool, nonpotential: bool, module: wp.Modul
         """Per slot: integrator's inertia part, f_int.dq, loads.dq, gravity.dq, supports.dq, kinetic, free g.dq,
         nonpotential.dq, inertia.dq, gravity.u."""
         world, slot = wp.tid()
-        Mv = vec3()
-        for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
-            Mv += mass_entry(topo, world, k) * balance.v[world, topo.mass_column[k]]
+        Mv = mass_times(topo, balance.v, world, slot)
         dq = balance.u[world, slot] - u_n[world, slot]
         a = balance.inertia[world, slot]
         dv = balance.v[world, slot] - v_n[world, slot]

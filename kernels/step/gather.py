@@ -10,7 +10,14 @@ import warp as wp
 from ..common.inverse import inverse_function
 from ..common.lanes import lane_functions
 from ..common.modules import SHORT_UNROLL, KernelSet, kernel_module, kernel_set, masked_kernel
-from ..common.structs import balance_struct, mass_function, pattern_struct, product_terms_struct, topology_struct
+from ..common.structs import (
+    balance_struct,
+    entry_sum_function,
+    mass_functions,
+    pattern_struct,
+    product_terms_struct,
+    topology_struct,
+)  # fmt: skip
 from ..common.traits import NO_TERMS, Traits
 from ..common.types import double_1d, double_3d, int_1d, precision
 from ..solvers.newton_control import (
@@ -60,7 +67,8 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> KernelSet:
     f64 = wp.float64
     Pattern = pattern_struct()
     lane_sum, store_sum = lane_functions(dtype).lane_sum, lane_functions(dtype).store_sum
-    free_inverse, mass_entry = inverse_function(dtype), mass_function(dtype)
+    free_inverse, entry_sum = inverse_function(dtype), entry_sum_function(dtype)
+    mass_entry, mass_times = mass_functions(dtype).mass_entry, mass_functions(dtype).mass_times
     name = f"{dtype}{traits.suffix('nonpotential', 'tangent', 'pooled', 'constraint_rows', 'midpoint')}"
     module = kernel_module(f"gather_{name}", max_unroll=SHORT_UNROLL)
     matrix_module = kernel_module(f"matrix_product_{name}", max_unroll=SHORT_UNROLL)
@@ -107,18 +115,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> KernelSet:
     @wp.func
     def gather_sum(topo: Topology, contribution: p.vec3_2d, world: int, slot: int) -> vec3:
         """Sum of the contributions to a slot, in order."""
-        f = vec3()
-        for k in range(topo.contribution_start[slot], topo.contribution_start[slot + 1]):
-            f += contribution[world, topo.contribution_entry[k]]
-        return f
-
-    @wp.func
-    def pooled_force(topo: Topology, balance: Balance, world: int, slot: int) -> vec3:
-        """Sum of the pooled terms' forces on a slot, in order."""
-        f = vec3()
-        for k in range(topo.pool_start[slot], topo.pool_start[slot + 1]):
-            f += balance.pool_force[world, topo.pool_entry[k]]
-        return f
+        return entry_sum(topo.contribution_start, topo.contribution_entry, contribution, world, slot)
 
     @wp.func
     def newton_gradient(balance: Balance, world: int, slot: int) -> vec3:
@@ -154,7 +151,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> KernelSet:
         f = gather_sum(topo, contribution, world, slot)
         own = f
         if wp.static(pooled):
-            of_pool = pooled_force(topo, balance, world, slot)
+            of_pool = entry_sum(topo.pool_start, topo.pool_entry, balance.pool_force, world, slot)
             f += of_pool
         a, past = vec3(), vec3()
         for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
@@ -241,9 +238,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> KernelSet:
         """H p on the free components: adds the terms' part to the elements' part. Returns p.Hp."""
         out = h
         if wp.static(tangent):
-            f = vec3()
-            for k in range(more.contribution_start[slot], more.contribution_start[slot + 1]):
-                f += more.contribution[world, more.contribution_entry[k]]
+            f = entry_sum(more.contribution_start, more.contribution_entry, more.contribution, world, slot)
             out -= T(more.dq_dv[world]) * f
         if wp.static(pooled):
             stiff = vec3()
@@ -263,65 +258,37 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> KernelSet:
         result[world, slot] = out
         return f64(wp.dot(out, p))
 
-    @wp.func
-    def slot_product(
-        topo: Topology,
-        contribution: p.vec3_2d,
-        mass: bool,
-        more: ProductTerms,
-        p_in: p.vec3_2d,
-        con: Constraints,
-        mul: Multipliers,
-        world: int,
-        slot: int,
-        out: p.vec3_2d,
-        rows: double_3d,
-    ):
-        """H p at a slot, with c_M M p and factor dq/dv if `mass`, and p.Hp per warp of slots."""
-        share = f64(0.0)
-        if slot < out.shape[1]:
-            pool = pool_range(more, slot)
-            h = gather_sum(topo, contribution, world, slot)
-            if mass:
-                a = vec3()
-                for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
-                    a += mass_entry(topo, world, k) * p_in[world, topo.mass_column[k]]
-                h = T(more.mass_factor[world]) * a + T(more.dq_dv[world]) * h
-            share = add_term_products(topo, h, more, pool, p_in[world, slot], con, mul, world, slot, out)
-        store_sum(0, share, slot, more.warp_lanes, world, rows)
+    def product_kernel(name: str, mass: bool, **options: tuple[int, int]) -> wp.Kernel:
+        """Kernel `name` of H p from the contributions of elements; `mass`: these lack c_M M p and the factor dq/dv."""
 
-    @masked_kernel(module, "active")
-    def operator_product(
-        topo: Topology,
-        contribution: p.vec3_2d,
-        more: ProductTerms,
-        p_in: p.vec3_2d,
-        active: int_1d,
-        con: Constraints,
-        mul: Multipliers,
-        out: p.vec3_2d,
-        rows: double_3d,
-    ):
-        """H p = c_M M p + (dq/dv) K p on the free components, constraints included, and p.Hp per warp of slots."""
-        world, slot = wp.tid()
-        slot_product(topo, contribution, True, more, p_in, con, mul, world, slot, out, rows)
+        @masked_kernel(module, "active", f"gather_kernels__locals__{name}", **options)
+        def slot_product(
+            topo: Topology,
+            contribution: p.vec3_2d,
+            more: ProductTerms,
+            p_in: p.vec3_2d,
+            active: int_1d,
+            con: Constraints,
+            mul: Multipliers,
+            out: p.vec3_2d,
+            rows: double_3d,
+        ):
+            """H p = c_M M p + (dq/dv) K p on the free components, constraints included, and p.Hp per warp of slots."""
+            world, slot = wp.tid()
+            share = f64(0.0)
+            if slot < out.shape[1]:
+                pool = pool_range(more, slot)
+                h = gather_sum(topo, contribution, world, slot)
+                if wp.static(mass):
+                    a = mass_times(topo, p_in, world, slot)
+                    h = T(more.mass_factor[world]) * a + T(more.dq_dv[world]) * h
+                share = add_term_products(topo, h, more, pool, p_in[world, slot], con, mul, world, slot, out)
+            store_sum(0, share, slot, more.warp_lanes, world, rows)
 
-    @wp.kernel(module=module, launch_bounds=(256, MIN_RESIDENT_BLOCKS[dtype]))
-    def with_mass_sum(
-        topo: Topology,
-        contribution: p.vec3_2d,
-        more: ProductTerms,
-        p_in: p.vec3_2d,
-        active: int_1d,
-        con: Constraints,
-        mul: Multipliers,
-        out: p.vec3_2d,
-        rows: double_3d,
-    ):
-        """H p from contributions that include the mass and the factors."""
-        world, slot = wp.tid()
-        if active[world] != 0:
-            slot_product(topo, contribution, False, more, p_in, con, mul, world, slot, out, rows)
+        return slot_product
+
+    operator_product = product_kernel("operator_product", mass=True)
+    with_mass_sum = product_kernel("with_mass_sum", mass=False, launch_bounds=(256, MIN_RESIDENT_BLOCKS[dtype]))
 
     @masked_kernel(matrix_module, "active")
     def matrix_product(
@@ -390,9 +357,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> KernelSet:
     def kinetic_terms(topo: Topology, a: p.vec3_2d, rows: double_3d):
         """a.M a / 2 per slot, for every world."""
         world, slot = wp.tid()
-        s = vec3()
-        for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
-            s += mass_entry(topo, world, k) * a[world, topo.mass_column[k]]
+        s = mass_times(topo, a, world, slot)
         rows[0, world, slot] = f64(0.5) * f64(wp.dot(s, a[world, slot]))
 
     return kernel_set(locals())

@@ -139,6 +139,17 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
             step.mass_factor[world] = c.mass_factor
             step.load_factor[world] = f64(1.0)
 
+    @wp.func
+    def falling_velocity(step: Step, world: int, is_position: T, v_tilde: vec3, v_n: vec3) -> vec3:
+        """v~ + (dq/dv) g, with accelerations v_n + h g; gravity acts on position slots."""
+        if wp.static(accelerated):
+            return v_n + (T(step.h[world]) * is_position) * vec3(step.gravity[world])
+        else:
+            fall = T(step.dq_dv[world])
+            if wp.static(midpoint):
+                fall = T(f64(1.0) / step.mass_factor[world])
+            return v_tilde + (fall * is_position) * vec3(step.gravity[world])
+
     @masked_kernel(module, "step.running")
     def predict(
         step: Step,
@@ -177,19 +188,13 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
         q_tilde[world, slot] = q
         v_tilde[world, slot] = w
         first = vec3()
-        dq = T(step.dq_dv[world])
         if wp.static(not static):
-            fall = dq
-            if wp.static(midpoint):
-                fall = T(f64(1.0) / step.mass_factor[world])
-            first = w + (fall * is_position[slot]) * vec3(step.gravity[world])
+            first = falling_velocity(step, world, is_position[slot], w, v_n[world, slot])
             if wp.static(multistep):
                 if step.a1[world] > f64(0.0):  # linear extrapolation: also exact for a constant acceleration
                     ratio = T(step.h[world] / step.previous_h[world])
                     first = v_n[world, slot] + ratio * (v_n[world, slot] - v_before[world, slot])
-            if wp.static(accelerated):
-                first = v_n[world, slot] + (T(step.h[world]) * is_position[slot]) * vec3(step.gravity[world])
-        keep = (T(1.0) / dq) * (u_n[world, slot] - q)
+        keep = (T(1.0) / T(step.dq_dv[world])) * (u_n[world, slot] - q)
         v[world, slot] = free_components(free[slot], first, keep)
 
     @masked_kernel(module, "newton.start.has_alternatives")
@@ -207,17 +212,11 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
     ):
         """Alternative first iterate on the free components: 0: v~ + (dq/dv) g, 1: v_n, 2: the one with q = q_n."""
         world, slot = wp.tid()
-        dq = T(step.dq_dv[world])
         new = v_n[world, slot]
         if kind == 0:
-            fall = dq
-            if wp.static(midpoint):
-                fall = T(f64(1.0) / step.mass_factor[world])
-            new = v_tilde[world, slot] + (fall * is_position[slot]) * vec3(step.gravity[world])
-            if wp.static(accelerated):
-                new = v_n[world, slot] + (T(step.h[world]) * is_position[slot]) * vec3(step.gravity[world])
+            new = falling_velocity(step, world, is_position[slot], v_tilde[world, slot], new)
         elif kind == 2:
-            new = (T(1.0) / dq) * (u_n[world, slot] - q_tilde[world, slot])
+            new = (T(1.0) / T(step.dq_dv[world])) * (u_n[world, slot] - q_tilde[world, slot])
         v[world, slot] = free_components(free[slot], new, v[world, slot])
 
     @masked_kernel(module, "step.running")
@@ -291,9 +290,6 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
         if wp.static(multistep):
             u_before[world, slot] = u_n[world, slot]
             v_before[world, slot] = v_n[world, slot]
-            if slot == 0:
-                step.previous_h[world] = step.h[world]
-                step.previous_end_time[world] = step.time[world]
         if wp.static(accelerated):
             c = coefficients(step.h[world], step.acceleration_step[world], step.scheme_parameter)
             a = u_before[world, slot]
@@ -301,11 +297,11 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
             before = v_n[world, slot] + T(c.v_a) * a + T(c.v_w) * v_before[world, slot]
             u_before[world, slot] = T(c.a_v) * (new - v_n[world, slot]) - T(c.a_a) * a
             v_before[world, slot] = T(c.mass_factor) * (new - before)
-            if slot == 0:
-                step.previous_h[world] = step.h[world]
-                step.previous_end_time[world] = step.time[world]
         u_n[world, slot] = u[world, slot]
         if slot == 0:
+            if wp.static(multistep or accelerated):
+                step.previous_h[world] = step.h[world]
+                step.previous_end_time[world] = step.time[world]
             newton.strain_energy[world] = newton.elem_sums[0, world]
         if wp.static(not static):
             v_n[world, slot] = v[world, slot]
