@@ -12,7 +12,7 @@ import warpfea as wf
 from warpfea.builder.scene import find
 from warpfea.simulation.checkpoint import save_checkpoint
 from warpfea.solvers.band import MAX_AUTO_WIDTH, Band, find_band
-from warpfea.solvers.preconditioner import choose_preconditioner
+from warpfea.solvers.plan import choose_solver
 from warpfea.studies.bench.problems import PROBLEMS
 
 SIZES = {"bar": (12, 1, 1), "beam": 60, "plate": (12, 1)}
@@ -164,20 +164,14 @@ def test_on_a_gpu_it_is_for_small_models():
         return b.finalize(device="cpu")
 
     small, large = beam(16), beam(200)
-    assert choose_preconditioner("auto", None, small) == "banded"
-    cuda = SimpleNamespace(is_cuda=True)
-    with pytest.MonkeyPatch.context() as patch:
-        for model in (small, large):
-            patch.setattr(model, "device", cuda)
-            model.cache.pop("narrow band", None)
-        # the tables of a band lie on the device
-        patch.setattr(
-            type(small), "array", lambda self, name, values, dtype: wp.array(values, dtype=dtype, device="cpu")
-        )
-        assert choose_preconditioner("banded", None, small) == "banded"
-        assert choose_preconditioner("auto", None, small) == "two-level"
-        with pytest.raises(wf.ModelError, match=r"on a GPU for small models with a narrow band; .* take 'auto' or"):
-            choose_preconditioner("banded", None, large)
+    cuda, banded = SimpleNamespace(is_cuda=True), wf.NewtonPCG(preconditioner="banded")
+    assert choose_solver(small, small.device).preconditioner == "banded"
+    assert choose_solver(small, cuda, options=banded).preconditioner == "banded"
+    assert choose_solver(small, cuda).preconditioner == "two-level"
+    assert choose_solver(small, cuda, many=True).preconditioner == "banded"
+    assert choose_solver(large, cuda, many=True).preconditioner == "two-level"
+    with pytest.raises(wf.ModelError, match=r"on a GPU for small models with a narrow band; .* take 'auto' or"):
+        choose_solver(large, cuda, options=banded)
 
 
 def test_wider_bands_are_kept_for_longer():

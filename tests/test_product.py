@@ -20,7 +20,7 @@ def test_both_operators_are_the_matrix_of_the_step(name):
     got = {}
     for operator in ("elements", "matrix"):
         sim, residual = prepare(model, operator)
-        assert residual.uses_matrix == (operator == "matrix")
+        assert residual.plan.uses_matrix == (operator == "matrix")
         direction, out = apply(model, residual)
         got[operator] = out.numpy()[0]
     state = model.state()

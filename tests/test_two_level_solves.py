@@ -1,11 +1,13 @@
 """The two-level preconditioner: what it promises of solves."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from two_level_models import bar
 
 import warpfea as wf
-from warpfea.solvers.preconditioner import choose_preconditioner
+from warpfea.solvers.plan import choose_solver
 from warpfea.studies.bench.problems import PROBLEMS
 
 
@@ -171,8 +173,8 @@ def test_many_small_bodies_on_joints_take_the_deflated_blocks(links, kind):
     scene = find("chain")
     model = scene.build(scene.resolve({"links": links})).finalize(device="cpu")
     counts = {}
-    assert choose_preconditioner("auto", None, model) == "banded"
-    assert choose_preconditioner("auto", "float32", model) == kind  # as on CUDA, where there are no factors
+    assert choose_solver(model, model.device).preconditioner == "banded"
+    assert choose_solver(model, SimpleNamespace(is_cuda=True)).preconditioner == kind
     for name in (kind, "block-jacobi"):
         sim = wf.Simulation(model, dt=1e-3, solver=wf.NewtonPCG(preconditioner=name, max_pcg=20000), ledger=False)
         counts[name] = sum(int(sim.step().pcg[0]) for _ in range(3))

@@ -407,13 +407,16 @@ class ModelBuilder:
                        smoothing=smoothing, overlap=overlap, overlap_time=overlap_time)  # fmt: skip
         return add_contact(self.description, surface, collider, name, **options)
 
-    def finalize(self, *, device: Any = None, dtype: str = "float64", worlds: int = 1) -> Model:
+    def finalize(
+        self, *, device: Any = None, dtype: str = "float64", worlds: int = 1, many: bool | None = None
+    ) -> Model:
         """Make the constant Model of the description; later additions apply to the next `finalize`.
 
         Args:
             device: Warp device, e.g. "cpu" or "cuda:0"; by default CUDA if available, else the CPU.
             dtype: "float64" or "float32".
             worlds: number of independent copies of the scene.
+            many: "auto" options of solvers take what is fastest for many worlds on a GPU; None: from 64 worlds.
 
         Raises:
             ModelError: no bodies, unknown device or precision, or gravity or a body force on a body whose material has
@@ -426,7 +429,8 @@ class ModelBuilder:
         """
         check_densities(self.description)
         with quiet_warp():
-            model = Model(self.description, self.term_factory(), device=device, dtype=dtype, worlds=worlds)
+            args = self.description, self.term_factory()
+            model = Model(*args, device=device, dtype=dtype, worlds=worlds, many=many)
         warn_implausible(model)
         return model
 

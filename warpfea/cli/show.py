@@ -124,6 +124,8 @@ def _info_table(content: dict[str, Any]) -> str:
     methods = c["methods"]
     details = [f"{name} {value}" for name, value in methods.items() if name != "solver"]
     rows.append(["solver", ", ".join([methods["solver"], *details])])
+    plan = {name: value for name, value in c["plan"].items() if name not in {*methods, "dtype", "on_cuda"} and value}
+    rows.append(["", ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in plan.items())])
     rows.append(["energy growth", c["energy_growth"]])
     rows.append(["used", ", ".join(c["features"])])
     rows.append(["left out", ", ".join(c["left_out"])])

@@ -29,6 +29,8 @@ from .topology import make_topology
 __all__ = ["Block", "Model"]
 
 
+MANY_WORLDS = 64
+"""Number of worlds from which a model is one of many: solvers then choose what is fastest for many on a GPU."""
 MAX_LISTED_BODIES = 3
 """Maximum number of bodies listed by a repr."""
 
@@ -39,12 +41,13 @@ class Model:
     Args:
         description: the scene; later additions to it do not change the model.
         terms: makes the set of terms (forces, contact, constraints) of a model, see terms.term_set.
-        device, dtype, worlds: see ModelBuilder.finalize.
+        device, dtype, worlds, many: see ModelBuilder.finalize.
         tables: tables of shape gradients for straight elements, too.
 
     Attributes:
         bodies: the bodies, in the order they were added.
         worlds: number of copies of the model stepped together; dtype, device: as given.
+        many: solvers take what is fastest for many worlds.
         slots: number of slots (3-vector unknowns: node positions and gradients) of all bodies.
         size: diagonal of the box of all nodes, m; reference length of constraint tolerances.
         slot_table: kinds, reference values and free components of the slots.
@@ -68,6 +71,7 @@ class Model:
         device: Any = None,
         dtype: str = "float64",
         worlds: int = 1,
+        many: bool | None = None,
         tables: bool = False,
     ) -> None:
         if dtype not in ("float64", "float32"):
@@ -79,6 +83,7 @@ class Model:
         self.device = find_device(device)
         self.dtype = dtype
         self.worlds = int(worlds)
+        self.many = self.worlds >= MANY_WORLDS if many is None else bool(many)
         self.description = description.copy()
         self.types = precision(dtype)
         self.memory = Memory(self.device, self.types)
@@ -92,7 +97,7 @@ class Model:
         are not carried over."""
         return Model(
             self.description, self._make_terms, device=self.device, dtype=dtype or self.dtype, worlds=worlds,
-            tables=self._tables,
+            many=self.many, tables=self._tables,
         )  # fmt: skip
 
     def _build(self) -> None:
@@ -185,6 +190,7 @@ class Model:
                 for b in self.bodies
             ],
             "worlds": self.worlds,
+            "many": self.many,
             "dtype": self.dtype,
             "device": str(self.device),
             "slots": self.slots,

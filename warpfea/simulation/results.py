@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,10 +30,11 @@ class Results:
     state: State
 
     def info(self) -> dict[str, Any]:
-        """`Model.info`, "integrator" with its options, "methods", and the monitoring of "energy_growth"."""
+        """`Model.info`, "integrator" with its options, "methods", the solver's "plan", the monitoring of
+        "energy_growth"."""
         own: Any = self
-        more = {"integrator": own.integrator.label, "methods": own.methods, "energy_growth": str(own.energy_growth)}
-        return self.model.info() | more
+        more = {"integrator": own.integrator.label, "methods": own.methods, "plan": dataclasses.asdict(own.plan)}
+        return self.model.info() | more | {"energy_growth": str(own.energy_growth)}
 
     def check_body(self, body: Any, what: str) -> None:
         """Raise ModelError unless `body` is the handle of a body of this model; the text begins with `what`."""

@@ -20,7 +20,7 @@ from ..kernels.step.step_control import SAME_TIME_FRACTION, STATUS
 from ..model.assembly import require_density
 from ..model.handles import NodeSet
 from ..model.state import State
-from ..solvers import Jacobi, NewtonPCG
+from ..solvers import Jacobi, NewtonPCG, SolverPlan
 from . import integrators
 from .adaptive import adaptive_options, algebraic_tolerance
 from .capacity import check_capacity
@@ -68,6 +68,8 @@ class Simulation(RunStatistics):
         integrator: "backward_euler", "bdf2", "energy_momentum", wf.GeneralizedAlpha(rho_inf=0.5) or
             wf.EnergyMomentum(rho_inf=0.8); also as text: "generalized_alpha(rho_inf=0.5)".
         solver: "newton-pcg", "jacobi" or "direct", or options: wf.NewtonPCG(...), wf.Jacobi(...).
+        plan: methods for what the options leave open, `plan` of another simulation: a world alone then has the bits
+            that it has among others. None: chosen for the model, see `ModelBuilder.finalize(many=)`.
         constraint_tol: largest constraint violation, over the model's size (`model.size`); by default 1e-8 in float64,
             1e-5 in float32.
         ledger: compute the energy ledger.
@@ -89,7 +91,7 @@ class Simulation(RunStatistics):
         energy_growth: description of the energy growth monitor.
 
     Raises:
-        ModelError: dt or an option out of range, or a material without a density.
+        ModelError: dt or an option out of range, a plan that does not fit, or a material without a density.
         ConstraintError: initially violated joints.
         CapacityError: insufficient device memory.
     """
@@ -106,6 +108,7 @@ class Simulation(RunStatistics):
         horizon: float | None = None,
         integrator: str | integrators.Integrator = "backward_euler",
         solver: NewtonPCG | Jacobi | str | None = None,
+        plan: SolverPlan | None = None,
         constraint_tol: float | None = None,
         ledger: bool = True,
         record: bool = True,
@@ -144,7 +147,7 @@ class Simulation(RunStatistics):
                 model, state, scheme, options,
                 ledger=ledger, capture=capture, constraint_tol=constraint_tol * model.size, inversion=inversion,
                 adapt=adapt, episodes={"asynchronous": asynchronous, "ends": t_end is not None},
-                growth=self.energy_growth, on_compile=on_compile or bar,
+                growth=self.energy_growth, on_compile=on_compile or bar, plan=plan,
             )  # fmt: skip
 
         self.model = model
@@ -228,7 +231,12 @@ class Simulation(RunStatistics):
     @property
     def methods(self) -> dict[str, str]:
         """Methods chosen for "auto": "solver", and for NewtonPCG "linear", "operator" and "preconditioner"."""
-        return dict(self.stepper.newton.methods)
+        return self.plan.methods
+
+    @property
+    def plan(self) -> SolverPlan:
+        """Methods of the linear systems, chosen or given; `plan=` of another simulation takes them."""
+        return self.stepper.newton.plan
 
     @property
     def status(self) -> np.ndarray:

@@ -13,7 +13,7 @@ from ..base.errors import ModelError
 from ..model.assembly import require_density
 from ..model.state import State
 from ..model.topology import check_static_supports
-from ..solvers import NewtonPCG
+from ..solvers import NewtonPCG, SolverPlan
 from .checks import check_choice, check_model
 from .integrators import INTEGRATORS
 from .simulation import Simulation, StepReport
@@ -119,6 +119,7 @@ def solve_static(
     load_steps: int | str = 10,
     tol: float | None = None,
     solver: NewtonPCG | None = None,
+    plan: SolverPlan | None = None,
     state: State | None = None,
     constraint_tol: float | None = None,
     inversion: str = "refuse",
@@ -137,7 +138,7 @@ def solve_static(
         load_steps: number of load steps; "auto": the whole load at once, halved after a rejection.
         tol: relative residual, by default the solver's.
         solver: NewtonPCG options; by default with max_pcg = 20000, for slender bodies.
-        constraint_tol, inversion: as for Simulation.
+        plan, constraint_tol, inversion: as for Simulation.
         state: initial state, copied; by default model.state().
         stabilise: stabilise bodies restrained by contact alone, or not at all yet: a spring per mass of (1 - load)
             times this many N/m per kg on each part, from the last equilibrium to the next, none at full load. True:
@@ -161,8 +162,8 @@ def solve_static(
         KeyboardInterrupt: after Ctrl-C with load steps left, once outputs are closed.
     """
     check_choice("unstable", unstable, *UNSTABLE_CHOICES)
-    options: dict[str, Any] = {"load_steps": load_steps, "tol": tol, "solver": solver, "state": state}
-    options |= {"constraint_tol": constraint_tol, "inversion": inversion, "stabilise": stabilise}
+    options: dict[str, Any] = {"load_steps": load_steps, "tol": tol, "solver": solver, "plan": plan}
+    options |= {"state": state, "constraint_tol": constraint_tol, "inversion": inversion, "stabilise": stabilise}
     sim = begin_static(model, **options)
     return run_static(sim, outputs=outputs, progress=progress, unstable=unstable)
 
@@ -173,6 +174,7 @@ def begin_static(
     load_steps: int | str = 10,
     tol: float | None = None,
     solver: NewtonPCG | None = None,
+    plan: SolverPlan | None = None,
     state: State | None = None,
     constraint_tol: float | None = None,
     inversion: str = "refuse",
@@ -207,6 +209,7 @@ def begin_static(
     return Simulation(
         model, start, dt=1.0 / count, integrator=scheme, solver=options, ledger=False,
         on_failure="raise", constraint_tol=constraint_tol, inversion=inversion, on_compile=on_compile,
+        plan=plan,
     )  # fmt: skip
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ..base.errors import ModelError
 from ..base.names import did_you_mean
@@ -12,11 +12,9 @@ from ..terms.protocols import Coupled
 from ..terms.term import StepContext
 from .jacobi import Jacobi, JacobiLoop
 from .newton import NewtonLoop, NewtonPCG
+from .plan import SolverPlan, check_plan, choose_solver
 
-if TYPE_CHECKING:
-    from ..model.model import Model
-
-__all__ = ["SOLVERS", "Jacobi", "NewtonPCG", "make_solver_loop", "solver_options"]
+__all__ = ["SOLVERS", "Jacobi", "NewtonPCG", "SolverPlan", "choose_solver", "make_solver_loop", "solver_options"]
 
 SOLVERS: dict[str, Callable[..., NewtonPCG | Jacobi]] = {
     "newton-pcg": NewtonPCG,
@@ -39,26 +37,16 @@ def solver_options(solver: Any) -> NewtonPCG | Jacobi:
     raise ModelError(f"solver = {solver!r} is unknown; there are {names}, or options such as wf.NewtonPCG(...){hint}")
 
 
-def make_solver_loop(ctx: StepContext, options: NewtonPCG | Jacobi, **more: Any) -> NewtonLoop:
-    """The solver loop of the given options.
+def make_solver_loop(ctx: StepContext, options: NewtonPCG | Jacobi, plan: SolverPlan | None, **more: Any) -> NewtonLoop:
+    """The solver loop of the given options, with the methods of a plan or those chosen.
 
     Raises:
-        ModelError: a matrix-based solver for a term that couples bodies with a changing pattern.
+        ModelError: a plan that does not fit, or a matrix-based solver for a term that couples bodies with a changing
+            pattern.
     """
-    if isinstance(options, Jacobi) or options.linear == "direct":
-        refuse_couplings(ctx.model, "Jacobi" if isinstance(options, Jacobi) else "NewtonPCG(linear='direct')")
-    if isinstance(options, Jacobi):
-        return JacobiLoop(ctx, options, **more)
-    return NewtonLoop(ctx, options, **more)
-
-
-def refuse_couplings(model: Model, name: str) -> None:
-    """Raise ModelError for a term that couples bodies without a shared element: the matrix has a fixed pattern."""
-    found = [(term.name, couples) for term in model.terms.having(Coupled) if (couples := term.coupled_bodies())]
-    if found:
-        kind, couples = found[0]
-        a, b = (repr(model.bodies[k].name) for k in couples[0])
-        more = f" and {len(couples) - 1} more" if len(couples) > 1 else ""
-        raise ModelError(
-            f"{name} needs a fixed sparsity pattern, but {kind!r} couple bodies {a} and {b}{more}: use wf.NewtonPCG()"
-        )
+    scheme = "statics" if not ctx.inertia else "midpoint" if ctx.midpoint else "dynamics"
+    if plan is None:
+        plan = choose_solver(ctx.model, ctx.model.device, ctx.model.many, options=options, scheme=scheme)
+    else:
+        check_plan(plan, ctx.model, options, scheme)
+    return (JacobiLoop if isinstance(options, Jacobi) else NewtonLoop)(ctx, options, plan, **more)

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from ..terms.workspace import Workspace
     from .matrix_assembly import Pattern
 
-__all__ = ["Band", "BandFactor", "find_band", "thread_block_band"]
+__all__ = ["Band", "BandFactor", "find_band", "fits_thread_block"]
 
 MAX_AUTO_WIDTH = 112
 """Widest band chosen automatically, blocks beside the diagonal; beyond it the two-level preconditioner is cheaper."""
@@ -46,18 +46,13 @@ PRODUCT_TIME, SOLUTION_TIME = 0.06, 5.4e-4
 """us per unknown on one core: H p; forward and backward substitution, per bandwidth."""
 
 
-def thread_block_band(model: Model) -> Band | None:
-    """Narrow band of a small model on CUDA, factored by one thread block per world, or None."""
-    band = find_band(model) if model.device.is_cuda else None
+def fits_thread_block(band: Band | None, model: Model) -> bool:
+    """True if a thread block of a GPU factors the narrow band of a small model, per world."""
     if band is None:
-        return None
+        return False
     size = wp.types.type_size_in_bytes(model.types.T)
     factors = band.block_rows * (band.half_bandwidth + 1) * BLOCK**2 * size
-    return (
-        band
-        if factors <= MAX_WORLD_FACTOR_BYTES and window_size(band.half_bandwidth) * size < MAX_WINDOW_BYTES
-        else None
-    )
+    return factors <= MAX_WORLD_FACTOR_BYTES and window_size(band.half_bandwidth) * size < MAX_WINDOW_BYTES
 
 
 @dataclass(eq=False)

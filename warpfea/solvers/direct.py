@@ -47,7 +47,6 @@ class DirectSolver:
         self.kernels = direct_kernels(model.dtype)
         self.dim = (model.worlds, ctx.launch.padded(model.slots))
         self.factors = make_factors(model, self.assembler.pattern.graph)
-        self.elements_only = not model.terms.has_tangents
         for term in model.terms.having(Preconditioned):
             term.allocate_blocks(ctx, self.assembler, projected=False)
         self.matrix_storage: wp.array | None = None
@@ -97,9 +96,9 @@ class DirectSolver:
     def prepare(self, active: wp.array) -> None:
         """Factorise H in the active worlds."""
         residual = self.residual
-        own = self.elements_only and residual.uses_matrix
+        own = residual.plan.factors_operator
         worlds = np.flatnonzero(
-            (residual.matrix_reuse_rule.control.build_now if own and residual.matrix_reuse_level else active).numpy()
+            (residual.matrix_reuse_rule.control.build_now if own and residual.plan.matrix_reuse else active).numpy()
         )
         if not len(worlds):
             return

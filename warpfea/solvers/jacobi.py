@@ -37,10 +37,10 @@ from ..base.launch import launch_part
 from ..kernels.solvers.jacobi import MAX_PAIRS, jacobi_kernels, jacobi_struct
 from ..terms.protocols import Updated
 from .newton import NewtonLoop, NewtonPCG
-from .twolevel import TwoLevel
 
 if TYPE_CHECKING:
     from ..terms.term import StepContext
+    from .plan import SolverPlan
 
 __all__ = ["Jacobi", "JacobiLoop"]
 
@@ -140,18 +140,16 @@ class JacobiLoop(NewtonLoop):
         self,
         ctx: StepContext,
         options: Jacobi,
+        plan: SolverPlan,
         *,
         constraint_tol: float,
         inversion: str = "refuse",
     ) -> None:
-        super().__init__(ctx, options.newton_options, constraint_tol=constraint_tol, inversion=inversion)
+        super().__init__(ctx, options.newton_options, plan, constraint_tol=constraint_tol, inversion=inversion)
         model, work = ctx.model, ctx.work
-        self.methods = {"solver": "jacobi"}
         # multipliers are updated once, on acceptance: no outer loop, and convergence includes violations
         self.outer_multipliers = False
         work.newton.norms.constraint_tol = constraint_tol
-        assert isinstance(self.preconditioner, TwoLevel)
-        self.preconditioner.rebuild_cost = REBUILD_COST
         self.acceleration = options.acceleration
         self.uses_secants = options.acceleration in ("secants", "anderson")
         self.descent_kernels = jacobi_kernels(model.dtype, model.terms.traits, options.acceleration)

@@ -22,12 +22,13 @@ from ..terms.term import Term
 from .bicgstab import BiCGStab
 from .direct import DirectSolver
 from .pcg import PCG
-from .preconditioner import PRECONDITIONERS, choose_preconditioner, make_preconditioner
+from .preconditioner import PRECONDITIONERS, make_preconditioner
 from .residual import Residual
 
 if TYPE_CHECKING:
     from ..model.state import State
     from ..terms.term import StepContext
+    from .plan import SolverPlan
 
 __all__ = ["NewtonLoop", "NewtonPCG"]
 
@@ -65,10 +66,11 @@ class NewtonPCG:
             contact as 100, have reached it (not with dt="auto").
         preconditioner: "two-level" (dense tiles of 48 unknowns and affine motions of groups of them, reused while
             effective; in statics of short chains of beams factors of the whole), "tiles" (the tiles alone), "banded"
-            (Cholesky factors of the whole, reused too; on the CPU, for chains, strips and slender or small bodies),
+            (Cholesky factors of the whole, reused too, for chains, strips and slender or small bodies; on a GPU for
+            small models only),
             "deflated" (3x3 blocks of every iterate, and inverted constraint directions), "block-jacobi" (the blocks
-            alone), or "auto": on the CPU "banded" for a narrow band or small model, else "deflated" for many small
-            bodies on joints, else "two-level".
+            alone), or "auto": "banded" for a narrow band or small model, on a GPU only for many worlds, else "deflated"
+            for many small bodies on joints, else "two-level".
         linear: "pcg", or "direct": a sparse factorisation, by SuperLU or on a GPU by cuDSS if installed.
         preconditioner_dtype: storage precision of the inverses of "two-level", "float32" or "float64"; None: the
             model's. They are computed in the model's precision; float32 halves the memory traffic of an application. A
@@ -165,61 +167,45 @@ class TermOptions:
 
 
 class NewtonLoop:
-    """Newton loop of all worlds: conditional loops on the device, one code path with and without capture."""
+    """Newton loop of all worlds: conditional loops on the device, one code path with and without capture.
+
+    Attributes:
+        plan: the methods.
+    """
 
     def __init__(
-        self, ctx: StepContext, options: NewtonPCG, *, constraint_tol: float, inversion: str = "refuse"
+        self,
+        ctx: StepContext,
+        options: NewtonPCG,
+        plan: SolverPlan,
+        *,
+        constraint_tol: float,
+        inversion: str = "refuse",
     ) -> None:
         model, work, launch, inertia = ctx.model, ctx.work, ctx.launch, ctx.inertia
         self.ctx, self.model, self.work, self.launch, self.terms = ctx, model, work, launch, model.terms
-        self.constraint_tol = constraint_tol
+        self.plan, self.constraint_tol = plan, constraint_tol
         traits = ctx.traits
         self.kernels, self.vector_kernels = newton_kernels(traits), vector_kernels(model.dtype, traits.has_constraints)
         self.limits_step = traits.limited
         self.outer_multipliers = traits.has_constraints and options.multipliers == "outer"
         self.max_outer = options.max_outer
-        direct = options.linear == "direct"
-        kind = (
-            "direct" if direct else choose_preconditioner(options.preconditioner, options.preconditioner_dtype, model)
-        )
-        # factors include the penalties
-        deflate = kind not in ("block-jacobi", "banded") and not direct
         penalty_ratio = options.penalty_ratio(model.dtype)
-        ctx.options = TermOptions(self.outer_multipliers, penalty_ratio, deflate_constraints=deflate)
+        ctx.options = TermOptions(self.outer_multipliers, penalty_ratio, plan.deflates_constraints)
         self.terms.call(ctx, Constrained, "configure")
-        operator = options.operator
-        if direct and operator == "auto":  # factors live as long as the matrix, unless terms add to it
-            operator = "elements" if model.terms.has_tangents or ctx.midpoint else "matrix"
-        banded = kind == "banded" and model.device.is_cuda
-        assembled = kind not in ("deflated", "block-jacobi")
-        self.residual = Residual(ctx, operator=operator, assembled=assembled, banded=banded)
-        self.direct = DirectSolver(ctx, self.residual) if direct else None
-        self.preconditioner = self.direct or make_preconditioner(
-            kind, options.preconditioner_dtype, model, work, launch, self.residual
-        )
-        linear_solver = BiCGStab if ctx.midpoint else PCG  # unsymmetric operator of mid-point schemes
+        self.residual = Residual(ctx, plan)
+        self.direct = DirectSolver(ctx, self.residual) if plan.linear == "direct" else None
+        self.preconditioner = self.direct or make_preconditioner(plan, model, work, launch, self.residual)
+        linear_solver = BiCGStab if plan.krylov == "bicgstab" else PCG
         self.pcg = linear_solver(
             model, work, launch, self.residual, self.preconditioner,
             max_iterations=options.max_pcg, max_work=options.max_work, deflate=inertia,
         )  # fmt: skip
-        self.methods = {
-            "solver": "newton-pcg",
-            "linear": options.linear,
-            "operator": "matrix" if self.residual.uses_matrix else "elements",
-        }
-        if not direct:
-            self.methods["preconditioner"] = kind
         self.dim = (model.worlds, model.slots)
         ctl = work.newton
         ctl.dq_dv = work.step.dq_dv
-        # a good preconditioner makes a decade of PCG cheaper than another Newton iteration
-        # (in statics the first iterates are far off: solving them tightly is wasted)
-        ctl.solve.first_forcing = 0.1 if kind in ("block-jacobi", "deflated") or not inertia else 0.001
-        if traits.has_constraints:  # constraints are stiff: a loose first solve costs more iterations than it saves
-            ctl.solve.first_forcing = min(ctl.solve.first_forcing, 0.01)
+        ctl.solve.first_forcing = plan.first_forcing
         ctl.solve.fixed_forcing = int(options.forcing is not None)
-        if options.forcing is not None:
-            ctl.solve.first_forcing = options.forcing
         ctl.norms.force_tol = options.force_tol
         ctl.norms.tol = options.tolerance(model.dtype)
         ctl.floor.eps = MACHINE_EPSILON[model.dtype]

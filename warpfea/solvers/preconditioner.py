@@ -1,4 +1,4 @@
-"""Interface of preconditioners, block Jacobi, and automatic selection."""
+"""Interface of preconditioners, and block Jacobi."""
 
 from __future__ import annotations
 
@@ -6,11 +6,9 @@ from typing import TYPE_CHECKING, Protocol
 
 import warp as wp
 
-from ..base.errors import ModelError
 from ..base.launch import launch_part
 from ..kernels.solvers.pcg import pcg_kernels
 from ..terms.protocols import Constrained
-from .band import MAX_FULL_FACTOR_SLOTS, find_band, thread_block_band
 from .residual import Residual
 from .twolevel import TwoLevel
 
@@ -19,8 +17,9 @@ if TYPE_CHECKING:
     from ..model.model import Model
     from ..model.state import State
     from ..terms.workspace import Workspace
+    from .plan import SolverPlan
 
-__all__ = ["PRECONDITIONERS", "BlockJacobi", "Preconditioner", "choose_preconditioner", "make_preconditioner"]
+__all__ = ["BLOCK_PRECONDITIONERS", "PRECONDITIONERS", "BlockJacobi", "Preconditioner", "make_preconditioner"]
 
 
 class Preconditioner(Protocol):
@@ -107,46 +106,14 @@ class BlockJacobi:
             term.precondition(ctx, r, z, active)
 
 
-PRECONDITIONERS = ("two-level", "tiles", "banded", "deflated", "block-jacobi")
-SMALL_BODY_SLOTS = 64
-"""Mean number of slots of a body below which bodies on joints take block Jacobi."""
-
-
-def choose_preconditioner(name: str, storage: str | None, model: Model) -> str:
-    """Resolve a name of PRECONDITIONERS or "auto": banded factors for a narrow band, else block Jacobi if bodies on
-    joints are too small for several groups of nodes.
-
-    Raises:
-        ModelError: "banded" for a larger model on a GPU, or with a storage precision other than the model's.
-    """
-    kept = storage in (None, model.dtype)
-    banded = kept and (not model.device.is_cuda or thread_block_band(model) is not None)
-    if name == "banded" and kept and not banded:
-        raise ModelError(
-            "NewtonPCG: preconditioner = 'banded' is for the CPU, and on a GPU for small models with a narrow band; "
-            f"for this one on {model.device} take 'auto' or 'two-level'"
-        )
-    if name == "banded" and not banded:
-        raise ModelError(
-            f"NewtonPCG: preconditioner = 'banded' keeps its factors in the model's precision, {model.dtype}: leave "
-            f"out preconditioner_dtype = {storage!r}, or take 'two-level'"
-        )
-    if name != "auto":
-        return name
-    if banded and not model.device.is_cuda and find_band(model) is not None:
-        return "banded"
-    small = model.slots < SMALL_BODY_SLOTS * (int(model.components.mesh_of_slot.max()) + 1)
-    return (
-        "deflated"
-        if model.terms.traits.has_constraints and small and model.slots > MAX_FULL_FACTOR_SLOTS
-        else "two-level"
-    )
+BLOCK_PRECONDITIONERS = ("deflated", "block-jacobi")
+"""Preconditioners of 3x3 blocks, which need no assembled matrix."""
+PRECONDITIONERS = ("two-level", "tiles", "banded", *BLOCK_PRECONDITIONERS)
 
 
 def make_preconditioner(
-    name: str, storage: str | None, model: Model, work: Workspace, launch: Launcher, residual: Residual
+    plan: SolverPlan, model: Model, work: Workspace, launch: Launcher, residual: Residual
 ) -> Preconditioner:
-    """Construct the preconditioner `name` of PRECONDITIONERS."""
-    if name in ("block-jacobi", "deflated"):
-        return BlockJacobi(model, work, launch, residual)
-    return TwoLevel(model, work, launch, residual, storage, kind=name)
+    """Construct the preconditioner of a plan."""
+    kind = BlockJacobi if plan.preconditioner in BLOCK_PRECONDITIONERS else TwoLevel
+    return kind(model, work, launch, residual)

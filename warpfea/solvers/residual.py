@@ -27,18 +27,9 @@ if TYPE_CHECKING:
     from ..model.state import State
     from ..terms.term import StepContext
     from ..terms.workspace import Workspace
+    from .plan import SolverPlan
 
 __all__ = ["Residual", "RowReducer"]
-
-MAX_MATRIX_FREE_SLOTS = 10
-"""Slots per element up to which H p from elements is cheaper than from their matrix, on a GPU."""
-MATRIX_REBUILD_COST = {False: 2.0, True: 0.5}
-"""Assembly cost in Newton iterations, on the CPU and on CUDA."""
-BAND_REBUILD_COST = 3.0
-"""Assembly cost in Newton iterations of matrices factored in a band on a GPU. 4096 pendulums take 8.5, 8.1 and 8.2 ms
-per step with 0.5, 1.5 and 3 at a tolerance of 1e-8, and 6.9, 5.7 and 4.2 ms at 1e-4."""
-MAX_FAST_ASSEMBLY_SLOTS = 16384
-"""Slots up to which a GPU assembles a matrix faster than it solves with one."""
 
 
 class RowReducer:
@@ -71,14 +62,14 @@ class Residual:
     """Launches that evaluate g(v), Phi(v), the norms, and H p.
 
     Attributes:
-        uses_matrix: H p is a product with the assembled matrix.
-        matrix_reuse_level: reuse of that matrix: 0 none, 1 over the iterates of a step, 2 also over steps.
+        plan: the methods, as far as the operator goes.
         on_assembled: called with that matrix and the flags of worlds that reassembled it.
     """
 
-    def __init__(self, ctx: StepContext, *, operator: str, assembled: bool, banded: bool = False) -> None:
+    def __init__(self, ctx: StepContext, plan: SolverPlan) -> None:
         model, work, launch = ctx.model, ctx.work, ctx.launch
         self.ctx, self.model, self.work, self.launch, self.terms = ctx, model, work, launch, model.terms
+        self.plan = plan
         self.elements: Elements = model.terms.find(Elements)
         self.reduce = RowReducer(launch, work, model.worlds)
         traits = ctx.traits
@@ -91,56 +82,25 @@ class Residual:
         self.constraint_data = model.constraints.data if traits.constraint_rows else constraint_struct()()
         self.dim = (model.worlds, model.slots)
         self.product_terms = self._make_product_terms()
-        self.products_include_mass = all(block.with_mass for block in model.blocks)
-        # elements with many points per slot cost more than their matrix. On the CPU it is used whenever the
-        # preconditioner needs one anyway: one core assembles H in the time of 2 to 7 products of ANCF elements, and of
-        # 15 of straight tetrahedra
-        cheaper = any(block.slots > MAX_MATRIX_FREE_SLOTS or block.key.tying for block in model.blocks)
-        if not model.device.is_cuda:
-            cheaper = assembled
-        elif banded:  # their factors solve with the matrix
-            cheaper = True
-        if ctx.midpoint:  # symmetric matrix, unsymmetric operator of a mid-point step
-            cheaper = False
-        self.uses_matrix: bool = operator == "matrix" or (operator == "auto" and cheaper)
         self.clusters: ModelClusters | None = None
-        # an equilibrium takes few products per iterate, and fewer iterates with the predicted stress
-        self.uses_predicted_stress = not ctx.inertia and not self.uses_matrix
-        if self.products_include_mass and not self.uses_matrix and ctx.inertia:
+        if plan.operator == "clusters":
             if "clusters" not in model.cache:
                 model.cache["clusters"] = make_clusters(model)
             self.clusters = model.cache["clusters"]
             self.cluster_memory = make_cluster_memory(model, work, midpoint=ctx.midpoint)
-            forms = [block.key.damping if ctx.inertia else None for block in model.blocks]
             self.product_kernels = [
-                block.with_mass_product(model.dtype, form, ctx.midpoint, ctx.dissipation > 0.0)
-                for block, form in zip(model.blocks, forms)
+                block.with_mass_product(model.dtype, block.key.damping, ctx.midpoint, ctx.dissipation > 0.0)
+                for block in model.blocks
             ]
-        self.matrix_reuse_level, self.reuse_across_steps = 0, False
         self.on_assembled: Callable[[wp.array, wp.array], None] | None = None
         self.assembler: MatrixAssembler | None = None
-        if assembled or self.uses_matrix:
+        if plan.assembles:
             self.assembler = MatrixAssembler(model, work, launch, self.elements.kernels(ctx))
-        if self.uses_matrix:
+        if plan.uses_matrix:
             assert self.assembler is not None
             self.operator_matrix = self.assembler.allocate_values("operator matrix")
-            # not in statics (large steps) nor with damping (the viscous stress is no function of the state of a resumed
-            # run) nor constraints (their forces are only as accurate as the solve); a GPU assembles a small matrix at
-            # negligible cost
-            damped = ctx.midpoint or any(block.key.damping in ("incremental", "rate") for block in model.blocks)
-            small = model.device.is_cuda and model.slots <= MAX_FAST_ASSEMBLY_SLOTS
-            self.matrix_reuse_level = 2 if ctx.inertia and not damped else 0 if small else 1
-            if traits.has_constraints:
-                self.matrix_reuse_level = 0
-            self.reuse_across_steps = self.matrix_reuse_level == 2
-            if self.matrix_reuse_level:
-                self.matrix_reuse_rule = ReuseRule(
-                    model,
-                    work,
-                    launch,
-                    "operator",
-                    BAND_REBUILD_COST if banded else MATRIX_REBUILD_COST[model.device.is_cuda],
-                )
+        if plan.matrix_reuse:
+            self.matrix_reuse_rule = ReuseRule(model, work, launch, "operator", plan.matrix_rebuild_cost)
 
     def _make_product_terms(self) -> Any:
         """Terms of a product H p beyond the elements' part."""
@@ -165,29 +125,29 @@ class Residual:
         out = {self.gather_kernels.module, self.vector_kernels.module} | (
             {self.midpoint_kernels.module} if self.ctx.midpoint else set()
         )
-        if self.uses_matrix:
+        if self.plan.uses_matrix:
             assert self.assembler is not None
             out |= {self.gather_kernels.matrix_module} | self.assembler.modules()
-            out |= {self.matrix_reuse_rule.kernels.module} if self.matrix_reuse_level else set()
+            out |= {self.matrix_reuse_rule.kernels.module} if self.plan.matrix_reuse else set()
         elif self.clusters:
             out |= {kernel.module for kernel in self.product_kernels}
-        elif self.uses_predicted_stress:
+        elif self.plan.uses_predicted_stress:
             out |= {kernel.module for kernel in self.elements.predicted_stress_kernels()}
         return out
 
     def register(self, state: State) -> None:
         """Register the reuse data of the operator matrix in the state."""
-        if self.reuse_across_steps:
+        if self.plan.reuses_across_steps:
             self.matrix_reuse_rule.register(state)
 
     def invalidate(self, flags: wp.array) -> None:
         """Invalidate history of worlds whose state was set externally."""
-        if self.reuse_across_steps:
+        if self.plan.reuses_across_steps:
             self.matrix_reuse_rule.invalidate(flags)
 
     def store_history(self, accepted: wp.array) -> None:
         """Store the reuse data of the operator matrix in the state."""
-        if self.reuse_across_steps:
+        if self.plan.reuses_across_steps:
             args = [self.matrix_reuse_rule.control, self.work.newton, accepted]
             self.launch(self.matrix_reuse_rule.kernels.count_step, self.model.worlds, args)
             self.matrix_reuse_rule.move_point(accepted)
@@ -196,13 +156,13 @@ class Residual:
     @launch_part("assembly")
     def linearise(self, active: wp.array) -> None:
         """Assemble the operator matrix at the iterate if its reuse rule requires it."""
-        if not self.uses_matrix:
+        if not self.plan.uses_matrix:
             return
-        if self.matrix_reuse_level == 0:
+        if not self.plan.matrix_reuse:
             self.assemble_matrix(active)
             return
         control = self.matrix_reuse_rule.control
-        args = [control, self.work.newton, self.matrix_reuse_level]
+        args = [control, self.work.newton, self.plan.matrix_reuse]
         self.launch(self.matrix_reuse_rule.kernels.check_matrix_reuse, self.model.worlds, args)
         self.matrix_reuse_rule.decide_rebuild(active)
         self.launch(self.matrix_reuse_rule.kernels.loosen_forcing, self.model.worlds, [control, self.work.newton])
@@ -228,7 +188,7 @@ class Residual:
     def assemble_matrix(self, active: wp.array) -> None:
         """Assemble the operator matrix at the iterate unconditionally."""
         w = self.work
-        if self.uses_matrix:
+        if self.plan.uses_matrix:
             assert self.assembler is not None
             factors = (w.step.mass_factor, w.step.dq_dv)
             self.assembler.assemble(w.u_stage, factors, active, self.operator_matrix, projected=False)
@@ -321,14 +281,14 @@ class Residual:
                 ]
                 args += [lanes, self.cluster_memory, w.contribution]
                 launch(kernel, (m.worlds, count * lanes), args, block_dim=block.cluster_size)
-        elif self.uses_predicted_stress:
+        elif self.plan.uses_predicted_stress:
             self.elements.predicted_stress_tangent(self.ctx, p, active)
-        elif not self.uses_matrix:
+        elif not self.plan.uses_matrix:
             self.elements.tangent(self.ctx, p, active)
         for term in self.terms:
             term.product(self.ctx, p, active)
         rest = [self.product_terms, p, active, self.constraint_data, w.multipliers]
-        if self.uses_matrix:
+        if self.plan.uses_matrix:
             assert self.assembler is not None
             pattern = self.assembler.pattern
             lanes = launch.lanes(pattern.mean_row_length)

@@ -33,13 +33,13 @@ from ..kernels.solvers.levels_build import FACTOR_LANES, build_kernels
 from ..kernels.solvers.pcg import pcg_kernels
 from ..model.state import view_as_words
 from ..terms.protocols import CachedInputs, Constrained, Coupled, Preconditioned
-from .band import MAX_FULL_FACTOR_SLOTS, BandFactor, find_band
+from .band import BandFactor, find_band
 from .dense import gauss_jordan
 from .level_arrays import LevelArrays
 from .levels import GROUP_SLOTS, Level, make_levels
 from .matrix_assembly import leading_view, worlds_per_chunk
 from .reuse import ReuseRule
-from .rigid_body_modes import RigidBodyModes, mode_bodies
+from .rigid_body_modes import RigidBodyModes
 
 if TYPE_CHECKING:
     from ..base.launch import Launcher
@@ -55,8 +55,6 @@ LARGEST_EIGENVALUE = 3.5
 """Assumed largest eigenvalue of a preconditioned coarse matrix (2.7 to 3.5 measured)."""
 EIGENVALUE_RATIO = 8.0
 """Design ratio of largest to smallest eigenvalue of the Chebyshev steps."""
-REBUILD_COST = 40.0
-"""Setup cost of the preconditioner, in PCG iterations."""
 
 
 class TwoLevel:
@@ -74,12 +72,10 @@ class TwoLevel:
         work: Workspace,
         launch: Launcher,
         residual: Residual,
-        storage: str | None = None,
-        *,
-        kind: str = "two-level",
     ) -> None:
         self.model, self.work, self.launch, self.residual = model, work, launch, residual
-        self.storage_dtype = storage or model.dtype
+        self.plan = plan = residual.plan
+        self.storage_dtype = plan.storage
         assert residual.assembler is not None
         self.assembler = residual.assembler
         self.kernels = level_kernels(model.dtype, self.storage_dtype)
@@ -87,7 +83,7 @@ class TwoLevel:
         self.block_kernels = block_kernels(model.dtype)
         self.block_jacobi = pcg_kernels(model.dtype, model.terms.traits.has_constraints).apply_block_jacobi
         self.dim = (model.worlds, model.slots)
-        self.levels = self._make_levels(kind)
+        self.levels = self._make_levels()
         self.ctx, self.terms = residual.ctx, model.terms
         for term in self.terms.having(Preconditioned):
             term.allocate_blocks(self.ctx, self.assembler, projected=True)
@@ -97,19 +93,7 @@ class TwoLevel:
         first, pattern = self.levels[0], self.assembler.pattern
         band = first.band
         self.band = BandFactor(model, work, launch, band, pattern) if band is not None else None
-        # factors of the operator's matrix if cheap, or for static equilibria of beams (the matrix made here then only
-        # serves D); wider bands are reused for longer
-        one = (
-            self.storage_dtype == model.dtype and not residual.ctx.inertia and first.slot_count <= MAX_FULL_FACTOR_SLOTS
-        )
-        order = find_band(model) if first.is_dense and one else band
-        # (a GPU factors the band of a small model, joint terms included, in about the time of its matrix)
-        quick = order is not None and (order.cheap_to_factorise or (band is not None and model.device.is_cuda))
-        traits = model.terms.traits
-        whole = not self.terms_add_blocks or (
-            model.device.is_cuda and not traits.pooled and residual.matrix_reuse_level == 0
-        )
-        self.factors_operator = quick and residual.uses_matrix and whole and not traits.tangent
+        self.factors_operator = plan.factors_operator
         by_component = not self.factors_operator
         self.level_arrays = [
             LevelArrays(model, work, launch, level, k, self.storage_dtype, by_component)
@@ -122,38 +106,37 @@ class TwoLevel:
         # matrix of a chunk of worlds; with factors a GPU needs more worlds at once to be busy
         share = 2 if self.factors_operator and self.terms_add_blocks else 1
         self.worlds_per_chunk = model.worlds
-        if not mode_bodies(model):
+        if not plan.body_modes:
             work.chunks["preconditioner matrix"] = lambda worlds: min(worlds, share * worlds_per_chunk(worlds))
             self.worlds_per_chunk = work.chunks["preconditioner matrix"](model.worlds)
         self.block_values = self.assembler.allocate_values("preconditioner matrix", self.worlds_per_chunk)
         self.chunk_flags = work.array("preconditioner chunk", (model.worlds,), wp.int32)
-        free = model.components.free_group_count > 0  # bodies whose momentum is conserved by the translation correction
-        if self.factors_operator and self.band and model.dtype == "float64" and residual.ctx.inertia and not free:
+        if plan.exact:
+            assert self.band is not None
             work.pcg.preconditioner_is_exact = self.band.exact
         self.body_modes, self.mode_coupling_modules = self._make_body_modes()
         self.one_thread_per_row = 0 if model.device.is_cuda else 1
         deflates = not first.solved_directly and self.ctx.options.deflate_constraints
         self.corrections = self.terms.having(Constrained) if deflates else []
         self.cached_inputs: dict[str, CachedInputs] = {}
-        self.rebuild_cost = band.rebuild_cost if band is not None and not self.factors_operator else REBUILD_COST
         # iteration counts are not comparable; separate key
         name = "preconditioner" if band is None else "preconditioner_banded"
-        self.reuse = ReuseRule(model, work, launch, name, self.rebuild_cost)
+        self.reuse = ReuseRule(model, work, launch, name, plan.rebuild_cost)
         most = max([level.slot_count for level in self.levels[1:]], default=1)
         self.all_free = wp.full(most, 1.0, dtype=model.types.vec3, device=model.device)
 
     def _make_body_modes(self) -> tuple[RigidBodyModes | None, set[wp.Module]]:
         """Rigid body modes of bodies coupled by terms, and the term modules that they need."""
-        if not mode_bodies(self.model):
+        if not self.plan.body_modes:
             return None, set()
         out = RigidBodyModes(self.model, self.work, self.launch, self.residual, self.assembler.pattern)
         return out, out.modules().union(
             *(term.allocate_mode_coupling(self.ctx, out) for term in self.terms.having(Coupled))
         )
 
-    def _make_levels(self, kind: str) -> list[Level]:
-        """Levels of a kind of preconditioner: "two-level", "tiles" (without a coarse space) or "banded"."""
-        model, pattern = self.model, self.assembler.pattern
+    def _make_levels(self) -> list[Level]:
+        """Levels of "two-level", "tiles" (without a coarse space) or "banded"."""
+        model, pattern, kind = self.model, self.assembler.pattern, self.plan.preconditioner
         if kind == "banded":
             band = find_band(model) or find_band(model, any_width=True)
             return [Level(pattern, model.slots, False, level_struct(model.dtype)(), band=band)]
@@ -165,7 +148,6 @@ class TwoLevel:
 
     def register(self, state: State) -> None:
         """Register the linearisation point and the rule's counts in the state, for resumed runs."""
-        self.reuse.control.max_extra_iterations = self.rebuild_cost
         self.reuse.register(state)
         for term in self.terms.having(Preconditioned):
             kept = CachedInputs([], [], [])
