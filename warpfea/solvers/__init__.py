@@ -8,7 +8,6 @@ from typing import Any
 
 from ..base.errors import ModelError
 from ..base.names import did_you_mean
-from ..terms.protocols import Coupled
 from ..terms.term import StepContext
 from .jacobi import Jacobi, JacobiLoop
 from .newton import NewtonLoop, NewtonPCG
