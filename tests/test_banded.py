@@ -11,8 +11,8 @@ from warpfea.kernels.solvers.band import BLOCK
 import warpfea as wf
 from warpfea.builder.scene import find
 from warpfea.simulation.checkpoint import save_checkpoint
+from warpfea.solvers import choose_solver
 from warpfea.solvers.band import MAX_AUTO_WIDTH, Band, find_band
-from warpfea.solvers.plan import choose_solver
 from warpfea.studies.bench.problems import PROBLEMS
 
 SIZES = {"bar": (12, 1, 1), "beam": 60, "plate": (12, 1)}

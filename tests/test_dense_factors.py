@@ -6,7 +6,7 @@ import warp as wp
 
 import warpfea as wf
 from warpfea.simulation.statics import begin_static
-from warpfea.solvers import plan
+from warpfea.solvers import choice
 from warpfea.solvers.twolevel import TwoLevel
 from warpfea.studies.stress.case import Setting
 from warpfea.studies.stress.suite import load_cases
@@ -128,13 +128,13 @@ def test_a_slender_elastica_takes_ten_iterations_per_load_step(
     slenderness: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The row of the stress suite with what a GPU takes."""
-    monkeypatch.setattr(plan, "choose_preconditioner", lambda *_: "two-level")
+    monkeypatch.setattr(choice, "choose_preconditioner", lambda *_: "two-level")
     answer = CASES["elastica"].run(Setting("cpu", "float64"), slenderness)
     assert answer.passed, answer
 
 
 def test_a_twisted_beam_holds_in_single_precision(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without exact factors it was accepted with forces up to 1.8 % out of balance."""
-    monkeypatch.setattr(plan, "choose_preconditioner", lambda *_: "two-level")
+    monkeypatch.setattr(choice, "choose_preconditioner", lambda *_: "two-level")
     answer = CASES["twist-below"].run(Setting("cpu", "float32"), 0.9)
     assert answer.passed, answer

@@ -9,7 +9,7 @@ import warp as wp
 
 import warpfea as wf
 from warpfea.contact.facets import FacetContact
-from warpfea.solvers import plan
+from warpfea.solvers import choice
 
 SIDE = 0.2
 
@@ -68,7 +68,7 @@ def test_iterations_do_not_grow_with_the_stack(kind):
 
 
 def test_without_the_motions_they_do(monkeypatch):
-    monkeypatch.setattr(plan, "mode_bodies", lambda model: {})
+    monkeypatch.setattr(choice, "mode_bodies", lambda model: {})
     few, many = (iterations(stack(n, 1e8), "banded") for n in (5, 20))
     assert many > 1.5 * few
 
@@ -157,9 +157,9 @@ def test_the_correction_is_that_of_the_coupled_motions(element, held):
 
 def test_bodies_that_touch_no_free_one_have_no_motions():
     model = stack(1, 1e6)
-    assert plan.mode_bodies(model) == {}
+    assert choice.mode_bodies(model) == {}
     assert simulation(model, "banded").stepper.newton.preconditioner.body_modes is None
-    assert plan.mode_bodies(stack(2, 1e6, foreign=True)) == {1: 0, 2: 1}
+    assert choice.mode_bodies(stack(2, 1e6, foreign=True)) == {1: 0, 2: 1}
 
 
 @pytest.mark.parametrize("kind", ["banded", "two-level"])

@@ -45,11 +45,18 @@ MODELS = {
 }
 TABLE = [
     # model, device, many, options, scheme, what the plan has
-    ("beam", CPU, False, {}, "dynamics", {"preconditioner": "banded", "operator": "matrix", "matrix_reuse": 2}),
+    ("beam", CPU, False, {}, "dynamics", {"preconditioner": "banded", "operator": "matrix", "matrix_reuse_level": 2}),
     ("beam", CPU, True, {}, "dynamics", {"preconditioner": "banded", "exact": True, "factors_operator": True}),
     ("beam", CUDA, False, {}, "dynamics", {"preconditioner": "two-level", "operator": "matrix", "exact": False}),
     ("beam", CUDA, True, {}, "dynamics", {"preconditioner": "banded", "exact": True, "matrix_rebuild_cost": 3.0}),
-    ("beam", CUDA, False, {}, "statics", {"preconditioner": "two-level", "factors_operator": True, "matrix_reuse": 0}),
+    (
+        "beam",
+        CUDA,
+        False,
+        {},
+        "statics",
+        {"preconditioner": "two-level", "factors_operator": True, "matrix_reuse_level": 0},
+    ),
     ("beam", CPU, False, {}, "midpoint", {"krylov": "bicgstab", "operator": "elements", "factors_operator": False}),
     ("beam", CPU, False, {"operator": "elements"}, "statics", {"operator": "predicted stress", "assembles": True}),
     (
@@ -63,14 +70,21 @@ TABLE = [
     ("beam", CPU, False, {"preconditioner_dtype": "float32"}, "dynamics", {"preconditioner": "two-level"}),
     ("beam", CUDA, True, {"preconditioner_dtype": "float32"}, "dynamics", {"preconditioner": "two-level"}),
     ("beam", CPU, False, {"forcing": 1e-8}, "dynamics", {"first_forcing": 1e-8}),
-    ("damped beam", CPU, False, {}, "dynamics", {"matrix_reuse": 1, "first_forcing": 0.001}),
-    ("damped beam", CUDA, False, {}, "dynamics", {"matrix_reuse": 0}),
+    ("damped beam", CPU, False, {}, "dynamics", {"matrix_reuse_level": 1, "first_forcing": 0.001}),
+    ("damped beam", CUDA, False, {}, "dynamics", {"matrix_reuse_level": 0}),
     ("long beam", CUDA, True, {}, "dynamics", {"preconditioner": "two-level", "half_bandwidth": 0}),
     ("block", CPU, False, {}, "dynamics", {"preconditioner": "two-level", "operator": "matrix", "rebuild_cost": 40.0}),
     ("block", CUDA, True, {}, "dynamics", {"preconditioner": "two-level", "operator": "clusters", "assembles": True}),
     ("block", CUDA, False, {"preconditioner": "block-jacobi"}, "dynamics", {"assembles": False, "first_forcing": 0.1}),
     ("slider", CUDA, False, {}, "dynamics", {"preconditioner": "two-level", "deflates_constraints": True}),
-    ("slider", CUDA, True, {}, "dynamics", {"preconditioner": "banded", "matrix_reuse": 0, "factors_operator": True}),
+    (
+        "slider",
+        CUDA,
+        True,
+        {},
+        "dynamics",
+        {"preconditioner": "banded", "matrix_reuse_level": 0, "factors_operator": True},
+    ),
     ("slider", CPU, True, {}, "dynamics", {"preconditioner": "banded", "factors_operator": False}),
     ("chain", CUDA, False, {}, "dynamics", {"preconditioner": "deflated", "first_forcing": 0.01}),
 ]
@@ -115,7 +129,7 @@ def test_the_plan_is_shown(models):
 
 
 def test_a_world_alone_with_the_plan_of_many_has_its_bits():
-    """What a GPU takes for many, which differs from what a lone model takes there."""
+    """The plan of many differs from what a lone model takes, as on a GPU."""
     two_level = wf.NewtonPCG(preconditioner="two-level")
     many = beam(worlds=3)
     gravity = np.array([(0.0, 0.0, -9.81), (0.0, 5.0, 0.0), (3.0, 0.0, -1.0)])
@@ -167,7 +181,7 @@ def test_statics_takes_a_plan_too(models):
         ({"scheme": "statics"}, {}, "scheme = 'statics' does not fit this simulation, which takes 'dynamics'"),
         ({"dtype": "float32"}, {}, "dtype = 'float32' does not fit"),
         ({"on_cuda": True}, {}, "on_cuda = True does not fit"),
-        ({"matrix_reuse": 1}, {}, "matrix_reuse = 1 does not fit this simulation, which takes 2"),
+        ({"matrix_reuse_level": 1}, {}, "matrix_reuse_level = 1 does not fit this simulation, which takes 2"),
     ],
 )
 def test_a_plan_that_does_not_fit_is_refused(models, change, options, message):

@@ -7,7 +7,7 @@ import pytest
 from two_level_models import bar
 
 import warpfea as wf
-from warpfea.solvers.plan import choose_solver
+from warpfea.solvers import choose_solver
 from warpfea.studies.bench.problems import PROBLEMS
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from ..base.errors import ConstraintError, ConvergenceError
 from ..kernels.step.episodes import RUN_STATISTICS
 from ..kernels.step.step_control import REPORT_COLUMNS, STATUS
+from ..solvers import SolverPlan
 from .energy_growth import EnergyGrowth
 from .failures import step_error
 from .records import Records
@@ -61,6 +62,16 @@ class RunStatistics(Records):
     on_failure: str | None
     record: bool
     energy_growth: EnergyGrowth
+
+    @property
+    def methods(self) -> dict[str, str]:
+        """Methods chosen for "auto": "solver", and for NewtonPCG "linear", "operator" and "preconditioner"."""
+        return self.plan.methods
+
+    @property
+    def plan(self) -> SolverPlan:
+        """Methods of the linear systems, chosen or given; `plan=` of another simulation takes them."""
+        return self.stepper.newton.plan
 
     def _reset_statistics(self, asynchronous: bool) -> None:
         B = self.model.worlds

@@ -229,16 +229,6 @@ class Simulation(RunStatistics):
         return self.time if self._load is None else self._load
 
     @property
-    def methods(self) -> dict[str, str]:
-        """Methods chosen for "auto": "solver", and for NewtonPCG "linear", "operator" and "preconditioner"."""
-        return self.plan.methods
-
-    @property
-    def plan(self) -> SolverPlan:
-        """Methods of the linear systems, chosen or given; `plan=` of another simulation takes them."""
-        return self.stepper.newton.plan
-
-    @property
     def status(self) -> np.ndarray:
         """Status [world]: 0 running, 1 failed, 2 frozen."""
         return self.state.status.numpy().copy()

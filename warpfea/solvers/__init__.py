@@ -9,9 +9,10 @@ from typing import Any
 from ..base.errors import ModelError
 from ..base.names import did_you_mean
 from ..terms.term import StepContext
+from .choice import check_plan, choose_solver
 from .jacobi import Jacobi, JacobiLoop
 from .newton import NewtonLoop, NewtonPCG
-from .plan import SolverPlan, check_plan, choose_solver
+from .plan import SolverPlan
 
 __all__ = ["SOLVERS", "Jacobi", "NewtonPCG", "SolverPlan", "choose_solver", "make_solver_loop", "solver_options"]
 

@@ -98,7 +98,9 @@ class DirectSolver:
         residual = self.residual
         own = residual.plan.factors_operator
         worlds = np.flatnonzero(
-            (residual.matrix_reuse_rule.control.build_now if own and residual.plan.matrix_reuse else active).numpy()
+            (
+                residual.matrix_reuse_rule.control.build_now if own and residual.plan.matrix_reuse_level else active
+            ).numpy()
         )
         if not len(worlds):
             return

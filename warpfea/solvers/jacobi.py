@@ -50,9 +50,6 @@ MAX_RESIDUAL_GROWTH = 10.0
 """Largest accepted ratio of the final to the initial residual of a step."""
 MAX_VIOLATION = 1e-3
 """Largest accepted constraint violation over the model's size."""
-REBUILD_COST = 10.0
-"""Extra iterations that trigger a rebuild of B: fewer than for Newton's method, since an old B costs accuracy here, not
-time. Of 5, 10, 20 and 40 on soft bars in large rotations, 40 saves a tenth of the time at up to 70 times the error."""
 STEP_LENGTH = {"secants": 0.7, "anderson": 0.7, "chebyshev": 1.0, "none": 0.5}
 """Factor of z = B r in the move, by acceleration."""
 LARGEST_EIGENVALUE = 3.5

@@ -22,13 +22,13 @@ from ..terms.term import Term
 from .bicgstab import BiCGStab
 from .direct import DirectSolver
 from .pcg import PCG
-from .preconditioner import PRECONDITIONERS, make_preconditioner
+from .plan import PRECONDITIONERS, SolverPlan
+from .preconditioner import make_preconditioner
 from .residual import Residual
 
 if TYPE_CHECKING:
     from ..model.state import State
     from ..terms.term import StepContext
-    from .plan import SolverPlan
 
 __all__ = ["NewtonLoop", "NewtonPCG"]
 

@@ -1,41 +1,14 @@
-"""Choice of a simulation's methods: preconditioner, operator, reuse and forcing, in one function of model and options.
-
-A GPU takes banded factors for many worlds only: 4096 pendulums of 201 unknowns take 560 000 world-steps/s with them and
-315 000 with two levels, slider-cranks of 225 unknowns 77 000 and 18 700; a single pendulum 912 and 1220 steps/s.
-"""
+"""Methods of a simulation's linear systems, as `choice.py` chooses them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
 
-from ..base.errors import ModelError
-from ..terms.protocols import Coupled
-from .band import MAX_FULL_FACTOR_SLOTS, Band, find_band, fits_thread_block
-from .jacobi import REBUILD_COST as JACOBI_REBUILD_COST
-from .jacobi import Jacobi
-from .newton import NewtonPCG
-from .preconditioner import BLOCK_PRECONDITIONERS
-from .rigid_body_modes import mode_bodies
+__all__ = ["BLOCK_PRECONDITIONERS", "PRECONDITIONERS", "SolverPlan"]
 
-if TYPE_CHECKING:
-    from ..model.model import Model
-
-__all__ = ["SolverPlan", "check_plan", "choose_solver"]
-
-SMALL_BODY_SLOTS = 64
-"""Mean number of slots of a body below which bodies on joints take block Jacobi."""
-MAX_MATRIX_FREE_SLOTS = 10
-"""Slots per element up to which H p from elements is cheaper than from their matrix, on a GPU."""
-MAX_FAST_ASSEMBLY_SLOTS = 16384
-"""Slots up to which a GPU assembles a matrix faster than it solves with one."""
-MATRIX_REBUILD_COST = {False: 2.0, True: 0.5}
-"""Assembly cost in Newton iterations, on the CPU and on CUDA."""
-BAND_REBUILD_COST = 3.0
-"""Assembly cost in Newton iterations of matrices factored in a band on a GPU. 4096 pendulums take 8.5, 8.1 and 8.2 ms
-per step with 0.5, 1.5 and 3 at a tolerance of 1e-8, and 6.9, 5.7 and 4.2 ms at 1e-4."""
-REBUILD_COST = 40.0
-"""Setup cost of the two-level preconditioner, in PCG iterations."""
+BLOCK_PRECONDITIONERS = ("deflated", "block-jacobi")
+"""Preconditioners of 3x3 blocks, which need no assembled matrix."""
+PRECONDITIONERS = ("two-level", "tiles", "banded", *BLOCK_PRECONDITIONERS)
 
 
 @dataclass(frozen=True)
@@ -53,7 +26,7 @@ class SolverPlan:
         rebuild_cost: setup cost of the preconditioner in PCG iterations, of the reuse rule.
         operator: H p from the "matrix", from "elements", from "clusters" of elements with their mass, or from elements
             with the "predicted stress".
-        matrix_reuse: of the operator's matrix: 0 none, 1 over the iterates of a step, 2 also over steps.
+        matrix_reuse_level: of the operator's matrix: 0 none, 1 over the iterates of a step, 2 also over steps.
         matrix_rebuild_cost: assembly cost of that matrix in Newton iterations.
         factors_operator: every matrix of the operator is factored.
         exact: the solution of exact factors is taken without a product.
@@ -72,7 +45,7 @@ class SolverPlan:
     body_modes: bool
     rebuild_cost: float
     operator: str
-    matrix_reuse: int
+    matrix_reuse_level: int
     matrix_rebuild_cost: float
     factors_operator: bool
     exact: bool
@@ -94,7 +67,7 @@ class SolverPlan:
     @property
     def reuses_across_steps(self) -> bool:
         """True if a matrix of the operator may serve several steps."""
-        return self.matrix_reuse == 2
+        return self.matrix_reuse_level == 2
 
     @property
     def assembles(self) -> bool:
@@ -113,184 +86,3 @@ class SolverPlan:
             return {"solver": self.solver}
         out = {"solver": self.solver, "linear": self.linear, "operator": "matrix" if self.uses_matrix else "elements"}
         return out if self.linear == "direct" else out | {"preconditioner": self.preconditioner}
-
-
-def choose_solver(
-    model: Model,
-    device: Any,
-    many: bool = False,
-    *,
-    options: NewtonPCG | Jacobi | None = None,
-    scheme: str = "dynamics",
-) -> SolverPlan:
-    """Methods for a model on a device, whose `is_cuda` alone counts; `many`: of many worlds.
-
-    Raises:
-        ModelError: an option that is not for this model or device.
-    """
-    given = NewtonPCG() if options is None else options
-    jacobi = isinstance(given, Jacobi)
-    newton = given.newton_options if isinstance(given, Jacobi) else given
-    direct, on_cuda, static, midpoint = (
-        newton.linear == "direct",
-        device.is_cuda,
-        scheme == "statics",
-        scheme == "midpoint",
-    )
-    if jacobi or direct:
-        refuse_couplings(model, "Jacobi" if jacobi else "NewtonPCG(linear='direct')")
-    kind = "factors" if direct else choose_preconditioner(model, newton, on_cuda, many)
-    band = (find_band(model) or find_band(model, any_width=True)) if kind == "banded" else None
-    storage = newton.preconditioner_dtype or model.dtype
-    operator = choose_operator(model, newton, kind, scheme, on_cuda)
-    reuse = matrix_reuse(model, scheme, on_cuda) if operator == "matrix" else 0
-    factors = operator == "matrix" and _factors_operator(model, kind, storage, band, static, on_cuda, reuse)
-    free = model.components.free_group_count > 0  # bodies whose momentum is conserved by the translation correction
-    cost = band.rebuild_cost if band is not None and not factors else REBUILD_COST
-    return SolverPlan(
-        solver="jacobi" if jacobi else "newton-pcg",
-        linear=newton.linear,
-        krylov="bicgstab" if midpoint else "pcg",
-        preconditioner=kind,
-        storage=storage,
-        half_bandwidth=band.half_bandwidth if band is not None else 0,
-        body_modes=kind not in ("factors", *BLOCK_PRECONDITIONERS) and bool(mode_bodies(model)),
-        rebuild_cost=JACOBI_REBUILD_COST if jacobi else cost,
-        operator=operator,
-        matrix_reuse=reuse,
-        matrix_rebuild_cost=BAND_REBUILD_COST if on_cuda and band is not None else MATRIX_REBUILD_COST[on_cuda],
-        factors_operator=factors,
-        exact=factors and band is not None and model.dtype == "float64" and not static and not free,
-        first_forcing=_first_forcing(model, newton, kind, static),
-        scheme=scheme,
-        dtype=model.dtype,
-        on_cuda=on_cuda,
-    )
-
-
-def choose_preconditioner(model: Model, options: NewtonPCG, on_cuda: bool, many: bool) -> str:
-    """Name of the preconditioner: banded factors for a narrow band, else block Jacobi if bodies on joints are too small
-    for several groups of nodes.
-
-    Raises:
-        ModelError: "banded" for a larger model on a GPU, or with a storage precision other than the model's.
-    """
-    name, storage = options.preconditioner, options.preconditioner_dtype
-    kept = storage in (None, model.dtype)
-    banded = kept and (not on_cuda or fits_thread_block(find_band(model), model))
-    if name == "banded" and kept and not banded:
-        raise ModelError(
-            "NewtonPCG: preconditioner = 'banded' is for the CPU, and on a GPU for small models with a narrow band; "
-            f"for this one on {model.device} take 'auto' or 'two-level'"
-        )
-    if name == "banded" and not banded:
-        raise ModelError(
-            f"NewtonPCG: preconditioner = 'banded' keeps its factors in the model's precision, {model.dtype}: leave "
-            f"out preconditioner_dtype = {storage!r}, or take 'two-level'"
-        )
-    if name != "auto":
-        return name
-    if banded and (many or not on_cuda) and find_band(model) is not None:
-        return "banded"
-    small = model.slots < SMALL_BODY_SLOTS * (int(model.components.mesh_of_slot.max()) + 1)
-    deflated = model.terms.traits.has_constraints and small and model.slots > MAX_FULL_FACTOR_SLOTS
-    return "deflated" if deflated else "two-level"
-
-
-def choose_operator(model: Model, options: NewtonPCG, kind: str, scheme: str, on_cuda: bool) -> str:
-    """Source of the products H p.
-
-    Elements with many points per slot cost more than their matrix. On the CPU it is used whenever the preconditioner
-    needs one anyway: one core assembles H in the time of 2 to 7 products of ANCF elements, and of 15 of straight
-    tetrahedra. An equilibrium takes few products per iterate, and fewer iterates with the predicted stress.
-    """
-    cheaper = any(block.slots > MAX_MATRIX_FREE_SLOTS or block.key.tying for block in model.blocks)
-    if not on_cuda:
-        cheaper = kind not in BLOCK_PRECONDITIONERS
-    elif kind == "banded":  # their factors solve with the matrix
-        cheaper = True
-    if kind == "factors":  # they live as long as the matrix, unless terms add to it
-        cheaper = not model.terms.has_tangents
-    if scheme == "midpoint":  # symmetric matrix, unsymmetric operator of a mid-point step
-        cheaper = False
-    if options.operator == "matrix" or (options.operator == "auto" and cheaper):
-        return "matrix"
-    if scheme == "statics":
-        return "predicted stress"
-    return "clusters" if all(block.with_mass for block in model.blocks) else "elements"
-
-
-def matrix_reuse(model: Model, scheme: str, on_cuda: bool) -> int:
-    """Reuse of the operator's matrix: 0 none, 1 over the iterates of a step, 2 also over steps.
-
-    Not over steps in statics (large steps) nor with damping (the viscous stress is no function of the state of a
-    resumed run); not at all with constraints (their forces are only as accurate as the solve); a GPU assembles a small
-    matrix at negligible cost.
-    """
-    if model.terms.traits.has_constraints:
-        return 0
-    damped = scheme == "midpoint" or any(block.key.damping in ("incremental", "rate") for block in model.blocks)
-    small = on_cuda and model.slots <= MAX_FAST_ASSEMBLY_SLOTS
-    return 2 if scheme != "statics" and not damped else 0 if small else 1
-
-
-def _factors_operator(
-    model: Model, kind: str, storage: str, band: Band | None, static: bool, on_cuda: bool, reuse: int
-) -> bool:
-    """True for factors of the operator's matrix: if cheap, or for static equilibria of beams (the preconditioner's own
-    matrix then only serves D); wider bands are reused for longer."""
-    traits = model.terms.traits
-    if kind == "factors":
-        return not model.terms.has_tangents
-    order = band
-    if kind == "two-level" and storage == model.dtype and static and model.slots <= MAX_FULL_FACTOR_SLOTS:
-        order = find_band(model)
-    # (a GPU factors the band of a small model, joint terms included, in about the time of its matrix)
-    quick = order is not None and (order.cheap_to_factorise or (band is not None and on_cuda))
-    whole = not (traits.pooled or traits.constraint_rows) or (on_cuda and not traits.pooled and reuse == 0)
-    return quick and whole and not traits.tangent
-
-
-def _first_forcing(model: Model, options: NewtonPCG, kind: str, static: bool) -> float:
-    """Forcing term of the first solve.
-
-    A good preconditioner makes a decade of PCG cheaper than another Newton iteration (in statics the first iterates are
-    far off: solving them tightly is wasted).
-    """
-    if options.forcing is not None:
-        return options.forcing
-    out = 0.1 if kind in BLOCK_PRECONDITIONERS or static else 0.001
-    # constraints are stiff: a loose first solve costs more iterations than it saves
-    return min(out, 0.01) if model.terms.traits.has_constraints else out
-
-
-def check_plan(plan: SolverPlan, model: Model, options: NewtonPCG | Jacobi, scheme: str) -> None:
-    """Raise ModelError for a plan that does not fit the model, the solver's options or the scheme."""
-    if not isinstance(plan, SolverPlan):
-        raise ModelError(f"plan = {plan!r} must be a SolverPlan, as `plan` of a Simulation")
-    own = options
-    if isinstance(options, NewtonPCG):  # what the options leave open
-        if options.operator == "auto":
-            own = replace(own, operator="matrix" if plan.uses_matrix else "elements")
-        if options.preconditioner == "auto" and "direct" not in (options.linear, plan.linear):
-            own = replace(own, preconditioner=plan.preconditioner)
-    fitting = choose_solver(model, model.device, options=own, scheme=scheme)
-    for field in fields(SolverPlan):
-        found, needed = getattr(plan, field.name), getattr(fitting, field.name)
-        if found != needed:
-            raise ModelError(
-                f"plan: {field.name} = {found!r} does not fit this simulation, which takes {needed!r}; "
-                "take the plan of a simulation with the same description, device, integrator and solver options"
-            )
-
-
-def refuse_couplings(model: Model, name: str) -> None:
-    """Raise ModelError for a term that couples bodies without a shared element: the matrix has a fixed pattern."""
-    found = [(term.name, couples) for term in model.terms.having(Coupled) if (couples := term.coupled_bodies())]
-    if found:
-        kind, couples = found[0]
-        a, b = (repr(model.bodies[k].name) for k in couples[0])
-        more = f" and {len(couples) - 1} more" if len(couples) > 1 else ""
-        raise ModelError(
-            f"{name} needs a fixed sparsity pattern, but {kind!r} couple bodies {a} and {b}{more}: use wf.NewtonPCG()"
-        )

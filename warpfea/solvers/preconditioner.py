@@ -9,6 +9,7 @@ import warp as wp
 from ..base.launch import launch_part
 from ..kernels.solvers.pcg import pcg_kernels
 from ..terms.protocols import Constrained
+from .plan import BLOCK_PRECONDITIONERS, SolverPlan
 from .residual import Residual
 from .twolevel import TwoLevel
 
@@ -17,9 +18,8 @@ if TYPE_CHECKING:
     from ..model.model import Model
     from ..model.state import State
     from ..terms.workspace import Workspace
-    from .plan import SolverPlan
 
-__all__ = ["BLOCK_PRECONDITIONERS", "PRECONDITIONERS", "BlockJacobi", "Preconditioner", "make_preconditioner"]
+__all__ = ["BlockJacobi", "Preconditioner", "make_preconditioner"]
 
 
 class Preconditioner(Protocol):
@@ -104,11 +104,6 @@ class BlockJacobi:
         ctx = self.residual.ctx
         for term in self.residual.terms.having(Constrained) if ctx.options.deflate_constraints else ():
             term.precondition(ctx, r, z, active)
-
-
-BLOCK_PRECONDITIONERS = ("deflated", "block-jacobi")
-"""Preconditioners of 3x3 blocks, which need no assembled matrix."""
-PRECONDITIONERS = ("two-level", "tiles", "banded", *BLOCK_PRECONDITIONERS)
 
 
 def make_preconditioner(

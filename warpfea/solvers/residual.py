@@ -99,7 +99,7 @@ class Residual:
         if plan.uses_matrix:
             assert self.assembler is not None
             self.operator_matrix = self.assembler.allocate_values("operator matrix")
-        if plan.matrix_reuse:
+        if plan.matrix_reuse_level:
             self.matrix_reuse_rule = ReuseRule(model, work, launch, "operator", plan.matrix_rebuild_cost)
 
     def _make_product_terms(self) -> Any:
@@ -128,7 +128,7 @@ class Residual:
         if self.plan.uses_matrix:
             assert self.assembler is not None
             out |= {self.gather_kernels.matrix_module} | self.assembler.modules()
-            out |= {self.matrix_reuse_rule.kernels.module} if self.plan.matrix_reuse else set()
+            out |= {self.matrix_reuse_rule.kernels.module} if self.plan.matrix_reuse_level else set()
         elif self.clusters:
             out |= {kernel.module for kernel in self.product_kernels}
         elif self.plan.uses_predicted_stress:
@@ -158,11 +158,11 @@ class Residual:
         """Assemble the operator matrix at the iterate if its reuse rule requires it."""
         if not self.plan.uses_matrix:
             return
-        if not self.plan.matrix_reuse:
+        if not self.plan.matrix_reuse_level:
             self.assemble_matrix(active)
             return
         control = self.matrix_reuse_rule.control
-        args = [control, self.work.newton, self.plan.matrix_reuse]
+        args = [control, self.work.newton, self.plan.matrix_reuse_level]
         self.launch(self.matrix_reuse_rule.kernels.check_matrix_reuse, self.model.worlds, args)
         self.matrix_reuse_rule.decide_rebuild(active)
         self.launch(self.matrix_reuse_rule.kernels.loosen_forcing, self.model.worlds, [control, self.work.newton])
