@@ -399,17 +399,15 @@ class ModelBuilder:
             ModelError: a value out of range, an unknown name, no faces, or a handle of another builder.
             NotImplementedError: a body with itself, model = "sphere" or law = "smooth" between bodies.
         """
-        self._check_owner(surface, "add_contact", Body, SurfaceSet)
-        if isinstance(collider, (Body, SurfaceSet)):
-            self._check_owner(collider, "add_contact", Body, SurfaceSet)
+        for side in (surface, collider) if isinstance(collider, (Body, SurfaceSet)) else (surface,):
+            self._check_owner(side, "add_contact", Body, SurfaceSet)
         options = dict(mu=mu, mu_static=mu_static, restitution=restitution, law=law, treatment=treatment,
                        stiffness=stiffness, model=model, radius=radius, offset=offset, points=points,
                        smoothing=smoothing, overlap=overlap, overlap_time=overlap_time)  # fmt: skip
         return add_contact(self.description, surface, collider, name, **options)
 
-    def finalize(
-        self, *, device: Any = None, dtype: str = "float64", worlds: int = 1, many: bool | None = None
-    ) -> Model:
+    def finalize(self, *, device: Any = None, dtype: str = "float64", worlds: int = 1, many: bool | None = None
+                 ) -> Model:  # fmt: skip
         """Make the constant Model of the description; later additions apply to the next `finalize`.
 
         Args:
@@ -429,8 +427,7 @@ class ModelBuilder:
         """
         check_densities(self.description)
         with quiet_warp():
-            args = self.description, self.term_factory()
-            model = Model(*args, device=device, dtype=dtype, worlds=worlds, many=many)
+            model = Model(self.description, self.term_factory(), device=device, dtype=dtype, worlds=worlds, many=many)
         warn_implausible(model)
         return model
 

@@ -50,13 +50,12 @@ class Stepper:
     def __init__(
         self, model: Model, state: State, integrator: Integrator, solver: NewtonPCG | Jacobi, *, ledger: bool, capture:
         bool, constraint_tol: float = 0.0, inversion: str = "refuse", adapt: AdaptiveOptions | None = None, episodes:
-        Mapping[str, bool] | None = None, growth: EnergyGrowth | None = None, on_compile: OnCompile | None = None,
-        plan: SolverPlan | None = None,
+        Mapping[str, bool] | None = None, growth: EnergyGrowth | None = None, on_compile: OnCompile | None = None, plan:
+        SolverPlan | None = None,
     ) -> None:  # fmt: skip
         self.model, self.state, self.integrator, self.solver = model, state, integrator, solver
         self.ledger, self.on_compile = ledger, on_compile
-        self.launch = Launcher(model.device)
-        self.terms = model.terms
+        self.launch, self.terms = Launcher(model.device), model.terms
         self.launch.parts |= model.terms.parts
         if integrator.midpoint and isinstance(solver, Jacobi):
             raise ModelError(f"integrator {integrator.name!r} needs Newton's method: solver=NewtonPCG(...), not Jacobi")
