@@ -145,9 +145,10 @@ class Simulation(RunStatistics):
         def stepper(model: Model, state: State, capture: bool = False) -> Stepper:
             return Stepper(
                 model, state, scheme, options,
-                ledger=ledger, capture=capture, constraint_tol=constraint_tol * model.size, inversion=inversion,
+                ledger=ledger, capture=capture,
+                loop={"plan": plan, "constraint_tol": constraint_tol * model.size, "inversion": inversion},
                 adapt=adapt, episodes={"asynchronous": asynchronous, "ends": t_end is not None},
-                growth=self.energy_growth, on_compile=on_compile or bar, plan=plan,
+                growth=self.energy_growth, on_compile=on_compile or bar,
             )  # fmt: skip
 
         self.model = model

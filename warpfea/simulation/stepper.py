@@ -17,7 +17,7 @@ from ..kernels.step.energy_ledger import LEDGER_TERM_ROWS
 from ..kernels.step.step import step_kernels
 from ..kernels.step.step_control import REPORT_COLUMNS
 from ..model.state import State
-from ..solvers import Jacobi, NewtonPCG, SolverPlan, make_solver_loop
+from ..solvers import Jacobi, NewtonPCG, make_solver_loop
 from ..terms.checks import check_stored_energy
 from ..terms.protocols import Preconditioned
 from ..terms.term import StepContext, Term
@@ -43,15 +43,14 @@ CANDIDATE_FIRST_ITERATES = (0, 1, 2)
 class Stepper:
     """Launches of a step of all worlds, and the graph that replays them.
 
-    The host writes `work.step.dt` and reads `work.report`; everything between stays on the device. `episodes`: options
-    of `Episodes`.
+    The host writes `work.step.dt` and reads `work.report`; everything between stays on the device. `loop`, `episodes`:
+    options of `make_solver_loop` and `Episodes`.
     """
 
     def __init__(
         self, model: Model, state: State, integrator: Integrator, solver: NewtonPCG | Jacobi, *, ledger: bool, capture:
-        bool, constraint_tol: float = 0.0, inversion: str = "refuse", adapt: AdaptiveOptions | None = None, episodes:
-        Mapping[str, bool] | None = None, growth: EnergyGrowth | None = None, on_compile: OnCompile | None = None, plan:
-        SolverPlan | None = None,
+        bool, loop: Mapping[str, Any], adapt: AdaptiveOptions | None = None, episodes: Mapping[str, bool] | None = None,
+        growth: EnergyGrowth | None = None, on_compile: OnCompile | None = None,
     ) -> None:  # fmt: skip
         self.model, self.state, self.integrator, self.solver = model, state, integrator, solver
         self.ledger, self.on_compile = ledger, on_compile
@@ -86,7 +85,7 @@ class Stepper:
             midpoint=midpoint, dissipation=loss, accelerated=integrator.accelerated,
         )  # fmt: skip
         self.terms.allocate(self.work, self.ctx)
-        self.newton = make_solver_loop(self.ctx, solver, plan, constraint_tol=constraint_tol, inversion=inversion)
+        self.newton = make_solver_loop(self.ctx, solver, **loop)
         self.newton.register(state)
         if model.terms.traits.unilateral:  # contact energy, which is not evaluated at rest
             state.register("predictor_potential", wp.float64)
