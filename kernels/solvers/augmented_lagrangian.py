@@ -1,11 +1,10 @@
 """Outer loop of Newton's method: classical multiplier updates, updates of frozen quantities, step limits."""
 
-import types as _types
-
 import warp as wp
 
+from ..common.modules import KernelSet, kernel_set, masked_kernel
 from ..common.traits import Traits
-from ..common.types import int_1d, kernel_set
+from ..common.types import int_1d
 from .convergence import STALL_ROUNDINGS, convergence_functions
 from .newton_control import FAIL_CONSTRAINT, FAIL_ITERATIONS, ROW_FROZEN_CHANGE, control_struct
 
@@ -18,7 +17,7 @@ FROZEN_UPDATE_RESIDUAL = 0.1
 """Relative residual below which frozen quantities (friction limits) are updated at each iterate."""
 
 
-def outer_loop_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
+def outer_loop_kernels(traits: Traits, module: wp.Module) -> KernelSet:
     """Kernels of the outer loop, in the module of Newton's method."""
     f64 = wp.float64
     Control = control_struct()
@@ -95,11 +94,10 @@ def outer_loop_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamesp
         ctl.active[world] = 1
         ctl.search.trial_accepted[world] = 1
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "ctl.active")
     def reset_step_limit(ctl: Control):
         """Reset the step limit to the full step."""
         world = wp.tid()
-        if ctl.active[world] != 0:
-            ctl.search.limit[world] = f64(1.0)
+        ctl.search.limit[world] = f64(1.0)
 
     return kernel_set(locals())

@@ -5,12 +5,12 @@ core processes the rows in turn; its vector units process a column of a block at
 """
 
 import functools
-import types as _types
 
 import warp as wp
 
+from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.structs import pattern_struct
-from ..common.types import int_1d, kernel_module, kernel_set, precision
+from ..common.types import int_1d, precision
 
 __all__ = ["BLOCK", "band_kernels", "block_column_type"]
 
@@ -26,7 +26,7 @@ def block_column_type(dtype: str):
 
 
 @functools.cache
-def band_kernels(dtype: str) -> _types.SimpleNamespace:
+def band_kernels(dtype: str) -> KernelSet:
     """Kernels in one precision."""
     p = precision(dtype)
     T, vec3, mat33 = p.T, p.vec3, p.mat33
@@ -39,19 +39,17 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
     FIRST_SHIFT = {"float64": 1.0e-4, "float32": 1.0e-6}[dtype]
     module = kernel_module(f"band_{dtype}", max_unroll=BLOCK)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def clear_band(slots: int, width: int, active: int_1d, band: wp.array3d(dtype=Column)):
         """Set the band to zero, with ones on the diagonal beyond the slots; one thread per block row."""
         world, row = wp.tid()
-        if active[world] == 0:
-            return
         for k in range(band.shape[2]):
             band[world, row, k] = Column()
         for r in range(BLOCK):
             if BLOCK * row + r >= 3 * slots:
                 band[world, row, BLOCK * width + r][r] = T(1.0)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def fill_band(
         pattern: Pattern,
         value: p.mat33_2d,
@@ -66,8 +64,6 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
         Negative diagonal entries, as under strong compression, are made positive.
         """
         world, slot = wp.tid()
-        if active[world] == 0:
-            return
         position = position_of[slot]
         for k in range(pattern.start[slot], pattern.start[slot + 1]):
             other = position_of[pattern.column[k]]
@@ -114,12 +110,10 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
             rows[j] = own
         return wp.transpose(rows)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def factor_band(width: int, active: int_1d, replaced_pivots: int_1d, band: wp.array3d(dtype=Column)):
         """Factor A into L, in place; `replaced_pivots`: number of unknowns whose pivot was replaced."""
         world = wp.tid()
-        if active[world] == 0:
-            return
         count = wp.int32(0)
         for row in range(band.shape[1]):
             first = wp.max(row - width, 0)
@@ -164,15 +158,13 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
         if flags[world] != 0:
             shift[world] = T(0.0)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "factoring")
     def raise_shift(replaced_pivots: int_1d, factoring: int_1d, shift: p.scalar_1d, refactor: int_1d, exact: int_1d):
         """If A was not positive definite, raise the shift, up to 1, and request another factorisation.
 
         `exact`: the factors are those of A.
         """
         world = wp.tid()
-        if factoring[world] == 0:
-            return
         exact[world] = wp.where(replaced_pivots[world] == 0 and shift[world] == T(0.0), 1, 0)
         if replaced_pivots[world] != 0 and shift[world] < T(1.0):
             shift[world] = wp.min(wp.max(T(SHIFT_GROWTH) * shift[world], T(FIRST_SHIFT)), T(1.0))
@@ -180,7 +172,7 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
         else:
             factoring[world] = 0
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def solve(
         width: int,
         band: wp.array3d(dtype=Column),
@@ -192,8 +184,6 @@ def band_kernels(dtype: str) -> _types.SimpleNamespace:
     ):
         """z = A^-1 r by forward and backward substitution; y holds the forward solution."""
         world = wp.tid()
-        if active[world] == 0:
-            return
         slots = slot_at.shape[0]
         rows = band.shape[1]
         for row in range(rows):

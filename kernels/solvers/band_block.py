@@ -12,13 +12,13 @@ unknowns 45 600 for 18 500, 119 for 166, 0.44 MB for 0.98. A single world is lim
 """
 
 import functools
-import types as _types
 
 import warp as wp
 
 from ..common.lanes import WARP_SIZE, block_memory, lane_functions
+from ..common.modules import KernelSet, kernel_module, kernel_set
 from ..common.structs import pattern_struct
-from ..common.types import int_1d, kernel_module, kernel_set, precision
+from ..common.types import int_1d, precision
 from .band import BLOCK, band_kernels, block_column_type
 
 __all__ = ["band_block_kernels", "solution_memory_size", "window_size"]
@@ -54,7 +54,7 @@ def solution_memory_size(rows: int, width: int) -> int:
 
 
 @functools.cache
-def band_block_kernels(dtype: str, rows: int, width: int) -> _types.SimpleNamespace:
+def band_block_kernels(dtype: str, rows: int, width: int) -> KernelSet:
     """Kernels in one precision for a given number of block rows and off-diagonal blocks."""
     p = precision(dtype)
     T, vec3, mat33 = p.T, p.vec3, p.mat33

@@ -7,11 +7,11 @@ sums[1] r.D^-1 r; `active` is 2 where products use the stress at the start of th
 """
 
 import functools
-import types as _types
 
 import warp as wp
 
-from ..common.types import double_3d, kernel_module, kernel_set, precision
+from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
+from ..common.types import double_3d, precision
 from .newton_control import control_struct
 from .pcg import forcing_functions, pcg_struct
 
@@ -53,7 +53,7 @@ def bicgstab_struct():
 
 
 @functools.cache
-def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNamespace:
+def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> KernelSet:
     """Kernels in one precision; `has_constraints`: with constraints, see Traits."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
@@ -95,7 +95,7 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> _types.Simple
         elif newton.floor.estimate_error[world] != 0:
             ctl.negative_curvature[world] = 1  # no error estimate
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "ctl.active")
     def first_direction(
         ctl: Control,
         z: p.vec3_2d,
@@ -108,11 +108,10 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> _types.Simple
     ):
         """r^ = B r, p = r; the start is the initial best."""
         world, slot = wp.tid()
-        if ctl.active[world] != 0:
-            shadow[world, slot] = z[world, slot]
-            p_out[world, slot] = r[world, slot]
-            best_x[world, slot] = x[world, slot]
-            best_r[world, slot] = r[world, slot]
+        shadow[world, slot] = z[world, slot]
+        p_out[world, slot] = r[world, slot]
+        best_x[world, slot] = x[world, slot]
+        best_r[world, slot] = r[world, slot]
 
     @wp.kernel(module=module)
     def compute_alpha(ctl: Control, bi: Recursion):
@@ -131,46 +130,41 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> _types.Simple
             if ctl.iterations[world] == 1:
                 ctl.negative_curvature[world] = 1
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "ctl.active")
     def half_step(ctl: Control, bi: Recursion, y: p.vec3_2d, v: p.vec3_2d, x: p.vec3_2d, r: p.vec3_2d):
         """x += alpha y, r -= alpha v."""
         world, slot = wp.tid()
-        if ctl.active[world] != 0:
-            alpha = T(bi.alpha[world])
-            x[world, slot] = x[world, slot] + alpha * y[world, slot]
-            r[world, slot] = r[world, slot] - alpha * v[world, slot]
+        alpha = T(bi.alpha[world])
+        x[world, slot] = x[world, slot] + alpha * y[world, slot]
+        r[world, slot] = r[world, slot] - alpha * v[world, slot]
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "ctl.active")
     def check_half_step(ctl: Control, bi: Recursion):
         """End the solve if the half step has reached the target."""
         world = wp.tid()
-        if ctl.active[world] != 0:
-            norm = wp.sqrt(ctl.sums[1, world])
-            ctl.norm[world] = norm
-            if not norm > ctl.target_norm[world]:
-                bi.best_norm[world] = norm
-                ctl.active[world] = 0
+        norm = wp.sqrt(ctl.sums[1, world])
+        ctl.norm[world] = norm
+        if not norm > ctl.target_norm[world]:
+            bi.best_norm[world] = norm
+            ctl.active[world] = 0
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "ctl.active")
     def second_dot_terms(
         ctl: Control, diagonal: p.vec3_2d, r: p.vec3_2d, t: p.vec3_2d, shadow: p.vec3_2d, rows: double_3d
     ):
         """t.D^-1 r, t.D^-1 t, r^.r, r^.t per slot."""
         world, slot = wp.tid()
-        if ctl.active[world] != 0:
-            a = t[world, slot]
-            b = wp.cw_div(a, diagonal[world, slot])
-            rows[0, world, slot] = f64(wp.dot(b, r[world, slot]))
-            rows[1, world, slot] = f64(wp.dot(b, a))
-            rows[2, world, slot] = f64(wp.dot(shadow[world, slot], r[world, slot]))
-            rows[3, world, slot] = f64(wp.dot(shadow[world, slot], a))
+        a = t[world, slot]
+        b = wp.cw_div(a, diagonal[world, slot])
+        rows[0, world, slot] = f64(wp.dot(b, r[world, slot]))
+        rows[1, world, slot] = f64(wp.dot(b, a))
+        rows[2, world, slot] = f64(wp.dot(shadow[world, slot], r[world, slot]))
+        rows[3, world, slot] = f64(wp.dot(shadow[world, slot], a))
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "ctl.active")
     def compute_omega(ctl: Control, bi: Recursion):
         """omega = argmin |r - omega t|, beta of the next direction, and the decision to continue."""
         world = wp.tid()
-        if ctl.active[world] == 0:
-            return
         along = bi.sums[0, world]
         omega = along / bi.sums[1, world]
         if not wp.isfinite(omega):
@@ -196,7 +190,7 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> _types.Simple
         else:
             bi.unfinished[world] = 0
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "ctl.active")
     def full_step(
         ctl: Control,
         bi: Recursion,
@@ -211,8 +205,6 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> _types.Simple
     ):
         """x += omega z, r -= omega t, p = r + beta (p - omega v) while the solve continues."""
         world, slot = wp.tid()
-        if ctl.active[world] == 0:
-            return
         omega = T(bi.omega[world])
         place = x[world, slot] + omega * z[world, slot]
         new = r[world, slot] - omega * t[world, slot]

@@ -4,20 +4,20 @@ A pattern is symmetric and full; values are [world, entry]. One thread computes 
 """
 
 import functools
-import types as _types
 
 import warp as wp
 
 from ..common.inverse import inverse_function
+from ..common.modules import SHORT_UNROLL, KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.structs import pattern_struct, topology_struct
-from ..common.types import SHORT_UNROLL, double_1d, int_1d, int_2d, kernel_module, kernel_set, precision
+from ..common.types import double_1d, int_1d, int_2d, precision
 from ..elements.matrix import panel_layout, panel_row
 
 __all__ = ["assembly_kernels", "block_kernels"]
 
 
 @functools.cache
-def assembly_kernels(dtype: str, slots: int, rows: bool) -> _types.SimpleNamespace:
+def assembly_kernels(dtype: str, slots: int, rows: bool) -> KernelSet:
     """Assembly from the matrices of elements with a given number of slots, in the layout of `element_matrix` or,
     `rows`, of `element_matrix_panels`."""
     p = precision(dtype)
@@ -82,7 +82,7 @@ def assembly_kernels(dtype: str, slots: int, rows: bool) -> _types.SimpleNamespa
         if listing == 0:
             start[index + 1] = found
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def add_element_matrices(
         topo: Topology,
         pattern: Pattern,
@@ -101,8 +101,6 @@ def assembly_kernels(dtype: str, slots: int, rows: bool) -> _types.SimpleNamespa
         Prescribed components keep their diagonal only.
         """
         world, index = wp.tid()
-        if active[world] == 0:
-            return
         at = pattern.upper[index]
         row = at[2]
         column = at[3]
@@ -129,7 +127,7 @@ def assembly_kernels(dtype: str, slots: int, rows: bool) -> _types.SimpleNamespa
         if at[1] != at[0]:
             value[world, at[1]] = wp.transpose(A)
 
-    return _types.SimpleNamespace(
+    return KernelSet(
         module=module,
         add_element_matrices=add_element_matrices,
         list_contributions=list_contributions,
@@ -138,7 +136,7 @@ def assembly_kernels(dtype: str, slots: int, rows: bool) -> _types.SimpleNamespa
 
 
 @functools.cache
-def block_kernels(dtype: str) -> _types.SimpleNamespace:
+def block_kernels(dtype: str) -> KernelSet:
     """Kernels on matrices of 3x3 blocks of any origin."""
     p = precision(dtype)
     T, vec3, mat33 = p.T, p.vec3, p.mat33
@@ -148,14 +146,12 @@ def block_kernels(dtype: str) -> _types.SimpleNamespace:
     free_inverse = inverse_function(dtype)
     module = kernel_module(f"blocks_{dtype}", max_unroll=SHORT_UNROLL)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def invert_diagonal_blocks(
         topo: Topology, pattern: Pattern, value: p.mat33_2d, active: int_1d, diagonal: p.vec3_2d, inverse: p.mat33_2d
     ):
         """Diagonal D and inverses of the diagonal blocks on the free components."""
         world, slot = wp.tid()
-        if active[world] == 0:
-            return
         for k in range(pattern.start[slot], pattern.start[slot + 1]):
             if pattern.column[k] == slot:
                 A = value[world, k]
@@ -165,7 +161,7 @@ def block_kernels(dtype: str) -> _types.SimpleNamespace:
                 diagonal[world, slot] = D
                 inverse[world, slot] = free_inverse(A, T(0.0), topo.free[slot])
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def galerkin_product(
         pair: wp.array(dtype=wp.vec3i),
         pair_start: int_1d,
@@ -182,8 +178,6 @@ def block_kernels(dtype: str) -> _types.SimpleNamespace:
         `fine_entry`: an entry, its row, its column.
         """
         world, index = wp.tid()
-        if active[world] == 0:
-            return
         group = index / 16
         k = (index / 4) % 4
         l = index % 4

@@ -1,12 +1,11 @@
 """Objective Phi, residual norms, convergence and failure of a Newton iterate. Functions of one world."""
 
 import functools
-import types as _types
 
 import warp as wp
 
+from ..common.modules import KernelSet, kernel_set
 from ..common.traits import NO_TERMS, Traits
-from ..common.types import kernel_set
 from .newton_control import (
     FAIL_CONSTRAINT,
     FAIL_CURVATURE,
@@ -66,7 +65,7 @@ MAX_ERROR_ESTIMATES = 3
 
 
 @functools.cache
-def convergence_functions(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
+def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
     """Device functions; traits used: "stored", "has_constraints", "midpoint" and "unilateral"."""
     f64 = wp.float64
     Control = control_struct()

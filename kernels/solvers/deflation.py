@@ -7,19 +7,19 @@ coupled clusters are swept by symmetric Gauss-Seidel, colour by colour.
 """
 
 import functools
-import types as _types
 
 import warp as wp
 
 from ..common.lanes import lane_functions
-from ..common.types import double_1d, double_3d, int_1d, kernel_module, kernel_set, precision
+from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
+from ..common.types import double_1d, double_3d, int_1d, precision
 from ..terms.constraints import constraint_functions, constraint_struct, multiplier_struct
 
 __all__ = ["deflation_kernels"]
 
 
 @functools.cache
-def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
+def deflation_kernels(dtype: str) -> KernelSet:
     """Kernels of the deflation for one precision of the slots, and of the penalty rho derived from the same
     matrices."""
     p = precision(dtype)
@@ -30,12 +30,10 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
     store_sum = lane_functions(dtype).store_sum
     module = kernel_module(f"deflation_{dtype}")
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def assemble_pair_blocks(con: Constraints, inverse: p.mat33_2d, active: int_1d, mul: Multipliers):
         """Sum of w w' D^-1 over the common slots of two constraint vectors, with their weights w and w' there."""
         world, block = wp.tid()
-        if active[world] == 0:
-            return
         s = wp.mat33d()
         for k in range(con.block_start[block], con.block_start[block + 1]):
             s += con.block_weight[k] * wp.mat33d(inverse[world, con.block_slot[k]])
@@ -60,37 +58,32 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
         first = con.cluster_start[cluster]
         return first, con.cluster_start[cluster + 1] - first
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def assemble_cluster_couplings(con: Constraints, active: int_1d, mul: Multipliers):
         """J D^-1 J^T between rows of different clusters, one thread per coupling."""
         world, k = wp.tid()
-        if active[world] != 0:
-            first, last = con.coupling_pair_start[k], con.coupling_pair_start[k + 1]
-            mul.coupling[world, k] = delassus_entry(
-                con, mul, world, con.coupling_row[k], con.coupling_column[k], first, last
-            )
+        first, last = con.coupling_pair_start[k], con.coupling_pair_start[k + 1]
+        mul.coupling[world, k] = delassus_entry(
+            con, mul, world, con.coupling_row[k], con.coupling_column[k], first, last
+        )
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def assemble_cluster_matrices(con: Constraints, active: int_1d, mul: Multipliers):
         """J D^-1 J^T within each cluster, one thread per row."""
         world, row = wp.tid()
-        if active[world] == 0:
-            return
         first, n = cluster_rows(con, con.cluster[row])
         base = con.matrix_start[con.cluster[row]] + (row - first) * n
         for column in range(n):
             start, end = con.pair_start[base + column], con.pair_start[base + column + 1]
             mul.inverse_matrix[world, base + column] = delassus_entry(con, mul, world, row, first + column, start, end)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def compute_penalty(con: Constraints, dq_dv: double_1d, active: int_1d, mul: Multipliers):
         """rho = kappa / ((dq/dv) (J D^-1 J^T)_ii), N/m, constant during a step.
 
         kappa is the ratio of rho to the stiffness of the constrained slots: independent of units, of the mesh and of E.
         """
         world, row = wp.tid()
-        if active[world] == 0:
-            return
         first, n = cluster_rows(con, con.cluster[row])
         own = mul.inverse_matrix[world, con.matrix_start[con.cluster[row]] + (row - first) * (n + 1)]
         rho = f64(0.0)
@@ -111,12 +104,10 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
             k = base + i * (n + 1)
             mul.inverse_matrix[world, k] = mul.inverse_matrix[world, k] + more
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def invert_clusters(con: Constraints, dq_dv: double_1d, limit: int, active: int_1d, mul: Multipliers):
         """Inverse of the matrix of each cluster up to `limit` rows, in place (Gauss-Jordan; positive definite)."""
         world, cluster = wp.tid()
-        if active[world] == 0:
-            return
         add_penalty_compliance(con, mul, dq_dv[world], world, cluster)
         n = con.cluster_start[cluster + 1] - con.cluster_start[cluster]
         if n > limit:
@@ -171,19 +162,16 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
         for j in range(n):
             mul.inverse_matrix[world, base + j] = d * mul.inverse_matrix[world, base + j]
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def restrict_to_constraints(con: Constraints, mul: Multipliers, z: p.vec3_2d, active: int_1d):
         """restricted = J z, one thread per row."""
         world, row = wp.tid()
-        if active[world] != 0:
-            mul.deflation_rhs[world, row] = directional_derivative(con, mul.gradient, z, world, row)
+        mul.deflation_rhs[world, row] = directional_derivative(con, mul.gradient, z, world, row)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def apply_cluster_inverses(con: Constraints, mul: Multipliers, active: int_1d):
         """s, `solved` = the inverse of each cluster's matrix times J z, one thread per row."""
         world, row = wp.tid()
-        if active[world] == 0:
-            return
         first, n = cluster_rows(con, con.cluster[row])
         base = con.matrix_start[con.cluster[row]] + (row - first) * n
         s = f64(0.0)
@@ -191,7 +179,7 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
             s += mul.inverse_matrix[world, base + j] * mul.deflation_rhs[world, first + j]
         mul.deflation_solution[world, row] = s
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def gauss_seidel_sweep(con: Constraints, mul: Multipliers, first_cluster: int, forward: int, active: int_1d):
         """One colour of a symmetric block Gauss-Seidel sweep over coupled clusters.
 
@@ -199,8 +187,6 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
         preceding colours, an upper bound of J D^-1 J^T + 1/((dq/dv) rho): the preconditioner stays positive definite.
         """
         world, k = wp.tid()
-        if active[world] == 0:
-            return
         cluster = con.colour_cluster[first_cluster + k]
         colour = con.colour[cluster]
         first, n = cluster_rows(con, cluster)
@@ -223,7 +209,7 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
                 s += mul.deflation_solution[world, first + i]
             mul.deflation_solution[world, first + i] = s
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def subtract_constraint_part(
         con: Constraints,
         mul: Multipliers,
@@ -238,8 +224,6 @@ def deflation_kernels(dtype: str) -> _types.SimpleNamespace:
     ):
         """z = y - D^-1 J^T s on slots with constraints, y = D^-1 r; with `add` added to z. Rows: r.z per warp."""
         world, slot = wp.tid()
-        if active[world] == 0:
-            return
         rz = f64(0.0)
         if slot < z.shape[1]:
             out = z[world, slot]

@@ -1,19 +1,19 @@
 """Block-diagonal matrices of uncoupled components, each a dense matrix: [world component, i, j]."""
 
 import functools
-import types as _types
 
 import warp as wp
 
 from ..common.lanes import lane_functions
+from ..common.modules import SHORT_UNROLL, KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.structs import pattern_struct
-from ..common.types import SHORT_UNROLL, int_1d, int_2d, kernel_module, kernel_set, precision
+from ..common.types import int_1d, int_2d, precision
 
 __all__ = ["dense_component_kernels"]
 
 
 @functools.cache
-def dense_component_kernels(dtype: str) -> _types.SimpleNamespace:
+def dense_component_kernels(dtype: str) -> KernelSet:
     """Kernels in one precision. `slot`: [component, position] or -1; `component_of`, `position_of`: [slot]."""
     p = precision(dtype)
     T, mat33 = p.T, p.mat33
@@ -56,15 +56,13 @@ def dense_component_kernels(dtype: str) -> _types.SimpleNamespace:
             if other == own:
                 scale[block, row] = A[i, i]
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def apply_component_inverses(
         matrix: p.scalar_3d, slot: int_2d, lanes: int, r: p.scalar_2d,
         active: int_1d, x: p.scalar_2d,
     ):  # fmt: skip
         """x = A^-1 r with dense inverses, `lanes` threads per row."""
         world, index = wp.tid()
-        if active[world] == 0:
-            return
         n = 3 * slot.shape[1]
         row = wp.min(index / lanes, slot.shape[0] * n - 1)
         component = row / n

@@ -1,14 +1,14 @@
 """Additions to the elements' matrix that complete H for direct solvers, and the vector operations of a solve."""
 
 import functools
-import types as _types
 
 import warp as wp
 
 from ..common.block_entries import add_block_function
 from ..common.lanes import lane_functions
+from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.structs import pattern_struct, topology_struct
-from ..common.types import double_1d, double_3d, int_1d, int_2d, kernel_module, kernel_set, precision
+from ..common.types import double_1d, double_3d, int_1d, int_2d, precision
 
 __all__ = ["direct_kernels", "follower_pattern_struct"]
 
@@ -28,7 +28,7 @@ def follower_pattern_struct():
 
 
 @functools.cache
-def direct_kernels(dtype: str) -> _types.SimpleNamespace:
+def direct_kernels(dtype: str) -> KernelSet:
     """Kernels of the direct solver in one precision."""
     p = precision(dtype)
     T, vec3, mat33 = p.T, p.vec3, p.mat33
@@ -38,12 +38,11 @@ def direct_kernels(dtype: str) -> _types.SimpleNamespace:
     residual_products, store_products = lane_functions(dtype).residual_products, lane_functions(dtype).store_products
     module = kernel_module(f"direct_{dtype}")
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def gather_local(conn: int_2d, u: p.vec3_2d, active: int_1d, out: p.vec3_2d):
         """Gather values at the slots of each item, local * count + item."""
         world, local, item = wp.tid()
-        if active[world] != 0:
-            out[world, local * conn.shape[1] + item] = u[world, conn[local, item]]
+        out[world, local * conn.shape[1] + item] = u[world, conn[local, item]]
 
     @wp.kernel(module=module)
     def set_unit_direction(local: int, component: int, count: int, out: p.vec3_2d):
@@ -54,7 +53,7 @@ def direct_kernels(dtype: str) -> _types.SimpleNamespace:
             e[component] = T(1.0)
         out[world, k] = e
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def add_follower_matrices(
         topo: Topology,
         pattern: Pattern,
@@ -66,8 +65,6 @@ def direct_kernels(dtype: str) -> _types.SimpleNamespace:
     ):
         """value -= (dq/dv) K, K from its products with unit vectors."""
         world, item = wp.tid()
-        if active[world] == 0:
-            return
         A = mat33()
         for k in range(places.start[item], places.start[item + 1]):
             for c in range(3):
@@ -76,12 +73,10 @@ def direct_kernels(dtype: str) -> _types.SimpleNamespace:
                     A[i, c] = A[i, c] + f[i]
         add_block(topo, pattern.upper[places.entry[item]], -T(dq_dv[world]) * A, world, value)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def dot_partials(r: p.vec3_2d, z: p.vec3_2d, diagonal: p.vec3_2d, active: int_1d, warp: int, rows: double_3d):
         """r.z and r.D^-1 r per warp of slots."""
         world, slot = wp.tid()
-        if active[world] == 0:
-            return
         products = wp.vec2d()
         if slot < z.shape[1]:
             products = residual_products(r[world, slot], z[world, slot], diagonal[world, slot])

@@ -5,12 +5,12 @@ constant H. One thread per slot, or one per world for the small systems. See war
 """
 
 import functools
-import types as _types
 
 import warp as wp
 
+from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.traits import Traits
-from ..common.types import double_1d, double_3d, int_1d, kernel_module, kernel_set, precision
+from ..common.types import double_1d, double_3d, int_1d, precision
 from .convergence import convergence_functions
 from .newton import newton_kernels
 from .newton_control import (
@@ -54,7 +54,7 @@ def jacobi_struct():
 
 
 @functools.cache
-def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.SimpleNamespace:
+def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> KernelSet:
     """Kernels for one precision, the traits of a model's terms, and one acceleration."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
@@ -105,23 +105,19 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
                 ctl.floor.accepted_unconverged[world] = 1
                 accept_iterate(ctl, world)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "ctl.active")
     def begin_iteration(ctl: Newton, jac: Jacobi):
         """Evaluate the norms of the first iterate and test convergence."""
         world = wp.tid()
-        if ctl.active[world] == 0:
-            return
         evaluate_norms(ctl, world)
         jac.first_norm[world] = ctl.norms.residual_norm[world]
         ctl.search.alpha[world] = f64(1.0)
         check_convergence(ctl, jac, world)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "ctl.active")
     def check_iterate(ctl: Newton, jac: Jacobi):
         """Evaluate the norms of an iterate, count it, and test convergence."""
         world = wp.tid()
-        if ctl.active[world] == 0:
-            return
         evaluate_norms(ctl, world)
         ctl.iterations[world] = ctl.iterations[world] + 1
         ctl.step_iterations[world] = ctl.step_iterations[world] + 1
@@ -132,7 +128,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
         """Index of the pair of `age` moves ago at iteration k, in a ring buffer."""
         return (k - 1 - age) % MAX_PAIRS
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "ctl.active")
     def store_pair(
         ctl: Newton,
         gradient: p.vec3_2d,
@@ -146,8 +142,6 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
     ):
         """r = -g on the free components; store the newest pair; rows: s_j.y and s_j.r of all pairs."""
         world, slot = wp.tid()
-        if ctl.active[world] == 0:
-            return
         new = -wp.cw_mul(gradient[world, slot], free[slot])
         r[world, slot] = new
         if wp.static(not paired):
@@ -191,12 +185,10 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
             at = history_index(k, i)
             jac.gamma[world, at] = add * jac.gamma[world, at] + v
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "ctl.active")
     def chebyshev_coefficients(ctl: Newton, jac: Jacobi):
         """Factors gamma of the last move and of z in the Chebyshev iteration for eigenvalues in centre -+ half."""
         world = wp.tid()
-        if ctl.active[world] == 0:
-            return
         ratio = jac.eigenvalue_centre / jac.eigenvalue_half_width
         if ctl.iterations[world] == 0:
             jac.chebyshev_rho[world] = f64(1.0) / ratio
@@ -208,13 +200,11 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
             jac.gamma[world, 1] = f64(2.0) * new / jac.eigenvalue_half_width
             jac.chebyshev_rho[world] = new
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "ctl.active")
     def solve_gram(ctl: Newton, jac: Jacobi):
         """Coefficient gamma of each pair in the move: G gamma = S^T r, G = S^T Y, by Cholesky with the newest pair
         first."""
         world = wp.tid()
-        if ctl.active[world] == 0:
-            return
         k = ctl.iterations[world]
         for j in range(MAX_PAIRS):
             jac.gamma[world, j] = f64(0.0)
@@ -243,46 +233,38 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
                     jac.gram_factor[world, i, j] = f64(0.0)
         substitute(jac, world, k, count, f64(0.0))
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "ctl.active")
     def project_residual(ctl: Newton, jac: Jacobi, y: p.vec3_3d, r: p.vec3_2d):
         """Residual after the projection on the pairs, r -= Y gamma."""
         world, slot = wp.tid()
-        if ctl.active[world] == 0:
-            return
         a = r[world, slot]
         for j in range(wp.min(ctl.iterations[world], MAX_PAIRS)):
             a -= T(jac.gamma[world, j]) * y[j, world, slot]
         r[world, slot] = a
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "ctl.active")
     def conjugation_dot_terms(ctl: Newton, y: p.vec3_3d, z: p.vec3_2d, rows: double_3d):
         """Rows: y_j.z of all pairs, per slot."""
         world, slot = wp.tid()
-        if ctl.active[world] == 0:
-            return
         for j in range(MAX_PAIRS):
             rows[j, world, slot] = f64(0.0)
             if j < ctl.iterations[world]:
                 rows[j, world, slot] = f64(wp.dot(y[j, world, slot], z[world, slot]))
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "ctl.active")
     def conjugate_move(ctl: Newton, jac: Jacobi):
         """gamma -= step G^-1 Y^T z: makes the move conjugate to the pairs."""
         world = wp.tid()
-        if ctl.active[world] == 0:
-            return
         k = ctl.iterations[world]
         count = wp.min(k, MAX_PAIRS)
         for i in range(count):
             jac.right_side[world, i] = -jac.step_length * jac.sums[history_index(k, i), world]
         substitute(jac, world, k, count, f64(1.0))
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "ctl.active")
     def combine_move(ctl: Newton, jac: Jacobi, s: p.vec3_3d, z: p.vec3_2d, move: p.vec3_2d):
         """Move p = S gamma + step z; in the Chebyshev iteration gamma_0 times the last move + gamma_1 z."""
         world, slot = wp.tid()
-        if ctl.active[world] == 0:
-            return
         if wp.static(acceleration == "chebyshev"):
             a = T(jac.gamma[world, 1]) * z[world, slot]
             if ctl.iterations[world] > 0:
@@ -295,7 +277,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
                     a += T(jac.gamma[world, j]) * s[j, world, slot]
             move[world, slot] = a
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "ctl.active")
     def residual_after_move(
         ctl: Newton,
         mass_factor: double_1d,
@@ -308,19 +290,17 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> _types.Simp
         """r = -g - c_M M p with the lumped mass, exact for the sum over a body: the remaining force on its
         translation."""
         world, slot = wp.tid()
-        if ctl.active[world] != 0:
-            m = T(mass_factor[world]) * lumped[world % lumped.shape[0], slot]
-            r[world, slot] = -wp.cw_mul(gradient[world, slot] + m * move[world, slot], free[slot])
+        m = T(mass_factor[world]) * lumped[world % lumped.shape[0], slot]
+        r[world, slot] = -wp.cw_mul(gradient[world, slot] + m * move[world, slot], free[slot])
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "ctl.active")
     def apply_move(ctl: Newton, move: p.vec3_2d, v: p.vec3_2d):
         """v += p, shortened by step limits of terms."""
         world, slot = wp.tid()
-        if ctl.active[world] != 0:
-            if wp.static(traits.limited):
-                share = wp.clamp(ctl.search.limit[world], f64(0.0), f64(1.0))
-                move[world, slot] = T(share) * move[world, slot]
-            v[world, slot] = v[world, slot] + move[world, slot]
+        if wp.static(traits.limited):
+            share = wp.clamp(ctl.search.limit[world], f64(0.0), f64(1.0))
+            move[world, slot] = T(share) * move[world, slot]
+        v[world, slot] = v[world, slot] + move[world, slot]
 
     @wp.kernel(module=module)
     def report_cost(ctl: Newton, jac: Jacobi, pcg: PCG, running: int_1d):

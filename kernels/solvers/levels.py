@@ -6,13 +6,13 @@ of each group are the slots of the next, coarser level; P interpolates from them
 """
 
 import functools
-import types as _types
 
 import warp as wp
 
 from ..common.lanes import lane_functions
+from ..common.modules import SHORT_UNROLL, KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.structs import pattern_struct
-from ..common.types import SHORT_UNROLL, double_3d, int_1d, kernel_module, kernel_set, precision
+from ..common.types import double_3d, int_1d, precision
 
 __all__ = ["TILE_LANES", "TILE_SLOTS", "TILE_UNKNOWNS", "level_kernels", "level_struct"]
 
@@ -45,7 +45,7 @@ def level_struct(dtype: str):
 
 
 @functools.cache
-def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamespace:
+def level_kernels(dtype: str, storage: str | None = None) -> KernelSet:
     """Kernels that apply the levels in one precision; `storage`: precision of the inverses, see `build_kernels`."""
     storage = storage or dtype
     S = precision(storage).T
@@ -60,7 +60,7 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
     residual_products, store_products = lanes_of.residual_products, lanes_of.store_products
     module = kernel_module(f"levels_{dtype}{'_' + storage if scaled else ''}", max_unroll=SHORT_UNROLL)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def smooth_and_restrict(
         level: Level,
         inverse: wp.array4d(dtype=S),
@@ -79,8 +79,6 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         The inverse is symmetric: access by columns is coalesced on CUDA, access by rows is contiguous on the CPU.
         """
         world, index = wp.tid()
-        if active[world] == 0:
-            return
         if index < first_group:
             part = index % share
             place = (index / share) % TILE_SLOTS
@@ -149,7 +147,7 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
             s += w[k] * x[world, first + k]
         return s
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def add_coarse_correction(
         level: Level,
         correct: int,
@@ -164,8 +162,6 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
     ):
         """z += P x on free components if `correct`; rows: r.z and r.D^-1 r, one sum per warp of slots."""
         world, slot = wp.tid()
-        if active[world] == 0:
-            return
         products = wp.vec2d()
         if slot < z.shape[1]:
             s = z[world, slot]
@@ -175,7 +171,7 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
             products = residual_products(r[world, slot], s, diagonal[world, slot])
         store_products(products, slot, warp, world, rows)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def chebyshev_step(
         level: Level,
         correct: int,
@@ -189,8 +185,6 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
     ):
         """A Chebyshev step: d = keep d + step (z + P coarse), x += d; with keep = 0 both start from zero."""
         world, slot = wp.tid()
-        if active[world] == 0:
-            return
         s = z[world, slot]
         if correct != 0:
             s += prolong_to_slot(level, coarse, world, slot)
@@ -203,12 +197,10 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
             d[world, slot] = s
             x[world, slot] = x[world, slot] + s
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def subtract_product(pattern: Pattern, value: p.mat33_2d, d: p.vec3_2d, lanes: int, active: int_1d, r: p.vec3_2d):
         """r -= A d, `lanes` threads per row."""
         world, index = wp.tid()
-        if active[world] == 0:
-            return
         slot = index / lanes
         lane = index % lanes
         s = vec3()
@@ -259,21 +251,19 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         else:
             x[world, row] = s
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def apply_dense_inverse(
         matrix: wp.array3d(dtype=S), root: p.scalar_2d, lanes: int, r: p.scalar_2d, active: int_1d, x: p.scalar_2d
     ):
         """x = A^-1 r with a dense inverse, `lanes` threads per row."""
         world, index = wp.tid()
-        if active[world] == 0:
-            return
         lane = index % lanes
         row = wp.min(index / lanes, x.shape[1] - 1)
         s = scalar_sum(row_product(matrix, root, r, world, row, lane, r.shape[1], lanes), lanes)
         if lane == 0:
             store_row(root, s, world, row, x)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def apply_triangular_inverse(
         matrix: wp.array3d(dtype=S),
         root: p.scalar_2d,
@@ -285,8 +275,6 @@ def level_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
     ):
         """`apply_dense_inverse` with the lower triangle of a matrix or, `upper`, its upper one, diagonal included."""
         world, index = wp.tid()
-        if active[world] == 0:
-            return
         lane = index % lanes
         row = wp.min(index / lanes, x.shape[1] - 1)
         first = wp.where(upper != 0, row, 0) + lane

@@ -4,13 +4,13 @@ On CUDA the threads (lanes) of a block share the work on a tile; on the CPU one 
 """
 
 import functools
-import types as _types
 
 import warp as wp
 
 from ..common.lanes import block_memory, lane_functions
+from ..common.modules import SHORT_UNROLL, KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.structs import pattern_struct
-from ..common.types import SHORT_UNROLL, double_2d, double_3d, int_1d, kernel_module, kernel_set, precision
+from ..common.types import double_2d, double_3d, int_1d, precision
 from .levels import TILE_UNKNOWNS, level_struct
 
 __all__ = ["FACTOR_LANES", "build_kernels"]
@@ -22,7 +22,7 @@ ROW_LANES = 128
 
 
 @functools.cache
-def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamespace:
+def build_kernels(dtype: str, storage: str | None = None) -> KernelSet:
     """Kernels that build the levels in one precision.
 
     `storage`: precision of the stored inverses, by default the same. In another one an inverse B of A is stored as
@@ -46,7 +46,7 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
     MIN_FACTOR_PIVOT = {"float64": 1.0e-14, "float32": 3.0e-7}[dtype]
     module = kernel_module(f"levels_build_{dtype}{'_' + storage if storage != dtype else ''}", max_unroll=SHORT_UNROLL)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def fill_tiles(
         level: Level,
         pattern: Pattern,
@@ -57,8 +57,6 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
     ):
         """Block of A for each tile, and its diagonal; one thread per slot, rows without an unknown are zero."""
         world, tile, place = wp.tid()
-        if active[world] == 0:
-            return
         for a in range(3):
             diagonal[world, tile, 3 * place + a] = T(0.0)
             for j in range(TILE_UNKNOWNS):
@@ -152,14 +150,12 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
             for i in range(lane, TILE_UNKNOWNS * TILE_UNKNOWNS, lanes):
                 memory.store(own, i, memory.load(at, i))
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def fill_dense(
         pattern: Pattern, value: p.mat33_2d, slots: int, active: int_1d, scale: p.scalar_2d, matrix: p.scalar_3d
     ):
         """A as a dense matrix, and its diagonal; one thread per slot, rows beyond the slots are zero."""
         world, slot = wp.tid()
-        if active[world] == 0:
-            return
         for a in range(3):
             scale[world, 3 * slot + a] = T(0.0)
             for j in range(matrix.shape[2]):
@@ -175,7 +171,7 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
                 if pattern.column[k] == slot:
                     scale[world, 3 * slot + i] = A[i, i]
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def copy_pivot_block(
         matrix: p.scalar_3d,
         scale: p.scalar_2d,
@@ -186,19 +182,16 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
     ):
         """Copy of the pivot block and of the diagonal of A there."""
         world, i, j = wp.tid()
-        if active[world] != 0:
-            pivot[world, 0, i, j] = matrix[world, first + i, first + j]
-            if i == j:
-                diagonal[world, 0, i] = scale[world, first + i]
+        pivot[world, 0, i, j] = matrix[world, first + i, first + j]
+        if i == j:
+            diagonal[world, 0, i] = scale[world, first + i]
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def compute_panels(
         matrix: p.scalar_3d, pivot: wp.array4d(dtype=T), first: int, active: int_1d, left: p.scalar_3d, top: p.scalar_3d
     ):
         """left = A_ik P with P the inverse pivot block, top = A_kj: panels of the rank update."""
         world, m, i = wp.tid()
-        if active[world] == 0:
-            return
         s = T(0.0)
         for n in range(TILE_UNKNOWNS):
             # A is symmetric beside the pivot except for the sign of eliminated columns
@@ -206,14 +199,12 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
         left[world, m, i] = s
         top[world, m, i] = matrix[world, first + m, i]
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def eliminate_pivot_block(
         pivot: wp.array4d(dtype=T), left: p.scalar_3d, top: p.scalar_3d, first: int, active: int_1d, matrix: p.scalar_3d
     ):
         """One pivot of block Gauss-Jordan; a thread updates four rows of a column, which share their loads."""
         world, i4, j = wp.tid()
-        if active[world] == 0:
-            return
         i = 4 * i4
         # a tile's size is a multiple of 4: the four rows are all in the pivot's or all outside
         in_row = i >= first and i < first + TILE_UNKNOWNS
@@ -316,7 +307,7 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
                 x += T(STORAGE_ROUNDOFF) * trace
         return S(x)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def store_tile_inverses(
         tiles: int,
         diagonal: p.scalar_3d,
@@ -327,8 +318,6 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
     ):
         """Store the inverses of tiles, one thread per row."""
         world, tile, i = wp.tid()
-        if active[world] == 0:
-            return
         trace = T(0.0)
         for j in range(TILE_UNKNOWNS):
             trace += matrix[world, tile, j, j] * wp.abs(diagonal[world, tile, j])
@@ -338,7 +327,7 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
             other = inverse_sqrt(diagonal[world, tile, j])
             stored[world, tile, i, j] = storage_entry(matrix[world, tile, i, j], own, other, i == j, trace)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def store_dense_inverse(
         diagonal: p.scalar_2d,
         trace: double_2d,
@@ -349,19 +338,16 @@ def build_kernels(dtype: str, storage: str | None = None) -> _types.SimpleNamesp
     ):
         """Store the dense inverse, one thread per entry."""
         world, i, j = wp.tid()
-        if active[world] == 0:
-            return
         own = inverse_sqrt(diagonal[world, i])
         other = inverse_sqrt(diagonal[world, j])
         stored[world, i, j] = storage_entry(matrix[world, i, j], own, other, i == j, T(trace[0, world]))
         if i == j:
             root[world, i] = own
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def trace_terms(diagonal: p.scalar_2d, matrix: p.scalar_3d, active: int_1d, rows: double_3d):
         """Terms of the trace of R B R."""
         world, i = wp.tid()
-        if active[world] != 0:
-            rows[0, world, i] = f64(matrix[world, i, i] * wp.abs(diagonal[world, i]))
+        rows[0, world, i] = f64(matrix[world, i, i] * wp.abs(diagonal[world, i]))
 
     return kernel_set(locals())

@@ -1,11 +1,9 @@
 """Line search of Newton's method: acceptance of trials and choice of the next step length. One thread per world."""
 
-import types as _types
-
 import warp as wp
 
+from ..common.modules import KernelSet, kernel_set, masked_kernel
 from ..common.traits import Traits
-from ..common.types import kernel_set
 from .convergence import convergence_functions
 from .newton_control import FAIL_JACOBIAN, FAIL_LINE_SEARCH, ROW_FROZEN_CHANGE, ROW_RESIDUAL, ROW_SLOPE, control_struct
 
@@ -32,7 +30,7 @@ points have reversed and Phi has a kink before. It is located by at most MAX_KIN
 the points slip back, again and again, while one that ends near it makes them stick."""
 
 
-def line_search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNamespace:
+def line_search_kernels(traits: Traits, module: wp.Module) -> KernelSet:
     """Kernels in the module of Newton's method, and the function `tangent_needed`."""
     f64 = wp.float64
     Control = control_struct()
@@ -278,12 +276,10 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> _types.SimpleNames
         else:
             shorten_step(ctl, world, reused)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "ctl.search.active")
     def check_trial(ctl: Control):
         """Acceptance of a trial, Armijo on Phi, Eq. (18), or the next step length; then convergence."""
         world = wp.tid()
-        if ctl.search.active[world] == 0:
-            return
         alpha = ctl.search.alpha[world]
         # frozen forces keep their symmetric tangent: the curvature of Phi then agrees with H
         bend = ctl.dq_dv[world] * ctl.search.tangent_sum[0, world]

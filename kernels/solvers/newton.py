@@ -1,12 +1,12 @@
 """Newton's method per world: convergence, forcing terms, line search, acceptance. One thread per world."""
 
 import functools
-import types as _types
 
 import warp as wp
 
+from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.traits import NO_TERMS, Traits
-from ..common.types import int_1d, kernel_module, kernel_set
+from ..common.types import int_1d
 from .augmented_lagrangian import outer_loop_kernels
 from .convergence import MAX_ERROR_ESTIMATES, SINGLE_PRECISION_EPS, VELOCITY_ROUNDINGS, convergence_functions
 from .line_search import MAX_TRUST_RADIUS, PHI_NOISE_ROUNDINGS, line_search_kernels
@@ -39,7 +39,7 @@ MAX_START_ENERGY_RATIO = 3.0
 
 
 @functools.cache
-def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
+def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
     """Kernels of the Newton iteration, of one thread per world; scalars are float64.
 
     They depend on the traits "stored", "has_constraints", "limited", "unilateral" and "midpoint".
@@ -74,15 +74,14 @@ def newton_kernels(traits: Traits = NO_TERMS) -> _types.SimpleNamespace:
     searching = line_search_kernels(traits, module)
     tangent_needed = searching.tangent_needed
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def reset_min_J(ctl: Control, active: int_1d):
         """Reset the smallest J before an evaluation."""
         world = wp.tid()
-        if active[world] != 0:
-            ctl.min_J[world] = f64(1.0e30)
-            ctl.domain_J[world] = f64(1.0e30)
-            if wp.static(unilateral):
-                ctl.frozen.contact_active[world] = 0
+        ctl.min_J[world] = f64(1.0e30)
+        ctl.domain_J[world] = f64(1.0e30)
+        if wp.static(unilateral):
+            ctl.frozen.contact_active[world] = 0
 
     @wp.func
     def initialise_iteration(ctl: Control, world: int):

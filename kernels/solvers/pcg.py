@@ -4,12 +4,12 @@ Vector kernels run over [world, slot]; scalar logic runs with one thread per wor
 """
 
 import functools
-import types as _types
 
 import warp as wp
 
 from ..common.lanes import lane_functions
-from ..common.types import double_1d, double_3d, int_1d, kernel_module, kernel_set, precision
+from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
+from ..common.types import double_1d, double_3d, int_1d, precision
 from .newton_control import control_struct
 
 __all__ = ["FREE_GROUP_LANES", "forcing_functions", "free_groups_struct", "pcg_kernels", "pcg_struct"]
@@ -80,7 +80,7 @@ def free_groups_struct(dtype: str):
 
 
 @functools.cache
-def forcing_functions(has_constraints: bool) -> _types.SimpleNamespace:
+def forcing_functions(has_constraints: bool) -> KernelSet:
     """Target norms of linear solves, Eisenstat and Walker (1996); `has_constraints`: with constraints, see Traits."""
     f64 = wp.float64
     Newton = control_struct()
@@ -114,7 +114,7 @@ def forcing_functions(has_constraints: bool) -> _types.SimpleNamespace:
 
 
 @functools.cache
-def pcg_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNamespace:
+def pcg_kernels(dtype: str, has_constraints: bool = False) -> KernelSet:
     """Kernels of the linear solver in one precision; `has_constraints`: with constraints, see Traits."""
     p = precision(dtype)
     T, vec3, mat33 = p.T, p.vec3, p.mat33
@@ -126,13 +126,12 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNames
     forcing_target = forcing_functions(has_constraints).forcing_target
     module = kernel_module(f"pcg_{dtype}{'_gated' if has_constraints else ''}")
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def initialise_residual(g: p.vec3_2d, free: p.vec3_1d, active: int_1d, x: p.vec3_2d, r: p.vec3_2d):
         """x = 0, r = -g on the free components."""
         world, slot = wp.tid()
-        if active[world] != 0:
-            x[world, slot] = vec3()
-            r[world, slot] = -wp.cw_mul(g[world, slot], free[slot])
+        x[world, slot] = vec3()
+        r[world, slot] = -wp.cw_mul(g[world, slot], free[slot])
 
     @wp.kernel(module=module)
     def zero_converged(newton: Newton, of_slot: int_1d, active: int_1d, r: p.vec3_2d):
@@ -141,14 +140,12 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNames
         if active[world] != 0 and newton.norms.component_converged[world, of_slot[slot]] != 0:
             r[world, slot] = vec3()
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def apply_block_jacobi(
         inverse: p.mat33_2d, r: p.vec3_2d, diagonal: p.vec3_2d, active: int_1d, warp: int, z: p.vec3_2d, rows: double_3d
     ):
         """z = B r with 3x3 blocks B; rows: r.z and r.D^-1 r, one sum per warp of slots."""
         world, slot = wp.tid()
-        if active[world] == 0:
-            return
         products = wp.vec2d()
         if slot < z.shape[1]:
             a = r[world, slot]
@@ -242,12 +239,10 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNames
         x[world, slot] = x[world, slot] + alpha * p_in[world, slot]
         r[world, slot] = r[world, slot] - alpha * Hp[world, slot]
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "ctl.active")
     def new_direction(ctl: Control, z: p.vec3_2d, p_out: p.vec3_2d):
         """p = z + beta p with beta = (r.z)_new / (r.z)_old; the first thread of a world decides whether to continue."""
         world, slot = wp.tid()
-        if ctl.active[world] == 0:
-            return
         rz = ctl.sums[0, world]
         p_out[world, slot] = z[world, slot] + T(rz / ctl.rz[world]) * p_out[world, slot]
         if slot == 0:
@@ -276,30 +271,26 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNames
             else:
                 ctl.active[world] = 0  # threads that see this at once leave p unchanged; it is not read again
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def free_group_partials(groups: Groups, r: p.vec3_2d, active: int_1d, partial: p.vec3_3d):
         """Z^T r, in FREE_GROUP_LANES strided partial sums per group."""
         world, group, lane = wp.tid()
-        if active[world] == 0:
-            return
         s = vec3()
         for k in range(groups.start[group] + lane, groups.start[group + 1], FREE_GROUP_LANES):
             s += r[world, groups.slot[k]]
         partial[world, group, lane] = s
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def group_velocity(groups: Groups, partial: p.vec3_3d, mass_factor: double_1d, active: int_1d, velocity: p.vec3_2d):
         """c = (Z^T H Z)^-1 Z^T r; a free translation has no stiffness, so Z^T H Z is c_M times the mass of a group."""
         world, group = wp.tid()
-        if active[world] == 0:
-            return
         s = vec3()
         for lane in range(FREE_GROUP_LANES):
             s += partial[world, group, lane]
         scale = T(1.0) / (T(mass_factor[world]) * groups.mass[world % groups.mass.shape[0], group])
         velocity[world, group] = scale * wp.cw_mul(s, groups.free_directions[group])
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def translate_groups(
         groups: Groups,
         velocity: p.vec3_2d,
@@ -311,8 +302,6 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNames
     ):
         """x += Z c, r -= H Z c, where H Z = c_M M Z."""
         world, slot = wp.tid()
-        if active[world] == 0:
-            return
         group = groups.group_of_slot[slot]
         if group < 0:
             return

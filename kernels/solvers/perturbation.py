@@ -5,12 +5,12 @@ sample perturbs the bits of the positions and so has different round-off.
 """
 
 import functools
-import types as _types
 
 import warp as wp
 
+from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.structs import mass_functions, topology_struct
-from ..common.types import double_1d, int_1d, kernel_module, kernel_set, precision
+from ..common.types import double_1d, int_1d, precision
 from .newton_control import control_struct
 
 __all__ = ["SAMPLES", "SCATTER_FACTOR", "perturbation_kernels"]
@@ -24,7 +24,7 @@ MAX_PERTURBATION = 3
 
 
 @functools.cache
-def perturbation_kernels(dtype: str) -> _types.SimpleNamespace:
+def perturbation_kernels(dtype: str) -> KernelSet:
     """Kernels in one precision of the vectors."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
@@ -44,15 +44,13 @@ def perturbation_kernels(dtype: str) -> _types.SimpleNamespace:
             perturbation_sum[world, slot] = vec3()
             gradient_sum[world, slot] = vec3()
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "flags")
     def perturb_positions(
         ctl: Control, flags: int_1d, sample: int, u: p.vec3_2d,
         perturbation_sum: p.vec3_2d,
     ):  # fmt: skip
         """u += d, up to MAX_PERTURBATION roundings, random per slot and sample; perturbation_sum += d / (dq/dv)."""
         world, slot = wp.tid()
-        if flags[world] == 0:
-            return
         x = u[world, slot]
         y = vec3()
         state = wp.rand_init(sample, slot)
@@ -61,14 +59,13 @@ def perturbation_kernels(dtype: str) -> _types.SimpleNamespace:
         u[world, slot] = y
         perturbation_sum[world, slot] = perturbation_sum[world, slot] + (y - x) / T(ctl.dq_dv[world])
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "flags")
     def add_sample(flags: int_1d, gradient: p.vec3_2d, gradient_sum: p.vec3_2d):
         """gradient_sum += gradient."""
         world, slot = wp.tid()
-        if flags[world] != 0:
-            gradient_sum[world, slot] = gradient_sum[world, slot] + gradient[world, slot]
+        gradient_sum[world, slot] = gradient_sum[world, slot] + gradient[world, slot]
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "flags")
     def mean_gradient(
         topo: Topology,
         mass_factor: double_1d,
@@ -80,8 +77,6 @@ def perturbation_kernels(dtype: str) -> _types.SimpleNamespace:
     ):
         """Mean over the samples of g(u + d) - (dq/dv) K p, with p = d / (dq/dv) and `product` = H p of their sum."""
         world, slot = wp.tid()
-        if flags[world] == 0:
-            return
         a = vec3()
         for k in range(topo.mass_start[slot], topo.mass_start[slot + 1]):
             a += mass_entry(topo, world, k) * perturbation_sum[world, topo.mass_column[k]]

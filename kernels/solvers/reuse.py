@@ -7,12 +7,12 @@ linearisation point (displacements).
 """
 
 import functools
-import types as _types
 from typing import Any
 
 import warp as wp
 
-from ..common.types import double_1d, double_2d, int_1d, kernel_set, precision, vec3d_2d
+from ..common.modules import KernelSet, kernel_set, masked_kernel
+from ..common.types import double_1d, double_2d, int_1d, precision, vec3d_2d
 from .blocks import block_kernels
 from .newton_control import control_struct
 from .pcg import pcg_struct
@@ -58,7 +58,7 @@ def reuse_struct():
 
 
 @functools.cache
-def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
+def reuse_kernels(dtype: str) -> KernelSet:
     """Kernels of the reuse rule."""
     p = precision(dtype)
     vec3 = p.vec3
@@ -108,7 +108,7 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
             reuse.build_now[world] = 1
             wp.atomic_max(reuse.any_build, 0, 1)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "newton.active")
     def check_matrix_reuse(reuse: Reuse, newton: Newton, keep: int):
         """Before a solve: decide whether the matrix of this iterate would save enough Newton iterations.
 
@@ -117,8 +117,6 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
         (`first_reduction`, which fades). `keep`: 1: the matrix may be kept within a step; 2: from step to step.
         """
         world = wp.tid()
-        if newton.active[world] == 0:
-            return
         if keep == 2:
             restore_counts(reuse, world)
         k = newton.iterations[world]
@@ -220,19 +218,17 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
         reuse.stored_counts[world, 4] = reuse.extra_iterations[world]
         reuse.stored_counts[world, 5] = reuse.first_reduction[world]
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "flags")
     def mark_stale(flags: int_1d, reuse: Reuse):
         """Flag the worlds whose state was set externally."""
         world = wp.tid()
-        if flags[world] != 0:
-            reuse.stale[world] = 1
+        reuse.stale[world] = 1
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "flags")
     def request_rebuild(flags: int_1d, reuse: Reuse):
         """Request a rebuild before the next solve in the flagged worlds."""
         world = wp.tid()
-        if flags[world] != 0:
-            reuse.rebuild_due[world] = 1
+        reuse.rebuild_due[world] = 1
 
     @wp.func
     def transfer_case(reuse: Reuse, accepted: int_1d, world: int) -> int:
@@ -297,11 +293,10 @@ def reuse_kernels(dtype: str) -> _types.SimpleNamespace:
         for side in range(3):
             transfer_entry(to, gradient, kept_gradient, point_gradient, world, 3 * row + side)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "reuse.build_now")
     def mark_built(reuse: Reuse):
         """Clear `stale` in the worlds that have built the object."""
         world = wp.tid()
-        if reuse.build_now[world] != 0:
-            reuse.stale[world] = 0
+        reuse.stale[world] = 0
 
     return kernel_set(locals())

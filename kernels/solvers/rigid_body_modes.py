@@ -9,19 +9,19 @@ by t + w x a with a = (x - c)/size, a gradient by w x g/size. Modes that a suppo
 """
 
 import functools
-import types as _types
 
 import warp as wp
 
+from ..common.modules import SHORT_UNROLL, KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.rigid import RIGID_MODES, bodies_struct, rigid_mode_functions
 from ..common.structs import pattern_struct
-from ..common.types import SHORT_UNROLL, int_1d, kernel_module, kernel_set, precision
+from ..common.types import int_1d, precision
 
 __all__ = ["rigid_mode_kernels"]
 
 
 @functools.cache
-def rigid_mode_kernels(dtype: str) -> _types.SimpleNamespace:
+def rigid_mode_kernels(dtype: str) -> KernelSet:
     """Kernels in one precision of the slots."""
     p = precision(dtype)
     T, vec3, mat33 = p.T, p.vec3, p.mat33
@@ -49,7 +49,7 @@ def rigid_mode_kernels(dtype: str) -> _types.SimpleNamespace:
         x = bodies.slot_reference[slot] + vec3d(u[world, slot]) - (f64(bodies.is_position[slot]) / f64(count)) * c
         bodies.lever_arm[world, slot] = x / bodies.body_size[body]
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def body_matrix_partials(
         bodies: Bodies, pattern: Pattern, free: p.vec3_1d, value: p.mat33_2d,
         active: int_1d, lanes: int, parts: wp.array4d(dtype=mat33d),
@@ -60,8 +60,6 @@ def rigid_mode_kernels(dtype: str) -> _types.SimpleNamespace:
         to the diagonal.
         """
         world, body, lane = wp.tid()
-        if active[world] == 0:
-            return
         mm = mat33d()
         tm = mat33d()
         tt = mat33d()
@@ -88,15 +86,13 @@ def rigid_mode_kernels(dtype: str) -> _types.SimpleNamespace:
         parts[world, body, lane, 1] = tm
         parts[world, body, lane, 2] = tt
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def fill_matrix(
         active: int_1d, parts: wp.array4d(dtype=mat33d), scale: p.scalar_2d,
         matrix: p.scalar_3d,
     ):  # fmt: skip
         """Block-diagonal part of the matrix, and its diagonal; rows beyond the bodies are zero."""
         world, row = wp.tid()
-        if active[world] == 0:
-            return
         for j in range(matrix.shape[2]):
             matrix[world, row, j] = T(0.0)
         scale[world, row] = T(0.0)
@@ -120,14 +116,12 @@ def rigid_mode_kernels(dtype: str) -> _types.SimpleNamespace:
             matrix[world, row, RIGID_MODES * body + 3 + j] = T(high[j])
         scale[world, row] = T(wp.where(turn == 0, low[a], high[a]))
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def restrict(
         bodies: Bodies, r: p.vec3_2d, active: int_1d, out: p.scalar_2d
     ):  # fmt: skip
         """R^T r; a block of threads per body. r is zero at prescribed components."""
         world, body, thread = wp.tid()
-        if active[world] == 0:
-            return
         move = vec3d()
         turn = vec3d()
         slot = bodies.first_slot[body] + thread

@@ -1,11 +1,11 @@
 """Kernels of Newton's method on vectors [world, slot]: iterates, dot products, sums over residual groups."""
 
 import functools
-import types as _types
 
 import warp as wp
 
-from ..common.types import double_1d, double_3d, int_1d, kernel_set, precision
+from ..common.modules import KernelSet, kernel_set, masked_kernel
+from ..common.types import double_1d, double_3d, int_1d, precision
 from .newton_control import FLOOR_LANES, GROUP_LANES, GROUP_ROUNDOFF, GROUP_ROWS, ROW_ROUNDOFF, control_struct
 from .pcg import pcg_kernels
 
@@ -13,7 +13,7 @@ __all__ = ["vector_kernels"]
 
 
 @functools.cache
-def vector_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNamespace:
+def vector_kernels(dtype: str, has_constraints: bool = False) -> KernelSet:
     """Kernels in one precision of the vectors, in the module of `pcg_kernels`, which every solver loads."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
@@ -21,7 +21,7 @@ def vector_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNa
     Control = control_struct()
     module = pcg_kernels(dtype, has_constraints).module
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def group_norm_partials(
         start: int_1d,
         slot: int_1d,
@@ -34,8 +34,6 @@ def vector_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNa
     ):
         """Strided partial sums of GROUP_ROWS over the slots and elements of a residual group."""
         world, group, lane = wp.tid()
-        if active[world] == 0:
-            return
         for row in range(GROUP_ROWS - 1):
             source = wp.where(row == GROUP_ROUNDOFF, ROW_ROUNDOFF, row)
             total = f64(0.0)
@@ -47,42 +45,37 @@ def vector_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNa
             strain += energy[0, world, element[k]]
         partial[GROUP_ROWS - 1, world, group, lane] = strain
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def sum_group_norms(partial: wp.array4d(dtype=f64), active: int_1d, out: double_3d):
         """Sum of the lanes, in order."""
         row, world, group = wp.tid()
-        if active[world] == 0:
-            return
         total = f64(0.0)
         for lane in range(GROUP_LANES):
             total += partial[row, world, group, lane]
         out[row, world, group] = total
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def update_position(q_tilde: p.vec3_2d, v: p.vec3_2d, dq_dv: double_1d, active: int_1d, u: p.vec3_2d):
         """q = q~ + (dq/dv) v."""
         world, slot = wp.tid()
-        if active[world] != 0:
-            u[world, slot] = q_tilde[world, slot] + T(dq_dv[world]) * v[world, slot]
+        u[world, slot] = q_tilde[world, slot] + T(dq_dv[world]) * v[world, slot]
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "ctl.search.active")
     def trial_velocity(ctl: Control, base: p.vec3_2d, direction: p.vec3_2d, best: p.vec3_2d, v: p.vec3_2d):
         """v = base + alpha p, or the best iterate if that is to be restored."""
         world, slot = wp.tid()
-        if ctl.search.active[world] != 0:
-            if ctl.nonmonotone.restore_best[world] != 0:
-                v[world, slot] = best[world, slot]
-            else:
-                v[world, slot] = base[world, slot] + T(ctl.search.alpha[world]) * direction[world, slot]
+        if ctl.nonmonotone.restore_best[world] != 0:
+            v[world, slot] = best[world, slot]
+        else:
+            v[world, slot] = base[world, slot] + T(ctl.search.alpha[world]) * direction[world, slot]
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "ctl.active")
     def set_base(ctl: Control, v: p.vec3_2d, base: p.vec3_2d, best: p.vec3_2d):
         """base = v; before that, best iterate = base in the marked worlds."""
         world, slot = wp.tid()
-        if ctl.active[world] != 0:
-            if ctl.nonmonotone.store_best[world] != 0:
-                best[world, slot] = base[world, slot]
-            base[world, slot] = v[world, slot]
+        if ctl.nonmonotone.store_best[world] != 0:
+            best[world, slot] = base[world, slot]
+        base[world, slot] = v[world, slot]
 
     @wp.kernel(module=module)
     def floor_partials(
@@ -127,19 +120,17 @@ def vector_kernels(dtype: str, has_constraints: bool = False) -> _types.SimpleNa
         ctl.floor.sums[4, world, part, lane] = size
         ctl.floor.sums[5, world, part, lane] = speed
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def copy_active(source: p.vec3_2d, active: int_1d, target: p.vec3_2d):
         """target = source in the active worlds."""
         world, slot = wp.tid()
-        if active[world] != 0:
-            target[world, slot] = source[world, slot]
+        target[world, slot] = source[world, slot]
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def dot_terms(a: p.vec3_2d, b: p.vec3_2d, active: int_1d, rows: double_3d):
         """a.b per slot."""
         world, slot = wp.tid()
-        if active[world] != 0:
-            rows[0, world, slot] = f64(wp.dot(a[world, slot], b[world, slot]))
+        rows[0, world, slot] = f64(wp.dot(a[world, slot], b[world, slot]))
 
     @wp.kernel(module=module)
     def set_any_flag(flags: int_1d, out: int_1d):
