@@ -137,6 +137,24 @@ def test_a_swinging_rope_keeps_length_and_energy():
     assert sim.totals["newton"][0] < 4 * 20
 
 
+def test_the_matrix_is_that_of_the_products():
+    """H v by the matrix of the direct solver and by the operator of conjugate gradients."""
+    sim = wf.Simulation(atwood(sway=0.3)[0], dt=1e-3, solver=wf.NewtonPCG(linear="direct", tol=1e-10))
+    sim.step(3)
+    newton, work = sim.stepper.newton, sim.stepper.work
+    active = wp.ones(1, dtype=wp.int32, device="cpu")
+    newton.residual.evaluate(active)
+    newton.direct._assemble(active, newton.direct.matrix, projected=False)
+    v = np.random.default_rng(0).normal(size=work.p.numpy().shape)
+    work.p.assign(v)
+    work.newton.active.fill_(1)
+    newton.residual.product(work.p, work.Hp, active)
+    expected = work.Hp.numpy().ravel()
+    product = newton.direct.assembler.host_csr(newton.direct.matrix) @ v.ravel()
+    assert abs(work.multipliers.curvature.numpy()).max() * work.multipliers.trial_multiplier.numpy().max() > 1.0
+    assert np.abs(product - expected).max() < 1e-12 * np.abs(expected).max()
+
+
 def test_two_formulas_of_one_name_are_refused(monkeypatch):
     b = wf.ModelBuilder()
     other = Formula("rope", rope_length, rope_directions, None)
