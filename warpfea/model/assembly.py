@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -27,6 +28,7 @@ __all__ = [
     "facet_positions_and_areas",
     "facet_tables",
     "gather_table",
+    "greedy_colouring",
     "host_blocks",
     "require_density",
     "rigid_modes",
@@ -403,3 +405,12 @@ def rigid_modes(x: np.ndarray, kind: np.ndarray) -> np.ndarray:
 def connected_components(graph: Any) -> np.ndarray:
     """(n,) connected component of each row of a symmetric sparse matrix."""
     return sp.csgraph.connected_components(graph, directed=False)[1]
+
+
+def greedy_colouring(graph: sp.csr_matrix) -> np.ndarray:
+    """Greedy colouring (n,) of the items of a symmetric graph: neighbours differ."""
+    colour = np.full(graph.shape[0], -1)
+    for k in range(len(colour)):
+        taken = set(colour[graph.indices[graph.indptr[k] : graph.indptr[k + 1]]].tolist())
+        colour[k] = next(c for c in itertools.count() if c not in taken)
+    return colour

@@ -22,13 +22,13 @@ import warp as wp
 from ..base.errors import ModelError
 from ..kernels.step.step_control import STATUS
 from ..kernels.terms.constraints import ANGLE, DISTANCE, FORMULA
+from ..terms.term import StepContext, Term
 from ..time_laws import TimeLaw
 from .discontinuities import jump_intervals, kink_times
 
 if TYPE_CHECKING:
     from ..model.model import Model
     from ..solvers.residual import Residual
-    from ..terms.term import StepContext
     from .integrators import Integrator
 
 __all__ = ["ConsistentInitialConditions"]
@@ -207,10 +207,8 @@ class ConsistentInitialConditions:
         u, v = ctx.state.displacement.numpy(), ctx.state.velocity.numpy()
         for array, values in ((w.u, u), (w.v, v), (w.v_tilde, v), (w.q_tilde, u - dt * v)):
             self._write_flagged(array, flags, values)
-        for term in m.terms:
-            term.begin(ctx, active)
-        for term in m.terms:
-            term.prepare(ctx, active)
+        for stage in ("begin", "prepare"):
+            m.terms.call(ctx, Term, stage, active)
         self.residual.evaluate_forces(active)
         return w.g.numpy().astype(float)
 

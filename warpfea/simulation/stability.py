@@ -25,6 +25,7 @@ import warp as wp
 from ..base.errors import StabilityError, StabilityWarning
 from ..model.state import is_solver_history
 from ..solvers import NewtonPCG
+from ..terms.checks import overrides
 from ..terms.term import Term
 from .simulation import Simulation
 
@@ -230,7 +231,7 @@ class TangentOperator:
         def gathered(call: str, pool: wp.array, *more: Any) -> np.ndarray:
             pool.zero_()
             for term in terms:
-                if call != "product" or type(term).product is not Term.product:
+                if call != "product" or overrides(term, Term.product):
                     getattr(term, call)(ctx, *more, every)
             ctx.launch(gather, (m.worlds, m.slots), [m.terms.nonpotential_topology, pool, every, w.Hp])
             return self._host_values(w.Hp, np.ones(m.worlds, dtype=bool))
@@ -413,7 +414,6 @@ def _evaluate_state(stepper: Any) -> None:
     args += [stepper.u_before, stepper.v_before, w.q_tilde, w.v_tilde, w.v]
     launch(k.predict, stepper.dim, args)
     m.terms.supports.drive(stepper.ctx, running)
-    for term in m.terms:
-        term.begin(stepper.ctx, running)
+    m.terms.call(stepper.ctx, Term, "begin", running)
     stepper.newton._clear_direction(running)
     stepper.newton._evaluate_first_iterate(running)

@@ -18,7 +18,7 @@ from ..kernels.step.step import step_kernels
 from ..kernels.step.step_control import REPORT_COLUMNS
 from ..model.state import State
 from ..solvers import Jacobi, NewtonPCG, make_solver_loop
-from ..terms.checks import check_stored_energy
+from ..terms.checks import check_stored_energy, overrides
 from ..terms.protocols import Preconditioned
 from ..terms.term import StepContext, Term
 from ..terms.workspace import Workspace
@@ -152,7 +152,7 @@ class Stepper:
 
     def start_terms(self, mask: np.ndarray | None = None) -> None:
         """Reinitialise terms after the state of the masked worlds was set."""
-        following = [term for term in self.terms if type(term).start is not Term.start]
+        following = [term for term in self.terms if overrides(term, Term.start)]
         if not following and self.terms.dead_loads.gravity_law is None:
             return
         w, state = self.work, self.state
@@ -229,8 +229,8 @@ class Stepper:
         self.newton.invalidate(flags)
         if "predictor_potential" not in self.state.names:
             self._evaluate_potential(flags)
-        for term in self.terms.having(Preconditioned) if restart else ():
-            term.reset_scratch(self.ctx, flags)
+        if restart:
+            self.terms.call(self.ctx, Preconditioned, "reset_scratch", flags)
 
     def _evaluate_potential(self, flags: np.ndarray | wp.array | None) -> None:
         """Evaluate the strain energy of the state in the chosen worlds, for the choice of first iterates."""
@@ -327,8 +327,7 @@ class Stepper:
         launch(self.kernels.write_report, m.worlds, [w.step, w.newton, w.pcg, w.report])
         if m.description.probes:
             self._write_probes()
-        for term in self.terms:
-            term.report(self.ctx)
+        self.terms.call(self.ctx, Term, "report")
         self.episodes.end_step()
 
     @launch_part("commit")
@@ -364,8 +363,7 @@ class Stepper:
         if self.predictor:
             self.predictor.begin()
         self.terms.supports.drive(self.ctx, running)
-        for term in self.terms:
-            term.begin(self.ctx, running)
+        self.terms.call(self.ctx, Term, "begin", running)
         self.newton.run()
         if self.step_size_control:
             self.step_size_control.check_local_error()
@@ -394,8 +392,7 @@ class Stepper:
             self.predictor.update_history()
         args = [w.step, w.newton, w.u, w.v, state.displacement, state.velocity, self.u_before, self.v_before]
         launch(self.kernels.accept_state, self.dim, args)
-        for term in self.terms:
-            term.commit(self.ctx, w.step.accepted)
+        self.terms.call(self.ctx, Term, "commit", w.step.accepted)
         self.newton.store_history(w.step.accepted)
 
     @launch_part("loads")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +22,7 @@ from ..kernels.terms.constraints import (
     constraint_struct,
     joint_struct,
 )
+from ..model.assembly import greedy_colouring
 from ..model.joints import ConstraintRow, Joint, Vector
 from ..time_laws import TimeLaw
 from .time_law_table import TimeLawTable
@@ -289,16 +289,9 @@ class ConstraintTables:
 
     def _colour_clusters(self, row: np.ndarray, column: np.ndarray) -> None:
         """Greedy colouring of coupled clusters; `colour_sizes` counts the clusters per colour."""
-        n = len(self.cluster_sizes)
-        neighbours: list[set[int]] = [set() for _ in range(n)]
-        for a, b in zip(self.cluster_host[row].tolist(), self.cluster_host[column].tolist()):
-            neighbours[a].add(b)
-        colour = np.full(n, -1)
-        for k in range(n):
-            taken = {int(colour[j]) for j in neighbours[k]}
-            colour[k] = next(c for c in itertools.count() if c not in taken)
-        self.colour_host = colour
-        self.colour_sizes = np.bincount(colour)
+        pairs, n = (self.cluster_host[row], self.cluster_host[column]), len(self.cluster_sizes)
+        self.colour_host = greedy_colouring(sp.csr_matrix((np.ones(len(row)), pairs), (n, n)))
+        self.colour_sizes = np.bincount(self.colour_host)
 
     def _upload_joints(self) -> None:
         m = self.model

@@ -8,7 +8,7 @@ and the curvature sum lambda d2c/dq2 is free of rho c. The classical update is `
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -88,29 +88,32 @@ class Constraints(Constrained, Updated, Tied, Preconditioned):
         """Kernels specialised for the integrator of a simulation."""
         return constraint_kernels(self.model.dtype, ctx.midpoint)
 
+    def _make_multipliers(self, make: Callable[[str, tuple[int, ...], Any], wp.array], *, midpoint: bool) -> Any:
+        """Multiplier struct with arrays from make(name, shape, dtype), but the rows of the potential."""
+        mul, con = multiplier_struct()(), self.tables
+        B, M = self.dim
+        shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("gradient", "end_gradient", "product"), (B, 3 * M))
+        shapes |= {
+            "curvature": (B, 9 * M),
+            "violation": (B, self.model.components.count),
+            "compliance_block": (B, max(con.block_count, 1)),
+            "inverse_matrix": (B, con.matrix_entries),
+            "coupling": (B, max(con.coupling_count, 1)),
+        }
+        absent = ("rows", *(() if con.formulas else ("curvature",)), *(() if midpoint else ("end_gradient",)))
+        for name, var in multiplier_struct().vars.items():
+            if isinstance(var.type, wp.array) and name not in absent:
+                setattr(mul, name, make(name, shapes.get(name, self.dim), var.type.dtype))
+        if not midpoint:
+            mul.end_gradient = mul.gradient
+        return mul
+
     def allocate(self, work: Workspace, ctx: StepContext) -> None:
         """Allocate multipliers and matrices, work.multipliers."""
-        model, con = self.model, self.tables
-        mul = multiplier_struct()()
-        B, M = model.worlds, con.count
-        shapes: dict[str, tuple[tuple[int, ...], Any]] = {
-            "gradient": ((B, 3 * M), wp.vec3d),
-            "end_gradient": ((B, 3 * M), wp.vec3d),
-            "product": ((B, 3 * M), wp.vec3d),
-            "violation": ((B, model.components.count), wp.float64),
-            "compliance_block": ((B, max(con.block_count, 1)), wp.mat33d),
-            "curvature": ((B, 9 * M), wp.mat33d),
-            "inverse_matrix": ((B, con.matrix_entries), wp.float64),
-            "coupling": ((B, max(con.coupling_count, 1)), wp.float64),
-        }
-        for name, var in multiplier_struct().vars.items():
-            if name == "end_gradient" and not ctx.midpoint:
-                mul.end_gradient = mul.gradient
-            elif isinstance(var.type, wp.array) and name != "rows" and (name != "curvature" or con.formulas):
-                shape, dtype = shapes.get(name, ((B, M), wp.float64))
-                setattr(mul, name, work.array(f"Multipliers.{name}", shape, dtype))
-        mul.rows = work.rows_of(self)
-        work.multipliers = mul
+        work.multipliers = self._make_multipliers(
+            lambda name, shape, dtype: work.array(f"Multipliers.{name}", shape, dtype), midpoint=ctx.midpoint
+        )
+        work.multipliers.rows = work.rows_of(self)
 
     def register(self, ctx: StepContext) -> None:
         ctx.state.register("constraint_force", wp.float64, (self.tables.count,))
@@ -307,27 +310,8 @@ class Constraints(Constrained, Updated, Tied, Preconditioned):
         all_worlds = wp.ones(B, dtype=wp.int32, device=m.device)
         value = zeros((B, max(laws.count, 1)), wp.vec3d)
         laws.evaluate(launch, state, state.time, wp.ones(B, dtype=wp.float64, device=m.device), all_worlds, value)
-        mul = multiplier_struct()()
-        for name in (
-            "constraint_value",
-            "target",
-            "last_target",
-            "signed_scale",
-            "multiplier",
-            "multiplier_change",
-            "trial_multiplier",
-            "frozen_force",
-            "penalty_force",
-            "penalty",
-        ):
-            setattr(mul, name, zeros((B, con.count), wp.float64))
-        for name in ("gradient", "product"):
-            setattr(mul, name, zeros((B, 3 * con.count), wp.vec3d))
-        if con.formulas:
-            mul.curvature = zeros((B, 9 * con.count), wp.mat33d)
-        mul.end_gradient = mul.gradient
-        mul.rows = zeros((TERM_ROWS, B, con.count), wp.float64)
-        mul.violation = zeros((B, m.components.count), wp.float64)
+        mul = self._make_multipliers(lambda name, shape, dtype: zeros(shape, dtype), midpoint=False)
+        mul.rows = zeros((TERM_ROWS, *self.dim), wp.float64)
         if multipliers is not None:
             mul.multiplier.assign(np.tile(multipliers, (B, 1)))
         mul.last_target.fill_(np.nan)  # any number of turns is valid

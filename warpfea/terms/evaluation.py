@@ -131,7 +131,7 @@ class Evaluation:
         direction = self._zeros((1, m.slots), m.types.vec3)
         flag = wp.ones(1, dtype=wp.int32, device=m.device)
         conns = [b.connectivity for b in m.blocks]
-        colour = _greedy_colouring(slot_graph(m.blocks, m.slots))
+        colour = assembly.greedy_colouring(slot_graph(m.blocks, m.slots))
         rows, cols, values = [], [], []
         for c in range(int(colour.max()) + 1):
             for axis in range(3):
@@ -286,16 +286,3 @@ def _extrapolation_matrix(rule: Rule, at: np.ndarray) -> np.ndarray:
         return np.full((len(at), len(points)), 1.0 / len(points))
     A = np.column_stack([np.ones(len(points)), points])
     return np.column_stack([np.ones(len(at)), at]) @ np.linalg.pinv(A)
-
-
-def _greedy_colouring(graph: sp.csr_matrix) -> np.ndarray:
-    """Greedy colouring: slots that share an element differ."""
-    n = graph.shape[0]
-    colour = np.full(n, -1)
-    for s in range(n):
-        taken = set(colour[graph.indices[graph.indptr[s] : graph.indptr[s + 1]]].tolist())
-        c = 0
-        while c in taken:
-            c += 1
-        colour[s] = c
-    return colour
