@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from .arguments import StoreOnce, add_general_options, lazy_command, positive_integer, positive_number
+from .arguments import MANY, ONCE, add_options, finish_command, positive_integer, positive_number
 
 __all__ = ["SCENE_COMMAND", "add_accuracy"]
 
@@ -59,40 +59,37 @@ def add_accuracy(names: Any) -> None:
         epilog=EXAMPLES,
     )
     to.add_argument("what", metavar=SCENE_COMMAND, help="a scene, file.py or file.py:scene")
-    sweep = to.add_argument_group("the sweep")
-    sweep.add_argument("--over", action="append", default=[], metavar="NAME=V1,V2", help="repeatable")
-    sweep.add_argument("--methods", metavar="NAME,NAME", help="integrators, with options as name(option=value)")
-    sweep.add_argument("--error", metavar="X,X", help="steps that adapt, to each of these errors")
-    fixed = to.add_argument_group("for all runs (defaults are the scene's)")
-    fixed.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="a parameter of the scene")
-    fixed.add_argument("--dt", type=positive_number, metavar="S", help="step, s, where it is not swept")
-    fixed.add_argument("--t-end", type=positive_number, metavar="S", help="end time, s")
-    fixed.add_argument("--tol", type=positive_number, metavar="X", help="relative residual at which a step is accepted")
-    fixed.add_argument("--solver", default="newton-pcg", metavar="NAME", help="newton-pcg (default), jacobi, direct")
-    fixed.add_argument("--dtype", default="float64", metavar="NAME", help="float64 (default) or float32")
-    fixed.add_argument("--device", help="cpu, cuda:0, ...; by default CUDA where there is one")
-    judge = to.add_argument_group("errors")
-    judge.add_argument("--probe", action="append", metavar="NAME", help="whose error counts; repeatable (default: all)")
-    judge.add_argument("--reference", metavar="FILE", help="a file of positions, or run for a finer run")
-    judge.add_argument("--finer", action="append", default=[], metavar="NAME=VALUE", help="of the finer run")
-    judge.add_argument("--mesh", action="append", metavar="NAME", help="a parameter that refines the mesh; repeatable")
-    judge.add_argument(
-        "--measure", default="l2", metavar="NAME", help="error that counts: l2 (default), end, energy, field"
+    add_options(
+        to.add_argument_group("the sweep"),
+        ("--over", MANY, "NAME=V1,V2", "repeatable"),
+        ("--methods", None, "NAME,NAME", "integrators, with options as name(option=value)"),
+        ("--error", None, "X,X", "steps that adapt, to each of these errors"),
     )
-    judge.add_argument(
-        "--target",
-        type=positive_number,
-        metavar="X",
-        help="name the cheapest setting with at most this error, in time and mesh",
+    add_options(
+        to.add_argument_group("for all runs (defaults are the scene's)"),
+        ("--set", MANY, "NAME=VALUE", "a parameter of the scene"),
+        ("--dt", positive_number, "S", "step, s, where it is not swept"),
+        ("--t-end", positive_number, "S", "end time, s"),
+        ("--tol", positive_number, "X", "relative residual at which a step is accepted"),
+        ("--solver", None, "NAME", "newton-pcg (default), jacobi, direct", "newton-pcg"),
+        ("--dtype", None, "NAME", "float64 (default) or float32", "float64"),
+        ("--device", None, None, "cpu, cuda:0, ...; by default CUDA where there is one"),
     )
-    judge.add_argument(
-        "--split", default="best", metavar="ROWS", help="parts of the error of the best row (default), of all, or none"
+    add_options(
+        to.add_argument_group("errors"),
+        ("--probe", MANY, "NAME", "whose error counts; repeatable (default: all)", None),
+        ("--reference", None, "FILE", "a file of positions, or run for a finer run"),
+        ("--finer", MANY, "NAME=VALUE", "of the finer run"),
+        ("--mesh", MANY, "NAME", "a parameter that refines the mesh; repeatable", None),
+        ("--measure", None, "NAME", "error that counts: l2 (default), end, energy, field", "l2"),
+        ("--target", positive_number, "X", "name the cheapest setting with at most this error, in time and mesh"),
+        ("--split", None, "ROWS", "parts of the error of the best row (default), of all, or none", "best"),
     )
-    to.add_argument("--repeat", type=positive_integer, default=3, metavar="N", help="runs for the times (default 3)")
-    to.add_argument("--limit", type=positive_number, metavar="S", help="s, after which a run is given up")
-    to.add_argument(
-        "--out", action=StoreOnce, metavar="FOLDER", help="NAME.csv, .json, .png, and what is needed to go on"
+    add_options(
+        to,
+        ("--repeat", positive_integer, "N", "runs for the times (default 3)", 3),
+        ("--limit", positive_number, "S", "s, after which a run is given up"),
+        ("--out", ONCE, "FOLDER", "NAME.csv, .json, .png, and what is needed to go on"),
+        ("--name", None, "NAME", "of the files (default: the scene's)"),
     )
-    to.add_argument("--name", metavar="NAME", help="of the files (default: the scene's)")
-    add_general_options(to, "no bars, no table")
-    to.set_defaults(command=lazy_command("study", "accuracy"))
+    finish_command(to, ".study", "accuracy", "no bars, no table")

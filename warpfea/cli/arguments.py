@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import functools
+import importlib
 import math
 import pathlib
 import re
+from collections.abc import Callable
 from typing import Any, NoReturn
 
 from ..base.checks import number_hint
@@ -13,22 +16,10 @@ from ..base.errors import UsageError
 from ..base.names import did_you_mean
 
 __all__ = [
-    "Parser",
-    "StoreOnce",
-    "add_general_options",
-    "color_range",
-    "existing_file",
-    "lazy_command",
-    "load_steps",
-    "number_pair",
-    "number_tuple",
-    "positive_integer",
-    "positive_integers",
-    "positive_number",
-    "size",
-    "step_size",
+    "FLAG", "MANY", "ONCE", "Parser", "add_options", "color_range", "existing_file", "finish_command", "load_steps",
+    "number_pair", "number_tuple", "positive_integer", "positive_integers", "positive_number", "size", "step_size",
     "vector",
-]
+]  # fmt: skip
 
 
 class Parser(argparse.ArgumentParser):
@@ -75,16 +66,6 @@ def positive_number(text: str) -> float:
     return value
 
 
-def step_size(text: str) -> float | str:
-    """A positive finite number, or "auto"."""
-    if text == "auto":
-        return text
-    try:
-        return positive_number(text)
-    except argparse.ArgumentTypeError:
-        raise argparse.ArgumentTypeError(f"{text!r} is neither a positive finite number nor auto") from None
-
-
 def positive_integer(text: str) -> int:
     """A positive whole number."""
     if not (text.isdecimal() and int(text) > 0):
@@ -92,14 +73,18 @@ def positive_integer(text: str) -> int:
     return int(text)
 
 
-def load_steps(text: str) -> int:
-    """Number of load steps; "auto": one, halved by the solver if rejected."""
-    if text == "auto":
-        return 1
+def _or_auto(parse: Callable[[str], Any], auto: Any, what: str, text: str) -> Any:
+    """`auto` for "auto", else a parsed number; `what` is expected."""
     try:
-        return positive_integer(text)
+        return auto if text == "auto" else parse(text)
     except argparse.ArgumentTypeError:
-        raise argparse.ArgumentTypeError(f"{text!r} is neither a positive whole number nor auto") from None
+        raise argparse.ArgumentTypeError(f"{text!r} is neither {what} nor auto") from None
+
+
+step_size = functools.partial(_or_auto, positive_number, "auto", "a positive finite number")
+"""A positive finite number, or "auto"."""
+load_steps = functools.partial(_or_auto, positive_integer, 1, "a positive whole number")
+"""Number of load steps; "auto": one, halved by the solver if rejected."""
 
 
 def positive_integers(text: str) -> list[int]:
@@ -124,14 +109,10 @@ def number_tuple(text: str, size: int) -> tuple[float, ...]:
     return values
 
 
-def vector(text: str) -> tuple[float, ...]:
-    """x,y,z."""
-    return number_tuple(text, 3)
-
-
-def number_pair(text: str) -> tuple[float, ...]:
-    """Two numbers separated by a comma."""
-    return number_tuple(text, 2)
+vector = functools.partial(number_tuple, size=3)
+"""x,y,z."""
+number_pair = functools.partial(number_tuple, size=2)
+"""Two numbers separated by a comma."""
 
 
 def color_range(text: str) -> tuple[float, ...]:
@@ -150,20 +131,38 @@ def size(text: str) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
-def lazy_command(module: str, function: str) -> Any:
-    """The command, imported on call."""
+FLAG, MANY, ONCE = "store_true", "append", StoreOnce
+"""Kinds of options: a switch; repeatable; an output, given once."""
+
+
+def add_options(to: Any, *rows: tuple[Any, ...]) -> None:
+    """Add options, a row (flag, kind, metavar, help) or (flag, kind, metavar, help, default) each.
+
+    Kinds are FLAG, MANY, ONCE, a type of values, a tuple of choices, or None for text; a tuple as metavar: choices of
+    a repeatable option. Flags with synonyms are separated by blanks.
+    """
+    for flags, kind, shown, text, *default in rows:
+        how: dict[str, Any] = {"action": kind} if kind in (FLAG, MANY, ONCE) else {"type": kind}
+        choices = kind if isinstance(kind, tuple) else shown
+        if isinstance(choices, tuple):
+            how = {"action": how.get("action"), "choices": choices}
+        elif shown:
+            how["metavar"] = shown
+        if default or kind == MANY:
+            how["default"] = default[0] if default else []
+        to.add_argument(*flags.split(), help=text, **how)
+
+
+def finish_command(to: Any, module: str, function: str, quiet: str = "no bars and no summary table") -> None:
+    """Options common to all commands, and the command, imported on call; `quiet` is the help of --quiet."""
+    add_options(
+        to.add_argument_group("general"),
+        ("--quiet", FLAG, None, quiet),
+        ("--no-progress", FLAG, None, "no bars; there are none without a terminal"),
+        ("--debug", FLAG, None, "errors as Python tracebacks"),
+    )
 
     def command(arguments: argparse.Namespace) -> int:
-        import importlib
+        return int(getattr(importlib.import_module(module, __package__), function)(arguments) or 0)
 
-        return int(getattr(importlib.import_module(f"{__package__}.{module}"), function)(arguments))
-
-    return command
-
-
-def add_general_options(to: argparse.ArgumentParser, quiet: str = "no bars and no summary table") -> None:
-    """Options common to all commands; `quiet` is the help of --quiet."""
-    group = to.add_argument_group("general")
-    group.add_argument("--quiet", action="store_true", help=quiet)
-    group.add_argument("--no-progress", action="store_true", help="no bars; there are none without a terminal")
-    group.add_argument("--debug", action="store_true", help="errors as Python tracebacks")
+    to.set_defaults(command=command)

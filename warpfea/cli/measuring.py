@@ -11,10 +11,12 @@ from ..base.errors import UsageError
 from ..base.names import did_you_mean
 from .accuracy import SCENE_COMMAND, add_accuracy
 from .arguments import (
+    FLAG,
+    MANY,
+    ONCE,
     Parser,
-    StoreOnce,
-    add_general_options,
-    lazy_command,
+    add_options,
+    finish_command,
     positive_integer,
     positive_integers,
     positive_number,
@@ -64,13 +66,6 @@ exit codes: 0 every row met its criterion, 3 one did not, 2 bad usage, 130 inter
 """
 
 
-def _bench(arguments: argparse.Namespace) -> int:
-    from ..studies.bench.command import bench
-
-    bench(arguments)
-    return 0
-
-
 def add_bench(commands: Any) -> None:
     """`warpfea bench`."""
     to = commands.add_parser(
@@ -91,49 +86,28 @@ def add_bench(commands: Any) -> None:
     kind = to.add_mutually_exclusive_group()
     kind.add_argument("--peer", action="store_true", help="120 steps to 5e-4 N on the peer's sizes, beside its times")
     kind.add_argument("--worlds", action="store_true", help="many worlds of small models: error beside run time")
-    to.add_argument(
-        "--problem",
-        action="append",
-        choices=("bar", "beam", "plate", "ENMC", "FN18", "H3843"),
-        help="may be repeated; default bar",
+    add_options(
+        to,
+        ("--problem", MANY, ("bar", "beam", "plate", "ENMC", "FN18", "H3843"), "may be repeated; default bar", None),
+        ("--unknowns --sizes", positive_integers, "N,N,...", "sizes (default: a few per problem)", []),
+        ("--device", None, None, "cpu, cuda:0, ...; by default CUDA where there is one"),
+        ("--dtype", MANY, ("float64", "float32"), "may be repeated; default both, of --peer float64", None),
+        ("--linear", MANY, ("pcg", "direct"), "linear solver, may be repeated; default pcg", None),
+        ("--steps", positive_integer, "N", "steps to simulate (default 10, --peer 120)"),
+        ("--repeat", positive_integer, "N", "runs; the median counts (default 3)"),
+        ("--dt", positive_number, "S", "step, s (default 1e-3)"),
+        ("--tol", positive_number, "X", "relative residual at which a step is accepted"),
+        ("--reference-up-to", positive_integers, "N", "largest size that gets a reference with 100 times tighter "
+         "tolerance (default 100000)"),
+    )  # fmt: skip
+    add_options(
+        to.add_argument_group("with --peer or --worlds"),
+        ("--rows", None, "LABEL,...", "rows by label, with * for any text (default: all)"),
+        ("--large", FLAG, None, "--peer: a bar of 4 million unknowns too, ten steps"),
+        ("--meshes", None, "FOLDER", "--peer: unstructured meshes (default: tests/data of the checkout)"),
     )
-    to.add_argument(
-        "--unknowns",
-        "--sizes",
-        type=positive_integers,
-        default=[],
-        metavar="N,N,...",
-        help="sizes (default: a few per problem)",
-    )
-    to.add_argument("--device", help="cpu, cuda:0, ...; by default CUDA where there is one")
-    to.add_argument(
-        "--dtype",
-        action="append",
-        choices=("float64", "float32"),
-        help="may be repeated; default both, of --peer float64",
-    )
-    to.add_argument(
-        "--linear", action="append", choices=("pcg", "direct"), help="linear solver, may be repeated; default pcg"
-    )
-    to.add_argument("--steps", type=positive_integer, metavar="N", help="steps to simulate (default 10, --peer 120)")
-    to.add_argument("--repeat", type=positive_integer, metavar="N", help="runs; the median counts (default 3)")
-    to.add_argument("--dt", type=positive_number, metavar="S", help="step, s (default 1e-3)")
-    to.add_argument("--tol", type=positive_number, metavar="X", help="relative residual at which a step is accepted")
-    to.add_argument(
-        "--reference-up-to",
-        type=positive_integers,
-        metavar="N",
-        help="largest size that gets a reference with 100 times tighter tolerance (default 100000)",
-    )
-    group = to.add_argument_group("with --peer or --worlds")
-    group.add_argument("--rows", metavar="LABEL,...", help="rows by label, with * for any text (default: all)")
-    group.add_argument("--large", action="store_true", help="--peer: a bar of 4 million unknowns too, ten steps")
-    group.add_argument(
-        "--meshes", metavar="FOLDER", help="--peer: unstructured meshes (default: tests/data of the checkout)"
-    )
-    to.add_argument("--out", metavar="FILE", help="JSON with command, machine, settings and rows")
-    add_general_options(to, "no bars; the table is what it is for")
-    to.set_defaults(command=_bench)
+    add_options(to, ("--out", None, "FILE", "JSON with command, machine, settings and rows"))
+    finish_command(to, "..studies.bench.command", "bench", "no bars; the table is what it is for")
 
 
 STUDIES: dict[str, tuple[str, tuple[str, ...], str]] = {
@@ -146,11 +120,11 @@ STUDIES: dict[str, tuple[str, tuple[str, ...], str]] = {
     ),
 }
 """Studies other than those of scenes: name -> help, options, description; executed by `run` of cli/study.py."""
-_STUDY_OPTIONS: dict[str, dict[str, Any]] = {
-    "--device": {"help": "cpu, cuda:0, ..."},
-    "--quick": {"action": "store_true", "help": "a trial: few and small rows, no result"},
-    "--worlds": {"type": positive_integer, "metavar": "N", "help": "candidates at a time (default 64)"},
-    "--out": {"metavar": "PATH", "help": "JSON with command, machine, settings and rows"},
+_STUDY_OPTIONS: dict[str, tuple[Any, ...]] = {
+    "--device": (None, None, "cpu, cuda:0, ..."),
+    "--quick": (FLAG, None, "a trial: few and small rows, no result"),
+    "--worlds": (positive_integer, "N", "candidates at a time (default 64)"),
+    "--out": (None, "PATH", "JSON with command, machine, settings and rows"),
 }
 
 
@@ -168,10 +142,8 @@ def add_study(commands: Any) -> None:
     add_accuracy(names)
     for name, (text, options, about) in STUDIES.items():
         one = names.add_parser(name, help=text, description=about, epilog=f"example:\n  warpfea study {name}")
-        for flag in options:
-            one.add_argument(flag, **_STUDY_OPTIONS[flag])
-        add_general_options(one, "no bars, no table")
-        one.set_defaults(command=lazy_command("study", "study"))
+        add_options(one, *((flag, *_STUDY_OPTIONS[flag]) for flag in options))
+        finish_command(one, ".study", "study", "no bars, no table")
 
 
 def add_stress(commands: Any) -> None:
@@ -183,20 +155,18 @@ def add_stress(commands: Any) -> None:
         "inside out, very long steps, large rotations, joints. Each answer is held to a closed form or to a reference.",
         epilog=STRESS_EXAMPLES,
     )
-    to.add_argument(
-        "--case", action="append", default=[], metavar="NAME", help="a case, a row NAME/VALUE or a group; repeatable"
+    add_options(
+        to,
+        ("--case", MANY, "NAME", "a case, a row NAME/VALUE or a group; repeatable"),
+        ("--list", FLAG, None, "the cases and what each tries; runs nothing"),
+        ("--quick", FLAG, None, "the fast rows only (minutes)"),
+        ("--device", None, None, "cpu, cuda:0, ...; by default CUDA where there is one"),
+        ("--dtype", ("float64", "float32", "both"), None, "precision (default both)", "both"),
+        ("--meshes", None, "FOLDER", "meshes of the soft solids (mat.msh, ...); without: left out"),
+        ("--json", ONCE, "FILE", "rows with all numbers, kept after each; - for stdout"),
+        ("--resume", FLAG, None, "keep the rows that --json holds, of the same commit"),
     )
-    to.add_argument("--list", action="store_true", help="the cases and what each tries; runs nothing")
-    to.add_argument("--quick", action="store_true", help="the fast rows only (minutes)")
-    to.add_argument("--device", help="cpu, cuda:0, ...; by default CUDA where there is one")
-    to.add_argument("--dtype", choices=("float64", "float32", "both"), default="both", help="precision (default both)")
-    to.add_argument("--meshes", metavar="FOLDER", help="meshes of the soft solids (mat.msh, ...); without: left out")
-    to.add_argument(
-        "--json", action=StoreOnce, metavar="FILE", help="rows with all numbers, kept after each; - for stdout"
-    )
-    to.add_argument("--resume", action="store_true", help="keep the rows that --json holds, of the same commit")
-    add_general_options(to, "no bars, no table: which rows failed, and the exit code")
-    to.set_defaults(command=lazy_command("stress", "stress"))
+    finish_command(to, ".study", "stress", "no bars, no table: which rows failed, and the exit code")
 
 
 def insert_scene_command(words: Sequence[str]) -> list[str]:
@@ -231,11 +201,10 @@ def add_profile(commands: Any, add_model: Callable[[argparse.ArgumentParser], No
         epilog=PROFILE_EXAMPLES.replace("@PARTS@", parts),
     )
     add_model(to)
-    to.add_argument(
-        "--steps", type=positive_integer, default=10, metavar="N", help="steps that are timed, after 2 (default 10)"
+    add_options(to, ("--steps", positive_integer, "N", "steps that are timed, after 2 (default 10)", 10))
+    add_options(
+        to.add_argument_group("output (existing files are replaced once the new one is whole)"),
+        ("--png", None, "FILE", "picture of the parts (pip install 'warpfea[plots]')"),
+        ("--json", None, "FILE", "all numbers, with fixed keys; - for stdout"),
     )
-    out = to.add_argument_group("output (existing files are replaced once the new one is whole)")
-    out.add_argument("--png", metavar="FILE", help="picture of the parts (pip install 'warpfea[plots]')")
-    out.add_argument("--json", metavar="FILE", help="all numbers, with fixed keys; - for stdout")
-    add_general_options(to)
-    to.set_defaults(command=lazy_command("profile", "profile"))
+    finish_command(to, ".profile", "profile")

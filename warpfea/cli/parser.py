@@ -12,11 +12,13 @@ from ..base.names import did_you_mean
 from ..simulation.statics import UNSTABLE_CHOICES
 from ..solvers import SOLVERS
 from .arguments import (
+    FLAG,
+    MANY,
+    ONCE,
     Parser,
-    StoreOnce,
-    add_general_options,
+    add_options,
     color_range,
-    lazy_command,
+    finish_command,
     load_steps,
     number_pair,
     positive_integer,
@@ -126,58 +128,36 @@ def _join_negative_vectors(words: Sequence[str]) -> list[str]:
 
 
 def _add_model_options(to: argparse.ArgumentParser) -> None:
-    """Model and solver options common to run and info."""
+    """Model and solver options common to run, info and profile."""
     to.add_argument("what", metavar="SCENE", help="a scene, file.py or file.py:scene, or a mesh (.msh, .vtu, .inp)")
-    to.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="set a parameter of the scene")
-    mesh = to.add_argument_group("for a mesh file (vectors are x,y,z; repeat an option for several groups)")
-    mesh.add_argument(
-        "--material", action="append", default=[], metavar="[GROUP=]LAW:NAME=VALUE,...", help=MATERIAL_HINT
+    add_options(to, ("--set", MANY, "NAME=VALUE", "set a parameter of the scene"))
+    add_options(
+        to.add_argument_group("for a mesh file (vectors are x,y,z; repeat an option for several groups)"),
+        ("--material", MANY, "[GROUP=]LAW:NAME=VALUE,...", MATERIAL_HINT),
+        ("--clamp", MANY, "GROUP", "hold the nodes of a group"),
+        ("--traction", MANY, "GROUP:x,y,z", "dead load on a surface, Pa"),
+        ("--pressure", MANY, "GROUP:p", "follower pressure on a surface, Pa"),
+        ("--gravity", vector, "x,y,z", "m/s^2, by default 9.81 downwards"),
+        ("--scale", positive_number, "S", "metres per unit of the file, 1e-3 for mm"),
+        ("--up-axis", ("Y", "Z"), None, "by default Z"),
+        ("--quadrature", None, "RULE", "force rule: tet4, tet5_paper, tet8, tet14 (T10), tet1, tet4 (T4)"),
     )
-    mesh.add_argument("--clamp", action="append", default=[], metavar="GROUP", help="hold the nodes of a group")
-    mesh.add_argument(
-        "--traction", action="append", default=[], metavar="GROUP:x,y,z", help="dead load on a surface, Pa"
-    )
-    mesh.add_argument(
-        "--pressure", action="append", default=[], metavar="GROUP:p", help="follower pressure on a surface, Pa"
-    )
-    mesh.add_argument("--gravity", type=vector, metavar="x,y,z", help="m/s^2, by default 9.81 downwards")
-    mesh.add_argument("--scale", type=positive_number, metavar="S", help="metres per unit of the file, 1e-3 for mm")
-    mesh.add_argument("--up-axis", choices=("Y", "Z"), help="by default Z")
-    mesh.add_argument(
-        "--quadrature", metavar="RULE", help="force rule: tet4, tet5_paper, tet8, tet14 (T10), tet1, tet4 (T4)"
-    )
-    how = to.add_argument_group("simulation (defaults are the scene's)")
-    how.add_argument("--device", help="cpu, cuda:0, ...; by default CUDA where there is one")
-    how.add_argument("--dtype", choices=("float64", "float32"), help="precision, by default float64")
-    how.add_argument("--dt", type=step_size, metavar="S", help="step, s; auto: as --error asks for")
-    how.add_argument(
-        "--error", type=positive_number, metavar="X", help="of --dt auto: of positions, over the model's size"
-    )
-    how.add_argument(
-        "--integrator",
-        metavar="NAME",
-        help="backward_euler, bdf2, energy_momentum or generalized_alpha, also with its option: "
-        "generalized_alpha(rho_inf=0.5), energy_momentum(rho_inf=0.8)",
-    )
-    how.add_argument(
-        "--solver",
-        choices=tuple(SOLVERS),
-        default="newton-pcg",
-        help="of a step, by default newton-pcg; jacobi: few cheap iterations, what is left is told; direct: SuperLU",
-    )
-    how.add_argument("--tol", type=positive_number, metavar="X", help="relative residual at which a step is accepted")
-    how.add_argument(
-        "--inversion",
-        choices=("refuse", "report"),
-        default="refuse",
-        help="a step that turns an element inside out is refused (default), or passes where the law allows it",
-    )
-    how.add_argument(
-        "--energy-growth",
-        choices=("refuse", "warn", "ignore"),
-        default="refuse",
-        help="energy that the integrator adds: above 1 %% a warning, above 10 %% refused (default), or not",
-    )
+    add_options(
+        to.add_argument_group("simulation (defaults are the scene's)"),
+        ("--device", None, None, "cpu, cuda:0, ...; by default CUDA where there is one"),
+        ("--dtype", ("float64", "float32"), None, "precision, by default float64"),
+        ("--dt", step_size, "S", "step, s; auto: as --error asks for"),
+        ("--error", positive_number, "X", "of --dt auto: of positions, over the model's size"),
+        ("--integrator", None, "NAME", "backward_euler, bdf2, energy_momentum or generalized_alpha, also with its "
+         "option: generalized_alpha(rho_inf=0.5), energy_momentum(rho_inf=0.8)"),
+        ("--solver", tuple(SOLVERS), None, "of a step, by default newton-pcg; jacobi: few cheap iterations, what is "
+         "left is told; direct: SuperLU", "newton-pcg"),
+        ("--tol", positive_number, "X", "relative residual at which a step is accepted"),
+        ("--inversion", ("refuse", "report"), None, "a step that turns an element inside out is refused (default), or "
+         "passes where the law allows it", "refuse"),
+        ("--energy-growth", ("refuse", "warn", "ignore"), None, "energy that the integrator adds: above 1 %% a "
+         "warning, above 10 %% refused (default), or not", "refuse"),
+    )  # fmt: skip
 
 
 def _add_run(commands: Any) -> None:
@@ -188,73 +168,47 @@ def _add_run(commands: Any) -> None:
         epilog=RUN_EXAMPLES,
     )
     _add_model_options(to)
-    to.add_argument("--t-end", type=positive_number, metavar="S", help="end time, s (default: the scene's)")
-    to.add_argument("--static", action="store_true", help="static equilibrium in place of a motion")
-    to.add_argument(
-        "--load-steps",
-        type=load_steps,
-        metavar="N",
-        help="of --static (default 10); auto: the whole load at once, halved where it is refused",
-    )
-    to.add_argument(
-        "--stabilise",
-        action="store_true",
-        help="of --static: springs that fade with the load, for bodies that only contact holds",
-    )
-    to.add_argument(
-        "--unstable",
-        choices=UNSTABLE_CHOICES,
-        help="of --static: warn of an unstable equilibrium (default), refuse it, or do not judge it",
-    )
-    out = to.add_argument_group("output (existing files are replaced once the new one is whole)")
-    out.add_argument(
-        "--usd",
-        action=StoreOnce,
-        metavar="FILE",
-        help="animation (.usdc, .usda) with stress and displacement; validated",
-    )
-    out.add_argument("--vtu", action=StoreOnce, metavar="FOLDER", help="series of .vtu and a .pvd for ParaView")
-    out.add_argument("--png", action=StoreOnce, metavar="FILE", help="picture")
-    out.add_argument("--png-time", type=float, metavar="S", help="time of the picture")
-    out.add_argument("--gif", action=StoreOnce, metavar="FILE", help="animation")
-    _add_picture_options(out)
-    out.add_argument("--fps", type=positive_number, metavar="N", help="frames per simulated second of --usd and --vtu")
-    out.add_argument("--speed", type=positive_number, metavar="X", help="simulated seconds per second of --gif")
-    out.add_argument("--json", action=StoreOnce, metavar="FILE", help="summary of the run; - for stdout")
-    out.add_argument(
-        "--checkpoint",
-        action=StoreOnce,
-        metavar="FILE",
-        help="state (.npz), written every --every steps and at the end",
-    )
-    out.add_argument("--every", type=positive_integer, metavar="N", help="steps between checkpoints (default 100)")
-    out.add_argument(
-        "--resume",
-        metavar="FILE",
-        help="go on from a checkpoint, with its integrator and precision, and without --dt its dt; a file of --usd or "
-        "a series of --vtu that is there goes on too, if it ends where the checkpoint is",
-    )
-    add_general_options(to)
-    to.set_defaults(command=lazy_command("run", "run"))
+    add_options(
+        to,
+        ("--t-end", positive_number, "S", "end time, s (default: the scene's)"),
+        ("--static", FLAG, None, "static equilibrium in place of a motion"),
+        ("--load-steps", load_steps, "N", "of --static (default 10); auto: the whole load at once, halved where it is "
+         "refused"),
+        ("--stabilise", FLAG, None, "of --static: springs that fade with the load, for bodies that only contact holds"),
+        ("--unstable", UNSTABLE_CHOICES, None, "of --static: warn of an unstable equilibrium (default), refuse it, or "
+         "do not judge it"),
+    )  # fmt: skip
+    add_options(
+        to.add_argument_group("output (existing files are replaced once the new one is whole)"),
+        ("--usd", ONCE, "FILE", "animation (.usdc, .usda) with stress and displacement; validated"),
+        ("--vtu", ONCE, "FOLDER", "series of .vtu and a .pvd for ParaView"),
+        ("--png", ONCE, "FILE", "picture"),
+        ("--png-time", float, "S", "time of the picture"),
+        ("--gif", ONCE, "FILE", "animation"),
+        *PICTURE_OPTIONS,
+        ("--fps", positive_number, "N", "frames per simulated second of --usd and --vtu"),
+        ("--speed", positive_number, "X", "simulated seconds per second of --gif"),
+        ("--json", ONCE, "FILE", "summary of the run; - for stdout"),
+        ("--checkpoint", ONCE, "FILE", "state (.npz), written every --every steps and at the end"),
+        ("--every", positive_integer, "N", "steps between checkpoints (default 100)"),
+        ("--resume", None, "FILE", "go on from a checkpoint, with its integrator and precision, and without --dt its "
+         "dt; a file of --usd or a series of --vtu that is there goes on too, if it ends where the checkpoint is"),
+    )  # fmt: skip
+    finish_command(to, ".run", "run")
 
 
-def _add_picture_options(to: Any) -> None:
-    """Options of pictures."""
-    to.add_argument(
-        "--field",
-        metavar="NAME",
-        help="field in colour: von_mises (default), displacement, J, strain_energy_density, contact_pressure, gap, or "
-        "none",
-    )
-    to.add_argument("--view", type=number_pair, metavar="AZIMUTH,ELEVATION", help="of the camera, degrees")
-    to.add_argument("--range", type=color_range, metavar="LOW,HIGH", help="of the colours, SI units")
+PICTURE_OPTIONS = (
+    ("--field", None, "NAME", "field in colour: von_mises (default), displacement, J, strain_energy_density, "
+     "contact_pressure, gap, or none"),
+    ("--view", number_pair, "AZIMUTH,ELEVATION", "of the camera, degrees"),
+    ("--range", color_range, "LOW,HIGH", "of the colours, SI units"),
+)  # fmt: skip
 
 
 def _add_scenes(commands: Any) -> None:
     to = commands.add_parser("scenes", help="list scenes, or the parameters of one", description="List scenes.")
     to.add_argument("what", nargs="?", metavar="SCENE", help="a scene, file.py or file.py:scene: show its parameters")
-    add_general_options(to)
-    to.set_defaults(command=lazy_command("show", "scenes"))
+    finish_command(to, ".show", "scenes")
 
 
 def _add_info(commands: Any) -> None:
@@ -265,9 +219,8 @@ def _add_info(commands: Any) -> None:
         "Of a mesh its groups and size, with --material also what it costs.",
     )
     _add_model_options(to)
-    to.add_argument("--json", metavar="FILE", help="the same as JSON; - for stdout")
-    add_general_options(to)
-    to.set_defaults(command=lazy_command("show", "info"))
+    add_options(to, ("--json", None, "FILE", "the same as JSON; - for stdout"))
+    finish_command(to, ".show", "info")
 
 
 def _add_render(commands: Any) -> None:
@@ -280,14 +233,12 @@ def _add_render(commands: Any) -> None:
     )
     to.add_argument("file", help="the USD file")
     to.add_argument("-o", "--output", required=True, metavar="FILE", help="picture (.png) or animation (.gif)")
-    to.add_argument("--time", type=float, metavar="S", help="time of a .png (default: the last)")
-    _add_picture_options(to)
-    to.add_argument("--size", type=size, metavar="WxH", help="pixels")
-    to.add_argument(
-        "--fps", type=positive_number, default=20.0, metavar="N", help="frames per second of a .gif (default 20)"
+    add_options(
+        to,
+        ("--time", float, "S", "time of a .png (default: the last)"),
+        *PICTURE_OPTIONS,
+        ("--size", size, "WxH", "pixels"),
+        ("--fps", positive_number, "N", "frames per second of a .gif (default 20)", 20.0),
+        ("--speed", positive_number, "X", "simulated seconds per second of a .gif", 1.0),
     )
-    to.add_argument(
-        "--speed", type=positive_number, default=1.0, metavar="X", help="simulated seconds per second of a .gif"
-    )
-    add_general_options(to)
-    to.set_defaults(command=lazy_command("show", "render"))
+    finish_command(to, ".show", "render")

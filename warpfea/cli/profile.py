@@ -22,32 +22,10 @@ __all__ = ["JSON_KEYS", "SCHEMA", "profile"]
 
 SCHEMA = 1
 JSON_KEYS = (
-    "schema",
-    "scene",
-    "parameters",
-    "device",
-    "dtype",
-    "dt",
-    "integrator",
-    "elements",
-    "unknowns",
-    "warm_up",
-    "steps",
-    "step_ms",
-    "kernels_ms",
-    "between_ms",
-    "newton_per_step",
-    "pcg_per_step",
-    "launches_per_step",
-    "bytes_per_step",
-    "copy_GBps",
-    "empty_launch_us",
-    "compile_s",
-    "parts",
-    "kernels",
-    "machine",
-    "versions",
-)
+    "schema", "scene", "parameters", "device", "dtype", "dt", "integrator", "elements", "unknowns", "warm_up", "steps",
+    "step_ms", "kernels_ms", "between_ms", "newton_per_step", "pcg_per_step", "launches_per_step", "bytes_per_step",
+    "copy_GBps", "empty_launch_us", "compile_s", "parts", "kernels", "machine", "versions",
+)  # fmt: skip
 MAX_KERNEL_ROWS = 15
 """Maximum number of kernels listed one by one."""
 

@@ -122,22 +122,20 @@ def check_targets(options: argparse.Namespace) -> None:
         check_folder(folder if folder.is_dir() else folder.parent, folder)
 
 
+STATIC_ONLY = ("load_steps", "stabilise", "unstable")
 MOTION_ONLY = ("t_end", "dt", "error", "integrator", "png_time", "checkpoint", "resume")
 
 
 def _check_analysis(options: argparse.Namespace) -> None:
     """UsageError for options of dynamics with --static, or the reverse."""
     if not options.static:
-        if options.load_steps:
-            raise UsageError("--load-steps is for --static")
-        if options.stabilise:
-            raise UsageError("--stabilise is for --static")
-        if options.unstable:
-            raise UsageError("--unstable is for --static")
+        for name in STATIC_ONLY:
+            if getattr(options, name):
+                raise UsageError(f"--{name.replace('_', '-')} is for --static")
         return
-    given = [name for name in MOTION_ONLY if getattr(options, name) is not None]
-    if given:
-        raise UsageError(f"--{given[0].replace('_', '-')} is for a motion; --static finds the equilibrium at full load")
+    for name in MOTION_ONLY:
+        if getattr(options, name) is not None:
+            raise UsageError(f"--{name.replace('_', '-')} is for a motion; --static finds the equilibrium at full load")
     if options.solver != "newton-pcg":
         raise UsageError(f"--solver {options.solver} is for a motion; --static needs newton-pcg")
 

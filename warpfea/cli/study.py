@@ -1,4 +1,4 @@
-"""`warpfea study`: studies of scenes, and `measuring.STUDIES`."""
+"""`warpfea study`: studies of scenes, and `measuring.STUDIES`; `warpfea stress`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ..studies.accuracy.study import study as measure
 from . import DONE, NOT_CONVERGED
 from .source import find_scene, show_progress
 
-__all__ = ["accuracy", "study"]
+__all__ = ["accuracy", "stress", "study"]
 
 SHARED_OPTIONS = ("reference", "mesh", "measure", "target", "split", "repeat", "limit", "out", "name", "what", "words")
 """Fields of StudyOptions that are options of the command line."""
@@ -50,3 +50,10 @@ def accuracy(options: argparse.Namespace) -> int:
     if not options.quiet:
         print(result.table(), flush=True)
     return NOT_CONVERGED if options.target is not None and result.answer is None else DONE
+
+
+def stress(options: argparse.Namespace) -> int:
+    """Run `warpfea stress`; 3 if a row fails its criterion."""
+    from ..studies.stress import suite
+
+    return DONE if suite.stress(options) else NOT_CONVERGED

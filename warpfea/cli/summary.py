@@ -21,40 +21,11 @@ __all__ = ["SCHEMA", "SUMMARY_KEYS", "box_text", "mass_text", "model_box", "summ
 
 SCHEMA = 1
 SUMMARY_KEYS = (
-    "schema",
-    "scene",
-    "analysis",
-    "parameters",
-    "device",
-    "dtype",
-    "dt",
-    "t_end",
-    "load",
-    "steps",
-    "substeps",
-    "status",
-    "wall_s",
-    "compile_s",
-    "setup_s",
-    "solve_s",
-    "output_s",
-    "newton_iterations",
-    "pcg_iterations",
-    "max_residual",
-    "min_J",
-    "rough_steps",
-    "floored_steps",
-    "max_floor",
-    "mass",
-    "bounding_box",
-    "energies",
-    "probes",
-    "violation",
-    "versions",
-    "left_out",
-    "contacts",
-    "stable",
-)
+    "schema", "scene", "analysis", "parameters", "device", "dtype", "dt", "t_end", "load", "steps", "substeps",
+    "status", "wall_s", "compile_s", "setup_s", "solve_s", "output_s", "newton_iterations", "pcg_iterations",
+    "max_residual", "min_J", "rough_steps", "floored_steps", "max_floor", "mass", "bounding_box", "energies", "probes",
+    "violation", "versions", "left_out", "contacts", "stable",
+)  # fmt: skip
 MAX_ROWS = 12
 """Maximum number of joints and contacts listed one by one."""
 SHOWN_ROWS = 4
