@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import copy
 import inspect
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from .base.checks import number_hint
+from .base.checks import is_number, number_hint
 from .base.errors import ModelError
 from .base.names import did_you_mean
 from .base.renamed import check_members
@@ -38,18 +37,17 @@ DENSITY_CONSTANTS = ("density", "density_factor")
 """Constants of the mass: the density if it is one number, else a factor on the given one."""
 
 
-def _positive(owner: str, **values: float) -> None:
+def _check_constants(owner: str, **values: Any) -> None:
+    """ModelError for a constant outside its range."""
     for name, value in values.items():
-        if not (isinstance(value, (int, float, np.floating)) and math.isfinite(value) and value > 0.0):
-            raise ModelError(f"{owner}: {name} = {value!r} must be a positive finite number{number_hint(value)}")
-
-
-def _non_negative(owner: str, **values: float) -> None:
-    for name, value in values.items():
-        if not (isinstance(value, (int, float, np.floating)) and math.isfinite(value) and value >= 0.0):
-            raise ModelError(
-                f"{owner}: {name} = {value!r} must be a finite number that is not negative{number_hint(value)}"
-            )
+        if name == "nu":
+            good, text = is_number(value) and -1.0 < value < 0.5, "lie between -1 and 0.5, both excluded"
+        elif name in ("mu01", "eta", "lambda_v"):
+            good, text = is_number(value) and value >= 0.0, "be a finite number that is not negative"
+        else:
+            good, text = is_number(value) and value > 0.0, "be a positive finite number"
+        if not good:
+            raise ModelError(f"{owner}: {name} = {value!r} must {text}{number_hint(value)}")
 
 
 def _check_density(owner: str, density: Density) -> None:
@@ -64,16 +62,6 @@ def _check_density(owner: str, density: Density) -> None:
             f"{owner}: density = {density!r} must be positive (kg/m^3): a number, one per element, or f(X)"
             f"{number_hint(density)}"
         )
-
-
-def _check_damping(owner: str, damping: Any) -> None:
-    if damping is not None and not isinstance(damping, KelvinVoigt):
-        raise ModelError(f"{owner}: damping = {damping!r} must be a KelvinVoigt(eta, lambda_v), or None")
-
-
-def _check_nu(owner: str, nu: float) -> None:
-    if not (isinstance(nu, (int, float, np.floating)) and -1.0 < nu < 0.5):
-        raise ModelError(f"{owner}: nu = {nu!r} must lie between -1 and 0.5, both excluded{number_hint(nu)}")
 
 
 @dataclass(frozen=True)
@@ -96,7 +84,7 @@ class KelvinVoigt:
     form: str = "incremental"
 
     def __post_init__(self) -> None:
-        _non_negative("KelvinVoigt", eta=self.eta, lambda_v=self.lambda_v)
+        _check_constants("KelvinVoigt", eta=self.eta, lambda_v=self.lambda_v)
         if self.form not in DAMPING_FORMS:
             hint = did_you_mean(self.form, DAMPING_FORMS)
             raise ModelError(f"KelvinVoigt: form = {self.form!r} is none of 'incremental', 'rate', 'explicit'{hint}")
@@ -135,14 +123,19 @@ class Material:
         row = known[: kinds.count(inspect.Parameter.POSITIONAL_OR_KEYWORD) - 1]
         odd = [name for name in options if name not in known and inspect.Parameter.VAR_KEYWORD not in kinds]
         if odd or (len(values) > len(row) and inspect.Parameter.VAR_POSITIONAL not in kinds):
-            what = (
-                f"{odd[0]!r} is unknown"
-                if odd
-                else f"{len(values)} values without names, such as density=, are too many"
-            )
-            hint = did_you_mean(odd[0], known) if odd else ""
+            what, hint = f"{len(values)} values without names, such as density=, are too many", ""
+            if odd:
+                what, hint = f"{odd[0]!r} is unknown", did_you_mean(odd[0], known)
             raise ModelError(f"{cls.__name__}: {what}; it takes {', '.join(known)}{hint}")
         return super().__new__(cls)
+
+    def _check(self) -> None:
+        """ModelError for constants, density or damping out of range."""
+        owner = type(self).__name__
+        _check_constants(owner, **{name: getattr(self, name) for name in self.constant_names})
+        _check_density(owner, self.density)
+        if self.damping is not None and not isinstance(self.damping, KelvinVoigt):
+            raise ModelError(f"{owner}: damping = {self.damping!r} must be a KelvinVoigt(eta, lambda_v), or None")
 
     @property
     def constants(self) -> dict[str, float]:
@@ -178,6 +171,7 @@ class Material:
         cls, E: float, nu: float, *, density: Any, damping: KelvinVoigt | None, **options: float
     ) -> Self:
         """Material from E and nu at rest, which it stores."""
+        _check_constants(cls.__name__, E=E, nu=nu)
         out = cls(**cls._constants_from_E_nu(E, nu, **options), density=density, damping=damping)
         vars(out).update(_given_constants={"E": E, "nu": nu}, _options=options)
         return out
@@ -222,10 +216,7 @@ class SVK(Material):
     constant_names: ClassVar[tuple[str, ...]] = ("E", "nu")
 
     def __post_init__(self) -> None:
-        _positive("SVK", E=self.E)
-        _check_nu("SVK", self.nu)
-        _check_density("SVK", self.density)
-        _check_damping("SVK", self.damping)
+        self._check()
 
     @classmethod
     def from_E_nu(cls, *, E: float, nu: float, density: Any = None, damping: KelvinVoigt | None = None) -> SVK:
@@ -263,18 +254,13 @@ class MooneyRivlin(Material):
     constant_names: ClassVar[tuple[str, ...]] = ("mu10", "mu01", "k")
 
     def __post_init__(self) -> None:
-        _positive("MooneyRivlin", k=self.k, mu10=self.mu10)
-        _non_negative("MooneyRivlin", mu01=self.mu01)
-        _check_density("MooneyRivlin", self.density)
-        _check_damping("MooneyRivlin", self.damping)
+        self._check()
 
     @classmethod
     def from_E_nu(
         cls, *, E: float, nu: float, density: Any = None, damping: KelvinVoigt | None = None, ratio: float = 0.25
     ) -> MooneyRivlin:
         """From Young's modulus and Poisson's ratio at rest; `ratio` = mu01 / (mu10 + mu01)."""
-        _positive("MooneyRivlin", E=E)
-        _check_nu("MooneyRivlin", nu)
         if not 0.0 <= ratio < 1.0:
             raise ModelError(f"MooneyRivlin: ratio = {ratio!r} must lie in [0, 1)")
         return cls._create_from_E_nu(E, nu, ratio=ratio, density=density, damping=damping)
@@ -312,15 +298,11 @@ class NeoHookean(Material):
     constant_names: ClassVar[tuple[str, ...]] = ("mu", "k")
 
     def __post_init__(self) -> None:
-        _positive("NeoHookean", mu=self.mu, k=self.k)
-        _check_density("NeoHookean", self.density)
-        _check_damping("NeoHookean", self.damping)
+        self._check()
 
     @classmethod
     def from_E_nu(cls, *, E: float, nu: float, density: Any = None, damping: KelvinVoigt | None = None) -> NeoHookean:
         """From Young's modulus and Poisson's ratio at rest."""
-        _positive("NeoHookean", E=E)
-        _check_nu("NeoHookean", nu)
         return cls._create_from_E_nu(E, nu, density=density, damping=damping)
 
     @staticmethod

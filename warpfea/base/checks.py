@@ -8,7 +8,9 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["is_count", "is_number", "number_hint"]
+from .errors import ModelError
+
+__all__ = ["check_positive", "is_count", "is_number", "number_hint", "number_pair"]
 
 UNIT_FACTORS = {
     **dict.fromkeys(("", "s", "m", "Pa", "N", "kg", "kg/m^3", "kg/m3"), 1.0),
@@ -22,16 +24,29 @@ UNIT_FACTORS = {
 
 def is_number(value: Any) -> bool:
     """A finite number."""
-    return (
-        isinstance(value, (int, float, np.integer, np.floating))
-        and not isinstance(value, bool)
-        and math.isfinite(value)
-    )
+    number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+    return number and math.isfinite(value)
 
 
 def is_count(value: Any) -> bool:
     """A whole number."""
     return is_number(value) and value == int(value)
+
+
+def check_positive(owner: str, **values: Any) -> None:
+    """ModelError for a value that is no positive finite number."""
+    for name, value in values.items():
+        if not (is_number(value) and value > 0.0):
+            raise ModelError(f"{owner}: {name} = {value!r} must be a positive finite number{number_hint(value)}")
+
+
+def number_pair(values: Any) -> tuple[float, float]:
+    """Two numbers; nan for anything else."""
+    try:
+        first, second = map(float, values)
+    except (TypeError, ValueError):
+        return math.nan, math.nan
+    return first, second
 
 
 def number_hint(value: Any) -> str:

@@ -2,27 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 __all__ = [
-    "CapacityError",
-    "CheckpointError",
-    "ConstraintError",
-    "ConvergenceError",
-    "Error",
-    "MeshError",
-    "MeshWarning",
-    "ModelError",
-    "ModelWarning",
-    "OutputError",
-    "PenetrationError",
-    "StabilityError",
-    "StabilityWarning",
-]
+    "CapacityError", "CheckpointError", "ConstraintError", "ConvergenceError", "Error", "MeshError", "MeshWarning",
+    "ModelError", "ModelWarning", "OutputError", "PenetrationError", "StabilityError", "StabilityWarning",
+]  # fmt: skip
 
 
 class Error(Exception):
-    """Base class of all errors raised by warpfea."""
+    """Base class of all errors raised by warpfea; `details` are values of attributes that its class declares."""
+
+    def __init__(self, message: str = "", **details: Any) -> None:
+        super().__init__(message)
+        for name, value in details.items():
+            getattr(self, name)  # AttributeError for an unknown one
+            setattr(self, name, value)
 
 
 class MeshError(Error):
@@ -52,22 +48,11 @@ class ConstraintError(Error):
         state: the state before the refused step; None if there is none.
     """
 
-    def __init__(
-        self,
-        message: str,
-        *,
-        joints: list[str] | None = None,
-        violations: list[float] | None = None,
-        time: float = 0.0,
-        world: int = 0,
-        state: Any = None,
-    ) -> None:
-        super().__init__(message)
-        self.joints = joints or []
-        self.violations = violations or []
-        self.time = time
-        self.world = world
-        self.state = state
+    joints: Sequence[str] = ()
+    violations: Sequence[float] = ()
+    time: float = 0.0
+    world: int = 0
+    state: Any = None
 
 
 class CapacityError(Error):
@@ -79,11 +64,9 @@ class CapacityError(Error):
         worlds: largest number of worlds that fits; 0 if unknown.
     """
 
-    def __init__(self, message: str, *, bytes: int = 0, per_world: int = 0, worlds: int = 0) -> None:
-        super().__init__(message)
-        self.bytes = bytes
-        self.per_world = per_world
-        self.worlds = worlds
+    bytes: int = 0
+    per_world: int = 0
+    worlds: int = 0
 
 
 class CheckpointError(Error):
@@ -105,22 +88,11 @@ class ConvergenceError(Error):
         state: the state before the refused step.
     """
 
-    def __init__(
-        self,
-        message: str,
-        *,
-        time: float = 0.0,
-        world: int = 0,
-        residuals: list[float] | None = None,
-        element: int = -1,
-        state: Any = None,
-    ) -> None:
-        super().__init__(message)
-        self.time = time
-        self.world = world
-        self.residuals = residuals or []
-        self.element = element
-        self.state = state
+    time: float = 0.0
+    world: int = 0
+    residuals: Sequence[float] = ()
+    element: int = -1
+    state: Any = None
 
 
 class PenetrationError(ConvergenceError):

@@ -24,7 +24,7 @@ class Output:
     older target file. A writer may be reopened after either.
 
     Adaptive steps end where a frame is due: `rate` is frames per simulated second, None without a rate; `output_times`
-    are single times, s.
+    are single times, s. By default `open`, `close` and `abort` do nothing.
     """
 
     rate: float | None = None
@@ -37,7 +37,6 @@ class Output:
 
     def open(self, sim: Any) -> None:
         """Check the target and start. OutputError if the target can't be written."""
-        raise NotImplementedError
 
     def write(self, sim: Any) -> None:
         """Write the current state if a frame is due."""
@@ -45,11 +44,9 @@ class Output:
 
     def close(self, sim: Any) -> None:
         """Finish; the target is complete and valid afterwards. OutputError otherwise."""
-        raise NotImplementedError
 
     def abort(self) -> None:
         """Remove temporary files; no effect if not open."""
-        raise NotImplementedError
 
 
 _counter = itertools.count()

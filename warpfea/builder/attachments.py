@@ -94,10 +94,8 @@ class Attachment:
         """0 for a direction carried by the section, director or solid, 1 for others; 10: not known."""
         if self.body is None:
             return 0.0
-        return float(
-            np.linalg.norm(self.weak_directions @ n)
-            + UNKNOWN_WEAKNESS * (np.linalg.norm(n - self.known_directions @ n) > 1e-6)
-        )
+        unknown = np.linalg.norm(n - self.known_directions @ n) > 1e-6
+        return float(np.linalg.norm(self.weak_directions @ n) + UNKNOWN_WEAKNESS * unknown)
 
     @property
     def size(self) -> float:
@@ -109,39 +107,30 @@ class Attachment:
 
     def coincides_with(self, other: Attachment) -> bool:
         """True if both are the same point of the same body."""
-        return (
-            self.body is not None
-            and self.body is other.body
-            and np.array_equal(self.slots, other.slots)
-            and np.array_equal(self.weights, other.weights)
-        )
+        same = np.array_equal(self.slots, other.slots) and np.array_equal(self.weights, other.weights)
+        return same and self.body is not None and self.body is other.body
 
 
 def make_attachment(thing: Any, what: str, *, child: bool) -> Attachment:
     """Attachment of a handle, or of a fixed point (3,). ModelError for anything else."""
-    all_known, none_weak = np.eye(3), np.zeros((3, 3))
+    no_slots = np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 3))
     if isinstance(thing, Ground):
-        return Attachment(None, np.full(3, np.nan), *_empty_support(), all_known, none_weak, "the ground", child)
+        return Attachment(None, np.full(3, np.nan), *no_slots, np.eye(3), np.zeros((3, 3)), "the ground", child)
     if isinstance(thing, MaterialPoint):
         label = f"the point {np.round(thing.X, 6).tolist()} of body {thing.body.name!r}"
         weak = _weak_projector(thing.body, thing.axes)
-        return Attachment(
-            thing.body, thing.X, thing.slots, thing.weights, thing.gradients, all_known, weak, label, child
-        )
+        motion = thing.slots, thing.weights, thing.gradients
+        return Attachment(thing.body, thing.X, *motion, np.eye(3), weak, label, child)
     if isinstance(thing, NodeSet):
         return _node_attachment(thing, child)
     if isinstance(thing, SurfaceSet):
         return _surface_attachment(thing, child)
     if isinstance(thing, (tuple, list, np.ndarray)):
-        return Attachment(None, vector(thing, what), *_empty_support(), all_known, none_weak, "a fixed point", child)
+        return Attachment(None, vector(thing, what), *no_slots, np.eye(3), np.zeros((3, 3)), "a fixed point", child)
     raise ModelError(
         f"{what}: expected wf.GROUND, body.at(X), body.nodes(...), body.surface(...), beam.start or beam.end, got "
         f"{thing!r}"
     )
-
-
-def _empty_support() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    return np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 3))
 
 
 def _weak_projector(body: Discretisation, axes: np.ndarray) -> np.ndarray:

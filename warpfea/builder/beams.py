@@ -95,17 +95,11 @@ def beam_geometry(
     axis_curve = _make_curve(name, curve, int(elements), corners)
     s = _node_parameters(name, int(elements), axis_curve.corner_parameters)
     points = np.array([axis_curve.position(k) for k in s])
-    ends = [
-        (axis_curve.derivative(a, 1) * (b - a), axis_curve.derivative(b, -1) * (b - a))
-        for a, b in itertools.pairwise(s)
-    ]
+    slope = axis_curve.derivative
+    ends = [(slope(a, 1) * (b - a), slope(b, -1) * (b - a)) for a, b in itertools.pairwise(s)]
     _check_turning_angles(name, s, ends, axis_curve.turning_angles, sharp_allowed=bool(axis_curve.corner_parameters))
-    frames = np.array(
-        [
-            [_section_frame(name, x, k, section, normal) for x, k in zip(pair, s[e : e + 2])]
-            for e, pair in enumerate(ends)
-        ]
-    )
+    tangents = [(x, k) for e, pair in enumerate(ends) for x, k in zip(pair, s[e : e + 2])]
+    frames = np.array([_section_frame(name, x, k, section, normal) for x, k in tangents]).reshape(-1, 2, 3, 3)
     axes = np.concatenate([frames[:, 0], frames[-1:, 1]])
     axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
     cells = np.column_stack([np.arange(elements), np.arange(elements) + 1])
@@ -115,12 +109,7 @@ def beam_geometry(
 
 
 def _check_turning_angles(
-    name: str,
-    s: np.ndarray,
-    ends: list[tuple[np.ndarray, np.ndarray]],
-    along: np.ndarray | None,
-    *,
-    sharp_allowed: bool,
+    name: str, s: np.ndarray, ends: list[tuple[Any, Any]], along: np.ndarray | None, *, sharp_allowed: bool
 ) -> None:
     """Refuse elements that turn too far for a cubic, and kinks between elements."""
     turns = np.array([float(_angles_between(np.array(pair))[0]) for pair in ends])

@@ -21,17 +21,9 @@ from ..model.handles import ElementSet, MaterialPoint, NodeSet, SurfaceSet
 from ..time_laws import Control, TimeLaw, time_law
 
 __all__ = [
-    "COMPONENT_INDEX",
-    "assign_materials",
-    "body_of_handle",
-    "check_densities",
-    "component_mask",
-    "nodal_vectors",
-    "parse_gravity",
-    "slot_field",
-    "vector",
-    "warn_implausible",
-]
+    "COMPONENT_INDEX", "assign_materials", "body_of_handle", "check_densities", "component_mask", "nodal_vectors",
+    "parse_gravity", "slot_field", "vector", "warn_implausible",
+]  # fmt: skip
 
 COMPONENT_INDEX = {"x": 0, "y": 1, "z": 2}
 SIZE_RANGE = (1e-6, 1e3)
@@ -90,18 +82,16 @@ def parse_gravity(value: Any) -> tuple[np.ndarray, TimeLaw | None]:
 
 def check_densities(d: Description) -> None:
     """Raise ModelError for gravity or a body force on a material without density."""
-    bodies, forces = d.bodies, d.body_forces
     if np.any(d.gravity) or d.gravity_law is not None:
-        require_density(bodies, "gravity, and by any motion")  # no hint "or gravity=(0, 0, 0)"
-    for force in forces:
+        require_density(d.bodies, "gravity, and by any motion")  # no hint "or gravity=(0, 0, 0)"
+    for force in d.body_forces:
         require_density(force.bodies, "add_body_force")
 
 
 def warn_implausible(model: Any) -> None:
     """Warn (MeshWarning) of a size, mass or density that suggests a wrong unit."""
     for body in model.bodies:
-        _warn_of_densities(body)
-        _warn_of_moduli(body)
+        _warn_of_materials(body)
         low, high = body.mesh.bounding_box()
         size = float(np.max(high - low))
         mass = None
@@ -120,46 +110,30 @@ def warn_implausible(model: Any) -> None:
         warnings.warn(f"body {body.name!r} {what}: {hint}", MeshWarning, stacklevel=3)
 
 
-def _warn_of_moduli(body: Body) -> None:
-    """Warn of a metal with E probably in MPa, and of volumetric locking of solids."""
+def _warn_of_materials(body: Body) -> None:
+    """Warn of densities in another unit, a metal with E probably in MPa, and of volumetric locking of solids."""
     for group, material in body.materials:
         law = type(material).__name__ + (f" of group {group!r}" if group else "")
         lam, mu = material.lame
         E, nu = mu * (3.0 * lam + 2.0 * mu) / (lam + mu), lam / (2.0 * (lam + mu))
-        dense = material.density is not None and not callable(material.density)
-        if dense and E < MIN_METAL_E and (low := float(np.min(material.density))) > METAL_DENSITY:
-            speed = math.sqrt(E / low)
-            warnings.warn(
-                f"body {body.name!r}: {law} with E = {E:.3g} Pa and {low:.4g} kg/m^3: implausible wave speed "
-                f"{speed:.2g} m/s for a metal: is E given in MPa? Steel is E=2.1e11, density=7850",
-                ModelWarning,
-                stacklevel=4,
+        given = material.density
+        low = math.inf if given is None else float(np.min(given(body.mesh.points) if callable(given) else given))
+        found: list[tuple[str, type[Warning]]] = []
+        if low < (FOAM_DENSITY if E > MAX_FOAM_E else MIN_DENSITY):
+            text = f"the density of {law} is {low:.3g} kg/m^3. Is it in another unit? Steel has 7850"
+            found.append((text, MeshWarning))
+        if E < MIN_METAL_E and METAL_DENSITY < low < math.inf and not callable(given):
+            text = (
+                f"{law} with E = {E:.3g} Pa and {low:.4g} kg/m^3: implausible wave speed {math.sqrt(E / low):.2g} m/s "
             )
+            found.append((f"{text}for a metal: is E given in MPa? Steel is E=2.1e11, density=7850", ModelWarning))
         if body.family.solid and nu > MAX_NU:
-            warnings.warn(
-                f"body {body.name!r}: {law} with nu = {nu:.6g}: volumetric locking above {MAX_NU}: use nu=0.49, "
-                "or refine the mesh until the result is stable",
-                ModelWarning,
-                stacklevel=4,
+            text = (
+                f"{law} with nu = {nu:.6g}: volumetric locking above {MAX_NU}: use nu=0.49, or refine the mesh until "
             )
-
-
-def _warn_of_densities(body: Body) -> None:
-    for group, material in body.materials:
-        if material.density is None:
-            continue
-        values = material.density(body.mesh.points) if callable(material.density) else material.density
-        low = float(np.min(values))
-        lam, mu = material.lame
-        stiff = mu * (3.0 * lam + 2.0 * mu) / (lam + mu) > MAX_FOAM_E
-        if low >= (FOAM_DENSITY if stiff else MIN_DENSITY):
-            continue
-        law = type(material).__name__ + (f" of group {group!r}" if group else "")
-        warnings.warn(
-            f"body {body.name!r}: the density of {law} is {low:.3g} kg/m^3. Is it in another unit? Steel has 7850",
-            MeshWarning,
-            stacklevel=4,
-        )
+            found.append((f"{text}the result is stable", ModelWarning))
+        for text, kind in found:
+            warnings.warn(f"body {body.name!r}: {text}", kind, stacklevel=4)
 
 
 def vector(value: Any, what: str) -> np.ndarray:
@@ -205,11 +179,8 @@ def slot_field(body: Body, values: Any, what: str) -> np.ndarray:
             node = body.slot_node[gradient]
             step = _node_cell_sizes(body.mesh)[node, None] / 256.0
             at, along = X[node], step * body.reference[gradient]
-            far, near = (
-                nodal_vectors(values(at + k * along), len(at), what)
-                - nodal_vectors(values(at - k * along), len(at), what)
-                for k in (2.0, 1.0)
-            )
+            moved = {k: nodal_vectors(values(at + k * along), len(at), what) for k in (-2.0, -1.0, 1.0, 2.0)}
+            far, near = moved[2.0] - moved[-2.0], moved[1.0] - moved[-1.0]
             out[gradient] = (8.0 * near - far) / (12.0 * step)
         return out
     if body.family.has_gradients and np.shape(values) != (3,):

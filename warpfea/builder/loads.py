@@ -17,26 +17,25 @@ from ..time_laws import time_law
 from .checks import slot_field, vector
 
 __all__ = [
-    "check_field",
-    "dead_traction",
-    "follower_pressure",
-    "moment_load",
-    "point_load",
-    "probe_at",
-    "set_initial_positions",
-    "set_initial_state",
-]
+    "check_field", "dead_traction", "follower_pressure", "moment_load", "point_load", "probe_at",
+    "set_initial_positions", "set_initial_state",
+]  # fmt: skip
 
 
 def point_load(body: Body, point: MaterialPoint | NodeSet, force: Any) -> DeadLoad:
     """See ModelBuilder.add_point_load."""
     law = time_law(force, f"point load on {body.name!r}")
     if isinstance(point, NodeSet):
-        slots = support_slots(point, "position")
-        weights = np.full(len(slots), 1.0 / len(slots))
+        slots, weights = _node_mean(point)
     else:
         slots, weights = point.slots, point.weights
     return DeadLoad(body, slots, weights, law, "point load")
+
+
+def _node_mean(nodes: NodeSet) -> tuple[np.ndarray, np.ndarray]:
+    """Slots and weights of the mean position of nodes."""
+    slots = support_slots(nodes, "position")
+    return slots, np.full(len(slots), 1.0 / len(slots))
 
 
 def moment_load(body: Body, point: MaterialPoint | NodeSet, moment: Any) -> Moment:
@@ -121,7 +120,6 @@ def probe_at(name: str, body: Body, where: MaterialPoint | SurfaceSet | NodeSet)
         slots, weights = surface_weights(where)
         weights = weights / weights[body.slot_kind[slots] == 0].sum()
     else:
-        slots = support_slots(where, "position")
-        weights = np.full(len(slots), 1.0 / len(slots))
+        slots, weights = _node_mean(where)
     X = weights @ (body.reference[slots] + (body.slot_kind[slots] == 0)[:, None] * body.origin)
     return Probe(name, body, slots, weights, X)

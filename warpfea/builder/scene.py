@@ -29,7 +29,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Generic, ParamSpec
 
-from ..base.checks import number_hint
+from ..base.checks import check_positive, number_hint
 from ..base.errors import ModelError
 from ..base.names import did_you_mean
 from ..base.usercode import convert_user_errors
@@ -82,29 +82,24 @@ class Scene(Generic[Params]):
         parameters: by name.
     """
 
-    def __init__(
-        self,
-        function: Callable[Params, ModelBuilder],
-        *,
-        dt: float,
-        t_end: float,
-        integrator: str = "backward_euler",
-        tol: float | None = None,
-        fps: float = 60.0,
-        speed: float = 1.0,
-        picture: float | None = None,
-        reference: Any = None,
-        field: Callable[[Any], Any] | None = None,
-    ) -> None:
-        for what, value in (("dt", dt), ("t_end", t_end), ("fps", fps), ("speed", speed)):
-            if not (isinstance(value, (int, float)) and math.isfinite(value) and value > 0.0):
-                raise ModelError(f"scene {function.__name__!r}: {what} = {value!r} must be a positive finite number")
+    dt: float
+    t_end: float
+    integrator: str
+    tol: float | None
+    fps: float
+    speed: float
+    picture: float | None
+    reference: Any
+    field: Callable[[Any], Any] | None
+
+    def __init__(self, function: Callable[Params, ModelBuilder], options: dict[str, Any]) -> None:
+        """Made by `scene`, of its options."""
         self.function = function
         functools.update_wrapper(self, function)
         self.name = function.__name__
-        self.dt, self.t_end, self.fps, self.speed = float(dt), float(t_end), float(fps), float(speed)
-        self.integrator, self.tol, self.picture = integrator, tol, picture
-        self.reference, self.field = reference, field
+        numbers = {name: options[name] for name in ("dt", "t_end", "fps", "speed")}
+        check_positive(f"scene {self.name!r}", **numbers)
+        vars(self).update(options | {name: float(value) for name, value in numbers.items()})
         text = inspect.getdoc(function) or ""
         self.description = text.split("\n\n")[0].replace("\n", " ").strip()
         self.details = text.partition("\n\n")[2].partition("Args:")[0].strip()
@@ -203,14 +198,8 @@ def scene(
     Raises:
         ModelError: a number that is not positive.
     """
-
-    def decorate(function: Callable[Params, ModelBuilder]) -> Scene[Params]:
-        return Scene(
-            function, dt=dt, t_end=t_end, integrator=integrator, tol=tol, fps=fps, speed=speed, picture=picture,
-            reference=reference, field=field,
-        )  # fmt: skip
-
-    return decorate
+    options = locals()
+    return lambda function: Scene(function, options)
 
 
 # finding scenes

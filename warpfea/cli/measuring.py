@@ -117,7 +117,7 @@ STUDIES: dict[str, tuple[str, tuple[str, ...], str]] = {
         "A finger of rubber is let go under gravity; scipy's differential evolution finds E and eta from the noisy "
         "record of its tip, a generation of candidates at a time, each a world of one model. An example of parameters "
         "per world, written for reading. Minutes on two cores.",
-    ),
+    )
 }
 """Studies other than those of scenes: name -> help, options, description; executed by `run` of cli/study.py."""
 _STUDY_OPTIONS: dict[str, tuple[Any, ...]] = {

@@ -17,7 +17,7 @@ from ..base.checks import number_hint
 from ..base.errors import Error, UsageError
 from ..base.names import did_you_mean
 from ..builder.builder import ModelBuilder
-from ..builder.scene import Scene
+from ..builder.scene import Scene, scene
 from ..model.bodies import Body
 from .arguments import existing_file, number_tuple
 from .parser import MATERIAL_HINT
@@ -66,7 +66,7 @@ def mesh_scene(options: argparse.Namespace) -> tuple[Scene[Any], dict[str, Any]]
     build.__doc__ = f"The mesh {path.name}."
     parameters = {name: getattr(options, name) for name in MESH_OPTIONS if name not in ("gravity", "up_axis", "scale")}
     parameters |= {"gravity": list(gravity), "up_axis": up, "scale": options.scale or 1.0}
-    return Scene(build, dt=1e-3, t_end=0.5, speed=0.2), parameters
+    return scene(dt=1e-3, t_end=0.5, speed=0.2)(build), parameters
 
 
 def mesh_facts(mesh: meshes.Mesh) -> dict[str, Any]:
@@ -143,10 +143,10 @@ def parse_material(text: str) -> tuple[str, materials.Material]:
         values[key] = value if key == "form" else _parse_number(where, key, value)
     damping = {key: values.pop(key) for key in DAMPING_PARAMETERS if key in values}
     make = _law_constructor(where, LAW_CLASSES[name], values)
+    if damping and "eta" not in damping:
+        raise UsageError(f"{where}: damping needs eta=")
     try:
-        return group, make(
-            **values, damping=materials.KelvinVoigt(**_check_damping(where, damping)) if damping else None
-        )
+        return group, make(**values, damping=materials.KelvinVoigt(**damping) if damping else None)
     except Error as error:
         raise UsageError(f"{where}: {error}") from None
 
@@ -164,12 +164,6 @@ def _parse_number(where: str, key: str, text: str) -> float:
     if not math.isfinite(value):
         raise UsageError(f"{where}: {key} = {text!r} is not a finite number{_number_hint(text)}")
     return value
-
-
-def _check_damping(where: str, values: dict[str, Any]) -> dict[str, Any]:
-    if "eta" not in values:
-        raise UsageError(f"{where}: damping needs eta=")
-    return values
 
 
 def _law_constructor(where: str, law: Any, values: dict[str, Any]) -> Callable[..., materials.Material]:

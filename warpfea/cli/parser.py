@@ -74,9 +74,7 @@ A scene file is Python:
 """
 
 
-LATER_COMMANDS = {
-    "sweep": "a sweep over parameters on many devices",
-}
+LATER_COMMANDS = {"sweep": "a sweep over parameters on many devices"}
 """Commands of a later version: not offered, but refused with an explanation."""
 MATERIAL_HINT = "e.g. svk:E=7e8,nu=0.33,density=2700"
 

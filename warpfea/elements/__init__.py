@@ -1,14 +1,7 @@
 """Element families as tables. A new family is a file here that calls `register` and is imported below."""
 
 from . import ancf_beam, ancf_shell, ancf_solid, lagrange
-from .family import (
-    EnergyPart,
-    Family,
-    families,
-    family_for_cell,
-    get_family,
-    register,
-)
+from .family import EnergyPart, Family, families, family_for_cell, get_family, register
 from .quadrature import TET_RULES, Rule
 
 __all__ = [

@@ -34,14 +34,7 @@ import numpy as np
 from ..base.errors import ModelError
 from ..materials import SVK, Material
 from .ancf import to_node_axes
-from .family import (
-    AssumedStrain,
-    EnergyPart,
-    Family,
-    ParentDomain,
-    VtkSubdivision,
-    register,
-)
+from .family import AssumedStrain, EnergyPart, Family, ParentDomain, VtkSubdivision, register
 from .quadrature import Rule, box_rule, square_rule
 
 if TYPE_CHECKING:

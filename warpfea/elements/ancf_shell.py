@@ -182,7 +182,7 @@ SHELL = register(
                 EnergyPart("surface", box_rule((4, 4, 2), PARENT_RANGES), _plane_stress_law, framed=True),
                 EnergyPart("thickness", SURFACE_RULE, _thickness_law, framed=True, tying=THICKNESS_TYING),
                 EnergyPart("shear", box_rule((4, 4, 2), PARENT_RANGES), _shear_law, tying=SHEAR_TYING),
-            ),
+            )
         },
         output_schemes={
             "thickness stress": (EnergyPart("thickness", CORNER_RULE, _thickness_output_law, framed=True),)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
+from ..base.checks import check_positive
 from ..base.errors import ModelError
 
 __all__ = ["Rectangle"]
@@ -34,12 +34,8 @@ class Rectangle:
     torsion: float | None = None
 
     def __post_init__(self) -> None:
-        for name in ("width", "height", "shear", "torsion"):
-            value = getattr(self, name)
-            if name == "torsion" and value is None:
-                continue
-            if not (isinstance(value, (int, float, np.floating)) and math.isfinite(value) and value > 0.0):
-                raise ModelError(f"Rectangle: {name} = {value!r} must be a positive finite number")
+        given = {name: value for name, value in vars(self).items() if name != "torsion" or value is not None}
+        check_positive("Rectangle", **given)
         if self.torsion_ratio > 1.0 + 1e-12:
             raise ModelError(f"Rectangle: torsion = {self.torsion!r} is above the polar moment {self.polar:.4g} m^4")
 

@@ -14,15 +14,7 @@ from .cells import CELL_TYPES, Ints, cell_dimension
 
 __all__ = ["read_inp"]
 
-_SOLID_CELLS = {
-    4: "tetra",
-    5: "pyramid",
-    6: "wedge",
-    8: "hexahedron",
-    10: "tetra10",
-    15: "wedge15",
-    20: "hexahedron20",
-}
+_SOLID_CELLS = {4: "tetra", 5: "pyramid", 6: "wedge", 8: "hexahedron", 10: "tetra10", 15: "wedge15", 20: "hexahedron20"}
 _SURFACE_CELLS = {3: "triangle", 4: "quad", 6: "triangle6", 8: "quad8", 9: "quad9"}
 _LINE_CELLS = {2: "line", 3: "line3"}
 _UNSUPPORTED_KEYWORDS = {"INCLUDE", "NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SYSTEM"}

@@ -7,14 +7,7 @@ import warnings
 import numpy as np
 
 from ..base.errors import MeshError, MeshWarning
-from .cells import (
-    CELL_TYPES,
-    CellType,
-    Floats,
-    Ints,
-    det_j0,
-    row_keys,
-)
+from .cells import CELL_TYPES, CellType, Floats, Ints, det_j0, row_keys
 from .mesh import Mesh
 
 __all__ = ["COINCIDENCE_TOL", "check", "check_topology", "check_volumes"]

@@ -14,15 +14,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from ..base.errors import MeshError
-from .arguments import (
-    PointMap,
-    cell_counts,
-    cell_type_of,
-    check_even,
-    finite_numbers,
-    map_points,
-    positive_numbers,
-)
+from .arguments import PointMap, cell_counts, cell_type_of, check_even, finite_numbers, map_points, positive_numbers
 from .cells import CELL_TYPES, Floats, Ints
 from .checks import check
 from .mesh import Mesh
@@ -115,12 +107,7 @@ def cylinder(
 
 
 def sphere(
-    radius: float,
-    *,
-    cells: int,
-    element: str = "T10",
-    center: Sequence[float] = (0.0, 0.0, 0.0),
-    name: str = "sphere",
+    radius: float, *, cells: int, element: str = "T10", center: Sequence[float] = (0.0, 0.0, 0.0), name: str = "sphere"
 ) -> Mesh:
     """A ball of ``radius`` about ``center`` (m), made of ``cells`` (even) cells across the diameter; 6 n^3
     elements.

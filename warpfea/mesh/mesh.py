@@ -11,14 +11,7 @@ import numpy as np
 
 from ..base.errors import MeshError
 from ..base.names import did_you_mean, listing
-from .cells import (
-    CELL_TYPES,
-    CellType,
-    Floats,
-    Ints,
-    element_volumes,
-    row_keys,
-)
+from .cells import CELL_TYPES, CellType, Floats, Ints, element_volumes, row_keys
 
 __all__ = ["Mesh", "Selection", "check_range", "transformation"]
 
@@ -81,11 +74,7 @@ class Mesh:
                 f"{self.cell_type}"
             )
         check_range(self.cells, len(self.points), f"{self.label}: cells")
-        limits = {
-            "node_sets": len(self.points),
-            "element_sets": len(self.cells),
-            "surface_sets": len(self.cells),
-        }
+        limits = {"node_sets": len(self.points), "element_sets": len(self.cells), "surface_sets": len(self.cells)}
         for attribute, limit in limits.items():
             sets = {str(key): _read_only_array(value, np.int64) for key, value in getattr(self, attribute).items()}
             for key, value in sets.items():

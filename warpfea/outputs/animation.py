@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from warpfea.base.writer import progress_bar, write_atomically
-from warpfea.outputs.colormap import map_colors
-from warpfea.outputs.obstacles import OBSTACLE_COLOR, clip_to_box
-from warpfea.outputs.raycaster import Camera, Image, Renderer, to_z_up
+from ..base.writer import progress_bar, write_atomically
+from .colormap import map_colors
+from .obstacles import OBSTACLE_COLOR, clip_to_box
+from .raycaster import Camera, Image, Renderer, to_z_up
 
 __all__ = ["Animation", "Frame"]
 
@@ -21,15 +21,8 @@ Floats = npt.NDArray[np.floating[Any]]
 _TEXT_COLOR = (45, 50, 60)
 _BODY_COLOR = (0.62, 0.66, 0.72)
 _BAR_WIDTH = 0.17  # width fraction of the colour bar
-_UNIT_PREFIXES = (
-    (1e9, "G"),
-    (1e6, "M"),
-    (1e3, "k"),
-    (1.0, ""),
-    (1e-3, "m"),
-    (1e-6, "u"),
-    (1e-9, "n"),
-)  # the font has no µ
+# the font has no µ
+_UNIT_PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, "u"), (1e-9, "n"))
 _LAST_FRAME_SECONDS = 0.6  # duration of the last frame, s
 
 
@@ -194,11 +187,8 @@ def draw_labels(image: Image, time: str, bar: tuple[float, float, str, str] | No
     if bar is None:
         return np.asarray(picture)
     low, high, title, units = bar
-    factor, prefix = (
-        next((p for p in _UNIT_PREFIXES if max(abs(low), abs(high)) >= 0.9995 * p[0]), (1.0, ""))
-        if units
-        else (1.0, "")
-    )
+    fits = (pair for pair in _UNIT_PREFIXES if units and max(abs(low), abs(high)) >= 0.9995 * pair[0])
+    factor, prefix = next(fits, (1.0, ""))
     left, right = round(width * (1.0 - 0.75 * _BAR_WIDTH)), round(width * (1.0 - 0.61 * _BAR_WIDTH))
     top, bottom = round(0.26 * height), round(0.80 * height)
     ramp = map_colors(np.linspace(1.0, 0.0, bottom - top), 0.0, 1.0 if high > low else 0.0)

@@ -14,19 +14,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from warpfea.base.checks import is_number
-from warpfea.base.errors import ModelError, OutputError
-from warpfea.outputs.obstacles import Obstacles, clip_to_box
+from ..base.checks import is_number, number_pair
+from ..base.errors import ModelError, OutputError
+from .obstacles import Obstacles, clip_to_box
 
-__all__ = [
-    "DrawnSurface",
-    "FrameClock",
-    "check_colors",
-    "check_fields",
-    "field_label",
-    "grid_offsets",
-    "is_static",
-]
+__all__ = ["DrawnSurface", "FrameClock", "check_colors", "check_fields", "field_label", "grid_offsets", "is_static"]
 
 Array = npt.NDArray[Any]
 
@@ -63,10 +55,7 @@ def check_colors(pair: Any) -> tuple[float, float] | None:
     """The colour range (low, high), or None. OutputError unless it is two finite rising numbers."""
     if pair is None:
         return None
-    try:
-        low, high = map(float, pair)
-    except (TypeError, ValueError):
-        low = high = np.nan
+    low, high = number_pair(pair)
     if not (np.isfinite(low) and np.isfinite(high) and low < high):
         raise OutputError(f"color_range must be two finite rising numbers, got {pair!r}")
     return low, high

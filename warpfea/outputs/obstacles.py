@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from warpfea.kernels.contact.collider_mesh import MESH
-from warpfea.model.shapes import BOX, CAPSULE, CYLINDER, HALF_SPACE
-from warpfea.outputs.normals import smooth_corners, vertex_normals
+from ..kernels.contact.collider_mesh import MESH
+from ..model.shapes import BOX, CAPSULE, CYLINDER, HALF_SPACE
+from .normals import smooth_corners, vertex_normals
 
 __all__ = ["OBSTACLE_COLOR", "PLANE_SIZE", "Obstacle", "Obstacles", "clip_to_box", "unique_names"]
 

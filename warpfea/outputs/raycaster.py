@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from warpfea.base.console import quiet_warp
-from warpfea.base.errors import ModelError, OutputError
-from warpfea.outputs.colormap import to_linear, to_srgb
-from warpfea.outputs.normals import scatter_rows, smooth_corners, unit_rows
+from ..base.checks import number_pair
+from ..base.console import quiet_warp
+from ..base.errors import ModelError, OutputError
+from .colormap import to_linear, to_srgb
+from .normals import scatter_rows, smooth_corners, unit_rows
 
 __all__ = ["DEFAULT_VIEW", "Camera", "Renderer", "check_view", "nice_number", "to_z_up"]
 
@@ -82,10 +83,7 @@ class Camera:
 
 def check_view(view: Any) -> tuple[float, float]:
     """(azimuth, elevation) degrees. ModelError unless it is two finite numbers, the elevation within +-90."""
-    try:
-        azimuth, elevation = map(float, view)
-    except (TypeError, ValueError):
-        azimuth = elevation = np.nan
+    azimuth, elevation = number_pair(view)
     if not (np.isfinite(azimuth) and abs(elevation) <= 90.0):
         raise ModelError(f"view must be (azimuth, elevation) in degrees, the elevation within +-90, got {view!r}")
     return azimuth, elevation
@@ -137,16 +135,8 @@ class Renderer:
         self._normal_groups: tuple[npt.NDArray[np.int64], int] | None = None
         self._mesh: Any = None
 
-    def to_z_up(self, points: Floats) -> npt.NDArray[np.float64]:
-        """Points (P, 3) as float64 in the frame with z up that cameras use."""
-        return to_z_up(points, self.up_axis)
-
     def render(
-        self,
-        points: Floats,
-        colors: Floats,
-        camera: Camera | None = None,
-        size: tuple[int, int] = (960, 540),
+        self, points: Floats, colors: Floats, camera: Camera | None = None, size: tuple[int, int] = (960, 540)
     ) -> Image:
         """A picture (height, width, 3) of points (P, 3) in metres with sRGB colours (P, 3) in [0, 1].
 
@@ -154,15 +144,15 @@ class Renderer:
         """
         import warp as wp
 
-        from warpfea.kernels.outputs import raycast
+        from ..kernels.outputs import raycast
 
-        points = self.to_z_up(points)
+        points = to_z_up(points, self.up_axis)
         if not np.isfinite(points).all() or self.triangles.max() >= len(points) or len(colors) != len(points):
             raise OutputError("points must be finite, as many as colours, and as many as triangles refer to")
         width, height = size
         camera = camera or Camera.framing(points, aspect=width / height)
         if self._normal_groups is None:
-            base = points if self._reference is None else self.to_z_up(self._reference)
+            base = points if self._reference is None else to_z_up(self._reference, self.up_axis)
             self._normal_groups = smooth_corners(base, self.triangles)
         unit = (points - camera.target) / camera.size
         with quiet_warp(), wp.ScopedDevice("cpu"):
@@ -240,9 +230,8 @@ class Renderer:
         return out.numpy()
 
 
-_SUBPIXELS = np.array(
-    [[(k + 0.5) / 8, ((5 * k + 2) % 8 + 0.5) / 8] for k in range(8)], dtype=np.float32
-)  # 8 rooks: one per row and column of an 8 x 8 raster
+# 8 rooks: one per row and column of an 8 x 8 raster
+_SUBPIXELS = np.array([[(k + 0.5) / 8, ((5 * k + 2) % 8 + 0.5) / 8] for k in range(8)], dtype=np.float32)
 
 
 def pixel_grid(width: int, height: int) -> npt.NDArray[np.float32]:
@@ -270,10 +259,8 @@ def cone_directions(axis: Floats, tangent: float, count: int) -> npt.NDArray[np.
     side /= np.linalg.norm(side)
     k = np.arange(count)
     radius, angle = tangent * np.sqrt((k + 0.5) / count), 2.399963 * k
-    directions = axis + radius[:, None] * (
-        np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * np.cross(axis, side)
-    )
-    return unit_rows(directions)
+    around = np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * np.cross(axis, side)
+    return unit_rows(axis + radius[:, None] * around)
 
 
 def nice_number(x: float) -> float:

@@ -13,22 +13,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from warpfea.base.checks import is_count, is_number
-from warpfea.base.errors import ModelError
-from warpfea.base.names import did_you_mean
-from warpfea.base.writer import Output, check_target
-from warpfea.outputs.animation import Animation, Frame
-from warpfea.outputs.frames import (
-    DrawnSurface,
-    FrameClock,
-    check_colors,
-    check_fields,
-    field_label,
-    frame_time,
-    is_static,
-)
-from warpfea.outputs.raycaster import DEFAULT_VIEW, Camera, Renderer, check_view
-from warpfea.outputs.usd_check import error_text
+from ..base.checks import is_count, is_number
+from ..base.errors import ModelError
+from ..base.names import did_you_mean
+from ..base.writer import Output, check_target
+from .animation import Animation, Frame
+from .frames import DrawnSurface, FrameClock, check_colors, check_fields, field_label, frame_time, is_static
+from .raycaster import DEFAULT_VIEW, Camera, Renderer, check_view
+from .usd_check import error_text
 
 __all__ = ["Camera", "GIFWriter", "PNGWriter", "Renderer", "render_usd"]
 
@@ -307,10 +299,7 @@ class _StageReader:
         if not self.metadata:
             raise ModelError(f"{path}: was not written by warpfea")
         self.rate = self.stage.GetTimeCodesPerSecond()
-        self.start, self.end = (
-            self.stage.GetStartTimeCode() / self.rate,
-            self.stage.GetEndTimeCode() / self.rate,
-        )
+        self.start, self.end = self.stage.GetStartTimeCode() / self.rate, self.stage.GetEndTimeCode() / self.rate
 
     def animation(self, field: str | None, times: Floats) -> Animation:
         """Frames at `times` (s); USD interpolates linearly between samples."""
@@ -336,19 +325,13 @@ class _StageReader:
         self.origin = 0.5 * (start[:body_points].min(axis=0) + start[:body_points].max(axis=0))
         reference = np.asarray(start - self.origin, dtype=np.float32)
         animation = Animation(np.concatenate(triangles), str(UsdGeom.GetStageUpAxis(self.stage)), reference)
-        animation.static, animation.body_points, animation.plane_squares = (
-            bool(self.metadata.get("static", False)),
-            body_points,
-            plane_squares,
-        )
+        animation.static = bool(self.metadata.get("static", False))
+        animation.body_points, animation.plane_squares = body_points, plane_squares
         if name is not None:
             field_metadata = self.metadata["fields"][name]
             pair = self.metadata["colorRange"] if name == self.metadata["color"] else field_metadata["range"]
-            animation.title, animation.units, animation.color_range = (
-                field_metadata["title"],
-                field_metadata["units"],
-                (pair[0], pair[1]),
-            )
+            animation.title, animation.units = field_metadata["title"], field_metadata["units"]
+            animation.color_range = pair[0], pair[1]
         for time in map(float, times):
             points = np.asarray(self._points(time) - self.origin, dtype=np.float32)
             animation.frames.append(Frame(time, points, self._values(name, time) if name else None))

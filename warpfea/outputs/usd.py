@@ -25,23 +25,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from warpfea.base.errors import ModelError, OutputError
-from warpfea.base.writer import Output, check_target, temporary_path
-from warpfea.outputs.colormap import map_colors
-from warpfea.outputs.frames import (
-    DrawnSurface,
-    FrameClock,
-    check_colors,
-    check_fields,
-    field_label,
-    frame_time,
-    is_static,
-)
-from warpfea.outputs.normals import vertex_normals
-from warpfea.outputs.obstacles import unique_names
-from warpfea.outputs.usd_check import error_text, validate_usd
-from warpfea.outputs.usd_extend import read_existing
-from warpfea.outputs.usd_obstacles import ObstaclePrims
+from ..base.errors import ModelError, OutputError
+from ..base.writer import Output, check_target, temporary_path
+from .colormap import map_colors
+from .frames import DrawnSurface, FrameClock, check_colors, check_fields, field_label, frame_time, is_static
+from .normals import vertex_normals
+from .obstacles import unique_names
+from .usd_check import error_text, validate_usd
+from .usd_extend import read_existing
+from .usd_obstacles import ObstaclePrims
 
 __all__ = ["SCHEMA", "USDWriter", "validate_usd"]
 
@@ -151,11 +143,8 @@ class USDWriter(Output):
         paths = [[f"/World/world_{world:04d}/{name}/skin" for world in worlds] for name in self._names()]
         wanted = {"fps": self.fps, "fields": self.fields, "color": self.color}
         existing = read_existing(target, stage, sim, self._surface, paths, wanted)
-        self._time_codes, self._bounding_box, self._surface.offsets = (
-            list(existing.codes),
-            existing.box,
-            existing.offsets,
-        )
+        self._time_codes, self._bounding_box = list(existing.codes), existing.box
+        self._surface.offsets = existing.offsets
         self._field_ranges = {name: existing.ranges[name] for name in self.fields}
         self._clock.due(existing.time)
         self._meshes: list[list[_MeshPrim]] = []
@@ -213,10 +202,8 @@ class USDWriter(Output):
                     values = {name: field[world] for name, field in fields.items()}
                     low, high = mesh.write(code, points[world], body.skin.triangles, values)
                     offset = self._surface.offsets[world]
-                    self._bounding_box = (
-                        np.minimum(self._bounding_box[0], low + offset),
-                        np.maximum(self._bounding_box[1], high + offset),
-                    )
+                    box = self._bounding_box
+                    self._bounding_box = np.minimum(box[0], low + offset), np.maximum(box[1], high + offset)
                 self._unsaved_bytes += points.shape[0] * points.shape[1] * (24 + 4 * len(fields))
             self._obstacles.write(code)
             self._time_codes.append(code)

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from warpfea.base.errors import OutputError
-from warpfea.outputs.frames import DrawnSurface, frame_time, is_static
+from ..base.errors import OutputError
+from .frames import DrawnSurface, frame_time, is_static
 
 __all__ = ["ExistingStage", "read_existing"]
 
@@ -28,7 +28,6 @@ class ExistingStage:
         ranges: extremes of each field, SI units.
         box: lowest and highest corner of all frames, (3,) each, m.
         offsets: (worlds, 3) origins of the worlds on the grid, m.
-        paths: prims of each body's meshes, [body][world].
     """
 
     codes: list[float]
@@ -36,7 +35,6 @@ class ExistingStage:
     ranges: dict[str, tuple[float, float]]
     box: tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]
     offsets: npt.NDArray[np.float64]
-    paths: list[list[str]]
 
 
 def read_existing(
@@ -85,12 +83,12 @@ def read_existing(
         raise _extension_error(
             target, f"it ends at t = {time:.6g} s, and the run is resumed at t = {now:.6g} s: frames are missing"
         )
-    offsets = np.array([_grid_origin(stage, meshes[0][world]) for world in range(surface.worlds)])
+    offsets = np.array([_translation(mesh.GetPrim().GetParent().GetParent()) for mesh in meshes[0]])
     box = _bounding_box(meshes, codes, offsets)
     if abs(time - now) <= slack:
         _check_frame(target, sim, surface, meshes, codes[-1], CONTINUITY_TOL * float(np.linalg.norm(box[1] - box[0])))
     ranges = {name: (float(field["range"][0]), float(field["range"][1])) for name, field in about["fields"].items()}
-    return ExistingStage(codes, time, ranges, box, offsets, paths)
+    return ExistingStage(codes, time, ranges, box, offsets)
 
 
 def _check_faces(target: pathlib.Path, surface: DrawnSurface, meshes: list[list[Any]]) -> None:
@@ -109,7 +107,8 @@ def _check_frame(
     for body, worlds in zip(surface.bodies, meshes, strict=True):
         points = surface.skin_points(sim, body)
         for world, mesh in enumerate(worlds):
-            drawn = np.asarray(mesh.GetPointsAttr().Get(code), dtype=float) + _body_center(mesh, code)
+            center = _translation(mesh.GetPrim().GetParent(), code)
+            drawn = np.asarray(mesh.GetPointsAttr().Get(code), dtype=float) + center
             if np.abs(drawn - points[world]).max() > bound:
                 raise _extension_error(target, f"its last frame shows body {body.name!r} elsewhere than the checkpoint")
 
@@ -118,20 +117,13 @@ def _extension_error(target: pathlib.Path, reason: str) -> OutputError:
     return OutputError(f"{target}: can't go on with this file: {reason}; give another file name")
 
 
-def _body_center(mesh: Any, code: float) -> npt.NDArray[np.float64]:
-    """The body's centre in its world at a time code, (3,) m."""
+def _translation(prim: Any, *code: float) -> npt.NDArray[np.float64]:
+    """Translation of a prim, (3,) m, at a time code: the parent of a mesh is at the body's centre in its world, that
+    of the body at the origin of the world on the grid."""
     from pxr import UsdGeom
 
-    (op,) = UsdGeom.Xformable(mesh.GetPrim().GetParent()).GetOrderedXformOps()
-    return np.asarray(op.Get(code), dtype=float)
-
-
-def _grid_origin(stage: Any, mesh: Any) -> npt.NDArray[np.float64]:
-    """Grid origin of the world of a mesh, (3,) m."""
-    from pxr import UsdGeom
-
-    (op,) = UsdGeom.Xformable(mesh.GetPrim().GetParent().GetParent()).GetOrderedXformOps()
-    return np.asarray(op.Get(), dtype=float)
+    (op,) = UsdGeom.Xformable(prim).GetOrderedXformOps()
+    return np.asarray(op.Get(*code), dtype=float)
 
 
 def _bounding_box(
@@ -142,8 +134,7 @@ def _bounding_box(
     for worlds in meshes:
         for world, mesh in enumerate(worlds):
             for code in codes:
-                extent = (
-                    np.asarray(mesh.GetExtentAttr().Get(code), dtype=float) + _body_center(mesh, code) + offsets[world]
-                )
+                center = _translation(mesh.GetPrim().GetParent(), code)
+                extent = np.asarray(mesh.GetExtentAttr().Get(code), dtype=float) + center + offsets[world]
                 low, high = np.minimum(low, extent[0]), np.maximum(high, extent[1])
     return low, high

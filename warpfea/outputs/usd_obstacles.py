@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from warpfea.outputs.colormap import to_linear
-from warpfea.outputs.normals import vertex_normals
-from warpfea.outputs.obstacles import OBSTACLE_COLOR, unique_names
+from .colormap import to_linear
+from .normals import vertex_normals
+from .obstacles import OBSTACLE_COLOR, unique_names
 
 if TYPE_CHECKING:
-    from warpfea.outputs.frames import DrawnSurface
+    from .frames import DrawnSurface
 
 __all__ = ["ObstaclePrims"]
 

@@ -13,11 +13,11 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from warpfea.base.errors import OutputError
-from warpfea.base.writer import Output, check_folder, write_atomically
-from warpfea.model.surfaces import reference_points
-from warpfea.outputs.frames import FrameClock, check_fields, frame_time
-from warpfea.outputs.obstacles import Obstacles
+from ..base.errors import OutputError
+from ..base.writer import Output, check_folder, write_atomically
+from ..model.surfaces import reference_points
+from .frames import FrameClock, check_fields, frame_time
+from .obstacles import Obstacles
 
 __all__ = ["VTUWriter"]
 

@@ -162,28 +162,16 @@ class StepSizeControl:
         `end_attempt`)."""
         m, w, k, ctl, launch = self.model, self.work, self.kernels, self.control, self.launch
         launch(k.begin_estimate, m.worlds, [w.step, w.newton, ctl])
-        args = [
-            w.step,
-            ctl,
-            self.displacement_factor,
-            m.topology.free,
-            w.u,
-            w.v,
-            self.velocity,
-            self.v_before,
-            self.mean_rates,
-        ]
+        args = [w.step, ctl, self.displacement_factor, m.topology.free]
+        args += [w.u, w.v, self.velocity, self.v_before, self.mean_rates]
         launch(k.max_error_rates, self.dim, args)
         launch(k.control_step_size, m.worlds, [w.step, w.newton, w.pcg, ctl])
 
     def finish_attempt(self) -> None:
         """Compute mean rates and the size of the next substep, after the kernel `end_attempt` and before acceptance."""
         w, launch = self.work, self.launch
-        launch(
-            self.kernels.update_mean_rates,
-            self.dim,
-            [w.step, self.control, w.v, self.velocity, self.v_before, self.mean_rates],
-        )
+        args = [w.step, self.control, w.v, self.velocity, self.v_before, self.mean_rates]
+        launch(self.kernels.update_mean_rates, self.dim, args)
         launch(self.kernels.refine_substeps, self.model.worlds, [w.step, self.control])
 
     def end_interval(self) -> None:

@@ -96,14 +96,10 @@ class ConsistentInitialConditions:
     def _drive_law_numbers(self) -> set[int]:
         """Indices of the laws that prescribe positions."""
         terms = self.model.terms
-        out = set()
-        if terms.supports.displacement_drives is not None:
-            out |= set(terms.supports.displacement_drives.law.numpy().ravel().tolist())
-        if terms.supports.rotation_drives is not None:
-            out |= set(terms.supports.rotation_drives.law.numpy().tolist())
+        tables = [terms.supports.displacement_drives, terms.supports.rotation_drives]
         if self.model.constraints is not None:
-            out |= set(terms.constraints.tables.data.law.numpy().tolist())
-        return out
+            tables.append(terms.constraints.tables.data)
+        return {number for table in tables if table is not None for number in table.law.numpy().ravel().tolist()}
 
     def _restart_worlds(self, flags: np.ndarray, time: np.ndarray, after_jump: np.ndarray, dt: float) -> None:
         state: Any = self.ctx.state
@@ -177,12 +173,10 @@ class ConsistentInitialConditions:
 
     def _law_values(self, flags: np.ndarray, time: np.ndarray) -> np.ndarray:
         """Values of the time laws in the flagged worlds at times (B,), (B, laws, 3)."""
-        m, w = self.model, self.ctx.work
+        ctx, w, active = self.ctx, self.ctx.work, self._world_flags(flags)
         self._write_flagged(w.step.new_time, flags, time)
-        active = self._world_flags(flags)
-        m.terms.time_laws.evaluate(
-            self.ctx.launch, self.ctx.state, w.step.new_time, w.step.load_factor, active, w.time_law_values
-        )
+        laws = self.model.terms.time_laws
+        laws.evaluate(ctx.launch, ctx.state, w.step.new_time, w.step.load_factor, active, w.time_law_values)
         return w.time_law_values.numpy().copy()
 
     def _world_flags(self, flags: np.ndarray) -> Any:
@@ -193,15 +187,9 @@ class ConsistentInitialConditions:
         m, ctx, w = self.model, self.ctx, self.ctx.work
         every, active = np.ones(len(flags)), self._world_flags(flags)
         # strain rates of the state: E~ = E - (dq/dv) dE/dt
-        for array, value in (
-            (w.step.load_factor, 1.0),
-            (w.step.h, dt),
-            (w.step.dq_dv, dt),
-            (w.step.b, -dt),
-            (w.step.q_a, 0.0),
-        ):
-            self._write_flagged(array, flags, value * every)
-        self._write_flagged(w.step.mass_factor, flags, every / dt)
+        step = {"load_factor": 1.0, "h": dt, "dq_dv": dt, "b": -dt, "q_a": 0.0, "mass_factor": 1.0 / dt}
+        for name, value in step.items():
+            self._write_flagged(getattr(w.step, name), flags, value * every)
         self._law_values(flags, time)
         m.terms.dead_loads.take_gravity(ctx.launch, w.time_law_values, active)
         u, v = ctx.state.displacement.numpy(), ctx.state.velocity.numpy()
@@ -215,8 +203,10 @@ class ConsistentInitialConditions:
     # supports and constraints
 
     def _constraint_rows(self, u: np.ndarray, v: np.ndarray, laws: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray]:
-        """J (rows, 3 slots), c' and c'' without J w (rows,)."""
+        """J (rows, 3 slots), c' and c'' without J w (rows,); None and no rows without constraints."""
         tables = self.model.constraints
+        if tables is None:
+            return None, np.zeros(0), np.zeros(0)
         gradients, first, second = constraint_rates(tables, u, v, laws)
         return tables.expand_jacobian(gradients), first, second
 
@@ -246,18 +236,15 @@ class ConsistentInitialConditions:
     def _velocity_correction(self, u: np.ndarray, v: np.ndarray, laws: np.ndarray) -> np.ndarray:
         """Velocity correction dv, m/s; zero if consistent."""
         jump = self._prescribed_rates(laws)[0] - np.where(self.model.slot_table.free == 0.0, v, 0.0)
-        if self.model.constraints is None:
-            return self._solve_saddle_point(np.zeros_like(v), jump) if jump.any() else jump
         J, first, _ = self._constraint_rows(u, v, laws)
+        if J is None and not jump.any():
+            return jump
         return self._solve_saddle_point(np.zeros_like(v), jump, J, -first)
 
     def _acceleration(self, g: np.ndarray, u: np.ndarray, v: np.ndarray, laws: np.ndarray) -> np.ndarray:
         """Acceleration w, m/s^2."""
-        prescribed = self._prescribed_rates(laws)[1]
-        if self.model.constraints is None:
-            return self._solve_saddle_point(-g, prescribed)
         J, _, second = self._constraint_rows(u, v, laws)
-        return self._solve_saddle_point(-g, prescribed, J, -second)
+        return self._solve_saddle_point(-g, self._prescribed_rates(laws)[1], J, -second)
 
     def _jerk(self, u: np.ndarray, v: np.ndarray, laws: np.ndarray, w: np.ndarray, s: float) -> np.ndarray:
         """Jerk dw/dt, m/s^3, prescribed by supports and constraints, by differences over -s .. s.
@@ -266,18 +253,16 @@ class ConsistentInitialConditions:
         """
         if self.model.constraints is None and not self.has_drives:
             return np.zeros_like(w)
-        prescribed, constraint_rhs, rows = np.zeros_like(w), None, None
+        prescribed, constraint_rhs = np.zeros_like(w), None
         for sign in (-0.5 / s, 0.5 / s):
             x = np.copysign(s, sign)
-            there = np.tensordot(
-                [[1.0, x, x**2 / 2.0, x**3 / 6.0], [0.0, 1.0, x, x**2 / 2.0], [0.0, 0.0, 1.0, x]], laws, 1
-            )
+            taylor = [[1.0, x, x**2 / 2.0, x**3 / 6.0], [0.0, 1.0, x, x**2 / 2.0], [0.0, 0.0, 1.0, x]]
+            there = np.tensordot(taylor, laws, 1)
             prescribed += sign * self._prescribed_rates(there)[1]
             if self.model.constraints is not None:
                 J, _, second = self._constraint_rows(u + x * v + 0.5 * x**2 * w, v + x * w, there)
                 constraint_rhs = (0.0 if constraint_rhs is None else constraint_rhs) - sign * (second + J @ w.ravel())
-        if self.model.constraints is not None:
-            rows = self._constraint_rows(u, v, laws)[0]
+        rows = self._constraint_rows(u, v, laws)[0]
         return self._solve_saddle_point(np.zeros_like(w), prescribed, rows, constraint_rhs)
 
     def _solve_saddle_point(

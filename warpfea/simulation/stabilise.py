@@ -66,9 +66,6 @@ class Springs(Output):
         largest = float(np.linalg.norm(self.force, axis=2).max(initial=0.0)) if self._rows else 0.0
         return f"Springs({self.stiffness:.3g} N/m per kg, at most {largest:.3g} N)"
 
-    def open(self, sim: Any) -> None:
-        """No-op."""
-
     def write(self, sim: Any) -> None:
         """Record the completed load step."""
         if sim.last is None:
@@ -78,9 +75,3 @@ class Springs(Output):
         moved = work.v.numpy().astype(float)
         force = -np.einsum("bsc,s->bc", pull, sim.model.slot_table.is_position)
         self._rows.append((force, 0.5 * np.einsum("bsc,bsc->b", pull, moved)))
-
-    def close(self, sim: Any) -> None:
-        """No-op."""
-
-    def abort(self) -> None:
-        """No-op."""

@@ -99,9 +99,7 @@ def report_unstable(result: Any, *, refuse: bool) -> None:
         f"r.perturbed({size_m}) (a static solve from there may return to this equilibrium)"
     )
     if refuse:
-        error = StabilityError(text, time=1.0, world=world, state=sim.state)
-        error.result = result
-        raise error
+        raise StabilityError(text, time=1.0, world=world, state=sim.state, result=result)
     warnings.warn(text, StabilityWarning, stacklevel=4)
 
 
@@ -132,11 +130,9 @@ def check_stability(sim: Simulation, *, every: bool = False) -> Stability:
         if strange[world] and not out.reasons[world]:
             names = ", ".join(term.name for term in model.terms if not term.potential)
             out.reasons[world] = f"non-conservative forces: {names}"
-    most = (
-        np.full(model.worlds, MAX_ITERATIONS)
-        if every
-        else np.maximum(ITERATIONS, (SOLVE_FACTOR * sim.totals["pcg"]).astype(int))
-    )
+    most = np.full(model.worlds, MAX_ITERATIONS)
+    if not every:
+        most = np.maximum(ITERATIONS, (SOLVE_FACTOR * sim.totals["pcg"]).astype(int))
     curvature, p = _find_negative_curvature(probe, out, most)
     if single:
         _check_roundoff(probe, sim, out, curvature, p)
@@ -316,24 +312,20 @@ def _check_roundoff(
 ) -> None:
     """Set the sign of p.H p to unknown if float32 round-off of the state can change it."""
     state, u = probe.sim.state, sim.state.displacement.numpy().astype(float)
-    shift = (
-        np.random.default_rng(3).uniform(-0.5, 0.5, u.shape)
-        * np.finfo("float32").eps
-        * np.abs(u)
-        * probe.free_components
-    )
-    state.displacement.assign(u + shift)
-    _evaluate_state(probe.stepper)
-    probe.linearise()
+    random = np.random.default_rng(3).uniform(-0.5, 0.5, u.shape)
+
+    def move_to(displacement: np.ndarray) -> None:
+        state.displacement.assign(displacement)
+        _evaluate_state(probe.stepper)
+        probe.linearise()
+
+    move_to(u + random * np.finfo("float32").eps * np.abs(u) * probe.free_components)
     change = np.abs(_dot(p, probe.product(p, np.ones(len(u), dtype=bool))) - curvature)
     for world in range(len(u)):
         if out.stable[world] is not None and abs(curvature[world]) <= MIN_ROUND_OFF_CHANGES * change[world]:
             out.stable[world], out.reasons[world] = None, "within the rounding of float32"
-    if all(s is not False for s in out.stable):
-        return
-    state.displacement.assign(u)
-    _evaluate_state(probe.stepper)
-    probe.linearise()
+    if any(s is False for s in out.stable):
+        move_to(u)
 
 
 def _unstable_modes(probe: TangentOperator, chosen: np.ndarray, x: np.ndarray) -> np.ndarray:

@@ -10,14 +10,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ParamSpec, TypeVar
 
-from ...base.checks import is_number
+from ...base.checks import check_positive
 from ...base.errors import ModelError
 from ...base.names import did_you_mean
 from ...builder.reference import Reference
 from .finer import check_finer
 from .report import ERROR_MEASURES
 
-__all__ = ["StudyOptions", "check_positive", "refuse_moved_keywords"]
+__all__ = ["StudyOptions", "refuse_moved_keywords"]
 
 SPLIT_CHOICES = ("best", "all", "none")
 Params = ParamSpec("Params")
@@ -73,15 +73,9 @@ class StudyOptions:
                 raise ModelError(f"study: {option} {value!r} is unknown; there are {', '.join(known)}{hint}")
         if not (isinstance(self.repeat, int) and self.repeat >= 1):
             raise ModelError(f"study: repeat = {self.repeat!r} must be a positive whole number")
-        check_positive(target=self.target, limit=self.limit)
+        given = {"target": self.target, "limit": self.limit}
+        check_positive("study", **{name: value for name, value in given.items() if value is not None})
         check_finer(self.finer or {})
-
-
-def check_positive(**values: float | None) -> None:
-    """ModelError for options that are neither None nor positive finite numbers."""
-    for option, value in values.items():
-        if value is not None and not (is_number(value) and value > 0.0):
-            raise ModelError(f"study: {option} = {value!r} must be a positive finite number")
 
 
 def refuse_moved_keywords(function: Callable[Params, Returned]) -> Callable[Params, Returned]:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+from ...base.checks import check_positive
 from ...base.console import quiet_warp
 from ...base.devices import find_device
 from ...base.errors import ModelError
@@ -23,7 +24,7 @@ from .finer import finer_motion, finer_setting
 from .measure import DONE, REFUSED, Outcome
 from .measure import measure as run_once
 from .motion import RESOLVED_RATIO, ROUND_OFF_ERROR, Motion, known_motion, motion_errors
-from .options import StudyOptions, check_positive, refuse_moved_keywords
+from .options import StudyOptions, refuse_moved_keywords
 from .report import Row, Study, with_orders, with_pareto
 from .settings import SWEEP_OPTIONS, Setting, SweepAxes, method_text, setting_product, sweep_axes
 from .split import split_error
@@ -86,7 +87,8 @@ def study(
             if option in sweep:
                 raise ModelError(f"study: {option} is given twice")
             sweep[option] = many
-    check_positive(dt=dt, t_end=t_end, tol=tol)
+    given = {"dt": dt, "t_end": t_end, "tol": tol}
+    check_positive("study", **{name: value for name, value in given.items() if value is not None})
     axes = sweep_axes(found, sweep, options.mesh)
     values = dict(parameters or {})
     _check_names("parameter", values, found.parameters)

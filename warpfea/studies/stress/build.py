@@ -137,19 +137,10 @@ class StepStats(Output):
             limits["error over the floor told"] = (error, 3.0 * reported_error)
         return Answer(float(error), bound, reference, limits=limits, **self.answer_fields, **more)
 
-    def open(self, sim: Any) -> None:
-        """Nothing to prepare."""
-
     def write(self, sim: Any) -> None:
         """Add the step done since the last call."""
         if sim.last is not None and sim.last is not self.last_report:
             self.add(sim)
-
-    def close(self, sim: Any) -> None:
-        """Nothing to finish."""
-
-    def abort(self) -> None:
-        """Nothing to drop."""
 
 
 @dataclass
