@@ -14,6 +14,7 @@ import itertools
 
 import numpy as np
 
+from ..mesh.cells import HEX_CORNERS, HEX_FACES
 from .ancf import monomials, nodal_basis, nodal_functions, to_node_axes
 from .ancf_beam import box_subdivision
 from .family import Family, ParentDomain, register
@@ -108,12 +109,6 @@ ENMC = _register_tet("ENMC", "tetra_faces", None)
 FN = _register_tet("FN", "tetra", 2.0 / 81.0)
 FN18 = _register_tet("FN18", "tetra", 1.0 / 18.0)
 
-HEX_NODES = np.array(
-    [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)], dtype=float
-)
-HEX_FACES = tuple(
-    HEX_NODES[list(f)] for f in ((0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7))
-)
 LOW, HIGH = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 UNIT_RANGES = tuple(zip(LOW, HIGH))
 
@@ -136,7 +131,7 @@ BRICK_EXPONENTS = _brick_exponents()
 
 @functools.cache
 def _brick_inverse_basis() -> np.ndarray:
-    return nodal_basis(BRICK_EXPONENTS, HEX_NODES)
+    return nodal_basis(BRICK_EXPONENTS, HEX_CORNERS)
 
 
 def _brick_shape_functions(xi: np.ndarray, nodes: np.ndarray, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -153,13 +148,13 @@ BRICK = register(
         curved_rule=box_rule((4, 4, 4), UNIT_RANGES),
         mass_rule=box_rule((5, 5, 5), UNIT_RANGES),
         curved_mass_rule=box_rule((5, 5, 5), UNIT_RANGES),
-        vertices=HEX_NODES[[0, 2, 5, 7]],
+        vertices=HEX_CORNERS[[0, 2, 5, 7]],
         affine=False,
         parent=ParentDomain(LOW, HIGH),
-        faces=HEX_FACES,
+        faces=tuple(HEX_CORNERS[HEX_FACES]),
         face_rule=square_rule(5),
         face_divisions=((3, 3),) * 6,
-        node_samples=HEX_NODES[:, None],
+        node_samples=HEX_CORNERS[:, None],
         vtk_subdivision=box_subdivision(LOW, HIGH, (2, 2, 2)),
         slot_sets=GRADIENT_SLOT_SETS,
     )

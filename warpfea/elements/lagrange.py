@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..mesh.cells import TET_EDGES, barycentric, tet4_gradients, tet10_gradients
+from ..mesh.cells import TET_EDGES, TET_FACES, barycentric, tet4_gradients, tet10_gradients
 from .family import Family, ParentDomain, VtkSubdivision, register
 from .quadrature import TET_RULES, conical_tet, triangle_6
 
@@ -12,8 +12,6 @@ __all__ = ["T4", "T10", "TET_CORNERS", "TET_FACES"]
 
 TET_CORNERS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
 TET_EDGE_MIDPOINTS = np.array([(TET_CORNERS[a] + TET_CORNERS[b]) / 2 for a, b in TET_EDGES])
-TET_FACES = ((0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2))
-"""Corners of each face, outward, in the order of the mesh's local faces."""
 TET_FACE_CORNERS = tuple(TET_CORNERS[list(face)] for face in TET_FACES)
 QUADRATIC_SUBDIVISION = VtkSubdivision(np.vstack([TET_CORNERS, TET_EDGE_MIDPOINTS]), "tetra10", np.arange(10)[None])
 

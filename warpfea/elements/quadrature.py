@@ -8,20 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import roots_jacobi
 
+from ..mesh.cells import CENTROID, TET14_ORBITS, edge_orbit, vertex_orbit
+
 __all__ = [
-    "TET_RULES",
-    "Rule",
-    "box_rule",
-    "composite_rule",
-    "conical_tet",
-    "conical_triangle",
-    "lobatto_square",
-    "square_rule",
-    "triangle_3",
-    "triangle_6",
-    "triangle_7",
-    "triangle_16",
-]
+    "TET_RULES", "Rule", "box_rule", "composite_rule", "conical_tet", "conical_triangle", "lobatto_square",
+    "square_rule", "triangle_3", "triangle_6", "triangle_7", "triangle_16",
+]  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,55 +48,26 @@ class Rule:
         return bool(near != 0.0 and np.allclose(own[-4:], towards, 0, 1e-14) and np.allclose(own[:-4], 0.25, 0, 1e-14))
 
 
-def _rule_from_orbits(name: str, degree: int, orbits: list[tuple[float, np.ndarray]]) -> Rule:
-    """Rule on the tetrahedron from orbits (weight of a point over the volume, barycentric points (n, 4))."""
-    points = np.concatenate([bary[:, 1:] for _, bary in orbits])
-    weights = np.concatenate([np.full(len(bary), w / 6.0) for w, bary in orbits])
-    return Rule(name, points, weights, degree)
+def _rule_from_orbits(name: str, degree: int, *orbits: tuple[float, np.ndarray]) -> Rule:
+    """Rule on the tetrahedron from orbits (weight of a point over the volume, points (n, 3))."""
+    weights = np.concatenate([np.full(len(points), w / 6.0) for w, points in orbits])
+    return Rule(name, np.concatenate([points for _, points in orbits]), weights, degree)
 
 
-def _orbit4(a: float) -> np.ndarray:
-    """The four points with one barycentric coordinate 1 - 3a and three a."""
-    out = np.full((4, 4), a)
-    np.fill_diagonal(out, 1.0 - 3.0 * a)
-    return out
-
-
-def _orbit6(a: float) -> np.ndarray:
-    """The six points with two coordinates a and two 1/2 - a."""
-    out = np.full((6, 4), a)
-    for row, pair in enumerate([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]):
-        out[row, list(pair)] = 0.5 - a
-    return out
-
-
-def _tet8() -> Rule:
-    """Eight points, degree 3, positive weights, interior (Jaskowiec and Sukumar, symmetric tetrahedron rules, 2020)."""
-    orbits = [(0.1385279665118621, _orbit4(0.3280546967114266)), (0.1114720334881379, _orbit4(0.1069522739329306))]
-    return _rule_from_orbits("tet8", 3, orbits)
-
-
-def _tet14() -> Rule:
-    """Walkington's 14 points, degree 5, positive weights (J. N. Walkington, quadrature on simplices, 2000)."""
-    return _rule_from_orbits(
-        "tet14",
-        5,
-        [
-            (6 * 0.01878132095300264180, _orbit4(0.31088591926330060980)),
-            (6 * 0.01224884051939365826, _orbit4(0.092735250310891226402)),
-            (6 * 0.0070910034628469110730, _orbit6(0.045503704125649649492)),
-        ],
-    )
-
-
-TET_RULES: dict[str, Rule] = {
-    "tet1": Rule("tet1", np.full((1, 3), 0.25), np.array([1.0 / 6.0]), 1),
-    "tet4": _rule_from_orbits("tet4", 2, [(0.25, _orbit4((5.0 - np.sqrt(5.0)) / 20.0))]),
+_VERTICES, _OTHERS, _EDGES = TET14_ORBITS
+TET_RULES: dict[str, Rule] = {rule.name: rule for rule in (
+    Rule("tet1", CENTROID, np.array([1.0 / 6.0]), 1),
+    _rule_from_orbits("tet4", 2, (0.25, vertex_orbit((5.0 - np.sqrt(5.0)) / 20.0))),
     # Paper I's rule, Eq. (11); its negative weight makes the T10 mass matrix indefinite
-    "tet5_paper": _rule_from_orbits("tet5_paper", 3, [(-0.8, np.full((1, 4), 0.25)), (0.45, _orbit4(1.0 / 6.0))]),
-    "tet8": _tet8(),
-    "tet14": _tet14(),
-}
+    _rule_from_orbits("tet5_paper", 3, (-0.8, CENTROID), (0.45, vertex_orbit(1.0 / 6.0))),
+    # positive weights, interior points (Jaskowiec and Sukumar, symmetric tetrahedron rules, 2020)
+    _rule_from_orbits("tet8", 3, (0.1385279665118621, vertex_orbit(0.3280546967114266)),
+                      (0.1114720334881379, vertex_orbit(0.1069522739329306))),
+    # positive weights (J. N. Walkington, quadrature on simplices, 2000)
+    _rule_from_orbits("tet14", 5, (6 * 0.01878132095300264180, vertex_orbit(_VERTICES)),
+                      (6 * 0.01224884051939365826, vertex_orbit(_OTHERS)),
+                      (6 * 0.0070910034628469110730, edge_orbit(_EDGES))),
+)}  # fmt: skip
 
 
 def _gauss_jacobi(n: int, alpha: int) -> tuple[np.ndarray, np.ndarray]:

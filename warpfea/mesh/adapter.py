@@ -74,22 +74,24 @@ def read(path: str | os.PathLike[str], scale: float = 1.0, transform: Any = None
     """
     file = Path(path)
     label = str(file)
-    matrix, shift = transformation(scale, transform, label)
-    if cell_type is not None and cell_type not in FILE_CELLS:
-        raise MeshError(f"{label}: unknown cell_type {cell_type!r}, known are {sorted(FILE_CELLS)}")
+    affine = _check_arguments(label, scale, transform, cell_type)
     if not file.exists():
         raise MeshError(f"{label}: no such mesh file")
     suffix = file.suffix.lower()
     if suffix not in FORMATS or not file.is_file():
         raise MeshError(f"{label}: unknown mesh format {suffix!r}, known are {', '.join(FORMATS)}")
     readers = {".msh": _read_gmsh, ".vtu": _read_vtu, ".inp": abaqus.read_inp}
-    try:
-        with _meshio_errors(label):
-            raw = readers[suffix](file)
-    except OSError as error:
-        raise MeshError(f"{label}: can't be read: {error}") from error
-    mesh = assemble_mesh(raw, file, cell_type)
-    return check(mesh.transformed(transform=(matrix, shift)))
+    with _meshio_errors(label):
+        raw = readers[suffix](file)
+    return check(assemble_mesh(raw, file, cell_type).transformed(transform=affine))
+
+
+def _check_arguments(label: str, scale: float, transform: Any, cell_type: str | None) -> tuple[np.ndarray, np.ndarray]:
+    """Matrix and translation of the arguments of :func:`read`. MeshError."""
+    affine = transformation(scale, transform, label)
+    if cell_type is not None and cell_type not in FILE_CELLS:
+        raise MeshError(f"{label}: unknown cell_type {cell_type!r}, known are {sorted(FILE_CELLS)}")
+    return affine
 
 
 def read_triangles(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
@@ -105,11 +107,8 @@ def read_triangles(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray
     file = Path(path)
     if not file.is_file():
         raise MeshError(f"{file}: no such mesh file")
-    try:
-        with _meshio_errors(str(file)):
-            mesh = meshio.read(file)
-    except OSError as error:
-        raise MeshError(f"{file}: can't be read: {error}") from error
+    with _meshio_errors(str(file)):
+        mesh = meshio.read(file)
     halves = {"triangle": ([0, 1, 2],), "quad": ([0, 1, 2], [0, 2, 3])}
     parts = [block.data[:, half] for block in mesh.cells for half in halves.get(block.type, ())]
     if not sum(map(len, parts)):
@@ -143,9 +142,7 @@ def from_meshio(mesh: Any, scale: float = 1.0, transform: Any = None, cell_type:
     label = "meshio.Mesh"
     if not is_meshio(mesh):
         raise MeshError(f"from_meshio: expected a meshio.Mesh, got {type(mesh).__module__}.{type(mesh).__qualname__}")
-    matrix, shift = transformation(scale, transform, label)
-    if cell_type is not None and cell_type not in FILE_CELLS:
-        raise MeshError(f"{label}: unknown cell_type {cell_type!r}, known are {sorted(FILE_CELLS)}")
+    affine = _check_arguments(label, scale, transform, cell_type)
     raw = _raw_mesh(mesh)
     raw.duplicates = "gmsh:physical" in mesh.cell_data  # MSH 2.2 repeats cells of two groups
     for name, arrays in mesh.cell_sets.items():
@@ -156,7 +153,7 @@ def from_meshio(mesh: Any, scale: float = 1.0, transform: Any = None, cell_type:
     for name, nodes in mesh.point_sets.items():
         raw.node_groups[str(name)] = np.unique(np.asarray(nodes, dtype=np.int64))
     found = assemble_mesh(raw, Path(label), cell_type)
-    return check(replace(found.transformed(transform=(matrix, shift)), name="mesh", path=None))
+    return check(replace(found.transformed(transform=affine), name="mesh", path=None))
 
 
 @contextlib.contextmanager
@@ -169,12 +166,11 @@ def _meshio_errors(label: str) -> Iterator[io.StringIO]:
             yield said
     except MeshError as error:
         raise error if str(error).startswith(label) else MeshError(f"{label}: {error}") from None
-    except OSError:
-        raise
+    except OSError as error:
+        raise MeshError(f"{label}: can't be read: {error}") from error
     except (Exception, SystemExit) as error:
-        reason = " ".join(said.getvalue().split()) or (
-            f"{type(error).__name__}: {error}" if str(error) and not isinstance(error, SystemExit) else "bad content"
-        )
+        told = str(error) and not isinstance(error, SystemExit)
+        reason = " ".join(said.getvalue().split()) or (f"{type(error).__name__}: {error}" if told else "bad content")
         raise MeshError(f"{label}: can't be read, the file is damaged or of another format ({reason})") from error
 
 
@@ -183,9 +179,8 @@ def _meshio_errors(label: str) -> Iterator[io.StringIO]:
 
 def _read_gmsh(file: Path) -> RawMesh:
     data = file.read_bytes()
-    header = re.match(
-        rb"\s*(?:\$Comments.*?\$EndComments\s*)?\$MeshFormat\s+([\d.]+)\s+([01])\s+(\d+)", data, re.DOTALL
-    )
+    before = rb"\s*(?:\$Comments.*?\$EndComments\s*)?"
+    header = re.match(before + rb"\$MeshFormat\s+([\d.]+)\s+([01])\s+(\d+)", data, re.DOTALL)
     if header is None:
         raise MeshError("not a Gmsh file: it does not begin with $MeshFormat")
     version, is_ascii, size = header[1].decode(), header[2] == b"0", int(header[3])
@@ -212,9 +207,8 @@ def _read_gmsh(file: Path) -> RawMesh:
     for k, (kind, cells) in enumerate(raw.blocks):
         dim, every = cell_dimension(kind), np.arange(len(cells))
         if new:
-            of_group = (
-                {} if entity is None or not len(cells) else dict.fromkeys(tags_of.get((dim, entity[k][0]), ()), every)
-            )
+            known = () if entity is None or not len(cells) else tags_of.get((dim, entity[k][0]), ())
+            of_group = dict.fromkeys(known, every)
         else:
             tags = np.zeros(0) if physical is None else np.abs(physical[k])
             if len(tags) not in (0, len(cells)):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -88,15 +88,11 @@ def assemble_mesh(raw: RawMesh, file: Path, cell_type: str | None) -> Mesh:
         surface_sets.setdefault(name, []).append(table)
         node_sets.setdefault(name, []).append(mesh.faces(table).ravel())
     node_sets.update({name: [nodes] for name, nodes in raw.node_groups.items()})
-    return Mesh(
-        mesh.points,
-        mesh.cells,
-        mesh.cell_type,
+    return replace(
+        mesh,
         node_sets={name: np.unique(np.concatenate(parts)) for name, parts in node_sets.items()},
         element_sets={name: np.unique(np.concatenate(parts)) for name, parts in element_sets.items()},
         surface_sets={name: np.unique(np.concatenate(parts), axis=0) for name, parts in surface_sets.items()},
-        name=file.stem,
-        path=label,
     )
 
 

@@ -18,15 +18,10 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 __all__ = [
-    "CELL_TYPES",
-    "ELEMENT_CELLS",
-    "FILE_CELLS",
-    "CellType",
-    "cell_dimension",
-    "det_j0",
-    "element_volumes",
-    "row_keys",
-]
+    "CELL_TYPES", "CENTROID", "ELEMENT_CELLS", "FILE_CELLS", "HEX_CORNERS", "HEX_FACES", "TET14_ORBITS", "TET_EDGES",
+    "TET_FACES", "CellType", "barycentric", "cell_dimension", "det_j0", "edge_orbit", "element_volumes", "row_keys",
+    "tet4_gradients", "tet10_gradients", "vertex_orbit",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -62,7 +57,7 @@ class CellType:
 
 
 TET_EDGES = np.array([(0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3)], dtype=np.int64)
-_TET_FACES = np.array([(0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2)], dtype=np.int64)
+TET_FACES = np.array([(0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2)], dtype=np.int64)
 _TET10_FACES = np.array(
     [(0, 2, 1, 6, 5, 4), (0, 1, 3, 4, 8, 7), (1, 2, 3, 5, 9, 8), (0, 3, 2, 7, 9, 6)], dtype=np.int64
 )
@@ -88,36 +83,33 @@ def tet10_gradients(xi: Floats) -> Floats:
     return np.concatenate([corner, mid], axis=1)
 
 
-def _vertex_orbit(a: float) -> list[tuple[float, float, float]]:
-    """The four points with barycentric coordinates (a, a, a, 1 - 3 a) in any order."""
+def vertex_orbit(a: float) -> Floats:
+    """The four points (4, 3) with one barycentric coordinate 1 - 3 a and three a; that of corner k comes k-th."""
     b = 1.0 - 3.0 * a
-    return [(a, a, a), (b, a, a), (a, b, a), (a, a, b)]
+    return np.array([(a, a, a), (b, a, a), (a, b, a), (a, a, b)])
 
 
-def _edge_orbit(a: float) -> list[tuple[float, float, float]]:
-    """The six points with barycentric coordinates (a, a, 1/2 - a, 1/2 - a) in any order."""
+def edge_orbit(a: float) -> Floats:
+    """The six points (6, 3) with two barycentric coordinates a and two 1/2 - a."""
     c = 0.5 - a
-    return [(a, c, c), (c, a, c), (c, c, a), (c, a, a), (a, c, a), (a, a, c)]
+    return np.array([(c, a, a), (a, c, a), (a, a, c), (c, c, a), (c, a, c), (a, c, c)])
 
 
-_CENTROID = [(0.25, 0.25, 0.25)]
+CENTROID = np.full((1, 3), 0.25)
 _FIVE_POINT_RULE = (
-    np.array(_CENTROID + _vertex_orbit(1.0 / 6.0)),
+    np.concatenate([CENTROID, vertex_orbit(1.0 / 6.0)]),
     np.array([-4.0 / 5.0, *(4 * [9.0 / 20.0])]) / 6.0,
 )  # degree 3: exact for det J0 of a T10, which is cubic; for volumes only, never for a mass matrix
-_ONE_POINT_RULE = (np.array(_CENTROID), np.array([1.0 / 6.0]))
-_TET10_CHECK_POINTS = np.array(
-    _vertex_orbit(0.0)  # corners
-    + _edge_orbit(0.0)  # mid-edges
-    + _CENTROID
-    + _vertex_orbit((5.0 - 5.0**0.5) / 20.0)  # tet4
-    + _vertex_orbit(1.0 / 6.0)  # tet5_paper
-    + _vertex_orbit(0.31088591926330060980)  # tet14, three orbits
-    + _vertex_orbit(0.092735250310891226402)
-    + _edge_orbit(0.045503704125649649492)
-)
+_ONE_POINT_RULE = (CENTROID, np.array([1.0 / 6.0]))
+TET14_ORBITS = (0.31088591926330060980, 0.092735250310891226402, 0.045503704125649649492)
+"""Barycentric coordinates of the rule tet14: two orbits of vertices, one of edges."""
+_TET10_CHECK_POINTS = np.concatenate([
+    vertex_orbit(0.0), edge_orbit(0.0), CENTROID,  # corners, mid-edges
+    vertex_orbit((5.0 - 5.0**0.5) / 20.0), vertex_orbit(1.0 / 6.0),  # tet4, tet5_paper
+    *map(vertex_orbit, TET14_ORBITS[:2]), edge_orbit(TET14_ORBITS[2]),
+])  # fmt: skip
 
-_TET_FACE_NODES = np.column_stack([_TET_FACES, np.arange(4, 8)])  # node 4 + k is the centroid of face k
+_TET_FACE_NODES = np.column_stack([TET_FACES, np.arange(4, 8)])  # node 4 + k is the centroid of face k
 
 
 def tet_faces_gradients(xi: Floats) -> Floats:
@@ -132,11 +124,11 @@ _LINE_EDGES = np.array([(0, 1)], dtype=np.int64)
 _LINE_FACES = np.empty((0, 2), dtype=np.int64)
 _QUAD_CORNERS = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
 _QUAD_EDGES = np.array([(0, 1), (1, 2), (2, 3), (3, 0)], dtype=np.int64)
-_HEX_CORNERS = np.array([(*corner, z) for z in (0.0, 1.0) for corner in _QUAD_CORNERS])
+HEX_CORNERS = np.array([(*corner, z) for z in (0.0, 1.0) for corner in _QUAD_CORNERS])
 _HEX_EDGES = np.array(
     [(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)], dtype=np.int64
 )
-_HEX_FACES = np.array(
+HEX_FACES = np.array(
     [(0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)], dtype=np.int64
 )
 
@@ -161,7 +153,7 @@ def quad_gradients(xi: Floats) -> Floats:
 
 def hex_gradients(xi: Floats) -> Floats:
     """ds_i/dxi of the trilinear hexahedron on the unit cube: (P, 8, 3)."""
-    return _multilinear_gradients(_HEX_CORNERS, xi)
+    return _multilinear_gradients(HEX_CORNERS, xi)
 
 
 def _gauss_rule(dimension: int) -> tuple[Floats, Floats]:
@@ -172,12 +164,12 @@ def _gauss_rule(dimension: int) -> tuple[Floats, Floats]:
 
 
 _LINE_RULE, _QUAD_RULE, _HEX_RULE = _gauss_rule(1), _gauss_rule(2), _gauss_rule(3)
-_HEX_CHECK_POINTS = np.concatenate([_HEX_CORNERS, [(0.5, 0.5, 0.5)], _HEX_RULE[0]])
+_HEX_CHECK_POINTS = np.concatenate([HEX_CORNERS, [(0.5, 0.5, 0.5)], _HEX_RULE[0]])
 
 _CELL_TYPE_ROWS = (
-    CellType("tetra", 4, 4, TET_EDGES, _TET_FACES, 3, tet4_gradients, _ONE_POINT_RULE, _ONE_POINT_RULE[0]),
+    CellType("tetra", 4, 4, TET_EDGES, TET_FACES, 3, tet4_gradients, _ONE_POINT_RULE, _ONE_POINT_RULE[0]),
     CellType("tetra10", 10, 4, TET_EDGES, _TET10_FACES, 3, tet10_gradients, _FIVE_POINT_RULE, _TET10_CHECK_POINTS),
-    CellType("hexahedron", 8, 8, _HEX_EDGES, _HEX_FACES, 4, hex_gradients, _HEX_RULE, _HEX_CHECK_POINTS),
+    CellType("hexahedron", 8, 8, _HEX_EDGES, HEX_FACES, 4, hex_gradients, _HEX_RULE, _HEX_CHECK_POINTS),
     CellType("quad", 4, 4, _QUAD_EDGES, _QUAD_EDGES, 2, quad_gradients, _QUAD_RULE, _QUAD_RULE[0]),
     CellType("line", 2, 2, _LINE_EDGES, _LINE_FACES, 2, line_gradients, _LINE_RULE, _LINE_RULE[0]),
     CellType(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from ..base.errors import MeshError
@@ -32,16 +34,8 @@ def linear(mesh: Mesh) -> Mesh:
     keep[mesh.used_nodes] = False
     keep[corners] = True
     new_number = np.cumsum(keep) - 1
-    out = Mesh(
-        mesh.points[keep],
-        new_number[corners],
-        "tetra",
-        node_sets={name: new_number[nodes[keep[nodes]]] for name, nodes in mesh.node_sets.items()},
-        element_sets=mesh.element_sets,
-        surface_sets=mesh.surface_sets,
-        name=mesh.name,
-        path=mesh.path,
-    )
+    sets = {name: new_number[nodes[keep[nodes]]] for name, nodes in mesh.node_sets.items()}
+    out = replace(mesh, points=mesh.points[keep], cells=new_number[corners], cell_type="tetra", node_sets=sets)
     try:
         check_volumes(out)
     except MeshError as error:
@@ -81,19 +75,12 @@ def with_face_nodes(mesh: Mesh, face_points: Floats | None = None) -> Mesh:
     else:
         added = _shared_points(mesh, face_points, face, first)
     start = len(mesh.points)
-    return Mesh(
-        np.concatenate([mesh.points, added]),
-        np.concatenate([mesh.cells, start + face.reshape(-1, 4)], axis=1),
-        "tetra_faces",
-        node_sets={
-            name: np.concatenate([nodes, start + np.unique(face[_face_rows_of_set(mesh, name, nodes, corners)])])
-            for name, nodes in mesh.node_sets.items()
-        },
-        element_sets=mesh.element_sets,
-        surface_sets=mesh.surface_sets,
-        name=mesh.name,
-        path=mesh.path,
-    )
+    sets = {
+        name: np.concatenate([nodes, start + np.unique(face[_face_rows_of_set(mesh, name, nodes, corners)])])
+        for name, nodes in mesh.node_sets.items()
+    }
+    points, cells = np.concatenate([mesh.points, added]), np.hstack([mesh.cells, start + face.reshape(-1, 4)])
+    return replace(mesh, points=points, cells=cells, cell_type="tetra_faces", node_sets=sets)
 
 
 def _face_rows_of_set(mesh: Mesh, name: str, nodes: Ints, corners: Ints) -> Ints:
