@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-__all__ = ["CASES", "DTYPES", "Answer", "Case", "Setting", "Skipped", "case", "label"]
+__all__ = ["CASES", "DTYPES", "FLOAT32_REFUSAL", "Answer", "Case", "Setting", "Skipped", "case", "label"]
 
 
 DTYPES = ("float64", "float32")
@@ -117,20 +117,25 @@ def label(name: str, value: Any) -> str:
     return f"{name}/{'-'.join(f'{x:g}' if isinstance(x, float) else str(x) for x in parts)}"
 
 
+FLOAT32_REFUSAL = {"float32": ("float32",)}
+"""Refusal of rows that float32 can't hold."""
 CASES: dict[str, Case] = {}
 """Cases by name, in the order of their definition."""
 
 
 def case(
     name: str, group: str, *, values: Sequence[Any] = (None,), quick: str = "none",
-    refusal: Mapping[str, Sequence[str]] | None = None, must_refuse: bool = False, dtypes: Sequence[str] = DTYPES,
+    refusal: Mapping[str, Sequence[str]] | Sequence[str] = (), must_refuse: bool = False,
+    dtypes: Sequence[str] = DTYPES, description: str = "",
 ) -> Callable[[Callable[..., Answer]], Callable[..., Answer]]:  # fmt: skip
-    """Add a function to `CASES`; see Case. The first line of its docstring is the description."""
+    """Add a function to `CASES`; see Case. The first line of its docstring is the default description; refusal without
+    precisions is for both."""
 
     def add(run: Callable[..., Answer]) -> Callable[..., Answer]:
-        texts = {dtype: tuple(t) for dtype, t in (refusal or {}).items()}
-        description = (run.__doc__ or "").strip().splitlines()[0]
-        CASES[name] = Case(name, group, run, tuple(values), quick, texts, must_refuse, description, tuple(dtypes))
+        known = refusal if isinstance(refusal, Mapping) else dict.fromkeys(DTYPES if refusal else (), refusal)
+        texts = {dtype: tuple(t) for dtype, t in known.items()}
+        about = description or (run.__doc__ or "").strip().splitlines()[0]
+        CASES[name] = Case(name, group, run, tuple(values), quick, texts, must_refuse, about, tuple(dtypes))
         return run
 
     return add

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import pathlib
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 import warpfea as wf
 
 from ..build import CLAMPED_SLOTS, beam, solve
-from ..case import Answer, Setting, Skipped, case
+from ..case import FLOAT32_REFUSAL, Answer, Setting, case
 
 ELASTICA_TIP = np.array([-0.056432, -0.301721])
 """Displacement of the tip along and across, over the length, at F L^2 / (E I) = 1 (Mattiasson 1981)."""
@@ -28,7 +29,7 @@ CLAMPED_FRACTION = 0.03
 """Clamped fraction of the length, from the low end."""
 
 
-@case("elastica", "bending", values=SLENDERNESS_RATIOS, quick="both", refusal={"float32": ["float32"]})
+@case("elastica", "bending", values=SLENDERNESS_RATIOS, quick="both", refusal=FLOAT32_REFUSAL)
 def elastica(setting: Setting, slenderness: float) -> Answer:
     """A cantilever of 16 beam elements bent by F L^2 = E I in five load steps."""
     E, side = 2e11, 1.0 / slenderness
@@ -47,11 +48,9 @@ def annulus_map(X: np.ndarray) -> np.ndarray:
     return np.column_stack([X[:, 0] * np.cos(angle), X[:, 0] * np.sin(angle), X[:, 2]])
 
 
-@case("annular", "bending", values=(3, "auto"), quick="float64", refusal={"float32": ["float32"]})
+@case("annular", "bending", values=(3, "auto"), quick="float64", refusal=FLOAT32_REFUSAL)
 def annular_plate(setting: Setting, load_steps: int | str) -> Answer:
     """The slit annular plate of Sze: one side of the slit is lifted by 0.8 N/m, the other clamped."""
-    if load_steps == "auto" and "auto" not in (wf.solve_static.__doc__ or ""):
-        raise Skipped("no option")
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     mesh = wf.mesh.grid((OUTER - INNER, 1.0), cells=(4, 32), origin=(INNER, 0.0, 0.0), map=annulus_map)
     body = b.add_shell(mesh, thickness=THICKNESS, material=wf.SVK(E=21e6, nu=0.0), name="annulus")
@@ -93,19 +92,7 @@ def solve_soft_solid(setting: Setting, name: str) -> Answer:
     return found.stats.answer(error, 1e-3 if setting.single else 1e-6, "the wall carries the weight", limits=limits)
 
 
-@case("soft-mat", "soft solids")
-def soft_mat(setting: Setting) -> Answer:
-    """A neo-Hookean mat of unstructured T4 bends by most of its length in two load steps."""
-    return solve_soft_solid(setting, "mat")
-
-
-@case("soft-dolphin", "soft solids")
-def soft_dolphin(setting: Setting) -> Answer:
-    """A neo-Hookean dolphin of unstructured T4 bends by most of its length in two load steps."""
-    return solve_soft_solid(setting, "dolphin")
-
-
-@case("soft-thin-limbs", "soft solids")
-def soft_thin_limbs(setting: Setting) -> Answer:
-    """A neo-Hookean body with thin limbs of unstructured T4 bends by most of its length in two load steps."""
-    return solve_soft_solid(setting, "thin_limbs")
+for _name, _what in {"mat": "mat", "dolphin": "dolphin", "thin_limbs": "body with thin limbs"}.items():
+    _text = f"A neo-Hookean {_what} of unstructured T4 bends by most of its length in two load steps."
+    _run = functools.partial(solve_soft_solid, name=_name)
+    case(f"soft-{_name.replace('_', '-')}", "soft solids", description=_text)(_run)

@@ -9,7 +9,7 @@ import numpy as np
 
 import warpfea as wf
 
-from ..build import StepStats, Z, finalize
+from ..build import StepStats, beam, finalize
 from ..case import Answer, Setting, case
 
 GROUP = "Stability"
@@ -36,12 +36,8 @@ def _stability_answer(b: wf.ModelBuilder, setting: Setting, stable: bool, refere
 def _column_model(factor: float, transverse: float = 0.0) -> wf.ModelBuilder:
     """A cantilever of 16 beam elements under so many times Euler's load, and the fraction `transverse` of it across."""
     load = factor * np.pi**2 * MODULUS * SIDE**4 / 12.0 / (4.0 * LENGTH**2)
-    b = wf.ModelBuilder(gravity=(0, 0, 0))
-    body = b.add_beam([(0, 0, 0), (LENGTH, 0, 0)], elements=16, section=wf.Rectangle(SIDE, SIDE), normal=Z,
-                      material=wf.SVK(E=MODULUS, nu=0.0), name="column")  # fmt: skip
-    b.clamp(body.start, slots="position+section")
+    b, body = beam(16, SIDE, wf.SVK(E=MODULUS, nu=0.0), LENGTH)
     b.add_point_load(body.end, (-load, 0.0, transverse * load))
-    b.add_probe("tip", body.end)
     return b
 
 

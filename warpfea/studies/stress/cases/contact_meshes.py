@@ -8,9 +8,9 @@ import numpy as np
 
 import warpfea as wf
 
-from ..case import Answer, Setting, case
+from ..case import FLOAT32_REFUSAL, Answer, Setting, case
 from . import contact
-from .contact import IMPACT_SPEED, SIDE, bound_for, center_of_mass, edge_down, make_scene, simulate, vertex_down
+from .contact import SIDE, bound_for, center_of_mass, edge_down, make_scene, simulate, vertex_down
 
 SQUARE_TRIANGLES = np.array([(0, 1, 2), (0, 2, 3)])
 
@@ -52,11 +52,7 @@ def impact(setting: Setting, value: tuple[str, float]) -> Answer:
     shape = square_sheet()
     if way == "behind":
         shape = wf.TriMesh(shape.points, shape.triangles[:, ::-1])
-    s = make_scene(shape, E=E, gravity=(0, 0, 0), translation=(0, 0, 0.3), mu=0.3, restitution=0.5)
-    s.builder.set_initial(s.body, velocity=(0, 0, -IMPACT_SPEED))
-    sim = wf.Simulation(s.model(setting), dt=1e-2)
-    run = simulate(sim, s, 5, mu=0.3)
-    return run.answer(setting, max(run.center_depth, 0.0), 0.0, "the centre stays before the obstacle")
+    return contact.strike(setting, shape, E)
 
 
 FEATURES: dict[str, tuple[Callable[[], wf.TriMesh], Callable[[], np.ndarray]]] = {
@@ -68,7 +64,7 @@ FEATURES: dict[str, tuple[Callable[[], wf.TriMesh], Callable[[], np.ndarray]]] =
 }
 
 
-@case("contact-mesh", contact.GROUP, values=tuple(FEATURES), quick="float64", refusal=contact.FLOAT32_REFUSAL)
+@case("contact-mesh", contact.GROUP, values=tuple(FEATURES), quick="float64", refusal=FLOAT32_REFUSAL)
 def feature_contact(setting: Setting, which: str) -> Answer:
     """A turned cube falls at 1 m/s with its vertex or edge on one of a mesh, 40 steps: no penetration, the
     change of its momentum is the impulse, and no energy is gained."""
@@ -81,7 +77,7 @@ def feature_contact(setting: Setting, which: str) -> Answer:
     run = simulate(sim, s, 40, mu=0.3)
     sunk = float(sim.contact_record(s.contacts[0]).penetration[0].max()) / SIDE
     limits = {"through": (run.center_depth, 0.0), "sunk": (sunk, 0.3)}
-    return run.answer(setting, None, bound_for(setting, 1e-6, 1e-2), "impulse of the records", limits=limits)
+    return run.impulse_answer(setting, limits=limits)
 
 
 @case("contact-mesh-touch", contact.GROUP, values=("sheet", "borders", "same faces", "tip"), quick="both")
@@ -103,4 +99,4 @@ def exact_touch(setting: Setting, which: str) -> Answer:
     limits = {"sunk": (sunk, 0.05)}
     if which != "tip":  # it slides off, as four slopes of 45 degrees and mu = 0.5 allow
         limits["shifted"] = (shifted, bound_for(setting, 1e-3, 1e-2))
-    return run.answer(setting, None, bound_for(setting, 1e-6, 1e-2), "impulse of the records", limits=limits)
+    return run.impulse_answer(setting, limits=limits)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ from scipy.integrate import solve_ivp
 
 import warpfea as wf
 
-from ..build import StepStats, X, Y, Z, finalize
+from ..build import STEEL, StepStats, X, Y, Z, finalize
 from ..case import Answer, Setting, case
 
 GRAVITY = 9.81
@@ -19,8 +20,12 @@ LIGHT, RATIO = 10.0, 1e6
 """Density of the light links, kg/m^3, and the mass ratio of the others."""
 
 
-def _violation_bound(setting: Setting) -> float:
-    return 1e-5 if setting.single else 1e-8
+def _joint_answer(
+    setting: Setting, stats: StepStats, error: float, bound: float, reference: str, note: str = ""
+) -> Answer:
+    """Answer of a case with joints, whose violation is limited."""
+    limits = {"violation": (stats.violation or 0.0, 1e-5 if setting.single else 1e-8)}
+    return Answer(error, bound, reference, **stats.answer_fields, limits=limits, note=note)
 
 
 def _add_links(
@@ -79,21 +84,7 @@ def mass_ratio(setting: Setting, value: str) -> Answer:
     exact = LINK_LENGTH * np.cumsum(ways, axis=1)
     got = np.stack([sim.probe(name).position[0] for name in ("elbow", "tip")], axis=1)
     error = float(np.linalg.norm(got - exact, axis=2).max() / (2.0 * LINK_LENGTH))
-    return Answer(error, 5e-3 if setting.single else 1e-3, "rigid double pendulum by scipy", **stats.answer_fields,
-                  limits={"violation": (stats.violation or 0.0, _violation_bound(setting))})  # fmt: skip
-
-
-@case("mass-ratio-chain", "Joints", values=("fixed", "revolute"), quick="both")
-def mass_ratio_chain(setting: Setting, kind: str) -> Answer:
-    """Six hanging links at rest, alternately light and 1e6 times as heavy: force of every joint against the weight."""
-    densities = [LIGHT, RATIO * LIGHT] * 3
-    return _chain_forces(setting, kind, densities, 0.0)
-
-
-@case("chain-1e3", "Joints", values=("fixed", "revolute"), quick="both")
-def loaded_chain(setting: Setting, kind: str) -> Answer:
-    """Ten hanging links at rest with a load of 1000 times a link's weight at their end."""
-    return _chain_forces(setting, kind, [1000.0] * 10, 1000.0)
+    return _joint_answer(setting, stats, error, 5e-3 if setting.single else 1e-3, "rigid double pendulum by scipy")
 
 
 def _chain_forces(setting: Setting, kind: str, densities: list[float], load: float) -> Answer:
@@ -116,8 +107,15 @@ def _chain_forces(setting: Setting, kind: str, densities: list[float], load: flo
     below = np.cumsum(weights[::-1])[::-1] + load * weights[0]
     got = np.array([sim.joint_force(joint)[0, :3] for joint in joints])
     error = float((np.linalg.norm(got - below[:, None] * np.array(Z), axis=1) / below).max())
-    return Answer(error, 1e-3 if setting.single else 1e-6, "weight below", **stats.answer_fields,
-                  limits={"violation": (stats.violation or 0.0, _violation_bound(setting))})  # fmt: skip
+    return _joint_answer(setting, stats, error, 1e-3 if setting.single else 1e-6, "weight below")
+
+
+case("mass-ratio-chain", "Joints", values=("fixed", "revolute"), quick="both", description="Six hanging links at rest, "
+     "alternately light and 1e6 times as heavy: force of every joint against the weight.")(
+    functools.partial(_chain_forces, densities=[LIGHT, RATIO * LIGHT] * 3, load=0.0))  # fmt: skip
+case("chain-1e3", "Joints", values=("fixed", "revolute"), quick="both", description="Ten hanging links at rest with a "
+     "load of 1000 times a link's weight at their end.")(
+    functools.partial(_chain_forces, densities=[1000.0] * 10, load=1000.0))  # fmt: skip
 
 
 @case("joints", "Joints", values=("redundant", "dead-point"), quick="both")
@@ -139,8 +137,7 @@ def _redundant_hinges(setting: Setting) -> Answer:
     weight = 600.0 * 0.4 * 0.04 * 0.8 * GRAVITY
     total = sum(sim.joint_force(hinge)[0] for hinge in hinges)
     error = float(np.linalg.norm(total[:3] - weight * np.array(Z)) / weight)
-    return Answer(error, 1e-3 if setting.single else 1e-6, "weight of the door", **stats.answer_fields,
-                  limits={"violation": (stats.violation or 0.0, _violation_bound(setting))})  # fmt: skip
+    return _joint_answer(setting, stats, error, 1e-3 if setting.single else 1e-6, "weight of the door")
 
 
 def _dead_point(setting: Setting) -> Answer:
@@ -149,7 +146,6 @@ def _dead_point(setting: Setting) -> Answer:
     """
     crank, coupler, h = 0.2, 0.5, 2e-3
     b = wf.ModelBuilder(gravity=(0, 0, 0))
-    law = wf.SVK(E=2e11, nu=0.3, density=7800.0)
     start = 0.5
     arm = crank * np.array([np.cos(start), 0.0, np.sin(start)])
     span = coupler * np.array(X)
@@ -157,7 +153,7 @@ def _dead_point(setting: Setting) -> Answer:
 
     def bar(a: Any, c: Any, name: str) -> wf.Body:
         along = np.asarray(c) - np.asarray(a)
-        return b.add_beam([a, c], elements=1, section=section, normal=np.cross(along, Y), material=law, name=name)
+        return b.add_beam([a, c], elements=1, section=section, normal=np.cross(along, Y), material=STEEL, name=name)
 
     first, second = bar(0.0 * arm, arm, "crank"), bar(span, span + arm, "follower")
     rod = bar(arm, span + arm, "coupler")
@@ -181,16 +177,11 @@ def _dead_point(setting: Setting) -> Answer:
     exact = crank * np.stack([np.cos(angle), 0.0 * angle, np.sin(angle)], axis=1)
     error = max(float(np.abs(lengths - 1.0).max()), float(np.linalg.norm(pin - exact, axis=1).max() / crank))
     away = float(np.linalg.norm(far - pin - span, axis=1).max())
-    return Answer(error, 1e-3, "rigid bars", **stats.answer_fields,
-                  limits={"violation": (stats.violation or 0.0, _violation_bound(setting))},
-                  note="stays a parallelogram" if away < 1e-2 * coupler else "crosses over")  # fmt: skip
+    note = "stays a parallelogram" if away < 1e-2 * coupler else "crosses over"
+    return _joint_answer(setting, stats, error, 1e-3, "rigid bars", note)
 
 
-REFUSAL_TEXTS = ("constraints could not be satisfied",)
-
-
-@case("joints-conflicting", "Joints", quick="both", must_refuse=True,
-      refusal={"float64": REFUSAL_TEXTS, "float32": REFUSAL_TEXTS})  # fmt: skip
+@case("joints-conflicting", "Joints", quick="both", must_refuse=True, refusal=("constraints could not be satisfied",))
 def conflicting_pins(setting: Setting) -> Answer:
     """One point pinned to two positions is refused with the names of the pins."""
     b = wf.ModelBuilder(gravity=(0, 0, 0))

@@ -9,8 +9,8 @@ import scipy.sparse.linalg
 
 import warpfea as wf
 
-from ..build import GRAVITY_VECTOR, REFERENCE_TOL, STEEL, StepStats, bar, relative_error, solve
-from ..case import Answer, Setting, case
+from ..build import GRAVITY_VECTOR, REFERENCE_TOL, STEEL, StepStats, bar, finalize, relative_error, solve
+from ..case import FLOAT32_REFUSAL, Answer, Setting, case
 
 SIZE, CELLS = (1.0, 0.1, 0.1), (10, 1, 1)
 STEP_SIZES = tuple(10.0**k for k in range(-8, 7))
@@ -61,10 +61,8 @@ def linear_tip(h: float, device: str) -> np.ndarray:
 
 def stepped_tip(law: wf.SVK, h: float, setting: Setting, tol: float | None = None) -> tuple[np.ndarray, StepStats]:
     """Displacement of the tip (3,), m, after three steps h from the straight state at rest."""
-    sim = wf.Simulation(
-        clamped_bar(law)[0].finalize(device=setting.device, dtype=setting.dtype), dt=h,
-        solver=wf.NewtonPCG(tol=tol, max_pcg=20000),
-    )  # fmt: skip
+    model = finalize(clamped_bar(law)[0], setting)
+    sim = wf.Simulation(model, dt=h, solver=wf.NewtonPCG(tol=tol, max_pcg=20000))
     stats = StepStats()
     stats.step(sim, 3)
     return sim.probe("tip").displacement[0, -1], stats
@@ -86,8 +84,7 @@ def long_steps(setting: Setting, h: float) -> Answer:
 @case("long-stay", "long steps", values=STEP_SIZES, quick="float64")
 def stay_in_equilibrium(setting: Setting, h: float) -> Answer:
     """The bar from its static equilibrium, which it keeps."""
-    b, _ = clamped_bar(STEEL)
-    model = b.finalize(device=setting.device, dtype=setting.dtype)
+    model = finalize(clamped_bar(STEEL)[0], setting)
     state = wf.solve_static(model, load_steps=1).state
     before = tip_displacement(model, state)
     sim = wf.Simulation(model, state, dt=h, solver=wf.NewtonPCG(max_pcg=20000))
@@ -116,14 +113,13 @@ def soft_bar(setting: Setting, h: float) -> Answer:
         source = "the same in float64, tol 1e-10"
     limits = {"Newton of a step": (stats.worst_newton, at_once + 2), "halvings": (stats.halvings, 0)}
     error = relative_error(tip, reference)
-    return stats.answer(
-        error, BOUNDS[setting.dtype], source, reported_error=stats.sum_of_floors, limits=limits, largest_step=h
-    )  # fmt: skip
+    floors, bound = stats.sum_of_floors, BOUNDS[setting.dtype]
+    return stats.answer(error, bound, source, reported_error=floors, limits=limits, largest_step=h)
 
 
 @case(
     "free-fall", "long steps", values=tuple((law, 10.0**k) for law in CUBE_LAWS for k in range(-3, 4)), quick="float64",
-    refusal={"float32": ["float32"]},
+    refusal=FLOAT32_REFUSAL,
 )  # fmt: skip
 def free_fall(setting: Setting, value: tuple[str, float]) -> Answer:
     """A free cube of 10 m falls for three steps, up to a million times its size."""
@@ -131,7 +127,7 @@ def free_fall(setting: Setting, value: tuple[str, float]) -> Answer:
     b = wf.ModelBuilder(gravity=GRAVITY_VECTOR)
     mesh = wf.mesh.box((CUBE_SIZE,) * 3, cells=(2, 2, 2))
     body = b.add_solid(mesh, material=CUBE_LAWS[law], name="cube")
-    sim = wf.Simulation(b.finalize(device=setting.device, dtype=setting.dtype), dt=h)
+    sim = wf.Simulation(finalize(b, setting), dt=h)
     stats = StepStats()
     stats.step(sim, 3)
     velocity = np.array(GRAVITY_VECTOR) * 3.0 * h

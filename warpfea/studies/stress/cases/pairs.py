@@ -14,14 +14,14 @@ import numpy as np
 import warpfea as wf
 
 from ..build import GRAVITY_VECTOR, StepStats
-from ..case import DTYPES, Answer, Setting, case
+from ..case import DTYPES, FLOAT32_REFUSAL, Answer, Setting, case
 from .contact import ContactMotion, bound_for, edge_down, momentum, total_energy, vertex_down
 
 GROUP = "pairs"
 SIDE, DENSITY, GRAVITY = 0.1, 1000.0, 9.81
-REFUSAL_TEXTS = {dtype: ["through body", "inverted", "J <= 0"] for dtype in DTYPES}
-REFUSAL_TEXTS["float32"].append("float32")
-FLOAT32_REFUSAL = {"float32": ["float32"]}
+REFUSAL_TEXTS = {
+    dtype: ["through body", "inverted", "J <= 0", *more] for dtype, more in zip(DTYPES, ((), ("float32",)))
+}
 IMPACT_SPEED = 100.0
 """Speed of impacts, m/s."""
 
@@ -158,7 +158,7 @@ def stiff_on_soft(setting: Setting, E: tuple[float, float]) -> Answer:
     s = cube_on_plate(E=E, position=(0, 0, 0.01 * SIDE), mu=0.5, restitution=0.5)
     s.builder.set_initial(s.upper, velocity=(0, 0, -0.3))
     run = simulate(wf.Simulation(s.model(setting), dt=1e-3), s, 30, mu=0.5)
-    return run.answer(setting, None, bound_for(setting, 1e-6, 1e-2), "impulse of the records")
+    return run.impulse_answer(setting)
 
 
 ROTATIONS: dict[str, Any] = {"face": None, "edge": edge_down(), "vertex": vertex_down()}
@@ -172,7 +172,7 @@ def landing(setting: Setting, value: tuple[str, str]) -> Answer:
     s = cube_on_plate(rotation=ROTATIONS[name], position=(spot, spot, 0.005), mu=0.3, restitution=0.5, across=3)
     s.builder.set_initial(s.upper, velocity=(0, 0, -1.0))
     run = simulate(wf.Simulation(s.model(setting), dt=1e-3), s, 40)
-    return run.answer(setting, None, bound_for(setting, 1e-6, 1e-2), "impulse of the records")
+    return run.impulse_answer(setting)
 
 
 @case("pairs-touch", GROUP, values=("plate", "same faces"), quick="both", refusal=FLOAT32_REFUSAL)
@@ -181,7 +181,7 @@ def exact_touch(setting: Setting, name: str) -> Answer:
     same: dict[str, Any] = {"width": SIDE, "across": 2} if name == "same faces" else {}
     s = cube_on_plate(mu=0.5, restitution=0.5, **same)
     run = simulate(wf.Simulation(s.model(setting), dt=1e-3), s, 50, mu=0.5)
-    return run.answer(setting, None, bound_for(setting, 1e-6, 1e-2), "impulse of the records")
+    return run.impulse_answer(setting)
 
 
 @case("pairs-rest", GROUP, values=(1e-3, 1.0, 1e3), quick="float64", refusal=FLOAT32_REFUSAL)
@@ -203,8 +203,7 @@ def over_the_edge(setting: Setting, mu: float) -> Answer:
     s = cube_on_plate(position=(SIDE, 0, 0), mu=mu, restitution=0.5)
     s.builder.set_initial(s.upper, velocity=(2.0, 0, 0))
     run = simulate(wf.Simulation(s.model(setting), dt=1e-3), s, 120)
-    return run.answer(setting, None, bound_for(setting, 1e-6, 1e-2), "impulse of the records",
-                       limits={"centre past the other body": (0.0, 0.0)})  # fmt: skip
+    return run.impulse_answer(setting, limits={"centre past the other body": (0.0, 0.0)})
 
 
 @case("pairs-mu", GROUP, values=(0.0, 10.0), quick="float64")
@@ -213,7 +212,7 @@ def extreme_friction(setting: Setting, mu: float) -> Answer:
     s = cube_on_plate(position=(-0.5 * SIDE, 0, 0), E=(1e6, 1e8), mu=mu, restitution=0.5)
     s.builder.set_initial(s.upper, velocity=(1.0, 0, 0))
     run = simulate(wf.Simulation(s.model(setting), dt=1e-3), s, 50, mu=mu)
-    return run.answer(setting, None, bound_for(setting, 1e-6, 1e-2), "impulse of the records")
+    return run.impulse_answer(setting)
 
 
 @case("pairs-spin", GROUP, values=(1.0, 30.0), quick="float64")

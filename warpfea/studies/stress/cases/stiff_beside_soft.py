@@ -10,7 +10,7 @@ import numpy as np
 import warpfea as wf
 
 from ..build import REFERENCE_TOL, StepStats, relative_error
-from ..case import Answer, Setting, case
+from ..case import FLOAT32_REFUSAL, Answer, Setting, case
 
 SOFT, HARD = wf.SVK(E=2e5, nu=0.3, density=1000.0), wf.SVK(E=2.1e11, nu=0.3, density=7850.0)
 BLOCK_TENSION = 1e9
@@ -89,13 +89,10 @@ def evaluate(setting: Setting, kind: str, motion: bool) -> Answer:
     return stats.answer(error, BOUNDS[setting.dtype], REFERENCE, limits=limits)
 
 
-@case("stiff-beside-soft", "Stiff beside soft", values=CONNECTIONS, quick="both", refusal={"float32": ["float32"]})
-def statics(setting: Setting, value: str) -> Answer:
-    """A soft arm (2e5 Pa), or a slender one of steel, sags on a steel block under 1e9 Pa across it; four load steps."""
-    return evaluate(setting, value, False)
-
-
-@case("stiff-beside-soft-motion", "Stiff beside soft", values=CONNECTIONS, refusal={"float32": ["float32"]})
-def motion(setting: Setting, value: str) -> Answer:
-    """The arm released, 300 steps of backward Euler of 50 ms."""
-    return evaluate(setting, value, True)
+for _name, _motion, _quick, _text in (
+    ("stiff-beside-soft", False, "both",
+     "A soft arm (2e5 Pa), or a slender one of steel, sags on a steel block under 1e9 Pa across it; four load steps."),
+    ("stiff-beside-soft-motion", True, "none", "The arm released, 300 steps of backward Euler of 50 ms."),
+):  # fmt: skip
+    _run = functools.partial(evaluate, motion=_motion)
+    case(_name, "Stiff beside soft", values=CONNECTIONS, quick=_quick, refusal=FLOAT32_REFUSAL, description=_text)(_run)

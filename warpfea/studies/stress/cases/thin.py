@@ -9,7 +9,7 @@ import numpy as np
 import warpfea as wf
 
 from ..build import CLAMPED_SLOTS, GRAVITY_VECTOR, REFERENCE_TOL, STEEL, StepStats, bar, beam, relative_error, solve
-from ..case import Answer, Setting, case
+from ..case import FLOAT32_REFUSAL, Answer, Setting, case
 
 SAG = 0.05
 """Tip deflection by Euler-Bernoulli theory, for the length of 1 m."""
@@ -52,9 +52,7 @@ def reference_tip(value: str, device: str) -> np.ndarray:
     return solve(thin_body(value), Setting(device, "float64"), load_steps=LOAD_STEPS, tol=REFERENCE_TOL).tip
 
 
-@case(
-    "thin-static", "thin", values=(*SOLIDS, *STRUCTURES), quick="both", refusal={"float32": ["float32"]},
-)  # fmt: skip
+@case("thin-static", "thin", values=(*SOLIDS, *STRUCTURES), quick="both", refusal=FLOAT32_REFUSAL)
 def thin_static(setting: Setting, value: str) -> Answer:
     """Statics of bodies of slenderness 50 to 5000 bent by 5 % of their length."""
     found = solve(thin_body(value), setting, load_steps=LOAD_STEPS)
@@ -87,7 +85,7 @@ def reference_motion(value: str, device: str) -> np.ndarray:
     return released_bar(value, device, "float64", REFERENCE_TOL)[0]
 
 
-@case("thin-dynamic", "thin", values=("T10-50", "T10-500"), quick="both", refusal={"float32": ["float32"]})
+@case("thin-dynamic", "thin", values=("T10-50", "T10-500"), quick="both", refusal=FLOAT32_REFUSAL)
 def thin_dynamic(setting: Setting, value: str) -> Answer:
     """A clamped steel bar released under its weight, 0.3 s."""
     path, stats = released_bar(value, setting.device, setting.dtype, None)
