@@ -38,14 +38,9 @@ def beam_over_cylinders(
     """
     b = wf.ModelBuilder(gravity=(0.0, 0.0, -9.81))
     height = radius + drop + 0.5 * side
-    beam = b.add_beam(
-        [(-0.5 * length, 0, height), (0.5 * length, 0, height)],
-        elements=elements,
-        section=wf.Rectangle(side, side),
-        normal=(0, 0, 1),
-        material=wf.SVK(E=E, nu=nu, density=density, damping=wf.KelvinVoigt(viscosity, 0.0)),
-        name="beam",
-    )
+    ends, section = [(-0.5 * length, 0, height), (0.5 * length, 0, height)], wf.Rectangle(side, side)
+    law = wf.SVK(E=E, nu=nu, density=density, damping=wf.KelvinVoigt(viscosity, 0.0))
+    beam = b.add_beam(ends, elements=elements, section=section, normal=(0, 0, 1), material=law, name="beam")
     for name, x in (("left", -0.5 * span), ("right", 0.5 * span)):
         shape = wf.Cylinder(start=(x, -3.0 * side, 0.0), end=(x, 3.0 * side, 0.0), radius=radius)
         cylinder = b.add_collider(shape, name=f"{name} cylinder")

@@ -48,15 +48,10 @@ def double_pendulum(
     here = lower.mesh.bounding_box()[0][0]
     axis = (0, -1, 0)
     first = upper.nodes(lambda X: X[:, 0] < low[0] + hold)
+    last = upper.nodes(lambda X: X[:, 0] > low[0] + size[0] - hold)
+    next_first = lower.nodes(lambda X: X[:, 0] < here + hold)
     b.add_joint("revolute", parent=wf.GROUND, child=first, anchor=(0, -0.5 * width, 0), axis=axis, name="pivot")
-    b.add_joint(
-        "revolute",
-        parent=upper.nodes(lambda X: X[:, 0] > low[0] + size[0] - hold),
-        child=lower.nodes(lambda X: X[:, 0] < here + hold),
-        anchor=(length, 0, 0),
-        axis=axis,
-        name="elbow",
-    )
+    b.add_joint("revolute", parent=last, child=next_first, anchor=(length, 0, 0), axis=axis, name="elbow")
     b.add_probe("elbow", upper.surface("x+"))
     b.add_probe("tip", lower.surface("x+"))
     return b

@@ -45,10 +45,8 @@ def finger_beam_shell(
     )  # fmt: skip
     mesh = wf.mesh.box((0.015, 0.03, 0.06), cells=(1, 2, 3), origin=(-0.01, -0.015, 0.004))
     finger = b.add_solid(mesh, material=wf.NeoHookean.from_E_nu(E=finger_E, nu=0.4, density=density), name="finger")
-    b.drive(
-        finger.nodes("z+"),
-        displacement=([0.0, 0.1, duration, 2.0], [(0, 0, 0), (0, 0, 0), (travel, 0, 0), (travel, 0, 0)]),
-    )
+    way = ([0.0, 0.1, duration, 2.0], [(0, 0, 0), (0, 0, 0), (travel, 0, 0), (travel, 0, 0)])
+    b.drive(finger.nodes("z+"), displacement=way)
     options: dict[str, Any] = {"mu": mu, "restitution": 0.3, "stiffness": stiffness}
     b.add_contact(beam, shell.surface("top"), name="table", **options)
     b.add_contact(finger.surface("x+"), beam, name="push", **options)

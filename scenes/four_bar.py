@@ -58,14 +58,9 @@ def four_bar(
     knee = pin + line * along / d + across
 
     def bar(name: str, ends: list[np.ndarray], width: float, count: int) -> wf.Body:
-        return b.add_beam(
-            ends,
-            elements=count,
-            section=wf.Rectangle(width, width),
-            normal=np.cross([0.0, -1.0, 0.0], ends[1] - ends[0]),
-            material=wf.SVK(E=E, nu=nu, density=density),
-            name=name,
-        )
+        section, law = wf.Rectangle(width, width), wf.SVK(E=E, nu=nu, density=density)
+        normal = np.cross([0.0, -1.0, 0.0], ends[1] - ends[0])
+        return b.add_beam(ends, elements=count, section=section, normal=normal, material=law, name=name)
 
     arm = bar("crank", [np.zeros(3), pin], 1.6 * side, 2)
     link = bar("coupler", [pin, knee], side, elements)

@@ -44,12 +44,9 @@ def hung_plate(
     """
     b = wf.ModelBuilder(gravity=(0.0, 0.0, -9.81))
     half = 0.5 * size
-    plate = b.add_shell(
-        wf.mesh.grid((size, size), cells=(cells, cells), origin=(-half, -half, 0.0)),
-        thickness=thickness,
-        material=wf.SVK(E=E, nu=nu, density=density, damping=wf.KelvinVoigt(eta=eta) if eta else None),
-        name="plate",
-    )
+    mesh = wf.mesh.grid((size, size), cells=(cells, cells), origin=(-half, -half, 0.0))
+    law = wf.SVK(E=E, nu=nu, density=density, damping=wf.KelvinVoigt(eta=eta) if eta else None)
+    plate = b.add_shell(mesh, thickness=thickness, material=law, name="plate")
     for k, (x, y) in enumerate(((-half, -half), (half, -half), (half, half), (-half, half))):
         corner = plate.at((x, y, 0.0))
         b.add_joint("distance", parent=wf.GROUND, child=corner, anchor=(x, y, rod), name=f"rod {k + 1}")

@@ -39,14 +39,8 @@ def mixed(
     b = wf.ModelBuilder(gravity=(0.0, 0.0, -9.81))
     material = wf.SVK(E=E, nu=nu, density=density)
 
-    beam = b.add_beam(
-        [(0, 0, 0), (length, 0, 0)],
-        elements=cells,
-        section=wf.Rectangle(width, height),
-        normal=(0, 0, 1),
-        material=material,
-        name="beam",
-    )
+    ends, section = [(0, 0, 0), (length, 0, 0)], wf.Rectangle(width, height)
+    beam = b.add_beam(ends, elements=cells, section=section, normal=(0, 0, 1), material=material, name="beam")
     b.clamp(beam.start, slots="position+section")
     b.add_probe("beam", beam.end)
 

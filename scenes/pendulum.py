@@ -33,14 +33,9 @@ def pendulum(
         integration: tied (without locking), split or full.
     """
     b = wf.ModelBuilder(gravity=(0.0, 0.0, -9.81))
+    ends, section, law = [(0, 0, 0), (length, 0, 0)], wf.Rectangle(side, side), wf.SVK(E=E, nu=nu, density=density)
     beam = b.add_beam(
-        [(0, 0, 0), (length, 0, 0)],
-        elements=elements,
-        section=wf.Rectangle(side, side),
-        normal=(0, 0, 1),
-        material=wf.SVK(E=E, nu=nu, density=density),
-        integration=integration,
-        name="beam",
+        ends, elements=elements, section=section, normal=(0, 0, 1), material=law, integration=integration, name="beam"
     )
     b.clamp(beam.start, slots="position")
     b.add_probe("tip", beam.end)

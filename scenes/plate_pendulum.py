@@ -33,13 +33,8 @@ def plate_pendulum(
         integration: tied (without locking) or full.
     """
     b = wf.ModelBuilder(gravity=(0.0, 0.0, -9.81))
-    plate = b.add_shell(
-        wf.mesh.grid((size, size), cells=(cells, cells)),
-        thickness=thickness,
-        material=wf.SVK(E=E, nu=nu, density=density),
-        integration=integration,
-        name="plate",
-    )
+    mesh, law = wf.mesh.grid((size, size), cells=(cells, cells)), wf.SVK(E=E, nu=nu, density=density)
+    plate = b.add_shell(mesh, thickness=thickness, material=law, integration=integration, name="plate")
     b.clamp(plate.nodes(lambda X: X[:, 0] + X[:, 1] < 1e-9), slots="position")
     b.add_probe("tip", plate.at((size, size, 0)))
     b.add_probe("side", plate.at((size, 0, 0)))

@@ -45,16 +45,10 @@ def rollup(
         integration: tied (without locking), split or full.
     """
     b = wf.ModelBuilder(gravity=(0.0, 0.0, 0.0))
-    section = wf.Rectangle(width, height)
-    material = wf.SVK(E=E, nu=nu, density=density, damping=wf.KelvinVoigt(eta=eta) if eta else None)
+    ends, section = [(0, 0, 0), (length, 0, 0)], wf.Rectangle(width, height)
+    law = wf.SVK(E=E, nu=nu, density=density, damping=wf.KelvinVoigt(eta=eta) if eta else None)
     beam = b.add_beam(
-        [(0, 0, 0), (length, 0, 0)],
-        elements=elements,
-        section=section,
-        normal=(0, 0, 1),
-        material=material,
-        integration=integration,
-        name="beam",
+        ends, elements=elements, section=section, normal=(0, 0, 1), material=law, integration=integration, name="beam"
     )
     b.clamp(beam.start, slots="position+section")
     b.clamp(beam.nodes(lambda X: X[:, 0] > -1.0), slots="all", components="y")

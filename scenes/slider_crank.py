@@ -43,23 +43,17 @@ def slider_crank(
     """
     b = wf.ModelBuilder(gravity=(0.0, 0.0, -gravity))
     reach = crank + rod
-    hard = wf.SVK(E=crank_E, nu=nu, density=density)
-    arm = b.add_beam(
-        [(0, 0, 0), (crank, 0, 0)],
-        elements=2,
-        section=wf.Rectangle(2.0 * side, 2.0 * side),
-        normal=(0, 0, 1),
-        material=hard,
-        name="crank",
-    )
-    link = b.add_beam(
-        [(crank, 0, 0), (reach, 0, 0)],
-        elements=elements,
-        section=wf.Rectangle(side, side),
-        normal=(0, 0, 1),
-        material=wf.SVK(E=E, nu=nu, density=density),
-        name="rod",
-    )
+
+    def bar(name: str, start: float, end: float, count: int, width: float, modulus: float) -> wf.Body:
+        ends, section, law = (
+            [(start, 0, 0), (end, 0, 0)],
+            wf.Rectangle(width, width),
+            wf.SVK(E=modulus, nu=nu, density=density),
+        )
+        return b.add_beam(ends, elements=count, section=section, normal=(0, 0, 1), material=law, name=name)
+
+    arm = bar("crank", 0, crank, 2, 2.0 * side, crank_E)
+    link = bar("rod", crank, reach, elements, side, E)
     size = 4.0 * side
     cube = wf.mesh.box((size, size, size), cells=(1, 1, 1), origin=(reach, -0.5 * size, -0.5 * size), name="slider")
     block = b.add_solid(cube, material=wf.SVK(E=crank_E, nu=nu, density=slider_mass / size**3))
