@@ -11,9 +11,9 @@ from .discretisation import Discretisation
 __all__ = ["ElementSet", "MaterialPoint", "NodeSet", "SurfaceSet"]
 
 
-@dataclass(frozen=True, eq=False)
-class NodeSet:
-    """Nodes of a body, by index in the mesh file's order (n,)."""
+@dataclass(frozen=True, eq=False, repr=False)
+class _IndexSet:
+    """Parts of a body, by index (n,)."""
 
     body: Discretisation
     indices: np.ndarray
@@ -23,10 +23,18 @@ class NodeSet:
         return len(self.indices)
 
     def __repr__(self) -> str:
-        return _describe(self, "nodes")
+        return _describe(self, "nodes" if isinstance(self, NodeSet) else "elements")
 
 
-@dataclass(frozen=True, eq=False)
+class NodeSet(_IndexSet):
+    """Nodes of a body, by index in the mesh file's order (n,)."""
+
+
+class ElementSet(_IndexSet):
+    """Elements of a body by index (n,)."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
 class SurfaceSet:
     """Faces of a body, rows (element, local face) (n, 2)."""
 
@@ -44,21 +52,6 @@ class SurfaceSet:
     def nodes(self) -> np.ndarray:
         """(n, 3, 4 or 6) node indices of each face of a solid, outward."""
         return self.body.mesh.faces(self.faces)
-
-
-@dataclass(frozen=True, eq=False)
-class ElementSet:
-    """Elements of a body by index (n,)."""
-
-    body: Discretisation
-    indices: np.ndarray
-    name: str = ""
-
-    def __len__(self) -> int:
-        return len(self.indices)
-
-    def __repr__(self) -> str:
-        return _describe(self, "elements")
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +82,7 @@ class MaterialPoint:
         return f"MaterialPoint(({place}) m of body {self.body.name!r}, element {self.element})"
 
 
-def _describe(handle: NodeSet | SurfaceSet | ElementSet, what: str) -> str:
+def _describe(handle: _IndexSet | SurfaceSet, what: str) -> str:
     """A set in one line."""
     name = f"{handle.name!r}, " if handle.name else ""
     return f"{type(handle).__name__}({name}{len(handle)} {what} of body {handle.body.name!r})"

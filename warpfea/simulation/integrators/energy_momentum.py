@@ -8,13 +8,10 @@ With rho_inf < 1 stresses include (chi/2) C0 : (E_{n+1} - E_n), chi = (1 - rho_i
 dissipation of the energy-decaying scheme of Armero and Romero (2001), without its velocity dissipation.
 """
 
-import math
-
 import warp as wp
 
-from ...base.errors import ModelError
 from ...kernels.step.step_control import Coefficients
-from .scheme import Integrator
+from .scheme import DampedIntegrator
 
 __all__ = ["EnergyMomentum", "energy_momentum"]
 
@@ -30,7 +27,7 @@ def energy_momentum(h: wp.float64, previous: wp.float64, parameter: wp.float64):
     return c
 
 
-class EnergyMomentum(Integrator):
+class EnergyMomentum(DampedIntegrator):
     """Mid-point scheme that conserves both momenta and conserves or dissipates energy, never gaining any.
 
     Args:
@@ -42,18 +39,8 @@ class EnergyMomentum(Integrator):
     """
 
     def __init__(self, *, rho_inf: float = 1.0) -> None:
-        known = isinstance(rho_inf, (int, float)) and not isinstance(rho_inf, bool)
-        if not (known and math.isfinite(rho_inf) and 0.0 <= rho_inf <= 1.0):
-            raise ModelError(f"EnergyMomentum: rho_inf = {rho_inf!r} must lie between 0 and 1")
-        super().__init__(
-            "energy_momentum", energy_momentum, order=2 if rho_inf == 1.0 else 1, takes_velocity=True, midpoint=True,
-            parameter=float(rho_inf),
-        )  # fmt: skip
-
-    @property
-    def rho_inf(self) -> float:
-        """Damping factor of strains unresolved by the step."""
-        return self.parameter
+        order = 2 if rho_inf == 1.0 else 1
+        super().__init__("energy_momentum", energy_momentum, rho_inf, order=order, takes_velocity=True, midpoint=True)
 
     @property
     def dissipation(self) -> float:
@@ -61,7 +48,4 @@ class EnergyMomentum(Integrator):
 
     @property
     def label(self) -> str:
-        return self.name if self.parameter == 1.0 else f"{self.name}(rho_inf={self.parameter!r})"
-
-    def __repr__(self) -> str:
-        return f"EnergyMomentum(rho_inf={self.parameter!r})"
+        return self.name if self.parameter == 1.0 else super().label

@@ -14,13 +14,10 @@ where index 1 denotes equal steps (Chung and Hulbert), all averages belong to th
 any steps; dq/dv is h beta_1 / gamma_1, and stiff components decay for r from 1/4 to 4 and rho_inf below 1.
 """
 
-import math
-
 import warp as wp
 
-from ...base.errors import ModelError
 from ...kernels.step.step_control import Coefficients
-from .scheme import Integrator
+from .scheme import DampedIntegrator
 
 __all__ = ["GeneralizedAlpha", "generalized_alpha"]
 
@@ -48,7 +45,7 @@ def generalized_alpha(h: wp.float64, previous: wp.float64, parameter: wp.float64
     return c
 
 
-class GeneralizedAlpha(Integrator):
+class GeneralizedAlpha(DampedIntegrator):
     """Generalized-alpha method of second order with adjustable high-frequency dissipation.
 
     Args:
@@ -62,22 +59,6 @@ class GeneralizedAlpha(Integrator):
     """
 
     def __init__(self, *, rho_inf: float = 0.2) -> None:
-        known = isinstance(rho_inf, (int, float)) and not isinstance(rho_inf, bool)
-        if not (known and math.isfinite(rho_inf) and 0.0 <= rho_inf <= 1.0):
-            raise ModelError(f"GeneralizedAlpha: rho_inf = {rho_inf!r} must lie between 0 and 1")
         super().__init__(
-            "generalized_alpha", generalized_alpha, order=2, takes_velocity=True, accelerated=True,
-            parameter=float(rho_inf),
-        )  # fmt: skip
-
-    @property
-    def rho_inf(self) -> float:
-        """Spectral radius at infinite frequency."""
-        return self.parameter
-
-    @property
-    def label(self) -> str:
-        return f"{self.name}(rho_inf={self.parameter!r})"
-
-    def __repr__(self) -> str:
-        return f"GeneralizedAlpha(rho_inf={self.parameter!r})"
+            "generalized_alpha", generalized_alpha, rho_inf, order=2, takes_velocity=True, accelerated=True
+        )

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
-__all__ = ["Integrator"]
+from ...base.errors import ModelError
+
+__all__ = ["DampedIntegrator", "Integrator"]
 
 
 @dataclass(frozen=True)
@@ -64,3 +67,25 @@ class Integrator:
         names = ("multistep", "takes_velocity", "midpoint", "accelerated", "static")
         flags = [name for name in names if getattr(self, name)]
         return "_".join([self.coefficients.key, *flags])
+
+
+class DampedIntegrator(Integrator):
+    """Integrator whose parameter is rho_inf, between 0 and 1; ModelError for another one."""
+
+    def __init__(self, name: str, coefficients: Any, rho_inf: float, **flags: Any) -> None:
+        known = isinstance(rho_inf, (int, float)) and not isinstance(rho_inf, bool)
+        if not (known and math.isfinite(rho_inf) and 0.0 <= rho_inf <= 1.0):
+            raise ModelError(f"{type(self).__name__}: rho_inf = {rho_inf!r} must lie between 0 and 1")
+        super().__init__(name, coefficients, parameter=float(rho_inf), **flags)
+
+    @property
+    def rho_inf(self) -> float:
+        """Spectral radius at infinite frequency: damping factor of motions unresolved by the step."""
+        return self.parameter
+
+    @property
+    def label(self) -> str:
+        return f"{self.name}(rho_inf={self.parameter!r})"
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}(rho_inf={self.parameter!r})"
