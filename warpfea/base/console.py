@@ -17,7 +17,10 @@ import warp as wp
 
 from .writer import write_atomically
 
-__all__ = ["compile_progress_bar", "format_bytes", "format_number", "format_table", "quiet_warp", "write_json"]
+__all__ = [
+    "compile_progress_bar", "format_bytes", "format_number", "format_table", "progress_bar", "quiet_warp", "to_json",
+    "write_json",
+]  # fmt: skip
 
 _NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
 
@@ -63,6 +66,16 @@ def _init_warp() -> None:
 
 
 @contextlib.contextmanager
+def progress_bar(label: str, unit: str, total: int | None = None, show: bool | None = None) -> Iterator[Any]:
+    """tqdm bar on stderr; `show=None`: only if stderr is a terminal."""
+    from tqdm import tqdm
+
+    hide = None if show is None else not show
+    with tqdm(desc=label, unit=unit, total=total, file=sys.stderr, disable=hide, leave=False) as bar:
+        yield bar
+
+
+@contextlib.contextmanager
 def compile_progress_bar(show: bool | None) -> Iterator[Callable[[int, int, str], None]]:
     """Progress bar "compiling kernels" on stderr with the number of loaded modules; None: if stderr is a terminal."""
     if show is None:
@@ -70,9 +83,7 @@ def compile_progress_bar(show: bool | None) -> Iterator[Callable[[int, int, str]
     if not show:
         yield lambda done, total, name: None
         return
-    from tqdm import tqdm
-
-    with tqdm(desc="compiling kernels", unit="module", file=sys.stderr, leave=False) as bar:
+    with progress_bar("compiling kernels", "module", show=True) as bar:
 
         def update(done: int, total: int, name: str) -> None:
             bar.total = total

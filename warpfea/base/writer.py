@@ -5,15 +5,13 @@ from __future__ import annotations
 import itertools
 import os
 import pathlib
-import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from .errors import OutputError
 from .renamed import check_members
 
-__all__ = ["Output", "check_folder", "check_target", "progress_bar", "temporary_path", "write_atomically"]
+__all__ = ["Output", "check_folder", "check_target", "temporary_path", "write_atomically"]
 
 
 class Output:
@@ -92,13 +90,3 @@ def write_atomically(target: pathlib.Path, write: Callable[[pathlib.Path], objec
         raise OutputError(f"{target}: can't be written ({error})") from error
     finally:
         temporary.unlink(missing_ok=True)
-
-
-@contextmanager
-def progress_bar(total: int, label: str, show: bool | None = None) -> Iterator[Callable[[], object]]:
-    """Progress bar on stderr; yields its advance function. `show=None`: only if stderr is a terminal."""
-    from tqdm import tqdm  # type: ignore[import-untyped,unused-ignore]
-
-    disable = None if show is None else not show
-    with tqdm(total=total, desc=label, file=sys.stderr, disable=disable, leave=False, unit="frame") as bar:
-        yield lambda: bar.update(1)

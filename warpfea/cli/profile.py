@@ -5,10 +5,9 @@ from __future__ import annotations
 import argparse
 import pathlib
 import statistics
-import sys
 from typing import Any
 
-from ..base.console import format_number, format_table, quiet_warp, to_json, write_json
+from ..base.console import format_number, format_table, progress_bar, quiet_warp, to_json, write_json
 from ..base.provenance import machine, versions
 from ..base.writer import write_atomically
 from ..simulation.simulation import Simulation
@@ -37,14 +36,11 @@ def profile(options: argparse.Namespace) -> int:
         from ..studies.files import require_matplotlib
 
         require_matplotlib()
-    from tqdm import tqdm
-
     source = resolve(options)
     with quiet_warp():
         show = show_progress(options)
         sim = source.simulation(source.model(), show)
-        total, hide = WARM_UP_STEPS + 1 + 2 * options.steps, None if show is None else not show
-        with tqdm(desc="profile", unit="step", total=total, leave=False, disable=hide, file=sys.stderr) as bar:
+        with progress_bar("profile", "step", WARM_UP_STEPS + 1 + 2 * options.steps, show) as bar:
             found = measure(sim, steps=options.steps, on_step=bar.update)
         content = _content(source, sim, found)
     if options.json:

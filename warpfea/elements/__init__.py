@@ -5,16 +5,6 @@ from .family import EnergyPart, Family, families, family_for_cell, get_family, r
 from .quadrature import TET_RULES, Rule
 
 __all__ = [
-    "TET_RULES",
-    "EnergyPart",
-    "Family",
-    "Rule",
-    "ancf_beam",
-    "ancf_shell",
-    "ancf_solid",
-    "families",
-    "family_for_cell",
-    "get_family",
-    "lagrange",
-    "register",
-]
+    "TET_RULES", "EnergyPart", "Family", "Rule", "ancf_beam", "ancf_shell", "ancf_solid", "families", "family_for_cell",
+    "get_family", "lagrange", "register",
+]  # fmt: skip

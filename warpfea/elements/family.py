@@ -14,16 +14,9 @@ from ..base.names import did_you_mean
 from .quadrature import Rule
 
 __all__ = [
-    "AssumedStrain",
-    "EnergyPart",
-    "Family",
-    "ParentDomain",
-    "VtkSubdivision",
-    "families",
-    "family_for_cell",
-    "get_family",
-    "register",
-]
+    "AssumedStrain", "EnergyPart", "Family", "ParentDomain", "VtkSubdivision", "families", "family_for_cell",
+    "get_family", "register",
+]  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

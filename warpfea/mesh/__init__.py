@@ -13,17 +13,6 @@ from .grids import grid
 from .mesh import Mesh
 
 __all__ = [
-    "CELL_TYPES",
-    "FORMATS",
-    "CellType",
-    "Mesh",
-    "box",
-    "check",
-    "cylinder",
-    "from_meshio",
-    "grid",
-    "is_meshio",
-    "linear",
-    "read",
-    "sphere",
-]
+    "CELL_TYPES", "FORMATS", "CellType", "Mesh", "box", "check", "cylinder", "from_meshio", "grid", "is_meshio",
+    "linear", "read", "sphere",
+]  # fmt: skip

@@ -182,9 +182,7 @@ FILE_CELLS = ("tetra", "tetra10", "hexahedron", "quad")
 ELEMENT_CELLS = {
     "T4": "tetra",
     "T10": "tetra10",
-    "ENMC": "tetra",
-    "FN": "tetra",
-    "FN18": "tetra",
+    **dict.fromkeys(("ENMC", "FN", "FN18"), "tetra"),
     "H3843": "hexahedron",
 }
 """Solid element name in the API -> cell type of its mesh."""

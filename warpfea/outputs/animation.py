@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..base.writer import progress_bar, write_atomically
+from ..base.console import progress_bar
+from ..base.writer import write_atomically
 from .colormap import map_colors
 from .obstacles import OBSTACLE_COLOR, clip_to_box
 from .raycaster import Camera, Image, Renderer, to_z_up
@@ -160,11 +161,11 @@ class Animation:
         palette = make_palette(list(self.draw(size, view, palette_frames, ground)), self.frames[0].values is not None)
         clock = np.round(np.array([frame.time for frame in self.frames]) / speed * 100.0)
         durations = [int(d) for d in np.maximum(np.diff(clock), 2.0) * 10.0] + [int(1000 * _LAST_FRAME_SECONDS)]
-        with progress_bar(count, "drawing", progress) as advance:
+        with progress_bar("drawing", "frame", count, progress) as bar:
             pictures = []
             for image in self.draw(size, view, list(range(count)), ground):
                 pictures.append(to_palette(image, palette))
-                advance()
+                bar.update()
 
         def save(path: pathlib.Path) -> None:
             pictures[0].save(path, format="GIF", save_all=True, append_images=pictures[1:], duration=durations, loop=0)

@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 import pathlib
 import statistics
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 from ...base.checks import check_positive
-from ...base.console import quiet_warp
+from ...base.console import progress_bar, quiet_warp
 from ...base.devices import find_device
 from ...base.errors import ModelError
 from ...base.names import did_you_mean, listing
@@ -191,7 +190,6 @@ class _StudyRunner:
     ) -> None:
         self.scene, self.axes, self.store, self.options = scene, axes, store, options
         self.known, self.chosen, self.base = known, chosen, base
-        self.show_progress = sys.stderr.isatty() if options.progress is None else options.progress
 
     def result(self, settings: Sequence[Setting], folder: pathlib.Path | None) -> Study:
         """The study of all settings, written into the folder if there is one."""
@@ -234,17 +232,12 @@ class _StudyRunner:
 
     def rows(self, settings: Sequence[Setting]) -> tuple[list[Row], list[dict[str, Any]], dict[str, Motion]]:
         """Rows of all settings; texts of the references; and the references by values of the physical parameters."""
-        from tqdm import tqdm
-
         groups: dict[str, list[Setting]] = {}
         for setting in settings:
             groups.setdefault(self._problem_key(setting), []).append(setting)
         motions: dict[str, Motion] = {}
         references = []
-        with tqdm(
-            desc=self.scene.name, unit="run", leave=False, disable=not self.show_progress, file=sys.stderr
-        ) as self.bar:
-            self.bar.total = len(settings)
+        with progress_bar(self.scene.name, "run", len(settings), self.options.progress) as self.bar:
             outcomes = {}
             for name, group in groups.items():
                 known = self.known(group[0])
@@ -304,16 +297,11 @@ class _StudyRunner:
             answer = _cheapest_row(rows, self.options.target)
             rows = self.split_rows(rows, motions, answer)
             answer = _cheapest_row(rows, self.options.target)
-            if (
-                answer is None
-                or answer.split is None
-                or answer.mesh_error is not None
-                or not self._in_time_only(answer)
-            ):
+            parts = {} if answer is None or answer.mesh_error is not None else answer.split or {}
+            space = parts.get("space")
+            if answer is None or space is None or not self._in_time_only(answer):
                 return rows
-            space, values = answer.split["space"], answer.setting.values
-            if space is None:
-                return rows
+            values = answer.setting.values
             rows = [replace(r, mesh_error=space) if r.error is not None and r.setting.values == values else r
                     for r in rows]  # fmt: skip
 
@@ -324,17 +312,13 @@ class _StudyRunner:
 
     def split_rows(self, rows: list[Row], motions: dict[str, Motion], answer: Row | None) -> list[Row]:
         """Rows with the requested parts of the error."""
-        from tqdm import tqdm
-
         done = [r for r in rows if r.status == DONE and r.error is not None]
         which = self.options.split
         if which == "none" or not done or (answer is None and any(r.split is not None for r in rows)):
             return rows
         best = answer or max(done, key=lambda r: -math.inf if r.efficacy is None else r.efficacy)
         out = []
-        with tqdm(
-            desc="parts of the error", unit="run", leave=False, disable=not self.show_progress, file=sys.stderr
-        ) as self.bar:
+        with progress_bar("parts of the error", "run", show=self.options.progress) as self.bar:
             for row in rows:
                 if row.error is not None and row.split is None and (which == "all" or row is best):
                     motion = motions[self._problem_key(row.setting)]
@@ -347,15 +331,11 @@ class _StudyRunner:
 
         Steps are rounded to divide the duration.
         """
-        from tqdm import tqdm
-
         setting, found = answer.setting, []
-        with tqdm(desc="target", unit="run", leave=False, disable=not self.show_progress, file=sys.stderr) as self.bar:
+        with progress_bar("target", "run", show=self.options.progress) as self.bar:
             for factor in CHECK_FACTORS:
-                if setting.dt is None:
-                    assert setting.error is not None
-                    near = setting.with_changes({"error": factor * setting.error})
-                else:
+                near = setting.with_changes({"error": factor * (setting.error or 0.0)})
+                if setting.dt is not None:
                     steps = max(1, round(setting.t_end / (factor * setting.dt)))
                     near = setting.with_changes({"dt": setting.t_end / steps})
                 found.append(self._make_row(near, self.run_extra(near), motions[self._problem_key(near)]))
