@@ -150,7 +150,7 @@ def test_joints_are_counted_and_written(tmp_path, capsys):
 
 
 def test_data_that_lies_in_the_checkout_alone_is_named(monkeypatch, capsys, tmp_path):
-    checkout = importlib.import_module("warpfea.studies.checkout")
+    checkout = importlib.import_module("warpfea.studies.files")
     monkeypatch.setattr(checkout, "DATA_FOLDER", tmp_path)
     assert runner.main(["ancf", "--only", "static_beam", "--quiet"]) == 2
     err = capsys.readouterr().err

@@ -20,7 +20,7 @@ import warp as wp
 import warpfea as wf
 from warpfea.model.assembly import shape_and_jacobian
 from warpfea.simulation.statics import StaticResult
-from warpfea.studies.checkout import reference_data
+from warpfea.studies.files import reference_data
 
 from .table import Row, Run, Table
 

@@ -18,7 +18,7 @@ import warp as wp
 
 import warpfea as wf
 from warpfea.base.errors import UsageError
-from warpfea.studies.checkout import data_file
+from warpfea.studies.files import data_file
 
 from .table import Row, Run, Table
 

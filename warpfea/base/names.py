@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
+from typing import Any
 
-__all__ = ["did_you_mean", "listing"]
+from .errors import ModelError
+
+__all__ = ["check_known", "did_you_mean", "listing"]
 
 SIMILARITY_CUTOFF = 0.6
 """Similarity, 0 to 1, from which a known name is suggested."""
@@ -43,6 +46,12 @@ def did_you_mean(name: object, known: Iterable[object]) -> str:
     )
     found = found or [text for text in plain if sorted(text) == sorted(wanted)]
     return f"; did you mean {plain[found[0]]!r}?" if found else ""
+
+
+def check_known(what: str, name: Any, known: Collection[Any]) -> None:
+    """ModelError for a name that is not among the known ones, which it lists; `what`: its kind."""
+    if name not in known:
+        raise ModelError(f"{what} {name!r} is unknown; there are {', '.join(known)}{did_you_mean(name, known)}")
 
 
 def listing(known: Iterable[object]) -> str:

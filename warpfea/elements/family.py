@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..base.errors import ModelError
-from ..base.names import did_you_mean
+from ..base.names import check_known, did_you_mean
 from .quadrature import Rule
 
 __all__ = [
@@ -246,9 +246,8 @@ def families() -> Sequence[str]:
 
 def get_family(name: str) -> Family:
     """The family `name`. Raises ModelError listing the names."""
-    if name in _families:
-        return _families[name]
-    raise ModelError(f"element {name!r} is unknown; there are {', '.join(_families)}{did_you_mean(name, _families)}")
+    check_known("element", name, _families)
+    return _families[name]
 
 
 def family_for_cell(cell_type: str) -> Family:

@@ -1,16 +1,20 @@
-"""The folder and the CSV of a study, and what pictures need."""
+"""The folder and the CSV of a study, what pictures need, and the reference data and meshes of a checkout."""
 
 from __future__ import annotations
 
 import csv
+import json
 import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ..base.errors import OutputError
+from ..base.errors import OutputError, UsageError
 from ..base.writer import check_folder, write_atomically
 
-__all__ = ["make_folder", "require_matplotlib", "write_csv"]
+__all__ = ["DATA_FOLDER", "data_file", "make_folder", "reference_data", "require_matplotlib", "write_csv"]
+
+DATA_FOLDER = pathlib.Path(__file__).resolve().parents[2] / "tests" / "data"
+"""Files of a checkout, absent in the installed package."""
 
 
 def make_folder(folder: str | pathlib.Path) -> pathlib.Path:
@@ -48,3 +52,16 @@ def require_matplotlib() -> Any:
     except ImportError as error:
         raise OutputError(f"the plot needs matplotlib: pip install 'warpfea[plots]' ({error})") from error
     return Figure
+
+
+def data_file(name: str) -> pathlib.Path:
+    """A file of tests/data. UsageError where it is not there."""
+    path = DATA_FOLDER / name
+    if not path.is_file():
+        raise UsageError(f"{path}: no such file; this study reads tests/data and needs a checkout of the repository")
+    return path
+
+
+def reference_data(name: str) -> Any:
+    """The content of tests/data/NAME.json: results that were made without warpfea, and their source."""
+    return json.loads(data_file(f"{name}.json").read_text())

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 import warpfea as wf
-from warpfea.studies.checkout import data_file
-from warpfea.studies.checkout import reference_data as stored
+from warpfea.studies.files import data_file
+from warpfea.studies.files import reference_data as stored
 
 FILES = {False: "S3_exact_svk_q5", True: "S3_exact_damped_svk_q5"}
 MIDDLE = (0.5, 0.05, 0.05)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 import warpfea as wf
-from warpfea.studies.checkout import reference_data as stored
+from warpfea.studies.files import reference_data as stored
 
 CASE = "stiff_E5e7_ANCF3243_SVK_nu0"
 

@@ -12,7 +12,7 @@ from typing import Any, ParamSpec, TypeVar
 
 from ...base.checks import check_positive
 from ...base.errors import ModelError
-from ...base.names import did_you_mean
+from ...base.names import check_known
 from ...builder.reference import Reference
 from .finer import check_finer
 from .report import ERROR_MEASURES
@@ -67,10 +67,7 @@ class StudyOptions:
         if self.name is not None and not re.fullmatch(r"[\w.-]+", self.name):
             raise ModelError(f"study: name {self.name!r} is to be part of names of files: letters, digits, _ - and .")
         for option, known in (("measure", ERROR_MEASURES), ("split", SPLIT_CHOICES)):
-            value = getattr(self, option)
-            if value not in known:
-                hint = did_you_mean(value, known)
-                raise ModelError(f"study: {option} {value!r} is unknown; there are {', '.join(known)}{hint}")
+            check_known(f"study: {option}", getattr(self, option), known)
         if not (isinstance(self.repeat, int) and self.repeat >= 1):
             raise ModelError(f"study: repeat = {self.repeat!r} must be a positive whole number")
         given = {"target": self.target, "limit": self.limit}

@@ -15,7 +15,7 @@ from typing import Any
 
 from ...base.console import to_json
 from ...base.errors import ModelError
-from ...base.names import did_you_mean
+from ...base.names import check_known, did_you_mean
 from ...builder.scene import Scene
 from ...simulation import integrators
 from ...solvers import SOLVERS
@@ -214,11 +214,9 @@ def sweep_axes(scene: Scene[Any], over: Mapping[str, Sequence[Any]], mesh: Seque
             out[name] = [method_text(value) for value in out[name]]
         if len({repr(value) for value in out[name]}) < len(out[name]):
             raise ModelError(f"study: over {name} = {out[name]} holds a value twice")
-        known = {"solver": tuple(SOLVERS), "dtype": DTYPES}.get(name)
-        for value in out[name]:
-            if known and value not in known:
-                hint = did_you_mean(value, known)
-                raise ModelError(f"study: {name} {value!r} is unknown; there are {', '.join(known)}{hint}")
+        known = {"solver": tuple(SOLVERS), "dtype": DTYPES}.get(name, ())
+        for value in out[name] if known else ():
+            check_known(f"study: {name}", value, known)
     whole = {name for name, p in scene.parameters.items() if is_integer(p.default) and not isinstance(p.default, bool)}
     for name in mesh or ():
         if name not in whole:

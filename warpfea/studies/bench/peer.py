@@ -31,7 +31,7 @@ import numpy as np
 from ...base.errors import UsageError
 from ...mesh import Mesh, check
 from ...solvers import NewtonPCG
-from ..checkout import DATA_FOLDER
+from ..files import DATA_FOLDER
 from .measure import Kind, Row, run_columns, run_once, select_by_label, solver
 from .problems import PROBLEMS
 
