@@ -1,7 +1,5 @@
 """An arch of blocks that stands by friction."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

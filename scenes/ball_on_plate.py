@@ -1,7 +1,5 @@
 """A soft ball that bounces on a plate."""
 
-from __future__ import annotations
-
 import warpfea as wf
 from warpfea.builder.scene import scene
 

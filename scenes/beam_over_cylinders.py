@@ -1,7 +1,5 @@
 """A soft beam that falls over two cylinders."""
 
-from __future__ import annotations
-
 import warpfea as wf
 from warpfea.builder.scene import scene
 

@@ -1,7 +1,5 @@
 """A belt that starts moving under a block."""
 
-from __future__ import annotations
-
 import warpfea as wf
 from warpfea.builder.scene import scene
 

@@ -1,7 +1,5 @@
 """Soft blocks that come to rest on each other."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A ball that bounces on a floor."""
 
-from __future__ import annotations
-
 import warpfea as wf
 from warpfea.builder.scene import scene
 

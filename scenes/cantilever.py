@@ -1,7 +1,5 @@
 """A clamped bar that bends under its own weight."""
 
-from __future__ import annotations
-
 import warpfea as wf
 from warpfea.builder.scene import scene
 

@@ -1,7 +1,5 @@
 """A chain of a hundred hinged links that carries a weight a thousand times as heavy as one of them."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, Literal
 

@@ -1,7 +1,5 @@
 """A double pendulum of two soft solid links."""
 
-from __future__ import annotations
-
 import numpy as np
 
 import warpfea as wf

@@ -1,7 +1,5 @@
 """A soft finger that pushes a beam off a shell."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import warpfea as wf

@@ -1,7 +1,5 @@
 """A four-bar linkage whose coupler bends."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

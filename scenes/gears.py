@@ -1,7 +1,5 @@
 """Two wheels with teeth that mesh."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """A gripper that lifts a soft block by friction."""
 
-from __future__ import annotations
-
 import warpfea as wf
 from warpfea.builder.scene import scene
 

@@ -1,7 +1,5 @@
 """A hook of soft rubber, pulled by a sling and let go."""
 
-from __future__ import annotations
-
 import pathlib
 
 import warpfea as wf

@@ -1,7 +1,5 @@
 """A plate on four rods, turned back and forth at its hub."""
 
-from __future__ import annotations
-
 import numpy as np
 
 import warpfea as wf

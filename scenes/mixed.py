@@ -1,7 +1,5 @@
 """The same bar, made of five families of elements, side by side."""
 
-from __future__ import annotations
-
 import numpy as np
 
 import warpfea as wf

@@ -1,7 +1,5 @@
 """A soft beam that swings from a pin."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import warpfea as wf

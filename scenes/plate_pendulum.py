@@ -1,7 +1,5 @@
 """A soft plate that swings from a corner."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import warpfea as wf

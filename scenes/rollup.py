@@ -1,7 +1,5 @@
 """A beam that an end moment rolls into a circle."""
 
-from __future__ import annotations
-
 import math
 from typing import Literal
 

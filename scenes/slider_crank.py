@@ -1,7 +1,5 @@
 """A slider-crank whose rod bends."""
 
-from __future__ import annotations
-
 import numpy as np
 
 import warpfea as wf

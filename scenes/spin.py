@@ -1,7 +1,5 @@
 """A soft dumb-bell that spins freely and tumbles."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

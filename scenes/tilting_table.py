@@ -1,7 +1,5 @@
 """A block on a table that is tilted until it slips."""
 
-from __future__ import annotations
-
 import math
 
 import warpfea as wf

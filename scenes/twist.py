@@ -1,7 +1,5 @@
 """A rubber bar whose end is turned."""
 
-from __future__ import annotations
-
 import math
 
 import warpfea as wf

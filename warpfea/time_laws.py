@@ -1,7 +1,5 @@
 """Time laws: a constant, samples (times, values), a `wp.func` of t, or a `Control`."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Validation of solver options."""
 
-from __future__ import annotations
-
 import math
 import re
 from typing import Any

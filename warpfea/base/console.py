@@ -1,7 +1,5 @@
 """Shared console output of the commands: quiet Warp, progress bars, tables, JSON."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math

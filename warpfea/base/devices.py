@@ -1,7 +1,5 @@
 """Device selection by name."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import warp as wp

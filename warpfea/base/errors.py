@@ -1,7 +1,5 @@
 """Exceptions of warpfea. Every one derives from :class:`Error`."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Counted kernel launches: the cost of a scene can be listed, asserted and timed."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Out-of-memory errors with the requested size and remedies."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Provenance of results: versions, machine, commit."""
 
-from __future__ import annotations
-
 import functools
 import os
 import pathlib

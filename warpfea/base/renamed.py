@@ -1,7 +1,5 @@
 """Former names of members that subclasses define, refused by name: nothing would read them."""
 
-from __future__ import annotations
-
 __all__ = ["FORMER_MEMBERS", "check_members"]
 
 FORMER_MEMBERS = {

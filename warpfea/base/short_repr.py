@@ -1,7 +1,5 @@
 """Short reprs of objects that hold arrays."""
 
-from __future__ import annotations
-
 import dataclasses
 import textwrap
 from typing import Any

@@ -1,7 +1,5 @@
 """Errors in user code, reported with file and line."""
 
-from __future__ import annotations
-
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager

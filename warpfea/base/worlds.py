@@ -1,7 +1,5 @@
 """Parsing and validation of values given for all worlds or one per world."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Output protocol and atomic file writing."""
 
-from __future__ import annotations
-
 import itertools
 import os
 import pathlib

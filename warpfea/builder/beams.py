@@ -1,7 +1,5 @@
 """Geometry of beams: from a curve and a section to nodes, their axes, and the frames dX/dxi of each element."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 import math

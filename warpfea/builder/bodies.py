@@ -1,7 +1,5 @@
 """Bodies from meshes, materials and options; unique names."""
 
-from __future__ import annotations
-
 import pathlib
 from typing import Any
 

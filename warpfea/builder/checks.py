@@ -1,7 +1,5 @@
 """Validation of a builder's arguments."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Loads, initial states and probes as recorded by a builder; documented at the methods of ModelBuilder."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Reference solution of a scene for error measurement by `warpfea study`."""
 
-from __future__ import annotations
-
 import csv
 import inspect
 import json

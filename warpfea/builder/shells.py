@@ -1,7 +1,5 @@
 """Geometry of shells: axes and frames dX/dxi of each quad at its nodes, with directors shared by adjacent elements."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

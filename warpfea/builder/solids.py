@@ -1,7 +1,5 @@
 """Geometry of ANCF solids: face-centroid nodes, and the frames dX/dxi at the nodes, from a mesh of tets or hexes."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from ..base.errors import ModelError

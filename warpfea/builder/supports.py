@@ -1,7 +1,5 @@
 """Supports as recorded by a builder: nodes clamped, moved or rotated."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

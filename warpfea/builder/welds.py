@@ -1,7 +1,5 @@
 """Welds of faces to other bodies: mortar ties, zero mean gap weighted with each function of the first face."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

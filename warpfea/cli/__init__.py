@@ -4,8 +4,6 @@ Exit codes: 0 success, 2 bad input or usage, 3 rejected step or failed case, 4 o
 valid), 1 internal error.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 import warnings

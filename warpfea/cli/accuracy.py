@@ -1,7 +1,5 @@
 """The options of `warpfea study SCENE`."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from .arguments import MANY, ONCE, add_options, finish_command, positive_integer, positive_number

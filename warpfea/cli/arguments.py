@@ -1,7 +1,5 @@
 """Common parts of the parsers: parser class, types of values, general options."""
 
-from __future__ import annotations
-
 import argparse
 import functools
 import importlib

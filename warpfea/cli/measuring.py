@@ -1,7 +1,5 @@
 """Options of the measuring commands: bench, study, stress, profile."""
 
-from __future__ import annotations
-
 import argparse
 import pathlib
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Scene of a mesh file with materials, supports and loads from the command line."""
 
-from __future__ import annotations
-
 import argparse
 import inspect
 import math

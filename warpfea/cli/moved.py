@@ -1,7 +1,5 @@
 """Commands that only made files of tests/results: tables of `python -m tests.validation` now, or no longer kept."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from ..base.errors import UsageError

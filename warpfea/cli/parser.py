@@ -1,7 +1,5 @@
 """Options of all commands, and help with examples."""
 
-from __future__ import annotations
-
 import argparse
 import re
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """`warpfea profile`: run time of a step by part and kernel, as a table, JSON and a picture."""
 
-from __future__ import annotations
-
 import argparse
 import pathlib
 import statistics

@@ -1,7 +1,5 @@
 """`warpfea run`: simulate, write files, summarise."""
 
-from __future__ import annotations
-
 import argparse
 import pathlib
 import sys

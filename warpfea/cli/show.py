@@ -1,7 +1,5 @@
 """`warpfea scenes`, `info` and `render`."""
 
-from __future__ import annotations
-
 import argparse
 import pathlib
 import sys

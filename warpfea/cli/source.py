@@ -1,7 +1,5 @@
 """Resolution of the SCENE argument: scene, user file or mesh; its simulation."""
 
-from __future__ import annotations
-
 import argparse
 import pathlib
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """`warpfea study`: studies of scenes, and `measuring.STUDIES`; `warpfea stress`."""
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import importlib

@@ -1,7 +1,5 @@
 """Summary of a run: JSON with fixed keys, and a readable table."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

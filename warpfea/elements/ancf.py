@@ -6,8 +6,6 @@ transforms the functions of one into those of the other (Paper T's S* = S T; `to
 stretched or rotated elements, and elements that meet at a node share its slots for any direction of their parent lines.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from ..base.errors import ModelError

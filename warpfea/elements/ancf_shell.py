@@ -32,8 +32,6 @@ stress and a pressure on both faces on any mesh, and under uniform transverse sh
 that is off by a few percent of the shear. "full" passes all of these.
 """
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np

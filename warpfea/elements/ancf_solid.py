@@ -7,8 +7,6 @@ Slots are Cartesian gradients d/dX_k (Paper T's S* = S T). Its printed formulas 
 compares both.
 """
 
-from __future__ import annotations
-
 import functools
 import itertools
 

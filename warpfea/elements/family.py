@@ -1,7 +1,5 @@
 """Element family tables: slots, shape functions, quadrature, faces."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field

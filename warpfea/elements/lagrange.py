@@ -1,7 +1,5 @@
 """Lagrange tetrahedra T4 and T10, Eqs. (4)-(9); nodes are corners 1-4, then edges 12, 23, 31, 14, 24, 34."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from ..mesh.cells import TET_EDGES, TET_FACES, barycentric, tet4_gradients, tet10_gradients

@@ -1,7 +1,5 @@
 """Quadrature on the unit tetrahedron and triangle and on boxes; weights sum to the volume or area of the parent."""
 
-from __future__ import annotations
-
 import functools
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Cross-sections of beams."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -9,8 +9,6 @@ become :class:`MeshError`. Abaqus files are read by :mod:`warpfea.mesh.abaqus`: 
 *NODE block and attaches sets to the wrong *ELEMENT block.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os

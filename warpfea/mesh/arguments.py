@@ -1,7 +1,5 @@
 """Checks of the generators' arguments; messages begin with ``what``, "<generator>: <argument>"."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

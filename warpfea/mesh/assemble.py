@@ -1,7 +1,5 @@
 """Assembly of a :class:`Mesh` with its sets from the cell blocks and groups of a file."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 

@@ -6,8 +6,6 @@ mid-edge nodes in the order of its edges (01, 12, 20); the "faces" of a quad are
 runs through them. Face k holds the nodes of Abaqus's label S(k+1), or E(k+1) for quads.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Checks of a mesh. Each failure names the file, the element or node (0-based) and the value."""
 
-from __future__ import annotations
-
 import warnings
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Conversion of cell types with their sets: T10 to T4, and T4 to T4 with face nodes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

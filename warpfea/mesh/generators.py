@@ -6,8 +6,6 @@ are mirrored about the centre, so that the diagonals run outward and no tetrahed
 side (its corner would be flat).
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Sequence
 

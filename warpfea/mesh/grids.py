@@ -1,7 +1,5 @@
 """Structured sheets of quads for shells, deterministic, with named edges."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Frames of a run and their rendering: camera, colour bar, time label, palette of an animation."""
 
-from __future__ import annotations
-
 import pathlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field

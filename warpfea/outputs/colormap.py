@@ -1,7 +1,5 @@
 """A perceptually even colour map and the conversions between display (sRGB) and linear colours."""
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 

@@ -6,8 +6,6 @@ A writer receives the simulation and reads `time` (B,), of statics `load` (B,), 
 drawn.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Normals of triangle meshes, and grouping of triangle corners by shared normal."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -4,8 +4,6 @@ A simulation with contact has `collider_poses()`: positions (B, K, 3), m, rotati
 the local axes, and outward offsets of the surfaces (B, K), m. Others have no colliders to draw.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any

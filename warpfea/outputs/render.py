@@ -4,8 +4,6 @@ Common layout: parallel worlds laid out on the same grid as in the USD file, a c
 one colour range for all frames, a colour bar and the time.
 """
 
-from __future__ import annotations
-
 import os
 import pathlib
 from typing import Any

@@ -14,8 +14,6 @@ Points are float32 relative to the body's centre, accurate far from the origin. 
 times `fps`, fractional if no step ended at the frame's time. In statics the time is the load factor, 0 to 1.
 """
 
-from __future__ import annotations
-
 import os
 import pathlib
 import shutil

@@ -1,7 +1,5 @@
 """Validation of USD files: USD's own validators, and additional checks."""
 
-from __future__ import annotations
-
 import os
 import re
 from typing import Any

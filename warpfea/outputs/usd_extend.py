@@ -1,7 +1,5 @@
 """Consistency check and contents of an existing USD stage to be extended."""
 
-from __future__ import annotations
-
 import pathlib
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """VTU series for ParaView: a file per frame, body and world, and a .pvd index with their times."""
 
-from __future__ import annotations
-
 import functools
 import os
 import pathlib

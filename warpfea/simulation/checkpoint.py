@@ -4,8 +4,6 @@ A temporary file is renamed to the target, so a checkpoint on disk is always com
 an uninterrupted one.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import os

@@ -12,8 +12,6 @@ found. A float32 state uses the float64 tangent of a copy of the model unless al
 round-off.
 """
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """The folder and the CSV of a study, what pictures need, and the reference data and meshes of a checkout."""
 
-from __future__ import annotations
-
 import csv
 import json
 import pathlib

@@ -9,8 +9,6 @@ and the recorded step is replayed. The misfit is the mean square of the differen
 tests/results/identify_cpu.json and identify_h200.json, with 4096 worlds, are the committed results.
 """
 
-from __future__ import annotations
-
 import argparse
 import time as clock
 from dataclasses import asdict, dataclass

@@ -1,7 +1,5 @@
 """Finer reference run for unknown motions, and the estimate of its own error."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any

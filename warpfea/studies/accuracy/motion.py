@@ -8,8 +8,6 @@ times of the reference: between steps a run is interpolated by cubics through it
 order in the step, exact at the ends of steps).
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Options of `wf.study` besides the settings of its runs."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import pathlib

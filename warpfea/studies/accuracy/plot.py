@@ -1,7 +1,5 @@
 """The plot of a study: error against run time."""
 
-from __future__ import annotations
-
 import math
 import pathlib
 import textwrap

@@ -1,7 +1,5 @@
 """Results of a study of error against run time: rows, and their table, CSV, JSON and plot."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math

@@ -14,8 +14,6 @@ accepted, or float32 can't hold the case. The parts may have different signs: th
 the model itself (element, law) left out.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from .finer import scale_counts

@@ -1,7 +1,5 @@
 """Finished points of a study: in memory, and in a file for resuming an interrupted study."""
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import inspect

@@ -1,7 +1,5 @@
 """Error against run time of a scene: sweep, reference, rows."""
 
-from __future__ import annotations
-
 import math
 import pathlib
 import statistics

@@ -1,7 +1,5 @@
 """`warpfea bench`: the kinds of measurement, and the checks of their options."""
 
-from __future__ import annotations
-
 import argparse
 import pathlib
 

@@ -1,7 +1,5 @@
 """Loop of all kinds of `warpfea bench`: measures their declared cases, prints and writes a row of each."""
 
-from __future__ import annotations
-
 import argparse
 import fnmatch
 import math

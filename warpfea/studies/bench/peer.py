@@ -16,8 +16,6 @@ residual_force  largest |g|_2 of a step
 tip_difference  of the tip from the tighter solve, over the latter
 """
 
-from __future__ import annotations
-
 import argparse
 import pathlib
 import statistics

@@ -10,8 +10,6 @@ ENMC, FN18, H3843: the bar of these ANCF solids.
 The tip is the mean of the loaded face, node or edge, along the load.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial

@@ -5,8 +5,6 @@ mesh and steps with a tolerance 100 times tighter in float64, over the largest t
 None where no reference was made. Times are in ms or s, the tip is in m.
 """
 
-from __future__ import annotations
-
 import argparse
 import statistics
 import time as clock

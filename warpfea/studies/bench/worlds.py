@@ -22,8 +22,6 @@ goal, reached           world-steps per second asked for, and whether they are
 note                    why there are no numbers, such as too little memory
 """
 
-from __future__ import annotations
-
 import argparse
 import time as clock
 from collections.abc import Callable, Sequence

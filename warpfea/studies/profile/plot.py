@@ -1,7 +1,5 @@
 """Picture of a profile: time per step of each part, and its bandwidth over that of a copy."""
 
-from __future__ import annotations
-
 import pathlib
 
 from ..files import require_matplotlib

@@ -9,8 +9,6 @@ Bytes are those of the arrays accessible to a launch, each counted once. Traffic
 arrays, and larger for repeated reads.
 """
 
-from __future__ import annotations
-
 import ast
 import functools
 import gc

@@ -1,7 +1,5 @@
 """Shared by the cases: bars and beams, static solutions with their counts, differences."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any

@@ -1,7 +1,5 @@
 """Case of the stress suite: setting, answer, registration."""
 
-from __future__ import annotations
-
 import pathlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field

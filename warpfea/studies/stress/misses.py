@@ -3,8 +3,6 @@
 A listed row that meets its criterion passes: some depend on round-off.
 """
 
-from __future__ import annotations
-
 __all__ = ["KNOWN_MISSES", "known_miss_reason"]
 
 _THIN_REASON = "refused for the work spent or without a reason; with two levels on the CPU float32 is named now"

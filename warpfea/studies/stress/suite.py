@@ -1,7 +1,5 @@
 """`warpfea stress`: selects, runs and evaluates rows, prints and writes results."""
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import json

@@ -1,7 +1,5 @@
 """Large bending in few load steps, with bounds on Newton iterations."""
 
-from __future__ import annotations
-
 import functools
 import pathlib
 

@@ -1,7 +1,5 @@
 """Buckling loads: statics tells a stable equilibrium from an unstable one, which a perfect structure does not leave."""
 
-from __future__ import annotations
-
 import dataclasses
 import warnings
 

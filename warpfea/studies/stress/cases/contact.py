@@ -4,8 +4,6 @@ Criteria for a deformable body: at rest the contacts carry its weight; in every 
 the impulse of the recorded forces and its weight; friction is at most mu N; no energy is gained.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Contact with rigid triangle meshes: fast thin sheets, vertices and edges on vertices and edges, exact touch."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

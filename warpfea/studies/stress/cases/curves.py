@@ -1,7 +1,5 @@
 """Beams given as functions: geometry of curves with many turns."""
 
-from __future__ import annotations
-
 import numpy as np
 
 import warpfea as wf

@@ -1,7 +1,5 @@
 """Discontinuous drives, beams twisted past their critical torque."""
 
-from __future__ import annotations
-
 import numpy as np
 
 import warpfea as wf

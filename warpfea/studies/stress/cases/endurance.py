@@ -1,7 +1,5 @@
 """A million steps at rest, one failing world among many, a load that becomes NaN."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

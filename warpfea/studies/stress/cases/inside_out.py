@@ -1,7 +1,5 @@
 """Bars compressed, stretched and twisted close to element inversion."""
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np

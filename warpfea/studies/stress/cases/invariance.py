@@ -1,7 +1,5 @@
 """Invariance to position, orientation, and the units of length and stress."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Joints between very unequal bodies, repeated, at a dead point, and in conflict."""
 
-from __future__ import annotations
-
 import functools
 from typing import Any
 

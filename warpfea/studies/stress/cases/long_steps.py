@@ -1,7 +1,5 @@
 """Steps from 1e-8 to 1e6 s: a long step of backward Euler is a static solution, at the same effort."""
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np

@@ -4,8 +4,6 @@ Criteria for both bodies: in every step the change of momentum equals the impuls
 weight; friction is at most mu N; no energy is gained; no centre of mass passes the other body.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Parameters that are set in a model of one world, each against a closed form of its value."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Free spinning bodies, against Euler's equations and the scheme's action on a rigid rotor."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Patch tests on tetrahedra of aspect ratio 1e4."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

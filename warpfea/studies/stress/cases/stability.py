@@ -1,7 +1,5 @@
 """Snap-through and lateral buckling."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Inadmissible initial states: inverted, flat, collapsed to a point, scrambled."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A soft arm on a steel block under a lateral tension of 1e9 Pa: small forces beside 1e7 times larger ones."""
 
-from __future__ import annotations
-
 import functools
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Homogeneous stretch far beyond linear theory."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.optimize import brentq
 

@@ -1,7 +1,5 @@
 """Beams and shells against the literature, and at extreme slenderness."""
 
-from __future__ import annotations
-
 import numpy as np
 
 import warpfea as wf

@@ -1,7 +1,5 @@
 """Thin bodies: statics and motion in both precisions, most sensitive to round-off."""
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np
