@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from .arguments import MANY, ONCE, add_options, finish_command, positive_integer, positive_number
+from .arguments import APPEND, ONCE, add_options, finish_command, positive_integer, positive_number
 
 __all__ = ["SCENE_COMMAND", "add_accuracy"]
 
@@ -59,13 +59,13 @@ def add_accuracy(names: Any) -> None:
     to.add_argument("what", metavar=SCENE_COMMAND, help="a scene, file.py or file.py:scene")
     add_options(
         to.add_argument_group("the sweep"),
-        ("--over", MANY, "NAME=V1,V2", "repeatable"),
+        ("--over", APPEND, "NAME=V1,V2", "repeatable"),
         ("--methods", None, "NAME,NAME", "integrators, with options as name(option=value)"),
         ("--error", None, "X,X", "steps that adapt, to each of these errors"),
     )
     add_options(
         to.add_argument_group("for all runs (defaults are the scene's)"),
-        ("--set", MANY, "NAME=VALUE", "a parameter of the scene"),
+        ("--set", APPEND, "NAME=VALUE", "a parameter of the scene"),
         ("--dt", positive_number, "S", "step, s, where it is not swept"),
         ("--t-end", positive_number, "S", "end time, s"),
         ("--tol", positive_number, "X", "relative residual at which a step is accepted"),
@@ -75,10 +75,10 @@ def add_accuracy(names: Any) -> None:
     )
     add_options(
         to.add_argument_group("errors"),
-        ("--probe", MANY, "NAME", "whose error counts; repeatable (default: all)", None),
+        ("--probe", APPEND, "NAME", "whose error counts; repeatable (default: all)", None),
         ("--reference", None, "FILE", "a file of positions, or run for a finer run"),
-        ("--finer", MANY, "NAME=VALUE", "of the finer run"),
-        ("--mesh", MANY, "NAME", "a parameter that refines the mesh; repeatable", None),
+        ("--finer", APPEND, "NAME=VALUE", "of the finer run"),
+        ("--mesh", APPEND, "NAME", "a parameter that refines the mesh; repeatable", None),
         ("--measure", None, "NAME", "error that counts: l2 (default), end, energy, field", "l2"),
         ("--target", positive_number, "X", "name the cheapest setting with at most this error, in time and mesh"),
         ("--split", None, "ROWS", "parts of the error of the best row (default), of all, or none", "best"),

@@ -14,7 +14,7 @@ from ..base.errors import UsageError
 from ..base.names import did_you_mean
 
 __all__ = [
-    "FLAG", "MANY", "ONCE", "Parser", "add_options", "color_range", "existing_file", "finish_command", "load_steps",
+    "APPEND", "FLAG", "ONCE", "Parser", "add_options", "color_range", "existing_file", "finish_command", "load_steps",
     "number_pair", "number_tuple", "positive_integer", "positive_integers", "positive_number", "size", "step_size",
     "vector",
 ]  # fmt: skip
@@ -129,24 +129,24 @@ def size(text: str) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
-FLAG, MANY, ONCE = "store_true", "append", StoreOnce
+FLAG, APPEND, ONCE = "store_true", "append", StoreOnce
 """Kinds of options: a switch; repeatable; an output, given once."""
 
 
 def add_options(to: Any, *rows: tuple[Any, ...]) -> None:
     """Add options, a row (flag, kind, metavar, help) or (flag, kind, metavar, help, default) each.
 
-    Kinds are FLAG, MANY, ONCE, a type of values, a tuple of choices, or None for text; a tuple as metavar: choices of
+    Kinds are FLAG, APPEND, ONCE, a type of values, a tuple of choices, or None for text; a tuple as metavar: choices of
     a repeatable option. Flags with synonyms are separated by blanks.
     """
     for flags, kind, shown, text, *default in rows:
-        how: dict[str, Any] = {"action": kind} if kind in (FLAG, MANY, ONCE) else {"type": kind}
+        how: dict[str, Any] = {"action": kind} if kind in (FLAG, APPEND, ONCE) else {"type": kind}
         choices = kind if isinstance(kind, tuple) else shown
         if isinstance(choices, tuple):
             how = {"action": how.get("action"), "choices": choices}
         elif shown:
             how["metavar"] = shown
-        if default or kind == MANY:
+        if default or kind == APPEND:
             how["default"] = default[0] if default else []
         to.add_argument(*flags.split(), help=text, **how)
 

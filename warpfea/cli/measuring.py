@@ -9,8 +9,8 @@ from ..base.errors import UsageError
 from ..base.names import did_you_mean
 from .accuracy import SCENE_COMMAND, add_accuracy
 from .arguments import (
+    APPEND,
     FLAG,
-    MANY,
     ONCE,
     Parser,
     add_options,
@@ -86,11 +86,11 @@ def add_bench(commands: Any) -> None:
     kind.add_argument("--worlds", action="store_true", help="many worlds of small models: error beside run time")
     add_options(
         to,
-        ("--problem", MANY, ("bar", "beam", "plate", "ENMC", "FN18", "H3843"), "may be repeated; default bar", None),
+        ("--problem", APPEND, ("bar", "beam", "plate", "ENMC", "FN18", "H3843"), "may be repeated; default bar", None),
         ("--unknowns --sizes", positive_integers, "N,N,...", "sizes (default: a few per problem)", []),
         ("--device", None, None, "cpu, cuda:0, ...; by default CUDA where there is one"),
-        ("--dtype", MANY, ("float64", "float32"), "may be repeated; default both, of --peer float64", None),
-        ("--linear", MANY, ("pcg", "direct"), "linear solver, may be repeated; default pcg", None),
+        ("--dtype", APPEND, ("float64", "float32"), "may be repeated; default both, of --peer float64", None),
+        ("--linear", APPEND, ("pcg", "direct"), "linear solver, may be repeated; default pcg", None),
         ("--steps", positive_integer, "N", "steps to simulate (default 10, --peer 120)"),
         ("--repeat", positive_integer, "N", "runs; the median counts (default 3)"),
         ("--dt", positive_number, "S", "step, s (default 1e-3)"),
@@ -155,7 +155,7 @@ def add_stress(commands: Any) -> None:
     )
     add_options(
         to,
-        ("--case", MANY, "NAME", "a case, a row NAME/VALUE or a group; repeatable"),
+        ("--case", APPEND, "NAME", "a case, a row NAME/VALUE or a group; repeatable"),
         ("--list", FLAG, None, "the cases and what each tries; runs nothing"),
         ("--quick", FLAG, None, "the fast rows only (minutes)"),
         ("--device", None, None, "cpu, cuda:0, ...; by default CUDA where there is one"),

@@ -10,8 +10,8 @@ from ..base.names import did_you_mean
 from ..simulation.statics import UNSTABLE_CHOICES
 from ..solvers import SOLVERS
 from .arguments import (
+    APPEND,
     FLAG,
-    MANY,
     ONCE,
     Parser,
     add_options,
@@ -126,13 +126,13 @@ def _join_negative_vectors(words: Sequence[str]) -> list[str]:
 def _add_model_options(to: argparse.ArgumentParser) -> None:
     """Model and solver options common to run, info and profile."""
     to.add_argument("what", metavar="SCENE", help="a scene, file.py or file.py:scene, or a mesh (.msh, .vtu, .inp)")
-    add_options(to, ("--set", MANY, "NAME=VALUE", "set a parameter of the scene"))
+    add_options(to, ("--set", APPEND, "NAME=VALUE", "set a parameter of the scene"))
     add_options(
         to.add_argument_group("for a mesh file (vectors are x,y,z; repeat an option for several groups)"),
-        ("--material", MANY, "[GROUP=]LAW:NAME=VALUE,...", MATERIAL_HINT),
-        ("--clamp", MANY, "GROUP", "hold the nodes of a group"),
-        ("--traction", MANY, "GROUP:x,y,z", "dead load on a surface, Pa"),
-        ("--pressure", MANY, "GROUP:p", "follower pressure on a surface, Pa"),
+        ("--material", APPEND, "[GROUP=]LAW:NAME=VALUE,...", MATERIAL_HINT),
+        ("--clamp", APPEND, "GROUP", "hold the nodes of a group"),
+        ("--traction", APPEND, "GROUP:x,y,z", "dead load on a surface, Pa"),
+        ("--pressure", APPEND, "GROUP:p", "follower pressure on a surface, Pa"),
         ("--gravity", vector, "x,y,z", "m/s^2, by default 9.81 downwards"),
         ("--scale", positive_number, "S", "metres per unit of the file, 1e-3 for mm"),
         ("--up-axis", ("Y", "Z"), None, "by default Z"),
