@@ -30,8 +30,9 @@ class Source:
         label: text of the argument.
         scene: the scene. values: its arguments.
         parameters: those of the summary.
-        dt, integrator, dtype, device, tol, solver, inversion, error, energy_growth: of the run.
-        load_steps, static_tol: of statics; None: a motion, the solver's default. stabilise: of statics.
+        dt: step of a motion, s, or "auto".
+        place: device and precision of the model.
+        static: True for statics. options: of the simulation or of statics.
     """
 
     label: str
@@ -39,46 +40,18 @@ class Source:
     values: dict[str, Any]
     parameters: dict[str, Any]
     dt: float | str
-    integrator: str
-    dtype: str
-    device: str | None
-    tol: float | None
-    solver: str
-    inversion: str
-    load_steps: int | None = None
-    static_tol: float | None = None
-    stabilise: bool = False
-    error: float | None = None
-    energy_growth: str = "refuse"
+    place: dict[str, Any]
+    static: bool
+    options: dict[str, Any]
 
     def model(self) -> Model:
         """Call the scene and finalize."""
-        return self.scene.build(self.values).finalize(device=self.device, dtype=self.dtype)
+        return self.scene.build(self.values).finalize(**self.place)
 
     def simulation(self, model: Model, show: bool | None) -> Simulation:
         """The simulation (dynamic, or static with load steps); shows a bar while kernels compile."""
-        if self.load_steps is not None:
-            with compile_progress_bar(show) as bar:
-                return begin_static(
-                    model,
-                    load_steps=self.load_steps,
-                    tol=self.static_tol,
-                    inversion=self.inversion,
-                    stabilise=self.stabilise,
-                    on_compile=bar,
-                )
-        solver = SOLVERS[self.solver](tol=self.tol)
         with compile_progress_bar(show) as bar:
-            return Simulation(
-                model,
-                dt=self.dt,
-                error=self.error,
-                integrator=self.integrator,
-                solver=solver,
-                inversion=self.inversion,
-                energy_growth=self.energy_growth,
-                on_compile=bar,
-            )
+            return (begin_static if self.static else Simulation)(model, on_compile=bar, **self.options)
 
 
 def show_progress(options: argparse.Namespace) -> bool | None:
@@ -136,21 +109,13 @@ def resolve(options: argparse.Namespace, checkpoint: dict[str, Any] | None = Non
     error = options.error or (saved.get("error") if dt == "auto" else None)
     if (error is None) == (dt == "auto"):
         raise UsageError("--dt auto needs --error, such as 1e-4" if dt == "auto" else "--error is for --dt auto")
-    return Source(
-        label=options.what,
-        scene=found,
-        values=values,
-        parameters=parameters,
-        dt=dt,
-        integrator=options.integrator or saved.get("integrator") or found.integrator,
-        dtype=options.dtype or saved.get("dtype") or "float64",
-        device=options.device,
-        tol=options.tol or found.tol,
-        solver=options.solver,
-        inversion=options.inversion,
-        load_steps=(options.load_steps or 10) if getattr(options, "static", False) else None,
-        static_tol=options.tol,
-        stabilise=getattr(options, "stabilise", False),
-        error=error,
-        energy_growth=options.energy_growth,
-    )
+    static = getattr(options, "static", False)
+    how: dict[str, Any] = {"inversion": options.inversion}
+    if static:
+        how |= {"load_steps": options.load_steps or 10, "tol": options.tol, "stabilise": options.stabilise}
+    else:
+        how |= {"dt": dt, "error": error, "energy_growth": options.energy_growth}
+        how["integrator"] = options.integrator or saved.get("integrator") or found.integrator
+        how["solver"] = SOLVERS[options.solver](tol=options.tol or found.tol)
+    place = {"device": options.device, "dtype": options.dtype or saved.get("dtype") or "float64"}
+    return Source(options.what, found, values, parameters, dt, place, static, how)

@@ -31,7 +31,7 @@ from .normals import vertex_normals
 from .obstacles import unique_names
 from .usd_check import error_text, validate_usd
 from .usd_extend import read_existing
-from .usd_obstacles import ObstaclePrims
+from .usd_obstacles import ObstaclePrims, define_mesh
 
 __all__ = ["SCHEMA", "USDWriter", "validate_usd"]
 
@@ -158,25 +158,18 @@ class USDWriter(Output):
 
     def _define(self) -> None:
         """Author constant data: transforms, topology, attributes without samples."""
-        from pxr import Gf, UsdGeom, Vt
+        from pxr import Gf, UsdGeom
 
         names = self._names()
         self._meshes = [[] for _ in names]
         for world in range(self._surface.worlds):
             place = UsdGeom.Xform.Define(self._stage, f"/World/world_{world:04d}")
-            place.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(
-                Gf.Vec3d(*map(float, self._surface.offsets[world]))
-            )
+            origin = Gf.Vec3d(*map(float, self._surface.offsets[world]))
+            place.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(origin)
             for body, name, meshes in zip(self._surface.bodies, names, self._meshes, strict=True):
                 xform = UsdGeom.Xform.Define(self._stage, place.GetPath().AppendChild(name))
                 xform.GetPrim().SetDisplayName(body.name)
-                mesh = UsdGeom.Mesh.Define(self._stage, xform.GetPath().AppendChild("skin"))
-                triangles = np.ascontiguousarray(body.skin.triangles, dtype=np.int32)
-                mesh.CreateFaceVertexCountsAttr(Vt.IntArray(len(triangles), 3))
-                mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(triangles.ravel()))
-                mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-                mesh.CreateOrientationAttr(UsdGeom.Tokens.rightHanded)
-                mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+                mesh = define_mesh(self._stage, xform.GetPath().AppendChild("skin"), body.skin.triangles)
                 meshes.append(_MeshPrim(mesh, xform.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble), self.fields))
         self._obstacles = ObstaclePrims(self._stage, self._surface, names)
         self._obstacles.define()

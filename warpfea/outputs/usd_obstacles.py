@@ -14,9 +14,22 @@ from .obstacles import OBSTACLE_COLOR, unique_names
 if TYPE_CHECKING:
     from .frames import DrawnSurface
 
-__all__ = ["ObstaclePrims"]
+__all__ = ["ObstaclePrims", "define_mesh"]
 
 COLLIDER_KEY = "warpfea:collider"
+
+
+def define_mesh(stage: Any, path: Any, triangles: np.ndarray) -> Any:
+    """A mesh of triangles (T, 3) with a normal at each vertex."""
+    from pxr import UsdGeom, Vt
+
+    mesh = UsdGeom.Mesh.Define(stage, path)
+    mesh.CreateFaceVertexCountsAttr(Vt.IntArray(len(triangles), 3))
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.ascontiguousarray(triangles, dtype=np.int32).ravel()))
+    mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    mesh.CreateOrientationAttr(UsdGeom.Tokens.rightHanded)
+    mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+    return mesh
 
 
 class ObstaclePrims:
@@ -57,16 +70,11 @@ class ObstaclePrims:
         from pxr import Gf, UsdGeom, Vt
 
         points = np.asarray(obstacle.points[world], dtype=np.float32)
-        mesh = UsdGeom.Mesh.Define(self.stage, path)
+        mesh = define_mesh(self.stage, path, obstacle.triangles)
         mesh.GetPrim().SetCustomDataByKey(COLLIDER_KEY, obstacle.kind)
         mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
-        mesh.CreateFaceVertexCountsAttr(Vt.IntArray(len(obstacle.triangles), 3))
-        mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.ascontiguousarray(obstacle.triangles.ravel())))
         mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(vertex_normals(points.astype(float), obstacle.triangles)))
-        mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
         mesh.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.stack([points.min(axis=0), points.max(axis=0)])))
-        mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-        mesh.CreateOrientationAttr(UsdGeom.Tokens.rightHanded)
         grey = Gf.Vec3f(*map(float, to_linear(OBSTACLE_COLOR)))
         mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set(Vt.Vec3fArray([grey]))
 

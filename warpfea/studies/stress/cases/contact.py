@@ -12,7 +12,7 @@ import numpy as np
 
 import warpfea as wf
 
-from ..build import GRAVITY_VECTOR, StepStats
+from ..build import GRAVITY_VECTOR, StepStats, finalize
 from ..case import FLOAT32_REFUSAL, Answer, Setting, case
 
 GROUP = "contact"
@@ -46,10 +46,6 @@ class ContactScene:
     body: wf.Body
     contacts: list[Any]
     mass: float
-
-    def model(self, setting: Setting) -> wf.Model:
-        """Model for the setting's device and precision."""
-        return self.builder.finalize(device=setting.device, dtype=setting.dtype)
 
 
 def make_scene(
@@ -178,14 +174,14 @@ def strike(setting: Setting, shape: Any, E: float) -> Answer:
     """A cube hits an obstacle at 100 m/s."""
     s = make_scene(shape, E=E, gravity=(0, 0, 0), translation=(0, 0, 0.3), mu=0.3, restitution=0.5)
     s.builder.set_initial(s.body, velocity=(0, 0, -IMPACT_SPEED))
-    run = simulate(wf.Simulation(s.model(setting), dt=1e-2), s, 5, mu=0.3)
+    run = simulate(wf.Simulation(finalize(s.builder, setting), dt=1e-2), s, 5, mu=0.3)
     return run.answer(setting, max(run.center_depth, 0.0), 0.0, "the centre stays before the obstacle")
 
 
 def at_rest(setting: Setting, E: float, mu: float) -> tuple[ContactScene, wf.Model, wf.State]:
     """A cube of a modulus at rest on the floor."""
     s = make_scene(FLOOR, E=E, mu=mu, restitution=0.5)
-    model = s.model(setting)
+    model = finalize(s.builder, setting)
     return s, model, wf.solve_static(model, stabilise=True).state
 
 
@@ -229,7 +225,7 @@ def exact_touch(setting: Setting, name: str) -> Answer:
         "same faces": wf.Box(center=(SIDE / 2, SIDE / 2, -SIDE / 2), size=(SIDE, SIDE, SIDE)),
     }
     s = make_scene(shapes[name], mu=0.5, restitution=0.5)
-    sim = wf.Simulation(s.model(setting), dt=1e-3)
+    sim = wf.Simulation(finalize(s.builder, setting), dt=1e-3)
     run = simulate(sim, s, 50, mu=0.5)
     sunk = float(sim.contact_record(s.contacts[0]).penetration[0].max()) / SIDE
     limits = {"sunk": (sunk, 0.05)}
@@ -259,7 +255,7 @@ def grazing_vertex(setting: Setting, depth: float) -> Answer:
         overlap="offset", overlap_time=1e-3,
     )  # fmt: skip
     s.builder.set_initial(s.body, velocity=(IMPACT_SPEED, 0, 0))
-    sim = wf.Simulation(s.model(setting), dt=1e-2)
+    sim = wf.Simulation(finalize(s.builder, setting), dt=1e-2)
     run = simulate(sim, s, 10, mu=0.5)
     error = float(np.abs(center_velocity(sim, s) / IMPACT_SPEED - (1, 0, 0)).max())
     limits = {"Newton of a step": (run.stats.worst_newton, MAX_NEWTON), "halvings": (run.stats.halvings, 0)}
@@ -273,7 +269,7 @@ def cube_in_trough(setting: Setting, mu: float) -> Answer:
     sides = (wf.HalfSpace((0, c, c), 0.0), wf.HalfSpace((0, -c, c), 0.0))
     s = make_scene(*sides, rotation=edge_down(), mu=mu)
     stats = StepStats()
-    result = wf.solve_static(s.model(setting), stabilise=True, outputs=[stats])
+    result = wf.solve_static(finalize(s.builder, setting), stabilise=True, outputs=[stats])
     records = [result.simulation.contact_record(pad) for pad in s.contacts]
     force = sum(r.force[0, -1] for r in records)
     error = float(np.abs(force / (s.mass * GRAVITY) - (0, 0, 1)).max())
@@ -290,7 +286,7 @@ def pressed_corner(setting: Setting, which: str) -> Answer:
     s = make_scene(FLOOR, gravity=(0, 0, 0), rotation=rotation, cells=12 if which == "edge" else 16, mu=0.0)
     s.builder.drive(s.body.nodes(lambda X: np.ones(len(X), bool)), displacement=(0, 0, -depth))
     stats = StepStats()
-    result = wf.solve_static(s.model(setting), load_steps=1, stabilise=True, outputs=[stats])
+    result = wf.solve_static(finalize(s.builder, setting), load_steps=1, stabilise=True, outputs=[stats])
     area = 6.0 * SIDE**2
     per_area = 4.0 / 3.0 * 1e6 / (1.0 - 0.09) * math.sqrt(area / math.pi) / area
     # integrals of the depth over the reference areas of all faces; the ends of an edge are faces too
@@ -307,7 +303,7 @@ def extreme_friction(setting: Setting, mu: float) -> Answer:
     """A cube slides over a smooth floor, or one of mu = 10, at 1 m/s."""
     s = make_scene(FLOOR, mu=mu, restitution=0.5)
     s.builder.set_initial(s.body, velocity=(1.0, 0, 0))
-    sim = wf.Simulation(s.model(setting), dt=1e-3)
+    sim = wf.Simulation(finalize(s.builder, setting), dt=1e-3)
     run = simulate(sim, s, 50, mu=mu)
     if mu > 0.0:
         return run.impulse_answer(setting)
@@ -320,7 +316,7 @@ def extreme_restitution(setting: Setting, e: float) -> Answer:
     """A cube much stiffer than its contact lands flat at 1 m/s: no rebound at e = 0.001, no contact loss at e = 1."""
     s = make_scene(FLOOR, E=1e9, gravity=(0, 0, 0), translation=(0, 0, 1e-3), mu=0.0, restitution=e, stiffness=1e-3)
     s.builder.set_initial(s.body, velocity=(0, 0, -1.0))
-    sim = wf.Simulation(s.model(setting), dt=1e-4)
+    sim = wf.Simulation(finalize(s.builder, setting), dt=1e-4)
     run = simulate(sim, s, 200)
     up, loss = float(center_velocity(sim, s)[2]), abs(float(sim.energies()["contact_loss"][0])) / (0.5 * s.mass)
     if e == 1.0:
@@ -337,7 +333,7 @@ def floor_jump(setting: Setting, height: float) -> Answer:
     """The floor jumps by 5, 50 or 500 mm into a resting cube of 100 mm within a step: above it after, or refused."""
     path = ((0.0, 0.0100001, 0.0100002, 1.0), [(0, 0, z) for z in (0.0, 0.0, height, height)])
     s = make_scene(FLOOR, path=path, mu=0.5, restitution=0.5)
-    sim = wf.Simulation(s.model(setting), dt=1e-3)
+    sim = wf.Simulation(finalize(s.builder, setting), dt=1e-3)
     run = simulate(sim, s, 20, mu=0.5, moves=True)
     behind = max(height - float(center_of_mass(sim, s)[2]), 0.0) / SIDE
     return run.answer(setting, behind, 0.0, "the body is above the floor")
@@ -348,7 +344,7 @@ def length_scales(setting: Setting, side: float) -> Answer:
     """Cubes of a millimetre to 1000 km at rest, of equal relative stiffness: the floor carries their weight."""
     s = make_scene(FLOOR, E=1e4 * DENSITY * GRAVITY * side, side=side, mu=0.5)
     stats = StepStats()
-    result = wf.solve_static(s.model(setting), stabilise=True, outputs=[stats])
+    result = wf.solve_static(finalize(s.builder, setting), stabilise=True, outputs=[stats])
     record = result.simulation.contact_record(s.contacts[0])
     error = abs(float(record.normal_force[0, -1]) / (s.mass * GRAVITY) - 1.0)
     return stats.answer(error, bound_for(setting, 1e-7, 1e-3), "sum of normal forces = m g")

@@ -6,6 +6,7 @@ import numpy as np
 
 import warpfea as wf
 
+from ..build import finalize
 from ..case import FLOAT32_REFUSAL, Answer, Setting, case
 from . import contact
 from .contact import SIDE, bound_for, center_of_mass, edge_down, make_scene, simulate, vertex_down
@@ -71,7 +72,7 @@ def feature_contact(setting: Setting, which: str) -> Answer:
         shape(), E=1e6, rotation=rotation(), translation=(0, 0, 5e-4), mu=0.3, restitution=0.5, stiffness=10.0
     )
     s.builder.set_initial(s.body, velocity=(0, 0, -1.0))
-    sim = wf.Simulation(s.model(setting), dt=1e-3)
+    sim = wf.Simulation(finalize(s.builder, setting), dt=1e-3)
     run = simulate(sim, s, 40, mu=0.3)
     sunk = float(sim.contact_record(s.contacts[0]).penetration[0].max()) / SIDE
     limits = {"through": (run.center_depth, 0.0), "sunk": (sunk, 0.3)}
@@ -90,7 +91,7 @@ def exact_touch(setting: Setting, which: str) -> Answer:
         "tip": wf.TriMesh(pyramid().points + (SIDE / 2, SIDE / 2, 0), pyramid().triangles),
     }
     s = make_scene(shapes[which], mu=0.5, restitution=0.5, stiffness=100.0 if which == "tip" else 1.0)
-    sim = wf.Simulation(s.model(setting), dt=1e-3)
+    sim = wf.Simulation(finalize(s.builder, setting), dt=1e-3)
     run = simulate(sim, s, 50, mu=0.5)
     sunk = float(sim.contact_record(s.contacts[0]).penetration[0].max()) / SIDE
     shifted = float(np.abs(center_of_mass(sim, s)[:2] / SIDE - 0.5).max())

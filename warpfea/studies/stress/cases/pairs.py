@@ -11,7 +11,7 @@ import numpy as np
 
 import warpfea as wf
 
-from ..build import GRAVITY_VECTOR, StepStats
+from ..build import GRAVITY_VECTOR, StepStats, finalize
 from ..case import DTYPES, FLOAT32_REFUSAL, Answer, Setting, case
 from .contact import ContactMotion, bound_for, edge_down, momentum, total_energy, vertex_down
 
@@ -40,10 +40,6 @@ class BodyPair:
     lower: wf.Body
     contact: Any
     clamped: bool
-
-    def model(self, setting: Setting) -> wf.Model:
-        """Model for the setting's device and precision."""
-        return self.builder.finalize(device=setting.device, dtype=setting.dtype)
 
 
 def cube_on_plate(
@@ -133,7 +129,7 @@ def impact(setting: Setting, value: tuple[float, float]) -> Answer:
         E=(E, E), gravity=(0, 0, 0), position=(0, 0, 0.3), thickness=0.01, clamped=False, mu=0.3, restitution=0.5
     )
     s.builder.set_initial(s.upper, velocity=(0, 0, -IMPACT_SPEED))
-    run = simulate(wf.Simulation(s.model(setting), dt=h), s, 8)
+    run = simulate(wf.Simulation(finalize(s.builder, setting), dt=h), s, 8)
     return run.answer(setting, max(run.center_depth, 0.0), 0.0, "the centre stays before the plate")
 
 
@@ -143,7 +139,7 @@ def thin_shell(setting: Setting, speed: float) -> Answer:
     s = cube_on_plate(E=(1e6, 1e8), gravity=(0, 0, 0), position=(0, 0, 0.05), thickness=1e-3, shell=True, mu=0.3,
                       restitution=0.5, stiffness=1e4)  # fmt: skip
     s.builder.set_initial(s.upper, velocity=(0, 0, -speed))
-    run = simulate(wf.Simulation(s.model(setting), dt=1e-3), s, 60)
+    run = simulate(wf.Simulation(finalize(s.builder, setting), dt=1e-3), s, 60)
     return run.answer(setting, max(run.center_depth, 0.0), 0.0, "the centre stays before the shell")
 
 
@@ -155,7 +151,7 @@ def stiff_on_soft(setting: Setting, E: tuple[float, float]) -> Answer:
     """A cube of 1e4 to 1e10 Pa falls by a hundredth of its side on a plate of another one, 30 steps of 1 ms."""
     s = cube_on_plate(E=E, position=(0, 0, 0.01 * SIDE), mu=0.5, restitution=0.5)
     s.builder.set_initial(s.upper, velocity=(0, 0, -0.3))
-    run = simulate(wf.Simulation(s.model(setting), dt=1e-3), s, 30, mu=0.5)
+    run = simulate(wf.Simulation(finalize(s.builder, setting), dt=1e-3), s, 30, mu=0.5)
     return run.impulse_answer(setting)
 
 
@@ -169,7 +165,7 @@ def landing(setting: Setting, value: tuple[str, str]) -> Answer:
     spot = 0.02 if at == "middle" else 0.05
     s = cube_on_plate(rotation=ROTATIONS[name], position=(spot, spot, 0.005), mu=0.3, restitution=0.5, across=3)
     s.builder.set_initial(s.upper, velocity=(0, 0, -1.0))
-    run = simulate(wf.Simulation(s.model(setting), dt=1e-3), s, 40)
+    run = simulate(wf.Simulation(finalize(s.builder, setting), dt=1e-3), s, 40)
     return run.impulse_answer(setting)
 
 
@@ -178,7 +174,7 @@ def exact_touch(setting: Setting, name: str) -> Answer:
     """A cube in initial exact touch with a plate, or face on face with a cube of its own, under its weight."""
     same: dict[str, Any] = {"width": SIDE, "across": 2} if name == "same faces" else {}
     s = cube_on_plate(mu=0.5, restitution=0.5, **same)
-    run = simulate(wf.Simulation(s.model(setting), dt=1e-3), s, 50, mu=0.5)
+    run = simulate(wf.Simulation(finalize(s.builder, setting), dt=1e-3), s, 50, mu=0.5)
     return run.impulse_answer(setting)
 
 
@@ -188,7 +184,7 @@ def mass_ratio(setting: Setting, ratio: float) -> Answer:
     E = max(1e7, 1e4 * ratio * DENSITY)
     s = cube_on_plate(E=(E, E), density=(ratio * DENSITY, DENSITY), mu=0.5)
     stats = StepStats()
-    result = wf.solve_static(s.model(setting), stabilise=True, outputs=[stats])
+    result = wf.solve_static(finalize(s.builder, setting), stabilise=True, outputs=[stats])
     record = result.simulation.contact_record(s.contact)
     weight = ratio * DENSITY * SIDE**3 * GRAVITY
     error = abs(float(record.force[0, -1, 2]) / weight - 1.0)
@@ -200,7 +196,7 @@ def over_the_edge(setting: Setting, mu: float) -> Answer:
     """A cube at 2 m/s slides over the edge of a plate, tips and falls free: 120 steps of 1 ms."""
     s = cube_on_plate(position=(SIDE, 0, 0), mu=mu, restitution=0.5)
     s.builder.set_initial(s.upper, velocity=(2.0, 0, 0))
-    run = simulate(wf.Simulation(s.model(setting), dt=1e-3), s, 120)
+    run = simulate(wf.Simulation(finalize(s.builder, setting), dt=1e-3), s, 120)
     return run.impulse_answer(setting, limits={"centre past the other body": (0.0, 0.0)})
 
 
@@ -209,7 +205,7 @@ def extreme_friction(setting: Setting, mu: float) -> Answer:
     """A cube slides over a smooth plate, or one of mu = 10, at 1 m/s."""
     s = cube_on_plate(position=(-0.5 * SIDE, 0, 0), E=(1e6, 1e8), mu=mu, restitution=0.5)
     s.builder.set_initial(s.upper, velocity=(1.0, 0, 0))
-    run = simulate(wf.Simulation(s.model(setting), dt=1e-3), s, 50, mu=mu)
+    run = simulate(wf.Simulation(finalize(s.builder, setting), dt=1e-3), s, 50, mu=mu)
     return run.impulse_answer(setting)
 
 
@@ -222,7 +218,7 @@ def spinning_stack(setting: Setting, rate: float) -> Answer:
         b.set_initial(body, velocity=lambda X: rate * np.cross((0.0, 0.0, 1.0), X))
     b.add_traction(s.upper.surface("z+"), (0, 0, -1e3))
     b.add_traction(s.lower.surface("z-"), (0, 0, 1e3))
-    sim = wf.Simulation(s.model(setting), dt=1e-3)
+    sim = wf.Simulation(finalize(s.builder, setting), dt=1e-3)
     stats = StepStats()
     start = float(sim.energies()["kinetic"][0])
     for _ in range(40):
