@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from .base.checks import is_number, number_hint
+from .base.checks import float_array, is_number, number_hint
 from .base.errors import ModelError
 from .base.names import did_you_mean
 from .base.renamed import check_members
@@ -53,10 +53,7 @@ def _check_constants(owner: str, **values: Any) -> None:
 def _check_density(owner: str, density: Density) -> None:
     if density is None or callable(density):
         return
-    try:
-        values = np.asarray(density, dtype=float)
-    except (TypeError, ValueError):
-        values = np.full(1, np.nan)
+    values = float_array(density)
     if values.ndim > 1 or not np.all(np.isfinite(values)) or not np.all(values > 0.0):
         raise ModelError(
             f"{owner}: density = {density!r} must be positive (kg/m^3): a number, one per element, or f(X)"

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from .base.checks import number_hint
+from .base.checks import float_array, number_hint
 from .base.errors import ModelError
 
 __all__ = ["Control", "TimeLaw", "time_law"]
@@ -41,10 +41,7 @@ class Control:
             raise ModelError(f"a control needs a name, got {self.name!r}")
         if isinstance(self.size, bool) or not isinstance(self.size, (int, np.integer)) or self.size not in SIZE_NAMES:
             raise ModelError(f"control {self.name!r}: size = {self.size!r} must be 1 (number) or 3 (vector)")
-        try:
-            value = np.asarray(self.initial, dtype=float)
-        except (TypeError, ValueError):
-            value = np.full(1, np.nan)
+        value = float_array(self.initial)
         if value.shape not in ((), (self.size,)) or not np.all(np.isfinite(value)):
             expected = f"a finite number{' or 3 of them' if self.size == 3 else ''}"
             raise ModelError(f"control {self.name!r}: initial = {self.initial!r} must be {expected}")

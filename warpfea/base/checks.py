@@ -8,7 +8,9 @@ import numpy as np
 
 from .errors import ModelError
 
-__all__ = ["check_positive", "is_count", "is_number", "number_hint", "number_pair"]
+__all__ = [
+    "check_positive", "finite_number", "float_array", "is_count", "is_number", "number_hint", "number_pair",
+]  # fmt: skip
 
 UNIT_FACTORS = {
     **dict.fromkeys(("", "s", "m", "Pa", "N", "kg", "kg/m^3", "kg/m3"), 1.0),
@@ -36,6 +38,23 @@ def check_positive(owner: str, **values: Any) -> None:
     for name, value in values.items():
         if not (is_number(value) and value > 0.0):
             raise ModelError(f"{owner}: {name} = {value!r} must be a positive finite number{number_hint(value)}")
+
+
+def finite_number(value: Any) -> float:
+    """A finite number, also from its text; nan for anything else."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        return math.nan
+    return number if math.isfinite(number) else math.nan
+
+
+def float_array(values: Any) -> np.ndarray:
+    """A copy of numbers of any shape; (1, 1) of nan for anything else."""
+    try:
+        return np.array(values, dtype=float)
+    except (TypeError, ValueError):
+        return np.full((1, 1), np.nan)
 
 
 def number_pair(values: Any) -> tuple[float, float]:

@@ -29,7 +29,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Generic, ParamSpec
 
-from ..base.checks import check_positive, number_hint
+from ..base.checks import check_positive, finite_number, number_hint
 from ..base.errors import ModelError
 from ..base.names import did_you_mean
 from ..base.usercode import convert_user_errors
@@ -384,11 +384,8 @@ def _parse_int(text: str) -> int:
 
 
 def _parse_float(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
+    value = finite_number(text)
+    if math.isnan(value):
         raise ValueError(f"{text!r} is not a finite number")
     return value
 

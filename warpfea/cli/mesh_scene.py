@@ -11,7 +11,7 @@ from typing import Any
 
 from .. import materials
 from .. import mesh as meshes
-from ..base.checks import number_hint
+from ..base.checks import finite_number, number_hint
 from ..base.errors import Error, UsageError
 from ..base.names import did_you_mean
 from ..builder.builder import ModelBuilder
@@ -155,11 +155,8 @@ def _number_hint(text: str) -> str:
 
 
 def _parse_number(where: str, key: str, text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
+    value = finite_number(text)
+    if math.isnan(value):
         raise UsageError(f"{where}: {key} = {text!r} is not a finite number{_number_hint(text)}")
     return value
 

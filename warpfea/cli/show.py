@@ -212,16 +212,9 @@ def render(options: argparse.Namespace) -> int:
         extra["view"] = options.view
     with quiet_warp():
         render_usd(
-            source,
-            options.output,
-            size=options.size,
-            fps=options.fps,
-            speed=options.speed,
-            field=options.field,
-            time=options.time,
-            progress=show_progress(options),
-            **extra,
-        )
+            source, options.output, size=options.size, fps=options.fps, speed=options.speed, field=options.field,
+            time=options.time, progress=show_progress(options), **extra,
+        )  # fmt: skip
     if not options.quiet:
         print(f"wrote {options.output}")
         sys.stdout.flush()

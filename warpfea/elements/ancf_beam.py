@@ -27,6 +27,7 @@ curvature extrapolated from the middle and the ends, exact to fourth order in th
 
 from __future__ import annotations
 
+import functools
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -43,7 +44,7 @@ if TYPE_CHECKING:
 __all__ = ["BEAM", "parent_functions", "svk_only"]
 
 LOW, HIGH = (0.0, -0.5, -0.5), (1.0, 0.5, 0.5)
-PARENT_RANGES = tuple(zip(LOW, HIGH))
+_rule = functools.partial(box_rule, ranges=tuple(zip(LOW, HIGH)))
 
 
 def parent_functions(xi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -195,13 +196,12 @@ BEAM = register(
         cell_type="line",
         node_slots=((0, 1, 2, 3),) * 2,
         shape=_shape_functions,
-        rules={"full": box_rule((5, 3, 3), PARENT_RANGES), "3x2x2": box_rule((3, 2, 2), PARENT_RANGES)},
-        curved_rule=box_rule((5, 3, 3), PARENT_RANGES),
-        mass_rule=box_rule((4, 2, 2), PARENT_RANGES),
+        rules={"full": _rule((5, 3, 3)), "3x2x2": _rule((3, 2, 2))},
+        curved_rule=_rule((5, 3, 3)),
+        mass_rule=_rule((4, 2, 2)),
         # degree 14 along a curved axis: two cubics, and det J0 of degree 8
-        curved_mass_rule=box_rule((8, 4, 4), PARENT_RANGES),
+        curved_mass_rule=_rule((8, 4, 4)),
         vertices=np.array([(0.0, -0.5, -0.5), (0.0, 0.5, 0.5), (1.0, -0.5, 0.5), (1.0, 0.5, -0.5)]),
-        affine=False,
         parent=ParentDomain(LOW, HIGH),
         faces=box_faces(LOW, HIGH),
         face_rule=square_rule(5),
@@ -210,21 +210,17 @@ BEAM = register(
         vtk_subdivision=box_subdivision(LOW, HIGH, (4, 1, 1)),
         schemes={
             "tied": (
-                EnergyPart("axis", box_rule((3, 2, 2), PARENT_RANGES), _axial_law, framed=True),
-                EnergyPart("section", end_point_rule(box_rule((2, 2, 2), PARENT_RANGES)), _section_law, framed=True),
-                EnergyPart(
-                    "D_nu", end_point_rule(box_rule((2, 1, 1), PARENT_RANGES)), _normal_coupling_law, framed=True
-                ),
-                EnergyPart("shear", box_rule((3, 2, 2), PARENT_RANGES), _shear_law, tying=SHEAR_TYING),
+                EnergyPart("axis", _rule((3, 2, 2)), _axial_law, framed=True),
+                EnergyPart("section", end_point_rule(_rule((2, 2, 2))), _section_law, framed=True),
+                EnergyPart("D_nu", end_point_rule(_rule((2, 1, 1))), _normal_coupling_law, framed=True),
+                EnergyPart("shear", _rule((3, 2, 2)), _shear_law, tying=SHEAR_TYING),
             ),
             "split": (
-                EnergyPart("D0", box_rule((3, 2, 2), PARENT_RANGES), _uncoupled_law, framed=True),
-                EnergyPart("D_nu", box_rule((3, 1, 1), PARENT_RANGES), _normal_coupling_law, framed=True),
+                EnergyPart("D0", _rule((3, 2, 2)), _uncoupled_law, framed=True),
+                EnergyPart("D_nu", _rule((3, 1, 1)), _normal_coupling_law, framed=True),
             ),
         },
-        output_schemes={
-            "shear stress": (EnergyPart("shear", box_rule((3, 2, 2), PARENT_RANGES), _shear_output_law, framed=True),)
-        },
+        output_schemes={"shear stress": (EnergyPart("shear", _rule((3, 2, 2)), _shear_output_law, framed=True),)},
         slot_sets={"axis": (1,), "section": (2, 3)},
         spin_vectors=2,
         solid=False,

@@ -51,7 +51,7 @@ SHELL_EXPONENTS = np.array(
 )
 SHELL_NODES = np.array([(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (1.0, 1.0, 0.0), (0.0, 1.0, 0.0)])
 LOW, HIGH = (0.0, 0.0, -0.5), (1.0, 1.0, 0.5)
-PARENT_RANGES = tuple(zip(LOW, HIGH))
+_rule = functools.partial(box_rule, ranges=tuple(zip(LOW, HIGH)))
 
 
 @functools.cache
@@ -146,7 +146,7 @@ SHEAR_TYING = AssumedStrain(
 )
 
 CORNER_RULE = Rule("corners", SHELL_NODES[[0, 3, 1, 2]], np.full(4, 0.25), 1, (2, 2, 1))
-SURFACE_RULE = box_rule((2, 2, 1), PARENT_RANGES)  # exact for the derivatives of the cubic functions over any flat quad
+SURFACE_RULE = _rule((2, 2, 1))  # exact for the derivatives of the cubic functions over any flat quad
 THICKNESS_TYING = AssumedStrain(
     points=np.vstack([CORNER_RULE.points, np.repeat(SURFACE_RULE.points, 2, axis=0)]),
     pairs=np.array([(2, 2)] * 4 + [(0, 0), (1, 1)] * 4),
@@ -162,12 +162,11 @@ SHELL = register(
         cell_type="quad",
         node_slots=((0, 1, 2, 3),) * 4,
         shape=_shape_functions,
-        rules={"full": box_rule((4, 4, 2), PARENT_RANGES)},
-        curved_rule=box_rule((4, 4, 2), PARENT_RANGES),
-        mass_rule=box_rule((4, 4, 2), PARENT_RANGES),
-        curved_mass_rule=box_rule((8, 8, 3), PARENT_RANGES),
+        rules={"full": _rule((4, 4, 2))},
+        curved_rule=_rule((4, 4, 2)),
+        mass_rule=_rule((4, 4, 2)),
+        curved_mass_rule=_rule((8, 8, 3)),
         vertices=SHELL_NODES,
-        affine=False,
         parent=ParentDomain(LOW, HIGH),
         # bottom, top, then the strips over the edges 01, 12, 23, 30 of the quad
         faces=(_BOX_FACES[4], _BOX_FACES[5], _BOX_FACES[2], _BOX_FACES[1], _BOX_FACES[3], _BOX_FACES[0]),
@@ -177,9 +176,9 @@ SHELL = register(
         vtk_subdivision=box_subdivision(LOW, HIGH, (2, 2, 1)),
         schemes={
             "tied": (
-                EnergyPart("surface", box_rule((4, 4, 2), PARENT_RANGES), _plane_stress_law, framed=True),
+                EnergyPart("surface", _rule((4, 4, 2)), _plane_stress_law, framed=True),
                 EnergyPart("thickness", SURFACE_RULE, _thickness_law, framed=True, tying=THICKNESS_TYING),
-                EnergyPart("shear", box_rule((4, 4, 2), PARENT_RANGES), _shear_law, tying=SHEAR_TYING),
+                EnergyPart("shear", _rule((4, 4, 2)), _shear_law, tying=SHEAR_TYING),
             )
         },
         output_schemes={

@@ -91,8 +91,6 @@ def _register_tet(name: str, cell: str, elimination: float | None) -> Family:
             # on a curved body the cubic map makes degree 12 with FN, degree 9 with the others
             curved_mass_rule=conical_tet(7) if name == "FN" else conical_tet(5),
             vertices=TET_CORNERS,
-            affine=False,
-            parent=ParentDomain(),
             faces=TET_FACE_CORNERS,
             face_rule=conical_triangle(4),
             face_divisions=((3, 3),) * 4,
@@ -108,7 +106,7 @@ FN = _register_tet("FN", "tetra", 2.0 / 81.0)
 FN18 = _register_tet("FN18", "tetra", 1.0 / 18.0)
 
 LOW, HIGH = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
-UNIT_RANGES = tuple(zip(LOW, HIGH))
+_rule = functools.partial(box_rule, ranges=tuple(zip(LOW, HIGH)))
 
 
 def _brick_exponents() -> np.ndarray:
@@ -142,12 +140,11 @@ BRICK = register(
         cell_type="hexahedron",
         node_slots=((0, 1, 2, 3),) * 8,
         shape=_brick_shape_functions,
-        rules={"3x3x3": box_rule((3, 3, 3), UNIT_RANGES), "4x4x4": box_rule((4, 4, 4), UNIT_RANGES)},
-        curved_rule=box_rule((4, 4, 4), UNIT_RANGES),
-        mass_rule=box_rule((5, 5, 5), UNIT_RANGES),
-        curved_mass_rule=box_rule((5, 5, 5), UNIT_RANGES),
+        rules={"3x3x3": _rule((3, 3, 3)), "4x4x4": _rule((4, 4, 4))},
+        curved_rule=_rule((4, 4, 4)),
+        mass_rule=_rule((5, 5, 5)),
+        curved_mass_rule=_rule((5, 5, 5)),
         vertices=HEX_CORNERS[[0, 2, 5, 7]],
-        affine=False,
         parent=ParentDomain(LOW, HIGH),
         faces=tuple(HEX_CORNERS[HEX_FACES]),
         face_rule=square_rule(5),

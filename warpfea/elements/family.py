@@ -90,7 +90,7 @@ class VtkSubdivision:
     cells: np.ndarray
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Family:
     """An element family as tables: r = sum e_i s_i, F = sum e_i h_i^T (Eq. (1)) over its slots i.
 
@@ -130,8 +130,8 @@ class Family:
     mass_rule: Rule
     curved_mass_rule: Rule
     vertices: np.ndarray
-    affine: bool
-    parent: ParentDomain
+    affine: bool = False
+    parent: ParentDomain = ParentDomain()
     faces: tuple[np.ndarray, ...]
     face_rule: Rule
     face_divisions: tuple[tuple[int, int], ...]

@@ -3,7 +3,7 @@
 import numpy as np
 
 from ..mesh.cells import TET_EDGES, TET_FACES, barycentric, tet4_gradients, tet10_gradients
-from .family import Family, ParentDomain, VtkSubdivision, register
+from .family import Family, VtkSubdivision, register
 from .quadrature import TET_RULES, conical_tet, triangle_6
 
 __all__ = ["T4", "T10", "TET_CORNERS", "TET_FACES"]
@@ -36,7 +36,6 @@ T10 = register(
         curved_mass_rule=conical_tet(4),
         vertices=TET_CORNERS,
         affine=True,
-        parent=ParentDomain(),
         faces=TET_FACE_CORNERS,
         face_rule=triangle_6(),
         face_divisions=((2, 2),) * 4,
@@ -57,7 +56,6 @@ T4 = register(
         curved_mass_rule=conical_tet(3),
         vertices=TET_CORNERS,
         affine=True,
-        parent=ParentDomain(),
         faces=TET_FACE_CORNERS,
         face_rule=triangle_6(),
         face_divisions=((1, 1),) * 4,

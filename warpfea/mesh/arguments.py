@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from ..base.checks import is_number
+from ..base.checks import float_array, is_number
 from ..base.errors import MeshError
 from ..base.names import did_you_mean
 from .cells import ELEMENT_CELLS, Floats
@@ -17,10 +17,7 @@ PointMap = Callable[[Floats], Any]
 
 
 def _number_array(what: str, values: Any, count: int) -> Floats:
-    try:
-        array = np.array(values, dtype=float)
-    except (TypeError, ValueError):
-        array = np.empty(0)
+    array = float_array(values)
     if array.shape != (count,):
         hint = f"; write {(values,) * count!r}" if np.ndim(values) == 0 and is_number(values) else ""
         raise MeshError(f"{what}: expected {count} number{'s' if count > 1 else ''}, got {values!r}{hint}")
@@ -78,10 +75,7 @@ def map_points(what: str, points: Floats, function: PointMap | None) -> Floats:
     if not callable(function):
         raise MeshError(f"{what} must be a function X (n, 3) -> (n, 3), got {type(function).__name__}")
     values = function(points.copy())
-    try:
-        out = np.array(values, dtype=float)
-    except (TypeError, ValueError):
-        out = np.empty(0)
+    out = float_array(values)
     if out.shape != points.shape:
         raise MeshError(f"{what} must return numbers of shape {points.shape}, got shape {np.shape(values)}")
     bad = np.flatnonzero(~np.isfinite(out).all(axis=1))

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ..base.checks import finite_number
 from ..base.errors import MeshError
 from ..base.names import did_you_mean, listing
 from .cells import CELL_TYPES, CellType, Floats, Ints, element_volumes, row_keys
@@ -319,11 +320,8 @@ def transformation(scale: float, transform: Any, label: str) -> tuple[Floats, Fl
     ``transform``: None, a 4x4 matrix with the last row 0 0 0 1, or a pair of a 3x3 matrix and a 3-vector (m).
     A reflection (det < 0) would invert every element and is refused.
     """
-    try:
-        factor = float(scale)
-    except (TypeError, ValueError):
-        factor = np.nan
-    if not (np.isfinite(factor) and factor > 0.0):
+    factor = finite_number(scale)
+    if not factor > 0.0:
         raise MeshError(f"{label}: scale must be a positive number, got {scale!r}")
     if transform is None:
         return factor * np.eye(3), np.zeros(3)

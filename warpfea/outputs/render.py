@@ -69,16 +69,9 @@ class _PictureWriter(Output):
         self._origin = 0.5 * (body_points.min(axis=0) + body_points.max(axis=0))
         title, units = field_label(sim, self.field) if self.field else ("", "")
         self._animation = Animation(
-            self._surface.triangles(),
-            self._surface.up_axis,
-            np.asarray(start - self._origin, dtype=np.float32),
-            title,
-            units,
-            self.color_range,
-            is_static(sim),
-            self._surface.body_points,
-            self._surface.plane_squares(),
-        )
+            self._surface.triangles(), self._surface.up_axis, np.asarray(start - self._origin, dtype=np.float32), title,
+            units, self.color_range, is_static(sim), self._surface.body_points, self._surface.plane_squares(),
+        )  # fmt: skip
 
     def _frame(self, sim: Any) -> Frame:
         points = np.asarray(self._surface.points(sim) - self._origin, dtype=np.float32)

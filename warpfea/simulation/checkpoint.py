@@ -73,21 +73,13 @@ def save_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
     target = check_target(path, SUFFIXES)
     sim.stepper.update_parameters()
     meta = {
-        "schema": SCHEMA,
-        "fingerprint": sim.model.fingerprint(),
-        "dtype": sim.model.dtype,
-        "worlds": sim.model.worlds,
-        "slots": sim.model.slots,
-        "integrator": sim.integrator.label,
-        "gravity": sim.model.description.gravity.tolist(),
-        "dt": np.asarray(sim.dt).tolist() if sim.error is None else "auto",
-        "steps": sim.steps,
-        "max_residual": sim.max_residual,
-        "max_floor": sim.max_floor,
-        "max_violation": sim.max_violation,
+        "schema": SCHEMA, "fingerprint": sim.model.fingerprint(), "dtype": sim.model.dtype, "worlds": sim.model.worlds,
+        "slots": sim.model.slots, "integrator": sim.integrator.label, "gravity": sim.model.description.gravity.tolist(),
+        "dt": np.asarray(sim.dt).tolist() if sim.error is None else "auto", "steps": sim.steps,
+        "max_residual": sim.max_residual, "max_floor": sim.max_floor, "max_violation": sim.max_violation,
         "min_J": sim.min_J if math.isfinite(sim.min_J) else None,
         "probes": [probe.name for probe in sim.model.description.probes],
-    }
+    }  # fmt: skip
     if sim.stepper.step_size_control:
         sync_times = sim.stepper.step_size_control.sync_times
         meta["error"] = sim.error

@@ -13,6 +13,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+from ...base.checks import finite_number
 from ...base.console import to_json
 from ...base.errors import ModelError
 from ...base.names import check_known, did_you_mean
@@ -170,11 +171,8 @@ def parse_over(scene: Scene[Any], texts: Iterable[str], option: str = "--over") 
 
 
 def _positive_number(name: str, text: Any) -> float:
-    try:
-        value = float(text)
-    except (TypeError, ValueError):
-        value = math.nan
-    if not (math.isfinite(value) and value > 0.0):
+    value = finite_number(text)
+    if not value > 0.0:
         raise ModelError(f"{name} = {text!r} must be a positive finite number")
     return value
 
