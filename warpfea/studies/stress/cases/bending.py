@@ -92,5 +92,5 @@ def solve_soft_solid(setting: Setting, name: str) -> Answer:
 
 for _name, _what in {"mat": "mat", "dolphin": "dolphin", "thin_limbs": "body with thin limbs"}.items():
     _text = f"A neo-Hookean {_what} of unstructured T4 bends by most of its length in two load steps."
-    _answer = functools.partial(solve_soft_solid, name=_name)
-    case(f"soft-{_name.replace('_', '-')}", "soft solids", description=_text)(_answer)
+    _trial = functools.partial(solve_soft_solid, name=_name)
+    case(f"soft-{_name.replace('_', '-')}", "soft solids", description=_text)(_trial)

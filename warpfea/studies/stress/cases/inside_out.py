@@ -93,5 +93,5 @@ for _name, _law, _refusal, _text in (
      "A neo-Hookean bar stretched tenfold: a solution is required, with J >= 0.35 at its points."),
     ("neo-twisted", NEO_HOOKEAN, FLOAT32_REFUSAL, "A neo-Hookean bar twisted by four turns: a solution is required."),
 ):  # fmt: skip
-    _answer = functools.partial(force_balance, law=_law, how=_name.partition("-")[2])
-    case(_name, "inside out", values=tuple(CELLS), refusal=_refusal, description=_text)(_answer)
+    _trial = functools.partial(force_balance, law=_law, how=_name.partition("-")[2])
+    case(_name, "inside out", values=tuple(CELLS), refusal=_refusal, description=_text)(_trial)

@@ -92,7 +92,7 @@ for _name, _motion, _quick, _text in (
      "A soft arm (2e5 Pa), or a slender one of steel, sags on a steel block under 1e9 Pa across it; four load steps."),
     ("stiff-beside-soft-motion", True, "none", "The arm released, 300 steps of backward Euler of 50 ms."),
 ):  # fmt: skip
-    _answer = functools.partial(evaluate, motion=_motion)
+    _trial = functools.partial(evaluate, motion=_motion)
     case(_name, "Stiff beside soft", values=CONNECTIONS, quick=_quick, refusal=FLOAT32_REFUSAL, description=_text)(
-        _answer
+        _trial
     )
