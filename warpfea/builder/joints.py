@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from ..base.errors import ModelError
-from ..base.names import did_you_mean
+from ..base.names import check_known, did_you_mean
 from ..kernels.terms.constraints import ANGLE, DISTANCE, DOT
 from ..model.joints import ConstraintRow, Joint, Vector, constant_vector
 from ..time_laws import TimeLaw, time_law
@@ -79,10 +79,7 @@ def make_joint(
 
 def _attachments(what: str, kind: str, parent: Any, child: Any) -> tuple[Attachment, Attachment]:
     """Parent and child of a joint. ModelError for an unknown kind, two grounds, or identical attachment points."""
-    if kind not in JOINT_KINDS:
-        raise ModelError(
-            f"{what}: kind {kind!r} is unknown; there are {', '.join(JOINT_KINDS)}{did_you_mean(kind, JOINT_KINDS)}"
-        )
+    check_known(f"{what}: kind", kind, JOINT_KINDS)
     P, Q = make_attachment(parent, f"{what}: parent", child=False), make_attachment(child, f"{what}: child", child=True)
     if P.body is None and Q.body is None:
         raise ModelError(f"{what}: neither parent nor child is a body")
