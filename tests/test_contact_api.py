@@ -114,7 +114,7 @@ def test_force_at_a_state_is_that_of_the_step_without_losses(options):
     assert nodal.shape == (1, model.slots, 3)
     force = sim.contact_force("pad")[0]
     assert nodal[0].sum(axis=0) == pytest.approx(force[:3], rel=1e-10, abs=1e-10 * np.abs(force).max())
-    moment = np.cross(sim.positions(cube)[0], sim._at_mesh_nodes(cube, nodal)[0]).sum(axis=0)
+    moment = np.cross(sim.positions(cube)[0], sim.results.at_mesh_nodes(cube, nodal)[0]).sum(axis=0)
     assert moment == pytest.approx(force[3:], rel=1e-9, abs=1e-9 * np.abs(force).max())
 
 

@@ -150,7 +150,8 @@ def test_forces_at_a_state_are_those_of_the_record_and_in_balance(dtype):
     assert size > 1.0
     assert np.abs(force.sum(axis=0)).max() < 1e-13 * size
     moment = sum(
-        np.cross(sim.positions(body), sim._at_mesh_nodes(body, force[None]))[0].sum(axis=0) for body in (slab, block)
+        np.cross(sim.positions(body), sim.results.at_mesh_nodes(body, force[None]))[0].sum(axis=0)
+        for body in (slab, block)
     )
     assert np.abs(moment).max() < (1e-12 if dtype == "float64" else 1e-7) * size
     recorded = sim.contact_force("pad")[0, :3]

@@ -88,8 +88,8 @@ def save_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
     arrays |= {f"parameter.{name}": values for name, values in sim.model.parameters.numpy().items()}
     arrays |= {f"set.{name}": array.numpy() for name, array in sim.model.terms.parameter_arrays().items()}
     arrays |= {f"total.{name}": values for name, values in sim.totals.items()}
-    if sim._history:
-        arrays["history"] = np.stack(sim._history)
+    if sim.statistics.history:
+        arrays["history"] = np.stack(sim.statistics.history)
     text = np.frombuffer(json.dumps(meta).encode(), dtype=np.uint8)
 
     def write(temporary: pathlib.Path) -> None:
@@ -149,7 +149,7 @@ def load_checkpoint(sim: Any, path: str | os.PathLike[str]) -> None:
     sim.max_floor = float(meta.get("max_floor", 0.0))
     sim.max_violation = float(meta.get("max_violation", 0.0))
     sim.min_J = math.inf if meta.get("min_J") is None else float(meta["min_J"])
-    sim._history = list(history)
+    sim.statistics.history = list(history)
     sim.last = idle_report(sim)
 
 

@@ -96,7 +96,7 @@ class EnergyGrowth:
         self._rows.assign(rows)
         self._round_off_energy.assign(round_off_energy(self._model))
 
-    def warn_once(self, sim: Any, shares: np.ndarray) -> None:
+    def warn_once(self, sim: Any, shares: np.ndarray, stacklevel: int = 4) -> None:
         """Warn once if a world's energy gain (worlds,) exceeds WARN_LIMIT."""
         if self.warned or not (worst := float(np.max(shares))) > WARN_LIMIT:
             return
@@ -109,7 +109,7 @@ class EnergyGrowth:
             f"{energy_source(sim, world)} is gaining energy: {worst:.1%} of the peak energy{where} (above "
             f"{WARN_LIMIT:.0%} since t = {since:.6g} s){refused}; {remedy_text(sim, world)}",
             ModelWarning,
-            stacklevel=4,
+            stacklevel=stacklevel,
         )
 
 

@@ -115,10 +115,10 @@ class Observations:
         self._column_count += 3
 
     def _add_joint(self, name: str, owner: str, what: str) -> None:
-        first = self._sim._joint_column(owner)
+        first = self._sim.records.joint_column(owner)
         tables = self._model.constraints
         assert tables is not None
-        joint = self._sim._joint(owner)
+        joint = self._sim.records.find_joint(owner)
         has = tables.coordinate_vectors(joint)
         self._check_quantity(name, what, [*has, *JOINT_REPORT_COLUMNS])
         if what in has:
@@ -128,7 +128,7 @@ class Observations:
         self._add_report(first, JOINT_REPORT_COLUMNS[what])
 
     def _add_contact(self, name: str, owner: str, what: str) -> None:
-        first = self._sim._contact_column(owner)
+        first = self._sim.records.contact_column(owner)
         self._check_quantity(name, what, CONTACT_REPORT_COLUMNS)
         self._add_report(first, CONTACT_REPORT_COLUMNS[what])
 
@@ -190,7 +190,7 @@ class Observations:
         if self._report_columns:
             assert self._stepped_flags is not None
             if not sim.asynchronous:  # known on the host
-                self._stepped_flags.assign(sim._stepped_worlds.astype(np.int32))
+                self._stepped_flags.assign(sim.statistics.stepped_worlds.astype(np.int32))
             args = [*self._report_columns, sim.stepper.work.report, self._stepped_flags, self.array]
             launch(k.report_columns, (B, len(self._reports)), args)
         for column in self._times:

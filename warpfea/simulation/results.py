@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,15 +25,8 @@ MAX_NAMED_BODIES = 5
 class Results:
     """Results of the present state of a model. Nodal results are in the mesh file's order, worlds first."""
 
-    model: Model
-    state: State
-
-    def info(self) -> dict[str, Any]:
-        """`Model.info`, "integrator" with its options, "methods", the solver's "plan", the monitoring of
-        "energy_growth"."""
-        own: Any = self
-        more = {"integrator": own.integrator.label, "methods": own.methods, "plan": dataclasses.asdict(own.plan)}
-        return self.model.info() | more | {"energy_growth": str(own.energy_growth)}
+    def __init__(self, model: Model, state: State) -> None:
+        self.model, self.state = model, state
 
     def check_body(self, body: Any, what: str) -> None:
         """Raise ModelError unless `body` is the handle of a body of this model; the text begins with `what`."""
@@ -52,7 +44,7 @@ class Results:
         if body not in self.model.bodies:
             raise ModelError(f"{what}: body {body.name!r} is not of this model")
 
-    def _at_mesh_nodes(self, body: Body, values: np.ndarray) -> np.ndarray:
+    def at_mesh_nodes(self, body: Body, values: np.ndarray) -> np.ndarray:
         """Slot values at mesh nodes, (B, nodes, 3); 0 at nodes without an element."""
         out = np.zeros((self.model.worlds, len(body.mesh.points), 3))
         used = body.mesh.used_nodes
@@ -63,7 +55,7 @@ class Results:
         """Nodal displacements (B, nodes, 3), m, in the mesh file's node order. ModelError for a body of another
         model."""
         self.check_body(body, "displacements")
-        return self._at_mesh_nodes(body, self.state.displacement.numpy())
+        return self.at_mesh_nodes(body, self.state.displacement.numpy())
 
     def positions(self, body: Body) -> np.ndarray:
         """Nodal positions (B, nodes, 3), m. ModelError for a body of another model."""
@@ -73,7 +65,7 @@ class Results:
     def velocities(self, body: Body) -> np.ndarray:
         """Nodal velocities (B, nodes, 3), m/s. ModelError for a body of another model."""
         self.check_body(body, "velocities")
-        return self._at_mesh_nodes(body, self.state.velocity.numpy())
+        return self.at_mesh_nodes(body, self.state.velocity.numpy())
 
     def point_positions(self, body: Body, weights: Any) -> np.ndarray:
         """Current positions (B, P, 3), m, of material points given by sparse weights (P, slots of the body)."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -10,10 +11,7 @@ import numpy as np
 from ..base.errors import ConstraintError, ConvergenceError
 from ..kernels.step.episodes import RUN_STATISTICS
 from ..kernels.step.step_control import REPORT_COLUMNS, STATUS
-from ..solvers import SolverPlan
-from .energy_growth import EnergyGrowth
 from .failures import step_error
-from .records import Records
 from .reports import StepReport
 
 __all__ = ["RunStatistics"]
@@ -21,25 +19,28 @@ __all__ = ["RunStatistics"]
 COUNTED_TOTALS = ("newton", "pcg", "rough", "floored")
 """Keys of `totals`: Newton and PCG iterations, steps accepted above the tolerance, and at the round-off limit."""
 
+COUNT_COLUMNS = ("newton", "pcg", "halvings", "status", "failure", "outer")
+"""Columns of a report that are whole numbers."""
+
 
 class SyncedAttribute:
     """Descriptor that synchronises device statistics before reading."""
 
     def __set_name__(self, owner: type, name: str) -> None:
-        self.key = f"_kept_{name.lstrip('_')}"
+        self.key = f"_kept_{name}"
 
-    def __get__(self, sim: Any, owner: type) -> Any:
-        if sim is None:
+    def __get__(self, statistics: Any, owner: type) -> Any:
+        if statistics is None:
             return self
-        sim._sync_from_device()
-        return getattr(sim, self.key)
+        statistics.sync_from_device()
+        return getattr(statistics, self.key)
 
-    def __set__(self, sim: Any, value: Any) -> None:
-        setattr(sim, self.key, value)
+    def __set__(self, statistics: Any, value: Any) -> None:
+        setattr(statistics, self.key, value)
 
 
-class RunStatistics(Records):
-    """Totals over steps, the last report, and records.
+class RunStatistics:
+    """Totals over steps, the last report, and recorded rows of a simulation.
 
     Attributes:
         steps: number of steps taken.
@@ -47,7 +48,10 @@ class RunStatistics(Records):
         totals: iterations by world; "rough" and "floored" count steps.
         max_residual, max_floor, max_violation, min_J: extremes over all steps and worlds.
         asynchronous: steps without device reads: `record` is False, failed worlds are frozen, and neither step
-            sizes nor initial accelerations are computed on the host.
+            sizes nor initial accelerations are computed on the host; unsynced: steps since the last reading.
+        times_differ: worlds have times of their own.
+        stepped_worlds: (worlds,) True for worlds stepped since their state was set.
+        history: recorded columns (worlds, columns) of each step.
     """
 
     last: Any = SyncedAttribute()
@@ -56,26 +60,13 @@ class RunStatistics(Records):
     max_floor: Any = SyncedAttribute()
     max_violation: Any = SyncedAttribute()
     min_J: Any = SyncedAttribute()
-    _stepped_worlds: Any = SyncedAttribute()
-    _failed_worlds: np.ndarray
-    _history: Any = SyncedAttribute()
-    on_failure: str | None
-    record: bool
-    energy_growth: EnergyGrowth
+    stepped_worlds: Any = SyncedAttribute()
+    history: Any = SyncedAttribute()
 
-    @property
-    def methods(self) -> dict[str, str]:
-        """Methods chosen for "auto": "solver", and for NewtonPCG "linear", "operator" and "preconditioner"."""
-        return self.plan.methods
-
-    @property
-    def plan(self) -> SolverPlan:
-        """Methods of the linear systems, chosen or given; `plan=` of another simulation takes them."""
-        return self.stepper.newton.plan
-
-    def _reset_statistics(self, asynchronous: bool) -> None:
-        B = self.model.worlds
-        self.asynchronous, self._unsynced, self._times_differ = asynchronous, False, False
+    def __init__(self, sim: Any, asynchronous: bool) -> None:
+        B = sim.model.worlds
+        self.sim, self.stepper = sim, sim.stepper
+        self.asynchronous, self.unsynced, self.times_differ = asynchronous, False, False
         self.steps = 0
         self.last = None
         self.totals = {name: np.zeros(B, int) for name in COUNTED_TOTALS}
@@ -83,14 +74,14 @@ class RunStatistics(Records):
             self.totals |= {name: np.zeros(B, int) for name in ("substeps", "rejected")}
         self.max_residual = self.max_floor = self.max_violation = 0.0
         self.min_J = math.inf
-        self._stepped_worlds, self._failed_worlds = (np.zeros(B, dtype=bool) for _ in range(2))
-        self._history = []
+        self.stepped_worlds, self._failed_worlds = (np.zeros(B, dtype=bool) for _ in range(2))
+        self.history = []
 
-    def _sync_from_device(self) -> None:
+    def sync_from_device(self) -> None:
         """Read the device statistics of the steps since the last reading."""
-        if not self._unsynced:
+        if not self.unsynced:
             return
-        self._unsynced = False
+        self.unsynced = False
         sums, stepped = self.stepper.episodes.read_totals()
         rows = self.stepper.work.report.numpy()
         self.last = self._make_report(rows)
@@ -100,47 +91,34 @@ class RunStatistics(Records):
             key = f"max_{name}"
             setattr(self, key, max(getattr(self, key), float(sums[:, RUN_STATISTICS.index(name)].max())))
         self.min_J = min(self.min_J, float(sums[:, RUN_STATISTICS.index("min_J")].min()))
-        self.energy_growth.warn_once(self, sums[:, RUN_STATISTICS.index("energy_growth")])
-        self._stepped_worlds = stepped
+        self.sim.energy_growth.warn_once(self.sim, sums[:, RUN_STATISTICS.index("energy_growth")], stacklevel=5)
+        self.stepped_worlds = stepped
         if self._records_columns:
-            self._history = [self._history_row(rows)]
+            self.history = [self._recorded_row(rows)]
 
-    def _clear_stepped(self, mask: np.ndarray) -> None:
+    def clear_stepped(self, mask: np.ndarray) -> None:
         """Mark worlds as not stepped since their state was set."""
-        self._stepped_worlds[mask] = False
+        self.stepped_worlds[mask] = False
         self.stepper.episodes.clear_stepped(mask)
 
     def _make_report(self, rows: np.ndarray) -> StepReport:
         """Report of a step from its columns (worlds, columns)."""
         column = {name: rows[:, k].copy() for k, name in enumerate(REPORT_COLUMNS)}
-        status = column["status"].astype(int)
-        return StepReport(
-            converged=(status == STATUS["running"]) & (column["rough"] == 0.0),
-            newton=column["newton"].astype(int),
-            pcg=column["pcg"].astype(int),
-            residual=column["residual"],
-            halvings=column["halvings"].astype(int),
-            status=status,
-            min_J=column["min_J"],
-            time=column["time"],
-            failure=column["failure"].astype(int),
-            violation=column["violation"],
-            outer=column["outer"].astype(int),
-            residual_force=column["residual_force"],
-            floor=column["floor"],
-            energy_growth=column["energy_growth"],
-            **(self.stepper.step_size_control.step_statistics() if self.stepper.step_size_control else {}),
-        )
+        column |= {name: column[name].astype(int) for name in COUNT_COLUMNS}
+        column["converged"] = (column["status"] == STATUS["running"]) & (column["rough"] == 0.0)
+        known = {entry.name: column[entry.name] for entry in fields(StepReport) if entry.name in column}
+        control = self.stepper.step_size_control
+        return StepReport(**known, **(control.step_statistics() if control else {}))
 
-    def _record_step(self, rows: np.ndarray) -> None:
+    def add_step(self, rows: np.ndarray) -> None:
         """Accumulate the statistics of a step (worlds, columns); raise for failed worlds if requested."""
         last = self.last = self._make_report(rows)
         failed = last.status == STATUS["failed"]
         fresh, self._failed_worlds = failed & ~self._failed_worlds, failed
         self.steps += 1
         good = last.status == STATUS["running"]
-        self._stepped_worlds |= good
-        self._stepped_worlds &= last.status != STATUS["failed"]
+        self.stepped_worlds |= good
+        self.stepped_worlds &= last.status != STATUS["failed"]
         totals = self.totals
         if self.stepper.step_size_control:
             totals["substeps"] += last.substeps
@@ -155,35 +133,35 @@ class RunStatistics(Records):
             self.max_violation = max(self.max_violation, float(last.violation[good].max()))
             self.min_J = min(self.min_J, float(last.min_J[good].min()))
         if self._records_columns:
-            if not self.record:
-                self._history.clear()
-            self._history.append(self._history_row(rows))
-        self.energy_growth.warn_once(self, last.energy_growth)
+            if not self.sim.record:
+                self.history.clear()
+            self.history.append(self._recorded_row(rows))
+        self.sim.energy_growth.warn_once(self.sim, last.energy_growth)
         if fresh.any():
-            fatal = self.on_failure == "raise" or (self.on_failure is None and not good.any())
+            fatal = self.sim.on_failure == "raise" or (self.sim.on_failure is None and not good.any())
             if fatal:
                 if not good.any():  # no world advanced
                     self.steps -= 1
                     if self._records_columns:
-                        self._history.pop()
+                        self.history.pop()
                 raise self._failure_error(int(np.flatnonzero(fresh)[0]))
 
-    def _history_row(self, rows: np.ndarray) -> np.ndarray:
+    def _recorded_row(self, rows: np.ndarray) -> np.ndarray:
         """Recorded columns of a report: time, probes, and term columns, NaN for worlds that did not step."""
         row = rows[:, [REPORT_COLUMNS.index("time"), *range(len(REPORT_COLUMNS), rows.shape[1])]].copy()
-        row[~self._stepped_worlds, 1 + 6 * len(self.model.description.probes) :] = np.nan
+        row[~self.stepped_worlds, 1 + 6 * len(self.sim.model.description.probes) :] = np.nan
         return row
 
     @property
     def _records_columns(self) -> bool:
         """True if any quantity is recorded per step."""
-        return self.model.terms.report_width > len(REPORT_COLUMNS)
+        return self.sim.model.terms.report_width > len(REPORT_COLUMNS)
 
     def _failure_error(self, world: int) -> ConvergenceError | ConstraintError:
         """Error of a failed world; its status is cleared so that a caller may retry with another dt."""
-        error = step_error(self, world)
-        status = self.state.status.numpy()
+        error = step_error(self.sim, world)
+        status = self.sim.state.status.numpy()
         status[status == STATUS["failed"]] = STATUS["running"]
-        self.state.status.assign(status)
+        self.sim.state.status.assign(status)
         self._failed_worlds[:] = False
         return error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import time as clock
 from collections.abc import Callable, Sequence
@@ -14,11 +15,8 @@ from .. import solvers
 from ..base.console import compile_progress_bar, quiet_warp
 from ..base.errors import ModelError
 from ..base.memory import convert_memory_errors
-from ..base.names import listing
-from ..base.worlds import worlds_mask
 from ..kernels.step.step_control import SAME_TIME_FRACTION, STATUS
 from ..model.assembly import require_density
-from ..model.handles import NodeSet
 from ..model.state import State
 from ..solvers import Jacobi, NewtonPCG, SolverPlan
 from . import integrators
@@ -27,7 +25,6 @@ from .capacity import check_capacity
 from .checks import (
     check_choice,
     check_constraint_tol,
-    check_mask,
     check_model,
     check_state,
     check_steps,
@@ -39,7 +36,11 @@ from .controls import Controls
 from .energy_growth import ENERGY_GROWTH_CHOICES, EnergyGrowth
 from .failures import check_initial_constraints
 from .observations import Observations
+from .part_member import PartMember
+from .records import Records
 from .reports import ContactRecord, JointRecord, PendingReport, ProbeRecord, StepReport, idle_report, simulation_text
+from .resets import Resets
+from .results import Results
 from .run_loop import run_steps
 from .run_statistics import RunStatistics
 from .stepper import Stepper
@@ -51,7 +52,7 @@ if TYPE_CHECKING:
 __all__ = ["ContactRecord", "JointRecord", "ProbeRecord", "Simulation", "StepReport"]
 
 
-class Simulation(RunStatistics):
+class Simulation:
     """Time integration of a model.
 
     Args:
@@ -86,6 +87,8 @@ class Simulation(RunStatistics):
             "ignore" and ledger=False: not monitored.
 
     Attributes:
+        results: results of the present state; records: of the last step and over time; statistics: totals over steps;
+            resets: resets of worlds. Their public members are the simulation's, too.
         controls: values written by the caller between steps, see Controls.
         compile_s, output_s: time to construct the simulation, kernels included, and of output writers in runs, s.
         energy_growth: description of the energy growth monitor.
@@ -95,6 +98,37 @@ class Simulation(RunStatistics):
         ConstraintError: initially violated joints.
         CapacityError: insufficient device memory.
     """
+
+    positions = PartMember("results", Results.positions)
+    displacements = PartMember("results", Results.displacements)
+    velocities = PartMember("results", Results.velocities)
+    field = PartMember("results", Results.field)
+    fields = PartMember("results", Results.fields)
+    field_on = PartMember("results", Results.field_on)
+    check_field = PartMember("results", Results.check_field)
+    point_positions = PartMember("results", Results.point_positions)
+    skin_points = PartMember("results", Results.skin_points)
+    skin_field = PartMember("results", Results.skin_field)
+    node_gradients = PartMember("results", Results.node_gradients)
+    collider_poses = PartMember("results", Results.collider_poses)
+    energies = PartMember("records", Records.energies)
+    reaction = PartMember("records", Records.reaction)
+    probe = PartMember("records", Records.probe)
+    joint_record = PartMember("records", Records.joint_record)
+    joint_force = PartMember("records", Records.joint_force)
+    joint_value = PartMember("records", Records.joint_value)
+    violation = PartMember("records", Records.violation)
+    contact_record = PartMember("records", Records.contact_record)
+    contact_force = PartMember("records", Records.contact_force)
+    reset = PartMember("resets", Resets.reset)
+    steps = PartMember("statistics")
+    last = PartMember("statistics")
+    totals = PartMember("statistics")
+    max_residual = PartMember("statistics")
+    max_floor = PartMember("statistics")
+    max_violation = PartMember("statistics")
+    min_J = PartMember("statistics")
+    asynchronous = PartMember("statistics")
 
     def __init__(
         self,
@@ -166,9 +200,10 @@ class Simulation(RunStatistics):
         self.controls = Controls(model, self.state)
         self.compile_s, self.output_s = clock.perf_counter() - began, 0.0
         self.error = adapt.error if adapt else None
-        self._reset_statistics(asynchronous)
-        self._initial_state: State | None = None
-        self._initial_state_writes = -1
+        self.statistics = RunStatistics(self, asynchronous)
+        self.results = Results(model, self.state)
+        self.records = Records(self.results, self.stepper, self.statistics)
+        self.resets = Resets(self)
         if not isinstance(dt, str):
             self.dt = dt
         if t_end is not None:
@@ -199,7 +234,7 @@ class Simulation(RunStatistics):
         if not one and (self.integrator.static or self.integrator.accelerated):
             raise ModelError(f"dt = {value!r}: integrator {self.integrator.name!r} takes one step for all worlds")
         self._dt = float(value) if one else None
-        self._times_differ |= not one
+        self.statistics.times_differ |= not one
         self.stepper.set_dt(self._dt if one else value)
 
     @property
@@ -214,7 +249,7 @@ class Simulation(RunStatistics):
         if ends is None:
             raise ModelError(f"t_end = {value!r}: this simulation was made without; give t_end to Simulation")
         check_times("t_end", value, self.model)
-        self._times_differ |= not isinstance(value, (int, float, np.floating))
+        self.statistics.times_differ |= not isinstance(value, (int, float, np.floating))
         write_times(ends, value)
 
     @property
@@ -255,9 +290,9 @@ class Simulation(RunStatistics):
             self.stepper.run()
             if self.asynchronous:
                 self.steps += 1
-                self._unsynced = True
+                self.statistics.unsynced = True
             else:
-                self._record_step(self.stepper.work.report.numpy())
+                self.statistics.add_step(self.stepper.work.report.numpy())
         if self.asynchronous:
             return PendingReport(self, self.steps)
         assert self.last is not None
@@ -325,119 +360,33 @@ class Simulation(RunStatistics):
             ) from None
         self.state.status.assign(status)
 
-    def reset(self, mask: Any = None, state: State | None = None) -> None:
-        """Reset worlds to a state, by default the model's initial one.
-
-        Args:
-            mask: [world] of True and False, or indices of worlds, by default all; or a Warp array of int32 or bool
-                [world] on the model's device: nothing is read back then, joints and overlaps are not checked, and
-                worlds end bitwise equal to a run from that state.
-            state: target state. With a Warp array as the mask it must come from a simulation of this model, such as a
-                copy by `sim.state.copy()`.
-
-        Raises:
-            ModelError: another shape or device, or a state that lacks arrays of the simulation.
-            ConstraintError: violated joints in that state.
-        """
-        if isinstance(mask, wp.array):
-            self._reset_on_device(mask, state)
-            return
-        mask = worlds_mask("reset", mask, self.model.worlds)
-        source = self.model.state() if state is None else state
-        check_state(self.model, source)
-        self._times_differ |= bool(mask.any() and not mask.all())
-        fresh = source.numpy()
-        values = self.state.numpy()
-        for name, array in values.items():
-            spec = self.state.specs[name]
-            array[mask] = fresh[name][mask] if name in fresh else np.asarray(spec.initial)
-        self.state.load(values)
-        self.stepper.invalidate(mask)
-        self._clear_stepped(mask)
-        self.stepper.start_terms(mask)
-        if self.model.constraints:
-            check_initial_constraints(self, mask)
-        if self.stepper.ledger:
-            self.stepper.restart_ledger(mask)
-
-    def _reset_on_device(self, mask: wp.array, state: State | None) -> None:
-        check_mask(mask, self.model)
-        if state is None:
-            written = self.model.terms.parameter_updates
-            if self._initial_state is None or self._initial_state_writes != written:
-                self._initial_state, self._initial_state_writes = self._make_initial_state(), written
-            state = self._initial_state
-        check_state(self.model, state)
-        if lacks := [name for name in self.state.names if name not in state.names]:
-            raise ModelError(f"reset: state lacks {listing(lacks)}: pass a copy of sim.state")
-        self._times_differ = True
-        flags = self.stepper.episodes.copy_mask_to_flags(mask)
-        self.state.copy_rows(self.stepper.launch, flags, state)
-        self.stepper.finish_device_reset(flags)
-        if self.asynchronous:
-            self.stepper.episodes.clear_stepped(flags)
-            self._unsynced = True
-        else:
-            self._stepped_worlds[flags.numpy() != 0] = False
-
-    def _make_initial_state(self) -> State:
-        """Initial state of a simulation from the model's initial state, without changing the present one."""
-        self.stepper.update_parameters()
-        now, stepped = self.state.copy(), self._stepped_worlds.copy()
-        everyone = wp.ones(self.model.worlds, dtype=wp.int32, device=self.model.device)
-        try:
-            self.reset()
-            return self.state.copy()
-        finally:
-            self.state.copy_rows(self.stepper.launch, everyone, now)
-            self.stepper.finish_device_reset(everyone, restart=False)
-            self._stepped_worlds = stepped
-            if self.stepper.episodes.stepped_flags is not None:
-                self.stepper.episodes.stepped_flags.assign(stepped.astype(np.int32))
-
     def observe(self, *names: str) -> Observations:
         """Observation table of all worlds on the device, see Observations."""
         return Observations(self, names)
 
-    # results of the whole run; more in Records, those of the present state in Results
+    @property
+    def methods(self) -> dict[str, str]:
+        """Methods chosen for "auto": "solver", and for NewtonPCG "linear", "operator" and "preconditioner"."""
+        return self.plan.methods
 
-    def energies(self) -> dict[str, np.ndarray]:
-        """Energy ledger, each (B,), J.
+    @property
+    def plan(self) -> solvers.SolverPlan:
+        """Methods of the linear systems, chosen or given; `plan=` of another simulation takes them."""
+        return self.stepper.newton.plan
 
-        work_joints is the force at the end of each substep times the drive's travel, as in the scheme; `integrator`
-        contains the difference to the exact work, and may be negative.
-
-        kinetic, strain and potential (of gravity, from the reference) are current values. work (by loads, supports,
-        fields and driven joints, also listed separately), viscous, contact, friction and integrator accumulate from the
-        start; ledger_residual is change of energy + losses - work, which equals `unbalanced`, the sum of g . dq left by
-        the solver's tolerance.
-        """
-        if not self.stepper.ledger:
-            raise ModelError("energies: the simulation was made with ledger=False")
-        return self.model.terms.energies(self.state.ledger.numpy())
-
-    def reaction(self, nodes: NodeSet) -> np.ndarray:
-        """Force of the supports on the prescribed components of nodes at the last accepted step, (B, 3), N.
-
-        NaN for a world whose last step was rejected, or without a step since a reset or resumption.
-        """
-        if not isinstance(nodes, NodeSet):
-            raise ModelError(f"reaction: expected nodes (body.nodes), got {nodes!r}")
-        self.check_body(nodes.body, "reaction")
-        g = self.stepper.work.g.numpy() * (1.0 - self.model.slot_table.free)
-        first = nodes.body.node_slot[nodes.indices]
-        rows = nodes.body.slot_offset + first[first >= 0]
-        total = g[:, rows].sum(axis=1).astype(float)
-        total[~self._stepped_worlds] = np.nan
-        return total
+    def info(self) -> dict[str, Any]:
+        """`Model.info`, "integrator" with its options, "methods", the solver's "plan", the monitoring of
+        "energy_growth"."""
+        more = {"integrator": self.integrator.label, "methods": self.methods, "plan": dataclasses.asdict(self.plan)}
+        return self.model.info() | more | {"energy_growth": str(self.energy_growth)}
 
     def resume(self, path: Any) -> None:
         """Continue from a checkpoint, bit for bit. Raises CheckpointError for one of another model."""
         from .checkpoint import load_checkpoint
 
         load_checkpoint(self, path)
-        self._initial_state = None
-        self._clear_stepped(np.ones(self.model.worlds, bool))
+        self.resets.initial_state = None
+        self.statistics.clear_stepped(np.ones(self.model.worlds, bool))
 
     def bytes(self) -> dict[str, int]:
         """Bytes on the device: constants, scratch, and each array of the state (twice if steps may be halved)."""

@@ -16,6 +16,9 @@ from ..model.topology import check_static_supports
 from ..solvers import NewtonPCG, SolverPlan
 from .checks import check_choice, check_model
 from .integrators import INTEGRATORS
+from .part_member import PartMember
+from .records import Records
+from .results import Results
 from .simulation import Simulation, StepReport
 from .stabilise import Springs, spring_stiffness
 from .stability import Stability, check_stability, report_unstable
@@ -51,6 +54,15 @@ class StaticResult:
     pcg: np.ndarray
     stabilise: Springs | None = None
     stability: Stability | None = None
+    probe = PartMember("simulation", Records.probe)
+    displacements = PartMember("simulation", Results.displacements)
+    positions = PartMember("simulation", Results.positions)
+    reaction = PartMember("simulation", Records.reaction)
+    joint_force = PartMember("simulation", Records.joint_force)
+    contact_force = PartMember("simulation", Records.contact_force)
+    violation = PartMember("simulation", Records.violation)
+    node_gradients = PartMember("simulation", Results.node_gradients)
+    field = PartMember("simulation", Results.field)
 
     def __repr__(self) -> str:
         count = f"{self.simulation.steps} load step{'s' * (self.simulation.steps != 1)}"
@@ -64,8 +76,9 @@ class StaticResult:
         """
         if self.stability is None:
             raise ModelError("no stability analysis was done (unstable='ignore')")
-        self.simulation.check_body(body, "mode")
-        return self.simulation._at_mesh_nodes(body, self.stability.mode)
+        results = self.simulation.results
+        results.check_body(body, "mode")
+        return results.at_mesh_nodes(body, self.stability.mode)
 
     def perturbed(self, size: float) -> State:
         """Copy of the state displaced by the unstable mode times a size, m: start of a motion off the equilibrium."""
@@ -75,42 +88,6 @@ class StaticResult:
         u = out.displacement.numpy()
         out.displacement.assign((u + size * self.stability.mode).astype(u.dtype))
         return out
-
-    def probe(self, name: str) -> Any:
-        """Record of the probe `name`, one entry per load step; the last is at full load."""
-        return self.simulation.probe(name)
-
-    def displacements(self, body: Any) -> np.ndarray:
-        """Nodal displacements (B, nodes, 3), m."""
-        return self.simulation.displacements(body)
-
-    def positions(self, body: Any) -> np.ndarray:
-        """Nodal positions (B, nodes, 3), m."""
-        return self.simulation.positions(body)
-
-    def reaction(self, nodes: Any) -> np.ndarray:
-        """Support force (B, 3), N."""
-        return self.simulation.reaction(nodes)
-
-    def joint_force(self, joint: Any) -> np.ndarray:
-        """Force and moment of a joint on its child, (B, 6), N and N m."""
-        return self.simulation.joint_force(joint)
-
-    def contact_force(self, contact: Any) -> np.ndarray:
-        """Force and moment about the origin of a contact on its body, (B, 6), N and N m."""
-        return self.simulation.contact_force(contact)
-
-    def violation(self, joint: Any) -> np.ndarray:
-        """Largest violation of a joint, (B,), m."""
-        return self.simulation.violation(joint)
-
-    def node_gradients(self, body: Any) -> np.ndarray:
-        """Deformation gradient (B, nodes, 3, 3) at the nodes of a body with gradient slots."""
-        return self.simulation.node_gradients(body)
-
-    def field(self, name: str, body: Any) -> np.ndarray:
-        """Scalar nodal field (B, nodes)."""
-        return self.simulation.field(name, body)
 
 
 def solve_static(
