@@ -43,10 +43,6 @@ class ColliderContact(ContactTerm):
         self.deepest_points = DeepestPoints(self.tables) if self.tables.has_single_point else None
 
     @classmethod
-    def of(cls, model: Model) -> ColliderContact | None:
-        return cls(model) if model.description.contacts else None
-
-    @classmethod
     def features(cls, model: Model) -> dict[str, bool]:
         contacts = model.description.contacts
         return {"contact": bool(contacts), "friction": any(c.mu_static > 0.0 for c in contacts)}

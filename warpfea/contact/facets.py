@@ -59,10 +59,6 @@ class FacetContact(ContactTerm, Tied, Coupled):
         self.pair_ledger_kernels = pair_ledger_kernels(model.dtype)
 
     @classmethod
-    def of(cls, model: Model) -> FacetContact | None:
-        return cls(model) if model.description.pairs else None
-
-    @classmethod
     def features(cls, model: Model) -> dict[str, bool]:
         return {"contact between bodies": bool(model.description.pairs)}
 

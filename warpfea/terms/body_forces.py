@@ -52,10 +52,6 @@ class BodyForces(Term):
         self.block_forces: list[BodyForceBlock] = []
 
     @classmethod
-    def of(cls, model: Model) -> BodyForces | None:
-        return cls(model) if model.description.body_forces else None
-
-    @classmethod
     def features(cls, model: Model) -> dict[str, bool]:
         return {"body forces": bool(model.description.body_forces)}
 

@@ -293,6 +293,13 @@ class ConstraintTables:
         self.colour_host = greedy_colouring(sp.csr_matrix((np.ones(len(row)), pairs), (n, n)))
         self.colour_sizes = np.bincount(self.colour_host)
 
+    def clusters_above(self, rows: int) -> tuple[wp.array | None, int, int]:
+        """Clusters of more than so many rows: their numbers on the device, count, and rows of the largest."""
+        large = np.flatnonzero(self.cluster_sizes > rows)
+        if not len(large):
+            return None, 0, 0
+        return self.model.array("constraints", large, wp.int32), len(large), int(self.cluster_sizes[large].max())
+
     def _upload_joints(self) -> None:
         m = self.model
         position = m.slot_table.kind == 0

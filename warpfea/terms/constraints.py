@@ -57,10 +57,6 @@ class Constraints(Constrained, Updated, Tied, Preconditioned):
         self.dim = (model.worlds, self.tables.count)
 
     @classmethod
-    def of(cls, model: Model) -> Constraints | None:
-        return cls(model) if model.description.joints else None
-
-    @classmethod
     def features(cls, model: Model) -> dict[str, bool]:
         return {"constraints": bool(model.description.joints)}
 
@@ -125,12 +121,8 @@ class Constraints(Constrained, Updated, Tied, Preconditioned):
         ctx.work.newton.norms.violation = ctx.work.multipliers.violation
         mul, options = ctx.work.multipliers, ctx.options
         mul.outer_updates, mul.penalty_ratio = int(options.outer_multipliers), options.penalty_ratio
-        deflate = bool(options.deflate_constraints)
-        sizes = self.tables.cluster_sizes
-        large = np.flatnonzero(sizes > MAX_THREAD_ROWS)
-        largest = int(sizes[large].max()) if len(large) and deflate else 0
-        table = self.model.array("constraints", large, wp.int32) if largest else None
-        ctx.scratch[self.name] = Deflation(deflate, largest, table, len(large))
+        if options.deflate_constraints:
+            self.large = self.tables.clusters_above(MAX_THREAD_ROWS)
 
     def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
         formulas = {kernels.module for _, kernels in self.tables.formula_kernels(ctx.midpoint)}
@@ -176,8 +168,8 @@ class Constraints(Constrained, Updated, Tied, Preconditioned):
     @part("build")
     def invert_cluster_matrices(self, ctx: StepContext, active: wp.array, *, penalty: bool = False) -> None:
         """Assemble and invert the cluster matrices from the inverse diagonal blocks; `penalty`: set rho from them."""
-        deflation: Deflation = ctx.scratch[self.name]
-        if not (deflation.on or penalty):
+        deflate = ctx.options.deflate_constraints
+        if not (deflate or penalty):
             return
         m, w, con, k, launch = self.model, ctx.work, self.tables, deflation_kernels(self.model.dtype), ctx.launch
         data, mul = con.data, w.multipliers
@@ -186,14 +178,15 @@ class Constraints(Constrained, Updated, Tied, Preconditioned):
         launch(k.assemble_cluster_couplings, (m.worlds, con.coupling_count), [data, active, mul])
         if penalty:
             launch(k.compute_penalty, self.dim, [data, w.step.dq_dv, active, mul])
-        if not deflation.on:
+        if not deflate:
             return
         clusters = len(con.cluster_sizes)
         launch(k.invert_clusters, (m.worlds, clusters), [data, w.step.dq_dv, MAX_THREAD_ROWS, active, mul])
-        for pivot in range(deflation.largest):
-            dim = (m.worlds, deflation.count, deflation.largest)
-            launch(k.eliminate_pivot, dim, [data, deflation.large, pivot, active, mul])
-            launch(k.scale_pivot_row, dim[:2], [data, deflation.large, pivot, active, mul])
+        numbers, count, largest = self.large
+        for pivot in range(largest):
+            dim = (m.worlds, count, largest)
+            launch(k.eliminate_pivot, dim, [data, numbers, pivot, active, mul])
+            launch(k.scale_pivot_row, dim[:2], [data, numbers, pivot, active, mul])
 
     def product(self, ctx: StepContext, p: wp.array, active: wp.array) -> None:
         """Constraint part of H p, for the gather."""
@@ -342,15 +335,3 @@ class Constraints(Constrained, Updated, Tied, Preconditioned):
         for world in range(m.worlds):
             np.add.at(out[world], con.slot_host, con.weight_host[:, None] * terms[world, con.term_host])
         return out
-
-
-class Deflation:
-    """Separate treatment of constraint directions in a preconditioner.
-
-    Attributes:
-        on: deflation is active; else the preconditioner includes the penalties.
-        largest, large, count: rows of the largest cluster above THREAD_LIMIT, these clusters, and their number.
-    """
-
-    def __init__(self, on: bool, largest: int, large: wp.array | None, count: int) -> None:
-        self.on, self.largest, self.large, self.count = on, largest, large, count

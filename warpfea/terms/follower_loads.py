@@ -48,11 +48,6 @@ class FollowerLoads(Preconditioned):
         self._entry_count = 0
 
     @classmethod
-    def of(cls, model: Model) -> FollowerLoads | None:
-        d = model.description
-        return cls(model) if d.pressures or d.moments else None
-
-    @classmethod
     def features(cls, model: Model) -> dict[str, bool]:
         return {"follower pressure": bool(model.description.pressures), "moments": bool(model.description.moments)}
 

@@ -176,8 +176,8 @@ class Term:
 
     @classmethod
     def of(cls, model: Model) -> Term | None:
-        """Construct the term of a model, or None if the model does not use it (no cost then)."""
-        raise NotImplementedError
+        """Construct the term of a model, or None if the model uses none of its features (no cost then)."""
+        return cls(model) if any(cls.features(model).values()) else None
 
     @classmethod
     def features(cls, model: Model) -> dict[str, bool]:

@@ -235,11 +235,11 @@ class TermSet:
     @property
     def features(self) -> dict[str, bool]:
         """Optional features of all kinds of terms: used by the model or not."""
-        kinds = [*TERM_TYPES, *(type(term) for term in self.all if type(term) not in TERM_TYPES)]
+        kinds = [*TERM_TYPES, *map(type, self.added_terms)]
         out: dict[str, bool] = {}
         for kind in kinds:
             out |= kind.features(self.model)
-        out |= {term.name: True for term in self.all if type(term) not in TERM_TYPES}
+        out |= {term.name: True for term in self.added_terms}
         return out | {"controls": bool(self.time_laws.controls)}
 
     def shift_time(self, state: State) -> None:
