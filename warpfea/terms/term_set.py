@@ -235,7 +235,7 @@ class TermSet:
     @property
     def features(self) -> dict[str, bool]:
         """Optional features of all kinds of terms: used by the model or not."""
-        kinds = [*TERM_TYPES, *map(type, self.added_terms)]
+        kinds = [*TERM_TYPES, *(type(term) for term in self.added_terms)]
         out: dict[str, bool] = {}
         for kind in kinds:
             out |= kind.features(self.model)
