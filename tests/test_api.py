@@ -156,6 +156,21 @@ def test_a_model_has_few_public_names():
     assert len(names) <= 40, names
 
 
+def test_a_simulation_has_parts_and_no_bases():
+    assert wf.Simulation.__mro__ == (wf.Simulation, object)
+    b = wf.ModelBuilder()
+    body = b.add_solid(wf.mesh.box((1, 0.1, 0.1), cells=(2, 1, 1)), material=wf.SVK(E=1e6, nu=0.3, density=1000.0))
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-3)
+    sim.step()
+    assert sim.statistics.steps == sim.steps == 1
+    sim.steps += 1  # of the part, not of the simulation beside it
+    assert sim.statistics.steps == 2
+    assert sim.positions == sim.results.positions
+    assert sim.probe == sim.records.probe
+    assert wf.Simulation.positions.__doc__ == sim.positions.__doc__
+    assert np.array_equal(sim.positions(body), sim.results.positions(body))
+
+
 def test_later_additions_leave_a_model_as_it_is():
     b = wf.ModelBuilder()
     body = b.add_solid(wf.mesh.box((1, 0.1, 0.1), cells=(2, 1, 1)), material=wf.SVK(E=1e6, nu=0.3, density=1000.0))
