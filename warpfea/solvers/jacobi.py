@@ -134,13 +134,7 @@ class JacobiLoop(NewtonLoop):
     """Newton loop with one preconditioner application in place of the linear solve, and no line search."""
 
     def __init__(
-        self,
-        ctx: StepContext,
-        options: Jacobi,
-        plan: SolverPlan,
-        *,
-        constraint_tol: float,
-        inversion: str = "refuse",
+        self, ctx: StepContext, options: Jacobi, plan: SolverPlan, *, constraint_tol: float, inversion: str = "refuse"
     ) -> None:
         super().__init__(ctx, options.newton_options, plan, constraint_tol=constraint_tol, inversion=inversion)
         model, work = ctx.model, ctx.work

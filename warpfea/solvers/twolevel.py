@@ -66,13 +66,7 @@ class TwoLevel:
         cached_inputs: by term, the inputs of its blocks at the linearisation point.
     """
 
-    def __init__(
-        self,
-        model: Model,
-        work: Workspace,
-        launch: Launcher,
-        residual: Residual,
-    ) -> None:
+    def __init__(self, model: Model, work: Workspace, launch: Launcher, residual: Residual) -> None:
         self.model, self.work, self.launch, self.residual = model, work, launch, residual
         self.plan = plan = residual.plan
         self.storage_dtype = plan.storage
