@@ -163,29 +163,15 @@ class BandFactor:
         self.any_retry.zero_()
         if self.by_thread_block:
             lanes = self.thread_block_kernels.lanes
-            args = [
-                lanes,
-                self.window_memory,
-                self.pattern.data,
-                value,
-                b.slot_order,
-                b.slot_position,
-                self.diagonal_shift,
-            ]
+            args = [lanes, self.window_memory, self.pattern.data, value, b.slot_order, b.slot_position]
+            args += [self.diagonal_shift]
             args += [self.pending, self.failed, self.factors]
             launch(self.thread_block_kernels.factor, self.worlds * lanes, args, block_dim=lanes)
         else:
             slots = self.pattern.graph.shape[0]
             launch(k.clear_band, (self.worlds, b.block_rows), [slots, b.half_bandwidth, self.pending, self.factors])
-            args = [
-                self.pattern.data,
-                value,
-                b.slot_position,
-                b.half_bandwidth,
-                self.diagonal_shift,
-                self.pending,
-                self.factors,
-            ]
+            args = [self.pattern.data, value, b.slot_position, b.half_bandwidth, self.diagonal_shift]
+            args += [self.pending, self.factors]
             launch(k.fill_band, (self.worlds, slots), args)
             launch(k.factor_band, self.worlds, [b.half_bandwidth, self.pending, self.failed, self.factors])
         launch(k.raise_shift, self.worlds, [self.failed, self.pending, self.diagonal_shift, self.any_retry, self.exact])
@@ -198,8 +184,5 @@ class BandFactor:
             args = [lanes, self.window_memory, self.factors, b.slot_order, r, active, z]
             self.launch(self.thread_block_kernels.solve, self.worlds * lanes, args, block_dim=lanes)
             return
-        self.launch(
-            self.kernels.solve,
-            self.worlds,
-            [b.half_bandwidth, self.factors, b.slot_order, r, active, self.half_solution, z],
-        )
+        args = [b.half_bandwidth, self.factors, b.slot_order, r, active, self.half_solution, z]
+        self.launch(self.kernels.solve, self.worlds, args)

@@ -119,15 +119,8 @@ class DenseInverse:
             self.launch(
                 self.component_kernels.copy_flags_to_components, self.matrix_count, [flags, self.component_flags]
             )
-            args = [
-                pattern.data,
-                value,
-                self.components.slot_table,
-                self.components.slot_position,
-                self.component_flags,
-                self.matrix_diagonal,
-                self.matrix,
-            ]
+            args = [pattern.data, value, self.components.slot_table, self.components.slot_position]
+            args += [self.component_flags, self.matrix_diagonal, self.matrix]
             self.launch(self.component_kernels.fill_components, (self.matrix_count, self.padded_size), args)
             return
         args = [pattern.data, value, self.unknowns // 3, flags, self.matrix_diagonal, self.matrix]
@@ -149,31 +142,17 @@ class DenseInverse:
         if self.stored_inverse is not self.matrix:
             launch(k.trace_terms, (B, N), [self.matrix_diagonal, self.matrix, flags, self.trace_terms])
             reduce(self.trace_terms, 1, flags, self.trace)
-            args = [
-                self.matrix_diagonal,
-                self.trace,
-                self.matrix,
-                flags,
-                self.inverse_root_diagonal,
-                self.stored_inverse,
-            ]
+            args = [self.matrix_diagonal, self.trace, self.matrix, flags, self.inverse_root_diagonal]
+            args += [self.stored_inverse]
             launch(k.store_dense_inverse, (B, N, N), args)
 
     def apply(self, r: wp.array, x: wp.array, active: wp.array) -> None:
         """x = A^-1 r, [world, unknown]."""
         if self.components:
-            n = self.components.count * 3 * self.components.max_slots
             lanes = self.launch.lanes(3 * self.components.max_slots)
-            args = [self.matrix, self.components.slot_table, lanes, r, active, x]
-            self.launch(
-                self.component_kernels.apply_component_inverses, (self.worlds, self.launch.padded(n * lanes)), args
-            )
-            return
-        n = self.unknowns
-        lanes = self.launch.lanes(n)
-        dim = (self.worlds, self.launch.padded(n * lanes))
-        self.launch(
-            self.kernels.apply_dense_inverse,
-            dim,
-            [self.stored_inverse, self.inverse_root_diagonal, lanes, r, active, x],
-        )
+            n = self.components.count * 3 * self.components.max_slots
+            kernel, matrix = self.component_kernels.apply_component_inverses, [self.matrix, self.components.slot_table]
+        else:
+            lanes, n = self.launch.lanes(self.unknowns), self.unknowns
+            kernel, matrix = self.kernels.apply_dense_inverse, [self.stored_inverse, self.inverse_root_diagonal]
+        self.launch(kernel, (self.worlds, self.launch.padded(n * lanes)), [*matrix, lanes, r, active, x])

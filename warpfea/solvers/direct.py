@@ -21,16 +21,16 @@ from ..kernels.solvers.direct import direct_kernels
 from ..terms.follower_loads import FollowerLoads, FollowerMatrix
 from ..terms.protocols import Preconditioned
 from .factor import SingularMatrix, make_factors
+from .preconditioner import Preconditioner
 
 if TYPE_CHECKING:
-    from ..model.state import State
     from ..terms.term import StepContext
     from .residual import Residual
 
 __all__ = ["DirectSolver"]
 
 
-class DirectSolver:
+class DirectSolver(Preconditioner):
     """Preconditioner by sparse factors, see the module; on the host: a step can't be captured as a graph.
 
     Attributes:
@@ -53,12 +53,6 @@ class DirectSolver:
         self.unverified_worlds: set[int] = set()
         self.singular_worlds: set[int] = set()
 
-    def register(self, state: State) -> None:
-        """Stateless."""
-
-    def invalidate(self, flags: wp.array) -> None:
-        """Stateless."""
-
     def modules(self) -> set[wp.Module]:
         """Modules launched."""
         return {self.kernels.module} | self.assembler.modules()
@@ -67,18 +61,6 @@ class DirectSolver:
     def start(self, active: wp.array) -> None:
         """Compute D and the inverses of its blocks."""
         self.residual.diagonal_blocks(active)
-
-    def discard(self, active: wp.array) -> None:
-        """No-op: only factors of the operator's matrix are reused."""
-
-    def update(self, active: wp.array) -> None:
-        """No-op: D stays that of the start of the step."""
-
-    def store_history(self, accepted: wp.array) -> None:
-        """No-op: no history."""
-
-    def record_cost(self, active: wp.array) -> None:
-        """No reuse rule."""
 
     @property
     def follower_matrices(self) -> list[FollowerMatrix]:
@@ -97,11 +79,8 @@ class DirectSolver:
         """Factorise H in the active worlds."""
         residual = self.residual
         own = residual.plan.factors_operator
-        worlds = np.flatnonzero(
-            (
-                residual.matrix_reuse_rule.control.build_now if own and residual.plan.matrix_reuse_level else active
-            ).numpy()
-        )
+        kept = own and residual.plan.matrix_reuse_level
+        worlds = np.flatnonzero((residual.matrix_reuse_rule.control.build_now if kept else active).numpy())
         if not len(worlds):
             return
         if own:

@@ -148,10 +148,8 @@ class CuDSS:
         self.device, self.cupy = model.device, cupy
         self.matrix = FreeMatrix.from_pattern(graph, model.slot_table.free, ordered=False)
         with cupy.cuda.Device(self.device.ordinal):
-            self.value_index, self.free = (
-                cupy.asarray(self.matrix.value_index),
-                cupy.asarray(self.matrix.free_components),
-            )
+            self.value_index = cupy.asarray(self.matrix.value_index)
+            self.free = cupy.asarray(self.matrix.free_components)
         self.solvers: dict[int, Any] = {}
 
     def _plan_solver(self, data: Any) -> Any:

@@ -160,10 +160,8 @@ class JacobiLoop(NewtonLoop):
         self.control.max_violation = MAX_VIOLATION * model.size
         self.control.step_length = STEP_LENGTH[options.acceleration]
         least = LARGEST_EIGENVALUE / max(4.0, 0.25 * options.iterations**2)
-        self.control.eigenvalue_centre, self.control.eigenvalue_half_width = (
-            0.5 * (LARGEST_EIGENVALUE + least),
-            0.5 * (LARGEST_EIGENVALUE - least),
-        )
+        self.control.eigenvalue_centre = 0.5 * (LARGEST_EIGENVALUE + least)
+        self.control.eigenvalue_half_width = 0.5 * (LARGEST_EIGENVALUE - least)
 
     def modules(self) -> set[wp.Module]:
         """Modules launched by the loop, except those of reductions and constraints."""
@@ -201,17 +199,8 @@ class JacobiLoop(NewtonLoop):
     def _compute_step(self, active: wp.array) -> None:
         """Write the next move p to work.direction."""
         m, w, k, launch, ctl = self.model, self.work, self.descent_kernels, self.launch, self.control
-        args = [
-            w.newton,
-            w.gradient,
-            m.topology.free,
-            w.direction,
-            w.p,
-            w.r,
-            self.previous_moves,
-            self.residual_changes,
-            w.rows,
-        ]
+        args = [w.newton, w.gradient, m.topology.free, w.direction, w.p, w.r, self.previous_moves]
+        args += [self.residual_changes, w.rows]
         launch(k.store_pair, self.dim, args)
         if self.uses_secants:
             self.residual.reduce(w.rows, 2 * MAX_PAIRS, active, ctl.sums)
@@ -226,14 +215,7 @@ class JacobiLoop(NewtonLoop):
             launch(k.conjugate_move, m.worlds, [w.newton, ctl])
         launch(k.combine_move, self.dim, [w.newton, ctl, self.previous_moves, w.z, w.direction])
         if self.pcg.deflate_translations:  # a loose tolerance then conserves the momentum of free bodies
-            args = [
-                w.newton,
-                w.step.mass_factor,
-                m.components.free_groups.lumped_mass,
-                w.gradient,
-                m.topology.free,
-                w.direction,
-                w.r,
-            ]
+            args = [w.newton, w.step.mass_factor, m.components.free_groups.lumped_mass, w.gradient]
+            args += [m.topology.free, w.direction, w.r]
             launch(k.residual_after_move, self.dim, args)
             self.pcg.correct_translations(active)

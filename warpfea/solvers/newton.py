@@ -22,9 +22,10 @@ from ..terms.term import Term
 from .bicgstab import BiCGStab
 from .direct import DirectSolver
 from .pcg import PCG
-from .plan import PRECONDITIONERS, SolverPlan
-from .preconditioner import make_preconditioner
+from .plan import BLOCK_PRECONDITIONERS, PRECONDITIONERS, SolverPlan
+from .preconditioner import BlockJacobi, Preconditioner
 from .residual import Residual
+from .twolevel import TwoLevel
 
 if TYPE_CHECKING:
     from ..model.state import State
@@ -195,7 +196,8 @@ class NewtonLoop:
         self.terms.call(ctx, Constrained, "configure")
         self.residual = Residual(ctx, plan)
         self.direct = DirectSolver(ctx, self.residual) if plan.linear == "direct" else None
-        self.preconditioner = self.direct or make_preconditioner(plan, model, work, launch, self.residual)
+        kind = BlockJacobi if plan.preconditioner in BLOCK_PRECONDITIONERS else TwoLevel
+        self.preconditioner: Preconditioner = self.direct or kind(model, work, launch, self.residual)
         linear_solver = BiCGStab if plan.krylov == "bicgstab" else PCG
         self.pcg = linear_solver(
             model, work, launch, self.residual, self.preconditioner,

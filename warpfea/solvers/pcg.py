@@ -84,13 +84,8 @@ class PCG:
         if not self.deflate_translations:
             return
         m, w, k, launch = self.model, self.work, self.kernels, self.launch
-        mass = w.step.mass_factor
-        launch(
-            k.free_group_partials,
-            (m.worlds, m.components.free_group_count, FREE_GROUP_LANES),
-            [m.components.free_groups, w.r, active, w.group_partial],
-        )
-        args = [m.components.free_groups, w.group_partial, mass, active, w.group_velocity]
-        launch(k.group_velocity, (m.worlds, m.components.free_group_count), args)
-        args = [m.components.free_groups, w.group_velocity, m.topology.free, mass, active, w.direction, w.r]
+        groups, mass, dim = m.components.free_groups, w.step.mass_factor, (m.worlds, m.components.free_group_count)
+        launch(k.free_group_partials, (*dim, FREE_GROUP_LANES), [groups, w.r, active, w.group_partial])
+        launch(k.group_velocity, dim, [groups, w.group_partial, mass, active, w.group_velocity])
+        args = [groups, w.group_velocity, m.topology.free, mass, active, w.direction, w.r]
         launch(k.translate_groups, self.dim, args)

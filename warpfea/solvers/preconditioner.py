@@ -1,17 +1,15 @@
-"""Interface of preconditioners, and block Jacobi."""
+"""Base class of preconditioners, and block Jacobi."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import warp as wp
 
 from ..base.launch import launch_part
 from ..kernels.solvers.pcg import pcg_kernels
 from ..terms.protocols import Constrained
-from .plan import BLOCK_PRECONDITIONERS, SolverPlan
 from .residual import Residual
-from .twolevel import TwoLevel
 
 if TYPE_CHECKING:
     from ..base.launch import Launcher
@@ -19,11 +17,11 @@ if TYPE_CHECKING:
     from ..model.state import State
     from ..terms.workspace import Workspace
 
-__all__ = ["BlockJacobi", "Preconditioner", "make_preconditioner"]
+__all__ = ["BlockJacobi", "Preconditioner"]
 
 
-class Preconditioner(Protocol):
-    """Interface of a preconditioner B ~ H^-1."""
+class Preconditioner:
+    """A preconditioner B ~ H^-1; by default without a history and without data beside D and its inverses."""
 
     def register(self, state: State) -> None:
         """Register the data kept between steps in the state."""
@@ -33,9 +31,11 @@ class Preconditioner(Protocol):
 
     def modules(self) -> set[wp.Module]:
         """Modules launched."""
+        raise NotImplementedError
 
     def start(self, active: wp.array) -> None:
         """Compute work.diagonal and work.inverse at the first iterate of an attempt."""
+        raise NotImplementedError
 
     def discard(self, active: wp.array) -> None:
         """Discard the setup of the last `start`; the attempt restarts from another iterate."""
@@ -54,9 +54,10 @@ class Preconditioner(Protocol):
 
     def apply(self, r: wp.array, z: wp.array, active: wp.array) -> None:
         """z = B r; per slot r.z in rows[0] and r.D^-1 r in rows[1]."""
+        raise NotImplementedError
 
 
-class BlockJacobi:
+class BlockJacobi(Preconditioner):
     """3x3 diagonal blocks of H, made positive at each quadrature point."""
 
     def __init__(self, model: Model, work: Workspace, launch: Launcher, residual: Residual) -> None:
@@ -64,12 +65,6 @@ class BlockJacobi:
         work.allocate_diagonal_blocks()
         self.kernels = pcg_kernels(model.dtype, model.terms.traits.has_constraints)
         self.dim = (model.worlds, launch.padded(model.slots))
-
-    def register(self, state: State) -> None:
-        """Stateless."""
-
-    def invalidate(self, flags: wp.array) -> None:
-        """Stateless."""
 
     def modules(self) -> set[wp.Module]:
         """Module of the PCG kernel launched here."""
@@ -82,33 +77,11 @@ class BlockJacobi:
 
     update = start
 
-    def discard(self, active: wp.array) -> None:
-        """No-op: no stored setup."""
-
-    def store_history(self, accepted: wp.array) -> None:
-        """No-op: no history."""
-
-    def prepare(self, active: wp.array) -> None:
-        """No-op: the blocks of the iterate are available."""
-
-    def record_cost(self, active: wp.array) -> None:
-        """No reuse rule."""
-
     @launch_part("preconditioner")
     def apply(self, r: wp.array, z: wp.array, active: wp.array) -> None:
         """z = D^-1 r, with constraints (D + (dq/dv) J^T rho J)^-1 r."""
-        w = self.work
-        self.launch(
-            self.kernels.apply_block_jacobi, self.dim, [w.inverse, r, w.diagonal, active, w.warp_size, z, w.warp_rows]
-        )
-        ctx = self.residual.ctx
+        w, ctx = self.work, self.residual.ctx
+        args = [w.inverse, r, w.diagonal, active, w.warp_size, z, w.warp_rows]
+        self.launch(self.kernels.apply_block_jacobi, self.dim, args)
         for term in self.residual.terms.having(Constrained) if ctx.options.deflate_constraints else ():
             term.precondition(ctx, r, z, active)
-
-
-def make_preconditioner(
-    plan: SolverPlan, model: Model, work: Workspace, launch: Launcher, residual: Residual
-) -> Preconditioner:
-    """Construct the preconditioner of a plan."""
-    kind = BlockJacobi if plan.preconditioner in BLOCK_PRECONDITIONERS else TwoLevel
-    return kind(model, work, launch, residual)

@@ -74,10 +74,8 @@ class Residual:
         self.reduce = RowReducer(launch, work, model.worlds)
         traits = ctx.traits
         self.gather_kernels = gather_kernels(model.dtype, traits)
-        self.newton_kernels, self.vector_kernels = (
-            newton_kernels(traits),
-            vector_kernels(model.dtype, traits.has_constraints),
-        )
+        self.newton_kernels = newton_kernels(traits)
+        self.vector_kernels = vector_kernels(model.dtype, traits.has_constraints)
         self.midpoint_kernels = midpoint_kernels(model.dtype)
         self.constraint_data = model.constraints.data if traits.constraint_rows else constraint_struct()()
         self.dim = (model.worlds, model.slots)
@@ -161,39 +159,31 @@ class Residual:
         if not self.plan.matrix_reuse_level:
             self.assemble_matrix(active)
             return
-        control = self.matrix_reuse_rule.control
-        args = [control, self.work.newton, self.plan.matrix_reuse_level]
-        self.launch(self.matrix_reuse_rule.kernels.check_matrix_reuse, self.model.worlds, args)
-        self.matrix_reuse_rule.decide_rebuild(active)
-        self.launch(self.matrix_reuse_rule.kernels.loosen_forcing, self.model.worlds, [control, self.work.newton])
-        wp.capture_if(control.any_build, self._assemble)
+        rule, args = self.matrix_reuse_rule, [self.matrix_reuse_rule.control, self.work.newton]
+        level = self.plan.matrix_reuse_level
+        self.launch(rule.kernels.check_matrix_reuse, self.model.worlds, [*args, level])
+        rule.decide_rebuild(active)
+        self.launch(rule.kernels.loosen_forcing, self.model.worlds, args)
+        wp.capture_if(rule.control.any_build, self._assemble)
 
     @launch_part("assembly")
     def _assemble(self) -> None:
-        assert self.assembler is not None
-        control = self.matrix_reuse_rule.control
-        self.matrix_reuse_rule.move_point()
-        factors = (control.mass_factor, control.dq_dv)
-        self.assembler.assemble(
-            self.matrix_reuse_rule.linearisation_point,
-            factors,
-            control.build_now,
-            self.operator_matrix,
-            projected=False,
-        )
-        if self.on_assembled:
-            self.on_assembled(self.operator_matrix, control.build_now)
-        self.matrix_reuse_rule.mark_built()
+        rule = self.matrix_reuse_rule
+        rule.move_point()
+        self._assemble_at(rule.linearisation_point, rule.control, rule.control.build_now)
+        rule.mark_built()
 
     def assemble_matrix(self, active: wp.array) -> None:
         """Assemble the operator matrix at the iterate unconditionally."""
-        w = self.work
         if self.plan.uses_matrix:
-            assert self.assembler is not None
-            factors = (w.step.mass_factor, w.step.dq_dv)
-            self.assembler.assemble(w.u_stage, factors, active, self.operator_matrix, projected=False)
-            if self.on_assembled:
-                self.on_assembled(self.operator_matrix, active)
+            self._assemble_at(self.work.u_stage, self.work.step, active)
+
+    def _assemble_at(self, u: wp.array, step: Any, flags: wp.array) -> None:
+        """Assemble the operator matrix at displacements u with the coefficients of a step."""
+        assert self.assembler is not None
+        self.assembler.assemble(u, (step.mass_factor, step.dq_dv), flags, self.operator_matrix, projected=False)
+        if self.on_assembled:
+            self.on_assembled(self.operator_matrix, flags)
 
     def update_positions(self, active: wp.array) -> None:
         """Positions q~ + (dq/dv) v, and stage positions of mid-point schemes."""
@@ -268,17 +258,8 @@ class Residual:
         if self.clusters:
             for block, kernel, (data, count) in zip(m.blocks, self.product_kernels, self.clusters.blocks):
                 lanes = block.cluster_size if m.device.is_cuda else 1
-                args = [
-                    w.data_of(block),
-                    data,
-                    w.u_stage,
-                    w.v_stage,
-                    w.history,
-                    w.step.mass_factor,
-                    w.step.dq_dv,
-                    active,
-                    p,
-                ]
+                args = [w.data_of(block), data, w.u_stage, w.v_stage, w.history, w.step.mass_factor]
+                args += [w.step.dq_dv, active, p]
                 args += [lanes, self.cluster_memory, w.contribution]
                 launch(kernel, (m.worlds, count * lanes), args, block_dim=block.cluster_size)
         elif self.plan.uses_predicted_stress:

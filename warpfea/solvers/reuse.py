@@ -64,13 +64,8 @@ class ReuseRule:
 
         `accepted`: flags of a step; the point is then copied to the state of accepted worlds instead.
         """
-        args = [
-            self.control,
-            self.no_flags if accepted is None else accepted,
-            self.work.u_stage,
-            self.accepted_point,
-            self.linearisation_point,
-        ]
+        args = [self.control, self.no_flags if accepted is None else accepted, self.work.u_stage]
+        args += [self.accepted_point, self.linearisation_point]
         self.launch(self.kernels.transfer_points, self.dim, args)
 
     def mark_built(self) -> None:

@@ -118,11 +118,8 @@ class RigidBodyModes:
         lanes = self.partial_sums.shape[2]
         args = [self.bodies, self.pattern.data, m.topology.free, value, flags, lanes, self.partial_sums]
         self.launch(k.body_matrix_partials, self.partial_sums.shape[:3], args)
-        self.launch(
-            k.fill_matrix,
-            (m.worlds, dense.padded_size),
-            [flags, self.partial_sums, dense.matrix_diagonal, dense.matrix],
-        )
+        args = [flags, self.partial_sums, dense.matrix_diagonal, dense.matrix]
+        self.launch(k.fill_matrix, (m.worlds, dense.padded_size), args)
 
     def invert(self, flags: wp.array) -> None:
         """Invert the matrix after terms have added to it."""

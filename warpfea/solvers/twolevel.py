@@ -38,6 +38,7 @@ from .dense import gauss_jordan
 from .level_arrays import LevelArrays
 from .levels import GROUP_SLOTS, Level, make_levels
 from .matrix_assembly import leading_view, worlds_per_chunk
+from .preconditioner import Preconditioner
 from .reuse import ReuseRule
 from .rigid_body_modes import RigidBodyModes
 
@@ -57,7 +58,7 @@ EIGENVALUE_RATIO = 8.0
 """Design ratio of largest to smallest eigenvalue of the Chebyshev steps."""
 
 
-class TwoLevel:
+class TwoLevel(Preconditioner):
     """Preconditioner of the module docstring, rebuilt by the reuse rule (kernels/solvers/reuse.py).
 
     Attributes:
@@ -81,18 +82,14 @@ class TwoLevel:
         self.ctx, self.terms = residual.ctx, model.terms
         for term in self.terms.having(Preconditioned):
             term.allocate_blocks(self.ctx, self.assembler, projected=True)
-        self.terms_add_blocks = (
-            model.terms.traits.pooled or model.terms.traits.constraint_rows
-        )  # terms add to the matrix
+        traits = model.terms.traits
+        self.terms_add_blocks = traits.pooled or traits.constraint_rows  # terms add to the matrix
         first, pattern = self.levels[0], self.assembler.pattern
         band = first.band
         self.band = BandFactor(model, work, launch, band, pattern) if band is not None else None
         self.factors_operator = plan.factors_operator
-        by_component = not self.factors_operator
-        self.level_arrays = [
-            LevelArrays(model, work, launch, level, k, self.storage_dtype, by_component)
-            for k, level in enumerate(self.levels)
-        ]
+        more = {"storage": self.storage_dtype, "by_component": not self.factors_operator}
+        self.level_arrays = [LevelArrays(model, work, launch, lev, k, **more) for k, lev in enumerate(self.levels)]
         if self.factors_operator:
             residual.on_assembled = self._factorise
             unknowns = 3 * model.slots if first.is_dense else 0
@@ -166,12 +163,8 @@ class TwoLevel:
 
     def modules(self) -> set[wp.Module]:
         """Modules launched."""
-        k = self.kernels
-        out = (
-            {k.module, self.reuse.kernels.module, self.block_kernels.module}
-            | self.assembler.modules()
-            | self.mode_coupling_modules
-        )
+        out = {self.kernels.module, self.reuse.kernels.module, self.block_kernels.module}
+        out |= self.assembler.modules() | self.mode_coupling_modules
         out |= self.band.modules() if self.band else {self.setup_kernels.module}
         dense = [] if self.band else [arrays.dense_inverse for arrays in self.level_arrays]
         return out.union(*(inverse.modules() for inverse in dense if inverse))
@@ -181,9 +174,6 @@ class TwoLevel:
         if self.factors_operator and self.model.device.is_cuda:
             return
         self.launch(self.reuse.kernels.request_rebuild, self.model.worlds, [active, self.reuse.control])
-
-    def update(self, active: wp.array) -> None:
-        """No-op: reused at later iterates."""
 
     @launch_part("build")
     def invalidate(self, flags: wp.array) -> None:
