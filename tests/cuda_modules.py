@@ -64,6 +64,8 @@ def encoded(value):
         return {"traits": value._asdict()}
     if hasattr(value, "coefficients"):
         return {"integrator": value.name}
+    if isinstance(value, tuple):
+        return [encoded(x) for x in value]
     if isinstance(value, wp.Module):
         return {"module": value.name, "options": {k: value.options[k] for k in ("max_unroll",)}}
     if value is None or isinstance(value, bool | int | float | str):
@@ -78,6 +80,8 @@ def decoded(value):
 
     from warpfea.simulation.integrators import INTEGRATORS
 
+    if isinstance(value, list):
+        return tuple(map(decoded, value))
     if not isinstance(value, dict):
         return value
     if "traits" in value:

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 import warp as wp
-from warpfea.kernels.contact.laws import DEFAULT, PAPER, SMOOTH, law_functions
+from warpfea.kernels.contact.law import DEFAULT, PAPER, SMOOTH, huber_friction, law_functions, smooth_friction
 
 from warpfea.contact.tables import hunt_crossley_damping, restitution_beta
 
@@ -18,8 +18,7 @@ STEP = 1e-6
 
 @functools.cache
 def _kernels():
-    laws = law_functions()
-    normal_law, friction, smooth_friction = laws.normal_law, laws.huber_friction, laws.smooth_friction
+    normal_law, friction = law_functions().normal_law, huber_friction
     f64, vec3d = wp.float64, wp.vec3d
     module = wp.get_module("contact_laws_alone")
     wp.set_module_options({"enable_backward": False}, module=module)

@@ -260,7 +260,7 @@ def test_surfaces_that_lie_further_out_are_drawn_there(shape):
     low, high = np.zeros(3), np.full(3, 0.1)
     (before,) = Obstacles(sim, low, high).points()
     (term,) = (term for term in sim.model.terms.all if term.name == "contact")
-    term.tables.data.margin.assign(np.array([[0.0], [0.05]]))
+    term.tables.shapes.margin.assign(np.array([[0.0], [0.05]]))
     (after,) = Obstacles(sim, low, high).points()
     np.testing.assert_allclose(after[0], before[0], atol=1e-15)
     moved = after[1] - before[1]

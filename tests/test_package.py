@@ -253,11 +253,6 @@ def test_tests_have_as_many_lines_as_at_51a4e5d():
 # nothing stands twice
 
 SHARED_LINES = 6
-STILL_TWICE = {
-    "assembly.py", "collider_mesh.py", "facet_blocks.py", "facet_ledger.py", "facet_search.py", "ledger.py",
-    "projection.py",
-}  # fmt: skip
-"""Files of kernels/contact with lines that stand twice, as contact is written for colliders and for facets."""
 
 
 def code_lines(path):
@@ -283,10 +278,7 @@ def test_no_six_lines_stand_twice():
             place = (path, lines[k][0])
             if (other := first.setdefault(run, place)) != place:
                 twice.add((other, place))
-    known = {KERNELS / "contact" / name for name in STILL_TWICE}
-    found = {path for pair in twice for path, _ in pair}
-    assert [f"{a}:{i} ~ {b}:{j}" for (a, i), (b, j) in sorted(twice) if not {a, b} <= known] == []
-    assert known <= found, "remove from STILL_TWICE what stands once"
+    assert [f"{a}:{i} ~ {b}:{j}" for (a, i), (b, j) in sorted(twice)] == []
 
 
 # floors

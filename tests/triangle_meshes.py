@@ -6,7 +6,7 @@ import math
 import numpy as np
 import warp as wp
 from warpfea.kernels.contact.colliders import collider_functions
-from warpfea.kernels.contact.structs import contact_struct
+from warpfea.kernels.contact.structs import collider_struct
 
 import warpfea as wf
 from warpfea.base.launch import Launcher
@@ -61,19 +61,19 @@ def sheet(cells=4, half=0.3, height=-0.002, shape=None):
 @functools.cache
 def probing():
     """A kernel that calls the device functions, and the collider's struct."""
-    f, Contacts = collider_functions(True), contact_struct(True)
+    f, Colliders = collider_functions(True), collider_struct(True)
     distance, sweep = f.distance, f.sweep
 
     @wp.kernel(module="unique", enable_backward=False)
     def probe(
-        con: Contacts, k: int, a: wp.array(dtype=wp.vec3d), b: wp.array(dtype=wp.vec3d), side: wp.array(dtype=int),
+        con: Colliders, k: int, a: wp.array(dtype=wp.vec3d), b: wp.array(dtype=wp.vec3d), side: wp.array(dtype=int),
         gap: wp.array(dtype=wp.vec4d), swept: wp.array(dtype=int),
     ):  # fmt: skip
         i = wp.tid()
         gap[i] = distance(con, k, b[i], side[i])
         swept[i] = sweep(con, k, a[i], b[i], side[i])
 
-    return probe, Contacts
+    return probe, Colliders
 
 
 class Model:
@@ -88,12 +88,12 @@ class Model:
 
 def search(mesh, ends, starts=None, sides=None, others=(), device="cpu"):
     """Normals, gaps and swept sides of places in the world; `others`: meshes before and after it in the tables."""
-    probe, Contacts = probing()
+    probe, Colliders = probing()
     shapes = [*others, mesh, *others]
-    con, k = Contacts(), len(others)
+    con, k = Colliders(), len(others)
     con.mesh = upload_collider_meshes(Model(device), shapes)
-    con.collider_kind = wp.array([s.kind for s in shapes], dtype=wp.int32, device=device)
-    con.collider_size = wp.array([s.sizes for s in shapes], dtype=wp.vec3d, device=device)
+    con.kind = wp.array([s.kind for s in shapes], dtype=wp.int32, device=device)
+    con.size = wp.array([s.sizes for s in shapes], dtype=wp.vec3d, device=device)
     center = mesh.frame()[0]
     count = len(ends)
     a, b = (

@@ -1,1 +1,18 @@
-"""Contact by stages: boxes, facet search, projection, laws, forces of points, assembly, ledger."""
+"""Contact by stages. Points of a surface lie against an other side: rigid shapes ("colliders") or facets of bodies.
+
+Broad phase: boxes of master facets (broad_phase.py), and of a mesh (collider_mesh.py).
+Search: facet of a point (facet_search.py, facet_candidates.py, point_lists.py); deepest position of a single-point
+    contact (deepest_point.py).
+Projection: on a facet (projection.py); distance from a shape, and the side (colliders.py, collider_shapes.py).
+Kinematics: own side of a point (kinematics.py); the geometry of the other side fills the record `PointContact`
+    (structs.py): collider_kinematics.py, facet_kinematics.py.
+Law: normal force (law.py); friction (friction.py).
+Assembly: forces, products, blocks of any geometry (assembly.py).
+Ledger: history, energies, records of any geometry (ledger.py).
+At a state: evaluation.py. float32: double_displacements.py. Preconditioner: rigid_modes.py. Setup: thickness.py,
+    collider_sheets.py.
+"""
+
+from . import collider_kinematics, facet_kinematics
+
+__all__ = ["collider_kinematics", "facet_kinematics"]

@@ -1,6 +1,6 @@
-"""Contact of surface points with rigid shapes: forces, tangent, friction limits, explicit forces.
+"""Contact of surface points with their other side: forces, tangent, friction limits, products; for any geometry.
 
-A point's force is the derivative of a scalar: `normal_law` of its depth, and `friction` of its anchored slip, whose
+A point's force is the derivative of a scalar: `normal_law` of its depth, and friction of its anchored slip, whose
 limit mu F_n is frozen during a line search and updated at each iterate. Gap and law are evaluated in float64.
 """
 
@@ -9,191 +9,82 @@ import types as _types
 
 import warp as wp
 
+from ..common.block_entries import add_symmetric_function
 from ..common.lanes import lane_functions
+from ..common.structs import pattern_struct, topology_struct
 from ..common.types import SHORT_UNROLL, kernel_module, kernel_set, precision
-from .colliders import MESH_SUFFIX, collider_functions
-from .laws import SMOOTH
-from .point import contact_point_functions
-from .structs import clock_struct, contact_scratch_struct, contact_struct, facet_struct, history_struct
+from .facet_structs import point_list_struct
+from .friction import friction_functions
+from .kinematics import GEOMETRIES, kinematics_functions
+from .law import ANY_GAP
+from .structs import FORCE_ONLY, FREE, INACTIVE, PASSED, TURNED, WITH_STIFFNESS, contact_structs
 
-__all__ = ["AITKEN_LANES", "MAX_COLLIDER_ROTATION", "MIN_APPROACH_SPEED", "contact_kernels"]
+__all__ = ["AITKEN_LANES", "block_kernels", "contact_kernels", "contact_module"]
 
-MIN_APPROACH_SPEED = 1e-3
-"""Lower bound of the approach speed in the damping of the default law, m/s."""
-INACTIVE, FORCE_ONLY, WITH_STIFFNESS = 0, 1, 2
-"""States of a point: no force; a force without tangent; a force with tangent."""
-MAX_COLLIDER_ROTATION = 1.0
-"""Largest rotation of a touched collider in a step, rad; larger rotations are rejected."""
 AITKEN_LANES = 128
 SLOW_REDUCTION = 0.35
 """Ratio of successive changes of the friction limits above which they are relaxed."""
 
 
-@functools.cache
-def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
-    """Kernels of contact in one precision of the displacements; `meshes`: some collider is a triangle mesh."""
-    p = precision(dtype)
-    T, vec3, sym = p.T, p.vec3, p.sym
-    f64, vec3d = wp.float64, wp.vec3d
-    Contacts, Facets = contact_struct(meshes), facet_struct(dtype)
-    lane_sum = lane_functions(dtype).lane_sum
-    History, ContactScratch, Clock = history_struct(), contact_scratch_struct(dtype), clock_struct()
-    f = contact_point_functions(dtype, meshes)
-    interpolate, history_row, activation_gap, is_acting, acting_shape_value = (
-        f.interpolate,
-        f.history_row,
-        f.activation_gap,
-        f.is_acting,
-        f.acting_shape_value,
-    )
-    set_explicit_force, evaluate_point, with_friction_normal, friction_parameters = (
-        f.set_explicit_force,
-        f.evaluate_point,
-        f.with_friction_normal,
-        f.friction_parameters,
-    )
-    friction_potential, friction_force = f.friction_potential, f.friction_force
-    point_stiffness = f.point_stiffness
-    g = collider_functions(meshes)
-    distance, stored_side, sheet_side = g.distance, g.stored_side, g.sheet_side
-    module = kernel_module(f"contact_{dtype}{MESH_SUFFIX * meshes}", max_unroll=SHORT_UNROLL)
+def contact_module(dtype: str, geometry: str, own: tuple[str, ...]) -> wp.Module:
+    """Module of assembly and ledger."""
+    return kernel_module("_".join(["contact", dtype, geometry, *own]), max_unroll=SHORT_UNROLL)
 
-    @wp.kernel(module=module)
-    def update_poses(
-        con: Contacts, his: History, value: wp.array2d(dtype=vec3d), active: wp.array(dtype=wp.int32),
-        scr: ContactScratch
-    ):  # fmt: skip
-        """Poses of the colliders at the end of the attempt, and their motion in it."""
-        world, k = wp.tid()
-        if active[world] == 0:
-            return
-        position = con.collider_center[k]
-        rotation = con.collider_axes[k]
-        if con.rotation_law[k] >= 0:
-            angle = value[world, con.rotation_law[k]][0]
-            n = con.rotation_axis[k]
-            N = wp.skew(n)
-            half = wp.sin(f64(0.5) * angle)
-            R = wp.identity(n=3, dtype=f64) + wp.sin(angle) * N + (f64(2.0) * half * half) * (N * N)
-            position = con.rotation_anchor[k] + R * (position - con.rotation_anchor[k])
-            rotation = R * rotation
-        if con.translation_law[k] >= 0:
-            position += value[world, con.translation_law[k]]
-        if k == 0:
-            scr.limit_updates[world] = 0
-        scr.collider_position[world, k] = position
-        scr.collider_rotation[world, k] = rotation
-        scr.collider_translation[world, k] = position - his.position[world, k]
-        if con.rotation_law[k] >= 0:
-            scr.collider_angle[world, k] = value[world, con.rotation_law[k]][0]
-            scr.collider_rotation_change[world, k] = rotation * wp.transpose(his.rotation[world, k]) - wp.identity(
-                n=3, dtype=f64
-            )
+
+@functools.cache
+def contact_kernels(dtype: str, geometry: str, own: tuple[str, ...] = ()) -> _types.SimpleNamespace:
+    """Kernels of contact in one precision of the displacements.
+
+    Args:
+        geometry: of the other side, see `GEOMETRIES`.
+        own: laws of one's own in use.
+    """
+    p = precision(dtype)
+    vec3, sym = p.vec3, p.sym
+    f64, vec3d = wp.float64, wp.vec3d
+    Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)
+    k, law, g = kinematics_functions(dtype), friction_functions(dtype, own), GEOMETRIES[geometry](dtype)
+    Other, lane_sum, acting_shape_value = g.Other, lane_functions(dtype).lane_sum, k.acting_shape_value
+    module = contact_module(dtype, geometry, own)
 
     @wp.kernel(module=module)
     def begin_points(
-        con: Contacts, facets: Facets, his: History, clock: Clock, u_n: wp.array2d(dtype=vec3),
+        con: Contacts, other: Other, facets: Facets, his: History, clock: Clock, u_n: wp.array2d(dtype=vec3),
         v_n: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), scr: ContactScratch,
     ):  # fmt: skip
-        """Positions of the points at the start of an attempt, and the approach speed of the damping."""
+        """Points at the start of an attempt: position, depth, approach speed of the damping."""
         world, item, q = wp.tid()
         if active[world] == 0:
             return
         if q == 0 and item == 0 and facets.first_row == 0:
             scr.passed_point[world] = 0
+            scr.limit_updates[world] = 0
             if clock.substep_index[world] == 0:
                 scr.elapsed_time[world] = f64(0.0)
-        if facets.area_fraction[q, item] == f64(0.0):
-            return
-        c = facets.contact[item]
-        point = facets.first_point + item * facets.point_count + q
-        rec = history_row(con, c, point)
-        k = con.collider[c]
-        x = facets.X[q, item] + interpolate(facets, u_n, world, q, item)
-        rotation = his.rotation[world, k]
-        y = wp.transpose(rotation) * (x - his.position[world, k])
-        in_contact = his.speed[world, rec] > f64(0.0)
-        if wp.static(meshes):
-            if not in_contact:
-                his.contact_state[world, rec] = sheet_side(con, k, y, his.contact_state[world, rec])
-        side = stored_side(con, k, in_contact, his.contact_state[world, rec])
-        d = distance(con, k, y, side)
-        scr.start_position[world, point] = y
-        activation_gap_now = activation_gap(con, his, world, c, point, clock.time[world], his.previous_margin[world, k])
-        scr.start_displacement[world, point] = interpolate(facets, u_n, world, q, item)
-        scr.activation_gap[world, point] = activation_gap_now
-        scr.start_depth[world, point] = activation_gap_now - d[3]
-        speed = wp.max(his.speed[world, rec], f64(MIN_APPROACH_SPEED))
-        if clock.is_static == 0:
-            moved = (scr.collider_rotation[world, k] * y + scr.collider_position[world, k] - x) / clock.h[world]
-            approach = wp.dot(rotation * vec3d(d[0], d[1], d[2]), moved - interpolate(facets, v_n, world, q, item))
-            speed = wp.max(speed, approach)
-        scr.approach_speed[world, point] = speed
-
-    @wp.kernel(module=module)
-    def points_at_state(
-        con: Contacts, facets: Facets, his: History, time: wp.array(dtype=f64), u: wp.array2d(dtype=vec3),
-        scr: ContactScratch
-    ):  # fmt: skip
-        """Point data at a state without motion, for evaluations outside of a step."""
-        world, item, q = wp.tid()
-        c = facets.contact[item]
-        k = con.collider[c]
-        x = facets.X[q, item] + interpolate(facets, u, world, q, item)
-        point = facets.first_point + item * facets.point_count + q
-        y = wp.transpose(scr.collider_rotation[world, k]) * (x - scr.collider_position[world, k])
-        scr.start_position[world, point] = y
-        scr.start_displacement[world, point] = interpolate(facets, u, world, q, item)
-        d = distance(con, k, y, -1)
-        scr.activation_gap[world, point] = activation_gap(con, his, world, c, point, time[world], con.margin[world, k])
-        scr.start_depth[world, point] = scr.activation_gap[world, point] - d[3]
+        if facets.area_fraction[q, item] > f64(0.0):
+            g.begin_point(con, other, facets, his, clock, scr, u_n, v_n, world, item, q)
 
     @wp.kernel(module=module)
     def explicit_forces(
-        con: Contacts, facets: Facets, his: History, clock: Clock, v_n: wp.array2d(dtype=vec3),
+        con: Contacts, other: Other, facets: Facets, his: History, clock: Clock, v_n: wp.array2d(dtype=vec3),
         active: wp.array(dtype=wp.int32), scr: ContactScratch,
     ):  # fmt: skip
         """Forces of explicit contacts at the state that the attempt begins from."""
         world, item, q = wp.tid()
-        if active[world] == 0 or facets.area_fraction[q, item] == f64(0.0):
-            return
         c = facets.contact[item]
-        if con.is_explicit[c] == 0:
+        if active[world] == 0 or facets.area_fraction[q, item] == f64(0.0) or con.is_explicit[c] == 0:
             return
         point = facets.first_point + item * facets.point_count + q
-        rec = history_row(con, c, point)
-        k = con.collider[c]
         scr.explicit_force[world, point] = vec3d()
         scr.explicit_elastic_slip[world, point] = vec3d()
         delta = scr.start_depth[world, point]
-        if delta <= f64(0.0):
-            return
-        rotation = his.rotation[world, k]
-        y = scr.start_position[world, point]
-        side = stored_side(con, k, True, his.contact_state[world, rec])
-        d = distance(con, k, y, side)
-        n = rotation * vec3d(d[0], d[1], d[2])
-        x = rotation * y + his.position[world, k]
-        h = clock.h[world]
-        moved = (scr.collider_rotation[world, k] * y + scr.collider_position[world, k] - x) / h
-        set_explicit_force(
-            con, his, scr, world, c, point, delta, n, interpolate(facets, v_n, world, q, item) - moved, h
-        )
-
-    @wp.func
-    def explicit_work(
-        con: Contacts, facets: Facets, his: History, scr: ContactScratch, world: int, c: int, q: int, item: int,
-        point: int, u: wp.array2d(dtype=vec3d),
-    ) -> f64:  # fmt: skip
-        """Potential of an explicit force: minus its work on the step so far, J."""
-        k = con.collider[c]
-        x_n = his.rotation[world, k] * scr.start_position[world, point] + his.position[world, k]
-        x = facets.X[q, item] + interpolate(facets, u, world, q, item)
-        return -wp.dot(scr.explicit_force[world, point], x - x_n)
+        if delta > f64(0.0):
+            n, v = g.start_motion(con, other, facets, his, clock, scr, v_n, world, item, q)
+            law.set_explicit_force(con, his, scr, world, c, point, delta, n, v, clock.h[world])
 
     @wp.kernel(module=module)
     def forces(
-        con: Contacts, facets: Facets, his: History, clock: Clock, u: wp.array2d(dtype=vec3d),
+        con: Contacts, other: Other, facets: Facets, his: History, clock: Clock, u: wp.array2d(dtype=vec3d),
         active: wp.array(dtype=wp.int32), fresh: int, scr: ContactScratch,
     ):  # fmt: skip
         """Forces of points, N, their stiffness and potential.
@@ -206,57 +97,40 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
             return
         c = facets.contact[item]
         point = facets.first_point + item * facets.point_count + q
-        area_fraction = facets.area_fraction[q, item] * is_acting(con, scr, world, c, point)
+        area_fraction = facets.area_fraction[q, item] * k.is_acting(con, scr, world, c, point)
         scr.activity[world, point] = INACTIVE
         if area_fraction == f64(0.0):
             return
-        inv_h = f64(0.0)
-        if clock.is_static == 0:
-            inv_h = f64(1.0) / clock.h[world]
-        rec = history_row(con, c, point)
-        frozen = scr.frozen_friction[world, rec]
-        if fresh != 0:
-            frozen[2] = f64(1.0)
-        t = evaluate_point(con, facets, his, scr, world, q, item, point, u, clock.new_time[world], inv_h, frozen[2])
-        if con.is_explicit[c] == 0:
-            new = friction_parameters(con, his, scr, world, c, point, t)
-            if fresh != 0:  # initial limits: those of the last step, zero for a new contact
-                scr.frozen_normal[world, rec] = t.normal
-                frozen = new
-                frozen[0] = wp.min(new[0], his.friction_limit[world, rec])
-                scr.frozen_friction[world, rec] = frozen
-            scr.updated_normal[world, rec] = t.normal
-            t = with_friction_normal(t, scr.frozen_normal[world, rec])
-            scr.updated_friction[world, rec] = new
-        turned = f64(0.0)
-        if con.rotation_law[con.collider[c]] >= 0:
-            turned = wp.abs(scr.collider_angle[world, con.collider[c]] - his.angle[world, con.collider[c]])
-        near = t.depth > f64(0.0) or scr.start_depth[world, point] > f64(0.0)
-        if t.side == -2 or (near and turned > f64(MAX_COLLIDER_ROTATION)):
-            scr.passed_point[world] = wp.where(t.side == -2, point + 1, -point - 1)
+        rec = k.history_row(con, c, point)
+        t = g.evaluate(con, other, facets, his, scr, world, q, item, point, u, clock.new_time[world])
+        friction = vec3d()
+        if t.state == PASSED or t.state == TURNED:  # an infinite potential: the iterate is refused
+            scr.passed_point[world] = wp.where(t.state == PASSED, point + 1, -point - 1)
             scr.activity[world, point] = FORCE_ONLY
             scr.force[world, point] = vec3d()
             scr.energy[world, point] = wp.vec2d(f64(wp.inf), f64(0.0))
         elif con.is_explicit[c] != 0:
-            if wp.length_sq(scr.explicit_force[world, point]) > f64(0.0):
-                work = area_fraction * explicit_work(con, facets, his, scr, world, c, q, item, point, u)
+            force = -area_fraction * scr.explicit_force[world, point]
+            if wp.length_sq(force) > f64(0.0):
+                work = wp.dot(force, t.relative_motion)
                 scr.activity[world, point] = FORCE_ONLY
-                scr.force[world, point] = -area_fraction * scr.explicit_force[world, point]
+                scr.force[world, point] = force
                 scr.energy[world, point] = wp.vec2d(work, wp.abs(work))
-        elif t.depth > f64(0.0) or frozen[0] > f64(0.0) or con.law[c] == SMOOTH:
-            friction_energy = friction_potential(con, world, c, t, frozen, inv_h)
-            K = point_stiffness(con, world, c, t, frozen, inv_h)
-            scr.activity[world, point] = WITH_STIFFNESS
-            scr.force[world, point] = area_fraction * (
-                friction_force(con, world, c, t, frozen, inv_h) - t.normal_values[0] * t.normal
-            )
-            scr.energy[world, point] = wp.vec2d(
-                area_fraction * (t.normal_values[2] + friction_energy),
-                area_fraction * (t.normal_values[3] + wp.abs(friction_energy)),
-            )
-            scr.stiffness[world, point] = sym(T(area_fraction * K[0, 0]), T(area_fraction * K[1, 1]),
-                T(area_fraction * K[2, 2]), T(area_fraction * K[1, 2]), T(area_fraction * K[0, 2]),
-                T(area_fraction * K[0, 1]))  # fmt: skip
+        elif t.state == FREE:
+            scr.updated_friction[world, rec] = vec3d()
+            if fresh != 0:
+                scr.frozen_friction[world, rec] = vec3d(f64(0.0), f64(0.0), f64(1.0))
+                scr.frozen_normal[world, rec] = vec3d()
+        else:
+            inv_h = k.inverse_step(clock, world)
+            t = law.with_normal_force(con, scr, world, c, point, t, inv_h)
+            frozen = law.freeze_friction(con, his, scr, world, c, point, t, fresh)
+            t = g.frozen_motion(other, facets, scr, u, world, q, item, point, t, frozen[0], fresh)
+            t = law.in_friction_plane(t, scr.frozen_normal[world, rec], frozen[2])
+            if t.depth > f64(0.0) or frozen[0] > f64(0.0) or law.has_trait(con, c, ANY_GAP):
+                scr.activity[world, point] = WITH_STIFFNESS
+                friction = law.set_point_force(con, scr, world, c, point, t, frozen, inv_h, area_fraction)
+        g.transmit(con, other, scr, world, c, point, t, friction)
 
     @wp.kernel(module=module)
     def gather_point_forces(
@@ -352,15 +226,9 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
             scr.frozen_friction[world, point] = new
             scr.frozen_normal[world, point] = scr.updated_normal[world, point]
 
-    @wp.func
-    def multiply_symmetric(k: sym, p: vec3) -> vec3:
-        """Product of the symmetric matrix k (Voigt) with p."""
-        return vec3(k[0] * p[0] + k[5] * p[1] + k[4] * p[2], k[5] * p[0] + k[1] * p[1] + k[3] * p[2],
-                    k[4] * p[0] + k[3] * p[1] + k[2] * p[2])  # fmt: skip
-
     @wp.kernel(module=module)
     def point_products(
-        facets: Facets, active: wp.array(dtype=wp.int32), p: wp.array2d(dtype=vec3), scr: ContactScratch
+        other: Other, facets: Facets, active: wp.array(dtype=wp.int32), p: wp.array2d(dtype=vec3), scr: ContactScratch
     ):  # fmt: skip
         """K times the displacement of each point."""
         world, item, q = wp.tid()
@@ -370,26 +238,34 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         for i in range(facets.conn.shape[0]):
             d += acting_shape_value(facets, scr, world, q, i, item) * p[world, facets.conn[i, item]]
         point = facets.first_point + item * facets.point_count + q
-        scr.point_product[world, point] = multiply_symmetric(scr.stiffness[world, point], d)
+        scr.point_product[world, point] = g.other_product(other, scr, p, world, point, d)
 
     @wp.kernel(module=module)
-    def gather_facet_products(
-        facets: Facets, active: wp.array(dtype=wp.int32), lanes: int, scr: ContactScratch, pool: wp.array2d(dtype=vec3)
+    def gather_products(
+        other: Other, facets: Facets, active: wp.array(dtype=wp.int32), lanes: int, last: int, scr: ContactScratch,
+        pool: wp.array2d(dtype=vec3),
     ):  # fmt: skip
-        """Sums of the point products on the slots of the facets."""
+        """Sums of the point products on the slots of the facets, and of the other side where `last` includes them."""
         world, index = wp.tid()
         if active[world] == 0:
             return
-        entry = wp.min(index / lanes, facets.facet_count * facets.conn.shape[0] - 1)
-        item = entry % facets.facet_count
         out = vec3()
-        if scr.facet_activity[world, facets.first_row + item] == WITH_STIFFNESS:
-            for q in range(index % lanes, facets.point_count, lanes):
-                flux = scr.point_product[world, facets.first_point + item * facets.point_count + q]
-                out += acting_shape_value(facets, scr, world, q, entry / facets.facet_count, item) * flux
+        own = facets.facet_count * facets.conn.shape[0]
+        entry = wp.min(index / lanes, last)
+        lane = index % lanes
+        place = facets.first_entry + entry
+        if entry < own:
+            item = entry % facets.facet_count
+            if scr.facet_activity[world, facets.first_row + item] == WITH_STIFFNESS:
+                for q in range(lane, facets.point_count, lanes):
+                    flux = scr.point_product[world, facets.first_point + item * facets.point_count + q]
+                    out += acting_shape_value(facets, scr, world, q, entry / facets.facet_count, item) * flux
+        else:
+            place = g.other_entries(other) + entry - own
+            out = g.gather_other_product(other, scr, world, entry - own, lane, lanes)
         out = lane_sum(out, lanes)
-        if index % lanes == 0:
-            pool[world, facets.first_entry + entry] = out
+        if lane == 0:
+            pool[world, place] = out
 
     @wp.kernel(module=module)
     def diagonal(facets: Facets, active: wp.array(dtype=wp.int32), scr: ContactScratch, pool: wp.array2d(dtype=sym)):
@@ -403,5 +279,66 @@ def contact_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
                 s = acting_shape_value(facets, scr, world, q, i, item)
                 out += s * s * scr.stiffness[world, facets.first_point + item * facets.point_count + q]
         pool[world, facets.first_entry + i * facets.facet_count + item] = out
+
+    return kernel_set(locals())
+
+
+@functools.cache
+def block_kernels(dtype: str, listed: bool) -> _types.SimpleNamespace:
+    """Contributions of contact to an assembled matrix: points on their own facets, or `listed` by the facets of the
+    other side."""
+    p = precision(dtype)
+    T, mat33, sym = p.T, p.mat33, p.sym
+    f64 = wp.float64
+    Facets, PointLists = contact_structs(dtype).Facets, point_list_struct()
+    Points = PointLists if listed else Facets
+    Topology, Pattern = topology_struct(dtype), pattern_struct()
+    add_symmetric = add_symmetric_function(dtype)
+    module = kernel_module(f"{'pair' if listed else 'contact'}_blocks_{dtype}", max_unroll=SHORT_UNROLL)
+
+    @wp.func
+    def own_block(
+        facets: Facets, stiffness: wp.array2d(dtype=sym), weight: wp.array3d(dtype=T), world: int, at: wp.vec3i, k6: sym
+    ) -> sym:  # fmt: skip
+        """k6 + sum over the points of a facet of s_a s_b K; `weight`: of moving contact points."""
+        out = k6
+        for q in range(facets.point_count):
+            s = facets.shape[q, at[1], at[0]] * facets.shape[q, at[2], at[0]]
+            if facets.tracks_deepest != 0:
+                c = facets.contact[at[0]]
+                s = weight[world, c, at[1]] * weight[world, c, at[2]]
+            out += s * stiffness[world, facets.first_point + at[0] * facets.point_count + q]
+        return out
+
+    @wp.func
+    def listed_block(
+        lists: PointLists, stiffness: wp.array2d(dtype=sym), weight: wp.array3d(dtype=T), world: int, at: wp.vec3i,
+        k6: sym,
+    ) -> sym:  # fmt: skip
+        """k6 + sum over the points listed by a facet of w_a w_b K."""
+        out = k6
+        begin = lists.list_start[world, at[0]]
+        for k in range(lists.list_size[world, at[0]]):
+            point = lists.list_point[world, begin + k]
+            out += (weight[world, point, at[1]] * weight[world, point, at[2]]) * stiffness[world, point]
+        return out
+
+    block = listed_block if listed else own_block
+
+    @wp.kernel(module=module)
+    def add_blocks(
+        topo: Topology, pattern: Pattern, points: Points, entry: wp.array(dtype=wp.int32),
+        start: wp.array(dtype=wp.int32), source: wp.array(dtype=wp.vec3i), stiffness: wp.array2d(dtype=sym),
+        weight: wp.array3d(dtype=T), dq_dv: wp.array(dtype=f64), active: wp.array(dtype=wp.int32),
+        value: wp.array2d(dtype=mat33),
+    ):  # fmt: skip
+        """value += (dq/dv) times the blocks of an entry; `source`: facet and two of its slots."""
+        world, index = wp.tid()
+        if active[world] == 0:
+            return
+        k6 = sym()
+        for e in range(start[index], start[index + 1]):
+            k6 = block(points, stiffness, weight, world, source[e], k6)
+        add_symmetric(topo, pattern.upper[entry[index]], T(dq_dv[world]) * k6, world, value)
 
     return kernel_set(locals())

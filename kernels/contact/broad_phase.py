@@ -1,7 +1,6 @@
 """Broad phase of contact between bodies: master facets at an iterate and at the start of an attempted step.
 
 Computed are the monomial coefficients of displacements on each facet, its centre, and the bounding boxes of the tree.
-u_coefs, director_u_coefs: coefficients of the displacement and of the director's displacement, see `master_struct`.
 """
 
 import functools
@@ -11,7 +10,7 @@ from typing import Any
 import warp as wp
 
 from ..common.types import SHORT_UNROLL, kernel_module, kernel_set, precision
-from .facet_structs import master_struct, pair_scratch_struct
+from .facet_structs import facet_field_struct, master_struct, pair_scratch_struct
 from .projection import facet_projection_functions
 
 __all__ = ["BOX_MARGIN", "broad_phase_kernels"]
@@ -28,7 +27,7 @@ def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
     vec3 = precision(dtype).vec3
     f64, vec3d, box3 = wp.float64, wp.vec3d, wp.vec3
     mat43 = wp.types.matrix(shape=(4, 3), dtype=f64)
-    Masters, PairScratch = master_struct(dtype), pair_scratch_struct(dtype)
+    Masters, PairScratch, FacetField = master_struct(dtype), pair_scratch_struct(dtype), facet_field_struct()
     f = facet_projection_functions(dtype)
     FacetPoint, surface_point, facet_centre, unit_normal = (
         f.FacetPoint,
@@ -39,30 +38,27 @@ def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
     module = kernel_module(f"facet_search_{dtype}", max_unroll=SHORT_UNROLL)
 
     @wp.func
-    def set_coefficient(
-        mas: Masters, u: wp.array2d(dtype=Any), world: int, item: int, m: int, C: wp.array2d(dtype=vec3d),
-        D: wp.array2d(dtype=vec3d),
-    ):  # fmt: skip
-        """Monomial coefficients m of a field u [world, slot] on facet `item`, [world, control]: C of its value, D of
-        its derivative along the director."""
+    def coefficients(mas: Masters, u: wp.array2d(dtype=Any), world: int, item: int, m: int):
+        """Monomial coefficients m of a field u [world, slot] on facet `item`: of its value, and of its derivative along
+        the director."""
         c = vec3d()
         d = vec3d()
         for i in range(mas.conn.shape[0]):
             value = vec3d(u[world, mas.conn[i, item]])
             c += f64(mas.shape[m, i, item]) * value
             d += f64(mas.director_shape[m, i, item]) * value
-        C[world, mas.max_monomials * item + m] = c
-        D[world, mas.max_monomials * item + m] = d
+        return c, d
 
     @wp.kernel(module=module)
     def update_coefficients(
-        mas: Masters, u: wp.array2d(dtype=vec3d), active: wp.array(dtype=wp.int32), C: wp.array2d(dtype=vec3d),
-        D: wp.array2d(dtype=vec3d),
+        mas: Masters, u: wp.array2d(dtype=vec3d), active: wp.array(dtype=wp.int32), pair: PairScratch
     ):  # fmt: skip
         """Coefficients of displacements on master facets in float64, see kernels/contact/double_displacements.py."""
         world, item, m = wp.tid()
         if active[world] != 0 and m < mas.monomial_count[mas.facet_kind[item]]:
-            set_coefficient(mas, u, world, item, m, C, D)
+            c, d = coefficients(mas, u, world, item, m)
+            pair.displacement.value[world, mas.max_monomials * item + m] = c
+            pair.displacement.director[world, mas.max_monomials * item + m] = d
 
     @wp.kernel(module=module)
     def initial_coefficients(
@@ -71,16 +67,18 @@ def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
     ):  # fmt: skip
         """Coefficients of displacements and velocities at the start of an attempt; reset the largest depths."""
         world, item, m = wp.tid()
-        if active[world] != 0:
-            # threads of a world share the bodies
-            for body in range(
-                mas.max_monomials * item + m, pair.deepest_contact.shape[1], mas.max_monomials * mas.facet_count
-            ):
-                pair.deepest_contact[world, body] = f64(0.0)
-        if active[world] != 0 and m < mas.monomial_count[mas.facet_kind[item]]:
-            # the director part of the velocity is not used: the next line overwrites it
-            set_coefficient(mas, v_n, world, item, m, pair.start_v_coefs, pair.start_director_u_coefs)
-            set_coefficient(mas, u_n, world, item, m, pair.start_u_coefs, pair.start_director_u_coefs)
+        if active[world] == 0:
+            return
+        control = mas.max_monomials * item + m
+        # threads of a world share the bodies
+        for body in range(control, pair.deepest_contact.shape[1], mas.max_monomials * mas.facet_count):
+            pair.deepest_contact[world, body] = f64(0.0)
+        if m < mas.monomial_count[mas.facet_kind[item]]:
+            c, d = coefficients(mas, u_n, world, item, m)
+            pair.start_displacement.value[world, control] = c
+            pair.start_displacement.director[world, control] = d
+            v, turned = coefficients(mas, v_n, world, item, m)
+            pair.start_velocity[world, control] = v
 
     @wp.func
     def round_down(x: vec3d) -> box3:
@@ -108,25 +106,25 @@ def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
     @wp.func
     def pack_facet_point(s: FacetPoint) -> mat43:
         """Position and derivatives of a facet point as the rows of a matrix."""
-        return mat43(
-            s.position[0],
-            s.position[1],
-            s.position[2],
-            s.tangent_a[0],
-            s.tangent_a[1],
-            s.tangent_a[2],
-            s.tangent_b[0],
-            s.tangent_b[1],
-            s.tangent_b[2],
-            s.director[0],
-            s.director[1],
-            s.director[2],
-        )
+        return wp.matrix_from_rows(s.position, s.tangent_a, s.tangent_b, s.director)
 
     @wp.func
     def unpack_facet_point(m: mat43) -> FacetPoint:
         """Facet point from the rows of a matrix."""
         return FacetPoint(m[0], m[1], m[2], m[3])
+
+    @wp.func
+    def hull_point(mas: Masters, U: FacetField, world: int, item: int, q: int) -> vec3d:
+        """Control point of Bernstein's form of a facet, m."""
+        kind = mas.facet_kind[item]
+        x = vec3d()
+        for m in range(mas.monomial_count[kind]):
+            part = mas.hull_coefficients[kind, q, m]
+            if part != f64(0.0):
+                x += part * (
+                    mas.reference_position_coefficients[m, item] + U.value[world, mas.max_monomials * item + m]
+                )
+        return x
 
     @wp.kernel(module=module)
     def check_boxes(mas: Masters, active: wp.array(dtype=wp.int32), pair: PairScratch):
@@ -139,18 +137,8 @@ def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
         kind = mas.facet_kind[item]
         count = mas.monomial_count[kind]
         for q in range(count):
-            x = vec3d()
-            y = vec3d()
-            for m in range(count):
-                part = mas.hull_coefficients[kind, q, m]
-                if part != f64(0.0):
-                    x += part * (
-                        mas.reference_position_coefficients[m, item] + pair.u_coefs[world, mas.max_monomials * item + m]
-                    )
-                    y += part * (
-                        mas.reference_position_coefficients[m, item]
-                        + pair.start_u_coefs[world, mas.max_monomials * item + m]
-                    )
+            x = hull_point(mas, pair.displacement, world, item, q)
+            y = hull_point(mas, pair.start_displacement, world, item, q)
             low = wp.min(low, wp.min(x, y))
             high = wp.max(high, wp.max(x, y))
         index = world * mas.facet_count + item
@@ -171,20 +159,16 @@ def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
         kind = mas.facet_kind[item]
         count = mas.monomial_count[kind]
         xi = facet_centre(mas.corner_count[kind])
-        s = surface_point(mas, pair.u_coefs, pair.director_u_coefs, world, item, xi)
+        s = surface_point(mas, pair.displacement, world, item, xi)
         n = unit_normal(s)
         bulge = f64(0.0)
         for q in range(count):
-            x = vec3d()
-            for m in range(count):
-                x += mas.hull_coefficients[kind, q, m] * (
-                    mas.reference_position_coefficients[m, item] + pair.u_coefs[world, mas.max_monomials * item + m]
-                )
+            x = hull_point(mas, pair.displacement, world, item, q)
             bulge = wp.max(bulge, wp.dot(x - s.position, n))
         pair.bulge[world, item] = bulge
         pair.facet_centre[world, item] = pack_facet_point(s)
         pair.start_facet_centre[world, item] = pack_facet_point(
-            surface_point(mas, pair.start_u_coefs, pair.start_director_u_coefs, world, item, xi)
+            surface_point(mas, pair.start_displacement, world, item, xi)
         )
 
     @wp.kernel(module=module)

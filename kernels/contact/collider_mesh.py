@@ -57,8 +57,8 @@ def mesh_struct():
 
 
 @functools.cache
-def mesh_functions(Contacts) -> _types.SimpleNamespace:
-    """Device functions for contacts of a struct with `mesh`; `size`: its size, thickness, 1 if closed."""
+def mesh_functions(Colliders) -> _types.SimpleNamespace:
+    """Device functions of a `collider_struct` with `mesh`; `size`: its size, thickness, 1 if closed."""
     f64, vec3d, vec4d = wp.float64, wp.vec3d, wp.vec4d
     ints = wp.types.vector(length=STACK_SIZE, dtype=wp.int32)
 
@@ -125,34 +125,34 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
         return wp.where(side >= 0 and side % 2 == 1, f64(-1.0), f64(1.0))
 
     @wp.func
-    def is_candidate(con: Contacts, t: int, y: vec3d, side: int) -> bool:
+    def is_candidate(col: Colliders, t: int, y: vec3d, side: int) -> bool:
         """True if a triangle faces like that of a side and is ahead of a point that has passed the surface."""
         if side < 0:
             return True
-        n = con.mesh.normal[0, t]
-        if wp.dot(n, con.mesh.normal[0, side / 2]) <= f64(SAME_SIDE_COSINE):
+        n = col.mesh.normal[0, t]
+        if wp.dot(n, col.mesh.normal[0, side / 2]) <= f64(SAME_SIDE_COSINE):
             return False
-        return side_sign(side) * wp.dot(y - con.mesh.corner[0, t], n) <= f64(0.0)
+        return side_sign(side) * wp.dot(y - col.mesh.corner[0, t], n) <= f64(0.0)
 
     @wp.func
-    def nearest_on_mesh(con: Contacts, k: int, y: vec3d, side: int) -> Nearest:
+    def nearest_on_mesh(col: Colliders, k: int, y: vec3d, side: int) -> Nearest:
         """Nearest position on a mesh to y; with a side, among the candidate triangles."""
         best = Nearest()
         best.distance_squared = f64(1.0e300)
         best.triangle = -1
-        base = con.mesh.first_box[k]
-        inner = con.mesh.inner_count[k]
+        base = col.mesh.first_box[k]
+        inner = col.mesh.inner_count[k]
         waiting = ints()
         top = wp.int32(1)
         while top > 0:
             top -= 1
             i = waiting[top]
-            if box_distance_squared(con.mesh.box_low[base + i], con.mesh.box_high[base + i], y) < best.distance_squared:
+            if box_distance_squared(col.mesh.box_low[base + i], col.mesh.box_high[base + i], y) < best.distance_squared:
                 if i < inner:
                     near = 2 * i + 1
                     far = near + 1
-                    d_near = box_distance_squared(con.mesh.box_low[base + near], con.mesh.box_high[base + near], y)
-                    d_far = box_distance_squared(con.mesh.box_low[base + far], con.mesh.box_high[base + far], y)
+                    d_near = box_distance_squared(col.mesh.box_low[base + near], col.mesh.box_high[base + near], y)
+                    d_far = box_distance_squared(col.mesh.box_low[base + far], col.mesh.box_high[base + far], y)
                     if d_far < d_near:
                         near = far
                         far = 2 * i + 1
@@ -160,11 +160,11 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
                     waiting[top + 1] = near
                     top += 2
                 else:
-                    leaf = con.mesh.first_leaf[k] + i - inner
-                    for t in range(con.mesh.leaf_start[leaf], con.mesh.leaf_start[leaf + 1]):
-                        if is_candidate(con, t, y, side):
-                            c = closest_on_triangle(con.mesh.corner[0, t], con.mesh.corner[1, t], con.mesh.corner[2, t],
-                                           con.mesh.normal[0, t], y)  # fmt: skip
+                    leaf = col.mesh.first_leaf[k] + i - inner
+                    for t in range(col.mesh.leaf_start[leaf], col.mesh.leaf_start[leaf + 1]):
+                        if is_candidate(col, t, y, side):
+                            c = closest_on_triangle(col.mesh.corner[0, t], col.mesh.corner[1, t], col.mesh.corner[2, t],
+                                           col.mesh.normal[0, t], y)  # fmt: skip
                             place = vec3d(c[0], c[1], c[2])
                             square = wp.length_sq(y - place)
                             if square < best.distance_squared:
@@ -175,56 +175,56 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
         return best
 
     @wp.func
-    def signed_distance(con: Contacts, k: int, s: Nearest, y: vec3d) -> vec4d:
+    def signed_distance(col: Colliders, k: int, s: Nearest, y: vec3d) -> vec4d:
         """Normal and signed distance at the nearest position, positive in front of the surface."""
-        n = con.mesh.normal[s.feature, s.triangle]
-        if con.mesh.feature_kind[s.feature, s.triangle] == FLAT:
-            return vec4d(n[0], n[1], n[2], wp.dot(y - con.mesh.corner[0, s.triangle], n))
+        n = col.mesh.normal[s.feature, s.triangle]
+        if col.mesh.feature_kind[s.feature, s.triangle] == FLAT:
+            return vec4d(n[0], n[1], n[2], wp.dot(y - col.mesh.corner[0, s.triangle], n))
         arm = y - s.position
         size = wp.length(arm)
         sign = wp.where(wp.dot(arm, n) >= f64(0.0), f64(1.0), f64(-1.0))
-        if size > f64(1.0e-9) * con.collider_size[k][0]:
+        if size > f64(1.0e-9) * col.size[k][0]:
             n = (sign / size) * arm
         return vec4d(n[0], n[1], n[2], sign * size)
 
     @wp.func
-    def on_boundary(con: Contacts, s: Nearest) -> bool:
+    def on_boundary(col: Colliders, s: Nearest) -> bool:
         """True if the nearest position is on the boundary of a sheet."""
-        return con.mesh.feature_kind[s.feature, s.triangle] == BOUNDARY
+        return col.mesh.feature_kind[s.feature, s.triangle] == BOUNDARY
 
     @wp.func
-    def distance(con: Contacts, k: int, y: vec3d, side: int) -> vec4d:
+    def distance(col: Colliders, k: int, y: vec3d, side: int) -> vec4d:
         """Normal towards the side of the point, and signed distance; without a side: outside of a sheet."""
-        s = nearest_on_mesh(con, k, y, -1)
-        d = signed_distance(con, k, s, y)
-        if con.collider_size[k][2] == f64(0.0) and (side < 0 or on_boundary(con, s)):
+        s = nearest_on_mesh(col, k, y, -1)
+        d = signed_distance(col, k, s, y)
+        if col.size[k][2] == f64(0.0) and (side < 0 or on_boundary(col, s)):
             return wp.where(d[3] < f64(0.0), -d, d)
         d = side_sign(side) * d
         if side >= 0 and d[3] < f64(0.0):
-            ahead = nearest_on_mesh(con, k, y, side)
+            ahead = nearest_on_mesh(col, k, y, side)
             if ahead.triangle >= 0:
-                d = side_sign(side) * signed_distance(con, k, ahead, y)
-                if (d[3] > f64(0.0)) != on_boundary(con, ahead):  # away from the boundary it is outside
+                d = side_sign(side) * signed_distance(col, k, ahead, y)
+                if (d[3] > f64(0.0)) != on_boundary(col, ahead):  # away from the boundary it is outside
                     d = -d
         return d
 
     @wp.func
-    def updated_side(con: Contacts, k: int, y: vec3d, side: int) -> int:
+    def updated_side(col: Colliders, k: int, y: vec3d, side: int) -> int:
         """Side of a point at its new position, -1 outside."""
-        if distance(con, k, y, side)[3] >= f64(0.0):
+        if distance(col, k, y, side)[3] >= f64(0.0):
             return -1
-        s = nearest_on_mesh(con, k, y, side)
+        s = nearest_on_mesh(col, k, y, side)
         if s.triangle < 0:
-            s = nearest_on_mesh(con, k, y, -1)
+            s = nearest_on_mesh(col, k, y, -1)
         return 2 * s.triangle + wp.max(side, 0) % 2
 
     @wp.func
-    def sheet_side(con: Contacts, k: int, y: vec3d, contact_state: int) -> int:
+    def sheet_side(col: Colliders, k: int, y: vec3d, contact_state: int) -> int:
         """1 in front of a sheet, 2 behind, and unchanged within round-off of the sheet."""
-        s = nearest_on_mesh(con, k, y, -1)
-        above = wp.dot(y - s.position, con.mesh.normal[s.feature, s.triangle])
-        if wp.abs(above) <= f64(SIDE_TOLERANCE) * con.collider_size[k][0]:
-            if contact_state == 0 and above < -f64(SURFACE_TOLERANCE) * con.collider_size[k][0]:
+        s = nearest_on_mesh(col, k, y, -1)
+        above = wp.dot(y - s.position, col.mesh.normal[s.feature, s.triangle])
+        if wp.abs(above) <= f64(SIDE_TOLERANCE) * col.size[k][0]:
+            if contact_state == 0 and above < -f64(SURFACE_TOLERANCE) * col.size[k][0]:
                 return 2
             return wp.max(contact_state, 1)
         return wp.where(above > f64(0.0), 1, 2)
@@ -246,52 +246,51 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
         return wp.abs(w[2]) > e[0] * a[1] + e[1] * a[0]
 
     @wp.func
-    def within_triangle(con: Contacts, t: int, p: vec3d, tol: f64) -> bool:
+    def within_triangle(col: Colliders, t: int, p: vec3d, tol: f64) -> bool:
         """True if a position in the plane of a triangle is within it or within `tol` of it."""
-        n = con.mesh.normal[0, t]
+        n = col.mesh.normal[0, t]
         for k in range(3):
-            a = con.mesh.corner[k, t]
-            edge = con.mesh.corner[(k + 1) % 3, t] - a
+            a = col.mesh.corner[k, t]
+            edge = col.mesh.corner[(k + 1) % 3, t] - a
             if wp.dot(wp.cross(n, edge), p - a) < -tol * wp.length(edge):
                 return False
         return True
 
     @wp.func
-    def find_crossings(con: Contacts, k: int, a: vec3d, b: vec3d, side: int) -> Crossings:
+    def find_crossings(col: Colliders, k: int, a: vec3d, b: vec3d, side: int) -> Crossings:
         """Crossings of the surface by the segment from a to b; `side` at its start: -3 in front, -4 behind."""
         out = Crossings()
         out.entry_parameter = f64(2.0)
         out.exit_parameter = f64(2.0)
-        tol = f64(SURFACE_TOLERANCE) * con.collider_size[k][0]
+        tol = f64(SURFACE_TOLERANCE) * col.size[k][0]
         level = -tol  # lowest start height that counts as in front
         if side < -2:
-            level = wp.where(side == -3, -f64(SIDE_TOLERANCE), f64(SIDE_TOLERANCE)) * con.collider_size[k][0]
-        reach = f64(2.0) * f64(SIDE_TOLERANCE) * con.collider_size[k][0]
+            level = wp.where(side == -3, -f64(SIDE_TOLERANCE), f64(SIDE_TOLERANCE)) * col.size[k][0]
+        reach = f64(2.0) * f64(SIDE_TOLERANCE) * col.size[k][0]
         margin = vec3d(reach, reach, reach)
-        base = con.mesh.first_box[k]
-        inner = con.mesh.inner_count[k]
         waiting = ints()
         top = wp.int32(1)
         while top > 0:
             top -= 1
             i = waiting[top]
-            low, high = con.mesh.box_low[base + i] - margin, con.mesh.box_high[base + i] + margin
+            box = col.mesh.first_box[k] + i
+            low, high = col.mesh.box_low[box] - margin, col.mesh.box_high[box] + margin
             if not misses_box(low, high, f64(0.5) * (a + b), f64(0.5) * (b - a)):
-                if i < inner:
+                if i < col.mesh.inner_count[k]:
                     waiting[top] = 2 * i + 1
                     waiting[top + 1] = 2 * i + 2
                     top += 2
                 else:
-                    leaf = con.mesh.first_leaf[k] + i - inner
-                    for t in range(con.mesh.leaf_start[leaf], con.mesh.leaf_start[leaf + 1]):
-                        n = con.mesh.normal[0, t]
-                        before = wp.dot(a - con.mesh.corner[0, t], n)
-                        after = wp.dot(b - con.mesh.corner[0, t], n)
+                    leaf = col.mesh.first_leaf[k] + i - col.mesh.inner_count[k]
+                    for t in range(col.mesh.leaf_start[leaf], col.mesh.leaf_start[leaf + 1]):
+                        n = col.mesh.normal[0, t]
+                        before = wp.dot(a - col.mesh.corner[0, t], n)
+                        after = wp.dot(b - col.mesh.corner[0, t], n)
                         enters = before >= level and after < f64(0.0) and after < before
                         leaves = before < level and after >= f64(0.0) and after > before
                         if enters or leaves:
                             part = wp.clamp(before / (before - after), f64(0.0), f64(1.0))
-                            if within_triangle(con, t, a + part * (b - a), f64(1000.0) * tol):
+                            if within_triangle(col, t, a + part * (b - a), f64(1000.0) * tol):
                                 if enters and part < out.entry_parameter:
                                     out.entry_parameter = part
                                     out.entry_triangle = t
@@ -301,40 +300,40 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
         return out
 
     @wp.func
-    def passes_through(con: Contacts, k: int, first: int, entry: vec3d, last: int, leave: vec3d, sense: f64) -> bool:
+    def passes_through(col: Colliders, k: int, first: int, entry: vec3d, last: int, leave: vec3d, sense: f64) -> bool:
         """True if a path in through a triangle and out through another crosses the mesh, not just its edge."""
-        n = con.mesh.normal[0, first]
-        turn = wp.dot(n, con.mesh.normal[0, last])
+        n = col.mesh.normal[0, first]
+        turn = wp.dot(n, col.mesh.normal[0, last])
         deep = sense * wp.dot(n, entry - leave)
-        thick = con.collider_size[k][1]
+        thick = col.size[k][1]
         if turn < f64(-SAME_SIDE_COSINE):
             return deep > f64(MIN_PASSAGE) * thick
         return turn < f64(SAME_SIDE_COSINE) and deep > f64(0.5) * thick
 
     @wp.func
-    def beyond_sheet(con: Contacts, k: int, side: int, y: vec3d) -> bool:
+    def beyond_sheet(col: Colliders, k: int, side: int, y: vec3d) -> bool:
         """True if a point is so far behind a sheet that it is beyond it."""
-        deep = side_sign(side) * wp.dot(con.mesh.normal[0, side / 2], con.mesh.corner[0, side / 2] - y)
-        return con.collider_size[k][2] == f64(0.0) and deep > con.collider_size[k][1]
+        deep = side_sign(side) * wp.dot(col.mesh.normal[0, side / 2], col.mesh.corner[0, side / 2] - y)
+        return col.size[k][2] == f64(0.0) and deep > col.size[k][1]
 
     @wp.func
-    def sweep(con: Contacts, k: int, start: vec3d, end: vec3d, side: int) -> int:
+    def sweep(col: Colliders, k: int, start: vec3d, end: vec3d, side: int) -> int:
         """Side through which a motion has passed the surface at its end, -1: none or any, -2: it passed through; see
         `contact_shapes`."""
-        h = find_crossings(con, k, start, end, side)
+        h = find_crossings(col, k, start, end, side)
         d = end - start
         if side >= 0:
             leave = wp.where(side % 2 == 0, h.exit_parameter, h.entry_parameter)
             last = wp.where(side % 2 == 0, h.exit_triangle, h.entry_triangle)
             if leave > f64(1.0):
-                return wp.where(beyond_sheet(con, k, side, end), -2, side)
-            entry = con.mesh.corner[0, side / 2]
-            if passes_through(con, k, side / 2, entry, last, start + leave * d, side_sign(side)):
+                return wp.where(beyond_sheet(col, k, side, end), -2, side)
+            entry = col.mesh.corner[0, side / 2]
+            if passes_through(col, k, side / 2, entry, last, start + leave * d, side_sign(side)):
                 return -2
             return -1
         if h.entry_parameter > f64(1.0) and h.exit_parameter > f64(1.0):
             return -1
-        behind = wp.where(con.collider_size[k][2] == f64(0.0) and h.exit_parameter < h.entry_parameter, 1, 0)
+        behind = wp.where(col.size[k][2] == f64(0.0) and h.exit_parameter < h.entry_parameter, 1, 0)
         first = wp.where(behind == 1, h.exit_triangle, h.entry_triangle)
         last = wp.where(behind == 1, h.entry_triangle, h.exit_triangle)
         t0 = wp.where(behind == 1, h.exit_parameter, h.entry_parameter)
@@ -342,21 +341,21 @@ def mesh_functions(Contacts) -> _types.SimpleNamespace:
         if t0 > f64(1.0) or t1 < t0:
             return -1
         if t1 > f64(1.0):
-            return wp.where(beyond_sheet(con, k, 2 * first + behind, end), -2, 2 * first + behind)
-        if passes_through(con, k, first, start + t0 * d, last, start + t1 * d, side_sign(behind)):
+            return wp.where(beyond_sheet(col, k, 2 * first + behind, end), -2, 2 * first + behind)
+        if passes_through(col, k, first, start + t0 * d, last, start + t1 * d, side_sign(behind)):
             return -2
         return -1
 
     @wp.func
     def depth_change(
-        con: Contacts, k: int, side: int, start: vec3d, y: vec3d, local: vec3d, before: f64, after: f64
+        col: Colliders, k: int, side: int, start: vec3d, y: vec3d, local: vec3d, before: f64, after: f64
     ) -> wp.vec2d:  # fmt: skip
         """(change of depth, 1) by a motion along one plane, else (difference of the end distances, 0)."""
         if side < 0:
             return wp.vec2d()
-        n = side_sign(side) * con.mesh.normal[0, side / 2]
-        a = con.mesh.corner[0, side / 2]
-        tol = f64(SURFACE_TOLERANCE) * con.collider_size[k][0]
+        n = side_sign(side) * col.mesh.normal[0, side / 2]
+        a = col.mesh.corner[0, side / 2]
+        tol = f64(SURFACE_TOLERANCE) * col.size[k][0]
         if wp.abs(wp.dot(start - a, n) - before) <= tol and wp.abs(wp.dot(y - a, n) - after) <= tol:
             return wp.vec2d(-wp.dot(n, local), f64(1.0))
         return wp.vec2d()

@@ -7,8 +7,8 @@ import warp as wp
 
 from ..common.types import SHORT_UNROLL, kernel_module, kernel_set, precision
 from .colliders import MESH_SUFFIX, collider_functions
-from .point import contact_point_functions
-from .structs import contact_scratch_struct, contact_struct, facet_struct
+from .kinematics import kinematics_functions
+from .structs import collider_struct, facet_struct
 
 __all__ = ["sheet_kernels"]
 
@@ -17,26 +17,26 @@ __all__ = ["sheet_kernels"]
 def sheet_kernels(dtype: str) -> _types.SimpleNamespace:
     """A kernel in a module of its own, run once at the start of a simulation."""
     vec3, vec3d = precision(dtype).vec3, wp.vec3d
-    Contacts, Facets, ContactScratch = contact_struct(True), facet_struct(dtype), contact_scratch_struct(dtype)
-    interpolate = contact_point_functions(dtype, True).interpolate
+    Colliders, Facets = collider_struct(True), facet_struct(dtype)
+    interpolate = kinematics_functions(dtype).interpolate
     distance, sweep = collider_functions(True).distance, collider_functions(True).sweep
     module = kernel_module(f"contact_sheets_{dtype}{MESH_SUFFIX}", max_unroll=SHORT_UNROLL)
 
     @wp.kernel(module=module)
     def find_crossed_sheets(
-        con: Contacts, facets: Facets, u: wp.array2d(dtype=vec3), tolerance: wp.array(dtype=wp.float64),
-        scr: ContactScratch, found: wp.array2d(dtype=wp.int32),
+        col: Colliders, facets: Facets, u: wp.array2d(dtype=vec3), tolerance: wp.array(dtype=wp.float64),
+        found: wp.array2d(dtype=wp.int32),
     ):  # fmt: skip
         """Point of each facet that is behind a sheet as seen from the preceding point, + 1; found: [world, row]."""
         world, item = wp.tid()
-        k = con.collider[facets.contact[item]]
+        k = col.of_contact[facets.contact[item]]
         before = vec3d()
         for q in range(facets.point_count):
             x = facets.X[q, item] + interpolate(facets, u, world, q, item)
-            y = wp.transpose(scr.collider_rotation[world, k]) * (x - scr.collider_position[world, k])
+            y = wp.transpose(col.rotation[world, k]) * (x - col.position[world, k])
             if q > 0:
-                side = sweep(con, k, before, y, -1)
-                if side == -2 or (side >= 0 and distance(con, k, y, side)[3] < -tolerance[world]):
+                side = sweep(col, k, before, y, -1)
+                if side == -2 or (side >= 0 and distance(col, k, y, side)[3] < -tolerance[world]):
                     found[world, facets.first_row + item] = facets.first_point + item * facets.point_count + q + 1
             before = y
 

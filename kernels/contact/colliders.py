@@ -8,97 +8,93 @@ import types as _types
 
 import warp as wp
 
+from ..common.types import kernel_set
 from .collider_mesh import MESH, mesh_functions
 from .collider_shapes import BOX, HALF_SPACE, SPHERE, shape_functions
-from .structs import contact_struct
+from .structs import SLIP_FLAG, collider_struct
 
 __all__ = ["MESH_SUFFIX", "collider_functions"]
 
 MESH_SUFFIX = "_meshes"
 """Suffix of the names of modules compiled with the mesh code."""
 
-SLIP_FLAG = 16
-"""Bit of a point's contact state: slipping; the bits below are the side."""
 MESH_FUNCTIONS = ("distance", "sweep", "updated_side", "depth_change", "sheet_side")
-MESH_SLIP_FLAG = 1 << 30
-"""Slipping bit where sides are triangles."""
 
 
 @functools.cache
 def collider_functions(meshes: bool) -> _types.SimpleNamespace:
-    """Device functions, see `contact_shapes` and `contact_mesh`, and the slipping bit SLIP_FLAG."""
-    slips = MESH_SLIP_FLAG if meshes else SLIP_FLAG
+    """Device functions, see `shape_functions` and `mesh_functions`."""
     f64, vec3d = wp.float64, wp.vec3d
-    Contacts = contact_struct(meshes)
+    Colliders = collider_struct(meshes)
     shapes = shape_functions()
     of_shape, sweep_shape = shapes.distance, shapes.sweep
-    mesh = mesh_functions(Contacts) if meshes else _types.SimpleNamespace(**dict.fromkeys(MESH_FUNCTIONS))
+    mesh = mesh_functions(Colliders) if meshes else _types.SimpleNamespace(**dict.fromkeys(MESH_FUNCTIONS))
     distance_on_mesh, sweep_mesh, side_on_mesh, depth_change_on_mesh, sheet_side_on_mesh = (
         getattr(mesh, name) for name in MESH_FUNCTIONS
     )
 
     @wp.func
-    def distance(con: Contacts, k: int, y: vec3d, side: int) -> wp.vec4d:
+    def distance(col: Colliders, k: int, y: vec3d, side: int) -> wp.vec4d:
         """Outward unit normal and signed distance at a position in the frame of collider k."""
         if wp.static(meshes):
-            if con.collider_kind[k] == MESH:
-                return distance_on_mesh(con, k, y, side)
-        return of_shape(con.collider_kind[k], con.collider_size[k], y, side)
+            if col.kind[k] == MESH:
+                return distance_on_mesh(col, k, y, side)
+        return of_shape(col.kind[k], col.size[k], y, side)
 
     @wp.func
-    def sweep(con: Contacts, k: int, start: vec3d, end: vec3d, side: int) -> int:
+    def sweep(col: Colliders, k: int, start: vec3d, end: vec3d, side: int) -> int:
         """Side through which a motion ends inside, -1: any; -2: it passed through the collider."""
         if wp.static(meshes):
-            if con.collider_kind[k] == MESH:
-                return sweep_mesh(con, k, start, end, side)
-        return sweep_shape(con.collider_kind[k], con.collider_size[k], start, end, side)
+            if col.kind[k] == MESH:
+                return sweep_mesh(col, k, start, end, side)
+        return sweep_shape(col.kind[k], col.size[k], start, end, side)
 
     @wp.func
-    def stored_side(con: Contacts, k: int, in_contact: bool, contact_state: int) -> int:
+    def stored_side(col: Colliders, k: int, in_contact: bool, contact_state: int) -> int:
         """Side stored in a contact state, -1: none; of a point without contact to a sheet -3 in front of it, -4
         behind."""
         if in_contact:
-            return contact_state % slips - 1
+            return contact_state % SLIP_FLAG - 1
         if wp.static(meshes):
-            if contact_state % slips > 0:
-                return -2 - contact_state % slips
+            if contact_state % SLIP_FLAG > 0:
+                return -2 - contact_state % SLIP_FLAG
         return -1
 
     @wp.func
-    def sheet_side(con: Contacts, k: int, y: vec3d, contact_state: int) -> int:
+    def sheet_side(col: Colliders, k: int, y: vec3d, contact_state: int) -> int:
         """Contact state of a free point: its side of a sheet, unchanged where round-off hides the side."""
         if wp.static(meshes):
-            if con.collider_kind[k] == MESH and con.collider_size[k][2] == f64(0.0):
-                return sheet_side_on_mesh(con, k, y, contact_state)
+            if col.kind[k] == MESH and col.size[k][2] == f64(0.0):
+                return sheet_side_on_mesh(col, k, y, contact_state)
         return 0
 
     @wp.func
-    def released_contact_state(con: Contacts, k: int, in_contact: bool, contact_state: int) -> int:
+    def released_contact_state(col: Colliders, k: int, in_contact: bool, contact_state: int) -> int:
         """Contact state of a point that has left contact."""
         if wp.static(meshes):
-            if con.collider_kind[k] == MESH and con.collider_size[k][2] == f64(0.0):
-                if in_contact and contact_state % slips > 0:
-                    return 1 + (contact_state % slips - 1) % 2
+            if col.kind[k] == MESH and col.size[k][2] == f64(0.0):
+                if in_contact and contact_state % SLIP_FLAG > 0:
+                    return 1 + (contact_state % SLIP_FLAG - 1) % 2
                 return wp.where(in_contact, 0, contact_state)
         return 0
 
     @wp.func
-    def updated_side(con: Contacts, k: int, y: vec3d, side: int) -> int:
+    def updated_side(col: Colliders, k: int, y: vec3d, side: int) -> int:
         """Updated side of a point at y that was swept to a side: on a mesh it slides over triangles."""
         if wp.static(meshes):
-            if con.collider_kind[k] == MESH:
-                return side_on_mesh(con, k, y, side)
+            if col.kind[k] == MESH:
+                return side_on_mesh(col, k, y, side)
         return wp.max(side, -1)
 
     @wp.func
     def depth_change(
-        con: Contacts, k: int, side: int, start: vec3d, y: vec3d, local: vec3d, before: f64, after: f64
+        col: Colliders, k: int, side: int, start: vec3d, y: vec3d, local: vec3d, before: f64, after: f64
     ) -> wp.vec2d:  # fmt: skip
         """(change of depth, 1) from the motion itself where that is exact, else (difference of the end distances, 0).
 
         A difference of positions has their round-off, which exceeds the motion of a stiff body at rest.
         """
-        kind = con.collider_kind[k]
+        kind = col.kind[k]
         if kind == HALF_SPACE:
             return wp.vec2d(-local[2], f64(1.0))
         if kind == SPHERE:
@@ -106,7 +102,7 @@ def collider_functions(meshes: bool) -> _types.SimpleNamespace:
                 -wp.dot(y + start, local) / wp.max(wp.length(y) + wp.length(start), f64(1.0e-300)), f64(1.0)
             )
         if kind == BOX and side >= 0:
-            h = con.collider_size[k]
+            h = col.size[k]
             axis = side / 2
             sign = wp.where(side % 2 == 0, f64(-1.0), f64(1.0))
             flat = wp.abs(h[axis] - sign * start[axis] + before) <= f64(1.0e-12) * h[axis]
@@ -117,10 +113,7 @@ def collider_functions(meshes: bool) -> _types.SimpleNamespace:
                 return wp.vec2d(-sign * local[axis], f64(1.0))
         if wp.static(meshes):
             if kind == MESH:
-                return depth_change_on_mesh(con, k, side, start, y, local, before, after)
+                return depth_change_on_mesh(col, k, side, start, y, local, before, after)
         return wp.vec2d()
 
-    return _types.SimpleNamespace(
-        distance=distance, sweep=sweep, stored_side=stored_side, updated_side=updated_side, sheet_side=sheet_side,
-        released_contact_state=released_contact_state, depth_change=depth_change, SLIP_FLAG=slips,
-    )  # fmt: skip
+    return kernel_set(locals())

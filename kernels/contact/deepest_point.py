@@ -10,10 +10,10 @@ import types as _types
 import warp as wp
 
 from ..common.types import SHORT_UNROLL, kernel_module, kernel_set, precision
-from .assembly import MIN_APPROACH_SPEED
+from .collider_kinematics import MIN_APPROACH_SPEED, collider_kinematics
 from .colliders import MESH_SUFFIX, collider_functions
-from .point import contact_point_functions
-from .structs import clock_struct, contact_scratch_struct, contact_struct, facet_struct, history_struct
+from .kinematics import kinematics_functions
+from .structs import collider_struct, contact_structs
 
 __all__ = ["deepest_point_kernels"]
 
@@ -32,17 +32,11 @@ def deepest_point_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
     f64, vec2d, vec3d = wp.float64, wp.vec2d, wp.vec3d
-    Contacts, Facets = contact_struct(meshes), facet_struct(dtype)
-    History, ContactScratch, Clock = history_struct(), contact_scratch_struct(dtype), clock_struct()
-    f = contact_point_functions(dtype, meshes)
-    interpolate, activation_gap, depth_at_start, history_row, lagrange_polynomial, monomial_derivative = (
-        f.interpolate,
-        f.activation_gap,
-        f.depth_at_start,
-        f.history_row,
-        f.lagrange_polynomial,
-        f.monomial_derivative,
-    )
+    Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)
+    Colliders = collider_struct(meshes)
+    f, geometry = kinematics_functions(dtype), collider_kinematics(dtype, meshes)
+    interpolate, activation_gap, lagrange_polynomial = f.interpolate, f.activation_gap, f.lagrange_polynomial
+    monomial_derivative = f.monomial_derivative
     distance, stored_side = collider_functions(meshes).distance, collider_functions(meshes).stored_side
     module = kernel_module(f"deepest_point_{dtype}{MESH_SUFFIX * meshes}", max_unroll=SHORT_UNROLL)
 
@@ -58,14 +52,14 @@ def deepest_point_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         bb: vec3d
 
     @wp.func
-    def surface_point(con: Contacts, facets: Facets, scr: ContactScratch, world: int, k: int, item: int,
+    def surface_point(col: Colliders, facets: Facets, world: int, k: int, item: int,
         u: wp.array2d(dtype=vec3d),
             s: vec2d) -> SurfacePoint:  # fmt: skip
         """Position and derivatives at coordinates s."""
         out = SurfacePoint()
-        back = wp.transpose(scr.collider_rotation[world, k])
+        back = wp.transpose(col.rotation[world, k])
         for q in range(facets.point_count):
-            x = back * (facets.X[q, item] + interpolate(facets, u, world, q, item) - scr.collider_position[world, k])
+            x = back * (facets.X[q, item] + interpolate(facets, u, world, q, item) - col.position[world, k])
             for m in range(facets.exponents.shape[0]):
                 i = facets.exponents[m][0]
                 j = facets.exponents[m][1]
@@ -131,16 +125,16 @@ def deepest_point_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         return vec2d()
 
     @wp.func
-    def deepest_in_facet(con: Contacts, facets: Facets, scr: ContactScratch, world: int, k: int, item: int,
+    def deepest_in_facet(col: Colliders, facets: Facets, world: int, k: int, item: int,
                    u: wp.array2d(dtype=vec3d), start: vec2d) -> vec3d:  # fmt: skip
         """Coordinates of the position of a facet closest to the collider, and its gap, by descent from a start."""
         s = start
-        here = surface_point(con, facets, scr, world, k, item, u, s)
-        d = distance(con, k, here.y, -1)
+        here = surface_point(col, facets, world, k, item, u, s)
+        d = distance(col, k, here.y, -1)
         for _ in range(MAX_NEWTON_STEPS):
             n = vec3d(d[0], d[1], d[2])
-            next_a = distance(con, k, here.y + f64(DIFFERENCE_STEP) * here.a, -1)
-            next_b = distance(con, k, here.y + f64(DIFFERENCE_STEP) * here.b, -1)
+            next_a = distance(col, k, here.y + f64(DIFFERENCE_STEP) * here.a, -1)
+            next_b = distance(col, k, here.y + f64(DIFFERENCE_STEP) * here.b, -1)
             turn_a = (vec3d(next_a[0], next_a[1], next_a[2]) - n) / f64(DIFFERENCE_STEP)
             turn_b = (vec3d(next_b[0], next_b[1], next_b[2]) - n) / f64(DIFFERENCE_STEP)
             g = vec2d(wp.dot(n, here.a), wp.dot(n, here.b))
@@ -151,8 +145,8 @@ def deepest_point_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
             found = bool(False)
             for _try in range(MAX_HALVINGS):
                 if not found and wp.length(step) > f64(1.0e-9):
-                    new = surface_point(con, facets, scr, world, k, item, u, s + step)
-                    new_d = distance(con, k, new.y, -1)
+                    new = surface_point(col, facets, world, k, item, u, s + step)
+                    new_d = distance(col, k, new.y, -1)
                     if new_d[3] < d[3]:
                         found = True
                         s = s + step
@@ -166,8 +160,8 @@ def deepest_point_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def point_depths(
-        con: Contacts, facets: Facets, his: History, time: wp.array(dtype=f64), u: wp.array2d(dtype=vec3d),
-        active: wp.array(dtype=wp.int32), scr: ContactScratch,
+        con: Contacts, col: Colliders, facets: Facets, his: History, time: wp.array(dtype=f64),
+        u: wp.array2d(dtype=vec3d), active: wp.array(dtype=wp.int32), scr: ContactScratch,
     ):  # fmt: skip
         """Depths of the points of lumped contacts."""
         world, item, q = wp.tid()
@@ -177,19 +171,19 @@ def deepest_point_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
         point = facets.first_point + item * facets.point_count + q
         depth = f64(-1.0e300)
         if facets.area_fraction[q, item] > f64(0.0):
-            k = con.collider[c]
+            k = col.of_contact[c]
             x = facets.X[q, item] + interpolate(facets, u, world, q, item)
-            y = wp.transpose(scr.collider_rotation[world, k]) * (x - scr.collider_position[world, k])
-            d = distance(con, k, y, -1)
-            depth = activation_gap(con, his, world, c, point, time[world], con.margin[world, k]) - d[3]
+            y = wp.transpose(col.rotation[world, k]) * (x - col.position[world, k])
+            d = distance(col, k, y, -1)
+            depth = activation_gap(con, his, world, c, point, time[world], col.margin[world, k]) - d[3]
             if con.is_explicit[c] != 0:  # explicit: its force is that of the last state
                 depth = scr.start_depth[world, point]
         scr.point_depth[world, point] = depth
 
     @wp.kernel(module=module)
     def find_deepest(
-        con: Contacts, facets: Facets, his: History, time: wp.array(dtype=f64), u: wp.array2d(dtype=vec3d),
-        active: wp.array(dtype=wp.int32), scr: ContactScratch,
+        con: Contacts, col: Colliders, facets: Facets, his: History, time: wp.array(dtype=f64),
+        u: wp.array2d(dtype=vec3d), active: wp.array(dtype=wp.int32), scr: ContactScratch,
     ):  # fmt: skip
         """Deepest position of each facet that may touch and be the deepest of its contact; else its deepest point."""
         world, item = wp.tid()
@@ -217,10 +211,10 @@ def deepest_point_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
             known = scr.point_depth[world, scr.contact_point[world, c]]
         if facets.tracks_deepest == 0 or top < f64(-1.0e299) or highest <= f64(0.0) or highest < known:
             return
-        k = con.collider[c]
-        found = deepest_in_facet(con, facets, scr, world, k, item, u, facets.point_coords[q])
+        k = col.of_contact[c]
+        found = deepest_in_facet(col, facets, world, k, item, u, facets.point_coords[q])
         scr.facet_deepest_xi[world, row] = vec2d(found[0], found[1])
-        depth = activation_gap(con, his, world, c, first, time[world], con.margin[world, k]) - found[2]
+        depth = activation_gap(con, his, world, c, first, time[world], col.margin[world, k]) - found[2]
         scr.facet_max_depth[world, row] = wp.max(depth, top)
 
     @wp.kernel(module=module)
@@ -252,7 +246,7 @@ def deepest_point_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def set_contact_point(
-        con: Contacts, facets: Facets, his: History, clock: Clock, u_n: wp.array2d(dtype=vec3),
+        con: Contacts, col: Colliders, facets: Facets, his: History, clock: Clock, u_n: wp.array2d(dtype=vec3),
         v_n: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), settled: int, scr: ContactScratch,
     ):  # fmt: skip
         """Shape values of the chosen contact point and its position at the start of the attempt; `settled`: at a
@@ -286,33 +280,21 @@ def deepest_point_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
             for q in range(facets.point_count):
                 X += lagrange_polynomial(facets, q, scr.facet_deepest_xi[world, row]) * facets.X[q, item]
         scr.point_reference[world, c] = X
-        rec = history_row(con, c, point)
-        k = con.collider[c]
-        rotation = his.rotation[world, k]
-        position = his.position[world, k]
-        margin = his.previous_margin[world, k]
-        if settled != 0:
-            rotation = scr.collider_rotation[world, k]
-            position = scr.collider_position[world, k]
-            margin = con.margin[world, k]
-        x = X + origin
-        y = wp.transpose(rotation) * (x - position)
+        rec = f.history_row(con, c, point)
+        k = col.of_contact[c]
+        rotation = col.previous_rotation[world, k]
+        y = wp.transpose(rotation) * (X + origin - col.previous_position[world, k])
         in_contact = settled == 0 and his.speed[world, rec] > f64(0.0)
-        side = stored_side(con, k, in_contact, his.contact_state[world, rec])
-        d = distance(con, k, y, side)
-        activation_gap_now = activation_gap(con, his, world, c, point, clock.time[world], margin)
-        scr.start_position[world, point] = y
+        side = stored_side(col, k, in_contact, his.contact_state[world, rec])
+        now = activation_gap(con, his, world, c, point, clock.time[world], col.previous_margin[world, k])
+        n = geometry.set_start(col, scr, world, k, point, y, side, now)
         scr.start_displacement[world, point] = origin
-        scr.activation_gap[world, point] = activation_gap_now
-        scr.start_depth[world, point] = activation_gap_now - d[3]
-        if settled == 0:
-            speed = wp.max(his.speed[world, rec], f64(MIN_APPROACH_SPEED))
-            if clock.is_static == 0:
-                motion = (scr.collider_rotation[world, k] * y + scr.collider_position[world, k] - x) / clock.h[world]
-                approach = wp.dot(rotation * vec3d(d[0], d[1], d[2]), motion - v)
-                # a rolling contact point descends initially at twice its mean speed
-                rolled = depth_at_start(con, facets, his, scr, world, c, point) - scr.start_depth[world, point]
-                speed = wp.max(speed, approach - f64(2.0) * rolled / clock.h[world])
-            scr.approach_speed[world, point] = speed
+        speed = wp.max(his.speed[world, rec], f64(MIN_APPROACH_SPEED))
+        if clock.is_static == 0:
+            approach = wp.dot(rotation * n, geometry.material_velocity(col, clock, world, k, y) - v)
+            # a rolling contact point descends initially at twice its mean speed
+            rolled = f.depth_at_start(con, facets, his, scr, world, c, point) - scr.start_depth[world, point]
+            speed = wp.max(speed, approach - f64(2.0) * rolled / clock.h[world])
+        scr.approach_speed[world, point] = speed
 
     return kernel_set(locals())

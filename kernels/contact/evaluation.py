@@ -1,19 +1,22 @@
-"""Contact between bodies at a state: gap, elastic force and facet of every point, for fields and checks."""
+"""Contact at a state: gap, elastic force and facet of every point, for fields and checks."""
 
 import functools
 import types as _types
 
 import warp as wp
 
-from ..common.types import SHORT_UNROLL, kernel_module, kernel_set
+from ..common.types import SHORT_UNROLL, kernel_module, kernel_set, precision
+from .collider_kinematics import collider_kinematics
+from .colliders import MESH_SUFFIX
 from .facet_search import facet_search_kernels
-from .facet_structs import master_struct, pair_history_struct, pair_scratch_struct
-from .laws import PAPER, law_functions
-from .point import contact_point_functions
+from .facet_structs import facet_side_struct, master_struct, pair_scratch_struct
+from .friction import friction_functions
+from .kinematics import kinematics_functions
+from .law import FIXED_SPRING
 from .projection import OUTSIDE_TOLERANCE, facet_projection_functions
-from .structs import contact_scratch_struct, contact_struct, facet_struct, history_struct, world_value
+from .structs import collider_struct, contact_structs
 
-__all__ = ["pair_evaluation_kernels", "pair_results_struct"]
+__all__ = ["collider_evaluation_kernels", "pair_evaluation_kernels", "pair_results_struct"]
 
 
 @functools.cache
@@ -33,40 +36,85 @@ def pair_results_struct():
 
 
 @functools.cache
-def pair_evaluation_kernels(dtype: str) -> _types.SimpleNamespace:
-    """Kernels in one precision of the model."""
+def collider_evaluation_kernels(dtype: str, meshes: bool, own: tuple[str, ...] = ()) -> _types.SimpleNamespace:
+    """Kernels for contact with colliders; arguments as of `contact_kernels`, `meshes`: some collider is a mesh."""
+    vec3 = precision(dtype).vec3
     f64, vec3d = wp.float64, wp.vec3d
-    Contacts, Facets, History = contact_struct(False), facet_struct(dtype), history_struct()
-    ContactScratch, PairResults = contact_scratch_struct(dtype), pair_results_struct()
-    Masters, PairHistory, PairScratch = master_struct(dtype), pair_history_struct(), pair_scratch_struct(dtype)
-    k, places, seek = (
-        contact_point_functions(dtype, False),
-        facet_projection_functions(dtype),
-        facet_search_kernels(dtype),
-    )
-    PointContact, interpolate, activation_gap, friction_parameters, with_friction_normal = (
-        k.PointContact,
-        k.interpolate,
-        k.activation_gap,
-        k.friction_parameters,
-        k.with_friction_normal,
-    )
-    friction_force, normal_law = k.friction_force, law_functions().normal_law
-    surface_point, inverse_map, distance_outside, unit_normal, facet_centre = (
-        places.surface_point,
-        places.inverse_map,
-        places.distance_outside,
-        places.unit_normal,
-        places.facet_centre,
-    )
-    project_on_facet, shape_value, facet_frame, round_down, round_up = (
-        places.project_on_facet,
-        places.shape_value,
-        seek.facet_frame,
-        seek.round_down,
-        seek.round_up,
-    )
-    module = kernel_module(f"pair_evaluation_{dtype}", max_unroll=SHORT_UNROLL)
+    Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)
+    Colliders = collider_struct(meshes)
+    k, law, g = kinematics_functions(dtype), friction_functions(dtype, own), collider_kinematics(dtype, meshes)
+    name = "_".join(["contact_evaluation", dtype, *own])
+    module = kernel_module(f"{name}{MESH_SUFFIX * meshes}", max_unroll=SHORT_UNROLL)
+
+    @wp.kernel(module=module)
+    def points_at_state(
+        con: Contacts, col: Colliders, facets: Facets, his: History, time: wp.array(dtype=f64),
+        u: wp.array2d(dtype=vec3), scr: ContactScratch,
+    ):  # fmt: skip
+        """Point data at a state without motion, for evaluations outside of a step."""
+        world, item, q = wp.tid()
+        c = facets.contact[item]
+        kc = col.of_contact[c]
+        point = facets.first_point + item * facets.point_count + q
+        shift = k.interpolate(facets, u, world, q, item)
+        y = wp.transpose(col.rotation[world, kc]) * (facets.X[q, item] + shift - col.position[world, kc])
+        now = k.activation_gap(con, his, world, c, point, time[world], col.margin[world, kc])
+        g.set_start(col, scr, world, kc, point, y, -1, now)
+        scr.start_displacement[world, point] = shift
+
+    @wp.kernel(module=module)
+    def evaluate_at_points(
+        con: Contacts, col: Colliders, facets: Facets, his: History, u: wp.array2d(dtype=vec3d),
+        time: wp.array(dtype=f64), scr: ContactScratch, places: int, gap: wp.array2d(dtype=f64),
+        normal: wp.array2d(dtype=f64), force: wp.array2d(dtype=vec3d),
+    ):  # fmt: skip
+        """Gap, m, elastic normal force and elastic force, N, of each point at a state, without rates; with `places` the
+        gap of a moving contact point is written at the point next to it."""
+        world, item, q = wp.tid()
+        point = facets.first_point + item * facets.point_count + q
+        if facets.area_fraction[q, item] == f64(0.0):
+            gap[world, point] = f64(1.0e30)
+            return
+        c = facets.contact[item]
+        area_fraction = facets.area_fraction[q, item] * k.is_acting(con, scr, world, c, point)
+        acting_point = point
+        if facets.tracks_deepest != 0:  # the force at the contact point is written at a point of its facet
+            gap[world, point] = -scr.point_depth[world, point]
+            row = facets.first_row + item
+            area_fraction = f64(0.0)
+            acting_point = scr.contact_point[world, c]
+            if scr.chosen_facet[world, c] == row:
+                area_fraction = k.lagrange_polynomial(facets, q, scr.facet_deepest_xi[world, row])
+                if wp.length_sq(
+                    scr.facet_deepest_xi[world, row] - facets.point_coords[acting_point - (point - q)]
+                ) == f64(0.0):
+                    area_fraction = wp.where(acting_point == point, f64(1.0), f64(0.0))
+            if area_fraction == f64(0.0) and acting_point != point:
+                return
+        t = g.evaluate(con, col, facets, his, scr, world, q, item, acting_point, u, time[world])
+        t = law.with_normal_force(con, scr, world, c, acting_point, t, f64(0.0))
+        frozen = law.friction_parameters(con, his, world, c, acting_point, t)
+        if acting_point == point and (facets.tracks_deepest == 0 or places != 0):
+            gap[world, point] = -t.depth
+        normal[world, point] = area_fraction * t.normal_values[0]
+        force[world, point] = area_fraction * (
+            t.normal_values[0] * t.normal - law.friction_force(con, world, c, t, frozen, f64(0.0))
+        )
+
+    return kernel_set(locals())
+
+
+@functools.cache
+def pair_evaluation_kernels(dtype: str, own: tuple[str, ...] = ()) -> _types.SimpleNamespace:
+    """Kernels for contact between bodies; arguments as of `contact_kernels`."""
+    f64, vec3d = wp.float64, wp.vec3d
+    Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)
+    PairResults, Other = pair_results_struct(), facet_side_struct(dtype)
+    Masters, PairScratch = master_struct(dtype), pair_scratch_struct(dtype)
+    k, law, seek = kinematics_functions(dtype), friction_functions(dtype, own), facet_search_kernels(dtype)
+    places, round_down, round_up = facet_projection_functions(dtype), seek.round_down, seek.round_up
+    surface_point, inverse_map, distance_outside = places.surface_point, places.inverse_map, places.distance_outside
+    module = kernel_module("_".join(["pair_evaluation", dtype, *own]), max_unroll=SHORT_UNROLL)
 
     @wp.func
     def closest_facet(mas: Masters, pair: PairScratch, world: int, surface: int, x: vec3d, far: f64) -> wp.vec4d:
@@ -81,12 +129,12 @@ def pair_evaluation_kernels(dtype: str) -> _types.SimpleNamespace:
         while wp.bvh_query_next(query, index):
             f = index - world * mas.facet_count
             corners = mas.corner_count[mas.facet_kind[f]]
-            found = inverse_map(mas, pair.u_coefs, pair.director_u_coefs, world, f, x, facet_centre(corners))
+            found = inverse_map(mas, pair.displacement, world, f, x, places.facet_centre(corners))
             xi = vec3d(found[0], found[1], found[2])
             o = distance_outside(corners, xi)
             if found[3] != f64(0.0) and o <= off:
-                s = surface_point(mas, pair.u_coefs, pair.director_u_coefs, world, f, xi)
-                gap = xi[2] * wp.dot(unit_normal(s), s.director)
+                s = surface_point(mas, pair.displacement, world, f, xi)
+                gap = xi[2] * wp.dot(places.unit_normal(s), s.director)
                 closer = wp.abs(gap) < height or (wp.abs(gap) == height and f64(f) < out[3])
                 if gap >= -mas.depth_limit[f] and (o < off or closer) and wp.abs(gap) <= far:
                     out = wp.vec4d(xi[0], xi[1], xi[2], f64(f))
@@ -96,8 +144,8 @@ def pair_evaluation_kernels(dtype: str) -> _types.SimpleNamespace:
 
     @wp.kernel(module=module)
     def evaluate_pairs(
-        con: Contacts, mas: Masters, facets: Facets, his: History, pair_his: PairHistory, time: wp.array(dtype=f64),
-        u: wp.array2d(dtype=vec3d), far: f64, scr: ContactScratch, pair: PairScratch, out: PairResults,
+        con: Contacts, other: Other, facets: Facets, his: History, time: wp.array(dtype=f64),
+        u: wp.array2d(dtype=vec3d), far: f64, scr: ContactScratch, out: PairResults,
     ):  # fmt: skip
         """Gaps of points in contact on their facets, of others on the closest facet; elastic forces, without motion."""
         world, item, q = wp.tid()
@@ -108,51 +156,46 @@ def pair_evaluation_kernels(dtype: str) -> _types.SimpleNamespace:
         out.facet[world, point] = -1
         if area_fraction == f64(0.0):
             return
-        x = facets.X[q, item] + interpolate(facets, u, world, q, item)
+        U = other.scratch.displacement
+        x = facets.X[q, item] + k.interpolate(facets, u, world, q, item)
         in_contact = his.speed[world, point] > f64(0.0)
         f = wp.int32(-1)
-        place = vec3d()
+        found = wp.vec4d()
         if in_contact:
-            f = pair_his.facet[world, point] - 1
-            found = inverse_map(mas, pair.u_coefs, pair.director_u_coefs, world, f, x, pair_his.xi[world, point])
-            place = vec3d(found[0], found[1], found[2])
+            f = other.history.facet[world, point] - 1
+            found = inverse_map(other.masters, U, world, f, x, other.history.xi[world, point])
             if found[3] == f64(0.0):
                 f = -1
         if f < 0:
-            found = closest_facet(mas, pair, world, mas.surface_of[c], x, far)
-            place = vec3d(found[0], found[1], found[2])
+            found = closest_facet(other.masters, other.scratch, world, other.masters.surface_of[c], x, far)
             f = wp.int32(found[3])
         if f < 0:
             return
-        projection = project_on_facet(mas, pair.u_coefs, pair.director_u_coefs, world, f, place)
-        s = PointContact()
-        s.normal = projection.normal
-        activation_gap_now = activation_gap(con, his, world, c, point, time[world], f64(0.0))
-        s.depth = activation_gap_now - (place[2] * projection.gap_slope + projection.gap_offset)
-        k_n = con.scale[world, c] * world_value(con.normal_stiffness, world, c)
-        s.normal_values = normal_law(
-            con.law[c], 0, k_n, f64(0.0), con.damping_ramp[c], con.force_eps[c], s.depth, s.depth
+        xi = vec3d(found[0], found[1], found[2])
+        projection = places.project_on_facet(other.masters, U, world, f, xi)
+        t = PointContact()
+        t.normal = projection.normal
+        t.depth = k.activation_gap(con, his, world, c, point, time[world], f64(0.0)) - (
+            xi[2] * projection.gap_slope + projection.gap_offset
         )
+        t.previous_depth = t.depth
         if in_contact:
-            s.trial_displacement = his.spring[world, point]
-            if con.law[c] != PAPER:
-                s.trial_displacement = (
-                    facet_frame(surface_point(mas, pair.u_coefs, pair.director_u_coefs, world, f, place))
-                    * s.trial_displacement
-                )
-        s = with_friction_normal(s, s.normal)
-        frozen = friction_parameters(con, his, scr, world, c, point, s)
-        frozen[2] = f64(1.0)
-        pressed = area_fraction * s.normal_values[0] * s.normal
-        tangential_force = area_fraction * friction_force(con, world, c, s, frozen, f64(0.0))
-        out.gap[world, point] = -s.depth
-        out.normal[world, point] = area_fraction * s.normal_values[0]
+            t.spring = his.spring[world, point]
+            if not law.has_trait(con, c, FIXED_SPRING):
+                t.spring = seek.facet_frame(surface_point(other.masters, U, world, f, xi)) * t.spring
+        t = law.with_normal_force(con, scr, world, c, point, t, f64(0.0))
+        frozen = law.friction_parameters(con, his, world, c, point, t)
+        pressed = area_fraction * t.normal_values[0] * t.normal
+        tangential_force = area_fraction * law.friction_force(con, world, c, t, frozen, f64(0.0))
+        out.gap[world, point] = -t.depth
+        out.normal[world, point] = area_fraction * t.normal_values[0]
         out.force[world, point] = pressed - tangential_force
         out.facet[world, point] = f
-        out.xi[world, point] = place
-        for i in range(mas.conn.shape[0]):
+        out.xi[world, point] = xi
+        for i in range(other.masters.conn.shape[0]):
             out.reaction[world, point, i] = (
-                shape_value(mas, f, i, place) * tangential_force - shape_value(mas, f, i, projection.xi) * pressed
+                places.shape_value(other.masters, f, i, xi) * tangential_force
+                - places.shape_value(other.masters, f, i, projection.xi) * pressed
             )
 
     return kernel_set(locals())

@@ -8,9 +8,9 @@ import warp as wp
 from ..common.types import kernel_set
 from .broad_phase import broad_phase_kernels
 from .facet_structs import master_struct, pair_scratch_struct
-from .point import contact_point_functions
+from .kinematics import kinematics_functions
 from .projection import MAX_OVERHANG, OUTSIDE_TOLERANCE, facet_projection_functions
-from .structs import clock_struct, contact_scratch_struct, contact_struct, facet_struct, history_struct
+from .structs import contact_structs
 
 __all__ = ["TUNNEL_LIMIT_RATIO", "facet_candidate_functions"]
 
@@ -33,10 +33,9 @@ TANGENT_PLANE_MARGIN = 0.5
 def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
     """Device functions in one precision of the displacements."""
     f64, vec3d = wp.float64, wp.vec3d
-    Contacts, Facets, History = contact_struct(False), facet_struct(dtype), history_struct()
-    ContactScratch, Clock = contact_scratch_struct(dtype), clock_struct()
+    Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)
     Masters, PairScratch = master_struct(dtype), pair_scratch_struct(dtype)
-    k, f = contact_point_functions(dtype, False), facet_projection_functions(dtype)
+    k, f = kinematics_functions(dtype), facet_projection_functions(dtype)
     interpolate, remaining_overlap = k.interpolate, k.remaining_overlap
     (
         surface_point, displacement_change, local_components, distance_outside, facet_centre, inverse_map, track_point,
@@ -103,7 +102,7 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
         offset = con.offset[out.contact]
         out.displacement = interpolate(facets, u, world, q, item)
         out.position = facets.X[q, item] + out.displacement
-        out.start_position = pair.start_position[world, point]
+        out.start_position = scr.start_position[world, point]
         overlap = remaining_overlap(con, his, world, out.contact, point, clock.time[world])
         out.overlap_limit = overlap_limit
         out.height_limit = overlap_limit + overlap + wp.abs(offset) + f64(1.0e-6) * wp.length(out.position)
@@ -112,9 +111,7 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
         if out.anchored:
             f = pair.anchor_facet[world, point] - 1
             xi = pair.anchor_xi[world, point]
-            change = displacement_change(
-                mas, pair.u_coefs, pair.director_u_coefs, pair.start_u_coefs, pair.start_director_u_coefs, world, f, xi
-            )
+            change = displacement_change(mas, pair.displacement, pair.start_displacement, world, f, xi)
             out.motion = out.displacement - scr.start_displacement[world, point] - change
             out.height_limit += f64(2.0) * wp.abs(xi[2])
         return out
@@ -131,13 +128,9 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
         if slave.anchored:
             f = pair.anchor_facet[world, slave.point] - 1
             corners = mas.corner_count[mas.facet_kind[f]]
-            found = track_point(
-                mas, pair.u_coefs, pair.director_u_coefs, world, f, pair.anchor_xi[world, slave.point], slave.motion
-            )
+            found = track_point(mas, pair.displacement, world, f, pair.anchor_xi[world, slave.point], slave.motion)
             if found[3] == f64(0.0):
-                found = inverse_map(
-                    mas, pair.u_coefs, pair.director_u_coefs, world, f, slave.position, facet_centre(corners)
-                )
+                found = inverse_map(mas, pair.displacement, world, f, slave.position, facet_centre(corners))
             xi = vec3d(found[0], found[1], found[2])
             o = distance_outside(corners, xi)
             if found[3] != f64(0.0) and (
@@ -163,7 +156,7 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
         if g0 <= f64(0.0) or g1 >= -deep:
             return False
         y = slave.position - (g1 / (g1 - g0)) * position_change
-        there = inverse_map(mas, pair.u_coefs, pair.director_u_coefs, world, f, y, m)
+        there = inverse_map(mas, pair.displacement, world, f, y, m)
         xi = vec3d(there[0], there[1], there[2])
         return there[3] != f64(0.0) and distance_outside(mas.corner_count[kind], xi) == f64(0.0)
 
@@ -189,23 +182,21 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
     def in_front(mas: Masters, pair: PairScratch, slave: SlavePoint, f: int) -> bool:
         """True if a point is above a facet by more than `height_limit` and within its sides."""
         corners = mas.corner_count[mas.facet_kind[f]]
-        found = inverse_map(
-            mas, pair.u_coefs, pair.director_u_coefs, slave.world, f, slave.position, facet_centre(corners)
-        )
+        found = inverse_map(mas, pair.displacement, slave.world, f, slave.position, facet_centre(corners))
         within = distance_outside(corners, vec3d(found[0], found[1], found[2])) == f64(0.0)
         return found[3] != f64(0.0) and within and found[2] > slave.height_limit
 
     @wp.func
-    def inward_normal(facets: Facets, pair: PairScratch, slave: SlavePoint, corners: wp.vec3i) -> vec3d:
+    def inward_normal(facets: Facets, scr: ContactScratch, slave: SlavePoint, corners: wp.vec3i) -> vec3d:
         """Inward normal of a slave facet at the start of the attempt; 0 if undefined."""
         if corners[0] < 0:
             return vec3d()
         point = facets.first_point + slave.slave_facet * facets.point_count
-        x = pair.start_position[slave.world, point + corners[0]]
+        x = scr.start_position[slave.world, point + corners[0]]
         return wp.normalize(
             wp.cross(
-                pair.start_position[slave.world, point + corners[2]] - x,
-                pair.start_position[slave.world, point + corners[1]] - x,
+                scr.start_position[slave.world, point + corners[2]] - x,
+                scr.start_position[slave.world, point + corners[1]] - x,
             )
         )
 
@@ -229,9 +220,7 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
             return False
         if distance_outside(mas.corner_count[kind], xi) > edge_margin(mas, f, xi):
             return False
-        found = inverse_map(
-            mas, pair.start_u_coefs, pair.start_director_u_coefs, world, f, pair.start_position[world, slave.point], xi
-        )
+        found = inverse_map(mas, pair.start_displacement, world, f, scr.start_position[world, slave.point], xi)
         return found[3] == f64(0.0) or distance_outside(
             mas.corner_count[kind], vec3d(found[0], found[1], found[2])
         ) > f64(0.0)
@@ -243,7 +232,7 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
         """Rank of a facet for a point, -1: rejected by depth, by the previous facet, or by the side at the start of the
         attempt. Higher for facets that face the slave's; among others, for one that the point reached from beside."""
         world = slave.world
-        s = surface_point(mas, pair.u_coefs, pair.director_u_coefs, world, f, xi)
+        s = surface_point(mas, pair.displacement, world, f, xi)
         n = unit_normal(s)
         cosine = wp.dot(n, slave.facing_normal)
         gap = xi[2] * wp.dot(n, s.director)
@@ -257,9 +246,7 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
         if slave.overlap_limit > f64(0.0):
             rank = 0
         else:
-            projection = surface_point(
-                mas, pair.start_u_coefs, pair.start_director_u_coefs, world, f, vec3d(xi[0], xi[1], f64(0.0))
-            )
+            projection = surface_point(mas, pair.start_displacement, world, f, vec3d(xi[0], xi[1], f64(0.0)))
             before = wp.dot(slave.start_position - projection.position, unit_normal(projection))
             if before < -slave.outside_depth:
                 if rank == 0 or not entered_sideways(mas, scr, pair, slave, f, xi, before):
@@ -288,9 +275,7 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
         """The better of a candidate and another facet for a point."""
         out = candidate
         corners = mas.corner_count[mas.facet_kind[f]]
-        found = inverse_map(
-            mas, pair.u_coefs, pair.director_u_coefs, slave.world, f, slave.position, facet_centre(corners)
-        )
+        found = inverse_map(mas, pair.displacement, slave.world, f, slave.position, facet_centre(corners))
         xi = vec3d(found[0], found[1], found[2])
         beyond = distance_outside(corners, xi)
         slack = f64(0.0)
@@ -339,7 +324,7 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
         if slave.anchored:
             f = pair.anchor_facet[world, slave.point] - 1
             slave.facing_normal = unit_normal(
-                surface_point(mas, pair.u_coefs, pair.director_u_coefs, world, f, pair.anchor_xi[world, slave.point])
+                surface_point(mas, pair.displacement, world, f, pair.anchor_xi[world, slave.point])
             )
             depth = scr.start_depth[world, slave.point] - wp.dot(slave.motion, slave.facing_normal)
             out.passed_through = depth > f64(TUNNEL_LIMIT_RATIO) * mas.depth_limit[f]
@@ -354,7 +339,7 @@ def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
             if is_far(mas, pair, slave, f):
                 continue
             if free and wp.length_sq(slave.facing_normal) == f64(0.0):
-                slave.facing_normal = inward_normal(facets, pair, slave, corners)
+                slave.facing_normal = inward_normal(facets, scr, slave, corners)
             out = better_candidate(mas, scr, pair, slave, f, out)
             if free and passed_through_facet(mas, pair, slave, f):
                 out.passed_through = True

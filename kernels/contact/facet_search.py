@@ -10,14 +10,14 @@ import types as _types
 import warp as wp
 
 from ..common.types import SHORT_UNROLL, kernel_module, kernel_set, precision
-from .assembly import MIN_APPROACH_SPEED
 from .broad_phase import BOX_MARGIN, broad_phase_kernels
+from .collider_kinematics import MIN_APPROACH_SPEED
 from .facet_candidates import TUNNEL_LIMIT_RATIO, facet_candidate_functions
 from .facet_structs import master_struct, pair_history_struct, pair_scratch_struct
-from .laws import PAPER
-from .point import contact_point_functions
+from .kinematics import kinematics_functions
+from .law import FIXED_SPRING
 from .projection import OUTSIDE_TOLERANCE, facet_projection_functions
-from .structs import clock_struct, contact_scratch_struct, contact_struct, facet_struct, history_struct
+from .structs import contact_structs
 
 __all__ = ["BOX_MARGIN", "PENETRATED", "facet_search_kernels"]
 
@@ -31,12 +31,11 @@ def facet_search_kernels(dtype: str) -> _types.SimpleNamespace:
     p = precision(dtype)
     vec3 = p.vec3
     f64, vec3d = wp.float64, wp.vec3d
-    Contacts, Facets, History = contact_struct(False), facet_struct(dtype), history_struct()
-    ContactScratch, Clock = contact_scratch_struct(dtype), clock_struct()
+    Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)
     Masters, PairHistory, PairScratch = master_struct(dtype), pair_history_struct(), pair_scratch_struct(dtype)
-    k, f = contact_point_functions(dtype, False), facet_projection_functions(dtype)
+    k, f = kinematics_functions(dtype), facet_projection_functions(dtype)
     interpolate, activation_gap = k.interpolate, k.activation_gap
-    surface_point, polynomial_value, displacement_change = f.surface_point, f.polynomial_value, f.displacement_change
+    surface_point, facet_value, displacement_change = f.surface_point, f.facet_value, f.displacement_change
     distance_outside, inverse_map, project_on_facet = f.distance_outside, f.inverse_map, f.project_on_facet
     FacetPoint, boxes, candidates = f.FacetPoint, broad_phase_kernels(dtype), facet_candidate_functions(dtype)
     round_down, round_up, contains = boxes.round_down, boxes.round_up, boxes.contains
@@ -52,9 +51,7 @@ def facet_search_kernels(dtype: str) -> _types.SimpleNamespace:
         """Approach speed of a point towards a facet at the start of the attempt, m/s."""
         projection = vec3d(xi[0], xi[1], f64(0.0))
         own = interpolate(facets, v, slave.world, slave.number_in_facet, slave.slave_facet)
-        return wp.dot(
-            n, polynomial_value(mas, pair.start_v_coefs, pair.start_v_coefs, slave.world, f, projection) - own
-        )
+        return wp.dot(n, facet_value(mas, pair.start_velocity, slave.world, f, projection) - own)
 
     @wp.func
     def set_anchor(
@@ -65,9 +62,7 @@ def facet_search_kernels(dtype: str) -> _types.SimpleNamespace:
         start."""
         world = slave.world
         point = slave.point
-        found = inverse_map(
-            mas, pair.start_u_coefs, pair.start_director_u_coefs, world, f, pair.start_position[world, point], start
-        )
+        found = inverse_map(mas, pair.start_displacement, world, f, scr.start_position[world, point], start)
         xi = vec3d(found[0], found[1], found[2])
         in_contact = his.speed[world, point] > f64(0.0)
         if found[3] == f64(0.0):
@@ -76,7 +71,7 @@ def facet_search_kernels(dtype: str) -> _types.SimpleNamespace:
             xi = start
         if in_contact and distance_outside(mas.corner_count[mas.facet_kind[f]], xi) > f64(OUTSIDE_TOLERANCE):
             return  # it has left the surface
-        projection = project_on_facet(mas, pair.start_u_coefs, pair.start_director_u_coefs, world, f, xi)
+        projection = project_on_facet(mas, pair.start_displacement, world, f, xi)
         pair.anchor_facet[world, point] = f + 1
         pair.anchor_xi[world, point] = xi
         pair.anchor_gap[world, point] = wp.vec2d(projection.gap_slope, projection.gap_offset)
@@ -88,35 +83,24 @@ def facet_search_kernels(dtype: str) -> _types.SimpleNamespace:
             speed = wp.max(speed, approach_speed(mas, facets, pair, v_n, slave, f, xi, projection.normal))
         scr.approach_speed[world, point] = speed
 
-    @wp.kernel(module=module)
-    def begin_points(
+    @wp.func
+    def begin_point(
         con: Contacts, mas: Masters, facets: Facets, his: History, pair_his: PairHistory, clock: Clock,
-        u_n: wp.array2d(dtype=vec3), v_n: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), scr: ContactScratch,
-        pair: PairScratch,
+        scr: ContactScratch, pair: PairScratch, u_n: wp.array2d(dtype=vec3), v_n: wp.array2d(dtype=vec3),
+        slave: SlavePoint,
     ):  # fmt: skip
-        """Start positions of the points; depth and approach speed of those in contact."""
-        world, item, q = wp.tid()
-        if active[world] == 0:
-            return
-        if q == 0 and item == 0 and facets.first_row == 0:
-            scr.passed_point[world] = 0
-            scr.limit_updates[world] = 0
-            if clock.substep_index[world] == 0:
-                scr.elapsed_time[world] = f64(0.0)
-        if facets.area_fraction[q, item] == f64(0.0):
-            return
-        c = facets.contact[item]
-        point = facets.first_point + item * facets.point_count + q
-        shift = interpolate(facets, u_n, world, q, item)
-        x = facets.X[q, item] + shift
-        pair.start_position[world, point] = x
+        """Start position of a point; depth and approach speed of one in contact."""
+        world = slave.world
+        point = slave.point
+        c = slave.contact
+        shift = interpolate(facets, u_n, world, slave.number_in_facet, slave.slave_facet)
+        scr.start_position[world, point] = facets.X[slave.number_in_facet, slave.slave_facet] + shift
         scr.start_displacement[world, point] = shift
         scr.start_depth[world, point] = f64(-1.0e30)
         scr.approach_speed[world, point] = f64(MIN_APPROACH_SPEED)
         pair.anchor_facet[world, point] = 0
         scr.activation_gap[world, point] = activation_gap(con, his, world, c, point, clock.time[world], f64(0.0))
         if his.speed[world, point] > f64(0.0):
-            slave = slave_point(facets, world, item, q)
             f = pair_his.facet[world, point] - 1
             set_anchor(mas, facets, his, clock, scr, pair, v_n, slave, f, pair_his.xi[world, point])
             if pair.anchor_facet[world, point] > 0:
@@ -129,7 +113,7 @@ def facet_search_kernels(dtype: str) -> _types.SimpleNamespace:
     @wp.kernel(module=module)
     def query_boxes(
         con: Contacts, mas: Masters, facets: Facets, his: History, u: wp.array2d(dtype=vec3d),
-        active: wp.array(dtype=wp.int32), search_distance: f64, pair: PairScratch,
+        active: wp.array(dtype=wp.int32), search_distance: f64, scr: ContactScratch, pair: PairScratch,
     ):  # fmt: skip
         """Flag slave facets with a master facet's box nearby; for the others store the box without master facets."""
         world, item = wp.tid()
@@ -141,7 +125,7 @@ def facet_search_kernels(dtype: str) -> _types.SimpleNamespace:
         inside = f64(0.0)
         for q in range(facets.point_count):
             x = facets.X[q, item] + interpolate(facets, u, world, q, item)
-            y = pair.start_position[world, facets.first_point + item * facets.point_count + q]
+            y = scr.start_position[world, facets.first_point + item * facets.point_count + q]
             if facets.area_fraction[q, item] > f64(0.0):
                 low = wp.min(low, wp.min(x, y))
                 high = wp.max(high, wp.max(x, y))
@@ -190,7 +174,7 @@ def facet_search_kernels(dtype: str) -> _types.SimpleNamespace:
         world = slave.world
         point = slave.point
         c = slave.contact
-        projection = project_on_facet(mas, pair.u_coefs, pair.director_u_coefs, world, f, xi)
+        projection = project_on_facet(mas, pair.displacement, world, f, xi)
         now = activation_gap(con, his, world, c, point, clock.new_time[world], f64(0.0))
         pair.facet[world, point] = f
         pair.xi[world, point] = xi
@@ -206,10 +190,8 @@ def facet_search_kernels(dtype: str) -> _types.SimpleNamespace:
             from0 = pair.anchor_xi[world, point]
             motion -= displacement_change(
                 mas,
-                pair.u_coefs,
-                pair.director_u_coefs,
-                pair.start_u_coefs,
-                pair.start_director_u_coefs,
+                pair.displacement,
+                pair.start_displacement,
                 world,
                 first,
                 from0,
@@ -226,20 +208,15 @@ def facet_search_kernels(dtype: str) -> _types.SimpleNamespace:
             pair.initial_depth[world, point] = scr.start_depth[world, point]
             if his.speed[world, point] > f64(0.0):
                 spring = his.spring[world, point]
-                if con.law[c] != PAPER:
-                    spring = (
-                        facet_frame(surface_point(mas, pair.u_coefs, pair.director_u_coefs, world, first, from0))
-                        * spring
-                    )
+                if con.law[c] & FIXED_SPRING == 0:
+                    spring = facet_frame(surface_point(mas, pair.displacement, world, first, from0)) * spring
         else:
-            motion -= displacement_change(
-                mas, pair.u_coefs, pair.director_u_coefs, pair.start_u_coefs, pair.start_director_u_coefs, world, f, xi
-            )
+            motion -= displacement_change(mas, pair.displacement, pair.start_displacement, world, f, xi)
             pair.initial_depth[world, point] = (
                 pair.depth[world, point] + wp.dot(projection.normal, motion) - (now - scr.activation_gap[world, point])
             )
         pair.relative_motion[world, point] = motion
-        pair.trial_displacement[world, point] = spring + motion
+        pair.spring[world, point] = spring
 
     @wp.kernel(module=module)
     def find_facets(

@@ -6,7 +6,14 @@ import warp as wp
 
 from ..common.types import precision
 
-__all__ = ["master_struct", "pair_history_struct", "pair_scratch_struct", "point_list_struct"]
+__all__ = [
+    "facet_field_struct",
+    "facet_side_struct",
+    "master_struct",
+    "pair_history_struct",
+    "pair_scratch_struct",
+    "point_list_struct",
+]
 
 
 @functools.cache
@@ -64,19 +71,30 @@ def pair_history_struct():
 
 
 @functools.cache
+def facet_field_struct():
+    """Displacements on master facets as polynomials, [world, control], m: monomial m of facet f is control
+    `max_monomials f + m`."""
+
+    @wp.struct
+    class FacetField:
+        value: wp.array2d(dtype=wp.vec3d)  # sum_i shape_mi u_i
+        director: wp.array2d(dtype=wp.vec3d)  # sum_i director_shape_mi u_i
+
+    return FacetField
+
+
+@functools.cache
 def pair_scratch_struct(dtype: str):
-    """Pair quantities of an attempt; [world, control]: monomial m of facet f is control `max_monomials f + m`."""
+    """Pair quantities of an attempt."""
     p = precision(dtype)
     T, vec3, vec2, sym = p.T, p.vec3, p.vec2, p.sym
     mat43 = wp.types.matrix(shape=(4, 3), dtype=wp.float64)
 
     @wp.struct
     class PairScratch:
-        u_coefs: wp.array2d(dtype=wp.vec3d)  # [world, control] sum_i shape_mi u_i at the iterate, m
-        director_u_coefs: wp.array2d(dtype=wp.vec3d)  # sum_i director_shape_mi u_i
-        start_u_coefs: wp.array2d(dtype=wp.vec3d)  # both at the start of the attempt
-        start_director_u_coefs: wp.array2d(dtype=wp.vec3d)
-        start_v_coefs: wp.array2d(dtype=wp.vec3d)  # sum_i shape_mi v_i at the start of the attempt, m/s
+        displacement: facet_field_struct()  # at the iterate
+        start_displacement: facet_field_struct()  # at the start of the attempt
+        start_velocity: wp.array2d(dtype=wp.vec3d)  # [world, control] sum_i shape_mi v_i then, m/s
         facet_centre: wp.array2d(dtype=mat43)  # [world, facet] centre and derivatives, rows as of a FacetPoint
         bulge: wp.array2d(dtype=wp.float64)  # [world, facet] largest height above the tangent plane at the centre, m
         start_facet_centre: wp.array2d(dtype=mat43)  # at the start of the attempt
@@ -90,7 +108,6 @@ def pair_scratch_struct(dtype: str):
         empty_box_lower: wp.array2d(dtype=wp.vec3)  # box without master facets, valid for refit `empty_box_refit`
         empty_box_upper: wp.array2d(dtype=wp.vec3)
         empty_box_refit: wp.array2d(dtype=wp.int32)
-        start_position: wp.array2d(dtype=wp.vec3d)  # [world, point] position at the start of the attempt, m
         deepest_contact: wp.array2d(
             dtype=wp.float64
         )  # [world, body] largest depth of its points in contact at the start, m
@@ -104,7 +121,7 @@ def pair_scratch_struct(dtype: str):
         initial_depth: wp.array2d(dtype=wp.float64)  # depth at the start of the attempt, m
         normal: wp.array2d(dtype=wp.vec3d)  # unit normal of the facet there; -d(depth)/d(position)
         relative_motion: wp.array2d(dtype=wp.vec3d)  # in the step, relative to the master's material, m
-        trial_displacement: wp.array2d(dtype=wp.vec3d)  # relative motion plus the stored elastic slip, m
+        spring: wp.array2d(dtype=wp.vec3d)  # stored elastic slip, turned with the facet, m
         shape_values: wp.array3d(dtype=T)  # [world, point, local] shape values of the master's slots at the projection
         shape_gradient: wp.array3d(dtype=vec2)  # their derivatives by the facet coordinates
         geometric_tangent: wp.array3d(
@@ -116,7 +133,7 @@ def pair_scratch_struct(dtype: str):
         )  # [world, point] change of the facet's inclination by the direction of a product
         friction_shape: wp.array3d(dtype=T)  # shape values of friction, frozen with the friction limit
         frozen_motion: wp.array2d(dtype=wp.vec3d)
-        frozen_trial_displacement: wp.array2d(dtype=wp.vec3d)  # `trial_displacement` at freezing, m
+        frozen_spring: wp.array2d(dtype=wp.vec3d)  # `spring` at freezing, m
         frozen_displacement: wp.array2d(
             dtype=wp.vec3d
         )  # relative displacement by the frozen shape values at freezing, m
@@ -133,6 +150,19 @@ def pair_scratch_struct(dtype: str):
         list_point: wp.array2d(dtype=wp.int32)  # [world, point]
 
     return PairScratch
+
+
+@functools.cache
+def facet_side_struct(dtype: str):
+    """Facets of bodies as the other side."""
+
+    @wp.struct
+    class FacetSide:
+        masters: master_struct(dtype)
+        history: pair_history_struct()
+        scratch: pair_scratch_struct(dtype)
+
+    return FacetSide
 
 
 @functools.cache

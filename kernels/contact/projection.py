@@ -1,7 +1,7 @@
 """Facet coordinates of a point by Newton's method, and its projection on a master facet.
 
 Positions on a facet are polynomials of xi = (a, b, z), see `master_struct`: a, b on the unit triangle or square, z in m
-along the director. C, D: monomial coefficients [world, control] of the displacement and of the director's displacement.
+along the director. U: displacements on the facets, see `facet_field_struct`.
 """
 
 import functools
@@ -10,7 +10,7 @@ import types as _types
 import warp as wp
 
 from ..common.types import kernel_set
-from .facet_structs import master_struct
+from .facet_structs import facet_field_struct, master_struct
 
 __all__ = ["INSIDE_TOLERANCE", "MAX_OVERHANG", "OUTSIDE_TOLERANCE", "facet_projection_functions"]
 
@@ -33,7 +33,7 @@ steps, since a force that ends at an iterate has no potential."""
 @functools.cache
 def facet_projection_functions(dtype: str) -> _types.SimpleNamespace:
     """Device functions in one precision of the displacements; evaluated in float64."""
-    Masters = master_struct(dtype)
+    Masters, FacetField = master_struct(dtype), facet_field_struct()
     f64, vec3d = wp.float64, wp.vec3d
 
     @wp.struct
@@ -76,7 +76,7 @@ def facet_projection_functions(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def surface_point(
-        mas: Masters, C: wp.array2d(dtype=vec3d), D: wp.array2d(dtype=vec3d), world: int, f: int, xi: vec3d
+        mas: Masters, U: FacetField, world: int, f: int, xi: vec3d
     ) -> FacetPoint:  # fmt: skip
         """Position and derivatives at the coordinates `xi`."""
         out = FacetPoint()
@@ -86,8 +86,8 @@ def facet_projection_functions(dtype: str) -> _types.SimpleNamespace:
             j = mas.exponents[kind, m][1]
             p = power(xi[0], i)
             q = power(xi[1], j)
-            rise = mas.reference_director_coefficients[m, f] + D[world, mas.max_monomials * f + m]
-            g = mas.reference_position_coefficients[m, f] + C[world, mas.max_monomials * f + m] + xi[2] * rise
+            rise = mas.reference_director_coefficients[m, f] + U.director[world, mas.max_monomials * f + m]
+            g = mas.reference_position_coefficients[m, f] + U.value[world, mas.max_monomials * f + m] + xi[2] * rise
             out.position += (p * q) * g
             out.director += (p * q) * rise
             if i > 0:
@@ -97,21 +97,17 @@ def facet_projection_functions(dtype: str) -> _types.SimpleNamespace:
         return out
 
     @wp.func
-    def polynomial_value(
-        mas: Masters, C: wp.array2d(dtype=vec3d), D: wp.array2d(dtype=vec3d), world: int, f: int, xi: vec3d
-    ) -> vec3d:  # fmt: skip
-        """Polynomial with coefficients C + z D alone, e.g. the displacement."""
+    def facet_value(mas: Masters, C: wp.array2d(dtype=vec3d), world: int, f: int, xi: vec3d) -> vec3d:
+        """Polynomial with coefficients C at the projection of a point on a facet, e.g. the velocity."""
         out = vec3d()
         kind = mas.facet_kind[f]
         for m in range(mas.monomial_count[kind]):
-            p = monomial(mas, kind, m, xi)
-            out += p * (C[world, mas.max_monomials * f + m] + xi[2] * D[world, mas.max_monomials * f + m])
+            out += monomial(mas, kind, m, xi) * C[world, mas.max_monomials * f + m]
         return out
 
     @wp.func
     def displacement_change(
-        mas: Masters, C: wp.array2d(dtype=vec3d), D: wp.array2d(dtype=vec3d), C0: wp.array2d(dtype=vec3d),
-        D0: wp.array2d(dtype=vec3d), world: int, f: int, xi: vec3d,
+        mas: Masters, U: FacetField, U0: FacetField, world: int, f: int, xi: vec3d,
     ) -> vec3d:  # fmt: skip
         """Displacement at given coordinates by C and D minus that by C0 and D0."""
         out = vec3d()
@@ -119,12 +115,14 @@ def facet_projection_functions(dtype: str) -> _types.SimpleNamespace:
         for m in range(mas.monomial_count[kind]):
             p = monomial(mas, kind, m, xi)
             i = mas.max_monomials * f + m
-            out += p * ((C[world, i] - C0[world, i]) + xi[2] * (D[world, i] - D0[world, i]))
+            out += p * (
+                (U.value[world, i] - U0.value[world, i]) + xi[2] * (U.director[world, i] - U0.director[world, i])
+            )
         return out
 
     @wp.func
     def position_change(
-        mas: Masters, C: wp.array2d(dtype=vec3d), D: wp.array2d(dtype=vec3d), world: int, f: int, old: vec3d, new: vec3d
+        mas: Masters, U: FacetField, world: int, f: int, old: vec3d, new: vec3d
     ) -> vec3d:  # fmt: skip
         """x(new) - x(old) with round-off relative to its own size: a sum of differences of powers."""
         out = vec3d()
@@ -135,8 +133,10 @@ def facet_projection_functions(dtype: str) -> _types.SimpleNamespace:
             j = mas.exponents[kind, m][1]
             p = step[0] * power_quotient(old[0], new[0], i) * power(new[1], j)
             p += power(old[0], i) * step[1] * power_quotient(old[1], new[1], j)
-            rise = mas.reference_director_coefficients[m, f] + D[world, mas.max_monomials * f + m]
-            out += p * (mas.reference_position_coefficients[m, f] + C[world, mas.max_monomials * f + m] + old[2] * rise)
+            rise = mas.reference_director_coefficients[m, f] + U.director[world, mas.max_monomials * f + m]
+            out += p * (
+                mas.reference_position_coefficients[m, f] + U.value[world, mas.max_monomials * f + m] + old[2] * rise
+            )
             out += (power(new[0], i) * power(new[1], j) * step[2]) * rise
         return out
 
@@ -171,15 +171,21 @@ def facet_projection_functions(dtype: str) -> _types.SimpleNamespace:
         return vec3d(part, part, f64(0.0))
 
     @wp.func
-    def inverse_map(
-        mas: Masters, C: wp.array2d(dtype=vec3d), D: wp.array2d(dtype=vec3d), world: int, f: int, x: vec3d, first: vec3d
+    def newton_coordinates(
+        mas: Masters, U: FacetField, world: int, f: int, first: vec3d, target: vec3d, moved: bool
     ) -> wp.vec4d:  # fmt: skip
-        """Coordinates of x by Newton's method from `first`, and 1 if converged."""
+        """Coordinates of a point by Newton's method from `first`, and 1 if converged; `target`: its position, m, or
+        with `moved` its motion from `first`, whose change then has a round-off relative to the motion."""
         xi = first
         last = f64(1.0e300)
         for _ in range(MAX_NEWTON_STEPS):
-            t = surface_point(mas, C, D, world, f, xi)
-            d = local_components(t, x - t.position)
+            t = surface_point(mas, U, world, f, xi)
+            r = target
+            if moved:
+                r -= position_change(mas, U, world, f, first, xi)
+            else:
+                r -= t.position
+            d = local_components(t, r)
             size = wp.max(wp.abs(d[0]), wp.abs(d[1]))
             if size > f64(0.5):
                 d = d * (f64(0.5) / size)
@@ -187,35 +193,23 @@ def facet_projection_functions(dtype: str) -> _types.SimpleNamespace:
             if distance_outside(mas.corner_count[mas.facet_kind[f]], xi) > f64(1.0):
                 return wp.vec4d(xi[0], xi[1], xi[2], f64(0.0))
             size = wp.max(size, wp.abs(d[2]) / mas.side_length[f])
-            if size < f64(QUADRATIC_STEP):
+            least = f64(QUADRATIC_STEP)
+            if moved:
+                least = wp.max(least * wp.length(xi - first), f64(1.0e-15))
+            if size < least:
                 return wp.vec4d(xi[0], xi[1], xi[2], f64(1.0))
             last = size
         return wp.vec4d(xi[0], xi[1], xi[2], wp.where(last < f64(1.0e-9), f64(1.0), f64(0.0)))
 
     @wp.func
-    def track_point(
-        mas: Masters, C: wp.array2d(dtype=vec3d), D: wp.array2d(dtype=vec3d), world: int, f: int, first: vec3d,
-        motion: vec3d,
-    ) -> wp.vec4d:  # fmt: skip
-        """Coordinates of a point that was at `first` and has moved by `motion`, and 1 if converged; round-off of the
-        change is relative to the motion."""
-        xi = first
-        last = f64(1.0e300)
-        for _ in range(MAX_NEWTON_STEPS):
-            t = surface_point(mas, C, D, world, f, xi)
-            d = local_components(t, motion - position_change(mas, C, D, world, f, first, xi))
-            size = wp.max(wp.abs(d[0]), wp.abs(d[1]))
-            if size > f64(0.5):
-                d = d * (f64(0.5) / size)
-            xi += d
-            if distance_outside(mas.corner_count[mas.facet_kind[f]], xi) > f64(1.0):
-                return wp.vec4d(xi[0], xi[1], xi[2], f64(0.0))
-            change = wp.length(xi - first)
-            size = wp.max(size, wp.abs(d[2]) / mas.side_length[f])
-            if size <= f64(QUADRATIC_STEP) * change or size < f64(1.0e-15):
-                return wp.vec4d(xi[0], xi[1], xi[2], f64(1.0))
-            last = size
-        return wp.vec4d(xi[0], xi[1], xi[2], wp.where(last < f64(1.0e-9), f64(1.0), f64(0.0)))
+    def inverse_map(mas: Masters, U: FacetField, world: int, f: int, x: vec3d, first: vec3d) -> wp.vec4d:
+        """Coordinates of x, and 1 if converged."""
+        return newton_coordinates(mas, U, world, f, first, x, False)
+
+    @wp.func
+    def track_point(mas: Masters, U: FacetField, world: int, f: int, first: vec3d, motion: vec3d) -> wp.vec4d:
+        """Coordinates of a point that was at `first` and has moved by `motion`, and 1 if converged."""
+        return newton_coordinates(mas, U, world, f, first, motion, True)
 
     @wp.func
     def unit_normal(t: FacetPoint) -> vec3d:
@@ -233,17 +227,17 @@ def facet_projection_functions(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def project_on_facet(
-        mas: Masters, C: wp.array2d(dtype=vec3d), D: wp.array2d(dtype=vec3d), world: int, f: int, xi: vec3d
+        mas: Masters, U: FacetField, world: int, f: int, xi: vec3d
     ) -> Projection:  # fmt: skip
         """Orthogonal projection of a position."""
         out = Projection()
         base = vec3d(xi[0], xi[1], f64(0.0))
-        off = surface_point(mas, C, D, world, f, base).director
+        off = surface_point(mas, U, world, f, base).director
         out.xi = base
         for _ in range(MAX_PROJECTION_STEPS):
-            t = surface_point(mas, C, D, world, f, out.xi)
+            t = surface_point(mas, U, world, f, out.xi)
             out.normal = unit_normal(t)
-            lie = position_change(mas, C, D, world, f, out.xi, base)
+            lie = position_change(mas, U, world, f, out.xi, base)
             out.gap_offset = wp.dot(out.normal, lie)
             lie += xi[2] * off
             t.director = out.normal
@@ -257,7 +251,7 @@ def facet_projection_functions(dtype: str) -> _types.SimpleNamespace:
 
     @wp.func
     def second_derivatives(
-        mas: Masters, C: wp.array2d(dtype=vec3d), world: int, f: int, xi: vec3d, n: vec3d
+        mas: Masters, U: FacetField, world: int, f: int, xi: vec3d, n: vec3d
     ) -> vec3d:  # fmt: skip
         """Second derivatives of a facet along n: (11, 22, 12)."""
         out = vec3d()
@@ -265,7 +259,7 @@ def facet_projection_functions(dtype: str) -> _types.SimpleNamespace:
         for m in range(mas.monomial_count[kind]):
             i = mas.exponents[kind, m][0]
             j = mas.exponents[kind, m][1]
-            h = wp.dot(n, mas.reference_position_coefficients[m, f] + C[world, mas.max_monomials * f + m])
+            h = wp.dot(n, mas.reference_position_coefficients[m, f] + U.value[world, mas.max_monomials * f + m])
             if i > 1:
                 out[0] = out[0] + f64(i * (i - 1)) * power(xi[0], i - 2) * power(xi[1], j) * h
             if j > 1:

@@ -1,6 +1,7 @@
-"""Structs of the contact kernels: contacts and colliders, facets with their points, history, quantities of a step."""
+"""Structs of the contact kernels: contacts, facets with their points, history, quantities of a step; colliders."""
 
 import functools
+from typing import Any, NamedTuple
 
 import warp as wp
 
@@ -9,18 +10,29 @@ from .collider_mesh import mesh_struct
 
 __all__ = [
     "AREA_ROW",
+    "FORCE_ONLY",
+    "FREE",
+    "INACTIVE",
+    "IN_REACH",
     "MOMENT_ROW",
     "NORMAL_ROW",
+    "PASSED",
     "PENETRATION_ROW",
     "RECORD_NAMES",
+    "SLIP_FLAG",
     "SLIP_ROW",
     "STICK_ROW",
     "STORED_ROW",
+    "TURNED",
+    "WITH_STIFFNESS",
     "clock_struct",
+    "collider_struct",
     "contact_scratch_struct",
     "contact_struct",
+    "contact_structs",
     "facet_struct",
     "history_struct",
+    "point_contact_struct",
     "world_value",
 ]  # fmt: skip
 
@@ -31,6 +43,14 @@ MOMENT_ROW, NORMAL_ROW, SLIP_ROW, AREA_ROW, STICK_ROW, STORED_ROW, PENETRATION_R
     RECORD_NAMES.index(name) for name in ("moment_x", "normal_force", "slip", "area", "stick", "stored", "penetration")
 )
 
+INACTIVE, FORCE_ONLY, WITH_STIFFNESS = 0, 1, 2
+"""Activity of a point: no force; a force without tangent; a force with tangent."""
+SLIP_FLAG = 1 << 30
+"""Bit of a point's contact state: slipping; the bits below are the side of a collider + 1, or 1 on a facet."""
+FREE, IN_REACH, PASSED, TURNED = range(4)
+"""State of a point: without another side; with one, at a depth of either sign; passed through it; touched by one that
+turned too far in the step. Iterates with the last two are refused."""
+
 
 @wp.func
 def world_value(table: wp.array2d(dtype=wp.float64), world: int, contact: int) -> wp.float64:
@@ -39,12 +59,12 @@ def world_value(table: wp.array2d(dtype=wp.float64), world: int, contact: int) -
 
 
 @functools.cache
-def contact_struct(meshes: bool):
-    """Contacts [contact] and colliders [collider]; `meshes`: with the triangles of mesh colliders."""
+def contact_struct():
+    """Contacts, [contact], and the constants of their laws."""
 
+    @wp.struct
     class Contacts:
-        collider: wp.array(dtype=wp.int32)  # [contact] index of its collider
-        law: wp.array(dtype=wp.int32)  # DEFAULT, PAPER or SMOOTH
+        law: wp.array(dtype=wp.int32)  # number and traits of its law, see `law_code`
         single_point: wp.array(dtype=wp.int32)  # single contact at the deepest point
         is_explicit: wp.array(dtype=wp.int32)  # explicit force of the last state
         first_point: wp.array(dtype=wp.int32)  # [contact + 1] index of its first point
@@ -54,9 +74,9 @@ def contact_struct(meshes: bool):
         tangential_stiffness: wp.array2d(dtype=wp.float64)  # k_t, N/m; if single_point over sqrt(delta)
         normal_damping: wp.array2d(dtype=wp.float64)  # gamma_n over -beta; if single_point over delta^(1/4)
         effective_mass: wp.array2d(dtype=wp.float64)  # m_eff, kg
-        damping_ramp: wp.array(dtype=wp.float64)  # depth over which the damping grows, law PAPER, m
-        force_eps: wp.array(dtype=wp.float64)  # smoothing of the normal force, law SMOOTH, N
-        speed_eps: wp.array(dtype=wp.float64)  # smoothing of friction, law SMOOTH, m/s
+        damping_ramp: wp.array(dtype=wp.float64)  # depth over which the damping grows, law "paper", m
+        force_eps: wp.array(dtype=wp.float64)  # smoothing of the normal force, law "smooth", N
+        speed_eps: wp.array(dtype=wp.float64)  # smoothing of friction, law "smooth", m/s
         offset: wp.array(dtype=wp.float64)  # gap at which contact begins, m
         overlap_decay_time: wp.array(dtype=wp.float64)  # s, over which a stored overlap vanishes
         mu: wp.array2d(dtype=wp.float64)  # [world, contact]
@@ -64,19 +84,43 @@ def contact_struct(meshes: bool):
         damping: wp.array2d(dtype=wp.float64)  # d of the default law
         beta: wp.array2d(dtype=wp.float64)  # -beta of Eq. (75)
         scale: wp.array2d(dtype=wp.float64)  # factor on k_n and k_t
-        margin: wp.array2d(dtype=wp.float64)  # [world, collider] m, outward offset of its surface
-        collider_kind: wp.array(dtype=wp.int32)  # [collider] HALF_SPACE to CYLINDER, or MESH
-        collider_size: wp.array(dtype=wp.vec3d)  # see `contact_shapes` and `mesh_functions`, m
-        collider_center: wp.array(dtype=wp.vec3d)  # initial position, m
-        collider_axes: wp.array(dtype=wp.mat33d)  # initial axes as columns
-        translation_law: wp.array(dtype=wp.int32)  # time law of its displacement, -1: none
-        rotation_law: wp.array(dtype=wp.int32)  # time law of its angle, -1: none
-        rotation_anchor: wp.array(dtype=wp.vec3d)  # point on the axis of rotation, m
-        rotation_axis: wp.array(dtype=wp.vec3d)  # unit vector
 
-    if meshes:
-        Contacts.__annotations__["mesh"] = mesh_struct()
-    return wp.struct(Contacts)
+    return Contacts
+
+
+@functools.cache
+def point_contact_struct():
+    """The record of a point, between the geometry of the other side and the law."""
+
+    @wp.struct
+    class PointContact:
+        """A point of a surface against its other side at an iterate; forces are of the whole region.
+
+        A geometry (collider_kinematics.py, facet_kinematics.py) fills the first part, the law (friction.py) the second.
+        Weights of slots vary in number and lie in arrays: those of the point's own side in `Facets.shape` (moving
+        contact point: `ContactScratch.shape_values`), those of the other side in `PairScratch.shape_values` and
+        `friction_shape`; a collider has none. An edge or a vertex as the other side fills the same record, with its
+        nearest position and the weights of its slots; a moving shape gives its motion by `carried`; a dynamic part, or
+        the body of the point itself, has slots and weights as facets have.
+        """
+
+        state: wp.int32  # FREE, IN_REACH, PASSED or TURNED
+        feature: wp.int32  # facet of the other side; of a collider the side through which the point has entered, -1:
+        # any or none, -2: it passed through
+        position: wp.vec3d  # m
+        local_position: wp.vec3d  # in the collider's frame, m
+        normal: wp.vec3d  # outward unit normal of the other side; -d(depth)/d(position)
+        depth: wp.float64  # minus the gap beyond the activation gap, m
+        previous_depth: wp.float64  # at the start of the step, m; of a moving contact point, that of the one before
+        relative_motion: wp.vec3d  # in the step, relative to the other side's material, m
+        spring: wp.vec3d  # stored elastic slip, turned with the other side, m
+
+        normal_values: wp.vec4d  # normal force, its derivative, its potential, the magnitude of the potential's terms
+        friction_normal: wp.vec3d  # normal of the plane of friction
+        tangential_motion: wp.vec3d  # tangential part of `relative_motion`, m
+        trial_elastic_slip: wp.vec3d  # tangential part of `spring` plus `relative_motion`, m
+
+    return PointContact
 
 
 @functools.cache
@@ -110,15 +154,12 @@ def facet_struct(dtype: str):
 
 @functools.cache
 def history_struct():
-    """Contact history in the state: [world, point], of a lumped contact at its first point; [world, collider] of
-    colliders."""
+    """Contact history in the state: [world, point], of a lumped contact at its first point."""
 
     @wp.struct
     class History:
-        angle: wp.array2d(dtype=wp.float64)  # [world, collider] of its rotation, rad
-        previous_margin: wp.array2d(dtype=wp.float64)  # `Contacts.margin` of the last step, m
         spring: wp.array2d(dtype=wp.vec3d)  # elastic slip: displacement of the friction spring, in the collider's or
-        # facet's frame (law PAPER: world), m
+        # facet's frame (law "paper": world), m
         speed: wp.array2d(dtype=wp.float64)  # largest approach speed since contact began, m/s; 0: not in contact
         contact_state: wp.array2d(dtype=wp.int32)  # side + 1, plus SLIP_FLAG if slipping; see stored_side
         overlap: wp.array2d(dtype=wp.float64)  # initial overlap, m
@@ -127,8 +168,6 @@ def history_struct():
         previous_depth: wp.array2d(dtype=wp.float64)  # of moving contact points: depth at the end of the last step, m
         overlap_time: wp.array(dtype=wp.float64)  # [world] time at which overlaps were stored, s
         pose_time: wp.array(dtype=wp.float64)  # [world] time of the collider poses, s
-        position: wp.array2d(dtype=wp.vec3d)  # position of colliders, m
-        rotation: wp.array2d(dtype=wp.mat33d)
 
     return History
 
@@ -141,16 +180,11 @@ def contact_scratch_struct(dtype: str):
 
     @wp.struct
     class ContactScratch:
-        collider_position: wp.array2d(dtype=wp.vec3d)  # [world, collider] position at the end of the step, m
-        collider_rotation: wp.array2d(dtype=wp.mat33d)
-        collider_translation: wp.array2d(dtype=wp.vec3d)  # [world, collider] translation in the attempt, m
-        collider_rotation_change: wp.array2d(dtype=wp.mat33d)  # R - 1 of the rotation R in the attempt
-        collider_angle: wp.array2d(dtype=wp.float64)  # rotation angle, rad
         start_displacement: wp.array2d(dtype=wp.vec3d)  # [world, point] displacement at the start of the attempt, m
         activation_gap: wp.array2d(dtype=wp.float64)  # gap at which contact begins, at the start of the attempt, m
         start_position: wp.array2d(
             dtype=wp.vec3d
-        )  # [world, point] position at the start of the step in the collider's frame, m
+        )  # [world, point] position at the start of the attempt, m; in a collider's frame
         start_depth: wp.array2d(dtype=wp.float64)  # depth at the start of the step, m
         approach_speed: wp.array2d(dtype=wp.float64)  # approach speed of the damping, m/s
         frozen_friction: wp.array2d(dtype=wp.vec3d)  # friction limit, N, k_t, N/m, factor on the stored elastic slip;
@@ -194,6 +228,36 @@ def contact_scratch_struct(dtype: str):
 
 
 @functools.cache
+def collider_struct(meshes: bool):
+    """Colliders as the other side: shapes, poses in the state and in an attempt; `meshes`: with their triangles."""
+
+    class Colliders:
+        of_contact: wp.array(dtype=wp.int32)  # [contact] index of its collider
+        kind: wp.array(dtype=wp.int32)  # [collider] HALF_SPACE to CYLINDER, or MESH
+        size: wp.array(dtype=wp.vec3d)  # see `shape_functions` and `mesh_functions`, m
+        center: wp.array(dtype=wp.vec3d)  # initial position, m
+        axes: wp.array(dtype=wp.mat33d)  # initial axes as columns
+        translation_law: wp.array(dtype=wp.int32)  # time law of its displacement, -1: none
+        rotation_law: wp.array(dtype=wp.int32)  # time law of its angle, -1: none
+        rotation_anchor: wp.array(dtype=wp.vec3d)  # point on the axis of rotation, m
+        rotation_axis: wp.array(dtype=wp.vec3d)  # unit vector
+        margin: wp.array2d(dtype=wp.float64)  # [world, collider] outward offset of its surface, m
+        previous_position: wp.array2d(dtype=wp.vec3d)  # in the state: at the start of the step, m
+        previous_rotation: wp.array2d(dtype=wp.mat33d)
+        previous_angle: wp.array2d(dtype=wp.float64)  # rad
+        previous_margin: wp.array2d(dtype=wp.float64)  # m
+        position: wp.array2d(dtype=wp.vec3d)  # at the end of the attempt, m
+        rotation: wp.array2d(dtype=wp.mat33d)
+        angle: wp.array2d(dtype=wp.float64)  # rad
+        translation: wp.array2d(dtype=wp.vec3d)  # in the attempt, m
+        rotation_change: wp.array2d(dtype=wp.mat33d)  # R - 1 of the rotation R in the attempt
+
+    if meshes:
+        Colliders.__annotations__["mesh"] = mesh_struct()
+    return wp.struct(Colliders)
+
+
+@functools.cache
 def clock_struct():
     """Times of the current substep, [world]."""
 
@@ -206,3 +270,21 @@ def clock_struct():
         is_static: wp.int32  # 1 in statics: no rates
 
     return Clock
+
+
+class ContactStructs(NamedTuple):
+    """Structs of all kernels of contact."""
+
+    Contacts: Any
+    Facets: Any
+    History: Any
+    ContactScratch: Any
+    Clock: Any
+    PointContact: Any
+
+
+@functools.cache
+def contact_structs(dtype: str) -> ContactStructs:
+    """The structs in one precision of the displacements."""
+    own = (facet_struct(dtype), history_struct(), contact_scratch_struct(dtype))
+    return ContactStructs(contact_struct(), *own, clock_struct(), point_contact_struct())

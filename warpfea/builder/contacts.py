@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from .. import contact as _contact  # noqa: F401 - registers its terms
 from ..base.checks import is_count, is_number
 from ..base.errors import ModelError
 from ..base.names import did_you_mean
+from ..contact import ANY_GAP, LAWS
 from ..model.bodies import Body
 from ..model.contact_points import check_contact_points
 from ..model.contacts import Collider, ColliderRotation, Contact
@@ -22,10 +23,9 @@ from ..time_laws import time_law
 from .bodies import unused_name
 from .checks import vector
 
-__all__ = ["CONTACT_LAWS", "CONTACT_MODELS", "OVERLAP_OPTIONS", "TIME_TREATMENTS", "make_collider", "make_contact",
+__all__ = ["CONTACT_MODELS", "OVERLAP_OPTIONS", "TIME_TREATMENTS", "make_collider", "make_contact",
            "make_pair", "outer_surface"]  # fmt: skip
 
-CONTACT_LAWS = ("default", "paper", "smooth")
 TIME_TREATMENTS = ("implicit", "explicit")
 CONTACT_MODELS = ("patch", "sphere")
 OVERLAP_OPTIONS = ("refuse", "offset")
@@ -80,11 +80,10 @@ def add_contact(
         raise NotImplementedError(
             "add_contact: a body with itself is not part of this version; give a collider or another body"
         )
-    if isinstance(other, (Body, SurfaceSet)):
-        d.pairs.append(make_pair(d, thing, other, name, **options))
-        return d.pairs[-1]
-    d.contacts.append(make_contact(d, thing, other, name, **options))
-    return d.contacts[-1]
+    make = next((make for kind, make in KINDS.items() if isinstance(other, kind)), make_contact)
+    contact = make(d, thing, other, name, **options)
+    (d.pairs if isinstance(contact, PairContact) else d.contacts).append(contact)
+    return contact
 
 
 def make_contact(d: Description, thing: Body | SurfaceSet, collider: Any, name: str | None, **options: Any) -> Contact:
@@ -126,9 +125,10 @@ def make_pair(
     what = f"contact {name!r}"
     if options["model"] == "sphere":
         raise NotImplementedError(f"{what}: model = 'sphere' between bodies is not part of this version; take 'patch'")
-    if options["law"] == "smooth":
+    if options["law"] in LAWS and LAWS[options["law"]].traits & ANY_GAP:
         raise NotImplementedError(
-            f"{what}: law = 'smooth' acts at any distance, and is for contact with colliders; take 'default' or 'paper'"
+            f"{what}: law = {options['law']!r} acts at any distance, and is for contact with colliders; take 'default' "
+            "or 'paper'"
         )
     slave, master = slave_and_master(a, b)
     points, options["points"] = options["points"], None
@@ -144,14 +144,20 @@ def make_pair(
     return PairContact(a, b, name, slave, master, index=len(d.pairs), **o)
 
 
+KINDS: dict[type, Callable[..., Contact | PairContact]] = {
+    Body: make_pair, SurfaceSet: make_pair, Collider: make_contact,
+}  # fmt: skip
+"""Contacts by the type of the other side that `add_contact` is given."""
+
+
 def _checked_options(what: str, surface: SurfaceSet, o: dict[str, Any]) -> dict[str, Any]:
     """Contact options with None replaced by defaults. ModelError names the invalid one."""
-    for option, known in (("law", CONTACT_LAWS), ("treatment", TIME_TREATMENTS), ("model", CONTACT_MODELS),
+    for option, known in (("law", LAWS), ("treatment", TIME_TREATMENTS), ("model", CONTACT_MODELS),
                           ("overlap", OVERLAP_OPTIONS)):  # fmt: skip
         if o[option] not in known:
             hint = did_you_mean(o[option], known)
             raise ModelError(f"{what}: {option} = {o[option]!r} is none of {', '.join(map(repr, known))}{hint}")
-    if o["treatment"] == "explicit" and o["law"] != "paper":
+    if o["treatment"] == "explicit" and not LAWS[o["law"]].explicit:
         raise ModelError(f"{what}: treatment = 'explicit' is for law = 'paper' only, not {o['law']!r}")
     o["mu"] = _number(what, "mu", o["mu"], "a friction coefficient, 0 or above", low=0.0)
     if o["mu_static"] is None:
@@ -189,12 +195,13 @@ def _number(
 
 
 def _smoothing(what: str, law: str, value: Any) -> float | tuple[float, float] | None:
-    """A depth with the paper's law, (eps, v_eps) with the smooth law, else None."""
+    """A depth or (eps, v_eps), as `ContactLaw.smoothing` of the law says, else None."""
     if value is None:
         return None
-    if law == "default":
+    kind = LAWS[law].smoothing
+    if kind is None:
         raise ModelError(f"{what}: smoothing = {value!r} applies to law = 'paper' or 'smooth' only")
-    if law == "paper":
+    if kind == "depth":
         return _number(what, "smoothing", value, "a positive depth, m, over which the paper's damping is ramped in")
     pair = tuple(value) if isinstance(value, (tuple, list, np.ndarray)) else ()
     if len(pair) != 2 or not all(is_number(v) and v > 0.0 for v in pair):

@@ -18,17 +18,17 @@ __all__ = ["check_sheet_sides"]
 
 
 def check_sheet_sides(
-    term: Any, attempt: Any, displacement: wp.array, tolerance: np.ndarray, new: np.ndarray, launch: Launcher
+    term: Any, other: Any, displacement: wp.array, tolerance: np.ndarray, new: np.ndarray, launch: Launcher
 ) -> None:  # fmt: skip
     """Raise ModelError for a body that begins on both sides of a sheet.
 
     Args:
         term: the contact term.
-        attempt: current collider poses.
+        other: current collider poses.
         tolerance, new: (worlds,) m, and flags of the worlds to check.
     """
     t = term.tables
-    points = _points_behind(t, attempt, displacement, tolerance, launch)
+    points = _points_behind(t, other, displacement, tolerance, launch)
     for world, row in np.argwhere((points > 0) & new[:, None])[:1]:
         k = int(np.searchsorted(t.row_start, row, side="right")) - 1
         contact, where = t.contacts[k], reference_position_text(t, k, int(points[world, row]) - 1 - int(t.first[k]))
@@ -40,14 +40,14 @@ def check_sheet_sides(
 
 
 def _points_behind(
-    tables: ContactTables, attempt: Any, displacement: wp.array, tolerance: np.ndarray, launch: Launcher
+    tables: ContactTables, other: Any, displacement: wp.array, tolerance: np.ndarray, launch: Launcher
 ) -> np.ndarray:  # fmt: skip
     """One point (worlds, facets) of each facet, + 1, behind a sheet while others are in front, or 0."""
     m = tables.model
     found = wp.zeros((m.worlds, tables.rows), dtype=wp.int32, device=m.device)
     limit: Any = wp.array(tolerance, dtype=wp.float64, device=m.device)
     for group in tables.groups:
-        args = [tables.data, group.data, displacement, limit, attempt, found]
+        args = [other, group.data, displacement, limit, found]
         launch(sheet_kernels(m.dtype).find_crossed_sheets, (m.worlds, group.count), args)
     sheet = [isinstance(c.collider.shape, TriMesh) and not c.collider.shape.closed for c in tables.contacts]
     return np.where(np.repeat(sheet, np.diff(tables.row_start)), found.numpy(), 0)

@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from ..base.errors import ModelError
-from ..kernels.contact.structs import contact_struct
+from ..kernels.contact.structs import collider_struct, contact_struct
 from ..model.contact_points import ContactPoints, Modulus, body_mass_total, contact_points, effective_modulus
 from ..model.contacts import Collider, Contact
 from ..model.triangle_mesh import TriMesh
@@ -27,7 +27,7 @@ class ContactTables(FacetTables[Contact]):
     """Contacts with colliders of a model, and the colliders.
 
     Attributes:
-        colliders: descriptions.
+        colliders: descriptions. shapes: on the device, without poses.
         region_radii: `region_radius` by contact index.
         clamped_point_counts: number of points per contact excluded because all their slots are clamped.
     """
@@ -40,16 +40,6 @@ class ContactTables(FacetTables[Contact]):
         self.clamped_point_counts: list[int] = []
         self.region_radii: dict[int, float] = {}
         self.area_fractions = [self._area_fraction(c, p) for c, p in zip(self.contacts, self.host)]
-
-    @property
-    def has_single_point(self) -> bool:
-        """True if a contact acts at its deepest point only."""
-        return any(contact.model == "sphere" for contact in self.contacts)
-
-    @property
-    def tracks_deepest(self) -> bool:
-        """True if a contact acts at its deepest position anywhere on its facets."""
-        return any(group.data.tracks_deepest for group in self.groups)
 
     @property
     def has_meshes(self) -> bool:
@@ -80,29 +70,35 @@ class ContactTables(FacetTables[Contact]):
     def build(self, laws: TimeLawTable, pool: int) -> None:
         """Upload the tables; `pool`: first pool entry of the term."""
         self._build_facets(pool)
-        self.data = self._upload_contacts(laws)
+        self.data = contact_struct()()
+        self._upload_laws(self.data, [self.law_constants(c) for c in self.contacts])
+        self.shapes = self._upload_colliders(laws)
         self.store_built_values()
 
     @property
     def parameter_arrays(self) -> dict[str, wp.array]:
-        return super().parameter_arrays | {"margin": self.data.margin}
+        return super().parameter_arrays | {"margin": self.shapes.margin}
 
-    def _upload_contacts(self, laws: TimeLawTable) -> Any:
-        """Device struct of the contacts."""
-        m, C, K = self.model, self.contacts, self.colliders
-        out = contact_struct(self.has_meshes)()
+    @property
+    def stored_sides(self) -> int:  # type: ignore[override]
+        """Number of colliders."""
+        return len(self.colliders)
+
+    def _upload_colliders(self, laws: TimeLawTable) -> Any:
+        """Device struct of the colliders, without poses."""
+        m, K = self.model, self.colliders
+        out = collider_struct(self.has_meshes)()
 
         def upload(name: str, values: Any, dtype: Any) -> None:
             setattr(out, name, m.array("contact", np.asarray(values), dtype))
 
-        self._upload_laws(out, [self.law_constants(c) for c in C])
-        upload("collider", [K.index(c.collider) for c in C], wp.int32)
+        upload("of_contact", [K.index(c.collider) for c in self.contacts], wp.int32)
         upload("margin", np.zeros((m.worlds, len(K))), wp.float64)
         frames = [k.shape.frame() for k in K]
-        upload("collider_kind", [k.shape.kind for k in K], wp.int32)
-        upload("collider_size", [shape_sizes(k.shape, self._contact_positions(k)) for k in K], wp.vec3d)
-        upload("collider_center", [center for center, _ in frames], wp.vec3d)
-        upload("collider_axes", [axes for _, axes in frames], wp.mat33d)
+        upload("kind", [k.shape.kind for k in K], wp.int32)
+        upload("size", [shape_sizes(k.shape, self._contact_positions(k)) for k in K], wp.vec3d)
+        upload("center", [center for center, _ in frames], wp.vec3d)
+        upload("axes", [axes for _, axes in frames], wp.mat33d)
         upload("translation_law", [laws.add(k.law) if k.law is not None else -1 for k in K], wp.int32)
         upload("rotation_law", [laws.add(k.rotation.angle) if k.rotation is not None else -1 for k in K], wp.int32)
         upload("rotation_anchor", [k.rotation.anchor if k.rotation else np.zeros(3) for k in K], wp.vec3d)

@@ -1,4 +1,4 @@
-"""Contact with rigid obstacles, with a potential per contact point, see kernels/contact/assembly.py."""
+"""Contact with rigid obstacles, see kernels/contact/collider_kinematics.py."""
 
 from __future__ import annotations
 
@@ -8,22 +8,30 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from ..kernels.contact.assembly import MAX_COLLIDER_ROTATION
+from ..kernels.contact.collider_kinematics import MAX_COLLIDER_ROTATION, pose_kernels
+from ..kernels.contact.structs import collider_struct
 from ..model.state import State
 from ..model.triangle_mesh import TriMesh
 from ..terms.term import StepContext, part
 from .collider_sheets import check_sheet_sides
 from .collider_tables import ContactTables
-from .deepest_point import DeepestPoints, at_points
+from .deepest_point import DeepestPoints
+from .evaluation import evaluate_points
 from .fields import contact_field, nodal_force, obstacle_contact_points
 from .initial_overlaps import store_overlaps, touching_depth
 from .parameters import collider_parameters
 from .term import ContactTerm, contact_columns
 
 if TYPE_CHECKING:
+    from ..base.launch import Launcher
     from ..model.model import Model
+    from ..terms.workspace import Workspace
 
 __all__ = ["ColliderContact"]
+
+POSES = {"position": "previous_position", "rotation": "previous_rotation", "angle": "previous_angle",
+         "previous_margin": "previous_margin"}  # fmt: skip
+"""History of the colliders in the state, and its names in `Colliders`."""
 
 
 class ColliderContact(ContactTerm):
@@ -39,38 +47,36 @@ class ColliderContact(ContactTerm):
 
     def __init__(self, model: Model) -> None:
         tables = ContactTables(model)
-        super().__init__(model, tables, meshes=tables.has_meshes)
-        self.deepest_points = DeepestPoints(self.tables) if self.tables.has_single_point else None
+        super().__init__(model, tables, "colliders_meshes" if tables.has_meshes else "colliders")
+        self.pose_kernels = pose_kernels(tables.has_meshes)
+        self.deepest_points = DeepestPoints(tables) if tables.has_single_point else None
 
     @classmethod
     def features(cls, model: Model) -> dict[str, bool]:
         contacts = model.description.contacts
         return {"contact": bool(contacts), "friction": any(c.mu_static > 0.0 for c in contacts)}
 
-    def scratch_shapes(self, worlds: int) -> dict[str, tuple[int, ...]]:
-        t, B = self.tables, worlds
-        K, C, R = len(t.colliders), len(t.contacts), t.rows
-        poses = ("position", "rotation", "translation", "rotation_change", "angle")
-        of_facets = ("facet_deepest_point", "facet_deepest_xi", "facet_max_depth")
-        out = super().scratch_shapes(B) | {f"collider_{name}": (B, K) for name in poses}
-        out |= dict.fromkeys(("contact_point", "choice_count"), (B, C))
-        if not t.has_single_point:
-            return out | dict.fromkeys(("point_depth", *of_facets, "chosen_facet", "point_reference"), (1, 1))
-        out |= dict.fromkeys(of_facets, (B, R)) | dict.fromkeys(("chosen_facet", "point_reference"), (B, C))
-        return out | {"shape_values": (B, C, max(group.conn.shape[1] for group in t.groups))}
+    def make_other(self, make: Callable[[str, Any, tuple[int, ...]], wp.array]) -> Any:
+        struct = collider_struct(self.tables.has_meshes)
+        out = struct()
+        out.assign(self.tables.shapes)
+        for name, attribute in POSES.items():
+            dtype = struct.vars[attribute].type.dtype
+            setattr(out, attribute, make(f"{self.name}_{name}", dtype, (len(self.tables.colliders),)))
+        return out
 
-    def history_shapes(self) -> dict[str, tuple[int, ...]]:
-        poses = ("position", "rotation", "angle", "previous_margin")
-        return super().history_shapes() | dict.fromkeys(poses, (len(self.tables.colliders),))
+    def _allocate_other(self, work: Workspace, other: Any) -> None:
+        self._set_attempt(other, lambda name, shape, dtype: work.array(f"{self.name} collider_{name}", shape, dtype))
 
-    @property
-    def unused_history(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Arrays of contacts at moving positions, without such."""
-        return () if self.tables.tracks_deepest else ("previous_depth",)
+    def _set_attempt(self, other: Any, make: Callable[[str, tuple[int, ...], Any], wp.array]) -> None:
+        """Add the poses of an attempt, arrays from make(name, shape, dtype)."""
+        shape, struct = (self.model.worlds, len(self.tables.colliders)), collider_struct(self.tables.has_meshes)
+        for name in ("position", "rotation", "translation", "rotation_change", "angle"):
+            setattr(other, name, make(name, shape, struct.vars[name].type.dtype))
 
     def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
-        others = (user.kernels.module for user in (self.deepest_points, self.double_displacements) if user)
-        return [self.point_kernels.module, *others]
+        deepest = [self.deepest_points.kernels.module] if self.deepest_points else []
+        return [*super().modules(ctx), self.pose_kernels.module, *deepest]
 
     def start(self, ctx: StepContext, active: wp.array) -> None:
         """Collider poses at the state's time, and initial overlaps.
@@ -79,60 +85,38 @@ class ColliderContact(ContactTerm):
             ModelError: a new contact point overlaps an obstacle, and `overlap` is "refuse".
         """
         s, state = ctx.scratch[self.name], ctx.state
-        history = s["history"]
+        history, other = s["history"], s["other"]
         time = state.time.numpy()
         # with a history at this time colliders continue from it: a control may have changed since
-        known = history.rotation.numpy().any(axis=(1, 2, 3)) & (history.pose_time.numpy() == time)
+        known = other.previous_rotation.numpy().any(axis=(1, 2, 3)) & (history.pose_time.numpy() == time)
         fresh = (active.numpy() != 0) & ~known
-        self._update_poses(ctx, active)
-        for name in ("position", "rotation", "angle", "previous_margin"):
-            source = self.tables.data.margin if name == "previous_margin" else getattr(s["attempt"], f"collider_{name}")
-            values = getattr(history, name).numpy()
-            values[fresh] = source.numpy()[fresh]
-            getattr(history, name).assign(values)
+        self._begin_other(ctx, active)
+        for name, attribute in POSES.items():
+            values = getattr(other, attribute).numpy()
+            values[fresh] = getattr(other, name.removeprefix("previous_")).numpy()[fresh]
+            getattr(other, attribute).assign(values)
         new = fresh & ~(history.speed.numpy() > 0.0).any(axis=1)
         overlap = self.forget_overlaps(ctx, new)
         posed = history.pose_time.numpy()
         posed[fresh] = time[fresh]
         history.pose_time.assign(posed)
-        gap, _ = self.at_points(state, history, places=False)
+        gap = evaluate_points(self, state, history, places=False)[0]
         touching = touching_depth(self.model.size, state.displacement.numpy())
         if self.tables.has_sheets and new.any():
-            check_sheet_sides(self, s["attempt"], state.displacement, touching, new, ctx.launch)
+            check_sheet_sides(self, other, state.displacement, touching, new, ctx.launch)
         store_overlaps(self.tables, np.where(new[:, None], -gap, 0.0), touching, overlap)
         history.overlap.assign(overlap)
 
-    def _update_poses(self, ctx: StepContext, active: wp.array) -> None:
-        s = ctx.scratch[self.name]
-        args = [self.tables.data, s["history"], ctx.work.time_law_values, active, s["attempt"]]
-        ctx.launch(self.point_kernels.update_poses, (self.model.worlds, len(self.tables.colliders)), args)
+    def _begin_other(self, ctx: StepContext, active: wp.array) -> None:
+        """Poses of the colliders at the end of the attempt."""
+        args = [ctx.scratch[self.name]["other"], ctx.work.time_law_values, active]
+        ctx.launch(self.pose_kernels.update_poses, (self.model.worlds, len(self.tables.colliders)), args)
 
     # in a step
 
-    def _begin_points(self, ctx: StepContext, active: wp.array) -> None:
-        """Poses of the colliders at the end of the attempt, points at its start."""
-        s, m = ctx.scratch[self.name], self.model
-        self._update_poses(ctx, active)
-        for group in self.tables.groups:
-            dim = (m.worlds, group.count, group.data.point_count)
-            args = [self.tables.data, group.data, s["history"], s["clock"]]
-            more = [ctx.state.displacement, ctx.state.velocity, active, s["attempt"]]
-            ctx.launch(self.point_kernels.begin_points, dim, [*args, *more])
-            if self.tables.explicit:
-                ctx.launch(self.point_kernels.explicit_forces, dim, [*args, *more[1:]])
-
-    @part()
-    def _evaluate_forces(self, ctx: StepContext, active: wp.array, *, fresh: int) -> None:
-        s, m = ctx.scratch[self.name], self.model
-        if self.double_displacements and ctx.positions_changed:
-            self.double_displacements.update(ctx, s["u"], active)
+    def _find_other(self, ctx: StepContext, active: wp.array, *, fresh: int) -> None:
         if fresh:
             self._choose_deepest(ctx, active, fresh=1)
-        for group in self.tables.groups:
-            args = [self.tables.data, group.data, s["history"], s["clock"], s["u"], active, fresh]
-            dim = (m.worlds, group.count, group.data.point_count)
-            ctx.launch(self.point_kernels.forces, dim, [*args, s["attempt"]])
-            self._gather_point_forces(ctx, group, active)
 
     def _choose_deepest(self, ctx: StepContext, active: wp.array, *, fresh: int) -> None:
         """Select the point of each single-point contact at work.u."""
@@ -147,29 +131,6 @@ class ColliderContact(ContactTerm):
     def update_frozen(self, ctx: StepContext, flags: wp.array) -> None:
         super().update_frozen(ctx, flags)
         self._choose_deepest(ctx, flags, fresh=0)
-
-    @part()
-    def product(self, ctx: StepContext, p: wp.array, active: wp.array) -> None:
-        m, k, attempt = self.model, self.point_kernels, ctx.scratch[self.name]["attempt"]
-        for group in self.tables.groups:
-            dim = (m.worlds, group.count, group.data.point_count)
-            ctx.launch(k.point_products, dim, [group.data, active, p, attempt])
-            sides, lanes = group.sum_threads(ctx.launch, m.worlds)
-            args = [group.data, active, lanes, attempt, ctx.work.pool_product]
-            ctx.launch(k.gather_facet_products, sides, args)
-
-    def _record_points(self, ctx: StepContext, accepted: wp.array) -> None:
-        s = ctx.scratch[self.name]
-        for group in self.tables.groups:
-            args = [self.tables.data, group.data, s["history"], s["clock"], s["u"], accepted, s["attempt"]]
-            dim = (self.model.worlds, group.count)
-            ctx.launch(self.ledger_kernels.record_substep, dim, [*args, s["energies"]])
-
-    def _store_state(self, ctx: StepContext, accepted: wp.array) -> None:
-        s, newton = ctx.scratch[self.name], ctx.work.newton
-        args = [self.tables.data, s["clock"], newton.strain_energy, newton.term_sums, accepted, s["history"]]
-        dim = (self.model.worlds, len(self.tables.colliders))
-        ctx.launch(self.ledger_kernels.store_poses, dim, [*args, s["attempt"]])
 
     @property
     def weights(self) -> np.ndarray:
@@ -220,6 +181,24 @@ class ColliderContact(ContactTerm):
 
     # at a state
 
+    def settled_other(self, stored: Any, zeros: Any, launch: Launcher, state: State) -> Any:
+        """Colliders at rest in their poses at a state; without history by their time laws."""
+        m, laws, B = self.model, self.model.terms.time_laws, state.worlds
+        other = self.make_other(stored)
+        self._set_attempt(other, lambda _, shape, dtype: zeros(shape, dtype))
+        if "contact_position" not in state.specs:
+            all_worlds = wp.ones(B, dtype=wp.int32, device=m.device)
+            value = zeros((B, max(laws.count, 1)), wp.vec3d)
+            laws.evaluate(launch, state, state.time, wp.ones(B, dtype=wp.float64, device=m.device), all_worlds, value)
+            launch(self.pose_kernels.update_poses, (B, len(self.tables.colliders)), [other, value, all_worlds])
+            other.translation.zero_()
+            other.rotation_change.zero_()
+            other.previous_position, other.previous_rotation = other.position, other.rotation
+        # statics resets its time to 0: the stored poses count
+        other.position, other.rotation = other.previous_position, other.previous_rotation
+        other.previous_angle, other.previous_margin = other.angle, other.margin
+        return other
+
     def nodal_force(self, state: State) -> np.ndarray:
         """Elastic nodal forces of all contacts at a state, (worlds, slots, 3), N."""
         return nodal_force(self.tables, self.at_points(state)[1])
@@ -229,14 +208,16 @@ class ColliderContact(ContactTerm):
         colliders at a state; None without history."""
         if "contact_position" not in state.specs:
             return None
-        return state.contact_position.numpy(), state.contact_rotation.numpy(), self.tables.data.margin.numpy()  # type: ignore[attr-defined]
+        return state.contact_position.numpy(), state.contact_rotation.numpy(), self.tables.shapes.margin.numpy()  # type: ignore[attr-defined]
 
     def samples(self, field: str, body: Any, state: State) -> np.ndarray:
         mine = any(contact.body is body for contact in self.tables.contacts)
-        contact_points = obstacle_contact_points(self.tables, body, *self.at_points(state)) if mine else []
+        gap, normal, _ = evaluate_points(self, state) if mine else (None, None, None)
+        contact_points = obstacle_contact_points(self.tables, body, gap, normal) if mine else []
         return contact_field(field, body, state.worlds, contact_points)
 
-    def at_points(self, state: State, history: Any = None, *, places: bool = True) -> tuple[np.ndarray, np.ndarray]:
-        """Gap (worlds, points), m, and elastic force on each point (worlds, points, 3), N, at a state; with `places`
-        the gap at the deepest position of a single-point contact is assigned to the nearest point."""
-        return at_points(self, state, history, places)
+    def at_points(self, state: State) -> tuple[np.ndarray, np.ndarray]:
+        """Gap (worlds, points), m, and elastic force on each point (worlds, points, 3), N, at a state; the gap at the
+        deepest position of a single-point contact is assigned to the nearest point."""
+        gap, _, force = evaluate_points(self, state)
+        return gap, force

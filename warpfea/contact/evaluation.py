@@ -1,4 +1,4 @@
-"""Contact between bodies at a state, independent of a simulation: gaps, elastic forces, positions on both bodies."""
+"""Contact at a state, independent of a simulation: gaps, elastic forces, positions on both bodies."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 import warp as wp
 
 from ..base.launch import Launcher
-from ..kernels.contact.evaluation import pair_evaluation_kernels, pair_results_struct
-from ..kernels.contact.facet_structs import pair_scratch_struct
-from ..kernels.contact.structs import contact_scratch_struct
+from ..kernels.contact.evaluation import collider_evaluation_kernels, pair_evaluation_kernels, pair_results_struct
+from ..kernels.contact.facet_structs import facet_side_struct, pair_scratch_struct
+from ..kernels.contact.structs import clock_struct, contact_scratch_struct
 from ..model.pairs import monomial_exponents
 from ..model.state import State
 from .fields import BodyContactPoints, nearest_samples, nodal_force
@@ -19,7 +19,7 @@ from .fields import BodyContactPoints, nearest_samples, nodal_force
 if TYPE_CHECKING:
     from .facet_tables import PairTables
 
-__all__ = ["PairEvaluation", "evaluate_pairs"]
+__all__ = ["PairEvaluation", "evaluate_pairs", "evaluate_points"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,50 +81,94 @@ class PairEvaluation:
         return out
 
 
-def evaluate_pairs(term: Any, state: State) -> PairEvaluation:
-    """Evaluate all points at a state with its friction spring history."""
-    m, t, B = term.model, term.tables, state.worlds
-    launch = Launcher(m.device)
+class _AtState:
+    """Arrays and displacements for an evaluation at a state.
 
-    def zeros(shape: tuple[int, ...], dtype: Any) -> wp.array:
-        return wp.zeros(shape, dtype=dtype, device=m.device)
+    Attributes:
+        u: displacements in float64. all_worlds: [world] flags of 1.
+    """
 
-    def state_or_zeros(name: str, dtype: Any, shape: tuple[int, ...]) -> wp.array:
-        return getattr(state, name) if name in state.specs else zeros((B, *shape), dtype)
+    def __init__(self, term: Any, state: State) -> None:
+        self.term, self.state, self.launch = term, state, Launcher(term.model.device)
+        self.all_worlds = wp.ones(state.worlds, dtype=wp.int32, device=term.model.device)
+        self.u = state.displacement
+        if term.double_displacements:
+            self.u = self.zeros(self.u.shape, wp.vec3d)
+            term.double_displacements.widen(self.launch, state.displacement, self.all_worlds, self.u)
 
-    history, pair_history = term.make_history(state_or_zeros), term.make_pair_history(state_or_zeros)
-    all_worlds = wp.ones(B, dtype=wp.int32, device=m.device)
-    u = state.displacement
-    if term.double_displacements:
-        u = zeros(u.shape, wp.vec3d)
-        term.double_displacements.widen(launch, state.displacement, all_worlds, u)
+    def zeros(self, shape: tuple[int, ...], dtype: Any) -> wp.array:
+        return wp.zeros(shape, dtype=dtype, device=self.term.model.device)
 
-    def allocate_fields(struct: Any, arrays: dict[str, tuple[tuple[int, ...], Any]]) -> Any:
+    def stored(self, name: str, dtype: Any, shape: tuple[int, ...]) -> wp.array:
+        """Array of the state, or zeros."""
+        state = self.state
+        return getattr(state, name) if name in state.specs else self.zeros((state.worlds, *shape), dtype)
+
+    def fields(self, struct: Any, arrays: dict[str, tuple[tuple[int, ...], Any]]) -> Any:
+        """Struct with new arrays of these shapes and types."""
         for name, (shape, dtype) in arrays.items():
-            setattr(struct, name, zeros(shape, dtype))
+            setattr(struct, name, self.zeros(shape, dtype))
         return struct
 
+
+def evaluate_points(
+    term: Any, state: State, history: Any = None, *, places: bool = True
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+    """Gap, m, elastic normal force, N, (worlds, points), and elastic force, N, (..., 3) of contact with colliders.
+
+    Args:
+        history: by default that of the state.
+        places: assign the gap at the deepest position of a single-point contact to the nearest point.
+    """
+    m, t, at = term.model, term.tables, _AtState(term, state)
+    B, launch = state.worlds, at.launch
+    history = history or term.make_history(at.stored)
+    other = term.settled_other(at.stored, at.zeros, launch, state)
+    attempt = term.make_scratch(B, lambda _, shape, dtype: at.zeros(shape, dtype))
+    attempt.approach_speed.fill_(1.0)
+    kernels = collider_evaluation_kernels(m.dtype, t.has_meshes, t.own_laws)
+    for group in t.groups:
+        args = [t.data, other, group.data, history, state.time, state.displacement, attempt]
+        launch(kernels.points_at_state, group.point_threads(B), args)
+    if term.deepest_points:
+        clock = clock_struct()()
+        clock.time, clock.is_static = state.time, 1
+        row_start = m.array("contact", t.row_start, wp.int32)
+        s = {"history": history, "other": other, "attempt": attempt, "clock": clock, "row_start": row_start}
+        before, changed = (state.displacement,) * 2, at.zeros((B,), wp.int32)
+        term.deepest_points.choose(launch, s, state.time, at.u, before, at.all_worlds, changed, fresh=1, settled=1)
+    gap, normal = (at.zeros((B, t.points), wp.float64) for _ in range(2))
+    force = at.zeros((B, t.points), wp.vec3d)
+    for group in t.groups:
+        args = [t.data, other, group.data, history, at.u, state.time, attempt, int(places), gap, normal, force]
+        launch(kernels.evaluate_at_points, group.point_threads(B), args)
+    return gap.numpy(), normal.numpy(), force.numpy()
+
+
+def evaluate_pairs(term: Any, state: State) -> PairEvaluation:
+    """Evaluate all points at a state with its friction spring history."""
+    m, t, at = term.model, term.tables, _AtState(term, state)
+    B, launch, history = state.worlds, at.launch, term.make_history(at.stored)
     masters = t.master_data(wp.uint64(0))
-    arrays: dict[str, tuple[tuple[int, ...], Any]] = dict.fromkeys(
-        ("u_coefs", "director_u_coefs"), ((B, t.facets * masters.max_monomials), wp.vec3d)
+    boxes = ("box_lower", "box_upper", "refit_lower", "refit_upper")
+    arrays: dict[str, tuple[tuple[int, ...], Any]] = dict.fromkeys(boxes, ((B * t.facets,), wp.vec3))
+    pair = at.fields(pair_scratch_struct(m.dtype)(), arrays | {"refit_needed": ((1,), wp.int32)})
+    at.fields(
+        pair.displacement, dict.fromkeys(("value", "director"), ((B, t.facets * masters.max_monomials), wp.vec3d))
     )
-    arrays |= dict.fromkeys(("box_lower", "box_upper", "refit_lower", "refit_upper"), ((B * t.facets,), wp.vec3))
-    pair = allocate_fields(pair_scratch_struct(m.dtype)(), arrays | {"refit_needed": ((1,), wp.int32)})
-    pair.start_u_coefs = pair.u_coefs
-    launch(
-        term.search_kernels.update_coefficients,
-        (B, t.facets, masters.max_monomials),
-        [masters, u, all_worlds, pair.u_coefs, pair.director_u_coefs],
-    )
-    launch(term.search_kernels.check_boxes, (B, t.facets), [masters, all_worlds, pair])
+    pair.start_displacement = pair.displacement
+    dim = (B, t.facets, masters.max_monomials)
+    launch(term.search_kernels.update_coefficients, dim, [masters, at.u, at.all_worlds, pair])
+    launch(term.search_kernels.check_boxes, (B, t.facets), [masters, at.all_worlds, pair])
     tree = wp.Bvh(pair.refit_lower, pair.refit_upper, groups=t.box_groups)
+    other = facet_side_struct(m.dtype)()
+    other.masters, other.history, other.scratch = t.master_data(tree.id), term.make_pair_history(at.stored), pair
     P, L = t.points, t.master_conn.shape[1]
     arrays = dict.fromkeys(("gap", "normal"), ((B, P), wp.float64)) | dict.fromkeys(("force", "xi"), ((B, P), wp.vec3d))
-    found = allocate_fields(
-        pair_results_struct()(), arrays | {"facet": ((B, P), wp.int32), "reaction": ((B, P, L), wp.vec3d)}
-    )
+    arrays |= {"facet": ((B, P), wp.int32), "reaction": ((B, P, L), wp.vec3d)}
+    found = at.fields(pair_results_struct()(), arrays)
     for group in t.groups:
-        args = [t.data, t.master_data(tree.id), group.data, history, pair_history, state.time, u, t.max_gap]
-        args += [contact_scratch_struct(m.dtype)(), pair, found]
-        launch(pair_evaluation_kernels(m.dtype).evaluate_pairs, (B, group.count, group.data.point_count), args)
+        args = [t.data, other, group.data, history, state.time, at.u, t.max_gap]
+        args += [contact_scratch_struct(m.dtype)(), found]
+        launch(pair_evaluation_kernels(m.dtype, t.own_laws).evaluate_pairs, group.point_threads(B), args)
     return PairEvaluation(t, *(getattr(found, field.name).numpy() for field in fields(PairEvaluation)[1:]))

@@ -101,7 +101,7 @@ class PairTables(FacetTables[PairContact]):
         for group in self.groups:
             corners = np.concatenate([corner_points(self.host[k]) for k in group.contacts])
             self.corners.append(self.model.array("contact", corners, wp.vec3i))
-        self.data = contact_struct(False)()
+        self.data = contact_struct()()
         self._upload_laws(self.data, [self.law_constants(c) for c in self.contacts])
         self.store_built_values()
         self.reach_distance = 1e-3 * max(float(mas.size.mean()) for mas in self.masters) + max(
@@ -110,6 +110,7 @@ class PairTables(FacetTables[PairContact]):
         self.max_overlap_depth = max(float(mas.depth_limit.max()) for mas in self.masters)
         self.max_gap = max(float(mas.size.max()) for mas in self.masters)
         self.master_conn = self._master_conn()
+        self.other_entries = self.master_conn.size
         self.size = self.model.size
 
     def law_constants(self, contact: PairContact, world: int | None = None) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""Contact between bodies, with a potential per slave surface point, see kernels/contact/facet_assembly.py."""
+"""Contact between bodies, see kernels/contact/facet_kinematics.py."""
 
 from __future__ import annotations
 
@@ -9,12 +9,16 @@ import numpy as np
 import warp as wp
 
 from ..kernels.common.state import state_kernels
-from ..kernels.contact.facet_assembly import pair_kernels
-from ..kernels.contact.facet_blocks import pair_block_kernels
-from ..kernels.contact.facet_ledger import pair_ledger_kernels
-from ..kernels.contact.facet_point_lists import FACETS_PER_CHUNK, point_list_kernels
+from ..kernels.contact.assembly import block_kernels
+from ..kernels.contact.facet_kinematics import master_kernels
 from ..kernels.contact.facet_search import facet_search_kernels
-from ..kernels.contact.facet_structs import pair_history_struct, pair_scratch_struct, point_list_struct
+from ..kernels.contact.facet_structs import (
+    facet_side_struct,
+    pair_history_struct,
+    pair_scratch_struct,
+    point_list_struct,
+)
+from ..kernels.contact.point_lists import FACETS_PER_CHUNK, point_list_kernels
 from ..model.state import State, view_as_words
 from ..terms.protocols import Coupled, Tied
 from ..terms.term import StepContext, part
@@ -44,19 +48,12 @@ class FacetContact(ContactTerm, Tied, Coupled):
     translation_invariant = True  # a pair's forces are self-equilibrated
     columns = contact_columns("contact_pairs")
     parts = {"pairs": "contact between bodies: search, forces, products, history"}
-    unused_history = ("angle", "previous_margin", "previous_depth", "position", "rotation")
-    unused_scratch = (
-        "collider_position", "collider_rotation", "collider_translation", "collider_rotation_change", "collider_angle",
-        "start_position", "point_depth", "facet_deepest_point", "facet_deepest_xi", "facet_max_depth", "contact_point",
-        "chosen_facet", "point_reference", "choice_count",
-    )  # fmt: skip
 
     def __init__(self, model: Model) -> None:
-        super().__init__(model, PairTables(model))
-        self.kernels = pair_kernels(model.dtype)
+        super().__init__(model, PairTables(model), "facets")
         self.search_kernels = facet_search_kernels(model.dtype)
+        self.master_kernels = master_kernels(model.dtype)
         self.point_list_kernels = point_list_kernels(model.dtype)
-        self.pair_ledger_kernels = pair_ledger_kernels(model.dtype)
 
     @classmethod
     def features(cls, model: Model) -> dict[str, bool]:
@@ -73,7 +70,7 @@ class FacetContact(ContactTerm, Tied, Coupled):
         most = t.master_data(wp.uint64(0)).max_monomials
         F, P, R = t.facets, t.points, t.rows
         shapes: dict[str, tuple[int, ...]] = dict.fromkeys(
-            ("u_coefs", "director_u_coefs", "start_u_coefs", "start_director_u_coefs", "start_v_coefs"), (B, F * most)
+            ("displacement", "start_displacement", "start_velocity"), (B, F * most)
         )
         shapes |= dict.fromkeys(("box_lower", "box_upper", "refit_lower", "refit_upper", "list_count"), (B * F,))
         shapes |= dict.fromkeys(("refit_needed", "refit_count", "lists_changed"), (1,))
@@ -84,15 +81,22 @@ class FacetContact(ContactTerm, Tied, Coupled):
         shapes |= {"geometric_tangent": (B, P, 2), "deepest_contact": (B, len(t.bodies))}
         out = pair_scratch_struct(self.model.dtype)()
         for name, var in pair_scratch_struct(self.model.dtype).vars.items():
-            setattr(out, name, work.array(f"pairs {name}", shapes.get(name, (B, P)), var.type.dtype))
+            shape = shapes.get(name, (B, P))
+            if name in ("displacement", "start_displacement"):
+                for part in ("value", "director"):
+                    setattr(getattr(out, name), part, work.array(f"pairs {name} {part}", shape, wp.vec3d))
+            else:
+                setattr(out, name, work.array(f"pairs {name}", shape, var.type.dtype))
         out.refit_count.fill_(1)
         return out
 
     def allocate(self, work: Workspace, ctx: StepContext) -> None:
         super().allocate(work, ctx)
-        pair = self._make_pair_scratch(work)
-        tree = self._build_tree(pair)
-        ctx.scratch[self.name] |= {"pair": pair, "tree": tree, "masters": self.tables.master_data(tree.id)}
+        s = ctx.scratch[self.name]
+        s["pair"] = self._make_pair_scratch(work)
+        s["tree"] = self._build_tree(s["pair"])
+        s["masters"] = self.tables.master_data(s["tree"].id)
+        s["other"].masters, s["other"].scratch = s["masters"], s["pair"]
 
     def _build_tree(self, pair: Any) -> wp.Bvh:
         """Bounding volume hierarchy of the facets in the reference; one group per world and surface."""
@@ -108,13 +112,17 @@ class FacetContact(ContactTerm, Tied, Coupled):
             setattr(out, name, make(f"{self.name}_{name}", var.type.dtype, (self.tables.points,)))
         return out
 
-    def register(self, ctx: StepContext) -> None:
-        super().register(ctx)
-        ctx.scratch[self.name]["pair_history"] = self.make_pair_history(ctx.state.register)
+    def _allocate_other(self, work: Workspace, other: Any) -> None:
+        """No-op: the arrays of an attempt come with the tree, in `allocate`."""
+
+    def make_other(self, make: Callable[[str, Any, tuple[int, ...]], wp.array]) -> Any:
+        out = facet_side_struct(self.model.dtype)()
+        out.history = self.make_pair_history(make)
+        return out
 
     def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
-        double_displacements = [self.double_displacements.kernels.module] if self.double_displacements else []
-        return [self.point_kernels.module, self.search_kernels.module, self.kernels.module, *double_displacements]
+        own = (self.search_kernels, self.master_kernels, self.point_list_kernels)
+        return [*super().modules(ctx), *(kernels.module for kernels in own)]
 
     def start(self, ctx: StepContext, active: wp.array) -> None:
         """Initial overlaps at the state.
@@ -139,23 +147,16 @@ class FacetContact(ContactTerm, Tied, Coupled):
         depth = np.where((facet != -1) & new[:, None], s["pair"].depth.numpy(), 0.0)
         touching = touching_depth(self.model.size, ctx.state.displacement.numpy())
         store_overlaps(t, depth, touching, overlap)
-        refuse_deep_overlaps(t, ctx.state.displacement.numpy(), s["pair"].start_position.numpy(), facet, new)
+        refuse_deep_overlaps(t, ctx.state.displacement.numpy(), s["attempt"].start_position.numpy(), facet, new)
         history.overlap.assign(overlap)
 
     # in a step
 
-    def _begin_points(self, ctx: StepContext, active: wp.array) -> None:
-        s, m, t = ctx.scratch[self.name], self.model, self.tables
-        pair, masters = s["pair"], s["masters"]
-        u, v = ctx.state.displacement, ctx.state.velocity
-        dim = (m.worlds, t.facets, masters.max_monomials)
-        ctx.launch(self.search_kernels.initial_coefficients, dim, [masters, u, v, active, pair])
-        for group in t.groups:
-            args = [t.data, masters, group.data, s["history"], s["pair_history"], s["clock"]]
-            dim = (m.worlds, group.count, group.data.point_count)
-            ctx.launch(self.search_kernels.begin_points, dim, [*args, u, v, active, s["attempt"], pair])
-            if t.explicit:
-                ctx.launch(self.kernels.explicit_forces, dim, [*args, v, active, s["attempt"], pair])
+    def _begin_other(self, ctx: StepContext, active: wp.array) -> None:
+        s, state = ctx.scratch[self.name], ctx.state
+        dim = (self.model.worlds, self.tables.facets, s["masters"].max_monomials)
+        args = [s["masters"], state.displacement, state.velocity, active, s["pair"]]
+        ctx.launch(self.search_kernels.initial_coefficients, dim, args)
 
     def _refit_tree(self, ctx: StepContext) -> None:
         s = ctx.scratch[self.name]
@@ -167,36 +168,35 @@ class FacetContact(ContactTerm, Tied, Coupled):
         s, m, t, k = ctx.scratch[self.name], self.model, self.tables, self.search_kernels
         pair, masters = s["pair"], s["masters"]
         dim = (m.worlds, t.facets, masters.max_monomials)
-        ctx.launch(k.update_coefficients, dim, [masters, u, active, pair.u_coefs, pair.director_u_coefs])
+        ctx.launch(k.update_coefficients, dim, [masters, u, active, pair])
         ctx.launch(k.check_boxes, (m.worlds, t.facets), [masters, active, pair])
         ctx.launch(k.update_centres, (m.worlds, t.facets), [masters, active, pair])
         wp.capture_if(pair.refit_needed, self._refit_tree, ctx=ctx)
         for group, corners in zip(t.groups, t.corners):
             args = [t.data, masters, group.data, s["history"]]
             ctx.launch(
-                k.query_boxes, (m.worlds, group.count), [*args, u, active, t.reach_distance + overlap_limit, pair]
+                k.query_boxes,
+                (m.worlds, group.count),
+                [*args, u, active, t.reach_distance + overlap_limit, s["attempt"], pair],
             )
             args += [s["clock"], u, ctx.state.velocity, active, overlap_limit, s["attempt"], pair, corners]
-            ctx.launch(k.find_facets, (m.worlds, group.count, group.data.point_count), args)
+            ctx.launch(k.find_facets, group.point_threads(m.worlds), args)
 
-    @part()
-    def _evaluate_forces(self, ctx: StepContext, active: wp.array, *, fresh: int) -> None:
-        s, m, w, t = ctx.scratch[self.name], self.model, ctx.work, self.tables
-        pair, masters = s["pair"], s["masters"]
+    def _find_other(self, ctx: StepContext, active: wp.array, *, fresh: int) -> None:
         if ctx.positions_changed:
-            if self.double_displacements:
-                self.double_displacements.update(ctx, s["u"], active)
-            self._search_facets(ctx, s["u"], active, overlap_limit=0.0)
-        for group in t.groups:
-            args = [t.data, masters, group.data, s["history"], s["pair_history"], s["clock"], s["u"], active, fresh]
-            dim = (m.worlds, group.count, group.data.point_count)
-            ctx.launch(self.kernels.forces, dim, [*args, s["attempt"], pair])
-        wp.capture_if(pair.lists_changed, self._build_point_lists, ctx=ctx)
-        for group in t.groups:
-            self._gather_point_forces(ctx, group, active)
-        lanes = ctx.launch.lanes(POINT_SUM_LANES)
-        args = [masters, active, lanes, s["attempt"], pair, w.pool_force]
-        ctx.launch(self.kernels.gather_master_forces, (m.worlds, ctx.launch.padded(lanes * t.master_conn.size)), args)
+            self._search_facets(ctx, ctx.scratch[self.name]["u"], active, overlap_limit=0.0)
+
+    def _find_accepted(self, ctx: StepContext, accepted: wp.array) -> None:
+        self._search_facets(ctx, ctx.scratch[self.name]["u"], accepted, overlap_limit=0.0)
+
+    def _list_points(self, ctx: StepContext) -> None:
+        wp.capture_if(ctx.scratch[self.name]["pair"].lists_changed, self._build_point_lists, ctx=ctx)
+
+    def _gather_other_forces(self, ctx: StepContext, active: wp.array) -> None:
+        s, lanes = ctx.scratch[self.name], ctx.launch.lanes(POINT_SUM_LANES)
+        dim = (self.model.worlds, ctx.launch.padded(lanes * self.tables.other_entries))
+        args = [s["other"], active, lanes, s["attempt"], ctx.work.pool_force]
+        ctx.launch(self.master_kernels.gather_master_forces, dim, args)
 
     def _build_point_lists(self, ctx: StepContext) -> None:
         """Build the point lists of the master facets."""
@@ -215,45 +215,17 @@ class FacetContact(ContactTerm, Tied, Coupled):
         super().update_frozen(ctx, flags)
         s = ctx.scratch[self.name]
         for group in self.tables.groups:
-            args = [s["masters"], group.data, s["u"], flags, s["attempt"], s["pair"]]
-            ctx.launch(
-                self.kernels.update_friction_shapes, (self.model.worlds, group.count, group.data.point_count), args
-            )
-
-    def _record_points(self, ctx: StepContext, accepted: wp.array) -> None:
-        s, t = ctx.scratch[self.name], self.tables
-        self._search_facets(ctx, s["u"], accepted, overlap_limit=0.0)
-        for group in t.groups:
-            args = [t.data, s["masters"], group.data, s["history"], s["pair_history"], s["clock"], accepted]
-            args += [s["attempt"], s["pair"], s["energies"]]
-            ctx.launch(self.pair_ledger_kernels.record_substep, (self.model.worlds, group.count), args)
-
-    def _store_state(self, ctx: StepContext, accepted: wp.array) -> None:
-        s, newton = ctx.scratch[self.name], ctx.work.newton
-        args = [s["clock"], newton.strain_energy, newton.term_sums, accepted, s["history"], s["attempt"]]
-        ctx.launch(self.pair_ledger_kernels.add_energy_bound, self.model.worlds, args)
+            args = [s["other"], group.data, s["u"], flags, s["attempt"]]
+            ctx.launch(self.master_kernels.update_friction_shapes, group.point_threads(self.model.worlds), args)
 
     # in a linear solve
 
     @part()
-    def product(self, ctx: StepContext, p: wp.array, active: wp.array) -> None:
-        s, m, w, t, k = ctx.scratch[self.name], self.model, ctx.work, self.tables, self.kernels
-        attempt, pair, masters = s["attempt"], s["pair"], s["masters"]
-        for group in t.groups:
-            dim = (m.worlds, group.count, group.data.point_count)
-            ctx.launch(k.point_products, dim, [masters, group.data, active, p, attempt, pair])
-        for group in t.groups:  # the last group includes the master facets
-            entries = group.conn.size + (t.master_conn.size if group is t.groups[-1] else 0)
-            lanes = ctx.launch.lanes(POINT_SUM_LANES)
-            args = [masters, group.data, active, lanes, entries - 1, attempt, pair, w.pool_product]
-            ctx.launch(k.gather_pair_products, (m.worlds, ctx.launch.padded(lanes * entries)), args)
-
-    @part()
     def diagonal(self, ctx: StepContext, active: wp.array) -> None:
-        s, m, w, t = ctx.scratch[self.name], self.model, ctx.work, self.tables
+        s, m, t = ctx.scratch[self.name], self.model, self.tables
         super().diagonal(ctx, active)
-        args = [s["masters"], active, s["attempt"], s["pair"], w.pool_block]
-        ctx.launch(self.kernels.master_diagonal, (m.worlds, t.facets, t.master_conn.shape[1]), args)
+        args = [s["other"], active, s["attempt"], ctx.work.pool_block]
+        ctx.launch(self.master_kernels.master_diagonal, (m.worlds, t.facets, t.master_conn.shape[1]), args)
 
     def cached_inputs(self, ctx: StepContext) -> list[tuple[str, wp.array]]:
         s = ctx.scratch[self.name]
@@ -283,12 +255,11 @@ class FacetContact(ContactTerm, Tied, Coupled):
         stiffness, lists.list_size, lists.list_start, lists.list_point, weight, _ = kept
         self._add_facet_blocks(ctx, matrix, stiffness, weight, dq_dv, active, out)
         index, begin, source, count = m.cache["pairs blocks"][-1]
-        args = [m.topology, matrix.pattern.data, index, begin, source, stiffness, weight, lists]
-        add = pair_block_kernels(m.dtype).add_master_blocks
-        ctx.launch(add, (m.worlds, count), [*args, dq_dv, active, out])
+        args = [m.topology, matrix.pattern.data, lists, index, begin, source, stiffness, weight, dq_dv, active, out]
+        ctx.launch(block_kernels(m.dtype, True).add_blocks, (m.worlds, count), args)
 
     def block_modules(self) -> set[wp.Module]:
-        return super().block_modules() | {pair_block_kernels(self.model.dtype).module}
+        return super().block_modules() | {block_kernels(self.model.dtype, True).module}
 
     def coupled_bodies(self) -> list[tuple[int, int]]:
         number = {id(body): k for k, body in enumerate(self.model.bodies)}

@@ -8,11 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..kernels.contact.laws import SMOOTH
 from ..model.discretisation import Discretisation, element_functions
 from ..terms.term import FieldSpec
 from .collider_tables import ContactTables
-from .tables import LAWS
 
 if TYPE_CHECKING:
     from .facet_tables import PairTables
@@ -70,34 +68,19 @@ def contact_field(name: str, body: Any, worlds: int, contact_points: list[BodyCo
     return pressure if name == "contact_pressure" else np.where(least < 1e29, least, np.nan)
 
 
-def obstacle_contact_points(t: ContactTables, body: Any, gap: np.ndarray, force: np.ndarray) -> list[BodyContactPoints]:
-    """Contact points of a body with obstacles, from gaps and forces of all points."""
+def obstacle_contact_points(
+    t: ContactTables, body: Any, gap: np.ndarray, normal: np.ndarray
+) -> list[BodyContactPoints]:  # fmt: skip
+    """Contact points of a body with obstacles, from gaps and elastic normal forces of all points."""
     out = []
     for k, contact in enumerate(t.contacts):
         if contact.body is body:
             points = slice(t.first[k], t.first[k + 1])
-            normal = _normal_force(t, k, gap[:, points], force[:, points])
             nearest, area = nearest_samples(t, k, body), t.host[k].area.ravel()
-            shape = normal.shape
-            out.append(
-                BodyContactPoints(np.broadcast_to(nearest, shape), np.broadcast_to(area, shape), normal, gap[:, points])
-            )
+            shape = gap[:, points].shape
+            out.append(BodyContactPoints(np.broadcast_to(nearest, shape), np.broadcast_to(area, shape),
+                                         normal[:, points], gap[:, points]))  # fmt: skip
     return out
-
-
-def _normal_force(t: ContactTables, k: int, gap: np.ndarray, force: np.ndarray) -> np.ndarray:
-    """Elastic normal force, N, on the points (worlds, points) of a contact from their gaps, without friction."""
-    contact = t.contacts[k]
-    stiffness = t.data.scale.numpy()[:, k, None] * t.data.normal_stiffness.numpy()[:, k, None]
-    share = t.area_fractions[k].ravel()
-    depth = np.where(share > 0.0, -gap, 0.0)
-    if contact.model == "sphere":
-        deepest = np.arange(depth.shape[1]) == depth.argmax(axis=1)[:, None]
-        return np.where(deepest & force.any(axis=2), stiffness * np.maximum(depth, 0.0) ** 1.5, 0.0)
-    if LAWS[contact.law] == SMOOTH:
-        y = stiffness * depth
-        return share * 0.5 * (y + np.hypot(y, t.data.force_eps.numpy()[k]))
-    return share * stiffness * np.maximum(depth, 0.0)
 
 
 def nearest_samples(

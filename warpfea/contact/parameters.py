@@ -80,7 +80,7 @@ def _set_surface_offset(tables: ContactTables, collider: Collider, values: Any, 
     _check_values(what, "offset", wanted, ~mask, np.isfinite(wanted))
     if isinstance(collider.shape, HalfSpace):
         wanted = wanted - collider.shape.offset
-    _write_column(tables.data.margin, tables.colliders.index(collider), wanted, mask)
+    _write_column(tables.shapes.margin, tables.colliders.index(collider), wanted, mask)
 
 
 def _check_values(

@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 from scipy.optimize import brentq
 
-from ..kernels.contact.laws import DEFAULT, PAPER, SMOOTH
+from ..kernels.contact.law import law_code
 from ..kernels.contact.structs import facet_struct
 from ..model.contact_points import CONTACT_RULES, ContactPoints, lagrange_basis
 from ..model.contacts import Contact
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from ..model.model import Model
 
 __all__ = [
-    "LAWS",
     "POINT_SUM_LANES",
     "WORLD_PARAMETERS",
     "FacetGroup",
@@ -34,7 +33,7 @@ __all__ = [
 ]  # fmt: skip
 
 AnyContact = TypeVar("AnyContact", Contact, PairContact)
-LAWS = {"default": DEFAULT, "paper": PAPER, "smooth": SMOOTH}
+BUILT_IN_LAWS = ("default", "paper", "smooth")
 DEFAULT_SMOOTHING = (1e-3, 1e-4)
 """Default eps, N, and v_eps, m/s, of the smooth law."""
 WORLD_PARAMETERS = {"mu": "mu", "mu_static": "mu_static", "restitution": "damping", "stiffness": "scale"}
@@ -112,6 +111,10 @@ class FacetGroup:
         """Number of facets."""
         return len(self.conn)
 
+    def point_threads(self, worlds: int) -> tuple[int, int, int]:
+        """Threads of the points of each facet."""
+        return worlds, self.count, self.data.point_count
+
     def sum_threads(self, launch: Launcher, worlds: int) -> tuple[tuple[int, int], int]:
         """Threads that sum over the points of a facet for each of its slots, and threads per slot."""
         lanes = launch.lanes(POINT_SUM_LANES)
@@ -129,6 +132,7 @@ class FacetTables(Generic[AnyContact]):
         points, rows: total numbers of points and facets.
         first, row_start: first point and first facet of each contact.
         area_fractions: (F, P) of each contact: area of each point over that of the region; 0: inactive.
+        other_entries, stored_sides: pool entries of the other side, and threads that store it after a step.
     """
 
     data: Any
@@ -136,6 +140,8 @@ class FacetTables(Generic[AnyContact]):
     first: np.ndarray
     row_start: np.ndarray
     area_fractions: list[np.ndarray]
+    other_entries = 0
+    stored_sides = 1
 
     def __init__(self, model: Model, contacts: Sequence[AnyContact], points: Sequence[ContactPoints]) -> None:
         self.model = model
@@ -152,6 +158,21 @@ class FacetTables(Generic[AnyContact]):
     def connectivity(self) -> list[np.ndarray]:
         """Slots (F, L) of the facets of each group."""
         return [group.conn for group in self.groups]
+
+    @property
+    def own_laws(self) -> tuple[str, ...]:
+        """Laws in use beside the built-in ones."""
+        return tuple(sorted({contact.law for contact in self.contacts} - set(BUILT_IN_LAWS)))
+
+    @property
+    def has_single_point(self) -> bool:
+        """True if a contact acts at its deepest point only."""
+        return any(contact.model == "sphere" for contact in self.contacts)
+
+    @property
+    def tracks_deepest(self) -> bool:
+        """True if a contact acts at its deepest position anywhere on its facets."""
+        return any(group.data.tracks_deepest for group in self.groups)
 
     @property
     def explicit(self) -> bool:
@@ -247,7 +268,7 @@ class FacetTables(Generic[AnyContact]):
         def upload(name: str, values: Any, dtype: Any = wp.float64) -> None:
             setattr(out, name, m.array("contact", np.asarray(values), dtype))
 
-        upload("law", [LAWS[c.law] for c in C], wp.int32)
+        upload("law", [law_code(c.law) for c in C], wp.int32)
         upload("single_point", [int(c.model == "sphere") for c in C], wp.int32)
         upload("is_explicit", [int(c.treatment == "explicit") for c in C], wp.int32)
         upload("first_point", self.first, wp.int32)

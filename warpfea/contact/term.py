@@ -1,20 +1,21 @@
 """Contact of surface points with another side, a potential per point, in the order of its stages, written once.
 
-A subclass is one geometry: it finds the other side of each point (`_begin_points`, `_forces_of_points`), and gathers on
-its slots. Law, friction, history, ledger, records, parameters and fields are those of every geometry.
+A subclass is one geometry: it has the other side's tables and arrays, and finds the other side of each point
+(`_begin_other`, `_find_other`). Law, friction, history, ledger, records, parameters and fields are those of every
+geometry.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, ClassVar
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 
 from ..base.errors import PenetrationError
-from ..kernels.contact.assembly import AITKEN_LANES, contact_kernels
-from ..kernels.contact.ledger import ENERGY_COLUMNS, RECORD_LANES, contact_block_kernels, contact_ledger_kernels
+from ..kernels.contact.assembly import AITKEN_LANES, block_kernels, contact_kernels
+from ..kernels.contact.ledger import ENERGY_COLUMNS, RECORD_LANES, contact_ledger_kernels
 from ..kernels.contact.structs import RECORD_NAMES, clock_struct, contact_scratch_struct, history_struct
 from ..kernels.solvers.newton_control import FAIL_ROUNDOFF, FAIL_WORK
 from ..model.state import State
@@ -25,6 +26,7 @@ from .double_displacements import DoubleDisplacements
 from .fields import CONTACT_FIELDS
 from .initial_overlaps import reference_position_text
 from .parameters import contact_parameters
+from .tables import POINT_SUM_LANES
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -36,6 +38,9 @@ __all__ = ["ContactTerm", "contact_columns"]
 
 MAX_NAMED_CONTACTS = 3
 """Maximum number of contacts named in a message."""
+OF_FACETS = ("facet_deepest_point", "facet_deepest_xi", "facet_max_depth")
+OF_CONTACTS = ("contact_point", "chosen_facet", "point_reference", "choice_count")
+"""Arrays of single-point contacts, by facets and by contacts."""
 
 
 def contact_columns(stored: str) -> tuple[Column, ...]:
@@ -50,18 +55,15 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed):
     Attributes:
         tables: contacts, points and facets on the device.
         point_kernels, ledger_kernels: kernels of the points, and of their energies and records.
-        unused_scratch, unused_history: arrays that the geometry doesn't use.
     """
 
     fields = CONTACT_FIELDS
-    unused_scratch: ClassVar[tuple[str, ...]] = ()
-    unused_history: ClassVar[tuple[str, ...]] = ()
 
-    def __init__(self, model: Model, tables: FacetTables[Any], *, meshes: bool = False) -> None:
+    def __init__(self, model: Model, tables: FacetTables[Any], geometry: str) -> None:
         super().__init__(model)
         self.tables: Any = tables
-        self.point_kernels = contact_kernels(model.dtype, meshes)
-        self.ledger_kernels = contact_ledger_kernels(model.dtype, meshes)
+        self.point_kernels = contact_kernels(model.dtype, geometry, tables.own_laws)
+        self.ledger_kernels = contact_ledger_kernels(model.dtype, geometry, tables.own_laws)
         self.report_columns = len(RECORD_NAMES) * len(tables.contacts)
 
     def build(self, laws: TimeLawTable) -> None:
@@ -85,29 +87,37 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed):
             "record_rows": (len(RECORD_NAMES), B, t.rows), "facet_activity": (B, t.rows), "shape_values": (1, 1, 1),
         }  # fmt: skip
         shapes |= dict.fromkeys(("passed_point", "elapsed_time", "relaxation", "limit_updates", "aitken_norm2"), (B,))
+        shapes |= dict.fromkeys(OF_FACETS, (B, t.rows)) | dict.fromkeys(OF_CONTACTS, (B, len(t.contacts)))
+        if t.has_single_point:
+            shapes["shape_values"] = (B, len(t.contacts), max(group.conn.shape[1] for group in t.groups))
         return shapes | ({} if t.explicit else dict.fromkeys(("explicit_force", "explicit_elastic_slip"), (1, 1)))
 
     def make_scratch(self, worlds: int, make: Callable[[str, tuple[int, ...], Any], wp.array]) -> Any:
         """Attempt struct with arrays from make(name, shape, dtype)."""
         struct, shapes = contact_scratch_struct(self.model.dtype), self.scratch_shapes(worlds)
+        unused = () if self.tables.has_single_point else (*OF_FACETS, *OF_CONTACTS, "point_depth")
         out = struct()
         for name, var in struct.vars.items():
-            if name not in self.unused_scratch:
+            if name not in unused:
                 setattr(out, name, make(name, shapes.get(name, (worlds, self.tables.points)), var.type.dtype))
         return out
 
-    def history_shapes(self) -> dict[str, tuple[int, ...]]:
-        """Shapes per world of the history arrays that are not (points,)."""
-        return {"overlap_time": (), "pose_time": ()}
-
     def make_history(self, make: Callable[[str, Any, tuple[int, ...]], wp.array]) -> Any:
         """History struct with arrays from make(name, dtype, shape per world)."""
-        out, shapes = history_struct()(), self.history_shapes()
+        out = history_struct()()
         for name, var in history_struct().vars.items():
-            if name not in self.unused_history:
-                shape = shapes.get(name, (self.tables.points,))
+            if name != "previous_depth" or self.tables.tracks_deepest:
+                shape = () if name in ("overlap_time", "pose_time") else (self.tables.points,)
                 setattr(out, name, make(f"{self.name}_{name}", var.type.dtype, shape))
         return out
+
+    def make_other(self, make: Callable[[str, Any, tuple[int, ...]], wp.array]) -> Any:
+        """Struct of the other side, with its history arrays as of `make_history`."""
+        raise NotImplementedError
+
+    def _allocate_other(self, work: Workspace, other: Any) -> None:
+        """Add the arrays of an attempt to the struct of the other side."""
+        raise NotImplementedError
 
     def allocate(self, work: Workspace, ctx: StepContext) -> None:
         t, B = self.tables, self.model.worlds
@@ -129,9 +139,11 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed):
             "u": self.double_displacements.allocate(work, self.name) if self.double_displacements else work.u,
         }
         ctx.scratch[self.name] = scratch | ctx.scratch.get(self.name, {})
+        self._allocate_other(work, ctx.scratch[self.name]["other"])
 
     def register(self, ctx: StepContext) -> None:
-        ctx.scratch[self.name] = {"history": self.make_history(ctx.state.register)}
+        make = ctx.state.register
+        ctx.scratch[self.name] = {"history": self.make_history(make), "other": self.make_other(make)}
 
     def forget_overlaps(self, ctx: StepContext, new: np.ndarray) -> np.ndarray:
         """Clear the stored overlaps of the `new` worlds, which begin now; returns a host copy of all."""
@@ -142,6 +154,10 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed):
         history.overlap.assign(overlap)
         history.overlap_time.assign(begins)
         return overlap
+
+    def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
+        double_displacements = [self.double_displacements.kernels.module] if self.double_displacements else []
+        return [self.point_kernels.module, *double_displacements]
 
     def shift_time(self, state: State) -> None:
         """Shift the start times of stored overlaps."""
@@ -158,15 +174,42 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed):
     def force(self, ctx: StepContext, active: wp.array) -> None:
         self._evaluate_forces(ctx, active, fresh=0)
 
+    @part()
     def _evaluate_forces(self, ctx: StepContext, active: wp.array, *, fresh: int) -> None:
-        raise NotImplementedError
+        """Forces of the points on the slots of both sides, and rows of the potential."""
+        s, t, w, k = ctx.scratch[self.name], self.tables, ctx.work, self.point_kernels
+        if self.double_displacements and ctx.positions_changed:
+            self.double_displacements.update(ctx, s["u"], active)
+        self._find_other(ctx, active, fresh=fresh)
+        for group in t.groups:
+            args = [t.data, s["other"], group.data, s["history"], s["clock"], s["u"], active, fresh, s["attempt"]]
+            ctx.launch(k.forces, group.point_threads(self.model.worlds), args)
+        self._list_points(ctx)
+        for group in t.groups:
+            dim, lanes = group.sum_threads(ctx.launch, self.model.worlds)
+            args = [group.data, active, lanes, s["attempt"], w.pool_force, w.rows_of(self), s["contact_active"]]
+            ctx.launch(k.gather_point_forces, dim, args)
+        self._gather_other_forces(ctx, active)
 
-    def _gather_point_forces(self, ctx: StepContext, group: Any, active: wp.array) -> None:
-        """Forces of the points of a group on the slots of their own facets, and rows of the potential."""
-        s, w = ctx.scratch[self.name], ctx.work
-        dim, lanes = group.sum_threads(ctx.launch, self.model.worlds)
-        args = [group.data, active, lanes, s["attempt"], w.pool_force, w.rows_of(self), s["contact_active"]]
-        ctx.launch(self.point_kernels.gather_point_forces, dim, args)
+    def _find_other(self, ctx: StepContext, active: wp.array, *, fresh: int) -> None:
+        """Find the other side of each point at the iterate; `fresh`: an attempt begins."""
+
+    def _list_points(self, ctx: StepContext) -> None:
+        """List the points for each slot of the other side, if it has slots."""
+
+    def _gather_other_forces(self, ctx: StepContext, active: wp.array) -> None:
+        """Forces on the slots of the other side, if it has slots."""
+
+    @part()
+    def product(self, ctx: StepContext, p: wp.array, active: wp.array) -> None:
+        s, k, B = ctx.scratch[self.name], self.point_kernels, self.model.worlds
+        other, attempt, lanes = s["other"], s["attempt"], ctx.launch.lanes(POINT_SUM_LANES)
+        for group in self.tables.groups:
+            ctx.launch(k.point_products, group.point_threads(B), [other, group.data, active, p, attempt])
+        for group in self.tables.groups:  # the last group includes the other side
+            entries = group.conn.size + (self.tables.other_entries if group is self.tables.groups[-1] else 0)
+            args = [other, group.data, active, lanes, entries - 1, attempt, ctx.work.pool_product]
+            ctx.launch(k.gather_products, (B, ctx.launch.padded(lanes * entries)), args)
 
     @part()
     def update_frozen(self, ctx: StepContext, flags: wp.array) -> None:
@@ -183,15 +226,17 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed):
             dim = (self.model.worlds, group.count, group.conn.shape[1])
             ctx.launch(self.point_kernels.diagonal, dim, args)
 
-    def _record_points(self, ctx: StepContext, accepted: wp.array) -> None:
-        """Update history, ledger rows and record rows of the points after an accepted substep."""
-        raise NotImplementedError
+    def _find_accepted(self, ctx: StepContext, accepted: wp.array) -> None:
+        """Find the other side of each point at the accepted iterate, where that is another one."""
 
     @part()
     def _record_substep(self, ctx: StepContext, accepted: wp.array) -> None:
         """Update history, ledger rows and records of an accepted substep."""
-        self._record_points(ctx, accepted)
-        s, k = ctx.scratch[self.name], self.ledger_kernels
+        self._find_accepted(ctx, accepted)
+        s, k, t = ctx.scratch[self.name], self.ledger_kernels, self.tables
+        for group in t.groups:
+            args = [t.data, s["other"], group.data, s["history"], s["clock"], s["u"], accepted, s["attempt"]]
+            ctx.launch(k.record_substep, (self.model.worlds, group.count), [*args, s["energies"]])
         sums = (self.model.worlds, len(self.tables.contacts), len(RECORD_NAMES))
         args = [self.tables.data, s["row_start"], accepted, s["attempt"], s["parts"]]
         ctx.launch(k.partial_records, (*sums, RECORD_LANES), args)
@@ -204,6 +249,18 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed):
 
     def _begin_points(self, ctx: StepContext, active: wp.array) -> None:
         """Update the other side and the points at the start of the attempt."""
+        s, k, t, state = ctx.scratch[self.name], self.point_kernels, self.tables, ctx.state
+        self._begin_other(ctx, active)
+        for group in t.groups:
+            dim = group.point_threads(self.model.worlds)
+            args = [t.data, s["other"], group.data, s["history"], s["clock"]]
+            more = [state.velocity, active, s["attempt"]]
+            ctx.launch(k.begin_points, dim, [*args, state.displacement, *more])
+            if t.explicit:
+                ctx.launch(k.explicit_forces, dim, [*args, *more])
+
+    def _begin_other(self, ctx: StepContext, active: wp.array) -> None:
+        """Update the other side at the start of the attempt."""
         raise NotImplementedError
 
     def energy_increments(self, ctx: StepContext, accepted: wp.array) -> wp.array:
@@ -215,11 +272,9 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed):
     def commit(self, ctx: StepContext, accepted: wp.array) -> None:
         if not ctx.scratch[self.name]["finished"]:  # no ledger, `energy_increments` not called
             self._record_substep(ctx, accepted)
-        self._store_state(ctx, accepted)
-
-    def _store_state(self, ctx: StepContext, accepted: wp.array) -> None:
-        """Store the time of the accepted state and the pose of the other side."""
-        raise NotImplementedError
+        s, newton = ctx.scratch[self.name], ctx.work.newton
+        args = [s["other"], s["clock"], newton.strain_energy, newton.term_sums, accepted, s["history"], s["attempt"]]
+        ctx.launch(self.ledger_kernels.store_state, (self.model.worlds, self.tables.stored_sides), args)
 
     def report(self, ctx: StepContext) -> None:
         args = [ctx.scratch[self.name]["attempt"], self.report_offset, ctx.work.report]
@@ -248,11 +303,11 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed):
         m = self.model
         for group, (entry, start, source, count) in zip(self.tables.groups, m.cache[f"{self.name} blocks"]):
             args = [m.topology, matrix.pattern.data, group.data, entry, start, source, stiffness, weight]
-            kernel = contact_block_kernels(m.dtype).add_contact_blocks
+            kernel = block_kernels(m.dtype, False).add_blocks
             ctx.launch(kernel, (m.worlds, count), [*args, *target])
 
     def block_modules(self) -> set[wp.Module]:
-        return {contact_block_kernels(self.model.dtype).module}
+        return {block_kernels(self.model.dtype, False).module}
 
     # failures
 

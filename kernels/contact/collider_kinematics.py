@@ -1,0 +1,282 @@
+"""Points against rigid shapes: the geometry of colliders, their poses, and the record of a point."""
+
+import functools
+import types as _types
+
+import warp as wp
+
+from ..common.types import kernel_module, kernel_set, precision
+from .collider_mesh import MESH
+from .colliders import MESH_SUFFIX, collider_functions
+from .kinematics import GEOMETRIES, kinematics_functions
+from .law import ANY_GAP, FIXED_SPRING
+from .structs import IN_REACH, PASSED, TURNED, collider_struct, contact_structs
+
+__all__ = ["MAX_COLLIDER_ROTATION", "MIN_APPROACH_SPEED", "collider_kinematics", "pose_kernels"]
+
+MIN_APPROACH_SPEED = 1e-3
+"""Lower bound of the approach speed in the damping of the default law, m/s."""
+MAX_COLLIDER_ROTATION = 1.0
+"""Largest rotation of a touched collider in a step, rad; larger rotations are rejected."""
+
+
+@functools.cache
+def collider_kinematics(dtype: str, meshes: bool) -> _types.SimpleNamespace:
+    """Device functions of the geometry, see kinematics.py; `meshes`: some collider is a triangle mesh."""
+    vec3 = precision(dtype).vec3
+    f64, vec3d = wp.float64, wp.vec3d
+    Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)
+    Other = collider_struct(meshes)
+    k, g = kinematics_functions(dtype), collider_functions(meshes)
+    interpolate, distance, stored_side = k.interpolate, g.distance, g.stored_side
+
+    @wp.func
+    def set_start(
+        col: Other, scr: ContactScratch, world: int, kc: int, point: int, y: vec3d, side: int, activation: f64
+    ) -> vec3d:  # fmt: skip
+        """Set position and depth of a point at the start of an attempt; the normal there in the collider's frame."""
+        d = distance(col, kc, y, side)
+        scr.start_position[world, point] = y
+        scr.activation_gap[world, point] = activation
+        scr.start_depth[world, point] = activation - d[3]
+        return vec3d(d[0], d[1], d[2])
+
+    @wp.func
+    def material_velocity(col: Other, clock: Clock, world: int, kc: int, y: vec3d) -> vec3d:
+        """Mean velocity in the attempt of the collider's material at y in its frame, m/s."""
+        before = col.previous_rotation[world, kc] * y + col.previous_position[world, kc]
+        return (col.rotation[world, kc] * y + col.position[world, kc] - before) / clock.h[world]
+
+    @wp.func
+    def begin_point(
+        con: Contacts, col: Other, facets: Facets, his: History, clock: Clock, scr: ContactScratch,
+        u_n: wp.array2d(dtype=vec3), v_n: wp.array2d(dtype=vec3), world: int, item: int, q: int,
+    ):  # fmt: skip
+        """Position and depth of a point at the start of an attempt, and the approach speed of the damping."""
+        c = facets.contact[item]
+        point = facets.first_point + item * facets.point_count + q
+        rec = k.history_row(con, c, point)
+        kc = col.of_contact[c]
+        shift = interpolate(facets, u_n, world, q, item)
+        rotation = col.previous_rotation[world, kc]
+        y = wp.transpose(rotation) * (facets.X[q, item] + shift - col.previous_position[world, kc])
+        in_contact = his.speed[world, rec] > f64(0.0)
+        if wp.static(meshes):
+            if not in_contact:
+                his.contact_state[world, rec] = g.sheet_side(col, kc, y, his.contact_state[world, rec])
+        side = stored_side(col, kc, in_contact, his.contact_state[world, rec])
+        now = k.activation_gap(con, his, world, c, point, clock.time[world], col.previous_margin[world, kc])
+        n = set_start(col, scr, world, kc, point, y, side, now)
+        scr.start_displacement[world, point] = shift
+        speed = wp.max(his.speed[world, rec], f64(MIN_APPROACH_SPEED))
+        if clock.is_static == 0:
+            v = material_velocity(col, clock, world, kc, y) - interpolate(facets, v_n, world, q, item)
+            speed = wp.max(speed, wp.dot(rotation * n, v))
+        scr.approach_speed[world, point] = speed
+
+    @wp.func
+    def start_motion(
+        con: Contacts, col: Other, facets: Facets, his: History, clock: Clock, scr: ContactScratch,
+        v_n: wp.array2d(dtype=vec3), world: int, item: int, q: int,
+    ):  # fmt: skip
+        """Normal, and velocity of a point relative to the collider, m/s, at the start of the attempt."""
+        c = facets.contact[item]
+        point = facets.first_point + item * facets.point_count + q
+        kc = col.of_contact[c]
+        y = scr.start_position[world, point]
+        d = distance(col, kc, y, stored_side(col, kc, True, his.contact_state[world, k.history_row(con, c, point)]))
+        v = interpolate(facets, v_n, world, q, item) - material_velocity(col, clock, world, kc, y)
+        return col.previous_rotation[world, kc] * vec3d(d[0], d[1], d[2]), v
+
+    @wp.func
+    def turn_in_step(col: Other, world: int, kc: int) -> f64:
+        """Rotation of a collider in the step, rad."""
+        if col.rotation_law[kc] < 0:
+            return f64(0.0)
+        return col.angle[world, kc] - col.previous_angle[world, kc]
+
+    @wp.func
+    def is_far(con: Contacts, col: Other, scr: ContactScratch, world: int, c: int, point: int, gap: f64) -> bool:
+        """True if a point is outside of a mesh by a lower bound `gap` of its distance: this avoids a search."""
+        kind = col.kind[col.of_contact[c]]
+        return kind == MESH and con.law[c] & ANY_GAP == 0 and gap > f64(0.0)
+
+    @wp.func
+    def set_depth(
+        con: Contacts, col: Other, his: History, scr: ContactScratch, world: int, c: int, point: int, t: PointContact,
+        activation: f64,
+    ) -> PointContact:  # fmt: skip
+        """The record with side, normal, depth and state from its local position and relative motion."""
+        out = t
+        kc = col.of_contact[c]
+        rotation = col.rotation[world, kc]
+        start = scr.start_position[world, point]
+        before = scr.start_depth[world, point]
+        in_contact = his.speed[world, k.history_row(con, c, point)] > f64(0.0)
+        d = wp.vec4d(f64(0.0), f64(0.0), f64(1.0), f64(0.0))
+        out.feature = -1
+        far = bool(False)
+        if wp.static(meshes):
+            d[3] = scr.activation_gap[world, point] - before - wp.length(t.local_position - start)
+            far = not in_contact and d[3] > activation and is_far(con, col, scr, world, c, point, d[3])
+        if not far:
+            side = stored_side(col, kc, in_contact, his.contact_state[world, k.history_row(con, c, point)])
+            out.feature = g.sweep(col, kc, start, t.local_position, side)
+            d = distance(col, kc, t.local_position, out.feature)
+        out.normal = rotation * vec3d(d[0], d[1], d[2])
+        out.depth = activation - d[3]
+        change = g.depth_change(col, kc, out.feature, start, t.local_position,
+                                wp.transpose(rotation) * t.relative_motion,
+                                scr.activation_gap[world, point] - before, d[3])  # fmt: skip
+        if change[1] != f64(0.0):
+            out.depth = before + change[0] + (activation - scr.activation_gap[world, point])
+        near = out.depth > f64(0.0) or before > f64(0.0)
+        out.state = wp.where(out.feature == -2, PASSED, IN_REACH)
+        if near and out.feature != -2 and wp.abs(turn_in_step(col, world, kc)) > f64(MAX_COLLIDER_ROTATION):
+            out.state = TURNED
+        return out
+
+    @wp.func
+    def evaluate(
+        con: Contacts, col: Other, facets: Facets, his: History, scr: ContactScratch, world: int, q: int, item: int,
+        point: int, u: wp.array2d(dtype=vec3d), time: f64,
+    ) -> PointContact:  # fmt: skip
+        """The record of a point at displacements u (float64, see kernels/contact/double_displacements.py)."""
+        out = PointContact()
+        c = facets.contact[item]
+        kc = col.of_contact[c]
+        rec = k.history_row(con, c, point)
+        moved = k.interpolate_acting(facets, scr, u, world, q, item)
+        out.position = k.reference_position(facets, scr, world, q, item) + moved
+        rotation = col.rotation[world, kc]
+        out.local_position = wp.transpose(rotation) * (out.position - col.position[world, kc])
+        motion = moved - scr.start_displacement[world, point] - col.translation[world, kc]
+        if col.rotation_law[kc] >= 0:
+            motion -= col.rotation_change[world, kc] * (
+                col.previous_rotation[world, kc] * scr.start_position[world, point]
+            )
+        out.relative_motion = motion
+        activation = k.activation_gap(con, his, world, c, point, time, col.margin[world, kc])
+        out = set_depth(con, col, his, scr, world, c, point, out, activation)
+        out.previous_depth = k.depth_at_start(con, facets, his, scr, world, c, point)
+        if his.speed[world, rec] > f64(0.0):
+            out.spring = his.spring[world, rec]
+            if con.law[c] & FIXED_SPRING == 0:
+                out.spring = rotation * out.spring
+        return out
+
+    @wp.func
+    def frozen_motion(
+        col: Other, facets: Facets, scr: ContactScratch, u: wp.array2d(dtype=vec3d), world: int, q: int, item: int,
+        point: int, t: PointContact, limit: f64, fresh: int,
+    ) -> PointContact:  # fmt: skip
+        """The record itself: motion relative to a rigid shape is linear in the displacements."""
+        return t
+
+    @wp.func
+    def transmit(
+        con: Contacts, col: Other, scr: ContactScratch, world: int, c: int, point: int, t: PointContact, friction: vec3d
+    ):  # fmt: skip
+        """No-op: a collider has no slots."""
+        return
+
+    @wp.func
+    def other_product(
+        col: Other, scr: ContactScratch, p: wp.array2d(dtype=vec3), world: int, point: int, d: vec3
+    ) -> vec3:  # fmt: skip
+        """Stiffness of a point times its displacement d, N."""
+        return k.multiply_symmetric(scr.stiffness[world, point], d)
+
+    @wp.func
+    def gather_other_product(
+        col: Other, scr: ContactScratch, world: int, entry: int, lane: int, lanes: int
+    ) -> vec3:  # fmt: skip
+        """Zero: a collider has no slots."""
+        return vec3()
+
+    @wp.func
+    def other_entries(col: Other) -> int:
+        """First pool entry of the other side: none."""
+        return 0
+
+    @wp.func
+    def report_sign(col: Other, c: int) -> f64:
+        """1: reports state the force on the body."""
+        return f64(1.0)
+
+    @wp.func
+    def carried(con: Contacts, col: Other, world: int, c: int, t: PointContact) -> vec3d:
+        """Motion of the collider's material at a point, m, by its last velocity."""
+        kc = col.of_contact[c]
+        if col.rotation_law[kc] < 0:
+            return col.translation[world, kc]
+        return turn_in_step(col, world, kc) * wp.cross(col.rotation_axis[kc], t.position - col.rotation_anchor[kc])
+
+    @wp.func
+    def slip_frame(col: Other, world: int, c: int, point: int, t: PointContact) -> wp.mat33d:
+        """Axes of the collider as columns."""
+        return col.rotation[world, col.of_contact[c]]
+
+    @wp.func
+    def touched_state(col: Other, world: int, c: int, point: int, t: PointContact) -> int:
+        """Side of the collider that a point is in contact with, + 1."""
+        return g.updated_side(col, col.of_contact[c], t.local_position, t.feature) + 1
+
+    @wp.func
+    def released_state(col: Other, his: History, world: int, c: int, point: int, rec: int) -> int:
+        """Contact state of a point that is not in contact: its side of a sheet."""
+        in_contact = his.speed[world, rec] > f64(0.0)
+        return g.released_contact_state(col, col.of_contact[c], in_contact, his.contact_state[world, rec])
+
+    @wp.func
+    def store_side(col: Other, world: int, kc: int):
+        """Store the pose of a collider after an accepted step."""
+        col.previous_position[world, kc] = col.position[world, kc]
+        col.previous_rotation[world, kc] = col.rotation[world, kc]
+        col.previous_angle[world, kc] = col.angle[world, kc]
+        col.previous_margin[world, kc] = col.margin[world, kc]
+
+    return kernel_set(locals())
+
+
+GEOMETRIES["colliders"] = functools.partial(collider_kinematics, meshes=False)
+GEOMETRIES["colliders_meshes"] = functools.partial(collider_kinematics, meshes=True)
+
+
+@functools.cache
+def pose_kernels(meshes: bool) -> _types.SimpleNamespace:
+    """Kernel of the poses of colliders."""
+    f64, vec3d = wp.float64, wp.vec3d
+    Colliders = collider_struct(meshes)
+    module = kernel_module(f"collider_poses{MESH_SUFFIX * meshes}", light=True)
+
+    @wp.kernel(module=module)
+    def update_poses(
+        col: Colliders, value: wp.array2d(dtype=vec3d), active: wp.array(dtype=wp.int32)
+    ):  # fmt: skip
+        """Poses of the colliders at the end of the attempt, and their motion in it."""
+        world, k = wp.tid()
+        if active[world] == 0:
+            return
+        position = col.center[k]
+        rotation = col.axes[k]
+        if col.rotation_law[k] >= 0:
+            angle = value[world, col.rotation_law[k]][0]
+            n = col.rotation_axis[k]
+            N = wp.skew(n)
+            half = wp.sin(f64(0.5) * angle)
+            R = wp.identity(n=3, dtype=f64) + wp.sin(angle) * N + (f64(2.0) * half * half) * (N * N)
+            position = col.rotation_anchor[k] + R * (position - col.rotation_anchor[k])
+            rotation = R * rotation
+        if col.translation_law[k] >= 0:
+            position += value[world, col.translation_law[k]]
+        col.position[world, k] = position
+        col.rotation[world, k] = rotation
+        col.translation[world, k] = position - col.previous_position[world, k]
+        if col.rotation_law[k] >= 0:
+            col.angle[world, k] = value[world, col.rotation_law[k]][0]
+            col.rotation_change[world, k] = rotation * wp.transpose(col.previous_rotation[world, k]) - wp.identity(
+                n=3, dtype=f64
+            )
+
+    return kernel_set(locals())

@@ -1,0 +1,163 @@
+"""Kinematics of a point of contact: what its own side gives, before the geometry of the other side fills the record.
+
+The record is `PointContact` (structs.py). A geometry of the other side is one file that adds itself to `GEOMETRIES`:
+collider_kinematics.py for rigid shapes, facet_kinematics.py for facets of bodies. Assembly and ledger are made once for
+each geometry, from its struct `Other` and these device functions:
+
+begin_point: position, depth and approach speed of a point at the start of an attempt.
+start_motion: normal, and velocity relative to the other side, at the start (explicit contacts).
+evaluate: the record at an iterate.
+frozen_motion: the record with the motion that friction acts on while its limit is frozen.
+transmit: what the other side needs to gather the force of a point on its slots.
+other_product: force of a point for a direction of a product, on its own side; keeps what the other side gathers.
+gather_other_product, other_entries: sum of a slot of the other side, and the place of its first entry.
+report_sign: 1, or -1 where reports state the force on the other side.
+carried: prescribed motion of the other side's material at a point in the step, which does work.
+slip_frame: axes in which the elastic slip is stored, turned with the other side.
+touched_state, released_state: `History.contact_state` of a point after a step, in contact or not.
+store_side: what the other side stores after a step.
+"""
+
+import functools
+import types as _types
+from collections.abc import Callable
+from typing import Any
+
+import warp as wp
+
+from ..common.types import kernel_set, precision
+from .structs import contact_structs
+
+__all__ = ["GEOMETRIES", "kinematics_functions"]
+
+GEOMETRIES: dict[str, Callable[[str], _types.SimpleNamespace]] = {}
+"""Geometries of the other side by name: the precision of the displacements -> device functions and `Other`."""
+
+
+@functools.cache
+def kinematics_functions(dtype: str) -> _types.SimpleNamespace:
+    """Device functions in one precision of the displacements; everything else is float64."""
+    p = precision(dtype)
+    T, vec3, sym = p.T, p.vec3, p.sym
+    f64, vec3d = wp.float64, wp.vec3d
+    Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)
+
+    @wp.func
+    def interpolate(facets: Facets, field: wp.array2d(dtype=Any), world: int, point: int, item: int) -> vec3d:
+        """sum_i s_i field_i at a point."""
+        out = vec3d()
+        for i in range(facets.conn.shape[0]):
+            out += f64(facets.shape[point, i, item]) * vec3d(field[world, facets.conn[i, item]])
+        return out
+
+    @wp.func
+    def acting_shape_value(facets: Facets, scr: ContactScratch, world: int, point: int, i: int, item: int) -> T:
+        """Shape value of slot i at the active point: a point of a facet, or that of a lumped contact."""
+        if facets.tracks_deepest != 0:
+            return scr.shape_values[world, facets.contact[item], i]
+        return facets.shape[point, i, item]
+
+    @wp.func
+    def interpolate_acting(
+        facets: Facets, scr: ContactScratch, field: wp.array2d(dtype=Any), world: int, point: int, item: int
+    ) -> vec3d:
+        """sum_i s_i field_i at the active point."""
+        if facets.tracks_deepest == 0:
+            return interpolate(facets, field, world, point, item)
+        out = vec3d()
+        for i in range(facets.conn.shape[0]):
+            out += f64(acting_shape_value(facets, scr, world, point, i, item)) * vec3d(
+                field[world, facets.conn[i, item]]
+            )
+        return out
+
+    @wp.func
+    def reference_position(facets: Facets, scr: ContactScratch, world: int, point: int, item: int) -> vec3d:
+        """Reference position of the active point, m."""
+        if facets.tracks_deepest != 0:
+            return scr.point_reference[world, facets.contact[item]]
+        return facets.X[point, item]
+
+    @wp.func
+    def monomial_derivative(x: f64, power: int, derivative: int) -> f64:
+        """Derivative of x^power of order `derivative`."""
+        out = f64(1.0)
+        for j in range(derivative):
+            out *= f64(power - j)
+        for _ in range(power - derivative):
+            out *= x
+        return out
+
+    @wp.func
+    def lagrange_polynomial(facets: Facets, q: int, s: wp.vec2d) -> f64:
+        """Lagrange polynomial of a facet: 1 at point q and 0 at the others."""
+        out = f64(0.0)
+        for m in range(facets.exponents.shape[0]):
+            out += facets.lagrange_coefficients[q, m] * (
+                monomial_derivative(s[0], facets.exponents[m][0], 0)
+                * monomial_derivative(s[1], facets.exponents[m][1], 0)
+            )
+        return out
+
+    @wp.func
+    def tangential(n: vec3d, a: vec3d) -> vec3d:
+        """Component of a normal to n."""
+        return a - wp.dot(n, a) * n
+
+    @wp.func
+    def history_row(con: Contacts, c: int, point: int) -> int:
+        """Index of a point's history."""
+        if con.single_point[c] != 0:
+            return con.first_point[c]
+        return point
+
+    @wp.func
+    def remaining_overlap(con: Contacts, his: History, world: int, c: int, point: int, time: f64) -> f64:
+        """Remaining part of an initial overlap, m."""
+        left = f64(1.0) - (time - his.overlap_time[world]) / con.overlap_decay_time[c]
+        return his.overlap[world, point] * wp.clamp(left, f64(0.0), f64(1.0))
+
+    @wp.func
+    def overlap_recovery(con: Contacts, his: History, clock: Clock, world: int, c: int, point: int) -> f64:
+        """Outward motion of the surface of an initial overlap in a substep, m: its force does work."""
+        now = clock.new_time[world]
+        before = remaining_overlap(con, his, world, c, point, now - clock.h[world])
+        return before - remaining_overlap(con, his, world, c, point, now)
+
+    @wp.func
+    def activation_gap(con: Contacts, his: History, world: int, c: int, point: int, time: f64, margin: f64) -> f64:
+        """Gap at which contact begins, m: offset + `margin` - remaining overlap."""
+        return con.offset[c] + margin - remaining_overlap(con, his, world, c, point, time)
+
+    @wp.func
+    def depth_at_start(
+        con: Contacts, facets: Facets, his: History, scr: ContactScratch, world: int, c: int, point: int
+    ) -> f64:
+        """Depth at the start of the step, m; for a moving point in contact, that of the deepest position then."""
+        if facets.tracks_deepest != 0:
+            rec = history_row(con, c, point)
+            if his.speed[world, rec] > f64(0.0):
+                return his.previous_depth[world, rec]
+        return scr.start_depth[world, point]
+
+    @wp.func
+    def is_acting(con: Contacts, scr: ContactScratch, world: int, c: int, point: int) -> f64:
+        """1, or 0 if another point represents the contact."""
+        if con.single_point[c] != 0 and scr.contact_point[world, c] != point:
+            return f64(0.0)
+        return f64(1.0)
+
+    @wp.func
+    def inverse_step(clock: Clock, world: int) -> f64:
+        """1/h, 1/s; 0 in statics."""
+        if clock.is_static != 0:
+            return f64(0.0)
+        return f64(1.0) / clock.h[world]
+
+    @wp.func
+    def multiply_symmetric(k: sym, p: vec3) -> vec3:
+        """Product of the symmetric matrix k (Voigt) with p."""
+        return vec3(k[0] * p[0] + k[5] * p[1] + k[4] * p[2], k[5] * p[0] + k[1] * p[1] + k[3] * p[2],
+                    k[4] * p[0] + k[3] * p[1] + k[2] * p[2])  # fmt: skip
+
+    return kernel_set(locals())

@@ -1,0 +1,244 @@
+"""Contact laws of one point as derivatives of scalars: normal force of the depth, potentials of friction.
+
+delta is the depth, m; delta_n that at the start of the step; all in float64. The elastic force is k delta^1.5 for a
+lumped contact ("sphere"), else k delta.
+
+"default": Hunt and Crossley's normal force and an anchored friction spring. In patches with mu_static > mu the points
+begin to slip one after another, the least loaded first, and slipping points carry only mu: a stiff body slides before
+mu_static.
+
+"paper": Paper I, Eqs. (73)-(83), unmodified. Known properties: with max(0, .) rebounds for e = 0.1, 0.3, 0.5, 0.7, 0.9
+are 0.2527, 0.3971, 0.5503, 0.7182, 0.9020 (spheres) and 0.2242, 0.3635, 0.5174, 0.6926, 0.8914 (patches). The implicit
+patch force jumps at first contact, and some impacts have no solution (`smoothing` ramps it). With k_t ~ sqrt(delta) and
+a persistent spring, energy is created when the normal load rises (Elata and Berryman 1996). Eq. (83) reverses the
+spring where gamma_t v exceeds mu F_n. Eq. (78) does not rotate it with the bodies: a sticking block walks on a rotating
+plate.
+
+"smooth": Paper I, 6.2.
+
+A law of one's own is an entry of `LAWS`, see "A new contact law" in warpfea/README.md.
+"""
+
+import functools
+import types as _types
+from typing import NamedTuple
+
+import warp as wp
+
+from ..common.types import kernel_set
+
+__all__ = [
+    "ANY_GAP",
+    "FIXED_SPRING",
+    "LAWS",
+    "SLIP_SPEED",
+    "SPEED_DAMPING",
+    "TRAIT_BITS",
+    "UNLOADING",
+    "ContactLaw",
+    "elastic_force",
+    "huber_friction",
+    "law_code",
+    "law_functions",
+    "smooth_friction",
+]
+
+f64, vec3d, vec4d = wp.float64, wp.vec3d, wp.vec4d
+SPEED_DAMPING, UNLOADING, FIXED_SPRING, SLIP_SPEED, ANY_GAP = 1, 2, 4, 8, 16
+"""Traits of a law, added up. SPEED_DAMPING: its damping g is d/(v_i h), with d of the restitution and v_i the largest
+approach speed, else gamma_n/h. UNLOADING: a lumped contact that unloads reduces its elastic slip with its radius.
+FIXED_SPRING: Eqs. (78) and (83) of Paper I, where the elastic slip does not turn with the bodies and may reverse.
+SLIP_SPEED: friction of the slip speed, without elastic slip. ANY_GAP: it acts at any gap."""
+TRAIT_BITS = 5
+
+
+@wp.func
+def elastic_force(single_point: int, k: f64, delta: f64) -> wp.vec2d:
+    """Elastic force, N, and stored energy, J."""
+    if delta <= f64(0.0):
+        return wp.vec2d()
+    if single_point != 0:
+        force = k * delta * wp.sqrt(delta)
+        return wp.vec2d(force, f64(0.4) * force * delta)
+    return wp.vec2d(k * delta, f64(0.5) * k * delta * delta)
+
+
+@wp.func
+def hunt_crossley(
+    single_point: int, k: f64, rate: f64, ramp: f64, eps: f64, delta: f64, delta_n: f64
+) -> vec4d:  # fmt: skip
+    """F = F_el (1 + rate (delta - delta_n)), not below 0 (Hunt and Crossley 1975), its derivative, its integral,
+    and the magnitude of the terms that the integral is the difference of (for its round-off).
+
+    rate = chi / h, 1/m. F increases with delta wherever it is positive, so its integral is convex.
+    """
+    if delta <= f64(0.0):
+        return vec4d()
+    factor = f64(1.0) + rate * (delta - delta_n)
+    if factor <= f64(0.0):
+        return vec4d()
+    m = wp.where(single_point != 0, f64(1.5), f64(1.0))
+    c0 = f64(1.0) - rate * delta_n
+    power = elastic_force(single_point, k, delta)[0]
+    force = power * factor
+    slope = m * force / delta + power * rate
+    psi = power * delta * (c0 / (m + f64(1.0)) + rate * delta / (m + f64(2.0)))
+    size = power * delta * ((f64(1.0) + rate * wp.abs(delta_n)) / (m + f64(1.0)) + rate * delta / (m + f64(2.0)))
+    if c0 < f64(0.0):  # the force begins at delta_a > 0
+        begin = -c0 / rate
+        low = elastic_force(single_point, k, begin)[0] * begin
+        psi -= low * (c0 / (m + f64(1.0)) + rate * begin / (m + f64(2.0)))
+    return vec4d(force, slope, psi, size)
+
+
+@wp.func
+def damped_force(single_point: int, k: f64, g: f64, ramp: f64, delta: f64, delta_n: f64) -> vec3d:
+    """k_n delta - gamma_n v_n of Eq. (77) before the cut at 0, its derivative and its integral.
+
+    g = gamma_n / h (of spheres gamma_n is g h delta^(1/4)); the damping grows linearly over the depth `ramp`.
+    """
+    spring = elastic_force(single_point, k, delta)
+    if single_point != 0:
+        root = wp.sqrt(wp.sqrt(delta))
+        force = spring[0] + g * root * (delta - delta_n)
+        slope = f64(0.25) * force / wp.max(delta, f64(1.0e-300)) + root * (f64(1.25) * k * root + g)
+        psi = spring[1] + g * root * delta * (delta / f64(2.25) - delta_n / f64(1.25))
+        return vec3d(force, slope, psi)
+    if delta < ramp:
+        part = delta / ramp
+        force = spring[0] + g * part * (delta - delta_n)
+        psi = spring[1] + g * part * delta * (delta / f64(3.0) - f64(0.5) * delta_n)
+        return vec3d(force, k + g * part + g / ramp * (delta - delta_n), psi)
+    psi = spring[1] + g * (f64(0.5) * delta * delta - delta_n * delta)
+    # reduction of the integral by the ramp
+    psi += g * ramp * (f64(0.5) * delta_n - ramp / f64(6.0))
+    return vec3d(spring[0] + g * (delta - delta_n), k + g, psi)
+
+
+@wp.func
+def paper_law(single_point: int, k: f64, g: f64, ramp: f64, eps: f64, delta: f64, delta_n: f64) -> vec4d:
+    """Eq. (77): max(0, k_n delta - gamma_n v_n), its derivative, integral, and the magnitude of the integral."""
+    if delta <= f64(0.0):
+        return vec4d()
+    out = damped_force(single_point, k, g, ramp, delta, delta_n)
+    if out[0] <= f64(0.0):
+        return vec4d()
+    size = elastic_force(single_point, k, delta)[1] + g * delta * (delta + wp.abs(delta_n))
+    if delta_n > f64(0.0) and g > f64(0.0):
+        low = f64(0.0)  # depth at which the force begins: negative below, positive at delta_n
+        high = wp.min(delta, delta_n)
+        for _ in range(60):
+            middle = f64(0.5) * (low + high)
+            if damped_force(single_point, k, g, ramp, middle, delta_n)[0] > f64(0.0):
+                high = middle
+            else:
+                low = middle
+        out[2] = out[2] - damped_force(single_point, k, g, ramp, low, delta_n)[2]
+    return vec4d(out[0], out[1], out[2], size)
+
+
+@wp.func
+def smooth_law(single_point: int, k: f64, g: f64, ramp: f64, eps: f64, delta: f64, delta_n: f64) -> vec4d:
+    """(y + sqrt(y^2 + eps^2)) / 2 in place of max(0, y) (Paper I, 6.2), y = k delta - gamma v, at any gap."""
+    y = k * delta + g * (delta - delta_n)
+    root = wp.sqrt(y * y + eps * eps)
+    total = y + root
+    if y < f64(0.0):
+        total = eps * eps / (root - y)
+    bend = k + g
+    logarithm = wp.log((wp.abs(y) + root) / eps) * wp.sign(y)
+    psi = f64(0.25) * (y * total + eps * eps * logarithm) / bend
+    return vec4d(f64(0.5) * total, f64(0.5) * total / root * bend, psi, wp.abs(psi) + k * delta * delta)
+
+
+@wp.func
+def huber_friction(trial: vec3d, stiffness: f64, friction_limit: f64) -> wp.vec2d:
+    """Huber potential, J, of a trial force stiffness x slip cut at `friction_limit`, and the fraction of the trial
+    force that acts."""
+    size = wp.length(trial)
+    if size <= friction_limit:
+        return wp.vec2d(f64(0.5) * size * size / stiffness, f64(1.0))
+    return wp.vec2d(
+        (friction_limit * size - f64(0.5) * friction_limit * friction_limit) / stiffness, friction_limit / size
+    )
+
+
+@wp.func
+def smooth_friction(slip: vec3d, inv_h: f64, v_eps: f64, friction_limit: f64) -> wp.vec2d:
+    """friction_limit v / sqrt(v^2 + v_eps^2) (Paper I, 6.2), v = slip/h: potential, J, and force over slip, N/m."""
+    v = inv_h * slip
+    root = wp.sqrt(wp.dot(v, v) + v_eps * v_eps)
+    if inv_h == f64(0.0):
+        return wp.vec2d()
+    return wp.vec2d(friction_limit * wp.dot(v, v) / (root + v_eps) / inv_h, friction_limit * inv_h / root)
+
+
+class ContactLaw(NamedTuple):
+    """Law of contact, chosen by `add_contact(..., law=name)`.
+
+    Attributes:
+        normal: device function (single_point, k, g, ramp, eps, delta, delta_n) -> (force, N, its derivative by the
+            depth, N/m, its integral, J, magnitude of the integral's terms, J), of the whole region. k: normal
+            stiffness, N/m (single_point: N/m^1.5); g: damping by trait SPEED_DAMPING, 0 for the elastic part; ramp,
+            eps: from `smoothing`, m and N; delta, delta_n: depth now and at the start of the step, m. All are 0 for
+            delta <= 0, without trait ANY_GAP.
+        traits: sum of traits of the law.
+        smoothing: noun of the option `smoothing`: None (refused), "depth" (ramp) or "pair" (eps and a slip speed).
+        explicit: True if `treatment="explicit"` is available: Eqs. (77)-(83) of Paper I.
+    """
+
+    normal: wp.Function
+    traits: int = SPEED_DAMPING | UNLOADING
+    smoothing: str | None = None
+    explicit: bool = False
+
+
+LAWS = {
+    "default": ContactLaw(hunt_crossley),
+    "paper": ContactLaw(paper_law, FIXED_SPRING, "depth", explicit=True),
+    "smooth": ContactLaw(smooth_law, SLIP_SPEED | ANY_GAP, "pair"),
+}
+"""Laws by name; the number of a law is its place."""
+DEFAULT, PAPER, SMOOTH = range(3)
+
+
+def law_code(name: str) -> int:
+    """Number and traits of a law, as in `Contacts.law`."""
+    return list(LAWS).index(name) << TRAIT_BITS | LAWS[name].traits
+
+
+@functools.cache
+def law_functions(own: tuple[str, ...] = ()) -> _types.SimpleNamespace:
+    """Device function `normal_law` of the built-in laws and those of one's own, by name."""
+    hunt_crossley, paper_law, smooth_law = (LAWS[name].normal for name in ("default", "paper", "smooth"))
+
+    @wp.func
+    def normal_law(
+        law: int, single_point: int, k: f64, g: f64, ramp: f64, eps: f64, delta: f64, delta_n: f64
+    ) -> vec4d:  # fmt: skip
+        """Normal force, N, its derivative by the depth, N/m, its integral, J, and the magnitude of its terms; g is
+        chi/h or gamma_n/h."""
+        if law == DEFAULT:
+            return hunt_crossley(single_point, k, g, ramp, eps, delta, delta_n)
+        if law == PAPER:
+            return paper_law(single_point, k, g, ramp, eps, delta, delta_n)
+        return smooth_law(single_point, k, g, ramp, eps, delta, delta_n)
+
+    for name in own:
+        normal_law = _with_law(list(LAWS).index(name), LAWS[name].normal, normal_law)
+    return kernel_set({"normal_law": normal_law})
+
+
+def _with_law(number: int, normal: wp.Function, others: wp.Function) -> wp.Function:
+    """Device function of one more law."""
+
+    @wp.func
+    def normal_law(
+        law: int, single_point: int, k: f64, g: f64, ramp: f64, eps: f64, delta: f64, delta_n: f64
+    ) -> vec4d:  # fmt: skip
+        """The law of this number, else another one."""
+        if law == number:
+            return normal(single_point, k, g, ramp, eps, delta, delta_n)
+        return others(law, single_point, k, g, ramp, eps, delta, delta_n)
+
+    return normal_law

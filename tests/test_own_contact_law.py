@@ -1,0 +1,101 @@
+"""A contact law of one's own, in this file alone: an exponential normal force with Hunt and Crossley's damping."""
+
+import math
+
+import numpy as np
+import pytest
+import warp as wp
+
+import warpfea as wf
+from warpfea.contact import LAWS, ContactLaw
+from warpfea.contact.collider_tables import contact_law_constants
+
+f64 = wp.float64
+LENGTH = 1e-5
+"""L, m, of the force k L (exp(d / L) - 1)."""
+WEIGHT = 9.81
+
+
+@wp.func
+def integral(k: f64, c0: f64, g: f64, x: f64) -> f64:
+    """Integral of k L (exp(x / L) - 1) (c0 + g x) from 0, J."""
+    L = f64(LENGTH)
+    e = wp.exp(x / L)
+    return k * L * (c0 * (L * (e - f64(1.0)) - x) + g * (L * x * e - L * L * (e - f64(1.0)) - f64(0.5) * x * x))
+
+
+@wp.func
+def exponential(single_point: int, k: f64, g: f64, ramp: f64, eps: f64, delta: f64, delta_n: f64) -> wp.vec4d:
+    """F = k L (exp(d / L) - 1) (1 + g (d - d_n)), not below 0."""
+    c0 = f64(1.0) - g * delta_n
+    if delta <= f64(0.0) or c0 + g * delta <= f64(0.0):
+        return wp.vec4d()
+    e = wp.exp(delta / f64(LENGTH))
+    spring = k * f64(LENGTH) * (e - f64(1.0))
+    psi = integral(k, c0, g, delta)
+    if c0 < f64(0.0):
+        psi -= integral(k, c0, g, -c0 / g)
+    size = integral(k, wp.abs(c0), g, delta)
+    return wp.vec4d(spring * (c0 + g * delta), k * e * (c0 + g * delta) + spring * g, psi, size)
+
+
+@pytest.fixture
+def registered(monkeypatch):
+    monkeypatch.setitem(LAWS, "exponential", ContactLaw(exponential))
+
+
+def resting_block(law, other="collider", **options):
+    """A stiff cube of 1 kg on a floor; k so that it rests at a depth of 2 L with the exponential law."""
+    b = wf.ModelBuilder(gravity=(0, 0, -WEIGHT))
+    mesh = wf.mesh.box((0.1, 0.1, 0.1), cells=(1, 1, 1))
+    block = b.add_solid(mesh, material=wf.SVK(E=1e10, nu=0.0, density=1000.0), name="block")
+    if other == "collider":
+        other = b.add_collider(wf.HalfSpace(normal=(0, 0, 1), offset=0.0))
+    else:
+        where = wf.mesh.box((0.1, 0.1, 0.1), cells=(1, 1, 1), origin=(0, 0, -0.1))
+        base = b.add_solid(where, material=wf.SVK(E=1e10, nu=0.0, density=1000.0), name="base")
+        b.clamp(base.nodes(lambda X: X[:, 2] < 1.0))
+        other = base.surface("z+")
+    pad = b.add_contact(block.surface("z-"), other, law=law, name="pad", **options)
+    return b, block, pad
+
+
+def stiffness_for_depth():
+    k = contact_law_constants(resting_block("default")[2])["normal_stiffness"]
+    return WEIGHT / (LENGTH * math.expm1(2.0)) / k
+
+
+@pytest.mark.parametrize("other", ["collider", "body"])
+def test_resting_depth(registered, other):
+    """d = L ln(1 + W / (k L)); a linear spring would give L (exp(2) - 1)."""
+    half = 2.0 if other == "body" else 1.0  # two equal bodies have half the stiffness
+    b, block, _ = resting_block("exponential", other, stiffness=half * stiffness_for_depth())
+    b.clamp(block.nodes("z+"), components="xy")
+    result = wf.solve_static(b.finalize(device="cpu"), load_steps=2, stabilise=True)
+    depth = -result.displacements(block)[0][block.mesh.points[:, 2] < 1e-9, 2]
+    np.testing.assert_allclose(depth, 2.0 * LENGTH, rtol=2e-3)
+
+
+def test_energy_of_an_impact(registered):
+    """The stored energy is the law's own, and the ledger closes with what the damping takes."""
+    b, block, _ = resting_block("exponential", stiffness=stiffness_for_depth(), restitution=0.5)
+    b.set_initial(block, velocity=(0, 0, -0.01))
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=2e-5, solver=wf.NewtonPCG(tol=1e-12))
+    k = stiffness_for_depth() * contact_law_constants(resting_block("default")[2])["normal_stiffness"]
+    deepest = 0.0
+    for _ in range(10):
+        sim.step(20)
+        depth = sim.contact_record("pad").penetration[0, -1]
+        if depth > deepest:
+            deepest = depth
+            stored = k * LENGTH * (LENGTH * math.expm1(depth / LENGTH) - depth)
+            assert sim.energies()["contact"][0] == pytest.approx(stored, rel=1e-3)
+    energies = sim.energies()
+    assert deepest > 2.0 * LENGTH
+    assert energies["contact_loss"][0] > 0.1 * 0.5 * 0.01**2
+    assert abs(energies["ledger_residual"][0]) < 1e-9 * 0.5 * 0.01**2
+
+
+def test_an_unknown_law_is_refused():
+    with pytest.raises(wf.ModelError, match="law = 'exponential' is none of 'default', 'paper', 'smooth'"):
+        resting_block("exponential")
