@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 from element_meshes import rotation
+from warpfea.kernels.elements.element_slots import iterate_struct
 from warpfea.kernels.elements.with_mass import with_mass_kernel
 
 import warpfea as wf
@@ -119,13 +120,15 @@ def straight_model(material, form, dtype, rule):
 
 
 def fields_of(model, u, v, p, mass_factor):
-    """Arrays on the device for fields [world, slot]: of two worlds with their own factors and random histories."""
+    """Arguments on the device for fields [world, slot] of two worlds with their own factors and random histories:
+    iterate, c_M, flags, p."""
     rng, n = np.random.default_rng(3), max(1, model.history_count)
     u, v, p = (wp.array(x.astype(model.dtype), dtype=model.types.vec3, device="cpu") for x in (u, v, p))
     past = 0.1 * rng.uniform(-1, 1, (2, n, 6)).astype(model.dtype)
-    history = wp.array(past, dtype=model.types.sym, device="cpu")
-    mass, dq = (wp.array([x, 2 * x], dtype=wp.float64, device="cpu") for x in (mass_factor, 1e-3))
-    return u, v, history, mass, dq, wp.ones(2, dtype=wp.int32, device="cpu"), p
+    at = iterate_struct(model.dtype)()
+    at.u, at.v, at.history = u, v, wp.array(past, dtype=model.types.sym, device="cpu")
+    mass, at.dq_dv = (wp.array([x, 2 * x], dtype=wp.float64, device="cpu") for x in (mass_factor, 1e-3))
+    return at, mass, wp.ones(2, dtype=wp.int32, device="cpu"), p
 
 
 def with_mass_product(model, kernel, u, v, p, mass_factor=1e3):
@@ -147,13 +150,13 @@ def with_mass_product(model, kernel, u, v, p, mass_factor=1e3):
 def separate_product(model, u, v, p, mass_factor):
     """The same from the stiffness of elements that read their slots themselves, and the model's mass."""
     (block,) = model.blocks
-    u, v, history, mass, dq, on, p = fields_of(model, u, v, p, mass_factor)
+    at, mass, on, p = fields_of(model, u, v, p, mass_factor)
     out = wp.zeros((2, model.contributions), dtype=model.types.vec3, device="cpu")
-    args = [block.data, u, v, history, dq, on, p, out]
+    args = [block.data, at, on, p, out]
     wp.launch(block.kernels.tangent_product, dim=(2, block.count), inputs=args, device="cpu")
     force = out.numpy().astype(float)
     total = np.stack([m * (model.masses.matrix @ x) for m, x in zip(mass.numpy(), p.numpy().astype(float))])
-    np.add.at(total, (slice(None), block.data.conn.numpy().ravel()), dq.numpy()[:, None, None] * force)
+    np.add.at(total, (slice(None), block.data.conn.numpy().ravel()), at.dq_dv.numpy()[:, None, None] * force)
     return total
 
 

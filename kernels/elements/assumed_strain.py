@@ -12,7 +12,7 @@ import warp as wp
 from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.types import double_1d, double_3d, int_1d, precision
 from .assumed_strain_block import assumed_shear_functions, assumed_strain_struct, coupling_entry_function
-from .element_slots import slot_access_functions
+from .element_slots import iterate_struct, slot_access_functions
 from .matrix import PANEL_UNROLL, column_kernel, panel_kernel, panel_layout, panel_row, panel_row_type, scheme_suffix
 from .products import predicted_stress_kernel, tangent_kernel
 
@@ -42,7 +42,7 @@ def assumed_strain_kernels(
     """
     types = p = precision(dtype)
     T, vec3, mat33, sym6, sym_2d = p.T, p.vec3, p.mat33, p.sym, p.sym_2d
-    Block = assumed_strain_struct(dtype, dissipative)
+    Block, Iterate = assumed_strain_struct(dtype, dissipative), iterate_struct(dtype)
     name = f"tied_{dtype}_{slots}_{ties}_{width}{scheme_suffix(midpoint, dissipative)}{'_worlds' if worlds else ''}"
     module = kernel_module(name)
     matrix_module = kernel_module(f"{name}_matrix", max_unroll=8)
@@ -133,19 +133,18 @@ def assumed_strain_kernels(
 
     @wp.kernel(module=module)
     def internal_force(
-        block: Block, u: p.vec3_2d, v: p.vec3_2d, history: p.sym_2d, dq_dv:
-        double_1d, active: int_1d, lanes: int, contribution: p.vec3_2d,
+        block: Block, iterate: Iterate, active: int_1d, lanes: int, contribution: p.vec3_2d,
         energy: double_3d, min_J: double_1d, domain_J: double_1d,
     ):  # fmt: skip
         """f_i = sum_t s_t (s_i,a x_b + s_i,b x_a), N, and the energy e.s/2, J; one thread per element."""
         world, elem = wp.tid()
         if active[world] == 0 or elem >= block.count:
             return
-        U = load_slots(block, u, world, elem)
+        U = load_slots(block, iterate.u, world, elem)
         x1, x2, e = kinematics(block, U, elem)
         s = Ties()
         if wp.static(midpoint):
-            D = load_slots(block, v, world, elem)
+            D = load_slots(block, iterate.v, world, elem)
             s = tying_stresses(block, step_shears(block, x1, x2, D, e, elem), world, elem)
             _, _, e = kinematics(block, U + D, elem)
         else:
@@ -212,18 +211,7 @@ def assumed_strain_kernels(
             )
 
     @masked_kernel(matrix_module, "active")
-    def prepare_matrix(
-        block: Block,
-        u: p.vec3_2d,
-        v: p.vec3_2d,
-        base: p.vec3_2d,
-        use_prediction: int_1d,
-        history: p.sym_2d,
-        dq_dv: double_1d,
-        form: int,
-        active: int_1d,
-        lines: p.vec3_3d,
-    ):
+    def prepare_matrix(block: Block, iterate: Iterate, form: int, active: int_1d, lines: p.vec3_3d):
         """Data of the ties common to all columns of an element's matrix, [world, row, elem].
 
         Row `tie` holds x_a, row NT + tie x_b, and row 2 NT + tie the shear e_t in its first component.
@@ -231,24 +219,24 @@ def assumed_strain_kernels(
         world, tie, elem = wp.tid()
         da = vec3()
         dd = vec3()
-        first = u[world, block.conn[0, elem]]
+        first = iterate.u[world, block.conn[0, elem]]
         for i in range(NS):
-            x = u[world, block.conn[i, elem]] - block.is_position[i] * first
+            x = iterate.u[world, block.conn[i, elem]] - block.is_position[i] * first
             da += block.derivative_a[tie, i, elem] * x
             dd += block.derivative_b[tie, i, elem] * x
         a = block.X_a[tie, elem] + da
         d = block.X_b[tie, elem] + dd
         shear = wp.dot(block.X_a[tie, elem], dd) + wp.dot(da, d)
         if wp.static(midpoint):
-            D = load_slots(block, v, world, elem)
+            D = load_slots(block, iterate.v, world, elem)
             half_a = directional_derivative(block.derivative_a, D, tie, elem)
             half_d = directional_derivative(block.derivative_b, D, tie, elem)
             shear += wp.dot(half_a, half_d)
             if wp.static(dissipative):
                 shear += block.dissipation * (wp.dot(a, half_d) + wp.dot(d, half_a))
-        if use_prediction[world] == 1:
-            change = load_slots(block, v, world, elem) - load_slots(block, base, world, elem)
-            factor = T(dq_dv[world]) * T(dq_dv[world])
+        if iterate.use_prediction[world] == 1:
+            change = load_slots(block, iterate.v, world, elem) - load_slots(block, iterate.base, world, elem)
+            factor = T(iterate.dq_dv[world]) * T(iterate.dq_dv[world])
             shear -= factor * wp.dot(
                 directional_derivative(block.derivative_a, change, tie, elem),
                 directional_derivative(block.derivative_b, change, tie, elem),
@@ -258,7 +246,7 @@ def assumed_strain_kernels(
         lines[world, 2 * NT + tie, elem] = vec3(shear, T(0.0), T(0.0))
 
     @masked_kernel(matrix_module, "active")
-    def prepare_stress(block: Block, use_prediction: int_1d, active: int_1d, lines: p.vec3_3d):
+    def prepare_stress(block: Block, iterate: Iterate, active: int_1d, lines: p.vec3_3d):
         """s = mu A e of the ties, in the first components of the rows 3 NT + tie."""
         world, tie, elem = wp.tid()
         first = (tie / W) * W
@@ -266,7 +254,7 @@ def assumed_strain_kernels(
         for k in range(W):
             s += coupling_entry(block, tie, k, world, elem) * lines[world, 2 * NT + first + k, elem][0]
         mu = block.coefficients[world % block.coefficients.shape[0], block.material[elem], 0]
-        if use_prediction[world] == 2:
+        if iterate.use_prediction[world] == 2:
             mu = T(0.0)  # no geometric part
         lines[world, 3 * NT + tie, elem] = vec3(midpoint_weight(mu) * s, T(0.0), T(0.0))
 

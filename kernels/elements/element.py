@@ -11,6 +11,7 @@ from ..common.lanes import lane_functions, warp_minimum
 from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.types import double_1d, double_3d, int_1d
 from . import materials
+from .element_slots import iterate_struct
 from .matrix import matrix_kernels, scheme_suffix
 from .output import output_kernels
 from .points import point_functions
@@ -47,7 +48,7 @@ def element_kernels(
     p = fn.types
     T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
     t, m, Block, Local = fn.tensors, fn.law, fn.Block, fn.Local
-    NS, needs_J = fn.slots, fn.needs_J
+    NS, needs_J, Iterate = fn.slots, fn.needs_J, iterate_struct(dtype)
     constant = affine and slots == 4  # F of a straight T4 is constant
     ETA_INDEX, LAMBDA_V_INDEX = materials.ETA_INDEX, materials.LAMBDA_V_INDEX
     viscous = materials.svk(dtype)
@@ -58,18 +59,9 @@ def element_kernels(
 
     @masked_kernel(module, "active")
     def internal_force(
-        block: Block,
-        u: p.vec3_2d,
-        v: p.vec3_2d,
-        history: p.sym_2d,
-        dq_dv: double_1d,
-        active: int_1d,
-        lanes: int,
-        contribution: p.vec3_2d,
-        energy: double_3d,
-        min_J: double_1d,
-        domain_J: double_1d,
-    ):
+        block: Block, iterate: Iterate, active: int_1d, lanes: int, contribution: p.vec3_2d,
+        energy: double_3d, min_J: double_1d, domain_J: double_1d,
+    ):  # fmt: skip
         """Internal force contributions (N), Eqs. (32) and (70), strain energy and viscous potential (J) by element.
 
         `lanes` threads share the quadrature points of an element. The smallest J goes to `min_J`, and for laws that
@@ -79,13 +71,13 @@ def element_kernels(
         lane = index % lanes
         elem = wp.min(index / lanes, block.count - 1)
         c = fn.coefficients(block, world, elem)
-        U = fn.load_slots(block, u, world, elem)
+        U = fn.load_slots(block, iterate.u, world, elem)
         f = Local()
         psi = T(0.0)
         psi_v = T(0.0)
         J_low = T(1.0e30)
-        V = fn.load_velocities(block, v, world, elem)
-        dq = T(dq_dv[world])
+        V = fn.load_velocities(block, iterate.v, world, elem)
+        dq = T(iterate.dq_dv[world])
         for point in range(lane, block.shape_gradient.shape[0], lanes):
             G = fn.field_gradient(block, U, point, elem)
             w = fn.point_weight(block, point, elem)
@@ -102,7 +94,7 @@ def element_kernels(
                 P = m.stress(local, c)
                 psi += w * m.energy(local, c)
             if wp.static(fn.viscous):
-                rate = fn.strain_rate(block, local, Fdot, history, dq, world, point, elem)
+                rate = fn.strain_rate(block, local, Fdot, iterate.history, dq, world, point, elem)
                 S = t.isotropic_stress(rate, c[LAMBDA_V_INDEX], c[ETA_INDEX])
                 P = P + S + local * S
                 psi_v += T(0.5) * dq * w * wp.ddot(S, rate)

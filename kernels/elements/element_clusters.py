@@ -14,6 +14,7 @@ import warp as wp
 from ..common.lanes import lane_functions
 from ..common.modules import KernelSet, kernel_set
 from ..common.types import double_1d, int_1d, precision
+from .element_slots import iterate_struct
 
 __all__ = [
     "CLUSTER_SIZE",
@@ -166,7 +167,7 @@ def cluster_functions(dtype: str, size: int, slots: int, fields: int) -> KernelS
     """
     p = precision(dtype)
     T, vec3, sym6 = p.T, p.vec3, p.sym
-    Clusters, Pool = cluster_struct(), pool_struct(dtype)
+    Clusters, Pool, Iterate = cluster_struct(), pool_struct(dtype), iterate_struct(dtype)
     sync = lane_functions(dtype).sync
     NS, ELEMENTS, ROOM = slots, size, slot_capacity(size, slots)
     PLACE, SUM_START, WORDS = table_layout(size, slots)
@@ -254,19 +255,9 @@ def cluster_functions(dtype: str, size: int, slots: int, fields: int) -> KernelS
 
         @wp.kernel(module=module, launch_bounds=(ELEMENTS, RESIDENT_THREADS[dtype] // ELEMENTS) if bounded else None)
         def with_mass_product(
-            block: Block,
-            clusters: Clusters,
-            u: p.vec3_2d,
-            v: p.vec3_2d,
-            history: p.sym_2d,
-            mass_factor: double_1d,
-            dq_dv: double_1d,
-            active: int_1d,
-            direction: p.vec3_2d,
-            lanes: int,
-            pool: Pool,
-            sums: p.vec3_2d,
-        ):
+            block: Block, clusters: Clusters, iterate: Iterate, mass_factor: double_1d, active: int_1d,
+            direction: p.vec3_2d, lanes: int, pool: Pool, sums: p.vec3_2d,
+        ):  # fmt: skip
             """(c_M M + (dq/dv) K) p of straight elements, one sum per slot of each cluster.
 
             The mass of a straight element is the table of its parent times rho det J0. `lanes` threads process a
@@ -284,16 +275,16 @@ def cluster_functions(dtype: str, size: int, slots: int, fields: int) -> KernelS
             for first in range(lane, count, SLOTS_AT_ONCE * lanes):
                 if first != lane:
                     slot = load_slots(clusters, cluster, first, lanes)
-                copy_field(u, DISPLACEMENT, slot, world, first, lanes, count, pool)
+                copy_field(iterate.u, DISPLACEMENT, slot, world, first, lanes, count, pool)
                 copy_field(direction, DIRECTION, slot, world, first, lanes, count, pool)
                 if wp.static(fields == 3):
-                    copy_field(v, VELOCITY, slot, world, first, lanes, count, pool)
+                    copy_field(iterate.v, VELOCITY, slot, world, first, lanes, count, pool)
             sync()
             first_elem = clusters.element_start[cluster]
             for elem in range(first_elem + lane, clusters.element_start[cluster + 1], lanes):
-                dq = T(dq_dv[world])
+                dq = T(iterate.dq_dv[world])
                 scale = T(mass_factor[world]) * block.density_det_J0[world % block.density_det_J0.shape[0], elem]
-                product(block, pool, history, dq, scale, active[world], world, elem, elem - first_elem)
+                product(block, pool, iterate.history, dq, scale, active[world], world, elem, elem - first_elem)
             sync()
             for k in range(lane, count, lanes):
                 f = vec3()

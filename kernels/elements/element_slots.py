@@ -6,13 +6,30 @@ import warp as wp
 
 from ..common.types import precision
 
-__all__ = ["slot_access_functions", "slot_values_type"]
+__all__ = ["iterate_struct", "slot_access_functions", "slot_values_type"]
 
 
 @functools.cache
 def slot_values_type(dtype: str, slots: int):
     """Slot values of an element: a matrix with one row per slot."""
     return wp.types.matrix(shape=(slots, 3), dtype=precision(dtype).T)
+
+
+@functools.cache
+def iterate_struct(dtype: str):
+    """Iterate at which elements are evaluated; fields are [world, slot]."""
+    p = precision(dtype)
+
+    @wp.struct
+    class Iterate:
+        u: p.vec3_2d  # displacements, m; of a midpoint scheme those at the midpoint
+        v: p.vec3_2d  # velocities, m/s; of a midpoint scheme half of the change of u, m
+        base: p.vec3_2d  # v at the previous iterate, m/s
+        use_prediction: wp.array(dtype=wp.int32)  # [world] 1: stress of the linear prediction; 2: without compression
+        history: p.sym_2d  # [world, point] reference strains of incremental strain rates
+        dq_dv: wp.array(dtype=wp.float64)  # [world] derivative of the end displacement by the velocity, s
+
+    return Iterate
 
 
 @functools.cache
@@ -23,6 +40,7 @@ def slot_access_functions(dtype: str, slots: int, Block) -> tuple[wp.Function, w
         Block: struct of the elements, with conn, is_position, contribution_offset and count.
     """
     p, Local, NS = precision(dtype), slot_values_type(dtype, slots), slots
+    Iterate = iterate_struct(dtype)
 
     @wp.func
     def load_slots(block: Block, field: p.vec3_2d, world: int, elem: int) -> Local:
@@ -34,13 +52,12 @@ def slot_access_functions(dtype: str, slots: int, Block) -> tuple[wp.Function, w
         return U
 
     @wp.func
-    def load_last_change(
-        block: Block, v: p.vec3_2d, base: p.vec3_2d, use_prediction: int, dq: p.T, world: int, elem: int
-    ) -> Local:
+    def load_last_change(block: Block, iterate: Iterate, world: int, elem: int) -> Local:
         """Change of an element's slots in the last iteration, m, if `use_prediction` is 1; else zeros."""
         step = Local()
-        if use_prediction == 1:
-            step = dq * (load_slots(block, v, world, elem) - load_slots(block, base, world, elem))
+        if iterate.use_prediction[world] == 1:
+            change = load_slots(block, iterate.v, world, elem) - load_slots(block, iterate.base, world, elem)
+            step = p.T(iterate.dq_dv[world]) * change
         return step
 
     @wp.func

@@ -8,7 +8,8 @@ computes whole elements: it forms dP/dF once per quadrature point, and its vecto
 import warp as wp
 
 from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
-from ..common.types import double_1d, int_1d, precision
+from ..common.types import int_1d, precision
+from .element_slots import iterate_struct
 
 __all__ = [
     "PANEL_UNROLL",
@@ -65,18 +66,11 @@ def column_kernel(fn: KernelSet, module: wp.Module) -> wp.Kernel:
         fn: functions of the kind: of points.py or assumed_strain.py, and `matrix_column`.
         module: that it is compiled in.
     """
-    p, Block, NS = fn.types, fn.Block, fn.slots
+    p, Block, NS, Iterate = fn.types, fn.Block, fn.slots, iterate_struct(fn.types.name)
 
     @masked_kernel(module, "active")
     def element_matrix(
-        block: Block,
-        dq_dv: double_1d,
-        lines: p.vec3_3d,
-        use_prediction: int_1d,
-        form: int,
-        add: int,
-        active: int_1d,
-        matrix: p.vec3_3d,
+        block: Block, iterate: Iterate, lines: p.vec3_3d, form: int, add: int, active: int_1d, matrix: p.vec3_3d
     ):
         """K of each element, Eqs. (35) and (54), as the columns of its 3x3 blocks K_ab, a <= b; one thread per column.
 
@@ -89,8 +83,8 @@ def column_kernel(fn: KernelSet, module: wp.Module) -> wp.Kernel:
         elem = index % block.count
         b = index / block.count / 3
         axis = (index / block.count) % 3
-        stress = stress_form(form, use_prediction[world])
-        K = fn.matrix_column(block, p.T(dq_dv[world]), lines, stress, b, axis, world, elem)
+        stress = stress_form(form, iterate.use_prediction[world])
+        K = fn.matrix_column(block, p.T(iterate.dq_dv[world]), lines, stress, b, axis, world, elem)
         for a in range(NS):
             if a <= b:
                 pair = a * NS - (a * (a - 1)) / 2 + b - a
@@ -109,38 +103,28 @@ def panel_kernel(fn: KernelSet, module: wp.Module) -> wp.Kernel:
         fn: functions of the kind: of points.py or assumed_strain.py, and `add_panels`.
         module: that it is compiled in.
     """
-    p, Block = fn.types, fn.Block
+    p, Block, Iterate = fn.types, fn.Block, iterate_struct(fn.types.name)
     Rows = panel_row_type(p.name, panel_layout(fn.slots)[1])
 
     @masked_kernel(module, "active")
     def element_matrix_panels(
-        block: Block,
-        u: p.vec3_2d,
-        v: p.vec3_2d,
-        base: p.vec3_2d,
-        use_prediction: int_1d,
-        history: p.sym_2d,
-        dq_dv: double_1d,
-        form: int,
-        active: int_1d,
-        add: int,
-        matrix: wp.array3d(dtype=Rows),
+        block: Block, iterate: Iterate, form: int, active: int_1d, add: int, matrix: wp.array3d(dtype=Rows)
     ):
         """K of each element by one thread; it needs no `prepare_matrix`.
 
         Args:
             matrix: [world, elem, panel_row(panel, a)], K_ab over the slots b of a panel, see `panel_row_type`.
-            form, add: see `element_matrix`; base, use_prediction: see `prepare_matrix`.
+            form, add: see `element_matrix`.
         """
         world, elem = wp.tid()
-        dq = p.T(dq_dv[world])
-        U, V = fn.load_slots(block, u, world, elem), fn.load_velocities(block, v, world, elem)
-        step = fn.load_last_change(block, v, base, use_prediction[world], dq, world, elem)
-        stress = stress_form(form, use_prediction[world])
+        U, V = fn.load_slots(block, iterate.u, world, elem), fn.load_velocities(block, iterate.v, world, elem)
+        step = fn.load_last_change(block, iterate, world, elem)
+        stress = stress_form(form, iterate.use_prediction[world])
         if add == 0:
             for k in range(matrix.shape[2]):
                 matrix[world, elem, k] = Rows()
-        fn.add_panels(block, U, V, step, history, dq, stress, world, elem, matrix)
+        dq = p.T(iterate.dq_dv[world])
+        fn.add_panels(block, U, V, step, iterate.history, dq, stress, world, elem, matrix)
 
     return element_matrix_panels
 
@@ -156,7 +140,7 @@ def matrix_kernels(fn: KernelSet, name: str) -> KernelSet:
     T, vec3, mat33, sym_2d = p.T, p.vec3, p.mat33, p.sym_2d
     t, m, Block, Local, coef = fn.tensors, fn.law, fn.Block, fn.Local, fn.coef
     NS, needs_J, affine, framed = fn.slots, fn.needs_J, fn.affine, fn.framed
-    midpoint, dissipative = fn.midpoint, fn.dissipative
+    midpoint, dissipative, Iterate = fn.midpoint, fn.dissipative, iterate_struct(p.name)
     module = kernel_module(f"{name}_matrix", max_unroll=16)
     rows_module = kernel_module(f"{name}_rows", max_unroll=PANEL_UNROLL)
     PANELS, P, _ = panel_layout(NS)
@@ -226,30 +210,18 @@ def matrix_kernels(fn: KernelSet, name: str) -> KernelSet:
             return m.increment(F - t.identity(), dF, c)
 
     @masked_kernel(module, "active")
-    def prepare_matrix(
-        block: Block,
-        u: p.vec3_2d,
-        v: p.vec3_2d,
-        base: p.vec3_2d,
-        use_prediction: int_1d,
-        history: p.sym_2d,
-        dq_dv: double_1d,
-        form: int,
-        active: int_1d,
-        lines: p.vec3_3d,
-    ):
+    def prepare_matrix(block: Block, iterate: Iterate, form: int, active: int_1d, lines: p.vec3_3d):
         """F and S of `point_state`, common to all columns of an element's matrix: [world, 5 point + row, elem].
 
         Rows 0 to 2 are those of F, row 3 is the diagonal of S, row 4 its components (23, 13, 12). `form`: see
-        `element_matrix`; `base`: v at the previous iterate, for worlds with `use_prediction`.
+        `element_matrix`.
         """
         world, point, elem = wp.tid()
-        U, V = fn.load_slots(block, u, world, elem), fn.load_velocities(block, v, world, elem)
+        U, V = fn.load_slots(block, iterate.u, world, elem), fn.load_velocities(block, iterate.v, world, elem)
         c = fn.coefficients(block, world, elem)
-        dq = T(dq_dv[world])
-        step = fn.load_last_change(block, v, base, use_prediction[world], dq, world, elem)
-        stress = stress_form(form, use_prediction[world])
-        F, S = point_state(block, U, V, step, history, dq, c, stress, world, point, elem)
+        step = fn.load_last_change(block, iterate, world, elem)
+        dq, stress = T(iterate.dq_dv[world]), stress_form(form, iterate.use_prediction[world])
+        F, S = point_state(block, U, V, step, iterate.history, dq, c, stress, world, point, elem)
         for i in range(3):
             lines[world, 5 * point + i, elem] = F[i]
         lines[world, 5 * point + 3, elem] = vec3(S[0, 0], S[1, 1], S[2, 2])

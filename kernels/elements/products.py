@@ -5,7 +5,8 @@ import functools
 import warp as wp
 
 from ..common.modules import KernelSet, kernel_module, masked_kernel
-from ..common.types import double_1d, int_1d
+from ..common.types import int_1d
+from .element_slots import iterate_struct
 from .points import point_functions
 
 __all__ = ["predicted_stress_kernel", "predicted_stress_product", "tangent_kernel"]
@@ -18,28 +19,20 @@ def tangent_kernel(fn: KernelSet, module: wp.Module) -> wp.Kernel:
         fn: functions of the kind: of points.py or assumed_strain.py.
         module: that it is compiled in.
     """
-    p, Block = fn.types, fn.Block
+    p, Block, Iterate = fn.types, fn.Block, iterate_struct(fn.types.name)
 
     @masked_kernel(module, "active")
-    def tangent_product(
-        block: Block,
-        u: p.vec3_2d,
-        v: p.vec3_2d,
-        history: p.sym_2d,
-        dq_dv: double_1d,
-        active: int_1d,
-        direction: p.vec3_2d,
-        contribution: p.vec3_2d,
-    ):
+    def tangent_product(block: Block, iterate: Iterate, active: int_1d, direction: p.vec3_2d, contribution: p.vec3_2d):
         """K p (N) with K = df_int/dq at u, Eqs. (35) and (54); only the symmetric part for damping of the rate form.
 
         `active` 2: see `point_increment`.
         """
         world, elem = wp.tid()
-        U = fn.load_slots(block, u, world, elem)
+        U = fn.load_slots(block, iterate.u, world, elem)
         dU = fn.load_slots(block, direction, world, elem)
-        V = fn.load_velocities(block, v, world, elem)
-        f = fn.tangent_force(block, U, dU, V, history, p.T(dq_dv[world]), active[world], world, elem)
+        V = fn.load_velocities(block, iterate.v, world, elem)
+        dq = p.T(iterate.dq_dv[world])
+        f = fn.tangent_force(block, U, dU, V, iterate.history, dq, active[world], world, elem)
         fn.store_forces(block, f, world, elem, contribution)
 
     return tangent_product
@@ -50,29 +43,19 @@ def predicted_stress_kernel(fn: KernelSet, module: wp.Module) -> wp.Kernel:
 
     Arguments as those of `tangent_kernel`.
     """
-    p, Block = fn.types, fn.Block
+    p, Block, Iterate = fn.types, fn.Block, iterate_struct(fn.types.name)
 
     @masked_kernel(module, "active")
     def predicted_stress_product(
-        block: Block,
-        u: p.vec3_2d,
-        v: p.vec3_2d,
-        base: p.vec3_2d,
-        use_prediction: int_1d,
-        history: p.sym_2d,
-        dq_dv: double_1d,
-        active: int_1d,
-        direction: p.vec3_2d,
-        contribution: p.vec3_2d,
+        block: Block, iterate: Iterate, active: int_1d, direction: p.vec3_2d, contribution: p.vec3_2d
     ):
-        """K p (N); `base`: v at the previous iterate, for worlds with `use_prediction` 1; `use_prediction` 2: positive
-        semi-definite form. See `predicted_stress_change`."""
+        """K p (N) by `predicted_stress_change`; `use_prediction` 2: positive semi-definite form."""
         world, elem = wp.tid()
-        U = fn.load_slots(block, u, world, elem)
+        U = fn.load_slots(block, iterate.u, world, elem)
         dU = fn.load_slots(block, direction, world, elem)
-        dq, use = p.T(dq_dv[world]), use_prediction[world]
-        step = fn.load_last_change(block, v, base, use, dq, world, elem)
-        f = fn.predicted_force(block, U, dU, step, history, dq, use, world, elem)
+        step = fn.load_last_change(block, iterate, world, elem)
+        dq, use = p.T(iterate.dq_dv[world]), iterate.use_prediction[world]
+        f = fn.predicted_force(block, U, dU, step, iterate.history, dq, use, world, elem)
         fn.store_forces(block, f, world, elem, contribution)
 
     return predicted_stress_product

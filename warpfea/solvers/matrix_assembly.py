@@ -225,26 +225,28 @@ class MatrixAssembler:
         """
         w = self.work
         every = worlds or range(self.model.worlds)
-        state = [u, w.v_stage, w.base_velocity, w.newton.solve.predicted_stress, w.history, *factors, active, out]
         for first in range(every.start, every.stop, self.worlds_per_chunk):
             last = min(first + self.worlds_per_chunk, every.stop)
+            state = [*factors, active, out]
             if last - first == self.model.worlds:
-                self._assemble(last, state, projected)
+                self._assemble(last, w.iterate(u, w.v_stage, factors[1]), state, projected)
                 continue
+            part = slice(first, last)
             with self.model.parameters.temporarily_restricted_to_worlds(first, last):
-                self._assemble(last - first, [a[first:last] for a in state], projected, first)
+                iterate = w.iterate(u, w.v_stage, factors[1], part)
+                self._assemble(last - first, iterate, [a[part] for a in state], projected, first)
 
-    def _assemble(self, count: int, state: list[wp.array], projected: bool, first_world: int = 0) -> None:
-        """Assemble `count` worlds from `first_world` on; `state` holds their arrays."""
+    def _assemble(self, count: int, iterate: Any, state: list[wp.array], projected: bool, first_world: int = 0) -> None:
+        """Assemble `count` worlds from `first_world` on; `iterate` and `state` hold their arrays."""
         m, launch = self.model, self.launch
-        u, v, base, mixed, history, mass_factor, dq_dv, active, out = state
+        mass_factor, dq_dv, active, out = state
         mass = m.cache["matrix"][1]
         if mass.shape[0] != 1:
             mass = mass[first_world : first_world + count]
         for first, parts in enumerate(self.blocks_by_elements):
             for k, (block, elements) in enumerate(parts):
                 data = self.work.data_of(block)
-                given = [data, u, v, base, mixed, history, dq_dv, int(projected), active]
+                given = [data, iterate, int(projected), active]
                 if self.whole_elements:
                     _, width, rows = panel_layout(block.slots)
                     matrix = leading_view(
@@ -259,8 +261,8 @@ class MatrixAssembler:
                 points = (count, block.points, block.count)
                 launch(elements.prepare_matrix, points, [*given, gradients])
                 if block.key.tying and not projected:
-                    launch(elements.prepare_stress, points, [data, mixed, active, gradients])
-                args = [data, dq_dv, gradients, mixed, int(projected), int(k > 0), active, matrix]
+                    launch(elements.prepare_stress, points, [data, iterate, active, gradients])
+                args = [data, iterate, gradients, int(projected), int(k > 0), active, matrix]
                 launch(elements.element_matrix, (count, 3 * block.slots * block.count), args)
             args = [m.topology, self.pattern.data, *self.contributions[first], matrix]
             args += [mass, int(first == 0), mass_factor, dq_dv, active, out]

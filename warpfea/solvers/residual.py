@@ -258,8 +258,7 @@ class Residual:
         if self.clusters:
             for block, kernel, (data, count) in zip(m.blocks, self.product_kernels, self.clusters.blocks):
                 lanes = block.cluster_size if m.device.is_cuda else 1
-                args = [w.data_of(block), data, w.u_stage, w.v_stage, w.history, w.step.mass_factor]
-                args += [w.step.dq_dv, active, p]
+                args = [w.data_of(block), data, w.stage, w.step.mass_factor, active, p]
                 args += [lanes, self.cluster_memory, w.contribution]
                 launch(kernel, (m.worlds, count * lanes), args, block_dim=block.cluster_size)
         elif self.plan.uses_predicted_stress:

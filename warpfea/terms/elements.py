@@ -55,17 +55,7 @@ class Elements(Term):
         m, w, launch = self.model, ctx.work, ctx.launch
         for block, kernels in zip(m.blocks, self.kernels(ctx)):
             lanes = launch.lanes(block.points // 2) if block.points >= MIN_LANE_POINTS and not block.key.tying else 1
-            args = [
-                w.data_of(block),
-                w.u_stage,
-                w.v_stage,
-                w.history,
-                w.step.dq_dv,
-                active,
-                lanes,
-                w.contribution,
-                w.energy_rows,
-            ]
+            args = [w.data_of(block), w.stage, active, lanes, w.contribution, w.energy_rows]
             dim = (w.u.shape[0], launch.padded(block.count * lanes))
             launch(kernels.internal_force, dim, [*args, w.newton.min_J, w.newton.domain_J])
 
@@ -92,25 +82,14 @@ class Elements(Term):
         """`tangent` with the linearly predicted stress in its geometric part, for worlds flagged `predicted_stress`."""
         m, w = self.model, ctx.work
         for block, kernel in zip(m.blocks, self.predicted_stress_kernels()):
-            args = [
-                block.data,
-                w.u,
-                w.v,
-                w.base_velocity,
-                w.newton.solve.predicted_stress,
-                w.history,
-                w.step.dq_dv,
-                active,
-                p,
-                w.contribution,
-            ]
+            args = [block.data, w.iterate(w.u, w.v, w.step.dq_dv), active, p, w.contribution]
             ctx.launch(kernel, (p.shape[0], block.count), args)
 
     def tangent(self, ctx: StepContext, p: wp.array, active: wp.array) -> None:
         """K p of all elements into work.contribution, for matrix-free products."""
         m, w = self.model, ctx.work
         for block, kernels in zip(m.blocks, self.kernels(ctx)):
-            args = [w.data_of(block), w.u_stage, w.v_stage, w.history, w.step.dq_dv, active, p, w.contribution]
+            args = [w.data_of(block), w.stage, active, p, w.contribution]
             ctx.launch(kernels.tangent_product, (p.shape[0], block.count), args)
 
     def diagonal(self, ctx: StepContext, active: wp.array) -> None:

@@ -15,6 +15,7 @@ from ..base.launch import Launcher
 from ..base.memory import convert_memory_errors
 from ..elements import Rule, get_family
 from ..kernels.common.types import precision
+from ..kernels.elements.element_slots import iterate_struct
 from ..kernels.elements.materials import DEFINED_FOR_ANY_J
 from ..kernels.step.gather import gather_kernels
 from ..model import assembly
@@ -57,13 +58,14 @@ class Evaluation:
         m, B = self.model, u.shape[0]
         least = [wp.full(B, 1e30, dtype=wp.float64, device=m.device) for _ in range(2)]
         none: Any = None
+        stage = iterate_struct(m.dtype)()
+        stage.u = stage.v = u
+        stage.history = self._zeros((1, 1), m.types.sym)
+        stage.dq_dv = wp.ones(B, dtype=wp.float64, device=m.device)
         work: Any = SimpleNamespace(
             u=u,
-            u_stage=u,
-            v_stage=u,
+            stage=stage,
             data_of=lambda block: block.data,
-            history=self._zeros((1, 1), m.types.sym),
-            step=SimpleNamespace(dq_dv=wp.ones(B, dtype=wp.float64, device=m.device)),
             contribution=self._zeros((B, m.contributions), m.types.vec3),
             energy_rows=self._zeros((2, B, m.element_count), wp.float64),
             newton=SimpleNamespace(min_J=least[0], domain_J=least[1]),

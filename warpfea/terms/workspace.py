@@ -13,6 +13,7 @@ from ..base.memory import convert_memory_errors
 from ..kernels.common.lanes import WARP_SIZE
 from ..kernels.common.reduce import CHUNK
 from ..kernels.common.structs import balance_struct
+from ..kernels.elements.element_slots import iterate_struct
 from ..kernels.solvers.newton_control import FLOOR_LANES, FLOOR_ROWS, GROUP_LANES, GROUP_ROWS, TERM_ROWS, control_struct
 from ..kernels.solvers.pcg import FREE_GROUP_LANES, pcg_struct
 from ..kernels.step.energy_ledger import LEDGER_TERM_ROWS
@@ -139,6 +140,15 @@ class Workspace:
         for name in balance_struct(model.dtype).vars:
             of_step = name in ("mass_factor", "dq_dv")
             setattr(self.balance, name, getattr(self.step if of_step else self, name))
+        self.stage = self.iterate(self.u_stage, self.v_stage, self.step.dq_dv)
+
+    def iterate(self, u: wp.array, v: wp.array, dq_dv: wp.array, worlds: slice = slice(None)) -> Any:
+        """Struct of the arrays of some worlds from which element kernels evaluate an iterate."""
+        arrays = {"u": u, "v": v, "base": self.base_velocity, "history": self.history, "dq_dv": dq_dv}
+        out = iterate_struct(self._dtype)()
+        for name, array in (arrays | {"use_prediction": self.newton.solve.predicted_stress}).items():
+            setattr(out, name, array if worlds == slice(None) else array[worlds])
+        return out
 
     def data_of(self, block: Block) -> Any:
         """Constants of an element block in the form that the scheme's kernels take."""
