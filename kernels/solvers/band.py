@@ -51,14 +51,9 @@ def band_kernels(dtype: str) -> KernelSet:
 
     @masked_kernel(module, "active")
     def fill_band(
-        pattern: Pattern,
-        value: p.mat33_2d,
-        position_of: int_1d,
-        width: int,
-        shift: p.scalar_1d,
-        active: int_1d,
+        pattern: Pattern, value: p.mat33_2d, position_of: int_1d, width: int, shift: p.scalar_1d, active: int_1d,
         band: wp.array3d(dtype=Column),
-    ):
+    ):  # fmt: skip
         """Lower half of A + shift |D|, D = diag A, with slots in the order of `position_of`; one thread per slot.
 
         Negative diagonal entries, as under strong compression, are made positive.
@@ -174,14 +169,9 @@ def band_kernels(dtype: str) -> KernelSet:
 
     @masked_kernel(module, "active")
     def solve(
-        width: int,
-        band: wp.array3d(dtype=Column),
-        slot_at: int_1d,
-        r: p.vec3_2d,
-        active: int_1d,
-        y: wp.array2d(dtype=Column),
-        z: p.vec3_2d,
-    ):
+        width: int, band: wp.array3d(dtype=Column), slot_at: int_1d, r: p.vec3_2d, active: int_1d,
+        y: wp.array2d(dtype=Column), z: p.vec3_2d,
+    ):  # fmt: skip
         """z = A^-1 r by forward and backward substitution; y holds the forward solution."""
         world = wp.tid()
         slots = slot_at.shape[0]

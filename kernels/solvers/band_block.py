@@ -73,6 +73,12 @@ def band_block_kernels(dtype: str, rows: int, width: int) -> KernelSet:
     window, vector = block_memory(dtype, window_size(width)), block_memory(dtype, solution_memory_size(rows, width))
 
     @wp.func
+    def memory_of_world(global_memory: p.scalar_2d, world: int) -> wp.uint64:
+        """Address of a world's row of the memory that stands for shared memory on the CPU."""
+        stride = wp.uint64(global_memory.shape[1]) * wp.uint64(wp.static(SCALAR_BYTES))
+        return global_memory.ptr + wp.uint64(world) * stride
+
+    @wp.func
     def window_index(row: int, other: int) -> int:
         """Index of a block in the window."""
         return (row % M) * WINDOW_ROW_STRIDE + (other % M) * BLOCK_STRIDE
@@ -158,10 +164,7 @@ def band_block_kernels(dtype: str, rows: int, width: int) -> KernelSet:
         lane = thread % lanes
         if active[world] == 0:
             return
-        at = window.open(
-            global_memory.ptr
-            + wp.uint64(world) * wp.uint64(global_memory.shape[1]) * wp.uint64(wp.static(SCALAR_BYTES))
-        )
+        at = window.open(memory_of_world(global_memory, world))
         count = wp.int32(0)
         for row in range(wp.min(M, rows)):
             load_window_row(at, pattern, value, slot_at, position_of, shift[world], world, row, lane, lanes)
@@ -247,10 +250,7 @@ def band_block_kernels(dtype: str, rows: int, width: int) -> KernelSet:
         lane = thread % lanes
         if active[world] == 0:
             return
-        at = vector.open(
-            global_memory.ptr
-            + wp.uint64(world) * wp.uint64(global_memory.shape[1]) * wp.uint64(wp.static(SCALAR_BYTES))
-        )
+        at = vector.open(memory_of_world(global_memory, world))
         unknowns = 3 * slot_at.shape[0]
         for i in range(lane, PADDED_UNKNOWNS, lanes):
             s = T(0.0)

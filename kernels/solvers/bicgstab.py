@@ -97,15 +97,9 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> KernelSet:
 
     @masked_kernel(module, "ctl.active")
     def first_direction(
-        ctl: Control,
-        z: p.vec3_2d,
-        r: p.vec3_2d,
-        x: p.vec3_2d,
-        shadow: p.vec3_2d,
-        p_out: p.vec3_2d,
-        best_x: p.vec3_2d,
+        ctl: Control, z: p.vec3_2d, r: p.vec3_2d, x: p.vec3_2d, shadow: p.vec3_2d, p_out: p.vec3_2d, best_x: p.vec3_2d,
         best_r: p.vec3_2d,
-    ):
+    ):  # fmt: skip
         """r^ = B r, p = r; the start is the initial best."""
         world, slot = wp.tid()
         shadow[world, slot] = z[world, slot]
@@ -192,17 +186,9 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> KernelSet:
 
     @masked_kernel(module, "ctl.active")
     def full_step(
-        ctl: Control,
-        bi: Recursion,
-        z: p.vec3_2d,
-        t: p.vec3_2d,
-        v: p.vec3_2d,
-        x: p.vec3_2d,
-        r: p.vec3_2d,
-        p_out: p.vec3_2d,
-        best_x: p.vec3_2d,
-        best_r: p.vec3_2d,
-    ):
+        ctl: Control, bi: Recursion, z: p.vec3_2d, t: p.vec3_2d, v: p.vec3_2d, x: p.vec3_2d, r: p.vec3_2d,
+        p_out: p.vec3_2d, best_x: p.vec3_2d, best_r: p.vec3_2d,
+    ):  # fmt: skip
         """x += omega z, r -= omega t, p = r + beta (p - omega v) while the solve continues."""
         world, slot = wp.tid()
         omega = T(bi.omega[world])

@@ -54,15 +54,9 @@ def assembly_kernels(dtype: str, slots: int, rows: bool) -> KernelSet:
 
     @wp.kernel(module=module)
     def list_contributions(
-        topo: Topology,
-        pattern: Pattern,
-        conn: int_2d,
-        offset: int,
-        count: int,
-        listing: int,
-        start: int_1d,
+        topo: Topology, pattern: Pattern, conn: int_2d, offset: int, count: int, listing: int, start: int_1d,
         source: int_1d,
-    ):
+    ):  # fmt: skip
         """Contributions of elements to an entry of Pattern.upper: start[index + 1] = their number, or with `listing`
         the `source`s from start[index] on, 2 (BLOCKS_PER_ELEMENT elem + block index) + 1 for a transposed block."""
         index = wp.tid()
@@ -84,18 +78,9 @@ def assembly_kernels(dtype: str, slots: int, rows: bool) -> KernelSet:
 
     @masked_kernel(module, "active")
     def add_element_matrices(
-        topo: Topology,
-        pattern: Pattern,
-        start: int_1d,
-        source: int_1d,
-        matrix: wp.array3d(dtype=Number),
-        mass: p.scalar_2d,
-        first: int,
-        mass_factor: double_1d,
-        dq_dv: double_1d,
-        active: int_1d,
-        value: p.mat33_2d,
-    ):
+        topo: Topology, pattern: Pattern, start: int_1d, source: int_1d, matrix: wp.array3d(dtype=Number),
+        mass: p.scalar_2d, first: int, mass_factor: double_1d, dq_dv: double_1d, active: int_1d, value: p.mat33_2d,
+    ):  # fmt: skip
         """value += (dq/dv) K of an element block; `first`: = c_M M + (dq/dv) K.
 
         Prescribed components keep their diagonal only.
@@ -163,15 +148,9 @@ def block_kernels(dtype: str) -> KernelSet:
 
     @masked_kernel(module, "active")
     def galerkin_product(
-        pair: wp.array(dtype=wp.vec3i),
-        pair_start: int_1d,
-        fine_entry: wp.array(dtype=wp.vec3i),
-        weight: wp.array(dtype=vec4),
-        free: p.vec3_1d,
-        fine: p.mat33_2d,
-        active: int_1d,
-        coarse: p.mat33_2d,
-    ):
+        pair: wp.array(dtype=wp.vec3i), pair_start: int_1d, fine_entry: wp.array(dtype=wp.vec3i),
+        weight: wp.array(dtype=vec4), free: p.vec3_1d, fine: p.mat33_2d, active: int_1d, coarse: p.mat33_2d,
+    ):  # fmt: skip
         """P^T A P: for two groups and two of their functions the sum of w w' A over the entries between them.
 
         `pair`: first coarse entry of the group's rows, width of its rows, index of the other in them;

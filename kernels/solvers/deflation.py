@@ -211,17 +211,9 @@ def deflation_kernels(dtype: str) -> KernelSet:
 
     @masked_kernel(module, "active")
     def subtract_constraint_part(
-        con: Constraints,
-        mul: Multipliers,
-        inverse: p.mat33_2d,
-        r: p.vec3_2d,
-        y: p.vec3_2d,
-        add: int,
-        active: int_1d,
-        warp: int,
-        z: p.vec3_2d,
-        rows: double_3d,
-    ):
+        con: Constraints, mul: Multipliers, inverse: p.mat33_2d, r: p.vec3_2d, y: p.vec3_2d, add: int, active: int_1d,
+        warp: int, z: p.vec3_2d, rows: double_3d,
+    ):  # fmt: skip
         """z = y - D^-1 J^T s on slots with constraints, y = D^-1 r; with `add` added to z. Rows: r.z per warp."""
         world, slot = wp.tid()
         rz = f64(0.0)

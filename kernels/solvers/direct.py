@@ -55,14 +55,9 @@ def direct_kernels(dtype: str) -> KernelSet:
 
     @masked_kernel(module, "active")
     def add_follower_matrices(
-        topo: Topology,
-        pattern: Pattern,
-        places: FollowerPattern,
-        columns: p.vec3_3d,
-        dq_dv: double_1d,
-        active: int_1d,
+        topo: Topology, pattern: Pattern, places: FollowerPattern, columns: p.vec3_3d, dq_dv: double_1d, active: int_1d,
         value: p.mat33_2d,
-    ):
+    ):  # fmt: skip
         """value -= (dq/dv) K, K from its products with unit vectors."""
         world, item = wp.tid()
         A = mat33()

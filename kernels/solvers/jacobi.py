@@ -130,16 +130,9 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> KernelSet:
 
     @masked_kernel(module, "ctl.active")
     def store_pair(
-        ctl: Newton,
-        gradient: p.vec3_2d,
-        free: p.vec3_1d,
-        move: p.vec3_2d,
-        before: p.vec3_2d,
-        r: p.vec3_2d,
-        s: p.vec3_3d,
-        y: p.vec3_3d,
-        rows: double_3d,
-    ):
+        ctl: Newton, gradient: p.vec3_2d, free: p.vec3_1d, move: p.vec3_2d, before: p.vec3_2d, r: p.vec3_2d,
+        s: p.vec3_3d, y: p.vec3_3d, rows: double_3d,
+    ):  # fmt: skip
         """r = -g on the free components; store the newest pair; rows: s_j.y and s_j.r of all pairs."""
         world, slot = wp.tid()
         new = -wp.cw_mul(gradient[world, slot], free[slot])
@@ -279,14 +272,9 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> KernelSet:
 
     @masked_kernel(module, "ctl.active")
     def residual_after_move(
-        ctl: Newton,
-        mass_factor: double_1d,
-        lumped: p.scalar_2d,
-        gradient: p.vec3_2d,
-        free: p.vec3_1d,
-        move: p.vec3_2d,
+        ctl: Newton, mass_factor: double_1d, lumped: p.scalar_2d, gradient: p.vec3_2d, free: p.vec3_1d, move: p.vec3_2d,
         r: p.vec3_2d,
-    ):
+    ):  # fmt: skip
         """r = -g - c_M M p with the lumped mass, exact for the sum over a body: the remaining force on its
         translation."""
         world, slot = wp.tid()

@@ -62,18 +62,9 @@ def level_kernels(dtype: str, storage: str | None = None) -> KernelSet:
 
     @masked_kernel(module, "active")
     def smooth_and_restrict(
-        level: Level,
-        inverse: wp.array4d(dtype=S),
-        root: p.scalar_3d,
-        by_row: int,
-        share: int,
-        lanes: int,
-        first_group: int,
-        r: p.vec3_2d,
-        active: int_1d,
-        z: p.vec3_2d,
-        coarse: p.vec3_2d,
-    ):
+        level: Level, inverse: wp.array4d(dtype=S), root: p.scalar_3d, by_row: int, share: int, lanes: int,
+        first_group: int, r: p.vec3_2d, active: int_1d, z: p.vec3_2d, coarse: p.vec3_2d,
+    ):  # fmt: skip
         """z = tile inverse times r, `share` lanes per slot; threads from `first_group` on: P^T r, `lanes` per group.
 
         The inverse is symmetric: access by columns is coalesced on CUDA, access by rows is contiguous on the CPU.
@@ -149,17 +140,9 @@ def level_kernels(dtype: str, storage: str | None = None) -> KernelSet:
 
     @masked_kernel(module, "active")
     def add_coarse_correction(
-        level: Level,
-        correct: int,
-        x: p.vec3_2d,
-        free: p.vec3_1d,
-        r: p.vec3_2d,
-        diagonal: p.vec3_2d,
-        active: int_1d,
-        warp: int,
-        z: p.vec3_2d,
-        rows: double_3d,
-    ):
+        level: Level, correct: int, x: p.vec3_2d, free: p.vec3_1d, r: p.vec3_2d, diagonal: p.vec3_2d, active: int_1d,
+        warp: int, z: p.vec3_2d, rows: double_3d,
+    ):  # fmt: skip
         """z += P x on free components if `correct`; rows: r.z and r.D^-1 r, one sum per warp of slots."""
         world, slot = wp.tid()
         products = wp.vec2d()
@@ -173,16 +156,9 @@ def level_kernels(dtype: str, storage: str | None = None) -> KernelSet:
 
     @masked_kernel(module, "active")
     def chebyshev_step(
-        level: Level,
-        correct: int,
-        coarse: p.vec3_2d,
-        z: p.vec3_2d,
-        keep: T,
-        step: T,
-        active: int_1d,
-        d: p.vec3_2d,
+        level: Level, correct: int, coarse: p.vec3_2d, z: p.vec3_2d, keep: T, step: T, active: int_1d, d: p.vec3_2d,
         x: p.vec3_2d,
-    ):
+    ):  # fmt: skip
         """A Chebyshev step: d = keep d + step (z + P coarse), x += d; with keep = 0 both start from zero."""
         world, slot = wp.tid()
         s = z[world, slot]
@@ -265,14 +241,9 @@ def level_kernels(dtype: str, storage: str | None = None) -> KernelSet:
 
     @masked_kernel(module, "active")
     def apply_triangular_inverse(
-        matrix: wp.array3d(dtype=S),
-        root: p.scalar_2d,
-        upper: int,
-        lanes: int,
-        r: p.scalar_2d,
-        active: int_1d,
+        matrix: wp.array3d(dtype=S), root: p.scalar_2d, upper: int, lanes: int, r: p.scalar_2d, active: int_1d,
         x: p.scalar_2d,
-    ):
+    ):  # fmt: skip
         """`apply_dense_inverse` with the lower triangle of a matrix or, `upper`, its upper one, diagonal included."""
         world, index = wp.tid()
         lane = index % lanes

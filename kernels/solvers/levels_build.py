@@ -48,13 +48,9 @@ def build_kernels(dtype: str, storage: str | None = None) -> KernelSet:
 
     @masked_kernel(module, "active")
     def fill_tiles(
-        level: Level,
-        pattern: Pattern,
-        value: p.mat33_2d,
-        active: int_1d,
-        diagonal: p.scalar_3d,
+        level: Level, pattern: Pattern, value: p.mat33_2d, active: int_1d, diagonal: p.scalar_3d,
         matrix: wp.array4d(dtype=T),
-    ):
+    ):  # fmt: skip
         """Block of A for each tile, and its diagonal; one thread per slot, rows without an unknown are zero."""
         world, tile, place = wp.tid()
         for a in range(3):
@@ -94,14 +90,9 @@ def build_kernels(dtype: str, storage: str | None = None) -> KernelSet:
 
     @wp.kernel(module=module)
     def invert_tiles(
-        lanes: int,
-        tiles: int,
-        keep: int,
-        active: int_1d,
-        diagonal: p.scalar_3d,
-        column: p.scalar_3d,
+        lanes: int, tiles: int, keep: int, active: int_1d, diagonal: p.scalar_3d, column: p.scalar_3d,
         matrix: wp.array4d(dtype=T),
-    ):
+    ):  # fmt: skip
         """Inverse of each tile in place, by Gauss-Jordan; a block of threads works in its shared memory.
 
         A row whose pivot is not safely positive against the diagonal of A is dropped: zeros, or with `keep` the inverse
@@ -173,13 +164,9 @@ def build_kernels(dtype: str, storage: str | None = None) -> KernelSet:
 
     @masked_kernel(module, "active")
     def copy_pivot_block(
-        matrix: p.scalar_3d,
-        scale: p.scalar_2d,
-        first: int,
-        active: int_1d,
-        diagonal: p.scalar_3d,
+        matrix: p.scalar_3d, scale: p.scalar_2d, first: int, active: int_1d, diagonal: p.scalar_3d,
         pivot: wp.array4d(dtype=T),
-    ):
+    ):  # fmt: skip
         """Copy of the pivot block and of the diagonal of A there."""
         world, i, j = wp.tid()
         pivot[world, 0, i, j] = matrix[world, first + i, first + j]
@@ -309,13 +296,9 @@ def build_kernels(dtype: str, storage: str | None = None) -> KernelSet:
 
     @masked_kernel(module, "active")
     def store_tile_inverses(
-        tiles: int,
-        diagonal: p.scalar_3d,
-        matrix: wp.array4d(dtype=T),
-        active: int_1d,
-        root: p.scalar_3d,
+        tiles: int, diagonal: p.scalar_3d, matrix: wp.array4d(dtype=T), active: int_1d, root: p.scalar_3d,
         stored: wp.array4d(dtype=S),
-    ):
+    ):  # fmt: skip
         """Store the inverses of tiles, one thread per row."""
         world, tile, i = wp.tid()
         trace = T(0.0)
@@ -329,13 +312,9 @@ def build_kernels(dtype: str, storage: str | None = None) -> KernelSet:
 
     @masked_kernel(module, "active")
     def store_dense_inverse(
-        diagonal: p.scalar_2d,
-        trace: double_2d,
-        matrix: p.scalar_3d,
-        active: int_1d,
-        root: p.scalar_2d,
+        diagonal: p.scalar_2d, trace: double_2d, matrix: p.scalar_3d, active: int_1d, root: p.scalar_2d,
         stored: wp.array3d(dtype=S),
-    ):
+    ):  # fmt: skip
         """Store the dense inverse, one thread per entry."""
         world, i, j = wp.tid()
         own = inverse_sqrt(diagonal[world, i])

@@ -292,14 +292,9 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> KernelSet:
 
     @masked_kernel(module, "active")
     def translate_groups(
-        groups: Groups,
-        velocity: p.vec3_2d,
-        free: p.vec3_1d,
-        mass_factor: double_1d,
-        active: int_1d,
-        x: p.vec3_2d,
+        groups: Groups, velocity: p.vec3_2d, free: p.vec3_1d, mass_factor: double_1d, active: int_1d, x: p.vec3_2d,
         r: p.vec3_2d,
-    ):
+    ):  # fmt: skip
         """x += Z c, r -= H Z c, where H Z = c_M M Z."""
         world, slot = wp.tid()
         group = groups.group_of_slot[slot]

@@ -67,14 +67,9 @@ def perturbation_kernels(dtype: str) -> KernelSet:
 
     @masked_kernel(module, "flags")
     def mean_gradient(
-        topo: Topology,
-        mass_factor: double_1d,
-        flags: int_1d,
-        perturbation_sum: p.vec3_2d,
-        product: p.vec3_2d,
-        gradient_sum: p.vec3_2d,
-        gradient: p.vec3_2d,
-    ):
+        topo: Topology, mass_factor: double_1d, flags: int_1d, perturbation_sum: p.vec3_2d, product: p.vec3_2d,
+        gradient_sum: p.vec3_2d, gradient: p.vec3_2d,
+    ):  # fmt: skip
         """Mean over the samples of g(u + d) - (dq/dv) K p, with p = d / (dq/dv) and `product` = H p of their sum."""
         world, slot = wp.tid()
         a = vec3()

@@ -264,12 +264,9 @@ def reuse_kernels(dtype: str) -> KernelSet:
 
     @wp.kernel(module=module)
     def transfer_words(
-        reuse: Reuse,
-        accepted: int_1d,
-        live: wp.array2d(dtype=wp.uint32),
-        kept: wp.array2d(dtype=wp.uint32),
+        reuse: Reuse, accepted: int_1d, live: wp.array2d(dtype=wp.uint32), kept: wp.array2d(dtype=wp.uint32),
         linearisation_point: wp.array2d(dtype=wp.uint32),
-    ):
+    ):  # fmt: skip
         """`transfer_points` for an array of a term, as [world, 32-bit word]."""
         world, word = wp.tid()
         to = transfer_case(reuse, accepted, world)
@@ -277,15 +274,9 @@ def reuse_kernels(dtype: str) -> KernelSet:
 
     @wp.kernel(module=module)
     def transfer_constraint_rows(
-        reuse: Reuse,
-        accepted: int_1d,
-        gradient: vec3d_2d,
-        stiffness: double_2d,
-        kept_gradient: vec3d_2d,
-        kept_stiffness: double_2d,
-        point_gradient: vec3d_2d,
-        point_stiffness: double_2d,
-    ):
+        reuse: Reuse, accepted: int_1d, gradient: vec3d_2d, stiffness: double_2d, kept_gradient: vec3d_2d,
+        kept_stiffness: double_2d, point_gradient: vec3d_2d, point_stiffness: double_2d,
+    ):  # fmt: skip
         """`transfer_points` for the rows of constraints of the object."""
         world, row = wp.tid()
         to = transfer_case(reuse, accepted, world)

@@ -23,15 +23,9 @@ def vector_kernels(dtype: str, has_constraints: bool = False) -> KernelSet:
 
     @masked_kernel(module, "active")
     def group_norm_partials(
-        start: int_1d,
-        slot: int_1d,
-        element_start: int_1d,
-        element: int_1d,
-        rows: double_3d,
-        energy: double_3d,
-        active: int_1d,
-        partial: wp.array4d(dtype=f64),
-    ):
+        start: int_1d, slot: int_1d, element_start: int_1d, element: int_1d, rows: double_3d, energy: double_3d,
+        active: int_1d, partial: wp.array4d(dtype=f64),
+    ):  # fmt: skip
         """Strided partial sums of GROUP_ROWS over the slots and elements of a residual group."""
         world, group, lane = wp.tid()
         for row in range(GROUP_ROWS - 1):
@@ -79,19 +73,9 @@ def vector_kernels(dtype: str, has_constraints: bool = False) -> KernelSet:
 
     @wp.kernel(module=module)
     def floor_partials(
-        ctl: Control,
-        start: int_1d,
-        slot: int_1d,
-        element_start: int_1d,
-        element: int_1d,
-        gradient: p.vec3_2d,
-        direction: p.vec3_2d,
-        inertia: p.vec3_2d,
-        v: p.vec3_2d,
-        v_tilde: p.vec3_2d,
-        u: p.vec3_2d,
-        energy: double_3d,
-    ):
+        ctl: Control, start: int_1d, slot: int_1d, element_start: int_1d, element: int_1d, gradient: p.vec3_2d,
+        direction: p.vec3_2d, inertia: p.vec3_2d, v: p.vec3_2d, v_tilde: p.vec3_2d, u: p.vec3_2d, energy: double_3d,
+    ):  # fmt: skip
         """Strided partial sums of FLOOR_ROWS over the slots and elements of a part; empty lists: all."""
         world, part, lane = wp.tid()
         if ctl.floor.estimate_error[world] != 2:
