@@ -23,6 +23,7 @@ JSON_KEYS = (
     "step_ms", "kernels_ms", "between_ms", "newton_per_step", "pcg_per_step", "launches_per_step", "bytes_per_step",
     "copy_GBps", "empty_launch_us", "compile_s", "parts", "kernels", "machine", "versions",
 )  # fmt: skip
+STEP_STATISTICS: dict[str, Any] = {"median": statistics.median, "mean": statistics.mean, "min": min, "max": max}
 MAX_KERNEL_ROWS = 15
 """Maximum number of kernels listed one by one."""
 
@@ -56,39 +57,20 @@ def profile(options: argparse.Namespace) -> int:
 
 def _content(source: Source, sim: Simulation, found: Profile) -> dict[str, Any]:
     """Contents of the JSON."""
-    info = sim.model.info()
+    info, device = sim.model.info(), str(sim.model.device)
     content = {
-        "schema": SCHEMA,
-        "scene": source.label,
-        "parameters": source.parameters,
-        "device": str(sim.model.device),
-        "dtype": sim.model.dtype,
-        "dt": sim.dt,
-        "integrator": sim.integrator.label,
-        "elements": info["elements"],
-        "unknowns": info["unknowns"],
-        "warm_up": WARM_UP_STEPS,
-        "steps": len(found.step_ms),
-        "step_ms": {
-            "median": statistics.median(found.step_ms),
-            "mean": statistics.mean(found.step_ms),
-            "min": min(found.step_ms),
-            "max": max(found.step_ms),
-        },
-        "kernels_ms": found.kernels_ms,
-        "between_ms": found.between_ms,
-        "newton_per_step": found.newton,
-        "pcg_per_step": found.pcg,
-        "launches_per_step": found.launches,
-        "bytes_per_step": sum(k.bytes for k in found.kernels),
-        "copy_GBps": found.copy_GBps,
-        "empty_launch_us": found.empty_launch_us,
-        "compile_s": sim.compile_s,
+        "schema": SCHEMA, "scene": source.label, "parameters": source.parameters, "device": device,
+        "dtype": sim.model.dtype, "dt": sim.dt, "integrator": sim.integrator.label, "elements": info["elements"],
+        "unknowns": info["unknowns"], "warm_up": WARM_UP_STEPS, "steps": len(found.step_ms),
+        "step_ms": {name: measure(found.step_ms) for name, measure in STEP_STATISTICS.items()},
+        "kernels_ms": found.kernels_ms, "between_ms": found.between_ms, "newton_per_step": found.newton,
+        "pcg_per_step": found.pcg, "launches_per_step": found.launches,
+        "bytes_per_step": sum(k.bytes for k in found.kernels), "copy_GBps": found.copy_GBps,
+        "empty_launch_us": found.empty_launch_us, "compile_s": sim.compile_s,
         "parts": {name: _row_content(k, found) for name, k in found.parts.items()},
         "kernels": [{"part": k.part, "kernel": k.kernel} | _row_content(k, found) for k in found.kernels],
-        "machine": machine(str(sim.model.device)),
-        "versions": versions(),
-    }
+        "machine": machine(device), "versions": versions(),
+    }  # fmt: skip
     assert tuple(content) == JSON_KEYS
     return {name: to_json(value) for name, value in content.items()}
 

@@ -34,6 +34,11 @@ OUTPUT_SUFFIXES: dict[str, Sequence[str]] = {
 
 CHECKPOINT_STEPS = 100
 """Steps between checkpoints."""
+ENDS: dict[type[BaseException], str] = {
+    StabilityError: "unstable", ConvergenceError: "not converged", ConstraintError: "not converged",
+    OutputError: "output failed", KeyboardInterrupt: "interrupted",
+}  # fmt: skip
+"""Status of a run by the error that ended it; the first that fits."""
 STATIC_SPEED = 0.5
 """Load factor per second of an animation of --static."""
 
@@ -68,14 +73,8 @@ def run(options: argparse.Namespace) -> int:
             else:
                 sim.run(t_end, outputs=outputs, progress=show_progress(options))
             status = "done"
-        except (ConvergenceError, ConstraintError) as error:
-            status = "unstable" if isinstance(error, StabilityError) else "not converged"
-            raise
-        except OutputError:
-            status = "output failed"
-            raise
-        except KeyboardInterrupt:
-            status = "interrupted"
+        except BaseException as error:
+            status = next((text for kind, text in ENDS.items() if isinstance(error, kind)), status)
             raise
         finally:
             with interruptible():  # only the report remains: Ctrl-C must not discard it

@@ -7,22 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..base.errors import ConstraintError, ConvergenceError
+from ..kernels.solvers import newton_control as codes
 from ..kernels.solvers.convergence import STALL_ROUNDINGS
-from ..kernels.solvers.newton_control import (
-    FAIL_CONSTRAINT,
-    FAIL_CURVATURE,
-    FAIL_ELEMENT_INVERTED,
-    FAIL_ENERGY_GROWTH,
-    FAIL_ITERATIONS,
-    FAIL_JACOBIAN,
-    FAIL_LINE_SEARCH,
-    FAIL_LOCAL_ERROR,
-    FAIL_NAN,
-    FAIL_RESIDUAL_GROWTH,
-    FAIL_ROUNDOFF,
-    FAIL_STEP_LIMIT,
-    FAIL_WORK,
-)
 from ..solvers import NewtonPCG
 from ..terms.evaluation import lowest_jacobian
 from ..terms.protocols import Diagnosed
@@ -36,17 +22,17 @@ if TYPE_CHECKING:
 __all__ = ["check_initial_constraints", "step_error"]
 
 FAILURE_REASONS = {
-    FAIL_ITERATIONS: "Newton's method did not converge",
-    FAIL_LINE_SEARCH: "the line search found no decrease",
-    FAIL_JACOBIAN: "an element reached J <= 0, where its law is not defined,",
-    FAIL_NAN: "a force or energy was not finite",
-    FAIL_CURVATURE: "no descent direction was found",
-    FAIL_STEP_LIMIT: "a term allowed no step along Newton's direction",
-    FAIL_RESIDUAL_GROWTH: "the residual grew more than tenfold",
-    FAIL_ELEMENT_INVERTED: "an element inverted (J <= 0)",
-    FAIL_LOCAL_ERROR: "the error tolerance was not met within 65536 substeps",
+    codes.FAIL_ITERATIONS: "Newton's method did not converge",
+    codes.FAIL_LINE_SEARCH: "the line search found no decrease",
+    codes.FAIL_JACOBIAN: "an element reached J <= 0, where its law is not defined,",
+    codes.FAIL_NAN: "a force or energy was not finite",
+    codes.FAIL_CURVATURE: "no descent direction was found",
+    codes.FAIL_STEP_LIMIT: "a term allowed no step along Newton's direction",
+    codes.FAIL_RESIDUAL_GROWTH: "the residual grew more than tenfold",
+    codes.FAIL_ELEMENT_INVERTED: "an element inverted (J <= 0)",
+    codes.FAIL_LOCAL_ERROR: "the error tolerance was not met within 65536 substeps",
 }
-INDEFINITE_FAILURES = (FAIL_ITERATIONS, FAIL_LINE_SEARCH, FAIL_CURVATURE)
+INDEFINITE_FAILURES = (codes.FAIL_ITERATIONS, codes.FAIL_LINE_SEARCH, codes.FAIL_CURVATURE)
 """Failures that an indefinite tangent may explain."""
 NO_ERROR_ESTIMATE = 1e30
 """Value of an unavailable error estimate."""
@@ -62,14 +48,14 @@ def step_error(sim: Any, world: int) -> ConvergenceError | ConstraintError:
     time = float(sim.last.time[world])
     # no halving follows the last rejection
     halvings = min(int(sim.last.halvings[world]) - 1, sim.solver.max_halvings)
-    if code == FAIL_ENERGY_GROWTH:
+    if code == codes.FAIL_ENERGY_GROWTH:
         text = f"{_step_text(sim, time, world)} was not taken in world {world}: {growth_error_text(sim, world)}"
         return ConvergenceError(text, time=time, world=world, state=sim.state)
-    if code == FAIL_CONSTRAINT:
+    if code == codes.FAIL_CONSTRAINT:
         return _constraint_error(sim, world, time, halvings)
     count = int(work.newton.iterations.numpy()[world]) + 1
     history = work.newton.norms.residual_history.numpy()[world, :count].tolist()
-    if code in (FAIL_JACOBIAN, FAIL_ELEMENT_INVERTED):
+    if code in (codes.FAIL_JACOBIAN, codes.FAIL_ELEMENT_INVERTED):
         element, where = lowest_jacobian(sim.model, work.u.numpy()[world].astype(float))
     else:
         element, where = _worst_element(sim.model, work.g.numpy()[world])
@@ -80,12 +66,12 @@ def step_error(sim: Any, world: int) -> ConvergenceError | ConstraintError:
         )
     hint += overload_text(sim.model)
     lumped = [c.name for c in sim.model.description.contacts if c.model == "sphere"] if sim.integrator.static else []
-    if lumped and code != FAIL_ROUNDOFF:
+    if lumped and code != codes.FAIL_ROUNDOFF:
         hint += f"; the single contact point of {lumped[0]!r} jumps as the body rolls: use model='patch' in statics"
     spent, most = int(sim.last.newton[world]), int(work.step.newton_budget)
-    if code != FAIL_WORK and most and spent >= most and halvings < sim.solver.max_halvings:
+    if code != codes.FAIL_WORK and most and spent >= most and halvings < sim.solver.max_halvings:
         hint += f"; {spent} Newton iterations used up max_work = {sim.solver.max_work}"
-    jumps = "" if code == FAIL_ROUNDOFF else discontinuous_drives_text(sim, world)
+    jumps = "" if code == codes.FAIL_ROUNDOFF else discontinuous_drives_text(sim, world)
     kind: type[ConvergenceError] = ConvergenceError
     for term in sim.model.terms.having(Diagnosed):
         if (found := term.failure_reason(sim.stepper.ctx, world)) is not None:
@@ -106,30 +92,30 @@ def _failure_reason(sim: Any, code: int, world: int) -> tuple[str, str]:
     work, dtype = sim.stepper.work, sim.model.dtype
     smaller = "; try more load steps" if sim.integrator.static else "; try a smaller dt"
     direct = sim.stepper.newton.direct
-    if code == FAIL_CURVATURE and direct is not None and world in direct.singular_worlds:
+    if code == codes.FAIL_CURVATURE and direct is not None and world in direct.singular_worlds:
         return "singular tangent matrix (unconstrained body or mechanism?)", ""
     near = float(work.newton.floor.rounding_ratio.numpy()[world]) <= STALL_ROUNDINGS
     finer = "; use float64" if dtype == "float32" else "; use fewer, stouter elements, or check the units"
     adaptive = sim.stepper.step_size_control
-    if code == FAIL_ROUNDOFF and adaptive and (least := adaptive.smallest_resolved_error(world)):
+    if code == codes.FAIL_ROUNDOFF and adaptive and (least := adaptive.smallest_resolved_error(world)):
         hides = f"{dtype} round-off of displacements hides the local errors of substeps"
         return hides, f"{finer}, or error = {1.05 * least:.2g} or more"
-    if code == FAIL_LOCAL_ERROR:
+    if code == codes.FAIL_LOCAL_ERROR:
         return FAILURE_REASONS[code], f"; {'use float64, or ' if dtype == 'float32' else 'use '}a larger error"
-    if code == FAIL_ROUNDOFF:
+    if code == codes.FAIL_ROUNDOFF:
         eta = float(work.newton.floor.error_estimate.numpy()[world])
         left = ""
         if eta < NO_ERROR_ESTIMATE:
             left = f" (estimated error {eta:.2g})"
         return f"{dtype} round-off limit reached{left}", finer
-    if code == FAIL_WORK:
+    if code == codes.FAIL_WORK:
         spent = f"the step took {int(work.pcg.step_iterations.numpy()[world])} CG iterations"
         limit = f"max_work = {sim.solver.max_work}"
         if near and dtype == "float32":
             return f"float32 round-off limit reached: {spent} ({limit})", finer
         slivers = f"; raise {limit} of NewtonPCG, or look for slivers and extreme contrasts of stiffness"
         return spent, "" if overload_text(sim.model) else slivers
-    if code == FAIL_ELEMENT_INVERTED:
+    if code == codes.FAIL_ELEMENT_INVERTED:
         return FAILURE_REASONS[code], f"{smaller}, or NeoHookean in place of SVK; inversion='report' lets it pass"
     bent = sim.integrator.static and int(work.newton.solve.met_negative_curvature.numpy()[world])
     if code in INDEFINITE_FAILURES and near and (dtype == "float32" or not bent):

@@ -78,12 +78,9 @@ class Setting:
         words = ["warpfea", "run", what, "--integrator", self.method]
         words += ["--dt", "auto" if self.error is not None else cli_text(self.dt)]
         words += ["--error", cli_text(self.error)] if self.error is not None else []
-        if self.t_end != scene.t_end:
-            words += ["--t-end", cli_text(self.t_end)]
-        if self.solver != "newton-pcg":
-            words += ["--solver", self.solver]
-        if self.tol is not None and self.tol != scene.tol:
-            words += ["--tol", cli_text(self.tol)]
+        for name, default in (("t_end", scene.t_end), ("solver", "newton-pcg"), ("tol", scene.tol)):
+            if (value := getattr(self, name)) not in (None, default):
+                words += [f"--{name.replace('_', '-')}", cli_text(value)]
         words += ["--dtype", self.dtype, "--device", self.device]
         for name, value in self.values.items():
             if value != scene.parameters[name].default:

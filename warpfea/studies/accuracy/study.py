@@ -92,16 +92,10 @@ def study(
     _check_names("finer", options.finer or {}, [*SWEEP_OPTIONS, *found.parameters])
     swept = {axis: many[0] for axis, many in axes.over.items() if axis not in SWEEP_OPTIONS}
     base = Setting(
-        method=method_text(found.integrator),
-        dt=float(dt or found.dt),
-        error=None,
-        solver=solver,
-        tol=tol if tol is not None else found.tol,
-        dtype=dtype,
-        device=str(find_device(device)),
-        t_end=float(t_end or found.t_end),
-        values=found.resolve(swept | values),
-    )
+        method=method_text(found.integrator), dt=float(dt or found.dt), error=None, solver=solver,
+        tol=tol if tol is not None else found.tol, dtype=dtype, device=str(find_device(device)),
+        t_end=float(t_end or found.t_end), values=found.resolve(swept | values),
+    )  # fmt: skip
     sweep_axes(found, {option: [base.get(option)] for option in ("solver", "dtype")}, None)
     settings = setting_product(base, axes)
     if options.measure == "field" and found.field is None:

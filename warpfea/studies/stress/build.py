@@ -23,13 +23,9 @@ MIN_POSITIVE_J = 1e-12
 REFERENCE_TOL = 1e-10
 """Solver tolerance of float64 references."""
 CLAMPED_SLOTS = {
-    "T4": "all",
-    "T10": "all",
-    "FN18": "position+gradient-y+gradient-z",
-    "H3843": "position+gradient-y+gradient-z",
-    "3243": "position+section",
-    "3443": "position+director",
-}
+    **dict.fromkeys(("T4", "T10"), "all"), **dict.fromkeys(("FN18", "H3843"), "position+gradient-y+gradient-z"),
+    "3243": "position+section", "3443": "position+director",
+}  # fmt: skip
 """Slots that a clamped wall x = const fixes, by element."""
 
 

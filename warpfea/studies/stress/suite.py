@@ -115,13 +115,8 @@ def run_row(row: Row, setting: Setting, debug: bool = False) -> dict[str, Any]:
     known = known_miss_reason(row.label, row.dtype, setting.device)
     if known and passed is False:
         outcome, passed, note = MISSED, None, f"{known} ({note})"
-    out: dict[str, Any] = {
-        "case": row.label,
-        "group": case.group,
-        "precision": row.dtype,
-        "outcome": outcome,
-        "passed": passed,
-    }
+    out: dict[str, Any] = {"case": row.label, "group": case.group, "precision": row.dtype}
+    out |= {"outcome": outcome, "passed": passed}
     if answer is not None:
         out |= {
             "error": answer.error, "bound": answer.bound, "reference": answer.reference, "newton": answer.newton,

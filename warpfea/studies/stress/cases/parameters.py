@@ -106,10 +106,8 @@ def one_world_parameter(setting: Setting, value: str) -> Answer:
     name, _, scheme = value.partition("-")
     if name == "density":
         error = _momentum_error(setting, scheme, stats)
-    elif name == "mu":
-        error = _sliding_error(setting, stats)
-    elif name == "eta":
-        error = _dissipation_error(setting, stats)
+    elif name in ("mu", "eta"):
+        error = {"mu": _sliding_error, "eta": _dissipation_error}[name](setting, stats)
     else:
         error = _tension_error(setting, name, stats)
     bounds: dict[str, tuple[float, float]] = {"E": (1e-5, 1e-3), "nu": (1e-5, 1e-3), "mu": (1e-3, 1e-3)}
