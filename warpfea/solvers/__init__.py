@@ -49,4 +49,6 @@ def make_solver_loop(ctx: StepContext, options: NewtonPCG | Jacobi, plan: Solver
         plan = choose_solver(ctx.model, ctx.model.device, ctx.model.many, options=options, scheme=scheme)
     else:
         check_plan(plan, ctx.model, options, scheme)
-    return (JacobiLoop if isinstance(options, Jacobi) else NewtonLoop)(ctx, options, plan, **more)
+    if isinstance(options, Jacobi):
+        return JacobiLoop(ctx, options, plan, **more)
+    return NewtonLoop(ctx, options, plan, **more)

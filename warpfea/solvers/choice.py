@@ -190,11 +190,10 @@ def check_plan(plan: SolverPlan, model: Model, options: NewtonPCG | Jacobi, sche
     if not isinstance(plan, SolverPlan):
         raise ModelError(f"plan = {plan!r} must be a SolverPlan, as `plan` of a Simulation")
     own = options
-    if isinstance(options, NewtonPCG):  # what the options leave open
-        if options.operator == "auto":
-            own = replace(own, operator="matrix" if plan.uses_matrix else "elements")
-        if options.preconditioner == "auto" and "direct" not in (options.linear, plan.linear):
-            own = replace(own, preconditioner=plan.preconditioner)
+    if isinstance(own, NewtonPCG) and own.operator == "auto":  # what the options leave open
+        own = replace(own, operator="matrix" if plan.uses_matrix else "elements")
+    if isinstance(own, NewtonPCG) and own.preconditioner == "auto" and "direct" not in (own.linear, plan.linear):
+        own = replace(own, preconditioner=plan.preconditioner)
     fitting = choose_solver(model, model.device, options=own, scheme=scheme)
     for field in fields(SolverPlan):
         found, needed = getattr(plan, field.name), getattr(fitting, field.name)

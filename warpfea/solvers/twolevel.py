@@ -22,6 +22,7 @@ With constraints, tiles and coarse matrices contain the penalties. As a constrai
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from typing import TYPE_CHECKING
 
 import warp as wp
@@ -88,8 +89,9 @@ class TwoLevel(Preconditioner):
         band = first.band
         self.band = BandFactor(model, work, launch, band, pattern) if band is not None else None
         self.factors_operator = plan.factors_operator
-        more = {"storage": self.storage_dtype, "by_component": not self.factors_operator}
-        self.level_arrays = [LevelArrays(model, work, launch, lev, k, **more) for k, lev in enumerate(self.levels)]
+        whole = self.factors_operator  # not by component
+        of_level = partial(LevelArrays, model, work, launch, storage=self.storage_dtype, by_component=not whole)
+        self.level_arrays = [of_level(level, depth) for depth, level in enumerate(self.levels)]
         if self.factors_operator:
             residual.on_assembled = self._factorise
             unknowns = 3 * model.slots if first.is_dense else 0
