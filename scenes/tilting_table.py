@@ -13,10 +13,10 @@ def tilting_table(
     rate: float = 10.0,
     side: float = 0.1,
     height: float = 0.05,
-    cells: int = 2,
     E: float = 1e6,
     nu: float = 0.3,
     density: float = 1000.0,
+    cells: int = 2,
 ) -> wf.ModelBuilder:
     """A soft block rests on a table rotating about the y axis, and slips at tan(angle) = mu.
 
@@ -25,10 +25,10 @@ def tilting_table(
         rate: at which the table tilts, degrees/s.
         side: of the block's square base, m.
         height: of the block, m.
-        cells: across the base; half as many over the height.
         E: Young's modulus (SVK), Pa.
         nu: Poisson's ratio.
         density: kg/m^3.
+        cells: across the base; half as many over the height.
     """
     b = wf.ModelBuilder(gravity=(0.0, 0.0, -9.81))
     mesh = wf.mesh.box((side, side, height), cells=(cells, cells, max(1, cells // 2)), origin=(0.0, -0.5 * side, 0.0))
