@@ -1,6 +1,6 @@
 """Seeded random models outside the stress suite: statics and motions of strips, joints and contacts.
 
-`python -m tests.validation.random_cases --seeds 0:200 --out FILE` runs some, and writes a row each: outcome, Newton and
+`python tests/random_cases.py --seeds 0:200 --out FILE` runs some, and writes a row each: outcome, Newton and
 PCG iterations, and the answer, the largest displacement and the mean position of the loaded end. Lengths, slenderness,
 stiffness, loads, elements, laws, integrators, joints, contacts and precisions are drawn from the seed.
 """

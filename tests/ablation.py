@@ -1,14 +1,17 @@
 """Removal of one mechanism or constant at a time: rows of the stress suite and random cases that are lost without it.
 
+`python tests/ablation.py --out FILE [--only NAME ...] [--suite quick] [--jobs 2] [--random]`
+
 Each variant is a copy of the sources with a mechanism switched off (`MECHANISMS`: a text in place of another) or a
-constant without effect (`CONSTANTS`: a value that disables it). The stress suite and 200 seeded random cases
-(random_cases.py) are run with the copy and with the unchanged sources, in processes side by side. A row is lost if it
-met its criterion before and does not now; it is touched if its iterations or its error differ. With a GPU
-(--device cuda:0) only rows that a file of the CPU names as touched are run, see `touched`.
+constant without effect (`CONSTANTS`: a value that disables it). The stress suite, or with --random 200 seeded random
+models (random_cases.py), is run with the copy and with the unchanged sources, in processes side by side. A row is lost
+if it met its criterion before and does not now; it is touched if its iterations or its error differ. A run that is cut
+short goes on from the rows that FILE has.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import math
 import os
@@ -23,13 +26,13 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
-from .random_cases import same
-from .table import Row, Run, Table
+from random_cases import same
 
-__all__ = ["CONSTANTS", "MECHANISMS", "TABLE", "Constant", "constant_file", "disabled", "variants"]
+__all__ = ["CONSTANTS", "MECHANISMS", "Constant", "constant_file", "disabled", "variants"]
 
-ROOT = pathlib.Path(__file__).resolve().parents[2]
-COPIED = ("kernels", "warpfea", "scenes", "tests/validation")
+ROOT = pathlib.Path(__file__).resolve().parents[1]
+Row = dict[str, Any]
+COPIED = ("kernels", "warpfea", "scenes")
 SEARCH, CONVERGENCE, NEWTON = (f"kernels/solvers/{name}.py" for name in ("line_search", "convergence", "newton"))
 RANDOM_CASES = 200
 LONG_ROWS = ("rest-1e6", "soft-")
@@ -196,7 +199,8 @@ def _parts(labels: Mapping[str, float], count: int) -> list[list[str]]:
 
 def _child(tree: pathlib.Path, words: Sequence[str], out: pathlib.Path) -> list[Row]:
     """Rows that a command of a variant's tree writes."""
-    env = os.environ | {"PYTHONPATH": os.pathsep.join([str(tree), *filter(None, [os.environ.get("PYTHONPATH")])])}
+    path = [str(tree), str(ROOT / "tests"), *filter(None, [os.environ.get("PYTHONPATH")])]
+    env = os.environ | {"PYTHONPATH": os.pathsep.join(path)}
     env |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONSAFEPATH": "1"}
     done = subprocess.run([sys.executable, *words], cwd=tree, env=env, capture_output=True, text=True)
     if not out.exists():
@@ -205,43 +209,38 @@ def _child(tree: pathlib.Path, words: Sequence[str], out: pathlib.Path) -> list[
     return list(json.loads(out.read_text())["rows"])
 
 
-def _stress_rows(run: Run) -> dict[str, tuple[str, float]]:
+def _stress_rows(options: argparse.Namespace) -> dict[str, tuple[str, float]]:
     """Rows of the stress suite that are run: label -> group and seconds measured."""
     from warpfea.studies.stress.suite import load_cases, select_rows
 
     known = json.loads((ROOT / "tests" / "results" / "stress_cpu.json").read_text())["rows"]
     seconds = {(row["case"], row["precision"]): row["wall_s"] for row in known}
     out: dict[str, tuple[str, float]] = {}
-    for row in select_rows(load_cases(), (), run.options["suite"] == "quick", ("float64", "float32")):
-        if not row.label.startswith(LONG_ROWS) and run.wants(row.label):
+    for row in select_rows(load_cases(), options.case, options.suite == "quick", ("float64", "float32")):
+        if not row.label.startswith(LONG_ROWS):
             before = out.get(row.label, ("", 0.0))[1]
             out[row.label] = (row.case.group, before + seconds.get((row.label, row.dtype), 1.0))
-    low, high = run.options["seconds"]
-    return {label: found for label, found in out.items() if low <= found[1] < high}
+    return {label: found for label, found in out.items() if found[1] <= options.longest}
 
 
-def _tasks(
-    run: Run, variant: str, jobs: int, random: bool, touched: Mapping[str, Sequence[str]]
-) -> Iterator[list[str]]:
+def _tasks(options: argparse.Namespace, variant: str) -> Iterator[list[str]]:
     """Commands of a variant, without the file of their rows."""
-    if random:
-        share = -(-RANDOM_CASES // jobs)
+    if options.random:
+        share = -(-RANDOM_CASES // options.jobs)
         for first in range(0, RANDOM_CASES, share):
-            last = min(first + share, RANDOM_CASES)
-            yield ["-m", "tests.validation.random_cases", "--device", run.device, "--seeds", f"{first}:{last}", "--out"]
+            seeds = f"{first}:{min(first + share, RANDOM_CASES)}"
+            yield [str(ROOT / "tests" / "random_cases.py"), "--device", options.device, "--seeds", seeds, "--out"]
         return
     part = CONSTANTS[variant].rows if variant in CONSTANTS else ""
-    wanted = set().union(*touched.values()) if variant == "" else set(touched.get(variant, ()))
-    rows = {label: seconds for label, (group, seconds) in _stress_rows(run).items()
-            if group.startswith(part) and (not touched or label in wanted)}  # fmt: skip
-    quick = ["--quick"] if run.options["suite"] == "quick" else []
-    for labels in _parts(rows, jobs if variant == "" else max(jobs // 2, 1)):
+    rows = {label: seconds for label, (group, seconds) in _stress_rows(options).items() if group.startswith(part)}
+    quick = ["--quick"] if options.suite == "quick" else []
+    for labels in _parts(rows, options.jobs):
         cases = [word for label in labels for word in ("--case", label)]
-        yield ["-m", "warpfea", "stress", "--quiet", *quick, "--device", run.device, *cases, "--json"]
+        yield ["-m", "warpfea", "stress", "--quiet", *quick, "--device", options.device, *cases, "--json"]
 
 
 def _compare(before: Sequence[Row], after: Sequence[Row]) -> Row:
-    """Lost and touched rows, and the ratio of iterations over the touched rows and over all that pass in both."""
+    """Lost and touched rows, and the ratio of iterations over all rows that pass in both."""
     old = {(row["case"], row["precision"]): row for row in before}
     lost, touched, regained = [], set(), []
     sums = {name: [0, 0] for name in ("newton", "pcg")}
@@ -251,7 +250,7 @@ def _compare(before: Sequence[Row], after: Sequence[Row]) -> Row:
         if was is None:
             lost.append(f"{name}: {row.get('note', '')[:200]}")
             continue
-        if any(was.get(key) != row.get(key) for key in ("newton", "pcg", "error", "outcome", "answer")):
+        if any(was.get(key) != row.get(key) for key in ("newton", "pcg", "error", "outcome")):
             touched.add(row["case"])
         if was["passed"] and not row["passed"]:
             lost.append(f"{name}: {row['outcome']}: {row['note'][:160]}")
@@ -267,65 +266,56 @@ def _compare(before: Sequence[Row], after: Sequence[Row]) -> Row:
     return {"rows": len(after), "touched": sorted(touched), "lost": lost, "regained": regained, **ratio}
 
 
-def _study(run: Run, *, random: bool) -> Iterator[Row]:
-    """A row per variant."""
-    asked, areas = run.options["variants"].split("+"), variants()
-    chosen = [name for name in areas if name and (asked == ["all"] or name in asked or areas[name] in asked)]
-    touched: Mapping[str, Sequence[str]] = {}
-    if run.options["touched"]:
-        known = json.loads(pathlib.Path(run.options["touched"]).read_text())
-        touched = {row["variant"]: row["touched"] for row in known["stress"]}
-        chosen = [name for name in chosen if touched.get(name)]
-    jobs, kept = run.options["jobs"], run.out and run.out.with_suffix(".jsonl")
-    if kept is not None and kept.exists():
-        done = [json.loads(line) for line in kept.read_text().splitlines()]
-        yield from (row for row in done if row["random"] == random)
-        chosen = [name for name in chosen if name not in {row["variant"] for row in done if row["random"] == random}]
-    with tempfile.TemporaryDirectory() as name, ThreadPoolExecutor(jobs) as pool:
+def study(options: argparse.Namespace, done: Sequence[Row]) -> Iterator[Row]:
+    """A row per variant that is not yet `done`."""
+    areas, finished = variants(), {row["variant"] for row in done if row["random"] == options.random}
+    wanted = options.only or [*areas]
+    chosen = [name for name, area in areas.items() if name and {name, area} & {*wanted} and name not in finished]
+    with tempfile.TemporaryDirectory() as name, ThreadPoolExecutor(options.jobs) as pool:
         folder = pathlib.Path(name)
 
         def submit(variant: str) -> list[Any]:
             tree = _tree(variant, folder)
-            files = enumerate(_tasks(run, variant, jobs, random, touched))
+            files = enumerate(_tasks(options, variant))
             return [pool.submit(_child, tree, [*words, str(out := tree / f"rows{k}.json")], out) for k, words in files]
 
         base = [row for task in submit("") for row in task.result()]  # first: compiles what all share
         running = {variant: submit(variant) for variant in chosen}
         for variant, tasks in running.items():
             rows = [row for task in tasks for row in task.result()]
-            label: Row = {"variant": variant, "area": variants()[variant], "random": random}
+            label: Row = {"variant": variant, "area": areas[variant], "random": options.random, "suite": options.suite}
             if variant in CONSTANTS:
                 constant = CONSTANTS[variant]
                 value = constant_file(variant)[1]
                 label |= {"value": value, "unit": constant.unit, "disabled": constant.disabled}
-            found = label | _compare(base, rows)
-            if kept is not None:
-                with kept.open("a") as file:  # a run that is cut short keeps what it has
-                    file.write(json.dumps(found) + "\n")
-            yield found
+            yield label | _compare(base, rows)
 
 
-def stress(run: Run) -> Iterator[Row]:
-    """Rows of the stress suite lost without a mechanism or constant."""
-    return _study(run, random=False)
+def main() -> None:
+    """Run the command line."""
+    from warpfea.base.console import write_json
+    from warpfea.base.provenance import provenance_of
+
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", required=True, type=pathlib.Path, help="JSON, added to where it exists")
+    parser.add_argument("--only", nargs="+", default=[], help="variants, or areas of them; by default all")
+    parser.add_argument("--case", nargs="+", default=[], help="cases, rows or groups of the stress suite")
+    parser.add_argument("--suite", choices=("all", "quick"), default="all")
+    parser.add_argument("--longest", type=float, default=math.inf, help="leave out rows that took more seconds")
+    parser.add_argument("--random", action="store_true", help=f"{RANDOM_CASES} random cases in place of the suite")
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--device", default="cpu")
+    options = parser.parse_args()
+    content = json.loads(options.out.read_text()) if options.out.exists() else {"rows": []}
+    command = " ".join(["python tests/ablation.py", *sys.argv[1:]])
+    origin = provenance_of([], options.device) | {"command": command}
+    content["runs"] = [*content.get("runs", []), origin]
+    for row in study(options, content["rows"]):
+        content["rows"].append(row | {"run": len(content["runs"]) - 1})
+        write_json(str(options.out), content)
+        shown = {key: row[key] for key in ("variant", "area", "rows", "newton", "pcg")}
+        print(*shown.values(), "lost", len(row["lost"]), row["lost"][:3], flush=True)
 
 
-def random_cases(run: Run) -> Iterator[Row]:
-    """Random cases refused, or answered otherwise, without a mechanism or constant."""
-    return _study(run, random=True)
-
-
-TABLE = Table(
-    __doc__,
-    {"stress": stress, "random": random_cases},
-    {
-        "ablation_cpu.json": "ablation --set jobs=16 --out tests/results/ablation_cpu.json",
-        "ablation_h200.json": "ablation --device cuda:0 --set jobs=14 --set touched=tests/results/ablation_cpu.json "
-        "--out tests/results/ablation_h200.json",
-    },
-    options={"jobs": 2, "variants": "all", "touched": "", "suite": "all", "seconds": [0.0, 1e9]},
-    settings={"random cases": RANDOM_CASES, "left out": list(LONG_ROWS)},
-    columns=("variant", "area", "value", "rows", "newton", "pcg", "lost"),
-    takes="an hour on 16 cores",
-    apart=True,
-)
+if __name__ == "__main__":
+    main()
