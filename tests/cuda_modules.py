@@ -75,8 +75,8 @@ def encoded(value):
 
 def decoded(value):
     """The argument that was encoded."""
+    from warpfea.kernels.common.modules import kernel_module
     from warpfea.kernels.common.traits import Traits
-    from warpfea.kernels.common.types import kernel_module
 
     from warpfea.simulation.integrators import INTEGRATORS
 

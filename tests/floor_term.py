@@ -11,8 +11,9 @@ from typing import ClassVar
 import numpy as np
 import warp as wp
 from warpfea.kernels.common.block_entries import add_block_function
+from warpfea.kernels.common.modules import kernel_module
 from warpfea.kernels.common.structs import pattern_struct, topology_struct
-from warpfea.kernels.common.types import kernel_module, precision
+from warpfea.kernels.common.types import precision
 from warpfea.kernels.solvers.newton_control import control_struct
 
 from warpfea.terms.protocols import Preconditioned, Tied, Updated

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import warp as wp
 from validation.conservation import LAWS
-from warpfea.kernels.common.types import kernel_module, precision
+from warpfea.kernels.common.modules import kernel_module
+from warpfea.kernels.common.types import precision
 from warpfea.kernels.elements import materials
 from warpfea.kernels.elements.energy_momentum import energy_momentum_law
 

@@ -5,7 +5,8 @@ import functools
 import numpy as np
 import pytest
 import warp as wp
-from warpfea.kernels.common.types import kernel_module, precision
+from warpfea.kernels.common.modules import kernel_module
+from warpfea.kernels.common.types import precision
 from warpfea.kernels.elements import materials
 
 import warpfea as wf

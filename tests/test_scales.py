@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import warp as wp
 from warpfea.kernels.common.inverse import inverse_function
-from warpfea.kernels.common.types import kernel_module, precision
+from warpfea.kernels.common.modules import kernel_module
+from warpfea.kernels.common.types import precision
 
 import warpfea as wf
 

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import warp as wp
 from floor_term import Floor
+from warpfea.kernels.common.modules import kernel_module
 from warpfea.kernels.common.traits import Traits
-from warpfea.kernels.common.types import kernel_module, precision
+from warpfea.kernels.common.types import precision
 
 import warpfea as wf
 from warpfea.simulation.checkpoint import load_checkpoint, save_checkpoint

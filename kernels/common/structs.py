@@ -54,11 +54,11 @@ def entry_sum_function(dtype: str) -> wp.Function:
     vec3 = p.vec3
 
     @wp.func
-    def entry_sum(start: int_1d, entry: int_1d, values: p.vec3_2d, world: int, slot: int) -> vec3:
+    def entry_sum(start: int_1d, entries: int_1d, values: p.vec3_2d, world: int, slot: int) -> vec3:
         """Sum of `values` [world, entry] over a slot's entries, in order."""
         s = vec3()
         for k in range(start[slot], start[slot + 1]):
-            s += values[world, entry[k]]
+            s += values[world, entries[k]]
         return s
 
     return entry_sum

@@ -4,12 +4,9 @@ import functools
 
 import warp as wp
 
-from .modules import SHORT_UNROLL, KernelSet, kernel_module, kernel_set
+from .modules import KernelSet
 
-__all__ = [
-    "SHORT_UNROLL", "double_1d", "double_2d", "double_3d", "int_1d", "int_2d", "kernel_module", "kernel_set",
-    "precision", "vec3d_1d", "vec3d_2d",
-]  # fmt: skip
+__all__ = ["double_1d", "double_2d", "double_3d", "int_1d", "int_2d", "precision", "vec3d_1d", "vec3d_2d"]
 
 int_1d, int_2d = wp.array(dtype=wp.int32), wp.array2d(dtype=wp.int32)
 double_1d, double_2d, double_3d = (kind(dtype=wp.float64) for kind in (wp.array, wp.array2d, wp.array3d))

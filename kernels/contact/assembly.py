@@ -5,14 +5,14 @@ limit mu F_n is frozen during a line search and updated at each iterate. Gap and
 """
 
 import functools
-import types as _types
 
 import warp as wp
 
 from ..common.block_entries import add_symmetric_function
 from ..common.lanes import lane_functions
+from ..common.modules import SHORT_UNROLL, KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.structs import pattern_struct, topology_struct
-from ..common.types import SHORT_UNROLL, kernel_module, kernel_set, precision
+from ..common.types import precision
 from .facet_structs import point_list_struct
 from .friction import friction_functions
 from .kinematics import GEOMETRIES, kinematics_functions
@@ -32,7 +32,7 @@ def contact_module(dtype: str, geometry: str, own: tuple[str, ...]) -> wp.Module
 
 
 @functools.cache
-def contact_kernels(dtype: str, geometry: str, own: tuple[str, ...] = ()) -> _types.SimpleNamespace:
+def contact_kernels(dtype: str, geometry: str, own: tuple[str, ...] = ()) -> KernelSet:
     """Kernels of contact in one precision of the displacements.
 
     Args:
@@ -47,15 +47,13 @@ def contact_kernels(dtype: str, geometry: str, own: tuple[str, ...] = ()) -> _ty
     Other, lane_sum, acting_shape_value = g.Other, lane_functions(dtype).lane_sum, k.acting_shape_value
     module = contact_module(dtype, geometry, own)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def begin_points(
         con: Contacts, other: Other, facets: Facets, his: History, clock: Clock, u_n: wp.array2d(dtype=vec3),
         v_n: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), scr: ContactScratch,
     ):  # fmt: skip
         """Points at the start of an attempt: position, depth, approach speed of the damping."""
         world, item, q = wp.tid()
-        if active[world] == 0:
-            return
         if q == 0 and item == 0 and facets.first_row == 0:
             scr.passed_point[world] = 0
             scr.limit_updates[world] = 0
@@ -82,7 +80,7 @@ def contact_kernels(dtype: str, geometry: str, own: tuple[str, ...] = ()) -> _ty
             n, v = g.start_motion(con, other, facets, his, clock, scr, v_n, world, item, q)
             law.set_explicit_force(con, his, scr, world, c, point, delta, n, v, clock.h[world])
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def forces(
         con: Contacts, other: Other, facets: Facets, his: History, clock: Clock, u: wp.array2d(dtype=vec3d),
         active: wp.array(dtype=wp.int32), fresh: int, scr: ContactScratch,
@@ -93,8 +91,6 @@ def contact_kernels(dtype: str, geometry: str, own: tuple[str, ...] = ()) -> _ty
         potential, which it would lose with the limits of each iterate where an iterate lies deep in an obstacle.
         """
         world, item, q = wp.tid()
-        if active[world] == 0:
-            return
         c = facets.contact[item]
         point = facets.first_point + item * facets.point_count + q
         area_fraction = facets.area_fraction[q, item] * k.is_acting(con, scr, world, c, point)
@@ -132,15 +128,13 @@ def contact_kernels(dtype: str, geometry: str, own: tuple[str, ...] = ()) -> _ty
                 friction = law.set_point_force(con, scr, world, c, point, t, frozen, inv_h, area_fraction)
         g.transmit(con, other, scr, world, c, point, t, friction)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def gather_point_forces(
         facets: Facets, active: wp.array(dtype=wp.int32), lanes: int, scr: ContactScratch, pool: wp.array2d(dtype=vec3),
         rows: wp.array3d(dtype=f64), touching: wp.array(dtype=wp.int32),
     ):  # fmt: skip
         """Forces of facets on their slots and, once per facet, rows of the potential."""
         world, index = wp.tid()
-        if active[world] == 0:
-            return
         entry = wp.min(index / lanes, facets.facet_count * facets.conn.shape[0] - 1)
         item = entry % facets.facet_count
         i = entry / facets.facet_count
@@ -178,12 +172,10 @@ def contact_kernels(dtype: str, geometry: str, own: tuple[str, ...] = ()) -> _ty
         rows[1, world, row] = energy[0]
         rows[2, world, row] = energy[1]
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "flags")
     def aitken_partial_sums(flags: wp.array(dtype=wp.int32), scr: ContactScratch):
         """Partial sums, by lanes, of r = limit of the iterate - frozen limit, and of its change, for relaxation."""
         world, lane = wp.tid()
-        if flags[world] == 0:
-            return
         out = wp.vec4d()
         for point in range(lane, scr.aitken_residual.shape[1], AITKEN_LANES):
             if scr.activity[world, point] == WITH_STIFFNESS:
@@ -193,14 +185,12 @@ def contact_kernels(dtype: str, geometry: str, own: tuple[str, ...] = ()) -> _ty
                 out += wp.vec4d(old * (r - old), (r - old) * (r - old), r * r, new * new)
         scr.aitken_sums[world, lane] = out
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "flags")
     def aitken_relaxation(
         flags: wp.array(dtype=wp.int32), tol: f64, scr: ContactScratch, unsettled: wp.array(dtype=wp.int32)
     ):
         """Relaxation factor of the friction limits: 1 while r shrinks, else Aitken's (Irons and Tuck 1969)."""
         world = wp.tid()
-        if flags[world] == 0:
-            return
         total = wp.vec4d()
         for lane in range(AITKEN_LANES):
             total += scr.aitken_sums[world, lane]
@@ -213,18 +203,17 @@ def contact_kernels(dtype: str, geometry: str, own: tuple[str, ...] = ()) -> _ty
         scr.aitken_norm2[world] = total[2]
         scr.limit_updates[world] = scr.limit_updates[world] + 1
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "flags")
     def update_frozen(flags: wp.array(dtype=wp.int32), scr: ContactScratch):
         """Update the frozen friction limits by the relaxed change, and the plane of friction."""
         world, point = wp.tid()
-        if flags[world] != 0:
-            new = scr.updated_friction[world, point]
-            r = new[0] - scr.frozen_friction[world, point][0]
-            if scr.relaxation[world] != f64(1.0):
-                new[0] = wp.max(scr.frozen_friction[world, point][0] + scr.relaxation[world] * r, f64(0.0))
-            scr.aitken_residual[world, point] = r
-            scr.frozen_friction[world, point] = new
-            scr.frozen_normal[world, point] = scr.updated_normal[world, point]
+        new = scr.updated_friction[world, point]
+        r = new[0] - scr.frozen_friction[world, point][0]
+        if scr.relaxation[world] != f64(1.0):
+            new[0] = wp.max(scr.frozen_friction[world, point][0] + scr.relaxation[world] * r, f64(0.0))
+        scr.aitken_residual[world, point] = r
+        scr.frozen_friction[world, point] = new
+        scr.frozen_normal[world, point] = scr.updated_normal[world, point]
 
     @wp.kernel(module=module)
     def point_products(
@@ -240,15 +229,13 @@ def contact_kernels(dtype: str, geometry: str, own: tuple[str, ...] = ()) -> _ty
         point = facets.first_point + item * facets.point_count + q
         scr.point_product[world, point] = g.other_product(other, scr, p, world, point, d)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def gather_products(
         other: Other, facets: Facets, active: wp.array(dtype=wp.int32), lanes: int, last: int, scr: ContactScratch,
         pool: wp.array2d(dtype=vec3),
     ):  # fmt: skip
         """Sums of the point products on the slots of the facets, and of the other side where `last` includes them."""
         world, index = wp.tid()
-        if active[world] == 0:
-            return
         out = vec3()
         own = facets.facet_count * facets.conn.shape[0]
         entry = wp.min(index / lanes, last)
@@ -267,12 +254,10 @@ def contact_kernels(dtype: str, geometry: str, own: tuple[str, ...] = ()) -> _ty
         if lane == 0:
             pool[world, place] = out
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def diagonal(facets: Facets, active: wp.array(dtype=wp.int32), scr: ContactScratch, pool: wp.array2d(dtype=sym)):
         """3x3 diagonal blocks of the facets."""
         world, item, i = wp.tid()
-        if active[world] == 0:
-            return
         out = sym()
         if scr.facet_activity[world, facets.first_row + item] == WITH_STIFFNESS:
             for q in range(facets.point_count):
@@ -284,7 +269,7 @@ def contact_kernels(dtype: str, geometry: str, own: tuple[str, ...] = ()) -> _ty
 
 
 @functools.cache
-def block_kernels(dtype: str, listed: bool) -> _types.SimpleNamespace:
+def block_kernels(dtype: str, listed: bool) -> KernelSet:
     """Contributions of contact to an assembled matrix: points on their own facets, or `listed` by the facets of the
     other side."""
     p = precision(dtype)
@@ -325,7 +310,7 @@ def block_kernels(dtype: str, listed: bool) -> _types.SimpleNamespace:
 
     block = listed_block if listed else own_block
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def add_blocks(
         topo: Topology, pattern: Pattern, points: Points, entry: wp.array(dtype=wp.int32),
         start: wp.array(dtype=wp.int32), source: wp.array(dtype=wp.vec3i), stiffness: wp.array2d(dtype=sym),
@@ -334,8 +319,6 @@ def block_kernels(dtype: str, listed: bool) -> _types.SimpleNamespace:
     ):  # fmt: skip
         """value += (dq/dv) times the blocks of an entry; `source`: facet and two of its slots."""
         world, index = wp.tid()
-        if active[world] == 0:
-            return
         k6 = sym()
         for e in range(start[index], start[index + 1]):
             k6 = block(points, stiffness, weight, world, source[e], k6)

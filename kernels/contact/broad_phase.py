@@ -4,12 +4,12 @@ Computed are the monomial coefficients of displacements on each facet, its centr
 """
 
 import functools
-import types as _types
 from typing import Any
 
 import warp as wp
 
-from ..common.types import SHORT_UNROLL, kernel_module, kernel_set, precision
+from ..common.modules import SHORT_UNROLL, KernelSet, kernel_module, kernel_set, masked_kernel
+from ..common.types import precision
 from .facet_structs import facet_field_struct, master_struct, pair_scratch_struct
 from .projection import facet_projection_functions
 
@@ -22,7 +22,7 @@ BOX_ROUNDING = 2.4e-7
 
 
 @functools.cache
-def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
+def broad_phase_kernels(dtype: str) -> KernelSet:
     """Kernels for displacements of type `dtype`, in the module of `facet_search_kernels`; functions of boxes."""
     vec3 = precision(dtype).vec3
     f64, vec3d, box3 = wp.float64, wp.vec3d, wp.vec3
@@ -60,15 +60,13 @@ def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
             pair.displacement.value[world, mas.max_monomials * item + m] = c
             pair.displacement.director[world, mas.max_monomials * item + m] = d
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def initial_coefficients(
         mas: Masters, u_n: wp.array2d(dtype=vec3), v_n: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32),
         pair: PairScratch,
     ):  # fmt: skip
         """Coefficients of displacements and velocities at the start of an attempt; reset the largest depths."""
         world, item, m = wp.tid()
-        if active[world] == 0:
-            return
         control = mas.max_monomials * item + m
         # threads of a world share the bodies
         for body in range(control, pair.deepest_contact.shape[1], mas.max_monomials * mas.facet_count):
@@ -126,12 +124,10 @@ def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
                 )
         return x
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def check_boxes(mas: Masters, active: wp.array(dtype=wp.int32), pair: PairScratch):
         """Request a refit if a facet, at the start of the attempt or now, left its box; compute the enlarged boxes."""
         world, item = wp.tid()
-        if active[world] == 0:
-            return
         low = vec3d(f64(1.0e300), f64(1.0e300), f64(1.0e300))
         high = -low
         kind = mas.facet_kind[item]
@@ -149,13 +145,11 @@ def broad_phase_kernels(dtype: str) -> _types.SimpleNamespace:
         pair.refit_lower[index] = round_down(low - pad)
         pair.refit_upper[index] = round_up(high + pad)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def update_centres(mas: Masters, active: wp.array(dtype=wp.int32), pair: PairScratch):
         """Position and derivatives at the centre of each facet, now and at the start of the attempt; an upper bound, m,
         of the facet's height above the tangent plane there, from its control points."""
         world, item = wp.tid()
-        if active[world] == 0:
-            return
         kind = mas.facet_kind[item]
         count = mas.monomial_count[kind]
         xi = facet_centre(mas.corner_count[kind])

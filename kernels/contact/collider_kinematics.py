@@ -1,11 +1,11 @@
 """Points against rigid shapes: the geometry of colliders, their poses, and the record of a point."""
 
 import functools
-import types as _types
 
 import warp as wp
 
-from ..common.types import kernel_module, kernel_set, precision
+from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
+from ..common.types import precision
 from .collider_mesh import MESH
 from .colliders import MESH_SUFFIX, collider_functions
 from .kinematics import GEOMETRIES, kinematics_functions
@@ -21,7 +21,7 @@ MAX_COLLIDER_ROTATION = 1.0
 
 
 @functools.cache
-def collider_kinematics(dtype: str, meshes: bool) -> _types.SimpleNamespace:
+def collider_kinematics(dtype: str, meshes: bool) -> KernelSet:
     """Device functions of the geometry, see kinematics.py; `meshes`: some collider is a triangle mesh."""
     vec3 = precision(dtype).vec3
     f64, vec3d = wp.float64, wp.vec3d
@@ -244,20 +244,18 @@ GEOMETRIES["colliders_meshes"] = functools.partial(collider_kinematics, meshes=T
 
 
 @functools.cache
-def pose_kernels(meshes: bool) -> _types.SimpleNamespace:
+def pose_kernels(meshes: bool) -> KernelSet:
     """Kernel of the poses of colliders."""
     f64, vec3d = wp.float64, wp.vec3d
     Colliders = collider_struct(meshes)
     module = kernel_module(f"collider_poses{MESH_SUFFIX * meshes}", light=True)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def update_poses(
         col: Colliders, value: wp.array2d(dtype=vec3d), active: wp.array(dtype=wp.int32)
     ):  # fmt: skip
         """Poses of the colliders at the end of the attempt, and their motion in it."""
         world, k = wp.tid()
-        if active[world] == 0:
-            return
         position = col.center[k]
         rotation = col.axes[k]
         if col.rotation_law[k] >= 0:

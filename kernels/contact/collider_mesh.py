@@ -10,11 +10,10 @@ are then the triangles that face like that one and are ahead of the point.
 """
 
 import functools
-import types as _types
 
 import warp as wp
 
-from ..common.types import kernel_set
+from ..common.modules import KernelSet, kernel_set
 
 __all__ = ["BOUNDARY", "FLAT", "MESH", "SHARP", "mesh_functions", "mesh_struct"]
 
@@ -57,7 +56,7 @@ def mesh_struct():
 
 
 @functools.cache
-def mesh_functions(Colliders) -> _types.SimpleNamespace:
+def mesh_functions(Colliders) -> KernelSet:
     """Device functions of a `collider_struct` with `mesh`; `size`: its size, thickness, 1 if closed."""
     f64, vec3d, vec4d = wp.float64, wp.vec3d, wp.vec4d
     ints = wp.types.vector(length=STACK_SIZE, dtype=wp.int32)

@@ -6,11 +6,10 @@ capsule: of its axis, without the caps).
 """
 
 import functools
-import types as _types
 
 import warp as wp
 
-from ..common.types import kernel_set
+from ..common.modules import KernelSet, kernel_set
 
 __all__ = ["BOX", "CAPSULE", "CYLINDER", "HALF_SPACE", "SPHERE", "shape_functions"]
 
@@ -23,7 +22,7 @@ again."""
 
 
 @functools.cache
-def shape_functions() -> _types.SimpleNamespace:
+def shape_functions() -> KernelSet:
     """Device functions `distance` and `sweep`."""
     f64 = wp.float64
     vec3d = wp.vec3d

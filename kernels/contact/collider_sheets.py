@@ -1,11 +1,11 @@
 """Check for bodies that cross a sheet of triangles at the start, where their side is undefined."""
 
 import functools
-import types as _types
 
 import warp as wp
 
-from ..common.types import SHORT_UNROLL, kernel_module, kernel_set, precision
+from ..common.modules import SHORT_UNROLL, KernelSet, kernel_module, kernel_set
+from ..common.types import precision
 from .colliders import MESH_SUFFIX, collider_functions
 from .kinematics import kinematics_functions
 from .structs import collider_struct, facet_struct
@@ -14,7 +14,7 @@ __all__ = ["sheet_kernels"]
 
 
 @functools.cache
-def sheet_kernels(dtype: str) -> _types.SimpleNamespace:
+def sheet_kernels(dtype: str) -> KernelSet:
     """A kernel in a module of its own, run once at the start of a simulation."""
     vec3, vec3d = precision(dtype).vec3, wp.vec3d
     Colliders, Facets = collider_struct(True), facet_struct(dtype)

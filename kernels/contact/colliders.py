@@ -4,11 +4,10 @@ Models without triangle meshes use functions compiled without the mesh code.
 """
 
 import functools
-import types as _types
 
 import warp as wp
 
-from ..common.types import kernel_set
+from ..common.modules import KernelSet, kernel_set
 from .collider_mesh import MESH, mesh_functions
 from .collider_shapes import BOX, HALF_SPACE, SPHERE, shape_functions
 from .structs import SLIP_FLAG, collider_struct
@@ -22,13 +21,13 @@ MESH_FUNCTIONS = ("distance", "sweep", "updated_side", "depth_change", "sheet_si
 
 
 @functools.cache
-def collider_functions(meshes: bool) -> _types.SimpleNamespace:
+def collider_functions(meshes: bool) -> KernelSet:
     """Device functions, see `shape_functions` and `mesh_functions`."""
     f64, vec3d = wp.float64, wp.vec3d
     Colliders = collider_struct(meshes)
     shapes = shape_functions()
     of_shape, sweep_shape = shapes.distance, shapes.sweep
-    mesh = mesh_functions(Colliders) if meshes else _types.SimpleNamespace(**dict.fromkeys(MESH_FUNCTIONS))
+    mesh = mesh_functions(Colliders) if meshes else KernelSet(**dict.fromkeys(MESH_FUNCTIONS))
     distance_on_mesh, sweep_mesh, side_on_mesh, depth_change_on_mesh, sheet_side_on_mesh = (
         getattr(mesh, name) for name in MESH_FUNCTIONS
     )

@@ -5,11 +5,11 @@ the contact point moves continuously as a smooth body rolls.
 """
 
 import functools
-import types as _types
 
 import warp as wp
 
-from ..common.types import SHORT_UNROLL, kernel_module, kernel_set, precision
+from ..common.modules import SHORT_UNROLL, KernelSet, kernel_module, kernel_set, masked_kernel
+from ..common.types import precision
 from .collider_kinematics import MIN_APPROACH_SPEED, collider_kinematics
 from .colliders import MESH_SUFFIX, collider_functions
 from .kinematics import kinematics_functions
@@ -27,7 +27,7 @@ DIFFERENCE_STEP = 1e-5
 
 
 @functools.cache
-def deepest_point_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
+def deepest_point_kernels(dtype: str, meshes: bool) -> KernelSet:
     """Kernels of lumped contacts, in a module of their own; `meshes`: some collider is a triangle mesh."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
@@ -158,15 +158,13 @@ def deepest_point_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
                 break
         return vec3d(s[0], s[1], d[3])
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def point_depths(
         con: Contacts, col: Colliders, facets: Facets, his: History, time: wp.array(dtype=f64),
         u: wp.array2d(dtype=vec3d), active: wp.array(dtype=wp.int32), scr: ContactScratch,
     ):  # fmt: skip
         """Depths of the points of lumped contacts."""
         world, item, q = wp.tid()
-        if active[world] == 0:
-            return
         c = facets.contact[item]
         point = facets.first_point + item * facets.point_count + q
         depth = f64(-1.0e300)
@@ -180,15 +178,13 @@ def deepest_point_kernels(dtype: str, meshes: bool) -> _types.SimpleNamespace:
                 depth = scr.start_depth[world, point]
         scr.point_depth[world, point] = depth
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def find_deepest(
         con: Contacts, col: Colliders, facets: Facets, his: History, time: wp.array(dtype=f64),
         u: wp.array2d(dtype=vec3d), active: wp.array(dtype=wp.int32), scr: ContactScratch,
     ):  # fmt: skip
         """Deepest position of each facet that may touch and be the deepest of its contact; else its deepest point."""
         world, item = wp.tid()
-        if active[world] == 0:
-            return
         c = facets.contact[item]
         row = facets.first_row + item
         first = facets.first_point + item * facets.point_count

@@ -1,11 +1,11 @@
 """Contact at a state: gap, elastic force and facet of every point, for fields and checks."""
 
 import functools
-import types as _types
 
 import warp as wp
 
-from ..common.types import SHORT_UNROLL, kernel_module, kernel_set, precision
+from ..common.modules import SHORT_UNROLL, KernelSet, kernel_module, kernel_set
+from ..common.types import precision
 from .collider_kinematics import collider_kinematics
 from .colliders import MESH_SUFFIX
 from .facet_search import facet_search_kernels
@@ -36,7 +36,7 @@ def pair_results_struct():
 
 
 @functools.cache
-def collider_evaluation_kernels(dtype: str, meshes: bool, own: tuple[str, ...] = ()) -> _types.SimpleNamespace:
+def collider_evaluation_kernels(dtype: str, meshes: bool, own: tuple[str, ...] = ()) -> KernelSet:
     """Kernels for contact with colliders; arguments as of `contact_kernels`, `meshes`: some collider is a mesh."""
     vec3 = precision(dtype).vec3
     f64, vec3d = wp.float64, wp.vec3d
@@ -105,7 +105,7 @@ def collider_evaluation_kernels(dtype: str, meshes: bool, own: tuple[str, ...] =
 
 
 @functools.cache
-def pair_evaluation_kernels(dtype: str, own: tuple[str, ...] = ()) -> _types.SimpleNamespace:
+def pair_evaluation_kernels(dtype: str, own: tuple[str, ...] = ()) -> KernelSet:
     """Kernels for contact between bodies; arguments as of `contact_kernels`."""
     f64, vec3d = wp.float64, wp.vec3d
     Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)

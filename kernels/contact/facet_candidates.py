@@ -1,11 +1,10 @@
 """Master facets near a slave point: depth, side and motion decide which one it is in contact with."""
 
 import functools
-import types as _types
 
 import warp as wp
 
-from ..common.types import kernel_set
+from ..common.modules import KernelSet, kernel_set
 from .broad_phase import broad_phase_kernels
 from .facet_structs import master_struct, pair_scratch_struct
 from .kinematics import kinematics_functions
@@ -30,7 +29,7 @@ TANGENT_PLANE_MARGIN = 0.5
 
 
 @functools.cache
-def facet_candidate_functions(dtype: str) -> _types.SimpleNamespace:
+def facet_candidate_functions(dtype: str) -> KernelSet:
     """Device functions in one precision of the displacements."""
     f64, vec3d = wp.float64, wp.vec3d
     Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)

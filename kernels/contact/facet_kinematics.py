@@ -7,12 +7,12 @@ iterate, nearly continuous where a point passes to the next facet, for any strai
 """
 
 import functools
-import types as _types
 
 import warp as wp
 
 from ..common.lanes import lane_functions
-from ..common.types import SHORT_UNROLL, kernel_module, kernel_set, precision
+from ..common.modules import SHORT_UNROLL, KernelSet, kernel_module, kernel_set, masked_kernel
+from ..common.types import precision
 from .facet_search import PENETRATED, facet_search_kernels
 from .facet_structs import facet_side_struct, master_struct, pair_scratch_struct
 from .kinematics import GEOMETRIES, kinematics_functions
@@ -23,7 +23,7 @@ __all__ = ["facet_kinematics", "master_kernels"]
 
 
 @functools.cache
-def facet_kinematics(dtype: str) -> _types.SimpleNamespace:
+def facet_kinematics(dtype: str) -> KernelSet:
     """Device functions of the geometry, see kinematics.py."""
     p = precision(dtype)
     T, vec2, vec3, sym = p.T, p.vec2, p.vec3, p.sym
@@ -279,7 +279,7 @@ GEOMETRIES["facets"] = facet_kinematics
 
 
 @functools.cache
-def master_kernels(dtype: str) -> _types.SimpleNamespace:
+def master_kernels(dtype: str) -> KernelSet:
     """Kernels of master facets: sums over the points listed for each, and shape values of friction."""
     p = precision(dtype)
     T, vec3, sym = p.T, p.vec3, p.sym
@@ -305,14 +305,12 @@ def master_kernels(dtype: str) -> _types.SimpleNamespace:
             other.scratch.friction_shape[world, point, i] = T(shape_value(other.masters, f, i, xi))
         freeze_friction_shapes(other.masters, facets, other.scratch, u, world, q, item, point, f)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def gather_master_forces(
         other: Other, active: wp.array(dtype=wp.int32), lanes: int, scr: ContactScratch, pool: wp.array2d(dtype=vec3)
     ):  # fmt: skip
         """Forces of points on the slots of their master facets."""
         world, index = wp.tid()
-        if active[world] == 0:
-            return
         entry = wp.min(index / lanes, other.masters.facet_count * other.masters.conn.shape[0] - 1)
         f = entry % other.masters.facet_count
         i = entry / other.masters.facet_count
@@ -327,14 +325,12 @@ def master_kernels(dtype: str) -> _types.SimpleNamespace:
         if index % lanes == 0:
             pool[world, other.masters.first_entry + entry] = total
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def master_diagonal(
         other: Other, active: wp.array(dtype=wp.int32), scr: ContactScratch, pool: wp.array2d(dtype=sym)
     ):  # fmt: skip
         """3x3 diagonal blocks of master facets."""
         world, f, i = wp.tid()
-        if active[world] == 0:
-            return
         out = sym()
         for k in range(other.scratch.list_size[world, f]):
             point = other.scratch.list_point[world, other.scratch.list_start[world, f] + k]

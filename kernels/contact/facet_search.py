@@ -5,11 +5,11 @@ inside of a facet now and was outside of it at the start of the step; only boxes
 """
 
 import functools
-import types as _types
 
 import warp as wp
 
-from ..common.types import SHORT_UNROLL, kernel_module, kernel_set, precision
+from ..common.modules import SHORT_UNROLL, KernelSet, kernel_module, kernel_set, masked_kernel
+from ..common.types import precision
 from .broad_phase import BOX_MARGIN, broad_phase_kernels
 from .collider_kinematics import MIN_APPROACH_SPEED
 from .facet_candidates import TUNNEL_LIMIT_RATIO, facet_candidate_functions
@@ -26,7 +26,7 @@ PENETRATED = -2
 
 
 @functools.cache
-def facet_search_kernels(dtype: str) -> _types.SimpleNamespace:
+def facet_search_kernels(dtype: str) -> KernelSet:
     """Kernels in one precision of the displacements."""
     p = precision(dtype)
     vec3 = p.vec3
@@ -110,15 +110,13 @@ def facet_search_kernels(dtype: str) -> _types.SimpleNamespace:
                     if depth > pair.deepest_contact[world, body]:
                         wp.atomic_max(pair.deepest_contact, world, body, depth)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def query_boxes(
         con: Contacts, mas: Masters, facets: Facets, his: History, u: wp.array2d(dtype=vec3d),
         active: wp.array(dtype=wp.int32), search_distance: f64, scr: ContactScratch, pair: PairScratch,
     ):  # fmt: skip
         """Flag slave facets with a master facet's box nearby; for the others store the box without master facets."""
         world, item = wp.tid()
-        if active[world] == 0:
-            return
         row = facets.first_row + item
         low = vec3d(f64(1.0e300), f64(1.0e300), f64(1.0e300))
         high = -low
@@ -218,7 +216,7 @@ def facet_search_kernels(dtype: str) -> _types.SimpleNamespace:
         pair.relative_motion[world, point] = motion
         pair.spring[world, point] = spring
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def find_facets(
         con: Contacts, mas: Masters, facets: Facets, his: History, clock: Clock, u: wp.array2d(dtype=vec3d),
         v_n: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), overlap_limit: f64, scr: ContactScratch,
@@ -227,8 +225,6 @@ def facet_search_kernels(dtype: str) -> _types.SimpleNamespace:
         """Facet of each point at an iterate. `overlap_limit` > 0: no step; inner points up to that depth, m, are in
         contact. `corner_points`: three points of each slave facet, or -1."""
         world, item, q = wp.tid()
-        if active[world] == 0:
-            return
         point = facets.first_point + item * facets.point_count + q
         pair.facet[world, point] = -1
         if facets.area_fraction[q, item] == f64(0.0):

@@ -6,11 +6,11 @@ during a line search, and updated at each iterate (`freeze_friction`): friction 
 """
 
 import functools
-import types as _types
 
 import warp as wp
 
-from ..common.types import kernel_set, precision
+from ..common.modules import KernelSet, kernel_set
+from ..common.types import precision
 from .kinematics import kinematics_functions
 from .law import (
     ANY_GAP,
@@ -30,7 +30,7 @@ __all__ = ["friction_functions"]
 
 
 @functools.cache
-def friction_functions(dtype: str, own: tuple[str, ...] = ()) -> _types.SimpleNamespace:
+def friction_functions(dtype: str, own: tuple[str, ...] = ()) -> KernelSet:
     """Device functions in one precision of the displacements; `own`: laws of one's own in use."""
     T, sym = precision(dtype).T, precision(dtype).sym
     f64, vec3d, mat33d = wp.float64, wp.vec3d, wp.mat33d

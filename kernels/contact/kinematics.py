@@ -19,23 +19,23 @@ store_side: what the other side stores after a step.
 """
 
 import functools
-import types as _types
 from collections.abc import Callable
 from typing import Any
 
 import warp as wp
 
-from ..common.types import kernel_set, precision
+from ..common.modules import KernelSet, kernel_set
+from ..common.types import precision
 from .structs import contact_structs
 
 __all__ = ["GEOMETRIES", "kinematics_functions"]
 
-GEOMETRIES: dict[str, Callable[[str], _types.SimpleNamespace]] = {}
+GEOMETRIES: dict[str, Callable[[str], KernelSet]] = {}
 """Geometries of the other side by name: the precision of the displacements -> device functions and `Other`."""
 
 
 @functools.cache
-def kinematics_functions(dtype: str) -> _types.SimpleNamespace:
+def kinematics_functions(dtype: str) -> KernelSet:
     """Device functions in one precision of the displacements; everything else is float64."""
     p = precision(dtype)
     T, vec3, sym = p.T, p.vec3, p.sym

@@ -20,12 +20,11 @@ A law of one's own is an entry of `LAWS`, see "A new contact law" in warpfea/REA
 """
 
 import functools
-import types as _types
 from typing import NamedTuple
 
 import warp as wp
 
-from ..common.types import kernel_set
+from ..common.modules import KernelSet, kernel_set
 
 __all__ = [
     "ANY_GAP",
@@ -208,7 +207,7 @@ def law_code(name: str) -> int:
 
 
 @functools.cache
-def law_functions(own: tuple[str, ...] = ()) -> _types.SimpleNamespace:
+def law_functions(own: tuple[str, ...] = ()) -> KernelSet:
     """Device function `normal_law` of the built-in laws and those of one's own, by name."""
     hunt_crossley, paper_law, smooth_law = (LAWS[name].normal for name in ("default", "paper", "smooth"))
 

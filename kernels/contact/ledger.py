@@ -1,11 +1,10 @@
 """Contact after an accepted step: history, energy ledger, record of each contact; for any geometry."""
 
 import functools
-import types as _types
 
 import warp as wp
 
-from ..common.types import kernel_set
+from ..common.modules import KernelSet, kernel_set, masked_kernel
 from .assembly import contact_module
 from .friction import friction_functions
 from .kinematics import GEOMETRIES, kinematics_functions
@@ -41,7 +40,7 @@ stored are values at its end."""
 
 
 @functools.cache
-def contact_ledger_kernels(dtype: str, geometry: str, own: tuple[str, ...] = ()) -> _types.SimpleNamespace:
+def contact_ledger_kernels(dtype: str, geometry: str, own: tuple[str, ...] = ()) -> KernelSet:
     """Kernels in the module of `contact_kernels`, with the same arguments."""
     f64, vec3d = wp.float64, wp.vec3d
     Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)
@@ -159,7 +158,7 @@ def contact_ledger_kernels(dtype: str, geometry: str, own: tuple[str, ...] = ())
             add_to_row(scr.record_rows, STICK_ROW, world, row, area * f64(1 - o.slipping))
         scr.record_rows[PENETRATION_ROW, world, row] = wp.max(scr.record_rows[PENETRATION_ROW, world, row], t.depth)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "accepted")
     def record_substep(
         con: Contacts, other: Other, facets: Facets, his: History, clock: Clock, u: wp.array2d(dtype=vec3d),
         accepted: wp.array(dtype=wp.int32), scr: ContactScratch, energies: wp.array3d(dtype=f64),
@@ -170,8 +169,6 @@ def contact_ledger_kernels(dtype: str, geometry: str, own: tuple[str, ...] = ())
         overlap moves: the integrator's formula omits both.
         """
         world, item = wp.tid()
-        if accepted[world] == 0:
-            return
         c = facets.contact[item]
         row = facets.first_row + item
         for j in range(ENERGY_COLUMNS):
@@ -209,15 +206,13 @@ def contact_ledger_kernels(dtype: str, geometry: str, own: tuple[str, ...] = ())
         for j in range(4):
             scr.record_rows[STORED_ROW + j, world, row] = energies[j, world, row]
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "accepted")
     def partial_records(
         con: Contacts, rows_of: wp.array(dtype=wp.int32), accepted: wp.array(dtype=wp.int32), scr: ContactScratch,
         out: wp.array4d(dtype=f64),
     ):  # fmt: skip
         """Sums over the facets of a contact, by lanes: [world, contact, RECORD_NAMES, lane]."""
         world, c, j, lane = wp.tid()
-        if accepted[world] == 0:
-            return
         total = f64(0.0)
         for row in range(rows_of[c] + lane, rows_of[c + 1], RECORD_LANES):
             value = scr.record_rows[j, world, row]
@@ -227,14 +222,12 @@ def contact_ledger_kernels(dtype: str, geometry: str, own: tuple[str, ...] = ())
                 total += value
         out[world, c, j, lane] = total
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "accepted")
     def total_records(
         clock: Clock, accepted: wp.array(dtype=wp.int32), parts: wp.array4d(dtype=f64), scr: ContactScratch
     ):  # fmt: skip
         """Record of the step so far: forces averaged over time, work summed."""
         world, c, j = wp.tid()
-        if accepted[world] == 0:
-            return
         h = clock.h[world]
         past = scr.elapsed_time[world]
         total = f64(0.0)
@@ -255,7 +248,7 @@ def contact_ledger_kernels(dtype: str, geometry: str, own: tuple[str, ...] = ())
             total += old
         scr.record_totals[world, c, j] = total
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "accepted")
     def store_state(
         other: Other, clock: Clock, potential: wp.array(dtype=f64), term_sums: wp.array2d(dtype=f64),
         accepted: wp.array(dtype=wp.int32), his: History, scr: ContactScratch,
@@ -263,8 +256,6 @@ def contact_ledger_kernels(dtype: str, geometry: str, own: tuple[str, ...] = ())
         """Store the other side and the time of the accepted state; advance the elapsed time; add the contact energy,
         J, to the bound of the next initial iterate."""
         world, index = wp.tid()
-        if accepted[world] == 0:
-            return
         g.store_side(other, world, index)
         if index == 0:
             his.pose_time[world] = clock.time[world]

@@ -1,11 +1,10 @@
 """Point list of each master facet by counting sort; rebuilt when a point changes its facet."""
 
 import functools
-import types as _types
 
 import warp as wp
 
-from ..common.types import SHORT_UNROLL, kernel_module, kernel_set
+from ..common.modules import SHORT_UNROLL, KernelSet, kernel_module, kernel_set
 from .facet_structs import master_struct, pair_scratch_struct
 
 __all__ = ["FACETS_PER_CHUNK", "point_list_kernels"]
@@ -15,7 +14,7 @@ FACETS_PER_CHUNK = 64
 
 
 @functools.cache
-def point_list_kernels(dtype: str) -> _types.SimpleNamespace:
+def point_list_kernels(dtype: str) -> KernelSet:
     """Kernels in the module of `pair_kernels`."""
     Masters, PairScratch = master_struct(dtype), pair_scratch_struct(dtype)
     module = kernel_module(f"pairs_{dtype}", max_unroll=SHORT_UNROLL)

@@ -5,11 +5,10 @@ along the director. U: displacements on the facets, see `facet_field_struct`.
 """
 
 import functools
-import types as _types
 
 import warp as wp
 
-from ..common.types import kernel_set
+from ..common.modules import KernelSet, kernel_set
 from .facet_structs import facet_field_struct, master_struct
 
 __all__ = ["INSIDE_TOLERANCE", "MAX_OVERHANG", "OUTSIDE_TOLERANCE", "facet_projection_functions"]
@@ -31,7 +30,7 @@ steps, since a force that ends at an iterate has no potential."""
 
 
 @functools.cache
-def facet_projection_functions(dtype: str) -> _types.SimpleNamespace:
+def facet_projection_functions(dtype: str) -> KernelSet:
     """Device functions in one precision of the displacements; evaluated in float64."""
     Masters, FacetField = master_struct(dtype), facet_field_struct()
     f64, vec3d = wp.float64, wp.vec3d

@@ -1,12 +1,12 @@
 """Cross terms of pair contact in the matrix of rigid-body modes, see kernels/solvers/rigid_body_modes.py."""
 
 import functools
-import types as _types
 
 import warp as wp
 
+from ..common.modules import SHORT_UNROLL, KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.rigid import RIGID_MODES, bodies_struct, rigid_mode_functions
-from ..common.types import SHORT_UNROLL, kernel_module, kernel_set, precision
+from ..common.types import precision
 from .facet_structs import master_struct
 from .structs import facet_struct
 
@@ -14,7 +14,7 @@ __all__ = ["pair_rigid_mode_kernels"]
 
 
 @functools.cache
-def pair_rigid_mode_kernels(dtype: str) -> _types.SimpleNamespace:
+def pair_rigid_mode_kernels(dtype: str) -> KernelSet:
     """Kernels in one precision of the displacements."""
     p = precision(dtype)
     T, sym = p.T, p.sym
@@ -24,7 +24,7 @@ def pair_rigid_mode_kernels(dtype: str) -> _types.SimpleNamespace:
     translation_columns, rotation_columns = rigid.translation_columns, rigid.rotation_columns
     module = kernel_module(f"pair_rigid_modes_{dtype}", max_unroll=SHORT_UNROLL)
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def cross_term_sums(
         bodies: Bodies, mas: Masters, facets: Facets, contact: wp.array(dtype=wp.int32),
         first: wp.array(dtype=wp.int32),
@@ -34,8 +34,6 @@ def pair_rigid_mode_kernels(dtype: str) -> _types.SimpleNamespace:
         """R_s^T K R_m of the points of a contact, partial sum of a lane, as blocks: translation-translation,
         translation-rotation, rotation-translation, rotation-rotation of slave and master."""
         world, index, lane = wp.tid()
-        if active[world] == 0:
-            return
         c = contact[index]
         a = bodies.body_of_slot[facets.conn[0, (first[c] - facets.first_point) / facets.point_count]]
         mm = mat33d()
@@ -74,7 +72,7 @@ def pair_rigid_mode_kernels(dtype: str) -> _types.SimpleNamespace:
         parts[world, c, lane, 2] = tm
         parts[world, c, lane, 3] = tt
 
-    @wp.kernel(module=module)
+    @masked_kernel(module, "active")
     def add_cross_terms(
         pair: wp.array(dtype=wp.vec2i), start: wp.array(dtype=wp.int32), source: wp.array(dtype=wp.vec2i),
         parts: wp.array4d(dtype=mat33d), dq_dv: wp.array(dtype=f64), active: wp.array(dtype=wp.int32),
@@ -82,8 +80,6 @@ def pair_rigid_mode_kernels(dtype: str) -> _types.SimpleNamespace:
     ):  # fmt: skip
         """matrix -= (dq/dv) sums of each pair of bodies; `source`: contact, and 1 if its slave is the second body."""
         world, index, block = wp.tid()
-        if active[world] == 0:
-            return
         at = pair[index]
         turn_a = block / 2
         turn_b = block % 2

@@ -4,7 +4,7 @@ import functools
 
 import warp as wp
 
-from ..common.types import kernel_module
+from ..common.modules import kernel_module
 
 __all__ = ["depth_kernel", "thickness_kernel"]
 

@@ -1,12 +1,12 @@
 """Constraint rows c = scale (h(a, b, a2) - f) by a formula h of their vectors, beside those of constraints.py."""
 
 import functools
-import types as _types
 from typing import Any, NamedTuple
 
 import warp as wp
 
-from ..common.types import double_1d, int_1d, kernel_module, kernel_set, precision, vec3d_2d
+from ..common.modules import KernelSet, kernel_module, kernel_set
+from ..common.types import double_1d, int_1d, precision, vec3d_2d
 from .constraints import constraint_functions, constraint_struct, multiplier_struct
 
 __all__ = ["Formula", "formula_kernels"]
@@ -32,7 +32,7 @@ class Formula(NamedTuple):
 
 
 @functools.cache
-def formula_kernels(dtype: str, midpoint: bool, formula: Formula) -> _types.SimpleNamespace:
+def formula_kernels(dtype: str, midpoint: bool, formula: Formula) -> KernelSet:
     """Kernels of the rows of one formula, for one precision of the slots.
 
     `midpoint`: forces act along the gradients at the middle of a step. The work of a step is lambda times the change of
