@@ -52,11 +52,8 @@ def facet_kinematics(dtype: str) -> KernelSet:
         f = other.history.facet[world, point] - 1
         xi = other.scratch.anchor_xi[world, point]
         s = surface_point(other.masters, other.scratch.start_displacement, world, f, xi)
-        v = k.interpolate(facets, v_n, world, q, item) - facet_value(
-            other.masters, other.scratch.start_velocity, world, f,
-            vec3d(xi[0], xi[1], f64(0.0)),
-        )  # fmt: skip
-        return f_.unit_normal(s), v
+        v = k.interpolate(facets, v_n, world, q, item)
+        return f_.unit_normal(s), v - facet_value(other.masters, other.scratch.start_velocity, world, f, xi)
 
     @wp.func
     def evaluate(

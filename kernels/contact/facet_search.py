@@ -49,9 +49,8 @@ def facet_search_kernels(dtype: str) -> KernelSet:
         xi: vec3d, n: vec3d,
     ) -> f64:  # fmt: skip
         """Approach speed of a point towards a facet at the start of the attempt, m/s."""
-        projection = vec3d(xi[0], xi[1], f64(0.0))
         own = interpolate(facets, v, slave.world, slave.number_in_facet, slave.slave_facet)
-        return wp.dot(n, facet_value(mas, pair.start_velocity, slave.world, f, projection) - own)
+        return wp.dot(n, facet_value(mas, pair.start_velocity, slave.world, f, xi) - own)
 
     @wp.func
     def set_anchor(
@@ -186,14 +185,7 @@ def facet_search_kernels(dtype: str) -> KernelSet:
         if pair.anchor_facet[world, point] > 0:
             first = pair.anchor_facet[world, point] - 1
             from0 = pair.anchor_xi[world, point]
-            motion -= displacement_change(
-                mas,
-                pair.displacement,
-                pair.start_displacement,
-                world,
-                first,
-                from0,
-            )
+            motion -= displacement_change(mas, pair.displacement, pair.start_displacement, world, first, from0)
             if f == first:  # sum of motions: a difference of positions would lose digits
                 before = pair.anchor_gap[world, point]
                 rise = (

@@ -57,33 +57,10 @@ class PairRigidModes:
     def add(self, kept: list[wp.array], dq_dv: wp.array, active: wp.array) -> None:
         """Add the coupling blocks, from the arrays of `cached_inputs`."""
         stiffness, _, _, _, weight, listed = kept
-        B, lanes, launch, bodies = (
-            self.ctx.model.worlds,
-            self.partial_sums.shape[2],
-            self.ctx.launch,
-            self.rigid_modes.bodies,
-        )
+        B, lanes, launch = self.ctx.model.worlds, self.partial_sums.shape[2], self.ctx.launch
         for group, contact, count in self.groups:
-            args = [
-                bodies,
-                self.masters,
-                group.data,
-                contact,
-                self.first_point,
-                stiffness,
-                weight,
-                listed,
-                active,
-                lanes,
-            ]
-            launch(self.kernels.cross_term_sums, (B, count, lanes), [*args, self.partial_sums])
-        args = [
-            self.body_pairs,
-            self.pair_start,
-            self.pair_contacts,
-            self.partial_sums,
-            dq_dv,
-            active,
-            self.rigid_modes.dense_inverse.matrix,
-        ]
-        launch(self.kernels.add_cross_terms, (B, self.count, 4), args)
+            args = [self.rigid_modes.bodies, self.masters, group.data, contact, self.first_point]
+            args += [stiffness, weight, listed, active, lanes, self.partial_sums]
+            launch(self.kernels.cross_term_sums, (B, count, lanes), args)
+        args = [self.body_pairs, self.pair_start, self.pair_contacts, self.partial_sums, dq_dv, active]
+        launch(self.kernels.add_cross_terms, (B, self.count, 4), [*args, self.rigid_modes.dense_inverse.matrix])
