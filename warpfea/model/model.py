@@ -205,13 +205,7 @@ class Model:
             "features": [k for k, on in features.items() if on],
             "left_out": [k for k, on in features.items() if not on],
             "blocks": [
-                {
-                    "element": b.key.family,
-                    "law": b.key.law,
-                    "elements": b.count,
-                    "points": b.points,
-                    "affine": b.key.affine,
-                }
+                dict(element=b.key.family, law=b.key.law, elements=b.count, points=b.points, affine=b.key.affine)
                 for b in self.blocks
             ],
             "bytes": self.memory.bytes | {"total": sum(self.memory.bytes.values())},

@@ -31,22 +31,12 @@ Owner = tuple["Discretisation", int]
 """A body and the index of one of its materials."""
 DAMPING_CONSTANTS = ("eta", "lambda_v")
 SHARED_DATA = {
-    "cells": "the mesh",
-    "elements": "the mesh",
-    "form": "the kernels of damping",
-    "frames": "the reference geometry",
-    "height": "the reference geometry",
-    "integration": "the element's kernels",
-    "law": "the element's kernels",
-    "mesh": "the mesh",
-    "points": "the mesh",
-    "quadrature": "the element's kernels",
-    "scale": "the reference geometry",
-    "section": "the reference geometry",
-    "thickness": "the reference geometry",
-    "width": "the reference geometry",
+    "the mesh": ("cells", "elements", "mesh", "points"),
+    "the reference geometry": ("frames", "height", "scale", "section", "thickness", "width"),
+    "the element's kernels": ("integration", "law", "quadrature"),
+    "the kernels of damping": ("form",),
 }
-"""Body data that can't be parameters, and the shared data they belong to."""
+"""Shared data, and the body data that belong to them and can't be parameters."""
 
 
 class MaterialParameters:
@@ -115,8 +105,9 @@ class MaterialParameters:
             return None
         laws = [body.materials[k][1] for body, k in owners[owner]]
         kinds = " and ".join(dict.fromkeys(type(law).__name__ for law in laws))
-        if what in SHARED_DATA:
-            return f"shared by all worlds ({SHARED_DATA[what]}): build a separate model"
+        for shared, names in SHARED_DATA.items():
+            if what in names:
+                return f"shared by all worlds ({shared}): build a separate model"
         if what in DAMPING_CONSTANTS:
             return f"the material {kinds} has no damping, so its kernels were left out; give it KelvinVoigt(eta=0)"
         for law in laws:

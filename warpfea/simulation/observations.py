@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -91,13 +92,17 @@ class Observations:
             raise ModelError(f"observe: {name!r} is unknown; of {name.rpartition('.')[0]!r} there are: "
                              f"{listing(known)}{hint}")  # fmt: skip
 
+    @staticmethod
+    def _find(kind: str, owner: str, things: Sequence[Any]) -> Any:
+        known = {thing.name: thing for thing in things}
+        if owner not in known:
+            hint = did_you_mean(owner, known)
+            raise ModelError(f"observe: {kind} {owner!r} is unknown; there are: {listing(known)}{hint}")
+        return known[owner]
+
     def _add_body(self, name: str, owner: str, what: str) -> None:
-        bodies = {body.name: body for body in self._model.bodies}
-        if owner not in bodies:
-            raise ModelError(f"observe: body {owner!r} is unknown; there are: {listing(bodies)}"
-                             f"{did_you_mean(owner, list(bodies))}")  # fmt: skip
+        body = self._find("body", owner, self._model.bodies)
         self._check_quantity(name, what, MOTION_KINDS)
-        body = bodies[owner]
         for node, X in enumerate(body.mesh.points):
             slot = int(body.node_slot[node])
             slots = [body.slot_offset + slot] if slot >= 0 else []
@@ -105,12 +110,8 @@ class Observations:
             self._column_count += 3
 
     def _add_probe(self, name: str, owner: str, what: str) -> None:
-        probes = {probe.name: probe for probe in self._model.description.probes}
-        if owner not in probes:
-            raise ModelError(f"observe: probe {owner!r} is unknown; there are: {listing(probes)}"
-                             f"{did_you_mean(owner, list(probes))}")  # fmt: skip
+        probe = self._find("probe", owner, self._model.description.probes)
         self._check_quantity(name, what, MOTION_KINDS)
-        probe = probes[owner]
         self._points.append((probe.body.slot_offset + probe.slots, probe.weights, what, probe.X, self._column_count))
         self._column_count += 3
 

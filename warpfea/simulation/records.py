@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -131,15 +132,8 @@ class Records:
 
     def find_joint(self, joint: Joint | str) -> Joint:
         """Joint of this model by handle or name."""
-        known = self.model.constraints.joints if self.model.constraints else []
-        for other in known:
-            if other is joint or other.name == joint:
-                return other
-        names = [j.name for j in known]
-        raise ModelError(
-            f"expected a joint of this model (a handle from add_joint, add_constraint or weld, or a name), "
-            f"got {joint!r}; it has: {listing(names)}{did_you_mean(joint, names) if isinstance(joint, str) else ''}"
-        )
+        joints = self.model.constraints.joints if self.model.constraints else []
+        return _find("joint", joint, joints, "a handle from add_joint, add_constraint or weld, or a name")
 
     def contact_record(self, contact: Contact | PairContact | str) -> ContactRecord:
         """Record of a contact (handle or name), one entry per step."""
@@ -158,13 +152,19 @@ class Records:
 
     def contact_column(self, contact: Contact | PairContact | str) -> int:
         """First report column of a contact."""
-        contacts, terms = self.model.description.all_contacts, self.model.terms
-        for other in contacts:
-            if other is contact or other.name == contact:
-                term: Any = terms.contact if isinstance(other, Contact) else terms.pairs
-                return term.report_offset + len(RECORD_NAMES) * term.tables.number[other.index]
-        names = [c.name for c in contacts]
-        raise ModelError(
-            f"expected a contact of this model (a handle from add_contact, or a name), got {contact!r}; it has: "
-            f"{listing(names)}{did_you_mean(contact, names) if isinstance(contact, str) else ''}"
-        )
+        known = _find("contact", contact, self.model.description.all_contacts, "a handle from add_contact, or a name")
+        terms = self.model.terms
+        term: Any = terms.contact if isinstance(known, Contact) else terms.pairs
+        return term.report_offset + len(RECORD_NAMES) * term.tables.number[known.index]
+
+
+def _find(kind: str, given: Any, things: Sequence[Any], handle: str) -> Any:
+    """The joint or contact of a model by its handle or name."""
+    for thing in things:
+        if thing is given or thing.name == given:
+            return thing
+    names = [thing.name for thing in things]
+    raise ModelError(
+        f"expected a {kind} of this model ({handle}), got {given!r}; it has: {listing(names)}"
+        f"{did_you_mean(given, names) if isinstance(given, str) else ''}"
+    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
@@ -18,9 +19,10 @@ __all__ = ["RunStatistics"]
 
 COUNTED_TOTALS = ("newton", "pcg", "rough", "floored")
 """Keys of `totals`: Newton and PCG iterations, steps accepted above the tolerance, and at the round-off limit."""
-
 COUNT_COLUMNS = ("newton", "pcg", "halvings", "status", "failure", "outer")
 """Columns of a report that are whole numbers."""
+LARGEST = ("residual", "floor", "violation")
+"""Columns whose largest values are kept."""
 
 
 class SyncedAttribute:
@@ -87,14 +89,17 @@ class RunStatistics:
         self.last = self._make_report(rows)
         for name in COUNTED_TOTALS:
             self.totals[name] += sums[:, RUN_STATISTICS.index(name)].astype(int)
-        for name in ("residual", "floor", "violation"):
-            key = f"max_{name}"
-            setattr(self, key, max(getattr(self, key), float(sums[:, RUN_STATISTICS.index(name)].max())))
-        self.min_J = min(self.min_J, float(sums[:, RUN_STATISTICS.index("min_J")].min()))
+        self._add_extremes({name: sums[:, RUN_STATISTICS.index(name)] for name in (*LARGEST, "min_J")})
         self.sim.energy_growth.warn_once(self.sim, sums[:, RUN_STATISTICS.index("energy_growth")], stacklevel=5)
         self.stepped_worlds = stepped
         if self._records_columns:
             self.history = [self._recorded_row(rows)]
+
+    def _add_extremes(self, values: Mapping[str, np.ndarray]) -> None:
+        """Include values by column in the extremes."""
+        for name in LARGEST:
+            setattr(self, f"max_{name}", max(getattr(self, f"max_{name}"), float(values[name].max())))
+        self.min_J = min(self.min_J, float(values["min_J"].min()))
 
     def clear_stepped(self, mask: np.ndarray) -> None:
         """Mark worlds as not stepped since their state was set."""
@@ -128,10 +133,7 @@ class RunStatistics:
         totals["rough"] += good & ~last.converged
         totals["floored"] += good & (last.floor > 0.0)
         if good.any():
-            self.max_residual = max(self.max_residual, float(last.residual[good].max()))
-            self.max_floor = max(self.max_floor, float(last.floor[good].max()))
-            self.max_violation = max(self.max_violation, float(last.violation[good].max()))
-            self.min_J = min(self.min_J, float(last.min_J[good].min()))
+            self._add_extremes({name: getattr(last, name)[good] for name in (*LARGEST, "min_J")})
         if self._records_columns:
             if not self.sim.record:
                 self.history.clear()

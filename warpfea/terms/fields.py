@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..base.errors import ModelError
-from ..base.names import did_you_mean
+from ..base.names import check_known
 from .term import FieldSpec
 
 if TYPE_CHECKING:
@@ -38,10 +38,8 @@ ELEMENT_FIELDS = {
 
 def find_field(terms: Any, name: str) -> FieldSpec:
     """Specification of a field. Raises ModelError, listing the available names, for an unknown one."""
-    known = terms.fields
-    if name not in known:
-        raise ModelError(f"field {name!r} is unknown; there are {', '.join(known)}{did_you_mean(name, known)}")
-    return known[name]
+    check_known("field", name, terms.fields)
+    return terms.fields[name]
 
 
 def _sample_field(terms: Any, name: str, body: Any, state: State) -> np.ndarray:
