@@ -1,7 +1,7 @@
 """Contact of surface points with their other side: forces, tangent, friction limits, products; for any geometry.
 
-A point's force is the derivative of a scalar: `normal_law` of its depth, and friction of its anchored slip, whose
-limit mu F_n is frozen during a line search and updated at each iterate. Gap and law are evaluated in float64.
+A point's force is the derivative of a scalar: `normal_law` of its depth, and friction of its anchored slip with a
+frozen limit mu F_n (friction.py says when limits are updated). Gap and law are evaluated in float64.
 """
 
 import functools
@@ -87,8 +87,7 @@ def contact_kernels(dtype: str, geometry: str, own: tuple[str, ...] = ()) -> Ker
     ):  # fmt: skip
         """Forces of points, N, their stiffness and potential.
 
-        `fresh`: an attempt begins. Friction limits are frozen while Newton's method solves: the problem then has a
-        potential, which it would lose with the limits of each iterate where an iterate lies deep in an obstacle.
+        `fresh`: an attempt begins: the first friction limits. Otherwise they are the frozen ones.
         """
         world, item, q = wp.tid()
         c = facets.contact[item]
@@ -120,7 +119,7 @@ def contact_kernels(dtype: str, geometry: str, own: tuple[str, ...] = ()) -> Ker
         else:
             inv_h = k.inverse_step(clock, world)
             t = law.with_normal_force(con, scr, world, c, point, t, inv_h)
-            frozen = law.freeze_friction(con, his, scr, world, c, point, t, fresh)
+            frozen = law.friction_limits_at_iterate(con, his, scr, world, c, point, t, fresh)
             t = g.frozen_motion(other, facets, scr, u, world, q, item, point, t, frozen[0], fresh)
             t = law.in_friction_plane(t, scr.frozen_normal[world, rec], frozen[2])
             if t.depth > f64(0.0) or frozen[0] > f64(0.0) or law.has_trait(con, c, ANY_GAP):

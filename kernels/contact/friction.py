@@ -1,8 +1,16 @@
 """Forces of a point of contact from its record: normal force, friction, their potential and derivative.
 
 The normal force is `normal_law` of the depth. Friction is an anchored spring and damper of the elastic slip, whose
-force is cut at the friction limit mu F_n (`friction_trial`, `friction_force`, `return_mapping`). The limit is frozen
-during a line search, and updated at each iterate (`freeze_friction`): friction then has a potential, Huber's.
+force is cut at the friction limit mu F_n (`friction_trial`, `friction_force`, `return_mapping`). With a frozen limit
+friction has a potential, Huber's; with the limits of each iterate it has none, and an iterate deep in an obstacle has a
+huge one.
+
+Limits, the plane of friction and the elastic slip's factor are frozen over Newton's iterations. `forces` (assembly.py)
+sets those of an attempt from its first iterate, at most the limits of the last step, and stores those of each later
+iterate aside (`friction_limits_at_iterate`). `update_frozen` takes them over, relaxed, when `NewtonLoop._update_frozen`
+asks for it, after the first iterate and after each iteration: where the relative residual is at most
+`FROZEN_UPDATE_RESIDUAL` (0.1, frozen_update.py) or within round-off, or no iteration is left. The residual is then
+evaluated again, and convergence is tested with it.
 """
 
 import functools
@@ -159,11 +167,12 @@ def friction_functions(dtype: str, own: tuple[str, ...] = ()) -> KernelSet:
         return vec3d(mu * t.normal_values[0], friction_stiffness(con, world, c, t.depth), shrink)
 
     @wp.func
-    def freeze_friction(
+    def friction_limits_at_iterate(
         con: Contacts, his: History, scr: ContactScratch, world: int, c: int, point: int, t: PointContact, fresh: int
     ) -> vec3d:  # fmt: skip
-        """Frozen friction limit, k_t and factor on the stored elastic slip; `fresh`: they and the normal are those of
-        the record, with limits of the last step: zero for a new contact."""
+        """Store friction limit, k_t, factor on the stored elastic slip, and normal of an iterate for the next frozen
+        update. Returns the frozen three; `fresh`: they and the normal are set to those of the iterate, with at most the
+        limit of the last step: zero for a new contact."""
         rec = history_row(con, c, point)
         frozen = scr.frozen_friction[world, rec]
         new = friction_parameters(con, his, world, c, point, t)

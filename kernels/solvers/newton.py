@@ -9,6 +9,7 @@ from ..common.traits import NO_TERMS, Traits
 from ..common.types import int_1d
 from .augmented_lagrangian import outer_loop_kernels
 from .convergence import MAX_ERROR_ESTIMATES, SINGLE_PRECISION_EPS, VELOCITY_ROUNDINGS, convergence_functions
+from .frozen_update import frozen_update_kernels
 from .line_search import MAX_TRUST_RADIUS, PHI_NOISE_ROUNDINGS, line_search_kernels
 from .newton_control import (
     FAIL_CURVATURE,
@@ -311,5 +312,5 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
         else:
             check_direction(ctl, world)
 
-    outer = outer_loop_kernels(traits, module)
-    return kernel_set(vars(outer) | vars(searching) | locals())
+    outer, frozen = outer_loop_kernels(traits, module), frozen_update_kernels(traits, module)
+    return kernel_set(vars(outer) | vars(frozen) | vars(searching) | locals())

@@ -369,7 +369,8 @@ class NewtonLoop:
 
     @launch_part("control")
     def _update_frozen(self) -> None:
-        """Update lagged term data (friction limits, multipliers) after convergence with frozen values."""
+        """Update frozen quantities of terms (friction limits) where the residual is at most `FROZEN_UPDATE_RESIDUAL` or
+        within round-off, or no iteration is left."""
         w, flags = self.work, self.work.newton.search.trial_accepted
         self.launch(self.kernels.begin_frozen_update, self.model.worlds, [w.newton, flags])
         self._reduce_flags(flags, self.any_searching)

@@ -195,7 +195,7 @@ class Residual:
 
     @launch_part("residual")
     def reevaluate_frozen(self, active: wp.array) -> None:
-        """Re-evaluate forces, g and sums after an update of lagged term data."""
+        """Re-evaluate forces, g and sums after an update of frozen quantities."""
         self.ctx.positions_changed = False
         self.evaluate_forces(active, freeze=True)
         self.ctx.positions_changed = True

@@ -58,12 +58,13 @@ class Updated(Term):
         """
 
     def accept_trial(self, ctx: StepContext, flags: wp.array) -> None:
-        """Accept a trial in the flagged worlds: freeze its multipliers, friction limits, ... for the next search."""
+        """Accept a trial in the flagged worlds: freeze its multipliers, ... for the next search."""
 
     def update_frozen(self, ctx: StepContext, flags: wp.array) -> None:
-        """Update lagged quantities in the flagged worlds, such as the limits of unilateral forces.
+        """Update frozen quantities, such as friction limits, in the flagged worlds, to those of the iterate.
 
-        Forces and residual are re-evaluated and checked with the updated values.
+        The flags are of worlds whose relative residual is at most `FROZEN_UPDATE_RESIDUAL` or within round-off, or that
+        have no iteration left. Forces and residual are then re-evaluated and checked with the updated values.
         """
 
 
