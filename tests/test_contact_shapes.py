@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
+import pathlib
 
 import numpy as np
 import pytest
+from warpfea.kernels.contact.collider_shapes import MESH, SHAPE_KINDS
 
 import warpfea as wf
+from warpfea.builder.contacts import SHAPE_NAMES
 from warpfea.model import shapes
+from warpfea.outputs.obstacles import SCALED
 
 C, S = math.cos(0.7), math.sin(0.7)
 TURN = np.array([[C, S, 0.0], [-S, C, 0.0], [0.0, 0.0, 1.0]]) @ np.array([[1.0, 0, 0], [0, C, S], [0, -S, C]])
@@ -145,3 +149,29 @@ def test_bad_shapes(case):
     action, text = BAD_SHAPES[case]
     with pytest.raises(wf.ModelError, match=text):
         action()
+
+
+# all shapes, and one of one's own
+
+
+def test_every_shape_is_known_everywhere():
+    """A shape of the device is public, documented, drawn with an offset, and tested here."""
+    page = (pathlib.Path(__file__).parents[1] / "warpfea/builder/CONTACT.md").read_text()
+    assert [type(shape).__name__ for shape, *_ in SHAPES.values()] + ["TriMesh"] == list(SHAPE_KINDS)
+    for kind, name in enumerate(SHAPE_KINDS):
+        assert getattr(wf, name).kind == kind
+        assert f"`{name}(" in page
+        assert name in SHAPE_NAMES
+    assert {*SCALED, shapes.HALF_SPACE, MESH} == {*range(len(SHAPE_KINDS))}
+
+
+@pytest.mark.parametrize("kind", [None, len(SHAPE_KINDS), -1])
+def test_a_shape_without_device_functions_is_refused(kind):
+    class Cone(shapes.Shape):
+        pass
+
+    if kind is not None:
+        Cone.kind = kind
+    b = wf.ModelBuilder()
+    with pytest.raises(wf.ModelError, match=rf"^add_collider: Cone has no device functions, kind = {kind}; "):
+        b.add_collider(Cone())

@@ -6,7 +6,7 @@ import warp as wp
 
 from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.types import precision
-from .collider_mesh import MESH
+from .collider_shapes import MESH
 from .colliders import MESH_SUFFIX, collider_functions
 from .kinematics import GEOMETRIES, kinematics_functions
 from .law import ANY_GAP, FIXED_SPRING

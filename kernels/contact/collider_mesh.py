@@ -15,10 +15,8 @@ import warp as wp
 
 from ..common.modules import KernelSet, kernel_set
 
-__all__ = ["BOUNDARY", "FLAT", "MESH", "SHARP", "mesh_functions", "mesh_struct"]
+__all__ = ["BOUNDARY", "FLAT", "SHARP", "mesh_functions", "mesh_struct"]
 
-MESH = 5
-"""The kind of collider, after those of `contact_shapes`."""
 SHARP, FLAT, BOUNDARY = range(3)
 """Edge between triangles of different planes, of one plane, or of a single triangle."""
 STACK_SIZE = 40

@@ -11,9 +11,11 @@ import warp as wp
 
 from ..common.modules import KernelSet, kernel_set
 
-__all__ = ["BOX", "CAPSULE", "CYLINDER", "HALF_SPACE", "SPHERE", "shape_functions"]
+__all__ = ["BOX", "CAPSULE", "CYLINDER", "HALF_SPACE", "MESH", "SHAPE_KINDS", "SPHERE", "shape_functions"]
 
-HALF_SPACE, SPHERE, BOX, CAPSULE, CYLINDER = range(5)
+SHAPE_KINDS = ("HalfSpace", "Sphere", "Box", "Capsule", "Cylinder", "TriMesh")
+"""Classes of the shapes, in the order of their kinds: those that the device functions of colliders know."""
+HALF_SPACE, SPHERE, BOX, CAPSULE, CYLINDER, MESH = range(len(SHAPE_KINDS))
 LATERAL_SIDE = 6
 """Sides: 0 to 5 are the faces -x, +x, -y, +y, -z, +z (ends of a cylinder: 4, 5), 6 the lateral side of a cylinder."""
 TUNNEL_DEPTH_RATIO = 0.5

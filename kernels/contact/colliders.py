@@ -8,8 +8,8 @@ import functools
 import warp as wp
 
 from ..common.modules import KernelSet, kernel_set
-from .collider_mesh import MESH, mesh_functions
-from .collider_shapes import BOX, HALF_SPACE, SPHERE, shape_functions
+from .collider_mesh import mesh_functions
+from .collider_shapes import BOX, HALF_SPACE, MESH, SPHERE, shape_functions
 from .structs import SLIP_FLAG, collider_struct
 
 __all__ = ["MESH_SUFFIX", "collider_functions"]

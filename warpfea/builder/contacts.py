@@ -11,6 +11,7 @@ from ..base.checks import is_count, is_number
 from ..base.errors import ModelError
 from ..base.names import did_you_mean
 from ..contact import ANY_GAP, LAWS
+from ..kernels.contact.collider_shapes import SHAPE_KINDS
 from ..model.bodies import Body
 from ..model.contact_points import check_contact_points
 from ..model.contacts import Collider, ColliderRotation, Contact
@@ -29,13 +30,18 @@ __all__ = ["CONTACT_MODELS", "OVERLAP_OPTIONS", "TIME_TREATMENTS", "make_collide
 TIME_TREATMENTS = ("implicit", "explicit")
 CONTACT_MODELS = ("patch", "sphere")
 OVERLAP_OPTIONS = ("refuse", "offset")
-SHAPE_NAMES = "HalfSpace, Sphere, Box, Capsule, Cylinder or TriMesh"
+SHAPE_NAMES = f"{', '.join(SHAPE_KINDS[:-1])} or {SHAPE_KINDS[-1]}"
 
 
 def make_collider(d: Description, shape: Any, path: Any, name: str | None) -> Collider:
     """See ModelBuilder.add_collider."""
     if not isinstance(shape, Shape):
         raise ModelError(f"add_collider: expected a shape ({SHAPE_NAMES}), got {shape!r}")
+    if getattr(shape, "kind", None) not in range(len(SHAPE_KINDS)):
+        raise ModelError(
+            f"add_collider: {type(shape).__name__} has no device functions, kind = {getattr(shape, 'kind', None)!r}; "
+            f"give a {SHAPE_NAMES}, or add the kind to kernels/contact/collider_shapes.py"
+        )
     default = {"HalfSpace": "half_space", "TriMesh": "mesh"}.get(type(shape).__name__, type(shape).__name__.lower())
     name = unused_name(name, default, {c.name for c in d.colliders}, "collider")
     out = Collider(shape, name, index=len(d.colliders))

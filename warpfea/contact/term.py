@@ -52,6 +52,26 @@ def contact_columns(stored: str) -> tuple[Column, ...]:
 class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed):
     """Contacts of a model with one geometry of the other side.
 
+    Members of a geometry; the first six rows are needed, the others do nothing here, or what any geometry needs:
+
+    =============================  ==================================================================================
+    `name`, `columns`, `parts`     name; ledger columns, of `contact_columns`; parts of a profile
+    `features`                     features that the model uses: without any there is no term
+    `make_other`                   struct `Other` of the device functions, with its arrays in the state
+    `_allocate_other`              arrays of an attempt of that struct
+    `_begin_other`                 the other side at the start of an attempt, such as poses
+    `_sides_text`, `_contact_info` texts and numbers of messages and of `Model.info`
+    `_turn_text`                   reason where `evaluate` returns TURNED
+    `_find_other`                  search at an iterate
+    `_find_accepted`               search at the accepted iterate
+    `_list_points`                 points of each slot of the other side, before the forces are gathered
+    `_gather_other_forces`         forces on the slots of the other side
+    `start`                        other side and overlaps at a state that a run begins from
+    `update_frozen`, `diagonal`    more than that of the points, for the other side
+    `cached_inputs`, `blocks`      stiffness in an assembled matrix; `_add_facet_blocks` adds that of the points
+    `samples`, `nodal_force`       fields and forces at a state
+    =============================  ==================================================================================
+
     Attributes:
         tables: contacts, points and facets on the device.
         point_kernels, ledger_kernels: kernels of the points, and of their energies and records.

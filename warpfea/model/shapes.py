@@ -35,7 +35,7 @@ class Shape:
     """Rigid solid at displacement 0; base of the shapes.
 
     Attributes:
-        kind: HALF_SPACE, SPHERE, BOX, CAPSULE or CYLINDER; MESH of a TriMesh.
+        kind: HALF_SPACE, SPHERE, BOX, CAPSULE or CYLINDER; MESH of a TriMesh: an index of `SHAPE_KINDS`.
     """
 
     kind: ClassVar[int]

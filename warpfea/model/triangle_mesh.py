@@ -11,7 +11,8 @@ import numpy as np
 
 from ..base.checks import is_number
 from ..base.errors import MeshError, ModelError
-from ..kernels.contact.collider_mesh import BOUNDARY, FLAT, MESH, SHARP
+from ..kernels.contact.collider_mesh import BOUNDARY, FLAT, SHARP
+from ..kernels.contact.collider_shapes import MESH
 from ..mesh.adapter import read_triangles
 from .shapes import Shape, set_checked
 

@@ -4,15 +4,15 @@ A simulation with contact has `collider_poses()`: positions (B, K, 3), m, rotati
 the local axes, and outward offsets of the surfaces (B, K), m. Others have no colliders to draw.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..kernels.contact.collider_mesh import MESH
-from ..model.shapes import BOX, CAPSULE, CYLINDER, HALF_SPACE
+from ..kernels.contact.collider_shapes import MESH
+from ..model.shapes import BOX, CAPSULE, CYLINDER, HALF_SPACE, SPHERE
 from .normals import smooth_corners, vertex_normals
 
 __all__ = ["OBSTACLE_COLOR", "PLANE_SIZE", "Obstacle", "Obstacles", "clip_to_box", "unique_names"]
@@ -23,6 +23,14 @@ OBSTACLE_COLOR = (0.60, 0.60, 0.61)
 """Colour of obstacles, sRGB."""
 PLANE_SIZE = 6.0
 """Side of the square drawn for a half-space, over the initial size of the bodies."""
+SCALED: dict[int, Callable[[float, float, float], tuple[tuple[float, float, float], float]]] = {
+    SPHERE: lambda radius, *_: ((radius, radius, radius), 0.0),
+    BOX: lambda x, y, z: ((x, y, z), 0.0),
+    CAPSULE: lambda radius, half, _: ((radius, radius, radius), half),
+    CYLINDER: lambda radius, half, _: ((radius, radius, half), 0.0),
+}
+"""Shapes drawn with an outward offset by scaling, by kind: from `Shape.sizes` the lengths along the local axes that
+grow by the offset, and the part of the half length along z that does not, m."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,15 +139,9 @@ def _offset_points(shape: Any, points: Floats, triangles: npt.NDArray[np.int32],
         return points
     if shape.kind == MESH:
         return points + offset * vertex_normals(points, triangles)
-    first, second, third = shape.sizes
-    size = np.full(3, first)
-    if shape.kind == BOX:
-        size = np.array([first, second, third])
-    elif shape.kind == CYLINDER:
-        size[2] = second
+    size, half = (np.array(values) for values in SCALED[shape.kind](*shape.sizes))
     ends = np.zeros_like(points)
-    if shape.kind == CAPSULE:
-        ends[:, 2] = second * np.sign(points[:, 2])
+    ends[:, 2] = half * np.sign(points[:, 2])
     return ends + (points - ends) * (size + offset) / size
 
 
