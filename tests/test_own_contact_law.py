@@ -9,6 +9,7 @@ import warp as wp
 import warpfea as wf
 from warpfea.contact import LAWS, ContactLaw
 from warpfea.contact.collider_tables import contact_law_constants
+from warpfea.contact.evaluation import evaluate_points
 
 f64 = wp.float64
 LENGTH = 1e-5
@@ -94,6 +95,59 @@ def test_energy_of_an_impact(registered):
     assert deepest > 2.0 * LENGTH
     assert energies["contact_loss"][0] > 0.1 * 0.5 * 0.01**2
     assert abs(energies["ledger_residual"][0]) < 1e-9 * 0.5 * 0.01**2
+
+
+def linear(factor):
+    """A law of `factor` times the linear spring, undamped."""
+
+    @wp.func
+    def force(single_point: int, k: f64, g: f64, ramp: f64, eps: f64, delta: f64, delta_n: f64) -> wp.vec4d:
+        if delta <= f64(0.0):
+            return wp.vec4d()
+        K = f64(factor) * k
+        psi = f64(0.5) * K * delta * delta
+        return wp.vec4d(K * delta, K, psi, psi)
+
+    return ContactLaw(force)
+
+
+def relative_force(law, depth=1e-4):
+    """Force of a block at a depth over that of a linear spring, as evaluated by a new model."""
+    b, _, pad = resting_block(law)
+    model = b.finalize(device="cpu")
+    state = model.state()
+    state.displacement.fill_(wp.vec3d(0.0, 0.0, -depth))
+    (term,) = (term for term in model.terms.all if term.name == "contact")
+    return evaluate_points(term, state)[1].sum() / (contact_law_constants(pad)["normal_stiffness"] * depth)
+
+
+def test_laws_may_change_place_and_definition(monkeypatch):
+    """A law is that of the entry of `LAWS` when the model is made, in any order of entries, also if redefined."""
+    two, three = linear(2.0), linear(3.0)
+    monkeypatch.setitem(LAWS, "one", two)
+    assert relative_force("one") == pytest.approx(2.0, rel=1e-9)
+    monkeypatch.delitem(LAWS, "one")
+    monkeypatch.setitem(LAWS, "another", three)
+    monkeypatch.setitem(LAWS, "one", two)
+    assert relative_force("one") == pytest.approx(2.0, rel=1e-9)
+    assert relative_force("another") == pytest.approx(3.0, rel=1e-9)
+    monkeypatch.setitem(LAWS, "one", three)
+    assert relative_force("one") == pytest.approx(3.0, rel=1e-9)
+    monkeypatch.setitem(LAWS, "default", two)
+    assert relative_force("default") == pytest.approx(2.0, rel=1e-9)
+
+
+@wp.func
+def single_precision(single_point: int, k: f64, g: f64, ramp: f64, eps: f64, delta: f64, delta_n: f64) -> wp.vec4d:
+    return wp.vec4d(k * delta, k, 0.5 * k * delta * delta, f64(0.0))
+
+
+def test_a_corrected_law_compiles(monkeypatch):
+    monkeypatch.setitem(LAWS, "own", ContactLaw(single_precision))
+    with pytest.raises(RuntimeError, match="single_precision"):
+        relative_force("own")
+    monkeypatch.setitem(LAWS, "own", linear(2.0))
+    assert relative_force("own") == pytest.approx(2.0, rel=1e-9)
 
 
 def test_an_unknown_law_is_refused():

@@ -1,4 +1,4 @@
-"""Constitutive laws and damping as immutable values (DESIGN 4; device side in kernels/elements/materials.py)."""
+"""Constitutive laws and damping as immutable values (device side in kernels/elements/materials.py)."""
 
 from __future__ import annotations
 

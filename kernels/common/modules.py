@@ -7,7 +7,7 @@ from typing import Any
 
 import warp as wp
 
-__all__ = ["SHORT_UNROLL", "KernelSet", "kernel_module", "kernel_set", "masked_kernel"]
+__all__ = ["SHORT_UNROLL", "KernelSet", "definition_name", "kernel_module", "kernel_set", "masked_kernel"]
 
 KernelSet = _types.SimpleNamespace
 """Types, structs, functions and kernels of a factory, as attributes."""
@@ -33,6 +33,20 @@ def kernel_module(name: str, light: bool = False, **options) -> wp.Module:
         options = {"optimization_level": 0} | options
     wp.set_module_options({"enable_backward": False, "max_unroll": 1} | options, module=module)
     return module
+
+
+_definitions: dict[str, list[Any]] = {}
+
+
+def definition_name(name: str, definition: Any) -> str:
+    """`name` of a user's definition in names of modules; name_2, name_3, ... of later definitions of that name.
+
+    A module compiles all kernels that it ever had: one that does not compile would be in the way of its correction.
+    """
+    known = _definitions.setdefault(name, [])
+    if definition not in known:
+        known.append(definition)
+    return name if definition == known[0] else f"{name}_{known.index(definition) + 1}"
 
 
 class _Mask:

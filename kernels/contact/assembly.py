@@ -16,7 +16,7 @@ from ..common.types import precision
 from .facet_structs import point_list_struct
 from .friction import friction_functions
 from .kinematics import GEOMETRIES, kinematics_functions
-from .law import ANY_GAP
+from .law import ANY_GAP, OwnLaws, law_names
 from .structs import FORCE_ONLY, FREE, INACTIVE, PASSED, TURNED, WITH_STIFFNESS, contact_structs
 
 __all__ = ["AITKEN_LANES", "block_kernels", "contact_kernels", "contact_module"]
@@ -26,13 +26,13 @@ SLOW_REDUCTION = 0.35
 """Ratio of successive changes of the friction limits above which they are relaxed."""
 
 
-def contact_module(dtype: str, geometry: str, own: tuple[str, ...]) -> wp.Module:
+def contact_module(dtype: str, geometry: str, own: OwnLaws) -> wp.Module:
     """Module of assembly and ledger."""
-    return kernel_module("_".join(["contact", dtype, geometry, *own]), max_unroll=SHORT_UNROLL)
+    return kernel_module("_".join(["contact", dtype, geometry, *law_names(own)]), max_unroll=SHORT_UNROLL)
 
 
 @functools.cache
-def contact_kernels(dtype: str, geometry: str, own: tuple[str, ...] = ()) -> KernelSet:
+def contact_kernels(dtype: str, geometry: str, own: OwnLaws = ()) -> KernelSet:
     """Kernels of contact in one precision of the displacements.
 
     Args:

@@ -12,7 +12,7 @@ from .facet_search import facet_search_kernels
 from .facet_structs import facet_side_struct, master_struct, pair_scratch_struct
 from .friction import friction_functions
 from .kinematics import kinematics_functions
-from .law import FIXED_SPRING
+from .law import FIXED_SPRING, OwnLaws, law_names
 from .projection import OUTSIDE_TOLERANCE, facet_projection_functions
 from .structs import collider_struct, contact_structs
 
@@ -36,14 +36,14 @@ def pair_results_struct():
 
 
 @functools.cache
-def collider_evaluation_kernels(dtype: str, meshes: bool, own: tuple[str, ...] = ()) -> KernelSet:
+def collider_evaluation_kernels(dtype: str, meshes: bool, own: OwnLaws = ()) -> KernelSet:
     """Kernels for contact with colliders; arguments as of `contact_kernels`, `meshes`: some collider is a mesh."""
     vec3 = precision(dtype).vec3
     f64, vec3d = wp.float64, wp.vec3d
     Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)
     Colliders = collider_struct(meshes)
     k, law, g = kinematics_functions(dtype), friction_functions(dtype, own), collider_kinematics(dtype, meshes)
-    name = "_".join(["contact_evaluation", dtype, *own])
+    name = "_".join(["contact_evaluation", dtype, *law_names(own)])
     module = kernel_module(f"{name}{MESH_SUFFIX * meshes}", max_unroll=SHORT_UNROLL)
 
     @wp.kernel(module=module)
@@ -105,7 +105,7 @@ def collider_evaluation_kernels(dtype: str, meshes: bool, own: tuple[str, ...] =
 
 
 @functools.cache
-def pair_evaluation_kernels(dtype: str, own: tuple[str, ...] = ()) -> KernelSet:
+def pair_evaluation_kernels(dtype: str, own: OwnLaws = ()) -> KernelSet:
     """Kernels for contact between bodies; arguments as of `contact_kernels`."""
     f64, vec3d = wp.float64, wp.vec3d
     Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)
@@ -114,7 +114,7 @@ def pair_evaluation_kernels(dtype: str, own: tuple[str, ...] = ()) -> KernelSet:
     k, law, seek = kinematics_functions(dtype), friction_functions(dtype, own), facet_search_kernels(dtype)
     places, round_down, round_up = facet_projection_functions(dtype), seek.round_down, seek.round_up
     surface_point, inverse_map, distance_outside = places.surface_point, places.inverse_map, places.distance_outside
-    module = kernel_module("_".join(["pair_evaluation", dtype, *own]), max_unroll=SHORT_UNROLL)
+    module = kernel_module("_".join(["pair_evaluation", dtype, *law_names(own)]), max_unroll=SHORT_UNROLL)
 
     @wp.func
     def closest_facet(mas: Masters, pair: PairScratch, world: int, surface: int, x: vec3d, far: f64) -> wp.vec4d:

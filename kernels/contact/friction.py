@@ -27,6 +27,7 @@ from .law import (
     SPEED_DAMPING,
     TRAIT_BITS,
     UNLOADING,
+    OwnLaws,
     elastic_force,
     huber_friction,
     law_functions,
@@ -38,7 +39,7 @@ __all__ = ["friction_functions"]
 
 
 @functools.cache
-def friction_functions(dtype: str, own: tuple[str, ...] = ()) -> KernelSet:
+def friction_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
     """Device functions in one precision of the displacements; `own`: laws of one's own in use."""
     T, sym = precision(dtype).T, precision(dtype).sym
     f64, vec3d, mat33d = wp.float64, wp.vec3d, wp.mat33d

@@ -20,11 +20,12 @@ A law of one's own is an entry of `LAWS`, see "A new contact law" in warpfea/REA
 """
 
 import functools
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import warp as wp
 
-from ..common.modules import KernelSet, kernel_set
+from ..common.modules import KernelSet, definition_name, kernel_set
 
 __all__ = [
     "ANY_GAP",
@@ -35,10 +36,13 @@ __all__ = [
     "TRAIT_BITS",
     "UNLOADING",
     "ContactLaw",
+    "OwnLaws",
     "elastic_force",
     "huber_friction",
     "law_code",
     "law_functions",
+    "law_names",
+    "own_laws",
     "smooth_friction",
 ]
 
@@ -197,19 +201,33 @@ LAWS = {
     "paper": ContactLaw(paper_law, FIXED_SPRING, "depth", explicit=True),
     "smooth": ContactLaw(smooth_law, SLIP_SPEED | ANY_GAP, "pair"),
 }
-"""Laws by name; the number of a law is its place."""
+"""Laws by name."""
+BUILT_IN = dict(LAWS)
 DEFAULT, PAPER, SMOOTH = range(3)
+"""Numbers of the laws of `BUILT_IN`; one's own laws of a model follow."""
+OwnLaws = tuple[tuple[str, ContactLaw], ...]
+"""Names and definitions of the laws of a model that are not built in: kernels are cached by both."""
 
 
-def law_code(name: str) -> int:
+def own_laws(names: Iterable[str]) -> OwnLaws:
+    """Laws of these names that are not built in, as `LAWS` defines them now."""
+    return tuple((name, LAWS[name]) for name in sorted(set(names)) if LAWS[name] is not BUILT_IN.get(name))
+
+
+def law_names(own: OwnLaws) -> list[str]:
+    """Names of one's own laws in names of modules."""
+    return [definition_name(name, law) for name, law in own]
+
+
+def law_code(name: str, own: OwnLaws) -> int:
     """Number and traits of a law, as in `Contacts.law`."""
-    return list(LAWS).index(name) << TRAIT_BITS | LAWS[name].traits
+    laws = BUILT_IN | dict(own)
+    return list(laws).index(name) << TRAIT_BITS | laws[name].traits
 
 
 @functools.cache
-def law_functions(own: tuple[str, ...] = ()) -> KernelSet:
-    """Device function `normal_law` of the built-in laws and those of one's own, by name."""
-    hunt_crossley, paper_law, smooth_law = (LAWS[name].normal for name in ("default", "paper", "smooth"))
+def law_functions(own: OwnLaws = ()) -> KernelSet:
+    """Device function `normal_law` of the built-in laws and those of one's own."""
 
     @wp.func
     def normal_law(
@@ -223,8 +241,9 @@ def law_functions(own: tuple[str, ...] = ()) -> KernelSet:
             return paper_law(single_point, k, g, ramp, eps, delta, delta_n)
         return smooth_law(single_point, k, g, ramp, eps, delta, delta_n)
 
-    for name in own:
-        normal_law = _with_law(list(LAWS).index(name), LAWS[name].normal, normal_law)
+    numbers = list(BUILT_IN | dict(own))
+    for name, definition in own:
+        normal_law = _with_law(numbers.index(name), definition.normal, normal_law)
     return kernel_set({"normal_law": normal_law})
 
 

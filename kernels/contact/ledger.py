@@ -8,7 +8,7 @@ from ..common.modules import KernelSet, kernel_set, masked_kernel
 from .assembly import contact_module
 from .friction import friction_functions
 from .kinematics import GEOMETRIES, kinematics_functions
-from .law import ANY_GAP, FIXED_SPRING, SLIP_SPEED
+from .law import ANY_GAP, FIXED_SPRING, SLIP_SPEED, OwnLaws
 from .structs import (
     AREA_ROW,
     IN_REACH,
@@ -40,7 +40,7 @@ stored are values at its end."""
 
 
 @functools.cache
-def contact_ledger_kernels(dtype: str, geometry: str, own: tuple[str, ...] = ()) -> KernelSet:
+def contact_ledger_kernels(dtype: str, geometry: str, own: OwnLaws = ()) -> KernelSet:
     """Kernels in the module of `contact_kernels`, with the same arguments."""
     f64, vec3d = wp.float64, wp.vec3d
     Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)

@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 from scipy.optimize import brentq
 
-from ..kernels.contact.law import law_code
+from ..kernels.contact.law import law_code, own_laws
 from ..kernels.contact.structs import facet_struct
 from ..model.contact_points import CONTACT_RULES, ContactPoints, lagrange_basis
 from ..model.contacts import Contact
@@ -33,7 +33,6 @@ __all__ = [
 ]  # fmt: skip
 
 AnyContact = TypeVar("AnyContact", Contact, PairContact)
-BUILT_IN_LAWS = ("default", "paper", "smooth")
 DEFAULT_SMOOTHING = (1e-3, 1e-4)
 """Default eps, N, and v_eps, m/s, of the smooth law."""
 WORLD_PARAMETERS = {"mu": "mu", "mu_static": "mu_static", "restitution": "damping", "stiffness": "scale"}
@@ -55,7 +54,7 @@ def restitution_beta(restitution: float) -> float:
 def hunt_crossley_damping(restitution: float) -> float:
     """chi v_i of the default law: the d of (1 + e) d = ln((1 + d)/(1 - e d)), 0 for e = 1.
 
-    Exact for the impact of a mass on the spring, undamped at rest, for any exponent; DESIGN 8.
+    Exact for the impact of a mass on the spring, undamped at rest, for any exponent.
     """
     e = restitution
     if e >= 1.0:
@@ -128,6 +127,7 @@ class FacetTables(Generic[AnyContact]):
         contacts: handles in that order; number: position of a handle's index.
         host: shape functions, areas, slots and positions of each contact, for fields and checks.
         kinds: slots and points per facet, and the contact kind.
+        own_laws: laws in use that are not built in, as defined when the model was made.
         groups: facet groups.
         points, rows: total numbers of points and facets.
         first, row_start: first point and first facet of each contact.
@@ -151,6 +151,7 @@ class FacetTables(Generic[AnyContact]):
         self.contacts: list[AnyContact] = [contacts[k] for k in order]
         self.host: list[ContactPoints] = [points[k] for k in order]
         self.number = {contact.index: k for k, contact in enumerate(self.contacts)}
+        self.own_laws = own_laws(contact.law for contact in contacts)
         self.groups: list[FacetGroup] = []
         self.points = self.rows = 0
 
@@ -158,11 +159,6 @@ class FacetTables(Generic[AnyContact]):
     def connectivity(self) -> list[np.ndarray]:
         """Slots (F, L) of the facets of each group."""
         return [group.conn for group in self.groups]
-
-    @property
-    def own_laws(self) -> tuple[str, ...]:
-        """Laws in use beside the built-in ones."""
-        return tuple(sorted({contact.law for contact in self.contacts} - set(BUILT_IN_LAWS)))
 
     @property
     def has_single_point(self) -> bool:
@@ -268,7 +264,7 @@ class FacetTables(Generic[AnyContact]):
         def upload(name: str, values: Any, dtype: Any = wp.float64) -> None:
             setattr(out, name, m.array("contact", np.asarray(values), dtype))
 
-        upload("law", [law_code(c.law) for c in C], wp.int32)
+        upload("law", [law_code(c.law, self.own_laws) for c in C], wp.int32)
         upload("single_point", [int(c.model == "sphere") for c in C], wp.int32)
         upload("is_explicit", [int(c.treatment == "explicit") for c in C], wp.int32)
         upload("first_point", self.first, wp.int32)

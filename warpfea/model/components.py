@@ -47,7 +47,7 @@ class Components:
         self.free_groups, self.free_group_count = self._make_free_groups(model)
 
     def _make_free_groups(self, model: Any) -> tuple[Any, int]:
-        """Components with an unconstrained translation, on the device, and their number (DESIGN 5).
+        """Components with an unconstrained translation, on the device, and their number.
 
         Only the mass resists their translations: each solve is corrected for them, so that momentum is conserved.
         """
