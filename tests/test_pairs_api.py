@@ -250,7 +250,7 @@ def test_bad_options_are_named(options, error, text):
     b, first, second = two()
     with pytest.raises(error, match=text):
         b.add_contact(first, second, **options)
-    assert not b.description.pairs
+    assert not b.description.contacts
 
 
 def test_bodies_that_cannot_touch_are_refused():

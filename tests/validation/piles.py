@@ -55,7 +55,7 @@ def piles(run: Run) -> Iterator[Row]:
         count = 3 if run.quick else steps - 1
         ms = 1e3 * (clock.perf_counter() - began) / count
         per_step = {name: (int(sim.totals[name][0]) - many) / count for name, many in before.items()}
-        names = [contact.name for contact in model.description.all_contacts]
+        names = [contact.name for contact in model.description.contacts]
         deepest = max(float(sim.contact_record(name).penetration.max()) for name in names)
         yield {"label": f"pile-{cells}", "steps": count, "ms": ms, **per_step, "deepest": deepest}
 

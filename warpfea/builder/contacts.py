@@ -88,7 +88,7 @@ def add_contact(
         )
     make = next((make for kind, make in KINDS.items() if isinstance(other, kind)), make_contact)
     contact = make(d, thing, other, name, **options)
-    (d.pairs if isinstance(contact, PairContact) else d.contacts).append(contact)
+    d.contacts.append(contact)
     return contact
 
 
@@ -107,14 +107,14 @@ def make_contact(d: Description, thing: Body | SurfaceSet, collider: Any, name: 
         raise ModelError(f"add_contact: collider {collider.name!r} belongs to another builder")
     surface = outer_surface(thing)
     default = f"{surface.body.name} on {collider.name}"
-    name = unused_name(name, default, {c.name for c in d.contacts} | {c.name for c in d.pairs}, "contact")
+    name = unused_name(name, default, {c.name for c in d.contacts}, "contact")
     o = _checked_options(f"contact {name!r}", surface, dict(options))
     if o["model"] == "sphere" and isinstance(collider.shape, TriMesh) and not collider.shape.closed:
         raise ModelError(
             f"contact {name!r}: collider {collider.name!r} is a sheet of triangles, and model = 'sphere' needs an "
             "obstacle with an inside: take model = 'patch', or a closed mesh"
         )
-    return Contact(surface, collider, name, index=len(d.contacts), **o)
+    return Contact(surface, collider, name, index=len(d.contacts_of(Contact)), **o)
 
 
 def make_pair(
@@ -126,7 +126,7 @@ def make_pair(
         raise NotImplementedError(
             f"add_contact: body {a.body.name!r} with itself is not part of this version; give two bodies"
         )
-    taken = {c.name for c in d.contacts} | {c.name for c in d.pairs}
+    taken = {c.name for c in d.contacts}
     name = unused_name(name, f"{a.body.name} on {b.body.name}", taken, "contact")
     what = f"contact {name!r}"
     if options["model"] == "sphere":
@@ -147,7 +147,7 @@ def make_pair(
                 f"{what}: points = {points!r}: faces of {slave.body.name!r} have rules of {numbers} points"
             )
     o["points"] = None if points is None else int(points)
-    return PairContact(a, b, name, slave, master, index=len(d.pairs), **o)
+    return PairContact(a, b, name, slave, master, index=len(d.contacts_of(PairContact)), **o)
 
 
 KINDS: dict[type, Callable[..., Contact | PairContact]] = {

@@ -239,7 +239,7 @@ def _joint_rows(sim: Simulation) -> list[list[str]]:
 def _contact_values(sim: Simulation) -> dict[str, Any]:
     """Maximum and last values of each recorded contact."""
     out = {}
-    for contact in sim.model.description.all_contacts:
+    for contact in sim.model.description.contacts:
         record = sim.contact_record(contact)
         if record.time.size:
             largest = {name: np.nanmax(getattr(record, name)[0]) for name in ("normal_force", "penetration")}

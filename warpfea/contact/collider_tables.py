@@ -33,7 +33,7 @@ class ContactTables(FacetTables[Contact]):
     """
 
     def __init__(self, model: Model) -> None:
-        contacts = list(model.description.contacts)
+        contacts = model.description.contacts_of(Contact)
         super().__init__(model, contacts, [contact_points(contact.surface, contact.points) for contact in contacts])
         self.colliders: list[Collider] = list(model.description.colliders)
         self.clamped = clamped_slots(model)

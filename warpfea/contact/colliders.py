@@ -10,6 +10,7 @@ import warp as wp
 
 from ..kernels.contact.collider_kinematics import MAX_COLLIDER_ROTATION, pose_kernels
 from ..kernels.contact.structs import collider_struct
+from ..model.contacts import Contact
 from ..model.state import State
 from ..model.triangle_mesh import TriMesh
 from ..terms.term import StepContext, part
@@ -53,7 +54,7 @@ class ColliderContact(ContactTerm):
 
     @classmethod
     def features(cls, model: Model) -> dict[str, bool]:
-        contacts = model.description.contacts
+        contacts = model.description.contacts_of(Contact)
         return {"contact": bool(contacts), "friction": any(c.mu_static > 0.0 for c in contacts)}
 
     def make_other(self, make: Callable[[str, Any, tuple[int, ...]], wp.array]) -> Any:
@@ -104,7 +105,7 @@ class ColliderContact(ContactTerm):
         touching = touching_depth(self.model.size, state.displacement.numpy())
         if self.tables.has_sheets and new.any():
             check_sheet_sides(self, other, state.displacement, touching, new, ctx.launch)
-        store_overlaps(self.tables, np.where(new[:, None], -gap, 0.0), touching, overlap)
+        store_overlaps(self, np.where(new[:, None], -gap, 0.0), touching, overlap)
         history.overlap.assign(overlap)
 
     def _begin_other(self, ctx: StepContext, active: wp.array) -> None:
@@ -157,7 +158,7 @@ class ColliderContact(ContactTerm):
         weight = kept[1] if self.tables.tracks_deepest else ctx.scratch[self.name]["attempt"].shape_values
         self._add_facet_blocks(ctx, matrix, kept[0], weight, dq_dv, active, out)
 
-    def _sides_text(self, contact: Any) -> tuple[str, str, str]:
+    def sides_text(self, contact: Any) -> tuple[str, str, str]:
         return contact.body.name, f"collider {contact.collider.name!r}", "shape"
 
     def _turn_text(self, contact: Any) -> str:

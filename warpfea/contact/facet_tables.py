@@ -46,7 +46,7 @@ class PairTables(FacetTables[PairContact]):
     """
 
     def __init__(self, model: Model) -> None:
-        contacts = list(model.description.pairs)
+        contacts = model.description.contacts_of(PairContact)
         super().__init__(model, contacts, [pair_points(contact.slave, contact.points) for contact in contacts])
         self.surfaces: list[SurfaceSet] = []
         self.master_of: list[int] = []

@@ -19,6 +19,7 @@ from ..kernels.contact.facet_structs import (
     point_list_struct,
 )
 from ..kernels.contact.point_lists import FACETS_PER_CHUNK, point_list_kernels
+from ..model.pairs import PairContact
 from ..model.state import State, view_as_words
 from ..terms.protocols import Coupled, Tied
 from ..terms.term import StepContext, part
@@ -57,7 +58,7 @@ class FacetContact(ContactTerm, Tied, Coupled):
 
     @classmethod
     def features(cls, model: Model) -> dict[str, bool]:
-        return {"contact between bodies": bool(model.description.pairs)}
+        return {"contact between bodies": bool(model.description.contacts_of(PairContact))}
 
     def tied_slots(self) -> list[np.ndarray]:
         """Bodies in contact form one component."""
@@ -146,7 +147,7 @@ class FacetContact(ContactTerm, Tied, Coupled):
         facet = s["pair"].facet.numpy()
         depth = np.where((facet != -1) & new[:, None], s["pair"].depth.numpy(), 0.0)
         touching = touching_depth(self.model.size, ctx.state.displacement.numpy())
-        store_overlaps(t, depth, touching, overlap)
+        store_overlaps(self, depth, touching, overlap)
         refuse_deep_overlaps(t, ctx.state.displacement.numpy(), s["attempt"].start_position.numpy(), facet, new)
         history.overlap.assign(overlap)
 
@@ -273,7 +274,7 @@ class FacetContact(ContactTerm, Tied, Coupled):
     def add_mode_coupling(self, ctx: StepContext, kept: list[wp.array], dq_dv: wp.array, active: wp.array) -> None:
         ctx.scratch[self.name]["motions"].add(kept, dq_dv, active)
 
-    def _sides_text(self, contact: Any) -> tuple[str, str, str]:
+    def sides_text(self, contact: Any) -> tuple[str, str, str]:
         return contact.slave.body.name, f"body {contact.master.body.name!r}", "body"
 
     def _contact_info(self, contact: Any, k: int) -> tuple[dict[str, Any], dict[str, Any]]:

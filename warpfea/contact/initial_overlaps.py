@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..base.errors import ModelError
-from ..model.contacts import Contact
-from ..model.pairs import PairContact
 from ..model.surfaces import make_skin, reference_points
 
 if TYPE_CHECKING:
@@ -37,16 +35,14 @@ def reference_position_text(tables: ContactTables | PairTables, k: int, point: i
     return "(" + ", ".join(f"{x:.4g}" for x in X) + ")"
 
 
-def store_overlaps(
-    tables: ContactTables | PairTables, depth: np.ndarray, touching: np.ndarray, overlap: np.ndarray
-) -> None:  # fmt: skip
-    """Store depths (worlds, points), m, above the touching depth in `overlap` (worlds, points).
+def store_overlaps(term: Any, depth: np.ndarray, touching: np.ndarray, overlap: np.ndarray) -> None:
+    """Store depths (worlds, points), m, above the touching depth in `overlap` (worlds, points); `term`: of the points.
 
     Raises:
         ModelError: an overlap with `overlap` "refuse".
     """
-    contacts: list[Contact | PairContact] = [*tables.contacts]
-    for k, contact in enumerate(contacts):
+    tables = term.tables
+    for k, contact in enumerate(tables.contacts):
         points = slice(tables.first[k], tables.first[k + 1])
         mine = depth[:, points]
         deep = mine.max(axis=1) > touching
@@ -54,12 +50,9 @@ def store_overlaps(
             continue
         if contact.overlap == "refuse":
             world, point = np.unravel_index(int(mine.argmax()), mine.shape)
-            if isinstance(contact, PairContact):
-                other = f"body {contact.master.body.name!r}"
-            else:
-                other = f"collider {contact.collider.name!r}"
+            body, other, _ = term.sides_text(contact)
             raise ModelError(
-                f"contact {contact.name!r}: body {contact.body.name!r} begins {mine.max():.3g} m inside {other} "
+                f"contact {contact.name!r}: body {body!r} begins {mine.max():.3g} m inside {other} "
                 f"(world {world}, reference point {reference_position_text(tables, k, int(point))}); move one of them, "
                 "or take overlap='offset', which stores the overlap and lets it decay"
             )

@@ -19,7 +19,7 @@ from ..kernels.contact.ledger import ENERGY_COLUMNS, RECORD_LANES, contact_ledge
 from ..kernels.contact.structs import RECORD_NAMES, clock_struct, contact_scratch_struct, history_struct
 from ..kernels.solvers.newton_control import FAIL_ROUNDOFF, FAIL_WORK
 from ..model.state import State
-from ..terms.protocols import Diagnosed, Parametrised, Preconditioned, Updated
+from ..terms.protocols import Diagnosed, Parametrised, Preconditioned, Touching, Updated
 from ..terms.term import LOSS, NUMERICAL, STORED, WORK, Column, StepContext, part
 from .collider_tables import facet_pattern_entries
 from .double_displacements import DoubleDisplacements
@@ -49,7 +49,7 @@ def contact_columns(stored: str) -> tuple[Column, ...]:
     return (Column(stored, STORED), *shared, Column("", NUMERICAL))
 
 
-class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed):
+class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
     """Contacts of a model with one geometry of the other side.
 
     Members of a geometry; the first six rows are needed, the others do nothing here, or what any geometry needs:
@@ -60,7 +60,7 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed):
     `make_other`                   struct `Other` of the device functions, with its arrays in the state
     `_allocate_other`              arrays of an attempt of that struct
     `_begin_other`                 the other side at the start of an attempt, such as poses
-    `_sides_text`, `_contact_info` texts and numbers of messages and of `Model.info`
+    `sides_text`, `_contact_info`  texts and numbers of messages and of `Model.info`
     `_turn_text`                   reason where `evaluate` returns TURNED
     `_find_other`                  search at an iterate
     `_find_accepted`               search at the accepted iterate
@@ -300,6 +300,9 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed):
         args = [ctx.scratch[self.name]["attempt"], self.report_offset, ctx.work.report]
         ctx.launch(self.ledger_kernels.write_records, (self.model.worlds, len(self.tables.contacts)), args)
 
+    def contact_column(self, contact: Any) -> int:
+        return self.report_offset + len(RECORD_NAMES) * self.tables.number[contact.index]
+
     def stored_energy(self, ctx: StepContext) -> dict[str, np.ndarray]:
         """Stored energy according to the history, by points."""
         return {self.columns[0].name: ctx.scratch[self.name]["history"].stored.numpy() @ self.weights}
@@ -340,14 +343,14 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed):
         contact = t.contacts[k]
         if found < 0:
             return PenetrationError, f"contact {contact.name!r}: {self._turn_text(contact)}"
-        body, other, thicker = self._sides_text(contact)
+        body, other, thicker = self.sides_text(contact)
         return PenetrationError, (
             f"contact {contact.name!r}: a point of body {body!r} (reference place "
             f"{reference_position_text(t, k, point - int(t.first[k]))}) went through {other}; take a larger "
             f"stiffness= of the contact or a thicker {thicker}, or a smaller dt where it moves that far in a step"
         )
 
-    def _sides_text(self, contact: Any) -> tuple[str, str, str]:
+    def sides_text(self, contact: Any) -> tuple[str, str, str]:
         """Body of the points, the other side, and the noun of what could be thicker, for messages."""
         raise NotImplementedError
 
@@ -377,8 +380,7 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed):
     def parameters(self) -> dict[str, Callable[[Any, np.ndarray], None]]:
         return contact_parameters(self.tables)
 
-    def info(self) -> list[dict[str, Any]]:
-        """Entries of `Model.info` per contact, in the order of addition."""
+    def contacts_info(self) -> list[dict[str, Any]]:
         t, out = self.tables, []
         for contact in sorted(t.contacts, key=lambda c: c.index):
             k = t.number[contact.index]

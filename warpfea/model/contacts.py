@@ -73,7 +73,7 @@ class ContactOptions:
         smoothing: None; with the paper's law a depth, m; with the smooth law (eps in N, v_eps in m/s).
         overlap: "refuse" or "offset".
         overlap_time: time in which a stored overlap decays, s.
-        index: number in its builder.
+        index: number in its builder, of contacts of its class.
     """
 
     mu: float = 0.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -12,10 +12,9 @@ from ..base.errors import ModelError
 from ..base.short_repr import use_short_repr
 from ..time_laws import TimeLaw
 from .bodies import Body
-from .contacts import Collider, Contact
+from .contacts import Collider, ContactOptions
 from .handles import NodeSet, SurfaceSet
 from .joints import Joint
-from .pairs import PairContact
 
 __all__ = [
     "BodyForce",
@@ -28,6 +27,8 @@ __all__ = [
     "Support",
     "support_slots",
 ]
+
+C = TypeVar("C", bound=ContactOptions)
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,8 +133,7 @@ class Description:
     probes: list[Probe] = field(default_factory=list)
     joints: list[Joint] = field(default_factory=list)
     colliders: list[Collider] = field(default_factory=list)
-    contacts: list[Contact] = field(default_factory=list)
-    pairs: list[PairContact] = field(default_factory=list)
+    contacts: list[Any] = field(default_factory=list)
     gravity: np.ndarray = field(default_factory=lambda: np.zeros(3))
     gravity_law: TimeLaw | None = None
     up_axis: str = "Z"
@@ -146,10 +146,9 @@ class Description:
                 setattr(out, name, copy(value))
         return out
 
-    @property
-    def all_contacts(self) -> list[Contact | PairContact]:
-        """Contacts with colliders, then between bodies."""
-        return [*self.contacts, *self.pairs]
+    def contacts_of(self, kind: type[C]) -> list[C]:
+        """Contacts of one class, as `Contact` with colliders or `PairContact` between bodies."""
+        return [contact for contact in self.contacts if isinstance(contact, kind)]
 
     def summary(self) -> str:
         """One-line summary; "" for an empty description."""
@@ -157,7 +156,7 @@ class Description:
         counts = {"support": len(self.supports), "load": loads, "joint": len(self.joints)}
         counts |= {
             "collider": len(self.colliders),
-            "contact": len(self.all_contacts),
+            "contact": len(self.contacts),
             "probe": len(self.probes),
         }
         parts = [repr(body) for body in self.bodies] if len(self.bodies) <= 3 else [f"{len(self.bodies)} bodies"]

@@ -201,7 +201,7 @@ class Model:
                 {"name": j.name, "kind": j.kind, "rows": len(j.rows), "between": j.between}
                 for j in (self.constraints.joints if self.constraints else ())
             ],
-            "contacts": [fact for term in (self.terms.contact, self.terms.pairs) if term for fact in term.info()],
+            "contacts": [fact for term in self.terms.contacts for fact in term.contacts_info()],
             "features": [k for k, on in features.items() if on],
             "left_out": [k for k, on in features.items() if not on],
             "blocks": [
@@ -272,9 +272,8 @@ class Model:
         their paths at its time, without friction.
         """
         out = np.zeros((self.worlds, self.slots, 3))
-        for term in (self.terms.contact, self.terms.pairs):
-            if term is not None:
-                out += term.nodal_force(state)
+        for term in self.terms.contacts:
+            out += term.nodal_force(state)
         return out
 
     def set_parameter(self, name: str, values: Any, *, mask: Any = None) -> None:

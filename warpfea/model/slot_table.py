@@ -68,5 +68,5 @@ class SlotTable:
             self.free[rows] *= 1.0 - support.components
             if support.law is None and support.node_laws is None:
                 self.clamped[rows] |= support.components.astype(bool)
-        if not self.free.any() and not description.all_contacts:
+        if not self.free.any() and not description.contacts:
             raise ModelError("every component of every node is prescribed: nothing is left to solve for")

@@ -33,7 +33,7 @@ def make_topology(model: Any) -> Any:
 def check_static_supports(model: Any) -> None:
     """Raise ModelError for an unconstrained rigid-body mode."""
     state, table = model.state(), model.slot_table
-    touches = model.description.all_contacts
+    touches = model.description.contacts
     held_by = "hold what rests on contact with solve_static(stabilise=True), " if touches else ""
     for label in range(model.components.count):
         slots = np.flatnonzero(model.components.of_slot == label)

@@ -152,10 +152,9 @@ class Records:
 
     def contact_column(self, contact: Contact | PairContact | str) -> int:
         """First report column of a contact."""
-        known = _find("contact", contact, self.model.description.all_contacts, "a handle from add_contact, or a name")
-        terms = self.model.terms
-        term: Any = terms.contact if isinstance(known, Contact) else terms.pairs
-        return term.report_offset + len(RECORD_NAMES) * term.tables.number[known.index]
+        known = _find("contact", contact, self.model.description.contacts, "a handle from add_contact, or a name")
+        term = next(term for term in self.model.terms.contacts if known in term.tables.contacts)
+        return term.contact_column(known)
 
 
 def _find(kind: str, given: Any, things: Sequence[Any], handle: str) -> Any:

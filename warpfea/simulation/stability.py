@@ -160,8 +160,8 @@ def _stable_in_float32(sim: Simulation, out: Stability) -> bool:
 def _friction_contacts(sim: Simulation) -> list[tuple[int, str]]:
     """Worlds and names of contacts that touch with friction."""
     found = []
-    for term in (sim.model.terms.contact, sim.model.terms.pairs):
-        for contact in term.tables.contacts if term else ():
+    for term in sim.model.terms.contacts:
+        for contact in term.tables.contacts:
             mu = term.tables.data.mu_static.numpy()[:, term.tables.number[contact.index]]
             touching = sim.contact_record(contact).normal_force[:, -1] > 0.0
             found += [(int(world), contact.name) for world in np.flatnonzero((mu > 0.0) & touching)]

@@ -165,7 +165,7 @@ def begin_static(
     check_model(model)
     if model.terms.dead_loads.has_gravity:
         require_density(model.bodies, "gravity")
-    for contact in model.description.all_contacts:
+    for contact in model.description.contacts:
         if contact.treatment == "explicit":
             raise ModelError(
                 f"contact {contact.name!r}: treatment = 'explicit' is for dynamics: use 'implicit' in statics"

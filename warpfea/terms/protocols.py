@@ -28,6 +28,7 @@ __all__ = [
     "Parametrised",
     "Preconditioned",
     "Tied",
+    "Touching",
     "Updated",
 ]
 
@@ -194,4 +195,26 @@ class Diagnosed(Term):
         return ""
 
 
-PROTOCOLS = (Tied, Updated, Constrained, Preconditioned, Coupled, Parametrised, Diagnosed)
+class Touching(Term):
+    """Term of contacts, with their columns in the report.
+
+    Attributes:
+        tables: its contacts, points and facets.
+    """
+
+    tables: Any
+
+    def nodal_force(self, state: State) -> np.ndarray:
+        """Elastic nodal forces of all its contacts at a state, (worlds, slots, 3), N."""
+        raise NotImplementedError
+
+    def contacts_info(self) -> list[dict[str, Any]]:
+        """Entries of `Model.info` per contact, in the order of addition."""
+        raise NotImplementedError
+
+    def contact_column(self, contact: Any) -> int:
+        """First report column of one of its contacts."""
+        raise NotImplementedError
+
+
+PROTOCOLS = (Tied, Updated, Constrained, Preconditioned, Coupled, Parametrised, Diagnosed, Touching)

@@ -34,7 +34,7 @@ from .dead_loads import DeadLoads
 from .elements import Elements
 from .evaluation import Evaluation
 from .follower_loads import FollowerLoads
-from .protocols import Constrained, Parametrised, Tied
+from .protocols import Constrained, Parametrised, Tied, Touching
 from .supports import Supports
 from .term import FieldSpec, StepContext, Term
 from .time_law_table import TimeLawTable, control_array
@@ -271,6 +271,11 @@ class TermSet:
         return {name: spec for term in self.all for name, spec in term.fields.items()}
 
     # parameters and fields
+
+    @property
+    def contacts(self) -> list[Touching]:
+        """Terms of contact, one for each geometry of the other side in use."""
+        return self.having(Touching)
 
     @property
     def contact(self) -> Any:
