@@ -57,7 +57,7 @@ def formula_kernels(dtype: str, midpoint: bool, formula: Formula) -> KernelSet:
         return out
 
     @wp.func
-    def directional(v: mat33d, side: int, axis: int) -> mat33d:
+    def derivative_along(v: mat33d, side: int, axis: int) -> mat33d:
         """Derivative of the gradients along a component of one vector."""
         d = mat33d()
         d[side, axis] = f64(1.0)
@@ -68,9 +68,9 @@ def formula_kernels(dtype: str, midpoint: bool, formula: Formula) -> KernelSet:
         """Store first and second derivatives of c at the vectors v of a row."""
         store_gradients(gradient, world, row, scale * gradients(v[0], v[1], v[2]))
         for side in range(3):
-            x = scale * directional(v, side, 0)
-            y = scale * directional(v, side, 1)
-            z = scale * directional(v, side, 2)
+            x = scale * derivative_along(v, side, 0)
+            y = scale * derivative_along(v, side, 1)
+            z = scale * derivative_along(v, side, 2)
             for other in range(3):
                 curvature[world, 9 * row + 3 * other + side] = wp.matrix_from_cols(x[other], y[other], z[other])
 
