@@ -225,10 +225,17 @@ class Term:
         """Evaluate the data of blocks and penalties at the first iterate work.u."""
 
     def force(self, ctx: StepContext, active: wp.array) -> None:
-        """Forces and potential rows at work.u, work.v; in statics work.v is the load step increment, m."""
+        """Forces at work.u_stage, work.v_stage and work.stage_time, potential rows at work.u.
+
+        These are work.u, work.v and the new time, but with `ctx.midpoint` the middle of the step; there work.v_stage is
+        half of the change of u, m, the mean velocity times dq/dv. In statics work.v is the load step increment, m.
+        """
 
     def product(self, ctx: StepContext, p: wp.array, active: wp.array) -> None:
-        """Derivative of the force along p, a change of the positions, m; velocities change by p/(dq/dv)."""
+        """Derivative of the force along p, a change of work.u, m; velocities change by p/(dq/dv).
+
+        Stage quantities, u_stage and mean velocity, change by `ctx.midpoint_factor` of that.
+        """
 
     def diagonal(self, ctx: StepContext, active: wp.array) -> None:
         """Positive semi-definite 3x3 diagonal blocks, into the pool.
