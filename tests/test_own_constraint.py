@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 import warp as wp
 from warpfea.kernels.terms.constraint_formulas import Formula
+from warpfea.kernels.terms.constraints import DOT
 
 import warpfea as wf
 from warpfea.builder.joints import CONSTRAINT_KINDS, ConstraintKind
-from warpfea.model.joints import ConstraintRow
+from warpfea.model.joints import ConstraintRow, constant_vector
 
 G, MASSES = 9.81, (3.0, 1.0)
 
@@ -153,6 +154,69 @@ def test_the_matrix_is_that_of_the_products():
     product = newton.direct.assembler.host_csr(newton.direct.matrix) @ v.ravel()
     assert abs(work.multipliers.curvature.numpy()).max() * work.multipliers.trial_multiplier.numpy().max() > 1.0
     assert np.abs(product - expected).max() < 1e-12 * np.abs(expected).max()
+
+
+UP = constant_vector((0.0, 0.0, 1.0))
+
+
+def kind_of(*row):
+    return ConstraintKind(2, lambda at: [ConstraintRow(row[0], at.x[1] - at.x[0], *row[1:])])
+
+
+SPOILT = {
+    "a row": (
+        ConstraintKind(2, lambda at: ConstraintRow(DOT, at.x[0], UP)),
+        "its rows are ConstraintRow.*expected a list",
+    ),
+    "no rows": (ConstraintKind(2, lambda at: []), r"its rows are \[\]; expected a list of one ConstraintRow or more"),
+    "other rows": (ConstraintKind(2, lambda at: [1.0]), r"its rows are \[1.0\]; expected a list"),
+    "an array": (kind_of(DOT, np.ones(3)), r"vector b of row 0 is array.*expected a Vector.*constant_vector"),
+    "a third array": (kind_of(DOT, UP, 1.0, np.ones(3)), r"vector a2 of row 0 is array.*expected a Vector"),
+    "a text": (kind_of("DOT", UP), "row 0 has kind 'DOT'; expected DOT, DISTANCE, ANGLE or a Formula"),
+    "a device function": (kind_of(rope_length, UP), "row 0 has kind .*rope_length.*; expected DOT"),
+    "an unknown number": (kind_of(17, UP), "row 0 has kind 17; expected DOT"),
+    "nan": (
+        kind_of(DOT, constant_vector((0, 0, np.nan))),
+        r"vector b of row 0 is \[ *0. +0. +nan\]; expected three finite",
+    ),
+    "two numbers": (kind_of(DOT, constant_vector((0, 1))), r"vector b of row 0 is .*; expected three finite numbers"),
+    "a bare function": (rope_rows, r"CONSTRAINT_KINDS\['OWN'\] is <function rope_rows.*, no ConstraintKind; write"),
+}
+
+
+@pytest.mark.parametrize("case", SPOILT)
+def test_a_kind_that_does_not_fit_is_refused(case, monkeypatch):
+    kind, message = SPOILT[case]
+    monkeypatch.setitem(CONSTRAINT_KINDS, "OWN", kind)
+    b = wf.ModelBuilder()
+    cube = b.add_solid(wf.mesh.box((0.1, 0.1, 0.1), cells=(1, 1, 1)), material=wf.SVK(E=1e8, nu=0.3, density=1000.0))
+    with pytest.raises(wf.ModelError, match=rf"constraint 'OWN_1' \(OWN\): .*{message}"):
+        b.add_constraint("OWN", points=((0.0, 0.0, 1.0), cube.at((0, 0, 0))))
+
+
+@wp.func
+def single_precision(a: wp.vec3d, b: wp.vec3d, a2: wp.vec3d) -> wp.float64:
+    return 2.0 * wp.length(a)
+
+
+def test_a_corrected_formula_compiles(monkeypatch):
+    """Kernels that do not compile are not in the way of those of a later formula of that name."""
+
+    def model(value):
+        b = wf.ModelBuilder()
+        mesh = wf.mesh.box((0.1, 0.1, 0.1), cells=(1, 1, 1))
+        cube = b.add_solid(mesh, material=wf.SVK(E=1e8, nu=0.3, density=1000.0))
+        formula = Formula("own", value, rope_directions, rope_turns)
+        monkeypatch.setitem(CONSTRAINT_KINDS, "OWN", kind_of(formula, UP))
+        b.add_constraint("OWN", points=((0.0, 0.0, 1.0), cube.at((0, 0, 0))))
+        return b.finalize(device="cpu")
+
+    def value(model):
+        return model.terms.constraints.values(model.state())[0][0, 0]
+
+    with pytest.raises(RuntimeError, match="single_precision"):
+        value(model(single_precision))
+    assert value(model(rope_length)) == pytest.approx(2.0, rel=1e-12)  # |(0, 0, -1)| + |(0, 0, 1)|
 
 
 def test_two_formulas_of_one_name_are_refused(monkeypatch):

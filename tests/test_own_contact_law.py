@@ -66,6 +66,50 @@ def stiffness_for_depth():
     return WEIGHT / (LENGTH * math.expm1(2.0)) / k
 
 
+@wp.kernel(enable_backward=False)
+def law_values(g: f64, delta: wp.array(dtype=f64), delta_n: wp.array(dtype=f64), out: wp.array(dtype=wp.vec4d)):
+    i = wp.tid()
+    out[i] = exponential(0, f64(1e6), g, f64(0.0), f64(0.0), delta[i], delta_n[i])
+
+
+def evaluated(g, delta, delta_n):
+    """Force, its derivative, its integral, and the magnitude of its terms, each (n,)."""
+    arrays = [wp.array(x, dtype=f64, device="cpu") for x in np.broadcast_arrays(delta, delta_n)]
+    out = wp.zeros(len(delta), dtype=wp.vec4d, device="cpu")
+    wp.launch(law_values, len(delta), inputs=[g, *arrays, out], device="cpu")
+    return out.numpy().T
+
+
+@pytest.mark.parametrize("g", [0.0, 3e4])
+@pytest.mark.parametrize("start", [-1e-5, 5e-6, 6e-5])
+def test_derivatives_are_differences(g, start):
+    """The integral's derivative is the force, the force's the second value; also where damping ends it."""
+    delta = np.linspace(-1e-5, 5e-5, 602)
+    force, slope, psi, size = evaluated(g, delta, start)
+    step = 1e-9
+    above, below = (evaluated(g, delta + sign * step, start) for sign in (1.0, -1.0))
+    smooth = (above[0] > 0.0) == (below[0] > 0.0)  # no kink between
+    assert smooth.sum() > 598
+    assert (force > 0.0).sum() > 50
+    np.testing.assert_allclose((above[2] - below[2]) / (2.0 * step), force, rtol=1e-6, atol=1e-6 * force.max())
+    change = (above[0] - below[0]) / (2.0 * step)
+    np.testing.assert_allclose(change[smooth], slope[smooth], rtol=1e-6, atol=1e-6 * slope.max())
+    np.testing.assert_array_equal(psi[force == 0.0], 0.0)
+    summed = np.cumsum(0.5 * (force[1:] + force[:-1]) * np.diff(delta))  # it is 0 where the force begins
+    np.testing.assert_allclose(psi[1:], summed, atol=1e-4 * psi.max())
+    assert (size >= 0.0).all()
+
+
+def test_without_damping_it_is_elastic():
+    """For g = 0 the energy depends on the depth alone, and so does the force for delta_n = delta."""
+    delta = np.linspace(1e-6, 5e-5, 20)
+    spring = evaluated(0.0, delta, 0.0)
+    np.testing.assert_array_equal(evaluated(0.0, delta, delta), spring)
+    np.testing.assert_allclose(evaluated(3e4, delta, delta)[0], spring[0], rtol=1e-14)
+    L = LENGTH
+    np.testing.assert_allclose(spring[2], 1e6 * L * (L * np.expm1(delta / L) - delta), rtol=1e-10)
+
+
 @pytest.mark.parametrize("other", ["collider", "body"])
 def test_resting_depth(registered, other):
     """d = L ln(1 + W / (k L)); a linear spring would give L (exp(2) - 1)."""
@@ -148,6 +192,31 @@ def test_a_corrected_law_compiles(monkeypatch):
         relative_force("own")
     monkeypatch.setitem(LAWS, "own", linear(2.0))
     assert relative_force("own") == pytest.approx(2.0, rel=1e-9)
+
+
+SPOILT = {
+    "a bare function": (exponential, {}, r"LAWS\['own'\] is .*, no ContactLaw; write LAWS\['own'\] = ContactLaw"),
+    "no device function": (
+        ContactLaw(lambda *args: 0.0),
+        {},
+        r"`normal` of law 'own' is .*, no device function.*@wp.func",
+    ),
+    "smoothing": (ContactLaw(exponential), {"smoothing": 1e-4}, "law 'own' declares no smoothing; leave it out"),
+    "explicit": (
+        ContactLaw(exponential),
+        {"treatment": "explicit"},
+        "law 'own' declares no explicit force; 'paper'",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", SPOILT)
+@pytest.mark.parametrize("other", ["collider", "body"])
+def test_a_law_that_does_not_fit_is_refused(case, other, monkeypatch):
+    law, options, message = SPOILT[case]
+    monkeypatch.setitem(LAWS, "own", law)
+    with pytest.raises(wf.ModelError, match=f"contact 'pad': .*{message}"):
+        resting_block("own", other, **options)
 
 
 def test_an_unknown_law_is_refused():

@@ -240,7 +240,7 @@ def two(**options):
         ({"model": "sphere", "radius": 0.1}, NotImplementedError, "model = 'sphere' between bodies"),
         ({"law": "smooth"}, NotImplementedError, "law = 'smooth'"),
         ({"points": 5}, wf.ModelError, "points = 5: faces of '(one|two)' have rules of 7, 16 points"),
-        ({"treatment": "explicit"}, wf.ModelError, "'explicit' is for law = 'paper' only"),
+        ({"treatment": "explicit"}, wf.ModelError, "law 'default' declares no explicit force; 'paper' does"),
         ({"mu": -1.0}, wf.ModelError, "mu = -1.0"),
         ({"offset": np.nan}, wf.ModelError, "offset = nan"),
         ({"overlap": "push"}, wf.ModelError, "overlap = 'push'"),

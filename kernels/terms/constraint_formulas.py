@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from ..common.modules import KernelSet, kernel_module, kernel_set
+from ..common.modules import KernelSet, definition_name, kernel_module, kernel_set
 from ..common.types import double_1d, int_1d, precision, vec3d_2d
 from .constraints import constraint_functions, constraint_struct, multiplier_struct
 
@@ -46,7 +46,8 @@ def formula_kernels(dtype: str, midpoint: bool, formula: Formula) -> KernelSet:
     term_vector, right_side, store_value = functions.term_vector, functions.right_side, functions.store_value
     store_gradients = functions.store_gradients
     value, gradients, gradient_change = formula.value, formula.gradients, formula.gradient_change
-    module = kernel_module(f"constraint_formula_{formula.name}_{dtype}{'_midpoint' if midpoint else ''}")
+    name = f"constraint_formula_{definition_name(formula.name, formula)}"
+    module = kernel_module(f"{name}_{dtype}{'_midpoint' if midpoint else ''}")
 
     @wp.func
     def row_vectors(con: Constraints, x: p.vec3_2d, world: int, row: int) -> mat33d:

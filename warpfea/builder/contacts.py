@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any
 
 import numpy as np
+import warp as wp
 
 from ..base.checks import is_count, is_number
 from ..base.errors import ModelError
 from ..base.names import did_you_mean
-from ..contact import ANY_GAP, LAWS
+from ..contact import ANY_GAP, LAWS, ContactLaw
 from ..kernels.contact.collider_shapes import SHAPE_KINDS
 from ..model.bodies import Body
 from ..model.contact_points import check_contact_points
@@ -131,7 +132,7 @@ def make_pair(
     what = f"contact {name!r}"
     if options["model"] == "sphere":
         raise NotImplementedError(f"{what}: model = 'sphere' between bodies is not part of this version; take 'patch'")
-    if options["law"] in LAWS and LAWS[options["law"]].traits & ANY_GAP:
+    if _checked_law(what, options["law"]).traits & ANY_GAP:
         raise NotImplementedError(
             f"{what}: law = {options['law']!r} acts at any distance, and is for contact with colliders; take 'default' "
             "or 'paper'"
@@ -158,13 +159,12 @@ KINDS: dict[type, Callable[..., Contact | PairContact]] = {
 
 def _checked_options(what: str, surface: SurfaceSet, o: dict[str, Any]) -> dict[str, Any]:
     """Contact options with None replaced by defaults. ModelError names the invalid one."""
-    for option, known in (("law", LAWS), ("treatment", TIME_TREATMENTS), ("model", CONTACT_MODELS),
-                          ("overlap", OVERLAP_OPTIONS)):  # fmt: skip
-        if o[option] not in known:
-            hint = did_you_mean(o[option], known)
-            raise ModelError(f"{what}: {option} = {o[option]!r} is none of {', '.join(map(repr, known))}{hint}")
-    if o["treatment"] == "explicit" and not LAWS[o["law"]].explicit:
-        raise ModelError(f"{what}: treatment = 'explicit' is for law = 'paper' only, not {o['law']!r}")
+    law = _checked_law(what, o["law"])
+    known = {"treatment": TIME_TREATMENTS, "model": CONTACT_MODELS, "overlap": OVERLAP_OPTIONS}
+    for option, names in known.items():
+        _check_option(what, option, o[option], names)
+    if o["treatment"] == "explicit" and not law.explicit:
+        raise ModelError(f"{what}: treatment = 'explicit': law {o['law']!r} declares no explicit force; 'paper' does")
     o["mu"] = _number(what, "mu", o["mu"], "a friction coefficient, 0 or above", low=0.0)
     if o["mu_static"] is None:
         o["mu_static"] = o["mu"]
@@ -191,6 +191,29 @@ def _checked_options(what: str, surface: SurfaceSet, o: dict[str, Any]) -> dict[
     return o
 
 
+def _check_option(what: str, option: str, value: Any, known: Collection[str]) -> None:
+    """ModelError for a value that is not among the known ones."""
+    if value not in known:
+        hint = did_you_mean(value, known)
+        raise ModelError(f"{what}: {option} = {value!r} is none of {', '.join(map(repr, known))}{hint}")
+
+
+def _checked_law(what: str, name: str) -> ContactLaw:
+    """A law of `LAWS`. ModelError for an unknown name, or an entry that is no law of a device function."""
+    _check_option(what, "law", name, LAWS)
+    law = LAWS[name]
+    if not isinstance(law, ContactLaw):
+        raise ModelError(
+            f"{what}: LAWS[{name!r}] is {law!r}, no ContactLaw; write LAWS[{name!r}] = ContactLaw(normal), normal its "
+            "device function"
+        )
+    if not isinstance(law.normal, wp.Function):
+        raise ModelError(
+            f"{what}: `normal` of law {name!r} is {law.normal!r}, no device function: decorate it @wp.func"
+        )
+    return law
+
+
 def _number(
     what: str, name: str, value: Any, wanted: str, *, low: float | None = None, high: float = np.inf
 ) -> float:  # fmt: skip
@@ -206,7 +229,10 @@ def _smoothing(what: str, law: str, value: Any) -> float | tuple[float, float] |
         return None
     kind = LAWS[law].smoothing
     if kind is None:
-        raise ModelError(f"{what}: smoothing = {value!r} applies to law = 'paper' or 'smooth' only")
+        raise ModelError(
+            f"{what}: smoothing = {value!r}: law {law!r} declares no smoothing; leave it out, or take 'paper' or "
+            "'smooth'"
+        )
     if kind == "depth":
         return _number(what, "smoothing", value, "a positive depth, m, over which the paper's damping is ramped in")
     pair = tuple(value) if isinstance(value, (tuple, list, np.ndarray)) else ()

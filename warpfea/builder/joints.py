@@ -21,7 +21,7 @@ import numpy as np
 from ..base.errors import ModelError
 from ..base.names import check_known, did_you_mean
 from ..kernels.terms.constraints import ANGLE, DISTANCE, DOT
-from ..model.joints import ConstraintRow, Joint, Vector, constant_vector
+from ..model.joints import ConstraintRow, Joint, Vector, check_rows, constant_vector
 from ..time_laws import TimeLaw, time_law
 from .attachments import COINCIDENCE_TOL, GROUND, UNKNOWN_WEAKNESS, Attachment, Ground, make_attachment
 from .checks import vector
@@ -329,12 +329,15 @@ def make_constraint(kind: str, points: Any, value: Any, name: str) -> Joint:
     (3,).
 
     Raises:
-        ModelError: an unknown kind, a wrong number of points, or points that coincide where a direction is needed.
+        ModelError: an unknown kind, a wrong number of points, points that coincide where a direction is needed, or
+            rows that are none.
     """
     what = f"constraint {name!r} ({kind})"
     at = ConstraintPoints(what, _constraint_points(what, kind, points), value)
     between = ", ".join(point.label for point in at.attachments)
-    return Joint(name, kind, CONSTRAINT_KINDS[kind].rows(at), at.x[-1], between)
+    rows = CONSTRAINT_KINDS[kind].rows(at)
+    check_rows(what, rows)
+    return Joint(name, kind, rows, at.x[-1], between)
 
 
 def _direction_rows(at: ConstraintPoints) -> list[ConstraintRow]:
@@ -359,6 +362,11 @@ def _constraint_points(what: str, kind: str, points: Any) -> list[Attachment]:
         raise ModelError(
             f"{what}: the kind is unknown; there are {', '.join(CONSTRAINT_KINDS)}"
             f"{did_you_mean(kind, CONSTRAINT_KINDS)}"
+        )
+    if not isinstance(CONSTRAINT_KINDS[kind], ConstraintKind):
+        raise ModelError(
+            f"{what}: CONSTRAINT_KINDS[{kind!r}] is {CONSTRAINT_KINDS[kind]!r}, no ConstraintKind; write "
+            "ConstraintKind(number of points, function of them that returns rows)"
         )
     count = CONSTRAINT_KINDS[kind].points
     if not isinstance(points, (tuple, list)) or len(points) != count:

@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from ..base.errors import ModelError
 from ..kernels.terms.constraint_formulas import Formula
-from ..kernels.terms.constraints import DISTANCE
+from ..kernels.terms.constraints import ANGLE, DISTANCE, DOT
 from ..time_laws import TimeLaw
 from .discretisation import Discretisation
 
-__all__ = ["WEIGHT_TOL", "ConstraintRow", "Joint", "Vector", "VectorPart", "constant_vector"]
+__all__ = ["WEIGHT_TOL", "ConstraintRow", "Joint", "Vector", "VectorPart", "check_rows", "constant_vector"]
 
 WEIGHT_TOL = 1e-13
 """Weights below this fraction of a vector's largest are round-off of vanishing functions."""
@@ -91,6 +92,27 @@ class ConstraintRow:
             return float(A @ A)
         dot = float(A @ B)
         return 0.0 if abs(dot) < 1e-13 * np.linalg.norm(A) * np.linalg.norm(B) else dot
+
+
+def check_rows(what: str, rows: Any) -> None:
+    """ModelError for anything but a list of constraint rows of known kinds and finite vectors."""
+    if not isinstance(rows, (list, tuple)) or not rows or not all(isinstance(row, ConstraintRow) for row in rows):
+        raise ModelError(f"{what}: its rows are {rows!r}; expected a list of one ConstraintRow or more, such as [row]")
+    for k, row in enumerate(rows):
+        if not isinstance(row.kind, Formula) and row.kind not in (DOT, DISTANCE, ANGLE):
+            raise ModelError(f"{what}: row {k} has kind {row.kind!r}; expected DOT, DISTANCE, ANGLE or a Formula")
+        for name in ("a", "b", "a2") if row.a2 is not None else ("a", "b"):
+            vector = getattr(row, name)
+            if not isinstance(vector, Vector):
+                raise ModelError(
+                    f"{what}: vector {name} of row {k} is {vector!r}; expected a Vector: a difference of points, or "
+                    "constant_vector((x, y, z))"
+                )
+            if vector.value.shape != (3,) or not np.isfinite(vector.value).all():
+                raise ModelError(
+                    f"{what}: vector {name} of row {k} is {vector.value}; expected three finite numbers: do points "
+                    "coincide that give a direction?"
+                )
 
 
 @dataclass(eq=False)
