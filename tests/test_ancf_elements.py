@@ -220,12 +220,13 @@ def lowest_elastic_eigenvalue(model):
 def test_six_rigid_modes_and_no_more(name, integration, n):
     """One element, two, a patch; thick and thin. A zero-energy mode would make a seventh zero.
 
-    With every slot scaled to a unit diagonal, round-off is some 1e-16 and bending some 0.1 to 1000 (t/L)^2.
+    With every slot scaled to a unit diagonal, round-off is some 1e-16, by LAPACK up to 1.5e-14 on some processors, and
+    bending some 0.1 to 1000 (t/L)^2.
     """
     for t in (None,) if integration is None else (0.1, 1e-3):
         _, model = build(name, integration, n=n, t=t)
         values = scaled_eigenvalues(model.tangent_matrix(model.state()).toarray())
-        assert np.abs(values[:6]).max() < 1e-14
+        assert np.abs(values[:6]).max() < 2e-14
         assert values[6] > (0.05 * t**2 if t else 1e-3)
 
 

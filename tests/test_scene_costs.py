@@ -79,6 +79,11 @@ def test_all_scenes_take_fewer_iterations_than_before(tables):
         assert row["newton"] <= GROUPS.get(label, 1.06) * before[label]["newton"] + 1, label
 
 
+WIDER = {"loads rate auto": (4805965,)}
+"""Bytes with another band: scipy's order of Cuthill and McKee begins at the first of the nodes with fewest neighbours in
+numpy's sort, which orders equal ones differently on processors with other vector instructions."""
+
+
 @pytest.mark.parametrize("label", ["cantilever", "slider_crank", "loads rate auto"])
 def test_the_table_is_up_to_date(tables, label):
     """Launches recorded for a step, counted again."""
@@ -89,7 +94,7 @@ def test_the_table_is_up_to_date(tables, label):
     row = tables[0][label]
     assert sim.stepper.launch.launches == row["launches"]
     assert len(sim.stepper.launch.modules) == row["modules"]
-    assert sum(sim.bytes().values()) == row["bytes"]
+    assert sum(sim.bytes().values()) in {row["bytes"], *WIDER.get(label, ())}
 
 
 def test_the_command_compares_with_an_earlier_file(tmp_path, capfd):

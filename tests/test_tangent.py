@@ -250,8 +250,9 @@ def step_force(model, block, u0, u1, h):
     contribution = wp.zeros((1, model.contributions), dtype=model.types.vec3, device="cpu")
     energy = wp.zeros((2, 1, model.element_count), dtype=wp.float64, device="cpu")
     low = wp.full(1, 1e30, dtype=wp.float64, device="cpu")
-    args = [block.data, after.displacement, after.velocity, history, dq, on, 1, contribution, energy]
-    args += [low, wp.clone(low)]
+    iterate = iterate_struct("float64")()
+    iterate.u, iterate.v, iterate.history, iterate.dq_dv = after.displacement, after.velocity, history, dq
+    args = [block.data, iterate, on, 1, contribution, energy, low, wp.clone(low)]
     wp.launch(block.kernels.internal_force, dim=(1, block.count), inputs=args, device="cpu")
     rows = contribution.numpy()[0].reshape(block.slots, block.count, 3)
     force = np.zeros((model.slots, 3))
