@@ -80,7 +80,7 @@ def test_all_scenes_take_fewer_iterations_than_before(tables):
 
 
 WIDER = {"loads rate auto": (4805965,)}
-"""Bytes with another band: scipy's order of Cuthill and McKee begins at the first of the nodes with fewest neighbours in
+"""Bytes with another band: scipy's order of Cuthill and McKee begins at a node with the fewest neighbours, the first by
 numpy's sort, which orders equal ones differently on processors with other vector instructions."""
 
 
