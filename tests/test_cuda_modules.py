@@ -9,8 +9,8 @@ import time
 import pytest
 
 HERE = pathlib.Path(__file__).parent
-MOST = 240.0
-"""s"""
+MOST = 1000.0
+"""s: three times what 134 modules take beside other tests on two slow cores; unrolled loops take far longer."""
 
 
 @pytest.mark.slow

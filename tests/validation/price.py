@@ -75,7 +75,7 @@ def force_in(b: wf.ModelBuilder, missing: list[str]) -> None:
     size = float(np.linalg.norm(high - low))
     point = first.at(first.mesh.points[first.mesh.used_nodes[0]])
     on_bodies: dict[str, Callable[[], Any]] = {
-        "gravity": lambda: setattr(b, "gravity", (0.0, 0.0, -NEXT_TO_NONE)),
+        "gravity": lambda: setattr(b.description, "gravity", (0.0, 0.0, -NEXT_TO_NONE)),
         "dead loads": lambda: b.add_point_load(point, (0.0, 0.0, 0.0)),
         "controls": lambda: b.add_point_load(point, wf.Control("price", 3)),
         "moments": lambda: b.add_moment(point, (0.0, 0.0, 0.0)),
