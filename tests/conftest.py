@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import gc
 import json
 import types
 from pathlib import Path
@@ -18,16 +19,17 @@ import warpfea as wf
 DATA = Path(__file__).parent / "data"
 
 wp.config.log_level = 30  # warnings and errors: no greeting, no lines for loaded modules
+gc.set_threshold(100_000, 20, 50)  # a worker holds the syntax trees of all kernels, which each collection goes through
 
 
-def remember_structs():
-    """Make Warp's recorder of CPU graphs walk a struct that it has walked once in a capture no more.
+def remember_launches():
+    """Make Warp's recorder of CPU graphs describe a struct, and a launch, once in a capture.
 
-    A step passes the same few structs, of some forty arrays each, to nearly every launch, and the walk through them, in
-    Python, is half of what a short test takes. The relocations of a struct follow from its bytes, which hold its
-    pointers. Returns a function that undoes it.
+    A step passes the same few structs, of some forty arrays each, to nearly every launch, and evaluates its forces in
+    several branches: the descriptions, in Python, are half of what a short test takes. They follow from the bytes of
+    the arguments, which hold their pointers. Returns a function that undoes it.
     """
-    walk = APICapture._walk_value_pointers
+    walk, describe = APICapture._walk_value_pointers, APICapture.build_launch_info
 
     def walk_value_pointers(self, arg_type, original, packed, base, out):
         if base != 0 or not isinstance(arg_type, Struct):
@@ -40,11 +42,23 @@ def remember_structs():
         out.extend(known[key])
         return None
 
-    APICapture._walk_value_pointers = walk_value_pointers
-    return lambda: setattr(APICapture, "_walk_value_pointers", walk)
+    def build_launch_info(self, kernel, module_exec, hooks, params, fwd_args, adjoint, adj_args=None):
+        known = self.__dict__.setdefault("known_launches", {})
+        key = kernel, adjoint, *(bytes(param) for param in params[1:])
+        if key not in known:
+            info = describe(self, kernel, module_exec, hooks, params, fwd_args, adjoint, adj_args)
+            known[key] = info, self._last_value_data, self._last_param_array, self._last_relocs
+        return known[key][0]
+
+    APICapture._walk_value_pointers, APICapture.build_launch_info = walk_value_pointers, build_launch_info
+
+    def undo():
+        APICapture._walk_value_pointers, APICapture.build_launch_info = walk, describe
+
+    return undo
 
 
-remember_structs()
+remember_launches()
 
 
 @functools.cache
