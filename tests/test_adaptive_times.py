@@ -10,10 +10,10 @@ from adaptive_bars import LAW, auto, bar
 
 import warpfea as wf
 from warpfea.cli import main
+from warpfea.simulation.adaptive import SyncTimes
 from warpfea.simulation.checkpoint import Checkpoint
 from warpfea.simulation.integrators import Integrator
 from warpfea.simulation.integrators.backward_euler import BACKWARD_EULER
-from warpfea.simulation.sync_times import SyncTimes
 from warpfea.time_laws import time_law
 
 

@@ -30,7 +30,7 @@ from ancf_bodies import (
 
 import warpfea as wf
 from warpfea.model import assembly
-from warpfea.terms.follower_loads import FollowerLoads
+from warpfea.terms.loads import FollowerLoads
 
 FLAT = [name for name in BODIES if name not in ("arc", "roof", "ball")]
 SIDES = ("beam", "arc", "plate", "roof", "ENMC", "ball", "H3843")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import warpfea as wf
-from warpfea.terms.fields import field_at_nodes, field_at_points
+from warpfea.terms.evaluation import field_at_nodes, field_at_points
 
 STRETCH = np.array([(0.1, 0.05, 0.0), (0.02, -0.04, 0.03), (0.0, 0.01, 0.06)])
 LAW = wf.SVK(E=1e6, nu=0.3, density=1000.0)

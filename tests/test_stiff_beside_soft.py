@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import warpfea as wf
-from warpfea.model.residual_groups import slenderness, stiffness_classes
+from warpfea.model.components import slenderness, stiffness_classes
 from warpfea.studies.stress.cases import stiff_beside_soft as pairs
 
 

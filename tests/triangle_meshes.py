@@ -10,7 +10,7 @@ from warpfea.kernels.contact.structs import collider_struct
 
 import warpfea as wf
 from warpfea.base.launch import Launcher
-from warpfea.contact.collider_meshes import upload_collider_meshes
+from warpfea.contact.collider_tables import upload_collider_meshes
 
 SIDE, DT = 0.1, 1e-3
 

@@ -27,8 +27,8 @@ from .bodies import MeshLike, as_mesh, make_solid, make_structure, unused_name
 from .checks import body_of_handle, check_densities, parse_gravity, warn_implausible
 from .contacts import add_contact, make_collider
 from .joints import make_constraint, make_joint
+from .loads import clamp_support, drive_supports
 from .shells import shell_geometry
-from .supports import clamp_support, drive_supports
 from .welds import make_weld
 
 __all__ = ["ModelBuilder"]

@@ -6,12 +6,11 @@ import numpy as np
 
 from ..base.errors import ModelError
 from ..model import assembly
-from ..model.bodies import Body
+from ..model.bodies import Body, locate
 from ..model.description import support_slots
 from ..model.discretisation import Discretisation
 from ..model.handles import NodeSet, SurfaceSet
 from ..model.joints import Joint, Vector, VectorPart
-from ..model.locate import locate
 from ..model.surfaces import named_faces
 from .joints import pin_rows
 

@@ -1,4 +1,5 @@
-"""Contact with rigid obstacles, see kernels/contact/collider_kinematics.py."""
+"""Contact with rigid obstacles, see kernels/contact/collider_kinematics.py: term, deepest positions of single-point
+contacts, initial penetration check of bodies across a sheet of triangles."""
 
 from __future__ import annotations
 
@@ -8,23 +9,24 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
+from ..base.errors import ModelError
+from ..base.launch import Launcher
 from ..kernels.contact.collider_kinematics import MAX_COLLIDER_ROTATION, pose_kernels
+from ..kernels.contact.collider_sheets import sheet_kernels
+from ..kernels.contact.deepest_point import deepest_point_kernels
 from ..kernels.contact.structs import collider_struct
 from ..model.contacts import Contact
 from ..model.state import State
 from ..model.triangle_mesh import TriMesh
 from ..terms.term import StepContext, part
-from .collider_sheets import check_sheet_sides
 from .collider_tables import ContactTables
-from .deepest_point import DeepestPoints
 from .evaluation import evaluate_points
 from .fields import contact_field, nodal_force, obstacle_contact_points
-from .initial_overlaps import store_overlaps, touching_depth
+from .initial_overlaps import reference_position_text, store_overlaps, touching_depth
 from .parameters import collider_parameters
 from .term import ContactTerm, contact_columns
 
 if TYPE_CHECKING:
-    from ..base.launch import Launcher
     from ..model.model import Model
     from ..terms.workspace import Workspace
 
@@ -221,3 +223,80 @@ class ColliderContact(ContactTerm):
         deepest position of a single-point contact is assigned to the nearest point."""
         gap, _, force = evaluate_points(self, state)
         return gap, force
+
+
+def check_sheet_sides(
+    term: Any, other: Any, displacement: wp.array, tolerance: np.ndarray, new: np.ndarray, launch: Launcher
+) -> None:  # fmt: skip
+    """Raise ModelError for a body that begins on both sides of a sheet.
+
+    Args:
+        term: the contact term.
+        other: current collider poses.
+        tolerance, new: (worlds,) m, and flags of the worlds to check.
+    """
+    t = term.tables
+    points = _points_behind(t, other, displacement, tolerance, launch)
+    for world, row in np.argwhere((points > 0) & new[:, None])[:1]:
+        k = int(np.searchsorted(t.row_start, row, side="right")) - 1
+        contact, where = t.contacts[k], reference_position_text(t, k, int(points[world, row]) - 1 - int(t.first[k]))
+        raise ModelError(
+            f"contact {contact.name!r}: body {contact.body.name!r} begins on both sides of collider "
+            f"{contact.collider.name!r}, or on it and behind (world {world}, reference point {where}); move one of "
+            "them: bodies on a sheet of triangles are in front of it"
+        )
+
+
+def _points_behind(
+    tables: ContactTables, other: Any, displacement: wp.array, tolerance: np.ndarray, launch: Launcher
+) -> np.ndarray:  # fmt: skip
+    """One point (worlds, facets) of each facet, + 1, behind a sheet while others are in front, or 0."""
+    m = tables.model
+    found = wp.zeros((m.worlds, tables.rows), dtype=wp.int32, device=m.device)
+    limit: Any = wp.array(tolerance, dtype=wp.float64, device=m.device)
+    for group in tables.groups:
+        args = [other, group.data, displacement, limit, found]
+        launch(sheet_kernels(m.dtype).find_crossed_sheets, (m.worlds, group.count), args)
+    sheet = [isinstance(c.collider.shape, TriMesh) and not c.collider.shape.closed for c in tables.contacts]
+    return np.where(np.repeat(sheet, np.diff(tables.row_start)), found.numpy(), 0)
+
+
+class DeepestPoints:
+    """Single-point contacts of a model; see kernels/contact/deepest_point.py.
+
+    Attributes:
+        kernels: device code.
+    """
+
+    def __init__(self, tables: ContactTables) -> None:
+        self.tables = tables
+        self.kernels = deepest_point_kernels(tables.model.dtype, tables.has_meshes)
+
+    def choose(
+        self, launch: Launcher, s: dict[str, Any], time: wp.array, u: wp.array, state: tuple[wp.array, wp.array],
+        active: wp.array, changed: wp.array, *, fresh: int, settled: int = 0,
+    ) -> None:  # fmt: skip
+        """Find the deepest position of each single-point contact.
+
+        Args:
+            launch: launcher of the device.
+            s: history, other, attempt, clock and row_start of the term's scratch.
+            time, u: [world] s, and displacements, at which positions are compared.
+            state: displacements and velocities at the start of the attempt.
+            active: [world] flags.
+            changed: [world] set to 1 if another point of a surface becomes the closest one.
+            fresh: start of an attempt.
+            settled: evaluation at a state, without motion.
+        """
+        k, t, B = self.kernels, self.tables, self.tables.model.worlds
+        groups = [group for group in t.groups if group.lumped]
+        for group in groups:
+            args = [t.data, s["other"], group.data, s["history"], time, u, active, s["attempt"]]
+            launch(k.point_depths, (B, group.count, group.data.point_count), args)
+            launch(k.find_deepest, (B, group.count), args)
+        args = [t.data, s["row_start"], active, fresh, s["attempt"], changed]
+        launch(k.choose_deepest, (B, len(t.contacts)), args)
+        for group in groups:
+            if group.data.tracks_deepest:
+                args = [t.data, s["other"], group.data, s["history"], s["clock"], *state, active, settled, s["attempt"]]
+                launch(k.set_contact_point, (B, group.count), args)

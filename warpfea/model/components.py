@@ -1,7 +1,9 @@
-"""Connected components of a model, groups of slots within them, components with free translations."""
+"""Connected components of a model, components with free translations, and residual groups within components: connected
+slots of similar stiffness, each with its own convergence norm."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,9 +12,12 @@ import warp as wp
 
 from ..kernels.solvers.pcg import free_groups_struct
 from . import assembly
-from .residual_groups import slot_groups
+from .assembly import connected_components
 
 __all__ = ["Components"]
+
+STIFFNESS_RATIO = 30.0
+"""Largest ratio of successive stiffnesses in one class."""
 
 
 class Components:
@@ -73,3 +78,101 @@ class Components:
         groups.mass = model.array("groups", model.masses.group_masses(*model.cache["free groups"]), model.types.T)
         groups.free_directions = model.array("groups", free[keep], model.types.vec3)
         return groups, len(keep)
+
+
+def stiffness_classes(stiffness: np.ndarray, label: np.ndarray) -> np.ndarray:
+    """(n,) class number, from 0 for the softest, of similar `stiffness` (n,) within each `label`."""
+    out = np.zeros(len(stiffness), dtype=np.int64)
+    for one in np.unique(label):
+        values, which = np.unique(stiffness[label == one], return_inverse=True)
+        out[label == one] = np.append(0, np.cumsum(values[1:] > STIFFNESS_RATIO * values[:-1]))[which.ravel()]
+    return out
+
+
+def slenderness(model: Any) -> np.ndarray:
+    """(parts,) squared ratio of the least to the largest radius of gyration of each part: softening by bending.
+
+    With x = sum_i s_i E_i the second moments of a part are E^T M E.
+    """
+    E, M = model.slot_table.reference, model.masses.matrix
+    count = int(model.components.mesh_of_slot.max()) + 1
+    rows = np.column_stack([np.ones(model.slots) * model.slot_table.is_position, E])
+    moments = np.zeros((count, 4, 4))
+    np.add.at(moments, model.components.mesh_of_slot, rows[:, :, None] * (M @ rows)[:, None, :])
+    mass, centre = moments[:, 0, 0], moments[:, 0, 1:] / moments[:, :1, 0]
+    second = moments[:, 1:, 1:] / mass[:, None, None] - centre[:, :, None] * centre[:, None, :]
+    least, _, largest = np.linalg.eigvalsh(second).T
+    return np.maximum(least / largest, 1e-12)
+
+
+def stiffness_pieces(model: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Piece of similar stiffness, softest first, of each slot, and of each element in block order.
+
+    A piece is connected by elements of one stiffness class and by constraints: stiff bodies on both sides of a soft
+    one are two pieces, since a small residual relative to the loaded one's forces displaces the other far. A slot
+    between materials belongs to the stiffest, which dominates its forces; an element to its softest slot. Moduli are
+    those of the model as built.
+    """
+    parts = [host for block in model.blocks for host in block.host_blocks]
+    first = np.concatenate([host.conn[:, 0] + host.body.slot_offset for host in parts])
+    mu = np.concatenate([np.full(len(host.conn), host.body.materials[host.material][1].lame[1]) for host in parts])
+    parts_of = model.components
+    of_element = stiffness_classes(mu * slenderness(model)[parts_of.mesh_of_slot[first]], parts_of.of_slot[first])
+    of_slot = np.zeros(model.slots, dtype=np.int64)
+    connectivity = [block.connectivity for block in model.blocks]
+    ends = np.cumsum([len(conn) for conn in connectivity])[:-1]
+    of_block = np.split(of_element, ends)
+    for conn, classes in zip(connectivity, of_block):
+        np.maximum.at(of_slot, conn, classes[:, None])
+    sets = [np.where(of_slot[conn] == own[:, None], conn, -1) for conn, own in zip(connectivity, of_block)]
+    for tie in model.terms.tied_slots():
+        sets += [tie[of_slot[tie] == one][None] for one in np.unique(of_slot[tie])]
+    piece = np.unique(of_slot * model.slots + connected_slots(sets, model.slots), return_inverse=True)[1].ravel()
+    softest = [conn[np.arange(len(conn)), of_slot[conn].argmin(axis=1)] for conn in connectivity]
+    return piece, piece[np.concatenate(softest)]
+
+
+def connected_slots(sets: list[np.ndarray], slots: int) -> np.ndarray:
+    """(slots,) connected component number from the rows of `sets`, (n, m) slots padded with -1."""
+    count = np.cumsum([0] + [len(rows) for rows in sets])
+    row = np.concatenate([np.repeat(first + np.arange(len(rows)), rows.shape[1]) for first, rows in zip(count, sets)])
+    slot = np.concatenate([rows.ravel() for rows in sets])
+    row, slot = row[slot >= 0] + slots, slot[slot >= 0]
+    n = slots + count[-1]
+    return connected_components(sp.coo_matrix((np.ones(len(row)), (row, slot)), shape=(n, n)).tocsr())[:slots]
+
+
+@dataclass(frozen=True)
+class SlotGroups:
+    """Slots and elements by group, on the device; with one group the lists are empty (all in order).
+
+    Attributes:
+        slot_start, element_start: [group + 1] into slot and element.
+        component: [group] connected component of the model.
+    """
+
+    count: int
+    slot_start: wp.array
+    slot: wp.array
+    element_start: wp.array
+    element: wp.array
+    component: wp.array
+
+
+def slot_groups(model: Any, label: np.ndarray) -> SlotGroups:
+    """Groups of one `label` (slots,), constant within each element, and one piece of similar stiffness."""
+    of_slot, of_element = stiffness_pieces(model)
+    first = np.concatenate([block.connectivity[:, 0] for block in model.blocks])
+    keys, of = np.unique(label * (of_slot.max() + 1) + of_slot, return_inverse=True)
+    of_element = np.searchsorted(keys, label[first] * (of_slot.max() + 1) + of_element)
+
+    def listed(of: np.ndarray) -> tuple[wp.array, wp.array]:
+        edges = np.concatenate([[0], np.cumsum(np.bincount(of, minlength=len(keys)))])
+        order = np.argsort(of, kind="stable") if len(keys) > 1 else np.zeros(0)
+        return model.array("components", edges, wp.int32), model.array("components", order, wp.int32)
+
+    component = np.zeros(len(keys))
+    component[of.ravel()] = model.components.of_slot
+    return SlotGroups(
+        len(keys), *listed(of.ravel()), *listed(of_element), model.array("components", component, wp.int32)
+    )

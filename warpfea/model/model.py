@@ -22,9 +22,8 @@ from .description import Description
 from .masses import Masses
 from .memory import Memory
 from .parameters import MaterialParameters
-from .slot_table import SlotTable
+from .slot_table import SlotTable, make_topology
 from .state import State
-from .topology import make_topology
 
 __all__ = ["Block", "Model"]
 

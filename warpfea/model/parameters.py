@@ -15,9 +15,8 @@ from ..base.worlds import check_values_per_world, values_per_world
 from ..kernels.elements.materials import NCOEF
 from ..materials import ADMISSIBLE_VALUES, DENSITY_CONSTANTS, Material
 from . import assembly
-from .blocks import Block, output_rows
+from .blocks import Block, couplings, output_rows
 from .contact_points import Modulus, effective_modulus
-from .tied_tables import couplings
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

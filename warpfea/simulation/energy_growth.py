@@ -20,7 +20,7 @@ import warp as wp
 from ..base.errors import ModelWarning
 from ..kernels.step.step_control import GROWTH_COLUMNS
 from ..model.assembly import element_volumes
-from .drive_jumps import list_drives
+from .discontinuities import list_drives
 
 if TYPE_CHECKING:
     from ..model.model import Model

@@ -1,4 +1,5 @@
-"""Error messages of failed steps and initially violated joints."""
+"""Error messages of failed steps and initially violated joints, with a hint for implausibly large loads (nominal stress
+over E)."""
 
 from __future__ import annotations
 
@@ -9,12 +10,13 @@ import numpy as np
 from ..base.errors import ConstraintError, ConvergenceError
 from ..kernels.solvers import newton_control as codes
 from ..kernels.solvers.convergence import STALL_ROUNDINGS
+from ..model.assembly import element_volumes
+from ..model.contact_points import effective_modulus
 from ..solvers import NewtonPCG
 from ..terms.evaluation import lowest_jacobian
 from ..terms.protocols import Diagnosed
-from .drive_jumps import discontinuous_drives_text
+from .discontinuities import discontinuous_drives_text
 from .energy_growth import growth_error_text
-from .overload import overload_text
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -38,6 +40,8 @@ NO_ERROR_ESTIMATE = 1e30
 """Value of an unavailable error estimate."""
 MAX_INITIAL_VIOLATION = 1e-4
 """Largest initial constraint violation (over the model size) accepted by dynamics."""
+MIN_OVERLOAD_RATIO = 0.3
+"""Smallest reported nominal stress over E."""
 
 
 def step_error(sim: Any, world: int) -> ConvergenceError | ConstraintError:
@@ -193,3 +197,51 @@ def _worst_element(m: Model, residual: np.ndarray) -> tuple[int, str]:
                 best, index = float(values[k]), part.body.element_offset + int(part.elements[k])
                 text = f"element {int(part.elements[k])} of body {part.body.name!r} (residual {best:.3g} N)"
     return index, text
+
+
+def overload_text(model: Model) -> str:
+    """Load with the largest nominal stress over E of its body, if above MIN_OVERLOAD_RATIO; else "".
+
+    Nominal stress: the value of a traction or pressure; force over the mean section (volume over longest side) for a
+    point load; density times g times the longest side for gravity.
+    """
+    found = [(0.0, "", 0.0, "", "")]
+    d = model.description
+    for load in d.dead_loads:
+        if load.name == "traction":
+            found.append(_load_entry(load.body, "traction", _largest_value(load.law), _largest_value(load.law), "Pa"))
+        else:
+            side = float(np.ptp(load.body.mesh.bounding_box(), axis=0).max())
+            section = float(element_volumes(load.body).sum()) / side
+            found.append(
+                _load_entry(load.body, load.name, _largest_value(load.law), _largest_value(load.law) / section, "N")
+            )
+    for pressure in d.pressures:
+        found.append(
+            _load_entry(
+                pressure.surface.body, "pressure", _largest_value(pressure.law), _largest_value(pressure.law), "Pa"
+            )
+        )
+    g = float(np.linalg.norm(model.terms.dead_loads.gravity.numpy(), axis=1).max())
+    for body in model.bodies if g > 0.0 else ():
+        side = float(np.ptp(body.mesh.bounding_box(), axis=0).max())
+        weight = model.masses.total_of_body(body) / float(element_volumes(body).sum()) * g * side
+        found.append(_load_entry(body, "weight", weight, weight, "Pa"))
+    ratio, what, value, unit, name = max(found)
+    if ratio < MIN_OVERLOAD_RATIO:
+        return ""
+    E = max(effective_modulus(body)[0] for body in model.bodies if body.name == name)
+    nominal = "" if unit == "Pa" else ", as a stress,"
+    return (
+        f"; the {what} of {value:.3g} {unit} on body {name!r}{nominal} is {ratio:.3g} times E = {E:.3g} Pa: check the "
+        "units of load and E"
+    )
+
+
+def _load_entry(body: Any, what: str, value: float, stress: float, unit: str) -> tuple[float, str, float, str, str]:
+    return stress / effective_modulus(body)[0], what, value, unit, body.name
+
+
+def _largest_value(law: Any) -> float:
+    """Largest value of a time law, 0 for a function of time or a control."""
+    return float(np.linalg.norm(law.values, axis=1).max()) if len(law.times) else 0.0

@@ -33,18 +33,16 @@ from .checks import (
     write_times,
 )
 from .controls import Controls
+from .discontinuities import warn_early_ends, warn_initial_jumps
 from .energy_growth import ENERGY_GROWTH_CHOICES, EnergyGrowth
 from .failures import check_initial_constraints
 from .observations import Observations
-from .part_member import PartMember
-from .records import Records
 from .reports import ContactRecord, JointRecord, PendingReport, ProbeRecord, StepReport, idle_report, simulation_text
 from .resets import Resets
-from .results import Results
+from .results import PartMember, Records, Results
 from .run_loop import run_steps
 from .run_statistics import RunStatistics
 from .stepper import Stepper
-from .time_law_warnings import warn_early_ends, warn_initial_jumps
 
 if TYPE_CHECKING:
     from ..model.model import Model

@@ -18,7 +18,7 @@ import warp as wp
 
 from ..base.launch import launch_part
 from ..kernels.solvers.direct import direct_kernels
-from ..terms.follower_loads import FollowerLoads, FollowerMatrix
+from ..terms.loads import FollowerLoads, FollowerMatrix
 from ..terms.protocols import Preconditioned
 from .factor import SingularMatrix, make_factors
 from .preconditioner import Preconditioner

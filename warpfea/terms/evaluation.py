@@ -1,7 +1,12 @@
-"""Evaluation of forces, energy, tangent and stresses at a state for output and checks."""
+"""Evaluation of forces, energy, tangent and stresses at a state for output and checks.
+
+Scalar fields of a model at nodes and drawn points: each field is declared once, in `fields` of a term, and evaluated by
+its `samples`.
+"""
 
 from __future__ import annotations
 
+import functools
 import itertools
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -13,6 +18,7 @@ import warp as wp
 from ..base.errors import ModelError
 from ..base.launch import Launcher
 from ..base.memory import convert_memory_errors
+from ..base.names import check_known
 from ..elements import Rule, get_family
 from ..kernels.common.types import precision
 from ..kernels.elements.element_slots import iterate_struct
@@ -23,12 +29,12 @@ from ..model.assembly import element_chunks, shape_and_jacobian, shape_gradients
 from ..model.blocks import output_block
 from ..model.state import State
 from .elements import Elements
-from .term import StepContext
+from .term import FieldSpec, StepContext
 
 if TYPE_CHECKING:
     from ..model.model import Model
 
-__all__ = ["Evaluation"]
+__all__ = ["Evaluation", "field_at_nodes", "field_at_points", "find_field", "lowest_jacobian"]
 
 
 class Evaluation:
@@ -288,3 +294,50 @@ def _extrapolation_matrix(rule: Rule, at: np.ndarray) -> np.ndarray:
         return np.full((len(at), len(points)), 1.0 / len(points))
     A = np.column_stack([np.ones(len(points)), points])
     return np.column_stack([np.ones(len(at)), at]) @ np.linalg.pinv(A)
+
+
+def find_field(terms: Any, name: str) -> FieldSpec:
+    """Specification of a field. Raises ModelError, listing the available names, for an unknown one."""
+    check_known("field", name, terms.fields)
+    return terms.fields[name]
+
+
+def _sample_field(terms: Any, name: str, body: Any, state: State) -> np.ndarray:
+    """Samples of a field, joined over its terms; nodal values are repeated at each sample.
+
+    Raises:
+        ModelError: an unknown field, or a term returns another shape.
+    """
+    spec, count = find_field(terms, name), body.family.node_samples.shape[1]
+    nodes = len(body.mesh.points)
+    rows = body.slot_count if spec.of_slots else nodes * count if spec.node_reduction else nodes
+    found = []
+    for term in (term for term in terms if name in term.fields):
+        values = np.asarray(term.samples(name, body, state))
+        expected = (terms.model.worlds, rows)
+        if values.shape[: 2 if spec.scalar else None] != expected:
+            raise ModelError(f"term {term.name!r}: samples({name!r}) gave {values.shape}; expected {expected}")
+        found.append(values if spec.of_slots or spec.node_reduction else np.repeat(values, count, axis=1))
+    return functools.reduce(spec.join, found) if spec.join else found[0]
+
+
+def field_at_nodes(terms: Any, name: str, body: Any, state: State) -> np.ndarray:
+    """Values (worlds, nodes) of a field."""
+    spec, values = find_field(terms, name), _sample_field(terms, name, body, state)
+    if spec.scalar:
+        values = spec.scalar(values)
+    nodes, used = len(body.mesh.points), body.mesh.used_nodes
+    if spec.of_slots:
+        out = np.zeros((len(values), nodes))
+        out[:, used] = values[:, body.node_slot[used]]
+        return out
+    values = values.reshape(len(values), nodes, -1)
+    return np.asarray(spec.node_reduction.reduce(values, axis=2) if spec.node_reduction else values[:, :, 0])
+
+
+def field_at_points(terms: Any, name: str, body: Any, state: State, drawn: Any) -> np.ndarray:
+    """Values (worlds, points) of a field at the points of a Skin or Drawing of the body."""
+    spec, values = find_field(terms, name), _sample_field(terms, name, body, state)
+    weights = drawn.slot_weights if spec.of_slots else drawn.node_weights
+    values = np.stack([weights @ row for row in values])
+    return spec.scalar(values) if spec.scalar else values

@@ -17,7 +17,6 @@ from ..kernels.step.energy_ledger import LEDGER_COLUMNS, term_energies_struct
 from ..kernels.step.step_control import REPORT_COLUMNS
 from ..model import assembly
 from ..model.state import SOLVER_HISTORY_PREFIXES
-from .body_forces import BodyForces
 from .checks import (
     check_constructed,
     check_energy_increments,
@@ -29,11 +28,9 @@ from .checks import (
     overrides,
 )
 from .constraints import Constraints
-from .damping import Damping
-from .dead_loads import DeadLoads
-from .elements import Elements
+from .elements import Damping, Elements
 from .evaluation import Evaluation
-from .follower_loads import FollowerLoads
+from .loads import BodyForces, DeadLoads, FollowerLoads
 from .protocols import Constrained, Parametrised, Tied, Touching
 from .supports import Supports
 from .term import FieldSpec, StepContext, Term
@@ -267,7 +264,7 @@ class TermSet:
 
     @property
     def fields(self) -> dict[str, FieldSpec]:
-        """Scalar fields of all terms, see terms.fields."""
+        """Scalar fields of all terms, see terms.evaluation."""
         return {name: spec for term in self.all for name, spec in term.fields.items()}
 
     # parameters and fields

@@ -1,0 +1,419 @@
+"""Loads that do not depend on the iterate, gravity Eq. (24), forces and tractions Eq. (72); fields b(r, t) at the
+current position, Eq. (23); follower loads: pressure on faces, and moments."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from .. import elements as families
+from ..base.errors import ModelError
+from ..base.worlds import check_values_per_world, values_per_world
+from ..kernels.solvers.direct import direct_kernels, follower_pattern_struct
+from ..kernels.terms.follower_loads import follower_struct, moment_kernels, pressure_kernels
+from ..kernels.terms.loads import body_force_kernel, load_kernels
+from ..model import assembly
+from ..model.assembly import require_density
+from ..model.description import BodyForce, Moment, Pressure
+from ..time_laws import TimeLaw
+from .protocols import Parametrised, Preconditioned
+from .term import StepContext, Term, part
+from .time_law_table import TimeLawTable, argument_precision
+
+if TYPE_CHECKING:
+    from ..base.launch import Launcher
+    from ..model.model import Model
+
+__all__ = ["BodyForces", "DeadLoads", "FollowerLoads", "FollowerMatrix"]
+
+
+class DeadLoads(Parametrised):
+    """Dead loads: assembled once per attempt into work.dead.
+
+    Gravity, [world] on the device, is part of every model; without any load nothing is launched. With a time law of
+    gravity `gravity` follows the law, and `constant_gravity`, which the load of a static path scales, is zero.
+    """
+
+    name = "dead loads"
+
+    def __init__(self, model: Model) -> None:
+        super().__init__(model)
+        self.kernels = load_kernels(model.dtype)
+        self.gravity = model.array("loads", np.tile(model.description.gravity, (model.worlds, 1)), wp.vec3d)
+        self.gravity_law = model.description.gravity_law
+        self.constant_gravity = self.gravity
+
+    @classmethod
+    def of(cls, model: Model) -> DeadLoads:
+        """Every model has this term, for gravity."""
+        return cls(model)
+
+    @classmethod
+    def features(cls, model: Model) -> dict[str, bool]:
+        return {
+            "gravity": model.terms.dead_loads.has_gravity,
+            "dead loads": bool(model.description.dead_loads),
+        }
+
+    def build(self, laws: TimeLawTable) -> None:
+        m = self.model
+        slots, numbers, weights = [], [], []
+        for load in m.description.dead_loads:
+            index = laws.add(load.law)
+            slots.append(load.body.slot_offset + load.slots)
+            numbers.append(np.full(len(load.slots), index))
+            weights.append(load.weights)
+        if self.gravity_law is not None:
+            self.constant_gravity = m.array("loads", self.gravity.numpy(), wp.vec3d)
+            self.gravity_law_index = laws.add(self.gravity_law)
+            slots.append(np.arange(m.slots))
+            numbers.append(np.full(m.slots, self.gravity_law_index))
+            weights.append(m.masses.lumped[0])
+        slot = np.concatenate(slots) if slots else np.zeros(0, dtype=np.int64)
+        order = np.argsort(slot, kind="stable")
+        start = np.concatenate([[0], np.cumsum(np.bincount(slot, minlength=m.slots))])
+        law = np.concatenate(numbers) if numbers else np.zeros(0)
+        weight = np.concatenate(weights) if weights else np.zeros(0)
+        explicit = any(b.key.damping == "explicit" for b in m.blocks)  # adds its force to the dead loads
+        self.has_loads = bool(len(slots)) or self.has_gravity or explicit
+        self.slot_start = m.array("loads", start, wp.int32)
+        self.law = m.array("loads", law[order] if len(order) else np.zeros(1), wp.int32)
+        table = np.repeat(weight[order][:, None], 3, axis=1) if len(order) else np.zeros((1, 3))
+        self.weight = m.array("loads", table, m.types.vec3)
+        self._definition = (slot, law, weight)
+
+    @property
+    def has_gravity(self) -> bool:
+        """True with gravity or a time law of it."""
+        return self.gravity_law is not None or bool(np.any(self.gravity.numpy()))
+
+    def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
+        law = [self.kernels.copy_gravity.module] * (self.gravity_law is not None)
+        return law + [self.kernels.dead_load.module] * self.has_loads
+
+    def take_gravity(self, launch: Launcher, value: wp.array, active: wp.array) -> None:
+        """Set gravity at the end of the attempt from the values of the time laws."""
+        if self.gravity_law is not None:
+            launch(self.kernels.copy_gravity, self.model.worlds, [value, self.gravity_law_index, active, self.gravity])
+
+    @part("loads")
+    def begin(self, ctx: StepContext, active: wp.array) -> None:
+        """Assemble force and magnitude of all dead loads per slot."""
+        if not self.has_loads:
+            return
+        m, w = self.model, ctx.work
+        args = [
+            self.slot_start,
+            self.law,
+            self.weight,
+            w.time_law_stage_values,
+            m.masses.lumped_values,
+            self.constant_gravity,
+            w.step.load_factor,
+            active,
+        ]
+        ctx.launch(self.kernels.dead_load, (m.worlds, m.slots), [*args, w.dead, w.dead_magnitude])
+
+    def set_gravity(self, gravity: Any, mask: np.ndarray) -> None:
+        """Set gravity in the chosen worlds, (3,) or (worlds, 3), m/s^2.
+
+        Raises:
+            ModelError: wrong shape, a non-finite value, a material without density, or a model built without gravity or
+                with a time law of it.
+        """
+        if self.gravity_law is not None:
+            raise ModelError("the model was built with a time law of gravity, which set_gravity can't replace")
+        values = values_per_world("set_gravity", "gravity", gravity, self.model.worlds, (3,))
+        check_values_per_world("set_gravity", "gravity", values, ~mask | np.isfinite(values).all(axis=1), "finite")
+        values = np.where(mask[:, None], values, self.gravity.numpy())
+        if np.any(values):
+            require_density(self.model.bodies, "gravity")
+        if not self.has_loads and np.any(values):
+            raise ModelError(
+                "the model was built without gravity or dead loads, so their kernels were left out: build it with a "
+                "gravity that is not zero"
+            )
+        self.gravity.assign(values)
+
+    def parameter_arrays(self) -> dict[str, wp.array]:
+        return {} if self.gravity_law is not None else {"gravity": self.gravity}
+
+    def hash(self, h: Any) -> None:
+        for values in self._definition:
+            h.update(np.ascontiguousarray(values).tobytes())
+
+
+@dataclass(eq=False)
+class BodyForceBlock:
+    """Body force on the elements of one block that belong to one body.
+
+    Attributes:
+        kernel: device code of the force, specialised for the user's field.
+        block: element block. members: indices (count,) of the body's elements in it.
+        origin: position of the body's reference origin, m.
+        offset: first entry of the block in the term's own pool entries. count: number of elements.
+    """
+
+    kernel: Any
+    block: Any
+    members: Any
+    origin: Any
+    offset: int
+    count: int
+
+
+class BodyForces(Term):
+    """Body force fields, non-potential in general: their force is frozen during a line search."""
+
+    name = "body forces"
+    potential = False
+
+    def __init__(self, model: Model) -> None:
+        super().__init__(model)
+        self.block_forces: list[BodyForceBlock] = []
+
+    @classmethod
+    def features(cls, model: Model) -> dict[str, bool]:
+        return {"body forces": bool(model.description.body_forces)}
+
+    def build(self, laws: TimeLawTable) -> None:
+        offset = 0
+        for force in self.model.description.body_forces:
+            for field, conn in self._block_forces(force):
+                field.offset = offset
+                offset += conn.size
+                self.block_forces.append(field)
+                self.connectivity.append(conn)
+
+    def _block_forces(self, force: BodyForce) -> list[tuple[BodyForceBlock, np.ndarray]]:
+        m = self.model
+        out = []
+        for block in m.blocks:
+            first = 0
+            for host in block.host_blocks:
+                members = np.arange(first, first + len(host.elements))
+                first += len(host.elements)
+                if host.body not in force.bodies or block.key.part:  # one part of the energy represents the element
+                    continue
+                self._upload_shape_tables(block)
+                take = argument_precision(force.function, m.dtype)
+                field = BodyForceBlock(
+                    kernel=body_force_kernel(force.function, m.dtype, take),
+                    block=block,
+                    members=m.array("loads", members, wp.int32),
+                    origin=wp.vec3d(*host.body.origin),
+                    offset=0,
+                    count=len(members),
+                )
+                out.append((field, host.conn + host.body.slot_offset))
+        return out
+
+    def _upload_shape_tables(self, block: Any) -> None:
+        """Tables of shape functions and rho w at the points of the mass rule, built once per block."""
+        m = self.model
+        rules = [assembly.mass_rule(p.body, block.key.affine) for p in block.host_blocks]
+        rule = max(rules, key=lambda r: r.degree)
+        if block.body_force_rule is None:
+            weights, shapes = [], []
+            for host in block.host_blocks:
+                for elems in assembly.element_chunks(host.body, host.elements, len(rule.weights)):
+                    s, _, _, det = assembly.shape_and_jacobian(host.body, elems, rule.points)
+                    rho = assembly.density_at(host.body, elems, s, host.body.connectivity[elems])
+                    weights.append(rho * det * rule.weights)
+                    shapes.append(s)
+            per_element = families.get_family(block.key.family).has_gradients
+            shape = np.concatenate(shapes) if per_element else shapes[0]
+            block.data.shape = m.array("loads", np.moveaxis(shape, 0, 2), m.types.T)
+            block.data.mass_weight = m.array("loads", np.concatenate(weights).T, m.types.T)
+            block.body_force_rule = rule
+
+    def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
+        return {field.kernel.module for field in self.block_forces}
+
+    def force(self, ctx: StepContext, active: wp.array) -> None:
+        m, w = self.model, ctx.work
+        for field in self.block_forces:
+            args = [field.block.data, field.members, m.slot_table.reference_array, field.origin]
+            args += [
+                w.u_stage,
+                w.stage_time,
+                w.step.load_factor,
+                active,
+                self.offset + field.offset,
+                w.nonpotential_contribution,
+            ]
+            ctx.launch(field.kernel, (m.worlds, field.count), args)
+
+    def hash(self, h: Any) -> None:
+        for force in self.model.description.body_forces:
+            h.update(force.function.key.encode())
+
+
+@dataclass(eq=False)
+class FollowerLoad:
+    """Pressure on faces or moment at points: device data, kernels of the force and of its symmetric tangent, and the
+    number of faces or points."""
+
+    data: Any
+    force: Any
+    product: Any
+    count: int
+
+
+class FollowerLoads(Preconditioned):
+    """Pressures and moments, non-potential in general; H contains the symmetric part of their tangent."""
+
+    name = "followers"
+    potential = False
+    translation_invariant = True
+
+    def __init__(self, model: Model) -> None:
+        super().__init__(model)
+        self.loads: list[FollowerLoad] = []
+        self._entry_count = 0
+
+    @classmethod
+    def features(cls, model: Model) -> dict[str, bool]:
+        return {"follower pressure": bool(model.description.pressures), "moments": bool(model.description.moments)}
+
+    def build(self, laws: TimeLawTable) -> None:
+        self.loads = [self._pressure(p, laws) for p in self.model.description.pressures]
+        self.loads += [self._moment(p, laws) for p in self.model.description.moments]
+
+    def _load_data(self, conn: np.ndarray, law: TimeLaw, laws: TimeLawTable) -> Any:
+        """Common device data; conn (items, local) in model slots."""
+        m = self.model
+        data = follower_struct(m.dtype)()
+        data.conn = m.array("loads", conn.T, wp.int32)
+        data.time_law = m.array("loads", np.full(len(conn), laws.add(law)), wp.int32)
+        data.first_entry, data.item_count = self.offset + self._entry_count, len(conn)
+        self.connectivity.append(conn)
+        self._entry_count += conn.size
+        return data
+
+    def _pressure(self, pressure: Pressure, laws: TimeLawTable) -> FollowerLoad:
+        m = self.model
+        body = pressure.surface.body
+        t = assembly.facet_tables(pressure.surface)
+        data = self._load_data(t.conn + body.slot_offset, pressure.law, laws)
+        position = body.slot_kind[t.conn] == 0
+        value = body.reference[t.conn]
+        value = np.where(position[:, :, None], value - value[:, :1], value)
+        data.reference = m.array("loads", np.swapaxes(value, 0, 1), m.types.vec3)
+        data.is_position = m.array("loads", position.T.astype(float), m.types.T)
+        for name, table in (("shape", t.shape), ("shape_da", t.d_a), ("shape_db", t.d_b)):
+            setattr(data, name, m.array("loads", np.moveaxis(table, 0, 2), m.types.T))
+        data.weight = m.array("loads", t.weights[0], m.types.T)
+        k = pressure_kernels(m.dtype)
+        return FollowerLoad(data, k.pressure_force, k.pressure_tangent_product, len(t.conn))
+
+    def _moment(self, moment: Moment, laws: TimeLawTable) -> FollowerLoad:
+        m = self.model
+        data = self._load_data(moment.slots + moment.body.slot_offset, moment.law, laws)
+        data.vector_coefficients = m.array("loads", np.swapaxes(moment.vectors, 0, 1), m.types.vec3)
+        data.reference_vectors = m.array("loads", moment.axes, m.types.mat33)
+        data.moment_fraction = m.array("loads", np.full(len(moment.slots), 1.0 / len(moment.slots)), m.types.T)
+        k = moment_kernels(m.dtype, moment.body.family.spin_vectors)
+        return FollowerLoad(data, k.moment_force, k.moment_tangent_product, len(moment.slots))
+
+    def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
+        return {kernel.module for load in self.loads for kernel in (load.force, load.product)}
+
+    def force(self, ctx: StepContext, active: wp.array) -> None:
+        m, w = self.model, ctx.work
+        for load in self.loads:
+            args = [load.data, w.u_stage, w.time_law_stage_values, active, w.nonpotential_contribution]
+            ctx.launch(load.force, (m.worlds, load.count), args)
+
+    def product(self, ctx: StepContext, p: wp.array, active: wp.array) -> None:
+        """Symmetric tangent of the force times p."""
+        m, w = self.model, ctx.work
+        for load in self.loads:
+            args = [
+                load.data,
+                ctx.midpoint_factor,
+                w.u_stage,
+                w.time_law_stage_values,
+                active,
+                p,
+                w.nonpotential_tangent,
+            ]
+            ctx.launch(load.product, (m.worlds, load.count), args)
+
+    def allocate_blocks(self, ctx: StepContext, matrix: Any, *, projected: bool) -> None:
+        if not projected:
+            loads = self.loads
+            ctx.scratch[self.name] = [FollowerMatrix(self, ctx, load, matrix.pattern) for load in loads]
+
+    def blocks(
+        self, ctx: StepContext, matrix: Any, kept: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,
+        *, projected: bool,
+    ) -> None:  # fmt: skip
+        """Minus the symmetric tangent of the force; indefinite, so nothing if projected."""
+        if projected:
+            return
+        for matrices in ctx.scratch[self.name]:
+            matrices.add(ctx, matrix, dq_dv, active, out)
+
+    def hash(self, h: Any) -> None:
+        for conn in self.connectivity:
+            h.update(np.ascontiguousarray(conn).tobytes())
+        for pressure in self.model.description.pressures:
+            h.update(np.ascontiguousarray(pressure.surface.faces).tobytes())
+        for moment in self.model.description.moments:
+            h.update(np.ascontiguousarray(moment.vectors).tobytes())
+
+
+class FollowerMatrix:
+    """Matrices of a follower load's items, built by columns as products with unit vectors at local slots."""
+
+    def __init__(self, term: FollowerLoads, ctx: StepContext, load: FollowerLoad, pattern: Any) -> None:
+        model, work = term.model, ctx.work
+        self.model, self.load = model, load
+        self.kernels = direct_kernels(model.dtype)
+        conn = load.data.conn.numpy()
+        self.slots, self.count = conn.shape
+        size = conn.size
+        self.data = follower_struct(model.dtype)()
+        for name in follower_struct(model.dtype).vars:
+            setattr(self.data, name, getattr(load.data, name))
+        own = np.arange(size, dtype=np.int32).reshape(conn.shape)
+        self.data.conn = wp.array(own, dtype=wp.int32, device=model.device)
+        self.data.first_entry = 0
+        name = f"direct follower {load.data.first_entry}"
+        vec3, B = model.types.vec3, model.worlds
+        self.u = work.array(f"{name} u", (B, size), vec3)
+        self.direction = work.array(f"{name} direction", (B, size), vec3)
+        self.columns = work.array(f"{name} columns", (3 * self.slots, B, size), vec3)
+        self.pattern_entries, self.entry_count = self._find_pattern_entries(conn, pattern)
+
+    def _find_pattern_entries(self, conn: np.ndarray, pattern: Any) -> tuple[Any, int]:
+        """Pattern entries of the items' matrices."""
+        i, j, item = (a.ravel() for a in np.indices((self.slots, self.slots, self.count)))
+        index = pattern.find_upper(conn[i, item], conn[j, item])
+        chosen = np.flatnonzero(index >= 0)
+        chosen = chosen[np.argsort(index[chosen], kind="stable")]
+        entry, count = np.unique(index[chosen], return_counts=True)
+        places = follower_pattern_struct()()
+        values = (entry, np.concatenate([[0], np.cumsum(count)]), (i * self.count + item)[chosen], j[chosen])
+        for name, value in zip(("entry", "start", "row", "column"), values):
+            setattr(places, name, self.model.array("matrix pattern", value, wp.int32))
+        return places, len(entry)
+
+    def add(self, ctx: StepContext, matrix: Any, dq_dv: wp.array, active: wp.array, out: wp.array) -> None:
+        """out -= (dq/dv) times the items' matrices."""
+        B, k, w, launch = self.model.worlds, self.kernels, ctx.work, ctx.launch
+        launch(k.gather_local, (B, self.slots, self.count), [self.load.data.conn, w.u_stage, active, self.u])
+        for local in range(self.slots):
+            for axis in range(3):
+                args = [local, axis, self.count, self.direction]
+                launch(k.set_unit_direction, (B, self.slots * self.count), args)
+                column = self.columns[3 * local + axis]
+                args = [self.data, ctx.midpoint_factor, self.u, w.time_law_stage_values, active, self.direction, column]
+                launch(self.load.product, (B, self.count), args)
+        args = [self.model.topology, matrix.pattern.data, self.pattern_entries, self.columns, dq_dv, active, out]
+        launch(k.add_follower_matrices, (B, self.entry_count), args)
