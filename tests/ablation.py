@@ -1,12 +1,13 @@
 """Removal of one mechanism or constant at a time: rows of the stress suite and random cases that are lost without it.
 
-`python tests/ablation.py --out FILE [--only NAME ...] [--suite quick] [--jobs 2] [--random]`
+`python tests/ablation.py --out FILE [--only NAME ...] [--suite quick] [--jobs 2] [--random] [--base FILE]`
 
 Each variant is a copy of the sources with a mechanism switched off (`MECHANISMS`: a text in place of another) or a
 constant without effect (`CONSTANTS`: a value that disables it). The stress suite, or with --random 200 seeded random
 models (random_cases.py), is run with the copy and with the unchanged sources, in processes side by side. A row is lost
 if it met its criterion before and does not now; it is touched if its iterations or its error differ. A run that is cut
-short goes on from the rows that FILE has.
+short goes on from the rows that FILE has. NAME+NAME+... switches several off at once: what may go must go together,
+and the rows that a group loses (`--case`) tell which of its members stay.
 """
 
 from __future__ import annotations
@@ -160,10 +161,11 @@ def variants() -> dict[str, str]:
 
 def disabled(variant: str, root: pathlib.Path) -> None:
     """Change the sources under `root` to a variant. KeyError where a text to replace is not there."""
-    if variant in CONSTANTS:
-        path, _ = constant_file(variant, root)
-        path.write_text(f"{path.read_text()}\n{variant} = {CONSTANTS[variant].disabled!r}\n")
-    for file, old, new in MECHANISMS.get(variant, ()):
+    parts = [name for name in variant.split("+") if name]
+    for name in CONSTANTS.keys() & {*parts}:
+        path, _ = constant_file(name, root)
+        path.write_text(f"{path.read_text()}\n{name} = {CONSTANTS[name].disabled!r}\n")
+    for file, old, new in (change for name in parts for change in MECHANISMS.get(name, ())):
         path = root / file
         text = path.read_text()
         if old not in text:
@@ -173,7 +175,7 @@ def disabled(variant: str, root: pathlib.Path) -> None:
 
 def _tree(variant: str, folder: pathlib.Path) -> pathlib.Path:
     """A copy of the sources as a variant."""
-    out = folder / (variant.replace(" ", "_") or "unchanged")
+    out = folder / (variant.replace(" ", "_")[:100] or "unchanged")
     for name in COPIED:
         shutil.copytree(ROOT / name, out / name, ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copy(ROOT / "pyproject.toml", out)
@@ -270,6 +272,7 @@ def study(options: argparse.Namespace, done: Sequence[Row]) -> Iterator[Row]:
     """A row per variant that is not yet `done`."""
     areas, finished = variants(), {row["variant"] for row in done if row["random"] == options.random}
     wanted = options.only or [*areas]
+    areas |= {name: "group" for name in wanted if "+" in name}
     chosen = [name for name, area in areas.items() if name and {name, area} & {*wanted} and name not in finished]
     with tempfile.TemporaryDirectory() as name, ThreadPoolExecutor(options.jobs) as pool:
         folder = pathlib.Path(name)
@@ -279,7 +282,12 @@ def study(options: argparse.Namespace, done: Sequence[Row]) -> Iterator[Row]:
             files = enumerate(_tasks(options, variant))
             return [pool.submit(_child, tree, [*words, str(out := tree / f"rows{k}.json")], out) for k, words in files]
 
-        base = [row for task in submit("") for row in task.result()]  # first: compiles what all share
+        if options.base and options.base.exists():
+            base = json.loads(options.base.read_text())
+        else:
+            base = [row for task in submit("") for row in task.result()]  # first: compiles what all share
+        if options.base:
+            options.base.write_text(json.dumps(base))
         running = {variant: submit(variant) for variant in chosen}
         for variant, tasks in running.items():
             rows = [row for task in tasks for row in task.result()]
@@ -303,6 +311,9 @@ def main() -> None:
     parser.add_argument("--suite", choices=("all", "quick"), default="all")
     parser.add_argument("--longest", type=float, default=math.inf, help="leave out rows that took more seconds")
     parser.add_argument("--random", action="store_true", help=f"{RANDOM_CASES} random cases in place of the suite")
+    parser.add_argument(
+        "--base", type=pathlib.Path, help="rows of the unchanged sources: written, read where it exists"
+    )
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--device", default="cpu")
     options = parser.parse_args()
