@@ -6,7 +6,7 @@ import warp as wp
 
 from .lanes import lane_sum_float64
 from .modules import KernelSet, kernel_module, kernel_set, masked_kernel
-from .types import double_2d, double_3d, int_1d
+from .types import double_2d, double_3d, f64, int_1d
 
 __all__ = ["CHUNK", "MAX_WARP_ROW", "reduce_kernels"]
 
@@ -22,7 +22,6 @@ CHUNK = 16384
 @functools.cache
 def reduce_kernels() -> KernelSet:
     """Kernels that sum rows [row, world, item] of float64."""
-    f64 = wp.float64
     module = kernel_module("reduce")
 
     @masked_kernel(module, "active")

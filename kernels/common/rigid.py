@@ -5,7 +5,7 @@ import functools
 import warp as wp
 
 from .modules import KernelSet, kernel_set
-from .types import precision
+from .types import mat33d, precision
 
 __all__ = ["RIGID_MODES", "bodies_struct", "rigid_mode_functions"]
 
@@ -37,7 +37,6 @@ def bodies_struct(dtype: str):
 @functools.cache
 def rigid_mode_functions(dtype: str) -> KernelSet:
     """Device functions: columns of the matrix of rigid-body modes, R, at a slot."""
-    mat33d = wp.mat33d
     Bodies = bodies_struct(dtype)
 
     @wp.func

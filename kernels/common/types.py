@@ -6,8 +6,12 @@ import warp as wp
 
 from .modules import KernelSet
 
-__all__ = ["double_1d", "double_2d", "double_3d", "int_1d", "int_2d", "precision", "vec3d_1d", "vec3d_2d"]
+__all__ = [
+    "double_1d", "double_2d", "double_3d", "f64", "int_1d", "int_2d", "mat33d", "precision", "vec3d", "vec3d_1d",
+    "vec3d_2d",
+]  # fmt: skip
 
+f64, vec3d, mat33d = wp.float64, wp.vec3d, wp.mat33d
 int_1d, int_2d = wp.array(dtype=wp.int32), wp.array2d(dtype=wp.int32)
 double_1d, double_2d, double_3d = (kind(dtype=wp.float64) for kind in (wp.array, wp.array2d, wp.array3d))
 vec3d_1d, vec3d_2d = wp.array(dtype=wp.vec3d), wp.array2d(dtype=wp.vec3d)

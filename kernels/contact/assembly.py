@@ -12,7 +12,7 @@ from ..common.block_entries import add_symmetric_function
 from ..common.lanes import lane_functions
 from ..common.modules import SHORT_UNROLL, KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.structs import pattern_struct, topology_struct
-from ..common.types import precision
+from ..common.types import f64, precision, vec3d
 from .facet_structs import point_list_struct
 from .friction import friction_functions
 from .kinematics import GEOMETRIES, kinematics_functions
@@ -41,7 +41,6 @@ def contact_kernels(dtype: str, geometry: str, own: OwnLaws = ()) -> KernelSet:
     """
     p = precision(dtype)
     vec3, sym = p.vec3, p.sym
-    f64, vec3d = wp.float64, wp.vec3d
     Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)
     k, law, g = kinematics_functions(dtype), friction_functions(dtype, own), GEOMETRIES[geometry](dtype)
     Other, lane_sum, acting_shape_value = g.Other, lane_functions(dtype).lane_sum, k.acting_shape_value
@@ -273,7 +272,6 @@ def block_kernels(dtype: str, listed: bool) -> KernelSet:
     other side."""
     p = precision(dtype)
     T, mat33, sym = p.T, p.mat33, p.sym
-    f64 = wp.float64
     Facets, PointLists = contact_structs(dtype).Facets, point_list_struct()
     Points = PointLists if listed else Facets
     Topology, Pattern = topology_struct(dtype), pattern_struct()

@@ -5,7 +5,7 @@ import functools
 import warp as wp
 
 from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
-from ..common.types import precision
+from ..common.types import f64, precision, vec3d
 from .collider_shapes import MESH
 from .colliders import MESH_SUFFIX, collider_functions
 from .kinematics import GEOMETRIES, kinematics_functions
@@ -24,7 +24,6 @@ MAX_COLLIDER_ROTATION = 1.0
 def collider_kinematics(dtype: str, meshes: bool) -> KernelSet:
     """Device functions of the geometry, see kinematics.py; `meshes`: some collider is a triangle mesh."""
     vec3 = precision(dtype).vec3
-    f64, vec3d = wp.float64, wp.vec3d
     Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)
     Other = collider_struct(meshes)
     k, g = kinematics_functions(dtype), collider_functions(meshes)
@@ -246,7 +245,6 @@ GEOMETRIES["colliders_meshes"] = functools.partial(collider_kinematics, meshes=T
 @functools.cache
 def pose_kernels(meshes: bool) -> KernelSet:
     """Kernel of the poses of colliders."""
-    f64, vec3d = wp.float64, wp.vec3d
     Colliders = collider_struct(meshes)
     module = kernel_module(f"collider_poses{MESH_SUFFIX * meshes}", light=True)
 

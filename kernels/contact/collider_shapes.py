@@ -10,6 +10,7 @@ import functools
 import warp as wp
 
 from ..common.modules import KernelSet, kernel_set
+from ..common.types import f64, vec3d
 
 __all__ = ["BOX", "CAPSULE", "CYLINDER", "HALF_SPACE", "MESH", "SHAPE_KINDS", "SPHERE", "shape_functions"]
 
@@ -26,8 +27,6 @@ again."""
 @functools.cache
 def shape_functions() -> KernelSet:
     """Device functions `distance` and `sweep`."""
-    f64 = wp.float64
-    vec3d = wp.vec3d
 
     @wp.func
     def unit_vector(v: vec3d) -> vec3d:

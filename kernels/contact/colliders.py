@@ -8,6 +8,7 @@ import functools
 import warp as wp
 
 from ..common.modules import KernelSet, kernel_set
+from ..common.types import f64, vec3d
 from .collider_mesh import mesh_functions
 from .collider_shapes import BOX, HALF_SPACE, MESH, SPHERE, shape_functions
 from .structs import SLIP_FLAG, collider_struct
@@ -23,7 +24,6 @@ MESH_FUNCTIONS = ("distance", "sweep", "updated_side", "depth_change", "sheet_si
 @functools.cache
 def collider_functions(meshes: bool) -> KernelSet:
     """Device functions, see `shape_functions` and `mesh_functions`."""
-    f64, vec3d = wp.float64, wp.vec3d
     Colliders = collider_struct(meshes)
     shapes = shape_functions()
     of_shape, sweep_shape = shapes.distance, shapes.sweep

@@ -5,7 +5,7 @@ import functools
 import warp as wp
 
 from ..common.modules import SHORT_UNROLL, KernelSet, kernel_module, kernel_set
-from ..common.types import precision
+from ..common.types import f64, precision, vec3d
 from .collider_kinematics import collider_kinematics
 from .colliders import MESH_SUFFIX
 from .facet_search import facet_search_kernels
@@ -39,7 +39,6 @@ def pair_results_struct():
 def collider_evaluation_kernels(dtype: str, meshes: bool, own: OwnLaws = ()) -> KernelSet:
     """Kernels for contact with colliders; arguments as of `contact_kernels`, `meshes`: some collider is a mesh."""
     vec3 = precision(dtype).vec3
-    f64, vec3d = wp.float64, wp.vec3d
     Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)
     Colliders = collider_struct(meshes)
     k, law, g = kinematics_functions(dtype), friction_functions(dtype, own), collider_kinematics(dtype, meshes)
@@ -107,7 +106,6 @@ def collider_evaluation_kernels(dtype: str, meshes: bool, own: OwnLaws = ()) -> 
 @functools.cache
 def pair_evaluation_kernels(dtype: str, own: OwnLaws = ()) -> KernelSet:
     """Kernels for contact between bodies; arguments as of `contact_kernels`."""
-    f64, vec3d = wp.float64, wp.vec3d
     Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)
     PairResults, Other = pair_results_struct(), facet_side_struct(dtype)
     Masters, PairScratch = master_struct(dtype), pair_scratch_struct(dtype)

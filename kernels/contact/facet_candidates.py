@@ -5,6 +5,7 @@ import functools
 import warp as wp
 
 from ..common.modules import KernelSet, kernel_set
+from ..common.types import f64, vec3d
 from .broad_phase import broad_phase_kernels
 from .facet_structs import master_struct, pair_scratch_struct
 from .kinematics import kinematics_functions
@@ -31,7 +32,6 @@ TANGENT_PLANE_MARGIN = 0.5
 @functools.cache
 def facet_candidate_functions(dtype: str) -> KernelSet:
     """Device functions in one precision of the displacements."""
-    f64, vec3d = wp.float64, wp.vec3d
     Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)
     Masters, PairScratch = master_struct(dtype), pair_scratch_struct(dtype)
     k, f = kinematics_functions(dtype), facet_projection_functions(dtype)

@@ -12,7 +12,7 @@ import warp as wp
 
 from ..common.lanes import lane_functions
 from ..common.modules import SHORT_UNROLL, KernelSet, kernel_module, kernel_set, masked_kernel
-from ..common.types import precision
+from ..common.types import f64, precision, vec3d
 from .facet_search import PENETRATED, facet_search_kernels
 from .facet_structs import facet_side_struct, master_struct, pair_scratch_struct
 from .kinematics import GEOMETRIES, kinematics_functions
@@ -27,7 +27,6 @@ def facet_kinematics(dtype: str) -> KernelSet:
     """Device functions of the geometry, see kinematics.py."""
     p = precision(dtype)
     T, vec2, vec3, sym = p.T, p.vec2, p.vec3, p.sym
-    f64, vec3d = wp.float64, wp.vec3d
     Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)
     Masters, PairScratch, Other = master_struct(dtype), pair_scratch_struct(dtype), facet_side_struct(dtype)
     k, f_, search = kinematics_functions(dtype), facet_projection_functions(dtype), facet_search_kernels(dtype)
@@ -280,7 +279,6 @@ def master_kernels(dtype: str) -> KernelSet:
     """Kernels of master facets: sums over the points listed for each, and shape values of friction."""
     p = precision(dtype)
     T, vec3, sym = p.T, p.vec3, p.sym
-    vec3d = wp.vec3d
     Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)
     Other = facet_side_struct(dtype)
     lane_sum, shape_value = lane_functions(dtype).lane_sum, facet_projection_functions(dtype).shape_value

@@ -9,7 +9,7 @@ import functools
 import warp as wp
 
 from ..common.modules import SHORT_UNROLL, KernelSet, kernel_module, kernel_set, masked_kernel
-from ..common.types import precision
+from ..common.types import f64, precision, vec3d
 from .broad_phase import BOX_MARGIN, broad_phase_kernels
 from .collider_kinematics import MIN_APPROACH_SPEED
 from .facet_candidates import TUNNEL_LIMIT_RATIO, facet_candidate_functions
@@ -30,7 +30,6 @@ def facet_search_kernels(dtype: str) -> KernelSet:
     """Kernels in one precision of the displacements."""
     p = precision(dtype)
     vec3 = p.vec3
-    f64, vec3d = wp.float64, wp.vec3d
     Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)
     Masters, PairHistory, PairScratch = master_struct(dtype), pair_history_struct(), pair_scratch_struct(dtype)
     k, f = kinematics_functions(dtype), facet_projection_functions(dtype)

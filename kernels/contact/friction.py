@@ -18,7 +18,7 @@ import functools
 import warp as wp
 
 from ..common.modules import KernelSet, kernel_set
-from ..common.types import precision
+from ..common.types import f64, mat33d, precision, vec3d
 from .kinematics import kinematics_functions
 from .law import (
     ANY_GAP,
@@ -42,7 +42,6 @@ __all__ = ["friction_functions"]
 def friction_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
     """Device functions in one precision of the displacements; `own`: laws of one's own in use."""
     T, sym = precision(dtype).T, precision(dtype).sym
-    f64, vec3d, mat33d = wp.float64, wp.vec3d, wp.mat33d
     Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)
     k, normal_law = kinematics_functions(dtype), law_functions(own).normal_law
     tangential, history_row = k.tangential, k.history_row

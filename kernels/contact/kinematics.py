@@ -25,7 +25,7 @@ from typing import Any
 import warp as wp
 
 from ..common.modules import KernelSet, kernel_set
-from ..common.types import precision
+from ..common.types import f64, precision, vec3d
 from .structs import contact_structs
 
 __all__ = ["GEOMETRIES", "kinematics_functions"]
@@ -39,7 +39,6 @@ def kinematics_functions(dtype: str) -> KernelSet:
     """Device functions in one precision of the displacements; everything else is float64."""
     p = precision(dtype)
     T, vec3, sym = p.T, p.vec3, p.sym
-    f64, vec3d = wp.float64, wp.vec3d
     Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)
 
     @wp.func

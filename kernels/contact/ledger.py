@@ -5,6 +5,7 @@ import functools
 import warp as wp
 
 from ..common.modules import KernelSet, kernel_set, masked_kernel
+from ..common.types import f64, vec3d
 from .assembly import contact_module
 from .friction import friction_functions
 from .kinematics import GEOMETRIES, kinematics_functions
@@ -42,7 +43,6 @@ stored are values at its end."""
 @functools.cache
 def contact_ledger_kernels(dtype: str, geometry: str, own: OwnLaws = ()) -> KernelSet:
     """Kernels in the module of `contact_kernels`, with the same arguments."""
-    f64, vec3d = wp.float64, wp.vec3d
     Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)
     k, law, g = kinematics_functions(dtype), friction_functions(dtype, own), GEOMETRIES[geometry](dtype)
     Other = g.Other

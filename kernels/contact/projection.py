@@ -9,6 +9,7 @@ import functools
 import warp as wp
 
 from ..common.modules import KernelSet, kernel_set
+from ..common.types import f64, vec3d
 from .facet_structs import facet_field_struct, master_struct
 
 __all__ = ["INSIDE_TOLERANCE", "MAX_OVERHANG", "OUTSIDE_TOLERANCE", "facet_projection_functions"]
@@ -33,7 +34,6 @@ steps, since a force that ends at an iterate has no potential."""
 def facet_projection_functions(dtype: str) -> KernelSet:
     """Device functions in one precision of the displacements; evaluated in float64."""
     Masters, FacetField = master_struct(dtype), facet_field_struct()
-    f64, vec3d = wp.float64, wp.vec3d
 
     @wp.struct
     class FacetPoint:

@@ -6,7 +6,7 @@ import warp as wp
 
 from ..common.modules import SHORT_UNROLL, KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.rigid import RIGID_MODES, bodies_struct, rigid_mode_functions
-from ..common.types import precision
+from ..common.types import f64, mat33d, precision
 from .facet_structs import master_struct
 from .structs import facet_struct
 
@@ -18,7 +18,6 @@ def pair_rigid_mode_kernels(dtype: str) -> KernelSet:
     """Kernels in one precision of the displacements."""
     p = precision(dtype)
     T, sym = p.T, p.sym
-    f64, mat33d = wp.float64, wp.mat33d
     Bodies, Masters, Facets = bodies_struct(dtype), master_struct(dtype), facet_struct(dtype)
     rigid = rigid_mode_functions(dtype)
     translation_columns, rotation_columns = rigid.translation_columns, rigid.rotation_columns

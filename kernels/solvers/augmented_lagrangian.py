@@ -4,7 +4,7 @@ import warp as wp
 
 from ..common.modules import KernelSet, kernel_set, masked_kernel
 from ..common.traits import Traits
-from ..common.types import int_1d
+from ..common.types import f64, int_1d
 from .convergence import convergence_functions
 from .newton_control import FAIL_CONSTRAINT, control_struct
 
@@ -13,7 +13,6 @@ __all__ = ["outer_loop_kernels"]
 
 def outer_loop_kernels(traits: Traits, module: wp.Module) -> KernelSet:
     """Kernels of the outer loop, in the module of Newton's method."""
-    f64 = wp.float64
     Control = control_struct()
     convergence = convergence_functions(traits)
     allowed_violation, largest_violation = convergence.allowed_violation, convergence.largest_violation

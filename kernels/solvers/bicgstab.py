@@ -11,7 +11,7 @@ import functools
 import warp as wp
 
 from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
-from ..common.types import double_3d, precision
+from ..common.types import double_3d, f64, precision
 from .newton_control import control_struct
 from .pcg import forcing_functions, pcg_struct
 
@@ -57,7 +57,6 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> KernelSet:
     """Kernels in one precision; `has_constraints`: with constraints, see Traits."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
-    f64 = wp.float64
     Newton, Control, Recursion = control_struct(), pcg_struct(), bicgstab_struct()
     forcing = forcing_functions(has_constraints)
     forcing_target, min_target_norm = forcing.forcing_target, forcing.min_target_norm

@@ -6,6 +6,7 @@ import warp as wp
 
 from ..common.modules import KernelSet, kernel_set
 from ..common.traits import NO_TERMS, Traits
+from ..common.types import f64
 from .newton_control import (
     FAIL_CONSTRAINT,
     FAIL_CURVATURE,
@@ -67,15 +68,8 @@ MAX_ERROR_ESTIMATES = 3
 @functools.cache
 def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
     """Device functions; traits used: "stored", "has_constraints", "midpoint" and "unilateral"."""
-    f64 = wp.float64
     Control = control_struct()
-    stored, has_constraints, midpoint, unilateral = (
-        traits.stored,
-        traits.has_constraints,
-        traits.midpoint,
-        traits.unilateral,
-    )
-    MAX_STALL_ROUNDINGS = STALL_ROUNDINGS_MIDPOINT if midpoint else STALL_ROUNDINGS
+    MAX_STALL_ROUNDINGS = STALL_ROUNDINGS_MIDPOINT if traits.midpoint else STALL_ROUNDINGS
 
     @wp.func
     def objective(ctl: Control, world: int) -> f64:
@@ -88,10 +82,10 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
         term_sums[0]. With the trait "midpoint" Phi does not exist: half of the squared D^-1 norm of the residual
         replaces it.
         """
-        if wp.static(midpoint):
+        if wp.static(traits.midpoint):
             return ctl.slot_sums[ROW_OBJECTIVE, world]
         energy = ctl.elem_sums[0, world] + ctl.elem_sums[1, world]
-        if wp.static(stored):
+        if wp.static(traits.stored):
             energy += ctl.term_sums[0, world]
         return ctl.slot_sums[ROW_OBJECTIVE, world] + energy / ctl.dq_dv[world]
 
@@ -99,7 +93,7 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
     def objective_magnitude(ctl: Control, world: int) -> f64:
         """Sum of the magnitudes of the parts of Phi, in its unit; the round-off of Phi is a few eps of it."""
         energy = wp.abs(ctl.elem_sums[0, world]) + wp.abs(ctl.elem_sums[1, world])
-        if wp.static(stored):
+        if wp.static(traits.stored):
             energy += ctl.term_sums[2, world]
         return ctl.slot_sums[ROW_MAGNITUDE, world] + energy / ctl.dq_dv[world]
 
@@ -219,7 +213,7 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
             if norm > accepted_norm and is_group_roundoff(ctl, world, group, norm, rounding):
                 accepted_norm = norm
             unconverged = norm > accepted_norm
-            if wp.static(has_constraints):
+            if wp.static(traits.has_constraints):
                 allowed = allowed_violation(ctl, world, ctl.norms.constraint_tol)
                 violation = ctl.norms.violation[world, ctl.norms.component_of_group[group]]
                 if violation > allowed:
@@ -233,13 +227,13 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
                 if ctl.norms.group_count > ctl.norms.component_count:
                     # forces between groups have the round-off of both
                     rounding = f64(2.0) * ctl.floor.eps * wp.sqrt(component_sum(ctl, world, group, GROUP_ROUNDOFF))
-                if wp.static(has_constraints):
+                if wp.static(traits.has_constraints):
                     if ctl.classical_multipliers != 0:  # the residual contains rho c: position round-off times kappa
                         rounding = rounding / (ctl.norms.penalty_norm_ratio * ctl.norms.penalty_norm_ratio)
                 floor_excess = wp.max(floor_excess, norm / (rounding + f64(1.0e-300)))
             largest = wp.max(largest, norm / wp.max(scale, f64(1.0e-300)))
             worst = wp.max(worst, norm / wp.max(accepted_norm, f64(1.0e-300)))
-        if wp.static(has_constraints):
+        if wp.static(traits.has_constraints):
             ctl.norms.violation_ratio[world] = largest_violation(ctl, world) / allowed_violation(
                 ctl, world, ctl.norms.constraint_tol
             )
@@ -310,7 +304,7 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
             and ctl.is_static != 0
         ):
             ctl.failed[world] = FAIL_ROUNDOFF
-        if wp.static(has_constraints):
+        if wp.static(traits.has_constraints):
             if why != FAIL_NAN and why != FAIL_JACOBIAN and is_only_constraint_violated(ctl, world):
                 ctl.failed[world] = FAIL_CONSTRAINT
 
@@ -335,9 +329,10 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
         settling = step <= most * most * energy or ctl.iterations[world] + 1 >= limit
         alike = f64(STALL_ENERGY_ROUNDINGS) * ctl.floor.eps
         near = ctl.floor.rounding_ratio[world] <= f64(MAX_STALL_ROUNDINGS)
-        if wp.static(not midpoint) and not near and ctl.floor.rounding_ratio[world] < f64(1.0e300):  # g.p: no energy
-            near = step <= alike * alike * energy
-        if wp.static(unilateral):
+        if wp.static(not traits.midpoint):  # g.p: no energy
+            if not near and ctl.floor.rounding_ratio[world] < f64(1.0e300):
+                near = step <= alike * alike * energy
+        if wp.static(traits.unilateral):
             if is_velocity_roundoff(ctl, world):
                 near = True
                 settling = True
@@ -354,12 +349,12 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
     def handle_failed_search(ctl: Control, world: int, why: int):
         """Failed search: if round-off may explain it, keep the iterate and request an error estimate, else give up."""
         at_roundoff = ctl.floor.rounding_ratio[world] <= f64(MAX_STALL_ROUNDINGS)
-        if wp.static(unilateral):
+        if wp.static(traits.unilateral):
             at_roundoff = at_roundoff or is_velocity_roundoff(ctl, world)
         near = at_roundoff and ctl.floor.estimates[world] < MAX_ERROR_ESTIMATES
         at_roundoff = at_roundoff or ctl.floor.eps > f64(SINGLE_PRECISION_EPS)
         enough = False
-        if wp.static(has_constraints):  # only accelerations need the tighter tolerance, which round-off prevents
+        if wp.static(traits.has_constraints):  # only accelerations need the tighter tolerance, which round-off prevents
             if (
                 ctl.norms.constraint_acceleration_tol > f64(0.0)
                 and ctl.norms.relative_residual[world] <= ctl.norms.tol + f64(TOL_ROUNDINGS) * ctl.floor.eps

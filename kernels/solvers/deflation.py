@@ -12,7 +12,7 @@ import warp as wp
 
 from ..common.lanes import lane_functions
 from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
-from ..common.types import double_1d, double_3d, int_1d, precision
+from ..common.types import double_1d, double_3d, f64, int_1d, precision, vec3d
 from ..terms.constraints import constraint_functions, constraint_struct, multiplier_struct
 
 __all__ = ["deflation_kernels"]
@@ -24,7 +24,6 @@ def deflation_kernels(dtype: str) -> KernelSet:
     matrices."""
     p = precision(dtype)
     vec3, mat33 = p.vec3, p.mat33
-    f64, vec3d = wp.float64, wp.vec3d
     Constraints, Multipliers = constraint_struct(), multiplier_struct()
     directional_derivative = constraint_functions(dtype).directional_derivative
     store_sum = lane_functions(dtype).store_sum

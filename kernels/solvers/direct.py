@@ -32,7 +32,6 @@ def direct_kernels(dtype: str) -> KernelSet:
     """Kernels of the direct solver in one precision."""
     p = precision(dtype)
     T, vec3, mat33 = p.T, p.vec3, p.mat33
-    f64 = wp.float64
     Topology, Pattern, FollowerPattern = topology_struct(dtype), pattern_struct(), follower_pattern_struct()
     add_block = add_block_function(dtype)
     residual_products, store_products = lane_functions(dtype).residual_products, lane_functions(dtype).store_products

@@ -4,7 +4,7 @@ import warp as wp
 
 from ..common.modules import KernelSet, kernel_set
 from ..common.traits import Traits
-from ..common.types import int_1d
+from ..common.types import f64, int_1d
 from .convergence import STALL_ROUNDINGS, convergence_functions
 from .newton_control import FAIL_ITERATIONS, ROW_FROZEN_CHANGE, control_struct
 
@@ -19,17 +19,8 @@ FROZEN_UPDATE_RESIDUAL = 0.1
 
 def frozen_update_kernels(traits: Traits, module: wp.Module) -> KernelSet:
     """Kernels of frozen updates, in the module of Newton's method."""
-    f64 = wp.float64
     Control = control_struct()
     convergence = convergence_functions(traits)
-    objective, objective_magnitude, evaluate_norms, check_convergence, record_residual, give_up = (
-        convergence.objective,
-        convergence.objective_magnitude,
-        convergence.evaluate_norms,
-        convergence.check_convergence,
-        convergence.record_residual,
-        convergence.give_up,
-    )
 
     @wp.kernel(module=module)
     def begin_frozen_update(ctl: Control, flags: int_1d):
@@ -38,7 +29,7 @@ def frozen_update_kernels(traits: Traits, module: wp.Module) -> KernelSet:
         world = wp.tid()
         flags[world] = 0
         if ctl.active[world] != 0 and ctl.frozen.contact_active[world] == 0:
-            check_convergence(ctl, world)  # nothing is frozen
+            convergence.check_convergence(ctl, world)  # nothing is frozen
         elif ctl.active[world] != 0:
             last = ctl.iterations[world] + 1 >= ctl.max_iterations
             # within round-off the residual may not fall further
@@ -46,7 +37,7 @@ def frozen_update_kernels(traits: Traits, module: wp.Module) -> KernelSet:
             if ctl.norms.relative_residual[world] <= f64(FROZEN_UPDATE_RESIDUAL) or rounding or last:
                 flags[world] = 1
             else:
-                record_residual(ctl, world)
+                convergence.record_residual(ctl, world)
 
     @wp.kernel(module=module)
     def end_frozen_update(ctl: Control, flags: int_1d):
@@ -54,22 +45,22 @@ def frozen_update_kernels(traits: Traits, module: wp.Module) -> KernelSet:
         world = wp.tid()
         if ctl.active[world] != 0 and flags[world] != 0:
             before = ctl.norms.residual_norm[world]
-            evaluate_norms(ctl, world)
+            convergence.evaluate_norms(ctl, world)
             if ctl.solve.fixed_forcing == 0 and ctl.norms.residual_norm[world] > f64(RESIDUAL_GROWTH) * before:
                 # the frozen quantities were the larger error: tighter solves are wasted
                 ctl.solve.forcing[world] = wp.max(ctl.solve.forcing[world], f64(LOOSE_FORCING))
-            ctl.search.phi[world] = objective(ctl, world) + ctl.slot_sums[ROW_FROZEN_CHANGE, world]
-            ctl.search.phi_magnitude[world] = objective_magnitude(ctl, world)
+            ctl.search.phi[world] = convergence.objective(ctl, world) + ctl.slot_sums[ROW_FROZEN_CHANGE, world]
+            ctl.search.phi_magnitude[world] = convergence.objective_magnitude(ctl, world)
             ctl.nonmonotone.steps[world] = 0
             ctl.frozen.updated[world] = 1 - ctl.frozen.unilateral_changed[world]
             ctl.frozen.unilateral_changed[world] = 0
             part = ctl.frozen.partly_updated[world] != 0
             ctl.frozen.partly_updated[world] = 0
             if not part:
-                check_convergence(ctl, world)
+                convergence.check_convergence(ctl, world)
             else:
-                record_residual(ctl, world)
+                convergence.record_residual(ctl, world)
                 if ctl.iterations[world] >= ctl.max_iterations:
-                    give_up(ctl, world, FAIL_ITERATIONS)
+                    convergence.give_up(ctl, world, FAIL_ITERATIONS)
 
     return kernel_set(locals())

@@ -10,9 +10,8 @@ import warp as wp
 
 from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.traits import Traits
-from ..common.types import double_1d, double_3d, int_1d, precision
+from ..common.types import double_1d, double_3d, f64, int_1d, precision
 from .convergence import convergence_functions
-from .newton import newton_kernels
 from .newton_control import (
     FAIL_CONSTRAINT,
     FAIL_JACOBIAN,
@@ -58,22 +57,15 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> KernelSet:
     """Kernels for one precision, the traits of a model's terms, and one acceleration."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
-    f64 = wp.float64
     Newton, PCG, Jacobi = control_struct(), pcg_struct(), jacobi_struct()
-    shared = newton_kernels(traits)
-    evaluate_norms, record_residual, accept_iterate = (
-        shared.evaluate_norms,
-        shared.record_residual,
-        shared.accept_iterate,
-    )
-    allowed_violation = convergence_functions(traits).allowed_violation
+    convergence = convergence_functions(traits)
     paired = acceleration in ("secants", "anderson")
     module = kernel_module(f"jacobi_{dtype}_{acceleration}{traits.suffix('stored', 'has_constraints', 'limited')}")
 
     @wp.func
     def check_convergence(ctl: Newton, jac: Jacobi, world: int):
         """End a world's iterations on convergence, failure or at the iteration limit."""
-        record_residual(ctl, world)
+        convergence.record_residual(ctl, world)
         finite = wp.isfinite(ctl.norms.residual_norm[world]) and wp.isfinite(ctl.elem_sums[0, world])
         if wp.static(traits.stored):
             finite = finite and wp.isfinite(ctl.term_sums[0, world])
@@ -90,26 +82,27 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> KernelSet:
             ctl.active[world] = 0
             ctl.failed[world] = FAIL_STEP_LIMIT
         elif ctl.norms.ratio[world] <= f64(1.0):
-            accept_iterate(ctl, world)
+            convergence.accept_iterate(ctl, world)
         elif ctl.iterations[world] >= ctl.max_iterations:
             ctl.active[world] = 0
             if ctl.norms.residual_norm[world] > jac.max_growth * jac.first_norm[world]:
                 ctl.failed[world] = FAIL_RESIDUAL_GROWTH
             if wp.static(traits.has_constraints):
                 if (
-                    ctl.norms.violation_ratio[world] * allowed_violation(ctl, world, ctl.norms.constraint_tol)
+                    ctl.norms.violation_ratio[world]
+                    * convergence.allowed_violation(ctl, world, ctl.norms.constraint_tol)
                     > jac.max_violation
                 ):
                     ctl.failed[world] = FAIL_CONSTRAINT
             if ctl.failed[world] == 0:
                 ctl.floor.accepted_unconverged[world] = 1
-                accept_iterate(ctl, world)
+                convergence.accept_iterate(ctl, world)
 
     @masked_kernel(module, "ctl.active")
     def begin_iteration(ctl: Newton, jac: Jacobi):
         """Evaluate the norms of the first iterate and test convergence."""
         world = wp.tid()
-        evaluate_norms(ctl, world)
+        convergence.evaluate_norms(ctl, world)
         jac.first_norm[world] = ctl.norms.residual_norm[world]
         ctl.search.alpha[world] = f64(1.0)
         check_convergence(ctl, jac, world)
@@ -118,7 +111,7 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> KernelSet:
     def check_iterate(ctl: Newton, jac: Jacobi):
         """Evaluate the norms of an iterate, count it, and test convergence."""
         world = wp.tid()
-        evaluate_norms(ctl, world)
+        convergence.evaluate_norms(ctl, world)
         ctl.iterations[world] = ctl.iterations[world] + 1
         ctl.step_iterations[world] = ctl.step_iterations[world] + 1
         check_convergence(ctl, jac, world)

@@ -52,7 +52,6 @@ def level_kernels(dtype: str, storage: str | None = None) -> KernelSet:
     scaled = storage != dtype
     p = precision(dtype)
     T, vec3, mat33 = p.T, p.vec3, p.mat33
-    f64 = wp.float64
     Level = level_struct(dtype)
     Pattern = pattern_struct()
     lanes_of = lane_functions(dtype)

@@ -10,7 +10,7 @@ import warp as wp
 from ..common.lanes import block_memory, lane_functions
 from ..common.modules import SHORT_UNROLL, KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.structs import pattern_struct
-from ..common.types import double_2d, double_3d, int_1d, precision
+from ..common.types import double_2d, double_3d, f64, int_1d, precision
 from .levels import TILE_UNKNOWNS, level_struct
 
 __all__ = ["FACTOR_LANES", "build_kernels"]
@@ -33,7 +33,6 @@ def build_kernels(dtype: str, storage: str | None = None) -> KernelSet:
     STORAGE_ROUNDOFF = {"float64": 2.0**-53, "float32": 2.0**-24}[storage]
     p = precision(dtype)
     T, mat33 = p.T, p.mat33
-    f64 = wp.float64
     vec4 = wp.types.vector(length=4, dtype=T)
     Level = level_struct(dtype)
     Pattern = pattern_struct()

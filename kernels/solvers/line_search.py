@@ -4,6 +4,7 @@ import warp as wp
 
 from ..common.modules import KernelSet, kernel_set, masked_kernel
 from ..common.traits import Traits
+from ..common.types import f64
 from .convergence import convergence_functions
 from .newton_control import FAIL_JACOBIAN, FAIL_LINE_SEARCH, ROW_FROZEN_CHANGE, ROW_RESIDUAL, ROW_SLOPE, control_struct
 
@@ -32,17 +33,8 @@ the points slip back, again and again, while one that ends near it makes them st
 
 def line_search_kernels(traits: Traits, module: wp.Module) -> KernelSet:
     """Kernels in the module of Newton's method, and the function `tangent_needed`."""
-    f64 = wp.float64
     Control = control_struct()
-    stored, unilateral, midpoint, limited = traits.stored, traits.unilateral, traits.midpoint, traits.limited
-    has_kinks = unilateral and not midpoint
     convergence = convergence_functions(traits)
-    objective, objective_magnitude, evaluate_norms = (
-        convergence.objective,
-        convergence.objective_magnitude,
-        convergence.evaluate_norms,
-    )
-    check_convergence, handle_failed_search = convergence.check_convergence, convergence.handle_failed_search
 
     @wp.func
     def tangent_needed(ctl: Control, world: int) -> bool:
@@ -57,13 +49,13 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> KernelSet:
         if ctl.nonmonotone.steps[world] == 0:
             ctl.nonmonotone.store_best[world] = 1
             ctl.nonmonotone.best_phi[world] = old_phi
-            if wp.static(unilateral):
+            if wp.static(traits.unilateral):
                 ctl.nonmonotone.penetrating_steps[world] = ctl.nonmonotone.penetrating_steps[world] + 1
             ctl.nonmonotone.best_norm[world] = old_norm
-        if wp.static(not midpoint):
+        if wp.static(not traits.midpoint):
             ctl.solve.predicted_stress[world] = 1
         counts = True
-        if wp.static(unilateral):  # Phi decreases monotonically on the way back out of an obstacle
+        if wp.static(traits.unilateral):  # Phi decreases monotonically on the way back out of an obstacle
             counts = ctl.nonmonotone.steps[world] == 0 or not ctl.search.phi[world] < old_phi
         if counts:
             ctl.nonmonotone.steps[world] = ctl.nonmonotone.steps[world] + 1
@@ -101,14 +93,14 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> KernelSet:
         old_worst = ctl.norms.residual_ratio[world]
         old_phi = ctl.search.phi[world]
         ctl.search.active[world] = 0
-        evaluate_norms(ctl, world)
-        ctl.search.phi[world] = objective(ctl, world) + ctl.slot_sums[ROW_FROZEN_CHANGE, world]
-        if wp.static(stored):
+        convergence.evaluate_norms(ctl, world)
+        ctl.search.phi[world] = convergence.objective(ctl, world) + ctl.slot_sums[ROW_FROZEN_CHANGE, world]
+        if wp.static(traits.stored):
             ctl.search.trial_accepted[world] = 1
-        if wp.static(stored and not midpoint):
+        if wp.static(traits.stored and not traits.midpoint):
             more = ctl.term_sums[1, world] - ctl.term_sums[0, world]
             ctl.search.phi[world] = ctl.search.phi[world] + more / ctl.dq_dv[world]
-        ctl.search.phi_magnitude[world] = objective_magnitude(ctl, world)
+        ctl.search.phi_magnitude[world] = convergence.objective_magnitude(ctl, world)
         if stands:
             if ctl.solve.operator_reused[world] != 0:
                 ctl.solve.operator_reused[world] = 2
@@ -116,14 +108,14 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> KernelSet:
                 ctl.nonmonotone.restore_best[world] = 0
                 ctl.nonmonotone.trust_radius[world] = f64(RADIUS_SHRINK) * ctl.nonmonotone.trust_radius[world]
                 ctl.nonmonotone.steps[world] = 0
-                if wp.static(not midpoint):
+                if wp.static(not traits.midpoint):
                     ctl.solve.predicted_stress[world] = wp.where(tangent_needed(ctl, world), 0, 2)
                 ctl.nonmonotone.require_armijo[world] = 1
         else:
             ctl.iterations[world] = ctl.iterations[world] + 1
             if ctl.nonmonotone.require_armijo[world] != 0:
                 ctl.nonmonotone.require_armijo[world] = 0
-                if wp.static(not midpoint):
+                if wp.static(not traits.midpoint):
                     ctl.solve.predicted_stress[world] = wp.where(tangent_needed(ctl, world), 0, 1)
         ctl.step_iterations[world] = ctl.step_iterations[world] + 1
         ratio = ctl.norms.residual_norm[world] / wp.max(old_norm, f64(1.0e-300))
@@ -137,8 +129,8 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> KernelSet:
             eta = wp.max(eta, guard)
         if ctl.solve.fixed_forcing == 0 and not stands:
             ctl.solve.forcing[world] = wp.clamp(eta, f64(1.0e-6), f64(0.1))
-        if wp.static(not unilateral):
-            check_convergence(ctl, world)
+        if wp.static(not traits.unilateral):
+            convergence.check_convergence(ctl, world)
         if not stands and ctl.floor.estimate_error[world] == 0 and (nonmonotone or ctl.nonmonotone.steps[world] > 0):
             track_best_iterate(ctl, world, old_phi, old_norm)
 
@@ -155,7 +147,7 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> KernelSet:
             why = FAIL_LINE_SEARCH
             if ctl.domain_J[world] <= f64(0.0):
                 why = FAIL_JACOBIAN
-            handle_failed_search(ctl, world, why)
+            convergence.handle_failed_search(ctl, world, why)
 
     @wp.func
     def lengthen_step(ctl: Control, world: int, good: bool, slope: f64) -> bool:
@@ -168,7 +160,7 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> KernelSet:
             and ctl.search.doublings[world] >= 0
             and ctl.search.doublings[world] < MAX_DOUBLINGS
         )
-        if wp.static(limited):
+        if wp.static(traits.limited):
             longer = longer and f64(2.0) * alpha <= ctl.search.limit[world]
         if longer:
             ctl.search.doublings[world] = ctl.search.doublings[world] + 1
@@ -205,12 +197,12 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> KernelSet:
         noise = (
             f64(PHI_NOISE_ROUNDINGS)
             * ctl.floor.eps
-            * (ctl.search.phi_magnitude[world] + objective_magnitude(ctl, world))
+            * (ctl.search.phi_magnitude[world] + convergence.objective_magnitude(ctl, world))
         )
         good = slope <= f64(WOLFE_FACTOR) * wp.abs(ctl.search.slope[world])
         if wp.abs(change) > noise:
             good = change <= f64(ARMIJO_FACTOR) * alpha * ctl.search.slope[world]
-        if wp.static(midpoint):
+        if wp.static(traits.midpoint):
             good = change <= f64(-2.0) * f64(ARMIJO_FACTOR) * alpha * ctl.search.phi[world]
         return good or (ctl.has_nonpotential != 0 and norm <= f64(0.5) * ctl.norms.residual_norm[world])
 
@@ -239,7 +231,7 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> KernelSet:
             and ctl.solve.negative_curvature[world] == 0
         )
         out = out and (ctl.nonmonotone.require_armijo[world] == 0 or ctl.solve.predicted_stress[world] == 2)
-        if wp.static(unilateral):  # into an obstacle and back; friction has a convex potential: full steps overshoot
+        if wp.static(traits.unilateral):  # into an obstacle and back; friction is convex: full steps overshoot
             out = (
                 out
                 and ctl.frozen.updated[world] == 0
@@ -283,7 +275,7 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> KernelSet:
         alpha = ctl.search.alpha[world]
         # frozen forces keep their symmetric tangent: the curvature of Phi then agrees with H
         bend = ctl.dq_dv[world] * ctl.search.tangent_sum[0, world]
-        phi = objective(ctl, world) - f64(0.5) * alpha * alpha * bend
+        phi = convergence.objective(ctl, world) - f64(0.5) * alpha * alpha * bend
         slope = ctl.slot_sums[ROW_SLOPE, world] - alpha * bend
         norm = wp.sqrt(ctl.slot_sums[ROW_RESIDUAL, world])
         finite = wp.isfinite(phi) and wp.isfinite(norm)
@@ -292,7 +284,7 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> KernelSet:
         stands = alpha == f64(0.0) or ctl.nonmonotone.restore_best[world] != 0
         usable = finite and not (stands or reused)
         wants_nonmonotone = usable and not good and is_nonmonotone_allowed(ctl, world)
-        if wp.static(has_kinks):
+        if wp.static(traits.unilateral and not traits.midpoint):
             if usable and not wants_nonmonotone:
                 if locate_kink(ctl, world, slope):
                     return

@@ -6,7 +6,7 @@ import warp as wp
 
 from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.traits import NO_TERMS, Traits
-from ..common.types import int_1d
+from ..common.types import f64, int_1d
 from .augmented_lagrangian import outer_loop_kernels
 from .convergence import MAX_ERROR_ESTIMATES, SINGLE_PRECISION_EPS, VELOCITY_ROUNDINGS, convergence_functions
 from .frozen_update import frozen_update_kernels
@@ -45,29 +45,9 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
 
     They depend on the traits "stored", "has_constraints", "limited", "unilateral" and "midpoint".
     """
-    f64 = wp.float64
     Control = control_struct()
     PCG = pcg_struct()
-    stored, has_constraints, limited, unilateral = (
-        traits.stored,
-        traits.has_constraints,
-        traits.limited,
-        traits.unilateral,
-    )
-    midpoint = traits.midpoint
     convergence = convergence_functions(traits)
-    objective, objective_magnitude = convergence.objective, convergence.objective_magnitude
-    evaluate_norms, check_convergence, handle_failed_search = (
-        convergence.evaluate_norms,
-        convergence.check_convergence,
-        convergence.handle_failed_search,
-    )
-    accept_iterate, give_up, record_residual, iteration_factor = (
-        convergence.accept_iterate,
-        convergence.give_up,
-        convergence.record_residual,
-        convergence.iteration_factor,
-    )
     module = kernel_module(
         f"newton{traits.suffix('stored', 'has_constraints', 'limited', 'unilateral', 'midpoint')}", light=True
     )
@@ -81,16 +61,16 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
         world = wp.tid()
         ctl.min_J[world] = f64(1.0e30)
         ctl.domain_J[world] = f64(1.0e30)
-        if wp.static(unilateral):
+        if wp.static(traits.unilateral):
             ctl.frozen.contact_active[world] = 0
 
     @wp.func
     def initialise_iteration(ctl: Control, world: int):
         """Initialise the iteration at its first iterate, and test that for convergence."""
-        evaluate_norms(ctl, world)
-        phi = objective(ctl, world) + ctl.slot_sums[ROW_FROZEN_CHANGE, world]
+        convergence.evaluate_norms(ctl, world)
+        phi = convergence.objective(ctl, world) + ctl.slot_sums[ROW_FROZEN_CHANGE, world]
         ctl.search.phi[world] = phi
-        ctl.search.phi_magnitude[world] = objective_magnitude(ctl, world)
+        ctl.search.phi_magnitude[world] = convergence.objective_magnitude(ctl, world)
         ctl.solve.forcing[world] = ctl.solve.first_forcing
         ctl.solve.operator_reused[world] = 0
         ctl.nonmonotone.steps[world] = 0
@@ -107,18 +87,18 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
         ctl.solve.count[world] = 0
         ctl.floor.error_estimate[world] = f64(1.0e30)
         ctl.search.slope[world] = f64(0.0)
-        if wp.static(unilateral):
+        if wp.static(traits.unilateral):
             ctl.frozen.updated[world] = 0
             ctl.frozen.unilateral_changed[world] = 0
             ctl.nonmonotone.penetrating_steps[world] = 0
         if ctl.domain_J[world] <= f64(0.0):
-            give_up(ctl, world, FAIL_JACOBIAN)
+            convergence.give_up(ctl, world, FAIL_JACOBIAN)
         elif not (wp.isfinite(phi) and wp.isfinite(ctl.norms.residual_norm[world])):
-            give_up(ctl, world, FAIL_NAN)
-        elif wp.static(unilateral) and ctl.norms.residual_norm[world] > f64(0.0):
-            record_residual(ctl, world)  # frozen quantities are not those of this iterate: it cannot be accepted
+            convergence.give_up(ctl, world, FAIL_NAN)
+        elif wp.static(traits.unilateral) and ctl.norms.residual_norm[world] > f64(0.0):
+            convergence.record_residual(ctl, world)  # frozen quantities are of another iterate: no acceptance
         else:
-            check_convergence(ctl, world)
+            convergence.check_convergence(ctl, world)
 
     @wp.func
     def is_poor_first_iterate(ctl: Control, world: int) -> bool:
@@ -127,14 +107,14 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
         At q_n Phi is the strain energy of the state plus a kinetic energy: row 10 of `residual` for backward Euler, a
         third of it for BDF2.
         """
-        phi = objective(ctl, world)
-        if wp.static(midpoint):
+        phi = convergence.objective(ctl, world)
+        if wp.static(traits.midpoint):
             return not (wp.isfinite(phi) and ctl.min_J[world] > f64(0.0))
         bound = (
             ctl.strain_energy[world] / ctl.dq_dv[world]
             + f64(MAX_START_ENERGY_RATIO) * ctl.slot_sums[ROW_KINETIC, world]
         )
-        bound += f64(PHI_NOISE_ROUNDINGS) * ctl.floor.eps * objective_magnitude(ctl, world)
+        bound += f64(PHI_NOISE_ROUNDINGS) * ctl.floor.eps * convergence.objective_magnitude(ctl, world)
         return not (phi <= bound and wp.isfinite(phi) and ctl.min_J[world] > f64(0.0))
 
     @wp.kernel(module=module)
@@ -161,7 +141,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
         better[world] = 0
         if ctl.start.has_alternatives[world] == 0:
             return
-        phi = objective(ctl, world)
+        phi = convergence.objective(ctl, world)
         if not (wp.isfinite(phi) and ctl.domain_J[world] > f64(0.0)):
             phi = f64(1.0e300)
         low = wp.min(ctl.min_J[world], f64(0.0))
@@ -184,12 +164,12 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
         )
         ctl.search.active[world] = 1
         barred = False
-        if wp.static(limited):
+        if wp.static(traits.limited):
             barred = not ctl.search.limit[world] > f64(0.0)
         if not wp.isfinite(ctl.search.slope[world]):
-            handle_failed_search(ctl, world, FAIL_NAN)
+            convergence.handle_failed_search(ctl, world, FAIL_NAN)
         elif barred:
-            handle_failed_search(ctl, world, FAIL_STEP_LIMIT)
+            convergence.handle_failed_search(ctl, world, FAIL_STEP_LIMIT)
         elif ctl.solve.negative_curvature[world] != 0 and ctl.solve.predicted_stress[world] == 1:
             if ctl.nonmonotone.steps[world] > 0:
                 ctl.nonmonotone.restore_best[world] = 1
@@ -197,13 +177,13 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
                 ctl.solve.predicted_stress[world] = wp.where(tangent_needed(ctl, world), 0, 2)
                 ctl.nonmonotone.require_armijo[world] = 1
                 ctl.search.alpha[world] = f64(0.0)
-        elif ctl.search.slope[world] >= f64(0.0) and wp.static(not midpoint):  # midpoint: |g| can still fall
+        elif ctl.search.slope[world] >= f64(0.0) and wp.static(not traits.midpoint):  # midpoint: |g| can still fall
             if ctl.solve.operator_reused[world] != 0:
                 ctl.search.alpha[world] = f64(0.0)
             elif ctl.nonmonotone.steps[world] > 0:
                 ctl.nonmonotone.restore_best[world] = 1
             else:
-                handle_failed_search(ctl, world, FAIL_CURVATURE)
+                convergence.handle_failed_search(ctl, world, FAIL_CURVATURE)
 
     @wp.func
     def part_error(ctl: Control, world: int, part: int, whole: f64, largest: f64) -> f64:
@@ -244,14 +224,14 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
         ctl.floor.estimate_error[world] = 0
         # this solve cannot give the error either
         if ctl.solve.pcg_unconverged[world] != 0 and ctl.floor.eps > f64(SINGLE_PRECISION_EPS):
-            give_up(ctl, world, FAIL_ROUNDOFF)
+            convergence.give_up(ctl, world, FAIL_ROUNDOFF)
             return
         largest, whole = f64(0.0), f64(0.0)
         for part in range(component_of_part.shape[0]):
             for lane in range(FLOOR_LANES):
                 whole += ctl.floor.sums[0, world, part, lane]
                 largest = wp.max(largest, ctl.floor.sums[4, world, part, lane])
-        if wp.static(unilateral):  # gaps have position round-off
+        if wp.static(traits.unilateral):  # gaps have position round-off
             largest = wp.max(largest, ctl.model_size)
         worst = f64(0.0)
         for part in range(component_of_part.shape[0]):
@@ -260,7 +240,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
         ctl.floor.error_estimate[world] = worst
         if worst <= ctl.floor.max_error:
             ctl.floor.error[world] = wp.max(ctl.floor.error[world], worst)
-            accept_iterate(ctl, world)
+            convergence.accept_iterate(ctl, world)
             return
         tries = ctl.floor.estimates[world] + 1
         ctl.floor.estimates[world] = tries
@@ -268,7 +248,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
         if tries >= MAX_ERROR_ESTIMATES or (
             known and tries > 1 and worst > f64(0.5) * ctl.floor.last_error_estimate[world]
         ):
-            give_up(ctl, world, wp.where(known, FAIL_ROUNDOFF, FAIL_CURVATURE))
+            convergence.give_up(ctl, world, wp.where(known, FAIL_ROUNDOFF, FAIL_CURVATURE))
             return
         ctl.floor.last_error_estimate[world] = worst
         check_direction(ctl, world)
@@ -282,12 +262,12 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
             return
         ctl.search.slope[world] = ctl.search.slope_sum[0, world]
         ctl.search.alpha[world] = f64(1.0)
-        if wp.static(limited):
+        if wp.static(traits.limited):
             ctl.search.alpha[world] = wp.min(ctl.search.limit[world], f64(1.0))
         ctl.solve.count[world] = ctl.solve.count[world] + 1
         ctl.search.trials[world] = 0
         ctl.search.doublings[world] = wp.where(ctl.solve.negative_curvature[world] != 0 and ctl.is_static != 0, 0, -1)
-        if wp.static(unilateral):
+        if wp.static(traits.unilateral):
             ctl.search.bracket_low[world] = wp.vec2d(f64(0.0), ctl.search.slope_sum[0, world])
             ctl.search.bracket_high[world] = wp.vec2d()
         ctl.nonmonotone.trial[world] = 0
@@ -295,9 +275,9 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
         ctl.search.active[world] = 1
         ctl.start.is_extrapolated[world] = 0
         ctl.nonmonotone.store_best[world] = 0
-        if wp.static(stored):
+        if wp.static(traits.stored):
             ctl.search.trial_accepted[world] = 0
-        if wp.static(has_constraints):
+        if wp.static(traits.has_constraints):
             if ctl.classical_multipliers == 0:
                 ctl.multiplier_updates[world] = ctl.multiplier_updates[world] + 1
         if ctl.floor.estimate_error[world] != 0 and pcg.step_iterations[world] < pcg.max_work:
@@ -306,9 +286,12 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
             ctl.search.active[world] = 0
             wp.atomic_max(ctl.any_rare_branch, 0, 1)
         elif pcg.step_iterations[world] >= pcg.max_work:
-            give_up(ctl, world, FAIL_WORK)
-        elif ctl.solve.count[world] > MAX_SOLVES_PER_ITERATION * iteration_factor(ctl, world) * ctl.max_iterations:
-            give_up(ctl, world, FAIL_ITERATIONS)
+            convergence.give_up(ctl, world, FAIL_WORK)
+        elif (
+            ctl.solve.count[world]
+            > MAX_SOLVES_PER_ITERATION * convergence.iteration_factor(ctl, world) * ctl.max_iterations
+        ):
+            convergence.give_up(ctl, world, FAIL_ITERATIONS)
         else:
             check_direction(ctl, world)
 

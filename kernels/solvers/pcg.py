@@ -9,7 +9,7 @@ import warp as wp
 
 from ..common.lanes import lane_functions
 from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
-from ..common.types import double_1d, double_3d, int_1d, precision
+from ..common.types import double_1d, double_3d, f64, int_1d, precision
 from .newton_control import control_struct
 
 __all__ = ["FREE_GROUP_LANES", "forcing_functions", "free_groups_struct", "pcg_kernels", "pcg_struct"]
@@ -82,7 +82,6 @@ def free_groups_struct(dtype: str):
 @functools.cache
 def forcing_functions(has_constraints: bool) -> KernelSet:
     """Target norms of linear solves, Eisenstat and Walker (1996); `has_constraints`: with constraints, see Traits."""
-    f64 = wp.float64
     Newton = control_struct()
 
     @wp.func
@@ -118,7 +117,6 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> KernelSet:
     """Kernels of the linear solver in one precision; `has_constraints`: with constraints, see Traits."""
     p = precision(dtype)
     T, vec3, mat33 = p.T, p.vec3, p.mat33
-    f64 = wp.float64
     Newton = control_struct()
     Control = pcg_struct()
     Groups = free_groups_struct(dtype)

@@ -10,7 +10,7 @@ import warp as wp
 
 from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.structs import mass_functions, topology_struct
-from ..common.types import double_1d, int_1d, precision
+from ..common.types import double_1d, f64, int_1d, precision
 from .newton_control import control_struct
 
 __all__ = ["SAMPLES", "SCATTER_FACTOR", "perturbation_kernels"]
@@ -28,7 +28,6 @@ def perturbation_kernels(dtype: str) -> KernelSet:
     """Kernels in one precision of the vectors."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
-    f64 = wp.float64
     Control = control_struct()
     Topology, mass_entry = topology_struct(dtype), mass_functions(dtype).mass_entry
     module = kernel_module(f"perturbation_{dtype}")

@@ -12,7 +12,7 @@ from typing import Any
 import warp as wp
 
 from ..common.modules import KernelSet, kernel_set, masked_kernel
-from ..common.types import double_1d, double_2d, int_1d, precision, vec3d_2d
+from ..common.types import double_1d, double_2d, f64, int_1d, precision, vec3d_2d
 from .blocks import block_kernels
 from .newton_control import control_struct
 from .pcg import pcg_struct
@@ -62,7 +62,6 @@ def reuse_kernels(dtype: str) -> KernelSet:
     """Kernels of the reuse rule."""
     p = precision(dtype)
     vec3 = p.vec3
-    f64 = wp.float64
     Reuse = reuse_struct()
     Newton, PCG = control_struct(), pcg_struct()
     module = block_kernels(dtype).module  # shared with the kernels of the matrices, to compile one module less

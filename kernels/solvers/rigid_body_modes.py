@@ -15,7 +15,7 @@ import warp as wp
 from ..common.modules import SHORT_UNROLL, KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.rigid import RIGID_MODES, bodies_struct, rigid_mode_functions
 from ..common.structs import pattern_struct
-from ..common.types import int_1d, precision
+from ..common.types import f64, int_1d, mat33d, precision, vec3d
 
 __all__ = ["rigid_mode_kernels"]
 
@@ -25,7 +25,6 @@ def rigid_mode_kernels(dtype: str) -> KernelSet:
     """Kernels in one precision of the slots."""
     p = precision(dtype)
     T, vec3, mat33 = p.T, p.vec3, p.mat33
-    f64, vec3d, mat33d = wp.float64, wp.vec3d, wp.mat33d
     Bodies, Pattern = bodies_struct(dtype), pattern_struct()
     rigid = rigid_mode_functions(dtype)
     translation_columns, rotation_columns = rigid.translation_columns, rigid.rotation_columns

@@ -5,7 +5,7 @@ import functools
 import warp as wp
 
 from ..common.modules import KernelSet, kernel_set, masked_kernel
-from ..common.types import double_1d, double_3d, int_1d, precision
+from ..common.types import double_1d, double_3d, f64, int_1d, precision
 from .newton_control import FLOOR_LANES, GROUP_LANES, GROUP_ROUNDOFF, GROUP_ROWS, ROW_ROUNDOFF, control_struct
 from .pcg import pcg_kernels
 
@@ -17,7 +17,6 @@ def vector_kernels(dtype: str, has_constraints: bool = False) -> KernelSet:
     """Kernels in one precision of the vectors, in the module of `pcg_kernels`, which every solver loads."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
-    f64 = wp.float64
     Control = control_struct()
     module = pcg_kernels(dtype, has_constraints).module
 

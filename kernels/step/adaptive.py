@@ -22,7 +22,7 @@ from typing import Any
 import warp as wp
 
 from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
-from ..common.types import precision
+from ..common.types import f64, precision
 from ..solvers.newton_control import FAIL_LOCAL_ERROR, FAIL_ROUNDOFF, control_struct
 from ..solvers.pcg import pcg_struct
 from .step_control import step_end_functions, step_struct
@@ -95,7 +95,6 @@ def adaptive_kernels(dtype: str, scheme: Any) -> KernelSet:
     """
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
-    f64 = wp.float64
     step_length = step_end_functions().step_length
     Step, Newton, PCG, Adaptive = step_struct(), control_struct(), pcg_struct(), adaptive_struct()
     estimate, order, multistep = scheme.error_weights, scheme.order, scheme.multistep

@@ -6,7 +6,7 @@ import warp as wp
 
 from ..common.modules import KernelSet, kernel_set, masked_kernel
 from ..common.structs import balance_struct, mass_functions, topology_struct
-from ..common.types import double_2d, precision
+from ..common.types import double_2d, f64, precision
 from ..solvers.newton_control import control_struct
 from .step_control import GROWTH_COLUMNS, step_struct
 
@@ -72,7 +72,6 @@ def ledger_kernels(dtype: str, chord: bool, nonpotential: bool, module: wp.Modul
     """
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
-    f64 = wp.float64
     mass_times = mass_functions(dtype).mass_times
     Step = step_struct()
     Newton = control_struct()

@@ -6,7 +6,7 @@ import math
 import warp as wp
 
 from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
-from ..common.types import double_1d, double_2d, int_1d, precision, vec3d_1d
+from ..common.types import double_1d, double_2d, f64, int_1d, precision, vec3d, vec3d_1d
 from .step_control import REPORT_COLUMNS, SAME_TIME_FRACTION, STATUS
 
 __all__ = ["JOINT_VALUE_KINDS", "MOTION_KINDS", "RUN_STATISTICS", "episode_kernels", "observation_kernels"]
@@ -24,7 +24,6 @@ JOINT_VALUE_KINDS = {"length": 0, "travel": 1, "angle": 2}
 @functools.cache
 def episode_kernels() -> KernelSet:
     """Kernels with one thread per world."""
-    f64 = wp.float64
     module = kernel_module("loops", light=True)
     column = {name: REPORT_COLUMNS.index(name) for name in REPORT_COLUMNS}
     running = STATUS["running"]
@@ -83,7 +82,6 @@ def observation_kernels(dtype: str) -> KernelSet:
     """Kernels in one precision that fill a table [world, column]."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
-    f64, vec3d = wp.float64, wp.vec3d
     module = kernel_module(f"observations_{dtype}")
 
     @wp.kernel(module=module)

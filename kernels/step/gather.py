@@ -19,7 +19,7 @@ from ..common.structs import (
     topology_struct,
 )  # fmt: skip
 from ..common.traits import NO_TERMS, Traits
-from ..common.types import double_1d, double_3d, int_1d, precision
+from ..common.types import double_1d, double_3d, f64, int_1d, precision
 from ..solvers.newton_control import (
     ROW_FORCE,
     ROW_FROZEN_CHANGE,
@@ -52,19 +52,11 @@ REACTION_FRACTION = wp.constant(wp.float64(1.0e-6))
 @functools.cache
 def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> KernelSet:
     """Kernels over slots; traits used: "nonpotential", "tangent", "pooled", "constraint_rows" and "midpoint"."""
-    nonpotential, tangent, pooled, constraint_rows = (
-        traits.nonpotential,
-        traits.tangent,
-        traits.pooled,
-        traits.constraint_rows,
-    )
-    midpoint = traits.midpoint
     p = precision(dtype)
     T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
     Topology = topology_struct(dtype)
     Balance, ProductTerms = balance_struct(dtype), product_terms_struct(dtype)
     Constraints, Multipliers = constraint_struct(), multiplier_struct()
-    f64 = wp.float64
     Pattern = pattern_struct()
     lane_sum, store_sum = lane_functions(dtype).lane_sum, lane_functions(dtype).store_sum
     free_inverse, entry_sum = inverse_function(dtype), entry_sum_function(dtype)
@@ -120,7 +112,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> KernelSet:
     @wp.func
     def newton_gradient(balance: Balance, world: int, slot: int) -> vec3:
         """Gradient on the right side of the Newton step."""
-        if wp.static(constraint_rows):
+        if wp.static(traits.constraint_rows):
             return balance.gradient[world, slot]
         else:
             return balance.g[world, slot]
@@ -150,7 +142,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> KernelSet:
         world, slot = wp.tid()
         f = gather_sum(topo, contribution, world, slot)
         own = f
-        if wp.static(pooled):
+        if wp.static(traits.pooled):
             of_pool = entry_sum(topo.pool_start, topo.pool_entry, balance.pool_force, world, slot)
             f += of_pool
         a, past = vec3(), vec3()
@@ -163,7 +155,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> KernelSet:
         load = balance.dead[world, slot]
         magnitude = balance.dead_magnitude[world, slot]
         held = load
-        if wp.static(nonpotential):
+        if wp.static(traits.nonpotential):
             new = balance.nonpotential[world, slot]
             held = load + balance.nonpotential_frozen[world, slot]
             load = load + new
@@ -171,14 +163,14 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> KernelSet:
                 magnitude[k] = magnitude[k] + wp.abs(new[k])
         residual_force = a + f - load
         descent = a + f - held
-        if wp.static(constraint_rows):
+        if wp.static(traits.constraint_rows):
             constraint_force = constraint_forces(con, mul, world, slot)
             residual_force += vec3(constraint_force[0])
             balance.gradient[world, slot] = residual_force + vec3(constraint_force[1])
             descent += vec3(constraint_force[2])
             for k in range(3):
                 magnitude[k] = magnitude[k] + T(wp.abs(constraint_force[0][k]))
-        if wp.static(pooled):  # opposing contact forces on a body cancel: each sets a scale by itself
+        if wp.static(traits.pooled):  # opposing contact forces on a body cancel: each sets a scale by itself
             for k in range(3):
                 magnitude[k] = magnitude[k] + wp.abs(of_pool[k])
         balance.inertia[world, slot] = a
@@ -198,14 +190,14 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> KernelSet:
         balance.rows[ROW_LOADS, world, slot] = weighted_square(wp.cw_mul(magnitude, free), D)
         balance.rows[ROW_INERTIA, world, slot] = weighted_square(wp.cw_mul(a, free), D)
         balance.rows[ROW_OBJECTIVE, world, slot] = f64(kinetic - work)
-        if wp.static(midpoint):  # Phi does not exist: half of the squared gradient replaces it
+        if wp.static(traits.midpoint):  # Phi does not exist: half of the squared gradient replaces it
             balance.rows[ROW_OBJECTIVE, world, slot] = f64(0.5) * weighted_square(
                 wp.cw_mul(newton_gradient(balance, world, slot), free), D
             )
         balance.rows[ROW_MAGNITUDE, world, slot] = f64(wp.abs(kinetic) + wp.abs(work))
         balance.rows[ROW_SLOPE, world, slot] = f64(wp.dot(wp.cw_mul(descent, free), balance.direction[world, slot]))
         balance.rows[ROW_FROZEN_CHANGE, world, slot] = f64(0.0)
-        if wp.static(nonpotential and not midpoint):
+        if wp.static(traits.nonpotential and not traits.midpoint):
             balance.rows[ROW_FROZEN_CHANGE, world, slot] = f64(
                 wp.dot(balance.nonpotential_frozen[world, slot] - balance.nonpotential[world, slot], vs)
             )
@@ -218,7 +210,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> KernelSet:
     def pool_range(more: ProductTerms, slot: int) -> wp.vec2i:
         """Pool entries of a slot; loaded early to hide the latency."""
         out = wp.vec2i()
-        if wp.static(pooled):
+        if wp.static(traits.pooled):
             out = wp.vec2i(more.pool_start[slot], more.pool_start[slot + 1])
         return out
 
@@ -237,16 +229,16 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> KernelSet:
     ) -> f64:
         """H p on the free components: adds the terms' part to the elements' part. Returns p.Hp."""
         out = h
-        if wp.static(tangent):
+        if wp.static(traits.tangent):
             f = entry_sum(more.contribution_start, more.contribution_entry, more.contribution, world, slot)
             out -= T(more.dq_dv[world]) * f
-        if wp.static(pooled):
+        if wp.static(traits.pooled):
             stiff = vec3()
             for k in range(pool[0], pool[1]):
                 stiff += more.pool[world, more.pool_entry[k]]
             if pool[0] < pool[1]:
                 out += T(more.dq_dv[world]) * stiff
-        if wp.static(constraint_rows):
+        if wp.static(traits.constraint_rows):
             constraint_force = wp.vec3d()
             for k in range(con.slot_start[slot], con.slot_start[slot + 1]):
                 constraint_force += con.slot_weight[k] * mul.product[world, con.slot_term[k]]
@@ -336,7 +328,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> KernelSet:
         k6 = sym6()
         for k in range(topo.contribution_start[slot], topo.contribution_start[slot + 1]):
             k6 += contribution[world, topo.contribution_entry[k]]
-        if wp.static(pooled):
+        if wp.static(traits.pooled):
             for k in range(topo.pool_start[slot], topo.pool_start[slot + 1]):
                 k6 += pool[world, topo.pool_entry[k]]
         mass = T(0.0)

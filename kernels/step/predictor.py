@@ -10,7 +10,7 @@ import warp as wp
 
 from ..common.modules import KernelSet, kernel_set, masked_kernel
 from ..common.structs import free_components_function
-from ..common.types import double_3d, precision
+from ..common.types import double_3d, f64, precision
 from ..solvers.newton_control import control_struct
 from .step_control import step_struct
 
@@ -47,7 +47,6 @@ def predictor_kernels(dtype: str, accelerated: bool, module: wp.Module) -> Kerne
     """Kernels in one precision, compiled into the module of the step kernels; `accelerated`: see `step_kernels`."""
     p, free_components = precision(dtype), free_components_function(dtype)
     T, vec3 = p.T, p.vec3
-    f64 = wp.float64
     Predictor, Step, Newton = predictor_struct(), step_struct(), control_struct()
     NEGLIGIBLE_ERROR_RATIO = (PREDICTOR_ROUNDINGS * {"float64": 2.0**-53, "float32": 2.0**-24}[dtype]) ** 2
 

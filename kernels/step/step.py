@@ -13,7 +13,7 @@ import warp as wp
 from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.structs import free_components_function
 from ..common.traits import NO_TERMS, Traits
-from ..common.types import double_2d, int_1d, precision
+from ..common.types import double_2d, f64, int_1d, precision
 from ..solvers.newton_control import FAIL_ELEMENT_INVERTED, FAIL_ENERGY_GROWTH, FAIL_ROUNDOFF, FAIL_WORK, control_struct
 from ..solvers.pcg import pcg_struct
 from .energy_ledger import GROWTH_SHARE, ledger_kernels
@@ -43,12 +43,10 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
     """
     p, free_components = precision(dtype), free_components_function(dtype)
     T, vec3 = p.T, p.vec3
-    f64 = wp.float64
     Step, limits = step_struct(), step_end_functions()
     end_time, time_tolerance, step_length = limits.end_time, limits.time_tolerance, limits.step_length
     Newton = control_struct()
     PCG = pcg_struct()
-    nonpotential, has_constraints = traits.nonpotential, traits.has_constraints
     variant = traits.suffix("nonpotential", "has_constraints")
     coefficients, static, multistep = scheme.coefficients, scheme.static, scheme.multistep
     takes_velocity, accelerated, midpoint = scheme.takes_velocity, scheme.accelerated, scheme.midpoint
@@ -73,7 +71,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
         newton.floor.accepted_unconverged[world] = 0
         newton.floor.step_error[world] = f64(0.0)
         newton.strain_energy_start[world] = newton.strain_energy[world]
-        if wp.static(has_constraints):
+        if wp.static(traits.has_constraints):
             newton.multiplier_updates[world] = 0
         pcg.step_iterations[world] = 0
         step.halvings[world] = 0
@@ -327,7 +325,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
         report[world, 14] = f64(0.0)
         if step.growth_monitored != 0:
             report[world, 14] = step.energy_growth[world, GROWTH_SHARE]
-        if wp.static(has_constraints):
+        if wp.static(traits.has_constraints):
             largest = f64(0.0)
             for c in range(newton.norms.component_count):
                 largest = wp.max(largest, newton.norms.violation[world, c])
@@ -356,5 +354,5 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
             report[world, first_column + 6 * probe + c] = d[c]
             report[world, first_column + 6 * probe + 3 + c] = w[c]
 
-    ledger = ledger_kernels(dtype, multistep or midpoint or accelerated, nonpotential, module)
+    ledger = ledger_kernels(dtype, multistep or midpoint or accelerated, traits.nonpotential, module)
     return kernel_set(vars(ledger) | locals())

@@ -5,6 +5,7 @@ import functools
 import warp as wp
 
 from ..common.modules import KernelSet, kernel_set
+from ..common.types import f64
 
 __all__ = [
     "GROWTH_COLUMNS",
@@ -120,7 +121,6 @@ def step_struct():
 @functools.cache
 def step_end_functions() -> KernelSet:
     """Device functions: time at which a run or world ends, its tolerance, and the step that matches it."""
-    f64 = wp.float64
     Step = step_struct()
 
     @wp.func

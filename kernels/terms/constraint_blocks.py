@@ -7,7 +7,7 @@ import warp as wp
 from ..common.block_entries import add_block_function
 from ..common.modules import SHORT_UNROLL, KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.structs import pattern_struct, topology_struct
-from ..common.types import double_1d, double_2d, int_1d, precision, vec3d_2d
+from ..common.types import double_1d, double_2d, f64, int_1d, precision, vec3d_2d
 from .constraints import ANGLE, DISTANCE, FORMULA, constraint_struct, multiplier_struct
 
 __all__ = ["constraint_block_kernels", "coupling_struct"]
@@ -33,7 +33,6 @@ def constraint_block_kernels(dtype: str) -> KernelSet:
     """Kernels that add the constraints' part to a matrix, in one precision of its blocks."""
     p = precision(dtype)
     mat33 = p.mat33
-    f64 = wp.float64
     Topology, Pattern, Couplings = topology_struct(dtype), pattern_struct(), coupling_struct()
     Constraints, Multipliers = constraint_struct(), multiplier_struct()
     add_block = add_block_function(dtype)

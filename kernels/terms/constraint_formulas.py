@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from ..common.modules import KernelSet, definition_name, kernel_module, kernel_set
-from ..common.types import double_1d, int_1d, precision, vec3d_2d
+from ..common.types import double_1d, f64, int_1d, mat33d, precision, vec3d_2d
 from .constraints import constraint_functions, constraint_struct, multiplier_struct
 
 __all__ = ["Formula", "formula_kernels"]
@@ -39,7 +39,6 @@ def formula_kernels(dtype: str, midpoint: bool, formula: Formula) -> KernelSet:
     c where h is at most quadratic, else up to a third-order term.
     """
     p = precision(dtype)
-    f64, vec3d, mat33d = wp.float64, wp.vec3d, wp.mat33d
     mat33d_2d = wp.array2d(dtype=mat33d)
     Constraints, Multipliers = constraint_struct(), multiplier_struct()
     functions = constraint_functions(dtype)

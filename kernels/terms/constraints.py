@@ -17,7 +17,7 @@ import functools
 import warp as wp
 
 from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
-from ..common.types import double_1d, double_2d, int_1d, int_2d, precision, vec3d_2d
+from ..common.types import double_1d, double_2d, f64, int_1d, int_2d, precision, vec3d, vec3d_2d
 
 __all__ = [
     "ANGLE",
@@ -140,7 +140,6 @@ def constraint_functions(dtype: str) -> KernelSet:
     """Device functions of the vectors, values and gradients of rows."""
     p = precision(dtype)
     vec3 = p.vec3
-    f64, vec3d = wp.float64, wp.vec3d
     Constraints, Multipliers = constraint_struct(), multiplier_struct()
 
     @wp.func
@@ -208,7 +207,6 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> KernelSet:
     """
     p = precision(dtype)
     vec3 = p.vec3
-    f64, vec3d = wp.float64, wp.vec3d
     Constraints, Multipliers, Joints = constraint_struct(), multiplier_struct(), joint_struct()
     functions = constraint_functions(dtype)
     term_vector, directional_derivative = functions.term_vector, functions.directional_derivative

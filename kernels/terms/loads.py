@@ -5,7 +5,7 @@ import functools
 import warp as wp
 
 from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
-from ..common.types import double_1d, double_2d, double_3d, int_1d, precision, vec3d_1d, vec3d_2d
+from ..common.types import double_1d, double_2d, double_3d, f64, int_1d, precision, vec3d_1d, vec3d_2d
 from ..elements.points import block_struct
 
 __all__ = ["body_force_kernel", "load_kernels", "time_law_kernel", "time_law_struct"]
@@ -31,7 +31,6 @@ def load_kernels(dtype: str) -> KernelSet:
     """Kernels of the loads in one precision."""
     p = precision(dtype)
     T, vec3 = p.T, p.vec3
-    f64 = wp.float64
     Laws = time_law_struct()
     # a module per kind of load: a scene compiles only those it uses
     laws_module = kernel_module(f"laws_{dtype}")
@@ -168,7 +167,6 @@ def load_kernels(dtype: str) -> KernelSet:
 @functools.lru_cache(maxsize=256)
 def time_law_kernel(function: wp.Function, scalar: bool, take_dtype: str):
     """Kernel that evaluates one time law given as a `wp.func` of t (s)."""
-    f64 = wp.float64
     A = precision(take_dtype).T
 
     def set_time_law(
@@ -193,7 +191,6 @@ def body_force_kernel(function: wp.Function, dtype: str, take_dtype: str):
     T, vec3 = p.T, p.vec3
     take = precision(take_dtype)
     Block = block_struct(dtype)
-    f64 = wp.float64
 
     def add_body_force(
         block: Block,
