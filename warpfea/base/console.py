@@ -91,13 +91,13 @@ def compile_progress_bar(show: bool | None) -> Iterator[Callable[[int, int, str]
         yield update
 
 
-def format_table(rows: Sequence[Sequence[str]], *, indent: str = "", right: Sequence[int] = ()) -> str:
+def format_table(rows: Sequence[Sequence[str]], *, right: Sequence[int] = ()) -> str:
     """Rows in columns two spaces apart; the columns in `right` are right-aligned."""
     widths = [max(len(row[k]) for row in rows if k < len(row)) for k in range(max(map(len, rows)))]
     lines = []
     for row in rows:
         cells = [text.rjust(w) if k in right else text.ljust(w) for k, (text, w) in enumerate(zip(row, widths))]
-        lines.append((indent + "  ".join(cells)).rstrip())
+        lines.append("  ".join(cells).rstrip())
     return "\n".join(lines)
 
 

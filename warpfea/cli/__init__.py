@@ -21,7 +21,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in words
     try:
-        from . import parser  # inside the try block, so that Ctrl-C is handled
+        from ..base.devices import find_device  # inside the try block, so that Ctrl-C is handled
+        from . import parser
 
         try:
             arguments = parser.parse(words)
@@ -30,7 +31,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         with warnings.catch_warnings():
             warnings.simplefilter("always", UserWarning)
             warnings.showwarning = _show_warning
-            _check_device(getattr(arguments, "device", None))
+            if getattr(arguments, "device", None) is not None:
+                find_device(arguments.device)  # ModelError for an unknown one, before any work
             return int(arguments.command(arguments))
     except KeyboardInterrupt as stop:
         if debug:
@@ -46,14 +48,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         code, text = _describe(error)
         print(f"warpfea: error: {text}", file=sys.stderr)
         return code
-
-
-def _check_device(name: str | None) -> None:
-    """ModelError for an unknown device, before any work."""
-    if name is not None:
-        from ..base.devices import find_device
-
-        find_device(name)
 
 
 def _describe(error: Exception) -> tuple[int, str]:

@@ -16,7 +16,6 @@ from ..base.errors import Error, UsageError
 from ..base.names import did_you_mean
 from ..builder.builder import ModelBuilder
 from ..builder.scene import Scene, scene
-from ..model.bodies import Body
 from .arguments import existing_file, number_tuple
 from .parser import MATERIAL_HINT
 
@@ -57,7 +56,7 @@ def mesh_scene(options: argparse.Namespace) -> tuple[Scene[Any], dict[str, Any]]
         for group in dict.fromkeys(group for group, _ in tractions + pressures):
             b.add_probe(group, body.surface(group))
         if not tractions + pressures:
-            b.add_probe("all", _all_nodes(body))
+            b.add_probe("all", body.nodes(body.mesh.used_nodes))
         return b
 
     build.__name__ = path.stem
@@ -80,10 +79,6 @@ def mesh_facts(mesh: meshes.Mesh) -> dict[str, Any]:
         "surface_groups": {name: len(rows) for name, rows in sorted(mesh.surface_sets.items())},
         "node_groups": {name: len(ids) for name, ids in sorted(mesh.node_sets.items())},
     }
-
-
-def _all_nodes(body: Body) -> Any:
-    return body.nodes(body.mesh.used_nodes)
 
 
 def _parse_load(text: str, option: str, size: int) -> tuple[str, tuple[float, ...]]:
@@ -149,15 +144,11 @@ def parse_material(text: str) -> tuple[str, materials.Material]:
         raise UsageError(f"{where}: {error}") from None
 
 
-def _number_hint(text: str) -> str:
-    """Hint for a text that is not a number."""
-    return "; commas stand between the values" if ";" in text else number_hint(text)
-
-
 def _parse_number(where: str, key: str, text: str) -> float:
     value = finite_number(text)
     if math.isnan(value):
-        raise UsageError(f"{where}: {key} = {text!r} is not a finite number{_number_hint(text)}")
+        hint = "; commas stand between the values" if ";" in text else number_hint(text)
+        raise UsageError(f"{where}: {key} = {text!r} is not a finite number{hint}")
     return value
 
 

@@ -172,26 +172,18 @@ def _joint_rows(joints: list[dict[str, Any]]) -> list[list[str]]:
     return [["joints", ", ".join(f"{len(n)} {kind} ({sum(n)} equations)" for kind, n in counts.items())]]
 
 
-def _contact_bodies_text(c: dict[str, Any]) -> str:
-    """Bodies and colliders in contact."""
-    return f"body {c['body']} on {c['collider'] if 'collider' in c else 'body ' + c['with']}"
-
-
 def _contact_rows(contacts: list[dict[str, Any]]) -> list[list[str]]:
     """A row for each contact; a count for many."""
     if len(contacts) > MAX_ROWS:
         left = sum(c["left_out"] for c in contacts)
         return [["contacts", f"{len(contacts)}, {sum(c['points'] for c in contacts)} points{_left_out_text(left)}"]]
-    return [
-        [f"contact {c['name']}", f"{_contact_bodies_text(c)}{_triangles_text(c)}, law {c['law']}, {c['model']}, "
-         f"{c['points']} points{_left_out_text(c['left_out'])}"]
-        for c in contacts
-    ]  # fmt: skip
-
-
-def _triangles_text(contact: dict[str, Any]) -> str:
-    """Text of a mesh collider."""
-    return f" ({contact['triangles']} triangles)" if "triangles" in contact else ""
+    rows = []
+    for c in contacts:
+        other = c["collider"] if "collider" in c else f"body {c['with']}"
+        other += f" ({c['triangles']} triangles)" if "triangles" in c else ""
+        text = f"body {c['body']} on {other}, law {c['law']}, {c['model']}, {c['points']} points"
+        rows.append([f"contact {c['name']}", text + _left_out_text(c["left_out"])])
+    return rows
 
 
 def _left_out_text(count: int) -> str:

@@ -34,13 +34,8 @@ def accuracy(options: argparse.Namespace) -> int:
         scene,
         over=parse_over(scene, texts),
         parameters=scene.parse_settings(options.set),
-        dt=options.dt,
-        t_end=options.t_end,
-        solver=options.solver,
-        tol=options.tol,
-        dtype=options.dtype,
-        device=options.device,
         probes=options.probe,
+        **{name: getattr(options, name) for name in ("dt", "t_end", "solver", "tol", "dtype", "device")},
         options=StudyOptions(
             finer=finer, progress=show_progress(options), **{k: getattr(options, k) for k in SHARED_OPTIONS}
         ),

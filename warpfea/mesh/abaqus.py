@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -127,29 +128,16 @@ def _read_surfaces(raw: RawMesh, blocks: list[Block], members: Members, ids: _Id
 
 def _keyword_blocks(text: str) -> Iterator[Block]:
     """Keyword (upper case), options (upper-case keys) and data lines, comments removed."""
-    keyword = ""
-    lines: list[str] = []
-    for line in text.splitlines():
-        line = line.strip()
-        if not line or line.startswith("**"):
-            continue
-        if line.startswith("*") or (keyword.endswith(",") and not lines):
-            if line.startswith("*"):
-                if keyword:
-                    yield _parse_block(keyword, lines)
-                keyword, lines = line, []
-            else:
-                keyword += line
-        else:
-            lines.append(line)
-    if keyword:
-        yield _parse_block(keyword, lines)
-
-
-def _parse_block(keyword: str, lines: list[str]) -> Block:
-    name, *options = (part.strip() for part in keyword[1:].split(","))
-    pairs = (option.partition("=") for option in options if option)
-    return name.upper(), {key.strip().upper(): value.strip().strip('"') for key, _, value in pairs}, lines
+    lines = [line for line in map(str.strip, text.splitlines()) if line and not line.startswith("**")]
+    starts = [k for k, line in enumerate(lines) if line.startswith("*")]
+    for start, end in itertools.pairwise([*starts, len(lines)]):
+        keyword, first = lines[start], start + 1
+        while keyword.endswith(",") and first < end:  # continued
+            keyword, first = keyword + lines[first], first + 1
+        name, *options = (part.strip() for part in keyword[1:].split(","))
+        pairs = (option.partition("=") for option in options if option)
+        values = {key.strip().upper(): value.strip().strip('"') for key, _, value in pairs}
+        yield name.upper(), values, lines[first:end]
 
 
 def _drop_assembly_data(blocks: list[Block]) -> list[Block]:

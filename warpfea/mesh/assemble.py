@@ -66,14 +66,13 @@ def assemble_mesh(raw: RawMesh, file: Path, cell_type: str | None) -> Mesh:
     element_sets: dict[str, list[Ints]] = {}
     surface_sets: dict[str, list[Ints]] = {}
     node_sets: dict[str, list[Ints]] = {}
-    faces = _FaceFinder(mesh)
     for name, k, numbers in raw.groups:
         kind, block = raw.blocks[k]
         nodes = block[numbers]
         if k in offsets:
             element_sets.setdefault(name, []).append(number[offsets[k] + numbers])
         elif cell_dimension(kind) == 2:
-            table = faces.find(kind, nodes, name)
+            table = _find_faces(mesh, kind, nodes, name)
             surface_sets.setdefault(name, []).append(table)
             nodes = mesh.faces(table)
         else:
@@ -128,46 +127,34 @@ def _body_cell_type(raw: RawMesh, label: str, cell_type: str | None) -> str:
     return body
 
 
-class _FaceFinder:
-    """Finds boundary cells among the faces of a mesh by their corners."""
-
-    def __init__(self, mesh: Mesh) -> None:
-        self.mesh = mesh
-        self.sorted_corners: tuple[Ints, Ints] | None = None
-
-    def find(self, kind: str, nodes: Ints, name: str) -> Ints:
-        """Rows (element, local face) of boundary cells (K, n)."""
-        mesh, label = self.mesh, self.mesh.label
-        row, boundary, (solid, solids) = mesh.kind, _BOUNDARY_CELLS[mesh.cell_type], _CELL_NOUNS[mesh.cell_type]
-        if not kind.startswith(boundary):
-            raise MeshError(
-                f"{label}: surface {name!r} holds {len(nodes)} cells of type {kind!r}, not faces of {solids}"
-            )
-        corners = nodes[:, : row.face_corners]
-        check_range(corners, len(mesh.points), f"{label}: surface {name!r}, node")
-        # keys of faces and queries are numbered together: row_keys may compress
-        if self.sorted_corners is None:
-            local = row.faces[:, : row.face_corners]
-            self.sorted_corners = (np.sort(mesh.cells[:, local].reshape(-1, row.face_corners), axis=1), local)
-        table, local = self.sorted_corners
-        keys = row_keys(np.concatenate([table, np.sort(corners, axis=1)]), len(mesh.points))
-        keys, wanted = keys[: len(table)], keys[len(table) :]
-        order = np.argsort(keys, kind="stable")
-        ordered = keys[order]
-        low, high = np.searchsorted(ordered, wanted), np.searchsorted(ordered, wanted, side="right")
-        lost = np.flatnonzero(low == high)
-        if lost.size:
-            raise MeshError(
-                f"{label}: surface {name!r}: {boundary} {lost[0]} with nodes {corners[lost[0]].tolist()} is "
-                f"not the face of a {solid} ({lost.size} such)"
-            )
-        face = order[low]
-        inside = np.flatnonzero(high - low == 2)  # between two elements: the one on the back of its normal
-        for other in (order[low[inside]], order[high[inside] - 1]):
-            element, side = np.divmod(other, len(local))
-            own = mesh.cells[element[:, None], local[side]]
-            start = (own == corners[inside, :1]).argmax(axis=1)
-            following = np.take_along_axis(own, ((start + 1) % row.face_corners)[:, None], axis=1)[:, 0]
-            agrees = following == corners[inside, 1]
-            face[inside[agrees]] = other[agrees]
-        return np.column_stack(np.divmod(face, len(local)))
+def _find_faces(mesh: Mesh, kind: str, nodes: Ints, name: str) -> Ints:
+    """Rows (element, local face) of boundary cells (K, n) of the surface `name`, found by their corners."""
+    label = mesh.label
+    row, boundary, (solid, solids) = mesh.kind, _BOUNDARY_CELLS[mesh.cell_type], _CELL_NOUNS[mesh.cell_type]
+    if not kind.startswith(boundary):
+        raise MeshError(f"{label}: surface {name!r} holds {len(nodes)} cells of type {kind!r}, not faces of {solids}")
+    corners = nodes[:, : row.face_corners]
+    check_range(corners, len(mesh.points), f"{label}: surface {name!r}, node")
+    # keys of faces and queries are numbered together: row_keys may compress
+    table, local = mesh._sorted_faces, row.faces[:, : row.face_corners]
+    keys = row_keys(np.concatenate([table, np.sort(corners, axis=1)]), len(mesh.points))
+    keys, wanted = keys[: len(table)], keys[len(table) :]
+    order = np.argsort(keys, kind="stable")
+    ordered = keys[order]
+    low, high = np.searchsorted(ordered, wanted), np.searchsorted(ordered, wanted, side="right")
+    lost = np.flatnonzero(low == high)
+    if lost.size:
+        raise MeshError(
+            f"{label}: surface {name!r}: {boundary} {lost[0]} with nodes {corners[lost[0]].tolist()} is "
+            f"not the face of a {solid} ({lost.size} such)"
+        )
+    face = order[low]
+    inside = np.flatnonzero(high - low == 2)  # between two elements: the one on the back of its normal
+    for other in (order[low[inside]], order[high[inside] - 1]):
+        element, side = np.divmod(other, len(local))
+        own = mesh.cells[element[:, None], local[side]]
+        start = (own == corners[inside, :1]).argmax(axis=1)
+        following = np.take_along_axis(own, ((start + 1) % row.face_corners)[:, None], axis=1)[:, 0]
+        agrees = following == corners[inside, 1]
+        face[inside[agrees]] = other[agrees]
+    return np.column_stack(np.divmod(face, len(local)))

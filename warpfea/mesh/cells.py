@@ -6,8 +6,10 @@ mid-edge nodes in the order of its edges (01, 12, 20); the "faces" of a quad are
 runs through them. Face k holds the nodes of Abaqus's label S(k+1), or E(k+1) for quads.
 """
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -139,19 +141,11 @@ def _multilinear_gradients(corners: Floats, xi: Floats) -> Floats:
     return sign * np.stack(others, axis=2)
 
 
-def line_gradients(xi: Floats) -> Floats:
-    """ds_i/dxi of the linear line on the unit interval: (P, 2, 1)."""
-    return _multilinear_gradients(_LINE_CORNERS, xi)
-
-
-def quad_gradients(xi: Floats) -> Floats:
-    """ds_i/dxi of the bilinear quadrilateral on the unit square: (P, 4, 2)."""
-    return _multilinear_gradients(_QUAD_CORNERS, xi)
-
-
-def hex_gradients(xi: Floats) -> Floats:
-    """ds_i/dxi of the trilinear hexahedron on the unit cube: (P, 8, 3)."""
-    return _multilinear_gradients(HEX_CORNERS, xi)
+line_gradients, quad_gradients, hex_gradients = (
+    partial(_multilinear_gradients, corners) for corners in (_LINE_CORNERS, _QUAD_CORNERS, HEX_CORNERS)
+)
+"""ds_i/dxi of the linear line, the bilinear quadrilateral and the trilinear hexahedron on the unit interval, square and
+cube: (P, 2, 1), (P, 4, 2), (P, 8, 3)."""
 
 
 def _gauss_rule(dimension: int) -> tuple[Floats, Floats]:
@@ -185,28 +179,17 @@ ELEMENT_CELLS = {
 }
 """Solid element name in the API -> cell type of its mesh."""
 
-_DIMENSION_PREFIXES = {
-    0: ("vertex", "empty"),
-    1: ("line", "VTK_LAGRANGE_CURVE", "VTK_BEZIER_CURVE"),
-    2: (
-        "triangle",
-        "quad",
-        "polygon",
-        "pixel",
-        "VTK_LAGRANGE_TRI",
-        "VTK_LAGRANGE_QUAD",
-        "VTK_BEZIER_TRI",
-        "VTK_BEZIER_QUAD",
-    ),
+_DIMENSION_PATTERNS = {
+    0: "vertex|empty",
+    1: "line|VTK_(LAGRANGE|BEZIER)_CURVE",
+    2: "triangle|quad|polygon|pixel|VTK_(LAGRANGE|BEZIER)_(TRI|QUAD)",
 }
+"""Beginnings of cell types."""
 
 
 def cell_dimension(name: str) -> int:
     """Dimension 0 .. 3 of a meshio cell type; anything but a point, line or surface counts as 3."""
-    for dim, prefixes in _DIMENSION_PREFIXES.items():
-        if name.startswith(prefixes):
-            return dim
-    return 3
+    return next((dim for dim, pattern in _DIMENSION_PATTERNS.items() if re.match(pattern, name)), 3)
 
 
 def det_j0(points: Floats, cells: Ints, kind: CellType, xi: Floats) -> Floats:

@@ -250,20 +250,18 @@ def _check_manifold(mesh: Mesh) -> None:
     sides = len(mesh.kind.edges)
     edges = mesh.cells[:, mesh.kind.edges].reshape(-1, 2)
     keys = row_keys(np.sort(edges, axis=1), len(mesh.points))
-    order = np.argsort(keys, kind="stable")
-    first = np.flatnonzero(np.r_[True, keys[order][1:] != keys[order][:-1]])
-    count = np.diff(np.r_[first, len(keys)])
-    many = first[count > 2]
+    _, edge, count = np.unique(keys, return_inverse=True, return_counts=True)
+    many = np.flatnonzero(count > 2)
     if many.size:
-        start = many[np.argmin(order[many])]
-        rows = order[start : start + count[first == start][0]]
+        rows = np.flatnonzero(edge == edge[np.isin(edge, many).argmax()])
         a, b = edges[rows[0]]
         raise MeshError(
             f"{mesh.label}: the edge between nodes {a} and {b} is shared by {len(rows)} quads "
             f"({_list_numbers(rows // sides)}; {many.size} such edge{_plural(many)}): a shell can't branch, use one "
             "body per sheet"
         )
-    one, other = order[first[count == 2]], order[first[count == 2] + 1]
+    order = np.argsort(edge, kind="stable")
+    one, other = order[count[edge[order]] == 2].reshape(-1, 2).T
     same = np.flatnonzero(edges[one, 0] == edges[other, 0])
     if same.size:
         i = same[np.argmin(one[same])]

@@ -186,19 +186,20 @@ class Mesh:
 
     @cached_property
     def _boundary(self) -> Ints:
-        keys = self._face_keys
-        order = np.argsort(keys, kind="stable")
-        ordered = keys[order]
-        first = np.flatnonzero(np.r_[True, ordered[1:] != ordered[:-1]])
-        alone = np.sort(order[first[np.diff(np.r_[first, len(keys)]) == 1]])
+        _, first, count = np.unique(self._face_keys, return_index=True, return_counts=True)
+        alone = np.sort(first[count == 1])
         return _read_only_array(np.column_stack(np.divmod(alone, len(self.kind.faces))), np.int64)
 
     @cached_property
     def _face_keys(self) -> Ints:
         """Key per (element, local face), (M * faces,), equal for faces with the same corners."""
+        return row_keys(self._sorted_faces, len(self.points))
+
+    @cached_property
+    def _sorted_faces(self) -> Ints:
+        """Sorted corners of each (element, local face), (M * faces, corners)."""
         corners = self.kind.faces[:, : self.kind.face_corners]
-        table = np.sort(self.cells[:, corners].reshape(-1, self.kind.face_corners), axis=1)
-        return row_keys(table, len(self.points))
+        return np.sort(self.cells[:, corners].reshape(-1, self.kind.face_corners), axis=1)
 
     # selections
 

@@ -6,7 +6,8 @@ one colour range for all frames, a colour bar and the time.
 
 import os
 import pathlib
-from typing import Any
+from dataclasses import KW_ONLY, dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -36,32 +37,30 @@ def _checked_size(size: Any) -> tuple[int, int]:
     return int(width), int(height)
 
 
+@dataclass(eq=False, repr=False)
 class _PictureWriter(Output):
     """Common parts of PNGWriter and GIFWriter: collection of frames."""
 
-    suffix = ""
+    path: str | os.PathLike[str]
+    _: KW_ONLY
+    field: str | None = "von_mises"
+    size: tuple[int, int] = (960, 540)
+    view: tuple[float, float] = DEFAULT_VIEW
+    color_range: tuple[float, float] | None = None
+    spacing: float | tuple[float, float] | None = None
+    ground: bool = True
+    suffix: ClassVar[str] = ""
 
-    def __init__(
-        self,
-        path: str | os.PathLike[str],
-        *,
-        field: str | None,
-        size: tuple[int, int],
-        view: tuple[float, float],
-        color_range: tuple[float, float] | None,
-        spacing: float | tuple[float, float] | None,
-        ground: bool,
-    ) -> None:
-        self.path = pathlib.Path(path)
-        if not isinstance(field, (str, type(None))):
-            raise ModelError(f"field must be the name of a field, or None for grey, got {field!r}")
-        self.field, self.size, self.view = field, _checked_size(size), check_view(view)
-        self.color_range, self.spacing, self.ground = check_colors(color_range), spacing, ground
+    def __post_init__(self) -> None:
+        if not isinstance(self.field, (str, type(None))):
+            raise ModelError(f"field must be the name of a field, or None for grey, got {self.field!r}")
+        self.size, self.view = _checked_size(self.size), check_view(self.view)
+        self.color_range = check_colors(self.color_range)
         self._animation: Animation | None = None
 
     def open(self, sim: Any) -> None:
         self.abort()
-        check_target(self.path, (self.suffix,))
+        self._target = check_target(self.path, (self.suffix,))
         check_fields(sim, [self.field] if self.field else [])
         self._surface = DrawnSurface(sim, self.spacing)
         start = self._surface.points(sim)
@@ -83,6 +82,7 @@ class _PictureWriter(Output):
         self._animation = None
 
 
+@dataclass(eq=False, repr=False, kw_only=True)
 class PNGWriter(_PictureWriter):
     """Draws one state to `path` (.png).
 
@@ -98,25 +98,12 @@ class PNGWriter(_PictureWriter):
     that can't be written (at `close`).
     """
 
+    time: float | None = None
     suffix = ".png"
 
-    def __init__(
-        self,
-        path: str | os.PathLike[str],
-        *,
-        field: str | None = "von_mises",
-        size: tuple[int, int] = (960, 540),
-        time: float | None = None,
-        view: tuple[float, float] = DEFAULT_VIEW,
-        color_range: tuple[float, float] | None = None,
-        spacing: float | tuple[float, float] | None = None,
-        ground: bool = True,
-    ) -> None:
-        super().__init__(
-            path, field=field, size=size, view=view, color_range=color_range, spacing=spacing, ground=ground
-        )
-        self.time = time
-        self.output_times = () if time is None else (time,)
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.output_times = () if self.time is None else (self.time,)
 
     def write(self, sim: Any) -> None:
         if self._animation is None or self.time is None or self._animation.frames:
@@ -129,11 +116,12 @@ class PNGWriter(_PictureWriter):
             return
         try:
             self._animation.frames = self._animation.frames or [self._frame(sim)]
-            self._animation.save_png(self.path, self.size, self.view, self.ground)
+            self._animation.save_png(self._target, self.size, self.view, self.ground)
         finally:
             self.abort()
 
 
+@dataclass(eq=False, repr=False, kw_only=True)
 class GIFWriter(_PictureWriter):
     """Draws an animation to `path` (.gif).
 
@@ -147,29 +135,17 @@ class GIFWriter(_PictureWriter):
     Frames (points and field, float32) are kept in memory and drawn at `close`, when the colour range is known.
     """
 
+    size: tuple[int, int] = (640, 360)
+    fps: float = 20.0
+    speed: float = 1.0
+    max_frames: int = 240
+    progress: bool | None = None
     suffix = ".gif"
 
-    def __init__(
-        self,
-        path: str | os.PathLike[str],
-        *,
-        fps: float = 20.0,
-        speed: float = 1.0,
-        field: str | None = "von_mises",
-        size: tuple[int, int] = (640, 360),
-        max_frames: int = 240,
-        view: tuple[float, float] = DEFAULT_VIEW,
-        color_range: tuple[float, float] | None = None,
-        spacing: float | tuple[float, float] | None = None,
-        ground: bool = True,
-        progress: bool | None = None,
-    ) -> None:
-        super().__init__(
-            path, field=field, size=size, view=view, color_range=color_range, spacing=spacing, ground=ground
-        )
-        check_rates(fps, speed, max_frames)
-        self.fps, self.speed, self.max_frames, self.progress = fps, speed, max_frames, progress
-        self.rate = fps / speed
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_rates(self.fps, self.speed, self.max_frames)
+        self.rate = self.fps / self.speed
 
     def open(self, sim: Any) -> None:
         super().open(sim)
@@ -195,7 +171,7 @@ class GIFWriter(_PictureWriter):
         try:
             if frame_time(sim) > self._clock.last:
                 self._append(sim)
-            self._animation.save_gif(self.path, self.size, self.view, self.ground, self.speed, self.progress)
+            self._animation.save_gif(self._target, self.size, self.view, self.ground, self.speed, self.progress)
         finally:
             self.abort()
 

@@ -93,7 +93,7 @@ def known_motion(reference: Reference, chosen: Sequence[str] | None, run: Outcom
         if times is not None and not np.array_equal(times, sample_times[inside]):
             raise ModelError(f"reference {reference.about!r}: its probes must have the same times")
         times = sample_times[inside]
-        probes[name] = _sample_lookup(times, x[inside])
+        probes[name] = lambda at, times=times, x=x[inside]: x[np.searchsorted(times, at)]
     curve = np.linspace(0.0, t_end, TRAVEL_SAMPLES)[1:] if times is None else times
     travel = _largest_travel(probes, run.start_positions, curve)
     own_error = reference.error / travel
@@ -110,13 +110,6 @@ def _validated_function(function: Callable[[np.ndarray], Any], what: str) -> Cal
         return out
 
     return call
-
-
-def _sample_lookup(times: np.ndarray, x: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    def sample_at(at: np.ndarray) -> np.ndarray:
-        return x[np.searchsorted(times, at)]
-
-    return sample_at
 
 
 def _largest_travel(

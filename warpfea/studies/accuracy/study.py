@@ -4,7 +4,7 @@ import math
 import pathlib
 import statistics
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from ...base.checks import check_positive
@@ -167,21 +167,17 @@ def _cheapest_row(rows: Sequence[Row], target: float | None) -> Row | None:
     return min(good, key=lambda r: r.seconds or 0.0) if good else None
 
 
+@dataclass
 class _StudyRunner:
     """Runs and evaluates a study."""
 
-    def __init__(
-        self,
-        scene: Scene[Any],
-        axes: SweepAxes,
-        store: OutcomeStore,
-        options: StudyOptions,
-        known: Callable[[Setting], Reference | None],
-        chosen: Sequence[str] | None,
-        base: Setting,
-    ) -> None:
-        self.scene, self.axes, self.store, self.options = scene, axes, store, options
-        self.known, self.chosen, self.base = known, chosen, base
+    scene: Scene[Any]
+    axes: SweepAxes
+    store: OutcomeStore
+    options: StudyOptions
+    known: Callable[[Setting], Reference | None]
+    chosen: Sequence[str] | None
+    base: Setting
 
     def result(self, settings: Sequence[Setting], folder: pathlib.Path | None) -> Study:
         """The study of all settings, written into the folder if there is one."""

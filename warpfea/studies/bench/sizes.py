@@ -19,7 +19,7 @@ from ...solvers import NewtonPCG
 from .measure import Kind, Row, run_columns, run_once, solver
 from .problems import PROBLEMS, Problem
 
-__all__ = ["SIZES_KIND", "check_sizes"]
+__all__ = ["SIZES_KIND"]
 
 WARM_UP_STEPS = 2
 """First steps whose time does not count."""
@@ -35,13 +35,6 @@ COLUMNS = {
 }  # fmt: skip
 
 
-def check_sizes(problems: Sequence[Problem], sizes: Sequence[int]) -> None:
-    """Refuse sizes that a problem does not have. UsageError."""
-    for problem in problems:
-        if sizes and min(sizes) < problem.min_unknowns:
-            raise UsageError(f"--unknowns {min(sizes)}: the smallest {problem.name} has {problem.min_unknowns}")
-
-
 @dataclass(frozen=True)
 class Case:
     """A mesh, by its approximate number of unknowns, and a linear solver."""
@@ -53,7 +46,9 @@ class Case:
 
 def _cases(options: argparse.Namespace) -> list[Case]:
     problems = [PROBLEMS[name] for name in options.problem or ["bar"]]
-    check_sizes(problems, options.unknowns)
+    for p in problems:
+        if options.unknowns and min(options.unknowns) < p.min_unknowns:
+            raise UsageError(f"--unknowns {min(options.unknowns)}: the smallest {p.name} has {p.min_unknowns}")
     for name, value in DEFAULT_OPTIONS.items():
         setattr(options, name, getattr(options, name) or value)
     options.references = {}

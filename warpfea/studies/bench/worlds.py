@@ -26,7 +26,6 @@ import argparse
 import time as clock
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -63,14 +62,11 @@ def five_tet_box(size: tuple[float, float, float], cells: tuple[int, int, int]) 
     """A box of T4, five per cell, mirrored from cell to cell so that faces match."""
     n = np.array(cells) + 1
     grid = np.stack(np.meshgrid(*(np.linspace(0.0, s, k) for s, k in zip(size, n)), indexing="ij"), axis=-1)
-
-    def node_number(i: int, j: int, k: int) -> int:
-        return int((i * n[1] + j) * n[2] + k)
-
+    number = np.arange(np.prod(n)).reshape(n)
     out = []
     for i, j, k in np.ndindex(*cells):
         odd = (i + j + k) % 2
-        c = [node_number(i + (a ^ odd), j + b, k + d) for a in (0, 1) for b in (0, 1) for d in (0, 1)]
+        c = [number[i + (a ^ odd), j + b, k + d] for a in (0, 1) for b in (0, 1) for d in (0, 1)]
         out += [[c[p] for p in tet] for tet in ((0, 1, 2, 4), (3, 2, 1, 7), (5, 4, 7, 1), (6, 7, 4, 2), (1, 2, 4, 7))]
     points, tets = grid.reshape(-1, 3), np.array(out)
     edges = points[tets[:, 1:]] - points[tets[:, :1]]
@@ -91,16 +87,12 @@ def _finger_model(points: Any, traction: bool) -> ModelBuilder:
     return b
 
 
-def _named_scene(name: str, **given: Any) -> ModelBuilder:
-    return find(name)(**given)
-
-
 SCENES: dict[str, tuple[Callable[[], ModelBuilder], float]] = {
-    "pendulum": (partial(_named_scene, "pendulum", elements=16), 2e-3),
-    "slider": (partial(_named_scene, "slider_crank"), 1e-3),
-    "double": (partial(_named_scene, "double_pendulum"), 4e-3),
+    "pendulum": (lambda: find("pendulum")(elements=16), 2e-3),
+    "slider": (lambda: find("slider_crank")(), 1e-3),
+    "double": (lambda: find("double_pendulum")(), 4e-3),
     "finger": (lambda: _finger_model(mesh.box((0.12, 0.02, 0.02), cells=(20, 2, 2)), True), 2e-3),
-    "gripper": (partial(_named_scene, "gripper", element="T4"), 1.0 / 240.0),
+    "gripper": (lambda: find("gripper")(element="T4"), 1.0 / 240.0),
     "tets": (lambda: _finger_model(five_tet_box((0.12, 0.02, 0.02), (12, 2, 2)), False), 2e-3),
 }
 

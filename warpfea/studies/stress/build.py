@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import scipy.sparse.linalg
 
 import warpfea as wf
 from warpfea.base.writer import Output
@@ -12,10 +13,13 @@ from warpfea.simulation.statics import StaticResult
 
 from .case import Answer, Setting
 
-__all__ = ["CLAMPED_SLOTS", "GRAVITY_VECTOR", "MIN_POSITIVE_J", "REFERENCE_TOL", "STEEL", "StaticSolution", "StepStats",
-           "X", "Y", "Z", "bar", "beam", "finalize", "relative_error", "solve"]  # fmt: skip
+__all__ = [
+    "CLAMPED_SLOTS", "GRAVITY_VECTOR", "MIN_POSITIVE_J", "REFERENCE_TOL", "STEEL", "StaticSolution", "StepStats", "X",
+    "Y", "Z", "add_along_x", "bar", "beam", "finalize", "linear_steps", "relative_error", "solve", "step",
+]  # fmt: skip
 
 X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+AXES = np.array([X, Y, Z])
 GRAVITY_VECTOR = (0.0, 0.0, -9.81)
 STEEL = wf.SVK(E=2e11, nu=0.3, density=7800.0)
 MIN_POSITIVE_J = 1e-12
@@ -29,14 +33,34 @@ CLAMPED_SLOTS = {
 """Slots that a clamped wall x = const fixes, by element."""
 
 
+def add_along_x(
+    b: wf.ModelBuilder, element: str, cells: Sequence[int], size: Sequence[float], law: Any, *, name: str | None = None,
+    turn: np.ndarray = AXES, shift: Any = (0.0, 0.0, 0.0),
+) -> tuple[wf.Body, Any, Any]:  # fmt: skip
+    """Add a 3243 beam, a 3443 shell or solids along x from the origin, turned and moved: the body, its start and end.
+
+    `size` in m: the shell's last is its thickness.
+    """
+    if element == "3243":
+        ends, section = [shift, shift + size[0] * turn[:, 0]], wf.Rectangle(size[1], size[2])
+        body = b.add_beam(ends, elements=cells[0], section=section, normal=turn[:, 2], material=law, name=name)
+        return body, body.start, body.end
+    if element == "3443":
+        grid = wf.mesh.grid(size[:2], cells=cells[:2])
+        body = b.add_shell(grid, thickness=size[2], material=law, transform=(turn, shift), name=name)
+        return body, body.edge("x-"), body.edge("x+")
+    mesh = wf.mesh.box(size, cells=cells, element=element)
+    body = b.add_solid(mesh, material=law, element=element, transform=(turn, shift), name=name)
+    return body, body.nodes("x-"), body.nodes("x+")
+
+
 def bar(
     element: str, cells: Sequence[int], size: Sequence[float], law: Any, gravity: Sequence[float] = (0.0, 0.0, 0.0)
 ) -> tuple[wf.ModelBuilder, wf.Body]:
-    """A solid bar from x = 0 on, built in at its side x-, with the probe "tip" at x+; `size` in m."""
+    """A bar of solids or a 3443 strip from x = 0 on, built in at x-, with the probe "tip" at x+; `size` in m."""
     b = wf.ModelBuilder(gravity=tuple(gravity))
-    mesh = wf.mesh.box(tuple(size), cells=tuple(cells), element=element)
-    body = b.add_solid(mesh, material=law, element=element, name="bar")
-    b.clamp(body.nodes("x-"), slots=CLAMPED_SLOTS[element])
+    body, start, _ = add_along_x(b, element, cells, size, law, name="bar")
+    b.clamp(start, slots=CLAMPED_SLOTS[element])
     b.add_probe("tip", body.surface("x+"))
     return b, body
 
@@ -46,11 +70,9 @@ def beam(
 ) -> tuple[wf.ModelBuilder, wf.Body]:
     """A 3243 beam along x with a square section, built in at its start, with the probe "tip" at its end; m."""
     b = wf.ModelBuilder(gravity=tuple(gravity))
-    section = wf.Rectangle(side, side)
-    line = [(0, 0, 0), (length, 0, 0)]
-    body = b.add_beam(line, elements=elements, section=section, normal=(0, 0, 1), material=law, name="beam")
-    b.clamp(body.start, slots=CLAMPED_SLOTS["3243"])
-    b.add_probe("tip", body.end)
+    body, start, end = add_along_x(b, "3243", (elements,), (length, side, side), law, name="beam")
+    b.clamp(start, slots=CLAMPED_SLOTS["3243"])
+    b.add_probe("tip", end)
     return b, body
 
 
@@ -155,10 +177,36 @@ def finalize(b: wf.ModelBuilder, setting: Setting, worlds: int = 1) -> wf.Model:
     return b.finalize(device=setting.device, dtype=setting.dtype, worlds=worlds)
 
 
+def step(
+    b: wf.ModelBuilder, setting: Setting, steps: int, stats: StepStats | None = None, **options: Any
+) -> tuple[wf.Simulation, StepStats]:
+    """A simulation with these options after so many steps, and their statistics; `stats`: those to add to."""
+    sim, stats = wf.Simulation(finalize(b, setting), **options), stats or StepStats()
+    stats.step(sim, steps)
+    return sim, stats
+
+
 def solve(b: wf.ModelBuilder, setting: Setting, stats: StepStats | None = None, **options: Any) -> StaticSolution:
     """Result of `solve_static` with these options; `stats`: statistics to add to."""
     stats = stats or StepStats()
     return StaticSolution(wf.solve_static(finalize(b, setting), outputs=[stats], **options), stats)
+
+
+def linear_steps(model: wf.Model, force: np.ndarray, h: float, steps: int) -> np.ndarray:
+    """Displacements of the slots (slots, 3), m, after steps of backward Euler from rest with constant matrices.
+
+    `force` (slots, 3) in N; float64, by a factorisation.
+    """
+    free = np.flatnonzero(model.free_slots.ravel())
+    M, K = (A[free][:, free] for A in (model.mass_matrix(), model.tangent_matrix(model.state())))
+    factor = scipy.sparse.linalg.splu((M + h * h * K).tocsc())
+    u = v = np.zeros(len(free))
+    for _ in range(steps):
+        v = factor.solve(M @ v + h * (force.ravel()[free] - K @ u))
+        u = u + h * v
+    out = np.zeros(3 * model.slots)
+    out[free] = u
+    return out.reshape(-1, 3)
 
 
 def relative_error(value: Any, reference: Any, scale: float | None = None) -> float:

@@ -99,12 +99,12 @@ class Case:
     name: str
     group: str
     run: Callable[..., Answer]
-    values: tuple[Any, ...]
-    quick: str
-    refusal: dict[str, tuple[str, ...]]
-    must_refuse: bool
-    description: str
-    dtypes: tuple[str, ...] = DTYPES
+    values: Sequence[Any] = (None,)
+    quick: str = "none"
+    refusal: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    must_refuse: bool = False
+    description: str = ""
+    dtypes: Sequence[str] = DTYPES
 
 
 def label(name: str, value: Any) -> str:
@@ -122,18 +122,16 @@ CASES: dict[str, Case] = {}
 
 
 def case(
-    name: str, group: str, *, values: Sequence[Any] = (None,), quick: str = "none",
-    refusal: Mapping[str, Sequence[str]] | Sequence[str] = (), must_refuse: bool = False,
-    dtypes: Sequence[str] = DTYPES, description: str = "",
+    name: str, group: str, *, refusal: Mapping[str, Sequence[str]] | Sequence[str] = (), description: str = "",
+    **options: Any,
 ) -> Callable[[Callable[..., Answer]], Callable[..., Answer]]:  # fmt: skip
     """Add a function to `CASES`; see Case. The first line of its docstring is the default description; refusal without
     precisions is for both."""
 
     def add(run: Callable[..., Answer]) -> Callable[..., Answer]:
-        known = refusal if isinstance(refusal, Mapping) else dict.fromkeys(DTYPES if refusal else (), refusal)
-        texts = {dtype: tuple(t) for dtype, t in known.items()}
+        texts = refusal if isinstance(refusal, Mapping) else dict.fromkeys(DTYPES if refusal else (), refusal)
         about = description or (run.__doc__ or "").strip().splitlines()[0]
-        CASES[name] = Case(name, group, run, tuple(values), quick, texts, must_refuse, about, tuple(dtypes))
+        CASES[name] = Case(name, group, run, refusal=texts, description=about, **options)
         return run
 
     return add

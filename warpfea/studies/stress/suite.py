@@ -29,10 +29,12 @@ DONE, REFUSED, FAILED, MISSED = "done", "refused", "FAILED", "missed"
 STDOUT = "-"
 NOTE_WIDTH = 120
 """Characters of a note in the table; the file has the full text."""
-HEADINGS = (
-    "case", "precision", "outcome", "error", "bound", "Newton", "PCG", "largest step", "drift", "violation", "s",
-    "note",
-)  # fmt: skip
+COLUMNS = {
+    "case": "case", "precision": "precision", "outcome": "outcome", "error": "error", "bound": "bound",
+    "Newton": "newton", "PCG": "pcg", "largest step": "largest_step", "drift": "drift", "violation": "violation",
+    "s": "wall_s", "note": "note",
+}  # fmt: skip
+"""Headings of the table -> values of a row."""
 
 
 @dataclass(frozen=True)
@@ -118,13 +120,8 @@ def run_row(row: Row, setting: Setting, debug: bool = False) -> dict[str, Any]:
     out: dict[str, Any] = {"case": row.label, "group": case.group, "precision": row.dtype}
     out |= {"outcome": outcome, "passed": passed}
     if answer is not None:
-        out |= {
-            "error": answer.error, "bound": answer.bound, "reference": answer.reference, "newton": answer.newton,
-            "pcg": answer.pcg, "halvings": answer.halvings,
-            "limits": {name: {"value": v, "bound": b} for name, (v, b) in answer.limits.items()},
-            "largest_step": answer.largest_step, "drift": answer.drift, "violation": answer.violation,
-            "min_J": answer.min_J, "floor": answer.floor,
-        }  # fmt: skip
+        out |= vars(answer) | {"limits": {name: {"value": v, "bound": b} for name, (v, b) in answer.limits.items()}}
+        del out["note"]  # the evaluated one comes last
     out |= {"wall_s": clock.perf_counter() - began, "note": note}
     return dict(to_json(out))
 
@@ -159,7 +156,7 @@ def run_rows(
     have = {(row["case"], row["precision"]): row for row in content["rows"]}
     width = max(len(row.label) for row in rows)
     live = sys.stderr.isatty() and not (options.quiet or options.no_progress)
-    _print_row(options, dict(zip(HEADINGS, HEADINGS)), width)
+    _print_row(options, dict(zip(COLUMNS, COLUMNS)), width)
     for k, row in enumerate(rows):
         found = have.get((row.label, row.dtype))
         if found is None:
@@ -181,20 +178,18 @@ def _row_texts(row: Mapping[str, Any]) -> dict[str, str]:
         value = row.get(name)
         if value is None:
             return "nan" if name == "error" and "bound" in row else "-"
-        return str(value) if isinstance(value, int) else format_number(value, 3)
+        if name == "wall_s":
+            return f"{value:.1f}"
+        return str(value) if isinstance(value, (int, str)) else format_number(value, 3)
 
-    return {
-        "case": row["case"], "precision": row["precision"], "outcome": row["outcome"], "error": text("error"),
-        "bound": text("bound"), "Newton": text("newton"), "PCG": text("pcg"), "largest step": text("largest_step"),
-        "drift": text("drift"), "violation": text("violation"), "s": f"{row['wall_s']:.1f}", "note": row["note"],
-    }  # fmt: skip
+    return {heading: text(name) for heading, name in COLUMNS.items()}
 
 
 def _print_row(options: argparse.Namespace, cells: Mapping[str, str], width: int) -> None:
     """A line of the table on stdout."""
     if not options.quiet and options.json != STDOUT:
         first = [cells["case"].ljust(width), cells["precision"].ljust(9), cells["outcome"].ljust(8)]
-        middle = [cells[name].rjust(max(len(name), 8)) for name in HEADINGS[3:-1]]
+        middle = [cells[name].rjust(max(len(name), 8)) for name in list(COLUMNS)[3:-1]]
         note = cells["note"] if len(cells["note"]) <= NOTE_WIDTH else f"{cells['note'][: NOTE_WIDTH - 3]}..."
         print("  ".join([*first, *middle, note]).rstrip(), flush=True)
 

@@ -7,7 +7,7 @@ import numpy as np
 
 import warpfea as wf
 
-from ..build import StepStats, beam, finalize
+from ..build import beam, solve
 from ..case import Answer, Setting, case
 
 GROUP = "Stability"
@@ -20,15 +20,14 @@ TRANSVERSE_FRACTION = 1e-5
 
 def _stability_answer(b: wf.ModelBuilder, setting: Setting, stable: bool, reference: str) -> Answer:
     """Error 0 if statics reports the equilibrium as `stable`, 1 if as the opposite, 0.5 if as undecided."""
-    stats = StepStats()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", wf.StabilityWarning)
-        found = wf.solve_static(finalize(b, setting), outputs=[stats])
-    assert found.stability is not None
-    warnings_caught = found.stability.stable[0]
-    error = 0.5 if warnings_caught is None else float(warnings_caught is not stable)
-    note = f"{found.stability.text} {found.stability.reasons[0]}, {int(found.stability.iterations[0])} products"
-    return Answer(error, 0.1, reference, **stats.answer_fields, note=note)
+        found = solve(b, setting)
+    told = found.result.stability
+    assert told is not None
+    error = 0.5 if told.stable[0] is None else float(told.stable[0] is not stable)
+    note = f"{told.text} {told.reasons[0]}, {int(told.iterations[0])} products"
+    return Answer(error, 0.1, reference, **found.stats.answer_fields, note=note)
 
 
 def _column_model(factor: float, transverse: float = 0.0) -> wf.ModelBuilder:
@@ -49,15 +48,13 @@ def perfect_column(setting: Setting, factor: float) -> Answer:
       refusal={"float64": ("was not accepted",), "float32": ("float32",)})  # fmt: skip
 def imperfect_column(setting: Setting, factor: float) -> Answer:
     """With 1e-5 of the load across it a column is reported as unstable, refused, or bent by 0.1 L."""
-    b = _column_model(factor, TRANSVERSE_FRACTION)
-    stats = StepStats()
     with warnings.catch_warnings(record=True) as warnings_caught:
         warnings.simplefilter("always", wf.StabilityWarning)
-        found = wf.solve_static(finalize(b, setting), outputs=[stats])
-    side = abs(float(found.probe("tip").displacement[0, -1, 2])) / LENGTH
+        found = solve(_column_model(factor, TRANSVERSE_FRACTION), setting)
+    side = abs(float(found.tip[2])) / LENGTH
     warned = any(issubclass(w.category, wf.StabilityWarning) for w in warnings_caught)
     note = f"{side:.2g} L to the side, {'un' if warned else ''}stable"
-    return Answer(0.0 if warned or side > 0.1 else 1.0, 0.1, "Euler", **stats.answer_fields, note=note)
+    return Answer(0.0 if warned or side > 0.1 else 1.0, 0.1, "Euler", **found.stats.answer_fields, note=note)
 
 
 def _supported_plate(factor: float, imperfection: float = 0.0) -> tuple[wf.ModelBuilder, wf.Body]:
@@ -91,9 +88,8 @@ def imperfect_plate(setting: Setting, imperfection: float) -> Answer:
     """At 1.5 of Bryan's load the plate buckles as far as one of 32 x 32 shells, and is stable."""
     b, body = _supported_plate(1.5, imperfection)
     b.add_probe("middle", body.at((LENGTH / 2, LENGTH / 2, imperfection)))
-    stats = StepStats()
-    found = wf.solve_static(finalize(b, setting), outputs=[stats])
-    assert found.report.stable is not None
-    middle = float(found.probe("middle").displacement[0, -1, 2])
-    error = abs(middle / BUCKLED_DEFLECTION - 1.0) if found.report.stable[0] else 1.0
-    return Answer(error, 0.04, "32 x 32 shells", **stats.answer_fields, note=f"middle at {middle:.4g} m")
+    found = solve(b, setting)
+    assert found.result.report.stable is not None
+    middle = float(found.result.probe("middle").displacement[0, -1, 2])
+    error = abs(middle / BUCKLED_DEFLECTION - 1.0) if found.result.report.stable[0] else 1.0
+    return Answer(error, 0.04, "32 x 32 shells", **found.stats.answer_fields, note=f"middle at {middle:.4g} m")

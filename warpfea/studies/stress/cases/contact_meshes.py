@@ -6,10 +6,9 @@ import numpy as np
 
 import warpfea as wf
 
-from ..build import finalize
 from ..case import FLOAT32_REFUSAL, Answer, Setting, case
 from . import contact
-from .contact import SIDE, bound_for, center_of_mass, edge_down, make_scene, simulate, vertex_down
+from .contact import SIDE, bound_for, center_of_mass, edge_down, make_scene, vertex_down
 
 SQUARE_TRIANGLES = np.array([(0, 1, 2), (0, 2, 3)])
 
@@ -71,10 +70,8 @@ def feature_contact(setting: Setting, which: str) -> Answer:
     s = make_scene(
         shape(), E=1e6, rotation=rotation(), translation=(0, 0, 5e-4), mu=0.3, restitution=0.5, stiffness=10.0
     )
-    s.builder.set_initial(s.body, velocity=(0, 0, -1.0))
-    sim = wf.Simulation(finalize(s.builder, setting), dt=1e-3)
-    run = simulate(sim, s, 40, mu=0.3)
-    sunk = float(sim.contact_record(s.contacts[0]).penetration[0].max()) / SIDE
+    run = s.release(setting, 40, velocity=(0, 0, -1.0), mu=0.3)
+    sunk = float(run.sim.contact_record(s.contacts[0]).penetration[0].max()) / SIDE
     limits = {"through": (run.center_depth, 0.0), "sunk": (sunk, 0.3)}
     return run.impulse_answer(setting, limits=limits)
 
@@ -91,10 +88,9 @@ def exact_touch(setting: Setting, which: str) -> Answer:
         "tip": wf.TriMesh(pyramid().points + (SIDE / 2, SIDE / 2, 0), pyramid().triangles),
     }
     s = make_scene(shapes[which], mu=0.5, restitution=0.5, stiffness=100.0 if which == "tip" else 1.0)
-    sim = wf.Simulation(finalize(s.builder, setting), dt=1e-3)
-    run = simulate(sim, s, 50, mu=0.5)
-    sunk = float(sim.contact_record(s.contacts[0]).penetration[0].max()) / SIDE
-    shifted = float(np.abs(center_of_mass(sim, s)[:2] / SIDE - 0.5).max())
+    run = s.release(setting, 50, mu=0.5)
+    sunk = float(run.sim.contact_record(s.contacts[0]).penetration[0].max()) / SIDE
+    shifted = float(np.abs(center_of_mass(run.sim, s.body)[:2] / SIDE - 0.5).max())
     limits = {"sunk": (sunk, 0.05)}
     if which != "tip":  # it slides off, as four slopes of 45 degrees and mu = 0.5 allow
         limits["shifted"] = (shifted, bound_for(setting, 1e-3, 1e-2))

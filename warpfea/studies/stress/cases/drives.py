@@ -4,7 +4,7 @@ import numpy as np
 
 import warpfea as wf
 
-from ..build import STEEL, StepStats, beam, finalize, relative_error, solve
+from ..build import STEEL, beam, relative_error, solve, step
 from ..case import FLOAT32_REFUSAL, Answer, Setting, case
 
 REFUSAL_TEXTS = ["'crank'", "drive", "inverted"]
@@ -44,9 +44,7 @@ def drive_jump(setting: Setting, value: tuple[str, float, str]) -> Answer:
     jump = ([0.0, begin, end, 1.0], [0.0, 0.0, angle, angle])
     child = arm.start if kind == "beam" else arm.surface("x-")
     joint = b.add_joint("revolute", parent=wf.GROUND, child=child, axis=(0, -1, 0), drive=jump, name="crank")
-    sim = wf.Simulation(finalize(b, setting), dt=JUMP_STEP)
-    stats = StepStats()
-    stats.step(sim, 6)
+    sim, stats = step(b, setting, 6, dt=JUMP_STEP)
     error = abs(float(sim.joint_value(joint)[0]) / angle - 1.0)
     reference = "the angle of the drive"
     return stats.answer(error, 1e-3 if setting.single else 1e-6, reference, note=f"min J {stats.min_J:.3g}")

@@ -7,7 +7,7 @@ import warp as wp
 
 import warpfea as wf
 
-from ..build import StepStats, finalize
+from ..build import StepStats, add_along_x, finalize
 from ..case import Answer, Setting, case
 
 LAW = wf.SVK(E=1e6, nu=0.3, density=1000.0)
@@ -22,17 +22,13 @@ def long_rest(setting: Setting, element: str) -> Answer:
     """
     steps = 100_000 if "cuda" in setting.device else 1_000_000
     b = wf.ModelBuilder()
-    if element == "3243":
-        body = b.add_beam([(0, 0, 0), (1, 0, 0)], elements=1, section=wf.Rectangle(0.1, 0.1), normal=(0, 0, 1),
-                          material=LAW)  # fmt: skip
-        b.clamp(body.start)
-    else:
-        body = b.add_solid(wf.mesh.box((0.3, 0.3, 0.3), cells=(1, 1, 1), element="T4"), material=LAW)
-        b.clamp(body.nodes("x-"))
+    size = (1.0, 0.1, 0.1) if element == "3243" else (0.3, 0.3, 0.3)
+    _, start, _ = add_along_x(b, element, (1, 1, 1), size, LAW)
+    b.clamp(start)
     model = finalize(b, setting)
     stats = StepStats()
     static = wf.solve_static(model, load_steps=1, tol=None if setting.single else 1e-13, outputs=[stats])
-    start = static.state.displacement.numpy().copy()
+    initial = static.state.displacement.numpy().copy()
     sim = wf.Simulation(model, static.state, dt=1e-2, record=False)
     first: dict[str, Any] | None = None
     drift = 0.0
@@ -41,11 +37,11 @@ def long_rest(setting: Setting, element: str) -> Answer:
         stats.add(sim)
         e = sim.energies()
         if setting.single and first is None:
-            start = sim.state.displacement.numpy().copy()
+            initial = sim.state.displacement.numpy().copy()
         total = float((e["kinetic"] + e["strain"] + e["potential"])[0])
         first = first or {"total": total, "strain": float(e["strain"][0])}
         drift = max(drift, abs(total - first["total"]) / first["strain"])
-    moved = float(np.abs(sim.state.displacement.numpy() - start).max() / np.abs(start).max())
+    moved = float(np.abs(sim.state.displacement.numpy() - initial).max() / np.abs(initial).max())
     limits = {"energy": (drift, 1e-5 if setting.single else 1e-10)}
     values = stats.answer_fields | {name: int(sim.totals[name].max()) for name in ("newton", "pcg")}
     return Answer(moved, 1e-5 if setting.single else 1e-12, "it stays", **values, limits=limits, drift=drift,

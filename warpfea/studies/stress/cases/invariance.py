@@ -1,13 +1,11 @@
 """Invariance to position, orientation, and the units of length and stress."""
 
-from typing import Any
-
 import numpy as np
 from scipy.spatial.transform import Rotation as Turn
 
 import warpfea as wf
 
-from ..build import StepStats, finalize, relative_error, solve
+from ..build import StepStats, add_along_x, linear_steps, relative_error, solve, step
 from ..case import Answer, Setting, case
 
 ROTATION_VECTORS = ((0.3, 0.0, 0.0), (1.2, -2.1, 0.7), (0.0, np.pi, 0.0))
@@ -24,23 +22,9 @@ def _cantilever(
     """
     R = turn.as_matrix()
     b = wf.ModelBuilder(gravity=(0, 0, 0))
-    size = unit * np.array(SIZE)
-    if element == "3243":
-        ends = [shift, shift + size[0] * R[:, 0]]
-        section = wf.Rectangle(size[1], size[2])
-        body = b.add_beam(ends, elements=4, section=section, normal=R[:, 2], material=law)
-        b.clamp(body.start)
-        end: Any = body.end
-    elif element == "3443":
-        grid = wf.mesh.grid(tuple(size[:2]), cells=(8, 1))
-        body = b.add_shell(grid, thickness=size[2], material=law, transform=(R, shift))
-        b.clamp(body.edge("x-"))
-        end = body.edge("x+")
-    else:
-        mesh = wf.mesh.box(tuple(size), cells=(6, 1, 1), element=element)
-        body = b.add_solid(mesh, element=element, material=law, transform=(R, shift))
-        b.clamp(body.nodes("x-"))
-        end = body.nodes("x+")
+    cells = {"3243": (4,), "3443": (8, 1)}.get(element, (6, 1, 1))
+    body, start, end = add_along_x(b, element, cells, unit * np.array(SIZE), law, turn=R, shift=shift)
+    b.clamp(start)
     b.add_point_load(end, tuple(load * R[:, 2]))
     b.add_probe("tip", end)
     return b, body
@@ -113,28 +97,15 @@ def stiffness_dynamic(setting: Setting, value: str) -> Answer:
     worst = 0.0
     for element in ("T10", "3243"):
         law = wf.SVK(E=E, nu=0.3, density=1000.0)
-        exact = _linear_steps(*_cantilever(element, law, 1.0, Turn.identity(), np.zeros(3)), h, steps)
+        b, body = _cantilever(element, law, 1.0, Turn.identity(), np.zeros(3))
+        model = b.finalize(device="cpu")
+        force = np.zeros((model.slots, 3))
+        for dead in b.description.dead_loads:
+            np.add.at(force, body.slot_offset + dead.slots, dead.weights[:, None] * dead.law.values[0])
+        exact = linear_steps(model, force, h, steps)
         load = 1e-7 / float(np.abs(exact).max())  # second-order terms: strains of about 1e-7
         b, _ = _cantilever(element, law, load, Turn.identity(), np.zeros(3))
         tol = None if setting.single else 1e-10
-        sim = wf.Simulation(finalize(b, setting), dt=h, solver=wf.NewtonPCG(tol=tol))
-        stats.step(sim, steps)
+        sim, _ = step(b, setting, steps, stats, dt=h, solver=wf.NewtonPCG(tol=tol))
         worst = max(worst, relative_error(sim.state.displacement.numpy()[0], load * exact))
     return Answer(worst, 1e-4 if setting.single else 1e-6, "linear backward Euler by scipy", **stats.answer_fields)
-
-
-def _linear_steps(b: wf.ModelBuilder, body: wf.Body, h: float, steps: int) -> np.ndarray:
-    """Slots' displacements (slots, 3) after steps of backward Euler with constant matrices, in float64."""
-    model = b.finalize(device="cpu")
-    free = np.flatnonzero(model.free_slots.ravel())
-    M, K = (A[free][:, free].toarray() for A in (model.mass_matrix(), model.tangent_matrix(model.state())))
-    f = np.zeros((model.slots, 3))
-    for dead in b.description.dead_loads:
-        np.add.at(f, body.slot_offset + dead.slots, dead.weights[:, None] * dead.law.values[0])
-    u, v = np.zeros(len(free)), np.zeros(len(free))
-    for _ in range(steps):
-        v = np.linalg.solve(M + h * h * K, M @ v + h * (f.ravel()[free] - K @ u))
-        u = u + h * v
-    out = np.zeros(3 * model.slots)
-    out[free] = u
-    return out.reshape(-1, 3)

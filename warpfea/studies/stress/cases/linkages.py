@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 
 import warpfea as wf
 
-from ..build import STEEL, StepStats, X, Y, Z, finalize
+from ..build import STEEL, StepStats, X, Y, Z, finalize, solve, step
 from ..case import Answer, Setting, case
 
 GRAVITY = 9.81
@@ -95,13 +95,11 @@ def _chain_forces(setting: Setting, kind: str, densities: list[float], load: flo
     weights = np.array(densities) * SIDE**2 * LINK_LENGTH * GRAVITY
     if load:
         b.add_point_load(bodies[-1].end, (0, 0, -load * weights[0]))
-    stats = StepStats()
-    model = finalize(b, setting)
     if kind == "fixed":
-        sim = wf.solve_static(model, load_steps=1, outputs=[stats]).simulation
+        found = solve(b, setting, load_steps=1)
+        sim, stats = found.result.simulation, found.stats
     else:
-        sim = wf.Simulation(model, dt=1e-2)
-        stats.step(sim, 100)
+        sim, stats = step(b, setting, 100, dt=1e-2)
     below = np.cumsum(weights[::-1])[::-1] + load * weights[0]
     got = np.array([sim.joint_force(joint)[0, :3] for joint in joints])
     error = float((np.linalg.norm(got - below[:, None] * np.array(Z), axis=1) / below).max())
@@ -128,10 +126,7 @@ def _redundant_hinges(setting: Setting) -> Answer:
     mesh = wf.mesh.box((0.4, 0.04, 0.8), cells=(2, 1, 4), origin=(-0.2, -0.02, -0.8))
     door = b.add_solid(mesh, material=wf.SVK(E=1e9, nu=0.3, density=600.0))
     hinges = [b.add_joint("revolute", parent=wf.GROUND, child=door.surface("z+"), axis=Y) for _ in range(2)]
-    model = finalize(b, setting)
-    sim = wf.Simulation(model, dt=1e-2)
-    stats = StepStats()
-    stats.step(sim, 40)
+    sim, stats = step(b, setting, 40, dt=1e-2)
     weight = 600.0 * 0.4 * 0.04 * 0.8 * GRAVITY
     total = sum(sim.joint_force(hinge)[0] for hinge in hinges)
     error = float(np.linalg.norm(total[:3] - weight * np.array(Z)) / weight)
@@ -186,9 +181,8 @@ def conflicting_pins(setting: Setting) -> Answer:
     body = b.add_solid(wf.mesh.box((1, 0.2, 0.2), cells=(1, 1, 1)), material=wf.SVK(E=1e7, nu=0.3, density=1000.0))
     b.clamp(body.nodes("x-"))
     tip = body.at((1, 0.1, 0.1))
-    stats = StepStats()
     for k, way in enumerate((0.1, 0.2)):
         b.add_constraint("PIN", points=(tip, (1, 0.1, 0.1)), value=([0, 1e-2], [(0, 0, 0), (0, 0, way)]),
                          name=f"pin {k}")  # fmt: skip
-    stats.step(wf.Simulation(finalize(b, setting), dt=1e-3), 10)
+    _, stats = step(b, setting, 10, dt=1e-3)
     return Answer(float("nan"), 0.0, "no place satisfies both", **stats.answer_fields)

@@ -3,11 +3,11 @@
 import functools
 
 import numpy as np
-import scipy.sparse.linalg
 
 import warpfea as wf
 
-from ..build import GRAVITY_VECTOR, REFERENCE_TOL, STEEL, StepStats, bar, finalize, relative_error, solve
+from .. import build
+from ..build import GRAVITY_VECTOR, REFERENCE_TOL, STEEL, StepStats, bar, finalize, relative_error, solve, step
 from ..case import FLOAT32_REFUSAL, Answer, Setting, case
 
 SIZE, CELLS = (1.0, 0.1, 0.1), (10, 1, 1)
@@ -42,27 +42,14 @@ def static_tip(E: float, device: str) -> np.ndarray:
 def linear_tip(h: float, device: str) -> np.ndarray:
     """Displacement of the tip after three steps of backward Euler, linear, by a factorisation (3,), m."""
     model = clamped_bar(STEEL)[0].finalize(device=device)
-    free = np.flatnonzero(model.free_slots.ravel())
-    M, K = model.mass_matrix(), model.tangent_matrix(model.state())
-    weight = (M @ np.tile(GRAVITY_VECTOR, model.slots))[free]
-    M, K = M[free][:, free], K[free][:, free]
-    factor = scipy.sparse.linalg.splu((M + h * h * K).tocsc())
-    u = v = np.zeros(len(free))
-    for _ in range(3):
-        v = factor.solve(M @ v + h * (weight - K @ u))
-        u = u + h * v
-    full = np.zeros(3 * model.slots)
-    full[free] = u
+    weight = model.mass_matrix() @ np.tile(GRAVITY_VECTOR, model.slots)
     tip = model.description.probes[0]
-    return tip.weights @ full.reshape(-1, 3)[tip.slots]
+    return tip.weights @ build.linear_steps(model, weight, h, 3)[tip.slots]
 
 
 def stepped_tip(law: wf.SVK, h: float, setting: Setting, tol: float | None = None) -> tuple[np.ndarray, StepStats]:
     """Displacement of the tip (3,), m, after three steps h from the straight state at rest."""
-    model = finalize(clamped_bar(law)[0], setting)
-    sim = wf.Simulation(model, dt=h, solver=wf.NewtonPCG(tol=tol, max_pcg=20000))
-    stats = StepStats()
-    stats.step(sim, 3)
+    sim, stats = step(clamped_bar(law)[0], setting, 3, dt=h, solver=wf.NewtonPCG(tol=tol, max_pcg=20000))
     return sim.probe("tip").displacement[0, -1], stats
 
 
@@ -125,9 +112,7 @@ def free_fall(setting: Setting, value: tuple[str, float]) -> Answer:
     b = wf.ModelBuilder(gravity=GRAVITY_VECTOR)
     mesh = wf.mesh.box((CUBE_SIZE,) * 3, cells=(2, 2, 2))
     body = b.add_solid(mesh, material=CUBE_LAWS[law], name="cube")
-    sim = wf.Simulation(finalize(b, setting), dt=h)
-    stats = StepStats()
-    stats.step(sim, 3)
+    sim, stats = step(b, setting, 3, dt=h)
     velocity = np.array(GRAVITY_VECTOR) * 3.0 * h
     error = float(np.abs(sim.velocities(body)[0] - velocity).max() / np.abs(velocity).max())
     bound = 1e-5 if setting.single else 1e-10

@@ -7,7 +7,7 @@ from scipy.optimize import brentq
 
 import warpfea as wf
 
-from ..build import StepStats, Y, Z, finalize
+from ..build import StepStats, Y, add_along_x, finalize, solve
 from ..case import Answer, Setting, case
 
 SPAN, RISE, SIDE, E = 1.0, 0.1, 0.1, 1e7
@@ -87,14 +87,12 @@ def lateral_buckling(setting: Setting, value: str) -> Answer:
     critical = 4.013 * np.sqrt(EI * GJ) / L**2 / np.sqrt((1.0 - EI / EI_strong) * (1.0 - GJ / EI_strong))
     load = float(value) * critical
     b = wf.ModelBuilder(gravity=(0, 0, 0))
-    strip = b.add_beam([(0, 0, 0), (L, 0, 0)], elements=16, section=wf.Rectangle(t, h), normal=Z,
-                       material=wf.SVK(E=modulus, nu=nu))  # fmt: skip
-    b.clamp(strip.start, slots="position+section")
-    b.add_point_load(strip.end, (0.0, 1e-4 * load, -load))
-    b.add_probe("tip", strip.end)
-    stats = StepStats()
-    result = wf.solve_static(finalize(b, setting), load_steps=8, outputs=[stats])
-    side = abs(float(result.probe("tip").displacement[0, -1, 1])) / L
+    _, start, end = add_along_x(b, "3243", (16,), (L, t, h), wf.SVK(E=modulus, nu=nu))
+    b.clamp(start, slots="position+section")
+    b.add_point_load(end, (0.0, 1e-4 * load, -load))
+    b.add_probe("tip", end)
+    found = solve(b, setting, load_steps=8)
+    side = abs(float(found.tip[1])) / L
     error = side / 0.01 if float(value) < 1.0 else 0.1 / side
     note = f"{side:.4f} L to the side; error: over 0.01 L below, 0.1 L over it above"
-    return Answer(error, 1.0, "Timoshenko", **stats.answer_fields, note=note)
+    return Answer(error, 1.0, "Timoshenko", **found.stats.answer_fields, note=note)

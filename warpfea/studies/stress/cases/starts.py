@@ -1,12 +1,12 @@
 """Inadmissible initial states: inverted, flat, collapsed to a point, scrambled."""
 
-from collections.abc import Sequence
+import functools
 
 import numpy as np
 
 import warpfea as wf
 
-from ..build import StepStats, Z, finalize
+from ..build import StepStats, add_along_x, finalize
 from ..case import Answer, Setting, case
 
 MODULUS = 1e6
@@ -20,17 +20,9 @@ REFUSAL_TEXTS = ("worst element", "J <= 0")
 def _body(b: wf.ModelBuilder, element: str, law: str) -> wf.Body:
     """A body 1 m long along x, clamped at x = 0."""
     material = (wf.SVK if law == "svk" else wf.NeoHookean).from_E_nu(E=MODULUS, nu=0.3, density=1000.0)
-    if element == "3243":
-        body = b.add_beam([(0, 0, 0), (1, 0, 0)], elements=4, section=wf.Rectangle(0.1, 0.1), normal=Z,
-                          material=material)  # fmt: skip
-        b.clamp(body.start)
-    elif element == "3443":
-        body = b.add_shell(wf.mesh.grid((1.0, 0.5), cells=(4, 2)), thickness=0.05, material=material)
-        b.clamp(body.edge("x-"))
-    else:
-        mesh = wf.mesh.box((1.0, 0.4, 0.4), cells=(4, 2, 2), element=element)
-        body = b.add_solid(mesh, element=element, material=material)
-        b.clamp(body.nodes("x-"))
+    width, height = {"3243": (0.1, 0.1), "3443": (0.5, 0.05)}.get(element, (0.4, 0.4))
+    body, start, _ = add_along_x(b, element, (4, 2, 2), (1.0, width, height), material)
+    b.clamp(start)
     return body
 
 
@@ -77,20 +69,14 @@ def _release(setting: Setting, value: str, kind: str, damped: bool) -> Answer:
     return Answer(away, bound, "rest", **values, note="recovered" if away <= bound else "another equilibrium")
 
 
-def _add_cases(kind: str, what: str) -> None:
-    """Cases of a kind of initial state: by statics, and by steps of backward Euler longer than its periods."""
-    refusal: dict[str, Sequence[str]] = {"float64": REFUSAL_TEXTS, "float32": REFUSAL_TEXTS}
-    for damped, way in ((False, "statics"), (True, "damped steps")):
-
-        def run(setting: Setting, value: str, damped: bool = damped) -> Answer:
-            return _release(setting, value, kind, damped)
-
-        run.__doc__ = f"{what}, by {way}: recovers, is refused by the name of an element, or says that J <= 0."
-        name, quick = (f"start-{kind}-damped", "none") if damped else (f"start-{kind}", "float64")
-        case(name, "Starts", values=ELEMENT_LAWS, quick=quick, refusal=refusal)(run)
-
-
-_add_cases("inverted", "A mirrored body")
-_add_cases("flat", "A body pressed flat")
-_add_cases("collapsed", "A body in one point")
-_add_cases("random", "A scrambled body")
+for _kind, _what in (
+    ("inverted", "A mirrored body"),
+    ("flat", "A body pressed flat"),
+    ("collapsed", "A body in one point"),
+    ("random", "A scrambled body"),
+):
+    for _suffix, _quick, _way in (("", "float64", "statics"), ("-damped", "none", "damped steps")):
+        _text = f"{_what}, by {_way}: recovers, is refused by the name of an element, or says that J <= 0."
+        _trial = functools.partial(_release, kind=_kind, damped=bool(_suffix))
+        case(f"start-{_kind}{_suffix}", "Starts", values=ELEMENT_LAWS, quick=_quick, refusal=REFUSAL_TEXTS,
+             description=_text)(_trial)  # fmt: skip
