@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from ..base.errors import MeshError
+from ..base.lazy import meshio
 from . import abaqus
 from .assemble import RawMesh, assemble_mesh
 from .cells import FILE_CELLS, cell_dimension
@@ -100,8 +101,6 @@ def read_triangles(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray
     MeshError
         A missing or unreadable file, or no triangles.
     """
-    import meshio
-
     file = Path(path)
     if not file.is_file():
         raise MeshError(f"{file}: no such mesh file")
@@ -219,12 +218,10 @@ def _read_gmsh(file: Path) -> RawMesh:
 
 def _read_gmsh_cells(file: Path, start: int, new: bool, is_ascii: bool, size: int) -> Any:
     """meshio's mesh of a Gmsh file of format 4.1, or 2.2 unless `new`, read from the byte `start` on."""
-    from meshio.gmsh import _gmsh22, _gmsh41
-
     with open(file, "rb") as stream:
         stream.seek(start)
         try:
-            return (_gmsh41 if new else _gmsh22).read_buffer(stream, is_ascii, size)
+            return (meshio.gmsh._gmsh41 if new else meshio.gmsh._gmsh22).read_buffer(stream, is_ascii, size)
         except IndexError as error:
             number = re.search(r"index (\d+) is out of bounds for axis 0 with size", str(error))
             if number is None:
@@ -277,8 +274,6 @@ def _entity_groups(body: bytes, is_ascii: bool, size: int) -> dict[tuple[int, in
 
 
 def _read_vtu(file: Path) -> RawMesh:
-    import meshio
-
     if file.read_bytes().count(b"<Piece") > 1:
         raise MeshError("a VTU file of several pieces is not supported: merge them")
     with _meshio_errors(str(file)) as said:

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.console import progress_bar
+from ..base.lazy import pillow
 from ..base.writer import write_atomically
 from .colormap import map_colors
 from .obstacles import OBSTACLE_COLOR, clip_to_box
@@ -139,10 +140,8 @@ class Animation:
 
     def save_png(self, target: pathlib.Path, size: tuple[int, int], view: tuple[float, float], ground: bool) -> None:
         """Draw the last frame. OutputError if the file can't be written."""
-        from PIL import Image as Pictures
-
         image = next(self.draw(size, view, [len(self.frames) - 1], ground))
-        write_atomically(target, lambda path: Pictures.fromarray(image).save(path, format="PNG"))
+        write_atomically(target, lambda path: pillow.Image.fromarray(image).save(path, format="PNG"))
 
     def save_gif(
         self,
@@ -173,14 +172,11 @@ class Animation:
 
 def draw_labels(image: Image, time: str, bar: tuple[float, float, str, str] | None) -> Image:
     """Write the time, and a colour bar for (low, high, title, units), onto a picture."""
-    from PIL import Image as Pictures
-    from PIL import ImageDraw, ImageFont
-
     height, width = image.shape[:2]
-    picture = Pictures.fromarray(image)
-    draw = ImageDraw.Draw(picture)
-    font = ImageFont.load_default(max(10.0, height / 30))
-    small = ImageFont.load_default(max(9.0, height / 36))
+    picture = pillow.Image.fromarray(image)
+    draw = pillow.ImageDraw.Draw(picture)
+    font = pillow.ImageFont.load_default(max(10.0, height / 30))
+    small = pillow.ImageFont.load_default(max(9.0, height / 36))
     line = 1.25 * height / 30
     draw.text((0.025 * width, height - 1.6 * line), time, fill=_TEXT_COLOR, font=font)
     if bar is None:
@@ -192,7 +188,7 @@ def draw_labels(image: Image, time: str, bar: tuple[float, float, str, str] | No
     top, bottom = round(0.26 * height), round(0.80 * height)
     ramp = map_colors(np.linspace(1.0, 0.0, bottom - top), 0.0, 1.0 if high > low else 0.0)
     strip = np.broadcast_to(np.round(255 * ramp)[:, None, :], (bottom - top, right - left, 3)).astype(np.uint8)
-    picture.paste(Pictures.fromarray(np.ascontiguousarray(strip)), (left, top))
+    picture.paste(pillow.Image.fromarray(np.ascontiguousarray(strip)), (left, top))
     draw.rectangle((left - 1, top - 1, right, bottom), outline=_TEXT_COLOR)
     ticks = np.linspace(low, high, 5) if high > low else np.array([low])
     texts = _tick_texts(ticks / factor)
@@ -227,8 +223,6 @@ def make_palette(images: list[Image], barred: bool) -> Any:
     With a colour bar 64 of them are the colour map. Vivid pixels (bodies) and dull ones (ground, sky) are
     quantised separately, since the latter are numerous and smooth and would take nearly all entries.
     """
-    from PIL import Image as Pictures
-
     colors = np.round(255 * map_colors(np.linspace(0, 1, 64 if barred else 0), 0, 1)).astype(np.uint8)
     pixels = np.concatenate([image[::2, ::2].reshape(-1, 3) for image in images])
     vivid = np.max(pixels, axis=1).astype(int) - np.min(pixels, axis=1) > 40
@@ -236,22 +230,20 @@ def make_palette(images: list[Image], barred: bool) -> Any:
     for kind, count in room.items():
         fraction = pixels[vivid == kind] if barred else pixels
         if len(fraction):
-            picture = Pictures.fromarray(np.ascontiguousarray(fraction[None]))
-            found = picture.quantize(count, method=Pictures.Quantize.MEDIANCUT, kmeans=1).getpalette() or []
+            picture = pillow.Image.fromarray(np.ascontiguousarray(fraction[None]))
+            found = picture.quantize(count, method=pillow.Image.Quantize.MEDIANCUT, kmeans=1).getpalette() or []
             colors = np.concatenate([colors, np.array(found, dtype=np.uint8).reshape(-1, 3)[:count]])
-    palette = Pictures.new("P", (1, 1))
+    palette = pillow.Image.new("P", (1, 1))
     palette.putpalette(colors.ravel().tolist())
     return palette
 
 
 def to_palette(image: Image, palette: Any) -> Any:
     """Picture in the palette's colours, with ordered dithering: no banding, static pattern."""
-    from PIL import Image as Pictures
-
     pattern = np.zeros((1, 1))
     for _ in range(3):
         pattern = np.block([[4 * pattern, 4 * pattern + 2], [4 * pattern + 3, 4 * pattern + 1]])
     height, width = image.shape[:2]
     tiles = np.tile((pattern / 63.0 - 0.5) * 8.0, (height // 8 + 1, width // 8 + 1))[:height, :width, None]
     spread = np.clip(np.round(image + tiles), 0, 255).astype(np.uint8)
-    return Pictures.fromarray(spread).quantize(palette=palette, dither=Pictures.Dither.NONE)
+    return pillow.Image.fromarray(spread).quantize(palette=palette, dither=pillow.Image.Dither.NONE)

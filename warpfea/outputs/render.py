@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from ..base.checks import is_count, is_number
 from ..base.errors import ModelError
+from ..base.lazy import pxr
 from ..base.names import did_you_mean
 from ..base.writer import Output, check_target
 from .animation import Animation, Frame
@@ -247,16 +248,14 @@ class _StageReader:
     """A stage written by USDWriter, opened for drawing."""
 
     def __init__(self, path: pathlib.Path) -> None:
-        from pxr import Tf, Usd, UsdGeom
-
         self.path = path
         if not path.is_file():
             raise ModelError(f"{path}: no such file")
         try:
-            self.stage = Usd.Stage.Open(str(path))
-        except Tf.ErrorException as error:
+            self.stage = pxr.Usd.Stage.Open(str(path))
+        except pxr.Tf.ErrorException as error:
             raise ModelError(f"{path}: can't be read as USD ({error_text(error)})") from error
-        meshes = [UsdGeom.Mesh(prim) for prim in self.stage.Traverse() if prim.IsA(UsdGeom.Mesh)]
+        meshes = [pxr.UsdGeom.Mesh(prim) for prim in self.stage.Traverse() if prim.IsA(pxr.UsdGeom.Mesh)]
         self.obstacles = [mesh for mesh in meshes if mesh.GetPrim().GetCustomDataByKey("warpfea:collider")]
         self.meshes = [mesh for mesh in meshes if not mesh.GetPrim().GetCustomDataByKey("warpfea:collider")]
         if not self.meshes:
@@ -270,8 +269,6 @@ class _StageReader:
 
     def animation(self, field: str | None, times: Floats) -> Animation:
         """Frames at `times` (s); USD interpolates linearly between samples."""
-        from pxr import UsdGeom
-
         name = None if field == "none" else field or self.metadata["color"] or None
         if name is not None and name not in self.metadata["fields"]:
             have = ", ".join(self.metadata["fields"]) or "none"
@@ -291,7 +288,7 @@ class _StageReader:
         start = self._points(self.start)
         self.origin = 0.5 * (start[:body_points].min(axis=0) + start[:body_points].max(axis=0))
         reference = np.asarray(start - self.origin, dtype=np.float32)
-        animation = Animation(np.concatenate(triangles), str(UsdGeom.GetStageUpAxis(self.stage)), reference)
+        animation = Animation(np.concatenate(triangles), str(pxr.UsdGeom.GetStageUpAxis(self.stage)), reference)
         animation.static = bool(self.metadata.get("static", False))
         animation.body_points, animation.plane_squares = body_points, plane_squares
         if name is not None:
@@ -306,10 +303,8 @@ class _StageReader:
 
     def _points(self, time: float) -> npt.NDArray[np.float64]:
         """(P, 3) points of all meshes in the world (m), of the bodies first."""
-        from pxr import UsdGeom
-
         code = time * self.rate
-        cache = UsdGeom.XformCache(code)
+        cache = pxr.UsdGeom.XformCache(code)
         blocks = []
         for mesh in self.meshes + self.obstacles:
             matrix = np.array(cache.GetLocalToWorldTransform(mesh.GetPrim()))
@@ -318,8 +313,6 @@ class _StageReader:
         return np.concatenate(blocks)
 
     def _values(self, name: str, time: float) -> npt.NDArray[np.float32]:
-        from pxr import Tf, UsdGeom
-
-        key = Tf.MakeValidIdentifier(name)
-        primvars = [UsdGeom.PrimvarsAPI(mesh).GetPrimvar(key) for mesh in self.meshes]
+        key = pxr.Tf.MakeValidIdentifier(name)
+        primvars = [pxr.UsdGeom.PrimvarsAPI(mesh).GetPrimvar(key) for mesh in self.meshes]
         return np.concatenate([np.asarray(p.Get(time * self.rate), dtype=np.float32) for p in primvars])

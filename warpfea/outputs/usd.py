@@ -24,6 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import ModelError, OutputError
+from ..base.lazy import pxr
 from ..base.writer import Output, check_target, temporary_path
 from .colormap import map_colors
 from .frames import DrawnSurface, FrameClock, check_colors, check_fields, field_label, frame_time, is_static
@@ -89,8 +90,6 @@ class USDWriter(Output):
         self._temporary: pathlib.Path | None = None
 
     def open(self, sim: Any) -> None:
-        from pxr import Tf, Usd, UsdGeom, UsdPhysics
-
         self.abort()
         target = check_target(self.path, SUFFIXES)
         check_fields(sim, self.fields)
@@ -106,37 +105,33 @@ class USDWriter(Output):
             if extending:
                 self._resume(sim, target)
                 return
-            self._stage = stage = Usd.Stage.CreateNew(str(self._temporary))
-        except (OSError, Tf.ErrorException) as error:
+            self._stage = stage = pxr.Usd.Stage.CreateNew(str(self._temporary))
+        except (OSError, pxr.Tf.ErrorException) as error:
             self.abort()
-            reason = error_text(error) if isinstance(error, Tf.ErrorException) else error.strerror
+            reason = error_text(error) if isinstance(error, pxr.Tf.ErrorException) else error.strerror
             what = "read or continued" if extending else "written"
             raise OutputError(f"{target}: can't be {what} ({reason})") from error
         except OutputError:
             self.abort()
             raise
-        UsdGeom.SetStageUpAxis(stage, self._surface.up_axis)
-        UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-        UsdPhysics.SetStageKilogramsPerUnit(stage, 1.0)
+        pxr.UsdGeom.SetStageUpAxis(stage, self._surface.up_axis)
+        pxr.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+        pxr.UsdPhysics.SetStageKilogramsPerUnit(stage, 1.0)
         stage.SetTimeCodesPerSecond(self.fps)
         stage.SetFramesPerSecond(self.fps)
-        root = UsdGeom.Xform.Define(stage, "/World").GetPrim()
+        root = pxr.UsdGeom.Xform.Define(stage, "/World").GetPrim()
         stage.SetDefaultPrim(root)
         self._define()
 
     def _names(self) -> list[str]:
         """Names of the bodies' prims."""
-        from pxr import Tf
-
-        return unique_names((), [Tf.MakeValidIdentifier(body.name) for body in self._surface.bodies])
+        return unique_names((), [pxr.Tf.MakeValidIdentifier(body.name) for body in self._surface.bodies])
 
     def _resume(self, sim: Any, target: pathlib.Path) -> None:
         """Open a copy of the existing file for extension."""
-        from pxr import Usd, UsdGeom
-
         assert self._temporary is not None
         shutil.copyfile(target, self._temporary)
-        self._stage = stage = Usd.Stage.Open(str(self._temporary))
+        self._stage = stage = pxr.Usd.Stage.Open(str(self._temporary))
         worlds = range(self._surface.worlds)
         paths = [[f"/World/world_{world:04d}/{name}/skin" for world in worlds] for name in self._names()]
         wanted = {"fps": self.fps, "fields": self.fields, "color": self.color}
@@ -147,8 +142,8 @@ class USDWriter(Output):
         self._clock.due(existing.time)
         self._meshes: list[list[_MeshPrim]] = []
         for of_body in paths:
-            meshes = [UsdGeom.Mesh(stage.GetPrimAtPath(path)) for path in of_body]
-            moves = [UsdGeom.Xformable(m.GetPrim().GetParent()).GetOrderedXformOps()[0] for m in meshes]
+            meshes = [pxr.UsdGeom.Mesh(stage.GetPrimAtPath(path)) for path in of_body]
+            moves = [pxr.UsdGeom.Xformable(m.GetPrim().GetParent()).GetOrderedXformOps()[0] for m in meshes]
             self._meshes.append([_MeshPrim(mesh, move, self.fields) for mesh, move in zip(meshes, moves)])
         self._obstacles = ObstaclePrims(stage, self._surface, self._names())
         if not self._obstacles.resume():
@@ -158,19 +153,17 @@ class USDWriter(Output):
 
     def _define(self) -> None:
         """Author constant data: transforms, topology, attributes without samples."""
-        from pxr import Gf, UsdGeom
-
         names = self._names()
         self._meshes = [[] for _ in names]
         for world in range(self._surface.worlds):
-            place = UsdGeom.Xform.Define(self._stage, f"/World/world_{world:04d}")
-            origin = Gf.Vec3d(*map(float, self._surface.offsets[world]))
-            place.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(origin)
+            place = pxr.UsdGeom.Xform.Define(self._stage, f"/World/world_{world:04d}")
+            origin = pxr.Gf.Vec3d(*map(float, self._surface.offsets[world]))
+            place.AddTranslateOp(pxr.UsdGeom.XformOp.PrecisionDouble).Set(origin)
             for body, name, meshes in zip(self._surface.bodies, names, self._meshes, strict=True):
-                xform = UsdGeom.Xform.Define(self._stage, place.GetPath().AppendChild(name))
+                xform = pxr.UsdGeom.Xform.Define(self._stage, place.GetPath().AppendChild(name))
                 xform.GetPrim().SetDisplayName(body.name)
                 mesh = define_mesh(self._stage, xform.GetPath().AppendChild("skin"), body.skin.triangles)
-                meshes.append(_MeshPrim(mesh, xform.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble), self.fields))
+                meshes.append(_MeshPrim(mesh, xform.AddTranslateOp(pxr.UsdGeom.XformOp.PrecisionDouble), self.fields))
         self._obstacles = ObstaclePrims(self._stage, self._surface, names)
         self._obstacles.define()
 
@@ -180,8 +173,6 @@ class USDWriter(Output):
             self._write_frame(sim, time)
 
     def _write_frame(self, sim: Any, time: float) -> None:
-        from pxr import Tf
-
         code = self._clock.time_code(time)
         try:
             samples = [
@@ -200,7 +191,7 @@ class USDWriter(Output):
             self._time_codes.append(code)
             if self._unsaved_bytes > _SAVE_BYTES and self.path.suffix.lower() != ".usda":
                 self._save()
-        except Tf.ErrorException as error:
+        except pxr.Tf.ErrorException as error:
             raise OutputError(f"{self.path}: can't be written ({error_text(error)})") from error
 
     def _field_values(self, sim: Any, name: str, body: Any) -> npt.NDArray[np.float32]:
@@ -219,8 +210,6 @@ class USDWriter(Output):
     def close(self, sim: Any) -> None:
         if self._stage is None or self._temporary is None:
             return
-        from pxr import Sdf, Tf
-
         temporary = self._temporary
         try:
             time = frame_time(sim)
@@ -235,11 +224,11 @@ class USDWriter(Output):
             os.replace(temporary, self.path)
         except OSError as error:
             raise OutputError(f"{self.path}: can't be written ({error})") from error
-        except Tf.ErrorException as error:
+        except pxr.Tf.ErrorException as error:
             raise OutputError(f"{self.path}: can't be written ({error_text(error)})") from error
         finally:
             self.abort()
-        stale = Sdf.Layer.Find(str(self.path))
+        stale = pxr.Sdf.Layer.Find(str(self.path))
         if stale is not None:
             stale.Reload(True)
 
@@ -280,14 +269,14 @@ class _MeshPrim:
     """The varying attributes of one body in one world."""
 
     def __init__(self, mesh: Any, translate: Any, fields: Sequence[str]) -> None:
-        from pxr import Sdf, Tf, UsdGeom
-
         self.translate, self.points = translate, mesh.CreatePointsAttr()
         self.normals, self.extent = mesh.CreateNormalsAttr(), mesh.CreateExtentAttr()
-        self.color = mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
-        api = UsdGeom.PrimvarsAPI(mesh)
+        self.color = mesh.CreateDisplayColorPrimvar(pxr.UsdGeom.Tokens.vertex)
+        api = pxr.UsdGeom.PrimvarsAPI(mesh)
         self.fields = {
-            name: api.CreatePrimvar(Tf.MakeValidIdentifier(name), Sdf.ValueTypeNames.FloatArray, UsdGeom.Tokens.vertex)
+            name: api.CreatePrimvar(
+                pxr.Tf.MakeValidIdentifier(name), pxr.Sdf.ValueTypeNames.FloatArray, pxr.UsdGeom.Tokens.vertex
+            )
             for name in fields
         }
 
@@ -295,50 +284,42 @@ class _MeshPrim:
         self, code: float, points: npt.NDArray[Any], triangles: npt.NDArray[Any], values: dict[str, Any]
     ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
         """One frame of points (P, 3) and fields (P,); returns the corners of their box in the world."""
-        from pxr import Gf, Vt
-
         low, high = points.min(axis=0), points.max(axis=0)
         center = 0.5 * (low + high)
         local = np.ascontiguousarray(points - center, dtype=np.float32)
-        self.translate.Set(Gf.Vec3d(*map(float, center)), code)
-        self.points.Set(Vt.Vec3fArray.FromNumpy(local), code)
-        self.normals.Set(Vt.Vec3fArray.FromNumpy(vertex_normals(local.astype(np.float64), triangles)), code)
+        self.translate.Set(pxr.Gf.Vec3d(*map(float, center)), code)
+        self.points.Set(pxr.Vt.Vec3fArray.FromNumpy(local), code)
+        self.normals.Set(pxr.Vt.Vec3fArray.FromNumpy(vertex_normals(local.astype(np.float64), triangles)), code)
         extent = np.stack([local.min(axis=0), local.max(axis=0)])
-        self.extent.Set(Vt.Vec3fArray.FromNumpy(extent), code)
+        self.extent.Set(pxr.Vt.Vec3fArray.FromNumpy(extent), code)
         for name, primvar in self.fields.items():
-            primvar.Set(Vt.FloatArray.FromNumpy(np.ascontiguousarray(values[name])), code)
+            primvar.Set(pxr.Vt.FloatArray.FromNumpy(np.ascontiguousarray(values[name])), code)
         return low, high
 
     def write_colors(self, name: str | None, shown: tuple[float, float]) -> int:
         """Display colours (linear light) of every frame from the field's samples; returns the bytes set."""
-        from pxr import Gf, UsdGeom, Vt
-
         if name is None:
-            self.color.SetInterpolation(UsdGeom.Tokens.constant)
-            self.color.Set(Vt.Vec3fArray([Gf.Vec3f(*_BODY_COLOR)]))
+            self.color.SetInterpolation(pxr.UsdGeom.Tokens.constant)
+            self.color.Set(pxr.Vt.Vec3fArray([pxr.Gf.Vec3f(*_BODY_COLOR)]))
             return 12
         size = 0
         for code in self.fields[name].GetTimeSamples():
             colors = map_colors(np.asarray(self.fields[name].Get(code)), *shown, linear=True)
-            self.color.Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(colors)), code)
+            self.color.Set(pxr.Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(colors)), code)
             size += colors.nbytes
         return size
 
 
 def _vec2d(pair: tuple[float, float]) -> Any:
-    from pxr import Gf
-
-    return Gf.Vec2d(float(pair[0]), float(pair[1]))
+    return pxr.Gf.Vec2d(float(pair[0]), float(pair[1]))
 
 
 def _define_camera(stage: Any, low: npt.NDArray[np.float64], high: npt.NDArray[np.float64], up_axis: str) -> None:
     """A camera that frames the box (m) from the front right above, a sky and a sun."""
-    from pxr import Gf, UsdGeom, UsdLux
-
     if not np.isfinite(low).all():
         low, high = -np.ones(3), np.ones(3)
     center, radius = 0.5 * (low + high), max(0.5 * float(np.linalg.norm(high - low)), 1e-6)
-    up = Gf.Vec3d(0, 0, 1) if up_axis == "Z" else Gf.Vec3d(0, 1, 0)
+    up = pxr.Gf.Vec3d(0, 0, 1) if up_axis == "Z" else pxr.Gf.Vec3d(0, 1, 0)
 
     def direction(azimuth: float, elevation: float) -> npt.NDArray[np.float64]:
         a, e = np.radians([azimuth, elevation])
@@ -346,19 +327,19 @@ def _define_camera(stage: Any, low: npt.NDArray[np.float64], high: npt.NDArray[n
         return np.array([x, y, z] if up_axis == "Z" else [x, z, -y])
 
     def look_from(xform: Any, eye: npt.NDArray[np.float64]) -> None:
-        view = Gf.Matrix4d().SetLookAt(Gf.Vec3d(*map(float, eye)), Gf.Vec3d(*map(float, center)), up)
+        view = pxr.Gf.Matrix4d().SetLookAt(pxr.Gf.Vec3d(*map(float, eye)), pxr.Gf.Vec3d(*map(float, center)), up)
         xform.AddTransformOp().Set(view.GetInverse())
 
-    camera = UsdGeom.Camera.Define(stage, "/World/Camera")
+    camera = pxr.UsdGeom.Camera.Define(stage, "/World/Camera")
     camera.CreateFocalLengthAttr(50.0)
     camera.CreateHorizontalApertureAttr(36.0)
     camera.CreateVerticalApertureAttr(20.25)
     distance = 1.05 * radius / np.sin(np.arctan(0.5 * 20.25 / 50.0))
     look_from(camera, center + distance * direction(-65.0, 20.0))
-    camera.CreateClippingRangeAttr(Gf.Vec2f(float(1e-3 * distance), float(1e3 * distance)))
-    sun = UsdLux.DistantLight.Define(stage, "/World/Sun")
+    camera.CreateClippingRangeAttr(pxr.Gf.Vec2f(float(1e-3 * distance), float(1e3 * distance)))
+    sun = pxr.UsdLux.DistantLight.Define(stage, "/World/Sun")
     look_from(sun, center + radius * direction(-110.0, 50.0))
     sun.CreateIntensityAttr(2.0)
     sun.CreateNormalizeAttr(True)
     sun.CreateAngleAttr(2.0)
-    UsdLux.DomeLight.Define(stage, "/World/Sky").CreateIntensityAttr(0.5)
+    pxr.UsdLux.DomeLight.Define(stage, "/World/Sky").CreateIntensityAttr(0.5)

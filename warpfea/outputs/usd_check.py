@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from ..base.lazy import pxr
+
 __all__ = ["error_text", "validate_usd"]
 
 
@@ -24,35 +26,31 @@ def validate_usd(path: str | os.PathLike[str], max_samples: int = 64) -> list[st
     of its times (evenly spread, first and last included) finite points, unit normals, extents that hold the
     points, and counts of normals and primvars. No message of a validator is filtered out.
     """
-    from pxr import Tf, Usd, UsdGeom, UsdPhysics, UsdValidation
-
     try:
-        stage = Usd.Stage.Open(str(path))
-    except Tf.ErrorException as error:
+        stage = pxr.Usd.Stage.Open(str(path))
+    except pxr.Tf.ErrorException as error:
         return [f"{path}: can't be opened ({error_text(error)})"]
-    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    validators = pxr.UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
     problems = [
         f"{error.GetName()}: {error.GetMessage()}"
-        for error in UsdValidation.ValidationContext(validators).Validate(stage)
+        for error in pxr.UsdValidation.ValidationContext(validators).Validate(stage)
     ]
-    if not UsdGeom.StageHasAuthoredMetersPerUnit(stage):
+    if not pxr.UsdGeom.StageHasAuthoredMetersPerUnit(stage):
         problems.append("metersPerUnit is missing")
-    if not UsdPhysics.StageHasAuthoredKilogramsPerUnit(stage):
+    if not pxr.UsdPhysics.StageHasAuthoredKilogramsPerUnit(stage):
         problems.append("kilogramsPerUnit is missing")
-    if not stage.HasAuthoredMetadata(UsdGeom.Tokens.upAxis):
+    if not stage.HasAuthoredMetadata(pxr.UsdGeom.Tokens.upAxis):
         problems.append("upAxis is missing")
     if not stage.GetDefaultPrim():
         problems.append("defaultPrim is missing")
     for prim in stage.Traverse():
-        if prim.IsA(UsdGeom.Mesh):
+        if prim.IsA(pxr.UsdGeom.Mesh):
             problems += [f"{prim.GetPath()}: {text}" for text in _mesh_problems(stage, prim, max_samples)]
     return problems
 
 
 def _mesh_problems(stage: Any, prim: Any, max_samples: int) -> list[str]:
-    from pxr import UsdGeom
-
-    mesh = UsdGeom.Mesh(prim)
+    mesh = pxr.UsdGeom.Mesh(prim)
     counts = np.asarray(mesh.GetFaceVertexCountsAttr().Get() or (), dtype=np.int64)
     indices = np.asarray(mesh.GetFaceVertexIndicesAttr().Get() or (), dtype=np.int64)
     problems = []
@@ -60,8 +58,8 @@ def _mesh_problems(stage: Any, prim: Any, max_samples: int) -> list[str]:
         problems.append("face counts and indices do not match")
     primvars = {
         p.GetPrimvarName(): p
-        for p in UsdGeom.PrimvarsAPI(mesh).GetPrimvars()
-        if p.GetInterpolation() == UsdGeom.Tokens.vertex and p.HasValue()
+        for p in pxr.UsdGeom.PrimvarsAPI(mesh).GetPrimvars()
+        if p.GetInterpolation() == pxr.UsdGeom.Tokens.vertex and p.HasValue()
     }
     codes = np.asarray(mesh.GetPointsAttr().GetTimeSamples() or (0.0,))
     if len(codes) > 1 and not (stage.GetStartTimeCode() <= codes[0] and codes[-1] <= stage.GetEndTimeCode()):

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import OutputError
+from ..base.lazy import pxr
 from .frames import DrawnSurface, frame_time, is_static
 
 __all__ = ["ExistingStage", "read_existing"]
@@ -49,8 +50,6 @@ def read_existing(
     Raises:
         OutputError: another writer, scene or setting, another end time than the simulation's, or another motion.
     """
-    from pxr import UsdGeom
-
     root = stage.GetDefaultPrim()
     about = root.GetCustomDataByKey("warpfea") if root else None
     if not about:
@@ -60,13 +59,13 @@ def read_existing(
         "frames per second": (float(stage.GetTimeCodesPerSecond()), float(wanted["fps"])),
         "fields": (sorted(about["fields"]), sorted(wanted["fields"])),
         "field in colour": (str(about["color"]), wanted["color"] or ""),
-        "up axis": (str(UsdGeom.GetStageUpAxis(stage)), surface.up_axis),
+        "up axis": (str(pxr.UsdGeom.GetStageUpAxis(stage)), surface.up_axis),
         "kind": (bool(about.get("static", False)), is_static(sim)),
     }
     for what, (old, new) in has.items():
         if old != new:
             raise _extension_error(target, f"its {what} is {old!r}, of this run {new!r}")
-    meshes = [[UsdGeom.Mesh(stage.GetPrimAtPath(path)) for path in worlds] for worlds in paths]
+    meshes = [[pxr.UsdGeom.Mesh(stage.GetPrimAtPath(path)) for path in worlds] for worlds in paths]
     _check_faces(target, surface, meshes)
     codes = list(map(float, meshes[0][0].GetPointsAttr().GetTimeSamples()))
     if not codes:
@@ -118,9 +117,7 @@ def _extension_error(target: pathlib.Path, reason: str) -> OutputError:
 def _translation(prim: Any, *code: float) -> npt.NDArray[np.float64]:
     """Translation of a prim, (3,) m, at a time code: the parent of a mesh is at the body's centre in its world, that
     of the body at the origin of the world on the grid."""
-    from pxr import UsdGeom
-
-    (op,) = UsdGeom.Xformable(prim).GetOrderedXformOps()
+    (op,) = pxr.UsdGeom.Xformable(prim).GetOrderedXformOps()
     return np.asarray(op.Get(*code), dtype=float)
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..base.lazy import pxr
 from .colormap import to_linear
 from .normals import vertex_normals
 from .obstacles import OBSTACLE_COLOR, unique_names
@@ -21,14 +22,12 @@ COLLIDER_KEY = "warpfea:collider"
 
 def define_mesh(stage: Any, path: Any, triangles: np.ndarray) -> Any:
     """A mesh of triangles (T, 3) with a normal at each vertex."""
-    from pxr import UsdGeom, Vt
-
-    mesh = UsdGeom.Mesh.Define(stage, path)
-    mesh.CreateFaceVertexCountsAttr(Vt.IntArray(len(triangles), 3))
-    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.ascontiguousarray(triangles, dtype=np.int32).ravel()))
-    mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-    mesh.CreateOrientationAttr(UsdGeom.Tokens.rightHanded)
-    mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+    mesh = pxr.UsdGeom.Mesh.Define(stage, path)
+    mesh.CreateFaceVertexCountsAttr(pxr.Vt.IntArray(len(triangles), 3))
+    mesh.CreateFaceVertexIndicesAttr(pxr.Vt.IntArray.FromNumpy(np.ascontiguousarray(triangles, dtype=np.int32).ravel()))
+    mesh.CreateSubdivisionSchemeAttr(pxr.UsdGeom.Tokens.none)
+    mesh.CreateOrientationAttr(pxr.UsdGeom.Tokens.rightHanded)
+    mesh.SetNormalsInterpolation(pxr.UsdGeom.Tokens.vertex)
     return mesh
 
 
@@ -42,10 +41,10 @@ class ObstaclePrims:
     """
 
     def __init__(self, stage: Any, surface: DrawnSurface, bodies: Sequence[str]) -> None:
-        from pxr import Tf
-
         self.stage, self.surface, self.obstacles = stage, surface, surface.obstacles
-        self.names = unique_names(bodies, [Tf.MakeValidIdentifier(obstacle.name) for obstacle in self.obstacles.all])
+        self.names = unique_names(
+            bodies, [pxr.Tf.MakeValidIdentifier(obstacle.name) for obstacle in self.obstacles.all]
+        )
         self._transform_ops: list[list[tuple[Any, Any]]] = []
 
     def _prim_path(self, world: int, name: str) -> str:
@@ -53,35 +52,29 @@ class ObstaclePrims:
 
     def define(self) -> None:
         """Author meshes, and the transforms of fixed obstacles."""
-        from pxr import UsdGeom
-
         for obstacle, name in zip(self.obstacles.all, self.names):
             ops = []
             for world in range(self.surface.worlds):
-                xform = UsdGeom.Xform.Define(self.stage, self._prim_path(world, name))
+                xform = pxr.UsdGeom.Xform.Define(self.stage, self._prim_path(world, name))
                 xform.GetPrim().SetDisplayName(obstacle.name)
-                double = UsdGeom.XformOp.PrecisionDouble
+                double = pxr.UsdGeom.XformOp.PrecisionDouble
                 ops.append((xform.AddTranslateOp(double), xform.AddOrientOp(double)))
                 self._define_mesh(obstacle, world, self._prim_path(world, name) + "/shape")
             self._transform_ops.append(ops)
         self._set_transforms(lambda obstacle: not obstacle.moves)
 
     def _define_mesh(self, obstacle: Any, world: int, path: str) -> None:
-        from pxr import Gf, UsdGeom, Vt
-
         points = np.asarray(obstacle.points[world], dtype=np.float32)
         mesh = define_mesh(self.stage, path, obstacle.triangles)
         mesh.GetPrim().SetCustomDataByKey(COLLIDER_KEY, obstacle.kind)
-        mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
-        mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(vertex_normals(points.astype(float), obstacle.triangles)))
-        mesh.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.stack([points.min(axis=0), points.max(axis=0)])))
-        grey = Gf.Vec3f(*map(float, to_linear(OBSTACLE_COLOR)))
-        mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set(Vt.Vec3fArray([grey]))
+        mesh.CreatePointsAttr(pxr.Vt.Vec3fArray.FromNumpy(points))
+        mesh.CreateNormalsAttr(pxr.Vt.Vec3fArray.FromNumpy(vertex_normals(points.astype(float), obstacle.triangles)))
+        mesh.CreateExtentAttr(pxr.Vt.Vec3fArray.FromNumpy(np.stack([points.min(axis=0), points.max(axis=0)])))
+        grey = pxr.Gf.Vec3f(*map(float, to_linear(OBSTACLE_COLOR)))
+        mesh.CreateDisplayColorPrimvar(pxr.UsdGeom.Tokens.constant).Set(pxr.Vt.Vec3fArray([grey]))
 
     def resume(self) -> bool:
         """Find the prims in an extended stage; False if it has others."""
-        from pxr import UsdGeom
-
         there = {
             str(prim.GetParent().GetPath()) for prim in self.stage.Traverse() if prim.GetCustomDataByKey(COLLIDER_KEY)
         }
@@ -90,7 +83,7 @@ class ObstaclePrims:
             return False
         for name in self.names:
             prims = [self.stage.GetPrimAtPath(self._prim_path(world, name)) for world in worlds]
-            ops = [UsdGeom.Xformable(prim).GetOrderedXformOps() for prim in prims]
+            ops = [pxr.UsdGeom.Xformable(prim).GetOrderedXformOps() for prim in prims]
             self._transform_ops.append([(pair[0], pair[1]) for pair in ops])
         return True
 
@@ -99,14 +92,12 @@ class ObstaclePrims:
         self._set_transforms(lambda obstacle: obstacle.moves, code)
 
     def _set_transforms(self, chosen: Any, *code: float) -> None:
-        from pxr import Gf
-
         if not any(map(chosen, self.obstacles.all)):
             return
         position, rotation = self.obstacles.poses()
         for k, obstacle in enumerate(self.obstacles.all):
             for world, (translate, orient) in enumerate(self._transform_ops[k] if chosen(obstacle) else ()):
-                translate.Set(Gf.Vec3d(*map(float, position[world, k])), *code)
+                translate.Set(pxr.Gf.Vec3d(*map(float, position[world, k])), *code)
                 # rows are the images of the axes
-                quaternion = Gf.Matrix3d(*map(float, rotation[world, k].T.ravel())).ExtractRotation().GetQuat()
-                orient.Set(Gf.Quatd(quaternion), *code)
+                quaternion = pxr.Gf.Matrix3d(*map(float, rotation[world, k].T.ravel())).ExtractRotation().GetQuat()
+                orient.Set(pxr.Gf.Quatd(quaternion), *code)

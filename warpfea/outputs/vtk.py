@@ -12,6 +12,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from ..base.errors import OutputError
+from ..base.lazy import meshio
 from ..base.writer import Output, check_folder, write_atomically
 from ..model.surfaces import reference_points
 from .frames import FrameClock, check_fields, frame_time
@@ -269,8 +270,6 @@ def _element_set_flags(mesh: Any, element: np.ndarray) -> dict[str, np.ndarray]:
 
 def _write_vtu(cells: Cells, points: np.ndarray, data: dict[str, np.ndarray], path: pathlib.Path) -> None:
     """One VTU file. All arguments are copied, since meshio modifies its input."""
-    import meshio
-
     mesh = meshio.Mesh(
         np.array(points),
         [(cells[0], np.array(cells[1]))],

@@ -23,10 +23,10 @@ def _stability_answer(b: wf.ModelBuilder, setting: Setting, stable: bool, refere
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", wf.StabilityWarning)
         found = solve(b, setting)
-    told = found.result.stability
-    assert told is not None
-    error = 0.5 if told.stable[0] is None else float(told.stable[0] is not stable)
-    note = f"{told.text} {told.reasons[0]}, {int(told.iterations[0])} products"
+    stability = found.result.stability
+    assert stability is not None
+    error = 0.5 if stability.stable[0] is None else float(stability.stable[0] is not stable)
+    note = f"{stability.text} {stability.reasons[0]}, {int(stability.iterations[0])} products"
     return Answer(error, 0.1, reference, **found.stats.answer_fields, note=note)
 
 

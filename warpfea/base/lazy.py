@@ -1,0 +1,20 @@
+"""Packages that are imported on first use, so that `import warpfea` is light."""
+
+import importlib
+from typing import Any
+
+__all__ = ["LazyPackage", "meshio", "pillow", "pxr"]
+
+
+class LazyPackage:
+    """Package of which a member or a module is imported where it is read as an attribute."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __getattr__(self, name: str) -> Any:
+        package = importlib.import_module(self._name)
+        return getattr(package, name) if hasattr(package, name) else importlib.import_module(f"{self._name}.{name}")
+
+
+meshio, pillow, pxr = LazyPackage("meshio"), LazyPackage("PIL"), LazyPackage("pxr")
