@@ -9,6 +9,7 @@ order in the step, exact at the ends of steps).
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -93,7 +94,7 @@ def known_motion(reference: Reference, chosen: Sequence[str] | None, run: Outcom
         if times is not None and not np.array_equal(times, sample_times[inside]):
             raise ModelError(f"reference {reference.about!r}: its probes must have the same times")
         times = sample_times[inside]
-        probes[name] = lambda at, times=times, x=x[inside]: x[np.searchsorted(times, at)]
+        probes[name] = functools.partial(_sample_at, times, x[inside])
     curve = np.linspace(0.0, t_end, TRAVEL_SAMPLES)[1:] if times is None else times
     travel = _largest_travel(probes, run.start_positions, curve)
     own_error = reference.error / travel
@@ -110,6 +111,10 @@ def _validated_function(function: Callable[[np.ndarray], Any], what: str) -> Cal
         return out
 
     return call
+
+
+def _sample_at(times: np.ndarray, x: np.ndarray, at: np.ndarray) -> np.ndarray:
+    return x[np.searchsorted(times, at)]
 
 
 def _largest_travel(

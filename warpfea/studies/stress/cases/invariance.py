@@ -23,7 +23,7 @@ def _cantilever(
     R = turn.as_matrix()
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     cells = {"3243": (4,), "3443": (8, 1)}.get(element, (6, 1, 1))
-    body, start, end = add_along_x(b, element, cells, unit * np.array(SIZE), law, turn=R, shift=shift)
+    body, start, end = add_along_x(b, element, cells, [unit * side for side in SIZE], law, turn=R, shift=shift)
     b.clamp(start)
     b.add_point_load(end, tuple(load * R[:, 2]))
     b.add_probe("tip", end)

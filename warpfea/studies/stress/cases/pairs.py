@@ -134,6 +134,7 @@ def spinning_stack(setting: Setting, rate: float) -> Answer:
     """A cube pressed on a free one, both spun about their common axis: they rotate as one, 40 steps of 1 ms."""
     s = cube_on_plate(width=SIDE, across=2, clamped=False, gravity=(0, 0, 0), mu=0.8, restitution=0.5)
     b = s.builder
+    assert s.lower is not None
     for body in (s.body, s.lower):
         b.set_initial(body, velocity=lambda X: rate * np.cross((0.0, 0.0, 1.0), X))
     b.add_traction(s.body.surface("z+"), (0, 0, -1e3))
