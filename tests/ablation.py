@@ -299,6 +299,29 @@ def study(options: argparse.Namespace, done: Sequence[Row]) -> Iterator[Row]:
             yield label | _compare(base, rows)
 
 
+def tables(rows: Sequence[Row]) -> str:
+    """Markdown: mechanisms, then constants by area, each with its value, unit, and a row that is lost without it."""
+    alone = {row["variant"]: row for row in rows if "+" not in row["variant"] and (row["lost"] or not row["random"])}
+    out = []
+    for area in ("globalisation", NEWTON_PCG, REUSE, ADAPTIVE, CONTACT):
+        out += ["", f"## {area[0].upper()}{area[1:]}", ""]
+        heads = ["name", "lost without it"] if area == "globalisation" else ["name", "value", "unit", "lost without it"]
+        out += ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
+        for name, row in alone.items():
+            if row["area"] == area and (name in MECHANISMS or name in CONSTANTS):
+                values = [f"{row['value']:g}", row["unit"]] if name in CONSTANTS else []
+                out.append("| " + " | ".join([name, *values, reason(row)]) + " |")
+    return "\n".join(out) + "\n"
+
+
+def reason(row: Row) -> str:
+    """The first lost row of a variant and the number of others, or the iterations that it saves."""
+    if row["lost"]:
+        case = ": ".join(row["lost"][0].split(": ")[:2])
+        return case + (f", and {len(row['lost']) - 1} more" if len(row["lost"]) > 1 else "")
+    return f"{row['newton']:.2f} times the Newton, {row['pcg']:.2f} times the PCG iterations"
+
+
 def main() -> None:
     """Run the command line."""
     from warpfea.base.console import write_json
