@@ -16,7 +16,7 @@ plate.
 
 "smooth": Paper I, 6.2.
 
-A law of one's own is an entry of `LAWS`, see "A new contact law" in warpfea/README.md.
+A law of one's own is an entry of `LAWS`, see "Add a contact law" in warpfea/README.md.
 """
 
 import functools
