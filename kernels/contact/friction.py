@@ -3,8 +3,8 @@
 The normal force is `normal_law` of the depth. Friction is an anchored spring and damper of the elastic slip, whose
 force is cut at the friction limit mu F_n (`friction_trial`, `friction_force`, `return_mapping`). With a frozen limit
 friction has a potential, Huber's; with the limits of each iterate it has none, and an iterate deep in an obstacle has a
-huge one. Stick or slip is decided after an accepted step, in `point_outcome` of ledger.py; the `SLIP_FLAG` that it stores
-selects mu or mu_static in the next one.
+huge one. Stick or slip is decided after an accepted step, in `point_outcome` of ledger.py; the `SLIP_FLAG` that it
+stores selects mu or mu_static in the next one.
 
 Limits, the plane of friction and the elastic slip's factor are frozen over Newton's iterations. `forces` (assembly.py)
 sets those of an attempt from its first iterate, at most the limits of the last step, and stores those of each later

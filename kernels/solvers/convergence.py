@@ -79,8 +79,8 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
         is the residual, Eq. (17). Sums over a world: inertia and the frozen forces f_frozen (dead loads, and
         non-conservative forces at the start of the search) are slot_sums[ROW_OBJECTIVE], of `residual`; Psi_el and
         Psi_visc, J, are elem_sums[0] and [1], of `internal_force`; Psi_terms, J, is term_sums[0]: of constraints
-        lambda.c + rho/2 c.c, of contact its potential, of other terms their `stored_energy`. With the trait "midpoint" Phi does not exist: half of the squared D^-1 norm of the residual
-        replaces it.
+        lambda.c + rho/2 c.c, of contact its potential, of other terms their own. With the trait
+        "midpoint" Phi does not exist: half of the squared D^-1 norm of the residual replaces it.
         """
         if wp.static(traits.midpoint):
             return ctl.slot_sums[ROW_OBJECTIVE, world]
