@@ -34,7 +34,6 @@ from .builder.scene import scene  # noqa: E402
 from .elements.sections import Rectangle  # noqa: E402
 from .materials import SVK, KelvinVoigt, MooneyRivlin, NeoHookean  # noqa: E402
 from .model.bodies import Body  # noqa: E402
-from .model.description import Rotation  # noqa: E402
 from .model.handles import ElementSet, MaterialPoint, NodeSet, SurfaceSet  # noqa: E402
 from .model.joints import Joint  # noqa: E402
 from .model.model import Model  # noqa: E402
@@ -50,7 +49,7 @@ from .simulation.observations import Observations  # noqa: E402
 from .simulation.simulation import Simulation, StepReport  # noqa: E402
 from .simulation.statics import solve_static  # noqa: E402
 from .solvers import Jacobi, NewtonPCG  # noqa: E402
-from .time_laws import Control  # noqa: E402
+from .time_laws import Control, Rotation  # noqa: E402
 
 __all__ = [
     "GROUND", "SVK", "Body", "Box", "CapacityError", "Capsule", "Checkpoint", "CheckpointError", "ConstraintError",

@@ -25,9 +25,9 @@ from .builder.reference import Reference as Reference
 from .builder.scene import scene as scene
 from .elements.sections import Rectangle as Rectangle
 from .time_laws import Control as Control
+from .time_laws import Rotation as Rotation
 from .materials import SVK as SVK, KelvinVoigt as KelvinVoigt, MooneyRivlin as MooneyRivlin, NeoHookean as NeoHookean
 from .model.bodies import Body as Body
-from .model.description import Rotation as Rotation
 from .model.handles import (
     ElementSet as ElementSet,
     MaterialPoint as MaterialPoint,

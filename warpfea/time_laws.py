@@ -8,8 +8,9 @@ import warp as wp
 
 from .base.checks import float_array, number_hint
 from .base.errors import ModelError
+from .base.short_repr import use_short_repr
 
-__all__ = ["Control", "TimeLaw", "time_law"]
+__all__ = ["Control", "Rotation", "TimeLaw", "time_law"]
 
 SIZE_NAMES = {1: "a scalar", 3: "a vector"}
 """Sizes of a control, as text."""
@@ -47,6 +48,23 @@ class Control:
             raise ModelError(f"control {self.name!r}: initial = {self.initial!r} must be {expected}")
         object.__setattr__(self, "size", int(self.size))
         object.__setattr__(self, "initial", tuple(np.broadcast_to(value, (self.size,)).tolist()))
+
+
+@dataclass(frozen=True, eq=False)
+class Rotation:
+    """A prescribed rotation about an axis through an anchor.
+
+    Args:
+        anchor: (3,) m.
+        axis: (3,), any length but zero.
+        angle: time law, rad.
+    """
+
+    anchor: Any
+    axis: Any
+    angle: Any
+
+    __repr__ = use_short_repr
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ import warp as wp
 
 from .errors import ModelError
 
-__all__ = ["check_values_per_world", "to_host", "values_per_world", "worlds_mask"]
+__all__ = ["check_values_per_world", "device_flags", "set_rows", "to_host", "values_per_world", "worlds_mask"]
 
 
 def to_host(values: Any) -> np.ndarray:
@@ -69,3 +69,15 @@ def check_values_per_world(what: str, name: str, values: np.ndarray, good: np.nd
     """Raise ModelError for the first world with an invalid value; `wanted`: the requirement."""
     for world in np.flatnonzero(~good)[:1]:
         raise ModelError(f"{what}: {name} = {values[world].tolist()!r} in world {world} must be {wanted}")
+
+
+def device_flags(flags: Any, device: Any) -> wp.array:
+    """Flags of worlds on a device, int32."""
+    return wp.array(np.asarray(flags).astype(np.int32), dtype=wp.int32, device=device)
+
+
+def set_rows(array: wp.array, chosen: Any, values: Any) -> None:
+    """Set `array[chosen]`, with a mask or index of numpy, in place: captured graphs read the array."""
+    host = array.numpy()
+    host[chosen] = values
+    array.assign(host)

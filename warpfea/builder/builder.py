@@ -12,7 +12,7 @@ from ..elements.sections import Rectangle
 from ..materials import Material
 from ..model.bodies import Body
 from ..model.contacts import Collider, Contact
-from ..model.description import BodyForce, Description, Rotation
+from ..model.description import BodyForce, Description
 from ..model.handles import MaterialPoint, NodeSet, SurfaceSet
 from ..model.joints import Joint
 from ..model.model import Model
@@ -20,15 +20,14 @@ from ..model.pairs import PairContact
 from ..model.shapes import Shape
 from ..terms.term import Term
 from ..terms.term_set import TermSet
+from ..time_laws import Rotation
 from . import loads
 from .attachments import Ground
 from .beams import beam_geometry
-from .bodies import MeshLike, as_mesh, make_solid, make_structure, unused_name
+from .bodies import MeshLike, as_mesh, make_solid, make_structure, shell_geometry, unused_name
 from .checks import body_of_handle, check_densities, parse_gravity, warn_implausible
 from .contacts import add_contact, make_collider
 from .joints import make_constraint, make_joint
-from .loads import clamp_support, drive_supports
-from .shells import shell_geometry
 from .welds import make_weld
 
 __all__ = ["ModelBuilder"]
@@ -179,7 +178,7 @@ class ModelBuilder:
             ModelError: an unknown name of slots or components, or nodes of another builder.
         """
         body = self._check_owner(nodes, "clamp", NodeSet)
-        self.description.supports.append(clamp_support(body, nodes, slots, components))
+        self.description.supports.append(loads.clamp_support(body, nodes, slots, components))
 
     def drive(
         self, nodes: NodeSet, *, displacement: Any = None, rotation: Rotation | None = None, components: str = "xyz",
@@ -200,7 +199,7 @@ class ModelBuilder:
             ModelError: neither or both of displacement and rotation, or a wrong shape.
         """
         body = self._check_owner(nodes, "drive", NodeSet)
-        self.description.supports += drive_supports(body, nodes, displacement, rotation, components, slots)
+        self.description.supports += loads.drive_supports(body, nodes, displacement, rotation, components, slots)
 
     # loads
 

@@ -16,11 +16,11 @@ from ..model.assembly import require_density
 from ..model.bodies import Body
 from ..model.description import Description
 from ..model.handles import ElementSet, MaterialPoint, NodeSet, SurfaceSet
-from ..time_laws import Control, TimeLaw, time_law
+from ..time_laws import Control, Rotation, TimeLaw, time_law
 
 __all__ = [
-    "COMPONENT_INDEX", "assign_materials", "body_of_handle", "check_densities", "component_mask", "nodal_vectors",
-    "parse_gravity", "slot_field", "vector", "warn_implausible",
+    "COMPONENT_INDEX", "assign_materials", "body_of_handle", "check_densities", "checked_rotation", "component_mask",
+    "nodal_vectors", "parse_gravity", "slot_field", "unit_vector", "vector", "warn_implausible",
 ]  # fmt: skip
 
 COMPONENT_INDEX = {"x": 0, "y": 1, "z": 2}
@@ -144,6 +144,20 @@ def vector(value: Any, what: str) -> np.ndarray:
         hint = f"; write a vector such as (0, 0, {value!r})" if out.shape == () else ""
         raise ModelError(f"{what} = {value!r} is not three finite numbers{hint}")
     return out
+
+
+def unit_vector(value: Any, what: str) -> np.ndarray:
+    """Three finite numbers as a vector of length 1. ModelError otherwise."""
+    out = vector(value, what)
+    if not np.linalg.norm(out) > 0.0:
+        raise ModelError(f"{what} is zero")
+    return out / np.linalg.norm(out)
+
+
+def checked_rotation(rotation: Rotation, what: str) -> Rotation:
+    """A rotation with an axis of length 1 and a scalar time law of the angle. ModelError for a bad value."""
+    axis, anchor = unit_vector(rotation.axis, f"{what}: axis"), vector(rotation.anchor, f"{what}: anchor")
+    return Rotation(anchor, axis, time_law(rotation.angle, f"{what}: angle", scalar=True))
 
 
 def nodal_vectors(values: Any, nodes: int, what: str) -> np.ndarray:

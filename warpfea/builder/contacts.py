@@ -15,15 +15,14 @@ from ..contact import ANY_GAP, LAWS, ContactLaw
 from ..kernels.contact.collider_shapes import SHAPE_KINDS
 from ..model.bodies import Body
 from ..model.contact_points import check_contact_points
-from ..model.contacts import Collider, ColliderRotation, Contact
-from ..model.description import Description, Rotation
+from ..model.contacts import Collider, Contact
+from ..model.description import Description
 from ..model.handles import SurfaceSet
 from ..model.pairs import PAIR_RULES, PairContact, slave_and_master
 from ..model.shapes import Shape
-from ..model.triangle_mesh import TriMesh
-from ..time_laws import time_law
+from ..time_laws import Rotation, time_law
 from .bodies import unused_name
-from .checks import vector
+from .checks import checked_rotation
 
 __all__ = ["CONTACT_MODELS", "OVERLAP_OPTIONS", "TIME_TREATMENTS", "make_collider", "make_contact",
            "make_pair", "outer_surface"]  # fmt: skip
@@ -48,11 +47,7 @@ def make_collider(d: Description, shape: Any, path: Any, name: str | None) -> Co
     out = Collider(shape, name, index=len(d.colliders))
     what = f"collider {name!r}: path"
     if isinstance(path, Rotation):
-        axis = vector(path.axis, f"{what}: axis")
-        if not np.linalg.norm(axis) > 0.0:
-            raise ModelError(f"{what}: axis is zero")
-        angle = time_law(path.angle, f"{what}: angle", scalar=True)
-        out.rotation = ColliderRotation(vector(path.anchor, f"{what}: anchor"), axis / np.linalg.norm(axis), angle)
+        out.rotation = checked_rotation(path, what)
     elif path is not None:
         out.law = time_law(path, what)
     return out
@@ -110,7 +105,7 @@ def make_contact(d: Description, thing: Body | SurfaceSet, collider: Any, name: 
     default = f"{surface.body.name} on {collider.name}"
     name = unused_name(name, default, {c.name for c in d.contacts}, "contact")
     o = _checked_options(f"contact {name!r}", surface, dict(options))
-    if o["model"] == "sphere" and isinstance(collider.shape, TriMesh) and not collider.shape.closed:
+    if o["model"] == "sphere" and collider.is_sheet:
         raise ModelError(
             f"contact {name!r}: collider {collider.name!r} is a sheet of triangles, and model = 'sphere' needs an "
             "obstacle with an inside: take model = 'patch', or a closed mesh"

@@ -24,7 +24,7 @@ from ..kernels.terms.constraints import ANGLE, DISTANCE, DOT
 from ..model.joints import ConstraintRow, Joint, Vector, check_rows, constant_vector
 from ..time_laws import TimeLaw, time_law
 from .attachments import COINCIDENCE_TOL, GROUND, UNKNOWN_WEAKNESS, Attachment, Ground, make_attachment
-from .checks import vector
+from .checks import unit_vector, vector
 
 __all__ = [
     "CONSTRAINT_KINDS", "GROUND", "JOINT_KINDS", "ConstraintKind", "ConstraintPoints", "Ground", "make_constraint",
@@ -59,7 +59,7 @@ def make_joint(
     if (axis is None) == (kind in KINDS_WITH_AXIS):
         raise ModelError(f"{what}: a {kind} joint {'needs an axis' if axis is None else 'has no axis'}")
     at = _joint_anchor(what, P, Q, anchor)
-    n = None if axis is None else _unit_vector(axis, f"{what}: axis")
+    n = None if axis is None else unit_vector(axis, f"{what}: axis")
     x_p, x_c = P.position(at, what), Q.position(at, what)
     gap = Vector(np.zeros(3), (x_c - x_p).parts)
     rows = pin_rows(gap) if kind in KINDS_WITH_PIN else []
@@ -90,7 +90,7 @@ def _attachments(what: str, kind: str, parent: Any, child: Any) -> tuple[Attachm
 
 def _cross_row(n: np.ndarray, axis2: Any, P: Attachment, Q: Attachment, what: str) -> ConstraintRow:
     """Perpendicular axes of a universal joint, n on the parent and axis2 on the child."""
-    m = _perpendicular_to(n) if axis2 is None else _unit_vector(axis2, f"{what}: axis2")
+    m = _perpendicular_to(n) if axis2 is None else unit_vector(axis2, f"{what}: axis2")
     if abs(n @ m) > 1e-6:
         raise ModelError(f"{what}: axis2 = {axis2!r} must be perpendicular to the axis")
     m = _orthogonalise(m, n)
@@ -252,14 +252,6 @@ def _distance_row(what: str, p: Vector, q: Vector, law: TimeLaw | None, size: fl
     return ConstraintRow(
         DISTANCE, gap, constant_vector(np.zeros(3)), **(_right_side(law) if law else {"fixed": length})
     )
-
-
-def _unit_vector(value: Any, what: str) -> np.ndarray:
-    n = vector(value, what)
-    size = np.linalg.norm(n)
-    if not size > 0.0:
-        raise ModelError(f"{what} is zero")
-    return n / size
 
 
 def _orthogonalise(m: np.ndarray, n: np.ndarray) -> np.ndarray:

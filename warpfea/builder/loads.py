@@ -8,11 +8,11 @@ import warp as wp
 from ..base.errors import ModelError
 from ..model.assembly import surface_weights
 from ..model.bodies import Body
-from ..model.description import DeadLoad, Moment, Pressure, Probe, Rotation, Support, support_slots
+from ..model.description import DeadLoad, Moment, Pressure, Probe, Support, support_slots
 from ..model.handles import MaterialPoint, NodeSet, SurfaceSet
 from ..model.masses import center_of_mass
-from ..time_laws import time_law
-from .checks import component_mask, slot_field, vector
+from ..time_laws import Rotation, time_law
+from .checks import checked_rotation, component_mask, slot_field, vector
 
 __all__ = [
     "check_field",
@@ -153,11 +153,8 @@ def drive_supports(
     if rotation is not None:
         if not isinstance(rotation, Rotation):
             raise ModelError(f"{what}: rotation must be a Rotation(anchor, axis, angle), got {rotation!r}")
-        axis = vector(rotation.axis, f"{what}: axis")
-        if not np.linalg.norm(axis) > 0.0:
-            raise ModelError(f"{what}: axis is zero")
-        support.law = time_law(rotation.angle, f"{what}: angle", scalar=True)
-        support.rotation = (vector(rotation.anchor, f"{what}: anchor"), axis / np.linalg.norm(axis))
+        support.rotation = checked_rotation(rotation, what)
+        support.law = support.rotation.angle
         return [support]
     out = []
     position_mask = np.isin(support.slots, support_slots(nodes, "position"))

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 
 from ..base.errors import ModelError
+from ..base.worlds import set_rows, values_per_world
 from ..kernels.contact.collider_mesh import mesh_struct
 from ..kernels.contact.structs import collider_struct, contact_struct
 from ..model.contact_points import ContactPoints, Modulus, body_mass_total, contact_points, effective_modulus
 from ..model.contacts import Collider, Contact
-from ..model.shapes import Shape
+from ..model.shapes import HalfSpace, Shape
 from ..model.triangle_mesh import TriMesh
 from ..terms.time_law_table import TimeLawTable
-from .tables import WORLD_PARAMETERS, FacetTables, clamped_slots, normal_damping
+from .tables import WORLD_PARAMETERS, FacetTables, check_chosen_values, clamped_slots, normal_damping
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -51,7 +53,7 @@ class ContactTables(FacetTables[Contact]):
     @property
     def has_sheets(self) -> bool:
         """True if a collider mesh is a sheet (no inside)."""
-        return any(isinstance(k.shape, TriMesh) and not k.shape.closed for k in self.colliders)
+        return any(collider.is_sheet for collider in self.colliders)
 
     def _area_fraction(self, contact: Contact, p: ContactPoints) -> np.ndarray:
         """Area fraction (F, P) of each point in the contact region; 0 if all its slots are clamped."""
@@ -77,6 +79,19 @@ class ContactTables(FacetTables[Contact]):
         self.shapes = self._upload_colliders(laws)
         self.store_built_values()
 
+    def parameters(self) -> dict[str, Callable[[Any, np.ndarray], None]]:
+        """Setters of the parameters of contacts and colliders."""
+        return super().parameters() | {f"{k.name}.offset": partial(self._set_surface_offset, k) for k in self.colliders}
+
+    def _set_surface_offset(self, collider: Collider, values: Any, mask: np.ndarray) -> None:
+        """Offset the surface of a collider along its normals in the chosen worlds."""
+        what = f"collider {collider.name!r}"
+        wanted = values_per_world(what, "offset", values, self.model.worlds)
+        check_chosen_values(what, "offset", wanted, ~mask, np.isfinite(wanted))
+        if isinstance(collider.shape, HalfSpace):
+            wanted = wanted - collider.shape.offset
+        set_rows(self.shapes.margin, (mask, self.colliders.index(collider)), wanted[mask])
+
     @property
     def parameter_arrays(self) -> dict[str, wp.array]:
         return super().parameter_arrays | {"margin": self.shapes.margin}
@@ -90,21 +105,20 @@ class ContactTables(FacetTables[Contact]):
         """Device struct of the colliders, without poses."""
         m, K = self.model, self.colliders
         out = collider_struct(self.has_meshes)()
-
-        def upload(name: str, values: Any, dtype: Any) -> None:
-            setattr(out, name, m.array("contact", np.asarray(values), dtype))
-
-        upload("of_contact", [K.index(c.collider) for c in self.contacts], wp.int32)
-        upload("margin", np.zeros((m.worlds, len(K))), wp.float64)
         frames = [k.shape.frame() for k in K]
-        upload("kind", [k.shape.kind for k in K], wp.int32)
-        upload("size", [shape_sizes(k.shape, self._contact_positions(k)) for k in K], wp.vec3d)
-        upload("center", [center for center, _ in frames], wp.vec3d)
-        upload("axes", [axes for _, axes in frames], wp.mat33d)
-        upload("translation_law", [laws.add(k.law) if k.law is not None else -1 for k in K], wp.int32)
-        upload("rotation_law", [laws.add(k.rotation.angle) if k.rotation is not None else -1 for k in K], wp.int32)
-        upload("rotation_anchor", [k.rotation.anchor if k.rotation else np.zeros(3) for k in K], wp.vec3d)
-        upload("rotation_axis", [k.rotation.axis if k.rotation else (0.0, 0.0, 1.0) for k in K], wp.vec3d)
+        tables = {
+            "of_contact": [K.index(c.collider) for c in self.contacts],
+            "margin": np.zeros((m.worlds, len(K))),
+            "kind": [k.shape.kind for k in K],
+            "size": [shape_sizes(k.shape, self._contact_positions(k)) for k in K],
+            "center": [center for center, _ in frames],
+            "axes": [axes for _, axes in frames],
+            "translation_law": [laws.add(k.law) if k.law is not None else -1 for k in K],
+            "rotation_law": [laws.add(k.rotation.angle) if k.rotation is not None else -1 for k in K],
+            "rotation_anchor": [k.rotation.anchor if k.rotation else np.zeros(3) for k in K],
+            "rotation_axis": [k.rotation.axis if k.rotation else (0.0, 0.0, 1.0) for k in K],
+        }
+        m.memory.fill(out, "contact", **tables)
         if self.has_meshes:
             out.mesh = upload_collider_meshes(m, [k.shape for k in K])
         return out
@@ -190,19 +204,18 @@ def upload_collider_meshes(model: Model, shapes: Sequence[Shape]) -> Any:
         *((len(p.low), len(p.start), len(p.corner[0])) for p in parts)))  # fmt: skip
     place = {shape: k for k, shape in enumerate(found)}
     index = [place.get(shape, -1) for shape in shapes]  # type: ignore[call-overload]
-
-    def upload(name: str, values: Any, dtype: Any) -> None:
-        setattr(out, name, model.array("contact", np.ascontiguousarray(values), dtype))
-
-    upload("first_box", [boxes[k] if k >= 0 else 0 for k in index], wp.int32)
-    upload("first_leaf", [leaves[k] if k >= 0 else 0 for k in index], wp.int32)
-    upload("inner_count", [len(parts[k].start) - 2 if k >= 0 else 0 for k in index], wp.int32)
-    upload("box_low", np.concatenate([p.low for p in parts]), wp.vec3d)
-    upload("box_high", np.concatenate([p.high for p in parts]), wp.vec3d)
-    upload("leaf_start", np.concatenate([p.start + n for p, n in zip(parts, triangles)]), wp.int32)
-    upload("corner", np.concatenate([p.corner for p in parts], axis=1), wp.vec3d)
-    upload("normal", np.concatenate([p.normal for p in parts], axis=1), wp.vec3d)
-    upload("feature_kind", np.concatenate([p.border for p in parts], axis=1), wp.int32)
+    tables = {
+        "first_box": [boxes[k] if k >= 0 else 0 for k in index],
+        "first_leaf": [leaves[k] if k >= 0 else 0 for k in index],
+        "inner_count": [len(parts[k].start) - 2 if k >= 0 else 0 for k in index],
+        "box_low": np.concatenate([p.low for p in parts]),
+        "box_high": np.concatenate([p.high for p in parts]),
+        "leaf_start": np.concatenate([p.start + n for p, n in zip(parts, triangles)]),
+        "corner": np.concatenate([p.corner for p in parts], axis=1),
+        "normal": np.concatenate([p.normal for p in parts], axis=1),
+        "feature_kind": np.concatenate([p.border for p in parts], axis=1),
+    }
+    model.memory.fill(out, "contact", **tables)
     return out
 
 

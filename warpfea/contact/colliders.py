@@ -1,5 +1,4 @@
-"""Contact with rigid obstacles, see kernels/contact/collider_kinematics.py: term, deepest positions of single-point
-contacts, initial penetration check of bodies across a sheet of triangles."""
+"""Contact with rigid obstacles, see kernels/contact/collider_kinematics.py."""
 
 from __future__ import annotations
 
@@ -10,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from ..base.errors import ModelError
-from ..base.launch import Launcher
+from ..base.worlds import set_rows
 from ..kernels.contact.collider_kinematics import MAX_COLLIDER_ROTATION, pose_kernels
 from ..kernels.contact.collider_sheets import sheet_kernels
 from ..kernels.contact.deepest_point import deepest_point_kernels
@@ -20,13 +19,12 @@ from ..model.state import State
 from ..model.triangle_mesh import TriMesh
 from ..terms.term import StepContext, part
 from .collider_tables import ContactTables
-from .evaluation import evaluate_points
-from .fields import contact_field, nodal_force, obstacle_contact_points
+from .evaluation import contact_field, evaluate_points, nodal_force, obstacle_contact_points
 from .initial_overlaps import reference_position_text, store_overlaps, touching_depth
-from .parameters import collider_parameters
 from .term import ContactTerm, contact_columns
 
 if TYPE_CHECKING:
+    from ..base.launch import Launcher
     from ..model.model import Model
     from ..terms.workspace import Workspace
 
@@ -42,6 +40,7 @@ class ColliderContact(ContactTerm):
 
     Attributes:
         tables: contacts, colliders and facets on the device.
+        deepest_kernels: device code of single-point contacts, see kernels/contact/deepest_point.py; None without.
     """
 
     name = "contact"
@@ -52,7 +51,9 @@ class ColliderContact(ContactTerm):
         tables = ContactTables(model)
         super().__init__(model, tables, "colliders_meshes" if tables.has_meshes else "colliders")
         self.pose_kernels = pose_kernels(tables.has_meshes)
-        self.deepest_points = DeepestPoints(tables) if tables.has_single_point else None
+        self.deepest_kernels: Any = None
+        if tables.has_single_point:
+            self.deepest_kernels = deepest_point_kernels(model.dtype, tables.has_meshes)
 
     @classmethod
     def features(cls, model: Model) -> dict[str, bool]:
@@ -78,7 +79,7 @@ class ColliderContact(ContactTerm):
             setattr(other, name, make(name, shape, struct.vars[name].type.dtype))
 
     def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
-        deepest = [self.deepest_points.kernels.module] if self.deepest_points else []
+        deepest = [self.deepest_kernels.module] if self.deepest_kernels else []
         return [*super().modules(ctx), self.pose_kernels.module, *deepest]
 
     def start(self, ctx: StepContext, active: wp.array) -> None:
@@ -95,20 +96,40 @@ class ColliderContact(ContactTerm):
         fresh = (active.numpy() != 0) & ~known
         self._begin_other(ctx, active)
         for name, attribute in POSES.items():
-            values = getattr(other, attribute).numpy()
-            values[fresh] = getattr(other, name.removeprefix("previous_")).numpy()[fresh]
-            getattr(other, attribute).assign(values)
+            posed = getattr(other, name.removeprefix("previous_")).numpy()
+            set_rows(getattr(other, attribute), fresh, posed[fresh])
         new = fresh & ~(history.speed.numpy() > 0.0).any(axis=1)
         overlap = self.forget_overlaps(ctx, new)
-        posed = history.pose_time.numpy()
-        posed[fresh] = time[fresh]
-        history.pose_time.assign(posed)
+        set_rows(history.pose_time, fresh, time[fresh])
         gap = evaluate_points(self, state, history, places=False)[0]
         touching = touching_depth(self.model.size, state.displacement.numpy())
         if self.tables.has_sheets and new.any():
-            check_sheet_sides(self, other, state.displacement, touching, new, ctx.launch)
+            self._check_sheet_sides(ctx, touching, new)
         store_overlaps(self, np.where(new[:, None], -gap, 0.0), touching, overlap)
         history.overlap.assign(overlap)
+
+    def _check_sheet_sides(self, ctx: StepContext, tolerance: np.ndarray, new: np.ndarray) -> None:
+        """Raise ModelError for a body that begins on both sides of a sheet of triangles.
+
+        Args:
+            tolerance, new: (worlds,) m, and flags of the worlds to check.
+        """
+        m, t = self.model, self.tables
+        found = wp.zeros((m.worlds, t.rows), dtype=wp.int32, device=m.device)  # one point of each facet behind, + 1
+        limit: Any = wp.array(tolerance, dtype=wp.float64, device=m.device)
+        for group in t.groups:
+            args = [ctx.scratch[self.name]["other"], group.data, ctx.state.displacement, limit, found]
+            ctx.launch(sheet_kernels(m.dtype).find_crossed_sheets, (m.worlds, group.count), args)
+        of_sheet = np.repeat([c.collider.is_sheet for c in t.contacts], np.diff(t.row_start))
+        points = np.where(of_sheet, found.numpy(), 0)
+        for world, row in np.argwhere((points > 0) & new[:, None])[:1]:
+            k = int(np.searchsorted(t.row_start, row, side="right")) - 1
+            contact, where = t.contacts[k], reference_position_text(t, k, int(points[world, row]) - 1 - int(t.first[k]))
+            raise ModelError(
+                f"contact {contact.name!r}: body {contact.body.name!r} begins on both sides of collider "
+                f"{contact.collider.name!r}, or on it and behind (world {world}, reference point {where}); move one of "
+                "them: bodies on a sheet of triangles are in front of it"
+            )
 
     def _begin_other(self, ctx: StepContext, active: wp.array) -> None:
         """Poses of the colliders at the end of the attempt."""
@@ -123,12 +144,41 @@ class ColliderContact(ContactTerm):
 
     def _choose_deepest(self, ctx: StepContext, active: wp.array, *, fresh: int) -> None:
         """Select the point of each single-point contact at work.u."""
-        if not self.deepest_points:
+        if not self.deepest_kernels:
             return
         s, w = ctx.scratch[self.name], ctx.work
         state = (ctx.state.displacement, ctx.state.velocity)
-        place = self.deepest_points.choose
-        place(ctx.launch, s, w.step.new_time, s["u"], state, active, w.newton.frozen.unilateral_changed, fresh=fresh)
+        args = [s["u"], state, active, w.newton.frozen.unilateral_changed]
+        self.choose_deepest(ctx.launch, s, w.step.new_time, *args, fresh=fresh)
+
+    def choose_deepest(
+        self, launch: Launcher, s: dict[str, Any], time: wp.array, u: wp.array, state: tuple[wp.array, wp.array],
+        active: wp.array, changed: wp.array, *, fresh: int, settled: int = 0,
+    ) -> None:  # fmt: skip
+        """Find the deepest position of each single-point contact.
+
+        Args:
+            launch: launcher of the device.
+            s: history, other, attempt, clock and row_start of the term's scratch.
+            time, u: [world] s, and displacements, at which positions are compared.
+            state: displacements and velocities at the start of the attempt.
+            active: [world] flags.
+            changed: [world] set to 1 if another point of a surface becomes the closest one.
+            fresh: start of an attempt.
+            settled: evaluation at a state, without motion.
+        """
+        k, t, B = self.deepest_kernels, self.tables, self.model.worlds
+        groups = [group for group in t.groups if group.lumped]
+        for group in groups:
+            args = [t.data, s["other"], group.data, s["history"], time, u, active, s["attempt"]]
+            launch(k.point_depths, (B, group.count, group.data.point_count), args)
+            launch(k.find_deepest, (B, group.count), args)
+        args = [t.data, s["row_start"], active, fresh, s["attempt"], changed]
+        launch(k.choose_deepest, (B, len(t.contacts)), args)
+        for group in groups:
+            if group.data.tracks_deepest:
+                args = [t.data, s["other"], group.data, s["history"], s["clock"], *state, active, settled, s["attempt"]]
+                launch(k.set_contact_point, (B, group.count), args)
 
     @part()
     def update_frozen(self, ctx: StepContext, flags: wp.array) -> None:
@@ -172,9 +222,6 @@ class ColliderContact(ContactTerm):
     def _contact_text(self, contact: Any) -> str:
         return f"{contact.name!r} with collider {contact.collider.name!r}"
 
-    def parameters(self) -> dict[str, Callable[[Any, np.ndarray], None]]:
-        return super().parameters() | collider_parameters(self.tables)
-
     def _contact_info(self, contact: Any, k: int) -> tuple[dict[str, Any], dict[str, Any]]:
         """`left_out`: points that don't act because their slots are clamped."""
         numbers = {"left_out": self.tables.clamped_point_counts[k]}
@@ -186,14 +233,13 @@ class ColliderContact(ContactTerm):
 
     def settled_other(self, stored: Any, zeros: Any, launch: Launcher, state: State) -> Any:
         """Colliders at rest in their poses at a state; without history by their time laws."""
-        m, laws, B = self.model, self.model.terms.time_laws, state.worlds
         other = self.make_other(stored)
         self._set_attempt(other, lambda _, shape, dtype: zeros(shape, dtype))
         if "contact_position" not in state.specs:
-            all_worlds = wp.ones(B, dtype=wp.int32, device=m.device)
-            value = zeros((B, max(laws.count, 1)), wp.vec3d)
-            laws.evaluate(launch, state, state.time, wp.ones(B, dtype=wp.float64, device=m.device), all_worlds, value)
-            launch(self.pose_kernels.update_poses, (B, len(self.tables.colliders)), [other, value, all_worlds])
+            value, all_worlds = self.model.terms.time_laws.values_at_state(launch, state)
+            launch(
+                self.pose_kernels.update_poses, (state.worlds, len(self.tables.colliders)), [other, value, all_worlds]
+            )
             other.translation.zero_()
             other.rotation_change.zero_()
             other.previous_position, other.previous_rotation = other.position, other.rotation
@@ -223,80 +269,3 @@ class ColliderContact(ContactTerm):
         deepest position of a single-point contact is assigned to the nearest point."""
         gap, _, force = evaluate_points(self, state)
         return gap, force
-
-
-def check_sheet_sides(
-    term: Any, other: Any, displacement: wp.array, tolerance: np.ndarray, new: np.ndarray, launch: Launcher
-) -> None:  # fmt: skip
-    """Raise ModelError for a body that begins on both sides of a sheet.
-
-    Args:
-        term: the contact term.
-        other: current collider poses.
-        tolerance, new: (worlds,) m, and flags of the worlds to check.
-    """
-    t = term.tables
-    points = _points_behind(t, other, displacement, tolerance, launch)
-    for world, row in np.argwhere((points > 0) & new[:, None])[:1]:
-        k = int(np.searchsorted(t.row_start, row, side="right")) - 1
-        contact, where = t.contacts[k], reference_position_text(t, k, int(points[world, row]) - 1 - int(t.first[k]))
-        raise ModelError(
-            f"contact {contact.name!r}: body {contact.body.name!r} begins on both sides of collider "
-            f"{contact.collider.name!r}, or on it and behind (world {world}, reference point {where}); move one of "
-            "them: bodies on a sheet of triangles are in front of it"
-        )
-
-
-def _points_behind(
-    tables: ContactTables, other: Any, displacement: wp.array, tolerance: np.ndarray, launch: Launcher
-) -> np.ndarray:  # fmt: skip
-    """One point (worlds, facets) of each facet, + 1, behind a sheet while others are in front, or 0."""
-    m = tables.model
-    found = wp.zeros((m.worlds, tables.rows), dtype=wp.int32, device=m.device)
-    limit: Any = wp.array(tolerance, dtype=wp.float64, device=m.device)
-    for group in tables.groups:
-        args = [other, group.data, displacement, limit, found]
-        launch(sheet_kernels(m.dtype).find_crossed_sheets, (m.worlds, group.count), args)
-    sheet = [isinstance(c.collider.shape, TriMesh) and not c.collider.shape.closed for c in tables.contacts]
-    return np.where(np.repeat(sheet, np.diff(tables.row_start)), found.numpy(), 0)
-
-
-class DeepestPoints:
-    """Single-point contacts of a model; see kernels/contact/deepest_point.py.
-
-    Attributes:
-        kernels: device code.
-    """
-
-    def __init__(self, tables: ContactTables) -> None:
-        self.tables = tables
-        self.kernels = deepest_point_kernels(tables.model.dtype, tables.has_meshes)
-
-    def choose(
-        self, launch: Launcher, s: dict[str, Any], time: wp.array, u: wp.array, state: tuple[wp.array, wp.array],
-        active: wp.array, changed: wp.array, *, fresh: int, settled: int = 0,
-    ) -> None:  # fmt: skip
-        """Find the deepest position of each single-point contact.
-
-        Args:
-            launch: launcher of the device.
-            s: history, other, attempt, clock and row_start of the term's scratch.
-            time, u: [world] s, and displacements, at which positions are compared.
-            state: displacements and velocities at the start of the attempt.
-            active: [world] flags.
-            changed: [world] set to 1 if another point of a surface becomes the closest one.
-            fresh: start of an attempt.
-            settled: evaluation at a state, without motion.
-        """
-        k, t, B = self.kernels, self.tables, self.tables.model.worlds
-        groups = [group for group in t.groups if group.lumped]
-        for group in groups:
-            args = [t.data, s["other"], group.data, s["history"], time, u, active, s["attempt"]]
-            launch(k.point_depths, (B, group.count, group.data.point_count), args)
-            launch(k.find_deepest, (B, group.count), args)
-        args = [t.data, s["row_start"], active, fresh, s["attempt"], changed]
-        launch(k.choose_deepest, (B, len(t.contacts)), args)
-        for group in groups:
-            if group.data.tracks_deepest:
-                args = [t.data, s["other"], group.data, s["history"], s["clock"], *state, active, settled, s["attempt"]]
-                launch(k.set_contact_point, (B, group.count), args)

@@ -174,9 +174,6 @@ class PairTables(FacetTables[PairContact]):
                     values = [np.pad(x, ((0, 0), (0, most - x.shape[1]), (0, 0))) for x in values]
                 return np.concatenate(values)
 
-            def upload(values: Any, dtype: Any) -> wp.array:
-                return m.array("contact", np.ascontiguousarray(values), dtype)
-
             power = np.zeros((len(kinds), most, 2), dtype=np.int32)
             hull = np.zeros((len(kinds), most, most))
             for k, kind in enumerate(kinds):
@@ -184,38 +181,33 @@ class PairTables(FacetTables[PairContact]):
                 power[k, :count] = monomial_exponents(*kind)
                 hull[k, :count, :count] = bernstein_from_monomials(*kind)
             counts = [len(mas.conn) for mas in all_of]
-            m.cache["pair masters"] = {
-                "surface_of": upload(self.master_of, wp.int32),
-                "sign": upload([1.0 if c.slave is c.first else -1.0 for c in self.contacts], wp.float64),
-                "bodies": upload(
-                    [[self.bodies.index(s.body.index) for s in (c.slave, c.master)] for c in self.contacts], wp.vec2i
-                ),
-                "conn": upload(self.master_conn.T, wp.int32),
-                "shape": upload(np.moveaxis(concatenated("shape"), 0, 2), m.types.T),
-                "director_shape": upload(np.moveaxis(concatenated("director_shape"), 0, 2), m.types.T),
-                "reference_position_coefficients": upload(
-                    np.swapaxes(concatenated("reference_position_coefficients"), 0, 1), wp.vec3d
-                ),
-                "reference_director_coefficients": upload(
-                    np.swapaxes(concatenated("normal_coefficients"), 0, 1), wp.vec3d
-                ),
-                "facet_kind": upload(np.repeat([kinds.index((q.corners, q.degree)) for q in all_of], counts), wp.int32),
-                "monomial_count": upload([len(monomial_exponents(*kind)) for kind in kinds], wp.int32),
-                "corner_count": upload([kind[0] for kind in kinds], wp.int32),
-                "exponents": upload(power, wp.vec2i),
-                "hull_coefficients": upload(hull, wp.float64),
-                "depth_limit": upload(concatenated("depth_limit"), wp.float64),
-                "side_length": upload(concatenated("size"), wp.float64),
-                "surface": upload(np.repeat(np.arange(len(counts)), counts), wp.int32),
+            tables = {
+                "surface_of": self.master_of,
+                "sign": [1.0 if c.slave is c.first else -1.0 for c in self.contacts],
+                "bodies": [[self.bodies.index(s.body.index) for s in (c.slave, c.master)] for c in self.contacts],
+                "conn": self.master_conn.T,
+                "shape": np.moveaxis(concatenated("shape"), 0, 2),
+                "director_shape": np.moveaxis(concatenated("director_shape"), 0, 2),
+                "reference_position_coefficients": np.swapaxes(concatenated("reference_position_coefficients"), 0, 1),
+                "reference_director_coefficients": np.swapaxes(concatenated("normal_coefficients"), 0, 1),
+                "facet_kind": np.repeat([kinds.index((q.corners, q.degree)) for q in all_of], counts),
+                "monomial_count": [len(monomial_exponents(*kind)) for kind in kinds],
+                "corner_count": [kind[0] for kind in kinds],
+                "exponents": power,
+                "hull_coefficients": hull,
+                "depth_limit": concatenated("depth_limit"),
+                "side_length": concatenated("size"),
+                "surface": np.repeat(np.arange(len(counts)), counts),
                 "max_monomials": most,
                 "surface_count": len(self.surfaces),
                 "touch_depth": TOUCH * self.size,
                 "first_entry": self.pool,
                 "facet_count": self.facets,
             }
+            m.cache["pair masters"] = master_struct(m.dtype)()
+            m.memory.fill(m.cache["pair masters"], "contact", **tables)
         out = master_struct(m.dtype)()
-        for name, value in m.cache["pair masters"].items():
-            setattr(out, name, value)
+        out.assign(m.cache["pair masters"])
         out.tree = tree
         return out
 

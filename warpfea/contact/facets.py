@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
+from ..base.worlds import device_flags
 from ..kernels.common.state import state_kernels
 from ..kernels.contact.assembly import block_kernels
 from ..kernels.contact.facet_kinematics import master_kernels
@@ -24,9 +25,8 @@ from ..model.pairs import PairContact
 from ..model.state import State, view_as_words
 from ..terms.protocols import Coupled, Tied
 from ..terms.term import StepContext, part
-from .evaluation import evaluate_pairs
+from .evaluation import contact_field, evaluate_pairs
 from .facet_tables import PairTables
-from .fields import contact_field
 from .initial_overlaps import refuse_deep_overlaps, store_overlaps, touching_depth
 from .tables import POINT_SUM_LANES
 from .term import ContactTerm, contact_columns
@@ -136,7 +136,7 @@ class FacetContact(ContactTerm, Tied, Coupled):
         new = (active.numpy() != 0) & ~(history.speed.numpy() > 0.0).any(axis=1)
         if not new.any():
             return
-        flags: wp.array = wp.array(new.astype(np.int32), dtype=wp.int32, device=self.model.device)
+        flags = device_flags(new, self.model.device)
         overlap = self.forget_overlaps(ctx, new)
         self._begin_points(ctx, flags)
         u = ctx.state.displacement

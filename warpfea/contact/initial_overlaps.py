@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..base.errors import ModelError
-from ..model.surfaces import make_skin, reference_points
+from ..kernels.contact.thickness import depth_kernel
+from ..model.surfaces import measure_to_skin
 
 if TYPE_CHECKING:
-    from ..model.discretisation import Discretisation
     from .collider_tables import ContactTables
     from .facet_tables import PairTables
 
@@ -93,7 +93,7 @@ def refuse_deep_overlaps(
             if key in seen:
                 continue
             seen.add(key)
-            depth = _depths_in_body(body, u[world, body.slots], x[world, near[world]])
+            depth = measure_to_skin(body, depth_kernel(), x[world, near[world]], u=u[world, body.slots])
             if depth.max() > least:
                 point = int(np.flatnonzero(near[world])[depth.argmax()])
                 raise ModelError(
@@ -102,24 +102,3 @@ def refuse_deep_overlaps(
                     f"{depth.max():.3g} m deep), where no facet of the contact reaches; move one of them, or leave "
                     "these faces out of the contact"
                 )
-
-
-def _depths_in_body(body: Discretisation, u: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Distance, m, of interior points to the skin of a body at displacements of its slots; 0 outside."""
-    import warp as wp
-
-    from ..kernels.contact.thickness import depth_kernel
-
-    drawn = make_skin(body)
-    skin = reference_points(body, drawn.slot_weights) + drawn.slot_weights @ u.astype(float)
-    center, size = skin.mean(axis=0), float(np.ptp(skin, axis=0).max())
-    with wp.ScopedDevice("cpu"):
-        mesh = wp.Mesh(
-            wp.array((skin - center) / size, dtype=wp.vec3),
-            wp.array(drawn.triangles.ravel(), dtype=wp.int32),
-            support_winding_number=True,
-        )
-        out = wp.zeros(len(x), dtype=float)
-        places: wp.array = wp.array((x - center) / size, dtype=wp.vec3)
-        wp.launch(depth_kernel(), len(x), [mesh.id, places, out], device="cpu")
-        return np.asarray(out.numpy(), dtype=float) * size

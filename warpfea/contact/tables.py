@@ -1,16 +1,19 @@
-"""Tables common to contact with colliders and between bodies: groups of facets with their points, law constants."""
+"""Tables common to contact with colliders and between bodies: groups of facets with their points, law constants,
+parameters per world for Model.set_parameter."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import numpy as np
 import warp as wp
 from scipy.optimize import brentq
 
+from ..base.worlds import check_values_per_world, set_rows, values_per_world
 from ..kernels.contact.law import law_code, own_laws
 from ..kernels.contact.structs import facet_struct
 from ..model.contact_points import CONTACT_RULES, ContactPoints, lagrange_basis
@@ -26,11 +29,12 @@ __all__ = [
     "WORLD_PARAMETERS",
     "FacetGroup",
     "FacetTables",
+    "check_chosen_values",
     "clamped_slots",
     "hunt_crossley_damping",
     "normal_damping",
     "restitution_beta",
-]  # fmt: skip
+]
 
 AnyContact = TypeVar("AnyContact", Contact, PairContact)
 DEFAULT_SMOOTHING = (1e-3, 1e-4)
@@ -43,6 +47,13 @@ POINT_SUM_LANES = 8
 """Largest number of threads that share a sum over the points of a facet on CUDA."""
 PATCH, LUMPED, MOVING = range(3)
 """Contact kinds of a facet: all points, at most one point, or at most one moving position."""
+VALID_RANGES = {  # for error texts
+    "mu": "a friction coefficient, 0 or above",
+    "mu_static": "at least mu",
+    "restitution": "above 0 and at most 1",
+    "stiffness": "a positive factor",
+    "offset": "a finite number, m",
+}
 
 
 def restitution_beta(restitution: float) -> float:
@@ -197,16 +208,14 @@ class FacetTables(Generic[AnyContact]):
         parts = [self.host[k] for k in chosen]
         conn = np.concatenate([self.host[k].conn + self.contacts[k].body.slot_offset for k in chosen])
         data = facet_struct(m.dtype)()
-
-        def upload(name: str, values: Any, dtype: Any) -> None:
-            setattr(data, name, m.array("contact", np.ascontiguousarray(values), dtype))
-
-        upload("conn", conn.T, wp.int32)
-        upload("shape", np.moveaxis(np.concatenate([p.shape for p in parts]), 0, 2), m.types.T)
-        upload("X", np.swapaxes(np.concatenate([p.X for p in parts]), 0, 1), wp.vec3d)
-        upload("area_fraction", np.concatenate([self.area_fractions[k] for k in chosen]).T, wp.float64)
-        upload("area", np.concatenate([p.area for p in parts]).T, wp.float64)
-        upload("contact", np.repeat(chosen, [len(p.conn) for p in parts]), wp.int32)
+        tables = {
+            "conn": conn.T,
+            "shape": np.moveaxis(np.concatenate([p.shape for p in parts]), 0, 2),
+            "X": np.swapaxes(np.concatenate([p.X for p in parts]), 0, 1),
+            "area_fraction": np.concatenate([self.area_fractions[k] for k in chosen]).T,
+            "area": np.concatenate([p.area for p in parts]).T,
+            "contact": np.repeat(chosen, [len(p.conn) for p in parts]),
+        }
         data.first_entry, data.first_row, data.first_point = pool, self.rows, self.points
         _, data.point_count, acts = kind
         data.facet_count, data.tracks_deepest, data.corner_count = (
@@ -217,14 +226,45 @@ class FacetTables(Generic[AnyContact]):
         if acts != PATCH:
             points = CONTACT_RULES[data.corner_count][data.point_count].points
             basis, power = lagrange_basis(points)
-            upload("point_coords", points, wp.vec2d)
-            upload("lagrange_coefficients", basis, wp.float64)
-            upload("exponents", power, wp.vec2i)
+            tables |= {"point_coords": points, "lagrange_coefficients": basis, "exponents": power}
+        m.memory.fill(data, "contact", **tables)
         return FacetGroup(conn, data, acts != PATCH, chosen)
 
     def law_constants(self, contact: AnyContact, world: int | None = None) -> dict[str, float]:
         """Constants `MATERIAL_CONSTANTS` of a contact, as built or in one world."""
         raise NotImplementedError
+
+    def parameters(self) -> dict[str, Callable[[Any, np.ndarray], None]]:
+        """Setters of the parameters of contacts per world, by name, for Model.set_parameter."""
+        return {
+            f"{c.name}.{name}": partial(self._set_parameter, c, name)
+            for c in self.contacts
+            for name in WORLD_PARAMETERS
+        }
+
+    def _set_parameter(self, contact: AnyContact, name: str, values: Any, mask: np.ndarray) -> None:
+        """Write one value of a contact in the chosen worlds."""
+        what, k, data = f"contact {contact.name!r}", self.number[contact.index], self.data
+        wanted = values_per_world(what, name, values, self.model.worlds)
+        mu, mu_static = data.mu.numpy()[:, k], data.mu_static.numpy()[:, k]
+        check = partial(check_chosen_values, what, name, wanted, ~mask)
+        check(np.isfinite(wanted))
+        if name == "mu":
+            check(wanted >= 0.0)
+            follow = mu_static == mu
+            high = np.where(follow, np.inf, mu_static)
+            check(wanted <= high, "at most mu_static = {:g}", mu_static)
+            set_rows(data.mu_static, (mask, k), np.where(follow, wanted, mu_static)[mask])
+        elif name == "mu_static":
+            check(wanted >= mu, "at least mu = {:g}", mu)
+        elif name == "restitution":
+            check((wanted > 0.0) & (wanted <= 1.0))
+            wanted = np.where(mask, wanted, 1.0)
+            set_rows(data.beta, (mask, k), [restitution_beta(float(e)) for e in wanted[mask]])
+            wanted = np.array([hunt_crossley_damping(float(e)) for e in wanted])
+        else:
+            check(wanted > 0.0)
+        set_rows(getattr(data, WORLD_PARAMETERS[name]), (mask, k), wanted[mask])
 
     @property
     def parameter_arrays(self) -> dict[str, wp.array]:
@@ -260,22 +300,19 @@ class FacetTables(Generic[AnyContact]):
     def _upload_laws(self, out: Any, law_constants: list[dict[str, float]]) -> None:
         """Upload the contact law constants; `law_constants` per contact: `FROM_BODIES`."""
         m, C = self.model, self.contacts
-
-        def upload(name: str, values: Any, dtype: Any = wp.float64) -> None:
-            setattr(out, name, m.array("contact", np.asarray(values), dtype))
-
-        upload("law", [law_code(c.law, self.own_laws) for c in C], wp.int32)
-        upload("single_point", [int(c.model == "sphere") for c in C], wp.int32)
-        upload("is_explicit", [int(c.treatment == "explicit") for c in C], wp.int32)
-        upload("first_point", self.first, wp.int32)
-        for name in MATERIAL_CONSTANTS:
-            upload(name, [[row[name] for row in law_constants]])
         smoothing = [c.smoothing if isinstance(c.smoothing, tuple) else DEFAULT_SMOOTHING for c in C]
-        upload("damping_ramp", [float(c.smoothing) if isinstance(c.smoothing, (int, float)) else 0.0 for c in C])
-        upload("force_eps", [pair[0] for pair in smoothing])
-        upload("speed_eps", [pair[1] for pair in smoothing])
-        upload("offset", [c.offset for c in C])
-        upload("overlap_decay_time", [c.overlap_time for c in C])
+        tables = {
+            "law": [law_code(c.law, self.own_laws) for c in C],
+            "single_point": [int(c.model == "sphere") for c in C],
+            "is_explicit": [int(c.treatment == "explicit") for c in C],
+            "first_point": self.first,
+            "damping_ramp": [float(c.smoothing) if isinstance(c.smoothing, (int, float)) else 0.0 for c in C],
+            "force_eps": [pair[0] for pair in smoothing],
+            "speed_eps": [pair[1] for pair in smoothing],
+            "offset": [c.offset for c in C],
+            "overlap_decay_time": [c.overlap_time for c in C],
+        }
+        tables |= {name: [[row[name] for row in law_constants]] for name in MATERIAL_CONSTANTS}
         per_world = {
             "mu": [c.mu for c in C],
             "mu_static": [c.mu_static for c in C],
@@ -283,8 +320,8 @@ class FacetTables(Generic[AnyContact]):
             "beta": [restitution_beta(c.restitution) for c in C],
             "scale": [c.stiffness for c in C],
         }
-        for name, values in per_world.items():
-            upload(name, np.tile(values, (m.worlds, 1)))
+        tables |= {name: np.tile(values, (m.worlds, 1)) for name, values in per_world.items()}
+        m.memory.fill(out, "contact", **tables)
 
 
 def bodies_of(contact: Contact | PairContact) -> list[Any]:
@@ -296,3 +333,13 @@ def _facet_kind(contact: Contact | PairContact, p: ContactPoints) -> tuple[int, 
     """Contact kind of a facet: slots, points, and PATCH, LUMPED or MOVING."""
     lumped = LUMPED if contact.treatment == "explicit" else MOVING
     return p.conn.shape[1], p.area.shape[1], PATCH if contact.model == "patch" else lumped
+
+
+def check_chosen_values(
+    what: str, name: str, values: np.ndarray, left: np.ndarray, good: np.ndarray, text: str = "", limit: Any = None
+) -> None:  # fmt: skip
+    """Raise ModelError for the first chosen world with an invalid value."""
+    for world in np.flatnonzero(~(good | left))[:1]:
+        check_values_per_world(
+            what, name, values, good | left, text.format(limit[world]) if text else VALID_RANGES[name]
+        )

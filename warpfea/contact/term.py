@@ -24,9 +24,8 @@ from ..model.state import State
 from ..terms.protocols import Diagnosed, Parametrised, Preconditioned, Touching, Updated
 from ..terms.term import LOSS, NUMERICAL, STORED, WORK, Column, StepContext, part
 from .collider_tables import facet_pattern_entries
-from .fields import CONTACT_FIELDS
+from .evaluation import CONTACT_FIELDS
 from .initial_overlaps import reference_position_text
-from .parameters import contact_parameters
 from .tables import POINT_SUM_LANES
 
 if TYPE_CHECKING:
@@ -149,6 +148,9 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
             setattr(clock, name, getattr(work.step, name))
         clock.time, clock.is_static = ctx.state.time, int(not ctx.inertia)
         parts = (B, len(t.contacts), len(RECORD_NAMES), RECORD_LANES)
+        u = work.u
+        if self.double_displacements:  # only contact slots are used
+            u = work.array(f"{self.name} displacements", u.shape, wp.vec3d)
         scratch = {
             "attempt": attempt,
             "clock": clock,
@@ -157,7 +159,7 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
             "energies": work.array(f"{self.name} energies", (ENERGY_COLUMNS, B, t.rows), wp.float64),
             "parts": work.array(f"{self.name} parts", parts, wp.float64),
             "row_start": self.model.array("contact", t.row_start, wp.int32),
-            "u": self.double_displacements.allocate(work, self.name) if self.double_displacements else work.u,
+            "u": u,
         }
         ctx.scratch[self.name] = scratch | ctx.scratch.get(self.name, {})
         self._allocate_other(work, ctx.scratch[self.name]["other"])
@@ -379,7 +381,7 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
         self.tables.update_materials(mask)
 
     def parameters(self) -> dict[str, Callable[[Any, np.ndarray], None]]:
-        return contact_parameters(self.tables)
+        return self.tables.parameters()
 
     def contacts_info(self) -> list[dict[str, Any]]:
         t, out = self.tables, []
@@ -407,10 +409,6 @@ class DoubleDisplacements:
         self.kernels = double_displacement_kernels()
         slots = np.unique(np.concatenate([conn.ravel() for conn in connectivity]))
         self._slots = model.array("contact", slots, wp.int32)
-
-    def allocate(self, work: Workspace, term: str) -> wp.array:
-        """Array [world, slot], m, of one term by its name; only contact slots are used."""
-        return work.array(f"{term} displacements", work.u.shape, wp.vec3d)
 
     def update(self, ctx: StepContext, out: wp.array, active: wp.array) -> None:
         """Displacements of the iterate; in statics (no velocities) those of the state, rounded."""

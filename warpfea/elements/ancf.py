@@ -6,11 +6,14 @@ transforms the functions of one into those of the other (Paper T's S* = S T; `to
 stretched or rotated elements, and elements that meet at a node share its slots for any direction of their parent lines.
 """
 
+import functools
+from collections.abc import Callable
+
 import numpy as np
 
 from ..base.errors import ModelError
 
-__all__ = ["monomials", "nodal_basis", "nodal_functions", "to_node_axes"]
+__all__ = ["monomials", "nodal_basis", "nodal_functions", "nodal_shape_functions", "to_node_axes"]
 
 
 def monomials(powers: np.ndarray, xi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -48,6 +51,16 @@ def nodal_functions(powers: np.ndarray, inverse: np.ndarray, xi: np.ndarray) -> 
     """s = B^-1 b and ds/dxi at xi (Q, 3): (Q, m), (Q, m, 3)."""
     b, db = monomials(powers, xi)
     return b @ inverse.T, np.einsum("sm,qmk->qsk", inverse, db)
+
+
+def nodal_shape_functions(powers: np.ndarray, nodes: np.ndarray) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
+    """`Family.shape` of the functions s = B^-1 b with slots along the node's axes; B^-1 is computed on first use."""
+    inverse = functools.cache(lambda: nodal_basis(powers, nodes))
+
+    def shape(xi: np.ndarray, nodes: np.ndarray, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return to_node_axes(*nodal_functions(powers, inverse(), xi), frames)
+
+    return shape
 
 
 def to_node_axes(s: np.ndarray, ds: np.ndarray, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -41,7 +41,7 @@ from .quadrature import Rule, box_rule, square_rule
 if TYPE_CHECKING:
     from .sections import Rectangle
 
-__all__ = ["BEAM", "parent_functions", "svk_only"]
+__all__ = ["BEAM", "parent_functions", "shear_law", "svk_only"]
 
 LOW, HIGH = (0.0, -0.5, -0.5), (1.0, 0.5, 0.5)
 _rule = functools.partial(box_rule, ranges=tuple(zip(LOW, HIGH)))
@@ -128,7 +128,8 @@ def _section_law(material: Material) -> tuple[str, tuple[float, ...]]:
     return "orthotropic", (0.0, m.E, m.E, 0.0, 0.0, 0.0, m.lame[1], 0.0, 0.0)
 
 
-def _shear_law(material: Material) -> tuple[str, tuple[float, ...]]:
+def shear_law(material: Material) -> tuple[str, tuple[float, ...]]:
+    """Transverse shear at tying points."""
     return "assumed_strain", (svk_only(material).lame[1],)
 
 
@@ -213,7 +214,7 @@ BEAM = register(
                 EnergyPart("axis", _rule((3, 2, 2)), _axial_law, framed=True),
                 EnergyPart("section", end_point_rule(_rule((2, 2, 2))), _section_law, framed=True),
                 EnergyPart("D_nu", end_point_rule(_rule((2, 1, 1))), _normal_coupling_law, framed=True),
-                EnergyPart("shear", _rule((3, 2, 2)), _shear_law, tying=SHEAR_TYING),
+                EnergyPart("shear", _rule((3, 2, 2)), shear_law, tying=SHEAR_TYING),
             ),
             "split": (
                 EnergyPart("D0", _rule((3, 2, 2)), _uncoupled_law, framed=True),

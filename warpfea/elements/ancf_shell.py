@@ -37,8 +37,8 @@ import functools
 import numpy as np
 
 from ..materials import Material
-from .ancf import nodal_basis, nodal_functions, to_node_axes
-from .ancf_beam import box_faces, box_subdivision, svk_only
+from .ancf import nodal_shape_functions
+from .ancf_beam import box_faces, box_subdivision, shear_law, svk_only
 from .family import AssumedStrain, EnergyPart, Family, ParentDomain, register
 from .quadrature import Rule, box_rule, square_rule
 
@@ -52,15 +52,6 @@ SHELL_EXPONENTS = np.array(
 SHELL_NODES = np.array([(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (1.0, 1.0, 0.0), (0.0, 1.0, 0.0)])
 LOW, HIGH = (0.0, 0.0, -0.5), (1.0, 1.0, 0.5)
 _rule = functools.partial(box_rule, ranges=tuple(zip(LOW, HIGH)))
-
-
-@functools.cache
-def _inverse_nodal_basis() -> np.ndarray:
-    return nodal_basis(SHELL_EXPONENTS, SHELL_NODES)
-
-
-def _shape_functions(xi: np.ndarray, nodes: np.ndarray, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return to_node_axes(*nodal_functions(SHELL_EXPONENTS, _inverse_nodal_basis(), xi), frames)
 
 
 def _plane_stress_law(material: Material) -> tuple[str, tuple[float, ...]]:
@@ -84,12 +75,6 @@ def _thickness_output_law(material: Material) -> tuple[str, tuple[float, ...]]:
     c = m.E / (1.0 - m.nu * m.nu)
     d = lam + 2.0 * mu
     return "orthotropic", (d - c, d - c, d, lam, lam, lam - m.nu * c, 0.0, 0.0, 0.0)
-
-
-def _shear_law(material: Material) -> tuple[str, tuple[float, ...]]:
-    """Transverse shear at tying points."""
-    _, mu = svk_only(material).lame
-    return "assumed_strain", (mu,)
 
 
 def _tying_weights(xi: np.ndarray) -> np.ndarray:
@@ -161,7 +146,7 @@ SHELL = register(
         name="3443",
         cell_type="quad",
         node_slots=((0, 1, 2, 3),) * 4,
-        shape=_shape_functions,
+        shape=nodal_shape_functions(SHELL_EXPONENTS, SHELL_NODES),
         rules={"full": _rule((4, 4, 2))},
         curved_rule=_rule((4, 4, 2)),
         mass_rule=_rule((4, 4, 2)),
@@ -178,7 +163,7 @@ SHELL = register(
             "tied": (
                 EnergyPart("surface", _rule((4, 4, 2)), _plane_stress_law, framed=True),
                 EnergyPart("thickness", SURFACE_RULE, _thickness_law, framed=True, tying=THICKNESS_TYING),
-                EnergyPart("shear", _rule((4, 4, 2)), _shear_law, tying=SHEAR_TYING),
+                EnergyPart("shear", _rule((4, 4, 2)), shear_law, tying=SHEAR_TYING),
             )
         },
         output_schemes={

@@ -13,7 +13,7 @@ import itertools
 import numpy as np
 
 from ..mesh.cells import HEX_CORNERS, HEX_FACES
-from .ancf import monomials, nodal_basis, nodal_functions, to_node_axes
+from .ancf import monomials, nodal_functions, nodal_shape_functions, to_node_axes
 from .ancf_beam import box_subdivision
 from .family import Family, ParentDomain, register
 from .lagrange import QUADRATIC_SUBDIVISION, TET_CORNERS, TET_FACE_CORNERS, TET_FACES
@@ -125,21 +125,12 @@ def _brick_exponents() -> np.ndarray:
 BRICK_EXPONENTS = _brick_exponents()
 
 
-@functools.cache
-def _brick_inverse_basis() -> np.ndarray:
-    return nodal_basis(BRICK_EXPONENTS, HEX_CORNERS)
-
-
-def _brick_shape_functions(xi: np.ndarray, nodes: np.ndarray, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return to_node_axes(*nodal_functions(BRICK_EXPONENTS, _brick_inverse_basis(), xi), frames)
-
-
 BRICK = register(
     Family(
         name="H3843",
         cell_type="hexahedron",
         node_slots=((0, 1, 2, 3),) * 8,
-        shape=_brick_shape_functions,
+        shape=nodal_shape_functions(BRICK_EXPONENTS, HEX_CORNERS),
         rules={"3x3x3": _rule((3, 3, 3)), "4x4x4": _rule((4, 4, 4))},
         curved_rule=_rule((4, 4, 4)),
         mass_rule=_rule((5, 5, 5)),

@@ -304,17 +304,10 @@ def gather_table(conn: list[np.ndarray], slots: int) -> tuple[np.ndarray, np.nda
 def slot_graph(blocks: Iterable[Any], slots: int) -> sp.csr_matrix:
     """Pairs of slots that share an element. The mass matrix is no substitute: some of its entries are zero."""
     conn = [block.connectivity for block in blocks]
-    rows = np.concatenate([np.repeat(first + np.arange(len(c)), c.shape[1]) for first, c in _first_elements(conn)])
-    columns = np.concatenate([c.ravel() for c in conn])
-    incidence = sp.csr_matrix((np.ones(len(rows), dtype=np.int32), (rows, columns)), shape=(rows.max() + 1, slots))
+    count, width = sum(len(c) for c in conn), np.concatenate([np.full(len(c), c.shape[1]) for c in conn])
+    rows, columns = np.repeat(np.arange(count), width), np.concatenate([c.ravel() for c in conn])
+    incidence = sp.csr_matrix((np.ones(len(rows), dtype=np.int32), (rows, columns)), shape=(count, slots))
     return sp.csr_matrix(incidence.T @ incidence)
-
-
-def _first_elements(conn: list[np.ndarray]) -> Iterator[tuple[int, np.ndarray]]:
-    first = 0
-    for c in conn:
-        yield first, c
-        first += len(c)
 
 
 @dataclass(eq=False)

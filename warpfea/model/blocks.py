@@ -68,10 +68,8 @@ class Block:
             )
         if k.tying:
             return self.kernels
-        if midpoint:
-            kind = (k.law, self.slots, k.affine, tangent_damping(mean_damping(damping)), k.framed)
-            return element_kernels(dtype, *kind, midpoint, dissipative)
-        return element_kernels(dtype, k.law, self.slots, k.affine, tangent_damping(damping), k.framed)
+        damping = tangent_damping(damping, midpoint=midpoint)
+        return element_kernels(dtype, k.law, self.slots, k.affine, damping, k.framed, midpoint, dissipative)
 
     def dissipative_data(self, dtype: str, dissipation: float) -> Any:
         """Constants for the dissipative mid-point scheme with its chi."""
@@ -99,23 +97,15 @@ class Block:
         self, dtype: str, damping: str | None, midpoint: bool = False, dissipative: bool = False
     ) -> wp.Kernel:
         """Kernel of the product of a with_mass block, with a form of damping; others: see `kernels_for`."""
-        k = self.key
-        if midpoint:
-            kind = (k.law, self.slots, self.points, tangent_damping(mean_damping(damping)), k.vertex, self.cluster_size)
-            return with_mass_kernel(dtype, *kind, midpoint, dissipative)
-        return with_mass_kernel(
-            dtype, k.law, self.slots, self.points, tangent_damping(damping), k.vertex, self.cluster_size
-        )
+        k, damping = self.key, tangent_damping(damping, midpoint=midpoint)
+        kind = (k.law, self.slots, self.points, damping, k.vertex, self.cluster_size)
+        return with_mass_kernel(dtype, *kind, midpoint, dissipative)
 
 
-def tangent_damping(damping: str | None) -> str | None:
-    """Form of damping in element kernels: explicit damping is a load, see warpfea/terms/elements.py."""
-    return None if damping == "explicit" else damping
-
-
-def mean_damping(damping: str | None) -> str | None:
-    """Damping form of the conserving scheme: Edot = (E1 - E0)/h for incremental and rate forms."""
-    return "rate" if damping == "incremental" else damping
+def tangent_damping(damping: str | None, *, midpoint: bool = False) -> str | None:
+    """Form of damping in element kernels: explicit damping is a load, see warpfea/terms/elements.py; incremental and
+    rate forms of the conserving scheme have Edot = (E1 - E0)/h."""
+    return None if damping == "explicit" else "rate" if damping == "incremental" and midpoint else damping
 
 
 def build_block(model: Any, key: assembly.BlockKey, parts: list[assembly.HostBlock]) -> Block:
@@ -123,10 +113,8 @@ def build_block(model: Any, key: assembly.BlockKey, parts: list[assembly.HostBlo
     family = elements.get_family(key.family)
     conn = np.concatenate([p.conn + p.body.slot_offset for p in parts])
     data = (assumed_strain_struct if key.tying else block_struct)(model.dtype)()
-    data.conn = model.array("elements", conn.T, wp.int32)
-    data.is_position = model.array("elements", (family.slot_kind == 0).astype(float), model.types.T)
-    rows = [np.full(len(p.elements), p.coefficient_row) for p in parts]
-    data.material = model.array("elements", np.concatenate(rows), wp.int32)
+    rows = np.concatenate([np.full(len(p.elements), p.coefficient_row) for p in parts])
+    model.memory.fill(data, "elements", conn=conn.T, is_position=family.slot_kind == 0, material=rows)
     data.coefficients = model.parameters.coefficients
     data.contribution_offset, data.element_offset = model.contributions, model.element_count
     data.history_offset = model.history_count
@@ -140,7 +128,7 @@ def build_block(model: Any, key: assembly.BlockKey, parts: list[assembly.HostBlo
         det = _point_tables(model, data, key, parts)
         points = len(key.rule.weights)
         kind = (key.law, family.slots, key.affine, tangent_damping(key.damping), key.framed)
-        kernels = element_kernels(model.dtype, *kind)
+        kernels = element_kernels(model.dtype, *kind, False, False)
     cluster = cluster_size(model.dtype, len(conn), fit=model.device.is_cuda)
     sizes = len(conn), points, family.slots
     return Block(key, data, kernels, parts, *sizes, model.contributions, model.element_count, cluster, det_J0=det)
@@ -152,12 +140,11 @@ def output_block(model: Any, block: Block, scheme: str) -> Block:
     parts = [assembly.HostBlock(key, host.body, host.elements, host.material, ()) for host in block.host_blocks]
     data = block_struct(model.dtype)()
     data.conn, data.is_position, data.count = block.data.conn, block.data.is_position, block.count
-    data.coefficients = model.array("output", output_rows(model, block), model.types.T)
     index = np.concatenate([np.full(len(p.elements), k) for k, p in enumerate(parts)])
-    data.material = model.array("output", index, wp.int32)
+    model.memory.fill(data, "output", coefficients=output_rows(model, block), material=index)
     _point_tables(model, data, key, parts)
     points = len(key.rule.weights)
-    kernels = element_kernels(model.dtype, key.law, block.slots, False, None, True)
+    kernels = element_kernels(model.dtype, key.law, block.slots, False, None, True, False, False)
     return Block(key, data, kernels, parts, block.count, points, block.slots, 0, 0, block.cluster_size)
 
 
@@ -189,7 +176,7 @@ def _tied_tables(model: Any, data: Any, key: assembly.BlockKey, parts: list[asse
     if not normal:
         names += [("derivative_b", T), ("X_b", vec3)]
     for name, dtype in names:
-        table = np.concatenate([getattr(t, name) for t in tables])
+        table = np.concatenate([t[name] for t in tables])
         axis = 1 if dtype is vec3 else 2
         setattr(data, name, model.memory.element_array(np.moveaxis(table, 0, axis), dtype))
     if normal:  # strains x_a . x_a
@@ -237,25 +224,14 @@ def _point_tables(model: Any, data: Any, key: assembly.BlockKey, parts: list[ass
     return det_J0
 
 
-@dataclass(eq=False)
-class TiedTables:
+def tied_tables(host: HostBlock, elements: np.ndarray) -> dict[str, np.ndarray]:
     """Tables of elements with tied strains e_t = x_a . x_b - X_a . X_b (see kernels/elements/assumed_strain.py).
 
-    Attributes:
+    Returns:
         derivative_a, derivative_b: (E, n, S) derivatives of s_i along a and b at the tying points.
         X_a, X_b: (E, n, 3) X_a and X_b.
         coupling: (E, n, width) A of the energy (mu/2) e.A e.
     """
-
-    derivative_a: np.ndarray
-    derivative_b: np.ndarray
-    X_a: np.ndarray
-    X_b: np.ndarray
-    coupling: np.ndarray
-
-
-def tied_tables(host: HostBlock, elements: np.ndarray) -> TiedTables:
-    """Tables of the tied part of elements of a block."""
     part, body = host.key.integral, host.body
     tying = part.tying
     assert tying is not None
@@ -267,9 +243,9 @@ def tied_tables(host: HostBlock, elements: np.ndarray) -> TiedTables:
     t = np.arange(len(tying.points))
     a, b = tying.pairs.T
     coupling = _coupling(host, elements, J, [body.materials[host.material][1]])[0]
-    derivative_a, derivative_b = (np.moveaxis(ds[:, t, :, k], 0, 1) for k in (a, b))
-    X_a, X_b = (np.moveaxis(along[:, t, :, k], 0, 1) for k in (a, b))
-    return TiedTables(derivative_a, derivative_b, X_a, X_b, coupling)
+    out = {f"derivative_{name}": np.moveaxis(ds[:, t, :, k], 0, 1) for name, k in (("a", a), ("b", b))}
+    out |= {f"X_{name}": np.moveaxis(along[:, t, :, k], 0, 1) for name, k in (("a", a), ("b", b))}
+    return out | {"coupling": coupling}
 
 
 def couplings(host: HostBlock, materials: Sequence[Material]) -> np.ndarray:

@@ -70,13 +70,12 @@ class Components:
         slots = np.flatnonzero((of_slot >= 0) & (table.kind == 0))
         slots = slots[np.argsort(of_slot[slots], kind="stable")]
         start = np.concatenate([[0], np.cumsum(np.bincount(of_slot[slots], minlength=len(keep)))])
-        groups.start = model.array("groups", start, wp.int32)
-        groups.slot = model.array("groups", slots, wp.int32)
-        groups.group_of_slot = model.array("groups", of_slot, wp.int32)
         groups.is_position, groups.lumped_mass = table.is_position_array, model.masses.lumped_values
         model.cache["free groups"] = of_slot, slots, len(keep)
-        groups.mass = model.array("groups", model.masses.group_masses(*model.cache["free groups"]), model.types.T)
-        groups.free_directions = model.array("groups", free[keep], model.types.vec3)
+        mass = model.masses.group_masses(*model.cache["free groups"])
+        model.memory.fill(
+            groups, "groups", start=start, slot=slots, group_of_slot=of_slot, mass=mass, free_directions=free[keep]
+        )
         return groups, len(keep)
 
 

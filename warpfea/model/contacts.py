@@ -4,29 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
-from ..time_laws import TimeLaw
+from ..time_laws import Rotation, TimeLaw
 from .discretisation import Discretisation
 from .handles import SurfaceSet
 from .shapes import Shape
+from .triangle_mesh import TriMesh
 
-__all__ = ["Collider", "ColliderRotation", "Contact", "ContactOptions"]
-
-
-@dataclass(frozen=True, eq=False)
-class ColliderRotation:
-    """Checked wf.Rotation: rotation by angle(t) about an axis through an anchor.
-
-    Attributes:
-        anchor: (3,) m.
-        axis: (3,) of length 1.
-        angle: scalar law, rad.
-    """
-
-    anchor: np.ndarray
-    axis: np.ndarray
-    angle: TimeLaw
+__all__ = ["Collider", "Contact", "ContactOptions"]
 
 
 @dataclass(eq=False)
@@ -44,8 +28,13 @@ class Collider:
     shape: Shape
     name: str
     law: TimeLaw | None = None
-    rotation: ColliderRotation | None = None
+    rotation: Rotation | None = None
     index: int = -1
+
+    @property
+    def is_sheet(self) -> bool:
+        """True for triangles without an inside."""
+        return isinstance(self.shape, TriMesh) and not self.shape.closed
 
     @property
     def moves(self) -> bool:

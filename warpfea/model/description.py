@@ -9,8 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ..base.errors import ModelError
-from ..base.short_repr import use_short_repr
-from ..time_laws import TimeLaw
+from ..time_laws import Rotation, TimeLaw
 from .bodies import Body
 from .contacts import Collider, ContactOptions
 from .handles import NodeSet, SurfaceSet
@@ -23,29 +22,11 @@ __all__ = [
     "Moment",
     "Pressure",
     "Probe",
-    "Rotation",
     "Support",
     "support_slots",
 ]
 
 C = TypeVar("C", bound=ContactOptions)
-
-
-@dataclass(frozen=True, eq=False)
-class Rotation:
-    """A prescribed rotation about an axis through an anchor.
-
-    Args:
-        anchor: (3,) m.
-        axis: (3,), any length but zero.
-        angle: time law, rad.
-    """
-
-    anchor: Any
-    axis: Any
-    angle: Any
-
-    __repr__ = use_short_repr
 
 
 @dataclass(eq=False)
@@ -101,7 +82,7 @@ class Support:
     components: np.ndarray
     law: TimeLaw | None = None
     node_laws: list[TimeLaw] | None = None
-    rotation: tuple[np.ndarray, np.ndarray] | None = None
+    rotation: Rotation | None = None
 
 
 @dataclass(eq=False)

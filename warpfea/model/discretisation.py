@@ -14,7 +14,7 @@ from ..materials import Material
 from ..mesh import Mesh
 from .partition import morton_order
 
-__all__ = ["Discretisation", "boundary_faces", "element_boxes", "element_functions"]
+__all__ = ["Discretisation", "element_functions"]
 
 ORDERED_NODES = 20000
 """Node count above which slots and elements are ordered spatially; smaller bodies fit into caches."""
@@ -143,13 +143,31 @@ class Discretisation:
 
     @cached_property
     def boundary(self) -> np.ndarray:
-        """(K, 2) outer faces, rows (element, local face); see `boundary_faces`."""
-        return boundary_faces(self)
+        """(K, 2) outer faces, rows (element, local face): of solids those of the mesh, of beams and shells their
+        own."""
+        mesh = self.mesh
+        if self.family.solid:
+            return mesh.boundary()
+        every = np.arange(len(mesh.cells))
+        if mesh.cell_type == "line":
+            uses = np.bincount(mesh.cells.ravel(), minlength=len(mesh.points))
+            tips = [every[uses[mesh.cells[:, k]] == 1] for k in (0, 1)]
+            ends = [np.column_stack([e, np.full(len(e), k)]) for k, e in enumerate(tips)]
+            long = [np.column_stack([every, np.full(len(every), k)]) for k in (2, 3, 4, 5)]
+            return np.concatenate(ends + long)
+        wide = [np.column_stack([every, np.full(len(every), k)]) for k in (0, 1)]
+        return np.concatenate([*wide, mesh.boundary() + np.array([0, 2])])
 
     @cached_property
     def element_boxes(self) -> tuple[np.ndarray, np.ndarray, float]:
-        """Element bounding boxes for point location; see `element_boxes`."""
-        return element_boxes(self)
+        """Lower and upper corners (E, 3) of the bounding boxes of elements in the reference, and their longest side, m,
+        for point location."""
+        E = self.reference[self.connectivity] + (self.slot_kind[self.connectivity] == 0)[:, :, None] * self.origin
+        if self.family.has_gradients:
+            s, _ = element_functions(self, np.arange(len(E)), self.family.vtk_subdivision.points)
+            E = np.einsum("eps,esk->epk", s, E, optimize=True)
+        low, high = E.min(axis=1), E.max(axis=1)
+        return low, high, float(np.max(high - low))
 
 
 def element_functions(body: Discretisation, elements: np.ndarray, xi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -157,30 +175,3 @@ def element_functions(body: Discretisation, elements: np.ndarray, xi: np.ndarray
     nodes = body.mesh.points[body.mesh.cells[elements]] - body.origin
     extra = () if body.frames is None else (body.frames[elements],)
     return body.family.shape(xi, nodes, *extra)
-
-
-def boundary_faces(body: Discretisation) -> np.ndarray:
-    """(K, 2) outer faces, rows (element, local face): of solids those of the mesh, of beams and shells their own."""
-    mesh, family = body.mesh, body.family
-    if family.solid:
-        return mesh.boundary()
-    every = np.arange(len(mesh.cells))
-    if mesh.cell_type == "line":
-        uses = np.bincount(mesh.cells.ravel(), minlength=len(mesh.points))
-        ends = [np.column_stack([e, np.full(len(e), k)]) for k in (0, 1) for e in [every[uses[mesh.cells[:, k]] == 1]]]
-        long = [np.column_stack([every, np.full(len(every), k)]) for k in (2, 3, 4, 5)]
-        return np.concatenate(ends + long)
-    edges = mesh.boundary()
-    wide = [np.column_stack([every, np.full(len(every), k)]) for k in (0, 1)]
-    return np.concatenate([*wide, edges + np.array([0, 2])])
-
-
-def element_boxes(body: Discretisation) -> tuple[np.ndarray, np.ndarray, float]:
-    """Lower and upper corners (E, 3) of the elements' bounding boxes in the reference, and their longest side, m."""
-    E = body.reference[body.connectivity] + (body.slot_kind[body.connectivity] == 0)[:, :, None] * body.origin
-    coords = E
-    if body.family.has_gradients:
-        s, _ = element_functions(body, np.arange(len(E)), body.family.vtk_subdivision.points)
-        coords = np.einsum("eps,esk->epk", s, E, optimize=True)
-    low, high = coords.min(axis=1), coords.max(axis=1)
-    return low, high, float(np.max(high - low))

@@ -33,6 +33,12 @@ class Memory:
         self.count(name, out)
         return out
 
+    def fill(self, struct: Any, name: str, **values: Any) -> None:
+        """Set fields of a struct: arrays are uploaded in the fields' types, their bytes counted under `name`."""
+        for field, value in values.items():
+            kind = struct._cls.vars[field].type
+            setattr(struct, field, self.array(name, value, kind.dtype) if isinstance(kind, wp.array) else value)
+
     def count(self, name: str, *arrays: wp.array) -> None:
         """Count the bytes of device arrays under `name`."""
         for array in arrays:

@@ -11,10 +11,12 @@ import numpy as np
 from ..base.errors import ModelError
 from ..elements import Rule
 from ..elements.quadrature import lobatto_square, triangle_7, triangle_16
+from ..kernels.contact.thickness import thickness_kernel
 from .contact_points import ContactPoints, Modulus, effective_modulus, points_by_rules
 from .contacts import ContactOptions
 from .discretisation import Discretisation, element_functions
 from .handles import SurfaceSet
+from .surfaces import measure_to_skin
 
 __all__ = ["PAIR_RULES", "MasterFacets", "PairContact", "master_facets", "pair_points", "slave_and_master"]
 
@@ -211,30 +213,13 @@ def master_facets(surface: SurfaceSet) -> MasterFacets:
 
 def facet_thickness(surface: SurfaceSet) -> np.ndarray:
     """(F,) thickness, m: inward distance from the middle of each facet to the opposite side of its body."""
-    import warp as wp
-
-    from ..kernels.contact.thickness import thickness_kernel
-    from .surfaces import make_skin, reference_points
-
     body = surface.body
     corners = len(body.family.faces[int(surface.faces[0, 1])])
     middle = np.full((1, 2), 1.0 / 3.0 if corners == 3 else 0.5)
     shape, _, normal = _shape_functions(surface, middle)
     e = body.reference[body.connectivity[surface.faces[:, 0]]]
     positions = np.einsum("fqs,fsk->fqk", shape, e)[:, 0] + body.origin
-    skin = make_skin(body)
-    points = reference_points(body, skin.slot_weights)
-    center, size = points.mean(axis=0), float(np.ptp(points, axis=0).max())
-    with wp.ScopedDevice("cpu"):
-        mesh = wp.Mesh(
-            wp.array((points - center) / size, dtype=wp.vec3),
-            wp.array(skin.triangles.ravel(), dtype=wp.int32),
-        )
-        out = wp.zeros(len(positions), dtype=float)
-        x: wp.array = wp.array((positions - center) / size, dtype=wp.vec3)
-        n: wp.array = wp.array(normal[:, 0], dtype=wp.vec3)
-        wp.launch(thickness_kernel(), len(positions), [mesh.id, x, n, out], device="cpu")
-        return np.asarray(out.numpy(), dtype=float) * size
+    return measure_to_skin(body, thickness_kernel(), positions, normal[:, 0])
 
 
 def contact_constants(

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import warp as wp
 
 from ..base.errors import ModelError
 from ..kernels.common.structs import topology_struct
@@ -78,14 +77,11 @@ def make_topology(model: Any) -> Any:
     """The Topology struct: contributions of the elements, mass matrix, prescribed components."""
     topo = topology_struct(model.dtype)()
     start, entry = assembly.gather_table([b.connectivity for b in model.blocks], model.slots)
-    topo.contribution_start = model.array("topology", start, wp.int32)
-    topo.contribution_entry = model.array("topology", entry, wp.int32)
-    topo.mass_start = model.array("mass", model.masses.matrix.indptr, wp.int32)
-    topo.mass_column = model.array("mass", model.masses.matrix.indices, wp.int32)
+    matrix, free, fill = model.masses.matrix, model.slot_table.free, model.memory.fill
+    fill(topo, "topology", contribution_start=start, contribution_entry=entry)
+    fill(topo, "mass", mass_start=matrix.indptr, mass_column=matrix.indices)
     topo.mass_value = model.masses.values
-    free = model.slot_table.free
-    topo.free = model.array("slots", free, model.types.vec3)
-    topo.prescribed_bits = model.array("slots", (free == 0.0) @ [1, 2, 4], wp.uint8)
+    fill(topo, "slots", free=free, prescribed_bits=(free == 0.0) @ [1, 2, 4])
     model.terms.add_pool_topology(topo)
     return topo
 

@@ -18,6 +18,7 @@ __all__ = [
     "face_centroids",
     "make_drawing",
     "make_skin",
+    "measure_to_skin",
     "reference_points",
 ]
 
@@ -232,3 +233,27 @@ def make_drawing(body: Discretisation) -> Drawing:
 def reference_points(body: Discretisation, weights: sp.csr_matrix) -> np.ndarray:
     """(P, 3) reference positions, m, of points given by their weights (P, slots) on slots."""
     return weights @ body.reference + np.asarray(weights @ (body.slot_kind == 0))[:, None] * body.origin
+
+
+def measure_to_skin(
+    body: Discretisation, kernel: Any, x: np.ndarray, *vectors: np.ndarray, u: np.ndarray | None = None
+) -> np.ndarray:
+    """Distances (n,), m, that a kernel (mesh, points, vectors, out) measures from points x (n, 3), m, to the skin of a
+    body; `vectors`: of unit length, (n, 3); u: displacements of the body's slots, by default 0."""
+    import warp as wp
+
+    drawn = make_skin(body)
+    skin = reference_points(body, drawn.slot_weights)
+    if u is not None:
+        skin = skin + drawn.slot_weights @ u.astype(float)
+    center, size = skin.mean(axis=0), float(np.ptp(skin, axis=0).max())
+    with wp.ScopedDevice("cpu"):
+        mesh = wp.Mesh(
+            wp.array((skin - center) / size, dtype=wp.vec3),
+            wp.array(drawn.triangles.ravel(), dtype=wp.int32),
+            support_winding_number=u is not None,
+        )
+        out = wp.zeros(len(x), dtype=float)
+        args: list[Any] = [wp.array(values, dtype=wp.vec3) for values in ((x - center) / size, *vectors)]
+        wp.launch(kernel, len(x), [mesh.id, *args, out], device="cpu")
+        return np.asarray(out.numpy(), dtype=float) * size

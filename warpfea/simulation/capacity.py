@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import bisect
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -55,12 +54,17 @@ def check_capacity(model: Model, make: Callable[[Model, State], Stepper]) -> Non
     item = 3 * wp.types.type_size_in_bytes(model.types.T)
     if free is None or model.worlds <= 2 or model.worlds * model.slots * MAX_SCRATCH_VECTORS_PER_SLOT * item < free:
         return
-    small = ByteCounts(*(_array_bytes(model, worlds, make) for worlds in (1, 2)))
+    (one_world, chunks), (two_worlds, _) = (_array_bytes(model, worlds, make) for worlds in (1, 2))
+
+    def total_bytes(worlds: int) -> int:
+        growth = {name: two_worlds[name] - count for name, count in one_world.items()}
+        return sum(count + (chunks.get(name, int)(worlds) - 1) * growth[name] for name, count in one_world.items())
+
     room = int((1.0 - RESERVED_FRACTION) * free)
-    need = small.total_bytes(model.worlds)
+    need = total_bytes(model.worlds)
     if need <= room:
         return
-    fit = bisect.bisect_right(range(1, model.worlds), room, key=small.total_bytes)
+    fit = bisect.bisect_right(range(1, model.worlds), room, key=total_bytes)
     per_world = need // model.worlds
     raise CapacityError(
         f"a simulation of {model.worlds} worlds takes {format_bytes(need)}, {per_world} bytes per world, and "
@@ -69,31 +73,11 @@ def check_capacity(model: Model, make: Callable[[Model, State], Stepper]) -> Non
     )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class ByteCounts:
-    """Bytes of arrays by name with one and two worlds, and chunk sizes of chunked arrays."""
-
-    one_world: tuple[dict[str, int], dict[str, Callable[[int], int]]]
-    two_worlds: tuple[dict[str, int], dict[str, Callable[[int], int]]]
-
-    def total_bytes(self, worlds: int) -> int:
-        """Bytes for a number of worlds."""
-        out = 0
-        for name, count in self.one_world[0].items():
-            chunk = self.one_world[1].get(name, int)
-            out += count + (chunk(worlds) - 1) * (self.two_worlds[0][name] - count)
-        return out
-
-
 def _array_bytes(
     model: Model, worlds: int, make: Callable[[Model, State], Stepper]
 ) -> tuple[dict[str, int], dict[str, Callable[[int], int]]]:
-    """Arrays of the state and scratch of a simulation of a number of worlds."""
+    """Bytes of the arrays of the state and scratch of a simulation of a number of worlds, by name; and chunk sizes of
+    chunked arrays."""
     small = model.resized(worlds)
-    state = small.state()
-    stepper = make(small, state)
-    out = dict(stepper.work.bytes)
-    for label, kept in (("state", state), ("backup", stepper.backup)):
-        if kept is not None:
-            out |= {f"{label}.{name}": count for name, count in kept.bytes.items()}
-    return out, stepper.work.chunks
+    stepper = make(small, small.state())
+    return stepper.bytes(), {f"work.{name}": chunk for name, chunk in stepper.work.chunks.items()}

@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as spl
-import warp as wp
 
 from ..base.errors import ModelError
+from ..base.worlds import device_flags, set_rows
 from ..kernels.step.step_control import STATUS
 from ..kernels.terms.constraints import ANGLE, DISTANCE, FORMULA
 from ..terms.term import StepContext, Term
@@ -112,7 +112,7 @@ class ConsistentInitialConditions:
         for world in np.flatnonzero(flags).tolist():
             self._world = world
             v[world] += self._velocity_correction(u[world], v[world], laws[:, world])
-        self._write_flagged(state.velocity, flags, v)
+        set_rows(state.velocity, flags, v[flags])
         g = self._unbalanced_force(flags, after_jump, dt)
         w, a = np.zeros_like(v), np.zeros_like(v)
         rho = self.integrator.parameter
@@ -125,19 +125,13 @@ class ConsistentInitialConditions:
             jerk = self._jerk(*motion, w[world], 0.25 * dt)
             a[world] = w[world] + early * dt * jerk
             v[world] += late * dt**2 * jerk  # prescribed: the limit of a scheme with constant steps
-        self._write_flagged(state.velocity, flags, v)
+        set_rows(state.velocity, flags, v[flags])
         self._record_impulse(flags, self._kinetic_energy(v) - before)
-        self._write_flagged(state.acceleration, flags, w)
-        self._write_flagged(state.algorithmic_acceleration, flags, a)
-        self._write_flagged(state.previous_step, flags, np.full(len(time), dt))
-        self._write_flagged(state.acceleration_end, flags, time)
+        set_rows(state.acceleration, flags, w[flags])
+        set_rows(state.algorithmic_acceleration, flags, a[flags])
+        set_rows(state.previous_step, flags, dt)
+        set_rows(state.acceleration_end, flags, time[flags])
         self.restart_count += 1
-
-    @staticmethod
-    def _write_flagged(array: wp.array, flags: np.ndarray, values: np.ndarray) -> None:
-        host = array.numpy()
-        host[flags] = values[flags]
-        array.assign(host)
 
     def _kinetic_energy(self, v: np.ndarray) -> np.ndarray:
         """1/2 v.M v, (B,), J."""
@@ -173,28 +167,25 @@ class ConsistentInitialConditions:
 
     def _law_values(self, flags: np.ndarray, time: np.ndarray) -> np.ndarray:
         """Values of the time laws in the flagged worlds at times (B,), (B, laws, 3)."""
-        ctx, w, active = self.ctx, self.ctx.work, self._world_flags(flags)
-        self._write_flagged(w.step.new_time, flags, time)
+        ctx, w, active = self.ctx, self.ctx.work, device_flags(flags, self.model.device)
+        set_rows(w.step.new_time, flags, time[flags])
         laws = self.model.terms.time_laws
         laws.evaluate(ctx.launch, ctx.state, w.step.new_time, w.step.load_factor, active, w.time_law_values)
         return w.time_law_values.numpy().copy()
 
-    def _world_flags(self, flags: np.ndarray) -> Any:
-        return wp.array(flags.astype(np.int32), dtype=wp.int32, device=self.model.device)
-
     def _unbalanced_force(self, flags: np.ndarray, time: np.ndarray, dt: float) -> np.ndarray:
         """f_int + J^T lambda - f at the state in the flagged worlds, with the laws at times (B,); (B, slots, 3), N."""
         m, ctx, w = self.model, self.ctx, self.ctx.work
-        every, active = np.ones(len(flags)), self._world_flags(flags)
+        active = device_flags(flags, self.model.device)
         # strain rates of the state: E~ = E - (dq/dv) dE/dt
         step = {"load_factor": 1.0, "h": dt, "dq_dv": dt, "b": -dt, "q_a": 0.0, "mass_factor": 1.0 / dt}
         for name, value in step.items():
-            self._write_flagged(getattr(w.step, name), flags, value * every)
+            set_rows(getattr(w.step, name), flags, value)
         self._law_values(flags, time)
         m.terms.dead_loads.take_gravity(ctx.launch, w.time_law_values, active)
         u, v = ctx.state.displacement.numpy(), ctx.state.velocity.numpy()
         for array, values in ((w.u, u), (w.v, v), (w.v_tilde, v), (w.q_tilde, u - dt * v)):
-            self._write_flagged(array, flags, values)
+            set_rows(array, flags, values[flags])
         for stage in ("begin", "prepare"):
             m.terms.call(ctx, Term, stage, active)
         self.residual.evaluate_forces(active)

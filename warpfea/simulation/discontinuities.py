@@ -210,10 +210,8 @@ def _drive_error(support: Support, values: dict[int, np.ndarray], u: np.ndarray)
     chosen = np.flatnonzero(body.slot_kind[support.slots] == 0)
     slots = support.slots[chosen]
     if support.rotation is not None:
-        anchor, axis = support.rotation
-        angle = values[id(support.law)][0]
-        arm = body.reference[slots] + body.origin - anchor
-        turn = np.cross(axis, arm)
+        axis, angle = support.rotation.axis, values[id(support.law)][0]
+        turn = np.cross(axis, body.reference[slots] + body.origin - support.rotation.anchor)
         target = np.sin(angle) * turn + (1.0 - np.cos(angle)) * np.cross(axis, turn)
     elif support.node_laws:
         target = np.array([values[id(support.node_laws[k])] for k in chosen])

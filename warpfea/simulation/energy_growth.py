@@ -18,6 +18,7 @@ import numpy as np
 import warp as wp
 
 from ..base.errors import ModelWarning
+from ..base.worlds import set_rows
 from ..kernels.step.step_control import GROWTH_COLUMNS
 from ..model.assembly import element_volumes
 from .discontinuities import list_drives
@@ -91,9 +92,7 @@ class EnergyGrowth:
         writes = self._model.terms.world_updates
         chosen, self._writes = writes > self._writes, writes
         self._parameter_writes_seen = self._model.terms.parameter_updates
-        rows = self._rows.numpy()
-        rows[chosen] = 0.0
-        self._rows.assign(rows)
+        set_rows(self._rows, chosen, 0.0)
         self._round_off_energy.assign(round_off_energy(self._model))
 
     def warn_once(self, sim: Any, shares: np.ndarray, stacklevel: int = 4) -> None:
@@ -105,9 +104,10 @@ class EnergyGrowth:
         since = float(sim.state.energy_growth.numpy()[world, GROWTH_COLUMNS.index("since")])
         refused = f"; steps are refused above {REFUSE_LIMIT:.0%}" if self.choice == "refuse" else ""
         where = f" in world {world}" if sim.model.worlds > 1 else ""
+        source, cure = cause_and_remedy(sim, world)
         warnings.warn(
-            f"{energy_source(sim, world)} is gaining energy: {worst:.1%} of the peak energy{where} (above "
-            f"{WARN_LIMIT:.0%} since t = {since:.6g} s){refused}; {remedy_text(sim, world)}",
+            f"{source} is gaining energy: {worst:.1%} of the peak energy{where} (above "
+            f"{WARN_LIMIT:.0%} since t = {since:.6g} s){refused}; {cure}",
             ModelWarning,
             stacklevel=stacklevel,
         )
@@ -124,27 +124,17 @@ def round_off_energy(model: Model) -> np.ndarray:
     return out
 
 
-def caused_by_residuals(sim: Any, world: int) -> bool:
-    """True if accepted residuals have added more than half of the energy; never for generalized-alpha, which is
-    unstable by itself."""
-    if list_drives(sim.model) or sim.integrator.name == "generalized_alpha":
-        return False
-    share, largest, turnover = sim.state.energy_growth.numpy()[world, :3]
-    added = share * (largest + turnover)
-    return float(sim.energies()["ledger_residual"][world]) > 0.5 * added
-
-
-def energy_source(sim: Any, world: int) -> str:
-    """Source of the energy: the integrator, or accepted residuals."""
-    return "the work of accepted residuals" if caused_by_residuals(sim, world) else sim.integrator.label
-
-
-def remedy_text(sim: Any, world: int) -> str:
-    """Alternative integrators or tolerance, as text."""
-    if caused_by_residuals(sim, world):
-        return "take a smaller tol" + (", or dtype='float64'" if sim.model.dtype == "float32" else "")
+def cause_and_remedy(sim: Any, world: int) -> tuple[str, str]:
+    """Source of the energy, as text: accepted residuals that have added more than half of it (never for
+    generalized-alpha, which is unstable by itself), or the integrator; and a tolerance or alternative integrators."""
+    if not (list_drives(sim.model) or sim.integrator.name == "generalized_alpha"):
+        share, largest, turnover = sim.state.energy_growth.numpy()[world, :3]
+        if float(sim.energies()["ledger_residual"][world]) > 0.5 * share * (largest + turnover):
+            finer = ", or dtype='float64'" if sim.model.dtype == "float32" else ""
+            return "the work of accepted residuals", f"take a smaller tol{finer}"
     others = [f"{other!r}" for other in MORE_DISSIPATIVE_SCHEMES.get(sim.integrator.name, ())]
-    return f"take integrator={', '.join(others)} or a smaller dt" if others else "take a smaller dt"
+    better = f"integrator={', '.join(others)} or " if others else ""
+    return sim.integrator.label, f"take {better}a smaller dt"
 
 
 def integrator_energy_ratio(sim: Any) -> float:
@@ -164,9 +154,8 @@ def growth_error_text(sim: Any, world: int) -> str:
     """Message of a step rejected for energy growth; restarts the monitor of the world."""
     rows = sim.state.energy_growth.numpy()
     share, since = (float(rows[world, GROWTH_COLUMNS.index(name)]) for name in ("share", "since"))
-    name, cure = energy_source(sim, world), remedy_text(sim, world)
-    rows[world] = 0.0
-    sim.state.energy_growth.assign(rows)
+    name, cure = cause_and_remedy(sim, world)
+    set_rows(sim.state.energy_growth, world, 0.0)
     return (
         f"{name}: energy gain {share:.1%} of the peak energy (above {WARN_LIMIT:.0%} since t = {since:.6g} s); {cure}; "
         "energy_growth='warn' continues"

@@ -26,7 +26,7 @@ from .reports import ContactRecord, JointRecord, ProbeRecord
 
 if TYPE_CHECKING:
     from ..model.model import Model
-    from .run_statistics import RunStatistics
+    from .reports import RunStatistics
     from .stepper import Stepper
 
 __all__ = ["PartMember", "Records", "Results"]
@@ -184,19 +184,19 @@ class Records:
         if name not in names:
             raise ModelError(f"probe {name!r} is unknown; there are: {listing(names)}{did_you_mean(name, names)}")
         k = names.index(name)
-        table = self._recorded_table([0, *range(1 + 6 * k, 7 + 6 * k)])
-        d, v = table[:, :, 1:4], table[:, :, 4:7]
-        return ProbeRecord(self._recorded_times(table), self.model.description.probes[k].X + d, d, v)
+        time, table = self._recorded_table(len(REPORT_COLUMNS) + 6 * k, 6)
+        d, v = table[:, :, :3], table[:, :, 3:]
+        return ProbeRecord(time, self.model.description.probes[k].X + d, d, v)
 
-    def _recorded_table(self, columns: list[int]) -> np.ndarray:
-        """Recorded table (B, steps, columns): time, then the columns of the report from the probes on."""
+    def _recorded_table(self, first: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Times (steps,), s, or (B, steps) with times per world, and values (B, steps, count) of the columns of the
+        report from `first`, one of a probe or later, on."""
+        first += 1 - len(REPORT_COLUMNS)
+        table = np.zeros((self.model.worlds, 0, 1 + count))
         if self.statistics.history:
-            return np.stack([rows[:, columns] for rows in self.statistics.history], axis=1)
-        return np.zeros((self.model.worlds, 0, len(columns)))
-
-    def _recorded_times(self, table: np.ndarray) -> np.ndarray:
-        """Recorded times (steps,), s, or (B, steps) with times per world."""
-        return table[:, :, 0] if self.statistics.times_differ else table[:, :, 0].max(axis=0)
+            table = np.stack([rows[:, [0, *range(first, first + count)]] for rows in self.statistics.history], axis=1)
+        time = table[:, :, 0]
+        return time if self.statistics.times_differ else time.max(axis=0), table[:, :, 1:]
 
     def _of_last_step(self, first: int) -> np.ndarray:
         """(B, 6) report columns of the last accepted step; NaN for worlds without."""
@@ -206,10 +206,8 @@ class Records:
 
     def joint_record(self, joint: Joint | str) -> JointRecord:
         """Record of a joint (handle or name), one entry per step."""
-        first = 1 + self.joint_column(joint) - len(REPORT_COLUMNS)
-        columns = [0, *range(first, first + JOINT_COLUMNS)]
-        table = self._recorded_table(columns)
-        return JointRecord(self._recorded_times(table), table[:, :, 1:4], table[:, :, 4:7], table[:, :, 7])
+        time, table = self._recorded_table(self.joint_column(joint), JOINT_COLUMNS)
+        return JointRecord(time, table[:, :, :3], table[:, :, 3:6], table[:, :, 6])
 
     def joint_force(self, joint: Joint | str) -> np.ndarray:
         """Force (N) and moment about the anchor (N m) that a joint exerts on its child at the last accepted step.
@@ -252,11 +250,10 @@ class Records:
 
     def contact_record(self, contact: Contact | PairContact | str) -> ContactRecord:
         """Record of a contact (handle or name), one entry per step."""
-        first = 1 + self.contact_column(contact) - len(REPORT_COLUMNS)
-        table = self._recorded_table([0, *range(first, first + len(RECORD_NAMES))])
+        time, table = self._recorded_table(self.contact_column(contact), len(RECORD_NAMES))
         names = ("normal_force", "penetration", "slip", "area", "stick", "stored", "loss", "friction", "collider_work")
-        scalars = {name: table[:, :, 1 + RECORD_NAMES.index(name)] for name in names}
-        return ContactRecord(self._recorded_times(table), table[:, :, 1:4], table[:, :, 4:7], **scalars)
+        scalars = {name: table[:, :, RECORD_NAMES.index(name)] for name in names}
+        return ContactRecord(time, table[:, :, :3], table[:, :, 3:6], **scalars)
 
     def contact_force(self, contact: Contact | PairContact | str) -> np.ndarray:
         """Force (N) and moment about the origin (N m) of a contact on its body over the last accepted step.

@@ -15,6 +15,7 @@ from .. import solvers
 from ..base.console import compile_progress_bar, quiet_warp
 from ..base.errors import ModelError
 from ..base.memory import convert_memory_errors
+from ..base.worlds import set_rows
 from ..kernels.step.step_control import SAME_TIME_FRACTION, STATUS
 from ..model.assembly import require_density
 from ..model.state import State
@@ -37,11 +38,19 @@ from .discontinuities import warn_early_ends, warn_initial_jumps
 from .energy_growth import ENERGY_GROWTH_CHOICES, EnergyGrowth
 from .failures import check_initial_constraints
 from .observations import Observations
-from .reports import ContactRecord, JointRecord, PendingReport, ProbeRecord, StepReport, idle_report, simulation_text
+from .reports import (
+    ContactRecord,
+    JointRecord,
+    PendingReport,
+    ProbeRecord,
+    RunStatistics,
+    StepReport,
+    idle_report,
+    simulation_text,
+)
 from .resets import Resets
 from .results import PartMember, Records, Results
 from .run_loop import run_steps
-from .run_statistics import RunStatistics
 from .stepper import Stepper
 
 if TYPE_CHECKING:
@@ -348,15 +357,13 @@ class Simulation:
 
     def freeze(self, worlds: Any) -> None:
         """Freeze worlds (indices or mask) in their present state."""
-        status = self.state.status.numpy()
         try:
-            status[worlds] = STATUS["frozen"]
+            set_rows(self.state.status, worlds, STATUS["frozen"])
         except IndexError:
             B = self.model.worlds
             raise ModelError(
                 f"freeze: worlds = {worlds!r} must be numbers from 0 to {B - 1}, or ({B},) of True and False"
             ) from None
-        self.state.status.assign(status)
 
     def observe(self, *names: str) -> Observations:
         """Observation table of all worlds on the device, see Observations."""
@@ -388,9 +395,4 @@ class Simulation:
 
     def bytes(self) -> dict[str, int]:
         """Bytes on the device: constants, scratch, and each array of the state (twice if steps may be halved)."""
-        out = {f"model.{k}": v for k, v in self.model.memory.bytes.items()}
-        out |= {f"work.{k}": v for k, v in self.stepper.work.bytes.items()}
-        for label, state in (("state", self.state), ("backup", self.stepper.backup)):
-            if state is not None:
-                out |= {f"{label}.{k}": v for k, v in state.bytes.items()}
-        return out
+        return {f"model.{k}": v for k, v in self.model.memory.bytes.items()} | self.stepper.bytes()

@@ -21,6 +21,7 @@ import scipy.linalg
 import warp as wp
 
 from ..base.errors import StabilityError, StabilityWarning
+from ..base.worlds import device_flags
 from ..model.state import is_solver_history
 from ..solvers import NewtonPCG
 from ..terms.checks import overrides
@@ -193,7 +194,7 @@ class TangentOperator:
 
     def flags(self, chosen: np.ndarray) -> wp.array:
         """Device mask of worlds."""
-        return wp.array(chosen.astype(np.int32), dtype=wp.int32, device=self.model.device)
+        return device_flags(chosen, self.model.device)
 
     def product(self, p: np.ndarray, chosen: np.ndarray) -> np.ndarray:
         """Product H p."""
@@ -393,17 +394,9 @@ def _float64_copy(sim: Simulation) -> Simulation:
 
 def _evaluate_state(stepper: Any) -> None:
     """Evaluate residual and tangent at the current state (no solve)."""
-    w, m, state = stepper.work, stepper.model, stepper.state
-    k, launch = stepper.kernels, stepper.launch
+    w = stepper.work
     w.step.dt.zero_()
-    launch(k.begin_step, m.worlds, [w.step, w.newton, w.pcg])
-    launch(k.begin_attempt, m.worlds, [w.step, w.newton])
-    running = w.step.running
-    stepper._evaluate_time_laws(running)
-    args = [w.step, m.slot_table.is_position_array, m.topology.free, state.displacement, state.velocity]
-    args += [stepper.u_before, stepper.v_before, w.q_tilde, w.v_tilde, w.v]
-    launch(k.predict, stepper.dim, args)
-    m.terms.supports.drive(stepper.ctx, running)
-    m.terms.call(stepper.ctx, Term, "begin", running)
-    stepper.newton._clear_direction(running)
-    stepper.newton._evaluate_first_iterate(running)
+    stepper.launch(stepper.kernels.begin_step, stepper.model.worlds, [w.step, w.newton, w.pcg])
+    stepper.begin_attempt()
+    stepper.newton._clear_direction(w.step.running)
+    stepper.newton._evaluate_first_iterate(w.step.running)

@@ -12,6 +12,7 @@ import warp as wp
 from ..base.errors import ModelError
 from ..base.launch import Launcher, launch_part
 from ..base.memory import convert_memory_errors
+from ..base.worlds import device_flags, set_rows
 from ..kernels.step.adaptive import MAX_LEVEL
 from ..kernels.step.energy_ledger import LEDGER_TERM_ROWS
 from ..kernels.step.step import step_kernels
@@ -247,14 +248,12 @@ class Stepper:
         if isinstance(flags, wp.array):
             self.episodes.copy_flagged(flags, measured, w.newton.strain_energy)
         else:
-            w.newton.strain_energy.assign(
-                np.where(active.numpy() != 0, measured.numpy(), w.newton.strain_energy.numpy())
-            )
+            chosen = active.numpy() != 0
+            set_rows(w.newton.strain_energy, chosen, measured.numpy()[chosen])
 
     def _world_flags(self, mask: np.ndarray | None) -> wp.array:
         """Device mask of worlds, by default all."""
-        flags = np.ones(self.model.worlds) if mask is None else np.asarray(mask)
-        return wp.array(flags.astype(np.int32), dtype=wp.int32, device=self.model.device)
+        return device_flags(np.ones(self.model.worlds) if mask is None else mask, self.model.device)
 
     def _capture_graph(self) -> wp.Graph:
         with wp.ScopedCapture(device=self.model.device) as capture:
@@ -285,6 +284,12 @@ class Stepper:
             extra = [b.kernels_for(m.dtype, None).module for b in m.blocks] + [gather_kernels(m.dtype).module]
             modules |= {module.name: module for module in extra}
         load_modules(modules, m.device, self.on_compile)
+
+    def bytes(self) -> dict[str, int]:
+        """Bytes of scratch and of each array of the state and its backup."""
+        owners: dict[str, Any] = {"work": self.work, "state": self.state}
+        owners |= {"backup": self.backup} if self.backup else {}
+        return {f"{label}.{name}": count for label, owner in owners.items() for name, count in owner.bytes.items()}
 
     def set_dt(self, dt: Any) -> None:
         """Set the step of all worlds, s, or of each [world]."""
@@ -345,29 +350,25 @@ class Stepper:
         assert self.backup is not None
         self.backup.copy_rows(self.launch, self.work.step.first_rejection, self.state)
 
-    def _attempt(self) -> None:
+    def begin_attempt(self) -> None:
+        """Evaluate time laws, predict, and begin the terms: all that precedes the solve."""
         m, w, launch, state = self.model, self.work, self.launch, self.state
         launch(self.kernels.begin_attempt, m.worlds, [w.step, w.newton])
-        running = w.step.running
-        self._evaluate_time_laws(running)
-        args = [
-            w.step,
-            m.slot_table.is_position_array,
-            m.topology.free,
-            state.displacement,
-            state.velocity,
-            self.u_before,
-            self.v_before,
-        ]
-        launch(self.kernels.predict, self.dim, [*args, w.q_tilde, w.v_tilde, w.v])
+        self._evaluate_time_laws(w.step.running)
+        args = [w.step, m.slot_table.is_position_array, m.topology.free, state.displacement, state.velocity]
+        args += [self.u_before, self.v_before, w.q_tilde, w.v_tilde, w.v]
+        launch(self.kernels.predict, self.dim, args)
         if self.predictor:
             self.predictor.begin()
-        self.terms.supports.drive(self.ctx, running)
-        self.terms.call(self.ctx, Term, "begin", running)
+        self.terms.supports.drive(self.ctx, w.step.running)
+        self.terms.call(self.ctx, Term, "begin", w.step.running)
+
+    def _attempt(self) -> None:
+        self.begin_attempt()
         self.newton.run()
         if self.step_size_control:
             self.step_size_control.check_local_error()
-        launch(self.kernels.end_attempt, m.worlds, [w.step, w.newton])
+        self.launch(self.kernels.end_attempt, self.model.worlds, [self.work.step, self.work.newton])
         if self.step_size_control:
             self.step_size_control.finish_attempt()
         self.accept_attempt()

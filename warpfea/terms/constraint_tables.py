@@ -98,11 +98,6 @@ class ConstraintTables:
         self._upload_row_pairs()
         self._upload_joints()
 
-    def _upload(self, data: Any, tables: dict[str, tuple[Any, Any]]) -> None:
-        """Set the arrays of a struct from (values, dtype) by name."""
-        for name, (values, dtype) in tables.items():
-            setattr(data, name, self.model.array("constraints", np.asarray(values), dtype))
-
     def _order_rows(self, component: np.ndarray) -> None:
         """Sort joints by component and cluster."""
         groups = self.joint_slots()
@@ -153,22 +148,22 @@ class ConstraintTables:
         slot_start = np.concatenate([[0], np.cumsum(np.bincount(slot, minlength=m.slots))])
         self.reference_host = np.array([vector.value for row in rows for vector in row.vectors])
         tables = {
-            "kind": ([self._kind_number(row) for row in rows], wp.int32),
-            "scale": (self.scale_host, wp.float64),
-            "reference_product": ([r.reference_product for r in rows], wp.float64),
-            "constant_target": ([r.fixed for r in rows], wp.float64),
-            "law": (law, wp.int32),
-            "law_component": ([r.component for r in rows], wp.int32),
-            "connected_component": (self.component_host, wp.int32),
-            "term_start": (start, wp.int32),
-            "term_slot": (slot, wp.int32),
-            "term_weight": (weight, wp.float64),
-            "reference": (self.reference_host, wp.vec3d),
-            "slot_start": (slot_start, wp.int32),
-            "slot_term": (term[order], wp.int32),
-            "slot_weight": (weight[order], wp.float64),
+            "kind": [self._kind_number(row) for row in rows],
+            "scale": self.scale_host,
+            "reference_product": [r.reference_product for r in rows],
+            "constant_target": [r.fixed for r in rows],
+            "law": law,
+            "law_component": [r.component for r in rows],
+            "connected_component": self.component_host,
+            "term_start": start,
+            "term_slot": slot,
+            "term_weight": weight,
+            "reference": self.reference_host,
+            "slot_start": slot_start,
+            "slot_term": term[order],
+            "slot_weight": weight[order],
         }
-        self._upload(data, tables)
+        self.model.memory.fill(data, "constraints", **tables)
         self.data = data
         self._vector_entries = entries
 
@@ -212,20 +207,20 @@ class ConstraintTables:
         couple_row = np.repeat(np.arange(self.count), np.diff(couple_start))
         self._colour_clusters(couple_row, np.array(couple_column, dtype=np.int64))
         tables = {
-            "cluster": (self.cluster_host, wp.int32),
-            "cluster_start": (first, wp.int32),
-            "matrix_start": (np.concatenate([[0], np.cumsum(n**2)[:-1]]), wp.int32),
-            "pair_start": (pair_start, wp.int32),
-            "pair_side": (np.reshape(pair_side or [(0, 0)], (-1, 2)), wp.vec2i),
-            "pair_block": (pair_block or [0], wp.int32),
-            "coupling_start": (couple_start, wp.int32),
-            "coupling_row": (couple_row if len(couple_row) else [0], wp.int32),
-            "coupling_column": (couple_column or [0], wp.int32),
-            "coupling_pair_start": (couple_pair, wp.int32),
-            "colour": (self.colour_host, wp.int32),
-            "colour_cluster": (np.argsort(self.colour_host, kind="stable"), wp.int32),
+            "cluster": self.cluster_host,
+            "cluster_start": first,
+            "matrix_start": np.concatenate([[0], np.cumsum(n**2)[:-1]]),
+            "pair_start": pair_start,
+            "pair_side": np.reshape(pair_side or [(0, 0)], (-1, 2)),
+            "pair_block": pair_block or [0],
+            "coupling_start": couple_start,
+            "coupling_row": couple_row if len(couple_row) else [0],
+            "coupling_column": couple_column or [0],
+            "coupling_pair_start": couple_pair,
+            "colour": self.colour_host,
+            "colour_cluster": np.argsort(self.colour_host, kind="stable"),
         }
-        self._upload(self.data, tables)
+        self.model.memory.fill(self.data, "constraints", **tables)
 
     def _split_large_clusters(self) -> np.ndarray:
         """First row of each cluster, after splitting clusters too large for a dense inverse into joints."""
@@ -255,8 +250,8 @@ class ConstraintTables:
                         columns.setdefault(other, []).append(((side, other_side), block))
             out.append(columns)
         self.block_count = len(block_start) - 1
-        tables = {"block_start": (block_start, wp.int32), "block_slot": (block_slot or [0], wp.int32)}
-        self._upload(self.data, tables | {"block_weight": (block_weight or [0.0], wp.float64)})
+        tables = {"block_start": block_start, "block_slot": block_slot or [0], "block_weight": block_weight or [0.0]}
+        self.model.memory.fill(self.data, "constraints", **tables)
         return out
 
     def _vector_weights(
@@ -313,16 +308,16 @@ class ConstraintTables:
             if not self.on_child_host[own].any():  # child in space: the parent's reaction
                 side[own] = -1
         tables = {
-            "first_row": ([rows[0] for rows in self.rows_of], wp.int32),
-            "end_row": ([rows[-1] + 1 for rows in self.rows_of], wp.int32),
-            "anchor": ([joint.anchor.value for joint in self.joints], wp.vec3d),
-            "anchor_start": (np.concatenate([[0], np.cumsum([len(a[0]) for a in anchors])]), wp.int32),
-            "anchor_slot": (np.concatenate([a[0] for a in anchors] + [np.zeros(1)]), wp.int32),
-            "anchor_weight": (np.concatenate([a[1] for a in anchors] + [np.zeros(1)]), wp.float64),
-            "entry_role": (side * (1 + position[self.slot_host]), wp.int32),
-            "slot_position": (place[self.slot_host], wp.vec3d),
+            "first_row": [rows[0] for rows in self.rows_of],
+            "end_row": [rows[-1] + 1 for rows in self.rows_of],
+            "anchor": [joint.anchor.value for joint in self.joints],
+            "anchor_start": np.concatenate([[0], np.cumsum([len(a[0]) for a in anchors])]),
+            "anchor_slot": np.concatenate([a[0] for a in anchors] + [np.zeros(1)]),
+            "anchor_weight": np.concatenate([a[1] for a in anchors] + [np.zeros(1)]),
+            "entry_role": side * (1 + position[self.slot_host]),
+            "slot_position": place[self.slot_host],
         }
-        self._upload(data, tables)
+        self.model.memory.fill(data, "constraints", **tables)
         self.joint_data = data
         for k, joint in enumerate(self.joints):
             joint.index = k
@@ -414,12 +409,10 @@ class ConstraintTables:
         item = np.concatenate(items)
         order = np.argsort(item, kind="stable")
         entry, count = np.unique(item, return_counts=True)
-        data, array = coupling_struct()(), self.model.array
-        data.entry = array("matrix pattern", entry, wp.int32)
-        data.start = array("matrix pattern", np.concatenate([[0], np.cumsum(count)]), wp.int32)
-        data.term_a = array("matrix pattern", np.concatenate(term_a)[order], wp.int32)
-        data.term_b = array("matrix pattern", np.concatenate(term_b)[order], wp.int32)
-        data.weight = array("matrix pattern", np.concatenate(weight)[order], wp.float64)
+        a, b, w = (np.concatenate(values)[order] for values in (term_a, term_b, weight))
+        data, start = coupling_struct()(), np.concatenate([[0], np.cumsum(count)])
+        tables = {"entry": entry, "start": start, "term_a": a, "term_b": b, "weight": w}
+        self.model.memory.fill(data, "matrix pattern", **tables)
         return data, len(entry)
 
 

@@ -295,14 +295,12 @@ class Constraints(Constrained, Updated, Tied, Preconditioned):
     def evaluate(self, state: State, multipliers: np.ndarray | None = None) -> Any:
         """Multiplier struct with the rows evaluated at a state, for given multipliers (rows,) and no penalty."""
         m, con, B = self.model, self.tables, self.model.worlds
-        launch, laws = Launcher(m.device), m.terms.time_laws
+        launch = Launcher(m.device)
 
         def zeros(shape: tuple[int, ...], dtype: Any) -> wp.array:
             return wp.zeros(shape, dtype=dtype, device=m.device)
 
-        all_worlds = wp.ones(B, dtype=wp.int32, device=m.device)
-        value = zeros((B, max(laws.count, 1)), wp.vec3d)
-        laws.evaluate(launch, state, state.time, wp.ones(B, dtype=wp.float64, device=m.device), all_worlds, value)
+        value, all_worlds = m.terms.time_laws.values_at_state(launch, state)
         mul = self._make_multipliers(lambda name, shape, dtype: zeros(shape, dtype), midpoint=False)
         mul.rows = zeros((TERM_ROWS, *self.dim), wp.float64)
         if multipliers is not None:

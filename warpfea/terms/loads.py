@@ -227,8 +227,8 @@ class BodyForces(Term):
                     shapes.append(s)
             per_element = families.get_family(block.key.family).has_gradients
             shape = np.concatenate(shapes) if per_element else shapes[0]
-            block.data.shape = m.array("loads", np.moveaxis(shape, 0, 2), m.types.T)
-            block.data.mass_weight = m.array("loads", np.concatenate(weights).T, m.types.T)
+            tables = {"shape": np.moveaxis(shape, 0, 2), "mass_weight": np.concatenate(weights).T}
+            m.memory.fill(block.data, "loads", **tables)
             block.body_force_rule = rule
 
     def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
@@ -288,8 +288,7 @@ class FollowerLoads(Preconditioned):
         """Common device data; conn (items, local) in model slots."""
         m = self.model
         data = follower_struct(m.dtype)()
-        data.conn = m.array("loads", conn.T, wp.int32)
-        data.time_law = m.array("loads", np.full(len(conn), laws.add(law)), wp.int32)
+        m.memory.fill(data, "loads", conn=conn.T, time_law=np.full(len(conn), laws.add(law)))
         data.first_entry, data.item_count = self.offset + self._entry_count, len(conn)
         self.connectivity.append(conn)
         self._entry_count += conn.size
@@ -303,20 +302,18 @@ class FollowerLoads(Preconditioned):
         position = body.slot_kind[t.conn] == 0
         value = body.reference[t.conn]
         value = np.where(position[:, :, None], value - value[:, :1], value)
-        data.reference = m.array("loads", np.swapaxes(value, 0, 1), m.types.vec3)
-        data.is_position = m.array("loads", position.T.astype(float), m.types.T)
-        for name, table in (("shape", t.shape), ("shape_da", t.d_a), ("shape_db", t.d_b)):
-            setattr(data, name, m.array("loads", np.moveaxis(table, 0, 2), m.types.T))
-        data.weight = m.array("loads", t.weights[0], m.types.T)
+        shape, shape_da, shape_db = (np.moveaxis(table, 0, 2) for table in (t.shape, t.d_a, t.d_b))
+        tables = {"shape": shape, "shape_da": shape_da, "shape_db": shape_db, "weight": t.weights[0]}
+        m.memory.fill(data, "loads", reference=np.swapaxes(value, 0, 1), is_position=position.T, **tables)
         k = pressure_kernels(m.dtype)
         return FollowerLoad(data, k.pressure_force, k.pressure_tangent_product, len(t.conn))
 
     def _moment(self, moment: Moment, laws: TimeLawTable) -> FollowerLoad:
         m = self.model
         data = self._load_data(moment.slots + moment.body.slot_offset, moment.law, laws)
-        data.vector_coefficients = m.array("loads", np.swapaxes(moment.vectors, 0, 1), m.types.vec3)
-        data.reference_vectors = m.array("loads", moment.axes, m.types.mat33)
-        data.moment_fraction = m.array("loads", np.full(len(moment.slots), 1.0 / len(moment.slots)), m.types.T)
+        moment_fraction = np.full(len(moment.slots), 1.0 / len(moment.slots))
+        tables = {"vector_coefficients": np.swapaxes(moment.vectors, 0, 1), "reference_vectors": moment.axes}
+        m.memory.fill(data, "loads", moment_fraction=moment_fraction, **tables)
         k = moment_kernels(m.dtype, moment.body.family.spin_vectors)
         return FollowerLoad(data, k.moment_force, k.moment_tangent_product, len(moment.slots))
 
@@ -399,9 +396,8 @@ class FollowerMatrix:
         chosen = chosen[np.argsort(index[chosen], kind="stable")]
         entry, count = np.unique(index[chosen], return_counts=True)
         places = follower_pattern_struct()()
-        values = (entry, np.concatenate([[0], np.cumsum(count)]), (i * self.count + item)[chosen], j[chosen])
-        for name, value in zip(("entry", "start", "row", "column"), values):
-            setattr(places, name, self.model.array("matrix pattern", value, wp.int32))
+        start, row = np.concatenate([[0], np.cumsum(count)]), (i * self.count + item)[chosen]
+        self.model.memory.fill(places, "matrix pattern", entry=entry, start=start, row=row, column=j[chosen])
         return places, len(entry)
 
     def add(self, ctx: StepContext, matrix: Any, dq_dv: wp.array, active: wp.array, out: wp.array) -> None:

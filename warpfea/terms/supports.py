@@ -63,7 +63,7 @@ class Supports:
         rotation_rows: list[tuple[int, int, np.ndarray, np.ndarray, np.ndarray]] = []
         for support in self.model.description.supports:
             slots = support.body.slot_offset + support.slots
-            arms = _lever_arms(support, support.rotation[0]) if support.rotation else None
+            arms = _lever_arms(support, support.rotation.anchor) if support.rotation else None
             index = laws.add(support.law) if support.law is not None else -1
             for k, slot in enumerate(slots):
                 node_law = support.node_laws[k] if support.node_laws else None
@@ -72,7 +72,7 @@ class Supports:
                 _check_conflict(taken, support, int(slot), (node_law or support.law, turn))
                 if arms is not None:
                     assert support.rotation is not None
-                    rotation_rows.append((slot, own, support.components, arms[k], support.rotation[1]))
+                    rotation_rows.append((slot, own, support.components, arms[k], support.rotation.axis))
                 elif own >= 0:
                     row = displacement_rows.setdefault(int(slot), [-1, -1, -1])
                     for c in np.flatnonzero(support.components):

@@ -191,8 +191,7 @@ class TermSet:
         m = self.model
         start, order = assembly.gather_table(conns, m.slots)
         out = topology_struct(m.dtype)()
-        out.contribution_start = m.array("loads", start, wp.int32)
-        out.contribution_entry = m.array("loads", order, wp.int32)
+        m.memory.fill(out, "loads", contribution_start=start, contribution_entry=order)
         return out
 
     def add_pool_topology(self, topology: Any) -> None:

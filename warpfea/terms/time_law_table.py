@@ -70,11 +70,9 @@ class TimeLawTable:
         if not laws:
             return
         start = np.concatenate([[0], np.cumsum([len(w.times) for w in laws])])
-        self.data.sample_start = m.array("laws", start, wp.int32)
-        self.data.sample_time = m.array("laws", np.concatenate([w.times for w in laws] + [[0.0]]), wp.float64)
-        self.data.sample_value = m.array(
-            "laws", np.concatenate([w.values for w in laws] + [np.zeros((1, 3))]), wp.vec3d
-        )
+        times = np.concatenate([w.times for w in laws] + [[0.0]])
+        values = np.concatenate([w.values for w in laws] + [np.zeros((1, 3))])
+        m.memory.fill(self.data, "laws", sample_start=start, sample_time=times, sample_value=values)
         for k, law in enumerate(laws):
             if law.function is not None:
                 take = argument_precision(law.function, m.dtype)
@@ -97,6 +95,14 @@ class TimeLawTable:
         for (name, ramped), law in self.control_laws.items():
             args = [getattr(state, control_array(name)), law, int(ramped), ramp, active, value]
             launch(self.kernels.evaluate_control, B, args)
+
+    def values_at_state(self, launch: Launcher, state: State) -> tuple[wp.array, wp.array]:
+        """Values [world, law] at the time of a state, at full load; and flags [world] of 1."""
+        B, device = state.worlds, self.model.device
+        value = wp.zeros((B, max(self.count, 1)), dtype=wp.vec3d, device=device)
+        full, all_worlds = wp.ones(B, dtype=wp.float64, device=device), wp.ones(B, dtype=wp.int32, device=device)
+        self.evaluate(launch, state, state.time, full, all_worlds, value)
+        return value, all_worlds
 
     def modules(self) -> set[wp.Module]:
         """Modules launched by `evaluate`."""
