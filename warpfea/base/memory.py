@@ -26,15 +26,11 @@ def convert_memory_errors(what: str, device: Any) -> Iterator[None]:
             raise
         count = int(found[1]) if found[1] else 0
         asked = f": {count} bytes ({format_bytes(count)}) requested" if count else ""
-        text = f"{what}: out of memory on {device}{asked}{_free_memory_text(device)}{MEMORY_REMEDY}"
+        free = ""
+        if getattr(device, "is_cuda", False):
+            free = f", {format_bytes(device.free_memory)} of {format_bytes(device.total_memory)} are free"
+        text = f"{what}: out of memory on {device}{asked}{free}{MEMORY_REMEDY}"
         raise CapacityError(text, bytes=count) from error
 
 
 MEMORY_REMEDY = "; take fewer worlds, a coarser mesh, dtype='float32' or a device with more memory"
-
-
-def _free_memory_text(device: Any) -> str:
-    """Free and total memory of a GPU as text."""
-    if not getattr(device, "is_cuda", False):
-        return ""
-    return f", {format_bytes(device.free_memory)} of {format_bytes(device.total_memory)} are free"

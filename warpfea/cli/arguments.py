@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable
 from typing import Any, NoReturn
 
-from ..base.checks import number_hint
+from ..base.checks import finite_number, number_hint
 from ..base.errors import UsageError
 from ..base.names import did_you_mean
 
@@ -87,21 +87,16 @@ load_steps = functools.partial(_or_auto, positive_integer, 1, "a positive whole 
 
 def positive_integers(text: str) -> list[int]:
     """Positive whole numbers separated by commas; 1e5 counts as one."""
-    try:
-        values = [float(part) for part in text.split(",")]
-        assert all(math.isfinite(v) and v >= 1 and v == int(v) for v in values)
-    except (ValueError, AssertionError):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a list of positive whole numbers") from None
+    values = [finite_number(part) for part in text.split(",")]
+    if not all(v >= 1 and v == int(v) for v in values):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a list of positive whole numbers")
     return [int(v) for v in values]
 
 
 def number_tuple(text: str, size: int) -> tuple[float, ...]:
     """Finite numbers separated by commas."""
-    try:
-        values = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        values = ()
-    if len(values) != size or not all(map(math.isfinite, values)):
+    values = tuple(map(finite_number, text.split(",")))
+    if len(values) != size or any(map(math.isnan, values)):
         expected = "a finite number" if size == 1 else f"{size} finite numbers with commas"
         raise argparse.ArgumentTypeError(f"{text!r} is not {expected}")
     return values

@@ -68,8 +68,7 @@ def run(options: argparse.Namespace) -> int:
         status = "failed"
         try:
             if options.static:
-                unstable = options.unstable or "warn"
-                run_static(sim, outputs=outputs, progress=show_progress(options), unstable=unstable)
+                run_static(sim, outputs=outputs, progress=show_progress(options), unstable=options.unstable or "warn")
             else:
                 sim.run(t_end, outputs=outputs, progress=show_progress(options))
             status = "done"

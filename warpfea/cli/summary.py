@@ -205,17 +205,11 @@ def _iterations(s: dict[str, Any], sim: Simulation) -> str:
     """Iterations and residuals."""
     if s["steps"] == 0:
         return "no step was accepted"
-    text = f"{_iteration_counts(s, sim)} per step, residual up to {_number_text(s['max_residual'], 2)}"
+    steps = max(s["steps"] if s["substeps"] is None else s["substeps"], 1)  # accepted ones of adaptive steps
+    first, second = s["newton_iterations"] / steps, s["pcg_iterations"] / steps
+    counts = f"{first:.1f} of Jacobi" if isinstance(sim.solver, Jacobi) else f"{first:.1f} Newton and {second:.0f} PCG"
+    text = f"{counts} per step, residual up to {_number_text(s['max_residual'], 2)}"
     return text + (f", violation up to {_number_text(s['violation'], 2)} m" if sim.model.constraints else "")
-
-
-def _iteration_counts(s: dict[str, Any], sim: Simulation) -> str:
-    """Iterations per step; accepted ones of adaptive steps."""
-    steps = max(s["steps"] if s["substeps"] is None else s["substeps"], 1)
-    first = s["newton_iterations"] / steps
-    if isinstance(sim.solver, Jacobi):
-        return f"{first:.1f} of Jacobi"
-    return f"{first:.1f} Newton and {s['pcg_iterations'] / steps:.0f} PCG"
 
 
 def _joint_rows(sim: Simulation) -> list[list[str]]:

@@ -179,17 +179,8 @@ def check_volumes(mesh: Mesh) -> None:
         Zero-volume or inverted elements.
     """
     kind: CellType = mesh.kind
-    longest = _longest_edges(mesh)
+    volumes, longest = _nonzero_sizes(mesh)
     scale = longest**kind.dimension
-    volumes = mesh.volumes()
-    flat = np.flatnonzero(np.abs(volumes) <= FLATNESS_TOL * scale)
-    if flat.size:
-        e = flat[0]
-        what, unit = {1: ("length", "m"), 3: ("volume", "m^3")}[kind.dimension]
-        raise MeshError(
-            f"{mesh.label}: element {e} has zero {what} ({volumes[e]:.3g} {unit}, longest edge "
-            f"{longest[e]:.3g} m; {flat.size} such element{_plural(flat)})"
-        )
     lowest = volumes / kind.rule[1].sum()  # mean det J0; constant in a straight simplex
     simplex = kind.corners == kind.dimension + 1
     bent = np.flatnonzero(~mesh.straight_sided(1e-12)) if simplex else np.arange(len(mesh.cells))
@@ -213,22 +204,25 @@ def check_volumes(mesh: Mesh) -> None:
     )
 
 
-def _longest_edges(mesh: Mesh) -> Floats:
+def _nonzero_sizes(mesh: Mesh) -> tuple[Floats, Floats]:
+    """Volumes (m^3; areas, lengths) and longest edges, m, of the elements. MeshError for a size of zero."""
     ends = mesh.points[mesh.cells[:, mesh.kind.edges]]
-    return np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=2).max(axis=1)
+    longest = np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=2).max(axis=1)
+    sizes, dimension = mesh.volumes(), mesh.kind.dimension
+    flat = np.flatnonzero(np.abs(sizes) <= FLATNESS_TOL * longest**dimension)
+    if flat.size:
+        e, noun = flat[0], "quad" if dimension == 2 else "element"
+        what, unit = {1: ("length", "m"), 2: ("area", "m^2"), 3: ("volume", "m^3")}[dimension]
+        raise MeshError(
+            f"{mesh.label}: {noun} {e} has zero {what} ({sizes[e]:.3g} {unit}, longest edge {longest[e]:.3g} m; "
+            f"{flat.size} such {noun}{_plural(flat)})"
+        )
+    return sizes, longest
 
 
 def _check_quads(mesh: Mesh) -> None:
     """Each quad has an area, and is convex with respect to its mean normal."""
-    longest = _longest_edges(mesh)
-    areas = mesh.volumes()
-    flat = np.flatnonzero(areas <= FLATNESS_TOL * longest**2)
-    if flat.size:
-        e = flat[0]
-        raise MeshError(
-            f"{mesh.label}: quad {e} has zero area ({areas[e]:.3g} m^2, longest edge {longest[e]:.3g} m; "
-            f"{flat.size} such quad{_plural(flat)})"
-        )
+    _, longest = _nonzero_sizes(mesh)
     x = mesh.points[mesh.cells]
     normals = np.cross(np.roll(x, -1, axis=1) - x, np.roll(x, 1, axis=1) - x)
     mean = normals.mean(axis=1)

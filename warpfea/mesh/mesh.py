@@ -264,16 +264,12 @@ class Mesh:
 
     def _set_by_name(self, what: str, sets: dict[str, Ints], name: str) -> Ints:
         if name not in sets:
-            elsewhere = self._set_kinds(name)
+            kinds = {"elements": self.element_sets, "faces": self.surface_sets, "nodes": self.node_sets}
+            elsewhere = [kind for kind, of_kind in kinds.items() if name in of_kind]
             hint = f"; {name!r} is a set of {' and '.join(elsewhere)}" if elsewhere else did_you_mean(name, sets)
             found = listing(sorted(sets)) if sets else "none; give a function of the positions instead, X -> mask"
             raise MeshError(f"{self.label}: no {what} set named {name!r}; there are: {found}{hint}")
         return sets[name]
-
-    def _set_kinds(self, name: str) -> list[str]:
-        """Kinds of sets of this name in the mesh: "nodes", "elements", "faces"."""
-        kinds = {"elements": self.element_sets, "faces": self.surface_sets, "nodes": self.node_sets}
-        return [kind for kind, sets in kinds.items() if name in sets]
 
     def _predicate_mask(self, predicate: Callable[[Floats], Any], coordinates: Floats, what: str) -> np.ndarray:
         mask = np.asarray(predicate(coordinates))

@@ -121,7 +121,8 @@ class DrawnSurface:
         self.obstacles = Obstacles(sim, low, high)
         start += [
             np.asarray(clip_to_box(points, low, high, 0.5), dtype=np.float64)
-            for points in self.obstacles.bounded_points()
+            for points, obstacle in zip(self.obstacles.points(), self.obstacles.all)
+            if not obstacle.is_plane
         ]
         distance = self._grid_spacing(start, spacing)
         self.offsets = grid_offsets(self.worlds, distance, self.up_axis)

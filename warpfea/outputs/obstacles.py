@@ -114,10 +114,6 @@ class Obstacles:
             for k, obstacle in enumerate(self.all)
         ]
 
-    def bounded_points(self) -> list[Floats]:
-        """(B, n, 3) current points of those other than half-spaces, m."""
-        return [points for points, obstacle in zip(self.points(), self.all) if not obstacle.is_plane]
-
 
 def clip_to_box(points: Array, low: Array, high: Array, fraction: float) -> Array:
     """Points (..., 3) clamped to the box from low to high, enlarged each way by a fraction of its diagonal."""

@@ -158,7 +158,8 @@ class Renderer:
         with quiet_warp(), wp.ScopedDevice("cpu"):
             scene = self._make_scene(wp, raycast, unit, np.asarray(colors), camera, size)
             self._cast_shadow(wp, raycast, scene, unit)
-            image = self._cast(wp, raycast, scene, pixel_grid(width, height)).reshape(height, width, 3)
+            centers = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1)
+            image = self._cast(wp, raycast, scene, centers.reshape(-1, 2).astype(np.float32)).reshape(height, width, 3)
             edges = edge_pixels(to_srgb(image))
             rows, columns = np.nonzero(edges)
             corners = np.stack([columns, rows], axis=1).astype(np.float32)
@@ -172,8 +173,7 @@ class Renderer:
         assert self._normal_groups is not None
         points = np.ascontiguousarray(unit, dtype=np.float32)
         if self._mesh is None or len(self._mesh.points) != len(points):
-            indices = wp.array(self.triangles.ravel(), dtype=wp.int32)
-            self._mesh = wp.Mesh(wp.array(points, dtype=wp.vec3), indices)
+            self._mesh = wp.Mesh(wp.array(points, dtype=wp.vec3), wp.array(self.triangles.ravel(), dtype=wp.int32))
         else:
             self._mesh.points.assign(points)
             self._mesh.refit()
@@ -232,12 +232,6 @@ class Renderer:
 
 # 8 rooks: one per row and column of an 8 x 8 raster
 _SUBPIXELS = np.array([[(k + 0.5) / 8, ((5 * k + 2) % 8 + 0.5) / 8] for k in range(8)], dtype=np.float32)
-
-
-def pixel_grid(width: int, height: int) -> npt.NDArray[np.float32]:
-    """(height * width, 2) centres of the pixels, row by row."""
-    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    return np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float32)
 
 
 def edge_pixels(image: Floats, limit: float = 0.025) -> npt.NDArray[np.bool_]:

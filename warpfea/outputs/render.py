@@ -75,8 +75,7 @@ class _PictureWriter(Output):
 
     def _frame(self, sim: Any) -> Frame:
         points = np.asarray(self._surface.points(sim) - self._origin, dtype=np.float32)
-        values = self._surface.values(sim, self.field) if self.field else None
-        return Frame(frame_time(sim), points, values)
+        return Frame(frame_time(sim), points, self._surface.values(sim, self.field) if self.field else None)
 
     def abort(self) -> None:
         """Discard the frames; nothing is on disk before `close`."""

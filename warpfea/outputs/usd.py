@@ -18,6 +18,7 @@ import os
 import pathlib
 import shutil
 from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
 import numpy as np
@@ -42,6 +43,7 @@ _SAVE_BYTES = 32 << 20  # unsaved data (bytes) above which a binary layer is flu
 _BODY_COLOR = (0.55, 0.57, 0.60)
 
 
+@dataclass(eq=False, repr=False)
 class USDWriter(Output):
     """Writes `path` (.usdc, .usda or .usd).
 
@@ -64,34 +66,29 @@ class USDWriter(Output):
             `write`), an invalid file (at `close`; the target is then unchanged).
     """
 
-    def __init__(
-        self,
-        path: str | os.PathLike[str],
-        *,
-        fps: float = 60.0,
-        fields: Sequence[str] = ("von_mises", "displacement"),
-        color: str | None = "von_mises",
-        color_range: tuple[float, float] | None = None,
-        spacing: float | tuple[float, float] | None = None,
-        extend: bool = False,
-    ) -> None:
-        self.path = pathlib.Path(path)
-        self.fps = self.rate = FrameClock(fps).fps
-        self.color = color
-        if isinstance(fields, str) or not all(isinstance(name, str) for name in fields):
-            raise ModelError(f"fields must be names of fields, such as ('von_mises',), got {fields!r}")
-        if not isinstance(color, (str, type(None))):
-            raise ModelError(f"color must be the name of a field, or None for grey, got {color!r}")
-        self.fields = list(dict.fromkeys([*fields, *([color] if color else [])]))
-        self.color_range = check_colors(color_range)
-        self.spacing = spacing
-        self.extend = extend
+    path: str | os.PathLike[str]
+    _: KW_ONLY
+    fps: float = 60.0
+    fields: Sequence[str] = ("von_mises", "displacement")
+    color: str | None = "von_mises"
+    color_range: tuple[float, float] | None = None
+    spacing: float | tuple[float, float] | None = None
+    extend: bool = False
+
+    def __post_init__(self) -> None:
+        self.fps = self.rate = FrameClock(self.fps).fps
+        if isinstance(self.fields, str) or not all(isinstance(name, str) for name in self.fields):
+            raise ModelError(f"fields must be names of fields, such as ('von_mises',), got {self.fields!r}")
+        if not isinstance(self.color, (str, type(None))):
+            raise ModelError(f"color must be the name of a field, or None for grey, got {self.color!r}")
+        self.fields = list(dict.fromkeys([*self.fields, *([self.color] if self.color else [])]))
+        self.color_range = check_colors(self.color_range)
         self._stage: Any = None
         self._temporary: pathlib.Path | None = None
 
     def open(self, sim: Any) -> None:
         self.abort()
-        target = check_target(self.path, SUFFIXES)
+        target = self._target = check_target(self.path, SUFFIXES)
         check_fields(sim, self.fields)
         self._surface = DrawnSurface(sim, self.spacing)
         self._clock = FrameClock(self.fps)
@@ -119,8 +116,7 @@ class USDWriter(Output):
         pxr.UsdPhysics.SetStageKilogramsPerUnit(stage, 1.0)
         stage.SetTimeCodesPerSecond(self.fps)
         stage.SetFramesPerSecond(self.fps)
-        root = pxr.UsdGeom.Xform.Define(stage, "/World").GetPrim()
-        stage.SetDefaultPrim(root)
+        stage.SetDefaultPrim(pxr.UsdGeom.Xform.Define(stage, "/World").GetPrim())
         self._define()
 
     def _names(self) -> list[str]:
@@ -189,10 +185,10 @@ class USDWriter(Output):
                 self._unsaved_bytes += points.shape[0] * points.shape[1] * (24 + 4 * len(fields))
             self._obstacles.write(code)
             self._time_codes.append(code)
-            if self._unsaved_bytes > _SAVE_BYTES and self.path.suffix.lower() != ".usda":
+            if self._unsaved_bytes > _SAVE_BYTES and self._target.suffix.lower() != ".usda":
                 self._save()
         except pxr.Tf.ErrorException as error:
-            raise OutputError(f"{self.path}: can't be written ({error_text(error)})") from error
+            raise OutputError(f"{self._target}: can't be written ({error_text(error)})") from error
 
     def _field_values(self, sim: Any, name: str, body: Any) -> npt.NDArray[np.float32]:
         values = np.ascontiguousarray(sim.skin_field(name, body), dtype=np.float32)
@@ -204,7 +200,7 @@ class USDWriter(Output):
 
     def _save(self) -> None:
         if not self._stage.GetRootLayer().Save():
-            raise OutputError(f"{self.path}: can't be written")
+            raise OutputError(f"{self._target}: can't be written")
         self._unsaved_bytes = 0
 
     def close(self, sim: Any) -> None:
@@ -220,15 +216,15 @@ class USDWriter(Output):
             self._stage, self._meshes = None, []
             problems = validate_usd(temporary)
             if problems:
-                raise OutputError(f"{self.path}: the stage is not valid: " + "; ".join(problems[:10]))
-            os.replace(temporary, self.path)
+                raise OutputError(f"{self._target}: the stage is not valid: " + "; ".join(problems[:10]))
+            os.replace(temporary, self._target)
         except OSError as error:
-            raise OutputError(f"{self.path}: can't be written ({error})") from error
+            raise OutputError(f"{self._target}: can't be written ({error})") from error
         except pxr.Tf.ErrorException as error:
-            raise OutputError(f"{self.path}: can't be written ({error_text(error)})") from error
+            raise OutputError(f"{self._target}: can't be written ({error_text(error)})") from error
         finally:
             self.abort()
-        stale = pxr.Sdf.Layer.Find(str(self.path))
+        stale = pxr.Sdf.Layer.Find(str(self._target))
         if stale is not None:
             stale.Reload(True)
 
@@ -249,7 +245,7 @@ class USDWriter(Output):
         for meshes in self._meshes:
             for mesh in meshes:
                 self._unsaved_bytes += mesh.write_colors(self.color, shown)
-                if self._unsaved_bytes > _SAVE_BYTES and self.path.suffix.lower() != ".usda":
+                if self._unsaved_bytes > _SAVE_BYTES and self._target.suffix.lower() != ".usda":
                     self._save()
         _define_camera(stage, *self._bounding_box, self._surface.up_axis)
         data: dict[str, Any] = {"schema": SCHEMA, "frames": len(self._time_codes), "worlds": self._surface.worlds}

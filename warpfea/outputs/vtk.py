@@ -91,7 +91,8 @@ class VTUWriter(Output):
         self._colliders: list[tuple[float, list[str]]] = []
         self._indexed_frames = 0
         self._names = self._file_names([body.name for body in sim.model.bodies])
-        self._obstacles = self._make_obstacles(sim)
+        points = np.concatenate([np.asarray(sim.positions(body)).reshape(-1, 3) for body in sim.model.bodies])
+        self._obstacles = Obstacles(sim, points.min(axis=0), points.max(axis=0))  # half-spaces around the bodies
         named = [f"collider_{obstacle.name}" for obstacle in self._obstacles.all]
         self._collider_names = self._file_names([*self._names, *named])[len(self._names) :]
         self._last_written: dict[tuple[int, int], tuple[np.ndarray, str]] = {}
@@ -127,15 +128,6 @@ class VTUWriter(Output):
         return frames
 
     @staticmethod
-    def _make_obstacles(sim: Any) -> Obstacles:
-        """Colliders, with half-spaces drawn around the bodies."""
-        bodies = [body for body in sim.model.bodies if getattr(body, "mesh", None) is not None]
-        points = np.concatenate(
-            [np.asarray(sim.positions(body)).reshape(-1, 3) for body in bodies] or [np.zeros((1, 3))]
-        )
-        return Obstacles(sim, points.min(axis=0), points.max(axis=0))
-
-    @staticmethod
     def _file_names(given: Sequence[str]) -> list[str]:
         """Names valid in file names, still unique."""
         names: list[str] = []
@@ -159,8 +151,6 @@ class VTUWriter(Output):
         self._frames.append((time, files))
         self._last_time = time
         for body, name in zip(sim.model.bodies, self._names, strict=True):
-            if getattr(body, "mesh", None) is None:
-                continue
             points, data, cells = _frame_data(sim, body, self.fields)
             for world in range(int(sim.model.worlds)):
                 file = f"{name}_{world:04d}_{frame:06d}.vtu"

@@ -4,6 +4,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from ...base.checks import is_number
 from ...base.errors import ConvergenceError, ModelError
 from .measure import DONE, REFUSED, Outcome
@@ -65,15 +67,11 @@ def finer_setting(group: Sequence[Setting], axes: SweepAxes, given: Mapping[str,
     }
     for name in axes.over:
         if name in axes.mesh:
-            finest = max((s.values[name] for s in group), key=_total_cells)
+            finest = max((s.values[name] for s in group), key=np.sum)
             changes[name] = scale_counts(finest, MESH_REFINEMENT)
         elif name in axes.choices:
             changes[name] = axes.over[name][-1]
     return first.with_changes(changes | dict(given))
-
-
-def _total_cells(value: Any) -> float:
-    return float(sum(value)) if isinstance(value, tuple) else float(value)
 
 
 def finer_motion(

@@ -110,17 +110,13 @@ def measure(scene: Scene[Any], setting: Setting, *, repeat: int, limit: float | 
         with convert_user_errors(f"field of scene {scene.name!r}"):
             values = np.asarray(scene.field(first.sim), dtype=float)
     motions = {name: (record.position[0], record.velocity[0]) for name, record in probes.items()}
-    return Outcome(DONE, "", cost, np.ravel(times), motions, _start_positions(model), values)
+    u = model.state().displacement.numpy()[0].astype(float)
+    starts = {p.name: np.asarray(p.X + p.weights @ u[p.slots], dtype=float) for p in model.description.probes}
+    return Outcome(DONE, "", cost, np.ravel(times), motions, starts, values)
 
 
 def _one_line(error: BaseException) -> str:
     return " ".join(str(error).split())
-
-
-def _start_positions(model: Model) -> dict[str, np.ndarray]:
-    """Initial positions of the probes, m."""
-    u = model.state().displacement.numpy()[0].astype(float)
-    return {p.name: np.asarray(p.X + p.weights @ u[p.slots], dtype=float) for p in model.description.probes}
 
 
 class _Run:

@@ -118,8 +118,7 @@ def with_orders(rows: Sequence[Row], axes: SweepAxes) -> list[Row]:
             if row.status == DONE and row.swept.get(name) is not None:
                 groups.setdefault(repr({key: v for key, v in row.swept.items() if key != name}), []).append(k)
         for group in groups.values():
-            inverse = name in axes.mesh
-            sizes = {k: mean_size(rows[k].swept[name]) ** (-1.0 if inverse else 1.0) for k in group}
+            sizes = {k: mean_size(rows[k].swept[name]) ** (-1.0 if name in axes.mesh else 1.0) for k in group}
             group.sort(key=lambda k: -sizes[k])
             for coarse, fine in itertools.pairwise(group):
                 a, b = rows[coarse], rows[fine]

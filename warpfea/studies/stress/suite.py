@@ -112,8 +112,7 @@ def run_row(row: Row, setting: Setting, debug: bool = False) -> dict[str, Any]:
     except Exception as error:
         if debug:
             raise
-        line = traceback.format_exception_only(error)[-1].strip()
-        outcome, passed, note = FAILED, False, line
+        outcome, passed, note = FAILED, False, traceback.format_exception_only(error)[-1].strip()
     known = known_miss_reason(row.label, row.dtype, setting.device)
     if known and passed is False:
         outcome, passed, note = MISSED, None, f"{known} ({note})"
@@ -238,8 +237,7 @@ def stress(options: argparse.Namespace) -> bool:
     if options.json == STDOUT:
         write_json(STDOUT, content)
     wanted = {(row.label, row.dtype) for row in rows}
-    results = [row for row in content["rows"] if (row["case"], row["precision"]) in wanted]
-    return _print_summary(options, results)
+    return _print_summary(options, [row for row in content["rows"] if (row["case"], row["precision"]) in wanted])
 
 
 def _print_summary(options: argparse.Namespace, results: Sequence[Mapping[str, Any]]) -> bool:

@@ -275,8 +275,7 @@ def exact_touch(setting: Setting, name: str) -> Answer:
     s = make_scene(shapes[name], mu=0.5, restitution=0.5)
     run = s.release(setting, 50, mu=0.5)
     sunk = float(run.sim.contact_record(s.contacts[0]).penetration[0].max()) / SIDE
-    limits = {"sunk": (sunk, 0.05)}
-    return run.impulse_answer(setting, limits=limits)
+    return run.impulse_answer(setting, limits={"sunk": (sunk, 0.05)})
 
 
 def vertex_down() -> np.ndarray:

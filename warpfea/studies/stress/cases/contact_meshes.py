@@ -72,8 +72,7 @@ def feature_contact(setting: Setting, which: str) -> Answer:
     )
     run = s.release(setting, 40, velocity=(0, 0, -1.0), mu=0.3)
     sunk = float(run.sim.contact_record(s.contacts[0]).penetration[0].max()) / SIDE
-    limits = {"through": (run.center_depth, 0.0), "sunk": (sunk, 0.3)}
-    return run.impulse_answer(setting, limits=limits)
+    return run.impulse_answer(setting, limits={"through": (run.center_depth, 0.0), "sunk": (sunk, 0.3)})
 
 
 @case("contact-mesh-touch", contact.GROUP, values=("sheet", "borders", "same faces", "tip"), quick="both")

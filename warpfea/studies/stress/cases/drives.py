@@ -101,8 +101,7 @@ def kilometre_cube(setting: Setting, cells: int) -> Answer:
         return b
 
     reference = solve(cube(), Setting(setting.device, "float64"), load_steps=1, tol=1e-10).tip
-    solver = wf.NewtonPCG(preconditioner="block-jacobi", max_halvings=2)
-    found = solve(cube(), setting, load_steps=1, solver=solver)
+    found = solve(cube(), setting, load_steps=1, solver=wf.NewtonPCG(preconditioner="block-jacobi", max_halvings=2))
     bound = 1e-2 if setting.single else 3e-4
     error, stats = relative_error(found.tip, reference), found.stats
     return stats.answer(error, bound, "float64, tol 1e-10", reported_error=stats.last_floor)

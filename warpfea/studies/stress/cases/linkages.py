@@ -36,8 +36,7 @@ def _add_links(
         ends = [k * LINK_LENGTH * along, (k + 1) * LINK_LENGTH * along]
         link = b.add_beam(ends, elements=1, section=wf.Rectangle(SIDE, SIDE), normal=across, name=f"link {k}",
                           material=wf.SVK(E=E, nu=0.3, density=density))  # fmt: skip
-        axis = Y if kind == "revolute" else None
-        joints.append(b.add_joint(kind, parent=parent, child=link.start, axis=axis))
+        joints.append(b.add_joint(kind, parent=parent, child=link.start, axis=Y if kind == "revolute" else None))
         bodies.append(link)
         parent = link.end
     return bodies, joints
@@ -66,15 +65,13 @@ def _double_pendulum(masses: Any, angle: float, times: np.ndarray) -> np.ndarray
 def mass_ratio(setting: Setting, value: str) -> Answer:
     """Double pendulum with link masses 1 : 1e6, from 45 degrees for 1 s, against rigid links."""
     densities = [LIGHT * (RATIO if word == "heavy" else 1.0) for word in value.split("-")]
-    angle, h = np.pi / 4, 1e-3
+    angle = np.pi / 4
     along = np.array([np.sin(angle), 0.0, -np.cos(angle)])
     b = wf.ModelBuilder(gravity=(0, 0, -GRAVITY))
     bodies, _ = _add_links(b, "revolute", densities, along, np.cross(along, Y), 2e12)
     for name, body in zip(("elbow", "tip"), bodies):
         b.add_probe(name, body.end)
-    model = finalize(b, setting)
-    sim = wf.Simulation(model, dt=h, integrator="bdf2")
-    stats = StepStats()
+    sim, stats = wf.Simulation(finalize(b, setting), dt=1e-3, integrator="bdf2"), StepStats()
     sim.run(1.0, outputs=[stats], progress=False)
     times = sim.probe("tip").time
     angles = _double_pendulum([d * SIDE**2 * LINK_LENGTH for d in densities], angle, np.append(0.0, times))[1:]
@@ -137,7 +134,7 @@ def _dead_point(setting: Setting) -> Answer:
     """A full turn of the crank, at 1 turn/s: at 0 and 180 degrees all pins are collinear, and the follower may go
     either way. Criteria: lengths of cranks and coupler, and prescribed angle of the crank.
     """
-    crank, coupler, h = 0.2, 0.5, 2e-3
+    crank, coupler = 0.2, 0.5
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     start = 0.5
     arm = crank * np.array([np.cos(start), 0.0, np.sin(start)])
@@ -161,9 +158,7 @@ def _dead_point(setting: Setting) -> Answer:
     b.set_initial(rod, velocity=tuple(np.cross(around, arm)))
     for name, body in (("pin", first), ("far", second)):
         b.add_probe(name, body.end)
-    sim = wf.Simulation(finalize(b, setting), dt=h, integrator="bdf2")
-    stats = StepStats()
-    sim.run(1.0, outputs=[stats], progress=False)
+    sim, stats = step(b, setting, 500, dt=2e-3, integrator="bdf2")
     pin, far = (sim.probe(name).position[0] for name in ("pin", "far"))
     lengths = np.stack([np.linalg.norm(far - pin, axis=1) / coupler, np.linalg.norm(far - span, axis=1) / crank])
     angle = start + 2.0 * np.pi * sim.probe("pin").time

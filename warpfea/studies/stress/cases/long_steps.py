@@ -110,8 +110,7 @@ def free_fall(setting: Setting, value: tuple[str, float]) -> Answer:
     """A free cube of 10 m falls for three steps, up to a million times its size."""
     law, h = value
     b = wf.ModelBuilder(gravity=GRAVITY_VECTOR)
-    mesh = wf.mesh.box((CUBE_SIZE,) * 3, cells=(2, 2, 2))
-    body = b.add_solid(mesh, material=CUBE_LAWS[law], name="cube")
+    body = b.add_solid(wf.mesh.box((CUBE_SIZE,) * 3, cells=(2, 2, 2)), material=CUBE_LAWS[law], name="cube")
     sim, stats = step(b, setting, 3, dt=h)
     velocity = np.array(GRAVITY_VECTOR) * 3.0 * h
     error = float(np.abs(sim.velocities(body)[0] - velocity).max() / np.abs(velocity).max())

@@ -8,13 +8,13 @@ from scipy.spatial.transform import Rotation as Turn
 
 import warpfea as wf
 
-from ..build import StepStats, finalize
+from ..build import StepStats, finalize, step
 from ..case import Answer, Setting, case
 
 BOX = np.array([0.3, 0.2, 0.1])
 
 
-def _spinning_box(setting: Setting, spin: Any, E: float) -> tuple[wf.Model, wf.Body]:
+def _spinning_box(spin: Any, E: float) -> wf.ModelBuilder:
     """A stiff free box about the origin with angular velocity `spin`, rad/s; probes "y+" and "y-"."""
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     law = wf.SVK(E=E, nu=0.3, density=1000.0)
@@ -22,7 +22,7 @@ def _spinning_box(setting: Setting, spin: Any, E: float) -> tuple[wf.Model, wf.B
     b.set_initial(body, angular_velocity=spin)
     for side in ("y+", "y-"):
         b.add_probe(side, body.surface(side))
-    return finalize(b, setting), body
+    return b
 
 
 def _momenta(sim: wf.Simulation) -> tuple[np.ndarray, np.ndarray]:
@@ -40,11 +40,7 @@ def dzhanibekov(setting: Setting) -> Answer:
     Criterion: direction of that axis, initially 1 % off.
     """
     spin = 2.0 * np.pi * np.array([0.01, 1.0, 0.01])
-    seconds, h = 3.0, 1e-3
-    model, _ = _spinning_box(setting, spin, 1e8)
-    sim = wf.Simulation(model, dt=h, integrator="bdf2")
-    stats = StepStats()
-    sim.run(seconds, outputs=[stats], progress=False)
+    sim, stats = step(_spinning_box(spin, 1e8), setting, 3000, dt=1e-3, integrator="bdf2")
     got = sim.probe("y+").position[0] - sim.probe("y-").position[0]
     got /= np.linalg.norm(got, axis=1, keepdims=True)
     inertia = np.array([BOX[1] ** 2 + BOX[2] ** 2, BOX[0] ** 2 + BOX[2] ** 2, BOX[0] ** 2 + BOX[1] ** 2])
@@ -70,9 +66,8 @@ def spin(setting: Setting, integrator: str) -> Answer:
     The scheme moves a point of a rigid rotor to its free position, projected radially onto its circle.
     """
     omega, h, steps = 10.0, 5e-3, 100
-    model, _ = _spinning_box(setting, (0.0, 0.0, omega), 1e8 if setting.single else 1e10)
-    sim = wf.Simulation(model, dt=h, integrator=integrator,
-                        solver=wf.NewtonPCG(tol=None if setting.single else 1e-10))  # fmt: skip
+    b, tol = _spinning_box((0.0, 0.0, omega), 1e8 if setting.single else 1e10), None if setting.single else 1e-10
+    sim = wf.Simulation(finalize(b, setting), dt=h, integrator=integrator, solver=wf.NewtonPCG(tol=tol))
     start = _momenta(sim)[1][2]
     kinetic = 0.5 * omega * start
     stats = StepStats()
