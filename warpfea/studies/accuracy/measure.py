@@ -111,8 +111,8 @@ def measure(scene: Scene[Any], setting: Setting, *, repeat: int, limit: float | 
             values = np.asarray(scene.field(first.sim), dtype=float)
     motions = {name: (record.position[0], record.velocity[0]) for name, record in probes.items()}
     u = model.state().displacement.numpy()[0].astype(float)
-    starts = {p.name: np.asarray(p.X + p.weights @ u[p.slots], dtype=float) for p in model.description.probes}
-    return Outcome(DONE, "", cost, np.ravel(times), motions, starts, values)
+    start_positions = {p.name: np.asarray(p.X + p.weights @ u[p.slots], dtype=float) for p in model.description.probes}
+    return Outcome(DONE, "", cost, np.ravel(times), motions, start_positions, values)
 
 
 def _one_line(error: BaseException) -> str:
