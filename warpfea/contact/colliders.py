@@ -19,8 +19,15 @@ from ..model.state import State
 from ..model.triangle_mesh import TriMesh
 from ..terms.term import StepContext, part
 from .collider_tables import ContactTables
-from .evaluation import contact_field, evaluate_points, nodal_force, obstacle_contact_points
-from .initial_overlaps import reference_position_text, store_overlaps, touching_depth
+from .evaluation import (
+    contact_field,
+    evaluate_points,
+    nodal_force,
+    obstacle_contact_points,
+    reference_position_text,
+    store_overlaps,
+    touching_depth,
+)
 from .term import ContactTerm, contact_columns
 
 if TYPE_CHECKING:

@@ -143,20 +143,11 @@ class PairTables(FacetTables[PairContact]):
         groups = (np.arange(self.model.worlds)[:, None] * len(counts) + group).ravel()
         return wp.array(groups, dtype=wp.int32, device=self.model.device)
 
-    def _pad_facets(self, values: list[np.ndarray], axis: int, width: int, mode: str = "constant") -> np.ndarray:
-        """Facet arrays of all surfaces, padded along one axis."""
-        out = []
-        for x in values:
-            pad = [(0, 0)] * x.ndim
-            pad[axis] = (0, width - x.shape[axis])
-            out.append(np.pad(x, pad, mode=mode))  # type: ignore[call-overload]
-        return np.concatenate(out)
-
     def _master_conn(self) -> np.ndarray:
         """Model slots (facets, L); smaller facets repeat their last slot, with zero shape functions."""
         width = max(mas.conn.shape[1] for mas in self.masters)
         conns = [mas.conn + surface.body.slot_offset for mas, surface in zip(self.masters, self.surfaces)]
-        return self._pad_facets(conns, 1, width, "edge")
+        return np.concatenate([np.pad(conn, ((0, 0), (0, width - conn.shape[1])), mode="edge") for conn in conns])
 
     def master_data(self, tree: Any) -> Any:
         """Device struct for a bounding volume hierarchy."""

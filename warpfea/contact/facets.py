@@ -25,9 +25,8 @@ from ..model.pairs import PairContact
 from ..model.state import State, view_as_words
 from ..terms.protocols import Coupled, Tied
 from ..terms.term import StepContext, part
-from .evaluation import contact_field, evaluate_pairs
+from .evaluation import contact_field, evaluate_pairs, refuse_deep_overlaps, store_overlaps, touching_depth
 from .facet_tables import PairTables
-from .initial_overlaps import refuse_deep_overlaps, store_overlaps, touching_depth
 from .tables import POINT_SUM_LANES
 from .term import ContactTerm, contact_columns
 

@@ -24,8 +24,7 @@ from ..model.state import State
 from ..terms.protocols import Diagnosed, Parametrised, Preconditioned, Touching, Updated
 from ..terms.term import LOSS, NUMERICAL, STORED, WORK, Column, StepContext, part
 from .collider_tables import facet_pattern_entries
-from .evaluation import CONTACT_FIELDS
-from .initial_overlaps import reference_position_text
+from .evaluation import CONTACT_FIELDS, reference_position_text
 from .tables import POINT_SUM_LANES
 
 if TYPE_CHECKING:

@@ -28,7 +28,8 @@ curvature extrapolated from the middle and the ends, exact to fourth order in th
 from __future__ import annotations
 
 import functools
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -71,19 +72,21 @@ def svk_only(material: Material) -> SVK:
     return material
 
 
-def _uncoupled_law(material: Material) -> tuple[str, tuple[float, ...]]:
-    """D0: Young's modulus in each direction without coupling, and the shear modulus."""
-    m = svk_only(material)
-    _, mu = m.lame
-    return "orthotropic", (m.E, m.E, m.E, 0.0, 0.0, 0.0, mu, mu, mu)
+def orthotropic(coefficients: Callable[[SVK], tuple[float, ...]]) -> Callable[[Material], tuple[str, Any]]:
+    """Law of a part of the energy with orthotropic coefficients: three normal moduli, three couplings, three shears."""
+    return lambda material: ("orthotropic", coefficients(svk_only(material)))
 
 
-def _normal_coupling_law(material: Material) -> tuple[str, tuple[float, ...]]:
-    """D - D0: the coupling of the normal strains."""
-    m = svk_only(material)
-    lam, _ = m.lame
-    d = 2.0 * m.nu * lam
-    return "orthotropic", (d, d, d, lam, lam, lam, 0.0, 0.0, 0.0)
+UNCOUPLED_LAW = orthotropic(lambda m: (m.E, m.E, m.E, 0.0, 0.0, 0.0, m.lame[1], m.lame[1], m.lame[1]))
+"""D0: Young's modulus in each direction without coupling, and the shear modulus."""
+NORMAL_COUPLING_LAW = orthotropic(lambda m: (*[2.0 * m.nu * m.lame[0]] * 3, *[m.lame[0]] * 3, 0.0, 0.0, 0.0))
+"""D - D0: the coupling of the normal strains."""
+AXIAL_LAW = orthotropic(lambda m: (m.E, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+"""D0 along the axis."""
+SECTION_LAW = orthotropic(lambda m: (0.0, m.E, m.E, 0.0, 0.0, 0.0, m.lame[1], 0.0, 0.0))
+"""D0 in the section."""
+SHEAR_OUTPUT_LAW = orthotropic(lambda m: (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, m.lame[1], m.lame[1]))
+"""Transverse shears at quadrature points, for the stress output of "tied"."""
 
 
 def box_faces(low: tuple[float, ...], high: tuple[float, ...]) -> tuple[np.ndarray, ...]:
@@ -117,26 +120,9 @@ SECTION_CORNERS = [(y, z) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]
 SECTION_GAUSS_POINTS = [(y, z) for y in (-0.5 / 3**0.5, 0.5 / 3**0.5) for z in (-0.5 / 3**0.5, 0.5 / 3**0.5)]
 
 
-def _axial_law(material: Material) -> tuple[str, tuple[float, ...]]:
-    """D0 along the axis."""
-    return "orthotropic", (svk_only(material).E, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-
-
-def _section_law(material: Material) -> tuple[str, tuple[float, ...]]:
-    """D0 in the section."""
-    m = svk_only(material)
-    return "orthotropic", (0.0, m.E, m.E, 0.0, 0.0, 0.0, m.lame[1], 0.0, 0.0)
-
-
 def shear_law(material: Material) -> tuple[str, tuple[float, ...]]:
     """Transverse shear at tying points."""
     return "assumed_strain", (svk_only(material).lame[1],)
-
-
-def _shear_output_law(material: Material) -> tuple[str, tuple[float, ...]]:
-    """Transverse shears at quadrature points, for the stress output of "tied"."""
-    _, mu = svk_only(material).lame
-    return "orthotropic", (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, mu, mu)
 
 
 def _shear_coupling(
@@ -211,17 +197,17 @@ BEAM = register(
         vtk_subdivision=box_subdivision(LOW, HIGH, (4, 1, 1)),
         schemes={
             "tied": (
-                EnergyPart("axis", _rule((3, 2, 2)), _axial_law, framed=True),
-                EnergyPart("section", end_point_rule(_rule((2, 2, 2))), _section_law, framed=True),
-                EnergyPart("D_nu", end_point_rule(_rule((2, 1, 1))), _normal_coupling_law, framed=True),
+                EnergyPart("axis", _rule((3, 2, 2)), AXIAL_LAW, framed=True),
+                EnergyPart("section", end_point_rule(_rule((2, 2, 2))), SECTION_LAW, framed=True),
+                EnergyPart("D_nu", end_point_rule(_rule((2, 1, 1))), NORMAL_COUPLING_LAW, framed=True),
                 EnergyPart("shear", _rule((3, 2, 2)), shear_law, tying=SHEAR_TYING),
             ),
             "split": (
-                EnergyPart("D0", _rule((3, 2, 2)), _uncoupled_law, framed=True),
-                EnergyPart("D_nu", _rule((3, 1, 1)), _normal_coupling_law, framed=True),
+                EnergyPart("D0", _rule((3, 2, 2)), UNCOUPLED_LAW, framed=True),
+                EnergyPart("D_nu", _rule((3, 1, 1)), NORMAL_COUPLING_LAW, framed=True),
             ),
         },
-        output_schemes={"shear stress": (EnergyPart("shear", _rule((3, 2, 2)), _shear_output_law, framed=True),)},
+        output_schemes={"shear stress": (EnergyPart("shear", _rule((3, 2, 2)), SHEAR_OUTPUT_LAW, framed=True),)},
         slot_sets={"axis": (1,), "section": (2, 3)},
         spin_vectors=2,
         solid=False,

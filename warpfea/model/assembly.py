@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -73,7 +74,7 @@ class BlockKey:
         name = f"{self.integral.name} stress"
         return name if name in families.get_family(self.family).output_schemes else None
 
-    @property
+    @cached_property
     def integral(self) -> EnergyPart:
         """Part of the strain energy integrated by the block."""
         return families.get_family(self.family).scheme(self.scheme)[self.part]
@@ -90,7 +91,7 @@ class BlockKey:
         quadratic = family.cell_type == "tetra10" and family.slots == 10
         return self.affine and quadratic and not self.framed and self.rule.points_on_medians
 
-    @property
+    @cached_property
     def tying(self) -> AssumedStrain | None:
         """Tying of assumed strains of parts that have them; else None."""
         return self.integral.tying

@@ -12,7 +12,7 @@ import warp as wp
 
 from ..base.devices import find_device
 from ..base.errors import ModelError
-from ..base.memory import convert_memory_errors
+from ..base.memory import Memory, convert_memory_errors
 from ..kernels.common.types import precision
 from . import assembly
 from .blocks import Block, build_block
@@ -20,7 +20,6 @@ from .bodies import Body
 from .components import Components
 from .description import Description
 from .masses import Masses
-from .memory import Memory
 from .parameters import MaterialParameters
 from .slot_table import SlotTable, make_topology
 from .state import State

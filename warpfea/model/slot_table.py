@@ -11,9 +11,9 @@ from ..kernels.common.structs import topology_struct
 from . import assembly
 
 if TYPE_CHECKING:
+    from ..base.memory import Memory
     from .bodies import Body
     from .description import Description
-    from .memory import Memory
 
 __all__ = ["SlotTable", "check_static_supports", "make_topology", "number_slots"]
 

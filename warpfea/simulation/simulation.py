@@ -36,6 +36,7 @@ from .checks import (
 from .controls import Controls
 from .discontinuities import warn_early_ends, warn_initial_jumps
 from .energy_growth import ENERGY_GROWTH_CHOICES, EnergyGrowth
+from .episodes import Resets
 from .failures import check_initial_constraints
 from .observations import Observations
 from .reports import (
@@ -48,7 +49,6 @@ from .reports import (
     idle_report,
     simulation_text,
 )
-from .resets import Resets
 from .results import PartMember, Records, Results
 from .run_loop import run_steps
 from .stepper import Stepper
@@ -290,20 +290,18 @@ class Simulation:
             ModelError: `count` is not a positive whole number.
         """
         check_steps(count)
+        stepper, statistics = self.stepper, self.statistics
         for _ in range(count):
-            if self.stepper.step_size_control:
-                self.stepper.step_size_control.set_interval(self.time)
-            self.stepper.update_parameters()
-            self.stepper.run()
-            if self.asynchronous:
-                self.steps += 1
-                self.statistics.unsynced = True
+            if stepper.step_size_control:
+                stepper.step_size_control.set_interval(self.time)
+            stepper.update_parameters()
+            stepper.run()
+            if statistics.asynchronous:
+                statistics.steps += 1
+                statistics.unsynced = True
             else:
-                self.statistics.add_step(self.stepper.work.report.numpy())
-        if self.asynchronous:
-            return PendingReport(self, self.steps)
-        assert self.last is not None
-        return self.last
+                statistics.add_step(stepper.work.report.numpy())
+        return PendingReport(self, statistics.steps) if statistics.asynchronous else statistics.last
 
     def run(
         self,

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from ..base.errors import ModelError
-from ..base.launch import Launcher, launch_part
+from ..base.launch import Launcher, OnCompile, launch_part, load_modules
 from ..base.memory import convert_memory_errors
 from ..base.worlds import device_flags, set_rows
 from ..kernels.step.adaptive import MAX_LEVEL
@@ -25,7 +25,6 @@ from ..terms.term import StepContext, Term
 from ..terms.workspace import Workspace
 from .adaptive import AdaptiveOptions, StepSizeControl
 from .checks import write_times
-from .compiling import OnCompile, load_modules
 from .consistent_initial_conditions import ConsistentInitialConditions
 from .energy_growth import EnergyGrowth
 from .episodes import Episodes
@@ -125,8 +124,11 @@ class Stepper:
         if ledger:
             fresh = ~self.state.ledger.numpy().any(axis=1)
             self.restart_ledger(fresh | (self.state.ledger_time.numpy() != self.state.time.numpy()))
-        # a direct solver runs on the host
-        self.graph = self._capture_graph() if capture and self.newton.direct is None else None
+        self.graph: wp.Graph | None = None
+        if capture and self.newton.direct is None:  # a direct solver runs on the host
+            with wp.ScopedCapture(device=model.device) as recorded:
+                self.launch_step()
+            self.graph = recorded.graph
 
     def _bind_structs(self) -> None:
         w, state = self.work, self.state
@@ -254,11 +256,6 @@ class Stepper:
     def _world_flags(self, mask: np.ndarray | None) -> wp.array:
         """Device mask of worlds, by default all."""
         return device_flags(np.ones(self.model.worlds) if mask is None else mask, self.model.device)
-
-    def _capture_graph(self) -> wp.Graph:
-        with wp.ScopedCapture(device=self.model.device) as capture:
-            self.launch_step()
-        return capture.graph
 
     def modules(self) -> list[wp.Module]:
         """Modules launched by a step, found by recording its launches without execution."""

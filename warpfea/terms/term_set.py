@@ -88,7 +88,7 @@ class TermSet:
             if term is not None:
                 check_constructed(term, make, model)
                 self.all.append(term)
-        self._having: dict[type[Term], list[Any]] = {}
+        self._having: dict[Any, list[Any]] = {}  # by protocol, or method
         self.dead_loads = self.find(DeadLoads)
         self.nonpotential_topology: Any = None
         self.parameter_updates = 0
@@ -131,8 +131,11 @@ class TermSet:
         return self._having[protocol]
 
     def call(self, ctx: StepContext, protocol: type[Term], method: str, *flags: wp.array) -> None:
-        """Call a method of a protocol of all terms that have it, in order."""
-        for term in self.having(protocol):
+        """Call a method of a protocol of all terms that override it, in order."""
+        base = getattr(protocol, method)
+        if base not in self._having:
+            self._having[base] = [term for term in self.having(protocol) if overrides(term, base)]
+        for term in self._having[base]:
             getattr(term, method)(ctx, *flags)
 
     def find(self, kind: type[Any]) -> Any:
