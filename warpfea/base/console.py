@@ -1,6 +1,7 @@
 """Shared console output of the commands: quiet Warp, progress bars, tables, JSON."""
 
 import contextlib
+import functools
 import json
 import math
 import os
@@ -35,16 +36,13 @@ class quiet_warp:
         asked = self.before < wp.LOG_INFO or bool(getattr(wp.config, "verbose", False))
         if not asked:
             wp.config.log_level = max(self.before, wp.LOG_WARNING)
-        if not _warp_initialised:
-            _init_warp()
+        _init_warp()
 
     def __exit__(self, *_: object) -> None:
         wp.config.log_level = self.before
 
 
-_warp_initialised: list[bool] = []
-
-
+@functools.cache
 def _init_warp() -> None:
     """wp.init; suppresses the native library's message (descriptor 2) about a missing CUDA driver."""
     sys.stderr.flush()
@@ -60,7 +58,6 @@ def _init_warp() -> None:
         for line in file:
             if _NO_DRIVER not in line:
                 os.write(2, line)
-    _warp_initialised.append(True)
 
 
 @contextlib.contextmanager

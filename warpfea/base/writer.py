@@ -9,7 +9,7 @@ from typing import Any
 from .errors import OutputError
 from .renamed import check_members
 
-__all__ = ["Output", "check_folder", "check_target", "temporary_path", "write_atomically"]
+__all__ = ["Output", "check_folder", "check_target", "make_folder", "temporary_path", "write_atomically"]
 
 
 class Output:
@@ -71,6 +71,19 @@ def check_folder(folder: pathlib.Path, target: pathlib.Path) -> None:
         probe.unlink()
     except OSError as error:
         raise OutputError(f"{target}: cannot write to folder {folder} ({error.strerror or error})") from error
+
+
+def make_folder(folder: str | os.PathLike[str]) -> pathlib.Path:
+    """Make the folder if it is not there. OutputError for one that can't be written, or is a file."""
+    path = pathlib.Path(folder)
+    if path.exists() and not path.is_dir():
+        raise OutputError(f"{path}: is a file, not a folder")
+    check_folder(path if path.exists() else path.parent, path)
+    try:
+        path.mkdir(exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{path}: can't be made ({error})") from error
+    return path
 
 
 def temporary_path(target: pathlib.Path) -> pathlib.Path:

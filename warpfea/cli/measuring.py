@@ -147,22 +147,8 @@ def add_bench(commands: Any) -> None:
     finish_command(to, "..studies.bench.command", "bench", "no bars; the table is what it is for")
 
 
-STUDIES: dict[str, tuple[str, tuple[str, ...], str]] = {
-    "identify": (
-        "stiffness and damping from a recorded, noisy motion, over many worlds",
-        ("--device", "--worlds", "--quick", "--out"),
-        "A finger of rubber is let go under gravity; scipy's differential evolution finds E and eta from the noisy "
-        "record of its tip, a generation of candidates at a time, each a world of one model. An example of parameters "
-        "per world, written for reading. Minutes on two cores.",
-    )
-}
-"""Studies other than those of scenes: name -> help, options, description; executed by `run` of cli/study.py."""
-_STUDY_OPTIONS: dict[str, tuple[Any, ...]] = {
-    "--device": (None, None, "cpu, cuda:0, ..."),
-    "--quick": (FLAG, None, "a trial: few and small rows, no result"),
-    "--worlds": (positive_integer, "N", "candidates at a time (default 64)"),
-    "--out": (None, "PATH", "JSON with command, machine, settings and rows"),
-}
+STUDIES = ("identify",)
+"""Studies other than those of scenes; executed by `run` of their module, see cli/study.py."""
 
 
 def add_study(commands: Any) -> None:
@@ -177,10 +163,22 @@ def add_study(commands: Any) -> None:
     )
     names = to.add_subparsers(title="studies", metavar="STUDY", dest="study", required=True, parser_class=Parser)
     _add_scene_study(names)
-    for name, (text, options, about) in STUDIES.items():
-        one = names.add_parser(name, help=text, description=about, epilog=f"example:\n  warpfea study {name}")
-        add_options(one, *((flag, *_STUDY_OPTIONS[flag]) for flag in options))
-        finish_command(one, ".study", "study", "no bars, no table")
+    one = names.add_parser(
+        "identify",
+        help="stiffness and damping from a recorded, noisy motion, over many worlds",
+        description="A finger of rubber is let go under gravity; scipy's differential evolution finds E and eta from "
+        "the noisy record of its tip, a generation of candidates at a time, each a world of one model. An example of "
+        "parameters per world, written for reading. Minutes on two cores.",
+        epilog="example:\n  warpfea study identify",
+    )
+    add_options(
+        one,
+        ("--device", None, None, "cpu, cuda:0, ..."),
+        ("--worlds", positive_integer, "N", "candidates at a time (default 64)"),
+        ("--quick", FLAG, None, "a trial: few and small rows, no result"),
+        ("--out", None, "PATH", "JSON with command, machine, settings and rows"),
+    )
+    finish_command(one, ".study", "study", "no bars, no table")
 
 
 def _add_scene_study(names: Any) -> None:

@@ -199,8 +199,7 @@ def _grid_sides(lattice: Ints, cells: Ints, kind: str) -> dict[str, Ints]:
 
 
 def _merge_sides(sides: dict[str, Ints], names: Sequence[str]) -> Ints:
-    table = np.concatenate([sides[n] for n in names])
-    return table[np.lexsort((table[:, 1], table[:, 0]))]
+    return np.unique(np.concatenate([sides[n] for n in names]), axis=0)
 
 
 def _round_points(

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..base.errors import OutputError
 from ..base.lazy import meshio
-from ..base.writer import Output, check_folder, write_atomically
+from ..base.writer import Output, make_folder, write_atomically
 from ..model.surfaces import reference_points
 from .frames import FrameClock, check_fields, frame_time
 from .obstacles import Obstacles
@@ -75,14 +75,8 @@ class VTUWriter(Output):
 
     def open(self, sim: Any) -> None:
         check_fields(sim, self.fields)
-        if self.folder.exists() and not self.folder.is_dir():
-            raise OutputError(f"{self.folder}: is a file, not a folder")
         self._folder_created = not self.folder.exists()
-        check_folder(self.folder if not self._folder_created else self.folder.parent, self.folder)
-        try:
-            self.folder.mkdir(exist_ok=True)
-        except OSError as error:
-            raise OutputError(f"{self.folder}: can't be made ({error})") from error
+        make_folder(self.folder)
         self._open = True
         self._clock = None if self.fps is None else FrameClock(self.fps)
         self._write_calls = 0

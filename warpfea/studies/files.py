@@ -1,4 +1,4 @@
-"""The folder and the CSV of a study, what pictures need, and the reference data and meshes of a checkout."""
+"""The CSV of a study, what pictures need, and the reference data and meshes of a checkout."""
 
 import csv
 import json
@@ -7,38 +7,24 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ..base.errors import OutputError, UsageError
-from ..base.writer import check_folder, write_atomically
+from ..base.writer import write_atomically
 
-__all__ = ["DATA_FOLDER", "data_file", "make_folder", "reference_data", "require_matplotlib", "write_csv"]
+__all__ = ["DATA_FOLDER", "data_file", "reference_data", "require_matplotlib", "write_csv"]
 
 DATA_FOLDER = pathlib.Path(__file__).resolve().parents[2] / "tests" / "data"
 """Files of a checkout, absent in the installed package."""
-
-
-def make_folder(folder: str | pathlib.Path) -> pathlib.Path:
-    """Make the folder if it is not there. OutputError for one that can't be written."""
-    path = pathlib.Path(folder)
-    if not path.exists():
-        check_folder(path.absolute().parent, path)
-        path.mkdir()
-    check_folder(path, path)
-    return path
 
 
 def write_csv(path: pathlib.Path, columns: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> None:
     """Write rows; tuples as their values with blanks, None as nothing. OutputError."""
 
     def text(value: Any) -> Any:
-        if isinstance(value, (tuple, list)):
-            return " ".join(map(repr, value))
-        return "" if value is None else value
+        return " ".join(map(repr, value)) if isinstance(value, (tuple, list)) else value
 
     def write(target: pathlib.Path) -> None:
         with open(target, "w", newline="") as file:
             writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(columns)
-            for row in rows:
-                writer.writerow([text(row.get(name)) for name in columns])
+            writer.writerows([columns, *([text(row.get(name)) for name in columns] for row in rows)])
 
     write_atomically(path, write)
 

@@ -8,9 +8,10 @@ import numpy as np
 
 from ...base.checks import is_number
 from ...base.errors import ConvergenceError, ModelError
+from ...simulation.integrators import find_integrator
 from .measure import DONE, REFUSED, Outcome
 from .motion import Motion, motion_errors, observed_order, run_motion
-from .settings import Setting, SweepAxes, check_steps, convergence_order
+from .settings import Setting, SweepAxes, check_steps
 
 __all__ = ["check_finer", "finer_motion", "finer_setting"]
 
@@ -59,7 +60,7 @@ def finer_setting(group: Sequence[Setting], axes: SweepAxes, given: Mapping[str,
     steps = [s.dt for s in group if s.dt is not None] or [default_dt]
     tols = [s.tol for s in group if s.tol is not None and s.dtype == "float64"]
     changes: dict[str, Any] = {
-        "method": next((m for m in methods if convergence_order(m) >= 2), SECOND_ORDER_METHOD),
+        "method": next((m for m in methods if find_integrator(m).order >= 2), SECOND_ORDER_METHOD),
         "dt": min(steps) / STEP_REFINEMENT,
         "tol": max(MIN_TOL, min([*tols, DEFAULT_TOL]) / TOL_REFINEMENT),
         "dtype": "float64",
@@ -114,7 +115,7 @@ def finer_motion(
             own_error[what] += near[what] / (2.0**p - 1.0)
             estimates[label][what] = {"order": p, "difference": near[what]}
 
-    add_estimate("time", coarser, MIN_TIME_ORDER, float(convergence_order(setting.method)))
+    add_estimate("time", coarser, MIN_TIME_ORDER, float(find_integrator(setting.method).order))
     if swept:
         meshes = []
         for factor in (0.5, 0.25):

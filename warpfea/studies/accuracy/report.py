@@ -14,8 +14,8 @@ from ...base.console import format_bytes, format_number, format_table, to_json, 
 from ...base.errors import OutputError
 from ...base.provenance import machine, provenance_of, versions
 from ...base.short_repr import use_short_repr
-from ...base.writer import write_atomically
-from ..files import make_folder, require_matplotlib, write_csv
+from ...base.writer import make_folder, write_atomically
+from ..files import require_matplotlib, write_csv
 from .measure import DONE
 from .motion import RESOLVED_RATIO
 from .settings import Setting, SweepAxes, cli_text

@@ -18,11 +18,11 @@ from ...base.console import to_json
 from ...base.errors import ModelError
 from ...base.names import check_known, did_you_mean
 from ...builder.scene import Scene
-from ...simulation import integrators
+from ...simulation.integrators import Integrator, find_integrator
 from ...solvers import SOLVERS
 
 __all__ = [
-    "SWEEP_OPTIONS", "Setting", "SweepAxes", "check_steps", "convergence_order", "method_text", "parse_over",
+    "SWEEP_OPTIONS", "Setting", "SweepAxes", "check_steps", "method_text", "parse_over",
     "setting_product", "sweep_axes",
 ]  # fmt: skip
 
@@ -134,15 +134,10 @@ def split_methods(text: str) -> list[str]:
     return [part.strip() for part in re.split(r",(?![^(]*\))", text)]
 
 
-def method_text(given: str | integrators.Integrator) -> str:
+def method_text(given: str | Integrator) -> str:
     """An integrator as text; names are unchanged. ModelError for an unknown one."""
-    label = integrators.find_integrator(given).label
-    return given if isinstance(given, str) else label
-
-
-def convergence_order(text: str) -> int:
-    """Order of convergence of an integrator."""
-    return integrators.find_integrator(text).order
+    found = find_integrator(given)
+    return given if isinstance(given, str) else found.label
 
 
 def parse_over(scene: Scene[Any], texts: Iterable[str], option: str = "--over") -> dict[str, list[Any]]:

@@ -16,10 +16,11 @@ the model itself (element, law) left out.
 
 from collections.abc import Callable
 
+from ...simulation.integrators import find_integrator
 from .finer import scale_counts
 from .measure import DONE, Outcome
 from .motion import Motion, motion_errors, run_motion
-from .settings import Setting, SweepAxes, convergence_order
+from .settings import Setting, SweepAxes
 
 __all__ = ["split_error"]
 
@@ -50,7 +51,7 @@ def split_error(setting: Setting, axes: SweepAxes, motion: Motion, run: Callable
         return None if value is None else factor * value
 
     if setting.dt is not None:
-        growth = 2.0 ** convergence_order(setting.method)
+        growth = 2.0 ** find_integrator(setting.method).order
         time = multiply(distance_to(setting.with_changes({"dt": setting.dt / 2})), growth / (growth - 1.0))
     else:
         assert setting.error is not None

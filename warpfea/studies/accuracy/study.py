@@ -12,11 +12,11 @@ from ...base.console import progress_bar, quiet_warp
 from ...base.devices import find_device
 from ...base.errors import ModelError
 from ...base.names import did_you_mean, listing
+from ...base.writer import make_folder
 from ...builder.builder import ModelBuilder
 from ...builder.reference import Reference, make_reference, read_reference
 from ...builder.scene import Scene, locate
 from ...builder.scene import scene as as_scene
-from ..files import make_folder
 from .finer import finer_motion, finer_setting
 from .measure import DONE, REFUSED, Outcome
 from .measure import measure as run_once

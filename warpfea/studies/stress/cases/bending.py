@@ -1,7 +1,6 @@
 """Large bending in few load steps, with bounds on Newton iterations."""
 
 import functools
-import pathlib
 
 import numpy as np
 
@@ -65,9 +64,9 @@ def annular_plate(setting: Setting, load_steps: int | str) -> Answer:
     return found.stats.answer(error, 2e-2, "Sze's 13.891 and 17.528 m", limits=limits, note=note)
 
 
-def soft_solid(path: pathlib.Path) -> tuple[wf.ModelBuilder, wf.NodeSet, np.ndarray]:
-    """A soft solid clamped at the low end of its longest axis, the clamped nodes, and its weight (3,), N."""
-    mesh = wf.mesh.read(path)
+def solve_soft_solid(setting: Setting, name: str) -> Answer:
+    """Answer of a soft solid, clamped at the low end of its longest axis, under its weight: the reaction equals it."""
+    mesh = wf.mesh.read(setting.mesh(f"{name}.msh"))
     low, high = mesh.bounding_box()
     axis = int(np.argmax(high - low))
     length = float(high[axis] - low[axis])
@@ -77,12 +76,7 @@ def soft_solid(path: pathlib.Path) -> tuple[wf.ModelBuilder, wf.NodeSet, np.ndar
     body = b.add_solid(mesh, material=SOFT_LAW, name="solid")
     clamped = body.nodes(lambda X: X[:, axis] <= low[axis] + CLAMPED_FRACTION * length)
     b.clamp(clamped)
-    return b, clamped, SOFT_LAW.density * mesh.volume() * gravity
-
-
-def solve_soft_solid(setting: Setting, name: str) -> Answer:
-    """Answer of a soft solid under its weight: the reaction equals the weight."""
-    b, clamped, weight = soft_solid(setting.mesh(f"{name}.msh"))
+    weight = SOFT_LAW.density * mesh.volume() * gravity
     found = solve(b, setting, load_steps=2)
     reaction = found.result.reaction(clamped)[0]
     error = float(np.abs(reaction + weight).max() / np.abs(weight).max())
