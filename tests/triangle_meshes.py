@@ -10,6 +10,7 @@ from warpfea.kernels.contact.structs import collider_struct
 
 import warpfea as wf
 from warpfea.base.launch import Launcher
+from warpfea.base.memory import Memory
 from warpfea.contact.collider_tables import upload_collider_meshes
 
 SIDE, DT = 0.1, 1e-3
@@ -80,10 +81,7 @@ class Model:
     """As much of a model as tables need."""
 
     def __init__(self, device):
-        self.device = device
-
-    def array(self, _, values, dtype):
-        return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device)
+        self.memory = Memory(device, None)
 
 
 def search(mesh, ends, starts=None, sides=None, others=(), device="cpu"):

@@ -24,8 +24,7 @@ from ..time_laws import Rotation, time_law
 from .bodies import unused_name
 from .checks import checked_rotation
 
-__all__ = ["CONTACT_MODELS", "OVERLAP_OPTIONS", "TIME_TREATMENTS", "make_collider", "make_contact",
-           "make_pair", "outer_surface"]  # fmt: skip
+__all__ = ["add_contact", "make_collider"]
 
 TIME_TREATMENTS = ("implicit", "explicit")
 CONTACT_MODELS = ("patch", "sphere")

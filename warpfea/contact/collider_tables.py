@@ -14,6 +14,7 @@ from ..base.errors import ModelError
 from ..base.worlds import set_rows, values_per_world
 from ..kernels.contact.collider_mesh import mesh_struct
 from ..kernels.contact.structs import collider_struct, contact_struct
+from ..model import assembly
 from ..model.contact_points import ContactPoints, Modulus, body_mass_total, contact_points, effective_modulus
 from ..model.contacts import Collider, Contact
 from ..model.shapes import HalfSpace, Shape
@@ -186,12 +187,8 @@ def facet_pattern_entries(model: Model, conn: np.ndarray, pattern: Any) -> tuple
     a, b = (x.ravel() for x in np.indices((conn.shape[1],) * 2))
     facet = np.repeat(np.arange(len(conn)), len(a))
     a, b = np.tile(a, len(conn)), np.tile(b, len(conn))
-    index = pattern.find_upper(conn[facet, a], conn[facet, b])
-    chosen = np.flatnonzero(index >= 0)
-    chosen = chosen[np.argsort(index[chosen], kind="stable")]
-    entry, count = np.unique(index[chosen], return_counts=True)
+    chosen, entry, start = assembly.grouped_items(pattern.find_upper(conn[facet, a], conn[facet, b]))
     source = np.stack([facet[chosen], a[chosen], b[chosen]], axis=1)
-    start = np.concatenate([[0], np.cumsum(count)])
     arrays = (model.array("contact", x, t) for x, t in ((entry, wp.int32), (start, wp.int32), (source, wp.vec3i)))
     return (*arrays, len(entry))  # type: ignore[return-value]
 

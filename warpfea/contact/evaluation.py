@@ -27,20 +27,9 @@ if TYPE_CHECKING:
     from .facet_tables import PairTables
 
 __all__ = [
-    "CONTACT_FIELDS",
-    "BodyContactPoints",
-    "PairEvaluation",
-    "contact_field",
-    "evaluate_pairs",
-    "evaluate_points",
-    "nearest_samples",
-    "nodal_force",
-    "obstacle_contact_points",
-    "reference_position_text",
-    "refuse_deep_overlaps",
-    "store_overlaps",
-    "touching_depth",
-]
+    "CONTACT_FIELDS", "contact_field", "evaluate_pairs", "evaluate_points", "nodal_force", "obstacle_contact_points",
+    "reference_position_text", "refuse_deep_overlaps", "store_overlaps", "touching_depth",
+]  # fmt: skip
 
 CONTACT_FIELDS = {
     "contact_pressure": FieldSpec("contact pressure", "Pa", np.add, np.maximum),

@@ -21,20 +21,12 @@ from ..model.contacts import Contact
 from ..model.pairs import PairContact
 
 if TYPE_CHECKING:
-    from ..base.launch import Launcher
     from ..model.model import Model
 
 __all__ = [
-    "POINT_SUM_LANES",
-    "WORLD_PARAMETERS",
-    "FacetGroup",
-    "FacetTables",
-    "check_chosen_values",
-    "clamped_slots",
-    "hunt_crossley_damping",
-    "normal_damping",
-    "restitution_beta",
-]
+    "POINT_SUM_LANES", "WORLD_PARAMETERS", "FacetTables", "check_chosen_values", "clamped_slots",
+    "hunt_crossley_damping", "normal_damping", "restitution_beta",
+]  # fmt: skip
 
 AnyContact = TypeVar("AnyContact", Contact, PairContact)
 DEFAULT_SMOOTHING = (1e-3, 1e-4)
@@ -124,11 +116,6 @@ class FacetGroup:
     def point_threads(self, worlds: int) -> tuple[int, int, int]:
         """Threads of the points of each facet."""
         return worlds, self.count, self.data.point_count
-
-    def sum_threads(self, launch: Launcher, worlds: int) -> tuple[tuple[int, int], int]:
-        """Threads that sum over the points of a facet for each of its slots, and threads per slot."""
-        lanes = launch.lanes(POINT_SUM_LANES)
-        return (worlds, launch.padded(lanes * self.conn.size)), lanes
 
 
 class FacetTables(Generic[AnyContact]):

@@ -158,6 +158,7 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
             "energies": work.array(f"{self.name} energies", (ENERGY_COLUMNS, B, t.rows), wp.float64),
             "parts": work.array(f"{self.name} parts", parts, wp.float64),
             "row_start": self.model.array("contact", t.row_start, wp.int32),
+            "rows": work.rows_of(self),
             "u": u,
         }
         ctx.scratch[self.name] = scratch | ctx.scratch.get(self.name, {})
@@ -207,10 +208,10 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
             args = [t.data, s["other"], group.data, s["history"], s["clock"], s["u"], active, fresh, s["attempt"]]
             ctx.launch(k.forces, group.point_threads(self.model.worlds), args)
         self._list_points(ctx)
+        lanes = ctx.launch.lanes(POINT_SUM_LANES)
         for group in t.groups:
-            dim, lanes = group.sum_threads(ctx.launch, self.model.worlds)
-            args = [group.data, active, lanes, s["attempt"], w.pool_force, w.rows_of(self), s["contact_active"]]
-            ctx.launch(k.gather_point_forces, dim, args)
+            args = [group.data, active, lanes, s["attempt"], w.pool_force, s["rows"], s["contact_active"]]
+            ctx.launch(k.gather_point_forces, (self.model.worlds, ctx.launch.padded(lanes * group.conn.size)), args)
         self._gather_other_forces(ctx, active)
 
     def _find_other(self, ctx: StepContext, active: wp.array, *, fresh: int) -> None:

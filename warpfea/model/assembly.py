@@ -30,6 +30,7 @@ __all__ = [
     "facet_tables",
     "gather_table",
     "greedy_colouring",
+    "grouped_items",
     "host_blocks",
     "require_density",
     "rigid_modes",
@@ -300,6 +301,14 @@ def gather_table(conn: list[np.ndarray], slots: int) -> tuple[np.ndarray, np.nda
     order = np.argsort(flat, kind="stable")
     start = np.concatenate([[0], np.cumsum(np.bincount(flat, minlength=slots))])
     return start.astype(np.int32), order.astype(np.int32)
+
+
+def grouped_items(index: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Items with an index of 0 or more, in its order; the distinct indices, and the start of each one's items (CSR)."""
+    chosen = np.flatnonzero(index >= 0)
+    chosen = chosen[np.argsort(index[chosen], kind="stable")]
+    distinct, count = np.unique(index[chosen], return_counts=True)
+    return chosen, distinct, np.concatenate([[0], np.cumsum(count)])
 
 
 def slot_graph(blocks: Iterable[Any], slots: int) -> sp.csr_matrix:

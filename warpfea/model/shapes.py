@@ -53,8 +53,8 @@ class Shape:
 
     @property
     def radius_of_curvature(self) -> float:
-        """Radius, m, of spheres, capsules and cylinders; infinite for half-spaces and boxes."""
-        raise NotImplementedError
+        """Radius, m, of spheres, capsules and cylinders; infinite for half-spaces, boxes and other shapes."""
+        return np.inf
 
     def mesh(self, resolution: int = 24) -> tuple[np.ndarray, np.ndarray]:
         """The surface for drawing.
@@ -97,10 +97,6 @@ class HalfSpace(Shape):
     @property
     def sizes(self) -> np.ndarray:
         return np.zeros(3)
-
-    @property
-    def radius_of_curvature(self) -> float:
-        return np.inf
 
     def mesh(
         self, resolution: int = 24, *, size: float = 2.0, around: Any = (0.0, 0.0, 0.0)
@@ -182,10 +178,6 @@ class Box(Shape):
     @property
     def sizes(self) -> np.ndarray:
         return 0.5 * self.size
-
-    @property
-    def radius_of_curvature(self) -> float:
-        return np.inf
 
     def mesh(self, resolution: int = 24) -> tuple[np.ndarray, np.ndarray]:
         """See Shape."""

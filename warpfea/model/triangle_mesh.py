@@ -112,10 +112,6 @@ class TriMesh(Shape):
         area = 0.5 * float(np.linalg.norm(self._double_area_normals, axis=1).sum())
         return np.array([size, 2.0 * self.volume / area if self.closed else size, float(self.closed)])
 
-    @property
-    def radius_of_curvature(self) -> float:
-        return np.inf
-
     def mesh(self, resolution: int = 24) -> tuple[np.ndarray, np.ndarray]:
         """Points and triangles, unchanged."""
         return self.points, self.triangles

@@ -27,14 +27,7 @@ if TYPE_CHECKING:
     from ..model.model import Model
     from ..model.state import State
 
-__all__ = [
-    "ENERGY_GROWTH_CHOICES",
-    "REFUSE_LIMIT",
-    "WARN_LIMIT",
-    "EnergyGrowth",
-    "growth_error_text",
-    "integrator_energy_ratio",
-]
+__all__ = ["ENERGY_GROWTH_CHOICES", "EnergyGrowth", "growth_error_text", "integrator_energy_ratio"]
 
 ENERGY_GROWTH_CHOICES = ("refuse", "warn", "ignore")
 WARN_LIMIT, REFUSE_LIMIT = 0.01, 0.1

@@ -22,7 +22,7 @@ from ..kernels.terms.constraints import (
     constraint_struct,
     joint_struct,
 )
-from ..model.assembly import greedy_colouring
+from ..model.assembly import greedy_colouring, grouped_items
 from ..model.joints import ConstraintRow, Joint, Vector
 from ..time_laws import TimeLaw
 from .time_law_table import TimeLawTable
@@ -406,11 +406,9 @@ class ConstraintTables:
             term_a.append(term[i])
             term_b.append(term[j])
             weight.append(w[i] * w[j])
-        item = np.concatenate(items)
-        order = np.argsort(item, kind="stable")
-        entry, count = np.unique(item, return_counts=True)
+        order, entry, start = grouped_items(np.concatenate(items))
         a, b, w = (np.concatenate(values)[order] for values in (term_a, term_b, weight))
-        data, start = coupling_struct()(), np.concatenate([[0], np.cumsum(count)])
+        data = coupling_struct()()
         tables = {"entry": entry, "start": start, "term_a": a, "term_b": b, "weight": w}
         self.model.memory.fill(data, "matrix pattern", **tables)
         return data, len(entry)

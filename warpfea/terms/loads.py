@@ -391,12 +391,9 @@ class FollowerMatrix:
     def _find_pattern_entries(self, conn: np.ndarray, pattern: Any) -> tuple[Any, int]:
         """Pattern entries of the items' matrices."""
         i, j, item = (a.ravel() for a in np.indices((self.slots, self.slots, self.count)))
-        index = pattern.find_upper(conn[i, item], conn[j, item])
-        chosen = np.flatnonzero(index >= 0)
-        chosen = chosen[np.argsort(index[chosen], kind="stable")]
-        entry, count = np.unique(index[chosen], return_counts=True)
+        chosen, entry, start = assembly.grouped_items(pattern.find_upper(conn[i, item], conn[j, item]))
         places = follower_pattern_struct()()
-        start, row = np.concatenate([[0], np.cumsum(count)]), (i * self.count + item)[chosen]
+        row = (i * self.count + item)[chosen]
         self.model.memory.fill(places, "matrix pattern", entry=entry, start=start, row=row, column=j[chosen])
         return places, len(entry)
 
