@@ -67,7 +67,9 @@ class Animation:
         n = self.body_points or len(self.start_points)
         stride = max(1, n * len(self.frames) // 50_000)
         swept = np.concatenate([frame.points[k % stride : n : stride] for k, frame in enumerate(self.frames)])
-        swept = np.concatenate([swept, *self._obstacle_points(swept.min(axis=0), swept.max(axis=0))])
+        box = swept.min(axis=0), swept.max(axis=0)  # obstacles count in its neighbourhood, for the camera
+        obstacles = [clip_to_box(frame.points[n:], *box, 0.15) for frame in self.frames if len(frame.points) > n]
+        swept = np.concatenate([swept, *obstacles])
         low, high = self.color_limits()
         longest = max(abs(frame.time) for frame in self.frames)
         decimals = int(np.clip(3 - np.floor(np.log10(longest)), 1, 12)) if longest > 0 else 1
@@ -96,13 +98,6 @@ class Animation:
                 f"load {100.0 * frame.time:.4g} %" if self.static else f"t = {frame.time:.{decimals}f} s",
                 (low, high, self.title, self.units) if barred else None,
             )
-
-    def _obstacle_points(self, low: Floats, high: Floats) -> list[Floats]:
-        """Points of the obstacles, clamped to the neighbourhood of the bodies' bounding box, for the camera."""
-        first = self.body_points or len(self.start_points)
-        return [
-            clip_to_box(frame.points[first:], low, high, 0.15) for frame in self.frames if len(frame.points) > first
-        ]
 
     def _ground_height(self, camera: Camera) -> tuple[float | None, list[int]]:
         """Height of the ground, and hidden squares.

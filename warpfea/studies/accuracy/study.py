@@ -3,7 +3,7 @@
 import math
 import pathlib
 import statistics
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -121,7 +121,7 @@ def _resolve_scene(given: Any, dt: float | None, t_end: float | None) -> tuple[s
     raise ModelError(f"study: expected a scene, a function or a name, got {given!r}")
 
 
-def _check_names(what: str, given: Mapping[str, Any], known: Any) -> None:
+def _check_names(what: str, given: Iterable[str], known: Collection[str]) -> None:
     for name in given:
         if name not in known:
             raise ModelError(
@@ -138,9 +138,7 @@ def _check_probes(scene: Scene[Any], setting: Setting, chosen: Sequence[str] | N
         )
     if chosen is not None and not chosen:
         raise ModelError(f"study: probes = {chosen!r} are none; there are {listing(names)}")
-    for name in chosen or ():
-        if name not in names:
-            raise ModelError(f"study: probe {name!r} is unknown; there are {listing(names)}{did_you_mean(name, names)}")
+    _check_names("probe", chosen or (), names)
 
 
 def _reference_function(
