@@ -53,7 +53,7 @@ MECHANISMS: dict[str, tuple[Change, ...]] = {
         (SEARCH, "wp.where(tangent_needed(ctl, world), 0, 2)", "0"),
         (NEWTON, "wp.where(tangent_needed(ctl, world), 0, 2)", "0"),
     ),
-    "kink search": ((SEARCH, "has_kinks = unilateral and not midpoint", "has_kinks = False"),),
+    "kink search": ((SEARCH, "if wp.static(traits.unilateral and not traits.midpoint):", "if wp.static(False):"),),
     "excursions": ((SEARCH, "ctl.nonmonotone.penetrating_steps[world] < MAX_PENETRATING_STEPS", "False"),),
     "floor estimate": (
         (CONVERGENCE, "near = near and ctl.floor.estimates[world] < MAX_ERROR_ESTIMATES", "near = False"),

@@ -104,8 +104,8 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
     def is_poor_first_iterate(ctl: Control, world: int) -> bool:
         """True if other first iterates should be tried: Phi exceeds a bound of Phi at q_n, or J <= 0.
 
-        At q_n Phi is the strain energy of the state plus a kinetic energy, `ROW_KINETIC` of `residual`: for backward Euler all
-        of it, for BDF2 a third.
+        At q_n Phi is the strain energy of the state plus a kinetic energy (`ROW_KINETIC` of `residual`): all of it for
+        backward Euler, a third for BDF2.
         """
         phi = convergence.objective(ctl, world)
         if wp.static(traits.midpoint):
