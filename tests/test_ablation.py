@@ -1,7 +1,9 @@
 """Variants of ablation.py: each changes the sources as they are."""
 
+import json
+
 import pytest
-from ablation import CONSTANTS, MECHANISMS, ROOT, constant_file, disabled, variants
+from ablation import CONSTANTS, MECHANISMS, ROOT, constant_file, disabled, tables, variants
 from random_cases import build, draw
 
 
@@ -36,3 +38,18 @@ def test_variants_are_many_and_random_models_can_be_built():
     for seed in range(12):
         assert build(draw(seed)).bodies
     assert draw(3) == draw(3)
+
+
+def rows():
+    return json.loads((ROOT / "tests" / "results" / "ablation_cpu.json").read_text())["rows"]
+
+
+@pytest.mark.parametrize("name", [*MECHANISMS, *CONSTANTS])
+def test_what_is_there_is_needed(name):
+    """A row of the stress suite or a random model is lost without it, or the iterations of all rise by a tenth."""
+    alone = [row for row in rows() if row["variant"] == name]
+    assert any(row["lost"] or row["newton"] > 1.1 or row["pcg"] > 1.1 for row in alone), name
+
+
+def test_the_page_shows_the_tables():
+    assert (ROOT / "kernels" / "CONSTANTS.md").read_text().endswith(tables(rows()))
