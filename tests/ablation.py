@@ -1,13 +1,14 @@
 """Removal of one mechanism or constant at a time: rows of the stress suite and random cases that are lost without it.
 
-`python tests/ablation.py --out FILE [--only NAME ...] [--suite quick] [--jobs 2] [--random] [--base FILE]`
+`python tests/ablation.py --out FILE [--only NAME ...] [--suite quick] [--jobs 2] [--rows random] [--base FILE]`
 
 Each variant is a copy of the sources with a mechanism switched off (`MECHANISMS`: a text in place of another) or a
-constant without effect (`CONSTANTS`: a value that disables it). The stress suite, or with --random 200 seeded random
-models (random_cases.py), is run with the copy and with the unchanged sources, in processes side by side. A row is lost
-if it met its criterion before and does not now; it is touched if its iterations or its error differ. A run that is cut
-short goes on from the rows that FILE has. NAME+NAME+... switches several off at once: what may go must go together,
-and the rows that a group loses (`--case`) tell which of its members stay.
+constant without effect (`CONSTANTS`: a value that disables it). The stress suite, 200 seeded random models
+(random_cases.py), the pile of cubes of 4^3 cells (validation/piles.py) or tests are run with the copy and with the
+unchanged sources, in processes side by side. A row is lost if it met its criterion before and does not now; it is
+touched if its iterations or its error differ. A run that is cut short goes on from the rows that FILE has.
+NAME+NAME+... switches several off at once: what may go must go together, and the rows that a group loses (`--case`)
+tell which of its members stay.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ __all__ = ["CONSTANTS", "MECHANISMS", "Constant", "constant_file", "disabled", "
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 Row = dict[str, Any]
-COPIED = ("kernels", "warpfea", "scenes")
+COPIED = ("kernels", "warpfea", "scenes", "tests")
 SEARCH, CONVERGENCE, NEWTON = (f"kernels/solvers/{name}.py" for name in ("line_search", "convergence", "newton"))
 RANDOM_CASES = 200
 LONG_ROWS = ("rest-1e6", "soft-")
@@ -176,9 +177,11 @@ def disabled(variant: str, root: pathlib.Path) -> None:
 def _tree(variant: str, folder: pathlib.Path) -> pathlib.Path:
     """A copy of the sources as a variant."""
     out = folder / (variant.replace(" ", "_")[:100] or "unchanged")
+    skipped = shutil.ignore_patterns("__pycache__", "results")
     for name in COPIED:
-        shutil.copytree(ROOT / name, out / name, ignore=shutil.ignore_patterns("__pycache__"))
-    shutil.copy(ROOT / "pyproject.toml", out)
+        shutil.copytree(ROOT / name, out / name, ignore=skipped)
+    for name in ("pyproject.toml", "README.md"):
+        shutil.copy(ROOT / name, out)
     disabled(variant, out)
     return out
 
@@ -205,10 +208,20 @@ def _child(tree: pathlib.Path, words: Sequence[str], out: pathlib.Path) -> list[
     env = os.environ | {"PYTHONPATH": os.pathsep.join(path)}
     env |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONSAFEPATH": "1"}
     done = subprocess.run([sys.executable, *words], cwd=tree, env=env, capture_output=True, text=True)
+    if words[1] == "pytest":
+        told = [line.split(" ", 1) for line in done.stdout.splitlines() if line.startswith(("PASSED", "FAILED"))]
+        return [{"case": name.split(" - ")[0], "precision": "", "passed": word == "PASSED", "outcome": word, "note": ""}
+                for word, name in told]  # fmt: skip
     if not out.exists():
         return [{"case": " ".join(words[-6:]), "precision": "", "passed": False, "outcome": "crashed",
                  "note": done.stderr[-500:]}]  # fmt: skip
-    return list(json.loads(out.read_text())["rows"])
+    found = json.loads(out.read_text())
+    if words[1] == "tests.validation":
+        return [
+            row | {"case": row["label"], "precision": "float64", "passed": True}
+            for row in found["parts"]["piles"]["rows"]
+        ]
+    return list(found["rows"])
 
 
 def _stress_rows(options: argparse.Namespace) -> dict[str, tuple[str, float]]:
@@ -227,7 +240,13 @@ def _stress_rows(options: argparse.Namespace) -> dict[str, tuple[str, float]]:
 
 def _tasks(options: argparse.Namespace, variant: str) -> Iterator[list[str]]:
     """Commands of a variant, without the file of their rows."""
-    if options.random:
+    if options.rows[0] == "piles":
+        yield ["-m", "tests.validation", "piles", "--device", options.device, "--rows", "pile-4", "--out"]
+        return
+    if options.rows[0].startswith("tests/"):
+        yield ["-m", "pytest", "-q", "-rpf", "-p", "no:cacheprovider", "-m", "", *options.rows, "--junitxml"]
+        return
+    if options.rows[0] == "random":
         share = -(-RANDOM_CASES // options.jobs)
         for first in range(0, RANDOM_CASES, share):
             seeds = f"{first}:{min(first + share, RANDOM_CASES)}"
@@ -270,7 +289,7 @@ def _compare(before: Sequence[Row], after: Sequence[Row]) -> Row:
 
 def study(options: argparse.Namespace, done: Sequence[Row]) -> Iterator[Row]:
     """A row per variant that is not yet `done`."""
-    areas, finished = variants(), {row["variant"] for row in done if row["random"] == options.random}
+    areas, finished = variants(), {row["variant"] for row in done if row["of"] == " ".join(options.rows)}
     wanted = options.only or [*areas]
     areas |= {name: "group" for name in wanted if "+" in name}
     chosen = [name for name, area in areas.items() if name and {name, area} & {*wanted} and name not in finished]
@@ -291,7 +310,12 @@ def study(options: argparse.Namespace, done: Sequence[Row]) -> Iterator[Row]:
         running = {variant: submit(variant) for variant in chosen}
         for variant, tasks in running.items():
             rows = [row for task in tasks for row in task.result()]
-            label: Row = {"variant": variant, "area": areas[variant], "random": options.random, "suite": options.suite}
+            label: Row = {
+                "variant": variant,
+                "area": areas[variant],
+                "of": " ".join(options.rows),
+                "suite": options.suite,
+            }
             if variant in CONSTANTS:
                 constant = CONSTANTS[variant]
                 value = constant_file(variant)[1]
@@ -301,7 +325,9 @@ def study(options: argparse.Namespace, done: Sequence[Row]) -> Iterator[Row]:
 
 def tables(rows: Sequence[Row]) -> str:
     """Markdown: mechanisms, then constants by area, each with its value, unit, and a row that is lost without it."""
-    alone = {row["variant"]: row for row in rows if "+" not in row["variant"] and (row["lost"] or not row["random"])}
+    alone = {
+        row["variant"]: row for row in rows if "+" not in row["variant"] and (row["lost"] or row["of"] == "stress")
+    }
     out = []
     for area in ("globalisation", NEWTON_PCG, REUSE, ADAPTIVE, CONTACT):
         out += ["", f"## {area[0].upper()}{area[1:]}", ""]
@@ -333,7 +359,9 @@ def main() -> None:
     parser.add_argument("--case", nargs="+", default=[], help="cases, rows or groups of the stress suite")
     parser.add_argument("--suite", choices=("all", "quick"), default="all")
     parser.add_argument("--longest", type=float, default=math.inf, help="leave out rows that took more seconds")
-    parser.add_argument("--random", action="store_true", help=f"{RANDOM_CASES} random cases in place of the suite")
+    parser.add_argument(
+        "--rows", nargs="+", default=["stress"], help="stress, random, piles, or tests of pytest by name"
+    )
     parser.add_argument(
         "--base", type=pathlib.Path, help="rows of the unchanged sources: written, read where it exists"
     )
