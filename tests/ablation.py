@@ -331,12 +331,13 @@ def tables(rows: Sequence[Row]) -> str:
     out = []
     for area in ("globalisation", NEWTON_PCG, REUSE, ADAPTIVE, CONTACT):
         out += ["", f"## {area[0].upper()}{area[1:]}", ""]
-        heads = ["name", "lost without it"] if area == "globalisation" else ["name", "value", "unit", "lost without it"]
+        constants = area not in ("globalisation", "group")
+        heads = ["name", "value", "unit", "lost without it"] if constants else ["name", "lost without it"]
         out += ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
-        for name, row in alone.items():
-            if row["area"] == area and (name in MECHANISMS or name in CONSTANTS):
-                values = [f"{row['value']:g}", row["unit"]] if name in CONSTANTS else []
-                out.append("| " + " | ".join([name, *values, reason(row)]) + " |")
+        for name, row in shown.items():
+            if row["area"] == area:
+                values = [f"{row['value']:g}", row["unit"]] if constants else []
+                out.append("| " + " | ".join([name.replace("+", ", "), *values, reason(row)]) + " |")
     return "\n".join(out) + "\n"
 
 
