@@ -325,11 +325,9 @@ def study(options: argparse.Namespace, done: Sequence[Row]) -> Iterator[Row]:
 
 def tables(rows: Sequence[Row]) -> str:
     """Markdown: mechanisms, then constants by area, each with its value, unit, and a row that is lost without it."""
-    alone = {
-        row["variant"]: row for row in rows if "+" not in row["variant"] and (row["lost"] or row["of"] == "stress")
-    }
+    shown = {row["variant"]: row for row in rows if row["lost"] or row["of"] in ("stress", "piles")}
     out = []
-    for area in ("globalisation", NEWTON_PCG, REUSE, ADAPTIVE, CONTACT):
+    for area in ("globalisation", NEWTON_PCG, REUSE, ADAPTIVE, CONTACT, "group"):
         out += ["", f"## {area[0].upper()}{area[1:]}", ""]
         constants = area not in ("globalisation", "group")
         heads = ["name", "value", "unit", "lost without it"] if constants else ["name", "lost without it"]
