@@ -45,9 +45,10 @@ def rows():
 
 
 def is_needed(name):
-    """A row is lost without it, or the iterations of piles, which may be no slower by a twentieth, rise by as much."""
+    """A row is lost without it, or iterations rise by a tenth; of piles, which may be 5 % slower, by a twentieth."""
     alone = [row for row in rows() if row["variant"] == name]
-    return any(row["lost"] or (row["of"] == "piles" and row["newton"] > 1.05) for row in alone)
+    rise = [max(row["newton"], row["pcg"]) - (1.05 if row["of"] == "piles" else 1.1) for row in alone]
+    return any(row["lost"] for row in alone) or max(rise) > 0.0
 
 
 @pytest.mark.parametrize("name", MECHANISMS)
