@@ -29,12 +29,6 @@ def broad_phase_kernels(dtype: str) -> KernelSet:
     mat43 = wp.types.matrix(shape=(4, 3), dtype=f64)
     Masters, PairScratch, FacetField = master_struct(dtype), pair_scratch_struct(dtype), facet_field_struct()
     f = facet_projection_functions(dtype)
-    FacetPoint, surface_point, facet_centre, unit_normal = (
-        f.FacetPoint,
-        f.surface_point,
-        f.facet_centre,
-        f.unit_normal,
-    )
     module = kernel_module(f"facet_search_{dtype}", max_unroll=SHORT_UNROLL)
 
     @wp.func
@@ -102,14 +96,14 @@ def broad_phase_kernels(dtype: str) -> KernelSet:
         return inside
 
     @wp.func
-    def pack_facet_point(s: FacetPoint) -> mat43:
+    def pack_facet_point(s: f.FacetPoint) -> mat43:
         """Position and derivatives of a facet point as the rows of a matrix."""
         return wp.matrix_from_rows(s.position, s.tangent_a, s.tangent_b, s.director)
 
     @wp.func
-    def unpack_facet_point(m: mat43) -> FacetPoint:
+    def unpack_facet_point(m: mat43) -> f.FacetPoint:
         """Facet point from the rows of a matrix."""
-        return FacetPoint(m[0], m[1], m[2], m[3])
+        return f.FacetPoint(m[0], m[1], m[2], m[3])
 
     @wp.func
     def hull_point(mas: Masters, U: FacetField, world: int, item: int, q: int) -> vec3d:
@@ -152,9 +146,9 @@ def broad_phase_kernels(dtype: str) -> KernelSet:
         world, item = wp.tid()
         kind = mas.facet_kind[item]
         count = mas.monomial_count[kind]
-        xi = facet_centre(mas.corner_count[kind])
-        s = surface_point(mas, pair.displacement, world, item, xi)
-        n = unit_normal(s)
+        xi = f.facet_centre(mas.corner_count[kind])
+        s = f.surface_point(mas, pair.displacement, world, item, xi)
+        n = f.unit_normal(s)
         bulge = f64(0.0)
         for q in range(count):
             x = hull_point(mas, pair.displacement, world, item, q)
@@ -162,7 +156,7 @@ def broad_phase_kernels(dtype: str) -> KernelSet:
         pair.bulge[world, item] = bulge
         pair.facet_centre[world, item] = pack_facet_point(s)
         pair.start_facet_centre[world, item] = pack_facet_point(
-            surface_point(mas, pair.start_displacement, world, item, xi)
+            f.surface_point(mas, pair.start_displacement, world, item, xi)
         )
 
     @wp.kernel(module=module)

@@ -35,8 +35,6 @@ def deepest_point_kernels(dtype: str, meshes: bool) -> KernelSet:
     Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)
     Colliders = collider_struct(meshes)
     f, geometry = kinematics_functions(dtype), collider_kinematics(dtype, meshes)
-    interpolate, activation_gap, lagrange_polynomial = f.interpolate, f.activation_gap, f.lagrange_polynomial
-    monomial_derivative = f.monomial_derivative
     distance, stored_side = collider_functions(meshes).distance, collider_functions(meshes).stored_side
     module = kernel_module(f"deepest_point_{dtype}{MESH_SUFFIX * meshes}", max_unroll=SHORT_UNROLL)
 
@@ -59,18 +57,18 @@ def deepest_point_kernels(dtype: str, meshes: bool) -> KernelSet:
         out = SurfacePoint()
         back = wp.transpose(col.rotation[world, k])
         for q in range(facets.point_count):
-            x = back * (facets.X[q, item] + interpolate(facets, u, world, q, item) - col.position[world, k])
+            x = back * (facets.X[q, item] + f.interpolate(facets, u, world, q, item) - col.position[world, k])
             for m in range(facets.exponents.shape[0]):
                 i = facets.exponents[m][0]
                 j = facets.exponents[m][1]
                 c = facets.lagrange_coefficients[q, m]
                 if c != f64(0.0):
-                    out.y += (c * monomial_derivative(s[0], i, 0) * monomial_derivative(s[1], j, 0)) * x
-                    out.a += (c * monomial_derivative(s[0], i, 1) * monomial_derivative(s[1], j, 0)) * x
-                    out.b += (c * monomial_derivative(s[0], i, 0) * monomial_derivative(s[1], j, 1)) * x
-                    out.aa += (c * monomial_derivative(s[0], i, 2) * monomial_derivative(s[1], j, 0)) * x
-                    out.ab += (c * monomial_derivative(s[0], i, 1) * monomial_derivative(s[1], j, 1)) * x
-                    out.bb += (c * monomial_derivative(s[0], i, 0) * monomial_derivative(s[1], j, 2)) * x
+                    out.y += (c * f.monomial_derivative(s[0], i, 0) * f.monomial_derivative(s[1], j, 0)) * x
+                    out.a += (c * f.monomial_derivative(s[0], i, 1) * f.monomial_derivative(s[1], j, 0)) * x
+                    out.b += (c * f.monomial_derivative(s[0], i, 0) * f.monomial_derivative(s[1], j, 1)) * x
+                    out.aa += (c * f.monomial_derivative(s[0], i, 2) * f.monomial_derivative(s[1], j, 0)) * x
+                    out.ab += (c * f.monomial_derivative(s[0], i, 1) * f.monomial_derivative(s[1], j, 1)) * x
+                    out.bb += (c * f.monomial_derivative(s[0], i, 0) * f.monomial_derivative(s[1], j, 2)) * x
         return out
 
     @wp.func
@@ -170,10 +168,10 @@ def deepest_point_kernels(dtype: str, meshes: bool) -> KernelSet:
         depth = f64(-1.0e300)
         if facets.area_fraction[q, item] > f64(0.0):
             k = col.of_contact[c]
-            x = facets.X[q, item] + interpolate(facets, u, world, q, item)
+            x = facets.X[q, item] + f.interpolate(facets, u, world, q, item)
             y = wp.transpose(col.rotation[world, k]) * (x - col.position[world, k])
             d = distance(col, k, y, -1)
-            depth = activation_gap(con, his, world, c, point, time[world], col.margin[world, k]) - d[3]
+            depth = f.activation_gap(con, his, world, c, point, time[world], col.margin[world, k]) - d[3]
             if con.is_explicit[c] != 0:  # explicit: its force is that of the last state
                 depth = scr.start_depth[world, point]
         scr.point_depth[world, point] = depth
@@ -210,7 +208,7 @@ def deepest_point_kernels(dtype: str, meshes: bool) -> KernelSet:
         k = col.of_contact[c]
         found = deepest_in_facet(col, facets, world, k, item, u, facets.point_coords[q])
         scr.facet_deepest_xi[world, row] = vec2d(found[0], found[1])
-        depth = activation_gap(con, his, world, c, first, time[world], col.margin[world, k]) - found[2]
+        depth = f.activation_gap(con, his, world, c, first, time[world], col.margin[world, k]) - found[2]
         scr.facet_max_depth[world, row] = wp.max(depth, top)
 
     @wp.kernel(module=module)
@@ -263,7 +261,7 @@ def deepest_point_kernels(dtype: str, meshes: bool) -> KernelSet:
             if moved:
                 w = f64(0.0)
                 for q in range(facets.point_count):
-                    w += lagrange_polynomial(facets, q, scr.facet_deepest_xi[world, row]) * f64(
+                    w += f.lagrange_polynomial(facets, q, scr.facet_deepest_xi[world, row]) * f64(
                         facets.shape[q, i, item]
                     )
             scr.shape_values[world, c, i] = T(w)
@@ -274,7 +272,7 @@ def deepest_point_kernels(dtype: str, meshes: bool) -> KernelSet:
         if moved:
             X = vec3d()
             for q in range(facets.point_count):
-                X += lagrange_polynomial(facets, q, scr.facet_deepest_xi[world, row]) * facets.X[q, item]
+                X += f.lagrange_polynomial(facets, q, scr.facet_deepest_xi[world, row]) * facets.X[q, item]
         scr.point_reference[world, c] = X
         rec = f.history_row(con, c, point)
         k = col.of_contact[c]
@@ -282,7 +280,7 @@ def deepest_point_kernels(dtype: str, meshes: bool) -> KernelSet:
         y = wp.transpose(rotation) * (X + origin - col.previous_position[world, k])
         in_contact = settled == 0 and his.speed[world, rec] > f64(0.0)
         side = stored_side(col, k, in_contact, his.contact_state[world, rec])
-        now = activation_gap(con, his, world, c, point, clock.time[world], col.previous_margin[world, k])
+        now = f.activation_gap(con, his, world, c, point, clock.time[world], col.previous_margin[world, k])
         n = geometry.set_start(col, scr, world, k, point, y, side, now)
         scr.start_displacement[world, point] = origin
         speed = wp.max(his.speed[world, rec], f64(MIN_APPROACH_SPEED))

@@ -35,7 +35,6 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
     Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)
     Masters, PairScratch = master_struct(dtype), pair_scratch_struct(dtype)
     k, f = kinematics_functions(dtype), facet_projection_functions(dtype)
-    interpolate, remaining_overlap = k.interpolate, k.remaining_overlap
     (
         surface_point, displacement_change, local_components, distance_outside, facet_centre, inverse_map, track_point,
         unit_normal,
@@ -44,7 +43,6 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
         f.track_point, f.unit_normal,
     )  # fmt: skip
     boxes = broad_phase_kernels(dtype)
-    round_down, round_up, unpack_facet_point = boxes.round_down, boxes.round_up, boxes.unpack_facet_point
 
     @wp.struct
     class SlavePoint:
@@ -99,10 +97,10 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
         out = slave_point(facets, world, item, q)
         point = out.point
         offset = con.offset[out.contact]
-        out.displacement = interpolate(facets, u, world, q, item)
+        out.displacement = k.interpolate(facets, u, world, q, item)
         out.position = facets.X[q, item] + out.displacement
         out.start_position = scr.start_position[world, point]
-        overlap = remaining_overlap(con, his, world, out.contact, point, clock.time[world])
+        overlap = k.remaining_overlap(con, his, world, out.contact, point, clock.time[world])
         out.overlap_limit = overlap_limit
         out.height_limit = overlap_limit + overlap + wp.abs(offset) + f64(1.0e-6) * wp.length(out.position)
         out.outside_depth = overlap + mas.touch_depth - wp.min(offset, f64(0.0))
@@ -144,8 +142,8 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
         world = slave.world
         kind = mas.facet_kind[f]
         m = facet_centre(mas.corner_count[kind])
-        old = unpack_facet_point(pair.start_facet_centre[world, f])
-        new = unpack_facet_point(pair.facet_centre[world, f])
+        old = boxes.unpack_facet_point(pair.start_facet_centre[world, f])
+        new = boxes.unpack_facet_point(pair.facet_centre[world, f])
         position_change = slave.position - slave.start_position - (new.position - old.position)
         deep = f64(TUNNEL_LIMIT_RATIO) * mas.depth_limit[f]
         if wp.length(position_change) <= deep:
@@ -164,7 +162,7 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
         """True if a point is above a facet by more than twice `height_limit`, or moved little and is beside it, by
         the tangent plane at its centre."""
         corners = mas.corner_count[mas.facet_kind[f]]
-        s = unpack_facet_point(pair.facet_centre[slave.world, f])
+        s = boxes.unpack_facet_point(pair.facet_centre[slave.world, f])
         if (
             wp.dot(slave.position - s.position, unit_normal(s))
             > f64(2.0) * slave.height_limit + pair.bulge[slave.world, f]
@@ -328,8 +326,8 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
             depth = scr.start_depth[world, slave.point] - wp.dot(slave.motion, slave.facing_normal)
             out.passed_through = depth > f64(TUNNEL_LIMIT_RATIO) * mas.depth_limit[f]
         wide = vec3d(slave.height_limit, slave.height_limit, slave.height_limit)
-        low = round_down(wp.min(slave.position, slave.start_position) - wide)
-        high = round_up(wp.max(slave.position, slave.start_position) + wide)
+        low = boxes.round_down(wp.min(slave.position, slave.start_position) - wide)
+        high = boxes.round_up(wp.max(slave.position, slave.start_position) + wide)
         root = wp.bvh_get_group_root(mas.tree, world * mas.surface_count + mas.surface_of[slave.contact])
         query = wp.bvh_query_aabb(mas.tree, low, high, root)
         index = wp.int32(0)

@@ -45,7 +45,6 @@ def friction_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
     T, sym = precision(dtype).T, precision(dtype).sym
     Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)
     k, normal_law = kinematics_functions(dtype), law_functions(own).normal_law
-    tangential, history_row = k.tangential, k.history_row
 
     @wp.func
     def has_trait(con: Contacts, c: int, trait: int) -> bool:
@@ -81,8 +80,8 @@ def friction_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
         stored elastic slip."""
         out = t
         out.friction_normal = m
-        out.tangential_motion = tangential(m, t.relative_motion)
-        out.trial_elastic_slip = tangential(m, shrink * t.spring + t.relative_motion)
+        out.tangential_motion = k.tangential(m, t.relative_motion)
+        out.trial_elastic_slip = k.tangential(m, shrink * t.spring + t.relative_motion)
         return out
 
     @wp.func
@@ -134,7 +133,7 @@ def friction_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
     ):  # fmt: skip
         """Force and spring, Eqs. (77)-(83) unmodified, of a point at depth delta with relative velocity v, for a step
         h."""
-        rec = history_row(con, c, point)
+        rec = k.history_row(con, c, point)
         v_n_rel = wp.dot(v, n)
         v_t = v - v_n_rel * n
         beta = con.beta[world, c]
@@ -144,7 +143,7 @@ def friction_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
         if con.single_point[c] != 0:
             gamma *= wp.sqrt(wp.sqrt(delta))
         force = wp.max(spring - gamma * v_n_rel, f64(0.0))
-        s = tangential(n, his.spring[world, rec] + h * v_t)
+        s = k.tangential(n, his.spring[world, rec] + h * v_t)
         gamma_t = tangent_damping(con, world, c, k_t)
         tangential_force = -k_t * s - gamma_t * v_t
         friction_limit = friction_coefficient(con, his, world, c, rec) * force
@@ -158,7 +157,7 @@ def friction_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
     @wp.func
     def friction_parameters(con: Contacts, his: History, world: int, c: int, point: int, t: PointContact) -> vec3d:
         """Friction limit, k_t and factor on the stored elastic slip at an iterate."""
-        rec = history_row(con, c, point)
+        rec = k.history_row(con, c, point)
         shrink = f64(1.0)
         depth = wp.max(t.depth, f64(0.0))
         if con.single_point[c] != 0 and his.speed[world, rec] > f64(0.0) and depth < t.previous_depth:
@@ -174,7 +173,7 @@ def friction_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
         """Store friction limit, k_t, factor on the stored elastic slip, and normal of an iterate for the next frozen
         update. Returns the frozen three; `fresh`: they and the normal are set to those of the iterate, with at most the
         limit of the last step: zero for a new contact."""
-        rec = history_row(con, c, point)
+        rec = k.history_row(con, c, point)
         frozen = scr.frozen_friction[world, rec]
         new = friction_parameters(con, his, world, c, point, t)
         if fresh != 0:

@@ -20,7 +20,6 @@ def pair_rigid_mode_kernels(dtype: str) -> KernelSet:
     T, sym = p.T, p.sym
     Bodies, Masters, Facets = bodies_struct(dtype), master_struct(dtype), facet_struct(dtype)
     rigid = rigid_mode_functions(dtype)
-    translation_columns, rotation_columns = rigid.translation_columns, rigid.rotation_columns
     module = kernel_module(f"pair_rigid_modes_{dtype}", max_unroll=SHORT_UNROLL)
 
     @masked_kernel(module, "active")
@@ -51,14 +50,14 @@ def pair_rigid_mode_kernels(dtype: str) -> KernelSet:
                 st = mat33d()
                 for i in range(facets.conn.shape[0]):
                     s = f64(facets.shape[q, i, item])
-                    sm += s * translation_columns(bodies, a, facets.conn[i, item])
-                    st += s * rotation_columns(bodies, world, a, facets.conn[i, item])
+                    sm += s * rigid.translation_columns(bodies, a, facets.conn[i, item])
+                    st += s * rigid.rotation_columns(bodies, world, a, facets.conn[i, item])
                 om = mat33d()
                 ot = mat33d()
                 for i in range(mas.conn.shape[0]):
                     s = f64(weight[world, point, i])
-                    om += s * translation_columns(bodies, b, mas.conn[i, f])
-                    ot += s * rotation_columns(bodies, world, b, mas.conn[i, f])
+                    om += s * rigid.translation_columns(bodies, b, mas.conn[i, f])
+                    ot += s * rigid.rotation_columns(bodies, world, b, mas.conn[i, f])
                 K = mat33d(f64(k[0]), f64(k[5]), f64(k[4]), f64(k[5]), f64(k[1]), f64(k[3]), f64(k[4]), f64(k[3]),
                            f64(k[2]))  # fmt: skip
                 mm += wp.transpose(sm) @ K @ om

@@ -15,7 +15,6 @@ def outer_loop_kernels(traits: Traits, module: wp.Module) -> KernelSet:
     """Kernels of the outer loop, in the module of Newton's method."""
     Control = control_struct()
     convergence = convergence_functions(traits)
-    allowed_violation, largest_violation = convergence.allowed_violation, convergence.largest_violation
 
     @wp.kernel(module=module)
     def check_constraints(ctl: Control, running: int_1d, tol: f64, limit: int):
@@ -24,7 +23,7 @@ def outer_loop_kernels(traits: Traits, module: wp.Module) -> KernelSet:
         ctl.search.trial_accepted[world] = 0
         if running[world] == 0 or ctl.failed[world] != 0:
             return
-        if largest_violation(ctl, world) <= allowed_violation(ctl, world, tol):
+        if convergence.largest_violation(ctl, world) <= convergence.allowed_violation(ctl, world, tol):
             return
         if ctl.multiplier_updates[world] >= limit:
             ctl.failed[world] = FAIL_CONSTRAINT

@@ -59,7 +59,6 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> KernelSet:
     T, vec3 = p.T, p.vec3
     Newton, Control, Recursion = control_struct(), pcg_struct(), bicgstab_struct()
     forcing = forcing_functions(has_constraints)
-    forcing_target, min_target_norm = forcing.forcing_target, forcing.min_target_norm
     module = kernel_module(f"bicgstab_{dtype}{'_gated' if has_constraints else ''}")
 
     @wp.func
@@ -83,11 +82,11 @@ def bicgstab_kernels(dtype: str, has_constraints: bool = False) -> KernelSet:
         bi.best_norm[world] = norm
         bi.halved_norm[world] = norm
         bi.stalled_iterations[world] = 0
-        ctl.target_norm[world] = forcing_target(newton, world, norm)
+        ctl.target_norm[world] = forcing.forcing_target(newton, world, norm)
         if newton.floor.estimate_error[world] != 0:
             ctl.target_norm[world] = f64(ESTIMATE_TOL) * norm
         elif newton.norms.relative_residual[world] > f64(START_STRESS_RESIDUAL) and newton.solve.fixed_forcing == 0:
-            ctl.target_norm[world] = wp.max(f64(START_STRESS_TOL) * norm, min_target_norm(newton, world))
+            ctl.target_norm[world] = wp.max(f64(START_STRESS_TOL) * norm, forcing.min_target_norm(newton, world))
         if norm > ctl.target_norm[world] and ctl.max_iterations > 0 and wp.isfinite(norm) and bi.rho[world] != f64(0.0):
             ctl.active[world] = wp.where(newton.norms.relative_residual[world] > f64(START_STRESS_RESIDUAL), 2, 1)
             wp.atomic_max(ctl.any_active, 0, 1)

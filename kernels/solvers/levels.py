@@ -55,8 +55,6 @@ def level_kernels(dtype: str, storage: str | None = None) -> KernelSet:
     Level = level_struct(dtype)
     Pattern = pattern_struct()
     lanes_of = lane_functions(dtype)
-    lane_sum, scalar_sum = lanes_of.lane_sum, lanes_of.scalar_sum
-    residual_products, store_products = lanes_of.residual_products, lanes_of.store_products
     module = kernel_module(f"levels_{dtype}{'_' + storage if scaled else ''}", max_unroll=SHORT_UNROLL)
 
     @masked_kernel(module, "active")
@@ -95,7 +93,7 @@ def level_kernels(dtype: str, storage: str | None = None) -> KernelSet:
                             for j in range(3):
                                 for i in range(3):
                                     s[i] = s[i] + T(inverse[world, tile, column + j, row + i]) * x[j]
-            s = lane_sum(s, share)
+            s = lanes_of.lane_sum(s, share)
             if part == 0 and slot >= 0:
                 if wp.static(scaled):
                     for i in range(3):
@@ -117,10 +115,10 @@ def level_kernels(dtype: str, storage: str | None = None) -> KernelSet:
             s1 += w[1] * x
             s2 += w[2] * x
             s3 += w[3] * x
-        s0 = lane_sum(s0, lanes)
-        s1 = lane_sum(s1, lanes)
-        s2 = lane_sum(s2, lanes)
-        s3 = lane_sum(s3, lanes)
+        s0 = lanes_of.lane_sum(s0, lanes)
+        s1 = lanes_of.lane_sum(s1, lanes)
+        s2 = lanes_of.lane_sum(s2, lanes)
+        s3 = lanes_of.lane_sum(s3, lanes)
         if lane == 0:
             coarse[world, 4 * group] = s0
             coarse[world, 4 * group + 1] = s1
@@ -150,8 +148,8 @@ def level_kernels(dtype: str, storage: str | None = None) -> KernelSet:
             if correct != 0:
                 s += wp.cw_mul(prolong_to_slot(level, x, world, slot), free[slot])
                 z[world, slot] = s
-            products = residual_products(r[world, slot], s, diagonal[world, slot])
-        store_products(products, slot, warp, world, rows)
+            products = lanes_of.residual_products(r[world, slot], s, diagonal[world, slot])
+        lanes_of.store_products(products, slot, warp, world, rows)
 
     @masked_kernel(module, "active")
     def chebyshev_step(
@@ -182,7 +180,7 @@ def level_kernels(dtype: str, storage: str | None = None) -> KernelSet:
         if slot < r.shape[1]:
             for k in range(pattern.start[slot] + lane, pattern.start[slot + 1], lanes):
                 s += value[world, k] * d[world, pattern.column[k]]
-        s = lane_sum(s, lanes)
+        s = lanes_of.lane_sum(s, lanes)
         if lane == 0 and slot < r.shape[1]:
             r[world, slot] = r[world, slot] - s
 
@@ -234,7 +232,7 @@ def level_kernels(dtype: str, storage: str | None = None) -> KernelSet:
         world, index = wp.tid()
         lane = index % lanes
         row = wp.min(index / lanes, x.shape[1] - 1)
-        s = scalar_sum(row_product(matrix, root, r, world, row, lane, r.shape[1], lanes), lanes)
+        s = lanes_of.scalar_sum(row_product(matrix, root, r, world, row, lane, r.shape[1], lanes), lanes)
         if lane == 0:
             store_row(root, s, world, row, x)
 
@@ -249,7 +247,7 @@ def level_kernels(dtype: str, storage: str | None = None) -> KernelSet:
         row = wp.min(index / lanes, x.shape[1] - 1)
         first = wp.where(upper != 0, row, 0) + lane
         n = wp.where(upper != 0, r.shape[1], row + 1)
-        s = scalar_sum(row_product(matrix, root, r, world, row, first, n, lanes), lanes)
+        s = lanes_of.scalar_sum(row_product(matrix, root, r, world, row, first, n, lanes), lanes)
         if lane == 0:
             store_row(root, s, world, row, x)
 

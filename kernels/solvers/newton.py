@@ -53,7 +53,6 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
     )
 
     searching = line_search_kernels(traits, module)
-    tangent_needed = searching.tangent_needed
 
     @masked_kernel(module, "active")
     def reset_min_J(ctl: Control, active: int_1d):
@@ -174,7 +173,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
             if ctl.nonmonotone.steps[world] > 0:
                 ctl.nonmonotone.restore_best[world] = 1
             else:
-                ctl.solve.predicted_stress[world] = wp.where(tangent_needed(ctl, world), 0, 2)
+                ctl.solve.predicted_stress[world] = wp.where(searching.tangent_needed(ctl, world), 0, 2)
                 ctl.nonmonotone.require_armijo[world] = 1
                 ctl.search.alpha[world] = f64(0.0)
         elif ctl.search.slope[world] >= f64(0.0) and wp.static(not traits.midpoint):  # midpoint: |g| can still fall

@@ -27,7 +27,6 @@ def rigid_mode_kernels(dtype: str) -> KernelSet:
     T, vec3, mat33 = p.T, p.vec3, p.mat33
     Bodies, Pattern = bodies_struct(dtype), pattern_struct()
     rigid = rigid_mode_functions(dtype)
-    translation_columns, rotation_columns = rigid.translation_columns, rigid.rotation_columns
     UNIT_ROUNDOFF = {"float64": 2.0**-53, "float32": 2.0**-24}[dtype]
     module = kernel_module(f"motions_{dtype}", max_unroll=SHORT_UNROLL)
 
@@ -66,14 +65,14 @@ def rigid_mode_kernels(dtype: str) -> KernelSet:
         while slot < bodies.end_slot[body]:
             move = mat33d()
             turn = mat33d()
-            own_move = translation_columns(bodies, body, slot)
-            own_turn = rotation_columns(bodies, world, body, slot)
+            own_move = rigid.translation_columns(bodies, body, slot)
+            own_turn = rigid.rotation_columns(bodies, world, body, slot)
             own_free = wp.diag(vec3d(free[slot]))
             for k in range(pattern.start[slot], pattern.start[slot + 1]):
                 other = pattern.column[k]
                 A = own_free @ mat33d(value[world, k]) @ wp.diag(vec3d(free[other]))
-                move += A @ translation_columns(bodies, body, other)
-                turn += A @ rotation_columns(bodies, world, body, other)
+                move += A @ rigid.translation_columns(bodies, body, other)
+                turn += A @ rigid.rotation_columns(bodies, world, body, other)
                 if other == slot:
                     move += f64(UNIT_ROUNDOFF) * wp.diag(wp.get_diag(A)) @ own_move
                     turn += f64(UNIT_ROUNDOFF) * wp.diag(wp.get_diag(A)) @ own_turn

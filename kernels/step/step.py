@@ -44,7 +44,6 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
     p, free_components = precision(dtype), free_components_function(dtype)
     T, vec3 = p.T, p.vec3
     Step, limits = step_struct(), step_end_functions()
-    end_time, time_tolerance, step_length = limits.end_time, limits.time_tolerance, limits.step_length
     Newton = control_struct()
     PCG = pcg_struct()
     variant = traits.suffix("nonpotential", "has_constraints")
@@ -59,7 +58,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
         world = wp.tid()
         time = step.time[world]
         alive = wp.where(step.status[world] == wp.static(STATUS["running"]), 1, 0)
-        if time >= end_time(step, world) - time_tolerance(step, world):
+        if time >= limits.end_time(step, world) - limits.time_tolerance(step, world):
             alive = 0
         if alive != 0 and step.growth_monitored != 0 and step.energy_growth[world, GROWTH_SHARE] > step.growth_limit:
             alive = 0
@@ -81,7 +80,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
         step.halving_level[world] = 0
         step.substep_index[world] = 0
         step.step_start_time[world] = time
-        if wp.abs(step.summed_time[world] - time) <= time_tolerance(step, world):
+        if wp.abs(step.summed_time[world] - time) <= limits.time_tolerance(step, world):
             step.step_start_time[world] = step.summed_time[world]
         step.step_min_J[world] = f64(1.0e30)
 
@@ -105,7 +104,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
         newton.failed[world] = 0
         newton.iterations[world] = 0
         parts = f64(wp.lshift(1, step.halving_level[world]))
-        span = step_length(step, world)
+        span = limits.step_length(step, world)
         h = span / parts
         step.h[world] = h
         step.new_time[world] = step.step_start_time[world] + span * (f64(step.substep_index[world] + 1) / parts)
@@ -238,8 +237,8 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
             if level == 0:
                 step.running[world] = 0
                 step.summed_time[world] = step.new_time[world]
-                if wp.abs(end_time(step, world) - step.new_time[world]) <= time_tolerance(step, world):
-                    step.time[world] = end_time(step, world)
+                if wp.abs(limits.end_time(step, world) - step.new_time[world]) <= limits.time_tolerance(step, world):
+                    step.time[world] = limits.end_time(step, world)
             else:
                 wp.atomic_max(step.any_running, 0, 1)
             return

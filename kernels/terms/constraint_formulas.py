@@ -42,9 +42,6 @@ def formula_kernels(dtype: str, midpoint: bool, formula: Formula) -> KernelSet:
     mat33d_2d = wp.array2d(dtype=mat33d)
     Constraints, Multipliers = constraint_struct(), multiplier_struct()
     functions = constraint_functions(dtype)
-    term_vector, right_side, store_value = functions.term_vector, functions.right_side, functions.store_value
-    store_gradients = functions.store_gradients
-    value, gradients, gradient_change = formula.value, formula.gradients, formula.gradient_change
     name = f"constraint_formula_{definition_name(formula.name, formula)}"
     module = kernel_module(f"{name}_{dtype}{'_midpoint' if midpoint else ''}")
 
@@ -53,7 +50,7 @@ def formula_kernels(dtype: str, midpoint: bool, formula: Formula) -> KernelSet:
         """Vectors a, b, a2 of a row, as rows."""
         out = mat33d()
         for side in range(3):
-            out[side] = con.reference[3 * row + side] + term_vector(con, 3 * row + side, x, world)
+            out[side] = con.reference[3 * row + side] + functions.term_vector(con, 3 * row + side, x, world)
         return out
 
     @wp.func
@@ -61,12 +58,12 @@ def formula_kernels(dtype: str, midpoint: bool, formula: Formula) -> KernelSet:
         """Derivative of the gradients along a component of one vector."""
         d = mat33d()
         d[side, axis] = f64(1.0)
-        return gradient_change(v[0], v[1], v[2], d[0], d[1], d[2])
+        return formula.gradient_change(v[0], v[1], v[2], d[0], d[1], d[2])
 
     @wp.func
     def store_derivatives(gradient: vec3d_2d, curvature: mat33d_2d, world: int, row: int, scale: f64, v: mat33d):
         """Store first and second derivatives of c at the vectors v of a row."""
-        store_gradients(gradient, world, row, scale * gradients(v[0], v[1], v[2]))
+        functions.store_gradients(gradient, world, row, scale * formula.gradients(v[0], v[1], v[2]))
         for side in range(3):
             x = scale * derivative_along(v, side, 0)
             y = scale * derivative_along(v, side, 1)
@@ -84,14 +81,14 @@ def formula_kernels(dtype: str, midpoint: bool, formula: Formula) -> KernelSet:
         if active[world] == 0 or con.kind[row] != kind:
             return
         scale = con.scale[row]
-        f = right_side(con, law_value, world, row)
+        f = functions.right_side(con, law_value, world, row)
         v = row_vectors(con, u, world, row)
-        c = scale * (value(v[0], v[1], v[2]) - f)
+        c = scale * (formula.value(v[0], v[1], v[2]) - f)
         if wp.static(midpoint):
-            store_gradients(mul.end_gradient, world, row, scale * gradients(v[0], v[1], v[2]))
+            functions.store_gradients(mul.end_gradient, world, row, scale * formula.gradients(v[0], v[1], v[2]))
             v = row_vectors(con, u_stage, world, row)
         store_derivatives(mul.gradient, mul.curvature, world, row, scale, v)
-        store_value(con, mul, alpha[world], world, row, scale, f, c)
+        functions.store_value(con, mul, alpha[world], world, row, scale, f, c)
 
     @wp.kernel(module=module)
     def derivatives(

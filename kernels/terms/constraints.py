@@ -209,8 +209,6 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> KernelSet:
     vec3 = p.vec3
     Constraints, Multipliers, Joints = constraint_struct(), multiplier_struct(), joint_struct()
     functions = constraint_functions(dtype)
-    term_vector, directional_derivative = functions.term_vector, functions.directional_derivative
-    right_side, store_gradients, store_value = functions.right_side, functions.store_gradients, functions.store_value
     module = kernel_module(f"constraints_{dtype}{'_midpoint' if midpoint else ''}")
 
     @wp.func
@@ -246,9 +244,9 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> KernelSet:
         if active[world] == 0 or kind >= FORMULA:
             return
         scale = con.scale[row]
-        f = right_side(con, law_value, world, row)
-        da = term_vector(con, 3 * row, u, world)
-        db = term_vector(con, 3 * row + 1, u, world)
+        f = functions.right_side(con, law_value, world, row)
+        da = functions.term_vector(con, 3 * row, u, world)
+        db = functions.term_vector(con, 3 * row + 1, u, world)
         A, B = con.reference[3 * row], con.reference[3 * row + 1]
         a = A + da
         b = B + db
@@ -261,7 +259,7 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> KernelSet:
             c = scale * (con.reference_product[row] - f * f + f64(2.0) * wp.dot(A, da) + wp.dot(da, da)) / (size + f)
             slope = a / size
         elif kind == ANGLE:
-            a2 = con.reference[3 * row + 2] + term_vector(con, 3 * row + 2, u, world)
+            a2 = con.reference[3 * row + 2] + functions.term_vector(con, 3 * row + 2, u, world)
             along = wp.sin(f) * a2 + wp.cos(f) * a
             c = scale * wp.dot(wp.cos(f) * a2 - wp.sin(f) * a, b)
             if wp.dot(along, b) < f64(0.0):
@@ -274,29 +272,29 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> KernelSet:
             c = scale * (con.reference_product[row] - f + wp.dot(A, db) + wp.dot(da, B) + wp.dot(da, db))
         angle = f  # at which the forces act
         if wp.static(midpoint):
-            store_gradients(mul.end_gradient, world, row, constraint_gradients(kind, scale, f, slope, b, a2))
-            middle = A + term_vector(con, 3 * row, u_stage, world)
+            functions.store_gradients(mul.end_gradient, world, row, constraint_gradients(kind, scale, f, slope, b, a2))
+            middle = A + functions.term_vector(con, 3 * row, u_stage, world)
             slope = middle
             if kind == DISTANCE:
                 slope = middle * (f64(2.0) / (wp.length(a) + wp.length(f64(2.0) * middle - a)))
-            b = B + term_vector(con, 3 * row + 1, u_stage, world)
+            b = B + functions.term_vector(con, 3 * row + 1, u_stage, world)
             if kind == ANGLE:
-                a2 = con.reference[3 * row + 2] + term_vector(con, 3 * row + 2, u_stage, world)
+                a2 = con.reference[3 * row + 2] + functions.term_vector(con, 3 * row + 2, u_stage, world)
                 if wp.isfinite(mul.last_target[world, row]):
                     angle = f64(0.5) * (mul.last_target[world, row] + f)
-        store_gradients(mul.gradient, world, row, constraint_gradients(kind, scale, angle, slope, b, a2))
-        store_value(con, mul, alpha[world], world, row, scale, f, c)
+        functions.store_gradients(mul.gradient, world, row, constraint_gradients(kind, scale, angle, slope, b, a2))
+        functions.store_value(con, mul, alpha[world], world, row, scale, f, c)
 
     @masked_kernel(module, "active")
     def product_terms(con: Constraints, mul: Multipliers, p_in: p.vec3_2d, dq_dv: double_1d, active: int_1d):
         """Contributions to (dq/dv) (rho J^T J + sum lambda d2c/dq2) p, one vector per term."""
         world, row = wp.tid()
         kind = con.kind[row]
-        a = term_vector(con, 3 * row, p_in, world)
-        b = term_vector(con, 3 * row + 1, p_in, world)
+        a = functions.term_vector(con, 3 * row, p_in, world)
+        b = functions.term_vector(con, 3 * row + 1, p_in, world)
         a2 = vec3d()
         if kind >= ANGLE:
-            a2 = term_vector(con, 3 * row + 2, p_in, world)
+            a2 = functions.term_vector(con, 3 * row + 2, p_in, world)
         Ga = mul.gradient[world, 3 * row]
         Gb = mul.gradient[world, 3 * row + 1]
         Gc = mul.gradient[world, 3 * row + 2]
@@ -341,7 +339,7 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> KernelSet:
         world, row = wp.tid()
         mul.multiplier_change[world, row] = f64(0.0)
         if converged[world, con.connected_component[row]] == 0:
-            change = dq_dv[world] * directional_derivative(con, mul.end_gradient, direction, world, row)
+            change = dq_dv[world] * functions.directional_derivative(con, mul.end_gradient, direction, world, row)
             mul.multiplier_change[world, row] = mul.penalty[world, row] * (mul.constraint_value[world, row] + change)
 
     @masked_kernel(module, "flags")
