@@ -52,7 +52,7 @@ MECHANISMS: dict[str, tuple[Change, ...]] = {
         (SEARCH, "predicted_stress[world] = 1\n", "predicted_stress[world] = 0\n"),
         (SEARCH, "wp.where(tangent_needed(ctl, world), 0, 1)", "0"),
         (SEARCH, "wp.where(tangent_needed(ctl, world), 0, 2)", "0"),
-        (NEWTON, "wp.where(tangent_needed(ctl, world), 0, 2)", "0"),
+        (NEWTON, "wp.where(searching.tangent_needed(ctl, world), 0, 2)", "0"),
     ),
     "kink search": ((SEARCH, "if wp.static(traits.unilateral and not traits.midpoint):", "if wp.static(False):"),),
     "excursions": ((SEARCH, "ctl.nonmonotone.penetrating_steps[world] < MAX_PENETRATING_STEPS", "False"),),
@@ -217,7 +217,7 @@ def _child(tree: pathlib.Path, words: Sequence[str], out: pathlib.Path) -> list[
                  "note": done.stderr[-500:]}]  # fmt: skip
     found = json.loads(out.read_text())
     if words[1] == "tests.validation":
-        return [row | {"case": row["label"], "precision": "float64", "passed": True} for row in found["rows"]]
+        return [row | {"case": row["label"], "precision": "float64", "passed": True} for row in found["piles"]]
     return list(found["rows"])
 
 
@@ -324,7 +324,7 @@ def tables(rows: Sequence[Row]) -> str:
     """Markdown: mechanisms, then constants by area, each with its value, unit, and a row that is lost without it."""
     shown = {row["variant"]: row for row in rows if row["lost"] or row["of"] in ("stress", "piles")}
     out = []
-    for area in ("globalisation", NEWTON_PCG, REUSE, ADAPTIVE, CONTACT, "group"):
+    for area in dict.fromkeys(row["area"] for row in shown.values()):
         out += ["", f"## {area[0].upper()}{area[1:]}", ""]
         constants = area not in ("globalisation", "group")
         heads = ["name", "value", "unit", "lost without it"] if constants else ["name", "lost without it"]
@@ -339,7 +339,8 @@ def tables(rows: Sequence[Row]) -> str:
 def reason(row: Row) -> str:
     """The first lost row of a variant and the number of others, or the iterations that it saves."""
     if row["lost"]:
-        case = ": ".join(row["lost"][0].split(": ")[:2])
+        first = min(row["lost"], key=lambda text: ": missed" in text)
+        case = ": ".join(first.split(": ")[:2])
         return case + (f", and {len(row['lost']) - 1} more" if len(row["lost"]) > 1 else "")
     return f"{row['newton']:.2f} times the Newton, {row['pcg']:.2f} times the PCG iterations"
 

@@ -27,6 +27,7 @@ TUTORIAL = "scenes/TUTORIAL.md"
 PAGES = [ROOT / folder / "README.md" for folder in FOLDERS]
 PAGES += [ROOT / folder / "NOTES.md" for folder in NOTES]
 PAGES += [
+    ROOT / "kernels/CONSTANTS.md",
     ROOT / "kernels/LAUNCHES.md",
     ROOT / TUTORIAL,
     ROOT / "warpfea/builder/CONTACT.md",
