@@ -176,7 +176,7 @@ def disabled(variant: str, root: pathlib.Path) -> None:
 
 def _tree(variant: str, folder: pathlib.Path) -> pathlib.Path:
     """A copy of the sources as a variant."""
-    out = folder / (variant.replace(" ", "_")[:100] or "unchanged")
+    out = folder / str(len([*folder.iterdir()]))
     skipped = shutil.ignore_patterns("__pycache__", "results")
     for name in COPIED:
         shutil.copytree(ROOT / name, out / name, ignore=skipped)
@@ -209,7 +209,8 @@ def _child(tree: pathlib.Path, words: Sequence[str], out: pathlib.Path) -> list[
     env |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONSAFEPATH": "1"}
     done = subprocess.run([sys.executable, *words], cwd=tree, env=env, capture_output=True, text=True)
     if words[1] == "pytest":
-        told = [line.split(" ", 1) for line in done.stdout.splitlines() if line.startswith(("PASSED", "FAILED"))]
+        words = ("PASSED", "FAILED", "ERROR")
+        told = [line.split(" ", 1) for line in done.stdout.splitlines() if line.startswith(words)]
         return [{"case": name.split(" - ")[0], "precision": "", "passed": word == "PASSED", "outcome": word, "note": ""}
                 for word, name in told]  # fmt: skip
     if not out.exists():
@@ -241,7 +242,7 @@ def _tasks(options: argparse.Namespace, variant: str) -> Iterator[list[str]]:
         yield ["-m", "tests.validation", "piles", "--device", options.device, "--rows", "pile-4", "--out"]
         return
     if options.rows[0].startswith("tests/"):
-        yield ["-m", "pytest", "-q", "-rpf", "-p", "no:cacheprovider", "-m", "", *options.rows, "--junitxml"]
+        yield ["-m", "pytest", "-q", "-rpfE", "-p", "no:cacheprovider", "-m", "", *options.rows, "--junitxml"]
         return
     if options.rows[0] == "random":
         share = -(-RANDOM_CASES // options.jobs)
@@ -280,13 +281,17 @@ def _compare(before: Sequence[Row], after: Sequence[Row]) -> Row:
             for key, pair in sums.items():
                 pair[0] += was.get(key) or 0
                 pair[1] += row.get(key) or 0
+    seen = {(row["case"], row["precision"]) for row in after}
+    part = {case for case, _ in seen}  # of the rows before, those of other parts of the suite were not asked for
+    gone = [key for key, row in old.items() if row["passed"] and key not in seen and (key[0] in part or not part)]
+    lost += [f"{case} {precision}: has no answer" for case, precision in gone]
     ratio = {key: pair[1] / pair[0] if pair[0] else 1.0 for key, pair in sums.items()}
     return {"rows": len(after), "touched": sorted(touched), "lost": lost, "regained": regained, **ratio}
 
 
 def study(options: argparse.Namespace, done: Sequence[Row]) -> Iterator[Row]:
     """A row per variant that is not yet `done`."""
-    areas, finished = variants(), {row["variant"] for row in done if row["of"] == " ".join(options.rows)}
+    areas, finished = variants(), {row["variant"] for row in done if row.get("of") == " ".join(options.rows)}
     wanted = options.only or [*areas]
     areas |= {name: "group" for name in wanted if "+" in name}
     chosen = [name for name, area in areas.items() if name and {name, area} & {*wanted} and name not in finished]
@@ -322,7 +327,8 @@ def study(options: argparse.Namespace, done: Sequence[Row]) -> Iterator[Row]:
 
 def tables(rows: Sequence[Row]) -> str:
     """Markdown: mechanisms, then constants by area, each with its value, unit, and a row that is lost without it."""
-    shown = {row["variant"]: row for row in rows if row["lost"] or row["of"] in ("stress", "piles")}
+    found = [row for row in rows if row["lost"] or row["of"] in ("stress", "piles")]
+    shown = {row["variant"]: row for row in sorted(found, key=lambda row: bool(row["lost"]))}
     out = []
     for area in dict.fromkeys(row["area"] for row in shown.values()):
         out += ["", f"## {area[0].upper()}{area[1:]}", ""]

@@ -89,7 +89,7 @@ def test_all_of_H_is_factorised(operator):
     expected = work.Hp.numpy().ravel()
     parts = [
         abs(work.multipliers.trial_multiplier.numpy()).max(),
-        abs(newton.direct.follower_matrices[0].columns.numpy()).max(),
+        abs(newton.ctx.scratch["followers"][0].columns.numpy()).max(),
     ]
     assert min(parts) > 0.0
     assert np.abs(matrix @ v.ravel() - expected).max() < 1e-12 * np.abs(expected).max()

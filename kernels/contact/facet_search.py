@@ -33,13 +33,10 @@ def facet_search_kernels(dtype: str) -> KernelSet:
     Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)
     Masters, PairHistory, PairScratch = master_struct(dtype), pair_history_struct(), pair_scratch_struct(dtype)
     k, f = kinematics_functions(dtype), facet_projection_functions(dtype)
-    interpolate, activation_gap = k.interpolate, k.activation_gap
     surface_point, facet_value, displacement_change = f.surface_point, f.facet_value, f.displacement_change
     distance_outside, inverse_map, project_on_facet = f.distance_outside, f.inverse_map, f.project_on_facet
     FacetPoint, boxes, candidates = f.FacetPoint, broad_phase_kernels(dtype), facet_candidate_functions(dtype)
-    round_down, round_up, contains = boxes.round_down, boxes.round_up, boxes.contains
     SlavePoint, slave_point, slave_point_at = candidates.SlavePoint, candidates.slave_point, candidates.slave_point_at
-    anchor_candidate, search_facets = candidates.anchor_candidate, candidates.search_facets
     module = kernel_module(f"facet_search_{dtype}", max_unroll=SHORT_UNROLL)
 
     @wp.func
@@ -48,7 +45,7 @@ def facet_search_kernels(dtype: str) -> KernelSet:
         xi: vec3d, n: vec3d,
     ) -> f64:  # fmt: skip
         """Approach speed of a point towards a facet at the start of the attempt, m/s."""
-        own = interpolate(facets, v, slave.world, slave.number_in_facet, slave.slave_facet)
+        own = k.interpolate(facets, v, slave.world, slave.number_in_facet, slave.slave_facet)
         return wp.dot(n, facet_value(mas, pair.start_velocity, slave.world, f, xi) - own)
 
     @wp.func
@@ -91,13 +88,13 @@ def facet_search_kernels(dtype: str) -> KernelSet:
         world = slave.world
         point = slave.point
         c = slave.contact
-        shift = interpolate(facets, u_n, world, slave.number_in_facet, slave.slave_facet)
+        shift = k.interpolate(facets, u_n, world, slave.number_in_facet, slave.slave_facet)
         scr.start_position[world, point] = facets.X[slave.number_in_facet, slave.slave_facet] + shift
         scr.start_displacement[world, point] = shift
         scr.start_depth[world, point] = f64(-1.0e30)
         scr.approach_speed[world, point] = f64(MIN_APPROACH_SPEED)
         pair.anchor_facet[world, point] = 0
-        scr.activation_gap[world, point] = activation_gap(con, his, world, c, point, clock.time[world], f64(0.0))
+        scr.activation_gap[world, point] = k.activation_gap(con, his, world, c, point, clock.time[world], f64(0.0))
         if his.speed[world, point] > f64(0.0):
             f = pair_his.facet[world, point] - 1
             set_anchor(mas, facets, his, clock, scr, pair, v_n, slave, f, pair_his.xi[world, point])
@@ -120,7 +117,7 @@ def facet_search_kernels(dtype: str) -> KernelSet:
         high = -low
         inside = f64(0.0)
         for q in range(facets.point_count):
-            x = facets.X[q, item] + interpolate(facets, u, world, q, item)
+            x = facets.X[q, item] + k.interpolate(facets, u, world, q, item)
             y = scr.start_position[world, facets.first_point + item * facets.point_count + q]
             if facets.area_fraction[q, item] > f64(0.0):
                 low = wp.min(low, wp.min(x, y))
@@ -132,18 +129,18 @@ def facet_search_kernels(dtype: str) -> KernelSet:
         far = search_distance + inside
         pad = vec3d(far, far, far)
         empty_box_known = pair.empty_box_refit[world, row] == pair.refit_count[0]
-        if empty_box_known and contains(
+        if empty_box_known and boxes.contains(
             pair.empty_box_lower[world, row],
             pair.empty_box_upper[world, row],
-            round_down(low - pad),
-            round_up(high + pad),
+            boxes.round_down(low - pad),
+            boxes.round_up(high + pad),
         ):
             pair.in_reach[world, row] = 0
             return
         room = f64(2.0) * far + f64(BOX_MARGIN) * wp.length(high - low)
         wide = vec3d(room, room, room)
         root = wp.bvh_get_group_root(mas.tree, world * mas.surface_count + mas.surface_of[facets.contact[item]])
-        query = wp.bvh_query_aabb(mas.tree, round_down(low - wide), round_up(high + wide), root)
+        query = wp.bvh_query_aabb(mas.tree, boxes.round_down(low - wide), boxes.round_up(high + wide), root)
         index = wp.int32(0)
         if wp.bvh_query_next(query, index):
             pair.in_reach[world, row] = 1
@@ -151,8 +148,8 @@ def facet_search_kernels(dtype: str) -> KernelSet:
             return
         pair.in_reach[world, row] = 0
         pair.empty_box_refit[world, row] = pair.refit_count[0]
-        pair.empty_box_lower[world, row] = round_down(low - wide)
-        pair.empty_box_upper[world, row] = round_up(high + wide)
+        pair.empty_box_lower[world, row] = boxes.round_down(low - wide)
+        pair.empty_box_upper[world, row] = boxes.round_up(high + wide)
 
     @wp.func
     def facet_frame(s: FacetPoint) -> wp.mat33d:
@@ -171,7 +168,7 @@ def facet_search_kernels(dtype: str) -> KernelSet:
         point = slave.point
         c = slave.contact
         projection = project_on_facet(mas, pair.displacement, world, f, xi)
-        now = activation_gap(con, his, world, c, point, clock.new_time[world], f64(0.0))
+        now = k.activation_gap(con, his, world, c, point, clock.new_time[world], f64(0.0))
         pair.facet[world, point] = f
         pair.xi[world, point] = xi
         pair.projection[world, point] = projection.xi
@@ -223,9 +220,9 @@ def facet_search_kernels(dtype: str) -> KernelSet:
         if his.speed[world, point] <= f64(0.0) and pair.in_reach[world, facets.first_row + item] == 0:
             return
         slave = slave_point_at(con, mas, facets, his, clock, scr, pair, u, world, item, q, overlap_limit)
-        candidate = anchor_candidate(mas, his, pair, slave)
+        candidate = candidates.anchor_candidate(mas, his, pair, slave)
         if candidate.facet < 0 or candidate.outside_distance > f64(OUTSIDE_TOLERANCE):
-            candidate = search_facets(mas, facets, scr, pair, slave, candidate, corner_points[item])
+            candidate = candidates.search_facets(mas, facets, scr, pair, slave, candidate, corner_points[item])
         if candidate.facet >= 0:
             set_contact(con, mas, facets, his, clock, scr, pair, v_n, slave, candidate.facet, candidate.xi)
             most = mas.depth_limit[candidate.facet] * wp.where(

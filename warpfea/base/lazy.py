@@ -13,6 +13,8 @@ class LazyPackage:
         self._name = name
 
     def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):  # of protocols, such as pickle's, that look for it
+            raise AttributeError(name)
         package = importlib.import_module(self._name)
         return getattr(package, name) if hasattr(package, name) else importlib.import_module(f"{self._name}.{name}")
 

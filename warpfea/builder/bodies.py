@@ -1,6 +1,8 @@
 """Bodies from meshes, materials and options; unique names.
 
-Geometry of ANCF solids: face-centroid nodes, and the frames dX/dxi at the nodes, from a mesh of tets or hexes."""
+Geometry of ANCF solids: face-centroid nodes, and the frames dX/dxi at the nodes, from a mesh of tets or hexes.
+Geometry of shells: axes and frames dX/dxi of each quad at its nodes, with directors shared by adjacent elements.
+"""
 
 import math
 import pathlib

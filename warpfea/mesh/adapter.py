@@ -165,6 +165,8 @@ def _meshio_errors(label: str) -> Iterator[io.StringIO]:
         raise error if str(error).startswith(label) else MeshError(f"{label}: {error}") from None
     except OSError as error:
         raise MeshError(f"{label}: can't be read: {error}") from error
+    except ImportError:
+        raise
     except (Exception, SystemExit) as error:
         told = str(error) and not isinstance(error, SystemExit)
         reason = " ".join(said.getvalue().split()) or (f"{type(error).__name__}: {error}" if told else "bad content")

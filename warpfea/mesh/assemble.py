@@ -136,7 +136,7 @@ def _find_faces(mesh: Mesh, kind: str, nodes: Ints, name: str) -> Ints:
     corners = nodes[:, : row.face_corners]
     check_range(corners, len(mesh.points), f"{label}: surface {name!r}, node")
     # keys of faces and queries are numbered together: row_keys may compress
-    table, local = mesh._sorted_faces, row.faces[:, : row.face_corners]
+    table, local = mesh._sorted_faces(), row.faces[:, : row.face_corners]
     keys = row_keys(np.concatenate([table, np.sort(corners, axis=1)]), len(mesh.points))
     keys, wanted = keys[: len(table)], keys[len(table) :]
     order = np.argsort(keys, kind="stable")

@@ -193,9 +193,8 @@ class Mesh:
     @cached_property
     def _face_keys(self) -> Ints:
         """Key per (element, local face), (M * faces,), equal for faces with the same corners."""
-        return row_keys(self._sorted_faces, len(self.points))
+        return row_keys(self._sorted_faces(), len(self.points))
 
-    @cached_property
     def _sorted_faces(self) -> Ints:
         """Sorted corners of each (element, local face), (M * faces, corners)."""
         corners = self.kind.faces[:, : self.kind.face_corners]

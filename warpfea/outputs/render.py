@@ -55,6 +55,7 @@ class _PictureWriter(Output):
     def __post_init__(self) -> None:
         if not isinstance(self.field, (str, type(None))):
             raise ModelError(f"field must be the name of a field, or None for grey, got {self.field!r}")
+        self.path = pathlib.Path(self.path)
         self.size, self.view = _checked_size(self.size), check_view(self.view)
         self.color_range = check_colors(self.color_range)
         self._animation: Animation | None = None

@@ -76,6 +76,7 @@ class USDWriter(Output):
     extend: bool = False
 
     def __post_init__(self) -> None:
+        self.path = pathlib.Path(self.path)
         self.fps = self.rate = FrameClock(self.fps).fps
         if isinstance(self.fields, str) or not all(isinstance(name, str) for name in self.fields):
             raise ModelError(f"fields must be names of fields, such as ('von_mises',), got {self.fields!r}")

@@ -18,7 +18,6 @@ import warp as wp
 
 from ..base.launch import launch_part
 from ..kernels.solvers.direct import direct_kernels
-from ..terms.loads import FollowerLoads, FollowerMatrix
 from ..terms.protocols import Preconditioned
 from .factor import SingularMatrix, make_factors
 from .preconditioner import Preconditioner
@@ -61,11 +60,6 @@ class DirectSolver(Preconditioner):
     def start(self, active: wp.array) -> None:
         """Compute D and the inverses of its blocks."""
         self.residual.diagonal_blocks(active)
-
-    @property
-    def follower_matrices(self) -> list[FollowerMatrix]:
-        """Matrices of the follower loads' items, built on first use."""
-        return self.ctx.scratch.get(FollowerLoads.name, [])
 
     @property
     def matrix(self) -> wp.array:

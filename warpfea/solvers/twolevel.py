@@ -191,7 +191,7 @@ class TwoLevel(Preconditioner):
     def start(self, active: wp.array) -> None:
         """Rebuild where due, with D and the penalties that follow from D."""
         self.reuse.decide_rebuild(active)
-        wp.capture_if(self.reuse.control.any_build, self._build_with_penalties)
+        wp.capture_if(self.reuse.control.any_build, self._build, penalty=True)
 
     @launch_part("build")
     def prepare(self, active: wp.array) -> None:
@@ -288,9 +288,6 @@ class TwoLevel(Preconditioner):
             new = 1.0 / (2.0 * ratio - rho)
             keep, step = new * rho, 2.0 * new / half
             rho = new
-
-    def _build_with_penalties(self) -> None:
-        self._build(penalty=True)
 
     def _chunks(self, flags: wp.array) -> Iterator[tuple[range, wp.array, wp.array]]:
         """Worlds of each chunk, flags of the worlds chosen by `flags`, and `value` indexed over all worlds."""

@@ -76,8 +76,8 @@ def check_unique_names(terms: Sequence[Term], taken: Sequence[str], what: str, n
 
 
 def overrides(term: Term, method: Any) -> bool:
-    """True if a term overrides a method of Term or of a protocol."""
-    return getattr(type(term), method.__name__, method) is not method
+    """True if a term overrides a method of Term or of a protocol, in its class or by itself."""
+    return method.__name__ in vars(term) or getattr(type(term), method.__name__, method) is not method
 
 
 def derived_traits(term: Term) -> Traits:
