@@ -371,12 +371,13 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--device", default="cpu")
     options = parser.parse_args()
-    content = json.loads(options.out.read_text()) if options.out.exists() else {"rows": []}
+    content = json.loads(options.out.read_text()) if options.out.exists() else {"parts": {}}
+    done = [row for part in content["parts"].values() for row in part["rows"]]
     command = " ".join(["python tests/ablation.py", *sys.argv[1:]])
-    origin = provenance_of([], options.device) | {"command": command}
-    content["runs"] = [*content.get("runs", []), origin]
-    for row in study(options, content["rows"]):
-        content["rows"].append(row | {"run": len(content["runs"]) - 1})
+    part: Row = provenance_of([], options.device) | {"command": command, "rows": []}
+    content["parts"][f"run {len(content['parts']) + 1}"] = part
+    for row in study(options, done):
+        part["rows"].append(row)
         write_json(str(options.out), content)
         shown = {key: row[key] for key in ("variant", "area", "rows", "newton", "pcg")}
         print(*shown.values(), "lost", len(row["lost"]), row["lost"][:3], flush=True)

@@ -1,10 +1,9 @@
 """Variants of ablation.py: each changes the sources as they are."""
 
-import json
-
 import pytest
 from ablation import CONSTANTS, MECHANISMS, ROOT, constant_file, disabled, tables, variants
 from random_cases import build, draw
+from result_files import content_of
 
 
 @pytest.mark.parametrize("name", CONSTANTS)
@@ -41,7 +40,7 @@ def test_variants_are_many_and_random_models_can_be_built():
 
 
 def rows():
-    return json.loads((ROOT / "tests" / "results" / "ablation_cpu.json").read_text())["rows"]
+    return [row for part in content_of("ablation_cpu.json")["parts"].values() for row in part["rows"]]
 
 
 def is_needed(name):
