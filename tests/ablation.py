@@ -209,8 +209,8 @@ def _child(tree: pathlib.Path, words: Sequence[str], out: pathlib.Path) -> list[
     env |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONSAFEPATH": "1"}
     done = subprocess.run([sys.executable, *words], cwd=tree, env=env, capture_output=True, text=True)
     if words[1] == "pytest":
-        words = ("PASSED", "FAILED", "ERROR")
-        told = [line.split(" ", 1) for line in done.stdout.splitlines() if line.startswith(words)]
+        kinds = ("PASSED", "FAILED", "ERROR")
+        told = [line.split(" ", 1) for line in done.stdout.splitlines() if line.startswith(kinds)]
         return [{"case": name.split(" - ")[0], "precision": "", "passed": word == "PASSED", "outcome": word, "note": ""}
                 for word, name in told]  # fmt: skip
     if not out.exists():
