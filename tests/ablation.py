@@ -253,7 +253,7 @@ def _tasks(options: argparse.Namespace, variant: str) -> Iterator[list[str]]:
     part = CONSTANTS[variant].rows if variant in CONSTANTS else ""
     rows = {label: seconds for label, (group, seconds) in _stress_rows(options).items() if group.startswith(part)}
     quick = ["--quick"] if options.suite == "quick" else []
-    for labels in _parts(rows, options.jobs):
+    for labels in _parts(rows, options.parts or options.jobs):
         cases = [word for label in labels for word in ("--case", label)]
         yield ["-m", "warpfea", "stress", "--quiet", *quick, "--device", options.device, *cases, "--json"]
 
@@ -368,7 +368,10 @@ def main() -> None:
     parser.add_argument(
         "--base", type=pathlib.Path, help="rows of the unchanged sources: written, read where it exists"
     )
-    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--jobs", type=int, default=2, help="processes side by side")
+    parser.add_argument(
+        "--parts", type=int, default=0, help="processes per variant of the stress suite: as many as jobs"
+    )
     parser.add_argument("--device", default="cpu")
     options = parser.parse_args()
     content = json.loads(options.out.read_text()) if options.out.exists() else {"parts": {}}

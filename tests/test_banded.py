@@ -32,7 +32,8 @@ def parts(sim):
 def assembled(sim, u, *, projected):
     _, matrix, on = parts(sim)
     out, work = matrix.allocate_values("test"), sim.stepper.work
-    matrix.assemble(u, (work.step.mass_factor, work.step.dq_dv), on, out, projected=projected)
+    iterate = work.iterate(u, work.v_stage, work.step.dq_dv)
+    matrix.assemble(iterate, work.step.mass_factor, on, out, projected=projected)
     return out
 
 

@@ -47,7 +47,7 @@ def watch(sim, after):
 
     def anew(active):
         loop.residual.assemble_matrix(active)
-        loop.preconditioner.discard(active)
+        loop.preconditioner.prepare(active, anew=True)
         solve(active)
         after(loop)
 

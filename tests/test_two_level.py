@@ -44,8 +44,7 @@ def assembled(sim, *, projected, whole=None):
     if whole is not None:
         matrix = MatrixAssembler(sim.model, work, sim.stepper.launch, residual.block_kernels, whole)
     out = matrix.allocate_values("test")
-    factors = (work.step.mass_factor, work.step.dq_dv)
-    matrix.assemble(work.u, factors, on(sim), out, projected=projected)
+    matrix.assemble(work.stage, work.step.mass_factor, on(sim), out, projected=projected)
     return matrix.host_csr(out)
 
 

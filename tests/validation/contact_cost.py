@@ -135,7 +135,7 @@ def count_solves(sim: Simulation, steps: int) -> list[int]:
 
     def anew(active: wp.array) -> None:
         loop.residual.assemble_matrix(active)
-        preconditioner.discard(active)
+        preconditioner.prepare(active, anew=True)
         solve(active)
         counts.append(int(work.pcg.iterations.numpy()[0]))
 

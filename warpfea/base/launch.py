@@ -13,11 +13,12 @@ from ..kernels.common.lanes import WARP_SIZE
 from .console import quiet_warp
 from .errors import ModelError
 
-__all__ = ["LAUNCH_PARTS", "Launcher", "OnCompile", "Recorder", "kernel_name", "launch_part", "load_modules"]
+__all__ = ["LAUNCH_PARTS", "Launcher", "OnCompile", "Recorder", "kernel_name", "launch_part", "load_modules", "part"]
 
 P = ParamSpec("P")
 R = TypeVar("R")
 S = TypeVar("S")
+F = TypeVar("F", bound=Callable[..., Any])
 OnCompile = Callable[[int, int, str], None]
 
 LAUNCH_PARTS = {
@@ -138,6 +139,20 @@ def launch_part(name: str) -> Callable[[Callable[Concatenate[S, P], R]], Callabl
                 return method(self, *args, **options)
 
         return wrapper
+
+    return decorate
+
+
+def part(name: str = "") -> Callable[[F], F]:
+    """Decorator: attribute the launches of a term's method to profile part `name`, by default that of its name."""
+
+    def decorate(method: F) -> F:
+        @functools.wraps(method)
+        def wrapper(self: Any, ctx: Any, *args: Any, **options: Any) -> Any:
+            with ctx.launch.part(name or self.name):
+                return method(self, ctx, *args, **options)
+
+        return wrapper  # type: ignore[return-value]
 
     return decorate
 

@@ -67,8 +67,6 @@ class State:
 
     def __getattr__(self, name: str) -> wp.array:
         arrays = self.__dict__.get("_arrays", {})
-        if name in arrays:
-            return arrays[name]
         raise AttributeError(f"state has no array {name!r}; it has {sorted(arrays)}")
 
     def register(self, name: str, dtype: Any, shape: tuple[int, ...] = (), initial: Any = 0) -> wp.array:
@@ -100,8 +98,13 @@ class State:
                 host[...] = values
                 array.assign(host)
         self.specs[name] = spec
-        self._arrays[name] = array
+        self._add(name, array)
         return array
+
+    def _add(self, name: str, array: wp.array) -> None:
+        if not hasattr(self, name):  # else it is found by `numpy` alone
+            setattr(self, name, array)
+        self._arrays[name] = array
 
     @property
     def names(self) -> list[str]:
@@ -118,7 +121,8 @@ class State:
         out = State(self.worlds, self.device)
         out.specs = dict(self.specs)
         with convert_memory_errors(f"a copy of a state with {self.worlds} worlds", self.device):
-            out._arrays = {name: wp.clone(array) for name, array in self._arrays.items()}
+            for name, array in self._arrays.items():
+                out._add(name, wp.clone(array))
         return out
 
     def copy_rows(self, launch: Launcher, flags: wp.array, source: State, skip: tuple[str, ...] = ()) -> None:

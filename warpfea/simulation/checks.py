@@ -12,7 +12,7 @@ from ..base.errors import ModelError
 from ..model.model import Model
 from ..model.state import State
 
-__all__ = ["check_choice", "check_constraint_tol", "check_mask", "check_model", "check_state", "check_steps",
+__all__ = ["check_choice", "check_constraint_tol", "check_mask", "check_model", "check_state",
            "check_time", "check_times", "write_times"]  # fmt: skip
 
 
@@ -86,12 +86,6 @@ def check_constraint_tol(value: Any) -> None:
     """Raise ModelError unless `value` is a constraint tolerance, over the model's size."""
     if not (isinstance(value, (int, float, np.floating)) and 0.0 < value < 1.0):
         raise ModelError(f"constraint_tol = {value!r} must lie between 0 and 1")
-
-
-def check_steps(count: Any) -> None:
-    """Raise ModelError unless `count` is a number of steps."""
-    if isinstance(count, bool) or not isinstance(count, (int, np.integer)) or count < 1:
-        raise ModelError(f"step({count!r}): the number of steps must be a whole number, at least 1")
 
 
 def check_state(model: Model, state: State) -> None:

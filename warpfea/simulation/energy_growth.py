@@ -48,13 +48,21 @@ class EnergyGrowth:
     Args:
         choice: one of ENERGY_GROWTH_CHOICES.
         ledger: True with an energy ledger, which monitoring requires.
+
+    Attributes:
+        unwarned_growth: energy gain above which a step calls `warn`, which it does once.
     """
 
     def __init__(self, choice: str, *, ledger: bool, static: bool) -> None:
         self.choice = choice
         self.monitored = ledger and not static and choice != "ignore"
-        self.warned = False
+        self.unwarned_growth = WARN_LIMIT
         self._ledger = ledger
+
+    @property
+    def warned(self) -> bool:
+        """True once it has warned."""
+        return self.unwarned_growth > WARN_LIMIT
 
     def __str__(self) -> str:
         if not self.monitored:
@@ -88,12 +96,10 @@ class EnergyGrowth:
         set_rows(self._rows, chosen, 0.0)
         self._round_off_energy.assign(round_off_energy(self._model))
 
-    def warn_once(self, sim: Any, shares: np.ndarray, stacklevel: int = 4) -> None:
-        """Warn once if a world's energy gain (worlds,) exceeds WARN_LIMIT."""
-        if self.warned or not (worst := float(np.max(shares))) > WARN_LIMIT:
-            return
-        self.warned = True
-        world = int(np.argmax(shares))
+    def warn(self, sim: Any, shares: np.ndarray, stacklevel: int = 4) -> None:
+        """Warn, once, of the largest energy gain of the worlds (worlds,)."""
+        self.unwarned_growth = np.inf
+        world, worst = int(np.argmax(shares)), float(np.max(shares))
         since = float(sim.state.energy_growth.numpy()[world, GROWTH_COLUMNS.index("since")])
         refused = f"; steps are refused above {REFUSE_LIMIT:.0%}" if self.choice == "refuse" else ""
         where = f" in world {world}" if sim.model.worlds > 1 else ""

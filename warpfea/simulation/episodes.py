@@ -32,6 +32,7 @@ class Episodes:
         ends: [world] end times, s, at which worlds are frozen.
         statistics: [world, RUN_STATISTICS] statistics since the last read.
         stepped_flags: [world] flags of worlds stepped since their state was set.
+        in_use: a step launches kernels of episodes.
     """
 
     def __init__(self, model: Model, work: Workspace, launch: Launcher, *, asynchronous: bool, ends: bool) -> None:
@@ -40,6 +41,7 @@ class Episodes:
         self.statistics: wp.array | None = None
         self.stepped_flags: wp.array | None = None
         self._flags: wp.array | None = None
+        self.in_use = ends or asynchronous
         self.set_run_end()
         if ends:
             work.step.world_end = self.ends
@@ -50,7 +52,7 @@ class Episodes:
 
     def modules(self) -> set[wp.Module]:
         """Modules launched."""
-        return set() if self.statistics is None and self.ends is None else {episode_kernels().module}
+        return {episode_kernels().module} if self.in_use else set()
 
     def set_run_end(self, end: float = math.inf, steps: int = 0) -> None:
         """Set the end, s, and the number of steps of a run; inf: no run."""

@@ -265,7 +265,9 @@ class RunStatistics:
         for name in COUNTED_TOTALS:
             self.totals[name] += sums[:, RUN_STATISTICS.index(name)].astype(int)
         self._add_extremes({name: sums[:, RUN_STATISTICS.index(name)] for name in (*LARGEST, "min_J")})
-        self.sim.energy_growth.warn_once(self.sim, sums[:, RUN_STATISTICS.index("energy_growth")], stacklevel=5)
+        growth = sums[:, RUN_STATISTICS.index("energy_growth")]
+        if np.max(growth) > self.sim.energy_growth.unwarned_growth:
+            self.sim.energy_growth.warn(self.sim, growth, stacklevel=5)
         self.stepped_worlds = stepped
         if self._records_columns:
             self.history = [self._recorded_row(rows)]
@@ -313,7 +315,8 @@ class RunStatistics:
             if not self.sim.record:
                 self.history.clear()
             self.history.append(self._recorded_row(rows))
-        self.sim.energy_growth.warn_once(self.sim, last.energy_growth)
+        if np.max(last.energy_growth) > self.sim.energy_growth.unwarned_growth:
+            self.sim.energy_growth.warn(self.sim, last.energy_growth)
         if fresh.any():
             fatal = self.sim.on_failure == "raise" or (self.sim.on_failure is None and not good.any())
             if fatal:

@@ -28,7 +28,6 @@ from .checks import (
     check_constraint_tol,
     check_model,
     check_state,
-    check_steps,
     check_time,
     check_times,
     write_times,
@@ -289,7 +288,8 @@ class Simulation:
             PenetrationError: a ConvergenceError for a body that went through an obstacle; names contact and point.
             ModelError: `count` is not a positive whole number.
         """
-        check_steps(count)
+        if isinstance(count, bool) or not isinstance(count, (int, np.integer)) or count < 1:
+            raise ModelError(f"step({count!r}): the number of steps must be a whole number, at least 1")
         stepper, statistics = self.stepper, self.statistics
         for _ in range(count):
             if stepper.step_size_control:

@@ -98,7 +98,7 @@ class Stepper:
         self.dim = (model.worlds, model.slots)
         if not integrator.static and isinstance(solver, NewtonPCG):
             self.newton.first_iterate_candidates = [
-                partial(self._start_from_candidate, kind) for kind in CANDIDATE_FIRST_ITERATES
+                partial(self.launch, *self._candidate_start(kind)) for kind in CANDIDATE_FIRST_ITERATES
             ]
         self.initial_conditions = (
             ConsistentInitialConditions(self.ctx, self.newton.residual, integrator) if integrator.accelerated else None
@@ -120,7 +120,8 @@ class Stepper:
         self._load_modules()
         self.start_terms()
         self._evaluate_potential(None)
-        self._parameter_version, self._changes_applied = model.parameters.version, model.parameters.changes.copy()
+        self._parameter_updates = self.terms.parameter_updates, model.parameters.version
+        self._changes_applied = model.parameters.changes.copy()
         if ledger:
             fresh = ~self.state.ledger.numpy().any(axis=1)
             self.restart_ledger(fresh | (self.state.ledger_time.numpy() != self.state.time.numpy()))
@@ -205,12 +206,13 @@ class Stepper:
 
     def update_parameters(self) -> None:
         """Apply parameters set since the last step; the energy jump counts as work of fields."""
+        parameters = self.model.parameters
+        updates = self.terms.parameter_updates, parameters.version
+        if self._parameter_updates == updates:
+            return
+        self._parameter_updates = updates
         if self.energy_growth:
             self.energy_growth.restart_changed()
-        parameters = self.model.parameters
-        if self._parameter_version == parameters.version:
-            return
-        self._parameter_version = parameters.version
         mask = parameters.changes > self._changes_applied
         if not mask.any():
             return
@@ -309,7 +311,8 @@ class Stepper:
         """Launch all kernels of a step."""
         m, w, launch = self.model, self.work, self.launch
         w.any_flag[2:5].zero_()
-        self.episodes.freeze_finished()
+        if self.episodes.ends is not None:
+            self.episodes.freeze_finished()
         launch(self.kernels.begin_step, m.worlds, [w.step, w.newton, w.pcg])
         if self.step_size_control:
             assert self.backup is not None
@@ -330,7 +333,8 @@ class Stepper:
         if m.description.probes:
             self._write_probes()
         self.terms.call(self.ctx, Term, "report")
-        self.episodes.end_step()
+        if self.episodes.in_use:
+            self.episodes.end_step()
 
     @launch_part("commit")
     def _restore_failed(self) -> None:
@@ -357,7 +361,8 @@ class Stepper:
         launch(self.kernels.predict, self.dim, args)
         if self.predictor:
             self.predictor.begin()
-        self.terms.supports.drive(self.ctx, w.step.running)
+        if self.terms.supports.in_use:
+            self.terms.supports.drive(self.ctx, w.step.running)
         self.terms.call(self.ctx, Term, "begin", w.step.running)
 
     def _attempt(self) -> None:
@@ -370,12 +375,12 @@ class Stepper:
             self.step_size_control.finish_attempt()
         self.accept_attempt()
 
-    def _start_from_candidate(self, kind: int) -> None:
-        """Write an alternative first iterate to work.v in worlds that choose one."""
+    def _candidate_start(self, kind: int) -> tuple[wp.Kernel, tuple[int, int], list[Any]]:
+        """Launch that writes an alternative first iterate to work.v in worlds that choose one."""
         m, w, state = self.model, self.work, self.state
         args = [w.step, w.newton, kind, m.slot_table.is_position_array, m.topology.free]
-        args += [state.displacement, state.velocity]
-        self.launch(self.kernels.alternative_first_iterate, self.dim, [*args, w.q_tilde, w.v_tilde, w.v])
+        args += [state.displacement, state.velocity, w.q_tilde, w.v_tilde, w.v]
+        return self.kernels.alternative_first_iterate, self.dim, args
 
     @launch_part("commit")
     def accept_attempt(self) -> None:
@@ -401,7 +406,8 @@ class Stepper:
         laws.evaluate(self.launch, self.state, w.step.new_time, w.step.load_factor, active, w.time_law_values)
         if self.ctx.midpoint:
             laws.evaluate(self.launch, self.state, w.stage_time, w.step.load_factor, active, w.time_law_stage_values)
-        self.terms.dead_loads.take_gravity(self.launch, w.time_law_stage_values, active)
+        if self.terms.dead_loads.gravity_law is not None:
+            self.terms.dead_loads.take_gravity(self.launch, w.time_law_stage_values, active)
 
     def law_values(self, time: float) -> np.ndarray:
         """Values of the time laws at a time, s, or load fraction, (B, laws, 3), without changing those of the step."""
@@ -426,7 +432,8 @@ class Stepper:
         args = [w.step, topo, w.balance, m.masses.lumped_values, state.displacement, state.velocity]
         launch(self.kernels.ledger_terms, self.dim, args)
         reduce(w.rows, LEDGER_TERM_ROWS, accepted, w.ledger_sums)
-        self.terms.energy_increments(self.ctx, reduce, accepted)
+        if self.terms.ledger_terms:
+            self.terms.energy_increments(self.ctx, reduce, accepted)
         args = [w.step, w.newton, w.ledger_sums, self.increment_table, state.ledger]
         launch(self.kernels.update_ledger, m.worlds, args)
 

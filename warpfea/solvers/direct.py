@@ -57,7 +57,7 @@ class DirectSolver(Preconditioner):
         return {self.kernels.module} | self.assembler.modules()
 
     @launch_part("build")
-    def start(self, active: wp.array) -> None:
+    def start(self, active: wp.array, *, anew: bool = False) -> None:
         """Compute D and the inverses of its blocks."""
         self.residual.diagonal_blocks(active)
 
@@ -69,7 +69,7 @@ class DirectSolver(Preconditioner):
         return self.matrix_storage
 
     @launch_part("build")
-    def prepare(self, active: wp.array) -> None:
+    def prepare(self, active: wp.array, *, anew: bool = False) -> None:
         """Factorise H in the active worlds."""
         residual = self.residual
         own = residual.plan.factors_operator
@@ -88,7 +88,7 @@ class DirectSolver(Preconditioner):
     def _assemble(self, flags: wp.array, value: wp.array, *, projected: bool) -> None:
         """Assemble H or, with `projected`, its positive definite approximation."""
         w = self.work
-        self.assembler.assemble(w.u_stage, (w.step.mass_factor, w.step.dq_dv), flags, value, projected=projected)
+        self.assembler.assemble(w.stage, w.step.mass_factor, flags, value, projected=projected)
         for term in self.model.terms.having(Preconditioned):
             live = [array for _, array in term.cached_inputs(self.ctx)]
             term.blocks(self.ctx, self.assembler, live, w.step.dq_dv, flags, value, projected=projected)

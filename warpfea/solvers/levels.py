@@ -61,11 +61,6 @@ class Level:
     band: Band | None = None
     components: DenseComponents | None = None
 
-    @property
-    def solved_directly(self) -> bool:
-        """True if the level is inverted or factored as a whole (no level below)."""
-        return self.is_dense or self.band is not None
-
 
 @dataclass(eq=False)
 class ReferencePoints:

@@ -42,11 +42,16 @@ class Pattern:
         graph: the pattern on the host, rows sorted.
         data: device struct of the same tables.
         upper_entries: (m, 4) (entry, its transpose, row, column) of the blocks on the diagonal and above.
+        entry_count, mean_row_length: number of blocks, and of those in a row on average.
     """
 
     graph: sp.csr_matrix
     data: Any
     upper_entries: np.ndarray
+
+    def __post_init__(self) -> None:
+        self.entry_count = len(self.graph.indices)
+        self.mean_row_length = self.entry_count // max(self.graph.shape[0], 1)
 
     def find_upper(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """Indices into `upper` of entries (row, column) on or above the diagonal; -1 for others."""
@@ -55,16 +60,6 @@ class Pattern:
         wanted = np.asarray(rows).astype(np.int64) * n + columns
         at = np.minimum(np.searchsorted(key, wanted), len(key) - 1)
         return np.where(key[at] == wanted, at, -1)
-
-    @property
-    def mean_row_length(self) -> int:
-        """Mean number of blocks in a row."""
-        return self.entry_count // max(self.graph.shape[0], 1)
-
-    @property
-    def entry_count(self) -> int:
-        """Number of blocks."""
-        return len(self.graph.indices)
 
 
 def make_pattern(model: Model, graph: sp.csr_matrix, *, with_upper: bool = True) -> Pattern:
@@ -214,32 +209,31 @@ class MatrixAssembler:
         return out
 
     def assemble(
-        self, u: wp.array, factors: tuple[wp.array, wp.array], active: wp.array, out: wp.array, *, projected: bool,
+        self, iterate: Any, mass_factor: wp.array, active: wp.array, out: wp.array, *, projected: bool,
         worlds: range | None = None,
     ) -> None:  # fmt: skip
-        """out = c_M M + (dq/dv) K at u; `factors` are c_M and dq/dv per world.
+        """out = c_M M + (dq/dv) K at an iterate, as of `Workspace.iterate`; `mass_factor`: c_M per world.
 
         `projected`: K is made positive semi-definite at each quadrature point; it then depends on u and the factors
         only.
         `worlds`: the worlds to scan.
         """
-        w = self.work
         every = worlds or range(self.model.worlds)
         for first in range(every.start, every.stop, self.worlds_per_chunk):
             last = min(first + self.worlds_per_chunk, every.stop)
-            state = [*factors, active, out]
+            state = [mass_factor, active, out]
             if last - first == self.model.worlds:
-                self._assemble(last, w.iterate(u, w.v_stage, factors[1]), state, projected)
+                self._assemble(last, iterate, state, projected)
                 continue
             part = slice(first, last)
             with self.model.parameters.temporarily_restricted_to_worlds(first, last):
-                iterate = w.iterate(u, w.v_stage, factors[1], part)
-                self._assemble(last - first, iterate, [a[part] for a in state], projected, first)
+                own = self.work.iterate(iterate.u, iterate.v, iterate.dq_dv, part)
+                self._assemble(last - first, own, [a[part] for a in state], projected, first)
 
     def _assemble(self, count: int, iterate: Any, state: list[wp.array], projected: bool, first_world: int = 0) -> None:
         """Assemble `count` worlds from `first_world` on; `iterate` and `state` hold their arrays."""
         m, launch = self.model, self.launch
-        mass_factor, dq_dv, active, out = state
+        mass_factor, active, out = state
         mass = m.cache["matrix"][1]
         if mass.shape[0] != 1:
             mass = mass[first_world : first_world + count]
@@ -265,7 +259,7 @@ class MatrixAssembler:
                 args = [data, iterate, gradients, int(projected), int(k > 0), active, matrix]
                 launch(elements.element_matrix, (count, 3 * block.slots * block.count), args)
             args = [m.topology, self.pattern.data, *self.contributions[first], matrix]
-            args += [mass, int(first == 0), mass_factor, dq_dv, active, out]
+            args += [mass, int(first == 0), mass_factor, iterate.dq_dv, active, out]
             launch(self._assembly_kernels(block).add_element_matrices, (count, len(self.pattern.upper_entries)), args)
 
     def host_csr(self, values: wp.array, world: int = 0) -> sp.csr_matrix:

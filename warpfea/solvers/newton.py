@@ -270,11 +270,11 @@ class NewtonLoop:
             self._check_constraints()
             wp.capture_while(self.any_iterating, self._update_multipliers)
 
-    def _evaluate_first_iterate(self, flags: wp.array) -> None:
+    def _evaluate_first_iterate(self, flags: wp.array, *, anew: bool = False) -> None:
         """Evaluate the first iterate; its convergence check needs D, so the blocks come first."""
         self.residual.update_positions(flags)
         self.terms.call(self.ctx, Term, "prepare", flags)
-        self.preconditioner.start(flags)
+        self.preconditioner.start(flags, anew=anew)
         self.terms.call(self.ctx, Constrained, "scale", flags)
         self.residual.evaluate(flags, freeze=True)
 
@@ -302,8 +302,7 @@ class NewtonLoop:
             launch(k.compare_first_iterates, self.model.worlds, [w.newton, 0, better])
             launch(self.vector_kernels.copy_active, self.dim, [w.v, better, w.best_velocity])
         launch(self.vector_kernels.copy_active, self.dim, [w.best_velocity, choose, w.v])
-        self.preconditioner.discard(choose)
-        self._evaluate_first_iterate(choose)
+        self._evaluate_first_iterate(choose, anew=True)
         launch(k.begin_iteration, self.model.worlds, [w.newton, 2])
         self._check_inversion()
 
@@ -328,9 +327,11 @@ class NewtonLoop:
         if self.perturbation_kernels:
             with launch.rare():
                 wp.capture_if(w.newton.floor.any_estimate_error, self._average_perturbed_residuals)
+        self.preconditioner.prepare(active)
         self.pcg.solve(active)
         self.residual.freeze_nonpotential(active)
         self.residual.tangent_curvature(active)
+        self.preconditioner.record_cost(active)
         if self.limits_step:
             launch(k.reset_step_limit, self.model.worlds, [w.newton])
         self.terms.call(self.ctx, Updated, "process_direction", active)
@@ -343,7 +344,8 @@ class NewtonLoop:
         self._run_if_rare(self._run_rare_branch)
         if self.terms.traits.unilateral:
             self._update_frozen()
-        self.preconditioner.update(active)
+        if isinstance(self.preconditioner, BlockJacobi):
+            self.preconditioner.start(active)
         self.terms.call(self.ctx, Constrained, "prepare_solve", active)
         self._reduce_flags(active, self.any_iterating)
 

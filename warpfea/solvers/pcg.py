@@ -46,11 +46,9 @@ class PCG:
         if m.components.count > 1:
             launch(k.zero_converged, self.dim, [w.newton, m.components.of_slot_array, active, w.r])
         self.correct_translations(active)
-        self.preconditioner.prepare(active)
         self._precondition(w.r, w.z, active)
         w.pcg.any_active.zero_()
         self._run()
-        self.preconditioner.record_cost(active)
         self.correct_translations(active)
 
     def modules(self) -> set[wp.Module]:

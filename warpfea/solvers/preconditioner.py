@@ -33,21 +33,18 @@ class Preconditioner:
         """Modules launched."""
         raise NotImplementedError
 
-    def start(self, active: wp.array) -> None:
-        """Compute work.diagonal and work.inverse at the first iterate of an attempt."""
+    def start(self, active: wp.array, *, anew: bool = False) -> None:
+        """Compute work.diagonal and work.inverse at the first iterate of an attempt; block Jacobi at every one.
+
+        `anew`: the attempt restarts from another iterate, for which nothing is reused.
+        """
         raise NotImplementedError
-
-    def discard(self, active: wp.array) -> None:
-        """Discard the setup of the last `start`; the attempt restarts from another iterate."""
-
-    def update(self, active: wp.array) -> None:
-        """Update at every further iterate as far as needed."""
 
     def store_history(self, accepted: wp.array) -> None:
         """Store history after acceptance of the attempt."""
 
-    def prepare(self, active: wp.array) -> None:
-        """Compute the data of `apply` before a linear solve."""
+    def prepare(self, active: wp.array, *, anew: bool = False) -> None:
+        """Compute the data of `apply` before a linear solve; `anew`: without reuse."""
 
     def record_cost(self, active: wp.array) -> None:
         """After a linear solve: record its iteration count for the reuse rule."""
@@ -71,11 +68,9 @@ class BlockJacobi(Preconditioner):
         return {self.kernels.module}
 
     @launch_part("build")
-    def start(self, active: wp.array) -> None:
+    def start(self, active: wp.array, *, anew: bool = False) -> None:
         """Assemble and invert the blocks."""
         self.residual.diagonal_blocks(active)
-
-    update = start
 
     @launch_part("preconditioner")
     def apply(self, r: wp.array, z: wp.array, active: wp.array) -> None:

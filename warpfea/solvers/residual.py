@@ -18,6 +18,7 @@ from ..kernels.step.gather import RESIDUAL_ROWS, gather_kernels
 from ..kernels.step.midpoint import midpoint_kernels
 from ..kernels.terms.constraints import constraint_struct
 from ..terms.elements import Elements
+from ..terms.term import Term
 from .clusters import ModelClusters, make_cluster_memory, make_clusters
 from .matrix_assembly import MatrixAssembler, leading_view
 from .reuse import ReuseRule
@@ -70,6 +71,7 @@ class Residual:
         model, work, launch = ctx.model, ctx.work, ctx.launch
         self.ctx, self.model, self.work, self.launch, self.terms = ctx, model, work, launch, model.terms
         self.plan = plan
+        self.uses_matrix, self.uses_predicted_stress = plan.uses_matrix, plan.uses_predicted_stress
         self.elements: Elements = model.terms.find(Elements)
         self.reduce = RowReducer(launch, work, model.worlds)
         traits = ctx.traits
@@ -94,11 +96,12 @@ class Residual:
         self.assembler: MatrixAssembler | None = None
         if plan.assembles:
             self.assembler = MatrixAssembler(model, work, launch, self.elements.kernels(ctx))
-        if plan.uses_matrix:
+        if self.uses_matrix:
             assert self.assembler is not None
             self.operator_matrix = self.assembler.allocate_values("operator matrix")
         if plan.matrix_reuse_level:
             self.matrix_reuse_rule = ReuseRule(model, work, launch, "operator", plan.matrix_rebuild_cost)
+        self.rule_over_steps = self.matrix_reuse_rule if plan.matrix_reuse_level == 2 else None
 
     def _make_product_terms(self) -> Any:
         """Terms of a product H p beyond the elements' part."""
@@ -123,38 +126,37 @@ class Residual:
         out = {self.gather_kernels.module, self.vector_kernels.module} | (
             {self.midpoint_kernels.module} if self.ctx.midpoint else set()
         )
-        if self.plan.uses_matrix:
+        if self.uses_matrix:
             assert self.assembler is not None
             out |= {self.gather_kernels.matrix_module} | self.assembler.modules()
             out |= {self.matrix_reuse_rule.kernels.module} if self.plan.matrix_reuse_level else set()
         elif self.clusters:
             out |= {kernel.module for kernel in self.product_kernels}
-        elif self.plan.uses_predicted_stress:
+        elif self.uses_predicted_stress:
             out |= {kernel.module for kernel in self.elements.predicted_stress_kernels()}
         return out
 
     def register(self, state: State) -> None:
         """Register the reuse data of the operator matrix in the state."""
-        if self.plan.reuses_across_steps:
-            self.matrix_reuse_rule.register(state)
+        if self.rule_over_steps:
+            self.rule_over_steps.register(state)
 
     def invalidate(self, flags: wp.array) -> None:
         """Invalidate history of worlds whose state was set externally."""
-        if self.plan.reuses_across_steps:
-            self.matrix_reuse_rule.invalidate(flags)
+        if self.rule_over_steps:
+            self.rule_over_steps.invalidate(flags)
 
     def store_history(self, accepted: wp.array) -> None:
         """Store the reuse data of the operator matrix in the state."""
-        if self.plan.reuses_across_steps:
-            args = [self.matrix_reuse_rule.control, self.work.newton, accepted]
-            self.launch(self.matrix_reuse_rule.kernels.count_step, self.model.worlds, args)
-            self.matrix_reuse_rule.move_point(accepted)
-            self.matrix_reuse_rule.store_counts(accepted)
+        if rule := self.rule_over_steps:
+            self.launch(rule.kernels.count_step, self.model.worlds, [rule.control, self.work.newton, accepted])
+            rule.move_point(accepted)
+            rule.store_counts(accepted)
 
     @launch_part("assembly")
     def linearise(self, active: wp.array) -> None:
         """Assemble the operator matrix at the iterate if its reuse rule requires it."""
-        if not self.plan.uses_matrix:
+        if not self.uses_matrix:
             return
         if not self.plan.matrix_reuse_level:
             self.assemble_matrix(active)
@@ -164,24 +166,21 @@ class Residual:
         self.launch(rule.kernels.check_matrix_reuse, self.model.worlds, [*args, level])
         rule.decide_rebuild(active)
         self.launch(rule.kernels.loosen_forcing, self.model.worlds, args)
-        wp.capture_if(rule.control.any_build, self._assemble)
+        rule.rebuild_if_flagged(self._assemble)
 
-    @launch_part("assembly")
     def _assemble(self) -> None:
         rule = self.matrix_reuse_rule
-        rule.move_point()
-        self._assemble_at(rule.linearisation_point, rule.control, rule.control.build_now)
-        rule.mark_built()
+        self._assemble_at(rule.iterate, rule.control.mass_factor, rule.control.build_now)
 
     def assemble_matrix(self, active: wp.array) -> None:
         """Assemble the operator matrix at the iterate unconditionally."""
-        if self.plan.uses_matrix:
-            self._assemble_at(self.work.u_stage, self.work.step, active)
+        if self.uses_matrix:
+            self._assemble_at(self.work.stage, self.work.step.mass_factor, active)
 
-    def _assemble_at(self, u: wp.array, step: Any, flags: wp.array) -> None:
-        """Assemble the operator matrix at displacements u with the coefficients of a step."""
+    def _assemble_at(self, iterate: Any, mass_factor: wp.array, flags: wp.array) -> None:
+        """Assemble the operator matrix at an iterate, as of `Workspace.iterate`."""
         assert self.assembler is not None
-        self.assembler.assemble(u, (step.mass_factor, step.dq_dv), flags, self.operator_matrix, projected=False)
+        self.assembler.assemble(iterate, mass_factor, flags, self.operator_matrix, projected=False)
         if self.on_assembled:
             self.on_assembled(self.operator_matrix, flags)
 
@@ -211,8 +210,7 @@ class Residual:
     def evaluate_forces(self, active: wp.array, *, freeze: bool = False) -> None:
         """Evaluate forces, g and all sums at work.u and work.v."""
         m, w, launch = self.model, self.work, self.launch
-        for term in self.terms:
-            term.force(self.ctx, active)
+        self.terms.call(self.ctx, Term, "force", active)
         if self.terms.traits.nonpotential:
             args = [self.terms.nonpotential_topology, w.nonpotential_contribution, active, w.nonpotential]
             launch(self.gather_kernels.gather_force, self.dim, args)
@@ -245,8 +243,7 @@ class Residual:
     def diagonal_blocks(self, active: wp.array) -> None:
         """Diagonal blocks of H at the iterate: D for the norms, inverses for the preconditioner."""
         m, w, launch = self.model, self.work, self.launch
-        for term in self.terms:
-            term.diagonal(self.ctx, active)
+        self.terms.call(self.ctx, Term, "diagonal", active)
         args = [m.topology, w.block_contribution, w.pool_block, w.step.mass_factor, w.step.dq_dv, active]
         args += [w.diagonal, w.inverse]
         launch(self.gather_kernels.gather_diagonal_blocks, self.dim, args)
@@ -261,14 +258,13 @@ class Residual:
                 args = [w.data_of(block), data, w.stage, w.step.mass_factor, active, p]
                 args += [lanes, self.cluster_memory, w.contribution]
                 launch(kernel, (m.worlds, count * lanes), args, block_dim=block.cluster_size)
-        elif self.plan.uses_predicted_stress:
+        elif self.uses_predicted_stress:
             self.elements.predicted_stress_tangent(self.ctx, p, active)
-        elif not self.plan.uses_matrix:
+        elif not self.uses_matrix:
             self.elements.tangent(self.ctx, p, active)
-        for term in self.terms:
-            term.product(self.ctx, p, active)
+        self.terms.call(self.ctx, Term, "product", p, active)
         rest = [self.product_terms, p, active, self.constraint_data, w.multipliers]
-        if self.plan.uses_matrix:
+        if self.uses_matrix:
             assert self.assembler is not None
             pattern = self.assembler.pattern
             lanes = launch.lanes(pattern.mean_row_length)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import warp as wp
@@ -22,7 +23,8 @@ class ReuseRule:
 
     Attributes:
         control: counts of the rule on the device; `build_now` flags the worlds that build the object before a solve.
-        linearisation_point: displacements of the linearisation point, [world, slot], m.
+        linearisation_point: displacements of the linearisation point, [world, slot], m; `iterate`: with them, the
+            arrays from which element kernels evaluate it.
     """
 
     def __init__(self, model: Model, work: Workspace, launch: Launcher, name: str, limit: float) -> None:
@@ -42,6 +44,7 @@ class ReuseRule:
         # no state owns it before `register`
         self.control.stored_counts = wp.zeros((0, 0), dtype=wp.float64, device=model.device)
         self.accepted_point = self.linearisation_point
+        self.iterate = work.iterate(self.linearisation_point, work.v_stage, self.control.dq_dv)
 
     def register(self, state: State) -> None:
         """Register the linearisation point and counts in the state, so that a resumed run takes the same decisions."""
@@ -59,6 +62,15 @@ class ReuseRule:
         args = [self.control, w.newton, w.step.mass_factor, w.step.dq_dv, active]
         self.launch(self.kernels.decide_rebuild, self.model.worlds, args)
 
+    def rebuild_if_flagged(self, build: Callable[[], None]) -> None:
+        """Move the linearisation point and call `build` if any world is flagged; mark the object as built."""
+        wp.capture_if(self.control.any_build, self._rebuild, build=build)
+
+    def _rebuild(self, build: Callable[[], None]) -> None:
+        self.move_point()
+        build()
+        self.launch(self.kernels.mark_built, self.model.worlds, [self.control])
+
     def move_point(self, accepted: wp.array | None = None) -> None:
         """Set the linearisation point before a solve: the iterate for a rebuild, the state's copy after a restore.
 
@@ -67,10 +79,6 @@ class ReuseRule:
         args = [self.control, self.no_flags if accepted is None else accepted, self.work.u_stage]
         args += [self.accepted_point, self.linearisation_point]
         self.launch(self.kernels.transfer_points, self.dim, args)
-
-    def mark_built(self) -> None:
-        """Mark the object of the flagged worlds as built."""
-        self.launch(self.kernels.mark_built, self.model.worlds, [self.control])
 
     def store_counts(self, accepted: wp.array) -> None:
         """Store the rule's counts in the state of accepted worlds, after `move_point` has stored the point."""

@@ -21,7 +21,7 @@ With constraints, tiles and coarse matrices contain the penalties. As a constrai
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -64,6 +64,7 @@ class TwoLevel(Preconditioner):
 
     Attributes:
         factors_operator: triangular factors of every matrix of the operator, in place of inverses.
+        with_blocks: terms that add to the matrix.
         block_values: matrix of the first level [world of a chunk, entry].
         cached_inputs: by term, the inputs of its blocks at the linearisation point.
     """
@@ -81,7 +82,8 @@ class TwoLevel(Preconditioner):
         self.dim = (model.worlds, model.slots)
         self.levels = self._make_levels()
         self.ctx, self.terms = residual.ctx, model.terms
-        for term in self.terms.having(Preconditioned):
+        self.with_blocks = self.terms.having(Preconditioned)
+        for term in self.with_blocks:
             term.allocate_blocks(self.ctx, self.assembler, projected=True)
         traits = model.terms.traits
         self.terms_add_blocks = traits.pooled or traits.constraint_rows  # terms add to the matrix
@@ -109,7 +111,8 @@ class TwoLevel(Preconditioner):
             work.pcg.preconditioner_is_exact = self.band.exact
         self.body_modes, self.mode_coupling_modules = self._make_body_modes()
         self.one_thread_per_row = 0 if model.device.is_cuda else 1
-        deflates = not first.solved_directly and self.ctx.options.deflate_constraints
+        self.solved_directly = first.is_dense or band is not None
+        deflates = not self.solved_directly and self.ctx.options.deflate_constraints
         self.corrections = self.terms.having(Constrained) if deflates else []
         self.cached_inputs: dict[str, CachedInputs] = {}
         # iteration counts are not comparable; separate key
@@ -142,7 +145,7 @@ class TwoLevel(Preconditioner):
     def register(self, state: State) -> None:
         """Register the linearisation point and the rule's counts in the state, for resumed runs."""
         self.reuse.register(state)
-        for term in self.terms.having(Preconditioned):
+        for term in self.with_blocks:
             kept = CachedInputs([], [], [])
             for key, array in term.cached_inputs(self.ctx):
                 name = f"{term.name}_{key}".replace(" ", "_")
@@ -156,7 +159,7 @@ class TwoLevel(Preconditioner):
         reuse = self.reuse
         reuse.move_point(accepted)
         flags = reuse.no_flags if accepted is None else accepted
-        for term in self.terms.having(Preconditioned):
+        for term in self.with_blocks:
             kept = self.cached_inputs.get(term.name)
             if kept is not None and not term.copy_cached(self.ctx, kept, reuse.control, flags):
                 for arrays in zip(kept.live, kept.state, kept.cached):
@@ -171,12 +174,6 @@ class TwoLevel(Preconditioner):
         dense = [] if self.band else [arrays.dense_inverse for arrays in self.level_arrays]
         return out.union(*(inverse.modules() for inverse in dense if inverse))
 
-    def discard(self, active: wp.array) -> None:
-        """Request a rebuild at the new start iterate; with factors that follow the operator's matrix, D only."""
-        if self.factors_operator and self.model.device.is_cuda:
-            return
-        self.launch(self.reuse.kernels.request_rebuild, self.model.worlds, [active, self.reuse.control])
-
     @launch_part("build")
     def invalidate(self, flags: wp.array) -> None:
         """Invalidate history of worlds whose state was set externally."""
@@ -188,16 +185,21 @@ class TwoLevel(Preconditioner):
         self.reuse.store_counts(accepted)
 
     @launch_part("build")
-    def start(self, active: wp.array) -> None:
+    def start(self, active: wp.array, *, anew: bool = False) -> None:
         """Rebuild where due, with D and the penalties that follow from D."""
-        self.reuse.decide_rebuild(active)
-        wp.capture_if(self.reuse.control.any_build, self._build, penalty=True)
+        self._rebuild(active, anew, partial(self._build, penalty=True))
 
     @launch_part("build")
-    def prepare(self, active: wp.array) -> None:
+    def prepare(self, active: wp.array, *, anew: bool = False) -> None:
         """Rebuild where due, with the constraint penalties of the step."""
+        self._rebuild(active, anew, self._build)
+
+    def _rebuild(self, active: wp.array, anew: bool, build: Callable[[], None]) -> None:
+        # factors that follow the operator's matrix reuse D only
+        if anew and not (self.factors_operator and self.model.device.is_cuda):
+            self.launch(self.reuse.kernels.request_rebuild, self.model.worlds, [active, self.reuse.control])
         self.reuse.decide_rebuild(active)
-        wp.capture_if(self.reuse.control.any_build, self._build)
+        self.reuse.rebuild_if_flagged(build)
 
     @launch_part("build")
     def record_cost(self, active: wp.array) -> None:
@@ -210,7 +212,7 @@ class TwoLevel(Preconditioner):
         """z = B r; partial sums r.z and r.D^-1 r in rows."""
         m, w, launch, k = self.model, self.work, self.launch, self.kernels
         level = self.levels[0]
-        if level.solved_directly:
+        if self.solved_directly:
             if self.band:
                 self.band.solve(r, z, active)
             else:
@@ -302,13 +304,9 @@ class TwoLevel(Preconditioner):
 
     def _build(self, *, penalty: bool = False) -> None:
         m, w, launch, reuse = self.model, self.work, self.launch, self.reuse.control
-        factors = (reuse.mass_factor, reuse.dq_dv)
         # rows are scaled once the penalties are known
-        self.reuse.move_point()
         for worlds, flags, value in self._chunks(reuse.build_now):
-            self.assembler.assemble(
-                self.reuse.linearisation_point, factors, flags, value, projected=True, worlds=worlds
-            )
+            self.assembler.assemble(self.reuse.iterate, reuse.mass_factor, flags, value, projected=True, worlds=worlds)
             if self.terms_add_blocks and m.terms.traits.pooled:
                 self._copy_cached()
                 self._add_term_blocks(value, flags, penalties=False)
@@ -321,7 +319,6 @@ class TwoLevel(Preconditioner):
                 self._copy_cached()
                 self._add_term_blocks(value, flags, penalties=True)
             self._factorise_or_fill(value, flags)
-        self.reuse.mark_built()
         if self.body_modes:
             self._add_mode_coupling(self.body_modes, reuse.build_now)
         if not (self.factors_operator or self.band):
@@ -374,7 +371,7 @@ class TwoLevel(Preconditioner):
     def _add_term_blocks(self, value: wp.array, flags: wp.array, *, penalties: bool) -> None:
         """Add the terms' blocks to the matrix of some worlds: those that D is taken from, or the penalties."""
         reuse = self.reuse.control
-        for term in self.terms.having(Preconditioned):
+        for term in self.with_blocks:
             if isinstance(term, Constrained) == penalties:
                 kept = self.cached_inputs[term.name].cached if term.name in self.cached_inputs else []
                 term.blocks(self.ctx, self.assembler, kept, reuse.dq_dv, flags, value, projected=True)
@@ -402,7 +399,7 @@ class TwoLevel(Preconditioner):
         rows = slice(worlds.start, worlds.stop)
         given, copy = (leading_view(a, dim, self.model.types.vec3) for a in (value[rows], self.block_values))
         self.launch(self.residual.vector_kernels.copy_active, dim, [given, flags[rows], copy])
-        for term in self.terms.having(Preconditioned):
+        for term in self.with_blocks:
             live = [array for _, array in term.cached_inputs(self.ctx)]
             term.blocks(self.ctx, self.assembler, live, w.step.dq_dv, flags, out, projected=False)
 

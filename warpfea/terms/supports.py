@@ -44,13 +44,14 @@ class DrivenSlots:
 
 
 class Supports:
-    """Driven slots of a model, by displacement laws and by rotations; None if unused."""
+    """Driven slots of a model, by displacement laws and by rotations, None if unused; `in_use`: one of them is."""
 
     def __init__(self, model: Model) -> None:
         self.model = model
         self.kernels = load_kernels(model.dtype)
         self.displacement_drives: DrivenSlots | None = None
         self.rotation_drives: DrivenSlots | None = None
+        self.in_use = False
 
     def build(self, laws: TimeLawTable) -> None:
         """Build one row per driven slot with a law for each component; contradictory laws are rejected.
@@ -78,6 +79,7 @@ class Supports:
                     for c in np.flatnonzero(support.components):
                         row[c] = own
         m = self.model
+        self.in_use = bool(displacement_rows or rotation_rows)
         if displacement_rows:
             rows = np.array([[slot, *numbers] for slot, numbers in displacement_rows.items()])
             self.displacement_drives = DrivenSlots(

@@ -7,14 +7,14 @@ passed as a `StepContext`. What few terms need is in the protocols of `protocols
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import warp as wp
 
+from ..base.launch import part
 from ..base.renamed import check_members
 from ..kernels.common.traits import Traits
 from ..kernels.step.energy_ledger import EXPLICIT_VISCOUS, LOSS, NUMERICAL, STORED, WORK
@@ -38,8 +38,6 @@ __all__ = [
     "Term",
     "part",
 ]
-
-F = TypeVar("F", bound=Callable[..., Any])
 
 
 @dataclass(eq=False)
@@ -115,20 +113,6 @@ class FieldSpec:
     node_reduction: np.ufunc | None = None
     of_slots: bool = False
     scalar: Callable[[np.ndarray], Any] | None = None
-
-
-def part(name: str = "") -> Callable[[F], F]:
-    """Decorator: attribute a method's launches to profile part `name`, by default that of the term's name."""
-
-    def decorate(method: F) -> F:
-        @functools.wraps(method)
-        def wrapper(self: Any, ctx: StepContext, *args: Any, **options: Any) -> Any:
-            with ctx.launch.part(name or self.name):
-                return method(self, ctx, *args, **options)
-
-        return wrapper  # type: ignore[return-value]
-
-    return decorate
 
 
 class Term:

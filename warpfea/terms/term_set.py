@@ -180,7 +180,8 @@ class TermSet:
             self.nonpotential_topology = self._gather_topology(
                 [c for t in self.all if not t.potential for c in t.connectivity]
             )
-        named = [column.name for term in self.all for column in term.columns if column.name]
+        self.ledger_terms = [term for term in self.all if term.columns]
+        named = [column.name for term in self.ledger_terms for column in term.columns if column.name]
         self.ledger = (*LEDGER_COLUMNS, *dict.fromkeys(name for name in named if name not in LEDGER_COLUMNS))
 
     @staticmethod
@@ -339,11 +340,6 @@ class TermSet:
                     raise ModelError(f"term {term.name!r}: the state's array {name!r} is that of {taken}; rename it")
                 owner[name] = term.name
             term.allocate(work, ctx)
-
-    @property
-    def ledger_terms(self) -> list[Term]:
-        """Terms with ledger rows."""
-        return [term for term in self.all if term.columns]
 
     def increment_table(self, work: Any) -> Any:
         """Device table of the ledger columns of the terms; `energy_increments` fills their sums."""

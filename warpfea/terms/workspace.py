@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from operator import attrgetter, methodcaller
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -38,7 +39,11 @@ class Workspace:
         self, model: Model, *, max_newton: int, ledger: bool, midpoint: bool = False, dissipation: float = 0.0
     ) -> None:
         self.device = model.device
-        self.dissipation, self._dtype = dissipation, model.dtype
+        self._dtype = model.dtype
+        # constants of an element block in the form that the scheme's kernels take
+        self.data_of: Callable[[Block], Any] = attrgetter("data")
+        if dissipation:
+            self.data_of = methodcaller("dissipative_data", model.dtype, dissipation)
         self.bytes: dict[str, int] = {}
         # arrays for a chunk of the worlds: chunk size as a function of the number of worlds
         self.chunks: dict[str, Callable[[int], int]] = {}
@@ -149,10 +154,6 @@ class Workspace:
         for name, array in (arrays | {"use_prediction": self.newton.solve.predicted_stress}).items():
             setattr(out, name, array if worlds == slice(None) else array[worlds])
         return out
-
-    def data_of(self, block: Block) -> Any:
-        """Constants of an element block in the form that the scheme's kernels take."""
-        return block.dissipative_data(self._dtype, self.dissipation) if self.dissipation else block.data
 
     def allocate_diagonal_blocks(self) -> None:
         """Allocate the diagonal blocks of element matrices."""
