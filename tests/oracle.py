@@ -1,9 +1,10 @@
 """Comparison of two commits, bit by bit: `python tests/oracle.py --baseline COMMIT [--rows LABEL ...] [--out FILE]`.
 
 Each row is run with the baseline, in a worktree of its own, and with the tree that this file lies in, on the same
-machine: digests of u and v, Newton and PCG iterations, launches recorded for a step, bytes, ledgers. Rows: every scene,
-and a table of precisions x integrators x contact x worlds x joints x statics in which every pair of values occurs.
-Exit code 0 where all rows agree, 1 where one does not. `RENAMES` maps what has another name since.
+machine: digests of u and v, Newton and PCG iterations, launches recorded for a step, bytes, ledgers, and the difference
+of u over its largest value. Rows: every scene, and a table of precisions x integrators x contact x worlds x joints x
+statics in which every pair of values occurs. Exit code 0 where all rows agree, 1 where one does not.
+`RENAMES` maps what has another name since.
 """
 
 from __future__ import annotations
@@ -17,10 +18,10 @@ import pathlib
 import subprocess
 import sys
 import tempfile
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
-STEPS = 6
 RENAMES: dict[str, str] = {}
 """Old name -> new name: of ledger columns, and of the dotted paths that `COUNTS` reads."""
 COUNTS = {"launches": "stepper.launch.launches"}
@@ -80,8 +81,8 @@ def build(row: dict[str, Any]) -> Any:
     return b
 
 
-def measure(label: str, device: str, renames: dict[str, str]) -> dict[str, Any]:
-    """One row: a refusal is a result as well."""
+def measure(label: str, device: str, steps: int, save: str, renames: dict[str, str]) -> dict[str, Any]:
+    """One row, with u in the file `save`: a refusal is a result as well."""
     import numpy as np
 
     import warpfea as wf
@@ -118,12 +119,13 @@ def measure(label: str, device: str, renames: dict[str, str]) -> dict[str, Any]:
                 sim = wf.Simulation(model, dt=scene.dt, integrator=scene.integrator, solver=how)
             out |= {name: count(sim, path) for name, path in COUNTS.items()}
             out["bytes"] = int(sum(sim.bytes().values()))
-            sim.step(STEPS)
+            sim.step(steps)
             state = sim.state
             out |= {name: sim.totals[name].tolist() for name in ("newton", "pcg")}
             energies = sim.energies()
             out["ledger"] = {renames.get(k, k): [float(x).hex() for x in v] for k, v in sorted(energies.items())}
         out |= {"u": digest(state.displacement), "v": digest(state.velocity)}
+        np.save(save, state.displacement.numpy().astype(float))
     except wf.Error as error:
         out["refused"] = type(error).__name__
     return out
@@ -132,14 +134,29 @@ def measure(label: str, device: str, renames: dict[str, str]) -> dict[str, Any]:
 # the parent
 
 
-def run(tree: pathlib.Path, label: str, device: str) -> dict[str, Any]:
+def run(tree: pathlib.Path, label: str, options: argparse.Namespace, save: str) -> dict[str, Any]:
     """The row in a process of its own with the package of a tree."""
     env = os.environ | {"PYTHONPATH": str(tree), "PYTHONSAFEPATH": "1"}
-    command = [sys.executable, __file__, "--measure", label, "--device", device]
+    command = [sys.executable, __file__, "--measure", label, "--device", options.device, "--save", save]
+    command += ["--steps", str(options.steps)]
     done = subprocess.run(command, cwd=tree, env=env, capture_output=True, text=True)
     if done.returncode:
         raise SystemExit(f"{label} in {tree}: {done.stderr[-2000:]}")
     return json.loads(done.stdout.splitlines()[-1])
+
+
+def compare(trees: list[pathlib.Path], label: str, options: argparse.Namespace) -> dict[str, Any]:
+    """The row in both trees: their results, and the largest difference of u over its largest value."""
+    import numpy as np
+
+    with tempfile.TemporaryDirectory() as folder:
+        files = [str(pathlib.Path(folder) / f"{k}.npy") for k in range(2)]
+        old, new = (run(tree, label, options, file) for tree, file in zip(trees, files))
+        out: dict[str, Any] = {"baseline": old, "present": new, "equal": not differences(old, new)}
+        if all(map(os.path.exists, files)):
+            u = [np.load(file) for file in files]
+            out["u difference"] = float(np.abs(u[1] - u[0]).max() / (np.abs(u[0]).max() or 1.0))
+        return out
 
 
 def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
@@ -153,12 +170,14 @@ def main() -> int:
     parser.add_argument("--baseline", help="the commit to compare with")
     parser.add_argument("--rows", nargs="+", help="labels; by default all")
     parser.add_argument("--device", default="cpu")
+    parser.add_argument("--steps", type=int, default=6)
     parser.add_argument("--out", type=pathlib.Path, help="JSON of all rows, of both commits")
     parser.add_argument("--list", action="store_true", help="print the labels")
     parser.add_argument("--measure", help=argparse.SUPPRESS)
+    parser.add_argument("--save", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.measure:
-        print(json.dumps(measure(options.measure, options.device, RENAMES)))
+        print(json.dumps(measure(options.measure, options.device, options.steps, options.save, RENAMES)))
         return 0
     scenes = [p.stem for p in sorted((ROOT / "scenes").glob("[a-z]*.py"))]
     rows = options.rows or [*scenes, *table()]
@@ -171,17 +190,17 @@ def main() -> int:
         git = ["git", "-C", str(ROOT), "worktree"]
         subprocess.run([*git, "add", "--detach", "--quiet", str(tree), options.baseline], check=True)
         try:
-            for label in rows:
-                old, new = run(tree, label, options.device), run(ROOT, label, options.device)
-                found = differences(old, new)
-                failed += bool(found)
-                results[label] = {"baseline": old, "present": new, "equal": not found}
-                print(f"{label:36} {'equal' if not found else '; '.join(found)}", flush=True)
+            with ThreadPoolExecutor(2) as pool:
+                for label, row in zip(rows, pool.map(lambda label: compare([tree, ROOT], label, options), rows)):
+                    found = differences(row["baseline"], row["present"])
+                    failed += bool(found)
+                    results[label] = row
+                    print(f"{label:36} {'equal' if not found else '; '.join(found)}", flush=True)
         finally:
             subprocess.run([*git, "remove", "--force", str(tree)], check=True)
     if options.out:
         head = subprocess.run(["git", "-C", str(ROOT), "rev-parse", "HEAD"], capture_output=True, text=True).stdout
-        about = {"baseline": options.baseline, "commit": head.strip(), "device": options.device, "steps": STEPS}
+        about = {"baseline": options.baseline, "commit": head.strip(), "device": options.device, "steps": options.steps}
         options.out.write_text(json.dumps(about | {"rows": results}, indent=1) + "\n")
     print(f"{len(rows) - failed} of {len(rows)} rows equal")
     return int(failed > 0)
