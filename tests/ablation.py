@@ -291,7 +291,8 @@ def _compare(before: Sequence[Row], after: Sequence[Row]) -> Row:
 
 def study(options: argparse.Namespace, done: Sequence[Row]) -> Iterator[Row]:
     """A row per variant that is not yet `done`."""
-    areas, finished = variants(), {row["variant"] for row in done if row.get("of") == " ".join(options.rows)}
+    of = "tests" if options.rows[0].startswith("tests/") else " ".join(options.rows)
+    areas, finished = variants(), {row["variant"] for row in done if row.get("of") == of}
     wanted = options.only or [*areas]
     areas |= {name: "group" for name in wanted if "+" in name}
     chosen = [name for name, area in areas.items() if name and {name, area} & {*wanted} and name not in finished]
@@ -315,7 +316,7 @@ def study(options: argparse.Namespace, done: Sequence[Row]) -> Iterator[Row]:
             label: Row = {
                 "variant": variant,
                 "area": areas[variant],
-                "of": " ".join(options.rows),
+                "of": of,
                 "suite": options.suite,
             }
             if variant in CONSTANTS:
