@@ -81,8 +81,8 @@ def build(row: dict[str, Any]) -> Any:
     return b
 
 
-def measure(label: str, device: str, steps: int, save: str, renames: dict[str, str]) -> dict[str, Any]:
-    """One row, with u in the file `save`: a refusal is a result as well."""
+def measure(label: str, options: argparse.Namespace, renames: dict[str, str]) -> dict[str, Any]:
+    """One row, with u in the file `options.save`: a refusal is a result as well."""
     import numpy as np
 
     import warpfea as wf
@@ -100,7 +100,7 @@ def measure(label: str, device: str, steps: int, save: str, renames: dict[str, s
     def digest(array: Any) -> str:
         return hashlib.sha256(np.ascontiguousarray(array.numpy()).tobytes()).hexdigest()[:16]
 
-    row = table().get(label)
+    row, device = table().get(label), options.device
     out: dict[str, Any] = {}
     try:
         if row and row["static"]:
@@ -115,17 +115,17 @@ def measure(label: str, device: str, steps: int, save: str, renames: dict[str, s
             else:
                 scene = find(label)
                 model = scene().finalize(device=device)
-                how = wf.NewtonPCG(tol=scene.tol)
+                how = wf.NewtonPCG(tol=options.tol or scene.tol)
                 sim = wf.Simulation(model, dt=scene.dt, integrator=scene.integrator, solver=how)
             out |= {name: count(sim, path) for name, path in COUNTS.items()}
             out["bytes"] = int(sum(sim.bytes().values()))
-            sim.step(steps)
+            sim.step(options.steps)
             state = sim.state
             out |= {name: sim.totals[name].tolist() for name in ("newton", "pcg")}
             energies = sim.energies()
             out["ledger"] = {renames.get(k, k): [float(x).hex() for x in v] for k, v in sorted(energies.items())}
         out |= {"u": digest(state.displacement), "v": digest(state.velocity)}
-        np.save(save, state.displacement.numpy().astype(float))
+        np.save(options.save, state.displacement.numpy().astype(float))
     except wf.Error as error:
         out["refused"] = type(error).__name__
     return out
@@ -138,7 +138,7 @@ def run(tree: pathlib.Path, label: str, options: argparse.Namespace, save: str) 
     """The row in a process of its own with the package of a tree."""
     env = os.environ | {"PYTHONPATH": str(tree), "PYTHONSAFEPATH": "1"}
     command = [sys.executable, __file__, "--measure", label, "--device", options.device, "--save", save]
-    command += ["--steps", str(options.steps)]
+    command += ["--steps", str(options.steps), *(["--tol", str(options.tol)] if options.tol else [])]
     done = subprocess.run(command, cwd=tree, env=env, capture_output=True, text=True)
     if done.returncode:
         raise SystemExit(f"{label} in {tree}: {done.stderr[-2000:]}")
@@ -171,13 +171,14 @@ def main() -> int:
     parser.add_argument("--rows", nargs="+", help="labels; by default all")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--steps", type=int, default=6)
+    parser.add_argument("--tol", type=float, help="of Newton's method in scenes; by default the scene's")
     parser.add_argument("--out", type=pathlib.Path, help="JSON of all rows, of both commits")
     parser.add_argument("--list", action="store_true", help="print the labels")
     parser.add_argument("--measure", help=argparse.SUPPRESS)
     parser.add_argument("--save", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.measure:
-        print(json.dumps(measure(options.measure, options.device, options.steps, options.save, RENAMES)))
+        print(json.dumps(measure(options.measure, options, RENAMES)))
         return 0
     scenes = [p.stem for p in sorted((ROOT / "scenes").glob("[a-z]*.py"))]
     rows = options.rows or [*scenes, *table()]
@@ -199,8 +200,12 @@ def main() -> int:
         finally:
             subprocess.run([*git, "remove", "--force", str(tree)], check=True)
     if options.out:
-        head = subprocess.run(["git", "-C", str(ROOT), "rev-parse", "HEAD"], capture_output=True, text=True).stdout
-        about = {"baseline": options.baseline, "commit": head.strip(), "device": options.device, "steps": options.steps}
+        from warpfea.base.provenance import provenance_of
+
+        about = provenance_of(["python", *sys.argv], options.device)
+        about |= {"baseline": options.baseline, "settings": {"steps": options.steps, "tol": options.tol}}
+        for row in results.values():
+            row["baseline"].pop("ledger", None), row["present"].pop("ledger", None)
         options.out.write_text(json.dumps(about | {"rows": results}, indent=1) + "\n")
     print(f"{len(rows) - failed} of {len(rows)} rows equal")
     return int(failed > 0)
