@@ -202,7 +202,7 @@ def main() -> int:
     if options.out:
         from warpfea.base.provenance import provenance_of
 
-        about = provenance_of(["python", *sys.argv], options.device)
+        about = provenance_of([], options.device) | {"command": " ".join(["python", *sys.argv])}
         about |= {"baseline": options.baseline, "settings": {"steps": options.steps, "tol": options.tol}}
         for row in results.values():
             row["baseline"].pop("ledger", None), row["present"].pop("ledger", None)
