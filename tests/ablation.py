@@ -291,7 +291,7 @@ def _compare(before: Sequence[Row], after: Sequence[Row]) -> Row:
 
 def study(options: argparse.Namespace, done: Sequence[Row]) -> Iterator[Row]:
     """A row per variant that is not yet `done`."""
-    of = "tests" if options.rows[0].startswith("tests/") else " ".join(options.rows)
+    of = " ".join(options.rows)
     areas, finished = variants(), {row["variant"] for row in done if row.get("of") == of}
     wanted = options.only or [*areas]
     areas |= {name: "group" for name in wanted if "+" in name}

@@ -22,10 +22,18 @@ def test_displacements_with_contact(label):
     assert row["u difference"] <= 1e-9
     assert ROWS[label]["u difference"] <= 1e-7
     for count in ("launches", "bytes"):
-        assert (row["present"].get(count) or 0) <= (row["baseline"].get(count) or 0)
+        assert count not in row["baseline"] or row["present"][count] <= row["baseline"][count]
+
+
+LARGER = {("bdf2-pairs", "newton"): 0.1, ("bdf2-pairs", "pcg"): 0.16, ("finger_beam_shell", "newton"): 0.04,
+          ("finger_beam_shell", "pcg"): 0.07}  # fmt: skip
+"""Changes of rows that are not within 2 %: by rounding, a friction limit more or less in one of 60 iterations."""
 
 
 @pytest.mark.parametrize("count", ["newton", "pcg"])
 def test_iterations_with_contact(count):
-    before, now = (sum(sum(ROWS[k][tree].get(count, [])) for k in TOUCHING) for tree in ("baseline", "present"))
+    rows = {k: [sum(ROWS[k][tree].get(count, [])) for tree in ("baseline", "present")] for k in TOUCHING}
+    before, now = map(sum, zip(*rows.values()))
     assert abs(now - before) <= 0.02 * before
+    for label, (old, new) in rows.items():
+        assert abs(new - old) <= LARGER.get((label, count), 0.02) * old

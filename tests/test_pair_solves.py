@@ -47,7 +47,8 @@ def watch(sim, after):
 
     def anew(active):
         loop.residual.assemble_matrix(active)
-        loop.preconditioner.prepare(active, anew=True)
+        loop.preconditioner.reuse.request_rebuild(active)
+        loop.preconditioner.prepare(active)
         solve(active)
         after(loop)
 

@@ -117,7 +117,7 @@ def start(
     """A scene, stepped to where it counts."""
     model = build(scene, cells, stiffness).finalize(device=device, dtype=dtype)
     term = next((term for term in model.terms if isinstance(term, ColliderContact)), None)
-    sim = Simulation(model, dt=DT, solver=solver(tol), ledger=False)
+    sim = Simulation(model, dt=DT, solver=solver(tol), ledger=False, capture=True)
     out = _Runner(sim, term, [])
     if scene in MOVING:
         sim.dt = LONG_DT
@@ -135,7 +135,8 @@ def count_solves(sim: Simulation, steps: int) -> list[int]:
 
     def anew(active: wp.array) -> None:
         loop.residual.assemble_matrix(active)
-        preconditioner.prepare(active, anew=True)
+        preconditioner.reuse.request_rebuild(active)
+        preconditioner.prepare(active)
         solve(active)
         counts.append(int(work.pcg.iterations.numpy()[0]))
 

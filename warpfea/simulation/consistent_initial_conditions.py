@@ -182,8 +182,7 @@ class ConsistentInitialConditions:
         for name, value in step.items():
             set_rows(getattr(w.step, name), flags, value)
         self._law_values(flags, time)
-        if m.terms.dead_loads.gravity_law is not None:
-            m.terms.dead_loads.take_gravity(ctx.launch, w.time_law_values, active)
+        m.terms.dead_loads.take_gravity(ctx.launch, w.time_law_values, active)
         u, v = ctx.state.displacement.numpy(), ctx.state.velocity.numpy()
         for array, values in ((w.u, u), (w.v, v), (w.v_tilde, v), (w.q_tilde, u - dt * v)):
             set_rows(array, flags, values[flags])

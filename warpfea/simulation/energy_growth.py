@@ -50,19 +50,19 @@ class EnergyGrowth:
         ledger: True with an energy ledger, which monitoring requires.
 
     Attributes:
-        unwarned_growth: energy gain above which a step calls `warn`, which it does once.
+        warn_threshold: energy gain above which a step calls `warn`, which it does once.
     """
 
     def __init__(self, choice: str, *, ledger: bool, static: bool) -> None:
         self.choice = choice
         self.monitored = ledger and not static and choice != "ignore"
-        self.unwarned_growth = WARN_LIMIT
+        self.warn_threshold = WARN_LIMIT
         self._ledger = ledger
 
     @property
     def warned(self) -> bool:
         """True once it has warned."""
-        return self.unwarned_growth > WARN_LIMIT
+        return self.warn_threshold > WARN_LIMIT
 
     def __str__(self) -> str:
         if not self.monitored:
@@ -98,7 +98,7 @@ class EnergyGrowth:
 
     def warn(self, sim: Any, shares: np.ndarray, stacklevel: int = 4) -> None:
         """Warn, once, of the largest energy gain of the worlds (worlds,)."""
-        self.unwarned_growth = np.inf
+        self.warn_threshold = np.inf
         world, worst = int(np.argmax(shares)), float(np.max(shares))
         since = float(sim.state.energy_growth.numpy()[world, GROWTH_COLUMNS.index("since")])
         refused = f"; steps are refused above {REFUSE_LIMIT:.0%}" if self.choice == "refuse" else ""

@@ -266,7 +266,7 @@ class RunStatistics:
             self.totals[name] += sums[:, RUN_STATISTICS.index(name)].astype(int)
         self._add_extremes({name: sums[:, RUN_STATISTICS.index(name)] for name in (*LARGEST, "min_J")})
         growth = sums[:, RUN_STATISTICS.index("energy_growth")]
-        if np.max(growth) > self.sim.energy_growth.unwarned_growth:
+        if np.max(growth) > self.sim.energy_growth.warn_threshold:
             self.sim.energy_growth.warn(self.sim, growth, stacklevel=5)
         self.stepped_worlds = stepped
         if self._records_columns:
@@ -315,7 +315,7 @@ class RunStatistics:
             if not self.sim.record:
                 self.history.clear()
             self.history.append(self._recorded_row(rows))
-        if np.max(last.energy_growth) > self.sim.energy_growth.unwarned_growth:
+        if np.max(last.energy_growth) > self.sim.energy_growth.warn_threshold:
             self.sim.energy_growth.warn(self.sim, last.energy_growth)
         if fresh.any():
             fatal = self.sim.on_failure == "raise" or (self.sim.on_failure is None and not good.any())

@@ -57,7 +57,7 @@ class DirectSolver(Preconditioner):
         return {self.kernels.module} | self.assembler.modules()
 
     @launch_part("build")
-    def start(self, active: wp.array, *, anew: bool = False) -> None:
+    def start(self, active: wp.array, *, rebuild: bool = False) -> None:
         """Compute D and the inverses of its blocks."""
         self.residual.diagonal_blocks(active)
 
@@ -69,7 +69,7 @@ class DirectSolver(Preconditioner):
         return self.matrix_storage
 
     @launch_part("build")
-    def prepare(self, active: wp.array, *, anew: bool = False) -> None:
+    def prepare(self, active: wp.array) -> None:
         """Factorise H in the active worlds."""
         residual = self.residual
         own = residual.plan.factors_operator

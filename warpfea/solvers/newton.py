@@ -270,11 +270,11 @@ class NewtonLoop:
             self._check_constraints()
             wp.capture_while(self.any_iterating, self._update_multipliers)
 
-    def _evaluate_first_iterate(self, flags: wp.array, *, anew: bool = False) -> None:
+    def _evaluate_first_iterate(self, flags: wp.array, *, rebuild: bool = False) -> None:
         """Evaluate the first iterate; its convergence check needs D, so the blocks come first."""
         self.residual.update_positions(flags)
         self.terms.call(self.ctx, Term, "prepare", flags)
-        self.preconditioner.start(flags, anew=anew)
+        self.preconditioner.start(flags, rebuild=rebuild)
         self.terms.call(self.ctx, Constrained, "scale", flags)
         self.residual.evaluate(flags, freeze=True)
 
@@ -302,7 +302,7 @@ class NewtonLoop:
             launch(k.compare_first_iterates, self.model.worlds, [w.newton, 0, better])
             launch(self.vector_kernels.copy_active, self.dim, [w.v, better, w.best_velocity])
         launch(self.vector_kernels.copy_active, self.dim, [w.best_velocity, choose, w.v])
-        self._evaluate_first_iterate(choose, anew=True)
+        self._evaluate_first_iterate(choose, rebuild=True)
         launch(k.begin_iteration, self.model.worlds, [w.newton, 2])
         self._check_inversion()
 
@@ -344,7 +344,7 @@ class NewtonLoop:
         self._run_if_rare(self._run_rare_branch)
         if self.terms.traits.unilateral:
             self._update_frozen()
-        if isinstance(self.preconditioner, BlockJacobi):
+        if self.preconditioner.follows_iterates:
             self.preconditioner.start(active)
         self.terms.call(self.ctx, Constrained, "prepare_solve", active)
         self._reduce_flags(active, self.any_iterating)

@@ -21,7 +21,13 @@ __all__ = ["BlockJacobi", "Preconditioner"]
 
 
 class Preconditioner:
-    """A preconditioner B ~ H^-1; by default without a history and without data beside D and its inverses."""
+    """A preconditioner B ~ H^-1; by default without a history and without data beside D and its inverses.
+
+    Attributes:
+        follows_iterates: `start` is called at every iterate, not at the first of an attempt alone.
+    """
+
+    follows_iterates = False
 
     def register(self, state: State) -> None:
         """Register the data kept between steps in the state."""
@@ -33,18 +39,15 @@ class Preconditioner:
         """Modules launched."""
         raise NotImplementedError
 
-    def start(self, active: wp.array, *, anew: bool = False) -> None:
-        """Compute work.diagonal and work.inverse at the first iterate of an attempt; block Jacobi at every one.
-
-        `anew`: the attempt restarts from another iterate, for which nothing is reused.
-        """
+    def start(self, active: wp.array, *, rebuild: bool = False) -> None:
+        """Compute work.diagonal and work.inverse at an iterate; `rebuild`: without reuse."""
         raise NotImplementedError
 
     def store_history(self, accepted: wp.array) -> None:
         """Store history after acceptance of the attempt."""
 
-    def prepare(self, active: wp.array, *, anew: bool = False) -> None:
-        """Compute the data of `apply` before a linear solve; `anew`: without reuse."""
+    def prepare(self, active: wp.array) -> None:
+        """Compute the data of `apply` before a linear solve."""
 
     def record_cost(self, active: wp.array) -> None:
         """After a linear solve: record its iteration count for the reuse rule."""
@@ -57,6 +60,8 @@ class Preconditioner:
 class BlockJacobi(Preconditioner):
     """3x3 diagonal blocks of H, made positive at each quadrature point."""
 
+    follows_iterates = True
+
     def __init__(self, model: Model, work: Workspace, launch: Launcher, residual: Residual) -> None:
         self.work, self.launch, self.residual = work, launch, residual
         work.allocate_diagonal_blocks()
@@ -68,7 +73,7 @@ class BlockJacobi(Preconditioner):
         return {self.kernels.module}
 
     @launch_part("build")
-    def start(self, active: wp.array, *, anew: bool = False) -> None:
+    def start(self, active: wp.array, *, rebuild: bool = False) -> None:
         """Assemble and invert the blocks."""
         self.residual.diagonal_blocks(active)
 

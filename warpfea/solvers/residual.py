@@ -63,7 +63,8 @@ class Residual:
     """Launches that evaluate g(v), Phi(v), the norms, and H p.
 
     Attributes:
-        plan: the methods, as far as the operator goes.
+        plan: the methods, as far as the operator goes; uses_matrix, uses_predicted_stress: as there.
+        rule_over_steps: reuse rule of a matrix that serves several steps, or None.
         on_assembled: called with that matrix and the flags of worlds that reassembled it.
     """
 
@@ -101,7 +102,7 @@ class Residual:
             self.operator_matrix = self.assembler.allocate_values("operator matrix")
         if plan.matrix_reuse_level:
             self.matrix_reuse_rule = ReuseRule(model, work, launch, "operator", plan.matrix_rebuild_cost)
-        self.rule_over_steps = self.matrix_reuse_rule if plan.matrix_reuse_level == 2 else None
+        self.rule_over_steps = self.matrix_reuse_rule if plan.reuses_across_steps else None
 
     def _make_product_terms(self) -> Any:
         """Terms of a product H p beyond the elements' part."""

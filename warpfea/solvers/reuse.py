@@ -55,6 +55,10 @@ class ReuseRule:
         """Flag worlds whose state was set externally: the object is rebuilt at the stored linearisation point."""
         self.launch(self.kernels.mark_stale, self.model.worlds, [flags, self.control])
 
+    def request_rebuild(self, flags: wp.array) -> None:
+        """Request that the flagged worlds build the object before their next solve."""
+        self.launch(self.kernels.request_rebuild, self.model.worlds, [flags, self.control])
+
     def decide_rebuild(self, active: wp.array) -> None:
         """Flag the worlds that build the object before this solve, in `control.build_now`."""
         w = self.work

@@ -21,7 +21,7 @@ With constraints, tiles and coarse matrices contain the penalties. As a constrai
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -64,7 +64,8 @@ class TwoLevel(Preconditioner):
 
     Attributes:
         factors_operator: triangular factors of every matrix of the operator, in place of inverses.
-        with_blocks: terms that add to the matrix.
+        block_terms: terms that add to the matrix.
+        solved_directly: the first level is inverted or factored as a whole.
         block_values: matrix of the first level [world of a chunk, entry].
         cached_inputs: by term, the inputs of its blocks at the linearisation point.
     """
@@ -82,8 +83,8 @@ class TwoLevel(Preconditioner):
         self.dim = (model.worlds, model.slots)
         self.levels = self._make_levels()
         self.ctx, self.terms = residual.ctx, model.terms
-        self.with_blocks = self.terms.having(Preconditioned)
-        for term in self.with_blocks:
+        self.block_terms = self.terms.having(Preconditioned)
+        for term in self.block_terms:
             term.allocate_blocks(self.ctx, self.assembler, projected=True)
         traits = model.terms.traits
         self.terms_add_blocks = traits.pooled or traits.constraint_rows  # terms add to the matrix
@@ -145,7 +146,7 @@ class TwoLevel(Preconditioner):
     def register(self, state: State) -> None:
         """Register the linearisation point and the rule's counts in the state, for resumed runs."""
         self.reuse.register(state)
-        for term in self.with_blocks:
+        for term in self.block_terms:
             kept = CachedInputs([], [], [])
             for key, array in term.cached_inputs(self.ctx):
                 name = f"{term.name}_{key}".replace(" ", "_")
@@ -159,7 +160,7 @@ class TwoLevel(Preconditioner):
         reuse = self.reuse
         reuse.move_point(accepted)
         flags = reuse.no_flags if accepted is None else accepted
-        for term in self.with_blocks:
+        for term in self.block_terms:
             kept = self.cached_inputs.get(term.name)
             if kept is not None and not term.copy_cached(self.ctx, kept, reuse.control, flags):
                 for arrays in zip(kept.live, kept.state, kept.cached):
@@ -185,21 +186,19 @@ class TwoLevel(Preconditioner):
         self.reuse.store_counts(accepted)
 
     @launch_part("build")
-    def start(self, active: wp.array, *, anew: bool = False) -> None:
+    def start(self, active: wp.array, *, rebuild: bool = False) -> None:
         """Rebuild where due, with D and the penalties that follow from D."""
-        self._rebuild(active, anew, partial(self._build, penalty=True))
+        # factors that follow the operator's matrix reuse D only
+        if rebuild and not (self.factors_operator and self.model.device.is_cuda):
+            self.reuse.request_rebuild(active)
+        self.reuse.decide_rebuild(active)
+        self.reuse.rebuild_if_flagged(partial(self._build, penalty=True))
 
     @launch_part("build")
-    def prepare(self, active: wp.array, *, anew: bool = False) -> None:
+    def prepare(self, active: wp.array) -> None:
         """Rebuild where due, with the constraint penalties of the step."""
-        self._rebuild(active, anew, self._build)
-
-    def _rebuild(self, active: wp.array, anew: bool, build: Callable[[], None]) -> None:
-        # factors that follow the operator's matrix reuse D only
-        if anew and not (self.factors_operator and self.model.device.is_cuda):
-            self.launch(self.reuse.kernels.request_rebuild, self.model.worlds, [active, self.reuse.control])
         self.reuse.decide_rebuild(active)
-        self.reuse.rebuild_if_flagged(build)
+        self.reuse.rebuild_if_flagged(self._build)
 
     @launch_part("build")
     def record_cost(self, active: wp.array) -> None:
@@ -371,7 +370,7 @@ class TwoLevel(Preconditioner):
     def _add_term_blocks(self, value: wp.array, flags: wp.array, *, penalties: bool) -> None:
         """Add the terms' blocks to the matrix of some worlds: those that D is taken from, or the penalties."""
         reuse = self.reuse.control
-        for term in self.with_blocks:
+        for term in self.block_terms:
             if isinstance(term, Constrained) == penalties:
                 kept = self.cached_inputs[term.name].cached if term.name in self.cached_inputs else []
                 term.blocks(self.ctx, self.assembler, kept, reuse.dq_dv, flags, value, projected=True)
@@ -399,7 +398,7 @@ class TwoLevel(Preconditioner):
         rows = slice(worlds.start, worlds.stop)
         given, copy = (leading_view(a, dim, self.model.types.vec3) for a in (value[rows], self.block_values))
         self.launch(self.residual.vector_kernels.copy_active, dim, [given, flags[rows], copy])
-        for term in self.with_blocks:
+        for term in self.block_terms:
             live = [array for _, array in term.cached_inputs(self.ctx)]
             term.blocks(self.ctx, self.assembler, live, w.step.dq_dv, flags, out, projected=False)
 

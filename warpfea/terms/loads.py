@@ -96,8 +96,9 @@ class DeadLoads(Parametrised):
         return law + [self.kernels.dead_load.module] * self.has_loads
 
     def take_gravity(self, launch: Launcher, value: wp.array, active: wp.array) -> None:
-        """Set gravity at the end of the attempt from the values of the time laws, one of which it has."""
-        launch(self.kernels.copy_gravity, self.model.worlds, [value, self.gravity_law_index, active, self.gravity])
+        """Set gravity at the end of the attempt from the values of the time laws."""
+        if self.gravity_law is not None:
+            launch(self.kernels.copy_gravity, self.model.worlds, [value, self.gravity_law_index, active, self.gravity])
 
     @part("loads")
     def begin(self, ctx: StepContext, active: wp.array) -> None:

@@ -74,6 +74,7 @@ class TermSet:
         nonpotential_entries: pool entries of non-potential forces; pool_entries: of potential ones.
         nonpotential_topology: gather table of the non-potential pool, or None.
         rows: rows of potentials.
+        ledger_terms: terms with ledger rows.
         parameter_updates: number of calls of set_parameter, for all worlds; world_updates: per world.
         ledger: columns of the energy ledger. report: columns of the step report.
     """
@@ -131,7 +132,7 @@ class TermSet:
         return self._having[protocol]
 
     def call(self, ctx: StepContext, protocol: type[Term], method: str, *flags: wp.array) -> None:
-        """Call a method of a protocol of all terms that override it, in order."""
+        """Call a method of a protocol of all terms that override it, in order; which do is found at the first call."""
         base = getattr(protocol, method)
         if base not in self._having:
             self._having[base] = [term for term in self.having(protocol) if overrides(term, base)]
