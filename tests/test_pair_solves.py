@@ -47,8 +47,7 @@ def watch(sim, after):
 
     def anew(active):
         loop.residual.assemble_matrix(active)
-        loop.preconditioner.reuse.request_rebuild(active)
-        loop.preconditioner.prepare(active)
+        loop.preconditioner.start(active, rebuild=True)
         solve(active)
         after(loop)
 

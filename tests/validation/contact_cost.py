@@ -135,8 +135,7 @@ def count_solves(sim: Simulation, steps: int) -> list[int]:
 
     def anew(active: wp.array) -> None:
         loop.residual.assemble_matrix(active)
-        preconditioner.reuse.request_rebuild(active)
-        preconditioner.prepare(active)
+        preconditioner.start(active, rebuild=True)
         solve(active)
         counts.append(int(work.pcg.iterations.numpy()[0]))
 

@@ -55,13 +55,11 @@ class ReuseRule:
         """Flag worlds whose state was set externally: the object is rebuilt at the stored linearisation point."""
         self.launch(self.kernels.mark_stale, self.model.worlds, [flags, self.control])
 
-    def request_rebuild(self, flags: wp.array) -> None:
-        """Request that the flagged worlds build the object before their next solve."""
-        self.launch(self.kernels.request_rebuild, self.model.worlds, [flags, self.control])
-
-    def decide_rebuild(self, active: wp.array) -> None:
-        """Flag the worlds that build the object before this solve, in `control.build_now`."""
+    def decide_rebuild(self, active: wp.array, *, all_active: bool = False) -> None:
+        """Flag the worlds that build the object before this solve, in `control.build_now`: those due, or all active."""
         w = self.work
+        if all_active:
+            self.launch(self.kernels.request_rebuild, self.model.worlds, [active, self.control])
         self.control.any_build.zero_()
         args = [self.control, w.newton, w.step.mass_factor, w.step.dq_dv, active]
         self.launch(self.kernels.decide_rebuild, self.model.worlds, args)
