@@ -50,16 +50,7 @@ def is_needed(name):
     return any(row["lost"] for row in alone) or max(rise) > 0.0
 
 
-KEPT = {"excursions": "a pile takes 1.046 times the iterations without; the random models have not been run without"}
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=pytest.mark.xfail(reason=KEPT[name], strict=True) if name in KEPT else ())
-        for name in MECHANISMS
-    ],
-)
+@pytest.mark.parametrize("name", MECHANISMS)
 def test_mechanisms_are_needed(name):
     assert is_needed(name)
 
