@@ -55,9 +55,31 @@ def test_mechanisms_are_needed(name):
     assert is_needed(name)
 
 
-@pytest.mark.xfail(reason="only groups of constants were run", strict=True)
-def test_constants_are_needed():
-    assert all(map(is_needed, CONSTANTS))
+UNPROVEN = {
+    "CONSTRAINT_FORCING": "a chain of 100 joints takes 2.0 Newton iterations a step with it, 2.55 without",
+    "PREDICTOR_ROUNDINGS": "for runs of a million steps, which ablations leave out",
+    "MAX_EXTRAPOLATED_GROWTH": "for the same",
+    **dict.fromkeys(("NEW_MATRIX_DECADES", "REDUCTION_FADING", "DIAGONAL_AGEING", "UNCHECKED_ITERATIONS"),
+                    "they save assembly, factors or products, which iterations do not count"),
+    **dict.fromkeys(("RESIDUAL_GROWTH", "FROZEN_UPDATE_RESIDUAL", "TANGENT_PLANE_MARGIN"),
+                    "they save work of piles, which was not measured without"),
+    **dict.fromkeys(("OPPOSING_COSINE", "MAX_DEPTH_RATIO", "MAX_OVERHANG"), "the search of facets is to be written anew"),
+    **dict.fromkeys(("TIGHT_CONSTRAINT_ITERATIONS", "VELOCITY_ROUNDINGS", "STRAIN_ENERGY_FRACTION", "SCATTER_FACTOR",
+                     "SOLVES_WITHOUT_STEP", "MAX_STALLED_ITERATIONS"),
+                    "found in single extreme cases; the whole stress suite and slow tests were not run without"),
+}  # fmt: skip
+"""Constants that no quick row, fast test or pair of bodies has lost anything without, and why they are still there."""
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.xfail(reason=UNPROVEN[name], strict=True) if name in UNPROVEN else ())
+        for name in CONSTANTS
+    ],
+)
+def test_constants_are_needed(name):
+    assert is_needed(name)
 
 
 def test_the_page_shows_the_tables():

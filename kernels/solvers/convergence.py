@@ -31,8 +31,6 @@ from .newton_control import (
 
 __all__ = ["MAX_ERROR_ESTIMATES", "SINGLE_PRECISION_EPS", "VELOCITY_ROUNDINGS", "convergence_functions"]
 
-TOL_ROUNDINGS = 16.0
-"""Round-off units added to the relative tolerance of the residual."""
 EXTRAPOLATED_TOL_FACTOR, UNSOLVED_TOL_FACTOR = 1.0e-3, 0.1
 """Fractions of the tolerance that a first iterate must meet: extrapolated; in float32 with parts of unlike stiffness.
 The residual of an unsolved iterate lies in the softest directions and accumulates over steps without iterations."""
@@ -42,8 +40,6 @@ TIGHT_CONSTRAINT_ITERATIONS = 4
 """Iterations in which constraints are closed to the tolerance of accelerations, if `constraint_tol` is looser."""
 STALL_ROUNDINGS = 1.0e3
 """Multiple of the residual of rounded positions below which a stall may be due to round-off."""
-STALL_ROUNDINGS_MIDPOINT = 4.0
-"""`STALL_ROUNDINGS` for midpoint schemes, whose unsymmetric linear solves may stall long before round-off."""
 MAX_STALL_STEP = 10.0
 """Largest last step of a residual at its round-off floor, in largest accepted errors (`max_floor`)."""
 EXTRA_ITERATION_FACTOR = 3
@@ -59,8 +55,6 @@ VELOCITY_ROUNDINGS = 1.0e4
 """Roundings of a body's speed below which, in double precision, a velocity error is negligible."""
 STRAIN_ENERGY_FRACTION = 1.0e-6
 """Fraction of twice the strain energy in the squared scale of a residual group."""
-GROUP_ROUNDINGS = 8.0
-"""Roundings of the positions below which, in double precision, the residual of one group of several is negligible."""
 MAX_ERROR_ESTIMATES = 3
 """Maximum number of error estimates of a stalled iterate before the step is given up."""
 
@@ -69,7 +63,6 @@ MAX_ERROR_ESTIMATES = 3
 def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
     """Device functions; traits used: "stored", "has_constraints", "midpoint" and "unilateral"."""
     Control = control_struct()
-    MAX_STALL_ROUNDINGS = STALL_ROUNDINGS_MIDPOINT if traits.midpoint else STALL_ROUNDINGS
 
     @wp.func
     def objective(ctl: Control, world: int) -> f64:
@@ -165,21 +158,6 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
         return total
 
     @wp.func
-    def is_group_roundoff(ctl: Control, world: int, group: int, norm: f64, rounding: f64) -> bool:
-        """True in float64 if a group's residual is position round-off, and within the tolerance of all groups of its
-        component: further iterations would not reduce it."""
-        if (
-            ctl.norms.group_count == ctl.norms.component_count
-            or ctl.floor.eps > f64(SINGLE_PRECISION_EPS)
-            or norm > f64(GROUP_ROUNDINGS) * rounding
-        ):
-            return False
-        internal, loads = component_sum(ctl, world, group, ROW_INTERNAL), component_sum(ctl, world, group, ROW_LOADS)
-        return norm <= ctl.norms.tol * wp.sqrt(
-            wp.max(internal, wp.max(loads, component_sum(ctl, world, group, ROW_INERTIA)))
-        )
-
-    @wp.func
     def evaluate_norms(ctl: Control, world: int):
         """Norms and acceptance of the current residual, separately for each residual group.
 
@@ -201,7 +179,7 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
             g2 = sums[0]
             norm = wp.sqrt(g2)
             scale = wp.sqrt(sums[1])
-            accepted_norm = (ctl.norms.tol + f64(TOL_ROUNDINGS) * ctl.floor.eps) * scale
+            accepted_norm = ctl.norms.tol * scale
             if force > f64(0.0):
                 # the force tolerance in this norm, by their ratio at this iterate
                 accepted_norm = wp.max(accepted_norm, norm * (ctl.norms.force_tol / force))
@@ -210,8 +188,6 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
             elif is_unsolved_unlike_stiffness(ctl, world):
                 accepted_norm = f64(UNSOLVED_TOL_FACTOR) * accepted_norm
             rounding = f64(2.0) * ctl.floor.eps * wp.sqrt(sums[2])
-            if norm > accepted_norm and is_group_roundoff(ctl, world, group, norm, rounding):
-                accepted_norm = norm
             unconverged = norm > accepted_norm
             if wp.static(traits.has_constraints):
                 allowed = allowed_violation(ctl, world, ctl.norms.constraint_tol)
@@ -328,7 +304,7 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
         limit = ctl.max_iterations * iteration_factor(ctl, world)
         settling = step <= most * most * energy or ctl.iterations[world] + 1 >= limit
         alike = f64(STALL_ENERGY_ROUNDINGS) * ctl.floor.eps
-        near = ctl.floor.rounding_ratio[world] <= f64(MAX_STALL_ROUNDINGS)
+        near = ctl.floor.rounding_ratio[world] <= f64(STALL_ROUNDINGS)
         if wp.static(not traits.midpoint):  # g.p: no energy
             if not near and ctl.floor.rounding_ratio[world] < f64(1.0e300):
                 near = step <= alike * alike * energy
@@ -348,17 +324,14 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
     @wp.func
     def handle_failed_search(ctl: Control, world: int, why: int):
         """Failed search: if round-off may explain it, keep the iterate and request an error estimate, else give up."""
-        at_roundoff = ctl.floor.rounding_ratio[world] <= f64(MAX_STALL_ROUNDINGS)
+        at_roundoff = ctl.floor.rounding_ratio[world] <= f64(STALL_ROUNDINGS)
         if wp.static(traits.unilateral):
             at_roundoff = at_roundoff or is_velocity_roundoff(ctl, world)
         near = at_roundoff and ctl.floor.estimates[world] < MAX_ERROR_ESTIMATES
         at_roundoff = at_roundoff or ctl.floor.eps > f64(SINGLE_PRECISION_EPS)
         enough = False
         if wp.static(traits.has_constraints):  # only accelerations need the tighter tolerance, which round-off prevents
-            if (
-                ctl.norms.constraint_acceleration_tol > f64(0.0)
-                and ctl.norms.relative_residual[world] <= ctl.norms.tol + f64(TOL_ROUNDINGS) * ctl.floor.eps
-            ):
+            if ctl.norms.constraint_acceleration_tol > f64(0.0) and ctl.norms.relative_residual[world] <= ctl.norms.tol:
                 enough = largest_violation(ctl, world) <= ctl.norms.constraint_tol
         if enough and (why == FAIL_LINE_SEARCH or why == FAIL_CURVATURE):
             accept_iterate(ctl, world)
