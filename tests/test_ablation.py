@@ -66,7 +66,7 @@ UNPROVEN = {
     **dict.fromkeys(("OPPOSING_COSINE", "MAX_DEPTH_RATIO", "MAX_OVERHANG"), "the search of facets is to be written anew"),
     **dict.fromkeys(("TIGHT_CONSTRAINT_ITERATIONS", "VELOCITY_ROUNDINGS", "STRAIN_ENERGY_FRACTION", "SCATTER_FACTOR",
                      "SOLVES_WITHOUT_STEP", "MAX_STALLED_ITERATIONS"),
-                    "found in single extreme cases; the whole stress suite and slow tests were not run without"),
+                    "of single extreme cases; the whole stress suite and slow tests were not run without"),
 }  # fmt: skip
 """Constants that no quick row, fast test or pair of bodies has lost anything without, and why they are still there."""
 
