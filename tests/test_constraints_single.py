@@ -1,5 +1,7 @@
 """Single constraints and their kinds of points: definitions, derivatives, reactions."""
 
+import warnings
+
 import numpy as np
 import pytest
 import warp as wp
@@ -84,3 +86,29 @@ def test_reaction_of_dp2_is_that_on_its_last_point():
     sim = wf.Simulation(b.finalize(device="cpu"), dt=0.05)
     sim.step(60)
     assert sim.joint_record(joint).force[0, -20:].mean(axis=0) == pytest.approx([0, 0, 400.0], abs=8.0)
+
+
+def lifted_arm(dtype):
+    """A beam of aluminium that a motor lifts slowly: its own joint carries the weight."""
+    b = wf.ModelBuilder(gravity=(0, 0, -9.81))
+    metal = wf.SVK(E=7e10, nu=0.33, density=2700.0)
+    line, section = [(0, 0, 0), (0.5, 0, 0)], wf.Rectangle(0.04, 0.04)
+    arm = b.add_beam(line, elements=4, section=section, normal=(0, 0, 1), material=metal)
+    angle = np.linspace(0.0, 0.1, 11)
+    motor = b.add_joint("revolute", parent=wf.GROUND, child=arm.start, axis=(0, -1, 0), drive=(10.0 * angle, angle))
+    sim = wf.Simulation(b.finalize(device="cpu", dtype=dtype), dt=0.01)
+    sim.step(20)
+    return sim, motor
+
+
+def test_joint_forces_at_the_rounding_of_float32_are_told():
+    sim, motor = lifted_arm("float32")
+    assert sim.totals["floored"][0] > 0
+    with pytest.warns(wf.ModelWarning, match="float32 rounds"):
+        sim.joint_force(motor)
+    with warnings.catch_warnings():  # once
+        warnings.simplefilter("error")
+        sim.joint_record(motor)
+        sim, motor = lifted_arm("float64")
+        force = sim.joint_force(motor)
+    assert force[0, 2] == pytest.approx(2700.0 * 0.04**2 * 0.5 * 9.81, rel=0.1)

@@ -3,12 +3,13 @@ contacts."""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..base.errors import ModelError
+from ..base.errors import ModelError, ModelWarning
 from ..base.names import did_you_mean, listing
 from ..kernels.contact.structs import RECORD_NAMES
 from ..kernels.step.step_control import REPORT_COLUMNS
@@ -146,6 +147,7 @@ class Records:
 
     def __init__(self, results: Results, stepper: Stepper, statistics: RunStatistics) -> None:
         self.results, self.stepper, self.statistics = results, stepper, statistics
+        self.warned_of_noise = False
         self.model, self.state = results.model, results.state
 
     def energies(self) -> dict[str, np.ndarray]:
@@ -204,16 +206,34 @@ class Records:
         out[~self.statistics.stepped_worlds] = np.nan
         return out
 
+    def warn_of_noise(self) -> None:
+        """Warn, once, of joint forces in float32 after steps that ended at its round-off: they carry that of the stress
+        in stiff bodies, which the positions and the error estimate of those steps do not show."""
+        floored = int(self.statistics.totals["floored"].sum())
+        if self.warned_of_noise or self.model.dtype != "float32" or not floored:
+            return
+        self.warned_of_noise = True
+        warnings.warn(
+            f"joint forces: {floored} of {self.statistics.steps * self.model.worlds} steps ended where float32 rounds the "
+            "stress; forces and moments of joints may be wrong by more than the loads, though positions are right; take "
+            "dtype='float64'",
+            ModelWarning,
+            stacklevel=3,
+        )
+
     def joint_record(self, joint: Joint | str) -> JointRecord:
-        """Record of a joint (handle or name), one entry per step."""
+        """Record of a joint (handle or name), one entry per step. Warns as `joint_force`."""
+        self.warn_of_noise()
         time, table = self._recorded_table(self.joint_column(joint), JOINT_COLUMNS)
         return JointRecord(time, table[:, :, :3], table[:, :, 3:6], table[:, :, 6])
 
     def joint_force(self, joint: Joint | str) -> np.ndarray:
         """Force (N) and moment about the anchor (N m) that a joint exerts on its child at the last accepted step.
 
-        (B, 6) in world axes; over time see `joint_record`. NaN as for `reaction`.
+        (B, 6) in world axes; over time see `joint_record`. NaN as for `reaction`. Warns (ModelWarning) in float32 after
+        steps that ended at its round-off (`report.floor` above 0).
         """
+        self.warn_of_noise()
         return self._of_last_step(self.joint_column(joint))
 
     def violation(self, joint: Joint | str) -> np.ndarray:
