@@ -55,6 +55,8 @@ VELOCITY_ROUNDINGS = 1.0e4
 """Roundings of a body's speed below which, in double precision, a velocity error is negligible."""
 STRAIN_ENERGY_FRACTION = 1.0e-6
 """Fraction of twice the strain energy in the squared scale of a residual group."""
+GROUP_ROUNDINGS = 8.0
+"""Roundings of the positions below which, in double precision, the residual of one group of several is negligible."""
 MAX_ERROR_ESTIMATES = 3
 """Maximum number of error estimates of a stalled iterate before the step is given up."""
 
@@ -158,6 +160,21 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
         return total
 
     @wp.func
+    def is_group_roundoff(ctl: Control, world: int, group: int, norm: f64, rounding: f64) -> bool:
+        """True in float64 if a group's residual is position round-off, and within the tolerance of all groups of its
+        component: further iterations would not reduce it."""
+        if (
+            ctl.norms.group_count == ctl.norms.component_count
+            or ctl.floor.eps > f64(SINGLE_PRECISION_EPS)
+            or norm > f64(GROUP_ROUNDINGS) * rounding
+        ):
+            return False
+        internal, loads = component_sum(ctl, world, group, ROW_INTERNAL), component_sum(ctl, world, group, ROW_LOADS)
+        return norm <= ctl.norms.tol * wp.sqrt(
+            wp.max(internal, wp.max(loads, component_sum(ctl, world, group, ROW_INERTIA)))
+        )
+
+    @wp.func
     def evaluate_norms(ctl: Control, world: int):
         """Norms and acceptance of the current residual, separately for each residual group.
 
@@ -188,6 +205,8 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
             elif is_unsolved_unlike_stiffness(ctl, world):
                 accepted_norm = f64(UNSOLVED_TOL_FACTOR) * accepted_norm
             rounding = f64(2.0) * ctl.floor.eps * wp.sqrt(sums[2])
+            if norm > accepted_norm and is_group_roundoff(ctl, world, group, norm, rounding):
+                accepted_norm = norm
             unconverged = norm > accepted_norm
             if wp.static(traits.has_constraints):
                 allowed = allowed_violation(ctl, world, ctl.norms.constraint_tol)
