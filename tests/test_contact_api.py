@@ -216,7 +216,7 @@ def test_colliders_are_set_off_in_each_world():
 def test_a_run_in_progress_takes_new_values():
     """Recorded steps see them, also friction where there was none before; Warp arrays will do."""
     model = thrown(mu=0.0)[2]
-    sim = wf.Simulation(model, dt=DT, capture=True)
+    sim = wf.Simulation(model, dt=DT)
     graph = sim.stepper.graph
     sim.step(10)
     assert sim.contact_record("pad").friction[0].sum() == 0.0

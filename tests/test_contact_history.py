@@ -139,8 +139,7 @@ def test_static_friction_of_the_papers_law(treatment, tangent):
 def test_jaws_closed_by_controls_in_four_worlds_equal_single_runs(device, dtype):
     h, steps = 1.0 / 1024.0, 6
     path = np.linspace(0.0, 3e-4, steps)[:, None] * np.array([1.0, 0.5, -0.5, 2.0])
-    model = resting(path=wf.Control("jaw", 3), worlds=4, device=device, dtype=dtype)[1]
-    together = wf.Simulation(model, dt=h, capture=True)
+    together = wf.Simulation(resting(path=wf.Control("jaw", 3), worlds=4, device=device, dtype=dtype)[1], dt=h)
     launches = together.stepper.launch.launches
     for values in path:
         together.controls["jaw"][:] = np.stack([0 * values, 0 * values, values], axis=1)

@@ -295,7 +295,7 @@ def count_calls(patch, calls, names):
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_a_step_is_the_same_recorded_graph_and_reads_nothing_more(monkeypatch, device):
-    sims = {law: simulation("pressure", law, device=device, capture=True) for law in (wf.Control("c"), 0.0)}
+    sims = {law: simulation("pressure", law, device=device) for law in (wf.Control("c"), 0.0)}
     calls = []
     for law, sim in sims.items():
         stepper = sim.stepper
@@ -315,7 +315,7 @@ def test_a_step_is_the_same_recorded_graph_and_reads_nothing_more(monkeypatch, d
 
 
 def test_a_scene_without_controls_has_nothing_of_them():
-    with_it, bare = (simulation("pressure", law, capture=True) for law in (wf.Control("c"), 1.0))
+    with_it, bare = (simulation("pressure", law) for law in (wf.Control("c"), 1.0))
     assert "controls" in with_it.model.info()["features"]
     assert "controls" in bare.model.info()["left_out"]
     assert not any(name.startswith(("state.control_", "backup.control_")) for name in bare.bytes())

@@ -139,7 +139,7 @@ def test_worlds_that_grow_fail_and_leave_the_others():
 def test_what_is_not_watched_costs_nothing_and_is_told():
     sims = {}
     for choice, more in (("refuse", {}), ("warn", {}), ("ignore", {}), ("refuse", {"ledger": False})):
-        sim = wf.Simulation(rotor(), dt=DT, integrator=ALPHA, energy_growth=choice, capture=True, **more)
+        sim = wf.Simulation(rotor(), dt=DT, integrator=ALPHA, energy_growth=choice, **more)
         sims[choice, bool(more)] = sim
     watched = [key for key, sim in sims.items() if "energy_growth" in sim.state.names]
     assert watched == [("refuse", False), ("warn", False)]

@@ -258,7 +258,7 @@ def test_unknown_names_and_values_out_of_range(soft):
 
 def test_newtons_method_pays_nothing_for_it(soft):
     model, _ = soft
-    sim = wf.Simulation(model, dt=5e-3, capture=True)
+    sim = wf.Simulation(model, dt=5e-3)
     assert not any("jacobi_" in name for name in sim.stepper.launch.modules)
     assert not any(name.startswith("jacobi") for name in sim.stepper.work.bytes)
 

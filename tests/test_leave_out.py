@@ -48,7 +48,7 @@ def cost(feature=None, **simulation):
         other = b.add_solid(mesh, material=wf.NeoHookean(mu=1e6, k=1e6, density=1000.0), name="other")
         b.clamp(other.nodes("x-"))
     model = b.finalize(device="cpu")
-    sim = wf.Simulation(model, dt=1e-3, capture=True, **simulation)
+    sim = wf.Simulation(model, dt=1e-3, **simulation)
     launch = sim.stepper.launch
     names = frozenset(module.name for module in sim.stepper.modules())
     kernels = frozenset(k.rsplit(".", 1)[1] for k in launch.kernels)

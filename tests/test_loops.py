@@ -54,7 +54,7 @@ def test_the_guard_sees_readings_and_allocations(silent):
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("build", [cubes, arms])
 def test_a_thousand_steps_read_and_allocate_nothing(build, device, silent):
-    sim = wf.Simulation(build(2, device=device), dt=DT, capture=True, **QUIET)
+    sim = wf.Simulation(build(2, device=device), dt=DT, **QUIET)
     names = ["probe.top.position", "contact.pad.force"] if build is cubes else ["joint.motor.angle", "time"]
     observed = sim.observe(*names)
     mask, graph = flags(1, of=2, device=device), sim.stepper.graph
@@ -150,8 +150,7 @@ def test_worlds_of_every_kind_equal_their_own_runs(dtype, device):
             v[row, ::2] += (0.0, 0.0, 1e7 if world == 1 else 0.0)
             v[row] *= np.nan if world == 2 else 1.0
         state.velocity.assign(v)
-        solver = wf.NewtonPCG(max_halvings=2)
-        return wf.Simulation(model, state, dt=DT, t_end=ends[worlds], solver=solver, capture=True, **QUIET)
+        return wf.Simulation(model, state, dt=DT, t_end=ends[worlds], solver=wf.NewtonPCG(max_halvings=2), **QUIET)
 
     everyone = np.arange(6)
     sim = start(cubes(6, dtype, device), everyone)

@@ -177,7 +177,7 @@ def test_a_change_in_a_run_reaches_the_chosen_worlds_alone(case):
         if worlds == 1:
             for name, value in values[0].items():
                 m.set_parameter(f"body.{name}", value)
-        sim = wf.Simulation(m, dt=2e-3, capture=True)
+        sim = wf.Simulation(m, dt=2e-3)
         sim.step(3)
         graph, tables = sim.stepper.graph, [block.data.coefficients.ptr for block in m.blocks]
         if values[1]:

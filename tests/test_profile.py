@@ -47,7 +47,7 @@ def counting(monkeypatch, request):
 def simulation(name, device, **values):
     scene = find(name)
     model = scene.build(scene.resolve(values)).finalize(device=device)
-    return wf.Simulation(model, dt=scene.dt, integrator=scene.integrator, capture=True)
+    return wf.Simulation(model, dt=scene.dt, integrator=scene.integrator)
 
 
 def launches_of(name, device, steps, after, **values):
@@ -151,7 +151,7 @@ def test_bad_options_are_named(device):
     sim = simulation("cantilever", device, cells=2)
     with pytest.raises(wf.ModelError, match="steps = 0"):
         profile(sim, steps=0)
-    sim.stepper.graph, sim.stepper.recordable = None, False
+    sim.stepper.graph = None
     with pytest.raises(wf.ModelError, match="capture=False"):
         profile(sim)
 

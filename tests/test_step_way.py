@@ -16,7 +16,7 @@ def stays(name):
     """Files in the order of a step, launched anew, one entry for each stay; a function counts at its first call."""
     scene = find(name)
     options = {"dt": scene.dt, "integrator": scene.integrator, "solver": wf.NewtonPCG(tol=scene.tol)}
-    sim = wf.Simulation(scene().finalize(device="cpu"), capture=True, **options)
+    sim = wf.Simulation(scene().finalize(device="cpu"), **options)
     sim.stepper.graph = None
     seen, way = set(), []
 

@@ -117,7 +117,7 @@ def start(
     """A scene, stepped to where it counts."""
     model = build(scene, cells, stiffness).finalize(device=device, dtype=dtype)
     term = next((term for term in model.terms if isinstance(term, ColliderContact)), None)
-    sim = Simulation(model, dt=DT, solver=solver(tol), ledger=False, capture=True)
+    sim = Simulation(model, dt=DT, solver=solver(tol), ledger=False)
     out = _Runner(sim, term, [])
     if scene in MOVING:
         sim.dt = LONG_DT

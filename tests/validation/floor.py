@@ -94,7 +94,7 @@ def solved(
     if case["motion"]:
         dt = 2.0 * np.pi / (1.875**2 * case["width"] * np.sqrt(case["E"] / (12.0 * DENSITY))) / PERIODS
         solver = wf.NewtonPCG(tol=tol, max_pcg=20000, max_halvings=0)
-        sim = wf.Simulation(model, dt=dt, integrator="bdf2", solver=solver, ledger=False, capture=True)
+        sim = wf.Simulation(model, dt=dt, integrator="bdf2", solver=solver, ledger=False)
         for _ in range(STEPS):
             floors.append(float(sim.step().floor[0]))
             stable = stable and (tol is None or positive(sim))

@@ -45,7 +45,7 @@ def piles(run: Run) -> Iterator[Row]:
         if not run.wants(f"pile-{cells}"):
             continue
         model = pile(cells).finalize(device=run.device)
-        sim = wf.Simulation(model, dt=DT, solver=wf.NewtonPCG(tol=TOL), ledger=False, capture=True)
+        sim = wf.Simulation(model, dt=DT, solver=wf.NewtonPCG(tol=TOL), ledger=False)
         sim.step()
         before = {name: int(sim.totals[name][0]) for name in ("newton", "pcg")}
         wp.synchronize_device(model.device)

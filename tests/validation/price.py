@@ -113,7 +113,7 @@ class _Runner:
         self.model = b.finalize(device=device)
         how = wf.NewtonPCG(tol=scene.tol)
         method = STATED.get(scene.name, scene.integrator)
-        self.sim = wf.Simulation(self.model, dt=scene.dt, integrator=method, solver=how, capture=True)
+        self.sim = wf.Simulation(self.model, dt=scene.dt, integrator=method, solver=how)
         self.sim.step(WARM_UP)
         self.times: list[float] = []
 

@@ -143,7 +143,7 @@ def rows(run: Run) -> Iterator[Row]:
     for case in filter(lambda case: run.wants(case.label), cases()):
         model = case.make().finalize(device=run.device, dtype=case.dtype, worlds=case.worlds)
         how = wf.Jacobi(iterations=case.iterations) if case.iterations else wf.NewtonPCG(tol=case.tol, **case.solver)
-        sim = wf.Simulation(model, dt=case.dt, integrator=case.integrator, solver=how, capture=True)
+        sim = wf.Simulation(model, dt=case.dt, integrator=case.integrator, solver=how)
         held, launch = sum(sim.bytes().values()), sim.stepper.launch
         row: Row = {"label": case.label, "launches": launch.launches, "per_step": None}
         row |= {"modules": len(launch.modules), "bytes": held}

@@ -63,7 +63,6 @@ def info(options: argparse.Namespace) -> int:
     with quiet_warp():
         model = source.model()
         sim = source.simulation(model, show_progress(options))
-        sim.stepper.record()
         launcher = sim.stepper.launch
         content = {"scene": source.label, "parameters": source.parameters} | sim.info()
         content |= {"bounding_box": model_box(model)}

@@ -214,9 +214,9 @@ class Records:
             return
         self.warned_of_noise = True
         warnings.warn(
-            f"joint forces: {floored} of {self.statistics.steps * self.model.worlds} steps ended where float32 rounds the "
-            "stress; forces and moments of joints may be wrong by more than the loads, though positions are right; take "
-            "dtype='float64'",
+            f"joint forces: {floored} of {self.statistics.steps * self.model.worlds} steps ended where float32 rounds "
+            "the stress; forces and moments of joints may be wrong by more than the loads, though positions are right; "
+            "take dtype='float64'",
             ModelWarning,
             stacklevel=3,
         )

@@ -81,8 +81,7 @@ class Simulation:
             1e-5 in float32.
         ledger: compute the energy ledger.
         record: store probe, joint and contact results of every step, else of the last only.
-        capture: record a step as one graph, and replay it; None: on a GPU at once, on the CPU once its launches have
-            cost as much as recording does. Never with linear="direct".
+        capture: capture a step as one graph, on the GPU and on the CPU; never with linear="direct".
         on_compile: called with (modules ready, total modules, name) while kernels compile; by default a bar on stderr
             if it is a terminal. Warp's own module messages are hidden, unless its log level was lowered.
         on_failure: "raise" ConvergenceError, or "freeze" the failed worlds; by default raise with one world, and with
@@ -153,7 +152,7 @@ class Simulation:
         constraint_tol: float | None = None,
         ledger: bool = True,
         record: bool = True,
-        capture: bool | None = None,
+        capture: bool = True,
         on_failure: str | None = None,
         inversion: str = "refuse",
         energy_growth: str = "refuse",
@@ -183,7 +182,7 @@ class Simulation:
             constraint_tol = {"float64": 1e-8, "float32": 1e-5}[model.dtype]
         check_constraint_tol(constraint_tol)
 
-        def stepper(model: Model, state: State, capture: bool | None = False) -> Stepper:
+        def stepper(model: Model, state: State, capture: bool = False) -> Stepper:
             return Stepper(
                 model, state, scheme, options,
                 ledger=ledger, capture=capture,

@@ -1,4 +1,4 @@
-"""One step on the device (predict, solve, accept or halve, energy ledger, report), recorded as a graph."""
+"""One step on the device (predict, solve, accept or halve, energy ledger, report), captured as a graph."""
 
 from __future__ import annotations
 
@@ -38,9 +38,6 @@ __all__ = ["Stepper"]
 
 CANDIDATE_FIRST_ITERATES = (0, 1, 2)
 """Alternative first iterates, see the kernel `alternative_first_iterate`."""
-MAX_UNRECORDED_LAUNCHES = 5000
-"""Launches after which a step on the CPU is recorded: they have then cost about as much as recording, 0.3 to 1 s, for
-which a run of few steps has no use."""
 
 
 class Stepper:
@@ -52,8 +49,8 @@ class Stepper:
 
     def __init__(
         self, model: Model, state: State, integrator: Integrator, solver: NewtonPCG | Jacobi, *, ledger: bool, capture:
-        bool | None, loop: Mapping[str, Any], adapt: AdaptiveOptions | None = None, episodes: Mapping[str, bool] | None
-        = None, growth: EnergyGrowth | None = None, on_compile: OnCompile | None = None,
+        bool, loop: Mapping[str, Any], adapt: AdaptiveOptions | None = None, episodes: Mapping[str, bool] | None = None,
+        growth: EnergyGrowth | None = None, on_compile: OnCompile | None = None,
     ) -> None:  # fmt: skip
         self.model, self.state, self.integrator, self.solver = model, state, integrator, solver
         self.ledger, self.on_compile = ledger, on_compile
@@ -129,9 +126,10 @@ class Stepper:
             fresh = ~self.state.ledger.numpy().any(axis=1)
             self.restart_ledger(fresh | (self.state.ledger_time.numpy() != self.state.time.numpy()))
         self.graph: wp.Graph | None = None
-        self.recordable = capture is not False and self.newton.direct is None  # a direct solver runs on the host
-        if self.recordable and (capture or model.device.is_cuda):
-            self.record()
+        if capture and self.newton.direct is None:  # a direct solver runs on the host
+            with wp.ScopedCapture(device=model.device) as recorded:
+                self.launch_step()
+            self.graph = recorded.graph
 
     def _bind_structs(self) -> None:
         w, state = self.work, self.state
@@ -302,20 +300,10 @@ class Stepper:
         if self.initial_conditions is not None:
             self.initial_conditions.prepare(self._dt)
         with convert_memory_errors("a step", self.model.device):
-            if self.launch.launches > MAX_UNRECORDED_LAUNCHES:
-                self.launch.launches = 0  # those of a step from here on
-                self.record()
             if self.graph is not None:
                 wp.capture_launch(self.graph)
             else:
                 self.launch_step()
-
-    def record(self) -> None:
-        """Record the launches of a step as a graph, unless that is done, or the simulation has none."""
-        if self.recordable and self.graph is None:
-            with wp.ScopedCapture(device=self.model.device) as recorded:
-                self.launch_step()
-            self.graph = recorded.graph
 
     # sequence of launches
 

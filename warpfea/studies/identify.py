@@ -47,8 +47,7 @@ def finger_model(device: Any, worlds: int) -> Any:
 
 def make_simulation(model: Any, dt: float, **how: Any) -> wf.Simulation:
     """A simulation of the model; the constants of all worlds have been set."""
-    solver = wf.NewtonPCG(tol=1e-6)
-    return wf.Simulation(model, dt=dt, integrator="bdf2", solver=solver, ledger=False, capture=True, **how)
+    return wf.Simulation(model, dt=dt, integrator="bdf2", solver=wf.NewtonPCG(tol=1e-6), ledger=False, **how)
 
 
 def record_tip(device: Any, t_end: float = T_END, seed: int = 7) -> np.ndarray:

@@ -128,7 +128,7 @@ class _Run:
         if setting.error is not None:
             steps = {"dt": "auto", "error": setting.error}
         solver = SOLVERS[setting.solver](tol=setting.tol)
-        self.sim = Simulation(model, solver=solver, integrator=setting.method, capture=True, **steps)
+        self.sim = Simulation(model, solver=solver, integrator=setting.method, **steps)
         self.energies = [self.sim.energies()]
         self.limit = limit
         self.step_began = clock.perf_counter()

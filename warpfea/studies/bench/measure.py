@@ -115,7 +115,7 @@ def solver(tol: float | None, **options: Any) -> NewtonPCG:
 def run_once(model: Model, *, dt: float, steps: int, solver: NewtonPCG, limit: float = math.inf) -> Run:
     """Simulate from rest; the step that brings the time beyond `limit` seconds is the last."""
     began = clock.perf_counter()
-    sim = Simulation(model, dt=dt, solver=solver, ledger=False, capture=True)
+    sim = Simulation(model, dt=dt, solver=solver, ledger=False)
     ready = clock.perf_counter() - began
     times: list[float] = []
     largest = 0.0

@@ -138,7 +138,7 @@ class ReferenceTips(dict[str, list[Any]]):
         steps = WARM + TIMED, LATER + TIMED
         found: list[Any] = [None, None]
         for tol in REFERENCE_TOLS:
-            sim = Simulation(model, dt=dt, solver=NewtonPCG(tol=tol), ledger=False, capture=True)
+            sim = Simulation(model, dt=dt, solver=NewtonPCG(tol=tol), ledger=False)
             whole = 0
             while whole < max(steps) and not sim.step().halvings.any():
                 whole += 1
@@ -188,7 +188,7 @@ def _measure(case: Case, dtype: str, options: argparse.Namespace) -> Row:
         row["unknowns"] = model.info()["unknowns"]
         banded = case.method != "auto" and case.scene in NARROW_BAND_SCENES
         method = NewtonPCG(tol=METHOD_TOLS[case.method], preconditioner="banded" if banded else "auto")
-        sim = Simulation(model, dt=dt, solver=method, ledger=False, record=False, on_failure="freeze", capture=True)
+        sim = Simulation(model, dt=dt, solver=method, ledger=False, record=False, on_failure="freeze")
         sim.step(WARM)
     except (CapacityError, ModelError) as refused:
         return row | {"note": str(refused)}

@@ -264,12 +264,12 @@ def profile(sim: Simulation, *, steps: int = 10, on_step: Callable[[], object] |
     """Profile the `steps` steps after a warm-up of two; the simulation is then at their end, as after `step`.
 
     Args:
-        sim: a simulation whose steps are recorded (not with capture=False).
+        sim: a simulation with captured steps (capture=True).
         steps: number of timed steps, as graphs and then launch by launch.
         on_step: called after each of the 2 steps + 3 executed steps.
 
     Raises:
-        ModelError: steps out of range, or a simulation whose steps are not recorded.
+        ModelError: steps out of range, or a simulation without captured steps.
         ConvergenceError, ConstraintError: a step failed.
     """
     done = replay(sim, steps, on_step)
@@ -294,7 +294,6 @@ def replay(sim: Simulation, steps: int, on_step: Callable[[], object] | None = N
     if not (is_count(steps) and steps >= 1):
         raise ModelError(f"profile: steps = {steps!r} must be a whole number, at least 1")
     stepper = sim.stepper
-    stepper.record()
     if stepper.graph is None:
         raise ModelError("profile: the simulation was made with capture=False, or with linear='direct'")
 
