@@ -152,18 +152,9 @@ def matrix_kernels(fn: KernelSet, name: str) -> KernelSet:
 
     @wp.func
     def point_state(
-        block: Block,
-        U: Local,
-        V: Local,
-        step: Local,
-        history: p.sym_2d,
-        dq: T,
-        c: coef,
-        form: int,
-        world: int,
-        point: int,
-        elem: int,
-    ):
+        block: Block, U: Local, V: Local, step: Local, history: p.sym_2d, dq: T, c: coef, form: int, world: int,
+        point: int, elem: int,
+    ):  # fmt: skip
         """F with columns along the law's axes, and the second Piola-Kirchhoff stress S there, Pa.
 
         `form` 0: S with its viscous part; 1: without it, and with compression removed. For laws that need J > 0, S is

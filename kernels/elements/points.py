@@ -330,18 +330,9 @@ def point_functions(
 
     @wp.func
     def point_increment(
-        block: Block,
-        G: mat33,
-        dG: mat33,
-        Fdot: mat33,
-        history: p.sym_2d,
-        c: coef,
-        dq: T,
-        form: int,
-        world: int,
-        point: int,
-        elem: int,
-    ) -> mat33:
+        block: Block, G: mat33, dG: mat33, Fdot: mat33, history: p.sym_2d, c: coef, dq: T, form: int, world: int,
+        point: int, elem: int,
+    ) -> mat33:  # fmt: skip
         """dP by a change dG at a point in the body's axes, damping included: the integrand of the tangent product.
 
         `form` 2, for midpoint schemes: with the stress at the start of the step in the geometric part.

@@ -170,16 +170,9 @@ def adaptive_kernels(dtype: str, scheme: Any) -> KernelSet:
 
     @wp.kernel(module=module)
     def max_error_rates(
-        step: Step,
-        ctl: Adaptive,
-        displacement_factor: p.scalar_1d,
-        free: p.vec3_1d,
-        u: p.vec3_2d,
-        v: p.vec3_2d,
-        v_n: p.vec3_2d,
-        v_before: p.vec3_2d,
-        means: p.vec3_2d,
-    ):
+        step: Step, ctl: Adaptive, displacement_factor: p.scalar_1d, free: p.vec3_1d, u: p.vec3_2d, v: p.vec3_2d,
+        v_n: p.vec3_2d, v_before: p.vec3_2d, means: p.vec3_2d,
+    ):  # fmt: skip
         """Largest rate, mean of rates and displacement over free slots. The maximum is independent of the order.
 
         `displacement_factor`: from an unknown to a displacement: 1 for positions; half the size of the section, m, for

@@ -216,17 +216,9 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> KernelSet:
 
     @wp.func
     def add_term_products(
-        topo: Topology,
-        h: vec3,
-        more: ProductTerms,
-        pool: wp.vec2i,
-        p: vec3,
-        con: Constraints,
-        mul: Multipliers,
-        world: int,
-        slot: int,
-        result: p.vec3_2d,
-    ) -> f64:
+        topo: Topology, h: vec3, more: ProductTerms, pool: wp.vec2i, p: vec3, con: Constraints, mul: Multipliers,
+        world: int, slot: int, result: p.vec3_2d,
+    ) -> f64:  # fmt: skip
         """H p on the free components: adds the terms' part to the elements' part. Returns p.Hp."""
         out = h
         if wp.static(traits.tangent):
@@ -255,16 +247,9 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> KernelSet:
 
         @masked_kernel(module, "active", f"gather_kernels__locals__{name}", **options)
         def slot_product(
-            topo: Topology,
-            contribution: p.vec3_2d,
-            more: ProductTerms,
-            p_in: p.vec3_2d,
-            active: int_1d,
-            con: Constraints,
-            mul: Multipliers,
-            out: p.vec3_2d,
-            rows: double_3d,
-        ):
+            topo: Topology, contribution: p.vec3_2d, more: ProductTerms, p_in: p.vec3_2d, active: int_1d,
+            con: Constraints, mul: Multipliers, out: p.vec3_2d, rows: double_3d,
+        ):  # fmt: skip
             """H p = c_M M p + (dq/dv) K p on the free components, constraints included, and p.Hp per warp of slots."""
             world, slot = wp.tid()
             share = f64(0.0)
@@ -284,18 +269,9 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> KernelSet:
 
     @masked_kernel(matrix_module, "active")
     def matrix_product(
-        topo: Topology,
-        pattern: Pattern,
-        value: p.mat33_2d,
-        lanes: int,
-        more: ProductTerms,
-        p_in: p.vec3_2d,
-        active: int_1d,
-        con: Constraints,
-        mul: Multipliers,
-        out: p.vec3_2d,
-        rows: double_3d,
-    ):
+        topo: Topology, pattern: Pattern, value: p.mat33_2d, lanes: int, more: ProductTerms, p_in: p.vec3_2d,
+        active: int_1d, con: Constraints, mul: Multipliers, out: p.vec3_2d, rows: double_3d,
+    ):  # fmt: skip
         """H p with the elements' part and the mass as one matrix, `lanes` threads per row."""
         world, index = wp.tid()
         slot = index / lanes
@@ -314,15 +290,9 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> KernelSet:
 
     @masked_kernel(module, "active")
     def gather_diagonal_blocks(
-        topo: Topology,
-        contribution: p.sym_2d,
-        pool: p.sym_2d,
-        mass_factor: double_1d,
-        dq_dv: double_1d,
-        active: int_1d,
-        diagonal: p.vec3_2d,
-        inverse: p.mat33_2d,
-    ):
+        topo: Topology, contribution: p.sym_2d, pool: p.sym_2d, mass_factor: double_1d, dq_dv: double_1d,
+        active: int_1d, diagonal: p.vec3_2d, inverse: p.mat33_2d,
+    ):  # fmt: skip
         """Diagonal blocks of H: their diagonal D and their inverse on the free components."""
         world, slot = wp.tid()
         k6 = sym6()

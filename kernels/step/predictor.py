@@ -91,17 +91,9 @@ def predictor_kernels(dtype: str, accelerated: bool, module: wp.Module) -> Kerne
 
     @masked_kernel(module, "step.accepted")
     def order_error_terms(
-        predictor: Predictor,
-        step: Step,
-        free: p.vec3_1d,
-        is_position: p.scalar_1d,
-        diagonal: p.vec3_2d,
-        v: p.vec3_2d,
-        v_n: p.vec3_2d,
-        before: p.vec3_2d,
-        first: p.vec3_2d,
-        rows: double_3d,
-    ):
+        predictor: Predictor, step: Step, free: p.vec3_1d, is_position: p.scalar_1d, diagonal: p.vec3_2d, v: p.vec3_2d,
+        v_n: p.vec3_2d, before: p.vec3_2d, first: p.vec3_2d, rows: double_3d,
+    ):  # fmt: skip
         """Squared errors of the orders in an accepted step, in the norm of D.
 
         Rows 0 to 2: the orders; row 3: the squared velocity.

@@ -149,17 +149,9 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
 
     @masked_kernel(module, "step.running")
     def predict(
-        step: Step,
-        is_position: p.scalar_1d,
-        free: p.vec3_1d,
-        u_n: p.vec3_2d,
-        v_n: p.vec3_2d,
-        u_before: p.vec3_2d,
-        v_before: p.vec3_2d,
-        q_tilde: p.vec3_2d,
-        v_tilde: p.vec3_2d,
-        v: p.vec3_2d,
-    ):
+        step: Step, is_position: p.scalar_1d, free: p.vec3_1d, u_n: p.vec3_2d, v_n: p.vec3_2d, u_before: p.vec3_2d,
+        v_before: p.vec3_2d, q_tilde: p.vec3_2d, v_tilde: p.vec3_2d, v: p.vec3_2d,
+    ):  # fmt: skip
         """q~, v~ and the first iterate; prescribed components keep their positions.
 
         The iterate is v~ + (dq/dv) g, or v_n + (h/h_{n-1}) (v_n - v_{n-1}) if the previous step is known: its error is
@@ -196,17 +188,9 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
 
     @masked_kernel(module, "newton.start.has_alternatives")
     def alternative_first_iterate(
-        step: Step,
-        newton: Newton,
-        kind: int,
-        is_position: p.scalar_1d,
-        free: p.vec3_1d,
-        u_n: p.vec3_2d,
-        v_n: p.vec3_2d,
-        q_tilde: p.vec3_2d,
-        v_tilde: p.vec3_2d,
-        v: p.vec3_2d,
-    ):
+        step: Step, newton: Newton, kind: int, is_position: p.scalar_1d, free: p.vec3_1d, u_n: p.vec3_2d,
+        v_n: p.vec3_2d, q_tilde: p.vec3_2d, v_tilde: p.vec3_2d, v: p.vec3_2d,
+    ):  # fmt: skip
         """Alternative first iterate on the free components: 0: v~ + (dq/dv) g, 1: v_n, 2: the one with q = q_n."""
         world, slot = wp.tid()
         new = v_n[world, slot]
@@ -273,15 +257,9 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
 
     @masked_kernel(module, "step.accepted")
     def accept_state(
-        step: Step,
-        newton: Newton,
-        u: p.vec3_2d,
-        v: p.vec3_2d,
-        u_n: p.vec3_2d,
-        v_n: p.vec3_2d,
-        u_before: p.vec3_2d,
+        step: Step, newton: Newton, u: p.vec3_2d, v: p.vec3_2d, u_n: p.vec3_2d, v_n: p.vec3_2d, u_before: p.vec3_2d,
         v_before: p.vec3_2d,
-    ):
+    ):  # fmt: skip
         """Store the accepted iterate in the state."""
         world, slot = wp.tid()
         if wp.static(multistep):

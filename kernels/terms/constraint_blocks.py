@@ -40,15 +40,9 @@ def constraint_block_kernels(dtype: str) -> KernelSet:
 
     @masked_kernel(module, "active")
     def add_penalties(
-        topo: Topology,
-        pattern: Pattern,
-        pairs: Couplings,
-        gradient: vec3d_2d,
-        stiffness: double_2d,
-        dq_dv: double_1d,
-        active: int_1d,
-        value: p.mat33_2d,
-    ):
+        topo: Topology, pattern: Pattern, pairs: Couplings, gradient: vec3d_2d, stiffness: double_2d, dq_dv: double_1d,
+        active: int_1d, value: p.mat33_2d,
+    ):  # fmt: skip
         """value += (dq/dv) J^T rho J."""
         world, item = wp.tid()
         A = wp.mat33d()
@@ -82,16 +76,9 @@ def constraint_block_kernels(dtype: str) -> KernelSet:
 
     @masked_kernel(module, "active")
     def add_tangent(
-        topo: Topology,
-        pattern: Pattern,
-        pairs: Couplings,
-        con: Constraints,
-        mul: Multipliers,
-        midpoint_factor: f64,
-        dq_dv: double_1d,
-        active: int_1d,
-        value: p.mat33_2d,
-    ):
+        topo: Topology, pattern: Pattern, pairs: Couplings, con: Constraints, mul: Multipliers, midpoint_factor: f64,
+        dq_dv: double_1d, active: int_1d, value: p.mat33_2d,
+    ):  # fmt: skip
         """value += (dq/dv) (J^T rho J + midpoint_factor sum lambda d2c/dq2), as gradients move with u."""
         world, item = wp.tid()
         A = wp.mat33d()

@@ -73,17 +73,9 @@ def load_kernels(dtype: str) -> KernelSet:
 
     @masked_kernel(dead_module, "active")
     def dead_load(
-        start: int_1d,
-        law: int_1d,
-        weight: p.vec3_1d,
-        value: vec3d_2d,
-        lumped: p.scalar_2d,
-        gravity: vec3d_1d,
-        ramp: double_1d,
-        active: int_1d,
-        force: p.vec3_2d,
-        magnitude: p.vec3_2d,
-    ):
+        start: int_1d, law: int_1d, weight: p.vec3_1d, value: vec3d_2d, lumped: p.scalar_2d, gravity: vec3d_1d,
+        ramp: double_1d, active: int_1d, force: p.vec3_2d, magnitude: p.vec3_2d,
+    ):  # fmt: skip
         """Sum of weight x value per slot (Eq. 72), gravity included (Eq. 24), and of the magnitudes."""
         world, slot = wp.tid()
         f = (T(ramp[world]) * lumped[world % lumped.shape[0], slot]) * vec3(gravity[world])
@@ -135,17 +127,9 @@ def load_kernels(dtype: str) -> KernelSet:
 
     @masked_kernel(turn_module, "active")
     def drive_rotation(
-        slot: int_1d,
-        law: int_1d,
-        components: vec3d_1d,
-        arm: vec3d_1d,
-        axis: vec3d_1d,
-        value: vec3d_2d,
-        q_tilde: p.vec3_2d,
-        dq_dv: double_1d,
-        active: int_1d,
-        v: p.vec3_2d,
-    ):
+        slot: int_1d, law: int_1d, components: vec3d_1d, arm: vec3d_1d, axis: vec3d_1d, value: vec3d_2d,
+        q_tilde: p.vec3_2d, dq_dv: double_1d, active: int_1d, v: p.vec3_2d,
+    ):  # fmt: skip
         """`drive_displacement` for u(t) = (R(angle) - I) arm, arm the slot's reference position relative to the anchor
         (Rodrigues)."""
         world, k = wp.tid()
@@ -193,17 +177,10 @@ def body_force_kernel(function: wp.Function, dtype: str, take_dtype: str):
     Block = block_struct(dtype)
 
     def add_body_force(
-        block: Block,
-        members: wp.array(dtype=wp.int32),
-        reference: wp.array(dtype=vec3),
-        origin: wp.vec3d,
-        u: wp.array2d(dtype=vec3),
-        time: wp.array(dtype=f64),
-        ramp: wp.array(dtype=f64),
-        active: wp.array(dtype=wp.int32),
-        offset: int,
-        contribution: wp.array2d(dtype=vec3),
-    ):
+        block: Block, members: wp.array(dtype=wp.int32), reference: wp.array(dtype=vec3), origin: wp.vec3d,
+        u: wp.array2d(dtype=vec3), time: wp.array(dtype=f64), ramp: wp.array(dtype=f64),
+        active: wp.array(dtype=wp.int32), offset: int, contribution: wp.array2d(dtype=vec3),
+    ):  # fmt: skip
         """f_i = sum_q rho w s_i b(r_q, t) of one element."""
         world, k = wp.tid()
         if active[world] == 0:
