@@ -90,14 +90,9 @@ def pressure_kernels(dtype: str) -> KernelSet:
 
     @masked_kernel(pressure_module, "active")
     def pressure_tangent_product(
-        data: FollowerLoads,
-        midpoint_factor: T,
-        u: p.vec3_2d,
-        value: vec3d_2d,
-        active: int_1d,
-        direction: p.vec3_2d,
+        data: FollowerLoads, midpoint_factor: T, u: p.vec3_2d, value: vec3d_2d, active: int_1d, direction: p.vec3_2d,
         contribution: p.vec3_2d,
-    ):
+    ):  # fmt: skip
         """(K + K^T)/2 d, K = df/dq of the pressure force, d a direction; symmetric on a closed surface at uniform p.
 
         `midpoint_factor`: ratio of the stage's displacement increment to that of the step, 1/2 for midpoint schemes.
@@ -232,14 +227,9 @@ def moment_kernels(dtype: str, vectors: int) -> KernelSet:
 
     @masked_kernel(module, "active")
     def moment_tangent_product(
-        data: FollowerLoads,
-        midpoint_factor: T,
-        u: p.vec3_2d,
-        value: vec3d_2d,
-        active: int_1d,
-        direction: p.vec3_2d,
+        data: FollowerLoads, midpoint_factor: T, u: p.vec3_2d, value: vec3d_2d, active: int_1d, direction: p.vec3_2d,
         contribution: p.vec3_2d,
-    ):
+    ):  # fmt: skip
         """(K + K^T)/2 d with K = df/dq, d a direction; `midpoint_factor`: as of `pressure_tangent_product`."""
         world, item = wp.tid()
         m = (midpoint_factor * data.moment_fraction[item]) * vec3(value[world, data.time_law[item]])
