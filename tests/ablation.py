@@ -103,6 +103,7 @@ CONSTANTS: dict[str, Constant] = {
     "SOLVES_WITHOUT_STEP": Constant(NEWTON_PCG, "solves", 1000000),
     "DISPLACEMENT_ROUNDINGS": Constant(NEWTON_PCG, "roundings of the displacements", 0.0),
     "ALTERNATIVE_START_FORCING": Constant(NEWTON_PCG, "1", 1.0e-3),
+    "MAX_START_ENERGY_RATIO": Constant(NEWTON_PCG, "kinetic energies", 1.0),
     "CONSTRAINT_FORCING": Constant(NEWTON_PCG, "1", 1.0),
     "UNCHECKED_ITERATIONS": Constant(NEWTON_PCG, "iterations", 0),
     "MIN_ENERGY_GAIN": Constant(NEWTON_PCG, "1", 0.0),

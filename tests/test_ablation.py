@@ -57,8 +57,9 @@ def test_mechanisms_are_needed(name):
 
 UNPROVEN = {
     "CONSTRAINT_FORCING": "a chain of 100 joints takes 2.0 Newton iterations a step with it, 2.55 without",
-    "ALTERNATIVE_START_FORCING": "a slider-crank takes 4.6 Newton iterations a step with it, 5.0 without",
-    "GROUP_ROUNDINGS": "the same takes 4.6 with it, 5.4 without",
+    "ALTERNATIVE_START_FORCING": "of single extreme cases, as below",
+    "GROUP_ROUNDINGS": "a slider-crank takes 5.1 Newton iterations a step with it, 5.7 without",
+    "MAX_START_ENERGY_RATIO": "a slow test fails without it: a column that buckles in float32",
     "PREDICTOR_ROUNDINGS": "for runs of a million steps, which ablations leave out",
     "MAX_EXTRAPOLATED_GROWTH": "for the same",
     **dict.fromkeys(("NEW_MATRIX_DECADES", "REDUCTION_FADING", "DIAGONAL_AGEING", "UNCHECKED_ITERATIONS"),

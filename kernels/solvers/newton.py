@@ -35,6 +35,8 @@ DISPLACEMENT_ROUNDINGS = 64.0
 """Roundings of the displacements below which an error is negligible, whatever the reference energy."""
 ALTERNATIVE_START_FORCING = 0.1
 """Forcing term of the first solve after an alternative first iterate, far from the end: a tighter one is wasted."""
+MAX_START_ENERGY_RATIO = 3.0
+"""Strain energy increase of a first iterate, in kinetic energies, above which other first iterates are tried."""
 
 
 @functools.cache
@@ -99,15 +101,18 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
 
     @wp.func
     def is_poor_first_iterate(ctl: Control, world: int) -> bool:
-        """True if other first iterates should be tried: Phi exceeds that at q_n, or J <= 0.
+        """True if other first iterates should be tried: Phi exceeds a bound of Phi at q_n, or J <= 0.
 
-        At q_n it is the strain energy of the state plus a kinetic energy (`ROW_KINETIC` of `residual`): all of it for
+        At q_n Phi is the strain energy of the state plus a kinetic energy (`ROW_KINETIC` of `residual`): all of it for
         backward Euler, a third for BDF2.
         """
         phi = convergence.objective(ctl, world)
         if wp.static(traits.midpoint):
             return not (wp.isfinite(phi) and ctl.min_J[world] > f64(0.0))
-        bound = ctl.strain_energy[world] / ctl.dq_dv[world] + ctl.slot_sums[ROW_KINETIC, world]
+        bound = (
+            ctl.strain_energy[world] / ctl.dq_dv[world]
+            + f64(MAX_START_ENERGY_RATIO) * ctl.slot_sums[ROW_KINETIC, world]
+        )
         bound += f64(PHI_NOISE_ROUNDINGS) * ctl.floor.eps * convergence.objective_magnitude(ctl, world)
         return not (phi <= bound and wp.isfinite(phi) and ctl.min_J[world] > f64(0.0))
 
