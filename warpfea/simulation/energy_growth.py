@@ -80,7 +80,7 @@ class EnergyGrowth:
         step.residual_work_counted = float(not list_drives(model))
         self._model, self._rows = model, rows
         self._round_off_energy = wp.zeros(model.worlds, dtype=wp.float64, device=model.device)
-        self._parameter_writes_seen, self._writes = model.terms.parameter_updates, model.terms.world_updates
+        self._writes = model.terms.world_updates
         self._round_off_energy.assign(round_off_energy(model))
         step.growth_warn_limit = WARN_LIMIT
         step.growth_limit = REFUSE_LIMIT if self.choice == "refuse" else np.inf
@@ -88,11 +88,10 @@ class EnergyGrowth:
 
     def restart_changed(self) -> None:
         """Restart in worlds whose parameters were set: the energy jump is not the integrator's."""
-        if not self.monitored or self._parameter_writes_seen == self._model.terms.parameter_updates:
+        if not self.monitored:
             return
         writes = self._model.terms.world_updates
         chosen, self._writes = writes > self._writes, writes
-        self._parameter_writes_seen = self._model.terms.parameter_updates
         set_rows(self._rows, chosen, 0.0)
         self._round_off_energy.assign(round_off_energy(self._model))
 
