@@ -312,7 +312,7 @@ def test_commands_tell_of_contacts(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     summary = json.loads(command(capfd, "run", "mine.py:slide", "--device", "cpu", "--json", "-"))
     pad = summary["contacts"]["pad0"]
-    assert set(pad) == {"normal_force", "penetration", "force", "area", "stick"}
+    assert set(pad) == {"normal_force", "penetration", "relative_penetration", "force", "area", "stick"}
     assert pad["normal_force"] > 10.0
     assert 0.005 < pad["area"] < 0.016
     assert len(pad["force"]) == 3

@@ -39,6 +39,8 @@ LESS_DISSIPATION = {
 """Suggestion for large numerical dissipation."""
 ADDED_ENERGY = "--integrator bdf2 or 'energy_momentum(rho_inf=0.8)', or a smaller --dt"
 """Suggestion after a warning that generalized-alpha adds energy."""
+MAX_PENETRATION = 0.01
+"""Depth of a contact over the size of its smallest element above which the summary warns."""
 NO_MIN_J = 1e30
 """Reported min J without elements that have one."""
 
@@ -57,9 +59,9 @@ def summarize(
     residual rounding stopped above it, and `max_floor` the largest error that was estimated there
     (`StepReport.floor`),
     0 without such steps; energies and probes are the last values, of statics the strain energy alone; `violation` is
-    the largest of the constraints in any step, m; `contacts` has by name the largest normal_force, N, and penetration,
-    m, of any step, and the last force, N, area, m^2, and stick; `stable` is the stability of the static equilibrium,
-    null if unknown.
+    the largest of the constraints in any step, m; `contacts` has by name the largest normal_force, N, penetration, m,
+    and relative_penetration (over the size of its smallest element) of any step, and the last force, N, area, m^2, and
+    stick; `stable` is the stability of the static equilibrium, null if unknown.
     """
     setup_s = min(sim.compile_s if setup_s is None else setup_s, wall_s)
     output_s = min(sim.output_s, wall_s - setup_s)
@@ -146,7 +148,7 @@ def summary_text(summary: dict[str, Any], sim: Simulation, wrote: Sequence[str])
         u = ", ".join(_number_text(x) for x in values["displacement"])
         rows.append([f"probe {name}", f"displaced by ({u}) m"])
     rows += _joint_rows(sim)
-    rows += _contact_rows(s["contacts"])
+    rows += _contact_rows(s["contacts"]) + _penetration_rows(s["contacts"], static=s["load"] is not None)
     rows += [["wrote" if k == 0 else "", text] for k, text in enumerate(wrote)]
     return format_table(rows)
 
@@ -237,6 +239,8 @@ def _contact_values(sim: Simulation) -> dict[str, Any]:
         record = sim.contact_record(contact)
         if record.time.size:
             largest = {name: np.nanmax(getattr(record, name)[0]) for name in ("normal_force", "penetration")}
+            size = sim.records.element_size(contact) if largest["penetration"] > 0.0 else 1.0
+            largest["relative_penetration"] = largest["penetration"] / size
             out[contact.name] = largest | {name: getattr(record, name)[0, -1] for name in ("force", "area", "stick")}
     return out
 
@@ -254,6 +258,17 @@ def _contact_rows(contacts: dict[str, Any]) -> list[list[str]]:
     if len(rows) < len(contacts):
         rows.append(["contacts", f"{len(contacts)} in all, of which these have the largest forces"])
     return rows
+
+
+def _penetration_rows(contacts: dict[str, Any], *, static: bool) -> list[list[str]]:
+    """A warning for each contact that is deeper than `MAX_PENETRATION`, of many the deepest ones."""
+    deep = {name: c["relative_penetration"] or 0.0 for name, c in contacts.items()}
+    names = sorted((name for name in deep if deep[name] > MAX_PENETRATION), key=lambda name: -deep[name])
+    cure = "take a higher stiffness= of the contact" + (
+        "" if static else ", or a smaller dt if it is deep in an impact"
+    )
+    return [["WARNING", f"contact {name!r}: penetration of up to {deep[name]:.2g} of its smallest element; {cure}"]
+            for name in names[:SHOWN_ROWS]]  # fmt: skip
 
 
 def _number_text(value: float | None, digits: int = 4) -> str:

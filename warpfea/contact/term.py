@@ -8,6 +8,7 @@ geometry.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,8 +19,15 @@ from ..base.launch import Launcher
 from ..kernels.contact.assembly import AITKEN_LANES, block_kernels, contact_kernels
 from ..kernels.contact.double_displacements import double_displacement_kernels
 from ..kernels.contact.ledger import ENERGY_COLUMNS, RECORD_LANES, contact_ledger_kernels
-from ..kernels.contact.structs import RECORD_NAMES, clock_struct, contact_scratch_struct, history_struct
+from ..kernels.contact.structs import (
+    PENETRATION_ROW,
+    RECORD_NAMES,
+    clock_struct,
+    contact_scratch_struct,
+    history_struct,
+)
 from ..kernels.solvers.newton_control import FAIL_ROUNDOFF, FAIL_WORK
+from ..model.contact_points import element_edge_and_depth
 from ..model.state import State
 from ..terms.protocols import Diagnosed, Parametrised, Preconditioned, Touching, Updated
 from ..terms.term import LOSS, NUMERICAL, STORED, WORK, Column, StepContext, part
@@ -305,6 +313,23 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
 
     def contact_column(self, contact: Any) -> int:
         return self.report_offset + len(RECORD_NAMES) * self.tables.number[contact.index]
+
+    @cached_property
+    def element_sizes(self) -> np.ndarray:
+        """Smallest edge of a face, and smallest depth of an element behind it, of each contact in device order,
+        (contacts, 2), m."""
+        of_contact = [[(side.body.index, side.faces.tobytes()) for side in c.surfaces] for c in self.tables.contacts]
+        sides = {key: side for keys, c in zip(of_contact, self.tables.contacts) for key, side in zip(keys, c.surfaces)}
+        least = {key: np.min(element_edge_and_depth(side), axis=1) for key, side in sides.items()}
+        return np.array([np.min([least[key] for key in keys], axis=0) for keys in of_contact])
+
+    def element_size(self, contact: Any) -> float:
+        return float(self.element_sizes[self.tables.number[contact.index]].min())
+
+    def relative_penetration(self, rows: np.ndarray) -> np.ndarray:
+        first = self.report_offset + PENETRATION_ROW
+        depth = rows[:, first : first + self.report_columns : len(RECORD_NAMES)]
+        return np.asarray(depth / self.element_sizes.min(axis=1)) if depth.any() else depth
 
     def stored_energy(self, ctx: StepContext) -> dict[str, np.ndarray]:
         """Stored energy according to the history, by points."""

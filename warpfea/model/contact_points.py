@@ -28,6 +28,7 @@ __all__ = [
     "contact_points",
     "corner_points",
     "effective_modulus",
+    "element_edge_and_depth",
     "lagrange_basis",
     "points_by_rules",
 ]
@@ -154,6 +155,19 @@ def check_contact_points(surface: SurfaceSet, points: Any) -> None:
                 f"points = {points!r}: the faces of body {surface.body.name!r} ({family.name}) are {faces}, which have "
                 f"rules of {numbers} points; None takes {DEFAULT_POINTS[corners]}"
             )
+
+
+def element_edge_and_depth(surface: SurfaceSet) -> tuple[np.ndarray, np.ndarray]:
+    """Edge of each face of a surface, and depth of the element behind it, both (F,), m.
+
+    Edge of a square of the face's area (of a triangle: of twice its area), and volume over that area (of a tetrahedron
+    its height), in the reference.
+    """
+    body, faces = surface.body, surface.faces
+    area = assembly.facet_positions_and_areas(body, assembly.facet_tables(surface))[1].sum(axis=1)
+    triangle = np.array([len(face) == 3 for face in body.family.faces])[faces[:, 1]]
+    volume = assembly.element_volumes(body)[faces[:, 0]]
+    return np.sqrt(np.where(triangle, 2.0, 1.0) * area), np.where(triangle, 3.0, 1.0) * volume / area
 
 
 def effective_modulus(

@@ -100,5 +100,10 @@ class Contact(ContactOptions):
         """The body of the surface."""
         return self.surface.body
 
+    @property
+    def surfaces(self) -> tuple[SurfaceSet, ...]:
+        """Surfaces of bodies in the contact."""
+        return (self.surface,)
+
     def __repr__(self) -> str:
         return f"Contact({self.name!r}, body {self.body.name!r} with collider {self.collider.name!r})"

@@ -53,6 +53,11 @@ class PairContact(ContactOptions):
         """The body of the slave surface."""
         return self.slave.body
 
+    @property
+    def surfaces(self) -> tuple[SurfaceSet, ...]:
+        """Surfaces of bodies in the contact."""
+        return self.slave, self.master
+
     def __repr__(self) -> str:
         return f"PairContact({self.name!r}, bodies {self.first.body.name!r} and {self.second.body.name!r})"
 

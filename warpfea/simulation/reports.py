@@ -58,6 +58,8 @@ class StepReport:
         violation: largest constraint violation, m.
         energy_growth: net energy gain of the integrator since the start, over the largest kinetic + strain + contact
             energy plus the sum of |work|; 0 if not monitored.
+        penetration: largest depth of a contact point in the step, over the size of the smallest element of its contact
+            (edge of a face, or depth of the element behind it, on both bodies); 0 without contact.
         outer: multiplier updates; with multipliers="newton" one per Newton iteration.
         stable: statics at full load: objects True, False, or None if unknown (reason: `StaticResult.stability`). None
             in place of the array without a stability analysis.
@@ -79,6 +81,7 @@ class StepReport:
     residual_force: np.ndarray
     floor: np.ndarray
     energy_growth: np.ndarray
+    penetration: np.ndarray
     substeps: np.ndarray | None = None
     rejected: np.ndarray | None = None
     least_h: np.ndarray | None = None
@@ -180,7 +183,7 @@ def idle_report(sim: Any) -> StepReport:
     count = sim.model.worlds
     zero, none = np.zeros(count, int), np.zeros(count)
     counts = (zero, zero, none, zero, sim.status, none, sim.time, zero, none, zero)
-    return StepReport(sim.status == 0, *counts, none, none, none)
+    return StepReport(sim.status == 0, *counts, none, none, none, none)
 
 
 def step_text(dt: Any) -> str:
@@ -288,6 +291,9 @@ class RunStatistics:
         column = {name: rows[:, k].copy() for k, name in enumerate(REPORT_COLUMNS)}
         column |= {name: column[name].astype(int) for name in COUNT_COLUMNS}
         column["converged"] = (column["status"] == STATUS["running"]) & (column["rough"] == 0.0)
+        column["penetration"] = np.zeros(len(rows))
+        for term in self.sim.model.terms.contacts:
+            column["penetration"] = np.maximum(column["penetration"], term.relative_penetration(rows).max(axis=1))
         known = {entry.name: column[entry.name] for entry in fields(StepReport) if entry.name in column}
         control = self.stepper.step_size_control
         return StepReport(**known, **(control.step_statistics() if control else {}))

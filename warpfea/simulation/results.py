@@ -22,6 +22,7 @@ from ..model.pairs import PairContact
 from ..model.state import State
 from ..model.surfaces import reference_points
 from ..terms.evaluation import field_at_nodes, field_at_points, find_field
+from ..terms.protocols import Touching
 from ..terms.term import FieldSpec
 from .reports import ContactRecord, JointRecord, ProbeRecord
 
@@ -284,9 +285,18 @@ class Records:
 
     def contact_column(self, contact: Contact | PairContact | str) -> int:
         """First report column of a contact."""
-        known = _find("contact", contact, self.model.description.contacts, "a handle from add_contact, or a name")
-        term = next(term for term in self.model.terms.contacts if known in term.tables.contacts)
+        term, known = self._find_contact(contact)
         return term.contact_column(known)
+
+    def element_size(self, contact: Contact | PairContact | str) -> float:
+        """Size, m, that `StepReport.penetration` divides the depth of a contact by."""
+        term, known = self._find_contact(contact)
+        return term.element_size(known)
+
+    def _find_contact(self, contact: Contact | PairContact | str) -> tuple[Touching, Any]:
+        """Term and handle of a contact."""
+        known = _find("contact", contact, self.model.description.contacts, "a handle from add_contact, or a name")
+        return next(term for term in self.model.terms.contacts if known in term.tables.contacts), known
 
 
 def _find(kind: str, given: Any, things: Sequence[Any], handle: str) -> Any:

@@ -216,5 +216,14 @@ class Touching(Term):
         """First report column of one of its contacts."""
         raise NotImplementedError
 
+    def element_size(self, contact: Any) -> float:
+        """Size of the smallest element of one of its contacts, m."""
+        raise NotImplementedError
+
+    def relative_penetration(self, rows: np.ndarray) -> np.ndarray:
+        """Largest depth of each contact over the size of its smallest element, (worlds, contacts), from report rows
+        (worlds, columns)."""
+        raise NotImplementedError
+
 
 PROTOCOLS = (Tied, Updated, Constrained, Preconditioned, Coupled, Parametrised, Diagnosed, Touching)
