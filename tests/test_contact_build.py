@@ -61,7 +61,7 @@ def test_contact_with_its_defaults(scene):
     assert (c.name, c.index, c.body, c.collider) == ("block on floor", 0, block, floor)
     np.testing.assert_array_equal(c.surface.faces, block.boundary)
     assert (c.mu, c.mu_static, c.restitution, c.stiffness) == (0.0, 0.0, 1.0, 1.0)
-    assert (c.law, c.treatment, c.model, c.overlap) == ("default", "implicit", "patch", "refuse")
+    assert (c.law, c.treatment, c.model, c.overlap) == ("default", "implicit", "patch", "auto")
     assert (c.radius, c.points, c.smoothing, c.offset, c.overlap_time) == (None, None, None, 0.0, 0.1)
     assert b.description.contacts == [c]
     assert b.add_contact(block, floor).name == "block on floor_2"
@@ -142,7 +142,7 @@ BAD = {
     "law": (contact(law="papper"), r"law = 'papper' is none of 'default', 'paper', 'smooth'; did you mean 'paper'"),
     "model": (contact(model="points"), r"'pad': model = 'points' is none of 'patch', 'sphere'"),
     "treatment": (contact(treatment="semi"), r"'pad': treatment = 'semi' is none of 'implicit', 'explicit'"),
-    "overlap": (contact(overlap="push"), r"'pad': overlap = 'push' is none of 'refuse', 'offset'"),
+    "overlap": (contact(overlap="push"), r"'pad': overlap = 'push' is none of 'auto', 'refuse', 'offset'"),
     "explicit": (contact(treatment="explicit"), r"'explicit': law 'default' declares no explicit force; 'paper' does"),
     "points": (contact(points=6), r"'pad': points = 6: the faces of body 'block' \(T10\) are triangles.* 3, 7 points"),
     "points text": (contact(points="many"), r"'pad': points = 'many': the faces"),

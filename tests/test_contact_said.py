@@ -1,9 +1,11 @@
 """Words of contact: depth over the element size, overlaps at the start, bodies that nobody named."""
 
 import json
+import warnings
 
 import numpy as np
 import pytest
+from triangle_meshes import octahedron, sheet
 
 import warpfea as wf
 from warpfea.cli import main
@@ -78,3 +80,153 @@ def test_commands_warn_of_deep_contact(static, tmp_path, monkeypatch, capfd):
     assert ("or a smaller dt" in out) != static
     assert main([*words, "--set", "stiffness=1000"]) == 0
     assert "WARNING" not in capfd.readouterr().out
+
+
+# overlaps at the start
+
+
+def block_on(collider, map=None, cells=(2, 2, 2), origin=(0.0, 0.0, 0.0), **options):
+    """A block of 0.1 m on an obstacle: simulation, body, contact."""
+    b = wf.ModelBuilder()
+    mesh = wf.mesh.box((0.1, 0.1, 0.1), cells=cells, element="T4", origin=origin, map=map)
+    block = b.add_solid(mesh, material=SOFT, name="block")
+    pad = b.add_contact(block.surface("z-"), b.add_collider(collider, name="base"), stiffness=10, name="pad", **options)
+    return wf.Simulation(b.finalize(device="cpu"), dt=1e-3), block, pad
+
+
+def test_a_curve_laid_on_its_like_begins_stored():
+    """Chords of an arc lie R (1 - cos(h/2R)) within the cylinder that the nodes are on."""
+    R = 0.25
+
+    def bend(X):
+        angle, r = X[:, 0] / R, R + X[:, 2]
+        return np.column_stack([r * np.sin(angle), X[:, 1], r * np.cos(angle)])
+
+    depth = R * (1.0 - np.cos(0.05 / 2 / R))
+    drum = wf.Cylinder((0, -1, 0), (0, 1, 0), R)
+    text = rf"contact 'pad': body 'block' begins {depth:.3g} m inside collider 'base' .*it is stored.*overlap='offset'"
+    with pytest.warns(wf.ModelWarning, match=text):
+        sim, block, pad = block_on(drum, bend, origin=(-0.05, 0, 0))
+    assert sim.step(20).converged.all()
+    assert sim.contact_record(pad).penetration.max() < 0.2 * depth
+    assert np.abs(sim.velocities(block)).max() < 3.0 * depth / 0.1  # it decays in overlap_time
+    with pytest.raises(wf.ModelError, match="begins"):
+        block_on(drum, bend, origin=(-0.05, 0, 0), overlap="refuse")
+
+
+@pytest.mark.parametrize("pair", [False, True])
+def test_overlaps_are_stored_up_to_five_percent_of_an_edge(pair):
+    def begin(depth, **options):
+        if not pair:
+            return block_on(wf.HalfSpace((0, 0, 1), depth), **options)[0]
+        b = wf.ModelBuilder()
+        low, top = (b.add_solid(wf.mesh.box((0.1,) * 3, cells=(2, 2, 2), origin=(0, 0, z), element="T4"), material=SOFT)
+                    for z in (0.0, 0.1 - depth))  # fmt: skip
+        b.add_contact(top.surface("z-"), low.surface("z+"), name="pad", **options)
+        return wf.Simulation(b.finalize(device="cpu"), dt=1e-3)
+
+    with pytest.warns(wf.ModelWarning, match=r"begins 0\.0024 m inside"):
+        sim = begin(0.0024)
+    assert sim.step().penetration < 1e-2
+    with pytest.raises(wf.ModelError, match=r"begins 0\.0026 m inside .*stores up to 0\.0025 m.*overlap='offset'"):
+        begin(0.0026)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", wf.ModelWarning)
+        begin(0.0026, overlap="offset")
+        begin(1e-8)  # rounded coordinates: stored, without a word
+
+
+# triangle meshes of rounded coordinates
+
+
+def soup(points, triangles, noise):
+    """Triangles with three points each, with noise."""
+    corners = points[triangles].reshape(-1, 3)
+    noise = noise * np.random.default_rng(1).standard_normal(corners.shape)
+    return corners + noise, np.arange(len(corners)).reshape(-1, 3)
+
+
+def test_a_noisy_soup_is_closed():
+    points, triangles = octahedron()
+    mesh = wf.TriMesh(*soup(points, triangles, 1e-8))
+    assert mesh.closed
+    assert len(np.unique(mesh.points, axis=0)) == 6
+    np.testing.assert_allclose(mesh.volume, 4.0 / 3.0, rtol=1e-6)
+    assert not wf.TriMesh(*soup(points, triangles, 1e-4)).closed
+    ends = np.concatenate([points, [points[0] + 1e-7]])  # a needle of 1e-7 m at a corner
+    needle = wf.TriMesh(ends, np.concatenate([triangles, [(0, 6, triangles[0, 1])]]))
+    assert len(needle.triangles) == len(triangles)
+
+
+def test_a_block_rests_on_a_noisy_sheet():
+    points, triangles = sheet(6, 0.6, 0.0)
+    found = []
+    for mesh in (wf.TriMesh(points, triangles), wf.TriMesh(*soup(points, triangles, 1e-9))):
+        sim, block, pad = block_on(mesh, overlap="refuse")
+        assert sim.step(30).converged.all()
+        assert sim.contact_record(pad).normal_force.max() > 1.0
+        found.append(sim.displacements(block))
+    np.testing.assert_allclose(*found, atol=1e-7)
+
+
+# all pairs
+
+
+def row_of_bodies(count, gap=1e-3):
+    """Cubes of 0.1 m beside each other on a floor, and the floor."""
+    b = wf.ModelBuilder()
+    bodies = []
+    for k in range(count):
+        mesh = wf.mesh.box((0.1,) * 3, cells=(1, 1, 1), element="T4", origin=((0.1 + gap) * k, 0, 0))
+        bodies.append(b.add_solid(mesh, material=SOFT, name=f"cube{k}"))
+    return b, bodies, b.add_collider(wf.HalfSpace((0, 0, 1)), name="floor")
+
+
+def sides(contact):
+    return {contact.first.body, contact.second.body} if hasattr(contact, "first") else {contact.body, contact.collider}
+
+
+def test_all_pairs_are_named_once():
+    b, bodies, floor = row_of_bodies(4, gap=0.0)
+    roof = b.add_collider(wf.Sphere((0, 0, 9), 1.0), name="roof")
+    named = [b.add_contact(bodies[2].surface("x+"), bodies[3]), b.add_contact(bodies[1], floor)]
+    b.weld(bodies[0].surface("x+"), bodies[1])
+    b.add_joint("spherical", parent=bodies[1].surface("x+"), child=bodies[2].surface("x-"))
+    rod = (bodies[0].surface("x+"), bodies[3].surface("x-"))
+    b.add_joint("distance", parent=rod[0], child=rod[1])
+    b.clamp(bodies[3].nodes(lambda X: X[:, 2] > -1.0))
+    added = b.add_contact_all(mu=0.3, restitution=0.5)
+    expected = [(0, 2), (0, 3), (1, 3), (0, floor), (0, roof), (1, roof), (2, floor), (2, roof)]
+    wanted = [{bodies[j], bodies[k] if isinstance(k, int) else k} for j, k in expected]
+    assert [sides(contact) for contact in added] == wanted
+    assert b.description.contacts == named + added
+    assert {(c.mu, c.restitution) for c in added} == {(0.3, 0.5)}
+    assert added[0].name == "cube0 on cube2"
+    assert b.add_contact_all() == []
+    assert len(b.finalize(device="cpu").description.contacts) == 10
+
+
+def test_all_pairs_that_are_no_pairs_are_refused():
+    b, _, _ = row_of_bodies(1)
+    b.description.colliders.clear()
+    with pytest.raises(wf.ModelError, match=r"add_contact_all: there is no pair yet \(Body\('cube0'"):
+        b.add_contact_all()
+    b, _, _ = row_of_bodies(3)
+    with pytest.raises(wf.ModelError, match="add_contact_all: name = names one contact"):
+        b.add_contact_all(name="pad")
+    with pytest.raises(NotImplementedError, match="law = 'smooth' acts at any distance"):
+        b.add_contact_all(law="smooth")
+    with pytest.raises(TypeError, match="stifness"):
+        b.add_contact_all(stifness=2.0)
+    assert b.description.contacts == []
+
+
+def test_all_pairs_hold():
+    """The second of three falls onto the first, all on a floor."""
+    b, bodies, _ = row_of_bodies(2)
+    top = b.add_solid(wf.mesh.box((0.1,) * 3, cells=(1, 1, 1), element="T4", origin=(0, 0, 0.101)), material=SOFT)
+    b.add_contact_all(mu=0.3, restitution=0.3, stiffness=10.0)
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=2e-3)
+    assert sim.step(100).converged.all()
+    assert sim.positions(top)[0, :, 2].min() > 0.095
+    assert sim.positions(bodies[1])[0, :, 2].min() > -0.005

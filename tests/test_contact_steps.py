@@ -103,7 +103,7 @@ def test_touch_at_the_start_is_fine_and_overlap_is_not():
     assert sim.step(3).converged.all()
     text = r"'pad': body 'cube' begins 0.002 m inside collider 'floor' \(world 0.*overlap='offset'"
     with pytest.raises(wf.ModelError, match=text):
-        resting(0.002)
+        resting(0.002, overlap="refuse")
 
 
 def test_a_stored_overlap_decays():

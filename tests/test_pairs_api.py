@@ -278,7 +278,7 @@ def test_two_surfaces_that_are_clamped_are_refused():
 
 def test_overlap_at_the_start_is_refused_or_decays():
     depth = 1e-3
-    b, _, _ = blocks(place=(0.05, 0.05, 0.1 - depth))
+    b, _, _ = blocks(place=(0.05, 0.05, 0.1 - depth), overlap="refuse")
     with pytest.raises(wf.ModelError, match=r"contact 'pad': body '\w+' begins 0.001 m inside body '\w+'"):
         wf.Simulation(b.finalize(device="cpu"), dt=1e-3)
     b, _, block = blocks(place=(0.05, 0.05, 0.1 - depth), overlap="offset", overlap_time=0.05, gravity=(0, 0, 0))

@@ -15,7 +15,7 @@ import warp as wp
 
 from ..common.modules import KernelSet, kernel_set
 
-__all__ = ["BOUNDARY", "FLAT", "SHARP", "mesh_functions", "mesh_struct"]
+__all__ = ["BOUNDARY", "FLAT", "SHARP", "SIDE_TOLERANCE", "mesh_functions", "mesh_struct"]
 
 SHARP, FLAT, BOUNDARY = range(3)
 """Edge between triangles of different planes, of one plane, or of a single triangle."""

@@ -11,13 +11,10 @@ from ..base.errors import ModelError
 from ..elements.sections import Rectangle
 from ..materials import Material
 from ..model.bodies import Body
-from ..model.contacts import Collider, Contact
 from ..model.description import BodyForce, Description
 from ..model.handles import MaterialPoint, NodeSet, SurfaceSet
 from ..model.joints import Joint
 from ..model.model import Model
-from ..model.pairs import PairContact
-from ..model.shapes import Shape
 from ..terms.term import Term
 from ..terms.term_set import TermSet
 from ..time_laws import Rotation
@@ -26,14 +23,14 @@ from .attachments import Ground
 from .beams import beam_geometry
 from .bodies import MeshLike, as_mesh, make_solid, make_structure, shell_geometry, unused_name
 from .checks import body_of_handle, check_densities, parse_gravity, warn_implausible
-from .contacts import add_contact, make_collider
+from .contact_methods import ContactMethods
 from .joints import make_constraint, make_joint
 from .welds import make_weld
 
 __all__ = ["ModelBuilder"]
 
 
-class ModelBuilder:
+class ModelBuilder(ContactMethods):
     """Collects bodies, supports and loads; `finalize` makes a Model.
 
     Args:
@@ -345,65 +342,6 @@ class ModelBuilder:
     def _record_joint(self, joint: Joint) -> Joint:
         self.description.joints.append(joint)
         return joint
-
-    # contact
-
-    def add_collider(self, shape: Shape, path: Any = None, name: str | None = None) -> Collider:
-        """Add a rigid obstacle; it acts on bodies through `add_contact`.
-
-        Args:
-            shape: HalfSpace, Sphere, Box, Capsule, Cylinder or TriMesh, placed at displacement 0.
-            path: time law of its displacement (3,), m, or a Rotation; None: it is fixed.
-            name: unique name; by default the shape's.
-
-        Raises:
-            ModelError: not a shape, a non-finite path, or a name used twice.
-        """
-        collider = make_collider(self.description, shape, path, name)
-        self.description.colliders.append(collider)
-        return collider
-
-    def add_contact(
-        self, surface: Body | SurfaceSet, collider: Collider | Any = None, *, mu: float = 0.0,
-        mu_static: float | None = None, restitution: float = 1.0, law: str = "default", treatment: str = "implicit",
-        stiffness: float | None = None, model: str = "patch", radius: float | None = None, offset: float = 0.0,
-        points: int | None = None, smoothing: Any = None, overlap: str = "refuse", overlap_time: float = 0.1,
-        name: str | None = None,
-    ) -> Contact | PairContact:  # fmt: skip
-        """Define contact of a body, or a surface of it, with a collider or another body.
-
-        Args:
-            surface: outer faces; of a body all.
-            collider: as `add_collider` returned it; or another body, or a surface of it.
-            mu, mu_static: coefficients of friction in slip, and in stick if it is larger.
-            restitution: speed after an impact over that before, 0 < restitution <= 1.
-            law: "default", "paper" (Paper I, Eqs. 72-83) or "smooth".
-            treatment: "implicit", or "explicit" with the paper's law.
-            stiffness: factor on the normal and the tangential stiffness; None: 1.
-            model: "patch", spread over the surface, or "sphere", one contact at the deepest place, by Hertz.
-            radius: m; "patch": disc whose area replaces the surface's; "sphere": local radius of the body.
-            offset: gap at which contact begins, m.
-            points: points of each face, see warpfea.model.contact_points; by default 7 or 4 x 4, between bodies 16.
-            smoothing: "paper": depth over which its damping is ramped in, m; "smooth": (eps in N, v_eps in m/s).
-            overlap: initial overlap: "refuse", or "offset": stored and decaying in `overlap_time`, s (statics: load
-                factor).
-            name: unique name; by default "BODY on COLLIDER".
-
-        Bodies without a contact pass through each other. Between two, reported forces act on the first.
-
-        Returns:
-            Contact, PairContact: the handle for reports.
-
-        Raises:
-            ModelError: a value out of range, an unknown name, no faces, or a handle of another builder.
-            NotImplementedError: a body with itself, model = "sphere" or law = "smooth" between bodies.
-        """
-        for side in (surface, collider) if isinstance(collider, (Body, SurfaceSet)) else (surface,):
-            self._check_owner(side, "add_contact", Body, SurfaceSet)
-        options = dict(mu=mu, mu_static=mu_static, restitution=restitution, law=law, treatment=treatment,
-                       stiffness=stiffness, model=model, radius=radius, offset=offset, points=points,
-                       smoothing=smoothing, overlap=overlap, overlap_time=overlap_time)  # fmt: skip
-        return add_contact(self.description, surface, collider, name, **options)
 
     def finalize(self, *, device: Any = None, dtype: str = "float64", worlds: int = 1, many: bool | None = None
                  ) -> Model:  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
+from itertools import combinations, product
 from typing import Any
 
 import numpy as np
@@ -24,11 +25,11 @@ from ..time_laws import Rotation, time_law
 from .bodies import unused_name
 from .checks import checked_rotation
 
-__all__ = ["add_contact", "make_collider"]
+__all__ = ["add_contact", "make_collider", "pairs_without_contact"]
 
 TIME_TREATMENTS = ("implicit", "explicit")
 CONTACT_MODELS = ("patch", "sphere")
-OVERLAP_OPTIONS = ("refuse", "offset")
+OVERLAP_OPTIONS = ("auto", "refuse", "offset")
 SHAPE_NAMES = f"{', '.join(SHAPE_KINDS[:-1])} or {SHAPE_KINDS[-1]}"
 
 
@@ -143,6 +144,27 @@ def make_pair(
             )
     o["points"] = None if points is None else int(points)
     return PairContact(a, b, name, slave, master, index=len(d.contacts_of(PairContact)), **o)
+
+
+def pairs_without_contact(d: Description, options: Collection[str]) -> list[tuple[Body, Body | Collider]]:
+    """Pairs that `ModelBuilder.add_contact_all` adds. ModelError for the option `name`, or where there is no pair."""
+    if "name" in options:
+        raise ModelError("add_contact_all: name = names one contact; leave it out: names are 'BODY on OTHER'")
+    if len(d.bodies) + len(d.colliders) < 2 or not d.bodies:
+        raise ModelError(
+            f"add_contact_all: there is no pair yet ({d.summary() or 'no bodies'}): call it after bodies and colliders"
+        )
+    known = d.contact_pairs | d.attached_pairs
+    clamped = {id(body) for body in d.bodies if d.clamped_slots(body).all()} | {
+        id(collider) for collider in d.colliders
+    }
+    others: list[tuple[Body, Body | Collider]] = list(combinations(d.bodies, 2))
+    pairs = [*others, *product(d.bodies, d.colliders)]
+    return [
+        (body, other)
+        for body, other in pairs
+        if frozenset({id(body), id(other)}) not in known and not {id(body), id(other)} <= clamped
+    ]
 
 
 KINDS: dict[type, Callable[..., Contact | PairContact]] = {

@@ -11,6 +11,7 @@ import warp as wp
 from ..base.errors import ModelError
 from ..base.worlds import set_rows
 from ..kernels.contact.collider_kinematics import MAX_COLLIDER_ROTATION, pose_kernels
+from ..kernels.contact.collider_mesh import SIDE_TOLERANCE
 from ..kernels.contact.collider_sheets import sheet_kernels
 from ..kernels.contact.deepest_point import deepest_point_kernels
 from ..kernels.contact.structs import collider_struct
@@ -111,22 +112,38 @@ class ColliderContact(ContactTerm):
         gap = evaluate_points(self, state, history, places=False)[0]
         touching = touching_depth(self.model.size, state.displacement.numpy())
         if self.tables.has_sheets and new.any():
-            self._check_sheet_sides(ctx, touching, new)
+            self._settle_sheet_sides(ctx, touching, new)
         store_overlaps(self, np.where(new[:, None], -gap, 0.0), touching, overlap)
         history.overlap.assign(overlap)
 
-    def _check_sheet_sides(self, ctx: StepContext, tolerance: np.ndarray, new: np.ndarray) -> None:
-        """Raise ModelError for a body that begins on both sides of a sheet of triangles.
+    def _settle_sheet_sides(self, ctx: StepContext, touching: np.ndarray, new: np.ndarray) -> None:
+        """Put points that begin on a sheet of triangles, within round-off of it, on the side of their body: in front,
+        unless all of it is behind.
 
         Args:
-            tolerance, new: (worlds,) m, and flags of the worlds to check.
+            touching, new: (worlds,) m, and flags of the worlds to check.
+
+        Raises:
+            ModelError: a body that begins on both sides.
         """
         m, t = self.model, self.tables
-        found = wp.zeros((m.worlds, t.rows), dtype=wp.int32, device=m.device)  # one point of each facet behind, + 1
-        limit: Any = wp.array(tolerance, dtype=wp.float64, device=m.device)
+        found = wp.zeros((m.worlds, t.rows), dtype=wp.int32, device=m.device)  # one point of each facet across, + 1
+        sides = wp.zeros((m.worlds, t.points), dtype=wp.int32, device=m.device)
+        kernels, other, u = sheet_kernels(m.dtype), ctx.scratch[self.name]["other"], ctx.state.displacement
         for group in t.groups:
-            args = [ctx.scratch[self.name]["other"], group.data, ctx.state.displacement, limit, found]
-            ctx.launch(sheet_kernels(m.dtype).find_crossed_sheets, (m.worlds, group.count), args)
+            ctx.launch(kernels.point_sides, group.point_threads(m.worlds), [other, group.data, u, sides])
+        side, stored = sides.numpy(), ctx.scratch[self.name]["history"].contact_state.numpy()
+        for k in np.flatnonzero([c.collider.is_sheet for c in t.contacts]).tolist():
+            mine = slice(t.first[k], t.first[k + 1])
+            side[:, mine] = side[:, mine].min(axis=1, keepdims=True)
+            stored[new, mine] = side[new, mine]
+        sides.assign(side)
+        ctx.scratch[self.name]["history"].contact_state.assign(stored)
+        size = max(float(k.shape.sizes[0]) for k in t.colliders if k.is_sheet)
+        limit: Any = wp.array(np.maximum(touching, SIDE_TOLERANCE * size), dtype=wp.float64, device=m.device)
+        for group in t.groups:
+            args = [other, group.data, u, sides, limit, found]
+            ctx.launch(kernels.find_crossed_sheets, (m.worlds, group.count), args)
         of_sheet = np.repeat([c.collider.is_sheet for c in t.contacts], np.diff(t.row_start))
         points = np.where(of_sheet, found.numpy(), 0)
         for world, row in np.argwhere((points > 0) & new[:, None])[:1]:

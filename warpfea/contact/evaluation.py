@@ -3,6 +3,7 @@ pressure and gap; initial overlaps, rejected or stored as offsets."""
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +11,7 @@ import numpy as np
 import warp as wp
 from scipy.spatial import cKDTree
 
-from ..base.errors import ModelError
+from ..base.errors import ModelError, ModelWarning
 from ..base.launch import Launcher
 from ..kernels.contact.evaluation import collider_evaluation_kernels, pair_evaluation_kernels, pair_results_struct
 from ..kernels.contact.facet_structs import facet_side_struct, pair_scratch_struct
@@ -38,7 +39,10 @@ CONTACT_FIELDS = {
 """Fields of both contact terms: pressures add up, the smallest gap counts."""
 TOUCHING_DEPTH_RATIO = 1e-9
 """Initial depth over the model's size treated as touching; round-off of displacements is added."""
-
+AUTO_OVERLAP_RATIOS = np.array([0.05, 0.25])
+"""Largest overlap that `overlap` "auto" stores, over the smallest edge of a face and depth of an element behind it."""
+ROUNDED_OVERLAP_RATIO = 1e-6
+"""Overlap over the model's size up to which "auto" stores it without a warning: that of rounded coordinates."""
 MIN_DEEP_OVERLAP_RATIO = 0.1
 """Smallest depth, over the depth limit of the body's thinnest facet, at which an unassigned point counts as inside: the
 inside test uses flat triangles."""
@@ -324,25 +328,43 @@ def store_overlaps(term: Any, depth: np.ndarray, touching: np.ndarray, overlap: 
     """Store depths (worlds, points), m, above the touching depth in `overlap` (worlds, points); `term`: of the points.
 
     Raises:
-        ModelError: an overlap with `overlap` "refuse".
+        ModelError: an overlap with `overlap` "refuse", or with "auto" a deeper one than it stores.
+
+    Warns:
+        ModelWarning: overlaps stored by "auto", but for those of rounded coordinates.
     """
-    tables = term.tables
+    tables, stored = term.tables, []
     for k, contact in enumerate(tables.contacts):
         points = slice(tables.first[k], tables.first[k + 1])
         mine = depth[:, points]
         deep = mine.max(axis=1) > touching
         if not deep.any():
             continue
-        if contact.overlap == "refuse":
-            world, point = np.unravel_index(int(mine.argmax()), mine.shape)
-            body, other, _ = term.sides_text(contact)
+        limit = {"refuse": 0.0, "offset": np.inf}.get(contact.overlap)
+        if limit is None:
+            limit = float((AUTO_OVERLAP_RATIOS * term.element_sizes[k]).min())
+        world, point = np.unravel_index(int(mine.argmax()), mine.shape)
+        body, other, _ = term.sides_text(contact)
+        where = f"world {world}, reference point {reference_position_text(tables, k, int(point))}"
+        text = f"contact {contact.name!r}: body {body!r} begins {mine.max():.3g} m inside {other} ({where}"
+        if mine.max() > limit:
+            stores = f"; overlap='auto' stores up to {limit:.3g} m" if contact.overlap == "auto" else ""
             raise ModelError(
-                f"contact {contact.name!r}: body {body!r} begins {mine.max():.3g} m inside {other} "
-                f"(world {world}, reference point {reference_position_text(tables, k, int(point))}); move one of them, "
-                "or take overlap='offset', which stores the overlap and lets it decay"
+                f"{text}{stores}); move one of them, or take overlap='offset', which stores it and lets it decay"
             )
         kept = np.maximum(mine[deep], 0.0)
         overlap[deep, points] = kept.max(axis=1, keepdims=True) if contact.model == "sphere" else kept
+        if contact.overlap == "auto" and mine.max() > ROUNDED_OVERLAP_RATIO * term.model.size:
+            stored.append(
+                f"{text}); it is stored as an offset that decays in overlap_time = {contact.overlap_time:g} s"
+            )
+    if stored:
+        more = f" (and {len(stored) - 1} more contacts)" if len(stored) > 1 else ""
+        warnings.warn(
+            f"{stored[0]}{more}: move one of them, or write overlap='offset' if that is meant",
+            ModelWarning,
+            stacklevel=2,
+        )
 
 
 def refuse_deep_overlaps(
@@ -357,10 +379,10 @@ def refuse_deep_overlaps(
         new: (worlds,) flags of the worlds that begin.
 
     Raises:
-        ModelError: such a point in a contact with `overlap` "refuse".
+        ModelError: such a point in a contact without `overlap` "offset".
     """
     for k, contact in enumerate(tables.contacts):
-        if contact.overlap != "refuse":
+        if contact.overlap == "offset":
             continue
         body, points = contact.master.body, slice(tables.first[k], tables.first[k + 1])
         limit = tables.masters[tables.master_of[k]].depth_limit

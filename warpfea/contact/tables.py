@@ -84,11 +84,10 @@ def normal_damping(stiffness: float, mass: float) -> float:
 
 def clamped_slots(model: Model) -> np.ndarray:
     """Mask (slots,) of slots clamped in all directions by supports that never move."""
-    held = np.zeros((model.slots, 3))
-    for support in model.description.supports:
-        if support.law is None and support.node_laws is None and support.rotation is None:
-            held[support.body.slot_offset + support.slots] += support.components
-    return np.asarray((held > 0).all(axis=1))
+    out = np.zeros(model.slots, dtype=bool)
+    for body in model.bodies:
+        out[body.slots] = model.description.clamped_slots(body)
+    return out
 
 
 @dataclass(eq=False)

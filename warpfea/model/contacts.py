@@ -60,7 +60,7 @@ class ContactOptions:
         offset: gap at which contact begins, m.
         points: points of each face, or None for the default rules.
         smoothing: None; with the paper's law a depth, m; with the smooth law (eps in N, v_eps in m/s).
-        overlap: "refuse" or "offset".
+        overlap: "auto", "refuse" or "offset".
         overlap_time: time in which a stored overlap decays, s.
         index: number in its builder, of contacts of its class.
     """
@@ -76,7 +76,7 @@ class ContactOptions:
     offset: float = 0.0
     points: int | None = None
     smoothing: float | tuple[float, float] | None = None
-    overlap: str = "refuse"
+    overlap: str = "auto"
     overlap_time: float = 0.1
     index: int = -1
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import dataclass, field
+from itertools import combinations
 from typing import Any, TypeVar
 
 import numpy as np
@@ -27,6 +28,8 @@ __all__ = [
 ]
 
 C = TypeVar("C", bound=ContactOptions)
+RODS = ("distance", "DIST")
+"""Kinds of joints that keep bodies apart."""
 
 
 @dataclass(eq=False)
@@ -130,6 +133,33 @@ class Description:
     def contacts_of(self, kind: type[C]) -> list[C]:
         """Contacts of one class, as `Contact` with colliders or `PairContact` between bodies."""
         return [contact for contact in self.contacts if isinstance(contact, kind)]
+
+    @property
+    def contact_pairs(self) -> set[frozenset[int]]:
+        """Identities of both sides, bodies or colliders, of each contact."""
+        return {
+            frozenset({id(side.body) for side in c.surfaces} | {id(getattr(c, "collider", c.body))})
+            for c in self.contacts
+        }
+
+    @property
+    def attached_pairs(self) -> set[frozenset[int]]:
+        """Identities of each two bodies that a weld, a joint or a constraint connects, but for those of a rod."""
+        out: set[frozenset[int]] = set()
+        for joint in self.joints:
+            vectors = (v for row in joint.rows if joint.kind not in RODS for v in row.vectors)
+            bodies = {id(part.body) for vector in vectors for part in vector.parts}
+            out |= {frozenset(pair) for pair in combinations(sorted(bodies), 2)}
+        return out
+
+    def clamped_slots(self, body: Body) -> np.ndarray:
+        """Mask (slots,) of the slots of a body clamped in all directions by supports that never move."""
+        held = np.zeros((body.slot_count, 3))
+        for support in self.supports:
+            fixed = support.law is None and support.node_laws is None and support.rotation is None
+            if support.body is body and fixed:
+                held[support.slots] += support.components
+        return np.asarray((held > 0).all(axis=1))
 
     def summary(self) -> str:
         """One-line summary; "" for an empty description."""

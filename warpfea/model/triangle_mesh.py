@@ -8,6 +8,9 @@ from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from ..base.checks import is_number
 from ..base.errors import MeshError, ModelError
@@ -26,6 +29,8 @@ MIN_FOLD_NORMAL_SUM = 1e-6
 """Minimum length of the sum of the normals at an edge."""
 MAX_LEAF_TRIANGLES = 4
 """Maximum triangles per leaf."""
+WELD_RATIO = 1e-6
+"""Distance of points that are one, over the size of the mesh: files round coordinates to float32 or six digits."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +59,8 @@ class TriMesh(Shape):
     """Solid within a closed triangle mesh, or a sheet of zero thickness.
 
     A mesh in which each edge has two triangles is closed, and solid behind its triangles. Any other is a sheet with
-    contact on both sides; a body that starts on it is in front. Coincident points are merged.
+    contact on both sides; a body that starts on it is in front. Points within 1e-6 of the size are welded to the
+    first of them, and triangles left without three corners are dropped.
 
     Args:
         points: (n, 3), m over `scale`, or a file that meshio reads, such as .stl, .obj, .ply, .vtk or .msh.
@@ -85,6 +91,7 @@ class TriMesh(Shape):
                 raise ModelError(f"TriMesh: {error}") from None
         points = float(self.scale) * _points(points)
         triangles = _triangles(triangles, points)
+        points, triangles = _weld(points, triangles)
         set_checked(self, points=points, triangles=triangles, scale=float(self.scale))
         self._neighbours  # noqa: B018  (checks edges)
         if self.closed and not self.volume > 0.0:
@@ -142,7 +149,7 @@ class TriMesh(Shape):
     def _merged_triangles(self) -> np.ndarray:
         """(m, 3) triangles by merged point indices."""
         _, number = np.unique(self.points, axis=0, return_inverse=True)
-        return number.reshape(-1)[self.triangles]
+        return np.asarray(number.reshape(-1)[self.triangles])
 
     @cached_property
     def _neighbours(self) -> np.ndarray:
@@ -272,3 +279,19 @@ def _triangles(values: Any, points: np.ndarray) -> np.ndarray:
     for k in np.flatnonzero(flat)[:1]:
         raise ModelError(f"TriMesh: triangle {k} = {out[k].tolist()} has no area ({int(flat.sum())} such)")
     return out.astype(np.int64)
+
+
+def _weld(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The points, each at the first of those within `WELD_RATIO` of it, and the triangles that keep three corners."""
+    used = points[triangles.ravel()]
+    near = WELD_RATIO * float(np.linalg.norm(np.ptp(used, axis=0)))
+    first, number = np.unique(points, axis=0, return_index=True, return_inverse=True)[1:]
+    pairs = cKDTree(points[first]).query_pairs(near, output_type="ndarray")
+    if not len(pairs):
+        return points, triangles
+    ones = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(first), len(first)))
+    group = connected_components(ones, directed=False)[1][number.reshape(-1)]
+    out = points[np.unique(group, return_index=True)[1]][group]
+    corner = group[triangles]
+    kept = (corner != np.roll(corner, 1, axis=1)).all(axis=1)
+    return out, _triangles(triangles[kept], out)
