@@ -230,3 +230,148 @@ def test_all_pairs_hold():
     assert sim.step(100).converged.all()
     assert sim.positions(top)[0, :, 2].min() > 0.095
     assert sim.positions(bodies[1])[0, :, 2].min() > -0.005
+
+
+# bodies that nobody named
+
+
+def flying(b, shape, speed, name):
+    """A body of a unit velocity (m/s) times `speed`; shape: (size, origin, cells)."""
+    size, origin, cells = shape
+    body = b.add_solid(wf.mesh.box(size, cells=cells, origin=origin, element="T4"), material=SOFT, name=name)
+    b.set_initial(body, velocity=speed)
+    return body
+
+
+def crossing_cubes(shift=0.0, gap=0.0105):
+    """A cube that flies down, 1 mm in a step of 1 ms, onto another one; each face is two triangles."""
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    low = flying(b, ((0.1,) * 3, (0, 0, 0), (1, 1, 1)), (0, 0, 0), "low")
+    top = flying(b, ((0.1,) * 3, (shift, shift, 0.1 + gap), (1, 1, 1)), (0, 0, -1.0), "top")
+    return b, low, top
+
+
+def silent(sim, steps):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", wf.ModelWarning)
+        sim.step(steps)
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.03])
+def test_bodies_that_cross_are_named_once_with_the_time(shift):
+    sim = wf.Simulation(crossing_cubes(shift)[0].finalize(device="cpu"), dt=1e-3, check_overlap=True)
+    silent(sim, 11)  # 0.5 mm: less than 5 % of a third of the edge
+    silent(sim, 1)
+    text = r"body 'low' and body 'top' have no contact and cross since t = 0.013 s .* write b.add_contact\(low, top\)"
+    with pytest.warns(wf.ModelWarning, match=text):
+        sim.step()
+    silent(sim, 3)
+    (found,) = sim.overlap_check.found
+    assert (found.first, found.second, found.world) == ("low", "top", 0)
+    assert found.time == pytest.approx(0.013)
+    assert found.depth == pytest.approx(2.5e-3, rel=1e-5)
+
+
+def test_pairs_that_are_meant_are_not_named():
+    def contact(b, low, top):
+        b.add_contact(top, low)
+
+    def rod(b, low, top):
+        b.add_joint("distance", parent=low.surface("z-"), child=top.surface("z+"))
+
+    def joint(b, low, top):
+        ends = {"parent": low.surface("z-"), "child": top.surface("z+")}
+        b.add_joint("translational", **ends, anchor=(0.05, 0.05, 0), axis=(0, 0, 1))
+
+    for connect, gap, left in ((contact, 1e-3, 0), (joint, 1e-3, 0), (rod, 1e-3, 1), (None, -0.01, 0), (None, 1e-3, 1)):
+        b, low, top = crossing_cubes(0.02, gap)
+        if connect:
+            connect(b, low, top)
+        sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-3, check_overlap=True)
+        sim.overlap_check.begin(sim)
+        assert len(sim.overlap_check.pairs) == left
+
+
+THROUGH = {
+    "thin peg through a facet": ((0.004, 0.004, 0.1), (0.03, 0.06, 0.101)),
+    "plate beside plate": ((0.1, 0.1, 0.002), (0.05, 0.05, 0.101)),
+    "inside at once": ((0.02,) * 3, (0.04, 0.04, 0.101)),
+}
+
+
+@pytest.mark.parametrize("name", THROUGH)
+def test_thin_bodies_are_seen(name):
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    flying(b, ((0.1,) * 3, (0, 0, 0), (1, 1, 1)), (0, 0, 0), "low")
+    flying(b, (*THROUGH[name], (1, 1, 1)), (0, 0, -1.0), "top")
+    dt = 0.05 if "inside" in name else 3e-3
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=dt, check_overlap=True)
+    with pytest.warns(wf.ModelWarning, match="body 'low' and body 'top' have no contact"):
+        sim.step()
+
+
+OBSTACLES = {
+    "half-space": (wf.HalfSpace((0, 0, 1), 0.0), None),
+    "ball": (wf.Sphere((0.03, 0.06, -0.004), 0.004), None),
+    "box": (wf.Box((0.05, 0.05, -0.05), (0.1, 0.1, 0.1)), None),
+    "sheet": (wf.TriMesh([(-1, -1, 0), (1, -1, 0), (0, 2, 0)], [(0, 1, 2)]), None),
+    "moving": (wf.Capsule((-1, 0.03, -0.5), (1, 0.03, -0.5), 0.01), ([0, 1e-3], [(0, 0, 0), (0, 0, 0.5)])),
+}
+
+
+@pytest.mark.parametrize("name", OBSTACLES)
+def test_obstacles_are_named(name):
+    """Poses of moving ones are those of the contact with others."""
+    shape, path = OBSTACLES[name]
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    flying(b, ((0.1,) * 3, (0, 0, 1e-3), (1, 1, 1)), (0, 0, -1.0), "cube")
+    collider = b.add_collider(shape, path=path, name="base")
+    other = flying(b, ((0.1,) * 3, (0, 0, 5.0), (1, 1, 1)), (0, 0, 0), "other")
+    if path:
+        b.add_contact(other, collider)
+    sim = wf.Simulation(b.finalize(device="cpu", worlds=2), dt=1e-3, check_overlap=True)
+    if path is None:
+        silent(sim, 1)
+    text = r"body 'cube' and collider 'base' .* in world 0 .*b.add_contact\(cube, base\)"
+    with pytest.warns(wf.ModelWarning, match=text):
+        sim.step(3)
+    assert [crossing.second for crossing in sim.overlap_check.found] == ["base"]
+
+
+CROSSED = """
+import warpfea as wf
+
+@wf.scene(dt=1e-2, t_end=.2)
+def fall() -> wf.ModelBuilder:
+    '''A cube falls through another one.'''
+    b = wf.ModelBuilder()
+    law = wf.SVK(E=1e6, nu=.3, density=1000)
+    for name, z in (("low", 0), ("top", .101)):
+        mesh = wf.mesh.box((.1, .1, .1), cells=(1, 1, 1), origin=(0, 0, z))
+        body = b.add_solid(mesh, material=law, name=name)
+        if name == "low":
+            b.clamp(body.nodes("z-"))
+    return b
+"""
+
+
+def test_commands_name_bodies_that_cross(tmp_path, monkeypatch, capfd):
+    (tmp_path / "mine.py").write_text(CROSSED)
+    monkeypatch.chdir(tmp_path)
+    words = ["run", "mine.py", "--device", "cpu", "--json", "s.json"]
+    text = "body 'low' and body 'top' have no contact and cross since t ="
+    assert main(words) == 0
+    printed = capfd.readouterr()
+    assert f"WARNING {text}" in " ".join(printed.out.split())
+    assert text in printed.err
+    (found,) = json.loads((tmp_path / "s.json").read_text())["overlaps"]
+    assert (found["first"], found["second"]) == ("low", "top")
+    assert 0.01 < found["time"] < 0.04
+    assert main([*words, "--overlaps", "ignore"]) == 0
+    assert text not in "".join(capfd.readouterr())
+
+
+def test_without_the_check_there_is_nothing_of_it():
+    sim = wf.Simulation(crossing_cubes(gap=-0.05)[0].finalize(device="cpu"), dt=1e-3)
+    silent(sim, 3)
+    assert sim.overlap_check is None

@@ -10,7 +10,7 @@ Law: normal force (law.py); friction (friction.py).
 Assembly: forces, products, blocks of any geometry (assembly.py).
 Ledger: history, energies, records of any geometry (ledger.py).
 At a state: evaluation.py. float32: double_displacements.py. Preconditioner: rigid_modes.py. Setup: thickness.py,
-    collider_sheets.py.
+    collider_sheets.py. Bodies without contact: crossings.py.
 
 Recipes for a law, a rigid shape, a geometry of the other side: warpfea/README.md.
 """

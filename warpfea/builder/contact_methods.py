@@ -62,7 +62,8 @@ class ContactMethods:
                 "auto": stored and said up to 5 % of the smallest edge of a face and 25 % of the depth of an element.
             name: unique name; by default "BODY on COLLIDER".
 
-        Bodies without a contact pass through each other. Between two, reported forces act on the first.
+        Bodies without a contact pass through each other; `Simulation(check_overlap=True)` names them. Between
+        two, reported forces act on the first.
 
         Returns:
             Contact, PairContact: the handle for reports.

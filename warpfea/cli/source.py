@@ -111,6 +111,7 @@ def resolve(options: argparse.Namespace, checkpoint: dict[str, Any] | None = Non
         raise UsageError("--dt auto needs --error, such as 1e-4" if dt == "auto" else "--error is for --dt auto")
     static = getattr(options, "static", False)
     how: dict[str, Any] = {"inversion": options.inversion}
+    how["check_overlap"] = getattr(options, "overlaps", "ignore") == "warn"
     if static:
         how |= {"load_steps": options.load_steps or 10, "tol": options.tol, "stabilise": options.stabilise}
     else:

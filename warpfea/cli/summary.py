@@ -11,6 +11,7 @@ from ..kernels.elements.materials import DEFINED_FOR_ANY_J
 from ..kernels.step.step_control import SAME_TIME_FRACTION
 from ..model.model import Model
 from ..simulation.energy_growth import integrator_energy_ratio
+from ..simulation.overlap import Crossing
 from ..simulation.simulation import Simulation
 from ..solvers import Jacobi
 from .source import Source
@@ -22,7 +23,7 @@ SUMMARY_KEYS = (
     "schema", "scene", "analysis", "parameters", "device", "dtype", "dt", "t_end", "load", "steps", "substeps",
     "status", "wall_s", "compile_s", "setup_s", "solve_s", "output_s", "newton_iterations", "pcg_iterations",
     "max_residual", "min_J", "rough_steps", "floored_steps", "max_floor", "mass", "bounding_box", "energies", "probes",
-    "violation", "versions", "left_out", "contacts", "stable",
+    "violation", "versions", "left_out", "contacts", "stable", "overlaps",
 )  # fmt: skip
 MAX_ROWS = 12
 """Maximum number of joints and contacts listed one by one."""
@@ -61,7 +62,9 @@ def summarize(
     0 without such steps; energies and probes are the last values, of statics the strain energy alone; `violation` is
     the largest of the constraints in any step, m; `contacts` has by name the largest normal_force, N, penetration, m,
     and relative_penetration (over the size of its smallest element) of any step, and the last force, N, area, m^2, and
-    stick; `stable` is the stability of the static equilibrium, null if unknown.
+    stick; `stable` is the stability of the static equilibrium, null if unknown; `overlaps` are pairs of bodies, or of a
+    body and a collider, that cross without a contact, with the time, s or load factor, and the depth, m, of the check
+    that found them.
     """
     setup_s = min(sim.compile_s if setup_s is None else setup_s, wall_s)
     output_s = min(sim.output_s, wall_s - setup_s)
@@ -92,6 +95,8 @@ def summarize(
         "violation": sim.max_violation, "versions": versions(), "left_out": sim.model.info()["left_out"],
         "contacts": _contact_values(sim),
         "stable": None if sim.last is None or sim.last.stable is None else sim.last.stable[0],
+        "overlaps": [{name: getattr(crossing, name) for name in ("first", "second", "time", "depth")}
+                     for crossing in _crossings(sim)],
     }  # fmt: skip
     assert tuple(content) == SUMMARY_KEYS
     return {name: to_json(value) for name, value in content.items()}
@@ -148,6 +153,7 @@ def summary_text(summary: dict[str, Any], sim: Simulation, wrote: Sequence[str])
         u = ", ".join(_number_text(x) for x in values["displacement"])
         rows.append([f"probe {name}", f"displaced by ({u}) m"])
     rows += _joint_rows(sim)
+    rows += [["WARNING", crossing.text] for crossing in _crossings(sim)[:SHOWN_ROWS]]
     rows += _contact_rows(s["contacts"]) + _penetration_rows(s["contacts"], static=s["load"] is not None)
     rows += [["wrote" if k == 0 else "", text] for k, text in enumerate(wrote)]
     return format_table(rows)
@@ -258,6 +264,11 @@ def _contact_rows(contacts: dict[str, Any]) -> list[list[str]]:
     if len(rows) < len(contacts):
         rows.append(["contacts", f"{len(contacts)} in all, of which these have the largest forces"])
     return rows
+
+
+def _crossings(sim: Simulation) -> list[Crossing]:
+    """Crossings found by the simulation."""
+    return sim.overlap_check.found if sim.overlap_check else []
 
 
 def _penetration_rows(contacts: dict[str, Any], *, static: bool) -> list[list[str]]:

@@ -38,6 +38,7 @@ from .energy_growth import ENERGY_GROWTH_CHOICES, EnergyGrowth
 from .episodes import Resets
 from .failures import check_initial_constraints
 from .observations import Observations
+from .overlap import OverlapCheck
 from .reports import (
     ContactRecord,
     JointRecord,
@@ -91,8 +92,12 @@ class Simulation:
         energy_growth: net energy gain of the integrator in a world, over the largest kinetic + strain + contact energy
             plus the sum of |work|: above 1 % a warning, above 10 % steps are rejected ("refuse") or continue ("warn");
             "ignore" and ledger=False: not monitored.
+        check_overlap: warn of bodies that cross each other or a collider without a contact, once for each pair, with
+            the time: after each call of `step`, of a run at about 64 steps (skins on the host; see OverlapCheck for
+            pairs left out: connected by a joint, or crossing from the start).
 
     Attributes:
+        overlap_check: crossings `found` with check_overlap, else None.
         results: results of the present state; records: of the last step and over time; statistics: totals over steps;
             resets: resets of worlds. Their public members are the simulation's, too.
         controls: values written by the caller between steps, see Controls.
@@ -156,6 +161,7 @@ class Simulation:
         on_failure: str | None = None,
         inversion: str = "refuse",
         energy_growth: str = "refuse",
+        check_overlap: bool = False,
         on_compile: Callable[[int, int, str], None] | None = None,
     ) -> None:
         scheme, options = integrators.find_integrator(integrator), solvers.solver_options(solver)
@@ -214,6 +220,7 @@ class Simulation:
             self.dt = dt
         if t_end is not None:
             self.t_end = t_end
+        self.overlap_check = OverlapCheck(self) if check_overlap else None
         check_initial_constraints(self)
         warn_initial_jumps(self)
         self._load: np.ndarray | None = None
@@ -291,6 +298,8 @@ class Simulation:
         if isinstance(count, bool) or not isinstance(count, (int, np.integer)) or count < 1:
             raise ModelError(f"step({count!r}): the number of steps must be a whole number, at least 1")
         stepper, statistics = self.stepper, self.statistics
+        if self.overlap_check:
+            self.overlap_check.begin(self)
         for _ in range(count):
             if stepper.step_size_control:
                 stepper.step_size_control.set_interval(self.time)
@@ -301,6 +310,8 @@ class Simulation:
                 statistics.unsynced = True
             else:
                 statistics.add_step(stepper.work.report.numpy())
+        if self.overlap_check:
+            self.overlap_check.after_step(self)
         return PendingReport(self, statistics.steps) if statistics.asynchronous else statistics.last
 
     def run(
@@ -345,10 +356,14 @@ class Simulation:
         if not self.integrator.static:
             warn_early_ends(self, t_end)
         self.stepper.episodes.set_run_end(t_end, total)
+        if self.overlap_check:
+            self.overlap_check.set_run(total)
         try:
             run_steps(self, total, t_end, outputs, on_step, progress)
         finally:
             self.stepper.episodes.set_run_end()
+            if self.overlap_check:
+                self.overlap_check.set_run()
         if self.last is None:
             self.last = idle_report(self)
         return self.last

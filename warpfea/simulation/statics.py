@@ -162,9 +162,11 @@ def begin_static(
     constraint_tol: float | None = None,
     inversion: str = "refuse",
     stabilise: bool | float = False,
+    check_overlap: bool = False,
     on_compile: Callable[[int, int, str], None] | None = None,
 ) -> Simulation:
-    """Simulation of `solve_static` before its first load step; ModelError as there. `on_compile` as for Simulation."""
+    """Simulation of `solve_static` before its first load step; ModelError as there. `check_overlap`, `on_compile`: of
+    Simulation."""
     count = 1 if isinstance(load_steps, str) and load_steps == "auto" else load_steps
     if isinstance(count, (bool, str)) or not (isinstance(count, (int, np.integer)) and count >= 1):
         raise ModelError(f"solve_static: load_steps = {load_steps!r} must be a positive whole number, or 'auto'")
@@ -192,7 +194,7 @@ def begin_static(
     return Simulation(
         model, start, dt=1.0 / count, integrator=scheme, solver=options, ledger=False,
         on_failure="raise", constraint_tol=constraint_tol, inversion=inversion, on_compile=on_compile,
-        plan=plan,
+        plan=plan, check_overlap=check_overlap,
     )  # fmt: skip
 
 
