@@ -1,12 +1,13 @@
 """Removal of one mechanism or constant at a time: rows of the stress suite and random cases that are lost without it.
 
-`python tests/ablation.py --out FILE [--only NAME ...] [--suite quick] [--jobs 2] [--rows random] [--base FILE]`
+`python tests/ablation.py --out FILE [--only NAME ...] [--suite quick] [--jobs 2] [--rows scenes] [--base FILE]`
 
 Each variant is a copy of the sources with a mechanism switched off (`MECHANISMS`: a text in place of another) or a
 constant without effect (`CONSTANTS`: a value that disables it). The stress suite, 200 seeded random models
-(random_cases.py), the pile of cubes of 4^3 cells (validation/piles.py) or tests are run with the copy and with the
-unchanged sources, in processes side by side. A row is lost if it met its criterion before and does not now; it is
-touched if its iterations or its error differ. A run that is cut short goes on from the rows that FILE has.
+(random_cases.py), scenes (scene_counts.py), the pile of cubes of 4^3 cells (validation/piles.py) or tests are run with
+the copy and with the unchanged sources, in processes side by side. A row is lost if it met its criterion before and
+does not now; it is touched if its iterations or its error differ; iterations or work of a scene may rise. A run that is
+cut short goes on from the rows that FILE has.
 NAME+NAME+... switches several off at once: what may go must go together, and the rows that a group loses (`--case`)
 tell which of its members stay.
 """
@@ -29,6 +30,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from random_cases import same
+from scene_counts import COUNTS
 
 __all__ = ["CONSTANTS", "MECHANISMS", "Constant", "constant_file", "disabled", "variants"]
 
@@ -37,6 +39,9 @@ Row = dict[str, Any]
 COPIED = ("kernels", "warpfea", "scenes", "tests")
 SEARCH, CONVERGENCE, NEWTON = (f"kernels/solvers/{name}.py" for name in ("line_search", "convergence", "newton"))
 RANDOM_CASES = 200
+MIN_RISE, MIN_COUNT = 1.1, 20
+"""Ratio of a count of a scene without a constant to that with it, above which the constant is needed; the smallest
+count with it that is compared."""
 LONG_ROWS = ("rest-1e6", "soft-")
 """Beginnings of rows left out: a million steps, and meshes that the package does not contain."""
 
@@ -116,7 +121,6 @@ CONSTANTS: dict[str, Constant] = {
     "START_STRESS_RESIDUAL": Constant(NEWTON_PCG, "1", 0.0),
     "NEW_MATRIX_DECADES": Constant(REUSE, "decades", 1.0e3),
     "REDUCTION_FADING": Constant(REUSE, "1", 1.0),
-    "DIAGONAL_AGEING": Constant(REUSE, "iterations", 0.0),
     "REUSED_FORCING_FACTOR": Constant(REUSE, "1", 1.0),
     "ORDER_MARGIN": Constant(ADAPTIVE, "1", 1.0),
     "PREDICTOR_ROUNDINGS": Constant(ADAPTIVE, "roundings of the velocity", 0.0),
@@ -239,6 +243,10 @@ def _tasks(options: argparse.Namespace, variant: str) -> Iterator[list[str]]:
     if options.rows[0] == "piles":
         yield ["-m", "tests.validation", "piles", "--device", options.device, "--rows", "pile-4", "--out"]
         return
+    if options.rows[0] == "scenes":
+        cases = ["--case", *options.case] if options.case else []
+        yield [str(ROOT / "tests" / "scene_counts.py"), *cases, "--out"]
+        return
     if options.rows[0].startswith("tests/"):
         yield ["-m", "pytest", "-q", "-rpfE", "-p", "no:cacheprovider", "-m", "", *options.rows, "--junitxml"]
         return
@@ -260,6 +268,7 @@ def _compare(before: Sequence[Row], after: Sequence[Row]) -> Row:
     """Lost and touched rows, and the ratio of iterations over all rows that pass in both."""
     old = {(row["case"], row["precision"]): row for row in before}
     lost, touched, regained = [], set(), []
+    rises: dict[str, float] = {}
     sums = {name: [0, 0] for name in ("newton", "pcg")}
     for row in after:
         was = old.get((row["case"], row["precision"]))
@@ -279,12 +288,16 @@ def _compare(before: Sequence[Row], after: Sequence[Row]) -> Row:
             for key, pair in sums.items():
                 pair[0] += was.get(key) or 0
                 pair[1] += row.get(key) or 0
+            if "launches" in row:
+                ratios = {key: row[key] / was[key] for key in COUNTS if was[key] >= MIN_COUNT}
+                rises |= {f"{row['case']} {key}": ratio for key, ratio in ratios.items() if ratio > MIN_RISE}
     seen = {(row["case"], row["precision"]) for row in after}
     part = {case for case, _ in seen}  # of the rows before, those of other parts of the suite were not asked for
     gone = [key for key, row in old.items() if row["passed"] and key not in seen and (key[0] in part or not part)]
     lost += [f"{case} {precision}: has no answer" for case, precision in gone]
     ratio = {key: pair[1] / pair[0] if pair[0] else 1.0 for key, pair in sums.items()}
-    return {"rows": len(after), "touched": sorted(touched), "lost": lost, "regained": regained, **ratio}
+    found = {"rows": len(after), "touched": sorted(touched), "lost": lost, "regained": regained, **ratio}
+    return found | ({"rises": rises} if rises else {})
 
 
 def study(options: argparse.Namespace, done: Sequence[Row]) -> Iterator[Row]:
@@ -327,8 +340,9 @@ def study(options: argparse.Namespace, done: Sequence[Row]) -> Iterator[Row]:
 def tables(rows: Sequence[Row]) -> str:
     """Markdown: mechanisms, then constants by area, each with its value, unit, and a row that is lost without it; last
     those that are no longer there."""
-    found = [row for row in rows if row["lost"] or row["of"] in ("stress", "piles")]
-    shown = {row["variant"]: row for row in sorted(found, key=lambda row: bool(row["lost"]))}
+    found = [row for row in rows if row["lost"] or row["of"] in ("stress", "piles", "scenes")]
+    found.sort(key=lambda row: (bool(row["lost"]), "rises" in row, row["of"] != "scenes"))
+    shown = {row["variant"]: row for row in found}
     gone = {*shown} - {*MECHANISMS, *CONSTANTS, *(name for name in shown if "+" in name)}
     shown |= {name: shown[name] | {"area": "removed"} for name in gone}
     out = []
@@ -345,11 +359,15 @@ def tables(rows: Sequence[Row]) -> str:
 
 
 def reason(row: Row) -> str:
-    """The first lost row of a variant and the number of others, or the iterations that it saves."""
+    """The first lost row of a variant and the number of others, or the iterations or the work that it saves."""
     if row["lost"]:
         first = min(row["lost"], key=lambda text: ": missed" in text)
         case = ": ".join(first.split(": ")[:2])
         return case + (f", and {len(row['lost']) - 1} more" if len(row["lost"]) > 1 else "")
+    if row.get("rises"):
+        (first, ratio), more = next(iter(row["rises"].items())), len(row["rises"]) - 1
+        scene, count = first.split(" ")
+        return f"{scene}: {ratio:.2f} times the {COUNTS[count]}" + (f", and {more} more" if more else "")
     return f"{row['newton']:.2f} times the Newton, {row['pcg']:.2f} times the PCG iterations"
 
 
@@ -361,11 +379,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", required=True, type=pathlib.Path, help="JSON, added to where it exists")
     parser.add_argument("--only", nargs="+", default=[], help="variants, or areas of them; by default all")
-    parser.add_argument("--case", nargs="+", default=[], help="cases, rows or groups of the stress suite")
+    parser.add_argument("--case", nargs="+", default=[], help="cases, rows or groups of the stress suite, or scenes")
     parser.add_argument("--suite", choices=("all", "quick"), default="all")
     parser.add_argument("--longest", type=float, default=math.inf, help="leave out rows that took more seconds")
     parser.add_argument(
-        "--rows", nargs="+", default=["stress"], help="stress, random, piles, or tests of pytest by name"
+        "--rows", nargs="+", default=["stress"], help="stress, random, scenes, piles, or tests of pytest by name"
     )
     parser.add_argument(
         "--base", type=pathlib.Path, help="rows of the unchanged sources: written, read where it exists"

@@ -44,10 +44,11 @@ def rows():
 
 
 def is_needed(name):
-    """A row is lost without it, or iterations rise by a tenth; of piles, which may be 5 % slower, by a twentieth."""
+    """A row is lost without it, or iterations rise by a tenth, in all rows or, with matrices, factorisations, launches
+    or bytes, in a scene (`rises`); of piles, which may be 5 % slower, by a twentieth."""
     alone = [row for row in rows() if row["variant"] == name]
     rise = [max(row["newton"], row["pcg"]) - (1.05 if row["of"] == "piles" else 1.1) for row in alone]
-    return any(row["lost"] for row in alone) or max(rise) > 0.0
+    return any(row["lost"] or row.get("rises") for row in alone) or max(rise) > 0.0
 
 
 @pytest.mark.parametrize("name", MECHANISMS)
@@ -56,19 +57,11 @@ def test_mechanisms_are_needed(name):
 
 
 UNPROVEN = {
-    "CONSTRAINT_FORCING": "a chain of 100 joints takes 2.0 Newton iterations a step with it, 2.55 without",
-    "ALTERNATIVE_START_FORCING": "of single extreme cases, as below",
-    "GROUP_ROUNDINGS": "a slider-crank takes 5.1 Newton iterations a step with it, 5.7 without",
-    "MAX_START_ENERGY_RATIO": "a slow test fails without it: a column that buckles in float32",
     "PREDICTOR_ROUNDINGS": "for runs of a million steps, which ablations leave out",
     "MAX_EXTRAPOLATED_GROWTH": "for the same",
-    **dict.fromkeys(("NEW_MATRIX_DECADES", "REDUCTION_FADING", "DIAGONAL_AGEING", "UNCHECKED_ITERATIONS"),
-                    "they save assembly, factors or products, which iterations do not count"),
-    **dict.fromkeys(("RESIDUAL_GROWTH", "FROZEN_UPDATE_RESIDUAL", "TANGENT_PLANE_MARGIN"),
-                    "they save work of piles, which was not measured without"),
-    **dict.fromkeys(("OPPOSING_COSINE", "MAX_DEPTH_RATIO", "MAX_OVERHANG"),
+    **dict.fromkeys(("OPPOSING_COSINE", "MAX_DEPTH_RATIO", "MAX_OVERHANG", "TANGENT_PLANE_MARGIN"),
                     "the search of facets is to be written again"),
-    **dict.fromkeys(("VELOCITY_ROUNDINGS", "STRAIN_ENERGY_FRACTION", "SCATTER_FACTOR",
+    **dict.fromkeys(("VELOCITY_ROUNDINGS", "STRAIN_ENERGY_FRACTION", "SCATTER_FACTOR", "ALTERNATIVE_START_FORCING",
                      "SOLVES_WITHOUT_STEP", "MAX_STALLED_ITERATIONS"),
                     "of single extreme cases; the whole stress suite and slow tests were not run without"),
 }  # fmt: skip

@@ -23,8 +23,6 @@ NEW_MATRIX_DECADES = 3.0
 """Expected residual reduction of a Newton iteration with a new matrix, in decades."""
 REDUCTION_FADING = 0.8
 """Factor on `first_reduction` when a step begins with a new matrix: the rule retries an old matrix after some steps."""
-DIAGONAL_AGEING = 0.25
-"""Increment of `extra_iterations` per solve if only D, which weights the norms, is kept."""
 REUSED_FORCING_FACTOR = 0.3
 """Relative tolerance of a linear solve with a reused matrix, over the reduction by the last Newton iteration."""
 
@@ -181,20 +179,15 @@ def reuse_kernels(dtype: str) -> KernelSet:
                 reuse.rebuild_due[world] = 1
 
     @wp.kernel(module=module)
-    def count_solve(reuse: Reuse, newton: Newton, pcg: PCG, follows: int):
-        """After a solve: count its iterations beyond those of the first solve with this preconditioner.
-
-        `follows`: the preconditioner is always rebuilt with the operator's matrix, and only D is kept.
-        """
+    def count_solve(reuse: Reuse, newton: Newton, pcg: PCG):
+        """After a solve: count its iterations beyond those of the first solve with this preconditioner."""
         world = wp.tid()
         if newton.active[world] == 0 or pcg.iterations[world] == 0:
             return
         count = f64(pcg.iterations[world])
         gained = wp.max(pcg.first_norm[world] / wp.max(pcg.norm[world], f64(1.0e-300)), f64(2.0))
         decades = wp.log10(gained)
-        if follows != 0:
-            reuse.extra_iterations[world] = reuse.extra_iterations[world] + f64(DIAGONAL_AGEING)
-        elif reuse.baseline_iterations[world] == f64(0.0):
+        if reuse.baseline_iterations[world] == f64(0.0):
             reuse.baseline_iterations[world] = count / decades
         else:
             reuse.extra_iterations[world] = reuse.extra_iterations[world] + wp.max(

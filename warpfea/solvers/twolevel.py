@@ -201,9 +201,11 @@ class TwoLevel(Preconditioner):
 
     @launch_part("build")
     def record_cost(self, active: wp.array) -> None:
-        """Record the iteration count of the solve."""
-        args = [self.reuse.control, self.work.newton, self.work.pcg, int(self.factors_operator)]
-        self.launch(self.reuse.kernels.count_solve, self.model.worlds, args)
+        """Record the iteration count of the solve. Factors follow the operator's matrix: only D is kept, which weights
+        the norms, and which no count of iterations calls for anew."""
+        if not self.factors_operator:
+            args = [self.reuse.control, self.work.newton, self.work.pcg]
+            self.launch(self.reuse.kernels.count_solve, self.model.worlds, args)
 
     @launch_part("preconditioner")
     def apply(self, r: wp.array, z: wp.array, active: wp.array) -> None:
