@@ -158,6 +158,7 @@ def collider_kinematics(dtype: str, meshes: bool) -> KernelSet:
         activation = k.activation_gap(con, his, world, c, point, time, col.margin[world, kc])
         out = set_depth(con, col, his, scr, world, c, point, out, activation)
         out.previous_depth = k.depth_at_start(con, facets, his, scr, world, c, point)
+        out.stiffness_ratio = k.stiffness_ratio(con, facets, world, c, item, f64(0.0))
         if his.speed[world, rec] > f64(0.0):
             out.spring = his.spring[world, rec]
             if con.law[c] & FIXED_SPRING == 0:

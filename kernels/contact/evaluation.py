@@ -177,6 +177,7 @@ def pair_evaluation_kernels(dtype: str, own: OwnLaws = ()) -> KernelSet:
             xi[2] * projection.gap_slope + projection.gap_offset
         )
         t.previous_depth = t.depth
+        t.stiffness_ratio = k.stiffness_ratio(con, facets, world, c, item, other.masters.element_depth[f])
         if in_contact:
             t.spring = his.spring[world, point]
             if not law.has_trait(con, c, FIXED_SPRING):

@@ -73,6 +73,8 @@ def facet_kinematics(dtype: str) -> KernelSet:
         out.depth = other.scratch.depth[world, point]
         out.previous_depth = other.scratch.initial_depth[world, point]
         out.spring = other.scratch.spring[world, point]
+        depth = other.masters.element_depth[f]
+        out.stiffness_ratio = k.stiffness_ratio(con, facets, world, facets.contact[item], item, depth)
         return out
 
     @wp.func

@@ -47,6 +47,7 @@ def master_struct(dtype: str):
         hull_coefficients: wp.array3d(
             dtype=wp.float64
         )  # [kind, point, monomial] Bernstein control points: their hull contains the facet
+        element_depth: wp.array(dtype=wp.float64)  # [facet] of the element behind it, m
         depth_limit: wp.array(
             dtype=wp.float64
         )  # [facet] depth beyond which a point would leave through the opposite side, m

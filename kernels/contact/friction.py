@@ -24,6 +24,7 @@ from .kinematics import kinematics_functions
 from .law import (
     ANY_GAP,
     FIXED_SPRING,
+    IMPACT_SPEED,
     SLIP_SPEED,
     SPEED_DAMPING,
     TRAIT_BITS,
@@ -52,26 +53,36 @@ def friction_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
         return con.law[c] & trait != 0
 
     @wp.func
-    def normal_stiffness(con: Contacts, world: int, c: int) -> f64:
+    def normal_stiffness(con: Contacts, world: int, c: int, ratio: f64) -> f64:
         """k_n, N/m; of a lumped contact over the root of the depth."""
-        return con.scale[world, c] * world_value(con.normal_stiffness, world, c)
+        return con.scale[world, c] * ratio * world_value(con.normal_stiffness, world, c)
 
     @wp.func
-    def friction_stiffness(con: Contacts, world: int, c: int, depth: f64) -> f64:
+    def friction_stiffness(con: Contacts, world: int, c: int, ratio: f64, depth: f64) -> f64:
         """k_t, N/m."""
-        k_t = con.scale[world, c] * world_value(con.tangential_stiffness, world, c)
+        k_t = con.scale[world, c] * ratio * world_value(con.tangential_stiffness, world, c)
         if con.single_point[c] != 0:
             k_t *= wp.sqrt(wp.max(depth, f64(0.0)))
         return k_t
 
     @wp.func
-    def normal_damping_rate(con: Contacts, scr: ContactScratch, world: int, c: int, point: int, inv_h: f64) -> f64:
-        """Damping per depth of the normal law: chi/h, or gamma_n/h."""
+    def normal_damping_rate(
+        con: Contacts, scr: ContactScratch, world: int, c: int, point: int, ratio: f64, inv_h: f64
+    ) -> f64:  # fmt: skip
+        """Damping per depth of the normal law: chi/h, or gamma_n/h; with restitution 0 minus the critical damping of
+        the effective mass over h, at points that have come faster than `IMPACT_SPEED`."""
         if inv_h == f64(0.0):
             return f64(0.0)
         if has_trait(con, c, SPEED_DAMPING):
-            return con.damping[world, c] * inv_h / scr.approach_speed[world, point]
-        return con.beta[world, c] * wp.sqrt(con.scale[world, c]) * world_value(con.normal_damping, world, c) * inv_h
+            speed = scr.approach_speed[world, point]
+            if con.damping[world, c] >= f64(0.0):
+                return con.damping[world, c] * inv_h / speed
+            if speed <= f64(IMPACT_SPEED):
+                return f64(0.0)
+            mass = world_value(con.effective_mass, world, c)
+            return f64(-2.0) * inv_h * wp.sqrt(normal_stiffness(con, world, c, ratio) * mass)
+        damping = world_value(con.normal_damping, world, c)
+        return con.beta[world, c] * wp.sqrt(con.scale[world, c] * ratio) * damping * inv_h
 
     @wp.func
     def in_friction_plane(t: PointContact, m: vec3d, shrink: f64) -> PointContact:
@@ -91,21 +102,21 @@ def friction_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
         """The record with the normal force, and friction in its own tangent plane."""
         out = in_friction_plane(t, t.normal, f64(1.0))
         out.normal_values = normal_law(
-            con.law[c] >> TRAIT_BITS, con.single_point[c], normal_stiffness(con, world, c),
-            normal_damping_rate(con, scr, world, c, point, inv_h), con.damping_ramp[c], con.force_eps[c], t.depth,
-            t.previous_depth,
+            con.law[c] >> TRAIT_BITS, con.single_point[c], normal_stiffness(con, world, c, t.stiffness_ratio),
+            normal_damping_rate(con, scr, world, c, point, t.stiffness_ratio, inv_h), con.damping_ramp[c],
+            con.force_eps[c], t.depth, t.previous_depth,
         )  # fmt: skip
         return out
 
     @wp.func
-    def elastic_part(con: Contacts, world: int, c: int, depth: f64) -> wp.vec2d:
+    def elastic_part(con: Contacts, world: int, c: int, t: PointContact) -> wp.vec2d:
         """Elastic normal force, N, and its stored energy, J."""
-        k_n = normal_stiffness(con, world, c)
+        k_n = normal_stiffness(con, world, c, t.stiffness_ratio)
         if has_trait(con, c, ANY_GAP):
-            return elastic_force(con.single_point[c], k_n, depth)
+            return elastic_force(con.single_point[c], k_n, t.depth)
         w = normal_law(
-            con.law[c] >> TRAIT_BITS, con.single_point[c], k_n, f64(0.0), con.damping_ramp[c], con.force_eps[c], depth,
-            depth,
+            con.law[c] >> TRAIT_BITS, con.single_point[c], k_n, f64(0.0), con.damping_ramp[c], con.force_eps[c],
+            t.depth, t.depth,
         )  # fmt: skip
         return wp.vec2d(w[0], w[2])
 
@@ -137,9 +148,9 @@ def friction_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
         v_n_rel = wp.dot(v, n)
         v_t = v - v_n_rel * n
         beta = con.beta[world, c]
-        spring = elastic_force(con.single_point[c], normal_stiffness(con, world, c), delta)[0]
+        spring = elastic_force(con.single_point[c], normal_stiffness(con, world, c, f64(1.0)), delta)[0]
         gamma = beta * wp.sqrt(con.scale[world, c]) * world_value(con.normal_damping, world, c)
-        k_t = friction_stiffness(con, world, c, delta)
+        k_t = friction_stiffness(con, world, c, f64(1.0), delta)
         if con.single_point[c] != 0:
             gamma *= wp.sqrt(wp.sqrt(delta))
         force = wp.max(spring - gamma * v_n_rel, f64(0.0))
@@ -164,7 +175,7 @@ def friction_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
             if has_trait(con, c, UNLOADING):
                 shrink = wp.sqrt(depth / t.previous_depth)
         mu = friction_coefficient(con, his, world, c, rec)
-        return vec3d(mu * t.normal_values[0], friction_stiffness(con, world, c, t.depth), shrink)
+        return vec3d(mu * t.normal_values[0], friction_stiffness(con, world, c, t.stiffness_ratio, t.depth), shrink)
 
     @wp.func
     def friction_limits_at_iterate(

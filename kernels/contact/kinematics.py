@@ -140,6 +140,18 @@ def kinematics_functions(dtype: str) -> KernelSet:
         return scr.start_depth[world, point]
 
     @wp.func
+    def stiffness_ratio(
+        con: Contacts, facets: Facets, world: int, c: int, item: int, other_depth: f64
+    ) -> f64:  # fmt: skip
+        """Factor on the stiffness of a contact at a facet, from the depths of the elements on both sides, m.
+
+        The compliance per area is (c_1 depth_1 + c_2 depth_2) times that of the contact; one stiffness for the whole
+        region is 1 + 0 + 0.
+        """
+        s = con.compliance[world % con.compliance.shape[0], c]
+        return f64(1.0) / (s[0] + s[1] * facets.element_depth[item] + s[2] * other_depth)
+
+    @wp.func
     def is_acting(con: Contacts, scr: ContactScratch, world: int, c: int, point: int) -> f64:
         """1, or 0 if another point represents the contact."""
         if con.single_point[c] != 0 and scr.contact_point[world, c] != point:

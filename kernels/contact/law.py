@@ -30,6 +30,7 @@ from ..common.modules import KernelSet, definition_name, kernel_set
 __all__ = [
     "ANY_GAP",
     "FIXED_SPRING",
+    "IMPACT_SPEED",
     "LAWS",
     "SLIP_SPEED",
     "SPEED_DAMPING",
@@ -53,6 +54,9 @@ approach speed, else gamma_n/h. UNLOADING: a lumped contact that unloads reduces
 FIXED_SPRING: Eqs. (78) and (83) of Paper I, where the elastic slip does not turn with the bodies and may reverse.
 SLIP_SPEED: friction of the slip speed, without elastic slip. ANY_GAP: it acts at any gap."""
 TRAIT_BITS = 5
+IMPACT_SPEED = 0.05
+"""Approach speed of a point, m/s, up to which restitution 0 does not damp it: points that enter a rolling contact would
+brake it."""
 
 
 @wp.func
@@ -141,6 +145,23 @@ def paper_law(single_point: int, k: f64, g: f64, ramp: f64, eps: f64, delta: f64
 
 
 @wp.func
+def default_law(single_point: int, k: f64, rate: f64, ramp: f64, eps: f64, delta: f64, delta_n: f64) -> vec4d:
+    """Hunt and Crossley's law. Restitution 0, which has no rate, is told by rate < 0, minus a damping g, N/m: then
+    F = max(0, k delta + g (delta - max(0, delta_n))), continuous at touch as it is, with a convex integral."""
+    if rate >= f64(0.0):
+        return hunt_crossley(single_point, k, rate, ramp, eps, delta, delta_n)
+    before = wp.max(delta_n, f64(0.0))
+    if single_point != 0:
+        return paper_law(single_point, k, -rate, f64(0.0), eps, delta, before)
+    bend = k - rate
+    force = bend * delta + rate * before
+    if delta <= f64(0.0) or force <= f64(0.0):
+        return vec4d()
+    psi = f64(0.5) * force * force / bend
+    return vec4d(force, bend, psi, psi - rate * before * delta)
+
+
+@wp.func
 def smooth_law(single_point: int, k: f64, g: f64, ramp: f64, eps: f64, delta: f64, delta_n: f64) -> vec4d:
     """(y + sqrt(y^2 + eps^2)) / 2 in place of max(0, y) (Paper I, 6.2), y = k delta - gamma v, at any gap."""
     y = k * delta + g * (delta - delta_n)
@@ -182,7 +203,8 @@ class ContactLaw(NamedTuple):
     Attributes:
         normal: device function (single_point, k, g, ramp, eps, delta, delta_n) -> (force, N, its derivative by the
             depth, N/m, its integral, J, magnitude of the integral's terms, J), of the whole region. k: normal
-            stiffness, N/m (single_point: N/m^1.5); g: damping by trait SPEED_DAMPING, 0 for the elastic part; ramp,
+            stiffness, N/m (single_point: N/m^1.5); g: damping by trait SPEED_DAMPING (with restitution 0 negative:
+            minus the critical damping over h), 0 for the elastic part; ramp,
             eps: from `smoothing`, m and N; delta, delta_n: depth now and at the start of the step, m. All are 0 for
             delta <= 0, without trait ANY_GAP.
         traits: sum of traits of the law.
@@ -197,7 +219,7 @@ class ContactLaw(NamedTuple):
 
 
 LAWS = {
-    "default": ContactLaw(hunt_crossley),
+    "default": ContactLaw(default_law),
     "paper": ContactLaw(paper_law, FIXED_SPRING, "depth", explicit=True),
     "smooth": ContactLaw(smooth_law, SLIP_SPEED | ANY_GAP, "pair"),
 }
@@ -236,7 +258,7 @@ def law_functions(own: OwnLaws = ()) -> KernelSet:
         """Normal force, N, its derivative by the depth, N/m, its integral, J, and the magnitude of its terms; g is
         chi/h or gamma_n/h."""
         if law == DEFAULT:
-            return hunt_crossley(single_point, k, g, ramp, eps, delta, delta_n)
+            return default_law(single_point, k, g, ramp, eps, delta, delta_n)
         if law == PAPER:
             return paper_law(single_point, k, g, ramp, eps, delta, delta_n)
         return smooth_law(single_point, k, g, ramp, eps, delta, delta_n)

@@ -86,14 +86,14 @@ def contact_ledger_kernels(dtype: str, geometry: str, own: OwnLaws = ()) -> Kern
             tangential_force = normal * t.normal - scr.explicit_force[world, point]
             out.elastic_slip = scr.explicit_elastic_slip[world, point]
             frozen[0] = law.friction_coefficient(con, his, world, c, rec) * normal
-            frozen[1] = law.friction_stiffness(con, world, c, scr.start_depth[world, point])
+            frozen[1] = law.friction_stiffness(con, world, c, f64(1.0), scr.start_depth[world, point])
             out.slipping = wp.where(wp.length(tangential_force) >= f64(0.999999) * frozen[0], 1, 0)
         elif normal > f64(0.0) and frozen[1] > f64(0.0) and not law.has_trait(con, c, SLIP_SPEED):
             out.elastic_slip = law.return_mapping(con, world, c, t, frozen, inv_h)
         out.normal_force = normal
         out.friction_limit = frozen[0]
         out.force = normal * t.normal - tangential_force
-        spring = law.elastic_part(con, world, c, t.depth)
+        spring = law.elastic_part(con, world, c, t)
         out.stored = spring[1] + f64(0.5) * frozen[1] * wp.dot(out.elastic_slip, out.elastic_slip)
         out.loss = (normal - spring[0]) * (t.depth - t.previous_depth)
         stretch = out.elastic_slip - k.tangential(t.friction_normal, t.spring)  # change of the elastic slip

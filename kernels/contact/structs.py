@@ -84,6 +84,7 @@ def contact_struct():
         damping: wp.array2d(dtype=wp.float64)  # d of the default law
         beta: wp.array2d(dtype=wp.float64)  # -beta of Eq. (75)
         scale: wp.array2d(dtype=wp.float64)  # factor on k_n and k_t
+        compliance: wp.array2d(dtype=wp.vec3d)  # [world or 0, contact] see `stiffness_ratio` of kinematics.py
 
     return Contacts
 
@@ -114,6 +115,7 @@ def point_contact_struct():
         previous_depth: wp.float64  # at the start of the step, m; of a moving contact point, that of the one before
         relative_motion: wp.vec3d  # in the step, relative to the other side's material, m
         spring: wp.vec3d  # stored elastic slip, turned with the other side, m
+        stiffness_ratio: wp.float64  # of the point's stiffness, over its area, to the contact's
 
         normal_values: wp.vec4d  # normal force, its derivative, its potential, the magnitude of the potential's terms
         friction_normal: wp.vec3d  # normal of the plane of friction
@@ -136,6 +138,7 @@ def facet_struct(dtype: str):
         area_fraction: wp.array2d(dtype=wp.float64)  # [point, facet] fraction of the area of the region; 0: no contact
         area: wp.array2d(dtype=wp.float64)  # m^2
         contact: wp.array(dtype=wp.int32)  # [facet]
+        element_depth: wp.array(dtype=wp.float64)  # [facet] of the element behind it, m
         first_entry: wp.int32  # first entry in the pool of terms
         first_row: wp.int32  # first row of the potential
         first_point: wp.int32  # first point: [facet, point] are numbered in this order

@@ -186,9 +186,11 @@ def _checked_options(what: str, surface: SurfaceSet, o: dict[str, Any]) -> dict[
         o["mu_static"] = o["mu"]
     wanted = f"None, or at least mu = {o['mu']:g}"
     o["mu_static"] = _number(what, "mu_static", o["mu_static"], wanted, low=o["mu"])
-    o["restitution"] = _number(what, "restitution", o["restitution"], "above 0 and at most 1", high=1.0)
-    o["stiffness"] = 1.0 if o["stiffness"] is None else o["stiffness"]
-    o["stiffness"] = _number(what, "stiffness", o["stiffness"], "a positive factor, or None for 1")
+    o["restitution"] = _number(what, "restitution", o["restitution"], "from 0 to 1", low=0.0, high=1.0)
+    whole = o["stiffness"] == "region" or o["radius"] is not None or o["model"] != "patch"
+    o["stiffness_of"] = "region" if whole or law.smoothing is not None else "elements"
+    o["stiffness"] = 1.0 if o["stiffness"] in (None, "region") else o["stiffness"]
+    o["stiffness"] = _number(what, "stiffness", o["stiffness"], "a positive factor, None for 1, or 'region'")
     if o["radius"] is not None:
         o["radius"] = _number(what, "radius", o["radius"], "positive, m")
     elif o["model"] == "sphere":

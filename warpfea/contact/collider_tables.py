@@ -20,7 +20,7 @@ from ..model.contacts import Collider, Contact
 from ..model.shapes import HalfSpace, Shape
 from ..model.triangle_mesh import TriMesh
 from ..terms.time_law_table import TimeLawTable
-from .tables import WORLD_PARAMETERS, FacetTables, check_chosen_values, clamped_slots, normal_damping
+from .tables import WORLD_PARAMETERS, FacetTables, check_chosen_values, clamped_slots, compliance, normal_damping
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -124,7 +124,7 @@ class ContactTables(FacetTables[Contact]):
             out.mesh = upload_collider_meshes(m, [k.shape for k in K])
         return out
 
-    def law_constants(self, contact: Contact, world: int | None = None) -> dict[str, float]:
+    def law_constants(self, contact: Contact, world: int | None = None) -> dict[str, Any]:
         if contact.index not in self.region_radii:
             self.region_radii[contact.index] = region_radius(contact)
         parameters = self.model.parameters
@@ -166,7 +166,7 @@ def region_radius(contact: Contact) -> float:
 
 def contact_law_constants(
     contact: Contact, modulus_of: Modulus = effective_modulus, a: float | None = None, mass: float | None = None
-) -> dict[str, float]:
+) -> dict[str, Any]:
     """Constants of Eqs. (74)-(76), (79) and (80) with a rigid obstacle; for single-point contacts over powers of the
     depth."""
     E, nu = modulus_of(contact.body, contact.surface)
@@ -174,8 +174,10 @@ def contact_law_constants(
     shear = E / (2.0 * (1.0 + nu)) / (2.0 - nu)
     a = region_radius(contact) if a is None else a
     mass = body_mass_total(contact.body) if mass is None else mass
+    stiffness = 4.0 / 3.0 * modulus * a
     return {
-        "normal_stiffness": 4.0 / 3.0 * modulus * a,
+        "normal_stiffness": stiffness,
+        "compliance": compliance(contact, stiffness, math.pi * a**2, 1.0 / modulus, 0.0),
         "tangential_stiffness": 8.0 * shear * a,
         "normal_damping": normal_damping(2.0 * modulus * a, mass),
         "effective_mass": mass,

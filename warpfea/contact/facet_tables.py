@@ -12,7 +12,7 @@ import warp as wp
 from ..base.errors import ModelError
 from ..kernels.contact.facet_structs import master_struct
 from ..kernels.contact.structs import contact_struct
-from ..model.contact_points import corner_points
+from ..model.contact_points import corner_points, element_depths
 from ..model.handles import SurfaceSet
 from ..model.pairs import (
     MasterFacets,
@@ -23,7 +23,7 @@ from ..model.pairs import (
     monomial_exponents,
     pair_points,
 )
-from .tables import WORLD_PARAMETERS, FacetTables, clamped_slots, normal_damping
+from .tables import WORLD_PARAMETERS, FacetTables, clamped_slots, compliance, normal_damping
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -113,11 +113,15 @@ class PairTables(FacetTables[PairContact]):
         self.other_entries = self.master_conn.size
         self.size = self.model.size
 
-    def law_constants(self, contact: PairContact, world: int | None = None) -> dict[str, float]:
+    def law_constants(self, contact: PairContact, world: int | None = None) -> dict[str, Any]:
         region = self.region_areas[self.number[contact.index]]
         parameters = self.model.parameters
         row = contact_constants(contact, region, partial(parameters.mass, world=world), parameters.modulus(world))
-        return row | {"normal_damping": normal_damping(row["damping_stiffness"], row["effective_mass"])}
+        sides = row.pop("own_compliance"), row.pop("other_compliance")
+        return row | {
+            "normal_damping": normal_damping(row["damping_stiffness"], row["effective_mass"]),
+            "compliance": compliance(contact, row["normal_stiffness"], region, *sides),
+        }
 
     @property
     def parameter_arrays(self) -> dict[str, wp.array]:
@@ -187,6 +191,7 @@ class PairTables(FacetTables[PairContact]):
                 "exponents": power,
                 "hull_coefficients": hull,
                 "depth_limit": concatenated("depth_limit"),
+                "element_depth": np.concatenate([element_depths(s, q.size**2) for s, q in zip(self.surfaces, all_of)]),
                 "side_length": concatenated("size"),
                 "surface": np.repeat(np.arange(len(counts)), counts),
                 "max_monomials": most,

@@ -16,8 +16,9 @@ from scipy.optimize import brentq
 from ..base.worlds import check_values_per_world, set_rows, values_per_world
 from ..kernels.contact.law import law_code, own_laws
 from ..kernels.contact.structs import facet_struct
-from ..model.contact_points import CONTACT_RULES, ContactPoints, lagrange_basis
-from ..model.contacts import Contact
+from ..model.contact_points import CONTACT_RULES, ContactPoints, element_depths, lagrange_basis
+from ..model.contacts import Contact, ContactOptions
+from ..model.handles import SurfaceSet
 from ..model.pairs import PairContact
 
 if TYPE_CHECKING:
@@ -33,35 +34,40 @@ DEFAULT_SMOOTHING = (1e-3, 1e-4)
 """Default eps, N, and v_eps, m/s, of the smooth law."""
 WORLD_PARAMETERS = {"mu": "mu", "mu_static": "mu_static", "restitution": "damping", "stiffness": "scale"}
 """Contact parameters of Model.set_parameter and their arrays; the restitution also sets `beta`."""
-MATERIAL_CONSTANTS = ("normal_stiffness", "tangential_stiffness", "normal_damping", "effective_mass")
+MATERIAL_CONSTANTS = ("normal_stiffness", "tangential_stiffness", "normal_damping", "effective_mass", "compliance")
 """Contact constants derived from the bodies' materials."""
 POINT_SUM_LANES = 8
 """Largest number of threads that share a sum over the points of a facet on CUDA."""
+ELEMENT_STIFFNESS = 10.0
+"""Stiffness of a contact over that of the elements that touch: it is a tenth of their compression deep."""
 PATCH, LUMPED, MOVING = range(3)
 """Contact kinds of a facet: all points, at most one point, or at most one moving position."""
 VALID_RANGES = {  # for error texts
     "mu": "a friction coefficient, 0 or above",
     "mu_static": "at least mu",
-    "restitution": "above 0 and at most 1",
+    "restitution": "from 0 to 1",
     "stiffness": "a positive factor",
     "offset": "a finite number, m",
 }
 
 
 def restitution_beta(restitution: float) -> float:
-    """-beta of Eq. (75), positive."""
+    """-beta of Eq. (75), positive; 1 for 0."""
+    if restitution == 0.0:
+        return 1.0
     log = math.log(restitution)
     return -log / math.hypot(log, math.pi)
 
 
 def hunt_crossley_damping(restitution: float) -> float:
-    """chi v_i of the default law: the d of (1 + e) d = ln((1 + d)/(1 - e d)), 0 for e = 1.
+    """chi v_i of the default law: the d of (1 + e) d = ln((1 + d)/(1 - e d)), 0 for e = 1; -1 for e = 0, see
+    `default_law`.
 
     Exact for the impact of a mass on the spring, undamped at rest, for any exponent.
     """
     e = restitution
-    if e >= 1.0:
-        return 0.0
+    if e >= 1.0 or e <= 0.0:
+        return e - 1.0 if e <= 0.0 else 0.0
 
     def excess(d: float) -> float:
         return (1.0 + e) * d - math.log1p(d) + math.log1p(-e * d)
@@ -75,6 +81,19 @@ def hunt_crossley_damping(restitution: float) -> float:
         return 0.0
     # below e of about 0.02 the root is within round-off of 1/e
     return float(brentq(excess, low, high, xtol=1e-15)) if excess(high) < 0.0 else high
+
+
+def compliance(contact: ContactOptions, stiffness: float, area: float, *compliances: float) -> tuple[float, ...]:
+    """Coefficients of `stiffness_ratio` (kernels/contact/kinematics.py): 1 and zeros for one stiffness of the region.
+
+    Args:
+        stiffness: k_n of the region, N/m.
+        area: of the region, m^2.
+        compliances: (1 - nu^2)/E of both sides, 1/Pa.
+    """
+    if contact.stiffness_of == "region":
+        return 1.0, 0.0, 0.0
+    return 0.0, *(stiffness * c / (ELEMENT_STIFFNESS * area) for c in compliances)
 
 
 def normal_damping(stiffness: float, mass: float) -> float:
@@ -201,6 +220,9 @@ class FacetTables(Generic[AnyContact]):
             "area_fraction": np.concatenate([self.area_fractions[k] for k in chosen]).T,
             "area": np.concatenate([p.area for p in parts]).T,
             "contact": np.repeat(chosen, [len(p.conn) for p in parts]),
+            "element_depth": np.concatenate(
+                [element_depths(self._own_surface(k), self.host[k].area.sum(axis=1)) for k in chosen]
+            ),
         }
         data.first_entry, data.first_row, data.first_point = pool, self.rows, self.points
         _, data.point_count, acts = kind
@@ -216,7 +238,12 @@ class FacetTables(Generic[AnyContact]):
         m.memory.fill(data, "contact", **tables)
         return FacetGroup(conn, data, acts != PATCH, chosen)
 
-    def law_constants(self, contact: AnyContact, world: int | None = None) -> dict[str, float]:
+    def _own_surface(self, k: int) -> SurfaceSet:
+        """Surface that the points of a contact lie on."""
+        contact = self.contacts[k]
+        return contact.surface if isinstance(contact, Contact) else contact.slave
+
+    def law_constants(self, contact: AnyContact, world: int | None = None) -> dict[str, Any]:
         """Constants `MATERIAL_CONSTANTS` of a contact, as built or in one world."""
         raise NotImplementedError
 
@@ -244,7 +271,7 @@ class FacetTables(Generic[AnyContact]):
         elif name == "mu_static":
             check(wanted >= mu, "at least mu = {:g}", mu)
         elif name == "restitution":
-            check((wanted > 0.0) & (wanted <= 1.0))
+            check((wanted >= 0.0) & (wanted <= 1.0))
             wanted = np.where(mask, wanted, 1.0)
             set_rows(data.beta, (mask, k), [restitution_beta(float(e)) for e in wanted[mask]])
             wanted = np.array([hunt_crossley_damping(float(e)) for e in wanted])
@@ -273,7 +300,7 @@ class FacetTables(Generic[AnyContact]):
             if getattr(data, name).shape[0] != m.worlds:
                 old = getattr(data, name)
                 m.memory.uncount("contact", old)
-                setattr(data, name, m.array("contact", np.tile(old.numpy(), (m.worlds, 1)), wp.float64))
+                setattr(data, name, m.array("contact", np.repeat(old.numpy(), m.worlds, axis=0), old.dtype))
         host = {name: getattr(data, name).numpy() for name in MATERIAL_CONSTANTS}
         for world in np.flatnonzero(mask).tolist():
             for k in touched:
@@ -283,7 +310,7 @@ class FacetTables(Generic[AnyContact]):
         for name, values in host.items():
             getattr(data, name).assign(values)
 
-    def _upload_laws(self, out: Any, law_constants: list[dict[str, float]]) -> None:
+    def _upload_laws(self, out: Any, law_constants: list[dict[str, Any]]) -> None:
         """Upload the contact law constants; `law_constants` per contact: `FROM_BODIES`."""
         m, C = self.model, self.contacts
         smoothing = [c.smoothing if isinstance(c.smoothing, tuple) else DEFAULT_SMOOTHING for c in C]

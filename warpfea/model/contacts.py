@@ -51,10 +51,11 @@ class ContactOptions:
 
     Attributes:
         mu, mu_static: coefficients of friction in slip and in stick, 0 <= mu <= mu_static.
-        restitution: in (0, 1].
+        restitution: from 0 to 1.
         law: "default", "paper" or "smooth".
         treatment: "implicit", or "explicit" with the paper's law.
         stiffness: factor on the normal and the tangential stiffness.
+        stiffness_of: "elements" that touch, or the contact's "region".
         model: "patch" or "sphere".
         radius: m, of the contact region ("patch") or of the body ("sphere"), or None.
         offset: gap at which contact begins, m.
@@ -67,10 +68,11 @@ class ContactOptions:
 
     mu: float = 0.0
     mu_static: float = 0.0
-    restitution: float = 1.0
+    restitution: float = 0.0
     law: str = "default"
     treatment: str = "implicit"
     stiffness: float = 1.0
+    stiffness_of: str = "elements"
     model: str = "patch"
     radius: float | None = None
     offset: float = 0.0

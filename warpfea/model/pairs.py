@@ -232,19 +232,24 @@ def contact_constants(
 ) -> dict[str, float]:
     """Contact constants of Eqs. (74)-(76), (79), (80) for a contact region of `area`, m^2.
 
-    Normal and tangential stiffness 4/3 E* a and 8 G* a, N/m; 2 E* a, N/m, for the damping; effective mass, kg.
+    Normal and tangential stiffness 4/3 E* a and 8 G* a, N/m; 2 E* a, N/m, for the damping; effective mass, kg; 1/E* of
+    slave and master, 1/Pa.
     """
-    compliance = shear_compliance = inverse_mass = 0.0
+    shear_compliance = inverse_mass = 0.0
+    compliances = []
     for surface in (contact.slave, contact.master):
         total = mass_of(surface.body)
         inverse_mass += 1.0 / total if total > 0.0 else math.inf
         E, nu = modulus_of(surface.body, surface)
-        compliance += (1.0 - nu**2) / E
+        compliances.append((1.0 - nu**2) / E)
         shear_compliance += 2.0 * (2.0 - nu) * (1.0 + nu) / E
     a = contact.radius or math.sqrt(area / math.pi)
+    compliance = sum(compliances)
     return {
         "normal_stiffness": 4.0 / 3.0 * a / compliance,
         "tangential_stiffness": 8.0 * a / shear_compliance,
         "damping_stiffness": 2.0 * a / compliance,
         "effective_mass": 1.0 / inverse_mass,
+        "own_compliance": compliances[0],
+        "other_compliance": compliances[1],
     }
