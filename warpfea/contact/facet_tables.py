@@ -191,7 +191,7 @@ class PairTables(FacetTables[PairContact]):
                 "exponents": power,
                 "hull_coefficients": hull,
                 "depth_limit": concatenated("depth_limit"),
-                "element_depth": np.concatenate([element_depths(s, q.size**2) for s, q in zip(self.surfaces, all_of)]),
+                "element_depth": np.concatenate([element_depths(s) for s in self.surfaces]),
                 "side_length": concatenated("size"),
                 "surface": np.repeat(np.arange(len(counts)), counts),
                 "max_monomials": most,

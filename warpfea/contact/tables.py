@@ -220,9 +220,7 @@ class FacetTables(Generic[AnyContact]):
             "area_fraction": np.concatenate([self.area_fractions[k] for k in chosen]).T,
             "area": np.concatenate([p.area for p in parts]).T,
             "contact": np.repeat(chosen, [len(p.conn) for p in parts]),
-            "element_depth": np.concatenate(
-                [element_depths(self._own_surface(k), self.host[k].area.sum(axis=1)) for k in chosen]
-            ),
+            "element_depth": np.concatenate([element_depths(self._own_surface(k)) for k in chosen]),
         }
         data.first_entry, data.first_row, data.first_point = pool, self.rows, self.points
         _, data.point_count, acts = kind

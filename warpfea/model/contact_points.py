@@ -41,7 +41,6 @@ CONTACT_RULES: Mapping[int, Mapping[int, Rule]] = {
     4: {n * n: lobatto_square(n) for n in (2, 3, 4, 5)},
 }
 """Rules including the face corners, by the numbers of corners and of points."""
-TINY = 1e-300
 ALIKE = 4.0
 """Ratio of the depths of elements that share a contact stiffness."""
 DEFAULT_POINTS = {3: 7, 4: 16}
@@ -193,18 +192,18 @@ def _elastic_constants(material: Material) -> tuple[float, float]:
     return mu * (3.0 * lam + 2.0 * mu) / (lam + mu), lam / (2.0 * (lam + mu))
 
 
-def element_depths(surface: SurfaceSet, area: np.ndarray) -> np.ndarray:
-    """(F,) depth of the element behind each face of `area` (F,), m: its height over the face.
+def element_depths(surface: SurfaceSet) -> np.ndarray:
+    """(F,) depth of the element behind each face, m, for the stiffness of contact.
 
     Of several materials at the surface, times the Young's modulus of `effective_modulus` over that of the element. The
     least depth of a surface stands for those below `ALIKE` times it, and so on: a contact of uniform stiffness alone
     leaves a uniform pressure uniform.
     """
     body, elements = surface.body, surface.faces[:, 0]
-    corners = np.array([len(face) for face in body.family.faces])[surface.faces[:, 1]]
-    height = np.where(corners == 3, 3.0, 1.0) * assembly.element_volumes(body)[elements] / np.maximum(area, TINY)
     moduli = np.array([_elastic_constants(material)[0] for _, material in body.materials])
-    depth = height * effective_modulus(body, surface)[0] / moduli[body.material_of[elements]]
+    depth = (
+        element_edge_and_depth(surface)[1] * effective_modulus(body, surface)[0] / moduli[body.material_of[elements]]
+    )
     least = float(depth.min())
     return np.asarray(least * ALIKE ** np.floor(np.log(depth / least) / math.log(ALIKE)))
 
