@@ -244,7 +244,7 @@ def test_static_friction_follows_where_it_was_equal():
     ("pad.mu", np.nan, r"mu = nan in world 0"), ("pad.mu", [0.1, 0.2, 0.3], r"mu has shape \(3,\).* \(2,\)"),
     ("pad.mu", "much", r"mu = 'much' must be a number"),
     ("pad.mu_static", [0.5, 0.4], r"mu_static = 0.4 in world 1 must be at least mu = 0.5"),
-    ("pad.restitution", [1.0, 0.0], r"restitution = 0.0 in world 1 must be above 0 and at most 1"),
+    ("pad.restitution", [1.0, -0.1], r"restitution = -0.1 in world 1 must be from 0 to 1"),
     ("pad.restitution", 1.1, r"restitution = 1.1"), ("pad.stiffness", 0, r"stiffness = 0.0 .* a positive factor"),
     ("floor.offset", np.inf, r"collider 'floor': offset = inf"),
     ("pad.nu", 1, r"'pad.nu' is unknown; there are: 'pad.mu'.* 'floor.offset'.*; did you mean"),

@@ -68,7 +68,7 @@ def test_worlds_with_values_of_their_own_equal_their_own_runs(name, values):
     [
         ("pad.mu", -0.1, "contact 'pad': mu = -0.1 in world 0 must be a friction coefficient"),
         ("pad.mu_static", 0.2, "at least mu = 0.5"),
-        ("pad.restitution", 0.0, "above 0 and at most 1"),
+        ("pad.restitution", -0.1, "from 0 to 1"),
         ("pad.stiffness", [1.0, 2.0], r"shape \(2,\)"),
         ("pad.offset", 1e-3, "'pad.offset' is unknown; there are: .*'pad.mu'"),
         ("pas.mu", 0.1, r"did you mean 'pad.mu'\?"),

@@ -29,6 +29,7 @@ from ..common.modules import KernelSet, definition_name, kernel_set
 
 __all__ = [
     "ANY_GAP",
+    "CRITICAL_DAMPING",
     "FIXED_SPRING",
     "IMPACT_SPEED",
     "LAWS",
@@ -48,12 +49,13 @@ __all__ = [
 ]
 
 f64, vec3d, vec4d = wp.float64, wp.vec3d, wp.vec4d
-SPEED_DAMPING, UNLOADING, FIXED_SPRING, SLIP_SPEED, ANY_GAP = 1, 2, 4, 8, 16
+SPEED_DAMPING, UNLOADING, FIXED_SPRING, SLIP_SPEED, ANY_GAP, CRITICAL_DAMPING = 1, 2, 4, 8, 16, 32
 """Traits of a law, added up. SPEED_DAMPING: its damping g is d/(v_i h), with d of the restitution and v_i the largest
 approach speed, else gamma_n/h. UNLOADING: a lumped contact that unloads reduces its elastic slip with its radius.
 FIXED_SPRING: Eqs. (78) and (83) of Paper I, where the elastic slip does not turn with the bodies and may reverse.
-SLIP_SPEED: friction of the slip speed, without elastic slip. ANY_GAP: it acts at any gap."""
-TRAIT_BITS = 5
+SLIP_SPEED: friction of the slip speed, without elastic slip. ANY_GAP: it acts at any gap. CRITICAL_DAMPING: with
+SPEED_DAMPING, restitution 0 is told by g < 0, minus the critical damping over h, N/m."""
+TRAIT_BITS = 6
 IMPACT_SPEED = 0.05
 """Approach speed of a point, m/s, up to which restitution 0 does not damp it: points that enter a rolling contact would
 brake it."""
@@ -203,8 +205,7 @@ class ContactLaw(NamedTuple):
     Attributes:
         normal: device function (single_point, k, g, ramp, eps, delta, delta_n) -> (force, N, its derivative by the
             depth, N/m, its integral, J, magnitude of the integral's terms, J), of the whole region. k: normal
-            stiffness, N/m (single_point: N/m^1.5); g: damping by trait SPEED_DAMPING (with restitution 0 negative:
-            minus the critical damping over h), 0 for the elastic part; ramp,
+            stiffness, N/m (single_point: N/m^1.5); g: damping by trait SPEED_DAMPING, 0 for the elastic part; ramp,
             eps: from `smoothing`, m and N; delta, delta_n: depth now and at the start of the step, m. All are 0 for
             delta <= 0, without trait ANY_GAP.
         traits: sum of traits of the law.
@@ -217,9 +218,15 @@ class ContactLaw(NamedTuple):
     smoothing: str | None = None
     explicit: bool = False
 
+    @property
+    def least_restitution(self) -> float:
+        """0, or the least positive number for a law that has no damping without a rebound."""
+        undamped = self.traits & SPEED_DAMPING and not self.traits & CRITICAL_DAMPING
+        return 5e-324 if undamped else 0.0
+
 
 LAWS = {
-    "default": ContactLaw(default_law),
+    "default": ContactLaw(default_law, SPEED_DAMPING | UNLOADING | CRITICAL_DAMPING),
     "paper": ContactLaw(paper_law, FIXED_SPRING, "depth", explicit=True),
     "smooth": ContactLaw(smooth_law, SLIP_SPEED | ANY_GAP, "pair"),
 }

@@ -38,8 +38,8 @@ class ContactMethods:
 
     def add_contact(
         self, surface: Body | SurfaceSet, collider: Collider | Any = None, *, mu: float = 0.0,
-        mu_static: float | None = None, restitution: float = 0.0, law: str = "default", treatment: str = "implicit",
-        stiffness: float | str | None = None, model: str = "patch", radius: float | None = None, offset: float = 0.0,
+        mu_static: float | None = None, restitution: float = 1.0, law: str = "default", treatment: str = "implicit",
+        stiffness: Any = None, model: str = "patch", radius: float | None = None, offset: float = 0.0,
         points: int | None = None, smoothing: Any = None, overlap: str = "auto", overlap_time: float = 0.1,
         name: str | None = None,
     ) -> Contact | PairContact:  # fmt: skip
@@ -49,13 +49,13 @@ class ContactMethods:
             surface: outer faces; of a body all.
             collider: as `add_collider` returned it; or another body, or a surface of it.
             mu, mu_static: coefficients of friction in slip, and in stick if it is larger.
-            restitution: speed after an impact over that before, from 0 to 1. 0 damps points that come faster than
-                `IMPACT_SPEED`; with any, waves stay in the bodies.
+            restitution: speed after an impact over that before, from 0 to 1; 0 damps points that come faster than
+                `IMPACT_SPEED`. Waves stay in the bodies.
             law: "default", "paper" (Paper I, Eqs. 72-83) or "smooth".
             treatment: "implicit", or "explicit" with the paper's law.
-            stiffness: factor on the normal and the tangential stiffness, None: 1. They follow the elements that touch,
-                so that the contact yields by a tenth of them (`ELEMENT_STIFFNESS`); with "region", a radius, model
-                "sphere" and the laws of Paper I they are k_n and k_t of Eqs. (74) and (79), of the whole surface.
+            stiffness: factor on the normal and the tangential stiffness, None: 1, of the whole surface by Eqs. (74) and
+                (79): "region", or ("region", factor). "elements", or ("elements", factor), follows the elements that
+                touch: the contact yields by a tenth of what they do (`ELEMENT_STIFFNESS`), soft or stiff.
             model: "patch", spread over the surface, or "sphere", one contact at the deepest place, by Hertz.
             radius: m; "patch": disc whose area replaces the surface's; "sphere": local radius of the body.
             offset: gap at which contact begins, m.

@@ -186,11 +186,10 @@ def _checked_options(what: str, surface: SurfaceSet, o: dict[str, Any]) -> dict[
         o["mu_static"] = o["mu"]
     wanted = f"None, or at least mu = {o['mu']:g}"
     o["mu_static"] = _number(what, "mu_static", o["mu_static"], wanted, low=o["mu"])
-    o["restitution"] = _number(what, "restitution", o["restitution"], "from 0 to 1", low=0.0, high=1.0)
-    whole = o["stiffness"] == "region" or o["radius"] is not None or o["model"] != "patch"
-    o["stiffness_of"] = "region" if whole or law.smoothing is not None else "elements"
-    o["stiffness"] = 1.0 if o["stiffness"] in (None, "region") else o["stiffness"]
-    o["stiffness"] = _number(what, "stiffness", o["stiffness"], "a positive factor, None for 1, or 'region'")
+    wanted = "above 0 and at most 1 with this law" if law.least_restitution else "from 0 to 1"
+    o["restitution"] = _number(what, "restitution", o["restitution"], wanted, low=law.least_restitution, high=1.0)
+    may_follow = o["radius"] is None and o["model"] == "patch" and law.smoothing is None
+    o["stiffness_of"], o["stiffness"] = _stiffness(what, o["stiffness"], may_follow)
     if o["radius"] is not None:
         o["radius"] = _number(what, "radius", o["radius"], "positive, m")
     elif o["model"] == "sphere":
@@ -239,6 +238,19 @@ def _number(
     if not is_number(value) or value > high or (value <= 0.0 if low is None else value < low):
         raise ModelError(f"{what}: {name} = {value!r} must be {wanted}")
     return float(value)
+
+
+def _stiffness(what: str, value: Any, may_follow: bool) -> tuple[str, float]:
+    """`ContactOptions.stiffness_of`, and the factor."""
+    of, factor = value if isinstance(value, (tuple, list)) and len(value) == 2 else ("region", value)
+    if isinstance(value, str):
+        of, factor = value, None
+    wanted = "a positive factor, None for 1, 'region' or 'elements', or (one of these, factor)"
+    if of not in ("region", "elements"):
+        raise ModelError(f"{what}: stiffness = {value!r} must be {wanted}")
+    if of == "elements" and not may_follow:
+        raise ModelError(f"{what}: stiffness = {value!r} needs law = 'default', model = 'patch' and no radius")
+    return of, 1.0 if factor is None else _number(what, "stiffness", factor, wanted)
 
 
 def _smoothing(what: str, law: str, value: Any) -> float | tuple[float, float] | None:

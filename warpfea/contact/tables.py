@@ -14,11 +14,10 @@ import warp as wp
 from scipy.optimize import brentq
 
 from ..base.worlds import check_values_per_world, set_rows, values_per_world
-from ..kernels.contact.law import law_code, own_laws
+from ..kernels.contact.law import LAWS, law_code, own_laws
 from ..kernels.contact.structs import facet_struct
 from ..model.contact_points import CONTACT_RULES, ContactPoints, element_depths, lagrange_basis
 from ..model.contacts import Contact, ContactOptions
-from ..model.handles import SurfaceSet
 from ..model.pairs import PairContact
 
 if TYPE_CHECKING:
@@ -220,7 +219,7 @@ class FacetTables(Generic[AnyContact]):
             "area_fraction": np.concatenate([self.area_fractions[k] for k in chosen]).T,
             "area": np.concatenate([p.area for p in parts]).T,
             "contact": np.repeat(chosen, [len(p.conn) for p in parts]),
-            "element_depth": np.concatenate([element_depths(self._own_surface(k)) for k in chosen]),
+            "element_depth": np.concatenate([element_depths(self.contacts[k].surfaces[0]) for k in chosen]),
         }
         data.first_entry, data.first_row, data.first_point = pool, self.rows, self.points
         _, data.point_count, acts = kind
@@ -235,11 +234,6 @@ class FacetTables(Generic[AnyContact]):
             tables |= {"point_coords": points, "lagrange_coefficients": basis, "exponents": power}
         m.memory.fill(data, "contact", **tables)
         return FacetGroup(conn, data, acts != PATCH, chosen)
-
-    def _own_surface(self, k: int) -> SurfaceSet:
-        """Surface that the points of a contact lie on."""
-        contact = self.contacts[k]
-        return contact.surface if isinstance(contact, Contact) else contact.slave
 
     def law_constants(self, contact: AnyContact, world: int | None = None) -> dict[str, Any]:
         """Constants `MATERIAL_CONSTANTS` of a contact, as built or in one world."""
@@ -269,7 +263,7 @@ class FacetTables(Generic[AnyContact]):
         elif name == "mu_static":
             check(wanted >= mu, "at least mu = {:g}", mu)
         elif name == "restitution":
-            check((wanted >= 0.0) & (wanted <= 1.0))
+            check((wanted >= LAWS[contact.law].least_restitution) & (wanted <= 1.0))
             wanted = np.where(mask, wanted, 1.0)
             set_rows(data.beta, (mask, k), [restitution_beta(float(e)) for e in wanted[mask]])
             wanted = np.array([hunt_crossley_damping(float(e)) for e in wanted])

@@ -68,11 +68,11 @@ class ContactOptions:
 
     mu: float = 0.0
     mu_static: float = 0.0
-    restitution: float = 0.0
+    restitution: float = 1.0
     law: str = "default"
     treatment: str = "implicit"
     stiffness: float = 1.0
-    stiffness_of: str = "elements"
+    stiffness_of: str = "region"
     model: str = "patch"
     radius: float | None = None
     offset: float = 0.0

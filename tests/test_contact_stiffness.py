@@ -1,0 +1,124 @@
+"""Stiffness of contact from the elements that touch, and restitution 0."""
+
+import numpy as np
+import pytest
+import warp as wp
+from warpfea.kernels.contact.law import CRITICAL_DAMPING, LAWS, ContactLaw, default_law, hunt_crossley
+
+import warpfea as wf
+from warpfea.contact.tables import ELEMENT_STIFFNESS
+
+f64 = wp.float64
+SIDE, NU = 0.1, 0.3
+
+
+def block(b, E, cells, low=0.0, name="block"):
+    mesh = wf.mesh.box((SIDE,) * 3, cells=(cells,) * 3, origin=(0, 0, low))
+    return b.add_solid(mesh, material=wf.NeoHookean.from_E_nu(E=E, nu=NU, density=1000.0), name=name)
+
+
+def pressed(E, cells, other, *, pressure=1e4, worlds=1, **options):
+    """Model of a block that a pressure, Pa, presses on a floor or on a clamped block (E, cells), and the contact."""
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    body = block(b, E, cells)
+    if other is None:
+        base = b.add_collider(wf.HalfSpace((0, 0, 1)))
+    else:
+        base = block(b, *other, low=-SIDE, name="base")
+        b.clamp(base.nodes(lambda X: np.ones(len(X), dtype=bool)))
+        base = base.surface("z+")
+    b.clamp(body.nodes("z+"), components="xy")
+    b.add_traction(body.surface("z+"), (0, 0, -pressure))
+    pad = b.add_contact(body.surface("z-"), base, **({"stiffness": "elements"} | options))
+    return b.finalize(device="cpu", worlds=worlds), pad
+
+
+def mean_depth(model, pad, world=0):
+    """Depth of the contact whose force is that of the record, m."""
+    r = wf.solve_static(model, stabilise=True).contact_record(pad)
+    return float(r.stored[world, -1] / r.normal_force[world, -1]) * 2.0
+
+
+@pytest.mark.parametrize("E", [1e4, 1e9])
+@pytest.mark.parametrize("other", [None, (1e9, 2), (1e5, 1)])
+def test_the_depth_is_a_tenth_of_the_compression_of_the_elements(E, other):
+    """Of a uniform pressure p: p (1 - nu^2) (h_1/E_1 + h_2/E_2) / 10, h the heights of the elements."""
+    p = 1e-3 * (E if other is None else min(E, other[0]))
+    model, pad = pressed(E, 2, other, pressure=p)
+    heights = SIDE / 2 / E + (0.0 if other is None else SIDE / other[1] / other[0])
+    wanted = p * (1.0 - NU**2) * heights / ELEMENT_STIFFNESS
+    assert mean_depth(model, pad) == pytest.approx(wanted, rel=0.02)  # the pressure is uneven at the borders
+
+
+def test_the_stiffness_follows_the_parameters_of_a_world():
+    model, pad = pressed(1e6, 1, None, worlds=2)
+    model.set_parameter("block.E", [1e6, 4e6])
+    first, second = (mean_depth(model, pad, world) for world in (0, 1))
+    assert second == pytest.approx(0.25 * first, rel=0.02)
+
+
+def test_other_stiffness_is_that_of_the_region():
+    depths = [mean_depth(*pressed(1e6, 2, None, stiffness=s)) for s in (None, "region", ("region", 4.0), 4.0)]
+    assert depths[0] == depths[1] > 3.0 * depths[2] == 3.0 * depths[3]
+
+
+@wp.kernel(enable_backward=False)
+def law_values(single: int, rate: f64, before: f64, delta: wp.array(dtype=f64), out: wp.array(dtype=wp.vec4d)):
+    i = wp.tid()
+    out[i] = default_law(single, f64(1e6), rate, f64(0.0), f64(0.0), delta[i], before)
+
+
+@pytest.mark.parametrize("single", [0, 1])
+@pytest.mark.parametrize("before", [-1e-4, 0.0, 1e-3])
+def test_without_a_rebound_the_law_is_continuous_and_has_a_potential(single, before):
+    """F = max(0, k d^m + g d^((m-1)/2) (d - max(0, d_n))), m = 1 or 1.5, its slope and integral by differences."""
+    g = 5e5
+    d = np.linspace(-2e-4, 3e-3, 20001)
+    out = wp.zeros(len(d), dtype=wp.vec4d, device="cpu")
+    wp.launch(law_values, len(d), [single, -g, before, wp.array(d, dtype=f64, device="cpu"), out], device="cpu")
+    force, slope, psi, size = out.numpy().T
+    depth = np.maximum(d, 0.0)
+    wanted = 1e6 * depth ** (1.5 if single else 1.0) + g * depth ** (0.25 * single) * (depth - max(before, 0.0))
+    np.testing.assert_allclose(force, np.maximum(wanted, 0.0), atol=1e-12 * force.max())
+    inside = slice(1, -1)
+    np.testing.assert_allclose(np.gradient(psi, d)[inside], force[inside], atol=2e-3 * force.max())
+    ends = np.flatnonzero((force[1:] > 0.0) != (force[:-1] > 0.0))  # the kink
+    smooth = np.setdiff1d(np.arange(2, len(d) - 2), ends[:, None] + np.arange(-2, 4))
+    np.testing.assert_allclose(np.gradient(force, d)[smooth], slope[smooth], rtol=2e-2, atol=1e-3 * slope.max())
+    assert (size >= psi - 1e-15).all()
+
+
+def dropped(E, height, *, t_end, dtype="float64", **options):
+    """Simulation of a falling block, and its contact with the floor."""
+    b = wf.ModelBuilder(gravity=(0, 0, -9.81))
+    body = block(b, E, 2, low=height)
+    pad = b.add_contact(body, b.add_collider(wf.HalfSpace((0, 0, 1))), stiffness="elements", **options)
+    sim = wf.Simulation(b.finalize(device="cpu", dtype=dtype), dt=1e-3)
+    sim.run(t_end=t_end)
+    return sim, pad
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_a_stiff_block_does_not_come_back(dtype):
+    """After 0.2 s less than 1e-6 of the energy of a drop of 2 cm is left."""
+    sim, pad = dropped(1e8, 0.02, t_end=0.2, restitution=0.0, dtype=dtype)
+    assert sim.energies()["kinetic"][0] < 1e-6 * 9.81 * 0.02
+    force = sim.contact_record(pad).normal_force[0, -20:].mean()
+    assert force == pytest.approx(9.81, rel=1e-3 if dtype == "float64" else 1e-2)
+    assert abs(sim.energies()["ledger_residual"][0]) < (1e-6 if dtype == "float64" else 1e-3) * 9.81 * 0.02
+
+
+def test_a_soft_block_sinks_little():
+    """E = 1e5 Pa from 0.5 m: 40 mm, most of an element, with one stiffness of the region."""
+    sim, pad = dropped(1e5, 0.5, t_end=0.36, restitution=0.0)
+    assert sim.contact_record(pad).normal_force[0].max() > 100.0
+    assert sim.contact_record(pad).penetration[0].max() < 0.05 * 0.05
+
+
+def test_a_law_without_critical_damping_needs_a_restitution(monkeypatch):
+    assert LAWS["default"].traits & CRITICAL_DAMPING
+    monkeypatch.setitem(LAWS, "mine", ContactLaw(hunt_crossley))
+    b = wf.ModelBuilder()
+    floor = b.add_collider(wf.HalfSpace((0, 0, 1)))
+    with pytest.raises(wf.ModelError, match=r"restitution = 0.0 must be above 0 and at most 1 with this law"):
+        b.add_contact(block(b, 1e6, 1), floor, law="mine", restitution=0.0)
