@@ -252,8 +252,8 @@ def _tasks(options: argparse.Namespace, variant: str) -> Iterator[list[str]]:
         return
     if options.rows[0] == "random":
         share = -(-RANDOM_CASES // options.jobs)
-        for first in range(0, RANDOM_CASES, share):
-            seeds = f"{first}:{min(first + share, RANDOM_CASES)}"
+        parts = [f"{k}:{min(k + share, RANDOM_CASES)}" for k in range(0, RANDOM_CASES, share)]
+        for seeds in options.case or parts:
             yield [str(ROOT / "tests" / "random_cases.py"), "--device", options.device, "--seeds", seeds, "--out"]
         return
     part = CONSTANTS[variant].rows if variant in CONSTANTS else ""
@@ -379,7 +379,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", required=True, type=pathlib.Path, help="JSON, added to where it exists")
     parser.add_argument("--only", nargs="+", default=[], help="variants, or areas of them; by default all")
-    parser.add_argument("--case", nargs="+", default=[], help="cases, rows or groups of the stress suite, or scenes")
+    parser.add_argument(
+        "--case", nargs="+", default=[], help="cases, rows or groups of the stress suite, scenes, or first:last seeds"
+    )
     parser.add_argument("--suite", choices=("all", "quick"), default="all")
     parser.add_argument("--longest", type=float, default=math.inf, help="leave out rows that took more seconds")
     parser.add_argument(
