@@ -75,7 +75,7 @@ def test_commands_warn_of_deep_contact(static, tmp_path, monkeypatch, capfd):
     pad = json.loads((tmp_path / "s.json").read_text())["contacts"]["pad"]
     assert pad["relative_penetration"] == pytest.approx(pad["penetration"] / 0.1)
     ratio = f"{pad['relative_penetration']:.2g}"
-    text = f"WARNING contact 'pad': penetration of up to {ratio} of its smallest element; take a higher stiffness="
+    text = f"WARNING contact 'pad': penetration of up to {ratio} of its smallest element; take stiffness='elements' of"
     assert text in out
     assert ("or a smaller dt" in out) != static
     assert main([*words, "--set", "stiffness=1000"]) == 0
