@@ -6,11 +6,12 @@ import warp as wp
 
 from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.types import f64, precision, vec3d
+from .collider_seams import SEAMS_SUFFIX, seam_functions
 from .collider_shapes import MESH
 from .colliders import MESH_SUFFIX, collider_functions
 from .kinematics import GEOMETRIES, kinematics_functions
 from .law import ANY_GAP, FIXED_SPRING
-from .structs import IN_REACH, PASSED, TURNED, collider_struct, contact_structs
+from .structs import FREE, IN_REACH, PASSED, TURNED, collider_struct, contact_structs
 
 __all__ = ["MAX_COLLIDER_ROTATION", "MIN_APPROACH_SPEED", "collider_kinematics", "pose_kernels"]
 
@@ -21,13 +22,17 @@ MAX_COLLIDER_ROTATION = 1.0
 
 
 @functools.cache
-def collider_kinematics(dtype: str, meshes: bool) -> KernelSet:
-    """Device functions of the geometry, see kinematics.py; `meshes`: some collider is a triangle mesh."""
+def collider_kinematics(dtype: str, meshes: bool, seams: bool = False) -> KernelSet:
+    """Device functions of the geometry, see kinematics.py; `meshes`: some collider is a triangle mesh; `seams`: some
+    contact has neighbours, see collider_seams.py."""
     vec3 = precision(dtype).vec3
     Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)
     Other = collider_struct(meshes)
     k, g = kinematics_functions(dtype), collider_functions(meshes)
     interpolate, distance, stored_side = k.interpolate, g.distance, g.stored_side
+    seam = seam_functions(meshes) if seams else None
+    names = ("level_side", "level_sheet_side", "kept_sheet_side", "is_shared")
+    level_side, level_sheet_side, kept_sheet_side, is_shared = (getattr(seam, name, None) for name in names)
 
     @wp.func
     def set_start(
@@ -62,7 +67,10 @@ def collider_kinematics(dtype: str, meshes: bool) -> KernelSet:
         in_contact = his.speed[world, rec] > f64(0.0)
         if wp.static(meshes):
             if not in_contact:
-                his.contact_state[world, rec] = g.sheet_side(col, kc, y, his.contact_state[world, rec])
+                state = g.sheet_side(col, kc, y, his.contact_state[world, rec])
+                if wp.static(seams):
+                    state = kept_sheet_side(col, c, y, his.contact_state[world, rec], state)
+                his.contact_state[world, rec] = state
         side = stored_side(col, kc, in_contact, his.contact_state[world, rec])
         now = k.activation_gap(con, his, world, c, point, clock.time[world], col.previous_margin[world, kc])
         n = set_start(col, scr, world, kc, point, y, side, now)
@@ -102,10 +110,10 @@ def collider_kinematics(dtype: str, meshes: bool) -> KernelSet:
 
     @wp.func
     def set_depth(
-        con: Contacts, col: Other, his: History, scr: ContactScratch, world: int, c: int, point: int, t: PointContact,
-        activation: f64,
+        con: Contacts, col: Other, facets: Facets, his: History, scr: ContactScratch, world: int, c: int, point: int,
+        t: PointContact, activation: f64,
     ) -> PointContact:  # fmt: skip
-        """The record with side, normal, depth and state from its local position and relative motion."""
+        """The record with side, normal, depths and state from its local position and relative motion."""
         out = t
         kc = col.of_contact[c]
         rotation = col.rotation[world, kc]
@@ -115,6 +123,8 @@ def collider_kinematics(dtype: str, meshes: bool) -> KernelSet:
         d = wp.vec4d(f64(0.0), f64(0.0), f64(1.0), f64(0.0))
         out.feature = -1
         far = bool(False)
+        crossed = bool(False)
+        level = wp.int32(-1)
         if wp.static(meshes):
             d[3] = scr.activation_gap[world, point] - before - wp.length(t.local_position - start)
             far = not in_contact and d[3] > activation and is_far(con, col, scr, world, c, point, d[3])
@@ -122,6 +132,15 @@ def collider_kinematics(dtype: str, meshes: bool) -> KernelSet:
             side = stored_side(col, kc, in_contact, his.contact_state[world, k.history_row(con, c, point)])
             out.feature = g.sweep(col, kc, start, t.local_position, side)
             d = distance(col, kc, t.local_position, out.feature)
+            if wp.static(seams):
+                if d[3] < f64(0.0) and out.feature != -2 and (out.feature != side or side < 0):
+                    level = level_side(col, world, c, t.local_position, vec3d(d[0], d[1], d[2]), d[3])
+                elif wp.static(meshes) and out.feature == -1:
+                    level = level_sheet_side(col, world, c, start, t.local_position, side)
+                if level >= 0:
+                    out.feature = level
+                    d = distance(col, kc, t.local_position, level)
+                    crossed = bool(True)
         out.normal = rotation * vec3d(d[0], d[1], d[2])
         out.depth = activation - d[3]
         change = g.depth_change(col, kc, out.feature, start, t.local_position,
@@ -129,10 +148,16 @@ def collider_kinematics(dtype: str, meshes: bool) -> KernelSet:
                                 scr.activation_gap[world, point] - before, d[3])  # fmt: skip
         if change[1] != f64(0.0):
             out.depth = before + change[0] + (activation - scr.activation_gap[world, point])
+        out.previous_depth = k.depth_at_start(con, facets, his, scr, world, c, point)
+        if crossed:  # the depth at the start is the distance from the side face
+            out.previous_depth = out.depth + wp.dot(out.normal, t.relative_motion)
         near = out.depth > f64(0.0) or before > f64(0.0)
         out.state = wp.where(out.feature == -2, PASSED, IN_REACH)
         if near and out.feature != -2 and wp.abs(turn_in_step(col, world, kc)) > f64(MAX_COLLIDER_ROTATION):
             out.state = TURNED
+        if wp.static(seams):
+            if d[3] < f64(0.0) and is_shared(col, world, c, t.local_position, vec3d(d[0], d[1], d[2]), d[3]):
+                out.state = wp.where(out.state == IN_REACH, FREE, out.state)
         return out
 
     @wp.func
@@ -156,8 +181,7 @@ def collider_kinematics(dtype: str, meshes: bool) -> KernelSet:
             )
         out.relative_motion = motion
         activation = k.activation_gap(con, his, world, c, point, time, col.margin[world, kc])
-        out = set_depth(con, col, his, scr, world, c, point, out, activation)
-        out.previous_depth = k.depth_at_start(con, facets, his, scr, world, c, point)
+        out = set_depth(con, col, facets, his, scr, world, c, point, out, activation)
         out.stiffness_ratio = k.stiffness_ratio(con, facets, world, c, item, f64(0.0))
         if his.speed[world, rec] > f64(0.0):
             out.spring = his.spring[world, rec]
@@ -239,8 +263,9 @@ def collider_kinematics(dtype: str, meshes: bool) -> KernelSet:
     return kernel_set(locals())
 
 
-GEOMETRIES["colliders"] = functools.partial(collider_kinematics, meshes=False)
-GEOMETRIES["colliders_meshes"] = functools.partial(collider_kinematics, meshes=True)
+for name, flags in {"": (False, False), MESH_SUFFIX: (True, False), SEAMS_SUFFIX: (False, True),
+                    MESH_SUFFIX + SEAMS_SUFFIX: (True, True)}.items():  # fmt: skip
+    GEOMETRIES[f"colliders{name}"] = functools.partial(collider_kinematics, meshes=flags[0], seams=flags[1])
 
 
 @functools.cache

@@ -122,18 +122,19 @@ def mesh_functions(Colliders) -> KernelSet:
         return wp.where(side >= 0 and side % 2 == 1, f64(-1.0), f64(1.0))
 
     @wp.func
-    def is_candidate(col: Colliders, t: int, y: vec3d, side: int) -> bool:
-        """True if a triangle faces like that of a side and is ahead of a point that has passed the surface."""
-        if side < 0:
+    def is_candidate(col: Colliders, t: int, y: vec3d, way: vec3d, sign: f64) -> bool:
+        """True if a triangle faces along `way` and is ahead of a point that has passed the surface from the front (sign
+        1) or from behind (-1); 0: any."""
+        if sign == f64(0.0):
             return True
         n = col.mesh.normal[0, t]
-        if wp.dot(n, col.mesh.normal[0, side / 2]) <= f64(SAME_SIDE_COSINE):
+        if wp.dot(n, way) <= f64(SAME_SIDE_COSINE):
             return False
-        return side_sign(side) * wp.dot(y - col.mesh.corner[0, t], n) <= f64(0.0)
+        return sign * wp.dot(y - col.mesh.corner[0, t], n) <= f64(0.0)
 
     @wp.func
-    def nearest_on_mesh(col: Colliders, k: int, y: vec3d, side: int) -> Nearest:
-        """Nearest position on a mesh to y; with a side, among the candidate triangles."""
+    def nearest_facing(col: Colliders, k: int, y: vec3d, way: vec3d, sign: f64) -> Nearest:
+        """Nearest position to y on the candidate triangles of a mesh."""
         best = Nearest()
         best.distance_squared = f64(1.0e300)
         best.triangle = -1
@@ -159,7 +160,7 @@ def mesh_functions(Colliders) -> KernelSet:
                 else:
                     leaf = col.mesh.first_leaf[k] + i - inner
                     for t in range(col.mesh.leaf_start[leaf], col.mesh.leaf_start[leaf + 1]):
-                        if is_candidate(col, t, y, side):
+                        if is_candidate(col, t, y, way, sign):
                             c = closest_on_triangle(col.mesh.corner[0, t], col.mesh.corner[1, t], col.mesh.corner[2, t],
                                            col.mesh.normal[0, t], y)  # fmt: skip
                             place = vec3d(c[0], c[1], c[2])
@@ -170,6 +171,13 @@ def mesh_functions(Colliders) -> KernelSet:
                                 best.feature = wp.int32(c[3])
                                 best.triangle = t
         return best
+
+    @wp.func
+    def nearest_on_mesh(col: Colliders, k: int, y: vec3d, side: int) -> Nearest:
+        """Nearest position on a mesh to y; with a side, among the triangles that face like its one."""
+        if side < 0:
+            return nearest_facing(col, k, y, vec3d(), f64(0.0))
+        return nearest_facing(col, k, y, col.mesh.normal[0, side / 2], side_sign(side))
 
     @wp.func
     def signed_distance(col: Colliders, k: int, s: Nearest, y: vec3d) -> vec4d:
@@ -183,6 +191,20 @@ def mesh_functions(Colliders) -> KernelSet:
         if size > f64(1.0e-9) * col.size[k][0]:
             n = (sign / size) * arm
         return vec4d(n[0], n[1], n[2], sign * size)
+
+    @wp.func
+    def distance_behind(col: Colliders, k: int, s: Nearest, y: vec3d) -> vec4d:
+        """`signed_distance` of a point behind the surface, with a normal in the cone of the feature, else of the plane.
+
+        Below one part of a mesh the edge of another one may be nearer than the surface above.
+        """
+        d = signed_distance(col, k, s, y)
+        n = col.mesh.normal[0, s.triangle]
+        mean = col.mesh.normal[s.feature, s.triangle]
+        cosine = wp.abs(wp.dot(vec3d(d[0], d[1], d[2]), mean))
+        if col.mesh.feature_kind[s.feature, s.triangle] == SHARP and cosine < wp.dot(mean, n) - f64(SURFACE_TOLERANCE):
+            return vec4d(n[0], n[1], n[2], wp.dot(y - col.mesh.corner[0, s.triangle], n))
+        return d
 
     @wp.func
     def on_boundary(col: Colliders, s: Nearest) -> bool:
@@ -200,7 +222,7 @@ def mesh_functions(Colliders) -> KernelSet:
         if side >= 0 and d[3] < f64(0.0):
             ahead = nearest_on_mesh(col, k, y, side)
             if ahead.triangle >= 0:
-                d = side_sign(side) * signed_distance(col, k, ahead, y)
+                d = side_sign(side) * distance_behind(col, k, ahead, y)
                 if (d[3] > f64(0.0)) != on_boundary(col, ahead):  # away from the boundary it is outside
                     d = -d
         return d
@@ -214,6 +236,19 @@ def mesh_functions(Colliders) -> KernelSet:
         if s.triangle < 0:
             s = nearest_on_mesh(col, k, y, -1)
         return 2 * s.triangle + wp.max(side, 0) % 2
+
+    @wp.func
+    def side_facing(col: Colliders, k: int, y: vec3d, way: vec3d, sign: f64) -> int:
+        """Side of the nearest triangle that faces along `way` and is ahead of y; sign: 1, -1 from behind; -1: none."""
+        s = nearest_facing(col, k, y, way, sign)
+        return wp.where(s.triangle < 0, -1, 2 * s.triangle + wp.where(sign < f64(0.0), 1, 0))
+
+    @wp.func
+    def height_beside(col: Colliders, k: int, y: vec3d) -> f64:
+        """Distance from the plane of a sheet, m, of a position beyond its boundary; else -1."""
+        s = nearest_on_mesh(col, k, y, -1)
+        height = wp.abs(wp.dot(y - s.position, col.mesh.normal[0, s.triangle]))
+        return wp.where(on_boundary(col, s), height, f64(-1.0))
 
     @wp.func
     def sheet_side(col: Colliders, k: int, y: vec3d, contact_state: int) -> int:

@@ -26,7 +26,7 @@ again."""
 
 @functools.cache
 def shape_functions() -> KernelSet:
-    """Device functions `distance` and `sweep`."""
+    """Device functions `distance`, `side_facing` and `sweep`."""
 
     @wp.func
     def unit_vector(v: vec3d) -> vec3d:
@@ -117,6 +117,17 @@ def shape_functions() -> KernelSet:
                 else:
                     n = face_normal(face)
         return wp.vec4d(n[0], n[1], n[2], gap)
+
+    @wp.func
+    def side_facing(kind: int, way: vec3d) -> int:
+        """Side of a box or a cylinder whose normal is closest to a unit vector `way`."""
+        axis = wp.int32(2)
+        if kind == CYLINDER and way[2] * way[2] < f64(0.5):
+            return LATERAL_SIDE
+        for k in range(2):
+            if kind == BOX and wp.abs(way[k]) > wp.abs(way[axis]):
+                axis = k
+        return 2 * axis + wp.where(way[axis] > f64(0.0), 1, 0)
 
     @wp.func
     def line_interval(kind: int, size: vec3d, a: vec3d, d: vec3d) -> vec3d:

@@ -18,7 +18,8 @@ __all__ = ["MESH_SUFFIX", "collider_functions"]
 MESH_SUFFIX = "_meshes"
 """Suffix of the names of modules compiled with the mesh code."""
 
-MESH_FUNCTIONS = ("distance", "sweep", "updated_side", "depth_change", "sheet_side")
+MESH_FUNCTIONS = ("distance", "sweep", "updated_side", "depth_change", "sheet_side", "side_facing",
+                  "height_beside")  # fmt: skip
 
 
 @functools.cache
@@ -26,9 +27,9 @@ def collider_functions(meshes: bool) -> KernelSet:
     """Device functions, see `shape_functions` and `mesh_functions`."""
     Colliders = collider_struct(meshes)
     shapes = shape_functions()
-    of_shape, sweep_shape = shapes.distance, shapes.sweep
+    of_shape, sweep_shape, shape_side_facing = shapes.distance, shapes.sweep, shapes.side_facing
     mesh = mesh_functions(Colliders) if meshes else KernelSet(**dict.fromkeys(MESH_FUNCTIONS))
-    distance_on_mesh, sweep_mesh, side_on_mesh, depth_change_on_mesh, sheet_side_on_mesh = (
+    distance_on_mesh, sweep_mesh, side_on_mesh, depth_change_on_mesh, sheet_side_on_mesh, mesh_side_facing, beside = (
         getattr(mesh, name) for name in MESH_FUNCTIONS
     )
 
@@ -47,6 +48,22 @@ def collider_functions(meshes: bool) -> KernelSet:
             if col.kind[k] == MESH:
                 return sweep_mesh(col, k, start, end, side)
         return sweep_shape(col.kind[k], col.size[k], start, end, side)
+
+    @wp.func
+    def side_facing(col: Colliders, k: int, y: vec3d, way: vec3d, sign: f64) -> int:
+        """Side of a box, cylinder or mesh ahead of y that faces along `way`; sign -1: from behind a sheet; -1: none."""
+        if wp.static(meshes):
+            if col.kind[k] == MESH:
+                return mesh_side_facing(col, k, y, way, sign)
+        return shape_side_facing(col.kind[k], way)
+
+    @wp.func
+    def height_beside(col: Colliders, k: int, y: vec3d) -> f64:
+        """Distance from the plane of a sheet, m, of a position beyond its boundary; else -1."""
+        if wp.static(meshes):
+            if col.kind[k] == MESH and col.size[k][2] == f64(0.0):
+                return beside(col, k, y)
+        return f64(-1.0)
 
     @wp.func
     def stored_side(col: Colliders, k: int, in_contact: bool, contact_state: int) -> int:

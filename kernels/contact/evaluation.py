@@ -7,6 +7,7 @@ import warp as wp
 from ..common.modules import SHORT_UNROLL, KernelSet, kernel_module, kernel_set
 from ..common.types import f64, precision, vec3d
 from .collider_kinematics import collider_kinematics
+from .collider_seams import SEAMS_SUFFIX
 from .colliders import MESH_SUFFIX
 from .facet_search import facet_search_kernels
 from .facet_structs import facet_side_struct, master_struct, pair_scratch_struct
@@ -14,7 +15,7 @@ from .friction import friction_functions
 from .kinematics import kinematics_functions
 from .law import FIXED_SPRING, OwnLaws, law_names
 from .projection import OUTSIDE_TOLERANCE, facet_projection_functions
-from .structs import collider_struct, contact_structs
+from .structs import FREE, collider_struct, contact_structs
 
 __all__ = ["collider_evaluation_kernels", "pair_evaluation_kernels", "pair_results_struct"]
 
@@ -36,14 +37,15 @@ def pair_results_struct():
 
 
 @functools.cache
-def collider_evaluation_kernels(dtype: str, meshes: bool, own: OwnLaws = ()) -> KernelSet:
-    """Kernels for contact with colliders; arguments as of `contact_kernels`, `meshes`: some collider is a mesh."""
+def collider_evaluation_kernels(dtype: str, meshes: bool, seams: bool, own: OwnLaws = ()) -> KernelSet:
+    """Kernels for contact with colliders; arguments as of `contact_kernels` and `collider_kinematics`."""
     vec3 = precision(dtype).vec3
     Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)
     Colliders = collider_struct(meshes)
-    k, law, g = kinematics_functions(dtype), friction_functions(dtype, own), collider_kinematics(dtype, meshes)
+    k, law = kinematics_functions(dtype), friction_functions(dtype, own)
+    g = collider_kinematics(dtype, meshes, seams)
     name = "_".join(["contact_evaluation", dtype, *law_names(own)])
-    module = kernel_module(f"{name}{MESH_SUFFIX * meshes}", max_unroll=SHORT_UNROLL)
+    module = kernel_module(f"{name}{MESH_SUFFIX * meshes}{SEAMS_SUFFIX * seams}", max_unroll=SHORT_UNROLL)
 
     @wp.kernel(module=module)
     def points_at_state(
@@ -93,6 +95,8 @@ def collider_evaluation_kernels(dtype: str, meshes: bool, own: OwnLaws = ()) -> 
         t = g.evaluate(con, col, facets, his, scr, world, q, item, acting_point, u, time[world])
         t = law.with_normal_force(con, scr, world, c, acting_point, t, f64(0.0))
         frozen = law.friction_parameters(con, his, world, c, acting_point, t)
+        if t.state == FREE:
+            area_fraction = f64(0.0)
         if acting_point == point and (facets.tracks_deepest == 0 or places != 0):
             gap[world, point] = -t.depth
         normal[world, point] = area_fraction * t.normal_values[0]

@@ -254,6 +254,10 @@ def collider_struct(meshes: bool):
         angle: wp.array2d(dtype=wp.float64)  # rad
         translation: wp.array2d(dtype=wp.vec3d)  # in the attempt, m
         rotation_change: wp.array2d(dtype=wp.mat33d)  # R - 1 of the rotation R in the attempt
+        neighbor_start: wp.array(dtype=wp.int32)  # [contact + 1] its first neighbour; with the next three: seams
+        neighbor: wp.array(dtype=wp.int32)  # collider
+        neighbor_shares: wp.array(dtype=wp.int32)  # 1: the body's contact with it has the same points
+        seam_lengths: wp.array(dtype=wp.vec3d)  # [contact] seam, reach, depth, see collider_seams.py, m
 
     if meshes:
         Colliders.__annotations__["mesh"] = mesh_struct()

@@ -41,7 +41,7 @@ class ContactMethods:
         mu_static: float | None = None, restitution: float = 1.0, law: str = "default", treatment: str = "implicit",
         stiffness: Any = None, model: str = "patch", radius: float | None = None, offset: float = 0.0,
         points: int | None = None, smoothing: Any = None, overlap: str = "auto", overlap_time: float = 0.1,
-        name: str | None = None,
+        seam: float | None = None, name: str | None = None,
     ) -> Contact | PairContact:  # fmt: skip
         """Define contact of a body, or a surface of it, with a collider or another body.
 
@@ -63,6 +63,10 @@ class ContactMethods:
             smoothing: "paper": depth over which its damping is ramped in, m; "smooth": (eps in N, v_eps in m/s).
             overlap: initial overlap: "refuse"; "offset": stored, decaying in `overlap_time`, s (statics: load factor);
                 "auto": stored and said up to 5 % of the smallest edge of a face and 25 % of the depth of an element.
+            seam: largest difference of level, m, at which the body passes from one of its colliders to the next, fixed
+                to it, as over one surface, also over a gap of up to a fifth of the surface's width; None: a thousandth
+                of the width, the second largest edge of the surface's bounding box. More is a step with a side face.
+                0 or above, not for two bodies.
             name: unique name; by default "BODY on COLLIDER".
 
         Bodies without a contact pass through each other; `Simulation(check_overlap=True)` names them. Between
@@ -79,7 +83,7 @@ class ContactMethods:
             body_of_handle(side, "add_contact", (Body, SurfaceSet), self.description.bodies)
         options = dict(mu=mu, mu_static=mu_static, restitution=restitution, law=law, treatment=treatment,
                        stiffness=stiffness, model=model, radius=radius, offset=offset, points=points,
-                       smoothing=smoothing, overlap=overlap, overlap_time=overlap_time)  # fmt: skip
+                       smoothing=smoothing, overlap=overlap, overlap_time=overlap_time, seam=seam)  # fmt: skip
         return add_contact(self.description, surface, collider, name, **options)
 
     def add_contact_all(self, *, mu: float = 0.0, **options: Any) -> list[Contact | PairContact]:

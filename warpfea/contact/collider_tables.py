@@ -13,6 +13,8 @@ import warp as wp
 from ..base.errors import ModelError
 from ..base.worlds import set_rows, values_per_world
 from ..kernels.contact.collider_mesh import mesh_struct
+from ..kernels.contact.collider_seams import SEAMS_SUFFIX
+from ..kernels.contact.colliders import MESH_SUFFIX
 from ..kernels.contact.structs import collider_struct, contact_struct
 from ..model import assembly
 from ..model.contact_points import ContactPoints, Modulus, body_mass_total, contact_points, effective_modulus
@@ -20,7 +22,12 @@ from ..model.contacts import Collider, Contact
 from ..model.shapes import HalfSpace, Shape
 from ..model.triangle_mesh import TriMesh
 from ..terms.time_law_table import TimeLawTable
+<<<<<<< HEAD
 from .tables import WORLD_PARAMETERS, FacetTables, check_chosen_values, clamped_slots, compliance, normal_damping
+=======
+from .seams import seam_tables
+from .tables import WORLD_PARAMETERS, FacetTables, check_chosen_values, clamped_slots, normal_damping
+>>>>>>> 602c1f6 (A body passes a seam between colliders as one surface; seam= divides a seam from a step; of level colliders that overlap one acts)
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -33,6 +40,7 @@ class ContactTables(FacetTables[Contact]):
 
     Attributes:
         colliders: descriptions. shapes: on the device, without poses.
+        seams: neighbours of the contacts, None if no contact has one.
         region_radii: `region_radius` by contact index.
         clamped_point_counts: number of points per contact excluded because all their slots are clamped.
     """
@@ -44,12 +52,18 @@ class ContactTables(FacetTables[Contact]):
         self.clamped = clamped_slots(model)
         self.clamped_point_counts: list[int] = []
         self.region_radii: dict[int, float] = {}
+        self.seams = seam_tables(self.contacts, [p.X.reshape(-1, 3) for p in self.host])
         self.area_fractions = [self._area_fraction(c, p) for c, p in zip(self.contacts, self.host)]
 
     @property
     def has_meshes(self) -> bool:
         """True if a collider is a triangle mesh."""
         return any(isinstance(collider.shape, TriMesh) for collider in self.colliders)
+
+    @property
+    def geometry(self) -> str:
+        """Name of the colliders in `GEOMETRIES`."""
+        return f"colliders{MESH_SUFFIX * self.has_meshes}{SEAMS_SUFFIX * (self.seams is not None)}"
 
     @property
     def has_sheets(self) -> bool:
@@ -119,7 +133,7 @@ class ContactTables(FacetTables[Contact]):
             "rotation_anchor": [k.rotation.anchor if k.rotation else np.zeros(3) for k in K],
             "rotation_axis": [k.rotation.axis if k.rotation else (0.0, 0.0, 1.0) for k in K],
         }
-        m.memory.fill(out, "contact", **tables)
+        m.memory.fill(out, "contact", **tables | (vars(self.seams) if self.seams else {}))
         if self.has_meshes:
             out.mesh = upload_collider_meshes(m, [k.shape for k in K])
         return out

@@ -57,7 +57,7 @@ class ColliderContact(ContactTerm):
 
     def __init__(self, model: Model) -> None:
         tables = ContactTables(model)
-        super().__init__(model, tables, "colliders_meshes" if tables.has_meshes else "colliders")
+        super().__init__(model, tables, tables.geometry)
         self.pose_kernels = pose_kernels(tables.has_meshes)
         self.deepest_kernels: Any = None
         if tables.has_single_point:

@@ -152,7 +152,7 @@ def evaluate_points(
     other = term.settled_other(at.stored, at.zeros, launch, state)
     attempt = term.make_scratch(B, lambda _, shape, dtype: at.zeros(shape, dtype))
     attempt.approach_speed.fill_(1.0)
-    kernels = collider_evaluation_kernels(m.dtype, t.has_meshes, t.own_laws)
+    kernels = collider_evaluation_kernels(m.dtype, t.has_meshes, t.seams is not None, t.own_laws)
     for group in t.groups:
         args = [t.data, other, group.data, history, state.time, state.displacement, attempt]
         launch(kernels.points_at_state, group.point_threads(B), args)

@@ -63,6 +63,7 @@ class ContactOptions:
         smoothing: None; with the paper's law a depth, m; with the smooth law (eps in N, v_eps in m/s).
         overlap: "auto", "refuse" or "offset".
         overlap_time: time in which a stored overlap decays, s.
+        seam: largest difference of level of two colliders that is a seam, m, or None.
         index: number in its builder, of contacts of its class.
     """
 
@@ -80,6 +81,7 @@ class ContactOptions:
     smoothing: float | tuple[float, float] | None = None
     overlap: str = "auto"
     overlap_time: float = 0.1
+    seam: float | None = None
     index: int = -1
 
 

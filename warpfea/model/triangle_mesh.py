@@ -128,6 +128,13 @@ class TriMesh(Shape):
         """True if each edge has two triangles."""
         return bool((self._neighbours >= 0).all())
 
+    @cached_property
+    def part_count(self) -> int:
+        """Number of parts that share no edge."""
+        one, edge = np.nonzero(self._neighbours >= 0)
+        graph = coo_matrix((np.ones(len(one)), (one, self._neighbours[one, edge])), shape=(len(self.triangles),) * 2)
+        return int(connected_components(graph, directed=False, return_labels=False))
+
     @property
     def volume(self) -> float:
         """Volume of a closed mesh, m^3."""

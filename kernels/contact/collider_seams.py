@@ -1,0 +1,120 @@
+"""Seams between colliders: a point of a body on a level surface does not meet the side face of the next collider.
+
+A point that enters a collider by a side face would take its normal, although a neighbour's surface at the same level
+ends there. The neighbours of a contact are the colliders of its body's other contacts, and its own one if that is a
+mesh of several parts; `warpfea/contact/seams.py` lists them. A side face is hidden where a neighbour begins within
+`reach` in front of it, its surface there is across the face, at most `depth` above the point, and the collider's own
+surface is within `seam` of that level: the point takes the collider's surface. At the foot of a real step a higher
+neighbour must not count: the edge of a body that the step holds would gain and lose the support below it within a step
+of time, which has no solution. Where colliders of one level overlap, the higher one acts, or the first of those within
+`seam`.
+"""
+
+import functools
+
+import warp as wp
+
+from ..common.modules import KernelSet, kernel_set
+from ..common.types import f64, vec3d
+from .collider_shapes import HALF_SPACE
+from .colliders import collider_functions
+from .structs import collider_struct
+
+__all__ = ["SEAMS_SUFFIX", "seam_functions"]
+
+SEAMS_SUFFIX = "_seams"
+"""Suffix of the names of modules compiled with seams."""
+MIN_CROSS_COSINE = 0.5
+"""Largest cosine between the normals of a side face and of a surface across it."""
+LEVEL_COSINE = 0.9999
+"""Smallest cosine between the normals of overlapping colliders of one level."""
+
+
+@functools.cache
+def seam_functions(meshes: bool) -> KernelSet:
+    """Device functions `level_side`, `level_sheet_side`, `kept_sheet_side` and `is_shared`."""
+    Colliders, g = collider_struct(meshes), collider_functions(meshes)
+    distance, side_facing, height_beside = g.distance, g.side_facing, g.height_beside
+
+    @wp.func
+    def from_neighbor(col: Colliders, world: int, kc: int, b: int, y: vec3d, way: vec3d) -> wp.vec4d:
+        """Normal and signed distance of collider b at a position, within it of the side along `way`, if that is not 0;
+        all in the frame of collider kc."""
+        R = wp.transpose(col.rotation[world, kc]) * col.rotation[world, b]
+        x = col.rotation[world, kc] * y + col.position[world, kc]
+        place = wp.transpose(col.rotation[world, b]) * (x - col.position[world, b])
+        found = distance(col, b, place, -1)
+        if found[3] < f64(0.0) and wp.length_sq(way) > f64(0.0):
+            found = distance(col, b, place, side_facing(col, b, place, wp.transpose(R) * way, f64(1.0)))
+        n = R * vec3d(found[0], found[1], found[2])
+        return wp.vec4d(n[0], n[1], n[2], found[3])
+
+    @wp.func
+    def level_sheet_side(col: Colliders, world: int, c: int, start: vec3d, y: vec3d, side: int) -> int:
+        """Side of a sheet below which a point comes from beside it, from a neighbour at the same level; -1: none.
+
+        Args:
+            start, y: positions at the start of the step and now, in the sheet's frame, m.
+            side: -3 in front of it, -4 behind.
+        """
+        kc = col.of_contact[c]
+        if side > -3 or height_beside(col, kc, start) < f64(0.0) or height_beside(col, kc, y) >= f64(0.0):
+            return -1
+        lengths = col.seam_lengths[c]
+        d = distance(col, kc, y, -1)
+        n = vec3d(d[0], d[1], d[2])
+        sign = wp.where(side == -3, f64(1.0), f64(-1.0))
+        for e in range(col.neighbor_start[c], col.neighbor_start[c + 1]):
+            found = from_neighbor(col, world, kc, col.neighbor[e], y - lengths[1] * wp.normalize(y - start), vec3d())
+            across = wp.abs(wp.dot(vec3d(found[0], found[1], found[2]), n)) > f64(MIN_CROSS_COSINE)
+            if across and d[3] <= wp.min(wp.abs(found[3]) + lengths[0], lengths[2]):
+                return side_facing(col, kc, y, -sign * n, sign)
+        return -1
+
+    @wp.func
+    def kept_sheet_side(col: Colliders, c: int, y: vec3d, before: int, now: int) -> int:
+        """Contact state of a free point: beside a sheet, level with it, that before; in front where there is none."""
+        if before == now:
+            return now
+        height = height_beside(col, col.of_contact[c], y)
+        level = wp.where(before == 0, col.seam_lengths[c][0], col.seam_lengths[c][2])
+        return wp.where(height >= f64(0.0) and height <= level, wp.max(before, 1), now)
+
+    @wp.func
+    def is_shared(col: Colliders, world: int, c: int, y: vec3d, n: vec3d, gap: f64) -> bool:
+        """True for a point of normal n on a collider that is also on a neighbour, higher or of the same level: where
+        colliders overlap, one acts. Arguments as of `level_side`."""
+        kc = col.of_contact[c]
+        seam = col.seam_lengths[c][0]
+        for e in range(col.neighbor_start[c], col.neighbor_start[c + 1]):
+            b = col.neighbor[e]
+            if col.neighbor_shares[e] != 0:
+                found = from_neighbor(col, world, kc, b, y, n)
+                first = found[3] < gap - seam or (found[3] <= gap + seam and b < kc)
+                if first and found[3] < f64(0.0) and wp.dot(vec3d(found[0], found[1], found[2]), n) > f64(LEVEL_COSINE):
+                    return True
+        return False
+
+    @wp.func
+    def level_side(col: Colliders, world: int, c: int, y: vec3d, n: vec3d, gap: f64) -> int:
+        """Side of a contact's collider at the level of a neighbour that hides a side face; -1: it is not hidden.
+
+        Args:
+            y: position in the collider's frame, behind a face of unit normal n by -`gap`, m.
+        """
+        kc = col.of_contact[c]
+        if col.kind[kc] == HALF_SPACE:
+            return -1
+        lengths = col.seam_lengths[c]
+        for e in range(col.neighbor_start[c], col.neighbor_start[c + 1]):
+            found = from_neighbor(col, world, kc, col.neighbor[e], y + (lengths[1] - gap) * n, vec3d())
+            level = vec3d(found[0], found[1], found[2])
+            within = found[3] <= lengths[0] and found[3] >= -lengths[2]
+            if within and wp.abs(wp.dot(level, n)) < f64(MIN_CROSS_COSINE):
+                behind = y - f64(2.0) * lengths[2] * n  # there no edge of the neighbour is nearer than the level
+                side = side_facing(col, kc, behind, level, f64(1.0))
+                if side >= 0 and wp.abs(distance(col, kc, behind, side)[3] - found[3]) <= lengths[0]:
+                    return side
+        return -1
+
+    return kernel_set(locals())

@@ -1,0 +1,201 @@
+"""Seams between colliders: bodies pass flat ones as one surface, and steps as steps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+import warpfea as wf
+from warpfea.contact.colliders import ColliderContact
+from warpfea.studies.stress.cases.contact import momentum
+
+SIDE, SPEED, DT = 0.05, 1.0, 1e-3
+START = -0.0607
+"""First place of the rear face: the front is 10.7 mm before the seam at x = 0."""
+
+
+def boxes(gap=0.0, rise=0.0, height=0.1):
+    """Two boxes with a seam in the plane x = 0, at z = 0; the second `rise` higher."""
+    size = (0.4, 0.3, height)
+    return [wf.Box((-0.2, 0.0, -0.5 * height), size), wf.Box((0.2 + gap, 0.0, rise - 0.5 * height), size)]
+
+
+def meshes(gap=1e-6, rise=0.0, closed=True):
+    """The boxes as meshes; not closed: their upper faces as sheets."""
+    out = []
+    for box in boxes(gap, rise):
+        points, triangles = box.mesh()
+        upper = np.array([(4, 5, 7), (4, 7, 6)])
+        out.append(wf.TriMesh(points, triangles if closed else upper))
+    return out
+
+
+def joined(parts):
+    """One mesh of several."""
+    first = np.cumsum([0, *(len(part.points) for part in parts)])
+    triangles = np.concatenate([part.triangles + k for part, k in zip(parts, first)])
+    return [wf.TriMesh(np.concatenate([part.points for part in parts]), triangles)]
+
+
+def floor_with_wall(top, bottom=-0.05):
+    """A floor at z = 0, and a wall at x = 0 that reaches `top`."""
+    return [wf.HalfSpace((0, 0, 1), 0.0), wf.Box((0.2, 0.0, 0.5 * (top + bottom)), (0.4, 0.3, top - bottom))]
+
+
+@dataclass
+class Slide:
+    """End of a slide: velocity of the centre of mass, m/s, spin, rad/s, and positions of the lower front edge."""
+
+    velocity: np.ndarray
+    spin: np.ndarray
+    edge: np.ndarray
+
+
+def sliding(shapes, steps=100, *, E=1e8, paths=None, dtype="float64", integrator="backward_euler", **options):
+    """A block that slides along x."""
+    b = wf.ModelBuilder()
+    mesh = wf.mesh.box((SIDE,) * 3, cells=(2, 1, 1), origin=(START, -0.5 * SIDE, 0.0))
+    block = b.add_solid(mesh, material=wf.SVK(E=E, nu=0.3, density=1000.0), name="block")
+    b.set_initial(block, velocity=(SPEED, 0.0, 0.0))
+    for k, shape in enumerate(shapes):
+        floor = b.add_collider(shape, path=paths[k] if paths else None, name=f"floor {k}")
+        b.add_contact(block, floor, **options)
+    model = b.finalize(device="cpu", dtype=dtype)
+    sim = wf.Simulation(
+        model, dt=DT, integrator=integrator, solver=wf.NewtonPCG(tol=1e-10 if dtype == "float64" else 1e-6)
+    )
+    X = block.reference[block.slot_kind == 0] + block.origin
+    lower = (np.abs(X[:, 0] - START - SIDE) < 1e-9) & (np.abs(X[:, 2]) < 1e-9)
+    edge = []
+    for _ in range(steps):
+        sim.step()
+        edge.append(sim.positions(block)[0, lower])
+    mass = model.masses.lumped[0][block.slots] * (block.slot_kind == 0)
+    velocity = momentum(sim, block) / mass.sum()
+    x = block.reference + block.origin + sim.state.displacement.numpy()[0, block.slots]
+    arm = x - mass @ x / mass.sum()
+    v = sim.state.velocity.numpy()[0, block.slots] - velocity
+    inertia = np.einsum("n,nk,nk->", mass, arm, arm) * np.eye(3) - np.einsum("n,ni,nj->ij", mass, arm, arm)
+    return Slide(velocity, np.linalg.solve(inertia, mass @ np.cross(arm, v)), np.array(edge))
+
+
+CONVEYOR = ([0, 1], [(0, 0, 0), (0.2, 0.1, 0)])
+SEAMS = {
+    "flat": (boxes(), {}),
+    "overlap": (boxes(-0.01), {}),
+    "gap": (boxes(0.002), {}),
+    "stiff": (boxes(0.002), {"E": 1e9, "integrator": "bdf2"}),
+    "plates": (boxes(0.002, height=0.004), {}),
+    "conveyor": (boxes(), {"paths": [CONVEYOR, CONVEYOR]}),
+    "meshes": (meshes(0.002), {}),
+    "mesh of two parts": (joined(meshes(0.002)), {}),
+    "mesh of overlapping parts": (joined(meshes(-0.0101)), {}),
+    "sheets": (meshes(0.002, closed=False), {}),
+    "sheet of two parts": (joined(meshes(0.002, closed=False)), {}),
+    "low wall": (floor_with_wall(1e-6), {}),
+}
+FAST = ("flat", "mesh of two parts", "low wall")
+
+
+@pytest.mark.parametrize("name", [n if n in FAST else pytest.param(n, marks=pytest.mark.slow) for n in SEAMS])
+def test_a_block_slides_over_a_seam(name):
+    """Without friction its velocity along the surface stays, and it does not turn."""
+    shapes, options = SEAMS[name]
+    out = sliding(shapes, **options)
+    assert out.velocity[:2] == pytest.approx([SPEED, 0.0], abs=1e-6)
+    assert np.abs(out.spin).max() < 1e-3
+    assert np.abs(out.edge[-1, :, 2]).max() < 1e-4
+
+
+SMALL_STEPS = {
+    "boxes up": boxes(rise=1e-5), "boxes down": boxes(rise=-1e-5), "mesh up": joined(meshes(rise=1e-5)),
+    "mesh down": joined(meshes(rise=-1e-5)), "sheets up": meshes(rise=1e-5, closed=False),
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SMALL_STEPS)
+def test_a_small_step_is_a_seam(name):
+    out = sliding(SMALL_STEPS[name])
+    assert out.velocity[0] == pytest.approx(SPEED, abs=3e-4)
+    assert np.abs(out.spin).max() < 1e-3
+
+
+@pytest.mark.parametrize("shapes", [boxes(rise=1e-3), pytest.param(joined(meshes(rise=1e-3)), marks=pytest.mark.slow)])
+def test_a_real_step_holds_the_front_edge(shapes):
+    """The edge is behind the step, but for its penetration, until it is above it."""
+    x, _, z = np.moveaxis(sliding(shapes, 60, E=1e9).edge, 2, 0)
+    assert z[(x > 1e-4)].min(initial=1.0) > 0.9e-3 or x.max() < 1e-4
+    assert x.max() < 0.02  # without the step it is at 0.05
+
+
+ROLLS = {
+    "overlap": boxes(-0.01), "gap": boxes(0.002), "mesh": joined(meshes()), "sheets": meshes(closed=False),
+    "low wall": floor_with_wall(1e-6),
+}  # fmt: skip
+
+
+def rolling(shapes):
+    """State of a ball of facets after it has rolled over x = 0 with friction."""
+
+    def ball(X):
+        a, b, c = (X.T / 0.03) ** 2
+        parts = [1 - b / 2 - c / 2 + b * c / 3, 1 - a / 2 - c / 2 + a * c / 3, 1 - a / 2 - b / 2 + a * b / 3]
+        return X * np.sqrt(np.column_stack(parts)) + (-0.02, 0.0, 0.03)
+
+    b = wf.ModelBuilder()
+    mesh = wf.mesh.box((0.06,) * 3, cells=(4, 4, 4), origin=(-0.03,) * 3, element="T4", map=ball)
+    body = b.add_solid(mesh, material=wf.SVK(E=1e7, nu=0.3, density=1000.0), name="ball")
+    b.set_initial(body, velocity=(0.5, 0.0, 0.0), angular_velocity=(0.0, 0.5 / 0.03, 0.0))
+    for k, shape in enumerate(shapes):
+        b.add_contact(body, b.add_collider(shape, name=f"floor {k}"), mu=0.5)
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=DT)
+    sim.step(80)
+    return sim.state.velocity.numpy()[0]
+
+
+@pytest.mark.slow
+def test_a_ball_rolls_over_seams_as_over_one_box():
+    wanted = rolling([wf.Box((0.0, 0.0, -0.05), (0.8, 0.3, 0.1))])
+    for name, shapes in ROLLS.items():
+        assert rolling(shapes) == pytest.approx(wanted, abs=1e-6), name
+
+
+def test_seam_divides_a_seam_from_a_step():
+    """By default a thousandth of the width of the surface, 5e-5 m."""
+    for rise, seam, passes in ((1e-4, None, False), (1e-4, 1.1e-4, True), (1e-5, 0.0, False)):
+        speed = sliding(boxes(rise=rise), 40, seam=seam).velocity[0]
+        assert (abs(speed - SPEED) < 1e-4) == passes, (rise, seam)
+
+
+def floor_model(shapes, paths=(None, None), **options):
+    b = wf.ModelBuilder()
+    block = b.add_solid(wf.mesh.box((SIDE,) * 3, cells=(1, 1, 1)), material=wf.SVK(E=1e6, nu=0.3, density=1e3))
+    for shape, path in zip(shapes, paths):
+        b.add_contact(block, b.add_collider(shape, path=path), **options)
+    return b.finalize(device="cpu").terms.find(ColliderContact)
+
+
+def test_colliders_without_seams_cost_nothing():
+    """Alone, apart, on different paths, or round, they have no tables and the kernels of models without seams."""
+    with_seam = floor_model(boxes())
+    assert with_seam.tables.geometry == "colliders_seams"
+    assert with_seam.tables.shapes.neighbor.numpy().tolist() == [1, 0]
+    ball = wf.Sphere((0.3, 0.0, 0.0), 0.1)
+    groups = [boxes()[:1], boxes(0.1), [boxes()[0], ball], [wf.HalfSpace((0, 0, 1)), wf.HalfSpace((1, 0, 1), -0.1)]]
+    for term in [*map(floor_model, groups), floor_model(boxes(), (None, CONVEYOR))]:
+        assert term.tables.geometry == "colliders"
+        assert term.tables.seams is None
+        assert term.tables.shapes.neighbor is None or not term.tables.shapes.neighbor.size
+
+
+def test_bad_seams_are_refused():
+    with pytest.raises(wf.ModelError, match=r"seam = -0\.1 must be a length of 0 or above, m"):
+        floor_model(boxes(), seam=-0.1)
+    b = wf.ModelBuilder()
+    mesh, law = wf.mesh.box((SIDE,) * 3, cells=(1, 1, 1)), wf.SVK(E=1e6, nu=0.3, density=1e3)
+    one, two = (b.add_solid(mesh, material=law) for _ in range(2))
+    with pytest.raises(NotImplementedError, match="seam = between bodies is not part of this version"):
+        b.add_contact(one, two, seam=1e-3)
