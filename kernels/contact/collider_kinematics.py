@@ -31,8 +31,8 @@ def collider_kinematics(dtype: str, meshes: bool, seams: bool = False) -> Kernel
     k, g = kinematics_functions(dtype), collider_functions(meshes)
     interpolate, distance, stored_side = k.interpolate, g.distance, g.stored_side
     seam = seam_functions(meshes) if seams else None
-    names = ("level_side", "level_sheet_side", "kept_sheet_side", "is_shared")
-    level_side, level_sheet_side, kept_sheet_side, is_shared = (getattr(seam, name, None) for name in names)
+    names = ("entered_level", "kept_sheet_side", "is_shared")
+    entered_level, kept_sheet_side, is_shared = (getattr(seam, name, None) for name in names)
 
     @wp.func
     def set_start(
@@ -123,7 +123,6 @@ def collider_kinematics(dtype: str, meshes: bool, seams: bool = False) -> Kernel
         d = wp.vec4d(f64(0.0), f64(0.0), f64(1.0), f64(0.0))
         out.feature = -1
         far = bool(False)
-        crossed = bool(False)
         level = wp.int32(-1)
         if wp.static(meshes):
             d[3] = scr.activation_gap[world, point] - before - wp.length(t.local_position - start)
@@ -133,14 +132,10 @@ def collider_kinematics(dtype: str, meshes: bool, seams: bool = False) -> Kernel
             out.feature = g.sweep(col, kc, start, t.local_position, side)
             d = distance(col, kc, t.local_position, out.feature)
             if wp.static(seams):
-                if d[3] < f64(0.0) and out.feature != -2 and (out.feature != side or side < 0):
-                    level = level_side(col, world, c, t.local_position, vec3d(d[0], d[1], d[2]), d[3])
-                elif wp.static(meshes) and out.feature == -1:
-                    level = level_sheet_side(col, world, c, start, t.local_position, side)
+                level = entered_level(col, world, c, start, t.local_position, d, side, out.feature)
                 if level >= 0:
                     out.feature = level
                     d = distance(col, kc, t.local_position, level)
-                    crossed = bool(True)
         out.normal = rotation * vec3d(d[0], d[1], d[2])
         out.depth = activation - d[3]
         change = g.depth_change(col, kc, out.feature, start, t.local_position,
@@ -149,7 +144,7 @@ def collider_kinematics(dtype: str, meshes: bool, seams: bool = False) -> Kernel
         if change[1] != f64(0.0):
             out.depth = before + change[0] + (activation - scr.activation_gap[world, point])
         out.previous_depth = k.depth_at_start(con, facets, his, scr, world, c, point)
-        if crossed:  # the depth at the start is the distance from the side face
+        if level >= 0:  # the depth at the start is the distance from the side face
             out.previous_depth = out.depth + wp.dot(out.normal, t.relative_motion)
         near = out.depth > f64(0.0) or before > f64(0.0)
         out.state = wp.where(out.feature == -2, PASSED, IN_REACH)

@@ -32,7 +32,7 @@ LEVEL_COSINE = 0.9999
 
 @functools.cache
 def seam_functions(meshes: bool) -> KernelSet:
-    """Device functions `level_side`, `level_sheet_side`, `kept_sheet_side` and `is_shared`."""
+    """Device functions `entered_level`, `kept_sheet_side` and `is_shared`."""
     Colliders, g = collider_struct(meshes), collider_functions(meshes)
     distance, side_facing, height_beside = g.distance, g.side_facing, g.height_beside
 
@@ -115,6 +115,23 @@ def seam_functions(meshes: bool) -> KernelSet:
                 side = side_facing(col, kc, behind, level, f64(1.0))
                 if side >= 0 and wp.abs(distance(col, kc, behind, side)[3] - found[3]) <= lengths[0]:
                     return side
+        return -1
+
+    @wp.func
+    def entered_level(
+        col: Colliders, world: int, c: int, start: vec3d, y: vec3d, d: wp.vec4d, side: int, swept: int
+    ) -> int:  # fmt: skip
+        """Side at the level of a neighbour for a point that enters a contact's collider; -1: none.
+
+        Args:
+            start, y: positions at the start of the step and now, in the collider's frame, m.
+            d: normal and gap at y. side, swept: of the collider at the start, see `stored_side`, and at y.
+        """
+        if d[3] < f64(0.0) and swept != -2 and (swept != side or side < 0):
+            return level_side(col, world, c, y, vec3d(d[0], d[1], d[2]), d[3])
+        if wp.static(meshes):
+            if d[3] >= f64(0.0) and swept == -1:
+                return level_sheet_side(col, world, c, start, y, side)
         return -1
 
     return kernel_set(locals())
