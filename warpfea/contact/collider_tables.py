@@ -22,12 +22,8 @@ from ..model.contacts import Collider, Contact
 from ..model.shapes import HalfSpace, Shape
 from ..model.triangle_mesh import TriMesh
 from ..terms.time_law_table import TimeLawTable
-<<<<<<< HEAD
-from .tables import WORLD_PARAMETERS, FacetTables, check_chosen_values, clamped_slots, compliance, normal_damping
-=======
 from .seams import seam_tables
-from .tables import WORLD_PARAMETERS, FacetTables, check_chosen_values, clamped_slots, normal_damping
->>>>>>> 602c1f6 (A body passes a seam between colliders as one surface; seam= divides a seam from a step; of level colliders that overlap one acts)
+from .tables import WORLD_PARAMETERS, FacetTables, check_chosen_values, clamped_slots, compliance, normal_damping
 
 if TYPE_CHECKING:
     from ..model.model import Model
