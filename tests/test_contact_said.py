@@ -85,6 +85,16 @@ def test_commands_warn_of_deep_contact(static, tmp_path, monkeypatch, capfd):
 # overlaps at the start
 
 
+@pytest.mark.parametrize("height", [0.01, 0.04, 0.08])
+def test_a_block_above_a_slender_strip_does_not_begin_inside(height):
+    """Outward vectors of its end faces, inclined at their corners, cross far inside of it."""
+    b = wf.ModelBuilder()
+    strip = b.add_solid(wf.mesh.box((0.28, 0.03, 0.03), cells=(6, 1, 1)), material=SOFT, name="strip")
+    mesh = wf.mesh.box((0.05, 0.05, 0.05), cells=(2, 2, 1), element="T4", origin=(0.11, 0.0, 0.03 + height))
+    b.add_contact(b.add_solid(mesh, material=SOFT, name="block"), strip, overlap="refuse")
+    assert wf.Simulation(b.finalize(device="cpu"), dt=1e-3).step().converged.all()
+
+
 def block_on(collider, map=None, cells=(2, 2, 2), origin=(0.0, 0.0, 0.0), **options):
     """A block of 0.1 m on an obstacle: simulation, body, contact."""
     b = wf.ModelBuilder()

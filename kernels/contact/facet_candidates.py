@@ -223,6 +223,16 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
         ) > f64(0.0)
 
     @wp.func
+    def is_folded(mas: Masters, pair: PairScratch, world: int, f: int, xi: vec3d) -> bool:
+        """True if the outward vectors of a facet cross between a point and its foot: the tangents have turned round,
+        and coordinates within its sides say nothing."""
+        s = surface_point(mas, pair.displacement, world, f, xi)
+        foot = surface_point(mas, pair.displacement, world, f, vec3d(xi[0], xi[1], f64(0.0)))
+        n = wp.cross(foot.tangent_a, foot.tangent_b)
+        trace = wp.dot(wp.cross(foot.tangent_b, n), s.tangent_a) + wp.dot(wp.cross(n, foot.tangent_a), s.tangent_b)
+        return trace <= f64(0.0) or wp.dot(wp.cross(s.tangent_a, s.tangent_b), n) <= f64(0.0)
+
+    @wp.func
     def candidate_rank(
         mas: Masters, scr: ContactScratch, pair: PairScratch, slave: SlavePoint, f: int, xi: vec3d
     ) -> int:
@@ -241,6 +251,8 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
             return wp.where(cosine > f64(MIN_NORMAL_COSINE), 0, -1)
         rank = wp.where(cosine > f64(OPPOSING_COSINE), 4, wp.where(cosine > -f64(OPPOSING_COSINE), 1, 0))
         if slave.overlap_limit > f64(0.0):
+            if is_folded(mas, pair, world, f, xi):
+                return -1
             rank = 0
         else:
             projection = surface_point(mas, pair.start_displacement, world, f, vec3d(xi[0], xi[1], f64(0.0)))
