@@ -108,6 +108,39 @@ def test_a_stiff_block_does_not_come_back(dtype):
     assert abs(sim.energies()["ledger_residual"][0]) < (1e-6 if dtype == "float64" else 1e-3) * 9.81 * 0.02
 
 
+@pytest.mark.parametrize(("E", "restitution"), [(1e11, 0.3), (2e11, 0.0)])
+def test_a_stiff_block_on_a_wheel_rests_at_the_rounding_of_its_gap(E, restitution):
+    """Depths of 1e-10 m are differences of positions of 0.1 m: residuals do not fall to 1e-8 of the weight."""
+    b = wf.ModelBuilder(gravity=(0, 0, -9.81))
+    mesh = wf.mesh.box((SIDE,) * 3, cells=(2, 2, 1), origin=(-SIDE / 2, -SIDE / 2, SIDE / 2))
+    body = b.add_solid(mesh, material=wf.SVK(E=E, nu=NU, density=1000.0))
+    b.clamp(body.nodes(lambda X: np.ones(len(X), dtype=bool)), components="xy")
+    turn = wf.Rotation(anchor=(0, 0, 0), axis=(0, 1, 0), angle=([0, 100], [0, 100]))
+    wheel = b.add_collider(wf.Cylinder((0, -1, 0), (0, 1, 0), SIDE / 2), path=turn)
+    pad = b.add_contact(body, wheel, mu=0.4, restitution=restitution, stiffness="elements")
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=2e-3)
+    reports = [sim.step() for _ in range(30)]
+    assert all(report.converged.all() for report in reports)
+    assert max(float(report.floor[0]) for report in reports) < 1e-4
+    assert sim.contact_record(pad).force[0, -1] == pytest.approx([0.4 * 9.81, 0.0, 9.81], rel=1e-4, abs=1e-4)
+
+
+def test_a_strip_laid_on_a_drum_of_its_radius_is_not_refused():
+    """By the default options; before, the line search found no decrease after 65 steps."""
+    R = 0.25
+
+    def bent(X):
+        angle, r = X[:, 0] / R, R + X[:, 2]
+        return np.column_stack([r * np.sin(angle), X[:, 1], r * np.cos(angle)])
+
+    b = wf.ModelBuilder(gravity=(0, 0, -9.81))
+    mesh = wf.mesh.box((R, 0.1, 0.02), cells=(6, 2, 1), origin=(-R / 2, -0.05, 0), map=bent)
+    strip = b.add_solid(mesh, material=wf.SVK(E=1e7, nu=NU, density=1000.0))
+    b.add_contact(strip.surface("z-"), b.add_collider(wf.Cylinder((0, -1, 0), (0, 1, 0), R)))
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-3)
+    assert all(sim.step().converged.all() for _ in range(80))
+
+
 def test_a_soft_block_sinks_little():
     """E = 1e5 Pa from 0.5 m: 40 mm, most of an element, with one stiffness of the region."""
     sim, pad = dropped(1e5, 0.5, t_end=0.36, restitution=0.0)

@@ -127,6 +127,7 @@ def balance_struct(dtype: str):
         rows: wp.array3d(dtype=wp.float64)  # [row, world, slot] to be summed
         mass_factor: wp.array(dtype=wp.float64)  # [world] c_M of the inertia term, 1/s
         dq_dv: wp.array(dtype=wp.float64)  # [world] derivative of the end displacement by the velocity, s
+        gap_displacement: wp.float64  # displacement whose round-off is that of a gap, a difference of positions, m
 
     return Balance
 

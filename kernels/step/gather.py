@@ -76,16 +76,17 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> KernelSet:
         return s
 
     @wp.func
-    def position_rounding(balance: Balance, free: vec3, D: vec3, world: int, slot: int) -> f64:
+    def position_rounding(balance: Balance, free: vec3, D: vec3, world: int, slot: int, least: f64) -> f64:
         """Squared D norm of the velocity u/(dq/dv): times eps^2, the residual due to round-off of u.
 
-        If u = q~ + (dq/dv) v is a small difference, v sets the round-off.
+        If u = q~ + (dq/dv) v is a small difference, v sets the round-off. `least`: lower bound of u, of slots in contact:
+        gaps are differences of positions.
         """
         u = balance.u[world, slot]
         v = balance.v[world, slot]
         s = f64(0.0)
         for k in range(3):
-            x = wp.max(wp.abs(f64(u[k])) / balance.dq_dv[world], wp.abs(f64(v[k])))
+            x = wp.max(wp.max(wp.abs(f64(u[k])), least) / balance.dq_dv[world], wp.abs(f64(v[k])))
             s += f64(free[k]) * f64(D[k]) * x * x
         return s
 
@@ -201,7 +202,10 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> KernelSet:
             balance.rows[ROW_FROZEN_CHANGE, world, slot] = f64(
                 wp.dot(balance.nonpotential_frozen[world, slot] - balance.nonpotential[world, slot], vs)
             )
-        balance.rows[ROW_ROUNDOFF, world, slot] = position_rounding(balance, free, D, world, slot)
+        least = f64(0.0)
+        if wp.static(traits.pooled):
+            least = wp.where(wp.length_sq(of_pool) > T(0.0), balance.gap_displacement, least)
+        balance.rows[ROW_ROUNDOFF, world, slot] = position_rounding(balance, free, D, world, slot, least)
         balance.rows[ROW_FORCE, world, slot] = squared_length(wp.cw_mul(residual_force, free))
         motion = T(0.5) * wp.dot(balance.v_tilde[world, slot], past)
         balance.rows[ROW_KINETIC, world, slot] = balance.mass_factor[world] * f64(motion)

@@ -141,6 +141,9 @@ class Workspace:
         unused += () if midpoint else ("stage_time",)
         self.step = self.struct(step_struct(), B, skip=unused, run_end=(2,))
         self.stage_time = self.step.stage_time if midpoint else self.step.new_time
+        # contact evaluates gaps in double precision, of positions
+        farthest = max(float(np.abs(body.mesh.bounding_box()).max()) for body in model.bodies)
+        self.gap_displacement = farthest * float(np.finfo(np.float64).eps / np.finfo(model.dtype).eps)
         self.balance = balance_struct(model.dtype)()
         for name in balance_struct(model.dtype).vars:
             of_step = name in ("mass_factor", "dq_dv")
