@@ -79,8 +79,8 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> KernelSet:
     def position_rounding(balance: Balance, free: vec3, D: vec3, world: int, slot: int, least: f64) -> f64:
         """Squared D norm of the velocity u/(dq/dv): times eps^2, the residual due to round-off of u.
 
-        If u = q~ + (dq/dv) v is a small difference, v sets the round-off. `least`: lower bound of u, of slots in contact:
-        gaps are differences of positions.
+        If u = q~ + (dq/dv) v is a small difference, v sets the round-off. `least`: lower bound of u, of slots in
+        contact, as gaps are differences of positions.
         """
         u = balance.u[world, slot]
         v = balance.v[world, slot]
