@@ -326,10 +326,9 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
     def element_size(self, contact: Any) -> float:
         return float(self.element_sizes[self.tables.number[contact.index]].min())
 
-    def relative_penetration(self, rows: np.ndarray) -> np.ndarray:
+    def penetration_columns(self) -> tuple[slice, np.ndarray]:
         first = self.report_offset + PENETRATION_ROW
-        depth = rows[:, first : first + self.report_columns : len(RECORD_NAMES)]
-        return np.asarray(depth / self.element_sizes.min(axis=1)) if depth.any() else depth
+        return slice(first, first + self.report_columns, len(RECORD_NAMES)), self.element_sizes.min(axis=1)
 
     def stored_energy(self, ctx: StepContext) -> dict[str, np.ndarray]:
         """Stored energy according to the history, by points."""

@@ -246,6 +246,7 @@ class RunStatistics:
     def __init__(self, sim: Any, asynchronous: bool) -> None:
         B = sim.model.worlds
         self.sim, self.stepper = sim, sim.stepper
+        self._penetration_columns = [term.penetration_columns() for term in sim.model.terms.contacts]
         self.asynchronous, self.unsynced, self.times_differ = asynchronous, False, False
         self.steps = 0
         self.last = None
@@ -292,8 +293,8 @@ class RunStatistics:
         column |= {name: column[name].astype(int) for name in COUNT_COLUMNS}
         column["converged"] = (column["status"] == STATUS["running"]) & (column["rough"] == 0.0)
         column["penetration"] = np.zeros(len(rows))
-        for term in self.sim.model.terms.contacts:
-            column["penetration"] = np.maximum(column["penetration"], term.relative_penetration(rows).max(axis=1))
+        for columns, sizes in self._penetration_columns:
+            column["penetration"] = np.maximum(column["penetration"], (rows[:, columns] / sizes).max(axis=1))
         known = {entry.name: column[entry.name] for entry in fields(StepReport) if entry.name in column}
         control = self.stepper.step_size_control
         return StepReport(**known, **(control.step_statistics() if control else {}))

@@ -220,9 +220,8 @@ class Touching(Term):
         """Size of the smallest element of one of its contacts, m."""
         raise NotImplementedError
 
-    def relative_penetration(self, rows: np.ndarray) -> np.ndarray:
-        """Largest depth of each contact over the size of its smallest element, (worlds, contacts), from report rows
-        (worlds, columns)."""
+    def penetration_columns(self) -> tuple[slice, np.ndarray]:
+        """Report columns of the largest depths of its contacts, and the sizes of their smallest elements, m."""
         raise NotImplementedError
 
 
