@@ -8,7 +8,7 @@ from ..model.bodies import Body
 from ..model.contacts import Collider, Contact
 from ..model.description import Description
 from ..model.handles import SurfaceSet
-from ..model.pairs import PairContact
+from ..model.pairs import FacetOptions
 from ..model.shapes import Shape
 from .checks import body_of_handle
 from .contacts import add_contact, make_collider, pairs_without_contact
@@ -42,7 +42,7 @@ class ContactMethods:
         stiffness: Any = None, model: str = "patch", radius: float | None = None, offset: float = 0.0,
         points: int | None = None, smoothing: Any = None, overlap: str = "auto", overlap_time: float = 0.1,
         seam: float | None = None, name: str | None = None,
-    ) -> Contact | PairContact:  # fmt: skip
+    ) -> Contact | FacetOptions:  # fmt: skip
         """Define contact of a body, or a surface of it, with a collider or another body.
 
         Args:
@@ -86,7 +86,7 @@ class ContactMethods:
                        smoothing=smoothing, overlap=overlap, overlap_time=overlap_time, seam=seam)  # fmt: skip
         return add_contact(self.description, surface, collider, name, **options)
 
-    def add_contact_all(self, *, mu: float = 0.0, **options: Any) -> list[Contact | PairContact]:
+    def add_contact_all(self, *, mu: float = 0.0, **options: Any) -> list[Contact | FacetOptions]:
         """Define contact of each two bodies, and of each body with each collider, as far as they have none.
 
         Bodies with themselves are not meant, and left out are bodies that a weld, a joint or a constraint (but for a

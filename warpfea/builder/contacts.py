@@ -19,7 +19,8 @@ from ..model.contact_points import check_contact_points
 from ..model.contacts import Collider, Contact
 from ..model.description import Description
 from ..model.handles import SurfaceSet
-from ..model.pairs import PAIR_RULES, PairContact, slave_and_master
+from ..model.obstacle_points import ObstacleContact, is_narrow
+from ..model.pairs import PAIR_RULES, FacetOptions, PairContact, slave_and_master
 from ..model.shapes import Shape
 from ..time_laws import Rotation, time_law
 from .bodies import unused_name
@@ -76,7 +77,7 @@ def outer_surface(thing: Body | SurfaceSet) -> SurfaceSet:
 
 def add_contact(
     d: Description, thing: Body | SurfaceSet, other: Any, name: str | None, **options: Any
-) -> Contact | PairContact:  # fmt: skip
+) -> Contact | FacetOptions:  # fmt: skip
     """Record a contact with a collider or another body; see ModelBuilder.add_contact."""
     if other is None:
         raise NotImplementedError(
@@ -88,7 +89,9 @@ def add_contact(
     return contact
 
 
-def make_contact(d: Description, thing: Body | SurfaceSet, collider: Any, name: str | None, **options: Any) -> Contact:
+def make_contact(
+    d: Description, thing: Body | SurfaceSet, collider: Any, name: str | None, **options: Any
+) -> Contact | ObstacleContact:
     """See ModelBuilder.add_contact.
 
     Args:
@@ -110,6 +113,10 @@ def make_contact(d: Description, thing: Body | SurfaceSet, collider: Any, name: 
             f"contact {name!r}: collider {collider.name!r} is a sheet of triangles, and model = 'sphere' needs an "
             "obstacle with an inside: take model = 'patch', or a closed mesh"
         )
+    patch = o["model"] == "patch" and o["treatment"] == "implicit" and not LAWS[o["law"]].traits & ANY_GAP
+    if patch and is_narrow(surface, collider):
+        o |= {"points": None, "index": len(d.contacts_of(FacetOptions))}
+        return ObstacleContact(surface=surface, collider=collider, name=name, **o)
     return Contact(surface, collider, name, index=len(d.contacts_of(Contact)), **o)
 
 
@@ -145,7 +152,8 @@ def make_pair(
                 f"{what}: points = {points!r}: faces of {slave.body.name!r} have rules of {numbers} points"
             )
     o["points"] = None if points is None else int(points)
-    return PairContact(a, b, name, slave, master, index=len(d.contacts_of(PairContact)), **o)
+    o["index"] = len(d.contacts_of(FacetOptions))
+    return PairContact(first=a, second=b, name=name, slave=slave, master=master, **o)
 
 
 def pairs_without_contact(d: Description, options: Collection[str]) -> list[tuple[Body, Body | Collider]]:
@@ -169,7 +177,7 @@ def pairs_without_contact(d: Description, options: Collection[str]) -> list[tupl
     ]
 
 
-KINDS: dict[type, Callable[..., Contact | PairContact]] = {
+KINDS: dict[type, Callable[..., Contact | FacetOptions]] = {
     Body: make_pair, SurfaceSet: make_pair, Collider: make_contact,
 }  # fmt: skip
 """Contacts by the type of the other side that `add_contact` is given."""

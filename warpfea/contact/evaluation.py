@@ -80,14 +80,14 @@ class PairEvaluation:
         for k, contact in enumerate(t.contacts):
             points = slice(t.first[k], t.first[k + 1])
             gap, normal, area = self.gap[:, points], self.normal[:, points], t.host[k].area.ravel()
-            if contact.slave.body is body:
-                nearest = np.broadcast_to(nearest_samples(t, k, contact.slave.body), gap.shape)
+            if contact.surfaces[0].body is body and len(contact.surfaces) > 1:
+                nearest = np.broadcast_to(nearest_samples(t, k, body), gap.shape)
                 out.append(BodyContactPoints(nearest, np.broadcast_to(area, gap.shape), normal, gap))
-            if contact.master.body is body:
+            if contact.facets.body is body:
                 X = self._master_positions(points)
                 nearest = np.full(gap.shape, -1)
                 seated = self.facet[:, points] >= 0
-                nearest[seated] = nearest_samples(t, k, contact.master.body, X[seated])
+                nearest[seated] = nearest_samples(t, k, contact.facets.body, X[seated])
                 # master area: the loaded part only, without the area beside the slave
                 out.append(BodyContactPoints(nearest, np.where(normal > 0.0, area, 0.0), normal, gap))
         return out
@@ -384,7 +384,7 @@ def refuse_deep_overlaps(
     for k, contact in enumerate(tables.contacts):
         if contact.overlap == "offset":
             continue
-        body, points = contact.master.body, slice(tables.first[k], tables.first[k + 1])
+        body, points = contact.facets.body, slice(tables.first[k], tables.first[k + 1])
         limit = tables.masters[tables.master_of[k]].depth_limit
         least = MIN_DEEP_OVERLAP_RATIO * float(limit.min())
         beyond = (0.0 if body.family.solid else float(limit.max())) - least  # margin of the nodal bounding box
@@ -404,7 +404,7 @@ def refuse_deep_overlaps(
             if depth.max() > least:
                 point = int(np.flatnonzero(near[world])[depth.argmax()])
                 raise ModelError(
-                    f"contact {contact.name!r}: body {contact.slave.body.name!r} begins within body {body.name!r} "
+                    f"contact {contact.name!r}: {contact.points_of} begins within body {body.name!r} "
                     f"(world {world}, reference point {reference_position_text(tables, k, point)}, "
                     f"{depth.max():.3g} m deep), where no facet of the contact reaches; move one of them, or leave "
                     "these faces out of the contact"

@@ -12,9 +12,11 @@ import warp as wp
 from ..base.errors import ModelError
 from ..kernels.contact.facet_structs import master_struct
 from ..kernels.contact.structs import contact_struct
-from ..model.contact_points import corner_points, element_depths
+from ..model.contact_points import ContactPoints, corner_points, element_depths
 from ..model.handles import SurfaceSet
+from ..model.obstacle_points import ObstacleContact, obstacle_points
 from ..model.pairs import (
+    FacetOptions,
     MasterFacets,
     PairContact,
     bernstein_from_monomials,
@@ -35,8 +37,17 @@ TOUCH = 1e-9
 """Depth over the size of a model treated as touching at the start of a step."""
 
 
-class PairTables(FacetTables[PairContact]):
-    """Contacts between bodies of a model; points lie on the slave surfaces.
+def slave_points(contact: FacetOptions) -> tuple[ContactPoints, Any]:
+    """Points of a contact, and the factor on their stiffness by area."""
+    if isinstance(contact, ObstacleContact):
+        points, factor = obstacle_points(contact)
+        return points, factor if contact.stiffness_of == "elements" else 1.0
+    return pair_points(contact.surfaces[0], contact.points), 1.0
+
+
+class PairTables(FacetTables[FacetOptions]):
+    """Contacts between bodies of a model, and of obstacles narrower than the facets of a body; points lie on the slave
+    surfaces, or on the obstacles.
 
     Attributes:
         surfaces, masters: distinct master surfaces and their facets; master_of: master surface of each contact.
@@ -46,22 +57,26 @@ class PairTables(FacetTables[PairContact]):
     """
 
     def __init__(self, model: Model) -> None:
-        contacts = model.description.contacts_of(PairContact)
-        super().__init__(model, contacts, [pair_points(contact.slave, contact.points) for contact in contacts])
+        contacts = model.description.contacts_of(FacetOptions)
+        found = [slave_points(contact) for contact in contacts]
+        factors = {contact.index: factor for contact, (_, factor) in zip(contacts, found)}
+        super().__init__(model, contacts, [points for points, _ in found])
         self.surfaces: list[SurfaceSet] = []
         self.master_of: list[int] = []
         for contact in self.contacts:
-            same = [k for k, other in enumerate(self.surfaces) if other.body is contact.master.body
-                    and np.array_equal(other.faces, contact.master.faces)]  # fmt: skip
+            same = [k for k, other in enumerate(self.surfaces) if other.body is contact.facets.body
+                    and np.array_equal(other.faces, contact.facets.faces)]  # fmt: skip
             if not same:
-                self.surfaces.append(contact.master)
+                self.surfaces.append(contact.facets)
             self.master_of.append(same[0] if same else len(self.surfaces) - 1)
         self.masters: list[MasterFacets] = [master_facets(surface) for surface in self.surfaces]
         self._check_clamped()
         self.region_areas = [self._region_area(contact) for contact in self.contacts]
-        self.area_fractions = [p.area / region for p, region in zip(self.host, self.region_areas)]
+        self.area_fractions = [
+            factors[c.index] * p.area / area for c, p, area in zip(self.contacts, self.host, self.region_areas)
+        ]
         self.facets = sum(len(m.conn) for m in self.masters)
-        self.bodies = sorted({surface.body.index for c in self.contacts for surface in (c.slave, c.master)})
+        self.bodies = sorted({surface.body.index for c in self.contacts for surface in c.surfaces})
         self.corners: list[wp.array] = []
 
     def _check_clamped(self) -> None:
@@ -69,16 +84,28 @@ class PairTables(FacetTables[PairContact]):
         clamped = clamped_slots(self.model)
         for contact, slots in zip(self.contacts, self.slots):
             if clamped[slots].all():
+                sides = [contact.points_of, f"body {contact.facets.body.name!r}"]
+                if isinstance(contact, PairContact):
+                    sides = [repr(side.body.name) for side in (contact.first, contact.second)]
                 raise ModelError(
-                    f"contact {contact.name!r}: all of the surfaces of bodies {contact.first.body.name!r} and "
-                    f"{contact.second.body.name!r} is clamped; leave the contact out, or free one of them"
+                    f"contact {contact.name!r}: all of the surfaces of bodies {' and '.join(sides)} is clamped; leave "
+                    "the contact out, or free one of them"
                 )
 
-    def _region_area(self, contact: PairContact) -> float:
-        """Area that the contact stiffness is distributed over, m^2: the smaller of both surfaces."""
+    def _region_area(self, contact: FacetOptions) -> float:
+        """Area that the contact stiffness is distributed over, m^2: the smaller of both surfaces; of an obstacle the
+        mean shadow of a convex one, a quarter of its surface."""
         if contact.radius:
             return math.pi * contact.radius**2
-        return min(float(pair_points(surface).area.sum()) for surface in (contact.slave, contact.master))
+        areas = [float(pair_points(surface).area.sum()) for surface in contact.surfaces]
+        if isinstance(contact, ObstacleContact):
+            areas.append(0.25 * float(self.host[self.number[contact.index]].area.sum()))
+        return min(areas)
+
+    def _own_depths(self, k: int) -> np.ndarray:
+        if isinstance(self.contacts[k], ObstacleContact):
+            return np.zeros(len(self.host[k].conn))
+        return super()._own_depths(k)
 
     @property
     def connectivity(self) -> list[np.ndarray]:
@@ -90,8 +117,8 @@ class PairTables(FacetTables[PairContact]):
         """Model slots of both surfaces of each contact."""
         out = []
         for contact, p, k in zip(self.contacts, self.host, self.master_of):
-            slave = np.unique(p.conn) + contact.slave.body.slot_offset
-            master = np.unique(self.masters[k].conn) + contact.master.body.slot_offset
+            slave = np.unique(p.conn) + contact.body.slot_offset
+            master = np.unique(self.masters[k].conn) + contact.facets.body.slot_offset
             out.append(np.concatenate([slave, master]))
         return out
 
@@ -113,7 +140,7 @@ class PairTables(FacetTables[PairContact]):
         self.other_entries = self.master_conn.size
         self.size = self.model.size
 
-    def law_constants(self, contact: PairContact, world: int | None = None) -> dict[str, Any]:
+    def law_constants(self, contact: FacetOptions, world: int | None = None) -> dict[str, Any]:
         region = self.region_areas[self.number[contact.index]]
         parameters = self.model.parameters
         row = contact_constants(contact, region, partial(parameters.mass, world=world), parameters.modulus(world))
@@ -178,8 +205,8 @@ class PairTables(FacetTables[PairContact]):
             counts = [len(mas.conn) for mas in all_of]
             tables = {
                 "surface_of": self.master_of,
-                "sign": [1.0 if c.slave is c.first else -1.0 for c in self.contacts],
-                "bodies": [[self.bodies.index(s.body.index) for s in (c.slave, c.master)] for c in self.contacts],
+                "sign": [c.sign for c in self.contacts],
+                "bodies": [[self.bodies.index(c.surfaces[i].body.index) for i in (0, -1)] for c in self.contacts],
                 "conn": self.master_conn.T,
                 "shape": np.moveaxis(concatenated("shape"), 0, 2),
                 "director_shape": np.moveaxis(concatenated("director_shape"), 0, 2),
@@ -210,8 +237,11 @@ class PairTables(FacetTables[PairContact]):
     def hash(self, h: Any) -> None:
         """Hash the definition of the contacts."""
         for contact, p, k in zip(self.contacts, self.host, self.master_of):
-            fixed = ("first", "second", "slave", "master", *WORLD_PARAMETERS)
+            fixed = ("first", "second", "slave", "master", "surface", "collider", *WORLD_PARAMETERS)
             values = {name: v for name, v in vars(contact).items() if name not in fixed}
-            h.update(f"{contact.first.body.name} {contact.second.body.name} {sorted(values.items())}".encode())
+            names = [getattr(contact, side).body.name for side in ("first", "second") if hasattr(contact, side)]
+            h.update(f"{' '.join(names or [contact.points_of])} {sorted(values.items())}".encode())
             h.update(np.ascontiguousarray(p.faces).tobytes() + np.ascontiguousarray(self.surfaces[k].faces).tobytes())
+            if isinstance(contact, ObstacleContact):
+                h.update(p.X.tobytes())
         h.update(self.built_values)

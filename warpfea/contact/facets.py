@@ -21,7 +21,8 @@ from ..kernels.contact.facet_structs import (
 )
 from ..kernels.contact.point_lists import FACETS_PER_CHUNK, point_list_kernels
 from ..kernels.contact.rigid_modes import pair_rigid_mode_kernels
-from ..model.pairs import PairContact
+from ..model.obstacle_points import ObstacleContact
+from ..model.pairs import FacetOptions, PairContact
 from ..model.state import State, view_as_words
 from ..terms.protocols import Coupled, Tied
 from ..terms.term import StepContext, part
@@ -57,7 +58,7 @@ class FacetContact(ContactTerm, Tied, Coupled):
 
     @classmethod
     def features(cls, model: Model) -> dict[str, bool]:
-        return {"contact between bodies": bool(model.description.contacts_of(PairContact))}
+        return {"contact between bodies": bool(model.description.contacts_of(FacetOptions))}
 
     def tied_slots(self) -> list[np.ndarray]:
         """Bodies in contact form one component."""
@@ -263,9 +264,18 @@ class FacetContact(ContactTerm, Tied, Coupled):
 
     def coupled_bodies(self) -> list[tuple[int, int]]:
         number = {id(body): k for k, body in enumerate(self.model.bodies)}
-        return [(number[id(c.first.body)], number[id(c.second.body)]) for c in self.tables.contacts]
+        pairs = [c for c in self.tables.contacts if isinstance(c, PairContact)]
+        return [(number[id(c.first.body)], number[id(c.second.body)]) for c in pairs]
+
+    def mark_constrained(self, free: np.ndarray) -> None:
+        """Obstacles hold the bodies that they touch."""
+        for contact in self.tables.contacts:
+            if isinstance(contact, ObstacleContact):
+                free[np.unique(self.model.components.of_slot[contact.body.slots])] = 0.0
 
     def allocate_mode_coupling(self, ctx: StepContext, motions: Any) -> Iterable[wp.Module]:
+        if not self.coupled_bodies():
+            return ()
         s = ctx.scratch[self.name]
         s["motions"] = PairRigidModes(ctx, self.tables, s["masters"], motions)
         return {s["motions"].kernels.module}
@@ -274,10 +284,15 @@ class FacetContact(ContactTerm, Tied, Coupled):
         ctx.scratch[self.name]["motions"].add(kept, dq_dv, active)
 
     def sides_text(self, contact: Any) -> tuple[str, str, str]:
+        if isinstance(contact, ObstacleContact):
+            return contact.body.name, contact.points_of, "body"
         return contact.slave.body.name, f"body {contact.master.body.name!r}", "body"
 
     def _contact_info(self, contact: Any, k: int) -> tuple[dict[str, Any], dict[str, Any]]:
-        names = {"body": contact.first.body.name, "with": contact.second.body.name}
+        if isinstance(contact, ObstacleContact):
+            names = {"body": contact.body.name, "collider": contact.collider.name}
+        else:
+            names = {"body": contact.first.body.name, "with": contact.second.body.name}
         return names, {"facets": len(self.tables.masters[self.tables.master_of[k]].conn), "left_out": 0}
 
     # at a state
@@ -286,8 +301,18 @@ class FacetContact(ContactTerm, Tied, Coupled):
         """Elastic nodal forces of all contacts at a state, both bodies, (worlds, slots, 3), N."""
         return evaluate_pairs(self, state).nodal_force()
 
+    def poses(self, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """As of `ColliderContact`, of colliders at rest; None without an obstacle among the contacts."""
+        colliders = self.model.description.colliders
+        if not any(isinstance(contact, ObstacleContact) for contact in self.tables.contacts):
+            return None
+        frames = [collider.shape.frame() for collider in colliders]
+        position, rotation = (np.stack([frame[k] for frame in frames]) for k in (0, 1))
+        worlds = (state.worlds, 1, 1)
+        return np.tile(position, worlds), np.tile(rotation, (*worlds, 1)), np.zeros((state.worlds, len(colliders)))
+
     def samples(self, field: str, body: Any, state: State) -> np.ndarray:
-        bodies = [side.body for contact in self.tables.contacts for side in (contact.slave, contact.master)]
+        bodies = [side.body for contact in self.tables.contacts for side in contact.surfaces]
         contact_points = evaluate_pairs(self, state).contact_points(body) if body in bodies else []
         return contact_field(field, body, state.worlds, contact_points)
 
@@ -310,7 +335,7 @@ class PairRigidModes:
         self.ctx, self.tables, self.masters, self.rigid_modes = ctx, tables, masters, rigid_modes
         self.kernels = pair_rigid_mode_kernels(m.dtype)
         number = {id(body): rigid_modes.mode_index.get(k, -1) for k, body in enumerate(m.bodies)}
-        sides = [(number[id(c.slave.body)], number[id(c.master.body)]) for c in t.contacts]
+        sides = [(number[id(c.body)], number[id(c.facets.body)]) for c in t.contacts]
         coupled = [k for k, (a, b) in enumerate(sides) if min(a, b) >= 0 and a != b]
         pairs = sorted({(min(sides[k]), max(sides[k])) for k in coupled})
         found = [[(k, int(sides[k] != pair)) for k in coupled if tuple(sorted(sides[k])) == pair] for pair in pairs]

@@ -18,7 +18,7 @@ from ..kernels.contact.law import LAWS, law_code, own_laws
 from ..kernels.contact.structs import facet_struct
 from ..model.contact_points import CONTACT_RULES, ContactPoints, element_depths, lagrange_basis
 from ..model.contacts import Contact, ContactOptions
-from ..model.pairs import PairContact
+from ..model.pairs import FacetOptions
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -28,7 +28,7 @@ __all__ = [
     "hunt_crossley_damping", "normal_damping", "restitution_beta",
 ]  # fmt: skip
 
-AnyContact = TypeVar("AnyContact", Contact, PairContact)
+AnyContact = TypeVar("AnyContact", Contact, FacetOptions)
 DEFAULT_SMOOTHING = (1e-3, 1e-4)
 """Default eps, N, and v_eps, m/s, of the smooth law."""
 WORLD_PARAMETERS = {"mu": "mu", "mu_static": "mu_static", "restitution": "damping", "stiffness": "scale"}
@@ -219,7 +219,7 @@ class FacetTables(Generic[AnyContact]):
             "area_fraction": np.concatenate([self.area_fractions[k] for k in chosen]).T,
             "area": np.concatenate([p.area for p in parts]).T,
             "contact": np.repeat(chosen, [len(p.conn) for p in parts]),
-            "element_depth": np.concatenate([element_depths(self.contacts[k].surfaces[0]) for k in chosen]),
+            "element_depth": np.concatenate([self._own_depths(k) for k in chosen]),
         }
         data.first_entry, data.first_row, data.first_point = pool, self.rows, self.points
         _, data.point_count, acts = kind
@@ -234,6 +234,10 @@ class FacetTables(Generic[AnyContact]):
             tables |= {"point_coords": points, "lagrange_coefficients": basis, "exponents": power}
         m.memory.fill(data, "contact", **tables)
         return FacetGroup(conn, data, acts != PATCH, chosen)
+
+    def _own_depths(self, k: int) -> np.ndarray:
+        """(F,) depths of the elements behind the facets of contact k, m."""
+        return element_depths(self.contacts[k].surfaces[0])
 
     def law_constants(self, contact: AnyContact, world: int | None = None) -> dict[str, Any]:
         """Constants `MATERIAL_CONSTANTS` of a contact, as built or in one world."""
@@ -329,12 +333,12 @@ class FacetTables(Generic[AnyContact]):
         m.memory.fill(out, "contact", **tables)
 
 
-def bodies_of(contact: Contact | PairContact) -> list[Any]:
+def bodies_of(contact: Contact | FacetOptions) -> list[Any]:
     """Bodies of a contact."""
-    return [contact.body] if isinstance(contact, Contact) else [contact.first.body, contact.second.body]
+    return [surface.body for surface in contact.surfaces]
 
 
-def _facet_kind(contact: Contact | PairContact, p: ContactPoints) -> tuple[int, int, int]:
+def _facet_kind(contact: Contact | FacetOptions, p: ContactPoints) -> tuple[int, int, int]:
     """Contact kind of a facet: slots, points, and PATCH, LUMPED or MOVING."""
     lumped = LUMPED if contact.treatment == "explicit" else MOVING
     return p.conn.shape[1], p.area.shape[1], PATCH if contact.model == "patch" else lumped

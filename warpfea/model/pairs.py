@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -18,7 +19,15 @@ from .discretisation import Discretisation, element_functions
 from .handles import SurfaceSet
 from .surfaces import measure_to_skin
 
-__all__ = ["PAIR_RULES", "MasterFacets", "PairContact", "master_facets", "pair_points", "slave_and_master"]
+__all__ = [
+    "PAIR_RULES",
+    "FacetOptions",
+    "MasterFacets",
+    "PairContact",
+    "master_facets",
+    "pair_points",
+    "slave_and_master",
+]
 
 PAIR_RULES: dict[int, dict[int, Rule]] = {
     3: {7: triangle_7(), 16: triangle_16()},
@@ -34,7 +43,35 @@ RANK_TOL = 0.1
 
 
 @dataclass(eq=False)
-class PairContact(ContactOptions):
+class FacetOptions(ContactOptions):
+    """Base of contacts of points with the facets of a body; `slave`: the side of the points.
+
+    Attributes:
+        points_of: text of that side, for messages. sign: 1, or -1 where reports state the force on the facets.
+    """
+
+    name: str
+    sign: ClassVar[Any]
+    points_of: ClassVar[Any]
+
+    @property
+    def surfaces(self) -> tuple[SurfaceSet, ...]:
+        """Surfaces of bodies in the contact; the last one has the facets."""
+        raise NotImplementedError
+
+    @property
+    def body(self) -> Discretisation:
+        """The body of the first of them."""
+        return self.surfaces[0].body
+
+    @property
+    def facets(self) -> SurfaceSet:
+        """The surface whose facets are touched."""
+        return self.surfaces[-1]
+
+
+@dataclass(eq=False)
+class PairContact(FacetOptions):
     """Contact of two surfaces; made by ModelBuilder.add_contact, which documents the values.
 
     Attributes:
@@ -49,14 +86,16 @@ class PairContact(ContactOptions):
     master: SurfaceSet
 
     @property
-    def body(self) -> Discretisation:
-        """The body of the slave surface."""
-        return self.slave.body
+    def surfaces(self) -> tuple[SurfaceSet, ...]:
+        return self.slave, self.master
 
     @property
-    def surfaces(self) -> tuple[SurfaceSet, ...]:
-        """Surfaces of bodies in the contact."""
-        return self.slave, self.master
+    def sign(self) -> float:
+        return 1.0 if self.slave is self.first else -1.0
+
+    @property
+    def points_of(self) -> str:
+        return f"body {self.slave.body.name!r}"
 
     def __repr__(self) -> str:
         return f"PairContact({self.name!r}, bodies {self.first.body.name!r} and {self.second.body.name!r})"
@@ -228,16 +267,16 @@ def facet_thickness(surface: SurfaceSet) -> np.ndarray:
 
 
 def contact_constants(
-    contact: PairContact, area: float, mass_of: Callable[[Discretisation], float], modulus_of: Modulus
+    contact: FacetOptions, area: float, mass_of: Callable[[Discretisation], float], modulus_of: Modulus
 ) -> dict[str, float]:
     """Contact constants of Eqs. (74)-(76), (79), (80) for a contact region of `area`, m^2.
 
     Normal and tangential stiffness 4/3 E* a and 8 G* a, N/m; 2 E* a, N/m, for the damping; effective mass, kg; 1/E* of
-    slave and master, 1/Pa.
+    slave and master, 1/Pa; an obstacle as the slave has none.
     """
     shear_compliance = inverse_mass = 0.0
     compliances = []
-    for surface in (contact.slave, contact.master):
+    for surface in contact.surfaces:
         total = mass_of(surface.body)
         inverse_mass += 1.0 / total if total > 0.0 else math.inf
         E, nu = modulus_of(surface.body, surface)
@@ -250,6 +289,6 @@ def contact_constants(
         "tangential_stiffness": 8.0 * a / shear_compliance,
         "damping_stiffness": 2.0 * a / compliance,
         "effective_mass": 1.0 / inverse_mass,
-        "own_compliance": compliances[0],
-        "other_compliance": compliances[1],
+        "own_compliance": compliances[0] if len(compliances) > 1 else 0.0,
+        "other_compliance": compliances[-1],
     }

@@ -18,7 +18,7 @@ from ..model.bodies import Body
 from ..model.contacts import Contact
 from ..model.handles import NodeSet
 from ..model.joints import Joint
-from ..model.pairs import PairContact
+from ..model.pairs import FacetOptions
 from ..model.state import State
 from ..model.surfaces import reference_points
 from ..terms.evaluation import field_at_nodes, field_at_points, find_field
@@ -98,8 +98,8 @@ class Results:
     def collider_poses(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
         """Collider poses: positions (B, K, 3), m, rotations (B, K, 3, 3) with the shape's axes in the world as columns,
         and surface offsets (B, K), m; None for a model without contact."""
-        term = self.model.terms.contact
-        return term.poses(self.state) if term else None
+        found = (term.poses(self.state) for term in (self.model.terms.contact, self.model.terms.pairs) if term)
+        return next((poses for poses in found if poses), None)
 
     @property
     def fields(self) -> dict[str, FieldSpec]:
@@ -269,31 +269,31 @@ class Records:
         joints = self.model.constraints.joints if self.model.constraints else []
         return _find("joint", joint, joints, "a handle from add_joint, add_constraint or weld, or a name")
 
-    def contact_record(self, contact: Contact | PairContact | str) -> ContactRecord:
+    def contact_record(self, contact: Contact | FacetOptions | str) -> ContactRecord:
         """Record of a contact (handle or name), one entry per step."""
         time, table = self._recorded_table(self.contact_column(contact), len(RECORD_NAMES))
         names = ("normal_force", "penetration", "slip", "area", "stick", "stored", "loss", "friction", "collider_work")
         scalars = {name: table[:, :, RECORD_NAMES.index(name)] for name in names}
         return ContactRecord(time, table[:, :, :3], table[:, :, 3:6], **scalars)
 
-    def contact_force(self, contact: Contact | PairContact | str) -> np.ndarray:
+    def contact_force(self, contact: Contact | FacetOptions | str) -> np.ndarray:
         """Force (N) and moment about the origin (N m) of a contact on its body over the last accepted step.
 
         (B, 6) in world axes; over time see `contact_record`. NaN as for `reaction`.
         """
         return self._of_last_step(self.contact_column(contact))
 
-    def contact_column(self, contact: Contact | PairContact | str) -> int:
+    def contact_column(self, contact: Contact | FacetOptions | str) -> int:
         """First report column of a contact."""
         term, known = self._find_contact(contact)
         return term.contact_column(known)
 
-    def element_size(self, contact: Contact | PairContact | str) -> float:
+    def element_size(self, contact: Contact | FacetOptions | str) -> float:
         """Size, m, that `StepReport.penetration` divides the depth of a contact by."""
         term, known = self._find_contact(contact)
         return term.element_size(known)
 
-    def _find_contact(self, contact: Contact | PairContact | str) -> tuple[Touching, Any]:
+    def _find_contact(self, contact: Contact | FacetOptions | str) -> tuple[Touching, Any]:
         """Term and handle of a contact."""
         known = _find("contact", contact, self.model.description.contacts, "a handle from add_contact, or a name")
         return next(term for term in self.model.terms.contacts if known in term.tables.contacts), known
