@@ -43,7 +43,7 @@ def arch(
     b = wf.ModelBuilder(gravity=([0.0, ramp, 2.0 * ramp], [(0.0, 0.0, 0.0), (0.0, 0.0, -9.81), (0.0, 0.0, -9.81)]))
     material = wf.SVK(E=E, nu=nu, density=density)
     ground = b.add_collider(wf.HalfSpace(normal=(0, 0, 1)), name="ground")
-    contact_options: dict[str, Any] = {"mu": mu, "restitution": 0.1, "stiffness": stiffness}
+    contact_options: dict[str, Any] = {"mu": mu, "restitution": 0.1, "stiffness": ("region", stiffness)}
     block_angle = math.pi / blocks
 
     def polar_map(X: np.ndarray) -> np.ndarray:

@@ -47,7 +47,9 @@ def ball_on_plate(
     top = (0.0, 0.0, drop + radius)
     mesh = wf.mesh.sphere(radius, cells=cells, center=top)
     ball = b.add_solid(mesh, material=wf.NeoHookean.from_E_nu(E=E, nu=nu, density=density), name="ball")
-    b.add_contact(ball, plate.surface("z+"), mu=mu, restitution=restitution, stiffness=stiffness, name="impact")
+    b.add_contact(
+        ball, plate.surface("z+"), mu=mu, restitution=restitution, stiffness=("region", stiffness), name="impact"
+    )
     b.add_probe("ball", ball.at(top))
     b.add_probe("plate", plate.at((0.0, 0.0, 0.0)))
     return b

@@ -53,7 +53,7 @@ def block_stack(
         place = (np.array([(c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)]), np.array((0.0, 0.0, k * side + (k + 1) * gap)))
         block = b.add_solid(mesh, material=material, transform=place, name=f"block {k + 1}")
         faces = (block.surface("z-"), below.surface("z+"))
-        b.add_contact(*faces, mu=mu, restitution=restitution, stiffness=stiffness, name=f"joint {k + 1}")
+        b.add_contact(*faces, mu=mu, restitution=restitution, stiffness=("region", stiffness), name=f"joint {k + 1}")
         below = block
     b.add_probe("top", below.at((0.0, 0.0, blocks * (side + gap))))
     return b

@@ -45,7 +45,7 @@ def finger_beam_shell(
     finger = b.add_solid(mesh, material=wf.NeoHookean.from_E_nu(E=finger_E, nu=0.4, density=density), name="finger")
     way = ([0.0, 0.1, duration, 2.0], [(0, 0, 0), (0, 0, 0), (travel, 0, 0), (travel, 0, 0)])
     b.drive(finger.nodes("z+"), displacement=way)
-    options: dict[str, Any] = {"mu": mu, "restitution": 0.3, "stiffness": stiffness}
+    options: dict[str, Any] = {"mu": mu, "restitution": 0.3, "stiffness": ("region", stiffness)}
     b.add_contact(beam, shell.surface("top"), name="table", **options)
     b.add_contact(finger.surface("x+"), beam, name="push", **options)
     b.add_probe("beam", beam.at((0.02, 0.0, 0.5 * height)))

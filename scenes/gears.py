@@ -62,6 +62,6 @@ def gears(
         b.add_joint("revolute", parent=wf.GROUND, child=hub, drive=drive, name=f"{name} axle", **axis)
         wheels.append(wheel)
     sides = [wheel.surface("side") for wheel in wheels]
-    b.add_contact(*sides, mu=mu, restitution=0.2, stiffness=stiffness, name="mesh")
+    b.add_contact(*sides, mu=mu, restitution=0.2, stiffness=("region", stiffness), name="mesh")
     b.add_probe("tooth", wheels[1].at((apart - 0.8 * radius, 0.0, 0.5 * width)))
     return b

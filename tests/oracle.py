@@ -67,7 +67,7 @@ def build(row: dict[str, Any]) -> Any:
         else:
             b.set_initial(block, velocity=(0.2, 0.0, -0.5))
         if row["contact"] == "pairs":
-            b.add_contact(block, bar, mu=0.3, stiffness=10.0)
+            b.add_contact(block, bar, mu=0.3, restitution=1.0, stiffness=("region", 10.0))
         else:
             floor = b.add_collider(wf.HalfSpace(normal=(0, 0, 1), offset=0.1))
             law_name = {"default": "default", "paper": "paper", "smooth": "smooth"}[row["contact"]]

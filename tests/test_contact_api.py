@@ -137,7 +137,7 @@ def test_all_nodes_may_be_driven():
         expected = 4 / 3 * modulus * np.sqrt(0.05) * (1e-3 * k) ** 1.5
         assert sim.contact_force("pad")[0, 2] == pytest.approx(expected, rel=1e-10)
         assert sim.model.contact_force(sim.state)[0].sum(axis=0)[2] == pytest.approx(expected, rel=1e-10)
-    sim = driven()
+    sim = driven(stiffness="region", restitution=1.0)
     sim.step(3)
     expected = 4 / 3 * modulus * np.sqrt(0.01 / np.pi) * 3e-3
     nodal = sim.model.contact_force(sim.state)[0]

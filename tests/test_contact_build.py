@@ -60,7 +60,7 @@ def test_contact_with_its_defaults(scene):
     c = b.add_contact(block, floor)
     assert (c.name, c.index, c.body, c.collider) == ("block on floor", 0, block, floor)
     np.testing.assert_array_equal(c.surface.faces, block.boundary)
-    assert (c.mu, c.mu_static, c.restitution, c.stiffness) == (0.0, 0.0, 1.0, 1.0)
+    assert (c.mu, c.mu_static, c.restitution, c.stiffness, c.stiffness_of) == (0.0, 0.0, 0.0, 1.0, "elements")
     assert (c.law, c.treatment, c.model, c.overlap) == ("default", "implicit", "patch", "auto")
     assert (c.radius, c.points, c.smoothing, c.offset, c.overlap_time) == (None, None, None, 0.0, 0.1)
     assert b.description.contacts == [c]

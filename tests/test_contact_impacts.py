@@ -34,7 +34,7 @@ def rebound(model, law, treatment, wanted, per_contact):
         b.set_initial(body, velocity=(0, 0, -1.0))
         options = {"model": model, "radius": 0.3 if model == "sphere" else None, "law": law, "treatment": treatment}
         surface = body if model == "sphere" else body.surface("z-")
-        contacts.append(b.add_contact(surface, floor, restitution=e, stiffness=1e-5, **options))
+        contacts.append(b.add_contact(surface, floor, restitution=e, stiffness=("region", 1e-5), **options))
         b.add_probe(f"p{i}", body.at(middle(map)))
     h = impact_step(contacts[0], model, 1.0) / per_contact
     sim = wf.Simulation(b.finalize(device="cpu"), dt=h, solver=wf.NewtonPCG(tol=1e-10), record=False)
@@ -85,7 +85,7 @@ def impacts(count, steps, law, per_contact, e=0.5, smoothing=None):
     body = cube(b)
     b.clamp(body.nodes(everywhere), components="xy")
     surface = body.surface("z-")
-    contact = b.add_contact(surface, floor, law=law, restitution=e, stiffness=1e-5, smoothing=smoothing)
+    contact = b.add_contact(surface, floor, law=law, restitution=e, stiffness=("region", 1e-5), smoothing=smoothing)
     h = impact_step(contact, "patch", 1.0) / per_contact
     model = b.finalize(device="cpu", worlds=count)
     speed = 10.0 ** rng.uniform(-2, 1, count)
@@ -130,7 +130,7 @@ def test_paper_patch_without_solution_raises():
     b.clamp(body.nodes(everywhere), components="xy")
     b.set_initial(body, velocity=(0, 0, -1.0))
     floor = b.add_collider(wf.HalfSpace((0, 0, 1)))
-    b.add_contact(body.surface("z-"), floor, law="paper", restitution=0.1, stiffness=1e-2)
+    b.add_contact(body.surface("z-"), floor, law="paper", restitution=0.1, stiffness=("region", 1e-2))
     sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-3, solver=wf.NewtonPCG(max_halvings=0))
     with pytest.raises(wf.ConvergenceError, match="was not accepted"):
         sim.step()

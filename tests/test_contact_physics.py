@@ -28,7 +28,7 @@ def driven(values, times, options, path=None, low=1e-4, shape=None, device="cpu"
     b.drive(body.nodes(everywhere), displacement=(times, values))
     cube(b, "free", origin=(5.0, 0.0, 5.0))
     floor = b.add_collider(shape or wf.HalfSpace((0, 0, 1), -low), path=path)
-    contact = b.add_contact(body, floor, model="sphere", radius=0.3, **options)
+    contact = b.add_contact(body, floor, model="sphere", radius=0.3, **{"restitution": 1.0, **options})
     X = contact_points(contact.surface).X.reshape(-1, 3)
     return wf.Simulation(b.finalize(device=device, dtype=dtype), dt=times[1] - times[0]), contact, X[X[:, 2].argmin()]
 
@@ -114,7 +114,7 @@ def block(model="patch", *, mu, mu_static=None, guided=False, h=0.02, g=(0, 0, -
     options |= {"model": model, "radius": 0.05 if model == "sphere" else None}
     surface = body if model == "sphere" else body.surface("z-")
     contact = b.add_contact(
-        surface, floor, mu=mu, mu_static=mu_static, restitution=0.3, stiffness=stiffness, **options
+        surface, floor, mu=mu, mu_static=mu_static, restitution=0.3, stiffness=("region", stiffness), **options
     )  # fmt: skip
     b.add_probe("p", body.at(middle(map)))
     model = b.finalize(device=device)

@@ -57,7 +57,9 @@ def resting_block(law, other="collider", **options):
         base = b.add_solid(where, material=wf.SVK(E=1e10, nu=0.0, density=1000.0), name="base")
         b.clamp(base.nodes(lambda X: X[:, 2] < 1.0))
         other = base.surface("z+")
-    pad = b.add_contact(block.surface("z-"), other, law=law, name="pad", **options)
+    pad = b.add_contact(
+        block.surface("z-"), other, law=law, name="pad", **{"stiffness": "region", "restitution": 1.0, **options}
+    )
     return b, block, pad
 
 
@@ -114,7 +116,7 @@ def test_without_damping_it_is_elastic():
 def test_resting_depth(registered, other):
     """d = L ln(1 + W / (k L)); a linear spring would give L (exp(2) - 1)."""
     half = 2.0 if other == "body" else 1.0  # two equal bodies have half the stiffness
-    b, block, _ = resting_block("exponential", other, stiffness=half * stiffness_for_depth())
+    b, block, _ = resting_block("exponential", other, stiffness=("region", half * stiffness_for_depth()))
     b.clamp(block.nodes("z+"), components="xy")
     result = wf.solve_static(b.finalize(device="cpu"), load_steps=2, stabilise=True)
     depth = -result.displacements(block)[0][block.mesh.points[:, 2] < 1e-9, 2]
@@ -123,7 +125,7 @@ def test_resting_depth(registered, other):
 
 def test_energy_of_an_impact(registered):
     """The stored energy is the law's own, and the ledger closes with what the damping takes."""
-    b, block, _ = resting_block("exponential", stiffness=stiffness_for_depth(), restitution=0.5)
+    b, block, _ = resting_block("exponential", stiffness=("region", stiffness_for_depth()), restitution=0.5)
     b.set_initial(block, velocity=(0, 0, -0.01))
     sim = wf.Simulation(b.finalize(device="cpu"), dt=2e-5, solver=wf.NewtonPCG(tol=1e-12))
     k = stiffness_for_depth() * contact_law_constants(resting_block("default")[2])["normal_stiffness"]

@@ -116,7 +116,7 @@ def test_contact_begins_at_its_offset(offset):
 def test_a_flat_press_has_one_pressure_on_both_bodies():
     """Pushed in by the same everywhere: k_n depth over the area, on both sides, and nothing elsewhere."""
     depth = 1e-4
-    b, slab, block = blocks(gravity=(0, 0, 0))
+    b, slab, block = blocks(gravity=(0, 0, 0), stiffness="region")
     sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-3)
     u = sim.state.displacement.numpy()
     u[:, block.slots, 2] = -depth

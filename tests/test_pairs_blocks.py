@@ -93,7 +93,7 @@ def arch(mu):
         mesh = wf.mesh.box((0.25, DEPTH, 0.1), cells=(1, 1, 1), origin=(x - 0.125, 0, -0.1), element="T4")
         feet.append(b.add_solid(mesh, material=material, name=name))
         b.clamp(feet[-1].nodes(lambda X: np.ones(len(X), dtype=bool)))
-    options = {"mu": mu, "stiffness": 20.0, "restitution": 0.1}
+    options = {"mu": mu, "stiffness": ("region", 20.0), "restitution": 0.1}
     for one, other in itertools.pairwise(blocks):
         b.add_contact(one.surface("x-"), other.surface("x+"), **options)
     b.add_contact(blocks[0].surface("x+"), feet[0].surface("z+"), **options)

@@ -39,7 +39,14 @@ def sunk(depth, overlap):
     slab = box(b, "slab", (2 * SIDE, 2 * SIDE, SIDE), (2, 2, 1), (-SIDE, -SIDE, -SIDE), element="T4")
     block = box(b, "block", (SIDE,) * 3, (1, 1, 1), (-0.5 * SIDE, -0.5 * SIDE, -depth), element="T4")
     b.clamp(slab.nodes("z-"))
-    b.add_contact(block.surface("z-"), slab.surface("z+"), restitution=0.3, stiffness=10.0, name="pad", overlap=overlap)
+    b.add_contact(
+        block.surface("z-"),
+        slab.surface("z+"),
+        restitution=0.3,
+        stiffness=("region", 10.0),
+        name="pad",
+        overlap=overlap,
+    )
     return wf.Simulation(b.finalize(device="cpu"), dt=1e-3), block
 
 
@@ -69,7 +76,7 @@ def glide(*, gap, gravity, steps=20, cells=(1, 9), mu=0.0, named=False, element=
     b.clamp(plate.nodes("z-"))
     b.set_initial(block, velocity=(speed, 0, 0))
     faces = (block.surface("z-"), plate.surface("z+")) if named else (block, plate)
-    b.add_contact(*faces, mu=mu, restitution=0.3, stiffness=10.0)
+    b.add_contact(*faces, mu=mu, restitution=0.3, stiffness=("region", 10.0))
     sim = wf.Simulation(b.finalize(device="cpu", **kind), dt=dt)
     most = max(int(sim.step().newton[0]) for _ in range(steps))
     return mean_velocity(sim, block) - (speed, 0, 0), most
@@ -123,7 +130,9 @@ def test_an_offset_takes_no_more_iterations():
     slab = box(b, "slab", (2 * SIDE, 2 * SIDE, SIDE), (2, 2, 1), (-SIDE, -SIDE, -SIDE))
     block = box(b, "block", (SIDE,) * 3, (1, 1, 1), (-0.5 * SIDE, -0.5 * SIDE, 0.01))
     b.clamp(slab.nodes("z-"))
-    b.add_contact(block.surface("z-"), slab.surface("z+"), mu=0.5, restitution=0.3, stiffness=10.0, offset=0.01)
+    b.add_contact(
+        block.surface("z-"), slab.surface("z+"), mu=0.5, restitution=0.3, stiffness=("region", 10.0), offset=0.01
+    )
     sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-3)
     assert max(int(sim.step().newton[0]) for _ in range(10)) <= 20
 
@@ -139,8 +148,8 @@ def test_a_block_takes_its_plank_along_or_slides_on_it(ratio):
     plank = box(b, "plank", (0.4, 0.1, 0.02), (4, 1, 1), (-0.2, -0.05, -0.02), E=1e9)
     block = box(b, "block", (SIDE, SIDE, 0.5 * SIDE), (1, 1, 1), (-0.05, -0.05, 0), E=1e7)
     floor = b.add_collider(wf.HalfSpace((0, 0, 1), -0.02))
-    b.add_contact(plank.surface("z-"), floor, restitution=0.3, stiffness=100.0)
-    b.add_contact(block.surface("z-"), plank.surface("z+"), mu=mu, restitution=0.3, stiffness=100.0)
+    b.add_contact(plank.surface("z-"), floor, restitution=0.3, stiffness=("region", 100.0))
+    b.add_contact(block.surface("z-"), plank.surface("z+"), mu=mu, restitution=0.3, stiffness=("region", 100.0))
     force = ratio * mu * m * G * (1.0 + m / M)
     push = (force / (0.5 * SIDE**2), 0, 0)
     b.add_traction(block.surface("x-"), ([0, 0.05, 0.1, 9.0], [(0, 0, 0), (0, 0, 0), push, push]))
@@ -166,7 +175,7 @@ def test_a_disc_on_a_disc_rubs_with_two_thirds_of_the_rim(swapped):
     b.add_traction(top.surface("top"), ([0, 0.02, 9], [(0, 0, 0), (0, 0, -p), (0, 0, -p)]))
     b.set_initial(top, velocity=lambda X: np.cross((0, 0, 40.0), X))
     faces = (top.surface("bottom"), low.surface("top"))
-    pad = b.add_contact(*(faces[::-1] if swapped else faces), mu=mu, restitution=0.3, stiffness=10.0)
+    pad = b.add_contact(*(faces[::-1] if swapped else faces), mu=mu, restitution=0.3, stiffness=("region", 10.0))
     sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-3)
     sim.step(50)
     record = sim.contact_record(pad)
@@ -184,7 +193,7 @@ def test_a_slender_block_tips_at_its_angle(ratio):
     slab = box(b, "slab", (0.4, 0.2, 0.05), (3, 2, 1), (-0.2, -0.1, -0.05), E=1e8, nu=0.0)
     block = box(b, "block", (SIDE, SIDE, 2 * SIDE), (1, 1, 2), (-0.05, -0.05, 0), E=1e8, nu=0.0)
     b.clamp(slab.nodes("z-"))
-    b.add_contact(block.surface("z-"), slab.surface("z+"), mu=2.0, restitution=0.2, stiffness=100.0)
+    b.add_contact(block.surface("z-"), slab.surface("z+"), mu=2.0, restitution=0.2, stiffness=("region", 100.0))
     sim = wf.Simulation(b.finalize(device="cpu"), dt=2e-3)
     sim.step(250)
     moved = sim.displacements(block)[0, :, 0].max()

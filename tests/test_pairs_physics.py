@@ -31,7 +31,7 @@ def test_two_equal_bars_exchange_their_velocities(integrator):
         for name, x in (("striking", -L), ("struck", 0.0))
     ]  # fmt: skip
     b.set_initial(bars[0], velocity=(v, 0, 0))
-    pair = b.add_contact(bars[0].surface("x+"), bars[1].surface("x-"), restitution=1.0, stiffness=20.0)
+    pair = b.add_contact(bars[0].surface("x+"), bars[1].surface("x-"), restitution=1.0, stiffness=("region", 20.0))
     model = b.finalize(device="cpu")
     sim = wf.Simulation(model, dt=h, integrator=integrator)
     c = math.sqrt(E / rho)
@@ -123,7 +123,7 @@ def pressed_force(ratio, element, slow, slope=0.3):
     b.clamp(wedges[0].nodes("x+"))
     b.clamp(wedges[1].nodes("x-"))
     b.add_pressure(block.surface("z+"), ([0.0, slow, 2 * slow, 9.0], [0.0, 100.0, 0.0, 0.0]))
-    options = {"mu": ratio * slope, "stiffness": 10.0}
+    options = {"mu": ratio * slope, "stiffness": ("region", 10.0)}
     pair = b.add_contact(block.surface("x+"), wedges[0].surface("x-"), **options)
     b.add_contact(block.surface("x-"), wedges[1].surface("x+"), **options)
     sim = wf.Simulation(b.finalize(device="cpu"), dt=2e-3)
@@ -184,7 +184,7 @@ CELLS = {"cube": (2, 3), "plate": (1, 6)}
 @pytest.mark.parametrize("how", TURN)
 def test_what_falls_on_a_plate_comes_back(how, slave):
     """No restitution, friction or meshes make it stick or fail, and energy is only lost."""
-    sim, upper, _, pair = falling(how, speed=0.5, gap=1e-3, cells=CELLS[slave], stiffness=10.0)
+    sim, upper, _, pair = falling(how, speed=0.5, gap=1e-3, cells=CELLS[slave], stiffness=("region", 10.0))
     assert pair.slave.body.name == slave
     newton = [int(sim.step().newton[0]) for _ in range(130)]
     force, energies = sim.contact_record(pair).normal_force[0], sim.energies()
@@ -201,7 +201,9 @@ def test_what_falls_on_a_plate_comes_back(how, slave):
 @pytest.mark.parametrize("speed", [0.0, 0.2, -0.2])
 def test_coincident_start(how, speed):
     """Bodies that touch at the start rest, are pressed together, or part without a force."""
-    sim, upper, _, pair = falling(how, speed=speed, gap=0.0, stiffness=10.0, gravity=0.0 if speed < 0.0 else 9.81)
+    sim, upper, _, pair = falling(
+        how, speed=speed, gap=0.0, stiffness=("region", 10.0), gravity=0.0 if speed < 0.0 else 9.81
+    )
     sim.step(60)
     force = sim.contact_record(pair).normal_force[0]
     if speed < 0.0:
@@ -216,7 +218,7 @@ def test_coincident_start(how, speed):
 @pytest.mark.parametrize("dt", [1e-2, pytest.param(1e-3, marks=pytest.mark.slow)])
 def test_an_impact_beyond_the_law_is_refused(how, slave, dt):
     """100 m/s: the energy of 1 kg is 5 kJ, what the contact can store before its depth is reached is some joules."""
-    sim, upper, _, pair = falling(how, speed=100.0, gap=0.013, cells=CELLS[slave], dt=dt)
+    sim, upper, _, pair = falling(how, speed=100.0, gap=0.013, cells=CELLS[slave], dt=dt, stiffness="region")
     assert pair.slave.body.name == slave
     with pytest.raises(wf.PenetrationError, match=r"went through body .*take a larger stiffness="):
         sim.step(20)
@@ -257,7 +259,13 @@ def test_explicit_paper_law_on_a_random_sequence(first):
     faces = [bodies[0].surface("z-"), bodies[1].surface("z+")]
     sign = 1.0 if first == "upper" else -1.0
     pair = b.add_contact(
-        *faces[:: int(sign)], law="paper", treatment="explicit", mu=mu, restitution=e, stiffness=2.0, name="pair"
+        *faces[:: int(sign)],
+        law="paper",
+        treatment="explicit",
+        mu=mu,
+        restitution=e,
+        stiffness=("region", 2.0),
+        name="pair",
     )
     assert pair.slave.body is bodies[0]
     sim = wf.Simulation(b.finalize(device="cpu"), dt=h)

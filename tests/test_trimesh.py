@@ -42,7 +42,7 @@ def pressed(shape, down=0.004):
     law = wf.SVK(E=1e6, nu=0.3, density=1000)
     cube = b.add_solid(wf.mesh.box((SIDE,) * 3, cells=(3, 3, 3)), material=law, name="cube")
     b.drive(cube.nodes("z+"), displacement=(0, 0, -down))
-    b.add_contact(cube.surface("z-"), b.add_collider(shape), mu=0.2, stiffness=10.0, name="pad")
+    b.add_contact(cube.surface("z-"), b.add_collider(shape), mu=0.2, stiffness=("region", 10.0), name="pad")
     sim = wf.solve_static(b.finalize(device="cpu"), load_steps=2).simulation
     return sim.contact_record("pad").force[0, -1], sim.positions(cube)[0]
 
@@ -187,7 +187,7 @@ def test_an_impact_beyond_the_penalty_is_a_penetration_error():
     mesh = wf.mesh.box((SIDE,) * 3, cells=(2, 2, 2))
     cube = b.add_solid(mesh, material=wf.SVK(E=1e4, nu=0.3, density=1000), name="cube")
     b.set_initial(cube, velocity=(0, 0, -100.0))
-    b.add_contact(cube, b.add_collider(wf.TriMesh(*sheet(6, 0.5, -0.2)), name="sheet"), name="pad")
+    b.add_contact(cube, b.add_collider(wf.TriMesh(*sheet(6, 0.5, -0.2)), name="sheet"), stiffness="region", name="pad")
     sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-3)
     with pytest.raises(wf.PenetrationError, match=r"'pad': a point of body 'cube' .* went through collider 'sheet'"):
         sim.step(10)

@@ -78,7 +78,7 @@ def block(
         b.clamp(body.nodes("x-"), components="x")
     b.clamp(body.nodes("y-"), components="y")
     sphere = b.add_collider(wf.Sphere((0, 0, 1.0), 1.0), path=path, name="sphere")
-    pad = b.add_contact(body.surface("z+"), sphere, mu=mu, stiffness=stiffness, radius=A, name="pad")
+    pad = b.add_contact(body.surface("z+"), sphere, mu=mu, stiffness=("region", stiffness), radius=A, name="pad")
     return b, body, pad
 
 
@@ -237,7 +237,7 @@ def rebound_case(
     ball = b.add_solid(mesh, material=wf.SVK(E=BALL_E, nu=NU, density=DENSITY), name="ball")
     b.set_initial(ball, velocity=(0, 0, -THROWN))
     floor = b.add_collider(wf.HalfSpace((0, 0, 1), 0.0), name="floor")
-    pad = b.add_contact(ball, floor, restitution=1.0, stiffness=stiffness, radius=0.3 * RADIUS, name="pad")
+    pad = b.add_contact(ball, floor, restitution=1.0, stiffness=("region", stiffness), radius=0.3 * RADIUS, name="pad")
     model = b.finalize(device=device)
     dt = hertz_time() / steps
     sim = wf.Simulation(model, dt=dt, integrator=integrator)
@@ -334,7 +334,7 @@ def turntable_case(law: str, *, turns: int = 10, device: Any = "cpu") -> dict[st
     path = wf.Rotation(anchor=(centre, centre, 0), axis=(0, 0, 1), angle=(times, angle))
     plate = b.add_collider(wf.HalfSpace((0, 0, 1)), path=path, name="plate")
     body = _cube(b, "T4", 1e8, (0.2 * EDGE, 0.0, 0.0))
-    b.add_contact(body.surface("z-"), plate, mu=0.8, restitution=0.5, stiffness=0.1, law=law, name="pad")
+    b.add_contact(body.surface("z-"), plate, mu=0.8, restitution=0.5, stiffness=("region", 0.1), law=law, name="pad")
     sim = _simulation(b, dt, device)
     began = clock.perf_counter()
     sim.step(first)
@@ -370,7 +370,7 @@ def stack_case(
         bodies.append(b.add_solid(mesh, material=wf.SVK(E=E, nu=0.3, density=density), name=f"cube {k}"))
     b.clamp(bodies[0].nodes("z-"))
     pairs = [
-        b.add_contact(upper, lower, mu=0.5, restitution=0.5, stiffness=stiffness)
+        b.add_contact(upper, lower, mu=0.5, restitution=0.5, stiffness=("region", stiffness))
         for lower, upper in itertools.pairwise(bodies)
     ]
     sim = wf.Simulation(b.finalize(device=device), dt=dt)

@@ -105,7 +105,9 @@ def build(scene: str, cells: int, stiffness: float = 1.0) -> wf.ModelBuilder:
         b.add_contact(low, b.add_collider(wf.HalfSpace((0, 0, 1), -1.0)), mu=0.5)
     if scene in ("resting", "sliding"):
         mu = 0.5 if scene == "resting" else RUBBING
-        b.add_contact(low, b.add_collider(wf.HalfSpace((0, 0, 1), 0.0)), mu=mu, stiffness=stiffness)
+        b.add_contact(
+            low, b.add_collider(wf.HalfSpace((0, 0, 1), 0.0)), mu=mu, restitution=1.0, stiffness=("region", stiffness)
+        )
     if scene in MOVING:
         b.set_initial(block, velocity=(SPEED, 0.0, 0.0))
     return b

@@ -34,7 +34,7 @@ def pile(cells: int) -> wf.ModelBuilder:
         mesh = wf.mesh.box((SIDE,) * 3, cells=(cells,) * 3, element="T4", origin=low)
         cube = b.add_solid(mesh, material=law, name=f"cube {k}")
         other = b.add_collider(wf.HalfSpace((0, 0, 1), 0.0)) if below is None else below.surface("z+")
-        b.add_contact(cube.surface("z-"), other, mu=0.5, stiffness=STIFFNESS[cells])
+        b.add_contact(cube.surface("z-"), other, mu=0.5, restitution=1.0, stiffness=("region", STIFFNESS[cells]))
         below = cube
     return b
 

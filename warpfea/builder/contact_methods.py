@@ -38,7 +38,7 @@ class ContactMethods:
 
     def add_contact(
         self, surface: Body | SurfaceSet, collider: Collider | Any = None, *, mu: float = 0.0,
-        mu_static: float | None = None, restitution: float = 1.0, law: str = "default", treatment: str = "implicit",
+        mu_static: float | None = None, restitution: float = 0.0, law: str = "default", treatment: str = "implicit",
         stiffness: Any = None, model: str = "patch", radius: float | None = None, offset: float = 0.0,
         points: int | None = None, smoothing: Any = None, overlap: str = "auto", overlap_time: float = 0.1,
         seam: float | None = None, name: str | None = None,
@@ -53,9 +53,9 @@ class ContactMethods:
                 `IMPACT_SPEED`. Waves stay in the bodies.
             law: "default", "paper" (Paper I, Eqs. 72-83) or "smooth".
             treatment: "implicit", or "explicit" with the paper's law.
-            stiffness: factor on the normal and the tangential stiffness, None: 1, of the whole surface by Eqs. (74) and
-                (79): "region", or ("region", factor). "elements", or ("elements", factor), follows the elements that
-                touch: the contact yields by a tenth of what they do (`ELEMENT_STIFFNESS`), soft or stiff.
+            stiffness: factor on the normal and the tangential stiffness, None: 1. They follow the elements that touch,
+                so that the contact yields by a tenth of them (`ELEMENT_STIFFNESS`). "region", or ("region", factor), a
+                radius, model "sphere" and Paper I's laws take k_n and k_t of Eqs. (74), (79) for the whole surface.
             model: "patch", spread over the surface, or "sphere", one contact at the deepest place, by Hertz.
             radius: m; "patch": disc whose area replaces the surface's; "sphere": local radius of the body.
             offset: gap at which contact begins, m.

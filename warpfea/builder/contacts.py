@@ -254,15 +254,16 @@ def _number(
 
 def _stiffness(what: str, value: Any, may_follow: bool) -> tuple[str, float]:
     """`ContactOptions.stiffness_of`, and the factor."""
-    of, factor = value if isinstance(value, (tuple, list)) and len(value) == 2 else ("region", value)
+    of, factor = value if isinstance(value, (tuple, list)) and len(value) == 2 else (None, value)
     if isinstance(value, str):
         of, factor = value, None
     wanted = "a positive factor, None for 1, 'region' or 'elements', or (one of these, factor)"
-    if of not in ("region", "elements"):
+    if of not in (None, "region", "elements"):
         raise ModelError(f"{what}: stiffness = {value!r} must be {wanted}")
     if of == "elements" and not may_follow:
         raise ModelError(f"{what}: stiffness = {value!r} needs law = 'default', model = 'patch' and no radius")
-    return of, 1.0 if factor is None else _number(what, "stiffness", factor, wanted)
+    default = "elements" if may_follow else "region"
+    return of or default, 1.0 if factor is None else _number(what, "stiffness", factor, wanted)
 
 
 def _smoothing(what: str, law: str, value: Any) -> float | tuple[float, float] | None:

@@ -354,7 +354,9 @@ def extreme_friction(setting: Setting, mu: float) -> Answer:
 @case("contact-restitution", GROUP, values=(1e-3, 1.0), quick="float64")
 def extreme_restitution(setting: Setting, e: float) -> Answer:
     """A cube much stiffer than its contact lands flat at 1 m/s: no rebound at e = 0.001, no contact loss at e = 1."""
-    s = make_scene(FLOOR, E=1e9, gravity=(0, 0, 0), translation=(0, 0, 1e-3), mu=0.0, restitution=e, stiffness=1e-3)
+    s = make_scene(
+        FLOOR, E=1e9, gravity=(0, 0, 0), translation=(0, 0, 1e-3), mu=0.0, restitution=e, stiffness=("region", 1e-3)
+    )
     run = s.release(setting, 200, dt=1e-4, velocity=(0, 0, -1.0), mu=0.0)
     up, loss = float(center_velocity(run.sim, s)[2]), abs(float(run.sim.energies()["contact_loss"][0])) / (0.5 * s.mass)
     if e == 1.0:

@@ -68,7 +68,13 @@ def feature_contact(setting: Setting, which: str) -> Answer:
     change of its momentum is the impulse, and no energy is gained."""
     shape, rotation = FEATURES[which]
     s = make_scene(
-        shape(), E=1e6, rotation=rotation(), translation=(0, 0, 5e-4), mu=0.3, restitution=0.5, stiffness=10.0
+        shape(),
+        E=1e6,
+        rotation=rotation(),
+        translation=(0, 0, 5e-4),
+        mu=0.3,
+        restitution=0.5,
+        stiffness=("region", 10.0),
     )
     run = s.release(setting, 40, velocity=(0, 0, -1.0), mu=0.3)
     sunk = float(run.sim.contact_record(s.contacts[0]).penetration[0].max()) / SIDE
@@ -86,7 +92,7 @@ def exact_touch(setting: Setting, which: str) -> Answer:
         "same faces": wf.TriMesh(*cube.mesh()),
         "tip": wf.TriMesh(pyramid().points + (SIDE / 2, SIDE / 2, 0), pyramid().triangles),
     }
-    s = make_scene(shapes[which], mu=0.5, restitution=0.5, stiffness=100.0 if which == "tip" else 1.0)
+    s = make_scene(shapes[which], mu=0.5, restitution=0.5, stiffness=("region", 100.0 if which == "tip" else 1.0))
     run = s.release(setting, 50, mu=0.5)
     sunk = float(run.sim.contact_record(s.contacts[0]).penetration[0].max()) / SIDE
     shifted = float(np.abs(center_of_mass(run.sim, s.body)[:2] / SIDE - 0.5).max())

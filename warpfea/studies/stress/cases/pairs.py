@@ -68,7 +68,7 @@ def impact(setting: Setting, value: tuple[float, float]) -> Answer:
 def thin_shell(setting: Setting, speed: float) -> Answer:
     """A cube hits a shell of a hundredth of its side at 1 to 100 m/s, h = 1 ms: no penetration."""
     s = cube_on_plate(E=(1e6, 1e8), gravity=(0, 0, 0), position=(0, 0, 0.05), thickness=1e-3, shell=True, mu=0.3,
-                      restitution=0.5, stiffness=1e4)  # fmt: skip
+                      restitution=0.5, stiffness=("region", 1e4))  # fmt: skip
     run = s.release(setting, 60, velocity=(0, 0, -speed))
     return run.answer(setting, max(run.center_depth, 0.0), 0.0, "the centre stays before the shell")
 
