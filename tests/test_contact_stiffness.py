@@ -57,9 +57,12 @@ def test_the_stiffness_follows_the_parameters_of_a_world():
     assert second == pytest.approx(0.25 * first, rel=0.02)
 
 
-def test_other_stiffness_is_that_of_the_region():
-    depths = [mean_depth(*pressed(1e6, 2, None, stiffness=s)) for s in (None, "region", ("region", 4.0), 4.0)]
-    assert depths[0] == depths[1] > 3.0 * depths[2] == 3.0 * depths[3]
+def test_a_factor_is_of_the_elements_unless_the_region_is_named():
+    wanted = (None, "elements", 4.0, "region", ("region", 4.0))
+    depths = [mean_depth(*pressed(1e6, 2, None, stiffness=s)) for s in wanted]
+    assert depths[0] == depths[1] > 3.0 * depths[2]
+    assert depths[3] > 3.0 * depths[4]
+    assert depths[3] > 1.1 * depths[0]
 
 
 @wp.kernel(enable_backward=False)
