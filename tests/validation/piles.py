@@ -1,7 +1,8 @@
 """Time of a step of piles of ten cubes of T4 that fall on each other with friction, mu = 0.5, h = 10 ms.
 
 Cubes of 0.2 m, neo-Hookean, E = 1 MPa, nu = 0.4, 1000 kg/m^3, 10 mm apart, each 3 and 2 mm beside the one below, to a
-residual of 1e-6; in rows "-default" with default stiffness and restitution. ms: mean of the steps after the first; deepest: largest penetration at the end of a step, m.
+residual of 1e-6; in rows "-default" with default stiffness and restitution. ms: mean of the steps after the first;
+deepest: largest penetration at the end of a step, m.
 """
 
 from __future__ import annotations

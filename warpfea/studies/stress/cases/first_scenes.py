@@ -2,7 +2,8 @@
 
 A row is one of a covering array: every pair of values of body, other side, motion, E, step and integrator occurs. The
 other integrators than backward Euler, which dissipate little, have Kelvin-Voigt damping. Criteria: the contact at rest
-is at most 1 % of an element deep, the body is at rest within 2 s, and steps take at most 8 Newton iterations on average.
+is at most 1 % of an element deep, the body is at rest within 2 s, and steps take at most 8 Newton iterations on
+average.
 """
 
 import itertools
@@ -114,7 +115,7 @@ def first_scene(setting: Setting, row: tuple[str, str, str, float, float, str]) 
     side, support = add_support(b, other, kind, E, damped)
     drop = float(amount) if how == "drop" else 0.0
     body = add_body(b, kind, E, drop, "body", damped)
-    pad = b.add_contact(body, side, mu=0.3, name="pad")
+    b.add_contact(body, side, mu=0.3, name="pad")
     if how == "slide":
         b.set_initial(body, velocity=(float(amount), 0.0, 0.0))
     sim, stats = wf.Simulation(finalize(b, setting), dt=h, integrator=integrator), StepStats()
