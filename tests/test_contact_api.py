@@ -296,7 +296,7 @@ def slide(*, pads: int = 1) -> wf.ModelBuilder:
         mesh = wf.mesh.box((.1, .1, .1), cells=(1, 1, 1), origin=(.2 * k, 0, 0))
         cube = b.add_solid(mesh, material=wf.SVK(E=1e6, nu=.3, density=1000), name=f"cube{k}")
         b.set_initial(cube, velocity=(1, 0, -.1))
-        b.add_contact(cube, floor, mu=.5, restitution=.5, name=f"pad{k}")
+        b.add_contact(cube, floor, mu=.5, restitution=.5, stiffness="region", name=f"pad{k}")
     return b
 """
 

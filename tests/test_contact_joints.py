@@ -41,7 +41,7 @@ def test_a_hinged_bar_lies_with_half_its_weight_on_its_stop(device):
     bar = b.add_solid(wf.mesh.box((1, 0.1, 0.1), cells=(6, 1, 1)), material=STIFF, name="bar")
     b.add_joint("revolute", parent=wf.GROUND, child=bar.surface("x-"), axis=(0, 1, 0), name="hinge")
     stop = b.add_collider(wf.Sphere((1.0, 0.05, -0.05), 0.05), name="stop")
-    b.add_contact(bar.surface("z-"), stop, mu=0.3, restitution=0.2, name="pad")
+    b.add_contact(bar.surface("z-"), stop, mu=0.3, restitution=0.2, stiffness="region", name="pad")
     model = b.finalize(device=device)
     sim = wf.Simulation(model, dt=5e-3, solver=wf.NewtonPCG(tol=1e-10))
     sim.step(300)

@@ -54,7 +54,7 @@ SCENE = """
 import warpfea as wf
 
 @wf.scene(dt=1e-2, t_end=.02)
-def press(*, stiffness: float = 1.0) -> wf.ModelBuilder:
+def press(*, stiffness: float = 0.1) -> wf.ModelBuilder:
     '''A cube that is pressed onto a floor.'''
     b = wf.ModelBuilder()
     mesh = wf.mesh.box((.1, .1, .1), cells=(1, 1, 1))
@@ -75,7 +75,7 @@ def test_commands_warn_of_deep_contact(static, tmp_path, monkeypatch, capfd):
     pad = json.loads((tmp_path / "s.json").read_text())["contacts"]["pad"]
     assert pad["relative_penetration"] == pytest.approx(pad["penetration"] / 0.1)
     ratio = f"{pad['relative_penetration']:.2g}"
-    text = f"WARNING contact 'pad': penetration of up to {ratio} of its smallest element; take stiffness='elements' of"
+    text = f"WARNING contact 'pad': penetration of up to {ratio} of its smallest element; take a higher stiffness="
     assert text in out
     assert ("or a smaller dt" in out) != static
     assert main([*words, "--set", "stiffness=1000"]) == 0

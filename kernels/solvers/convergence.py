@@ -75,9 +75,12 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
         non-conservative forces at the start of the search) are slot_sums[ROW_OBJECTIVE], of `residual`; Psi_el and
         Psi_visc, J, are elem_sums[0] and [1], of `internal_force`; Psi_terms, J, is term_sums[0]: of constraints
         lambda.c + rho/2 c.c, of contact its potential, of other terms their own. With the trait
-        "midpoint" Phi does not exist: half of the squared D^-1 norm of the residual replaces it.
+        "midpoint" Phi does not exist: half of the squared D^-1 norm of the residual replaces it, infinite where
+        Psi_terms is: a point went through an obstacle.
         """
         if wp.static(traits.midpoint):
+            if wp.static(traits.stored):
+                return wp.where(wp.isfinite(ctl.term_sums[0, world]), ctl.slot_sums[ROW_OBJECTIVE, world], f64(wp.inf))
             return ctl.slot_sums[ROW_OBJECTIVE, world]
         energy = ctl.elem_sums[0, world] + ctl.elem_sums[1, world]
         if wp.static(traits.stored):

@@ -275,9 +275,7 @@ def _penetration_rows(contacts: dict[str, Any], *, static: bool) -> list[list[st
     """A warning for each contact that is deeper than `MAX_PENETRATION`, of many the deepest ones."""
     deep = {name: c["relative_penetration"] or 0.0 for name, c in contacts.items()}
     names = sorted((name for name in deep if deep[name] > MAX_PENETRATION), key=lambda name: -deep[name])
-    cure = "take stiffness='elements' of the contact, or a higher factor" + (
-        "" if static else ", or a smaller dt if it is deep in an impact"
-    )
+    cure = "take a higher stiffness=" + ("" if static else ", or a smaller dt if it is deep in an impact")
     return [["WARNING", f"contact {name!r}: penetration of up to {deep[name]:.2g} of its smallest element; {cure}"]
             for name in names[:SHOWN_ROWS]]  # fmt: skip
 

@@ -1,9 +1,9 @@
 """First scenes: a body dropped on, or sliding over, something else, with default options of contact.
 
-A row is one of a covering array: every pair of values of body, other side, motion, E, step and integrator occurs. The
-other integrators than backward Euler, which dissipate little, have Kelvin-Voigt damping. Criteria: the contact at rest
-is at most 1 % of an element deep, the body is at rest within 2 s, and steps take at most 8 Newton iterations on
-average.
+A row is one of a covering array: every pair of values of body, other side, motion, E, step and integrator occurs. Soft
+bodies and supports, and those with another integrator than backward Euler, have Kelvin-Voigt damping. Criteria: at rest
+the contact is at most 1 % of an element or 5 % of the elastic approach deep, the body is at rest within 2 s, and steps
+take at most 8 Newton iterations on average.
 """
 
 import itertools
@@ -28,8 +28,9 @@ OTHERS = ("floor", "plate", "shell-5mm", "shell-1mm", "mesh", "second")
 MOTIONS = (("drop", 0.1), ("drop", 0.5), ("slide", 0.5))
 MODULI, STEPS = (1e4, 1e6, 1e8, 2e11), (1e-3, 1e-2)
 INTEGRATORS = ("backward_euler", "bdf2", "generalized_alpha", "energy_momentum")
+STIFF = 1e6
+"""Young's modulus, Pa, from which backward Euler's own dissipation stops a body of this size in 2 s."""
 MAX_MEAN_NEWTON = 8.0
-MAX_ROWS = 60
 
 
 def covering(*axes: Sequence[Any]) -> list[tuple[Any, ...]]:
@@ -62,7 +63,7 @@ def add_body(b: wf.ModelBuilder, kind: str, E: float, height: float, name: str, 
     if kind == "cube":
         return b.add_solid(wf.mesh.box((SIZE,) * 3, cells=(2,) * 3, origin=origin), material=law, name=name)
     if kind == "ball":
-        mesh = wf.mesh.sphere(0.5 * SIZE, cells=3, center=(0, 0, height + 0.5 * SIZE))
+        mesh = wf.mesh.sphere(0.5 * SIZE, cells=4, center=(0, 0, height + 0.5 * SIZE))
         return b.add_solid(mesh, material=law, name=name)
     if kind == "bar":
         mesh = wf.mesh.box((2 * SIZE, 0.02, 0.02), cells=(8, 1, 1), origin=(-SIZE, -0.01, height))
@@ -89,7 +90,7 @@ def add_support(b: wf.ModelBuilder, other: str, body: str, E: float, damped: boo
     law = material(max(E, SUPPORT_MODULUS), damped)
     if other == "second":
         depth = {"cube": SIZE, "ball": SIZE, "bar": 0.02, "shell": 0.005, "beam": 0.01}[body]
-        support = add_body(b, body, E, -depth, "support", damped)
+        support = add_body(b, body, max(E, SUPPORT_MODULUS), -depth, "support", damped)
         b.clamp(support.nodes(lambda X: np.abs(X[:, 0]) > 0.9 * SIZE) if body in ("bar", "shell", "beam")
                 else support.nodes(lambda X: X[:, 2] < -0.8 * SIZE))  # fmt: skip
         return support, support
@@ -111,11 +112,11 @@ def first_scene(setting: Setting, row: tuple[str, str, str, float, float, str]) 
     kind, other, motion, E, h, integrator = row
     how, amount = motion.split("-")
     b = wf.ModelBuilder(gravity=GRAVITY_VECTOR)
-    damped = integrator != "backward_euler"
+    damped = integrator != "backward_euler" or E < STIFF or other.startswith("shell")
     side, support = add_support(b, other, kind, E, damped)
     drop = float(amount) if how == "drop" else 0.0
     body = add_body(b, kind, E, drop, "body", damped)
-    b.add_contact(body, side, mu=0.3, name="pad")
+    pad = b.add_contact(body, side, mu=0.3, name="pad")
     if how == "slide":
         b.set_initial(body, velocity=(float(amount), 0.0, 0.0))
     sim, stats = wf.Simulation(finalize(b, setting), dt=h, integrator=integrator), StepStats()
@@ -134,5 +135,9 @@ def first_scene(setting: Setting, row: tuple[str, str, str, float, float, str]) 
         "kinetic energy at rest": (float(np.mean(kinetic)) / scale, 1e-6),
         "centre past the other side": (fell - drop, 0.5 * SIZE if support is None else WIDTH),
     }
-    return stats.answer(float(sim.last.penetration.max()), 0.01, "1 % of an element", lowest_J=None, limits=limits,
-                        note=f"at most {100 * depth:.2g} % on the way")  # fmt: skip
+    allowed = max(0.01 * sim.records.element_size(pad), 0.05 * (fell - drop))
+    at_rest = float(sim.contact_record(pad).penetration[0, -1])
+    return stats.answer(
+        at_rest / allowed, 1.0, "1 % of an element, or 5 % of the elastic approach", lowest_J=None, limits=limits,
+        note=f"at most {100 * depth:.2g} % of an element deep on the way",
+    )  # fmt: skip
