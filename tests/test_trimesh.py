@@ -187,8 +187,8 @@ def test_an_impact_beyond_the_penalty_is_a_penetration_error():
     mesh = wf.mesh.box((SIDE,) * 3, cells=(2, 2, 2))
     cube = b.add_solid(mesh, material=wf.SVK(E=1e4, nu=0.3, density=1000), name="cube")
     b.set_initial(cube, velocity=(0, 0, -100.0))
-    b.add_contact(cube, b.add_collider(wf.TriMesh(*sheet(6, 0.5, -0.2)), name="sheet"), restitution=1.0, stiffness="region",
-                  name="pad")  # fmt: skip
+    b.add_contact(cube, b.add_collider(wf.TriMesh(*sheet(6, 0.5, -0.2)), name="sheet"), restitution=1.0,
+                  stiffness="region", name="pad")  # fmt: skip
     sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-3)
     with pytest.raises(wf.PenetrationError, match=r"'pad': a point of body 'cube' .* went through collider 'sheet'"):
         sim.step(10)
