@@ -171,7 +171,8 @@ def _round(shape: Shape, side: float, width: float) -> list[Patches]:
     ends = [] if shape.kind == CYLINDER else _ball(radius, half, width, _parts(0.5 * math.pi, angle))
     if shape.kind == SPHERE:
         return ends
-    turns = np.linspace(0.0, 2.0 * math.pi, _parts(2.0 * math.pi, angle) + 1)
+    count = 4 * _parts(0.5 * math.pi, angle)  # as symmetric as bodies may be, without a point on their middle
+    turns = 2.0 * math.pi * (np.arange(count + 1) - 0.5) / count
 
     def mantle(s: np.ndarray, t: np.ndarray) -> Any:
         n = np.stack([np.cos(s), np.sin(s), np.zeros(len(s))], axis=1)
