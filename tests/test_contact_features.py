@@ -112,3 +112,24 @@ def test_the_sides_of_a_rail_under_the_end_of_a_plate_do_not_press_on_it():
         force = sim.contact_record(pad).force[0]
         assert np.abs(force[:, 0]).max() < 3.0 < force[:, 2].max()
     assert abs(sim.energies()["ledger_residual"][0]) < 1e-7
+
+
+@pytest.mark.parametrize(
+    ("kind", "size", "obstacle"),
+    [
+        ("shell", 0.2, wf.Capsule((0.03, -0.5, -0.005), (0.03, 0.5, -0.005), 0.004)),
+        ("T10", 0.4, wf.Sphere((0.07, 0.03, -0.011), 0.01)),
+        ("shell", 0.1, wf.Sphere((0.07, 0.03, -0.051), 0.05)),
+    ],
+)
+def test_a_plate_does_not_pass_a_capsule_or_a_ball(kind, size, obstacle):
+    b = wf.ModelBuilder(gravity=(0, 0, -G))
+    body = plate(b, kind, size)
+    b.set_initial(body, velocity=(0, 0, -0.5))
+    pad = b.add_contact(body, b.add_collider(obstacle))
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=2e-3)
+    sim.step(25)
+    record = sim.contact_record(pad)
+    assert 2e-3 * record.force[0, :, 2].sum() > 0.5 * 8.0 * (0.5 + 0.05 * G)  # half of the momentum
+    assert record.penetration.max() < 2e-4
+    assert abs(sim.energies()["ledger_residual"][0]) < 1e-6
