@@ -21,7 +21,7 @@ from .triangle_mesh import TriMesh
 
 __all__ = ["ObstacleContact", "is_narrow", "obstacle_points"]
 
-NARROW_RATIO = 0.75
+NARROW_RATIO = 0.55
 """Width of an obstacle over the side of a body's facets up to which its points see the facets, not theirs it."""
 TALL_RATIO = 2.0
 """Height of a rail or wall over that side up to which all of it has points."""
@@ -29,7 +29,7 @@ SAGITTA_RATIO = 0.0025
 """Height of a curved obstacle between two of its points, over the smaller of the side and the depth of an element."""
 WIDEST_GAP = 0.45
 """Largest distance of points of a patch, over its side."""
-PATCH_ANGLES = math.radians(15.0), math.radians(45.0)
+PATCH_ANGLES = math.radians(10.0), math.radians(45.0)
 """Least and largest angle of a patch of a round obstacle."""
 MAX_PATCHES = 64
 """Largest number of patches along an edge of an obstacle."""
@@ -59,6 +59,7 @@ class ObstacleContact(FacetOptions):
 
     @property
     def points_of(self) -> str:
+        """As of `FacetOptions`."""
         return f"collider {self.collider.name!r}"
 
     def __repr__(self) -> str:

@@ -91,10 +91,12 @@ class PairContact(FacetOptions):
 
     @property
     def sign(self) -> float:
+        """As of `FacetOptions`."""
         return 1.0 if self.slave is self.first else -1.0
 
     @property
     def points_of(self) -> str:
+        """As of `FacetOptions`."""
         return f"body {self.slave.body.name!r}"
 
     def __repr__(self) -> str:
