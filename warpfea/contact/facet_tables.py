@@ -40,8 +40,7 @@ TOUCH = 1e-9
 def slave_points(contact: FacetOptions) -> tuple[ContactPoints, Any]:
     """Points of a contact, and the factor on their stiffness by area."""
     if isinstance(contact, ObstacleContact):
-        points, factor = obstacle_points(contact)
-        return points, factor if contact.stiffness_of == "elements" else 1.0
+        return obstacle_points(contact)
     return pair_points(contact.surfaces[0], contact.points), 1.0
 
 

@@ -25,7 +25,7 @@ NARROW_RATIO = 0.55
 """Width of an obstacle over the side of a body's facets up to which its points see the facets, not theirs it."""
 TALL_RATIO = 2.0
 """Height of a rail or wall over that side up to which all of it has points."""
-SAGITTA_RATIO = 0.0025
+SAGITTA_RATIO = 0.001
 """Height of a curved obstacle between two of its points, over the smaller of the side and the depth of an element."""
 WIDEST_GAP = 0.45
 """Largest distance of points of a patch, over its side."""
