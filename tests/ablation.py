@@ -100,14 +100,12 @@ CONSTANTS: dict[str, Constant] = {
     "STALL_ENERGY_ROUNDINGS": Constant(NEWTON_PCG, "eps", 0.0),
     "NOISE_DOMINATED_ROUNDINGS": Constant(NEWTON_PCG, "roundings of the positions", 0.0),
     "VELOCITY_ROUNDINGS": Constant(NEWTON_PCG, "roundings of the velocities", 0.0),
-    "STRAIN_ENERGY_FRACTION": Constant(NEWTON_PCG, "1", 0.0),
     "GROUP_ROUNDINGS": Constant(NEWTON_PCG, "roundings of the positions", 0.0),
     "MAX_REUSED_BACKTRACKS": Constant(NEWTON_PCG, "halvings", 20),
     "RADIUS_SHRINK": Constant(NEWTON_PCG, "1", 1.0),
     "MAX_TRUST_RADIUS": Constant(NEWTON_PCG, "1", 1.0e300),
     "SOLVES_WITHOUT_STEP": Constant(NEWTON_PCG, "solves", 1000000),
     "DISPLACEMENT_ROUNDINGS": Constant(NEWTON_PCG, "roundings of the displacements", 0.0),
-    "ALTERNATIVE_START_FORCING": Constant(NEWTON_PCG, "1", 1.0e-3),
     "MAX_START_ENERGY_RATIO": Constant(NEWTON_PCG, "kinetic energies", 1.0),
     "CONSTRAINT_FORCING": Constant(NEWTON_PCG, "1", 1.0),
     "UNCHECKED_ITERATIONS": Constant(NEWTON_PCG, "iterations", 0),
@@ -123,8 +121,6 @@ CONSTANTS: dict[str, Constant] = {
     "REDUCTION_FADING": Constant(REUSE, "1", 1.0),
     "REUSED_FORCING_FACTOR": Constant(REUSE, "1", 1.0),
     "ORDER_MARGIN": Constant(ADAPTIVE, "1", 1.0),
-    "PREDICTOR_ROUNDINGS": Constant(ADAPTIVE, "roundings of the velocity", 0.0),
-    "MAX_EXTRAPOLATED_GROWTH": Constant(ADAPTIVE, "1", 1.0e300),
     "STARTUP_STEPS": Constant(ADAPTIVE, "steps", 0.0),
     "SLOW_REDUCTION": Constant(CONTACT, "1", 1.0e300, "contact"),
     "MIN_APPROACH_SPEED": Constant(CONTACT, "m/s", 1.0e-30, "contact"),
@@ -133,11 +129,14 @@ CONSTANTS: dict[str, Constant] = {
     "OPPOSING_COSINE": Constant(CONTACT, "1", 2.0, "contact"),
     "MAX_DEPTH_RATIO": Constant(CONTACT, "deepest penetration", 1.0e300, "contact"),
     "MAX_EDGE_TANGENT": Constant(CONTACT, "1", 0.0, "contact"),
-    "TANGENT_PLANE_MARGIN": Constant(CONTACT, "facets", 1.0e300, "contact"),
     "OUTSIDE_TOLERANCE": Constant(CONTACT, "facets", 1.0e-9, "contact"),
-    "MAX_OVERHANG": Constant(CONTACT, "facets", 0.0, "contact"),
     "MASTER_SIZE_RATIO": Constant(CONTACT, "1", 1.0e300, "contact"),
     "MAX_CORNER_LENGTH": Constant(CONTACT, "facets", 0.0, "contact"),
+    "ELEMENT_STIFFNESS": Constant(CONTACT, "stiffnesses of the elements", 1.0, "contact"),
+    "ALIKE": Constant(CONTACT, "depths of elements", 1.000001, "contact"),
+    "SEAM_RATIO": Constant(CONTACT, "widths of the surface", 0.0, "contact"),
+    "REACH_RATIO": Constant(CONTACT, "widths of the surface", 0.0, "contact"),
+    "DEPTH_RATIO": Constant(CONTACT, "widths of the surface", 0.0, "contact"),
 }
 """Tuned constants by name, unique among the sources."""
 
@@ -179,7 +178,7 @@ def disabled(variant: str, root: pathlib.Path) -> None:
 def _tree(variant: str, folder: pathlib.Path) -> pathlib.Path:
     """A copy of the sources as a variant."""
     out = folder / str(len([*folder.iterdir()]))
-    skipped = shutil.ignore_patterns("__pycache__", "results")
+    skipped = shutil.ignore_patterns("__pycache__")
     for name in COPIED:
         shutil.copytree(ROOT / name, out / name, ignore=skipped)
     for name in ("pyproject.toml", "README.md"):
@@ -324,12 +323,9 @@ def study(options: argparse.Namespace, done: Sequence[Row]) -> Iterator[Row]:
         running = {variant: submit(variant) for variant in chosen}
         for variant, tasks in running.items():
             rows = [row for task in tasks for row in task.result()]
-            label: Row = {
-                "variant": variant,
-                "area": areas[variant],
-                "of": of,
-                "suite": options.suite,
-            }
+            label: Row = {"variant": variant, "area": areas[variant], "of": of, "suite": options.suite}
+            if options.case:
+                label["cases"] = " ".join(options.case)
             if variant in CONSTANTS:
                 constant = CONSTANTS[variant]
                 value = constant_file(variant)[1]
@@ -340,7 +336,7 @@ def study(options: argparse.Namespace, done: Sequence[Row]) -> Iterator[Row]:
 def tables(rows: Sequence[Row]) -> str:
     """Markdown: mechanisms, then constants by area, each with its value, unit, and a row that is lost without it; last
     those that are no longer there."""
-    found = [row for row in rows if row["lost"] or row["of"] in ("stress", "piles", "scenes")]
+    found = [row for row in rows if row["lost"] or row["of"] in ("stress", "piles", "scenes", "random")]
     found.sort(key=lambda row: (bool(row["lost"]), "rises" in row, row["of"] != "scenes"))
     shown = {row["variant"]: row for row in found}
     gone = {*shown} - {*MECHANISMS, *CONSTANTS, *(name for name in shown if "+" in name)}
@@ -368,7 +364,8 @@ def reason(row: Row) -> str:
         (first, ratio), more = next(iter(row["rises"].items())), len(row["rises"]) - 1
         scene, count = first.split(" ")
         return f"{scene}: {ratio:.2f} times the {COUNTS[count]}" + (f", and {more} more" if more else "")
-    return f"{row['newton']:.2f} times the Newton, {row['pcg']:.2f} times the PCG iterations"
+    part = f"{row['cases']}: " if row.get("cases") else ""
+    return f"{part}{row['newton']:.2f} times the Newton, {row['pcg']:.2f} times the PCG iterations"
 
 
 def main() -> None:

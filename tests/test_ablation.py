@@ -56,25 +56,7 @@ def test_mechanisms_are_needed(name):
     assert is_needed(name)
 
 
-UNPROVEN = {
-    "PREDICTOR_ROUNDINGS": "for runs of a million steps, which ablations leave out",
-    "MAX_EXTRAPOLATED_GROWTH": "for the same",
-    **dict.fromkeys(("OPPOSING_COSINE", "MAX_DEPTH_RATIO", "MAX_OVERHANG", "TANGENT_PLANE_MARGIN"),
-                    "the search of facets is to be written again"),
-    **dict.fromkeys(("VELOCITY_ROUNDINGS", "STRAIN_ENERGY_FRACTION", "SCATTER_FACTOR", "ALTERNATIVE_START_FORCING",
-                     "SOLVES_WITHOUT_STEP", "MAX_STALLED_ITERATIONS"),
-                    "of single extreme cases; the whole stress suite and slow tests were not run without"),
-}  # fmt: skip
-"""Constants that no quick row, fast test or pair of bodies has lost anything without, and why they are still there."""
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=pytest.mark.xfail(reason=UNPROVEN[name], strict=True) if name in UNPROVEN else ())
-        for name in CONSTANTS
-    ],
-)
+@pytest.mark.parametrize("name", CONSTANTS)
 def test_constants_are_needed(name):
     assert is_needed(name)
 

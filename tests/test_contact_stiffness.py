@@ -50,6 +50,22 @@ def test_the_depth_is_a_tenth_of_the_compression_of_the_elements(E, other):
     assert mean_depth(model, pad) == pytest.approx(wanted, rel=0.02)  # the pressure is uneven at the borders
 
 
+def test_a_uniform_pressure_stays_uniform_over_elements_of_unlike_depth():
+    """Their depths differ by less than four times, so they share a stiffness."""
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+
+    def leaning(X):
+        return np.column_stack([X[:, :2], X[:, 2] * (1.0 + 8.0 * X[:, 0] * (1.0 - X[:, 2] / SIDE))])
+
+    mesh = wf.mesh.box((SIDE,) * 3, cells=(3, 1, 2), map=leaning)
+    body = b.add_solid(mesh, material=wf.SVK(E=1e6, nu=NU, density=1000.0))
+    b.add_traction(body.surface("z+"), (0, 0, -1e3))
+    pad = b.add_contact(body.surface("z-"), b.add_collider(wf.HalfSpace((0, 0, 1))), stiffness="elements")
+    r = wf.solve_static(b.finalize(device="cpu"), stabilise=True).contact_record(pad)
+    mean = 2.0 * r.stored[0, -1] / r.normal_force[0, -1]
+    assert r.penetration[0, -1] == pytest.approx(mean, rel=1e-3)
+
+
 def test_the_stiffness_follows_the_parameters_of_a_world():
     model, pad = pressed(1e6, 1, None, worlds=2)
     model.set_parameter("block.E", [1e6, 4e6])

@@ -9,10 +9,10 @@ from ..common.types import f64, vec3d
 from .broad_phase import broad_phase_kernels
 from .facet_structs import master_struct, pair_scratch_struct
 from .kinematics import kinematics_functions
-from .projection import MAX_OVERHANG, OUTSIDE_TOLERANCE, facet_projection_functions
+from .projection import OUTSIDE_TOLERANCE, facet_projection_functions
 from .structs import contact_structs
 
-__all__ = ["TUNNEL_LIMIT_RATIO", "facet_candidate_functions"]
+__all__ = ["facet_candidate_functions"]
 
 MIN_NORMAL_COSINE = 0.1
 """Minimum cosine of the normals of two facets that a point in contact passes between: excludes the edge of a box."""
@@ -25,8 +25,6 @@ MAX_DEPTH_RATIO = 2.0
 """Largest depth of a point that enters from beside a facet, over the deepest active penetration."""
 MAX_EDGE_TANGENT = 2.0
 """Maximum tangent of the angle between an outward vector and the normal of its facet, at the edge of a box."""
-TANGENT_PLANE_MARGIN = 0.5
-"""Parametric margin for rejecting a facet by the tangent plane at its centre."""
 
 
 @functools.cache
@@ -36,10 +34,10 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
     Masters, PairScratch = master_struct(dtype), pair_scratch_struct(dtype)
     k, f = kinematics_functions(dtype), facet_projection_functions(dtype)
     (
-        surface_point, displacement_change, local_components, distance_outside, facet_centre, inverse_map, track_point,
+        surface_point, displacement_change, distance_outside, facet_centre, inverse_map, track_point,
         unit_normal,
     ) = (
-        f.surface_point, f.displacement_change, f.local_components, f.distance_outside, f.facet_centre, f.inverse_map,
+        f.surface_point, f.displacement_change, f.distance_outside, f.facet_centre, f.inverse_map,
         f.track_point, f.unit_normal,
     )  # fmt: skip
     boxes = broad_phase_kernels(dtype)
@@ -114,7 +112,7 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
         return out
 
     @wp.func
-    def anchor_candidate(mas: Masters, his: History, pair: PairScratch, slave: SlavePoint) -> FacetCandidate:
+    def anchor_candidate(mas: Masters, pair: PairScratch, slave: SlavePoint) -> FacetCandidate:
         """The anchor facet, with the coordinates that the point's motion leads to; none if the point has left it."""
         world = slave.world
         out = FacetCandidate(
@@ -130,9 +128,7 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
                 found = inverse_map(mas, pair.displacement, world, f, slave.position, facet_centre(corners))
             xi = vec3d(found[0], found[1], found[2])
             o = distance_outside(corners, xi)
-            if found[3] != f64(0.0) and (
-                o <= out.outside_distance or (o <= f64(MAX_OVERHANG) and his.speed[world, slave.point] > f64(0.0))
-            ):
+            if found[3] != f64(0.0) and o <= out.outside_distance:
                 out = FacetCandidate(f, xi, o, o, wp.abs(xi[2]), -1, False, False, False)
         return out
 
@@ -158,22 +154,11 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
         return there[3] != f64(0.0) and distance_outside(mas.corner_count[kind], xi) == f64(0.0)
 
     @wp.func
-    def is_far(mas: Masters, pair: PairScratch, slave: SlavePoint, f: int) -> bool:
-        """True if a point is above a facet by more than twice `height_limit`, or moved little and is beside it, by
-        the tangent plane at its centre."""
-        corners = mas.corner_count[mas.facet_kind[f]]
+    def is_far(pair: PairScratch, slave: SlavePoint, f: int) -> bool:
+        """True if a point is above a facet by more than twice `height_limit`."""
         s = boxes.unpack_facet_point(pair.facet_centre[slave.world, f])
-        if (
-            wp.dot(slave.position - s.position, unit_normal(s))
-            > f64(2.0) * slave.height_limit + pair.bulge[slave.world, f]
-        ):
-            return True
-        if distance_outside(corners, facet_centre(corners) + local_components(s, slave.position - s.position)) <= f64(
-            TANGENT_PLANE_MARGIN
-        ):
-            return False
-        path = slave.position - slave.start_position - (s.position - pair.start_facet_centre[slave.world, f][0])
-        return wp.length(path) <= f64(0.5) * mas.depth_limit[f]
+        height = wp.dot(slave.position - s.position, unit_normal(s))
+        return height > f64(2.0) * slave.height_limit + pair.bulge[slave.world, f]
 
     @wp.func
     def in_front(mas: Masters, pair: PairScratch, slave: SlavePoint, f: int) -> bool:
@@ -347,7 +332,7 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
         index = wp.int32(0)
         while wp.bvh_query_next(query, index):
             f = index - world * mas.facet_count
-            if is_far(mas, pair, slave, f):
+            if is_far(pair, slave, f):
                 continue
             if free and wp.length_sq(slave.facing_normal) == f64(0.0):
                 slave.facing_normal = inward_normal(facets, scr, slave, corners)

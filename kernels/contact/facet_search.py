@@ -12,7 +12,7 @@ from ..common.modules import SHORT_UNROLL, KernelSet, kernel_module, kernel_set,
 from ..common.types import f64, precision, vec3d
 from .broad_phase import BOX_MARGIN, broad_phase_kernels
 from .collider_kinematics import MIN_APPROACH_SPEED
-from .facet_candidates import TUNNEL_LIMIT_RATIO, facet_candidate_functions
+from .facet_candidates import facet_candidate_functions
 from .facet_structs import master_struct, pair_history_struct, pair_scratch_struct
 from .kinematics import kinematics_functions
 from .law import FIXED_SPRING
@@ -220,15 +220,12 @@ def facet_search_kernels(dtype: str) -> KernelSet:
         if his.speed[world, point] <= f64(0.0) and pair.in_reach[world, facets.first_row + item] == 0:
             return
         slave = slave_point_at(con, mas, facets, his, clock, scr, pair, u, world, item, q, overlap_limit)
-        candidate = candidates.anchor_candidate(mas, his, pair, slave)
-        if candidate.facet < 0 or candidate.outside_distance > f64(OUTSIDE_TOLERANCE):
+        candidate = candidates.anchor_candidate(mas, pair, slave)
+        if candidate.facet < 0:
             candidate = candidates.search_facets(mas, facets, scr, pair, slave, candidate, corner_points[item])
         if candidate.facet >= 0:
             set_contact(con, mas, facets, his, clock, scr, pair, v_n, slave, candidate.facet, candidate.xi)
-            most = mas.depth_limit[candidate.facet] * wp.where(
-                candidate.outside_distance > f64(OUTSIDE_TOLERANCE), f64(TUNNEL_LIMIT_RATIO), f64(1.0)
-            )
-            if pair.depth[world, point] > most:
+            if pair.depth[world, point] > mas.depth_limit[candidate.facet]:
                 pair.facet[world, point] = PENETRATED
         elif candidate.passed_through:
             pair.facet[world, point] = PENETRATED

@@ -12,7 +12,7 @@ from ..common.modules import KernelSet, kernel_set
 from ..common.types import f64, vec3d
 from .facet_structs import facet_field_struct, master_struct
 
-__all__ = ["INSIDE_TOLERANCE", "MAX_OVERHANG", "OUTSIDE_TOLERANCE", "facet_projection_functions"]
+__all__ = ["INSIDE_TOLERANCE", "OUTSIDE_TOLERANCE", "facet_projection_functions"]
 
 MAX_NEWTON_STEPS = 16
 """Maximum number of Newton steps for the facet coordinates."""
@@ -25,9 +25,6 @@ INSIDE_TOLERANCE = 1e-9
 """Distance over a side within which a point counts as inside of its facet: round-off of Newton's method."""
 QUADRATIC_STEP = 1e-8
 """Step size below which Newton's method stops: the remaining error is its square."""
-MAX_OVERHANG = 0.5
-"""Distance over a side beyond the surface's boundary up to which a point keeps contact in an attempt: it leaves between
-steps, since a force that ends at an iterate has no potential."""
 
 
 @functools.cache

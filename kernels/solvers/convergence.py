@@ -16,7 +16,6 @@ from .newton_control import (
     FAIL_NAN,
     FAIL_ROUNDOFF,
     GROUP_ROUNDOFF,
-    GROUP_STRAIN_ENERGY,
     ROW_FORCE,
     ROW_INERTIA,
     ROW_INTERNAL,
@@ -29,7 +28,7 @@ from .newton_control import (
     control_struct,
 )
 
-__all__ = ["MAX_ERROR_ESTIMATES", "SINGLE_PRECISION_EPS", "VELOCITY_ROUNDINGS", "convergence_functions"]
+__all__ = ["MAX_ERROR_ESTIMATES", "SINGLE_PRECISION_EPS", "convergence_functions"]
 
 EXTRAPOLATED_TOL_FACTOR, UNSOLVED_TOL_FACTOR = 1.0e-3, 0.1
 """Fractions of the tolerance that a first iterate must meet: extrapolated; in float32 with parts of unlike stiffness.
@@ -52,9 +51,7 @@ NOISE_DOMINATED_ROUNDINGS = 32.0
 SINGLE_PRECISION_EPS = 1.0e-10
 """Round-off unit above which the precision is single."""
 VELOCITY_ROUNDINGS = 1.0e4
-"""Roundings of a body's speed below which, in double precision, a velocity error is negligible."""
-STRAIN_ENERGY_FRACTION = 1.0e-6
-"""Fraction of twice the strain energy in the squared scale of a residual group."""
+"""Roundings of the velocities below which, in double precision, a change is their round-off."""
 GROUP_ROUNDINGS = 8.0
 """Roundings of the positions below which, in double precision, the residual of one group of several is negligible."""
 MAX_ERROR_ESTIMATES = 3
@@ -63,7 +60,7 @@ MAX_ERROR_ESTIMATES = 3
 
 @functools.cache
 def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
-    """Device functions; traits used: "stored", "has_constraints", "midpoint" and "unilateral"."""
+    """Device functions; traits used: "stored", "has_constraints" and "midpoint"."""
     Control = control_struct()
 
     @wp.func
@@ -120,11 +117,7 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
 
     @wp.func
     def squared_group_norms(ctl: Control, world: int, group: int):
-        """Squared norms of g, of the largest forces, and of the position round-off, of a residual group.
-
-        A small fraction of the strain energy is included as reactions: a group between others may carry no load of its
-        own.
-        """
+        """Squared norms of g, of the largest forces, and of the position round-off, of a residual group."""
         if ctl.norms.group_count == 1:
             f2 = wp.max(
                 ctl.slot_sums[ROW_INTERNAL, world],
@@ -135,15 +128,9 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
             ctl.norms.group_sums[ROW_INTERNAL, world, group],
             wp.max(ctl.norms.group_sums[ROW_LOADS, world, group], ctl.norms.group_sums[ROW_INERTIA, world, group]),
         )
-        stress = (
-            f64(2.0)
-            * f64(STRAIN_ENERGY_FRACTION)
-            * wp.abs(ctl.norms.group_sums[GROUP_STRAIN_ENERGY, world, group])
-            / ctl.dq_dv[world]
-        )
         return wp.vec3d(
             ctl.norms.group_sums[ROW_RESIDUAL, world, group],
-            wp.max(f2, stress),
+            f2,
             ctl.norms.group_sums[GROUP_ROUNDOFF, world, group],
         )
 
@@ -308,8 +295,8 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
 
     @wp.func
     def is_velocity_roundoff(ctl: Control, world: int) -> bool:
-        """True in float64 if the last step changes velocities by their round-off: gaps of moving bodies have the
-        round-off of their positions, and no other force may act."""
+        """True in float64 if the last step changes velocities by their round-off: what a moving body vibrates by, or
+        the forces of its gaps, may be no more than the round-off of its positions."""
         fine = f64(VELOCITY_ROUNDINGS) * ctl.floor.eps
         step = wp.abs(ctl.search.slope[world])
         return ctl.floor.eps < f64(SINGLE_PRECISION_EPS) and step <= fine * fine * ctl.slot_sums[ROW_KINETIC, world]
@@ -330,10 +317,9 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
         if wp.static(not traits.midpoint):  # g.p: no energy
             if not near and ctl.floor.rounding_ratio[world] < f64(1.0e300):
                 near = step <= alike * alike * energy
-        if wp.static(traits.unilateral):
-            if is_velocity_roundoff(ctl, world):
-                near = True
-                settling = True
+        if is_velocity_roundoff(ctl, world):
+            near = True
+            settling = True
         near = near and ctl.floor.estimates[world] < MAX_ERROR_ESTIMATES
         still = ctl.norms.residual_reduction[world] > f64(STALL_RATIO) and ctl.solve.operator_reused[world] == 0
         if ctl.norms.ratio[world] <= f64(1.0):
@@ -346,9 +332,7 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
     @wp.func
     def handle_failed_search(ctl: Control, world: int, why: int):
         """Failed search: if round-off may explain it, keep the iterate and request an error estimate, else give up."""
-        at_roundoff = ctl.floor.rounding_ratio[world] <= f64(STALL_ROUNDINGS)
-        if wp.static(traits.unilateral):
-            at_roundoff = at_roundoff or is_velocity_roundoff(ctl, world)
+        at_roundoff = ctl.floor.rounding_ratio[world] <= f64(STALL_ROUNDINGS) or is_velocity_roundoff(ctl, world)
         near = at_roundoff and ctl.floor.estimates[world] < MAX_ERROR_ESTIMATES
         at_roundoff = at_roundoff or ctl.floor.eps > f64(SINGLE_PRECISION_EPS)
         enough = False

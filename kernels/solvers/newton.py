@@ -8,7 +8,7 @@ from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.traits import NO_TERMS, Traits
 from ..common.types import f64, int_1d
 from .augmented_lagrangian import outer_loop_kernels
-from .convergence import MAX_ERROR_ESTIMATES, SINGLE_PRECISION_EPS, VELOCITY_ROUNDINGS, convergence_functions
+from .convergence import MAX_ERROR_ESTIMATES, SINGLE_PRECISION_EPS, convergence_functions
 from .frozen_update import frozen_update_kernels
 from .line_search import MAX_TRUST_RADIUS, PHI_NOISE_ROUNDINGS, line_search_kernels
 from .newton_control import (
@@ -33,8 +33,6 @@ MAX_SOLVES_PER_ITERATION = 3
 """Maximum linear solves of an attempt per allowed iteration: bounds solves without a step."""
 DISPLACEMENT_ROUNDINGS = 64.0
 """Roundings of the displacements below which an error is negligible, whatever the reference energy."""
-ALTERNATIVE_START_FORCING = 0.1
-"""Forcing term of the first solve after an alternative first iterate, far from the end: a tighter one is wasted."""
 MAX_START_ENERGY_RATIO = 3.0
 """Strain energy increase of a first iterate, in kinetic energies, above which other first iterates are tried."""
 
@@ -130,8 +128,6 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
                 wp.atomic_max(ctl.any_rare_branch, 0, 1)
                 return
         initialise_iteration(ctl, world)
-        if stage == 2 and ctl.solve.fixed_forcing == 0:
-            ctl.solve.forcing[world] = f64(ALTERNATIVE_START_FORCING)
 
     @wp.kernel(module=module)
     def compare_first_iterates(ctl: Control, first: int, better: int_1d):
@@ -191,13 +187,12 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
         `whole`: -g.p of all parts, W; `largest`: the largest length in the round-off bound, m.
         """
         dq = ctl.dq_dv[world]
-        work, kinetic, strain, step, speed = f64(0.0), f64(0.0), f64(0.0), f64(0.0), f64(0.0)
+        work, kinetic, strain, step = f64(0.0), f64(0.0), f64(0.0), f64(0.0)
         for lane in range(FLOOR_LANES):
             work += ctl.floor.sums[0, world, part, lane]
             kinetic += ctl.floor.sums[1, world, part, lane]
             strain += ctl.floor.sums[2, world, part, lane]
             step = wp.max(step, ctl.floor.sums[3, world, part, lane])
-            speed = wp.max(speed, ctl.floor.sums[5, world, part, lane])
         eta = f64(1.0e30)
         if ctl.solve.negative_curvature[world] == 0 and wp.isfinite(work) and whole > f64(0.0):
             eta = wp.sqrt(wp.abs(work) * dq / wp.max(f64(2.0) * strain + kinetic * dq, f64(1.0e-300)))
@@ -205,9 +200,6 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
                 eta = wp.max(eta, f64(SCATTER_FACTOR) * dq * step / wp.max(largest, f64(1.0e-300)))
             if eta > ctl.floor.max_error and dq * step <= f64(DISPLACEMENT_ROUNDINGS) * ctl.floor.eps * largest:
                 eta = dq * step / wp.max(largest, f64(1.0e-300))
-            slow = step <= f64(VELOCITY_ROUNDINGS) * ctl.floor.eps * speed
-            if eta > ctl.floor.max_error and slow and ctl.floor.eps < f64(SINGLE_PRECISION_EPS):
-                eta = step / speed
         return eta
 
     @wp.kernel(module=module)

@@ -10,7 +10,7 @@ __all__ = [
     "FAIL_CONSTRAINT", "FAIL_CURVATURE", "FAIL_ELEMENT_INVERTED", "FAIL_ENERGY_GROWTH", "FAIL_ITERATIONS",
     "FAIL_JACOBIAN", "FAIL_LINE_SEARCH", "FAIL_LOCAL_ERROR", "FAIL_NAN", "FAIL_RESIDUAL_GROWTH", "FAIL_ROUNDOFF",
     "FAIL_STEP_LIMIT", "FAIL_WORK", "FLOOR_LANES", "FLOOR_ROWS", "GROUP_LANES", "GROUP_ROUNDOFF", "GROUP_ROWS",
-    "GROUP_STRAIN_ENERGY", "ROW_FORCE", "ROW_FROZEN_CHANGE", "ROW_INERTIA", "ROW_INTERNAL", "ROW_KINETIC", "ROW_LOADS",
+    "ROW_FORCE", "ROW_FROZEN_CHANGE", "ROW_INERTIA", "ROW_INTERNAL", "ROW_KINETIC", "ROW_LOADS",
     "ROW_MAGNITUDE", "ROW_OBJECTIVE", "ROW_RESIDUAL", "ROW_ROUNDOFF", "ROW_SLOPE", "TERM_ROWS", "control_struct",
 ]  # fmt: skip
 
@@ -24,9 +24,8 @@ __all__ = [
     ROW_ROUNDOFF, ROW_FORCE, ROW_KINETIC,
 ) = range(11)  # fmt: skip
 """Rows of a residual's sums, RESIDUAL_ROWS of kernels/step/gather.py."""
-GROUP_ROWS = 6  # squared norms of g, f_int, loads, inertia (the ROW_ constants), of the round-off; strain energy
-GROUP_ROUNDOFF, GROUP_STRAIN_ENERGY = 4, 5
-FLOOR_ROWS = 6  # -g.p, inertia.(v - v~), strain energy, largest |p|, |u| and |v|
+GROUP_ROWS, GROUP_ROUNDOFF = 5, 4  # squared norms of g, f_int, loads, inertia (the ROW_ constants), of the round-off
+FLOOR_ROWS = 5  # -g.p, inertia.(v - v~), strain energy, largest |p| and |u|
 GROUP_LANES, FLOOR_LANES = 32, 16
 """Partial sums per residual group, and per part of an error estimate; fixed: the same for any number of worlds."""
 TERM_ROWS = 3

@@ -22,21 +22,16 @@ def vector_kernels(dtype: str, has_constraints: bool = False) -> KernelSet:
 
     @masked_kernel(module, "active")
     def group_norm_partials(
-        start: int_1d, slot: int_1d, element_start: int_1d, element: int_1d, rows: double_3d, energy: double_3d,
-        active: int_1d, partial: wp.array4d(dtype=f64),
+        start: int_1d, slot: int_1d, rows: double_3d, active: int_1d, partial: wp.array4d(dtype=f64)
     ):  # fmt: skip
-        """Strided partial sums of GROUP_ROWS over the slots and elements of a residual group."""
+        """Strided partial sums of GROUP_ROWS over the slots of a residual group."""
         world, group, lane = wp.tid()
-        for row in range(GROUP_ROWS - 1):
+        for row in range(GROUP_ROWS):
             source = wp.where(row == GROUP_ROUNDOFF, ROW_ROUNDOFF, row)
             total = f64(0.0)
             for k in range(start[group] + lane, start[group + 1], GROUP_LANES):
                 total += rows[source, world, slot[k]]
             partial[row, world, group, lane] = total
-        strain = f64(0.0)
-        for k in range(element_start[group] + lane, element_start[group + 1], GROUP_LANES):
-            strain += energy[0, world, element[k]]
-        partial[GROUP_ROWS - 1, world, group, lane] = strain
 
     @masked_kernel(module, "active")
     def sum_group_norms(partial: wp.array4d(dtype=f64), active: int_1d, out: double_3d):
@@ -79,8 +74,7 @@ def vector_kernels(dtype: str, has_constraints: bool = False) -> KernelSet:
         world, part, lane = wp.tid()
         if ctl.floor.estimate_error[world] != 2:
             return
-        work, kinetic, strain = f64(0.0), f64(0.0), f64(0.0)
-        step, size, speed = f64(0.0), f64(0.0), f64(0.0)
+        work, kinetic, strain, step, size = f64(0.0), f64(0.0), f64(0.0), f64(0.0), f64(0.0)
         for k in range(start[part] + lane, start[part + 1], FLOOR_LANES):
             i = k
             if slot.shape[0] > 0:
@@ -90,7 +84,6 @@ def vector_kernels(dtype: str, has_constraints: bool = False) -> KernelSet:
             kinetic += f64(wp.dot(inertia[world, i], v[world, i] - v_tilde[world, i]))
             step = wp.max(step, f64(wp.max(wp.abs(p))))
             size = wp.max(size, f64(wp.max(wp.abs(u[world, i]))))
-            speed = wp.max(speed, f64(wp.max(wp.abs(v[world, i]))))
         for k in range(element_start[part] + lane, element_start[part + 1], FLOOR_LANES):
             e = k
             if element.shape[0] > 0:
@@ -101,7 +94,6 @@ def vector_kernels(dtype: str, has_constraints: bool = False) -> KernelSet:
         ctl.floor.sums[2, world, part, lane] = strain
         ctl.floor.sums[3, world, part, lane] = step
         ctl.floor.sums[4, world, part, lane] = size
-        ctl.floor.sums[5, world, part, lane] = speed
 
     @masked_kernel(module, "active")
     def copy_active(source: p.vec3_2d, active: int_1d, target: p.vec3_2d):

@@ -16,12 +16,10 @@ from .step_control import step_struct
 
 __all__ = ["PREDICTOR_ROWS", "predictor_kernels", "predictor_struct"]
 
-PREDICTOR_ROWS = 4
+PREDICTOR_ROWS = 3
 """Rows of `order_error_terms` that are summed per world."""
 ORDER_MARGIN = 0.05
 """Squared error ratio to the lower order below which a higher order is chosen."""
-PREDICTOR_ROUNDINGS = 1.0e3
-"""Errors below this many roundings of the velocity are negligible."""
 
 
 @functools.cache
@@ -35,9 +33,7 @@ def predictor_struct():
         history_state: wp.array2d(
             dtype=wp.float64
         )  # [world, 4] in the state: next order and count, size and end of the last step
-        sums: wp.array2d(
-            dtype=wp.float64
-        )  # [PREDICTOR_ROWS, world] squared errors of orders 0, 1, 2 in the last step; squared velocity
+        sums: wp.array2d(dtype=wp.float64)  # [PREDICTOR_ROWS, world] squared errors of orders 0, 1, 2 in the last step
 
     return PredictorControl
 
@@ -48,7 +44,6 @@ def predictor_kernels(dtype: str, accelerated: bool, module: wp.Module) -> Kerne
     p, free_components = precision(dtype), free_components_function(dtype)
     T, vec3 = p.T, p.vec3
     Predictor, Step, Newton = predictor_struct(), step_struct(), control_struct()
-    NEGLIGIBLE_ERROR_RATIO = (PREDICTOR_ROUNDINGS * {"float64": 2.0**-53, "float32": 2.0**-24}[dtype]) ** 2
 
     @wp.func
     def extrapolated_velocity(order: int, v: vec3, before: vec3, first: vec3) -> vec3:
@@ -94,10 +89,7 @@ def predictor_kernels(dtype: str, accelerated: bool, module: wp.Module) -> Kerne
         predictor: Predictor, step: Step, free: p.vec3_1d, is_position: p.scalar_1d, diagonal: p.vec3_2d, v: p.vec3_2d,
         v_n: p.vec3_2d, before: p.vec3_2d, first: p.vec3_2d, rows: double_3d,
     ):  # fmt: skip
-        """Squared errors of the orders in an accepted step, in the norm of D.
-
-        Rows 0 to 2: the orders; row 3: the squared velocity.
-        """
+        """Squared errors of orders 0, 1, 2 in an accepted step, in the norm of D."""
         world, slot = wp.tid()
         D = wp.cw_mul(diagonal[world, slot], free[slot])
         w = v[world, slot]
@@ -112,7 +104,6 @@ def predictor_kernels(dtype: str, accelerated: bool, module: wp.Module) -> Kerne
         for order in range(1, 3):
             e = w - extrapolated_velocity(order, a, before[world, slot], first[world, slot])
             rows[order, world, slot] = f64(wp.dot(D, wp.cw_mul(e, e)))
-        rows[3, world, slot] = f64(wp.dot(D, wp.cw_mul(w, w)))
 
     @masked_kernel(module, "step.accepted")
     def shift_history(step: Step, own: int, v_n: p.vec3_2d, before: p.vec3_2d, first: p.vec3_2d):
@@ -129,8 +120,6 @@ def predictor_kernels(dtype: str, accelerated: bool, module: wp.Module) -> Kerne
         count = predictor.history_count[world]
         best = int(0)  # noqa: RUF046 - a variable of the loop
         least = f64(ORDER_MARGIN) * predictor.sums[0, world]
-        if predictor.sums[0, world] <= f64(NEGLIGIBLE_ERROR_RATIO) * predictor.sums[3, world]:
-            least = f64(0.0)  # extrapolated round-off would grow from step to step
         for order in range(1, 3):
             if order <= count and predictor.sums[order, world] < least:
                 best = order

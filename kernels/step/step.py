@@ -25,8 +25,6 @@ FULL_LOAD_TOLERANCE = 1e-9
 """Tolerance of the load factor at full load."""
 MAX_STEP_GROWTH = {"float64": 1e9, "float32": 1e4}
 """Largest step ratio for which a multistep scheme uses the previous step: beyond, its differences are round-off."""
-MAX_EXTRAPOLATED_GROWTH = 4.0
-"""Largest step ratio for the extrapolation of accelerations: after many halvings they belong to a short event."""
 
 
 @functools.cache
@@ -117,7 +115,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
             if known and h <= f64(MAX_GROWTH) * step.previous_h[world]:
                 previous = step.previous_h[world]
         if wp.static(accelerated):
-            previous = wp.max(step.previous_h[world], h / f64(MAX_EXTRAPOLATED_GROWTH))
+            previous = step.previous_h[world]
             step.acceleration_step[world] = previous
         c = coefficients(h, previous, step.scheme_parameter)
         step.a0[world] = c.a0

@@ -225,8 +225,7 @@ class Residual:
         self.reduce(w.energy_rows, 2, active, w.newton.elem_sums)
         groups = m.components.residual_groups
         if groups.count > 1:
-            args = [groups.slot_start, groups.slot, groups.element_start, groups.element]
-            args += [w.rows, w.energy_rows, active, w.residual_group_partial]
+            args = [groups.slot_start, groups.slot, w.rows, active, w.residual_group_partial]
             launch(self.vector_kernels.group_norm_partials, (m.worlds, groups.count, GROUP_LANES), args)
             sums = (GROUP_ROWS, m.worlds, groups.count)
             launch(
