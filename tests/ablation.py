@@ -106,6 +106,7 @@ CONSTANTS: dict[str, Constant] = {
     "MAX_TRUST_RADIUS": Constant(NEWTON_PCG, "1", 1.0e300),
     "SOLVES_WITHOUT_STEP": Constant(NEWTON_PCG, "solves", 1000000),
     "DISPLACEMENT_ROUNDINGS": Constant(NEWTON_PCG, "roundings of the displacements", 0.0),
+    "ALTERNATIVE_START_FORCING": Constant(NEWTON_PCG, "1", 1.0e-3),
     "MAX_START_ENERGY_RATIO": Constant(NEWTON_PCG, "kinetic energies", 1.0),
     "CONSTRAINT_FORCING": Constant(NEWTON_PCG, "1", 1.0),
     "UNCHECKED_ITERATIONS": Constant(NEWTON_PCG, "iterations", 0),
@@ -127,7 +128,7 @@ CONSTANTS: dict[str, Constant] = {
     "MIN_NORMAL_COSINE": Constant(CONTACT, "1", -2.0, "contact"),
     "TUNNEL_LIMIT_RATIO": Constant(CONTACT, "depth limit", 1.0e300, "contact"),
     "OPPOSING_COSINE": Constant(CONTACT, "1", 2.0, "contact"),
-    "MAX_DEPTH_RATIO": Constant(CONTACT, "deepest penetration", 1.0e300, "contact"),
+    "MAX_DEPTH_RATIO": Constant(CONTACT, "deepest penetration", 0.0, "contact"),
     "MAX_EDGE_TANGENT": Constant(CONTACT, "1", 0.0, "contact"),
     "OUTSIDE_TOLERANCE": Constant(CONTACT, "facets", 1.0e-9, "contact"),
     "MASTER_SIZE_RATIO": Constant(CONTACT, "1", 1.0e300, "contact"),
@@ -364,7 +365,7 @@ def reason(row: Row) -> str:
         (first, ratio), more = next(iter(row["rises"].items())), len(row["rises"]) - 1
         scene, count = first.split(" ")
         return f"{scene}: {ratio:.2f} times the {COUNTS[count]}" + (f", and {more} more" if more else "")
-    part = f"{row['cases']}: " if row.get("cases") else ""
+    part = f"{row['of']} {row['cases']}: " if row.get("cases") else ""
     return f"{part}{row['newton']:.2f} times the Newton, {row['pcg']:.2f} times the PCG iterations"
 
 

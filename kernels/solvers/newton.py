@@ -33,6 +33,8 @@ MAX_SOLVES_PER_ITERATION = 3
 """Maximum linear solves of an attempt per allowed iteration: bounds solves without a step."""
 DISPLACEMENT_ROUNDINGS = 64.0
 """Roundings of the displacements below which an error is negligible, whatever the reference energy."""
+ALTERNATIVE_START_FORCING = 0.1
+"""Forcing term of the first solve after an alternative first iterate, far from the end: a tighter one is wasted."""
 MAX_START_ENERGY_RATIO = 3.0
 """Strain energy increase of a first iterate, in kinetic energies, above which other first iterates are tried."""
 
@@ -128,6 +130,8 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
                 wp.atomic_max(ctl.any_rare_branch, 0, 1)
                 return
         initialise_iteration(ctl, world)
+        if stage == 2 and ctl.solve.fixed_forcing == 0:
+            ctl.solve.forcing[world] = f64(ALTERNATIVE_START_FORCING)
 
     @wp.kernel(module=module)
     def compare_first_iterates(ctl: Control, first: int, better: int_1d):
