@@ -230,7 +230,7 @@ def test_a_resumed_run_with_live_contacts_equals_the_undisturbed_one(tmp_path, d
     path = tmp_path / "c.npz"
     options = {"integrator": integrator, "dt": 2e-3 if max_newton < 30 else DT}
     solver = wf.NewtonPCG(max_newton=max_newton)
-    scene = {"device": device, "dtype": dtype, **LAWS[law]}
+    scene = {"device": device, "dtype": dtype, "stiffness": "region", **LAWS[law]}
     whole, first, second = (wf.Simulation(thrown("rotation", **scene)[2], solver=solver, **options) for _ in "abc")
     whole.step(20)
     first.step(12)
@@ -277,7 +277,7 @@ RAMPED = {"law": "paper", "smoothing": 1e-4}
     ("device", "place", "law"), on_devices(["plane", "path", "rotation", "ball", "capsule"], LAWS, strength=1)
 )
 def test_single_precision_runs(device, place, law):
-    options = RAMPED if law == "paper" else LAWS[law]
+    options = {"stiffness": "region"} | (RAMPED if law == "paper" else LAWS[law])
     double, single = (simulated(30, place, device=device, dtype=dtype, **options) for dtype in DTYPES)
     cube = single.model.bodies[0]
     difference = single.positions(cube) - double.positions(double.model.bodies[0])

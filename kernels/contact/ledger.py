@@ -31,6 +31,9 @@ STORED, LOSS, FRICTION, COLLIDER_WORK, INTEGRATOR_WORK = range(5)
 """Columns of the energy increments, J: stored energy (its value), lost to restitution, lost to friction, work of the
 colliders, and the part of the contact's work that is due to the integrator."""
 ENERGY_COLUMNS = 5
+IMPACT_DEPTH = 0.1
+"""Depth of a point after the step in which it touched, over approach speed times step, below which the step does not
+resolve its impact: BDF2 bounces then, as its velocity is also that before."""
 RECORD_LANES = 32
 """Threads that share the sums over the facets of a contact."""
 SUMMED_ROWS = len(RECORD_NAMES) - 1
@@ -121,12 +124,15 @@ def contact_ledger_kernels(dtype: str, geometry: str, own: OwnLaws = ()) -> Kern
     ):  # fmt: skip
         """Store the history of a point in contact."""
         rec = k.history_row(con, c, point)
+        speed = scr.approach_speed[world, point]
+        if his.speed[world, rec] == f64(0.0) and t.depth * inv_h < f64(IMPACT_DEPTH) * speed:
+            scr.impact[world] = 1
         his.spring[world, rec] = o.elastic_slip
         if not law.has_trait(con, c, FIXED_SPRING):
             his.spring[world, rec] = wp.transpose(g.slip_frame(other, world, c, point, t)) * o.elastic_slip
         his.stored[world, rec] = o.stored
         his.friction_limit[world, rec] = o.friction_limit
-        his.speed[world, rec] = wp.max(scr.approach_speed[world, point], (t.depth - t.previous_depth) * inv_h)
+        his.speed[world, rec] = wp.max(speed, (t.depth - t.previous_depth) * inv_h)
         contact_state = g.touched_state(other, world, c, point, t)
         if o.slipping != 0 and o.friction_limit > f64(0.0):
             contact_state += SLIP_FLAG
@@ -261,6 +267,8 @@ def contact_ledger_kernels(dtype: str, geometry: str, own: OwnLaws = ()) -> Kern
             his.pose_time[world] = clock.time[world]
             scr.elapsed_time[world] = scr.elapsed_time[world] + clock.h[world]
             potential[world] = potential[world] + term_sums[1, world]
+            if scr.impact[world] != 0 and clock.previous_end_time.shape[0] > 0:
+                clock.previous_end_time[world] = f64(-1.0e300)  # a multistep scheme starts anew
 
     @wp.kernel(module=module)
     def write_records(scr: ContactScratch, first: int, report: wp.array2d(dtype=f64)):
