@@ -35,9 +35,7 @@ def test_a_joint_elsewhere_does_not_change_a_contact(device, multipliers, veloci
     assert sim.violation("joint")[0] < 1e-8
 
 
-AT_THE_EDGE = pytest.mark.xfail(
-    reason="0.7 %: points of a ball next to its pole touch 4 mm beside the edge", strict=True
-)
+AT_THE_EDGE = pytest.mark.xfail(reason="0.7 %: points of a ball beside its pole touch, 4 mm from the edge", strict=True)
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -33,7 +33,7 @@ colliders, and the part of the contact's work that is due to the integrator."""
 ENERGY_COLUMNS = 5
 IMPACT_DEPTH = 0.1
 """Depth of a point after the step in which it touched, over approach speed times step, below which the step does not
-resolve its impact: BDF2 bounces then, as its velocity is also that before."""
+resolve its impact: what BDF2 and generalized-alpha remember of the step would throw the body back."""
 RECORD_LANES = 32
 """Threads that share the sums over the facets of a contact."""
 SUMMED_ROWS = len(RECORD_NAMES) - 1
@@ -267,8 +267,8 @@ def contact_ledger_kernels(dtype: str, geometry: str, own: OwnLaws = ()) -> Kern
             his.pose_time[world] = clock.time[world]
             scr.elapsed_time[world] = scr.elapsed_time[world] + clock.h[world]
             potential[world] = potential[world] + term_sums[1, world]
-            if scr.impact[world] != 0 and clock.previous_end_time.shape[0] > 0:
-                clock.previous_end_time[world] = f64(-1.0e300)  # a multistep scheme starts anew
+            if scr.impact[world] != 0 and clock.previous_h.shape[0] > 0:
+                clock.previous_h[world] = f64(-1.0)
 
     @wp.kernel(module=module)
     def write_records(scr: ContactScratch, first: int, report: wp.array2d(dtype=f64)):

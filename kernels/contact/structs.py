@@ -276,7 +276,7 @@ def clock_struct():
         h: wp.array(dtype=wp.float64)  # its length, s
         substep_index: wp.array(dtype=wp.int32)  # index of the substep; 0: first of the step
         is_static: wp.int32  # 1 in statics: no rates
-        previous_end_time: wp.array(dtype=wp.float64)  # of the step control, with a multistep scheme; else empty
+        previous_h: wp.array(dtype=wp.float64)  # of the step control, with a scheme that has a history; else empty
 
     return Clock
 

@@ -153,7 +153,8 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
         """q~, v~ and the first iterate; prescribed components keep their positions.
 
         The iterate is v~ + (dq/dv) g, or v_n + (h/h_{n-1}) (v_n - v_{n-1}) if the previous step is known: its error is
-        then of second order in h, as stiff rotating bodies require. With accelerations it is v_n + h g.
+        then of second order in h, as stiff rotating bodies require. With accelerations it is v_n + h g. After an impact
+        that a step has not resolved a multistep scheme has no history, and accelerations are those of gravity.
         """
         world, slot = wp.tid()
         q = u_n[world, slot]
@@ -169,6 +170,9 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
             q += T(step.b[world]) * v_n[world, slot]
         if wp.static(accelerated):
             c = coefficients(step.h[world], step.acceleration_step[world], step.scheme_parameter)
+            if step.previous_h[world] < f64(0.0):  # the force of an impact ends with its step
+                u_before[world, slot] = is_position[slot] * vec3(step.gravity[world])
+                v_before[world, slot] = u_before[world, slot]
             a = u_before[world, slot]
             q += T(c.q_a) * a
             w += T(c.v_a) * a + T(c.v_w) * v_before[world, slot]

@@ -113,9 +113,8 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
             "aitken_sums": (B, AITKEN_LANES), "record_totals": (B, len(t.contacts), len(RECORD_NAMES)),
             "record_rows": (len(RECORD_NAMES), B, t.rows), "facet_activity": (B, t.rows), "shape_values": (1, 1, 1),
         }  # fmt: skip
-        shapes |= dict.fromkeys(
-            ("passed_point", "elapsed_time", "relaxation", "limit_updates", "aitken_norm2", "impact"), (B,)
-        )
+        by_world = ("passed_point", "elapsed_time", "relaxation", "limit_updates", "aitken_norm2", "impact")
+        shapes |= dict.fromkeys(by_world, (B,))
         shapes |= dict.fromkeys(OF_FACETS, (B, t.rows)) | dict.fromkeys(OF_CONTACTS, (B, len(t.contacts)))
         if t.has_single_point:
             shapes["shape_values"] = (B, len(t.contacts), max(group.conn.shape[1] for group in t.groups))
@@ -156,8 +155,8 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
         for name in ("new_time", "h", "substep_index"):
             setattr(clock, name, getattr(work.step, name))
         clock.time, clock.is_static = ctx.state.time, int(not ctx.inertia)
-        if "previous_end" in ctx.state.specs:
-            clock.previous_end_time = ctx.state.previous_end
+        if "previous_step" in ctx.state.specs:
+            clock.previous_h = ctx.state.previous_step
         parts = (B, len(t.contacts), len(RECORD_NAMES), RECORD_LANES)
         u = work.u
         if self.double_displacements:  # only contact slots are used
