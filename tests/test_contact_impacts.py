@@ -137,15 +137,17 @@ def test_paper_patch_without_solution_raises():
 
 
 @pytest.mark.parametrize("integrator", ["bdf2", "generalized_alpha"])
-@pytest.mark.parametrize("E", [1e9, 2e11])
-def test_an_impact_within_a_step_adds_no_energy(E, integrator):
-    """What schemes remember of the step throws the body back: a steel bar with 2.7 times its speed, unnoticed."""
+@pytest.mark.parametrize("gap", [2.9e-3, 3.1e-3])
+def test_an_impact_within_a_step_adds_no_energy(gap, integrator):
+    """What schemes remember of the step threw the body back: a steel bar with up to 2.7 times its speed, unnoticed. Of
+    two gaps, one is passed in a step whose end barely touches."""
     b = wf.ModelBuilder(gravity=(0, 0, 0))
-    mesh = wf.mesh.box((0.1, 0.02, 0.02), cells=(4, 1, 1), origin=(0, 0, 2.3e-3))
-    bar = b.add_solid(mesh, material=wf.SVK(E=E, nu=0.3, density=1000.0), name="bar")
+    mesh = wf.mesh.box((0.1, 0.02, 0.02), cells=(4, 1, 1), origin=(0, 0, gap))
+    bar = b.add_solid(mesh, material=wf.SVK(E=2e11, nu=0.3, density=1000.0), name="bar")
     b.set_initial(bar, velocity=(0, 0, -3.0))
     b.add_contact(bar, b.add_collider(wf.HalfSpace((0, 0, 1)), name="floor"))
     sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-3, integrator=integrator, energy_growth="ignore")
     kinetic = [float(sim.energies()["kinetic"][0]) for _ in range(20) if sim.step()]
-    assert max(kinetic) <= kinetic[0] * (1.0 + 1e-9)
-    assert kinetic[-1] < 0.5 * kinetic[0]
+    whole = 0.5 * 0.04 * 3.0**2
+    assert max(kinetic) <= whole * (1.0 + 1e-9)
+    assert kinetic[-1] < 0.5 * whole

@@ -32,8 +32,8 @@ STORED, LOSS, FRICTION, COLLIDER_WORK, INTEGRATOR_WORK = range(5)
 colliders, and the part of the contact's work that is due to the integrator."""
 ENERGY_COLUMNS = 5
 IMPACT_DEPTH = 0.1
-"""Depth of a point after the step in which it touched, over approach speed times step, below which the step does not
-resolve its impact: what BDF2 and generalized-alpha remember of the step would throw the body back."""
+"""Depth of a point that was less than half as deep before the step, over approach speed times step, below which the step
+has not resolved its impact: what BDF2 and generalized-alpha remember of the step would throw the body back."""
 RECORD_LANES = 32
 """Threads that share the sums over the facets of a contact."""
 SUMMED_ROWS = len(RECORD_NAMES) - 1
@@ -125,7 +125,7 @@ def contact_ledger_kernels(dtype: str, geometry: str, own: OwnLaws = ()) -> Kern
         """Store the history of a point in contact."""
         rec = k.history_row(con, c, point)
         speed = scr.approach_speed[world, point]
-        if his.speed[world, rec] == f64(0.0) and t.depth * inv_h < f64(IMPACT_DEPTH) * speed:
+        if t.depth > f64(2.0) * t.previous_depth and t.depth * inv_h < f64(IMPACT_DEPTH) * speed:
             scr.impact[world] = 1
         his.spring[world, rec] = o.elastic_slip
         if not law.has_trait(con, c, FIXED_SPRING):
