@@ -32,8 +32,8 @@ STORED, LOSS, FRICTION, COLLIDER_WORK, INTEGRATOR_WORK = range(5)
 colliders, and the part of the contact's work that is due to the integrator."""
 ENERGY_COLUMNS = 5
 IMPACT_DEPTH = 0.1
-"""Depth of a point that was less than half as deep before the step, over approach speed times step, below which the step
-has not resolved its impact: what BDF2 and generalized-alpha remember of the step would throw the body back."""
+"""Depth of a point that was less than half as deep before the step, over approach speed times step, below which the
+step has not resolved its impact: what BDF2 and generalized-alpha remember of it would throw the body back."""
 RECORD_LANES = 32
 """Threads that share the sums over the facets of a contact."""
 SUMMED_ROWS = len(RECORD_NAMES) - 1
