@@ -42,7 +42,7 @@ def beam_over_cylinders(
     for name, x in (("left", -0.5 * span), ("right", 0.5 * span)):
         shape = wf.Cylinder(start=(x, -3.0 * side, 0.0), end=(x, 3.0 * side, 0.0), radius=radius)
         cylinder = b.add_collider(shape, name=f"{name} cylinder")
-        b.add_contact(beam, cylinder, mu=mu, restitution=0.3, name=f"{name} rest")
+        b.add_contact(beam, cylinder, mu=mu, restitution=0.3, stiffness="region", name=f"{name} rest")
     b.add_probe("middle", beam.at((0.0, 0.0, height)))
     b.add_probe("end", beam.end)
     return b

@@ -39,6 +39,6 @@ def belt(
     shape = wf.Box(center=(0.0, 0.0, -0.01), size=(8.0 * side, 2.0 * side, 0.02))
     path = ([0.0, start, start + 10.0], [(0, 0, 0), (0, 0, 0), (10.0 * speed, 0, 0)])
     moving = b.add_collider(shape, path=path, name="belt")
-    b.add_contact(block.surface("z-"), moving, mu=mu, restitution=0.3, name="base")
+    b.add_contact(block.surface("z-"), moving, mu=mu, restitution=0.3, stiffness="region", name="base")
     b.add_probe("middle", block.at((0.0, 0.0, 0.5 * height)))
     return b

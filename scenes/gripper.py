@@ -38,7 +38,8 @@ def gripper(
     material = wf.NeoHookean.from_E_nu(E=E, nu=nu, density=density)
     block = b.add_solid(mesh, material=material, name="block")
     floor = b.add_collider(wf.HalfSpace(normal=(0, 0, 1)), name="floor")
-    b.add_contact(block.surface("z-"), floor, mu=0.3, restitution=0.3, name="base")
+    options = {"restitution": 0.3, "stiffness": "region"}
+    b.add_contact(block.surface("z-"), floor, mu=0.3, name="base", **options)
     apart, thick = 0.01, 0.02  # of jaws and block at the start; of a jaw, m
     for name, sign in (("left", -1.0), ("right", 1.0)):
         # the jaws reach beyond the block's top: edges pressing into its side would lift it without friction
@@ -47,6 +48,6 @@ def gripper(
         path = [(0, 0, 0), (close, 0, 0), (close, 0, 0), (close, 0, lift), (close, 0, lift)]
         plate = wf.Box(center, size=(thick, 0.8 * side, 1.1 * side))
         jaw = b.add_collider(plate, path=([0.0, 0.3, 0.4, 0.8, 2.0], path), name=f"{name} jaw")
-        b.add_contact(block.surface("x-" if sign < 0.0 else "x+"), jaw, mu=mu, restitution=0.3, name=f"{name} grip")
+        b.add_contact(block.surface("x-" if sign < 0.0 else "x+"), jaw, mu=mu, name=f"{name} grip", **options)
     b.add_probe("middle", block.at((0.0, 0.0, half)))
     return b

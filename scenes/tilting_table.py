@@ -35,6 +35,6 @@ def tilting_table(
     block = b.add_solid(mesh, material=wf.SVK(E=E, nu=nu, density=density), name="block")
     turn = wf.Rotation(anchor=(0, 0, 0), axis=(0, 1, 0), angle=([0.0, 10.0], [0.0, math.radians(10.0 * rate)]))
     table = b.add_collider(wf.HalfSpace(normal=(0, 0, 1)), path=turn, name="table")
-    b.add_contact(block.surface("z-"), table, mu=mu, restitution=0.3, name="base")
+    b.add_contact(block.surface("z-"), table, mu=mu, restitution=0.3, stiffness="region", name="base")
     b.add_probe("middle", block.at((0.5 * side, 0.0, 0.5 * height)))
     return b

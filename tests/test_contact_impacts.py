@@ -139,8 +139,8 @@ def test_paper_patch_without_solution_raises():
 @pytest.mark.parametrize("integrator", ["bdf2", "generalized_alpha"])
 @pytest.mark.parametrize("gap", [2.9e-3, 3.1e-3])
 def test_an_impact_within_a_step_adds_no_energy(gap, integrator):
-    """What schemes remember of the step threw the body back: a steel bar with up to 2.7 times its speed, unnoticed. Of
-    two gaps, one is passed in a step whose end barely touches."""
+    """The history of a scheme threw bodies back: a steel bar with up to 2.7 times its speed, unnoticed. Of two gaps,
+    one is passed in a step whose end barely touches."""
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     mesh = wf.mesh.box((0.1, 0.02, 0.02), cells=(4, 1, 1), origin=(0, 0, gap))
     bar = b.add_solid(mesh, material=wf.SVK(E=2e11, nu=0.3, density=1000.0), name="bar")

@@ -1,8 +1,7 @@
 """Time of a step of piles of ten cubes of T4 that fall on each other with friction, mu = 0.5, h = 10 ms.
 
 Cubes of 0.2 m, neo-Hookean, E = 1 MPa, nu = 0.4, 1000 kg/m^3, 10 mm apart, each 3 and 2 mm beside the one below, to a
-residual of 1e-6; in rows "-default" with default stiffness and restitution. ms: mean of the steps after the first;
-deepest: largest penetration at the end of a step, m.
+residual of 1e-6; "-default": with default contact. ms: mean of the steps after the first; deepest: m, after a step.
 """
 
 from __future__ import annotations
@@ -46,8 +45,7 @@ def pile(cells: int, default: bool = False) -> wf.ModelBuilder:
 def piles(run: Run) -> Iterator[Row]:
     """A row per number of cells along a side, with the held and with default options."""
     for (cells, steps), default in itertools.product(STEPS.items(), (False, True)):
-        label = f"pile-{cells}" + default * "-default"
-        if not run.wants(label):
+        if not run.wants(label := f"pile-{cells}" + default * "-default"):
             continue
         model = pile(cells, default).finalize(device=run.device)
         sim = wf.Simulation(model, dt=DT, solver=wf.NewtonPCG(tol=TOL), ledger=False)

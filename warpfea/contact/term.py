@@ -110,11 +110,10 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
         """Shapes of the arrays of an attempt that are not (worlds, points)."""
         t, B = self.tables, worlds
         shapes: dict[str, tuple[int, ...]] = {
-            "aitken_sums": (B, AITKEN_LANES), "record_totals": (B, len(t.contacts), len(RECORD_NAMES)),
+            "impact": (B,), "aitken_sums": (B, AITKEN_LANES), "record_totals": (B, len(t.contacts), len(RECORD_NAMES)),
             "record_rows": (len(RECORD_NAMES), B, t.rows), "facet_activity": (B, t.rows), "shape_values": (1, 1, 1),
         }  # fmt: skip
-        by_world = ("passed_point", "elapsed_time", "relaxation", "limit_updates", "aitken_norm2", "impact")
-        shapes |= dict.fromkeys(by_world, (B,))
+        shapes |= dict.fromkeys(("passed_point", "elapsed_time", "relaxation", "limit_updates", "aitken_norm2"), (B,))
         shapes |= dict.fromkeys(OF_FACETS, (B, t.rows)) | dict.fromkeys(OF_CONTACTS, (B, len(t.contacts)))
         if t.has_single_point:
             shapes["shape_values"] = (B, len(t.contacts), max(group.conn.shape[1] for group in t.groups))

@@ -29,7 +29,7 @@ OTHERS = ("floor", "plate", "shell-5mm", "shell-1mm", "mesh", "second")
 MOTIONS = (("drop", 0.1), ("drop", 0.5), ("slide", 0.5))
 MODULI, STEPS = (1e4, 1e6, 1e8, 2e11), (1e-3, 1e-2)
 INTEGRATORS = ("backward_euler", "bdf2", "generalized_alpha", "energy_momentum")
-STIFF = 1e6
+SELF_DAMPED_MODULUS = 1e6
 """Young's modulus, Pa, from which backward Euler's own dissipation stops a body of this size in 2 s."""
 MAX_MEAN_NEWTON = 8.0
 
@@ -47,7 +47,7 @@ def covering(*axes: Sequence[Any]) -> list[tuple[Any, ...]]:
     return chosen
 
 
-ROWS = tuple((*row[:2], "-".join(map(str, row[2])), *row[3:])
+COMBINATIONS = tuple((*row[:2], "-".join(map(str, row[2])), *row[3:])
              for row in covering(BODIES, OTHERS, MOTIONS, MODULI, STEPS, INTEGRATORS))  # fmt: skip
 
 
@@ -107,13 +107,13 @@ def add_support(b: wf.ModelBuilder, other: str, body: str, E: float, damped: boo
     return support, support
 
 
-@case("first-scenes", GROUP, values=ROWS, quick="none", dtypes=("float64",), refusal=("went through",))
+@case("first-scenes", GROUP, values=COMBINATIONS, quick="none", dtypes=("float64",), refusal=("went through",))
 def first_scene(setting: Setting, row: tuple[str, str, str, float, float, str]) -> Answer:
     """A body is dropped on, or slides over, another or an obstacle with default options, and comes to rest."""
     kind, other, motion, E, h, integrator = row
     how, amount = motion.split("-")
     b = wf.ModelBuilder(gravity=GRAVITY_VECTOR)
-    damped = integrator != "backward_euler" or E < STIFF or other.startswith("shell")
+    damped = integrator != "backward_euler" or E < SELF_DAMPED_MODULUS or other.startswith("shell")
     side, support = add_support(b, other, kind, E, damped)
     drop = float(amount) if how == "drop" else 0.0
     body = add_body(b, kind, E, drop, "body", damped)
