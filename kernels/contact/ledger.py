@@ -23,6 +23,7 @@ from .structs import (
     STICK_ROW,
     STORED_ROW,
     contact_structs,
+    world_value,
 )
 
 __all__ = ["ENERGY_COLUMNS", "RECORD_LANES", "contact_ledger_kernels"]
@@ -32,8 +33,9 @@ STORED, LOSS, FRICTION, COLLIDER_WORK, INTEGRATOR_WORK = range(5)
 colliders, and the part of the contact's work that is due to the integrator."""
 ENERGY_COLUMNS = 5
 IMPACT_DEPTH = 0.1
-"""Depth of a point that was less than half as deep before the step, over approach speed times step, below which the
-step has not resolved its impact: what BDF2 and generalized-alpha remember of it would throw the body back."""
+"""Depth of a point that was less than half as deep before the step and loses half of its momentum in it, over approach
+speed times step, below which the step has not resolved its impact: what BDF2 and generalized-alpha remember of it would
+throw the body back."""
 RECORD_LANES = 32
 """Threads that share the sums over the facets of a contact."""
 SUMMED_ROWS = len(RECORD_NAMES) - 1
@@ -125,7 +127,9 @@ def contact_ledger_kernels(dtype: str, geometry: str, own: OwnLaws = ()) -> Kern
         """Store the history of a point in contact."""
         rec = k.history_row(con, c, point)
         speed = scr.approach_speed[world, point]
-        if t.depth > f64(2.0) * t.previous_depth and t.depth * inv_h < f64(IMPACT_DEPTH) * speed:
+        momentum = world_value(con.effective_mass, world, c) * speed
+        stopped = t.depth > f64(2.0) * t.previous_depth and o.normal_force > f64(0.5) * momentum * inv_h
+        if stopped and t.depth * inv_h < f64(IMPACT_DEPTH) * speed:
             scr.impact[world] = 1
         his.spring[world, rec] = o.elastic_slip
         if not law.has_trait(con, c, FIXED_SPRING):
