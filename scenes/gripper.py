@@ -1,5 +1,7 @@
 """A gripper that lifts a soft block by friction."""
 
+from typing import Any
+
 import warpfea as wf
 from warpfea.builder.scene import scene
 
@@ -38,7 +40,7 @@ def gripper(
     material = wf.NeoHookean.from_E_nu(E=E, nu=nu, density=density)
     block = b.add_solid(mesh, material=material, name="block")
     floor = b.add_collider(wf.HalfSpace(normal=(0, 0, 1)), name="floor")
-    options = {"restitution": 0.3, "stiffness": "region"}
+    options: dict[str, Any] = {"restitution": 0.3, "stiffness": "region"}
     b.add_contact(block.surface("z-"), floor, mu=0.3, name="base", **options)
     apart, thick = 0.01, 0.02  # of jaws and block at the start; of a jaw, m
     for name, sign in (("left", -1.0), ("right", 1.0)):
