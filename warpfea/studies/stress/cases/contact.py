@@ -325,7 +325,8 @@ def pressed_corner(setting: Setting, which: str) -> Answer:
     """A cube driven rigidly with its edge or vertex into an obstacle: closed-form forces of a penalty per area."""
     depth = SIDE / 4
     rotation = edge_down() if which == "edge" else vertex_down()
-    s = make_scene(FLOOR, gravity=(0, 0, 0), rotation=rotation, cells=12 if which == "edge" else 16, mu=0.0)
+    s = make_scene(FLOOR, gravity=(0, 0, 0), rotation=rotation, cells=12 if which == "edge" else 16, mu=0.0,
+                   stiffness="region")  # fmt: skip
     s.builder.drive(s.body.nodes(lambda X: np.ones(len(X), bool)), displacement=(0, 0, -depth))
     stats, (record,) = s.solve(setting, load_steps=1)
     area = 6.0 * SIDE**2
