@@ -8,6 +8,8 @@ from typing import Any
 
 import pytest
 
+from warpfea.studies.stress.build import covering_array
+
 __all__ = ["covering", "on_devices"]
 
 
@@ -21,16 +23,9 @@ def covering(*axes: Sequence[Any], strength: int = 2) -> list[Any]:
         axes: values of each parameter.
         strength: how many parameters are combined fully.
     """
-    cases = list(itertools.product(*axes))
-    groups = list(itertools.combinations(range(len(axes)), strength))
-    covers = [{(g, *(repr(case[k]) for k in g)) for g in groups} for case in cases]
-    left = set().union(*covers)
-    chosen = set()
-    while left:
-        best = max(range(len(cases)), key=lambda k: (len(covers[k] & left), -k))
-        chosen.add(best)
-        left -= covers[best]
-    return [pytest.param(*case, marks=[] if k in chosen else [pytest.mark.slow]) for k, case in enumerate(cases)]
+    chosen = {repr(case) for case in covering_array(*axes, strength=strength)}
+    marks = {True: [], False: [pytest.mark.slow]}
+    return [pytest.param(*case, marks=marks[repr(case) in chosen]) for case in itertools.product(*axes)]
 
 
 def on_devices(*axes: Sequence[Any], strength: int = 2, cuda: Sequence[Sequence[Any]] | None = None) -> list[Any]:

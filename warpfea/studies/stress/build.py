@@ -1,5 +1,6 @@
 """Shared by the cases: bars and beams, static solutions with their counts, differences."""
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,7 +16,8 @@ from .case import Answer, Setting
 
 __all__ = [
     "CLAMPED_SLOTS", "GRAVITY_VECTOR", "MIN_POSITIVE_J", "REFERENCE_TOL", "STEEL", "StaticSolution", "StepStats", "X",
-    "Y", "Z", "add_along_x", "bar", "beam", "finalize", "linear_steps", "relative_error", "solve", "step",
+    "Y", "Z", "add_along_x", "bar", "beam", "covering_array", "finalize", "linear_steps", "relative_error", "solve",
+    "step",
 ]  # fmt: skip
 
 X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
@@ -213,3 +215,18 @@ def relative_error(value: Any, reference: Any, scale: float | None = None) -> fl
     """Largest difference over `scale`, by default the largest absolute value of the reference."""
     value, reference = np.asarray(value, dtype=float), np.asarray(reference, dtype=float)
     return float(np.abs(value - reference).max() / (np.abs(reference).max() if scale is None else scale))
+
+
+def covering_array(*axes: Sequence[Any], strength: int = 2) -> list[tuple[Any, ...]]:
+    """Cases of the product of axes that have every combination of values of `strength` axes.
+
+    A greedy choice: each next case is the first of those that bring most new combinations; in the order of the product.
+    """
+    cases = list(itertools.product(*axes))
+    groups = list(itertools.combinations(range(len(axes)), strength))
+    covers = [{(g, *(repr(case[k]) for k in g)) for g in groups} for case in cases]
+    left, chosen = set().union(*covers), []
+    while left:
+        chosen.append(max(range(len(cases)), key=lambda k: (len(covers[k] & left), -k)))
+        left -= covers[chosen[-1]]
+    return [cases[k] for k in sorted(chosen)]

@@ -7,15 +7,13 @@ take at most 8 Newton iterations on average. A body that moves by more than half
 refused by name.
 """
 
-import itertools
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 import warpfea as wf
 
-from ..build import GRAVITY_VECTOR, StepStats, finalize
+from ..build import GRAVITY_VECTOR, StepStats, covering_array, finalize
 from ..case import Answer, Setting, case
 from .contact import FLOOR, GRAVITY, center_of_mass
 
@@ -34,21 +32,8 @@ SELF_DAMPED_MODULUS = 1e6
 MAX_MEAN_NEWTON = 8.0
 
 
-def covering(*axes: Sequence[Any]) -> list[tuple[Any, ...]]:
-    """Cases of the product of axes that have every pair of values, each the first of those with most new pairs."""
-    cases = list(itertools.product(*axes))
-    pairs = list(itertools.combinations(range(len(axes)), 2))
-    covers = [{(a, b, case[a], case[b]) for a, b in pairs} for case in cases]
-    left, chosen = set().union(*covers), []
-    while left:
-        best = max(range(len(cases)), key=lambda k: (len(covers[k] & left), -k))
-        chosen.append(cases[best])
-        left -= covers[best]
-    return chosen
-
-
 COMBINATIONS = tuple((*row[:2], "-".join(map(str, row[2])), *row[3:])
-             for row in covering(BODIES, OTHERS, MOTIONS, MODULI, STEPS, INTEGRATORS))  # fmt: skip
+             for row in covering_array(BODIES, OTHERS, MOTIONS, MODULI, STEPS, INTEGRATORS))  # fmt: skip
 
 
 def material(E: float, damped: bool, size: float = SIZE) -> wf.NeoHookean:
