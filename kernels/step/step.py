@@ -115,7 +115,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
             if known and h <= f64(MAX_GROWTH) * step.previous_h[world]:
                 previous = step.previous_h[world]
         if wp.static(accelerated):
-            previous = step.previous_h[world]
+            previous = wp.where(step.previous_h[world] > f64(0.0), step.previous_h[world], h)  # h: after an impact
             step.acceleration_step[world] = previous
         c = coefficients(h, previous, step.scheme_parameter)
         step.a0[world] = c.a0
