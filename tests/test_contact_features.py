@@ -133,3 +133,54 @@ def test_a_plate_does_not_pass_a_capsule_or_a_ball(kind, size, obstacle):
     assert 2e-3 * record.force[0, :, 2].sum() > 0.25 * 8.0 * (0.5 + 0.03 * G)  # a quarter of the momentum
     assert record.penetration.max() < 2e-4
     assert abs(sim.energies()["ledger_residual"][0]) < 1e-6
+
+
+def bar(b, kind, cells, along, at, material):
+    """A bar of 0.4 x 0.01 x 0.01 m along x or y through a point."""
+    ends = np.array(at) + np.outer((-0.2, 0.2), np.eye(3)[along])
+    if kind == "beam":
+        return b.add_beam(
+            ends, elements=cells, section=wf.Rectangle(0.01, 0.01), normal=(0, 0, 1), material=material
+        )  # fmt: skip
+    size, count = np.full(3, 0.01), np.ones(3, dtype=int)
+    size[along], count[along] = 0.4, cells
+    mesh = wf.mesh.box(tuple(size), cells=tuple(count), origin=tuple(np.array(at) - 0.5 * size), element=kind)
+    return b.add_solid(mesh, material=material)
+
+
+@pytest.mark.parametrize(
+    ("kind", "cells"),
+    [("T10", (2, 2)), ("beam", (1, 4)), pytest.param("H3843", (2, 3), marks=pytest.mark.slow)],
+)
+def test_crossed_bars_hold_each_other(kind, cells):
+    """Bars of elements 10 to 40 times as long as wide. Before, they passed through each other without a force."""
+    material = wf.SVK(E=1e10, nu=0.3, density=RHO, damping=wf.KelvinVoigt(eta=1e6))
+    b = wf.ModelBuilder(gravity=(0, 0, -G))
+    low = bar(b, kind, cells[0], 0, (0.0, 0.013, 0.0), material)
+    high = bar(b, kind, cells[1], 1, (0.017, 0.013, 0.012), material)
+    b.clamp(low.nodes(lambda X: np.abs(X[:, 0]) > 0.199))
+    pad = b.add_contact(low, high, mu=0.3)
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=2e-3)
+    sim.step(60)
+    record = sim.contact_record(pad)
+    weight = 0.4 * 0.01**2 * RHO * G
+    assert record.force[0, -10:, 2].mean() == pytest.approx(-weight, rel=0.02)
+    assert record.penetration.max() < 1e-4 * 0.01
+    assert sim.positions(high)[0, :, 2].mean() == pytest.approx(0.01, abs=2e-4)
+
+
+@pytest.mark.parametrize(("beside", "facet", "whole"), [(1e-4, 0.1, True), (1e-3, 0.05, False), (1.5e-2, 0.4, False)])
+def test_a_block_falls_freely_beside_the_border_of_a_body(beside, facet, whole):
+    """Before, it hung in the air within 5 % of a facet's side beside the border, or was thrown by up to 17 weights."""
+    b = wf.ModelBuilder(gravity=(0, 0, -G))
+    cells = (max(1, round(0.4 / facet)),) * 2 + (1,)
+    table = b.add_solid(wf.mesh.box((0.4, 0.4, 0.05), cells=cells, origin=(-0.4, -0.2, -0.05)), material=MAT)
+    b.clamp(table.nodes(lambda X: X[:, 2] < -0.04))
+    mesh = wf.mesh.box((0.1, 0.1, 0.1), cells=(2, 2, 2), origin=(beside, -0.05, 0.005))
+    block = b.add_solid(mesh, material=wf.SVK(E=1e6, nu=0.3, density=RHO))
+    pad = b.add_contact(*(block, table) if whole else (block.surface("z-"), table.surface("z+")), mu=0.3)
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=2e-3)
+    sim.step(60)
+    assert not sim.contact_record(pad).force.any()
+    fallen = 0.055 - sim.positions(block)[0, :, 2].mean()
+    assert fallen == pytest.approx(0.5 * G * 0.12 * 0.122, rel=1e-9)  # backward Euler

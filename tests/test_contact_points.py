@@ -196,7 +196,7 @@ def test_curved_faces_of_a_ball(element):
     mesh = wf.mesh.sphere(0.7, cells=4, center=(3, -2, 1), element="T10")
     body = wf.ModelBuilder().add_solid(mesh, material=LAW, element=element)
     p = contact_points(whole(body))
-    fine = assembly.facet_tables(whole(body), rules={3: conical_triangle(7)})
+    fine = assembly.facet_tables(whole(body), rules={face: conical_triangle(7) for face in range(4)})
     X, area = assembly.facet_positions_and_areas(body, fine)
     if element == "T10":
         assert np.abs((p.normal * p.area[:, :, None]).sum(axis=(0, 1))).max() < 1e-13

@@ -23,6 +23,8 @@ OPPOSING_COSINE = 0.5
 face the same way."""
 MAX_DEPTH_RATIO = 2.0
 """Largest depth of a point that enters from beside a facet, over the deepest active penetration."""
+BORDER_TOLERANCE = 1e-4
+"""Distance over a side by which a point may pass a surface beside its border: round-off of flush borders."""
 MAX_EDGE_TANGENT = 2.0
 """Maximum tangent of the angle between an outward vector and the normal of its facet, at the edge of a box."""
 
@@ -188,6 +190,21 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
         return wp.max(-f64(MAX_EDGE_TANGENT) * xi[2] / mas.side_length[f], f64(0.0))
 
     @wp.func
+    def passed_beside(
+        mas: Masters, scr: ContactScratch, pair: PairScratch, slave: SlavePoint, f: int, xi: vec3d
+    ) -> bool:
+        """True if a point at `xi` passed the surface of a facet, or was below it at the start, beside the facet."""
+        corners = mas.corner_count[mas.facet_kind[f]]
+        start = scr.start_position[slave.world, slave.point]
+        found = inverse_map(mas, pair.start_displacement, slave.world, f, start, xi)
+        before = vec3d(found[0], found[1], found[2])
+        part = f64(0.0)
+        if before[2] > f64(0.0):
+            part = before[2] / wp.max(before[2] - xi[2], before[2])
+        there = before + part * (xi - before)
+        return found[3] != f64(0.0) and distance_outside(corners, there) > f64(BORDER_TOLERANCE)
+
+    @wp.func
     def entered_sideways(
         mas: Masters, scr: ContactScratch, pair: PairScratch, slave: SlavePoint, f: int, xi: vec3d, gap: f64
     ) -> bool:
@@ -284,6 +301,9 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
         if rank < 0:
             return out
         beside = rank == 2 or rank == 3
+        if not beside and beyond > f64(0.0) and not slave.anchored and slave.overlap_limit == f64(0.0):
+            if passed_beside(mas, scr, pair, slave, f, xi):
+                return out
         out.entered = out.entered or not beside
         o = beyond
         if rank > 1 and beyond <= slack:

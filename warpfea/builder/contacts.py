@@ -19,7 +19,7 @@ from ..model.contact_points import check_contact_points
 from ..model.contacts import Collider, Contact
 from ..model.description import Description
 from ..model.handles import SurfaceSet
-from ..model.obstacle_points import ObstacleContact, is_narrow
+from ..model.obstacle_points import ObstacleContact, is_narrow_obstacle
 from ..model.pairs import PAIR_RULES, FacetOptions, PairContact, slave_and_master
 from ..model.shapes import Shape
 from ..time_laws import Rotation, time_law
@@ -114,7 +114,7 @@ def make_contact(
             "obstacle with an inside: take model = 'patch', or a closed mesh"
         )
     patch = o["model"] == "patch" and o["treatment"] == "implicit" and not LAWS[o["law"]].traits & ANY_GAP
-    if patch and is_narrow(surface, collider):
+    if patch and is_narrow_obstacle(surface, collider):
         o |= {"points": None, "index": len(d.contacts_of(FacetOptions))}
         return ObstacleContact(surface=surface, collider=collider, name=name, **o)
     return Contact(surface, collider, name, index=len(d.contacts_of(Contact)), **o)
@@ -141,7 +141,7 @@ def make_pair(
         )
     if options["seam"] is not None:
         raise NotImplementedError(f"{what}: seam = between bodies is not part of this version; leave it out")
-    slave, master = slave_and_master(a, b)
+    slave, master, width = slave_and_master(a, b)
     points, options["points"] = options["points"], None
     o = _checked_options(what, slave, dict(options))
     corners = {len(slave.body.family.faces[int(face)]) for face in np.unique(slave.faces[:, 1])}
@@ -153,7 +153,7 @@ def make_pair(
             )
     o["points"] = None if points is None else int(points)
     o["index"] = len(d.contacts_of(FacetOptions))
-    return PairContact(first=a, second=b, name=name, slave=slave, master=master, **o)
+    return PairContact(first=a, second=b, name=name, slave=slave, master=master, width=width, **o)
 
 
 def pairs_without_contact(d: Description, options: Collection[str]) -> list[tuple[Body, Body | Collider]]:

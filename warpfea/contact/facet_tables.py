@@ -41,7 +41,7 @@ def slave_points(contact: FacetOptions) -> tuple[ContactPoints, Any]:
     """Points of a contact, and the factor on their stiffness by area."""
     if isinstance(contact, ObstacleContact):
         return obstacle_points(contact)
-    return pair_points(contact.surfaces[0], contact.points), 1.0
+    return pair_points(contact.surfaces[0], contact.points, contact.width), 1.0
 
 
 class PairTables(FacetTables[FacetOptions]):

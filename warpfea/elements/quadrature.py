@@ -10,7 +10,7 @@ from ..mesh.cells import CENTROID, TET14_ORBITS, edge_orbit, vertex_orbit
 
 __all__ = [
     "TET_RULES", "Rule", "box_rule", "composite_rule", "conical_tet", "conical_triangle", "lobatto_square",
-    "square_rule", "triangle_3", "triangle_6", "triangle_7", "triangle_16",
+    "square_rule", "trapezoidal_rule", "triangle_3", "triangle_6", "triangle_7", "triangle_16",
 ]  # fmt: skip
 
 
@@ -186,3 +186,17 @@ def composite_rule(rule: Rule, parts: int) -> Rule:
         cells += [(np.array([i + 1, j + 1]), -1.0) for i in range(parts - 1) for j in range(parts - 1 - i)]
     points = np.concatenate([(corner + sign * rule.points) / parts for corner, sign in cells])
     return Rule(f"{rule.name}/{parts}", points, np.tile(rule.weights, len(cells)) / parts**2, rule.degree)
+
+
+def trapezoidal_rule(corners: int, parts: tuple[int, int]) -> Rule:
+    """Trapezoidal rule on parts[0] x parts[1] equal parts of the unit square, or on as many, the larger number, along
+    all sides of the unit triangle; of degree 1, with equidistant points, those on the sides included."""
+    a, b = parts if corners == 4 else (max(parts), max(parts))
+    i, j = (index.ravel() for index in np.meshgrid(np.arange(a + 1), np.arange(b + 1), indexing="ij"))
+    inside = [1.0 * (i > 0) + (i < a), 1.0 * (j > 0) + (j < b)]
+    weights = 0.25 * inside[0] * inside[1] / (a * b)
+    if corners == 3:
+        i, j = i[i + j <= a], j[i + j <= a]
+        on_sides = 1 * (i == 0) + (j == 0) + (i + j == a)
+        weights = np.array([6.0, 3.0, 1.0])[on_sides] / (6.0 * a * a)
+    return Rule(f"trapezoidal{a}x{b}", np.stack([i / a, j / b], axis=1), weights, 1)

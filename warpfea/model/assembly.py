@@ -344,13 +344,11 @@ def facet_tables(surface: SurfaceSet, parts: int = 1, rules: Mapping[int, Rule] 
     Args:
         surface: the faces.
         parts: the rule is repeated on parts x parts of a face.
-        rules: rule by the number of corners of a face, 3 or 4; by default the family's face rule for all.
+        rules: rule by local face; by default the family's face rule for all.
     """
     body, faces = surface.body, surface.faces
     kinds = [int(face) for face in np.unique(faces[:, 1])]
-    rule = {
-        k: composite_rule(rules[len(body.family.faces[k])] if rules else body.family.face_rule, parts) for k in kinds
-    }
+    rule = {k: composite_rule(rules[k] if rules else body.family.face_rule, parts) for k in kinds}
     Q, S = max((len(r.weights) for r in rule.values()), default=0), body.family.slots
     values = np.zeros((3, len(faces), Q, S))
     weights = np.zeros((len(faces), Q))

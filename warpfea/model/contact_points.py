@@ -31,6 +31,7 @@ __all__ = [
     "element_depths",
     "element_edge_and_depth",
     "lagrange_basis",
+    "points_by_faces",
     "points_by_rules",
 ]
 
@@ -94,6 +95,14 @@ def points_by_rules(
     body = surface.body
     rules = {corners: those[default[corners] if points is None else points] for corners, those in known.items()
              if points is None or points in those}  # fmt: skip
+    return points_by_faces(
+        surface, {face: rules[len(body.family.faces[face])] for face in np.unique(surface.faces[:, 1])}
+    )
+
+
+def points_by_faces(surface: SurfaceSet, rules: Mapping[int, Rule]) -> ContactPoints:
+    """The points of a surface by the rules of its local faces."""
+    body = surface.body
     t = assembly.facet_tables(surface, rules=rules)
     X, area = assembly.facet_positions_and_areas(body, t)
     x = body.reference[t.conn]

@@ -12,23 +12,18 @@ from typing import Any
 import numpy as np
 
 from ..elements.quadrature import lobatto_square, triangle_16
-from .contact_points import ContactPoints, contact_points, element_depths
+from .contact_points import ContactPoints, element_depths
 from .contacts import Collider
 from .handles import SurfaceSet
+from .narrow import WIDEST_GAP, facet_side, is_narrow
 from .pairs import FacetOptions
 from .shapes import BOX, CYLINDER, HALF_SPACE, SPHERE, Shape
 from .triangle_mesh import TriMesh
 
-__all__ = ["ObstacleContact", "is_narrow", "obstacle_points"]
+__all__ = ["ObstacleContact", "is_narrow_obstacle", "obstacle_points"]
 
-NARROW_RATIO = 0.55
-"""Width of an obstacle over the side of a body's facets up to which its points see the facets, not theirs it."""
-TALL_RATIO = 2.0
-"""Height of a rail or wall over that side up to which all of it has points."""
 SAGITTA_RATIO = 0.001
 """Height of a curved obstacle between two of its points, over the smaller of the side and the depth of an element."""
-WIDEST_GAP = 0.45
-"""Largest distance of points of a patch, over its side."""
 PATCH_ANGLES = math.radians(10.0), math.radians(45.0)
 """Least and largest angle of a patch of a round obstacle."""
 MAX_PATCHES = 64
@@ -66,15 +61,6 @@ class ObstacleContact(FacetOptions):
         return f"ObstacleContact({self.name!r}, body {self.body.name!r} with collider {self.collider.name!r})"
 
 
-def facet_side(surface: SurfaceSet) -> float:
-    """Mean side of the facets of a surface by their area, m: the longer one of beams and strips. All of one kind."""
-    corners = len(surface.body.family.faces[int(surface.faces[0, 1])])
-    p = contact_points(surface, corners)
-    X = p.X if corners == 3 else p.X[:, [0, 1, 3, 2]]
-    longest = np.linalg.norm(X - np.roll(X, 1, axis=1), axis=2).max(axis=1)
-    return float(np.average(longest, weights=p.area.sum(axis=1))) / (math.sqrt(2.0) if corners == 3 else 1.0)
-
-
 def _widths(shape: Shape) -> tuple[float, float]:
     """Least and second extent of a shape, m, its radius if it is round; infinite for half-spaces and sheets."""
     if shape.kind == HALF_SPACE or (isinstance(shape, TriMesh) and not shape.closed):
@@ -85,14 +71,13 @@ def _widths(shape: Shape) -> tuple[float, float]:
     return float(extent[0]), float(extent[1])
 
 
-def is_narrow(surface: SurfaceSet, collider: Collider) -> bool:
+def is_narrow_obstacle(surface: SurfaceSet, collider: Collider) -> bool:
     """True for an obstacle at rest that is narrower than the facets of a surface, all of them of one kind."""
     kinds = {len(surface.body.family.faces[int(face)]) for face in np.unique(surface.faces[:, 1])}
-    width, height = _widths(collider.shape)
-    if collider.moves or len(kinds) > 1 or math.isinf(width):
+    widths = _widths(collider.shape)
+    if collider.moves or len(kinds) > 1 or math.isinf(widths[0]):
         return False
-    side = facet_side(surface)
-    return width < NARROW_RATIO * side and height < TALL_RATIO * side
+    return is_narrow(widths, facet_side(surface))
 
 
 @dataclass(frozen=True)

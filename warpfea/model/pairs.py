@@ -13,10 +13,11 @@ from ..base.errors import ModelError
 from ..elements import Rule
 from ..elements.quadrature import lobatto_square, triangle_7, triangle_16
 from ..kernels.contact.thickness import thickness_kernel
-from .contact_points import ContactPoints, Modulus, effective_modulus, points_by_rules
+from .contact_points import ContactPoints, Modulus, effective_modulus, points_by_faces, points_by_rules
 from .contacts import ContactOptions
 from .discretisation import Discretisation, element_functions
 from .handles import SurfaceSet
+from .narrow import body_widths, facet_side, is_narrow, rules_for_width
 from .surfaces import measure_to_skin
 
 __all__ = [
@@ -77,6 +78,7 @@ class PairContact(FacetOptions):
     Attributes:
         first, second: faces of two bodies; forces of reports are those on the first.
         slave, master: their roles: points of the slave against facets of the master.
+        width: width of the master, m, that the points of the slave must see; None: by their rule.
     """
 
     first: SurfaceSet
@@ -84,6 +86,7 @@ class PairContact(FacetOptions):
     name: str
     slave: SurfaceSet
     master: SurfaceSet
+    width: float | None
 
     @property
     def surfaces(self) -> tuple[SurfaceSet, ...]:
@@ -129,21 +132,32 @@ class MasterFacets:
     depth_limit: np.ndarray
 
 
-def pair_points(surface: SurfaceSet, points: int | None = None) -> ContactPoints:
-    """Quadrature points of a slave surface, corners included: `points` per face, or 16, since meshes need not match."""
+def pair_points(surface: SurfaceSet, points: int | None = None, width: float | None = None) -> ContactPoints:
+    """Points of a slave surface, corners included: `points` per face, or 16, since meshes need not match; None with a
+    `width`, m: equidistant ones that a thing of this width can't pass between."""
+    if points is None and width is not None:
+        return points_by_faces(surface, rules_for_width(surface, width))
     return points_by_rules(surface, PAIR_RULES, {3: 16, 4: 16}, points)
 
 
-def slave_and_master(first: SurfaceSet, second: SurfaceSet) -> tuple[SurfaceSet, SurfaceSet]:
-    """(slave, master): the coarser surface is the master; at equal size the stiffer, then the second."""
+def slave_and_master(first: SurfaceSet, second: SurfaceSet) -> tuple[SurfaceSet, SurfaceSet, float | None]:
+    """Slave, master, and `PairContact.width`.
+
+    The side that is narrower than the other's facets is the slave. Otherwise, or if both are (crossed bars), the
+    coarser surface is the master; at equal size the stiffer, then the second.
+    """
+    widths = [body_widths(surface.body) for surface in (first, second)]
+    narrow = [is_narrow(width, facet_side(other)) for width, other in zip(widths, (second, first))]
+    if narrow[0] != narrow[1]:
+        return (first, second, None) if narrow[0] else (second, first, None)
     sides = []
     for surface in (first, second):
         area = pair_points(surface).area.sum(axis=1)
         sides.append((math.sqrt(float(area.mean())), effective_modulus(surface.body, surface)[0]))
     (size_1, modulus_1), (size_2, modulus_2) = sides
     if size_1 > MASTER_SIZE_RATIO * size_2 or (size_2 <= MASTER_SIZE_RATIO * size_1 and modulus_1 > modulus_2):
-        return second, first
-    return first, second
+        return second, first, widths[0][0] if narrow[0] else None
+    return first, second, widths[1][0] if narrow[1] else None
 
 
 def monomial_exponents(corners: int, degree: int) -> np.ndarray:
