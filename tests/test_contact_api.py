@@ -231,7 +231,7 @@ def test_a_run_in_progress_takes_new_values():
 
 def test_static_friction_follows_where_it_was_equal():
     model = thrown(worlds=2)[2]
-    data = model.terms.contact.tables.data
+    data = model.terms.named("contact").tables.data
     model.set_parameter("pad.mu_static", [0.5, 0.6])
     model.set_parameter("pad.mu", 0.2)
     assert data.mu.numpy()[:, 0].tolist() == [0.2, 0.2]

@@ -184,3 +184,61 @@ def test_a_block_falls_freely_beside_the_border_of_a_body(beside, facet, whole):
     assert not sim.contact_record(pad).force.any()
     fallen = 0.055 - sim.positions(block)[0, :, 2].mean()
     assert fallen == pytest.approx(0.5 * G * 0.12 * 0.122, rel=1e-9)  # backward Euler
+
+
+def on_a_rail(z, **options):
+    """A plate with its lower face at z, and a rail narrower than its facets, with friction."""
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    mesh = wf.mesh.box((1.0, 0.4, 0.02), cells=(4, 2, 1), origin=(-0.5, -0.2, z), element="T10")
+    body = b.add_solid(mesh, material=wf.SVK(E=1e7, nu=0.3, density=RHO), name="plate")
+    rail = b.add_collider(wf.Box((0.0, 0.0, -0.05), (0.02, 1.0, 0.1)), name="rail")
+    b.add_contact(body, rail, mu=0.3, name="pad", **options)
+    return b, body, rail
+
+
+def test_messages_name_the_rail_whose_points_they_give():
+    b, _, _ = on_a_rail(-1e-3, overlap="refuse")
+    text = r"contact 'pad': collider 'rail' begins 0.001 m inside body 'plate' \(world 0, reference point \(\S*0.01, "
+    with pytest.raises(wf.ModelError, match=text):
+        wf.Simulation(b.finalize(device="cpu"), dt=1e-3)
+    b, body, _ = on_a_rail(1e-3)
+    b.set_initial(body, velocity=(0, 0, -100.0))
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-3, solver=wf.NewtonPCG(max_halvings=0))
+    text = r"a point of collider 'rail' \(reference place \S*0.00\d+, .* went through body 'plate'; .* thicker body"
+    with pytest.raises(wf.PenetrationError, match=text):
+        sim.step()
+
+
+def test_a_rail_is_contact_with_an_obstacle():
+    b, _, rail = on_a_rail(0.0)
+    model = b.finalize(device="cpu")
+    assert not {"contact", "friction"} & set(model.info()["left_out"])
+    assert "contact between bodies" in model.info()["left_out"]
+    (fact,) = model.info()["contacts"]
+    assert (fact["body"], fact["collider"]) == ("plate", "rail")
+    second = b.add_solid(wf.mesh.box((0.1,) * 3, cells=(8, 8, 8), origin=(0, 0, 1)), material=MAT, name="fine")
+    pad = b.add_contact(second, rail)
+    for steps in range(2):  # alone, and beside contact of points of a body
+        with pytest.raises(wf.ModelError, match=r"collider 'rail': offset can't be set: .* facets of body 'plate'"):
+            b.finalize(device="cpu").set_parameter("rail.offset", -5e-4)
+        if steps == 0:
+            b.description.contacts.remove(pad)
+
+
+@pytest.mark.parametrize("option", [{"points": 7}, {"seam": 0.01}])
+def test_options_that_points_of_a_rail_lack_are_refused(option):
+    with pytest.raises(NotImplementedError, match=rf"'pad': {next(iter(option))} = for collider 'rail', .* 'plate'"):
+        on_a_rail(0.0, **option)
+
+
+def test_moving_obstacles_beside_a_rail_are_where_their_paths_lead():
+    b, _, _ = on_a_rail(1e-3)
+    b.add_collider(wf.Sphere((5, 0, 0), 0.1), path=([0, 2e-3], [(0, 0, 0), (1, 0, 0)]))
+    turn = wf.Rotation(anchor=(5, 1, 0), axis=(0, 0, 2), angle=([0, 2e-3], [0, 0.5 * np.pi]))
+    b.add_collider(wf.Box((6, 1, 0), (0.4, 0.1, 0.1)), path=turn)
+    sim = wf.Simulation(b.finalize(device="cpu", worlds=2), dt=1e-3)
+    sim.step(2)
+    position, axes, offset = sim.collider_poses()
+    np.testing.assert_allclose(position[1], [(0, 0, -0.05), (6, 0, 0), (5, 2, 0)], atol=1e-12)
+    np.testing.assert_allclose(axes[1, 2], [(0, -1, 0), (1, 0, 0), (0, 0, 1)], atol=1e-12)
+    assert not offset.any()

@@ -29,7 +29,7 @@ def test_sizes_of_elements(element, size):
         mesh = wf.mesh.box((0.1, 0.1, 0.1), cells=(2, 2, 2), element=element)
         body = b.add_solid(mesh, material=SOFT, element=element)
     pad = b.add_contact(body, b.add_collider(wf.HalfSpace((0, 0, 1), -1.0)))
-    term = b.finalize(device="cpu").terms.contact
+    term = b.finalize(device="cpu").terms.named("contact")
     np.testing.assert_allclose(term.element_size(pad), size, rtol=1e-9)
 
 

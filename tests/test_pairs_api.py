@@ -353,7 +353,7 @@ def test_a_scene_without_pairs_has_nothing_of_them(obstacle):
         b.clamp(block.nodes("z-"))
     model = b.finalize(device="cpu")
     sim = wf.Simulation(model, dt=1e-3)
-    assert model.terms.pairs is None
+    assert model.terms.named("pairs") is None
     assert "contact between bodies" in model.info()["left_out"]
     assert not [module for module in sim.stepper.launch.modules if "pair" in module]
     assert not [name for name in sim.state.specs if name.startswith("pairs")]

@@ -163,7 +163,7 @@ def test_a_scene_without_a_mesh_has_nothing_of_it():
     for name, shape in (("box", BOX), ("closed", boxed()), ("sheet", wf.TriMesh(*sheet()))):
         sim = moved(2, shape)[1]
         names[name] = {module.name.rpartition(".")[2] for module in sim.stepper.modules()}
-        assert hasattr(sim.model.terms.contact.tables.shapes, "mesh") == (name != "box")
+        assert hasattr(sim.model.terms.named("contact").tables.shapes, "mesh") == (name != "box")
     assert not any("meshes" in module for module in names["box"])
     assert {m.replace("_meshes", "") for m in names["closed"]} == names["box"]
     assert names["sheet"] == names["closed"]

@@ -59,25 +59,26 @@ class ContactMethods:
             model: "patch", spread over the surface, or "sphere", one contact at the deepest place, by Hertz.
             radius: m; "patch": disc whose area replaces the surface's; "sphere": local radius of the body.
             offset: gap at which contact begins, m.
-            points: points of each face, see warpfea.model.contact_points; by default 7 or 4 x 4, between bodies 16.
+            points: points of each face, see warpfea.model.contact_points; by default 7 or 4 x 4, between bodies 16;
+                not for obstacles narrower than the facets.
             smoothing: "paper": depth over which its damping is ramped in, m; "smooth": (eps in N, v_eps in m/s).
             overlap: initial overlap: "refuse"; "offset": stored, decaying in `overlap_time`, s (statics: load factor);
                 "auto": stored and said up to 5 % of the smallest edge of a face and 25 % of the depth of an element.
             seam: largest difference of level, m, at which the body passes from one of its colliders to the next, fixed
                 to it, as over one surface, also over a gap of up to a fifth of the surface's width; None: a thousandth
                 of the width, the second largest edge of the surface's bounding box. More is a step with a side face.
-                0 or above, not for two bodies.
+                0 or above, not for two bodies or obstacles narrower than the facets.
             name: unique name; by default "BODY on COLLIDER".
 
         Bodies without a contact pass through each other; `Simulation(check_overlap=True)` names them. Between
         two, reported forces act on the first.
 
         Returns:
-            Contact, PairContact: the handle for reports.
+            Contact, ObstacleContact (narrower than the facets), PairContact: the handle for reports.
 
         Raises:
             ModelError: a value out of range, an unknown name, no faces, or a handle of another builder.
-            NotImplementedError: a body with itself, model = "sphere" or law = "smooth" between bodies.
+            NotImplementedError: a body with itself, options that bodies or narrow obstacles lack.
         """
         for side in (surface, collider) if isinstance(collider, (Body, SurfaceSet)) else (surface,):
             body_of_handle(side, "add_contact", (Body, SurfaceSet), self.description.bodies)

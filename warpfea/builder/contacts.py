@@ -115,7 +115,13 @@ def make_contact(
         )
     patch = o["model"] == "patch" and o["treatment"] == "implicit" and not LAWS[o["law"]].traits & ANY_GAP
     if patch and is_narrow_obstacle(surface, collider):
-        o |= {"points": None, "index": len(d.contacts_of(FacetOptions))}
+        for option in ("points", "seam"):
+            if o[option] is not None:
+                raise NotImplementedError(
+                    f"contact {name!r}: {option} = for collider {collider.name!r}, narrower than the facets of body "
+                    f"{surface.body.name!r}, is not part of this version; leave it out, or take finer facets"
+                )
+        o["index"] = len(d.contacts_of(FacetOptions))
         return ObstacleContact(surface=surface, collider=collider, name=name, **o)
     return Contact(surface, collider, name, index=len(d.contacts_of(Contact)), **o)
 

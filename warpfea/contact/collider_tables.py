@@ -19,6 +19,7 @@ from ..kernels.contact.structs import collider_struct, contact_struct
 from ..model import assembly
 from ..model.contact_points import ContactPoints, Modulus, body_mass_total, contact_points, effective_modulus
 from ..model.contacts import Collider, Contact
+from ..model.pairs import FacetOptions
 from ..model.shapes import HalfSpace, Shape
 from ..model.triangle_mesh import TriMesh
 from ..terms.time_law_table import TimeLawTable
@@ -92,7 +93,9 @@ class ContactTables(FacetTables[Contact]):
 
     def parameters(self) -> dict[str, Callable[[Any, np.ndarray], None]]:
         """Setters of the parameters of contacts and colliders."""
-        return super().parameters() | {f"{k.name}.offset": partial(self._set_surface_offset, k) for k in self.colliders}
+        narrow = [contact.sides[1] for contact in self.model.description.contacts_of(FacetOptions)]
+        setters = {f"{k.name}.offset": partial(self._set_surface_offset, k) for k in self.colliders if k not in narrow}
+        return super().parameters() | setters
 
     def _set_surface_offset(self, collider: Collider, values: Any, mask: np.ndarray) -> None:
         """Offset the surface of a collider along its normals in the chosen worlds."""

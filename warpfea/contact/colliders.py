@@ -234,24 +234,18 @@ class ColliderContact(ContactTerm):
         weight = kept[1] if self.tables.tracks_deepest else ctx.scratch[self.name]["attempt"].shape_values
         self._add_facet_blocks(ctx, matrix, kept[0], weight, dq_dv, active, out)
 
-    def sides_text(self, contact: Any) -> tuple[str, str, str]:
-        return contact.body.name, f"collider {contact.collider.name!r}", "shape"
-
     def _turn_text(self, contact: Any) -> str:
         return (
             f"collider {contact.collider.name!r} turns by more than {MAX_COLLIDER_ROTATION:g} rad in the step, in "
             "which it is touched; take a smaller dt"
         )
 
-    def _contact_text(self, contact: Any) -> str:
-        return f"{contact.name!r} with collider {contact.collider.name!r}"
-
-    def _contact_info(self, contact: Any, k: int) -> tuple[dict[str, Any], dict[str, Any]]:
+    def _contact_info(self, contact: Any, k: int) -> dict[str, Any]:
         """`left_out`: points that don't act because their slots are clamped."""
         numbers = {"left_out": self.tables.clamped_point_counts[k]}
         if isinstance(contact.collider.shape, TriMesh):
             numbers["triangles"] = len(contact.collider.shape.triangles)
-        return {"body": contact.body.name, "collider": contact.collider.name}, numbers
+        return numbers
 
     # at a state
 
@@ -277,8 +271,7 @@ class ColliderContact(ContactTerm):
         return nodal_force(self.tables, self.at_points(state)[1])
 
     def poses(self, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """Positions (worlds, colliders, 3), m, rotations (..., 3, 3) and surface offsets (worlds, colliders), m, of the
-        colliders at a state; None without history."""
+        """As of `Touching`; None without history."""
         if "contact_position" not in state.specs:
             return None
         return state.contact_position.numpy(), state.contact_rotation.numpy(), self.tables.shapes.margin.numpy()  # type: ignore[attr-defined]

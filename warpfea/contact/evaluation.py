@@ -344,9 +344,9 @@ def store_overlaps(term: Any, depth: np.ndarray, touching: np.ndarray, overlap: 
         if limit is None:
             limit = float((AUTO_OVERLAP_RATIOS * term.element_sizes[k]).min())
         world, point = np.unravel_index(int(mine.argmax()), mine.shape)
-        body, other, _ = term.sides_text(contact)
+        of, touched = contact.texts
         where = f"world {world}, reference point {reference_position_text(tables, k, int(point))}"
-        text = f"contact {contact.name!r}: body {body!r} begins {mine.max():.3g} m inside {other} ({where}"
+        text = f"contact {contact.name!r}: {of} begins {mine.max():.3g} m inside {touched} ({where}"
         if mine.max() > limit:
             stores = f"; overlap='auto' stores up to {limit:.3g} m" if contact.overlap == "auto" else ""
             raise ModelError(
@@ -404,7 +404,7 @@ def refuse_deep_overlaps(
             if depth.max() > least:
                 point = int(np.flatnonzero(near[world])[depth.argmax()])
                 raise ModelError(
-                    f"contact {contact.name!r}: {contact.points_of} begins within body {body.name!r} "
+                    f"contact {contact.name!r}: {' begins within '.join(contact.texts)} "
                     f"(world {world}, reference point {reference_position_text(tables, k, point)}, "
                     f"{depth.max():.3g} m deep), where no facet of the contact reaches; move one of them, or leave "
                     "these faces out of the contact"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -13,12 +14,12 @@ from ..base.errors import ModelError
 from ..kernels.contact.facet_structs import master_struct
 from ..kernels.contact.structs import contact_struct
 from ..model.contact_points import ContactPoints, corner_points, element_depths
+from ..model.contacts import Collider, Contact
 from ..model.handles import SurfaceSet
 from ..model.obstacle_points import ObstacleContact, obstacle_points
 from ..model.pairs import (
     FacetOptions,
     MasterFacets,
-    PairContact,
     bernstein_from_monomials,
     contact_constants,
     master_facets,
@@ -44,6 +45,15 @@ def slave_points(contact: FacetOptions) -> tuple[ContactPoints, Any]:
     return pair_points(contact.surfaces[0], contact.points, contact.width), 1.0
 
 
+def refuse_offset(contact: FacetOptions, values: Any, mask: np.ndarray) -> None:
+    """Raise ModelError: an offset of an obstacle whose points touch facets."""
+    body, collider = contact.sides
+    raise ModelError(
+        f"collider {collider.name!r}: offset can't be set: it is narrower than the facets of body {body.name!r} "
+        f"(contact {contact.name!r}); take finer facets, or move it by its path="
+    )
+
+
 class PairTables(FacetTables[FacetOptions]):
     """Contacts between bodies of a model, and of obstacles narrower than the facets of a body; points lie on the slave
     surfaces, or on the obstacles.
@@ -52,6 +62,7 @@ class PairTables(FacetTables[FacetOptions]):
         surfaces, masters: distinct master surfaces and their facets; master_of: master surface of each contact.
         region_areas: contact area of each contact, m^2.
         facets: number of master facets. bodies: bodies in a pair. corners: of the slave facets of each group.
+        collider_laws: all colliders with the numbers of their time laws, if poses follow from these alone.
         max_gap: largest reported gap, m. max_overlap_depth: search depth of initial overlaps, m.
     """
 
@@ -83,12 +94,10 @@ class PairTables(FacetTables[FacetOptions]):
         clamped = clamped_slots(self.model)
         for contact, slots in zip(self.contacts, self.slots):
             if clamped[slots].all():
-                sides = [contact.points_of, f"body {contact.facets.body.name!r}"]
-                if isinstance(contact, PairContact):
-                    sides = [repr(side.body.name) for side in (contact.first, contact.second)]
+                bodies = " and ".join(repr(side.name) for side in contact.sides[: 2 - contact.grounded])
                 raise ModelError(
-                    f"contact {contact.name!r}: all of the surfaces of bodies {' and '.join(sides)} is clamped; leave "
-                    "the contact out, or free one of them"
+                    f"contact {contact.name!r}: all of the surfaces of bodies {bodies} is clamped; leave the contact "
+                    "out, or free one of them"
                 )
 
     def _region_area(self, contact: FacetOptions) -> float:
@@ -134,6 +143,11 @@ class PairTables(FacetTables[FacetOptions]):
             abs(contact.offset) for contact in self.contacts
         )
         self.max_overlap_depth = max(float(mas.depth_limit.max()) for mas in self.masters)
+        self.collider_laws: list[tuple[Collider, int]] = []
+        if any(contact.grounded for contact in self.contacts) and not self.model.description.contacts_of(Contact):
+            for collider in self.model.description.colliders:
+                law = collider.rotation.angle if collider.rotation else collider.law
+                self.collider_laws.append((collider, laws.add(law) if law is not None else -1))
         self.max_gap = max(float(mas.size.max()) for mas in self.masters)
         self.master_conn = self._master_conn()
         self.other_entries = self.master_conn.size
@@ -148,6 +162,11 @@ class PairTables(FacetTables[FacetOptions]):
             "normal_damping": normal_damping(row["damping_stiffness"], row["effective_mass"]),
             "compliance": compliance(contact, row["normal_stiffness"], region, *sides),
         }
+
+    def parameters(self) -> dict[str, Callable[[Any, np.ndarray], None]]:
+        """Setters of the parameters of contacts; refusals of the offsets of their obstacles."""
+        obstacles = [contact for contact in self.contacts if contact.grounded]
+        return super().parameters() | {f"{c.sides[1].name}.offset": partial(refuse_offset, c) for c in obstacles}
 
     @property
     def parameter_arrays(self) -> dict[str, wp.array]:
@@ -238,8 +257,7 @@ class PairTables(FacetTables[FacetOptions]):
         for contact, p, k in zip(self.contacts, self.host, self.master_of):
             fixed = ("first", "second", "slave", "master", "surface", "collider", *WORLD_PARAMETERS)
             values = {name: v for name, v in vars(contact).items() if name not in fixed}
-            names = [getattr(contact, side).body.name for side in ("first", "second") if hasattr(contact, side)]
-            h.update(f"{' '.join(names or [contact.points_of])} {sorted(values.items())}".encode())
+            h.update(f"{' '.join(side.name for side in contact.sides)} {sorted(values.items())}".encode())
             h.update(np.ascontiguousarray(p.faces).tobytes() + np.ascontiguousarray(self.surfaces[k].faces).tobytes())
             if isinstance(contact, ObstacleContact):
                 h.update(p.X.tobytes())

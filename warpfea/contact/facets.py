@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
+from ..base.launch import Launcher
 from ..base.worlds import device_flags
 from ..kernels.common.state import state_kernels
 from ..kernels.contact.assembly import block_kernels
@@ -21,8 +22,7 @@ from ..kernels.contact.facet_structs import (
 )
 from ..kernels.contact.point_lists import FACETS_PER_CHUNK, point_list_kernels
 from ..kernels.contact.rigid_modes import pair_rigid_mode_kernels
-from ..model.obstacle_points import ObstacleContact
-from ..model.pairs import FacetOptions, PairContact
+from ..model.pairs import FacetOptions
 from ..model.state import State, view_as_words
 from ..terms.protocols import Coupled, Tied
 from ..terms.term import StepContext, part
@@ -58,7 +58,11 @@ class FacetContact(ContactTerm, Tied, Coupled):
 
     @classmethod
     def features(cls, model: Model) -> dict[str, bool]:
-        return {"contact between bodies": bool(model.description.contacts_of(FacetOptions))}
+        contacts = model.description.contacts_of(FacetOptions)
+        grounded = {contact.grounded for contact in contacts}
+        return {"contact": True in grounded, "contact between bodies": False in grounded} | {
+            "friction": any(contact.mu_static > 0.0 for contact in contacts)
+        }
 
     def tied_slots(self) -> list[np.ndarray]:
         """Bodies in contact form one component."""
@@ -264,13 +268,13 @@ class FacetContact(ContactTerm, Tied, Coupled):
 
     def coupled_bodies(self) -> list[tuple[int, int]]:
         number = {id(body): k for k, body in enumerate(self.model.bodies)}
-        pairs = [c for c in self.tables.contacts if isinstance(c, PairContact)]
-        return [(number[id(c.first.body)], number[id(c.second.body)]) for c in pairs]
+        pairs = [c.sides for c in self.tables.contacts if not c.grounded]
+        return [(number[id(first)], number[id(second)]) for first, second in pairs]
 
     def mark_constrained(self, free: np.ndarray) -> None:
         """Obstacles hold the bodies that they touch."""
         for contact in self.tables.contacts:
-            if isinstance(contact, ObstacleContact):
+            if contact.grounded:
                 free[np.unique(self.model.components.of_slot[contact.body.slots])] = 0.0
 
     def allocate_mode_coupling(self, ctx: StepContext, motions: Any) -> Iterable[wp.Module]:
@@ -283,17 +287,8 @@ class FacetContact(ContactTerm, Tied, Coupled):
     def add_mode_coupling(self, ctx: StepContext, kept: list[wp.array], dq_dv: wp.array, active: wp.array) -> None:
         ctx.scratch[self.name]["motions"].add(kept, dq_dv, active)
 
-    def sides_text(self, contact: Any) -> tuple[str, str, str]:
-        if isinstance(contact, ObstacleContact):
-            return contact.body.name, contact.points_of, "body"
-        return contact.slave.body.name, f"body {contact.master.body.name!r}", "body"
-
-    def _contact_info(self, contact: Any, k: int) -> tuple[dict[str, Any], dict[str, Any]]:
-        if isinstance(contact, ObstacleContact):
-            names = {"body": contact.body.name, "collider": contact.collider.name}
-        else:
-            names = {"body": contact.first.body.name, "with": contact.second.body.name}
-        return names, {"facets": len(self.tables.masters[self.tables.master_of[k]].conn), "left_out": 0}
+    def _contact_info(self, contact: Any, k: int) -> dict[str, Any]:
+        return {"facets": len(self.tables.masters[self.tables.master_of[k]].conn), "left_out": 0}
 
     # at a state
 
@@ -302,14 +297,14 @@ class FacetContact(ContactTerm, Tied, Coupled):
         return evaluate_pairs(self, state).nodal_force()
 
     def poses(self, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """As of `ColliderContact`, of colliders at rest; None without an obstacle among the contacts."""
-        colliders = self.model.description.colliders
-        if not any(isinstance(contact, ObstacleContact) for contact in self.tables.contacts):
+        """As of `Touching`, by the time laws; None if `ColliderContact` has them, or no contact an obstacle."""
+        laws = self.tables.collider_laws
+        if not laws:
             return None
-        frames = [collider.shape.frame() for collider in colliders]
-        position, rotation = (np.stack([frame[k] for frame in frames]) for k in (0, 1))
-        worlds = (state.worlds, 1, 1)
-        return np.tile(position, worlds), np.tile(rotation, (*worlds, 1)), np.zeros((state.worlds, len(colliders)))
+        value = self.model.terms.time_laws.values_at_state(Launcher(self.model.device), state)[0].numpy()
+        found = [collider.poses(value[:, law]) for collider, law in laws]
+        position, rotation = (np.stack(parts, axis=1) for parts in zip(*found))
+        return position, rotation, np.zeros(position.shape[:2])
 
     def samples(self, field: str, body: Any, state: State) -> np.ndarray:
         bodies = [side.body for contact in self.tables.contacts for side in contact.surfaces]

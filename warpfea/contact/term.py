@@ -67,7 +67,7 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
     `make_other`                   struct `Other` of the device functions, with its arrays in the state
     `_allocate_other`              arrays of an attempt of that struct
     `_begin_other`                 the other side at the start of an attempt, such as poses
-    `sides_text`, `_contact_info`  texts and numbers of messages and of `Model.info`
+    `_contact_info`                numbers of `Model.info`
     `_turn_text`                   reason where `evaluate` returns TURNED
     `_find_other`                  search at an iterate
     `_find_accepted`               search at the accepted iterate
@@ -372,16 +372,12 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
         contact = t.contacts[k]
         if found < 0:
             return PenetrationError, f"contact {contact.name!r}: {self._turn_text(contact)}"
-        body, other, thicker = self.sides_text(contact)
+        (of, touched), thicker = contact.texts, "body" if contact.sign < 0.0 or not contact.grounded else "shape"
         return PenetrationError, (
-            f"contact {contact.name!r}: a point of body {body!r} (reference place "
-            f"{reference_position_text(t, k, point - int(t.first[k]))}) went through {other}; take a larger "
+            f"contact {contact.name!r}: a point of {of} (reference place "
+            f"{reference_position_text(t, k, point - int(t.first[k]))}) went through {touched}; take a larger "
             f"stiffness= of the contact or a thicker {thicker}, or a smaller dt where it moves that far in a step"
         )
-
-    def sides_text(self, contact: Any) -> tuple[str, str, str]:
-        """Body of the points, the other side, and the noun of what could be thicker, for messages."""
-        raise NotImplementedError
 
     def _turn_text(self, contact: Any) -> str:
         """Reason of a refused rotation of the other side."""
@@ -390,13 +386,11 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
     def failure_note(self, ctx: StepContext, world: int) -> str:
         touched = ctx.scratch[self.name]["attempt"].facet_activity.numpy()[world] > 0
         t, most = self.tables, MAX_NAMED_CONTACTS
-        names = [self._contact_text(contact) for k, contact in enumerate(t.contacts)
+        names = [f"{contact.name!r}{f' with collider {contact.sides[1].name!r}' * contact.grounded}"
+                 for k, contact in enumerate(t.contacts)
                  if touched[t.row_start[k] : t.row_start[k + 1]].any()]  # fmt: skip
         more = f" and {len(names) - most} more" if len(names) > most else ""
         return f"; in touch: contact {', '.join(names[:most])}{more}" if names else ""
-
-    def _contact_text(self, contact: Any) -> str:
-        return repr(contact.name)
 
     # parameters and info
 
@@ -413,13 +407,13 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
         t, out = self.tables, []
         for contact in sorted(t.contacts, key=lambda c: c.index):
             k = t.number[contact.index]
-            names, numbers = self._contact_info(contact, k)
-            points = {"points": int((t.area_fractions[k] > 0.0).sum())}
-            out.append({"name": contact.name} | names | {"law": contact.law, "model": contact.model} | points | numbers)
+            names = zip(("body", "collider" if contact.grounded else "with"), (side.name for side in contact.sides))
+            points = {"points": int((t.area_fractions[k] > 0.0).sum())} | self._contact_info(contact, k)
+            out.append({"name": contact.name} | dict(names) | {"law": contact.law, "model": contact.model} | points)
         return out
 
-    def _contact_info(self, contact: Any, k: int) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Names of both sides, and further numbers."""
+    def _contact_info(self, contact: Any, k: int) -> dict[str, Any]:
+        """Further numbers."""
         raise NotImplementedError
 
 

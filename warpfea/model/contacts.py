@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from scipy.spatial.transform import Rotation as Turn
 
 from ..time_laws import Rotation, TimeLaw
 from .discretisation import Discretisation
@@ -41,6 +45,15 @@ class Collider:
         """True with a path, also a constant displacement."""
         return self.law is not None or self.rotation is not None
 
+    def poses(self, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Positions (n, 3), m, and axes (n, 3, 3) at values (n, 3) of its law, m, or of its angle, rad."""
+        position, axes = (np.tile(x, (len(value), *[1] * x.ndim)) for x in self.shape.frame())
+        if self.rotation is not None:
+            turn = Turn.from_rotvec(value[:, :1] * np.asarray(self.rotation.axis)).as_matrix()
+            anchor = np.asarray(self.rotation.anchor)
+            return anchor + np.einsum("nij,nj->ni", turn, position - anchor), turn @ axes
+        return position + value if self.law is not None else position, axes
+
     def __repr__(self) -> str:
         return f"Collider({self.name!r}, {type(self.shape).__name__}{', moves' if self.moves else ''})"
 
@@ -65,7 +78,10 @@ class ContactOptions:
         overlap_time: time in which a stored overlap decays, s.
         seam: largest difference of level of two colliders that is a seam, m, or None.
         index: number in its builder, of contacts of its class.
+        sign: 1, or -1 where its points belong to the second of `sides`, as reports state the force on the first.
     """
+
+    sign: ClassVar[Any] = 1.0
 
     mu: float = 0.0
     mu_static: float = 0.0
@@ -84,6 +100,37 @@ class ContactOptions:
     seam: float | None = None
     index: int = -1
 
+    @property
+    def surfaces(self) -> tuple[SurfaceSet, ...]:
+        """Surfaces of bodies in the contact."""
+        raise NotImplementedError
+
+    @property
+    def body(self) -> Discretisation:
+        """The body of the first of them."""
+        return self.surfaces[0].body
+
+    @property
+    def roles(self) -> tuple[Any, Any]:
+        """The body or collider of the points, and the one that these touch."""
+        raise NotImplementedError
+
+    @property
+    def sides(self) -> tuple[Any, Any]:
+        """Both of them in the order of reports: a collider, or the second body, comes last."""
+        return self.roles if self.sign > 0.0 else self.roles[::-1]
+
+    @property
+    def grounded(self) -> bool:
+        """True if one side is a collider."""
+        return isinstance(self.sides[1], Collider)
+
+    @property
+    def texts(self) -> tuple[str, str]:
+        """Texts of `roles` for messages."""
+        of, touched = (f"{'collider' if isinstance(x, Collider) else 'body'} {x.name!r}" for x in self.roles)
+        return of, touched
+
 
 @dataclass(eq=False)
 class Contact(ContactOptions):
@@ -100,14 +147,12 @@ class Contact(ContactOptions):
     name: str
 
     @property
-    def body(self) -> Discretisation:
-        """The body of the surface."""
-        return self.surface.body
+    def surfaces(self) -> tuple[SurfaceSet, ...]:
+        return (self.surface,)
 
     @property
-    def surfaces(self) -> tuple[SurfaceSet, ...]:
-        """Surfaces of bodies in the contact."""
-        return (self.surface,)
+    def roles(self) -> tuple[Any, Any]:
+        return self.body, self.collider
 
     def __repr__(self) -> str:
         return f"Contact({self.name!r}, body {self.body.name!r} with collider {self.collider.name!r})"

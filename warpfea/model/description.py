@@ -137,10 +137,7 @@ class Description:
     @property
     def contact_pairs(self) -> set[frozenset[int]]:
         """Identities of both sides, bodies or colliders, of each contact."""
-        return {
-            frozenset({id(side.body) for side in c.surfaces} | {id(getattr(c, "collider", c.body))})
-            for c in self.contacts
-        }
+        return {frozenset(map(id, c.sides)) for c in self.contacts}
 
     @property
     def attached_pairs(self) -> set[frozenset[int]]:

@@ -53,9 +53,8 @@ class ObstacleContact(FacetOptions):
         return (self.surface,)
 
     @property
-    def points_of(self) -> str:
-        """As of `FacetOptions`."""
-        return f"collider {self.collider.name!r}"
+    def roles(self) -> tuple[Any, Any]:
+        return self.collider, self.body
 
     def __repr__(self) -> str:
         return f"ObstacleContact({self.name!r}, body {self.body.name!r} with collider {self.collider.name!r})"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -45,25 +45,13 @@ RANK_TOL = 0.1
 
 @dataclass(eq=False)
 class FacetOptions(ContactOptions):
-    """Base of contacts of points with the facets of a body; `slave`: the side of the points.
+    """Base of contacts of points with the facets of a body, those of the last of its surfaces.
 
     Attributes:
-        points_of: text of that side, for messages. sign: 1, or -1 where reports state the force on the facets.
+        name: unique among the contacts of its builder.
     """
 
     name: str
-    sign: ClassVar[Any]
-    points_of: ClassVar[Any]
-
-    @property
-    def surfaces(self) -> tuple[SurfaceSet, ...]:
-        """Surfaces of bodies in the contact; the last one has the facets."""
-        raise NotImplementedError
-
-    @property
-    def body(self) -> Discretisation:
-        """The body of the first of them."""
-        return self.surfaces[0].body
 
     @property
     def facets(self) -> SurfaceSet:
@@ -93,14 +81,13 @@ class PairContact(FacetOptions):
         return self.slave, self.master
 
     @property
-    def sign(self) -> float:
-        """As of `FacetOptions`."""
-        return 1.0 if self.slave is self.first else -1.0
+    def roles(self) -> tuple[Any, Any]:
+        return self.slave.body, self.master.body
 
     @property
-    def points_of(self) -> str:
-        """As of `FacetOptions`."""
-        return f"body {self.slave.body.name!r}"
+    def sign(self) -> float:
+        """As of `ContactOptions`."""
+        return 1.0 if self.slave is self.first else -1.0
 
     def __repr__(self) -> str:
         return f"PairContact({self.name!r}, bodies {self.first.body.name!r} and {self.second.body.name!r})"

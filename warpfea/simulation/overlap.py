@@ -124,7 +124,7 @@ class OverlapCheck:
     def __init__(self, sim: Any) -> None:
         d = sim.model.description
         known = d.contact_pairs | d.attached_pairs
-        posed = sim.model.terms.contact is not None
+        posed = sim.results.collider_poses() is not None
         obstacles = [collider for collider in d.colliders if posed or not collider.moves]
         pairs = [pair for pair in [*combinations(d.bodies, 2), *product(d.bodies, obstacles)]
                  if frozenset(map(id, pair)) not in known]  # fmt: skip

@@ -98,7 +98,7 @@ class Results:
     def collider_poses(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
         """Collider poses: positions (B, K, 3), m, rotations (B, K, 3, 3) with the shape's axes in the world as columns,
         and surface offsets (B, K), m; None for a model without contact."""
-        found = (term.poses(self.state) for term in (self.model.terms.contact, self.model.terms.pairs) if term)
+        found = (term.poses(self.state) for term in self.model.terms.contacts)
         return next((poses for poses in found if poses), None)
 
     @property

@@ -204,6 +204,11 @@ class Touching(Term):
 
     tables: Any
 
+    def poses(self, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """Positions (worlds, colliders, 3), m, rotations (..., 3, 3) and surface offsets (worlds, colliders), m, of all
+        colliders of the model at a state; None if unknown to the term."""
+        return None
+
     def nodal_force(self, state: State) -> np.ndarray:
         """Elastic nodal forces of all its contacts at a state, (worlds, slots, 3), N."""
         raise NotImplementedError

@@ -239,7 +239,7 @@ class TermSet:
         kinds = [*TERM_TYPES, *(type(term) for term in self.added_terms)]
         out: dict[str, bool] = {}
         for kind in kinds:
-            out |= kind.features(self.model)
+            out |= {name: on or out.get(name, False) for name, on in kind.features(self.model).items()}
         out |= {term.name: True for term in self.added_terms}
         return out | {"controls": bool(self.time_laws.controls)}
 
@@ -277,16 +277,6 @@ class TermSet:
     def contacts(self) -> list[Touching]:
         """Terms of contact, one for each geometry of the other side in use."""
         return self.having(Touching)
-
-    @property
-    def contact(self) -> Any:
-        """Term of contact with obstacles, or None."""
-        return self.named("contact")
-
-    @property
-    def pairs(self) -> Any:
-        """Term of contact between bodies, or None."""
-        return self.named("pairs")
 
     def set_parameter(self, name: Any, values: Any, mask: Any) -> None:
         """See Model.set_parameter."""
