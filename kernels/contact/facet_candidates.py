@@ -256,7 +256,7 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
             if is_folded(mas, pair, world, f, xi):
                 return -1
             rank = 0
-        elif rank < 4 and mas.bodies[slave.contact][0] == mas.bodies[slave.contact][1]:
+        elif rank < 4 and mas.grounded[slave.contact] != 0:
             return -1  # a point of an obstacle: the other sides of its edge have points of their own
         else:
             projection = surface_point(mas, pair.start_displacement, world, f, vec3d(xi[0], xi[1], f64(0.0)))

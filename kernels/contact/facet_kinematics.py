@@ -233,8 +233,8 @@ def facet_kinematics(dtype: str) -> KernelSet:
 
     @wp.func
     def report_sign(other: Other, c: int) -> f64:
-        """-1 where the points belong to the second body of a contact, as reports state the force on the first."""
-        return other.masters.sign[c]
+        """-1 where the points belong to the second side of a contact, as reports state the force on the first."""
+        return f64(other.masters.sign[c])
 
     @wp.func
     def carried(con: Contacts, other: Other, world: int, c: int, t: PointContact) -> vec3d:

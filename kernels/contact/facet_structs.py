@@ -30,8 +30,10 @@ def master_struct(dtype: str):
     class Masters:
         tree: wp.uint64  # bounding-box tree of [world, facet], grouped by world and surface
         surface_of: wp.array(dtype=wp.int32)  # [contact] its master surface
-        sign: wp.array(dtype=wp.float64)  # [contact] -1 where the points belong to the second body
-        bodies: wp.array(dtype=wp.vec2i)  # [contact] of the points and of the facets, numbered among bodies in pairs
+        sign: wp.array(dtype=wp.int32)  # [contact] -1 where the points belong to the second side
+        grounded: wp.array(dtype=wp.int32)  # [contact] 1 where they belong to an obstacle
+        bodies: wp.array(dtype=wp.vec2i)  # [contact] of the points (of an obstacle: of the facets) and of the facets,
+        # numbered among bodies with facets or points
         surface_count: wp.int32  # number of master surfaces
         touch_depth: wp.float64  # depth at the start of a step that counts as contact, m
         max_monomials: wp.int32  # maximum number of monomials of a facet

@@ -80,7 +80,7 @@ class PairEvaluation:
         for k, contact in enumerate(t.contacts):
             points = slice(t.first[k], t.first[k + 1])
             gap, normal, area = self.gap[:, points], self.normal[:, points], t.host[k].area.ravel()
-            if contact.surfaces[0].body is body and len(contact.surfaces) > 1:
+            if contact.body is body and not contact.grounded:
                 nearest = np.broadcast_to(nearest_samples(t, k, body), gap.shape)
                 out.append(BodyContactPoints(nearest, np.broadcast_to(area, gap.shape), normal, gap))
             if contact.facets.body is body:

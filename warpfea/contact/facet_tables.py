@@ -13,10 +13,9 @@ import warp as wp
 from ..base.errors import ModelError
 from ..kernels.contact.facet_structs import master_struct
 from ..kernels.contact.structs import contact_struct
-from ..model.contact_points import ContactPoints, corner_points, element_depths
+from ..model.contact_points import corner_points, element_depths
 from ..model.contacts import Collider, Contact
 from ..model.handles import SurfaceSet
-from ..model.obstacle_points import ObstacleContact, obstacle_points
 from ..model.pairs import (
     FacetOptions,
     MasterFacets,
@@ -24,7 +23,6 @@ from ..model.pairs import (
     contact_constants,
     master_facets,
     monomial_exponents,
-    pair_points,
 )
 from .tables import WORLD_PARAMETERS, FacetTables, clamped_slots, compliance, normal_damping
 
@@ -36,13 +34,6 @@ __all__ = ["PairTables"]
 
 TOUCH = 1e-9
 """Depth over the size of a model treated as touching at the start of a step."""
-
-
-def slave_points(contact: FacetOptions) -> tuple[ContactPoints, Any]:
-    """Points of a contact, and the factor on their stiffness by area."""
-    if isinstance(contact, ObstacleContact):
-        return obstacle_points(contact)
-    return pair_points(contact.surfaces[0], contact.points, contact.width), 1.0
 
 
 def refuse_offset(contact: FacetOptions, values: Any, mask: np.ndarray) -> None:
@@ -68,7 +59,7 @@ class PairTables(FacetTables[FacetOptions]):
 
     def __init__(self, model: Model) -> None:
         contacts = model.description.contacts_of(FacetOptions)
-        found = [slave_points(contact) for contact in contacts]
+        found = [contact.slave_points() for contact in contacts]
         factors = {contact.index: factor for contact, (_, factor) in zip(contacts, found)}
         super().__init__(model, contacts, [points for points, _ in found])
         self.surfaces: list[SurfaceSet] = []
@@ -101,19 +92,10 @@ class PairTables(FacetTables[FacetOptions]):
                 )
 
     def _region_area(self, contact: FacetOptions) -> float:
-        """Area that the contact stiffness is distributed over, m^2: the smaller of both surfaces; of an obstacle the
-        mean shadow of a convex one, a quarter of its surface."""
+        """Area that the contact stiffness is distributed over, m^2."""
         if contact.radius:
             return math.pi * contact.radius**2
-        areas = [float(pair_points(surface).area.sum()) for surface in contact.surfaces]
-        if isinstance(contact, ObstacleContact):
-            areas.append(0.25 * float(self.host[self.number[contact.index]].area.sum()))
-        return min(areas)
-
-    def _own_depths(self, k: int) -> np.ndarray:
-        if isinstance(self.contacts[k], ObstacleContact):
-            return np.zeros(len(self.host[k].conn))
-        return super()._own_depths(k)
+        return contact.region_area(self.host[self.number[contact.index]])
 
     @property
     def connectivity(self) -> list[np.ndarray]:
@@ -224,6 +206,7 @@ class PairTables(FacetTables[FacetOptions]):
             tables = {
                 "surface_of": self.master_of,
                 "sign": [c.sign for c in self.contacts],
+                "grounded": [c.grounded for c in self.contacts],
                 "bodies": [[self.bodies.index(c.surfaces[i].body.index) for i in (0, -1)] for c in self.contacts],
                 "conn": self.master_conn.T,
                 "shape": np.moveaxis(concatenated("shape"), 0, 2),
@@ -259,6 +242,6 @@ class PairTables(FacetTables[FacetOptions]):
             values = {name: v for name, v in vars(contact).items() if name not in fixed}
             h.update(f"{' '.join(side.name for side in contact.sides)} {sorted(values.items())}".encode())
             h.update(np.ascontiguousarray(p.faces).tobytes() + np.ascontiguousarray(self.surfaces[k].faces).tobytes())
-            if isinstance(contact, ObstacleContact):
+            if contact.grounded:
                 h.update(p.X.tobytes())
         h.update(self.built_values)

@@ -1,4 +1,4 @@
-"""Contact between bodies, see kernels/contact/facet_kinematics.py, and its part in the matrix of rigid body modes."""
+"""Contact of points with facets of bodies, see kernels/contact/facet_kinematics.py, and its part in their modes."""
 
 from __future__ import annotations
 
@@ -39,16 +39,16 @@ __all__ = ["FacetContact"]
 
 
 class FacetContact(ContactTerm, Tied, Coupled):
-    """Contacts of a model between its bodies.
+    """Contacts of a model with facets of its bodies: of points of other bodies, and of narrow obstacles.
 
     Attributes:
         tables: points and facets on the device.
     """
 
     name = "pairs"
-    translation_invariant = True  # a pair's forces are self-equilibrated
+    translation_invariant = True  # forces of pairs are self-equilibrated; obstacles: `mark_constrained`
     columns = contact_columns("contact_pairs")
-    parts = {"pairs": "contact between bodies: search, forces, products, history"}
+    parts = {"pairs": "contact with facets of bodies: search, forces, products, history"}
 
     def __init__(self, model: Model) -> None:
         super().__init__(model, PairTables(model), "facets")

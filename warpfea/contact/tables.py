@@ -16,7 +16,7 @@ from scipy.optimize import brentq
 from ..base.worlds import check_values_per_world, set_rows, values_per_world
 from ..kernels.contact.law import LAWS, law_code, own_laws
 from ..kernels.contact.structs import facet_struct
-from ..model.contact_points import CONTACT_RULES, ContactPoints, element_depths, lagrange_basis
+from ..model.contact_points import CONTACT_RULES, ContactPoints, lagrange_basis
 from ..model.contacts import Contact, ContactOptions
 from ..model.pairs import FacetOptions
 
@@ -219,7 +219,7 @@ class FacetTables(Generic[AnyContact]):
             "area_fraction": np.concatenate([self.area_fractions[k] for k in chosen]).T,
             "area": np.concatenate([p.area for p in parts]).T,
             "contact": np.repeat(chosen, [len(p.conn) for p in parts]),
-            "element_depth": np.concatenate([self._own_depths(k) for k in chosen]),
+            "element_depth": np.concatenate([self.contacts[k].own_depths(self.host[k]) for k in chosen]),
         }
         data.first_entry, data.first_row, data.first_point = pool, self.rows, self.points
         _, data.point_count, acts = kind
@@ -234,10 +234,6 @@ class FacetTables(Generic[AnyContact]):
             tables |= {"point_coords": points, "lagrange_coefficients": basis, "exponents": power}
         m.memory.fill(data, "contact", **tables)
         return FacetGroup(conn, data, acts != PATCH, chosen)
-
-    def _own_depths(self, k: int) -> np.ndarray:
-        """(F,) depths of the elements behind the facets of contact k, m."""
-        return element_depths(self.contacts[k].surfaces[0])
 
     def law_constants(self, contact: AnyContact, world: int | None = None) -> dict[str, Any]:
         """Constants `MATERIAL_CONSTANTS` of a contact, as built or in one world."""

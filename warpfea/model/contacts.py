@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation as Turn
 
 from ..time_laws import Rotation, TimeLaw
+from .contact_points import ContactPoints, element_depths
 from .discretisation import Discretisation
 from .handles import SurfaceSet
 from .shapes import Shape
@@ -119,6 +120,10 @@ class ContactOptions:
     def sides(self) -> tuple[Any, Any]:
         """Both of them in the order of reports: a collider, or the second body, comes last."""
         return self.roles if self.sign > 0.0 else self.roles[::-1]
+
+    def own_depths(self, points: ContactPoints) -> np.ndarray:
+        """(F,) depths of the elements behind the faces of its points, m."""
+        return element_depths(self.surfaces[0])
 
     @property
     def grounded(self) -> bool:

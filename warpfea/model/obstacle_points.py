@@ -56,6 +56,17 @@ class ObstacleContact(FacetOptions):
     def roles(self) -> tuple[Any, Any]:
         return self.collider, self.body
 
+    def slave_points(self) -> tuple[ContactPoints, Any]:
+        return obstacle_points(self)
+
+    def region_area(self, points: ContactPoints) -> float:
+        """As of `FacetOptions`; of the obstacle the mean shadow of a convex one, a quarter of its surface."""
+        return min(super().region_area(points), 0.25 * float(points.area.sum()))
+
+    def own_depths(self, points: ContactPoints) -> np.ndarray:
+        """Zero: an obstacle does not yield."""
+        return np.zeros(len(points.conn))
+
     def __repr__(self) -> str:
         return f"ObstacleContact({self.name!r}, body {self.body.name!r} with collider {self.collider.name!r})"
 

@@ -53,6 +53,14 @@ class FacetOptions(ContactOptions):
 
     name: str
 
+    def slave_points(self) -> tuple[ContactPoints, Any]:
+        """Its points, and the factor on their stiffness by area."""
+        raise NotImplementedError
+
+    def region_area(self, points: ContactPoints) -> float:
+        """Area that the stiffness is distributed over, m^2, without a radius: that of its smaller surface."""
+        return min(float(pair_points(surface).area.sum()) for surface in self.surfaces)
+
     @property
     def facets(self) -> SurfaceSet:
         """The surface whose facets are touched."""
@@ -83,6 +91,9 @@ class PairContact(FacetOptions):
     @property
     def roles(self) -> tuple[Any, Any]:
         return self.slave.body, self.master.body
+
+    def slave_points(self) -> tuple[ContactPoints, Any]:
+        return pair_points(self.slave, self.points, self.width), 1.0
 
     @property
     def sign(self) -> float:
