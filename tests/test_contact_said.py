@@ -293,7 +293,7 @@ def test_pairs_that_are_meant_are_not_named():
         ends = {"parent": low.surface("z-"), "child": top.surface("z+")}
         b.add_joint("translational", **ends, anchor=(0.05, 0.05, 0), axis=(0, 0, 1))
 
-    for connect, gap, left in ((contact, 1e-3, 0), (joint, 1e-3, 0), (rod, 1e-3, 1), (None, -0.01, 0), (None, 1e-3, 1)):
+    for connect, gap, left in ((contact, 1e-3, 1), (joint, 1e-3, 0), (rod, 1e-3, 1), (None, -0.01, 0), (None, 1e-3, 1)):
         b, low, top = crossing_cubes(0.02, gap)
         if connect:
             connect(b, low, top)
@@ -346,6 +346,21 @@ def test_obstacles_are_named(name):
     with pytest.warns(wf.ModelWarning, match=text):
         sim.step(3)
     assert [crossing.second for crossing in sim.overlap_check.found] == ["base"]
+
+
+def test_bodies_that_cross_unseen_by_their_contact_are_named():
+    """Points of the cube's faces miss a thin capsule that moves."""
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    cube = flying(b, ((0.1,) * 3, (0, 0, 0), (1, 1, 1)), (0, 0, 0), "cube")
+    path = ([0, 0.02], [(0, 0, 0), (0, 0, 0.03)])
+    pin = b.add_collider(wf.Capsule((-1, 0.021, -0.006), (1, 0.021, -0.006), 0.004), path=path, name="pin")
+    b.add_contact(cube, pin, name="pad")
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-3, check_overlap=True)
+    with pytest.warns(
+        wf.ModelWarning, match="body 'cube' and collider 'pin' cross since t = .* contact 'pad' sees 0 m"
+    ):
+        sim.step(12)
+    assert len(sim.overlap_check.found) == 1
 
 
 CROSSED = """

@@ -33,6 +33,11 @@ MAX_SOLVES_PER_ITERATION = 3
 """Maximum linear solves of an attempt per allowed iteration: bounds solves without a step."""
 DISPLACEMENT_ROUNDINGS = 64.0
 """Roundings of the displacements below which an error is negligible, whatever the reference energy."""
+CONTACT_ROUNDINGS = 2048.0
+"""Roundings of the positions, in float64 with contact, below which an error up to `MAX_CONTACT_NOISE` is accepted: at
+rest, a stiff body lies as deep in its contact as the positions resolve."""
+MAX_CONTACT_NOISE = 0.1
+"""Largest error estimate accepted so."""
 ALTERNATIVE_START_FORCING = 0.1
 """Forcing term of the first solve after an alternative first iterate, far from the end: a tighter one is wasted."""
 MAX_START_ENERGY_RATIO = 3.0
@@ -206,6 +211,15 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
                 eta = dq * step / wp.max(largest, f64(1.0e-300))
         return eta
 
+    @wp.func
+    def is_noise(ctl: Control, world: int, part: int, estimate: f64, largest: f64) -> bool:
+        """True if the error of a part in contact is that of the positions; `largest`: of `part_error`."""
+        step = f64(0.0)
+        for lane in range(FLOOR_LANES):
+            step = wp.max(step, ctl.floor.sums[3, world, part, lane])
+        near = ctl.dq_dv[world] * step <= f64(CONTACT_ROUNDINGS) * ctl.floor.eps * largest
+        return near and estimate <= f64(MAX_CONTACT_NOISE) and ctl.floor.eps <= f64(SINGLE_PRECISION_EPS)
+
     @wp.kernel(module=module)
     def check_rounding_floor(ctl: Control, component_of_part: int_1d):
         """Error estimate of a stalled residual, relative to the solution, of the worst part.
@@ -228,13 +242,18 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
                 largest = wp.max(largest, ctl.floor.sums[4, world, part, lane])
         if wp.static(traits.unilateral):  # gaps have position round-off
             largest = wp.max(largest, ctl.model_size)
-        worst = f64(0.0)
+        worst, noise = f64(0.0), f64(0.0)
         for part in range(component_of_part.shape[0]):
             if ctl.norms.component_converged[world, component_of_part[part]] == 0:
-                worst = wp.max(worst, part_error(ctl, world, part, whole, largest))
+                error = part_error(ctl, world, part, whole, largest)
+                if wp.static(traits.unilateral):
+                    if is_noise(ctl, world, part, error, largest):
+                        noise = wp.max(noise, error)
+                        error = f64(0.0)
+                worst = wp.max(worst, error)
         ctl.floor.error_estimate[world] = worst
         if worst <= ctl.floor.max_error:
-            ctl.floor.error[world] = wp.max(ctl.floor.error[world], worst)
+            ctl.floor.error[world] = wp.max(ctl.floor.error[world], wp.max(worst, noise))
             convergence.accept_iterate(ctl, world)
             return
         tries = ctl.floor.estimates[world] + 1

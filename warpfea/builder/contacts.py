@@ -170,7 +170,7 @@ def pairs_without_contact(d: Description, options: Collection[str]) -> list[tupl
         raise ModelError(
             f"add_contact_all: there is no pair yet ({d.summary() or 'no bodies'}): call it after bodies and colliders"
         )
-    known = d.contact_pairs | d.attached_pairs
+    known = d.contact_pairs.keys() | d.attached_pairs
     clamped = {id(body) for body in d.bodies if d.clamped_slots(body).all()} | {
         id(collider) for collider in d.colliders
     }

@@ -135,9 +135,12 @@ class Description:
         return [contact for contact in self.contacts if isinstance(contact, kind)]
 
     @property
-    def contact_pairs(self) -> set[frozenset[int]]:
-        """Identities of both sides, bodies or colliders, of each contact."""
-        return {frozenset(map(id, c.sides)) for c in self.contacts}
+    def contact_pairs(self) -> dict[frozenset[int], list[Any]]:
+        """Contacts by the identities of both sides, bodies or colliders."""
+        out: dict[frozenset[int], list[Any]] = {}
+        for c in self.contacts:
+            out.setdefault(frozenset(map(id, c.sides)), []).append(c)
+        return out
 
     @property
     def attached_pairs(self) -> set[frozenset[int]]:

@@ -1,4 +1,5 @@
-"""Bodies that cross each other, or an obstacle, without a contact that was named: found at some steps, on the host.
+"""Bodies that cross each other, or an obstacle, without a contact or deeper than their contact sees: found at some
+steps, on the host.
 
 Skins are sets of triangles. Where boxes meet, the edges of each skin are tested against the triangles of the other one
 (kernels/contact/crossings.py), in the device's place by the CPU; a half-space against points.
@@ -29,6 +30,8 @@ MIN_DEPTH_RATIO = 0.05
 bodies that fit into each other overlap by less."""
 CHECKS_PER_RUN = 64
 """Number of checks in a run."""
+UNSEEN_RATIO = 2.0
+"""Depth that counts with a contact, over the penetration that this contact reports."""
 MAX_WORLDS = 8
 """Largest number of worlds in which a pair is tested at a time."""
 SEGMENTS = 48
@@ -39,7 +42,7 @@ MAX_NAMED = 3
 
 @dataclass(frozen=True)
 class Crossing:
-    """Two sides that cross without a contact.
+    """Two sides that cross without a contact, or deeper than it sees.
 
     Attributes:
         first, second: names of a body, and of a body or a collider.
@@ -111,11 +114,11 @@ def _collider_side(collider: Collider, k: int) -> _Side:
 
 
 class OverlapCheck:
-    """Check of a simulation for crossings of bodies that no contact names.
+    """Check of a simulation for crossings of bodies that no contact sees.
 
-    Pairs of bodies, and of bodies and colliders, without a contact; not those that a weld, a joint or a constraint
-    connects, those that cross when the first step begins, a body with itself, and moving colliders of a model without
-    contact with colliders. Each pair is said once.
+    Pairs of bodies, and of bodies and colliders; not those that a weld, a joint or a constraint connects, those that
+    cross when the first step begins, a body with itself, and moving colliders of a model without contact with
+    colliders. Each pair is said once.
 
     Attributes:
         found: crossings so far. pairs: (P, 2) indices of what is still tested.
@@ -123,16 +126,17 @@ class OverlapCheck:
 
     def __init__(self, sim: Any) -> None:
         d = sim.model.description
-        known = d.contact_pairs | d.attached_pairs
+        contacts, attached = d.contact_pairs, d.attached_pairs
         posed = sim.results.collider_poses() is not None
         obstacles = [collider for collider in d.colliders if posed or not collider.moves]
         pairs = [pair for pair in [*combinations(d.bodies, 2), *product(d.bodies, obstacles)]
-                 if frozenset(map(id, pair)) not in known]  # fmt: skip
+                 if frozenset(map(id, pair)) not in attached]  # fmt: skip
         things = {id(thing): thing for pair in pairs for thing in pair}
         number = {key: k for k, key in enumerate(things)}
         self.found: list[Crossing] = []
         self._things, self._sides = list(things.values()), list[_Side]()
         self.pairs = np.array([[number[id(thing)] for thing in pair] for pair in pairs], dtype=int).reshape(-1, 2)
+        self._contacts = [contacts.get(frozenset(map(id, pair)), []) for pair in pairs]
         self._begun, self._calls, self._every = False, 0, 1
 
     def set_run(self, steps: int = 0) -> None:
@@ -160,6 +164,11 @@ class OverlapCheck:
             texts = "; ".join(crossing.text for crossing in new[:MAX_NAMED])
             warnings.warn(f"{texts}{more}", ModelWarning, stacklevel=4)
 
+    def _seen_depth(self, sim: Any, pair: int, world: int) -> float:
+        """Largest penetration, m, that the contacts of a pair report of the last step."""
+        depths = [sim.contact_record(contact).penetration[world, -1:] for contact in self._contacts[pair]]
+        return float(np.max(np.concatenate([[0.0], *depths])))
+
     def _crossings(self, sim: Any) -> list[Crossing]:
         """New crossings; their pairs are left out from now on."""
         if not len(self.pairs):
@@ -181,26 +190,32 @@ class OverlapCheck:
             sides = self._sides[i[k]], self._sides[j[k]]
             for world in np.flatnonzero(meet[k])[:MAX_WORLDS].tolist():
                 depth = _crossing_depth(*sides, points[i[k]][world], points[j[k]][world], least[k])
-                if depth > least[k]:
-                    out.append(_crossing(sim, *sides, world, depth))
+                seen = self._seen_depth(sim, k, world) if depth > least[k] else 0.0
+                if depth > least[k] + UNSEEN_RATIO * seen:
+                    text = _crossing_text(sim, *sides, world, depth, self._contacts[k], seen)
+                    time = float((sim.time if sim.load is None else sim.load)[world])
+                    out.append(Crossing(sides[0].thing.name, sides[1].thing.name, time, world, depth, text))
                     found[k] = True
                     break
         self.pairs = self.pairs[~found]
+        self._contacts = [contacts for contacts, gone in zip(self._contacts, found) if not gone]
         return out
 
 
-def _crossing(sim: Any, one: _Side, other: _Side, world: int, depth: float) -> Crossing:
-    """Crossing of two sides, with its sentence."""
+def _crossing_text(
+    sim: Any, one: _Side, other: _Side, world: int, depth: float, contacts: list[Any], seen: float
+) -> str:  # fmt: skip
+    """Sentence on two sides that cross."""
     static = sim.load is not None
-    time = float((sim.load if static else sim.time)[world])
-    since = f"{100.0 * time:.4g} % of the load" if static else f"t = {time:.4g} s"
+    since = f"{100.0 * sim.load[world]:.4g} % of the load" if static else f"t = {sim.time[world]:.4g} s"
     where = f" in world {world}" if sim.model.worlds > 1 else ""
-    names = one.thing.name, other.thing.name
-    text = (
-        f"{one.name} and {other.name} have no contact and cross since {since}{where} ({depth:.2g} m deep): write "
-        f"b.add_contact({', '.join(names)}) with their handles, or nothing if that is meant"
-    )
-    return Crossing(*names, time, world, depth, text)
+    without, cure = "have no contact and ", (
+        f"write b.add_contact({one.thing.name}, {other.thing.name}) with their handles, or nothing if that is meant"
+    )  # fmt: skip
+    if contacts:
+        names = " and ".join(repr(contact.name) for contact in contacts)
+        without, cure = "", f"contact {names} sees {seen:.2g} m: take smaller elements there, or contact of all faces"
+    return f"{one.name} and {other.name} {without}cross since {since}{where} ({depth:.2g} m deep): {cure}"
 
 
 def _crossing_depth(one: _Side, other: _Side, x: np.ndarray, y: np.ndarray, least: float) -> float:
