@@ -9,15 +9,14 @@ import pytest
 from contact_cubes import G, cube, everywhere, middle, record, tilted
 
 import warpfea as wf
-from warpfea.contact.collider_tables import contact_law_constants
-from warpfea.contact.tables import restitution_beta
+from warpfea.contact.tables import contact_constants, restitution_beta
 
 WANTED = np.array([0.1, 0.3, 0.5, 0.7, 0.9])
 
 
 def impact_step(contact, model, v0):
     """Half a period of the contact, s, with a mass of 1 kg."""
-    k = contact.stiffness * contact_law_constants(contact)["normal_stiffness"]
+    k = contact.stiffness * contact_constants(contact)["normal_stiffness"]
     return math.pi / math.sqrt(k) if model == "patch" else 2.943 * (1.25 * v0**2 / k) ** 0.4 / v0
 
 
@@ -98,7 +97,7 @@ def impacts(count, steps, law, per_contact, e=0.5, smoothing=None):
     solver = wf.NewtonPCG(tol=1e-10, max_halvings=0)
     sim = wf.Simulation(model, state, dt=h, solver=solver, on_failure="freeze", record=False)
     sim.step(steps)
-    gamma = math.sqrt(contact.stiffness) * contact_law_constants(contact)["normal_damping"] * restitution_beta(e)
+    gamma = math.sqrt(contact.stiffness) * contact_constants(contact)["normal_damping"] * restitution_beta(e)
     inside = h * speed + G * h * h - gap
     return sim, (inside > 0.0) & (inside < gamma * h * gap)
 

@@ -10,8 +10,8 @@ import pytest
 from contact_cubes import LOAD, STIFF, flat_side, pressed
 
 import warpfea as wf
-from warpfea.contact.collider_tables import contact_law_constants
 from warpfea.contact.colliders import ColliderContact
+from warpfea.contact.tables import contact_constants
 
 SIZE = np.array([0.3, 0.24, 0.12])
 
@@ -95,7 +95,7 @@ def carried(turn, depth, cells):
     term = model.terms.find(ColliderContact)
     _, force = term.at_points(state)
     assert np.abs(force[0, :, :2]).max() == 0.0
-    return force[0, :, 2].sum() * term.tables.host[0].area.sum() / contact_law_constants(contact)["normal_stiffness"]
+    return force[0, :, 2].sum() * term.tables.host[0].area.sum() / contact_constants(contact)["normal_stiffness"]
 
 
 def test_a_corner_and_an_edge_carry_what_their_area_says():

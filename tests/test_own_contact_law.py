@@ -8,8 +8,8 @@ import warp as wp
 
 import warpfea as wf
 from warpfea.contact import LAWS, ContactLaw
-from warpfea.contact.collider_tables import contact_law_constants
 from warpfea.contact.evaluation import evaluate_points
+from warpfea.contact.tables import contact_constants
 
 f64 = wp.float64
 LENGTH = 1e-5
@@ -64,7 +64,7 @@ def resting_block(law, other="collider", **options):
 
 
 def stiffness_for_depth():
-    k = contact_law_constants(resting_block("default")[2])["normal_stiffness"]
+    k = contact_constants(resting_block("default")[2])["normal_stiffness"]
     return WEIGHT / (LENGTH * math.expm1(2.0)) / k
 
 
@@ -128,7 +128,7 @@ def test_energy_of_an_impact(registered):
     b, block, _ = resting_block("exponential", stiffness=("region", stiffness_for_depth()), restitution=0.5)
     b.set_initial(block, velocity=(0, 0, -0.01))
     sim = wf.Simulation(b.finalize(device="cpu"), dt=2e-5, solver=wf.NewtonPCG(tol=1e-12))
-    k = stiffness_for_depth() * contact_law_constants(resting_block("default")[2])["normal_stiffness"]
+    k = stiffness_for_depth() * contact_constants(resting_block("default")[2])["normal_stiffness"]
     deepest = 0.0
     for _ in range(10):
         sim.step(20)
@@ -164,7 +164,7 @@ def relative_force(law, depth=1e-4):
     state = model.state()
     state.displacement.fill_(wp.vec3d(0.0, 0.0, -depth))
     (term,) = (term for term in model.terms.all if term.name == "contact")
-    return evaluate_points(term, state)[1].sum() / (contact_law_constants(pad)["normal_stiffness"] * depth)
+    return evaluate_points(term, state)[1].sum() / (contact_constants(pad)["normal_stiffness"] * depth)
 
 
 def test_laws_may_change_place_and_definition(monkeypatch):

@@ -1,8 +1,7 @@
-"""Tables of contacts and colliders on the device, their triangle meshes, and contact law constants."""
+"""Tables of contacts and colliders on the device, their triangle meshes."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -17,19 +16,19 @@ from ..kernels.contact.collider_seams import SEAMS_SUFFIX
 from ..kernels.contact.colliders import MESH_SUFFIX
 from ..kernels.contact.structs import collider_struct, contact_struct
 from ..model import assembly
-from ..model.contact_points import ContactPoints, Modulus, body_mass_total, contact_points, effective_modulus
+from ..model.contact_points import ContactPoints
 from ..model.contacts import Collider, Contact
 from ..model.pairs import FacetOptions
 from ..model.shapes import HalfSpace, Shape
 from ..model.triangle_mesh import TriMesh
 from ..terms.time_law_table import TimeLawTable
 from .seams import seam_tables
-from .tables import WORLD_PARAMETERS, FacetTables, check_chosen_values, clamped_slots, compliance, normal_damping
+from .tables import WORLD_PARAMETERS, FacetTables, check_chosen_values, clamped_slots
 
 if TYPE_CHECKING:
     from ..model.model import Model
 
-__all__ = ["ContactTables", "contact_law_constants", "facet_pattern_entries", "upload_collider_meshes"]
+__all__ = ["ContactTables", "facet_pattern_entries", "upload_collider_meshes"]
 
 
 class ContactTables(FacetTables[Contact]):
@@ -38,19 +37,16 @@ class ContactTables(FacetTables[Contact]):
     Attributes:
         colliders: descriptions. shapes: on the device, without poses.
         seams: neighbours of the contacts, None if no contact has one.
-        region_radii: `region_radius` by contact index.
         clamped_point_counts: number of points per contact excluded because all their slots are clamped.
     """
 
     def __init__(self, model: Model) -> None:
-        contacts = model.description.contacts_of(Contact)
-        super().__init__(model, contacts, [contact_points(contact.surface, contact.points) for contact in contacts])
+        super().__init__(model, model.description.contacts_of(Contact))
         self.colliders: list[Collider] = list(model.description.colliders)
         self.clamped = clamped_slots(model)
         self.clamped_point_counts: list[int] = []
-        self.region_radii: dict[int, float] = {}
         self.seams = seam_tables(self.contacts, [p.X.reshape(-1, 3) for p in self.host])
-        self.area_fractions = [self._area_fraction(c, p) for c, p in zip(self.contacts, self.host)]
+        self.area_fractions = [self._area_fraction(*row) for row in zip(self.contacts, self.host, self.region_areas)]
 
     @property
     def has_meshes(self) -> bool:
@@ -67,7 +63,7 @@ class ContactTables(FacetTables[Contact]):
         """True if a collider mesh is a sheet (no inside)."""
         return any(collider.is_sheet for collider in self.colliders)
 
-    def _area_fraction(self, contact: Contact, p: ContactPoints) -> np.ndarray:
+    def _area_fraction(self, contact: Contact, p: ContactPoints, region: float) -> np.ndarray:
         """Area fraction (F, P) of each point in the contact region; 0 if all its slots are clamped."""
         slots = p.conn + contact.body.slot_offset
         moves = np.any((np.abs(p.shape) > 1e-12) & ~self.clamped[slots][:, None, :], axis=2)
@@ -80,7 +76,6 @@ class ContactTables(FacetTables[Contact]):
             )
         if contact.model == "sphere":
             return used.astype(float)
-        region = math.pi * contact.radius**2 if contact.radius else float(p.area.sum())
         return np.where(used, p.area / region, 0.0)
 
     def build(self, laws: TimeLawTable, pool: int) -> None:
@@ -137,13 +132,6 @@ class ContactTables(FacetTables[Contact]):
             out.mesh = upload_collider_meshes(m, [k.shape for k in K])
         return out
 
-    def law_constants(self, contact: Contact, world: int | None = None) -> dict[str, Any]:
-        if contact.index not in self.region_radii:
-            self.region_radii[contact.index] = region_radius(contact)
-        parameters = self.model.parameters
-        mass = parameters.mass(contact.body, world)
-        return contact_law_constants(contact, parameters.modulus(world), self.region_radii[contact.index], mass)
-
     def _contact_positions(self, collider: Collider) -> list[np.ndarray]:
         """Points (n, 3), m, of the surfaces in contact with a collider."""
         return [p.X.reshape(-1, 3) for c, p in zip(self.contacts, self.host) if c.collider is collider]
@@ -164,37 +152,6 @@ class ContactTables(FacetTables[Contact]):
             h.update(f"{contact.collider.name} {sorted(values.items())}".encode())
             h.update(np.ascontiguousarray(p.faces).tobytes())
         h.update(self.built_values)
-
-
-def region_radius(contact: Contact) -> float:
-    """Radius of the region of a contact, m; for single-point contacts over the root of the depth."""
-    if contact.model == "sphere":
-        # 1/R_eff = 1/R_A + 1/R_B, with a = sqrt(R_eff depth)
-        assert contact.radius is not None
-        return math.sqrt(1.0 / (1.0 / contact.radius + 1.0 / contact.collider.shape.radius_of_curvature))
-    if contact.radius:
-        return contact.radius
-    return math.sqrt(float(contact_points(contact.surface, contact.points).area.sum()) / math.pi)
-
-
-def contact_law_constants(
-    contact: Contact, modulus_of: Modulus = effective_modulus, a: float | None = None, mass: float | None = None
-) -> dict[str, Any]:
-    """Constants of Eqs. (74)-(76), (79) and (80) with a rigid obstacle; for single-point contacts over powers of the
-    depth."""
-    E, nu = modulus_of(contact.body, contact.surface)
-    modulus = E / (1.0 - nu**2)
-    shear = E / (2.0 * (1.0 + nu)) / (2.0 - nu)
-    a = region_radius(contact) if a is None else a
-    mass = body_mass_total(contact.body) if mass is None else mass
-    stiffness = 4.0 / 3.0 * modulus * a
-    return {
-        "normal_stiffness": stiffness,
-        "compliance": compliance(contact, stiffness, math.pi * a**2, 1.0 / modulus, 0.0),
-        "tangential_stiffness": 8.0 * shear * a,
-        "normal_damping": normal_damping(2.0 * modulus * a, mass),
-        "effective_mass": mass,
-    }
 
 
 def facet_pattern_entries(model: Model, conn: np.ndarray, pattern: Any) -> tuple[wp.array, wp.array, wp.array, int]:

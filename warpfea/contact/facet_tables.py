@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -20,11 +19,10 @@ from ..model.pairs import (
     FacetOptions,
     MasterFacets,
     bernstein_from_monomials,
-    contact_constants,
     master_facets,
     monomial_exponents,
 )
-from .tables import WORLD_PARAMETERS, FacetTables, clamped_slots, compliance, normal_damping
+from .tables import WORLD_PARAMETERS, FacetTables, clamped_slots
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -51,17 +49,13 @@ class PairTables(FacetTables[FacetOptions]):
 
     Attributes:
         surfaces, masters: distinct master surfaces and their facets; master_of: master surface of each contact.
-        region_areas: contact area of each contact, m^2.
         facets: number of master facets. bodies: bodies in a pair. corners: of the slave facets of each group.
         collider_laws: all colliders with the numbers of their time laws, if poses follow from these alone.
         max_gap: largest reported gap, m. max_overlap_depth: search depth of initial overlaps, m.
     """
 
     def __init__(self, model: Model) -> None:
-        contacts = model.description.contacts_of(FacetOptions)
-        found = [contact.slave_points() for contact in contacts]
-        factors = {contact.index: factor for contact, (_, factor) in zip(contacts, found)}
-        super().__init__(model, contacts, [points for points, _ in found])
+        super().__init__(model, model.description.contacts_of(FacetOptions))
         self.surfaces: list[SurfaceSet] = []
         self.master_of: list[int] = []
         for contact in self.contacts:
@@ -72,10 +66,7 @@ class PairTables(FacetTables[FacetOptions]):
             self.master_of.append(same[0] if same else len(self.surfaces) - 1)
         self.masters: list[MasterFacets] = [master_facets(surface) for surface in self.surfaces]
         self._check_clamped()
-        self.region_areas = [self._region_area(contact) for contact in self.contacts]
-        self.area_fractions = [
-            factors[c.index] * p.area / area for c, p, area in zip(self.contacts, self.host, self.region_areas)
-        ]
+        self.area_fractions = [f * p.area / area for f, p, area in zip(self.factors, self.host, self.region_areas)]
         self.facets = sum(len(m.conn) for m in self.masters)
         self.bodies = sorted({surface.body.index for c in self.contacts for surface in c.surfaces})
         self.corners: list[wp.array] = []
@@ -90,12 +81,6 @@ class PairTables(FacetTables[FacetOptions]):
                     f"contact {contact.name!r}: all of the surfaces of bodies {bodies} is clamped; leave the contact "
                     "out, or free one of them"
                 )
-
-    def _region_area(self, contact: FacetOptions) -> float:
-        """Area that the contact stiffness is distributed over, m^2."""
-        if contact.radius:
-            return math.pi * contact.radius**2
-        return contact.region_area(self.host[self.number[contact.index]])
 
     @property
     def connectivity(self) -> list[np.ndarray]:
@@ -134,16 +119,6 @@ class PairTables(FacetTables[FacetOptions]):
         self.master_conn = self._master_conn()
         self.other_entries = self.master_conn.size
         self.size = self.model.size
-
-    def law_constants(self, contact: FacetOptions, world: int | None = None) -> dict[str, Any]:
-        region = self.region_areas[self.number[contact.index]]
-        parameters = self.model.parameters
-        row = contact_constants(contact, region, partial(parameters.mass, world=world), parameters.modulus(world))
-        sides = row.pop("own_compliance"), row.pop("other_compliance")
-        return row | {
-            "normal_damping": normal_damping(row["damping_stiffness"], row["effective_mass"]),
-            "compliance": compliance(contact, row["normal_stiffness"], region, *sides),
-        }
 
     def parameters(self) -> dict[str, Callable[[Any, np.ndarray], None]]:
         """Setters of the parameters of contacts; refusals of the offsets of their obstacles."""

@@ -16,15 +16,23 @@ from scipy.optimize import brentq
 from ..base.worlds import check_values_per_world, set_rows, values_per_world
 from ..kernels.contact.law import LAWS, law_code, own_laws
 from ..kernels.contact.structs import facet_struct
-from ..model.contact_points import CONTACT_RULES, ContactPoints, lagrange_basis
+from ..model.contact_points import (
+    CONTACT_RULES,
+    ContactPoints,
+    Modulus,
+    body_mass_total,
+    effective_modulus,
+    lagrange_basis,
+)
 from ..model.contacts import Contact, ContactOptions
+from ..model.discretisation import Discretisation
 from ..model.pairs import FacetOptions
 
 if TYPE_CHECKING:
     from ..model.model import Model
 
 __all__ = [
-    "POINT_SUM_LANES", "WORLD_PARAMETERS", "FacetTables", "check_chosen_values", "clamped_slots",
+    "POINT_SUM_LANES", "WORLD_PARAMETERS", "FacetTables", "check_chosen_values", "clamped_slots", "contact_constants",
     "hunt_crossley_damping", "normal_damping", "restitution_beta",
 ]  # fmt: skip
 
@@ -88,11 +96,41 @@ def compliance(contact: ContactOptions, stiffness: float, area: float, *complian
     Args:
         stiffness: k_n of the region, N/m.
         area: of the region, m^2.
-        compliances: (1 - nu^2)/E of both sides, 1/Pa.
+        compliances: (1 - nu^2)/E of the side of the points and of the other one, 1/Pa.
     """
     if contact.stiffness_of == "region":
         return 1.0, 0.0, 0.0
     return 0.0, *(stiffness * c / (ELEMENT_STIFFNESS * area) for c in compliances)
+
+
+def contact_constants(
+    contact: ContactOptions, area: float | None = None,
+    mass_of: Callable[[Discretisation], float] = body_mass_total, modulus_of: Modulus = effective_modulus,
+) -> dict[str, Any]:  # fmt: skip
+    """Constants `MATERIAL_CONSTANTS` of a region of `area`, m^2, Eqs. (74)-(76), (79), (80); an obstacle is rigid.
+
+    k_n = 4/3 E* a, k_t = 8 G* a, N/m, with area = pi a^2; of single-point contacts over powers of the depth.
+    """
+    shear_compliance = inverse_mass = 0.0
+    compliances = []
+    for surface in contact.surfaces:
+        total = mass_of(surface.body)
+        inverse_mass += 1.0 / total if total > 0.0 else math.inf
+        E, nu = modulus_of(surface.body, surface)
+        compliances.append((1.0 - nu**2) / E)
+        shear_compliance += 2.0 * (2.0 - nu) * (1.0 + nu) / E
+    if contact.grounded:
+        compliances.insert(int(contact.sign > 0.0), 0.0)
+    area = contact.region_area(contact.slave_points()[0]) if area is None else area
+    a, total = math.sqrt(area / math.pi), sum(compliances)
+    stiffness, mass = 4.0 / 3.0 * a / total, 1.0 / inverse_mass
+    return {
+        "normal_stiffness": stiffness,
+        "compliance": compliance(contact, stiffness, area, *compliances),
+        "tangential_stiffness": 8.0 * a / shear_compliance,
+        "normal_damping": normal_damping(2.0 * a / total, mass),
+        "effective_mass": mass,
+    }
 
 
 def normal_damping(stiffness: float, mass: float) -> float:
@@ -140,7 +178,8 @@ class FacetTables(Generic[AnyContact]):
 
     Attributes:
         contacts: handles in that order; number: position of a handle's index.
-        host: shape functions, areas, slots and positions of each contact, for fields and checks.
+        host: shape functions, areas, slots and positions of each contact, for fields and checks; factors: on their
+            stiffness by area. region_areas: m^2, that its stiffness is distributed over.
         kinds: slots and points per facet, and the contact kind.
         own_laws: laws in use that are not built in, as defined when the model was made.
         groups: facet groups.
@@ -158,13 +197,16 @@ class FacetTables(Generic[AnyContact]):
     other_entries = 0
     stored_sides = 1
 
-    def __init__(self, model: Model, contacts: Sequence[AnyContact], points: Sequence[ContactPoints]) -> None:
+    def __init__(self, model: Model, contacts: Sequence[AnyContact]) -> None:
         self.model = model
+        points, factors = zip(*(contact.slave_points() for contact in contacts))
         kinds = [_facet_kind(*pair) for pair in zip(contacts, points)]
         order = sorted(range(len(kinds)), key=lambda k: (kinds[k], k))
         self.kinds = sorted(set(kinds))
         self.contacts: list[AnyContact] = [contacts[k] for k in order]
         self.host: list[ContactPoints] = [points[k] for k in order]
+        self.factors = [factors[k] for k in order]
+        self.region_areas = [c.region_area(p) for c, p in zip(self.contacts, self.host)]
         self.number = {contact.index: k for k, contact in enumerate(self.contacts)}
         self.own_laws = own_laws(contact.law for contact in contacts)
         self.groups: list[FacetGroup] = []
@@ -237,7 +279,8 @@ class FacetTables(Generic[AnyContact]):
 
     def law_constants(self, contact: AnyContact, world: int | None = None) -> dict[str, Any]:
         """Constants `MATERIAL_CONSTANTS` of a contact, as built or in one world."""
-        raise NotImplementedError
+        area, p = self.region_areas[self.number[contact.index]], self.model.parameters
+        return contact_constants(contact, area, partial(p.mass, world=world), p.modulus(world))
 
     def parameters(self) -> dict[str, Callable[[Any, np.ndarray], None]]:
         """Setters of the parameters of contacts per world, by name, for Model.set_parameter."""
@@ -303,7 +346,7 @@ class FacetTables(Generic[AnyContact]):
             getattr(data, name).assign(values)
 
     def _upload_laws(self, out: Any, law_constants: list[dict[str, Any]]) -> None:
-        """Upload the contact law constants; `law_constants` per contact: `FROM_BODIES`."""
+        """Upload the contact law constants; `law_constants` per contact: `MATERIAL_CONSTANTS`."""
         m, C = self.model, self.contacts
         smoothing = [c.smoothing if isinstance(c.smoothing, tuple) else DEFAULT_SMOOTHING for c in C]
         tables = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -9,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation as Turn
 
 from ..time_laws import Rotation, TimeLaw
-from .contact_points import ContactPoints, element_depths
+from .contact_points import ContactPoints, contact_points, element_depths
 from .discretisation import Discretisation
 from .handles import SurfaceSet
 from .shapes import Shape
@@ -121,6 +122,14 @@ class ContactOptions:
         """Both of them in the order of reports: a collider, or the second body, comes last."""
         return self.roles if self.sign > 0.0 else self.roles[::-1]
 
+    def slave_points(self) -> tuple[ContactPoints, Any]:
+        """Its points, and the factor on their stiffness by area."""
+        return contact_points(self.surfaces[0], self.points), 1.0
+
+    def region_area(self, points: ContactPoints) -> float:
+        """Area that the stiffness is distributed over, m^2: of a disc of `radius`, or that of its points."""
+        return math.pi * self.radius**2 if self.radius else float(points.area.sum())
+
     def own_depths(self, points: ContactPoints) -> np.ndarray:
         """(F,) depths of the elements behind the faces of its points, m."""
         return element_depths(self.surfaces[0])
@@ -158,6 +167,13 @@ class Contact(ContactOptions):
     @property
     def roles(self) -> tuple[Any, Any]:
         return self.body, self.collider
+
+    def region_area(self, points: ContactPoints) -> float:
+        """As of `ContactOptions`; of the "sphere" over the depth: pi R, 1/R = 1/R_A + 1/R_B of both."""
+        if self.model != "sphere":
+            return super().region_area(points)
+        assert self.radius is not None
+        return math.pi / (1.0 / self.radius + 1.0 / self.collider.shape.radius_of_curvature)
 
     def __repr__(self) -> str:
         return f"Contact({self.name!r}, body {self.body.name!r} with collider {self.collider.name!r})"

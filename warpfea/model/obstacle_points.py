@@ -61,7 +61,8 @@ class ObstacleContact(FacetOptions):
 
     def region_area(self, points: ContactPoints) -> float:
         """As of `FacetOptions`; of the obstacle the mean shadow of a convex one, a quarter of its surface."""
-        return min(super().region_area(points), 0.25 * float(points.area.sum()))
+        area = super().region_area(points)
+        return area if self.radius else min(area, 0.25 * float(points.area.sum()))
 
     def own_depths(self, points: ContactPoints) -> np.ndarray:
         """Zero: an obstacle does not yield."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,9 +12,9 @@ from ..base.errors import ModelError
 from ..elements import Rule
 from ..elements.quadrature import lobatto_square, triangle_7, triangle_16
 from ..kernels.contact.thickness import thickness_kernel
-from .contact_points import ContactPoints, Modulus, effective_modulus, points_by_faces, points_by_rules
+from .contact_points import ContactPoints, effective_modulus, points_by_faces, points_by_rules
 from .contacts import ContactOptions
-from .discretisation import Discretisation, element_functions
+from .discretisation import element_functions
 from .handles import SurfaceSet
 from .narrow import body_widths, facet_side, is_narrow, rules_for_width
 from .surfaces import measure_to_skin
@@ -53,12 +52,10 @@ class FacetOptions(ContactOptions):
 
     name: str
 
-    def slave_points(self) -> tuple[ContactPoints, Any]:
-        """Its points, and the factor on their stiffness by area."""
-        raise NotImplementedError
-
     def region_area(self, points: ContactPoints) -> float:
-        """Area that the stiffness is distributed over, m^2, without a radius: that of its smaller surface."""
+        """As of `ContactOptions`; without a radius that of its smaller surface."""
+        if self.radius:
+            return super().region_area(points)
         return min(float(pair_points(surface).area.sum()) for surface in self.surfaces)
 
     @property
@@ -278,31 +275,3 @@ def facet_thickness(surface: SurfaceSet) -> np.ndarray:
     e = body.reference[body.connectivity[surface.faces[:, 0]]]
     positions = np.einsum("fqs,fsk->fqk", shape, e)[:, 0] + body.origin
     return measure_to_skin(body, thickness_kernel(), positions, normal[:, 0])
-
-
-def contact_constants(
-    contact: FacetOptions, area: float, mass_of: Callable[[Discretisation], float], modulus_of: Modulus
-) -> dict[str, float]:
-    """Contact constants of Eqs. (74)-(76), (79), (80) for a contact region of `area`, m^2.
-
-    Normal and tangential stiffness 4/3 E* a and 8 G* a, N/m; 2 E* a, N/m, for the damping; effective mass, kg; 1/E* of
-    slave and master, 1/Pa; an obstacle as the slave has none.
-    """
-    shear_compliance = inverse_mass = 0.0
-    compliances = []
-    for surface in contact.surfaces:
-        total = mass_of(surface.body)
-        inverse_mass += 1.0 / total if total > 0.0 else math.inf
-        E, nu = modulus_of(surface.body, surface)
-        compliances.append((1.0 - nu**2) / E)
-        shear_compliance += 2.0 * (2.0 - nu) * (1.0 + nu) / E
-    a = contact.radius or math.sqrt(area / math.pi)
-    compliance = sum(compliances)
-    return {
-        "normal_stiffness": 4.0 / 3.0 * a / compliance,
-        "tangential_stiffness": 8.0 * a / shear_compliance,
-        "damping_stiffness": 2.0 * a / compliance,
-        "effective_mass": 1.0 / inverse_mass,
-        "own_compliance": compliances[0] if len(compliances) > 1 else 0.0,
-        "other_compliance": compliances[-1],
-    }
