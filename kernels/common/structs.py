@@ -7,7 +7,11 @@ import warp as wp
 from .modules import KernelSet, kernel_set
 from .types import int_1d, precision
 
-__all__ = ["balance_struct", "pattern_struct", "product_terms_struct", "topology_struct"]
+__all__ = ["AFTER_IMPACT", "balance_struct", "pattern_struct", "product_terms_struct", "topology_struct"]
+
+AFTER_IMPACT = -1.0
+"""Value of `previous_h` of the step control that a term writes at its commit, after `accept_state` has stored the step,
+where an impact was not resolved by it: what the scheme remembers of the step is void."""
 
 
 @functools.cache

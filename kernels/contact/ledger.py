@@ -5,6 +5,7 @@ import functools
 import warp as wp
 
 from ..common.modules import KernelSet, kernel_set, masked_kernel
+from ..common.structs import AFTER_IMPACT
 from ..common.types import f64, vec3d
 from .assembly import contact_module
 from .friction import friction_functions
@@ -263,8 +264,8 @@ def contact_ledger_kernels(dtype: str, geometry: str, own: OwnLaws = ()) -> Kern
         other: Other, clock: Clock, potential: wp.array(dtype=f64), term_sums: wp.array2d(dtype=f64),
         accepted: wp.array(dtype=wp.int32), his: History, scr: ContactScratch,
     ):  # fmt: skip
-        """Store the other side and the time of the accepted state; advance the elapsed time; add the contact energy,
-        J, to the bound of the next initial iterate."""
+        """Store the other side, the time of the accepted state, and whether an impact was not resolved; advance the
+        elapsed time; add the contact energy, J, to the bound of the next initial iterate."""
         world, index = wp.tid()
         g.store_side(other, world, index)
         if index == 0:
@@ -272,7 +273,7 @@ def contact_ledger_kernels(dtype: str, geometry: str, own: OwnLaws = ()) -> Kern
             scr.elapsed_time[world] = scr.elapsed_time[world] + clock.h[world]
             potential[world] = potential[world] + term_sums[1, world]
             if scr.impact[world] != 0 and clock.previous_h.shape[0] > 0:
-                clock.previous_h[world] = f64(-1.0)
+                clock.previous_h[world] = f64(AFTER_IMPACT)
 
     @wp.kernel(module=module)
     def write_records(scr: ContactScratch, first: int, report: wp.array2d(dtype=f64)):

@@ -267,7 +267,7 @@ def collider_struct(meshes: bool):
 
 @functools.cache
 def clock_struct():
-    """Times of the current substep, [world]."""
+    """Times of the current substep, and the state's memory of the step before, [world]."""
 
     @wp.struct
     class Clock:
@@ -276,7 +276,7 @@ def clock_struct():
         h: wp.array(dtype=wp.float64)  # its length, s
         substep_index: wp.array(dtype=wp.int32)  # index of the substep; 0: first of the step
         is_static: wp.int32  # 1 in statics: no rates
-        previous_h: wp.array(dtype=wp.float64)  # of the step control, with a scheme that has a history; else empty
+        previous_h: wp.array(dtype=wp.float64)  # of the state: AFTER_IMPACT is written; empty without a history
 
     return Clock
 

@@ -11,7 +11,7 @@ from typing import Any
 import warp as wp
 
 from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
-from ..common.structs import free_components_function
+from ..common.structs import AFTER_IMPACT, free_components_function
 from ..common.traits import NO_TERMS, Traits
 from ..common.types import double_2d, f64, int_1d, precision
 from ..solvers.newton_control import FAIL_ELEMENT_INVERTED, FAIL_ENERGY_GROWTH, FAIL_ROUNDOFF, FAIL_WORK, control_struct
@@ -154,7 +154,8 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
 
         The iterate is v~ + (dq/dv) g, or v_n + (h/h_{n-1}) (v_n - v_{n-1}) if the previous step is known: its error is
         then of second order in h, as stiff rotating bodies require. With accelerations it is v_n + h g. After an impact
-        that a step has not resolved a multistep scheme has no history, and accelerations are those of gravity.
+        that a step has not resolved a multistep scheme has no history, and the accelerations in the state become those
+        of gravity.
         """
         world, slot = wp.tid()
         q = u_n[world, slot]
@@ -170,7 +171,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
             q += T(step.b[world]) * v_n[world, slot]
         if wp.static(accelerated):
             c = coefficients(step.h[world], step.acceleration_step[world], step.scheme_parameter)
-            if step.previous_h[world] < f64(0.0):  # the force of an impact ends with its step
+            if step.previous_h[world] == f64(AFTER_IMPACT):  # the force of an impact ends with its step
                 u_before[world, slot] = is_position[slot] * vec3(step.gravity[world])
                 v_before[world, slot] = u_before[world, slot]
             a = u_before[world, slot]
