@@ -10,13 +10,11 @@ from .collider_seams import SEAMS_SUFFIX, seam_functions
 from .collider_shapes import MESH
 from .colliders import MESH_SUFFIX, collider_functions
 from .kinematics import GEOMETRIES, kinematics_functions
-from .law import ANY_GAP, FIXED_SPRING
+from .law import ANY_GAP
 from .structs import FREE, IN_REACH, PASSED, TURNED, collider_struct, contact_structs
 
-__all__ = ["MAX_COLLIDER_ROTATION", "MIN_APPROACH_SPEED", "collider_kinematics", "pose_kernels"]
+__all__ = ["MAX_COLLIDER_ROTATION", "collider_kinematics", "pose_kernels"]
 
-MIN_APPROACH_SPEED = 1e-3
-"""Lower bound of the approach speed in the damping of the default law, m/s."""
 MAX_COLLIDER_ROTATION = 1.0
 """Largest rotation of a touched collider in a step, rad; larger rotations are rejected."""
 
@@ -75,11 +73,11 @@ def collider_kinematics(dtype: str, meshes: bool, seams: bool = False) -> Kernel
         now = k.activation_gap(con, his, world, c, point, clock.time[world], col.previous_margin[world, kc])
         n = set_start(col, scr, world, kc, point, y, side, now)
         scr.start_displacement[world, point] = shift
-        speed = wp.max(his.speed[world, rec], f64(MIN_APPROACH_SPEED))
+        speed = f64(0.0)
         if clock.is_static == 0:
             v = material_velocity(col, clock, world, kc, y) - interpolate(facets, v_n, world, q, item)
-            speed = wp.max(speed, wp.dot(rotation * n, v))
-        scr.approach_speed[world, point] = speed
+            speed = wp.dot(rotation * n, v)
+        scr.approach_speed[world, point] = k.approach_speed(his, world, rec, speed)
 
     @wp.func
     def start_motion(
@@ -179,9 +177,7 @@ def collider_kinematics(dtype: str, meshes: bool, seams: bool = False) -> Kernel
         out = set_depth(con, col, facets, his, scr, world, c, point, out, activation)
         out.stiffness_ratio = k.stiffness_ratio(con, facets, world, c, item, f64(0.0))
         if his.speed[world, rec] > f64(0.0):
-            out.spring = his.spring[world, rec]
-            if con.law[c] & FIXED_SPRING == 0:
-                out.spring = rotation * out.spring
+            out.spring = k.turned_spring(con, his, world, c, rec, rotation)
         return out
 
     @wp.func

@@ -10,7 +10,7 @@ import warp as wp
 
 from ..common.modules import SHORT_UNROLL, KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.types import precision
-from .collider_kinematics import MIN_APPROACH_SPEED, collider_kinematics
+from .collider_kinematics import collider_kinematics
 from .colliders import MESH_SUFFIX, collider_functions
 from .kinematics import kinematics_functions
 from .structs import collider_struct, contact_structs
@@ -283,12 +283,12 @@ def deepest_point_kernels(dtype: str, meshes: bool) -> KernelSet:
         now = f.activation_gap(con, his, world, c, point, clock.time[world], col.previous_margin[world, k])
         n = geometry.set_start(col, scr, world, k, point, y, side, now)
         scr.start_displacement[world, point] = origin
-        speed = wp.max(his.speed[world, rec], f64(MIN_APPROACH_SPEED))
+        speed = f64(0.0)
         if clock.is_static == 0:
             approach = wp.dot(rotation * n, geometry.material_velocity(col, clock, world, k, y) - v)
             # a rolling contact point descends initially at twice its mean speed
             rolled = f.depth_at_start(con, facets, his, scr, world, c, point) - scr.start_depth[world, point]
-            speed = wp.max(speed, approach - f64(2.0) * rolled / clock.h[world])
-        scr.approach_speed[world, point] = speed
+            speed = approach - f64(2.0) * rolled / clock.h[world]
+        scr.approach_speed[world, point] = f.approach_speed(his, world, rec, speed)
 
     return kernel_set(locals())

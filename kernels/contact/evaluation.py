@@ -13,7 +13,7 @@ from .facet_search import facet_search_kernels
 from .facet_structs import facet_side_struct, master_struct, pair_scratch_struct
 from .friction import friction_functions
 from .kinematics import kinematics_functions
-from .law import FIXED_SPRING, OwnLaws, law_names
+from .law import OwnLaws, law_names
 from .projection import OUTSIDE_TOLERANCE, facet_projection_functions
 from .structs import FREE, collider_struct, contact_structs
 
@@ -183,9 +183,8 @@ def pair_evaluation_kernels(dtype: str, own: OwnLaws = ()) -> KernelSet:
         t.previous_depth = t.depth
         t.stiffness_ratio = k.stiffness_ratio(con, facets, world, c, item, other.masters.element_depth[f])
         if in_contact:
-            t.spring = his.spring[world, point]
-            if not law.has_trait(con, c, FIXED_SPRING):
-                t.spring = seek.facet_frame(surface_point(other.masters, U, world, f, xi)) * t.spring
+            frame = seek.facet_frame(surface_point(other.masters, U, world, f, xi))
+            t.spring = k.turned_spring(con, his, world, c, point, frame)
         t = law.with_normal_force(con, scr, world, c, point, t, f64(0.0))
         frozen = law.friction_parameters(con, his, world, c, point, t)
         pressed = area_fraction * t.normal_values[0] * t.normal

@@ -11,11 +11,10 @@ import warp as wp
 from ..common.modules import SHORT_UNROLL, KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.types import f64, precision, vec3d
 from .broad_phase import BOX_MARGIN, broad_phase_kernels
-from .collider_kinematics import MIN_APPROACH_SPEED
 from .facet_candidates import facet_candidate_functions
 from .facet_structs import master_struct, pair_history_struct, pair_scratch_struct
 from .kinematics import kinematics_functions
-from .law import FIXED_SPRING
+from .law import MIN_APPROACH_SPEED
 from .projection import OUTSIDE_TOLERANCE, facet_projection_functions
 from .structs import contact_structs
 
@@ -38,15 +37,6 @@ def facet_search_kernels(dtype: str) -> KernelSet:
     FacetPoint, boxes, candidates = f.FacetPoint, broad_phase_kernels(dtype), facet_candidate_functions(dtype)
     SlavePoint, slave_point, slave_point_at = candidates.SlavePoint, candidates.slave_point, candidates.slave_point_at
     module = kernel_module(f"facet_search_{dtype}", max_unroll=SHORT_UNROLL)
-
-    @wp.func
-    def approach_speed(
-        mas: Masters, facets: Facets, pair: PairScratch, v: wp.array2d(dtype=vec3), slave: SlavePoint, f: int,
-        xi: vec3d, n: vec3d,
-    ) -> f64:  # fmt: skip
-        """Approach speed of a point towards a facet at the start of the attempt, m/s."""
-        own = k.interpolate(facets, v, slave.world, slave.number_in_facet, slave.slave_facet)
-        return wp.dot(n, facet_value(mas, pair.start_velocity, slave.world, f, xi) - own)
 
     @wp.func
     def set_anchor(
@@ -73,10 +63,11 @@ def facet_search_kernels(dtype: str) -> KernelSet:
         scr.start_depth[world, point] = scr.activation_gap[world, point] - (
             xi[2] * projection.gap_slope + projection.gap_offset
         )
-        speed = wp.max(his.speed[world, point], f64(MIN_APPROACH_SPEED))
+        speed = f64(0.0)
         if clock.is_static == 0:
-            speed = wp.max(speed, approach_speed(mas, facets, pair, v_n, slave, f, xi, projection.normal))
-        scr.approach_speed[world, point] = speed
+            own = k.interpolate(facets, v_n, world, slave.number_in_facet, slave.slave_facet)
+            speed = wp.dot(projection.normal, facet_value(mas, pair.start_velocity, world, f, xi) - own)
+        scr.approach_speed[world, point] = k.approach_speed(his, world, point, speed)
 
     @wp.func
     def begin_point(
@@ -193,9 +184,8 @@ def facet_search_kernels(dtype: str) -> KernelSet:
                 )
             pair.initial_depth[world, point] = scr.start_depth[world, point]
             if his.speed[world, point] > f64(0.0):
-                spring = his.spring[world, point]
-                if con.law[c] & FIXED_SPRING == 0:
-                    spring = facet_frame(surface_point(mas, pair.displacement, world, first, from0)) * spring
+                frame = facet_frame(surface_point(mas, pair.displacement, world, first, from0))
+                spring = k.turned_spring(con, his, world, c, point, frame)
         else:
             motion -= displacement_change(mas, pair.displacement, pair.start_displacement, world, f, xi)
             pair.initial_depth[world, point] = (

@@ -26,6 +26,7 @@ import warp as wp
 
 from ..common.modules import KernelSet, kernel_set
 from ..common.types import f64, precision, vec3d
+from .law import FIXED_SPRING, MIN_APPROACH_SPEED
 from .structs import contact_structs
 
 __all__ = ["GEOMETRIES", "kinematics_functions"]
@@ -127,6 +128,18 @@ def kinematics_functions(dtype: str) -> KernelSet:
     def activation_gap(con: Contacts, his: History, world: int, c: int, point: int, time: f64, margin: f64) -> f64:
         """Gap at which contact begins, m: offset + `margin` - remaining overlap."""
         return con.offset[c] + margin - remaining_overlap(con, his, world, c, point, time)
+
+    @wp.func
+    def approach_speed(his: History, world: int, rec: int, speed: f64) -> f64:
+        """Approach speed of the damping, m/s: the largest since contact began; `speed`: at the start of the attempt."""
+        return wp.max(wp.max(his.speed[world, rec], f64(MIN_APPROACH_SPEED)), speed)
+
+    @wp.func
+    def turned_spring(con: Contacts, his: History, world: int, c: int, rec: int, frame: wp.mat33d) -> vec3d:
+        """Stored elastic slip of a point in contact, m, turned with the axes of the other side."""
+        if con.law[c] & FIXED_SPRING != 0:
+            return his.spring[world, rec]
+        return frame * his.spring[world, rec]
 
     @wp.func
     def depth_at_start(

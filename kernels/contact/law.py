@@ -33,6 +33,7 @@ __all__ = [
     "FIXED_SPRING",
     "IMPACT_SPEED",
     "LAWS",
+    "MIN_APPROACH_SPEED",
     "SLIP_SPEED",
     "SPEED_DAMPING",
     "TRAIT_BITS",
@@ -56,6 +57,8 @@ FIXED_SPRING: Eqs. (78) and (83) of Paper I, where the elastic slip does not tur
 SLIP_SPEED: friction of the slip speed, without elastic slip. ANY_GAP: it acts at any gap. CRITICAL_DAMPING: with
 SPEED_DAMPING, restitution 0 is told by g < 0, minus the critical damping over h, N/m."""
 TRAIT_BITS = 6
+MIN_APPROACH_SPEED = 1e-3
+"""Lower bound of the approach speed in the damping of the default law, m/s."""
 IMPACT_SPEED = 0.05
 """Approach speed of a point, m/s, up to which restitution 0 does not damp it: points that enter a rolling contact would
 brake it."""
