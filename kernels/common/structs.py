@@ -7,11 +7,17 @@ import warp as wp
 from .modules import KernelSet, kernel_set
 from .types import int_1d, precision
 
-__all__ = ["AFTER_IMPACT", "balance_struct", "pattern_struct", "product_terms_struct", "topology_struct"]
+__all__ = [
+    "IMPACT_FOUND",
+    "IMPACT_REPEATED",
+    "balance_struct",
+    "pattern_struct",
+    "product_terms_struct",
+    "topology_struct",
+]
 
-AFTER_IMPACT = -1.0
-"""Value of `previous_h` of the step control that a term writes at its commit, after `accept_state` has stored the step,
-where an impact was not resolved by it: what the scheme remembers of the step is void."""
+IMPACT_FOUND, IMPACT_REPEATED = 1, 2
+"""Values of `impact` of the step control: the attempt does not resolve an impact; it is taken again for that reason."""
 
 
 @functools.cache

@@ -56,7 +56,6 @@ def contact_kernels(dtype: str, geometry: str, own: OwnLaws = ()) -> KernelSet:
         if q == 0 and item == 0 and facets.first_row == 0:
             scr.passed_point[world] = 0
             scr.limit_updates[world] = 0
-            scr.impact[world] = 0
             if clock.substep_index[world] == 0:
                 scr.elapsed_time[world] = f64(0.0)
         if facets.area_fraction[q, item] > f64(0.0):

@@ -5,7 +5,7 @@ import functools
 import warp as wp
 
 from ..common.modules import KernelSet, kernel_set, masked_kernel
-from ..common.structs import AFTER_IMPACT
+from ..common.structs import IMPACT_FOUND
 from ..common.types import f64, vec3d
 from .assembly import contact_module
 from .friction import friction_functions
@@ -23,6 +23,7 @@ from .structs import (
     SLIP_ROW,
     STICK_ROW,
     STORED_ROW,
+    WITH_STIFFNESS,
     contact_structs,
     world_value,
 )
@@ -35,8 +36,8 @@ colliders, and the part of the contact's work that is due to the integrator."""
 ENERGY_COLUMNS = 5
 IMPACT_DEPTH = 0.1
 """Depth of a point that was less than half as deep before the step and loses half of its momentum in it, over approach
-speed times step, below which the step has not resolved its impact: what BDF2 and generalized-alpha remember of it would
-throw the body back."""
+speed times step, below which the step does not resolve its impact: BDF2 and generalized-alpha would throw the body
+back."""
 RECORD_LANES = 32
 """Threads that share the sums over the facets of a contact."""
 SUMMED_ROWS = len(RECORD_NAMES) - 1
@@ -128,10 +129,6 @@ def contact_ledger_kernels(dtype: str, geometry: str, own: OwnLaws = ()) -> Kern
         """Store the history of a point in contact."""
         rec = k.history_row(con, c, point)
         speed = scr.approach_speed[world, point]
-        momentum = world_value(con.effective_mass, world, c) * speed
-        stopped = t.depth > f64(2.0) * t.previous_depth and o.normal_force > f64(0.5) * momentum * inv_h
-        if stopped and t.depth * inv_h < f64(IMPACT_DEPTH) * speed:
-            scr.impact[world] = 1
         his.spring[world, rec] = o.elastic_slip
         if not law.has_trait(con, c, FIXED_SPRING):
             his.spring[world, rec] = wp.transpose(g.slip_frame(other, world, c, point, t)) * o.elastic_slip
@@ -168,6 +165,30 @@ def contact_ledger_kernels(dtype: str, geometry: str, own: OwnLaws = ()) -> Kern
             add_to_row(scr.record_rows, AREA_ROW, world, row, area)
             add_to_row(scr.record_rows, STICK_ROW, world, row, area * f64(1 - o.slipping))
         scr.record_rows[PENETRATION_ROW, world, row] = wp.max(scr.record_rows[PENETRATION_ROW, world, row], t.depth)
+
+    @wp.kernel(module=module)
+    def find_impacts(
+        con: Contacts, other: Other, facets: Facets, his: History, clock: Clock, u: wp.array2d(dtype=vec3d),
+        running: wp.array(dtype=wp.int32), failed: wp.array(dtype=wp.int32), scr: ContactScratch,
+        impact: wp.array(dtype=wp.int32),
+    ):  # fmt: skip
+        """Flag worlds whose converged attempt stops a point within the substep."""
+        world, item = wp.tid()
+        if running[world] == 0 or failed[world] != 0 or impact[world] != 0:
+            return
+        c = facets.contact[item]
+        inv_h = k.inverse_step(clock, world)
+        for q in range(facets.point_count):
+            point = facets.first_point + item * facets.point_count + q
+            if scr.activity[world, point] == WITH_STIFFNESS:
+                t = g.evaluate(con, other, facets, his, scr, world, q, item, point, u, clock.new_time[world])
+                speed = scr.approach_speed[world, point]
+                sudden = t.depth > f64(2.0) * t.previous_depth and t.depth * inv_h < f64(IMPACT_DEPTH) * speed
+                if t.state == IN_REACH and t.depth > f64(0.0) and sudden:
+                    momentum = world_value(con.effective_mass, world, c) * speed
+                    force = law.with_normal_force(con, scr, world, c, point, t, inv_h).normal_values[0]
+                    if force > f64(0.5) * momentum * inv_h:
+                        impact[world] = IMPACT_FOUND
 
     @masked_kernel(module, "accepted")
     def record_substep(
@@ -264,16 +285,14 @@ def contact_ledger_kernels(dtype: str, geometry: str, own: OwnLaws = ()) -> Kern
         other: Other, clock: Clock, potential: wp.array(dtype=f64), term_sums: wp.array2d(dtype=f64),
         accepted: wp.array(dtype=wp.int32), his: History, scr: ContactScratch,
     ):  # fmt: skip
-        """Store the other side, the time of the accepted state, and whether an impact was not resolved; advance the
-        elapsed time; add the contact energy, J, to the bound of the next initial iterate."""
+        """Store the other side and the time of the accepted state; advance the elapsed time; add the contact energy,
+        J, to the bound of the next initial iterate."""
         world, index = wp.tid()
         g.store_side(other, world, index)
         if index == 0:
             his.pose_time[world] = clock.time[world]
             scr.elapsed_time[world] = scr.elapsed_time[world] + clock.h[world]
             potential[world] = potential[world] + term_sums[1, world]
-            if scr.impact[world] != 0 and clock.previous_h.shape[0] > 0:
-                clock.previous_h[world] = f64(AFTER_IMPACT)
 
     @wp.kernel(module=module)
     def write_records(scr: ContactScratch, first: int, report: wp.array2d(dtype=f64)):

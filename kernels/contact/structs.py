@@ -223,7 +223,6 @@ def contact_scratch_struct(dtype: str):
             dtype=wp.int32
         )  # [world] 1 + point that passed through a collider; -1 - point touched by
         # a collider that rotated too far; 0: none
-        impact: wp.array(dtype=wp.int32)  # [world] 1: a point was stopped within the substep
         record_rows: wp.array3d(dtype=wp.float64)  # [RECORD_NAMES, world, facet row] of the substep
         record_totals: wp.array3d(dtype=wp.float64)  # [world, contact, RECORD_NAMES] of the step so far
         elapsed_time: wp.array(dtype=wp.float64)  # [world] duration of the accepted substeps of the step, s
@@ -267,7 +266,7 @@ def collider_struct(meshes: bool):
 
 @functools.cache
 def clock_struct():
-    """Times of the current substep, and the state's memory of the step before, [world]."""
+    """Times of the current substep, [world]."""
 
     @wp.struct
     class Clock:
@@ -276,7 +275,6 @@ def clock_struct():
         h: wp.array(dtype=wp.float64)  # its length, s
         substep_index: wp.array(dtype=wp.int32)  # index of the substep; 0: first of the step
         is_static: wp.int32  # 1 in statics: no rates
-        previous_h: wp.array(dtype=wp.float64)  # of the state: AFTER_IMPACT is written; empty without a history
 
     return Clock
 

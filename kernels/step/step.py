@@ -11,13 +11,13 @@ from typing import Any
 import warp as wp
 
 from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
-from ..common.structs import AFTER_IMPACT, free_components_function
+from ..common.structs import IMPACT_FOUND, IMPACT_REPEATED, free_components_function
 from ..common.traits import NO_TERMS, Traits
 from ..common.types import double_2d, f64, int_1d, precision
 from ..solvers.newton_control import FAIL_ELEMENT_INVERTED, FAIL_ENERGY_GROWTH, FAIL_ROUNDOFF, FAIL_WORK, control_struct
 from ..solvers.pcg import pcg_struct
 from .energy_ledger import GROWTH_SHARE, ledger_kernels
-from .step_control import STATUS, step_end_functions, step_struct
+from .step_control import STATUS, Coefficients, step_end_functions, step_struct
 
 __all__ = ["step_kernels"]
 
@@ -37,18 +37,31 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
             the specialisation of its kernels: static (no inertia, v is the displacement increment), multistep (uses the
             state before the last), takes_velocity (v_n in q~), accelerated (with accelerations: a_n and w_n replace the
             state before the last), midpoint (forces at the midpoint), variant (their name).
-        traits: of the model; depends on "nonpotential" and "has_constraints".
+        traits: of the model; depends on "nonpotential", "has_constraints" and "unilateral".
     """
     p, free_components = precision(dtype), free_components_function(dtype)
     T, vec3 = p.T, p.vec3
     Step, limits = step_struct(), step_end_functions()
     Newton = control_struct()
     PCG = pcg_struct()
-    variant = traits.suffix("nonpotential", "has_constraints")
     coefficients, static, multistep = scheme.coefficients, scheme.static, scheme.multistep
     takes_velocity, accelerated, midpoint = scheme.takes_velocity, scheme.accelerated, scheme.midpoint
     MAX_GROWTH = MAX_STEP_GROWTH[dtype]
+    impacts = traits.unilateral and (multistep or accelerated)
+    variant = traits.suffix("nonpotential", "has_constraints", *(("unilateral",) if impacts else ()))
     module = kernel_module(f"step_{dtype}_{scheme.kernel_variant}{variant}")
+
+    @wp.func
+    def attempt_coefficients(step: Step, world: int, previous: f64) -> Coefficients:
+        """Coefficients of an attempt; those of backward Euler where an impact is not resolved."""
+        c = Coefficients()
+        c.a0 = f64(1.0)
+        c.dq_dv = step.h[world]
+        c.mass_factor = f64(1.0) / step.h[world]
+        if wp.static(impacts):
+            if step.impact[world] == IMPACT_REPEATED:
+                return c
+        return coefficients(step.h[world], previous, step.scheme_parameter)
 
     @wp.kernel(module=module)
     def begin_step(step: Step, newton: Newton, pcg: PCG):
@@ -81,6 +94,8 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
         if wp.abs(step.summed_time[world] - time) <= limits.time_tolerance(step, world):
             step.step_start_time[world] = step.summed_time[world]
         step.step_min_J[world] = f64(1.0e30)
+        if wp.static(impacts):
+            step.impact[world] = 0
 
     @wp.kernel(module=module)
     def begin_attempt(step: Step, newton: Newton):
@@ -89,6 +104,9 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
         if world == 0:
             step.any_running[0] = 0
             step.any_rejected[0] = 0
+        if wp.static(impacts):
+            if step.accepted[world] != 0 or step.rejected[world] != 0:
+                step.impact[world] = 0
         step.accepted[world] = 0
         step.first_rejection[world] = 0
         newton.active[world] = step.running[world]
@@ -115,9 +133,9 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
             if known and h <= f64(MAX_GROWTH) * step.previous_h[world]:
                 previous = step.previous_h[world]
         if wp.static(accelerated):
-            previous = wp.where(step.previous_h[world] > f64(0.0), step.previous_h[world], h)  # h: after an impact
+            previous = step.previous_h[world]
             step.acceleration_step[world] = previous
-        c = coefficients(h, previous, step.scheme_parameter)
+        c = attempt_coefficients(step, world, previous)
         step.a0[world] = c.a0
         step.a1[world] = c.a1
         if wp.static(takes_velocity):
@@ -153,9 +171,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
         """q~, v~ and the first iterate; prescribed components keep their positions.
 
         The iterate is v~ + (dq/dv) g, or v_n + (h/h_{n-1}) (v_n - v_{n-1}) if the previous step is known: its error is
-        then of second order in h, as stiff rotating bodies require. With accelerations it is v_n + h g. After an impact
-        that a step has not resolved a multistep scheme has no history, and the accelerations in the state become those
-        of gravity.
+        then of second order in h, as stiff rotating bodies require. With accelerations it is v_n + h g.
         """
         world, slot = wp.tid()
         q = u_n[world, slot]
@@ -170,10 +186,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
         if wp.static(takes_velocity):
             q += T(step.b[world]) * v_n[world, slot]
         if wp.static(accelerated):
-            c = coefficients(step.h[world], step.acceleration_step[world], step.scheme_parameter)
-            if step.previous_h[world] == f64(AFTER_IMPACT):  # the force of an impact ends with its step
-                u_before[world, slot] = is_position[slot] * vec3(step.gravity[world])
-                v_before[world, slot] = u_before[world, slot]
+            c = attempt_coefficients(step, world, step.acceleration_step[world])
             a = u_before[world, slot]
             q += T(c.q_a) * a
             w += T(c.v_a) * a + T(c.v_w) * v_before[world, slot]
@@ -205,8 +218,17 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
 
     @masked_kernel(module, "step.running")
     def end_attempt(step: Step, newton: Newton):
-        """Accept the substep, or refuse and halve it."""
+        """Accept the substep, or refuse and halve it, or take it again with backward Euler.
+
+        Multistep schemes and averages of accelerations keep part of the force of an impact for the next steps, and
+        throw a body back that the step has stopped, with more momentum than the forces of the report give it.
+        """
         world = wp.tid()
+        if wp.static(impacts):
+            if step.impact[world] == IMPACT_FOUND and newton.failed[world] == 0 and newton.inverted[world] == 0:
+                step.impact[world] = IMPACT_REPEATED
+                wp.atomic_max(step.any_running, 0, 1)
+                return
         if newton.inverted[world] != 0 and newton.failed[world] == 0:
             newton.failed[world] = FAIL_ELEMENT_INVERTED
         if newton.failed[world] == 0:
@@ -263,12 +285,18 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
         step: Step, newton: Newton, u: p.vec3_2d, v: p.vec3_2d, u_n: p.vec3_2d, v_n: p.vec3_2d, u_before: p.vec3_2d,
         v_before: p.vec3_2d,
     ):  # fmt: skip
-        """Store the accepted iterate in the state."""
+        """Store the accepted iterate in the state.
+
+        After an impact the accelerations stay those before it, and a multistep scheme has no history.
+        """
         world, slot = wp.tid()
         if wp.static(multistep):
             u_before[world, slot] = u_n[world, slot]
             v_before[world, slot] = v_n[world, slot]
-        if wp.static(accelerated):
+        impact = False
+        if wp.static(impacts):
+            impact = step.impact[world] == IMPACT_REPEATED
+        if wp.static(accelerated) and not impact:
             c = coefficients(step.h[world], step.acceleration_step[world], step.scheme_parameter)
             a = u_before[world, slot]
             new = v[world, slot]
@@ -279,6 +307,8 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
         if slot == 0:
             if wp.static(multistep or accelerated):
                 step.previous_h[world] = step.h[world]
+                if wp.static(multistep) and impact:
+                    step.previous_h[world] = f64(0.0)
                 step.previous_end_time[world] = step.time[world]
             newton.strain_energy[world] = newton.elem_sums[0, world]
         if wp.static(not static):

@@ -88,7 +88,8 @@ def step_struct():
         stage_time: wp.array(dtype=wp.float64)  # its midpoint, for midpoint schemes
         step_start_time: wp.array(dtype=wp.float64)  # s
         h: wp.array(dtype=wp.float64)  # s, size of the substep
-        previous_h: wp.array(dtype=wp.float64)  # of schemes with a history; 0 before the first step, or AFTER_IMPACT
+        previous_h: wp.array(dtype=wp.float64)  # of schemes with a history; 0 before the first step
+        impact: wp.array(dtype=wp.int32)  # of schemes with a history, with contact: IMPACT_FOUND, IMPACT_REPEATED, or 0
         previous_end_time: wp.array(dtype=wp.float64)  # end time of the previous step, of schemes that use its state
         dt: wp.array(dtype=wp.float64)  # s, size of the step
         a0: wp.array(dtype=wp.float64)  # q~ = a0 q_n - a1 q_{n-1} + b v_n

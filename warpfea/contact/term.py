@@ -110,7 +110,7 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
         """Shapes of the arrays of an attempt that are not (worlds, points)."""
         t, B = self.tables, worlds
         shapes: dict[str, tuple[int, ...]] = {
-            "impact": (B,), "aitken_sums": (B, AITKEN_LANES), "record_totals": (B, len(t.contacts), len(RECORD_NAMES)),
+            "aitken_sums": (B, AITKEN_LANES), "record_totals": (B, len(t.contacts), len(RECORD_NAMES)),
             "record_rows": (len(RECORD_NAMES), B, t.rows), "facet_activity": (B, t.rows), "shape_values": (1, 1, 1),
         }  # fmt: skip
         shapes |= dict.fromkeys(("passed_point", "elapsed_time", "relaxation", "limit_updates", "aitken_norm2"), (B,))
@@ -154,8 +154,6 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
         for name in ("new_time", "h", "substep_index"):
             setattr(clock, name, getattr(work.step, name))
         clock.time, clock.is_static = ctx.state.time, int(not ctx.inertia)
-        if "previous_step" in ctx.state.specs:
-            clock.previous_h = ctx.state.previous_step
         parts = (B, len(t.contacts), len(RECORD_NAMES), RECORD_LANES)
         u = work.u
         if self.double_displacements:  # only contact slots are used
@@ -300,6 +298,14 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
         self._record_substep(ctx, accepted)
         ctx.scratch[self.name]["finished"] = True
         return ctx.scratch[self.name]["energies"]
+
+    @part("commit")
+    def find_impacts(self, ctx: StepContext) -> None:
+        s, t, w = ctx.scratch[self.name], self.tables, ctx.work
+        for group in t.groups:
+            args = [t.data, s["other"], group.data, s["history"], s["clock"], s["u"], w.step.running, w.newton.failed]
+            dim = (self.model.worlds, group.count)
+            ctx.launch(self.ledger_kernels.find_impacts, dim, [*args, s["attempt"], w.step.impact])
 
     @part()
     def commit(self, ctx: StepContext, accepted: wp.array) -> None:

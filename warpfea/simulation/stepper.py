@@ -149,6 +149,8 @@ class Stepper:
             w.step.acceleration_step = w.array("h_before", (self.model.worlds,), wp.float64)
         if self.integrator.multistep or self.integrator.accelerated:
             w.step.previous_h = state.previous_step
+            if self.terms.contacts:
+                w.step.impact = w.array("impact", (self.model.worlds,), wp.int32)
             w.step.previous_end_time = state.acceleration_end if self.integrator.accelerated else state.previous_end
         if self.ledger:
             w.step.ledger_time = state.ledger_time
@@ -366,10 +368,13 @@ class Stepper:
         self.terms.call(self.ctx, Term, "begin", w.step.running)
 
     def _attempt(self) -> None:
+        w = self.work
         self.begin_attempt()
         self.newton.run()
         if self.step_size_control:
             self.step_size_control.check_local_error()
+        for term in self.terms.contacts if w.step.impact else ():
+            term.find_impacts(self.ctx)
         self.launch(self.kernels.end_attempt, self.model.worlds, [self.work.step, self.work.newton])
         if self.step_size_control:
             self.step_size_control.finish_attempt()

@@ -209,6 +209,9 @@ class Touching(Term):
         colliders of the model at a state; None if unknown to the term."""
         return None
 
+    def find_impacts(self, ctx: StepContext) -> None:
+        """Set `impact` of the step control to IMPACT_FOUND in worlds whose attempt does not resolve an impact."""
+
     def nodal_force(self, state: State) -> np.ndarray:
         """Elastic nodal forces of all its contacts at a state, (worlds, slots, 3), N."""
         raise NotImplementedError

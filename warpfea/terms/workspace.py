@@ -136,7 +136,15 @@ class Workspace:
         self.pcg = self.struct(pcg_struct(), B, sums=(2, B), curvature=(1, B))
         solve = self.newton.solve
         solve.negative_curvature, solve.pcg_unconverged = self.pcg.negative_curvature, self.pcg.pcg_unconverged
-        unused: tuple[str, ...] = ("b", "q_a", "acceleration_step", "any_rejected", "summed_time", "world_end")
+        unused: tuple[str, ...] = (
+            "b",
+            "q_a",
+            "acceleration_step",
+            "any_rejected",
+            "summed_time",
+            "world_end",
+            "impact",
+        )
         unused += ("energy_growth", "min_energy")
         unused += () if midpoint else ("stage_time",)
         self.step = self.struct(step_struct(), B, skip=unused, run_end=(2,))
