@@ -150,3 +150,38 @@ def test_an_impact_within_a_step_adds_no_energy(gap, integrator):
     whole = 0.5 * 0.04 * 3.0**2
     assert max(kinetic) <= whole * (1.0 + 1e-9)
     assert kinetic[-1] < 0.5 * whole
+
+
+@pytest.mark.parametrize("integrator", ["generalized_alpha", "bdf2"])
+def test_a_dropped_cube_has_the_momentum_of_its_forces(integrator):
+    """Sum of force times step = change of momentum + weight times time. Before, generalized-alpha kept a part of the
+    force of an impact within a step, and was 0.25 of 2.4 N s off."""
+    b = wf.ModelBuilder(gravity=(0, 0, -G))
+    mesh = wf.mesh.box((0.1, 0.1, 0.1), cells=(3, 3, 3), origin=(0, 0, 0.02))
+    block = b.add_solid(mesh, material=wf.NeoHookean.from_E_nu(E=1e6, nu=0.3, density=1000.0))
+    pad = b.add_contact(block.surface("z-"), b.add_collider(wf.HalfSpace((0, 0, 1)), name="floor"))
+    model = b.finalize(device="cpu")
+    sim = wf.Simulation(model, dt=1e-3, integrator=integrator)
+    sim.step(90)
+    force = sim.contact_record(pad).force[0, :, 2]
+    assert force.max() > 50.0
+    assert not force[-10:].any()
+    mass = np.asarray(model.mass_matrix().sum(axis=1)).ravel()[2::3]
+    momentum = mass @ sim.state.velocity.numpy()[0][:, 2]
+    assert 1e-3 * force.sum() == pytest.approx(momentum + 1.0 * G * 0.09, abs=1e-9)
+
+
+@pytest.mark.parametrize(("h", "gap"), [(1e-3, 0.0), (2e-3, 0.0), (2e-3, 1e-3)])
+def test_a_block_slides_down_an_incline_with_generalized_alpha(h, gap):
+    """v = g (sin a - mu cos a) t within 0.2 %; before, refused for an energy gain of 14 %."""
+    a, mu = math.radians(30.0), 0.3
+    b = wf.ModelBuilder(gravity=(G * math.sin(a), 0, -G * math.cos(a)))
+    mesh = wf.mesh.box((0.1, 0.1, 0.05), cells=(2, 2, 2), origin=(0, 0, gap))
+    block = b.add_solid(mesh, material=wf.SVK(E=1e6, nu=0.3, density=1000.0))
+    b.add_contact(block.surface("z-"), b.add_collider(wf.HalfSpace((0, 0, 1)), name="floor"), mu=mu)
+    model = b.finalize(device="cpu")
+    sim = wf.Simulation(model, dt=h, integrator="generalized_alpha")
+    sim.run(t_end=0.3)
+    mass = np.asarray(model.mass_matrix().sum(axis=1)).ravel()[::3]
+    speed = mass @ sim.state.velocity.numpy()[0][:, 0] / mass.sum()
+    assert speed == pytest.approx(G * (math.sin(a) - mu * math.cos(a)) * 0.3, rel=2e-3)
