@@ -202,7 +202,9 @@ def _checked_options(what: str, surface: SurfaceSet, o: dict[str, Any]) -> dict[
         o["mu_static"] = o["mu"]
     wanted = f"None, or at least mu = {o['mu']:g}"
     o["mu_static"] = _number(what, "mu_static", o["mu_static"], wanted, low=o["mu"])
-    wanted = "above 0 and at most 1 with this law" if law.least_restitution else "from 0 to 1"
+    wanted = "from 0 to 1"
+    if law.least_restitution:
+        wanted = f"above 0 and at most 1: law {o['law']!r} has no critical damping, for which the default 0 stands"
     o["restitution"] = _number(what, "restitution", o["restitution"], wanted, low=law.least_restitution, high=1.0)
     may_follow = o["radius"] is None and o["model"] == "patch" and law.smoothing is None
     o["stiffness_of"], o["stiffness"] = _stiffness(what, o["stiffness"], may_follow)
