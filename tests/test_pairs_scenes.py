@@ -85,3 +85,15 @@ def test_finger_pushes_the_beam_off_the_shell():
     assert beam[-1, 0] > 0.05 - 0.02 + 0.01  # past the edge, and it falls freely
     assert table.normal_force[0, -10:].max() == push.normal_force[0, -10:].max() == 0.0
     assert (probe.velocity[0, -1, 2] - probe.velocity[0, -11, 2]) / 0.04 == pytest.approx(-G, rel=0.02)
+
+
+@pytest.mark.slow
+def test_every_link_of_a_chain_bears_the_weight_below_it():
+    sim = run_contact_scene("links")
+    slots = [body.slots for body in sim.model.bodies]
+    weights = G * np.array([sim.model.masses.lumped[0][s].sum() for s in slots])
+    for k in range(1, 10):
+        force = sim.contact_record(f"joint {k}").force[0, -1]  # on the upper link
+        assert -force[2] == pytest.approx(weights[k:].sum(), rel=1e-3)
+        assert np.abs(force[:2]).max() < 1e-3 * -force[2]
+    assert weights.sum() == pytest.approx(G * sim.model.mass, rel=1e-9)
