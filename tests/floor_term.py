@@ -211,8 +211,8 @@ class Floor(Updated, Tied, Preconditioned):
     def allocate_blocks(self, ctx, matrix, *, projected):
         self.entry = self.model.array("floor", matrix.pattern.find_upper(self.slots, self.slots), wp.int32)
 
-    def blocks(self, ctx, matrix, kept, dq_dv, active, out, *, projected):
-        args = [self.model.topology, matrix.pattern.data, self.entry, *kept, dq_dv, active, out]
+    def blocks(self, ctx, matrix, cached, dq_dv, active, out, *, projected):
+        args = [self.model.topology, matrix.pattern.data, self.entry, *cached, dq_dv, active, out]
         ctx.launch(self.kernels.add, self.dim, args)
 
     def energy_increments(self, ctx, accepted):

@@ -69,7 +69,7 @@ def collider_kinematics(dtype: str, meshes: bool, seams: bool = False) -> Kernel
                 if wp.static(seams):
                     state = kept_sheet_side(col, c, y, his.contact_state[world, rec], state)
                 his.contact_state[world, rec] = state
-        side = stored_side(col, kc, in_contact, his.contact_state[world, rec])
+        side = stored_side(in_contact, his.contact_state[world, rec])
         now = k.activation_gap(con, his, world, c, point, clock.time[world], col.previous_margin[world, kc])
         n = set_start(col, scr, world, kc, point, y, side, now)
         scr.start_displacement[world, point] = shift
@@ -89,7 +89,7 @@ def collider_kinematics(dtype: str, meshes: bool, seams: bool = False) -> Kernel
         point = facets.first_point + item * facets.point_count + q
         kc = col.of_contact[c]
         y = scr.start_position[world, point]
-        d = distance(col, kc, y, stored_side(col, kc, True, his.contact_state[world, k.history_row(con, c, point)]))
+        d = distance(col, kc, y, stored_side(True, his.contact_state[world, k.history_row(con, c, point)]))
         v = interpolate(facets, v_n, world, q, item) - material_velocity(col, clock, world, kc, y)
         return col.previous_rotation[world, kc] * vec3d(d[0], d[1], d[2]), v
 
@@ -101,7 +101,7 @@ def collider_kinematics(dtype: str, meshes: bool, seams: bool = False) -> Kernel
         return col.angle[world, kc] - col.previous_angle[world, kc]
 
     @wp.func
-    def is_far(con: Contacts, col: Other, scr: ContactScratch, world: int, c: int, point: int, gap: f64) -> bool:
+    def is_far(con: Contacts, col: Other, c: int, gap: f64) -> bool:
         """True if a point is outside of a mesh by a lower bound `gap` of its distance: this avoids a search."""
         kind = col.kind[col.of_contact[c]]
         return kind == MESH and con.law[c] & ANY_GAP == 0 and gap > f64(0.0)
@@ -124,9 +124,9 @@ def collider_kinematics(dtype: str, meshes: bool, seams: bool = False) -> Kernel
         level = wp.int32(-1)
         if wp.static(meshes):
             d[3] = scr.activation_gap[world, point] - before - wp.length(t.local_position - start)
-            far = not in_contact and d[3] > activation and is_far(con, col, scr, world, c, point, d[3])
+            far = not in_contact and d[3] > activation and is_far(con, col, c, d[3])
         if not far:
-            side = stored_side(col, kc, in_contact, his.contact_state[world, k.history_row(con, c, point)])
+            side = stored_side(in_contact, his.contact_state[world, k.history_row(con, c, point)])
             out.feature = g.sweep(col, kc, start, t.local_position, side)
             d = distance(col, kc, t.local_position, out.feature)
             if wp.static(seams):

@@ -351,7 +351,7 @@ def mesh_functions(Colliders) -> KernelSet:
     @wp.func
     def sweep(col: Colliders, k: int, start: vec3d, end: vec3d, side: int) -> int:
         """Side through which a motion has passed the surface at its end, -1: none or any, -2: it passed through; see
-        `contact_shapes`."""
+        `shape_functions`."""
         h = find_crossings(col, k, start, end, side)
         d = end - start
         if side >= 0:

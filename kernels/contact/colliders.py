@@ -66,7 +66,7 @@ def collider_functions(meshes: bool) -> KernelSet:
         return f64(-1.0)
 
     @wp.func
-    def stored_side(col: Colliders, k: int, in_contact: bool, contact_state: int) -> int:
+    def stored_side(in_contact: bool, contact_state: int) -> int:
         """Side stored in a contact state, -1: none; of a point without contact to a sheet -3 in front of it, -4
         behind."""
         if in_contact:

@@ -5,25 +5,15 @@ import functools
 import warp as wp
 
 from ..common.modules import kernel_module
+from .thickness import MAX_INTERSECTIONS, inner_depth
 
 __all__ = ["crossing_kernel"]
-
-MAX_INTERSECTIONS = 8
-"""Maximum number of intersections of a segment."""
 
 
 @functools.cache
 def crossing_kernel() -> wp.Kernel:
     """Kernel; lengths over the size of the mesh."""
     module = kernel_module("skin_crossings", light=True)
-
-    @wp.func
-    def inner_depth(mesh: wp.uint64, x: wp.vec3) -> float:
-        """Distance from a position inside a closed mesh to its nearest point, else 0."""
-        found = wp.mesh_query_point_sign_winding_number(mesh, x, float(10.0))
-        if found.result and found.sign < float(0.0):
-            return wp.length(x - wp.mesh_eval_position(mesh, found.face, found.u, found.v))
-        return float(0.0)
 
     @wp.kernel(module=module)
     def crossing_depth(

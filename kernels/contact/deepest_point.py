@@ -216,7 +216,7 @@ def deepest_point_kernels(dtype: str, meshes: bool) -> KernelSet:
         con: Contacts, row_start: wp.array(dtype=wp.int32), active: wp.array(dtype=wp.int32), fresh: int,
         scr: ContactScratch, changed: wp.array(dtype=wp.int32),
     ):  # fmt: skip
-        """Deepest facet of each lumped contact, the first of equals; it may change MAX_CHOICES times per attempt.
+        """Deepest facet of each lumped contact, the first of equals; it may change MAX_POINT_CHOICES times per attempt.
 
         With two equally deep positions neither alone gives an equilibrium: the last choice stays.
         """
@@ -279,7 +279,7 @@ def deepest_point_kernels(dtype: str, meshes: bool) -> KernelSet:
         rotation = col.previous_rotation[world, k]
         y = wp.transpose(rotation) * (X + origin - col.previous_position[world, k])
         in_contact = settled == 0 and his.speed[world, rec] > f64(0.0)
-        side = stored_side(col, k, in_contact, his.contact_state[world, rec])
+        side = stored_side(in_contact, his.contact_state[world, rec])
         now = f.activation_gap(con, his, world, c, point, clock.time[world], col.previous_margin[world, k])
         n = geometry.set_start(col, scr, world, k, point, y, side, now)
         scr.start_displacement[world, point] = origin

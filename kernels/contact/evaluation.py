@@ -113,9 +113,9 @@ def pair_evaluation_kernels(dtype: str, own: OwnLaws = ()) -> KernelSet:
     Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)
     PairResults, Other = pair_results_struct(), facet_side_struct(dtype)
     Masters, PairScratch = master_struct(dtype), pair_scratch_struct(dtype)
-    k, law, seek = kinematics_functions(dtype), friction_functions(dtype, own), facet_search_kernels(dtype)
-    places, round_down, round_up = facet_projection_functions(dtype), seek.round_down, seek.round_up
-    surface_point, inverse_map, distance_outside = places.surface_point, places.inverse_map, places.distance_outside
+    k, law, search = kinematics_functions(dtype), friction_functions(dtype, own), facet_search_kernels(dtype)
+    f_, round_down, round_up = facet_projection_functions(dtype), search.round_down, search.round_up
+    surface_point, inverse_map, distance_outside = f_.surface_point, f_.inverse_map, f_.distance_outside
     module = kernel_module("_".join(["pair_evaluation", dtype, *law_names(own)]), max_unroll=SHORT_UNROLL)
 
     @wp.func
@@ -131,12 +131,12 @@ def pair_evaluation_kernels(dtype: str, own: OwnLaws = ()) -> KernelSet:
         while wp.bvh_query_next(query, index):
             f = index - world * mas.facet_count
             corners = mas.corner_count[mas.facet_kind[f]]
-            found = inverse_map(mas, pair.displacement, world, f, x, places.facet_centre(corners))
+            found = inverse_map(mas, pair.displacement, world, f, x, f_.facet_centre(corners))
             xi = vec3d(found[0], found[1], found[2])
             o = distance_outside(corners, xi)
             if found[3] != f64(0.0) and o <= off:
                 s = surface_point(mas, pair.displacement, world, f, xi)
-                gap = xi[2] * wp.dot(places.unit_normal(s), s.director)
+                gap = xi[2] * wp.dot(f_.unit_normal(s), s.director)
                 closer = wp.abs(gap) < height or (wp.abs(gap) == height and f64(f) < out[3])
                 if gap >= -mas.depth_limit[f] and (o < off or closer) and wp.abs(gap) <= far:
                     out = wp.vec4d(xi[0], xi[1], xi[2], f64(f))
@@ -174,7 +174,7 @@ def pair_evaluation_kernels(dtype: str, own: OwnLaws = ()) -> KernelSet:
         if f < 0:
             return
         xi = vec3d(found[0], found[1], found[2])
-        projection = places.project_on_facet(other.masters, U, world, f, xi)
+        projection = f_.project_on_facet(other.masters, U, world, f, xi)
         t = PointContact()
         t.normal = projection.normal
         t.depth = k.activation_gap(con, his, world, c, point, time[world], f64(0.0)) - (
@@ -183,7 +183,7 @@ def pair_evaluation_kernels(dtype: str, own: OwnLaws = ()) -> KernelSet:
         t.previous_depth = t.depth
         t.stiffness_ratio = k.stiffness_ratio(con, facets, world, c, item, other.masters.element_depth[f])
         if in_contact:
-            frame = seek.facet_frame(surface_point(other.masters, U, world, f, xi))
+            frame = search.facet_frame(surface_point(other.masters, U, world, f, xi))
             t.spring = k.turned_spring(con, his, world, c, point, frame)
         t = law.with_normal_force(con, scr, world, c, point, t, f64(0.0))
         frozen = law.friction_parameters(con, his, world, c, point, t)
@@ -196,8 +196,8 @@ def pair_evaluation_kernels(dtype: str, own: OwnLaws = ()) -> KernelSet:
         out.xi[world, point] = xi
         for i in range(other.masters.conn.shape[0]):
             out.reaction[world, point, i] = (
-                places.shape_value(other.masters, f, i, xi) * tangential_force
-                - places.shape_value(other.masters, f, i, projection.xi) * pressed
+                f_.shape_value(other.masters, f, i, xi) * tangential_force
+                - f_.shape_value(other.masters, f, i, projection.xi) * pressed
             )
 
     return kernel_set(locals())

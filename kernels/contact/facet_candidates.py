@@ -226,12 +226,12 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
 
     @wp.func
     def is_folded(mas: Masters, pair: PairScratch, world: int, f: int, xi: vec3d) -> bool:
-        """True if the outward vectors of a facet cross between a point and its foot: the tangents have turned round,
-        and coordinates within its sides say nothing."""
+        """True if the outward vectors of a facet cross between a point and its projection: the tangents have turned
+        round, and coordinates within its sides say nothing."""
         s = surface_point(mas, pair.displacement, world, f, xi)
-        foot = surface_point(mas, pair.displacement, world, f, vec3d(xi[0], xi[1], f64(0.0)))
-        n = wp.cross(foot.tangent_a, foot.tangent_b)
-        trace = wp.dot(wp.cross(foot.tangent_b, n), s.tangent_a) + wp.dot(wp.cross(n, foot.tangent_a), s.tangent_b)
+        base = surface_point(mas, pair.displacement, world, f, vec3d(xi[0], xi[1], f64(0.0)))
+        n = wp.cross(base.tangent_a, base.tangent_b)
+        trace = wp.dot(wp.cross(base.tangent_b, n), s.tangent_a) + wp.dot(wp.cross(n, base.tangent_a), s.tangent_b)
         return trace <= f64(0.0) or wp.dot(wp.cross(s.tangent_a, s.tangent_b), n) <= f64(0.0)
 
     @wp.func

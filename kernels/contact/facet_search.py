@@ -98,7 +98,7 @@ def facet_search_kernels(dtype: str) -> KernelSet:
 
     @masked_kernel(module, "active")
     def query_boxes(
-        con: Contacts, mas: Masters, facets: Facets, his: History, u: wp.array2d(dtype=vec3d),
+        mas: Masters, facets: Facets, his: History, u: wp.array2d(dtype=vec3d),
         active: wp.array(dtype=wp.int32), search_distance: f64, scr: ContactScratch, pair: PairScratch,
     ):  # fmt: skip
         """Flag slave facets with a master facet's box nearby; for the others store the box without master facets."""

@@ -158,12 +158,12 @@ def default_law(single_point: int, k: f64, rate: f64, ramp: f64, eps: f64, delta
     before = wp.max(delta_n, f64(0.0))
     if single_point != 0:
         return paper_law(single_point, k, -rate, f64(0.0), eps, delta, before)
-    bend = k - rate
-    force = bend * delta + rate * before
+    slope = k - rate
+    force = slope * delta + rate * before
     if delta <= f64(0.0) or force <= f64(0.0):
         return vec4d()
-    psi = f64(0.5) * force * force / bend
-    return vec4d(force, bend, psi, psi - rate * before * delta)
+    psi = f64(0.5) * force * force / slope
+    return vec4d(force, slope, psi, psi - rate * before * delta)
 
 
 @wp.func
@@ -174,10 +174,10 @@ def smooth_law(single_point: int, k: f64, g: f64, ramp: f64, eps: f64, delta: f6
     total = y + root
     if y < f64(0.0):
         total = eps * eps / (root - y)
-    bend = k + g
+    slope = k + g
     logarithm = wp.log((wp.abs(y) + root) / eps) * wp.sign(y)
-    psi = f64(0.25) * (y * total + eps * eps * logarithm) / bend
-    return vec4d(f64(0.5) * total, f64(0.5) * total / root * bend, psi, wp.abs(psi) + k * delta * delta)
+    psi = f64(0.25) * (y * total + eps * eps * logarithm) / slope
+    return vec4d(f64(0.5) * total, f64(0.5) * total / root * slope, psi, wp.abs(psi) + k * delta * delta)
 
 
 @wp.func

@@ -240,7 +240,7 @@ def contact_ledger_kernels(dtype: str, geometry: str, own: OwnLaws = ()) -> Kern
 
     @masked_kernel(module, "accepted")
     def partial_records(
-        con: Contacts, rows_of: wp.array(dtype=wp.int32), accepted: wp.array(dtype=wp.int32), scr: ContactScratch,
+        rows_of: wp.array(dtype=wp.int32), accepted: wp.array(dtype=wp.int32), scr: ContactScratch,
         out: wp.array4d(dtype=f64),
     ):  # fmt: skip
         """Sums over the facets of a contact, by lanes: [world, contact, RECORD_NAMES, lane]."""

@@ -15,7 +15,7 @@ FACETS_PER_CHUNK = 64
 
 @functools.cache
 def point_list_kernels(dtype: str) -> KernelSet:
-    """Kernels in the module of `pair_kernels`."""
+    """Kernels of the points of each master facet."""
     Masters, PairScratch = master_struct(dtype), pair_scratch_struct(dtype)
     module = kernel_module(f"pairs_{dtype}", max_unroll=SHORT_UNROLL)
 
@@ -65,7 +65,7 @@ def point_list_kernels(dtype: str) -> KernelSet:
         pair.list_size[world, f] = 0
 
     @wp.kernel(module=module)
-    def fill_lists(mas: Masters, pair: PairScratch):
+    def fill_lists(pair: PairScratch):
         """Fill the lists, in arbitrary order."""
         world, point = wp.tid()
         f = pair.listed_facet[world, point] - 1

@@ -105,7 +105,7 @@ def facet_projection_functions(dtype: str) -> KernelSet:
     def displacement_change(
         mas: Masters, U: FacetField, U0: FacetField, world: int, f: int, xi: vec3d,
     ) -> vec3d:  # fmt: skip
-        """Displacement at given coordinates by C and D minus that by C0 and D0."""
+        """Displacement at given coordinates by U minus that by U0."""
         out = vec3d()
         kind = mas.facet_kind[f]
         for m in range(mas.monomial_count[kind]):

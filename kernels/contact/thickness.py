@@ -1,4 +1,4 @@
-"""Thickness of a body behind the facets of a surface, and depth of points in it."""
+"""Thickness of a body behind the facets of a surface, and depth of positions in it."""
 
 import functools
 
@@ -6,10 +6,19 @@ import warp as wp
 
 from ..common.modules import kernel_module
 
-__all__ = ["depth_kernel", "thickness_kernel"]
+__all__ = ["MAX_INTERSECTIONS", "depth_kernel", "inner_depth", "thickness_kernel"]
 
 MAX_INTERSECTIONS = 8
-"""Maximum number of ray intersections."""
+"""Maximum number of intersections of a ray or segment."""
+
+
+@wp.func
+def inner_depth(mesh: wp.uint64, x: wp.vec3) -> float:
+    """Distance from a position inside a closed mesh to its nearest point, else 0."""
+    found = wp.mesh_query_point_sign_winding_number(mesh, x, float(10.0))
+    if found.result and found.sign < float(0.0):
+        return wp.length(x - wp.mesh_eval_position(mesh, found.face, found.u, found.v))
+    return float(0.0)
 
 
 @functools.cache
@@ -48,11 +57,8 @@ def depth_kernel() -> wp.Kernel:
 
     @wp.kernel(module=module)
     def depth(mesh: wp.uint64, x: wp.array(dtype=wp.vec3), out: wp.array(dtype=float)):
-        """Distance from x inside a closed mesh to its nearest point, else 0."""
+        """Depths of positions in a closed mesh."""
         i = wp.tid()
-        found = wp.mesh_query_point_sign_winding_number(mesh, x[i], float(10.0))
-        out[i] = float(0.0)
-        if found.result and found.sign < float(0.0):
-            out[i] = wp.length(x[i] - wp.mesh_eval_position(mesh, found.face, found.u, found.v))
+        out[i] = inner_depth(mesh, x[i])
 
     return depth

@@ -19,7 +19,7 @@ def dense_component_kernels(dtype: str) -> KernelSet:
     T, mat33 = p.T, p.mat33
     Pattern = pattern_struct()
     scalar_sum = lane_functions(dtype).scalar_sum
-    module = kernel_module(f"parts_{dtype}", max_unroll=SHORT_UNROLL)
+    module = kernel_module(f"dense_components_{dtype}", max_unroll=SHORT_UNROLL)
 
     @wp.kernel(module=module)
     def copy_flags_to_components(flags: int_1d, out: int_1d):

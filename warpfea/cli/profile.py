@@ -136,7 +136,7 @@ TABLE_HEADER = ("ms/step", "share", "launches", "MB/step", "GB/s", "of copy")
 
 
 def _cells(k: KernelTime, found: Profile) -> list[str]:
-    """The texts under `HEADER`."""
+    """The texts under `TABLE_HEADER`."""
     rate = k.GBps
     return [
         format_number(k.ms, 3),

@@ -227,12 +227,12 @@ class ColliderContact(ContactTerm):
         )
 
     def blocks(
-        self, ctx: StepContext, matrix: Any, kept: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,
+        self, ctx: StepContext, matrix: Any, cached: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,
         *, projected: bool,
     ) -> None:  # fmt: skip
         """Positive semi-definite stiffness of the points."""
-        weight = kept[1] if self.tables.tracks_deepest else ctx.scratch[self.name]["attempt"].shape_values
-        self._add_facet_blocks(ctx, matrix, kept[0], weight, dq_dv, active, out)
+        weight = cached[1] if self.tables.tracks_deepest else ctx.scratch[self.name]["attempt"].shape_values
+        self._add_facet_blocks(ctx, matrix, cached[0], weight, dq_dv, active, out)
 
     def _turn_text(self, contact: Any) -> str:
         return (

@@ -23,6 +23,7 @@ from ..model.state import State
 from ..model.surfaces import measure_to_skin
 from ..terms.term import FieldSpec
 from .collider_tables import ContactTables
+from .tables import TOUCHING_DEPTH_RATIO
 
 if TYPE_CHECKING:
     from .facet_tables import PairTables
@@ -37,8 +38,6 @@ CONTACT_FIELDS = {
     "gap": FieldSpec("gap", "m", np.fmin, np.fmin),
 }
 """Fields of both contact terms: pressures add up, the smallest gap counts."""
-TOUCHING_DEPTH_RATIO = 1e-9
-"""Initial depth over the model's size treated as touching; round-off of displacements is added."""
 AUTO_OVERLAP_RATIOS = np.array([0.05, 0.25])
 """Largest overlap that `overlap` "auto" stores, over the smallest edge of a face and depth of an element behind it."""
 ROUNDED_OVERLAP_RATIO = 1e-6
@@ -86,8 +85,8 @@ class PairEvaluation:
             if contact.facets.body is body:
                 X = self._master_positions(points)
                 nearest = np.full(gap.shape, -1)
-                seated = self.facet[:, points] >= 0
-                nearest[seated] = nearest_samples(t, k, contact.facets.body, X[seated])
+                assigned = self.facet[:, points] >= 0
+                nearest[assigned] = nearest_samples(t, k, contact.facets.body, X[assigned])
                 # master area: the loaded part only, without the area beside the slave
                 out.append(BodyContactPoints(nearest, np.where(normal > 0.0, area, 0.0), normal, gap))
         return out

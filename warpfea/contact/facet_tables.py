@@ -22,16 +22,13 @@ from ..model.pairs import (
     master_facets,
     monomial_exponents,
 )
-from .tables import WORLD_PARAMETERS, FacetTables, clamped_slots
+from .tables import TOUCHING_DEPTH_RATIO, WORLD_PARAMETERS, FacetTables, clamped_slots
 
 if TYPE_CHECKING:
     from ..model.model import Model
     from ..terms.time_law_table import TimeLawTable
 
 __all__ = ["PairTables"]
-
-TOUCH = 1e-9
-"""Depth over the size of a model treated as touching at the start of a step."""
 
 
 def refuse_offset(contact: FacetOptions, values: Any, mask: np.ndarray) -> None:
@@ -125,11 +122,6 @@ class PairTables(FacetTables[FacetOptions]):
         obstacles = [contact for contact in self.contacts if contact.grounded]
         return super().parameters() | {f"{c.sides[1].name}.offset": partial(refuse_offset, c) for c in obstacles}
 
-    @property
-    def parameter_arrays(self) -> dict[str, wp.array]:
-        found = super().parameter_arrays
-        return {name: found[name] for name in ("mu", "mu_static", "damping", "beta", "scale")}  # hash order
-
     def reference_boxes(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper corners (facets, 3) of the reference bounding boxes."""
         nodes = [
@@ -199,7 +191,7 @@ class PairTables(FacetTables[FacetOptions]):
                 "surface": np.repeat(np.arange(len(counts)), counts),
                 "max_monomials": most,
                 "surface_count": len(self.surfaces),
-                "touch_depth": TOUCH * self.size,
+                "touch_depth": TOUCHING_DEPTH_RATIO * self.size,
                 "first_entry": self.pool,
                 "facet_count": self.facets,
             }

@@ -178,13 +178,21 @@ class FacetContact(ContactTerm, Tied, Coupled):
         ctx.launch(k.update_centres, (m.worlds, t.facets), [masters, active, pair])
         wp.capture_if(pair.refit_needed, self._refit_tree, ctx=ctx)
         for group, corners in zip(t.groups, t.corners):
-            args = [t.data, masters, group.data, s["history"]]
-            ctx.launch(
-                k.query_boxes,
-                (m.worlds, group.count),
-                [*args, u, active, t.reach_distance + overlap_limit, s["attempt"], pair],
-            )
-            args += [s["clock"], u, ctx.state.velocity, active, overlap_limit, s["attempt"], pair, corners]
+            args = [masters, group.data, s["history"]]
+            more = [t.reach_distance + overlap_limit, s["attempt"], pair]
+            ctx.launch(k.query_boxes, (m.worlds, group.count), [*args, u, active, *more])
+            args = [
+                t.data,
+                *args,
+                s["clock"],
+                u,
+                ctx.state.velocity,
+                active,
+                overlap_limit,
+                s["attempt"],
+                pair,
+                corners,
+            ]
             ctx.launch(k.find_facets, group.point_threads(m.worlds), args)
 
     def _find_other(self, ctx: StepContext, active: wp.array, *, fresh: int) -> None:
@@ -212,7 +220,7 @@ class FacetContact(ContactTerm, Tied, Coupled):
         ctx.launch(k.sum_chunks, pair.chunk_offset.shape, [masters, pair])
         ctx.launch(k.scan_chunks, m.worlds, [pair])
         ctx.launch(k.set_list_starts, (m.worlds, t.facets), [masters, pair])
-        ctx.launch(k.fill_lists, (m.worlds, t.points), [masters, pair])
+        ctx.launch(k.fill_lists, (m.worlds, t.points), [pair])
         ctx.launch(k.sort_lists, (m.worlds, t.facets), [pair])
 
     @part()
@@ -251,13 +259,13 @@ class FacetContact(ContactTerm, Tied, Coupled):
             ctx.launch(state_kernels().clear_rows, words.shape, [flags, words])
 
     def blocks(
-        self, ctx: StepContext, matrix: Any, kept: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,
+        self, ctx: StepContext, matrix: Any, cached: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,
         *, projected: bool,
     ) -> None:  # fmt: skip
         """Stiffness of the points on their own facets and on master facets, without the coupling of both."""
         m = self.model
         lists = point_list_struct()()
-        stiffness, lists.list_size, lists.list_start, lists.list_point, weight, _ = kept
+        stiffness, lists.list_size, lists.list_start, lists.list_point, weight, _ = cached
         self._add_facet_blocks(ctx, matrix, stiffness, weight, dq_dv, active, out)
         index, begin, source, count = m.cache["pairs blocks"][-1]
         args = [m.topology, matrix.pattern.data, lists, index, begin, source, stiffness, weight, dq_dv, active, out]
@@ -277,15 +285,15 @@ class FacetContact(ContactTerm, Tied, Coupled):
             if contact.grounded:
                 free[np.unique(self.model.components.of_slot[contact.body.slots])] = 0.0
 
-    def allocate_mode_coupling(self, ctx: StepContext, motions: Any) -> Iterable[wp.Module]:
+    def allocate_mode_coupling(self, ctx: StepContext, rigid_modes: Any) -> Iterable[wp.Module]:
         if not self.coupled_bodies():
             return ()
         s = ctx.scratch[self.name]
-        s["motions"] = PairRigidModes(ctx, self.tables, s["masters"], motions)
-        return {s["motions"].kernels.module}
+        s["rigid_modes"] = PairRigidModes(ctx, self.tables, s["masters"], rigid_modes)
+        return {s["rigid_modes"].kernels.module}
 
-    def add_mode_coupling(self, ctx: StepContext, kept: list[wp.array], dq_dv: wp.array, active: wp.array) -> None:
-        ctx.scratch[self.name]["motions"].add(kept, dq_dv, active)
+    def add_mode_coupling(self, ctx: StepContext, cached: list[wp.array], dq_dv: wp.array, active: wp.array) -> None:
+        ctx.scratch[self.name]["rigid_modes"].add(cached, dq_dv, active)
 
     def _contact_info(self, contact: Any, k: int) -> dict[str, Any]:
         return {"facets": len(self.tables.masters[self.tables.master_of[k]].conn), "left_out": 0}
@@ -350,9 +358,9 @@ class PairRigidModes:
             "pairs motions", (m.worlds, len(t.contacts), rigid_modes.lanes(most), 4), wp.mat33d
         )
 
-    def add(self, kept: list[wp.array], dq_dv: wp.array, active: wp.array) -> None:
+    def add(self, cached: list[wp.array], dq_dv: wp.array, active: wp.array) -> None:
         """Add the coupling blocks, from the arrays of `cached_inputs`."""
-        stiffness, _, _, _, weight, listed = kept
+        stiffness, _, _, _, weight, listed = cached
         B, lanes, launch = self.ctx.model.worlds, self.partial_sums.shape[2], self.ctx.launch
         for group, contact, count in self.groups:
             args = [self.rigid_modes.bodies, self.masters, group.data, contact, self.first_point]

@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from ..model.model import Model
 
 __all__ = [
-    "POINT_SUM_LANES", "WORLD_PARAMETERS", "FacetTables", "check_chosen_values", "clamped_slots", "contact_constants",
-    "hunt_crossley_damping", "normal_damping", "restitution_beta",
+    "POINT_SUM_LANES", "TOUCHING_DEPTH_RATIO", "WORLD_PARAMETERS", "FacetTables", "check_chosen_values",
+    "clamped_slots", "contact_constants", "hunt_crossley_damping", "normal_damping", "restitution_beta",
 ]  # fmt: skip
 
 AnyContact = TypeVar("AnyContact", Contact, FacetOptions)
@@ -43,6 +43,8 @@ WORLD_PARAMETERS = {"mu": "mu", "mu_static": "mu_static", "restitution": "dampin
 """Contact parameters of Model.set_parameter and their arrays; the restitution also sets `beta`."""
 MATERIAL_CONSTANTS = ("normal_stiffness", "tangential_stiffness", "normal_damping", "effective_mass", "compliance")
 """Contact constants derived from the bodies' materials."""
+TOUCHING_DEPTH_RATIO = 1e-9
+"""Depth over the model's size treated as touching at the start of a step; to that of a run round-off is added."""
 POINT_SUM_LANES = 8
 """Largest number of threads that share a sum over the points of a facet on CUDA."""
 ELEMENT_STIFFNESS = 10.0

@@ -59,7 +59,8 @@ def contact_columns(stored: str) -> tuple[Column, ...]:
 class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
     """Contacts of a model with one geometry of the other side.
 
-    Members of a geometry; the first six rows are needed, the others do nothing here, or what any geometry needs:
+    Members of a geometry; those down to `nodal_force` are needed (`_turn_text` with TURNED), the others do nothing
+    here, or what any geometry needs:
 
     =============================  ==================================================================================
     `name`, `columns`, `parts`     name; ledger columns, of `contact_columns`; parts of a profile
@@ -69,6 +70,7 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
     `_begin_other`                 the other side at the start of an attempt, such as poses
     `_contact_info`                numbers of `Model.info`
     `_turn_text`                   reason where `evaluate` returns TURNED
+    `samples`, `nodal_force`       fields and forces at a state
     `_find_other`                  search at an iterate
     `_find_accepted`               search at the accepted iterate
     `_list_points`                 points of each slot of the other side, before the forces are gathered
@@ -76,7 +78,7 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
     `start`                        other side and overlaps at a state that a run begins from
     `update_frozen`, `diagonal`    more than that of the points, for the other side
     `cached_inputs`, `blocks`      stiffness in an assembled matrix; `_add_facet_blocks` adds that of the points
-    `samples`, `nodal_force`       fields and forces at a state
+    `poses`                        of obstacles at a state
     =============================  ==================================================================================
 
     Attributes:
@@ -269,7 +271,7 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
             args = [t.data, s["other"], group.data, s["history"], s["clock"], s["u"], accepted, s["attempt"]]
             ctx.launch(k.record_substep, (self.model.worlds, group.count), [*args, s["energies"]])
         sums = (self.model.worlds, len(self.tables.contacts), len(RECORD_NAMES))
-        args = [self.tables.data, s["row_start"], accepted, s["attempt"], s["parts"]]
+        args = [s["row_start"], accepted, s["attempt"], s["parts"]]
         ctx.launch(k.partial_records, (*sums, RECORD_LANES), args)
         ctx.launch(k.total_records, sums, [s["clock"], accepted, s["parts"], s["attempt"]])
 

@@ -85,21 +85,21 @@ class ContactOptions:
 
     sign: ClassVar[Any] = 1.0
 
-    mu: float = 0.0
-    mu_static: float = 0.0
-    restitution: float = 1.0
-    law: str = "default"
-    treatment: str = "implicit"
-    stiffness: float = 1.0
-    stiffness_of: str = "region"
-    model: str = "patch"
-    radius: float | None = None
-    offset: float = 0.0
-    points: int | None = None
-    smoothing: float | tuple[float, float] | None = None
-    overlap: str = "auto"
-    overlap_time: float = 0.1
-    seam: float | None = None
+    mu: float
+    mu_static: float
+    restitution: float
+    law: str
+    treatment: str
+    stiffness: float
+    stiffness_of: str
+    model: str
+    radius: float | None
+    offset: float
+    points: int | None
+    smoothing: float | tuple[float, float] | None
+    overlap: str
+    overlap_time: float
+    seam: float | None
     index: int = -1
 
     @property

@@ -260,7 +260,7 @@ class NewtonLoop:
     def run(self) -> None:
         """Iterate from work.v until every active world has converged or failed.
 
-        `first_iterate_candidates` write other first iterates to work.v in the worlds flagged by `choose_initial`.
+        `first_iterate_candidates` write other first iterates to work.v in worlds whose `start.has_alternatives` is set.
         """
         w = self.work
         self._clear_direction(w.newton.active)

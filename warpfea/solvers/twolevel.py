@@ -189,7 +189,7 @@ class TwoLevel(Preconditioner):
     def start(self, active: wp.array, *, rebuild: bool = False) -> None:
         """Rebuild where due, with D and the penalties that follow from D."""
         # factors that follow the operator's matrix reuse D only
-        whole = rebuild and not (self.factors_operator and self.model.device.is_cuda)
+        whole = rebuild and not (self.factors_operator and self.plan.on_cuda)
         self.reuse.decide_rebuild(active, all_active=whole)
         self.reuse.rebuild_if_flagged(partial(self._build, penalty=True))
 

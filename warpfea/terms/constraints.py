@@ -248,14 +248,14 @@ class Constraints(Constrained, Updated, Tied, Preconditioned):
             self.model.cache["couplings"] = self.tables.pattern_couplings(matrix.pattern)
 
     def blocks(
-        self, ctx: StepContext, matrix: Any, kept: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,
+        self, ctx: StepContext, matrix: Any, cached: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,
         *, projected: bool,
     ) -> None:  # fmt: skip
         """J^T rho J and, unless projected, sum lambda d2c/dq2."""
         k = constraint_block_kernels(self.model.dtype)
         pairs, count = self.model.cache["couplings"]
         args = [self.model.topology, matrix.pattern.data, pairs]
-        kernel, more = k.add_penalties, list[Any](kept)
+        kernel, more = k.add_penalties, list[Any](cached)
         if not projected:
             kernel, more = k.add_tangent, [self.tables.data, ctx.work.multipliers, ctx.midpoint_factor]
         ctx.launch(kernel, (self.model.worlds, count), [*args, *more, dq_dv, active, out])

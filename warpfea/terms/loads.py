@@ -347,7 +347,7 @@ class FollowerLoads(Preconditioned):
             ctx.scratch[self.name] = [FollowerMatrix(self, ctx, load, matrix.pattern) for load in loads]
 
     def blocks(
-        self, ctx: StepContext, matrix: Any, kept: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,
+        self, ctx: StepContext, matrix: Any, cached: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,
         *, projected: bool,
     ) -> None:  # fmt: skip
         """Minus the symmetric tangent of the force; indefinite, so nothing if projected."""

@@ -1,4 +1,5 @@
-"""Protocols of terms: methods that few terms need, each group a base class with methods that do nothing.
+"""Protocols of terms: methods that few terms need, each group a base class with methods that do nothing, but for
+`Touching`, whose methods are needed.
 
 A solver iterates over `TermSet.having(protocol)`: the terms that lack it cost nothing. A term that defines a method of
 a protocol without deriving from it is refused by name.
@@ -140,7 +141,7 @@ class Preconditioned(Term):
         return ()
 
     def blocks(
-        self, ctx: StepContext, matrix: Any, kept: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,
+        self, ctx: StepContext, matrix: Any, cached: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,
         *, projected: bool,
     ) -> None:  # fmt: skip
         """out += (dq/dv) K, with the pattern of `matrix` (see solvers.matrix_assembly.MatrixAssembler), from the
@@ -158,11 +159,11 @@ class Coupled(Term):
         """Body pairs coupled by the tangent but not by `blocks`: the rest is added by `add_mode_coupling`."""
         return []
 
-    def allocate_mode_coupling(self, ctx: StepContext, motions: Any) -> Iterable[wp.Module]:
+    def allocate_mode_coupling(self, ctx: StepContext, rigid_modes: Any) -> Iterable[wp.Module]:
         """Allocate for `add_mode_coupling` before launches are captured; returns its modules."""
         return ()
 
-    def add_mode_coupling(self, ctx: StepContext, kept: list[wp.array], dq_dv: wp.array, active: wp.array) -> None:
+    def add_mode_coupling(self, ctx: StepContext, cached: list[wp.array], dq_dv: wp.array, active: wp.array) -> None:
         """Add the coupling of bodies to the rigid body mode matrix (solvers/rigid_body_modes.py)."""
 
 
