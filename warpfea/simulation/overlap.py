@@ -186,7 +186,7 @@ class OverlapCheck:
         inner = np.where(np.array([side.closed for side in self._sides])[j], least, 0.0)[:, None, None]
         meet = ((low[i] + inner <= high[j]) & (low[j] + inner <= high[i])).all(axis=2)
         found, out = np.zeros(len(meet), dtype=bool), []
-        for k in np.flatnonzero(meet.any(axis=1)):
+        for k in np.flatnonzero(meet.any(axis=1)).tolist():
             sides = self._sides[i[k]], self._sides[j[k]]
             for world in np.flatnonzero(meet[k])[:MAX_WORLDS].tolist():
                 depth = _crossing_depth(*sides, points[i[k]][world], points[j[k]][world], least[k])
