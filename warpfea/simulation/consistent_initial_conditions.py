@@ -22,6 +22,7 @@ from ..base.errors import ModelError
 from ..base.worlds import device_flags, set_rows
 from ..kernels.step.step_control import STATUS
 from ..kernels.terms.constraints import ANGLE, DISTANCE, FORMULA
+from ..terms.protocols import Constrained
 from ..terms.term import StepContext, Term
 from ..time_laws import TimeLaw
 from .discontinuities import jump_intervals, kink_times
@@ -97,8 +98,7 @@ class ConsistentInitialConditions:
         """Indices of the laws that prescribe positions."""
         terms = self.model.terms
         tables = [terms.supports.displacement_drives, terms.supports.rotation_drives]
-        if self.model.constraints is not None:
-            tables.append(terms.constraints.tables.data)
+        tables += [term.tables.data for term in terms.having(Constrained)]
         return {number for table in tables if table is not None for number in table.law.numpy().ravel().tolist()}
 
     def _restart_worlds(self, flags: np.ndarray, time: np.ndarray, after_jump: np.ndarray, dt: float) -> None:

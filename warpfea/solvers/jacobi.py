@@ -177,7 +177,7 @@ class JacobiLoop(NewtonLoop):
         self.launch(
             self.descent_kernels.report_cost, self.model.worlds, [w.newton, self.control, w.pcg, w.step.running]
         )
-        self.preconditioner.record_cost(w.newton.active)
+        self.preconditioner.record_cost()
         w.newton.active.zero_()
 
     def _iterate(self) -> None:

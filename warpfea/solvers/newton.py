@@ -331,7 +331,7 @@ class NewtonLoop:
         self.pcg.solve(active)
         self.residual.freeze_nonpotential(active)
         self.residual.tangent_curvature(active)
-        self.preconditioner.record_cost(active)
+        self.preconditioner.record_cost()
         if self.limits_step:
             launch(k.reset_step_limit, self.model.worlds, [w.newton])
         self.terms.call(self.ctx, Updated, "process_direction", active)

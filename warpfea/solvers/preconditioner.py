@@ -49,7 +49,7 @@ class Preconditioner:
     def prepare(self, active: wp.array) -> None:
         """Compute the data of `apply` before a linear solve."""
 
-    def record_cost(self, active: wp.array) -> None:
+    def record_cost(self) -> None:
         """After a linear solve: record its iteration count for the reuse rule."""
 
     def apply(self, r: wp.array, z: wp.array, active: wp.array) -> None:

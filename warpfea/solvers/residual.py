@@ -18,6 +18,7 @@ from ..kernels.step.gather import RESIDUAL_ROWS, gather_kernels
 from ..kernels.step.midpoint import midpoint_kernels
 from ..kernels.terms.constraints import constraint_struct
 from ..terms.elements import Elements
+from ..terms.protocols import Constrained
 from ..terms.term import Term
 from .clusters import ModelClusters, make_cluster_memory, make_clusters
 from .matrix_assembly import MatrixAssembler, leading_view
@@ -80,7 +81,8 @@ class Residual:
         self.newton_kernels = newton_kernels(traits)
         self.vector_kernels = vector_kernels(model.dtype, traits.has_constraints)
         self.midpoint_kernels = midpoint_kernels(model.dtype)
-        self.constraint_data = model.constraints.data if traits.constraint_rows else constraint_struct()()
+        constrained = traits.constraint_rows
+        self.constraint_data = self.terms.find(Constrained).tables.data if constrained else constraint_struct()()
         self.dim = (model.worlds, model.slots)
         self.product_terms = self._make_product_terms()
         self.clusters: ModelClusters | None = None

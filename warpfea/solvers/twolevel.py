@@ -200,7 +200,7 @@ class TwoLevel(Preconditioner):
         self.reuse.rebuild_if_flagged(self._build)
 
     @launch_part("build")
-    def record_cost(self, active: wp.array) -> None:
+    def record_cost(self) -> None:
         """Record the iteration count of the solve. Factors follow the operator's matrix: only D is kept, which weights
         the norms, and which no count of iterations calls for anew."""
         if not self.factors_operator:

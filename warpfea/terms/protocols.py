@@ -72,7 +72,13 @@ class Updated(Term):
 
 class Constrained(Term):
     """Term of constraint rows with multipliers and penalties; its blocks are added to a matrix after D is taken
-    from it. The slots gather from its rows in work.multipliers: a model has at most one such term."""
+    from it. The slots gather from its rows in work.multipliers: a model has at most one such term.
+
+    Attributes:
+        tables: its rows; `data`: on the device, as of kernels/terms/constraints.py, with the `law` of each.
+    """
+
+    tables: Any
 
     def configure(self, ctx: StepContext) -> None:
         """Configure for the solver and state, both known here."""
