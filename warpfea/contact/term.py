@@ -303,11 +303,10 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
 
     @part("commit")
     def find_impacts(self, ctx: StepContext) -> None:
-        s, t, w = ctx.scratch[self.name], self.tables, ctx.work
+        s, t, w, B = ctx.scratch[self.name], self.tables, ctx.work, self.model.worlds
         for group in t.groups:
             args = [t.data, s["other"], group.data, s["history"], s["clock"], s["u"], w.step.running, w.newton.failed]
-            dim = (self.model.worlds, group.count)
-            ctx.launch(self.ledger_kernels.find_impacts, dim, [*args, s["attempt"], w.step.impact])
+            ctx.launch(self.ledger_kernels.find_impacts, (B, group.count), [*args, s["attempt"], w.step.impact])
 
     @part()
     def commit(self, ctx: StepContext, accepted: wp.array) -> None:
@@ -394,8 +393,7 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
     def failure_note(self, ctx: StepContext, world: int) -> str:
         touched = ctx.scratch[self.name]["attempt"].facet_activity.numpy()[world] > 0
         t, most = self.tables, MAX_NAMED_CONTACTS
-        names = [f"{contact.name!r}{f' with collider {contact.sides[1].name!r}' * contact.grounded}"
-                 for k, contact in enumerate(t.contacts)
+        names = [f"{c.name!r}{f' with collider {c.sides[1].name!r}' * c.grounded}" for k, c in enumerate(t.contacts)
                  if touched[t.row_start[k] : t.row_start[k + 1]].any()]  # fmt: skip
         more = f" and {len(names) - most} more" if len(names) > most else ""
         return f"; in touch: contact {', '.join(names[:most])}{more}" if names else ""

@@ -59,19 +59,14 @@ class Stepper:
         if integrator.midpoint and isinstance(solver, Jacobi):
             raise ModelError(f"integrator {integrator.name!r} needs Newton's method: solver=NewtonPCG(...), not Jacobi")
         self.kernels = step_kernels(model.dtype, integrator, model.terms.traits)
-        vec3 = model.types.vec3
         state.sealed = False
         model.terms.time_laws.register(state)
-        if integrator.multistep:
-            state.register("previous_displacement", vec3, (model.slots,))
-            state.register("previous_velocity", vec3, (model.slots,))
+        if integrator.multistep or integrator.accelerated:
+            for name in integrator.history_arrays:
+                state.register(name, model.types.vec3, (model.slots,))
             state.register("previous_step", wp.float64)
-            state.register("previous_end", wp.float64)
-        if integrator.accelerated:
-            state.register("algorithmic_acceleration", vec3, (model.slots,))
-            state.register("acceleration", vec3, (model.slots,))
-            state.register("previous_step", wp.float64)
-            state.register("acceleration_end", wp.float64, initial=np.nan)
+            end, initial = ("acceleration_end", np.nan) if integrator.accelerated else ("previous_end", 0.0)
+            state.register(end, wp.float64, initial=initial)
         if ledger:
             state.register("ledger", wp.float64, (len(model.terms.ledger),))
             state.register("ledger_time", wp.float64)
@@ -368,12 +363,11 @@ class Stepper:
         self.terms.call(self.ctx, Term, "begin", w.step.running)
 
     def _attempt(self) -> None:
-        w = self.work
         self.begin_attempt()
         self.newton.run()
         if self.step_size_control:
             self.step_size_control.check_local_error()
-        for term in self.terms.contacts if w.step.impact else ():
+        for term in self.terms.contacts if self.work.step.impact else ():
             term.find_impacts(self.ctx)
         self.launch(self.kernels.end_attempt, self.model.worlds, [self.work.step, self.work.newton])
         if self.step_size_control:
@@ -416,10 +410,8 @@ class Stepper:
     def law_values(self, time: float) -> np.ndarray:
         """Values of the time laws at a time, s, or load fraction, (B, laws, 3), without changing those of the step."""
         m, w = self.model, self.work
-        kept = [
-            (array, array.numpy().copy())
-            for array in (w.step.new_time, w.step.load_factor, w.time_law_values, w.step.gravity)
-        ]
+        changed = (w.step.new_time, w.step.load_factor, w.time_law_values, w.step.gravity)
+        kept = [(array, array.numpy().copy()) for array in changed]
         w.step.new_time.fill_(time)
         w.step.load_factor.fill_(time if self.integrator.static else 1.0)
         self._evaluate_time_laws(wp.ones(m.worlds, dtype=wp.int32, device=m.device))

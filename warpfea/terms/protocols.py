@@ -1,5 +1,5 @@
 """Protocols of terms: methods that few terms need, each group a base class with methods that do nothing, but for
-`Touching`, whose methods are needed.
+those of `Touching` that raise.
 
 A solver iterates over `TermSet.having(protocol)`: the terms that lack it cost nothing. A term that defines a method of
 a protocol without deriving from it is refused by name.
