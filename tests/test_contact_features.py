@@ -242,3 +242,18 @@ def test_moving_obstacles_beside_a_rail_are_where_their_paths_lead():
     np.testing.assert_allclose(position[1], [(0, 0, -0.05), (6, 0, 0), (5, 2, 0)], atol=1e-12)
     np.testing.assert_allclose(axes[1, 2], [(0, -1, 0), (1, 0, 0), (0, 0, 1)], atol=1e-12)
     assert not offset.any()
+
+
+def test_a_bar_across_rails_does_not_pass_between_their_points():
+    """Rails longer than wide had points 17 mm apart along them: a bar of 20 mm sank 5 mm into them."""
+    b = wf.ModelBuilder(gravity=(0, 0, -G))
+    ends = [(-0.15, 0.0, 0.0102), (0.15, 0.0, 0.0102)]
+    material = wf.SVK(E=1e8, nu=0.3, density=RHO)
+    body = b.add_beam(ends, elements=2, section=wf.Rectangle(0.02, 0.02), normal=(0, 0, 1), material=material)
+    rails = [b.add_collider(wf.Box((x, 0.03, -0.02), (0.02, 0.33, 0.04))) for x in (-0.13, 0.13)]
+    pads = [b.add_contact(body, rail, mu=0.3) for rail in rails]
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=4e-3)
+    sim.step(20)
+    for pad in pads:
+        assert sim.contact_record(pad).force[0, -1, 2] == pytest.approx(0.15 * 0.02**2 * RHO * G, rel=1e-3)
+    assert sim.positions(body)[0, :, 2].min() > 0.0098  # of the axis

@@ -97,3 +97,17 @@ def test_every_link_of_a_chain_bears_the_weight_below_it():
         assert -force[2] == pytest.approx(weights[k:].sum(), rel=1e-3)
         assert np.abs(force[:2]).max() < 1e-3 * -force[2]
     assert weights.sum() == pytest.approx(G * sim.model.mass, rel=1e-9)
+
+
+@pytest.mark.slow
+def test_layers_of_crossed_beams_bear_what_is_above_them():
+    sim = run_contact_scene("crossed_beams")
+    records = {c.name: sim.contact_record(c.name) for c in sim.model.description.contacts}
+    beam, block = 0.3 * 0.02**2 * 1200.0 * G, 0.14**2 * 0.035 * 1200.0 * G
+    for layer, above in (("load", block), ("crossing 2", block + 3 * beam), ("crossing 1", block + 6 * beam)):
+        force = sum(record.force[0, -5:].mean(axis=0) for name, record in records.items() if name.startswith(layer))
+        assert force[2] == pytest.approx(above, rel=5e-3)
+        assert np.abs(force[:2]).max() < 5e-3 * above
+    for record in records.values():
+        assert record.penetration[0, -1] < 1e-2 * 0.02
+    assert -0.03 < sim.probe("block").displacement[0, -1, 2] < -0.002

@@ -51,7 +51,10 @@ def body_widths(body: Discretisation) -> tuple[float, float]:
     X = body.mesh.points[np.unique(body.mesh.cells)]
     axes = np.linalg.svd(X - X.mean(axis=0), full_matrices=False)[2]
     extents = np.sort(np.ptp(X @ axes.T, axis=0))
-    return float(extents[0]), float(extents[1])
+    thickness = assembly.element_volumes(body).sum() / (
+        extents[1] * extents[2]
+    )  # at most its extent, of shells it counts
+    return float(max(extents[0], thickness)), float(extents[1])
 
 
 def is_narrow(widths: tuple[float, float], side: float) -> bool:

@@ -15,7 +15,7 @@ from ..elements.quadrature import lobatto_square, triangle_16
 from .contact_points import ContactPoints, element_depths
 from .contacts import Collider
 from .handles import SurfaceSet
-from .narrow import WIDEST_GAP, facet_side, is_narrow
+from .narrow import WIDEST_GAP, body_widths, facet_side, is_narrow
 from .pairs import FacetOptions
 from .shapes import BOX, CYLINDER, HALF_SPACE, SPHERE, Shape
 from .triangle_mesh import TriMesh
@@ -216,6 +216,9 @@ def obstacle_points(contact: ObstacleContact) -> tuple[ContactPoints, np.ndarray
     """
     shape, surface = contact.collider.shape, contact.surface
     side, depth = facet_side(surface), float(element_depths(surface).min())
+    least, second = body_widths(surface.body)
+    if second < side:  # a bar, which may lie across: it would pass between points of longer patches
+        side = min(side, 2.0 * least)
     center, axes = shape.frame()
     if isinstance(shape, TriMesh):
         found, center, axes = _triangles(shape, 0.5 * side), np.zeros(3), np.eye(3)
