@@ -111,3 +111,15 @@ def test_layers_of_crossed_beams_bear_what_is_above_them():
     for record in records.values():
         assert record.penetration[0, -1] < 1e-2 * 0.02
     assert -0.03 < sim.probe("block").displacement[0, -1, 2] < -0.002
+
+
+def test_teeth_of_a_comb_share_the_weight_of_a_bar():
+    sim = run_contact_scene("comb")
+    share = 0.2 * 0.02**2 * 1200.0 * G / 5
+    EI, own, reach, length = 5e7 * 0.01**4 / 12.0, 0.01**2 * 1200.0 * G, 0.12, 0.15
+    wanted = share * reach**2 * (3.0 * length - reach) / (6.0 * EI) + own * length**4 / (8.0 * EI)
+    for k in range(1, 6):
+        force = sim.contact_record(f"on tooth {k}").force[0, -5:].mean(axis=0)
+        assert force[2] == pytest.approx(share, rel=5e-3)
+        assert np.abs(force[:2]).max() < 5e-3 * share
+        assert -sim.probe(f"tip {k}").displacement[0, -1, 2] == pytest.approx(wanted, rel=0.015)

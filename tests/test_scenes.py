@@ -16,8 +16,8 @@ from warpfea.builder.scene import Scene, find, load_file, names
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 BUILTIN = [
     "arch", "ball_on_plate", "beam_over_cylinders", "belt", "block_stack", "bouncing_ball", "brick_floor",
-    "cantilever", "chain", "crossed_beams", "double_pendulum", "finger_beam_shell", "four_bar", "gears", "gripper",
-    "hook", "hung_plate", "links", "mixed", "pendulum", "plate_pendulum", "rollup", "slider_crank", "spin",
+    "cantilever", "chain", "comb", "crossed_beams", "double_pendulum", "finger_beam_shell", "four_bar", "gears",
+    "gripper", "hook", "hung_plate", "links", "mixed", "pendulum", "plate_pendulum", "rollup", "slider_crank", "spin",
     "tilting_table", "twist",
 ]  # fmt: skip
 
