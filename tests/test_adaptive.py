@@ -34,11 +34,11 @@ def test_the_error_follows_what_is_asked():
     body = b.add_solid(wf.mesh.box((1, 1, 1), cells=(1, 1, 1)), material=LAW)
     model = b.finalize(device="cpu")
     found = []
-    for error in (1e-2, 1e-3, 1e-4):
+    for end, error in ((0.2, 1e-2), (0.2, 1e-3), (0.2, 1e-4), (0.3, 1e-3)):
         sim = auto(model, error)
-        sim.run(0.2)
-        assert sim.time[0] == pytest.approx(0.2, rel=1e-12)
-        fall = sim.displacements(body)[0, :, 2] + 0.5 * 9.81 * 0.2**2
+        sim.run(end)
+        assert sim.time[0] == pytest.approx(end, rel=1e-12)
+        fall = sim.displacements(body)[0, :, 2] + 0.5 * 9.81 * end**2
         found.append(np.abs(fall).max() / model.size / error)
     assert min(found) > 0.1
     assert max(found) < 1.0  # a share of the error is asked of the estimates, and steps are halves of halves
@@ -148,6 +148,20 @@ def test_a_kick_is_met_on_its_kink_and_with_short_steps():
     after = [h for t, h in sizes.items() if KICK + 1e-12 < t < KICK + 2e-3]
     assert min(after) < 0.25 * min(before)
     assert times[-1] == pytest.approx(0.05, rel=1e-14)
+
+
+@pytest.mark.parametrize(("integrator", "most"), [("backward_euler", 60), ("bdf2", 40)])
+def test_an_impact_is_passed_in_few_substeps(integrator, most):
+    """A velocity that jumps at any step: 37 and 22 substeps, 1661 and 254 where each is judged by its own size."""
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    mesh = wf.mesh.box((0.1, 0.1, 0.1), cells=(1, 1, 1), origin=(0, 0, 0.0503))
+    body = b.add_solid(mesh, material=wf.SVK(E=1e12, nu=0.3, density=1000.0))
+    b.set_initial(body, velocity=(0, 0, -1.0))
+    b.add_contact(body, b.add_collider(wf.HalfSpace((0, 0, 1), 0.0)))
+    sim = auto(b.finalize(device="cpu"), 2e-2, integrator=integrator, horizon=0.1, interval=1e-2)
+    sim.run(0.06)
+    assert sim.totals["substeps"][0] < most
+    assert abs(sim.velocities(body)[0, :, 2].mean()) < 0.1
 
 
 # bits of the state

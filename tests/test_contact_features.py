@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import warpfea as wf
+from warpfea.model.obstacle_points import ObstacleContact
 
 G = 9.81
 E, RHO = 1e9, 1000.0
@@ -186,6 +187,24 @@ def test_a_block_falls_freely_beside_the_border_of_a_body(beside, facet, whole):
     assert fallen == pytest.approx(0.5 * G * 0.12 * 0.122, rel=1e-9)  # backward Euler
 
 
+def test_a_block_flush_with_the_table_below_is_held_at_its_borders():
+    """Points of its edges pass the table's surface at the border, to the rounding of a turned mesh."""
+    c, s = np.cos(0.3), np.sin(0.3)
+    turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+    b = wf.ModelBuilder(gravity=(0, 0, -G))
+    low, block = (
+        b.add_solid(wf.mesh.box((0.1, 0.1, height), cells=(1, 1, 1), origin=(0.3, 0.2, z), map=lambda X: X @ turn),
+                    material=wf.SVK(E=modulus, nu=0.3, density=RHO))
+        for height, z, modulus in ((0.05, -0.05, 1e9), (0.1, 1e-3, 1e6))
+    )  # fmt: skip
+    b.clamp(low.nodes(lambda X: X[:, 2] < -0.04))
+    b.add_contact(block, low, mu=0.3)
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=2e-3)
+    sim.step(40)
+    z = sim.positions(block)[0, np.abs(block.mesh.points[:, 2] - 1e-3) < 1e-9, 2]
+    np.testing.assert_allclose(z, z.mean(), rtol=0.1)
+
+
 def on_a_rail(z, **options):
     """A plate with its lower face at z, and a rail narrower than its facets, with friction."""
     b = wf.ModelBuilder(gravity=(0, 0, 0))
@@ -223,6 +242,15 @@ def test_a_rail_is_contact_with_an_obstacle():
             b.finalize(device="cpu").set_parameter("rail.offset", -5e-4)
         if steps == 0:
             b.description.contacts.remove(pad)
+
+
+@pytest.mark.parametrize(("height", "seen"), [(0.4, True), (0.6, False)])
+def test_a_wall_taller_than_two_facets_has_no_points_of_its_own(height, seen):
+    """They would be all over it."""
+    b = wf.ModelBuilder()
+    body = plate(b, "T10", 0.25)
+    pad = b.add_contact(body, b.add_collider(wf.Box((0, 0, -0.5 * height), (0.02, 1.0, height))))
+    assert isinstance(pad, ObstacleContact) == seen
 
 
 @pytest.mark.parametrize("option", [{"points": 7}, {"seam": 0.01}])

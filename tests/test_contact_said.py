@@ -95,6 +95,27 @@ def test_a_block_above_a_slender_strip_does_not_begin_inside(height):
     assert wf.Simulation(b.finalize(device="cpu"), dt=1e-3).step().converged.all()
 
 
+R = 0.25
+"""Radius of the lower side of a bent block, m."""
+
+
+def bend(X):
+    angle, r = X[:, 0] / R, R + X[:, 2]
+    return np.column_stack([r * np.sin(angle), X[:, 1], r * np.cos(angle)])
+
+
+def test_a_peg_between_an_arc_and_its_chord_does_not_begin_inside():
+    """The inside test uses flat triangles, 0.36 mm below the arc there; its outer side is the one in contact."""
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    mesh = wf.mesh.box((0.1, 0.05, 0.02), cells=(2, 1, 1), element="T10", origin=(-0.05, 0, 0), map=bend)
+    arch = b.add_solid(mesh, material=SOFT, name="arch")
+    top = (R * np.sin(0.05), R * np.cos(0.05) - 1e-4)
+    mesh = wf.mesh.box((0.002, 0.01, 0.01), cells=(1, 1, 1), origin=(top[0] - 0.001, 0.02, top[1] - 0.01))
+    peg = b.add_solid(mesh, material=SOFT, name="peg")
+    b.add_contact(peg.surface("z+"), arch.surface("z+"), overlap="refuse")
+    assert wf.Simulation(b.finalize(device="cpu"), dt=1e-3).step().converged.all()
+
+
 def block_on(collider, map=None, cells=(2, 2, 2), origin=(0.0, 0.0, 0.0), **options):
     """A block of 0.1 m on an obstacle: simulation, body, contact."""
     b = wf.ModelBuilder()
@@ -106,12 +127,6 @@ def block_on(collider, map=None, cells=(2, 2, 2), origin=(0.0, 0.0, 0.0), **opti
 
 def test_a_curve_laid_on_its_like_begins_stored():
     """Chords of an arc lie R (1 - cos(h/2R)) within the cylinder that the nodes are on."""
-    R = 0.25
-
-    def bend(X):
-        angle, r = X[:, 0] / R, R + X[:, 2]
-        return np.column_stack([r * np.sin(angle), X[:, 1], r * np.cos(angle)])
-
     depth = R * (1.0 - np.cos(0.05 / 2 / R))
     drum = wf.Cylinder((0, -1, 0), (0, 1, 0), R)
     text = rf"contact 'pad': body 'block' begins {depth:.3g} m inside collider 'base' .*it is stored.*overlap='offset'"
@@ -361,6 +376,16 @@ def test_bodies_that_cross_unseen_by_their_contact_are_named():
     ):
         sim.step(12)
     assert len(sim.overlap_check.found) == 1
+
+
+def test_a_depth_that_a_soft_contact_sees_is_not_named():
+    """Far above 5 % of a third of the edge, 1.7 mm."""
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    cube = flying(b, ((0.1,) * 3, (0, 0, 1e-4), (1, 1, 1)), (0, 0, -1.0), "cube")
+    pad = b.add_contact(cube, b.add_collider(wf.HalfSpace((0, 0, 1), 0.0)), stiffness=("region", 0.05))
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-3, check_overlap=True)
+    silent(sim, 12)
+    assert sim.contact_record(pad).penetration.max() > 4e-3
 
 
 CROSSED = """

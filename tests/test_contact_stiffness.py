@@ -127,6 +127,23 @@ def test_a_stiff_block_does_not_come_back(dtype):
     assert abs(sim.energies()["ledger_residual"][0]) < (1e-6 if dtype == "float64" else 1e-3) * 9.81 * 0.02
 
 
+@pytest.mark.parametrize(("speed", "damped"), [(0.045, False), (0.055, True)])
+def test_a_slow_approach_is_not_damped(speed, damped):
+    """A floor that presses a held block, and goes back."""
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    body = block(b, 1e6, 1)
+    b.clamp(body.nodes("z+"))
+    times = [0.0, 0.02, 0.04]
+    floor = b.add_collider(wf.HalfSpace((0, 0, 1), -1e-4), path=(times, [(0, 0, 0), (0, 0, 0.02 * speed), (0, 0, 0)]))
+    pad = b.add_contact(body, floor)
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-3)
+    sim.step(40)
+    record = sim.contact_record(pad)
+    assert record.normal_force.max() > 1.0
+    assert (record.loss.sum() > 1e-3 * record.stored.max()) == damped
+    assert abs(record.loss.sum()) < 1e-12 or damped
+
+
 @pytest.mark.parametrize(("E", "restitution"), [(1e11, 0.3), (2e11, 0.0)])
 def test_a_stiff_block_on_a_wheel_rests_at_the_rounding_of_its_gap(E, restitution):
     """Depths of 1e-10 m are differences of positions of 0.1 m: residuals do not fall to 1e-8 of the weight."""

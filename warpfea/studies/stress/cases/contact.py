@@ -20,7 +20,7 @@ SIDE, DENSITY, GRAVITY = 0.1, 1000.0, 9.81
 MODULI, STEPS = (1e4, 1e6, 1e8, 1e11), (1e-5, 1e-3, 1e-2)
 MODULI_AND_STEPS = tuple((E, h) for E in MODULI for h in STEPS)
 REFUSAL_TEXTS = ["collider", "inverted", "J <= 0"]
-IMPACT_SPEED = 100.0
+FAST_IMPACT = 100.0
 """Speed of impacts, m/s."""
 MAX_NEWTON = 60
 """Maximum iterations of a step with grazing contact."""
@@ -222,7 +222,7 @@ def impact(setting: Setting, value: tuple[str, float]) -> Answer:
 def strike(setting: Setting, shape: Any, E: float) -> Answer:
     """A cube hits an obstacle at 100 m/s."""
     s = make_scene(shape, E=E, gravity=(0, 0, 0), translation=(0, 0, 0.3), mu=0.3, restitution=0.5)
-    run = s.release(setting, 5, dt=1e-2, velocity=(0, 0, -IMPACT_SPEED), mu=0.3)
+    run = s.release(setting, 5, dt=1e-2, velocity=(0, 0, -FAST_IMPACT), mu=0.3)
     return run.answer(setting, max(run.center_depth, 0.0), 0.0, "the centre stays before the obstacle")
 
 
@@ -300,8 +300,8 @@ def grazing_vertex(setting: Setting, depth: float) -> Answer:
         FLOOR, gravity=(0, 0, 0), rotation=vertex_down(), translation=(0, 0, -depth), mu=0.5, restitution=1.0,
         overlap="offset", overlap_time=1e-3,
     )  # fmt: skip
-    run = s.release(setting, 10, dt=1e-2, velocity=(IMPACT_SPEED, 0, 0), mu=0.5)
-    error = float(np.abs(center_velocity(run.sim, s) / IMPACT_SPEED - (1, 0, 0)).max())
+    run = s.release(setting, 10, dt=1e-2, velocity=(FAST_IMPACT, 0, 0), mu=0.5)
+    error = float(np.abs(center_velocity(run.sim, s) / FAST_IMPACT - (1, 0, 0)).max())
     limits = {"Newton of a step": (run.stats.worst_newton, MAX_NEWTON), "halvings": (run.stats.halvings, 0)}
     return run.answer(setting, error, bound_for(setting, 1e-5, 1e-3), "goes on at 100 m/s", limits=limits)
 

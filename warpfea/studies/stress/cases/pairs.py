@@ -60,7 +60,7 @@ def impact(setting: Setting, value: tuple[float, float]) -> Answer:
     s = cube_on_plate(
         E=(E, E), gravity=(0, 0, 0), position=(0, 0, 0.3), thickness=0.01, clamped=False, mu=0.3, restitution=0.5
     )
-    run = s.release(setting, 8, dt=h, velocity=(0, 0, -contact.IMPACT_SPEED))
+    run = s.release(setting, 8, dt=h, velocity=(0, 0, -contact.FAST_IMPACT))
     return run.answer(setting, max(run.center_depth, 0.0), 0.0, "the centre stays before the plate")
 
 
