@@ -5,18 +5,19 @@ A listed row that meets its criterion passes: some depend on round-off.
 
 __all__ = ["KNOWN_MISSES", "known_miss_reason"]
 
-_STEEL_AT_REST = "steel that has come to rest: refused at the round-off of its contact, on some processors"
 _THIN_REASON = "refused for the work spent or without a reason; with two levels on the CPU float32 is named now"
 
 KNOWN_MISSES: dict[tuple[str, str, str], str] = {
     ("annular/3", "float64", "cpu"): "68 or 86 iterations on two processors, 266 on others: by rounding",
     ("annular/auto", "float64", ""): "the whole load at once takes 160 to 230 iterations; three load steps take 86",
     ("annular/auto", "float32", "cuda"): _THIN_REASON,
-    ("first-scenes/ball-floor-slide-0.5-1e+08-0.01-generalized_alpha", "float64", ""): "11 Newton iterations a step",
+    ("first-scenes/ball-floor-slide-0.5-1e+08-0.01-generalized_alpha", "float64", ""): "16 Newton iterations a step",
     ("first-scenes/ball-plate-drop-0.1-10000-0.001-backward_euler", "float64", ""): "1.5 times as deep as asked",
-    ("first-scenes/bar-floor-drop-0.5-2e+11-0.001-bdf2", "float64", ""): _STEEL_AT_REST,
-    ("first-scenes/beam-plate-drop-0.1-2e+11-0.001-generalized_alpha", "float64", ""): _STEEL_AT_REST,
-    ("first-scenes/cube-mesh-drop-0.1-2e+11-0.001-bdf2", "float64", ""): _STEEL_AT_REST,
+    (
+        "first-scenes/beam-second-slide-0.5-10000-0.01-bdf2",
+        "float64",
+        "",
+    ): "1.3 times as deep as asked, where it hangs over the end of the lower beam",
     ("first-scenes/shell-floor-drop-0.1-1e+06-0.001-energy_momentum", "float64", ""): "12 Newton iterations a step",
     ("soft-thin-limbs", "float64", ""): "found, in 642 iterations on the CPU and 166 on a GPU, in place of 80",
     ("soft-dolphin", "float32", ""): "refused by name: float32 can't hold it",
