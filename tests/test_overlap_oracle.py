@@ -66,7 +66,7 @@ def shrunk(skin, depth):
 
 @pytest.mark.parametrize("frames", [40, pytest.param(600, marks=pytest.mark.slow)])
 def test_crossings_are_those_of_ipctk(frames):
-    """Reported pairs intersect; others that intersect no longer do with skins moved in by twice the depth that counts."""
+    """Reported pairs intersect; others that do no longer do with skins moved in by twice the depth that counts."""
     rng = np.random.default_rng(7)
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     of = bodies(b)
