@@ -11,7 +11,7 @@ import warpfea as wf
 from warpfea.contact.colliders import ColliderContact
 from warpfea.studies.stress.cases.contact import momentum
 
-SIDE, SPEED, DT = 0.05, 1.0, 1e-3
+SIDE, SPEED, DT, G = 0.05, 1.0, 1e-3, 9.81
 START = -0.0607
 """First place of the rear face: the front is 10.7 mm before the seam at x = 0."""
 
@@ -199,3 +199,32 @@ def test_bad_seams_are_refused():
     one, two = (b.add_solid(mesh, material=law) for _ in range(2))
     with pytest.raises(NotImplementedError, match="seam = between bodies is not part of this version"):
         b.add_contact(one, two, seam=1e-3)
+
+
+def knife():
+    """A prism of 30 degrees that stands on its edge, the y axis, in the corner of x = 0 and z = 0."""
+    a = np.radians(45.0) + np.radians(15.0) * np.array([-1.0, 1.0])
+    triangle = np.vstack([np.zeros(3), 0.1 * np.stack([np.cos(a), 0.0 * a, np.sin(a)], axis=1)])
+    points = np.concatenate([triangle + (0.0, y, 0.0) for y in (0.0, 0.05, 0.1)])
+    cells = np.concatenate([np.array([[0, 1, 2, 3], [1, 5, 2, 3], [1, 4, 5, 3]]) + k for k in (0, 3)])
+    x = points[cells]
+    turned = np.linalg.det(x[:, 1:] - x[:, :1]) < 0.0
+    cells[turned] = cells[turned][:, [0, 1, 3, 2]]
+    return wf.mesh.Mesh(points, cells, "tetra", name="knife")
+
+
+@pytest.mark.parametrize("E", [1e6, 1e8])
+def test_an_edge_rests_in_the_corner_of_a_floor_and_a_wall(E):
+    """Each bears the weight along its normal. Before, the top of the wall, 1 m above, took the place of the floor: the
+    edge sank, and was thrown out with 50 times its weight."""
+    b = wf.ModelBuilder(gravity=(-G, 0, -G))
+    body = b.add_solid(knife(), material=wf.NeoHookean.from_E_nu(E=E, nu=0.3, density=1000.0))
+    sides = [wf.HalfSpace((0, 0, 1)), wf.Box((-0.5, 0, 0), (1, 2, 2))]
+    pads = [b.add_contact(body, b.add_collider(side)) for side in sides]
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-3)
+    sim.step(60)
+    weight = 0.5 * 0.1**2 * 0.5 * 0.1 * 1000.0 * G
+    for pad, axis in zip(pads, (2, 0)):
+        force = sim.contact_record(pad).force[0, :, axis]
+        assert force[-10:].mean() == pytest.approx(weight, rel=2e-3)
+        assert force.max() < 2.0 * weight

@@ -82,15 +82,17 @@ def seam_functions(meshes: bool) -> KernelSet:
 
     @wp.func
     def is_shared(col: Colliders, world: int, c: int, y: vec3d, n: vec3d, gap: f64) -> bool:
-        """True for a point of normal n on a collider that is also on a neighbour, higher or of the same level: where
-        colliders overlap, one acts. Arguments as of `level_side`."""
+        """True for a point of normal n on a collider that is also on a neighbour, of the same level or higher by less
+        than `depth`: where colliders overlap, one acts. Arguments as of `level_side`."""
         kc = col.of_contact[c]
-        seam = col.seam_lengths[c][0]
+        lengths = col.seam_lengths[c]
+        seam = lengths[0]
         for e in range(col.neighbor_start[c], col.neighbor_start[c + 1]):
             b = col.neighbor[e]
             if col.neighbor_shares[e] != 0:
                 found = from_neighbor(col, world, kc, b, y, n)
                 first = found[3] < gap - seam or (found[3] <= gap + seam and b < kc)
+                first = first and found[3] >= gap - lengths[2]  # not the top of a wall
                 if first and found[3] < f64(0.0) and wp.dot(vec3d(found[0], found[1], found[2]), n) > f64(LEVEL_COSINE):
                     return True
         return False
