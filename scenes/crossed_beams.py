@@ -1,5 +1,7 @@
 """Layers of crossed beams that carry a block."""
 
+from typing import Any
+
 import numpy as np
 
 import warpfea as wf
@@ -42,7 +44,7 @@ def crossed_beams(
     damping = wf.KelvinVoigt(eta=5e-3 * E)
     material = wf.SVK(E=E, nu=nu, density=density, damping=damping)
     at = np.linspace(-0.2 * span, 0.2 * span, beams)
-    below = [
+    below: list[Any] = [
         b.add_collider(wf.Box((sign * 0.45 * span, 0.0, -side), (side, 1.1 * span, 2 * side)), name=f"sleeper {k + 1}")
         for k, sign in enumerate((-1.0, 1.0))
     ]
@@ -64,7 +66,7 @@ def crossed_beams(
     low = layers * side + (layers + 1) * gap
     mesh = wf.mesh.box((block, block, 0.25 * block), cells=(2, 2, 1), origin=(-0.5 * block, -0.5 * block, low))
     load = b.add_solid(mesh, material=wf.SVK(E=0.1 * E, nu=nu, density=density, damping=damping), name="block")
-    for k, beam in enumerate(below):
-        b.add_contact(load, beam, mu=mu, name=f"load {k + 1}")
+    for k, top in enumerate(below):
+        b.add_contact(load, top, mu=mu, name=f"load {k + 1}")
     b.add_probe("block", load.at((0.0, 0.0, low)))
     return b

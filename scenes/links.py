@@ -78,14 +78,14 @@ def links(
     material = wf.SVK(E=E, nu=nu, density=density, damping=wf.KelvinVoigt(eta=1e-4 * E))
     pitch = length - 2.0 * FLATNESS * wire - gap
     turned = np.array([(0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)])
-    above = None
+    links: list[wf.Body] = []
     for k in range(count):
         place = (turned if k % 2 else np.eye(3), np.array((0.0, 0.0, -k * pitch)))
         link = b.add_solid(mesh, material=material, transform=place, name=f"link {k + 1}")
-        if above is None:
+        if not links:
             b.clamp(link.nodes(lambda X: X[:, 2] > 0.5 * (length - width) - 1e-9))
         else:
-            b.add_contact(above, link, mu=mu, name=f"joint {k}")
-        above = link
-    b.add_probe("end", above.at((0.0, 0.0, -(count - 1) * pitch - 0.5 * length)))
+            b.add_contact(links[-1], link, mu=mu, name=f"joint {k}")
+        links.append(link)
+    b.add_probe("end", links[-1].at((0.0, 0.0, -(count - 1) * pitch - 0.5 * length)))
     return b
