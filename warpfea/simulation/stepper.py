@@ -20,7 +20,7 @@ from ..kernels.step.step_control import REPORT_COLUMNS
 from ..model.state import State
 from ..solvers import Jacobi, NewtonPCG, make_solver_loop
 from ..terms.checks import check_stored_energy, overrides
-from ..terms.protocols import Preconditioned
+from ..terms.protocols import Preconditioned, Touching
 from ..terms.term import StepContext, Term
 from ..terms.workspace import Workspace
 from .adaptive import AdaptiveOptions, StepSizeControl
@@ -142,9 +142,11 @@ class Stepper:
         if self.integrator.accelerated:
             w.step.q_a = w.array("q_a", (self.model.worlds,), wp.float64)
             w.step.acceleration_step = w.array("h_before", (self.model.worlds,), wp.float64)
+        self.impact_terms: list[Touching] = []
         if self.integrator.multistep or self.integrator.accelerated:
             w.step.previous_h = state.previous_step
-            if self.terms.contacts:
+            self.impact_terms = self.terms.contacts
+            if self.impact_terms:
                 w.step.impact = w.array("impact", (self.model.worlds,), wp.int32)
             w.step.previous_end_time = state.acceleration_end if self.integrator.accelerated else state.previous_end
         if self.ledger:
@@ -367,7 +369,7 @@ class Stepper:
         self.newton.run()
         if self.step_size_control:
             self.step_size_control.check_local_error()
-        for term in self.terms.contacts if self.work.step.impact else ():
+        for term in self.impact_terms:
             term.find_impacts(self.ctx)
         self.launch(self.kernels.end_attempt, self.model.worlds, [self.work.step, self.work.newton])
         if self.step_size_control:
