@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -275,6 +276,10 @@ class FacetContact(ContactTerm, Tied, Coupled):
         return super().block_modules() | {block_kernels(self.model.dtype, True).module}
 
     def coupled_bodies(self) -> list[tuple[int, int]]:
+        return self._coupled_bodies
+
+    @cached_property
+    def _coupled_bodies(self) -> list[tuple[int, int]]:
         number = {id(body): k for k, body in enumerate(self.model.bodies)}
         pairs = [c.sides for c in self.tables.contacts if not c.grounded]
         return [(number[id(first)], number[id(second)]) for first, second in pairs]
