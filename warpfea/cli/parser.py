@@ -171,8 +171,8 @@ def _add_run(commands: Any) -> None:
         ("--load-steps", load_steps, "N", "of --static (default 10); auto: the whole load at once, halved where it is "
          "refused"),
         ("--stabilise", FLAG, None, "of --static: springs that fade with the load, for bodies that only contact holds"),
-        ("--overlaps", ("warn", "ignore"), None, "bodies that cross each other or a collider without a contact: a "
-         "warning (default), or not", "warn"),
+        ("--overlaps", ("warn", "ignore"), None, "bodies that cross each other or a collider without a contact, or "
+         "deeper than it sees: a warning (default), or not", "warn"),
         ("--unstable", UNSTABLE_CHOICES, None, "of --static: warn of an unstable equilibrium (default), refuse it, or "
          "do not judge it"),
     )  # fmt: skip

@@ -92,8 +92,8 @@ class Simulation:
         energy_growth: net energy gain of the integrator in a world, over the largest kinetic + strain + contact energy
             plus the sum of |work|: above 1 % a warning, above 10 % steps are rejected ("refuse") or continue ("warn");
             "ignore" and ledger=False: not monitored.
-        check_overlap: warn of bodies that cross each other or a collider without a contact, once for each pair, with
-            the time: after each call of `step`, of a run at about 64 steps (skins on the host; see OverlapCheck for
+        check_overlap: warn of bodies that cross each other or a collider without a contact, or deeper than theirs sees,
+            once for each pair, with the time: after each call of `step`, of a run at about 64 steps (skins on the host; see OverlapCheck for
             pairs left out: connected by a joint, or crossing from the start).
 
     Attributes:
