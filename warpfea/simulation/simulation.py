@@ -93,8 +93,8 @@ class Simulation:
             plus the sum of |work|: above 1 % a warning, above 10 % steps are rejected ("refuse") or continue ("warn");
             "ignore" and ledger=False: not monitored.
         check_overlap: warn of bodies that cross each other or a collider without a contact, or deeper than theirs sees,
-            once for each pair, with the time: after each call of `step`, of a run at about 64 steps (skins on the host; see OverlapCheck for
-            pairs left out: connected by a joint, or crossing from the start).
+            once for each pair, with the time: after each call of `step`, of a run at about 64 steps (skins on the
+            host; see OverlapCheck for pairs left out: connected by a joint, or crossing from the start).
 
     Attributes:
         overlap_check: crossings `found` with check_overlap, else None.
