@@ -134,6 +134,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
                 previous = step.previous_h[world]
         if wp.static(accelerated):
             previous = step.previous_h[world]
+        if wp.static(accelerated or impacts):
             step.acceleration_step[world] = previous
         c = attempt_coefficients(step, world, previous)
         step.a0[world] = c.a0
@@ -287,15 +288,22 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
     ):  # fmt: skip
         """Store the accepted iterate in the state.
 
-        After an impact the accelerations stay those before it, and a multistep scheme has no history.
+        After an impact what the scheme remembers of accelerations stays as before it, and total momentum that of the
+        forces: accelerations, or the increment of the velocity in the step before.
         """
         world, slot = wp.tid()
-        if wp.static(multistep):
-            u_before[world, slot] = u_n[world, slot]
-            v_before[world, slot] = v_n[world, slot]
         impact = False
         if wp.static(impacts):
             impact = step.impact[world] == IMPACT_REPEATED
+        if wp.static(multistep):
+            u_before[world, slot] = u_n[world, slot]
+            remembered = v_n[world, slot]
+            if impact:
+                gained = v_n[world, slot] - v_before[world, slot]
+                previous = step.acceleration_step[world]  # 0: nothing is remembered
+                ratio = wp.where(previous > f64(0.0), step.h[world] / wp.max(previous, f64(1.0e-300)), f64(0.0))
+                remembered = v[world, slot] - T(ratio) * gained
+            v_before[world, slot] = remembered
         if wp.static(accelerated) and not impact:
             c = coefficients(step.h[world], step.acceleration_step[world], step.scheme_parameter)
             a = u_before[world, slot]
@@ -307,8 +315,6 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
         if slot == 0:
             if wp.static(multistep or accelerated):
                 step.previous_h[world] = step.h[world]
-                if wp.static(multistep) and impact:
-                    step.previous_h[world] = f64(0.0)
                 step.previous_end_time[world] = step.time[world]
             newton.strain_energy[world] = newton.elem_sums[0, world]
         if wp.static(not static):

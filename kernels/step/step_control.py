@@ -96,7 +96,7 @@ def step_struct():
         a1: wp.array(dtype=wp.float64)
         b: wp.array(dtype=wp.float64)  # of schemes with v_n in q~
         q_a: wp.array(dtype=wp.float64)  # of schemes with accelerations in their state
-        acceleration_step: wp.array(dtype=wp.float64)  # s, of these schemes: the step that led to a_n
+        acceleration_step: wp.array(dtype=wp.float64)  # s: the step that led to a_n, or to v_n with contact; 0: unknown
         dq_dv: wp.array(dtype=wp.float64)  # s
         mass_factor: wp.array(dtype=wp.float64)  # c_M of the inertia; in statics of the springs, `stabilisation`
         load_factor: wp.array(dtype=wp.float64)  # factor of constant loads; 1 in dynamics

@@ -43,6 +43,7 @@ class ContactTables(FacetTables[Contact]):
     def __init__(self, model: Model) -> None:
         super().__init__(model, model.description.contacts_of(Contact))
         self.colliders: list[Collider] = list(model.description.colliders)
+        self.stored_sides = len(self.colliders)
         self.clamped = clamped_slots(model)
         self.clamped_point_counts: list[int] = []
         self.seams = seam_tables(self.contacts, [p.X.reshape(-1, 3) for p in self.host])
@@ -104,11 +105,6 @@ class ContactTables(FacetTables[Contact]):
     @property
     def parameter_arrays(self) -> dict[str, wp.array]:
         return super().parameter_arrays | {"margin": self.shapes.margin}
-
-    @property
-    def stored_sides(self) -> int:  # type: ignore[override]
-        """Number of colliders."""
-        return len(self.colliders)
 
     def _upload_colliders(self, laws: TimeLawTable) -> Any:
         """Device struct of the colliders, without poses."""

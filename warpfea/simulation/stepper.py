@@ -141,13 +141,14 @@ class Stepper:
             w.step.b = w.array("b", (self.model.worlds,), wp.float64)
         if self.integrator.accelerated:
             w.step.q_a = w.array("q_a", (self.model.worlds,), wp.float64)
-            w.step.acceleration_step = w.array("h_before", (self.model.worlds,), wp.float64)
         self.impact_terms: list[Touching] = []
         if self.integrator.multistep or self.integrator.accelerated:
             w.step.previous_h = state.previous_step
             self.impact_terms = self.terms.contacts
             if self.impact_terms:
                 w.step.impact = w.array("impact", (self.model.worlds,), wp.int32)
+            if self.impact_terms or self.integrator.accelerated:
+                w.step.acceleration_step = w.array("h_before", (self.model.worlds,), wp.float64)
             w.step.previous_end_time = state.acceleration_end if self.integrator.accelerated else state.previous_end
         if self.ledger:
             w.step.ledger_time = state.ledger_time
