@@ -375,9 +375,9 @@ def point_functions(
         c = coefficients(block, world, elem)
         f = Local()
         for point in range(block.shape_gradient.shape[0]):
+            Fdot = velocity_gradient(block, V, point, elem)
             G = field_gradient(block, U, point, elem)
             dG = field_gradient(block, dU, point, elem)
-            Fdot = velocity_gradient(block, V, point, elem)
             dP = point_increment(block, G, dG, Fdot, history, c, dq, form, world, point, elem)
             f = add_point_forces(block, f, dP, point, elem)
         return f

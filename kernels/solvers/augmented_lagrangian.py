@@ -6,7 +6,7 @@ from ..common.modules import KernelSet, kernel_set, masked_kernel
 from ..common.traits import Traits
 from ..common.types import f64, int_1d
 from .convergence import convergence_functions
-from .newton_control import FAIL_CONSTRAINT, control_struct
+from .newton_control import Failure, control_struct
 
 __all__ = ["outer_loop_kernels"]
 
@@ -26,7 +26,7 @@ def outer_loop_kernels(traits: Traits, module: wp.Module) -> KernelSet:
         if convergence.largest_violation(ctl, world) <= convergence.allowed_violation(ctl, world, tol):
             return
         if ctl.multiplier_updates[world] >= limit:
-            ctl.failed[world] = FAIL_CONSTRAINT
+            ctl.failed[world] = Failure.CONSTRAINT
             return
         ctl.multiplier_updates[world] = ctl.multiplier_updates[world] + 1
         ctl.iterations[world] = 0

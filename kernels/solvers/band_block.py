@@ -159,9 +159,7 @@ def band_block_kernels(dtype: str, rows: int, width: int) -> KernelSet:
         active: int_1d, replaced_pivots: int_1d, band: wp.array3d(dtype=Column),
     ):  # fmt: skip
         """Factors of A; `replaced_pivots`: number of unknowns whose pivot was replaced."""
-        thread = wp.tid()
-        world = thread / lanes
-        lane = thread % lanes
+        world, lane = wp.tid()
         if active[world] == 0:
             return
         at = window.open(memory_of_world(global_memory, world))
@@ -245,9 +243,7 @@ def band_block_kernels(dtype: str, rows: int, width: int) -> KernelSet:
         z: p.vec3_2d,
     ):  # fmt: skip
         """z = A^-1 r: D^-1, forward and backward substitution with U, D^-T."""
-        thread = wp.tid()
-        world = thread / lanes
-        lane = thread % lanes
+        world, lane = wp.tid()
         if active[world] == 0:
             return
         at = vector.open(memory_of_world(global_memory, world))

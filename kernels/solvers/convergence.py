@@ -7,26 +7,7 @@ import warp as wp
 from ..common.modules import KernelSet, kernel_set
 from ..common.traits import NO_TERMS, Traits
 from ..common.types import f64
-from .newton_control import (
-    FAIL_CONSTRAINT,
-    FAIL_CURVATURE,
-    FAIL_ITERATIONS,
-    FAIL_JACOBIAN,
-    FAIL_LINE_SEARCH,
-    FAIL_NAN,
-    FAIL_ROUNDOFF,
-    GROUP_ROUNDOFF,
-    ROW_FORCE,
-    ROW_INERTIA,
-    ROW_INTERNAL,
-    ROW_KINETIC,
-    ROW_LOADS,
-    ROW_MAGNITUDE,
-    ROW_OBJECTIVE,
-    ROW_RESIDUAL,
-    ROW_ROUNDOFF,
-    control_struct,
-)
+from .newton_control import GROUP_ROUNDOFF, Failure, Row, control_struct
 
 __all__ = ["MAX_ERROR_ESTIMATES", "SINGLE_PRECISION_EPS", "convergence_functions"]
 
@@ -69,7 +50,7 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
 
         Phi = 1/2 (v - v~).M (v - v~) c_M - f_frozen.v + [Psi_el + Psi_visc + Psi_terms] / (dq/dv); its derivative by v
         is the residual, Eq. (17). Sums over a world: inertia and the frozen forces f_frozen (dead loads, and
-        non-conservative forces at the start of the search) are slot_sums[ROW_OBJECTIVE], of `residual`; Psi_el and
+        non-conservative forces at the start of the search) are slot_sums[Row.OBJECTIVE], of `residual`; Psi_el and
         Psi_visc, J, are elem_sums[0] and [1], of `internal_force`; Psi_terms, J, is term_sums[0]: of constraints
         lambda.c + rho/2 c.c, of contact its potential, of other terms their own. With the trait
         "midpoint" Phi does not exist: half of the squared D^-1 norm of the residual replaces it, infinite where
@@ -77,12 +58,12 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
         """
         if wp.static(traits.midpoint):
             if wp.static(traits.stored):
-                return wp.where(wp.isfinite(ctl.term_sums[0, world]), ctl.slot_sums[ROW_OBJECTIVE, world], f64(wp.inf))
-            return ctl.slot_sums[ROW_OBJECTIVE, world]
+                return wp.where(wp.isfinite(ctl.term_sums[0, world]), ctl.slot_sums[Row.OBJECTIVE, world], f64(wp.inf))
+            return ctl.slot_sums[Row.OBJECTIVE, world]
         energy = ctl.elem_sums[0, world] + ctl.elem_sums[1, world]
         if wp.static(traits.stored):
             energy += ctl.term_sums[0, world]
-        return ctl.slot_sums[ROW_OBJECTIVE, world] + energy / ctl.dq_dv[world]
+        return ctl.slot_sums[Row.OBJECTIVE, world] + energy / ctl.dq_dv[world]
 
     @wp.func
     def objective_magnitude(ctl: Control, world: int) -> f64:
@@ -90,7 +71,7 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
         energy = wp.abs(ctl.elem_sums[0, world]) + wp.abs(ctl.elem_sums[1, world])
         if wp.static(traits.stored):
             energy += ctl.term_sums[2, world]
-        return ctl.slot_sums[ROW_MAGNITUDE, world] + energy / ctl.dq_dv[world]
+        return ctl.slot_sums[Row.MAGNITUDE, world] + energy / ctl.dq_dv[world]
 
     @wp.func
     def allowed_violation(ctl: Control, world: int, tol: f64) -> f64:
@@ -120,16 +101,16 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
         """Squared norms of g, of the largest forces, and of the position round-off, of a residual group."""
         if ctl.norms.group_count == 1:
             f2 = wp.max(
-                ctl.slot_sums[ROW_INTERNAL, world],
-                wp.max(ctl.slot_sums[ROW_LOADS, world], ctl.slot_sums[ROW_INERTIA, world]),
+                ctl.slot_sums[Row.INTERNAL, world],
+                wp.max(ctl.slot_sums[Row.LOADS, world], ctl.slot_sums[Row.INERTIA, world]),
             )
-            return wp.vec3d(ctl.slot_sums[ROW_RESIDUAL, world], f2, ctl.slot_sums[ROW_ROUNDOFF, world])
+            return wp.vec3d(ctl.slot_sums[Row.RESIDUAL, world], f2, ctl.slot_sums[Row.ROUNDOFF, world])
         f2 = wp.max(
-            ctl.norms.group_sums[ROW_INTERNAL, world, group],
-            wp.max(ctl.norms.group_sums[ROW_LOADS, world, group], ctl.norms.group_sums[ROW_INERTIA, world, group]),
+            ctl.norms.group_sums[Row.INTERNAL, world, group],
+            wp.max(ctl.norms.group_sums[Row.LOADS, world, group], ctl.norms.group_sums[Row.INERTIA, world, group]),
         )
         return wp.vec3d(
-            ctl.norms.group_sums[ROW_RESIDUAL, world, group],
+            ctl.norms.group_sums[Row.RESIDUAL, world, group],
             f2,
             ctl.norms.group_sums[GROUP_ROUNDOFF, world, group],
         )
@@ -159,9 +140,9 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
             or norm > f64(GROUP_ROUNDINGS) * rounding
         ):
             return False
-        internal, loads = component_sum(ctl, world, group, ROW_INTERNAL), component_sum(ctl, world, group, ROW_LOADS)
+        internal, loads = component_sum(ctl, world, group, Row.INTERNAL), component_sum(ctl, world, group, Row.LOADS)
         return norm <= ctl.norms.tol * wp.sqrt(
-            wp.max(internal, wp.max(loads, component_sum(ctl, world, group, ROW_INERTIA)))
+            wp.max(internal, wp.max(loads, component_sum(ctl, world, group, Row.INERTIA)))
         )
 
     @wp.func
@@ -171,7 +152,7 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
         The forces of one component or stiff material must not hide the residual of another; a component of the model
         whose groups have all converged is excluded from further solves.
         """
-        force = wp.sqrt(ctl.slot_sums[ROW_FORCE, world])
+        force = wp.sqrt(ctl.slot_sums[Row.FORCE, world])
         ctl.norms.residual_force[world] = force
         largest = f64(0.0)
         worst = f64(0.0)
@@ -222,7 +203,7 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
             ctl.norms.violation_ratio[world] = largest_violation(ctl, world) / allowed_violation(
                 ctl, world, ctl.norms.constraint_tol
             )
-        ctl.norms.residual_norm[world] = wp.sqrt(ctl.slot_sums[ROW_RESIDUAL, world])
+        ctl.norms.residual_norm[world] = wp.sqrt(ctl.slot_sums[Row.RESIDUAL, world])
         ctl.norms.relative_residual[world] = largest
         ctl.norms.residual_ratio[world] = worst
         ctl.norms.ratio[world] = wp.max(excess, worst)
@@ -278,7 +259,7 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
         ctl.active[world] = 0
         ctl.search.active[world] = 0
         ctl.failed[world] = why
-        stuck = why == FAIL_ITERATIONS or why == FAIL_LINE_SEARCH or why == FAIL_CURVATURE
+        stuck = why == Failure.ITERATIONS or why == Failure.LINE_SEARCH or why == Failure.CURVATURE
         drowned = ctl.floor.rounding_ratio[world] <= f64(NOISE_DOMINATED_ROUNDINGS)
         drowned = drowned and ctl.norms.relative_residual[world] > f64(0.5)
         if (
@@ -288,10 +269,10 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
             and ctl.iterations[world] > 0
             and ctl.is_static != 0
         ):
-            ctl.failed[world] = FAIL_ROUNDOFF
+            ctl.failed[world] = Failure.ROUNDOFF
         if wp.static(traits.has_constraints):
-            if why != FAIL_NAN and why != FAIL_JACOBIAN and is_only_constraint_violated(ctl, world):
-                ctl.failed[world] = FAIL_CONSTRAINT
+            if why != Failure.NAN and why != Failure.JACOBIAN and is_only_constraint_violated(ctl, world):
+                ctl.failed[world] = Failure.CONSTRAINT
 
     @wp.func
     def is_velocity_roundoff(ctl: Control, world: int) -> bool:
@@ -299,7 +280,7 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
         the forces of its gaps, may be no more than the round-off of its positions."""
         fine = f64(VELOCITY_ROUNDINGS) * ctl.floor.eps
         step = wp.abs(ctl.search.slope[world])
-        return ctl.floor.eps < f64(SINGLE_PRECISION_EPS) and step <= fine * fine * ctl.slot_sums[ROW_KINETIC, world]
+        return ctl.floor.eps < f64(SINGLE_PRECISION_EPS) and step <= fine * fine * ctl.slot_sums[Row.KINETIC, world]
 
     @wp.func
     def check_convergence(ctl: Control, world: int):
@@ -307,7 +288,7 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
         error estimate."""
         record_residual(ctl, world)
         # predicted energy change of the last step, relative to the energy
-        energy = f64(2.0) * wp.abs(ctl.elem_sums[0, world]) + ctl.dq_dv[world] * ctl.slot_sums[ROW_MAGNITUDE, world]
+        energy = f64(2.0) * wp.abs(ctl.elem_sums[0, world]) + ctl.dq_dv[world] * ctl.slot_sums[Row.MAGNITUDE, world]
         step = wp.abs(ctl.search.slope[world]) * ctl.dq_dv[world]
         most = f64(MAX_STALL_STEP) * ctl.floor.max_error
         limit = ctl.max_iterations * iteration_factor(ctl, world)
@@ -327,7 +308,7 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
         elif near and ctl.iterations[world] > 0 and still and settling:
             request_error_estimate(ctl, world)
         elif ctl.iterations[world] >= limit:
-            give_up(ctl, world, FAIL_ITERATIONS)
+            give_up(ctl, world, Failure.ITERATIONS)
 
     @wp.func
     def handle_failed_search(ctl: Control, world: int, why: int):
@@ -339,17 +320,17 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
         if wp.static(traits.has_constraints):  # only accelerations need the tighter tolerance, which round-off prevents
             if ctl.norms.constraint_acceleration_tol > f64(0.0) and ctl.norms.relative_residual[world] <= ctl.norms.tol:
                 enough = largest_violation(ctl, world) <= ctl.norms.constraint_tol
-        if enough and (why == FAIL_LINE_SEARCH or why == FAIL_CURVATURE):
+        if enough and (why == Failure.LINE_SEARCH or why == Failure.CURVATURE):
             accept_iterate(ctl, world)
-        elif near and (why == FAIL_LINE_SEARCH or why == FAIL_CURVATURE):
+        elif near and (why == Failure.LINE_SEARCH or why == Failure.CURVATURE):
             request_error_estimate(ctl, world)
             ctl.search.alpha[world] = f64(0.0)
         elif (
-            (why == FAIL_LINE_SEARCH or why == FAIL_CURVATURE)
+            (why == Failure.LINE_SEARCH or why == Failure.CURVATURE)
             and at_roundoff
             and ctl.floor.error_estimate[world] < f64(1.0e30)
         ):
-            give_up(ctl, world, FAIL_ROUNDOFF)
+            give_up(ctl, world, Failure.ROUNDOFF)
         else:
             give_up(ctl, world, why)
 

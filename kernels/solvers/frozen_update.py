@@ -6,7 +6,7 @@ from ..common.modules import KernelSet, kernel_set
 from ..common.traits import Traits
 from ..common.types import f64, int_1d
 from .convergence import STALL_ROUNDINGS, convergence_functions
-from .newton_control import FAIL_ITERATIONS, ROW_FROZEN_CHANGE, control_struct
+from .newton_control import Failure, Row, control_struct
 
 __all__ = ["FROZEN_UPDATE_RESIDUAL", "frozen_update_kernels"]
 
@@ -49,7 +49,7 @@ def frozen_update_kernels(traits: Traits, module: wp.Module) -> KernelSet:
             if ctl.solve.fixed_forcing == 0 and ctl.norms.residual_norm[world] > f64(RESIDUAL_GROWTH) * before:
                 # the frozen quantities were the larger error: tighter solves are wasted
                 ctl.solve.forcing[world] = wp.max(ctl.solve.forcing[world], f64(LOOSE_FORCING))
-            ctl.search.phi[world] = convergence.objective(ctl, world) + ctl.slot_sums[ROW_FROZEN_CHANGE, world]
+            ctl.search.phi[world] = convergence.objective(ctl, world) + ctl.slot_sums[Row.FROZEN_CHANGE, world]
             ctl.search.phi_magnitude[world] = convergence.objective_magnitude(ctl, world)
             ctl.nonmonotone.steps[world] = 0
             ctl.frozen.updated[world] = 1 - ctl.frozen.unilateral_changed[world]
@@ -61,6 +61,6 @@ def frozen_update_kernels(traits: Traits, module: wp.Module) -> KernelSet:
             else:
                 convergence.record_residual(ctl, world)
                 if ctl.iterations[world] >= ctl.max_iterations:
-                    convergence.give_up(ctl, world, FAIL_ITERATIONS)
+                    convergence.give_up(ctl, world, Failure.ITERATIONS)
 
     return kernel_set(locals())

@@ -12,14 +12,7 @@ from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.traits import Traits
 from ..common.types import double_1d, double_3d, f64, int_1d, precision
 from .convergence import convergence_functions
-from .newton_control import (
-    FAIL_CONSTRAINT,
-    FAIL_JACOBIAN,
-    FAIL_NAN,
-    FAIL_RESIDUAL_GROWTH,
-    FAIL_STEP_LIMIT,
-    control_struct,
-)
+from .newton_control import Failure, control_struct
 from .pcg import pcg_struct
 
 __all__ = ["MAX_PAIRS", "jacobi_kernels", "jacobi_struct"]
@@ -74,26 +67,26 @@ def jacobi_kernels(dtype: str, traits: Traits, acceleration: str) -> KernelSet:
             barred = ctl.iterations[world] > 0 and not ctl.search.limit[world] > f64(0.0)
         if ctl.domain_J[world] <= f64(0.0):
             ctl.active[world] = 0
-            ctl.failed[world] = FAIL_JACOBIAN
+            ctl.failed[world] = Failure.JACOBIAN
         elif not finite:
             ctl.active[world] = 0
-            ctl.failed[world] = FAIL_NAN
+            ctl.failed[world] = Failure.NAN
         elif barred:
             ctl.active[world] = 0
-            ctl.failed[world] = FAIL_STEP_LIMIT
+            ctl.failed[world] = Failure.STEP_LIMIT
         elif ctl.norms.ratio[world] <= f64(1.0):
             convergence.accept_iterate(ctl, world)
         elif ctl.iterations[world] >= ctl.max_iterations:
             ctl.active[world] = 0
             if ctl.norms.residual_norm[world] > jac.max_growth * jac.first_norm[world]:
-                ctl.failed[world] = FAIL_RESIDUAL_GROWTH
+                ctl.failed[world] = Failure.RESIDUAL_GROWTH
             if wp.static(traits.has_constraints):
                 if (
                     ctl.norms.violation_ratio[world]
                     * convergence.allowed_violation(ctl, world, ctl.norms.constraint_tol)
                     > jac.max_violation
                 ):
-                    ctl.failed[world] = FAIL_CONSTRAINT
+                    ctl.failed[world] = Failure.CONSTRAINT
             if ctl.failed[world] == 0:
                 ctl.floor.accepted_unconverged[world] = 1
                 convergence.accept_iterate(ctl, world)

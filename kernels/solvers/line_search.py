@@ -6,7 +6,7 @@ from ..common.modules import KernelSet, kernel_set, masked_kernel
 from ..common.traits import Traits
 from ..common.types import f64
 from .convergence import convergence_functions
-from .newton_control import FAIL_JACOBIAN, FAIL_LINE_SEARCH, ROW_FROZEN_CHANGE, ROW_RESIDUAL, ROW_SLOPE, control_struct
+from .newton_control import Failure, Row, control_struct
 
 __all__ = ["MAX_TRUST_RADIUS", "PHI_NOISE_ROUNDINGS", "line_search_kernels"]
 
@@ -94,7 +94,7 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> KernelSet:
         old_phi = ctl.search.phi[world]
         ctl.search.active[world] = 0
         convergence.evaluate_norms(ctl, world)
-        ctl.search.phi[world] = convergence.objective(ctl, world) + ctl.slot_sums[ROW_FROZEN_CHANGE, world]
+        ctl.search.phi[world] = convergence.objective(ctl, world) + ctl.slot_sums[Row.FROZEN_CHANGE, world]
         if wp.static(traits.stored):
             ctl.search.trial_accepted[world] = 1
         if wp.static(traits.stored and not traits.midpoint):
@@ -144,9 +144,9 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> KernelSet:
             # the reused operator is at fault: keep the iterate and solve with its own operator
             ctl.search.alpha[world] = f64(0.0)
         if ctl.search.trials[world] > MAX_BACKTRACKS:
-            why = FAIL_LINE_SEARCH
+            why = Failure.LINE_SEARCH
             if ctl.domain_J[world] <= f64(0.0):
-                why = FAIL_JACOBIAN
+                why = Failure.JACOBIAN
             convergence.handle_failed_search(ctl, world, why)
 
     @wp.func
@@ -276,8 +276,8 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> KernelSet:
         # frozen forces keep their symmetric tangent: the curvature of Phi then agrees with H
         bend = ctl.dq_dv[world] * ctl.search.tangent_sum[0, world]
         phi = convergence.objective(ctl, world) - f64(0.5) * alpha * alpha * bend
-        slope = ctl.slot_sums[ROW_SLOPE, world] - alpha * bend
-        norm = wp.sqrt(ctl.slot_sums[ROW_RESIDUAL, world])
+        slope = ctl.slot_sums[Row.SLOPE, world] - alpha * bend
+        norm = wp.sqrt(ctl.slot_sums[Row.RESIDUAL, world])
         finite = wp.isfinite(phi) and wp.isfinite(norm)
         good = is_good_trial(ctl, world, phi, slope, norm)
         reused = ctl.solve.operator_reused[world] != 0

@@ -11,19 +11,7 @@ from .augmented_lagrangian import outer_loop_kernels
 from .convergence import MAX_ERROR_ESTIMATES, SINGLE_PRECISION_EPS, convergence_functions
 from .frozen_update import frozen_update_kernels
 from .line_search import MAX_TRUST_RADIUS, PHI_NOISE_ROUNDINGS, line_search_kernels
-from .newton_control import (
-    FAIL_CURVATURE,
-    FAIL_ITERATIONS,
-    FAIL_JACOBIAN,
-    FAIL_NAN,
-    FAIL_ROUNDOFF,
-    FAIL_STEP_LIMIT,
-    FAIL_WORK,
-    FLOOR_LANES,
-    ROW_FROZEN_CHANGE,
-    ROW_KINETIC,
-    control_struct,
-)
+from .newton_control import FLOOR_LANES, Failure, Row, control_struct
 from .pcg import pcg_struct
 from .perturbation import SCATTER_FACTOR
 
@@ -72,7 +60,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
     def initialise_iteration(ctl: Control, world: int):
         """Initialise the iteration at its first iterate, and test that for convergence."""
         convergence.evaluate_norms(ctl, world)
-        phi = convergence.objective(ctl, world) + ctl.slot_sums[ROW_FROZEN_CHANGE, world]
+        phi = convergence.objective(ctl, world) + ctl.slot_sums[Row.FROZEN_CHANGE, world]
         ctl.search.phi[world] = phi
         ctl.search.phi_magnitude[world] = convergence.objective_magnitude(ctl, world)
         ctl.solve.forcing[world] = ctl.solve.first_forcing
@@ -96,9 +84,9 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
             ctl.frozen.unilateral_changed[world] = 0
             ctl.nonmonotone.penetrating_steps[world] = 0
         if ctl.domain_J[world] <= f64(0.0):
-            convergence.give_up(ctl, world, FAIL_JACOBIAN)
+            convergence.give_up(ctl, world, Failure.JACOBIAN)
         elif not (wp.isfinite(phi) and wp.isfinite(ctl.norms.residual_norm[world])):
-            convergence.give_up(ctl, world, FAIL_NAN)
+            convergence.give_up(ctl, world, Failure.NAN)
         elif wp.static(traits.unilateral) and ctl.norms.residual_norm[world] > f64(0.0):
             convergence.record_residual(ctl, world)  # frozen quantities are of another iterate: no acceptance
         else:
@@ -108,7 +96,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
     def is_poor_first_iterate(ctl: Control, world: int) -> bool:
         """True if other first iterates should be tried: Phi exceeds a bound of Phi at q_n, or J <= 0.
 
-        At q_n Phi is the strain energy of the state plus a kinetic energy (`ROW_KINETIC` of `residual`): all of it for
+        At q_n Phi is the strain energy of the state plus a kinetic energy (`Row.KINETIC` of `residual`): all of it for
         backward Euler, a third for BDF2.
         """
         phi = convergence.objective(ctl, world)
@@ -116,7 +104,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
             return not (wp.isfinite(phi) and ctl.min_J[world] > f64(0.0))
         bound = (
             ctl.strain_energy[world] / ctl.dq_dv[world]
-            + f64(MAX_START_ENERGY_RATIO) * ctl.slot_sums[ROW_KINETIC, world]
+            + f64(MAX_START_ENERGY_RATIO) * ctl.slot_sums[Row.KINETIC, world]
         )
         bound += f64(PHI_NOISE_ROUNDINGS) * ctl.floor.eps * convergence.objective_magnitude(ctl, world)
         return not (phi <= bound and wp.isfinite(phi) and ctl.min_J[world] > f64(0.0))
@@ -171,9 +159,9 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
         if wp.static(traits.limited):
             barred = not ctl.search.limit[world] > f64(0.0)
         if not wp.isfinite(ctl.search.slope[world]):
-            convergence.handle_failed_search(ctl, world, FAIL_NAN)
+            convergence.handle_failed_search(ctl, world, Failure.NAN)
         elif barred:
-            convergence.handle_failed_search(ctl, world, FAIL_STEP_LIMIT)
+            convergence.handle_failed_search(ctl, world, Failure.STEP_LIMIT)
         elif ctl.solve.negative_curvature[world] != 0 and ctl.solve.predicted_stress[world] == 1:
             if ctl.nonmonotone.steps[world] > 0:
                 ctl.nonmonotone.restore_best[world] = 1
@@ -187,7 +175,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
             elif ctl.nonmonotone.steps[world] > 0:
                 ctl.nonmonotone.restore_best[world] = 1
             else:
-                convergence.handle_failed_search(ctl, world, FAIL_CURVATURE)
+                convergence.handle_failed_search(ctl, world, Failure.CURVATURE)
 
     @wp.func
     def part_error(ctl: Control, world: int, part: int, whole: f64, largest: f64) -> f64:
@@ -233,7 +221,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
         ctl.floor.estimate_error[world] = 0
         # this solve cannot give the error either
         if ctl.solve.pcg_unconverged[world] != 0 and ctl.floor.eps > f64(SINGLE_PRECISION_EPS):
-            convergence.give_up(ctl, world, FAIL_ROUNDOFF)
+            convergence.give_up(ctl, world, Failure.ROUNDOFF)
             return
         largest, whole = f64(0.0), f64(0.0)
         for part in range(component_of_part.shape[0]):
@@ -262,7 +250,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
         if tries >= MAX_ERROR_ESTIMATES or (
             known and tries > 1 and worst > f64(0.5) * ctl.floor.last_error_estimate[world]
         ):
-            convergence.give_up(ctl, world, wp.where(known, FAIL_ROUNDOFF, FAIL_CURVATURE))
+            convergence.give_up(ctl, world, wp.where(known, Failure.ROUNDOFF, Failure.CURVATURE))
             return
         ctl.floor.last_error_estimate[world] = worst
         check_direction(ctl, world)
@@ -300,12 +288,12 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
             ctl.search.active[world] = 0
             wp.atomic_max(ctl.any_rare_branch, 0, 1)
         elif pcg.step_iterations[world] >= pcg.max_work:
-            convergence.give_up(ctl, world, FAIL_WORK)
+            convergence.give_up(ctl, world, Failure.WORK)
         elif (
             ctl.solve.count[world]
             > MAX_SOLVES_PER_ITERATION * convergence.iteration_factor(ctl, world) * ctl.max_iterations
         ):
-            convergence.give_up(ctl, world, FAIL_ITERATIONS)
+            convergence.give_up(ctl, world, Failure.ITERATIONS)
         else:
             check_direction(ctl, world)
 

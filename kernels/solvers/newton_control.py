@@ -1,5 +1,6 @@
 """Newton control data of each world, and failure codes."""
 
+import enum
 import functools
 
 import warp as wp
@@ -7,24 +8,46 @@ import warp as wp
 from ..common.types import double_1d, double_2d, int_1d
 
 __all__ = [
-    "FAIL_CONSTRAINT", "FAIL_CURVATURE", "FAIL_ELEMENT_INVERTED", "FAIL_ENERGY_GROWTH", "FAIL_ITERATIONS",
-    "FAIL_JACOBIAN", "FAIL_LINE_SEARCH", "FAIL_LOCAL_ERROR", "FAIL_NAN", "FAIL_RESIDUAL_GROWTH", "FAIL_ROUNDOFF",
-    "FAIL_STEP_LIMIT", "FAIL_WORK", "FLOOR_LANES", "FLOOR_ROWS", "GROUP_LANES", "GROUP_ROUNDOFF", "GROUP_ROWS",
-    "ROW_FORCE", "ROW_FROZEN_CHANGE", "ROW_INERTIA", "ROW_INTERNAL", "ROW_KINETIC", "ROW_LOADS",
-    "ROW_MAGNITUDE", "ROW_OBJECTIVE", "ROW_RESIDUAL", "ROW_ROUNDOFF", "ROW_SLOPE", "TERM_ROWS", "control_struct",
+    "FLOOR_LANES", "FLOOR_ROWS", "GROUP_LANES", "GROUP_ROUNDOFF", "GROUP_ROWS", "TERM_ROWS", "Failure", "Row",
+    "control_struct",
 ]  # fmt: skip
 
-(
-    FAIL_ITERATIONS, FAIL_LINE_SEARCH, FAIL_JACOBIAN, FAIL_NAN, FAIL_CURVATURE, FAIL_CONSTRAINT, FAIL_RESIDUAL_GROWTH,
-    FAIL_STEP_LIMIT, FAIL_ROUNDOFF, FAIL_ELEMENT_INVERTED, FAIL_WORK, FAIL_LOCAL_ERROR, FAIL_ENERGY_GROWTH,
-) = range(1, 14)  # fmt: skip
-"""Codes in NewtonControl.failed; messages: warpfea/simulation/failures.py."""
-(
-    ROW_RESIDUAL, ROW_INTERNAL, ROW_LOADS, ROW_INERTIA, ROW_OBJECTIVE, ROW_MAGNITUDE, ROW_SLOPE, ROW_FROZEN_CHANGE,
-    ROW_ROUNDOFF, ROW_FORCE, ROW_KINETIC,
-) = range(11)  # fmt: skip
-"""Rows of a residual's sums, RESIDUAL_ROWS of kernels/step/gather.py."""
-GROUP_ROWS, GROUP_ROUNDOFF = 5, 4  # squared norms of g, f_int, loads, inertia (the ROW_ constants), of the round-off
+
+class Failure(enum.IntEnum):
+    """Codes in NewtonControl.failed; messages: warpfea/simulation/failures.py."""
+
+    ITERATIONS = 1
+    LINE_SEARCH = 2
+    JACOBIAN = 3
+    NAN = 4
+    CURVATURE = 5
+    CONSTRAINT = 6
+    RESIDUAL_GROWTH = 7
+    STEP_LIMIT = 8
+    ROUNDOFF = 9
+    ELEMENT_INVERTED = 10
+    WORK = 11
+    LOCAL_ERROR = 12
+    ENERGY_GROWTH = 13
+
+
+class Row(enum.IntEnum):
+    """Rows of a residual's sums, RESIDUAL_ROWS of kernels/step/gather.py."""
+
+    RESIDUAL = 0
+    INTERNAL = 1
+    LOADS = 2
+    INERTIA = 3
+    OBJECTIVE = 4
+    MAGNITUDE = 5
+    SLOPE = 6
+    FROZEN_CHANGE = 7
+    ROUNDOFF = 8
+    FORCE = 9
+    KINETIC = 10
+
+
+GROUP_ROWS, GROUP_ROUNDOFF = 5, 4  # squared norms of g, f_int, loads, inertia (see `Row`), of the round-off
 FLOOR_ROWS = 5  # -g.p, inertia.(v - v~), strain energy, largest |p| and |u|
 GROUP_LANES, FLOOR_LANES = 32, 16
 """Partial sums per residual group, and per part of an error estimate; fixed: the same for any number of worlds."""
@@ -142,7 +165,7 @@ def control_struct():
         solve: LinearSolve
         frozen: FrozenQuantities
         active: i1  # iterating
-        failed: i1  # 0 or a FAIL_ code
+        failed: i1  # 0 or a `Failure`
         iterations: i1  # of this attempt
         step_iterations: i1  # of this step
         max_iterations: wp.int32  # of an attempt

@@ -6,7 +6,7 @@ import warp as wp
 
 from ..common.modules import KernelSet, kernel_set, masked_kernel
 from ..common.types import double_1d, double_3d, f64, int_1d, precision
-from .newton_control import FLOOR_LANES, GROUP_LANES, GROUP_ROUNDOFF, GROUP_ROWS, ROW_ROUNDOFF, control_struct
+from .newton_control import FLOOR_LANES, GROUP_LANES, GROUP_ROUNDOFF, GROUP_ROWS, Row, control_struct
 from .pcg import pcg_kernels
 
 __all__ = ["vector_kernels"]
@@ -27,7 +27,7 @@ def vector_kernels(dtype: str, has_constraints: bool = False) -> KernelSet:
         """Strided partial sums of GROUP_ROWS over the slots of a residual group."""
         world, group, lane = wp.tid()
         for row in range(GROUP_ROWS):
-            source = wp.where(row == GROUP_ROUNDOFF, ROW_ROUNDOFF, row)
+            source = wp.where(row == GROUP_ROUNDOFF, Row.ROUNDOFF, row)
             total = f64(0.0)
             for k in range(start[group] + lane, start[group + 1], GROUP_LANES):
                 total += rows[source, world, slot[k]]

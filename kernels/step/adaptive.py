@@ -23,7 +23,7 @@ import warp as wp
 
 from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.types import f64, precision
-from ..solvers.newton_control import FAIL_LOCAL_ERROR, FAIL_ROUNDOFF, control_struct
+from ..solvers.newton_control import Failure, control_struct
 from ..solvers.pcg import pcg_struct
 from .step_control import step_end_functions, step_struct
 
@@ -234,7 +234,7 @@ def adaptive_kernels(dtype: str, scheme: Any) -> KernelSet:
         round_off = f64(ROUNDING_UNITS) * ctl.eps * ctl.max_displacement[world]
         ctl.round_off_ratio[world] = round_off * ctl.horizon[0] / (f64(RATE_MEMORY) * mean_step * ctl.tolerance)
         if ctl.round_off_ratio[world] > f64(1.0):
-            newton.failed[world] = FAIL_ROUNDOFF  # the run fails: a smaller step would not help
+            newton.failed[world] = Failure.ROUNDOFF  # the run fails: a smaller step would not help
             return
         rounding = round_off / span
         rate = wp.max(ctl.max_rate[world] - rounding, f64(0.0))
@@ -249,7 +249,7 @@ def adaptive_kernels(dtype: str, scheme: Any) -> KernelSet:
         if ctl.statistics[world, 0] >= f64(MAX_SUBSTEPS):
             ratio = f64(wp.inf)
         if not ratio <= f64(1.0):
-            newton.failed[world] = FAIL_LOCAL_ERROR
+            newton.failed[world] = Failure.LOCAL_ERROR
             ctl.statistics[world, 1] = ctl.statistics[world, 1] + f64(1.0)
             if ctl.statistics[world, 0] + ctl.statistics[world, 1] > f64(MAX_SUBSTEPS):
                 step.halving_level[world] = MAX_LEVEL  # no more halvings

@@ -20,25 +20,13 @@ from ..common.structs import (
 )  # fmt: skip
 from ..common.traits import NO_TERMS, Traits
 from ..common.types import double_1d, double_3d, f64, int_1d, precision
-from ..solvers.newton_control import (
-    ROW_FORCE,
-    ROW_FROZEN_CHANGE,
-    ROW_INERTIA,
-    ROW_INTERNAL,
-    ROW_KINETIC,
-    ROW_LOADS,
-    ROW_MAGNITUDE,
-    ROW_OBJECTIVE,
-    ROW_RESIDUAL,
-    ROW_ROUNDOFF,
-    ROW_SLOPE,
-)
+from ..solvers.newton_control import Row
 from ..terms.constraints import constraint_struct, multiplier_struct
 
 __all__ = ["RESIDUAL_ROWS", "gather_kernels"]
 
 RESIDUAL_ROWS = 11
-"""Rows summed per world with a residual, the ROW_ constants of newton_control.py in this order: the squared D^-1 norms
+"""Rows summed per world with a residual, `Row` of newton_control.py: the squared D^-1 norms
 of g, f_int, loads and inertia; the inertia and load part of Phi and its magnitude; g.p with non-conservative forces
 frozen; change of Phi by their update; squared norm of the position round-off; |g|^2; v~.M v~ c_M / 2."""
 
@@ -182,33 +170,33 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> KernelSet:
         vs = balance.v[world, slot]
         kinetic = T(0.5) * wp.dot(vs - balance.v_tilde[world, slot], a)
         work = wp.dot(held, vs)
-        balance.rows[ROW_RESIDUAL, world, slot] = weighted_square(wp.cw_mul(residual_force, free), D)
+        balance.rows[Row.RESIDUAL, world, slot] = weighted_square(wp.cw_mul(residual_force, free), D)
         # a prestressed body without loads has only reactions: a small fraction of them is its scale
         reaction = own - wp.cw_mul(own, free)
-        balance.rows[ROW_INTERNAL, world, slot] = weighted_square(
+        balance.rows[Row.INTERNAL, world, slot] = weighted_square(
             wp.cw_mul(own, free), D
         ) + REACTION_FRACTION * weighted_square(reaction, D)
-        balance.rows[ROW_LOADS, world, slot] = weighted_square(wp.cw_mul(magnitude, free), D)
-        balance.rows[ROW_INERTIA, world, slot] = weighted_square(wp.cw_mul(a, free), D)
-        balance.rows[ROW_OBJECTIVE, world, slot] = f64(kinetic - work)
+        balance.rows[Row.LOADS, world, slot] = weighted_square(wp.cw_mul(magnitude, free), D)
+        balance.rows[Row.INERTIA, world, slot] = weighted_square(wp.cw_mul(a, free), D)
+        balance.rows[Row.OBJECTIVE, world, slot] = f64(kinetic - work)
         if wp.static(traits.midpoint):  # Phi does not exist: half of the squared gradient replaces it
-            balance.rows[ROW_OBJECTIVE, world, slot] = f64(0.5) * weighted_square(
+            balance.rows[Row.OBJECTIVE, world, slot] = f64(0.5) * weighted_square(
                 wp.cw_mul(newton_gradient(balance, world, slot), free), D
             )
-        balance.rows[ROW_MAGNITUDE, world, slot] = f64(wp.abs(kinetic) + wp.abs(work))
-        balance.rows[ROW_SLOPE, world, slot] = f64(wp.dot(wp.cw_mul(descent, free), balance.direction[world, slot]))
-        balance.rows[ROW_FROZEN_CHANGE, world, slot] = f64(0.0)
+        balance.rows[Row.MAGNITUDE, world, slot] = f64(wp.abs(kinetic) + wp.abs(work))
+        balance.rows[Row.SLOPE, world, slot] = f64(wp.dot(wp.cw_mul(descent, free), balance.direction[world, slot]))
+        balance.rows[Row.FROZEN_CHANGE, world, slot] = f64(0.0)
         if wp.static(traits.nonpotential and not traits.midpoint):
-            balance.rows[ROW_FROZEN_CHANGE, world, slot] = f64(
+            balance.rows[Row.FROZEN_CHANGE, world, slot] = f64(
                 wp.dot(balance.nonpotential_frozen[world, slot] - balance.nonpotential[world, slot], vs)
             )
         least = f64(0.0)
         if wp.static(traits.pooled):
             least = wp.where(wp.length_sq(of_pool) > T(0.0), balance.gap_displacement, least)
-        balance.rows[ROW_ROUNDOFF, world, slot] = position_rounding(balance, free, D, world, slot, least)
-        balance.rows[ROW_FORCE, world, slot] = squared_length(wp.cw_mul(residual_force, free))
+        balance.rows[Row.ROUNDOFF, world, slot] = position_rounding(balance, free, D, world, slot, least)
+        balance.rows[Row.FORCE, world, slot] = squared_length(wp.cw_mul(residual_force, free))
         motion = T(0.5) * wp.dot(balance.v_tilde[world, slot], past)
-        balance.rows[ROW_KINETIC, world, slot] = balance.mass_factor[world] * f64(motion)
+        balance.rows[Row.KINETIC, world, slot] = balance.mass_factor[world] * f64(motion)
 
     @wp.func
     def pool_range(more: ProductTerms, slot: int) -> wp.vec2i:

@@ -14,7 +14,7 @@ from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.structs import IMPACT_FOUND, IMPACT_REPEATED, free_components_function
 from ..common.traits import NO_TERMS, Traits
 from ..common.types import double_2d, f64, int_1d, precision
-from ..solvers.newton_control import FAIL_ELEMENT_INVERTED, FAIL_ENERGY_GROWTH, FAIL_ROUNDOFF, FAIL_WORK, control_struct
+from ..solvers.newton_control import Failure, control_struct
 from ..solvers.pcg import pcg_struct
 from .energy_ledger import GROWTH_SHARE, ledger_kernels
 from .step_control import STATUS, Coefficients, step_end_functions, step_struct
@@ -74,7 +74,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
         if alive != 0 and step.growth_monitored != 0 and step.energy_growth[world, GROWTH_SHARE] > step.growth_limit:
             alive = 0
             step.status[world] = wp.static(STATUS["failed"])
-            newton.failed[world] = FAIL_ENERGY_GROWTH
+            newton.failed[world] = Failure.ENERGY_GROWTH
         step.running[world] = alive
         step.rejected[world] = 0
         newton.step_iterations[world] = 0
@@ -231,7 +231,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
                 wp.atomic_max(step.any_running, 0, 1)
                 return
         if newton.inverted[world] != 0 and newton.failed[world] == 0:
-            newton.failed[world] = FAIL_ELEMENT_INVERTED
+            newton.failed[world] = Failure.ELEMENT_INVERTED
         if newton.failed[world] == 0:
             step.accepted[world] = 1
             step.step_min_J[world] = wp.min(step.step_min_J[world], newton.min_J[world])
@@ -260,7 +260,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
         level = step.halving_level[world] + 1
         why = newton.failed[world]
         # a shorter step has no better round-off, and changes the motion
-        hopeless = why == FAIL_WORK or why == FAIL_ROUNDOFF
+        hopeless = why == Failure.WORK or why == Failure.ROUNDOFF
         if step.newton_budget > 0 and newton.step_iterations[world] >= step.newton_budget:
             hopeless = True
         if hopeless or level > step.max_halvings:

@@ -1,6 +1,7 @@
 """Common parts of the parsers: parser class, types of values, general options."""
 
 import argparse
+import enum
 import functools
 import importlib
 import math
@@ -14,7 +15,7 @@ from ..base.errors import UsageError
 from ..base.names import did_you_mean
 
 __all__ = [
-    "APPEND", "FLAG", "ONCE", "Parser", "add_options", "color_range", "existing_file", "finish_command", "load_steps",
+    "Kind", "Parser", "add_options", "color_range", "existing_file", "finish_command", "load_steps",
     "number_pair", "number_tuple", "positive_integer", "positive_integers", "positive_number", "size", "step_size",
     "vector",
 ]  # fmt: skip
@@ -124,24 +125,28 @@ def size(text: str) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
-FLAG, APPEND, ONCE = "store_true", "append", StoreOnce
-"""Kinds of options: a switch; repeatable; an output, given once."""
+class Kind(enum.Enum):
+    """Actions of options: a switch; repeatable; an output, given once."""
+
+    FLAG = "store_true"
+    APPEND = "append"
+    ONCE = StoreOnce
 
 
 def add_options(to: Any, *rows: tuple[Any, ...]) -> None:
     """Add options, a row (flag, kind, metavar, help) or (flag, kind, metavar, help, default) each.
 
-    Kinds are FLAG, APPEND, ONCE, a type of values, a tuple of choices, or None for text; a tuple as metavar: choices of
+    Kinds are a `Kind`, a type of values, a tuple of choices, or None for text; a tuple as metavar: choices of
     a repeatable option. Flags with synonyms are separated by blanks.
     """
     for flags, kind, shown, text, *default in rows:
-        how: dict[str, Any] = {"action": kind} if kind in (FLAG, APPEND, ONCE) else {"type": kind}
+        how: dict[str, Any] = {"action": kind.value} if isinstance(kind, Kind) else {"type": kind}
         choices = kind if isinstance(kind, tuple) else shown
         if isinstance(choices, tuple):
             how = {"action": how.get("action"), "choices": choices}
         elif shown:
             how["metavar"] = shown
-        if default or kind == APPEND:
+        if default or kind is Kind.APPEND:
             how["default"] = default[0] if default else []
         to.add_argument(*flags.split(), help=text, **how)
 
@@ -150,9 +155,9 @@ def finish_command(to: Any, module: str, function: str, quiet: str = "no bars an
     """Options common to all commands, and the command, imported on call; `quiet` is the help of --quiet."""
     add_options(
         to.add_argument_group("general"),
-        ("--quiet", FLAG, None, quiet),
-        ("--no-progress", FLAG, None, "no bars; there are none without a terminal"),
-        ("--debug", FLAG, None, "errors as Python tracebacks"),
+        ("--quiet", Kind.FLAG, None, quiet),
+        ("--no-progress", Kind.FLAG, None, "no bars; there are none without a terminal"),
+        ("--debug", Kind.FLAG, None, "errors as Python tracebacks"),
     )
 
     def command(arguments: argparse.Namespace) -> int:

@@ -8,9 +8,7 @@ from typing import Any
 from ..base.errors import UsageError
 from ..base.names import did_you_mean
 from .arguments import (
-    APPEND,
-    FLAG,
-    ONCE,
+    Kind,
     Parser,
     add_options,
     finish_command,
@@ -125,11 +123,11 @@ def add_bench(commands: Any) -> None:
     kind.add_argument("--worlds", action="store_true", help="many worlds of small models: error beside run time")
     add_options(
         to,
-        ("--problem", APPEND, ("bar", "beam", "plate", "ENMC", "FN18", "H3843"), "may be repeated; default bar", None),
+        ("--problem", Kind.APPEND, ("bar", "beam", "plate", "ENMC", "FN18", "H3843"), "repeatable; default bar", None),
         ("--unknowns --sizes", positive_integers, "N,N,...", "sizes (default: a few per problem)", []),
         ("--device", None, None, "cpu, cuda:0, ...; by default CUDA where there is one"),
-        ("--dtype", APPEND, ("float64", "float32"), "may be repeated; default both, of --peer float64", None),
-        ("--linear", APPEND, ("pcg", "direct"), "linear solver, may be repeated; default pcg", None),
+        ("--dtype", Kind.APPEND, ("float64", "float32"), "may be repeated; default both, of --peer float64", None),
+        ("--linear", Kind.APPEND, ("pcg", "direct"), "linear solver, may be repeated; default pcg", None),
         ("--steps", positive_integer, "N", "steps to simulate (default 10, --peer 120)"),
         ("--repeat", positive_integer, "N", "runs; the median counts (default 3)"),
         ("--dt", positive_number, "S", "step, s (default 1e-3)"),
@@ -140,7 +138,7 @@ def add_bench(commands: Any) -> None:
     add_options(
         to.add_argument_group("with --peer or --worlds"),
         ("--rows", None, "LABEL,...", "rows by label, with * for any text (default: all)"),
-        ("--large", FLAG, None, "--peer: a bar of 4 million unknowns too, ten steps"),
+        ("--large", Kind.FLAG, None, "--peer: a bar of 4 million unknowns too, ten steps"),
         ("--meshes", None, "FOLDER", "--peer: unstructured meshes (default: tests/data of the checkout)"),
     )
     add_options(to, ("--out", None, "FILE", "JSON with command, machine, settings and rows"))
@@ -175,7 +173,7 @@ def add_study(commands: Any) -> None:
         one,
         ("--device", None, None, "cpu, cuda:0, ..."),
         ("--worlds", positive_integer, "N", "candidates at a time (default 64)"),
-        ("--quick", FLAG, None, "a trial: few and small rows, no result"),
+        ("--quick", Kind.FLAG, None, "a trial: few and small rows, no result"),
         ("--out", None, "PATH", "JSON with command, machine, settings and rows"),
     )
     finish_command(one, ".study", "study", "no bars, no table")
@@ -193,13 +191,13 @@ def _add_scene_study(names: Any) -> None:
     to.add_argument("what", metavar=SCENE_COMMAND, help="a scene, file.py or file.py:scene")
     add_options(
         to.add_argument_group("the sweep"),
-        ("--over", APPEND, "NAME=V1,V2", "repeatable"),
+        ("--over", Kind.APPEND, "NAME=V1,V2", "repeatable"),
         ("--methods", None, "NAME,NAME", "integrators, with options as name(option=value)"),
         ("--error", None, "X,X", "steps that adapt, to each of these errors"),
     )
     add_options(
         to.add_argument_group("for all runs (defaults are the scene's)"),
-        ("--set", APPEND, "NAME=VALUE", "a parameter of the scene"),
+        ("--set", Kind.APPEND, "NAME=VALUE", "a parameter of the scene"),
         ("--dt", positive_number, "S", "step, s, where it is not swept"),
         ("--t-end", positive_number, "S", "end time, s"),
         ("--tol", positive_number, "X", "relative residual at which a step is accepted"),
@@ -209,10 +207,10 @@ def _add_scene_study(names: Any) -> None:
     )
     add_options(
         to.add_argument_group("errors"),
-        ("--probe", APPEND, "NAME", "whose error counts; repeatable (default: all)", None),
+        ("--probe", Kind.APPEND, "NAME", "whose error counts; repeatable (default: all)", None),
         ("--reference", None, "FILE", "a file of positions, or run for a finer run"),
-        ("--finer", APPEND, "NAME=VALUE", "of the finer run"),
-        ("--mesh", APPEND, "NAME", "a parameter that refines the mesh; repeatable", None),
+        ("--finer", Kind.APPEND, "NAME=VALUE", "of the finer run"),
+        ("--mesh", Kind.APPEND, "NAME", "a parameter that refines the mesh; repeatable", None),
         ("--measure", None, "NAME", "error that counts: l2 (default), end, energy, field", "l2"),
         ("--target", positive_number, "X", "name the cheapest setting with at most this error, in time and mesh"),
         ("--split", None, "ROWS", "parts of the error of the best row (default), of all, or none", "best"),
@@ -221,7 +219,7 @@ def _add_scene_study(names: Any) -> None:
         to,
         ("--repeat", positive_integer, "N", "runs for the times (default 3)", 3),
         ("--limit", positive_number, "S", "s, after which a run is given up"),
-        ("--out", ONCE, "FOLDER", "NAME.csv, .json, .png, and what is needed to go on"),
+        ("--out", Kind.ONCE, "FOLDER", "NAME.csv, .json, .png, and what is needed to go on"),
         ("--name", None, "NAME", "of the files (default: the scene's)"),
     )
     finish_command(to, ".study", "accuracy", "no bars, no table")
@@ -238,14 +236,14 @@ def add_stress(commands: Any) -> None:
     )
     add_options(
         to,
-        ("--case", APPEND, "NAME", "a case, a row NAME/VALUE or a group; repeatable"),
-        ("--list", FLAG, None, "the cases and what each tries; runs nothing"),
-        ("--quick", FLAG, None, "the fast rows only (minutes)"),
+        ("--case", Kind.APPEND, "NAME", "a case, a row NAME/VALUE or a group; repeatable"),
+        ("--list", Kind.FLAG, None, "the cases and what each tries; runs nothing"),
+        ("--quick", Kind.FLAG, None, "the fast rows only (minutes)"),
         ("--device", None, None, "cpu, cuda:0, ...; by default CUDA where there is one"),
         ("--dtype", ("float64", "float32", "both"), None, "precision (default both)", "both"),
         ("--meshes", None, "FOLDER", "meshes of the soft solids (mat.msh, ...); without: left out"),
-        ("--json", ONCE, "FILE", "rows with all numbers, kept after each; - for stdout"),
-        ("--resume", FLAG, None, "keep the rows that --json holds, of the same commit"),
+        ("--json", Kind.ONCE, "FILE", "rows with all numbers, kept after each; - for stdout"),
+        ("--resume", Kind.FLAG, None, "keep the rows that --json holds, of the same commit"),
     )
     finish_command(to, ".study", "stress", "no bars, no table: which rows failed, and the exit code")
 

@@ -10,9 +10,7 @@ from ..base.names import did_you_mean
 from ..simulation.statics import UNSTABLE_CHOICES
 from ..solvers import SOLVERS
 from .arguments import (
-    APPEND,
-    FLAG,
-    ONCE,
+    Kind,
     Parser,
     add_options,
     color_range,
@@ -126,13 +124,13 @@ def _join_negative_vectors(words: Sequence[str]) -> list[str]:
 def _add_model_options(to: argparse.ArgumentParser) -> None:
     """Model and solver options common to run, info and profile."""
     to.add_argument("what", metavar="SCENE", help="a scene, file.py or file.py:scene, or a mesh (.msh, .vtu, .inp)")
-    add_options(to, ("--set", APPEND, "NAME=VALUE", "set a parameter of the scene"))
+    add_options(to, ("--set", Kind.APPEND, "NAME=VALUE", "set a parameter of the scene"))
     add_options(
         to.add_argument_group("for a mesh file (vectors are x,y,z; repeat an option for several groups)"),
-        ("--material", APPEND, "[GROUP=]LAW:NAME=VALUE,...", MATERIAL_HINT),
-        ("--clamp", APPEND, "GROUP", "hold the nodes of a group"),
-        ("--traction", APPEND, "GROUP:x,y,z", "dead load on a surface, Pa"),
-        ("--pressure", APPEND, "GROUP:p", "follower pressure on a surface, Pa"),
+        ("--material", Kind.APPEND, "[GROUP=]LAW:NAME=VALUE,...", MATERIAL_HINT),
+        ("--clamp", Kind.APPEND, "GROUP", "hold the nodes of a group"),
+        ("--traction", Kind.APPEND, "GROUP:x,y,z", "dead load on a surface, Pa"),
+        ("--pressure", Kind.APPEND, "GROUP:p", "follower pressure on a surface, Pa"),
         ("--gravity", vector, "x,y,z", "m/s^2, by default 9.81 downwards"),
         ("--scale", positive_number, "S", "metres per unit of the file, 1e-3 for mm"),
         ("--up-axis", ("Y", "Z"), None, "by default Z"),
@@ -167,10 +165,10 @@ def _add_run(commands: Any) -> None:
     add_options(
         to,
         ("--t-end", positive_number, "S", "end time, s (default: the scene's)"),
-        ("--static", FLAG, None, "static equilibrium in place of a motion"),
+        ("--static", Kind.FLAG, None, "static equilibrium in place of a motion"),
         ("--load-steps", load_steps, "N", "of --static (default 10); auto: the whole load at once, halved where it is "
          "refused"),
-        ("--stabilise", FLAG, None, "of --static: springs that fade with the load, for bodies that only contact holds"),
+        ("--stabilise", Kind.FLAG, None, "of --static: springs that fade with the load, for bodies that contact holds"),
         ("--overlaps", ("warn", "ignore"), None, "bodies that cross each other or a collider without a contact, or "
          "deeper than it sees: a warning (default), or not", "warn"),
         ("--unstable", UNSTABLE_CHOICES, None, "of --static: warn of an unstable equilibrium (default), refuse it, or "
@@ -178,16 +176,16 @@ def _add_run(commands: Any) -> None:
     )  # fmt: skip
     add_options(
         to.add_argument_group("output (existing files are replaced once the new one is whole)"),
-        ("--usd", ONCE, "FILE", "animation (.usdc, .usda) with stress and displacement; validated"),
-        ("--vtu", ONCE, "FOLDER", "series of .vtu and a .pvd for ParaView"),
-        ("--png", ONCE, "FILE", "picture"),
+        ("--usd", Kind.ONCE, "FILE", "animation (.usdc, .usda) with stress and displacement; validated"),
+        ("--vtu", Kind.ONCE, "FOLDER", "series of .vtu and a .pvd for ParaView"),
+        ("--png", Kind.ONCE, "FILE", "picture"),
         ("--png-time", float, "S", "time of the picture"),
-        ("--gif", ONCE, "FILE", "animation"),
+        ("--gif", Kind.ONCE, "FILE", "animation"),
         *PICTURE_OPTIONS,
         ("--fps", positive_number, "N", "frames per simulated second of --usd and --vtu"),
         ("--speed", positive_number, "X", "simulated seconds per second of --gif"),
-        ("--json", ONCE, "FILE", "summary of the run; - for stdout"),
-        ("--checkpoint", ONCE, "FILE", "state (.npz), written every --every steps and at the end"),
+        ("--json", Kind.ONCE, "FILE", "summary of the run; - for stdout"),
+        ("--checkpoint", Kind.ONCE, "FILE", "state (.npz), written every --every steps and at the end"),
         ("--every", positive_integer, "N", "steps between checkpoints (default 100)"),
         ("--resume", None, "FILE", "go on from a checkpoint, with its integrator and precision, and without --dt its "
          "dt; a file of --usd or a series of --vtu that is there goes on too, if it ends where the checkpoint is"),

@@ -26,7 +26,7 @@ from ..kernels.contact.structs import (
     contact_scratch_struct,
     history_struct,
 )
-from ..kernels.solvers.newton_control import FAIL_ROUNDOFF, FAIL_WORK
+from ..kernels.solvers.newton_control import Failure
 from ..model.contact_points import element_edge_and_depth
 from ..model.state import State
 from ..terms.protocols import Diagnosed, Parametrised, Preconditioned, Touching, Updated
@@ -372,7 +372,7 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
 
     def failure_reason(self, ctx: StepContext, world: int) -> tuple[type[PenetrationError], str] | None:
         found = int(ctx.scratch[self.name]["attempt"].passed_point.numpy()[world])
-        if found == 0 or int(ctx.work.newton.failed.numpy()[world]) in (FAIL_ROUNDOFF, FAIL_WORK):
+        if found == 0 or int(ctx.work.newton.failed.numpy()[world]) in (Failure.ROUNDOFF, Failure.WORK):
             return None
         t, point = self.tables, abs(found) - 1
         k = int(np.searchsorted(t.first, point, side="right")) - 1

@@ -24,17 +24,17 @@ if TYPE_CHECKING:
 __all__ = ["check_initial_constraints", "step_error"]
 
 FAILURE_REASONS = {
-    codes.FAIL_ITERATIONS: "Newton's method did not converge",
-    codes.FAIL_LINE_SEARCH: "the line search found no decrease",
-    codes.FAIL_JACOBIAN: "an element reached J <= 0, where its law is not defined,",
-    codes.FAIL_NAN: "a force or energy was not finite",
-    codes.FAIL_CURVATURE: "no descent direction was found",
-    codes.FAIL_STEP_LIMIT: "a term allowed no step along Newton's direction",
-    codes.FAIL_RESIDUAL_GROWTH: "the residual grew more than tenfold",
-    codes.FAIL_ELEMENT_INVERTED: "an element inverted (J <= 0)",
-    codes.FAIL_LOCAL_ERROR: "the error tolerance was not met within 65536 substeps",
+    codes.Failure.ITERATIONS: "Newton's method did not converge",
+    codes.Failure.LINE_SEARCH: "the line search found no decrease",
+    codes.Failure.JACOBIAN: "an element reached J <= 0, where its law is not defined,",
+    codes.Failure.NAN: "a force or energy was not finite",
+    codes.Failure.CURVATURE: "no descent direction was found",
+    codes.Failure.STEP_LIMIT: "a term allowed no step along Newton's direction",
+    codes.Failure.RESIDUAL_GROWTH: "the residual grew more than tenfold",
+    codes.Failure.ELEMENT_INVERTED: "an element inverted (J <= 0)",
+    codes.Failure.LOCAL_ERROR: "the error tolerance was not met within 65536 substeps",
 }
-INDEFINITE_FAILURES = (codes.FAIL_ITERATIONS, codes.FAIL_LINE_SEARCH, codes.FAIL_CURVATURE)
+INDEFINITE_FAILURES = (codes.Failure.ITERATIONS, codes.Failure.LINE_SEARCH, codes.Failure.CURVATURE)
 """Failures that an indefinite tangent may explain."""
 NO_ERROR_ESTIMATE = 1e30
 """Value of an unavailable error estimate."""
@@ -52,14 +52,14 @@ def step_error(sim: Any, world: int) -> ConvergenceError | ConstraintError:
     time = float(sim.last.time[world])
     # no halving follows the last rejection
     halvings = min(int(sim.last.halvings[world]) - 1, sim.solver.max_halvings)
-    if code == codes.FAIL_ENERGY_GROWTH:
+    if code == codes.Failure.ENERGY_GROWTH:
         text = f"{_step_text(sim, time, world)} was not taken in world {world}: {growth_error_text(sim, world)}"
         return ConvergenceError(text, time=time, world=world, state=sim.state)
-    if code == codes.FAIL_CONSTRAINT:
+    if code == codes.Failure.CONSTRAINT:
         return _constraint_error(sim, world, time, halvings)
     count = int(work.newton.iterations.numpy()[world]) + 1
     history = work.newton.norms.residual_history.numpy()[world, :count].tolist()
-    if code in (codes.FAIL_JACOBIAN, codes.FAIL_ELEMENT_INVERTED):
+    if code in (codes.Failure.JACOBIAN, codes.Failure.ELEMENT_INVERTED):
         element, where = lowest_jacobian(sim.model, work.u.numpy()[world].astype(float))
     else:
         element, where = _worst_element(sim.model, work.g.numpy()[world])
@@ -70,12 +70,12 @@ def step_error(sim: Any, world: int) -> ConvergenceError | ConstraintError:
         )
     hint += overload_text(sim.model)
     lumped = [c.name for c in sim.model.description.contacts if c.model == "sphere"] if sim.integrator.static else []
-    if lumped and code != codes.FAIL_ROUNDOFF:
+    if lumped and code != codes.Failure.ROUNDOFF:
         hint += f"; the single contact point of {lumped[0]!r} jumps as the body rolls: use model='patch' in statics"
     spent, most = int(sim.last.newton[world]), int(work.step.newton_budget)
-    if code != codes.FAIL_WORK and most and spent >= most and halvings < sim.solver.max_halvings:
+    if code != codes.Failure.WORK and most and spent >= most and halvings < sim.solver.max_halvings:
         hint += f"; {spent} Newton iterations used up max_work = {sim.solver.max_work}"
-    jumps = "" if code == codes.FAIL_ROUNDOFF else discontinuous_drives_text(sim, world)
+    jumps = "" if code == codes.Failure.ROUNDOFF else discontinuous_drives_text(sim, world)
     kind: type[ConvergenceError] = ConvergenceError
     for term in sim.model.terms.having(Diagnosed):
         if (found := term.failure_reason(sim.stepper.ctx, world)) is not None:
@@ -96,30 +96,30 @@ def _failure_reason(sim: Any, code: int, world: int) -> tuple[str, str]:
     work, dtype = sim.stepper.work, sim.model.dtype
     smaller = "; try more load steps" if sim.integrator.static else "; try a smaller dt"
     direct = sim.stepper.newton.direct
-    if code == codes.FAIL_CURVATURE and direct is not None and world in direct.singular_worlds:
+    if code == codes.Failure.CURVATURE and direct is not None and world in direct.singular_worlds:
         return "singular tangent matrix (unconstrained body or mechanism?)", ""
     near = float(work.newton.floor.rounding_ratio.numpy()[world]) <= STALL_ROUNDINGS
     finer = "; use float64" if dtype == "float32" else "; use fewer, stouter elements, or check the units"
     adaptive = sim.stepper.step_size_control
-    if code == codes.FAIL_ROUNDOFF and adaptive and (least := adaptive.smallest_resolved_error(world)):
+    if code == codes.Failure.ROUNDOFF and adaptive and (least := adaptive.smallest_resolved_error(world)):
         hides = f"{dtype} round-off of displacements hides the local errors of substeps"
         return hides, f"{finer}, or error = {1.05 * least:.2g} or more"
-    if code == codes.FAIL_LOCAL_ERROR:
+    if code == codes.Failure.LOCAL_ERROR:
         return FAILURE_REASONS[code], f"; {'use float64, or ' if dtype == 'float32' else 'use '}a larger error"
-    if code == codes.FAIL_ROUNDOFF:
+    if code == codes.Failure.ROUNDOFF:
         eta = float(work.newton.floor.error_estimate.numpy()[world])
         left = ""
         if eta < NO_ERROR_ESTIMATE:
             left = f" (estimated error {eta:.2g})"
         return f"{dtype} round-off limit reached{left}", finer
-    if code == codes.FAIL_WORK:
+    if code == codes.Failure.WORK:
         spent = f"the step took {int(work.pcg.step_iterations.numpy()[world])} CG iterations"
         limit = f"max_work = {sim.solver.max_work}"
         if near and dtype == "float32":
             return f"float32 round-off limit reached: {spent} ({limit})", finer
         slivers = f"; raise {limit} of NewtonPCG, or look for slivers and extreme contrasts of stiffness"
         return spent, "" if overload_text(sim.model) else slivers
-    if code == codes.FAIL_ELEMENT_INVERTED:
+    if code == codes.Failure.ELEMENT_INVERTED:
         return FAILURE_REASONS[code], f"{smaller}, or NeoHookean in place of SVK; inversion='report' lets it pass"
     bent = sim.integrator.static and int(work.newton.solve.met_negative_curvature.numpy()[world])
     if code in INDEFINITE_FAILURES and near and (dtype == "float32" or not bent):

@@ -6,7 +6,7 @@ Stabilising springs for bodies before contact is established: k (1 - load) M (u 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -157,15 +157,11 @@ def begin_static(
     load_steps: int | str = 10,
     tol: float | None = None,
     solver: NewtonPCG | None = None,
-    plan: SolverPlan | None = None,
     state: State | None = None,
-    constraint_tol: float | None = None,
-    inversion: str = "refuse",
     stabilise: bool | float = False,
-    check_overlap: bool = False,
-    on_compile: Callable[[int, int, str], None] | None = None,
+    **options: Any,
 ) -> Simulation:
-    """Simulation of `solve_static` before its first load step; ModelError as there. `check_overlap`, `on_compile`: of
+    """Simulation of `solve_static` before its first load step; ModelError as there. `options`: further ones of
     Simulation."""
     count = 1 if isinstance(load_steps, str) and load_steps == "auto" else load_steps
     if isinstance(count, (bool, str)) or not (isinstance(count, (int, np.integer)) and count >= 1):
@@ -183,19 +179,17 @@ def begin_static(
         check_static_supports(model)
     if not isinstance(solver, (NewtonPCG, type(None))):
         raise ModelError(f"solve_static: solver = {solver!r} must be wf.NewtonPCG(...): an equilibrium is to be found")
-    options = solver or NewtonPCG(max_pcg=20000, max_newton=50)
+    newton = solver or NewtonPCG(max_pcg=20000, max_newton=50)
     if tol is not None:
         if not (math.isfinite(tol) and 0.0 < tol < 1.0):
             raise ModelError(f"solve_static: tol = {tol!r} must lie between 0 and 1")
-        options = replace(options, tol=tol)
+        newton = replace(newton, tol=tol)
     start = model.state() if state is None else state.copy()
     model.terms.shift_time(start)
     scheme = replace(INTEGRATORS["static"], stabilise=springs)
     return Simulation(
-        model, start, dt=1.0 / count, integrator=scheme, solver=options, ledger=False,
-        on_failure="raise", constraint_tol=constraint_tol, inversion=inversion, on_compile=on_compile,
-        plan=plan, check_overlap=check_overlap,
-    )  # fmt: skip
+        model, start, dt=1.0 / count, integrator=scheme, solver=newton, ledger=False, on_failure="raise", **options
+    )
 
 
 def run_static(

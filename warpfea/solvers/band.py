@@ -166,7 +166,7 @@ class BandFactor:
             args = [lanes, self.window_memory, self.pattern.data, value, b.slot_order, b.slot_position]
             args += [self.diagonal_shift]
             args += [self.pending, self.failed, self.factors]
-            launch(self.thread_block_kernels.factor, self.worlds * lanes, args, block_dim=lanes)
+            launch(self.thread_block_kernels.factor, (self.worlds, lanes), args, block_dim=lanes)
         else:
             slots = self.pattern.graph.shape[0]
             launch(k.clear_band, (self.worlds, b.block_rows), [slots, b.half_bandwidth, self.pending, self.factors])
@@ -182,7 +182,7 @@ class BandFactor:
         if self.by_thread_block:
             lanes = self.thread_block_kernels.lanes
             args = [lanes, self.window_memory, self.factors, b.slot_order, r, active, z]
-            self.launch(self.thread_block_kernels.solve, self.worlds * lanes, args, block_dim=lanes)
+            self.launch(self.thread_block_kernels.solve, (self.worlds, lanes), args, block_dim=lanes)
             return
         args = [b.half_bandwidth, self.factors, b.slot_order, r, active, self.half_solution, z]
         self.launch(self.kernels.solve, self.worlds, args)
