@@ -135,9 +135,14 @@ def test_kernels_import_nothing_from_the_host_side(path):
             if node.level == 0:
                 assert node.module.split(".")[0] in ("warp", "collections", "typing"), ast.unparse(node)
         if isinstance(node, ast.Import):
-            assert {a.name.split(".")[0] for a in node.names} <= {"ast", "enum", "warp", "functools", "types", "math"}, (
-                ast.unparse(node)
-            )
+            assert {a.name.split(".")[0] for a in node.names} <= {
+                "ast",
+                "enum",
+                "warp",
+                "functools",
+                "types",
+                "math",
+            }, ast.unparse(node)
 
 
 def literal_floats(function):

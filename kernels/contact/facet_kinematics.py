@@ -3,7 +3,8 @@
 Depth is the distance from the projection on the master's facet: the normal force, its derivative, acts there by the
 shape functions of the facet, along a line through the point. Friction acts at the point's own coordinates, by the shape
 functions of the master's material there. So force and moment balance, and the force is that of a potential of the
-iterate, nearly continuous where a point passes to the next facet, for any strain.
+iterate, nearly continuous where a point passes to the next facet, for any strain. In midpoint schemes midpoint.py moves
+the force to the middle of the step.
 """
 
 import functools
@@ -106,7 +107,7 @@ def facet_kinematics(dtype: str) -> KernelSet:
             pair.shape_values[world, point, i] = T(shape_value(mas, f, i, pair.projection[world, point]))
             pair.shape_gradient[world, point, i] = vec2(f_.shape_gradients(mas, f, i, pair.projection[world, point]))
             if friction:
-                pair.friction_shape[world, point, i] = T(shape_value(mas, f, i, pair.xi[world, point]))
+                pair.friction_shape[world, point, i] = T(shape_value(mas, f, i, pair.friction_xi[world, point]))
 
     @wp.func
     def frozen_motion(
@@ -297,7 +298,7 @@ def master_kernels(dtype: str) -> KernelSet:
         if flags[world] == 0 or scr.activity[world, point] != WITH_STIFFNESS:
             return
         f = other.scratch.facet[world, point]
-        xi = other.scratch.xi[world, point]
+        xi = other.scratch.friction_xi[world, point]
         for i in range(other.masters.conn.shape[0]):
             other.scratch.friction_shape[world, point, i] = T(shape_value(other.masters, f, i, xi))
         freeze_friction_shapes(other.masters, facets, other.scratch, u, world, q, item, point, f)

@@ -97,6 +97,7 @@ def pair_scratch_struct(dtype: str):
     class PairScratch:
         displacement: facet_field_struct()  # at the iterate
         start_displacement: facet_field_struct()  # at the start of the attempt
+        middle_displacement: facet_field_struct()  # in the middle of the step, in midpoint schemes
         start_velocity: wp.array2d(dtype=wp.vec3d)  # [world, control] sum_i shape_mi v_i then, m/s
         facet_centre: wp.array2d(dtype=mat43)  # [world, facet] centre and derivatives, rows as of a FacetPoint
         bulge: wp.array2d(dtype=wp.float64)  # [world, facet] largest height above the tangent plane at the centre, m
@@ -119,6 +120,7 @@ def pair_scratch_struct(dtype: str):
         anchor_gap: wp.array2d(dtype=wp.vec2d)  # start value of (gap_slope, gap_offset), see Projection
         facet: wp.array2d(dtype=wp.int32)  # master facet at the iterate, -1: none; -2: penetrated completely
         xi: wp.array2d(dtype=wp.vec3d)
+        friction_xi: wp.array2d(dtype=wp.vec3d)  # coordinates where friction acts: `xi`, in midpoint schemes halfway
         projection: wp.array2d(dtype=wp.vec3d)  # coordinates of the projection on the facet
         depth: wp.array2d(dtype=wp.float64)
         initial_depth: wp.array2d(dtype=wp.float64)  # depth at the start of the attempt, m

@@ -21,6 +21,7 @@ from ..kernels.contact.facet_structs import (
     pair_scratch_struct,
     point_list_struct,
 )
+from ..kernels.contact.midpoint import pair_midpoint_kernels
 from ..kernels.contact.point_lists import FACETS_PER_CHUNK, point_list_kernels
 from ..kernels.contact.rigid_modes import pair_rigid_mode_kernels
 from ..model.pairs import FacetOptions
@@ -56,6 +57,7 @@ class FacetContact(ContactTerm, Tied, Coupled):
         self.search_kernels = facet_search_kernels(model.dtype)
         self.master_kernels = master_kernels(model.dtype)
         self.point_list_kernels = point_list_kernels(model.dtype)
+        self.midpoint_kernels = pair_midpoint_kernels(model.dtype)
 
     @classmethod
     def features(cls, model: Model) -> dict[str, bool]:
@@ -71,12 +73,12 @@ class FacetContact(ContactTerm, Tied, Coupled):
 
     # simulation setup
 
-    def _make_pair_scratch(self, work: Workspace) -> Any:
+    def _make_pair_scratch(self, work: Workspace, *, midpoint: bool) -> Any:
         t, B = self.tables, self.model.worlds
         most = t.master_data(wp.uint64(0)).max_monomials
         F, P, R = t.facets, t.points, t.rows
         shapes: dict[str, tuple[int, ...]] = dict.fromkeys(
-            ("displacement", "start_displacement", "start_velocity"), (B, F * most)
+            ("displacement", "start_displacement", "middle_displacement", "start_velocity"), (B, F * most)
         )
         shapes |= dict.fromkeys(("box_lower", "box_upper", "refit_lower", "refit_upper", "list_count"), (B * F,))
         shapes |= dict.fromkeys(("refit_needed", "refit_count", "lists_changed"), (1,))
@@ -88,18 +90,22 @@ class FacetContact(ContactTerm, Tied, Coupled):
         out = pair_scratch_struct(self.model.dtype)()
         for name, var in pair_scratch_struct(self.model.dtype).vars.items():
             shape = shapes.get(name, (B, P))
-            if name in ("displacement", "start_displacement"):
+            if name in ("middle_displacement", "friction_xi") and not midpoint:
+                continue
+            if name.endswith("displacement") and name != "frozen_displacement":
                 for part in ("value", "director"):
                     setattr(getattr(out, name), part, work.array(f"pairs {name} {part}", shape, wp.vec3d))
             else:
                 setattr(out, name, work.array(f"pairs {name}", shape, var.type.dtype))
+        if not midpoint:
+            out.friction_xi = out.xi
         out.refit_count.fill_(1)
         return out
 
     def allocate(self, work: Workspace, ctx: StepContext) -> None:
         super().allocate(work, ctx)
         s = ctx.scratch[self.name]
-        s["pair"] = self._make_pair_scratch(work)
+        s["pair"] = self._make_pair_scratch(work, midpoint=ctx.midpoint)
         s["tree"] = self._build_tree(s["pair"])
         s["masters"] = self.tables.master_data(s["tree"].id)
         s["other"].masters, s["other"].scratch = s["masters"], s["pair"]
@@ -127,7 +133,8 @@ class FacetContact(ContactTerm, Tied, Coupled):
         return out
 
     def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
-        own = (self.search_kernels, self.master_kernels, self.point_list_kernels)
+        own = [self.search_kernels, self.master_kernels, self.point_list_kernels]
+        own += [self.midpoint_kernels] if ctx.midpoint else []
         return [*super().modules(ctx), *(kernels.module for kernels in own)]
 
     def start(self, ctx: StepContext, active: wp.array) -> None:
@@ -198,10 +205,17 @@ class FacetContact(ContactTerm, Tied, Coupled):
 
     def _find_other(self, ctx: StepContext, active: wp.array, *, fresh: int) -> None:
         if ctx.positions_changed:
-            self._search_facets(ctx, ctx.scratch[self.name]["u"], active, overlap_limit=0.0)
+            self._find_accepted(ctx, active)
 
     def _find_accepted(self, ctx: StepContext, accepted: wp.array) -> None:
-        self._search_facets(ctx, ctx.scratch[self.name]["u"], accepted, overlap_limit=0.0)
+        s, k = ctx.scratch[self.name], self.midpoint_kernels
+        self._search_facets(ctx, s["u"], accepted, overlap_limit=0.0)
+        if ctx.midpoint:
+            pair, worlds = s["pair"], self.model.worlds
+            ctx.launch(k.middle_coefficients, pair.displacement.value.shape, [accepted, pair])
+            for group in self.tables.groups:
+                args = [s["masters"], group.data, accepted, s["u"], s["attempt"], pair]
+                ctx.launch(k.middle_projections, group.point_threads(worlds), args)
 
     def _list_points(self, ctx: StepContext) -> None:
         wp.capture_if(ctx.scratch[self.name]["pair"].lists_changed, self._build_point_lists, ctx=ctx)
