@@ -6,6 +6,7 @@ The floors of the house: imports only go down, and the CUDA tests need neither m
 import ast
 import importlib.metadata
 import importlib.util
+import json
 import os
 import pathlib
 import re
@@ -248,6 +249,13 @@ def test_folders_keep_to_their_lines(record_property):
     assert lines_in("tests/validation") <= 4000
     assert lines_in("warpfea/studies") <= 6800
     record_property("lines outside tests", lines_in(*PROJECT["tool"]["setuptools"]["package-dir"].values()))
+
+
+def test_contact_written_once_took_three_thousand_lines_away():
+    """Of the code outside tests; what followed are parts of contact that were not there before."""
+    found = json.loads((ROOT / "tests/results/lines.json").read_text())["commits"]
+    assert all(sum(row["folders"].values()) == row["lines"] for row in found.values())
+    assert found["before"]["lines"] - found["after"]["lines"] >= 3000
 
 
 @pytest.mark.xfail(strict=True, reason="31 286 lines: longer names, files split by topic, tests of the renaming")
