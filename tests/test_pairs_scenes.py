@@ -123,3 +123,21 @@ def test_teeth_of_a_comb_share_the_weight_of_a_bar():
         assert force[2] == pytest.approx(share, rel=5e-3)
         assert np.abs(force[:2]).max() < 5e-3 * share
         assert -sim.probe(f"tip {k}").displacement[0, -1, 2] == pytest.approx(wanted, rel=0.015)
+
+
+@pytest.mark.slow
+def test_a_peg_in_a_hole_follows_coulombs_wedge():
+    """sin a + mu cos a on the way in, sin a - mu cos a on the way out; stuck between."""
+    sim = run_contact_scene("peg_in_hole", work="work")
+    records = [sim.contact_record(contact.name) for contact in sim.model.description.contacts]
+    time, normal = records[0].time, sum(record.normal_force[0] for record in records)
+    axial = sum(record.force[0, :, 2] for record in records)
+    a, mu = np.arctan(0.1), 0.2
+    inward = (time > 0.15) & (time < 0.36)
+    assert normal[inward].min() > 100.0
+    assert axial[inward] / normal[inward] == pytest.approx(np.sin(a) + mu * np.cos(a), rel=5e-3)
+    outward = (time > 0.56) & (time < 0.65)
+    assert axial[outward] / normal[outward] == pytest.approx(np.sin(a) - mu * np.cos(a), rel=5e-3)
+    stuck = np.argmin(np.abs(time - 0.47))
+    assert min(record.stick[0, stuck] for record in records) > 0.5
+    assert max(record.penetration.max() for record in records) < 0.01 * 0.02
