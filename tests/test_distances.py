@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import warp as wp
-
 from warpfea.kernels.contact.collider_mesh import mesh_functions
 from warpfea.kernels.contact.structs import collider_struct
 
