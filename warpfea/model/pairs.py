@@ -212,17 +212,17 @@ def _mitred_normals(positions: np.ndarray, normal: np.ndarray, size: float) -> n
     _, inverse = np.unique(key, axis=0, return_inverse=True)
     inverse = inverse.ravel()
     flat = normal.reshape(-1, 3)
-    order = np.argsort(inverse, kind="stable")
-    ends = np.cumsum(np.bincount(inverse))
-    out = np.empty_like(flat)
-    for rows in np.split(order, ends[:-1]):
+    order, counts = np.argsort(inverse, kind="stable"), np.bincount(inverse)
+    first = np.cumsum(counts) - counts
+    out = flat.copy()
+    for count in np.unique(counts[counts > 1]):
+        rows = order[first[counts == count, None] + np.arange(count)]
         n = flat[rows]
-        vector = np.linalg.lstsq(n, np.ones(len(n)), rcond=RANK_TOL)[0] if len(n) > 1 else n[0]
-        length = np.linalg.norm(vector)
-        if not length > 0.0 or (n @ vector).min() <= 0.0:
-            out[rows] = n
-        else:
-            out[rows] = vector * min(1.0, MAX_CORNER_LENGTH / length)
+        vector = np.linalg.pinv(n, rcond=RANK_TOL).sum(axis=2)
+        length = np.linalg.norm(vector, axis=1)
+        mitred = (length > 0.0) & (np.einsum("fqk,fk->fq", n, vector).min(axis=1) > 0.0)
+        vector *= np.minimum(1.0, MAX_CORNER_LENGTH / np.maximum(length, 1e-300))[:, None]
+        out[rows[mitred]] = vector[mitred, None]
     return out.reshape(normal.shape)
 
 
