@@ -12,7 +12,7 @@ from . import assembly
 from .discretisation import Discretisation
 from .handles import SurfaceSet
 
-__all__ = ["WIDEST_GAP", "body_widths", "facet_side", "is_narrow", "rules_for_width"]
+__all__ = ["WIDEST_GAP", "body_widths", "facet_size", "is_narrow", "rules_for_width"]
 
 NARROW_RATIO = 0.55
 """Width of an obstacle or body over the side of facets up to which its own points see the facets, not theirs it."""
@@ -36,11 +36,12 @@ def _sides(surface: SurfaceSet) -> tuple[np.ndarray, np.ndarray]:
     return sides, assembly.facet_positions_and_areas(body, t)[1].sum(axis=1)
 
 
-def facet_side(surface: SurfaceSet) -> float:
-    """Mean longer side of the facets of a surface by their area, m; of triangles over sqrt(2)."""
+def facet_size(surface: SurfaceSet) -> tuple[float, float]:
+    """Mean longer side of facets by their area, of triangles over sqrt(2), and root of their mean area, m."""
     sides, area = _sides(surface)
     triangle = np.array([len(face) == 3 for face in surface.body.family.faces])[surface.faces[:, 1]]
-    return float(np.average(sides.max(axis=1) / np.where(triangle, math.sqrt(2.0), 1.0), weights=area))
+    side = np.average(sides.max(axis=1) / np.where(triangle, math.sqrt(2.0), 1.0), weights=area)
+    return float(side), math.sqrt(float(area.mean()))
 
 
 def body_widths(body: Discretisation) -> tuple[float, float]:

@@ -15,7 +15,7 @@ from ..elements.quadrature import lobatto_square, triangle_16
 from .contact_points import ContactPoints, element_depths
 from .contacts import Collider
 from .handles import SurfaceSet
-from .narrow import WIDEST_GAP, body_widths, facet_side, is_narrow
+from .narrow import WIDEST_GAP, body_widths, facet_size, is_narrow
 from .pairs import FacetOptions
 from .shapes import BOX, CYLINDER, HALF_SPACE, SPHERE, Shape
 from .triangle_mesh import TriMesh
@@ -47,6 +47,7 @@ class ObstacleContact(FacetOptions):
     collider: Collider
     name: str
     sign = -1.0
+    shadow = 0.25
 
     @property
     def surfaces(self) -> tuple[SurfaceSet, ...]:
@@ -58,11 +59,6 @@ class ObstacleContact(FacetOptions):
 
     def slave_points(self) -> tuple[ContactPoints, Any]:
         return obstacle_points(self)
-
-    def region_area(self, points: ContactPoints) -> float:
-        """As of `FacetOptions`; of the obstacle the mean shadow of a convex one, a quarter of its surface."""
-        area = super().region_area(points)
-        return area if self.radius else min(area, 0.25 * float(points.area.sum()))
 
     def own_depths(self, points: ContactPoints) -> np.ndarray:
         """Zero: an obstacle does not yield."""
@@ -88,7 +84,7 @@ def is_narrow_obstacle(surface: SurfaceSet, collider: Collider) -> bool:
     widths = _widths(collider.shape)
     if collider.moves or len(kinds) > 1 or math.isinf(widths[0]):
         return False
-    return is_narrow(widths, facet_side(surface))
+    return is_narrow(widths, facet_size(surface)[0])
 
 
 @dataclass(frozen=True)
@@ -215,7 +211,7 @@ def obstacle_points(contact: ObstacleContact) -> tuple[ContactPoints, np.ndarray
     pressure on their own depth of material, on a width below it only that width: the factor is their ratio.
     """
     shape, surface = contact.collider.shape, contact.surface
-    side, depth = facet_side(surface), float(element_depths(surface).min())
+    side, depth = facet_size(surface)[0], float(element_depths(surface).min())
     least, second = body_widths(surface.body)
     if second < side:  # a bar, which may lie across: it would pass between points of longer patches
         side = min(side, 2.0 * least)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from .contact_points import ContactPoints, effective_modulus, points_by_faces, p
 from .contacts import ContactOptions
 from .discretisation import element_functions
 from .handles import SurfaceSet
-from .narrow import body_widths, facet_side, is_narrow, rules_for_width
+from .narrow import body_widths, facet_size, is_narrow, rules_for_width
 from .surfaces import measure_to_skin
 
 __all__ = [
@@ -48,15 +48,16 @@ class FacetOptions(ContactOptions):
 
     Attributes:
         name: unique among the contacts of its builder.
+        shadow: mean shadow over the area of the points, a quarter for those around a convex obstacle.
     """
 
     name: str
+    shadow: ClassVar[float] = 1.0
 
     def region_area(self, points: ContactPoints) -> float:
         """As of `ContactOptions`; without a radius that of its smaller surface."""
-        if self.radius:
-            return super().region_area(points)
-        return min(float(pair_points(surface).area.sum()) for surface in self.surfaces)
+        area = super().region_area(points)
+        return area if self.radius else min(self.shadow * area, float(pair_points(self.facets).area.sum()))
 
     @property
     def facets(self) -> SurfaceSet:
@@ -142,14 +143,11 @@ def slave_and_master(first: SurfaceSet, second: SurfaceSet) -> tuple[SurfaceSet,
     coarser surface is the master; at equal size the stiffer, then the second.
     """
     widths = [body_widths(surface.body) for surface in (first, second)]
-    narrow = [is_narrow(width, facet_side(other)) for width, other in zip(widths, (second, first))]
+    (side_1, size_1), (side_2, size_2) = (facet_size(surface) for surface in (first, second))
+    narrow = [is_narrow(widths[0], side_2), is_narrow(widths[1], side_1)]
     if narrow[0] != narrow[1]:
         return (first, second, None) if narrow[0] else (second, first, None)
-    sides = []
-    for surface in (first, second):
-        area = pair_points(surface).area.sum(axis=1)
-        sides.append((math.sqrt(float(area.mean())), effective_modulus(surface.body, surface)[0]))
-    (size_1, modulus_1), (size_2, modulus_2) = sides
+    modulus_1, modulus_2 = (effective_modulus(surface.body, surface)[0] for surface in (first, second))
     if size_1 > MASTER_SIZE_RATIO * size_2 or (size_2 <= MASTER_SIZE_RATIO * size_1 and modulus_1 > modulus_2):
         return second, first, widths[0][0] if narrow[0] else None
     return first, second, widths[1][0] if narrow[1] else None
