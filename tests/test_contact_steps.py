@@ -299,3 +299,21 @@ def test_single_precision_runs_or_is_refused_by_name_with_the_papers_jump(place)
         refused = str(error)
     assert not refused or "float32 round-off limit reached" in refused
     assert np.isfinite(sim.state.displacement.numpy()).all()
+
+
+@pytest.mark.parametrize("gap", [1e-5, 4.9e-5])
+def test_friction_begins_where_a_point_touches(gap):
+    """A soft cube that comes down at a slope of 0.09 to a floor and touches it within the step sticks: friction has
+    seen the part of its slip in contact, a fifth or a fiftieth of it, not all, with which it would slide."""
+    nu, slope, speed, dt = 0.3, 0.09, 0.05, 1e-3
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    mesh = wf.mesh.box((0.1, 0.1, 0.1), cells=(1, 1, 1), origin=(0, 0, gap))
+    cube = b.add_solid(mesh, material=wf.SVK(E=100.0, nu=nu, density=1000.0))
+    b.add_contact(cube, b.add_collider(wf.HalfSpace((0, 0, 1))), mu=0.2, restitution=1.0, name="pad")
+    b.set_initial(cube, velocity=(slope * speed, 0.0, -speed))
+    sim = wf.Simulation(b.finalize(), dt=dt)
+    sim.step()
+    record = sim.contact_record("pad")
+    force = record.force[0, -1]
+    assert record.stick[0, -1] == 1.0
+    assert -force[0] / force[2] == pytest.approx(3.0 * (1.0 - nu) / (2.0 - nu) * slope, rel=5e-3)  # k_t / k_n, slope

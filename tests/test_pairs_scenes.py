@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import importlib
 import math
 
 import numpy as np
 import pytest
 from scene_runs import run_contact_scene
+
+import warpfea as wf
 
 G = 9.81
 
@@ -141,3 +144,13 @@ def test_a_peg_in_a_hole_follows_coulombs_wedge():
     stuck = np.argmin(np.abs(time - 0.47))
     assert min(record.stick[0, stuck] for record in records) > 0.5
     assert max(record.penetration.max() for record in records) < 0.01 * 0.02
+
+
+def test_first_touches_with_friction_take_few_iterations():
+    """Two wedged points of a link that falls into another one stick; with the slip before they touched as friction's
+    they would slide, and steps take up to 80 iterations."""
+    model = importlib.import_module("warpfea.scenes.links").links(count=2, mu=0.2).finalize()
+    sim = wf.Simulation(model, dt=4e-3, solver=wf.NewtonPCG(tol=1e-6))
+    reports = [sim.step() for _ in range(10)]
+    assert max(int(r.newton[0]) for r in reports) <= 20
+    assert not any(r.halvings.any() for r in reports)

@@ -4,7 +4,9 @@ The normal force is `normal_law` of the depth. Friction is an anchored spring an
 force is cut at the friction limit mu F_n (`friction_trial`, `friction_force`, `return_mapping`). With a frozen limit
 friction has a potential, Huber's; with the limits of each iterate it has none, and an iterate deep in an obstacle has a
 huge one. Stick or slip is decided after an accepted step, in `point_outcome` of ledger.py; the `SLIP_FLAG` that it
-stores selects mu or mu_static in the next one.
+stores selects mu or mu_static in the next one. Of a point that comes into contact within the step friction acts on the
+part of its motion in contact, depth over the sum of depth and gap: what went before is no slip, and would make it slide
+where it sticks, against points that it is wedged between.
 
 Limits, the plane of friction and the elastic slip's factor are frozen over Newton's iterations. `forces` (assembly.py)
 sets those of an attempt from its first iterate, at most the limits of the last step, and stores those of each later
@@ -85,6 +87,11 @@ def friction_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
         return con.beta[world, c] * wp.sqrt(con.scale[world, c] * ratio) * damping * inv_h
 
     @wp.func
+    def touching_part(t: PointContact, factor: f64) -> f64:
+        """Part of the motion in the step that friction acts on: the frozen factor of a point that was apart before."""
+        return wp.where(t.previous_depth < f64(0.0), factor, f64(1.0))
+
+    @wp.func
     def in_friction_plane(t: PointContact, m: vec3d, shrink: f64) -> PointContact:
         """The point with friction in the plane of a normal m, frozen with the friction limits: on a curved shape the
         force would not be the derivative of its potential if the plane turned with the iterate. `shrink`: factor on the
@@ -92,7 +99,7 @@ def friction_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
         out = t
         out.friction_normal = m
         out.tangential_motion = k.tangential(m, t.relative_motion)
-        out.trial_elastic_slip = k.tangential(m, shrink * t.spring + t.relative_motion)
+        out.trial_elastic_slip = k.tangential(m, shrink * t.spring + touching_part(t, shrink) * t.relative_motion)
         return out
 
     @wp.func
@@ -167,10 +174,13 @@ def friction_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
 
     @wp.func
     def friction_parameters(con: Contacts, his: History, world: int, c: int, point: int, t: PointContact) -> vec3d:
-        """Friction limit, k_t and factor on the stored elastic slip at an iterate."""
+        """Friction limit, k_t and factor on the stored elastic slip at an iterate, or on the motion of a point that
+        comes into contact in the step: the part of the step after its first touch."""
         rec = k.history_row(con, c, point)
         shrink = f64(1.0)
         depth = wp.max(t.depth, f64(0.0))
+        if t.previous_depth < f64(0.0) and not has_trait(con, c, FIXED_SPRING) and not has_trait(con, c, SLIP_SPEED):
+            shrink = depth / (depth - t.previous_depth)
         if con.single_point[c] != 0 and his.speed[world, rec] > f64(0.0) and depth < t.previous_depth:
             if has_trait(con, c, UNLOADING):
                 shrink = wp.sqrt(depth / t.previous_depth)
@@ -194,7 +204,6 @@ def friction_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
             scr.frozen_friction[world, rec] = frozen
         elif con.single_point[c] == 0:  # a point that has come to another side since
             frozen[1] = new[1]
-            frozen[2] = f64(1.0)
         scr.updated_normal[world, rec] = t.normal
         scr.updated_friction[world, rec] = new
         return frozen
@@ -202,9 +211,10 @@ def friction_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
     @wp.func
     def friction_trial(con: Contacts, world: int, c: int, t: PointContact, frozen: vec3d, inv_h: f64) -> wp.vec4d:
         """Friction opposing the motion: trial force, and in w its total stiffness (spring and damper)."""
+        part = touching_part(t, frozen[2])
         gamma = tangent_damping(con, world, c, frozen[1]) * inv_h
-        trial = frozen[1] * t.trial_elastic_slip + gamma * t.tangential_motion
-        return wp.vec4d(trial[0], trial[1], trial[2], frozen[1] + gamma)
+        trial = frozen[1] * t.trial_elastic_slip + (part * gamma) * t.tangential_motion
+        return wp.vec4d(trial[0], trial[1], trial[2], part * (frozen[1] + gamma))
 
     @wp.func
     def friction_potential(con: Contacts, world: int, c: int, t: PointContact, frozen: vec3d, inv_h: f64) -> f64:
@@ -265,7 +275,7 @@ def friction_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
         if has_trait(con, c, FIXED_SPRING):  # reverses the spring where gamma_t v exceeds the friction limit
             return (frozen[0] / (frozen[1] * size)) * trial - ((w[3] - frozen[1]) / frozen[1]) * t.tangential_motion
         # spring and damper slip together: bounded by the motion of the point
-        return t.trial_elastic_slip - ((size - frozen[0]) / (w[3] * size)) * trial
+        return t.trial_elastic_slip - (touching_part(t, frozen[2]) * (size - frozen[0]) / (w[3] * size)) * trial
 
     @wp.func
     def is_slipping(con: Contacts, world: int, c: int, t: PointContact, frozen: vec3d, inv_h: f64) -> bool:

@@ -190,8 +190,8 @@ def contact_scratch_struct(dtype: str):
         )  # [world, point] position at the start of the attempt, m; in a collider's frame
         start_depth: wp.array2d(dtype=wp.float64)  # depth at the start of the step, m
         approach_speed: wp.array2d(dtype=wp.float64)  # approach speed of the damping, m/s
-        frozen_friction: wp.array2d(dtype=wp.vec3d)  # friction limit, N, k_t, N/m, factor on the stored elastic slip;
-        # frozen in a line search
+        frozen_friction: wp.array2d(dtype=wp.vec3d)  # friction limit, N, k_t, N/m, factor on the stored elastic slip
+        # (new in contact: on the motion); frozen in a line search
         updated_friction: wp.array2d(dtype=wp.vec3d)  # the same three at the iterate
         frozen_normal: wp.array2d(dtype=wp.vec3d)  # frozen normal of the plane of friction
         updated_normal: wp.array2d(dtype=wp.vec3d)  # normal of the plane of friction at the iterate
