@@ -26,6 +26,8 @@ from .kinematics import kinematics_functions
 from .law import (
     ANY_GAP,
     FIXED_SPRING,
+    HARDENING_DEPTH,
+    HARDENS,
     IMPACT_SPEED,
     SLIP_SPEED,
     SPEED_DAMPING,
@@ -58,6 +60,14 @@ def friction_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
     def normal_stiffness(con: Contacts, world: int, c: int, ratio: f64) -> f64:
         """k_n, N/m; of a lumped contact over the root of the depth."""
         return con.scale[world, c] * ratio * world_value(con.normal_stiffness, world, c)
+
+    @wp.func
+    def law_length(con: Contacts, world: int, c: int, ratio: f64) -> f64:
+        """Length `ramp` of the normal law, m: with the stiffness of the elements the depth beyond which it hardens."""
+        s = con.compliance[world % con.compliance.shape[0], c]
+        if s[0] > f64(0.0) or con.single_point[c] != 0 or not has_trait(con, c, HARDENS):
+            return con.damping_ramp[c]
+        return f64(HARDENING_DEPTH) / (ratio * (s[1] + s[2]))
 
     @wp.func
     def friction_stiffness(con: Contacts, world: int, c: int, ratio: f64, depth: f64) -> f64:
@@ -110,8 +120,8 @@ def friction_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
         out = in_friction_plane(t, t.normal, f64(1.0))
         out.normal_values = normal_law(
             con.law[c] >> TRAIT_BITS, con.single_point[c], normal_stiffness(con, world, c, t.stiffness_ratio),
-            normal_damping_rate(con, scr, world, c, point, t.stiffness_ratio, inv_h), con.damping_ramp[c],
-            con.force_eps[c], t.depth, t.previous_depth,
+            normal_damping_rate(con, scr, world, c, point, t.stiffness_ratio, inv_h),
+            law_length(con, world, c, t.stiffness_ratio), con.force_eps[c], t.depth, t.previous_depth,
         )  # fmt: skip
         return out
 
@@ -122,8 +132,8 @@ def friction_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
         if has_trait(con, c, ANY_GAP):
             return elastic_force(con.single_point[c], k_n, t.depth)
         w = normal_law(
-            con.law[c] >> TRAIT_BITS, con.single_point[c], k_n, f64(0.0), con.damping_ramp[c], con.force_eps[c],
-            t.depth, t.depth,
+            con.law[c] >> TRAIT_BITS, con.single_point[c], k_n, f64(0.0), law_length(con, world, c, t.stiffness_ratio),
+            con.force_eps[c], t.depth, t.depth,
         )  # fmt: skip
         return wp.vec2d(w[0], w[2])
 

@@ -31,6 +31,8 @@ __all__ = [
     "ANY_GAP",
     "CRITICAL_DAMPING",
     "FIXED_SPRING",
+    "HARDENING_DEPTH",
+    "HARDENS",
     "IMPACT_SPEED",
     "LAWS",
     "MIN_APPROACH_SPEED",
@@ -50,15 +52,20 @@ __all__ = [
 ]
 
 f64, vec3d, vec4d = wp.float64, wp.vec3d, wp.vec4d
-SPEED_DAMPING, UNLOADING, FIXED_SPRING, SLIP_SPEED, ANY_GAP, CRITICAL_DAMPING = 1, 2, 4, 8, 16, 32
+SPEED_DAMPING, UNLOADING, FIXED_SPRING, SLIP_SPEED, ANY_GAP, CRITICAL_DAMPING, HARDENS = (1 << bit for bit in range(7))
 """Traits of a law, added up. SPEED_DAMPING: its damping g is d/(v_i h), with d of the restitution and v_i the largest
 approach speed, else gamma_n/h. UNLOADING: a lumped contact that unloads reduces its elastic slip with its radius.
 FIXED_SPRING: Eqs. (78) and (83) of Paper I, where the elastic slip does not turn with the bodies and may reverse.
 SLIP_SPEED: friction of the slip speed, without elastic slip. ANY_GAP: it acts at any gap. CRITICAL_DAMPING: with
-SPEED_DAMPING, restitution 0 is told by g < 0, minus the critical damping over h, N/m."""
-TRAIT_BITS = 6
+SPEED_DAMPING, restitution 0 is told by g < 0, minus the critical damping over h, N/m. HARDENS: with the stiffness of
+the elements `ramp` is the depth beyond which the elastic force hardens."""
+TRAIT_BITS = 7
 MIN_APPROACH_SPEED = 1e-3
 """Lower bound of the approach speed in the damping of the default law, m/s."""
+HARDENING_DEPTH, HARDENING = 0.002, 12.0
+"""A contact that has the stiffness of its elements hardens beyond this depth d_h, over theirs, at a pressure of 2 % of
+E*: its elastic force is k (d + this number times (d - d_h)^2 / d_h). So corners and edges, whose points have little
+area, sink 1 % of an element, and a uniform pressure stays uniform."""
 IMPACT_SPEED = 0.05
 """Approach speed of a point, m/s, up to which restitution 0 does not damp it: points that enter a rolling contact would
 brake it."""
@@ -73,6 +80,22 @@ def elastic_force(single_point: int, k: f64, delta: f64) -> wp.vec2d:
         force = k * delta * wp.sqrt(delta)
         return wp.vec2d(force, f64(0.4) * force * delta)
     return wp.vec2d(k * delta, f64(0.5) * k * delta * delta)
+
+
+@wp.func
+def hardening(k: f64, rate: f64, depth: f64, delta: f64, delta_n: f64) -> vec4d:
+    """Part of `hunt_crossley` that is due to hardening beyond `depth` > 0, for delta > depth."""
+    a = f64(HARDENING) * k / depth
+    y = delta - depth
+    force = a * y * y
+    factor = f64(1.0) + rate * (delta - delta_n)
+    at_depth = f64(1.0) + rate * (depth - delta_n)
+    psi = force * y * (at_depth / f64(3.0) + f64(0.25) * rate * y)
+    if at_depth < f64(0.0):  # the force begins at y = -at_depth / rate
+        low = -at_depth / rate
+        psi -= a * low * low * low * at_depth / f64(12.0)
+    size = force * y * (f64(1.0) + rate * (wp.abs(delta_n) + delta))
+    return vec4d(force * factor, f64(2.0) * a * y * factor + force * rate, psi, size)
 
 
 @wp.func
@@ -100,7 +123,10 @@ def hunt_crossley(
         begin = -c0 / rate
         low = elastic_force(single_point, k, begin)[0] * begin
         psi -= low * (c0 / (m + f64(1.0)) + rate * begin / (m + f64(2.0)))
-    return vec4d(force, slope, psi, size)
+    out = vec4d(force, slope, psi, size)
+    if ramp > f64(0.0) and delta > ramp:
+        out += hardening(k, rate, ramp, delta, delta_n)
+    return out
 
 
 @wp.func
@@ -150,9 +176,27 @@ def paper_law(single_point: int, k: f64, g: f64, ramp: f64, eps: f64, delta: f64
 
 
 @wp.func
+def hardened_damping(k: f64, slope: f64, force_at_depth: f64, depth: f64, delta: f64, size: f64) -> vec4d:
+    """max(0, F_h + slope y + a y^2), y = delta - depth, where the contact has hardened, F_h its force at `depth`."""
+    a = f64(HARDENING) * k / depth
+    y = delta - depth
+    force = force_at_depth + slope * y + a * y * y
+    if force <= f64(0.0):
+        return vec4d()
+    psi = y * (force_at_depth + y * (f64(0.5) * slope + a * y / f64(3.0)))
+    if force_at_depth >= f64(0.0):  # from its zero before
+        psi += f64(0.5) * force_at_depth * force_at_depth / slope
+    else:
+        low = f64(-2.0) * force_at_depth / (slope + wp.sqrt(slope * slope - f64(4.0) * a * force_at_depth))
+        psi -= low * (force_at_depth + low * (f64(0.5) * slope + a * low / f64(3.0)))
+    return vec4d(force, slope + f64(2.0) * a * y, psi, size + a * y * y * y)
+
+
+@wp.func
 def default_law(single_point: int, k: f64, rate: f64, ramp: f64, eps: f64, delta: f64, delta_n: f64) -> vec4d:
     """Hunt and Crossley's law. Restitution 0, which has no rate, is told by rate < 0, minus a damping g, N/m: then
-    F = max(0, k delta + g (delta - max(0, delta_n))), continuous at touch as it is, with a convex integral."""
+    F = max(0, k delta + g (delta - max(0, delta_n))), continuous at touch as it is, with a convex integral. `ramp`:
+    depth beyond which the elastic force hardens, 0: none."""
     if rate >= f64(0.0):
         return hunt_crossley(single_point, k, rate, ramp, eps, delta, delta_n)
     before = wp.max(delta_n, f64(0.0))
@@ -160,9 +204,11 @@ def default_law(single_point: int, k: f64, rate: f64, ramp: f64, eps: f64, delta
         return paper_law(single_point, k, -rate, f64(0.0), eps, delta, before)
     slope = k - rate
     force = slope * delta + rate * before
+    psi = f64(0.5) * force * force / slope
+    if ramp > f64(0.0) and delta > ramp:
+        return hardened_damping(k, slope, slope * ramp + rate * before, ramp, delta, psi - rate * before * delta)
     if delta <= f64(0.0) or force <= f64(0.0):
         return vec4d()
-    psi = f64(0.5) * force * force / slope
     return vec4d(force, slope, psi, psi - rate * before * delta)
 
 
@@ -209,8 +255,8 @@ class ContactLaw(NamedTuple):
         normal: device function (single_point, k, g, ramp, eps, delta, delta_n) -> (force, N, its derivative by the
             depth, N/m, its integral, J, magnitude of the integral's terms, J), of the whole region. k: normal
             stiffness, N/m (single_point: N/m^1.5); g: damping by trait SPEED_DAMPING, 0 for the elastic part; ramp,
-            eps: from `smoothing`, m and N; delta, delta_n: depth now and at the start of the step, m. All are 0 for
-            delta <= 0, without trait ANY_GAP.
+            eps: from `smoothing`, m and N, or by trait HARDENS; delta, delta_n: depth now and at the start of the
+            step, m. All are 0 for delta <= 0, without trait ANY_GAP.
         traits: sum of traits of the law.
         smoothing: noun of the option `smoothing`: None (refused), "depth" (ramp) or "pair" (eps and a slip speed).
         explicit: True if `treatment="explicit"` is available: Eqs. (77)-(83) of Paper I.
@@ -229,7 +275,7 @@ class ContactLaw(NamedTuple):
 
 
 LAWS = {
-    "default": ContactLaw(default_law, SPEED_DAMPING | UNLOADING | CRITICAL_DAMPING),
+    "default": ContactLaw(default_law, SPEED_DAMPING | UNLOADING | CRITICAL_DAMPING | HARDENS),
     "paper": ContactLaw(paper_law, FIXED_SPRING, "depth", explicit=True),
     "smooth": ContactLaw(smooth_law, SLIP_SPEED | ANY_GAP, "pair"),
 }
