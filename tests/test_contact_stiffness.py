@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
-from warpfea.kernels.contact.law import CRITICAL_DAMPING, LAWS, ContactLaw, default_law, hunt_crossley
+from warpfea.kernels.contact.law import CRITICAL_DAMPING, HARDENING, LAWS, ContactLaw, default_law, hunt_crossley
 
 import warpfea as wf
 from warpfea.contact.tables import ELEMENT_STIFFNESS
@@ -82,9 +82,28 @@ def test_a_factor_is_of_the_elements_unless_the_region_is_named():
 
 
 @wp.kernel(enable_backward=False)
-def law_values(single: int, rate: f64, before: f64, delta: wp.array(dtype=f64), out: wp.array(dtype=wp.vec4d)):
+def law_values(
+    single: int, rate: f64, ramp: f64, before: f64, delta: wp.array(dtype=f64), out: wp.array(dtype=wp.vec4d)
+):  # fmt: skip
     i = wp.tid()
-    out[i] = default_law(single, f64(1e6), rate, f64(0.0), f64(0.0), delta[i], before)
+    out[i] = default_law(single, f64(1e6), rate, ramp, f64(0.0), delta[i], before)
+
+
+def law_at(d, rate, before, *, single=0, ramp=0.0):
+    """Force, slope, potential and its size at the depths d, m."""
+    out = wp.zeros(len(d), dtype=wp.vec4d, device="cpu")
+    inputs = [single, rate, ramp, before, wp.array(d, dtype=f64, device="cpu"), out]
+    wp.launch(law_values, len(d), inputs, device="cpu")
+    return out.numpy().T
+
+
+def check_differences(d, force, slope, psi, size):
+    """Slope and potential by differences, but for the kinks of the force."""
+    np.testing.assert_allclose(np.gradient(psi, d)[1:-1], force[1:-1], atol=2e-3 * force.max())
+    ends = np.flatnonzero((force[1:] > 0.0) != (force[:-1] > 0.0))
+    smooth = np.setdiff1d(np.arange(2, len(d) - 2), ends[:, None] + np.arange(-2, 4))
+    np.testing.assert_allclose(np.gradient(force, d)[smooth], slope[smooth], rtol=2e-2, atol=1e-3 * slope.max())
+    assert (size >= psi - 1e-15).all()
 
 
 @pytest.mark.parametrize("single", [0, 1])
@@ -93,18 +112,68 @@ def test_without_a_rebound_the_law_is_continuous_and_has_a_potential(single, bef
     """F = max(0, k d^m + g d^((m-1)/2) (d - max(0, d_n))), m = 1 or 1.5, its slope and integral by differences."""
     g = 5e5
     d = np.linspace(-2e-4, 3e-3, 20001)
-    out = wp.zeros(len(d), dtype=wp.vec4d, device="cpu")
-    wp.launch(law_values, len(d), [single, -g, before, wp.array(d, dtype=f64, device="cpu"), out], device="cpu")
-    force, slope, psi, size = out.numpy().T
+    force, slope, psi, size = law_at(d, -g, before, single=single)
     depth = np.maximum(d, 0.0)
     wanted = 1e6 * depth ** (1.5 if single else 1.0) + g * depth ** (0.25 * single) * (depth - max(before, 0.0))
     np.testing.assert_allclose(force, np.maximum(wanted, 0.0), atol=1e-12 * force.max())
-    inside = slice(1, -1)
-    np.testing.assert_allclose(np.gradient(psi, d)[inside], force[inside], atol=2e-3 * force.max())
-    ends = np.flatnonzero((force[1:] > 0.0) != (force[:-1] > 0.0))  # the kink
-    smooth = np.setdiff1d(np.arange(2, len(d) - 2), ends[:, None] + np.arange(-2, 4))
-    np.testing.assert_allclose(np.gradient(force, d)[smooth], slope[smooth], rtol=2e-2, atol=1e-3 * slope.max())
-    assert (size >= psi - 1e-15).all()
+    check_differences(d, force, slope, psi, size)
+
+
+@pytest.mark.parametrize("rate", [0.0, 1e3, -5e6])  # elastic, Hunt and Crossley's, restitution 0
+@pytest.mark.parametrize("before", [-1e-4, 8e-4, 2.8e-3])  # of the last two some begin after the contact has hardened
+def test_a_contact_hardens_beyond_a_depth(rate, before):
+    """F = k (d + c (d - r)^2 / r) beyond r, with the damping of F or of k; the same bits up to r."""
+    r = 1e-3
+    d = np.linspace(-2e-4, 4e-3, 20001)
+    force, slope, psi, size = law_at(d, rate, before, ramp=r)
+    np.testing.assert_array_equal(force[d <= r], law_at(d, rate, before)[0][d <= r])
+    elastic = 1e6 * (np.maximum(d, 0.0) + HARDENING * np.maximum(d - r, 0.0) ** 2 / r)
+    damped = elastic * (1.0 + rate * (d - before)) if rate >= 0.0 else elastic - rate * (d - max(before, 0.0)) * (d > 0)
+    np.testing.assert_allclose(force, np.maximum(damped, 0.0), atol=1e-12 * force.max())
+    check_differences(d, force, slope, psi, size)
+
+
+TURNS = {"edge": ((1, 0, 0), np.pi / 4), "corner": ((1, 0, 0), np.pi / 6, (0, 1, 0), -np.pi / 6)}
+
+
+def turn(axis, angle, *more):
+    """Matrix of a rotation about an axis through 0, after that of `more`."""
+    K = np.cross(np.eye(3), axis)
+    R = np.eye(3) + np.sin(angle) * K + (1.0 - np.cos(angle)) * K @ K
+    return R @ turn(*more) if more else R
+
+
+def pushed(how, other, stiffness):
+    """Penetration over an element's side, and force, N, of a cube whose edge or corner is pushed 4 mm into a floor or
+    a block as soft as itself by its far faces."""
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    R = turn(*TURNS[how])
+    corners = (np.array(np.meshgrid(*[(0, SIDE)] * 3)).reshape(3, -1).T - SIDE / 2) @ R.T
+    centre = np.array([0, 0, -corners[:, 2].min()])
+    rubber = wf.NeoHookean.from_E_nu(E=1e6, nu=NU, density=1000.0)
+    mesh = wf.mesh.box((SIDE,) * 3, cells=(2,) * 3, map=lambda X: (X - SIDE / 2) @ R.T + centre)
+    cube = b.add_solid(mesh, material=rubber, name="cube")
+    far = slice(1 if how == "edge" else 0, 3)
+    b.drive(cube.nodes(lambda X: (((X - centre) @ R)[:, far] > 0.499 * SIDE).any(axis=1)), displacement=(0, 0, -4e-3))
+    if other == "floor":
+        base = b.add_collider(wf.HalfSpace((0, 0, 1)))
+    else:
+        mesh = wf.mesh.box((0.2, 0.2, 0.1), cells=(4, 4, 2), origin=(-0.1, -0.1, -0.1))
+        block = b.add_solid(mesh, material=rubber, name="block")
+        b.clamp(block.nodes("z-"))
+        base = block.surface("z+")
+    pad = b.add_contact(cube, base, stiffness=stiffness)
+    record = wf.solve_static(b.finalize(device="cpu"), load_steps=5, unstable="ignore").contact_record(pad)
+    return record.penetration[0, -1] / (SIDE / 2), record.normal_force[0, -1]
+
+
+@pytest.mark.parametrize("other", ["floor", "block"])
+@pytest.mark.parametrize("how", TURNS)
+def test_edges_and_corners_sink_one_hundredth_of_an_element(how, other):
+    """Before, a corner sank half of its way into the block, with half of the force of a stiff contact."""
+    depth, force = pushed(how, other, None)
+    assert depth < 0.01
+    assert force == pytest.approx(pushed(how, other, 100.0)[1], rel=0.1)
 
 
 def dropped(E, height, *, t_end, dtype="float64", **options):

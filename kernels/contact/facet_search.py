@@ -20,8 +20,11 @@ from .structs import contact_structs
 
 __all__ = ["BOX_MARGIN", "PENETRATED", "facet_search_kernels"]
 
-PENETRATED = -2
-"""Facet of a point that has left through the opposite side."""
+PENETRATED, LEAVING = -2, -3
+"""Facet of a point that has left through the opposite side; of one, at the start of an attempt, that is to pass on."""
+PASSING_DISTANCE = 0.025
+"""Distance beyond a side, over its length, from which a step begins on the next facet: in a valley a step that begins
+near the `OUTSIDE_TOLERANCE` of one facet may end on neither."""
 
 
 @functools.cache
@@ -85,11 +88,15 @@ def facet_search_kernels(dtype: str) -> KernelSet:
         scr.start_depth[world, point] = f64(-1.0e30)
         scr.approach_speed[world, point] = f64(MIN_APPROACH_SPEED)
         pair.anchor_facet[world, point] = 0
+        pair.facet[world, point] = -1
         scr.activation_gap[world, point] = k.activation_gap(con, his, world, c, point, clock.time[world], f64(0.0))
         if his.speed[world, point] > f64(0.0):
             f = pair_his.facet[world, point] - 1
             set_anchor(mas, facets, his, clock, scr, pair, v_n, slave, f, pair_his.xi[world, point])
             if pair.anchor_facet[world, point] > 0:
+                corners = mas.corner_count[mas.facet_kind[f]]
+                beyond = distance_outside(corners, pair.anchor_xi[world, point]) > f64(PASSING_DISTANCE)
+                pair.facet[world, point] = wp.where(beyond and con.is_explicit[c] == 0, LEAVING, -1)
                 depth = scr.start_depth[world, point]
                 for i in range(2):
                     body = mas.bodies[c][i]
@@ -150,6 +157,21 @@ def facet_search_kernels(dtype: str) -> KernelSet:
         return wp.matrix_from_cols(a, wp.cross(n, a), n)
 
     @wp.func
+    def move_anchor(
+        mas: Masters, facets: Facets, his: History, clock: Clock, scr: ContactScratch, pair: PairScratch,
+        v_n: wp.array2d(dtype=vec3), slave: SlavePoint, f: int, xi: vec3d,
+    ):  # fmt: skip
+        """Move a point in contact to another facet before a step, and its elastic slip to the axes of that one."""
+        world, point = slave.world, slave.point
+        first = pair.anchor_facet[world, point] - 1
+        U = pair.start_displacement
+        before = facet_frame(surface_point(mas, U, world, first, pair.anchor_xi[world, point]))
+        set_anchor(mas, facets, his, clock, scr, pair, v_n, slave, f, xi)
+        if pair.anchor_facet[world, point] != first + 1:
+            after = facet_frame(surface_point(mas, U, world, f, pair.anchor_xi[world, point]))
+            his.spring[world, point] = wp.transpose(after) * (before * his.spring[world, point])
+
+    @wp.func
     def set_contact(
         con: Contacts, mas: Masters, facets: Facets, his: History, clock: Clock, scr: ContactScratch, pair: PairScratch,
         v_n: wp.array2d(dtype=vec3), slave: SlavePoint, f: int, xi: vec3d,
@@ -204,6 +226,7 @@ def facet_search_kernels(dtype: str) -> KernelSet:
         contact. `corner_points`: three points of each slave facet, or -1."""
         world, item, q = wp.tid()
         point = facets.first_point + item * facets.point_count + q
+        leaving = pair.facet[world, point] == LEAVING
         pair.facet[world, point] = -1
         if facets.area_fraction[q, item] == f64(0.0):
             return
@@ -211,8 +234,10 @@ def facet_search_kernels(dtype: str) -> KernelSet:
             return
         slave = slave_point_at(con, mas, facets, his, clock, scr, pair, u, world, item, q, overlap_limit)
         candidate = candidates.anchor_candidate(mas, pair, slave)
-        if candidate.facet < 0:
+        if candidate.facet < 0 or leaving:
             candidate = candidates.search_facets(mas, facets, scr, pair, slave, candidate, corner_points[item])
+        if candidate.facet >= 0 and leaving and slave.anchored:
+            move_anchor(mas, facets, his, clock, scr, pair, v_n, slave, candidate.facet, candidate.xi)
         if candidate.facet >= 0:
             set_contact(con, mas, facets, his, clock, scr, pair, v_n, slave, candidate.facet, candidate.xi)
             if pair.depth[world, point] > mas.depth_limit[candidate.facet]:

@@ -62,7 +62,7 @@ the elements `ramp` is the depth beyond which the elastic force hardens."""
 TRAIT_BITS = 7
 MIN_APPROACH_SPEED = 1e-3
 """Lower bound of the approach speed in the damping of the default law, m/s."""
-HARDENING_DEPTH, HARDENING = 0.002, 12.0
+HARDENING_DEPTH, HARDENING = 0.004, 40.0
 """A contact that has the stiffness of its elements hardens beyond this depth d_h, over theirs, at a pressure of 2 % of
 E*: its elastic force is k (d + this number times (d - d_h)^2 / d_h). So corners and edges, whose points have little
 area, sink 1 % of an element, and a uniform pressure stays uniform."""
