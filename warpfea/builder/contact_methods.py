@@ -54,8 +54,9 @@ class ContactMethods:
             law: "default", "paper" (Paper I, Eqs. 72-83) or "smooth".
             treatment: "implicit", or "explicit" with the paper's law.
             stiffness: factor on the normal and the tangential stiffness, None: 1. They follow the elements that touch,
-                so that the contact yields by a tenth of them (`ELEMENT_STIFFNESS`). "region", or ("region", factor), a
-                radius, model "sphere" and Paper I's laws take k_n and k_t of Eqs. (74), (79) for the whole surface.
+                so that the contact yields by a tenth of them (`ELEMENT_STIFFNESS`), and harden beyond `HARDENING_DEPTH`
+                of their depth. "region", or ("region", factor), a radius, model "sphere" and Paper I's laws take k_n
+                and k_t of Eqs. (74), (79) for the whole surface, without hardening.
             model: "patch", spread over the surface, or "sphere", one contact at the deepest place, by Hertz.
             radius: m; "patch": disc whose area replaces the surface's; "sphere": local radius of the body.
             offset: gap at which contact begins, m.
