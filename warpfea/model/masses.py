@@ -53,7 +53,7 @@ def mass_parts(body: Discretisation) -> list[MassPart]:
     ]
     out = []
     for k, scale in enumerate(scales):
-        total, mass = sp.csr_matrix((n, n)), 0.0
+        sums, mass = [sp.csr_matrix((n, n))], 0.0
         for affine in (True, False):
             chosen = np.flatnonzero((flat == affine) & (body.material_of == k))
             rule = assembly.mass_rule(body, affine)
@@ -68,8 +68,10 @@ def mass_parts(body: Discretisation) -> list[MassPart]:
                 S = conn.shape[1]
                 rows = np.repeat(conn, S, axis=1).ravel()
                 cols = np.tile(conn, (1, S)).ravel()
-                total = total + sp.csr_matrix((local.ravel(), (rows, cols)), shape=(n, n))
-        out.append(MassPart(scale, total, mass))
+                sums.append(sp.csr_matrix((local.ravel(), (rows, cols)), shape=(n, n)))
+        while len(sums) > 1:  # in pairs, since each sum is as large as all that it holds
+            sums = [*(a + b for a, b in zip(sums[::2], sums[1::2])), *sums[len(sums) // 2 * 2 :]]
+        out.append(MassPart(scale, sums[0], mass))
     return out
 
 
