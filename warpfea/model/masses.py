@@ -69,9 +69,9 @@ def mass_parts(body: Discretisation) -> list[MassPart]:
                 rows = np.repeat(conn, S, axis=1).ravel()
                 cols = np.tile(conn, (1, S)).ravel()
                 sums.append(sp.csr_matrix((local.ravel(), (rows, cols)), shape=(n, n)))
-        while len(sums) > 1:  # in pairs, since each sum is as large as all that it holds
-            sums = [*(a + b for a, b in zip(sums[::2], sums[1::2])), *sums[len(sums) // 2 * 2 :]]
-        out.append(MassPart(scale, sums[0], mass))
+                while len(sums) > 1 and sums[-2].nnz <= 2 * sums[-1].nnz:  # a sum copies all of both
+                    sums[-2:] = [sums[-2] + sums[-1]]
+        out.append(MassPart(scale, sum(sums[1:], sums[0]), mass))
     return out
 
 
