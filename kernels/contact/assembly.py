@@ -117,7 +117,10 @@ def contact_kernels(dtype: str, geometry: str, own: OwnLaws = ()) -> KernelSet:
                 scr.frozen_normal[world, rec] = vec3d()
         else:
             inv_h = k.inverse_step(clock, world)
+            ratio = t.stiffness_ratio
+            t.stiffness_ratio = ratio * scr.penalty_factor[world]
             t = law.with_normal_force(con, scr, world, c, point, t, inv_h)
+            t.stiffness_ratio = ratio
             frozen = law.friction_limits_at_iterate(con, his, scr, world, c, point, t, fresh)
             t = g.frozen_motion(other, facets, scr, u, world, q, item, point, t, frozen[0], fresh)
             t = law.in_friction_plane(t, scr.frozen_normal[world, rec], frozen[2])

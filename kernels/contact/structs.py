@@ -226,6 +226,7 @@ def contact_scratch_struct(dtype: str):
         record_rows: wp.array3d(dtype=wp.float64)  # [RECORD_NAMES, world, facet row] of the substep
         record_totals: wp.array3d(dtype=wp.float64)  # [world, contact, RECORD_NAMES] of the step so far
         elapsed_time: wp.array(dtype=wp.float64)  # [world] duration of the accepted substeps of the step, s
+        penalty_factor: wp.array(dtype=wp.float64)  # [world] factor on the stiffness, of Newton's method
 
     return ContactScratch
 

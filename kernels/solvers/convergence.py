@@ -9,7 +9,7 @@ from ..common.traits import NO_TERMS, Traits
 from ..common.types import f64
 from .newton_control import GROUP_ROUNDOFF, Failure, Row, control_struct
 
-__all__ = ["MAX_ERROR_ESTIMATES", "SINGLE_PRECISION_EPS", "convergence_functions"]
+__all__ = ["EXTRA_ITERATION_FACTOR", "MAX_ERROR_ESTIMATES", "SINGLE_PRECISION_EPS", "convergence_functions"]
 
 EXTRAPOLATED_TOL_FACTOR, UNSOLVED_TOL_FACTOR = 1.0e-3, 0.1
 """Fractions of the tolerance that a first iterate must meet: extrapolated; in float32 with parts of unlike stiffness.
@@ -41,7 +41,7 @@ MAX_ERROR_ESTIMATES = 3
 
 @functools.cache
 def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
-    """Device functions; traits used: "stored", "has_constraints" and "midpoint"."""
+    """Device functions; traits used: "stored", "has_constraints", "unilateral" and "midpoint"."""
     Control = control_struct()
 
     @wp.func
@@ -229,6 +229,8 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
         """End the iteration with this iterate; with J <= 0 it is checked again."""
         ctl.active[world] = 0
         ctl.search.active[world] = 0
+        if wp.static(traits.unilateral):
+            ctl.frozen.penalty_factor[world] = f64(1.0)
         if ctl.refuse_inversion != 0 and ctl.min_J[world] <= f64(0.0):
             ctl.inversion_suspected[world] = 1
             wp.atomic_max(ctl.any_rare_branch, 0, 1)
@@ -242,11 +244,13 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
 
     @wp.func
     def iteration_factor(ctl: Control, world: int) -> int:
-        """Factor on `max_iterations` of an attempt: larger for a start far from the solution, or after negative
-        curvature with a law that has its own tangent, since shorter steps meet it again."""
+        """Factor on `max_iterations` of an attempt: larger for a start far from the solution, with a continuation, or
+        after negative curvature with a law that has its own tangent, since shorter steps meet it again."""
         far = wp.max(
             ctl.start.has_alternatives[world], ctl.solve.met_negative_curvature[world] * (1 - ctl.linear_stress)
         )
+        if wp.static(traits.unilateral):
+            far = wp.max(far, ctl.frozen.continued[world])
         return 1 + EXTRA_ITERATION_FACTOR * far
 
     @wp.func
@@ -259,6 +263,8 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
         ctl.active[world] = 0
         ctl.search.active[world] = 0
         ctl.failed[world] = why
+        if wp.static(traits.unilateral):
+            ctl.frozen.penalty_factor[world] = f64(1.0)
         stuck = why == Failure.ITERATIONS or why == Failure.LINE_SEARCH or why == Failure.CURVATURE
         drowned = ctl.floor.rounding_ratio[world] <= f64(NOISE_DOMINATED_ROUNDINGS)
         drowned = drowned and ctl.norms.relative_residual[world] > f64(0.5)
@@ -315,6 +321,8 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
         """Failed search: if round-off may explain it, keep the iterate and request an error estimate, else give up."""
         at_roundoff = ctl.floor.rounding_ratio[world] <= f64(STALL_ROUNDINGS) or is_velocity_roundoff(ctl, world)
         near = at_roundoff and ctl.floor.estimates[world] < MAX_ERROR_ESTIMATES
+        if wp.static(traits.unilateral):
+            near = near and ctl.frozen.penalty_factor[world] == f64(1.0)
         at_roundoff = at_roundoff or ctl.floor.eps > f64(SINGLE_PRECISION_EPS)
         enough = False
         if wp.static(traits.has_constraints):  # only accelerations need the tighter tolerance, which round-off prevents

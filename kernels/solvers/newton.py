@@ -81,6 +81,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
         ctl.search.slope[world] = f64(0.0)
         if wp.static(traits.unilateral):
             ctl.frozen.updated[world] = 0
+            ctl.frozen.continued[world] = 0
             ctl.frozen.unilateral_changed[world] = 0
             ctl.nonmonotone.penetrating_steps[world] = 0
         if ctl.domain_J[world] <= f64(0.0):

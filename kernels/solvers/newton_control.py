@@ -154,6 +154,9 @@ def control_struct():
         partly_updated: i1  # they were updated only partly: the residual is not that of the iterate
         contact_active: i1  # unilateral forces act at the iterate
         unilateral_changed: i1  # the updated quantities may activate unilateral forces again
+        penalty_factor: d1  # factor on the stiffness of contact, below 1 during a continuation
+        continued: i1  # a continuation has begun in this attempt
+        update_due: i1  # they are updated next
 
     @wp.struct
     class NewtonControl:

@@ -127,7 +127,7 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
         unused = () if self.tables.has_single_point else (*OF_FACETS, *OF_CONTACTS, "point_depth")
         out = struct()
         for name, var in struct.vars.items():
-            if name not in unused:
+            if name not in (*unused, "penalty_factor"):
                 setattr(out, name, make(name, shapes.get(name, (worlds, self.tables.points)), var.type.dtype))
         return out
 
@@ -152,6 +152,7 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
         t, B = self.tables, self.model.worlds
         attempt = self.make_scratch(B, lambda name, shape, dtype: work.array(f"{self.name} {name}", shape, dtype))
         attempt.relaxation.fill_(1.0)
+        attempt.penalty_factor = work.newton.frozen.penalty_factor
         clock = clock_struct()()
         for name in ("new_time", "h", "substep_index"):
             setattr(clock, name, getattr(work.step, name))
@@ -163,8 +164,7 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
         scratch = {
             "attempt": attempt,
             "clock": clock,
-            # Newton's method only; unused by Jacobi's iteration
-            "contact_active": work.newton.frozen.contact_active,
+            "contact_active": work.newton.frozen.contact_active,  # unused by Jacobi's iteration
             "energies": work.array(f"{self.name} energies", (ENERGY_COLUMNS, B, t.rows), wp.float64),
             "parts": work.array(f"{self.name} parts", parts, wp.float64),
             "row_start": self.model.array("contact", t.row_start, wp.int32),

@@ -380,7 +380,7 @@ class NewtonLoop:
 
     def _reevaluate_frozen(self) -> None:
         w, flags = self.work, self.work.newton.search.trial_accepted
-        self.terms.call(self.ctx, Updated, "update_frozen", flags)
+        self.terms.call(self.ctx, Updated, "update_frozen", w.newton.frozen.update_due)
         self.residual.reevaluate_frozen(flags)
         self.launch(self.kernels.end_frozen_update, self.model.worlds, [w.newton, flags])
         self._run_if_rare(self._check_inversion)

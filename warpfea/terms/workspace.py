@@ -124,6 +124,7 @@ class Workspace:
         skip += () if traits.stored else ("term_sums", "trial_accepted")
         skip += () if traits.limited else ("limit",)
         of_contact = ("updated", "unilateral_changed", "penetrating_steps", "partly_updated", "contact_active")
+        of_contact += ("penalty_factor", "continued", "update_due")
         skip += () if traits.unilateral else (*of_contact, "bracket_low", "bracket_high")
         self.newton = self.struct(
             control_struct(), B, skip=skip,
@@ -132,6 +133,8 @@ class Workspace:
             term_sums=(TERM_ROWS, B), sums=(FLOOR_ROWS, B, model.components.error_estimate_groups.count, FLOOR_LANES),
         )  # fmt: skip
         self.newton.norms.component_count, self.newton.norms.group_count = C, groups
+        if traits.unilateral:
+            self.newton.frozen.penalty_factor.fill_(1.0)
         self.multipliers: Any = multiplier_struct()()  # of constraints, if any
         self.pcg = self.struct(pcg_struct(), B, sums=(2, B), curvature=(1, B))
         solve = self.newton.solve
