@@ -43,6 +43,11 @@ from .structs import SLIP_FLAG, contact_structs, world_value
 
 __all__ = ["friction_functions"]
 
+TOUCHING_PART_UPDATES = 2
+"""Updates in an attempt of the part of the step that a new point is in contact. By that part friction in stick follows
+the normal force, as a coefficient does: updates to the end diverge where two points wedge a body (by 1.05 each in a
+chain of links)."""
+
 
 @functools.cache
 def friction_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
@@ -203,7 +208,7 @@ def friction_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
     ) -> vec3d:  # fmt: skip
         """Store friction limit, k_t, factor on the stored elastic slip, and normal of an iterate for the next frozen
         update. Returns the frozen three; `fresh`: they and the normal are set to those of the iterate, with at most the
-        limit of the last step: zero for a new contact."""
+        limit of the last step: zero for a new contact. The factor of a point stays after a few updates."""
         rec = k.history_row(con, c, point)
         frozen = scr.frozen_friction[world, rec]
         new = friction_parameters(con, his, world, c, point, t)
@@ -214,6 +219,8 @@ def friction_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
             scr.frozen_friction[world, rec] = frozen
         elif con.single_point[c] == 0:  # a point that has come to another side since
             frozen[1] = new[1]
+            if frozen[0] > f64(0.0) and scr.limit_updates[world] >= TOUCHING_PART_UPDATES:
+                new[2] = frozen[2]
         scr.updated_normal[world, rec] = t.normal
         scr.updated_friction[world, rec] = new
         return frozen
