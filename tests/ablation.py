@@ -120,6 +120,10 @@ CONSTANTS: dict[str, Constant] = {
     "START_STRESS_RESIDUAL": Constant(NEWTON_PCG, "1", 0.0),
     "CONTACT_ROUNDINGS": Constant(NEWTON_PCG, "roundings of the positions", 0.0),
     "PHI_NOISE_ROUNDINGS": Constant(NEWTON_PCG, "roundings of Phi", 0.0),
+    "MAX_CONTACT_FORCING": Constant(NEWTON_PCG, "1", 0.1, "contact"),
+    "CONTINUATION_START": Constant(NEWTON_PCG, "iterations", 1000000, "contact"),
+    "SOFTEST_PENALTY": Constant(NEWTON_PCG, "1", 1.0, "contact"),
+    "PENALTY_RATIO": Constant(NEWTON_PCG, "1", 1.0e300, "contact"),
     "NEW_MATRIX_DECADES": Constant(REUSE, "decades", 1.0e3),
     "REDUCTION_FADING": Constant(REUSE, "1", 1.0),
     "REUSED_FORCING_FACTOR": Constant(REUSE, "1", 1.0),
@@ -156,6 +160,10 @@ CONSTANTS: dict[str, Constant] = {
     "SAGITTA_RATIO": Constant(CONTACT, "sizes of an element", 1.0e300, "contact"),
     "MIN_DEEP_OVERLAP_RATIO": Constant(CONTACT, "depth limit", 0.0, "contact"),
     "MIN_DEPTH_RATIO": Constant(CONTACT, "thicknesses", 0.0, "contact"),
+    "TOUCHING_PART_UPDATES": Constant(CONTACT, "updates", 1000000, "contact"),
+    "HARDENING": Constant(CONTACT, "1", 0.0, "contact"),
+    "HARDENING_DEPTH": Constant(CONTACT, "depths of elements", 1.0e300, "contact"),
+    "PASSING_DISTANCE": Constant(CONTACT, "sides of a facet", 1.0e300, "contact"),
     "UNSEEN_RATIO": Constant(CONTACT, "penetrations", 0.0, "contact"),
 }
 """Tuned constants by name, unique among the sources.
