@@ -54,13 +54,14 @@ SCENE = """
 import warpfea as wf
 
 @wf.scene(dt=1e-2, t_end=.02)
-def press(*, stiffness: float = 0.1) -> wf.ModelBuilder:
+def press(*, stiffness: float = 0.2) -> wf.ModelBuilder:
     '''A cube that is pressed onto a floor.'''
     b = wf.ModelBuilder()
     mesh = wf.mesh.box((.1, .1, .1), cells=(1, 1, 1))
     cube = b.add_solid(mesh, material=wf.SVK(E=1e6, nu=.3, density=1000), name="cube")
     b.drive(cube.nodes("z+"), displacement=([0, .02, 1], [(0, 0, 0), (0, 0, -.006), (0, 0, -.006)]))
-    b.add_contact(cube.surface("z-"), b.add_collider(wf.HalfSpace((0, 0, 1))), stiffness=stiffness, name="pad")
+    floor = b.add_collider(wf.HalfSpace((0, 0, 1)))
+    b.add_contact(cube.surface("z-"), floor, stiffness=("region", stiffness), name="pad")
     return b
 """
 
