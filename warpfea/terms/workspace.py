@@ -123,8 +123,10 @@ class Workspace:
         skip += () if traits.has_constraints else ("multiplier_updates", "violation_ratio")
         skip += () if traits.stored else ("term_sums", "trial_accepted")
         skip += () if traits.limited else ("limit",)
-        of_contact = ("updated", "unilateral_changed", "penetrating_steps", "partly_updated", "contact_active")
-        of_contact += ("penalty_factor", "continued", "update_due")
+        of_contact = (
+            "updated", "unilateral_changed", "penetrating_steps", "partly_updated", "contact_active", "penalty_factor",
+            "continued", "update_due",
+        )  # fmt: skip
         skip += () if traits.unilateral else (*of_contact, "bracket_low", "bracket_high")
         self.newton = self.struct(
             control_struct(), B, skip=skip,
