@@ -120,7 +120,6 @@ CONSTANTS: dict[str, Constant] = {
     "START_STRESS_RESIDUAL": Constant(NEWTON_PCG, "1", 0.0),
     "CONTACT_ROUNDINGS": Constant(NEWTON_PCG, "roundings of the positions", 0.0),
     "PHI_NOISE_ROUNDINGS": Constant(NEWTON_PCG, "roundings of Phi", 0.0),
-    "MAX_CONTACT_FORCING": Constant(NEWTON_PCG, "1", 0.1),
     "CONTINUATION_START": Constant(NEWTON_PCG, "iterations", 1000000, "contact"),
     "SOFTEST_PENALTY": Constant(NEWTON_PCG, "1", 1.0, "contact"),
     "PENALTY_RATIO": Constant(NEWTON_PCG, "1", 1.0e300, "contact"),

@@ -22,9 +22,6 @@ iterates whose membrane energy is far above that of both ends (Magisano, Leonett
 MAX_TRUST_RADIUS, RADIUS_SHRINK = 0.5, 0.4
 """Largest rotation or stretch of an element in such a step, and its reduction factor after restoring the best
 iterate."""
-MAX_FORCING, MAX_CONTACT_FORCING = 0.1, 0.01
-"""Largest relative tolerance of a linear solve after the first, without and in contact: its stiff forces hide what a
-loose solve leaves in the rotations of bodies, which then overshoot."""
 SOLVES_WITHOUT_STEP = 10  # solves without a step after which the exact tangent is used; with 0 soft solids take longer
 MAX_DOUBLINGS = 30  # maximum doublings of a step along which Phi is concave
 MAX_PENETRATING_STEPS = 1  # maximum deep penetrations by full steps in an attempt: the return may end at the start
@@ -35,7 +32,7 @@ the points slip back, again and again, while one that ends near it makes them st
 
 
 def line_search_kernels(traits: Traits, module: wp.Module) -> KernelSet:
-    """Kernels in the module of Newton's method, and the functions `tangent_needed`, `largest_forcing`."""
+    """Kernels in the module of Newton's method, and the function `tangent_needed`."""
     Control = control_struct()
     convergence = convergence_functions(traits)
 
@@ -44,14 +41,6 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> KernelSet:
         """True if solves with matrices other than the tangent have failed too often, for laws with their own tangent:
         beyond a bifurcation only the exact tangent gives descent."""
         return ctl.linear_stress == 0 and ctl.solve.count[world] - ctl.iterations[world] > SOLVES_WITHOUT_STEP
-
-    @wp.func
-    def largest_forcing(ctl: Control, world: int) -> f64:
-        """Largest relative tolerance of the next linear solve."""
-        if wp.static(traits.unilateral):
-            if ctl.frozen.contact_active[world] != 0:
-                return f64(MAX_CONTACT_FORCING)
-        return f64(MAX_FORCING)
 
     @wp.func
     def track_best_iterate(ctl: Control, world: int, old_phi: f64, old_norm: f64):
@@ -139,7 +128,7 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> KernelSet:
         if guard > f64(0.1):
             eta = wp.max(eta, guard)
         if ctl.solve.fixed_forcing == 0 and not stands:
-            ctl.solve.forcing[world] = wp.clamp(eta, f64(1.0e-6), largest_forcing(ctl, world))
+            ctl.solve.forcing[world] = wp.clamp(eta, f64(1.0e-6), f64(0.1))
         if wp.static(not traits.unilateral):
             convergence.check_convergence(ctl, world)
         if not stands and ctl.floor.estimate_error[world] == 0 and (nonmonotone or ctl.nonmonotone.steps[world] > 0):

@@ -125,7 +125,7 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
                 return
         initialise_iteration(ctl, world)
         if stage == 2 and ctl.solve.fixed_forcing == 0:
-            ctl.solve.forcing[world] = wp.min(f64(ALTERNATIVE_START_FORCING), searching.largest_forcing(ctl, world))
+            ctl.solve.forcing[world] = f64(ALTERNATIVE_START_FORCING)
 
     @wp.kernel(module=module)
     def compare_first_iterates(ctl: Control, first: int, better: int_1d):
