@@ -190,6 +190,15 @@ def test_named_surface():
     assert p.conn.shape[1] == 6
 
 
+def test_areas_of_many_faces_are_those_of_each(monkeypatch):
+    """Faces are evaluated in chunks: all in one, and in several of up to seven."""
+    surface = whole(solid("T4"))
+    whole_areas = contact_points(surface).area
+    monkeypatch.setattr(assembly, "MAX_CHUNK_FACETS", 7)
+    assert len(whole_areas) > 7
+    np.testing.assert_array_equal(contact_points(surface).area, whole_areas)
+
+
 @pytest.mark.parametrize("element", ["T10", "ENMC"])
 def test_curved_faces_of_a_ball(element):
     """The faces of a ball: normals sum to nothing exactly, area and volume as a rule of high degree gives."""
@@ -197,7 +206,7 @@ def test_curved_faces_of_a_ball(element):
     body = wf.ModelBuilder().add_solid(mesh, material=LAW, element=element)
     p = contact_points(whole(body))
     fine = assembly.facet_tables(whole(body), rules={face: conical_triangle(7) for face in range(4)})
-    X, area = assembly.facet_positions_and_areas(body, fine)
+    X, area = assembly.facet_positions(body, fine), assembly.facet_areas(body, fine)
     if element == "T10":
         assert np.abs((p.normal * p.area[:, :, None]).sum(axis=(0, 1))).max() < 1e-13
     assert p.area.sum() == pytest.approx(area.sum(), rel=2e-5)

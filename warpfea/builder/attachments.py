@@ -180,7 +180,7 @@ def _surface_attachment(surface: SurfaceSet, child: bool) -> Attachment:
     body = surface.body
     label = f"surface {surface.name!r} of body {body.name!r}" if surface.name else f"a surface of body {body.name!r}"
     t = assembly.facet_tables(surface)
-    X, dA = assembly.facet_positions_and_areas(body, t)
+    X, dA = assembly.facet_positions(body, t), assembly.facet_areas(body, t)
     share = (dA / dA.sum()).ravel()
     X = X.reshape(-1, 3)
     mean, at_points, span = _affine_fit(share, X, FLAT_SURFACE)

@@ -59,7 +59,7 @@ def _mortar_gaps(
     """One vector per slot i of the face: int phi_i (x - x_holder) dA / int |phi_i| dA."""
     body = face.body
     t = assembly.facet_tables(face, _subdivisions(face, holder))
-    X, dA = assembly.facet_positions_and_areas(body, t)
+    X, dA = assembly.facet_positions(body, t), assembly.facet_areas(body, t)
     _check_near_surface(X.reshape(-1, 3), target_surface, what)
     n, m = body.slot_count, holder.slot_count
     F, Q, _ = t.shape.shape
@@ -81,7 +81,7 @@ def _mortar_gaps(
 
 def _subdivisions(face: SurfaceSet, holder: Discretisation) -> int:
     """Quadrature subdivisions of a face that resolve the other body's element boundaries."""
-    _, dA = assembly.facet_positions_and_areas(face.body, assembly.facet_tables(face))
+    dA = assembly.facet_areas(face.body, assembly.facet_tables(face))
     area = float(dA.sum(axis=1).max())
     size = np.cbrt(float(np.median(assembly.element_volumes(holder))))
     return int(np.clip(np.ceil(SUBDIVISIONS_PER_ELEMENT * np.sqrt(area) / size), 1, MAX_SUBDIVISIONS))
@@ -112,7 +112,7 @@ def _check_near_surface(X: np.ndarray, target_surface: SurfaceSet | None, what: 
     if target_surface is None:
         return
     body = target_surface.body
-    x = assembly.facet_positions_and_areas(body, assembly.facet_tables(target_surface))[0].reshape(-1, 3)
+    x = assembly.facet_positions(body, assembly.facet_tables(target_surface)).reshape(-1, 3)
     low, high = x.min(axis=0), x.max(axis=0)
     slack = SURFACE_TOL * float(np.linalg.norm(high - low))
     off = np.flatnonzero(((low - slack > X) | (high + slack < X)).any(axis=1))

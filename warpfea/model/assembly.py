@@ -26,7 +26,9 @@ __all__ = [
     "FacetTables",
     "HostBlock",
     "density_of",
-    "facet_positions_and_areas",
+    "facet_area_vectors",
+    "facet_areas",
+    "facet_positions",
     "facet_tables",
     "gather_table",
     "greedy_colouring",
@@ -39,6 +41,8 @@ __all__ = [
 
 MAX_CHUNK_ELEMENTS = 20000
 """Maximum elements per pass for tables with one row per element."""
+MAX_CHUNK_FACETS = 2000
+"""Facets whose temporary arrays stay in the cache of a processor core."""
 MAX_CHUNK_ENTRIES = 20_000_000
 """Maximum entries (elements x points x slots) of a table computed at once."""
 
@@ -258,10 +262,10 @@ def host_blocks(body: Discretisation, *, tables: bool) -> Iterator[HostBlock]:
                     yield HostBlock(key, body, members, k, values)
 
 
-def element_volumes(body: Discretisation) -> np.ndarray:
-    """(E,) reference volumes of the elements, section and thickness included, m^3."""
+def element_volumes(body: Discretisation, elements: np.ndarray | None = None) -> np.ndarray:
+    """(E,) reference volumes of elements, None: of all, section and thickness included, m^3."""
     rule = body.family.rule(None)
-    every = np.arange(len(body.mesh.cells))
+    every = np.arange(len(body.mesh.cells)) if elements is None else elements
     parts = [
         shape_and_jacobian(body, part, rule.points)[3] @ rule.weights
         for part in element_chunks(body, every, len(rule.weights))
@@ -349,42 +353,58 @@ def facet_tables(surface: SurfaceSet, parts: int = 1, rules: Mapping[int, Rule] 
     body, faces = surface.body, surface.faces
     kinds = [int(face) for face in np.unique(faces[:, 1])]
     rule = {k: composite_rule(rules[k] if rules else body.family.face_rule, parts) for k in kinds}
-    Q, S = max((len(r.weights) for r in rule.values()), default=0), body.family.slots
-    values = np.zeros((3, len(faces), Q, S))
-    weights = np.zeros((len(faces), Q))
-    used = np.zeros((len(faces), S), dtype=bool)
+    Q = max((len(r.weights) for r in rule.values()), default=0)
+    parts_of_table = []
     for face in kinds:
         rows = np.flatnonzero(faces[:, 1] == face)
         pad = Q - len(rule[face].weights)
         xi, dxi = body.family.face_points(face, np.pad(rule[face].points, ((0, pad), (0, 0)), mode="edge"))
         s, ds = element_functions(body, faces[rows, 0], xi)
-        values[0, rows] = s
-        values[1:, rows] = np.einsum("eqsk,qkd->deqs", ds, dxi)
-        weights[rows] = np.pad(rule[face].weights, (0, pad))
-        size = np.abs(values[:, rows]).max(axis=(0, 1, 2))
-        used[rows] = size > 1e-12 * size.max()
-    width = int(used.sum(axis=1).max(initial=0))
-    order = np.argsort(~used, axis=1, kind="stable")[:, :width]
-    real = np.take_along_axis(used, order, axis=1)
-    conn = np.take_along_axis(body.connectivity[faces[:, 0]], order, axis=1)
-    conn = np.where(real, conn, conn[:, :1])
-    table = np.take_along_axis(values, order[None, :, None, :], axis=3) * real[:, None, :]
+        values = np.stack([s, *np.einsum("eqsk,qkd->deqs", ds, dxi)])
+        size = np.abs(values).max(axis=(0, 1, 2))
+        used = np.flatnonzero(size > 1e-12 * size.max())
+        parts_of_table.append((rows, used, values[..., used], np.pad(rule[face].weights, (0, pad))))
+    width = max((len(used) for _, used, _, _ in parts_of_table), default=0)
+    conn, weights = np.empty((len(faces), width), dtype=np.int64), np.empty((len(faces), Q))
+    table = np.zeros((3, len(faces), Q, width))
+    for rows, used, values, rule_weights in parts_of_table:
+        slots = np.pad(used, (0, width - len(used)), constant_values=used[0])
+        conn[rows] = body.connectivity[faces[rows, 0, None], slots]
+        table[:, rows, :, : len(used)] = values
+        weights[rows] = rule_weights
     return FacetTables(conn, table[0], table[1], table[2], weights)
 
 
-def facet_positions_and_areas(body: Discretisation, t: FacetTables) -> tuple[np.ndarray, np.ndarray]:
-    """Reference positions X (F, Q, 3), m, of face points, and their areas (F, Q), m^2."""
-    x = body.reference[t.conn]
-    normal = np.cross(np.einsum("fqi,fik->fqk", t.d_a, x), np.einsum("fqi,fik->fqk", t.d_b, x))
-    X = np.einsum("fqi,fik->fqk", t.shape, x) + body.origin
-    return X, np.linalg.norm(normal, axis=2) * t.weights
+def _at_points(functions: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """(F, Q, 3) sums of slot values (F, n, 3) with functions (F, Q, n); einsum of all components takes four times as
+    long."""
+    return np.stack([np.einsum("fqi,fi->fq", functions, values[:, :, k]) for k in range(3)], axis=2)
+
+
+def facet_positions(body: Discretisation, t: FacetTables) -> np.ndarray:
+    """(F, Q, 3) reference positions of face points, m."""
+    return _at_points(t.shape, body.reference[t.conn]) + body.origin
+
+
+def facet_area_vectors(body: Discretisation, t: FacetTables) -> np.ndarray:
+    """(F, Q, 3) outward vectors dX/da x dX/db at face points, m^2."""
+    out = np.empty((*t.weights.shape, 3))
+    for first in range(0, len(out), MAX_CHUNK_FACETS):
+        rows = slice(first, first + MAX_CHUNK_FACETS)
+        x = body.reference[t.conn[rows]]
+        out[rows] = np.cross(_at_points(t.d_a[rows], x), _at_points(t.d_b[rows], x))
+    return out
+
+
+def facet_areas(body: Discretisation, t: FacetTables) -> np.ndarray:
+    """(F, Q) reference areas of face points, m^2."""
+    return np.asarray(np.linalg.norm(facet_area_vectors(body, t), axis=2) * t.weights)
 
 
 def surface_weights(surface: SurfaceSet) -> tuple[np.ndarray, np.ndarray]:
     """Body slots, and integrals of their functions over a surface, curved or flat (m^2; m^3 for gradients)."""
     t = facet_tables(surface)
-    _, dA = facet_positions_and_areas(surface.body, t)
-    weights = np.einsum("fq,fqi->fi", dA, t.shape)
+    weights = np.einsum("fq,fqi->fi", facet_areas(surface.body, t), t.shape)
     slots, inverse = np.unique(t.conn, return_inverse=True)
     return slots, np.bincount(inverse.ravel(), weights=weights.ravel(), minlength=len(slots))
 

@@ -33,6 +33,7 @@ __all__ = [
     "lagrange_basis",
     "points_by_faces",
     "points_by_rules",
+    "rules_of_faces",
 ]
 
 Modulus = Callable[[Discretisation, SurfaceSet | None], tuple[float, float]]
@@ -92,24 +93,24 @@ def points_by_rules(
     surface: SurfaceSet, known: Mapping[int, Mapping[int, Rule]], default: Mapping[int, int], points: int | None
 ) -> ContactPoints:
     """The points of a surface by rules that are known by the corners of a face and their own number."""
-    body = surface.body
     rules = {corners: those[default[corners] if points is None else points] for corners, those in known.items()
              if points is None or points in those}  # fmt: skip
-    return points_by_faces(
-        surface, {face: rules[len(body.family.faces[face])] for face in np.unique(surface.faces[:, 1])}
-    )
+    return points_by_faces(surface, rules_of_faces(surface, rules))
+
+
+def rules_of_faces(surface: SurfaceSet, rules: Mapping[int, Rule]) -> dict[int, Rule]:
+    """Rule of each local face in a surface, from rules by the number of corners."""
+    return {int(face): rules[len(surface.body.family.faces[face])] for face in np.unique(surface.faces[:, 1])}
 
 
 def points_by_faces(surface: SurfaceSet, rules: Mapping[int, Rule]) -> ContactPoints:
     """The points of a surface by the rules of its local faces."""
     body = surface.body
     t = assembly.facet_tables(surface, rules=rules)
-    X, area = assembly.facet_positions_and_areas(body, t)
-    x = body.reference[t.conn]
-    cross = np.cross(np.einsum("fqi,fik->fqk", t.d_a, x), np.einsum("fqi,fik->fqk", t.d_b, x))
-    length = np.linalg.norm(cross, axis=2, keepdims=True)
-    normal = np.divide(cross, length, out=np.zeros_like(cross), where=length > 0.0)
-    return ContactPoints(t.conn, t.shape, area, X, normal, surface.faces)
+    normal = assembly.facet_area_vectors(body, t)
+    length = np.linalg.norm(normal, axis=2)
+    np.divide(normal, length[..., None], out=normal, where=length[..., None] > 0.0)
+    return ContactPoints(t.conn, t.shape, length * t.weights, assembly.facet_positions(body, t), normal, surface.faces)
 
 
 def corner_points(p: ContactPoints) -> np.ndarray:
@@ -176,9 +177,9 @@ def element_edge_and_depth(surface: SurfaceSet) -> tuple[np.ndarray, np.ndarray]
     its height), in the reference.
     """
     body, faces = surface.body, surface.faces
-    area = assembly.facet_positions_and_areas(body, assembly.facet_tables(surface))[1].sum(axis=1)
+    area = assembly.facet_areas(body, assembly.facet_tables(surface)).sum(axis=1)
     triangle = np.array([len(face) == 3 for face in body.family.faces])[faces[:, 1]]
-    volume = assembly.element_volumes(body)[faces[:, 0]]
+    volume = assembly.element_volumes(body, faces[:, 0])
     return np.sqrt(np.where(triangle, 2.0, 1.0) * area), np.where(triangle, 3.0, 1.0) * volume / area
 
 

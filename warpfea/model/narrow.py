@@ -33,7 +33,7 @@ def _sides(surface: SurfaceSet) -> tuple[np.ndarray, np.ndarray]:
     length = np.stack([np.linalg.norm(way, axis=2).mean(axis=1) for way in (a, b, b - a)], axis=1)
     triangle = np.array([len(face) == 3 for face in body.family.faces])[surface.faces[:, 1]]
     sides = np.where(triangle[:, None], length.max(axis=1, keepdims=True), length[:, :2])
-    return sides, assembly.facet_positions_and_areas(body, t)[1].sum(axis=1)
+    return sides, assembly.facet_areas(body, t).sum(axis=1)
 
 
 def facet_size(surface: SurfaceSet) -> tuple[float, float]:

@@ -12,7 +12,9 @@ from ..base.errors import ModelError
 from ..elements import Rule
 from ..elements.quadrature import lobatto_square, triangle_7, triangle_16
 from ..kernels.contact.thickness import thickness_kernel
-from .contact_points import ContactPoints, effective_modulus, points_by_faces, points_by_rules
+from ..mesh.cells import row_keys
+from . import assembly
+from .contact_points import ContactPoints, effective_modulus, points_by_faces, points_by_rules, rules_of_faces
 from .contacts import ContactOptions
 from .discretisation import element_functions
 from .handles import SurfaceSet
@@ -57,7 +59,7 @@ class FacetOptions(ContactOptions):
     def region_area(self, points: ContactPoints) -> float:
         """As of `ContactOptions`; without a radius that of its smaller surface."""
         area = super().region_area(points)
-        return area if self.radius else min(self.shadow * area, float(pair_points(self.facets).area.sum()))
+        return area if self.radius else min(self.shadow * area, float(facet_point_areas(self.facets).sum()))
 
     @property
     def facets(self) -> SurfaceSet:
@@ -136,6 +138,12 @@ def pair_points(surface: SurfaceSet, points: int | None = None, width: float | N
     return points_by_rules(surface, PAIR_RULES, {3: 16, 4: 16}, points)
 
 
+def facet_point_areas(surface: SurfaceSet) -> np.ndarray:
+    """(F, 16) areas of `pair_points`, m^2."""
+    rules = rules_of_faces(surface, {corners: known[16] for corners, known in PAIR_RULES.items()})
+    return assembly.facet_areas(surface.body, assembly.facet_tables(surface, rules=rules))
+
+
 def slave_and_master(first: SurfaceSet, second: SurfaceSet) -> tuple[SurfaceSet, SurfaceSet, float | None]:
     """Slave, master, and `PairContact.width`.
 
@@ -182,33 +190,40 @@ def bernstein_from_monomials(corners: int, degree: int) -> np.ndarray:
     return np.linalg.solve(np.stack(values, axis=1), monomials(nodes, corners, degree))
 
 
-def _shape_functions(surface: SurfaceSet, ab: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Shape functions (F, Q, S) of all slots of the elements at face coordinates ab (Q, 2), their gradients dN/dX
-    (F, Q, S, 3), 1/m, and outward unit normals (F, Q, 3)."""
+def _shape_functions(surface: SurfaceSet, ab: np.ndarray) -> np.ndarray:
+    """(F, Q, S) shape functions of all slots of the elements at face coordinates ab (Q, 2)."""
     body, faces = surface.body, surface.faces
-    S = body.family.slots
-    shape = np.zeros((len(faces), len(ab), S))
-    gradient = np.zeros((*shape.shape, 3))
-    normal = np.zeros((len(faces), len(ab), 3))
+    shape = np.empty((len(faces), len(ab), body.family.slots))
+    for face in np.unique(faces[:, 1]):
+        rows = np.flatnonzero(faces[:, 1] == face)
+        shape[rows] = element_functions(body, faces[rows, 0], body.family.face_points(int(face), ab)[0])[0]
+    return shape
+
+
+def _gradients_and_normals(surface: SurfaceSet, ab: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Gradients dN/dX (F, Q, S, 3), 1/m, of `_shape_functions`, and outward unit normals (F, Q, 3)."""
+    body, faces = surface.body, surface.faces
+    gradient = np.empty((len(faces), len(ab), body.family.slots, 3))
+    normal = np.empty((len(faces), len(ab), 3))
     for face in np.unique(faces[:, 1]):
         rows = np.flatnonzero(faces[:, 1] == face)
         xi, dxi = body.family.face_points(int(face), ab)
-        s, ds = element_functions(body, faces[rows, 0], xi)
+        ds = element_functions(body, faces[rows, 0], xi)[1]
         e = body.reference[body.connectivity[faces[rows, 0]]]
-        J = np.einsum("esk,eqsd->eqkd", e, np.broadcast_to(ds, (len(rows), *ds.shape[1:])))
-        shape[rows] = s
-        gradient[rows] = np.einsum("eqsd,eqdk->eqsk", np.broadcast_to(ds, (len(rows), *ds.shape[1:])), np.linalg.inv(J))
+        ds = np.broadcast_to(ds, (len(rows), *ds.shape[1:]))
+        J = np.einsum("esk,eqsd->eqkd", e, ds)
+        gradient[rows] = np.einsum("eqsd,eqdk->eqsk", ds, np.linalg.inv(J))
         tangents = np.einsum("eqkd,qdj->eqkj", J, dxi)
         n = np.cross(tangents[..., 0], tangents[..., 1])
         normal[rows] = n / np.linalg.norm(n, axis=2, keepdims=True)
-    return shape, gradient, normal
+    return gradient, normal
 
 
 def _mitred_normals(positions: np.ndarray, normal: np.ndarray, size: float) -> np.ndarray:
     """(F, Q, 3) node vectors with unit product with the normal of each facet at the node (mitred normals)."""
-    key = np.round(positions.reshape(-1, 3) / (1e-7 * size)).astype(np.int64)
-    _, inverse = np.unique(key, axis=0, return_inverse=True)
-    inverse = inverse.ravel()
+    place = np.round(positions.reshape(-1, 3) / (1e-7 * size)).astype(np.int64)
+    place -= place.min(axis=0)
+    inverse = np.unique(row_keys(place, int(place.max()) + 1), return_inverse=True)[1]
     flat = normal.reshape(-1, 3)
     order, counts = np.argsort(inverse, kind="stable"), np.bincount(inverse)
     first = np.cumsum(counts) - counts
@@ -238,20 +253,21 @@ def master_facets(surface: SurfaceSet) -> MasterFacets:
         )
     corners = kinds.pop()
     check = PAIR_RULES[corners][16].points
-    wanted = _shape_functions(surface, check)[0]
+    wanted = _shape_functions(surface, check)
     for degree in (1, 2, 3):
         ab = interpolation_nodes(corners, degree)
         inverse = np.linalg.inv(monomials(ab, corners, degree))
-        shape, gradient, normal = _shape_functions(surface, ab)
+        shape = _shape_functions(surface, ab)
         fitted = np.einsum("qm,mn,fns->fqs", monomials(check, corners, degree), inverse, shape)
         if np.abs(fitted - wanted).max() <= 1e-10 * np.abs(wanted).max():
             break
     else:
         raise ModelError(f"body {body.name!r}: shape functions of {body.family.name} on a face are of degree above 3")
+    gradient, normal = _gradients_and_normals(surface, ab)
     conn = body.connectivity[faces[:, 0]]
     e = body.reference[conn]
     positions = np.einsum("fqs,fsk->fqk", shape, e) + body.origin
-    area = pair_points(surface).area.sum(axis=1)
+    area = facet_point_areas(surface).sum(axis=1)
     outward = _mitred_normals(positions, normal, float(np.sqrt(area.max())))
     director_shape = np.einsum("fqsk,fqk->fqs", gradient, outward)
     used = (np.abs(shape).max(axis=(0, 1)) > 0.0) | (np.abs(director_shape).max(axis=(0, 1)) > 0.0)
@@ -269,7 +285,7 @@ def facet_thickness(surface: SurfaceSet) -> np.ndarray:
     body = surface.body
     corners = len(body.family.faces[int(surface.faces[0, 1])])
     middle = np.full((1, 2), 1.0 / 3.0 if corners == 3 else 0.5)
-    shape, _, normal = _shape_functions(surface, middle)
+    normal = _gradients_and_normals(surface, middle)[1]
     e = body.reference[body.connectivity[surface.faces[:, 0]]]
-    positions = np.einsum("fqs,fsk->fqk", shape, e)[:, 0] + body.origin
+    positions = np.einsum("fqs,fsk->fqk", _shape_functions(surface, middle), e)[:, 0] + body.origin
     return measure_to_skin(body, thickness_kernel(), positions, normal[:, 0])
