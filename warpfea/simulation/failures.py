@@ -205,28 +205,17 @@ def overload_text(model: Model) -> str:
     Nominal stress: the value of a traction or pressure; force over the mean section (volume over longest side) for a
     point load; density times g times the longest side for gravity.
     """
-    found = [(0.0, "", 0.0, "", "")]
     d = model.description
-    for load in d.dead_loads:
-        if load.name == "traction":
-            found.append(_load_entry(load.body, "traction", _largest_value(load.law), _largest_value(load.law), "Pa"))
-        else:
-            side = float(np.ptp(load.body.mesh.bounding_box(), axis=0).max())
-            section = float(element_volumes(load.body).sum()) / side
-            found.append(
-                _load_entry(load.body, load.name, _largest_value(load.law), _largest_value(load.law) / section, "N")
-            )
-    for pressure in d.pressures:
-        found.append(
-            _load_entry(
-                pressure.surface.body, "pressure", _largest_value(pressure.law), _largest_value(pressure.law), "Pa"
-            )
-        )
+    loads = [(pressure.surface.body, "pressure", _largest_value(pressure.law), "Pa") for pressure in d.pressures]
+    loads += [(x.body, x.name, _largest_value(x.law), "Pa" if x.name == "traction" else "N") for x in d.dead_loads]
+    volume: dict[Any, float] = {body: float(element_volumes(body).sum()) for body in model.bodies}
+    side: dict[Any, float] = {b: float(np.ptp(b.mesh.bounding_box(), axis=0).max()) for b in model.bodies}
     g = float(np.linalg.norm(model.terms.dead_loads.gravity.numpy(), axis=1).max())
-    for body in model.bodies if g > 0.0 else ():
-        side = float(np.ptp(body.mesh.bounding_box(), axis=0).max())
-        weight = model.masses.total_of_body(body) / float(element_volumes(body).sum()) * g * side
-        found.append(_load_entry(body, "weight", weight, weight, "Pa"))
+    loads += [(b, "weight", model.masses.total_of_body(b) / volume[b] * g * side[b], "Pa") for b in model.bodies]
+    found = [(0.0, "", 0.0, "", "")]
+    for loaded, what, value, unit in loads:
+        stress = value if unit == "Pa" else value / (volume[loaded] / side[loaded])
+        found.append((stress / effective_modulus(loaded)[0], what, value, unit, loaded.name))
     ratio, what, value, unit, name = max(found)
     if ratio < MIN_OVERLOAD_RATIO:
         return ""
@@ -236,10 +225,6 @@ def overload_text(model: Model) -> str:
         f"; the {what} of {value:.3g} {unit} on body {name!r}{nominal} is {ratio:.3g} times E = {E:.3g} Pa: check the "
         "units of load and E"
     )
-
-
-def _load_entry(body: Any, what: str, value: float, stress: float, unit: str) -> tuple[float, str, float, str, str]:
-    return stress / effective_modulus(body)[0], what, value, unit, body.name
 
 
 def _largest_value(law: Any) -> float:
