@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import weakref
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -262,15 +263,23 @@ def host_blocks(body: Discretisation, *, tables: bool) -> Iterator[HostBlock]:
                     yield HostBlock(key, body, members, k, values)
 
 
-def element_volumes(body: Discretisation, elements: np.ndarray | None = None) -> np.ndarray:
-    """(E,) reference volumes of elements, None: of all, section and thickness included, m^3."""
+_VOLUMES: weakref.WeakKeyDictionary[Discretisation, np.ndarray] = weakref.WeakKeyDictionary()
+"""Values of `element_volumes` so far."""
+
+
+def element_volumes(body: Discretisation) -> np.ndarray:
+    """(E,) reference volumes of the elements, section and thickness included, m^3."""
+    if body in _VOLUMES:
+        return _VOLUMES[body]
     rule = body.family.rule(None)
-    every = np.arange(len(body.mesh.cells)) if elements is None else elements
+    every = np.arange(len(body.mesh.cells))
     parts = [
         shape_and_jacobian(body, part, rule.points)[3] @ rule.weights
         for part in element_chunks(body, every, len(rule.weights))
     ]
-    return np.concatenate(parts)
+    volumes = _VOLUMES[body] = np.concatenate(parts)
+    volumes.flags.writeable = False
+    return volumes
 
 
 def orthonormal(J0: np.ndarray) -> np.ndarray:
