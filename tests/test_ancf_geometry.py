@@ -89,7 +89,7 @@ def test_spline():
         ({"curve": [(0, 0), (1, 0)]}, r"finite points \(n, 3\)"),
         ({"curve": lambda s: (s, 0)}, "must return three numbers"),
         ({"curve": lambda s: (0.0, 0.0, 0.0)}, "zero or non-finite tangent"),
-        ({"corners": "round"}, "neither 'error' nor 'weld'"),
+        ({"corners": "round"}, "is none of 'error', 'weld'"),
         ({"elements": 0}, "positive whole number"),
         ({"section": (0.1, 0.1)}, "must be a Rectangle"),
         ({"integration": "reduced"}, "integration = 'reduced' is none of 'tied', 'split', 'full', '3x2x2'"),
@@ -223,7 +223,7 @@ def folded(X):
     ("options", "message"),
     [
         ({}, r"has a corner at node \d+: the normal of quad \d+ lies 45 degrees off"),
-        ({"corners": "sharp"}, "neither 'error' nor 'weld'"),
+        ({"corners": "sharp"}, "is none of 'error', 'weld'"),
         ({"thickness": 0}, "thickness = 0 must be a positive length"),
         ({"normals": np.ones((2, 3))}, r"normals must be finite and of shape \(10, 3\)"),
         ({"normals": lambda X: 0 * X}, "the normal at node 0 of plate is zero"),

@@ -12,7 +12,7 @@ import numpy as np
 
 from .base.checks import float_array, is_number, number_hint
 from .base.errors import ModelError
-from .base.names import did_you_mean
+from .base.names import check_choice, did_you_mean
 from .base.renamed import check_members
 from .base.short_repr import use_short_repr
 
@@ -82,9 +82,7 @@ class KelvinVoigt:
 
     def __post_init__(self) -> None:
         _check_constants("KelvinVoigt", eta=self.eta, lambda_v=self.lambda_v)
-        if self.form not in DAMPING_FORMS:
-            hint = did_you_mean(self.form, DAMPING_FORMS)
-            raise ModelError(f"KelvinVoigt: form = {self.form!r} is none of 'incremental', 'rate', 'explicit'{hint}")
+        check_choice("KelvinVoigt: form", self.form, DAMPING_FORMS)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

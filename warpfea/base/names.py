@@ -6,7 +6,7 @@ from typing import Any
 
 from .errors import ModelError
 
-__all__ = ["check_known", "did_you_mean", "listing"]
+__all__ = ["check_choice", "check_known", "did_you_mean", "listing"]
 
 SIMILARITY_CUTOFF = 0.6
 """Similarity, 0 to 1, from which a known name is suggested."""
@@ -50,6 +50,12 @@ def check_known(what: str, name: Any, known: Collection[Any]) -> None:
     """ModelError for a name that is not among the known ones, which it lists; `what`: its kind."""
     if name not in known:
         raise ModelError(f"{what} {name!r} is unknown; there are {', '.join(known)}{did_you_mean(name, known)}")
+
+
+def check_choice(name: str, value: Any, known: Collection[Any]) -> None:
+    """ModelError for a value of `name` that is not among the known ones."""
+    if value not in known:
+        raise ModelError(f"{name} = {value!r} is none of {', '.join(map(repr, known))}{did_you_mean(value, known)}")
 
 
 def listing(known: Iterable[object]) -> str:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..base.errors import ModelError
+from ..base.names import check_choice
 from ..elements.sections import Rectangle
 from ..mesh import Mesh
 
@@ -88,8 +89,7 @@ def beam_geometry(
         raise ModelError(f"body {name!r}: elements = {elements!r} must be a positive whole number")
     if not isinstance(section, Rectangle):
         raise ModelError(f"body {name!r}: section must be a Rectangle, got {section!r}")
-    if corners not in ("error", "weld"):
-        raise ModelError(f"body {name!r}: corners = {corners!r} is neither 'error' nor 'weld'")
+    check_choice(f"body {name!r}: corners", corners, ("error", "weld"))
     axis_curve = _make_curve(name, curve, int(elements), corners)
     s = _node_parameters(name, int(elements), axis_curve.corner_parameters)
     points = np.array([axis_curve.position(k) for k in s])

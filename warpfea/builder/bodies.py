@@ -13,7 +13,7 @@ import numpy as np
 from .. import elements as element_families
 from .. import mesh as meshes
 from ..base.errors import ModelError
-from ..base.names import did_you_mean
+from ..base.names import check_choice
 from ..elements import Family
 from ..elements.lagrange import T10, TET_CORNERS, TET_FACES
 from ..elements.sections import Rectangle
@@ -75,12 +75,7 @@ def make_structure(
     family = element_families.get_family(element)
     split = all(law.law == "svk" for _, law in materials)
     scheme = integration or ("tied" if split else "full")
-    known = [*family.schemes, *family.rules]
-    if scheme not in known:
-        raise ModelError(
-            f"body {name!r}: integration = {scheme!r} is none of {', '.join(map(repr, known))}"
-            f"{did_you_mean(scheme, known)}"
-        )
+    check_choice(f"body {name!r}: integration", scheme, [*family.schemes, *family.rules])
     if scheme in family.schemes and not split:
         bad = next(law for _, law in materials if law.law != "svk")
         raise ModelError(
@@ -171,8 +166,7 @@ def shell_geometry(name: str, mesh: Mesh, thickness: Any, normals: Any, corners:
         raise ModelError(f"{label}: a shell needs quad cells, {mesh.label} has {mesh.cell_type}")
     if not (isinstance(thickness, (int, float, np.floating)) and math.isfinite(thickness) and thickness > 0.0):
         raise ModelError(f"{label}: thickness = {thickness!r} must be a positive length (m)")
-    if corners not in ("error", "weld"):
-        raise ModelError(f"{label}: corners = {corners!r} is neither 'error' nor 'weld'")
+    check_choice(f"{label}: corners", corners, ("error", "weld"))
     x = mesh.points[mesh.cells]
     along = np.stack([x[:, 1] - x[:, 0], x[:, 1] - x[:, 0], x[:, 2] - x[:, 3], x[:, 2] - x[:, 3]], axis=1)
     across = np.stack([x[:, 3] - x[:, 0], x[:, 2] - x[:, 1], x[:, 2] - x[:, 1], x[:, 3] - x[:, 0]], axis=1)

@@ -8,6 +8,7 @@ from typing import Any
 
 from ..base.console import quiet_warp
 from ..base.errors import ModelError
+from ..base.names import check_choice
 from ..elements.sections import Rectangle
 from ..materials import Material
 from ..model.bodies import Body
@@ -43,8 +44,7 @@ class ModelBuilder(ContactMethods):
 
     def __init__(self, gravity: Any = (0.0, 0.0, -9.81), up_axis: str = "Z") -> None:
         constant, law = parse_gravity(gravity)
-        if up_axis not in ("Z", "Y"):
-            raise ModelError(f"up_axis = {up_axis!r} is neither 'Z' nor 'Y'")
+        check_choice("up_axis", up_axis, ("Z", "Y"))
         self.description = Description(gravity=constant, gravity_law=law, up_axis=up_axis)
         self._terms: list[Callable[[Model], Term | None]] = []
 

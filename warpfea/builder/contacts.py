@@ -11,7 +11,7 @@ import warp as wp
 
 from ..base.checks import is_count, is_number
 from ..base.errors import ModelError
-from ..base.names import did_you_mean
+from ..base.names import check_choice
 from ..contact import ANY_GAP, LAWS, ContactLaw
 from ..kernels.contact.collider_shapes import SHAPE_KINDS
 from ..model.bodies import Body
@@ -194,7 +194,7 @@ def _checked_options(what: str, surface: SurfaceSet, o: dict[str, Any]) -> dict[
     law = _checked_law(what, o["law"])
     known = {"treatment": TIME_TREATMENTS, "model": CONTACT_MODELS, "overlap": OVERLAP_OPTIONS}
     for option, names in known.items():
-        _check_option(what, option, o[option], names)
+        check_choice(f"{what}: {option}", o[option], names)
     if o["treatment"] == "explicit" and not law.explicit:
         raise ModelError(f"{what}: treatment = 'explicit': law {o['law']!r} declares no explicit force; 'paper' does")
     o["mu"] = _number(what, "mu", o["mu"], "a friction coefficient, 0 or above", low=0.0)
@@ -228,16 +228,9 @@ def _checked_options(what: str, surface: SurfaceSet, o: dict[str, Any]) -> dict[
     return o
 
 
-def _check_option(what: str, option: str, value: Any, known: Collection[str]) -> None:
-    """ModelError for a value that is not among the known ones."""
-    if value not in known:
-        hint = did_you_mean(value, known)
-        raise ModelError(f"{what}: {option} = {value!r} is none of {', '.join(map(repr, known))}{hint}")
-
-
 def _checked_law(what: str, name: str) -> ContactLaw:
     """A law of `LAWS`. ModelError for an unknown name, or an entry that is no law of a device function."""
-    _check_option(what, "law", name, LAWS)
+    check_choice(f"{what}: law", name, LAWS)
     law = LAWS[name]
     if not isinstance(law, ContactLaw):
         raise ModelError(

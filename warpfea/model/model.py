@@ -13,6 +13,7 @@ import warp as wp
 from ..base.devices import find_device
 from ..base.errors import ModelError
 from ..base.memory import Memory, convert_memory_errors
+from ..base.names import check_choice
 from ..kernels.common.types import precision
 from . import assembly
 from .blocks import Block, build_block
@@ -72,8 +73,7 @@ class Model:
         many: bool | None = None,
         tables: bool = False,
     ) -> None:
-        if dtype not in ("float64", "float32"):
-            raise ModelError(f"dtype = {dtype!r} is neither 'float64' nor 'float32'")
+        check_choice("dtype", dtype, ("float64", "float32"))
         if not isinstance(worlds, (int, np.integer)) or worlds < 1:
             raise ModelError(f"worlds = {worlds!r} must be a positive whole number")
         if not description.bodies:

@@ -12,7 +12,7 @@ from ..base.errors import ModelError
 from ..model.model import Model
 from ..model.state import State
 
-__all__ = ["check_choice", "check_constraint_tol", "check_mask", "check_model", "check_state",
+__all__ = ["check_constraint_tol", "check_mask", "check_model", "check_state",
            "check_time", "check_times", "write_times"]  # fmt: skip
 
 
@@ -72,14 +72,6 @@ def check_mask(mask: wp.array, model: Model) -> None:
             f"reset: the mask is {mask.dtype.__name__}{mask.shape} on {mask.device}, expected int32 or bool "
             f"({model.worlds},) on {model.device}"
         )
-
-
-def check_choice(name: str, value: Any, *known: str) -> None:
-    """Raise ModelError unless `value` is one of the known words."""
-    if value not in known:
-        if len(known) == 2:
-            raise ModelError(f"{name} = {value!r} is neither {known[0]!r} nor {known[1]!r}")
-        raise ModelError(f"{name} = {value!r} is none of {', '.join(map(repr, known))}")
 
 
 def check_constraint_tol(value: Any) -> None:

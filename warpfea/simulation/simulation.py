@@ -15,6 +15,7 @@ from .. import solvers
 from ..base.console import compile_progress_bar, quiet_warp
 from ..base.errors import ModelError
 from ..base.memory import convert_memory_errors
+from ..base.names import check_choice
 from ..base.worlds import set_rows
 from ..kernels.step.step_control import SAME_TIME_FRACTION, STATUS
 from ..model.assembly import require_density
@@ -24,7 +25,6 @@ from . import integrators
 from .adaptive import adaptive_options, algebraic_tolerance
 from .capacity import check_capacity
 from .checks import (
-    check_choice,
     check_constraint_tol,
     check_model,
     check_state,
@@ -168,11 +168,10 @@ class Simulation:
         check_model(model)
         if not scheme.static:
             require_density(model.bodies, "motion")
-        check_choice("inversion", inversion, "refuse", "report")
-        check_choice("energy_growth", energy_growth, *ENERGY_GROWTH_CHOICES)
+        check_choice("inversion", inversion, ("refuse", "report"))
+        check_choice("energy_growth", energy_growth, ENERGY_GROWTH_CHOICES)
         self.energy_growth = EnergyGrowth(energy_growth, ledger=ledger, static=scheme.static)
-        if on_failure is not None:
-            check_choice("on_failure", on_failure, "raise", "freeze")
+        check_choice("on_failure", on_failure, ("raise", "freeze", None))
         times = {"error": error, "interval": interval, "horizon": horizon}
         adapt = adaptive_options(dt, **times, model=model, scheme=scheme, solver=options)
         options = algebraic_tolerance(options, adapt, model.dtype)

@@ -13,13 +13,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..base.errors import ModelError
+from ..base.names import check_choice
 from ..base.writer import Output
 from ..model.assembly import element_volumes, require_density
 from ..model.contact_points import effective_modulus
 from ..model.slot_table import check_static_supports
 from ..model.state import State
 from ..solvers import NewtonPCG, SolverPlan
-from .checks import check_choice, check_model
+from .checks import check_model
 from .integrators import INTEGRATORS
 from .results import PartMember, Records, Results
 from .simulation import Simulation, StepReport
@@ -144,7 +145,7 @@ def solve_static(
         OutputError: an output can't be written.
         KeyboardInterrupt: after Ctrl-C with load steps left, once outputs are closed.
     """
-    check_choice("unstable", unstable, *UNSTABLE_CHOICES)
+    check_choice("unstable", unstable, UNSTABLE_CHOICES)
     options: dict[str, Any] = {"load_steps": load_steps, "tol": tol, "solver": solver, "plan": plan}
     options |= {"state": state, "constraint_tol": constraint_tol, "inversion": inversion, "stabilise": stabilise}
     sim = begin_static(model, **options)
