@@ -164,13 +164,16 @@ CONSTANTS: dict[str, Constant] = {
     "HARDENING_DEPTH": Constant(CONTACT, "depths of elements", 1.0e300, "contact"),
     "PASSING_DISTANCE": Constant(CONTACT, "sides of a facet", 1.0e300, "contact"),
     "UNSEEN_RATIO": Constant(CONTACT, "penetrations", 0.0, "contact"),
+    "ENTRY_DEPTH": Constant(CONTACT, "depths of elements", 0.0, "contact"),
+    "BESIDE_DEPTH": Constant(CONTACT, "depths of elements", 0.0, "contact"),
 }
 """Tuned constants by name, unique among the sources.
 
 Not tuned, so without a row: MAX_NONMONOTONE and MAX_DOUBLINGS, whose absence is that of the watchdog and of doublings;
 MAX_CONTACT_NOISE, the largest error that is accepted; PATCH_ANGLES, bounds of a count of points; AUTO_OVERLAP_RATIOS,
-promised by `overlap`; LEVEL_COSINE, a tolerance of parallel planes. Not needed by any row yet: DOUBLING_RATIO (without
-it a falling bar takes 4 to 10 % fewer iterations) and FIRST_STEP_ERROR.
+promised by `overlap`; LEVEL_COSINE, a tolerance of parallel planes; SHARP_COSINE, promised by `clipping`; EDGE_WIDTH, that
+of other points at a border. Not needed by any row yet: DOUBLING_RATIO (without it a falling bar takes 4 to 10 % fewer
+iterations) and FIRST_STEP_ERROR.
 """
 
 

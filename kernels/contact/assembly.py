@@ -58,7 +58,7 @@ def contact_kernels(dtype: str, geometry: str, own: OwnLaws = ()) -> KernelSet:
             scr.limit_updates[world] = 0
             if clock.substep_index[world] == 0:
                 scr.elapsed_time[world] = f64(0.0)
-        if facets.area_fraction[q, item] > f64(0.0):
+        if facets.area[q, item] > f64(0.0):
             g.begin_point(con, other, facets, his, clock, scr, u_n, v_n, world, item, q)
 
     @wp.kernel(module=module)

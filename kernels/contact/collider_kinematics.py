@@ -7,9 +7,9 @@ import warp as wp
 from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.types import f64, precision, vec3d
 from .collider_seams import SEAMS_SUFFIX, seam_functions
-from .collider_shapes import MESH
+from .collider_shapes import BOX, CYLINDER, MESH
 from .colliders import MESH_SUFFIX, collider_functions
-from .kinematics import GEOMETRIES, kinematics_functions
+from .kinematics import GEOMETRIES, MAX_DEPTH_RATIO, MIN_NORMAL_COSINE, OPPOSING_COSINE, kinematics_functions
 from .law import ANY_GAP
 from .structs import FREE, IN_REACH, PASSED, TURNED, collider_struct, contact_structs
 
@@ -17,6 +17,11 @@ __all__ = ["MAX_COLLIDER_ROTATION", "collider_kinematics", "pose_kernels"]
 
 MAX_COLLIDER_ROTATION = 1.0
 """Largest rotation of a touched collider in a step, rad; larger rotations are rejected."""
+ENTRY_DEPTH, BESIDE_DEPTH = 1e-4, 0.25
+"""Depths over that of an element: to which a point may slide over the edge of a collider that nothing touches yet; to
+which a facet across a side face does not touch it."""
+BESIDE = -3
+"""In place of a side: the point has none."""
 
 
 @functools.cache
@@ -78,6 +83,40 @@ def collider_kinematics(dtype: str, meshes: bool, seams: bool = False) -> Kernel
             v = material_velocity(col, clock, world, kc, y) - interpolate(facets, v_n, world, q, item)
             speed = wp.dot(rotation * n, v)
         scr.approach_speed[world, point] = k.approach_speed(his, world, rec, speed)
+        if in_contact and scr.start_depth[world, point] > col.deepest[world, kc]:
+            wp.atomic_max(col.deepest, world, kc, scr.start_depth[world, point])
+
+    @wp.func
+    def side_slid_onto(
+        col: Other, facets: Facets, scr: ContactScratch, world: int, kc: int, item: int, y: vec3d, d: wp.vec4d
+    ) -> int:  # fmt: skip
+        """Side of a solid that a point slid onto over its edge, and entered by the side face there; -1: none.
+
+        The point's facet does not face that side face, and the side that the facet lies on, or ends at, is above the
+        point by at most the depth of others; BESIDE where it is higher: the facet sags below the edge.
+        y, d: position in the collider's frame, m, normal and gap by the face.
+        """
+        solid = col.kind[kc] == BOX or col.kind[kc] == CYLINDER
+        if wp.static(meshes):
+            solid = solid or (col.kind[kc] == MESH and col.size[kc][2] != f64(0.0))
+        n = vec3d(d[0], d[1], d[2])
+        inward = k.inward_normal(facets, scr, world, item)
+        if not solid or wp.dot(n, inward) >= f64(MIN_NORMAL_COSINE) or wp.length_sq(inward) == f64(0.0):
+            return -1
+        most = wp.max(f64(MAX_DEPTH_RATIO) * col.deepest[world, kc], f64(ENTRY_DEPTH) * facets.element_depth[item])
+        way = k.tangential(n, inward)
+        if wp.length_sq(way) < f64(0.5):
+            way = k.tangential(n, vec3d(n[1], n[2], n[0]) + vec3d(f64(0.0), n[2], -n[1]))
+        way = wp.normalize(way)
+        for _ in range(4):  # along the facet's normal first
+            side = g.side_facing(col, kc, y, way, f64(1.0))
+            if side >= 0:
+                found = distance(col, kc, y, side)
+                faces = wp.dot(vec3d(found[0], found[1], found[2]), way) > f64(OPPOSING_COSINE)
+                if faces and found[3] < f64(0.0) and -found[3] <= f64(BESIDE_DEPTH) * facets.element_depth[item]:
+                    return wp.where(-found[3] <= most, side, BESIDE)
+            way = wp.cross(n, way)
+        return -1
 
     @wp.func
     def start_motion(
@@ -109,7 +148,7 @@ def collider_kinematics(dtype: str, meshes: bool, seams: bool = False) -> Kernel
     @wp.func
     def set_depth(
         con: Contacts, col: Other, facets: Facets, his: History, scr: ContactScratch, world: int, c: int, point: int,
-        t: PointContact, activation: f64,
+        item: int, t: PointContact, activation: f64,
     ) -> PointContact:  # fmt: skip
         """The record with side, normal, depths and state from its local position and relative motion."""
         out = t
@@ -129,11 +168,14 @@ def collider_kinematics(dtype: str, meshes: bool, seams: bool = False) -> Kernel
             side = stored_side(in_contact, his.contact_state[world, k.history_row(con, c, point)])
             out.feature = g.sweep(col, kc, start, t.local_position, side)
             d = distance(col, kc, t.local_position, out.feature)
+            if side < 0 and d[3] < f64(0.0) and out.feature != -2:
+                level = side_slid_onto(col, facets, scr, world, kc, item, t.local_position, d)
             if wp.static(seams):
-                level = entered_level(col, world, c, start, t.local_position, d, side, out.feature)
-                if level >= 0:
-                    out.feature = level
-                    d = distance(col, kc, t.local_position, level)
+                if level == -1:
+                    level = entered_level(col, world, c, start, t.local_position, d, side, out.feature)
+            if level >= 0:
+                out.feature = level
+                d = distance(col, kc, t.local_position, level)
         out.normal = rotation * vec3d(d[0], d[1], d[2])
         out.depth = activation - d[3]
         change = g.depth_change(col, kc, out.feature, start, t.local_position,
@@ -145,7 +187,7 @@ def collider_kinematics(dtype: str, meshes: bool, seams: bool = False) -> Kernel
         if level >= 0:  # the depth at the start is the distance from the side face
             out.previous_depth = out.depth + wp.dot(out.normal, t.relative_motion)
         near = out.depth > f64(0.0) or before > f64(0.0)
-        out.state = wp.where(out.feature == -2, PASSED, IN_REACH)
+        out.state = wp.where(out.feature == -2, PASSED, wp.where(level == BESIDE, FREE, IN_REACH))
         if near and out.feature != -2 and wp.abs(turn_in_step(col, world, kc)) > f64(MAX_COLLIDER_ROTATION):
             out.state = TURNED
         if wp.static(seams):
@@ -174,7 +216,7 @@ def collider_kinematics(dtype: str, meshes: bool, seams: bool = False) -> Kernel
             )
         out.relative_motion = motion
         activation = k.activation_gap(con, his, world, c, point, time, col.margin[world, kc])
-        out = set_depth(con, col, facets, his, scr, world, c, point, out, activation)
+        out = set_depth(con, col, facets, his, scr, world, c, point, item, out, activation)
         out.stiffness_ratio = k.stiffness_ratio(con, facets, world, c, item, f64(0.0))
         if his.speed[world, rec] > f64(0.0):
             out.spring = k.turned_spring(con, his, world, c, rec, rotation)
@@ -283,6 +325,7 @@ def pose_kernels(meshes: bool) -> KernelSet:
             rotation = R * rotation
         if col.translation_law[k] >= 0:
             position += value[world, col.translation_law[k]]
+        col.deepest[world, k] = f64(0.0)
         col.position[world, k] = position
         col.rotation[world, k] = rotation
         col.translation[world, k] = position - col.previous_position[world, k]

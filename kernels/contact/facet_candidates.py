@@ -8,21 +8,14 @@ from ..common.modules import KernelSet, kernel_set
 from ..common.types import f64, vec3d
 from .broad_phase import broad_phase_kernels
 from .facet_structs import master_struct, pair_scratch_struct
-from .kinematics import kinematics_functions
+from .kinematics import MAX_DEPTH_RATIO, MIN_NORMAL_COSINE, OPPOSING_COSINE, kinematics_functions
 from .projection import OUTSIDE_TOLERANCE, facet_projection_functions
 from .structs import contact_structs
 
 __all__ = ["facet_candidate_functions"]
 
-MIN_NORMAL_COSINE = 0.1
-"""Minimum cosine of the normals of two facets that a point in contact passes between: excludes the edge of a box."""
 TUNNEL_LIMIT_RATIO = 0.25
 """Ratio to the depth limit of a facet above which a point that left the facet has passed through the body."""
-OPPOSING_COSINE = 0.5
-"""Cosine of a facet's normal and the slave's reversed normal above which they face each other; below its negative they
-face the same way."""
-MAX_DEPTH_RATIO = 2.0
-"""Largest depth of a point that enters from beside a facet, over the deepest active penetration."""
 BORDER_TOLERANCE = 1e-4
 """Distance over a side by which a point may pass a surface beside its border: round-off of flush borders."""
 MAX_EDGE_TANGENT = 2.0
@@ -171,20 +164,6 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
         return found[3] != f64(0.0) and within and found[2] > slave.height_limit
 
     @wp.func
-    def inward_normal(facets: Facets, scr: ContactScratch, slave: SlavePoint, corners: wp.vec3i) -> vec3d:
-        """Inward normal of a slave facet at the start of the attempt; 0 if undefined."""
-        if corners[0] < 0:
-            return vec3d()
-        point = facets.first_point + slave.slave_facet * facets.point_count
-        x = scr.start_position[slave.world, point + corners[0]]
-        return wp.normalize(
-            wp.cross(
-                scr.start_position[slave.world, point + corners[2]] - x,
-                scr.start_position[slave.world, point + corners[1]] - x,
-            )
-        )
-
-    @wp.func
     def edge_margin(mas: Masters, f: int, xi: vec3d) -> f64:
         """Tolerance beyond a side, over its length, for points below an edge, where outward vectors are inclined."""
         return wp.max(-f64(MAX_EDGE_TANGENT) * xi[2] / mas.side_length[f], f64(0.0))
@@ -256,8 +235,8 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
             if is_folded(mas, pair, world, f, xi):
                 return -1
             rank = 0
-        elif rank < 4 and mas.grounded[slave.contact] != 0:
-            return -1  # a point of an obstacle: the other sides of its edge have points of their own
+        elif rank < 4 and mas.one_sided[slave.contact] != 0:
+            return -1  # a point of an obstacle or edge: the other sides of its edge have points of their own
         else:
             projection = surface_point(mas, pair.start_displacement, world, f, vec3d(xi[0], xi[1], f64(0.0)))
             before = wp.dot(slave.start_position - projection.position, unit_normal(projection))
@@ -330,9 +309,8 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
     @wp.func
     def search_facets(
         mas: Masters, facets: Facets, scr: ContactScratch, pair: PairScratch, point: SlavePoint, first: FacetCandidate,
-        corners: wp.vec3i,
     ) -> FacetCandidate:  # fmt: skip
-        """The best facet near a point's path in the attempt; `corners`: three points of its slave facet, or -1."""
+        """The best facet near a point's path in the attempt."""
         out = first
         slave = point
         world = slave.world
@@ -355,7 +333,7 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
             if is_far(pair, slave, f):
                 continue
             if free and wp.length_sq(slave.facing_normal) == f64(0.0):
-                slave.facing_normal = inward_normal(facets, scr, slave, corners)
+                slave.facing_normal = k.inward_normal(facets, scr, world, slave.slave_facet)
             out = better_candidate(mas, scr, pair, slave, f, out)
             if free and passed_through_facet(mas, pair, slave, f):
                 out.passed_through = True

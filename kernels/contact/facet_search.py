@@ -220,10 +220,10 @@ def facet_search_kernels(dtype: str) -> KernelSet:
     def find_facets(
         con: Contacts, mas: Masters, facets: Facets, his: History, clock: Clock, u: wp.array2d(dtype=vec3d),
         v_n: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), overlap_limit: f64, scr: ContactScratch,
-        pair: PairScratch, corner_points: wp.array(dtype=wp.vec3i),
+        pair: PairScratch,
     ):  # fmt: skip
         """Facet of each point at an iterate. `overlap_limit` > 0: no step; inner points up to that depth, m, are in
-        contact. `corner_points`: three points of each slave facet, or -1."""
+        contact."""
         world, item, q = wp.tid()
         point = facets.first_point + item * facets.point_count + q
         leaving = pair.facet[world, point] == LEAVING
@@ -235,7 +235,7 @@ def facet_search_kernels(dtype: str) -> KernelSet:
         slave = slave_point_at(con, mas, facets, his, clock, scr, pair, u, world, item, q, overlap_limit)
         candidate = candidates.anchor_candidate(mas, pair, slave)
         if candidate.facet < 0 or leaving:
-            candidate = candidates.search_facets(mas, facets, scr, pair, slave, candidate, corner_points[item])
+            candidate = candidates.search_facets(mas, facets, scr, pair, slave, candidate)
         if candidate.facet >= 0 and leaving and slave.anchored:
             move_anchor(mas, facets, his, clock, scr, pair, v_n, slave, candidate.facet, candidate.xi)
         if candidate.facet >= 0:

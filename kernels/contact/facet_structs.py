@@ -31,7 +31,7 @@ def master_struct(dtype: str):
         tree: wp.uint64  # bounding-box tree of [world, facet], grouped by world and surface
         surface_of: wp.array(dtype=wp.int32)  # [contact] its master surface
         sign: wp.array(dtype=wp.int32)  # [contact] -1 where the points belong to the second side
-        grounded: wp.array(dtype=wp.int32)  # [contact] 1 where they belong to an obstacle
+        one_sided: wp.array(dtype=wp.int32)  # [contact] 1 where its points touch only facets that face theirs
         bodies: wp.array(dtype=wp.vec2i)  # [contact] of the points (of an obstacle: of the facets) and of the facets,
         # numbered among bodies with facets or points
         surface_count: wp.int32  # number of master surfaces

@@ -29,7 +29,15 @@ from ..common.types import f64, precision, vec3d
 from .law import FIXED_SPRING, MIN_APPROACH_SPEED
 from .structs import contact_structs
 
-__all__ = ["GEOMETRIES", "kinematics_functions"]
+__all__ = ["GEOMETRIES", "MAX_DEPTH_RATIO", "MIN_NORMAL_COSINE", "OPPOSING_COSINE", "kinematics_functions"]
+
+MIN_NORMAL_COSINE = 0.1
+"""Minimum cosine of the normals of two facets that a point in contact passes between: excludes the edge of a box."""
+OPPOSING_COSINE = 0.5
+"""Cosine of a facet's normal and the slave's reversed normal above which they face each other; below its negative they
+face the same way."""
+MAX_DEPTH_RATIO = 2.0
+"""Largest depth of a point that enters from beside a facet, over the deepest active penetration."""
 
 GEOMETRIES: dict[str, Callable[[str], KernelSet]] = {}
 """Geometries of the other side by name: the precision of the displacements -> device functions and `Other`."""
@@ -77,6 +85,20 @@ def kinematics_functions(dtype: str) -> KernelSet:
         if facets.tracks_deepest != 0:
             return scr.point_reference[world, facets.contact[item]]
         return facets.X[point, item]
+
+    @wp.func
+    def inward_normal(facets: Facets, scr: ContactScratch, world: int, item: int) -> vec3d:
+        """Inward normal of a facet at the start of the attempt, in its frame; 0 if undefined."""
+        corners = facets.corners[item]
+        if corners[0] < 0:
+            return vec3d()
+        point = facets.first_point + item * facets.point_count
+        x = scr.start_position[world, point + corners[0]]
+        return wp.normalize(
+            wp.cross(
+                scr.start_position[world, point + corners[2]] - x, scr.start_position[world, point + corners[1]] - x
+            )
+        )
 
     @wp.func
     def monomial_derivative(x: f64, power: int, derivative: int) -> f64:

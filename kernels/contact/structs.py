@@ -139,6 +139,7 @@ def facet_struct(dtype: str):
         area: wp.array2d(dtype=wp.float64)  # m^2
         contact: wp.array(dtype=wp.int32)  # [facet]
         element_depth: wp.array(dtype=wp.float64)  # [facet] of the element behind it, m
+        corners: wp.array(dtype=wp.vec3i)  # [facet] three of its points, whose cross product is outward, or -1
         first_entry: wp.int32  # first entry in the pool of terms
         first_row: wp.int32  # first row of the potential
         first_point: wp.int32  # first point: [facet, point] are numbered in this order
@@ -255,6 +256,7 @@ def collider_struct(meshes: bool):
         angle: wp.array2d(dtype=wp.float64)  # rad
         translation: wp.array2d(dtype=wp.vec3d)  # in the attempt, m
         rotation_change: wp.array2d(dtype=wp.mat33d)  # R - 1 of the rotation R in the attempt
+        deepest: wp.array2d(dtype=wp.float64)  # largest depth of its points at the start of the attempt, m
         neighbor_start: wp.array(dtype=wp.int32)  # [contact + 1] its first neighbour; with the next three: seams
         neighbor: wp.array(dtype=wp.int32)  # collider
         neighbor_shares: wp.array(dtype=wp.int32)  # 1: the body's contact with it has the same points

@@ -41,7 +41,7 @@ class ContactMethods:
         mu_static: float | None = None, restitution: float = 0.0, law: str = "default", treatment: str = "implicit",
         stiffness: Any = None, model: str = "patch", radius: float | None = None, offset: float = 0.0,
         points: int | None = None, smoothing: Any = None, overlap: str = "auto", overlap_time: float = 0.1,
-        seam: float | None = None, name: str | None = None,
+        seam: float | None = None, clipping: bool = False, name: str | None = None,
     ) -> Contact | FacetOptions:  # fmt: skip
         """Define contact of a body, or a surface of it, with a collider or another body.
 
@@ -69,6 +69,9 @@ class ContactMethods:
                 to it, as over one surface, also over a gap of up to a fifth of the surface's width; None: a thousandth
                 of the width, the second largest edge of the surface's bounding box. More is a step with a side face.
                 0 or above, not for two bodies or obstacles narrower than the facets.
+            clipping: True: sharp edges of the other side bear on the surface within its facets, too, by points of their
+                own at most half a facet apart (overhangs, table edges, knife edges), which cost as a contact between
+                bodies. Of two bodies those of the one whose facets are touched. Not for moving colliders.
             name: unique name; by default "BODY on COLLIDER".
 
         Bodies without a contact pass through each other; `Simulation(check_overlap=True)` names them. Between
@@ -85,7 +88,8 @@ class ContactMethods:
             body_of_handle(side, "add_contact", (Body, SurfaceSet), self.description.bodies)
         options = dict(mu=mu, mu_static=mu_static, restitution=restitution, law=law, treatment=treatment,
                        stiffness=stiffness, model=model, radius=radius, offset=offset, points=points,
-                       smoothing=smoothing, overlap=overlap, overlap_time=overlap_time, seam=seam)  # fmt: skip
+                       smoothing=smoothing, overlap=overlap, overlap_time=overlap_time, seam=seam,
+                       clipping=clipping)  # fmt: skip
         return add_contact(self.description, surface, collider, name, **options)
 
     def add_contact_all(self, *, mu: float = 0.0, **options: Any) -> list[Contact | FacetOptions]:

@@ -18,6 +18,7 @@ from ..model.bodies import Body
 from ..model.contact_points import check_contact_points
 from ..model.contacts import Collider, Contact
 from ..model.description import Description
+from ..model.edge_points import edges_of, has_edges
 from ..model.handles import SurfaceSet
 from ..model.obstacle_points import ObstacleContact, is_narrow_obstacle
 from ..model.pairs import PAIR_RULES, FacetOptions, PairContact, slave_and_master
@@ -76,7 +77,7 @@ def outer_surface(thing: Body | SurfaceSet) -> SurfaceSet:
 
 
 def add_contact(
-    d: Description, thing: Body | SurfaceSet, other: Any, name: str | None, **options: Any
+    d: Description, thing: Body | SurfaceSet, other: Any, name: str | None, *, clipping: bool, **options: Any
 ) -> Contact | FacetOptions:  # fmt: skip
     """Record a contact with a collider or another body; see ModelBuilder.add_contact."""
     if other is None:
@@ -85,8 +86,31 @@ def add_contact(
         )
     make = next((make for kind, make in KINDS.items() if isinstance(other, kind)), make_contact)
     contact = make(d, thing, other, name, **options)
+    check_clipping(contact, clipping)
+    if clipping and isinstance(contact, (Contact, PairContact)) and has_edges(contact):
+        index = len(d.contacts_of(FacetOptions)) + isinstance(contact, PairContact)
+        contact.edges = edges_of(contact, index)
     d.contacts.append(contact)
     return contact
+
+
+def check_clipping(contact: Contact | FacetOptions, clipping: Any) -> None:
+    """ModelError, or NotImplementedError, where the option `clipping` is not for a contact."""
+    what = f"contact {contact.name!r}: clipping = {clipping!r}"
+    if not isinstance(clipping, (bool, np.bool_)):
+        raise ModelError(f"{what} must be True or False")
+    if not clipping:
+        return
+    other = contact.sides[1]
+    reasons = {
+        "model = 'sphere'": contact.model == "sphere",
+        "treatment = 'explicit'": contact.treatment == "explicit",
+        f"law = {contact.law!r}, which acts at any distance,": LAWS[contact.law].traits & ANY_GAP,
+        f"collider {other.name!r}, which moves,": isinstance(other, Collider) and other.moves,
+        f"collider {other.name!r}, a sheet,": isinstance(other, Collider) and other.is_sheet,
+    }
+    for reason in (reason for reason, found in reasons.items() if found):
+        raise NotImplementedError(f"{what} with {reason} is not part of this version; leave it out")
 
 
 def make_contact(

@@ -143,7 +143,7 @@ class ContactTables(FacetTables[Contact]):
             if collider.rotation is not None:
                 h.update(np.concatenate([collider.rotation.anchor, collider.rotation.axis]).tobytes())
         for contact, p in zip(self.contacts, self.host):
-            fixed = ("surface", "collider", *WORLD_PARAMETERS)
+            fixed = ("surface", "collider", "edges", *WORLD_PARAMETERS)
             values = {k: v for k, v in vars(contact).items() if k not in fixed}
             h.update(f"{contact.collider.name} {sorted(values.items())}".encode())
             h.update(np.ascontiguousarray(p.faces).tobytes())

@@ -79,7 +79,7 @@ class PairEvaluation:
         for k, contact in enumerate(t.contacts):
             points = slice(t.first[k], t.first[k + 1])
             gap, normal, area = self.gap[:, points], self.normal[:, points], t.host[k].area.ravel()
-            if contact.body is body and not contact.grounded:
+            if contact.body is body and not contact.one_sided:
                 nearest = np.broadcast_to(nearest_samples(t, k, body), gap.shape)
                 out.append(BodyContactPoints(nearest, np.broadcast_to(area, gap.shape), normal, gap))
             if contact.facets.body is body:

@@ -12,7 +12,7 @@ import warp as wp
 from ..base.errors import ModelError
 from ..kernels.contact.facet_structs import master_struct
 from ..kernels.contact.structs import contact_struct
-from ..model.contact_points import corner_points, element_depths
+from ..model.contact_points import element_depths
 from ..model.contacts import Collider, Contact
 from ..model.handles import SurfaceSet
 from ..model.pairs import (
@@ -35,8 +35,8 @@ def refuse_offset(contact: FacetOptions, values: Any, mask: np.ndarray) -> None:
     """Raise ModelError: an offset of an obstacle whose points touch facets."""
     body, collider = contact.sides
     raise ModelError(
-        f"collider {collider.name!r}: offset can't be set: it is narrower than the facets of body {body.name!r} "
-        f"(contact {contact.name!r}); take finer facets, or move it by its path="
+        f"collider {collider.name!r}: offset can't be set: its own points touch facets of body {body.name!r} (contact "
+        f"{contact.name!r}), as it is narrower than these or has clipping=; take finer facets without it"
     )
 
 
@@ -46,7 +46,7 @@ class PairTables(FacetTables[FacetOptions]):
 
     Attributes:
         surfaces, masters: distinct master surfaces and their facets; master_of: master surface of each contact.
-        facets: number of master facets. bodies: bodies in a pair. corners: of the slave facets of each group.
+        facets: number of master facets. bodies: bodies in a pair.
         collider_laws: all colliders with the numbers of their time laws, if poses follow from these alone.
         max_gap: largest reported gap, m. max_overlap_depth: search depth of initial overlaps, m.
     """
@@ -66,7 +66,6 @@ class PairTables(FacetTables[FacetOptions]):
         self.area_fractions = [f * p.area / area for f, p, area in zip(self.factors, self.host, self.region_areas)]
         self.facets = sum(len(m.conn) for m in self.masters)
         self.bodies = sorted({surface.body.index for c in self.contacts for surface in c.surfaces})
-        self.corners: list[wp.array] = []
 
     def _check_clamped(self) -> None:
         """Raise ModelError for a contact whose slots are all clamped."""
@@ -97,9 +96,6 @@ class PairTables(FacetTables[FacetOptions]):
     def build(self, laws: TimeLawTable, pool: int) -> None:
         """Upload the tables; `pool`: first pool entry of the term."""
         self.pool = self._build_facets(pool)
-        for group in self.groups:
-            corners = np.concatenate([corner_points(self.host[k]) for k in group.contacts])
-            self.corners.append(self.model.array("contact", corners, wp.vec3i))
         self.data = contact_struct()()
         self._upload_laws(self.data, [self.law_constants(c) for c in self.contacts])
         self.store_built_values()
@@ -173,7 +169,7 @@ class PairTables(FacetTables[FacetOptions]):
             tables = {
                 "surface_of": self.master_of,
                 "sign": [c.sign for c in self.contacts],
-                "grounded": [c.grounded for c in self.contacts],
+                "one_sided": [c.one_sided for c in self.contacts],
                 "bodies": [[self.bodies.index(c.surfaces[i].body.index) for i in (0, -1)] for c in self.contacts],
                 "conn": self.master_conn.T,
                 "shape": np.moveaxis(concatenated("shape"), 0, 2),
@@ -205,7 +201,7 @@ class PairTables(FacetTables[FacetOptions]):
     def hash(self, h: Any) -> None:
         """Hash the definition of the contacts."""
         for contact, p, k in zip(self.contacts, self.host, self.master_of):
-            fixed = ("first", "second", "slave", "master", "surface", "collider", *WORLD_PARAMETERS)
+            fixed = ("first", "second", "slave", "master", "surface", "collider", "edges", "of", *WORLD_PARAMETERS)
             values = {name: v for name, v in vars(contact).items() if name not in fixed}
             h.update(f"{' '.join(side.name for side in contact.sides)} {sorted(values.items())}".encode())
             h.update(np.ascontiguousarray(p.faces).tobytes() + np.ascontiguousarray(self.surfaces[k].faces).tobytes())

@@ -13,6 +13,7 @@ from ..base.launch import Launcher
 from ..base.worlds import device_flags
 from ..kernels.common.state import state_kernels
 from ..kernels.contact.assembly import block_kernels
+from ..kernels.contact.edge_records import edge_record_kernels
 from ..kernels.contact.facet_kinematics import master_kernels
 from ..kernels.contact.facet_search import facet_search_kernels
 from ..kernels.contact.facet_structs import (
@@ -135,6 +136,7 @@ class FacetContact(ContactTerm, Tied, Coupled):
     def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
         own = [self.search_kernels, self.master_kernels, self.point_list_kernels]
         own += [self.midpoint_kernels] if ctx.midpoint else []
+        own += [edge_record_kernels()] if self._edge_columns is not None else []
         return [*super().modules(ctx), *(kernels.module for kernels in own)]
 
     def start(self, ctx: StepContext, active: wp.array) -> None:
@@ -185,7 +187,7 @@ class FacetContact(ContactTerm, Tied, Coupled):
         ctx.launch(k.check_boxes, (m.worlds, t.facets), [masters, active, pair])
         ctx.launch(k.update_centres, (m.worlds, t.facets), [masters, active, pair])
         wp.capture_if(pair.refit_needed, self._refit_tree, ctx=ctx)
-        for group, corners in zip(t.groups, t.corners):
+        for group in t.groups:
             args = [masters, group.data, s["history"]]
             more = [t.reach_distance + overlap_limit, s["attempt"], pair]
             ctx.launch(k.query_boxes, (m.worlds, group.count), [*args, u, active, *more])
@@ -199,7 +201,6 @@ class FacetContact(ContactTerm, Tied, Coupled):
                 overlap_limit,
                 s["attempt"],
                 pair,
-                corners,
             ]
             ctx.launch(k.find_facets, group.point_threads(m.worlds), args)
 
@@ -245,6 +246,21 @@ class FacetContact(ContactTerm, Tied, Coupled):
         for group in self.tables.groups:
             args = [s["other"], group.data, s["u"], flags, s["attempt"]]
             ctx.launch(self.master_kernels.update_friction_shapes, group.point_threads(self.model.worlds), args)
+
+    @cached_property
+    def _edge_columns(self) -> wp.array | None:
+        """First report columns of each contact with a contact of edges, and of that; None: there is none."""
+        terms = self.model.terms.contacts
+        found = [contact for contact in self.model.description.contacts if contact.edges is not None]
+        both = [(term.contact_column(contact), self.contact_column(contact.edges))
+                for contact in found for term in terms if contact in term.tables.contacts]  # fmt: skip
+        return self.model.array("contact", np.array(both), wp.vec2i) if both else None
+
+    def report(self, ctx: StepContext) -> None:
+        super().report(ctx)
+        if self._edge_columns is not None:
+            dim = (self.model.worlds, len(self._edge_columns))
+            ctx.launch(edge_record_kernels().add_edge_records, dim, [self._edge_columns, ctx.work.report])
 
     # in a linear solve
 

@@ -21,6 +21,7 @@ from ..model.contact_points import (
     ContactPoints,
     Modulus,
     body_mass_total,
+    corner_points,
     effective_modulus,
     lagrange_basis,
 )
@@ -264,6 +265,7 @@ class FacetTables(Generic[AnyContact]):
             "area": np.concatenate([p.area for p in parts]).T,
             "contact": np.repeat(chosen, [len(p.conn) for p in parts]),
             "element_depth": np.concatenate([self.contacts[k].own_depths(self.host[k]) for k in chosen]),
+            "corners": np.concatenate([corner_points(p) for p in parts]),
         }
         data.first_entry, data.first_row, data.first_point = pool, self.rows, self.points
         _, data.point_count, acts = kind

@@ -80,6 +80,7 @@ class ContactOptions:
         overlap_time: time in which a stored overlap decays, s.
         seam: largest difference of level of two colliders that is a seam, m, or None.
         index: number in its builder, of contacts of its class.
+        edges: contact of the edges of the touched side (`EdgeContact`), or None.
         sign: 1, or -1 where its points belong to the second of `sides`, as reports state the force on the first.
     """
 
@@ -101,6 +102,7 @@ class ContactOptions:
     overlap_time: float
     seam: float | None
     index: int = -1
+    edges: Any = None
 
     @property
     def surfaces(self) -> tuple[SurfaceSet, ...]:

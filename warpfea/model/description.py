@@ -131,8 +131,9 @@ class Description:
         return out
 
     def contacts_of(self, kind: type[C]) -> list[C]:
-        """Contacts of one class, as `Contact` with colliders or `PairContact` between bodies."""
-        return [contact for contact in self.contacts if isinstance(contact, kind)]
+        """Contacts of one class, as `Contact` with colliders or `PairContact` between bodies, and those of edges."""
+        both = [part for contact in self.contacts for part in (contact, contact.edges)]
+        return [contact for contact in both if isinstance(contact, kind)]
 
     @property
     def contact_pairs(self) -> dict[frozenset[int], list[Any]]:

@@ -48,6 +48,7 @@ class ObstacleContact(FacetOptions):
     name: str
     sign = -1.0
     shadow = 0.25
+    one_sided = True
 
     @property
     def surfaces(self) -> tuple[SurfaceSet, ...]:

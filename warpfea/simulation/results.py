@@ -15,7 +15,7 @@ from ..kernels.contact.structs import RECORD_NAMES
 from ..kernels.step.step_control import REPORT_COLUMNS
 from ..kernels.terms.constraints import JOINT_COLUMNS
 from ..model.bodies import Body
-from ..model.contacts import Contact
+from ..model.contacts import Contact, ContactOptions
 from ..model.handles import NodeSet
 from ..model.joints import Joint
 from ..model.pairs import FacetOptions
@@ -295,7 +295,8 @@ class Records:
 
     def _find_contact(self, contact: Contact | FacetOptions | str) -> tuple[Touching, Any]:
         """Term and handle of a contact."""
-        known = _find("contact", contact, self.model.description.contacts, "a handle from add_contact, or a name")
+        things = self.model.description.contacts_of(ContactOptions)
+        known = _find("contact", contact, things, "a handle from add_contact, or a name")
         return next(term for term in self.model.terms.contacts if known in term.tables.contacts), known
 
 

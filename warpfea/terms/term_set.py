@@ -291,6 +291,9 @@ class TermSet:
             found[0](values, chosen)
             self.parameter_updates += 1
             self.world_updates = self.world_updates + chosen
+            for contact in self.model.description.contacts:
+                if contact.edges is not None and name.startswith(f"{contact.name}."):
+                    self.set_parameter(contact.edges.name + name[len(contact.name) :], values, mask)
             return
         if found:
             raise ModelError(f"set_parameter: {name!r} is a parameter of {len(found)} things of that name; rename one")
