@@ -1,8 +1,8 @@
 """Contact by stages. Points of a surface lie against an other side: rigid shapes ("colliders") or facets of bodies.
 
 Broad phase: boxes of master facets (broad_phase.py), and of a mesh (collider_mesh.py).
-Search: facet of a point (facet_search.py, facet_candidates.py, point_lists.py); deepest position of a single-point
-    contact (deepest_point.py).
+Search: facet of a point (facet_search.py, facet_candidates.py, point_lists.py); edges that cross (edges.py); deepest
+    position of a single-point contact (deepest_point.py).
 Projection: on a facet (projection.py); distance from a shape, and the side (colliders.py, collider_shapes.py); seams
     between shapes (collider_seams.py).
 Kinematics: own side of a point (kinematics.py); the geometry of the other side fills the record `PointContact`

@@ -146,9 +146,10 @@ def contact_kernels(dtype: str, geometry: str, own: OwnLaws = ()) -> KernelSet:
             touched = wp.max(touched, scr.activity[world, first + q])
         f = vec3()
         if touched != INACTIVE:
+            at = k.column(facets, world, item)
             for q in range(lane, facets.point_count, lanes):
                 if scr.activity[world, first + q] != INACTIVE:
-                    f += acting_shape_value(facets, scr, world, q, i, item) * vec3(scr.force[world, first + q])
+                    f += acting_shape_value(facets, scr, world, q, i, item, at) * vec3(scr.force[world, first + q])
         f = lane_sum(f, lanes)
         if lane > 0:
             return
@@ -225,8 +226,9 @@ def contact_kernels(dtype: str, geometry: str, own: OwnLaws = ()) -> KernelSet:
         if active[world] == 0 or scr.facet_activity[world, facets.first_row + item] != WITH_STIFFNESS:
             return
         d = vec3()
+        at = k.column(facets, world, item)
         for i in range(facets.conn.shape[0]):
-            d += acting_shape_value(facets, scr, world, q, i, item) * p[world, facets.conn[i, item]]
+            d += acting_shape_value(facets, scr, world, q, i, item, at) * p[world, facets.conn[i, item]]
         point = facets.first_point + item * facets.point_count + q
         scr.point_product[world, point] = g.other_product(other, scr, p, world, point, d)
 
@@ -245,9 +247,10 @@ def contact_kernels(dtype: str, geometry: str, own: OwnLaws = ()) -> KernelSet:
         if entry < own:
             item = entry % facets.facet_count
             if scr.facet_activity[world, facets.first_row + item] == WITH_STIFFNESS:
+                at = k.column(facets, world, item)
                 for q in range(lane, facets.point_count, lanes):
                     flux = scr.point_product[world, facets.first_point + item * facets.point_count + q]
-                    out += acting_shape_value(facets, scr, world, q, entry / facets.facet_count, item) * flux
+                    out += acting_shape_value(facets, scr, world, q, entry / facets.facet_count, item, at) * flux
         else:
             place = g.other_entries(other) + entry - own
             out = g.gather_other_product(other, scr, world, entry - own, lane, lanes)
@@ -261,8 +264,9 @@ def contact_kernels(dtype: str, geometry: str, own: OwnLaws = ()) -> KernelSet:
         world, item, i = wp.tid()
         out = sym()
         if scr.facet_activity[world, facets.first_row + item] == WITH_STIFFNESS:
+            at = k.column(facets, world, item)
             for q in range(facets.point_count):
-                s = acting_shape_value(facets, scr, world, q, i, item)
+                s = acting_shape_value(facets, scr, world, q, i, item, at)
                 out += s * s * scr.stiffness[world, facets.first_point + item * facets.point_count + q]
         pool[world, facets.first_entry + i * facets.facet_count + item] = out
 
@@ -278,7 +282,7 @@ def block_kernels(dtype: str, listed: bool) -> KernelSet:
     Facets, PointLists = contact_structs(dtype).Facets, point_list_struct()
     Points = PointLists if listed else Facets
     Topology, Pattern = topology_struct(dtype), pattern_struct()
-    add_symmetric = add_symmetric_function(dtype)
+    add_symmetric, k_ = add_symmetric_function(dtype), kinematics_functions(dtype)
     module = kernel_module(f"{'pair' if listed else 'contact'}_blocks_{dtype}", max_unroll=SHORT_UNROLL)
 
     @wp.func
@@ -287,8 +291,9 @@ def block_kernels(dtype: str, listed: bool) -> KernelSet:
     ) -> sym:  # fmt: skip
         """k6 + sum over the points of a facet of s_a s_b K; `weight`: of moving contact points."""
         out = k6
+        at_world = k_.column(facets, world, at[0])
         for q in range(facets.point_count):
-            s = facets.shape[q, at[1], at[0]] * facets.shape[q, at[2], at[0]]
+            s = k_.shape_at(facets, q, at[1], at_world) * k_.shape_at(facets, q, at[2], at_world)
             if facets.tracks_deepest != 0:
                 c = facets.contact[at[0]]
                 s = weight[world, c, at[1]] * weight[world, c, at[2]]

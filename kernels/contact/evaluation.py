@@ -159,7 +159,7 @@ def pair_evaluation_kernels(dtype: str, own: OwnLaws = ()) -> KernelSet:
         if area_fraction == f64(0.0):
             return
         U = other.scratch.displacement
-        x = facets.X[q, item] + k.interpolate(facets, u, world, q, item)
+        x = k.position_at(facets, q, k.column(facets, world, item)) + k.interpolate(facets, u, world, q, item)
         in_contact = his.speed[world, point] > f64(0.0)
         f = wp.int32(-1)
         found = wp.vec4d()
@@ -168,18 +168,29 @@ def pair_evaluation_kernels(dtype: str, own: OwnLaws = ()) -> KernelSet:
             found = inverse_map(other.masters, U, world, f, x, other.history.xi[world, point])
             if found[3] == f64(0.0):
                 f = -1
-        if f < 0:
+        at_edge = k.is_edge(facets, item)
+        if at_edge:
+            f = other.scratch.facet[world, point]
+        elif f < 0:
             found = closest_facet(other.masters, other.scratch, world, other.masters.surface_of[c], x, far)
             f = wp.int32(found[3])
         if f < 0:
             return
         xi = vec3d(found[0], found[1], found[2])
-        projection = f_.project_on_facet(other.masters, U, world, f, xi)
+        base = xi
         t = PointContact()
-        t.normal = projection.normal
-        t.depth = k.activation_gap(con, his, world, c, point, time[world], f64(0.0)) - (
-            xi[2] * projection.gap_slope + projection.gap_offset
-        )
+        if at_edge:  # as `begin_edges` has found it
+            xi = other.scratch.xi[world, point]
+            t.normal = other.scratch.normal[world, point]
+            t.depth = other.scratch.depth[world, point]
+            base = other.scratch.projection[world, point]
+        else:
+            projection = f_.project_on_facet(other.masters, U, world, f, xi)
+            t.normal = projection.normal
+            t.depth = k.activation_gap(con, his, world, c, point, time[world], f64(0.0)) - (
+                xi[2] * projection.gap_slope + projection.gap_offset
+            )
+            base = projection.xi
         t.previous_depth = t.depth
         t.stiffness_ratio = k.stiffness_ratio(con, facets, world, c, item, other.masters.element_depth[f])
         if in_contact:
@@ -197,7 +208,7 @@ def pair_evaluation_kernels(dtype: str, own: OwnLaws = ()) -> KernelSet:
         for i in range(other.masters.conn.shape[0]):
             out.reaction[world, point, i] = (
                 f_.shape_value(other.masters, f, i, xi) * tangential_force
-                - f_.shape_value(other.masters, f, i, projection.xi) * pressed
+                - f_.shape_value(other.masters, f, i, base) * pressed
             )
 
     return kernel_set(locals())

@@ -55,6 +55,7 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
         overlap_limit: f64  # m, > 0: no step; inner points up to that depth are in contact
         height_limit: f64  # largest height above a facet that is considered, m
         outside_depth: f64  # depth at the start of the attempt up to which a point was outside, m
+        sudden_depth: f64  # depth beyond what a step adds, m; in statics none
 
     @wp.struct
     class FacetCandidate:
@@ -82,6 +83,12 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
         return out
 
     @wp.func
+    def deepest_contact(mas: Masters, pair: PairScratch, slave: SlavePoint) -> f64:
+        """Penetration of the bodies' contacts at the start of the attempt, m."""
+        bodies = mas.bodies[slave.contact]
+        return wp.max(pair.deepest_contact[slave.world, bodies[0]], pair.deepest_contact[slave.world, bodies[1]])
+
+    @wp.func
     def slave_point_at(
         con: Contacts, mas: Masters, facets: Facets, his: History, clock: Clock, scr: ContactScratch, pair: PairScratch,
         u: wp.array2d(dtype=vec3d), world: int, item: int, q: int, overlap_limit: f64,
@@ -97,6 +104,9 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
         out.overlap_limit = overlap_limit
         out.height_limit = overlap_limit + overlap + wp.abs(offset) + f64(1.0e-6) * wp.length(out.position)
         out.outside_depth = overlap + mas.touch_depth - wp.min(offset, f64(0.0))
+        out.sudden_depth = f64(MAX_DEPTH_RATIO) * deepest_contact(mas, pair, out)
+        if clock.is_static != 0 or out.sudden_depth == f64(0.0):
+            out.sudden_depth = f64(1.0e300)
         out.anchored = pair.anchor_facet[world, point] > 0
         if out.anchored:
             f = pair.anchor_facet[world, point] - 1
@@ -105,6 +115,11 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
             out.motion = out.displacement - scr.start_displacement[world, point] - change
             out.height_limit += f64(2.0) * wp.abs(xi[2])
         return out
+
+    @wp.func
+    def has_left(mas: Masters, slave: SlavePoint, f: int, xi: vec3d, outside: f64) -> bool:
+        """True if a point in contact is beside a facet and suddenly deep: an edge of the body has passed over it."""
+        return -xi[2] > slave.sudden_depth and outside * mas.side_length[f] > -xi[2]
 
     @wp.func
     def anchor_candidate(mas: Masters, pair: PairScratch, slave: SlavePoint) -> FacetCandidate:
@@ -123,7 +138,7 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
                 found = inverse_map(mas, pair.displacement, world, f, slave.position, facet_centre(corners))
             xi = vec3d(found[0], found[1], found[2])
             o = distance_outside(corners, xi)
-            if found[3] != f64(0.0) and o <= out.outside_distance:
+            if found[3] != f64(0.0) and o <= out.outside_distance and not has_left(mas, slave, f, xi, o):
                 out = FacetCandidate(f, xi, o, o, wp.abs(xi[2]), -1, False, False, False)
         return out
 
@@ -172,7 +187,8 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
     def passed_beside(
         mas: Masters, scr: ContactScratch, pair: PairScratch, slave: SlavePoint, f: int, xi: vec3d
     ) -> bool:
-        """True if a point at `xi` passed the surface of a facet, or was below it at the start, beside the facet."""
+        """True if a point at `xi` passed the surface of a facet, or was below it at the start, beside the facet, or an
+        edge of the facet passed over it."""
         corners = mas.corner_count[mas.facet_kind[f]]
         start = scr.start_position[slave.world, slave.point]
         found = inverse_map(mas, pair.start_displacement, slave.world, f, start, xi)
@@ -181,7 +197,12 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
         if before[2] > f64(0.0):
             part = before[2] / wp.max(before[2] - xi[2], before[2])
         there = before + part * (xi - before)
-        return found[3] != f64(0.0) and distance_outside(corners, there) > f64(BORDER_TOLERANCE)
+        inside = wp.where(xi[0] < xi[1], before[0], before[1])  # of the side that it is beyond now
+        if wp.min(xi[0], xi[1]) >= f64(0.0):
+            last = wp.where(xi[0] > xi[1], before[0], before[1])
+            inside = f64(1.0) - wp.where(corners == 3, before[0] + before[1], last)
+        swept = inside > f64(BORDER_TOLERANCE) and distance_outside(corners, xi) * mas.side_length[f] > -xi[2]
+        return found[3] != f64(0.0) and (swept or distance_outside(corners, there) > f64(BORDER_TOLERANCE))
 
     @wp.func
     def entered_sideways(
@@ -190,9 +211,8 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
         """True if a point is at a facet now, was beside it at the start of the attempt, and was below its plane by at
         most the penetration of the bodies' contact: it slid under the edge of a body that has sunk in."""
         world = slave.world
-        bodies = mas.bodies[slave.contact]
         kind = mas.facet_kind[f]
-        most = wp.max(pair.deepest_contact[world, bodies[0]], pair.deepest_contact[world, bodies[1]])
+        most = deepest_contact(mas, pair, slave)
         depth = scr.activation_gap[world, slave.point] - gap
         if depth > wp.min(f64(MAX_DEPTH_RATIO) * most, f64(TUNNEL_LIMIT_RATIO) * mas.depth_limit[f]):
             return False
@@ -275,6 +295,8 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
             slack = edge_margin(mas, f, xi)
         most = wp.min(wp.max(candidate.outside_distance, slack), f64(OUTSIDE_TOLERANCE))
         if found[3] == f64(0.0) or beyond > most:
+            return out
+        if slave.anchored and has_left(mas, slave, f, xi, beyond):
             return out
         rank = candidate_rank(mas, scr, pair, slave, f, xi)
         if rank < 0:

@@ -39,8 +39,9 @@ def facet_kinematics(dtype: str) -> KernelSet:
         u_n: wp.array2d(dtype=vec3), v_n: wp.array2d(dtype=vec3), world: int, item: int, q: int,
     ):  # fmt: skip
         """Start position of a point; depth and approach speed of one in contact."""
-        search.begin_point(con, other.masters, facets, his, other.history, clock, scr, other.scratch, u_n, v_n,
-                           search.slave_point(facets, world, item, q))  # fmt: skip
+        if not k.is_edge(facets, item):
+            search.begin_point(con, other.masters, facets, his, other.history, clock, scr, other.scratch, u_n, v_n,
+                               search.slave_point(facets, world, item, q))  # fmt: skip
 
     @wp.func
     def start_motion(
@@ -69,7 +70,7 @@ def facet_kinematics(dtype: str) -> KernelSet:
             out.state = wp.where(f == PENETRATED and con.is_explicit[facets.contact[item]] == 0, PASSED, FREE)
             return out
         out.state = IN_REACH
-        out.position = facets.X[q, item] + k.interpolate(facets, u, world, q, item)
+        out.position = k.position_at(facets, q, k.column(facets, world, item)) + k.interpolate(facets, u, world, q, item)
         out.normal = other.scratch.normal[world, point]
         out.depth = other.scratch.depth[world, point]
         out.previous_depth = other.scratch.initial_depth[world, point]
@@ -84,7 +85,7 @@ def facet_kinematics(dtype: str) -> KernelSet:
         point: int, f: int,
     ) -> vec3d:  # fmt: skip
         """Displacement of a point relative to a facet, by the frozen shape values."""
-        out = k.interpolate(facets, u, world, q, item)
+        out = k.interpolate_at(facets, u, world, q, item, k.frozen_column(facets, world, item))
         for i in range(mas.conn.shape[0]):
             out -= f64(pair.friction_shape[world, point, i]) * vec3d(u[world, mas.conn[i, f]])
         return out
@@ -118,7 +119,10 @@ def facet_kinematics(dtype: str) -> KernelSet:
         out = t
         if wp.dot(scr.frozen_normal[world, point], t.normal) <= f64(0.5):
             scr.frozen_normal[world, point] = t.normal  # the point has passed to another facet since
-        set_master_shapes(other.masters, other.scratch, world, point, t.feature, fresh != 0 or limit <= f64(0.0))
+        renew = fresh != 0 or limit <= f64(0.0)
+        set_master_shapes(other.masters, other.scratch, world, point, t.feature, renew)
+        if renew:
+            k.freeze_shape(facets, world, q, item)
         if fresh != 0:
             freeze_friction_shapes(other.masters, facets, other.scratch, u, world, q, item, point, t.feature)
         if limit > f64(0.0):
@@ -148,10 +152,11 @@ def facet_kinematics(dtype: str) -> KernelSet:
         B = wp.mat22d(b[0], b[2], b[2], b[1])
         M = A - gap * B
         det = wp.determinant(M)
+        at_edge = wp.dot(n, f_.unit_normal(s)) < f64(0.99)
         pair.geometric_tangent[world, point, 0] = vec3()
         pair.geometric_tangent[world, point, 1] = vec3()
         pair.geometric_curvature[world, point] = sym()
-        if force <= f64(0.0) or det <= f64(0.1) * wp.determinant(A):
+        if force <= f64(0.0) or at_edge or det <= f64(0.1) * wp.determinant(A):
             return  # no projection beyond the centre of curvature
         m = force * wp.inverse(M)
         pair.geometric_tangent[world, point, 0] = vec3(m[0, 0] * ta + m[0, 1] * tb)
@@ -286,6 +291,7 @@ def master_kernels(dtype: str) -> KernelSet:
     Other = facet_side_struct(dtype)
     lane_sum, shape_value = lane_functions(dtype).lane_sum, facet_projection_functions(dtype).shape_value
     freeze_friction_shapes = facet_kinematics(dtype).freeze_friction_shapes
+    freeze_shape = kinematics_functions(dtype).freeze_shape
     module = kernel_module(f"master_facets_{dtype}", max_unroll=SHORT_UNROLL)
 
     @wp.kernel(module=module)
@@ -301,6 +307,7 @@ def master_kernels(dtype: str) -> KernelSet:
         xi = other.scratch.friction_xi[world, point]
         for i in range(other.masters.conn.shape[0]):
             other.scratch.friction_shape[world, point, i] = T(shape_value(other.masters, f, i, xi))
+        freeze_shape(facets, world, q, item)
         freeze_friction_shapes(other.masters, facets, other.scratch, u, world, q, item, point, f)
 
     @masked_kernel(module, "active")

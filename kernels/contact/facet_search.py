@@ -111,6 +111,8 @@ def facet_search_kernels(dtype: str) -> KernelSet:
         """Flag slave facets with a master facet's box nearby; for the others store the box without master facets."""
         world, item = wp.tid()
         row = facets.first_row + item
+        if k.is_edge(facets, item):
+            return
         low = vec3d(f64(1.0e300), f64(1.0e300), f64(1.0e300))
         high = -low
         inside = f64(0.0)
@@ -225,6 +227,8 @@ def facet_search_kernels(dtype: str) -> KernelSet:
         """Facet of each point at an iterate. `overlap_limit` > 0: no step; inner points up to that depth, m, are in
         contact."""
         world, item, q = wp.tid()
+        if k.is_edge(facets, item):
+            return
         point = facets.first_point + item * facets.point_count + q
         leaving = pair.facet[world, point] == LEAVING
         pair.facet[world, point] = -1

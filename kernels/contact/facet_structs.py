@@ -7,6 +7,7 @@ import warp as wp
 from ..common.types import precision
 
 __all__ = [
+    "edge_struct",
     "facet_field_struct",
     "facet_side_struct",
     "master_struct",
@@ -55,10 +56,29 @@ def master_struct(dtype: str):
         )  # [facet] depth beyond which a point would leave through the opposite side, m
         side_length: wp.array(dtype=wp.float64)  # [facet] length of a side, m
         surface: wp.array(dtype=wp.int32)  # [facet] its master surface
+        half_angle: wp.array2d(dtype=wp.float64)  # [side, facet] between the normals at a sharp edge, 0: none, rad
         first_entry: wp.int32  # first entry in the pool of terms
         facet_count: wp.int32
 
     return Masters
+
+
+@functools.cache
+def edge_struct(dtype: str):
+    """Sharp edges of slave facets, as cubics of a place t from 0 to 1, see edges.py."""
+    T = precision(dtype).T
+
+    @wp.struct
+    class Edges:
+        row: wp.array(dtype=wp.int32)  # [edge] row of its point among the facets of its group
+        number: wp.array(dtype=wp.int32)  # number among the points of that row
+        owner: wp.array(dtype=wp.int32)  # facet of the group that it is a side of
+        half_angle: wp.array(dtype=wp.float64)  # between the normals of both facets, rad
+        shape: wp.array4d(dtype=T)  # [0: position, 1: vector into the facet; power of t, local, edge]
+        X: wp.array3d(dtype=wp.vec3d)  # [0 or 1, power of t, edge] in the reference, m
+        edge_count: wp.int32
+
+    return Edges
 
 
 @functools.cache

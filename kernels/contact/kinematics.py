@@ -51,19 +51,68 @@ def kinematics_functions(dtype: str) -> KernelSet:
     Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)
 
     @wp.func
-    def interpolate(facets: Facets, field: wp.array2d(dtype=Any), world: int, point: int, item: int) -> vec3d:
-        """sum_i s_i field_i at a point."""
+    def is_edge(facets: Facets, item: int) -> bool:
+        """True for a row of points on sharp edges."""
+        return facets.edge_rows > 0 and facets.edge_row[item] >= 0
+
+    @wp.func
+    def column(facets: Facets, world: int, item: int) -> int:
+        """Column of the shape values and positions of a facet; points on edges have one for each world."""
+        if not is_edge(facets, item):
+            return item
+        return facets.facet_count + world * facets.edge_rows + facets.edge_row[item]
+
+    @wp.func
+    def frozen_column(facets: Facets, world: int, item: int) -> int:
+        """Column of the shape values by which friction acts: those of points on edges are frozen with its limit."""
+        if not is_edge(facets, item):
+            return item
+        return column(facets, world, item) + facets.edge_shape.shape[2] / 2
+
+    @wp.func
+    def shape_at(facets: Facets, point: int, i: int, at: int) -> T:
+        """Shape value of slot i at a point, in column `at`."""
+        if at < facets.facet_count:
+            return facets.shape[point, i, at]
+        return facets.edge_shape[point, i, at - facets.facet_count]
+
+    @wp.func
+    def position_at(facets: Facets, point: int, at: int) -> vec3d:
+        """Reference position of a point, m, in column `at`."""
+        if at < facets.facet_count:
+            return facets.X[point, at]
+        return facets.edge_X[point, at - facets.facet_count]
+
+    @wp.func
+    def freeze_shape(facets: Facets, world: int, point: int, item: int):
+        """Freeze the shape values of a point on an edge."""
+        if is_edge(facets, item):
+            for i in range(facets.conn.shape[0]):
+                value = shape_at(facets, point, i, column(facets, world, item))
+                facets.edge_shape[point, i, frozen_column(facets, world, item) - facets.facet_count] = value
+
+    @wp.func
+    def interpolate_at(
+        facets: Facets, field: wp.array2d(dtype=Any), world: int, point: int, item: int, at: int
+    ) -> vec3d:  # fmt: skip
+        """sum_i s_i field_i by the shape values of a column."""
         out = vec3d()
         for i in range(facets.conn.shape[0]):
-            out += f64(facets.shape[point, i, item]) * vec3d(field[world, facets.conn[i, item]])
+            out += f64(shape_at(facets, point, i, at)) * vec3d(field[world, facets.conn[i, item]])
         return out
 
     @wp.func
-    def acting_shape_value(facets: Facets, scr: ContactScratch, world: int, point: int, i: int, item: int) -> T:
-        """Shape value of slot i at the active point: a point of a facet, or that of a lumped contact."""
+    def interpolate(facets: Facets, field: wp.array2d(dtype=Any), world: int, point: int, item: int) -> vec3d:
+        """sum_i s_i field_i at a point."""
+        return interpolate_at(facets, field, world, point, item, column(facets, world, item))
+
+    @wp.func
+    def acting_shape_value(facets: Facets, scr: ContactScratch, world: int, point: int, i: int, item: int, at: int) -> T:
+        """Shape value of slot i at the active point: a point of a facet with values in column `at`, or that of a lumped
+        contact."""
         if facets.tracks_deepest != 0:
             return scr.shape_values[world, facets.contact[item], i]
-        return facets.shape[point, i, item]
+        return shape_at(facets, point, i, at)
 
     @wp.func
     def interpolate_acting(
@@ -74,7 +123,7 @@ def kinematics_functions(dtype: str) -> KernelSet:
             return interpolate(facets, field, world, point, item)
         out = vec3d()
         for i in range(facets.conn.shape[0]):
-            out += f64(acting_shape_value(facets, scr, world, point, i, item)) * vec3d(
+            out += f64(acting_shape_value(facets, scr, world, point, i, item, item)) * vec3d(
                 field[world, facets.conn[i, item]]
             )
         return out

@@ -23,7 +23,8 @@ def pair_midpoint_kernels(dtype: str) -> KernelSet:
     """Kernels in one precision of the displacements."""
     Masters, PairScratch = master_struct(dtype), pair_scratch_struct(dtype)
     Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)
-    f_, interpolate = facet_projection_functions(dtype), kinematics_functions(dtype).interpolate
+    f_, k = facet_projection_functions(dtype), kinematics_functions(dtype)
+    interpolate, is_edge = k.interpolate, k.is_edge
     inverse_map, project_on_facet = f_.inverse_map, f_.project_on_facet
     module = kernel_module(f"pair_midpoint_{dtype}", max_unroll=SHORT_UNROLL)
 
@@ -46,13 +47,17 @@ def pair_midpoint_kernels(dtype: str) -> KernelSet:
         f = pair.facet[world, point]
         if f < 0:
             return
-        end = facets.X[q, item] + interpolate(facets, u, world, q, item)
+        end = k.position_at(facets, q, k.column(facets, world, item)) + interpolate(facets, u, world, q, item)
         x = f64(0.5) * (scr.start_position[world, point] + end)
         found = inverse_map(mas, pair.middle_displacement, world, f, x, pair.xi[world, point])
         pair.friction_xi[world, point] = pair.xi[world, point]
         if found[3] == f64(0.0):
             return
         xi = vec3d(found[0], found[1], found[2])
+        if is_edge(facets, item):
+            pair.friction_xi[world, point] = xi
+            pair.projection[world, point] = xi
+            return
         projection = project_on_facet(mas, pair.middle_displacement, world, f, xi)
         pair.friction_xi[world, point] = xi
         pair.projection[world, point] = projection.xi

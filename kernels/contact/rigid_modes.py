@@ -8,6 +8,7 @@ from ..common.modules import SHORT_UNROLL, KernelSet, kernel_module, kernel_set,
 from ..common.rigid import RIGID_MODES, bodies_struct, rigid_mode_functions
 from ..common.types import f64, mat33d, precision
 from .facet_structs import master_struct
+from .kinematics import kinematics_functions
 from .structs import facet_struct
 
 __all__ = ["pair_rigid_mode_kernels"]
@@ -19,7 +20,7 @@ def pair_rigid_mode_kernels(dtype: str) -> KernelSet:
     p = precision(dtype)
     T, sym = p.T, p.sym
     Bodies, Masters, Facets = bodies_struct(dtype), master_struct(dtype), facet_struct(dtype)
-    rigid = rigid_mode_functions(dtype)
+    rigid, k_ = rigid_mode_functions(dtype), kinematics_functions(dtype)
     module = kernel_module(f"pair_rigid_modes_{dtype}", max_unroll=SHORT_UNROLL)
 
     @masked_kernel(module, "active")
@@ -49,7 +50,7 @@ def pair_rigid_mode_kernels(dtype: str) -> KernelSet:
                 sm = mat33d()
                 st = mat33d()
                 for i in range(facets.conn.shape[0]):
-                    s = f64(facets.shape[q, i, item])
+                    s = f64(k_.shape_at(facets, q, i, k_.column(facets, world, item)))
                     sm += s * rigid.translation_columns(bodies, a, facets.conn[i, item])
                     st += s * rigid.rotation_columns(bodies, world, a, facets.conn[i, item])
                 om = mat33d()

@@ -152,6 +152,10 @@ def facet_struct(dtype: str):
         )  # [point] on the unit triangle or square; with the next two: lumped contacts
         lagrange_coefficients: wp.array2d(dtype=wp.float64)  # [point, monomial] Lagrange polynomials of the points
         exponents: wp.array(dtype=wp.vec2i)  # [monomial] exponents
+        edge_rows: wp.int32  # number of rows of points on sharp edges, which move along them
+        edge_row: wp.array(dtype=wp.int32)  # [facet] number among them, or -1
+        edge_shape: wp.array3d(dtype=T)  # [point, local, column - facet_count] shape values, see `column`
+        edge_X: wp.array2d(dtype=wp.vec3d)  # [point, column - facet_count] reference position, m
 
     return Facets
 

@@ -71,6 +71,14 @@ class PairEvaluation:
         for world, point in zip(*np.nonzero(self.force.any(axis=2))):
             slots = t.master_conn[self.facet[world, point]]
             np.add.at(out[world], slots, self.reaction[world, point])
+        for group, edges in t.edge_groups:
+            data, rows = group.data, np.flatnonzero(group.data.edge_row.numpy() >= 0)
+            shape = data.edge_shape.numpy()
+            shape = shape.reshape(*shape.shape[:2], 2, len(out), len(rows))[:, :, 0]
+            last = data.first_point + group.count * data.point_count
+            force = self.force[:, data.first_point : last].reshape(len(out), group.count, -1, 3)[:, rows]
+            for world, at_slot in enumerate(np.einsum("plbr,brpk->brlk", shape, force)):
+                np.add.at(out[world], group.conn[rows], at_slot)
         return out
 
     def contact_points(self, body: Any) -> list[BodyContactPoints]:
@@ -186,12 +194,24 @@ def evaluate_pairs(term: Any, state: State) -> PairEvaluation:
     launch(term.search_kernels.update_coefficients, dim, [masters, at.u, at.all_worlds, pair])
     launch(term.search_kernels.check_boxes, (B, t.facets), [masters, at.all_worlds, pair])
     tree = wp.Bvh(pair.refit_lower, pair.refit_upper, groups=t.box_groups)
+    if t.edge_groups:
+        clock, attempt = clock_struct()(), contact_scratch_struct(m.dtype)()
+        clock.time = state.time
+        arrays = dict.fromkeys(("facet", "anchor_facet"), ((B, t.points), wp.int32)) | {"depth": ((B, t.points), wp.float64)}
+        arrays |= dict.fromkeys(("xi", "projection", "normal", "anchor_xi"), ((B, t.points), wp.vec3d))
+        arrays |= {"anchor_gap": ((B, t.points), wp.vec2d), "deepest_contact": ((B, len(t.bodies)), wp.float64)}
+        at.fields(pair, arrays)
+        names = ("start_depth", "approach_speed", "activation_gap")
+        at.fields(attempt, dict.fromkeys(names, ((B, t.points), wp.float64)))
     other = facet_side_struct(m.dtype)()
     other.masters, other.history, other.scratch = t.master_data(tree.id), term.make_pair_history(at.stored), pair
     P, L = t.points, t.master_conn.shape[1]
     arrays = dict.fromkeys(("gap", "normal"), ((B, P), wp.float64)) | dict.fromkeys(("force", "xi"), ((B, P), wp.vec3d))
     arrays |= {"facet": ((B, P), wp.int32), "reaction": ((B, P, L), wp.vec3d)}
     found = at.fields(pair_results_struct()(), arrays)
+    for group, edges in t.edge_groups:
+        args = [t.data, other.masters, edges, group.data, history, other.history, clock, state.displacement]
+        launch(term.edge_kernels.begin_edges, (B, edges.edge_count), [*args, at.all_worlds, attempt, pair])
     for group in t.groups:
         args = [t.data, other, group.data, history, state.time, at.u, t.max_gap]
         args += [contact_scratch_struct(m.dtype)(), found]

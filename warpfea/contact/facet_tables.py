@@ -10,10 +10,11 @@ import numpy as np
 import warp as wp
 
 from ..base.errors import ModelError
-from ..kernels.contact.facet_structs import master_struct
+from ..kernels.contact.facet_structs import edge_struct, master_struct
 from ..kernels.contact.structs import contact_struct
-from ..model.contact_points import element_depths
+from ..model.contact_points import element_depths, element_edge_and_depth
 from ..model.contacts import Collider, Contact
+from ..model.edges import Edges, edge_places, with_edges
 from ..model.handles import SurfaceSet
 from ..model.pairs import (
     FacetOptions,
@@ -22,7 +23,7 @@ from ..model.pairs import (
     master_facets,
     monomial_exponents,
 )
-from .tables import TOUCHING_DEPTH_RATIO, WORLD_PARAMETERS, FacetTables, clamped_slots
+from .tables import TOUCHING_DEPTH_RATIO, WORLD_PARAMETERS, FacetGroup, FacetTables, clamped_slots
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -64,8 +65,61 @@ class PairTables(FacetTables[FacetOptions]):
         self.masters: list[MasterFacets] = [master_facets(surface) for surface in self.surfaces]
         self._check_clamped()
         self.area_fractions = [f * p.area / area for f, p, area in zip(self.factors, self.host, self.region_areas)]
+        self.edges = [contact.sharp_edges() for contact in self.contacts]
+        for k, edges in enumerate(self.edges):
+            if edges is not None:
+                self._add_edges(k, edges)
         self.facets = sum(len(m.conn) for m in self.masters)
         self.bodies = sorted({surface.body.index for c in self.contacts for surface in c.surfaces})
+        self.edge_data: list[Any] = []
+
+    def _add_edges(self, k: int, edges: Edges) -> None:
+        """Add the rows of a contact's edges: the area of each is that with the stiffness of both elements' depths."""
+        count, p = len(self.host[k].conn), with_edges(self.host[k], edges)
+        row, number = edge_places(edges, p.area.shape[1])
+        fraction = np.zeros_like(p.area)
+        fraction[:count] = self.area_fractions[k]
+        sharp = self.masters[self.master_of[k]].half_angle.any(axis=0)
+        other = float(element_edge_and_depth(self.surfaces[self.master_of[k]])[1][sharp].min())
+        fraction[count + row, number] = edges.depth * other / self.region_areas[k]
+        self.host[k], self.area_fractions[k] = p, fraction
+
+    def _edge_rows(self, chosen: list[int]) -> dict[str, Any]:
+        sizes = [len(self.host[k].conn) for k in chosen]
+        begin = np.cumsum(sizes) - sizes
+        parts, item, number, owner = [], [], [], []
+        for start, size, k in zip(begin, sizes, chosen):
+            edges = self.edges[k]
+            if edges is not None:
+                row, place = edge_places(edges, self.host[k].area.shape[1])
+                parts.append(edges)
+                item.append(start + size - row[-1] - 1 + row)
+                number.append(place)
+                owner.append(start + edges.facet)
+        if not parts:
+            self.edge_data.append(None)
+            return {}
+        rows, data, width = np.unique(np.concatenate(item)), edge_struct(self.model.dtype)(), self.host[chosen[0]].conn.shape[1]
+        edge_row, count = np.full(sum(sizes), -1), self.host[chosen[0]].area.shape[1]
+        edge_row[rows] = np.arange(len(rows))
+        self.model.memory.fill(
+            data, "contact", row=np.concatenate(item), number=np.concatenate(number), owner=np.concatenate(owner),
+            half_angle=np.concatenate([e.half_angle for e in parts]), edge_count=sum(len(e.facet) for e in parts),
+            shape=np.concatenate([np.pad(e.shape, ((0, 0), (0, 0), (0, width - e.shape.shape[2]), (0, 0))) for e in parts],
+                                 axis=3),
+            X=np.concatenate([e.X for e in parts], axis=2),
+        )  # fmt: skip
+        self.edge_data.append(data)
+        columns = 2 * len(rows) * self.model.worlds  # and those of friction
+        return {
+            "edge_rows": len(rows), "edge_row": edge_row, "edge_shape": np.zeros((count, width, columns)),
+            "edge_X": np.zeros((count, columns, 3)),
+        }  # fmt: skip
+
+    @property
+    def edge_groups(self) -> list[tuple[FacetGroup, Any]]:
+        """Groups of facets with edges, and these."""
+        return [(group, edges) for group, edges in zip(self.groups, self.edge_data) if edges is not None]
 
     def _check_clamped(self) -> None:
         """Raise ModelError for a contact whose slots are all clamped."""
@@ -185,6 +239,7 @@ class PairTables(FacetTables[FacetOptions]):
                 "element_depth": np.concatenate([element_depths(s) for s in self.surfaces]),
                 "side_length": concatenated("size"),
                 "surface": np.repeat(np.arange(len(counts)), counts),
+                "half_angle": np.concatenate([mas.half_angle for mas in all_of], axis=1),
                 "max_monomials": most,
                 "surface_count": len(self.surfaces),
                 "touch_depth": TOUCHING_DEPTH_RATIO * self.size,

@@ -14,6 +14,7 @@ from ..base.worlds import device_flags
 from ..kernels.common.state import state_kernels
 from ..kernels.contact.assembly import block_kernels
 from ..kernels.contact.edge_records import edge_record_kernels
+from ..kernels.contact.edges import edge_kernels
 from ..kernels.contact.facet_kinematics import master_kernels
 from ..kernels.contact.facet_search import facet_search_kernels
 from ..kernels.contact.facet_structs import (
@@ -59,6 +60,7 @@ class FacetContact(ContactTerm, Tied, Coupled):
         self.master_kernels = master_kernels(model.dtype)
         self.point_list_kernels = point_list_kernels(model.dtype)
         self.midpoint_kernels = pair_midpoint_kernels(model.dtype)
+        self.edge_kernels = edge_kernels(model.dtype)
 
     @classmethod
     def features(cls, model: Model) -> dict[str, bool]:
@@ -137,6 +139,7 @@ class FacetContact(ContactTerm, Tied, Coupled):
         own = [self.search_kernels, self.master_kernels, self.point_list_kernels]
         own += [self.midpoint_kernels] if ctx.midpoint else []
         own += [edge_record_kernels()] if self._edge_columns is not None else []
+        own += [self.edge_kernels] if self.tables.edge_groups else []
         return [*super().modules(ctx), *(kernels.module for kernels in own)]
 
     def start(self, ctx: StepContext, active: wp.array) -> None:
@@ -172,6 +175,10 @@ class FacetContact(ContactTerm, Tied, Coupled):
         dim = (self.model.worlds, self.tables.facets, s["masters"].max_monomials)
         args = [s["masters"], state.displacement, state.velocity, active, s["pair"]]
         ctx.launch(self.search_kernels.initial_coefficients, dim, args)
+        for group, edges in self.tables.edge_groups:
+            args = [self.tables.data, s["masters"], edges, group.data, s["history"], s["other"].history, s["clock"]]
+            args += [state.displacement, active, s["attempt"], s["pair"]]
+            ctx.launch(self.edge_kernels.begin_edges, (self.model.worlds, edges.edge_count), args)
 
     def _refit_tree(self, ctx: StepContext) -> None:
         s = ctx.scratch[self.name]
@@ -203,6 +210,10 @@ class FacetContact(ContactTerm, Tied, Coupled):
                 pair,
             ]
             ctx.launch(k.find_facets, group.point_threads(m.worlds), args)
+        for group, edges in t.edge_groups if overlap_limit == 0.0 else ():
+            args = [t.data, masters, edges, group.data, s["history"], s["clock"], ctx.state.displacement]
+            args += [ctx.state.velocity, u, active, s["attempt"], pair]
+            ctx.launch(self.edge_kernels.find_edges, (m.worlds, edges.edge_count), args)
 
     def _find_other(self, ctx: StepContext, active: wp.array, *, fresh: int) -> None:
         if ctx.positions_changed:
@@ -226,6 +237,10 @@ class FacetContact(ContactTerm, Tied, Coupled):
         dim = (self.model.worlds, ctx.launch.padded(lanes * self.tables.other_entries))
         args = [s["other"], active, lanes, s["attempt"], ctx.work.pool_force]
         ctx.launch(self.master_kernels.gather_master_forces, dim, args)
+        for group, edges in self.tables.edge_groups:
+            args = [edges, group.data, active, s["attempt"], s["pair"], ctx.work.pool_force]
+            dim = (self.model.worlds, edges.edge_count, group.conn.shape[1])
+            ctx.launch(self.edge_kernels.move_friction, dim, args)
 
     def _build_point_lists(self, ctx: StepContext) -> None:
         """Build the point lists of the master facets."""

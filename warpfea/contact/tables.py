@@ -261,6 +261,7 @@ class FacetTables(Generic[AnyContact]):
             "conn": conn.T,
             "shape": np.moveaxis(np.concatenate([p.shape for p in parts]), 0, 2),
             "X": np.swapaxes(np.concatenate([p.X for p in parts]), 0, 1),
+            **self._edge_rows(chosen),
             "area_fraction": np.concatenate([self.area_fractions[k] for k in chosen]).T,
             "area": np.concatenate([p.area for p in parts]).T,
             "contact": np.repeat(chosen, [len(p.conn) for p in parts]),
@@ -280,6 +281,10 @@ class FacetTables(Generic[AnyContact]):
             tables |= {"point_coords": points, "lagrange_coefficients": basis, "exponents": power}
         m.memory.fill(data, "contact", **tables)
         return FacetGroup(conn, data, acts != PATCH, chosen)
+
+    def _edge_rows(self, chosen: list[int]) -> dict[str, Any]:
+        """Fields of the rows of points on edges, of the chosen contacts."""
+        return {}
 
     def law_constants(self, contact: AnyContact, world: int | None = None) -> dict[str, Any]:
         """Constants `MATERIAL_CONSTANTS` of a contact, as built or in one world."""

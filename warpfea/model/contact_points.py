@@ -61,6 +61,7 @@ class ContactPoints:
         X: (F, P, 3) reference positions, m.
         normal: (F, P, 3) outward unit normals in the reference; 0 for degenerate faces.
         faces: (F, 2) rows (element, local face).
+        rows: of the surface; by default all, else those of points on its edges follow.
     """
 
     conn: np.ndarray
@@ -69,6 +70,7 @@ class ContactPoints:
     X: np.ndarray
     normal: np.ndarray
     faces: np.ndarray
+    rows: Any = ...
 
 
 def contact_points(surface: SurfaceSet, points: int | None = None) -> ContactPoints:

@@ -134,7 +134,7 @@ class ContactOptions:
 
     def own_depths(self, points: ContactPoints) -> np.ndarray:
         """(F,) depths of the elements behind the faces of its points, m."""
-        return element_depths(self.surfaces[0])
+        return np.asarray(element_depths(self.surfaces[0])[points.rows])
 
     @property
     def grounded(self) -> bool:

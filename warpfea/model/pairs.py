@@ -17,6 +17,7 @@ from . import assembly
 from .contact_points import ContactPoints, effective_modulus, points_by_faces, points_by_rules, rules_of_faces
 from .contacts import ContactOptions
 from .discretisation import element_functions
+from .edges import Edges, edges_of, parts_of, sharp_sides
 from .handles import SurfaceSet
 from .narrow import body_widths, facet_size, is_narrow, rules_for_width
 from .surfaces import measure_to_skin
@@ -68,6 +69,10 @@ class FacetOptions(ContactOptions):
         """The surface whose facets are touched."""
         return self.surfaces[-1]
 
+    def sharp_edges(self) -> Edges | None:
+        """Edges of the points' side that see edges of the other one."""
+        return None
+
 
 @dataclass(eq=False)
 class PairContact(FacetOptions):
@@ -97,6 +102,13 @@ class PairContact(FacetOptions):
     def slave_points(self) -> tuple[ContactPoints, Any]:
         return pair_points(self.slave, self.points, self.width), 1.0
 
+    def sharp_edges(self) -> Edges | None:
+        """Sharp edges of the slave, if the master has some too and the stiffness is that of the elements."""
+        if self.stiffness_of != "elements" or self.model != "patch" or self.treatment != "implicit":
+            return None
+        edges = parts_of(edges_of(self.slave), body_widths(self.master.body)[0])
+        return edges if len(edges.facet) and sharp_sides(self.master).any() else None
+
     @property
     def sign(self) -> float:
         """As of `ContactOptions`."""
@@ -119,6 +131,7 @@ class MasterFacets:
         corners, degree: 3 or 4, of each facet; of the polynomials.
         size: (F,) length of a side, m.
         depth_limit: (F,) half the thickness of the body behind it, m.
+        half_angle: (4, F) of `sharp_sides`.
     """
 
     conn: np.ndarray
@@ -130,6 +143,7 @@ class MasterFacets:
     degree: int
     size: np.ndarray
     depth_limit: np.ndarray
+    half_angle: np.ndarray
 
 
 def pair_points(surface: SurfaceSet, points: int | None = None, width: float | None = None) -> ContactPoints:
@@ -278,8 +292,9 @@ def master_facets(surface: SurfaceSet) -> MasterFacets:
     X = np.einsum("mq,fqk->fmk", inverse, positions)
     N = np.einsum("fms,fsk->fmk", director_shape, e)
     return MasterFacets(
-        conn, shape, director_shape, X, N, corners, degree, np.sqrt(area), 0.5 * facet_thickness(surface)
-    )
+        conn, shape, director_shape, X, N, corners, degree, np.sqrt(area), 0.5 * facet_thickness(surface),
+        sharp_sides(surface),
+    )  # fmt: skip
 
 
 def facet_thickness(surface: SurfaceSet) -> np.ndarray:

@@ -1,0 +1,134 @@
+"""Sharp convex edges of the facets of a surface, which can meet those of another body; see kernels/contact/edges.py."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..elements import Rule
+from ..kernels.contact.edges import EDGE_MARGIN
+from .assembly import facet_tables
+from .contact_points import ContactPoints, element_edge_and_depth
+from .handles import SurfaceSet
+
+__all__ = ["Edges", "edges_of", "sharp_sides", "with_edges"]
+
+SIDES = {3: ((0, 0), (1, 0), (0, 1)), 4: ((0, 0), (1, 0), (1, 1), (0, 1))}
+"""Corners of a facet, anticlockwise: a side goes from each one to the next."""
+INWARD = {3: ((0, 1), (-1, -1), (1, 0)), 4: ((0, 1), (-1, 0), (0, -1), (1, 0))}
+"""Vector from each side into the facet."""
+
+
+@dataclass(frozen=True, eq=False)
+class Edges:
+    """Sharp edges of a surface, each a side of one of its facets, as cubics of a place from 0 to 1.
+
+    Attributes:
+        facet, side: (E,) of the surface. half_angle: (E,) between the normals on both sides of it, rad.
+        depth: (E,) least depth of the elements behind both, m.
+        shape: (2, 4, L, E) coefficients of the functions of the facet's slots, X: (2, 4, E, 3) of the position, m, and
+            of a vector into the facet.
+    """
+
+    facet: np.ndarray
+    side: np.ndarray
+    half_angle: np.ndarray
+    depth: np.ndarray
+    shape: np.ndarray
+    X: np.ndarray
+
+
+def edges_of(surface: SurfaceSet) -> Edges:
+    """Sharp edges of a surface: convex ones between two facets with more than twice `EDGE_MARGIN` to either side."""
+    family, kind = surface.body.family, surface.faces[:, 1]
+    corners = {int(face): len(family.faces[face]) for face in np.unique(kind)}
+    places = np.array([0.0, 1.0 / 3.0, 0.5, 2.0 / 3.0, 1.0])
+    rules = {}
+    for face, n in corners.items():
+        c = np.array(SIDES[n], dtype=float)
+        points = (c[:, None] + places[:, None] * (np.roll(c, -1, axis=0) - c)[:, None]).reshape(-1, 2)
+        rules[face] = Rule("sides", points, np.ones(len(points)), 1)
+    t = facet_tables(surface, rules=rules)
+    most = t.shape.shape[1] // 5
+    sides = np.array([corners[int(face)] for face in kind])
+    facet, side = np.nonzero(np.arange(most) < sides[:, None])
+    inward = np.array([INWARD[n][k] for n, k in zip(sides[facet], side)], dtype=float).reshape(-1, 2)
+    along = np.array([np.subtract(SIDES[n][(k + 1) % n], SIDES[n][k]) for n, k in zip(sides[facet], side)])
+    rows = facet[:, None], 5 * side[:, None] + np.arange(5)
+    shape, d_a, d_b = t.shape[rows], t.d_a[rows], t.d_b[rows]
+    way = [v[:, 0, None, None] * d_a + v[:, 1, None, None] * d_b for v in (inward, along)]
+    e = surface.body.reference[t.conn[facet]]
+    x, into, tangent = (np.einsum("eqi,eik->eqk", s, e)[:, 2] for s in (shape, *way))
+    normal = np.cross(tangent, into)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    key = np.round(x / (1e-7 * np.ptp(x, axis=0).max())).astype(np.int64)
+    _, first, number, count = np.unique(key, axis=0, return_index=True, return_inverse=True, return_counts=True)
+    order = np.argsort(number.ravel(), kind="stable")
+    start = np.cumsum(count) - count
+    a, b = order[start[count == 2]], order[start[count == 2] + 1]
+    half = 0.5 * np.arccos(np.clip(np.einsum("ek,ek->e", normal[a], normal[b]), -1.0, 1.0))
+    sharp = (half > 2.0 * EDGE_MARGIN) & (np.einsum("ek,ek->e", into[a], normal[b]) < 0.0)
+    a, b = owners(facet, a[sharp], b[sharp])
+    order = np.lexsort((side[a], facet[a]))
+    a, b, half = a[order], b[order], half[sharp][order]
+    depth = element_edge_and_depth(surface)[1]
+    fit = np.linalg.inv(places[[0, 1, 3, 4], None] ** np.arange(4))
+    cubic = np.stack([np.einsum("mq,eqi->mie", fit, s[a][:, [0, 1, 3, 4]]) for s in (shape, way[0])])
+    X = np.einsum("nmie,eik->nmek", cubic, e[a])
+    X[0, 0] += surface.body.origin
+    return Edges(facet[a], side[a], half, np.minimum(depth[facet[a]], depth[facet[b]]), cubic, X)
+
+
+def owners(facet: np.ndarray, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Sides a and b of facets that meet at edges, the first of each that of a facet with more of them: few facets do."""
+    of: dict[int, list[int]] = {}
+    for k, both in enumerate(zip(facet[a].tolist(), facet[b].tolist())):
+        for f in both:
+            of.setdefault(f, []).append(k)
+    first = np.full(len(a), -1)
+    for least in (4, 3, 2, 1):
+        for f, edges in of.items():
+            left = [k for k in edges if first[k] < 0]
+            if len(left) >= least:
+                first[left] = f
+    swap = first != facet[a]
+    return np.where(swap, b, a), np.where(swap, a, b)
+
+
+def parts_of(edges: Edges, width: float) -> Edges:
+    """The edges in equal parts of about a width, m: each part sees one edge of the other side."""
+    counts = np.ceil(np.linalg.norm(edges.X[0, 1:].sum(axis=0), axis=1) / width - 0.5).clip(1).astype(int)
+    of = np.repeat(np.arange(len(counts)), counts)
+    size = 1.0 / counts[of]
+    begin = size * (np.arange(len(of)) - (np.cumsum(counts) - counts)[of])
+    turn = np.array([[math.comb(n, m) * begin ** (n - m) * size**m if n >= m else 0.0 * size for n in range(4)]
+                     for m in range(4)])  # fmt: skip
+    shape = np.einsum("mne,anie->amie", turn, edges.shape[..., of])
+    X = np.einsum("mne,anek->amek", turn, edges.X[:, :, of])
+    return Edges(edges.facet[of], edges.side[of], edges.half_angle[of], edges.depth[of], shape, X)
+
+
+def edge_places(edges: Edges, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of `count` points, (E,), one or more for each facet with edges, and (E,) number of each edge in its row."""
+    number = np.arange(len(edges.facet)) - np.searchsorted(edges.facet, edges.facet)
+    _, row = np.unique(np.stack([edges.facet, number // count], axis=1), axis=0, return_inverse=True)
+    return row.ravel(), number % count
+
+
+def with_edges(p: ContactPoints, edges: Edges) -> ContactPoints:
+    """Points of a surface, and rows of points on its edges, without an area of their own."""
+    row = edge_places(edges, p.area.shape[1])[0]
+    of = edges.facet[np.unique(row, return_index=True)[1]]
+    more = {"conn": p.conn[of], "X": p.X[of], "faces": p.faces[of]}
+    more |= {name: np.zeros_like(getattr(p, name)[of]) for name in ("shape", "area", "normal")}
+    both = {name: np.concatenate([getattr(p, name), values]) for name, values in more.items()}
+    return ContactPoints(**both, rows=np.concatenate([np.arange(len(p.conn)), of]))
+
+
+def sharp_sides(surface: SurfaceSet) -> np.ndarray:
+    """(4, F) half the angle between the normals at sharp sides of facets, rad, else 0."""
+    out, edges = np.zeros((4, len(surface.faces))), edges_of(surface)
+    out[edges.side, edges.facet] = edges.half_angle
+    return out
