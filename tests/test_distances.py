@@ -63,7 +63,8 @@ def test_distances_of_edges_from_edges(device):
     x[first, 1] = x[first, 0]
     x[second, 3] = x[second, 2]
     found = wp.empty(COUNT, dtype=wp.float64, device=device)
-    wp.launch(squared_distances_of_segments, COUNT, [wp.array(x, dtype=wp.vec3d, device=device)], [found], device=device)
+    ends = wp.array(x, dtype=wp.vec3d, device=device)
+    wp.launch(squared_distances_of_segments, COUNT, [ends], [found], device=device)
     wanted = np.array([ipctk.edge_edge_distance(*row) for row in x])
     wanted[first] = [ipctk.point_edge_distance(row[0], row[2], row[3]) for row in x[first]]
     wanted[second] = [ipctk.point_edge_distance(row[2], row[0], row[1]) for row in x[second]]

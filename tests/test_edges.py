@@ -131,7 +131,7 @@ def test_faces_on_faces_have_no_forces_of_edges(angle, monkeypatch):
 
 
 def test_struck_edges_keep_the_momenta():
-    """Free bars that strike each other, with friction: angular momentum with `energy_momentum`, and single precision."""
+    """Free bars that strike each other, with friction, `energy_momentum`, and in single precision."""
     force = []
     for dtype in ("float64", "float32"):
         b, low, high, _ = crossed(np.pi / 3.0, height=1e-3, offset=(0.03, 0.02), damped=False)

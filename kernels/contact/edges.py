@@ -102,11 +102,10 @@ def edge_kernels(dtype: str) -> KernelSet:
     ) -> mat43:  # fmt: skip
         """Coefficients of t^m of the position on a slave's edge, or of its inward vector."""
         out = mat43()
-        item = ed.row[edge]
         for m in range(4):
             c = ed.X[inward, m, edge]
             for i in range(facets.conn.shape[0]):
-                c += f64(ed.shape[inward, m, i, edge]) * vec3d(u[world, facets.conn[i, item]])
+                c += f64(ed.shape[inward, m, i, edge]) * vec3d(u[world, facets.conn[i, ed.row[edge]]])
             out[m] = c
         return out
 
@@ -211,15 +210,13 @@ def edge_kernels(dtype: str) -> KernelSet:
     @wp.func
     def is_within(q: Perpendicular) -> bool:
         """True if a perpendicular meets both edges between their ends."""
-        low = wp.min(q.own, q.other)
-        return q.found and low >= f64(0.0) and wp.max(q.own, q.other) <= f64(1.0)
+        return q.found and wp.min(q.own, q.other) >= f64(0.0) and wp.max(q.own, q.other) <= f64(1.0)
 
     @wp.func
     def write_shape(ed: Edges, facets: Facets, world: int, edge: int, t: f64):
         """Shape values and reference position of a place on a slave's edge."""
-        item = ed.row[edge]
         q = ed.number[edge]
-        at = k.column(facets, world, item) - facets.facet_count
+        at = k.column(facets, world, ed.row[edge]) - facets.facet_count
         X = vec3d()
         power = f64(1.0)
         for i in range(facets.conn.shape[0]):
@@ -418,8 +415,8 @@ def edge_kernels(dtype: str) -> KernelSet:
             f = pair.anchor_facet[world, point] - 1
             side = wp.int32(pair.anchor_gap[world, point][0])
             s = side_place(mas.corner_count[mas.facet_kind[f]], side, pair.anchor_xi[world, point])
-            own = pair.anchor_gap[world, point][1]
-            best = perpendicular(mas, ed, pair.displacement, x, inward, world, edge, f, side, own, s, f64(0.0))
+            t = pair.anchor_gap[world, point][1]
+            best = perpendicular(mas, ed, pair.displacement, x, inward, world, edge, f, side, t, s, f64(0.0))
         if not is_within(best):
             x0 = own_coefficients(ed, facets, u_n, world, edge, 0)
             inward0 = own_coefficients(ed, facets, u_n, world, edge, 1)

@@ -70,7 +70,9 @@ def facet_kinematics(dtype: str) -> KernelSet:
             out.state = wp.where(f == PENETRATED and con.is_explicit[facets.contact[item]] == 0, PASSED, FREE)
             return out
         out.state = IN_REACH
-        out.position = k.position_at(facets, q, k.column(facets, world, item)) + k.interpolate(facets, u, world, q, item)
+        out.position = k.position_at(facets, q, k.column(facets, world, item)) + k.interpolate(
+            facets, u, world, q, item
+        )
         out.normal = other.scratch.normal[world, point]
         out.depth = other.scratch.depth[world, point]
         out.previous_depth = other.scratch.initial_depth[world, point]

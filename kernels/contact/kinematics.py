@@ -107,7 +107,9 @@ def kinematics_functions(dtype: str) -> KernelSet:
         return interpolate_at(facets, field, world, point, item, column(facets, world, item))
 
     @wp.func
-    def acting_shape_value(facets: Facets, scr: ContactScratch, world: int, point: int, i: int, item: int, at: int) -> T:
+    def acting_shape_value(
+        facets: Facets, scr: ContactScratch, world: int, point: int, i: int, item: int, at: int
+    ) -> T:
         """Shape value of slot i at the active point: a point of a facet with values in column `at`, or that of a lumped
         contact."""
         if facets.tracks_deepest != 0:

@@ -71,7 +71,7 @@ class PairEvaluation:
         for world, point in zip(*np.nonzero(self.force.any(axis=2))):
             slots = t.master_conn[self.facet[world, point]]
             np.add.at(out[world], slots, self.reaction[world, point])
-        for group, edges in t.edge_groups:
+        for group, _ in t.edge_groups:
             data, rows = group.data, np.flatnonzero(group.data.edge_row.numpy() >= 0)
             shape = data.edge_shape.numpy()
             shape = shape.reshape(*shape.shape[:2], 2, len(out), len(rows))[:, :, 0]
@@ -197,12 +197,13 @@ def evaluate_pairs(term: Any, state: State) -> PairEvaluation:
     if t.edge_groups:
         clock, attempt = clock_struct()(), contact_scratch_struct(m.dtype)()
         clock.time = state.time
-        arrays = dict.fromkeys(("facet", "anchor_facet"), ((B, t.points), wp.int32)) | {"depth": ((B, t.points), wp.float64)}
-        arrays |= dict.fromkeys(("xi", "projection", "normal", "anchor_xi"), ((B, t.points), wp.vec3d))
-        arrays |= {"anchor_gap": ((B, t.points), wp.vec2d), "deepest_contact": ((B, len(t.bodies)), wp.float64)}
+        every = B, t.points
+        arrays = dict.fromkeys(("facet", "anchor_facet"), (every, wp.int32)) | {"depth": (every, wp.float64)}
+        arrays |= dict.fromkeys(("xi", "projection", "normal", "anchor_xi"), (every, wp.vec3d))
+        arrays |= {"anchor_gap": (every, wp.vec2d), "deepest_contact": ((B, len(t.bodies)), wp.float64)}
         at.fields(pair, arrays)
         names = ("start_depth", "approach_speed", "activation_gap")
-        at.fields(attempt, dict.fromkeys(names, ((B, t.points), wp.float64)))
+        at.fields(attempt, dict.fromkeys(names, (every, wp.float64)))
     other = facet_side_struct(m.dtype)()
     other.masters, other.history, other.scratch = t.master_data(tree.id), term.make_pair_history(at.stored), pair
     P, L = t.points, t.master_conn.shape[1]

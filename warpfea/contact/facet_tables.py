@@ -99,21 +99,20 @@ class PairTables(FacetTables[FacetOptions]):
         if not parts:
             self.edge_data.append(None)
             return {}
-        rows, data, width = np.unique(np.concatenate(item)), edge_struct(self.model.dtype)(), self.host[chosen[0]].conn.shape[1]
-        edge_row, count = np.full(sum(sizes), -1), self.host[chosen[0]].area.shape[1]
+        rows, data, p = np.unique(np.concatenate(item)), edge_struct(self.model.dtype)(), self.host[chosen[0]]
+        edge_row, width = np.full(sum(sizes), -1), p.conn.shape[1]
         edge_row[rows] = np.arange(len(rows))
+        shapes = [np.pad(e.shape, ((0, 0), (0, 0), (0, width - e.shape.shape[2]), (0, 0))) for e in parts]
         self.model.memory.fill(
             data, "contact", row=np.concatenate(item), number=np.concatenate(number), owner=np.concatenate(owner),
             half_angle=np.concatenate([e.half_angle for e in parts]), edge_count=sum(len(e.facet) for e in parts),
-            shape=np.concatenate([np.pad(e.shape, ((0, 0), (0, 0), (0, width - e.shape.shape[2]), (0, 0))) for e in parts],
-                                 axis=3),
-            X=np.concatenate([e.X for e in parts], axis=2),
+            shape=np.concatenate(shapes, axis=3), X=np.concatenate([e.X for e in parts], axis=2),
         )  # fmt: skip
         self.edge_data.append(data)
         columns = 2 * len(rows) * self.model.worlds  # and those of friction
         return {
-            "edge_rows": len(rows), "edge_row": edge_row, "edge_shape": np.zeros((count, width, columns)),
-            "edge_X": np.zeros((count, columns, 3)),
+            "edge_rows": len(rows), "edge_row": edge_row, "edge_shape": np.zeros((*p.shape.shape[1:], columns)),
+            "edge_X": np.zeros((p.area.shape[1], columns, 3)),
         }  # fmt: skip
 
     @property

@@ -239,8 +239,8 @@ class FacetContact(ContactTerm, Tied, Coupled):
         ctx.launch(self.master_kernels.gather_master_forces, dim, args)
         for group, edges in self.tables.edge_groups:
             args = [edges, group.data, active, s["attempt"], s["pair"], ctx.work.pool_force]
-            dim = (self.model.worlds, edges.edge_count, group.conn.shape[1])
-            ctx.launch(self.edge_kernels.move_friction, dim, args)
+            threads = (self.model.worlds, edges.edge_count, group.conn.shape[1])
+            ctx.launch(self.edge_kernels.move_friction, threads, args)
 
     def _build_point_lists(self, ctx: StepContext) -> None:
         """Build the point lists of the master facets."""

@@ -13,6 +13,7 @@ from ..elements import Rule
 from .contact_points import ContactPoints, element_depths, points_by_faces
 from .contacts import Collider, Contact, ContactOptions
 from .discretisation import Discretisation
+from .edges import CORNERS
 from .handles import SurfaceSet
 from .narrow import MAX_PARTS, WIDEST_GAP, facet_size
 from .pairs import FacetOptions, PairContact
@@ -29,11 +30,6 @@ PARTS = 4
 """Parts of a row of points along an edge of an obstacle."""
 RESOLUTION = 96
 """Sides of the polygon of a round edge."""
-CORNERS = {
-    3: np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)]),
-    4: np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)]),
-}
-"""Face coordinates of corners."""
 
 
 @dataclass(eq=False)

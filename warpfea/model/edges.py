@@ -13,10 +13,13 @@ from .assembly import facet_tables
 from .contact_points import ContactPoints, element_edge_and_depth
 from .handles import SurfaceSet
 
-__all__ = ["Edges", "edges_of", "sharp_sides", "with_edges"]
+__all__ = ["CORNERS", "Edges", "edges_of", "sharp_sides", "with_edges"]
 
-SIDES = {3: ((0, 0), (1, 0), (0, 1)), 4: ((0, 0), (1, 0), (1, 1), (0, 1))}
-"""Corners of a facet, anticlockwise: a side goes from each one to the next."""
+CORNERS = {
+    3: np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)]),
+    4: np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)]),
+}
+"""Face coordinates of corners, anticlockwise: a side goes from each one to the next."""
 INWARD = {3: ((0, 1), (-1, -1), (1, 0)), 4: ((0, 1), (-1, 0), (0, -1), (1, 0))}
 """Vector from each side into the facet."""
 
@@ -47,7 +50,7 @@ def edges_of(surface: SurfaceSet) -> Edges:
     places = np.array([0.0, 1.0 / 3.0, 0.5, 2.0 / 3.0, 1.0])
     rules = {}
     for face, n in corners.items():
-        c = np.array(SIDES[n], dtype=float)
+        c = CORNERS[n]
         points = (c[:, None] + places[:, None] * (np.roll(c, -1, axis=0) - c)[:, None]).reshape(-1, 2)
         rules[face] = Rule("sides", points, np.ones(len(points)), 1)
     t = facet_tables(surface, rules=rules)
@@ -55,7 +58,7 @@ def edges_of(surface: SurfaceSet) -> Edges:
     sides = np.array([corners[int(face)] for face in kind])
     facet, side = np.nonzero(np.arange(most) < sides[:, None])
     inward = np.array([INWARD[n][k] for n, k in zip(sides[facet], side)], dtype=float).reshape(-1, 2)
-    along = np.array([np.subtract(SIDES[n][(k + 1) % n], SIDES[n][k]) for n, k in zip(sides[facet], side)])
+    along = np.array([CORNERS[n][(k + 1) % n] - CORNERS[n][k] for n, k in zip(sides[facet], side)])
     rows = facet[:, None], 5 * side[:, None] + np.arange(5)
     shape, d_a, d_b = t.shape[rows], t.d_a[rows], t.d_b[rows]
     way = [v[:, 0, None, None] * d_a + v[:, 1, None, None] * d_b for v in (inward, along)]
@@ -82,7 +85,7 @@ def edges_of(surface: SurfaceSet) -> Edges:
 
 
 def owners(facet: np.ndarray, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Sides a and b of facets that meet at edges, the first of each that of a facet with more of them: few facets do."""
+    """Sides a and b of facets that meet at edges, the first of each that of a facet with more of them: few facets."""
     of: dict[int, list[int]] = {}
     for k, both in enumerate(zip(facet[a].tolist(), facet[b].tolist())):
         for f in both:
