@@ -115,6 +115,7 @@ def contact_kernels(dtype: str, geometry: str, own: OwnLaws = ()) -> KernelSet:
             if fresh != 0:
                 scr.frozen_friction[world, rec] = vec3d(f64(0.0), f64(0.0), f64(1.0))
                 scr.frozen_normal[world, rec] = vec3d()
+                scr.predicted_friction[world, point] = vec3d()
         else:
             inv_h = k.inverse_step(clock, world)
             ratio = t.stiffness_ratio
@@ -217,6 +218,17 @@ def contact_kernels(dtype: str, geometry: str, own: OwnLaws = ()) -> KernelSet:
         scr.frozen_friction[world, point] = new
         scr.frozen_normal[world, point] = scr.updated_normal[world, point]
 
+    @wp.func
+    def product_at_point(
+        other: Other, facets: Facets, p: wp.array2d(dtype=vec3), scr: ContactScratch, world: int, item: int, q: int
+    ) -> vec3:  # fmt: skip
+        """K times the displacement of a point along p."""
+        d = vec3()
+        at = k.column(facets, world, item)
+        for i in range(facets.conn.shape[0]):
+            d += acting_shape_value(facets, scr, world, q, i, item, at) * p[world, facets.conn[i, item]]
+        return g.other_product(other, scr, p, world, facets.first_point + item * facets.point_count + q, d)
+
     @wp.kernel(module=module)
     def point_products(
         other: Other, facets: Facets, active: wp.array(dtype=wp.int32), p: wp.array2d(dtype=vec3), scr: ContactScratch
@@ -225,12 +237,25 @@ def contact_kernels(dtype: str, geometry: str, own: OwnLaws = ()) -> KernelSet:
         world, item, q = wp.tid()
         if active[world] == 0 or scr.facet_activity[world, facets.first_row + item] != WITH_STIFFNESS:
             return
-        d = vec3()
-        at = k.column(facets, world, item)
-        for i in range(facets.conn.shape[0]):
-            d += acting_shape_value(facets, scr, world, q, i, item, at) * p[world, facets.conn[i, item]]
         point = facets.first_point + item * facets.point_count + q
-        scr.point_product[world, point] = g.other_product(other, scr, p, world, point, d)
+        scr.point_product[world, point] = product_at_point(other, facets, p, scr, world, item, q)
+
+    @masked_kernel(module, "active")
+    def predict_friction(
+        con: Contacts, other: Other, facets: Facets, active: wp.array(dtype=wp.int32), dq_dv: wp.array(dtype=f64),
+        p: wp.array2d(dtype=vec3), scr: ContactScratch,
+    ):  # fmt: skip
+        """Friction of points after the full step along p, by their stiffness."""
+        world, item, q = wp.tid()
+        c = facets.contact[item]
+        point = facets.first_point + item * facets.point_count + q
+        rec = k.history_row(con, c, point)
+        if scr.activity[world, point] != WITH_STIFFNESS or scr.frozen_friction[world, rec][0] <= f64(0.0):
+            return
+        change = dq_dv[world] * vec3d(product_at_point(other, facets, p, scr, world, item, q))
+        area_fraction = facets.area_fraction[q, item] * k.is_acting(con, scr, world, c, point)
+        friction = k.tangential(scr.frozen_normal[world, rec], scr.force[world, point] + change)
+        scr.predicted_friction[world, point] = friction / (area_fraction * scr.frozen_friction[world, rec][0])
 
     @masked_kernel(module, "active")
     def gather_products(

@@ -217,6 +217,9 @@ def friction_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
             frozen = new
             frozen[0] = wp.min(new[0], his.friction_limit[world, rec])
             scr.frozen_friction[world, rec] = frozen
+            scr.predicted_friction[world, point] = vec3d()
+            if his.friction_limit[world, rec] > f64(0.0):
+                scr.predicted_friction[world, point] = (new[1] / his.friction_limit[world, rec]) * t.spring
         elif con.single_point[c] == 0:  # a point that has come to another side since
             frozen[1] = new[1]
             if frozen[0] > f64(0.0) and scr.limit_updates[world] >= TOUCHING_PART_UPDATES:
@@ -259,8 +262,14 @@ def friction_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
         return huber_friction(trial, w[3], frozen[0])[1] * trial
 
     @wp.func
-    def point_stiffness(con: Contacts, world: int, c: int, t: PointContact, frozen: vec3d, inv_h: f64) -> mat33d:
-        """Derivative of the force that a point adds to the residual, positive; the change of the normal is omitted."""
+    def point_stiffness(
+        con: Contacts, world: int, c: int, t: PointContact, frozen: vec3d, inv_h: f64, predicted: vec3d
+    ) -> mat33d:  # fmt: skip
+        """Derivative of the force that a point adds to the residual, positive; the change of the normal is omitted.
+
+        Of a slipping point Newton's method with friction as an unknown of its own (Chan, Golub and Mulet 1999), where
+        `predicted` is that of the last step: with the derivative of the force a step does not see that the slip ends.
+        """
         K = wp.max(t.normal_values[1], f64(0.0)) * wp.outer(t.normal, t.normal)
         if frozen[0] > f64(0.0):
             P = wp.identity(n=3, dtype=f64) - wp.outer(t.friction_normal, t.friction_normal)
@@ -276,7 +285,9 @@ def friction_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
                 if size2 <= frozen[0] * frozen[0]:
                     K += w[3] * P
                 else:
-                    K += (w[3] * frozen[0] / wp.sqrt(size2)) * (P - wp.outer(trial, trial) / size2)
+                    size = wp.sqrt(size2)
+                    lead = (f64(0.5) / (size * wp.max(wp.length(predicted), f64(1.0)))) * (P @ predicted)
+                    K += (w[3] * frozen[0] / size) * (P - wp.outer(lead, trial) - wp.outer(trial, lead))
         return K
 
     @wp.func
@@ -307,7 +318,7 @@ def friction_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
     ) -> vec3d:  # fmt: skip
         """Set normal force and friction of a point, their potential, and the stiffness, N/m; its friction, N."""
         friction_energy = friction_potential(con, world, c, t, frozen, inv_h)
-        K = area_fraction * point_stiffness(con, world, c, t, frozen, inv_h)
+        K = area_fraction * point_stiffness(con, world, c, t, frozen, inv_h, scr.predicted_friction[world, point])
         tangential_force = area_fraction * friction_force(con, world, c, t, frozen, inv_h)
         scr.force[world, point] = tangential_force - (area_fraction * t.normal_values[0]) * t.normal
         scr.energy[world, point] = area_fraction * wp.vec2d(

@@ -200,6 +200,8 @@ def contact_scratch_struct(dtype: str):
         updated_friction: wp.array2d(dtype=wp.vec3d)  # the same three at the iterate
         frozen_normal: wp.array2d(dtype=wp.vec3d)  # frozen normal of the plane of friction
         updated_normal: wp.array2d(dtype=wp.vec3d)  # normal of the plane of friction at the iterate
+        predicted_friction: wp.array2d(dtype=wp.vec3d)  # friction after the last Newton step as its linear system has
+        # it, on the residual, over the friction limit
         aitken_residual: wp.array2d(dtype=wp.float64)  # r, change of the friction limit at its last update
         aitken_sums: wp.array2d(dtype=wp.vec4d)  # [world, lane]
         relaxation: wp.array(dtype=wp.float64)  # [world] relaxation factor

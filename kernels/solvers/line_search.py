@@ -29,6 +29,9 @@ KINK_SLOPE_RATIO, MAX_KINK_TRIALS = 0.5, 8
 """Contact: a positive slope of Phi at a trial above KINK_SLOPE_RATIO times that at the iterate indicates that slipping
 points have reversed and Phi has a kink before. It is located by at most MAX_KINK_TRIALS trials: a step beyond it makes
 the points slip back, again and again, while one that ends near it makes them stick."""
+QUADRATIC_SLOPE_RATIO = 0.2
+"""Contact: a step after which Phi still falls by more than this ratio of its slope at the iterate is doubled. A full
+step leaves a quarter of it where the force grows with the square of the depth, and would halve the depth only."""
 
 
 def line_search_kernels(traits: Traits, module: wp.Module) -> KernelSet:
@@ -242,7 +245,7 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> KernelSet:
     @wp.func
     def locate_kink(ctl: Control, world: int, slope: f64) -> bool:
         """True if a trial is beside a kink of Phi, where sticking begins: Phi rises steeply there, or still falls
-        steeply within the bracket. Sets the next step length."""
+        steeply within the bracket; or if Phi falls on beyond the full step. Sets the next step length."""
         if (
             ctl.nonmonotone.trial[world] != 0
             or ctl.search.trials[world] >= MAX_KINK_TRIALS
@@ -250,6 +253,13 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> KernelSet:
         ):
             return False
         steep = f64(KINK_SLOPE_RATIO) * wp.abs(ctl.search.slope[world])
+        alpha = ctl.search.alpha[world]
+        if ctl.search.trials[world] == 0 and slope < f64(QUADRATIC_SLOPE_RATIO) * ctl.search.slope[world]:
+            if alpha == f64(1.0) and wp.static(not traits.limited):
+                ctl.search.bracket_low[world] = wp.vec2d(alpha, slope)
+                ctl.search.trials[world] = 1
+                ctl.search.alpha[world] = f64(2.0) * alpha
+                return True
         beyond = slope > steep or (ctl.search.bracket_high[world][0] > f64(0.0) and slope < -steep)
         if beyond:
             ctl.search.trials[world] = ctl.search.trials[world] + 1

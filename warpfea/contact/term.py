@@ -245,6 +245,13 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
             ctx.launch(k.gather_products, (B, ctx.launch.padded(lanes * entries)), args)
 
     @part()
+    def predict_frozen(self, ctx: StepContext, active: wp.array) -> None:
+        s, t, w = ctx.scratch[self.name], self.tables, ctx.work
+        for group in t.groups:
+            args = [t.data, s["other"], group.data, active, w.step.dq_dv, w.direction, s["attempt"]]
+            ctx.launch(self.point_kernels.predict_friction, group.point_threads(self.model.worlds), args)
+
+    @part()
     def update_frozen(self, ctx: StepContext, flags: wp.array) -> None:
         k, m, newton = self.point_kernels, self.model, ctx.work.newton
         attempt = ctx.scratch[self.name]["attempt"]

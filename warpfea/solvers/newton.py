@@ -335,6 +335,7 @@ class NewtonLoop:
         if self.limits_step:
             launch(k.reset_step_limit, self.model.worlds, [w.newton])
         self.terms.call(self.ctx, Updated, "process_direction", active)
+        self.terms.call(self.ctx, Updated, "predict_frozen", active)
         self.terms.call(self.ctx, Constrained, "predict_multipliers", active)
         launch(self.vector_kernels.set_base, self.dim, [w.newton, w.v, w.base_velocity, w.best_velocity])
         launch(self.vector_kernels.dot_terms, self.dim, [w.gradient, w.direction, active, w.rows])

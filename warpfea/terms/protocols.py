@@ -59,6 +59,9 @@ class Updated(Term):
         A limit <= 0 allows no step: the attempt fails and is halved.
         """
 
+    def predict_frozen(self, ctx: StepContext, active: wp.array) -> None:
+        """Predict quantities after the full step along work.direction, for the tangent at the next iterates."""
+
     def accept_trial(self, ctx: StepContext, flags: wp.array) -> None:
         """Accept a trial in the flagged worlds: freeze its multipliers, ... for the next search."""
 
