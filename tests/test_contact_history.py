@@ -104,6 +104,21 @@ def test_friction_on_a_ball_takes_few_iterations():
     assert not any(r.halvings.any() for r in reports)
 
 
+@pytest.mark.parametrize("E", [1e6, 1e8])
+def test_a_step_that_leads_deep_into_the_floor_is_left_in_few_iterations(E):
+    """A cube on its corner hits the floor: where the force grows with the square of the depth each full step halves the
+    depth, and a step takes 11 or 12 iterations."""
+    axes = np.array([[1, -1, 0], [1, 1, -2], [2**0.5] * 3]) / np.array([[2], [6], [6]]) ** 0.5
+    b = wf.ModelBuilder()
+    material = wf.NeoHookean.from_E_nu(E=E, nu=0.3, density=1000.0)
+    mesh = wf.mesh.box((0.1,) * 3, cells=(2,) * 3, element="T4").transformed(transform=(axes, (0.0, 0.0, 1e-3)))
+    cube = b.add_solid(mesh, material=material)
+    b.set_initial(cube, velocity=(0.0, 0.0, -0.5))
+    b.add_contact(cube, b.add_collider(FLOOR), mu=0.3)
+    sim = wf.Simulation(b.finalize(), dt=1e-2)
+    assert max(int(sim.step().newton[0]) for _ in range(40)) <= 8
+
+
 def test_models_with_other_axes_of_rotation_differ():
     axes = ((0, 0, 1), (0, 1, 0))
     models = [resting(path=wf.Rotation(anchor=(0, 0, 0), axis=a, angle=1.0))[1] for a in axes]

@@ -154,3 +154,10 @@ def test_first_touches_with_friction_take_few_iterations():
     reports = [sim.step() for _ in range(6)]
     assert max(int(r.newton[0]) for r in reports) <= 20
     assert not any(r.halvings.any() for r in reports)
+
+
+def test_slip_that_ends_takes_few_iterations():
+    """The arch settles: with the derivative of friction alone as its tangent, 20 steps take 147 iterations."""
+    model = importlib.import_module("warpfea.scenes.arch").arch().finalize()
+    sim = wf.Simulation(model, dt=1e-2, solver=wf.NewtonPCG(tol=1e-6))
+    assert sum(int(sim.step().newton[0]) for _ in range(20)) <= 125
