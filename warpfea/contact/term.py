@@ -153,24 +153,18 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
         attempt = self.make_scratch(B, lambda name, shape, dtype: work.array(f"{self.name} {name}", shape, dtype))
         attempt.relaxation.fill_(1.0)
         attempt.penalty_factor = work.newton.frozen.penalty_factor
-        clock = clock_struct()()
-        for name in ("new_time", "h", "substep_index"):
-            setattr(clock, name, getattr(work.step, name))
+        clock, step = clock_struct()(), work.step
+        clock.new_time, clock.h, clock.substep_index = step.new_time, step.h, step.substep_index
         clock.time, clock.is_static = ctx.state.time, int(not ctx.inertia)
-        parts = (B, len(t.contacts), len(RECORD_NAMES), RECORD_LANES)
-        u = work.u
-        if self.double_displacements:  # only contact slots are used
-            u = work.array(f"{self.name} displacements", u.shape, wp.vec3d)
+        # only contact slots are used
+        u = work.array(f"{self.name} displacements", work.u.shape, wp.vec3d) if self.double_displacements else work.u
         scratch = {
-            "attempt": attempt,
-            "clock": clock,
+            "attempt": attempt, "clock": clock, "rows": work.rows_of(self), "u": u,
             "contact_active": work.newton.frozen.contact_active,  # unused by Jacobi's iteration
             "energies": work.array(f"{self.name} energies", (ENERGY_COLUMNS, B, t.rows), wp.float64),
-            "parts": work.array(f"{self.name} parts", parts, wp.float64),
+            "parts": work.array(f"{self.name} parts", (B, len(t.contacts), len(RECORD_NAMES), RECORD_LANES), wp.float64),
             "row_start": self.model.array("contact", t.row_start, wp.int32),
-            "rows": work.rows_of(self),
-            "u": u,
-        }
+        }  # fmt: skip
         ctx.scratch[self.name] = scratch | ctx.scratch.get(self.name, {})
         self._allocate_other(work, ctx.scratch[self.name]["other"])
 
@@ -253,8 +247,7 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
 
     @part()
     def update_frozen(self, ctx: StepContext, flags: wp.array) -> None:
-        k, m, newton = self.point_kernels, self.model, ctx.work.newton
-        attempt = ctx.scratch[self.name]["attempt"]
+        k, m, newton, attempt = self.point_kernels, self.model, ctx.work.newton, ctx.scratch[self.name]["attempt"]
         ctx.launch(k.aitken_partial_sums, (m.worlds, AITKEN_LANES), [flags, attempt])
         ctx.launch(k.aitken_relaxation, m.worlds, [flags, newton.norms.tol, attempt, newton.frozen.partly_updated])
         ctx.launch(k.update_frozen, (m.worlds, self.tables.points), [flags, attempt])
