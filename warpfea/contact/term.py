@@ -149,7 +149,7 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
         raise NotImplementedError
 
     def allocate(self, work: Workspace, ctx: StepContext) -> None:
-        t, B = self.tables, self.model.worlds
+        t, B, contacts = self.tables, self.model.worlds, len(self.tables.contacts)
         attempt = self.make_scratch(B, lambda name, shape, dtype: work.array(f"{self.name} {name}", shape, dtype))
         attempt.relaxation.fill_(1.0)
         attempt.penalty_factor = work.newton.frozen.penalty_factor
@@ -162,7 +162,7 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
             "attempt": attempt, "clock": clock, "rows": work.rows_of(self), "u": u,
             "contact_active": work.newton.frozen.contact_active,  # unused by Jacobi's iteration
             "energies": work.array(f"{self.name} energies", (ENERGY_COLUMNS, B, t.rows), wp.float64),
-            "parts": work.array(f"{self.name} parts", (B, len(t.contacts), len(RECORD_NAMES), RECORD_LANES), wp.float64),
+            "parts": work.array(f"{self.name} parts", (B, contacts, len(RECORD_NAMES), RECORD_LANES), wp.float64),
             "row_start": self.model.array("contact", t.row_start, wp.int32),
         }  # fmt: skip
         ctx.scratch[self.name] = scratch | ctx.scratch.get(self.name, {})
