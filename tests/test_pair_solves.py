@@ -155,6 +155,34 @@ def test_the_correction_is_that_of_the_coupled_motions(element, held):
     assert weights.max() > 0.1  # and what couples them counts
 
 
+@pytest.mark.parametrize("element", ["T4", "T10"])
+def test_the_coarse_level_is_that_of_the_coupled_bodies(element):
+    model = stack(3, 1e6, element=element, cells=2, foreign=True)
+    sim = simulation(model, "two-level")
+    rng = np.random.default_rng(3)
+    found = []
+
+    def after(loop):
+        own, cross = system(loop)
+        levels, arrays = loop.preconditioner.levels, loop.preconditioner.level_arrays
+        data, groups = levels[0].device_data, levels[0].group_count
+        P = np.zeros((model.slots, groups, 4))
+        P[np.arange(model.slots), data.group_of_slot.numpy()] = data.affine_values.numpy()
+        P = np.kron(P.reshape(model.slots, -1), np.eye(3)) * model.slot_table.free.ravel()[:, None]
+        r = P.T @ rng.standard_normal(3 * model.slots)
+        exact = P.T @ (own + cross) @ P
+        wanted = P @ np.linalg.lstsq(exact, r, rcond=1e-10)[0]
+        z = P @ (arrays[1].dense_inverse.matrix.numpy()[0, : len(r), : len(r)] @ r)
+        error = np.abs(z - wanted).max() / np.abs(wanted).max()
+        found.append((error, np.abs(P.T @ cross @ P).max() / np.abs(exact).max()))
+
+    watch(sim, after)
+    sim.step(3)
+    errors, weights = np.array(found).T
+    assert errors.max() < 1e-7
+    assert weights.max() > 0.1  # and what couples them counts
+
+
 def test_bodies_that_touch_no_free_one_have_no_motions():
     model = stack(1, 1e6)
     assert choice.mode_bodies(model) == {}

@@ -25,13 +25,13 @@ from ..kernels.contact.facet_structs import (
 )
 from ..kernels.contact.midpoint import pair_midpoint_kernels
 from ..kernels.contact.point_lists import FACETS_PER_CHUNK, point_list_kernels
-from ..kernels.contact.rigid_modes import pair_rigid_mode_kernels
 from ..model.pairs import FacetOptions
 from ..model.state import State, view_as_words
 from ..terms.protocols import Coupled, Tied
 from ..terms.term import StepContext, part
 from .evaluation import contact_field, evaluate_pairs, refuse_deep_overlaps, store_overlaps, touching_depth
 from .facet_tables import PairTables
+from .mode_coupling import PairCoarseTerms, PairRigidModes
 from .tables import POINT_SUM_LANES
 from .term import ContactTerm, contact_columns
 
@@ -345,6 +345,15 @@ class FacetContact(ContactTerm, Tied, Coupled):
     def add_mode_coupling(self, ctx: StepContext, cached: list[wp.array], dq_dv: wp.array, active: wp.array) -> None:
         ctx.scratch[self.name]["rigid_modes"].add(cached, dq_dv, active)
 
+    def allocate_coarse_coupling(self, ctx: StepContext, coarse: Any) -> Iterable[wp.Module]:
+        if not self.coupled_bodies():
+            return ()
+        ctx.scratch[self.name]["coarse"] = PairCoarseTerms(ctx, self.tables, ctx.scratch[self.name]["masters"], coarse)
+        return {ctx.scratch[self.name]["coarse"].kernels.module}
+
+    def add_coarse_coupling(self, ctx: StepContext, cached: list[wp.array], dq_dv: wp.array, active: wp.array) -> None:
+        ctx.scratch[self.name]["coarse"].add(cached, dq_dv, active)
+
     def _contact_info(self, contact: Any, k: int) -> dict[str, Any]:
         return {"facets": len(self.tables.masters[self.tables.master_of[k]].conn), "left_out": 0}
 
@@ -368,53 +377,3 @@ class FacetContact(ContactTerm, Tied, Coupled):
         bodies = [side.body for contact in self.tables.contacts for side in contact.surfaces]
         contact_points = evaluate_pairs(self, state).contact_points(body) if body in bodies else []
         return contact_field(field, body, state.worlds, contact_points)
-
-
-class PairRigidModes:
-    """Couplings by contacts between the bodies in the matrix of their rigid body modes, with sums over their points.
-
-    Args:
-        rigid_modes: rigid body modes of the preconditioner (solvers/rigid_body_modes.py).
-
-    Attributes:
-        body_pairs: coupled bodies.
-        pair_start, pair_contacts: contacts of each pair of bodies, with 1 where the slave comes second.
-        first_point: first point of each contact. groups: (facet group, its coupled contacts, their number).
-        partial_sums: [world, contact, lane, 4].
-    """
-
-    def __init__(self, ctx: StepContext, tables: PairTables, masters: Any, rigid_modes: Any) -> None:
-        m, t = ctx.model, tables
-        self.ctx, self.tables, self.masters, self.rigid_modes = ctx, tables, masters, rigid_modes
-        self.kernels = pair_rigid_mode_kernels(m.dtype)
-        number = {id(body): rigid_modes.mode_index.get(k, -1) for k, body in enumerate(m.bodies)}
-        sides = [(number[id(c.body)], number[id(c.facets.body)]) for c in t.contacts]
-        coupled = [k for k, (a, b) in enumerate(sides) if min(a, b) >= 0 and a != b]
-        pairs = sorted({(min(sides[k]), max(sides[k])) for k in coupled})
-        found = [[(k, int(sides[k] != pair)) for k in coupled if tuple(sorted(sides[k])) == pair] for pair in pairs]
-        start = np.concatenate([[0], np.cumsum([len(rows) for rows in found])])
-        self.body_pairs, self.count = m.array("motions", np.array(pairs), wp.vec2i), len(pairs)
-        self.pair_start = m.array("motions", start, wp.int32)
-        self.pair_contacts = m.array("motions", np.concatenate(found), wp.vec2i)
-        self.first_point = m.array("motions", t.first, wp.int32)
-        self.groups = []
-        for group in t.groups:
-            low, high = group.data.first_point, group.data.first_point + group.data.facet_count * group.data.point_count
-            own = [k for k in coupled if low <= t.first[k] < high]
-            if own:
-                self.groups.append((group, m.array("motions", np.array(own), wp.int32), len(own)))
-        most = int(np.diff(t.first)[coupled].max())
-        self.partial_sums = ctx.work.array(
-            "pairs motions", (m.worlds, len(t.contacts), rigid_modes.lanes(most), 4), wp.mat33d
-        )
-
-    def add(self, cached: list[wp.array], dq_dv: wp.array, active: wp.array) -> None:
-        """Add the coupling blocks, from the arrays of `cached_inputs`."""
-        stiffness, _, _, _, weight, listed = cached
-        B, lanes, launch = self.ctx.model.worlds, self.partial_sums.shape[2], self.ctx.launch
-        for group, contact, count in self.groups:
-            args = [self.rigid_modes.bodies, self.masters, group.data, contact, self.first_point]
-            args += [stiffness, weight, listed, active, lanes, self.partial_sums]
-            launch(self.kernels.cross_term_sums, (B, count, lanes), args)
-        args = [self.body_pairs, self.pair_start, self.pair_contacts, self.partial_sums, dq_dv, active]
-        launch(self.kernels.add_cross_terms, (B, self.count, 4), [*args, self.rigid_modes.dense_inverse.matrix])

@@ -46,6 +46,9 @@ class LevelArrays:
             self.inverse_root_diagonal = work.array(f"{name} root", shape[:3] if other else (1, 1, 1), T)
             self.pivot_diagonal = work.array(f"{name} pivots", (B, level.tile_count, TILE_UNKNOWNS), T)
             self.pivot_column = work.array(f"{name} column", (B, level.tile_count, TILE_UNKNOWNS), T)
+        elif level.group_count:  # no tiles
+            self.stored_inverse = work.array(f"{name} tiles", (1, 1, 1, 1), S)
+            self.inverse_root_diagonal = work.array(f"{name} root tiles", (1, 1, 1), T)
         self.vectors: dict[str, wp.array] = {}
         if depth:
             names = ("r", "x") if level.is_dense else ("r", "x", "z", "d")

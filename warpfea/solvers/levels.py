@@ -18,7 +18,7 @@ from .matrix_assembly import Pattern, make_pattern
 if TYPE_CHECKING:
     from ..model.model import Model
 
-__all__ = ["GROUP_SLOTS", "MAX_BOTTOM_SLOTS", "Level", "make_levels"]
+__all__ = ["GROUP_SLOTS", "MAX_BOTTOM_SLOTS", "CoarseFunctions", "Level", "make_levels"]
 
 GROUP_SLOTS = 64
 """Maximum slots of a group. Its affine functions are 4 slots of the next level, about 1/16 of the unknowns."""
@@ -30,6 +30,8 @@ cantilever of 180 slots takes half the iterations)."""
 MAX_BOTTOM_SLOTS = {"cpu": 160, "cuda": 1344}
 """Largest coarse level inverted as one dense matrix, slots by device; on CUDA this is cheaper than the launches of
 further levels."""
+MAX_COUPLED_SLOTS = 448
+"""Largest single coarse matrix of bodies that terms couple, slots: a third, as contacts change and it is rebuilt."""
 MAX_COMPONENT_PAIRS = 1344**2
 """Maximum slot pairs in components of up to MAX_FULL_FACTOR_SLOTS slots that are each inverted as a whole."""
 MAX_LEVELS = 12
@@ -79,11 +81,39 @@ class ReferencePoints:
     separate_label: np.ndarray
 
 
-def make_levels(model: Model, pattern: Pattern, *, coarse: bool = True, by_component: bool = True) -> list[Level]:
+@dataclass(eq=False)
+class CoarseFunctions:
+    """Affine functions of the last level's groups, as functions of the slots of the model, for terms that couple them.
+
+    Attributes:
+        group_of_slot: [slot] group, of four slots of the last level.
+        affine_values: [slot] values of its four functions.
+        matrix: dense matrix of the last level, to which terms add.
+    """
+
+    group_of_slot: wp.array
+    affine_values: wp.array
+    matrix: wp.array
+
+    @classmethod
+    def of_levels(cls, model: Model, levels: list[Level], matrix: wp.array) -> CoarseFunctions:
+        """Those of the last of `levels`."""
+        group, value = (getattr(levels[0].device_data, k).numpy() for k in ("group_of_slot", "affine_values"))
+        for level in levels[1:-1]:
+            slots = 4 * group[:, None] + np.arange(4)
+            value = np.einsum("si,sik->sk", value, level.device_data.affine_values.numpy()[slots])
+            group = level.device_data.group_of_slot.numpy()[slots[:, 0]]
+        vec4 = wp.types.vector(length=4, dtype=model.types.T)
+        return cls(model.array("levels", group, wp.int32), model.array("levels", value, vec4), matrix)
+
+
+def make_levels(
+    model: Model, pattern: Pattern, *, coarse: bool = True, by_component: bool = True, coupled: bool = False
+) -> list[Level]:
     """Levels of a model, finest first; `pattern` is that of H.
 
     Without `coarse`, only the tiles of the first level; without `by_component`, dense matrices are not split into
-    components.
+    components; `coupled`: two levels if possible, the second a single dense matrix, in which terms couple the bodies.
     """
     origin = np.concatenate([np.tile(body.origin, (body.slot_count, 1)) for body in model.bodies])
     position = model.slot_table.kind == 0
@@ -91,6 +121,9 @@ def make_levels(model: Model, pattern: Pattern, *, coarse: bool = True, by_compo
     points = ReferencePoints(place, position, np.cumsum(position) - 1, model.components.mesh_of_slot)
     if not coarse:
         return [_make_level(model, pattern, points, GROUP_SLOTS)[0]]
+    found = _coupled_levels(model, pattern, points, by_component) if coupled else []
+    if found:
+        return found
     levels = []
     bottom = MAX_BOTTOM_SLOTS["cuda" if model.device.is_cuda else "cpu"]
     for depth in range(MAX_LEVELS):
@@ -99,9 +132,7 @@ def make_levels(model: Model, pattern: Pattern, *, coarse: bool = True, by_compo
         small = n <= (bottom if depth else MAX_FULL_FACTOR_SLOTS)
         if components and not small:  # one matrix per component
             entries = components.count * components.max_slots**2
-            small = entries <= (
-                bottom**2 if depth else MAX_COMPONENT_PAIRS if components.max_slots <= MAX_FULL_FACTOR_SLOTS else 0
-            )
+            small = entries <= bottom**2 if depth else _inverted_whole(components)
         if small:
             levels.append(Level(pattern, n, True, level_struct(model.dtype)(), components=components))
             return levels
@@ -117,6 +148,29 @@ def make_levels(model: Model, pattern: Pattern, *, coarse: bool = True, by_compo
         if level.group_count * 4 > n // 2:
             points.separate_label = np.zeros_like(points.separate_label)
     raise AssertionError("groups do not shrink")
+
+
+def _inverted_whole(components: DenseComponents) -> bool:
+    """True if the components of the first level are each inverted as a whole."""
+    entries = components.count * components.max_slots**2
+    return components.max_slots <= MAX_FULL_FACTOR_SLOTS and entries <= MAX_COMPONENT_PAIRS
+
+
+def _coupled_levels(model: Model, pattern: Pattern, points: ReferencePoints, by_component: bool) -> list[Level]:
+    """Inverses of small components or tiles, and one dense matrix of the groups; empty if that would be too large."""
+    n, bottom = len(points.reference), MAX_COUPLED_SLOTS
+    components = DenseComponents.from_pattern(model, pattern) if by_component else None
+    whole = components is not None and _inverted_whole(components)
+    sizes = (SMALL_GROUP_SLOTS[-1],) if whole else ()
+    capacity = next((c for c in (*sizes, GROUP_SLOTS, 2 * GROUP_SLOTS) if 4.05 * n / c <= bottom), 0)
+    if not capacity:
+        return []
+    level, _, below = _make_level(model, pattern, points, capacity)
+    if 4 * level.group_count > bottom:
+        return []
+    if whole:
+        level.is_dense, level.components, level.tile_count = True, components, 0
+    return [level, Level(below, 4 * level.group_count, True, level_struct(model.dtype)())]
 
 
 def _representative_slots(level: Level) -> np.ndarray:

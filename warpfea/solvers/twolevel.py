@@ -13,6 +13,9 @@ If some slot order makes H a narrow band, H itself is the only level, factored a
 In statics a model of beams small enough for one dense inverse is factored instead, with every matrix of the operator:
 slender bodies need the exact tangent and exact directions there.
 
+With bodies that terms couple, as contacts do, C is one dense matrix with their couplings, if it is small enough, also
+where T holds inverses of whole bodies; else their rigid body modes are added (rigid_body_modes.py).
+
 An odd number of Chebyshev steps keeps C positive for any largest eigenvalue.
 
 With constraints, tiles and coarse matrices contain the penalties. As a constraint may couple slots of several tiles, (D
@@ -37,7 +40,7 @@ from ..terms.protocols import CachedInputs, Constrained, Coupled, Preconditioned
 from .band import BandFactor, find_band
 from .dense import gauss_jordan
 from .level_arrays import LevelArrays
-from .levels import GROUP_SLOTS, Level, make_levels
+from .levels import GROUP_SLOTS, CoarseFunctions, Level, make_levels
 from .matrix_assembly import leading_view, worlds_per_chunk
 from .preconditioner import Preconditioner
 from .reuse import ReuseRule
@@ -126,10 +129,14 @@ class TwoLevel(Preconditioner):
         """Rigid body modes of bodies coupled by terms, and the term modules that they need."""
         if not self.plan.body_modes:
             return None, set()
+        coupled = self.terms.having(Coupled)
+        if self.couples_levels:
+            dense = self.level_arrays[-1].dense_inverse
+            assert dense is not None
+            coarse = CoarseFunctions.of_levels(self.model, self.levels, dense.matrix)
+            return None, set().union(*(term.allocate_coarse_coupling(self.ctx, coarse) for term in coupled))
         out = RigidBodyModes(self.model, self.work, self.launch, self.residual, self.assembler.pattern)
-        return out, out.modules().union(
-            *(term.allocate_mode_coupling(self.ctx, out) for term in self.terms.having(Coupled))
-        )
+        return out, out.modules().union(*(term.allocate_mode_coupling(self.ctx, out) for term in coupled))
 
     def _make_levels(self) -> list[Level]:
         """Levels of "two-level", "tiles" (without a coarse space) or "banded"."""
@@ -138,10 +145,17 @@ class TwoLevel(Preconditioner):
             band = find_band(model) or find_band(model, any_width=True)
             return [Level(pattern, model.slots, False, level_struct(model.dtype)(), band=band)]
         by_component = self.storage_dtype == model.dtype
-        key = kind if by_component else f"{kind} whole"
+        coupled = self.plan.body_modes and not self.plan.factors_operator
+        key = f"{kind}{'' if by_component else ' whole'}{' coupled' if coupled else ''}"
         if key not in model.cache:
-            model.cache[key] = make_levels(model, pattern, coarse=kind != "tiles", by_component=by_component)
+            options = {"coarse": kind != "tiles", "by_component": by_component, "coupled": coupled}
+            model.cache[key] = make_levels(model, pattern, **options)
         return model.cache[key]
+
+    @property
+    def couples_levels(self) -> bool:
+        """True if terms couple bodies in the matrix of the second level, in place of their rigid body modes."""
+        return self.plan.body_modes and len(self.levels) == 2 and self.levels[1].components is None
 
     def register(self, state: State) -> None:
         """Register the linearisation point and the rule's counts in the state, for resumed runs."""
@@ -217,9 +231,9 @@ class TwoLevel(Preconditioner):
                 self.band.solve(r, z, active)
             else:
                 self._apply_dense(0, r, z, active)
-            coarse, correct = z, 0
-        else:
-            coarse, correct = self._smooth(0, r, z, active), int(len(self.levels) > 1)
+        coarse, correct = z, int(len(self.levels) > 1)
+        if correct or not self.solved_directly:
+            coarse = self._smooth(0, r, z, active)
         if self.body_modes:
             self.body_modes.apply(r, z, active)
         args = [level.device_data, correct, coarse, m.topology.free, r, w.diagonal, active, w.warp_size, z, w.warp_rows]
@@ -331,16 +345,17 @@ class TwoLevel(Preconditioner):
             return
         if self.band:
             self.band.factorise(value, flags)
-        elif arrays.dense_inverse is not None:
-            arrays.dense_inverse.fill(level.pattern, value, flags)
         else:
+            if arrays.dense_inverse is not None:
+                arrays.dense_inverse.fill(level.pattern, value, flags)
             self._fill(0, value, flags)
 
     def _fill(self, depth: int, value: wp.array, flags: wp.array) -> None:
         """Fill the tiles of a level and the matrix of the next one."""
         m, level, arrays = self.model, self.levels[depth], self.level_arrays[depth]
-        args = [level.device_data, level.pattern.data, value, flags, arrays.pivot_diagonal, arrays.tile_inverse]
-        self.launch(self.setup_kernels.fill_tiles, (m.worlds, level.tile_count, TILE_SLOTS), args)
+        if level.tile_count:
+            args = [level.device_data, level.pattern.data, value, flags, arrays.pivot_diagonal, arrays.tile_inverse]
+            self.launch(self.setup_kernels.fill_tiles, (m.worlds, level.tile_count, TILE_SLOTS), args)
         if depth + 1 < len(self.levels):
             assert level.galerkin_tables is not None
             free = self.all_free if depth else m.topology.free
@@ -354,8 +369,11 @@ class TwoLevel(Preconditioner):
             if arrays.dense_inverse is not None:
                 if depth:
                     arrays.dense_inverse.fill(level.pattern, arrays.block_values, flags)
+                if self.couples_levels:
+                    for term, kept in self._coupled_terms():
+                        term.add_coarse_coupling(self.ctx, kept, self.reuse.control.dq_dv, flags)
                 arrays.dense_inverse.invert(flags, keep=depth == 0, reduce=self.residual.reduce)
-                return
+                continue
             if arrays.block_values is not None:
                 self._fill(depth, arrays.block_values, flags)
             self._invert_tiles(level, arrays, flags, keep=depth == 0)
@@ -363,10 +381,14 @@ class TwoLevel(Preconditioner):
     def _add_mode_coupling(self, motions: RigidBodyModes, flags: wp.array) -> None:
         """Assemble and invert the matrix of the rigid body modes."""
         motions.assemble(self.reuse.linearisation_point, self.block_values, flags)
-        for term in (term for term in self.terms.having(Coupled) if term.coupled_bodies()):
-            kept = self.cached_inputs[term.name].cached if term.name in self.cached_inputs else []
+        for term, kept in self._coupled_terms():
             term.add_mode_coupling(self.ctx, kept, self.reuse.control.dq_dv, flags)
         motions.invert(flags)
+
+    def _coupled_terms(self) -> Iterator[tuple[Coupled, list[wp.array]]]:
+        """Terms that couple bodies, and the inputs of their blocks."""
+        for term in (term for term in self.terms.having(Coupled) if term.coupled_bodies()):
+            yield term, self.cached_inputs[term.name].cached if term.name in self.cached_inputs else []
 
     def _add_term_blocks(self, value: wp.array, flags: wp.array, *, penalties: bool) -> None:
         """Add the terms' blocks to the matrix of some worlds: those that D is taken from, or the penalties."""

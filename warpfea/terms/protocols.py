@@ -175,6 +175,13 @@ class Coupled(Term):
     def add_mode_coupling(self, ctx: StepContext, cached: list[wp.array], dq_dv: wp.array, active: wp.array) -> None:
         """Add the coupling of bodies to the rigid body mode matrix (solvers/rigid_body_modes.py)."""
 
+    def allocate_coarse_coupling(self, ctx: StepContext, coarse: Any) -> Iterable[wp.Module]:
+        """Allocate for `add_coarse_coupling` before launches are captured; returns its modules."""
+        return ()
+
+    def add_coarse_coupling(self, ctx: StepContext, cached: list[wp.array], dq_dv: wp.array, active: wp.array) -> None:
+        """Add the coupling of bodies to the coarse matrix of the levels (solvers/twolevel.py)."""
+
 
 class Parametrised(Term):
     """Term with parameters of `Model.set_parameter`, or with constants that follow from materials."""
