@@ -10,9 +10,9 @@ def overhang(
     reach: float = 0.55,
     side: float = 0.1,
     width: float = 0.2,
-    thickness: float = 4e-3,
+    thickness: float = 1e-2,
     clipping: bool = True,
-    E: float = 5e9,
+    E: float = 8e8,
     density: float = 1200.0,
 ) -> wf.ModelBuilder:
     """A sheet bends over the edge of a table, and rises from it behind.

@@ -168,6 +168,7 @@ CONSTANTS: dict[str, Constant] = {
     "EDGE_MARGIN": Constant(CONTACT, "rad", 0.0, "contact"),
     "ENTRY_DEPTH": Constant(CONTACT, "depths of elements", 0.0, "contact"),
     "BESIDE_DEPTH": Constant(CONTACT, "depths of elements", 0.0, "contact"),
+    "FACING_COSINE": Constant(CONTACT, "1", 0.0, "contact"),
 }
 """Tuned constants by name, unique among the sources.
 

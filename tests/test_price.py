@@ -19,6 +19,10 @@ TRACES = {
 """Of a feature: what modules of scenes that have it name, and no others."""
 
 
+FACETS_UNDER_OBSTACLES = {"overhang"}
+"""Scenes in which points of obstacles, as narrow ones or edges, touch facets, but no bodies each other."""
+
+
 def assert_priced(row):
     own, full = row["shipped"], row["all"]
     assert row["left"] == []
@@ -29,6 +33,8 @@ def assert_priced(row):
     for feature in set(TRACES) & set(row["forced"]):
         if feature == "contact" and "contact between bodies" not in row["forced"]:
             continue  # it has kernels of contact with obstacles too
+        if feature == "contact between bodies" and row["scene"] in FACETS_UNDER_OBSTACLES:
+            continue
         assert not [name for name in own["modules"] if TRACES[feature] in name], feature
         assert [name for name in full["modules"] if TRACES[feature] in name], feature
     for what in ("bytes", "launches", "unknowns"):

@@ -9,7 +9,14 @@ from ..common.types import f64, precision, vec3d
 from .collider_seams import SEAMS_SUFFIX, seam_functions
 from .collider_shapes import BOX, CYLINDER, MESH
 from .colliders import MESH_SUFFIX, collider_functions
-from .kinematics import GEOMETRIES, MAX_DEPTH_RATIO, MIN_NORMAL_COSINE, OPPOSING_COSINE, kinematics_functions
+from .kinematics import (
+    ENTRY_DEPTH,
+    GEOMETRIES,
+    MAX_DEPTH_RATIO,
+    MIN_NORMAL_COSINE,
+    OPPOSING_COSINE,
+    kinematics_functions,
+)
 from .law import ANY_GAP
 from .structs import FREE, IN_REACH, PASSED, TURNED, collider_struct, contact_structs
 
@@ -17,9 +24,8 @@ __all__ = ["MAX_COLLIDER_ROTATION", "collider_kinematics", "pose_kernels"]
 
 MAX_COLLIDER_ROTATION = 1.0
 """Largest rotation of a touched collider in a step, rad; larger rotations are rejected."""
-ENTRY_DEPTH, BESIDE_DEPTH = 1e-4, 0.25
-"""Depths over that of an element: to which a point may slide over the edge of a collider that nothing touches yet; to
-which a facet across a side face does not touch it."""
+BESIDE_DEPTH = 0.25
+"""Depth over that of an element to which a facet below an edge does not touch the side face that it does not face."""
 BESIDE = -3
 """In place of a side: the point has none."""
 
@@ -55,6 +61,15 @@ def collider_kinematics(dtype: str, meshes: bool, seams: bool = False) -> Kernel
         return (col.rotation[world, kc] * y + col.position[world, kc] - before) / clock.h[world]
 
     @wp.func
+    def direction(n: vec3d) -> int:
+        """Axis and sign that a vector is closest to: 2 times the axis, + 1 where positive."""
+        axis = wp.int32(0)
+        for j in range(1, 3):
+            if wp.abs(n[j]) > wp.abs(n[axis]):
+                axis = j
+        return 2 * axis + wp.where(n[axis] > f64(0.0), 1, 0)
+
+    @wp.func
     def begin_point(
         con: Contacts, col: Other, facets: Facets, his: History, clock: Clock, scr: ContactScratch,
         u_n: wp.array2d(dtype=vec3), v_n: wp.array2d(dtype=vec3), world: int, item: int, q: int,
@@ -83,8 +98,9 @@ def collider_kinematics(dtype: str, meshes: bool, seams: bool = False) -> Kernel
             v = material_velocity(col, clock, world, kc, y) - interpolate(facets, v_n, world, q, item)
             speed = wp.dot(rotation * n, v)
         scr.approach_speed[world, point] = k.approach_speed(his, world, rec, speed)
-        if in_contact and scr.start_depth[world, point] > col.deepest[world, kc]:
-            wp.atomic_max(col.deepest, world, kc, scr.start_depth[world, point])
+        face = direction(n)
+        if in_contact and scr.start_depth[world, point] > col.deepest[world, kc, face]:
+            wp.atomic_max(col.deepest, world, kc, face, scr.start_depth[world, point])
 
     @wp.func
     def side_slid_onto(
@@ -92,8 +108,8 @@ def collider_kinematics(dtype: str, meshes: bool, seams: bool = False) -> Kernel
     ) -> int:  # fmt: skip
         """Side of a solid that a point slid onto over its edge, and entered by the side face there; -1: none.
 
-        The point's facet does not face that side face, and the side that the facet lies on, or ends at, is above the
-        point by at most the depth of others; BESIDE where it is higher: the facet sags below the edge.
+        That side is above the point by at most the depth of other points on it. BESIDE where it is higher and the
+        point's facet does not face the side face: it sags below the edge.
         y, d: position in the collider's frame, m, normal and gap by the face.
         """
         solid = col.kind[kc] == BOX or col.kind[kc] == CYLINDER
@@ -101,9 +117,9 @@ def collider_kinematics(dtype: str, meshes: bool, seams: bool = False) -> Kernel
             solid = solid or (col.kind[kc] == MESH and col.size[kc][2] != f64(0.0))
         n = vec3d(d[0], d[1], d[2])
         inward = k.inward_normal(facets, scr, world, item)
-        if not solid or wp.dot(n, inward) >= f64(MIN_NORMAL_COSINE) or wp.length_sq(inward) == f64(0.0):
+        if not solid or wp.length_sq(inward) == f64(0.0):
             return -1
-        most = wp.max(f64(MAX_DEPTH_RATIO) * col.deepest[world, kc], f64(ENTRY_DEPTH) * facets.element_depth[item])
+        apart = wp.dot(n, inward) < f64(MIN_NORMAL_COSINE)
         way = k.tangential(n, inward)
         if wp.length_sq(way) < f64(0.5):
             way = k.tangential(n, vec3d(n[1], n[2], n[0]) + vec3d(f64(0.0), n[2], -n[1]))
@@ -112,9 +128,15 @@ def collider_kinematics(dtype: str, meshes: bool, seams: bool = False) -> Kernel
             side = g.side_facing(col, kc, y, way, f64(1.0))
             if side >= 0:
                 found = distance(col, kc, y, side)
-                faces = wp.dot(vec3d(found[0], found[1], found[2]), way) > f64(OPPOSING_COSINE)
-                if faces and found[3] < f64(0.0) and -found[3] <= f64(BESIDE_DEPTH) * facets.element_depth[item]:
-                    return wp.where(-found[3] <= most, side, BESIDE)
+                level = vec3d(found[0], found[1], found[2])
+                most = f64(MAX_DEPTH_RATIO) * col.deepest[world, kc, direction(level)]
+                if apart:
+                    most = wp.max(most, f64(ENTRY_DEPTH) * facets.element_depth[item])
+                if wp.dot(level, way) > f64(OPPOSING_COSINE) and found[3] < f64(0.0):
+                    if -found[3] <= most:
+                        return side
+                    if apart and -found[3] <= f64(BESIDE_DEPTH) * facets.element_depth[item]:
+                        return BESIDE
             way = wp.cross(n, way)
         return -1
 
@@ -325,7 +347,8 @@ def pose_kernels(meshes: bool) -> KernelSet:
             rotation = R * rotation
         if col.translation_law[k] >= 0:
             position += value[world, col.translation_law[k]]
-        col.deepest[world, k] = f64(0.0)
+        for face in range(6):
+            col.deepest[world, k, face] = f64(0.0)
         col.position[world, k] = position
         col.rotation[world, k] = rotation
         col.translation[world, k] = position - col.previous_position[world, k]

@@ -7,8 +7,8 @@ import warp as wp
 from ..common.modules import KernelSet, kernel_set
 from ..common.types import f64, vec3d
 from .broad_phase import broad_phase_kernels
-from .facet_structs import master_struct, pair_scratch_struct
-from .kinematics import MAX_DEPTH_RATIO, MIN_NORMAL_COSINE, OPPOSING_COSINE, kinematics_functions
+from .facet_structs import EDGES, master_struct, pair_scratch_struct
+from .kinematics import ENTRY_DEPTH, MAX_DEPTH_RATIO, MIN_NORMAL_COSINE, OPPOSING_COSINE, kinematics_functions
 from .projection import OUTSIDE_TOLERANCE, facet_projection_functions
 from .structs import contact_structs
 
@@ -18,6 +18,9 @@ TUNNEL_LIMIT_RATIO = 0.25
 """Ratio to the depth limit of a facet above which a point that left the facet has passed through the body."""
 BORDER_TOLERANCE = 1e-4
 """Distance over a side by which a point may pass a surface beside its border: round-off of flush borders."""
+FACING_COSINE = 0.9
+"""Cosine of a facet's normal and the slave's reversed normal above which a facet that a point slid onto over its edge
+stands back: the flanks of a block that slides askew over an edge meet the side face below it less squarely."""
 MAX_EDGE_TANGENT = 2.0
 """Maximum tangent of the angle between an outward vector and the normal of its facet, at the edge of a box."""
 
@@ -205,6 +208,16 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
         return found[3] != f64(0.0) and (swept or distance_outside(corners, there) > f64(BORDER_TOLERANCE))
 
     @wp.func
+    def within(mas: Masters, pair: PairScratch, slave: SlavePoint, f: int, xi: vec3d) -> f64:
+        """Distance of coordinates from the border of a facet, over its side, minus what its border may sag below the
+        edge of what it slides onto."""
+        far = f64(1.0) - wp.max(xi[0], xi[1])
+        if mas.corner_count[mas.facet_kind[f]] == 3:
+            far = f64(1.0) - xi[0] - xi[1]
+        sag = f64(MAX_DEPTH_RATIO) * deepest_contact(mas, pair, slave) / mas.side_length[f]
+        return wp.min(wp.min(xi[0], xi[1]), far) - wp.max(sag, f64(BORDER_TOLERANCE))
+
+    @wp.func
     def entered_sideways(
         mas: Masters, scr: ContactScratch, pair: PairScratch, slave: SlavePoint, f: int, xi: vec3d, gap: f64
     ) -> bool:
@@ -212,9 +225,9 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
         most the penetration of the bodies' contact: it slid under the edge of a body that has sunk in."""
         world = slave.world
         kind = mas.facet_kind[f]
-        most = deepest_contact(mas, pair, slave)
         depth = scr.activation_gap[world, slave.point] - gap
-        if depth > wp.min(f64(MAX_DEPTH_RATIO) * most, f64(TUNNEL_LIMIT_RATIO) * mas.depth_limit[f]):
+        most = wp.max(f64(MAX_DEPTH_RATIO) * deepest_contact(mas, pair, slave), f64(ENTRY_DEPTH) * mas.element_depth[f])
+        if depth > wp.min(most, f64(TUNNEL_LIMIT_RATIO) * mas.depth_limit[f]):
             return False
         if distance_outside(mas.corner_count[kind], xi) > edge_margin(mas, f, xi):
             return False
@@ -238,7 +251,7 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
         mas: Masters, scr: ContactScratch, pair: PairScratch, slave: SlavePoint, f: int, xi: vec3d
     ) -> int:
         """Rank of a facet for a point, -1: rejected by depth, by the previous facet, or by the side at the start of the
-        attempt. Higher for facets that face the slave's; among others, for one that the point reached from beside."""
+        attempt. Highest for facets that face the slave's squarely, then for one that the point reached from beside."""
         world = slave.world
         s = surface_point(mas, pair.displacement, world, f, xi)
         n = unit_normal(s)
@@ -250,7 +263,10 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
             return -1
         if slave.anchored:
             return wp.where(cosine > f64(MIN_NORMAL_COSINE), 0, -1)
+        if mas.one_sided[slave.contact] == EDGES and within(mas, pair, slave, f, xi) < f64(0.0):
+            return -1  # the points of the facet's border act
         rank = wp.where(cosine > f64(OPPOSING_COSINE), 4, wp.where(cosine > -f64(OPPOSING_COSINE), 1, 0))
+        rank = wp.where(cosine > f64(FACING_COSINE), 6, rank)
         if slave.overlap_limit > f64(0.0):
             if is_folded(mas, pair, world, f, xi):
                 return -1
@@ -263,7 +279,7 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
             if before < -slave.outside_depth:
                 if rank == 0 or not entered_sideways(mas, scr, pair, slave, f, xi, before):
                     return -1
-                rank = wp.where(rank == 4, 3, 2)
+                rank = 5
         return rank
 
     @wp.func
@@ -301,7 +317,7 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
         rank = candidate_rank(mas, scr, pair, slave, f, xi)
         if rank < 0:
             return out
-        beside = rank == 2 or rank == 3
+        beside = rank == 5
         if not beside and beyond > f64(0.0) and not slave.anchored and slave.overlap_limit == f64(0.0):
             if passed_beside(mas, scr, pair, slave, f, xi):
                 return out

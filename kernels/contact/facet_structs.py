@@ -7,6 +7,7 @@ import warp as wp
 from ..common.types import precision
 
 __all__ = [
+    "EDGES",
     "edge_struct",
     "facet_field_struct",
     "facet_side_struct",
@@ -15,6 +16,9 @@ __all__ = [
     "pair_scratch_struct",
     "point_list_struct",
 ]
+
+EDGES = 2
+"""`one_sided` of points on edges."""
 
 
 @functools.cache
@@ -32,7 +36,7 @@ def master_struct(dtype: str):
         tree: wp.uint64  # bounding-box tree of [world, facet], grouped by world and surface
         surface_of: wp.array(dtype=wp.int32)  # [contact] its master surface
         sign: wp.array(dtype=wp.int32)  # [contact] -1 where the points belong to the second side
-        one_sided: wp.array(dtype=wp.int32)  # [contact] 1 where its points touch only facets that face theirs
+        one_sided: wp.array(dtype=wp.int32)  # [contact] above 0: points touch facets that face theirs; EDGES: within
         bodies: wp.array(dtype=wp.vec2i)  # [contact] of the points (of an obstacle: of the facets) and of the facets,
         # numbered among bodies with facets or points
         surface_count: wp.int32  # number of master surfaces

@@ -29,15 +29,23 @@ from ..common.types import f64, precision, vec3d
 from .law import FIXED_SPRING, MIN_APPROACH_SPEED
 from .structs import contact_structs
 
-__all__ = ["GEOMETRIES", "MAX_DEPTH_RATIO", "MIN_NORMAL_COSINE", "OPPOSING_COSINE", "kinematics_functions"]
+__all__ = [
+    "ENTRY_DEPTH",
+    "GEOMETRIES",
+    "MAX_DEPTH_RATIO",
+    "MIN_NORMAL_COSINE",
+    "OPPOSING_COSINE",
+    "kinematics_functions",
+]
 
 MIN_NORMAL_COSINE = 0.1
 """Minimum cosine of the normals of two facets that a point in contact passes between: excludes the edge of a box."""
 OPPOSING_COSINE = 0.5
 """Cosine of a facet's normal and the slave's reversed normal above which they face each other; below its negative they
 face the same way."""
-MAX_DEPTH_RATIO = 2.0
-"""Largest depth of a point that enters from beside a facet, over the deepest active penetration."""
+MAX_DEPTH_RATIO, ENTRY_DEPTH = 2.0, 1e-4
+"""Largest depth of a point that enters from beside a facet, over the deepest active penetration; or over the depth of
+an element, where nothing touches yet."""
 
 GEOMETRIES: dict[str, Callable[[str], KernelSet]] = {}
 """Geometries of the other side by name: the precision of the displacements -> device functions and `Other`."""

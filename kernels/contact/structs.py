@@ -262,7 +262,8 @@ def collider_struct(meshes: bool):
         angle: wp.array2d(dtype=wp.float64)  # rad
         translation: wp.array2d(dtype=wp.vec3d)  # in the attempt, m
         rotation_change: wp.array2d(dtype=wp.mat33d)  # R - 1 of the rotation R in the attempt
-        deepest: wp.array2d(dtype=wp.float64)  # largest depth of its points at the start of the attempt, m
+        deepest: wp.array3d(dtype=wp.float64)  # [world, collider, 6] largest depth of points by sides that face along
+        # -x, x, -y, y, -z, z of its axes, at the start of the attempt, m
         neighbor_start: wp.array(dtype=wp.int32)  # [contact + 1] its first neighbour; with the next three: seams
         neighbor: wp.array(dtype=wp.int32)  # collider
         neighbor_shares: wp.array(dtype=wp.int32)  # 1: the body's contact with it has the same points

@@ -83,8 +83,9 @@ class ColliderContact(ContactTerm):
     def _set_attempt(self, other: Any, make: Callable[[str, tuple[int, ...], Any], wp.array]) -> None:
         """Add the poses of an attempt, arrays from make(name, shape, dtype)."""
         shape, struct = (self.model.worlds, len(self.tables.colliders)), collider_struct(self.tables.has_meshes)
-        for name in ("position", "rotation", "translation", "rotation_change", "angle", "deepest"):
+        for name in ("position", "rotation", "translation", "rotation_change", "angle"):
             setattr(other, name, make(name, shape, struct.vars[name].type.dtype))
+        other.deepest = make("deepest", (*shape, 6), wp.float64)
 
     def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
         deepest = [self.deepest_kernels.module] if self.deepest_kernels else []

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..elements import Rule
+from ..kernels.contact.facet_structs import EDGES
 from .contact_points import ContactPoints, element_depths, points_by_faces
 from .contacts import Collider, Contact, ContactOptions
 from .discretisation import Discretisation
@@ -43,7 +44,7 @@ class EdgeContact(FacetOptions):
 
     of: Contact | PairContact
     name: str
-    one_sided = True
+    one_sided = EDGES
 
     @property
     def surfaces(self) -> tuple[SurfaceSet, ...]:

@@ -48,7 +48,7 @@ class ObstacleContact(FacetOptions):
     name: str
     sign = -1.0
     shadow = 0.25
-    one_sided = True
+    one_sided = 1
 
     @property
     def surfaces(self) -> tuple[SurfaceSet, ...]:

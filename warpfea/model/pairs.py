@@ -52,12 +52,12 @@ class FacetOptions(ContactOptions):
     Attributes:
         name: unique among the contacts of its builder.
         shadow: mean shadow over the area of the points, a quarter for those around a convex obstacle.
-        one_sided: True if its points touch only facets that face theirs.
+        one_sided: 1 if its points touch only facets that face theirs; EDGES if only within these.
     """
 
     name: str
     shadow: ClassVar[float] = 1.0
-    one_sided: ClassVar[bool] = False
+    one_sided: ClassVar[int] = 0
 
     def region_area(self, points: ContactPoints) -> float:
         """As of `ContactOptions`; without a radius that of its smaller surface."""
