@@ -127,6 +127,8 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> KernelSet:
             ratio = ctl.norms.residual_ratio[world] / wp.max(old_worst, f64(1.0e-300))
         ctl.norms.residual_reduction[world] = ratio
         eta = f64(0.9) * ratio * ratio
+        if wp.static(traits.unilateral) and ctl.search.alpha[world] > f64(1.0):
+            eta = f64(0.1)  # the fall of a quadratic force tells nothing of the convergence
         guard = f64(0.9) * ctl.solve.forcing[world] * ctl.solve.forcing[world]
         if guard > f64(0.1):
             eta = wp.max(eta, guard)
