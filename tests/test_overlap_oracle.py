@@ -1,8 +1,15 @@
-"""Crossings of bodies that the overlap check reports, against intersections of their skins that ipctk finds."""
+"""Crossings of bodies that the overlap check reports, against intersections of their skins that ipctk finds.
+
+`python tests/test_overlap_oracle.py FRAMES JOBS FILE` counts them in many frames.
+"""
 
 from __future__ import annotations
 
+import json
+import pathlib
+import sys
 import warnings
+from concurrent.futures import ProcessPoolExecutor
 from itertools import combinations
 
 import numpy as np
@@ -31,11 +38,16 @@ def bodies(b):
     ]
 
 
-def throw(rng, body, u):
-    """Turn, stretch by up to a tenth and move a body: displacements of its slots."""
+def throw(rng, body, u, frame):
+    """Turn, stretch by up to a tenth and move a body: displacements of its slots. Each third frame is a drop without a
+    turn, each third one squeezes by up to a third."""
     turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     turn[:, 0] *= np.linalg.det(turn)
     A = turn @ (np.eye(3) + 0.05 * rng.uniform(-1.0, 1.0, (3, 3)))
+    if frame % 3 == 1:
+        A = np.eye(3)
+    elif frame % 3 == 2:
+        A = turn @ np.diag(1.0 - rng.uniform(-0.1, 0.33, 3))
     e = body.reference + (body.slot_kind == 0)[:, None] * body.origin
     u[body.slots] = e @ (A - np.eye(3)).T + (body.slot_kind == 0)[:, None] * rng.uniform(-0.12, 0.12, 3)
 
@@ -64,19 +76,19 @@ def shrunk(skin, depth):
     return x - depth * normal / np.linalg.norm(normal, axis=1, keepdims=True), triangles
 
 
-@pytest.mark.parametrize("frames", [40, pytest.param(600, marks=pytest.mark.slow)])
-def test_crossings_are_those_of_ipctk(frames):
-    """Reported pairs intersect; others that do no longer do with skins moved in by twice the depth that counts."""
-    rng = np.random.default_rng(7)
+def crossings(frames, seed=7):
+    """Numbers of reported pairs, all of which intersect; of others that do, but no longer with skins moved in by twice
+    the depth that counts; and of those apart."""
+    rng = np.random.default_rng(seed)
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     of = bodies(b)
     sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-3)
     counts = {"reported": 0, "shallow": 0, "apart": 0}
-    for _ in range(frames):
+    for frame in range(frames):
         state = sim.model.state()
         u = state.displacement.numpy()
         for body in of:
-            throw(rng, body, u[0])
+            throw(rng, body, u[0], frame)
         sim.state.displacement.assign(u)
         check = OverlapCheck(sim)
         with warnings.catch_warnings():
@@ -99,5 +111,22 @@ def test_crossings_are_those_of_ipctk(frames):
                 assert not intersect(shrunk(one, depth), shrunk(other, depth)), (first, second)
             else:
                 counts["apart"] += 1
+    return counts
+
+
+@pytest.mark.parametrize("frames", [40, pytest.param(600, marks=pytest.mark.slow)])
+def test_crossings_are_those_of_ipctk(frames):
+    counts = crossings(frames)
     assert counts["reported"] > frames
     assert counts["apart"] > frames
+
+
+if __name__ == "__main__":
+    from warpfea.base.provenance import provenance_of
+
+    frames, jobs = map(int, sys.argv[1:3])
+    with ProcessPoolExecutor(jobs) as pool:
+        rows = list(pool.map(crossings, [-(-frames // jobs)] * jobs, range(jobs)))
+    command = " ".join(["python", *sys.argv])
+    content = provenance_of([], "cpu") | {"command": command, "frames": -(-frames // jobs) * jobs, "rows": rows}
+    pathlib.Path(sys.argv[3]).write_text(json.dumps(content, indent=2) + "\n")
