@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation as Turn
 import warpfea as wf
 from warpfea.contact.facets import FacetContact
 from warpfea.model.pairs import PairContact
+from warpfea.simulation.checkpoint import save_checkpoint
 
 G, RHO, E, NU, WIDTH = 9.81, 1000.0, 1e7, 0.3, 0.04
 HALF = WIDTH / np.sqrt(2.0)
@@ -112,6 +113,29 @@ def test_an_edge_slides_on_another_over_the_borders_of_elements(along):
     assert record.penetration.max() < 2e-6
     assert newton < 10 * steps
     assert abs(sim.energies()["ledger_residual"][0]) < 1e-8
+
+
+@pytest.mark.parametrize("clamped", [True, False])
+def test_a_resumed_run_of_crossed_edges_has_the_same_bits(clamped, tmp_path):
+    """Also beside another simulation of the same model, and with rigid body modes in the preconditioner."""
+    b, low, high, at = crossed(1.0, 5)
+    b.clamp(low.nodes(lambda X: X[:, 2] < -0.3 * WIDTH))
+    if clamped:
+        b.clamp(high.nodes(lambda X: X[:, 2] > at[2] + HALF - 1e-9), slots="position", components="xy")
+    pad = b.add_contact(high, low, mu=0.3)
+    model = b.finalize(device="cpu")
+    first, beside = (wf.Simulation(model, dt=2e-3) for _ in range(2))
+    first.step(12)
+    beside.step(9)
+    save_checkpoint(first, tmp_path / "half.npz")
+    second = wf.Simulation(model, dt=2e-3)
+    second.resume(tmp_path / "half.npz")
+    for sim in (first, second):
+        sim.step(12)
+    beside.step(15)
+    assert first.contact_record(pad).force[0, -1].any()
+    for sim in (second, beside):
+        np.testing.assert_array_equal(sim.state.displacement.numpy(), first.state.displacement.numpy())
 
 
 @pytest.mark.parametrize("angle", [0.0, 30.0, 90.0])

@@ -307,18 +307,20 @@ def block_kernels(dtype: str, listed: bool) -> KernelSet:
     Facets, PointLists = contact_structs(dtype).Facets, point_list_struct()
     Points = PointLists if listed else Facets
     Topology, Pattern = topology_struct(dtype), pattern_struct()
-    add_symmetric, k_ = add_symmetric_function(dtype), kinematics_functions(dtype)
+    add_symmetric, is_edge = add_symmetric_function(dtype), kinematics_functions(dtype).is_edge
     module = kernel_module(f"{'pair' if listed else 'contact'}_blocks_{dtype}", max_unroll=SHORT_UNROLL)
 
     @wp.func
     def own_block(
         facets: Facets, stiffness: wp.array2d(dtype=sym), weight: wp.array3d(dtype=T), world: int, at: wp.vec3i, k6: sym
     ) -> sym:  # fmt: skip
-        """k6 + sum over the points of a facet of s_a s_b K; `weight`: of moving contact points."""
+        """k6 + sum over the points of a facet of s_a s_b K; `weight`: of moving contact points. Without those on edges:
+        their shape values are not stored with a preconditioner, which a restart makes anew."""
         out = k6
-        at_world = k_.column(facets, world, at[0])
+        if is_edge(facets, at[0]):
+            return out
         for q in range(facets.point_count):
-            s = k_.shape_at(facets, q, at[1], at_world) * k_.shape_at(facets, q, at[2], at_world)
+            s = facets.shape[q, at[1], at[0]] * facets.shape[q, at[2], at[0]]
             if facets.tracks_deepest != 0:
                 c = facets.contact[at[0]]
                 s = weight[world, c, at[1]] * weight[world, c, at[2]]

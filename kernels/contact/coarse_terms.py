@@ -42,7 +42,7 @@ def coarse_term_kernels(dtype: str) -> KernelSet:
     p = precision(dtype)
     T, vec3, mat33, sym = p.T, p.vec3, p.mat33, p.sym
     Groups, Masters, Facets = coarse_groups_struct(dtype), master_struct(dtype), facet_struct(dtype)
-    lane_sum, kinematics = lane_functions(dtype).lane_sum, kinematics_functions(dtype)
+    lane_sum, is_edge = lane_functions(dtype).lane_sum, kinematics_functions(dtype).is_edge
     module = kernel_module(f"pair_coarse_terms_{dtype}", max_unroll=SHORT_UNROLL)
 
     @wp.func
@@ -71,7 +71,8 @@ def coarse_term_kernels(dtype: str) -> KernelSet:
             l = wp.where(side == 0, entry % 4, (entry / 4) % 4)
             for e in range(groups.facet_start[own] + lane, groups.facet_start[own + 1], lanes):
                 item = groups.facet[e]
-                at = kinematics.column(facets, world, item)
+                if is_edge(facets, item):
+                    continue
                 for q in range(facets.point_count):
                     point = facets.first_point + item * facets.point_count + q
                     f = listed[world, point] - 1
@@ -83,7 +84,7 @@ def coarse_term_kernels(dtype: str) -> KernelSet:
                             s = vec3()
                             for i in range(facets.conn.shape[0]):
                                 f_s = function_at_slot(groups, facets.conn[i, item], own, k)
-                                s += kinematics.shape_at(facets, q, i, at) * f_s
+                                s += facets.shape[q, i, item] * f_s
                             c = stiffness[world, point]
                             B = mat33(c[0], c[5], c[4], c[5], c[1], c[3], c[4], c[3], c[2])
                             B = wp.diag(s) @ B @ wp.diag(o)

@@ -20,7 +20,7 @@ def pair_rigid_mode_kernels(dtype: str) -> KernelSet:
     p = precision(dtype)
     T, sym = p.T, p.sym
     Bodies, Masters, Facets = bodies_struct(dtype), master_struct(dtype), facet_struct(dtype)
-    rigid, k_ = rigid_mode_functions(dtype), kinematics_functions(dtype)
+    rigid, is_edge = rigid_mode_functions(dtype), kinematics_functions(dtype).is_edge
     module = kernel_module(f"pair_rigid_modes_{dtype}", max_unroll=SHORT_UNROLL)
 
     @masked_kernel(module, "active")
@@ -43,14 +43,14 @@ def pair_rigid_mode_kernels(dtype: str) -> KernelSet:
         while point < first[c + 1]:
             f = listed[world, point] - 1
             k = stiffness[world, point]
-            if f >= 0 and wp.length_sq(k) > T(0.0):
-                item = (point - facets.first_point) / facets.point_count
+            item = (point - facets.first_point) / facets.point_count
+            if f >= 0 and wp.length_sq(k) > T(0.0) and not is_edge(facets, item):
                 q = (point - facets.first_point) % facets.point_count
                 b = bodies.body_of_slot[mas.conn[0, f]]
                 sm = mat33d()
                 st = mat33d()
                 for i in range(facets.conn.shape[0]):
-                    s = f64(k_.shape_at(facets, q, i, k_.column(facets, world, item)))
+                    s = f64(facets.shape[q, i, item])
                     sm += s * rigid.translation_columns(bodies, a, facets.conn[i, item])
                     st += s * rigid.rotation_columns(bodies, world, a, facets.conn[i, item])
                 om = mat33d()
