@@ -38,6 +38,7 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> KernelSet:
     """Kernels in the module of Newton's method, and the function `tangent_needed`."""
     Control = control_struct()
     convergence = convergence_functions(traits)
+    longest = 1.0 if traits.unilateral else 1.0e300
 
     @wp.func
     def tangent_needed(ctl: Control, world: int) -> bool:
@@ -127,8 +128,8 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> KernelSet:
             ratio = ctl.norms.residual_ratio[world] / wp.max(old_worst, f64(1.0e-300))
         ctl.norms.residual_reduction[world] = ratio
         eta = f64(0.9) * ratio * ratio
-        if wp.static(traits.unilateral) and ctl.search.alpha[world] > f64(1.0):
-            eta = f64(0.1)  # the fall of a quadratic force tells nothing of the convergence
+        # the fall of a quadratic force tells nothing of the convergence
+        eta = wp.where(ctl.search.alpha[world] > f64(wp.static(longest)), f64(0.1), eta)
         guard = f64(0.9) * ctl.solve.forcing[world] * ctl.solve.forcing[world]
         if guard > f64(0.1):
             eta = wp.max(eta, guard)

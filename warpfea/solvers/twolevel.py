@@ -365,13 +365,13 @@ class TwoLevel(Preconditioner):
 
     def _invert(self, flags: wp.array) -> None:
         """Invert all levels; the first is already filled."""
+        coupled = [*self._coupled_terms()] if self.couples_levels else []
         for depth, (level, arrays) in enumerate(zip(self.levels, self.level_arrays)):
             if arrays.dense_inverse is not None:
                 if depth:
                     arrays.dense_inverse.fill(level.pattern, arrays.block_values, flags)
-                if self.couples_levels:
-                    for term, kept in self._coupled_terms():
-                        term.add_coarse_coupling(self.ctx, kept, self.reuse.control.dq_dv, flags)
+                for term, kept in coupled:
+                    term.add_coarse_coupling(self.ctx, kept, self.reuse.control.dq_dv, flags)
                 arrays.dense_inverse.invert(flags, keep=depth == 0, reduce=self.residual.reduce)
                 continue
             if arrays.block_values is not None:
