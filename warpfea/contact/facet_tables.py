@@ -23,7 +23,7 @@ from ..model.pairs import (
     master_facets,
     monomial_exponents,
 )
-from .tables import TOUCHING_DEPTH_RATIO, WORLD_PARAMETERS, FacetGroup, FacetTables, clamped_slots
+from .tables import TOUCHING_DEPTH_RATIO, WORLD_PARAMETERS, FacetTables, clamped_slots
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -115,11 +115,6 @@ class PairTables(FacetTables[FacetOptions]):
             "edge_X": np.zeros((p.area.shape[1], columns, 3)),
         }  # fmt: skip
 
-    @property
-    def edge_groups(self) -> list[tuple[FacetGroup, Any]]:
-        """Groups of facets with edges, and these."""
-        return [(group, edges) for group, edges in zip(self.groups, self.edge_data) if edges is not None]
-
     def _check_clamped(self) -> None:
         """Raise ModelError for a contact whose slots are all clamped."""
         clamped = clamped_slots(self.model)
@@ -149,6 +144,8 @@ class PairTables(FacetTables[FacetOptions]):
     def build(self, laws: TimeLawTable, pool: int) -> None:
         """Upload the tables; `pool`: first pool entry of the term."""
         self.pool = self._build_facets(pool)
+        both = zip(self.groups, self.edge_data)
+        self.edge_groups = [(group, edges) for group, edges in both if edges is not None]
         self.data = contact_struct()()
         self._upload_laws(self.data, [self.law_constants(c) for c in self.contacts])
         self.store_built_values()

@@ -272,7 +272,8 @@ class FacetContact(ContactTerm, Tied, Coupled):
         return self.model.array("contact", np.array(both), wp.vec2i) if both else None
 
     def report(self, ctx: StepContext) -> None:
-        super().report(ctx)
+        args = [ctx.scratch[self.name]["attempt"], self.report_offset, ctx.work.report]
+        ctx.launch(self.ledger_kernels.write_records, (self.model.worlds, len(self.tables.contacts)), args)
         if self._edge_columns is not None:
             dim = (self.model.worlds, len(self._edge_columns))
             ctx.launch(edge_record_kernels().add_edge_records, dim, [self._edge_columns, ctx.work.report])
