@@ -178,6 +178,15 @@ def test_many_worlds_take_bands_by_default(name):
     assert rows["pendulum-auto-1"]["preconditioner"] == "two-level"
 
 
+def test_piles_are_no_slower_than_before_contact_was_one():
+    """With the held stiffness and by default, beside the rows of contact_once_h200.json, on the same kind of card."""
+    before = {row["label"]: np.median(row["ms"]) for row in rows_of("contact_once_h200.json", device="cuda")}
+    piles = {row["label"]: row for row in content_of("piles_h200.json", device="cuda")["piles"]}
+    for cells in (4, 10, 20):
+        for label in (f"pile-{cells}", f"pile-{cells}-default"):
+            assert piles[label]["ms"] <= 1.05 * before[label], label
+
+
 BEFORE = "bf679c2fb4f87bf423f74465b239d3a398e548db"
 VERSIONS = {"versions_h200.json": ("--peer", 1.05, 15), "versions_cpu.json": ("--cpu", 1.10, 20)}
 

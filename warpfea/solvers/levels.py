@@ -30,8 +30,8 @@ cantilever of 180 slots takes half the iterations)."""
 MAX_BOTTOM_SLOTS = {"cpu": 160, "cuda": 1344}
 """Largest coarse level inverted as one dense matrix, slots by device; on CUDA this is cheaper than the launches of
 further levels."""
-MAX_COUPLED_SLOTS = 672
-"""Largest single coarse matrix of bodies that terms couple, slots: half, as contacts change and it is rebuilt."""
+MAX_COUPLED_SLOTS = 448
+"""Largest single coarse matrix of bodies that terms couple, slots: a third, as contacts change and it is rebuilt."""
 MAX_COMPONENT_PAIRS = 1344**2
 """Maximum slot pairs in components of up to MAX_FULL_FACTOR_SLOTS slots that are each inverted as a whole."""
 MAX_LEVELS = 12
@@ -162,12 +162,11 @@ def _coupled_levels(model: Model, pattern: Pattern, points: ReferencePoints, by_
     components = DenseComponents.from_pattern(model, pattern) if by_component else None
     whole = components is not None and _inverted_whole(components)
     sizes = (SMALL_GROUP_SLOTS[-1],) if whole else ()
-    for capacity in (*sizes, GROUP_SLOTS, 2 * GROUP_SLOTS, 4 * GROUP_SLOTS):
-        if 4 * n <= bottom * capacity:
-            level, _, below = _make_level(model, pattern, points, capacity)
-            if 4 * level.group_count <= bottom:
-                break
-    else:
+    capacity = next((c for c in (*sizes, GROUP_SLOTS, 2 * GROUP_SLOTS) if 4.05 * n / c <= bottom), 0)
+    if not capacity:
+        return []
+    level, _, below = _make_level(model, pattern, points, capacity)
+    if 4 * level.group_count > bottom:
         return []
     if whole:
         level.is_dense, level.components, level.tile_count = True, components, 0
