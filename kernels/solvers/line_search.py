@@ -30,8 +30,8 @@ KINK_SLOPE_RATIO, MAX_KINK_TRIALS = 0.5, 8
 points have reversed and Phi has a kink before. It is located by at most MAX_KINK_TRIALS trials: a step beyond it makes
 the points slip back, again and again, while one that ends near it makes them stick."""
 QUADRATIC_SLOPE_RATIO = 0.2
-"""Contact: a step after which Phi still falls by more than this ratio of its slope at the iterate is doubled. A full
-step leaves a quarter of it where the force grows with the square of the depth, and would halve the depth only."""
+"""Contact in motion: a step after which Phi still falls by more than this ratio of its slope at the iterate is doubled.
+A full step leaves a quarter of it where the force grows with the square of the depth, and would halve the depth only."""
 
 
 def line_search_kernels(traits: Traits, module: wp.Module) -> KernelSet:
@@ -258,7 +258,7 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> KernelSet:
         steep = f64(KINK_SLOPE_RATIO) * wp.abs(ctl.search.slope[world])
         alpha = ctl.search.alpha[world]
         if ctl.search.trials[world] == 0 and slope < f64(QUADRATIC_SLOPE_RATIO) * ctl.search.slope[world]:
-            if alpha == f64(1.0) and wp.static(not traits.limited):
+            if alpha == f64(1.0) and ctl.is_static == 0 and wp.static(not traits.limited):
                 ctl.search.bracket_low[world] = wp.vec2d(alpha, slope)
                 ctl.search.trials[world] = 1
                 ctl.search.alpha[world] = f64(2.0) * alpha
