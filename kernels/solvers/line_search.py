@@ -31,7 +31,8 @@ points have reversed and Phi has a kink before. It is located by at most MAX_KIN
 the points slip back, again and again, while one that ends near it makes them stick."""
 QUADRATIC_SLOPE_RATIO = 0.2
 """Contact in motion: a step after which Phi still falls by more than this ratio of its slope at the iterate is doubled.
-A full step leaves a quarter of it where the force grows with the square of the depth, and would halve the depth only."""
+A full step leaves a quarter of it where the force grows with the square of the depth, and would halve the depth
+only."""
 
 
 def line_search_kernels(traits: Traits, module: wp.Module) -> KernelSet:
