@@ -174,8 +174,8 @@ CONSTANTS: dict[str, Constant] = {
 
 Not tuned, so without a row: MAX_NONMONOTONE and MAX_DOUBLINGS, whose absence is that of the watchdog and of doublings;
 MAX_CONTACT_NOISE, the largest error that is accepted; PATCH_ANGLES, bounds of a count of points; AUTO_OVERLAP_RATIOS,
-promised by `overlap`; LEVEL_COSINE, a tolerance of parallel planes; SHARP_COSINE, promised by `clipping`; EDGE_WIDTH,
-that of other points at a border. Not needed by any row yet: DOUBLING_RATIO (without it a falling bar takes 4 to 10 %
+promised by `overlap`; LEVEL_COSINE, a tolerance of parallel planes; EDGE_WIDTH, that of other points at a
+border. Not needed by any row yet: DOUBLING_RATIO (without it a falling bar takes 4 to 10 %
 fewer iterations) and FIRST_STEP_ERROR.
 """
 

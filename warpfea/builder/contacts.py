@@ -18,7 +18,7 @@ from ..model.bodies import Body
 from ..model.contact_points import check_contact_points
 from ..model.contacts import Collider, Contact
 from ..model.description import Description
-from ..model.edge_points import edges_of, has_edges
+from ..model.edge_points import edge_contact
 from ..model.handles import SurfaceSet
 from ..model.obstacle_points import ObstacleContact, is_narrow_obstacle
 from ..model.pairs import PAIR_RULES, FacetOptions, PairContact, slave_and_master
@@ -87,9 +87,8 @@ def add_contact(
     make = next((make for kind, make in KINDS.items() if isinstance(other, kind)), make_contact)
     contact = make(d, thing, other, name, **options)
     check_clipping(contact, clipping)
-    if clipping and isinstance(contact, (Contact, PairContact)) and has_edges(contact):
-        index = len(d.contacts_of(FacetOptions)) + isinstance(contact, PairContact)
-        contact.edges = edges_of(contact, index)
+    if clipping and isinstance(contact, (Contact, PairContact)):
+        contact.edges = edge_contact(contact, len(d.contacts_of(FacetOptions)) + isinstance(contact, PairContact))
     d.contacts.append(contact)
     return contact
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from .assembly import facet_tables
 from .contact_points import ContactPoints, element_edge_and_depth
 from .handles import SurfaceSet
 
-__all__ = ["CORNERS", "Edges", "edges_of", "sharp_sides", "with_edges"]
+__all__ = ["Edges", "parts_of", "sharp_edges_of", "sharp_sides", "with_edges"]
 
 CORNERS = {
     3: np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)]),
@@ -29,7 +29,8 @@ class Edges:
     """Sharp edges of a surface, each a side of one of its facets, as cubics of a place from 0 to 1.
 
     Attributes:
-        facet, side: (E,) of the surface. half_angle: (E,) between the normals on both sides of it, rad.
+        facet, side: (E,) of the surface; across: the facet beyond it. conn: (E, L) slots of the facet.
+        half_angle: (E,) between the normals of both facets, rad.
         depth: (E,) least depth of the elements behind both, m.
         shape: (2, 4, L, E) coefficients of the functions of the facet's slots, X: (2, 4, E, 3) of the position, m, and
             of a vector into the facet.
@@ -37,14 +38,22 @@ class Edges:
 
     facet: np.ndarray
     side: np.ndarray
+    across: np.ndarray
+    conn: np.ndarray
     half_angle: np.ndarray
     depth: np.ndarray
     shape: np.ndarray
     X: np.ndarray
 
+    def take(self, of: np.ndarray) -> Edges:
+        """Some of the edges, by mask or number."""
+        rest = (getattr(self, name)[of] for name in ("facet", "side", "across", "conn", "half_angle", "depth"))
+        return Edges(*rest, self.shape[..., of], self.X[:, :, of])
 
-def edges_of(surface: SurfaceSet) -> Edges:
-    """Sharp edges of a surface: convex ones between two facets with more than twice `EDGE_MARGIN` to either side."""
+
+def sharp_edges_of(surface: SurfaceSet, *, both: bool = False) -> Edges:
+    """Sharp edges of a surface: convex ones between two facets with more than twice `EDGE_MARGIN` to either side, each
+    once, or with `both` as a side of each of the two."""
     family, kind = surface.body.family, surface.faces[:, 1]
     corners = {int(face): len(family.faces[face]) for face in np.unique(kind)}
     places = np.array([0.0, 1.0 / 3.0, 0.5, 2.0 / 3.0, 1.0])
@@ -73,15 +82,20 @@ def edges_of(surface: SurfaceSet) -> Edges:
     a, b = order[start[count == 2]], order[start[count == 2] + 1]
     half = 0.5 * np.arccos(np.clip(np.einsum("ek,ek->e", normal[a], normal[b]), -1.0, 1.0))
     sharp = (half > 2.0 * EDGE_MARGIN) & (np.einsum("ek,ek->e", into[a], normal[b]) < 0.0)
-    a, b = owners(facet, a[sharp], b[sharp])
+    a, b, half = a[sharp], b[sharp], half[sharp]
+    if both:
+        a, b, half = np.concatenate([a, b]), np.concatenate([b, a]), np.tile(half, 2)
+    else:
+        a, b = owners(facet, a, b)
     order = np.lexsort((side[a], facet[a]))
-    a, b, half = a[order], b[order], half[sharp][order]
+    a, b, half = a[order], b[order], half[order]
     depth = element_edge_and_depth(surface)[1]
     fit = np.linalg.inv(places[[0, 1, 3, 4], None] ** np.arange(4))
     cubic = np.stack([np.einsum("mq,eqi->mie", fit, s[a][:, [0, 1, 3, 4]]) for s in (shape, way[0])])
     X = np.einsum("nmie,eik->nmek", cubic, e[a])
     X[0, 0] += surface.body.origin
-    return Edges(facet[a], side[a], half, np.minimum(depth[facet[a]], depth[facet[b]]), cubic, X)
+    least = np.minimum(depth[facet[a]], depth[facet[b]])
+    return Edges(facet[a], side[a], facet[b], t.conn[facet[a]], half, least, cubic, X)
 
 
 def owners(facet: np.ndarray, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -108,9 +122,9 @@ def parts_of(edges: Edges, width: float) -> Edges:
     begin = size * (np.arange(len(of)) - (np.cumsum(counts) - counts)[of])
     turn = np.array([[math.comb(n, m) * begin ** (n - m) * size**m if n >= m else 0.0 * size for n in range(4)]
                      for m in range(4)])  # fmt: skip
-    shape = np.einsum("mne,anie->amie", turn, edges.shape[..., of])
-    X = np.einsum("mne,anek->amek", turn, edges.X[:, :, of])
-    return Edges(edges.facet[of], edges.side[of], edges.half_angle[of], edges.depth[of], shape, X)
+    out = edges.take(of)
+    shape, X = np.einsum("mne,anie->amie", turn, out.shape), np.einsum("mne,anek->amek", turn, out.X)
+    return replace(out, shape=shape, X=X)
 
 
 def edge_places(edges: Edges, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -132,6 +146,6 @@ def with_edges(p: ContactPoints, edges: Edges) -> ContactPoints:
 
 def sharp_sides(surface: SurfaceSet) -> np.ndarray:
     """(4, F) half the angle between the normals at sharp sides of facets, rad, else 0."""
-    out, edges = np.zeros((4, len(surface.faces))), edges_of(surface)
+    out, edges = np.zeros((4, len(surface.faces))), sharp_edges_of(surface)
     out[edges.side, edges.facet] = edges.half_angle
     return out

@@ -17,7 +17,7 @@ from . import assembly
 from .contact_points import ContactPoints, effective_modulus, points_by_faces, points_by_rules, rules_of_faces
 from .contacts import ContactOptions
 from .discretisation import element_functions
-from .edges import Edges, edges_of, parts_of, sharp_sides
+from .edges import Edges, parts_of, sharp_edges_of, sharp_sides
 from .handles import SurfaceSet
 from .narrow import body_widths, facet_size, is_narrow, rules_for_width
 from .surfaces import measure_to_skin
@@ -106,7 +106,7 @@ class PairContact(FacetOptions):
         """Sharp edges of the slave, if the master has some too and the stiffness is that of the elements."""
         if self.stiffness_of != "elements" or self.model != "patch" or self.treatment != "implicit":
             return None
-        edges = parts_of(edges_of(self.slave), body_widths(self.master.body)[0])
+        edges = parts_of(sharp_edges_of(self.slave), body_widths(self.master.body)[0])
         return edges if len(edges.facet) and sharp_sides(self.master).any() else None
 
     @property
