@@ -167,7 +167,9 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> KernelSet:
         ctl.first_norm[world] = norm
         ctl.iterations[world] = 0
         ctl.negative_curvature[world] = 0
-        ctl.follow_negative_curvature[world] = 1 - newton.linear_stress
+        # a linear prediction is of use to full steps only
+        predicts = newton.linear_stress != 0 and newton.solve.predicted_stress[world] != 0
+        ctl.follow_negative_curvature[world] = wp.where(predicts, 0, 1)
         estimate_error = newton.floor.estimate_error[world] != 0
         # a linear prediction must also cover the whole step; other laws are not linear that far
         whole = newton.solve.predicted_stress[world] == 1 and newton.linear_stress != 0
