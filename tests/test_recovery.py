@@ -246,18 +246,24 @@ def truss(kind, rise, side, E):
 @pytest.mark.parametrize(
     ("kind", "rise", "side", "steps", "most"),
     [
-        ("3243", 0.3, 0.1, 10, 300),
-        ("3243", 0.1, 0.02, 10, 150),
-        ("T10", 0.1, 0.02, 10, 200),
+        ("3243", 0.3, 0.1, 10, 100),
+        ("3243", 0.1, 0.02, 10, 120),
+        ("T10", 0.1, 0.02, 10, 150),
         ("T10", 0.3, 0.02, 10, 180),
     ],
 )
 def test_trusses_snap_through_in_few_iterations(kind, rise, side, steps, most):
-    """Bars that buckle on the way: 129, 74, 95, 87 Newton iterations. Fails on 8934ce7: 509, refused, refused, 333."""
-    model, height = truss(kind, rise, side, 2e11)
-    found = wf.solve_static(model, load_steps=steps)
-    assert found.probe("apex").position[0, -1, 2] == pytest.approx(height, rel=1e-4)
-    assert found.newton[0] <= most
+    """Bars that buckle on the way, symmetric, so that rounding begins it: five moduli that differ by rounding.
+
+    Medians of 21 moduli: 54, 60, 75, 80 Newton iterations; on f6f15820 124, 74, 259 (9 of them refused), 93.
+    """
+    newton = []
+    for k in range(5):
+        model, height = truss(kind, rise, side, 2e11 * (1 + k * 1e-11))
+        found = wf.solve_static(model, load_steps=steps)
+        assert found.probe("apex").position[0, -1, 2] == pytest.approx(height, rel=1e-4)
+        newton.append(found.newton[0])
+    assert np.median(newton) <= most
 
 
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda:0", marks=pytest.mark.cuda)])

@@ -23,6 +23,7 @@ UNCHECKED_ITERATIONS = 3
 refined by conjugate gradients."""
 ENERGY_CHECK_INTERVAL, MIN_ENERGY_GAIN = 10, 0.01
 """An error-estimating solve ends when its energy grows by less than this fraction in this number of iterations."""
+VANISHED_RESIDUAL = 1.0e-12  # residual over the first one of a solve that has nothing left but underflow
 FREE_GROUP_LANES = 128
 """Partial sums per group of bodies; fixed, so that results are independent of the number of worlds."""
 
@@ -264,9 +265,11 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> KernelSet:
             cut = ctl.estimate_error[world] != 0 and count >= ctl.max_iterations
             if count >= ctl.max_iterations and norm > ctl.target_norm[world]:
                 ctl.pcg_unconverged[world] = 1
-            if cut or not (pHp > f64(0.0) and rz >= f64(0.0)):
+            # solved beyond any rounding: signs of what is left say nothing of H
+            vanished = norm <= f64(VANISHED_RESIDUAL) * ctl.first_norm[world]
+            if cut or not (pHp > f64(0.0) and (rz >= f64(0.0) or vanished)):
                 ctl.negative_curvature[world] = 1
-            if more and pHp > f64(0.0) and wp.isfinite(pHp) and rz > f64(0.0) and wp.isfinite(rz):
+            if more and not vanished and pHp > f64(0.0) and wp.isfinite(pHp) and rz > f64(0.0) and wp.isfinite(rz):
                 wp.atomic_max(ctl.any_active, 0, 1)
             else:
                 ctl.active[world] = 0  # threads that see this at once leave p unchanged; it is not read again
