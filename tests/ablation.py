@@ -168,6 +168,7 @@ CONSTANTS: dict[str, Constant] = {
     "EDGE_MARGIN": Constant(CONTACT, "rad", 0.0, "contact"),
     "ENTRY_DEPTH": Constant(CONTACT, "depths of elements", 0.0, "contact"),
     "BESIDE_DEPTH": Constant(CONTACT, "depths of elements", 0.0, "contact"),
+    "EDGE_ENTRY_SLOPE": Constant(CONTACT, "1", 1.0e300, "contact"),
     "FACING_COSINE": Constant(CONTACT, "1", 0.0, "contact"),
 }
 """Tuned constants by name, unique among the sources.
@@ -175,7 +176,7 @@ CONSTANTS: dict[str, Constant] = {
 Not tuned, so without a row: MAX_NONMONOTONE and MAX_DOUBLINGS, whose absence is that of the watchdog and of doublings;
 MAX_CONTACT_NOISE, the largest error that is accepted; PATCH_ANGLES, bounds of a count of points; AUTO_OVERLAP_RATIOS,
 promised by `overlap`; LEVEL_COSINE, a tolerance of parallel planes; EDGE_WIDTH, that of other points at a
-border. Not needed by any row yet: DOUBLING_RATIO (without it a falling bar takes 4 to 10 %
+border; VANISHED_RESIDUAL, one of underflow; COUPLED_REBUILD_COST and MAX_COUPLED_SLOTS, costs and memory. Not needed by any row yet: DOUBLING_RATIO (without it a falling bar takes 4 to 10 %
 fewer iterations) and FIRST_STEP_ERROR.
 """
 

@@ -26,6 +26,9 @@ MAX_COLLIDER_ROTATION = 1.0
 """Largest rotation of a touched collider in a step, rad; larger rotations are rejected."""
 BESIDE_DEPTH = 0.25
 """Depth over that of an element to which a facet below an edge does not touch the side face that it does not face."""
+EDGE_ENTRY_SLOPE = 100.0
+"""Depth over that below the side face from which a point over an edge is in contact: one that wavers at the edge must
+not gain and lose its force."""
 BESIDE = -3
 """In place of a side: the point has none."""
 
@@ -129,13 +132,18 @@ def collider_kinematics(dtype: str, meshes: bool, seams: bool = False) -> Kernel
             if side >= 0:
                 found = distance(col, kc, y, side)
                 level = vec3d(found[0], found[1], found[2])
-                most = f64(MAX_DEPTH_RATIO) * col.deepest[world, kc, direction(level)]
-                if apart:
+                others = col.deepest[world, kc, direction(level)]
+                most = f64(MAX_DEPTH_RATIO) * others
+                if apart and wp.dot(level, inward) > f64(OPPOSING_COSINE):
                     most = wp.max(most, f64(ENTRY_DEPTH) * facets.element_depth[item])
-                if wp.dot(level, way) > f64(OPPOSING_COSINE) and found[3] < f64(0.0):
-                    if -found[3] <= most:
+                ends = wp.dot(level, inward) > -f64(MIN_NORMAL_COSINE)
+                if ends and wp.dot(level, way) > f64(OPPOSING_COSINE) and found[3] < f64(0.0):
+                    if -found[3] <= wp.min(most, f64(EDGE_ENTRY_SLOPE) * -d[3]):
                         return side
-                    if apart and -found[3] <= f64(BESIDE_DEPTH) * facets.element_depth[item]:
+                    # a blunt edge also meets facets between both sides
+                    if others > f64(0.0) or wp.dot(n, level) < f64(MIN_NORMAL_COSINE):
+                        most = wp.max(most, f64(BESIDE_DEPTH) * facets.element_depth[item])
+                    if apart and -found[3] <= most:
                         return BESIDE
             way = wp.cross(n, way)
         return -1
