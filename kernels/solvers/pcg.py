@@ -10,6 +10,7 @@ import warp as wp
 from ..common.lanes import lane_functions
 from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.types import double_1d, double_3d, f64, int_1d, precision
+from .convergence import SINGLE_PRECISION_EPS
 from .newton_control import control_struct
 
 __all__ = ["FREE_GROUP_LANES", "forcing_functions", "free_groups_struct", "pcg_kernels", "pcg_struct"]
@@ -168,9 +169,11 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> KernelSet:
         ctl.first_norm[world] = norm
         ctl.iterations[world] = 0
         ctl.negative_curvature[world] = 0
-        # a linear prediction is of use to full steps only
-        predicts = newton.linear_stress != 0 and newton.solve.predicted_stress[world] != 0
-        ctl.follow_negative_curvature[world] = wp.where(predicts, 0, 1)
+        follow = newton.linear_stress == 0
+        if newton.is_static != 0 and newton.floor.eps < f64(SINGLE_PRECISION_EPS):
+            # a linear prediction is of use to full steps only; in float32 the direction may be one of noise
+            follow = follow or newton.solve.predicted_stress[world] == 0
+        ctl.follow_negative_curvature[world] = wp.where(follow, 1, 0)
         estimate_error = newton.floor.estimate_error[world] != 0
         # a linear prediction must also cover the whole step; other laws are not linear that far
         whole = newton.solve.predicted_stress[world] == 1 and newton.linear_stress != 0
