@@ -47,8 +47,8 @@ class Edges:
 
     def take(self, of: np.ndarray) -> Edges:
         """Some of the edges, by mask or number."""
-        rest = (getattr(self, name)[of] for name in ("facet", "side", "across", "conn", "half_angle", "depth"))
-        return Edges(*rest, self.shape[..., of], self.X[:, :, of])
+        rest = {name: getattr(self, name)[of] for name in ("facet", "side", "across", "conn", "half_angle", "depth")}
+        return Edges(**rest, shape=self.shape[..., of], X=self.X[:, :, of])
 
 
 def sharp_edges_of(surface: SurfaceSet, *, both: bool = False) -> Edges:
