@@ -268,8 +268,8 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> KernelSet:
             cut = ctl.estimate_error[world] != 0 and count >= ctl.max_iterations
             if count >= ctl.max_iterations and norm > ctl.target_norm[world]:
                 ctl.pcg_unconverged[world] = 1
-            # solved beyond any rounding: signs of what is left say nothing of H
-            vanished = norm <= f64(VANISHED_RESIDUAL) * ctl.first_norm[world]
+            # an estimate has no other end than its energy's: signs of what underflow leaves say nothing of H
+            vanished = ctl.estimate_error[world] != 0 and norm <= f64(VANISHED_RESIDUAL) * ctl.first_norm[world]
             if cut or not (pHp > f64(0.0) and (rz >= f64(0.0) or vanished)):
                 ctl.negative_curvature[world] = 1
             if more and not vanished and pHp > f64(0.0) and wp.isfinite(pHp) and rz > f64(0.0) and wp.isfinite(rz):
