@@ -10,7 +10,6 @@ import warp as wp
 from ..common.lanes import lane_functions
 from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.types import double_1d, double_3d, f64, int_1d, precision
-from .convergence import SINGLE_PRECISION_EPS
 from .newton_control import control_struct
 
 __all__ = ["FREE_GROUP_LANES", "forcing_functions", "free_groups_struct", "pcg_kernels", "pcg_struct"]
@@ -58,6 +57,7 @@ def pcg_struct():
         follow_negative_curvature: wp.array(dtype=wp.int32)
         max_iterations: wp.int32  # of a solve
         max_work: wp.int32  # of a step
+        leaves_saddles: wp.int32  # negative curvature is followed with laws of linear stress too
 
     return PCGControl
 
@@ -170,8 +170,7 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> KernelSet:
         ctl.iterations[world] = 0
         ctl.negative_curvature[world] = 0
         follow = newton.linear_stress == 0
-        if newton.is_static != 0 and newton.floor.eps < f64(SINGLE_PRECISION_EPS):
-            # a linear prediction is of use to full steps only; in float32 the direction may be one of noise
+        if ctl.leaves_saddles != 0:  # a linear prediction is of use to full steps only
             follow = follow or newton.solve.predicted_stress[world] == 0
         ctl.follow_negative_curvature[world] = wp.where(follow, 1, 0)
         estimate_error = newton.floor.estimate_error[world] != 0

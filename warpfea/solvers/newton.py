@@ -203,6 +203,8 @@ class NewtonLoop:
             model, work, launch, self.residual, self.preconditioner,
             max_iterations=options.max_pcg, max_work=options.max_work, deflate=inertia,
         )  # fmt: skip
+        # in float32 negative curvature may be noise; factors meet it at the first direction
+        work.pcg.leaves_saddles = int(not inertia and model.dtype == "float64" and self.direct is None)
         self.dim = (model.worlds, model.slots)
         ctl = work.newton
         ctl.dq_dv = work.step.dq_dv
