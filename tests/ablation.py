@@ -169,7 +169,6 @@ CONSTANTS: dict[str, Constant] = {
     "ENTRY_DEPTH": Constant(CONTACT, "depths of elements", 0.0, "contact"),
     "BESIDE_DEPTH": Constant(CONTACT, "depths of elements", 0.0, "contact"),
     "EDGE_ENTRY_SLOPE": Constant(CONTACT, "1", 1.0e300, "contact"),
-    "SIDE_FACING_COSINE": Constant(CONTACT, "1", 0.0, "contact"),
     "FACING_COSINE": Constant(CONTACT, "1", 0.0, "contact"),
 }
 """Tuned constants by name, unique among the sources.

@@ -26,8 +26,6 @@ MAX_COLLIDER_ROTATION = 1.0
 """Largest rotation of a touched collider in a step, rad; larger rotations are rejected."""
 BESIDE_DEPTH = 0.25
 """Depth over that of an element to which a facet below an edge does not touch the side face that it does not face."""
-SIDE_FACING_COSINE = 0.4
-"""Cosine of a facet's reversed normal and that of a side face below which the facet does not face it."""
 EDGE_ENTRY_SLOPE = 100.0
 """Depth over that below the side face from which a point over an edge is in contact: one that wavers at the edge must
 not gain and lose its force."""
@@ -124,7 +122,7 @@ def collider_kinematics(dtype: str, meshes: bool, seams: bool = False) -> Kernel
         inward = k.inward_normal(facets, scr, world, item)
         if not solid or wp.length_sq(inward) == f64(0.0):
             return -1
-        apart = wp.dot(n, inward) < f64(SIDE_FACING_COSINE)
+        apart = wp.dot(n, inward) < f64(MIN_NORMAL_COSINE)
         way = k.tangential(n, inward)
         if wp.length_sq(way) < f64(0.5):
             way = k.tangential(n, vec3d(n[1], n[2], n[0]) + vec3d(f64(0.0), n[2], -n[1]))
