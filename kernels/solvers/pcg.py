@@ -183,8 +183,8 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> KernelSet:
         ctl.checked_energy[world] = f64(0.0)
         ctl.target_norm[world] = forcing_target(newton, world, norm)
         if ctl.estimate_error[world] != 0:
-            # round-off in the residual hides the smooth error: its norm is no stopping criterion
-            ctl.target_norm[world] = f64(0.0)
+            # round-off in the residual hides the smooth error: its norm is no stopping criterion before underflow
+            ctl.target_norm[world] = f64(VANISHED_RESIDUAL) * norm
         if ctl.step_iterations[world] >= ctl.max_work:
             return  # the step is given up, see `begin_search`
         if norm > ctl.target_norm[world] and rz > f64(0.0) and ctl.max_iterations > 0:
@@ -267,11 +267,11 @@ def pcg_kernels(dtype: str, has_constraints: bool = False) -> KernelSet:
             cut = ctl.estimate_error[world] != 0 and count >= ctl.max_iterations
             if count >= ctl.max_iterations and norm > ctl.target_norm[world]:
                 ctl.pcg_unconverged[world] = 1
-            # an estimate has no other end than its energy's: signs of what underflow leaves say nothing of H
-            vanished = ctl.estimate_error[world] != 0 and norm <= f64(VANISHED_RESIDUAL) * ctl.first_norm[world]
+            # signs of what underflow leaves say nothing of H
+            vanished = ctl.estimate_error[world] != 0 and norm <= ctl.target_norm[world]
             if cut or not (pHp > f64(0.0) and (rz >= f64(0.0) or vanished)):
                 ctl.negative_curvature[world] = 1
-            if more and not vanished and pHp > f64(0.0) and wp.isfinite(pHp) and rz > f64(0.0) and wp.isfinite(rz):
+            if more and pHp > f64(0.0) and wp.isfinite(pHp) and rz > f64(0.0) and wp.isfinite(rz):
                 wp.atomic_max(ctl.any_active, 0, 1)
             else:
                 ctl.active[world] = 0  # threads that see this at once leave p unchanged; it is not read again
