@@ -175,10 +175,9 @@ CONSTANTS: dict[str, Constant] = {
 
 Not tuned, so without a row: MAX_NONMONOTONE and MAX_DOUBLINGS, whose absence is that of the watchdog and of doublings;
 MAX_CONTACT_NOISE, the largest error that is accepted; PATCH_ANGLES, bounds of a count of points; AUTO_OVERLAP_RATIOS,
-promised by `overlap`; LEVEL_COSINE, a tolerance of parallel planes; EDGE_WIDTH, that of other points at a
-border; VANISHED_RESIDUAL, one of underflow; COUPLED_REBUILD_COST and MAX_COUPLED_SLOTS, costs and memory. Not
-needed by any row yet: DOUBLING_RATIO (without it a falling bar takes 4 to 10 %
-fewer iterations) and FIRST_STEP_ERROR.
+promised by `overlap`; LEVEL_COSINE, a tolerance of parallel planes; EDGE_WIDTH, that of other points at a border;
+VANISHED_RESIDUAL, one of underflow; COUPLED_REBUILD_COST and MAX_COUPLED_SLOTS, costs and memory. Not needed by any row
+yet: DOUBLING_RATIO (without it a falling bar takes 4 to 10 % fewer iterations) and FIRST_STEP_ERROR.
 """
 
 

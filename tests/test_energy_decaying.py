@@ -45,17 +45,9 @@ def energy(sim):
 # energy and momenta
 
 
-@pytest.mark.parametrize(
-    ("E", "turn", "steps"),
-    [(1e7, 0.2, 60), (1e9, 0.2, 40), (1e7, 1.0, 20)]
-    + [pytest.param(E, turn, 300, marks=pytest.mark.slow) for E in (1e7, 1e9, 2e11) for turn in (0.2, 0.5)]
-    + [pytest.param(1e9, 1.0, 300, marks=pytest.mark.slow)],
-)
-def test_a_free_bar_gains_no_energy_and_keeps_its_momenta(E, turn, steps):
-    """generalized_alpha has 440 times the energy at 1e9 Pa after 300 steps of 0.2; 8934ce7 has no rho_inf here.
-
-    Steps that rounding stops have the error that they report: 1e-11 to 1e-4, by chance, at 2e11 Pa and 0.5.
-    """
+def losses(E, turn, steps):
+    """Largest gain of energy in a step, errors of the momenta and of both ledgers of energy, and the largest error that
+    a step reports, of a free bar."""
     sim = wf.Simulation(spun(E), dt=turn / SPEED, integrator=LOSSY, solver=TIGHT)
     watch, last, gain = Conserved(sim), energy(sim), 0.0
     start = last
@@ -64,13 +56,33 @@ def test_a_free_bar_gains_no_energy_and_keeps_its_momenta(E, turn, steps):
         watch.measure()
         now = energy(sim)
         gain, last = max(gain, now / last - 1.0), now
-    floor = float(sim.max_floor)
-    assert gain <= (1e-11 if E < 1e11 else max(1e-11, floor))
-    bound = 1e-10 if E < 1e11 else max(1e-10, floor)
-    assert max(watch.linear, watch.angular) < bound
     e = {name: values[0] for name, values in sim.energies().items()}
-    assert e["integrator"] == pytest.approx(start - last, rel=1e-4, abs=bound * start)
-    assert abs(e["ledger_residual"]) < bound * start
+    lost = abs(e["integrator"] - (start - last))
+    lost = lost / start if lost > 1e-4 * (start - last) else 0.0
+    errors = [watch.linear, watch.angular, lost, abs(e["ledger_residual"]) / start]
+    return gain, max(errors), float(sim.max_floor)
+
+
+@pytest.mark.parametrize(
+    ("E", "turn", "steps"),
+    [(1e7, 0.2, 60), (1e9, 0.2, 40), (1e7, 1.0, 20)]
+    + [pytest.param(E, turn, 300, marks=pytest.mark.slow) for E in (1e7, 1e9) for turn in (0.2, 0.5)]
+    + [pytest.param(2e11, 0.2, 300, marks=pytest.mark.slow), pytest.param(1e9, 1.0, 300, marks=pytest.mark.slow)]
+    + [pytest.param(2e11, 0.5, 300, marks=[pytest.mark.slow, pytest.mark.xfail(reason=
+        "by rounding 5e-10 to 1.7e-5: where BiCGStab stalls the step is accepted with its estimate, up to 1e-4")])],
+)  # fmt: skip
+def test_a_free_bar_gains_no_energy_and_keeps_its_momenta(E, turn, steps):
+    """generalized_alpha has 440 times the energy at 1e9 Pa after 300 steps of 0.2; 8934ce7 has no rho_inf here."""
+    gain, error, _ = losses(E, turn, steps)
+    assert gain <= 1e-11
+    assert error < 1e-10
+
+
+@pytest.mark.slow
+def test_errors_of_steps_that_rounding_stops_are_those_they_report():
+    gain, error, floor = losses(2e11, 0.5, 300)
+    assert gain <= max(1e-11, floor)
+    assert error < max(1e-10, floor)
 
 
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda:0", marks=pytest.mark.cuda)])

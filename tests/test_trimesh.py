@@ -29,10 +29,10 @@ def test_flat_meshes_are_as_a_box(name, path):
     ("paper", {}, 1e-9), ("paper", {"treatment": "explicit"}, 1e-9), ("smooth", {}, 1e-9),
     ("default", {"offset": 0.0015}, 1e-9), ("default", {"model": "sphere", "radius": 0.05, "mu": 0.0}, 1e-9),
     ("default", {"model": "sphere", "radius": 0.05}, 1e-4),
+    pytest.param("default", {"model": "sphere", "radius": 0.05}, 1e-9, marks=pytest.mark.xfail(
+        reason="2.7e-7: the tolerance of friction limits; on a box 4e-5 between tol of 1e-8 and 1e-12")),
 ])  # fmt: skip
 def test_laws_and_options_are_those_of_a_box(law, options, bound):
-    """A ball that rubs amplifies rounding to the tolerance of friction limits: on a box, 4e-5 between tol of 1e-8 and
-    1e-12."""
     wanted, _ = moved(15, BOX, law=law, **options)
     found, sim = moved(15, boxed(cells=8), law=law, **options)
     assert sim.contact_record("pad").normal_force.max() > 1.0
