@@ -136,8 +136,8 @@ def collider_kinematics(dtype: str, meshes: bool, seams: bool = False) -> Kernel
                 most = f64(MAX_DEPTH_RATIO) * others
                 if apart and wp.dot(level, inward) > f64(OPPOSING_COSINE):
                     most = wp.max(most, f64(ENTRY_DEPTH) * facets.element_depth[item])
-                ends = wp.dot(level, inward) > -f64(MIN_NORMAL_COSINE)
-                if ends and wp.dot(level, way) > f64(OPPOSING_COSINE) and found[3] < f64(0.0):
+                unopposed = wp.dot(level, inward) > -f64(MIN_NORMAL_COSINE)
+                if unopposed and wp.dot(level, way) > f64(OPPOSING_COSINE) and found[3] < f64(0.0):
                     if -found[3] <= wp.min(most, f64(EDGE_ENTRY_SLOPE) * -d[3]):
                         return side
                     # a blunt edge also meets facets between both sides
