@@ -32,6 +32,7 @@ PAGES += [
     ROOT / TUTORIAL,
     ROOT / "warpfea/builder/CONTACT.md",
     ROOT / "warpfea/simulation/LEARNING.md",
+    ROOT / "warpfea/sweeps/SWEEPS.md",
 ]
 TEXT = {path.relative_to(ROOT).as_posix(): path.read_text() for path in PAGES}
 REGISTRIES = (family._families, materials.LAWS, integrators.INTEGRATORS)

@@ -53,22 +53,25 @@ from .time_laws import Control, Rotation  # noqa: E402
 
 __all__ = [
     "GROUND", "SVK", "Body", "Box", "CapacityError", "Capsule", "Checkpoint", "CheckpointError", "ConstraintError",
-    "Control", "ConvergenceError", "Cylinder", "ElementSet", "EnergyMomentum", "Error", "GIFWriter", "GeneralizedAlpha",
-    "HalfSpace", "Jacobi", "Joint", "KelvinVoigt", "MaterialPoint", "MeshError", "MeshWarning", "Model", "ModelBuilder",
-    "ModelError", "ModelWarning", "MooneyRivlin", "NeoHookean", "NewtonPCG", "NodeSet", "Observations", "OutputError",
-    "PNGWriter", "PenetrationError", "Rectangle", "Reference", "Rotation", "Simulation", "Sphere", "StabilityError",
-    "StabilityWarning", "State", "StepReport", "StudyOptions", "SurfaceSet", "TriMesh", "USDWriter", "VTUWriter",
-    "__version__", "mesh", "scene", "solve_static", "spline", "study",
+    "Control", "ConvergenceError", "Cylinder", "Design", "ElementSet", "EnergyMomentum", "Error", "GIFWriter",
+    "GeneralizedAlpha", "HalfSpace", "Jacobi", "Joint", "KelvinVoigt", "MaterialPoint", "MeshError", "MeshWarning",
+    "Model", "ModelBuilder", "ModelError", "ModelWarning", "MooneyRivlin", "NeoHookean", "NewtonPCG", "NodeSet",
+    "Observations", "OutputError", "PNGWriter", "PenetrationError", "Rectangle", "Reference", "Rotation",
+    "Simulation", "Sphere", "StabilityError", "StabilityWarning", "State", "StepReport", "StudyOptions",
+    "SurfaceSet", "TriMesh", "USDWriter", "VTUWriter", "__version__", "fit", "mesh", "scene", "solve_static",
+    "spline", "study", "sweep",
 ]  # fmt: skip
 
 
 def __getattr__(name: str) -> object:
-    """Lazy import of `study` and its options: scenes import this package and must not depend on the studies.
+    """Lazy import of studies and sweeps: scenes import this package and must not depend on them.
 
     Declarations for type checkers: `__init__.pyi`.
     """
     if name in ("study", "StudyOptions"):
         return getattr(_importlib.import_module(f"{__name__}.studies.accuracy"), name)
+    if name in ("sweep", "fit", "Design"):
+        return getattr(_importlib.import_module(f"{__name__}.sweeps"), name)
     raise AttributeError(f"module 'warpfea' has no attribute {name!r}")
 
 

@@ -1,4 +1,4 @@
-"""Interface for type checkers: the names of `__init__.py`, and `study` with its options, which is imported on use."""
+"""Interface for type checkers: the names of `__init__.py`, those imported on use included."""
 # ruff: noqa: I001
 
 from . import mesh as mesh
@@ -49,3 +49,4 @@ from .simulation.simulation import Simulation as Simulation, StepReport as StepR
 from .simulation.statics import solve_static as solve_static
 from .solvers import Jacobi as Jacobi, NewtonPCG as NewtonPCG
 from .studies.accuracy import StudyOptions as StudyOptions, study as study
+from .sweeps import Design as Design, fit as fit, sweep as sweep

@@ -4,7 +4,7 @@ import functools
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar
 
 import warp as wp
@@ -159,18 +159,36 @@ def part(name: str = "") -> Callable[[F], F]:
 
 def load_modules(modules: dict[str, wp.Module], device: Any, on_compile: OnCompile | None) -> None:
     """Compile modules by name on several threads; loaded ones are free. `on_compile(done, total, name)` is called for
-    each.
+    each. Of several processes that need a kernel one compiles it, and the others wait.
 
     Raises:
         ModelError: a user's function that Warp can't compile.
     """
+
+    def load(name: str, module: wp.Module) -> None:
+        with module_lock(name):
+            wp.force_load(device, [module], max_workers=0)
+
     with ThreadPoolExecutor(min(os.cpu_count() or 1, 4)) as pool:
-        load = functools.partial(wp.force_load, device, max_workers=0)
-        waiting = {pool.submit(load, [module]): name for name, module in modules.items()}
+        waiting = {pool.submit(load, name, module): name for name, module in modules.items()}
         for done, future in enumerate(as_completed(waiting)):
             _raise_compile_error(future, waiting[future])
             if on_compile:
                 on_compile(done + 1, len(waiting), waiting[future])
+
+
+@contextmanager
+def module_lock(name: str) -> Iterator[None]:
+    """Lock of a module in the kernel cache, among processes; the system frees it if its holder dies."""
+    with ExitStack() as stack:
+        with suppress(ImportError, OSError):  # Windows; a cache that can't be written
+            import fcntl
+
+            folder = os.path.join(str(wp.config.kernel_cache_dir), "locks")
+            os.makedirs(folder, exist_ok=True)
+            file = stack.enter_context(open(os.path.join(folder, name), "w"))
+            fcntl.flock(file, fcntl.LOCK_EX)
+        yield
 
 
 def _raise_compile_error(future: Future[Any], name: str) -> None:

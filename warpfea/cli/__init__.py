@@ -1,4 +1,4 @@
-"""The command line: `warpfea run | scenes | info | render | bench | study | stress | profile`.
+"""The command line: `warpfea run | scenes | info | render | bench | study | sweep | stress | profile`.
 
 Exit codes: 0 success, 2 bad input or usage, 3 rejected step or failed case, 4 output error, 130 interrupted (files
 valid), 1 internal error.

@@ -1,4 +1,4 @@
-"""Options of the measuring commands: bench, study, stress, profile."""
+"""Options of the measuring commands: bench, study, sweep, stress, profile."""
 
 import argparse
 import pathlib
@@ -17,7 +17,7 @@ from .arguments import (
     positive_number,
 )
 
-__all__ = ["add_bench", "add_profile", "add_stress", "add_study", "insert_scene_command"]
+__all__ = ["add_bench", "add_profile", "add_stress", "add_study", "add_sweep", "insert_scene_command"]
 
 PROFILE_EXAMPLES = """\
 examples:
@@ -58,6 +58,31 @@ outcomes:
 Seconds include the compilation of kernels that are not in Warp's cache.
 
 exit codes: 0 every row met its criterion, 3 one did not, 2 bad usage, 130 interrupted (the file is valid)
+"""
+
+SWEEP_EXAMPLES = """\
+examples:
+  warpfea sweep study.toml                              a process per GPU, or per core
+  warpfea sweep study.toml --resume                     go on after Ctrl-C, a crash, or a reboot
+  warpfea sweep study.toml --scheduler tcp://host:8786  the workers of a dask scheduler
+
+study.toml:
+  scene = "cantilever"                                  or file.py:NAME, from the file's folder, as are all paths
+  out = "stiffness"                                     record.jsonl, table.csv, times.csv, pictures
+
+  [design]
+  kind = "grid"                                         list (file = "designs.csv"), random, lhs, sobol (count, seed)
+  [design.over]
+  cells = [4, 8]                                        a parameter of the scene: another model
+  bar.E = {low = 1e8, high = 1e10, count = 10, log = true}   per world, as Model.set_parameter; gravity.z,
+                                                        velocity.BODY.x, control.NAME
+  [measures]
+  tip = "min probe.tip.displacement.z"                  also contact.NAME.normal_force, joint.NAME.force.norm,
+  stress = "field.von_mises"                            energy.strain, or a function of the simulation, file.py:NAME
+
+  further tables: [parameters] of the scene for all designs; [series] quantities kept for every step;
+  [run] t_end, dt, integrator, tol, dtype, device, static, ...; [engine] workers, worlds, memory, scheduler;
+  [pictures] table = "table.png", pareto = ["tip", "mass"], sheet = "sheet.png", designs = [0, 5], field = "von_mises"
 """
 
 SCENE_COMMAND = "SCENE"
@@ -287,3 +312,23 @@ def add_profile(commands: Any, add_model: Callable[[argparse.ArgumentParser], No
         ("--json", None, "FILE", "all numbers, with fixed keys; - for stdout"),
     )
     finish_command(to, ".profile", "profile")
+
+
+def add_sweep(commands: Any) -> None:
+    """`warpfea sweep`."""
+    to = commands.add_parser(
+        "sweep",
+        help="a scene for many designs, over worlds, cores, GPUs and machines",
+        description="Run a scene for each design of a study, and derive one table from what was recorded.",
+        epilog=SWEEP_EXAMPLES,
+    )
+    to.add_argument("file", metavar="FILE", help="the study (.toml)")
+    add_options(
+        to,
+        ("--resume", Kind.FLAG, None, "go on with the record that is there"),
+        ("--out", Kind.ONCE, "FOLDER", "in place of the study's"),
+        ("--workers", positive_integer, "N", "processes"),
+        ("--scheduler", None, "ADDRESS", "of dask.distributed, tcp://host:port, on a trusted network"),
+        ("--device", None, None, "cpu, cuda (all GPUs) or cuda:0; by default CUDA where there is one"),
+    )
+    finish_command(to, ".sweep", "sweep")

@@ -23,7 +23,7 @@ from .arguments import (
     step_size,
     vector,
 )
-from .measuring import add_bench, add_profile, add_stress, add_study, insert_scene_command
+from .measuring import add_bench, add_profile, add_stress, add_study, add_sweep, insert_scene_command
 from .moved import refuse_moved
 
 __all__ = ["parse"]
@@ -70,8 +70,6 @@ A scene file is Python:
 """
 
 
-LATER_COMMANDS = {"sweep": "a sweep over parameters on many devices"}
-"""Commands of a later version: not offered, but refused with an explanation."""
 MATERIAL_HINT = "e.g. svk:E=7e8,nu=0.33,density=2700"
 
 
@@ -92,10 +90,9 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     _add_render(commands)
     add_bench(commands)
     add_study(commands)
+    add_sweep(commands)
     add_stress(commands)
     add_profile(commands, _add_model_options)
-    if words and words[0] in LATER_COMMANDS:
-        raise UsageError(f"{words[0]}: {LATER_COMMANDS[words[0]]} is not part of this version")
     refuse_moved(words)
     arguments, rest = top.parse_known_args(_join_negative_vectors(insert_scene_command(words)))
     if rest:
@@ -105,7 +102,7 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     arguments.words = list(words)
     if not hasattr(arguments, "command"):
         top.print_help()
-        names = "run, scenes, info, render, bench, study, stress, profile"
+        names = "run, scenes, info, render, bench, study, sweep, stress, profile"
         raise UsageError(f"give a command: {names} (see {top.prog} --help)")
     return arguments
 

@@ -1,0 +1,165 @@
+"""Fit: parameters of a scene from a record, with scipy; the candidates are worlds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..base.console import quiet_warp
+from ..base.devices import find_device
+from ..base.errors import ModelError
+from ..base.names import check_choice
+from ..builder.scene import Scene, locate
+from .design import as_range
+from .measures import RECORDS, Measure, parse_measures
+from .worker import FAILED_WORLD, Group, Study
+
+__all__ = ["Fit", "fit"]
+
+METHODS = ("differential_evolution", "least_squares")
+DIFFERENCE = 1e-4
+"""Step of the differences of least_squares, over the ranges of the parameters."""
+REFUSED = 1e15
+"""Residual of a candidate whose run is refused."""
+SAME_TIME = 1e-6
+"""Largest distance of a time of the record from a step, over dt."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Result of a fit.
+
+    Attributes:
+        values: by parameter. misfit: root of the mean square of the residuals.
+        residuals: (samples,) of the record, simulation less record over sigma. runs: of the scene.
+    """
+
+    values: dict[str, float]
+    misfit: float
+    residuals: np.ndarray
+    runs: int
+
+
+def fit(
+    scene: str | Scene[Any],
+    parameters: Mapping[str, Any],
+    record: Mapping[str, Sequence[Any]],
+    *,
+    method: str = "differential_evolution",
+    fixed: Mapping[str, Any] | None = None,
+    run: Mapping[str, Any] | None = None,
+    worlds: int = 64,
+    generations: int = 16,
+    start: Mapping[str, float] | None = None,
+    seed: int = 1,
+) -> Fit:
+    """Find the parameters with which a scene gives a record: least squares of all samples.
+
+    Args:
+        parameters: range (low, high), or {"low", "high", "log"}, by name as in `sweep`. Values per world are
+            candidates of one model; each value of a parameter of the scene is another model.
+        record: (times, values) or (times, values, sigma) by text, such as "probe.tip.displacement.z"; times are those
+            of steps, s, of statics load fractions.
+        method: "differential_evolution", of `worlds` candidates over `generations`, or "least_squares" from `start`
+            (default: the middle of the ranges), with differences over worlds.
+        fixed: parameters of the scene. run: as of `sweep`. seed: of differential_evolution.
+
+    Raises:
+        ModelError: an unknown name, an empty range, or a time between steps.
+    """
+    check_choice("method", method, METHODS)
+    candidates = Candidates(scene, parameters, record, dict(fixed or {}), dict(run or {}))
+    if method == "least_squares":
+        point = candidates.search_locally(start or {})
+    else:
+        point = candidates.search_globally(worlds, generations, seed)
+    residuals = candidates.residuals(point[:, None])[0]
+    values = {name: float(column[0]) for name, column in candidates.values(point[:, None]).items()}
+    return Fit(values, float(np.sqrt(np.mean(residuals**2))), residuals, candidates.runs)
+
+
+class Candidates:
+    """Candidates of a fit: points between 0 and 1 of the ranges, and their residuals."""
+
+    def __init__(self, scene: Any, parameters: Any, record: Any, fixed: dict[str, Any], run: dict[str, Any]) -> None:
+        self.scene = locate(scene) if isinstance(scene, str) else scene
+        self.ranges = {name: as_range(f"parameters.{name}", axis) for name, axis in parameters.items()}
+        self.curves = parse_measures("record", {text: text for text in record})
+        for text, curve in self.curves.items():
+            check_choice(f"record.{text}: the kind", curve.kind, tuple(RECORDS))
+        self.samples = {text: [np.asarray(x, float) for x in given] for text, given in record.items()}
+        device = find_device(run.get("device"))
+        place = {"device": "cuda" if device.is_cuda else "cpu"}
+        self.study = Study("", fixed, {}, self.curves, run | place, many=True)
+        self.runs = 0
+
+    def values(self, points: np.ndarray) -> dict[str, np.ndarray]:
+        """Values by parameter of points (parameters, candidates)."""
+        out = {}
+        for (name, axis), row in zip(self.ranges.items(), points):
+            low, high = (math.log(axis[k]) if axis["log"] else axis[k] for k in ("low", "high"))
+            out[name] = np.exp(low + row * (high - low)) if axis["log"] else low + row * (high - low)
+        return out
+
+    def residuals(self, points: np.ndarray) -> np.ndarray:
+        """(candidates, samples) of points (parameters, candidates)."""
+        columns = self.values(points)
+        groups: dict[tuple[float, ...], list[int]] = {}
+        own = [name for name in columns if name in self.scene.parameters]
+        for k in range(points.shape[1]):
+            groups.setdefault(tuple(float(columns[name][k]) for name in own), []).append(k)
+        out = np.empty((points.shape[1], sum(values.size for _, values, *_ in self.samples.values())))
+        for arguments, members in groups.items():
+            group = Group(self.study, self.scene, dict(zip(own, arguments)))
+            per_world = {name: column[members].tolist() for name, column in columns.items() if name not in own}
+            with quiet_warp():
+                model = group.model(len(members))
+                sim = group.simulate(model, per_world, on_failure="freeze")
+            found = np.hstack([self._difference(text, curve, sim) for text, curve in self.curves.items()])
+            found[sim.status == FAILED_WORLD] = REFUSED
+            out[members] = found
+        self.runs += points.shape[1]
+        return out
+
+    def _difference(self, text: str, curve: Measure, sim: Any) -> np.ndarray:
+        """(worlds, samples) simulation less record, over sigma. ModelError for times between steps."""
+        times, values, *sigma = self.samples[text]
+        steps = curve.times(sim)[0]
+        at = np.abs(steps[:, None] - times).argmin(axis=0)
+        if times.shape != values.shape or np.abs(steps[at] - times).max() > SAME_TIME * np.diff(steps).min(initial=1.0):
+            raise ModelError(f"record.{text}: needs as many times as values, at ends of steps, up to {steps[-1]:g} s")
+        return (curve.series(sim)[:, at] - values) / (sigma[0] if sigma else 1.0)
+
+    def search_globally(self, worlds: int, generations: int, seed: int) -> np.ndarray:
+        """Best point of differential evolution."""
+        from scipy.optimize import differential_evolution
+
+        found = differential_evolution(
+            lambda points: (self.residuals(points) ** 2).mean(axis=1), [(0.0, 1.0)] * len(self.ranges),
+            vectorized=True, updating="deferred", polish=False, popsize=max(worlds // len(self.ranges), 1),
+            maxiter=generations - 1, tol=0.0, init="sobol", rng=np.random.default_rng(seed),
+        )  # fmt: skip
+        return np.asarray(found.x)
+
+    def search_locally(self, start: Mapping[str, float]) -> np.ndarray:
+        """Best point of least squares."""
+        from scipy.optimize import least_squares
+
+        size = len(self.ranges)
+
+        def jacobian(x: np.ndarray) -> np.ndarray:
+            step = np.where(x < 0.5, DIFFERENCE, -DIFFERENCE)
+            rows = self.residuals(np.column_stack([x, x[:, None] + np.diag(step)]))
+            return ((rows[1:] - rows[0]) / step[:, None]).T
+
+        first = np.full(size, 0.5)
+        for k, (name, axis) in enumerate(self.ranges.items()):
+            if name in start:
+                low, at, high = (math.log(v) if axis["log"] else v for v in (axis["low"], start[name], axis["high"]))
+                first[k] = (at - low) / (high - low)
+        found = least_squares(lambda x: self.residuals(x[:, None])[0], first, jac=jacobian, bounds=(0, 1), gtol=None)
+        return np.asarray(found.x)

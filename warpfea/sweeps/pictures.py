@@ -1,0 +1,77 @@
+"""Pictures of a sweep: its table, and a contact sheet of chosen designs."""
+
+from __future__ import annotations
+
+import math
+import pathlib
+import tempfile
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+import warpfea as wf
+
+from ..base.errors import ModelError, OutputError
+from ..base.lazy import pillow
+from ..base.writer import write_atomically
+from ..builder.scene import locate
+from .worker import Group
+
+__all__ = ["draw_sheet", "plot_table"]
+
+PANEL = 2.8
+"""Size of a panel, inches."""
+PICTURE = (480, 360)
+"""Size of a picture of a contact sheet, pixels."""
+
+
+def plot_table(result: Any, target: pathlib.Path, pareto: Sequence[str]) -> None:
+    """Each measure over each parameter, or one measure over another with the Pareto front. OutputError."""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise OutputError(f"the picture needs matplotlib: pip install 'warpfea[plots]' ({error})") from error
+    names = result.design.columns
+    pairs: list[Any] = [[tuple(pareto)]] if pareto else [[(x, y) for x in names] for y in result.measures]
+    figure = Figure(figsize=(1.0 + PANEL * len(pairs[0]), 0.6 + PANEL * len(pairs)), layout="constrained")
+    axes: Any = figure.subplots(len(pairs), len(pairs[0]), squeeze=False)
+    for line, row in zip(axes, pairs):
+        for axis, (x, y) in zip(line, row):
+            _draw(axis, result, x, y)
+            if pareto:
+                front = result.pareto(x, y)
+                axis.plot(result[x][front], result[y][front], "o-", color="tab:red", markersize=4)
+    write_atomically(target, lambda path: figure.savefig(path, dpi=150))
+
+
+def _draw(axis: Any, result: Any, x: str, y: str) -> None:
+    """One panel; a logarithmic axis for values over more than a decade."""
+    values = result[x]
+    numbers = values.dtype.kind in "iuf" and values.ndim == 1
+    axis.plot(values if numbers else [str(value) for value in values.tolist()], result[y], ".", color="tab:blue")
+    axis.set(xlabel=x, ylabel=y)
+    if numbers and np.nanmin(values) > 0.0 and np.nanmax(values) > 10.0 * np.nanmin(values):
+        axis.set_xscale("log")
+
+
+def draw_sheet(result: Any, target: pathlib.Path, designs: Sequence[int], field: str | None) -> None:
+    """Pictures of designs side by side, each with its number and measures. ModelError, OutputError."""
+    study = result.study
+    scene, columns = locate(study.scene), math.ceil(math.sqrt(len(designs)))
+    if not designs or not all(isinstance(k, int) and 0 <= k < len(result) for k in designs):
+        raise ModelError(f"sheet: designs = {designs!r} must be numbers from 0 to {len(result) - 1}")
+    width, height = PICTURE
+    sheet = pillow.Image.new("RGB", (width * columns, height * math.ceil(len(designs) / columns)), "white")
+    for place, index in enumerate(designs):
+        values = result.design[index]
+        group = Group(study, scene, {name: value for name, value in values.items() if name in scene.parameters})
+        own = {name: [value] for name, value in values.items() if name not in scene.parameters}
+        with tempfile.TemporaryDirectory() as folder:
+            file = pathlib.Path(folder) / "picture.png"
+            group.simulate(group.model(1), own, outputs=[wf.PNGWriter(file, field=field, size=PICTURE)])
+            x, y = width * (place % columns), height * (place // columns)
+            sheet.paste(pillow.Image.open(file).convert("RGB"), (x, y))
+        label = f"{index}: " + ", ".join(f"{name} {result[name][index]:.4g}" for name in result.measures)
+        pillow.ImageDraw.Draw(sheet).text((x + 8, y + height - 16), label, fill="black")
+    write_atomically(target, lambda path: sheet.save(path))

@@ -1,0 +1,173 @@
+"""Record of a sweep: an append-only file of JSON lines that alone decides which designs are done."""
+
+from __future__ import annotations
+
+import json
+import os
+import pathlib
+import zlib
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from ..base.errors import CheckpointError
+
+__all__ = ["Record"]
+
+SCHEMA = 1
+NONE = -1
+
+
+class Record:
+    """The record in a file, of which the offsets of its lines are kept.
+
+    Each line ends with the checksum of what precedes it. The first one holds the settings, others a design's row, the
+    plan of a group of designs ("group", "plan", "device"), or tasks whose worker died ("lost": a design, "worlds").
+
+    Args:
+        path: of the file. settings: of the sweep. count: of designs.
+        resume: go on with the file; None: if it is there.
+
+    Attributes:
+        done: (count,) flags. failed: number of designs that failed.
+        retries: number of lost tasks. deaths: of the worker of a design alone. plans: plan and device by group.
+
+    Raises:
+        CheckpointError: a file of another sweep, with a damaged line, in use, or there without `resume`.
+    """
+
+    def __init__(self, path: pathlib.Path, settings: Mapping[str, Any], count: int, *, resume: bool) -> None:
+        self.path, self.count = path, count
+        self._offsets = np.full(count, NONE, dtype=np.int64)
+        self.failed, self.retries = 0, 0
+        self.deaths, self.plans = dict[int, int](), dict[str, dict[str, Any]]()
+        if path.exists() and not resume:
+            raise CheckpointError(f"{path}: is there; go on with it (resume=True, --resume) or take another folder")
+        try:
+            self._file = open(path, "a+b")  # noqa: SIM115
+        except OSError as error:
+            raise CheckpointError(f"{path}: can't be opened ({error})") from error
+        try:
+            self._lock()
+            self._size = self._read(json.loads(json.dumps(settings)))
+            self._file.truncate(self._size)
+            if self._size == 0:
+                self.append({"schema": SCHEMA, "settings": settings})
+        except BaseException:
+            self._file.close()
+            raise
+
+    def _lock(self) -> None:
+        """Refuse a second driver; the system frees the lock of one that died."""
+        try:
+            import fcntl
+        except ImportError:  # not on Windows
+            return
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise CheckpointError(f"{self.path}: another sweep is writing it") from error
+
+    def _read(self, settings: dict[str, Any]) -> int:
+        """Read the lines that are there; returns the size up to a torn last one."""
+        self._file.seek(0)
+        offset = 0
+        for number, line in enumerate(self._file, 1):
+            content = _decode(line)
+            if not line.endswith(b"\n"):  # torn: it is the last
+                break
+            if content is None:
+                raise CheckpointError(
+                    f"{self.path}: line {number} is damaged; restore the file, or begin anew in another folder"
+                )
+            if number == 1:
+                self._check_settings(content, settings)
+            else:
+                self._note(content, offset, number)
+            offset += len(line)
+        return offset
+
+    def _check_settings(self, content: dict[str, Any], settings: dict[str, Any]) -> None:
+        found = content.get("settings")
+        if content.get("schema") != SCHEMA or not isinstance(found, dict):
+            raise CheckpointError(f"{self.path}: is no record of a sweep that this version reads")
+        for name in dict.fromkeys([*settings, *found]):
+            if found.get(name) != settings.get(name):
+                raise CheckpointError(
+                    f"{self.path}: is of another sweep: {name} was {found.get(name)!r}, is {settings.get(name)!r}"
+                )
+
+    def _note(self, content: dict[str, Any], offset: int, number: int) -> None:
+        """Take account of a line."""
+        if "group" in content:
+            self.plans[content["group"]] = {"plan": content["plan"], "device": content["device"]}
+            return
+        index = content.get("lost", content.get("design"))
+        if not (isinstance(index, int) and 0 <= index < self.count):
+            raise CheckpointError(f"{self.path}: line {number} names a design that there is not: {index}")
+        if "lost" in content:
+            self.retries += 1
+            if content["worlds"] == 1:
+                self.deaths[index] = self.deaths.get(index, 0) + 1
+        elif self._offsets[index] == NONE:
+            self._offsets[index] = offset
+            self.failed += content["status"] != "done"
+        else:
+            raise CheckpointError(f"{self.path}: line {number} repeats design {index}")
+
+    @property
+    def done(self) -> np.ndarray:
+        """(count,) flags of designs with a row."""
+        return self._offsets != NONE
+
+    def append(self, *lines: Mapping[str, Any]) -> None:
+        """Write lines to the disk. CheckpointError."""
+        data, offset = b"", self._size
+        for line in lines:
+            text = _encode(line)
+            if "settings" not in line:
+                self._note(dict(line), offset + len(data), 0)
+            data += text
+        try:
+            self._file.write(data)
+            self._file.flush()
+            os.fsync(self._file.fileno())
+        except OSError as error:
+            raise CheckpointError(f"{self.path}: can't be written ({error})") from error
+        self._size += len(data)
+
+    def rows(self) -> Iterator[dict[str, Any]]:
+        """The row of each design in their order, {"design", "status": "open"} without one."""
+        with open(self.path, "rb") as file:
+            for k, offset in enumerate(self._offsets.tolist()):
+                if offset == NONE:
+                    yield {"design": k, "status": "open", "values": {}, "reason": ""}
+                    continue
+                file.seek(offset)
+                content = _decode(file.readline())
+                if content is None or content.get("design") != k:
+                    raise CheckpointError(f"{self.path}: was changed while it was read")
+                yield content
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+def _encode(line: Mapping[str, Any]) -> bytes:
+    """A line with its checksum, which JSON readers see as one more key."""
+    body = json.dumps(line)[:-1].encode()
+    return body + b', "crc": "%08x"}\n' % zlib.crc32(body)
+
+
+def _decode(line: bytes) -> dict[str, Any] | None:
+    """Content of a line, None for a damaged one."""
+    body, _, end = line.rpartition(b', "crc": "')
+    if end != b'%08x"}\n' % zlib.crc32(body):
+        return None
+    try:
+        out = json.loads(body + b"}")
+    except ValueError:
+        return None
+    return out if isinstance(out, dict) else None

@@ -1,0 +1,316 @@
+"""Sweep: designs as worlds and tasks, done by an engine, recorded as they end, derived as one table."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import dataclasses
+import hashlib
+import json
+import pathlib
+import tempfile
+import time as clock
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..base.checks import check_positive, is_count
+from ..base.console import progress_bar
+from ..base.devices import find_device
+from ..base.errors import CheckpointError, ModelError
+from ..base.names import check_choice
+from ..base.provenance import versions
+from ..base.writer import make_folder, write_atomically
+from ..builder.scene import Scene, locate, split_name
+from ..model.model import MANY_WORLDS
+from ..simulation.integrators import find_integrator
+from .design import Design, check_keys
+from .engines import Engine, WorkerLost, make_engine
+from .measures import RECORDS, file_of, parse_measures
+from .record import Record
+from .result import SweepResult, write_tables
+from .worker import MOTION_OPTIONS, STATIC_OPTIONS, Outcome, Row, Study, check_names, solve, solver_of
+
+__all__ = ["RUN_OPTIONS", "sweep"]
+
+RUN_OPTIONS = tuple(dict.fromkeys(["device", "dtype", "static", "t_end", *MOTION_OPTIONS, *STATIC_OPTIONS]))
+"""Keys of `run`."""
+MAX_DEATHS = 3
+"""Deaths of its worker after which a design is listed and left."""
+BATCH = {False: 1024, True: 65536}
+"""Largest number of worlds of a task, on the CPU and on CUDA."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """Designs that share a model. arguments: of the scene. indices: of the designs."""
+
+    arguments: dict[str, Any]
+    indices: list[int]
+
+
+def sweep(
+    scene: str | Scene[Any],
+    design: Any,
+    *,
+    measures: Mapping[str, Any],
+    series: Mapping[str, str] | None = None,
+    parameters: Mapping[str, Any] | None = None,
+    run: Mapping[str, Any] | None = None,
+    out: str | pathlib.Path | None = None,
+    resume: bool = False,
+    worlds: int | None = None,
+    engine: Engine | int | str | Callable[[str], Engine] | None = None,
+    progress: bool | None = None,
+) -> SweepResult:
+    """Run a scene for each design, over worlds, processes, GPUs or machines.
+
+    Designs that differ only in values per world share a model, as its worlds. The bits of a design's results depend
+    neither on batch, worker nor engine, on one kind of device.
+
+    Args:
+        scene: name, file.py:NAME, or a Scene of a file.
+        design: a Design, a list of {name: value}, or a table as in TOML. Names are parameters of the scene, each value
+            of which is another model, or values per world: those of `Model.set_parameter` ("bar.E"), "gravity",
+            "velocity.BODY" (the initial one), both also ".x", ".y", ".z", and "control.NAME".
+        measures: by name, "[last|max|min|mean] KIND.NAME...": "probe.tip.displacement.z", "contact.pad.normal_force",
+            "joint.elbow.force.norm", "field.von_mises[.BODY]" (max over nodes, at the end), "energy.strain"; or a
+            function of the simulation that returns (worlds,), of a file, or its text "file.py:function".
+        series: such texts of probes, contacts and joints, whose values of every step are kept.
+        parameters: of the scene, for all designs.
+        run: "t_end" and options of Simulation ("dt", "integrator", "tol", ...), by default the scene's; or static=True
+            and those of `solve_static`; "device", "dtype".
+        out: folder of its files; None: a temporary one, for the life of the result.
+        resume: go on with the record in the folder, if there is one.
+        worlds: largest number of worlds of a task.
+        engine: number of processes, address of a dask scheduler ("tcp://host:8786"), an engine, or a function that
+            makes one for a device ("cpu", "cuda", "cuda:1"), closed at the end; None: a process per GPU, or per core.
+        progress: show a bar; None: if stderr is a terminal.
+
+    Raises:
+        ModelError: an unknown name or option, or a function that workers can't import.
+        CheckpointError: a record that is damaged or of another sweep.
+        OutputError: a file that can't be written.
+    """
+    points = Design.of(design)
+    study, sources = _make_study(scene, points, measures, series or {}, dict(parameters or {}), dict(run or {}))
+    if worlds is not None and not (is_count(worlds) and worlds > 0):
+        raise ModelError(f"worlds = {worlds!r} must be a positive whole number")
+    keep = tempfile.TemporaryDirectory(prefix="warpfea_sweep_") if out is None else None
+    folder = make_folder(out or keep.name)  # type: ignore[union-attr]
+    record = Record(folder / "record.jsonl", _settings(study, points, sources), len(points), resume=resume)
+    began, seconds = clock.perf_counter(), {"start": 0.0, "run": 0.0}
+    try:
+        if not record.done.all():
+            device = str(study.run["device"])
+            used = engine(device) if callable(engine) else make_engine(engine, device)
+            seconds["start"] = clock.perf_counter() - began
+            try:
+                tasks = _tasks(study, points, record, worlds or BATCH["cuda" in study.run["device"]], used.workers)
+                driver = _Driver(study, points, record, folder, used, tasks)
+                driver.check()
+                driver.run(progress)
+            finally:
+                if used is not engine:
+                    used.close()
+        seconds["run"] = clock.perf_counter() - began - seconds["start"]
+        write_tables(folder, points, list(study.measures), record)
+        result = SweepResult(folder, points, study, record, keep)
+    finally:
+        record.close()
+    result.seconds = seconds
+    return result
+
+
+# preparation
+
+
+def _make_study(
+    scene: Any, points: Design, measures: Any, series: Mapping[str, Any], fixed: dict[str, Any], run: dict[str, Any]
+) -> tuple[Study, dict[str, str]]:
+    """Settings for workers, with hashes of the user's files by name. ModelError for names that don't fit."""
+    if isinstance(scene, Scene):
+        module = scene.function.__module__
+        own = not module.startswith("warpfea.scenes.")
+        scene = f"{file_of('scene', scene.function, scene.function.__qualname__)}:{scene.name}" if own else scene.name
+    found = locate(scene)
+    file, _ = split_name(scene)
+    label = scene if file is None else f"{pathlib.Path(file).resolve()}:{found.name}"
+    check_keys("run", run, RUN_OPTIONS)
+    check_keys("parameters", fixed, list(found.parameters))
+    chosen = parse_measures("measures", measures)
+    curves = parse_measures("series", series) if series else {}
+    for name, curve in curves.items():
+        check_choice(f"series.{name}: the kind", curve.kind, tuple(RECORDS))
+    for name in chosen:
+        if name in points.columns or name in ("design", "status", "reason"):
+            raise ModelError(f"measures.{name}: the table has a column {name!r} already")
+    device = find_device(run.get("device"))
+    given = str(run.get("device") or "")
+    run = run | {"device": (given or "cuda") if device.is_cuda else "cpu"}
+    study = Study(label, fixed, chosen, curves, run, len(points) >= MANY_WORLDS)
+    for name in points.columns.keys() & fixed.keys():
+        raise ModelError(f"parameters.{name} is a parameter of the design, too")
+    _check_run(study)
+    for name in points.columns:
+        if "." not in name and name != "gravity":
+            check_keys("design.over", {name: None}, [*found.parameters, "gravity"])
+    sources = {}
+    for reference in (label, *(measure.name for measure in chosen.values() if measure.kind == "function")):
+        path = pathlib.Path(reference.rpartition(":")[0])
+        if ".py:" in reference and path.is_file():
+            sources[f"{path.name}:{reference.rpartition(':')[2]}"] = _hash(path.read_bytes())
+    return study, sources
+
+
+def _check_run(study: Study) -> None:
+    """ModelError for options that no design could run with."""
+    static = bool(study.run.get("static"))
+    known = ("device", "dtype", "static", *(STATIC_OPTIONS if static else ("t_end", *MOTION_OPTIONS)))
+    check_keys("run", study.run, known)
+    check_choice("run.dtype", study.run.get("dtype", "float64"), ("float64", "float32"))
+    check_positive("run", **{k: v for k, v in study.run.items() if k in ("dt", "t_end", "tol") and v != "auto"})
+    if not static:
+        find_integrator(study.run.get("integrator", "backward_euler"))
+        solver_of(study.run.get("solver", "newton-pcg"), study.run.get("tol"))
+
+
+def _hash(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:16]
+
+
+def _settings(study: Study, points: Design, sources: dict[str, str]) -> dict[str, Any]:
+    """Settings by which a record knows its sweep; files by name and content, not by place."""
+    file, name = split_name(study.scene)
+    texts = {name: (m.text, m.kind == "function") for name, m in study.measures.items()}
+    return {
+        "scene": name if file is None else f"{pathlib.Path(file).name}:{name}",
+        "sources": sources,
+        "parameters": study.fixed,
+        "names": list(points.columns),
+        "designs": len(points),
+        "design_hash": _hash(json.dumps(points.columns).encode()),
+        "measures": {name: pathlib.Path(text).name if own else text for name, (text, own) in texts.items()},
+        "series": {name: measure.text for name, measure in study.series.items()},
+        "run": study.run | {"device": study.run["device"].partition(":")[0]},
+        "many": study.many,
+        "versions": {name: versions()[name] for name in ("warpfea", "warp")},
+    }
+
+
+def _tasks(study: Study, points: Design, record: Record, batch: int, workers: int) -> deque[Task]:
+    """Tasks of the designs that are left: those with equal arguments, dealt over the workers, in batches."""
+    scene = locate(study.scene)
+    names = [name for name in points.columns if name in scene.parameters]
+    groups: dict[str, list[int]] = {}
+    for index in np.flatnonzero(~record.done).tolist():
+        groups.setdefault(json.dumps([points.columns[name][index] for name in names]), []).append(index)
+    tasks: deque[Task] = deque()
+    for indices in groups.values():
+        arguments = {name: points.columns[name][indices[0]] for name in names}
+        size = min(batch, max(1, -(-len(indices) // workers)))
+        tasks.extend(Task(arguments, indices[k : k + size]) for k in range(0, len(indices), size))
+    return tasks
+
+
+# the loop
+
+
+class _Driver:
+    """Loop of a sweep: as many tasks at a time as there are workers."""
+
+    def __init__(
+        self, study: Study, points: Design, record: Record, folder: pathlib.Path, engine: Engine, tasks: deque[Task]
+    ) -> None:
+        self.study, self.points, self.record, self.folder = study, points, record, folder
+        self.engine, self.tasks = engine, tasks
+
+    def check(self) -> None:
+        """Check names in a worker, as building a model may fail. ModelError."""
+        first = self.tasks[0]
+        ends = dataclasses.replace(first, indices=[first.indices[0], first.indices[-1]])
+        handle = self._submit(check_names, ends)
+        while handle not in self.engine.done([handle]):
+            pass
+        with contextlib.suppress(WorkerLost):
+            self.engine.result(handle)
+
+    def run(self, progress: bool | None) -> None:
+        """Do all tasks."""
+        running: dict[Any, Task] = {}
+        total, done = len(self.points), int(self.record.done.sum())
+        times = self.folder / "times.csv"
+        new = not times.exists()
+        with open(times, "a", newline="") as file, progress_bar("sweep", "design", total, progress) as bar:
+            writer = csv.writer(file, lineterminator="\n")
+            if new:
+                writer.writerow(["design", "seconds", "worlds", "alone", "worker", "task_seconds"])
+            bar.update(done)
+            while self.tasks or running:
+                while self.tasks and len(running) < self.engine.workers:
+                    task = self.tasks.popleft()
+                    running[self._submit(solve, task)] = task
+                for handle in self.engine.done(list(running)):
+                    task = running.pop(handle)
+                    try:
+                        outcome = self.engine.result(handle)
+                    except WorkerLost:
+                        self._lose(task)
+                    else:
+                        self._keep(task, outcome)
+                        writer.writerows([r.index, r.seconds, r.worlds, r.alone, outcome.worker, outcome.seconds]
+                                         for r in outcome.rows)  # fmt: skip
+                        file.flush()
+                    bar.set_postfix_str(f"{self.record.failed} failed", refresh=False)
+                    bar.update(int(self.record.done.sum()) - bar.n)
+
+    def _submit(self, call: Callable[..., Any], task: Task) -> Any:
+        own = [name for name in self.points.columns if name not in task.arguments]
+        designs = [(k, {name: self.points.columns[name][k] for name in own}) for k in task.indices]
+        return self.engine.submit(call, self.study, task.arguments, designs)
+
+    def _lose(self, task: Task) -> None:
+        """Halve a task whose worker died; a design that kills it thrice alone is listed."""
+        index = task.indices[0]
+        self.record.append({"lost": index, "worlds": len(task.indices)})
+        if len(task.indices) > 1:
+            half = len(task.indices) // 2
+            self.tasks.extendleft(
+                [Task(task.arguments, task.indices[half:]), Task(task.arguments, task.indices[:half])]
+            )
+            return
+        if self.record.deaths[index] < MAX_DEATHS:
+            self.tasks.append(task)
+            return
+        row = Row(index, "killed", reason=f"its worker died {MAX_DEATHS} times")
+        self.record.append(_line(row))
+
+    def _keep(self, task: Task, outcome: Outcome) -> None:
+        """Write the rows of a task, after their series and plan."""
+        lines = []
+        if outcome.plan is not None:
+            found = {"plan": outcome.plan, "device": outcome.device}
+            key = _hash(json.dumps(task.arguments, sort_keys=True).encode())
+            known = self.record.plans.get(key)
+            if known is None:
+                lines.append({"group": key, **found})
+            elif known != json.loads(json.dumps(found)):
+                raise CheckpointError(f"{self.record.path}: worker {outcome.worker} takes {found}, others took {known}")
+        for row in outcome.rows:
+            if row.series:
+                target = make_folder(self.folder / "series") / f"{row.index:06d}.npz"
+                write_atomically(target, _save(row.series))
+        self.record.append(*lines, *map(_line, outcome.rows))
+
+
+def _save(series: dict[str, np.ndarray]) -> Callable[[pathlib.Path], None]:
+    return lambda path: np.savez(path, **series)  # type: ignore[arg-type]
+
+
+def _line(row: Row) -> dict[str, Any]:
+    """Line of the record: nothing in it depends on batch or worker."""
+    kept = dataclasses.asdict(dataclasses.replace(row, series={}))
+    return {"design": row.index, **{name: kept[name] for name in ("status", "values", "reason")}}

@@ -1,0 +1,276 @@
+"""Work of a sweep's worker: designs that share a model, as worlds of one simulation."""
+
+from __future__ import annotations
+
+import dataclasses
+import gc
+import os
+import socket
+import time as clock
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+import warpfea as wf
+
+from ..base.errors import CapacityError, ModelError
+from ..base.names import did_you_mean
+from ..builder.scene import Scene, locate
+from .measures import Measure
+
+__all__ = ["FAILED_WORLD", "Group", "Outcome", "Row", "Study", "check_names", "solve", "solver_of"]
+
+FAILED_WORLD = 1
+"""Status of a world whose step was refused."""
+STATIC_OPTIONS = ("load_steps", "tol", "stabilise", "inversion", "unstable", "constraint_tol")
+MOTION_OPTIONS = (
+    "dt", "error", "interval", "horizon", "integrator", "tol", "solver", "ledger", "inversion", "energy_growth",
+    "constraint_tol",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Study:
+    """Settings of a sweep that its workers need.
+
+    Attributes:
+        scene: name or file.py:NAME. fixed: its parameters that are the same in all designs.
+        measures: by name. series: quantities over time that are kept.
+        run: options of the run, see `sweep`. many: of `ModelBuilder.finalize`.
+    """
+
+    scene: str
+    fixed: dict[str, Any]
+    measures: dict[str, Measure]
+    series: dict[str, Measure]
+    run: dict[str, Any]
+    many: bool
+
+    @property
+    def place(self) -> dict[str, Any]:
+        """Device and precision of the models; a worker sees one GPU alone."""
+        kind = str(self.run["device"]).partition(":")[0]
+        return {"device": "cuda:0" if kind == "cuda" else kind, "dtype": self.run.get("dtype", "float64")}
+
+
+@dataclass(frozen=True)
+class Row:
+    """Result of one design: its measures, or the reason why it has none.
+
+    Attributes:
+        index: of the design. status: "done", "failed" or "killed". values: by measure. reason: of a failure.
+        series: (steps,) by name, and "time".
+        seconds: of its batch over the number of worlds. worlds: of that batch.
+        alone: "" unless it failed among others and was run again: then "failed" or "done".
+    """
+
+    index: int
+    status: str
+    values: dict[str, float] = field(default_factory=dict)
+    reason: str = ""
+    series: dict[str, np.ndarray] = field(default_factory=dict)
+    seconds: float = 0.0
+    worlds: int = 1
+    alone: str = ""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Result of a task.
+
+    Attributes:
+        rows: one of each design. plan: of the solver; None without a simulation.
+        device: kind of device. worker: host and process. seconds: of the task.
+    """
+
+    rows: list[Row]
+    plan: dict[str, Any] | None
+    device: str
+    worker: str
+    seconds: float
+
+
+def check_names(study: Study, arguments: dict[str, Any], designs: Sequence[tuple[int, dict[str, Any]]]) -> None:
+    """Raise ModelError for measures that the model of some designs lacks, and values that none of them can set.
+
+    A model that can't be built is left for `solve` to tell.
+    """
+    try:
+        group = Group(study, locate(study.scene), arguments)
+        model = group.model(1)
+    except Exception:
+        return
+    for where, chosen in (("measures", study.measures), ("series", study.series)):
+        for name, measure in chosen.items():
+            measure.check(f"{where}.{name}", group.builder)
+    for last, (_, values) in enumerate(designs, 1 - len(designs)):
+        try:
+            set_values(model, {name: [value] for name, value in values.items()})
+            return
+        except ModelError as error:
+            if last == 0:
+                raise ModelError(f"design.over: {error}") from error
+
+
+def solve(study: Study, arguments: dict[str, Any], designs: Sequence[tuple[int, dict[str, Any]]]) -> Outcome:
+    """Run designs that share a model.
+
+    Args:
+        arguments: of the scene, the same for all.
+        designs: index and values per world of each.
+    """
+    began, worker = clock.perf_counter(), f"{socket.gethostname()}:{os.getpid()}"
+    try:
+        group = Group(study, locate(study.scene), arguments)
+    except Exception as error:  # the same for each of them
+        rows = [Row(index, "failed", reason=describe(error)) for index, _ in designs]
+        return Outcome(rows, None, "", worker, clock.perf_counter() - began)
+    rows = group.solve(list(designs))
+    return Outcome(rows, group.plan, group.device, worker, clock.perf_counter() - began)
+
+
+class Group:
+    """Designs with one set of scene arguments.
+
+    Attributes:
+        plan, device: as of Outcome.
+    """
+
+    def __init__(self, study: Study, scene: Scene[Any], arguments: dict[str, Any]) -> None:
+        self.study, self.scene = study, scene
+        self.builder = scene.build(scene.resolve(study.fixed | arguments))
+        self.plan: dict[str, Any] | None = None
+        self.device = ""
+
+    def model(self, worlds: int) -> Any:
+        """A model of so many worlds."""
+        return self.builder.finalize(**self.study.place, worlds=worlds, many=self.study.many)
+
+    def solve(self, designs: list[tuple[int, dict[str, Any]]]) -> list[Row]:
+        """Rows of the designs, in batches that fit; a batch that fails as a whole is halved until one is left."""
+        try:
+            return self.batch(designs)
+        except (CapacityError, MemoryError) as error:
+            failure: Exception = error
+            size = min(getattr(error, "worlds", 0), len(designs) - 1) or len(designs) // 2
+        except Exception as error:
+            failure, size = error, len(designs) // 2
+        if not size:
+            return [Row(designs[0][0], "failed", reason=describe(failure))]
+        del failure  # its traceback holds the arrays of the batch
+        gc.collect()
+        chunks = [designs[k : k + size] for k in range(0, len(designs), size)]
+        return [row for chunk in chunks for row in self.solve(chunk)]
+
+    def batch(self, designs: list[tuple[int, dict[str, Any]]]) -> list[Row]:
+        """Rows of designs as worlds of one simulation; failed worlds are run again alone."""
+        began, study, worlds = clock.perf_counter(), self.study, len(designs)
+        model = self.model(worlds)
+        columns = {name: [values[name] for _, values in designs] for name in designs[0][1]}
+        sim = self.simulate(model, columns, on_failure="freeze" if worlds > 1 else "raise")
+        self.plan = dataclasses.asdict(sim.plan)
+        self.device = model.device.name if model.device.is_cuda else "cpu"
+        failed = sim.status == FAILED_WORLD
+        values = {name: measure(sim) for name, measure in study.measures.items()}
+        series = {name: measure.series(sim) for name, measure in study.series.items()}
+        times = next(iter(study.series.values())).times(sim) if series else np.zeros((worlds, 0))
+        seconds, rows = (clock.perf_counter() - began) / worlds, []
+        for world, (index, _) in enumerate(designs):
+            kept = {name: float(column[world]) for name, column in values.items()}
+            curves = {"time": times[world]} | {name: of[world] for name, of in series.items()} if series else {}
+            rows.append(Row(index, "done", kept, "", curves, seconds, worlds))
+        for world in np.flatnonzero(failed).tolist():
+            (again,) = self.solve([designs[world]])
+            rows[world] = dataclasses.replace(again, alone=again.status)
+        return rows
+
+    def simulate(
+        self, model: Any, columns: dict[str, list[Any]], *, on_failure: str = "raise", outputs: Sequence[Any] = ()
+    ) -> Any:
+        """The finished simulation of worlds with the values of the columns."""
+        run = {k: v for k, v in self.study.run.items() if k not in ("device", "dtype", "static", "t_end")}
+        state, controls = set_values(model, columns)
+        if self.study.run.get("static"):
+            if controls:
+                raise ModelError(f"{next(iter(controls))}: controls have their initial values in statics")
+            return wf.solve_static(model, state=state, outputs=outputs, **run).simulation
+        scene = self.scene
+        solver, tol = run.pop("solver", "newton-pcg"), run.pop("tol", scene.tol)
+        run = {"dt": scene.dt, "integrator": scene.integrator, "solver": solver_of(solver, tol)} | run
+        record = bool(self.study.series) or any(measure.over_time for measure in self.study.measures.values())
+        sim = wf.Simulation(model, state, record=record, on_failure=on_failure, on_compile=_silent, **run)
+        for name, values in controls.items():
+            sim.controls[name] = np.array(values, dtype=float)
+        sim.run(self.study.run.get("t_end", scene.t_end), outputs=outputs, progress=False)
+        return sim
+
+
+def _silent(done: int, total: int, name: str) -> None:
+    """No bar for kernels in workers."""
+
+
+def solver_of(name: str, tol: float | None) -> Any:
+    """Options of a solver by its name and tolerance. ModelError."""
+    from ..solvers import SOLVERS, solver_options
+
+    solver_options(name)
+    return SOLVERS[name](tol=tol)
+
+
+def set_values(model: Any, columns: dict[str, list[Any]]) -> tuple[Any, dict[str, list[Any]]]:
+    """Set values per world by name: parameters of `Model.set_parameter`, "gravity", "velocity.BODY" (with ".x", ".y",
+    ".z" for a component), and "control.NAME".
+
+    Returns:
+        The initial state; values of controls by name.
+
+    Raises:
+        ModelError: an unknown name, or a value out of range.
+    """
+    state, controls = model.state(), {}
+    vectors: dict[str, np.ndarray] = {}
+    for name, values in columns.items():
+        first, _, rest = name.partition(".")
+        if first == "control":
+            controls[rest] = values
+        elif first in ("gravity", "velocity"):
+            whole, _, axis = name.rpartition(".") if name[-2:] in (".x", ".y", ".z") else (name, "", "")
+            if whole not in vectors:
+                vectors[whole] = np.tile(np.asarray(start_vector(model, state, whole), float), (model.worlds, 1))
+            vectors[whole][:, list("xyz").index(axis) if axis else slice(None)] = np.array(values, dtype=float)
+        else:
+            model.set_parameter(name, np.array(values, dtype=float))
+    for whole, each in vectors.items():
+        if whole == "gravity":
+            model.set_gravity(each)
+        else:
+            rows = position_slots(model, whole)
+            velocity = state.velocity.numpy()
+            velocity[:, rows] = each[:, None]
+            state.velocity.assign(velocity)
+    return state, controls
+
+
+def start_vector(model: Any, state: Any, whole: str) -> Any:
+    """Gravity of a model, or the initial velocity of a body's first node. ModelError."""
+    if whole == "gravity":
+        return model.description.gravity
+    return state.velocity.numpy()[0, position_slots(model, whole)[0]]
+
+
+def position_slots(model: Any, whole: str) -> np.ndarray:
+    """Slots of the positions of the body in "velocity.BODY". ModelError."""
+    bodies = {body.name: body for body in model.bodies}
+    name = whole.partition(".")[2]
+    if name not in bodies:
+        known = f"bodies are {', '.join(bodies)}{did_you_mean(name, bodies)}"
+        raise ModelError(f"{whole}: expected velocity.BODY or velocity.BODY.x; {known}")
+    slots = np.arange(model.slots)[bodies[name].slots]
+    return slots[model.slot_table.kind[slots] == 0]
+
+
+def describe(error: BaseException) -> str:
+    """Reason of a failure in one line."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"
