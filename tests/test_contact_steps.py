@@ -9,6 +9,8 @@ from pairwise import on_devices
 
 import warpfea as wf
 from warpfea.simulation.checkpoint import save_checkpoint
+from warpfea.studies.stress.build import GRAVITY_VECTOR
+from warpfea.studies.stress.cases.first_scenes import add_body
 
 
 def falling(shape, *, E, speed, solver=None, worlds=1, stiffness=None, **options):
@@ -317,3 +319,25 @@ def test_friction_begins_where_a_point_touches(gap):
     force = record.force[0, -1]
     assert record.stick[0, -1] == 1.0
     assert -force[0] / force[2] == pytest.approx(3.0 * (1.0 - nu) / (2.0 - nu) * slope, rel=5e-3)  # k_t / k_n, slope
+
+
+def bar_on_the_floor(E, h, integrator, steps):
+    """Newton iterations of the steps in which a bar of rubber falls 2 mm onto a floor and settles."""
+    b = wf.ModelBuilder(gravity=GRAVITY_VECTOR)
+    body = add_body(b, "bar", E, 2e-3, "bar", damped=True)
+    b.add_contact(body, b.add_collider(wf.HalfSpace((0, 0, 1))), mu=0.3)
+    b.set_initial(body, velocity=(0.2, 0.0, -1.0))
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=h, integrator=integrator)
+    return [int(sim.step().newton[0]) for _ in range(steps)]
+
+
+def test_midpoint_steps_of_a_body_at_rest_do_not_begin_deep_in_the_floor():
+    """By first iterates taken from the velocity, which alternates, 11 iterations each."""
+    assert max(bar_on_the_floor(1e4, 1e-2, "energy_momentum", 40)[20:]) <= 4
+
+
+def test_an_impact_taken_again_begins_where_the_first_attempt_ended():
+    """26 and 33 iterations from the velocity."""
+    newton = bar_on_the_floor(1e8, 1e-2, "generalized_alpha", 9)
+    assert newton[0] <= 20
+    assert newton[8] <= 26

@@ -49,7 +49,7 @@ def errors_of_operator(family, law, operator, integrator="energy_momentum"):
             wp.launch(kernel, 1, inputs=[w.step, w.newton], device="cpu")
         state = sim.state
         args = [w.step, sim.model.slot_table.is_position_array, sim.model.topology.free]
-        args += [state.displacement, state.velocity, state.displacement, state.velocity, w.q_tilde, w.v_tilde, w.v]
+        args += [state.displacement, state.velocity, state.displacement, state.velocity, w.q_tilde, w.v_tilde, w.u, w.v]
         wp.launch(sim.stepper.kernels.predict, (1, sim.model.slots), inputs=args, device="cpu")
         p = np.random.default_rng(1).uniform(-1, 1, v.shape)
         h = 1e-4

@@ -45,6 +45,14 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
     Control = control_struct()
 
     @wp.func
+    def potential_energy(ctl: Control, world: int) -> f64:
+        """Strain energy, viscous potential, and those of terms, J."""
+        energy = ctl.elem_sums[0, world] + ctl.elem_sums[1, world]
+        if wp.static(traits.stored):
+            energy += ctl.term_sums[0, world]
+        return energy
+
+    @wp.func
     def objective(ctl: Control, world: int) -> f64:
         """Phi of Eq. (18) at the trial, over dq/dv, with the quantities frozen during the line search.
 
@@ -60,10 +68,7 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
             if wp.static(traits.stored):
                 return wp.where(wp.isfinite(ctl.term_sums[0, world]), ctl.slot_sums[Row.OBJECTIVE, world], f64(wp.inf))
             return ctl.slot_sums[Row.OBJECTIVE, world]
-        energy = ctl.elem_sums[0, world] + ctl.elem_sums[1, world]
-        if wp.static(traits.stored):
-            energy += ctl.term_sums[0, world]
-        return ctl.slot_sums[Row.OBJECTIVE, world] + energy / ctl.dq_dv[world]
+        return ctl.slot_sums[Row.OBJECTIVE, world] + potential_energy(ctl, world) / ctl.dq_dv[world]
 
     @wp.func
     def objective_magnitude(ctl: Control, world: int) -> f64:

@@ -98,11 +98,14 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
         """True if other first iterates should be tried: Phi exceeds a bound of Phi at q_n, or J <= 0.
 
         At q_n Phi is the strain energy of the state plus a kinetic energy (`Row.KINETIC` of `residual`): all of it for
-        backward Euler, a third for BDF2.
+        backward Euler, a third for BDF2. Midpoint schemes, which have no Phi, compare its potentials, with contact: an
+        iterate deep in an obstacle takes many iterations to leave it.
         """
         phi = convergence.objective(ctl, world)
-        if wp.static(traits.midpoint):
+        if wp.static(traits.midpoint and not traits.unilateral):
             return not (wp.isfinite(phi) and ctl.min_J[world] > f64(0.0))
+        if wp.static(traits.midpoint):
+            phi = wp.where(wp.isfinite(phi), convergence.potential_energy(ctl, world) / ctl.dq_dv[world], phi)
         bound = (
             ctl.strain_energy[world] / ctl.dq_dv[world]
             + f64(MAX_START_ENERGY_RATIO) * ctl.slot_sums[Row.KINETIC, world]

@@ -9,7 +9,7 @@ import functools
 import warp as wp
 
 from ..common.modules import KernelSet, kernel_set, masked_kernel
-from ..common.structs import free_components_function
+from ..common.structs import IMPACT_REPEATED, free_components_function
 from ..common.types import double_3d, f64, precision
 from ..solvers.newton_control import control_struct
 from .step_control import step_struct
@@ -39,8 +39,8 @@ def predictor_struct():
 
 
 @functools.cache
-def predictor_kernels(dtype: str, accelerated: bool, module: wp.Module) -> KernelSet:
-    """Kernels in one precision, compiled into the module of the step kernels; `accelerated`: see `step_kernels`."""
+def predictor_kernels(dtype: str, accelerated: bool, impacts: bool, module: wp.Module) -> KernelSet:
+    """Kernels in one precision, in the module of the step kernels; `accelerated`, `impacts`: see `step_kernels`."""
     p, free_components = precision(dtype), free_components_function(dtype)
     T, vec3 = p.T, p.vec3
     Predictor, Step, Newton = predictor_struct(), step_struct(), control_struct()
@@ -61,6 +61,9 @@ def predictor_kernels(dtype: str, accelerated: bool, module: wp.Module) -> Kerne
         newton.start.is_extrapolated[world] = 0
         if step.running[world] == 0:
             return
+        if wp.static(impacts):
+            if step.impact[world] == IMPACT_REPEATED:
+                return
         if predictor.history_state[world, 2] == step.h[world] and predictor.history_state[world, 3] == step.time[world]:
             predictor.order[world] = int(predictor.history_state[world, 0])
             predictor.history_count[world] = int(predictor.history_state[world, 1])

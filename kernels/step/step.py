@@ -167,7 +167,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
     @masked_kernel(module, "step.running")
     def predict(
         step: Step, is_position: p.scalar_1d, free: p.vec3_1d, u_n: p.vec3_2d, v_n: p.vec3_2d, u_before: p.vec3_2d,
-        v_before: p.vec3_2d, q_tilde: p.vec3_2d, v_tilde: p.vec3_2d, v: p.vec3_2d,
+        v_before: p.vec3_2d, q_tilde: p.vec3_2d, v_tilde: p.vec3_2d, u: p.vec3_2d, v: p.vec3_2d,
     ):  # fmt: skip
         """q~, v~ and the first iterate; prescribed components keep their positions.
 
@@ -200,6 +200,9 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
                 if step.a1[world] > f64(0.0):  # linear extrapolation: also exact for a constant acceleration
                     ratio = T(step.h[world] / step.previous_h[world])
                     first = v_n[world, slot] + ratio * (v_n[world, slot] - v_before[world, slot])
+        if wp.static(impacts):
+            if step.impact[world] == IMPACT_REPEATED:  # where the attempt before has found the bodies
+                first = (T(1.0) / T(step.dq_dv[world])) * (u[world, slot] - q)
         keep = (T(1.0) / T(step.dq_dv[world])) * (u_n[world, slot] - q)
         v[world, slot] = free_components(free[slot], first, keep)
 

@@ -357,7 +357,7 @@ class Stepper:
         launch(self.kernels.begin_attempt, m.worlds, [w.step, w.newton])
         self._evaluate_time_laws(w.step.running)
         args = [w.step, m.slot_table.is_position_array, m.topology.free, state.displacement, state.velocity]
-        args += [self.u_before, self.v_before, w.q_tilde, w.v_tilde, w.v]
+        args += [self.u_before, self.v_before, w.q_tilde, w.v_tilde, w.u, w.v]
         launch(self.kernels.predict, self.dim, args)
         if self.predictor:
             self.predictor.begin()
