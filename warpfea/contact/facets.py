@@ -56,6 +56,8 @@ class FacetContact(ContactTerm, Tied, Coupled):
 
     def __init__(self, model: Model) -> None:
         super().__init__(model, PairTables(model), "facets")
+        if model.dtype == "float64":  # else their types differ
+            self.shared_arrays = {"point_product": "tangential_force", "energy": "facet_rotation"}
         self.search_kernels = facet_search_kernels(model.dtype)
         self.master_kernels = master_kernels(model.dtype)
         self.point_list_kernels = point_list_kernels(model.dtype)
@@ -109,6 +111,8 @@ class FacetContact(ContactTerm, Tied, Coupled):
         super().allocate(work, ctx)
         s = ctx.scratch[self.name]
         s["pair"] = self._make_pair_scratch(work, midpoint=ctx.midpoint)
+        for name, other in self.shared_arrays.items():  # forces and products are gathered before the next are written
+            setattr(s["attempt"], name, getattr(s["pair"], other))
         s["tree"] = self._build_tree(s["pair"])
         s["masters"] = self.tables.master_data(s["tree"].id)
         s["other"].masters, s["other"].scratch = s["masters"], s["pair"]

@@ -84,9 +84,11 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
     Attributes:
         tables: contacts, points and facets on the device.
         point_kernels, ledger_kernels: kernels of the points, and of their energies and records.
+        shared_arrays: arrays of an attempt, by name, that are arrays of the other side.
     """
 
     fields = CONTACT_FIELDS
+    shared_arrays: dict[str, str] = {}
 
     def __init__(self, model: Model, tables: FacetTables[Any], geometry: str) -> None:
         super().__init__(model)
@@ -125,9 +127,9 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
         """Attempt struct with arrays from make(name, shape, dtype)."""
         struct, shapes = contact_scratch_struct(self.model.dtype), self.scratch_shapes(worlds)
         unused = () if self.tables.has_single_point else (*OF_FACETS, *OF_CONTACTS, "point_depth")
-        out = struct()
+        out, unused = struct(), (*unused, *self.shared_arrays, "penalty_factor")
         for name, var in struct.vars.items():
-            if name not in (*unused, "penalty_factor"):
+            if name not in unused:
                 setattr(out, name, make(name, shapes.get(name, (worlds, self.tables.points)), var.type.dtype))
         return out
 
@@ -325,8 +327,7 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
 
     @cached_property
     def element_sizes(self) -> np.ndarray:
-        """Smallest edge of a face, and smallest depth of an element behind it, of each contact in device order,
-        (contacts, 2), m."""
+        """Smallest edge of a face and depth of an element behind it, (contacts in device order, 2), m."""
         of_contact = [[(side.body.index, side.faces.tobytes()) for side in c.surfaces] for c in self.tables.contacts]
         sides = {key: side for keys, c in zip(of_contact, self.tables.contacts) for key, side in zip(keys, c.surfaces)}
         least = {key: np.min(element_edge_and_depth(side), axis=1) for key, side in sides.items()}
@@ -362,8 +363,7 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
         m = self.model
         for group, (entry, start, source, count) in zip(self.tables.groups, m.cache[f"{self.name} blocks"]):
             args = [m.topology, matrix.pattern.data, group.data, entry, start, source, stiffness, weight]
-            kernel = block_kernels(m.dtype, False).add_blocks
-            ctx.launch(kernel, (m.worlds, count), [*args, *target])
+            ctx.launch(block_kernels(m.dtype, False).add_blocks, (m.worlds, count), [*args, *target])
 
     def block_modules(self) -> set[wp.Module]:
         return {block_kernels(self.model.dtype, False).module}
