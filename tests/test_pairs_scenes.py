@@ -161,3 +161,12 @@ def test_slip_that_ends_takes_few_iterations():
     model = importlib.import_module("warpfea.scenes.arch").arch().finalize()
     sim = wf.Simulation(model, dt=1e-2, solver=wf.NewtonPCG(tol=1e-6))
     assert sum(int(sim.step().newton[0]) for _ in range(20)) <= 125
+
+
+@pytest.mark.slow
+def test_a_small_pile_comes_to_rest():
+    """One body of each of three families on each other; thirty: `contact_speed_h200.json`."""
+    sim = run_contact_scene("pile", t_end=1.5, count=3, across=1)
+    e = sim.energies()
+    assert e["kinetic"][0] < -1e-5 * e["potential"][0]
+    assert float(sim.last.penetration.max()) < 0.02

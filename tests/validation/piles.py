@@ -26,18 +26,18 @@ STIFFNESS = {4: 11.0, 10: 11.0, 20: 15.0}
 """Factor on the stiffness of the region by cells along a side, with which no point is deeper than 2 mm."""
 
 
-def pile(cells: int, default: bool = False) -> wf.ModelBuilder:
-    """Cubes of cells^3 over each other, with gaps between them and over the ground; `default`: contact options."""
-    options: dict[str, Any] = {} if default else {"restitution": 1.0, "stiffness": ("region", STIFFNESS[cells])}
+def pile(cells: int, default: bool = False, *, cubes: int = CUBES, stiffness: float | None = None) -> wf.ModelBuilder:
+    """Cubes of cells^3 over each other, with gaps between; `default`: contact options, else a factor `stiffness`."""
+    held: dict[str, Any] = {"restitution": 1.0, "stiffness": ("region", stiffness or STIFFNESS.get(cells, 1.0))}
     b = wf.ModelBuilder()
     law = wf.NeoHookean.from_E_nu(E=1e6, nu=0.4, density=1000.0)
     below = None
-    for k in range(CUBES):
+    for k in range(cubes):
         low = (0.003 * k, 0.002 * k, GAP + (SIDE + GAP) * k)
         mesh = wf.mesh.box((SIDE,) * 3, cells=(cells,) * 3, element="T4", origin=low)
         cube = b.add_solid(mesh, material=law, name=f"cube {k}")
         other = b.add_collider(wf.HalfSpace((0, 0, 1), 0.0)) if below is None else below.surface("z+")
-        b.add_contact(cube.surface("z-"), other, mu=0.5, **options)
+        b.add_contact(cube.surface("z-"), other, mu=0.5, **({} if default else held))
         below = cube
     return b
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..elements import Rule
 from ..kernels.contact.edges import EDGE_MARGIN
-from .assembly import facet_tables
+from .assembly import _at_points, facet_tables
 from .contact_points import ContactPoints, element_edge_and_depth
 from .handles import SurfaceSet
 
@@ -20,7 +20,7 @@ CORNERS = {
     4: np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)]),
 }
 """Face coordinates of corners, anticlockwise: a side goes from each one to the next."""
-INWARD = {3: ((0, 1), (-1, -1), (1, 0)), 4: ((0, 1), (-1, 0), (0, -1), (1, 0))}
+INWARD = {3: np.array([(0, 1), (-1, -1), (1, 0)]), 4: np.array([(0, 1), (-1, 0), (0, -1), (1, 0)])}
 """Vector from each side into the facet."""
 
 
@@ -56,24 +56,12 @@ def sharp_edges_of(surface: SurfaceSet, *, both: bool = False) -> Edges:
     once, or with `both` as a side of each of the two."""
     family, kind = surface.body.family, surface.faces[:, 1]
     corners = {int(face): len(family.faces[face]) for face in np.unique(kind)}
-    places = np.array([0.0, 1.0 / 3.0, 0.5, 2.0 / 3.0, 1.0])
-    rules = {}
-    for face, n in corners.items():
-        c = CORNERS[n]
-        points = (c[:, None] + places[:, None] * (np.roll(c, -1, axis=0) - c)[:, None]).reshape(-1, 2)
-        rules[face] = Rule("sides", points, np.ones(len(points)), 1)
-    t = facet_tables(surface, rules=rules)
-    most = t.shape.shape[1] // 5
     sides = np.array([corners[int(face)] for face in kind])
-    facet, side = np.nonzero(np.arange(most) < sides[:, None])
-    inward = np.array([INWARD[n][k] for n, k in zip(sides[facet], side)], dtype=float).reshape(-1, 2)
-    along = np.array([CORNERS[n][(k + 1) % n] - CORNERS[n][k] for n, k in zip(sides[facet], side)])
-    rows = facet[:, None], 5 * side[:, None] + np.arange(5)
-    shape, d_a, d_b = t.shape[rows], t.d_a[rows], t.d_b[rows]
-    way = [v[:, 0, None, None] * d_a + v[:, 1, None, None] * d_b for v in (inward, along)]
-    e = surface.body.reference[t.conn[facet]]
-    x, into, tangent = (np.einsum("eqi,eik->eqk", s, e)[:, 2] for s in (shape, *way))
-    normal = np.cross(tangent, into)
+    facet, side = np.nonzero(np.arange(max(corners.values())) < sides[:, None])
+    conn, (shape, into, along) = _on_sides(surface, facet, side, np.array([0.5]))
+    e = surface.body.reference[conn]
+    x, inward, tangent = (_at_points(s, e)[:, 0] for s in (shape, into, along))
+    normal = np.cross(tangent, inward)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     key = np.round(x / (1e-7 * np.ptp(x, axis=0).max())).astype(np.int64)
     _, first, number, count = np.unique(key, axis=0, return_index=True, return_inverse=True, return_counts=True)
@@ -81,7 +69,7 @@ def sharp_edges_of(surface: SurfaceSet, *, both: bool = False) -> Edges:
     start = np.cumsum(count) - count
     a, b = order[start[count == 2]], order[start[count == 2] + 1]
     half = 0.5 * np.arccos(np.clip(np.einsum("ek,ek->e", normal[a], normal[b]), -1.0, 1.0))
-    sharp = (half > 2.0 * EDGE_MARGIN) & (np.einsum("ek,ek->e", into[a], normal[b]) < 0.0)
+    sharp = (half > 2.0 * EDGE_MARGIN) & (np.einsum("ek,ek->e", inward[a], normal[b]) < 0.0)
     a, b, half = a[sharp], b[sharp], half[sharp]
     if both:
         a, b, half = np.concatenate([a, b]), np.concatenate([b, a]), np.tile(half, 2)
@@ -90,12 +78,34 @@ def sharp_edges_of(surface: SurfaceSet, *, both: bool = False) -> Edges:
     order = np.lexsort((side[a], facet[a]))
     a, b, half = a[order], b[order], half[order]
     depth = element_edge_and_depth(surface)[1]
-    fit = np.linalg.inv(places[[0, 1, 3, 4], None] ** np.arange(4))
-    cubic = np.stack([np.einsum("mq,eqi->mie", fit, s[a][:, [0, 1, 3, 4]]) for s in (shape, way[0])])
-    X = np.einsum("nmie,eik->nmek", cubic, e[a])
+    places = np.array([0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0])
+    conn, (shape, into, _) = _on_sides(surface, facet[a], side[a], places)
+    fit = np.linalg.inv(places[:, None] ** np.arange(4))
+    cubic = np.stack([np.einsum("mq,eqi->mie", fit, s) for s in (shape, into)])
+    X = np.einsum("nmie,eik->nmek", cubic, surface.body.reference[conn])
     X[0, 0] += surface.body.origin
     least = np.minimum(depth[facet[a]], depth[facet[b]])
-    return Edges(facet[a], side[a], facet[b], t.conn[facet[a]], half, least, cubic, X)
+    return Edges(facet[a], side[a], facet[b], conn, half, least, cubic, X)
+
+
+def _on_sides(
+    surface: SurfaceSet, facet: np.ndarray, side: np.ndarray, places: np.ndarray
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Slots (E, L) of facets, and (E, places, L) values of their functions at places from 0 to 1 of a side each, and
+    derivatives into the facet and along the side."""
+    family, (of, item) = surface.body.family, np.unique(facet, return_inverse=True)
+    used, rules = replace(surface, faces=surface.faces[of]), {}
+    sides = np.array([len(family.faces[int(face)]) for face in used.faces[:, 1]])
+    for face in np.unique(used.faces[:, 1]).tolist():
+        c = CORNERS[len(family.faces[face])]
+        points = (c[:, None] + places[:, None] * (np.roll(c, -1, axis=0) - c)[:, None]).reshape(-1, 2)
+        rules[face] = Rule("sides", points, np.ones(len(points)), 1)
+    t = facet_tables(used, rules=rules)
+    rows = item[:, None], len(places) * side[:, None] + np.arange(len(places))
+    d_a, d_b = t.d_a[rows], t.d_b[rows]
+    along = {n: np.roll(c, -1, axis=0) - c for n, c in CORNERS.items()}
+    ways = [np.where(sides[item, None] == 3, way[3][np.minimum(side, 2)], way[4][side]) for way in (INWARD, along)]
+    return t.conn[item], [t.shape[rows], *(w[:, 0, None, None] * d_a + w[:, 1, None, None] * d_b for w in ways)]
 
 
 def owners(facet: np.ndarray, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
