@@ -72,7 +72,7 @@ def add_body(b, family, size, at, axes, material, name):
         cells = (2, 2, 2) if family == "T4" else (1, 1, 1)
         mesh = wf.mesh.box(edges, cells=cells, element=family, origin=tuple(-0.5 * np.array(edges)))
         body = b.add_solid(turned(mesh, at, axes), element=family, material=material, name=name)
-    return body
+    b.add_probe(name, body.at(tuple(at)))
 
 
 def turned(mesh, at, axes):
