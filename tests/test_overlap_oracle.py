@@ -14,6 +14,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from result_files import content_of
 
 import warpfea as wf
 from warpfea.model.surfaces import reference_points
@@ -119,6 +120,14 @@ def test_crossings_are_those_of_ipctk(frames):
     counts = crossings(frames)
     assert counts["reported"] > frames
     assert counts["apart"] > frames
+
+
+def test_twenty_thousand_frames():
+    """Each reported pair intersects, and others at most as deep as twice what counts, or the command had failed."""
+    content = content_of("overlap_cpu.json", "python tests/test_overlap_oracle.py 20000 2")
+    assert content["frames"] == 20_000
+    assert sum(row["reported"] for row in content["rows"]) > 30_000
+    assert sum(sum(row.values()) for row in content["rows"]) == 10 * content["frames"]
 
 
 if __name__ == "__main__":
