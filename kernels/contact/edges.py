@@ -406,7 +406,8 @@ def edge_kernels(dtype: str) -> KernelSet:
         point = facets.first_point + item * facets.point_count + ed.number[edge]
         pair.facet[world, point] = -1
         anchored = pair.anchor_facet[world, point] > 0
-        if not anchored and pair.in_reach[world, facets.first_row + ed.owner[edge]] == 0:
+        owner = ed.owner[edge]
+        if not anchored and owner >= 0 and pair.in_reach[world, facets.first_row + owner] == 0:
             return
         x = own_coefficients(ed, facets, u, world, edge, 0)
         inward = own_coefficients(ed, facets, u, world, edge, 1)

@@ -76,7 +76,7 @@ def edge_struct(dtype: str):
     class Edges:
         row: wp.array(dtype=wp.int32)  # [edge] row of its point among the facets of its group
         number: wp.array(dtype=wp.int32)  # number among the points of that row
-        owner: wp.array(dtype=wp.int32)  # facet of the group that it is a side of
+        owner: wp.array(dtype=wp.int32)  # row of the facet that it is a side of; -1: of several
         half_angle: wp.array(dtype=wp.float64)  # between the normals of both facets, rad
         shape: wp.array4d(dtype=T)  # [0: position, 1: vector into the facet; power of t, local, edge]
         X: wp.array3d(dtype=wp.vec3d)  # [0 or 1, power of t, edge] in the reference, m

@@ -69,9 +69,10 @@ class ContactMethods:
                 to it, as over one surface, also over a gap of up to a fifth of the surface's width; None: a thousandth
                 of the width, the second largest edge of the surface's bounding box. More is a step with a side face.
                 0 or above, not for two bodies or obstacles narrower than the facets.
-            clipping: True: sharp edges of the other side bear on the surface within its facets, too, by points of their
+            clipping: True: sharp edges of an obstacle bear on the surface within its facets, too, by points of their
                 own at most half a facet apart (overhangs, table edges, knife edges), which cost as a contact between
-                bodies. Of two bodies those of the one whose facets are touched. Not for moving colliders.
+                bodies; not of moving colliders. Facets of bodies that begin near each other cut each other: a
+                uniform pressure passes unlike meshes exactly, until they slide.
             name: unique name; by default "BODY on COLLIDER".
 
         Bodies without a contact pass through each other; `Simulation(check_overlap=True)` names them. Between

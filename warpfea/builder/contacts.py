@@ -22,6 +22,7 @@ from ..model.edge_points import edge_contact
 from ..model.handles import SurfaceSet
 from ..model.obstacle_points import ObstacleContact, is_narrow_obstacle
 from ..model.pairs import PAIR_RULES, FacetOptions, PairContact, slave_and_master
+from ..model.segments import SEGMENT_POINTS, SegmentContact, has_segments
 from ..model.shapes import Shape
 from ..time_laws import Rotation, time_law
 from .bodies import unused_name
@@ -87,7 +88,9 @@ def add_contact(
     make = next((make for kind, make in KINDS.items() if isinstance(other, kind)), make_contact)
     contact = make(d, thing, other, name, **options)
     check_clipping(contact, clipping)
-    if clipping and isinstance(contact, (Contact, PairContact)):
+    if clipping and isinstance(contact, PairContact) and has_segments(contact):
+        contact = SegmentContact(**vars(contact))
+    elif clipping and isinstance(contact, (Contact, PairContact)):
         contact.edges = edge_contact(contact, len(d.contacts_of(FacetOptions)) + isinstance(contact, PairContact))
     d.contacts.append(contact)
     return contact
@@ -101,7 +104,9 @@ def check_clipping(contact: Contact | FacetOptions, clipping: Any) -> None:
     if not clipping:
         return
     other = contact.sides[1]
+    points = SEGMENT_POINTS if isinstance(contact, PairContact) else (contact.points,)
     reasons = {
+        f"points = {contact.points}": contact.points not in (None, *points),
         "model = 'sphere'": contact.model == "sphere",
         "treatment = 'explicit'": contact.treatment == "explicit",
         f"law = {contact.law!r}, which acts at any distance,": LAWS[contact.law].traits & ANY_GAP,

@@ -95,7 +95,7 @@ class PairTables(FacetTables[FacetOptions]):
                 parts.append(edges)
                 item.append(start + size - row[-1] - 1 + row)
                 number.append(place)
-                owner.append(start + edges.facet)
+                owner.append(np.where(self.contacts[k].row_per_facet, start + edges.facet, -1))
         if not parts:
             self.edge_data.append(None)
             return {}

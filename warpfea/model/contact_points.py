@@ -61,7 +61,7 @@ class ContactPoints:
         X: (F, P, 3) reference positions, m.
         normal: (F, P, 3) outward unit normals in the reference; 0 for degenerate faces.
         faces: (F, 2) rows (element, local face).
-        rows: of the surface; by default all, else those of points on its edges follow.
+        rows: facet of each row; by default one each, else those of segments, and of points on edges last.
     """
 
     conn: np.ndarray

@@ -147,11 +147,13 @@ def edge_places(edges: Edges, count: int) -> tuple[np.ndarray, np.ndarray]:
 def with_edges(p: ContactPoints, edges: Edges) -> ContactPoints:
     """Points of a surface, and rows of points on its edges, without an area of their own."""
     row = edge_places(edges, p.area.shape[1])[0]
-    of = edges.facet[np.unique(row, return_index=True)[1]]
+    facet = edges.facet[np.unique(row, return_index=True)[1]]
+    rows = np.arange(len(p.conn)) if p.rows is ... else p.rows
+    of = np.searchsorted(rows, facet)
     more = {"conn": p.conn[of], "X": p.X[of], "faces": p.faces[of]}
     more |= {name: np.zeros_like(getattr(p, name)[of]) for name in ("shape", "area", "normal")}
     both = {name: np.concatenate([getattr(p, name), values]) for name, values in more.items()}
-    return ContactPoints(**both, rows=np.concatenate([np.arange(len(p.conn)), of]))
+    return ContactPoints(**both, rows=np.concatenate([rows, facet]))
 
 
 def sharp_sides(surface: SurfaceSet) -> np.ndarray:

@@ -53,11 +53,13 @@ class FacetOptions(ContactOptions):
         name: unique among the contacts of its builder.
         shadow: mean shadow over the area of the points, a quarter for those around a convex obstacle.
         one_sided: 1 if its points touch only facets that face theirs; EDGES if only within these.
+        row_per_facet: True if its points are in one row for each facet.
     """
 
     name: str
     shadow: ClassVar[float] = 1.0
     one_sided: ClassVar[int] = 0
+    row_per_facet: ClassVar[bool] = True
 
     def region_area(self, points: ContactPoints) -> float:
         """As of `ContactOptions`; without a radius that of its smaller surface."""
