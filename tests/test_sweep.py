@@ -15,6 +15,7 @@ import sweep_models
 import warpfea as wf
 from warpfea.sweeps import PoolEngine, WorkerLost
 from warpfea.sweeps.measures import parse_measure
+from warpfea.sweeps.worker import Group
 
 MODELS = pathlib.Path(sweep_models.__file__).resolve()
 BAR, FALL = f"{MODELS}:bar", f"{MODELS}:fall"
@@ -193,6 +194,40 @@ def test_a_design_that_kills_its_worker_is_left(pool, tmp_path):
     assert result.failures == {0: "its worker died 3 times"}
     assert result.retries == 3
     assert "killed" in table(result)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_batches_are_as_large_as_memory_allows(monkeypatch, known):
+    """Three worlds fit: the size is that of the error, or a half where it has none."""
+    sizes, batch = [], Group.batch
+
+    def limited(self, designs):
+        sizes.append(len(designs))
+        if len(designs) > 3:
+            raise wf.CapacityError("no room", worlds=3 if known else 0)
+        return batch(self, designs)
+
+    monkeypatch.setattr(Group, "batch", limited)
+    rows = [{"gravity.z": -1.0 * k} for k in range(10)]
+    result = wf.sweep(FALL, rows, measures={"z": "probe.p.displacement.z"}, engine=Inline(1))
+    assert result["z"] == pytest.approx(-6e-4 * np.arange(10), rel=1e-9)
+    assert sizes == ([10, 3, 3, 3, 1] if known else [10, 5, 2, 2, 1, 5, 2, 2, 1])
+
+
+@pytest.mark.cuda
+def test_two_workers_of_one_gpu_give_the_bits_of_one():
+    """Each sees a GPU of its own, as two GPUs would be dealt out."""
+    rows = [{"cells": cells, "bar.E": E} for cells in (2, 3) for E in STIFF[:32].tolist()]
+    tables, how = [], {"measures": TIP, "run": {"t_end": 0.03, "device": "cuda"}}
+    for gpus, worlds in (([0], 64), ([0, 0], 7)):
+        engine = PoolEngine(gpus=gpus)
+        try:
+            result = wf.sweep(BAR, rows, worlds=worlds, engine=engine, **how)
+        finally:
+            engine.close()
+        assert not result.failures
+        tables.append(table(result))
+    assert tables[0] == tables[1]
 
 
 def test_a_lost_batch_is_halved(tmp_path):
@@ -375,7 +410,7 @@ def test_fit_finds_a_modulus():
     assert local.values["bar.E"] == pytest.approx(3e5, rel=1e-6)
     search = wf.fit(sweep_models.bar, ranges, record, worlds=16, generations=4, run={"device": "cpu"})
     assert search.values["bar.E"] == pytest.approx(3e5, rel=0.05)
-    assert search.runs == 65
+    assert search.runs == 64
     built = wf.fit(sweep_models.bar, {"E": (1e5, 1e6)}, record, method="least_squares", run={"device": "cpu"})
     assert built.values["E"] == pytest.approx(3e5, rel=1e-6)
     with pytest.raises(wf.ModelError, match="needs as many times as values, at ends of steps"):

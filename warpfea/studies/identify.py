@@ -3,10 +3,10 @@
 A finger of rubber, 0.12 x 0.02 x 0.02 m of T10, is clamped at one end and let go under gravity; its tip is recorded for
 0.24 s with noise of 1 % of the largest deflection. The record comes from a run of four times as many steps with E and
 eta that the search does not know. scipy's differential evolution looks for both, a generation at a time: each candidate
-is a world of one model, `model.set_parameter` writes their constants in place, `sim.reset` begins anew on the device,
-and the recorded step is replayed. The misfit is the mean square of the differences of all samples.
+is a world of one model (`wf.fit`). The misfit is the mean square of the differences of all samples.
 
-tests/results/identify_cpu.json and identify_h200.json, with 4096 worlds, are the committed results.
+tests/results/identify_cpu.json and identify_h200.json, with 4096 worlds, are the committed results; they were made by
+a loop that reset one simulation.
 """
 
 import argparse
@@ -15,8 +15,6 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-import warp as wp
-from scipy.optimize import differential_evolution
 
 import warpfea as wf
 
@@ -35,27 +33,24 @@ RECORD_REFINEMENT = 4
 GENERATIONS, WORLDS = 16, 64
 
 
-def finger_model(device: Any, worlds: int) -> Any:
-    """The model; its constants are set for each world."""
+@wf.scene(dt=DT, t_end=T_END, integrator="bdf2", tol=1e-6)
+def finger() -> wf.ModelBuilder:
+    """The finger; its constants are set for each world."""
     b = wf.ModelBuilder(gravity=(0, 0, -9.81))
     law = wf.NeoHookean.from_E_nu(E=1e6, nu=0.45, density=1100.0, damping=wf.KelvinVoigt(eta=1e3))
     body = b.add_solid(wf.mesh.box((0.12, 0.02, 0.02), cells=(4, 1, 1)), material=law, name="finger")
     b.clamp(body.nodes("x-"))
     b.add_probe("tip", body.surface("x+"))
-    return b.finalize(device=device, worlds=worlds)
-
-
-def make_simulation(model: Any, dt: float, **how: Any) -> wf.Simulation:
-    """A simulation of the model; the constants of all worlds have been set."""
-    return wf.Simulation(model, dt=dt, integrator="bdf2", solver=wf.NewtonPCG(tol=1e-6), ledger=False, **how)
+    return b
 
 
 def record_tip(device: Any, t_end: float = T_END, seed: int = 7) -> np.ndarray:
     """The tip's deflection (steps, 3), m, every `DT`, of the true constants, with noise."""
-    model = finger_model(device, 1)
+    model = finger().finalize(device=device)
     for name, value in TRUE_CONSTANTS.items():
         model.set_parameter(f"finger.{name}", value)
-    sim = make_simulation(model, DT / RECORD_REFINEMENT)
+    how: dict[str, Any] = {"integrator": finger.integrator, "solver": wf.NewtonPCG(tol=finger.tol), "ledger": False}
+    sim = wf.Simulation(model, dt=DT / RECORD_REFINEMENT, **how)
     sim.step(RECORD_REFINEMENT * round(t_end / DT))
     samples = sim.probe("tip").displacement[0, RECORD_REFINEMENT - 1 :: RECORD_REFINEMENT]
     noise = np.random.default_rng(seed).normal(size=samples.shape)
@@ -92,43 +87,23 @@ def identify(
     samples: np.ndarray, *, device: Any, worlds: int = WORLDS, generations: int = GENERATIONS, seed: int = 1
 ) -> Identification:
     """Look for E and eta that give the recorded deflections (steps, 3), m; the worlds are the candidates."""
+    times = DT * np.arange(1, len(samples) + 1)
+    record = {f"probe.tip.displacement.{axis}": (times, column) for axis, column in zip("xyz", samples.T)}
+    ranges = {f"finger.{name}": {"low": a, "high": b, "log": True} for name, (a, b) in SEARCH_BOUNDS.items()}
+    run = {"device": str(device), "t_end": float(times[-1]), "ledger": False}
     began = clock.perf_counter()
-    model = finger_model(device, worlds)
-    names = list(SEARCH_BOUNDS)
-    for name in names:  # the first values precede the simulation
-        model.set_parameter(f"finger.{name}", np.full(worlds, SEARCH_BOUNDS[name][0]))
-    sim = make_simulation(model, DT, record=False, on_failure="freeze")
-    tip = sim.observe("probe.tip.displacement")
-    everyone = wp.ones(worlds, dtype=wp.int32, device=model.device)
-    sim.step()
+    one = {text: (time[:1], column[:1]) for text, (time, column) in record.items()}
+    wf.fit(finger, ranges, one, worlds=2, generations=1, run=run | {"t_end": DT})  # compiles
     ready = clock.perf_counter()
-    runs = 0
-
-    def misfits(logarithms: np.ndarray) -> np.ndarray:
-        """Mean square (candidates,), m^2, of candidates (constants, candidates)."""
-        nonlocal runs
-        count = logarithms.shape[1]
-        values = np.exp(logarithms[:, np.arange(worlds) % count])
-        for name, row in zip(names, values):
-            model.set_parameter(f"finger.{name}", row)
-        sim.reset(everyone)
-        sums = np.zeros(worlds)
-        for sample in samples:
-            sim.step()
-            sums += ((tip.update().numpy() - sample) ** 2).mean(axis=1)
-        runs += worlds
-        return np.where(sim.status == 0, sums / len(samples), 1e30)[:count]
-
-    found = differential_evolution(
-        misfits, [tuple(np.log(SEARCH_BOUNDS[name])) for name in names], vectorized=True, updating="deferred",
-        polish=False, popsize=worlds // len(names), maxiter=generations - 1, tol=0.0, init="sobol",
-        rng=np.random.default_rng(seed),
-    )  # fmt: skip
-    E, eta = (float(x) for x in np.exp(found.x))
+    found = wf.fit(finger, ranges, record, worlds=worlds, generations=generations, seed=seed, run=run)
+    values = {name: found.values[f"finger.{name}"] for name in TRUE_CONSTANTS}
+    errors = {f"{name}_error": abs(value / TRUE_CONSTANTS[name] - 1.0) for name, value in values.items()}
+    model = finger().finalize(device=device)
     return Identification(
-        str(model.device), worlds, generations, len(samples), model.info()["unknowns"], NOISE_RATIO, E, eta,
-        abs(E / TRUE_CONSTANTS["E"] - 1.0), abs(eta / TRUE_CONSTANTS["eta"] - 1.0),
-        float(np.sqrt(found.fun) / np.abs(samples).max()), runs, ready - began, clock.perf_counter() - ready,
+        device=str(model.device), worlds=worlds, generations=generations, steps=len(samples),
+        unknowns=model.info()["unknowns"], noise=NOISE_RATIO, **values, **errors,
+        misfit=found.misfit / np.abs(samples).max(), runs=found.runs, setup_s=ready - began,
+        time_s=clock.perf_counter() - ready,
     )  # fmt: skip
 
 

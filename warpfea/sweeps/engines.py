@@ -59,14 +59,14 @@ class PoolEngine:
         memory: limit of a process's address space, bytes; None: no limit. For the CPU: CUDA reserves addresses.
 
     Attributes:
-        pids: of the processes.
+        pids: of the processes. gpus: as given.
     """
 
     def __init__(self, workers: int | None = None, *, gpus: Sequence[int] = (), memory: float | None = None) -> None:
         if getattr(multiprocessing.current_process(), "_inheriting", False):
             raise ModelError('a sweep starts processes that import this file: put it under if __name__ == "__main__":')
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        self.workers, self.memory = workers or len(gpus) or cores, memory
+        self.workers, self.memory, self.gpus = workers or len(gpus) or cores, memory, tuple(gpus)
         visible = os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",")
         names = [visible[gpu] if gpu < len(visible) and visible[gpu] else str(gpu) for gpu in gpus]
         self.environments = [_environment(names[k % len(names)] if names else None) for k in range(self.workers)]

@@ -35,7 +35,7 @@ class Fit:
 
     Attributes:
         values: by parameter. misfit: root of the mean square of the residuals.
-        residuals: (samples,) of the record, simulation less record over sigma. runs: of the scene.
+        residuals: (samples,) of the record, simulation less record over sigma. runs: of the scene in the search.
     """
 
     values: dict[str, float]
@@ -77,9 +77,9 @@ def fit(
         point = candidates.search_locally(start or {})
     else:
         point = candidates.search_globally(worlds, generations, seed)
-    residuals = candidates.residuals(point[:, None])[0]
+    runs, residuals = candidates.runs, candidates.residuals(point[:, None])[0]
     values = {name: float(column[0]) for name, column in candidates.values(point[:, None]).items()}
-    return Fit(values, float(np.sqrt(np.mean(residuals**2))), residuals, candidates.runs)
+    return Fit(values, float(np.sqrt(np.mean(residuals**2))), residuals, runs)
 
 
 class Candidates:

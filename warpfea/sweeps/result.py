@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import csv
+import math
 import pathlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -37,12 +38,13 @@ class SweepResult:
         self.folder, self.design, self.study, self._keep = folder, design, study, keep
         self.measures = tuple(study.measures)
         self.failures: dict[int, str] = {}
+        self._status: dict[int, str] = {}
         self._values = np.full((len(self.measures), len(design)), np.nan)
         for row in record.rows():
             if row["status"] != "done":
-                self.failures[row["design"]] = row["reason"] or row["status"]
-            for k, name in enumerate(self.measures):
-                self._values[k, row["design"]] = row["values"].get(name, np.nan)
+                self.failures[row["design"]], self._status[row["design"]] = row["reason"], row["status"]
+            else:
+                self._values[:, row["design"]] = [row["values"][name] for name in self.measures]
         self.seconds: dict[str, float] = {}
         self.retries = record.retries
 
@@ -104,48 +106,44 @@ class SweepResult:
             return {name: stored[name] for name in stored.files}
 
 
-def write_tables(folder: pathlib.Path, design: Design, measures: Sequence[str], record: Record) -> None:
-    """Derive table.csv, with pyarrow also table.parquet, from the record: the same bytes in whatever order its lines
-    are. OutputError."""
-    names = ["design", *design.columns, *measures, "status", "reason"]
+def write_tables(result: SweepResult) -> None:
+    """Derive table.csv, with pyarrow also table.parquet: the same bytes in whatever order the record's lines are.
+    OutputError."""
+    names = ["design", *result.design.columns, *result.measures, "status", "reason"]
 
-    def rows() -> Iterator[list[Any]]:
-        for k, row in enumerate(record.rows()):
-            values = [row["values"].get(name) for name in measures]
-            yield [k, *design[k].values(), *values, row["status"], row["reason"]]
+    def columns(first: int, last: int) -> list[Sequence[Any]]:
+        """Columns of some designs, None for measures that there are not."""
+        values = [[None if math.isnan(x) else x for x in result[name][first:last].tolist()] for name in result.measures]
+        status = [result._status.get(k, "done") for k in range(first, last)]
+        reason = [result.failures.get(k, "") for k in range(first, last)]
+        own = [column[first:last] for column in result.design.columns.values()]
+        return [range(first, last), *own, *values, status, reason]
+
+    chunks = [(k, min(k + CHUNK, len(result))) for k in range(0, len(result), CHUNK)]
 
     def write_csv(target: pathlib.Path) -> None:
         with open(target, "w", newline="") as file:
             writer = csv.writer(file, lineterminator="\n")
             writer.writerow(names)
-            writer.writerows([" ".join(map(repr, x)) if isinstance(x, tuple) else x for x in row] for row in rows())
+            for chunk in chunks:
+                rows = zip(*columns(*chunk))
+                writer.writerows([" ".join(map(repr, x)) if isinstance(x, tuple) else x for x in row] for row in rows)
 
-    write_atomically(folder / "table.csv", write_csv)
+    write_atomically(result.folder / "table.csv", write_csv)
     try:
         arrow = require_pyarrow()
     except ModelError:
         return
-    kinds: dict[str, Any] = {name: arrow.array(column[:1]).type for name, column in design.columns.items()}
-    for name, column in design.columns.items():
-        if {type(value) for value in column} == {int, float}:
-            kinds[name] = arrow.float64()
-    kinds |= {"design": arrow.int64(), "status": arrow.string(), "reason": arrow.string()}
-    schema = arrow.schema([(name, kinds.get(name, arrow.float64())) for name in names])
+    kinds = {name: arrow.float64() for name in result.measures} | {"design": arrow.int64()}
+    for name, column in result.design.columns.items():
+        mixed = {type(value) for value in column} == {int, float}
+        kinds[name] = arrow.float64() if mixed else arrow.array(column[:1]).type
+    schema = arrow.schema([(name, kinds.get(name, arrow.string())) for name in names])
 
     def write_parquet(target: pathlib.Path) -> None:
         with arrow.parquet.ParquetWriter(target, schema) as writer:
-            chunk: list[list[Any]] = []
-            for row in rows():
-                chunk.append(row)
-                if len(chunk) == CHUNK:
-                    writer.write_table(_arrow_table(arrow, schema, chunk))
-                    chunk = []
-            if chunk:
-                writer.write_table(_arrow_table(arrow, schema, chunk))
+            for chunk in chunks:
+                arrays = [arrow.array(column, type=each.type) for each, column in zip(schema, columns(*chunk))]
+                writer.write_table(arrow.Table.from_arrays(arrays, schema=schema))
 
-    write_atomically(folder / "table.parquet", write_parquet)
-
-
-def _arrow_table(arrow: Any, schema: Any, rows: list[list[Any]]) -> Any:
-    columns = [arrow.array(column, type=field.type) for field, column in zip(schema, zip(*rows))]
-    return arrow.Table.from_arrays(columns, schema=schema)
+    write_atomically(result.folder / "table.parquet", write_parquet)

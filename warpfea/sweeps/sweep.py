@@ -107,6 +107,8 @@ def sweep(
         if not record.done.all():
             device = str(study.run["device"])
             used = engine(device) if callable(engine) else make_engine(engine, device)
+            if device.startswith("cuda") and getattr(used, "gpus", True) == ():
+                raise ModelError("engine has no GPU: give PoolEngine(gpus=[0, ...]), or run={'device': 'cpu'}")
             seconds["start"] = clock.perf_counter() - began
             try:
                 tasks = _tasks(study, points, record, worlds or BATCH["cuda" in study.run["device"]], used.workers)
@@ -116,11 +118,11 @@ def sweep(
             finally:
                 if used is not engine:
                     used.close()
-        seconds["run"] = clock.perf_counter() - began - seconds["start"]
-        write_tables(folder, points, list(study.measures), record)
         result = SweepResult(folder, points, study, record, keep)
+        write_tables(result)
     finally:
         record.close()
+    seconds["run"] = clock.perf_counter() - began - seconds["start"]
     result.seconds = seconds
     return result
 
@@ -249,23 +251,25 @@ class _Driver:
             if new:
                 writer.writerow(["design", "seconds", "worlds", "alone", "worker", "task_seconds"])
             bar.update(done)
-            while self.tasks or running:
+            ended: list[tuple[Task, Outcome]] = []
+            while self.tasks or running or ended:
                 while self.tasks and len(running) < self.engine.workers:
                     task = self.tasks.popleft()
                     running[self._submit(solve, task)] = task
-                for handle in self.engine.done(list(running)):
+                for task, outcome in ended:  # while workers go on
+                    self._keep(task, outcome)
+                    writer.writerows([r.index, r.seconds, r.worlds, r.alone, outcome.worker, outcome.seconds]
+                                     for r in outcome.rows)  # fmt: skip
+                    file.flush()
+                bar.set_postfix_str(f"{self.record.failed} failed", refresh=False)
+                bar.update(int(self.record.done.sum()) - bar.n)
+                ended = []
+                for handle in self.engine.done(list(running)) if running else ():
                     task = running.pop(handle)
                     try:
-                        outcome = self.engine.result(handle)
+                        ended.append((task, self.engine.result(handle)))
                     except WorkerLost:
                         self._lose(task)
-                    else:
-                        self._keep(task, outcome)
-                        writer.writerows([r.index, r.seconds, r.worlds, r.alone, outcome.worker, outcome.seconds]
-                                         for r in outcome.rows)  # fmt: skip
-                        file.flush()
-                    bar.set_postfix_str(f"{self.record.failed} failed", refresh=False)
-                    bar.update(int(self.record.done.sum()) - bar.n)
 
     def _submit(self, call: Callable[..., Any], task: Task) -> Any:
         own = [name for name in self.points.columns if name not in task.arguments]
@@ -312,5 +316,4 @@ def _save(series: dict[str, np.ndarray]) -> Callable[[pathlib.Path], None]:
 
 def _line(row: Row) -> dict[str, Any]:
     """Line of the record: nothing in it depends on batch or worker."""
-    kept = dataclasses.asdict(dataclasses.replace(row, series={}))
-    return {"design": row.index, **{name: kept[name] for name in ("status", "values", "reason")}}
+    return {"design": row.index, "status": row.status, "values": row.values, "reason": row.reason}

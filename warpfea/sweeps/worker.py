@@ -121,14 +121,22 @@ def solve(study: Study, arguments: dict[str, Any], designs: Sequence[tuple[int, 
         arguments: of the scene, the same for all.
         designs: index and values per world of each.
     """
-    began, worker = clock.perf_counter(), f"{socket.gethostname()}:{os.getpid()}"
+    began = clock.perf_counter()
+    rows, plan, device = _rows(study, arguments, list(designs))
+    worker = f"{socket.gethostname()}:{os.getpid()}"
+    return Outcome(rows, plan, device, worker, clock.perf_counter() - began)
+
+
+def _rows(
+    study: Study, arguments: dict[str, Any], designs: list[tuple[int, dict[str, Any]]]
+) -> tuple[list[Row], dict[str, Any] | None, str]:
+    """Rows, plan and device; its model and simulation are freed at the end."""
     try:
         group = Group(study, locate(study.scene), arguments)
     except Exception as error:  # the same for each of them
-        rows = [Row(index, "failed", reason=describe(error)) for index, _ in designs]
-        return Outcome(rows, None, "", worker, clock.perf_counter() - began)
-    rows = group.solve(list(designs))
-    return Outcome(rows, group.plan, group.device, worker, clock.perf_counter() - began)
+        return [Row(index, "failed", reason=describe(error)) for index, _ in designs], None, ""
+    rows = group.solve(designs)
+    return rows, group.plan, group.device
 
 
 class Group:
