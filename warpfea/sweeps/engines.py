@@ -90,7 +90,7 @@ class PoolEngine:
             return executor, executor.submit(os.getpid)  # the process starts here
 
     def _replace(self, k: int) -> None:
-        self.executors[k].shutdown(wait=False)
+        self.executors[k].shutdown()
         self.executors[k], future = self._start(k)
         with contextlib.suppress(BrokenProcessPool):  # then its next task is lost
             self.pids[k] = future.result()
@@ -125,7 +125,7 @@ class PoolEngine:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGTERM)
         for executor in self.executors:
-            executor.shutdown(wait=False, cancel_futures=True)
+            executor.shutdown(cancel_futures=True)
 
 
 def _environment(gpu: str | None) -> dict[str, str]:

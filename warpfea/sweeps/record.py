@@ -6,7 +6,7 @@ import json
 import os
 import pathlib
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -16,31 +16,32 @@ from ..base.errors import CheckpointError
 __all__ = ["Record"]
 
 SCHEMA = 1
-NONE = -1
 
 
 class Record:
-    """The record in a file, of which the offsets of its lines are kept.
+    """The record in a file, and what its lines say.
 
     Each line ends with the checksum of what precedes it. The first one holds the settings, others a design's row, the
     plan of a group of designs ("group", "plan", "device"), or tasks whose worker died ("lost": a design, "worlds").
 
     Args:
-        path: of the file. settings: of the sweep. count: of designs.
+        path: of the file. settings: of the sweep: "measures" by name, number of "designs", and others.
         resume: go on with the file; None: if it is there.
 
     Attributes:
-        done: (count,) flags. failed: number of designs that failed.
+        done: (count,) flags of designs that have ended. values: (measures, count), NaN without one.
+        failures: status, not "done", and reason by design.
         retries: number of lost tasks. deaths: of the worker of a design alone. plans: plan and device by group.
 
     Raises:
         CheckpointError: a file of another sweep, with a damaged line, in use, or there without `resume`.
     """
 
-    def __init__(self, path: pathlib.Path, settings: Mapping[str, Any], count: int, *, resume: bool) -> None:
-        self.path, self.count = path, count
-        self._offsets = np.full(count, NONE, dtype=np.int64)
-        self.failed, self.retries = 0, 0
+    def __init__(self, path: pathlib.Path, settings: Mapping[str, Any], *, resume: bool) -> None:
+        self.path, self.measures = path, tuple(settings["measures"])
+        self.count = count = settings["designs"]
+        self.done, self.values = np.zeros(count, dtype=bool), np.full((len(self.measures), count), np.nan)
+        self.failures, self.retries = dict[int, tuple[str, str]](), 0
         self.deaths, self.plans = dict[int, int](), dict[str, dict[str, Any]]()
         if path.exists() and not resume:
             raise CheckpointError(f"{path}: is there; go on with it (resume=True, --resume) or take another folder")
@@ -50,9 +51,9 @@ class Record:
             raise CheckpointError(f"{path}: can't be opened ({error})") from error
         try:
             self._lock()
-            self._size = self._read(json.loads(json.dumps(settings)))
-            self._file.truncate(self._size)
-            if self._size == 0:
+            size = self._read(json.loads(json.dumps(settings)))
+            self._file.truncate(size)
+            if size == 0:
                 self.append({"schema": SCHEMA, "settings": settings})
         except BaseException:
             self._file.close()
@@ -84,7 +85,7 @@ class Record:
             if number == 1:
                 self._check_settings(content, settings)
             else:
-                self._note(content, offset, number)
+                self._note(content, number)
             offset += len(line)
         return offset
 
@@ -98,7 +99,7 @@ class Record:
                     f"{self.path}: is of another sweep: {name} was {found.get(name)!r}, is {settings.get(name)!r}"
                 )
 
-    def _note(self, content: dict[str, Any], offset: int, number: int) -> None:
+    def _note(self, content: Mapping[str, Any], number: int) -> None:
         """Take account of a line."""
         if "group" in content:
             self.plans[content["group"]] = {"plan": content["plan"], "device": content["device"]}
@@ -110,45 +111,26 @@ class Record:
             self.retries += 1
             if content["worlds"] == 1:
                 self.deaths[index] = self.deaths.get(index, 0) + 1
-        elif self._offsets[index] == NONE:
-            self._offsets[index] = offset
-            self.failed += content["status"] != "done"
-        else:
+        elif self.done[index]:
             raise CheckpointError(f"{self.path}: line {number} repeats design {index}")
-
-    @property
-    def done(self) -> np.ndarray:
-        """(count,) flags of designs with a row."""
-        return self._offsets != NONE
+        else:
+            self.done[index] = True
+            if content["status"] == "done":
+                self.values[:, index] = [content["values"][name] for name in self.measures]
+            else:
+                self.failures[index] = content["status"], content["reason"]
 
     def append(self, *lines: Mapping[str, Any]) -> None:
         """Write lines to the disk. CheckpointError."""
-        data, offset = b"", self._size
         for line in lines:
-            text = _encode(line)
             if "settings" not in line:
-                self._note(dict(line), offset + len(data), 0)
-            data += text
+                self._note(line, 0)
         try:
-            self._file.write(data)
+            self._file.writelines(map(_encode, lines))
             self._file.flush()
             os.fsync(self._file.fileno())
         except OSError as error:
             raise CheckpointError(f"{self.path}: can't be written ({error})") from error
-        self._size += len(data)
-
-    def rows(self) -> Iterator[dict[str, Any]]:
-        """The row of each design in their order, {"design", "status": "open"} without one."""
-        with open(self.path, "rb") as file:
-            for k, offset in enumerate(self._offsets.tolist()):
-                if offset == NONE:
-                    yield {"design": k, "status": "open", "values": {}, "reason": ""}
-                    continue
-                file.seek(offset)
-                content = _decode(file.readline())
-                if content is None or content.get("design") != k:
-                    raise CheckpointError(f"{self.path}: was changed while it was read")
-                yield content
 
     def close(self) -> None:
         """Close the file."""

@@ -29,7 +29,7 @@ class SweepResult:
     Attributes:
         folder: of its files: record.jsonl, table.csv, table.parquet (with pyarrow), times.csv, series/.
         design: the designs. study: settings of their runs. measures: names.
-        failures: reason by index of each design without a result.
+        status, failures: of each design without a result by index, failed or killed, and the reason.
         seconds: of the workers' starts ("start") and of the rest ("run").
         retries: number of tasks that were lost with their worker.
     """
@@ -37,14 +37,10 @@ class SweepResult:
     def __init__(self, folder: pathlib.Path, design: Design, study: Study, record: Record, keep: Any = None) -> None:
         self.folder, self.design, self.study, self._keep = folder, design, study, keep
         self.measures = tuple(study.measures)
-        self.failures: dict[int, str] = {}
-        self._status: dict[int, str] = {}
-        self._values = np.full((len(self.measures), len(design)), np.nan)
-        for row in record.rows():
-            if row["status"] != "done":
-                self.failures[row["design"]], self._status[row["design"]] = row["reason"], row["status"]
-            else:
-                self._values[:, row["design"]] = [row["values"][name] for name in self.measures]
+        left = {int(k): ("open", "") for k in np.flatnonzero(~record.done)}
+        self.status = {k: status for k, (status, _) in (record.failures | left).items()}
+        self.failures = {k: reason for k, (_, reason) in (record.failures | left).items()}
+        self._values = record.values
         self.seconds: dict[str, float] = {}
         self.retries = record.retries
 
@@ -114,7 +110,7 @@ def write_tables(result: SweepResult) -> None:
     def columns(first: int, last: int) -> list[Sequence[Any]]:
         """Columns of some designs, None for measures that there are not."""
         values = [[None if math.isnan(x) else x for x in result[name][first:last].tolist()] for name in result.measures]
-        status = [result._status.get(k, "done") for k in range(first, last)]
+        status = [result.status.get(k, "done") for k in range(first, last)]
         reason = [result.failures.get(k, "") for k in range(first, last)]
         own = [column[first:last] for column in result.design.columns.values()]
         return [range(first, last), *own, *values, status, reason]

@@ -101,7 +101,7 @@ def sweep(
         raise ModelError(f"worlds = {worlds!r} must be a positive whole number")
     keep = tempfile.TemporaryDirectory(prefix="warpfea_sweep_") if out is None else None
     folder = make_folder(out or keep.name)  # type: ignore[union-attr]
-    record = Record(folder / "record.jsonl", _settings(study, points, sources), len(points), resume=resume)
+    record = Record(folder / "record.jsonl", _settings(study, points, sources), resume=resume)
     began, seconds = clock.perf_counter(), {"start": 0.0, "run": 0.0}
     try:
         if not record.done.all():
@@ -258,10 +258,10 @@ class _Driver:
                     running[self._submit(solve, task)] = task
                 for task, outcome in ended:  # while workers go on
                     self._keep(task, outcome)
-                    writer.writerows([r.index, r.seconds, r.worlds, r.alone, outcome.worker, outcome.seconds]
+                    writer.writerows([r.design, r.seconds, r.worlds, r.alone, outcome.worker, outcome.seconds]
                                      for r in outcome.rows)  # fmt: skip
                     file.flush()
-                bar.set_postfix_str(f"{self.record.failed} failed", refresh=False)
+                bar.set_postfix_str(f"{len(self.record.failures)} failed", refresh=False)
                 bar.update(int(self.record.done.sum()) - bar.n)
                 ended = []
                 for handle in self.engine.done(list(running)) if running else ():
@@ -305,15 +305,15 @@ class _Driver:
                 raise CheckpointError(f"{self.record.path}: worker {outcome.worker} takes {found}, others took {known}")
         for row in outcome.rows:
             if row.series:
-                target = make_folder(self.folder / "series") / f"{row.index:06d}.npz"
+                target = make_folder(self.folder / "series") / f"{row.design:06d}.npz"
                 write_atomically(target, _save(row.series))
         self.record.append(*lines, *map(_line, outcome.rows))
 
 
-def _save(series: dict[str, np.ndarray]) -> Callable[[pathlib.Path], None]:
+def _save(series: Mapping[str, np.ndarray]) -> Callable[[pathlib.Path], None]:
     return lambda path: np.savez(path, **series)  # type: ignore[arg-type]
 
 
 def _line(row: Row) -> dict[str, Any]:
     """Line of the record: nothing in it depends on batch or worker."""
-    return {"design": row.index, "status": row.status, "values": row.values, "reason": row.reason}
+    return {"design": row.design, "status": row.status, "values": row.values, "reason": row.reason}

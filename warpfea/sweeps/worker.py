@@ -7,9 +7,9 @@ import gc
 import os
 import socket
 import time as clock
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -55,22 +55,21 @@ class Study:
         return {"device": "cuda:0" if kind == "cuda" else kind, "dtype": self.run.get("dtype", "float64")}
 
 
-@dataclass(frozen=True)
-class Row:
+class Row(NamedTuple):
     """Result of one design: its measures, or the reason why it has none.
 
     Attributes:
-        index: of the design. status: "done", "failed" or "killed". values: by measure. reason: of a failure.
+        design: its index. status: "done", "failed" or "killed". values: by measure. reason: of a failure.
         series: (steps,) by name, and "time".
         seconds: of its batch over the number of worlds. worlds: of that batch.
         alone: "" unless it failed among others and was run again: then "failed" or "done".
     """
 
-    index: int
+    design: int
     status: str
-    values: dict[str, float] = field(default_factory=dict)
+    values: Mapping[str, float] = {}
     reason: str = ""
-    series: dict[str, np.ndarray] = field(default_factory=dict)
+    series: Mapping[str, np.ndarray] = {}
     seconds: float = 0.0
     worlds: int = 1
     alone: str = ""
@@ -191,7 +190,7 @@ class Group:
             rows.append(Row(index, "done", kept, "", curves, seconds, worlds))
         for world in np.flatnonzero(failed).tolist():
             (again,) = self.solve([designs[world]])
-            rows[world] = dataclasses.replace(again, alone=again.status)
+            rows[world] = again._replace(alone=again.status)
         return rows
 
     def simulate(

@@ -1,0 +1,34 @@
+"""tests/results/sweep_cpu.json and sweep_h200.json, made by tests/sweep_cost.py."""
+
+import pytest
+from result_files import RESULTS, content_of
+
+
+def rows(name):
+    """Rows of a file by part; skips where it is not there."""
+    if not (RESULTS / name).exists():
+        pytest.skip(f"{name} was not made yet")
+    return {row["part"]: row for row in content_of(name)["rows"]}
+
+
+def test_two_cores_do_nearly_twice_the_work():
+    row = rows("sweep_cpu.json")["efficiency"]
+    assert (row["designs"], row["workers"], row["failed"]) == (100, 2, 0)
+    assert 0.5 < row["design_s"] < 2.0
+    assert row["efficiency"] >= 0.9
+    assert row["overhead_s"] < 5e-3
+
+
+def test_the_driver_is_small():
+    """A hundred thousand designs: bytes of the driver for each, and a table that is right."""
+    row = rows("sweep_cpu.json")["many"]
+    assert (row["designs"], row["failed"]) == (100_000, 0)
+    assert row["bytes_per_design"] < 2000
+    assert row["error"] < 1e-12
+
+
+def test_a_sweep_is_as_fast_as_a_plain_batch():
+    row = rows("sweep_h200.json")["rate"]
+    assert (row["worlds"], row["failed"]) == (65536, 0)
+    assert row["ratio"] >= 0.95
+    assert row["same_bits"]
