@@ -9,6 +9,7 @@ import pytest
 
 import warpfea as wf
 from warpfea.contact.colliders import ColliderContact
+from warpfea.contact.facets import FacetContact
 from warpfea.studies.stress.cases.contact import momentum
 
 SIDE, SPEED, DT, G = 0.05, 1.0, 1e-3, 9.81
@@ -44,6 +45,27 @@ def floor_with_wall(top, bottom=-0.05):
     return [wf.HalfSpace((0, 0, 1), 0.0), wf.Box((0.2, 0.0, 0.5 * (top + bottom)), (0.4, 0.3, top - bottom))]
 
 
+def slabs(gap=0.0, rise=0.0, sides=((4, 3, 1), (4, 3, 1)), element="T10"):
+    """The boxes as meshes of elements, a little wider, so that no face of theirs ends where one of the block does."""
+    both = zip((-0.4, gap), (0.0, rise), sides)
+    return [wf.mesh.box((0.4, 0.31, 0.1), cells=n, origin=(x, -0.155, z - 0.1), element=element) for x, z, n in both]
+
+
+def one_slab(parts):
+    """One mesh of several."""
+    cells = np.concatenate([part.cells + k * len(parts[0].points) for k, part in enumerate(parts)])
+    return [wf.mesh.Mesh(np.concatenate([part.points for part in parts]), cells, parts[0].cell_type, name="slab")]
+
+
+def added(b, shape, name, path=None):
+    """A collider of a shape; a clamped body of a mesh."""
+    if not isinstance(shape, wf.mesh.Mesh):
+        return b.add_collider(shape, path=path, name=name)
+    body = b.add_solid(shape, material=wf.SVK(E=1e9, nu=0.3, density=1000.0), name=name)
+    b.clamp(body.nodes(lambda X: X[:, 0] > -1e9))
+    return body
+
+
 @dataclass
 class Slide:
     """End of a slide: velocity of the centre of mass, m/s, spin, rad/s, and positions of the lower front edge."""
@@ -53,20 +75,22 @@ class Slide:
     edge: np.ndarray
 
 
-def sliding(shapes, steps=100, *, E=1e8, paths=None, dtype="float64", integrator="backward_euler", **options):
-    """A block that slides along x."""
+def sliding(shapes, steps=100, *, E=1e8, paths=None, yaw=0.0, dtype="float64", integrator="backward_euler", **options):
+    """A block that slides along x over shapes, or meshes as clamped bodies."""
     b = wf.ModelBuilder()
-    mesh = wf.mesh.box((SIDE,) * 3, cells=(2, 1, 1), origin=(START, -0.5 * SIDE, 0.0))
+    c, s = np.cos(np.radians(yaw)), np.sin(np.radians(yaw))
+    turn, middle = np.array([(c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)]), (START + 0.5 * SIDE, 0.0, 0.0)
+    mesh = wf.mesh.box((SIDE,) * 3, cells=(2, 1, 1), origin=(START, -0.5 * SIDE, 0.0),
+                       map=lambda X: (X - middle) @ turn.T + middle)  # fmt: skip
     block = b.add_solid(mesh, material=wf.SVK(E=E, nu=0.3, density=1000.0), name="block")
     b.set_initial(block, velocity=(SPEED, 0.0, 0.0))
     for k, shape in enumerate(shapes):
-        floor = b.add_collider(shape, path=paths[k] if paths else None, name=f"floor {k}")
-        b.add_contact(block, floor, **options)
+        b.add_contact(block, added(b, shape, f"floor {k}", paths[k] if paths else None), **options)
     model = b.finalize(device="cpu", dtype=dtype)
     sim = wf.Simulation(
         model, dt=DT, integrator=integrator, solver=wf.NewtonPCG(tol=1e-10 if dtype == "float64" else 1e-6)
     )
-    X = block.reference[block.slot_kind == 0] + block.origin
+    X = (block.reference[block.slot_kind == 0] + block.origin - middle) @ turn + middle
     lower = (np.abs(X[:, 0] - START - SIDE) < 1e-9) & (np.abs(X[:, 2]) < 1e-9)
     edge = []
     for _ in range(steps):
@@ -96,7 +120,23 @@ SEAMS = {
     "sheet of two parts": (joined(meshes(0.002, closed=False)), {}),
     "low wall": (floor_with_wall(1e-6), {}),
 }
-FAST = ("flat", "mesh of two parts", "low wall")
+FINE = {"sides": ((16, 12, 1), (16, 12, 1)), "element": "ENMC"}
+"""Slabs of smaller facets than the block's: their points touch its facets."""
+SEAMS |= {
+    "bodies": (slabs(), {}),
+    "bodies, gap": (slabs(0.002), {}),
+    "bodies, overlap": (slabs(-0.01), {}),
+    "bodies, stiff": (slabs(0.002), {"E": 1e9, "integrator": "bdf2"}),
+    "bodies, alpha": (slabs(0.002), {"integrator": "generalized_alpha"}),
+    "bodies, askew": (slabs(0.002), {"yaw": -35.0}),
+    "bodies, segments": (slabs(0.002), {"clipping": True}),
+    "fine bodies": (slabs(**FINE), {}),
+    "fine bodies, gap": (slabs(0.002, **FINE), {}),
+    "a fine body behind": (slabs(0.002, sides=((8, 6, 1), (16, 12, 1)), element="ENMC"), {}),
+    "a fine body before": (slabs(0.002, sides=((16, 12, 1), (8, 6, 1)), element="ENMC"), {}),
+    "body of two parts": (one_slab(slabs(0.002)), {}),
+}
+FAST = ("flat", "mesh of two parts", "low wall", "bodies", "bodies, gap", "body of two parts")
 
 
 @pytest.mark.parametrize("name", [n if n in FAST else pytest.param(n, marks=pytest.mark.slow) for n in SEAMS])
@@ -112,6 +152,8 @@ def test_a_block_slides_over_a_seam(name):
 SMALL_STEPS = {
     "boxes up": boxes(rise=1e-5), "boxes down": boxes(rise=-1e-5), "mesh up": joined(meshes(rise=1e-5)),
     "mesh down": joined(meshes(rise=-1e-5)), "sheets up": meshes(rise=1e-5, closed=False),
+    "bodies up": slabs(rise=1e-5), "bodies down": slabs(rise=-1e-5), "fine bodies up": slabs(rise=1e-5, **FINE),
+    "fine bodies down": slabs(rise=-1e-5, **FINE), "body of two parts up": one_slab(slabs(1e-6, 1e-5)),
 }  # fmt: skip
 
 
@@ -123,12 +165,19 @@ def test_a_small_step_is_a_seam(name):
     assert np.abs(out.spin).max() < 1e-3
 
 
-@pytest.mark.parametrize("shapes", [boxes(rise=1e-3), pytest.param(joined(meshes(rise=1e-3)), marks=pytest.mark.slow)])
+REAL_STEPS = [boxes(rise=1e-3), slabs(rise=1e-3), joined(meshes(rise=1e-3)), slabs(rise=1e-3, **FINE)]
+
+
+@pytest.mark.parametrize(
+    "shapes", [s if k < 2 else pytest.param(s, marks=pytest.mark.slow) for k, s in enumerate(REAL_STEPS)]
+)
 def test_a_real_step_holds_the_front_edge(shapes):
     """The edge is behind the step, but for its penetration, until it is above it."""
-    x, _, z = np.moveaxis(sliding(shapes, 60, E=1e9).edge, 2, 0)
+    out = sliding(shapes, 60, E=1e9)
+    x, _, z = np.moveaxis(out.edge, 2, 0)
     assert z[(x > 1e-4)].min(initial=1.0) > 0.9e-3 or x.max() < 1e-4
     assert x.max() < 0.02  # without the step it is at 0.05
+    assert out.velocity @ out.velocity + out.spin @ out.spin * SIDE**2 / 6.0 < SPEED**2
 
 
 ROLLS = {
@@ -150,10 +199,10 @@ def rolling(shapes):
     body = b.add_solid(mesh, material=wf.SVK(E=1e7, nu=0.3, density=1000.0), name="ball")
     b.set_initial(body, velocity=(0.5, 0.0, 0.0), angular_velocity=(0.0, 0.5 / 0.03, 0.0))
     for k, shape in enumerate(shapes):
-        b.add_contact(body, b.add_collider(shape, name=f"floor {k}"), mu=0.5)
+        b.add_contact(body, added(b, shape, f"floor {k}"), mu=0.5)
     sim = wf.Simulation(b.finalize(device="cpu"), dt=DT)
     sim.step(80)
-    return sim.state.velocity.numpy()[0]
+    return sim.state.velocity.numpy()[0, body.slots]
 
 
 @pytest.mark.slow
@@ -163,11 +212,21 @@ def test_a_ball_rolls_over_seams_as_over_one_box():
         assert rolling(shapes) == pytest.approx(wanted, abs=1e-6), name
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("gap", [0.0, 0.002])
+def test_a_ball_rolls_over_seams_as_over_one_body(gap):
+    wanted = rolling([wf.mesh.box((0.8, 0.31, 0.1), cells=(8, 3, 1), origin=(-0.4, -0.155, -0.1), element="T10")])
+    found = rolling(slabs(gap))
+    assert found == pytest.approx(wanted, abs=5e-6)  # the tolerance of friction
+    assert found.mean(axis=0) == pytest.approx(wanted.mean(axis=0), abs=1e-6)
+
+
 def test_seam_divides_a_seam_from_a_step():
     """By default a thousandth of the width of the surface, 5e-5 m."""
-    for rise, seam, passes in ((1e-4, None, False), (1e-4, 1.1e-4, True), (1e-5, 0.0, False)):
-        speed = sliding(boxes(rise=rise), 40, seam=seam, stiffness="region").velocity[0]
-        assert (abs(speed - SPEED) < 1e-4) == passes, (rise, seam)
+    for make in (boxes, slabs):
+        for rise, seam, passes in ((1e-4, None, False), (1e-4, 1.1e-4, True), (1e-5, 0.0, False)):
+            speed = sliding(make(rise=rise), 40, seam=seam, stiffness="region").velocity[0]
+            assert (abs(speed - SPEED) < 1e-4) == passes, (make, rise, seam)
 
 
 def floor_model(shapes, paths=(None, None), **options):
@@ -191,14 +250,22 @@ def test_colliders_without_seams_cost_nothing():
         assert term.tables.shapes.neighbor is None or not term.tables.shapes.neighbor.size
 
 
+def test_bodies_without_seams_cost_nothing():
+    """One, or two apart: no tables, and the kernels of models without seams."""
+    for shapes, seams in ((slabs(), True), (slabs()[:1], False), (slabs(0.3), False)):
+        b = wf.ModelBuilder()
+        block = b.add_solid(wf.mesh.box((SIDE,) * 3, cells=(1, 1, 1)), material=wf.SVK(E=1e6, nu=0.3, density=1e3))
+        for k, shape in enumerate(shapes):
+            b.add_contact(block, added(b, shape, f"floor {k}"))
+        term = b.finalize(device="cpu").terms.find(FacetContact)
+        assert bool(term.tables.seams) == seams
+        assert len(term.tables.surfaces) == len(shapes)
+        assert term.search_kernels.module.name.endswith("_seams") == seams
+
+
 def test_bad_seams_are_refused():
     with pytest.raises(wf.ModelError, match=r"seam = -0\.1 must be a length of 0 or above, m"):
         floor_model(boxes(), seam=-0.1)
-    b = wf.ModelBuilder()
-    mesh, law = wf.mesh.box((SIDE,) * 3, cells=(1, 1, 1)), wf.SVK(E=1e6, nu=0.3, density=1e3)
-    one, two = (b.add_solid(mesh, material=law) for _ in range(2))
-    with pytest.raises(NotImplementedError, match="seam = between bodies is not part of this version"):
-        b.add_contact(one, two, seam=1e-3)
 
 
 def knife():

@@ -118,6 +118,38 @@ def broad_phase_kernels(dtype: str) -> KernelSet:
                 )
         return x
 
+    @wp.func
+    def closest_facet(
+        mas: Masters, pair: PairScratch, world: int, surface: int, x: vec3d, far: f64, tolerance: f64, way: vec3d,
+        least: f64, most: f64,
+    ) -> wp.vec4d:  # fmt: skip
+        """Coordinates of x on the closest facet of a surface, and that facet; -1: none within `far`, m, and `tolerance`
+        beside it, of those whose normal has a product between `least` and `most` with `way`."""
+        out = wp.vec4d(f64(0.0), f64(0.0), f64(0.0), f64(-1.0))
+        height = far
+        off = tolerance
+        pad = vec3d(far, far, far)
+        root = wp.bvh_get_group_root(mas.tree, world * mas.surface_count + surface)
+        query = wp.bvh_query_aabb(mas.tree, round_down(x - pad), round_up(x + pad), root)
+        index = wp.int32(0)
+        while wp.bvh_query_next(query, index):
+            item = index - world * mas.facet_count
+            corners = mas.corner_count[mas.facet_kind[item]]
+            found = f.inverse_map(mas, pair.displacement, world, item, x, f.facet_centre(corners))
+            xi = vec3d(found[0], found[1], found[2])
+            o = f.distance_outside(corners, xi)
+            if found[3] != f64(0.0) and o <= off:
+                s = f.surface_point(mas, pair.displacement, world, item, xi)
+                n = f.unit_normal(s)
+                gap = xi[2] * wp.dot(n, s.director)
+                turned = wp.dot(n, way) < least or wp.dot(n, way) > most
+                closer = wp.abs(gap) < height or (wp.abs(gap) == height and f64(item) < out[3])
+                if gap >= -mas.depth_limit[item] and (o < off or closer) and wp.abs(gap) <= far and not turned:
+                    out = wp.vec4d(xi[0], xi[1], xi[2], f64(item))
+                    height = wp.abs(gap)
+                    off = o
+        return out
+
     @masked_kernel(module, "active")
     def check_boxes(mas: Masters, active: wp.array(dtype=wp.int32), pair: PairScratch):
         """Request a refit if a facet, at the start of the attempt or now, left its box; compute the enlarged boxes."""

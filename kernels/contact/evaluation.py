@@ -10,7 +10,7 @@ from .collider_kinematics import collider_kinematics
 from .collider_seams import SEAMS_SUFFIX
 from .colliders import MESH_SUFFIX
 from .facet_search import facet_search_kernels
-from .facet_structs import facet_side_struct, master_struct, pair_scratch_struct
+from .facet_structs import facet_side_struct
 from .friction import friction_functions
 from .kinematics import kinematics_functions
 from .law import OwnLaws, law_names
@@ -112,37 +112,10 @@ def pair_evaluation_kernels(dtype: str, own: OwnLaws = ()) -> KernelSet:
     """Kernels for contact between bodies; arguments as of `contact_kernels`."""
     Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)
     PairResults, Other = pair_results_struct(), facet_side_struct(dtype)
-    Masters, PairScratch = master_struct(dtype), pair_scratch_struct(dtype)
     k, law, search = kinematics_functions(dtype), friction_functions(dtype, own), facet_search_kernels(dtype)
-    f_, round_down, round_up = facet_projection_functions(dtype), search.round_down, search.round_up
-    surface_point, inverse_map, distance_outside = f_.surface_point, f_.inverse_map, f_.distance_outside
+    f_ = facet_projection_functions(dtype)
+    surface_point, inverse_map = f_.surface_point, f_.inverse_map
     module = kernel_module("_".join(["pair_evaluation", dtype, *law_names(own)]), max_unroll=SHORT_UNROLL)
-
-    @wp.func
-    def closest_facet(mas: Masters, pair: PairScratch, world: int, surface: int, x: vec3d, far: f64) -> wp.vec4d:
-        """Coordinates of x on the closest facet of a surface, and that facet; -1: none within `far`."""
-        out = wp.vec4d(f64(0.0), f64(0.0), f64(0.0), f64(-1.0))
-        height = far
-        off = f64(OUTSIDE_TOLERANCE)
-        pad = vec3d(far, far, far)
-        root = wp.bvh_get_group_root(mas.tree, world * mas.surface_count + surface)
-        query = wp.bvh_query_aabb(mas.tree, round_down(x - pad), round_up(x + pad), root)
-        index = wp.int32(0)
-        while wp.bvh_query_next(query, index):
-            f = index - world * mas.facet_count
-            corners = mas.corner_count[mas.facet_kind[f]]
-            found = inverse_map(mas, pair.displacement, world, f, x, f_.facet_centre(corners))
-            xi = vec3d(found[0], found[1], found[2])
-            o = distance_outside(corners, xi)
-            if found[3] != f64(0.0) and o <= off:
-                s = surface_point(mas, pair.displacement, world, f, xi)
-                gap = xi[2] * wp.dot(f_.unit_normal(s), s.director)
-                closer = wp.abs(gap) < height or (wp.abs(gap) == height and f64(f) < out[3])
-                if gap >= -mas.depth_limit[f] and (o < off or closer) and wp.abs(gap) <= far:
-                    out = wp.vec4d(xi[0], xi[1], xi[2], f64(f))
-                    height = wp.abs(gap)
-                    off = o
-        return out
 
     @wp.kernel(module=module)
     def evaluate_pairs(
@@ -172,7 +145,8 @@ def pair_evaluation_kernels(dtype: str, own: OwnLaws = ()) -> KernelSet:
         if at_edge:
             f = other.scratch.facet[world, point]
         elif f < 0:
-            found = closest_facet(other.masters, other.scratch, world, other.masters.surface_of[c], x, far)
+            found = search.closest_facet(other.masters, other.scratch, world, other.masters.surface_of[c], x, far,
+                                         f64(OUTSIDE_TOLERANCE), vec3d(), f64(-1.0), f64(1.0))  # fmt: skip
             f = wp.int32(found[3])
         if f < 0:
             return

@@ -11,7 +11,9 @@ import warp as wp
 from ..common.modules import SHORT_UNROLL, KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.types import f64, precision, vec3d
 from .broad_phase import BOX_MARGIN, broad_phase_kernels
+from .collider_seams import SEAMS_SUFFIX
 from .facet_candidates import facet_candidate_functions
+from .facet_seams import facet_seam_functions
 from .facet_structs import master_struct, pair_history_struct, pair_scratch_struct
 from .kinematics import kinematics_functions
 from .law import MIN_APPROACH_SPEED
@@ -28,8 +30,8 @@ near the `OUTSIDE_TOLERANCE` of one facet may end on neither."""
 
 
 @functools.cache
-def facet_search_kernels(dtype: str) -> KernelSet:
-    """Kernels in one precision of the displacements."""
+def facet_search_kernels(dtype: str, seams: bool = False) -> KernelSet:
+    """Kernels in one precision of the displacements; `seams`: some contact has neighbours, see facet_seams.py."""
     p = precision(dtype)
     vec3 = p.vec3
     Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)
@@ -39,7 +41,9 @@ def facet_search_kernels(dtype: str) -> KernelSet:
     distance_outside, inverse_map, project_on_facet = f.distance_outside, f.inverse_map, f.project_on_facet
     FacetPoint, boxes, candidates = f.FacetPoint, broad_phase_kernels(dtype), facet_candidate_functions(dtype)
     SlavePoint, slave_point, slave_point_at = candidates.SlavePoint, candidates.slave_point, candidates.slave_point_at
-    module = kernel_module(f"facet_search_{dtype}", max_unroll=SHORT_UNROLL)
+    module = kernel_module(f"facet_search_{dtype}{SEAMS_SUFFIX * seams}", max_unroll=SHORT_UNROLL)
+    if seams:
+        level_candidate = facet_seam_functions(dtype).level_candidate
 
     @wp.func
     def set_anchor(
@@ -240,6 +244,9 @@ def facet_search_kernels(dtype: str) -> KernelSet:
         candidate = candidates.anchor_candidate(mas, pair, slave)
         if candidate.facet < 0 or leaving:
             candidate = candidates.search_facets(mas, facets, scr, pair, slave, candidate)
+            if wp.static(seams):
+                if candidate.facet >= 0 and not slave.anchored and overlap_limit == f64(0.0):
+                    candidate = level_candidate(mas, pair, slave, candidate)
         if candidate.facet >= 0 and leaving and slave.anchored:
             move_anchor(mas, facets, his, clock, scr, pair, v_n, slave, candidate.facet, candidate.xi)
         if candidate.facet >= 0:

@@ -63,6 +63,11 @@ def master_struct(dtype: str):
         half_angle: wp.array2d(dtype=wp.float64)  # [side, facet] between the normals at a sharp edge, 0: none, rad
         first_entry: wp.int32  # first entry in the pool of terms
         facet_count: wp.int32
+        # rows of seams: twice the contact, + 1 for the side of the points; see facet_seams.py
+        neighbor_start: wp.array(dtype=wp.int32)  # [row] first neighbour
+        neighbor: wp.array(dtype=wp.int32)  # surfaces
+        seam_surface: wp.array(dtype=wp.int32)  # [row] surface of the side itself
+        seam_lengths: wp.array(dtype=wp.vec3d)  # [row] `seam`, reach and depth, m
 
     return Masters
 

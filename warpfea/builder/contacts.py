@@ -173,8 +173,6 @@ def make_pair(
             f"{what}: law = {options['law']!r} acts at any distance, and is for contact with colliders; take 'default' "
             "or 'paper'"
         )
-    if options["seam"] is not None:
-        raise NotImplementedError(f"{what}: seam = between bodies is not part of this version; leave it out")
     slave, master, width = slave_and_master(a, b)
     points, options["points"] = options["points"], None
     o = _checked_options(what, slave, dict(options))

@@ -23,6 +23,7 @@ from ..model.pairs import (
     master_facets,
     monomial_exponents,
 )
+from .seams import facet_seam_tables
 from .tables import TOUCHING_DEPTH_RATIO, WORLD_PARAMETERS, FacetTables, clamped_slots
 
 if TYPE_CHECKING:
@@ -46,7 +47,8 @@ class PairTables(FacetTables[FacetOptions]):
     surfaces, or on the obstacles.
 
     Attributes:
-        surfaces, masters: distinct master surfaces and their facets; master_of: master surface of each contact.
+        surfaces, masters: distinct master surfaces, and those of seams, and their facets; master_of: master surface of
+            each contact. seams: neighbours of the contacts, empty if there are none.
         facets: number of master facets. bodies: bodies in a pair.
         collider_laws: all colliders with the numbers of their time laws, if poses follow from these alone.
         max_gap: largest reported gap, m. max_overlap_depth: search depth of initial overlaps, m.
@@ -55,13 +57,8 @@ class PairTables(FacetTables[FacetOptions]):
     def __init__(self, model: Model) -> None:
         super().__init__(model, model.description.contacts_of(FacetOptions))
         self.surfaces: list[SurfaceSet] = []
-        self.master_of: list[int] = []
-        for contact in self.contacts:
-            same = [k for k, other in enumerate(self.surfaces) if other.body is contact.facets.body
-                    and np.array_equal(other.faces, contact.facets.faces)]  # fmt: skip
-            if not same:
-                self.surfaces.append(contact.facets)
-            self.master_of.append(same[0] if same else len(self.surfaces) - 1)
+        self.master_of = [self._number(contact.facets) for contact in self.contacts]
+        self.seams = facet_seam_tables(self.contacts, self._number)
         self.masters: list[MasterFacets] = [master_facets(surface) for surface in self.surfaces]
         self._check_clamped()
         self.area_fractions = [f * p.area / area for f, p, area in zip(self.factors, self.host, self.region_areas)]
@@ -72,6 +69,14 @@ class PairTables(FacetTables[FacetOptions]):
         self.facets = sum(len(m.conn) for m in self.masters)
         self.bodies = sorted({surface.body.index for c in self.contacts for surface in c.surfaces})
         self.edge_data: list[Any] = []
+
+    def _number(self, surface: SurfaceSet) -> int:
+        """Number of a surface among those with facets."""
+        for k, other in enumerate(self.surfaces):
+            if other.body is surface.body and np.array_equal(other.faces, surface.faces):
+                return k
+        self.surfaces.append(surface)
+        return len(self.surfaces) - 1
 
     def _add_edges(self, k: int, edges: Edges) -> None:
         """Add the rows of a contact's edges: the area of each is that with the stiffness of both elements' depths."""
@@ -241,7 +246,7 @@ class PairTables(FacetTables[FacetOptions]):
                 "touch_depth": TOUCHING_DEPTH_RATIO * self.size,
                 "first_entry": self.pool,
                 "facet_count": self.facets,
-            }
+            } | self.seams
             m.cache["pair masters"] = master_struct(m.dtype)()
             m.memory.fill(m.cache["pair masters"], "contact", **tables)
         out = master_struct(m.dtype)()

@@ -58,7 +58,7 @@ class FacetContact(ContactTerm, Tied, Coupled):
         super().__init__(model, PairTables(model), "facets")
         if model.dtype == "float64":  # else their types differ
             self.shared_arrays = {"point_product": "tangential_force", "energy": "facet_rotation"}
-        self.search_kernels = facet_search_kernels(model.dtype)
+        self.search_kernels = facet_search_kernels(model.dtype, bool(self.tables.seams))
         self.master_kernels = master_kernels(model.dtype)
         self.point_list_kernels = point_list_kernels(model.dtype)
         self.midpoint_kernels = pair_midpoint_kernels(model.dtype)
@@ -140,7 +140,7 @@ class FacetContact(ContactTerm, Tied, Coupled):
         return out
 
     def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
-        own = [self.search_kernels, self.master_kernels, self.point_list_kernels]
+        own = [self.search_kernels, self.search_kernels.boxes, self.master_kernels, self.point_list_kernels]
         own += [self.midpoint_kernels] if ctx.midpoint else []
         own += [edge_record_kernels()] if self._edge_columns is not None else []
         own += [self.edge_kernels] if self.tables.edge_groups else []

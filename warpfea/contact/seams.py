@@ -1,19 +1,25 @@
-"""Neighbours of colliders at whose seams side faces are hidden, see kernels/contact/collider_seams.py."""
+"""Neighbours of colliders and bodies at whose seams side faces are hidden, see kernels/contact/collider_seams.py and
+facet_seams.py."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import permutations
 from typing import Any
 
 import numpy as np
+import scipy.sparse as sp
 
 from ..kernels.contact.collider_shapes import BOX, CYLINDER, HALF_SPACE, MESH
+from ..model.assembly import connected_components
 from ..model.contacts import Collider, Contact
+from ..model.handles import SurfaceSet
+from ..model.pairs import FacetOptions, pair_points
 from ..model.shapes import HalfSpace, Shape
 from ..model.triangle_mesh import TriMesh
 
-__all__ = ["SEAM_RATIO", "SeamTables", "seam_tables"]
+__all__ = ["SEAM_RATIO", "SeamTables", "facet_seam_tables", "seam_tables"]
 
 SEAM_RATIO = 1e-3
 """Default `seam` over the width of a surface: the second largest edge of its bounding box."""
@@ -97,5 +103,79 @@ def _are_near(a: Shape, b: Shape, reach: float) -> bool:
     for plane, other in ((a, b), (b, a)):
         if isinstance(plane, HalfSpace):
             return bool((other.mesh()[0] @ plane.normal).min() <= plane.offset + reach)
-    p, q = a.mesh()[0], b.mesh()[0]
+    return _boxes_are_near(a.mesh()[0], b.mesh()[0], reach)
+
+
+def _boxes_are_near(p: np.ndarray, q: np.ndarray, reach: float) -> bool:
+    """True if the bounding boxes of two sets of points are within `reach`, m."""
     return bool(np.all(p.min(axis=0) <= q.max(axis=0) + reach) and np.all(q.min(axis=0) <= p.max(axis=0) + reach))
+
+
+def facet_seam_tables(contacts: Sequence[FacetOptions], number: Callable[[SurfaceSet], int]) -> dict[str, np.ndarray]:
+    """Neighbours of both sides of contacts between bodies, as fields of `master_struct`; empty if none has any.
+
+    Neighbours of a side are surfaces near it that the body of the other side touches, too, and the parts of its own.
+
+    Args:
+        number: number of a surface, which then has facets.
+    """
+    touched: dict[int, dict[Any, SurfaceSet]] = {}
+    for contact in contacts:
+        for mine, other in permutations(contact.surfaces, 2):
+            touched.setdefault(mine.body.index, {})[_key(other)] = other
+    points: dict[Any, np.ndarray] = {}
+
+    def box(surface: SurfaceSet) -> np.ndarray:
+        """Lower and upper corner."""
+        key = _key(surface)
+        if key not in points:
+            X = pair_points(surface).X.reshape(-1, 3)
+            points[key] = np.stack([X.min(axis=0), X.max(axis=0)])
+        return points[key]
+
+    rows: list[list[SurfaceSet]] = []
+    lengths = np.zeros((2 * len(contacts), 3))
+    for contact in contacts:
+        for side, other in ((contact.surfaces[k], contact.surfaces[-1 - k]) for k in (-1, 0)):
+            near: list[SurfaceSet] = []
+            if not contact.grounded:
+                near = [s for key, s in touched[other.body.index].items() if key != _key(side) or _has_parts(s)]
+            if near:
+                width = float(np.sort(np.ptp(box(other), axis=0))[1])
+                lengths[len(rows)] = width * np.array((SEAM_RATIO, REACH_RATIO, DEPTH_RATIO))
+                near = [s for s in near if _boxes_are_near(box(s), box(side), REACH_RATIO * width)]
+            if contact.seam is not None:
+                lengths[len(rows), 0] = contact.seam
+            rows.append(near if all(_corners(s) == 1 for s in (side, *near)) else [])
+    if not any(rows):
+        return {}
+    sides = [contact.surfaces[k] for contact in contacts for k in (-1, 0)]
+    return {
+        "neighbor_start": np.cumsum([0, *map(len, rows)]),
+        "neighbor": np.array([number(surface) for row in rows for surface in row]),
+        "seam_surface": np.array([number(side) if row else -1 for side, row in zip(sides, rows)]),
+        "seam_lengths": lengths,
+    }
+
+
+def _key(surface: SurfaceSet) -> tuple[int, bytes]:
+    """Key of the faces of a surface."""
+    return surface.body.index, surface.faces.tobytes()
+
+
+def _corners(surface: SurfaceSet) -> int:
+    """Number of kinds of faces, by their corners."""
+    return len({len(surface.body.family.faces[int(face)]) for face in np.unique(surface.faces[:, 1])})
+
+
+def _has_parts(surface: SurfaceSet) -> bool:
+    """True for a surface of a body of several parts that are not connected."""
+    body = surface.body
+    for elements in (surface.faces[:, 0], np.arange(len(body.connectivity))):
+        conn = len(elements) + body.connectivity[elements]
+        row = np.repeat(np.arange(len(conn)), conn.shape[1])
+        size = len(elements) + len(body.reference)
+        graph = sp.coo_matrix((np.ones(len(row)), (row, conn.ravel())), shape=(size, size))
+        if not connected_components(graph)[: len(elements)].any():
+            return False
+    return True

@@ -78,7 +78,7 @@ class ContactOptions:
         smoothing: None; with the paper's law a depth, m; with the smooth law (eps in N, v_eps in m/s).
         overlap: "auto", "refuse" or "offset".
         overlap_time: time in which a stored overlap decays, s.
-        seam: largest difference of level of two colliders that is a seam, m, or None.
+        seam: largest difference of level of two colliders or bodies that is a seam, m, or None.
         index: number in its builder, of contacts of its class.
         edges: contact of the edges of the touched side (`EdgeContact`), or None.
         sign: 1, or -1 where its points belong to the second of `sides`, as reports state the force on the first.
