@@ -318,6 +318,13 @@ def test_foreign_records_are_refused(swept, change, message):
         wf.sweep(FALL, **given)
 
 
+def test_a_refused_sweep_leaves_no_record(tmp_path):
+    how = {"run": {"device": "cpu"}, "engine": Inline(), "out": tmp_path}
+    with pytest.raises(wf.ModelError, match=r"measures.z: probe 'q' is unknown"):
+        wf.sweep(FALL, DESIGN, measures={"z": "probe.q.displacement.z"}, **how)
+    assert len(wf.sweep(FALL, DESIGN, measures={"z": "probe.p.displacement.z"}, **how)) == 8
+
+
 def test_two_drivers_of_one_record(swept):
     fcntl = pytest.importorskip("fcntl")
     folder, how = swept

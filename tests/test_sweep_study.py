@@ -262,3 +262,20 @@ def test_the_page_of_sweeps_runs(tmp_path):
     assert took[1] < 60.0  # kernels are compiled
     first, second = ((tmp_path / name / "table.csv").read_bytes() for name in ("first", "second"))
     assert first == second
+
+
+@pytest.mark.slow
+def test_ctrl_c_leaves_a_record_that_goes_on(tmp_path):
+    """The terminal interrupts driver and workers together: exit code 130, one line, no traceback."""
+    (tmp_path / "study.toml").write_text(KILLED.replace("count = 200", "count = 24"))
+    words = [sys.executable, "-m", "warpfea", "sweep", str(tmp_path / "study.toml"), "--resume", "--workers", "2"]
+    env, folder = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}, tmp_path / "sweep"
+    how = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "env": env, "start_new_session": True}
+    driver = subprocess.Popen(words, **how)
+    wait_for_records(folder, 5, driver)
+    os.killpg(driver.pid, signal.SIGINT)
+    shown, told = driver.communicate(timeout=60)
+    assert (driver.returncode, shown) == (130, "")
+    assert "interrupted" in told.splitlines()[-1]
+    assert "Traceback" not in told
+    assert len(run_study(tmp_path / "study.toml", resume=True, workers=1).failures) == 0

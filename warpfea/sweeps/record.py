@@ -43,7 +43,7 @@ class Record:
         self.done, self.values = np.zeros(count, dtype=bool), np.full((len(self.measures), count), np.nan)
         self.failures, self.retries = dict[int, tuple[str, str]](), 0
         self.deaths, self.plans = dict[int, int](), dict[str, dict[str, Any]]()
-        if path.exists() and not resume:
+        if path.exists() and not resume and path.read_bytes().count(b"\n") > 1:
             raise CheckpointError(f"{path}: is there; go on with it (resume=True, --resume) or take another folder")
         try:
             self._file = open(path, "a+b")  # noqa: SIM115
@@ -51,6 +51,8 @@ class Record:
             raise CheckpointError(f"{path}: can't be opened ({error})") from error
         try:
             self._lock()
+            if not resume:  # settings without a row, of a sweep that was refused
+                self._file.truncate(0)
             size = self._read(json.loads(json.dumps(settings)))
             self._file.truncate(size)
             if size == 0:

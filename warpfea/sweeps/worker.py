@@ -121,6 +121,8 @@ def solve(study: Study, arguments: dict[str, Any], designs: Sequence[tuple[int, 
         designs: index and values per world of each.
     """
     began = clock.perf_counter()
+    if study.place["device"] != "cpu":
+        gc.collect()  # memory of the task before
     rows, plan, device = _rows(study, arguments, list(designs))
     worker = f"{socket.gethostname()}:{os.getpid()}"
     return Outcome(rows, plan, device, worker, clock.perf_counter() - began)
