@@ -18,9 +18,7 @@ FILES = {"stress_cpu.json": "cpu", "stress_h200.json": "cuda:0", "first_scenes_c
 OWN_FILES = {"first-scenes": "first_scenes_cpu.json"}
 """Cases whose rows, of minutes each, are in files of their own."""
 STOPPED = {"rest-1e6", "first-scenes/ball-shell-5mm-drop-0.5-2e+11-0.001-energy_momentum",
-           "first-scenes/cube-plate-slide-0.5-1e+08-0.001-energy_momentum",
-           "first-scenes/ball-second-drop-0.1-10000-0.001-energy_momentum",
-           "first-scenes/shell-second-drop-0.1-1e+08-0.001-bdf2"}  # fmt: skip
+           "first-scenes/ball-second-drop-0.1-10000-0.001-energy_momentum"}  # fmt: skip
 """Rows and cases that were stopped; those of first scenes after 470 s."""
 SPEED = {"hard_steps_h200.json": ("--peer", 1.05, 13), "hard_steps_cpu.json": ("--cpu", 1.10, 12)}
 BEAMS = (("beam-30", 372), ("beam-300", 3612), ("beam-1000", 12012))
