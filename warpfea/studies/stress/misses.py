@@ -17,6 +17,11 @@ KNOWN_MISSES: dict[tuple[str, str, str], str] = {
         "float64",
         "",
     ): "12 to 16 Newton iterations a step: it rolls from facet to facet, and impacts are taken again",
+    (
+        "first-scenes/ball-second-drop-0.1-10000-0.001-energy_momentum",
+        "float64",
+        "",
+    ): "a ball on a ball is unstable: it rolls off (its offset grows as exp(6.4 t)) and falls",
     ("first-scenes/bar-shell-1mm-drop-0.1-10000-0.01-energy_momentum", "float64", ""): f"3e-5 {_RINGING_REASON}",
     ("first-scenes/shell-floor-drop-0.1-1e+06-0.001-energy_momentum", "float64", ""): f"2e-6 {_RINGING_REASON}",
     ("soft-thin-limbs", "float64", ""): "found, in 642 iterations on the CPU and 166 on a GPU, in place of 80",
