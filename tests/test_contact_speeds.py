@@ -36,7 +36,7 @@ def impact(E, v, h, other, steps=8, dtype="float64"):
     try:
         for _ in range(steps):
             halvings += int(sim.step().halvings[0])
-    except wf.StepError as error:
+    except wf.ConvergenceError as error:
         outcome = f"{type(error).__name__}: {error}"
     error = np.abs(mass @ sim.state.velocity.numpy()[0] - began)
     impulse = 0.0 if sim.steps == 0 else h * sim.contact_record(pad).force[0, :, 2].sum()
