@@ -30,6 +30,21 @@ def plate(b, kind, size, thickness=0.02, material=MAT):
         ("shell", 0.125, 0.02, 0.05),
         pytest.param("H3843", 0.5, 0.02, 0.12, marks=pytest.mark.slow),
         pytest.param("H3843", 0.25, 0.05, 0.08, marks=pytest.mark.slow),
+        *(
+            pytest.param(*row, marks=pytest.mark.slow)
+            for row in (
+                ("T10", 0.5, 0.02, 0.5),
+                ("T10", 0.5, 0.05, 0.52),
+                ("T10", 0.25, 0.05, 0.18),
+                ("H3843", 0.5, 0.05, 0.1),
+                ("H3843", 0.25, 0.02, 0.06),
+                ("shell", 0.5, 0.02, 0.5),
+                ("shell", 0.5, 0.05, 0.53),
+                ("shell", 0.25, 0.02, 0.12),
+                ("H3843", 0.125, 0.019, 0.04),
+                ("shell", 0.125, 0.019, 0.05),
+            )
+        ),
     ],
 )
 def test_a_plate_rests_on_rails_narrower_than_its_facets(kind, size, rail, error):
@@ -78,8 +93,12 @@ def bars(b, kind, count, material, v):
     [
         ("T10", 0.005),
         ("beam", 0.005),
-        pytest.param("T10", 0.02, marks=pytest.mark.slow),
-        pytest.param("shell", 0.005, marks=pytest.mark.slow),
+        *(
+            pytest.param(kind, radius, marks=pytest.mark.slow)
+            for radius in (0.005, 0.01, 0.02)
+            for kind in ("T10", "shell", "beam")
+            if radius > 0.005 or kind == "shell"
+        ),
     ],
 )
 def test_bars_do_not_pass_a_peg(kind, radius):
@@ -121,6 +140,17 @@ def test_the_sides_of_a_rail_under_the_end_of_a_plate_do_not_press_on_it():
         ("shell", 0.2, wf.Capsule((0.03, -0.2, -0.005), (0.03, 0.2, -0.005), 0.004)),
         ("T10", 0.4, wf.Sphere((0.07, 0.03, -0.011), 0.01)),
         ("shell", 0.1, wf.Sphere((0.07, 0.03, -0.051), 0.05)),
+        *(
+            pytest.param(kind, size, wf.Sphere((0.07, 0.03, -radius - 1e-3), radius), marks=pytest.mark.slow)
+            for kind, size, radius in (
+                ("T10", 0.4, 0.05),
+                ("T10", 0.1, 0.01),
+                ("T10", 0.1, 0.05),
+                ("shell", 0.4, 0.01),
+                ("shell", 0.4, 0.05),
+                ("shell", 0.1, 0.01),
+            )
+        ),
     ],
 )
 def test_a_plate_does_not_pass_a_capsule_or_a_ball(kind, size, obstacle):

@@ -258,6 +258,24 @@ def test_all_pairs_hold():
     assert sim.positions(bodies[1])[0, :, 2].min() > -0.005
 
 
+def test_pairs_whose_boxes_are_apart_cost_no_launch_and_list_no_point():
+    """Two cubes that touch, and a third one far away: named as the one pair, and all three."""
+    found = []
+    for every in (False, True):
+        b, low, top = crossing_cubes(gap=1e-4)
+        flying(b, ((0.1,) * 3, (0, 0, 5.0), (1, 1, 1)), (0, 0, 0), "far")
+        added = b.add_contact_all() if every else [b.add_contact(low, top)]
+        sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-3)
+        before = sim.stepper.launch.launches
+        pcg = sim.step(5).pcg[0]
+        listed = np.count_nonzero(sim.state.numpy()["pairs_facet"])
+        found.append((sim.stepper.launch.launches - before, pcg, listed, sim.positions(top)[0]))
+    assert len(added) == 3
+    assert found[0][:3] == found[1][:3]
+    assert found[0][2] > 0
+    np.testing.assert_allclose(found[0][3], found[1][3], rtol=0, atol=1e-11)
+
+
 # bodies that nobody named
 
 

@@ -1,4 +1,4 @@
-"""Soft bodies with the default options of contact: depths beside Hertz' approach, cylinders beside their closed form."""
+"""Soft bodies by default: depths beside Hertz' approach, cylinders beside their closed form."""
 
 import math
 
@@ -122,11 +122,9 @@ def slice_of_a_cylinder(inner, outer, R, flip):
     return wf.mesh.box((n, 1, n), cells=(n, 1, n), origin=(0, 0, -n), map=place, element="T10")
 
 
-@pytest.mark.parametrize(
-    ("inner", "outer"), [((4, 5), (5, 6)), pytest.param((8, 11), (7, 9), marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("inner", "outer"), [((4, 5), (5, 6)), pytest.param((8, 11), (7, 9), marks=pytest.mark.slow)])
 def test_cylinders_pressed_together_are_hertz(inner, outer):
-    """Half width 4.514 mm and peak pressure 56.42 kPa, to 3 %; with `SVK`, which is softer in compression, 2.3, 3.1 %."""
+    """Half width 4.514 mm and peak pressure 56.42 kPa, to 3 %; `SVK`, softer in compression, gives 2.3, 3.1 %."""
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     bodies = []
     for k, name in enumerate(("lower", "upper")):
