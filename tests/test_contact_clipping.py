@@ -129,7 +129,7 @@ def test_a_block_with_its_centre_over_the_table_stands(d, on):
     ("d", "error"), [pytest.param(0.004, 0.22, marks=pytest.mark.slow), (0.013, 0.06), (0.03, 0.06)]
 )
 def test_a_block_with_its_centre_beyond_the_edge_tips(d, error, on):
-    """theta'' = m g (d + theta h)/I about the edge; the table's own edge yields a little: by 0.8 mm of lever. 40 degrees
+    """theta'' = m g (d + theta h)/I about the edge; the table's own edge yields by 0.8 mm of lever. 40 degrees
     without clipping at 4 mm, where 5 are right."""
     angle = tilted(d, on, time=0.16, clipping=True)[1]
     h, inertia = 0.1, 5.0 / 12.0 * 0.2**2
