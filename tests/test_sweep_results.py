@@ -1,13 +1,10 @@
 """tests/results/sweep_cpu.json and sweep_h200.json, made by tests/sweep_cost.py."""
 
-import pytest
-from result_files import RESULTS, content_of
+from result_files import content_of
 
 
 def rows(name):
-    """Rows of a file by part; skips where it is not there."""
-    if not (RESULTS / name).exists():
-        pytest.skip(f"{name} was not made yet")
+    """Rows of a file by part."""
     return {row["part"]: row for row in content_of(name)["rows"]}
 
 
