@@ -83,6 +83,7 @@ def facet_seam_functions(dtype: str) -> KernelSet:
             far = mas.seam_lengths[row][0] + mas.seam_lengths[row][2]
             at = closest_facet(mas, pair, world, mas.surface_of[slave.contact], slave.position, far,
                                f64(OUTSIDE_TOLERANCE), way, f64(OPPOSING_COSINE), f64(1.1))  # fmt: skip
+            out.passed_through = False
             out.facet = wp.int32(at[3])
             out.xi = vec3d(at[0], at[1], at[2])
         return out

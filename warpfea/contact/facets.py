@@ -56,7 +56,7 @@ class FacetContact(ContactTerm, Tied, Coupled):
 
     def __init__(self, model: Model) -> None:
         super().__init__(model, PairTables(model), "facets")
-        if model.dtype == "float64":  # else their types differ
+        if model.dtype == "float64" and not self.tables.explicit:  # else types differ, or forces have no product
             self.shared_arrays = {"point_product": "tangential_force", "energy": "facet_rotation"}
         self.search_kernels = facet_search_kernels(model.dtype, bool(self.tables.seams))
         self.master_kernels = master_kernels(model.dtype)

@@ -146,7 +146,7 @@ def facet_seam_tables(contacts: Sequence[FacetOptions], number: Callable[[Surfac
                 near = [s for s in near if _boxes_are_near(box(s), box(side), REACH_RATIO * width)]
             if contact.seam is not None:
                 lengths[len(rows), 0] = contact.seam
-            rows.append(near if all(_corners(s) == 1 for s in (side, *near)) else [])
+            rows.append([s for s in near if max(_corners(s), _corners(side)) == 1])
     if not any(rows):
         return {}
     sides = [contact.surfaces[k] for contact in contacts for k in (-1, 0)]
