@@ -373,6 +373,9 @@ def test_another_plan_is_refused(swept):
         ({"parameters": {"Q": 1}}, "parameters.Q is unknown"),
         ({"parameters": {"cells": 1}, "design": {"over": {"cells": [1]}}}, "parameters.cells is a parameter of the"),
         ({"engine": 0}, "engine = 0 must be a number of workers"),
+        ({"series": {"time": "probe.tip.displacement.z"}}, "series.time: the name 'time' is taken"),
+        ({"design": {"over": {"E": {"low": 1, "high": 2, "count": 2, "whole": True}}}}, "design.over.E.whole is for"),
+        ({"design": [{"bar.E": float("nan")}]}, "design: nan must be finite"),
         ({"worlds": 0}, "worlds = 0 must be a positive whole number"),
     ],
 )

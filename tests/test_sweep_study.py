@@ -239,8 +239,8 @@ def test_one_of_two_processes_compiles(tmp_path):
     env = os.environ | {"WARP_CACHE_PATH": str(tmp_path / "cache"), "PYTHONPATH": os.pathsep.join(sys.path)}
     call = [sys.executable, str(tmp_path / "compile.py")]
     calls = [subprocess.Popen([*call, f"ready{k}"], stdout=subprocess.PIPE, text=True, env=env) for k in range(2)]
-    shown = sorted(process.communicate()[0].splitlines()[-1] for process in calls)
-    assert [line.split()[-1] for line in shown] == ["(cached)", "(compiled)"]
+    shown = sorted(process.communicate()[0].split()[-1] for process in calls)
+    assert shown == ["(cached)", "(compiled)"]
 
 
 @pytest.mark.slow

@@ -232,13 +232,13 @@ def split_name(what: str) -> tuple[str | None, str]:
     return (what, "") if what.endswith(".py") else (None, what)
 
 
-def locate(what: str) -> Scene[Any]:
-    """The scene NAME, file.py or file.py:NAME. ModelError lists the known ones."""
+def locate(what: str, content: bytes | None = None) -> Scene[Any]:
+    """The scene NAME, file.py or file.py:NAME, from the file or its content. ModelError lists the known ones."""
     file, name = split_name(what)
     if file is None:
         return find(name)
     # absolute: Python stores the file's code under that path, so tracebacks show its lines
-    found = load_file(pathlib.Path(file).absolute())
+    found = load_file(pathlib.Path(file).absolute(), content)
     if not name:
         if len(found) > 1:
             raise ModelError(f"{file} holds several scenes, give {file}:NAME with one of {', '.join(found)}")
@@ -251,8 +251,8 @@ def locate(what: str) -> Scene[Any]:
 _loaded = itertools.count()
 
 
-def load_file(path: str | pathlib.Path) -> dict[str, Scene[Any]]:
-    """Run a Python file and return its scenes by name; imported ones only if it defines none.
+def load_file(path: str | pathlib.Path, content: bytes | None = None) -> dict[str, Scene[Any]]:
+    """Run a Python file, or its content, and return its scenes by name; imported ones only if it defines none.
 
     A file of a package (a folder with __init__.py) may use relative imports, any other file imports from its own
     folder.
@@ -277,7 +277,8 @@ def load_file(path: str | pathlib.Path) -> dict[str, Scene[Any]]:
     sys.modules[name] = module
     sys.path.insert(0, str(folder))
     try:
-        spec.loader.exec_module(module)
+        content = file.read_bytes() if content is None else content
+        exec(compile(content, file, "exec", dont_inherit=True), module.__dict__)
     except Exception as error:
         del sys.modules[name]
         raise ModelError(f"{_error_location(error, file)}: {type(error).__name__}: {error}") from error

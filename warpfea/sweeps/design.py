@@ -175,8 +175,10 @@ def _axis_values(where: str, axis: Any) -> list[Any]:
     """Values of an axis of a grid. ModelError."""
     if isinstance(axis, Mapping):
         given = as_range(where, axis)
+        if given["whole"]:
+            raise ModelError(f"{where}.whole is for samples: list the whole numbers of a grid")
         _check_count(f"{where}.count", given.get("count"), 2)
-        return _scaled(given | {"whole": False}, np.linspace(0.0, 1.0, given["count"]))
+        return _scaled(given, np.linspace(0.0, 1.0, given["count"]))
     values = list(axis) if isinstance(axis, (list, tuple, range, np.ndarray)) else None
     if not values:
         raise ModelError(f"{where} = {axis!r} must be a list of values that is not empty")
@@ -199,6 +201,8 @@ def _plain(value: Any) -> Any:
     value = value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
     if isinstance(value, (list, tuple)):
         return tuple(map(_plain, value))
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ModelError(f"design: {value!r} must be finite")
     if not isinstance(value, (bool, int, float, str)):
         raise ModelError(f"design: {value!r} must be a number, a text, a truth value or a list of these")
     return value

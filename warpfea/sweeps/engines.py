@@ -3,7 +3,7 @@
 An engine has three calls and a number of workers, each of which does one task at a time:
 
     submit(call, *arguments) -> handle      done(handles) -> handles that ended, after a wait for one
-    result(handle) -> value of the call     WorkerLost if its worker died
+    result(handle) -> value of the call     WorkerLost if its worker died; reset() forgets other calls, if there is one
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import os
-import signal
 import threading
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -19,7 +18,7 @@ from concurrent.futures.process import BrokenProcessPool
 from typing import Any, Protocol
 
 from ..base.devices import find_device
-from ..base.errors import ModelError
+from ..base.errors import Error, ModelError
 
 __all__ = ["DaskEngine", "Engine", "PoolEngine", "WorkerLost", "make_engine"]
 
@@ -111,19 +110,36 @@ class PoolEngine:
         return wait(handles, return_when=FIRST_COMPLETED).done
 
     def result(self, handle: Future[Any]) -> Any:
-        """Value of an ended call. WorkerLost."""
+        """Value of an ended call. WorkerLost; errors that are not warpfea's end the process."""
         k = self.busy.pop(handle)
         try:
             return handle.result()
+        except Error:
+            raise
         except BrokenProcessPool as error:
             self._replace(k)
             raise WorkerLost(str(error)) from error
+        except Exception:
+            self._replace(k)
+            raise
+
+    def reset(self) -> None:
+        """Leave the calls whose values were not asked for."""
+        self._terminate()
+        for k in set(self.busy.values()):
+            self._replace(k)
+        self.busy.clear()
+
+    def _terminate(self) -> None:
+        """End the processes at work."""
+        pids = {self.pids[k] for k in self.busy.values()}
+        for process in multiprocessing.active_children():
+            if process.pid in pids:
+                process.terminate()
 
     def close(self) -> None:
         """End the processes, at once if they are at work."""
-        for pid in {self.pids[k] for k in self.busy.values()}:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGTERM)
+        self._terminate()
         for executor in self.executors:
             executor.shutdown(cancel_futures=True)
 
@@ -198,10 +214,7 @@ class DaskEngine:
                 raise ModelError(f"the dask worker {address} has {count} threads: start it with --nthreads 1")
         self.workers = len(threads)
 
-        def count_retries_ourselves(dask_scheduler: Any) -> None:
-            dask_scheduler.allowed_failures = 0
-
-        self.client.run_on_scheduler(count_retries_ourselves)
+        self.allowed = self.client.run_on_scheduler(_set_allowed_failures, count=0)  # we count them ourselves
 
     def submit(self, call: Callable[..., Any], *arguments: Any) -> Any:
         """Start a call on some worker."""
@@ -220,9 +233,17 @@ class DaskEngine:
             raise WorkerLost(str(error)) from error
 
     def close(self) -> None:
-        """Leave the scheduler."""
+        """Leave the scheduler as it was."""
+        with contextlib.suppress(OSError, TimeoutError, ValueError):  # of a scheduler that is gone
+            self.client.run_on_scheduler(_set_allowed_failures, count=self.allowed)
         if self.own:
             self.client.close()
+
+
+def _set_allowed_failures(count: int, dask_scheduler: Any = None) -> int:
+    """Set deaths of workers after which a scheduler gives up a task; returns those before."""
+    before, dask_scheduler.allowed_failures = dask_scheduler.allowed_failures, count
+    return int(before)
 
 
 def make_engine(given: Any, device: str, memory: float | None = None) -> Engine:

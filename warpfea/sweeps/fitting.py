@@ -11,7 +11,7 @@ import numpy as np
 
 from ..base.console import quiet_warp
 from ..base.devices import find_device
-from ..base.errors import ModelError
+from ..base.errors import ConvergenceError, ModelError
 from ..base.names import check_choice
 from ..builder.scene import Scene, locate
 from .design import as_range
@@ -70,6 +70,7 @@ def fit(
 
     Raises:
         ModelError: an unknown name, an empty range, or a time between steps.
+        ConvergenceError: the start, or every candidate, is refused.
     """
     check_choice("method", method, METHODS)
     candidates = Candidates(scene, parameters, record, dict(fixed or {}), dict(run or {}))
@@ -78,6 +79,7 @@ def fit(
     else:
         point = candidates.search_globally(worlds, generations, seed)
     runs, residuals = candidates.runs, candidates.residuals(point[:, None])[0]
+    candidates.require("the best candidate", point)
     values = {name: float(column[0]) for name, column in candidates.values(point[:, None]).items()}
     return Fit(values, float(np.sqrt(np.mean(residuals**2))), residuals, runs)
 
@@ -95,7 +97,13 @@ class Candidates:
         device = find_device(run.get("device"))
         place = {"device": "cuda" if device.is_cuda else "cpu"}
         self.study = Study("", fixed, {}, self.curves, run | place, many=True)
-        self.runs = 0
+        self.runs, self.refused = 0, np.zeros(0, dtype=bool)
+
+    def require(self, what: str, point: np.ndarray) -> None:
+        """ConvergenceError if a candidate of the last residuals was refused."""
+        if self.refused.any():
+            at = ", ".join(f"{name} = {column[0]:.6g}" for name, column in self.values(point[:, None]).items())
+            raise ConvergenceError(f"fit: the run of {what} is refused, at {at}; take other ranges or another start")
 
     def values(self, points: np.ndarray) -> dict[str, np.ndarray]:
         """Values by parameter of points (parameters, candidates)."""
@@ -106,22 +114,26 @@ class Candidates:
         return out
 
     def residuals(self, points: np.ndarray) -> np.ndarray:
-        """(candidates, samples) of points (parameters, candidates)."""
+        """(candidates, samples) of points (parameters, candidates); `refused` flags those without a result."""
         columns = self.values(points)
         groups: dict[tuple[float, ...], list[int]] = {}
         own = [name for name in columns if name in self.scene.parameters]
         for k in range(points.shape[1]):
             groups.setdefault(tuple(float(columns[name][k]) for name in own), []).append(k)
         out = np.empty((points.shape[1], sum(values.size for _, values, *_ in self.samples.values())))
+        self.refused = np.zeros(points.shape[1], dtype=bool)
         for arguments, members in groups.items():
             group = Group(self.study, self.scene, dict(zip(own, arguments)))
             per_world = {name: column[members].tolist() for name, column in columns.items() if name not in own}
             with quiet_warp():
                 model = group.model(len(members))
                 sim = group.simulate(model, per_world, on_failure="freeze")
-            found = np.hstack([self._difference(text, curve, sim) for text, curve in self.curves.items()])
-            found[sim.status == FAILED_WORLD] = REFUSED
-            out[members] = found
+            self.refused[members] = failed = sim.status == FAILED_WORLD
+            if failed.all():  # its records end early
+                continue
+            out[members] = np.hstack([self._difference(text, curve, sim) for text, curve in self.curves.items()])
+            self.refused[members] |= ~np.isfinite(out[members]).all(axis=1)
+        out[self.refused] = REFUSED
         self.runs += points.shape[1]
         return out
 
@@ -154,6 +166,10 @@ class Candidates:
         def jacobian(x: np.ndarray) -> np.ndarray:
             step = np.where(x < 0.5, DIFFERENCE, -DIFFERENCE)
             rows = self.residuals(np.column_stack([x, x[:, None] + np.diag(step)]))
+            if (bad := np.flatnonzero(self.refused[1:])).size:  # then to the other side
+                step[bad] *= -1.0
+                rows[1 + bad] = self.residuals(x[:, None] + np.diag(step)[:, bad])
+                self.require("both neighbours of a candidate", x)
             return ((rows[1:] - rows[0]) / step[:, None]).T
 
         first = np.full(size, 0.5)
@@ -161,5 +177,7 @@ class Candidates:
             if name in start:
                 low, at, high = (math.log(v) if axis["log"] else v for v in (axis["low"], start[name], axis["high"]))
                 first[k] = (at - low) / (high - low)
+        self.residuals(first[:, None])
+        self.require("the start", first)
         found = least_squares(lambda x: self.residuals(x[:, None])[0], first, jac=jacobian, bounds=(0, 1), gtol=None)
         return np.asarray(found.x)

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 import inspect
 import pathlib
-import runpy
 import sys
+import types
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from ..base.errors import ModelError
+from ..base.errors import CheckpointError, ModelError
 from ..base.names import check_choice, check_known
 from ..base.usercode import convert_user_errors
 
-__all__ = ["Measure", "file_of", "parse_measure", "parse_measures", "reference_of"]
+__all__ = [
+    "Measure", "file_of", "load_function", "parse_measure", "parse_measures", "read_source", "reference_of",
+    "source_of",
+]  # fmt: skip
 
 REDUCTIONS: dict[str, Callable[..., np.ndarray]] = {
     "last": lambda values, axis: values[:, -1],
@@ -56,6 +60,7 @@ class Measure:
         text: as given. reduction: over time, of a field over nodes.
         kind: of KINDS, or "function". name: of the probe, contact, joint, field or energy; "file.py:function".
         quantity: of RECORDS; of a field the body, "" for all. component: of COMPONENTS, or "".
+        source: hash of the function's file.
     """
 
     text: str
@@ -64,6 +69,7 @@ class Measure:
     name: str
     quantity: str = ""
     component: str = ""
+    source: str = ""
 
     @property
     def over_time(self) -> bool:
@@ -101,7 +107,7 @@ class Measure:
             check_known("energy", self.name, energies)
             return energies[self.name]
         with convert_user_errors(f"measure {self.name.rpartition(':')[2]!r}"):
-            values = np.asarray(load_function(self.name)(sim), dtype=float)
+            values = np.asarray(load_function(self.name, self.source)(sim), dtype=float)
         if values.shape not in ((), (sim.model.worlds,)):
             raise ModelError(f"measure {self.text}: expected ({sim.model.worlds},) values, got {values.shape}")
         return np.broadcast_to(values, sim.model.worlds)
@@ -130,7 +136,7 @@ def parse_measure(where: str, given: Any) -> Measure:
     if not isinstance(given, str) or not given.strip():
         raise ModelError(f"{where} = {given!r} must be a text such as 'probe.tip.displacement.z', or a function")
     if ".py:" in given:
-        return Measure(given, "last", "function", given)
+        return Measure(given, "last", "function", given, source=source_of(given))
     *words, path = given.split()
     kind, *parts = path.split(".")
     check_choice(f"{where}: the kind", kind, KINDS)
@@ -175,18 +181,39 @@ def reference_of(what: str, function: Any) -> str:
     return f"{file_of(what, inspect.unwrap(function), name)}:{name}"
 
 
-@functools.lru_cache(maxsize=64)
-def load_function(reference: str) -> Callable[[Any], Any]:
-    """The function "file.py:function". ModelError."""
-    file, _, name = reference.rpartition(":")
-    if not pathlib.Path(file).is_file():
+def source_of(reference: str) -> str:
+    """Hash of the file of "file.py:NAME". ModelError."""
+    file = pathlib.Path(reference.rpartition(":")[0])
+    if not file.is_file():
         raise ModelError(f"{file}: no such file")
+    return hashlib.sha256(file.read_bytes()).hexdigest()
+
+
+def read_source(reference: str, source: str) -> bytes:
+    """Content of the file of "file.py:NAME" with that hash. CheckpointError if it is another one by now."""
+    file = reference.rpartition(":")[0]
+    try:
+        content = pathlib.Path(file).read_bytes()
+    except OSError as error:
+        raise CheckpointError(f"{file}: can't be read ({error})") from error
+    if hashlib.sha256(content).hexdigest() != source:
+        raise CheckpointError(f"{file}: has changed since the sweep began")
+    return content
+
+
+@functools.lru_cache(maxsize=64)
+def load_function(reference: str, source: str) -> Callable[[Any], Any]:
+    """The function "file.py:function" of the file with that hash. ModelError, CheckpointError."""
+    file, _, name = reference.rpartition(":")
+    content, module = read_source(reference, source), types.ModuleType(f"_warpfea_measures_{source}")
+    module.__file__ = file
+    sys.modules[module.__name__] = module
     sys.path.insert(0, str(pathlib.Path(file).parent))
     try:
         with convert_user_errors(file):
-            found = runpy.run_path(file)
+            exec(compile(content, file, "exec", dont_inherit=True), module.__dict__)
     finally:
         sys.path.pop(0)
-    functions = {key: value for key, value in found.items() if callable(value)}
+    functions = {key: value for key, value in vars(module).items() if callable(value)}
     check_known(f"{file}: function", name, functions)
     return functions[name]

@@ -15,8 +15,7 @@ import warpfea as wf
 from ..base.errors import ModelError, OutputError
 from ..base.lazy import pillow
 from ..base.writer import write_atomically
-from ..builder.scene import locate
-from .worker import Group
+from .worker import Group, find_scene
 
 __all__ = ["draw_sheet", "plot_table"]
 
@@ -58,7 +57,7 @@ def _draw(axis: Any, result: Any, x: str, y: str) -> None:
 def draw_sheet(result: Any, target: pathlib.Path, designs: Sequence[int], field: str | None) -> None:
     """Pictures of designs side by side, each with its number and measures. ModelError, OutputError."""
     study = result.study
-    scene, columns = locate(study.scene), math.ceil(math.sqrt(len(designs)))
+    scene, columns = find_scene(study.scene, study.source), math.ceil(math.sqrt(len(designs)))
     if not designs or not all(isinstance(k, int) and 0 <= k < len(result) for k in designs):
         raise ModelError(f"sheet: designs = {designs!r} must be numbers from 0 to {len(result) - 1}")
     width, height = PICTURE

@@ -43,20 +43,25 @@ class Record:
         self.done, self.values = np.zeros(count, dtype=bool), np.full((len(self.measures), count), np.nan)
         self.failures, self.retries = dict[int, tuple[str, str]](), 0
         self.deaths, self.plans = dict[int, int](), dict[str, dict[str, Any]]()
-        if path.exists() and not resume and path.read_bytes().count(b"\n") > 1:
-            raise CheckpointError(f"{path}: is there; go on with it (resume=True, --resume) or take another folder")
         try:
             self._file = open(path, "a+b")  # noqa: SIM115
         except OSError as error:
             raise CheckpointError(f"{path}: can't be opened ({error})") from error
         try:
             self._lock()
-            if not resume:  # settings without a row, of a sweep that was refused
-                self._file.truncate(0)
+            self._file.seek(0)
+            if not resume and (lines := self._file.readlines(1 << 20)):
+                content = _decode(lines[0]) or {}
+                if len(lines) > 1 or content.get("schema") != SCHEMA or "settings" not in content:
+                    raise CheckpointError(
+                        f"{path}: is there; go on with it (resume=True, --resume) or take another folder"
+                    )
+                self._file.truncate(0)  # settings without a row, of a sweep that was refused
             size = self._read(json.loads(json.dumps(settings)))
             self._file.truncate(size)
             if size == 0:
                 self.append({"schema": SCHEMA, "settings": settings})
+                _sync_folder(path.parent)
         except BaseException:
             self._file.close()
             raise
@@ -117,9 +122,9 @@ class Record:
             raise CheckpointError(f"{self.path}: line {number} repeats design {index}")
         else:
             self.done[index] = True
-            if content["status"] == "done":
-                self.values[:, index] = [content["values"][name] for name in self.measures]
-            else:
+            if content["values"]:
+                self.values[:, index] = [content["values"][name] for name in self.measures]  # null becomes NaN
+            if content["status"] != "done":
                 self.failures[index] = content["status"], content["reason"]
 
     def append(self, *lines: Mapping[str, Any]) -> None:
@@ -135,8 +140,21 @@ class Record:
             raise CheckpointError(f"{self.path}: can't be written ({error})") from error
 
     def close(self) -> None:
-        """Close the file."""
-        self._file.close()
+        """Close the file. CheckpointError."""
+        try:
+            self._file.close()
+        except OSError as error:  # lines that a full disk refused before
+            raise CheckpointError(f"{self.path}: can't be written ({error})") from error
+
+
+def _sync_folder(folder: pathlib.Path) -> None:
+    """Have the name of a new file on the disk."""
+    if os.name == "posix":
+        number = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(number)
+        finally:
+            os.close(number)
 
 
 def _encode(line: Mapping[str, Any]) -> bytes:

@@ -59,7 +59,9 @@ class SweepResult:
 
     def best(self, name: str, *, largest: bool = False) -> dict[str, Any]:
         """Design with the smallest or largest measure: its index, parameters and measures. ModelError."""
-        values = self[name] if largest else -self[name]
+        values = np.array(self[name] if largest else -self[name], dtype=float)
+        if name in self.measures:
+            values[list(self.failures)] = np.nan
         if np.isnan(values).all():
             raise ModelError(f"no design has a value of {name!r}")
         index = int(np.nanargmax(values))
@@ -68,7 +70,7 @@ class SweepResult:
     def pareto(self, first: str, second: str) -> np.ndarray:
         """Indices of the designs that no other beats in both measures, smaller is better, by the first."""
         x, y = self[first], self[second]
-        order = [k for k in np.lexsort((y, x)) if not np.isnan(x[k] + y[k])]
+        order = [k for k in np.lexsort((y, x)) if k not in self.failures]
         best, out = np.inf, []
         for k in order:
             if y[k] < best:

@@ -115,7 +115,9 @@ def run_study(path: str | pathlib.Path, **given: Any) -> SweepResult:
     run, how = study["run"], study["engine"]
     if given.get("device"):
         run["device"] = given["device"]
-    chosen = given.get("scheduler") or how.get("scheduler") or given.get("workers") or how.get("workers")
+    chosen = given.get("scheduler") or given.get("workers") or how.get("scheduler") or how.get("workers")
+    if isinstance(chosen, str) and "memory" in how:
+        raise ModelError(f"{path}: engine.memory limits processes of this machine, not those of a scheduler")
     pictures = study["pictures"]
     try:
         result = sweep(

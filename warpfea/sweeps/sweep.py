@@ -7,6 +7,7 @@ import csv
 import dataclasses
 import hashlib
 import json
+import os
 import pathlib
 import tempfile
 import time as clock
@@ -20,19 +21,30 @@ import numpy as np
 from ..base.checks import check_positive, is_count
 from ..base.console import progress_bar
 from ..base.devices import find_device
-from ..base.errors import CheckpointError, ModelError
+from ..base.errors import CheckpointError, Error, ModelError
 from ..base.names import check_choice
 from ..base.provenance import versions
 from ..base.writer import make_folder, write_atomically
-from ..builder.scene import Scene, locate, split_name
+from ..builder.scene import Scene, split_name
 from ..model.model import MANY_WORLDS
 from ..simulation.integrators import find_integrator
 from .design import Design, check_keys
 from .engines import Engine, WorkerLost, make_engine
-from .measures import RECORDS, file_of, parse_measures
+from .measures import RECORDS, file_of, parse_measures, source_of
 from .record import Record
 from .result import SweepResult, write_tables
-from .worker import MOTION_OPTIONS, STATIC_OPTIONS, Outcome, Row, Study, check_names, solve, solver_of
+from .worker import (
+    MOTION_OPTIONS,
+    STATIC_OPTIONS,
+    Outcome,
+    Row,
+    Study,
+    check_names,
+    describe,
+    find_scene,
+    solve,
+    solver_of,
+)  # fmt: skip
 
 __all__ = ["RUN_OPTIONS", "sweep"]
 
@@ -96,12 +108,12 @@ def sweep(
         OutputError: a file that can't be written.
     """
     points = Design.of(design)
-    study, sources = _make_study(scene, points, measures, series or {}, dict(parameters or {}), dict(run or {}))
+    study = _make_study(scene, points, measures, series or {}, dict(parameters or {}), dict(run or {}))
     if worlds is not None and not (is_count(worlds) and worlds > 0):
         raise ModelError(f"worlds = {worlds!r} must be a positive whole number")
     keep = tempfile.TemporaryDirectory(prefix="warpfea_sweep_") if out is None else None
     folder = make_folder(out or keep.name)  # type: ignore[union-attr]
-    record = Record(folder / "record.jsonl", _settings(study, points, sources), resume=resume)
+    record = Record(folder / "record.jsonl", _settings(study, points), resume=resume)
     began, seconds = clock.perf_counter(), {"start": 0.0, "run": 0.0}
     try:
         if not record.done.all():
@@ -115,6 +127,10 @@ def sweep(
                 driver = _Driver(study, points, record, folder, used, tasks)
                 driver.check()
                 driver.run(progress)
+            except BaseException:
+                if used is engine and hasattr(used, "reset"):
+                    used.reset()
+                raise
             finally:
                 if used is not engine:
                     used.close()
@@ -132,14 +148,16 @@ def sweep(
 
 def _make_study(
     scene: Any, points: Design, measures: Any, series: Mapping[str, Any], fixed: dict[str, Any], run: dict[str, Any]
-) -> tuple[Study, dict[str, str]]:
-    """Settings for workers, with hashes of the user's files by name. ModelError for names that don't fit."""
+) -> Study:
+    """Settings for workers. ModelError for names that don't fit."""
     if isinstance(scene, Scene):
         module = scene.function.__module__
         own = not module.startswith("warpfea.scenes.")
         scene = f"{file_of('scene', scene.function, scene.function.__qualname__)}:{scene.name}" if own else scene.name
-    found = locate(scene)
-    file, _ = split_name(scene)
+    file, name = split_name(scene)
+    where = scene if file is None else f"{pathlib.Path(file).resolve()}:{name}"
+    source = "" if file is None else source_of(where)
+    found = find_scene(where, source)
     label = scene if file is None else f"{pathlib.Path(file).resolve()}:{found.name}"
     check_keys("run", run, RUN_OPTIONS)
     check_keys("parameters", fixed, list(found.parameters))
@@ -147,25 +165,22 @@ def _make_study(
     curves = parse_measures("series", series) if series else {}
     for name, curve in curves.items():
         check_choice(f"series.{name}: the kind", curve.kind, tuple(RECORDS))
+        if name in ("time", "file"):
+            raise ModelError(f"series.{name}: the name {name!r} is taken, choose another")
     for name in chosen:
         if name in points.columns or name in ("design", "status", "reason"):
             raise ModelError(f"measures.{name}: the table has a column {name!r} already")
     device = find_device(run.get("device"))
     given = str(run.get("device") or "")
     run = run | {"device": (given or "cuda") if device.is_cuda else "cpu"}
-    study = Study(label, fixed, chosen, curves, run, len(points) >= MANY_WORLDS)
+    study = Study(label, fixed, chosen, curves, run, len(points) >= MANY_WORLDS, source)
     for name in points.columns.keys() & fixed.keys():
         raise ModelError(f"parameters.{name} is a parameter of the design, too")
     _check_run(study)
     for name in points.columns:
         if "." not in name and name != "gravity":
             check_keys("design.over", {name: None}, [*found.parameters, "gravity"])
-    sources = {}
-    for reference in (label, *(measure.name for measure in chosen.values() if measure.kind == "function")):
-        path = pathlib.Path(reference.rpartition(":")[0])
-        if ".py:" in reference and path.is_file():
-            sources[f"{path.name}:{reference.rpartition(':')[2]}"] = _hash(path.read_bytes())
-    return study, sources
+    return study
 
 
 def _check_run(study: Study) -> None:
@@ -184,13 +199,13 @@ def _hash(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()[:16]
 
 
-def _settings(study: Study, points: Design, sources: dict[str, str]) -> dict[str, Any]:
+def _settings(study: Study, points: Design) -> dict[str, Any]:
     """Settings by which a record knows its sweep; files by name and content, not by place."""
     file, name = split_name(study.scene)
     texts = {name: (m.text, m.kind == "function") for name, m in study.measures.items()}
     return {
         "scene": name if file is None else f"{pathlib.Path(file).name}:{name}",
-        "sources": sources,
+        "sources": {"scene": study.source} | {f"measures.{k}": m.source for k, m in study.measures.items() if m.source},
         "parameters": study.fixed,
         "names": list(points.columns),
         "designs": len(points),
@@ -205,7 +220,7 @@ def _settings(study: Study, points: Design, sources: dict[str, str]) -> dict[str
 
 def _tasks(study: Study, points: Design, record: Record, batch: int, workers: int) -> deque[Task]:
     """Tasks of the designs that are left: those with equal arguments, dealt over the workers, in batches."""
-    scene = locate(study.scene)
+    scene = find_scene(study.scene, study.source)
     names = [name for name in points.columns if name in scene.parameters]
     groups: dict[str, list[int]] = {}
     for index in np.flatnonzero(~record.done).tolist():
@@ -237,8 +252,12 @@ class _Driver:
         handle = self._submit(check_names, ends)
         while handle not in self.engine.done([handle]):
             pass
-        with contextlib.suppress(WorkerLost):
+        try:
             self.engine.result(handle)
+        except Error:
+            raise
+        except Exception:  # the task itself will tell
+            return
 
     def run(self, progress: bool | None) -> None:
         """Do all tasks."""
@@ -251,33 +270,42 @@ class _Driver:
             if new:
                 writer.writerow(["design", "seconds", "worlds", "alone", "worker", "task_seconds"])
             bar.update(done)
-            ended: list[tuple[Task, Outcome]] = []
-            while self.tasks or running or ended:
-                while self.tasks and len(running) < self.engine.workers:
-                    task = self.tasks.popleft()
-                    running[self._submit(solve, task)] = task
-                for task, outcome in ended:  # while workers go on
-                    self._keep(task, outcome)
-                    writer.writerows([r.design, r.seconds, r.worlds, r.alone, outcome.worker, outcome.seconds]
-                                     for r in outcome.rows)  # fmt: skip
-                    file.flush()
-                bar.set_postfix_str(f"{len(self.record.failures)} failed", refresh=False)
-                bar.update(int(self.record.done.sum()) - bar.n)
-                ended = []
-                for handle in self.engine.done(list(running)) if running else ():
-                    task = running.pop(handle)
-                    try:
-                        ended.append((task, self.engine.result(handle)))
-                    except WorkerLost:
-                        self._lose(task)
+            ended: deque[tuple[Task, Outcome]] = deque()
+            try:
+                while self.tasks or running or ended:
+                    while self.tasks and len(running) < self.engine.workers:
+                        task = self.tasks.popleft()
+                        running[self._submit(solve, task)] = task
+                    while ended:  # while workers go on
+                        task, outcome = ended.popleft()
+                        self._keep(task, outcome)
+                        writer.writerows([r.design, r.seconds, r.worlds, r.alone, outcome.worker, outcome.seconds]
+                                         for r in outcome.rows)  # fmt: skip
+                        file.flush()
+                    bar.set_postfix_str(f"{len(self.record.failures)} failed", refresh=False)
+                    bar.update(int(self.record.done.sum()) - bar.n)
+                    for handle in self.engine.done(list(running)) if running else ():
+                        task = running.pop(handle)
+                        try:
+                            ended.append((task, self.engine.result(handle)))
+                        except WorkerLost:
+                            self._lose(task, "died")
+                        except Error:
+                            raise
+                        except Exception as error:  # of its machine
+                            self._lose(task, "failed", f": {describe(error)}")
+            finally:
+                for task, outcome in ended:  # left by an error
+                    with contextlib.suppress(Error):
+                        self._keep(task, outcome)
 
     def _submit(self, call: Callable[..., Any], task: Task) -> Any:
         own = [name for name in self.points.columns if name not in task.arguments]
         designs = [(k, {name: self.points.columns[name][k] for name in own}) for k in task.indices]
         return self.engine.submit(call, self.study, task.arguments, designs)
 
-    def _lose(self, task: Task) -> None:
-        """Halve a task whose worker died; a design that kills it thrice alone is listed."""
+    def _lose(self, task: Task, how: str, why: str = "") -> None:
+        """Halve a task whose worker died or failed; a design that kills it thrice alone is listed."""
         index = task.indices[0]
         self.record.append({"lost": index, "worlds": len(task.indices)})
         if len(task.indices) > 1:
@@ -289,7 +317,7 @@ class _Driver:
         if self.record.deaths[index] < MAX_DEATHS:
             self.tasks.append(task)
             return
-        row = Row(index, "killed", reason=f"its worker died {MAX_DEATHS} times")
+        row = Row(index, "killed", reason=f"its worker {how} {MAX_DEATHS} times{why}")
         self.record.append(_line(row))
 
     def _keep(self, task: Task, outcome: Outcome) -> None:
@@ -311,7 +339,13 @@ class _Driver:
 
 
 def _save(series: Mapping[str, np.ndarray]) -> Callable[[pathlib.Path], None]:
-    return lambda path: np.savez(path, **series)  # type: ignore[arg-type]
+    def write(path: pathlib.Path) -> None:
+        with open(path, "wb") as file:
+            np.savez(file, **series)  # type: ignore[arg-type]
+            file.flush()
+            os.fsync(file.fileno())  # before its line in the record
+
+    return write
 
 
 def _line(row: Row) -> dict[str, Any]:

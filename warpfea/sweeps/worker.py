@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import gc
+import math
 import os
 import socket
 import time as clock
@@ -15,13 +17,15 @@ import numpy as np
 
 import warpfea as wf
 
-from ..base.errors import CapacityError, ModelError
+from ..base.errors import CapacityError, Error, ModelError
 from ..base.names import did_you_mean
-from ..builder.scene import Scene, locate
-from .measures import Measure
+from ..builder.scene import Scene, locate, split_name
+from .measures import Measure, load_function, read_source
 
-__all__ = ["FAILED_WORLD", "Group", "Outcome", "Row", "Study", "check_names", "solve", "solver_of"]
+__all__ = ["FAILED_WORLD", "Group", "Outcome", "Row", "Study", "check_names", "find_scene", "solve", "solver_of"]
 
+FAILURES = (Error, MemoryError, NotImplementedError)
+"""Errors of a design, also those of the user's functions; others are of the machine, and end the worker."""
 FAILED_WORLD = 1
 """Status of a world whose step was refused."""
 STATIC_OPTIONS = ("load_steps", "tol", "stabilise", "inversion", "unstable", "constraint_tol")
@@ -39,6 +43,7 @@ class Study:
         scene: name or file.py:NAME. fixed: its parameters that are the same in all designs.
         measures: by name. series: quantities over time that are kept.
         run: options of the run, see `sweep`. many: of `ModelBuilder.finalize`.
+        source: hash of the scene's file.
     """
 
     scene: str
@@ -47,6 +52,7 @@ class Study:
     series: dict[str, Measure]
     run: dict[str, Any]
     many: bool
+    source: str = ""
 
     @property
     def place(self) -> dict[str, Any]:
@@ -55,11 +61,26 @@ class Study:
         return {"device": "cuda:0" if kind == "cuda" else kind, "dtype": self.run.get("dtype", "float64")}
 
 
+@functools.lru_cache(maxsize=16)
+def find_scene(name: str, source: str) -> Scene[Any]:
+    """The scene NAME, or file.py:NAME of the file with that hash. ModelError, CheckpointError."""
+    return locate(name, None if split_name(name)[0] is None else read_source(name, source))
+
+
+def load(study: Study) -> Scene[Any]:
+    """The scene of a study, and functions of its measures, into the cache. ModelError, CheckpointError."""
+    for measure in study.measures.values():
+        if measure.kind == "function":
+            load_function(measure.name, measure.source)
+    return find_scene(study.scene, study.source)
+
+
 class Row(NamedTuple):
     """Result of one design: its measures, or the reason why it has none.
 
     Attributes:
-        design: its index. status: "done", "failed" or "killed". values: by measure. reason: of a failure.
+        design: its index. status: "done", "unconverged steps", "no value", "failed" or "killed".
+        values: by measure. reason: of a failure.
         series: (steps,) by name, and "time".
         seconds: of its batch over the number of worlds. worlds: of that batch.
         alone: "" unless it failed among others and was run again: then "failed" or "done".
@@ -67,7 +88,7 @@ class Row(NamedTuple):
 
     design: int
     status: str
-    values: Mapping[str, float] = {}
+    values: Mapping[str, float | None] = {}
     reason: str = ""
     series: Mapping[str, np.ndarray] = {}
     seconds: float = 0.0
@@ -94,12 +115,13 @@ class Outcome:
 def check_names(study: Study, arguments: dict[str, Any], designs: Sequence[tuple[int, dict[str, Any]]]) -> None:
     """Raise ModelError for measures that the model of some designs lacks, and values that none of them can set.
 
-    A model that can't be built is left for `solve` to tell.
+    A model that can't be built is left for `solve` to tell. CheckpointError for files that have changed.
     """
+    scene = load(study)
     try:
-        group = Group(study, locate(study.scene), arguments)
+        group = Group(study, scene, arguments)
         model = group.model(1)
-    except Exception:
+    except FAILURES:
         return
     for where, chosen in (("measures", study.measures), ("series", study.series)):
         for name, measure in chosen.items():
@@ -133,8 +155,12 @@ def _rows(
 ) -> tuple[list[Row], dict[str, Any] | None, str]:
     """Rows, plan and device; its model and simulation are freed at the end."""
     try:
-        group = Group(study, locate(study.scene), arguments)
-    except Exception as error:  # the same for each of them
+        scene = load(study)
+    except ModelError as error:  # not of a design: the first worker could load it
+        raise RuntimeError(str(error)) from error
+    try:
+        group = Group(study, scene, arguments)
+    except FAILURES as error:  # the same for each of them
         return [Row(index, "failed", reason=describe(error)) for index, _ in designs], None, ""
     rows = group.solve(designs)
     return rows, group.plan, group.device
@@ -164,7 +190,7 @@ class Group:
         except (CapacityError, MemoryError) as error:
             failure: Exception = error
             size = min(getattr(error, "worlds", 0), len(designs) - 1) or len(designs) // 2
-        except Exception as error:
+        except FAILURES as error:
             failure, size = error, len(designs) // 2
         if not size:
             return [Row(designs[0][0], "failed", reason=describe(failure))]
@@ -189,7 +215,7 @@ class Group:
         for world, (index, _) in enumerate(designs):
             kept = {name: float(column[world]) for name, column in values.items()}
             curves = {"time": times[world]} | {name: of[world] for name, of in series.items()} if series else {}
-            rows.append(Row(index, "done", kept, "", curves, seconds, worlds))
+            rows.append(Row(index, *_quality(kept, int(sim.totals["rough"][world])), curves, seconds, worlds))
         for world in np.flatnonzero(failed).tolist():
             (again,) = self.solve([designs[world]])
             rows[world] = again._replace(alone=again.status)
@@ -211,9 +237,18 @@ class Group:
         record = bool(self.study.series) or any(measure.over_time for measure in self.study.measures.values())
         sim = wf.Simulation(model, state, record=record, on_failure=on_failure, on_compile=_silent, **run)
         for name, values in controls.items():
-            sim.controls[name] = np.array(values, dtype=float)
+            sim.controls[name] = values
         sim.run(self.study.run.get("t_end", scene.t_end), outputs=outputs, progress=False)
         return sim
+
+
+def _quality(values: dict[str, float], rough: int) -> tuple[str, dict[str, float | None], str]:
+    """Status of a finished run, its values, None for those that are not finite, and what it lacks."""
+    kept = {name: value if math.isfinite(value) else None for name, value in values.items()}
+    empty = [name for name in kept if kept[name] is None]
+    if empty:
+        return "no value", kept, f"{', '.join(empty)}: not finite"
+    return ("unconverged steps", kept, f"{rough} steps above the tolerance") if rough else ("done", kept, "")
 
 
 def _silent(done: int, total: int, name: str) -> None:
@@ -228,7 +263,7 @@ def solver_of(name: str, tol: float | None) -> Any:
     return SOLVERS[name](tol=tol)
 
 
-def set_values(model: Any, columns: dict[str, list[Any]]) -> tuple[Any, dict[str, list[Any]]]:
+def set_values(model: Any, columns: dict[str, list[Any]]) -> tuple[Any, dict[str, np.ndarray]]:
     """Set values per world by name: parameters of `Model.set_parameter`, "gravity", "velocity.BODY" (with ".x", ".y",
     ".z" for a component), and "control.NAME".
 
@@ -238,19 +273,25 @@ def set_values(model: Any, columns: dict[str, list[Any]]) -> tuple[Any, dict[str
     Raises:
         ModelError: an unknown name, or a value out of range.
     """
-    state, controls = model.state(), {}
+    state, controls = model.state(), dict[str, np.ndarray]()
     vectors: dict[str, np.ndarray] = {}
-    for name, values in columns.items():
+    for name, given in columns.items():
+        try:
+            values = np.array(given, dtype=float)
+        except (TypeError, ValueError) as error:
+            raise ModelError(f"{name}: expected numbers, got {given[0]!r}") from error
         first, _, rest = name.partition(".")
         if first == "control":
             controls[rest] = values
         elif first in ("gravity", "velocity"):
             whole, _, axis = name.rpartition(".") if name[-2:] in (".x", ".y", ".z") else (name, "", "")
+            if values.shape[1:] != (() if axis else (3,)):
+                raise ModelError(f"{name}: expected {'a number' if axis else 'three numbers'}, got {given[0]!r}")
             if whole not in vectors:
                 vectors[whole] = np.tile(np.asarray(start_vector(model, state, whole), float), (model.worlds, 1))
-            vectors[whole][:, list("xyz").index(axis) if axis else slice(None)] = np.array(values, dtype=float)
+            vectors[whole][:, list("xyz").index(axis) if axis else slice(None)] = values
         else:
-            model.set_parameter(name, np.array(values, dtype=float))
+            model.set_parameter(name, values)
     for whole, each in vectors.items():
         if whole == "gravity":
             model.set_gravity(each)

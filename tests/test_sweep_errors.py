@@ -1,0 +1,87 @@
+"""Sweeps: errors of machines, files that change, engines after an error, designs short of quality, refused fits."""
+
+import time
+
+import pytest
+from test_sweep import BAR, DESIGN, FALL, Inline
+
+import warpfea as wf
+from warpfea.sweeps import PoolEngine
+from warpfea.sweeps.worker import Group
+
+
+def test_errors_of_the_machine_are_no_failures_of_designs(monkeypatch):
+    """Twice its disk is full: the designs are done again, and have their results."""
+    left, batch = [0, 0], Group.batch
+
+    def full(self, designs):
+        if left:
+            left.pop()
+            raise OSError("No space left on device")
+        return batch(self, designs)
+
+    monkeypatch.setattr(Group, "batch", full)
+    rows = [{"gravity.z": -1.0 * k} for k in range(4)]
+    result = wf.sweep(FALL, rows, measures={"z": "probe.p.displacement.z"}, engine=Inline(1))
+    assert (result.failures, result.retries) == ({}, 2)
+    left.extend([0] * 20)
+    result = wf.sweep(FALL, rows[:1], measures={"z": "probe.p.displacement.z"}, engine=Inline(1))
+    assert result.failures == {0: "its worker failed 3 times: OSError: No space left on device"}
+
+
+class Editing(Inline):
+    """The user edits the file once the sweep runs."""
+
+    def __init__(self, file):
+        super().__init__(1)
+        self.file = file
+
+    def submit(self, call, *arguments):
+        self.file.write_text("def half(sim):\n    return 0.0\n")
+        return super().submit(call, *arguments)
+
+
+def test_a_file_that_changes_is_told(tmp_path):
+    file = tmp_path / "mine.py"
+    file.write_text("def half(sim):\n    return 0.5\n")
+    with pytest.raises(wf.CheckpointError, match=r"mine.py: has changed since the sweep began"):
+        wf.sweep(FALL, [{"size": 1.0}], measures={"h": f"{file}:half"}, engine=Editing(file))
+    assert wf.sweep(FALL, [{"size": 1.0}], measures={"h": f"{file}:half"}, engine=Inline())["h"] == [0.0]
+
+
+@pytest.mark.parametrize("method", ["least_squares", "differential_evolution"])
+def test_a_fit_whose_runs_are_refused(method):
+    record = {"probe.tip.displacement.z": ([0.005], [0.0])}
+    how = {"method": method, "worlds": 4, "generations": 2, "run": {"device": "cpu"}}
+    with pytest.raises(wf.ConvergenceError, match=r"the run of the (start|best candidate) is refused, at gravity.z"):
+        wf.fit(BAR, {"gravity.z": (-2e9, -1e9)}, record, **how)
+
+
+def test_another_file_is_not_erased(tmp_path):
+    path = tmp_path / "record.jsonl"
+    path.write_text('{"mine": 1}\n')
+    with pytest.raises(wf.CheckpointError, match="is there"):
+        wf.sweep(FALL, DESIGN, measures={"z": "energy.strain"}, engine=Inline(), out=tmp_path)
+    assert path.read_text() == '{"mine": 1}\n'
+
+
+def test_an_engine_can_be_used_after_an_error():
+    pool = PoolEngine(1)
+    try:
+        pool.submit(time.sleep, 60)
+        pool.reset()
+        assert pool.result(pool.submit(abs, -1)) == 1
+    finally:
+        pool.close()
+
+
+def test_designs_short_of_quality_are_listed(tmp_path):
+    """A measure that is infinite has no value, in JSON null; steps above the tolerance are counted."""
+    file = tmp_path / "mine.py"
+    file.write_text("def h(sim):\n    sim.totals['rough'][2] = 4\n    return [1.0, float('inf'), 3.0, 2.0]\n")
+    rows = [{"gravity.z": -1.0 * k} for k in range(4)]
+    result = wf.sweep(FALL, rows, measures={"h": f"{file}:h"}, engine=Inline(1), run={"device": "cpu"})
+    assert result.failures == {1: "h: not finite", 2: "4 steps above the tolerance"}
+    assert result.status == {1: "no value", 2: "unconverged steps"}
+    assert '{"h": null}' in (result.folder / "record.jsonl").read_text()
+    assert result.best("h", largest=True)["design"] == 3
