@@ -83,6 +83,8 @@ study.toml:
   further tables: [parameters] of the scene for all designs; [series] quantities kept for every step;
   [run] t_end, dt, integrator, tol, dtype, device, static, ...; [engine] workers, worlds, memory, scheduler;
   [pictures] table = "table.png", pareto = ["tip", "mass"], sheet = "sheet.png", designs = [0, 5], field = "von_mises"
+
+exit codes: 0 every design has a result, 3 one failed, 2 bad usage, 130 interrupted (go on with --resume)
 """
 
 SCENE_COMMAND = "SCENE"

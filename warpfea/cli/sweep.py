@@ -14,12 +14,12 @@ SHOWN_FAILURES = 5
 
 
 def sweep(options: argparse.Namespace) -> int:
-    """Run `warpfea sweep`; 3 if no design has a result."""
+    """Run `warpfea sweep`; 3 if a design failed."""
     chosen = {name: getattr(options, name) for name in ("scheduler", "workers", "device", "out", "resume")}
     result = run_study(options.file, progress=show_progress(options), **chosen)
     if not options.quiet:
         print(summary(result), flush=True)
-    return DONE if len(result.failures) < len(result) else NOT_CONVERGED
+    return NOT_CONVERGED if result.failures else DONE
 
 
 def summary(result: SweepResult) -> str:

@@ -72,5 +72,5 @@ def draw_sheet(result: Any, target: pathlib.Path, designs: Sequence[int], field:
             x, y = width * (place % columns), height * (place // columns)
             sheet.paste(pillow.Image.open(file).convert("RGB"), (x, y))
         label = f"{index}: " + ", ".join(f"{name} {result[name][index]:.4g}" for name in result.measures)
-        pillow.ImageDraw.Draw(sheet).text((x + 8, y + height - 16), label, fill="black")
+        pillow.ImageDraw.Draw(sheet).text((x + 8, y + 8), label, fill="black")
     write_atomically(target, lambda path: sheet.save(path))
