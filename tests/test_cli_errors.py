@@ -109,7 +109,7 @@ BAD = {
     "bench too small": (["bench", "--unknowns", "10"], ["--unknowns 10", "270"]),
     "bench text": (["bench", "--unknowns", "many"], ["--unknowns", "'many'"]),
     "no such study": (["study", "hok"], ["'hok'", "identify", "did you mean 'hook'"]),
-    "later command": (["sweep", "--set", "E=1"], ["sweep", "not part of this version"]),
+    "option of another command": (["sweep", "--set", "E=1"], ["--set", "warpfea sweep --help"]),
 }
 
 
