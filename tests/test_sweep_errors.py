@@ -85,3 +85,12 @@ def test_designs_short_of_quality_are_listed(tmp_path):
     assert result.status == {1: "no value", 2: "unconverged steps"}
     assert '{"h": null}' in (result.folder / "record.jsonl").read_text()
     assert result.best("h", largest=True)["design"] == 3
+
+
+@pytest.mark.parametrize("values", [[2.5], ["2"], [2, "two"]])
+def test_values_of_another_type_are_refused_before_the_run(tmp_path, values):
+    with pytest.raises(wf.ModelError, match=r"design.over.cells: .* is not of type int"):
+        wf.sweep(
+            "cantilever", {"over": {"cells": values}}, measures={"u": "energy.strain"}, engine=1, out=tmp_path / "s"
+        )
+    assert not (tmp_path / "s" / "table.csv").exists()

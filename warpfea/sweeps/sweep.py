@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from ..base.checks import check_positive, is_count
+from ..base.checks import check_positive, is_count, is_number
 from ..base.console import progress_bar
 from ..base.devices import find_device
 from ..base.errors import CheckpointError, Error, ModelError
@@ -180,6 +180,11 @@ def _make_study(
     for name in points.columns:
         if "." not in name and name != "gravity":
             check_keys("design.over", {name: None}, [*found.parameters, "gravity"])
+        parameter = found.parameters.get(name)
+        for value in points.columns[name] if parameter and parameter.kind in (int, float) else ():
+            if not is_number(value) or (parameter.kind is int and value != int(value)):
+                hint = ": samples take whole = true" if is_number(value) else ""
+                raise ModelError(f"design.over.{name}: {value!r} is not of type {parameter.kind_name}{hint}")
     return study
 
 
