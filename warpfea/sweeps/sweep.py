@@ -181,7 +181,9 @@ def _make_study(
         if "." not in name and name != "gravity":
             check_keys("design.over", {name: None}, [*found.parameters, "gravity"])
         parameter = found.parameters.get(name)
-        for value in points.columns[name] if parameter and parameter.kind in (int, float) else ():
+        if parameter is None or parameter.kind not in (int, float):
+            continue
+        for value in points.columns[name]:
             if not is_number(value) or (parameter.kind is int and value != int(value)):
                 hint = ": samples take whole = true" if is_number(value) else ""
                 raise ModelError(f"design.over.{name}: {value!r} is not of type {parameter.kind_name}{hint}")
