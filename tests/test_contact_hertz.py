@@ -8,6 +8,23 @@ MOST_NEWTON = 50
 """Iterations of a load step in which points begin to slip."""
 
 
+@pytest.mark.parametrize("nu", [0.3, 0.45])
+def test_pressure_is_hertz_with_the_stiffness_of_the_region(nu):
+    """Times 300: held."""
+    rows = content_of("contact_hertz_region_cpu.json", device="cpu")["hertz"]
+    row = max((row for row in rows if row["nu"] == nu), key=lambda row: row["unknowns"])
+    assert row["stiffness"] == 300.0
+    assert 0.0 < row["penalty_share"] < 0.01
+    assert abs(row["a_error"]) < 0.03
+    assert abs(row["p0_error"]) < 0.03
+
+
+def test_slip_is_mindlin_with_the_stiffness_of_the_region():
+    (row,) = content_of("contact_hertz_region_cpu.json", device="cpu")["mindlin"]
+    for name in ("slope_ratio_error", "full_slip_first_error", "full_slip_fitted_error"):
+        assert abs(row[name]) < 0.05
+
+
 @pytest.fixture(scope="module")
 def result():
     content = content_of("contact_hertz_cpu.json", "python -m tests.validation contact", "cpu")

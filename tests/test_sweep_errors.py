@@ -94,3 +94,17 @@ def test_values_of_another_type_are_refused_before_the_run(tmp_path, values):
             "cantilever", {"over": {"cells": values}}, measures={"u": "energy.strain"}, engine=1, out=tmp_path / "s"
         )
     assert not (tmp_path / "s" / "table.csv").exists()
+
+
+@pytest.mark.parametrize(
+    ("axis", "start", "words"),
+    [
+        ({"low": 1e5, "high": 1e9}, {"E": 1e6}, "start.E is unknown; there are bar.E"),
+        ({"low": 1e5, "high": 1e9}, {"bar.E": 1e4}, "start.bar.E = 10000.0 is not in its range"),
+        ({"low": 1, "high": 9, "whole": True}, {}, "whole and count are of designs"),
+    ],
+)
+def test_bad_starts_and_ranges_of_a_fit_are_refused(axis, start, words):
+    record = {"probe.tip.displacement.z": ([0.01], [0.0])}
+    with pytest.raises(wf.ModelError, match=words):
+        wf.fit("cantilever", {"bar.E": axis}, record, method="least_squares", start=start)

@@ -26,6 +26,7 @@ __all__ = [
     "BlockKey",
     "FacetTables",
     "HostBlock",
+    "at_points",
     "density_of",
     "facet_area_vectors",
     "facet_areas",
@@ -384,7 +385,7 @@ def facet_tables(surface: SurfaceSet, parts: int = 1, rules: Mapping[int, Rule] 
     return FacetTables(conn, table[0], table[1], table[2], weights)
 
 
-def _at_points(functions: np.ndarray, values: np.ndarray) -> np.ndarray:
+def at_points(functions: np.ndarray, values: np.ndarray) -> np.ndarray:
     """(F, Q, 3) sums of slot values (F, n, 3) with functions (F, Q, n); einsum of all components takes four times as
     long."""
     return np.stack([np.einsum("fqi,fi->fq", functions, values[:, :, k]) for k in range(3)], axis=2)
@@ -392,7 +393,7 @@ def _at_points(functions: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 def facet_positions(body: Discretisation, t: FacetTables) -> np.ndarray:
     """(F, Q, 3) reference positions of face points, m."""
-    return _at_points(t.shape, body.reference[t.conn]) + body.origin
+    return at_points(t.shape, body.reference[t.conn]) + body.origin
 
 
 def facet_area_vectors(body: Discretisation, t: FacetTables) -> np.ndarray:
@@ -401,7 +402,7 @@ def facet_area_vectors(body: Discretisation, t: FacetTables) -> np.ndarray:
     for first in range(0, len(out), MAX_CHUNK_FACETS):
         rows = slice(first, first + MAX_CHUNK_FACETS)
         x = body.reference[t.conn[rows]]
-        out[rows] = np.cross(_at_points(t.d_a[rows], x), _at_points(t.d_b[rows], x))
+        out[rows] = np.cross(at_points(t.d_a[rows], x), at_points(t.d_b[rows], x))
     return out
 
 

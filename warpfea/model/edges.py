@@ -9,7 +9,7 @@ import numpy as np
 
 from ..elements import Rule
 from ..kernels.contact.edges import EDGE_MARGIN
-from .assembly import _at_points, facet_tables
+from .assembly import at_points, facet_tables
 from .contact_points import ContactPoints, element_edge_and_depth
 from .handles import SurfaceSet
 
@@ -60,7 +60,7 @@ def sharp_edges_of(surface: SurfaceSet, *, both: bool = False) -> Edges:
     facet, side = np.nonzero(np.arange(max(corners.values())) < sides[:, None])
     conn, (shape, into, along) = _on_sides(surface, facet, side, np.array([0.5]))
     e = surface.body.reference[conn]
-    x, inward, tangent = (_at_points(s, e)[:, 0] for s in (shape, into, along))
+    x, inward, tangent = (at_points(s, e)[:, 0] for s in (shape, into, along))
     normal = np.cross(tangent, inward)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     key = np.round(x / (1e-7 * np.ptp(x, axis=0).max())).astype(np.int64)

@@ -14,7 +14,7 @@ from ..base.devices import find_device
 from ..base.errors import ConvergenceError, ModelError
 from ..base.names import check_choice
 from ..builder.scene import Scene, locate
-from .design import as_range
+from .design import as_range, check_keys
 from .measures import RECORDS, Measure, parse_measures
 from .worker import FAILED_WORLD, Group, Study
 
@@ -90,6 +90,9 @@ class Candidates:
     def __init__(self, scene: Any, parameters: Any, record: Any, fixed: dict[str, Any], run: dict[str, Any]) -> None:
         self.scene = locate(scene) if isinstance(scene, str) else scene
         self.ranges = {name: as_range(f"parameters.{name}", axis) for name, axis in parameters.items()}
+        for name, axis in self.ranges.items():
+            if axis["whole"] or "count" in axis:
+                raise ModelError(f"parameters.{name}: a fit takes low, high and log; whole and count are of designs")
         self.curves = parse_measures("record", {text: text for text in record})
         for text, curve in self.curves.items():
             check_choice(f"record.{text}: the kind", curve.kind, tuple(RECORDS))
@@ -173,8 +176,13 @@ class Candidates:
             return ((rows[1:] - rows[0]) / step[:, None]).T
 
         first = np.full(size, 0.5)
+        check_keys("start", start, self.ranges)
         for k, (name, axis) in enumerate(self.ranges.items()):
             if name in start:
+                if not axis["low"] <= start[name] <= axis["high"]:
+                    raise ModelError(
+                        f"start.{name} = {start[name]!r} is not in its range, {axis['low']} to {axis['high']}"
+                    )
                 low, at, high = (math.log(v) if axis["log"] else v for v in (axis["low"], start[name], axis["high"]))
                 first[k] = (at - low) / (high - low)
         self.residuals(first[:, None])

@@ -317,8 +317,7 @@ def position_slots(model: Any, whole: str) -> np.ndarray:
     if name not in bodies:
         known = f"bodies are {', '.join(bodies)}{did_you_mean(name, bodies)}"
         raise ModelError(f"{whole}: expected velocity.BODY or velocity.BODY.x; {known}")
-    slots = np.arange(model.slots)[bodies[name].slots]
-    return slots[model.slot_table.kind[slots] == 0]
+    return np.arange(model.slots)[bodies[name].slots][bodies[name].slot_kind == 0]
 
 
 def describe(error: BaseException) -> str:
