@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from contact_runs import DEVICES
 
 import warpfea as wf
 from warpfea.contact.colliders import ColliderContact
@@ -75,7 +76,10 @@ class Slide:
     edge: np.ndarray
 
 
-def sliding(shapes, steps=100, *, E=1e8, paths=None, yaw=0.0, dtype="float64", integrator="backward_euler", **options):
+def sliding(
+    shapes, steps=100, *, E=1e8, paths=None, yaw=0.0, dtype="float64", device="cpu", integrator="backward_euler",
+    **options,
+):  # fmt: skip
     """A block that slides along x over shapes, or meshes as clamped bodies."""
     b = wf.ModelBuilder()
     c, s = np.cos(np.radians(yaw)), np.sin(np.radians(yaw))
@@ -86,7 +90,7 @@ def sliding(shapes, steps=100, *, E=1e8, paths=None, yaw=0.0, dtype="float64", i
     b.set_initial(block, velocity=(SPEED, 0.0, 0.0))
     for k, shape in enumerate(shapes):
         b.add_contact(block, added(b, shape, f"floor {k}", paths[k] if paths else None), **options)
-    model = b.finalize(device="cpu", dtype=dtype)
+    model = b.finalize(device=device, dtype=dtype)
     sim = wf.Simulation(
         model, dt=DT, integrator=integrator, solver=wf.NewtonPCG(tol=1e-10 if dtype == "float64" else 1e-6)
     )
@@ -147,6 +151,14 @@ def test_a_block_slides_over_a_seam(name):
     assert out.velocity[:2] == pytest.approx([SPEED, 0.0], abs=1e-6)
     assert np.abs(out.spin).max() < 1e-3
     assert np.abs(out.edge[-1, :, 2]).max() < 1e-4
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_a_block_slides_over_a_seam_of_bodies_in_both_precisions(device, dtype):
+    out = sliding(slabs(0.002), E=1e7, dtype=dtype, device=device)
+    assert out.velocity == pytest.approx([SPEED, 0.0, 0.0], abs=1e-6)
+    assert np.abs(out.spin).max() < 1e-3
 
 
 SMALL_STEPS = {
