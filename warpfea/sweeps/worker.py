@@ -208,14 +208,13 @@ class Group:
         self.plan = dataclasses.asdict(sim.plan)
         self.device = model.device.name if model.device.is_cuda else "cpu"
         failed = sim.status == FAILED_WORLD
-        values = {name: measure(sim) for name, measure in study.measures.items()}
+        measured = zip(*(np.asarray(measure(sim), dtype=float).tolist() for measure in study.measures.values()))
         series = {name: measure.series(sim) for name, measure in study.series.items()}
         times = next(iter(study.series.values())).times(sim) if series else np.zeros((worlds, 0))
         seconds, rows = (clock.perf_counter() - began) / worlds, []
-        for world, (index, _) in enumerate(designs):
-            kept = {name: float(column[world]) for name, column in values.items()}
+        for world, ((index, _), found, rough) in enumerate(zip(designs, measured, sim.totals["rough"].tolist())):
             curves = {"time": times[world]} | {name: of[world] for name, of in series.items()} if series else {}
-            rows.append(Row(index, *_quality(kept, int(sim.totals["rough"][world])), curves, seconds, worlds))
+            rows.append(Row(index, *_quality(dict(zip(study.measures, found)), rough), curves, seconds, worlds))
         for world in np.flatnonzero(failed).tolist():
             (again,) = self.solve([designs[world]])
             rows[world] = again._replace(alone=again.status)
@@ -242,13 +241,12 @@ class Group:
         return sim
 
 
-def _quality(values: dict[str, float], rough: int) -> tuple[str, dict[str, float | None], str]:
+def _quality(values: dict[str, float], rough: int) -> tuple[str, Mapping[str, float | None], str]:
     """Status of a finished run, its values, None for those that are not finite, and what it lacks."""
-    kept = {name: value if math.isfinite(value) else None for name, value in values.items()}
-    empty = [name for name in kept if kept[name] is None]
-    if empty:
-        return "no value", kept, f"{', '.join(empty)}: not finite"
-    return ("unconverged steps", kept, f"{rough} steps above the tolerance") if rough else ("done", kept, "")
+    if not all(map(math.isfinite, values.values())):
+        kept = {name: value if math.isfinite(value) else None for name, value in values.items()}
+        return "no value", kept, f"{', '.join(name for name in kept if kept[name] is None)}: not finite"
+    return ("unconverged steps", values, f"{rough} steps above the tolerance") if rough else ("done", values, "")
 
 
 def _silent(done: int, total: int, name: str) -> None:
