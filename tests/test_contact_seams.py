@@ -156,8 +156,9 @@ def test_a_block_slides_over_a_seam(name):
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_a_block_slides_over_a_seam_of_bodies_in_both_precisions(device, dtype):
+    """In float32 100 solves to 1e-6 leave 1e-7 on the CPU and 1.05e-6 on CUDA, in float64 1e-14."""
     out = sliding(slabs(0.002), E=1e7, dtype=dtype, device=device)
-    assert out.velocity == pytest.approx([SPEED, 0.0, 0.0], abs=1e-6)
+    assert out.velocity == pytest.approx([SPEED, 0.0, 0.0], abs=1e-12 if dtype == "float64" else 5e-6)
     assert np.abs(out.spin).max() < 1e-3
 
 

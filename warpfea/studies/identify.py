@@ -5,8 +5,7 @@ A finger of rubber, 0.12 x 0.02 x 0.02 m of T10, is clamped at one end and let g
 eta that the search does not know. scipy's differential evolution looks for both, a generation at a time: each candidate
 is a world of one model (`wf.fit`). The misfit is the mean square of the differences of all samples.
 
-tests/results/identify_cpu.json and identify_h200.json, with 4096 worlds, are the committed results; they were made by
-a loop that reset one simulation.
+tests/results/identify_cpu.json and identify_h200.json, with 4096 worlds, are the committed results.
 """
 
 import argparse
