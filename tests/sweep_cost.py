@@ -29,7 +29,7 @@ from warpfea.sweeps import PoolEngine
 MODELS = pathlib.Path(__file__).resolve().parent / "sweep_models.py"
 
 
-def efficiency(designs: int = 100, steps: int = 400) -> dict[str, Any]:
+def efficiency(designs: int = 100, steps: int = 1400) -> dict[str, Any]:
     """Two processes, each design a model of its own: share of the ideal, and overhead per design, s."""
     rows = [{"E": float(E)} for E in 10.0 ** np.random.default_rng(1).uniform(7, 8, designs)]
     how: dict[str, Any] = {"measures": {"tip": "probe.tip.displacement.z"}, "parameters": {"cells": 20}}
