@@ -18,7 +18,7 @@ from .facet_search import PENETRATED, facet_search_kernels
 from .facet_structs import facet_side_struct, master_struct, pair_scratch_struct
 from .kinematics import GEOMETRIES, kinematics_functions
 from .projection import facet_projection_functions
-from .structs import FREE, IN_REACH, INACTIVE, PASSED, WITH_STIFFNESS, contact_structs
+from .structs import FREE, IN_REACH, INACTIVE, PASSED, TURNED, WITH_STIFFNESS, contact_structs
 
 __all__ = ["facet_kinematics", "master_kernels"]
 
@@ -75,6 +75,8 @@ def facet_kinematics(dtype: str) -> KernelSet:
         )
         out.normal = other.scratch.normal[world, point]
         out.depth = other.scratch.depth[world, point]
+        if out.depth > f64(0.0) and search.has_turned_over(other.scratch, world, f):
+            out.state = TURNED
         out.previous_depth = other.scratch.initial_depth[world, point]
         out.spring = other.scratch.spring[world, point]
         depth = other.masters.element_depth[f]

@@ -39,6 +39,7 @@ def facet_search_kernels(dtype: str, seams: bool = False) -> KernelSet:
     k, f = kinematics_functions(dtype), facet_projection_functions(dtype)
     surface_point, facet_value, displacement_change = f.surface_point, f.facet_value, f.displacement_change
     distance_outside, inverse_map, project_on_facet = f.distance_outside, f.inverse_map, f.project_on_facet
+    unit_normal = f.unit_normal
     FacetPoint, boxes, candidates = f.FacetPoint, broad_phase_kernels(dtype), facet_candidate_functions(dtype)
     SlavePoint, slave_point, slave_point_at = candidates.SlavePoint, candidates.slave_point, candidates.slave_point_at
     module = kernel_module(f"facet_search_{dtype}{SEAMS_SUFFIX * seams}", max_unroll=SHORT_UNROLL)
@@ -154,6 +155,13 @@ def facet_search_kernels(dtype: str, seams: bool = False) -> KernelSet:
         pair.empty_box_refit[world, row] = pair.refit_count[0]
         pair.empty_box_lower[world, row] = boxes.round_down(low - wide)
         pair.empty_box_upper[world, row] = boxes.round_up(high + wide)
+
+    @wp.func
+    def has_turned_over(pair: PairScratch, world: int, f: int) -> bool:
+        """True if a facet has turned by more than a right angle in the attempt: motions along chords say nothing."""
+        old = boxes.unpack_facet_point(pair.start_facet_centre[world, f])
+        new = boxes.unpack_facet_point(pair.facet_centre[world, f])
+        return wp.dot(unit_normal(old), unit_normal(new)) < f64(0.0)
 
     @wp.func
     def facet_frame(s: FacetPoint) -> wp.mat33d:

@@ -359,6 +359,12 @@ class FacetContact(ContactTerm, Tied, Coupled):
     def add_coarse_coupling(self, ctx: StepContext, cached: list[wp.array], dq_dv: wp.array, active: wp.array) -> None:
         ctx.scratch[self.name]["coarse"].add(cached, dq_dv, active)
 
+    def _turn_text(self, contact: Any) -> str:
+        return (
+            f"a facet of {contact.texts[1]} turns by more than a right angle in the step, in which it is touched; take "
+            "a smaller dt"
+        )
+
     def _contact_info(self, contact: Any, k: int) -> dict[str, Any]:
         return {"facets": len(self.tables.masters[self.tables.master_of[k]].conn), "left_out": 0}
 
