@@ -43,6 +43,9 @@ MAX_INITIAL_VIOLATION = 1e-4
 MIN_OVERLOAD_RATIO = 0.3
 """Smallest reported nominal stress over E."""
 
+MAX_CRUSHED_J = 0.1
+"""Ratio of volumes below which a message names the most compressed element."""
+
 
 def step_error(sim: Any, world: int) -> ConvergenceError | ConstraintError:
     """Error of a world whose step was rejected after all halvings."""
@@ -59,10 +62,11 @@ def step_error(sim: Any, world: int) -> ConvergenceError | ConstraintError:
         return _constraint_error(sim, world, time, halvings)
     count = int(work.newton.iterations.numpy()[world]) + 1
     history = work.newton.norms.residual_history.numpy()[world, :count].tolist()
-    if code in (codes.Failure.JACOBIAN, codes.Failure.ELEMENT_INVERTED):
-        element, where = lowest_jacobian(sim.model, work.u.numpy()[world].astype(float))
-    else:
+    J, element, where = lowest_jacobian(sim.model, work.u.numpy()[world].astype(float))
+    if code not in (codes.Failure.JACOBIAN, codes.Failure.ELEMENT_INVERTED):
+        crushed = f"; most compressed: {where}" if J < MAX_CRUSHED_J else ""
         element, where = _worst_element(sim.model, work.g.numpy()[world])
+        where += crushed
     reason, hint = _failure_reason(sim, code, world)
     if sim.integrator.stabilise and work.step.mass_factor.numpy()[world] == 0.0:
         hint += (

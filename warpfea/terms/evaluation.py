@@ -250,8 +250,8 @@ def _is_first(block: Any) -> bool:
     return block.key.part == 0 and block.key.scheme not in get_family(block.key.family).output_schemes
 
 
-def lowest_jacobian(model: Model, u: np.ndarray) -> tuple[int, str]:
-    """Model index and description of the element with the smallest J at points and vertices; u (slots, 3), m."""
+def lowest_jacobian(model: Model, u: np.ndarray) -> tuple[float, int, str]:
+    """Smallest J at points and vertices, model index and description of its element; u (slots, 3), m."""
     best, index, text = np.inf, -1, "no element"
     needs_positive_J = any(block.key.law not in DEFINED_FOR_ANY_J for block in model.blocks)
     for block in model.blocks:
@@ -270,7 +270,7 @@ def lowest_jacobian(model: Model, u: np.ndarray) -> tuple[int, str]:
                 if not J[low] >= best:
                     best, index = float(J[low]), body.element_offset + int(members[low])
                     text = f"element {int(members[low])} of body {body.name!r} (J = {best:.3g})"
-    return index, text
+    return best, index, text
 
 
 def _extrapolation_matrix(rule: Rule, at: np.ndarray) -> np.ndarray:
