@@ -10,6 +10,7 @@ import warp as wp
 import warpfea as wf
 from warpfea.contact.facets import FacetContact
 from warpfea.solvers import choice
+from warpfea.solvers.matrix_assembly import MAX_FULL_FACTOR_SLOTS
 
 SIDE = 0.2
 
@@ -127,7 +128,7 @@ def system(loop):
 @pytest.mark.parametrize("element", ["T4", "T10"])
 @pytest.mark.parametrize("held", ["xyz", "z"])
 def test_the_correction_is_that_of_the_coupled_motions(element, held):
-    model = stack(3, 1e6, element=element, cells=1, held=held, foreign=True)
+    model = stack(3, 1e6, element=element, cells={"T4": 3, "T10": 1}[element], held=held, foreign=True)
     sim = simulation(model, "banded")
     rng = np.random.default_rng(3)
     found = []
@@ -157,7 +158,7 @@ def test_the_correction_is_that_of_the_coupled_motions(element, held):
 
 @pytest.mark.parametrize("element", ["T4", "T10"])
 def test_the_coarse_level_is_that_of_the_coupled_bodies(element):
-    model = stack(3, 1e6, element=element, cells=2, foreign=True)
+    model = stack(3, 1e6, element=element, cells={"T4": 3, "T10": 2}[element], foreign=True)
     sim = simulation(model, "two-level")
     rng = np.random.default_rng(3)
     found = []
@@ -183,11 +184,35 @@ def test_the_coarse_level_is_that_of_the_coupled_bodies(element):
     assert weights.max() > 0.1  # and what couples them counts
 
 
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("kind", ["banded", "two-level"])
+@pytest.mark.parametrize("element", ["T4", "T10"])
+def test_small_models_are_factored_with_their_couplings(element, kind, dtype):
+    sim = simulation(stack(2, 1e6, element=element, cells=1, foreign=True, dtype=dtype), kind, forcing=1e-5)
+    assert sim.model.slots <= MAX_FULL_FACTOR_SLOTS
+    found, counts = [], []
+
+    def after(loop):
+        whole, cross = system(loop)
+        of_body = np.repeat(np.arange(len(sim.model.bodies)), [3 * body.slot_count for body in sim.model.bodies])
+        between = of_body[:, None] != of_body
+        error = np.abs(np.where(between, whole, 0.0) - cross).max() / np.abs(whole).max()
+        found.append((error, np.abs(cross).max() / np.abs(whole).max()))
+        counts.append(int(sim.stepper.work.pcg.iterations.numpy()[0]))
+
+    watch(sim, after)
+    sim.step(3)
+    errors, weights = np.array(found).T
+    assert errors.max() < {"float64": 1e-14, "float32": 1e-6}[dtype]
+    assert weights.max() > 0.1  # and they count
+    assert max(counts) <= 6, counts
+
+
 def test_bodies_that_touch_no_free_one_have_no_motions():
     model = stack(1, 1e6)
     assert choice.mode_bodies(model) == {}
     assert simulation(model, "banded").stepper.newton.preconditioner.body_modes is None
-    assert choice.mode_bodies(stack(2, 1e6, foreign=True)) == {1: 0, 2: 1}
+    assert choice.mode_bodies(stack(2, 1e6, cells=4, foreign=True)) == {1: 0, 2: 1}
 
 
 @pytest.mark.parametrize("kind", ["banded", "two-level"])

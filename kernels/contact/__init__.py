@@ -10,8 +10,8 @@ Kinematics: own side of a point (kinematics.py); the geometry of the other side 
 Law: normal force (law.py); friction (friction.py).
 Assembly: forces, products, blocks of any geometry (assembly.py).
 Ledger: history, energies, records of any geometry (ledger.py).
-At a state: evaluation.py. float32: double_displacements.py. Preconditioner: rigid_modes.py. Setup: thickness.py,
-    collider_sheets.py. Bodies without contact: crossings.py.
+At a state: evaluation.py. float32: double_displacements.py. Preconditioner: coupling.py, coarse_terms.py,
+    rigid_modes.py. Setup: thickness.py, collider_sheets.py. Bodies without contact: crossings.py.
 
 Recipes for a law, a rigid shape, a geometry of the other side: warpfea/README.md.
 """

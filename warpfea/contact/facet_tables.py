@@ -139,11 +139,15 @@ class PairTables(FacetTables[FacetOptions]):
     @property
     def slots(self) -> list[np.ndarray]:
         """Model slots of both surfaces of each contact."""
+        return [np.concatenate(sides) for sides in self.slots_by_side]
+
+    @property
+    def slots_by_side(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Model slots of the points and of the facets of each contact."""
         out = []
         for contact, p, k in zip(self.contacts, self.host, self.master_of):
             slave = np.unique(p.conn) + contact.body.slot_offset
-            master = np.unique(self.masters[k].conn) + contact.facets.body.slot_offset
-            out.append(np.concatenate([slave, master]))
+            out.append((slave, np.unique(self.masters[k].conn) + contact.facets.body.slot_offset))
         return out
 
     def build(self, laws: TimeLawTable, pool: int) -> None:

@@ -13,6 +13,7 @@ from ..base.launch import Launcher
 from ..base.worlds import device_flags
 from ..kernels.common.state import state_kernels
 from ..kernels.contact.assembly import block_kernels
+from ..kernels.contact.coupling import coupling_kernels
 from ..kernels.contact.edge_records import edge_record_kernels
 from ..kernels.contact.edges import edge_kernels
 from ..kernels.contact.facet_kinematics import master_kernels
@@ -31,7 +32,7 @@ from ..terms.protocols import Coupled, Tied
 from ..terms.term import StepContext, part
 from .evaluation import contact_field, evaluate_pairs, refuse_deep_overlaps, store_overlaps, touching_depth
 from .facet_tables import PairTables
-from .mode_coupling import PairCoarseTerms, PairRigidModes
+from .mode_coupling import PairCoarseTerms, PairRigidModes, coupling_entries
 from .tables import POINT_SUM_LANES
 from .term import ContactTerm, contact_columns
 
@@ -313,17 +314,35 @@ class FacetContact(ContactTerm, Tied, Coupled):
         self, ctx: StepContext, matrix: Any, cached: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,
         *, projected: bool,
     ) -> None:  # fmt: skip
-        """Stiffness of the points on their own facets and on master facets, without the coupling of both."""
+        """Stiffness of the points on their own facets and on master facets, and the coupling of both where the
+        pattern has it."""
         m = self.model
         lists = point_list_struct()()
-        stiffness, lists.list_size, lists.list_start, lists.list_point, weight, _ = cached
+        stiffness, lists.list_size, lists.list_start, lists.list_point, weight, listed = cached
         self._add_facet_blocks(ctx, matrix, stiffness, weight, dq_dv, active, out)
         index, begin, source, count = m.cache["pairs blocks"][-1]
         args = [m.topology, matrix.pattern.data, lists, index, begin, source, stiffness, weight, dq_dv, active, out]
         ctx.launch(block_kernels(m.dtype, True).add_blocks, (m.worlds, count), args)
+        for group, begin, source, count in m.cache["pairs couplings"]:
+            args = [m.topology, matrix.pattern.data, group.data, ctx.scratch[self.name]["masters"], begin, source]
+            args += [stiffness, weight, listed, dq_dv, active, out]
+            ctx.launch(coupling_kernels(m.dtype).add_couplings, (m.worlds, count), args)
+
+    def allocate_blocks(self, ctx: StepContext, matrix: Any, *, projected: bool) -> None:
+        super().allocate_blocks(ctx, matrix, projected=projected)
+        if "pairs couplings" not in self.model.cache:
+            found = [(group, *coupling_entries(self.tables, group, matrix.pattern)) for group in self.tables.groups]
+            self.model.cache["pairs couplings"] = [row for row in found if row[-1]]
 
     def block_modules(self) -> set[wp.Module]:
-        return super().block_modules() | {block_kernels(self.model.dtype, True).module}
+        out = super().block_modules() | {block_kernels(self.model.dtype, True).module}
+        return out | ({coupling_kernels(self.model.dtype).module} if self.model.cache["pairs couplings"] else set())
+
+    def coupled_slot_pairs(self) -> tuple[np.ndarray, np.ndarray]:
+        both = [sides for c, sides in zip(self.tables.contacts, self.tables.slots_by_side) if not c.grounded]
+        grids = [np.stack(np.meshgrid(*sides)).reshape(2, -1) for sides in both]
+        a, b = np.concatenate([np.zeros((2, 0), dtype=np.int64), *grids], axis=1)
+        return a, b
 
     def coupled_bodies(self) -> list[tuple[int, int]]:
         return self._coupled_bodies

@@ -1,4 +1,4 @@
-"""Couplings of the bodies by their contacts, in the coarse matrices of preconditioners."""
+"""Couplings of the bodies by their contacts, in the matrices of small models and in coarse matrices."""
 
 from __future__ import annotations
 
@@ -9,10 +9,27 @@ import warp as wp
 
 from ..kernels.contact.coarse_terms import coarse_groups_struct, coarse_term_kernels
 from ..kernels.contact.rigid_modes import pair_rigid_mode_kernels
+from ..model.assembly import grouped_items
 from ..terms.term import StepContext
 from .facet_tables import PairTables
 
-__all__ = ["PairCoarseTerms", "PairRigidModes"]
+__all__ = ["PairCoarseTerms", "PairRigidModes", "coupling_entries"]
+
+
+def coupling_entries(tables: PairTables, group: Any, pattern: Any) -> tuple[wp.array, wp.array, int]:
+    """Entries of a pattern that couple the points of a facet group with their other side: start of the items of each,
+    the items (facet, its local slot, slot of the other side, entry), and the number of entries."""
+    m, found = tables.model, [np.zeros((0, 3), dtype=np.int64)]
+    for k in (k for k in group.contacts if not tables.contacts[k].grounded):
+        first = (tables.first[k : k + 2] - group.data.first_point) // group.data.point_count
+        local, other = np.arange(group.conn.shape[1]), tables.slots_by_side[k][1]
+        found.append(np.stack(np.meshgrid(np.arange(*first), local, other, indexing="ij"), axis=-1).reshape(-1, 3))
+    source = np.concatenate(found)
+    a, b = group.conn[source[:, 0], source[:, 1]], source[:, 2]
+    upper = pattern.find_upper(np.minimum(a, b), np.maximum(a, b))
+    chosen, entry, start = grouped_items(upper)
+    items = np.column_stack([source, upper])[chosen]
+    return m.array("contact", start, wp.int32), m.array("contact", items, wp.vec4i), len(entry)
 
 
 class PairRigidModes:

@@ -21,7 +21,7 @@ import warp as wp
 from ..base.errors import ModelError
 from ..kernels.solvers.band import BLOCK, band_kernels, block_column_type
 from ..kernels.solvers.band_block import band_block_kernels, window_size
-from .matrix_assembly import coupling_pattern
+from .matrix_assembly import MAX_FULL_FACTOR_SLOTS, coupling_pattern
 
 if TYPE_CHECKING:
     from ..base.launch import Launcher
@@ -33,9 +33,6 @@ __all__ = ["Band", "BandFactor", "find_band", "fits_thread_block"]
 
 MAX_AUTO_WIDTH = 112
 """Widest band chosen automatically, blocks beside the diagonal; beyond it the two-level preconditioner is cheaper."""
-MAX_FULL_FACTOR_SLOTS = 160
-"""Largest number of slots (3-vector unknowns) of a model factored as a whole: here in a band of any width, or else as
-a dense matrix."""
 MAX_FACTOR_BYTES = 2**31
 """Size of the factors of one world above which 32-bit indices overflow, bytes."""
 MAX_WINDOW_BYTES, MAX_WORLD_FACTOR_BYTES = 48 * 1024, 200_000

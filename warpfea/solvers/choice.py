@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 from ..base.errors import ModelError
 from ..terms.protocols import Coupled
-from .band import MAX_FULL_FACTOR_SLOTS, Band, find_band, fits_thread_block
+from .band import Band, find_band, fits_thread_block
 from .jacobi import Jacobi
+from .matrix_assembly import MAX_FULL_FACTOR_SLOTS
 from .newton import NewtonPCG
 from .plan import BLOCK_PRECONDITIONERS, SolverPlan
 from .rigid_body_modes import mode_bodies

@@ -11,9 +11,9 @@ import warp as wp
 
 from ..kernels.solvers.levels import TILE_SLOTS, level_struct
 from ..model.partition import bisect_groups, connected_groups
-from .band import MAX_FULL_FACTOR_SLOTS, Band
+from .band import Band
 from .dense import DenseComponents
-from .matrix_assembly import Pattern, make_pattern
+from .matrix_assembly import MAX_FULL_FACTOR_SLOTS, Pattern, make_pattern
 
 if TYPE_CHECKING:
     from ..model.model import Model

@@ -18,14 +18,26 @@ from ..kernels.common.structs import pattern_struct
 from ..kernels.elements.matrix import panel_layout, panel_row_type
 from ..kernels.solvers.blocks import assembly_kernels
 from ..model.assembly import slot_graph
-from ..terms.protocols import Preconditioned
+from ..terms.protocols import Coupled, Preconditioned
 
 if TYPE_CHECKING:
     from ..base.launch import Launcher
     from ..model.model import Model
     from ..terms.workspace import Workspace
 
-__all__ = ["MatrixAssembler", "Pattern", "coupling_pattern", "leading_view", "make_pattern", "worlds_per_chunk"]
+__all__ = [
+    "MatrixAssembler",
+    "Pattern",
+    "couples_slots",
+    "coupling_pattern",
+    "leading_view",
+    "make_pattern",
+    "worlds_per_chunk",
+]
+
+MAX_FULL_FACTOR_SLOTS = 160
+"""Largest number of slots (3-vector unknowns) of a model factored as a whole: in a band of any width, or else as a
+dense matrix, with the couplings of bodies in contact."""
 
 
 def transposed_entries(graph: sp.csr_matrix) -> np.ndarray:
@@ -77,14 +89,24 @@ def make_pattern(model: Model, graph: sp.csr_matrix, *, with_upper: bool = True)
     return Pattern(graph, data, upper)
 
 
+def couples_slots(model: Model) -> bool:
+    """True if matrices hold the couplings of bodies by terms, as of a model factored as a whole."""
+    return model.slots <= MAX_FULL_FACTOR_SLOTS
+
+
 def coupling_pattern(model: Model) -> sp.csr_matrix:
-    """Pattern (slots, slots) of slots that share an element or an item of a term, rows sorted."""
+    """Pattern (slots, slots) of slots that share an element or an item of a term, or in small models may come in
+    contact; rows sorted."""
     if "coupled slots" not in model.cache:
         graph = slot_graph(model.blocks, model.slots)
         for item, slot, count in filter(None, (term.incidence() for term in model.terms.having(Preconditioned))):
             touched = sp.csr_matrix((np.ones(len(item), dtype=np.int8), (item, slot)), (count, model.slots))
             touched.data[:] = 1
             graph = graph + sp.csr_matrix(touched.T.astype(np.int32) @ touched.astype(np.int32)).astype(np.int8)
+        for term in model.terms.having(Coupled) if couples_slots(model) else ():
+            a, b = term.coupled_slot_pairs()
+            one_sided = sp.csr_matrix((np.ones(len(a), dtype=np.int8), (a, b)), graph.shape)
+            graph = graph + one_sided + one_sided.T
         graph = graph.tocsr()
         graph.sort_indices()
         model.cache["coupled slots"] = graph

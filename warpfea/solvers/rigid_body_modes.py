@@ -12,6 +12,7 @@ from ..kernels.solvers.rigid_body_modes import rigid_mode_kernels
 from ..terms.protocols import Coupled
 from .dense import DenseInverse
 from .levels import MAX_BOTTOM_SLOTS
+from .matrix_assembly import couples_slots
 
 if TYPE_CHECKING:
     from ..base.launch import Launcher
@@ -36,8 +37,11 @@ def lanes_for(count: int) -> int:
 def mode_bodies(model: Model) -> dict[int, int]:
     """Mode index of each body that a term couples to another body with free rigid body modes.
 
-    Bodies without free modes are omitted; the map is empty if the matrix would be too large to invert.
+    Bodies without free modes are omitted; the map is empty if the matrix would be too large to invert, or if the
+    model is factored with the couplings.
     """
+    if couples_slots(model):
+        return {}
     free = [bool(allowed.any()) for allowed in map(_free_modes, [model] * len(model.bodies), range(len(model.bodies)))]
     terms = model.terms.having(Coupled)
     pairs = [(a, b) for term in terms for a, b in term.coupled_bodies() if a != b and free[a] and free[b]]

@@ -165,8 +165,13 @@ class Coupled(Term):
     """Term whose tangent couples bodies that share no element."""
 
     def coupled_bodies(self) -> list[tuple[int, int]]:
-        """Body pairs coupled by the tangent but not by `blocks`: the rest is added by `add_mode_coupling`."""
+        """Body pairs coupled by the tangent; by `blocks` only where the pattern has their `coupled_slot_pairs`, else in
+        the coarse space by `add_mode_coupling` or `add_coarse_coupling`."""
         return []
+
+    def coupled_slot_pairs(self) -> tuple[np.ndarray, np.ndarray]:
+        """Pairs of slots, (n,) each, that the tangent may couple: in the pattern of small models."""
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
 
     def allocate_mode_coupling(self, ctx: StepContext, rigid_modes: Any) -> Iterable[wp.Module]:
         """Allocate for `add_mode_coupling` before launches are captured; returns its modules."""
