@@ -51,14 +51,17 @@ def test_pressure_is_hertz(result, nu):
 
 
 def test_tangential_stiffness_and_full_slip_are_mindlin(result):
-    (row,) = result["mindlin"]
+    """Stiffnesses are off by the mesh's error: between the even zone and 60 radii, five or eight layers of elements."""
+    coarse, row = result["mindlin"]
+    assert row["unknowns"] > 2 * coarse["unknowns"]
     assert row["nu"] == 0.45
     assert row["depth_over_a"] >= 40.0
     assert row["first_share"] < 0.05
     assert row["stiffness"] is None
-    assert abs(row["slope_ratio_error"]) < 0.03
-    assert abs(row["full_slip_first_error"]) < 0.05  # steps near it are 2.5 % of it
-    assert abs(row["full_slip_fitted_error"]) < 0.03
+    names = ("slope_ratio", "normal_stiffness", "tangential_stiffness", "full_slip_first", "full_slip_fitted")
+    for name in names:
+        assert abs(row[f"{name}_error"]) < 0.03
+        assert abs(row[f"{name}_error"]) < abs(coarse[f"{name}_error"])
     assert row["halvings"] == 0
     assert row["newton_most"] <= MOST_NEWTON
 

@@ -400,7 +400,7 @@ def stack_case(
 CASES: dict[str, tuple[str, Callable[..., Row], list[Row]]] = {
     "hertz": ("two meshes at two Poisson's ratios", hertz_case,
               [{"nu": nu, "inner": i, "outer": o} for nu in (0.3, 0.45) for i, o in ((4, 5), (6, 6))]),
-    "mindlin": ("one row", mindlin_case, [{}]),
+    "mindlin": ("two meshes", mindlin_case, [{"outer": outer} for outer in (5, 8)]),
     "rebound": ("the run, and with a quarter of its step and half its mesh size", rebound_case,
                 [{"cells": 8 * k, "steps": 50 * k**2} for k in (1, 2)]),
     "wall": ("both tetrahedra", wall_case, [{"element": name} for name in ("T4", "T10")]),
