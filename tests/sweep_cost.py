@@ -12,6 +12,7 @@ From the root of a checkout. Seconds are those of the clock: no other work on th
 from __future__ import annotations
 
 import argparse
+import csv
 import pathlib
 import resource
 import sys
@@ -38,7 +39,7 @@ def efficiency(designs: int = 100, steps: int = 1400) -> dict[str, Any]:
         wf.sweep(f"{MODELS}:bar", rows[:2], run={"device": "cpu", "t_end": 0.01}, engine=engine, **how)  # kernels
         run = {"device": "cpu", "t_end": steps * 5e-3}
         result = wf.sweep(f"{MODELS}:bar", rows, run=run, engine=engine, **how)
-        seconds = np.loadtxt(result.folder / "times.csv", delimiter=",", skiprows=1, usecols=5)
+        seconds = _task_seconds(result)
     finally:
         engine.close()
     wall, ideal = result.seconds["run"], float(seconds.sum()) / 2
@@ -46,6 +47,13 @@ def efficiency(designs: int = 100, steps: int = 1400) -> dict[str, Any]:
         "part": "efficiency", "designs": designs, "workers": 2, "failed": len(result.failures), "wall_s": wall,
         "design_s": float(seconds.mean()), "efficiency": ideal / wall, "overhead_s": (wall - ideal) / designs,
     }  # fmt: skip
+
+
+def _task_seconds(result: Any) -> np.ndarray:
+    """Seconds of each task."""
+    with open(result.folder / "times.csv", newline="") as file:
+        rows = [(line["worker"], float(line["task_seconds"])) for line in csv.DictReader(file)]
+    return np.array([seconds for _, seconds in dict.fromkeys(rows)])
 
 
 def many(designs: int = 100_000) -> dict[str, Any]:
@@ -68,8 +76,9 @@ def many(designs: int = 100_000) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def rate(device: str, worlds: int = 65536, steps: int = 300) -> dict[str, Any]:
-    """World-steps per second of a sweep and of one plain batch, each from its models to its table or values."""
+def rate(device: str, worlds: int = 65536, steps: int = 300, repeats: int = 3) -> dict[str, Any]:
+    """World-steps per second of a sweep and of one plain batch, each from its models to its table or values: medians
+    of several, in turn."""
     rng = np.random.default_rng(3)
     E, lengths = 10.0 ** rng.uniform(6, 7, worlds), np.repeat([1.0, 1.1], worlds // 2)
     scene, measures = find("pendulum"), {"tip": "probe.tip.displacement.z"}
@@ -86,21 +95,26 @@ def rate(device: str, worlds: int = 65536, steps: int = 300) -> dict[str, Any]:
         return clock.perf_counter() - began, tip
 
     plain(64, 3 * dt)  # kernels
-    plain_s, tip = plain(worlds, t_end)
+    plain_s, sweep_s, task_s = list[float](), list[float](), list[float]()
     engine = PoolEngine(1, gpus=[0]) if device.startswith("cuda") else PoolEngine(1)
     run = {"device": device}
     try:
         few = wf.Design({"length": lengths[:64], "beam.E": E[:64]})
         wf.sweep("pendulum", few, measures=measures, run=run | {"t_end": 3 * dt}, engine=engine)
         design = wf.Design({"length": lengths, "beam.E": E})
-        result = wf.sweep("pendulum", design, measures=measures, run=run | {"t_end": t_end}, engine=engine)
+        for _ in range(repeats):
+            seconds, tip = plain(worlds, t_end)
+            plain_s.append(seconds)
+            result = wf.sweep("pendulum", design, measures=measures, run=run | {"t_end": t_end}, engine=engine)
+            sweep_s.append(result.seconds["run"])
+            task_s.append(float(_task_seconds(result).sum()))
     finally:
         engine.close()
-    sweep_s = result.seconds["run"]
+    of_plain, of_sweep = float(np.median(plain_s)), float(np.median(sweep_s))
     return {
         "part": "rate", "worlds": worlds, "steps": steps, "groups": 2, "failed": len(result.failures),
-        "plain_s": plain_s, "sweep_s": sweep_s, "plain_rate": worlds * steps / plain_s,
-        "sweep_rate": worlds * steps / sweep_s, "ratio": plain_s / sweep_s,
+        "plain_s": plain_s, "sweep_s": sweep_s, "task_s": task_s, "plain_rate": worlds * steps / of_plain,
+        "sweep_rate": worlds * steps / of_sweep, "ratio": of_plain / of_sweep,
         "same_bits": bool((result["tip"][: worlds // 2] == tip[: worlds // 2]).all()),
     }  # fmt: skip
 

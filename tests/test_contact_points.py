@@ -285,6 +285,22 @@ def test_the_stiffest_material_at_the_faces_counts():
     assert effective_modulus(body, body.surface("y-")) == pytest.approx((1e7, 0.2))
 
 
+def test_the_moduli_of_worlds_are_those_of_each():
+    """Bit for bit, of the stiffer of two materials in each world."""
+    mesh = wf.mesh.box((1, 1, 1), cells=(2, 1, 1))
+    mesh = replace(mesh, element_sets={"low": np.arange(6), "high": np.arange(6, len(mesh.cells))})
+    b = wf.ModelBuilder()
+    laws = {"low": wf.SVK(E=1e5, nu=0.4, density=1.0), "high": wf.MooneyRivlin.from_E_nu(E=1e7, nu=0.2, density=1.0)}
+    body = b.add_solid(mesh, material=laws, name="block")
+    model = b.finalize(device="cpu", worlds=3)
+    assert model.parameters.youngs_modulus(body) == effective_modulus(body)[0]
+    model.set_parameter("block.low.E", [1e5, 1e8, 3e6])
+    model.set_parameter("block.high.nu", [0.1, 0.2, 0.3])
+    each = [model.parameters.modulus(world)(body, None)[0] for world in range(3)]
+    assert model.parameters.youngs_modulus(body).tolist() == each
+    assert each == pytest.approx([1e7, 1e8, 1e7])
+
+
 @pytest.mark.parametrize("name", BODIES)
 def test_mass(name):
     body = BODIES[name]()

@@ -172,7 +172,7 @@ class Deadly(Inline):
     """Its workers die of one design."""
 
     def result(self, handle):
-        if any(index == 5 for index, _ in handle.args[2]) and handle.func.__name__ == "solve":
+        if 5 in handle.args[2] and handle.func.__name__ == "solve":
             raise WorkerLost("of design 5")
         return handle()
 
@@ -201,11 +201,11 @@ def test_batches_are_as_large_as_memory_allows(monkeypatch, known):
     """Three worlds fit: the size is that of the error, or a half where it has none."""
     sizes, batch = [], Group.batch
 
-    def limited(self, designs):
+    def limited(self, designs, columns):
         sizes.append(len(designs))
         if len(designs) > 3:
             raise wf.CapacityError("no room", worlds=3 if known else 0)
-        return batch(self, designs)
+        return batch(self, designs, columns)
 
     monkeypatch.setattr(Group, "batch", limited)
     rows = [{"gravity.z": -1.0 * k} for k in range(10)]
@@ -342,7 +342,7 @@ def test_another_plan_is_refused(swept):
 
     lines = [_decode(line) for line in path.read_bytes().splitlines(keepends=True)]
     lines[1]["plan"]["preconditioner"] = "two-level"
-    path.write_bytes(b"".join(map(_encode, lines[:4])))
+    path.write_bytes(b"".join(_encode(json.dumps(line)) for line in lines[:4]))
     with pytest.raises(wf.CheckpointError, match=r"takes .*'banded'.*others took .*'two-level'"):
         wf.sweep(FALL, DESIGN, **how, resume=True)
 

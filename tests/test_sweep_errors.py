@@ -1,5 +1,6 @@
 """Sweeps: errors of machines, files that change, engines after an error, designs short of quality, refused fits."""
 
+import csv
 import time
 
 import pytest
@@ -14,11 +15,11 @@ def test_errors_of_the_machine_are_no_failures_of_designs(monkeypatch):
     """Twice its disk is full: the designs are done again, and have their results."""
     left, batch = [0, 0], Group.batch
 
-    def full(self, designs):
+    def full(self, designs, columns):
         if left:
             left.pop()
             raise OSError("No space left on device")
-        return batch(self, designs)
+        return batch(self, designs, columns)
 
     monkeypatch.setattr(Group, "batch", full)
     rows = [{"gravity.z": -1.0 * k} for k in range(4)]
@@ -108,3 +109,15 @@ def test_bad_starts_and_ranges_of_a_fit_are_refused(axis, start, words):
     record = {"probe.tip.displacement.z": ([0.01], [0.0])}
     with pytest.raises(wf.ModelError, match=words):
         wf.fit("cantilever", {"bar.E": axis}, record, method="least_squares", start=start)
+
+
+def test_names_of_any_kind(tmp_path):
+    """The record and the tables take them as they are."""
+    name = 'tip, "100 %s" {, ' + "\N{GREEK SMALL LETTER DELTA}" * 200
+    how = {"measures": {name: "probe.p.displacement.z"}, "engine": Inline(1), "out": tmp_path / "two words \N{SNOWMAN}"}
+    design = {"over": {"gravity.z": [-1.0, -2.0]}}
+    first = wf.sweep(FALL, design, **how)
+    assert (first[name] == wf.sweep(FALL, design, **how, resume=True)[name]).all()
+    assert first[name] == pytest.approx([-6e-4, -12e-4], rel=1e-9)
+    with open(first.folder / "table.csv", encoding="utf-8", newline="") as file:
+        assert name in next(csv.reader(file))

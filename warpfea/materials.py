@@ -146,7 +146,8 @@ class Material:
 
     def with_constants(self, values: Mapping[str, Any]) -> Self:
         """Copy of the material with other `constants`, unchecked; arrays hold one value per world."""
-        out = copy.copy(self)
+        out = object.__new__(type(self))  # no look at the signature, as for arguments of users
+        vars(out).update(vars(self))
         if "density" in values:
             vars(out)["density"] = values["density"]
         rates = {name: values[name] for name in ("eta", "lambda_v") if name in values}

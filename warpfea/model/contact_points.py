@@ -28,6 +28,7 @@ __all__ = [
     "contact_points",
     "corner_points",
     "effective_modulus",
+    "elastic_constants",
     "element_depths",
     "element_edge_and_depth",
     "lagrange_basis",
@@ -195,10 +196,10 @@ def effective_modulus(
     """
     materials = materials or [material for _, material in body.materials]
     elements = slice(None) if surface is None else surface.faces[:, 0]
-    return max(_elastic_constants(materials[int(k)]) for k in np.unique(body.material_of[elements]))
+    return max(elastic_constants(materials[int(k)]) for k in np.unique(body.material_of[elements]))
 
 
-def _elastic_constants(material: Material) -> tuple[float, float]:
+def elastic_constants(material: Material) -> tuple[float, float]:
     """Young's modulus, Pa, and Poisson's ratio at small strain."""
     lam, mu = material.lame
     return mu * (3.0 * lam + 2.0 * mu) / (lam + mu), lam / (2.0 * (lam + mu))
@@ -212,7 +213,7 @@ def element_depths(surface: SurfaceSet) -> np.ndarray:
     leaves a uniform pressure uniform.
     """
     body, elements = surface.body, surface.faces[:, 0]
-    moduli = np.array([_elastic_constants(material)[0] for _, material in body.materials])
+    moduli = np.array([elastic_constants(material)[0] for _, material in body.materials])
     depth = (
         element_edge_and_depth(surface)[1] * effective_modulus(body, surface)[0] / moduli[body.material_of[elements]]
     )

@@ -16,7 +16,7 @@ from ..kernels.elements.materials import NCOEF
 from ..materials import ADMISSIBLE_VALUES, DENSITY_CONSTANTS, Material
 from . import assembly
 from .blocks import Block, couplings, output_rows
-from .contact_points import Modulus, effective_modulus
+from .contact_points import Modulus, effective_modulus, elastic_constants
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -142,6 +142,11 @@ class MaterialParameters:
             )
 
         return of
+
+    def youngs_modulus(self, body: Discretisation) -> np.ndarray:
+        """The modulus of `effective_modulus` of a body in each world (worlds,), Pa, or one for all."""
+        materials = [self.material_of_worlds(body, int(k)) for k in np.unique(body.material_of)]
+        return np.max(np.broadcast_arrays(*(elastic_constants(material)[0] for material in materials)), axis=0)
 
     def material_of_worlds(self, body: Discretisation, k: int) -> Material:
         """Material of a body, with arrays for constants that differ between worlds."""

@@ -116,9 +116,7 @@ def round_off_energy(model: Model) -> np.ndarray:
     unit, out = ROUND_OFF_STRAIN * float(np.finfo(model.dtype).eps), np.zeros(model.worlds)
     for body in model.bodies:
         volume = float(element_volumes(body).sum())
-        worlds = range(model.worlds) if model.parameters.varies(body) else [None]
-        moduli = [model.parameters.modulus(world)(body, None)[0] for world in worlds]
-        out += unit**2 * volume * np.array(moduli)
+        out += unit**2 * volume * model.parameters.youngs_modulus(body)
     return out
 
 

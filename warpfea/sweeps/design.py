@@ -98,7 +98,7 @@ class Design:
         if file.suffix.lower() == ".parquet":
             return cls(require_pyarrow().parquet.read_table(file).to_pydict())
         check_choice(f"{file}: the type", file.suffix.lower(), (".csv", ".parquet"))
-        with open(file, newline="") as stream:
+        with open(file, encoding="utf-8-sig", newline="") as stream:
             rows = [row for row in csv.reader(stream) if row]
         if len(rows) < 2 or any(len(row) != len(rows[0]) for row in rows):
             raise ModelError(f"{file}: expected a line of names and lines of as many values")

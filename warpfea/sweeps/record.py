@@ -6,12 +6,13 @@ import json
 import os
 import pathlib
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
 from ..base.errors import CheckpointError
+from .worker import Rows
 
 __all__ = ["Record"]
 
@@ -41,6 +42,7 @@ class Record:
         self.path, self.measures = path, tuple(settings["measures"])
         self.count = count = settings["designs"]
         self.done, self.values = np.zeros(count, dtype=bool), np.full((len(self.measures), count), np.nan)
+        self._rows = dict(zip(self.measures, self.values))
         self.failures, self.retries = dict[int, tuple[str, str]](), 0
         self.deaths, self.plans = dict[int, int](), dict[str, dict[str, Any]]()
         try:
@@ -122,22 +124,34 @@ class Record:
             raise CheckpointError(f"{self.path}: line {number} repeats design {index}")
         else:
             self.done[index] = True
-            if content["values"]:
-                self.values[:, index] = [content["values"][name] for name in self.measures]  # null becomes NaN
+            for name, value in content["values"].items():
+                if value is not None:
+                    self._rows[name][index] = value
             if content["status"] != "done":
                 self.failures[index] = content["status"], content["reason"]
 
-    def append(self, *lines: Mapping[str, Any]) -> None:
-        """Write lines to the disk. CheckpointError."""
+    def append(self, *lines: Mapping[str, Any], rows: Rows | None = None) -> None:
+        """Write lines, then rows, to the disk. CheckpointError."""
         for line in lines:
             if "settings" not in line:
                 self._note(line, 0)
+        texts = list(map(json.dumps, lines))
+        if rows is not None:
+            self._note_rows(rows)
+            texts += _lines(rows)
         try:
-            self._file.writelines(map(_encode, lines))
+            self._file.write(b"".join(map(_encode, texts)))
             self._file.flush()
             os.fsync(self._file.fileno())
         except OSError as error:
             raise CheckpointError(f"{self.path}: can't be written ({error})") from error
+
+    def _note_rows(self, rows: Rows) -> None:
+        """Take account of rows."""
+        design, status, reason = (rows.columns[name] for name in ("design", "status", "reason"))
+        self.done[design] = True
+        self.values[:, design] = np.array([rows.values[name] for name in self.measures], dtype=float)  # None: NaN
+        self.failures |= {k: (how, why) for k, how, why in zip(design, status, reason) if how != "done"}
 
     def close(self) -> None:
         """Close the file. CheckpointError."""
@@ -157,9 +171,19 @@ def _sync_folder(folder: pathlib.Path) -> None:
             os.close(number)
 
 
-def _encode(line: Mapping[str, Any]) -> bytes:
+def _lines(rows: Rows) -> Iterable[str]:
+    """Lines of rows in JSON: nothing in them depends on batch or worker."""
+    numbers = [json.dumps(column)[1:-1].split(", ") for column in (rows.columns["design"], *rows.values.values())]
+    status, reason = (rows.columns[name] for name in ("status", "reason"))
+    texts = {text: json.dumps(text) for text in {*status, *reason}}  # many designs have the same
+    values = ", ".join(json.dumps(name).replace("%", "%%") + ": %s" for name in rows.values)
+    line = f'{{"design": %s, "values": {{{values}}}, "status": %s, "reason": %s}}'
+    return map(line.__mod__, zip(*numbers, map(texts.__getitem__, status), map(texts.__getitem__, reason)))
+
+
+def _encode(line: str) -> bytes:
     """A line with its checksum, which JSON readers see as one more key."""
-    body = json.dumps(line)[:-1].encode()
+    body = line[:-1].encode()
     return body + b', "crc": "%08x"}\n' % zlib.crc32(body)
 
 

@@ -104,6 +104,13 @@ class SweepResult:
             return {name: stored[name] for name in stored.files}
 
 
+def _texts_of_tuples(column: Sequence[Any]) -> Sequence[Any]:
+    """A column with texts for tuples, as `Design.read` reads them."""
+    if tuple not in set(map(type, column)):
+        return column
+    return [" ".join(map(repr, value)) if isinstance(value, tuple) else value for value in column]
+
+
 def write_tables(result: SweepResult) -> None:
     """Derive table.csv, with pyarrow also table.parquet: the same bytes in whatever order the record's lines are.
     OutputError."""
@@ -120,12 +127,11 @@ def write_tables(result: SweepResult) -> None:
     chunks = [(k, min(k + CHUNK, len(result))) for k in range(0, len(result), CHUNK)]
 
     def write_csv(target: pathlib.Path) -> None:
-        with open(target, "w", newline="") as file:
+        with open(target, "w", encoding="utf-8", newline="") as file:
             writer = csv.writer(file, lineterminator="\n")
             writer.writerow(names)
             for chunk in chunks:
-                rows = zip(*columns(*chunk))
-                writer.writerows([" ".join(map(repr, x)) if isinstance(x, tuple) else x for x in row] for row in rows)
+                writer.writerows(zip(*map(_texts_of_tuples, columns(*chunk))))
 
     write_atomically(result.folder / "table.csv", write_csv)
     try:

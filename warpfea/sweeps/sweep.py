@@ -6,6 +6,7 @@ import contextlib
 import csv
 import dataclasses
 import hashlib
+import itertools
 import json
 import os
 import pathlib
@@ -37,10 +38,10 @@ from .worker import (
     MOTION_OPTIONS,
     STATIC_OPTIONS,
     Outcome,
-    Row,
     Study,
     check_names,
     describe,
+    failed_rows,
     find_scene,
     solve,
     solver_of,
@@ -52,6 +53,8 @@ RUN_OPTIONS = tuple(dict.fromkeys(["device", "dtype", "static", "t_end", *MOTION
 """Keys of `run`."""
 MAX_DEATHS = 3
 """Deaths of its worker after which a design is listed and left."""
+TIMES = ("design", "seconds", "worlds", "alone")
+"""Columns of times.csv beside the task's worker and seconds."""
 BATCH = {False: 1024, True: 65536}
 """Largest number of worlds of a task, on the CPU and on CUDA."""
 
@@ -183,7 +186,8 @@ def _make_study(
         parameter = found.parameters.get(name)
         if parameter is None or parameter.kind not in (int, float):
             continue
-        for value in points.columns[name]:
+        column = points.columns[name]
+        for _, value in dict.fromkeys(zip(map(type, column), column)):
             if not is_number(value) or (parameter.kind is int and value != int(value)):
                 hint = ": samples take whole = true" if is_number(value) else ""
                 raise ModelError(f"design.over.{name}: {value!r} is not of type {parameter.kind_name}{hint}")
@@ -229,9 +233,10 @@ def _tasks(study: Study, points: Design, record: Record, batch: int, workers: in
     """Tasks of the designs that are left: those with equal arguments, dealt over the workers, in batches."""
     scene = find_scene(study.scene, study.source)
     names = [name for name in points.columns if name in scene.parameters]
-    groups: dict[str, list[int]] = {}
+    groups: dict[tuple[str, ...], list[int]] = {}
+    keys = list(zip(*(map(repr, points.columns[name]) for name in names))) or [()] * len(points)
     for index in np.flatnonzero(~record.done).tolist():
-        groups.setdefault(json.dumps([points.columns[name][index] for name in names]), []).append(index)
+        groups.setdefault(keys[index], []).append(index)
     tasks: deque[Task] = deque()
     for indices in groups.values():
         arguments = {name: points.columns[name][indices[0]] for name in names}
@@ -275,7 +280,7 @@ class _Driver:
         with open(times, "a", newline="") as file, progress_bar("sweep", "design", total, progress) as bar:
             writer = csv.writer(file, lineterminator="\n")
             if new:
-                writer.writerow(["design", "seconds", "worlds", "alone", "worker", "task_seconds"])
+                writer.writerow([*TIMES, "worker", "task_seconds"])
             bar.update(done)
             ended: deque[tuple[Task, Outcome]] = deque()
             try:
@@ -286,8 +291,9 @@ class _Driver:
                     while ended:  # while workers go on
                         task, outcome = ended.popleft()
                         self._keep(task, outcome)
-                        writer.writerows([r.design, r.seconds, r.worlds, r.alone, outcome.worker, outcome.seconds]
-                                         for r in outcome.rows)  # fmt: skip
+                        own = [outcome.rows.columns[name] for name in TIMES]
+                        of_task = itertools.repeat(outcome.worker), itertools.repeat(outcome.seconds)
+                        writer.writerows(zip(*own, *of_task))
                         file.flush()
                     bar.set_postfix_str(f"{len(self.record.failures)} failed", refresh=False)
                     bar.update(int(self.record.done.sum()) - bar.n)
@@ -307,9 +313,12 @@ class _Driver:
                         self._keep(task, outcome)
 
     def _submit(self, call: Callable[..., Any], task: Task) -> Any:
-        own = [name for name in self.points.columns if name not in task.arguments]
-        designs = [(k, {name: self.points.columns[name][k] for name in own}) for k in task.indices]
-        return self.engine.submit(call, self.study, task.arguments, designs)
+        columns = {
+            name: [values[k] for k in task.indices]
+            for name, values in self.points.columns.items()
+            if name not in task.arguments
+        }
+        return self.engine.submit(call, self.study, task.arguments, task.indices, columns)
 
     def _lose(self, task: Task, how: str, why: str = "") -> None:
         """Halve a task whose worker died or failed; a design that kills it thrice alone is listed."""
@@ -324,8 +333,8 @@ class _Driver:
         if self.record.deaths[index] < MAX_DEATHS:
             self.tasks.append(task)
             return
-        row = Row(index, "killed", reason=f"its worker {how} {MAX_DEATHS} times{why}")
-        self.record.append(_line(row))
+        reason = f"its worker {how} {MAX_DEATHS} times{why}"
+        self.record.append(rows=failed_rows(self.study, [index], "killed", reason))
 
     def _keep(self, task: Task, outcome: Outcome) -> None:
         """Write the rows of a task, after their series and plan."""
@@ -338,11 +347,11 @@ class _Driver:
                 lines.append({"group": key, **found})
             elif known != json.loads(json.dumps(found)):
                 raise CheckpointError(f"{self.record.path}: worker {outcome.worker} takes {found}, others took {known}")
-        for row in outcome.rows:
-            if row.series:
-                target = make_folder(self.folder / "series") / f"{row.design:06d}.npz"
-                write_atomically(target, _save(row.series))
-        self.record.append(*lines, *map(_line, outcome.rows))
+        for design, series in zip(outcome.rows.columns["design"], outcome.rows.columns["series"]):
+            if series:
+                target = make_folder(self.folder / "series") / f"{design:06d}.npz"
+                write_atomically(target, _save(series))
+        self.record.append(*lines, rows=outcome.rows)
 
 
 def _save(series: Mapping[str, np.ndarray]) -> Callable[[pathlib.Path], None]:
@@ -353,8 +362,3 @@ def _save(series: Mapping[str, np.ndarray]) -> Callable[[pathlib.Path], None]:
             os.fsync(file.fileno())  # before its line in the record
 
     return write
-
-
-def _line(row: Row) -> dict[str, Any]:
-    """Line of the record: nothing in it depends on batch or worker."""
-    return {"design": row.design, "status": row.status, "values": row.values, "reason": row.reason}

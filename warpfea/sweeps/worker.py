@@ -5,13 +5,12 @@ from __future__ import annotations
 import dataclasses
 import functools
 import gc
-import math
 import os
 import socket
 import time as clock
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +21,10 @@ from ..base.names import did_you_mean
 from ..builder.scene import Scene, locate, split_name
 from .measures import Measure, load_function, read_source
 
-__all__ = ["FAILED_WORLD", "Group", "Outcome", "Row", "Study", "check_names", "find_scene", "solve", "solver_of"]
+__all__ = [
+    "FAILED_WORLD", "Group", "Outcome", "Rows", "Study", "check_names", "failed_rows", "find_scene", "solve",
+    "solver_of",
+]  # fmt: skip
 
 FAILURES = (Error, MemoryError, NotImplementedError)
 """Errors of a design, also those of the user's functions; others are of the machine, and end the worker."""
@@ -33,6 +35,10 @@ MOTION_OPTIONS = (
     "dt", "error", "interval", "horizon", "integrator", "tol", "solver", "ledger", "inversion", "energy_growth",
     "constraint_tol",
 )  # fmt: skip
+
+
+Columns = dict[str, list[Any]]
+"""Values of designs by name."""
 
 
 @dataclass(frozen=True)
@@ -75,25 +81,40 @@ def load(study: Study) -> Scene[Any]:
     return find_scene(study.scene, study.source)
 
 
-class Row(NamedTuple):
-    """Result of one design: its measures, or the reason why it has none.
+class Rows:
+    """Results of designs in columns, as an object for each would take longer than to send it.
+
+    Args:
+        design: indices. values: by measure, None where there is none.
+        seconds: of their batch over the number of worlds. worlds: of that batch.
+        status: "done", "unconverged steps", "no value", "failed" or "killed". reason: of a failure.
 
     Attributes:
-        design: its index. status: "done", "unconverged steps", "no value", "failed" or "killed".
-        values: by measure. reason: of a failure.
-        series: (steps,) by name, and "time".
-        seconds: of its batch over the number of worlds. worlds: of that batch.
-        alone: "" unless it failed among others and was run again: then "failed" or "done".
+        columns: "design", "status", "reason", "seconds", "worlds", "alone": "" unless the design failed among others
+            and was run again: then "failed" or "done"; "series": (steps,) by name, and "time".
+        values: by measure.
     """
 
-    design: int
-    status: str
-    values: Mapping[str, float | None] = {}
-    reason: str = ""
-    series: Mapping[str, np.ndarray] = {}
-    seconds: float = 0.0
-    worlds: int = 1
-    alone: str = ""
+    def __init__(
+        self, design: list[int], values: dict[str, list[float | None]], *, seconds: float = 0.0, worlds: int = 1,
+        status: str = "done", reason: str = "",
+    ) -> None:  # fmt: skip
+        each = {"status": status, "reason": reason, "seconds": seconds, "worlds": worlds, "alone": "", "series": {}}
+        self.columns: dict[str, list[Any]] = {"design": design}
+        self.columns |= {name: [value] * len(design) for name, value in each.items()}
+        self.values = values
+
+    def update(self, row: int, columns: Mapping[str, Any], values: Mapping[str, float | None]) -> None:
+        """Change one row."""
+        for table, given in ((self.columns, columns), (self.values, values)):
+            for name, value in given.items():
+                table[name][row] = value
+
+    def extend(self, other: Rows) -> None:
+        """Add rows at the end."""
+        for table, more in ((self.columns, other.columns), (self.values, other.values)):
+            for name, column in table.items():
+                column += more[name]
 
 
 @dataclass(frozen=True)
@@ -101,18 +122,18 @@ class Outcome:
     """Result of a task.
 
     Attributes:
-        rows: one of each design. plan: of the solver; None without a simulation.
+        rows: of the designs. plan: of the solver; None without a simulation.
         device: kind of device. worker: host and process. seconds: of the task.
     """
 
-    rows: list[Row]
+    rows: Rows
     plan: dict[str, Any] | None
     device: str
     worker: str
     seconds: float
 
 
-def check_names(study: Study, arguments: dict[str, Any], designs: Sequence[tuple[int, dict[str, Any]]]) -> None:
+def check_names(study: Study, arguments: dict[str, Any], indices: list[int], columns: Columns) -> None:
     """Raise ModelError for measures that the model of some designs lacks, and values that none of them can set.
 
     A model that can't be built is left for `solve` to tell. CheckpointError for files that have changed.
@@ -126,33 +147,33 @@ def check_names(study: Study, arguments: dict[str, Any], designs: Sequence[tuple
     for where, chosen in (("measures", study.measures), ("series", study.series)):
         for name, measure in chosen.items():
             measure.check(f"{where}.{name}", group.builder)
-    for last, (_, values) in enumerate(designs, 1 - len(designs)):
+    for last in range(1 - len(indices), 1):
         try:
-            set_values(model, {name: [value] for name, value in values.items()})
+            set_values(model, {name: [values[last - 1]] for name, values in columns.items()})
             return
         except ModelError as error:
             if last == 0:
                 raise ModelError(f"design.over: {error}") from error
 
 
-def solve(study: Study, arguments: dict[str, Any], designs: Sequence[tuple[int, dict[str, Any]]]) -> Outcome:
+def solve(study: Study, arguments: dict[str, Any], indices: list[int], columns: Columns) -> Outcome:
     """Run designs that share a model.
 
     Args:
         arguments: of the scene, the same for all.
-        designs: index and values per world of each.
+        indices: of the designs. columns: their values per world by name.
     """
     began = clock.perf_counter()
     if study.place["device"] != "cpu":
         gc.collect()  # memory of the task before
-    rows, plan, device = _rows(study, arguments, list(designs))
+    rows, plan, device = _rows(study, arguments, indices, columns)
     worker = f"{socket.gethostname()}:{os.getpid()}"
     return Outcome(rows, plan, device, worker, clock.perf_counter() - began)
 
 
 def _rows(
-    study: Study, arguments: dict[str, Any], designs: list[tuple[int, dict[str, Any]]]
-) -> tuple[list[Row], dict[str, Any] | None, str]:
+    study: Study, arguments: dict[str, Any], indices: list[int], columns: Columns
+) -> tuple[Rows, dict[str, Any] | None, str]:
     """Rows, plan and device; its model and simulation are freed at the end."""
     try:
         scene = load(study)
@@ -161,8 +182,8 @@ def _rows(
     try:
         group = Group(study, scene, arguments)
     except FAILURES as error:  # the same for each of them
-        return [Row(index, "failed", reason=describe(error)) for index, _ in designs], None, ""
-    rows = group.solve(designs)
+        return failed_rows(study, indices, "failed", describe(error)), None, ""
+    rows = group.solve(indices, columns)
     return rows, group.plan, group.device
 
 
@@ -183,46 +204,55 @@ class Group:
         """A model of so many worlds."""
         return self.builder.finalize(**self.study.place, worlds=worlds, many=self.study.many)
 
-    def solve(self, designs: list[tuple[int, dict[str, Any]]]) -> list[Row]:
+    def solve(self, indices: list[int], columns: Columns) -> Rows:
         """Rows of the designs, in batches that fit; a batch that fails as a whole is halved until one is left."""
         try:
-            return self.batch(designs)
+            return self.batch(indices, columns)
         except (CapacityError, MemoryError) as error:
             failure: Exception = error
-            size = min(getattr(error, "worlds", 0), len(designs) - 1) or len(designs) // 2
+            size = min(getattr(error, "worlds", 0), len(indices) - 1) or len(indices) // 2
         except FAILURES as error:
-            failure, size = error, len(designs) // 2
+            failure, size = error, len(indices) // 2
         if not size:
-            return [Row(designs[0][0], "failed", reason=describe(failure))]
+            return failed_rows(self.study, indices, "failed", describe(failure))
         del failure  # its traceback holds the arrays of the batch
         gc.collect()
-        chunks = [designs[k : k + size] for k in range(0, len(designs), size)]
-        return [row for chunk in chunks for row in self.solve(chunk)]
+        rows = failed_rows(self.study, [], "", "")
+        for part in (slice(k, k + size) for k in range(0, len(indices), size)):
+            rows.extend(self.solve(indices[part], {name: values[part] for name, values in columns.items()}))
+        return rows
 
-    def batch(self, designs: list[tuple[int, dict[str, Any]]]) -> list[Row]:
+    def batch(self, indices: list[int], columns: Columns) -> Rows:
         """Rows of designs as worlds of one simulation; failed worlds are run again alone."""
-        began, study, worlds = clock.perf_counter(), self.study, len(designs)
+        began, study, worlds = clock.perf_counter(), self.study, len(indices)
         model = self.model(worlds)
-        columns = {name: [values[name] for _, values in designs] for name in designs[0][1]}
         sim = self.simulate(model, columns, on_failure="freeze" if worlds > 1 else "raise")
         self.plan = dataclasses.asdict(sim.plan)
         self.device = model.device.name if model.device.is_cuda else "cpu"
-        failed = sim.status == FAILED_WORLD
-        measured = zip(*(np.asarray(measure(sim), dtype=float).tolist() for measure in study.measures.values()))
+        measured = {name: np.asarray(measure(sim), dtype=float) for name, measure in study.measures.items()}
         series = {name: measure.series(sim) for name, measure in study.series.items()}
         times = next(iter(study.series.values())).times(sim) if series else np.zeros((worlds, 0))
-        seconds, rows = (clock.perf_counter() - began) / worlds, []
-        for world, ((index, _), found, rough) in enumerate(zip(designs, measured, sim.totals["rough"].tolist())):
-            curves = {"time": times[world]} | {name: of[world] for name, of in series.items()} if series else {}
-            rows.append(Row(index, *_quality(dict(zip(study.measures, found)), rough), curves, seconds, worlds))
-        for world in np.flatnonzero(failed).tolist():
-            (again,) = self.solve([designs[world]])
-            rows[world] = again._replace(alone=again.status)
+        seconds, rough = (clock.perf_counter() - began) / worlds, sim.totals["rough"]
+        values = {name: column.tolist() for name, column in measured.items()}
+        rows = Rows(list(indices), values, seconds=seconds, worlds=worlds)
+        for world in np.flatnonzero(rough).tolist():
+            why = {"status": "unconverged steps", "reason": f"{rough[world]} steps above the tolerance"}
+            rows.update(world, why, {})
+        infinite = {name: ~np.isfinite(column) for name, column in measured.items()}
+        for world in np.flatnonzero(np.any(list(infinite.values()), axis=0)).tolist():
+            missing = [name for name in infinite if infinite[name][world]]
+            why = {"status": "no value", "reason": f"{', '.join(missing)}: not finite"}
+            rows.update(world, why, dict.fromkeys(missing))
+        for world in range(worlds) if series else ():
+            curves = {"time": times[world]} | {name: of[world] for name, of in series.items()}
+            rows.update(world, {"series": curves}, {})
+        for world in np.flatnonzero(sim.status == FAILED_WORLD).tolist():
+            again = self.solve([indices[world]], {name: [column[world]] for name, column in columns.items()})
+            found, own = ({name: column[0] for name, column in of.items()} for of in (again.columns, again.values))
+            rows.update(world, found | {"alone": found["status"]}, own)
         return rows
 
-    def simulate(
-        self, model: Any, columns: dict[str, list[Any]], *, on_failure: str = "raise", outputs: Sequence[Any] = ()
-    ) -> Any:
+    def simulate(self, model: Any, columns: Columns, *, on_failure: str = "raise", outputs: Sequence[Any] = ()) -> Any:
         """The finished simulation of worlds with the values of the columns."""
         run = {k: v for k, v in self.study.run.items() if k not in ("device", "dtype", "static", "t_end")}
         state, controls = set_values(model, columns)
@@ -241,14 +271,6 @@ class Group:
         return sim
 
 
-def _quality(values: dict[str, float], rough: int) -> tuple[str, Mapping[str, float | None], str]:
-    """Status of a finished run, its values, None for those that are not finite, and what it lacks."""
-    if not all(map(math.isfinite, values.values())):
-        kept = {name: value if math.isfinite(value) else None for name, value in values.items()}
-        return "no value", kept, f"{', '.join(name for name in kept if kept[name] is None)}: not finite"
-    return ("unconverged steps", values, f"{rough} steps above the tolerance") if rough else ("done", values, "")
-
-
 def _silent(done: int, total: int, name: str) -> None:
     """No bar for kernels in workers."""
 
@@ -261,7 +283,7 @@ def solver_of(name: str, tol: float | None) -> Any:
     return SOLVERS[name](tol=tol)
 
 
-def set_values(model: Any, columns: dict[str, list[Any]]) -> tuple[Any, dict[str, np.ndarray]]:
+def set_values(model: Any, columns: Columns) -> tuple[Any, dict[str, np.ndarray]]:
     """Set values per world by name: parameters of `Model.set_parameter`, "gravity", "velocity.BODY" (with ".x", ".y",
     ".z" for a component), and "control.NAME".
 
@@ -316,6 +338,11 @@ def position_slots(model: Any, whole: str) -> np.ndarray:
         known = f"bodies are {', '.join(bodies)}{did_you_mean(name, bodies)}"
         raise ModelError(f"{whole}: expected velocity.BODY or velocity.BODY.x; {known}")
     return np.arange(model.slots)[bodies[name].slots][bodies[name].slot_kind == 0]
+
+
+def failed_rows(study: Study, indices: list[int], status: str, reason: str) -> Rows:
+    """Rows of designs that have no result."""
+    return Rows(list(indices), {name: [None] * len(indices) for name in study.measures}, status=status, reason=reason)
 
 
 def describe(error: BaseException) -> str:
