@@ -36,6 +36,8 @@ def cost(feature=None, **simulation):
         b.drive(body.nodes("x+"), rotation=wf.Rotation((0, 0, 0), (1, 0, 0), 0.0))
     if feature == "joint":
         b.add_joint("distance", parent=wf.GROUND, child=body.at((1, 0.1, 0.1)), anchor=(1, 0.1, 2))
+    if feature == "spring":
+        b.add_spring(body.at((1, 0.1, 0.1)), (1, 0.1, 2), stiffness=1.0)
     if feature in ("contact", "friction"):
         floor = b.add_collider(wf.HalfSpace((0, 0, 1), -1.0))
         b.add_contact(body, floor, mu=0.5 if feature == "friction" else 0.0)
@@ -56,7 +58,7 @@ def cost(feature=None, **simulation):
 
 
 FEATURES = ["gravity", "incremental", "explicit", "rate", "free group", "traction", "pressure", "field", "drive"]
-FEATURES += ["joint", "contact", "friction", "rotation", "probe", "second body", "second law"]
+FEATURES += ["joint", "spring", "contact", "friction", "rotation", "probe", "second body", "second law"]
 
 
 @pytest.mark.parametrize("feature", FEATURES)

@@ -26,12 +26,13 @@ from .bodies import MeshLike, as_mesh, make_solid, make_structure, shell_geometr
 from .checks import body_of_handle, check_densities, parse_gravity, warn_implausible
 from .contact_methods import ContactMethods
 from .joints import make_constraint, make_joint
+from .springs import SpringMethods
 from .welds import make_weld
 
 __all__ = ["ModelBuilder"]
 
 
-class ModelBuilder(ContactMethods):
+class ModelBuilder(ContactMethods, SpringMethods):
     """Collects bodies, supports and loads; `finalize` makes a Model.
 
     Args:

@@ -15,6 +15,7 @@ from .bodies import Body
 from .contacts import Collider, ContactOptions
 from .handles import NodeSet, SurfaceSet
 from .joints import Joint
+from .springs import Spring
 
 __all__ = [
     "BodyForce",
@@ -116,6 +117,7 @@ class Description:
     body_forces: list[BodyForce] = field(default_factory=list)
     probes: list[Probe] = field(default_factory=list)
     joints: list[Joint] = field(default_factory=list)
+    springs: list[Spring] = field(default_factory=list)
     colliders: list[Collider] = field(default_factory=list)
     contacts: list[Any] = field(default_factory=list)
     gravity: np.ndarray = field(default_factory=lambda: np.zeros(3))
@@ -167,6 +169,7 @@ class Description:
         loads = len(self.dead_loads) + len(self.pressures) + len(self.moments) + len(self.body_forces)
         counts = {"support": len(self.supports), "load": loads, "joint": len(self.joints)}
         counts |= {
+            "spring": len(self.springs),
             "collider": len(self.colliders),
             "contact": len(self.contacts),
             "probe": len(self.probes),

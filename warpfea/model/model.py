@@ -285,7 +285,8 @@ class Model:
                 "C.mu", "C.mu_static", "C.restitution" or "C.stiffness" with the name C of a contact, as of
                 ModelBuilder.add_contact; mu_static follows mu if equal to it. "K.offset" with the name K of a
                 collider: of a HalfSpace the offset of its plane, m; of other shapes the outward offset of the
-                surface, m. A surface moved into a body pushes it out. "gravity", as set_gravity.
+                surface, m. A surface moved into a body pushes it out. "S.stiffness", "S.damping" or "S.rest" with the
+                name S of a spring. "gravity", as set_gravity.
             values: a number, or (worlds,), on the host or on a device; of gravity (3,) or (worlds, 3).
             mask: (worlds,), on the host or on a device: the worlds to set. None: all.
 

@@ -32,6 +32,7 @@ from .elements import Damping, Elements
 from .evaluation import Evaluation
 from .loads import BodyForces, DeadLoads, FollowerLoads
 from .protocols import Constrained, Parametrised, Tied, Touching
+from .springs import Springs
 from .supports import Supports
 from .term import FieldSpec, StepContext, Term
 from .time_law_table import TimeLawTable, control_array
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
 __all__ = ["TERM_TYPES", "TermSet", "profile_parts", "register"]
 
 T = TypeVar("T", bound=Term)
-TERM_TYPES: list[type[Term]] = [Elements, DeadLoads, Damping, FollowerLoads, BodyForces, Constraints]
+TERM_TYPES: list[type[Term]] = [Elements, DeadLoads, Damping, FollowerLoads, BodyForces, Springs, Constraints]
 """All kinds of terms in launch order, that in which the forces of an attempt are evaluated."""
 STATE_ARRAYS = ("displacement", "velocity", "time", "status", "ledger", "ledger_time", "previous_displacement",
          "previous_velocity", "previous_step", "previous_end", "summed_time",

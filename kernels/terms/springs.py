@@ -1,0 +1,364 @@
+"""Springs: potentials and dampers of scalar coordinates y of vectors that are linear in the slots.
+
+A spring has the force F = dW/dy(y) + F_v(y, dy/dt) along y, and the vectors a, b, a2 of a row of constraints.py:
+
+    LENGTH   y = |a|                                    between two points
+    ANGLE    y = atan2(a2.b, a.b), turns counted        of a revolute joint
+    VECTOR   a itself, W = k a.a / 2                    of a foundation, per area
+
+In a step dy/dt = (y - y~)/(dq/dv), with y~ the coordinate's q~: Phi contains W and the integral of F_v from y~ on, and
+the tangent is symmetric. In a mid-point scheme F is the mean of dW/dy between both ends, dy/dt the mean rate, and both
+act along a discrete gradient of y, whose product with the change of the vectors is that of y: W changes by exactly the
+work done. Those of LENGTH and ANGLE are gradients at the middle of a.a, and of |(a.b, a2.b)| sin(y - y_m), both
+quadratic, so that they have no moment. Evaluated in float64 from displacements, as constraints.py.
+"""
+
+import functools
+import math
+
+import warp as wp
+
+from ..common.block_entries import add_block_function
+from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
+from ..common.structs import pattern_struct, topology_struct
+from ..common.types import double_1d, double_2d, double_3d, f64, int_1d, mat33d, precision, vec3d
+from .spring_laws import OwnForces, law_functions, spring_struct
+
+__all__ = ["ANGLE", "LENGTH", "VECTOR", "scratch_struct", "spring_kernels"]
+
+LENGTH, ANGLE, VECTOR = 0, 1, 2
+"""Coordinates."""
+TINY = 1.0e-300
+"""Divisor of vectors without a length."""
+FULL_TURN = 2.0 * math.pi
+SMALL_TURN = 1.0e-2
+"""Half of a change of angle below which x / sin x is taken from its series, rad: what is left out is below 1e-16."""
+mat33d_2d = wp.array2d(dtype=mat33d)
+
+
+@functools.cache
+def scratch_struct():
+    """Springs at an iterate; vectors of a spring as rows of a matrix."""
+
+    @wp.struct
+    class SpringScratch:
+        start: wp.array2d(dtype=wp.float64)  # [world, item] y at the start of the step
+        reference: wp.array2d(dtype=wp.float64)  # [world, item] y~
+        force: wp.array2d(dtype=wp.mat33d)  # [world, item] derivatives of the potential by the vectors
+        product: wp.array2d(dtype=wp.mat33d)  # [world, item] their change along a direction
+        hessian: wp.array2d(dtype=wp.mat33d)  # [world, block] derivatives of the force
+        projected: wp.array2d(dtype=wp.mat33d)  # [world, block] positive semi-definite part
+        rows: wp.array3d(dtype=wp.float64)  # [TERM_ROWS, world, item] of the potential, J
+
+    return SpringScratch
+
+
+@functools.cache
+def coordinate_functions(midpoint: bool) -> KernelSet:
+    """Device functions of the coordinates LENGTH and ANGLE, and of their derivatives."""
+
+    @wp.struct
+    class Derivatives:
+        """First derivatives G, along which the force acts, and g, of y at the end of a step. The change of row s of G
+        is sum_t (unit_st I + A_s g_t^T + G_s B_t^T) d_t."""
+
+        G: wp.mat33d
+        g: wp.mat33d
+        A: wp.mat33d
+        B: wp.mat33d
+        unit: wp.vec3d  # of LENGTH; of ANGLE between a and b, b and a2
+
+    @wp.func
+    def coordinate(kind: int, v: mat33d, near: f64) -> f64:
+        """y of the vectors; an angle with the number of turns that brings it closest to `near`."""
+        if kind == LENGTH:
+            return wp.length(v[0])
+        y = wp.atan2(wp.dot(v[2], v[1]), wp.dot(v[0], v[1]))
+        return y + f64(FULL_TURN) * wp.round((near - y) / f64(FULL_TURN))
+
+    @wp.func
+    def radius(v: mat33d) -> f64:
+        """|(a.b, a2.b)|."""
+        return wp.max(wp.length(wp.vec2d(wp.dot(v[0], v[1]), wp.dot(v[2], v[1]))), f64(TINY))
+
+    @wp.func
+    def transverse(v: mat33d, y: f64) -> mat33d:
+        """Derivatives of (cos y a2 - sin y a).b by the vectors."""
+        s, c = wp.sin(y), wp.cos(y)
+        return wp.matrix_from_rows(-s * v[1], c * v[2] - s * v[0], c * v[1])
+
+    @wp.func
+    def along(v: mat33d, y: f64) -> mat33d:
+        """Derivatives of (cos y a + sin y a2).b, of `radius` at the angle y."""
+        s, c = wp.sin(y), wp.cos(y)
+        return wp.matrix_from_rows(c * v[1], c * v[0] + s * v[2], s * v[1])
+
+    @wp.func
+    def derivatives(kind: int, v: mat33d, y: f64) -> Derivatives:
+        """At one configuration: G = g."""
+        d = Derivatives()
+        if kind == LENGTH:
+            size = wp.max(wp.length(v[0]), f64(TINY))
+            d.G[0] = v[0] / size
+            d.unit = vec3d(f64(1.0) / size, f64(0.0), f64(0.0))
+            d.B = -d.G / size
+        else:
+            inverse = f64(1.0) / radius(v)
+            d.G = inverse * transverse(v, y)
+            d.A = -inverse * along(v, y)
+            d.B = d.A
+            d.unit = inverse * vec3d(f64(0.0), -wp.sin(y), wp.cos(y))
+        d.g = d.G
+        return d
+
+    @wp.func
+    def mean_derivatives(kind: int, v0: mat33d, v: mat33d, y0: f64, y: f64) -> Derivatives:
+        """Between the ends of a step: G.(v - v0) = y - y0."""
+        d = derivatives(kind, v, y)
+        if kind == LENGTH:
+            inverse = f64(1.0) / wp.max(wp.length(v0[0]) + wp.length(v[0]), f64(TINY))
+            d.G[0] = inverse * (v0[0] + v[0])
+            d.unit = vec3d(inverse, f64(0.0), f64(0.0))
+            d.B = -inverse * d.g
+            return d
+        x = f64(0.5) * (y - y0)
+        ratio = f64(1.0) + x * x / f64(6.0) * (f64(1.0) + f64(7.0) / f64(60.0) * x * x)  # x / sin x
+        slope = x / f64(3.0) * (f64(1.0) + f64(7.0) / f64(30.0) * x * x)  # its derivative over itself
+        slope = slope / ratio
+        if wp.abs(x) > f64(SMALL_TURN):
+            ratio = x / wp.sin(x)
+            slope = f64(1.0) / x - wp.cos(x) / wp.sin(x)
+        inverse = f64(1.0) / (radius(v0) + radius(v))
+        q = f64(2.0) * ratio * inverse
+        middle = f64(0.5) * (v0 + v)
+        mean = y - x
+        d.G = q * transverse(middle, mean)
+        d.A = (f64(-0.5) * q) * along(middle, mean)
+        d.B = (f64(0.5) * slope) * d.g - inverse * along(v, y)
+        d.unit = (f64(0.5) * q) * vec3d(f64(0.0), -wp.sin(mean), wp.cos(mean))
+        return d
+
+    @wp.func
+    def curvature(kind: int, d: Derivatives, s: int, t: int) -> mat33d:
+        """Derivative of row s of G by vector t."""
+        unit = f64(0.0)
+        if kind == LENGTH:
+            unit = d.unit[0]
+        elif s != t and s + t != 2:
+            unit = wp.where(s + t == 1, d.unit[1], d.unit[2])
+        return unit * wp.identity(n=3, dtype=f64) + wp.outer(d.A[s], d.g[t]) + wp.outer(d.G[s], d.B[t])
+
+    return kernel_set(locals())
+
+
+@functools.cache
+def spring_kernels(dtype: str, midpoint: bool, own: OwnForces = ()) -> KernelSet:
+    """Kernels of springs in one precision of the slots; `own`: forces given as functions."""
+    p = precision(dtype)
+    T, vec3, sym6, mat33 = p.T, p.vec3, p.sym, p.mat33
+    Springs, Scratch, Topology, Pattern = spring_struct(), scratch_struct(), topology_struct(dtype), pattern_struct()
+    law, c = law_functions(own), coordinate_functions(midpoint)
+    add_block = add_block_function(dtype)
+    suffix = "".join(f"_{name}" for name, _ in own)
+    module = kernel_module(f"springs_{dtype}{'_midpoint' if midpoint else ''}{suffix}")
+
+    @wp.func
+    def vectors(spr: Springs, x: p.vec3_2d, world: int, item: int) -> mat33d:
+        """Sums over the slots of an item."""
+        out = mat33d()
+        for k in range(spr.entry_start[item], spr.entry_start[item + 1]):
+            out += wp.outer(spr.entry_weight[k], vec3d(x[world, spr.entry_slot[k]]))
+        return out
+
+    @masked_kernel(module, "active")
+    def begin(
+        spr: Springs, u: p.vec3_2d, v: p.vec3_2d, earlier: p.vec3_2d, accelerated: int, first: double_1d,
+        second: double_1d, turned: double_2d, active: int_1d, scr: Scratch,
+    ):  # fmt: skip
+        """y at the start, and y~ = a0 y - a1 y(u_{n-1}), or with accelerations a y + b dy/dt + q_a d2y/dt2."""
+        world, item = wp.tid()
+        kind = spr.kind[item]
+        if kind == VECTOR:
+            return
+        near = f64(0.0)
+        if kind == ANGLE:
+            near = turned[world, item]
+        V = spr.reference[item] + vectors(spr, u, world, item)
+        y = c.coordinate(kind, V, near)
+        scr.start[world, item] = y
+        if accelerated == 0:
+            reference = first[world] * y
+            if second[world] != f64(0.0):
+                before = c.coordinate(kind, spr.reference[item] + vectors(spr, earlier, world, item), y)
+                reference -= second[world] * before
+        else:
+            d = c.derivatives(kind, V, y)
+            D = vectors(spr, v, world, item)
+            turn = wp.ddot(d.g, vectors(spr, earlier, world, item))
+            for s in range(3):
+                for t in range(3):
+                    turn += wp.dot(D[s], c.curvature(kind, d, s, t) * D[t])
+            reference = y + first[world] * wp.ddot(d.g, D) + second[world] * turn
+        scr.reference[world, item] = reference
+
+    @wp.func
+    def evaluate_vector(
+        spr: Springs, u: p.vec3_2d, start: p.vec3_2d, inverse: f64, world: int, item: int, scr: Scratch
+    ):
+        """Force, tangent and potential of a VECTOR; `start`: q~, or positions at the start of a mid-point step."""
+        stiffness = spr.scale[item] * spr.stiffness[world, spr.spring[item]]
+        damping = spr.scale[item] * spr.damping[world, spr.spring[item]] * inverse
+        a = spr.reference[item] + vectors(spr, u, world, item)
+        b = spr.reference[item] + vectors(spr, start, world, item)
+        at = a
+        slope = stiffness + damping
+        if wp.static(midpoint):
+            at = f64(0.5) * (a + b)
+            slope = f64(0.5) * stiffness + damping
+        block = spr.first_block[item]
+        scr.force[world, item] = stiffness * at + damping * (a - b)
+        scr.hessian[world, block] = slope * wp.identity(n=3, dtype=f64)
+        scr.projected[world, block] = scr.hessian[world, block]
+        energy = f64(0.5) * (stiffness * wp.ddot(a, a) + damping * wp.ddot(a - b, a - b))
+        for row in range(3):
+            scr.rows[row, world, item] = energy
+
+    @masked_kernel(module, "active")
+    def evaluate(
+        spr: Springs, u: p.vec3_2d, start: p.vec3_2d, in_motion: f64, dq_dv: double_1d, active: int_1d, scr: Scratch
+    ):
+        """Forces on the vectors, their derivatives, and rows of the potential. `in_motion`: 1, or 0 in statics."""
+        world, item = wp.tid()
+        kind = spr.kind[item]
+        inverse = in_motion / dq_dv[world]
+        if wp.static(midpoint):
+            inverse = f64(0.5) * inverse
+        if kind == VECTOR:
+            evaluate_vector(spr, u, start, inverse, world, item, scr)
+            return
+        sp = spr.spring[item]
+        V = spr.reference[item] + vectors(spr, u, world, item)
+        y0 = scr.start[world, item]
+        y = c.coordinate(kind, V, y0)
+        if wp.static(midpoint):
+            d = c.mean_derivatives(kind, spr.reference[item] + vectors(spr, start, world, item), V, y0, y)
+            elastic_part = law.mean_force(spr, world, sp, y0, y)
+            viscous_part = law.viscous_force(spr, world, sp, f64(0.5) * (y0 + y), (y - y0) * inverse)
+            viscous_part[1] = f64(0.5) * viscous_part[1]
+        else:
+            d = c.derivatives(kind, V, y)
+            elastic_part = law.elastic_force(spr, world, sp, y)
+            viscous_part = law.viscous_force(spr, world, sp, y, (y - scr.reference[world, item]) * inverse)
+        force = elastic_part[0] + in_motion * viscous_part[0]
+        slope = elastic_part[1] + in_motion * (viscous_part[1] + viscous_part[2] * inverse)
+        scr.force[world, item] = force * d.G
+        sides = wp.where(kind == LENGTH, 1, 3)
+        tension = f64(0.0)  # of a stretched spring: the geometric stiffness is positive
+        if kind == LENGTH:
+            tension = wp.max(force, f64(0.0)) * d.unit[0]
+        size = wp.max(wp.length_sq(d.G[0]), f64(TINY))
+        for s in range(sides):
+            for t in range(sides):
+                block = spr.first_block[item] + sides * s + t
+                along = wp.outer(d.G[s], d.G[t])
+                scr.hessian[world, block] = slope * wp.outer(d.G[s], d.g[t]) + force * c.curvature(kind, d, s, t)
+                scr.projected[world, block] = (
+                    wp.max(slope, f64(0.0)) - tension / size
+                ) * along + tension * wp.identity(n=3, dtype=f64)
+        energy = law.energy(spr, world, sp, y)
+        loss = f64(0.0)
+        if in_motion > f64(0.0):
+            loss = law.viscous_potential(spr, world, sp, scr.reference[world, item], y, inverse)
+        scr.rows[0, world, item] = energy + loss
+        scr.rows[1, world, item] = energy + loss
+        scr.rows[2, world, item] = wp.abs(energy) + wp.abs(loss)
+
+    @masked_kernel(module, "active")
+    def change(spr: Springs, direction: p.vec3_2d, active: int_1d, scr: Scratch):
+        """Change of the forces on the vectors along a direction."""
+        world, item = wp.tid()
+        D = vectors(spr, direction, world, item)
+        out = mat33d()
+        sides = wp.where(spr.kind[item] == ANGLE, 3, 1)
+        for s in range(sides):
+            row = vec3d()
+            for t in range(sides):
+                row += scr.hessian[world, spr.first_block[item] + sides * s + t] * D[t]
+            out[s] = row
+        scr.product[world, item] = out
+
+    @masked_kernel(module, "active")
+    def scatter(spr: Springs, of_item: mat33d_2d, active: int_1d, offset: int, pool: p.vec3_2d):
+        """Forces on the slots from those on the vectors."""
+        world, entry = wp.tid()
+        pool[world, offset + entry] = vec3(spr.entry_weight[entry] * of_item[world, spr.entry_item[entry]])
+
+    @wp.func
+    def slot_block(spr: Springs, blocks: mat33d_2d, world: int, row: int, column: int) -> mat33d:
+        """Symmetric part of the block of two entries of an item."""
+        item = spr.entry_item[row]
+        sides = wp.where(spr.kind[item] == ANGLE, 3, 1)
+        A = mat33d()
+        for s in range(sides):
+            for t in range(sides):
+                first = blocks[world, spr.first_block[item] + sides * s + t]
+                other = blocks[world, spr.first_block[item] + sides * t + s]
+                weight = spr.entry_weight[row][s] * spr.entry_weight[column][t]
+                A += (f64(0.5) * weight) * (first + wp.transpose(other))
+        return A
+
+    @masked_kernel(module, "active")
+    def diagonal(spr: Springs, active: int_1d, offset: int, scr: Scratch, pool: p.sym_2d):
+        """Blocks of D, Voigt order."""
+        world, entry = wp.tid()
+        A = slot_block(spr, scr.projected, world, entry, entry)
+        pool[world, offset + entry] = sym6(T(A[0, 0]), T(A[1, 1]), T(A[2, 2]), T(A[1, 2]), T(A[0, 2]), T(A[0, 1]))
+
+    @masked_kernel(module, "active")
+    def add_blocks(
+        topo: Topology, pattern: Pattern, spr: Springs, upper: int_1d, start: int_1d, row: int_1d, column: int_1d,
+        blocks: mat33d_2d, dq_dv: double_1d, active: int_1d, value: p.mat33_2d,
+    ):  # fmt: skip
+        """value += (dq/dv) K."""
+        world, k = wp.tid()
+        A = mat33d()
+        for pair in range(start[k], start[k + 1]):
+            A += slot_block(spr, blocks, world, row[pair], column[pair])
+        add_block(topo, pattern.upper[upper[k]], mat33(dq_dv[world] * A), world, value)
+
+    @masked_kernel(module, "active")
+    def energies(
+        spr: Springs, u: p.vec3_2d, start: p.vec3_2d, u_n: p.vec3_2d, in_motion: f64, dq_dv: double_1d, active: int_1d,
+        scr: Scratch, rows: double_3d,
+    ):  # fmt: skip
+        """Stored energy at u, and the work of the viscous force in the step from u_n, lost."""
+        world, item = wp.tid()
+        sp = spr.spring[item]
+        inverse = in_motion / dq_dv[world]
+        if wp.static(midpoint):
+            inverse = f64(0.5) * inverse
+        V = spr.reference[item] + vectors(spr, u, world, item)
+        if spr.kind[item] == VECTOR:
+            moved = vectors(spr, u, world, item) - vectors(spr, start, world, item)
+            step = vectors(spr, u, world, item) - vectors(spr, u_n, world, item)
+            rows[0, world, item] = f64(0.5) * spr.scale[item] * spr.stiffness[world, sp] * wp.ddot(V, V)
+            rows[1, world, item] = spr.scale[item] * spr.damping[world, sp] * inverse * wp.ddot(moved, step)
+            return
+        y0 = scr.start[world, item]
+        y = c.coordinate(spr.kind[item], V, y0)
+        if wp.static(midpoint):
+            viscous_part = law.viscous_force(spr, world, sp, f64(0.5) * (y0 + y), (y - y0) * inverse)
+        else:
+            viscous_part = law.viscous_force(spr, world, sp, y, (y - scr.reference[world, item]) * inverse)
+        rows[0, world, item] = law.energy(spr, world, sp, y)
+        rows[1, world, item] = in_motion * viscous_part[0] * (y - y0)
+
+    @masked_kernel(module, "active")
+    def store_turns(spr: Springs, u: p.vec3_2d, active: int_1d, scr: Scratch, turned: double_2d):
+        """Angles of an accepted step, from which the next counts turns."""
+        world, item = wp.tid()
+        if spr.kind[item] == ANGLE:
+            V = spr.reference[item] + vectors(spr, u, world, item)
+            turned[world, item] = c.coordinate(ANGLE, V, scr.start[world, item])
+
+    return kernel_set(locals())

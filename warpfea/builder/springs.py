@@ -1,0 +1,159 @@
+"""Methods of ModelBuilder for springs, foundations and point masses."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from ..base.checks import is_number
+from ..base.errors import ModelError
+from ..kernels.terms.springs import ANGLE, LENGTH, VECTOR
+from ..model import assembly
+from ..model.description import Description
+from ..model.handles import MaterialPoint, NodeSet, SurfaceSet
+from ..model.joints import Joint, Vector, VectorPart
+from ..model.springs import SampledForce, Spring
+from .attachments import COINCIDENCE_TOL, make_attachment
+from .bodies import unused_name
+from .checks import body_of_handle
+
+__all__ = ["SpringMethods"]
+
+
+class SpringMethods:
+    """Base of ModelBuilder: `add_spring`, `add_torsion_spring`, `add_foundation`, `add_point_mass`."""
+
+    description: Description
+
+    def add_spring(
+        self, first: Any, second: Any, *, stiffness: float | None = None, damping: float = 0.0,
+        rest: float | None = None, law: Any = None, name: str | None = None,
+    ) -> Spring:  # fmt: skip
+        """A spring and damper between two points: force k (length - rest) + c d(length)/dt along their line.
+
+        Args:
+            first, second: material points (body.at), nodes or surfaces (their mean), or fixed points (x, y, z) of the
+                ground.
+            stiffness: k, N/m.
+            damping: c, N s/m.
+            rest: length without elastic force, m; by default that of the reference. Less is a preload in tension.
+            law: in place of stiffness and rest: the force (N, positive in tension) as samples (lengths, forces), with
+                a continuous slope and linear beyond the ends, or a wp.func(length: wp.float64, rate: wp.float64) ->
+                wp.float64, both smooth in its arguments; `damping` adds to either.
+            name: unique name, for set_parameter("NAME.stiffness"), "NAME.damping", "NAME.rest".
+
+        Raises:
+            ModelError: points that coincide, a value out of range, or neither or both of stiffness and law.
+        """
+        name = self._spring_name(name, "spring")
+        what = f"spring {name!r}"
+        ends = []
+        for point, label in ((first, "first"), (second, "second")):
+            if hasattr(point, "body"):
+                body_of_handle(point, f"{what}: {label}", (MaterialPoint, NodeSet, SurfaceSet), self.description.bodies)
+            ends.append(make_attachment(point, f"{what}: {label} point", child=label == "second"))
+        P, Q = ends
+        if P.body is None and Q.body is None:
+            raise ModelError(f"{what}: neither of its points is on a body")
+        for end in ends:
+            if np.isnan(end.X).any():
+                raise ModelError(f"{what}: give a point (x, y, z) of the ground in place of wf.GROUND")
+        gap = Q.position(Q.X, what) - P.position(P.X, what)
+        length = float(np.linalg.norm(gap.value))
+        if length <= COINCIDENCE_TOL * max(P.size, Q.size):
+            raise ModelError(f"{what}: its two points coincide, so that its force has no direction")
+        if rest is not None and not (is_number(rest) and rest >= 0.0):
+            raise ModelError(f"{what}: rest = {rest!r} must be a length, 0 or more")
+        values = self._values(what, stiffness=stiffness, damping=damping, rest=rest, law=law, default_rest=length)
+        return self._add_spring(Spring(name, LENGTH, [(gap,)], **values, between=f"{P.label} and {Q.label}"))
+
+    def add_torsion_spring(
+        self, joint: Joint, *, stiffness: float | None = None, damping: float = 0.0, rest: float = 0.0,
+        law: Any = None, name: str | None = None,
+    ) -> Spring:  # fmt: skip
+        """A torsion spring and damper about a revolute joint: moment k (angle - rest) + c d(angle)/dt that turns the
+        child back; turns are counted.
+
+        Args:
+            joint: as `add_joint` returned it; its angle is 0 in the reference.
+            stiffness, damping: N m, N m s.
+            rest: angle without elastic moment, rad.
+            law: in place of stiffness and rest, of angle and rate, N m; see `add_spring`.
+            name: unique name, as for `add_spring`.
+
+        Raises:
+            ModelError: a joint without an angle, or as `add_spring`.
+        """
+        name = self._spring_name(name, "torsion_spring")
+        what = f"spring {name!r}"
+        if joint not in self.description.joints:
+            raise ModelError(f"{what}: {joint!r} is no joint of this builder")
+        if joint.angle is None:
+            raise ModelError(f"{what}: a {joint.kind} joint has no angle, or its handles do not determine it")
+        a, a2, b = joint.angle
+        values = self._values(what, stiffness=stiffness, damping=damping, rest=rest, law=law, default_rest=0.0)
+        if isinstance(law, wp.Function):
+            values["rest"] = 1.0
+        return self._add_spring(Spring(name, ANGLE, [(a, b, a2)], **values, between=joint.between))
+
+    def add_foundation(
+        self, surface: SurfaceSet, *, stiffness: float, damping: float = 0.0, name: str | None = None
+    ) -> Spring:
+        """An elastic foundation: a traction -k u - c du/dt per reference area, u the displacement from the reference.
+
+        Args:
+            surface: faces of a body.
+            stiffness, damping: N/m^3, N s/m^3.
+            name: unique name, for set_parameter("NAME.stiffness"), "NAME.damping".
+
+        Raises:
+            ModelError: no faces, or a value out of range.
+        """
+        name = self._spring_name(name, "foundation")
+        what = f"foundation {name!r}"
+        body = body_of_handle(surface, what, (SurfaceSet,), self.description.bodies)
+        values = self._values(what, stiffness=stiffness, damping=damping, rest=0.0, law=None, default_rest=0.0)
+        t = assembly.facet_tables(surface)
+        area = assembly.facet_areas(body, t)
+        items: list[tuple[Vector, ...]] = [
+            (Vector(np.zeros(3), (VectorPart(body, t.conn[f], t.shape[min(f, len(t.shape) - 1), q], False),)),)
+            for f in range(len(area))
+            for q in range(area.shape[1])
+        ]
+        label = f"surface {surface.name!r} of body {body.name!r}"
+        return self._add_spring(Spring(name, VECTOR, items, **values, scale=area.ravel(), between=label))
+
+    def _spring_name(self, name: str | None, default: str) -> str:
+        return unused_name(name, default, {spring.name for spring in self.description.springs}, "spring")
+
+    def _add_spring(self, spring: Spring) -> Spring:
+        self.description.springs.append(spring)
+        return spring
+
+    @staticmethod
+    def _values(
+        what: str, *, stiffness: Any, damping: Any, rest: Any, law: Any, default_rest: float
+    ) -> dict[str, Any]:  # fmt: skip
+        """Checked values of a Spring."""
+        if (stiffness is None) == (law is None):
+            raise ModelError(f"{what}: give either stiffness or law")
+        if law is not None and rest not in (None, default_rest):
+            raise ModelError(f"{what}: its law gives the force at every length; it has no rest")
+        if isinstance(law, (tuple, list)) and len(law) == 2:
+            law = SampledForce.from_samples(law[0], law[1], what)
+        elif law is not None and not (isinstance(law, wp.Function) and len(law.input_types) == 2):
+            raise ModelError(
+                f"{what}: law = {law!r} must be (lengths, forces), or a wp.func(length: wp.float64, rate: "
+                "wp.float64) -> wp.float64"
+            )
+        out = {"stiffness": 0.0 if stiffness is None else stiffness, "damping": damping}
+        for key, value in out.items():
+            if not (is_number(value) and math.isfinite(value) and value >= 0.0):
+                raise ModelError(f"{what}: {key} = {value!r} must be a number, 0 or more")
+        rest = default_rest if rest is None else rest
+        if not (is_number(rest) and math.isfinite(rest)):
+            raise ModelError(f"{what}: rest = {rest!r} must be a finite number")
+        return {name: float(value) for name, value in (out | {"rest": rest}).items()} | {"law": law}

@@ -1,0 +1,84 @@
+"""Springs as data: coordinates of vectors linear in the slots, with stiffness, damping and rest."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..base.errors import ModelError
+from .joints import Vector
+
+__all__ = ["SampledForce", "Spring"]
+
+
+@dataclass(frozen=True, eq=False)
+class SampledForce:
+    """Force (N, N m) by samples over a coordinate, joined by cubics whose slopes are continuous; monotone where the
+    samples are (Fritsch and Carlson 1980), linear beyond both ends.
+
+    Attributes:
+        knots: (pieces,) where each piece begins; the first is that before the samples.
+        coefficients: (pieces, 4) of powers of y - knot.
+        energy: (pieces,) integral of the force from the first sample, J.
+    """
+
+    knots: np.ndarray
+    coefficients: np.ndarray
+    energy: np.ndarray
+
+    @classmethod
+    def from_samples(cls, y: Any, force: Any, what: str) -> SampledForce:
+        """ModelError unless y rises and both have at least two finite samples."""
+        try:
+            x, f = np.asarray(y, dtype=float), np.asarray(force, dtype=float)
+        except (TypeError, ValueError):
+            x = f = np.zeros(0)
+        if x.ndim != 1 or x.shape != f.shape or len(x) < 2 or not np.isfinite([x, f]).all() or np.diff(x).min() <= 0.0:
+            raise ModelError(f"{what}: law must be (lengths, forces) of two samples or more, lengths rising")
+        h, secant = np.diff(x), np.diff(f) / np.diff(x)
+        m = np.concatenate([secant[:1], np.zeros(len(x) - 2), secant[-1:]])
+        before, after = secant[:-1], secant[1:]
+        w1, w2 = 2.0 * h[1:] + h[:-1], h[1:] + 2.0 * h[:-1]
+        rises = before * after > 0.0
+        safe = [np.where(rises, values, 1.0) for values in (before, after)]
+        m[1:-1] = np.where(rises, (w1 + w2) / (w1 / safe[0] + w2 / safe[1]), 0.0)
+        c2, c3 = (3.0 * secant - 2.0 * m[:-1] - m[1:]) / h, (m[:-1] + m[1:] - 2.0 * secant) / h**2
+        zero = np.zeros(1)
+        cubic = [np.concatenate([zero, c, zero]) for c in (c2, c3)]
+        ends = [np.concatenate([values[:1], values]) for values in (f, m)]
+        work = h * (f[:-1] + h * (m[:-1] / 2.0 + h * (c2 / 3.0 + h * c3 / 4.0)))
+        energy = np.concatenate([zero, zero, np.cumsum(work)])
+        return cls(np.concatenate([x[:1], x]), np.stack([*ends, *cubic], axis=1), energy)
+
+
+@dataclass(eq=False)
+class Spring:
+    """Handle of a spring.
+
+    Attributes:
+        name: unique in its model.
+        kind: LENGTH, ANGLE or VECTOR of kernels/terms/springs.py.
+        items: vectors of each coordinate, all of one spring: one, or many points of a foundation.
+        scale: (items,) factor on stiffness and damping: 1, or the area of a point, m^2.
+        stiffness, damping, rest: of all worlds until `Model.set_parameter`.
+        law: a SampledForce or a wp.func (y, dy/dt) -> force in place of a stiffness.
+        between: what it connects.
+    """
+
+    name: str
+    kind: int
+    items: list[tuple[Vector, ...]] = field(repr=False)
+    stiffness: float
+    damping: float
+    rest: float
+    scale: np.ndarray = field(default_factory=lambda: np.ones(1), repr=False)
+    law: Any = field(default=None, repr=False)
+    between: str = ""
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of its parameters per world."""
+        linear = ("stiffness", "rest") if self.law is None else ()
+        return tuple(name for name in (*linear, "damping") if name != "rest" or len(self.scale) == 1)

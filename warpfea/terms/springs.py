@@ -1,0 +1,311 @@
+"""Springs and dampers between points, about joints and under surfaces; see kernels/terms/springs.py."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy.sparse as sp
+import warp as wp
+
+from ..base.worlds import check_values_per_world, set_rows, values_per_world
+from ..kernels.common.modules import definition_name
+from ..kernels.terms.spring_laws import LINEAR, OWN, SAMPLED, OwnForces, spring_struct
+from ..kernels.terms.springs import ANGLE, LENGTH, VECTOR, scratch_struct, spring_kernels
+from ..model.assembly import grouped_items
+from ..model.springs import SampledForce, Spring
+from .protocols import Parametrised, Preconditioned, Tied
+from .term import LOSS, STORED, Column, StepContext, part
+from .time_law_table import TimeLawTable
+
+if TYPE_CHECKING:
+    from ..model.model import Model
+    from ..model.state import State
+    from .workspace import Workspace
+
+__all__ = ["Springs"]
+
+PARAMETERS = {"stiffness": "stiffness", "damping": "damping", "rest": "rest_coordinate"}
+"""Members of the device struct by the names of the parameters."""
+
+
+class Springs(Tied, Preconditioned, Parametrised):
+    """Springs of a model: a potential and a viscous force of each coordinate.
+
+    Attributes:
+        springs: in the order of addition.
+        data: device tables.
+    """
+
+    name = "springs"
+    translation_invariant = True  # but for those on the ground, see `mark_constrained`
+    columns = (Column("springs", STORED), Column("spring_loss", LOSS))
+    parts = {"springs": "springs and dampers"}
+
+    def __init__(self, model: Model) -> None:
+        super().__init__(model)
+        self.springs: list[Spring] = model.description.springs
+        self.own: OwnForces = tuple(
+            (definition_name(law.key, law), law)
+            for law in dict.fromkeys(s.law for s in self.springs if isinstance(s.law, wp.Function))
+        )
+        self.items = [vectors for spring in self.springs for vectors in spring.items]
+        self.count = self.rows = len(self.items)
+        self.kind = np.repeat([s.kind for s in self.springs], [len(s.items) for s in self.springs])
+        self.dim = (model.worlds, self.count)
+
+    @classmethod
+    def features(cls, model: Model) -> dict[str, bool]:
+        return {"springs": bool(model.description.springs)}
+
+    # tables
+
+    def _list_entries(self) -> None:
+        """Slots of the items, and their weights in the three vectors."""
+        parts = []
+        for item, vectors in enumerate(self.items):
+            found = [vector.entries()[:2] for vector in vectors]
+            slots = np.unique(np.concatenate([slot for slot, _ in found]))
+            weights = np.zeros((len(slots), 3))
+            for side, (slot, weight) in enumerate(found):
+                np.add.at(weights[:, side], np.searchsorted(slots, slot), weight)
+            parts.append((np.full(len(slots), item), slots, weights))
+        self.entry_item, self.entry_slot, self.entry_weight = (np.concatenate(column) for column in zip(*parts))
+        self.entry_start = np.searchsorted(self.entry_item, np.arange(self.count + 1))
+
+    def tied_slots(self) -> list[np.ndarray]:
+        self._list_entries()
+        sets = np.split(self.entry_slot, self.entry_start[1:-1])
+        return [slots for slots, kind in zip(sets, self.kind) if kind != VECTOR]
+
+    def build(self, laws: TimeLawTable) -> None:
+        m, springs = self.model, self.springs
+        sampled = [s.law if isinstance(s.law, SampledForce) else None for s in springs]
+        pieces = [law for law in sampled if law is not None]
+        functions = [function for _, function in self.own]
+        codes = [LINEAR if s.law is None else OWN + functions.index(s.law) if s.law in functions else SAMPLED
+                 for s in springs]  # fmt: skip
+        reference = np.zeros((self.count, 3, 3))
+        for item, vectors in enumerate(self.items):
+            for side, vector in enumerate(vectors):
+                reference[item, side] = vector.value
+        blocks = np.where(self.kind == ANGLE, 9, 1)
+        self.block_count = int(blocks.sum())
+        per_world = {
+            field: np.tile([getattr(s, name) for s in springs], (m.worlds, 1)) for name, field in PARAMETERS.items()
+        }
+        self.definition = {
+            "kind": self.kind,
+            "spring": np.repeat(np.arange(len(springs)), [len(s.items) for s in springs]),
+            "scale": np.concatenate([s.scale for s in springs]),
+            "reference": reference,
+            "entry_item": self.entry_item,
+            "entry_slot": self.entry_slot,
+            "entry_weight": self.entry_weight,
+            "law": np.array(codes),
+            "knot": np.concatenate([np.zeros(1), *(law.knots for law in pieces)]),
+            "coefficients": np.concatenate([np.zeros((1, 4)), *(law.coefficients for law in pieces)]),
+        } | per_world
+        self.data = spring_struct()()
+        m.memory.fill(
+            self.data, "springs", **self.definition, entry_start=self.entry_start,
+            first_block=np.cumsum(blocks) - blocks,
+            knot_start=1 + np.cumsum([0] + [len(law.knots) if law is not None else 0 for law in sampled]),
+            knot_energy=np.concatenate([np.zeros(1), *(law.energy for law in pieces)]),
+        )  # fmt: skip
+        self.connectivity = [self.entry_slot[:, None]]
+
+    def hash(self, h: Any) -> None:
+        for values in self.definition.values():
+            h.update(np.ascontiguousarray(values).tobytes())
+        h.update(repr([name for name, _ in self.own]).encode())
+
+    def mark_constrained(self, free: np.ndarray) -> None:
+        """Components whose translation changes a vector are held by the ground: nothing else moves the vector along."""
+        position = self.model.slot_table.kind == 0
+        total = np.zeros((self.count, 3))
+        size = np.zeros((self.count, 3))
+        own = position[self.entry_slot]
+        np.add.at(total, self.entry_item[own], self.entry_weight[own])
+        np.add.at(size, self.entry_item[own], np.abs(self.entry_weight[own]))
+        felt = np.any(np.abs(total) > 1e-9 * size, axis=1)[self.entry_item]
+        free[np.unique(self.model.components.of_slot[self.entry_slot[felt]])] = 0.0
+
+    def restraints(self, state: State, component: int) -> sp.csr_matrix:
+        """Gradients of the coordinates; of VECTOR its components."""
+        u = state.displacement.numpy()[0].astype(float)
+        rows, columns, values, count = [], [], [], 0
+        of = self.model.components.of_slot
+        for item in range(self.count):
+            own = slice(self.entry_start[item], self.entry_start[item + 1])
+            slots, weights = self.entry_slot[own], self.entry_weight[own]
+            if of[slots[0]] != component:
+                continue
+            vectors = self.definition["reference"][item] + weights.T @ u[slots]
+            for gradient in coordinate_gradients(int(self.kind[item]), vectors):
+                rows.append(np.full(3 * len(slots), count))
+                columns.append((3 * slots[:, None] + np.arange(3)).ravel())
+                values.append((weights @ gradient).ravel())
+                count += 1
+        shape = (count, 3 * self.model.slots)
+        if not count:
+            return sp.csr_matrix(shape)
+        return sp.csr_matrix((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=shape)
+
+    def incidence(self) -> tuple[np.ndarray, np.ndarray, int]:
+        return self.entry_item, self.entry_slot, self.count
+
+    # simulation setup
+
+    def kernels(self, ctx: StepContext) -> Any:
+        """Kernels for the integrator of a simulation."""
+        return spring_kernels(self.model.dtype, ctx.midpoint, self.own)
+
+    def register(self, ctx: StepContext) -> None:
+        if (self.kind == ANGLE).any():
+            ctx.state.register("spring_angle", wp.float64, (self.count,))
+
+    def allocate(self, work: Workspace, ctx: StepContext) -> None:
+        scratch, B = scratch_struct()(), self.model.worlds
+        for name, var in scratch_struct().vars.items():
+            if name != "rows":
+                shape = (B, self.block_count if name in ("hessian", "projected") else self.count)
+                setattr(scratch, name, work.array(f"springs {name}", shape, var.type.dtype))
+        scratch.rows = work.rows_of(self)
+        ctx.scratch[self.name] = scratch, work.array("springs energies", (len(self.columns), *self.dim), wp.float64)
+
+    def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
+        return {self.kernels(ctx).module}
+
+    def _turned(self, ctx: StepContext) -> wp.array:
+        """Angles with their turns [world, item]; of a model without angles an array that is not read."""
+        return getattr(ctx.state, "spring_angle", ctx.scratch[self.name][0].start)
+
+    # in a step
+
+    @part("springs")
+    def begin(self, ctx: StepContext, active: wp.array) -> None:
+        """Coordinates at the start, from which rates are computed."""
+        state, step = ctx.state, ctx.work.step
+        first, second = (step.b, step.q_a) if ctx.accelerated else (step.a0, step.a1)
+        args = [self.data, state.displacement, state.velocity, ctx.u_before, int(ctx.accelerated), first, second]
+        args += [self._turned(ctx), active, ctx.scratch[self.name][0]]
+        ctx.launch(self.kernels(ctx).begin, self.dim, args)
+
+    def _start(self, ctx: StepContext) -> list[Any]:
+        """Positions from which a VECTOR has its rate, 0 in statics, and dq/dv."""
+        start = ctx.state.displacement if ctx.midpoint else ctx.work.q_tilde
+        return [start, float(ctx.inertia), ctx.work.step.dq_dv]
+
+    @part("springs")
+    def force(self, ctx: StepContext, active: wp.array) -> None:
+        w, k, (scratch, _) = ctx.work, self.kernels(ctx), ctx.scratch[self.name]
+        start, in_motion, dq_dv = self._start(ctx)
+        ctx.launch(k.evaluate, self.dim, [self.data, w.u, start, in_motion, dq_dv, active, scratch])
+        self._scatter(ctx, scratch.force, active, w.pool_force)
+
+    prepare = force
+
+    def _scatter(self, ctx: StepContext, of_item: wp.array, active: wp.array, pool: wp.array) -> None:
+        args = [self.data, of_item, active, self.offset, pool]
+        ctx.launch(self.kernels(ctx).scatter, (self.model.worlds, len(self.entry_item)), args)
+
+    @part("springs")
+    def product(self, ctx: StepContext, p: wp.array, active: wp.array) -> None:
+        scratch, _ = ctx.scratch[self.name]
+        ctx.launch(self.kernels(ctx).change, self.dim, [self.data, p, active, scratch])
+        self._scatter(ctx, scratch.product, active, ctx.work.pool_product)
+
+    @part("springs")
+    def diagonal(self, ctx: StepContext, active: wp.array) -> None:
+        args = [self.data, active, self.offset, ctx.scratch[self.name][0], ctx.work.pool_block]
+        ctx.launch(self.kernels(ctx).diagonal, (self.model.worlds, len(self.entry_item)), args)
+
+    @part("springs")
+    def energy_increments(self, ctx: StepContext, accepted: wp.array) -> wp.array:
+        scratch, rows = ctx.scratch[self.name]
+        start, in_motion, dq_dv = self._start(ctx)
+        args = [self.data, ctx.work.u, start, ctx.state.displacement, in_motion, dq_dv, accepted, scratch, rows]
+        ctx.launch(self.kernels(ctx).energies, self.dim, args)
+        return rows
+
+    @part("springs")
+    def commit(self, ctx: StepContext, accepted: wp.array) -> None:
+        if "spring_angle" in ctx.state.names:
+            args = [self.data, ctx.work.u, accepted, ctx.scratch[self.name][0], self._turned(ctx)]
+            ctx.launch(self.kernels(ctx).store_turns, self.dim, args)
+
+    def stored_energy(self, ctx: StepContext) -> dict[str, np.ndarray]:
+        active = wp.ones(self.model.worlds, dtype=wp.int32, device=self.model.device)
+        self.begin(ctx, active)
+        scratch, rows = ctx.scratch[self.name]
+        u = ctx.state.displacement
+        args = [self.data, u, u, u, 0.0, wp.ones_like(ctx.work.step.dq_dv), active, scratch, rows]
+        ctx.launch(self.kernels(ctx).energies, self.dim, args)
+        return {"springs": rows.numpy()[0].sum(axis=1)}
+
+    # in a linear solve
+
+    def cached_inputs(self, ctx: StepContext) -> list[tuple[str, wp.array]]:
+        return [("springs", ctx.scratch[self.name][0].projected)]
+
+    def allocate_blocks(self, ctx: StepContext, matrix: Any, *, projected: bool) -> None:
+        if "springs" in self.model.cache:
+            return
+        size = np.diff(self.entry_start)
+        first = np.repeat(self.entry_start[:-1], size**2)
+        pair = np.arange(len(first)) - np.repeat(np.cumsum(size**2) - size**2, size**2)
+        width = np.repeat(size, size**2)
+        row, column = first + pair // width, first + pair % width
+        kept = self.entry_slot[row] <= self.entry_slot[column]
+        row, column = row[kept], column[kept]
+        found = matrix.pattern.find_upper(self.entry_slot[row], self.entry_slot[column])
+        order, entry, start = grouped_items(found)
+        tables = (entry, start, row[order], column[order])
+        arrays = [self.model.array("matrix pattern", table, wp.int32) for table in tables]
+        self.model.cache["springs"] = arrays, len(entry)
+
+    def block_modules(self) -> Iterable[wp.Module]:
+        return {spring_kernels(self.model.dtype, False, self.own).module}
+
+    def blocks(
+        self, ctx: StepContext, matrix: Any, cached: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,
+        *, projected: bool,
+    ) -> None:  # fmt: skip
+        (arrays, count), m = self.model.cache["springs"], self.model
+        values = cached[0] if projected else ctx.scratch[self.name][0].hessian
+        args = [m.topology, matrix.pattern.data, self.data, *arrays, values, dq_dv, active, out]
+        ctx.launch(spring_kernels(m.dtype, False, self.own).add_blocks, (m.worlds, count), args)
+
+    # parameters
+
+    def parameters(self) -> dict[str, Callable[[Any, np.ndarray], None]]:
+        return {
+            f"{spring.name}.{name}": partial(self._set_parameter, k, name)
+            for k, spring in enumerate(self.springs)
+            for name in spring.parameters
+        }
+
+    def _set_parameter(self, k: int, name: str, values: Any, mask: np.ndarray) -> None:
+        """Write one value of a spring in the chosen worlds."""
+        what = f"spring {self.springs[k].name!r}"
+        wanted = values_per_world(what, name, values, self.model.worlds)
+        good = np.isfinite(wanted) & ((wanted >= 0.0) | (name == "rest" and self.kind[k] != LENGTH))
+        check_values_per_world(what, name, wanted, ~mask | good, "finite" if name == "rest" else "0 or more")
+        set_rows(getattr(self.data, PARAMETERS[name]), (mask, k), wanted[mask])
+
+    def parameter_arrays(self) -> dict[str, wp.array]:
+        return {field: getattr(self.data, field) for field in PARAMETERS.values()}
+
+
+def coordinate_gradients(kind: int, v: np.ndarray) -> list[np.ndarray]:
+    """Derivatives (3, 3) of a coordinate, or of the components of a VECTOR, by the vectors v (3, 3), as rows."""
+    if kind != ANGLE:
+        n = v[0] / max(np.linalg.norm(v[0]), 1e-300)
+        zero = np.zeros(3)
+        return [np.stack([e, zero, zero]) for e in ([n] if kind == LENGTH else np.eye(3))]
+    a, b, a2 = v
+    y, radius = np.arctan2(a2 @ b, a @ b), np.hypot(a2 @ b, a @ b)
+    return [np.stack([-np.sin(y) * b, np.cos(y) * a2 - np.sin(y) * a, np.cos(y) * b]) / radius]
