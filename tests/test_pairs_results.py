@@ -23,7 +23,7 @@ def test_two_bodies_are_hertz(result, part, numbers, stiffness):
     assert fine["depth_over_a"] >= 25.0
     for name in numbers:
         assert abs(fine[name]) < 0.03
-    assert fine["pressure_scatter"] < 0.1
+    assert fine["pressure_scatter"] < (0.04 if stiffness is None else coarse["pressure_scatter"])
     assert fine["newton"] <= 30 * fine["load_steps"]
 
 
