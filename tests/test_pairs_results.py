@@ -1,4 +1,4 @@
-"""tests/results/contact_pairs_cpu.json: balls and cylinders beside Hertz, a stack that rests."""
+"""Results of balls and cylinders beside Hertz, and of a stack that rests."""
 
 import pytest
 from result_files import content_of
@@ -6,7 +6,7 @@ from result_files import content_of
 
 @pytest.fixture(scope="module")
 def result():
-    return content_of("contact_pairs_cpu.json", "python -m tests.validation contact", "cpu")
+    return content_of("contact_hertz_pairs_cpu.json", "python tests/contact_hertz_pairs.py", "cpu")
 
 
 @pytest.mark.parametrize("stiffness", [None, 300.0])
@@ -27,7 +27,8 @@ def test_two_bodies_are_hertz(result, part, numbers, stiffness):
     assert fine["newton"] <= 30 * fine["load_steps"]
 
 
-def test_stacks_rest(result):
+def test_stacks_rest():
+    result = content_of("contact_pairs_cpu.json", "warpfea study contact", "cpu")
     assert [(row["E"], row["top"]) for row in result["stack"]] == [(1e7, 1.0), (1e10, 1.0), (2e9, 1e3), (1e10, 1e3)]
     for row in result["stack"]:
         assert row["cubes"] == 10

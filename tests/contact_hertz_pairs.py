@@ -1,20 +1,22 @@
-"""Two elastic bodies pressed together, with meshes that do not match: balls and cylinders beside Hertz."""
+"""Two elastic bodies pressed together, with meshes that do not match: balls and cylinders beside Hertz.
 
-from __future__ import annotations
+Run as `python tests/contact_hertz_pairs.py --out FILE`.
+"""
 
+import argparse
+import json
 import math
+import pathlib
+import sys
 from typing import Any
 
 import numpy as np
+from validation.contact import WIDTH, A, E, fit_errors, grading, solved
 
 import warpfea as wf
+from warpfea.base.provenance import provenance_of
 from warpfea.contact.evaluation import evaluate_pairs
 from warpfea.contact.facets import FacetContact
-
-from .hertz import WIDTH, A, E, fit_errors, grading, solved
-from .table import Row
-
-__all__ = ["MODULI", "RADIUS", "pressed_case"]
 
 RADIUS = 2.0
 """Of each surface, m: of both together 1 m."""
@@ -63,8 +65,8 @@ def point_pressures(sim: wf.Simulation, round_axes: tuple[int, ...]) -> tuple[np
 
 def pressed_case(
     *, balls: bool, inner: tuple[int, int], outer: tuple[int, int], stiffness: float | None, load_steps: int = 4,
-    device: Any = "cpu",
-) -> Row:  # fmt: skip
+    device: Any = "cpu"
+) -> dict[str, Any]:  # fmt: skip
     """Press one elastic ball, or cylinder in plane strain, onto another of twice the modulus, R = 1 m of both.
 
     Meshed are a quarter of the balls and half a slice of the cylinders; `stiffness` is a multiple of the region's, by
@@ -112,3 +114,25 @@ def pressed_case(
         **fit_errors(*point_pressures(sim, round_axes), radius, peak), **approach, "penetration": penetration,
         "load_steps": load_steps, "newton": int(found.newton[0]), "pcg": int(found.pcg[0]), "seconds": seconds,
     }  # fmt: skip
+
+
+BALLS = [((4, 5), (5, 6), None), ((5, 7), (6, 7), None), ((4, 5), (5, 6), 300.0), ((6, 8), (6, 6), 300.0)]
+CYLINDERS = [(i, o, stiffness) for stiffness in (None, 300.0) for i, o in (((5, 7), (6, 7)), ((10, 14), (8, 9)))]
+
+
+def main():
+    """Make the file."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--out", type=pathlib.Path, required=True)
+    out = parser.parse_args().out
+    content = provenance_of([], "cpu") | {"command": " ".join(["python", *sys.argv])}
+    content["settings"] = {"E": MODULI, "surface_radius": RADIUS, "contact_radius": A, "nu": NU}
+    for part, cases in {"balls": BALLS, "cylinders": CYLINDERS}.items():
+        content[part] = [
+            pressed_case(balls=part == "balls", inner=i, outer=o, stiffness=stiffness) for i, o, stiffness in cases
+        ]
+    out.write_text(json.dumps(content, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
