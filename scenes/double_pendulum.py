@@ -1,4 +1,4 @@
-"""A double pendulum of two soft solid links."""
+"""A double pendulum of two soft or rigid links."""
 
 import numpy as np
 
@@ -16,6 +16,7 @@ def double_pendulum(
     E: float = 4e6,
     nu: float = 0.3,
     density: float = 1100.0,
+    rigid: bool = False,
 ) -> wf.ModelBuilder:
     """Two soft T10 links, hung one behind the other on hinges, are let go from the horizontal, and bend as they swing.
 
@@ -30,6 +31,7 @@ def double_pendulum(
         E: Young's modulus (SVK), Pa.
         nu: Poisson's ratio.
         density: kg/m^3.
+        rigid: rigid links in place of soft ones.
     """
     b = wf.ModelBuilder(gravity=(0.0, 0.0, -9.81))
     rubber = wf.SVK(E=E, nu=nu, density=density)
@@ -38,6 +40,8 @@ def double_pendulum(
 
     def link(name: str, low: np.ndarray) -> wf.Body:
         mesh = wf.mesh.box(size, cells=(cells, 1, 1), origin=low, name=name)
+        if rigid:
+            return b.add_rigid(mesh, density=density, name=name)
         return b.add_solid(mesh, material=rubber)
 
     low = np.array([-0.5 * depth, -width, -0.5 * depth])

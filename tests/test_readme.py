@@ -31,6 +31,7 @@ PAGES += [
     ROOT / "kernels/LAUNCHES.md",
     ROOT / TUTORIAL,
     ROOT / "warpfea/builder/CONTACT.md",
+    ROOT / "warpfea/builder/PARTS.md",
     ROOT / "warpfea/simulation/LEARNING.md",
     ROOT / "warpfea/sweeps/SWEEPS.md",
 ]

@@ -18,7 +18,7 @@ BUILTIN = [
     "arch", "ball_on_plate", "beam_over_cylinders", "belt", "block_stack", "bouncing_ball", "brick_floor",
     "cantilever", "chain", "comb", "crossed_beams", "double_pendulum", "finger_beam_shell", "four_bar", "gears",
     "gripper", "hook", "hung_plate", "links", "mixed", "overhang", "peg_in_hole", "pendulum", "pile",
-    "plate_pendulum", "rollup", "slider_crank", "spin", "tilting_table", "twist",
+    "plate_pendulum", "rollup", "slider_crank", "spin", "tilting_table", "top", "twist",
 ]  # fmt: skip
 
 

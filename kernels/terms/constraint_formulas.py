@@ -88,7 +88,7 @@ def formula_kernels(dtype: str, midpoint: bool, formula: Formula) -> KernelSet:
             functions.store_gradients(mul.end_gradient, world, row, scale * formula.gradients(v[0], v[1], v[2]))
             v = row_vectors(con, u_stage, world, row)
         store_derivatives(mul.gradient, mul.curvature, world, row, scale, v)
-        functions.store_value(con, mul, alpha[world], world, row, scale, f, c)
+        functions.store_value(con, mul, u, alpha[world], world, row, scale, f, c)
 
     @wp.kernel(module=module)
     def derivatives(

@@ -174,8 +174,24 @@ def constraint_functions(dtype: str) -> KernelSet:
             into[world, 3 * row + side] = G[side]
 
     @wp.func
-    def store_value(con: Constraints, mul: Multipliers, alpha: f64, world: int, row: int, scale: f64, f: f64, c: f64):
-        """Store c and f of a row, its multiplier at the trial step, and its part of the augmented potential."""
+    def term_size(con: Constraints, term: int, u: p.vec3_2d, world: int) -> f64:
+        """Sum of |w_k u_k| of a vector, whose round-off is that of the vector."""
+        s = f64(0.0)
+        for k in range(con.term_start[term], con.term_start[term + 1]):
+            s += wp.length(con.term_weight[k] * vec3d(u[world, con.term_slot[k]]))
+        return s
+
+    @wp.func
+    def store_value(
+        con: Constraints, mul: Multipliers, u: p.vec3_2d, alpha: f64, world: int, row: int, scale: f64, f: f64, c: f64
+    ):  # fmt: skip
+        """Store c and f of a row, its multiplier at the trial step, and its part of the augmented potential.
+
+        The size of that part, of which round-off is a fraction, follows the summands of c, which cancel.
+        """
+        size = wp.abs(c)
+        for term in range(3 * row, 3 * row + 3):
+            size += wp.length(mul.gradient[world, term]) * term_size(con, term, u, world)
         rho = mul.penalty[world, row]
         frozen = mul.multiplier[world, row]
         new = frozen
@@ -192,7 +208,7 @@ def constraint_functions(dtype: str) -> KernelSet:
         penalty_energy = f64(0.5) * rho * c * c
         mul.rows[0, world, row] = frozen * c + penalty_energy
         mul.rows[1, world, row] = new * c + penalty_energy
-        mul.rows[2, world, row] = wp.max(wp.abs(frozen * c), wp.abs(new * c)) + penalty_energy
+        mul.rows[2, world, row] = wp.max(wp.abs(frozen), wp.abs(new)) * size + penalty_energy
         wp.atomic_max(mul.violation, world, con.connected_component[row], wp.abs(c))
 
     return kernel_set(locals())
@@ -283,7 +299,7 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> KernelSet:
                 if wp.isfinite(mul.last_target[world, row]):
                     angle = f64(0.5) * (mul.last_target[world, row] + f)
         functions.store_gradients(mul.gradient, world, row, constraint_gradients(kind, scale, angle, slope, b, a2))
-        functions.store_value(con, mul, alpha[world], world, row, scale, f, c)
+        functions.store_value(con, mul, u, alpha[world], world, row, scale, f, c)
 
     @masked_kernel(module, "active")
     def product_terms(con: Constraints, mul: Multipliers, p_in: p.vec3_2d, dq_dv: double_1d, active: int_1d):

@@ -13,9 +13,10 @@ from ..model.description import support_slots
 from ..model.discretisation import Discretisation
 from ..model.handles import MaterialPoint, NodeSet, SurfaceSet
 from ..model.joints import Vector, VectorPart, constant_vector
+from ..model.rigid import RigidBody
 from .checks import vector
 
-__all__ = ["COINCIDENCE_TOL", "GROUND", "UNKNOWN_WEAKNESS", "Attachment", "Ground", "make_attachment"]
+__all__ = ["COINCIDENCE_TOL", "GROUND", "UNKNOWN_WEAKNESS", "Attachment", "Ground", "as_point", "make_attachment"]
 
 COINCIDENCE_TOL = 1e-9
 """Distance of coincident points, relative to the size of their bodies."""
@@ -111,9 +112,17 @@ class Attachment:
         return same and self.body is not None and self.body is other.body
 
 
+def as_point(thing: Any) -> Any:
+    """Nodes or a surface of a rigid part as the point of their mean; other things as they are."""
+    if isinstance(thing, (NodeSet, SurfaceSet)) and isinstance(thing.body, RigidBody):
+        return thing.body.mean_point(thing)
+    return thing
+
+
 def make_attachment(thing: Any, what: str, *, child: bool) -> Attachment:
     """Attachment of a handle, or of a fixed point (3,). ModelError for anything else."""
     no_slots = np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 3))
+    thing = as_point(thing)
     if isinstance(thing, Ground):
         return Attachment(None, np.full(3, np.nan), *no_slots, np.eye(3), np.zeros((3, 3)), "the ground", child)
     if isinstance(thing, MaterialPoint):

@@ -16,6 +16,7 @@ from ..model.description import BodyForce, Description
 from ..model.handles import MaterialPoint, NodeSet, SurfaceSet
 from ..model.joints import Joint
 from ..model.model import Model
+from ..model.rigid import RigidBody
 from ..terms.term import Term
 from ..terms.term_set import TermSet
 from ..time_laws import Rotation
@@ -26,6 +27,7 @@ from .bodies import MeshLike, as_mesh, make_solid, make_structure, shell_geometr
 from .checks import body_of_handle, check_densities, parse_gravity, warn_implausible
 from .contact_methods import ContactMethods
 from .joints import make_constraint, make_joint
+from .rigid import make_rigid
 from .springs import SpringMethods
 from .welds import make_weld
 
@@ -148,6 +150,32 @@ class ModelBuilder(ContactMethods, SpringMethods):
         name = self._body_name(name, mesh.name)
         axes, frames = shell_geometry(name, mesh, thickness, normals, corners)
         return self._add_body(make_structure(name, mesh, "3443", material, integration, axes, frames), initial)
+
+    def add_rigid(
+        self, shape: Any, *, density: float | None = None, mass: float | None = None, inertia: Any = None,
+        com: Any = None, material: Material | None = None, name: str | None = None,
+    ) -> RigidBody:  # fmt: skip
+        """Add a rigid part: twelve coordinates and six constraints, rotations as in Paper I, Eqs. (12)-(14).
+
+        Its handle serves as any body's: joints, welds, loads, moments, supports, drives, probes, contact.
+
+        Args:
+            shape: wf.Box, Sphere, Capsule, Cylinder, a closed wf.TriMesh, or a mesh of a volume.
+            density, mass: kg/m^3 or kg, one of them.
+            inertia: tensor (3, 3) or its diagonal (3,) about the centre of mass in the axes of the scene, kg m^2; by
+                default that of a uniform density.
+            com: (3,) centre of mass, m; by default that of a uniform density.
+            material: elasticity that a contact takes for the part; by default that of the other side.
+            name: unique name.
+
+        Raises:
+            ModelError: an open surface without mass, inertia and com, a value that is not positive, or inertias that
+                no mass has.
+        """
+        body = make_rigid(self._body_name(name, "rigid"), shape, density, mass, inertia, com, material)
+        self._add_body(body, None)
+        self._record_joint(body.rigidity())
+        return body
 
     def _body_name(self, name: str | None, default: str) -> str:
         return unused_name(name, default, {body.name for body in self.bodies}, "body")

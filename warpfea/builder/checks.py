@@ -63,7 +63,7 @@ def body_of_handle(thing: Any, what: str, kinds: tuple[type, ...], bodies: list[
     if isinstance(thing, (NodeSet, SurfaceSet)) and len(thing) == 0:
         chosen = repr(thing.name) if thing.name else "of the predicate or list"
         raise ModelError(f"{what}: the selection {chosen} on body {body.name!r} is empty")
-    if isinstance(thing, NodeSet):
+    if isinstance(thing, NodeSet) and not body.rigid:
         unused = thing.indices[body.node_slot[thing.indices] < 0]
         if len(unused) == len(thing.indices):
             raise ModelError(f"{what}: no element of body {body.name!r} uses node {int(unused[0])}")

@@ -12,6 +12,7 @@ from ..model.description import DeadLoad, Moment, Pressure, Probe, Support, supp
 from ..model.handles import MaterialPoint, NodeSet, SurfaceSet
 from ..model.masses import center_of_mass
 from ..time_laws import Rotation, time_law
+from .attachments import as_point
 from .checks import checked_rotation, component_mask, slot_field, vector
 
 __all__ = [
@@ -31,6 +32,7 @@ __all__ = [
 def point_load(body: Body, point: MaterialPoint | NodeSet, force: Any) -> DeadLoad:
     """See ModelBuilder.add_point_load."""
     law = time_law(force, f"point load on {body.name!r}")
+    point = as_point(point)
     if isinstance(point, NodeSet):
         slots, weights = _node_mean(point)
     else:
@@ -47,6 +49,7 @@ def _node_mean(nodes: NodeSet) -> tuple[np.ndarray, np.ndarray]:
 def moment_load(body: Body, point: MaterialPoint | NodeSet, moment: Any) -> Moment:
     """See ModelBuilder.add_moment."""
     law = time_law(moment, f"moment on {body.name!r}")
+    point = as_point(point)
     if isinstance(point, MaterialPoint):
         slots, vectors, axes = point.slots[None], (point.gradients @ point.axes)[None], point.axes[None]
     else:
@@ -120,6 +123,7 @@ def set_initial_state(body: Body, velocity: Any, angular_velocity: Any, displace
 
 def probe_at(name: str, body: Body, where: MaterialPoint | SurfaceSet | NodeSet) -> Probe:
     """See ModelBuilder.add_probe."""
+    where = as_point(where)
     if isinstance(where, MaterialPoint):
         slots, weights = where.slots, where.weights
     elif isinstance(where, SurfaceSet):

@@ -11,8 +11,9 @@ from ..model.description import support_slots
 from ..model.discretisation import Discretisation
 from ..model.handles import NodeSet, SurfaceSet
 from ..model.joints import Joint, Vector, VectorPart
+from ..model.rigid import RigidBody
 from ..model.surfaces import named_faces
-from .joints import pin_rows
+from .joints import make_joint, pin_rows
 
 __all__ = ["make_weld"]
 
@@ -31,6 +32,9 @@ def make_weld(first: NodeSet | SurfaceSet, second: SurfaceSet | Body, name: str)
     body = first.body
     if body is holder:
         raise ModelError(f"{what}: both sides are body {body.name!r}")
+    if isinstance(body, RigidBody) and isinstance(holder, RigidBody):
+        at = body.mean_point(first)
+        return make_joint("fixed", holder.point(at.X), at, None, None, None, None, name)
     face = first if isinstance(first, SurfaceSet) else _named_face(first)
     target_surface = second if isinstance(second, SurfaceSet) else None
     if face is not None:
@@ -61,6 +65,8 @@ def _mortar_gaps(
     t = assembly.facet_tables(face, _subdivisions(face, holder))
     X, dA = assembly.facet_positions(body, t), assembly.facet_areas(body, t)
     _check_near_surface(X.reshape(-1, 3), target_surface, what)
+    if isinstance(holder, RigidBody):
+        return _rigid_gaps(body, np.unique(t.conn), holder), _mean_of_face(body, t, X, dA)
     n, m = body.slot_count, holder.slot_count
     F, Q, _ = t.shape.shape
     own_weights, holder_weights = np.zeros((F * Q, n)), np.zeros((F * Q, m))
@@ -75,8 +81,21 @@ def _mortar_gaps(
         size = np.abs(test).sum()
         if size > 1e-12 * share.sum():
             gaps.append(_gap_vector(body, holder, test @ own_weights / size, test @ holder_weights / size))
-    mean = share / share.sum()
-    return gaps, _mean_point(body, mean @ own_weights, mean @ X.reshape(-1, 3))
+    return gaps, _mean_of_face(body, t, X, dA)
+
+
+def _rigid_gaps(body: Discretisation, slots: np.ndarray, holder: RigidBody) -> list[Vector]:
+    """Each slot of a face tied to its value in the affine motion of a rigid part: what the mortar tie comes to."""
+    E, position = body.reference[slots], body.slot_kind[slots] == 0
+    weights = np.column_stack([position, E + position[:, None] * (body.origin - holder.com)]) @ holder.affine
+    return [_gap_vector(body, holder, own, w) for own, w in zip(np.eye(body.slot_count)[slots], weights)]
+
+
+def _mean_of_face(body: Discretisation, t: assembly.FacetTables, X: np.ndarray, dA: np.ndarray) -> Vector:
+    """Area mean of a face."""
+    weights = np.zeros(body.slot_count)
+    np.add.at(weights, t.conn, np.einsum("fq,fqi->fi", dA / dA.sum(), t.shape))
+    return _mean_point(body, weights, np.einsum("fq,fqk->k", dA / dA.sum(), X))
 
 
 def _subdivisions(face: SurfaceSet, holder: Discretisation) -> int:
@@ -124,6 +143,8 @@ def _check_near_surface(X: np.ndarray, target_surface: SurfaceSet | None, what: 
 
 
 def _locate(holder: Discretisation, X: np.ndarray, what: str) -> Any:
+    if isinstance(holder, RigidBody):
+        return holder.point(X)
     try:
         return locate(holder, X, slack=GAP_TOL)
     except ModelError as error:

@@ -282,32 +282,19 @@ def nearest_samples(
     key = f"{type(t).__name__} {k} samples {body.name}"
     if key not in t.model.cache:
         count = body.family.node_samples.shape[1]
-        nodes = np.asarray(body.mesh.used_nodes)
-        if X is None:
+        nodes = np.asarray(body.surface_nodes)
+        if X is None and not body.rigid:
             p = t.host[k]
             used = np.zeros(body.slot_count, dtype=bool)
             used[p.conn[np.any(np.abs(p.shape) > 1e-12, axis=1)]] = True
-        else:
-            used = _surface_slots(body)
-        nodes = nodes[used[body.node_slot[nodes]]]
+            nodes = np.asarray(body.mesh.used_nodes)
+            nodes = nodes[used[body.node_slot[nodes]]]
         samples = (nodes[:, None] * count + np.arange(count)).ravel()
         tree = cKDTree(_sample_positions(body)[samples])
         fixed = None if X is not None else samples[tree.query(t.host[k].X.reshape(-1, 3))[1]]
         t.model.cache[key] = (samples, tree, fixed)
     samples, tree, fixed = t.model.cache[key]
     return fixed if X is None else samples[tree.query(X)[1]]
-
-
-def _surface_slots(body: Discretisation) -> np.ndarray:
-    """Mask (slots,) of slots on an outer face."""
-    out = np.zeros(body.slot_count, dtype=bool)
-    for face in np.unique(body.boundary[:, 1]):
-        xi, _ = body.family.face_points(int(face), np.array([(0.25, 0.25), (0.5, 0.25), (0.25, 0.5)]))
-        rows = body.boundary[body.boundary[:, 1] == face, 0]
-        shape, _ = element_functions(body, rows, xi)
-        used = np.any(np.abs(np.broadcast_to(shape, (len(rows), *shape.shape[1:]))) > 1e-12, axis=1)
-        out[body.connectivity[rows][used]] = True
-    return out
 
 
 def _sample_positions(body: Discretisation) -> np.ndarray:

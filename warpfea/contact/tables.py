@@ -116,9 +116,13 @@ def contact_constants(
     """
     shear_compliance = inverse_mass = 0.0
     compliances = []
+    yields = [surface.body.elastic for surface in contact.surfaces]
     for surface in contact.surfaces:
         total = mass_of(surface.body)
         inverse_mass += 1.0 / total if total > 0.0 else math.inf
+        if any(yields) and not surface.body.elastic:
+            compliances.append(0.0)
+            continue
         E, nu = modulus_of(surface.body, surface)
         compliances.append((1.0 - nu**2) / E)
         shear_compliance += 2.0 * (2.0 - nu) * (1.0 + nu) / E

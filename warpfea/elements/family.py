@@ -119,6 +119,7 @@ class Family:
         spin_vectors: rotated by a moment: 3, the deformation gradient; 2, the section; 1, the director. A beam's axis
             or a shell's surface offers almost no rotational stiffness at a point, and must not carry it.
         solid: the mesh cell is the body itself; False for beams and shells, which add a section or a thickness.
+        rigid: all cells of a body share four slots; not selectable as an element.
     """
 
     name: str
@@ -142,6 +143,7 @@ class Family:
     slot_sets: dict[str, tuple[int, ...]] = field(default_factory=dict)
     spin_vectors: int = 3
     solid: bool = True
+    rigid: bool = False
 
     def scheme(self, name: str) -> tuple[EnergyPart, ...]:
         """The parts of the integration `name`, a scheme or a force rule. Raises KeyError."""
@@ -238,8 +240,8 @@ def register(family: Family) -> Family:
 
 
 def families() -> Sequence[str]:
-    """Names of the registered families."""
-    return tuple(_families)
+    """Names of the registered families of flexible bodies."""
+    return tuple(name for name, family in _families.items() if not family.rigid)
 
 
 def get_family(name: str) -> Family:
@@ -250,7 +252,7 @@ def get_family(name: str) -> Family:
 
 def family_for_cell(cell_type: str) -> Family:
     """The default solid family of a cell type: the one with the fewest slots. Raises ModelError."""
-    fits = [f for f in _families.values() if f.cell_type == cell_type and f.solid]
+    fits = [f for f in _families.values() if f.cell_type == cell_type and f.solid and not f.rigid]
     if fits:
         return min(fits, key=lambda f: f.slots)
     raise ModelError(f"no solid element for mesh cells of type {cell_type!r}")

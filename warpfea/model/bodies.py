@@ -15,7 +15,7 @@ from .assembly import orthonormal
 from .discretisation import Discretisation, element_functions
 from .handles import ElementSet, MaterialPoint, NodeSet, SurfaceSet
 
-__all__ = ["Body", "locate"]
+__all__ = ["Body", "locate", "point_coordinates"]
 
 
 @dataclass(eq=False, repr=False)
@@ -73,6 +73,17 @@ def _label(selection: Any) -> str:
     return selection if isinstance(selection, str) else ""
 
 
+def point_coordinates(body: Discretisation, X: Any) -> np.ndarray:
+    """Three finite numbers (3,), m. Raises ModelError."""
+    try:
+        x = np.asarray(X, dtype=float)
+    except (TypeError, ValueError):
+        x = np.zeros(0)
+    if x.shape != (3,) or not np.all(np.isfinite(x)):
+        raise ModelError(f"body {body.name!r}: a point must be three finite numbers (m), got {X!r}")
+    return x
+
+
 def locate(body: Discretisation, X: Any, slack: float = 1e-9) -> MaterialPoint:
     """Material point at X (3,), m, in the reference of a body, by Newton's method in every nearby element.
 
@@ -81,12 +92,7 @@ def locate(body: Discretisation, X: Any, slack: float = 1e-9) -> MaterialPoint:
     Raises:
         ModelError: X is not three finite numbers, or lies outside of the body.
     """
-    try:
-        x = np.asarray(X, dtype=float)
-    except (TypeError, ValueError):
-        x = np.zeros(0)
-    if x.shape != (3,) or not np.all(np.isfinite(x)):
-        raise ModelError(f"body {body.name!r}: a point must be three finite numbers (m), got {X!r}")
+    x = point_coordinates(body, X)
     parent = body.family.parent
     near, size = _nearby_elements(body, x)
     best = (np.inf, -1, np.zeros(3))
@@ -130,7 +136,7 @@ def material_point_at(body: Discretisation, element: int, xi: np.ndarray, X: np.
 def _shape_at_own_points(body: Discretisation, elements: np.ndarray, xi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Functions (E, S), (E, S, 3) of each element at its own point (E, 3)."""
     s, ds = element_functions(body, elements[:1], xi)
-    if s.shape[0] == 1 and not body.family.has_gradients:
+    if s.shape[0] == 1 and body.frames is None:
         return s[0], ds[0]
     parts = [element_functions(body, elements[k : k + 1], xi[k : k + 1]) for k in range(len(elements))]
     return np.stack([p[0][0, 0] for p in parts]), np.stack([p[1][0, 0] for p in parts])

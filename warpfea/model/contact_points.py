@@ -182,6 +182,8 @@ def element_edge_and_depth(surface: SurfaceSet) -> tuple[np.ndarray, np.ndarray]
     body, faces = surface.body, surface.faces
     area = assembly.facet_areas(body, assembly.facet_tables(surface)).sum(axis=1)
     triangle = np.array([len(face) == 3 for face in body.family.faces])[faces[:, 1]]
+    if body.rigid_depth is not None:  # cones of any volume
+        return np.sqrt(2.0 * area), np.full(len(area), body.rigid_depth)
     volume = assembly.element_volumes(body)[faces[:, 0]]
     return np.sqrt(np.where(triangle, 2.0, 1.0) * area), np.where(triangle, 3.0, 1.0) * volume / area
 

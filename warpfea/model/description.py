@@ -178,6 +178,18 @@ class Description:
         return ", ".join(parts + [f"{n} {what}{'s' * (n > 1)}" for what, n in counts.items() if n])
 
 
+def every_slot_of_rigid(nodes: NodeSet) -> np.ndarray:
+    """The four slots of a rigid part held by nodes. Raises ModelError for nodes on one line: it could turn."""
+    X = nodes.body.mesh.points[nodes.indices]
+    spread = np.linalg.svd(X - X.mean(axis=0), compute_uv=False)
+    if len(X) < 3 or not spread[1] > 1e-6 * spread[0]:
+        raise ModelError(
+            f"rigid part {nodes.body.name!r}: {len(X)} nodes on one line do not hold it: take three nodes or more, or "
+            "add_joint('spherical' or 'revolute', parent=wf.GROUND, child=part.at(X)), which lets it turn"
+        )
+    return np.arange(4)
+
+
 def support_slots(nodes: NodeSet, which: str) -> np.ndarray:
     """Body slots of a node set, of the named kinds (see Family.kinds)."""
     body = nodes.body
@@ -185,6 +197,8 @@ def support_slots(nodes: NodeSet, which: str) -> np.ndarray:
         kinds = body.family.slot_kinds_of(which)
     except ModelError as error:
         raise ModelError(f"body {body.name!r}: {error}") from None
+    if body.rigid:
+        return every_slot_of_rigid(nodes)
     first = body.node_slot[nodes.indices]
     first = first[first >= 0]
     if not len(first):

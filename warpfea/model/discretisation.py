@@ -38,6 +38,7 @@ class Discretisation:
             families with gradient slots.
         section: section of a beam.
         node_axes: (nodes, 3, 3) orthonormal axes (columns) of each node's gradient slots; None: the global ones.
+        elastic: False for a rigid part whose contacts take the stiffness of the other side.
         index: number of the body in its builder, -1 before it is added.
         slot_offset, element_offset: slots and elements of the bodies before it, set at finalize; -1 before.
         velocity, initial_displacement: (slots, 3) initial values, m/s and m; None: zero.
@@ -53,6 +54,7 @@ class Discretisation:
     frames: np.ndarray | None = field(default=None, repr=False)
     node_axes: np.ndarray | None = field(default=None, repr=False)
     section: Any = None
+    elastic: bool = True
     index: int = -1
     slot_offset: int = -1
     element_offset: int = -1
@@ -89,6 +91,16 @@ class Discretisation:
         first = np.empty(len(counts), dtype=np.int64)
         first[order] = np.concatenate([[0], np.cumsum(counts[order])[:-1]])
         return np.where(counts > 0, first, -1)
+
+    @property
+    def rigid(self) -> bool:
+        """True for a rigid part."""
+        return self.family.rigid
+
+    @property
+    def rigid_depth(self) -> float | None:
+        """Depth of a rigid part behind its faces, m; None for flexible bodies, whose elements have theirs."""
+        return None
 
     @property
     def slot_count(self) -> int:
@@ -133,6 +145,31 @@ class Discretisation:
         counts = self.node_slot_count
         within = np.arange(self.slot_count) - np.repeat(np.cumsum(counts) - counts, counts)
         return self.slot_offset + np.repeat(self.node_slot, counts) + within
+
+    def at_nodes(self, values: np.ndarray) -> np.ndarray:
+        """Values (..., nodes, 3) at mesh nodes from those of the slots (..., slots, 3); 0 at unused nodes."""
+        out = np.zeros((*values.shape[:-2], len(self.mesh.points), values.shape[-1]))
+        used = self.mesh.used_nodes
+        out[..., used, :] = values[..., self.node_slot[used], :]
+        return out
+
+    def node_functions(self, node: int) -> tuple[np.ndarray, np.ndarray]:
+        """Body slots (n,) and weights (n,) of the position of a mesh node; none for an unused node."""
+        slot = self.node_slot[node : node + 1]
+        return slot[slot >= 0], np.ones(int(slot[0] >= 0))
+
+    @cached_property
+    def surface_nodes(self) -> np.ndarray:
+        """Mesh nodes with a slot that acts on an outer face."""
+        touched = np.zeros(self.slot_count, dtype=bool)
+        for face in np.unique(self.boundary[:, 1]):
+            xi, _ = self.family.face_points(int(face), np.array([(0.25, 0.25), (0.5, 0.25), (0.25, 0.5)]))
+            rows = self.boundary[self.boundary[:, 1] == face, 0]
+            shape, _ = element_functions(self, rows, xi)
+            used = np.any(np.abs(np.broadcast_to(shape, (len(rows), *shape.shape[1:]))) > 1e-12, axis=1)
+            touched[self.connectivity[rows][used]] = True
+        nodes = self.mesh.used_nodes
+        return nodes[touched[self.node_slot[nodes]]]
 
     @cached_property
     def element_order(self) -> np.ndarray:

@@ -44,8 +44,10 @@ def has_constant_density(material: Material) -> bool:
     return not callable(assembly.density_of(material)) and np.ndim(assembly.density_of(material)) == 0
 
 
-def mass_parts(body: Discretisation) -> list[MassPart]:
+def mass_parts(body: Any) -> list[MassPart]:
     """Consistent scalar mass m_ij = int rho s_i s_j dV (Eq. 20) of each material of a body."""
+    if body.rigid:
+        return [MassPart(body.materials[0][1].density, body.scalar_mass, body.moments[0, 0])]
     flat = assembly.is_straight(body)
     n = body.slot_count
     scales = [

@@ -11,6 +11,7 @@ rest are excluded.
 
 from __future__ import annotations
 
+import math
 import warnings
 from typing import TYPE_CHECKING, Any
 
@@ -112,11 +113,17 @@ class EnergyGrowth:
 
 
 def round_off_energy(model: Model) -> np.ndarray:
-    """Round-off level of the energy (worlds,), J: strain of ROUND_OFF_STRAIN eps everywhere."""
+    """Round-off level of the energy (worlds,), J: strain of ROUND_OFF_STRAIN eps everywhere; of a rigid part, whose
+    supports hold to a tolerance, a fall by sqrt(eps) of its size."""
+    fall = math.sqrt(np.finfo(model.dtype).eps) * float(np.linalg.norm(model.description.gravity))
     unit, out = ROUND_OFF_STRAIN * float(np.finfo(model.dtype).eps), np.zeros(model.worlds)
     for body in model.bodies:
         volume = float(element_volumes(body).sum())
         out += unit**2 * volume * model.parameters.youngs_modulus(body)
+        if body.rigid:
+            size = float(np.linalg.norm(np.ptp(np.array(body.mesh.bounding_box()), axis=0)))
+            part = model.bodies.index(body), 0
+            out += fall * size * model.masses.scales[part] * model.masses.parts[part].scaled_mass
     return out
 
 

@@ -21,6 +21,7 @@ JOINT_REPORT_COLUMNS = {"force": (0, 3), "moment": (3, 3), "violation": (6, 1)}
 CONTACT_REPORT_COLUMNS = {"force": (0, 3), "moment": (3, 3)} | {
     name: (k, 1) for k, name in enumerate(RECORD_NAMES) if k > 5
 }
+AXES_KINDS = {"axes": "position", "axes_rate": "velocity"}
 NAME_FORMS = "'time', 'body.NAME.position', 'probe.NAME.velocity', 'joint.NAME.angle' or 'contact.NAME.force'"
 
 
@@ -31,6 +32,8 @@ class Observations:
 
         time                                              1: s
         body.NAME.position, .displacement, .velocity      3 per node of the mesh, in its order: m, m/s
+        part.NAME.position, .displacement, .velocity      3: of the centre of mass of a rigid part: m, m/s
+        part.NAME.axes, .axes_rate                        9: columns of its rotation A, and dA/dt, 1/s
         probe.NAME.position, .displacement, .velocity     3: m, m/s
         joint.NAME.angle, .travel, .length                1: rad, m; as `sim.joint_value`
         joint.NAME.force, .moment, .violation             3, 3, 1: N, N m, m; as `sim.joint_force`
@@ -78,6 +81,7 @@ class Observations:
         owner, _, what = rest.rpartition(".")
         makers = {
             "body": self._add_body,
+            "part": self._add_part,
             "probe": self._add_probe,
             "joint": self._add_joint,
             "contact": self._add_contact,
@@ -104,9 +108,17 @@ class Observations:
         body = self._find("body", owner, self._model.bodies)
         self._check_quantity(name, what, MOTION_KINDS)
         for node, X in enumerate(body.mesh.points):
-            slot = int(body.node_slot[node])
-            slots = [body.slot_offset + slot] if slot >= 0 else []
-            self._points.append((slots, [1.0] * len(slots), what, X, self._column_count))
+            slots, weights = body.node_functions(node)
+            self._points.append((body.slot_offset + slots, weights, what, X, self._column_count))
+            self._column_count += 3
+
+    def _add_part(self, name: str, owner: str, what: str) -> None:
+        part = self._find("part", owner, [body for body in self._model.bodies if body.rigid])
+        self._check_quantity(name, what, [*MOTION_KINDS, *AXES_KINDS])
+        rows = [(0, part.com)] if what in MOTION_KINDS else [(k + 1, e) for k, e in enumerate(np.eye(3))]
+        for row, X in rows:
+            kind = AXES_KINDS.get(what, what)
+            self._points.append((part.slots, part.affine[row], kind, X, self._column_count))
             self._column_count += 3
 
     def _add_probe(self, name: str, owner: str, what: str) -> None:

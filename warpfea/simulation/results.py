@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ..base.errors import ModelError, ModelWarning
 from ..base.names import did_you_mean, listing
@@ -16,9 +17,11 @@ from ..kernels.step.step_control import REPORT_COLUMNS
 from ..kernels.terms.constraints import JOINT_COLUMNS
 from ..model.bodies import Body
 from ..model.contacts import Contact, ContactOptions
+from ..model.description import support_slots
 from ..model.handles import NodeSet
 from ..model.joints import Joint
 from ..model.pairs import FacetOptions
+from ..model.rigid import RigidBody
 from ..model.state import State
 from ..model.surfaces import reference_points
 from ..terms.evaluation import field_at_nodes, field_at_points, find_field
@@ -61,10 +64,7 @@ class Results:
 
     def at_mesh_nodes(self, body: Body, values: np.ndarray) -> np.ndarray:
         """Slot values at mesh nodes, (B, nodes, 3); 0 at nodes without an element."""
-        out = np.zeros((self.model.worlds, len(body.mesh.points), 3))
-        used = body.mesh.used_nodes
-        out[:, used] = values[:, body.slot_offset + body.node_slot[used]]
-        return out
+        return body.at_nodes(values[:, body.slot_offset : body.slot_offset + body.slot_count])
 
     def displacements(self, body: Body) -> np.ndarray:
         """Nodal displacements (B, nodes, 3), m, in the mesh file's node order. ModelError for a body of another
@@ -81,6 +81,26 @@ class Results:
         """Nodal velocities (B, nodes, 3), m/s. ModelError for a body of another model."""
         self.check_body(body, "velocities")
         return self.at_mesh_nodes(body, self.state.velocity.numpy())
+
+    def pose(self, part: RigidBody) -> tuple[np.ndarray, np.ndarray]:
+        """Position of the centre of mass (B, 3), m, and rotation from the reference as quaternions (B, 4), x y z w."""
+        self.check_rigid(part, "pose")
+        u = self.state.displacement.numpy()[:, part.slots].astype(float)
+        A = np.eye(3) + part.rotation_of(u)
+        return part.com + part.affine[0] @ u, Rotation.from_matrix(A).as_quat()
+
+    def angular_velocity(self, part: RigidBody) -> np.ndarray:
+        """Angular velocity (B, 3), rad/s, in the axes of the scene, from dA/dt A^T (Paper I, Eqs. (12)-(14))."""
+        self.check_rigid(part, "angular_velocity")
+        u, v = (x.numpy()[:, part.slots].astype(float) for x in (self.state.displacement, self.state.velocity))
+        spin = part.rotation_of(v) @ np.swapaxes(np.eye(3) + part.rotation_of(u), 1, 2)
+        return 0.5 * np.stack([spin[:, i, j] - spin[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))], axis=1)
+
+    def check_rigid(self, part: Any, what: str) -> None:
+        """Raise ModelError unless `part` is a rigid part of this model; the text begins with `what`."""
+        self.check_body(part, what)
+        if not isinstance(part, RigidBody):
+            raise ModelError(f"{what}: body {part.name!r} is flexible; positions and velocities give its motion")
 
     def point_positions(self, body: Body, weights: Any) -> np.ndarray:
         """Current positions (B, P, 3), m, of material points given by sparse weights (P, slots of the body)."""
@@ -175,8 +195,7 @@ class Records:
             raise ModelError(f"reaction: expected nodes (body.nodes), got {nodes!r}")
         self.results.check_body(nodes.body, "reaction")
         g = self.stepper.work.g.numpy() * (1.0 - self.model.slot_table.free)
-        first = nodes.body.node_slot[nodes.indices]
-        rows = nodes.body.slot_offset + first[first >= 0]
+        rows = nodes.body.slot_offset + support_slots(nodes, "position")
         total = g[:, rows].sum(axis=1).astype(float)
         total[~self.statistics.stepped_worlds] = np.nan
         return total

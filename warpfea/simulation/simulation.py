@@ -113,6 +113,8 @@ class Simulation:
     positions = PartMember("results", Results.positions)
     displacements = PartMember("results", Results.displacements)
     velocities = PartMember("results", Results.velocities)
+    pose = PartMember("results", Results.pose)
+    angular_velocity = PartMember("results", Results.angular_velocity)
     field = PartMember("results", Results.field)
     fields = PartMember("results", Results.fields)
     field_on = PartMember("results", Results.field_on)

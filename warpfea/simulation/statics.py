@@ -62,6 +62,7 @@ class StaticResult:
     probe = PartMember("simulation", Records.probe)
     displacements = PartMember("simulation", Results.displacements)
     positions = PartMember("simulation", Results.positions)
+    pose = PartMember("simulation", Results.pose)
     reaction = PartMember("simulation", Records.reaction)
     joint_force = PartMember("simulation", Records.joint_force)
     joint_value = PartMember("simulation", Records.joint_value)

@@ -196,7 +196,8 @@ class Evaluation:
         Each part of the energy is fitted per element and evaluated at the samples; parts add up, elements are averaged
         by volume.
         """
-        return self._at_samples(body, [(block, stress) for block, stress, _ in self._at_points(state, body)])
+        out = self._at_samples(body, [(block, stress) for block, stress, _ in self._at_points(state, body)])
+        return 0.0 * out if body.rigid else out  # that of the nominal stiffness is round-off
 
     def sample_jacobian(self, state: State, body: Any) -> np.ndarray:
         """J = det F at the samples of each mesh node, [world, node x sample, 1], from the points of the first part of
@@ -242,7 +243,8 @@ class Evaluation:
                     np.add.at(weight, rows, v[:, None])
                 for b in range(m.worlds):
                     np.add.at(total[b], rows, at_samples[b] * v[:, None, None])
-        return total / np.where(weight > 0.0, weight, 1.0)[None, :, None]
+        total /= np.where(weight > 0.0, weight, 1.0)[None, :, None]
+        return np.broadcast_to(total[:, weight > 0.0][:, :1], total.shape) if body.rigid else total
 
 
 def _is_first(block: Any) -> bool:
@@ -326,11 +328,9 @@ def field_at_nodes(terms: Any, name: str, body: Any, state: State) -> np.ndarray
     spec, values = find_field(terms, name), _sample_field(terms, name, body, state)
     if spec.scalar:
         values = spec.scalar(values)
-    nodes, used = len(body.mesh.points), body.mesh.used_nodes
+    nodes = len(body.mesh.points)
     if spec.of_slots:
-        out = np.zeros((len(values), nodes))
-        out[:, used] = values[:, body.node_slot[used]]
-        return out
+        return body.at_nodes(values[..., None])[..., 0]
     values = values.reshape(len(values), nodes, -1)
     return np.asarray(spec.node_reduction.reduce(values, axis=2) if spec.node_reduction else values[:, :, 0])
 

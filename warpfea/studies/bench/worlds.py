@@ -1,10 +1,10 @@
 """`warpfea bench --worlds`: many worlds of small models, error beside run time.
 
-Scenes: `pendulum` with 16 elements, h = 2 ms; `slider` (slider_crank), 1 ms; `double` (double_pendulum), 4 ms;
-`finger`, a box 0.12 x 0.02 x 0.02 m with 20 x 2 x 2 cells of T10, neo-Hookean, E = 1 MPa, nu = 0.45, 1100 kg/m^3,
-eta = 300 Pa s, clamped, with a traction that rises to 2 kPa in 0.1 s, 2 ms; `tets`, the same box with 12 x 2 x 2 cells
-of five T4 under gravity alone, 2 ms; `gripper`, that scene with 64 nodes (T4), mu = 0.6, 1/240 s: four steps are one of
-an environment at 60 Hz.
+Scenes: `pendulum` with 16 elements, h = 2 ms; `slider` (slider_crank), 1 ms; `double` (double_pendulum), 4 ms, and
+`rigid`, the same of rigid links; `finger`, a box 0.12 x 0.02 x 0.02 m with 20 x 2 x 2 cells of T10, neo-Hookean, E = 1
+MPa, nu = 0.45, 1100 kg/m^3, eta = 300 Pa s, clamped, with a traction that rises to 2 kPa in 0.1 s, 2 ms; `tets`, the
+same box with 12 x 2 x 2 cells of five T4 under gravity alone, 2 ms; `gripper`, that scene with 64 nodes (T4), mu = 0.6,
+1/240 s: four steps are one of an environment at 60 Hz.
 
 Three steps are not timed, then ten are; after 100 steps ten again. Steps read nothing back (record=False,
 on_failure="freeze", no ledger). The tip of world 0 is compared with that of one world in float64 with a tolerance of
@@ -45,7 +45,8 @@ __all__ = ["CASES", "RATE_GOALS", "WORLDS_KIND", "five_tet_box"]
 WORLD_COUNTS = (1, 64, 1024, 4096, 16384)
 WARM, TIMED, LATER = 3, 10, 100
 RATE_GOALS = {
-    "pendulum": 850_000, "slider": 200_000, "double": 100_000, "finger": 25_000, "tets": 1_638_400, "gripper": 74_400,
+    "pendulum": 850_000, "slider": 200_000, "double": 100_000, "rigid": 341_000, "finger": 25_000,
+    "tets": 1_638_400, "gripper": 74_400,
 }  # fmt: skip
 """World-steps/s at 4096 worlds; of `tets` 2.5 ms per step, of `gripper` 18 600 steps of environments per second."""
 WHOLE_MOTION_STEPS = {"gripper": 240}
@@ -91,6 +92,7 @@ SCENES: dict[str, tuple[Callable[[], ModelBuilder], float]] = {
     "pendulum": (lambda: find("pendulum")(elements=16), 2e-3),
     "slider": (lambda: find("slider_crank")(), 1e-3),
     "double": (lambda: find("double_pendulum")(), 4e-3),
+    "rigid": (lambda: find("double_pendulum")(rigid=True), 4e-3),
     "finger": (lambda: _finger_model(mesh.box((0.12, 0.02, 0.02), cells=(20, 2, 2)), True), 2e-3),
     "gripper": (lambda: find("gripper")(element="T4"), 1.0 / 240.0),
     "tets": (lambda: _finger_model(five_tet_box((0.12, 0.02, 0.02), (12, 2, 2)), False), 2e-3),
