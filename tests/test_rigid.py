@@ -328,7 +328,7 @@ def test_stack_of_rigid_blocks_on_a_soft_one() -> None:
     assert max(float(np.abs(sim.velocities(block)).max()) for block in blocks) < 1e-3
 
 
-def swing(worlds: int = 1, dtype: str = "float64") -> tuple[wf.Model, Any, Any]:
+def swing(worlds: int = 1, dtype: str = "float64", device: str = "cpu") -> tuple[wf.Model, Any, Any]:
     b = wf.ModelBuilder()
     part = b.add_rigid(wf.Box((0.5, 0, 0), (1.0, 0.1, 0.1)), density=1000.0, name="part")
     b.add_joint("revolute", parent=wf.GROUND, child=part.at((0, 0, 0)), axis=(0, 1, 0), name="hinge")
@@ -337,7 +337,7 @@ def swing(worlds: int = 1, dtype: str = "float64") -> tuple[wf.Model, Any, Any]:
         material=wf.SVK(E=1e8, nu=0.3, density=1000.0), name="beam",
     )  # fmt: skip
     b.weld(beam.start, part)
-    return b.finalize(device="cpu", worlds=worlds, dtype=dtype), part, beam
+    return b.finalize(device=device, worlds=worlds, dtype=dtype), part, beam
 
 
 def test_worlds_are_equal_to_lone_runs_and_checkpoints_go_on(tmp_path: Any) -> None:
@@ -360,14 +360,15 @@ def test_worlds_are_equal_to_lone_runs_and_checkpoints_go_on(tmp_path: Any) -> N
     np.testing.assert_array_equal(again.positions(part), sim.positions(part))
 
 
-def test_float32_follows_float64() -> None:
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_devices_and_precisions_agree(device: Any, dtype: str) -> None:
     ends = []
-    for dtype in ("float64", "float32"):
-        model, _, beam = swing(dtype=dtype)
+    for where, precision in (("cpu", "float64"), (device, dtype)):
+        model, _, beam = swing(dtype=precision, device=where)
         sim = wf.Simulation(model, dt=2e-3)
         sim.step(50)
         ends.append(sim.positions(beam)[0, -1])
-    np.testing.assert_allclose(ends[1], ends[0], atol=2e-6)
+    np.testing.assert_allclose(ends[1], ends[0], atol=1e-9 if dtype == "float64" else 2e-6)
 
 
 def test_observed_axes_and_centre_are_those_of_the_pose() -> None:
