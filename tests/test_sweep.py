@@ -362,6 +362,8 @@ def test_another_plan_is_refused(swept):
         ({"measures": {"z": "probe.tipp.displacement.z"}}, "measures.z: probe 'tipp' is unknown.*'tip'"),
         ({"measures": {"z": "probe.tip.displacement"}}, "measures.z: the component = '' is none of"),
         ({"measures": {"z": "most probe.tip.displacement.z"}}, "measures.z: the reduction = 'most'"),
+        ({"measures": {"z": "field.mises"}}, "measures.z: field 'mises' is unknown"),
+        ({"measures": {"z": "energy.strian"}}, "measures.z: energy 'strian' is unknown.*did you mean 'strain'"),
         ({"measures": {}}, "measures: give at least one"),
         ({"measures": {"cells": "energy.strain"}, "design": {"over": {"cells": [1]}}}, "a column 'cells' already"),
         ({"measures": {"z": lambda sim: 0.0}}, "measures.z: .*<lambda>.* is not at the top of the file"),

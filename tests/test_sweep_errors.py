@@ -7,6 +7,7 @@ import pytest
 from test_sweep import BAR, DESIGN, FALL, Inline
 
 import warpfea as wf
+from warpfea.outputs.animation import Animation
 from warpfea.sweeps import PoolEngine
 from warpfea.sweeps.worker import Group
 
@@ -48,6 +49,29 @@ def test_a_file_that_changes_is_told(tmp_path):
     with pytest.raises(wf.CheckpointError, match=r"mine.py: has changed since the sweep began"):
         wf.sweep(FALL, [{"size": 1.0}], measures={"h": f"{file}:half"}, engine=Editing(file))
     assert wf.sweep(FALL, [{"size": 1.0}], measures={"h": f"{file}:half"}, engine=Inline())["h"] == [0.0]
+
+
+def test_times_that_cannot_be_written_are_told(tmp_path):
+    (tmp_path / "times.csv").mkdir()
+    with pytest.raises(wf.OutputError, match=r"times.csv: can't be written"):
+        wf.sweep(FALL, DESIGN, measures={"z": "energy.strain"}, engine=Inline(), out=tmp_path)
+
+
+def test_the_sheet_has_one_scale(tmp_path, monkeypatch):
+    """The colours of all its pictures are those of the extremes of all."""
+    rows, drawn, draw = [{"gravity.z": g} for g in (-1.0, -4.0)], [], Animation.draw
+    result = wf.sweep(BAR, rows, measures={"s": "field.von_mises"}, run={"t_end": 0.01}, engine=Inline(), out=tmp_path)
+    monkeypatch.setattr(Animation, "draw", lambda self, *given: drawn.append(self.color_limits()) or draw(self, *given))
+    result.sheet(tmp_path / "sheet.png", field="von_mises")
+    assert drawn[0] == drawn[1]
+    assert drawn[0][1] == pytest.approx(result["s"].max(), rel=1e-5)
+
+
+def test_a_fit_tells_its_progress(capfd):
+    record = {"probe.tip.displacement.z": ([0.005], [-1e-4])}
+    wf.fit(BAR, {"gravity.z": (-9.0, -1.0)}, record, worlds=2, generations=2, run={"device": "cpu"}, progress=True)
+    assert "fit" in (told := capfd.readouterr()[1])
+    assert "misfit" in told
 
 
 @pytest.mark.parametrize("method", ["least_squares", "differential_evolution"])

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from operator import truediv
 
 import numpy as np
 import pytest
@@ -93,6 +94,14 @@ def test_the_command(study, tmp_path, capfd):
         ('"measures.py:half"', "3", "measures.own = 3 must be a text"),
         ('device = "cpu"', "device = 3", "run.device = 3 must be a text"),
         ("[run]", "[engine]\nworkers = 1.5\n[run]", "engine.workers = 1.5 must be a whole number"),
+        ("[run]", "[pictures]\ntable = 't.jpg'\n[run]", "pictures.table: the type = '.jpg' is none of"),
+        ("[run]", "[pictures]\nsheet = 's.svg'\n[run]", "pictures.sheet: the type = '.svg' is none of '.png'"),
+        ("[run]", "[pictures]\npareto = ['tip']\n[run]", r"pictures.pareto = \['tip'\] must be the names of two"),
+        ("[run]", "[pictures]\npareto = ['tip', 'top']\n[run]", "pictures.pareto: the column = 'top' is none of"),
+        ("[run]", "[pictures]\ndesigns = [0, 6]\n[run]", r"pictures.designs = \[0, 6\] must be numbers from 0 to 5"),
+        ("[run]", "[pictures]\nfield = 'mises'\n[run]", "pictures.field = 'mises' is none of .*'von_mises'"),
+        ("measures.py:half", "measure.py:half", "measure.py: no such file"),
+        ("measures.py:half", "measures.py:halve", "function 'halve' is unknown"),
         ("[parameters]\nE = 3e5", "parameters = 3", "parameters = 3 must be a table"),
         ("[design]", "[design", "study.toml: .*at line"),
     ],
@@ -102,6 +111,7 @@ def test_errors_of_a_study_name_file_and_key(study, capfd, old, new, message):
     study.write_text(STUDY.replace(old, new, 1))
     with pytest.raises(wf.ModelError, match=rf"(?s)study.toml: .*{message}|{message}"):
         run_study(study)
+    assert not (study.parent / "sweep" / "table.csv").exists()
     assert main(["sweep", str(study)]) == 2
     assert "study.toml: " in capfd.readouterr()[1]
 
@@ -131,6 +141,26 @@ def test_a_cluster_gives_the_same_bits(cluster):
     rows = [{"bar.E": E, "cells": cells} for E in (1e5, 1e6) for cells in (1, 2)]
     how = {"measures": TIP, "run": {"t_end": 0.02, "device": "cpu"}}
     assert table(wf.sweep(BAR, rows, **how, engine=cluster)) == table(wf.sweep(BAR, rows, **how, engine=Inline()))
+
+
+@pytest.mark.slow
+def test_a_worker_with_an_error_of_its_machine_is_replaced(cluster):
+    """As errors of CUDA stay with a process; those of warpfea are of a design."""
+    engine = DaskEngine(cluster)
+    try:
+        pids = [engine.client.run(os.getpid)]
+        for call, given, kind in ((truediv, (1, 0), ZeroDivisionError), (wf.SVK, (-1, 0), wf.ModelError)):
+            handle = engine.submit(call, *given)
+            (handle,) = engine.done([handle])
+            with pytest.raises(kind):
+                engine.result(handle)
+            engine.client.wait_for_workers(2, timeout=60)
+            pids.append(engine.client.run(os.getpid))
+        first, second, third = (set(each.values()) for each in pids)
+        assert len(first & second) == 1
+        assert second == third
+    finally:
+        engine.close()
 
 
 @pytest.mark.slow

@@ -218,7 +218,7 @@ class DaskEngine:
 
     def submit(self, call: Callable[..., Any], *arguments: Any) -> Any:
         """Start a call on some worker."""
-        return self.client.submit(call, *arguments, pure=False, retries=0, resources=self.resources)
+        return self.client.submit(_call_with_address, call, *arguments, pure=False, retries=0, resources=self.resources)
 
     def done(self, handles: Collection[Any]) -> Collection[Any]:
         """Calls that ended; waits for one."""
@@ -226,11 +226,24 @@ class DaskEngine:
             return self.distributed.wait(list(handles), return_when="FIRST_COMPLETED").done
 
     def result(self, handle: Any) -> Any:
-        """Value of an ended call. WorkerLost."""
+        """Value of an ended call. WorkerLost; errors that are not warpfea's end the worker, as those of CUDA stay."""
         try:
             return handle.result()
+        except Error:
+            raise
         except self.distributed.KilledWorker as error:
             raise WorkerLost(str(error)) from error
+        except Exception as error:
+            if address := vars(error).get("worker"):
+                self._replace(address)
+            raise
+
+    def _replace(self, address: str) -> None:
+        """End a worker, which its nanny starts again, if it has one."""
+        try:
+            self.client.restart_workers([address], timeout=60, raise_for_error=False)
+        except ValueError:  # no nanny
+            self.client.run(os._exit, 1, workers=[address], on_error="ignore")
 
     def close(self) -> None:
         """Leave the scheduler as it was."""
@@ -238,6 +251,17 @@ class DaskEngine:
             self.client.run_on_scheduler(_set_allowed_failures, count=self.allowed)
         if self.own:
             self.client.close()
+
+
+def _call_with_address(call: Callable[..., Any], *arguments: Any) -> Any:
+    """Value of a call; its errors carry the address of the worker."""
+    try:
+        return call(*arguments)
+    except Exception as error:
+        import distributed
+
+        vars(error)["worker"] = distributed.get_worker().address
+        raise
 
 
 def _set_allowed_failures(count: int, dask_scheduler: Any = None) -> int:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..base.console import quiet_warp
+from ..base.console import progress_bar, quiet_warp
 from ..base.devices import find_device
 from ..base.errors import ConvergenceError, ModelError
 from ..base.names import check_choice
@@ -56,6 +56,7 @@ def fit(
     generations: int = 16,
     start: Mapping[str, float] | None = None,
     seed: int = 1,
+    progress: bool | None = None,
 ) -> Fit:
     """Find the parameters with which a scene gives a record: least squares of all samples.
 
@@ -67,6 +68,7 @@ def fit(
         method: "differential_evolution", of `worlds` candidates over `generations`, or "least_squares" from `start`
             (default: the middle of the ranges), with differences over worlds.
         fixed: parameters of the scene. run: as of `sweep`. seed: of differential_evolution.
+        progress: show a bar of the runs; None: if stderr is a terminal.
 
     Raises:
         ModelError: an unknown name, an empty range, or a time between steps.
@@ -74,11 +76,12 @@ def fit(
     """
     check_choice("method", method, METHODS)
     candidates = Candidates(scene, parameters, record, dict(fixed or {}), dict(run or {}))
-    if method == "least_squares":
-        point = candidates.search_locally(start or {})
-    else:
-        point = candidates.search_globally(worlds, generations, seed)
-    runs, residuals = candidates.runs, candidates.residuals(point[:, None])[0]
+    with progress_bar("fit", "run", None, progress) as candidates.bar:
+        if method == "least_squares":
+            point = candidates.search_locally(start or {})
+        else:
+            point = candidates.search_globally(worlds, generations, seed)
+        runs, residuals = candidates.runs, candidates.residuals(point[:, None])[0]
     candidates.require("the best candidate", point)
     values = {name: float(column[0]) for name, column in candidates.values(point[:, None]).items()}
     return Fit(values, float(np.sqrt(np.mean(residuals**2))), residuals, runs)
@@ -100,7 +103,8 @@ class Candidates:
         device = find_device(run.get("device"))
         place = {"device": "cuda" if device.is_cuda else "cpu"}
         self.study = Study("", fixed, {}, self.curves, run | place, many=True)
-        self.runs, self.refused = 0, np.zeros(0, dtype=bool)
+        self.runs, self.refused, self.least = 0, np.zeros(0, dtype=bool), math.inf
+        self.bar: Any = None
 
     def require(self, what: str, point: np.ndarray) -> None:
         """ConvergenceError if a candidate of the last residuals was refused."""
@@ -138,6 +142,9 @@ class Candidates:
             self.refused[members] |= ~np.isfinite(out[members]).all(axis=1)
         out[self.refused] = REFUSED
         self.runs += points.shape[1]
+        self.least = min(self.least, float((out**2).mean(axis=1).min()) ** 0.5)
+        self.bar.set_postfix_str(f"misfit {self.least:.3g}", refresh=False)
+        self.bar.update(points.shape[1])
         return out
 
     def _difference(self, text: str, curve: Measure, sim: Any) -> np.ndarray:
@@ -153,8 +160,12 @@ class Candidates:
         """Best point of differential evolution."""
         from scipy.optimize import differential_evolution
 
+        def misfits(points: np.ndarray) -> np.ndarray:
+            self.bar.total = points.shape[1] * generations
+            return (self.residuals(points) ** 2).mean(axis=1)
+
         found = differential_evolution(
-            lambda points: (self.residuals(points) ** 2).mean(axis=1), [(0.0, 1.0)] * len(self.ranges),
+            misfits, [(0.0, 1.0)] * len(self.ranges),
             vectorized=True, updating="deferred", polish=False, popsize=max(worlds // len(self.ranges), 1),
             maxiter=generations - 1, tol=0.0, init="sobol", rng=np.random.default_rng(seed),
         )  # fmt: skip

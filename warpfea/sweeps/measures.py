@@ -112,14 +112,17 @@ class Measure:
             raise ModelError(f"measure {self.text}: expected ({sim.model.worlds},) values, got {values.shape}")
         return np.broadcast_to(values, sim.model.worlds)
 
-    def check(self, where: str, builder: Any) -> None:
-        """ModelError with the key's path for a name that a scene does not have."""
-        d = builder.description
+    def check(self, where: str, model: Any) -> None:
+        """ModelError with the key's path for a name that a model does not have."""
+        d, terms = model.description, model.terms
         known = {"probe": d.probes, "contact": d.contacts, "joint": d.joints}.get(self.kind)
         if known is not None:
             check_known(f"{where}: {self.kind}", self.name, [each.name for each in known])
-        if self.kind == "field" and self.quantity:
-            check_known(f"{where}: body", self.quantity, [body.name for body in builder.bodies])
+        if self.kind == "field":
+            check_known(f"{where}: field", self.name, terms.fields)
+            check_known(f"{where}: body", self.quantity or model.bodies[0].name, [body.name for body in model.bodies])
+        if self.kind == "energy":
+            check_known(f"{where}: energy", self.name, terms.energies(np.zeros((1, len(terms.ledger)))))
 
 
 def parse_measures(where: str, given: Any) -> dict[str, Measure]:
@@ -136,7 +139,9 @@ def parse_measure(where: str, given: Any) -> Measure:
     if not isinstance(given, str) or not given.strip():
         raise ModelError(f"{where} = {given!r} must be a text such as 'probe.tip.displacement.z', or a function")
     if ".py:" in given:
-        return Measure(given, "last", "function", given, source=source_of(given))
+        source = source_of(given)
+        load_function.__wrapped__(given, source)  # before a worker does, which reads the file anew
+        return Measure(given, "last", "function", given, source=source)
     *words, path = given.split()
     kind, *parts = path.split(".")
     check_choice(f"{where}: the kind", kind, KINDS)

@@ -4,33 +4,45 @@ from __future__ import annotations
 
 import math
 import pathlib
-import tempfile
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-import warpfea as wf
-
 from ..base.errors import ModelError, OutputError
 from ..base.lazy import pillow
 from ..base.writer import write_atomically
+from ..outputs.render import PNGWriter
 from .worker import Group, find_scene
 
-__all__ = ["draw_sheet", "plot_table"]
+__all__ = ["SHEET_SUFFIXES", "TABLE_SUFFIXES", "check_designs", "draw_sheet", "plot_table", "require_matplotlib"]
 
+TABLE_SUFFIXES = (".png", ".svg", ".pdf")
+SHEET_SUFFIXES = (".png",)
 PANEL = 2.8
 """Size of a panel, inches."""
 PICTURE = (480, 360)
 """Size of a picture of a contact sheet, pixels."""
 
 
-def plot_table(result: Any, target: pathlib.Path, pareto: Sequence[str]) -> None:
-    """Each measure over each parameter, or one measure over another with the Pareto front. OutputError."""
+def check_designs(what: str, designs: Any, count: int) -> None:
+    """ModelError unless these are numbers of some of so many designs."""
+    if not designs or not all(isinstance(k, int) and 0 <= k < count for k in designs):
+        raise ModelError(f"{what} = {designs!r} must be numbers from 0 to {count - 1}")
+
+
+def require_matplotlib() -> Any:
+    """Its class of figures. OutputError where it is not installed."""
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
         raise OutputError(f"the picture needs matplotlib: pip install 'warpfea[plots]' ({error})") from error
+    return Figure
+
+
+def plot_table(result: Any, target: pathlib.Path, pareto: Sequence[str]) -> None:
+    """Each measure over each parameter, or one measure over another with the Pareto front. OutputError."""
+    Figure = require_matplotlib()
     names = result.design.columns
     pairs: list[Any] = [[tuple(pareto)]] if pareto else [[(x, y) for x in names] for y in result.measures]
     figure = Figure(figsize=(1.0 + PANEL * len(pairs[0]), 0.6 + PANEL * len(pairs)), layout="constrained")
@@ -54,23 +66,36 @@ def _draw(axis: Any, result: Any, x: str, y: str) -> None:
         axis.set_xscale("log")
 
 
+class _Tile(PNGWriter):
+    """A picture that is drawn when the colours of all are known."""
+
+    def close(self, sim: Any) -> None:
+        assert self._animation is not None
+        self.drawn, self._animation.frames = self._animation, [self._frame(sim)]
+
+
 def draw_sheet(result: Any, target: pathlib.Path, designs: Sequence[int], field: str | None) -> None:
     """Pictures of designs side by side, each with its number and measures. ModelError, OutputError."""
     study = result.study
     scene, columns = find_scene(study.scene, study.source), math.ceil(math.sqrt(len(designs)))
-    if not designs or not all(isinstance(k, int) and 0 <= k < len(result) for k in designs):
-        raise ModelError(f"sheet: designs = {designs!r} must be numbers from 0 to {len(result) - 1}")
+    check_designs("sheet: designs", designs, len(result))
     width, height = PICTURE
     sheet = pillow.Image.new("RGB", (width * columns, height * math.ceil(len(designs) / columns)), "white")
-    for place, index in enumerate(designs):
+    tiles = []
+    for index in designs:
         values = result.design[index]
         group = Group(study, scene, {name: value for name, value in values.items() if name in scene.parameters})
         own = {name: [value] for name, value in values.items() if name not in scene.parameters}
-        with tempfile.TemporaryDirectory() as folder:
-            file = pathlib.Path(folder) / "picture.png"
-            group.simulate(group.model(1), own, outputs=[wf.PNGWriter(file, field=field, size=PICTURE)])
-            x, y = width * (place % columns), height * (place // columns)
-            sheet.paste(pillow.Image.open(file).convert("RGB"), (x, y))
+        tile = _Tile(target, field=field, size=PICTURE)
+        group.simulate(group.model(1), own, outputs=[tile])
+        tiles.append(tile)
+    limits = np.array([tile.drawn.color_limits() for tile in tiles])
+    low, high = float(limits[:, 0].min()), float(limits[:, 1].max())
+    for place, (index, tile) in enumerate(zip(designs, tiles)):
+        tile.drawn.color_range = (low, high) if low < high else None
+        x, y = width * (place % columns), height * (place // columns)
+        (image,) = tile.drawn.draw(PICTURE, tile.view, [0], tile.ground)
+        sheet.paste(pillow.Image.fromarray(image).convert("RGB"), (x, y))
         label = f"{index}: " + ", ".join(f"{name} {result[name][index]:.4g}" for name in result.measures)
         pillow.ImageDraw.Draw(sheet).text((x + 8, y + 8), label, fill="black")
     write_atomically(target, lambda path: sheet.save(path))

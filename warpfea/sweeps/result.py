@@ -14,6 +14,7 @@ from ..base.errors import ModelError
 from ..base.names import check_known
 from ..base.writer import check_target, write_atomically
 from .design import Design, require_pyarrow
+from .pictures import SHEET_SUFFIXES, TABLE_SUFFIXES, draw_sheet, plot_table
 from .record import Record
 from .worker import Study
 
@@ -81,19 +82,15 @@ class SweepResult:
     def plot(self, path: str | pathlib.Path, *, pareto: Sequence[str] = ()) -> None:
         """Picture (.png, .svg, .pdf) of each measure over each parameter, or with two measures in `pareto` of one over
         the other with the designs that are best. OutputError, also without matplotlib."""
-        from .pictures import plot_table
-
-        plot_table(self, check_target(path, (".png", ".svg", ".pdf")), pareto)
+        plot_table(self, check_target(path, TABLE_SUFFIXES), pareto)
 
     def sheet(
         self, path: str | pathlib.Path, designs: Sequence[int] | None = None, *, field: str | None = None
     ) -> None:
         """Contact sheet (.png): pictures of some designs at their ends, each run again here, by default of the first
         twelve without a failure. ModelError, OutputError."""
-        from .pictures import draw_sheet
-
         good = [k for k in range(len(self)) if k not in self.failures][:12]
-        draw_sheet(self, check_target(path, (".png",)), good if designs is None else list(designs), field)
+        draw_sheet(self, check_target(path, SHEET_SUFFIXES), good if designs is None else list(designs), field)
 
     def series(self, index: int) -> dict[str, np.ndarray]:
         """Time series of a design by name, and "time". ModelError where none was kept."""

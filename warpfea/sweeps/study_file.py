@@ -7,10 +7,13 @@ import tomllib
 from collections.abc import Mapping
 from typing import Any
 
-from ..base.errors import ModelError
-from ..builder.scene import split_name
+from ..base.errors import Error, ModelError
+from ..base.names import check_choice
+from ..base.writer import make_folder
+from ..builder.scene import locate, split_name
 from .design import AXIS_KEYS, Design, check_keys
 from .engines import make_engine
+from .pictures import SHEET_SUFFIXES, TABLE_SUFFIXES, check_designs, require_matplotlib
 from .result import SweepResult
 from .sweep import RUN_OPTIONS, sweep
 
@@ -82,7 +85,33 @@ def _checked(content: dict[str, Any], folder: pathlib.Path) -> dict[str, Any]:
     content["scene"] = _from_folder(content["scene"], folder)
     content["out"] = folder / (content["out"] or "sweep")
     content["measures"] = {name: _from_folder(text, folder) for name, text in content["measures"].items()}
+    _check_pictures(content)
     return content
+
+
+def _check_pictures(content: Mapping[str, Any]) -> None:
+    """ModelError, OutputError for pictures that could not be drawn after the sweep."""
+    pictures, design = content["pictures"], content["design"]
+    for key, suffixes in (("table", TABLE_SUFFIXES), ("sheet", SHEET_SUFFIXES)):
+        if key in pictures:
+            check_choice(f"pictures.{key}: the type", pathlib.Path(pictures[key]).suffix.lower(), suffixes)
+    if "table" in pictures:
+        require_matplotlib()
+    if "pareto" in pictures:
+        if len(pictures["pareto"]) != 2:
+            raise ModelError(f"pictures.pareto = {pictures['pareto']!r} must be the names of two measures")
+        for name in pictures["pareto"]:
+            check_choice("pictures.pareto: the column", name, [*content["measures"], *design.columns])
+    if "designs" in pictures:
+        check_designs("pictures.designs", pictures["designs"], len(design))
+    if "field" in pictures:
+        scene = locate(content["scene"])
+        own = {name: value for name, value in design[0].items() if name in scene.parameters}
+        try:
+            fields = scene(**content["parameters"] | own).finalize(device="cpu").terms.fields
+        except (Error, MemoryError, NotImplementedError):  # the sweep tells
+            return
+        check_choice("pictures.field", pictures["field"], fields)
 
 
 def _flat(table: Mapping[str, Any]) -> dict[str, Any]:
@@ -129,7 +158,14 @@ def run_study(path: str | pathlib.Path, **given: Any) -> SweepResult:
     except ModelError as error:
         raise ModelError(f"{path}: {error}") from error
     if "table" in pictures:
-        result.plot(result.folder / pictures["table"], pareto=pictures.get("pareto", ()))
+        result.plot(_target(result, pictures["table"]), pareto=pictures.get("pareto", ()))
     if "sheet" in pictures:
-        result.sheet(result.folder / pictures["sheet"], pictures.get("designs"), field=pictures.get("field"))
+        result.sheet(_target(result, pictures["sheet"]), pictures.get("designs"), field=pictures.get("field"))
     return result
+
+
+def _target(result: SweepResult, name: str) -> pathlib.Path:
+    """Path of a picture, whose folder is made. OutputError."""
+    target = result.folder / name
+    make_folder(target.parent)
+    return target

@@ -13,7 +13,7 @@ import pathlib
 import tempfile
 import time as clock
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,7 +22,7 @@ import numpy as np
 from ..base.checks import check_positive, is_count, is_number
 from ..base.console import progress_bar
 from ..base.devices import find_device
-from ..base.errors import CheckpointError, Error, ModelError
+from ..base.errors import CheckpointError, Error, ModelError, OutputError
 from ..base.names import check_choice
 from ..base.provenance import versions
 from ..base.writer import make_folder, write_atomically
@@ -275,12 +275,8 @@ class _Driver:
         """Do all tasks."""
         running: dict[Any, Task] = {}
         total, done = len(self.points), int(self.record.done.sum())
-        times = self.folder / "times.csv"
-        new = not times.exists()
-        with open(times, "a", newline="") as file, progress_bar("sweep", "design", total, progress) as bar:
-            writer = csv.writer(file, lineterminator="\n")
-            if new:
-                writer.writerow([*TIMES, "worker", "task_seconds"])
+        self._write_times([])
+        with progress_bar("sweep", "design", total, progress) as bar:
             bar.update(done)
             ended: deque[tuple[Task, Outcome]] = deque()
             try:
@@ -293,8 +289,7 @@ class _Driver:
                         self._keep(task, outcome)
                         own = [outcome.rows.columns[name] for name in TIMES]
                         of_task = itertools.repeat(outcome.worker), itertools.repeat(outcome.seconds)
-                        writer.writerows(zip(*own, *of_task))
-                        file.flush()
+                        self._write_times(zip(*own, *of_task))
                     bar.set_postfix_str(f"{len(self.record.failures)} failed", refresh=False)
                     bar.update(int(self.record.done.sum()) - bar.n)
                     for handle in self.engine.done(list(running)) if running else ():
@@ -311,6 +306,18 @@ class _Driver:
                 for task, outcome in ended:  # left by an error
                     with contextlib.suppress(Error):
                         self._keep(task, outcome)
+
+    def _write_times(self, rows: Iterable[Sequence[Any]]) -> None:
+        """Add rows to times.csv. OutputError."""
+        target = self.folder / "times.csv"
+        try:
+            with open(target, "a", encoding="utf-8", newline="") as file:
+                writer = csv.writer(file, lineterminator="\n")
+                if file.tell() == 0:
+                    writer.writerow([*TIMES, "worker", "task_seconds"])
+                writer.writerows(rows)
+        except OSError as error:
+            raise OutputError(f"{target}: can't be written ({error})") from error
 
     def _submit(self, call: Callable[..., Any], task: Task) -> Any:
         columns = {

@@ -146,7 +146,7 @@ def check_names(study: Study, arguments: dict[str, Any], indices: list[int], col
         return
     for where, chosen in (("measures", study.measures), ("series", study.series)):
         for name, measure in chosen.items():
-            measure.check(f"{where}.{name}", group.builder)
+            measure.check(f"{where}.{name}", model)
     for last in range(1 - len(indices), 1):
         try:
             set_values(model, {name: [values[last - 1]] for name, values in columns.items()})
