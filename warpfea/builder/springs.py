@@ -13,6 +13,7 @@ from ..base.errors import ModelError
 from ..kernels.terms.springs import ANGLE, LENGTH, VECTOR
 from ..model import assembly
 from ..model.description import Description
+from ..model.discretisation import PointMass
 from ..model.handles import MaterialPoint, NodeSet, SurfaceSet
 from ..model.joints import Joint, Vector, VectorPart
 from ..model.springs import SampledForce, Spring
@@ -125,6 +126,32 @@ class SpringMethods:
         ]
         label = f"surface {surface.name!r} of body {body.name!r}"
         return self._add_spring(Spring(name, VECTOR, items, **values, scale=area.ravel(), between=label))
+
+    def add_point_mass(self, at: Any, mass: float, inertia: float = 0.0) -> None:
+        """Add a mass at a point, which counts wherever the mass matrix does: inertia, weight, momentum, energies.
+
+        Args:
+            at: a material point, nodes or a surface (their mean, which all of them carry).
+            mass: kg, 0 or more.
+            inertia: moment of inertia about every axis of the point, kg m^2, that turns with the deformation gradient.
+
+        Raises:
+            ModelError: a value out of range, both 0, or an inertia where the rotation is not determined.
+        """
+        body = body_of_handle(at, "add_point_mass", (MaterialPoint, NodeSet, SurfaceSet), self.description.bodies)
+        what = f"point mass on body {body.name!r}"
+        for key, value in (("mass", mass), ("inertia", inertia)):
+            if not (is_number(value) and value >= 0.0):
+                raise ModelError(f"{what}: {key} = {value!r} must be a number, 0 or more")
+        if not (mass or inertia):
+            raise ModelError(f"{what}: mass and inertia are both 0")
+        point = make_attachment(at, what, child=False)
+        if inertia and np.abs(point.known_directions - np.eye(3)).max() > 1e-6:
+            raise ModelError(
+                f"{what}: {point.label} does not determine the rotation of its inertia: give a surface or a point"
+            )
+        values = (point.slots, point.weights, point.gradients, float(mass), float(inertia))
+        body.point_masses.append(PointMass(*values))
 
     def _spring_name(self, name: str | None, default: str) -> str:
         return unused_name(name, default, {spring.name for spring in self.description.springs}, "spring")

@@ -55,8 +55,10 @@ class Block:
 
     @property
     def with_mass(self) -> bool:
-        """True if the element mass is a number times one table."""
-        return self.key.affine and not any(callable(p.body.materials[p.material][1].density) for p in self.host_blocks)
+        """True if the mass is that of the elements, a number times one table."""
+        return self.key.affine and not any(
+            p.body.point_masses or callable(p.body.materials[p.material][1].density) for p in self.host_blocks
+        )
 
     def kernels_for(self, dtype: str, damping: str | None, midpoint: bool = False, dissipative: bool = False) -> Any:
         """The kernels of this kind of element with another form of damping; `midpoint`: of the conserving scheme,

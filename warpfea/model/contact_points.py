@@ -17,7 +17,7 @@ from ..materials import Material
 from . import assembly
 from .discretisation import Discretisation
 from .handles import SurfaceSet
-from .masses import mass_parts
+from .masses import all_mass_parts
 
 __all__ = [
     "CONTACT_RULES",
@@ -227,4 +227,4 @@ def body_mass_total(body: Discretisation) -> float:
     """Mass of a body as built, kg; 0 for a material without density (statics only)."""
     if any(material.density is None for _, material in body.materials):
         return 0.0
-    return sum(part.scale * part.scaled_mass for part in mass_parts(body))
+    return sum(part.scale * part.scaled_mass for part in all_mass_parts(body))

@@ -14,10 +14,32 @@ from ..materials import Material
 from ..mesh import Mesh
 from .partition import morton_order
 
-__all__ = ["Discretisation", "element_functions"]
+__all__ = ["Discretisation", "PointMass", "element_functions"]
 
 ORDERED_NODES = 20000
 """Node count above which slots and elements are ordered spatially; smaller bodies fit into caches."""
+
+
+@dataclass(frozen=True, eq=False)
+class PointMass:
+    """Mass at a point x = sum weights e with F = sum e gradients^T.
+
+    Attributes:
+        slots, weights, gradients: body slots (n,), (n,), (n, 3).
+        mass, inertia: kg; the moment of inertia about every axis of the point, kg m^2.
+    """
+
+    slots: np.ndarray
+    weights: np.ndarray
+    gradients: np.ndarray
+    mass: float
+    inertia: float
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """(n, n) scalar mass matrix, kg: of a spin w the columns of F have w^2 in each two directions, 2 w^2 in all."""
+        w, g = self.weights, self.gradients
+        return self.mass * np.outer(w, w) + 0.5 * self.inertia * (g @ g.T)
 
 
 @dataclass(eq=False)
@@ -41,6 +63,7 @@ class Discretisation:
         elastic: False for a rigid part whose contacts take the stiffness of the other side.
         index: number of the body in its builder, -1 before it is added.
         slot_offset, element_offset: slots and elements of the bodies before it, set at finalize; -1 before.
+        point_masses: of points, added to the mass matrix.
         velocity, initial_displacement: (slots, 3) initial values, m/s and m; None: zero.
     """
 
@@ -58,6 +81,7 @@ class Discretisation:
     index: int = -1
     slot_offset: int = -1
     element_offset: int = -1
+    point_masses: list[PointMass] = field(default_factory=list, repr=False)
     velocity: np.ndarray | None = field(default=None, repr=False)
     initial_displacement: np.ndarray | None = field(default=None, repr=False)
 

@@ -15,7 +15,7 @@ from . import assembly
 if TYPE_CHECKING:
     from .discretisation import Discretisation
 
-__all__ = ["MassPart", "Masses", "body_mass", "center_of_mass", "has_constant_density", "mass_parts"]
+__all__ = ["MassPart", "Masses", "all_mass_parts", "body_mass", "center_of_mass", "has_constant_density", "mass_parts"]
 
 
 def _entry_keys(matrix: sp.csr_matrix) -> np.ndarray:
@@ -77,9 +77,21 @@ def mass_parts(body: Any) -> list[MassPart]:
     return out
 
 
+def all_mass_parts(body: Discretisation) -> list[MassPart]:
+    """Mass of each material of a body, and of its point masses, if any."""
+    points = []
+    if body.point_masses:
+        matrix = sp.csr_matrix((body.slot_count,) * 2)
+        for point in body.point_masses:
+            entries = [point.slots[k.ravel()] for k in np.indices((len(point.slots),) * 2)]
+            matrix = matrix + sp.csr_matrix((point.matrix.ravel(), entries), shape=matrix.shape)
+        points.append(MassPart(1.0, matrix, sum(point.mass for point in body.point_masses)))
+    return mass_parts(body) + points
+
+
 def body_mass(body: Discretisation) -> sp.csr_matrix:
     """Consistent scalar mass matrix of a body (Eq. 20), (slots, slots) CSR, kg."""
-    return sum((part.scale * part.matrix for part in mass_parts(body)), sp.csr_matrix((body.slot_count,) * 2))
+    return sum((part.scale * part.matrix for part in all_mass_parts(body)), sp.csr_matrix((body.slot_count,) * 2))
 
 
 def center_of_mass(body: Discretisation, values: np.ndarray) -> np.ndarray:
@@ -103,11 +115,10 @@ class Masses:
 
     def __init__(self, model: Any) -> None:
         self.model = model
-        self.parts = {(b, k): part for b, body in enumerate(model.bodies) for k, part in enumerate(mass_parts(body))}
+        parts_of_bodies = [all_mass_parts(body) for body in model.bodies]
+        self.parts = {(b, k): part for b, parts in enumerate(parts_of_bodies) for k, part in enumerate(parts)}
         # includes zeros at entries of other matrices
-        patterns = [
-            sum(abs(self.parts[b, k].matrix) for k in range(len(body.materials))) for b, body in enumerate(model.bodies)
-        ]
+        patterns = [sum(abs(part.matrix) for part in parts) for parts in parts_of_bodies]
         self.matrix = sp.block_diag(patterns, format="csr")
         self.matrix.sort_indices()
         self.entry_indices = {key: self._entry_indices(key, patterns[key[0]]) for key in self.parts}

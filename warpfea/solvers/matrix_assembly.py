@@ -95,8 +95,8 @@ def couples_slots(model: Model) -> bool:
 
 
 def coupling_pattern(model: Model) -> sp.csr_matrix:
-    """Pattern (slots, slots) of slots that share an element or an item of a term, or in small models may come in
-    contact; rows sorted."""
+    """Pattern (slots, slots) of slots that share an element, an item of a term or a point mass, or in small models may
+    come in contact; rows sorted."""
     if "coupled slots" not in model.cache:
         graph = slot_graph(model.blocks, model.slots)
         for item, slot, count in filter(None, (term.incidence() for term in model.terms.having(Preconditioned))):
@@ -107,6 +107,8 @@ def coupling_pattern(model: Model) -> sp.csr_matrix:
             a, b = term.coupled_slot_pairs()
             one_sided = sp.csr_matrix((np.ones(len(a), dtype=np.int8), (a, b)), graph.shape)
             graph = graph + one_sided + one_sided.T
+        if any(body.point_masses for body in model.bodies):  # of the nodes of a set, which share no element
+            graph = graph + (model.masses.matrix != 0.0).astype(np.int8)
         graph = graph.tocsr()
         graph.sort_indices()
         model.cache["coupled slots"] = graph
