@@ -167,7 +167,7 @@ def test_a_torsion_spring_counts_turns():
     assert abs(sim.energies()["integrator"][0]) < 1e-9 * stored
 
 
-def linked(law="mixed", dtype="float64", worlds=1):
+def linked(law="mixed", dtype="float64", device="cpu"):
     """Two cubes with springs of all kinds between them, to the ground and under one, and a hinge."""
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     soft = wf.SVK(E=1e5, nu=0.3, density=1000.0)
@@ -184,7 +184,8 @@ def linked(law="mixed", dtype="float64", worlds=1):
     b.add_spring(second.at((0.3, 0.0, 0.0)), (0.35, -0.2, 0.2), law=hardening, name="own")
     if law == "mixed":
         b.add_foundation(first.surface("z-"), stiffness=2e3, damping=20.0, name="bed")
-    return b.finalize(device="cpu", dtype=dtype, worlds=worlds), (first, second)
+        b.add_point_mass(first.at((0.02, 0.03, 0.04)), 0.5, inertia=1e-3)
+    return b.finalize(device=device, dtype=dtype), (first, second)
 
 
 def poised(scheme="backward_euler", seed=1, **options):
@@ -460,6 +461,37 @@ def test_parameters_per_world(dtype):
         np.testing.assert_array_equal(sim.state.displacement.numpy()[world], one.state.displacement.numpy()[0])
     with pytest.raises(wf.ModelError, match="0 or more"):
         many.set_parameter("s.stiffness", -1.0)
+
+
+def test_a_changed_parameter_does_work():
+    """Stiffness doubled on the way: the energy that it adds is work of fields, none of the integrator's."""
+    b, body = cube()
+    b.add_spring((0.0, 0.05, 0.05), body.at(CENTRE), stiffness=100.0, rest=0.03, name="s")
+    b.set_initial(body, velocity=(0.1, 1.0, 0.2))
+    model = b.finalize(device="cpu", worlds=2)
+    sim = wf.Simulation(model, dt=2e-3, integrator="energy_momentum", solver=EXACT)
+    sim.step(20)
+    before = sim.energies()
+    model.set_parameter("s.stiffness", 200.0, mask=[True, False])
+    sim.step(20)
+    e = sim.energies()
+    assert np.abs(e["integrator"]).max() < 1e-10
+    np.testing.assert_allclose(e["work_fields"], [before["springs"][0], 0.0], rtol=1e-9)
+    assert np.abs(e["ledger_residual"]).max() < 1e-10
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_devices_agree(scheme, dtype):
+    """All kinds of springs and laws, and a point mass."""
+    found = []
+    for device in ("cpu", "cuda"):
+        model = linked(dtype=dtype, device=device)[0]
+        sim = wf.Simulation(model, dt=5e-3, integrator=scheme)
+        sim.step(20)
+        found.append(sim.state.displacement.numpy())
+    assert np.abs(found[1] - found[0]).max() < (1e-6 if dtype == "float64" else 1e-2) * np.abs(found[0]).max()
 
 
 def test_resumed_runs_go_on_bit_for_bit(tmp_path):

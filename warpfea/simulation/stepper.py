@@ -116,7 +116,7 @@ class Stepper:
         self.start_terms()
         self._evaluate_potential(None)
         self._parameter_updates = self.terms.parameter_updates, model.parameters.version
-        self._changes_applied = model.parameters.changes.copy()
+        self._changes_applied, self._world_updates = model.parameters.changes.copy(), self.terms.world_updates
         if ledger:
             fresh = ~self.state.ledger.numpy().any(axis=1)
             self.restart_ledger(fresh | (self.state.ledger_time.numpy() != self.state.time.numpy()))
@@ -214,16 +214,16 @@ class Stepper:
         if self.energy_growth:
             self.energy_growth.restart_changed()
         mask = parameters.changes > self._changes_applied
-        if not mask.any():
-            return
-        self.invalidate(mask)
-        if self.ledger:
+        if mask.any():
+            self.invalidate(mask)
+        if self.terms.named("springs"):  # their energy follows from parameters of terms
+            mask |= self.terms.world_updates > self._world_updates
+        self._world_updates = self.terms.world_updates
+        if self.ledger and mask.any():
+            before = self.state.ledger.numpy().copy()
+            self.restart_ledger(mask)
             ledger = self.state.ledger.numpy()
-            stored = self._stored_energies()
-            ledger[mask, list(self.model.terms.ledger).index("work_fields")] += (stored - ledger[:, :3]).sum(axis=1)[
-                mask
-            ]
-            ledger[mask, :3] = stored[mask]
+            ledger[:, list(self.model.terms.ledger).index("work_fields")] += (ledger - before).sum(axis=1)
             self.state.ledger.assign(ledger)
 
     def finish_device_reset(self, flags: wp.array, *, restart: bool = True) -> None:
