@@ -20,7 +20,7 @@ from ..model.contacts import Collider, Contact
 from ..model.description import Description
 from ..model.edge_points import edge_contact
 from ..model.handles import SurfaceSet
-from ..model.obstacle_points import ObstacleContact, is_narrow_obstacle
+from ..model.obstacle_points import ObstacleContact, has_own_points, narrow_width
 from ..model.pairs import PAIR_RULES, FacetOptions, PairContact, slave_and_master
 from ..model.segments import SEGMENT_POINTS, SegmentContact, has_segments
 from ..model.shapes import Shape
@@ -142,7 +142,8 @@ def make_contact(
             "obstacle with an inside: take model = 'patch', or a closed mesh"
         )
     patch = o["model"] == "patch" and o["treatment"] == "implicit" and not LAWS[o["law"]].traits & ANY_GAP
-    if patch and is_narrow_obstacle(surface, collider):
+    width = narrow_width(surface, collider) if patch else None
+    if width is not None and has_own_points(surface, collider):
         for option in ("points", "seam"):
             if o[option] is not None:
                 raise NotImplementedError(
@@ -151,7 +152,7 @@ def make_contact(
                 )
         o["index"] = len(d.contacts_of(FacetOptions))
         return ObstacleContact(surface=surface, collider=collider, name=name, **o)
-    return Contact(surface, collider, name, index=len(d.contacts_of(Contact)), **o)
+    return Contact(surface, collider, name, width=width, index=len(d.contacts_of(Contact)), **o)
 
 
 def make_pair(

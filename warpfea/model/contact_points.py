@@ -18,6 +18,7 @@ from . import assembly
 from .discretisation import Discretisation
 from .handles import SurfaceSet
 from .masses import all_mass_parts
+from .narrow import rules_for_width
 
 __all__ = [
     "CONTACT_RULES",
@@ -74,7 +75,7 @@ class ContactPoints:
     rows: Any = ...
 
 
-def contact_points(surface: SurfaceSet, points: int | None = None) -> ContactPoints:
+def contact_points(surface: SurfaceSet, points: int | None = None, width: float | None = None) -> ContactPoints:
     """The points of a surface, corners included.
 
     Triangles have 7 points (degree 3, area weights 1/20, 2/15, 9/20 of vertices, mid-sides and centre), quadrilaterals
@@ -84,10 +85,13 @@ def contact_points(surface: SurfaceSet, points: int | None = None) -> ContactPoi
         surface: faces of a body of any family; beams with their section, shells with their thickness.
         points: number of points per face: 3 (the vertices, degree 1: on a T10 face they miss the mid-side
             nodes) or 7 of triangles; 4, 9, 16 or 25 of quadrilaterals.
+        width: without `points`, m: equidistant ones that a thing of this width can't pass between.
 
     Raises:
         ModelError: another number, or one without a rule for all faces.
     """
+    if points is None and width is not None:
+        return points_by_faces(surface, rules_for_width(surface, width))
     check_contact_points(surface, points)
     return points_by_rules(surface, CONTACT_RULES, DEFAULT_POINTS, points)
 

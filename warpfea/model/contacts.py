@@ -156,11 +156,13 @@ class Contact(ContactOptions):
         surface: faces of the body.
         collider: the obstacle.
         name: unique among the contacts of its builder.
+        width: of an obstacle narrower than the facets, m, which their points must see; None: points by their rule.
     """
 
     surface: SurfaceSet
     collider: Collider
     name: str
+    width: float | None = None
 
     @property
     def surfaces(self) -> tuple[SurfaceSet, ...]:
@@ -169,6 +171,9 @@ class Contact(ContactOptions):
     @property
     def roles(self) -> tuple[Any, Any]:
         return self.body, self.collider
+
+    def slave_points(self) -> tuple[ContactPoints, Any]:
+        return contact_points(self.surface, self.points, self.width), 1.0
 
     def region_area(self, points: ContactPoints) -> float:
         """As of `ContactOptions`; of the "sphere" over the depth: pi R, 1/R = 1/R_A + 1/R_B of both."""

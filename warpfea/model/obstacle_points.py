@@ -20,7 +20,7 @@ from .pairs import FacetOptions
 from .shapes import BOX, CYLINDER, HALF_SPACE, SPHERE, Shape
 from .triangle_mesh import TriMesh
 
-__all__ = ["ObstacleContact", "is_narrow_obstacle", "obstacle_points"]
+__all__ = ["ObstacleContact", "has_own_points", "narrow_width", "obstacle_points"]
 
 SAGITTA_RATIO = 0.001
 """Height of a curved obstacle between two of its points, over the smaller of the side and the depth of an element."""
@@ -79,13 +79,16 @@ def _widths(shape: Shape) -> tuple[float, float]:
     return float(extent[0]), float(extent[1])
 
 
-def is_narrow_obstacle(surface: SurfaceSet, collider: Collider) -> bool:
-    """True for an obstacle at rest that is narrower than the facets of a surface, all of them of one kind."""
-    kinds = {len(surface.body.family.faces[int(face)]) for face in np.unique(surface.faces[:, 1])}
+def narrow_width(surface: SurfaceSet, collider: Collider) -> float | None:
+    """Least extent of an obstacle narrower than the facets of a surface, m; None of another one."""
     widths = _widths(collider.shape)
-    if collider.moves or len(kinds) > 1 or math.isinf(widths[0]):
-        return False
-    return is_narrow(widths, facet_size(surface)[0])
+    return widths[0] if math.isfinite(widths[0]) and is_narrow(widths, facet_size(surface)[0]) else None
+
+
+def has_own_points(surface: SurfaceSet, collider: Collider) -> bool:
+    """True if a narrow obstacle has points that see the facets of a surface: at rest, and facets of one kind."""
+    kinds = {len(surface.body.family.faces[int(face)]) for face in np.unique(surface.faces[:, 1])}
+    return not collider.moves and len(kinds) == 1
 
 
 @dataclass(frozen=True)
