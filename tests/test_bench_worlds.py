@@ -52,6 +52,7 @@ def miss(value, reason):
         "pendulum-loose-4096",
         "finger-loose-4096",
         "gripper-auto-4096",
+        "rigid-auto-4096",
         miss("slider-loose-4096", "93 000 of 200 000 world-steps/s; 115 000 after 100 steps"),
         miss("double-loose-4096", "52 000 of 100 000 world-steps/s"),
         miss("tets-rough-4096", "5.9 ms per step, 3.5 after 100 steps, of 2.5"),
@@ -87,6 +88,11 @@ def test_a_gripper_is_as_fast_from_its_fall_to_its_lift(rows):
     assert row["later_error"] < 1e-8
 
 
+def test_rigid_links_are_thirty_times_as_fast_as_soft_ones(rows):
+    rigid, soft = rows["rigid-auto-4096", "float64"], rows["double-auto-4096", "float64"]
+    assert rigid["world_steps_per_s"] > 30.0 * soft["world_steps_per_s"]
+
+
 def test_worlds_have_equal_bits(rows):
     assert all(row["equal"] for row in rows.values())
 
@@ -115,6 +121,7 @@ def test_throughput_grows_with_worlds(rows):
         ("slider-loose-4096", 1e-6),
         ("double-loose-4096", 1e-6),
         ("finger-loose-4096", 1e-6),
+        ("rigid-auto-4096", 1e-8),
         ("tets-loose-4096", 1e-5),
         miss(("tets-rough-4096", 1e-4), "1.7e-4 after 100 steps"),
     ],

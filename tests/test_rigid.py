@@ -360,6 +360,7 @@ def test_worlds_are_equal_to_lone_runs_and_checkpoints_go_on(tmp_path: Any) -> N
     np.testing.assert_array_equal(again.positions(part), sim.positions(part))
 
 
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_devices_and_precisions_agree(device: Any, dtype: str) -> None:
     ends = []

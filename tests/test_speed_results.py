@@ -267,7 +267,7 @@ def test_contact_of_a_million_facets(contact):
     assert row["bytes_per_point"] <= 1132
 
 
-STIFFER = pytest.mark.xfail(strict=True, reason="stiffer by default: 59 400 and 14 300")
+STIFFER = pytest.mark.xfail(strict=True, reason="stiffer by default: 86 300 and 21 600")
 
 
 @pytest.mark.parametrize(("label", "least"), [("blocks", 93_000), ("finger", 34_000)])
