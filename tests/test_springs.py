@@ -345,6 +345,25 @@ def test_the_static_check_sees_springs():
         wf.solve_static(b.finalize(device="cpu"))
 
 
+def test_negative_energy_of_a_function_is_no_growth():
+    """A preloaded function's energy is 0 in the reference and falls from there: what the monitor compares the errors of
+    the integrator with is as large as for the spring of the same force."""
+
+    @wp.func
+    def tension(y: wp.float64, rate: wp.float64) -> wp.float64:
+        return wp.float64(100.0) * (y - wp.float64(0.6))
+
+    shares = []
+    for options in ({"law": tension}, {"stiffness": 100.0, "rest": 0.6}):
+        b, body = cube()
+        b.add_spring((1.0, 0.05, 0.05), body.at(CENTRE), **options)
+        sim = wf.Simulation(b.finalize(device="cpu"), dt=5e-3, integrator="bdf2")
+        sim.step(100)
+        shares.append(sim.state.energy_growth.numpy()[0, 0])
+    assert abs(shares[1]) > 1e-9
+    assert abs(shares[0]) < 3.0 * abs(shares[1]), shares
+
+
 def test_sampled_forces():
     """Through all samples, monotone between, with the slope's integral as energy, linear beyond."""
     y, f = [0.0, 1.0, 1.5, 4.0], [-1.0, 0.0, 5.0, 5.0]
@@ -365,6 +384,8 @@ def test_sampled_forces():
     assert np.diff([force(x) for x in grid]).min() > -1e-13
     slopes = [(energy(x + 1e-6) - energy(x - 1e-6)) / 2e-6 for x in grid]
     np.testing.assert_allclose(slopes, [force(x) for x in grid], atol=1e-8)
+    within = [energy(x) for x in grid if 0.0 <= x <= 4.0]
+    assert min(within) == pytest.approx(0.0, abs=1e-12)
     assert force(-2.0) == pytest.approx(-3.0)
     assert force(9.0) == pytest.approx(5.0)
 

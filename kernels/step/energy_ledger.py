@@ -167,7 +167,7 @@ def ledger_kernels(dtype: str, chord: bool, nonpotential: bool, module: wp.Modul
             if energies.kind[k] == STORED:
                 change = amount - ledger[world, column]
                 stored += change
-                energy += amount
+                energy += wp.abs(amount)  # of a spring given as a function it may be negative
                 if energies.nonpotential[k] != 0:
                     fields += change
                 else:

@@ -21,7 +21,7 @@ class SampledForce:
     Attributes:
         knots: (pieces,) where each piece begins; the first is that before the samples.
         coefficients: (pieces, 4) of powers of y - knot.
-        energy: (pieces,) integral of the force from the first sample, J.
+        energy: (pieces,) integral of the force where each piece begins, J: 0 where it is least between the samples.
     """
 
     knots: np.ndarray
@@ -50,7 +50,13 @@ class SampledForce:
         ends = [np.concatenate([values[:1], values]) for values in (f, m)]
         work = h * (f[:-1] + h * (m[:-1] / 2.0 + h * (c2 / 3.0 + h * c3 / 4.0)))
         energy = np.concatenate([zero, zero, np.cumsum(work)])
-        return cls(np.concatenate([x[:1], x]), np.stack([*ends, *cubic], axis=1), energy)
+        coefficients = np.stack([*ends, *cubic], axis=1)
+        least = list(energy)  # it is least at a sample, or where the force vanishes between two
+        for q, width, start in zip(coefficients[1:-1], h, energy[1:]):
+            t = np.roots(q[::-1])
+            t = t.real[(abs(t.imag) < 1e-12) & (t.real > 0.0) & (t.real < width)]
+            least += list(start + t * (q[0] + t * (q[1] / 2.0 + t * (q[2] / 3.0 + t * q[3] / 4.0))))
+        return cls(np.concatenate([x[:1], x]), coefficients, energy - min(least))
 
 
 @dataclass(eq=False)
