@@ -1,7 +1,8 @@
 """Price of `clipping=True` in scenes that do not need it: `python tests/contact_clipping_price.py --out FILE`.
 
 A block of T10, 0.2 x 0.2 x 0.1 m, E = 1e7 Pa, rests on a wider block of other cells, or on a wide box that does not
-move, h = 1 ms: points of contact, seconds to build the model, median seconds of a step (of the processor, one thread), iterations.
+move, h = 1 ms: points of contact, seconds to build the model, median seconds of a step, iterations; seconds of one
+thread of the processor.
 """
 
 import argparse

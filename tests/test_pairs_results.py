@@ -35,3 +35,13 @@ def test_stacks_rest():
         assert row["duration"] == 10.0
         assert row["creep"] < 1e-3
         assert row["force_error"] < 1e-5
+
+
+def test_price_of_clipping():
+    """Twice the points and less than twice the step between bodies; obstacles cost no more iterations than a quarter."""
+    rows = content_of("contact_clipping_cpu.json", "python tests/contact_clipping_price.py", "cpu")["rows"]
+    assert [row["clipping"] for row in rows] == [False, True] * 4
+    for without, row in zip(rows[::2], rows[1::2]):
+        assert (row["other"], row["unknowns"]) == (without["other"], without["unknowns"])
+        most = {"points": 2.1, "ms_per_step": 2.0, "newton_per_step": 1.2, "pcg_per_step": 1.25}
+        assert all(row[name] <= ratio * without[name] for name, ratio in most.items())
