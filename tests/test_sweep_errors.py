@@ -74,6 +74,35 @@ def test_a_fit_tells_its_progress(capfd):
     assert "misfit" in told
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"design": [{"size": 10**400}]}, "design: a whole number of more than 64 bits"),
+        ({"design": [{"size": 1.0, "gravity.z": 1.0}, {"size": 1.0}]}, r"design\[1\].gravity.z is missing"),
+        ({"measures": {3: "energy.strain"}}, "measures: the name 3 must be a text"),
+        ({"measures": {"\ud800": "energy.strain"}}, "measures: the name .* must be a text that can be printed"),
+        ({"design": {"kind": "random", "count": 2, "over": {"size": [-1.7e308, 1.7e308]}}}, "high - low is too large"),
+        ({"design": {"kind": "random", "count": 2, "over": {"size": {"low": 0.2, "high": 0.8, "whole": True}}}},
+         "design.over.size: low and high of whole numbers must be whole"),
+    ],
+)  # fmt: skip
+def test_extreme_input_is_refused(change, message):
+    with pytest.raises(wf.ModelError, match=message):
+        wf.sweep(FALL, **{"design": DESIGN, "measures": {"z": "energy.strain"}, "engine": Inline(), **change})
+
+
+def test_a_folder_that_the_system_refuses():
+    with pytest.raises(wf.OutputError, match="can't be made"):
+        wf.sweep(FALL, DESIGN, measures={"z": "energy.strain"}, engine=Inline(), out="x" * 300)
+
+
+def test_a_measure_that_ends_the_process_fails(tmp_path):
+    """Neither worker nor driver ends."""
+    (tmp_path / "mine.py").write_text("import sys\ndef leave(sim):\n    sys.exit(3)\n")
+    result = wf.sweep(FALL, [{"size": 1.0}], measures={"h": f"{tmp_path}/mine.py:leave"}, engine=Inline())
+    assert "measure 'leave': SystemExit: 3" in result.failures[0]
+
+
 @pytest.mark.parametrize("method", ["least_squares", "differential_evolution"])
 def test_a_fit_whose_runs_are_refused(method):
     record = {"probe.tip.displacement.z": ([0.005], [0.0])}

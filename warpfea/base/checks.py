@@ -23,9 +23,12 @@ UNIT_FACTORS = {
 
 
 def is_number(value: Any) -> bool:
-    """A finite number."""
+    """A finite number, which a float can hold."""
     number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
-    return number and math.isfinite(value)
+    try:
+        return number and math.isfinite(value)
+    except OverflowError:
+        return False
 
 
 def is_count(value: Any) -> bool:

@@ -16,6 +16,6 @@ def convert_user_errors(what: str) -> Iterator[None]:
         yield
     except (Error, NotImplementedError):
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         last = traceback.extract_tb(error.__traceback__)[-1]
         raise ModelError(f"{what}: {type(error).__name__}: {error} ({last.filename}:{last.lineno})") from error

@@ -76,10 +76,10 @@ def check_folder(folder: pathlib.Path, target: pathlib.Path) -> None:
 def make_folder(folder: str | os.PathLike[str]) -> pathlib.Path:
     """Make the folder if it is not there. OutputError for one that can't be written, or is a file."""
     path = pathlib.Path(folder)
-    if path.exists() and not path.is_dir():
-        raise OutputError(f"{path}: is a file, not a folder")
-    check_folder(path if path.exists() else path.parent, path)
     try:
+        if path.exists() and not path.is_dir():
+            raise OutputError(f"{path}: is a file, not a folder")
+        check_folder(path if path.exists() else path.parent, path)
         path.mkdir(exist_ok=True)
     except OSError as error:
         raise OutputError(f"{path}: can't be made ({error})") from error

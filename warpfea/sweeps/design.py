@@ -112,7 +112,9 @@ class Design:
         if isinstance(given, (list, tuple)) and given and all(isinstance(row, Mapping) for row in given):
             for k, row in enumerate(given):
                 check_keys(f"{where}[{k}]", row, given[0])
-            return cls({name: [row.get(name) for row in given] for name in given[0]})
+                for name in given[0].keys() - row.keys():
+                    raise ModelError(f"{where}[{k}].{name} is missing")
+            return cls({name: [row[name] for row in given] for name in given[0]})
         if not isinstance(given, Mapping):
             raise ModelError(f"{where} = {given!r} must be a wf.Design, a list of {{name: value}}, or a table")
         table = dict(given)
@@ -164,6 +166,10 @@ def as_range(where: str, axis: Any) -> dict[str, Any]:
     for key in ("low", "high"):
         if not is_number(out.get(key)):
             raise ModelError(f"{where}.{key} = {out.get(key)!r} must be a finite number")
+    if not math.isfinite(float(out["high"]) - float(out["low"])):
+        raise ModelError(f"{where}: high - low is too large, from {out['low']} to {out['high']}")
+    if out["whole"] and any(out[key] != int(out[key]) for key in ("low", "high")):
+        raise ModelError(f"{where}: low and high of whole numbers must be whole")
     if not out["low"] < out["high"]:
         raise ModelError(f"{where} is empty: low = {out['low']} is not below high = {out['high']}")
     if out["log"] and not out["low"] > 0.0:
@@ -203,6 +209,8 @@ def _plain(value: Any) -> Any:
         return tuple(map(_plain, value))
     if isinstance(value, float) and not math.isfinite(value):
         raise ModelError(f"design: {value!r} must be finite")
+    if isinstance(value, int) and not -(2**63) <= value < 2**63:
+        raise ModelError("design: a whole number of more than 64 bits")
     if not isinstance(value, (bool, int, float, str)):
         raise ModelError(f"design: {value!r} must be a number, a text, a truth value or a list of these")
     return value

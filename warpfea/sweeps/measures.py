@@ -129,6 +129,9 @@ def parse_measures(where: str, given: Any) -> dict[str, Measure]:
     """Measures by name from texts or functions. ModelError with the key's path."""
     if not isinstance(given, Mapping) or not given:
         raise ModelError(f'{where}: give at least one measure, such as {{"tip": "probe.tip.displacement.z"}}')
+    for name in given:
+        if not isinstance(name, str) or not name.strip() or not name.isprintable():
+            raise ModelError(f"{where}: the name {name!r} must be a text that can be printed")
     return {name: parse_measure(f"{where}.{name}", item) for name, item in given.items()}
 
 
