@@ -38,7 +38,7 @@ def test_stacks_rest():
 
 
 def test_price_of_clipping():
-    """Twice the points and less than twice the step between bodies; obstacles cost no more iterations than a quarter."""
+    """Between bodies at most twice the points and the step; obstacles cost at most a quarter more iterations."""
     rows = content_of("contact_clipping_cpu.json", "python tests/contact_clipping_price.py", "cpu")["rows"]
     assert [row["clipping"] for row in rows] == [False, True] * 4
     for without, row in zip(rows[::2], rows[1::2]):
