@@ -411,3 +411,18 @@ def test_clamp_of_one_edge_of_a_part_is_refused() -> None:
     part = b.add_rigid(wf.Box((0, 0, 0), (1, 1, 1)), density=1.0)
     with pytest.raises(wf.ModelError, match="on one line do not hold it"):
         b.clamp(part.nodes(lambda X: (X[:, 0] < -0.4) & (X[:, 1] < -0.4)))
+
+
+def test_chain_of_twenty_parts_with_a_heavy_end_keeps_its_energy() -> None:
+    b = wf.ModelBuilder()
+    held: Any = wf.GROUND
+    for k in range(20):
+        link = b.add_rigid(wf.Box((0.1 * k + 0.05, 0, 0), (0.1, 0.02, 0.02)), mass=100.0 if k == 19 else 1.0)
+        b.add_joint("spherical", parent=held, child=link.at((0.1 * k, 0, 0)), anchor=(0.1 * k, 0, 0))
+        held = link.at((0.1 * k + 0.1, 0, 0))
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=2e-3, integrator="energy_momentum")
+    sim.step(100)
+    energy = sim.energies()
+    assert float(energy["kinetic"][0]) > 100.0
+    assert abs(float(energy["kinetic"][0] + energy["potential"][0])) < 1e-6 * float(energy["kinetic"][0])
+    assert int(sim.totals["newton"][0]) <= 300

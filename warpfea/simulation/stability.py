@@ -264,7 +264,7 @@ def _find_negative_curvature(
     """
     m = probe.model
     solver = probe.sim.solver
-    kappa = solver.penalty_ratio(m.dtype) if m.constraints and isinstance(solver, NewtonPCG) else 0.0
+    kappa = solver.penalty_ratio(m) if m.constraints and isinstance(solver, NewtonPCG) else 0.0
     rounding = (roundings or MIN_CURVATURE_ROUNDINGS) * (1.0 + kappa) * float(np.finfo(m.dtype).eps)
     going = np.array([not reason for reason in out.reasons])
     random = np.random.default_rng(1).standard_normal((m.slots, 3))
