@@ -11,7 +11,7 @@ from warpfea.builder.scene import find, names
 
 TRACES = {
     "contact": "contact", "contact between bodies": "pair", "constraints": "constraints",
-    "follower pressure": "pressure", "moments": "moment",
+    "follower pressure": "pressure", "moments": "moment_",
     "body forces": "field", "controls": "controls", "driven nodes": "drive", "damping explicit": "explicit",
     "damping rate": "rate", "damping incremental": "incremental", "table elements": "table",
     "straight elements": "affine",
