@@ -73,7 +73,7 @@ def force_in(b: wf.ModelBuilder, missing: list[str]) -> None:
     reference = np.concatenate([body.mesh.points[body.mesh.used_nodes] for body in bodies])
     low, high = reference.min(axis=0), reference.max(axis=0)
     size = float(np.linalg.norm(high - low))
-    point = first.at(first.mesh.points[first.mesh.used_nodes[0]])
+    point, other = (first.at(first.mesh.points[first.mesh.used_nodes[k]]) for k in (0, 1))
     on_bodies: dict[str, Callable[[], Any]] = {
         "gravity": lambda: setattr(b.description, "gravity", (0.0, 0.0, -NEXT_TO_NONE)),
         "dead loads": lambda: b.add_point_load(point, (0.0, 0.0, 0.0)),
@@ -81,6 +81,7 @@ def force_in(b: wf.ModelBuilder, missing: list[str]) -> None:
         "moments": lambda: b.add_moment(point, (0.0, 0.0, 0.0)),
         "follower pressure": lambda: b.add_pressure(first.surface(everywhere), 0.0),
         "body forces": lambda: b.add_body_force(_nothing, bodies=bodies),
+        "springs": lambda: b.add_spring(point, other, stiffness=NEXT_TO_NONE),
     }
     for name in missing:
         on_bodies.get(name, lambda: None)()
