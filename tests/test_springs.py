@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import warp as wp
 from scipy.integrate import solve_ivp
+from tight_solvers import SOLVERS
 
 import warpfea as wf
 from warpfea.model.springs import SampledForce
@@ -412,16 +413,6 @@ def test_laws_agree_with_the_linear_one():
     for k in range(2):
         for other in found[2 + k :: 2]:
             assert np.abs(other - found[k]).max() < 1e-9 * np.abs(found[k]).max()
-
-
-SOLVERS = {
-    "matrix": wf.NewtonPCG(operator="matrix", tol=1e-12),
-    "elements": wf.NewtonPCG(operator="elements", tol=1e-12),
-    "banded": wf.NewtonPCG(preconditioner="banded", tol=1e-12),
-    "two-level": wf.NewtonPCG(preconditioner="two-level", tol=1e-12),
-    "block-jacobi": wf.NewtonPCG(preconditioner="block-jacobi", tol=1e-12),
-    "direct": wf.NewtonPCG(linear="direct", tol=1e-12),
-}
 
 
 @functools.cache

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 from floor_term import Floor
+from tight_solvers import SOLVERS
 
 import warpfea as wf
 from warpfea.simulation.checkpoint import load_checkpoint, save_checkpoint
@@ -91,16 +92,6 @@ def test_product_is_the_difference_of_the_force(device):
     assert np.abs(product - expected).max() < 1e-6 * np.abs(expected).max()
     own = w.pool_product.numpy()[0]
     assert np.abs(1e-3 * own).max() > 1e-3 * np.abs(product).max()  # the term is felt
-
-
-SOLVERS = {
-    "matrix": wf.NewtonPCG(operator="matrix", tol=1e-12),
-    "elements": wf.NewtonPCG(operator="elements", tol=1e-12),
-    "banded": wf.NewtonPCG(preconditioner="banded", tol=1e-12),
-    "two-level": wf.NewtonPCG(preconditioner="two-level", tol=1e-12),
-    "block-jacobi": wf.NewtonPCG(preconditioner="block-jacobi", tol=1e-12),
-    "direct": wf.NewtonPCG(linear="direct", tol=1e-12),
-}
 
 
 @functools.cache

@@ -164,7 +164,7 @@ class ModelBuilder(ContactMethods, SpringMethods):
             density, mass: kg/m^3 or kg, one of them.
             inertia: tensor (3, 3) or its diagonal (3,) about the centre of mass in the axes of the scene, kg m^2; by
                 default that of a uniform density.
-            com: (3,) centre of mass, m; by default that of a uniform density.
+            com: (3,) centre of mass, m, with `inertia`; by default that of a uniform density.
             material: elasticity that a contact takes for the part; by default that of the other side.
             name: unique name.
 

@@ -49,14 +49,15 @@ def make_rigid(
         raise ModelError(
             f"{what}: the mesh is open, so that it has no volume: close it, or give mass=, inertia= and com="
         )
+    if com is not None and inertia is None:
+        raise ModelError(f"{what}: com= is off that of a uniform density, so give inertia= about it, too")
     exact = volume_moments(shape) if isinstance(shape, Shape) else None
     nowhere: tuple[float, np.ndarray, np.ndarray] = 1.0, np.zeros(3), np.zeros((3, 3))
     volume, center, second = exact or (surface_moments(points, triangles) if closed else nowhere)
     if not volume > 0.0:
         raise ModelError(f"{what}: its volume is {volume:.3g} m^3: the surface is inside out, turn its triangles round")
     if com is not None:
-        shift = vector(com, f"{what}: com") - center
-        center, second = center + shift, second + volume * np.outer(shift, shift)
+        center = vector(com, f"{what}: com")
     density = float(mass) / volume if density is None else float(density)
     moments = np.zeros((4, 4))
     moments[0, 0] = volume
@@ -84,7 +85,6 @@ def _equimomental_points(moments: np.ndarray) -> np.ndarray:
     squares, axes = np.linalg.eigh(moments[1:, 1:] / moments[0, 0])
     radii = np.sqrt(np.maximum(squares, 0.0))
     radii = np.maximum(radii, MIN_SPREAD * radii.max())
-    axes[:, 2] *= np.linalg.det(axes)
     return np.asarray(TETRAHEDRON * radii @ axes.T)
 
 
