@@ -1,5 +1,5 @@
-"""Springs between points, about joints and under surfaces: closed forms and equations of motion, derivatives, energy,
-momentum, worlds, checkpoints."""
+"""Springs between points, about joints and under surfaces: closed forms, equations of motion, derivatives, energy,
+momentum."""
 
 import functools
 
@@ -7,74 +7,13 @@ import numpy as np
 import pytest
 import warp as wp
 from scipy.integrate import solve_ivp
-from tight_solvers import SOLVERS
+from spring_models import CENTRE, EXACT, HARD, SCHEMES, cube, hardening, linked, oscillator, polar_inertia
 
 import warpfea as wf
 from warpfea.model.springs import SampledForce
-from warpfea.simulation.checkpoint import load_checkpoint, save_checkpoint
 from warpfea.terms.springs import Springs
 
-EXACT = wf.NewtonPCG(tol=1e-12)
-SCHEMES = ["backward_euler", "bdf2", "energy_momentum", "generalized_alpha"]
-CENTRE = np.array([0.05, 0.05, 0.05])
-CUBE = wf.mesh.box((0.1, 0.1, 0.1), cells=(1, 1, 1), element="T4")
-HARD = wf.SVK(E=1e9, nu=0.3, density=1000.0)
 OMEGA = 17.0
-
-
-@wp.func
-def sway(t: wp.float64) -> wp.vec3d:
-    return wp.float64(2.0) * wp.sin(wp.float64(17.0) * t) * wp.vec3d(wp.float64(1.0), wp.float64(0.0), wp.float64(0.0))
-
-
-@wp.func
-def twist(t: wp.float64) -> wp.vec3d:
-    return wp.float64(0.01) * wp.sin(wp.float64(17.0) * t) * wp.vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(1.0))
-
-
-@wp.func
-def hardening(length: wp.float64, rate: wp.float64) -> wp.float64:
-    """100 e + 4000 e^3 with e the elongation over 0.3 m, and quadratic damping."""
-    e = length - wp.float64(0.3)
-    return wp.float64(100.0) * e + wp.float64(4000.0) * e * e * e + wp.float64(3.0) * rate * wp.abs(rate)
-
-
-def cube(gravity=(0, 0, 0), **options):
-    """A cube of 1 kg, hard beside all springs."""
-    b = wf.ModelBuilder(gravity=gravity)
-    return b, b.add_solid(CUBE, material=HARD, name="cube", **options)
-
-
-def polar_inertia(body, axis_point):
-    """About the axis through a point along z, by the mass matrix, kg m^2."""
-    from warpfea.model.masses import body_mass
-
-    X = (body.reference + body.origin - axis_point)[:, :2]
-    return float(np.sum(X * (body_mass(body) @ X)))
-
-
-def oscillator(kind, damping, forced):
-    """Builder of a cube on a spring, with velocity 1 (m/s, rad/s) at rest length; its m, k and load amplitude."""
-    gravity = sway if forced and kind != "torsion" else (0, 0, 0)
-    b, body = cube(gravity)
-    if kind == "torsion":
-        hinge = b.add_joint("revolute", parent=wf.GROUND, child=body.surface("z-"), anchor=CENTRE, axis=(0, 0, 1))
-        mass = polar_inertia(body, CENTRE)
-        k = 100.0 * mass
-        b.add_torsion_spring(hinge, stiffness=k, damping=damping * mass, name="s")
-        b.set_initial(body, angular_velocity=(0, 0, 1.0))
-        if forced:
-            b.add_moment(body.at(CENTRE), twist)
-        return b, mass, k, 0.01 * forced, hinge
-    if kind == "foundation":
-        b.add_foundation(body.surface("z-"), stiffness=100.0 / 0.01, damping=damping / 0.01, name="s")
-        b.drive(body.nodes("z-"), displacement=(0, 0, 0), components="yz")
-        b.drive(body.nodes("z+"), displacement=(0, 0, 0), components="yz")
-    else:
-        b.add_spring((-1.0, 0.05, 0.05), body.surface("x-"), stiffness=100.0, damping=damping, name="s")
-    b.set_initial(body, velocity=(1.0, 0, 0))
-    b.add_probe("p", body.surface("z-"))
-    return b, 1.0, 100.0, 2.0 * forced, None
 
 
 def measured(b, hinge, dt, t_end, **options):
@@ -166,27 +105,6 @@ def test_a_torsion_spring_counts_turns():
     sim.step(314)
     assert abs(sim.state.spring_angle.numpy()[0, 0] - 20.0 * np.sin(3.14)) < 2e-3 * 20.0
     assert abs(sim.energies()["integrator"][0]) < 1e-9 * stored
-
-
-def linked(law="mixed", dtype="float64", device="cpu"):
-    """Two cubes with springs of all kinds between them, to the ground and under one, and a hinge."""
-    b = wf.ModelBuilder(gravity=(0, 0, 0))
-    soft = wf.SVK(E=1e5, nu=0.3, density=1000.0)
-    first = b.add_solid(CUBE, material=soft, name="first")
-    second = b.add_solid(wf.mesh.box((0.1, 0.1, 0.1), cells=(1, 1, 1), origin=(0.2, 0, 0), element="T10"),
-                         material=soft, name="second")  # fmt: skip
-    hinge = b.add_joint("revolute", parent=first.surface("x+"), child=second.surface("x-"), anchor=(0.15, 0.05, 0.05),
-                        axis=(1, 2, 2))  # fmt: skip
-    b.add_torsion_spring(hinge, stiffness=0.7, damping=0.05, rest=0.3, name="torsion")
-    b.add_spring(first.at((0.1, 0.1, 0.1)), second.at((0.2, 0.03, 0.04)), stiffness=40.0, damping=0.5, rest=0.05,
-                 name="line")  # fmt: skip
-    samples = ([0.05, 0.2, 0.26, 0.4], [-3.0, -1.0, 2.0, 4.0])
-    b.add_spring(first.surface("z+"), second.nodes("z-"), law=samples, damping=0.3, name="sampled")
-    b.add_spring(second.at((0.3, 0.0, 0.0)), (0.35, -0.2, 0.2), law=hardening, name="own")
-    if law == "mixed":
-        b.add_foundation(first.surface("z-"), stiffness=2e3, damping=20.0, name="bed")
-        b.add_point_mass(first.at((0.02, 0.03, 0.04)), 0.5, inertia=1e-3)
-    return b.finalize(device=device, dtype=dtype), (first, second)
 
 
 def poised(scheme="backward_euler", seed=1, **options):
@@ -413,191 +331,6 @@ def test_laws_agree_with_the_linear_one():
     for k in range(2):
         for other in found[2 + k :: 2]:
             assert np.abs(other - found[k]).max() < 1e-9 * np.abs(found[k]).max()
-
-
-@functools.cache
-def motion(solver, scheme="bdf2"):
-    model, (first, second) = linked()
-    sim = wf.Simulation(model, dt=5e-3, integrator=scheme, solver=SOLVERS[solver], constraint_tol=1e-12)
-    v = sim.state.velocity.numpy()
-    v[0, model.slot_table.kind == 0, 1] = 0.5
-    sim.state.velocity.assign(v)
-    sim.step(20)
-    return sim.state.displacement.numpy(), sim.totals["pcg"][0], sim.totals["newton"][0], sim.energies()
-
-
-@pytest.mark.parametrize("solver", list(SOLVERS))
-def test_solvers_agree(solver):
-    expected, pcg, _, _ = motion("block-jacobi")
-    found, own, newton, energies = motion(solver)
-    assert np.abs(found - expected).max() < 1e-9 * np.abs(expected).max()
-    assert abs(energies["ledger_residual"][0]) < 1e-9 * energies["kinetic"][0]
-    if solver == "direct":
-        assert own <= 1.2 * newton
-    elif solver in ("banded", "two-level"):
-        assert own < 0.7 * pcg
-
-
-def test_stiff_springs_converge():
-    """A spring far stiffer than the cube's own stiffness is in D and in the preconditioners."""
-    b, body = cube(gravity=(0, 0, -9.81))
-    b.add_spring((0.05, 0.05, 1.0), body.surface("z+"), stiffness=1e12, name="s")
-    sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-3)
-    sim.step(20)
-    assert sim.totals["newton"][0] <= 60
-    assert np.abs(sim.state.displacement.numpy()).max() < 1e-3
-
-
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
-def test_parameters_per_world(dtype):
-    """A world with its own values is bit-equal to a run of its own; bad values are named."""
-    values = {"stiffness": [100.0, 400.0, 50.0], "damping": [0.0, 2.0, 1.0], "rest": [0.03, 0.05, 0.02]}
-
-    def model(worlds):
-        b, body = cube()
-        b.add_spring((0.0, 0.05, 0.05), body.at(CENTRE), stiffness=1.0, name="s")
-        b.set_initial(body, velocity=(0.1, 1.0, 0.2))
-        return b.finalize(device="cpu", dtype=dtype, worlds=worlds)
-
-    many = model(3)
-    for name, of_world in values.items():
-        many.set_parameter(f"s.{name}", of_world)
-    sim = wf.Simulation(many, dt=2e-3)
-    sim.step(20)
-    for world in range(3):
-        own = model(1)
-        for name, of_world in values.items():
-            own.set_parameter(f"s.{name}", of_world[world])
-        one = wf.Simulation(own, dt=2e-3)
-        one.step(20)
-        np.testing.assert_array_equal(sim.state.displacement.numpy()[world], one.state.displacement.numpy()[0])
-    with pytest.raises(wf.ModelError, match="0 or more"):
-        many.set_parameter("s.stiffness", -1.0)
-
-
-def test_a_changed_parameter_does_work():
-    """Stiffness doubled on the way: the energy that it adds is work of fields, none of the integrator's."""
-    b, body = cube()
-    b.add_spring((0.0, 0.05, 0.05), body.at(CENTRE), stiffness=100.0, rest=0.03, name="s")
-    b.set_initial(body, velocity=(0.1, 1.0, 0.2))
-    model = b.finalize(device="cpu", worlds=2)
-    sim = wf.Simulation(model, dt=2e-3, integrator="energy_momentum", solver=EXACT)
-    sim.step(20)
-    before = sim.energies()
-    model.set_parameter("s.stiffness", 200.0, mask=[True, False])
-    sim.step(20)
-    e = sim.energies()
-    assert np.abs(e["integrator"]).max() < 1e-10
-    np.testing.assert_allclose(e["work_fields"], [before["springs"][0], 0.0], rtol=1e-9)
-    assert np.abs(e["ledger_residual"]).max() < 1e-10
-
-
-@pytest.mark.cuda
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
-@pytest.mark.parametrize("scheme", SCHEMES)
-def test_devices_agree(scheme, dtype):
-    """All kinds of springs and laws, and a point mass."""
-    found = []
-    for device in ("cpu", "cuda"):
-        model = linked(dtype=dtype, device=device)[0]
-        sim = wf.Simulation(model, dt=5e-3, integrator=scheme)
-        sim.step(20)
-        found.append(sim.state.displacement.numpy())
-    assert np.abs(found[1] - found[0]).max() < (1e-6 if dtype == "float64" else 1e-2) * np.abs(found[0]).max()
-
-
-def test_resumed_runs_go_on_bit_for_bit(tmp_path):
-    model, _ = linked()
-    whole = wf.Simulation(model, dt=5e-3)
-    v = whole.state.velocity.numpy()
-    v[0, model.slot_table.kind == 0, 1] = 0.5
-    whole.state.velocity.assign(v)
-    whole.step(6)
-    save_checkpoint(whole, tmp_path / "c.npz")
-    whole.step(6)
-    resumed = wf.Simulation(linked()[0], dt=5e-3)
-    load_checkpoint(resumed, tmp_path / "c.npz")
-    resumed.step(6)
-    for name, values in whole.state.numpy().items():
-        np.testing.assert_array_equal(resumed.state.numpy()[name], values, err_msg=name)
-    other, _ = linked(law="no foundation")
-    with pytest.raises(wf.CheckpointError, match="another model"):
-        load_checkpoint(wf.Simulation(other, dt=5e-3), tmp_path / "c.npz")
-
-
-def weighted(at, mass=3.0):
-    """A cube with a point mass."""
-    b = wf.ModelBuilder(gravity=(0, 0, -9.81))
-    mesh = wf.mesh.box((0.1, 0.1, 0.1), cells=(2, 2, 2), element="T4")
-    body = b.add_solid(mesh, material=HARD, name="cube")
-    b.add_point_mass(at(body), mass)
-    return b, body
-
-
-PLACES = {
-    "point": (lambda c: c.at((0.03, 0.08, 0.05)), (0.03, 0.08, 0.05)),
-    "face": (lambda c: c.surface("x+"), (0.1, 0.05, 0.05)),
-    "nodes": (lambda c: c.nodes(lambda X: (X[:, 0] < 1e-9) | (X[:, 0] > 0.099)), CENTRE),
-}
-
-
-@pytest.mark.parametrize("where", list(PLACES))
-def test_a_point_mass_counts_everywhere(where):
-    """Mass, weight, centre, momentum, kinetic energy, all solvers and the reaction of statics see it."""
-    b, body = weighted(PLACES[where][0])
-    b.set_initial(body, angular_velocity=(0, 0, 2.0))
-    model = b.finalize(device="cpu")
-    assert model.mass == pytest.approx(4.0, rel=1e-12)
-    centre = (CENTRE + 3.0 * np.array(PLACES[where][1])) / 4.0
-    M, is_position = model.mass_matrix()[::3, ::3], model.slot_table.is_position
-    np.testing.assert_allclose((is_position @ M @ (body.reference + body.origin)) / model.mass, centre, atol=1e-12)
-    motions = {}
-    for name, solver in SOLVERS.items():
-        sim = wf.Simulation(model, dt=1e-3, solver=solver)
-        sim.step(20)
-        v = sim.state.velocity.numpy()[0].astype(float)
-        np.testing.assert_allclose(is_position @ M @ v, [0, 0, -4.0 * 9.81 * 0.02], atol=1e-10)
-        assert sim.energies()["kinetic"][0] == pytest.approx(0.5 * np.sum(v * (M @ v)), rel=1e-12)
-        motions[name] = sim.state.displacement.numpy()
-        assert np.abs(motions[name] - motions["matrix"]).max() < 1e-8 * np.abs(motions["matrix"]).max()
-    b.clamp(body.nodes("z-"))
-    static = wf.solve_static(b.finalize(device="cpu"), load_steps=1, tol=1e-10)
-    assert static.reaction(body.nodes("z-"))[0, 2] == pytest.approx(4.0 * 9.81, rel=1e-8)
-
-
-def test_the_inertia_of_a_point():
-    """A torsion oscillator of the cube with I + J + m r^2."""
-    b, body = cube()
-    hinge = b.add_joint("revolute", parent=wf.GROUND, child=body.surface("z-"), anchor=CENTRE, axis=(0, 0, 1))
-    inertia = polar_inertia(body, CENTRE) + 2.0 * 0.04**2 + 0.01
-    b.add_point_mass(body.at((0.05, 0.09, 0.05)), 2.0, inertia=0.01)
-    assert polar_inertia(body, CENTRE) == pytest.approx(inertia, rel=1e-12)
-    b.add_torsion_spring(hinge, stiffness=100.0 * inertia)
-    b.set_initial(body, velocity=lambda X: np.cross([0, 0, 1.0], X - CENTRE))
-    sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-3, integrator="energy_momentum", solver=EXACT)
-    sim.run(0.4)
-    assert sim.joint_value(hinge)[0] == pytest.approx(np.sin(4.0) / 10.0, abs=1e-5)
-
-
-def test_rigid_parts_take_springs_and_masses():
-    """A rigid cube as a torsion oscillator of 1e-5 at h = 1e-3 s, order 2, with a point mass and its inertia."""
-    b = wf.ModelBuilder(gravity=(0, 0, 0))
-    part = b.add_rigid(wf.Box(CENTRE, (0.1, 0.1, 0.1)), density=1000.0, name="part")
-    b.add_point_mass(part.at((0.05, 0.09, 0.05)), 2.0, inertia=0.01)
-    inertia = 0.02 / 12.0 + 2.0 * 0.04**2 + 0.01
-    hinge = b.add_joint("revolute", parent=wf.GROUND, child=part.at(CENTRE), anchor=CENTRE, axis=(0, 0, 1))
-    b.add_torsion_spring(hinge, stiffness=100.0 * inertia)
-    b.set_initial(part, velocity=lambda X: np.cross([0, 0, 1.0], X - CENTRE))
-    model = b.finalize(device="cpu")
-    assert model.mass == pytest.approx(3.0, rel=1e-12)
-    errors = []
-    for h in (2e-3, 1e-3):
-        sim = wf.Simulation(model, dt=h, integrator="energy_momentum", solver=EXACT, constraint_tol=1e-12)
-        sim.run(0.4)
-        errors.append(abs(sim.joint_value(hinge)[0] - np.sin(4.0) / 10.0))
-    assert errors[1] < 1e-5, errors
-    assert errors[0] > 3.5 * errors[1], errors
-    assert abs(sim.energies()["integrator"][0]) < 1e-10 * sim.energies()["springs"][0]
 
 
 def test_bad_input_is_named():
