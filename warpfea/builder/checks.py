@@ -110,7 +110,7 @@ def warn_implausible(model: Any) -> None:
 
 def _warn_of_materials(body: Body) -> None:
     """Warn of densities in another unit, a metal with E probably in MPa, and of volumetric locking of solids."""
-    for group, material in body.materials:
+    for group, material in body.materials if body.elastic else ():  # else a stand-in, and a part may be hollow
         law = type(material).__name__ + (f" of group {group!r}" if group else "")
         lam, mu = material.lame
         E, nu = mu * (3.0 * lam + 2.0 * mu) / (lam + mu), lam / (2.0 * (lam + mu))
