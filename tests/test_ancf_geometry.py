@@ -91,7 +91,7 @@ def test_spline():
         ({"curve": lambda s: (0.0, 0.0, 0.0)}, "zero or non-finite tangent"),
         ({"corners": "round"}, "is none of 'error', 'weld'"),
         ({"elements": 0}, "positive whole number"),
-        ({"section": (0.1, 0.1)}, "must be a Rectangle"),
+        ({"section": (0.1, 0.1)}, "must be a Rectangle, Circle, Tube or Section"),
         ({"integration": "reduced"}, "integration = 'reduced' is none of 'tied', 'split', 'full', '3x2x2'"),
         (
             {"integration": "split", "material": RUBBER},

@@ -32,6 +32,7 @@ PAGES += [
     ROOT / TUTORIAL,
     ROOT / "warpfea/builder/CONTACT.md",
     ROOT / "warpfea/builder/PARTS.md",
+    ROOT / "warpfea/builder/SECTIONS.md",
     ROOT / "warpfea/builder/SPRINGS.md",
     ROOT / "warpfea/simulation/LEARNING.md",
     ROOT / "warpfea/sweeps/SWEEPS.md",

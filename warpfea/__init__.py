@@ -31,7 +31,7 @@ from .builder.builder import ModelBuilder  # noqa: E402
 from .builder.joints import GROUND  # noqa: E402
 from .builder.reference import Reference  # noqa: E402
 from .builder.scene import scene  # noqa: E402
-from .elements.sections import Rectangle  # noqa: E402
+from .elements.sections import Circle, Rectangle, Section, Tube  # noqa: E402
 from .materials import SVK, KelvinVoigt, MooneyRivlin, NeoHookean  # noqa: E402
 from .model.bodies import Body  # noqa: E402
 from .model.handles import ElementSet, MaterialPoint, NodeSet, SurfaceSet  # noqa: E402
@@ -52,13 +52,13 @@ from .solvers import Jacobi, NewtonPCG  # noqa: E402
 from .time_laws import Control, Rotation  # noqa: E402
 
 __all__ = [
-    "GROUND", "SVK", "Body", "Box", "CapacityError", "Capsule", "Checkpoint", "CheckpointError", "ConstraintError",
-    "Control", "ConvergenceError", "Cylinder", "Design", "ElementSet", "EnergyMomentum", "Error", "GIFWriter",
-    "GeneralizedAlpha", "HalfSpace", "Jacobi", "Joint", "KelvinVoigt", "MaterialPoint", "MeshError", "MeshWarning",
-    "Model", "ModelBuilder", "ModelError", "ModelWarning", "MooneyRivlin", "NeoHookean", "NewtonPCG", "NodeSet",
-    "Observations", "OutputError", "PNGWriter", "PenetrationError", "Rectangle", "Reference", "Rotation",
-    "Simulation", "Sphere", "StabilityError", "StabilityWarning", "State", "StepReport", "StudyOptions",
-    "SurfaceSet", "TriMesh", "USDWriter", "VTUWriter", "__version__", "fit", "mesh", "scene", "solve_static",
+    "GROUND", "SVK", "Body", "Box", "CapacityError", "Capsule", "Checkpoint", "CheckpointError", "Circle",
+    "ConstraintError", "Control", "ConvergenceError", "Cylinder", "Design", "ElementSet", "EnergyMomentum", "Error",
+    "GIFWriter", "GeneralizedAlpha", "HalfSpace", "Jacobi", "Joint", "KelvinVoigt", "MaterialPoint", "MeshError",
+    "MeshWarning", "Model", "ModelBuilder", "ModelError", "ModelWarning", "MooneyRivlin", "NeoHookean", "NewtonPCG",
+    "NodeSet", "Observations", "OutputError", "PNGWriter", "PenetrationError", "Rectangle", "Reference", "Rotation",
+    "Section", "Simulation", "Sphere", "StabilityError", "StabilityWarning", "State", "StepReport", "StudyOptions",
+    "SurfaceSet", "TriMesh", "Tube", "USDWriter", "VTUWriter", "__version__", "fit", "mesh", "scene", "solve_static",
     "spline", "study", "sweep",
 ]  # fmt: skip
 

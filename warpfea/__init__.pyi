@@ -23,7 +23,7 @@ from .builder.builder import ModelBuilder as ModelBuilder
 from .builder.joints import GROUND as GROUND
 from .builder.reference import Reference as Reference
 from .builder.scene import scene as scene
-from .elements.sections import Rectangle as Rectangle
+from .elements.sections import Circle as Circle, Rectangle as Rectangle, Section as Section, Tube as Tube
 from .time_laws import Control as Control
 from .time_laws import Rotation as Rotation
 from .materials import SVK as SVK, KelvinVoigt as KelvinVoigt, MooneyRivlin as MooneyRivlin, NeoHookean as NeoHookean

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..base.errors import ModelError
 from ..base.names import check_choice
-from ..elements.sections import Rectangle
+from ..elements.sections import BeamSection
 from ..mesh import Mesh
 
 __all__ = ["beam_geometry", "spline"]
@@ -74,7 +74,7 @@ class _Curve:
 
 
 def beam_geometry(
-    name: str, curve: Any, elements: int, section: Rectangle, normal: Any, corners: str
+    name: str, curve: Any, elements: int, section: BeamSection, normal: Any, corners: str
 ) -> tuple[Mesh, np.ndarray, np.ndarray]:
     """Nodes and frames of a beam.
 
@@ -87,8 +87,6 @@ def beam_geometry(
     """
     if isinstance(elements, bool) or not (isinstance(elements, (int, np.integer)) and elements >= 1):
         raise ModelError(f"body {name!r}: elements = {elements!r} must be a positive whole number")
-    if not isinstance(section, Rectangle):
-        raise ModelError(f"body {name!r}: section must be a Rectangle, got {section!r}")
     check_choice(f"body {name!r}: corners", corners, ("error", "weld"))
     axis_curve = _make_curve(name, curve, int(elements), corners)
     s = _node_parameters(name, int(elements), axis_curve.corner_parameters)
@@ -139,7 +137,7 @@ def _angles_between(lines: np.ndarray) -> np.ndarray:
     return np.degrees(np.arctan2(across, np.sum(a * b, axis=1)))
 
 
-def _section_frame(name: str, tangent: np.ndarray, s: float, section: Rectangle, normal: Any) -> np.ndarray:
+def _section_frame(name: str, tangent: np.ndarray, s: float, section: BeamSection, normal: Any) -> np.ndarray:
     """(3, 3) columns: tangent (unscaled), width and height vectors."""
     length = float(np.linalg.norm(tangent))
     if not (math.isfinite(length) and length > 0.0):
@@ -158,7 +156,11 @@ def _section_frame(name: str, tangent: np.ndarray, s: float, section: Rectangle,
             f"body {name!r}: normal {up.tolist()} lies along the beam's axis at s = {s:.4g}; give one across it"
         )
     n /= size
-    return np.stack([tangent, section.width * np.cross(n, t), section.height * n], axis=1)
+    width, height = section.sides_at(s)
+    across, up, c, d = np.cross(n, t), n, math.cos(section.angle), math.sin(section.angle)
+    if d:
+        across, up = c * across + d * up, c * up - d * across
+    return np.stack([tangent, width * across, height * up], axis=1)
 
 
 def _node_parameters(name: str, elements: int, corner_parameters: tuple[float, ...]) -> np.ndarray:

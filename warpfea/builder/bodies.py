@@ -12,11 +12,13 @@ import numpy as np
 
 from .. import elements as element_families
 from .. import mesh as meshes
+from ..base.checks import float_array
 from ..base.errors import ModelError
 from ..base.names import check_choice
 from ..elements import Family
+from ..elements.beam_sections import beam_family
 from ..elements.lagrange import T10, TET_CORNERS, TET_FACES
-from ..elements.sections import Rectangle
+from ..elements.sections import BeamSection
 from ..mesh import Mesh, linear
 from ..mesh.cells import CELL_TYPES
 from ..mesh.convert import with_face_nodes
@@ -68,11 +70,11 @@ def make_structure(
     integration: str | None,
     axes: np.ndarray,
     frames: np.ndarray,
-    section: Rectangle | None = None,
+    section: BeamSection | None = None,
 ) -> Body:
     """A beam or shell with the axes and frames of its geometry; see ModelBuilder.add_beam and add_shell."""
     materials, index = assign_materials(name, mesh, material)
-    family = element_families.get_family(element)
+    family = element_families.get_family(element) if section is None else beam_family(section)
     split = all(law.law == "svk" for _, law in materials)
     scheme = integration or ("tied" if split else "full")
     check_choice(f"body {name!r}: integration", scheme, [*family.schemes, *family.rules])
@@ -164,8 +166,9 @@ def shell_geometry(name: str, mesh: Mesh, thickness: Any, normals: Any, corners:
     label = f"body {name!r}"
     if mesh.cell_type != "quad":
         raise ModelError(f"{label}: a shell needs quad cells, {mesh.label} has {mesh.cell_type}")
-    if not (isinstance(thickness, (int, float, np.floating)) and math.isfinite(thickness) and thickness > 0.0):
-        raise ModelError(f"{label}: thickness = {thickness!r} must be a positive length (m)")
+    thick = float_array(thickness(mesh.points) if callable(thickness) else thickness)
+    if thick.shape not in ((), (len(mesh.points),)) or not np.all(np.isfinite(thick) & (thick > 0.0)):
+        raise ModelError(f"{label}: thickness = {thickness!r} must be a positive length (m), one per node, or f(X)")
     check_choice(f"{label}: corners", corners, ("error", "weld"))
     x = mesh.points[mesh.cells]
     along = np.stack([x[:, 1] - x[:, 0], x[:, 1] - x[:, 0], x[:, 2] - x[:, 3], x[:, 2] - x[:, 3]], axis=1)
@@ -186,7 +189,7 @@ def shell_geometry(name: str, mesh: Mesh, thickness: Any, normals: Any, corners:
     smooth = ~_corner_mask(mesh, sharp)
     own = np.where(smooth[:, :, None], d, normal)
     along, across = (_tangent_lines(a, own, smooth) for a in (along, across))
-    frames = np.stack([along, across, float(thickness) * own], axis=3)
+    frames = np.stack([along, across, np.broadcast_to(thick, len(mesh.points))[mesh.cells][..., None] * own], axis=3)
     axes = _node_axes(mesh, director, along)
     return axes, np.einsum("enck,encl->enkl", axes[mesh.cells], frames)
 

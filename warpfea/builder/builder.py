@@ -9,7 +9,7 @@ from typing import Any
 from ..base.console import quiet_warp
 from ..base.errors import ModelError
 from ..base.names import check_choice
-from ..elements.sections import Rectangle
+from ..elements.sections import BeamSection, section_along
 from ..materials import Material
 from ..model.bodies import Body
 from ..model.description import BodyForce, Description
@@ -92,8 +92,9 @@ class ModelBuilder(ContactMethods, SpringMethods):
         return self._add_body(make_solid(name, mesh, material, element, quadrature), initial)
 
     def add_beam(
-        self, curve: Any, *, elements: int, section: Rectangle, normal: Any, material: Material,
-        integration: str | None = None, corners: str = "error", initial: Any = None, name: str | None = None,
+        self, curve: Any, *, elements: int, section: BeamSection | tuple[BeamSection, BeamSection], normal: Any,
+        material: Material, integration: str | None = None, corners: str = "error", initial: Any = None,
+        name: str | None = None,
     ) -> Body:  # fmt: skip
         """Add a beam of ANCF 3243 elements; node sets "start" and "end", also as beam.start and beam.end.
 
@@ -101,7 +102,8 @@ class ModelBuilder(ContactMethods, SpringMethods):
             curve: points (n, 3), m, of a straight line or polyline; or a smooth function of s in [0, 1] that returns
                 (3,), such as wf.spline(points).
             elements: number of elements, of equal length in s.
-            section: Rectangle(width, height); the height lies along the normal.
+            section: Rectangle(width, height), whose height lies along the normal; Circle(r), Tube(r, thickness) or
+                Section(points, weights); or two of one shape, between which the beam tapers along s.
             normal: (3,), or a function of s; made perpendicular to the axis. A turning normal makes a twisted beam.
             material: one law.
             integration: "tied" (default with SVK; remedies against Poisson, shear and thickness locking, and the
@@ -117,11 +119,12 @@ class ModelBuilder(ContactMethods, SpringMethods):
             ModelError: a corner, a normal along the axis, an unknown integration, or an argument out of range.
         """
         name = self._body_name(name, "beam")
+        section = section_along(f"body {name!r}", section)
         mesh, axes, frames = beam_geometry(name, curve, elements, section, normal, corners)
         return self._add_body(make_structure(name, mesh, "3243", material, integration, axes, frames, section), initial)
 
     def add_shell(
-        self, mesh: MeshLike, *, thickness: float, material: Material | dict[str, Material],
+        self, mesh: MeshLike, *, thickness: Any, material: Material | dict[str, Material],
         integration: str | None = None, normals: Any = None, corners: str = "error", scale: float = 1.0,
         transform: Any = None, initial: Any = None, name: str | None = None,
     ) -> Body:  # fmt: skip
@@ -130,7 +133,7 @@ class ModelBuilder(ContactMethods, SpringMethods):
         Args:
             mesh: file, Mesh or meshio.Mesh of quads, such as wf.mesh.grid; the director of a quad is along
                 (X_1 - X_0) x (X_3 - X_0).
-            thickness: m.
+            thickness: m; also one per node, (nodes,), or a function X (n, 3) -> (n,).
             material: one law, or laws by element group of the mesh.
             integration: "tied" (default with SVK; remedies against thickness and shear locking, and the shear factor
                 5/6), or "full" (4x4x2 points of the full law, as Paper I; default with the other laws); see

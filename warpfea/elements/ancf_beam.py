@@ -40,7 +40,7 @@ from .family import AssumedStrain, EnergyPart, Family, ParentDomain, VtkSubdivis
 from .quadrature import Rule, box_rule, square_rule
 
 if TYPE_CHECKING:
-    from .sections import Rectangle
+    from .sections import BeamSection
 
 __all__ = ["BEAM", "parent_functions", "shear_law", "svk_only"]
 
@@ -126,7 +126,7 @@ def shear_law(material: Material) -> tuple[str, tuple[float, ...]]:
 
 
 def _shear_coupling(
-    at: np.ndarray, J: np.ndarray, det: np.ndarray, rule: Rule, material: Material, section: Rectangle
+    at: np.ndarray, J: np.ndarray, det: np.ndarray, rule: Rule, material: Material, section: BeamSection
 ) -> np.ndarray:
     """A (E, 24, 12) with e.A e / 2 = V/2 times the sum of k (g_0^2 + g_1^2)/2 + (c/mu) b^2, over directions and modes.
 
@@ -145,6 +145,7 @@ def _shear_coupling(
     gauss = np.array(SECTION_GAUSS_POINTS)
     modes = np.array([np.ones(4), *np.sign(gauss.T), np.sign(np.prod(gauss, axis=1))]) / 4.0
     ends, deviation = 0.5 * np.diag([1.0, 0.0, 1.0]), np.array([-0.5, 1.0, -0.5])
+    torsion = section.torsion_ratio_at(*(size[:, 12 * k : 12 * k + 12, 1 + k].mean(axis=1) for k in (0, 1)))
     out = np.empty((len(at), len(a), 12))
     for direction in (0, 1):
         rows = slice(12 * direction, 12 * direction + 12)
@@ -152,8 +153,8 @@ def _shear_coupling(
         c = 4.0 / 9.0 * (m.E / m.lame[1]) * (height / length) ** 2
         plain = np.zeros((12, 12))
         for k, mode in enumerate(modes):
-            factor = {0: section.shear, 2 - direction: section.torsion_ratio}.get(k, 1.0)
-            plain += factor * np.kron(np.outer(mode, mode), ends)
+            factor = {0: section.shear, 2 - direction: torsion}.get(k, 1.0)
+            plain = plain + np.multiply.outer(factor, np.kron(np.outer(mode, mode), ends))
         bent = np.kron(np.eye(4) / 4.0, np.outer(deviation, deviation))
         block = plain + c[:, None, None] * bent
         out[:, rows] = volume[:, None, None] * scale[:, rows, None] * scale[:, None, rows] * block
@@ -191,6 +192,7 @@ BEAM = register(
         vertices=np.array([(0.0, -0.5, -0.5), (0.0, 0.5, 0.5), (1.0, -0.5, 0.5), (1.0, 0.5, -0.5)]),
         parent=ParentDomain(LOW, HIGH),
         faces=box_faces(LOW, HIGH),
+        face_names=("start", "end", "side-", "side+", "normal-", "normal+"),
         face_rule=square_rule(5),
         face_divisions=((2, 2), (2, 2), (6, 2), (6, 2), (6, 2), (6, 2)),
         node_samples=np.array([[(x, y, z) for y, z in SECTION_CORNERS] for x in (0.0, 1.0)]),

@@ -109,6 +109,10 @@ class Family:
         parent: the parent domain.
         faces: parent corners of each face, (3, 3) triangles or (4, 3) quadrilaterals, outward; mesh cells of solids
             count their faces in the same order.
+        bulges: deviations of the sides a = 0 and a = 1 of quadrilateral faces from straight ones, (2, 2, 3): control
+            points of cubics in b, off the thirds of the chords.
+        face_names: of each face of a beam, in the order of its surface.
+        face_shares: depth of the element behind each face, over its volume by the area of the face; () for 1.
         face_rule: rule on the unit triangle or square, exact for a pressure on a flat face.
         face_divisions: numbers (a, b) of parts of each face along its two sides for drawing; triangles take the first.
         node_samples: (n, k, 3) parent points at each element node where fields are evaluated for drawing.
@@ -134,6 +138,9 @@ class Family:
     affine: bool = False
     parent: ParentDomain = ParentDomain()
     faces: tuple[np.ndarray, ...]
+    bulges: dict[int, np.ndarray] = field(default_factory=dict)
+    face_names: tuple[str, ...] = ()
+    face_shares: tuple[float, ...] = ()
     face_rule: Rule
     face_divisions: tuple[tuple[int, int], ...]
     node_samples: np.ndarray
@@ -193,7 +200,15 @@ class Family:
         N = np.stack([(1 - a) * (1 - b), a * (1 - b), a * b, (1 - a) * b], axis=1)
         da = np.stack([b - 1, 1 - b, b, -b], axis=1)
         db = np.stack([a - 1, -a, a, 1 - a], axis=1)
-        return N @ c, np.stack([da @ c, db @ c], axis=2)
+        xi, along, across = N @ c, da @ c, db @ c
+        if face in self.bulges:
+            d, sides = self.bulges[face], np.stack([1 - a, a], axis=1)
+            f = 3 * b * (1 - b) * np.stack([1 - b, b])
+            df = np.stack([3 * (1 - b) * (1 - 3 * b), 3 * b * (2 - 3 * b)])
+            xi = xi + np.einsum("qi,jq,ijk->qk", sides, f, d)
+            along = along + np.einsum("jq,jk->qk", f, d[1] - d[0])
+            across = across + np.einsum("qi,jq,ijk->qk", sides, df, d)
+        return xi, np.stack([along, across], axis=2)
 
     @property
     def node_points(self) -> np.ndarray:
@@ -204,7 +219,11 @@ class Family:
         """(Q, n k) weights of the nodes' samples for fields at xi (Q, 3): linear between corners, exact at a sample."""
         samples = self.node_samples.reshape(-1, 3)
         out = np.zeros((len(xi), len(samples)))
-        if self.parent.low is None:
+        if self.face_shares:  # of a beam with any section: linear in the section
+            fit = np.linalg.pinv(np.insert(self.node_samples[0, :, 1:], 0, 1.0, axis=1))
+            own, x = np.insert(xi[:, 1:], 0, 1.0, axis=1) @ fit, xi[:, :1]
+            out = np.hstack([(1.0 - x) * own, x * own])
+        elif self.parent.low is None:
             out[:, :4] = np.column_stack([1.0 - xi.sum(axis=1), xi])
         else:
             low, high = np.array(self.parent.low), np.array(self.parent.high)
@@ -241,7 +260,12 @@ def register(family: Family) -> Family:
 
 def families() -> Sequence[str]:
     """Names of the registered families of flexible bodies."""
-    return tuple(name for name, family in _families.items() if not family.rigid)
+    return tuple(name for name, family in _families.items() if not family.rigid and not family.face_shares)
+
+
+def known_family(name: str) -> Family | None:
+    """The family `name`, if it is registered."""
+    return _families.get(name)
 
 
 def get_family(name: str) -> Family:

@@ -189,7 +189,8 @@ def element_edge_and_depth(surface: SurfaceSet) -> tuple[np.ndarray, np.ndarray]
     if body.rigid_depth is not None:  # cones of any volume
         return np.sqrt(2.0 * area), np.full(len(area), body.rigid_depth)
     volume = assembly.element_volumes(body)[faces[:, 0]]
-    return np.sqrt(np.where(triangle, 2.0, 1.0) * area), np.where(triangle, 3.0, 1.0) * volume / area
+    share = np.where(triangle, 3.0, np.array(body.family.face_shares or [1.0] * len(body.family.faces))[faces[:, 1]])
+    return np.sqrt(np.where(triangle, 2.0, 1.0) * area), share * volume / area
 
 
 def effective_modulus(

@@ -212,10 +212,9 @@ class Discretisation:
         every = np.arange(len(mesh.cells))
         if mesh.cell_type == "line":
             uses = np.bincount(mesh.cells.ravel(), minlength=len(mesh.points))
-            tips = [every[uses[mesh.cells[:, k]] == 1] for k in (0, 1)]
-            ends = [np.column_stack([e, np.full(len(e), k)]) for k, e in enumerate(tips)]
-            long = [np.column_stack([every, np.full(len(every), k)]) for k in (2, 3, 4, 5)]
-            return np.concatenate(ends + long)
+            tips = {name: every[uses[mesh.cells[:, k]] == 1] for k, name in enumerate(("start", "end"))}
+            own = [(tips.get(name, every), k) for k, name in enumerate(self.family.face_names)]
+            return np.concatenate([np.column_stack([e, np.full(len(e), k)]) for e, k in own])
         wide = [np.column_stack([every, np.full(len(every), k)]) for k in (0, 1)]
         return np.concatenate([*wide, mesh.boundary() + np.array([0, 2])])
 

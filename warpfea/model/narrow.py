@@ -47,8 +47,7 @@ def facet_size(surface: SurfaceSet) -> tuple[float, float]:
 def body_widths(body: Discretisation) -> tuple[float, float]:
     """Least and second extent of a body in the reference, m; of a beam the sides of its section."""
     if body.section is not None:
-        width, height = sorted((body.section.width, body.section.height))
-        return width, height
+        return body.section.extents  # type: ignore[no-any-return]
     X = body.mesh.points[np.unique(body.mesh.cells)]
     axes = np.linalg.svd(X - X.mean(axis=0), full_matrices=False)[2]
     extents = np.sort(np.ptp(X @ axes.T, axis=0))

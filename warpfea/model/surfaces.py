@@ -57,13 +57,14 @@ class Drawing:
 
 
 def named_faces(body: Discretisation) -> dict[str, np.ndarray]:
-    """Named faces of beams ("start", "end", "side-", "side+", "normal-", "normal+") and shells ("top", "bottom", and
+    """Named faces of beams ("start", "end", "side-", "side+", "normal-", "normal+"; "side" and "bore" of
+    sections that are no rectangles) and shells ("top", "bottom", and
     the strip over each named edge)."""
     mesh = body.mesh
     faces = body.boundary
     if mesh.cell_type == "line":
-        names = ("start", "end", "side-", "side+", "normal-", "normal+")
-        return {name: faces[faces[:, 1] == k] for k, name in enumerate(names)}
+        names = np.array(body.family.face_names)
+        return {str(name): faces[names[faces[:, 1]] == name] for name in dict.fromkeys(body.family.face_names)}
     out = {"bottom": faces[faces[:, 1] == 0], "top": faces[faces[:, 1] == 1]}
     strips = faces[faces[:, 1] > 1]
     ends = np.array([(0, 1), (1, 2), (2, 3), (3, 0)])[strips[:, 1] - 2]
