@@ -34,6 +34,7 @@ PAGES += [
     ROOT / "warpfea/builder/PARTS.md",
     ROOT / "warpfea/builder/SECTIONS.md",
     ROOT / "warpfea/builder/SPRINGS.md",
+    ROOT / "warpfea/simulation/FIELDS.md",
     ROOT / "warpfea/simulation/LEARNING.md",
     ROOT / "warpfea/sweeps/SWEEPS.md",
 ]

@@ -40,11 +40,13 @@ from .model.model import Model  # noqa: E402
 from .model.shapes import Box, Capsule, Cylinder, HalfSpace, Sphere  # noqa: E402
 from .model.state import State  # noqa: E402
 from .model.triangle_mesh import TriMesh  # noqa: E402
+from .outputs import by_suffix as _by_suffix  # noqa: E402, F401
 from .outputs.render import GIFWriter, PNGWriter  # noqa: E402
 from .outputs.usd import USDWriter  # noqa: E402
 from .outputs.vtk import VTUWriter  # noqa: E402
 from .simulation.checkpoint import Checkpoint  # noqa: E402
 from .simulation.integrators import EnergyMomentum, GeneralizedAlpha  # noqa: E402
+from .simulation.modes import Buckling, Modes, buckling, modes  # noqa: E402
 from .simulation.observations import Observations  # noqa: E402
 from .simulation.simulation import Simulation, StepReport  # noqa: E402
 from .simulation.statics import solve_static  # noqa: E402
@@ -52,14 +54,15 @@ from .solvers import Jacobi, NewtonPCG  # noqa: E402
 from .time_laws import Control, Rotation  # noqa: E402
 
 __all__ = [
-    "GROUND", "SVK", "Body", "Box", "CapacityError", "Capsule", "Checkpoint", "CheckpointError", "Circle",
-    "ConstraintError", "Control", "ConvergenceError", "Cylinder", "Design", "ElementSet", "EnergyMomentum", "Error",
-    "GIFWriter", "GeneralizedAlpha", "HalfSpace", "Jacobi", "Joint", "KelvinVoigt", "MaterialPoint", "MeshError",
-    "MeshWarning", "Model", "ModelBuilder", "ModelError", "ModelWarning", "MooneyRivlin", "NeoHookean", "NewtonPCG",
-    "NodeSet", "Observations", "OutputError", "PNGWriter", "PenetrationError", "Rectangle", "Reference", "Rotation",
-    "Section", "Simulation", "Sphere", "StabilityError", "StabilityWarning", "State", "StepReport", "StudyOptions",
-    "SurfaceSet", "TriMesh", "Tube", "USDWriter", "VTUWriter", "__version__", "fit", "mesh", "scene", "solve_static",
-    "spline", "study", "sweep",
+    "GROUND", "SVK", "Body", "Box", "Buckling", "CapacityError", "Capsule", "Checkpoint", "CheckpointError",
+    "Circle", "ConstraintError", "Control", "ConvergenceError", "Cylinder", "Design", "ElementSet",
+    "EnergyMomentum", "Error", "GIFWriter", "GeneralizedAlpha", "HalfSpace", "Jacobi", "Joint", "KelvinVoigt",
+    "MaterialPoint", "MeshError", "MeshWarning", "Model", "ModelBuilder", "ModelError", "ModelWarning", "Modes",
+    "MooneyRivlin", "NeoHookean", "NewtonPCG", "NodeSet", "Observations", "OutputError", "PNGWriter",
+    "PenetrationError", "Rectangle", "Reference", "Rotation", "Section", "Simulation", "Sphere", "StabilityError",
+    "StabilityWarning", "State", "StepReport", "StudyOptions", "SurfaceSet", "TriMesh", "Tube", "USDWriter",
+    "VTUWriter", "__version__", "buckling", "fit", "mesh", "modes", "scene", "solve_static", "spline", "study",
+    "sweep",
 ]  # fmt: skip
 
 

@@ -44,6 +44,7 @@ from .outputs.usd import USDWriter as USDWriter
 from .outputs.vtk import VTUWriter as VTUWriter
 from .simulation.checkpoint import Checkpoint as Checkpoint
 from .simulation.integrators import EnergyMomentum as EnergyMomentum, GeneralizedAlpha as GeneralizedAlpha
+from .simulation.modes import Buckling as Buckling, Modes as Modes, buckling as buckling, modes as modes
 from .simulation.observations import Observations as Observations
 from .simulation.simulation import Simulation as Simulation, StepReport as StepReport
 from .simulation.statics import solve_static as solve_static

@@ -3,7 +3,9 @@
 import importlib
 from typing import Any
 
-__all__ = ["LazyPackage", "meshio", "pillow", "pxr"]
+from .errors import OutputError
+
+__all__ = ["LazyPackage", "meshio", "pillow", "pxr", "require_matplotlib"]
 
 
 class LazyPackage:
@@ -20,3 +22,12 @@ class LazyPackage:
 
 
 meshio, pillow, pxr = LazyPackage("meshio"), LazyPackage("PIL"), LazyPackage("pxr")
+
+
+def require_matplotlib() -> Any:
+    """matplotlib's Figure class. OutputError where it is not installed."""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise OutputError(f"the plot needs matplotlib: pip install 'warpfea[plots]' ({error})") from error
+    return Figure

@@ -9,7 +9,10 @@ from typing import Any
 from .errors import OutputError
 from .renamed import check_members
 
-__all__ = ["Output", "check_folder", "check_target", "make_folder", "temporary_path", "write_atomically"]
+__all__ = [
+    "Output", "check_folder", "check_target", "make_folder", "register_writer", "temporary_path", "write_atomically",
+    "writer_for",
+]  # fmt: skip
 
 
 class Output:
@@ -20,10 +23,11 @@ class Output:
     older target file. A writer may be reopened after either.
 
     Adaptive steps end where a frame is due: `rate` is frames per simulated second, None without a rate; `output_times`
-    are single times, s. By default `open`, `close` and `abort` do nothing.
+    are single times, s. `animates`: its file has more than one frame. By default `open`, `close`, `abort` do nothing.
     """
 
     rate: float | None = None
+    animates: bool = True
     output_times: Sequence[float] = ()
 
     def __init_subclass__(cls, **options: Any) -> None:
@@ -43,6 +47,23 @@ class Output:
 
     def abort(self) -> None:
         """Remove temporary files; no effect if not open."""
+
+
+WRITERS: dict[str, Callable[..., Any]] = {}
+"""Functions (path, fields, **options) that make the writer of one file, by suffix."""
+
+
+def register_writer(make: Callable[..., Any], *suffixes: str) -> None:
+    """Let `writer_for` make writers of files with these suffixes."""
+    WRITERS.update(dict.fromkeys(suffixes, make))
+
+
+def writer_for(path: str | os.PathLike[str], fields: Sequence[str], **options: Any) -> Any:
+    """The writer of a file by its suffix; the first of the fields is shown. OutputError for another suffix."""
+    suffix = pathlib.Path(path).suffix.lower()
+    if suffix not in WRITERS:
+        raise OutputError(f"{path}: the file name must end in one of {', '.join(sorted(WRITERS))}")
+    return WRITERS[suffix](path, fields, **options)
 
 
 _counter = itertools.count()

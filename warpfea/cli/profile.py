@@ -32,7 +32,7 @@ def profile(options: argparse.Namespace) -> int:
     """Run `warpfea profile SCENE`."""
     check_targets(options)
     if options.png:  # before any work
-        from ..studies.files import require_matplotlib
+        from ..base.lazy import require_matplotlib
 
         require_matplotlib()
     source = resolve(options)

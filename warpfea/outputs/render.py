@@ -101,6 +101,7 @@ class PNGWriter(_PictureWriter):
 
     time: float | None = None
     suffix = ".png"
+    animates = False
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -1,4 +1,4 @@
-"""The CSV of a study, what pictures need, and the reference data and meshes of a checkout."""
+"""The CSV of a study, and the reference data and meshes of a checkout."""
 
 import csv
 import json
@@ -6,10 +6,10 @@ import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ..base.errors import OutputError, UsageError
+from ..base.errors import UsageError
 from ..base.writer import write_atomically
 
-__all__ = ["DATA_FOLDER", "data_file", "reference_data", "require_matplotlib", "write_csv"]
+__all__ = ["DATA_FOLDER", "data_file", "reference_data", "write_csv"]
 
 DATA_FOLDER = pathlib.Path(__file__).resolve().parents[2] / "tests" / "data"
 """Files of a checkout, absent in the installed package."""
@@ -27,15 +27,6 @@ def write_csv(path: pathlib.Path, columns: Sequence[str], rows: Sequence[Mapping
             writer.writerows([columns, *([text(row.get(name)) for name in columns] for row in rows)])
 
     write_atomically(path, write)
-
-
-def require_matplotlib() -> Any:
-    """matplotlib's Figure class. OutputError where it is not installed."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise OutputError(f"the plot needs matplotlib: pip install 'warpfea[plots]' ({error})") from error
-    return Figure
 
 
 def data_file(name: str) -> pathlib.Path:

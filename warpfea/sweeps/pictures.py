@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from ..base.errors import ModelError, OutputError
-from ..base.lazy import pillow
+from ..base.errors import ModelError
+from ..base.lazy import pillow, require_matplotlib
 from ..base.writer import write_atomically
 from ..outputs.render import PNGWriter
 from .worker import Group, find_scene
 
-__all__ = ["SHEET_SUFFIXES", "TABLE_SUFFIXES", "check_designs", "draw_sheet", "plot_table", "require_matplotlib"]
+__all__ = ["SHEET_SUFFIXES", "TABLE_SUFFIXES", "check_designs", "draw_sheet", "plot_table"]
 
 TABLE_SUFFIXES = (".png", ".svg", ".pdf")
 SHEET_SUFFIXES = (".png",)
@@ -29,15 +29,6 @@ def check_designs(what: str, designs: Any, count: int) -> None:
     """ModelError unless these are numbers of some of so many designs."""
     if not designs or not all(isinstance(k, int) and 0 <= k < count for k in designs):
         raise ModelError(f"{what} = {designs!r} must be numbers from 0 to {count - 1}")
-
-
-def require_matplotlib() -> Any:
-    """Its class of figures. OutputError where it is not installed."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise OutputError(f"the picture needs matplotlib: pip install 'warpfea[plots]' ({error})") from error
-    return Figure
 
 
 def plot_table(result: Any, target: pathlib.Path, pareto: Sequence[str]) -> None:

@@ -8,12 +8,13 @@ from collections.abc import Mapping
 from typing import Any
 
 from ..base.errors import Error, ModelError
+from ..base.lazy import require_matplotlib
 from ..base.names import check_choice
 from ..base.writer import make_folder
 from ..builder.scene import locate, split_name
 from .design import AXIS_KEYS, Design, check_keys
 from .engines import make_engine
-from .pictures import SHEET_SUFFIXES, TABLE_SUFFIXES, check_designs, require_matplotlib
+from .pictures import SHEET_SUFFIXES, TABLE_SUFFIXES, check_designs
 from .result import SweepResult
 from .sweep import RUN_OPTIONS, sweep
 

@@ -21,6 +21,7 @@ from ..kernels.solvers.newton_control import TERM_ROWS
 from ..kernels.solvers.reuse import reuse_kernels
 from ..kernels.terms.constraint_blocks import constraint_block_kernels
 from ..kernels.terms.constraints import JOINT_COLUMNS, constraint_kernels, multiplier_struct
+from ..model import assembly
 from .constraint_tables import ConstraintTables
 from .protocols import CachedInputs, Constrained, Preconditioned, Tied, Updated
 from .term import NUMERICAL, WORK, Column, StepContext, part
@@ -321,8 +322,11 @@ class Constraints(Constrained, Updated, Tied, Preconditioned):
 
     def curvature(self, state: State, multipliers: np.ndarray, direction: np.ndarray) -> np.ndarray:
         """sum_i multipliers_i d2c_i/dq2 direction, [world, slot, 3]; multipliers (rows,), direction (slots, 3)."""
+        return self._curvature(self.evaluate(state, multipliers), direction)
+
+    def _curvature(self, mul: Any, direction: np.ndarray) -> np.ndarray:
+        """`curvature` of rows that are evaluated."""
         m, con = self.model, self.tables
-        mul = self.evaluate(state, multipliers)
         host = np.tile(direction, (m.worlds, 1, 1))
         p: Any = wp.array(host.astype(np.dtype(m.dtype)), dtype=m.types.vec3, device=m.device)
         one = wp.ones(m.worlds, dtype=wp.float64, device=m.device)
@@ -333,3 +337,24 @@ class Constraints(Constrained, Updated, Tied, Preconditioned):
         for world in range(m.worlds):
             np.add.at(out[world], con.slot_host, con.weight_host[:, None] * terms[world, con.term_host])
         return out
+
+    def matrices(self, state: State, world: int) -> tuple[sp.csr_matrix | None, sp.csr_matrix | None]:
+        """Geometric stiffness of the joint forces of a state, by one product per colour of slots and axis."""
+        if "constraint_force" not in state.names or not state.constraint_force.numpy()[world].any():
+            return None, None
+        m = self.model
+        mul = self.evaluate(state, state.constraint_force.numpy()[world])
+        rows, slots, count = self.incidence()
+        touched = sp.csr_matrix((np.ones(len(rows)), (rows, slots)), shape=(count, m.slots))
+        graph = (touched.T @ touched).tocoo()
+        colour = assembly.greedy_colouring(graph.tocsr())
+        entries = []
+        for c in range(int(colour[slots].max()) + 1):
+            row, column = (index[colour[graph.col] == c] for index in (graph.row, graph.col))
+            for axis in range(3):
+                direction = np.zeros((m.slots, 3))
+                direction[np.unique(column), axis] = 1.0
+                values = self._curvature(mul, direction)[world]
+                entries += [(values[row, k], 3 * row + k, 3 * column + axis) for k in range(3)]
+        value, row, column = (np.concatenate(part) for part in zip(*entries))
+        return sp.csr_matrix((value, (row, column)), shape=(3 * m.slots,) * 2), None

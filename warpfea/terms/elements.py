@@ -12,6 +12,7 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy.sparse as sp
 import warp as wp
 
 from ..kernels.step.gather import gather_kernels
@@ -123,6 +124,10 @@ class Elements(Term):
             args = [w.data_of(block), w.u_stage, w.step.dq_dv, active, w.block_contribution]
             ctx.launch(kernels.diagonal_blocks, (m.worlds, block.count), args)
 
+    def matrices(self, state: State, world: int) -> tuple[sp.csr_matrix, None]:
+        """The tangent; viscous forces of motions: Evaluation.viscous_force."""
+        return self.model.evaluation.tangent_matrix(state, world), None
+
     def samples(self, field: str, body: Any, state: State) -> np.ndarray:
         if field == "displacement":
             return state.displacement.numpy()[:, body.slots].astype(float)
@@ -203,3 +208,6 @@ class Damping(Term):
             self.kernels.explicit_work_rows, (m.worlds, m.slots), [force, w.u, ctx.state.displacement, accepted, w.rows]
         )
         return w.rows
+
+    def matrices(self, state: State, world: int) -> tuple[None, None]:
+        return None, None

@@ -27,6 +27,7 @@ from .time_law_table import TimeLawTable, argument_precision
 if TYPE_CHECKING:
     from ..base.launch import Launcher
     from ..model.model import Model
+    from ..model.state import State
 
 __all__ = ["BodyForces", "DeadLoads", "FollowerLoads", "FollowerMatrix"]
 
@@ -138,6 +139,9 @@ class DeadLoads(Parametrised):
                 "gravity that is not zero"
             )
         self.gravity.assign(values)
+
+    def matrices(self, state: State, world: int) -> tuple[None, None]:
+        return None, None
 
     def parameter_arrays(self) -> dict[str, wp.array]:
         return {} if self.gravity_law is not None else {"gravity": self.gravity}

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterable
 from functools import partial
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
+from ..base.launch import Launcher
 from ..base.worlds import check_values_per_world, set_rows, values_per_world
 from ..kernels.common.modules import definition_name
+from ..kernels.solvers.newton_control import TERM_ROWS
 from ..kernels.terms.spring_laws import LINEAR, OWN, SAMPLED, OwnForces, spring_struct
 from ..kernels.terms.springs import ANGLE, LENGTH, VECTOR, scratch_struct, spring_kernels
 from ..model.assembly import grouped_items
@@ -157,6 +161,14 @@ class Springs(Tied, Preconditioned, Parametrised):
     def incidence(self) -> tuple[np.ndarray, np.ndarray, int]:
         return self.entry_item, self.entry_slot, self.count
 
+    def _entry_pairs(self) -> tuple[np.ndarray, np.ndarray]:
+        """All ordered pairs of entries of each item."""
+        size = np.diff(self.entry_start)
+        first = np.repeat(self.entry_start[:-1], size**2)
+        pair = np.arange(len(first)) - np.repeat(np.cumsum(size**2) - size**2, size**2)
+        width = np.repeat(size, size**2)
+        return first + pair // width, first + pair % width
+
     # simulation setup
 
     def kernels(self, ctx: StepContext) -> Any:
@@ -246,6 +258,47 @@ class Springs(Tied, Preconditioned, Parametrised):
         ctx.launch(self.kernels(ctx).energies, self.dim, args)
         return {"springs": rows.numpy()[0].sum(axis=1)}
 
+    def matrices(self, state: State, world: int) -> tuple[sp.csr_matrix | None, sp.csr_matrix | None]:
+        """Derivatives of the forces by the positions, and by the velocities: what the tangent of a step at rest with
+        dq/dv = 1 adds to that of statics."""
+        m, u = self.model, state.displacement
+        one = wp.ones(m.worlds, dtype=wp.float64, device=m.device)
+        flags = wp.ones(m.worlds, dtype=wp.int32, device=m.device)
+
+        def zeros(_: str, shape: tuple[int, ...], dtype: Any) -> wp.array:
+            return wp.zeros(shape, dtype=dtype, device=m.device)
+
+        step = SimpleNamespace(a0=one, a1=wp.zeros_like(one), dq_dv=one)
+        rows = zeros("", (TERM_ROWS, *self.dim), wp.float64)
+        work: Any = SimpleNamespace(array=zeros, rows_of=lambda term: rows, step=step, u=u, q_tilde=u)
+        launch = Launcher(m.device)
+        launch.parts |= self.parts
+        ctx = StepContext(m, work, launch, state, u_before=u, inertia=False)
+        self.allocate(work, ctx)
+        self.begin(ctx, flags)
+        scratch, found = ctx.scratch[self.name][0], []
+        for in_motion in (0.0, 1.0):
+            ctx.launch(self.kernels(ctx).evaluate, self.dim, [self.data, u, u, in_motion, one, flags, scratch])
+            found.append(scratch.hessian.numpy()[world].copy())
+        return self._matrix(found[0]), self._matrix(found[1] - found[0])
+
+    def _matrix(self, blocks: np.ndarray) -> sp.csr_matrix:
+        """(3 slots, 3 slots) from the blocks (blocks, 3, 3) between the vectors of the items."""
+        row, column = self._entry_pairs()
+        sides = np.where(self.kind == ANGLE, 3, 1)
+        first = np.cumsum(sides**2) - sides**2
+        item = self.entry_item[row]
+        A = np.zeros((len(row), 3, 3))
+        for s, t in itertools.product(range(3), repeat=2):
+            own = np.flatnonzero(max(s, t) < sides[item])
+            of = item[own]
+            weight = self.entry_weight[row[own], s] * self.entry_weight[column[own], t]
+            A[own] += weight[:, None, None] * blocks[first[of] + sides[of] * s + t]
+        i, j = np.indices((3, 3))
+        index = (3 * self.entry_slot[row][:, None, None] + i, 3 * self.entry_slot[column][:, None, None] + j)
+        n = 3 * self.model.slots
+        return sp.csr_matrix((A.ravel(), (index[0].ravel(), index[1].ravel())), shape=(n, n))
+
     # in a linear solve
 
     def cached_inputs(self, ctx: StepContext) -> list[tuple[str, wp.array]]:
@@ -254,11 +307,7 @@ class Springs(Tied, Preconditioned, Parametrised):
     def allocate_blocks(self, ctx: StepContext, matrix: Any, *, projected: bool) -> None:
         if "springs" in self.model.cache:
             return
-        size = np.diff(self.entry_start)
-        first = np.repeat(self.entry_start[:-1], size**2)
-        pair = np.arange(len(first)) - np.repeat(np.cumsum(size**2) - size**2, size**2)
-        width = np.repeat(size, size**2)
-        row, column = first + pair // width, first + pair % width
+        row, column = self._entry_pairs()
         kept = self.entry_slot[row] <= self.entry_slot[column]
         row, column = row[kept], column[kept]
         found = matrix.pattern.find_upper(self.entry_slot[row], self.entry_slot[column])

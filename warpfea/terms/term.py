@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
+import scipy.sparse as sp
 import warp as wp
 
 from ..base.launch import part
@@ -245,6 +246,11 @@ class Term:
     def stored_energy(self, ctx: StepContext) -> dict[str, np.ndarray]:
         """STORED columns at the state, (worlds,), J, from which the ledger restarts."""
         return {}
+
+    def matrices(self, state: State, world: int) -> tuple[sp.csr_matrix | None, sp.csr_matrix | None]:
+        """Stiffness and damping of one world at a state at rest, (3 slots, 3 slots), N/m and N s/m, of motions small
+        about it; None: none. Terms that do not override it have no modes."""
+        raise NotImplementedError
 
     def samples(self, field: str, body: Any, state: State) -> np.ndarray:
         """Values (worlds, nodes x samples of a node) of one of `fields`, on sections and faces; of one without

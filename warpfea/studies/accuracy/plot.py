@@ -6,7 +6,7 @@ import textwrap
 from typing import Any
 
 from ...base.console import format_number
-from ..files import require_matplotlib
+from ...base.lazy import require_matplotlib
 from .measure import DONE, REFUSED
 from .motion import RESOLVED_RATIO
 

@@ -12,10 +12,11 @@ import numpy as np
 
 from ...base.console import format_bytes, format_number, format_table, to_json, write_json
 from ...base.errors import OutputError
+from ...base.lazy import require_matplotlib
 from ...base.provenance import machine, provenance_of, versions
 from ...base.short_repr import use_short_repr
 from ...base.writer import make_folder, write_atomically
-from ..files import require_matplotlib, write_csv
+from ..files import write_csv
 from .measure import DONE
 from .motion import RESOLVED_RATIO
 from .settings import Setting, SweepAxes, cli_text

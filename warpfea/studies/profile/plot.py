@@ -2,7 +2,7 @@
 
 import pathlib
 
-from ..files import require_matplotlib
+from ...base.lazy import require_matplotlib
 from .profiling import Profile
 
 __all__ = ["BETWEEN_KERNELS", "draw"]
