@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 import warpfea as wf
+from warpfea.model.surfaces import reference_points
+from warpfea.simulation.results import Results
 from warpfea.terms.evaluation import field_at_nodes, field_at_points
 
 STRETCH = np.array([(0.1, 0.05, 0.0), (0.02, -0.04, 0.03), (0.0, 0.01, 0.06)])
@@ -73,3 +75,29 @@ def test_titles_and_units_come_from_the_registry():
     assert list(touching.fields) == [*free.fields, "contact_pressure", "gap"]
     assert all(spec.title for spec in touching.fields.values())
     assert touching.fields["contact_pressure"].units == "Pa"
+
+
+@pytest.mark.parametrize("limit", [0, 20000], ids=["along a curve", "in the mesh's order"])
+def test_results_do_not_depend_on_the_order_of_the_slots(limit, monkeypatch):
+    """Slots of large bodies are numbered along a space-filling curve."""
+    monkeypatch.setattr("warpfea.model.discretisation.ORDERED_NODES", limit)
+    b = wf.ModelBuilder()
+    bodies = [
+        b.add_solid(wf.mesh.box((1, 0.4, 0.3), cells=(2, 2, 1), element="T10"), material=LAW, name="T10"),
+        b.add_solid(wf.mesh.box((1, 0.4, 0.3), cells=(2, 2, 1), element="T4"), material=LAW, element="ENMC"),
+    ]
+    for body in bodies:
+        b.set_initial(body, displacement=lambda X: X @ STRETCH.T, velocity=lambda X: X @ STRETCH)
+    model = b.finalize(device="cpu")
+    results = Results(model, model.state())
+    for body in bodies:
+        ordered = np.array_equal(body.node_slot, np.sort(body.node_slot))
+        assert ordered == (limit > 0)
+        X, skin = body.mesh.points, reference_points(body, body.skin.slot_weights)
+        assert results.displacements(body)[0] == pytest.approx(X @ STRETCH.T, abs=1e-15)
+        assert results.velocities(body)[0] == pytest.approx(X @ STRETCH, abs=1e-15)
+        assert results.skin_points(body)[0] == pytest.approx(skin + skin @ STRETCH.T, abs=1e-14)
+        moved = np.linalg.norm(X @ STRETCH.T, axis=1)
+        assert results.field("displacement", body)[0] == pytest.approx(moved, abs=1e-15)
+    gradients = results.node_gradients(bodies[1])[0]
+    assert np.nanmax(np.abs(gradients - np.eye(3) - STRETCH)) < 1e-12

@@ -94,7 +94,7 @@ def warn_implausible(model: Any) -> None:
         size = float(np.max(high - low))
         mass = None
         if all(material.density is not None for _, material in body.materials):
-            mass = float(model.masses.lumped[0][body.slots][body.slot_kind == 0].sum())
+            mass = float(model.masses.lumped[0][body.slot_range][body.slot_kind == 0].sum())
         large = size > SIZE_RANGE[1] or (mass is not None and mass > MASS_RANGE[1])
         small = size < SIZE_RANGE[0] or (mass is not None and mass < MASS_RANGE[0])
         if not (large or small):

@@ -396,18 +396,18 @@ def refuse_deep_overlaps(
         least = MIN_DEEP_OVERLAP_RATIO * float(limit.min())
         beyond = (0.0 if body.family.solid else float(limit.max())) - least  # margin of the nodal bounding box
         nodes = body.slot_kind == 0
-        spans = body.reference[nodes] + body.origin + u[:, body.slots[nodes]]
+        spans = body.reference[nodes] + body.origin + u[:, body.slot_range][:, nodes]
         low, high = (end(axis=1)[:, None] for end in (spans.min, spans.max))
         x = places[:, points]
         near = ((x > low - beyond) & (x < high + beyond)).all(axis=2) & (facets[:, points] < 0)
         near &= new[:, None] & (tables.host[k].area.ravel() > 0.0)
         seen = set()
         for world in np.flatnonzero(near.any(axis=1)):
-            key = (u[world, body.slots].tobytes(), x[world, near[world]].tobytes())
+            key = (u[world, body.slot_range].tobytes(), x[world, near[world]].tobytes())
             if key in seen:
                 continue
             seen.add(key)
-            depth = measure_to_skin(body, depth_kernel(), x[world, near[world]], u=u[world, body.slots])
+            depth = measure_to_skin(body, depth_kernel(), x[world, near[world]], u=u[world, body.slot_range])
             if depth.max() > least:
                 point = int(np.flatnonzero(near[world])[depth.argmax()])
                 raise ModelError(

@@ -149,7 +149,7 @@ def clamped_slots(model: Model) -> np.ndarray:
     """Mask (slots,) of slots clamped in all directions by supports that never move."""
     out = np.zeros(model.slots, dtype=bool)
     for body in model.bodies:
-        out[body.slots] = model.description.clamped_slots(body)
+        out[body.slot_range] = model.description.clamped_slots(body)
     return out
 
 

@@ -170,6 +170,11 @@ class Discretisation:
         within = np.arange(self.slot_count) - np.repeat(np.cumsum(counts) - counts, counts)
         return self.slot_offset + np.repeat(self.node_slot, counts) + within
 
+    @property
+    def slot_range(self) -> slice:
+        """The body's slots in the model, in the order of `connectivity`, `reference` and all weights of slots."""
+        return slice(self.slot_offset, self.slot_offset + self.slot_count)
+
     def at_nodes(self, values: np.ndarray) -> np.ndarray:
         """Values (..., nodes, 3) at mesh nodes from those of the slots (..., slots, 3); 0 at unused nodes."""
         out = np.zeros((*values.shape[:-2], len(self.mesh.points), values.shape[-1]))

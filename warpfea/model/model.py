@@ -217,7 +217,7 @@ class Model:
         u = np.zeros((self.slots, 3))
         v = np.zeros((self.slots, 3))
         for body in self.bodies:
-            rows = body.slots
+            rows = body.slot_range
             if body.initial_displacement is not None:
                 u[rows] = body.initial_displacement
             if body.velocity is not None:

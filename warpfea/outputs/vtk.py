@@ -225,7 +225,7 @@ def _frame_data(sim: Any, body: Any, fields: Sequence[str]) -> tuple[np.ndarray,
         return points, data, (mesh.cell_type, mesh.cells, _element_set_flags(mesh, np.arange(len(mesh.cells))))
     drawn = body.drawing
     points = sim.point_positions(body, drawn.slot_weights)
-    v = sim.state.velocity.numpy()[:, body.slots].astype(float)
+    v = sim.state.velocity.numpy()[:, body.slot_range].astype(float)
     data = {
         "displacement": points - reference_points(body, drawn.slot_weights),
         "velocity": np.stack([drawn.slot_weights @ row for row in v]),

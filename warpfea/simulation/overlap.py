@@ -86,7 +86,7 @@ class _Side:
 
 def _body_side(body: Body) -> _Side:
     """Skin of a body."""
-    weights, slots = body.skin.slot_weights, body.slots
+    weights, slots = body.skin.slot_weights, body.slot_range
     X = reference_points(body, weights)
 
     def points(u: np.ndarray, poses: Any) -> np.ndarray:

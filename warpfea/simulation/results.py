@@ -64,7 +64,7 @@ class Results:
 
     def at_mesh_nodes(self, body: Body, values: np.ndarray) -> np.ndarray:
         """Slot values at mesh nodes, (B, nodes, 3); 0 at nodes without an element."""
-        return body.at_nodes(values[:, body.slot_offset : body.slot_offset + body.slot_count])
+        return body.at_nodes(values[:, body.slot_range])
 
     def displacements(self, body: Body) -> np.ndarray:
         """Nodal displacements (B, nodes, 3), m, in the mesh file's node order. ModelError for a body of another
@@ -104,7 +104,7 @@ class Results:
 
     def point_positions(self, body: Body, weights: Any) -> np.ndarray:
         """Current positions (B, P, 3), m, of material points given by sparse weights (P, slots of the body)."""
-        u = self.state.displacement.numpy()[:, body.slots].astype(float)
+        u = self.state.displacement.numpy()[:, body.slot_range].astype(float)
         return reference_points(body, weights) + np.stack([weights @ row for row in u])
 
     def skin_points(self, body: Body) -> np.ndarray:
@@ -156,7 +156,7 @@ class Results:
                 "elements only)"
             )
         out = np.full((self.model.worlds, len(body.mesh.points), 3, 3), np.nan)
-        u = self.state.displacement.numpy()[:, body.slots].astype(float)
+        u = self.state.displacement.numpy()[:, body.slot_range].astype(float)
         nodes = np.flatnonzero(body.node_slot_count == 4)
         rows = body.node_slot[nodes][:, None] + np.arange(1, 4)
         out[:, nodes] = np.eye(3) + np.einsum("bnkc,nkd->bncd", u[:, rows], body.reference[rows])

@@ -337,7 +337,7 @@ def position_slots(model: Any, whole: str) -> np.ndarray:
     if name not in bodies:
         known = f"bodies are {', '.join(bodies)}{did_you_mean(name, bodies)}"
         raise ModelError(f"{whole}: expected velocity.BODY or velocity.BODY.x; {known}")
-    return np.arange(model.slots)[bodies[name].slots][bodies[name].slot_kind == 0]
+    return np.arange(model.slots)[bodies[name].slot_range][bodies[name].slot_kind == 0]
 
 
 def failed_rows(study: Study, indices: list[int], status: str, reason: str) -> Rows:

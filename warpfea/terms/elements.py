@@ -130,7 +130,7 @@ class Elements(Term):
 
     def samples(self, field: str, body: Any, state: State) -> np.ndarray:
         if field == "displacement":
-            return state.displacement.numpy()[:, body.slots].astype(float)
+            return state.displacement.numpy()[:, body.slot_range].astype(float)
         evaluation = self.model.evaluation
         if field == "von_mises":
             return evaluation.sample_stress(state, body)

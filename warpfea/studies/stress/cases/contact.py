@@ -75,7 +75,7 @@ class ContactScene:
         if self.lower is not None and not self.clamped:
             bodies.append((self.lower, -1.0))
         weights = [
-            float(sim.model.masses.lumped[0][body.slots] @ (body.slot_kind == 0)) * gravity for body, _ in bodies
+            float(sim.model.masses.lumped[0][body.slot_range] @ (body.slot_kind == 0)) * gravity for body, _ in bodies
         ]
         p = [momentum(sim, body) for body, _ in bodies]
         scale = max(float(np.linalg.norm(x)) for x in p)
@@ -144,14 +144,14 @@ def momentum(sim: wf.Simulation, body: wf.Body) -> np.ndarray:
     """Linear momentum (3,), kg m/s."""
     model = sim.model
     v = sim.state.velocity.numpy()[0].astype(float)
-    return np.asarray(model.masses.lumped[0][body.slots] @ v[body.slots])
+    return np.asarray(model.masses.lumped[0][body.slot_range] @ v[body.slot_range])
 
 
 def center_of_mass(sim: wf.Simulation, body: wf.Body) -> np.ndarray:
     """Centre of mass (3,), m."""
-    m = sim.model.masses.lumped[0][body.slots] * (body.slot_kind == 0)
+    m = sim.model.masses.lumped[0][body.slot_range] * (body.slot_kind == 0)
     x = body.reference + np.where(body.slot_kind[:, None] == 0, body.origin, 0.0)
-    return np.asarray(m @ (x + sim.state.displacement.numpy()[0, body.slots]) / m.sum())
+    return np.asarray(m @ (x + sim.state.displacement.numpy()[0, body.slot_range]) / m.sum())
 
 
 @dataclass

@@ -107,7 +107,7 @@ def first_scene(setting: Setting, row: tuple[str, str, str, float, float, str]) 
         b.set_initial(body, velocity=(float(amount), 0.0, 0.0))
     sim, stats = wf.Simulation(finalize(b, setting), dt=h, integrator=integrator), StepStats()
     depth, kinetic, start = 0.0, [], float(center_of_mass(sim, body)[2])
-    mass = float(sim.model.masses.lumped[0][body.slots] @ (body.slot_kind == 0))
+    mass = float(sim.model.masses.lumped[0][body.slot_range] @ (body.slot_kind == 0))
     steps = round(TIME / h)
     for k in range(steps):
         stats.step(sim)

@@ -47,7 +47,7 @@ def _release(setting: Setting, value: str, kind: str, damped: bool) -> Answer:
     body = _body(b, *value.split("-"))
     model = finalize(b, setting)
     state = model.state()
-    u = (_initial_values(kind, body) - body.reference) * model.free_slots[body.slots]
+    u = (_initial_values(kind, body) - body.reference) * model.free_slots[body.slot_range]
     state.displacement.assign(u[None].astype(state.displacement.numpy().dtype))
     stats = StepStats()
     bound = 1e-4 if setting.single else 1e-6
