@@ -13,12 +13,18 @@ from ..common.types import precision
 from .facet_structs import facet_field_struct, master_struct, pair_scratch_struct
 from .projection import facet_projection_functions
 
-__all__ = ["BOX_MARGIN", "broad_phase_kernels"]
+__all__ = ["BOX_MARGIN", "broad_phase_kernels", "search_module"]
 
 BOX_MARGIN = 0.25
 """Enlargement of the boxes of the tree, as a fraction of the facet's side length: they stay valid for several steps."""
 BOX_ROUNDING = 2.4e-7
 """Relative widening of a box before its conversion to float32: twice the machine epsilon, 1.2e-7."""
+
+
+def search_module(name: str) -> wp.Module:
+    """Module of the search of facets, in blocks of 128 threads: 4096 pairs of blocks take 3 % less time than with 256
+    (64: 11 % more)."""
+    return kernel_module(f"facet_search_{name}", max_unroll=SHORT_UNROLL, block_dim=128)
 
 
 @functools.cache
@@ -29,7 +35,7 @@ def broad_phase_kernels(dtype: str) -> KernelSet:
     mat43 = wp.types.matrix(shape=(4, 3), dtype=f64)
     Masters, PairScratch, FacetField = master_struct(dtype), pair_scratch_struct(dtype), facet_field_struct()
     f = facet_projection_functions(dtype)
-    module = kernel_module(f"facet_search_{dtype}", max_unroll=SHORT_UNROLL)
+    module = search_module(dtype)
 
     @wp.func
     def coefficients(mas: Masters, u: wp.array2d(dtype=Any), world: int, item: int, m: int):

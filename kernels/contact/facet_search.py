@@ -8,9 +8,9 @@ import functools
 
 import warp as wp
 
-from ..common.modules import SHORT_UNROLL, KernelSet, kernel_module, kernel_set, masked_kernel
+from ..common.modules import KernelSet, kernel_set, masked_kernel
 from ..common.types import f64, precision, vec3d
-from .broad_phase import BOX_MARGIN, broad_phase_kernels
+from .broad_phase import BOX_MARGIN, broad_phase_kernels, search_module
 from .collider_seams import SEAMS_SUFFIX
 from .facet_candidates import facet_candidate_functions
 from .facet_seams import facet_seam_functions
@@ -42,7 +42,7 @@ def facet_search_kernels(dtype: str, seams: bool = False) -> KernelSet:
     unit_normal = f.unit_normal
     FacetPoint, boxes, candidates = f.FacetPoint, broad_phase_kernels(dtype), facet_candidate_functions(dtype)
     SlavePoint, slave_point, slave_point_at = candidates.SlavePoint, candidates.slave_point, candidates.slave_point_at
-    module = kernel_module(f"facet_search_{dtype}{SEAMS_SUFFIX * seams}", max_unroll=SHORT_UNROLL)
+    module = search_module(f"{dtype}{SEAMS_SUFFIX * seams}")
     if seams:
         level_candidate = facet_seam_functions(dtype).level_candidate
 

@@ -176,14 +176,20 @@ def build_kernels(dtype: str, storage: str | None = None) -> KernelSet:
     def compute_panels(
         matrix: p.scalar_3d, pivot: wp.array4d(dtype=T), first: int, active: int_1d, left: p.scalar_3d, top: p.scalar_3d
     ):
-        """left = A_ik P with P the inverse pivot block, top = A_kj: panels of the rank update."""
-        world, m, i = wp.tid()
-        s = T(0.0)
+        """left = A_ik P with P the inverse pivot block, top = A_kj: panels of the rank update; a thread computes four
+        rows of `left`, which share their loads."""
+        world, m4, i = wp.tid()
+        m = 4 * m4
+        s = vec4()
         for n in range(TILE_UNKNOWNS):
-            # A is symmetric beside the pivot except for the sign of eliminated columns
-            s += matrix[world, i, first + n] * pivot[world, 0, n, m]
-        left[world, m, i] = s
-        top[world, m, i] = matrix[world, first + m, i]
+            x = matrix[world, first + n, i]  # A_ki, whose loads coalesce
+            for a in range(4):
+                s[a] = s[a] + x * pivot[world, 0, n, m + a]
+        # A is symmetric beside the pivot except for the sign of eliminated columns
+        sign = wp.where(i < first, T(-1.0), T(1.0))
+        for a in range(4):
+            left[world, m + a, i] = sign * s[a]
+            top[world, m + a, i] = matrix[world, first + m + a, i]
 
     @masked_kernel(module, "active")
     def eliminate_pivot_block(

@@ -64,11 +64,12 @@ class Launcher:
         self.label = "control"
         self.parts = dict(LAUNCH_PARTS)
 
-    def __call__(self, kernel: wp.Kernel, dim: int | Sequence[int], inputs: list[Any], block_dim: int = 256) -> None:
-        """Launch one thread per item of `dim`; empty launches are skipped."""
+    def __call__(self, kernel: wp.Kernel, dim: int | Sequence[int], inputs: list[Any], block_dim: int = 0) -> None:
+        """Launch one thread per item of `dim`; empty launches are skipped. 0: blocks of the module's option."""
         if min([dim] if isinstance(dim, int) else dim) == 0:
             return
-        self._launch(wp.launch, kernel, [dim] if isinstance(dim, int) else dim, inputs, block_dim)
+        size = block_dim or kernel.module.options["block_dim"]
+        self._launch(wp.launch, kernel, [dim] if isinstance(dim, int) else dim, inputs, size)
 
     def lanes(self, per_row: int) -> int:
         """Lanes that share a row of the given number of entries: a power of two; one on the CPU."""

@@ -136,7 +136,7 @@ class DenseInverse:
             launch(k.copy_pivot_block, (B, TILE_UNKNOWNS, TILE_UNKNOWNS), args)
             gauss_jordan(launch, k, 1, self, self.pivot_tile, flags, keep=keep)
             args = [self.matrix, self.pivot_tile, first, flags, self.left_panel, self.top_panel]
-            launch(k.compute_panels, (B, TILE_UNKNOWNS, N), args)
+            launch(k.compute_panels, (B, TILE_UNKNOWNS // 4, N), args)
             args = [self.pivot_tile, self.left_panel, self.top_panel, first, flags, self.matrix]
             launch(k.eliminate_pivot_block, (B, N // 4, N), args)
         if self.stored_inverse is not self.matrix:
