@@ -35,6 +35,7 @@ PAGES += [
     ROOT / "warpfea/builder/SECTIONS.md",
     ROOT / "warpfea/builder/SPRINGS.md",
     ROOT / "warpfea/simulation/FIELDS.md",
+    ROOT / "warpfea/builder/ACTUATORS.md",
     ROOT / "warpfea/simulation/LEARNING.md",
     ROOT / "warpfea/sweeps/SWEEPS.md",
 ]

@@ -26,6 +26,7 @@ from .base.errors import (  # noqa: E402
     StabilityWarning,
 )
 from .base.version import __version__  # noqa: E402
+from .builder.actuators import PD, Stop  # noqa: E402
 from .builder.beams import spline  # noqa: E402
 from .builder.builder import ModelBuilder  # noqa: E402
 from .builder.joints import GROUND  # noqa: E402
@@ -54,15 +55,14 @@ from .solvers import Jacobi, NewtonPCG  # noqa: E402
 from .time_laws import Control, Rotation  # noqa: E402
 
 __all__ = [
-    "GROUND", "SVK", "Body", "Box", "Buckling", "CapacityError", "Capsule", "Checkpoint", "CheckpointError",
-    "Circle", "ConstraintError", "Control", "ConvergenceError", "Cylinder", "Design", "ElementSet",
-    "EnergyMomentum", "Error", "GIFWriter", "GeneralizedAlpha", "HalfSpace", "Jacobi", "Joint", "KelvinVoigt",
-    "MaterialPoint", "MeshError", "MeshWarning", "Model", "ModelBuilder", "ModelError", "ModelWarning", "Modes",
-    "MooneyRivlin", "NeoHookean", "NewtonPCG", "NodeSet", "Observations", "OutputError", "PNGWriter",
-    "PenetrationError", "Rectangle", "Reference", "Rotation", "Section", "Simulation", "Sphere", "StabilityError",
-    "StabilityWarning", "State", "StepReport", "StudyOptions", "SurfaceSet", "TriMesh", "Tube", "USDWriter",
-    "VTUWriter", "__version__", "buckling", "fit", "mesh", "modes", "scene", "solve_static", "spline", "study",
-    "sweep",
+    "GROUND", "PD", "SVK", "Body", "Box", "Buckling", "CapacityError", "Capsule", "Checkpoint", "CheckpointError",
+    "Circle", "ConstraintError", "Control", "ConvergenceError", "Cylinder", "Design", "ElementSet", "EnergyMomentum",
+    "Error", "GIFWriter", "GeneralizedAlpha", "HalfSpace", "Jacobi", "Joint", "KelvinVoigt", "MaterialPoint",
+    "MeshError", "MeshWarning", "Model", "ModelBuilder", "ModelError", "ModelWarning", "Modes", "MooneyRivlin",
+    "NeoHookean", "NewtonPCG", "NodeSet", "Observations", "OutputError", "PNGWriter", "PenetrationError", "Rectangle",
+    "Reference", "Rotation", "Section", "Simulation", "Sphere", "StabilityError", "StabilityWarning", "State",
+    "StepReport", "Stop", "StudyOptions", "SurfaceSet", "TriMesh", "Tube", "USDWriter", "VTUWriter", "__version__",
+    "buckling", "fit", "mesh", "modes", "scene", "solve_static", "spline", "study", "sweep",
 ]  # fmt: skip
 
 

@@ -18,6 +18,8 @@ from .base.errors import (
     StabilityWarning as StabilityWarning,
 )
 from .base.version import __version__ as __version__
+from .builder.actuators import PD as PD
+from .builder.actuators import Stop as Stop
 from .builder.beams import spline as spline
 from .builder.builder import ModelBuilder as ModelBuilder
 from .builder.joints import GROUND as GROUND

@@ -6,7 +6,7 @@ import math
 import warp as wp
 
 from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
-from ..common.types import double_1d, double_2d, f64, int_1d, precision, vec3d, vec3d_1d
+from ..common.types import double_1d, double_2d, f64, int_1d, mat33d, precision, vec3d, vec3d_1d
 from .step_control import REPORT_COLUMNS, SAME_TIME_FRACTION, STATUS
 
 __all__ = ["JOINT_VALUE_KINDS", "MOTION_KINDS", "RUN_STATISTICS", "episode_kernels", "observation_kernels"]
@@ -17,7 +17,7 @@ FIRST_MINIMUM_COLUMN = 8
 MOTION_KINDS = {"position": 0, "displacement": 1, "velocity": 2}
 """Kinds of observed vectors."""
 FULL_TURN = 2.0 * math.pi
-JOINT_VALUE_KINDS = {"length": 0, "travel": 1, "angle": 2}
+JOINT_VALUE_KINDS = {"length": 0, "travel": 1, "angle": 2, "length_rate": 3, "travel_rate": 4, "angle_rate": 5}
 """Kinds of values of joints."""
 
 
@@ -113,36 +113,53 @@ def observation_kernels(dtype: str) -> KernelSet:
         out[world, column[k]] = wp.where(stepped[world] != 0, T(report[world, source[k]]), T(0.0))
 
     @wp.func
-    def current_joint_vector(
-        start: int_1d, slot: int_1d, weight: double_1d,
-        place: vec3d_1d, u: p.vec3_2d, world: int, k: int,
+    def joint_vector(
+        start: int_1d, slot: int_1d, weight: double_1d, place: vec3d, x: p.vec3_2d, world: int, k: int
     ) -> vec3d:  # fmt: skip
-        """Current vector of a joint: its reference value plus the sum of w_i u_i."""
-        x = place[k]
+        """Vector of a joint: its reference value, 0 of a rate, plus the sum of w_i x_i."""
+        out = place
         for i in range(start[k], start[k + 1]):
-            x += weight[i] * vec3d(u[world, slot[i]])
-        return x
+            out += weight[i] * vec3d(x[world, slot[i]])
+        return out
+
+    @wp.func
+    def joint_rate(kind: int, V: mat33d, D: mat33d) -> f64:
+        """Rate of a length, travel or angle of vectors V that change by D."""
+        if kind == wp.static(JOINT_VALUE_KINDS["travel_rate"]):
+            return wp.dot(D[0], V[1]) + wp.dot(V[0], D[1])
+        if kind == wp.static(JOINT_VALUE_KINDS["angle_rate"]):
+            c, s = wp.dot(V[2], V[0]), wp.dot(V[2], V[1])
+            dc = wp.dot(D[2], V[0]) + wp.dot(V[2], D[0])
+            ds = wp.dot(D[2], V[1]) + wp.dot(V[2], D[1])
+            return (c * ds - s * dc) / (c * c + s * s)
+        return wp.dot(V[0], D[0]) / wp.length(V[0])
 
     @wp.kernel(module=module)
     def joint_values(
-        start: int_1d, slot: int_1d, weight: double_1d,
-        place: vec3d_1d, kind: int_1d, row: int_1d,
-        column: int_1d, u: p.vec3_2d, target: double_2d,
-        out: p.scalar_2d,
+        start: int_1d, slot: int_1d, weight: double_1d, place: vec3d_1d, kind: int_1d, source: int_1d, column: int_1d,
+        u: p.vec3_2d, v: p.vec3_2d, target: double_2d, turns: double_2d, out: p.scalar_2d,
     ):  # fmt: skip
-        """Lengths, travels and angles from three vectors each; `row`: of a drive with multiple turns, or -1."""
+        """Lengths, travels and angles from three vectors each, or their rates; `source` of turns: row of a drive,
+        -2 - column of `turns`, or -1."""
         world, k = wp.tid()
-        a = current_joint_vector(start, slot, weight, place, u, world, 3 * k)
-        b = current_joint_vector(start, slot, weight, place, u, world, 3 * k + 1)
-        x = wp.length(a)
+        V, D = mat33d(), mat33d()
+        for side in range(3):
+            V[side] = joint_vector(start, slot, weight, place[3 * k + side], u, world, 3 * k + side)
+            D[side] = joint_vector(start, slot, weight, vec3d(), v, world, 3 * k + side)
+        x = wp.length(V[0])
         if kind[k] == wp.static(JOINT_VALUE_KINDS["travel"]):
-            x = wp.dot(a, b)
+            x = wp.dot(V[0], V[1])
         elif kind[k] == wp.static(JOINT_VALUE_KINDS["angle"]):
-            c = current_joint_vector(start, slot, weight, place, u, world, 3 * k + 2)
-            x = wp.atan2(wp.dot(c, b), wp.dot(c, a))
-            if row[k] >= 0 and not wp.isnan(target[world, row[k]]):
-                turn = f64(wp.static(FULL_TURN))
-                x += turn * wp.round((target[world, row[k]] - x) / turn)
+            x = wp.atan2(wp.dot(V[2], V[1]), wp.dot(V[2], V[0]))
+            near = x
+            if source[k] >= 0 and not wp.isnan(target[world, source[k]]):
+                near = target[world, source[k]]
+            elif source[k] < -1:
+                near = turns[world, -2 - source[k]]
+            turn = f64(wp.static(FULL_TURN))
+            x += turn * wp.round((near - x) / turn)
+        elif kind[k] >= wp.static(JOINT_VALUE_KINDS["length_rate"]):
+            x = joint_rate(kind[k], V, D)
         out[world, column[k]] = T(x)
 
     @wp.kernel(module=module)

@@ -50,7 +50,11 @@ def spring_struct():
         rest_coordinate: wp.array2d(
             dtype=wp.float64
         )  # [world, spring] m, rad; of an OWN law a length, where the energy is 0
-        law: wp.array(dtype=wp.int32)  # [spring] LINEAR, SAMPLED, OWN + k
+        max_force: wp.array2d(dtype=wp.float64)  # [world, spring] largest force of FEEDBACK and FRICTION, N, N m
+        lower_end: wp.array2d(dtype=wp.float64)  # [world, spring] bounds of STOP, m, rad
+        upper_end: wp.array2d(dtype=wp.float64)
+        schedule: wp.array(dtype=wp.int32)  # [spring] time law of TORQUE and FEEDBACK, -1: none
+        law: wp.array(dtype=wp.int32)  # [spring] LINEAR, SAMPLED, OWN + k, or one of bounded_laws.py, below 0
         knot_start: wp.array(dtype=wp.int32)  # [spring + 1] pieces of a sampled force; the first is linear
         knot: wp.array(dtype=wp.float64)  # y at which a piece begins, of the first: ends
         coefficients: wp.array(dtype=wp.vec4d)  # of powers of y - knot, N

@@ -1,16 +1,18 @@
-"""Springs: potentials and dampers of scalar coordinates y of vectors that are linear in the slots.
+"""Springs, actuators, stops and joint friction: forces of scalar coordinates y of vectors linear in the slots.
 
 A spring has the force F = dW/dy(y) + F_v(y, dy/dt) along y, and the vectors a, b, a2 of a row of constraints.py:
 
     LENGTH   y = |a|                                    between two points
     ANGLE    y = atan2(a2.b, a.b), turns counted        of a revolute joint
+    TRAVEL   y = a.b                                    of a translational or cylindrical joint
     VECTOR   a itself, W = k a.a / 2                    of a foundation, per area
 
 In a step dy/dt = (y - y~)/(dq/dv), with y~ the coordinate's q~: Phi contains W and the integral of F_v from y~ on, and
 the tangent is symmetric. In a mid-point scheme F is the mean of dW/dy between both ends, dy/dt the mean rate, and both
 act along a discrete gradient of y, whose product with the change of the vectors is that of y: W changes by exactly the
 work done. Those of LENGTH and ANGLE are gradients at the middle of a.a, and of |(a.b, a2.b)| sin(y - y_m), both
-quadratic, so that they have no moment. Evaluated in float64 from displacements, as constraints.py.
+quadratic, so that they have no moment; that of TRAVEL is its gradient at the middle. Evaluated in float64 from
+displacements, as constraints.py.
 """
 
 import functools
@@ -21,12 +23,13 @@ import warp as wp
 from ..common.block_entries import add_block_function
 from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.structs import pattern_struct, topology_struct
-from ..common.types import double_1d, double_2d, double_3d, f64, int_1d, mat33d, precision, vec3d
+from ..common.types import double_1d, double_2d, double_3d, f64, int_1d, mat33d, precision, vec3d, vec3d_2d
+from .bounded_laws import FRICTION, bounded_functions
 from .spring_laws import OwnForces, law_functions, spring_struct
 
-__all__ = ["ANGLE", "LENGTH", "VECTOR", "scratch_struct", "spring_kernels"]
+__all__ = ["ANGLE", "LENGTH", "TRAVEL", "VECTOR", "scratch_struct", "spring_kernels"]
 
-LENGTH, ANGLE, VECTOR = 0, 1, 2
+LENGTH, ANGLE, VECTOR, TRAVEL = 0, 1, 2, 3
 """Coordinates."""
 TINY = 1.0e-300
 """Divisor of vectors without a length."""
@@ -44,6 +47,7 @@ def scratch_struct():
     class SpringScratch:
         start: wp.array2d(dtype=wp.float64)  # [world, item] y at the start of the step
         reference: wp.array2d(dtype=wp.float64)  # [world, item] y~
+        anchor: wp.array2d(dtype=wp.float64)  # [world, item] of FRICTION at the start of the step
         force: wp.array2d(dtype=wp.mat33d)  # [world, item] derivatives of the potential by the vectors
         product: wp.array2d(dtype=wp.mat33d)  # [world, item] their change along a direction
         hessian: wp.array2d(dtype=wp.mat33d)  # [world, block] derivatives of the force
@@ -55,7 +59,7 @@ def scratch_struct():
 
 @functools.cache
 def coordinate_functions(midpoint: bool) -> KernelSet:
-    """Device functions of the coordinates LENGTH and ANGLE, and of their derivatives."""
+    """Device functions of the coordinates LENGTH, ANGLE and TRAVEL, and of their derivatives."""
 
     @wp.struct
     class Derivatives:
@@ -66,13 +70,15 @@ def coordinate_functions(midpoint: bool) -> KernelSet:
         g: wp.mat33d
         A: wp.mat33d
         B: wp.mat33d
-        unit: wp.vec3d  # of LENGTH; of ANGLE between a and b, b and a2
+        unit: wp.vec3d  # of LENGTH; of ANGLE and TRAVEL between a and b, b and a2
 
     @wp.func
     def coordinate(kind: int, v: mat33d, near: f64) -> f64:
         """y of the vectors; an angle with the number of turns that brings it closest to `near`."""
         if kind == LENGTH:
             return wp.length(v[0])
+        if kind == TRAVEL:
+            return wp.dot(v[0], v[1])
         y = wp.atan2(wp.dot(v[2], v[1]), wp.dot(v[0], v[1]))
         return y + f64(FULL_TURN) * wp.round((near - y) / f64(FULL_TURN))
 
@@ -102,6 +108,9 @@ def coordinate_functions(midpoint: bool) -> KernelSet:
             d.G[0] = v[0] / size
             d.unit = vec3d(f64(1.0) / size, f64(0.0), f64(0.0))
             d.B = -d.G / size
+        elif kind == TRAVEL:
+            d.G = wp.matrix_from_rows(v[1], v[0], vec3d())
+            d.unit = vec3d(f64(0.0), f64(1.0), f64(0.0))
         else:
             inverse = f64(1.0) / radius(v)
             d.G = inverse * transverse(v, y)
@@ -120,6 +129,10 @@ def coordinate_functions(midpoint: bool) -> KernelSet:
             d.G[0] = inverse * (v0[0] + v[0])
             d.unit = vec3d(inverse, f64(0.0), f64(0.0))
             d.B = -inverse * d.g
+            return d
+        if kind == TRAVEL:
+            d.G = wp.matrix_from_rows(f64(0.5) * (v0[1] + v[1]), f64(0.5) * (v0[0] + v[0]), vec3d())
+            d.unit = vec3d(f64(0.0), f64(0.5), f64(0.0))
             return d
         x = f64(0.5) * (y - y0)
         ratio = f64(1.0) + x * x / f64(6.0) * (f64(1.0) + f64(7.0) / f64(60.0) * x * x)  # x / sin x
@@ -152,15 +165,23 @@ def coordinate_functions(midpoint: bool) -> KernelSet:
 
 
 @functools.cache
-def spring_kernels(dtype: str, midpoint: bool, own: OwnForces = ()) -> KernelSet:
-    """Kernels of springs in one precision of the slots; `own`: forces given as functions."""
+def spring_kernels(dtype: str, midpoint: bool, own: OwnForces = (), bounded: bool = False) -> KernelSet:
+    """Kernels of springs in one precision of the slots; `own`: forces given as functions; `bounded`: some have a law of
+    bounded_laws.py."""
     p = precision(dtype)
     T, vec3, sym6, mat33 = p.T, p.vec3, p.sym, p.mat33
     Springs, Scratch, Topology, Pattern = spring_struct(), scratch_struct(), topology_struct(dtype), pattern_struct()
-    law, c = law_functions(own), coordinate_functions(midpoint)
+    law, c, more = law_functions(own), coordinate_functions(midpoint), bounded_functions(midpoint)
     add_block = add_block_function(dtype)
-    suffix = "".join(f"_{name}" for name, _ in own)
+    suffix = "_bounded" * bounded + "".join(f"_{name}" for name, _ in own)
     module = kernel_module(f"springs_{dtype}{'_midpoint' if midpoint else ''}{suffix}")
+
+    @wp.func
+    def side_count(kind: int) -> int:
+        """Number of vectors that a coordinate depends on."""
+        if kind == TRAVEL:
+            return 2
+        return wp.where(kind == ANGLE, 3, 1)
 
     @wp.func
     def vectors(spr: Springs, x: p.vec3_2d, world: int, item: int) -> mat33d:
@@ -173,7 +194,7 @@ def spring_kernels(dtype: str, midpoint: bool, own: OwnForces = ()) -> KernelSet
     @masked_kernel(module, "active")
     def begin(
         spr: Springs, u: p.vec3_2d, v: p.vec3_2d, earlier: p.vec3_2d, accelerated: int, first: double_1d,
-        second: double_1d, turned: double_2d, active: int_1d, scr: Scratch,
+        second: double_1d, turned: double_2d, anchor: double_2d, active: int_1d, scr: Scratch,
     ):  # fmt: skip
         """y at the start, and y~ = a0 y - a1 y(u_{n-1}), or with accelerations a y + b dy/dt + q_a d2y/dt2."""
         world, item = wp.tid()
@@ -186,6 +207,10 @@ def spring_kernels(dtype: str, midpoint: bool, own: OwnForces = ()) -> KernelSet
         V = spr.reference[item] + vectors(spr, u, world, item)
         y = c.coordinate(kind, V, near)
         scr.start[world, item] = y
+        if wp.static(bounded):
+            if spr.law[spr.spring[item]] == FRICTION:
+                previous = anchor[world, item]
+                scr.anchor[world, item] = wp.where(wp.isnan(previous), y, previous)
         if accelerated == 0:
             reference = first[world] * y
             if second[world] != f64(0.0):
@@ -223,10 +248,59 @@ def spring_kernels(dtype: str, midpoint: bool, own: OwnForces = ()) -> KernelSet
         for row in range(3):
             scr.rows[row, world, item] = energy
 
+    @wp.func
+    def unbounded(
+        spr: Springs, world: int, item: int, y0: f64, y: f64, inverse: f64, in_motion: f64, scr: Scratch
+    ) -> vec3d:  # fmt: skip
+        """Force, its derivative by y, and the potential of a law of spring_laws.py; its size into the rows."""
+        sp = spr.spring[item]
+        if wp.static(midpoint):
+            elastic_part = law.mean_force(spr, world, sp, y0, y)
+            viscous_part = law.viscous_force(spr, world, sp, f64(0.5) * (y0 + y), (y - y0) * inverse)
+            viscous_part[1] = f64(0.5) * viscous_part[1]
+        else:
+            elastic_part = law.elastic_force(spr, world, sp, y)
+            viscous_part = law.viscous_force(spr, world, sp, y, (y - scr.reference[world, item]) * inverse)
+        energy = law.energy(spr, world, sp, y)
+        loss = f64(0.0)
+        if in_motion > f64(0.0):
+            loss = law.viscous_potential(spr, world, sp, scr.reference[world, item], y, inverse)
+        scr.rows[2, world, item] = wp.abs(energy) + wp.abs(loss)
+        slope = elastic_part[1] + in_motion * (viscous_part[1] + viscous_part[2] * inverse)
+        return vec3d(elastic_part[0] + in_motion * viscous_part[0], slope, energy + loss)
+
+    @wp.func
+    def store_force(
+        kind: int, first: int, d: c.Derivatives, force: f64, slope: f64, world: int, item: int, scr: Scratch
+    ):  # fmt: skip
+        """Force on the vectors and its derivatives from those along y."""
+        scr.force[world, item] = force * d.G
+        sides = side_count(kind)
+        tension = f64(0.0)  # of a stretched spring: the geometric stiffness is positive
+        if kind == LENGTH:
+            tension = wp.max(force, f64(0.0)) * d.unit[0]
+        size = wp.max(wp.length_sq(d.G[0]), f64(TINY))
+        for s in range(sides):
+            for t in range(sides):
+                block = first + sides * s + t
+                along = wp.outer(d.G[s], d.G[t])
+                scr.hessian[world, block] = slope * wp.outer(d.G[s], d.g[t]) + force * c.curvature(kind, d, s, t)
+                scr.projected[world, block] = (
+                    wp.max(slope, f64(0.0)) - tension / size
+                ) * along + tension * wp.identity(n=3, dtype=f64)
+
+    @wp.func
+    def scheduled(spr: Springs, law_value: vec3d_2d, world: int, sp: int) -> f64:
+        """Value of the time law of a spring, 0 without."""
+        if spr.schedule[sp] < 0:
+            return f64(0.0)
+        return law_value[world, spr.schedule[sp]][0]
+
     @masked_kernel(module, "active")
     def evaluate(
-        spr: Springs, u: p.vec3_2d, start: p.vec3_2d, in_motion: f64, dq_dv: double_1d, active: int_1d, scr: Scratch
-    ):
+        spr: Springs, u: p.vec3_2d, start: p.vec3_2d, law_value: vec3d_2d, in_motion: f64, dq_dv: double_1d,
+        active: int_1d, scr: Scratch,
+    ):  # fmt: skip
         """Forces on the vectors, their derivatives, and rows of the potential. `in_motion`: 1, or 0 in statics."""
         world, item = wp.tid()
         kind = spr.kind[item]
@@ -242,36 +316,25 @@ def spring_kernels(dtype: str, midpoint: bool, own: OwnForces = ()) -> KernelSet
         y = c.coordinate(kind, V, y0)
         if wp.static(midpoint):
             d = c.mean_derivatives(kind, spr.reference[item] + vectors(spr, start, world, item), V, y0, y)
-            elastic_part = law.mean_force(spr, world, sp, y0, y)
-            viscous_part = law.viscous_force(spr, world, sp, f64(0.5) * (y0 + y), (y - y0) * inverse)
-            viscous_part[1] = f64(0.5) * viscous_part[1]
         else:
             d = c.derivatives(kind, V, y)
-            elastic_part = law.elastic_force(spr, world, sp, y)
-            viscous_part = law.viscous_force(spr, world, sp, y, (y - scr.reference[world, item]) * inverse)
-        force = elastic_part[0] + in_motion * viscous_part[0]
-        slope = elastic_part[1] + in_motion * (viscous_part[1] + viscous_part[2] * inverse)
-        scr.force[world, item] = force * d.G
-        sides = wp.where(kind == LENGTH, 1, 3)
-        tension = f64(0.0)  # of a stretched spring: the geometric stiffness is positive
-        if kind == LENGTH:
-            tension = wp.max(force, f64(0.0)) * d.unit[0]
-        size = wp.max(wp.length_sq(d.G[0]), f64(TINY))
-        for s in range(sides):
-            for t in range(sides):
-                block = spr.first_block[item] + sides * s + t
-                along = wp.outer(d.G[s], d.G[t])
-                scr.hessian[world, block] = slope * wp.outer(d.G[s], d.g[t]) + force * c.curvature(kind, d, s, t)
-                scr.projected[world, block] = (
-                    wp.max(slope, f64(0.0)) - tension / size
-                ) * along + tension * wp.identity(n=3, dtype=f64)
-        energy = law.energy(spr, world, sp, y)
-        loss = f64(0.0)
-        if in_motion > f64(0.0):
-            loss = law.viscous_potential(spr, world, sp, scr.reference[world, item], y, inverse)
-        scr.rows[0, world, item] = energy + loss
-        scr.rows[1, world, item] = energy + loss
-        scr.rows[2, world, item] = wp.abs(energy) + wp.abs(loss)
+        spring = vec3d()
+        if wp.static(bounded):
+            if spr.law[sp] < 0:
+                value, anchor = scheduled(spr, law_value, world, sp), scr.anchor[world, item]
+                reference = scr.reference[world, item]
+                out = more.bounded_force(spr, world, sp, y0, y, reference, inverse, anchor, value)
+                # round-off of an angle is that of 1 rad, of a travel that of its vectors
+                size = wp.where(kind == ANGLE, f64(1.0), wp.length(V[0]) * wp.length(V[1])) + wp.abs(y)
+                scr.rows[2, world, item] = wp.abs(out[2]) + wp.abs(out[0]) * size
+                spring = out
+            else:
+                spring = unbounded(spr, world, item, y0, y, inverse, in_motion, scr)
+        else:
+            spring = unbounded(spr, world, item, y0, y, inverse, in_motion, scr)
+        scr.rows[0, world, item] = spring[2]
+        scr.rows[1, world, item] = spring[2]
+        store_force(kind, spr.first_block[item], d, spring[0], spring[1], world, item, scr)
 
     @masked_kernel(module, "active")
     def change(spr: Springs, direction: p.vec3_2d, active: int_1d, scr: Scratch):
@@ -279,7 +342,7 @@ def spring_kernels(dtype: str, midpoint: bool, own: OwnForces = ()) -> KernelSet
         world, item = wp.tid()
         D = vectors(spr, direction, world, item)
         out = mat33d()
-        sides = wp.where(spr.kind[item] == ANGLE, 3, 1)
+        sides = side_count(spr.kind[item])
         for s in range(sides):
             row = vec3d()
             for t in range(sides):
@@ -297,7 +360,7 @@ def spring_kernels(dtype: str, midpoint: bool, own: OwnForces = ()) -> KernelSet
     def slot_block(spr: Springs, blocks: mat33d_2d, world: int, row: int, column: int) -> mat33d:
         """Symmetric part of the block of two entries of an item."""
         item = spr.entry_item[row]
-        sides = wp.where(spr.kind[item] == ANGLE, 3, 1)
+        sides = side_count(spr.kind[item])
         A = mat33d()
         for s in range(sides):
             for t in range(sides):
@@ -328,10 +391,10 @@ def spring_kernels(dtype: str, midpoint: bool, own: OwnForces = ()) -> KernelSet
 
     @masked_kernel(module, "active")
     def energies(
-        spr: Springs, u: p.vec3_2d, start: p.vec3_2d, u_n: p.vec3_2d, in_motion: f64, dq_dv: double_1d, active: int_1d,
-        scr: Scratch, rows: double_3d,
+        spr: Springs, u: p.vec3_2d, start: p.vec3_2d, u_n: p.vec3_2d, law_value: vec3d_2d, in_motion: f64,
+        dq_dv: double_1d, active: int_1d, scr: Scratch, rows: double_3d,
     ):  # fmt: skip
-        """Stored energy at u, and the work of the viscous force in the step from u_n, lost."""
+        """Stored energy at u, what viscous forces and friction take in the step from u_n, and the work of actuators."""
         world, item = wp.tid()
         sp = spr.spring[item]
         inverse = in_motion / dq_dv[world]
@@ -346,6 +409,16 @@ def spring_kernels(dtype: str, midpoint: bool, own: OwnForces = ()) -> KernelSet
             return
         y0 = scr.start[world, item]
         y = c.coordinate(spr.kind[item], V, y0)
+        if wp.static(bounded):
+            if spr.law[sp] < 0:
+                value, anchor = scheduled(spr, law_value, world, sp), scr.anchor[world, item]
+                reference = scr.reference[world, item]
+                force = more.bounded_force(spr, world, sp, y0, y, reference, inverse, anchor, value)[0]
+                change = more.increments(spr, world, sp, y0, y, anchor, force)
+                for row in range(3):
+                    rows[row, world, item] = change[row]
+                rows[3, world, item] = change[2]
+                return
         if wp.static(midpoint):
             viscous_part = law.viscous_force(spr, world, sp, f64(0.5) * (y0 + y), (y - y0) * inverse)
         else:
@@ -354,11 +427,18 @@ def spring_kernels(dtype: str, midpoint: bool, own: OwnForces = ()) -> KernelSet
         rows[1, world, item] = in_motion * viscous_part[0] * (y - y0)
 
     @masked_kernel(module, "active")
-    def store_turns(spr: Springs, u: p.vec3_2d, active: int_1d, scr: Scratch, turned: double_2d):
-        """Angles of an accepted step, from which the next counts turns."""
+    def store_history(
+        spr: Springs, u: p.vec3_2d, active: int_1d, scr: Scratch, turned: double_2d, anchor: double_2d
+    ):  # fmt: skip
+        """Angles of an accepted step, from which the next counts turns, and anchors of friction."""
         world, item = wp.tid()
+        sp = spr.spring[item]
+        V = spr.reference[item] + vectors(spr, u, world, item)
+        y = c.coordinate(spr.kind[item], V, scr.start[world, item])
         if spr.kind[item] == ANGLE:
-            V = spr.reference[item] + vectors(spr, u, world, item)
-            turned[world, item] = c.coordinate(ANGLE, V, scr.start[world, item])
+            turned[world, item] = y
+        if wp.static(bounded):
+            if spr.law[sp] == FRICTION:
+                anchor[world, item] = more.dragged(spr, world, sp, y, scr.anchor[world, item])
 
     return kernel_set(locals())

@@ -21,6 +21,7 @@ from ..terms.term import Term
 from ..terms.term_set import TermSet
 from ..time_laws import Rotation
 from . import loads
+from .actuators import joint_springs
 from .attachments import Ground
 from .beams import beam_geometry
 from .bodies import MeshLike, as_mesh, make_solid, make_structure, shell_geometry, unused_name
@@ -296,7 +297,8 @@ class ModelBuilder(ContactMethods, SpringMethods):
 
     def add_joint(
         self, kind: str, *, parent: Any, child: Any, anchor: Any = None, axis: Any = None, axis2: Any = None,
-        drive: Any = None, name: str | None = None,
+        drive: Any = None, limits: Any = None, friction: float | None = None, stiffness: float | None = None,
+        damping: float | None = None, name: str | None = None,
     ) -> Joint:  # fmt: skip
         """Connect two bodies, or a body and the ground, by a joint.
 
@@ -313,10 +315,14 @@ class ModelBuilder(ContactMethods, SpringMethods):
             drive: time law: angle (rad) of a revolute joint, child relative to parent, right-handed about the axis,
                 any number of turns; travel (m) of a translational joint, the child along the axis; length (m) of
                 a distance joint. Angle and travel are 0 in the reference.
-            name: unique name.
+            limits: (lower, upper) or a wf.Stop: stops of the angle or travel; turns are counted.
+            friction: largest torque (N m) or force (N) of Coulomb friction, which sticks by a spring that slips at
+                1e-4 rad or m.
+            stiffness, damping: N m/rad and N m s/rad, or N/m and N s/m, of a spring at rest in the reference.
+            name: unique name, also for set_parameter("NAME.friction"), "NAME.stiffness", "NAME.lower", ...
 
         Returns:
-            Joint: the handle for sim.joint_force, sim.violation, sim.joint_record.
+            Joint: the handle for add_actuator, sim.joint_value, sim.joint_rate, sim.joint_force, sim.joint_record.
 
         Raises:
             ModelError: an unknown kind, distant handles without an anchor, coincident points of a rod, a handle that
@@ -326,7 +332,11 @@ class ModelBuilder(ContactMethods, SpringMethods):
         for side, thing in (("parent", parent), ("child", child)):
             if not isinstance(thing, Ground):
                 self._check_owner(thing, f"joint {name!r}: {side}", MaterialPoint, NodeSet, SurfaceSet)
-        return self._record_joint(make_joint(kind, parent, child, anchor, axis, axis2, drive, name))
+        joint = make_joint(kind, parent, child, anchor, axis, axis2, drive, name)
+        for spring in joint_springs(joint, limits, friction, stiffness, damping):
+            self._spring_name(spring.name, "")
+            self._add_spring(spring)
+        return self._record_joint(joint)
 
     def add_constraint(self, kind: str, *, points: Any, value: Any = None, name: str | None = None) -> Joint:
         """A single basic constraint between points (Paper I, section 5.4).

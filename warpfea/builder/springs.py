@@ -1,4 +1,4 @@
-"""Methods of ModelBuilder for springs, foundations and point masses."""
+"""Methods of ModelBuilder for springs, actuators, foundations and point masses."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from ..model.discretisation import PointMass
 from ..model.handles import MaterialPoint, NodeSet, SurfaceSet
 from ..model.joints import Joint, Vector, VectorPart
 from ..model.springs import SampledForce, Spring
+from .actuators import make_actuator
 from .attachments import COINCIDENCE_TOL, make_attachment
 from .bodies import unused_name
 from .checks import body_of_handle
@@ -25,7 +26,7 @@ __all__ = ["SpringMethods"]
 
 
 class SpringMethods:
-    """Base of ModelBuilder: `add_spring`, `add_torsion_spring`, `add_foundation`, `add_point_mass`."""
+    """Base of ModelBuilder: `add_spring`, `add_torsion_spring`, `add_actuator`, `add_foundation`, `add_point_mass`."""
 
     description: Description
 
@@ -99,6 +100,24 @@ class SpringMethods:
         if isinstance(law, wp.Function):
             values["rest"] = 1.0
         return self._add_spring(Spring(name, ANGLE, [(a, b, a2)], **values, between=joint.between))
+
+    def add_actuator(self, joint: Joint, torque: Any, *, name: str | None = None) -> Spring:
+        """An actuator that turns the child of a revolute joint about its axis, or pushes that of a translational or
+        cylindrical joint along it, and the parent the other way. Several on one joint add up.
+
+        Args:
+            joint: as `add_joint` returned it, without drive.
+            torque: time law or Control, N m about the axis or N along it; or wf.PD(kp, kd, target=, limit=), implicit
+                in the step: its rate is that of the integrator.
+            name: unique name; of a PD for set_parameter("NAME.kp"), "NAME.kd", "NAME.limit".
+
+        Raises:
+            ModelError: a joint of another kind, or one that is driven.
+        """
+        name = self._spring_name(name, "actuator")
+        if joint not in self.description.joints:
+            raise ModelError(f"actuator {name!r}: {joint!r} is no joint of this builder")
+        return self._add_spring(make_actuator(name, joint, torque))
 
     def add_foundation(
         self, surface: SurfaceSet, *, stiffness: float, damping: float = 0.0, name: str | None = None

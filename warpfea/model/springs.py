@@ -1,4 +1,4 @@
-"""Springs as data: coordinates of vectors linear in the slots, with stiffness, damping and rest."""
+"""Springs, actuators, stops and friction as data: coordinates of vectors linear in the slots, and their laws."""
 
 from __future__ import annotations
 
@@ -8,9 +8,12 @@ from typing import Any
 import numpy as np
 
 from ..base.errors import ModelError
-from .joints import Vector
+from ..kernels.terms.bounded_laws import FEEDBACK, FRICTION
+from ..kernels.terms.springs import ANGLE, LENGTH, TRAVEL
+from ..time_laws import TimeLaw
+from .joints import Joint, Vector
 
-__all__ = ["SampledForce", "Spring"]
+__all__ = ["SampledForce", "Spring", "coordinate_gradients", "joint_coordinate"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,30 +64,81 @@ class SampledForce:
 
 @dataclass(eq=False)
 class Spring:
-    """Handle of a spring.
+    """Handle of a spring or actuator; stops and friction of joints.
 
     Attributes:
         name: unique in its model.
-        kind: LENGTH, ANGLE or VECTOR of kernels/terms/springs.py.
+        kind: LENGTH, ANGLE, TRAVEL or VECTOR of kernels/terms/springs.py.
         items: vectors of each coordinate, all of one spring: one, or many points of a foundation.
         scale: (items,) factor on stiffness and damping: 1, or the area of a point, m^2.
-        stiffness, damping, rest: of all worlds until `Model.set_parameter`.
-        law: a SampledForce or a wp.func (y, dy/dt) -> force in place of a stiffness.
+        stiffness, damping, rest, max_force, lower_end, upper_end: of all worlds until `Model.set_parameter`.
+        law: in place of a stiffness a SampledForce, a wp.func (y, dy/dt) -> force, or a law of
+            kernels/terms/bounded_laws.py.
+        schedule: time law of TORQUE and FEEDBACK.
+        stick: of FRICTION, max_force over stiffness: the deflection at which it slips.
         between: what it connects.
+        keys: its parameters per world, as name and attribute; by default those of a spring.
     """
 
     name: str
     kind: int
     items: list[tuple[Vector, ...]] = field(repr=False)
-    stiffness: float
-    damping: float
-    rest: float
+    stiffness: float = 0.0
+    damping: float = 0.0
+    rest: float = 0.0
     scale: np.ndarray = field(default_factory=lambda: np.ones(1), repr=False)
     law: Any = field(default=None, repr=False)
     between: str = ""
+    max_force: float = np.inf
+    lower_end: float = -np.inf
+    upper_end: float = np.inf
+    schedule: TimeLaw | None = field(default=None, repr=False)
+    stick: float = 0.0
+    keys: dict[str, str] | None = field(default=None, repr=False)
 
     @property
-    def parameters(self) -> tuple[str, ...]:
-        """Names of its parameters per world."""
+    def parameters(self) -> dict[str, str]:
+        """Attributes by the names of its parameters per world."""
+        if self.keys is not None:
+            return self.keys
         linear = ("stiffness", "rest") if self.law is None else ()
-        return tuple(name for name in (*linear, "damping") if name != "rest" or len(self.scale) == 1)
+        names = [name for name in (*linear, "damping") if name != "rest" or len(self.scale) == 1]
+        return {f"{self.name}.{name}": name for name in names}
+
+    @property
+    def bounded(self) -> bool:
+        """True with a law of kernels/terms/bounded_laws.py."""
+        return isinstance(self.law, int)
+
+    @property
+    def acting(self) -> bool:
+        """True for an actuator."""
+        return self.bounded and self.law >= FEEDBACK
+
+    @property
+    def resists(self) -> bool:
+        """True if it resists every motion of its coordinate in statics."""
+        return self.stiffness > 0.0 if self.law in (None, FEEDBACK, FRICTION) else not self.bounded
+
+
+def joint_coordinate(joint: Joint) -> tuple[int, tuple[Vector, ...]] | None:
+    """Kind and vectors of the coordinate that actuators of a joint act on: travel, else angle; None without."""
+    if joint.travel is not None:
+        return TRAVEL, joint.travel
+    if joint.angle is not None:
+        a, a2, b = joint.angle
+        return ANGLE, (a, b, a2)
+    return None
+
+
+def coordinate_gradients(kind: int, v: np.ndarray) -> list[np.ndarray]:
+    """Derivatives (3, 3) of a coordinate, or of the components of a VECTOR, by the vectors v (3, 3), as rows."""
+    if kind == TRAVEL:
+        return [np.stack([v[1], v[0], np.zeros(3)])]
+    if kind != ANGLE:
+        n = v[0] / max(np.linalg.norm(v[0]), 1e-300)
+        zero = np.zeros(3)
+        return [np.stack([e, zero, zero]) for e in ([n] if kind == LENGTH else np.eye(3))]
+    a, b, a2 = v
+    y, radius = np.arctan2(a2 @ b, a @ b), np.hypot(a2 @ b, a @ b)
+    return [np.stack([-np.sin(y) * b, np.cos(y) * a2 - np.sin(y) * a, np.cos(y) * b]) / radius]

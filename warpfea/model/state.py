@@ -24,7 +24,7 @@ __all__ = ["ArraySpec", "State", "view_as_words"]
 
 SOLVER_HISTORY_PREFIXES = ("preconditioner", "operator", "predictor", "summed")
 """Name prefixes of optional state arrays (solver history, summed time)."""
-MONITOR_ARRAYS = ("energy_growth",)
+MONITOR_ARRAYS = ("energy_growth", "joint_angle")
 """Monitor arrays, optional in a checkpoint."""
 
 

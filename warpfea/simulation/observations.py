@@ -13,6 +13,7 @@ from ..base.names import did_you_mean, listing
 from ..base.short_repr import truncated_lines
 from ..kernels.contact.structs import RECORD_NAMES
 from ..kernels.step.episodes import JOINT_VALUE_KINDS, MOTION_KINDS, observation_kernels
+from ..terms.joint_values import coordinate_vectors, turn_source, vector_tables
 
 __all__ = ["Observations"]
 
@@ -36,6 +37,7 @@ class Observations:
         part.NAME.axes, .axes_rate                        9: columns of its rotation A, and dA/dt, 1/s
         probe.NAME.position, .displacement, .velocity     3: m, m/s
         joint.NAME.angle, .travel, .length                1: rad, m; as `sim.joint_value`
+        joint.NAME.angle_rate, .travel_rate, ...          1: rad/s, m/s; as `sim.joint_rate`
         joint.NAME.force, .moment, .violation             3, 3, 1: N, N m, m; as `sim.joint_force`
         contact.NAME.force, .moment, .normal_force, ...   3, 3, 1: as `ContactRecord`, over the last step
 
@@ -132,10 +134,11 @@ class Observations:
         tables = self._model.constraints
         assert tables is not None
         joint = self._sim.records.find_joint(owner)
-        has = tables.coordinate_vectors(joint)
-        self._check_quantity(name, what, [*has, *JOINT_REPORT_COLUMNS])
-        if what in has:
-            self._values.append((has[what], what, tables.angle_row(joint), self._column_count))
+        has = coordinate_vectors(joint)
+        self._check_quantity(name, what, [*has, *(f"{key}_rate" for key in has), *JOINT_REPORT_COLUMNS])
+        coordinate = what.removesuffix("_rate")
+        if coordinate in has:
+            self._values.append((has[coordinate], what, turn_source(tables, joint), self._column_count))
             self._column_count += 1
             return
         self._add_report(first, JOINT_REPORT_COLUMNS[what])
@@ -173,10 +176,8 @@ class Observations:
             array([p[4] for p in points], wp.int32),
         ] if points else []  # fmt: skip
         vectors = [v for entry in self._values for v in (entry[0] + [entry[0][0]] * 2)[:3]]
-        entries = [vector.entries() for vector in vectors]
         self._joint_value_tables = [
-            *sums([(slots, weights) for slots, weights, _ in entries]),
-            array(np.array([v.value for v in vectors], dtype=float).reshape(-1, 3), wp.vec3d),
+            *vector_tables(vectors, array),
             array([JOINT_VALUE_KINDS[v[1]] for v in self._values], wp.int32),
             array([v[2] for v in self._values], wp.int32),
             array([v[3] for v in self._values], wp.int32),
@@ -198,7 +199,8 @@ class Observations:
             args = [*self._motion_tables, state.displacement, state.velocity, self.array]
             launch(k.point_motions, (B, len(self._points)), args)
         if self._joint_value_tables:
-            args = [*self._joint_value_tables, state.displacement, state.constraint_target, self.array]
+            turns = [state.constraint_target, getattr(state, "joint_angle", state.constraint_target)]
+            args = [*self._joint_value_tables, state.displacement, state.velocity, *turns, self.array]
             launch(k.joint_values, (B, len(self._values)), args)
         if self._report_columns:
             assert self._stepped_flags is not None

@@ -25,6 +25,7 @@ from ..model.rigid import RigidBody
 from ..model.state import State
 from ..model.surfaces import reference_points
 from ..terms.evaluation import field_at_nodes, field_at_points, find_field
+from ..terms.joint_values import joint_value
 from ..terms.protocols import Touching
 from ..terms.term import FieldSpec
 from .reports import ContactRecord, JointRecord, ProbeRecord
@@ -270,13 +271,21 @@ class Records:
     def joint_value(self, joint: Joint | str, what: str | None = None) -> np.ndarray:
         """Angle (rad) of a revolute or cylindrical joint, travel (m) of a translational, length (m) of a distance.
 
-        (B,), in the present state; a driven angle counts full turns, others lie between -pi and pi. `what`: "angle",
-        "travel" or "length" if a joint has several. Travel is along the parent's axis, per unit of its reference.
+        (B,), in the present state; angles count full turns, as long as no step turns by more than half of one. `what`:
+        "angle", "travel" or "length" if a joint has several. Travel is along the parent's axis, per unit of its
+        reference.
         """
+        return self._joint_value(joint, what, rate=False)
+
+    def joint_rate(self, joint: Joint | str, what: str | None = None) -> np.ndarray:
+        """Rate of change of `joint_value`, rad/s or m/s (B,), of the present velocities."""
+        return self._joint_value(joint, what, rate=True)
+
+    def _joint_value(self, joint: Joint | str, what: str | None, *, rate: bool) -> np.ndarray:
         known = self.find_joint(joint)
         constraints = self.model.constraints
         assert constraints is not None
-        return constraints.measure(known, what, self.state)
+        return joint_value(constraints, known, what, self.state, rate=rate)
 
     def joint_column(self, joint: Joint | str) -> int:
         """First report column of a joint."""

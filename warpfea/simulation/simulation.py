@@ -130,6 +130,7 @@ class Simulation:
     joint_record = PartMember("records", Records.joint_record)
     joint_force = PartMember("records", Records.joint_force)
     joint_value = PartMember("records", Records.joint_value)
+    joint_rate = PartMember("records", Records.joint_rate)
     violation = PartMember("records", Records.violation)
     contact_record = PartMember("records", Records.contact_record)
     contact_force = PartMember("records", Records.contact_force)

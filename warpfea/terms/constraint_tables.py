@@ -14,8 +14,6 @@ from ..base.launch import Launcher
 from ..kernels.terms.constraint_blocks import coupling_struct
 from ..kernels.terms.constraint_formulas import Formula, formula_kernels
 from ..kernels.terms.constraints import (
-    ANGLE,
-    DISTANCE,
     DOT,
     FORMULA,
     constraint_kernels,
@@ -25,6 +23,7 @@ from ..kernels.terms.constraints import (
 from ..model.assembly import greedy_colouring, grouped_items
 from ..model.joints import ConstraintRow, Joint, Vector
 from ..time_laws import TimeLaw
+from .joint_values import JointAngles
 from .time_law_table import TimeLawTable
 
 if TYPE_CHECKING:
@@ -40,7 +39,7 @@ class ConstraintTables:
     """Constraint rows of a model on the device, ordered by connected component and by cluster of rows that share slots.
 
     Attributes:
-        joints: in the order of addition.
+        joints: in the order of addition; `angles`: those whose turns are counted.
         count: number of rows.
         formulas: of the rows that have one; number k is the row kind FORMULA + k.
         rows_of: row indices of each joint.
@@ -55,6 +54,7 @@ class ConstraintTables:
     def __init__(self, model: Model, joints: Sequence[Joint]) -> None:
         self.model = model
         self.joints = list(joints)
+        self.angles = JointAngles(model, self.joints)
         self.kernels = constraint_kernels(model.dtype)
         self.data: Any = None
         self.joint_data: Any = None
@@ -97,6 +97,7 @@ class ConstraintTables:
         self._upload_vectors(laws)
         self._upload_row_pairs()
         self._upload_joints()
+        self.angles.upload()
 
     def _order_rows(self, component: np.ndarray) -> None:
         """Sort joints by component and cluster."""
@@ -342,41 +343,6 @@ class ConstraintTables:
             args = [kind, self.data.kind, self.data.scale, v, gradient, curvature]
             Launcher(device)(k.derivatives, (1, n), args)
         return gradient.numpy().reshape(n, 3, 3), curvature.numpy().reshape(n, 3, 3, 3, 3)
-
-    def measure(self, joint: Joint, what: str | None, state: Any) -> np.ndarray:
-        """Joint coordinate (worlds,): "angle" (rad), "travel" or "length" (m); ModelError if undefined."""
-        has = self.coordinate_vectors(joint)
-        what = what or next(iter(has), None)
-        if what not in has:
-            raise ModelError(f"joint {joint.name!r}: a {joint.kind} joint has no {what or 'angle, travel or length'}")
-        target, turn = self.targets(state), self.angle_row(joint)
-        out = []
-        for world, u in enumerate(state.displacement.numpy().astype(float)):
-            entries = [vector.entries() for vector in has[what]]
-            vectors = [vector.value + w @ u[slots] for vector, (slots, w, _) in zip(has[what], entries)]
-            if what == "length":
-                out.append(np.linalg.norm(vectors[0]))
-            elif what == "travel":
-                gap, axis = vectors
-                out.append(gap @ axis)
-            else:
-                a, a2, b = vectors
-                angle = np.arctan2(b @ a2, b @ a)
-                if turn >= 0:
-                    angle += 2.0 * np.pi * np.round((target[world, turn] - angle) / (2.0 * np.pi))
-                out.append(angle)
-        return np.array(out)
-
-    @staticmethod
-    def coordinate_vectors(joint: Joint) -> dict[str, list[Vector]]:
-        """Vectors of a joint that define its "angle" (three), "travel" (two) and "length" (one), if any."""
-        length = [joint.rows[0].a] if joint.rows[0].kind == DISTANCE else []
-        has = {"angle": list(joint.angle or ()), "travel": list(joint.travel or ()), "length": length}
-        return {name: vectors for name, vectors in has.items() if vectors}
-
-    def angle_row(self, joint: Joint) -> int:
-        """Row of the drive that counts the full turns of a joint's angle, or -1."""
-        return next((int(k) for k in self.rows_of[joint.index] if self.rows[k].kind == ANGLE), -1)
 
     def targets(self, state: Any) -> np.ndarray:
         """Right-hand sides (worlds, rows) of the state, or those at its time if it never stepped."""

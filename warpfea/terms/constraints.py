@@ -115,6 +115,7 @@ class Constraints(Constrained, Updated, Tied, Preconditioned):
     def register(self, ctx: StepContext) -> None:
         ctx.state.register("constraint_force", wp.float64, (self.tables.count,))
         ctx.state.register("constraint_target", wp.float64, (self.tables.count,), np.nan)
+        self.tables.angles.register(ctx)
 
     def configure(self, ctx: StepContext) -> None:
         """Read the solver's options: classical updates or not, kappa, and whether constraint directions are
@@ -127,7 +128,8 @@ class Constraints(Constrained, Updated, Tied, Preconditioned):
 
     def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
         formulas = {kernels.module for _, kernels in self.tables.formula_kernels(ctx.midpoint)}
-        return {self.integrator_kernels(ctx).module, deflation_kernels(self.model.dtype).module} | formulas
+        own = {self.integrator_kernels(ctx).module, deflation_kernels(self.model.dtype).module}
+        return own | formulas | self.tables.angles.modules()
 
     def start(self, ctx: StepContext, active: wp.array) -> None:
         """Initialise right-hand sides missing in the state, and the violation at the start."""
@@ -222,9 +224,10 @@ class Constraints(Constrained, Updated, Tied, Preconditioned):
 
     @part("constraints")
     def commit(self, ctx: StepContext, accepted: wp.array) -> None:
-        """Store multipliers and right-hand sides of an accepted substep."""
+        """Store multipliers, right-hand sides and turns of an accepted substep."""
         args = [accepted, ctx.work.multipliers, ctx.state.constraint_force, ctx.state.constraint_target]
         ctx.launch(self.integrator_kernels(ctx).store_multipliers, self.dim, args)
+        self.tables.angles.count(ctx, accepted)
 
     def report(self, ctx: StepContext) -> None:
         """Report the force and moment on the child and the violation of each joint."""

@@ -1,4 +1,4 @@
-"""Springs and dampers between points, about joints and under surfaces; see kernels/terms/springs.py."""
+"""Springs, dampers, actuators, stops and friction of joints; see kernels/terms/springs.py."""
 
 from __future__ import annotations
 
@@ -16,12 +16,13 @@ from ..base.launch import Launcher
 from ..base.worlds import check_values_per_world, set_rows, values_per_world
 from ..kernels.common.modules import definition_name
 from ..kernels.solvers.newton_control import TERM_ROWS
+from ..kernels.terms.bounded_laws import FRICTION
 from ..kernels.terms.spring_laws import LINEAR, OWN, SAMPLED, OwnForces, spring_struct
-from ..kernels.terms.springs import ANGLE, LENGTH, VECTOR, scratch_struct, spring_kernels
+from ..kernels.terms.springs import ANGLE, LENGTH, TRAVEL, VECTOR, scratch_struct, spring_kernels
 from ..model.assembly import grouped_items
-from ..model.springs import SampledForce, Spring
+from ..model.springs import SampledForce, Spring, coordinate_gradients
 from .protocols import Parametrised, Preconditioned, Tied
-from .term import LOSS, STORED, Column, StepContext, part
+from .term import LOSS, NUMERICAL, STORED, WORK, Column, StepContext, part
 from .time_law_table import TimeLawTable
 
 if TYPE_CHECKING:
@@ -31,8 +32,13 @@ if TYPE_CHECKING:
 
 __all__ = ["Springs"]
 
-PARAMETERS = {"stiffness": "stiffness", "damping": "damping", "rest": "rest_coordinate"}
-"""Members of the device struct by the names of the parameters."""
+DEVICE_FIELDS = {
+    "stiffness": "stiffness", "damping": "damping", "rest": "rest_coordinate", "max_force": "max_force",
+    "lower_end": "lower_end", "upper_end": "upper_end",
+}  # fmt: skip
+"""Members of the device struct by those of a Spring."""
+BLOCKS = {LENGTH: 1, VECTOR: 1, TRAVEL: 4, ANGLE: 9}
+"""Blocks of the tangent by coordinate."""
 
 
 class Springs(Tied, Preconditioned, Parametrised):
@@ -45,8 +51,10 @@ class Springs(Tied, Preconditioned, Parametrised):
 
     name = "springs"
     translation_invariant = True  # but for those on the ground, see `mark_constrained`
-    columns = (Column("springs", STORED), Column("spring_loss", LOSS))
-    parts = {"springs": "springs and dampers"}
+    columns = (  # the work of actuators also counts among that of internal forces, where nothing stores it
+        Column("springs", STORED), Column("spring_loss", LOSS), Column("actuators", WORK), Column("", NUMERICAL)
+    )  # fmt: skip
+    parts = {"springs": "springs, dampers, actuators, stops"}
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
@@ -55,6 +63,7 @@ class Springs(Tied, Preconditioned, Parametrised):
             (definition_name(law.key, law), law)
             for law in dict.fromkeys(s.law for s in self.springs if isinstance(s.law, wp.Function))
         )
+        self.bounded = any(s.bounded for s in self.springs)
         self.items = [vectors for spring in self.springs for vectors in spring.items]
         self.count = self.rows = len(self.items)
         self.kind = np.repeat([s.kind for s in self.springs], [len(s.items) for s in self.springs])
@@ -62,7 +71,8 @@ class Springs(Tied, Preconditioned, Parametrised):
 
     @classmethod
     def features(cls, model: Model) -> dict[str, bool]:
-        return {"springs": bool(model.description.springs)}
+        springs = model.description.springs
+        return {"springs": bool(springs), "actuators": any(s.acting for s in springs)}
 
     # tables
 
@@ -89,16 +99,17 @@ class Springs(Tied, Preconditioned, Parametrised):
         sampled = [s.law if isinstance(s.law, SampledForce) else None for s in springs]
         pieces = [law for law in sampled if law is not None]
         functions = [function for _, function in self.own]
-        codes = [LINEAR if s.law is None else OWN + functions.index(s.law) if s.law in functions else SAMPLED
-                 for s in springs]  # fmt: skip
+        codes = [LINEAR if s.law is None else s.law if s.bounded else OWN + functions.index(s.law)
+                 if s.law in functions else SAMPLED for s in springs]  # fmt: skip
+        schedule = [-1 if s.schedule is None else laws.add(s.schedule) for s in springs]
         reference = np.zeros((self.count, 3, 3))
         for item, vectors in enumerate(self.items):
             for side, vector in enumerate(vectors):
                 reference[item, side] = vector.value
-        blocks = np.where(self.kind == ANGLE, 9, 1)
+        blocks = np.array([BLOCKS[int(kind)] for kind in self.kind])
         self.block_count = int(blocks.sum())
         per_world = {
-            field: np.tile([getattr(s, name) for s in springs], (m.worlds, 1)) for name, field in PARAMETERS.items()
+            field: np.tile([getattr(s, name) for s in springs], (m.worlds, 1)) for name, field in DEVICE_FIELDS.items()
         }
         self.definition = {
             "kind": self.kind,
@@ -109,6 +120,7 @@ class Springs(Tied, Preconditioned, Parametrised):
             "entry_slot": self.entry_slot,
             "entry_weight": self.entry_weight,
             "law": np.array(codes),
+            "schedule": np.array(schedule),
             "knot": np.concatenate([np.zeros(1), *(law.knots for law in pieces)]),
             "coefficients": np.concatenate([np.zeros((1, 4)), *(law.coefficients for law in pieces)]),
         } | per_world
@@ -145,7 +157,7 @@ class Springs(Tied, Preconditioned, Parametrised):
         for item in range(self.count):
             own = slice(self.entry_start[item], self.entry_start[item + 1])
             slots, weights = self.entry_slot[own], self.entry_weight[own]
-            if of[slots[0]] != component:
+            if of[slots[0]] != component or not self.springs[self.definition["spring"][item]].resists:
                 continue
             vectors = self.definition["reference"][item] + weights.T @ u[slots]
             for gradient in coordinate_gradients(int(self.kind[item]), vectors):
@@ -173,11 +185,13 @@ class Springs(Tied, Preconditioned, Parametrised):
 
     def kernels(self, ctx: StepContext) -> Any:
         """Kernels for the integrator of a simulation."""
-        return spring_kernels(self.model.dtype, ctx.midpoint, self.own)
+        return spring_kernels(self.model.dtype, ctx.midpoint, self.own, self.bounded)
 
     def register(self, ctx: StepContext) -> None:
         if (self.kind == ANGLE).any():
             ctx.state.register("spring_angle", wp.float64, (self.count,))
+        if any(spring.law == FRICTION for spring in self.springs):
+            ctx.state.register("spring_anchor", wp.float64, (self.count,), np.nan)
 
     def allocate(self, work: Workspace, ctx: StepContext) -> None:
         scratch, B = scratch_struct()(), self.model.worlds
@@ -191,9 +205,11 @@ class Springs(Tied, Preconditioned, Parametrised):
     def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
         return {self.kernels(ctx).module}
 
-    def _turned(self, ctx: StepContext) -> wp.array:
-        """Angles with their turns [world, item]; of a model without angles an array that is not read."""
-        return getattr(ctx.state, "spring_angle", ctx.scratch[self.name][0].start)
+    def _history(self, ctx: StepContext) -> list[wp.array]:
+        """Angles with their turns, and anchors of friction [world, item]; in models without, arrays that are not
+        read."""
+        unread = ctx.scratch[self.name][0].start
+        return [getattr(ctx.state, name, unread) for name in ("spring_angle", "spring_anchor")]
 
     # in a step
 
@@ -203,19 +219,19 @@ class Springs(Tied, Preconditioned, Parametrised):
         state, step = ctx.state, ctx.work.step
         first, second = (step.b, step.q_a) if ctx.accelerated else (step.a0, step.a1)
         args = [self.data, state.displacement, state.velocity, ctx.u_before, int(ctx.accelerated), first, second]
-        args += [self._turned(ctx), active, ctx.scratch[self.name][0]]
+        args += [*self._history(ctx), active, ctx.scratch[self.name][0]]
         ctx.launch(self.kernels(ctx).begin, self.dim, args)
 
-    def _start(self, ctx: StepContext) -> list[Any]:
-        """Positions from which a VECTOR has its rate, 0 in statics, and dq/dv."""
-        start = ctx.state.displacement if ctx.midpoint else ctx.work.q_tilde
-        return [start, float(ctx.inertia), ctx.work.step.dq_dv]
+    def _start(self, ctx: StepContext) -> tuple[wp.array, list[Any]]:
+        """Positions from which a VECTOR has its rate; values of time laws, 0 in statics, and dq/dv."""
+        start, w = ctx.state.displacement if ctx.midpoint else ctx.work.q_tilde, ctx.work
+        return start, [w.time_law_stage_values, float(ctx.inertia), w.step.dq_dv]
 
     @part("springs")
     def force(self, ctx: StepContext, active: wp.array) -> None:
         w, k, (scratch, _) = ctx.work, self.kernels(ctx), ctx.scratch[self.name]
-        start, in_motion, dq_dv = self._start(ctx)
-        ctx.launch(k.evaluate, self.dim, [self.data, w.u, start, in_motion, dq_dv, active, scratch])
+        start, step = self._start(ctx)
+        ctx.launch(k.evaluate, self.dim, [self.data, w.u, start, *step, active, scratch])
         self._scatter(ctx, scratch.force, active, w.pool_force)
 
     prepare = force
@@ -238,23 +254,24 @@ class Springs(Tied, Preconditioned, Parametrised):
     @part("springs")
     def energy_increments(self, ctx: StepContext, accepted: wp.array) -> wp.array:
         scratch, rows = ctx.scratch[self.name]
-        start, in_motion, dq_dv = self._start(ctx)
-        args = [self.data, ctx.work.u, start, ctx.state.displacement, in_motion, dq_dv, accepted, scratch, rows]
+        start, step = self._start(ctx)
+        args = [self.data, ctx.work.u, start, ctx.state.displacement, *step, accepted, scratch, rows]
         ctx.launch(self.kernels(ctx).energies, self.dim, args)
         return rows
 
     @part("springs")
     def commit(self, ctx: StepContext, accepted: wp.array) -> None:
-        if "spring_angle" in ctx.state.names:
-            args = [self.data, ctx.work.u, accepted, ctx.scratch[self.name][0], self._turned(ctx)]
-            ctx.launch(self.kernels(ctx).store_turns, self.dim, args)
+        if {"spring_angle", "spring_anchor"} & {*ctx.state.names}:
+            args = [self.data, ctx.work.u, accepted, ctx.scratch[self.name][0], *self._history(ctx)]
+            ctx.launch(self.kernels(ctx).store_history, self.dim, args)
 
     def stored_energy(self, ctx: StepContext) -> dict[str, np.ndarray]:
         active = wp.ones(self.model.worlds, dtype=wp.int32, device=self.model.device)
         self.begin(ctx, active)
         scratch, rows = ctx.scratch[self.name]
         u = ctx.state.displacement
-        args = [self.data, u, u, u, 0.0, wp.ones_like(ctx.work.step.dq_dv), active, scratch, rows]
+        values = ctx.work.time_law_stage_values
+        args = [self.data, u, u, u, values, 0.0, wp.ones_like(ctx.work.step.dq_dv), active, scratch, rows]
         ctx.launch(self.kernels(ctx).energies, self.dim, args)
         return {"springs": rows.numpy()[0].sum(axis=1)}
 
@@ -276,16 +293,17 @@ class Springs(Tied, Preconditioned, Parametrised):
         ctx = StepContext(m, work, launch, state, u_before=u, inertia=False)
         self.allocate(work, ctx)
         self.begin(ctx, flags)
+        value = m.terms.time_laws.values_at_state(launch, state)[0]
         scratch, found = ctx.scratch[self.name][0], []
         for in_motion in (0.0, 1.0):
-            ctx.launch(self.kernels(ctx).evaluate, self.dim, [self.data, u, u, in_motion, one, flags, scratch])
+            ctx.launch(self.kernels(ctx).evaluate, self.dim, [self.data, u, u, value, in_motion, one, flags, scratch])
             found.append(scratch.hessian.numpy()[world].copy())
         return self._matrix(found[0]), self._matrix(found[1] - found[0])
 
     def _matrix(self, blocks: np.ndarray) -> sp.csr_matrix:
         """(3 slots, 3 slots) from the blocks (blocks, 3, 3) between the vectors of the items."""
         row, column = self._entry_pairs()
-        sides = np.where(self.kind == ANGLE, 3, 1)
+        sides = np.sqrt([BLOCKS[int(kind)] for kind in self.kind]).astype(int)
         first = np.cumsum(sides**2) - sides**2
         item = self.entry_item[row]
         A = np.zeros((len(row), 3, 3))
@@ -317,7 +335,7 @@ class Springs(Tied, Preconditioned, Parametrised):
         self.model.cache["springs"] = arrays, len(entry)
 
     def block_modules(self) -> Iterable[wp.Module]:
-        return {spring_kernels(self.model.dtype, False, self.own).module}
+        return {spring_kernels(self.model.dtype, False, self.own, self.bounded).module}
 
     def blocks(
         self, ctx: StepContext, matrix: Any, cached: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,
@@ -326,35 +344,32 @@ class Springs(Tied, Preconditioned, Parametrised):
         (arrays, count), m = self.model.cache["springs"], self.model
         values = cached[0] if projected else ctx.scratch[self.name][0].hessian
         args = [m.topology, matrix.pattern.data, self.data, *arrays, values, dq_dv, active, out]
-        ctx.launch(spring_kernels(m.dtype, False, self.own).add_blocks, (m.worlds, count), args)
+        ctx.launch(spring_kernels(m.dtype, False, self.own, self.bounded).add_blocks, (m.worlds, count), args)
 
     # parameters
 
     def parameters(self) -> dict[str, Callable[[Any, np.ndarray], None]]:
         return {
-            f"{spring.name}.{name}": partial(self._set_parameter, k, name)
+            name: partial(self._set_parameter, k, name, field)
             for k, spring in enumerate(self.springs)
-            for name in spring.parameters
+            for name, field in spring.parameters.items()
         }
 
-    def _set_parameter(self, k: int, name: str, values: Any, mask: np.ndarray) -> None:
+    def _set_parameter(self, k: int, name: str, field: str, values: Any, mask: np.ndarray) -> None:
         """Write one value of a spring in the chosen worlds."""
-        what = f"spring {self.springs[k].name!r}"
+        what, spring = f"spring {self.springs[k].name!r}", self.springs[k]
         wanted = values_per_world(what, name, values, self.model.worlds)
-        good = np.isfinite(wanted) & ((wanted >= 0.0) | (name == "rest" and self.kind[k] != LENGTH))
-        check_values_per_world(what, name, wanted, ~mask | good, "finite" if name == "rest" else "0 or more")
-        set_rows(getattr(self.data, PARAMETERS[name]), (mask, k), wanted[mask])
+        good, bound = np.isfinite(wanted), "finite"
+        if field in ("lower_end", "upper_end"):
+            other = getattr(self.data, "upper_end" if field == "lower_end" else "lower_end").numpy()[:, k]
+            good &= wanted < other if field == "lower_end" else wanted > other
+            bound = f"{'below the upper' if field == 'lower_end' else 'above the lower'} end"
+        elif field != "rest" or self.kind[self.definition["spring"] == k][0] == LENGTH:
+            good, bound = good & (wanted >= 0.0), "finite" if field == "rest" else "0 or more"
+        check_values_per_world(what, name, wanted, ~mask | good, bound)
+        set_rows(getattr(self.data, DEVICE_FIELDS[field]), (mask, k), wanted[mask])
+        if spring.law == FRICTION and spring.stick > 0.0:
+            set_rows(self.data.stiffness, (mask, k), wanted[mask] / spring.stick)
 
     def parameter_arrays(self) -> dict[str, wp.array]:
-        return {field: getattr(self.data, field) for field in PARAMETERS.values()}
-
-
-def coordinate_gradients(kind: int, v: np.ndarray) -> list[np.ndarray]:
-    """Derivatives (3, 3) of a coordinate, or of the components of a VECTOR, by the vectors v (3, 3), as rows."""
-    if kind != ANGLE:
-        n = v[0] / max(np.linalg.norm(v[0]), 1e-300)
-        zero = np.zeros(3)
-        return [np.stack([e, zero, zero]) for e in ([n] if kind == LENGTH else np.eye(3))]
-    a, b, a2 = v
-    y, radius = np.arctan2(a2 @ b, a @ b), np.hypot(a2 @ b, a @ b)
-    return [np.stack([-np.sin(y) * b, np.cos(y) * a2 - np.sin(y) * a, np.cos(y) * b]) / radius]
+        return {field: getattr(self.data, field) for field in DEVICE_FIELDS.values()}

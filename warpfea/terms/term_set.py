@@ -372,5 +372,6 @@ class TermSet:
         known = [column.name for kind in TERM_TYPES for column in kind.columns if column.name]
         for name in known:
             out.setdefault(name, np.zeros(len(ledger)))
-        out["work"] = np.sum([values for name, values in out.items() if name.startswith("work_")], axis=0)
+        work = [values for name, values in out.items() if name.startswith("work_") or name == "actuators"]
+        out["work"] = np.sum(work, axis=0)
         return out

@@ -1,0 +1,46 @@
+"""Angles of joints that no drive prescribes, with their turns."""
+
+import functools
+import math
+
+import warp as wp
+
+from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
+from ..common.types import double_1d, double_2d, int_1d, precision, vec3d, vec3d_1d
+
+__all__ = ["joint_angle_kernels"]
+
+FULL_TURN = 2.0 * math.pi
+
+
+@functools.cache
+def joint_angle_kernels(dtype: str) -> KernelSet:
+    """Kernel in one precision of the slots."""
+    p = precision(dtype)
+    module = kernel_module(f"joint_angles_{dtype}")
+
+    @wp.func
+    def current_vector(
+        start: int_1d, slot: int_1d, weight: double_1d, reference: vec3d_1d, u: p.vec3_2d, world: int, k: int
+    ) -> vec3d:  # fmt: skip
+        """Vector k: its reference value plus the sum of w_i u_i."""
+        x = reference[k]
+        for i in range(start[k], start[k + 1]):
+            x += weight[i] * vec3d(u[world, slot[i]])
+        return x
+
+    @masked_kernel(module, "active")
+    def count_turns(
+        start: int_1d, slot: int_1d, weight: double_1d, reference: vec3d_1d, u: p.vec3_2d, active: int_1d,
+        angle: double_2d,
+    ):  # fmt: skip
+        """atan2(a2.b, a.b) of the vectors a, a2, b of each joint, in the turn closest to the last angle."""
+        world, joint = wp.tid()
+        a = current_vector(start, slot, weight, reference, u, world, 3 * joint)
+        a2 = current_vector(start, slot, weight, reference, u, world, 3 * joint + 1)
+        b = current_vector(start, slot, weight, reference, u, world, 3 * joint + 2)
+        x = wp.atan2(wp.dot(a2, b), wp.dot(a, b))
+        turn = wp.float64(FULL_TURN)
+        angle[world, joint] = x + turn * wp.round((angle[world, joint] - x) / turn)
+
+    return kernel_set(locals())

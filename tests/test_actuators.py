@@ -1,0 +1,303 @@
+"""Actuators, stops, friction and turns of joints against closed forms and equations of motion."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+from scipy.integrate import solve_ivp
+from test_springs import forces
+
+import warpfea as wf
+from warpfea.terms.springs import Springs
+
+TIGHT = {"solver": wf.NewtonPCG(tol=1e-12), "constraint_tol": 1e-12}
+SCHEMES = ["backward_euler", "bdf2", "energy_momentum", "generalized_alpha"]
+
+
+def rotor(rate: float = 1.0, gravity: Any = (0, 0, 0), com: float = 0.0, **options: Any) -> tuple[Any, Any, Any]:
+    """A part of 1 kg m^2 about a hinge along z, its mass of 1 kg at `com` on the x axis."""
+    b = wf.ModelBuilder(gravity=gravity)
+    about = 1.0 - com**2
+    part = b.add_rigid(wf.Box((com, 0, 0), (0.1, 0.2, 0.3)), mass=1.0, inertia=(about, about, about), name="part")
+    joint = b.add_joint("revolute", parent=wf.GROUND, child=part.at((0, 0, 0)), axis=(0, 0, 1), name="hinge", **options)
+    if rate:
+        spin = np.array([0.0, 0.0, rate])
+        b.set_initial(part, angular_velocity=spin, velocity=np.cross(spin, (com, 0, 0)))
+    return b, part, joint
+
+
+def slider(speed: float, **options: Any) -> tuple[Any, Any]:
+    """A part of 2 kg on a slide along x."""
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    part = b.add_rigid(wf.Box((1, 0, 0), (0.1, 0.2, 0.3)), mass=2.0, name="slider")
+    slide = b.add_joint("translational", parent=wf.GROUND, child=part.at((1, 0, 0)), axis=(1, 0, 0), name="slide",
+                        **options)  # fmt: skip
+    b.set_initial(part, velocity=(speed, 0, 0))
+    return b, slide
+
+
+def run(b: Any, dt: Any, scheme: str = "energy_momentum", **options: Any) -> Any:
+    return wf.Simulation(b.finalize(device="cpu", **options), dt=dt, integrator=scheme, **TIGHT)
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_a_torque_and_a_controller_drive_a_pendulum(scheme: str) -> None:
+    """I y'' = T(t) + kp (target - y) - kd y' - m g l cos y, of the scheme's order; the ledger is closed."""
+
+    def rate(t: float, y: np.ndarray) -> list[float]:
+        torque = np.interp(t, [0, 0.2, 0.4], [0, 8.0, 3.0]) + 20.0 * (0.4 - y[0]) - 1.5 * y[1]
+        return [y[1], torque - 9.81 * 0.5 * np.cos(y[0])]
+
+    exact = solve_ivp(rate, (0, 0.4), [0.0, 2.0], rtol=1e-11, atol=1e-12, max_step=1e-2).y[:, -1]
+    b, _, hinge = rotor(2.0, (0, -9.81, 0), com=0.5)
+    b.add_actuator(hinge, ([0, 0.2, 0.4], [0, 8.0, 3.0]), name="torque")
+    b.add_actuator(hinge, wf.PD(20.0, 1.5, target=0.4), name="pd")
+    errors = []
+    for h in (4e-3, 2e-3):
+        sim = run(b, h, scheme)
+        sim.run(0.4)
+        errors.append(abs(sim.joint_value(hinge)[0] - exact[0]))
+    assert errors[0] / errors[1] > (1.9 if scheme == "backward_euler" else 3.5), errors
+    assert errors[1] < (1e-2 if scheme == "backward_euler" else 1e-4), errors
+    assert sim.joint_rate(hinge)[0] == pytest.approx(exact[1], rel=0.02)
+    e = {name: values[0] for name, values in sim.energies().items()}
+    assert abs(e["ledger_residual"]) < 1e-9
+    assert e["work"] == e["actuators"]
+    gained = e["kinetic"] + e["potential"] - 2.0
+    if scheme == "energy_momentum":
+        assert e["actuators"] == pytest.approx(gained, abs=1e-9)
+
+
+@pytest.mark.parametrize("scheme", ["backward_euler", "bdf2", "energy_momentum"])
+@pytest.mark.parametrize("h", [1e-4, 1e-2, 0.1])
+def test_a_stiff_controller_adds_no_energy(scheme: str, h: float) -> None:
+    """kp = 1e9 on 1 kg m^2, target held: kinetic energy and kp y^2/2 together never grow, of BDF2 in its own norm."""
+    b, _, hinge = rotor()
+    b.add_actuator(hinge, wf.PD(1e9, target=wf.Control("q", 1)))
+    sim = run(b, h, scheme)
+    z = [np.array([1.0, 0.0])]
+    for _ in range(20):
+        assert sim.step().converged.all()
+        z.append(np.array([sim.joint_rate(hinge)[0], np.sqrt(1e9) * sim.joint_value(hinge)[0]]))
+    states = np.array(z)
+    energy = 0.5 * (states**2).sum(axis=1)
+    if scheme == "bdf2":
+        energy = 0.25 * ((states[1:] ** 2).sum(axis=1) + ((2.0 * states[1:] - states[:-1]) ** 2).sum(axis=1))
+    assert np.diff(energy).max() < 1e-8 * energy[0]
+    if scheme == "energy_momentum":
+        assert energy[-1] > 0.99 * energy[0]
+
+
+def test_the_limit_of_a_controller() -> None:
+    """A motor of 2 N m on 1 kg m^2 accelerates by 2 rad/s^2 whatever the gain, and one per world by its own."""
+    b, _, hinge = rotor(0.0)
+    b.add_actuator(hinge, wf.PD(1e6, 10.0, target=wf.Control("q", 1, initial=3.0), limit=2.0), name="motor")
+    sim = run(b, 1e-2, worlds=2)
+    sim.model.set_parameter("motor.limit", [2.0, 3.0])
+    sim.run(1.0)
+    np.testing.assert_allclose(sim.joint_value(hinge), [1.0, 1.5], rtol=1e-4)
+    np.testing.assert_allclose(sim.joint_rate(hinge), [2.0, 3.0], rtol=2e-4)
+    np.testing.assert_allclose(sim.energies()["actuators"], [2.0, 4.5], rtol=1e-4)
+
+
+def test_a_stop_hit_at_10_m_per_s() -> None:
+    """Undamped it is passed by v sqrt(m/k) and left at the speed of the impact; damped by the equation of motion."""
+    b, slide = slider(10.0, limits=wf.Stop(-1.0, 0.2, stiffness=2e4))
+    sim = run(b, 5e-4)
+    travel = []
+    for _ in range(200):
+        sim.step()
+        travel.append(sim.joint_value(slide)[0])
+    assert max(travel) - 0.2 == pytest.approx(10.0 * np.sqrt(2.0 / 2e4), rel=1e-3)
+    assert sim.joint_rate(slide)[0] == pytest.approx(-10.0, abs=1e-8)
+    assert abs(sim.energies()["integrator"][0]) < 1e-8
+
+    def rate(t: float, y: np.ndarray) -> list[float]:
+        force = 2e4 * (y[0] - 0.2) + 60.0 * y[1] if y[0] > 0.2 else 0.0
+        return [y[1], -max(force, 0.0) / 2.0]
+
+    exact = solve_ivp(rate, (0, 0.1), [0.0, 10.0], rtol=1e-10, atol=1e-12, max_step=1e-4).y[:, -1]
+    errors = {}
+    for scheme in SCHEMES:
+        b, slide = slider(10.0, limits=wf.Stop(-1.0, 0.2, stiffness=2e4, damping=60.0))
+        sim = run(b, 5e-4, scheme)
+        sim.run(0.1)
+        errors[scheme] = abs(sim.joint_rate(slide)[0] - exact[1])
+        assert sim.energies()["spring_loss"][0] == pytest.approx(100.0 - exact[1] ** 2, rel=0.1)
+    assert max(errors.values()) < 0.5, errors
+    assert errors["energy_momentum"] < 0.02, errors
+    sim = wf.Simulation(b.finalize(device="cpu"), dt="auto", error=1e-4, integrator="bdf2", **TIGHT)
+    sim.run(0.1)
+    assert sim.joint_rate(slide)[0] == pytest.approx(exact[1], abs=0.02)
+
+
+def test_stops_by_default_take_most_of_the_speed() -> None:
+    """(lower, upper) alone: the inertia of both bodies sets stiffness and damping, at any step."""
+    for h, scheme in ((1e-3, "energy_momentum"), (2e-2, "backward_euler")):
+        b, _, hinge = rotor(5.0, limits=(-0.5, 0.3), com=0.5)
+        sim = run(b, h, scheme)
+        sim.step(round(0.2 / h))
+        assert abs(sim.joint_rate(hinge)[0]) < 1.0
+        assert abs(sim.joint_value(hinge)[0]) < 0.31
+    stop = b.description.springs[0]
+    assert stop.stiffness == pytest.approx((2.0 * np.pi / 0.01) ** 2)
+
+
+def test_friction_sticks_and_slips() -> None:
+    """A beam under its weight, of 4.905 N m: friction of 10 N m, twice the sudden load, holds it within the stick's
+    1e-4 rad, without creep; one of 3 N m is taken from the acceleration. A flywheel stops, and stays."""
+    for scheme in ("backward_euler", "energy_momentum"):
+        b, _, hinge = rotor(0.0, (0, -9.81, 0), com=0.5, friction=10.0)
+        sim = run(b, 1e-2, scheme, worlds=2)
+        sim.model.set_parameter("hinge.friction", [10.0, 3.0])
+        sim.step(10)
+        angles = sim.joint_value(hinge)
+        assert angles[1] == pytest.approx(-0.5 * 1.905 * 0.1**2, rel=0.1)
+        sim.step(100)
+        held = sim.joint_value(hinge)[0]
+        sim.step(100)
+        assert sim.joint_value(hinge)[0] == pytest.approx(held, rel=1e-3)
+        assert held == pytest.approx(-0.4905e-4, rel=1e-3)
+    b, _, hinge = rotor(1.0, friction=2.0)
+    sim = run(b, 2e-3)
+    sim.step(240)
+    assert sim.joint_value(hinge)[0] == pytest.approx(0.48 - 0.48**2, abs=1e-3)
+    sim.step(400)
+    assert sim.joint_value(hinge)[0] == pytest.approx(0.25, abs=2e-4)
+    assert abs(sim.joint_rate(hinge)[0]) < 1e-5
+    e = sim.energies()
+    assert e["spring_loss"][0] == pytest.approx(0.5, rel=1e-6)
+    assert abs(e["integrator"][0]) < 1e-9
+
+
+def test_undriven_angles_count_turns() -> None:
+    b, _, hinge = rotor(20.0, stiffness=0.25, damping=0.0)
+    sim = run(b, 5e-3)
+    seen = sim.observe("joint.hinge.angle", "joint.hinge.angle_rate")
+    sim.step(100)
+    exact = np.array([40.0 * np.sin(0.25), 20.0 * np.cos(0.25)])
+    got = np.array([sim.joint_value(hinge)[0], sim.joint_rate(hinge)[0]])
+    np.testing.assert_allclose(got, exact, rtol=2e-3)
+    np.testing.assert_allclose(seen.update().numpy()[0], got, rtol=1e-12)
+
+
+def test_controllers_hold_in_statics() -> None:
+    """The beam hangs down by its weight over kp; a torque alone does not hold it."""
+    b, _, hinge = rotor(0.0, (0, -9.81, 0), com=0.5)
+    b.add_actuator(hinge, 1.0)
+    with pytest.raises(wf.ModelError, match="1 unconstrained"):
+        wf.solve_static(b.finalize(device="cpu"))
+    b.add_actuator(hinge, wf.PD(100.0, 5.0, target=wf.Control("q", 1, initial=0.1)))
+    static = wf.solve_static(b.finalize(device="cpu"), load_steps=1, tol=1e-12)
+    y = static.joint_value(hinge)[0]
+    assert 100.0 * (0.1 - y) + 1.0 == pytest.approx(4.905 * np.cos(y), rel=1e-9)
+
+
+def mixed() -> tuple[Any, Any]:
+    """A pendulum on a slide with every law at work."""
+    b = wf.ModelBuilder(gravity=(0, 0, -9.81))
+    cart = b.add_rigid(wf.Box((0, 0, 0), (0.2, 0.1, 0.1)), mass=2.0, name="cart")
+    arm = b.add_rigid(wf.Box((0.25, 0, 0), (0.5, 0.05, 0.05)), mass=1.0, name="arm")
+    slide = b.add_joint("translational", parent=wf.GROUND, child=cart.at((0, 0, 0)), axis=(1, 0, 0), name="slide",
+                        limits=wf.Stop(-0.05, 0.02, stiffness=3e3, damping=5.0), friction=1.0)  # fmt: skip
+    hinge = b.add_joint("revolute", parent=cart.at((0, 0, 0)), child=arm.at((0, 0, 0)), axis=(0, 1, 0), name="hinge",
+                        limits=wf.Stop(-1.0, 0.4, stiffness=50.0, damping=0.1), friction=0.1, stiffness=1.0,
+                        damping=0.05)  # fmt: skip
+    b.add_actuator(slide, wf.PD(100.0, 3.0, target=wf.Control("q", 1), limit=15.0), name="pd")
+    b.add_actuator(hinge, ([0.0, 1.0], [0.5, -1.0]), name="torque")
+    return b, hinge
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_worlds_and_checkpoints_are_bit_equal(dtype: str, tmp_path: Any) -> None:
+    b, hinge = mixed()
+    sims = {n: wf.Simulation(b.finalize(device="cpu", dtype=dtype, worlds=n), dt=5e-3, integrator="bdf2")
+            for n in (1, 3)}  # fmt: skip
+    many, one = sims[3], sims[1]
+    many.model.set_parameter("pd.kp", [80.0, 100.0, 120.0])
+    many.controls["q"][:] = [0.1, 0.3, -0.2]
+    one.controls["q"][:] = 0.3
+    for sim in (many, one):
+        sim.step(40)
+    assert np.array_equal(many.state.displacement.numpy()[1], one.state.displacement.numpy()[0])
+    assert len({float(x) for x in many.joint_value(hinge)}) == 3
+    many.run(0.3, outputs=[wf.Checkpoint(str(tmp_path / "c.npz"))])
+    again = wf.Simulation(many.model, dt=5e-3, integrator="bdf2")
+    again.resume(str(tmp_path / "c.npz"))
+    for sim in (many, again):
+        sim.step(20)
+    for name, values in many.state.numpy().items():
+        assert np.array_equal(values, again.state.numpy()[name], equal_nan=True), name
+
+
+@pytest.mark.parametrize("scheme", ["backward_euler", "energy_momentum"])
+def test_forces_products_and_energies_agree(scheme: str) -> None:
+    """Forces are derivatives of the rows, products of forces; the discrete gradient takes what the ledger says."""
+    b, _ = mixed()
+    model = b.finalize(device="cpu")
+    for seed in range(4):
+        sim = wf.Simulation(model, dt=1e-2, integrator=scheme)
+        rng = np.random.default_rng(seed)
+        ctx, term, w = sim.stepper.ctx, model.terms.find(Springs), sim.stepper.work
+        shape = (1, model.slots, 3)
+        ctx.state.displacement.assign(rng.normal(scale=3e-2, size=shape))
+        w.q_tilde.assign(ctx.state.displacement.numpy())
+        w.step.dq_dv.fill_(5e-3 if scheme == "energy_momentum" else 1e-2)
+        w.step.a0.fill_(1.0)
+        active = wp.ones(1, dtype=wp.int32, device="cpu")
+        w.time_law_stage_values.assign(rng.normal(scale=0.2, size=w.time_law_stage_values.numpy().shape))
+        term.begin(ctx, active)
+        u = ctx.state.displacement.numpy()[0] + rng.normal(scale=1e-2, size=shape[1:])
+        d = rng.normal(size=u.shape)
+        start = ctx.state.displacement.numpy()[0]
+        before = term.stored_energy(ctx)["springs"][0]
+        term.begin(ctx, active)
+        near = [forces(sim, term, active, u + s * 1e-6 * d) for s in (-1, 1)]
+        f, _ = forces(sim, term, active, u)
+        w.p.assign(d[None])
+        term.product(ctx, w.p, active)
+        product = np.zeros_like(u)
+        np.add.at(product, term.entry_slot, w.pool_product.numpy()[0, term.offset :][: len(term.entry_slot)])
+        expected = (near[1][0] - near[0][0]) / 2e-6
+        assert np.abs(product - expected).max() < 1e-5 * np.abs(expected).max()
+        rows = term.energy_increments(ctx, active).numpy()[:, 0].sum(axis=1)
+        if scheme == "backward_euler":
+            assert (f * d).sum() == pytest.approx((near[1][1] - near[0][1]) / 2e-6, rel=1e-5)
+        else:
+            assert (f * (u - start)).sum() == pytest.approx(rows[0] - before + rows[1] - rows[2], rel=1e-9)
+            assert rows[1] > 0.0
+
+
+def test_bad_input_is_named() -> None:
+    b, part, hinge = rotor()
+    ball = b.add_joint("spherical", parent=wf.GROUND, child=part.at((0.1, 0, 0)), name="ball")
+    driven = b.add_joint("revolute", parent=wf.GROUND, child=part.at((0, 0, 0.1)), axis=(0, 0, 1), drive=0.5, name="d")
+    cases: list[tuple[Any, str]] = [
+        (lambda: wf.Stop(0.3, -0.3), "wrong way round"),
+        (lambda: wf.Stop(0.3, 0.3), "at one place"),
+        (lambda: wf.Stop(0.0, 1.0, stiffness=-1.0), "stiffness = -1.0"),
+        (lambda: wf.PD(-1.0), "kp = -1.0"),
+        (lambda: wf.PD(1.0, kd=np.nan), "kd = nan"),
+        (lambda: wf.PD(1.0, limit=0.0), "limit = 0.0"),
+        (lambda: b.add_actuator(ball, 1.0), "spherical joint has no angle"),
+        (lambda: b.add_actuator("hinge", 1.0), "no joint of this builder"),
+        (lambda: b.add_actuator(driven, 1.0), "is driven"),
+        (lambda: b.add_actuator(hinge, wf.PD(1.0, target=wf.Control("q", 3))), "control 'q' has size 3"),
+        (lambda: b.add_joint("revolute", parent=wf.GROUND, child=part.at((0, 0, 0)), axis=(0, 0, 1), friction=-2.0),
+         "friction = -2.0"),
+        (lambda: b.add_joint("revolute", parent=wf.GROUND, child=part.at((0, 0, 0)), axis=(0, 0, 1), limits=0.3),
+         "must be \\(lower, upper\\)"),
+        (lambda: b.add_joint("spherical", parent=wf.GROUND, child=part.at((0, 0, 0)), damping=1.0), "no angle"),
+    ]  # fmt: skip
+    for call, text in cases:
+        with pytest.raises(wf.ModelError, match=text):
+            call()
+    assert len(b.description.joints) == 4
+    assert not b.description.springs
+    b, _, hinge = rotor(limits=(-1.0, 1.0))
+    b.add_actuator(hinge, wf.PD(1.0), name="pd")
+    model = b.finalize(device="cpu")
+    for name, value, text in (("pd.kp", -1.0, "0 or more"), ("hinge.lower", 2.0, "below the upper")):
+        with pytest.raises(wf.ModelError, match=text):
+            model.set_parameter(name, value)

@@ -1,0 +1,124 @@
+"""Angle, travel and length of joints and their rates; turns of angles that no drive prescribes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from ..base.errors import ModelError
+from ..kernels.terms.constraints import ANGLE, DISTANCE
+from ..kernels.terms.joint_angles import joint_angle_kernels
+from ..kernels.terms.springs import ANGLE as ANGLE_COORDINATE
+from ..kernels.terms.springs import LENGTH, TRAVEL
+from ..model.joints import Joint, Vector
+from ..model.springs import coordinate_gradients
+
+if TYPE_CHECKING:
+    from ..model.model import Model
+    from .term import StepContext
+
+__all__ = ["JointAngles", "coordinate_vectors", "joint_value", "turn_source", "vector_tables"]
+
+
+class JointAngles:
+    """Joints with an angle that no drive prescribes: `state.joint_angle` [world, joint] counts their turns.
+
+    Attributes:
+        number: of each of them, by its index among all joints.
+    """
+
+    def __init__(self, model: Model, joints: Sequence[Joint]) -> None:
+        self.model = model
+        free = [(k, joint) for k, joint in enumerate(joints) if joint.angle and _drive_row(joint) < 0]
+        self.joints = [joint for _, joint in free]
+        self.number = {k: n for n, (k, _) in enumerate(free)}
+
+    def upload(self) -> None:
+        """Tables on the device."""
+        vectors = [v for joint in self.joints for v in joint.angle or ()]
+        self.tables = vector_tables(vectors, lambda values, dtype: self.model.array("constraints", values, dtype))
+
+    def register(self, ctx: StepContext) -> None:
+        """Register the angles with the state."""
+        if self.joints:
+            ctx.state.register("joint_angle", wp.float64, (len(self.joints),))
+
+    def count(self, ctx: StepContext, active: wp.array) -> None:
+        """Count turns to the positions of an accepted step."""
+        if self.joints:
+            args = [*self.tables, ctx.work.u, active, ctx.state.joint_angle]
+            kernel = joint_angle_kernels(self.model.dtype).count_turns
+            ctx.launch(kernel, (self.model.worlds, len(self.joints)), args)
+
+    def modules(self) -> set[wp.Module]:
+        """Modules launched by `count`."""
+        return {joint_angle_kernels(self.model.dtype).count_turns.module} if self.joints else set()
+
+
+def vector_tables(vectors: Sequence[Vector], array: Any) -> list[wp.array]:
+    """Start, slots, weights and reference values of vectors, by `array(values, dtype)`."""
+    entries = [vector.entries() for vector in vectors]
+    start = np.concatenate([[0], np.cumsum([len(slots) for slots, _, _ in entries])])
+    slot = np.concatenate([*(slots for slots, _, _ in entries), np.zeros(1)])
+    weight = np.concatenate([*(weights for _, weights, _ in entries), np.zeros(1)])
+    values = np.array([vector.value for vector in vectors], dtype=float).reshape(-1, 3)
+    kinds = ((start, wp.int32), (slot, wp.int32), (weight, wp.float64), (values, wp.vec3d))
+    return [array(column, dtype) for column, dtype in kinds]
+
+
+def coordinate_vectors(joint: Joint) -> dict[str, list[Vector]]:
+    """Vectors of a joint that define its "angle" (three), "travel" (two) and "length" (one), if any."""
+    length = [joint.rows[0].a] if joint.rows[0].kind == DISTANCE else []
+    has = {"angle": list(joint.angle or ()), "travel": list(joint.travel or ()), "length": length}
+    return {name: vectors for name, vectors in has.items() if vectors}
+
+
+def _drive_row(joint: Joint) -> int:
+    """Row of a joint, from its first, that drives its angle, or -1."""
+    return next((k for k, row in enumerate(joint.rows) if row.kind == ANGLE), -1)
+
+
+def turn_source(tables: Any, joint: Joint) -> int:
+    """Source of the turns of an angle: the row of its drive, -2 - its number in `JointAngles`, or -1."""
+    row = _drive_row(joint)
+    if row >= 0:
+        return int(tables.rows_of[joint.index][row])
+    return -2 - tables.angles.number[joint.index] if joint.index in tables.angles.number else -1
+
+
+def joint_value(tables: Any, joint: Joint, what: str | None, state: Any, *, rate: bool) -> np.ndarray:
+    """Joint coordinate (worlds,): "angle" (rad), "travel" or "length" (m), or its rate; ModelError if undefined."""
+    has = coordinate_vectors(joint)
+    what = what or next(iter(has), None)
+    if what not in has:
+        raise ModelError(f"joint {joint.name!r}: a {joint.kind} joint has no {what or 'angle, travel or length'}")
+    turns, source = tables.targets(state), turn_source(tables, joint)
+    if source < -1:
+        source = -2 - source
+        turns = state.joint_angle.numpy() if "joint_angle" in state.names else np.zeros((state.worlds, source + 1))
+    entries = [vector.entries() for vector in has[what]]
+    out = []
+    for world, (u, v) in enumerate(zip(state.displacement.numpy(), state.velocity.numpy())):
+        vectors = [x.value + w @ u[slots].astype(float) for x, (slots, w, _) in zip(has[what], entries)]
+        if rate:
+            if what == "angle":
+                vectors, of = [vectors[0], vectors[2], vectors[1]], [entries[0], entries[2], entries[1]]
+            else:
+                of = entries
+            kind = {"angle": ANGLE_COORDINATE, "travel": TRAVEL, "length": LENGTH}[what]
+            gradient = coordinate_gradients(kind, np.array(vectors))[0]
+            out.append(sum(g @ (w @ v[slots].astype(float)) for g, (slots, w, _) in zip(gradient, of)))
+        elif what == "length":
+            out.append(np.linalg.norm(vectors[0]))
+        elif what == "travel":
+            out.append(vectors[0] @ vectors[1])
+        else:
+            a, a2, b = vectors
+            angle = np.arctan2(b @ a2, b @ a)
+            if source >= 0:
+                angle += 2.0 * np.pi * np.round((turns[world, source] - angle) / (2.0 * np.pi))
+            out.append(angle)
+    return np.array(out, dtype=float)
