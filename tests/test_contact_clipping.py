@@ -178,9 +178,8 @@ def slid(
     return mass @ sim.state.velocity.numpy()[0][block.slots] / mass.sum() / speed
 
 
-@pytest.mark.parametrize("yaw", [17.0, -35.0])
 @pytest.mark.parametrize("kind", ["box", "mesh", "cylinder", "body"])
-@pytest.mark.parametrize("clipping", [False, True])
+@pytest.mark.parametrize(("clipping", "yaw"), [(False, 17.0), (True, -35.0)])
 @pytest.mark.parametrize("device", DEVICES)
 def test_a_block_turned_about_the_vertical_slides_onto_a_solid(kind, yaw, clipping, device):
     """Its flanks face the side face in part: 0.67 of the speed was left on a body, 0.99 on a box."""

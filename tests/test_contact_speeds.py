@@ -52,7 +52,8 @@ def impact(E, v, h, other, steps=8):
 
 CASES = [
     (E, share, h, other)
-    for other in THIN for E in (1e4, 1e6, 1e8, 1e11) for share in (0.03, 0.3) for h in (1e-4, 1e-3, 1e-2)
+    for other in THIN for E in (1e4, 1e6, 1e8, 1e11)
+    for share, h in ((0.03, 1e-2), (0.3, 1e-4), (0.3, 1e-3), (0.3, 1e-2))
 ]  # fmt: skip
 
 
@@ -117,9 +118,11 @@ def test_faster_impacts_are_refused_and_the_element_named(share, h, other):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("integrator", ["backward_euler", "generalized_alpha"])
-@pytest.mark.parametrize("h", [1e-4, 1e-3, 1e-2])
 @pytest.mark.parametrize("kind", ["sheet", "box"])
+@pytest.mark.parametrize(
+    ("h", "integrator"),
+    [(1e-4, "backward_euler"), (1e-3, "generalized_alpha"), (1e-2, "backward_euler"), (1e-2, "generalized_alpha")],
+)
 def test_sheets_and_boxes_of_2_mm_stop_a_cube_at_100_m_per_s(kind, h, integrator):
     """Both free, E = 1e8 Pa; a step of 10 ms is 500 thicknesses."""
     b = wf.ModelBuilder(gravity=(0, 0, 0))
