@@ -28,15 +28,16 @@ def folder(tmp_path, monkeypatch):
 def test_run_writes_every_output_and_says_so(folder, capfd):
     words = [*SHORT, "--usd", "a.usdc", "--vtu", "series", "--png", "a.png", "--gif", "a.gif", "--checkpoint", "a.npz"]
     before = files(folder)
-    code, out, err = run(capfd, *words, "--json", "a.json", "--fps", "500")
+    code, out, err = run(capfd, *words, "--html", "a.html", "--json", "a.json", "--fps", "500")
     assert (code, err) == (0, "")
-    for name in ("a.usdc", "a.png", "a.gif", "a.npz", "a.json", "series"):
+    for name in ("a.usdc", "a.png", "a.gif", "a.html", "a.npz", "a.json", "series"):
         assert name in out
         assert (folder / name).exists()
     for word in ("cantilever", "cells=2", "done at t = 0.01 s", "5 steps", "probe tip"):
         assert word in out
     assert validate_usd("a.usdc") == []
-    assert {n.rpartition(".")[2] for n in files(folder) - before} == {"usdc", "vtu", "pvd", "png", "gif", "npz", "json"}
+    kinds = {"usdc", "vtu", "pvd", "png", "gif", "html", "npz", "json"}
+    assert {n.rpartition(".")[2] for n in files(folder) - before} == kinds
 
 
 def test_summary_has_the_fixed_keys(folder, capfd):

@@ -128,7 +128,19 @@ def test_pictures_take_field_view_and_range(folder, capfd, monkeypatch):
 
     monkeypatch.setattr(animation, "draw_labels", note)
     look = ["--field", "displacement", "--range", "-1e-3,2e-3", "--view", "-60,10", "--quiet"]
-    assert run(capfd, *SHORT, "--png", "a.png", "--gif", "a.gif", "--usd", "a.usdc", *look)[0] == 0
+    assert run(capfd, *SHORT, "--png", "a.png", "--gif", "a.gif", "--usd", "a.usdc", "--html", "a.html", *look)[0] == 0
+    text = (folder / "a.html").read_text()
+    page = json.loads(text.split('id="header" type="application/json">')[1].partition("</script>")[0])
+    assert (page["range"], page["view"], page["fields"][page["color"]]["name"]) == (
+        [-1e-3, 2e-3],
+        [-60, 10],
+        "displacement",
+    )
+    assert {mark["kind"] for mark in page["markers"]} == {"support", "probe"}
+    assert [plot["title"] for plot in page["plots"]] == ["probe tip: displacement", "energy"]
+    facts = dict(page["facts"])
+    assert facts["command"].startswith("warpfea run cantilever --device cpu")
+    assert {"cells", "warp", "simulation"} <= facts.keys()
     assert {(bar[0], bar[1], bar[2]) for bar in shown} == {(-1e-3, 2e-3, "displacement")}
     shown.clear()
     render = ["render", "a.usdc", "-o", "b.png", "--quiet"]

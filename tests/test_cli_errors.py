@@ -270,16 +270,18 @@ def test_a_resumed_run_goes_on_with_its_animation(folder, capfd):
     assert (folder / "o.usdc").read_bytes() == before
 
 
-def test_a_gif_is_not_overwritten_by_its_second_half(folder, capfd):
-    assert run(capfd, *SHORT, "--checkpoint", "c.npz", "--quiet", "--gif", "o.gif")[0] == 0
-    before = (folder / "o.gif").read_bytes()
+@pytest.mark.parametrize("kind", ["gif", "html"])
+def test_a_file_is_not_overwritten_by_its_second_half(folder, capfd, kind):
+    name, option = f"o.{kind}", f"--{kind}"
+    assert run(capfd, *SHORT, "--checkpoint", "c.npz", "--quiet", option, name)[0] == 0
+    before = (folder / name).read_bytes()
     rest = [*SHORT[:-1], "0.014", "--resume", "c.npz", "--quiet"]
-    code, _, err = run(capfd, *rest, "--gif", "o.gif")
+    code, _, err = run(capfd, *rest, option, name)
     assert code == 2
-    assert "o.gif" in err
+    assert name in err
     assert "another name" in err
-    assert (folder / "o.gif").read_bytes() == before
-    assert run(capfd, *rest, "--gif", "rest.gif")[0] == 0
+    assert (folder / name).read_bytes() == before
+    assert run(capfd, *rest, option, f"rest.{kind}")[0] == 0
 
 
 @pytest.mark.skipif(not pathlib.Path("/proc").is_dir(), reason="no folder that takes no files")

@@ -36,6 +36,7 @@ PAGES += [
     ROOT / "warpfea/builder/SPRINGS.md",
     ROOT / "warpfea/simulation/FIELDS.md",
     ROOT / "warpfea/builder/ACTUATORS.md",
+    ROOT / "warpfea/outputs/PAGE.md",
     ROOT / "warpfea/simulation/LEARNING.md",
     ROOT / "warpfea/sweeps/SWEEPS.md",
 ]

@@ -42,6 +42,7 @@ from .model.shapes import Box, Capsule, Cylinder, HalfSpace, Sphere  # noqa: E40
 from .model.state import State  # noqa: E402
 from .model.triangle_mesh import TriMesh  # noqa: E402
 from .outputs import by_suffix as _by_suffix  # noqa: E402, F401
+from .outputs.html import HTMLWriter  # noqa: E402
 from .outputs.render import GIFWriter, PNGWriter  # noqa: E402
 from .outputs.usd import USDWriter  # noqa: E402
 from .outputs.vtk import VTUWriter  # noqa: E402
@@ -57,12 +58,12 @@ from .time_laws import Control, Rotation  # noqa: E402
 __all__ = [
     "GROUND", "PD", "SVK", "Body", "Box", "Buckling", "CapacityError", "Capsule", "Checkpoint", "CheckpointError",
     "Circle", "ConstraintError", "Control", "ConvergenceError", "Cylinder", "Design", "ElementSet", "EnergyMomentum",
-    "Error", "GIFWriter", "GeneralizedAlpha", "HalfSpace", "Jacobi", "Joint", "KelvinVoigt", "MaterialPoint",
-    "MeshError", "MeshWarning", "Model", "ModelBuilder", "ModelError", "ModelWarning", "Modes", "MooneyRivlin",
-    "NeoHookean", "NewtonPCG", "NodeSet", "Observations", "OutputError", "PNGWriter", "PenetrationError", "Rectangle",
-    "Reference", "Rotation", "Section", "Simulation", "Sphere", "StabilityError", "StabilityWarning", "State",
-    "StepReport", "Stop", "StudyOptions", "SurfaceSet", "TriMesh", "Tube", "USDWriter", "VTUWriter", "__version__",
-    "buckling", "fit", "mesh", "modes", "scene", "solve_static", "spline", "study", "sweep",
+    "Error", "GIFWriter", "GeneralizedAlpha", "HTMLWriter", "HalfSpace", "Jacobi", "Joint", "KelvinVoigt",
+    "MaterialPoint", "MeshError", "MeshWarning", "Model", "ModelBuilder", "ModelError", "ModelWarning", "Modes",
+    "MooneyRivlin", "NeoHookean", "NewtonPCG", "NodeSet", "Observations", "OutputError", "PNGWriter",
+    "PenetrationError", "Rectangle", "Reference", "Rotation", "Section", "Simulation", "Sphere", "StabilityError",
+    "StabilityWarning", "State", "StepReport", "Stop", "StudyOptions", "SurfaceSet", "TriMesh", "Tube", "USDWriter",
+    "VTUWriter", "__version__", "buckling", "fit", "mesh", "modes", "scene", "solve_static", "spline", "study", "sweep",
 ]  # fmt: skip
 
 

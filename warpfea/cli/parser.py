@@ -178,8 +178,9 @@ def _add_run(commands: Any) -> None:
         ("--png", Kind.ONCE, "FILE", "picture"),
         ("--png-time", float, "S", "time of the picture"),
         ("--gif", Kind.ONCE, "FILE", "animation"),
+        ("--html", Kind.ONCE, "FILE", "page for a browser: turns, plays and cuts the model, with its records"),
         *PICTURE_OPTIONS,
-        ("--fps", positive_number, "N", "frames per simulated second of --usd and --vtu"),
+        ("--fps", positive_number, "N", "frames per simulated second of --usd, --vtu and --html"),
         ("--speed", positive_number, "X", "simulated seconds per second of --gif"),
         ("--json", Kind.ONCE, "FILE", "summary of the run; - for stdout"),
         ("--checkpoint", Kind.ONCE, "FILE", "state (.npz), written every --every steps and at the end"),
@@ -220,12 +221,15 @@ def _add_render(commands: Any) -> None:
     to = commands.add_parser(
         "render",
         help="draw a USD file written by warpfea",
-        description="Draw a USD file written by warpfea to .png or .gif, on the CPU, without a display.",
+        description="Draw a USD file written by warpfea to .png or .gif, on the CPU, without a display, or to an .html "
+        "page.",
         epilog="examples:\n  warpfea render hook.usdc -o hook.png --time 0.1\n"
         "  warpfea render hook.usdc -o hook.gif --speed 0.1 --field displacement",
     )
     to.add_argument("file", help="the USD file")
-    to.add_argument("-o", "--output", required=True, metavar="FILE", help="picture (.png) or animation (.gif)")
+    to.add_argument(
+        "-o", "--output", required=True, metavar="FILE", help="picture (.png), animation (.gif), page (.html)"
+    )
     add_options(
         to,
         ("--time", float, "S", "time of a .png (default: the last)"),

@@ -2,6 +2,7 @@
 
 import argparse
 import pathlib
+import shlex
 import sys
 import time as clock
 from collections.abc import Sequence
@@ -28,6 +29,7 @@ OUTPUT_SUFFIXES: dict[str, Sequence[str]] = {
     "usd": (".usdc", ".usda", ".usd"),
     "png": (".png",),
     "gif": (".gif",),
+    "html": (".html", ".htm"),
     "json": (".json",),
     "checkpoint": CHECKPOINT_SUFFIXES,
 }
@@ -137,11 +139,11 @@ def _check_analysis(options: argparse.Namespace) -> None:
 
 
 OPTION_OUTPUTS = {
-    "field": ("pictures", ("png", "gif", "usd")),
-    "range": ("pictures", ("png", "gif", "usd")),
-    "view": ("pictures", ("png", "gif")),
+    "field": ("pictures", ("png", "gif", "usd", "html")),
+    "range": ("pictures", ("png", "gif", "usd", "html")),
+    "view": ("pictures", ("png", "gif", "html")),
     "png_time": ("a picture", ("png",)),
-    "fps": ("animations", ("usd", "vtu")),
+    "fps": ("animations", ("usd", "vtu", "html")),
     "speed": ("an animation", ("gif",)),
     "every": ("checkpoints", ("checkpoint",)),
 }
@@ -154,11 +156,13 @@ def _check_output_options(options: argparse.Namespace) -> None:
         if getattr(options, name) is not None and not any(getattr(options, use) for use in uses):
             option, outputs = name.replace("_", "-"), " or ".join(f"--{use}" for use in uses)
             raise UsageError(f"--{option} is for {what}: give {outputs} too")
-    if options.resume and options.gif and pathlib.Path(options.gif).exists():
-        raise UsageError(
-            f"--gif {options.gif}: already exists, and a GIF can't be extended after --resume: choose another name, or "
-            "render the --usd file with warpfea render"
-        )
+    for name in ("gif", "html"):
+        file = getattr(options, name)
+        if options.resume and file and pathlib.Path(file).exists():
+            raise UsageError(
+                f"--{name} {file}: already exists, and can't be extended after --resume: choose another name, or "
+                "render the --usd file with warpfea render"
+            )
 
 
 def _check_times(options: argparse.Namespace, source: Source, t_end: float) -> None:
@@ -210,6 +214,13 @@ def make_outputs(options: argparse.Namespace, source: Source, t_end: float) -> l
 
         speed = options.speed or (STATIC_SPEED if options.static else source.scene.speed)
         out.append(GIFWriter(options.gif, speed=speed, progress=show_progress(options), **picture_options))
+    if options.html:
+        from ..outputs.html import HTMLWriter
+
+        header: dict[str, Any] = {"title": source.label, "parameters": source.parameters}
+        header["command"] = shlex.join(["warpfea", *options.words])
+        header |= {name: value for name, value in picture_options.items() if name != "field"}
+        out.append(HTMLWriter(options.html, fps=fps, color=field, **header))
     if options.checkpoint:
         out.append(Checkpoint(options.checkpoint, every=options.every or CHECKPOINT_STEPS))
     return out
@@ -217,7 +228,7 @@ def make_outputs(options: argparse.Namespace, source: Source, t_end: float) -> l
 
 def _output_files(options: argparse.Namespace) -> dict[str, pathlib.Path]:
     """File that proves an output was written, by option; of a series its index."""
-    names = ("usd", "vtu", "png", "gif", "checkpoint", "json")
+    names = ("usd", "vtu", "png", "gif", "html", "checkpoint", "json")
     files = {name: pathlib.Path(getattr(options, name)) for name in names if getattr(options, name) not in (None, "-")}
     if "vtu" in files:
         files["vtu"] /= f"{files['vtu'].resolve().name}.pvd"
@@ -235,7 +246,11 @@ def _file_stamp(file: pathlib.Path) -> tuple[int, int] | None:
 
 def _written_files(options: argparse.Namespace, before: dict[pathlib.Path, Any]) -> list[str]:
     """Outputs written by this run, with their properties; `before`: file identities before it."""
-    notes: dict[str, Any] = {"usd": "validated, for usdview, Blender, Omniverse", "vtu": "for ParaView"}
+    notes: dict[str, Any] = {
+        "usd": "validated, for usdview, Blender, Omniverse",
+        "vtu": "for ParaView",
+        "html": "for any browser",
+    }
     texts = []
     for name, file in _output_files(options).items():
         if _file_stamp(file) not in (None, before[file]):

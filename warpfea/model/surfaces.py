@@ -31,11 +31,13 @@ class Skin:
         triangles: (T, 3) indices of the skin's points, outward by the right hand.
         slot_weights: sparse (points, slots): skin positions from slot values.
         node_weights: sparse (points, mesh nodes x samples): skin fields from fields at the nodes' samples.
+        edges: (E, 2) indices of the points along the edges of elements.
     """
 
     triangles: np.ndarray
     slot_weights: sp.csr_matrix
     node_weights: sp.csr_matrix
+    edges: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,15 +211,19 @@ def _sparse_weights(values: np.ndarray, columns: np.ndarray, width: int) -> sp.c
 def make_skin(body: Discretisation) -> Skin:
     """Outer faces as triangles; faces of beams and shells share no points, for sharp edges."""
     points = _PointMerger(body)
-    triangles = []
+    triangles, edges = [], []
     for face, rows in _rows_by_local_face(body.boundary):
         corners = body.family.faces[face]
         ab, cut = _subdivide(len(corners), body.family.face_divisions[face])
         xi, _ = body.family.face_points(face, ab)
         number = points.add(body.boundary[rows, 0], xi, 0 if body.family.solid else face + 1)
         triangles.append(number[:, cut].reshape(-1, 3))
+        sides = np.sort(cut[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        outline, count = np.unique(sides, axis=0, return_counts=True)
+        edges.append(number[:, outline[count == 1]].reshape(-1, 2))
     new, slot_weights, node_weights = points.merge()
-    return Skin(new[np.concatenate(triangles)], slot_weights, node_weights)
+    outlines = np.unique(np.sort(new[np.concatenate(edges)], axis=1), axis=0)
+    return Skin(new[np.concatenate(triangles)], slot_weights, node_weights, outlines)
 
 
 def make_drawing(body: Discretisation) -> Drawing:

@@ -1,9 +1,9 @@
-"""A perceptually even colour map and the conversions between display (sRGB) and linear colours."""
+"""Colour maps and the conversions between display (sRGB) and linear colours."""
 
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["COLOR_TABLE", "map_colors", "to_linear", "to_srgb"]
+__all__ = ["COLOR_TABLE", "hex_tables", "map_colors", "to_linear", "to_srgb"]
 
 # 33 sRGB entries from dark violet over teal to yellow. The hues are those of the viridis family; the entries
 # were re-spaced so that CIELAB lightness rises by 1.9 to 2.8 per entry and the OKLab distance of neighbours
@@ -17,6 +17,24 @@ COLOR_TABLE: npt.NDArray[np.float64] = np.array(
     [[int(entry[k : k + 2], 16) / 255.0 for k in (0, 2, 4)] for entry in _HEX_COLORS.split()]
 )
 """(33, 3) sRGB components in [0, 1]."""
+# cividis: Nunez, Anderton and Renslow 2018; coolwarm: Moreland 2009; by their usual tables
+_OTHER_HEX_COLORS = {
+    "cividis": (
+        "00224e 00285b 002e6a 053371 1a386f 273e6e 32436d 3b496c 434e6c 4b546c 535a6d "
+        "5a5f6e 61656f 686a71 6f7073 767676 7d7c78 848279 8c8878 938e78 9b9476 a39a74 "
+        "aba072 b4a76f bcae6c c4b468 cdbb63 d5c25e dec958 e7d150 f0d846 f9e03a fee838"
+    ),
+    "coolwarm": (
+        "3b4cc0 445acc 4e68d8 5875e1 6282ea 6c8ff1 779af7 82a6fb 8db0fe 98b9ff a3c2fe "
+        "aec9fc b9d0f9 c3d5f4 ccd9ed d5dbe5 dddcdc e5d8d1 ecd3c5 f1ccb8 f5c4ac f7ba9f "
+        "f7b093 f6a586 f4987a f08b6e eb7d62 e46e56 dd5f4b d44e41 ca3b37 be242e b40426"
+    ),
+}
+
+
+def hex_tables() -> dict[str, str]:
+    """33 colours of each map from low to high, as six hexadecimal digits, by name."""
+    return {"viridis": _HEX_COLORS, **_OTHER_HEX_COLORS}
 
 
 def to_linear(srgb: npt.ArrayLike) -> npt.NDArray[np.float64]:

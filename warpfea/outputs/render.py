@@ -16,11 +16,12 @@ from ..base.checks import is_count, is_number
 from ..base.errors import ModelError
 from ..base.lazy import pxr
 from ..base.names import did_you_mean
-from ..base.writer import Output, check_target
+from ..base.writer import Output, check_target, write_atomically
 from .animation import Animation, Frame
 from .frames import DrawnSurface, FrameClock, check_colors, check_fields, field_label, frame_time, is_static
 from .raycaster import DEFAULT_VIEW, Camera, Renderer, check_view
 from .usd_check import error_text
+from .usd_page import usd_page
 
 __all__ = ["Camera", "GIFWriter", "PNGWriter", "Renderer", "render_usd"]
 
@@ -203,12 +204,13 @@ def render_usd(
     ground: bool = True,
     progress: bool | None = None,
 ) -> pathlib.Path:
-    """Draw a USD file of :class:`warpfea.USDWriter` to `out` (.png or .gif) and return that path.
+    """Draw a USD file of :class:`warpfea.USDWriter` to `out` (.png, .gif or .html) and return that path.
 
     Args:
         field: a field of the file, or "none" for grey; None: the field of its colours.
         time: of the state drawn to a PNG (s); None: the last in the file.
-        fps, speed, max_frames: of a GIF, which spans the whole file; more frames are spread over the span.
+        fps, speed, max_frames: of a GIF, which spans the whole file; more frames are spread over the span. A page
+            holds the frames of the file, every n-th one above max_frames.
         color_range: (low, high) of the colours; None: those of the file, or the extremes of the run.
         size: (width, height), default (960, 540) for PNG and (640, 360) for GIF.
 
@@ -216,13 +218,17 @@ def render_usd(
         ModelError: an option out of range, a file that is missing or not one of warpfea, no such field or time.
         OutputError: `out` can't be written, or has an unknown suffix.
     """
-    target = check_target(out, (".png", ".gif"))
+    target = check_target(out, (".png", ".gif", ".html"))
     animated = target.suffix.lower() == ".gif"
     size = _checked_size(size or ((640, 360) if animated else (960, 540)))
     check_rates(fps, speed, max_frames)
     color_range = check_colors(color_range)
     view = check_view(view)
     source = _StageReader(pathlib.Path(path))
+    if target.suffix.lower() == ".html":
+        text = usd_page(source, field, view, color_range, max_frames).html()
+        write_atomically(target, lambda to: to.write_text(text, encoding="utf-8"))
+        return target
     if animated:
         count = int(np.floor((source.end - source.start) * fps / speed * (1 + 1e-9))) + 1
         times = source.start + np.arange(count) * speed / fps
@@ -268,13 +274,18 @@ class _StageReader:
         self.rate = self.stage.GetTimeCodesPerSecond()
         self.start, self.end = self.stage.GetStartTimeCode() / self.rate, self.stage.GetEndTimeCode() / self.rate
 
-    def animation(self, field: str | None, times: Floats) -> Animation:
-        """Frames at `times` (s); USD interpolates linearly between samples."""
+    def field_name(self, field: str | None) -> str | None:
+        """Name of the field drawn, None for grey. ModelError for one that the file lacks."""
         name = None if field == "none" else field or self.metadata["color"] or None
         if name is not None and name not in self.metadata["fields"]:
             have = ", ".join(self.metadata["fields"]) or "none"
             hint = did_you_mean(name, self.metadata["fields"])
             raise ModelError(f"{self.path}: has no field {name!r}; fields: {have}{hint}")
+        return name
+
+    def animation(self, field: str | None, times: Floats) -> Animation:
+        """Frames at `times` (s); USD interpolates linearly between samples."""
+        name = self.field_name(field)
         triangles, point_offset, body_points, plane_squares = [], 0, 0, []
         for k, mesh in enumerate(self.meshes + self.obstacles):
             counts = np.asarray(mesh.GetFaceVertexCountsAttr().Get())

@@ -5,7 +5,8 @@ Layout of a stage (metres, kilograms):
     /World                          Xform, default prim; customData["warpfea"]: contents
     /World/world_0000               Xform; its translate lays the worlds out on a grid
     /World/world_0000/<body>        Xform; a double-precision translate per frame, the centre of the body
-    /World/world_0000/<body>/skin   Mesh; points, normals, extent and fields per frame, about that centre
+    /World/world_0000/<body>/skin   Mesh; points, normals, extent and fields per frame, about that centre;
+                                    warpfea:edges, pairs of points along edges of elements
     /World/world_0000/<collider>        Xform; translate and orient, per frame of one that moves
     /World/world_0000/<collider>/shape  Mesh in the shape's own axes; customData["warpfea:collider"]: its kind;
     of a half-space a square /World/Camera /World/Sky /World/Sun
@@ -33,7 +34,7 @@ from .normals import vertex_normals
 from .obstacles import unique_names
 from .usd_check import error_text, validate_usd
 from .usd_extend import read_existing
-from .usd_obstacles import ObstaclePrims, define_mesh
+from .usd_obstacles import EDGES, ObstaclePrims, define_mesh
 
 __all__ = ["SCHEMA", "USDWriter", "validate_usd"]
 
@@ -160,6 +161,9 @@ class USDWriter(Output):
                 xform = pxr.UsdGeom.Xform.Define(self._stage, place.GetPath().AppendChild(name))
                 xform.GetPrim().SetDisplayName(body.name)
                 mesh = define_mesh(self._stage, xform.GetPath().AppendChild("skin"), body.skin.triangles)
+                edges = np.asarray(getattr(body.skin, "edges", np.zeros((0, 2))), dtype=np.int32)
+                attribute = mesh.GetPrim().CreateAttribute(EDGES, pxr.Sdf.ValueTypeNames.Int2Array, True)
+                attribute.Set(pxr.Vt.Vec2iArray.FromNumpy(np.ascontiguousarray(edges)))
                 meshes.append(_MeshPrim(mesh, xform.AddTranslateOp(pxr.UsdGeom.XformOp.PrecisionDouble), self.fields))
         self._obstacles = ObstaclePrims(self._stage, self._surface, names)
         self._obstacles.define()

@@ -15,9 +15,11 @@ from .obstacles import OBSTACLE_COLOR, unique_names
 if TYPE_CHECKING:
     from .frames import DrawnSurface
 
-__all__ = ["ObstaclePrims", "define_mesh"]
+__all__ = ["EDGES", "ObstaclePrims", "define_mesh"]
 
 COLLIDER_KEY = "warpfea:collider"
+EDGES = "warpfea:edges"
+"""Attribute of a body's mesh: pairs of points along edges of elements."""
 
 
 def define_mesh(stage: Any, path: Any, triangles: np.ndarray) -> Any:

@@ -1,0 +1,94 @@
+"""Marks of supports, joints, loads and probes: where they are drawn, and which way a load acts."""
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..model.surfaces import reference_points
+
+__all__ = ["Markers"]
+
+Array = npt.NDArray[Any]
+SHOWN_POINTS = 24
+"""Number of points drawn of a support or a pressure."""
+SHOWN_JOINTS = 100
+"""Number of joints drawn of a model."""
+
+
+class Markers:
+    """The marks of a simulation.
+
+    Supports and pressures are at points of the drawn surface. Joints, loads and probes have points of their own, linear
+    in the slots, that are evaluated at each frame.
+
+    Attributes:
+        on_surface: (kind, name, index of the body, its points); kind "support" or "pressure".
+        own: (kind, name) of each point of its own; kind "joint", "load" or "probe".
+    """
+
+    def __init__(self, sim: Any, bodies: list[Any]) -> None:
+        description = sim.model.description
+        self.on_surface: list[tuple[str, str, int, Array]] = []
+        self.own: list[tuple[str, str]] = []
+        self._points: list[tuple[Array, Array, Array]] = []  # value at rest, slots, weights
+        self._laws: list[Any] = []
+        drawn = {id(body): k for k, body in enumerate(bodies)}
+        for support in getattr(description, "supports", ()):
+            if id(support.body) in drawn:
+                at = support.body.reference[support.slots] + support.body.origin
+                at = at[support.body.slot_kind[support.slots] == 0]
+                fixed = support.law is None and support.node_laws is None and support.rotation is None
+                name = f"{'clamp' if fixed else 'drive'} of {support.body.name}"
+                self._mark_surface("support", name, drawn[id(support.body)], support.body, at)
+        for pressure in getattr(description, "pressures", ()):
+            body = pressure.surface.body
+            if id(body) in drawn and body.family.solid:
+                at = body.mesh.points[pressure.surface.nodes].mean(axis=1)
+                self._mark_surface("pressure", f"pressure on {body.name}", drawn[id(body)], body, at)
+        joints = [joint for joint in getattr(description, "joints", ()) if joint.kind != "rigid"]
+        for joint in joints[:SHOWN_JOINTS]:
+            slots, weights, _ = joint.anchor.entries()
+            self._mark("joint", f"{joint.name} ({joint.kind})", joint.anchor.value, slots, weights)
+        for load in getattr(description, "dead_loads", ()):
+            share = np.abs(np.asarray(load.weights, dtype=float)).reshape(len(load.slots), -1).sum(axis=1)
+            share[load.body.slot_kind[load.slots] != 0] = 0.0
+            if share.sum() > 0.0:
+                share /= share.sum()
+                at = share @ (load.body.reference[load.slots] + load.body.origin)
+                self._mark(
+                    "load", f"{load.name} on {load.body.name}", at, load.body.slot_offset + load.slots, share, load.law
+                )
+        for probe in getattr(description, "probes", ()):
+            self._mark("probe", probe.name, probe.X, probe.body.slot_offset + probe.slots, probe.weights)
+
+    def _mark_surface(self, kind: str, name: str, index: int, body: Any, at: Array) -> None:
+        """Mark the drawn points next to some of the places (n, 3)."""
+        from scipy.spatial import cKDTree
+
+        if len(at):
+            some = at[np.unique(np.linspace(0, len(at) - 1, SHOWN_POINTS).astype(int))]
+            skin = reference_points(body, body.skin.slot_weights)
+            self.on_surface.append((kind, name, index, np.unique(cKDTree(skin).query(some)[1])))
+
+    def _mark(self, kind: str, name: str, value: Array, slots: Array, weights: Array, law: Any = None) -> None:
+        self.own.append((kind, name))
+        self._points.append((np.asarray(value, dtype=float), slots, np.asarray(weights, dtype=float)))
+        self._laws.append(law)
+
+    def points(self, sim: Any) -> Array:
+        """(B, n, 3) current places of the marks of their own, m."""
+        u = sim.state.displacement.numpy() if self.own else np.zeros((int(sim.model.worlds), 0, 3))
+        places = [X + np.einsum("s,bsk->bk", w, u[:, slots].astype(float)) for X, slots, w in self._points]
+        return np.stack(places, axis=1) if places else u
+
+    def vectors(self, time: float, factor: float = 1.0) -> list[Array | None]:
+        """Force of each mark of its own at a time (s), times a load factor; None unless samples give it."""
+        return [None if law is None else _sampled(law, time, factor) for law in self._laws]
+
+
+def _sampled(law: Any, time: float, factor: float) -> Array | None:
+    """Value (3,) of a law given by samples; None for a function or a control."""
+    if not len(law.times) or law.scalar:
+        return None
+    return np.array([np.interp(time, law.times, column) for column in np.asarray(law.values).T]) * factor
