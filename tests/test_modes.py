@@ -207,6 +207,8 @@ def test_a_mode_is_written_and_drawn(tmp_path):
     value = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("displacement")
     assert max(value.Get(t).__len__() and max(value.Get(t)) for t in value.GetTimeSamples()) == pytest.approx(0.2, 1e-3)
     found.write(tmp_path / "mode.png", size=(0.1))
+    found.write(tmp_path / "mode.html", mode=2, size=0.2)
+    assert f"<title>{found.label(2)}</title>" in (tmp_path / "mode.html").read_text()
     assert (tmp_path / "mode.png").stat().st_size > 1000
     figure = found.plot()
     assert [axis.get_ylabel() for axis in figure.axes] == ["frequency, Hz", "effective mass / mass"]

@@ -146,17 +146,20 @@ class HTMLWriter(Output):
         frames = self._frames
         pairs = [(name, value) for name, value in self.parameters.items() if value not in (None, "", [])]
         page = Page(
-            self.title or pathlib.Path(self.path).stem, ", ".join(f"{name} = {value}" for name, value in pairs),
+            self.title or getattr(sim, "label", "") or pathlib.Path(self.path).stem,
+            ", ".join(f"{name} = {value}" for name, value in pairs),
             self._surface.up_axis, is_static(sim), self._origin, self._surface.offsets[: len(self._worlds)],
             self._worlds, {name: field_label(sim, name) for name in self._names}, self.color, self.color_range,
             self.view, self._surfaces(), [frame.time for frame in frames],
         )  # fmt: skip
         page.markers = self._marks(len(page.surfaces) - 1)
-        page.plots = record_plots(sim, self._worlds) if hasattr(sim, "state") else []
+        recorded = hasattr(sim, "statistics")
+        page.plots = record_plots(sim, self._worlds) if recorded else []
         page.plots += energy_plot(page.times, [frame.energies for frame in frames if frame.energies], self._worlds)
         page.warnings = run_warnings(sim)
-        told = {"simulation": repr(sim), "command": self.command, **{name: str(value) for name, value in pairs}}
-        page.facts = [(name, text) for name, text in {**told, **versions()}.items() if text]
+        texts = {"simulation": repr(sim) if recorded else "", "command": self.command or ""}
+        texts |= {name: str(value) for name, value in pairs} | versions()
+        page.facts = [(name, text) for name, text in texts.items() if text]
         return page
 
     def _surfaces(self) -> list[PageSurface]:
