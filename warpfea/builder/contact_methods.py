@@ -39,7 +39,7 @@ class ContactMethods:
     def add_contact(
         self, surface: Body | SurfaceSet, collider: Collider | Any = None, *, mu: float = 0.0,
         mu_static: float | None = None, restitution: float = 0.0, law: str = "default", treatment: str = "implicit",
-        stiffness: Any = None, model: str = "patch", radius: float | None = None, offset: float = 0.0,
+        stiffness: Any = None, model: str | None = None, radius: float | None = None, offset: float = 0.0,
         points: int | None = None, smoothing: Any = None, overlap: str = "auto", overlap_time: float = 0.1,
         seam: float | None = None, clipping: bool = False, name: str | None = None,
     ) -> Contact | FacetOptions:  # fmt: skip
@@ -57,7 +57,8 @@ class ContactMethods:
                 so that the contact yields by a tenth of them (`ELEMENT_STIFFNESS`), and harden beyond `HARDENING_DEPTH`
                 of their depth. "region", or ("region", factor), a radius, model "sphere" and Paper I's laws take k_n
                 and k_t of Eqs. (74), (79) for the whole surface, without hardening.
-            model: "patch", spread over the surface, or "sphere", one contact at the deepest place, by Hertz.
+            model: "patch", spread over the surface, or "sphere", one contact at the deepest place, by Hertz; None:
+                "patch", but "sphere" of a rigid part made from a Sphere on a convex obstacle without other options.
             radius: m; "patch": disc whose area replaces the surface's; "sphere": local radius of the body.
             offset: gap at which contact begins, m.
             points: points of each face, see warpfea.model.contact_points; by default 7 or 4 x 4, between bodies 16;

@@ -22,8 +22,10 @@ from ..model.edge_points import edge_contact
 from ..model.handles import SurfaceSet
 from ..model.obstacle_points import ObstacleContact, has_own_points, narrow_width
 from ..model.pairs import PAIR_RULES, FacetOptions, PairContact, slave_and_master
+from ..model.rigid import RigidBody
 from ..model.segments import SEGMENT_POINTS, SegmentContact, has_segments
-from ..model.shapes import Shape
+from ..model.shapes import Shape, Sphere
+from ..model.triangle_mesh import TriMesh
 from ..time_laws import Rotation, time_law
 from .bodies import unused_name
 from .checks import checked_rotation
@@ -86,7 +88,7 @@ def add_contact(
             "add_contact: a body with itself is not part of this version; give a collider or another body"
         )
     make = next((make for kind, make in KINDS.items() if isinstance(other, kind)), make_contact)
-    contact = make(d, thing, other, name, **options)
+    contact = make(d, thing, other, name, clipping=clipping, **options)
     check_clipping(contact, clipping)
     if clipping and isinstance(contact, PairContact) and has_segments(contact):
         contact = SegmentContact(**vars(contact))
@@ -117,6 +119,20 @@ def check_clipping(contact: Contact | FacetOptions, clipping: Any) -> None:
         raise NotImplementedError(f"{what} with {reason} is not part of this version; leave it out")
 
 
+def default_model(thing: Any, other: Any, o: dict[str, Any]) -> dict[str, Any]:
+    """The default of `model`: a ball on a convex obstacle touches it at one place, wherever the points of its facets
+    are."""
+    if o["model"] is not None:
+        return {}
+    plain = not o["clipping"] and (o["law"], o["treatment"]) == ("default", "implicit") and all(
+        o[name] is None for name in ("stiffness", "radius", "points", "seam")
+    )  # fmt: skip
+    ball = thing.shape if isinstance(thing, RigidBody) else None
+    if plain and isinstance(ball, Sphere) and isinstance(other, Collider) and not isinstance(other.shape, TriMesh):
+        return {"model": "sphere", "radius": ball.radius}
+    return {"model": "patch"}
+
+
 def make_contact(
     d: Description, thing: Body | SurfaceSet, collider: Any, name: str | None, **options: Any
 ) -> Contact | ObstacleContact:
@@ -135,6 +151,8 @@ def make_contact(
     surface = outer_surface(thing)
     default = f"{surface.body.name} on {collider.name}"
     name = unused_name(name, default, {c.name for c in d.contacts}, "contact")
+    options |= default_model(thing, collider, options)
+    options.pop("clipping")
     o = _checked_options(f"contact {name!r}", surface, dict(options))
     if o["model"] == "sphere" and collider.is_sheet:
         raise ModelError(
@@ -167,6 +185,8 @@ def make_pair(
     taken = {c.name for c in d.contacts}
     name = unused_name(name, f"{a.body.name} on {b.body.name}", taken, "contact")
     what = f"contact {name!r}"
+    options |= default_model(a, b, options)
+    options.pop("clipping")
     if options["model"] == "sphere":
         raise NotImplementedError(f"{what}: model = 'sphere' between bodies is not part of this version; take 'patch'")
     if _checked_law(what, options["law"]).traits & ANY_GAP:

@@ -9,12 +9,12 @@ import numpy as np
 
 from ..base.checks import is_number
 from ..base.errors import ModelError
-from ..elements.rigid import RIGID
+from ..elements.rigid import RIGID, TRIANGLE_SIDES, deviations_through
 from ..materials import SVK, Material
 from ..mesh import Mesh
 from ..mesh.cells import TET_FACES
 from ..model.rigid import RigidBody, surface_moments, volume_moments
-from ..model.shapes import HalfSpace, Shape
+from ..model.shapes import Capsule, Cylinder, HalfSpace, Shape, Sphere
 from ..model.triangle_mesh import TriMesh
 from .checks import vector
 
@@ -71,12 +71,48 @@ def make_rigid(
     mesh = _cone_mesh(name, points, triangles, center, sets)
     corners = _equimomental_points(moments)
     frames = np.broadcast_to(np.linalg.inv(np.column_stack([np.ones(4), corners])), (len(triangles), 4, 4))
+    if isinstance(shape, ROUND):
+        frames = np.concatenate([frames, _deviations(shape, mesh.points[mesh.cells[:, :3]])], axis=1)
     nodes = np.vstack([mesh.points, center + corners])
     mesh = replace(mesh, points=nodes)
     return RigidBody(
         name, mesh, RIGID, [("", material)], np.zeros(len(triangles), dtype=np.int64), "rigid", "rigid", frames,
-        com=center, moments=moments, elastic=given, corners=np.arange(len(nodes) - 4, len(nodes)),
+        com=center, moments=moments, elastic=given, corners=np.arange(len(nodes) - 4, len(nodes)), shape=shape,
     )  # fmt: skip
+
+
+ROUND = Sphere, Capsule, Cylinder
+"""Shapes whose surface is curved."""
+
+
+def _deviations(shape: Any, x: np.ndarray) -> np.ndarray:
+    """(T, 7, 4) of the control points of triangles x (T, 3, 3) of the drawn shape, which make them cubics through its
+    surface; the last column is zero."""
+    center, axes = shape.frame()
+    radius, half, _ = shape.sizes
+    local = (x - center) @ axes
+    flat = np.zeros(len(x), dtype=bool)
+    if isinstance(shape, Cylinder):
+        flat = np.all(np.abs(np.abs(local[..., 2]) - half) < 1e-9 * half, axis=1) & (
+            np.ptp(local[..., 2], axis=1) < half
+        )
+    thirds = np.array([[(2.0, 1.0), (1.0, 2.0)]]) / 3.0
+    ends = np.stack([local[:, list(side)] for side in TRIANGLE_SIDES], axis=1)
+    points = np.einsum("opn,tsnk->tspk", thirds, ends)
+    level = np.clip(points[..., 2:], -half, half) * (0.0, 0.0, 1.0)
+    if isinstance(shape, Cylinder):
+        level = points[..., 2:] * (0.0, 0.0, 1.0)
+    rim = np.all(np.linalg.norm(ends[..., :2], axis=3) > 0.5 * radius, axis=2) | ~flat[:, None]
+
+    def outward(p: np.ndarray, level: np.ndarray) -> np.ndarray:
+        return level + radius * (p - level) / np.linalg.norm(p - level, axis=-1, keepdims=True)
+
+    points = np.where(rim[:, :, None, None], outward(points, level), points)
+    middle = local.mean(axis=1)
+    level = (middle[:, 2:] if isinstance(shape, Cylinder) else np.clip(middle[:, 2:], -half, half)) * (0.0, 0.0, 1.0)
+    out = deviations_through(local, points, outward(middle, level))
+    out[flat] = deviations_through(local[flat], points[flat], None)
+    return np.pad(out @ axes.T, ((0, 0), (0, 0), (0, 1)))
 
 
 def _equimomental_points(moments: np.ndarray) -> np.ndarray:

@@ -9,7 +9,9 @@ from .family import EnergyPart, Family, VtkSubdivision, register
 from .lagrange import TET_CORNERS, TET_FACE_CORNERS
 from .quadrature import TET_RULES, triangle_6
 
-__all__ = ["RIGID"]
+__all__ = ["RIGID", "TRIANGLE_SIDES", "deviations_through"]
+
+TRIANGLE_SIDES = ((0, 1), (1, 2), (2, 0))
 
 
 NOMINAL_SOFTNESS = 1e-2
@@ -17,11 +19,46 @@ NOMINAL_SOFTNESS = 1e-2
 
 
 def _affine_functions(xi: np.ndarray, nodes: np.ndarray, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """s = [1, x, y, z] B and derivatives; frames: B (E, 4, 4), the inverse of the four points' rows [1, x, y, z]."""
-    x = barycentric(xi) @ nodes
-    dx = np.einsum("qnl,enk->eqlk", tet4_gradients(xi), nodes)
-    s = frames[:, None, 0] + np.einsum("eqk,eks->eqs", x, frames[:, 1:])
-    return s, np.einsum("eqlk,eks->eqsl", dx, frames[:, 1:])
+    """s = [1, x, y, z] B and derivatives.
+
+    Args:
+        frames: (E, 4 or 11, 4) B, the inverse of the four points' rows [1, x, y, z]; below it the deviations of the
+            control points of face 0 from a flat one, of curved surfaces, m, with a column of zeros.
+    """
+    L, dL = barycentric(xi), tet4_gradients(xi)
+    x = L @ nodes
+    dx = np.einsum("qnl,enk->eqlk", dL, nodes)
+    if frames.shape[1] > 4:
+        C, dC = cubic_deviations(L[:, :3])
+        x = x + np.einsum("qc,eck->eqk", C, frames[:, 4:, :3])
+        dx = dx + np.einsum("qcn,qnl,eck->eqlk", dC, dL[:, :3], frames[:, 4:, :3])
+    s = frames[:, None, 0] + np.einsum("eqk,eks->eqs", x, frames[:, 1:4])
+    return s, np.einsum("eqlk,eks->eqsl", dx, frames[:, 1:4])
+
+
+def cubic_deviations(L: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Cubic Bernstein polynomials (Q, 7) of a triangle but for those of the corners, and derivatives (Q, 7, 3), at
+    L (Q, 3): two of each of the `TRIANGLE_SIDES`, nearer to its first end and to its second, and that of the middle."""
+    C, dC = [], []
+    for i, j in (pair for side in TRIANGLE_SIDES for pair in (side, side[::-1])):
+        d = np.zeros((len(L), 3))
+        d[:, i], d[:, j] = 6.0 * L[:, i] * L[:, j], 3.0 * L[:, i] ** 2
+        C.append(3.0 * L[:, i] ** 2 * L[:, j])
+        dC.append(d)
+    C.append(6.0 * np.prod(L, axis=1))
+    dC.append(6.0 * np.roll(L, -1, axis=1) * np.roll(L, 1, axis=1))
+    return np.stack(C, axis=1), np.stack(dC, axis=1)
+
+
+def deviations_through(x: np.ndarray, side_points: np.ndarray, middle: np.ndarray | None) -> np.ndarray:
+    """Deviations (T, 7, 3) of the control points of triangles x (T, 3, 3) whose sides pass through side_points
+    (T, 3, 2, 3) at their thirds, and the middle of the surface through `middle` (T, 3); None: as flat as the sides
+    allow."""
+    ends = np.stack([x[:, list(side)] for side in TRIANGLE_SIDES], axis=1)
+    off = side_points - np.einsum("pn,tsnk->tspk", np.array([(2.0, 1.0), (1.0, 2.0)]) / 3.0, ends)
+    sides = np.einsum("cp,tspk->tsck", np.array([(3.0, -1.5), (-1.5, 3.0)]), off).reshape(len(x), 6, 3)
+    center = sides.sum(axis=1) / 4.0 if middle is None else 4.5 * (middle - x.mean(axis=1)) - sides.sum(axis=1) / 2.0
+    return np.concatenate([sides, center[:, None]], axis=1)
 
 
 def _nominal_law(material: Any) -> tuple[str, tuple[float, ...]]:

@@ -34,12 +34,14 @@ class RigidBody(Body):
         moments: (4, 4) volume, and second moments of volume about the centre (of the mass, over the density).
         corners: (4,) mesh nodes that are the four points.
         elastic: a material for contact was given.
+        shape: what it was made from.
     """
 
     com: np.ndarray = field(kw_only=True)
     moments: np.ndarray = field(kw_only=True)
     corners: np.ndarray = field(kw_only=True)
     elastic: bool = field(kw_only=True)
+    shape: Any = field(kw_only=True, default=None)
 
     def __repr__(self) -> str:
         return f"RigidBody({self.name!r}, {self.mass:.4g} kg)"
@@ -59,7 +61,7 @@ class RigidBody(Body):
     def affine(self) -> np.ndarray:
         """(4, 4) B: weights of the four points at X are [1, X - com] B."""
         assert self.frames is not None
-        return np.asarray(self.frames[0])
+        return np.asarray(self.frames[0, :4])
 
     @property
     def scalar_mass(self) -> sp.csr_matrix:
