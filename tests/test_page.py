@@ -265,3 +265,14 @@ def test_result_file():
         assert row["overlap"] >= 0.98, row["scene"]
         assert row["difference"] <= 0.05, row["scene"]
         assert row["errors"] == row["requests"] == 0
+
+
+@pytest.mark.parametrize("name", ["hook", "four_bar"])
+def test_committed_pages_open(name, browser):
+    path = RESULT.parent / "pages" / f"{name}.html"
+    assert path.stat().st_size <= 1e6
+    tab = Tab(browser, path)
+    assert tab("page.data.title") == name
+    assert tab("page.view.surfaces.length") >= 1
+    assert not tab.errors
+    assert not tab.foreign

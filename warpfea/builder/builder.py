@@ -9,6 +9,7 @@ from typing import Any
 from ..base.console import quiet_warp
 from ..base.errors import ModelError
 from ..base.names import check_choice
+from ..base.notebook import summary_table
 from ..elements.sections import BeamSection, section_along
 from ..materials import Material
 from ..model.bodies import Body
@@ -54,6 +55,9 @@ class ModelBuilder(ContactMethods, SpringMethods):
 
     def __repr__(self) -> str:
         return f"ModelBuilder({self.description.summary() or 'no bodies'})"
+
+    def _repr_html_(self) -> str:
+        return summary_table("model builder", self.description.table())
 
     # bodies
 

@@ -29,6 +29,8 @@ __all__ = [
 ]
 
 C = TypeVar("C", bound=ContactOptions)
+MAX_LISTED = 12
+"""Number of bodies, joints, ... that a table names one by one."""
 RODS = ("distance", "DIST")
 """Kinds of joints that keep bodies apart."""
 
@@ -163,6 +165,20 @@ class Description:
             if support.body is body and fixed:
                 held[support.slots] += support.components
         return np.asarray((held > 0).all(axis=1))
+
+    def table(self) -> dict[str, str]:
+        """Readable contents by name: each of a few bodies, and the names or numbers of all else."""
+        few = len(self.bodies) <= MAX_LISTED
+        rows = {f"body {body.name}": repr(body) for body in self.bodies} if few else {"bodies": str(len(self.bodies))}
+        for name in ("joints", "springs", "colliders", "contacts", "probes"):
+            things = getattr(self, name)
+            names = [str(getattr(thing, "name", "")) for thing in things]
+            rows[name] = ", ".join(names) if 0 < len(names) <= MAX_LISTED and all(names) else str(len(names) or "")
+        loads = len(self.dead_loads) + len(self.pressures) + len(self.moments) + len(self.body_forces)
+        rows |= {"supports": str(len(self.supports) or ""), "loads": str(loads or "")}
+        if self.gravity.any():
+            rows["gravity"] = f"({', '.join(f'{g:.4g}' for g in self.gravity)}) m/s^2"
+        return rows
 
     def summary(self) -> str:
         """One-line summary; "" for an empty description."""

@@ -14,6 +14,7 @@ from ..base.devices import find_device
 from ..base.errors import ModelError
 from ..base.memory import Memory, convert_memory_errors
 from ..base.names import check_choice
+from ..base.notebook import summary_table
 from ..kernels.common.types import precision
 from . import assembly
 from .blocks import Block, build_block
@@ -129,6 +130,13 @@ class Model:
         mass = "no density" if self.mass is None else f"{self.mass:.4g} kg"
         worlds = f", {self.worlds} worlds" if self.worlds > 1 else ""
         return f"Model({what}, {int(self.free_slots.sum())} unknowns, {mass}, {self.device}, {self.dtype}{worlds})"
+
+    def _repr_html_(self) -> str:
+        info = self.info()
+        rows = {name: info[name] for name in ("elements", "unknowns", "device", "dtype")}
+        rows |= {"mass": "" if self.mass is None else f"{self.mass:.4g} kg", "features": ", ".join(info["features"])}
+        rows |= {"worlds": self.worlds if self.worlds > 1 else "", "memory": f"{info['bytes']['total'] / 1e6:.3g} MB"}
+        return summary_table("model", self.description.table() | rows)
 
     @property
     def mass(self) -> float | None:

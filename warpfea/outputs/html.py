@@ -10,15 +10,17 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.checks import is_count
+from ..base.console import format_number
 from ..base.errors import ModelError, OutputError
+from ..base.notebook import page_frame
 from ..base.provenance import versions
 from ..base.writer import Output, check_target, write_atomically
 from ..model.surfaces import reference_points
+from ..simulation.plots import energy_plot, record_plots, run_warnings
 from .frames import DrawnSurface, FrameClock, check_colors, check_fields, field_label, frame_time, is_static
 from .markers import Markers
 from .page import Page, PageSurface
 from .raycaster import DEFAULT_VIEW, check_view
-from .records import energy_plot, record_plots, run_warnings
 
 __all__ = ["MAX_WORLDS", "HTMLWriter"]
 
@@ -140,11 +142,17 @@ class HTMLWriter(Output):
         """Discard the frames; nothing is on disk before `close`."""
         self._frames = None
 
+    def _repr_html_(self) -> str:
+        """The page in a frame of a notebook, once it is written."""
+        file = pathlib.Path(self.path)
+        return page_frame(file.read_text("utf-8")) if file.is_file() else ""
+
     def page(self, sim: Any) -> Page:
         """The page of the frames so far."""
         assert self._frames
         frames = self._frames
-        pairs = [(name, value) for name, value in self.parameters.items() if value not in (None, "", [])]
+        kept = [(name, value) for name, value in self.parameters.items() if value not in (None, "", [])]
+        pairs = [(name, format_number(v, 6) if isinstance(v, float) else str(v)) for name, v in kept]
         page = Page(
             self.title or getattr(sim, "label", "") or pathlib.Path(self.path).stem,
             ", ".join(f"{name} = {value}" for name, value in pairs),
@@ -158,7 +166,7 @@ class HTMLWriter(Output):
         page.plots += energy_plot(page.times, [frame.energies for frame in frames if frame.energies], self._worlds)
         page.warnings = run_warnings(sim)
         texts = {"simulation": repr(sim) if recorded else "", "command": self.command or ""}
-        texts |= {name: str(value) for name, value in pairs} | versions()
+        texts |= dict(pairs) | versions()
         page.facts = [(name, text) for name, text in texts.items() if text]
         return page
 

@@ -331,6 +331,7 @@ class View {
       probe: ([x, y]) => { pen.rect(x - 3, y - 3, 6, 6); pen.stroke(); },
       load: ([x, y]) => { pen.arc(x, y, 2.5, 0, 7); pen.fill(); },
     };
+    const cut = this.cutPlane();
     pen.lineWidth = 2;
     pen.globalAlpha = 0.85;
     for (const marker of $("marks").checked ? this.data.markers : []) {
@@ -338,6 +339,7 @@ class View {
       for (const s of this.shown().filter((other) => other.mesh === this.data.surfaces[marker.surface]))
         for (const p of marker.points) {
           const point = Array.from(s.points.subarray(3 * p, 3 * p + 3));
+          if (dot(point, cut) > cut[3]) continue;
           pen.beginPath();
           draw[marker.kind](at(point));
           const along = marker.vectors?.[Math.min(Math.round(this.time), marker.vectors.length - 1)];

@@ -25,6 +25,7 @@ __all__ = [
     "RunStatistics",
     "StepReport",
     "idle_report",
+    "simulation_table",
     "simulation_text",
     "step_text",
 ]
@@ -203,6 +204,23 @@ def simulation_text(sim: Any) -> str:
     return f"Simulation({at}, {sim.methods['solver']}, {m.slots} slots, {m.device}, {m.dtype}{worlds})"
 
 
+def simulation_table(sim: Any) -> dict[str, str]:
+    """Readable state of a simulation by name."""
+    totals = {name: int(sim.totals[name].sum()) for name in ("newton", "pcg", "floored", "rough")}
+    static = sim.load is not None
+    rows = {"load" if static else "time": f"{100.0 * sim.load.max():.4g} %" if static else f"{sim.time.max():.6g} s"}
+    rows |= {"steps": str(sim.steps), "step": "" if static else step_text(sim.dt) if sim.error is None else "auto"}
+    rows |= {"integrator": sim.integrator.label, "solver": sim.methods["solver"]}
+    rows |= {"Newton iterations": str(totals["newton"]), "PCG iterations": str(totals["pcg"])}
+    rows |= {"largest residual": f"{sim.max_residual:.3g}", "steps at round-off": str(totals["floored"] or "")}
+    running = int((np.asarray(sim.status) == STATUS["running"]).sum())
+    rows["worlds running"] = f"{running} of {sim.model.worlds}"
+    if not static and sim.stepper.ledger:
+        energies = {name: float(values[0]) for name, values in sim.energies().items()}
+        rows |= {f"{name} energy": f"{energies[name]:.4g} J" for name in ("kinetic", "strain", "potential")}
+    return rows
+
+
 class SyncedAttribute:
     """Descriptor that synchronises device statistics before reading."""
 
@@ -232,6 +250,7 @@ class RunStatistics:
         times_differ: worlds have times of their own.
         stepped_worlds: (worlds,) True for worlds stepped since their state was set.
         history: recorded columns (worlds, columns) of each step.
+        step_log: time (s), and largest numbers of Newton and PCG iterations and of halvings in any world, of each step.
     """
 
     last: Any = SyncedAttribute()
@@ -257,6 +276,7 @@ class RunStatistics:
         self.min_J = math.inf
         self.stepped_worlds, self._failed_worlds = (np.zeros(B, dtype=bool) for _ in range(2))
         self.history = []
+        self.step_log: list[tuple[float, ...]] = []
 
     def sync_from_device(self) -> None:
         """Read the device statistics of the steps since the last reading."""
@@ -312,6 +332,9 @@ class RunStatistics:
         if self.stepper.step_size_control:
             totals["substeps"] += last.substeps
             totals["rejected"] += last.rejected
+        if self.sim.record:
+            counts = (last.newton, last.pcg, last.halvings)
+            self.step_log.append((float(last.time.max()), *(float(values.max()) for values in counts)))
         totals["newton"] += last.newton
         totals["pcg"] += last.pcg
         totals["rough"] += good & ~last.converged

@@ -16,6 +16,7 @@ from ..base.console import compile_progress_bar, quiet_warp
 from ..base.errors import ModelError
 from ..base.memory import convert_memory_errors
 from ..base.names import check_choice
+from ..base.notebook import summary_table
 from ..base.worlds import set_rows
 from ..kernels.step.step_control import SAME_TIME_FRACTION, STATUS
 from ..model.assembly import require_density
@@ -39,6 +40,7 @@ from .episodes import Resets
 from .failures import check_initial_constraints
 from .observations import Observations
 from .overlap import OverlapCheck
+from .plots import plot_run
 from .reports import (
     ContactRecord,
     JointRecord,
@@ -47,6 +49,7 @@ from .reports import (
     RunStatistics,
     StepReport,
     idle_report,
+    simulation_table,
     simulation_text,
 )
 from .results import PartMember, Records, Results
@@ -229,6 +232,17 @@ class Simulation:
 
     def __repr__(self) -> str:
         return simulation_text(self)
+
+    def _repr_html_(self) -> str:
+        return summary_table("simulation", simulation_table(self))
+
+    def plot(self, world: int = 0) -> Any:
+        """Matplotlib figure of a world: records of probes, joints and contacts, energies, iterations of steps.
+
+        Raises:
+            ModelError: no step was taken. OutputError: without matplotlib (extra "plots").
+        """
+        return plot_run(self, world)
 
     # stepping
 

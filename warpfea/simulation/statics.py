@@ -14,6 +14,7 @@ import numpy as np
 
 from ..base.errors import ModelError
 from ..base.names import check_choice
+from ..base.notebook import drawn_page
 from ..base.writer import Output
 from ..model.assembly import element_volumes, require_density
 from ..model.contact_points import effective_modulus
@@ -76,6 +77,10 @@ class StaticResult:
         count = f"{self.simulation.steps} load step{'s' * (self.simulation.steps != 1)}"
         stable = f", {self.stability.text}" if self.stability else ""
         return f"StaticResult({count}, {int(self.newton.max())} Newton, {int(self.pcg.max())} PCG iterations{stable})"
+
+    def _repr_html_(self) -> str:
+        known = self.simulation.fields
+        return drawn_page(self.simulation, [name for name in ("von_mises", "displacement") if name in known])
 
     def mode(self, body: Any) -> np.ndarray:
         """Unstable mode (B, nodes, 3) of each world, 0 if none; its largest displacement is 1 m.

@@ -1,4 +1,4 @@
-"""Records of a run as line plots of a page: probes, energy ledger, joints, contacts."""
+"""Line plots of a run: probes, joints, contacts, energies, iterations; for pages, and as a figure of matplotlib."""
 
 import itertools
 from collections.abc import Sequence
@@ -7,10 +7,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["energy_plot", "record_plots", "run_warnings"]
+from ..base.errors import ModelError
+from ..base.lazy import require_matplotlib
+
+__all__ = ["energy_plot", "plot_run", "record_plots", "run_warnings"]
 
 Array = npt.NDArray[Any]
-SHOWN = 8
+PLOTTED = 8
 """Number of probes, joints or contacts plotted of many, the first of each."""
 SAMPLES = 240
 """Largest number of intervals of a curve; of each the least and the largest value are kept."""
@@ -18,6 +21,8 @@ LEDGER = (
     "kinetic", "strain", "potential", "contact", "work", "viscous", "contact_loss", "friction", "collider_work",
     "integrator",
 )  # fmt: skip
+STEP_LOG = ("time", "newton", "pcg", "halvings")
+"""Entries of `RunStatistics.step_log`: the time, s, and the largest count of all worlds of each step."""
 XYZ = ("x", "y", "z")
 NO_MOMENT = 1e-6
 """A moment below this part of the force times the largest body is round-off of a joint that carries none."""
@@ -26,18 +31,18 @@ NO_MOMENT = 1e-6
 def record_plots(sim: Any, worlds: Sequence[int]) -> list[dict[str, Any]]:
     """Plots of the histories of probes, joints and contacts of some worlds."""
     description, out = sim.model.description, []
-    for probe in getattr(description, "probes", ())[:SHOWN]:
+    for probe in getattr(description, "probes", ())[:PLOTTED]:
         record = sim.probe(probe.name)
         out.append(_plot(f"probe {probe.name}: displacement", "m", XYZ, record.time, record.displacement, worlds))
     joints = [joint for joint in getattr(description, "joints", ()) if joint.kind != "rigid"]
-    for joint in joints[:SHOWN]:
+    for joint in joints[:PLOTTED]:
         joint_record = sim.joint_record(joint)
         out.append(_plot(f"joint {joint.name}: force", "N", XYZ, joint_record.time, joint_record.force, worlds))
         size = max(float(np.ptp(body.mesh.points, axis=0).max()) for body in sim.model.bodies)
         force = float(np.abs(joint_record.force).max(initial=0.0))
         if np.abs(joint_record.moment).max(initial=0.0) > NO_MOMENT * size * force:
             out.append(_plot(f"joint {joint.name}: moment", "N m", XYZ, joint_record.time, joint_record.moment, worlds))
-    for contact in getattr(description, "contacts", ())[:SHOWN]:
+    for contact in getattr(description, "contacts", ())[:PLOTTED]:
         c = sim.contact_record(contact)
         size = np.linalg.norm(c.force, axis=2)
         forces = np.stack([c.normal_force, size], axis=2)
@@ -102,3 +107,41 @@ def run_warnings(sim: Any) -> list[str]:
     if last is not None and getattr(last, "stable", None) is not None and any(s is False for s in last.stable):
         out.append("the equilibrium is unstable")
     return out
+
+
+def plot_run(sim: Any, world: int = 0) -> Any:
+    """Figure of matplotlib: records of a world over time, its energies now, iterations of each step.
+
+    ModelError: no such world, or no step was taken. OutputError without matplotlib.
+    """
+    if not 0 <= world < sim.model.worlds:
+        raise ModelError(f"plot: world = {world!r} must lie between 0 and {sim.model.worlds - 1}")
+    log = np.array(sim.statistics.step_log, dtype=float).reshape(-1, len(STEP_LOG))
+    if not len(log):
+        raise ModelError("plot: no step was taken yet, or steps were not recorded (record=False)")
+    plots = record_plots(sim, [world])
+    ledger = {} if sim.load is not None or not sim.stepper.ledger else sim.energies()
+    energies = {name: float(ledger[name][world]) for name in LEDGER if name in ledger and ledger[name][world] != 0.0}
+    count = len(plots) + bool(energies) + 1
+    figure = require_matplotlib()(figsize=(9.6, 2.6 * -(-count // 2)), layout="constrained")
+    axes = iter(figure.subplots(-(-count // 2), 2, squeeze=False).ravel())
+    when = "time, s" if sim.load is None else "load factor"
+    for plot, axis in zip(plots, axes):
+        for name, values in zip(plot["names"], plot["values"][0]):
+            axis.plot(plot["times"][0], np.array(values, dtype=float), label=name)
+        axis.set(title=plot["title"], xlabel=when, ylabel=plot["units"])
+        axis.legend(fontsize="small")
+    if energies:
+        axis = next(axes)
+        axis.barh([name.replace("_", " ") for name in energies], list(energies.values()), color="0.5")
+        axis.set(title="energies now", xlabel="J")
+    axis = next(axes)
+    for name, column in zip(STEP_LOG[1:], log.T[1:]):
+        if column.any():
+            axis.step(log[:, 0], column, where="pre", label=name)
+    axis.set(title="iterations of each step, most of all worlds", xlabel=when)
+    axis.set_yscale("symlog", linthresh=1.0)
+    axis.legend(fontsize="small")
+    for axis in axes:
+        axis.remove()
+    return figure

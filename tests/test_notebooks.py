@@ -1,0 +1,63 @@
+"""Representations for notebooks, and the plot of a run."""
+
+from __future__ import annotations
+
+import html
+import re
+
+import numpy as np
+import pytest
+
+import warpfea as wf
+
+
+@pytest.fixture(scope="module")
+def model():
+    b = wf.ModelBuilder(gravity=(0, 0, -9.81))
+    box = wf.mesh.box((1, 0.2, 0.2), cells=(2, 1, 1))
+    body = b.add_solid(box, material=wf.SVK(E=1e7, nu=0.3, density=1000), name="<bar>")
+    b.clamp(body.nodes("x-"))
+    b.add_probe("tip", body.surface("x+"))
+    return b, b.finalize(device="cpu")
+
+
+def cells(text):
+    """Names and texts of a table."""
+    pairs = re.findall(r"<th[^>]*>(.*?)</th><td[^>]*>(.*?)</td>", text)
+    return {html.unescape(name): html.unescape(value) for name, value in pairs}
+
+
+def test_tables_and_plot_of_a_run(model):
+    builder, made = model
+    assert "<bar>" not in builder._repr_html_()
+    told = cells(builder._repr_html_())
+    assert told["probes"] == "tip"
+    assert told["gravity"] == "(0, 0, -9.81) m/s^2"
+    assert "body <bar>" in told
+    assert cells(made._repr_html_())["unknowns"] == str(int(made.free_slots.sum()))
+    sim = wf.Simulation(made, dt=2e-3)
+    with pytest.raises(wf.ModelError, match="no step was taken"):
+        sim.plot()
+    sim.step(4)
+    told = cells(sim._repr_html_())
+    assert (told["time"], told["steps"], told["worlds running"]) == ("0.008 s", "4", "1 of 1")
+    assert told["Newton iterations"] == str(int(sim.totals["newton"].sum()))
+    figure = sim.plot()
+    titles = [axis.get_title() for axis in figure.axes]
+    assert titles == ["probe tip: displacement", "energies now", "iterations of each step, most of all worlds"]
+    z = figure.axes[0].lines[2].get_ydata()
+    assert z == pytest.approx(sim.probe("tip").displacement[0, :, 2], rel=1e-5)
+    counts = {line.get_label(): line.get_ydata() for line in figure.axes[2].lines}
+    assert counts["newton"].sum() == sim.totals["newton"].sum()
+    with pytest.raises(wf.ModelError, match="world = 1"):
+        sim.plot(1)
+
+
+def test_a_static_result_is_a_page(model):
+    result = wf.solve_static(model[1], load_steps=1)
+    text = result._repr_html_()
+    assert text.startswith("<iframe srcdoc=")
+    inner = html.unescape(re.search(r'srcdoc="([^"]*)"', text)[1])
+    assert '"static":true' in inner
+    assert inner.startswith("<!DOCTYPE html>")
+    assert np.isfinite(result.simulation.field("von_mises", model[1].bodies[0])).all()
