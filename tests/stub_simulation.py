@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from warpfea.terms.elements import ELEMENT_FIELDS
+from warpfea.terms.fields import ELEMENT_FIELDS
 
 FAR = np.array([1.0e4, -2.0e4, 3.0e3])
 

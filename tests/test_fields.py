@@ -6,7 +6,7 @@ import pytest
 import warpfea as wf
 from warpfea.model.surfaces import reference_points
 from warpfea.simulation.results import Results
-from warpfea.terms.evaluation import field_at_nodes, field_at_points
+from warpfea.terms.fields import field_at_nodes, field_at_points, voigt
 
 STRETCH = np.array([(0.1, 0.05, 0.0), (0.02, -0.04, 0.03), (0.0, 0.01, 0.06)])
 LAW = wf.SVK(E=1e6, nu=0.3, density=1000.0)
@@ -33,8 +33,14 @@ def test_fields_of_elements_are_exact_in_a_uniform_deformation():
     E = 0.5 * (F.T @ F - np.eye(3))
     lam, mu = LAW.lame
     for body in model.bodies:
-        fields = {name: field_at_nodes(model.terms, name, body, state) for name in model.terms.fields}
-        drawn = {name: field_at_points(model.terms, name, body, state, body.skin) for name in model.terms.fields}
+        names = [name for name, spec in model.terms.fields.items() if not spec.cell_type]
+        fields = {name: field_at_nodes(model.terms, name, body, state) for name in names}
+        drawn = {name: field_at_points(model.terms, name, body, state, body.skin) for name in names}
+        for strain in (fields["green_lagrange"], drawn["green_lagrange"]):
+            assert np.abs(strain - voigt(E)).max() < 1e-12
+        exact = F @ (lam * np.trace(E) * np.eye(3) + 2 * mu * E) @ F.T / np.linalg.det(F)
+        if body.family.solid:
+            assert np.abs(drawn["cauchy"] - voigt(exact)).max() < 1e-12 * exact.max()
         assert fields["J"] == pytest.approx(np.linalg.det(F), rel=1e-13)
         assert drawn["J"] == pytest.approx(np.linalg.det(F), rel=1e-13)
         moved = np.linalg.norm(body.mesh.points @ STRETCH.T, axis=1)
@@ -69,10 +75,11 @@ def test_titles_and_units_come_from_the_registry():
     b = wf.ModelBuilder()
     body = b.add_solid(wf.mesh.box((0.1, 0.1, 0.1), cells=(1, 1, 1)), material=LAW)
     free = wf.Simulation(b.finalize(device="cpu"), dt=1e-3)
-    assert list(free.fields) == ["von_mises", "displacement", "J", "strain_energy_density"]
+    scalars = ["von_mises", "displacement", "J", "strain_energy_density", "viscous_dissipation", "tresca", "pressure"]
+    assert list(free.model.terms.scalar_fields) == scalars
     b.add_contact(body, b.add_collider(wf.HalfSpace((0, 0, 1), -1.0)))
     touching = wf.Simulation(b.finalize(device="cpu"), dt=1e-3)
-    assert list(touching.fields) == [*free.fields, "contact_pressure", "gap"]
+    assert list(touching.model.terms.scalar_fields) == [*scalars, "contact_pressure", "gap"]
     assert all(spec.title for spec in touching.fields.values())
     assert touching.fields["contact_pressure"].units == "Pa"
 

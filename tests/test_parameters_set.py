@@ -176,9 +176,9 @@ def test_stresses_follow_values_that_are_set_later():
     u = np.random.default_rng(0).normal(scale=1e-4, size=(2, m.slots, 3))
     u[1] = u[0]
     state.displacement.assign(u)
-    first = m.evaluation.sample_stress(state, m.bodies[0])
+    first = m.evaluation.samples.at_samples("stress", state, m.bodies[0])
     m.set_parameter("body.E", 3e6, mask=[False, True])
-    then = m.evaluation.sample_stress(state, m.bodies[0])
+    then = m.evaluation.samples.at_samples("stress", state, m.bodies[0])
     assert np.array_equal(then[0], first[0])
     assert then[1] == pytest.approx(3.0 * first[1], rel=1e-12)
 

@@ -1,4 +1,5 @@
-"""Kernels of table elements for particular scenes or outputs, one module each: history, viscous force, stress."""
+"""Kernels of table elements for particular scenes or outputs, one module each: history, viscous force, stress,
+deformation gradient."""
 
 import warp as wp
 
@@ -20,8 +21,9 @@ def output_kernels(fn: KernelSet, name: str) -> KernelSet:
     moving_module = kernel_module(f"{name}_history_moving")
     viscous_module = kernel_module(f"{name}_viscous")
     stress_module = kernel_module(f"{name}_stress")
+    gradient_module = kernel_module(f"{name}_gradient")
     p = fn.types
-    T, vec3, sym6 = p.T, p.vec3, p.sym
+    T, vec3, sym6, mat33 = p.T, p.vec3, p.sym, p.mat33
     t, m, Block, Local = fn.tensors, fn.law, fn.Block, fn.Local
     ETA_INDEX, LAMBDA_V_INDEX = materials.ETA_INDEX, materials.LAMBDA_V_INDEX
 
@@ -97,5 +99,13 @@ def output_kernels(fn: KernelSet, name: str) -> KernelSet:
             P = fn.to_body_axes(block, m.stress(fn.to_material_axes(block, G, point, elem), c), point, elem)
             stress[world, point, elem] = fn.to_voigt((T(1.0) / J) * (P + P * wp.transpose(G)))
             jacobian[world, point, elem] = J
+
+    @wp.kernel(module=gradient_module)
+    def point_gradient(block: Block, u: p.vec3_2d, gradient: wp.array3d(dtype=mat33)):
+        """F at the points, Eq. (1), [world, point, elem]."""
+        world, elem = wp.tid()
+        U = fn.load_slots(block, u, world, elem)
+        for point in range(block.shape_gradient.shape[0]):
+            gradient[world, point, elem] = t.identity() + fn.field_gradient(block, U, point, elem)
 
     return kernel_set(locals())

@@ -192,8 +192,8 @@ def _add_run(commands: Any) -> None:
 
 
 PICTURE_OPTIONS = (
-    ("--field", None, "NAME", "field in colour: von_mises (default), displacement, J, strain_energy_density, "
-     "contact_pressure, gap, or none"),
+    ("--field", None, "NAME", "field in colour: von_mises (default), displacement, J, tresca, pressure, "
+     "principal.1, cauchy.xx, contact_pressure, gap, ..., or none"),
     ("--view", number_pair, "AZIMUTH,ELEVATION", "of the camera, degrees"),
     ("--range", color_range, "LOW,HIGH", "of the colours, SI units"),
 )  # fmt: skip

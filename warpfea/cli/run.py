@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from ..base.console import quiet_warp, write_json
-from ..base.errors import ConstraintError, ConvergenceError, OutputError, StabilityError, UsageError
+from ..base.errors import ConstraintError, ConvergenceError, ModelError, OutputError, StabilityError, UsageError
 from ..base.names import did_you_mean
 from ..base.writer import Output, check_folder, check_target
 from ..kernels.step.step_control import SAME_TIME_FRACTION
@@ -19,6 +19,7 @@ from ..simulation.checkpoint import Checkpoint, load_checkpoint, read_meta
 from ..simulation.run_loop import interruptible
 from ..simulation.simulation import Simulation
 from ..simulation.statics import run_static
+from ..terms.fields import check_scalar
 from . import DONE
 from .source import Source, resolve, show_progress
 from .summary import summarize, summary_text
@@ -177,10 +178,16 @@ def _check_times(options: argparse.Namespace, source: Source, t_end: float) -> N
 
 
 def _check_field(name: str | None, model: Model) -> None:
-    """UsageError unless --field is a field of the model or none."""
-    known = [*model.terms.fields, "none"]
-    if name is not None and name not in known:
+    """UsageError unless --field is a scalar field of the model, a component of one, or none."""
+    known = [*model.terms.scalar_fields, "none"]
+    if name is None or name in known:
+        return
+    if name.partition(".")[0] not in model.terms.fields:
         raise UsageError(f"--field {name}: is unknown; there are {', '.join(known)}{did_you_mean(name, known)}")
+    try:
+        check_scalar(model.terms, name)
+    except ModelError as error:
+        raise UsageError(f"--field: {error}") from None
 
 
 def make_outputs(options: argparse.Namespace, source: Source, t_end: float) -> list[Output]:

@@ -44,6 +44,12 @@ class Body(Discretisation):
         """The material point at the reference position X (3,), m. Raises ModelError for X outside the body."""
         return locate(self, X)
 
+    def line(self, start: Any, end: Any, count: int = 50) -> list[MaterialPoint]:
+        """Material points evenly spaced on a straight line from start to end (3,), m, in the reference. ModelError for
+        points outside the body."""
+        a, b = point_coordinates(self, start), point_coordinates(self, end)
+        return [self.at(a + t * (b - a)) for t in np.linspace(0.0, 1.0, count)]
+
     @property
     def start(self) -> NodeSet:
         """First node of a beam. MeshError for other bodies."""
@@ -130,7 +136,7 @@ def material_point_at(body: Discretisation, element: int, xi: np.ndarray, X: np.
     conn = body.connectivity[element]
     J0 = body.reference[conn].T @ ds[0]
     axes = np.eye(3) if body.family.solid else orthonormal(J0)
-    return MaterialPoint(body, conn, s[0].copy(), X, ds[0] @ np.linalg.inv(J0), axes, element)
+    return MaterialPoint(body, conn, s[0].copy(), X, ds[0] @ np.linalg.inv(J0), axes, element, xi)
 
 
 def _shape_at_own_points(body: Discretisation, elements: np.ndarray, xi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

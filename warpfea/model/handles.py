@@ -66,7 +66,7 @@ class MaterialPoint:
         gradients: (n, 3) dweights/dX, 1/m: the deformation gradient is sum e_i gradients_i^T.
         axes: (3, 3) columns: in a beam its axis, width and height there; in a shell two tangents and the director;
             in a solid the global axes.
-        element: index of the element that holds the point.
+        element: index of the element that holds the point. xi: (3,) parent coordinates in it.
     """
 
     body: Discretisation
@@ -76,6 +76,7 @@ class MaterialPoint:
     gradients: np.ndarray
     axes: np.ndarray
     element: int = -1
+    xi: np.ndarray | None = None
 
     def __repr__(self) -> str:
         place = ", ".join(f"{x:.6g}" for x in self.X)

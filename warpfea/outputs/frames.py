@@ -23,8 +23,9 @@ Array = npt.NDArray[Any]
 
 def field_label(sim: Any, name: str) -> tuple[str, str]:
     """(title, units) of a field; one that the simulation lacks is its own title, without units."""
-    spec = sim.fields.get(name)
-    return (spec.title, spec.units) if spec else (name.replace("_", " "), "")
+    whole, _, part = name.partition(".")
+    spec = sim.fields.get(whole)
+    return (f"{spec.title} {part}".rstrip(), spec.units) if spec else (name.replace("_", " "), "")
 
 
 def frame_time(sim: Any) -> float:
@@ -41,12 +42,12 @@ def is_static(sim: Any) -> bool:
     return getattr(sim, "load", None) is not None
 
 
-def check_fields(sim: Any, names: Sequence[str]) -> None:
-    """Raise the simulation's ModelError for a missing field, before any computation."""
+def check_fields(sim: Any, names: Sequence[str], *, scalar: bool = True) -> None:
+    """Raise the simulation's ModelError for a missing field, or one with components, before any computation."""
     check = getattr(sim, "check_field", None)
     if check is not None:
         for name in names:
-            check(name)
+            check(name, scalar=scalar)
 
 
 def check_colors(pair: Any) -> tuple[float, float] | None:

@@ -15,6 +15,7 @@ from ..base.errors import OutputError
 from ..base.lazy import meshio
 from ..base.writer import Output, make_folder, write_atomically
 from ..model.surfaces import reference_points
+from ..terms.fields import SYMMETRIC
 from .frames import FrameClock, check_fields, frame_time
 from .obstacles import Obstacles
 
@@ -27,7 +28,7 @@ class VTUWriter(Output):
     Args:
         folder: the target folder; made if its parent exists. Files of the same names are overwritten.
         every: write each n-th accepted step (the default, with 1). fps: or by time, as USD does. Not both.
-        fields: scalar fields at the mesh nodes, SI units.
+        fields: fields at the mesh nodes, SI units; those with 6 components in ParaView's order XX YY ZZ XY YZ XZ.
         extend: extend the existing series of the resumed run; its frames after the current time are removed and
             rewritten.
 
@@ -74,7 +75,7 @@ class VTUWriter(Output):
         return self.folder / f"{self.folder.resolve().name}_colliders.pvd"
 
     def open(self, sim: Any) -> None:
-        check_fields(sim, self.fields)
+        check_fields(sim, self.fields, scalar=False)
         self._folder_created = not self.folder.exists()
         make_folder(self.folder)
         self._open = True
@@ -215,13 +216,15 @@ def _frame_data(sim: Any, body: Any, fields: Sequence[str]) -> tuple[np.ndarray,
     T4 and T10 are written as their mesh; other elements as drawn cells, with section and thickness.
     """
     mesh = body.mesh
+    kinds = {field: getattr(sim.fields.get(field), "cell_type", "") for field in fields}
+    fields = [field for field in fields if kinds[field] in ("", mesh.cell_type)]
     family = getattr(body, "family", None)
     if family is None or not family.has_gradients:
         points = np.asarray(sim.positions(body), dtype=np.float64)
         data = {"displacement": np.asarray(sim.displacements(body), dtype=np.float64)}
         if hasattr(sim, "velocities"):
             data["velocity"] = np.asarray(sim.velocities(body), dtype=np.float64)
-        data |= {field: np.asarray(sim.field(field, body), dtype=np.float64) for field in fields}
+        data |= {field: _in_vtk_order(sim, field, sim.field(field, body)) for field in fields}
         return points, data, (mesh.cell_type, mesh.cells, _element_set_flags(mesh, np.arange(len(mesh.cells))))
     drawn = body.drawing
     points = sim.point_positions(body, drawn.slot_weights)
@@ -230,8 +233,15 @@ def _frame_data(sim: Any, body: Any, fields: Sequence[str]) -> tuple[np.ndarray,
         "displacement": points - reference_points(body, drawn.slot_weights),
         "velocity": np.stack([drawn.slot_weights @ row for row in v]),
     }
-    data |= {field: sim.field_on(field, body, drawn) for field in fields}
+    data |= {field: _in_vtk_order(sim, field, sim.field_on(field, body, drawn)) for field in fields}
     return points, data, (drawn.cell_type, drawn.cells, _element_set_flags(mesh, drawn.element))
+
+
+def _in_vtk_order(sim: Any, field: str, values: np.ndarray) -> np.ndarray:
+    """Values (worlds, points, k); symmetric tensors xx yy zz yz xz xy as xx yy zz xy yz xz."""
+    spec = sim.fields.get(field)
+    values = np.asarray(values, dtype=np.float64)
+    return values[..., [0, 1, 2, 5, 3, 4]] if spec and spec.components == SYMMETRIC else values
 
 
 def _write_pvd(target: pathlib.Path, frames: list[tuple[float, list[str]]]) -> None:

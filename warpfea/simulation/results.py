@@ -11,24 +11,25 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..base.errors import ModelError, ModelWarning
-from ..base.names import did_you_mean, listing
+from ..base.names import check_choice, did_you_mean, listing
 from ..kernels.contact.structs import RECORD_NAMES
 from ..kernels.step.step_control import REPORT_COLUMNS
 from ..kernels.terms.constraints import JOINT_COLUMNS
-from ..model.bodies import Body
+from ..model.bodies import Body, point_coordinates
 from ..model.contacts import Contact, ContactOptions
 from ..model.description import support_slots
-from ..model.handles import NodeSet
+from ..model.handles import ElementSet, NodeSet
 from ..model.joints import Joint
 from ..model.pairs import FacetOptions
 from ..model.rigid import RigidBody
 from ..model.state import State
 from ..model.surfaces import reference_points
-from ..terms.evaluation import field_at_nodes, field_at_points, find_field
+from ..terms.fields import check_scalar, field_at_nodes, field_at_points, field_inside, find_field
 from ..terms.joint_values import joint_value
 from ..terms.protocols import Touching
 from ..terms.term import FieldSpec
 from .reports import ContactRecord, JointRecord, ProbeRecord
+from .sampling import History, Sampler
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -124,26 +125,46 @@ class Results:
 
     @property
     def fields(self) -> dict[str, FieldSpec]:
-        """Available scalar fields, by name."""
+        """Available fields, by name."""
         return self.model.terms.fields
 
-    def check_field(self, name: str) -> None:
-        """Raise ModelError, listing the available names, unless `name` is a field."""
+    def check_field(self, name: str, *, scalar: bool = False) -> None:
+        """Raise ModelError, listing the available names, unless `name` is a field, and a scalar where one is needed."""
         find_field(self.model.terms, name)
+        if scalar:
+            check_scalar(self.model.terms, name)
 
     def field_on(self, name: str, body: Body, drawn: Any) -> np.ndarray:
-        """Scalar field (B, P) at the points of a Skin or Drawing of the body."""
+        """Field (B, P), or (B, P, k), at the points of a Skin or Drawing of the body."""
         return field_at_points(self.model.terms, name, body, self.state, drawn)
 
-    def field(self, name: str, body: Body) -> np.ndarray:
-        """Scalar nodal field (B, nodes): "von_mises" (Pa, of the elastic Cauchy stress), "displacement" (m), "J"
-        (det F), "strain_energy_density" (J/m^3, mean of the elements at a node), or one of a term: with contact
-        "contact_pressure" (Pa, elastic, 0 away from contact) and "gap" (m, NaN off surfaces in contact).
+    def field(self, name: str, body: Body, *, at: str = "nodes", elements: ElementSet | None = None) -> np.ndarray:
+        """A field at the nodes of a body, (B, nodes), or (B, nodes, k) with components, listed by `fields`.
 
-        The stress at a beam node is the maximum over the corners of its section, at a shell node over its two faces.
+        Scalars such as "von_mises", "tresca", "pressure", "J", "strain_energy_density"; "cauchy", "second_piola",
+        "green_lagrange", "almansi" (6: xx yy zz yz xz xy), "first_piola" (9, row by row), "principal" (3, largest
+        first), "velocity" (3); "cauchy.xx" is a component; with contact "contact_pressure" and "gap" (NaN off surfaces
+        in contact). Stresses are elastic. "displacement" is its size. Nodes of beams and shells have the maximum over
+        the corners of the section or both faces, of J the minimum, and the mean of components.
+
+        Args:
+            at: "nodes", averaged over the elements of a material (nodes between materials have that given first);
+                "elements", means (B, elements); "points", quadrature points (B, elements, points).
+            elements: the elements that count at nodes, such as body.elements("rubber"); NaN at other nodes.
         """
         self.check_body(body, "field(name, body)")
-        return field_at_nodes(self.model.terms, name, body, self.state)
+        check_choice("field: at", at, ("nodes", "elements", "points"))
+        if at != "nodes":
+            return field_inside(self.model.terms, name, body, self.state, at)
+        if elements is not None and (not isinstance(elements, ElementSet) or elements.body is not body):
+            raise ModelError(f"field: elements = {elements!r} must be elements of body {body.name!r}")
+        chosen = None if elements is None else elements.indices
+        return field_at_nodes(self.model.terms, name, body, self.state, chosen)
+
+    def sample(self, points: Any, name: str) -> np.ndarray:
+        """A field (B, P), or (B, P, k), at material points: one, or several as `body.at` and `body.line` give them, or
+        nodes of a body."""
+        return Sampler(self.model, points, name).values(self.state)
 
     def node_gradients(self, body: Body) -> np.ndarray:
         """Deformation gradient F (B, nodes, 3, 3) at the nodes of a body with gradient slots; NaN at others.
@@ -171,6 +192,7 @@ class Records:
         self.results, self.stepper, self.statistics = results, stepper, statistics
         self.warned_of_noise = False
         self.model, self.state = results.model, results.state
+        self.histories: list[History] = []
 
     def energies(self) -> dict[str, np.ndarray]:
         """Energy ledger, each (B,), J.
@@ -192,14 +214,41 @@ class Records:
 
         NaN for a world whose last step was rejected, or without a step since a reset or resumption.
         """
+        return self._reactions(nodes, "position")[1].sum(axis=1)
+
+    def reaction_moment(self, nodes: NodeSet, about: Any = (0.0, 0.0, 0.0)) -> np.ndarray:
+        """Moment of the supports about a point (3,), m, on the prescribed components of nodes, gradients included, at
+        the last accepted step, (B, 3), N m. NaN as for `reaction`."""
+        slots, g = self._reactions(nodes, "all")
+        body, point = nodes.body, point_coordinates(nodes.body, about)
+        x = body.reference[slots] + self.state.displacement.numpy()[:, body.slot_range][:, slots].astype(float)
+        x = x + (body.slot_kind[slots] == 0)[:, None] * (body.origin - point)
+        return np.asarray(np.cross(x, g).sum(axis=1))
+
+    def _reactions(self, nodes: Any, slots: str) -> tuple[np.ndarray, np.ndarray]:
+        """Body slots of nodes, and the forces (B, slots, 3) of the supports on them."""
         if not isinstance(nodes, NodeSet):
             raise ModelError(f"reaction: expected nodes (body.nodes), got {nodes!r}")
         self.results.check_body(nodes.body, "reaction")
         g = self.stepper.work.g.numpy() * (1.0 - self.model.slot_table.free)
-        rows = nodes.body.slot_offset + support_slots(nodes, "position")
-        total = g[:, rows].sum(axis=1).astype(float)
-        total[~self.statistics.stepped_worlds] = np.nan
-        return total
+        rows = support_slots(nodes, slots)
+        of_nodes = g[:, nodes.body.slot_offset + rows].astype(float)
+        of_nodes[~self.statistics.stepped_worlds] = np.nan
+        return rows, of_nodes
+
+    def history(self, name: str, points: Any) -> History:
+        """Record a field at material points or nodes after each further step, as `sample`; or "reaction", force and
+        moment about the origin (6) of the supports on nodes."""
+        if self.statistics.asynchronous:
+            raise ModelError("history: the simulation was made with record=False")
+        if name == "reaction":
+            self._reactions(points, "position")
+            out = History(lambda: np.concatenate([self.reaction(points), self.reaction_moment(points)], axis=1))
+        else:
+            sampler = Sampler(self.model, points, name)
+            out = History(lambda: sampler.values(self.state))
+        self.histories.append(out)
+        return out
 
     def probe(self, name: str) -> ProbeRecord:
         """Record of the probe `name`, one entry per step. Raises ModelError listing the probes."""

@@ -119,6 +119,7 @@ class Simulation:
     pose = PartMember("results", Results.pose)
     angular_velocity = PartMember("results", Results.angular_velocity)
     field = PartMember("results", Results.field)
+    sample = PartMember("results", Results.sample)
     fields = PartMember("results", Results.fields)
     field_on = PartMember("results", Results.field_on)
     check_field = PartMember("results", Results.check_field)
@@ -129,6 +130,8 @@ class Simulation:
     collider_poses = PartMember("results", Results.collider_poses)
     energies = PartMember("records", Records.energies)
     reaction = PartMember("records", Records.reaction)
+    reaction_moment = PartMember("records", Records.reaction_moment)
+    history = PartMember("records", Records.history)
     probe = PartMember("records", Records.probe)
     joint_record = PartMember("records", Records.joint_record)
     joint_force = PartMember("records", Records.joint_force)
@@ -326,6 +329,8 @@ class Simulation:
                 statistics.unsynced = True
             else:
                 statistics.add_step(stepper.work.report.numpy())
+                for history in self.records.histories:
+                    history.record(self)
         if self.overlap_check:
             self.overlap_check.after_step(self)
         return PendingReport(self, statistics.steps) if statistics.asynchronous else statistics.last

@@ -65,6 +65,7 @@ class StaticResult:
     positions = PartMember("simulation", Results.positions)
     pose = PartMember("simulation", Results.pose)
     reaction = PartMember("simulation", Records.reaction)
+    reaction_moment = PartMember("simulation", Records.reaction_moment)
     joint_force = PartMember("simulation", Records.joint_force)
     joint_value = PartMember("simulation", Records.joint_value)
     contact_force = PartMember("simulation", Records.contact_force)
@@ -72,6 +73,7 @@ class StaticResult:
     violation = PartMember("simulation", Records.violation)
     node_gradients = PartMember("simulation", Results.node_gradients)
     field = PartMember("simulation", Results.field)
+    sample = PartMember("simulation", Results.sample)
 
     def __repr__(self) -> str:
         count = f"{self.simulation.steps} load step{'s' * (self.simulation.steps != 1)}"

@@ -119,7 +119,7 @@ class Measure:
         if known is not None:
             check_known(f"{where}: {self.kind}", self.name, [each.name for each in known])
         if self.kind == "field":
-            check_known(f"{where}: field", self.name, terms.fields)
+            check_known(f"{where}: field", self.name, terms.scalar_fields)
             check_known(f"{where}: body", self.quantity or model.bodies[0].name, [body.name for body in model.bodies])
         if self.kind == "energy":
             check_known(f"{where}: energy", self.name, terms.energies(np.zeros((1, len(terms.ledger)))))

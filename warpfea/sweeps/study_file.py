@@ -109,7 +109,7 @@ def _check_pictures(content: Mapping[str, Any]) -> None:
         scene = locate(content["scene"])
         own = {name: value for name, value in design[0].items() if name in scene.parameters}
         try:
-            fields = scene(**content["parameters"] | own).finalize(device="cpu").terms.fields
+            fields = scene(**content["parameters"] | own).finalize(device="cpu").terms.scalar_fields
         except (Error, MemoryError, NotImplementedError):  # the sweep tells
             return
         check_choice("pictures.field", pictures["field"], fields)

@@ -7,7 +7,6 @@ frozen during it among the dead loads.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
@@ -17,41 +16,27 @@ import warp as wp
 
 from ..kernels.step.gather import gather_kernels
 from ..kernels.terms.loads import load_kernels
-from .term import EXPLICIT_VISCOUS, Column, FieldSpec, StepContext, Term, part
+from .fields import ELEMENT_FIELDS
+from .section_forces import SECTION_FIELDS, section_field
+from .term import EXPLICIT_VISCOUS, Column, StepContext, Term, part
 
 if TYPE_CHECKING:
     from ..model.model import Model
     from ..model.state import State
     from .workspace import Workspace
 
-__all__ = ["ELEMENT_FIELDS", "Damping", "Elements", "von_mises"]
+__all__ = ["Damping", "Elements"]
 
 MIN_LANE_POINTS = 8
 """Points per element from which lanes of a warp share an element."""
 DAMPING_FORMS = ("incremental", "rate", "explicit")
 
 
-def von_mises(s: np.ndarray) -> np.ndarray:
-    """Von Mises stress of Voigt stresses [..., 6]."""
-    xx, yy, zz, yz, xz, xy = np.moveaxis(s, -1, 0)
-    normal = 0.5 * ((xx - yy) ** 2 + (yy - zz) ** 2 + (zz - xx) ** 2)
-    return np.sqrt(normal + 3.0 * (yz**2 + xz**2 + xy**2))
-
-
-ELEMENT_FIELDS = {
-    "von_mises": FieldSpec("von Mises stress", "Pa", node_reduction=np.maximum, scalar=von_mises),
-    "displacement": FieldSpec("displacement", "m", of_slots=True, scalar=functools.partial(np.linalg.norm, axis=-1)),
-    "J": FieldSpec("volume ratio J", "", node_reduction=np.minimum),
-    "strain_energy_density": FieldSpec("strain energy density", "J/m3", node_reduction=np.maximum),
-}
-"""Fields of every model."""
-
-
 class Elements(Term):
     """Element blocks of a model. Writes work.contribution and, for energies, work.energy_rows."""
 
     name = "elements"
-    fields = ELEMENT_FIELDS
+    fields = ELEMENT_FIELDS | SECTION_FIELDS
 
     @classmethod
     def of(cls, model: Model) -> Elements:
@@ -129,13 +114,10 @@ class Elements(Term):
         return self.model.evaluation.tangent_matrix(state, world), None
 
     def samples(self, field: str, body: Any, state: State) -> np.ndarray:
-        if field == "displacement":
-            return state.displacement.numpy()[:, body.slot_range].astype(float)
-        evaluation = self.model.evaluation
-        if field == "von_mises":
-            return evaluation.sample_stress(state, body)
-        sample = evaluation.sample_jacobian if field == "J" else evaluation.sample_energy_density
-        return sample(state, body)[:, :, 0]
+        """Fields of slots and section forces; others are functions of quantities."""
+        if field in SECTION_FIELDS:
+            return section_field(field, self.model, body, state)
+        return getattr(state, field).numpy()[:, body.slot_range].astype(float)
 
 
 class Damping(Term):

@@ -1,13 +1,7 @@
-"""Evaluation of forces, energy, tangent and stresses at a state for output and checks.
-
-Scalar fields of a model at nodes and drawn points: each field is declared once, in `fields` of a term, and evaluated by
-its `samples`.
-"""
+"""Evaluation of forces, energy, tangent and stresses at a state for output and checks."""
 
 from __future__ import annotations
 
-import functools
-import itertools
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
@@ -18,8 +12,6 @@ import warp as wp
 from ..base.errors import ModelError
 from ..base.launch import Launcher
 from ..base.memory import convert_memory_errors
-from ..base.names import check_known
-from ..elements import Rule, get_family
 from ..kernels.common.types import precision
 from ..kernels.elements.element_slots import iterate_struct
 from ..kernels.elements.materials import DEFINED_FOR_ANY_J
@@ -29,12 +21,13 @@ from ..model.assembly import element_chunks, shape_and_jacobian, shape_gradients
 from ..model.blocks import output_block
 from ..model.state import State
 from .elements import Elements
-from .term import FieldSpec, StepContext
+from .samples import Samples
+from .term import StepContext
 
 if TYPE_CHECKING:
     from ..model.model import Model
 
-__all__ = ["Evaluation", "field_at_nodes", "field_at_points", "find_field", "lowest_jacobian"]
+__all__ = ["Evaluation", "lowest_jacobian"]
 
 
 class Evaluation:
@@ -44,14 +37,16 @@ class Evaluation:
         self.model = model
         self.launch = Launcher(model.device)
         self.elements = Elements(model)
+        self.samples = Samples(model)
 
-    def _zeros(self, shape: tuple[int, ...], dtype: Any) -> wp.array:
+    def zeros(self, shape: tuple[int, ...], dtype: Any) -> wp.array:
+        """Array of zeros on the device."""
         with convert_memory_errors("an evaluation at a state", self.model.device):
             return wp.zeros(shape, dtype=dtype, device=self.model.device)
 
     def _gather(self, contribution: wp.array) -> np.ndarray:
         m = self.model
-        out = self._zeros((m.worlds, m.slots), m.types.vec3)
+        out = self.zeros((m.worlds, m.slots), m.types.vec3)
         kernel = gather_kernels(m.dtype).gather_force
         self.launch(kernel, (m.worlds, m.slots), [m.topology, contribution, self._all_worlds(), out])
         return out.numpy()
@@ -66,14 +61,14 @@ class Evaluation:
         none: Any = None
         stage = iterate_struct(m.dtype)()
         stage.u = stage.v = u
-        stage.history = self._zeros((1, 1), m.types.sym)
+        stage.history = self.zeros((1, 1), m.types.sym)
         stage.dq_dv = wp.ones(B, dtype=wp.float64, device=m.device)
         work: Any = SimpleNamespace(
             u=u,
             stage=stage,
             data_of=lambda block: block.data,
-            contribution=self._zeros((B, m.contributions), m.types.vec3),
-            energy_rows=self._zeros((2, B, m.element_count), wp.float64),
+            contribution=self.zeros((B, m.contributions), m.types.vec3),
+            energy_rows=self.zeros((2, B, m.element_count), wp.float64),
             newton=SimpleNamespace(min_J=least[0], domain_J=least[1]),
         )
         return StepContext(m, work, self.launch, state=none, u_before=none, inertia=False)
@@ -85,16 +80,47 @@ class Evaluation:
         self.elements.force(ctx, self._all_worlds())
         return self._gather(w.contribution), w.energy_rows.numpy()[0].sum(axis=1), w.newton.min_J.numpy()
 
+    def element_energies(self, state: State) -> np.ndarray:
+        """Strain energies (worlds, elements of all blocks), J."""
+        ctx = self._step_context(state.displacement)
+        self.elements.force(ctx, self._all_worlds())
+        return ctx.work.energy_rows.numpy()[0]
+
+    def element_forces(self, state: State, body: Any) -> np.ndarray:
+        """Elastic forces (worlds, elements, slots of an element, 3) of the elements of a body on their slots, N."""
+        ctx = self._step_context(state.displacement)
+        self.elements.force(ctx, self._all_worlds())
+        contribution = ctx.work.contribution.numpy().astype(float)
+        out = np.zeros((self.model.worlds, len(body.mesh.cells), body.connectivity.shape[1], 3))
+        for block in self.model.blocks:
+            own = contribution[:, block.contribution_offset :][:, : block.count * block.slots]
+            own = own.reshape(len(out), block.slots, block.count, 3)
+            first = 0
+            for part in block.host_blocks:
+                if part.body is body:
+                    out[:, part.elements] += np.swapaxes(own[:, :, first : first + len(part.elements)], 1, 2)
+                first += len(part.elements)
+        return out
+
     def viscous_force(self, state: State) -> tuple[np.ndarray, np.ndarray]:
         """Viscous force [world, slot, 3] and dissipation rate [world]."""
+        contribution, power = self._viscous(state)
+        return self._gather(contribution), power.numpy().sum(axis=1)
+
+    def element_losses(self, state: State) -> np.ndarray:
+        """Viscous dissipation (worlds, elements of all blocks), W."""
+        return self._viscous(state)[1].numpy()
+
+    def _viscous(self, state: State) -> tuple[wp.array, wp.array]:
+        """Viscous contributions of the elements, N, and power lost by each, W."""
         m = self.model
-        contribution = self._zeros((m.worlds, m.contributions), m.types.vec3)
-        power = self._zeros((m.worlds, m.element_count), wp.float64)
+        contribution = self.zeros((m.worlds, m.contributions), m.types.vec3)
+        power = self.zeros((m.worlds, m.element_count), wp.float64)
         for block in m.blocks:
             if block.key.damping:
                 args = [block.data, state.displacement, state.velocity, self._all_worlds(), contribution, power]
                 self.launch(block.kernels.viscous_force, (m.worlds, block.count), args)
-        return self._gather(contribution), power.numpy().sum(axis=1)
+        return contribution, power
 
     def minimum_jacobian(self, state: State) -> np.ndarray:
         """Smallest det F at the points (and vertices, for laws that need J > 0), [world]."""
@@ -136,7 +162,7 @@ class Evaluation:
         m = self.model
         row = state.displacement.numpy()[world : world + 1]
         ctx = self._step_context(wp.array(row, dtype=m.types.vec3, device=m.device))
-        direction = self._zeros((1, m.slots), m.types.vec3)
+        direction = self.zeros((1, m.slots), m.types.vec3)
         flag = wp.ones(1, dtype=wp.int32, device=m.device)
         conns = [b.connectivity for b in m.blocks]
         colour = assembly.greedy_colouring(slot_graph(m.blocks, m.slots))
@@ -168,88 +194,16 @@ class Evaluation:
 
         With an energy in parts each block has the stress of its part; parts add up.
         """
-        return [(block, stress) for block, stress, _ in self._at_points(state, body)]
+        bodies = self.model.bodies if body is None else [body]
+        blocks = {id(b): b for one in bodies for group in self.samples.groups(one, every_part=True) for b in group}
+        return [(block, self.samples.point_values("stress", block, state).numpy()) for block in blocks.values()]
 
-    def _at_points(self, state: State, body: Any) -> list[tuple[Any, np.ndarray, np.ndarray]]:
-        """Block, Cauchy stress and J [world, point, elem] of `stresses`."""
-        m = self.model
-        out = []
-        for block in m.blocks:
-            if body is not None and all(part.body is not body for part in block.host_blocks):
-                continue
-            if block.key.tying:
-                scheme = block.key.output_scheme
-                if scheme is None:
-                    continue  # a shell's transverse shear stress vanishes at its faces, the output points
-                block.stress_output = block.stress_output or output_block(m, block, scheme)
-                block = block.stress_output
-            stress = self._zeros((m.worlds, block.points, block.count), m.types.sym)
-            J = self._zeros((m.worlds, block.points, block.count), m.types.T)
-            kernel = block.kernels_for(m.dtype, None).point_stress
-            self.launch(kernel, (m.worlds, block.count), [block.data, state.displacement, stress, J])
-            out.append((block, stress.numpy(), J.numpy()))
-        return out
-
-    def sample_stress(self, state: State, body: Any) -> np.ndarray:
-        """Cauchy stress at the samples of each mesh node, [world, node x sample, 6], Pa.
-
-        Each part of the energy is fitted per element and evaluated at the samples; parts add up, elements are averaged
-        by volume.
-        """
-        out = self._at_samples(body, [(block, stress) for block, stress, _ in self._at_points(state, body)])
-        return 0.0 * out if body.rigid else out  # that of the nominal stiffness is round-off
-
-    def sample_jacobian(self, state: State, body: Any) -> np.ndarray:
-        """J = det F at the samples of each mesh node, [world, node x sample, 1], from the points of the first part of
-        the energy, as `sample_stress`."""
-        found = self._at_points(state, body)
-        return self._at_samples(body, [(b, J[..., None]) for b, _, J in found if _is_first(b)])
-
-    def sample_energy_density(self, state: State, body: Any) -> np.ndarray:
-        """Strain energy density at the samples of each mesh node, [world, node x sample, 1], J/m^3: mean of the
-        elements at the node, weighted by volume."""
-        ctx = self._step_context(state.displacement)
-        self.elements.force(ctx, self._all_worlds())
-        energy = ctx.work.energy_rows.numpy()[0]
-        found = []
-        for block in self.model.blocks:
-            volumes = [assembly.element_volumes(part.body)[part.elements] for part in block.host_blocks]
-            own = energy[:, block.element_offset : block.element_offset + block.count]
-            found.append((block, (own / np.concatenate(volumes))[:, None, :, None]))
-        return self._at_samples(body, found)
-
-    def _at_samples(self, body: Any, values: list[tuple[Any, np.ndarray]]) -> np.ndarray:
-        """Values at the samples of each mesh node, [world, node x sample, k], from those of blocks: [world, point,
-        elem, k], or [world, 1, elem, k] constant in each element."""
-        m, family = self.model, body.family
-        k = family.node_samples.shape[1]
-        total = np.zeros((m.worlds, len(body.mesh.points) * k, values[0][1].shape[3]))
-        weight = np.zeros(total.shape[1])
-        volumes = assembly.element_volumes(body)
-        for block, at_points in values:
-            first = 0
-            fit = _extrapolation_matrix(block.key.rule, family.node_samples.reshape(-1, 3))
-            if at_points.shape[1] == 1:
-                fit = np.ones((len(fit), 1))
-            for part in block.host_blocks:
-                members = slice(first, first + len(part.elements))
-                first += len(part.elements)
-                if part.body is not body:
-                    continue
-                at_samples = np.einsum("nq,bqek->benk", fit, at_points[:, :, members].astype(float))
-                rows = (body.mesh.cells[part.elements][:, :, None] * k + np.arange(k)).reshape(len(part.elements), -1)
-                v = volumes[part.elements]
-                if _is_first(block):
-                    np.add.at(weight, rows, v[:, None])
-                for b in range(m.worlds):
-                    np.add.at(total[b], rows, at_samples[b] * v[:, None, None])
-        total /= np.where(weight > 0.0, weight, 1.0)[None, :, None]
-        return np.broadcast_to(total[:, weight > 0.0][:, :1], total.shape) if body.rigid else total
-
-
-def _is_first(block: Any) -> bool:
-    """True for blocks of the first part of the energy, which has each element once; not for stress output."""
-    return block.key.part == 0 and block.key.scheme not in get_family(block.key.family).output_schemes
+    def output_of(self, block: Any) -> Any:
+        """Block of the stress output in place of a tied part of the energy; None if it has none: a shell's transverse
+        shear stress vanishes at its faces, the output points."""
+        if block.stress_output is None and block.key.output_scheme is not None:
+            block.stress_output = output_block(self.model, block, block.key.output_scheme)
+        return block.stress_output
 
 
 def lowest_jacobian(model: Model, u: np.ndarray) -> tuple[float, int, str]:
@@ -273,71 +227,3 @@ def lowest_jacobian(model: Model, u: np.ndarray) -> tuple[float, int, str]:
                     best, index = float(J[low]), body.element_offset + int(members[low])
                     text = f"element {int(members[low])} of body {body.name!r} (J = {best:.3g})"
     return best, index, text
-
-
-def _extrapolation_matrix(rule: Rule, at: np.ndarray) -> np.ndarray:
-    """Extrapolation matrix (n, Q) from the points of a rule to parent points (n, 3).
-
-    Product of Lagrange polynomials on a box; on the simplex a linear least-squares fit, or a constant with too few
-    points.
-    """
-    if rule.counts:
-        out = np.ones((len(at), 1))
-        grid = rule.points.reshape(*rule.counts, 3)
-        for axis in range(3):
-            nodes = np.moveaxis(grid[..., axis], axis, 0).reshape(rule.counts[axis], -1)[:, 0]
-            basis = np.ones((len(at), len(nodes)))
-            for j, k in itertools.permutations(range(len(nodes)), 2):
-                basis[:, j] *= (at[:, axis] - nodes[k]) / (nodes[j] - nodes[k])
-            out = (out[:, :, None] * basis[:, None, :]).reshape(len(at), -1)
-        return out
-    points = rule.points
-    if len(points) < 4:
-        return np.full((len(at), len(points)), 1.0 / len(points))
-    A = np.column_stack([np.ones(len(points)), points])
-    return np.column_stack([np.ones(len(at)), at]) @ np.linalg.pinv(A)
-
-
-def find_field(terms: Any, name: str) -> FieldSpec:
-    """Specification of a field. Raises ModelError, listing the available names, for an unknown one."""
-    check_known("field", name, terms.fields)
-    return terms.fields[name]
-
-
-def _sample_field(terms: Any, name: str, body: Any, state: State) -> np.ndarray:
-    """Samples of a field, joined over its terms; nodal values are repeated at each sample.
-
-    Raises:
-        ModelError: an unknown field, or a term returns another shape.
-    """
-    spec, count = find_field(terms, name), body.family.node_samples.shape[1]
-    nodes = len(body.mesh.points)
-    rows = body.slot_count if spec.of_slots else nodes * count if spec.node_reduction else nodes
-    found = []
-    for term in (term for term in terms if name in term.fields):
-        values = np.asarray(term.samples(name, body, state))
-        expected = (terms.model.worlds, rows)
-        if values.shape[: 2 if spec.scalar else None] != expected:
-            raise ModelError(f"term {term.name!r}: samples({name!r}) gave {values.shape}; expected {expected}")
-        found.append(values if spec.of_slots or spec.node_reduction else np.repeat(values, count, axis=1))
-    return functools.reduce(spec.join, found) if spec.join else found[0]
-
-
-def field_at_nodes(terms: Any, name: str, body: Any, state: State) -> np.ndarray:
-    """Values (worlds, nodes) of a field."""
-    spec, values = find_field(terms, name), _sample_field(terms, name, body, state)
-    if spec.scalar:
-        values = spec.scalar(values)
-    nodes = len(body.mesh.points)
-    if spec.of_slots:
-        return body.at_nodes(values[..., None])[..., 0]
-    values = values.reshape(len(values), nodes, -1)
-    return np.asarray(spec.node_reduction.reduce(values, axis=2) if spec.node_reduction else values[:, :, 0])
-
-
-def field_at_points(terms: Any, name: str, body: Any, state: State, drawn: Any) -> np.ndarray:
-    """Values (worlds, points) of a field at the points of a Skin or Drawing of the body."""
-    spec, values = find_field(terms, name), _sample_field(terms, name, body, state)
-    weights = drawn.slot_weights if spec.of_slots else drawn.node_weights
-    values = np.stack([weights @ row for row in values])
-    return spec.scalar(values) if spec.scalar else values

@@ -98,14 +98,18 @@ class Column:
 
 @dataclass(frozen=True)
 class FieldSpec:
-    """Scalar nodal field available to users.
+    """Field available to users.
 
     Attributes:
         title, units: for legends.
         join: combines the samples of two terms with this field; None: one term only.
         node_reduction: reduces the samples of a node; None: `samples` gives one value per node.
         of_slots: `samples` gives values (worlds, slots of the body), interpolated by the shape functions.
-        scalar: the scalar of samples with components (worlds, n, k), after interpolation; None: samples are scalars.
+        function: values from samples with components (worlds, n, k), after interpolation; None: the samples.
+        components: names of the components; () for a scalar. Components of samples of a node are averaged.
+        quantities: of a field of the elements, what is sampled, see terms.samples.
+        scalars: fields to take in its place where a scalar is needed.
+        cell_type: of the bodies that have it, beams "line", shells "quad"; "" for all.
     """
 
     title: str
@@ -113,7 +117,11 @@ class FieldSpec:
     join: np.ufunc | None = None
     node_reduction: np.ufunc | None = None
     of_slots: bool = False
-    scalar: Callable[[np.ndarray], Any] | None = None
+    function: Callable[[np.ndarray], Any] | None = None
+    components: tuple[str, ...] = ()
+    quantities: tuple[str, ...] = ()
+    scalars: tuple[str, ...] = ()
+    cell_type: str = ""
 
 
 class Term:

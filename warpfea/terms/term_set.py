@@ -269,8 +269,13 @@ class TermSet:
 
     @property
     def fields(self) -> dict[str, FieldSpec]:
-        """Scalar fields of all terms, see terms.evaluation."""
+        """Fields of all terms, see terms.fields."""
         return {name: spec for term in self.all for name, spec in term.fields.items()}
+
+    @property
+    def scalar_fields(self) -> dict[str, FieldSpec]:
+        """Those without components."""
+        return {name: spec for name, spec in self.fields.items() if not spec.components}
 
     # parameters and fields
 

@@ -1,0 +1,246 @@
+"""Tensor fields: uniform states of every law, materials side by side, invariants, sampling, section forces."""
+
+import functools
+
+import numpy as np
+import pytest
+
+import warpfea as wf
+from warpfea.simulation.results import Results
+from warpfea.terms.fields import MATRIX, SYMMETRIC
+
+GRADIENT = np.eye(3) + np.array([(0.1, 0.05, 0.0), (0.02, -0.04, 0.03), (0.0, 0.01, 0.06)])
+VOIGT = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
+LAWS = {
+    "SVK": wf.SVK(E=1e6, nu=0.3, density=1000.0),
+    "MooneyRivlin": wf.MooneyRivlin(mu10=3e5, mu01=1e5, k=1e7, density=1000.0),
+    "NeoHookean": wf.NeoHookean(mu=4e5, k=1e7, density=1000.0),
+}
+
+
+def voigt(A):
+    return np.array([A[i, j] for i, j in VOIGT])
+
+
+def second_piola(name, F):
+    """S of the three laws, by their energies in C."""
+    C, J, law = F.T @ F, np.linalg.det(F), LAWS[name]
+    if name == "SVK":
+        lam, mu = law.lame
+        E = 0.5 * (C - np.eye(3))
+        return lam * np.trace(E) * np.eye(3) + 2 * mu * E
+    inverse, I1 = np.linalg.inv(C), np.trace(C)
+    I2 = 0.5 * (I1**2 - np.trace(C @ C))
+    mu10, mu01 = (law.mu10, law.mu01) if name == "MooneyRivlin" else (law.mu / 2, 0.0)
+    S = 2 * mu10 * J ** (-2 / 3) * (np.eye(3) - I1 / 3 * inverse)
+    S += 2 * mu01 * J ** (-4 / 3) * (I1 * np.eye(3) - C - 2 * I2 / 3 * inverse)
+    return S + law.k * (J - 1.0) * J * inverse
+
+
+def move(model, F):
+    """State with x = F X everywhere."""
+    state = model.state()
+    origin = np.concatenate([np.where(body.slot_kind[:, None] == 0, body.origin, 0.0) for body in model.bodies])
+    state.displacement.assign(((model.slot_table.reference + origin) @ (F - np.eye(3)).T)[None])
+    return state
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_uniform_state(name):
+    b = wf.ModelBuilder()
+    for k, element in enumerate(("T4", "T10")):
+        b.add_solid(
+            wf.mesh.box((1, 0.2, 0.2), cells=(2, 1, 1), element=element, origin=(0, k, 0)),
+            material=LAWS[name],
+            name=element,
+        )
+    model = b.finalize(device="cpu")
+    results = Results(model, move(model, GRADIENT))
+    F, J = GRADIENT, np.linalg.det(GRADIENT)
+    S = second_piola(name, F)
+    sigma = F @ S @ F.T / J
+    inverse = np.linalg.inv(F)
+    values, vectors = np.linalg.eigh(sigma)
+    exact = {
+        "cauchy": voigt(sigma),
+        "second_piola": voigt(S),
+        "first_piola": (F @ S).ravel(),
+        "green_lagrange": voigt(0.5 * (F.T @ F - np.eye(3))),
+        "almansi": voigt(0.5 * (np.eye(3) - inverse.T @ inverse)),
+        "principal": values[::-1],
+        "tresca": values[2] - values[0],
+        "pressure": -np.trace(sigma) / 3,
+        "von_mises": np.sqrt(1.5 * np.sum((sigma - np.trace(sigma) / 3 * np.eye(3)) ** 2)),
+        "J": J,
+    }
+    for body in model.bodies:
+        for field, value in exact.items():
+            size = np.abs(value).max()
+            for found in (
+                results.field(field, body),
+                results.field(field, body, at="elements"),
+                results.field(field, body, at="points"),
+                results.skin_field(field, body),
+                results.sample(body.at(body.mesh.points.mean(axis=0)), field),
+            ):
+                assert np.abs(found - value).max() < 1e-12 * size, (body.name, field)
+        directions = results.field("principal_directions", body)[0, 0].reshape(3, 3)
+        assert np.abs(np.abs(directions @ vectors[:, ::-1]) - np.eye(3)).max() < 1e-9
+        assert results.field("cauchy.xy", body) == pytest.approx(sigma[0, 1], rel=1e-11)
+        assert results.field("first_piola.yz", body) == pytest.approx((F @ S)[1, 2], rel=1e-11)
+        assert results.field("principal.3", body) == pytest.approx(values[0], rel=1e-11)
+
+
+@functools.cache
+def two_materials():
+    b = wf.ModelBuilder()
+    mesh = wf.mesh.box((1, 0.2, 0.2), cells=(4, 1, 1), element="T4")
+    left = mesh.centroids()[:, 0] < 0.5
+    mesh.element_sets.update(soft=np.flatnonzero(left), hard=np.flatnonzero(~left))
+    soft, hard = LAWS["SVK"], wf.SVK(E=3e6, nu=0.3, density=1000.0, damping=wf.KelvinVoigt(eta=100.0))
+    body = b.add_solid(mesh, material={"soft": soft, "hard": hard}, name="bar")
+    model = b.finalize(device="cpu")
+    return model, body
+
+
+def test_nodes_between_materials_take_the_first():
+    model, body = two_materials()
+    results = Results(model, move(model, GRADIENT))
+    S, F = second_piola("SVK", GRADIENT), GRADIENT
+    sigma = voigt(F @ S @ F.T / np.linalg.det(F))
+    x = body.mesh.points[:, 0]
+    found = results.field("cauchy", body)[0]
+    assert np.abs(found[x < 0.5 + 1e-9] - sigma).max() < 1e-11 * np.abs(sigma).max()
+    assert np.abs(found[x > 0.5 + 1e-9] - 3.0 * sigma).max() < 1e-11 * np.abs(sigma).max()
+    hard = results.field("cauchy", body, elements=body.elements("hard"))[0]
+    assert np.isnan(hard[x < 0.5 - 1e-9]).all()
+    assert np.abs(hard[x > 0.5 - 1e-9] - 3.0 * sigma).max() < 1e-11 * np.abs(sigma).max()
+
+
+def test_dissipation_is_that_of_the_viscous_force():
+    model, body = two_materials()
+    state = move(model, GRADIENT)
+    rate = np.array([(0.3, 0.1, 0.0), (0.0, 0.2, 0.0), (0.0, 0.4, -0.1)])
+    state.velocity.assign(((model.slot_table.reference + body.origin) @ rate.T)[None])
+    results = Results(model, state)
+    E = 0.5 * (rate.T @ GRADIENT + GRADIENT.T @ rate)
+    found = results.field("viscous_dissipation", body, at="elements")[0]
+    expected = np.where(np.isin(np.arange(len(found)), body.elements("hard").indices), 200.0 * np.sum(E * E), 0.0)
+    assert found == pytest.approx(expected, rel=1e-11)
+    assert results.field("velocity", body)[0] == pytest.approx(body.mesh.points @ rate.T, abs=1e-14)
+    assert results.sample(body.line((0, 0.1, 0.1), (1, 0.1, 0.1), 5), "velocity")[0] == pytest.approx(
+        np.column_stack([np.linspace(0, 1, 5), np.full(5, 0.1), np.full(5, 0.1)]) @ rate.T, abs=1e-13
+    )
+
+
+def test_what_is_unknown_or_no_scalar_says_what_there_is(tmp_path):
+    model, body = two_materials()
+    results = Results(model, model.state())
+    for name, text in (
+        ("cauchi", r"'cauchi' is unknown.*did you mean 'cauchy'"),
+        ("cauchy.yx", r"'cauchy' has cauchy.xx, cauchy.yy.*did you mean"),
+        ("J.x", "'J' has no components, as it is a scalar"),
+        ("section_force", "'section_force' is one of beams; body 'bar' has element T4"),
+    ):
+        with pytest.raises(wf.ModelError, match=text):
+            results.field(name, body)
+    with pytest.raises(wf.ModelError, match="field 'displacement' is one of nodes: leave out at='points'"):
+        results.field("displacement", body, at="points")
+    with pytest.raises(wf.ModelError, match="expected material points"):
+        results.sample((0, 0, 0), "J")
+    sim = wf.Simulation(model, dt=1e-3)
+    text = (
+        "'cauchy' has 6 components where a scalar is needed: take von_mises, tresca, pressure, principal.1, or a comp"
+    )
+    for writer in (
+        wf.USDWriter(tmp_path / "a.usdc", fields=["cauchy"]),
+        wf.PNGWriter(tmp_path / "a.png", field="cauchy"),
+    ):
+        with pytest.raises(wf.ModelError, match=text):
+            writer.open(sim)
+
+
+def test_section_forces_balance_the_loads_of_a_bent_beam():
+    law = wf.SVK(E=1e7, nu=0.3, density=1000.0)
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    section = wf.Rectangle(0.05, 0.05)
+    beam = b.add_beam([(0, 0, 0), (1, 0, 0)], elements=6, section=section, normal=(0, 0, 1), material=law, name="beam")
+    b.clamp(beam.start, slots="all")
+    force, moment = np.array([2.0, 3.0, -10.0]), np.array([0.5, -0.8, 0.3])
+    b.add_point_load(beam.at((1, 0, 0)), force)
+    model = b.finalize(device="cpu")
+    r = wf.solve_static(model, load_steps=2, tol=1e-12, unstable="ignore")
+    x = r.positions(beam)[0]
+    assert abs(x[-1, 2]) > 0.1  # m: bent far
+    found = r.field("section_force", beam)[0].reshape(-1, 2, 3)
+    axes = np.swapaxes(r.node_gradients(beam)[0] @ beam.node_axes, 1, 2)
+    t = axes[:, 0] / np.linalg.norm(axes[:, 0], axis=1)[:, None]
+    for node in range(len(x)):
+        arm = x[-1] - x[node]
+        N, T = force @ t[node], np.cross(arm, force) @ t[node]
+        assert found[node, 0, 0] == pytest.approx(N, abs=1e-8 * np.linalg.norm(force))
+        assert found[node, 1, 0] == pytest.approx(T, abs=1e-8 * np.linalg.norm(force))
+        assert np.linalg.norm(found[node, 0]) == pytest.approx(np.linalg.norm(force), rel=1e-8)
+        assert np.linalg.norm(found[node, 1]) == pytest.approx(np.linalg.norm(np.cross(arm, force)), abs=1e-8)
+    assert np.abs(r.reaction(beam.start)[0] + force).max() < 1e-8
+    assert np.abs(r.reaction_moment(beam.start)[0] + np.cross(x[-1], force)).max() < 1e-8
+    about = r.reaction_moment(beam.start, about=(1, 0, 0))[0]
+    assert np.abs(about + np.cross(x[-1] - (1, 0, 0), force)).max() < 1e-8
+    with pytest.raises(wf.ModelError, match="'shell_force' is one of shells"):
+        r.field("shell_force", beam)
+    assert moment is not None
+
+
+def test_tensors_in_vtu(tmp_path):
+    import meshio
+
+    b = wf.ModelBuilder()
+    box = b.add_solid(wf.mesh.box((1, 0.2, 0.2), cells=(1, 1, 1), element="T4"), material=LAWS["SVK"], name="box")
+    options = {"section": wf.Rectangle(0.1, 0.1), "normal": (0, 0, 1), "material": LAWS["SVK"], "name": "beam"}
+    b.add_beam([(0, 1, 0), (1, 1, 0)], elements=1, **options)
+    model = b.finalize(device="cpu")
+    sim = wf.Simulation(model, move(model, GRADIENT), dt=1e-3)
+    writer = wf.VTUWriter(tmp_path / "vtu", fields=["cauchy", "first_piola", "section_force", "principal"])
+    writer.open(sim)
+    writer.write(sim)
+    writer.close(sim)
+    solid, beam = (meshio.read(tmp_path / "vtu" / f"{name}_0000_000000.vtu").point_data for name in ("box", "beam"))
+    sigma = sim.field("cauchy", box)[0, 0]
+    assert solid["cauchy"][0] == pytest.approx(
+        sigma[[SYMMETRIC.index(c) for c in ("xx", "yy", "zz", "xy", "yz", "xz")]]
+    )
+    assert solid["first_piola"][0] == pytest.approx(sim.field("first_piola", box)[0, 0])
+    assert MATRIX[1] == "xy"
+    assert "section_force" not in solid
+    assert beam["section_force"].shape[1] == 6
+    assert beam["cauchy"].shape[1] == 6
+
+
+def test_history_of_a_field_and_of_reactions():
+    law = wf.SVK(E=1e5, nu=0.3, density=1000.0)
+    b = wf.ModelBuilder()
+    box = b.add_solid(wf.mesh.box((1, 0.2, 0.2), cells=(2, 1, 1), element="T4"), material=law, name="box")
+    b.clamp(box.nodes("x-"))
+    sim = wf.Simulation(b.finalize(device="cpu", worlds=2), dt=1e-2)
+    points = box.line((0.1, 0.1, 0.1), (0.9, 0.1, 0.1), 3)
+    stress, held = sim.history("cauchy", points), sim.history("reaction", box.nodes("x-"))
+    for _ in range(3):
+        sim.step()
+    assert stress.time == pytest.approx([0.01, 0.02, 0.03])
+    assert stress.values.shape == (2, 3, 3, 6)
+    assert np.array_equal(stress.values[:, -1], sim.sample(points, "cauchy"))
+    assert held.values.shape == (2, 3, 6)
+    assert np.array_equal(held.values[:, -1, :3], sim.reaction(box.nodes("x-")))
+    assert np.array_equal(held.values[:, -1, 3:], sim.reaction_moment(box.nodes("x-")))
+    assert repr(held) == "History(3 steps)"
+    with pytest.raises(wf.ModelError, match="did you mean 'cauchy'"):
+        sim.history("cauchi", points)
+
+
+def test_a_simulation_without_fields_compiles_nothing_of_them():
+    model, body = two_materials()
+    sim = wf.Simulation(model, dt=1e-3)
+    sim.step()
+    assert not any("fields" in name or "_gradient" in name for name in sim.stepper.launch.modules)
+    sim.field("almansi", body)
+    assert any("fields" in name for name in model.evaluation.launch.modules)

@@ -1,0 +1,109 @@
+"""Fields at material points, and their history over the steps."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from ..base.errors import ModelError
+from ..model.handles import MaterialPoint, NodeSet
+from ..terms.fields import field_at_nodes, field_at_points, find_field
+
+if TYPE_CHECKING:
+    from ..model.model import Model
+    from ..model.state import State
+
+__all__ = ["History", "Sampler"]
+
+
+class PointWeights:
+    """Points of a body, as a Skin has them.
+
+    Attributes:
+        slot_weights, node_weights: sparse (points, slots), (points, mesh nodes x samples).
+    """
+
+    def __init__(self, body: Any, points: list[MaterialPoint]) -> None:
+        rows = np.repeat(np.arange(len(points)), [len(p.slots) for p in points])
+        slots, weights = (np.concatenate([getattr(p, name) for p in points]) for name in ("slots", "weights"))
+        self.slot_weights = sp.csr_matrix((weights, (rows, slots)), shape=(len(points), body.slot_count))
+        k = body.family.node_samples.shape[1]
+        width = len(body.mesh.points) * k
+        if body.rigid:  # of one value everywhere
+            self.node_weights = sp.csr_matrix((len(points), width))
+        elif not body.family.has_gradients:  # nodal values by the shape functions
+            self.node_weights = sp.csr_matrix((weights, (rows, body.slot_node[slots])), shape=(len(points), width))
+        else:
+            columns = [(body.mesh.cells[p.element][:, None] * k + np.arange(k)).ravel() for p in points]
+            values = [body.family.sample_weights(p.xi[None])[0] for p in points if p.xi is not None]
+            size = len(columns[0])
+            index = (np.repeat(np.arange(len(points)), size), np.concatenate(columns))
+            self.node_weights = sp.csr_matrix((np.concatenate(values), index), shape=(len(points), width))
+
+
+class Sampler:
+    """Values of a field at material points or nodes.
+
+    Raises:
+        ModelError: an unknown field, or points that are none of this model.
+    """
+
+    def __init__(self, model: Model, points: Any, name: str) -> None:
+        self.model, self.name = model, name
+        find_field(model.terms, name)
+        self.nodes = points if isinstance(points, NodeSet) else None
+        self.count = len(points) if isinstance(points, (list, tuple, NodeSet)) else 1
+        given = [points] if isinstance(points, MaterialPoint) else points
+        known = given if isinstance(given, (list, tuple)) else []
+        if self.nodes is None and not (known and all(isinstance(p, MaterialPoint) for p in known)):
+            raise ModelError(f"expected material points (body.at, body.line) or nodes (body.nodes), got {points!r}")
+        for body in [self.nodes.body] if self.nodes is not None else [p.body for p in known]:
+            if body not in model.bodies:
+                raise ModelError(f"a point of body {body.name!r}, which is not of this model")
+        self.groups = []
+        for body in {id(p.body): p.body for p in known}.values():
+            own = [k for k, p in enumerate(known) if p.body is body]
+            self.groups.append((body, np.array(own), PointWeights(body, [known[k] for k in own])))
+
+    def values(self, state: State) -> np.ndarray:
+        """Values (worlds, points), or (worlds, points, k)."""
+        terms = self.model.terms
+        if self.nodes is not None:
+            return field_at_nodes(terms, self.name, self.nodes.body, state)[:, self.nodes.indices]
+        found = [(own, field_at_points(terms, self.name, body, state, at)) for body, own, at in self.groups]
+        out = np.zeros((self.model.worlds, self.count, *found[0][1].shape[2:]))
+        for own, values in found:
+            out[:, own] = values
+        return out
+
+
+class History:
+    """Record of a field at points, or of a reaction, after each step since it was made.
+
+    Attributes:
+        time: (steps,) s, of the most advanced world.
+        values: (worlds, steps, points) or (worlds, steps, points, k); of a reaction (worlds, steps, 6).
+    """
+
+    def __init__(self, take: Any) -> None:
+        self._take, self._time, self._values = take, list[float](), list[np.ndarray]()
+
+    @property
+    def time(self) -> np.ndarray:
+        """(steps,) s."""
+        return np.array(self._time)
+
+    @property
+    def values(self) -> np.ndarray:
+        """Values, worlds first, then steps."""
+        return np.stack(self._values, axis=1) if self._values else np.zeros((0, 0))
+
+    def __repr__(self) -> str:
+        return f"History({len(self._time)} steps)"
+
+    def record(self, sim: Any) -> None:
+        """Add the present values."""
+        self._time.append(float(np.max(sim.time)))
+        self._values.append(self._take())

@@ -1,0 +1,84 @@
+"""Section forces of beams from the consistent nodal forces at a cut, and resultants of shells from the stress at their
+faces, at the nodes and in the present axes of the section."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..base.errors import ModelError
+from .fields import matrix
+from .term import FieldSpec
+
+if TYPE_CHECKING:
+    from ..model.model import Model
+    from ..model.state import State
+
+__all__ = ["SECTION_FIELDS", "section_field"]
+
+SECTION_FIELDS = {
+    "section_force": FieldSpec(
+        "section force", "N, N m", components=("N", "Qy", "Qz", "T", "My", "Mz"), cell_type="line"
+    ),
+    "shell_force": FieldSpec(
+        "shell force", "N/m, N", components=("nxx", "nyy", "nxy", "mxx", "myy", "mxy"), cell_type="quad"
+    ),
+}
+"""Of beams (y along the width, z along the height of the section), and of shells per length (x, y along the node's axes
+in the surface)."""
+
+
+def section_field(name: str, model: Model, body: Any, state: State) -> np.ndarray:
+    """Values (worlds, nodes, 6) of a field of SECTION_FIELDS.
+
+    Raises:
+        ModelError: a body that is no beam, or no shell.
+    """
+    cell_type = SECTION_FIELDS[name].cell_type
+    if body.mesh.cell_type != cell_type or not body.family.has_gradients:
+        kind = "beams" if cell_type == "line" else "shells"
+        raise ModelError(f"field {name!r} is one of {kind}; body {body.name!r} has element {body.family.name}")
+    return (_of_beam if name == "section_force" else _of_shell)(model, body, state)
+
+
+def _present_axes(body: Any, state: State) -> tuple[np.ndarray, np.ndarray]:
+    """Present slot values (worlds, nodes, 4, 3) of each node, the position relative to itself, and orthonormal axes as
+    rows (worlds, nodes, 3, 3), the first along the first gradient."""
+    u = state.displacement.numpy()[:, body.slot_range].astype(float)
+    rows = body.node_slot[:, None] + np.arange(4)
+    values = (body.reference + u)[:, rows]
+    values[:, :, 0] = 0.0
+    first, second = values[:, :, 1], values[:, :, 2]
+    t = first / np.linalg.norm(first, axis=2)[..., None]
+    second = second - np.einsum("bnk,bnk->bn", second, t)[..., None] * t
+    second /= np.linalg.norm(second, axis=2)[..., None]
+    return values, np.stack([t, second, np.cross(t, second)], axis=2)
+
+
+def _of_beam(model: Model, body: Any, state: State) -> np.ndarray:
+    """Force and moment of the beam after a node on the part before it; at the end those of the load on the beam."""
+    forces = model.evaluation.element_forces(state, body)
+    values, axes = _present_axes(body, state)
+    out = np.zeros((model.worlds, len(body.mesh.points), 2, 3))
+    cells, slots = body.mesh.cells, forces.shape[2] // 2
+    for end, sign in ((1, 1.0), (0, -1.0)):  # the element after a node counts where there is one
+        at = cells[:, end]
+        f = sign * forces[:, :, end * slots : (end + 1) * slots]
+        out[:, at, 0] = f[:, :, 0]
+        out[:, at, 1] = np.cross(values[:, at], f).sum(axis=2)
+    return np.einsum("bnik,bnck->bnci", axes, out).reshape(*out.shape[:2], 6)
+
+
+def _of_shell(model: Model, body: Any, state: State) -> np.ndarray:
+    """Membrane forces and moments: integrals over the thickness of the stress, linear between the faces."""
+    stress = model.evaluation.samples.at_samples("stress", state, body)
+    stress = matrix(stress.reshape(len(stress), -1, 2, 6))
+    _, axes = _present_axes(body, state)
+    local = np.einsum("bnik,bnfkl,bnjl->bnfij", axes, stress, axes)
+    thickness = np.zeros(len(body.mesh.points))
+    thickness[body.mesh.cells] = np.linalg.norm(body.frames[..., 2], axis=2)
+    t = thickness[:, None, None]
+    n = 0.5 * t * (local[:, :, 1] + local[:, :, 0])
+    m = t**2 / 12.0 * (local[:, :, 1] - local[:, :, 0])
+    return np.stack([x[..., i, j] for x in (n, m) for i, j in ((0, 0), (1, 1), (0, 1))], axis=2)
