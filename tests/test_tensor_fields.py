@@ -4,6 +4,8 @@ import functools
 
 import numpy as np
 import pytest
+from result_files import rows_of
+from stress_recovery import errors
 
 import warpfea as wf
 from warpfea.simulation.results import Results
@@ -244,3 +246,36 @@ def test_a_simulation_without_fields_compiles_nothing_of_them():
     assert not any("fields" in name or "_gradient" in name for name in sim.stepper.launch.modules)
     sim.field("almansi", body)
     assert any("fields" in name for name in model.evaluation.launch.modules)
+
+
+def test_stress_at_nodes_is_of_second_order():
+    """Lame and Kirsch; the file has other recoveries beside."""
+    rows = {(row["problem"], row["element"], row["cells"]): row for row in rows_of("stress_recovery_cpu.json")}
+    for problem in ("lame", "kirsch"):
+        found = errors(problem, 4, "T10", ["average"])
+        assert found["average"] == pytest.approx(rows[problem, "T10", 4]["average"], rel=1e-6)
+        for element, order in (("T10", 1.9), ("T4", 1.1)):
+            coarse, fine = (rows[problem, element, cells]["average"] for cells in (8, 16))
+            assert np.log2(coarse[0] / fine[0]) > order
+            least = min(rows[problem, element, 16][name][1] for name in ("l2_projection", "patch_recovery"))
+            assert fine[1] < 1.2 * least
+
+
+def test_shell_resultants():
+    """A strip under a tip load, mxx is the force times the arm over the width: each element has one curvature, so that
+    means of two are exact and ends of first order. Stretched, nxx is uniform."""
+    misses = []
+    for cells in (4, 8):
+        b = wf.ModelBuilder(gravity=(0, 0, 0))
+        law = wf.SVK(E=1e9, nu=0.0, density=1000.0)
+        strip = b.add_shell(wf.mesh.grid((1, 0.2), cells=(cells, 1)), thickness=0.02, material=law, name="strip")
+        b.clamp(strip.edge("x-"), slots="all")
+        b.add_traction(strip.surface("x+"), (5.0, 0, -0.125))
+        r = wf.solve_static(b.finalize(device="cpu"), load_steps=1, unstable="ignore", tol=1e-10)
+        n, m = np.split(r.field("shell_force", strip)[0], 2, axis=1)
+        arm = 1.0 - strip.mesh.points[:, 0]
+        inside = (arm > 1e-9) & (arm < 0.7)
+        assert n[arm < 0.7, 0] == pytest.approx(0.1, rel=0.03)
+        assert np.abs(m[inside, 0]) == pytest.approx(0.0025 * arm[inside], rel=2e-3)
+        misses.append(np.abs(np.abs(m[:, 0]) - 0.0025 * arm).max() / 0.0025)
+    assert misses == pytest.approx([0.125, 0.0625], rel=0.02)
