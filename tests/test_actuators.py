@@ -134,7 +134,7 @@ def test_a_stop_hit_at_10_m_per_s() -> None:
 
 def test_stops_by_default_take_most_of_the_speed() -> None:
     """(lower, upper) alone: the inertia of both bodies sets stiffness and damping, at any step."""
-    for h, scheme in ((1e-3, "energy_momentum"), (2e-2, "backward_euler")):
+    for h, scheme in ((1e-3, "energy_momentum"), (2e-2, "backward_euler"), (2e-2, "bdf2")):
         b, _, hinge = rotor(5.0, limits=(-0.5, 0.3), com=0.5)
         sim = run(b, h, scheme)
         sim.step(round(0.2 / h))

@@ -17,6 +17,7 @@ class Traits(NamedTuple):
         has_constraints: constraints with a violation tolerance, and with multipliers that change with the iterate.
         limited: terms may shorten a Newton step.
         unilateral: terms have unilateral forces, such as contact.
+        impacts: terms may stop a body within a step.
         midpoint: of the integrator: forces are those at the midpoint of a step and have no potential in its end state.
     """
 
@@ -28,6 +29,7 @@ class Traits(NamedTuple):
     has_constraints: bool = False
     limited: bool = False
     unilateral: bool = False
+    impacts: bool = False
     midpoint: bool = False
 
     def suffix(self, *names: str) -> str:

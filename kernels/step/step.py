@@ -37,7 +37,7 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
             the specialisation of its kernels: static (no inertia, v is the displacement increment), multistep (uses the
             state before the last), takes_velocity (v_n in q~), accelerated (with accelerations: a_n and w_n replace the
             state before the last), midpoint (forces at the midpoint), variant (their name).
-        traits: of the model; depends on "nonpotential", "has_constraints" and "unilateral".
+        traits: of the model; depends on "nonpotential", "has_constraints" and "impacts".
     """
     p, free_components = precision(dtype), free_components_function(dtype)
     T, vec3 = p.T, p.vec3
@@ -47,8 +47,8 @@ def step_kernels(dtype: str, scheme: Any, traits: Traits = NO_TERMS) -> KernelSe
     coefficients, static, multistep = scheme.coefficients, scheme.static, scheme.multistep
     takes_velocity, accelerated, midpoint = scheme.takes_velocity, scheme.accelerated, scheme.midpoint
     MAX_GROWTH = MAX_STEP_GROWTH[dtype]
-    impacts = traits.unilateral and (multistep or accelerated)
-    variant = traits.suffix("nonpotential", "has_constraints", *(("unilateral",) if impacts else ()))
+    impacts = traits.impacts and (multistep or accelerated)
+    variant = traits.suffix("nonpotential", "has_constraints", *(("impacts",) if impacts else ()))
     module = kernel_module(f"step_{dtype}_{scheme.kernel_variant}{variant}")
 
     @wp.func

@@ -31,12 +31,13 @@ from .contact_methods import ContactMethods
 from .joints import make_constraint, make_joint
 from .rigid import make_rigid
 from .springs import SpringMethods
+from .velocity_constraints import VelocityMethods
 from .welds import make_weld
 
 __all__ = ["ModelBuilder"]
 
 
-class ModelBuilder(ContactMethods, SpringMethods):
+class ModelBuilder(ContactMethods, SpringMethods, VelocityMethods):
     """Collects bodies, supports and loads; `finalize` makes a Model.
 
     Args:

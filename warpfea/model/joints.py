@@ -10,6 +10,7 @@ import numpy as np
 from ..base.errors import ModelError
 from ..kernels.terms.constraint_formulas import Formula
 from ..kernels.terms.constraints import ANGLE, DISTANCE, DOT
+from ..kernels.terms.velocity_rows import Velocity
 from ..time_laws import TimeLaw
 from .discretisation import Discretisation
 
@@ -61,14 +62,15 @@ class ConstraintRow:
     """A scalar constraint; see kernels/terms/constraints.py for the kinds.
 
     Attributes:
-        kind: DOT, DISTANCE, ANGLE, or a Formula.
+        kind: DOT, DISTANCE, ANGLE, a Formula, or VELOCITY.
         a, b, a2: its vectors.
         scale: factor to metres; with `angular` times the model's size.
         law: right side over time, or None: `fixed`.
         component: of the law's value.
+        parameters: (3, 3) of a VELOCITY row, see kernels/terms/velocity_rows.py.
     """
 
-    kind: int | Formula
+    kind: int | Formula | Velocity
     a: Vector
     b: Vector
     scale: float = 1.0
@@ -77,6 +79,7 @@ class ConstraintRow:
     component: int = 0
     fixed: float = 0.0
     angular: bool = False
+    parameters: np.ndarray | None = None
 
     @property
     def vectors(self) -> tuple[Vector, Vector, Vector]:
@@ -99,7 +102,7 @@ def check_rows(what: str, rows: Any) -> None:
     if not isinstance(rows, (list, tuple)) or not rows or not all(isinstance(row, ConstraintRow) for row in rows):
         raise ModelError(f"{what}: its rows are {rows!r}; expected a list of one ConstraintRow or more, such as [row]")
     for k, row in enumerate(rows):
-        if not isinstance(row.kind, Formula) and row.kind not in (DOT, DISTANCE, ANGLE):
+        if not isinstance(row.kind, (Formula, Velocity)) and row.kind not in (DOT, DISTANCE, ANGLE):
             raise ModelError(f"{what}: row {k} has kind {row.kind!r}; expected DOT, DISTANCE, ANGLE or a Formula")
         for name in ("a", "b", "a2") if row.a2 is not None else ("a", "b"):
             vector = getattr(row, name)

@@ -20,7 +20,7 @@ from ..kernels.step.step_control import REPORT_COLUMNS
 from ..model.state import State
 from ..solvers import Jacobi, NewtonPCG, make_solver_loop
 from ..terms.checks import check_stored_energy, overrides
-from ..terms.protocols import Preconditioned, Touching
+from ..terms.protocols import Impacting, Preconditioned
 from ..terms.term import StepContext, Term
 from ..terms.workspace import Workspace
 from .adaptive import AdaptiveOptions, StepSizeControl
@@ -141,10 +141,10 @@ class Stepper:
             w.step.b = w.array("b", (self.model.worlds,), wp.float64)
         if self.integrator.accelerated:
             w.step.q_a = w.array("q_a", (self.model.worlds,), wp.float64)
-        self.impact_terms: list[Touching] = []
+        self.impact_terms: list[Impacting] = []
         if self.integrator.multistep or self.integrator.accelerated:
             w.step.previous_h = state.previous_step
-            self.impact_terms = self.terms.contacts
+            self.impact_terms = [term for term in self.terms.having(Impacting) if term.impacts]
             if self.impact_terms:
                 w.step.impact = w.array("impact", (self.model.worlds,), wp.int32)
             if self.impact_terms or self.integrator.accelerated:

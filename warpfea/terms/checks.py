@@ -10,7 +10,7 @@ import numpy as np
 from ..base.errors import ModelError
 from ..kernels.common.traits import Traits
 from ..kernels.step.energy_ledger import EXPLICIT_VISCOUS, LEDGER_COLUMNS, LOSS, NUMERICAL, STORED, WORK
-from .protocols import PROTOCOLS, Constrained, Updated
+from .protocols import PROTOCOLS, Constrained, Impacting, Updated
 from .term import Term
 
 if TYPE_CHECKING:
@@ -92,6 +92,7 @@ def derived_traits(term: Term) -> Traits:
         has_constraints=constrained,
         limited=overrides(term, Updated.process_direction),
         unilateral=overrides(term, Updated.update_frozen),
+        impacts=isinstance(term, Impacting) and term.impacts,
     )
 
 

@@ -20,6 +20,7 @@ from ..kernels.terms.constraints import (
     constraint_struct,
     joint_struct,
 )
+from ..kernels.terms.velocity_rows import VELOCITY, Velocity, velocity_kernels
 from ..model.assembly import greedy_colouring, grouped_items
 from ..model.joints import ConstraintRow, Joint, Vector
 from ..time_laws import TimeLaw
@@ -41,7 +42,7 @@ class ConstraintTables:
     Attributes:
         joints: in the order of addition; `angles`: those whose turns are counted.
         count: number of rows.
-        formulas: of the rows that have one; number k is the row kind FORMULA + k.
+        formulas: of the rows that have one, or VELOCITY; number k is the row kind FORMULA + k.
         rows_of: row indices of each joint.
         data: device tables.
         component_host, cluster_host: component and cluster of each row; colour_host: colour of each cluster.
@@ -62,7 +63,8 @@ class ConstraintTables:
         self.colour_host = self.cluster_host = np.zeros(0, dtype=np.int64)
         self.rows = [row for joint in self.joints for row in joint.rows]
         self.count = len(self.rows)
-        self.formulas = list(dict.fromkeys(row.kind for row in self.rows if isinstance(row.kind, Formula)))
+        formulas = (row.kind for row in self.rows if isinstance(row.kind, (Formula, Velocity)))
+        self.formulas: list[Any] = list(dict.fromkeys(formulas))
         names = [formula.name for formula in self.formulas]
         if len({*names}) < len(names):
             raise ModelError(f"two formulas of constraints have one name among {', '.join(names)}: rename one")
@@ -166,15 +168,31 @@ class ConstraintTables:
         }
         self.model.memory.fill(data, "constraints", **tables)
         self.data = data
+        if self.velocity_kind is not None:
+            zero = np.zeros((3, 3))
+            parameters = np.array([zero if r.parameters is None else r.parameters for r in rows])
+            self.velocity_parameters = m.array("constraints", parameters, wp.mat33d)
         self._vector_entries = entries
 
     def _kind_number(self, row: ConstraintRow) -> int:
-        return FORMULA + self.formulas.index(row.kind) if isinstance(row.kind, Formula) else row.kind
+        return FORMULA + self.formulas.index(row.kind) if row.kind in self.formulas else int(row.kind)  # type: ignore[arg-type]
 
     def formula_kernels(self, midpoint: bool = False) -> list[tuple[int, Any]]:
         """Row kind and kernels of each formula."""
-        kernels = [formula_kernels(self.model.dtype, midpoint, formula) for formula in self.formulas]
-        return list(enumerate(kernels, FORMULA))
+        numbered = enumerate(self.formulas, FORMULA)
+        return [(k, formula_kernels(self.model.dtype, midpoint, f)) for k, f in numbered if isinstance(f, Formula)]
+
+    @property
+    def velocity_kind(self) -> int | None:
+        """Row kind of constraints at the level of velocities, or None without."""
+        return FORMULA + self.formulas.index(VELOCITY) if VELOCITY in self.formulas else None
+
+    def update_velocity_rows(
+        self, launch: Launcher, midpoint: bool, u_stage: wp.array, active: wp.array, multipliers: Any
+    ) -> None:  # fmt: skip
+        """A of the rows at the level of velocities, at u_stage."""
+        args = [self.velocity_kind, self.data, self.velocity_parameters, u_stage, active, multipliers]
+        launch(velocity_kernels(self.model.dtype, midpoint).update, (self.model.worlds, self.count), args)
 
     def _upload_row_pairs(self) -> None:
         """Pairs of shared vectors for each pair of rows that share slots: dense within clusters, else couplings."""
@@ -356,6 +374,8 @@ class ConstraintTables:
         """Hash the definition of the rows."""
         for row in self.rows:
             h.update(f"{row.kind} {row.scale!r} {row.reference_product!r} {row.fixed!r} {row.component}".encode())
+            if row.parameters is not None:
+                h.update(row.parameters.tobytes())
         for values in (self.slot_host, self.weight_host, self.start_host, self.reference_host):
             h.update(np.ascontiguousarray(values).tobytes())
 

@@ -21,6 +21,7 @@ from ..kernels.solvers.newton_control import TERM_ROWS
 from ..kernels.solvers.reuse import reuse_kernels
 from ..kernels.terms.constraint_blocks import constraint_block_kernels
 from ..kernels.terms.constraints import JOINT_COLUMNS, constraint_kernels, multiplier_struct
+from ..kernels.terms.velocity_rows import velocity_kernels
 from ..model import assembly
 from .constraint_tables import ConstraintTables
 from .protocols import CachedInputs, Constrained, Preconditioned, Tied, Updated
@@ -153,12 +154,18 @@ class Constraints(Constrained, Updated, Tied, Preconditioned):
         m, w, k = self.model, ctx.work, self.integrator_kernels(ctx)
         ctx.launch(k.reset_violation, (m.worlds, m.components.count), [active, w.multipliers])
         args = [self.tables.data, w.u, w.u_stage, w.time_law_values, w.newton.search.alpha, active, w.multipliers]
-        self._evaluate_rows(ctx.launch, ctx.midpoint, args)
+        start = ctx.state.displacement if ctx.midpoint else w.q_tilde
+        more = [w.time_law_stage_values, w.newton.search.alpha, active, w.multipliers]
+        more += [start, ctx.state.displacement, w.step.dq_dv, w.newton.frozen.contact_active]
+        self._evaluate_rows(ctx.launch, ctx.midpoint, args, more)
 
-    def _evaluate_rows(self, launch: Launcher, midpoint: bool, args: list[Any]) -> None:
+    def _evaluate_rows(self, launch: Launcher, midpoint: bool, args: list[Any], more: list[Any]) -> None:
         launch(constraint_kernels(self.model.dtype, midpoint).evaluate, self.dim, args)
         for kind, kernels in self.tables.formula_kernels(midpoint):
             launch(kernels.evaluate, self.dim, [kind, *args])
+        if (kind := self.tables.velocity_kind) is not None:
+            kernel = velocity_kernels(self.model.dtype, midpoint).evaluate
+            launch(kernel, self.dim, [kind, *args[:2], *more])
 
     prepare = force  # J, for rho
 
@@ -310,8 +317,11 @@ class Constraints(Constrained, Updated, Tied, Preconditioned):
         if multipliers is not None:
             mul.multiplier.assign(np.tile(multipliers, (B, 1)))
         mul.last_target.fill_(np.nan)  # any number of turns is valid
-        args = [con.data, state.displacement, state.displacement, value, zeros((B,), wp.float64), all_worlds, mul]
-        self._evaluate_rows(launch, False, args)
+        u, zero = state.displacement, zeros((B,), wp.float64)
+        if con.velocity_kind is not None:  # at rest
+            con.update_velocity_rows(launch, False, u, all_worlds, mul)
+        rest = [value, zero, all_worlds, mul]
+        self._evaluate_rows(launch, False, [con.data, u, u, *rest], [*rest, u, u, zero, zeros((B,), wp.int32)])
         return mul
 
     def values(self, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

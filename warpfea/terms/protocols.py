@@ -26,6 +26,7 @@ __all__ = [
     "Constrained",
     "Coupled",
     "Diagnosed",
+    "Impacting",
     "Parametrised",
     "Preconditioned",
     "Tied",
@@ -217,7 +218,20 @@ class Diagnosed(Term):
         return ""
 
 
-class Touching(Term):
+class Impacting(Term):
+    """Term with forces that may stop a body within a step.
+
+    Attributes:
+        impacts: False if those of the model can't.
+    """
+
+    impacts = True
+
+    def find_impacts(self, ctx: StepContext) -> None:
+        """Set `impact` of the step control to IMPACT_FOUND in worlds whose attempt does not resolve an impact."""
+
+
+class Touching(Impacting):
     """Term of contacts, with their columns in the report.
 
     Attributes:
@@ -230,9 +244,6 @@ class Touching(Term):
         """Positions (worlds, colliders, 3), m, rotations (..., 3, 3) and surface offsets (worlds, colliders), m, of all
         colliders of the model at a state; None if unknown to the term."""
         return None
-
-    def find_impacts(self, ctx: StepContext) -> None:
-        """Set `impact` of the step control to IMPACT_FOUND in worlds whose attempt does not resolve an impact."""
 
     def nodal_force(self, state: State) -> np.ndarray:
         """Elastic nodal forces of all its contacts at a state, (worlds, slots, 3), N."""
@@ -255,4 +266,4 @@ class Touching(Term):
         raise NotImplementedError
 
 
-PROTOCOLS = (Tied, Updated, Constrained, Preconditioned, Coupled, Parametrised, Diagnosed, Touching)
+PROTOCOLS = (Tied, Updated, Constrained, Preconditioned, Coupled, Parametrised, Diagnosed, Impacting, Touching)

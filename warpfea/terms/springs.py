@@ -16,12 +16,12 @@ from ..base.launch import Launcher
 from ..base.worlds import check_values_per_world, set_rows, values_per_world
 from ..kernels.common.modules import definition_name
 from ..kernels.solvers.newton_control import TERM_ROWS
-from ..kernels.terms.bounded_laws import FRICTION
+from ..kernels.terms.bounded_laws import FRICTION, STOP
 from ..kernels.terms.spring_laws import LINEAR, OWN, SAMPLED, OwnForces, spring_struct
 from ..kernels.terms.springs import ANGLE, LENGTH, TRAVEL, VECTOR, scratch_struct, spring_kernels
 from ..model.assembly import grouped_items
 from ..model.springs import SampledForce, Spring, coordinate_gradients
-from .protocols import Parametrised, Preconditioned, Tied
+from .protocols import Impacting, Parametrised, Preconditioned, Tied
 from .term import LOSS, NUMERICAL, STORED, WORK, Column, StepContext, part
 from .time_law_table import TimeLawTable
 
@@ -41,7 +41,7 @@ BLOCKS = {LENGTH: 1, VECTOR: 1, TRAVEL: 4, ANGLE: 9}
 """Blocks of the tangent by coordinate."""
 
 
-class Springs(Tied, Preconditioned, Parametrised):
+class Springs(Tied, Preconditioned, Parametrised, Impacting):
     """Springs of a model: a potential and a viscous force of each coordinate.
 
     Attributes:
@@ -64,6 +64,7 @@ class Springs(Tied, Preconditioned, Parametrised):
             for law in dict.fromkeys(s.law for s in self.springs if isinstance(s.law, wp.Function))
         )
         self.bounded = any(s.bounded for s in self.springs)
+        self.impacts = any(s.law == STOP for s in self.springs)
         self.items = [vectors for spring in self.springs for vectors in spring.items]
         self.count = self.rows = len(self.items)
         self.kind = np.repeat([s.kind for s in self.springs], [len(s.items) for s in self.springs])
@@ -258,6 +259,12 @@ class Springs(Tied, Preconditioned, Parametrised):
         args = [self.data, ctx.work.u, start, ctx.state.displacement, *step, accepted, scratch, rows]
         ctx.launch(self.kernels(ctx).energies, self.dim, args)
         return rows
+
+    @part("springs")
+    def find_impacts(self, ctx: StepContext) -> None:
+        w = ctx.work
+        args = [self.data, w.u, w.step.h, w.step.dq_dv, w.step.running, w.newton.failed, ctx.scratch[self.name][0]]
+        ctx.launch(self.kernels(ctx).find_impacts, self.dim, [*args, w.step.impact])
 
     @part("springs")
     def commit(self, ctx: StepContext, accepted: wp.array) -> None:

@@ -36,6 +36,7 @@ from .springs import Springs
 from .supports import Supports
 from .term import FieldSpec, StepContext, Term
 from .time_law_table import TimeLawTable, control_array
+from .velocity_rows import VelocityRows
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -45,7 +46,8 @@ if TYPE_CHECKING:
 __all__ = ["TERM_TYPES", "TermSet", "profile_parts", "register"]
 
 T = TypeVar("T", bound=Term)
-TERM_TYPES: list[type[Term]] = [Elements, DeadLoads, Damping, FollowerLoads, BodyForces, Springs, Constraints]
+TERM_TYPES: list[type[Term]] = [Elements, DeadLoads, Damping, FollowerLoads, BodyForces, Springs, VelocityRows,
+              Constraints]  # fmt: skip
 """All kinds of terms in launch order, that in which the forces of an attempt are evaluated."""
 STATE_ARRAYS = ("displacement", "velocity", "time", "status", "ledger", "ledger_time", "previous_displacement",
          "previous_velocity", "previous_step", "previous_end", "summed_time",
