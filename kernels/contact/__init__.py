@@ -5,8 +5,8 @@ Search: facet of a point (facet_search.py, facet_candidates.py, point_lists.py);
     position of a single-point contact (deepest_point.py).
 Projection: on a facet (projection.py); distance from a shape, and the side (colliders.py, collider_shapes.py); seams
     between shapes (collider_seams.py).
-Kinematics: own side of a point (kinematics.py); the geometry of the other side fills the record `PointContact`
-    (structs.py): collider_kinematics.py, facet_kinematics.py.
+Kinematics: own side of a point (kinematics.py), of obstacles that move (carriers.py); the geometry of the other side
+    fills the record `PointContact` (structs.py): collider_kinematics.py, facet_kinematics.py.
 Law: normal force (law.py); friction (friction.py).
 Assembly: forces, products, blocks of any geometry (assembly.py).
 Ledger: history, energies, records of any geometry (ledger.py).

@@ -6,6 +6,7 @@ import warp as wp
 
 from ..common.modules import SHORT_UNROLL, KernelSet, kernel_module, kernel_set
 from ..common.types import f64, precision, vec3d
+from .carriers import END, carrier_functions
 from .collider_kinematics import collider_kinematics
 from .collider_seams import SEAMS_SUFFIX
 from .colliders import MESH_SUFFIX
@@ -113,7 +114,7 @@ def pair_evaluation_kernels(dtype: str, own: OwnLaws = ()) -> KernelSet:
     Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)
     PairResults, Other = pair_results_struct(), facet_side_struct(dtype)
     k, law, search = kinematics_functions(dtype), friction_functions(dtype, own), facet_search_kernels(dtype)
-    f_ = facet_projection_functions(dtype)
+    f_, displacement = facet_projection_functions(dtype), carrier_functions(dtype).displacement
     surface_point, inverse_map = f_.surface_point, f_.inverse_map
     module = kernel_module("_".join(["pair_evaluation", dtype, *law_names(own)]), max_unroll=SHORT_UNROLL)
 
@@ -132,7 +133,8 @@ def pair_evaluation_kernels(dtype: str, own: OwnLaws = ()) -> KernelSet:
         if area_fraction == f64(0.0):
             return
         U = other.scratch.displacement
-        x = k.position_at(facets, q, k.column(facets, world, item)) + k.interpolate(facets, u, world, q, item)
+        x = k.position_at(facets, q, k.column(facets, world, item))
+        x += displacement(other.masters, facets, other.scratch, u, world, q, item, END)
         in_contact = his.speed[world, point] > f64(0.0)
         f = wp.int32(-1)
         found = wp.vec4d()

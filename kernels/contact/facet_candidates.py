@@ -7,6 +7,7 @@ import warp as wp
 from ..common.modules import KernelSet, kernel_set
 from ..common.types import f64, vec3d
 from .broad_phase import broad_phase_kernels
+from .carriers import END, carrier_functions
 from .facet_structs import EDGES, master_struct, pair_scratch_struct
 from .kinematics import ENTRY_DEPTH, MAX_DEPTH_RATIO, MIN_NORMAL_COSINE, OPPOSING_COSINE, kinematics_functions
 from .projection import OUTSIDE_TOLERANCE, facet_projection_functions
@@ -38,7 +39,7 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
         f.surface_point, f.displacement_change, f.distance_outside, f.facet_centre, f.inverse_map,
         f.track_point, f.unit_normal,
     )  # fmt: skip
-    boxes = broad_phase_kernels(dtype)
+    boxes, displacement = broad_phase_kernels(dtype), carrier_functions(dtype).displacement
 
     @wp.struct
     class SlavePoint:
@@ -100,7 +101,7 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
         out = slave_point(facets, world, item, q)
         point = out.point
         offset = con.offset[out.contact]
-        out.displacement = k.interpolate(facets, u, world, q, item)
+        out.displacement = displacement(mas, facets, pair, u, world, q, item, END)
         out.position = facets.X[q, item] + out.displacement
         out.start_position = scr.start_position[world, point]
         overlap = k.remaining_overlap(con, his, world, out.contact, point, clock.time[world])

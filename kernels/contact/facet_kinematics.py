@@ -14,6 +14,7 @@ import warp as wp
 from ..common.lanes import lane_functions
 from ..common.modules import SHORT_UNROLL, KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.types import f64, precision, vec3d
+from .carriers import END, carrier_functions
 from .facet_search import PENETRATED, facet_search_kernels
 from .facet_structs import facet_side_struct, master_struct, pair_scratch_struct
 from .kinematics import GEOMETRIES, kinematics_functions
@@ -32,6 +33,7 @@ def facet_kinematics(dtype: str) -> KernelSet:
     Masters, PairScratch, Other = master_struct(dtype), pair_scratch_struct(dtype), facet_side_struct(dtype)
     k, f_, search = kinematics_functions(dtype), facet_projection_functions(dtype), facet_search_kernels(dtype)
     surface_point, shape_value, facet_value = f_.surface_point, f_.shape_value, f_.facet_value
+    carriers = carrier_functions(dtype)
 
     @wp.func
     def begin_point(
@@ -70,8 +72,8 @@ def facet_kinematics(dtype: str) -> KernelSet:
             out.state = wp.where(f == PENETRATED and con.is_explicit[facets.contact[item]] == 0, PASSED, FREE)
             return out
         out.state = IN_REACH
-        out.position = k.position_at(facets, q, k.column(facets, world, item)) + k.interpolate(
-            facets, u, world, q, item
+        out.position = k.position_at(facets, q, k.column(facets, world, item)) + carriers.displacement(
+            other.masters, facets, other.scratch, u, world, q, item, END
         )
         out.normal = other.scratch.normal[world, point]
         out.depth = other.scratch.depth[world, point]
@@ -248,8 +250,8 @@ def facet_kinematics(dtype: str) -> KernelSet:
 
     @wp.func
     def carried(con: Contacts, other: Other, world: int, c: int, t: PointContact) -> vec3d:
-        """Zero: the motion of a body is not prescribed."""
-        return vec3d()
+        """Minus the motion of an obstacle that carries its points, m: the force on these is that of the body."""
+        return -carriers.motion_in_step(other.masters, other.scratch, world, c, t.position)
 
     @wp.func
     def slip_frame(other: Other, world: int, c: int, point: int, t: PointContact) -> wp.mat33d:
@@ -277,8 +279,9 @@ def facet_kinematics(dtype: str) -> KernelSet:
 
     @wp.func
     def store_side(other: Other, world: int, index: int):
-        """No-op: bodies are in the state."""
-        return
+        """Store the places of obstacles that carry their points; bodies are in the state."""
+        for carrier in range(other.masters.carrier_law.shape[0]):
+            other.history.carried[world, carrier] = other.scratch.carried_value[world, carrier]
 
     return kernel_set(locals())
 

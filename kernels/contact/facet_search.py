@@ -11,6 +11,7 @@ import warp as wp
 from ..common.modules import KernelSet, kernel_set, masked_kernel
 from ..common.types import f64, precision, vec3d
 from .broad_phase import BOX_MARGIN, broad_phase_kernels, search_module
+from .carriers import END, START, carrier_functions
 from .collider_seams import SEAMS_SUFFIX
 from .facet_candidates import facet_candidate_functions
 from .facet_seams import facet_seam_functions
@@ -36,7 +37,7 @@ def facet_search_kernels(dtype: str, seams: bool = False) -> KernelSet:
     vec3 = p.vec3
     Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)
     Masters, PairHistory, PairScratch = master_struct(dtype), pair_history_struct(), pair_scratch_struct(dtype)
-    k, f = kinematics_functions(dtype), facet_projection_functions(dtype)
+    k, f, carried = kinematics_functions(dtype), facet_projection_functions(dtype), carrier_functions(dtype)
     surface_point, facet_value, displacement_change = f.surface_point, f.facet_value, f.displacement_change
     distance_outside, inverse_map, project_on_facet = f.distance_outside, f.inverse_map, f.project_on_facet
     unit_normal = f.unit_normal
@@ -73,7 +74,8 @@ def facet_search_kernels(dtype: str, seams: bool = False) -> KernelSet:
         )
         speed = f64(0.0)
         if clock.is_static == 0:
-            own = k.interpolate(facets, v_n, world, slave.number_in_facet, slave.slave_facet)
+            q, item = slave.number_in_facet, slave.slave_facet
+            own = carried.velocity(mas, facets, pair, v_n, world, q, item, clock.h[world])
             speed = wp.dot(projection.normal, facet_value(mas, pair.start_velocity, world, f, xi) - own)
         scr.approach_speed[world, point] = k.approach_speed(his, world, point, speed)
 
@@ -87,7 +89,8 @@ def facet_search_kernels(dtype: str, seams: bool = False) -> KernelSet:
         world = slave.world
         point = slave.point
         c = slave.contact
-        shift = k.interpolate(facets, u_n, world, slave.number_in_facet, slave.slave_facet)
+        q, item = slave.number_in_facet, slave.slave_facet
+        shift = carried.displacement(mas, facets, pair, u_n, world, q, item, START)
         scr.start_position[world, point] = facets.X[slave.number_in_facet, slave.slave_facet] + shift
         scr.start_displacement[world, point] = shift
         scr.start_depth[world, point] = f64(-1.0e30)
@@ -122,7 +125,7 @@ def facet_search_kernels(dtype: str, seams: bool = False) -> KernelSet:
         high = -low
         inside = f64(0.0)
         for q in range(facets.point_count):
-            x = facets.X[q, item] + k.interpolate(facets, u, world, q, item)
+            x = facets.X[q, item] + carried.displacement(mas, facets, pair, u, world, q, item, END)
             y = scr.start_position[world, facets.first_point + item * facets.point_count + q]
             if facets.area_fraction[q, item] > f64(0.0):
                 low = wp.min(low, wp.min(x, y))

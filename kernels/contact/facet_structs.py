@@ -63,6 +63,11 @@ def master_struct(dtype: str):
         half_angle: wp.array2d(dtype=wp.float64)  # [side, facet] between the normals at a sharp edge, 0: none, rad
         first_entry: wp.int32  # first entry in the pool of terms
         facet_count: wp.int32
+        carrier: wp.array(dtype=wp.int32)  # [contact] obstacle that moves its points, see carriers.py; -1: none
+        carrier_law: wp.array(dtype=wp.int32)  # [carrier] time law of its displacement, m, or of its angle, rad
+        carrier_turns: wp.array(dtype=wp.int32)  # 1: of its angle
+        carrier_anchor: wp.array(dtype=wp.vec3d)  # point on the axis of its rotation, m
+        carrier_axis: wp.array(dtype=wp.vec3d)
         # rows of seams: twice the contact, + 1 for the side of the points; see facet_seams.py
         neighbor_start: wp.array(dtype=wp.int32)  # [row] first neighbour
         neighbor: wp.array(dtype=wp.int32)  # surfaces
@@ -98,6 +103,7 @@ def pair_history_struct():
     class PairHistory:
         facet: wp.array2d(dtype=wp.int32)  # master facet in contact + 1; 0: none
         xi: wp.array2d(dtype=wp.vec3d)  # its coordinates, and m along the outward vector
+        carried: wp.array2d(dtype=wp.vec4d)  # [world, carrier] value of its law, and 1: known
 
     return PairHistory
 
@@ -182,6 +188,11 @@ def pair_scratch_struct(dtype: str):
         )  # [world, facet] number of points in its list, which begins at `list_start`
         list_start: wp.array2d(dtype=wp.int32)
         list_point: wp.array2d(dtype=wp.int32)  # [world, point]
+        carried_shift: wp.array3d(dtype=wp.vec3d)  # [start or end of the attempt, world, carrier] m; with the next: the
+        # displacement of a place x of an obstacle is shift + turn (x - anchor)
+        carried_turn: wp.array3d(dtype=wp.mat33d)
+        carried_value: wp.array2d(dtype=wp.vec4d)  # [world, carrier] `PairHistory.carried` at the end
+        carried_angle: wp.array2d(dtype=wp.float64)  # rotation in the attempt, rad
 
     return PairScratch
 

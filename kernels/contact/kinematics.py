@@ -12,7 +12,7 @@ transmit: what the other side needs to gather the force of a point on its slots.
 other_product: force of a point for a direction of a product, on its own side; keeps what the other side gathers.
 gather_other_product, other_entries: sum of a slot of the other side, and the place of its first entry.
 report_sign: 1, or -1 where reports state the force on the other side.
-carried: prescribed motion of the other side's material at a point in the step, which does work.
+carried: prescribed motion of the other side's material at a point in the step less that of the point, which does work.
 slip_frame: axes in which the elastic slip is stored, turned with the other side.
 touched_state, released_state: `History.contact_state` of a point after a step, in contact or not.
 store_side: what the other side stores after a step.

@@ -10,6 +10,7 @@ import warp as wp
 
 from ..common.modules import SHORT_UNROLL, KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.types import f64, vec3d
+from .carriers import END, carrier_functions
 from .facet_structs import master_struct, pair_scratch_struct
 from .kinematics import kinematics_functions
 from .projection import facet_projection_functions
@@ -24,7 +25,7 @@ def pair_midpoint_kernels(dtype: str) -> KernelSet:
     Masters, PairScratch = master_struct(dtype), pair_scratch_struct(dtype)
     Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)
     f_, k = facet_projection_functions(dtype), kinematics_functions(dtype)
-    interpolate, is_edge = k.interpolate, k.is_edge
+    displacement, is_edge = carrier_functions(dtype).displacement, k.is_edge
     inverse_map, project_on_facet = f_.inverse_map, f_.project_on_facet
     module = kernel_module(f"pair_midpoint_{dtype}", max_unroll=SHORT_UNROLL)
 
@@ -47,7 +48,8 @@ def pair_midpoint_kernels(dtype: str) -> KernelSet:
         f = pair.facet[world, point]
         if f < 0:
             return
-        end = k.position_at(facets, q, k.column(facets, world, item)) + interpolate(facets, u, world, q, item)
+        end = k.position_at(facets, q, k.column(facets, world, item))
+        end += displacement(mas, facets, pair, u, world, q, item, END)
         x = f64(0.5) * (scr.start_position[world, point] + end)
         found = inverse_map(mas, pair.middle_displacement, world, f, x, pair.xi[world, point])
         pair.friction_xi[world, point] = pair.xi[world, point]

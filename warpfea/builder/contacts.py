@@ -112,7 +112,6 @@ def check_clipping(contact: Contact | FacetOptions, clipping: Any) -> None:
         "model = 'sphere'": contact.model == "sphere",
         "treatment = 'explicit'": contact.treatment == "explicit",
         f"law = {contact.law!r}, which acts at any distance,": LAWS[contact.law].traits & ANY_GAP,
-        f"collider {other.name!r}, which moves,": isinstance(other, Collider) and other.moves,
         f"collider {other.name!r}, a sheet,": isinstance(other, Collider) and other.is_sheet,
     }
     for reason in (reason for reason, found in reasons.items() if found):
@@ -161,7 +160,7 @@ def make_contact(
         )
     patch = o["model"] == "patch" and o["treatment"] == "implicit" and not LAWS[o["law"]].traits & ANY_GAP
     width = narrow_width(surface, collider) if patch else None
-    if width is not None and has_own_points(surface, collider):
+    if width is not None and has_own_points(surface):
         for option in ("points", "seam"):
             if o[option] is not None:
                 raise NotImplementedError(

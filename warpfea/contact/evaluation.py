@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 
 from ..base.errors import ModelError, ModelWarning
 from ..base.launch import Launcher
+from ..kernels.contact.carriers import carrier_kernels
 from ..kernels.contact.evaluation import collider_evaluation_kernels, pair_evaluation_kernels, pair_results_struct
 from ..kernels.contact.facet_structs import facet_side_struct, pair_scratch_struct
 from ..kernels.contact.structs import clock_struct, contact_scratch_struct
@@ -204,8 +205,15 @@ def evaluate_pairs(term: Any, state: State) -> PairEvaluation:
         at.fields(pair, arrays)
         names = ("start_depth", "approach_speed", "activation_gap")
         at.fields(attempt, dict.fromkeys(names, (every, wp.float64)))
+    stored = term.make_pair_history(at.stored)
+    if t.carriers:
+        both, single = (2, B, len(t.carriers)), (B, len(t.carriers))
+        at.fields(pair, {"carried_shift": (both, wp.vec3d), "carried_turn": (both, wp.mat33d)})
+        at.fields(pair, {"carried_value": (single, wp.vec4d), "carried_angle": (single, wp.float64)})
+        value = m.terms.time_laws.values_at_state(launch, state)[0]
+        launch(carrier_kernels(m.dtype).carry, single, [masters, value, at.all_worlds, 1, stored, pair])
     other = facet_side_struct(m.dtype)()
-    other.masters, other.history, other.scratch = t.master_data(tree.id), term.make_pair_history(at.stored), pair
+    other.masters, other.history, other.scratch = t.master_data(tree.id), stored, pair
     P, L = t.points, t.master_conn.shape[1]
     arrays = dict.fromkeys(("gap", "normal"), ((B, P), wp.float64)) | dict.fromkeys(("force", "xi"), ((B, P), wp.vec3d))
     arrays |= {"facet": ((B, P), wp.int32), "reaction": ((B, P, L), wp.vec3d)}

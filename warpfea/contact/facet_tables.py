@@ -51,6 +51,7 @@ class PairTables(FacetTables[FacetOptions]):
             each contact. seams: neighbours of the contacts, empty if there are none.
         facets: number of master facets. bodies: bodies in a pair.
         collider_laws: all colliders with the numbers of their time laws, if poses follow from these alone.
+        carriers: obstacles that move with points on them; carrier_laws: numbers of their time laws.
         max_gap: largest reported gap, m. max_overlap_depth: search depth of initial overlaps, m.
     """
 
@@ -69,6 +70,8 @@ class PairTables(FacetTables[FacetOptions]):
         self.facets = sum(len(m.conn) for m in self.masters)
         self.bodies = sorted({surface.body.index for c in self.contacts for surface in c.surfaces})
         self.edge_data: list[Any] = []
+        moving = [c.sides[1] for c in self.contacts if c.grounded and c.sides[1].moves]
+        self.carriers: list[Collider] = list(dict.fromkeys(moving))
 
     def _number(self, surface: SurfaceSet) -> int:
         """Number of a surface among those with facets."""
@@ -162,6 +165,7 @@ class PairTables(FacetTables[FacetOptions]):
             abs(contact.offset) for contact in self.contacts
         )
         self.max_overlap_depth = max(float(mas.depth_limit.max()) for mas in self.masters)
+        self.carrier_laws = [laws.add(k.rotation.angle if k.rotation else k.law) for k in self.carriers]
         self.collider_laws: list[tuple[Collider, int]] = []
         if any(contact.grounded for contact in self.contacts) and not self.model.description.contacts_of(Contact):
             for collider in self.model.description.colliders:
@@ -250,13 +254,24 @@ class PairTables(FacetTables[FacetOptions]):
                 "touch_depth": TOUCHING_DEPTH_RATIO * self.size,
                 "first_entry": self.pool,
                 "facet_count": self.facets,
-            } | self.seams
+            } | self.seams | self._carrier_tables()
             m.cache["pair masters"] = master_struct(m.dtype)()
             m.memory.fill(m.cache["pair masters"], "contact", **tables)
         out = master_struct(m.dtype)()
         out.assign(m.cache["pair masters"])
         out.tree = tree
         return out
+
+    def _carrier_tables(self) -> dict[str, Any]:
+        """Fields of `master_struct` of the obstacles that move."""
+        K = self.carriers
+        out: dict[str, Any] = {"carrier": [K.index(c.sides[1]) if c.sides[1] in K else -1 for c in self.contacts]}
+        return out if not K else out | {
+            "carrier_law": self.carrier_laws,
+            "carrier_turns": [int(k.rotation is not None) for k in K],
+            "carrier_anchor": [k.rotation.anchor if k.rotation else np.zeros(3) for k in K],
+            "carrier_axis": [k.rotation.axis if k.rotation else np.zeros(3) for k in K],
+        }  # fmt: skip
 
     def hash(self, h: Any) -> None:
         """Hash the definition of the contacts."""

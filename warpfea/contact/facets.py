@@ -10,9 +10,10 @@ import numpy as np
 import warp as wp
 
 from ..base.launch import Launcher
-from ..base.worlds import device_flags
+from ..base.worlds import device_flags, set_rows
 from ..kernels.common.state import state_kernels
 from ..kernels.contact.assembly import block_kernels
+from ..kernels.contact.carriers import carrier_kernels
 from ..kernels.contact.coupling import coupling_kernels
 from ..kernels.contact.edge_records import edge_record_kernels
 from ..kernels.contact.edges import edge_kernels
@@ -82,7 +83,7 @@ class FacetContact(ContactTerm, Tied, Coupled):
     def _make_pair_scratch(self, work: Workspace, *, midpoint: bool) -> Any:
         t, B = self.tables, self.model.worlds
         most = t.master_data(wp.uint64(0)).max_monomials
-        F, P, R = t.facets, t.points, t.rows
+        F, P, R, C = t.facets, t.points, t.rows, len(t.carriers)
         shapes: dict[str, tuple[int, ...]] = dict.fromkeys(
             ("displacement", "start_displacement", "middle_displacement", "start_velocity"), (B, F * most)
         )
@@ -92,11 +93,13 @@ class FacetContact(ContactTerm, Tied, Coupled):
         shapes |= dict.fromkeys(("list_size", "list_start", "facet_centre", "start_facet_centre", "bulge"), (B, F))
         shapes |= {"chunk_offset": (B, -(-F // FACETS_PER_CHUNK))}
         shapes |= dict.fromkeys(("shape_values", "friction_shape", "shape_gradient"), (B, P, t.master_conn.shape[1]))
+        shapes |= {"carried_shift": (2, B, C), "carried_turn": (2, B, C)}
+        shapes |= dict.fromkeys(("carried_value", "carried_angle"), (B, C))
         shapes |= {"geometric_tangent": (B, P, 2), "deepest_contact": (B, len(t.bodies))}
         out = pair_scratch_struct(self.model.dtype)()
         for name, var in pair_scratch_struct(self.model.dtype).vars.items():
             shape = shapes.get(name, (B, P))
-            if name in ("middle_displacement", "friction_xi") and not midpoint:
+            if (name in ("middle_displacement", "friction_xi") and not midpoint) or 0 in shape:
                 continue
             if name.endswith("displacement") and name != "frozen_displacement":
                 for part in ("value", "director"):
@@ -129,7 +132,9 @@ class FacetContact(ContactTerm, Tied, Coupled):
         """Struct of the facets of the points, with arrays from make(name, dtype, shape per world)."""
         out = pair_history_struct()()
         for name, var in pair_history_struct().vars.items():
-            setattr(out, name, make(f"{self.name}_{name}", var.type.dtype, (self.tables.points,)))
+            count = len(self.tables.carriers) if name == "carried" else self.tables.points
+            if count:
+                setattr(out, name, make(f"{self.name}_{name}", var.type.dtype, (count,)))
         return out
 
     def _allocate_other(self, work: Workspace, other: Any) -> None:
@@ -145,6 +150,7 @@ class FacetContact(ContactTerm, Tied, Coupled):
         own += [self.midpoint_kernels] if ctx.midpoint else []
         own += [edge_record_kernels()] if self._edge_columns is not None else []
         own += [self.edge_kernels] if self.tables.edge_groups else []
+        own += [carrier_kernels(self.model.dtype)] if self.tables.carriers else []
         return [*super().modules(ctx), *(kernels.module for kernels in own)]
 
     def start(self, ctx: StepContext, active: wp.array) -> None:
@@ -155,6 +161,14 @@ class FacetContact(ContactTerm, Tied, Coupled):
         """
         s, t = ctx.scratch[self.name], self.tables
         history = s["history"]
+        if t.carriers:  # they go on from a history at this time: a control may have changed since
+            time, carried = ctx.state.time.numpy(), s["other"].history.carried
+            known = (carried.numpy()[:, :, 3] > 0.0).all(axis=1) & (history.pose_time.numpy() == time)
+            fresh = (active.numpy() != 0) & ~known
+            set_rows(carried, fresh, 0.0)
+            self._carry(ctx, active)
+            set_rows(carried, fresh, s["pair"].carried_value.numpy()[fresh])
+            set_rows(history.pose_time, fresh, time[fresh])
         new = (active.numpy() != 0) & ~(history.speed.numpy() > 0.0).any(axis=1)
         if not new.any():
             return
@@ -175,8 +189,16 @@ class FacetContact(ContactTerm, Tied, Coupled):
 
     # in a step
 
+    def _carry(self, ctx: StepContext, active: wp.array) -> None:
+        """Places of the obstacles that move."""
+        s = ctx.scratch[self.name]
+        args = [s["masters"], ctx.work.time_law_values, active, 0, s["other"].history, s["pair"]]
+        ctx.launch(carrier_kernels(self.model.dtype).carry, (self.model.worlds, len(self.tables.carriers)), args)
+
     def _begin_other(self, ctx: StepContext, active: wp.array) -> None:
         s, state = ctx.scratch[self.name], ctx.state
+        if self.tables.carriers:
+            self._carry(ctx, active)
         dim = (self.model.worlds, self.tables.facets, s["masters"].max_monomials)
         args = [s["masters"], state.displacement, state.velocity, active, s["pair"]]
         ctx.launch(self.search_kernels.initial_coefficients, dim, args)

@@ -85,10 +85,10 @@ def narrow_width(surface: SurfaceSet, collider: Collider) -> float | None:
     return widths[0] if math.isfinite(widths[0]) and is_narrow(widths, facet_size(surface)[0]) else None
 
 
-def has_own_points(surface: SurfaceSet, collider: Collider) -> bool:
-    """True if a narrow obstacle has points that see the facets of a surface: at rest, and facets of one kind."""
+def has_own_points(surface: SurfaceSet) -> bool:
+    """True if a narrow obstacle has points that see the facets of a surface: facets of one kind."""
     kinds = {len(surface.body.family.faces[int(face)]) for face in np.unique(surface.faces[:, 1])}
-    return not collider.moves and len(kinds) == 1
+    return len(kinds) == 1
 
 
 @dataclass(frozen=True)
