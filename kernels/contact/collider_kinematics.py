@@ -43,8 +43,8 @@ def collider_kinematics(dtype: str, meshes: bool, seams: bool = False) -> Kernel
     k, g = kinematics_functions(dtype), collider_functions(meshes)
     interpolate, distance, stored_side = k.interpolate, g.distance, g.stored_side
     seam = seam_functions(meshes) if seams else None
-    names = ("entered_level", "kept_sheet_side", "is_shared")
-    entered_level, kept_sheet_side, is_shared = (getattr(seam, name, None) for name in names)
+    names = ("entered_level", "foot", "kept_sheet_side", "is_shared")
+    entered_level, foot, kept_sheet_side, is_shared = (getattr(seam, name, None) for name in names)
 
     @wp.func
     def set_start(
@@ -149,6 +149,28 @@ def collider_kinematics(dtype: str, meshes: bool, seams: bool = False) -> Kernel
         return -1
 
     @wp.func
+    def side_met(
+        col: Other, facets: Facets, scr: ContactScratch, world: int, c: int, item: int, point: int, y: vec3d,
+        d: wp.vec4d, side: int, swept: int,
+    ) -> wp.vec4d:  # fmt: skip
+        """Shift of a point, m, and the side that it meets there in place of `swept`; -1: that one, or BESIDE.
+
+        y, d: as of `side_slid_onto`; side: at the start, see `stored_side`.
+        """
+        level = wp.int32(-1)
+        if side < 0 and d[3] < f64(0.0) and swept != -2:
+            level = side_slid_onto(col, facets, scr, world, col.of_contact[c], item, y, d)
+        if wp.static(seams):
+            start = scr.start_position[world, point]
+            if level == -1:
+                level = entered_level(col, world, c, start, y, d, side, swept)
+            if level < 0:
+                found = foot(col, world, c, start, y, d[3], side)
+                if found[3] >= f64(0.0):
+                    return found
+        return wp.vec4d(f64(0.0), f64(0.0), f64(0.0), f64(level))
+
+    @wp.func
     def start_motion(
         con: Contacts, col: Other, facets: Facets, his: History, clock: Clock, scr: ContactScratch,
         v_n: wp.array2d(dtype=vec3), world: int, item: int, q: int,
@@ -198,14 +220,11 @@ def collider_kinematics(dtype: str, meshes: bool, seams: bool = False) -> Kernel
             side = stored_side(in_contact, his.contact_state[world, k.history_row(con, c, point)])
             out.feature = g.sweep(col, kc, start, t.local_position, side)
             d = distance(col, kc, t.local_position, out.feature)
-            if side < 0 and d[3] < f64(0.0) and out.feature != -2:
-                level = side_slid_onto(col, facets, scr, world, kc, item, t.local_position, d)
-            if wp.static(seams):
-                if level == -1:
-                    level = entered_level(col, world, c, start, t.local_position, d, side, out.feature)
+            met = side_met(col, facets, scr, world, c, item, point, t.local_position, d, side, out.feature)
+            level = wp.int32(met[3])
             if level >= 0:
                 out.feature = level
-                d = distance(col, kc, t.local_position, level)
+                d = distance(col, kc, t.local_position + vec3d(met[0], met[1], met[2]), level)
         out.normal = rotation * vec3d(d[0], d[1], d[2])
         out.depth = activation - d[3]
         change = g.depth_change(col, kc, out.feature, start, t.local_position,

@@ -7,7 +7,7 @@ mesh of several parts; `warpfea/contact/seams.py` lists them. A side face is hid
 surface is within `seam` of that level: the point takes the collider's surface. At the foot of a real step a higher
 neighbour must not count: the edge of a body that the step holds would gain and lose the support below it within a step
 of time, which has no solution. Where colliders of one level overlap, the higher one acts, or the first of those within
-`seam`.
+`seam`. The lower face of a collider that stands on a neighbour is hidden too: points there meet its sides.
 """
 
 import functools
@@ -16,7 +16,7 @@ import warp as wp
 
 from ..common.modules import KernelSet, kernel_set
 from ..common.types import f64, vec3d
-from .collider_shapes import HALF_SPACE
+from .collider_shapes import BOX, CYLINDER, HALF_SPACE, MESH
 from .colliders import collider_functions
 from .structs import collider_struct
 
@@ -32,7 +32,7 @@ LEVEL_COSINE = 0.9999
 
 @functools.cache
 def seam_functions(meshes: bool) -> KernelSet:
-    """Device functions `entered_level`, `kept_sheet_side` and `is_shared`."""
+    """Device functions `entered_level`, `foot`, `kept_sheet_side` and `is_shared`."""
     Colliders, g = collider_struct(meshes), collider_functions(meshes)
     distance, side_facing, height_beside = g.distance, g.side_facing, g.height_beside
 
@@ -118,6 +118,37 @@ def seam_functions(meshes: bool) -> KernelSet:
                 if side >= 0 and wp.abs(distance(col, kc, behind, side)[3] - found[3]) <= lengths[0]:
                     return side
         return -1
+
+    @wp.func
+    def foot(col: Colliders, world: int, c: int, start: vec3d, y: vec3d, gap: f64, side: int) -> wp.vec4d:
+        """Shift of a point at the foot of a contact's collider that stands on a neighbour, within `seam` of its level,
+        to `seam` above that, m, and the side that it meets there, as its lower face is hidden; -1: none.
+
+        Args:
+            start, y: as of `entered_level`; gap: at y, m; side: of the collider at the start, see `stored_side`.
+        """
+        kc = col.of_contact[c]
+        lengths = col.seam_lengths[c]
+        solid = col.kind[kc] == BOX or col.kind[kc] == CYLINDER
+        if wp.static(meshes):
+            solid = solid or (col.kind[kc] == MESH and col.size[kc][2] != f64(0.0))
+        if not solid or gap > lengths[0]:
+            return wp.vec4d(f64(0.0), f64(0.0), f64(0.0), f64(-1.0))
+        for e in range(col.neighbor_start[c], col.neighbor_start[c + 1]):
+            found = from_neighbor(col, world, kc, col.neighbor[e], y, vec3d())
+            level = vec3d(found[0], found[1], found[2])
+            lift = (lengths[0] - found[3]) * level
+            if found[3] > lengths[0] or found[3] < -lengths[2]:
+                continue
+            at = y + lift
+            lower = distance(col, kc, at, side_facing(col, kc, at, -level, f64(1.0)))
+            if lower[3] > f64(0.0) or lower[3] < f64(-2.0) * lengths[0]:
+                continue
+            d = distance(col, kc, start + lift, side)
+            n = vec3d(d[0], d[1], d[2])
+            if wp.abs(wp.dot(n, level)) < f64(MIN_CROSS_COSINE):
+                return wp.vec4d(lift[0], lift[1], lift[2], f64(side_facing(col, kc, at, n, f64(1.0))))
+        return wp.vec4d(f64(0.0), f64(0.0), f64(0.0), f64(-1.0))
 
     @wp.func
     def entered_level(

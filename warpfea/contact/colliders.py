@@ -29,6 +29,7 @@ from .evaluation import (
     store_overlaps,
     touching_depth,
 )
+from .seams import warn_of_mixed_seams
 from .term import ContactTerm, contact_columns
 
 if TYPE_CHECKING:
@@ -57,6 +58,7 @@ class ColliderContact(ContactTerm):
 
     def __init__(self, model: Model) -> None:
         tables = ContactTables(model)
+        warn_of_mixed_seams(model.description)
         super().__init__(model, tables, tables.geometry)
         self.pose_kernels = pose_kernels(tables.has_meshes)
         self.deepest_kernels: Any = None

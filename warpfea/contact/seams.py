@@ -3,6 +3,8 @@ facet_seams.py."""
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import permutations
@@ -11,15 +13,18 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
+from ..base.errors import ModelWarning
 from ..kernels.contact.collider_shapes import BOX, CYLINDER, HALF_SPACE, MESH
 from ..model.assembly import connected_components
+from ..model.contact_points import ContactPoints
 from ..model.contacts import Collider, Contact
+from ..model.description import Description
 from ..model.handles import SurfaceSet
 from ..model.pairs import FacetOptions, pair_points
 from ..model.shapes import HalfSpace, Shape
 from ..model.triangle_mesh import TriMesh
 
-__all__ = ["SEAM_RATIO", "SeamTables", "facet_seam_tables", "seam_tables"]
+__all__ = ["SEAM_RATIO", "SeamTables", "facet_seam_tables", "seam_tables", "warn_of_mixed_seams"]
 
 SEAM_RATIO = 1e-3
 """Default `seam` over the width of a surface: the second largest edge of its bounding box."""
@@ -27,7 +32,10 @@ REACH_RATIO = 0.2
 """Widest gap that a surface passes level, over its width."""
 DEPTH_RATIO = 0.02
 """Largest depth below the level at which a point at a gap belongs to it, over the width of the surface."""
-
+ALIGNED = 0.9999
+"""Smallest cosine between the normals of faces of one level."""
+MAX_FLAT = 1000
+"""Triangles of a collider above which none is looked for that continues a body's face."""
 EDGED = {HALF_SPACE, BOX, CYLINDER, MESH}
 """Kinds of shapes with flat faces."""
 
@@ -80,6 +88,48 @@ def _neighbors(contact: Contact, contacts: Sequence[Contact], reach: float) -> l
     return list(out.items())
 
 
+def warn_of_mixed_seams(description: Description) -> None:
+    """Warn of a body above a collider and another body whose faces are at one level: it would meet their side faces.
+
+    Warns:
+        ModelWarning: names all three.
+    """
+    pairs = [c for c in description.contacts_of(FacetOptions) if not c.grounded]
+    for contact in description.contacts_of(Contact):
+        body, collider = contact.body, contact.collider
+        near = [s for c in pairs if body in c.sides for s in c.surfaces if s.body is not body]
+        if not near or collider.shape.kind not in EDGED:
+            continue
+        X = pair_points(contact.surface).X.reshape(-1, 3)
+        for surface in near:
+            if _continues(collider.shape, pair_points(surface), X, float(np.sort(np.ptp(X, axis=0))[1])):
+                warnings.warn(
+                    f"body {body.name!r} touches collider {collider.name!r} and body {surface.body.name!r}, which are "
+                    "at one level: what slides from one to the other meets a side face; make the collider a rigid "
+                    "part, b.add_rigid(shape, ...) with its nodes clamped: seams of parts and bodies are passed",
+                    ModelWarning,
+                    stacklevel=2,
+                )
+
+
+def _continues(shape: Shape, p: ContactPoints, above: np.ndarray, width: float) -> bool:
+    """True if facets of a body are in the plane of a flat face of a shape, near it, and all points `above` on it."""
+    size = float(np.ptp(p.X.reshape(-1, 3), axis=0).max())
+    points, triangles = shape.mesh(size=4.0 * size, around=p.X[0, 0]) if isinstance(shape, HalfSpace) else shape.mesh()
+    reach, seam = REACH_RATIO * width, SEAM_RATIO * width
+    if len(triangles) > MAX_FLAT or not _boxes_are_near(points, p.X.reshape(-1, 3), reach):
+        return False
+    for x in points[triangles]:
+        n = np.cross(x[1] - x[0], x[2] - x[0])
+        n /= np.linalg.norm(n)
+        level = (np.abs((p.X - x[0]) @ n) <= seam).all(axis=1) & (p.normal[:, 0] @ n > ALIGNED)
+        low, high = p.X[level].min(axis=1) - reach, p.X[level].max(axis=1) + reach
+        near = ((low <= x.max(axis=0)) & (high >= x.min(axis=0))).all(axis=1)
+        if near.any() and ((above - x[0]) @ n).min() > -seam:
+            return True
+    return False
+
+
 def _same_path(a: Collider, b: Collider) -> bool:
     """True for colliders that keep their relative position."""
     if a.rotation is not None and b.rotation is not None:
@@ -114,7 +164,8 @@ def _boxes_are_near(p: np.ndarray, q: np.ndarray, reach: float) -> bool:
 def facet_seam_tables(contacts: Sequence[FacetOptions], number: Callable[[SurfaceSet], int]) -> dict[str, np.ndarray]:
     """Neighbours of both sides of contacts between bodies, as fields of `master_struct`; empty if none has any.
 
-    Neighbours of a side are surfaces near it that the body of the other side touches, too, and the parts of its own.
+    Neighbours of a side are surfaces near it that the body of the other side touches, too, at any distance where the
+    contact has a `seam`, and the parts of its own.
 
     Args:
         number: number of a surface, which then has facets.
@@ -143,7 +194,8 @@ def facet_seam_tables(contacts: Sequence[FacetOptions], number: Callable[[Surfac
             if near:
                 width = float(np.sort(np.ptp(box(other), axis=0))[1])
                 lengths[len(rows)] = width * np.array((SEAM_RATIO, REACH_RATIO, DEPTH_RATIO))
-                near = [s for s in near if _boxes_are_near(box(s), box(side), REACH_RATIO * width)]
+                reach = math.inf if contact.seam is not None else REACH_RATIO * width
+                near = [s for s in near if _boxes_are_near(box(s), box(side), reach)]
             if contact.seam is not None:
                 lengths[len(rows), 0] = contact.seam
             rows.append([s for s in near if max(_corners(s), _corners(side)) == 1])
