@@ -64,7 +64,7 @@ def struck(shape, integrator, rides, device="cpu", dtype="float64", **options):
         b.set_initial(plate, velocity=tuple(-WAY))
     b.add_contact(plate.surface("z-"), obstacle, mu=0.3, name="pad", **options)
     sim = wf.Simulation(b.finalize(device=device, dtype=dtype), dt=4e-3, integrator=integrator, solver=TIGHT)
-    sim.step(6)
+    sim.step(3)  # later steps under friction have several solutions, between which the solver's round-off chooses
     return sim
 
 
@@ -107,7 +107,9 @@ def test_a_table_that_rises_with_clipping_presses_uniformly():
     mesh = wf.mesh.box((0.2, 0.2, 0.02), cells=(2, 2, 1), element="T10")
     plate = b.add_solid(mesh, material=wf.SVK(E=1e8, nu=0.0, density=1000.0), name="plate")
     b.clamp(plate.nodes(lambda X: X[:, 2] > 0.0199))
-    box = b.add_collider(wf.Box((0.1, 0.1, -GAP - 0.1), (1.0, 1.0, 0.2)), path=([0, 1], [(0, 0, 0), (0, 0, GAP + 1e-5)]))
+    box = b.add_collider(
+        wf.Box((0.1, 0.1, -GAP - 0.1), (1.0, 1.0, 0.2)), path=([0, 1], [(0, 0, 0), (0, 0, GAP + 1e-5)])
+    )
     b.add_contact(plate.surface("z-"), box, clipping=True, mu=0.3)
     result = wf.solve_static(b.finalize(device="cpu"), load_steps=2, tol=1e-12)
     pressure = result.field("contact_pressure", plate)[0]
@@ -123,7 +125,7 @@ def on_supports(path, shapes, device="cpu"):
     plate = b.add_solid(mesh, material=wf.SVK(E=1e8, nu=0.3, density=1000.0), name="plate")
     for k, shape in enumerate(shapes):
         b.add_contact(plate.surface("z-"), b.add_collider(shape, path=path, name=f"ball {k}"), mu=0.5)
-    sim = wf.Simulation(b.finalize(device=device), dt=5e-3, solver=TIGHT)
+    sim = wf.Simulation(b.finalize(device=device), dt=1e-2, solver=TIGHT)
     return sim, plate
 
 
@@ -132,12 +134,12 @@ def test_a_plate_turns_with_the_balls_that_it_lies_on(device, tmp_path):
     """Without slip, so by the angle of the path; a run goes on from a checkpoint."""
     turns = 2 * np.pi / 3 * np.arange(3)
     balls = [wf.Sphere((0.053 * np.cos(a), 0.053 * np.sin(a), -0.008), 0.008) for a in turns + 0.2]
-    times = np.linspace(0.0, 0.3, 61)
+    times = np.linspace(0.0, 0.3, 31)
     path = wf.Rotation(anchor=(0, 0, 0), axis=(0, 0, 1), angle=(times, 5.0 * np.maximum(times - 0.1, 0.0) ** 2))
     sim, plate = on_supports(path, balls, device)
-    sim.step(40)
-    save_checkpoint(sim, tmp_path / "half.npz")
     sim.step(20)
+    save_checkpoint(sim, tmp_path / "half.npz")
+    sim.step(10)
     X = plate.reference[plate.slot_kind == 0]
     x = X + sim.state.displacement.numpy()[0][plate.slots[plate.slot_kind == 0]]
     angle = np.angle(((x[:, :2] @ (1, 1j)) * np.conj(X[:, :2] @ (1, 1j))).sum())
@@ -149,7 +151,7 @@ def test_a_plate_turns_with_the_balls_that_it_lies_on(device, tmp_path):
     assert abs(energies["ledger_residual"][0]) < 1e-9 * energies["collider_work"][0]
     again, _ = on_supports(path, balls, device)
     again.resume(tmp_path / "half.npz")
-    again.step(20)
+    again.step(10)
     np.testing.assert_array_equal(again.state.displacement.numpy(), sim.state.displacement.numpy())
 
 

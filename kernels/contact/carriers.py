@@ -6,7 +6,7 @@ from typing import Any
 import warp as wp
 
 from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
-from ..common.types import f64, precision, vec3d
+from ..common.types import f64, vec3d
 from .facet_structs import master_struct, pair_history_struct, pair_scratch_struct
 from .kinematics import kinematics_functions
 from .structs import contact_structs

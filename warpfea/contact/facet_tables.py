@@ -165,7 +165,8 @@ class PairTables(FacetTables[FacetOptions]):
             abs(contact.offset) for contact in self.contacts
         )
         self.max_overlap_depth = max(float(mas.depth_limit.max()) for mas in self.masters)
-        self.carrier_laws = [laws.add(k.rotation.angle if k.rotation else k.law) for k in self.carriers]
+        angles_or_motions: list[Any] = [k.rotation.angle if k.rotation else k.law for k in self.carriers]
+        self.carrier_laws = [laws.add(law) for law in angles_or_motions]
         self.collider_laws: list[tuple[Collider, int]] = []
         if any(contact.grounded for contact in self.contacts) and not self.model.description.contacts_of(Contact):
             for collider in self.model.description.colliders:
@@ -254,7 +255,8 @@ class PairTables(FacetTables[FacetOptions]):
                 "touch_depth": TOUCHING_DEPTH_RATIO * self.size,
                 "first_entry": self.pool,
                 "facet_count": self.facets,
-            } | self.seams | self._carrier_tables()
+                **self._carrier_tables(),
+            } | self.seams
             m.cache["pair masters"] = master_struct(m.dtype)()
             m.memory.fill(m.cache["pair masters"], "contact", **tables)
         out = master_struct(m.dtype)()
