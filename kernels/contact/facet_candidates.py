@@ -33,11 +33,11 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
     Masters, PairScratch = master_struct(dtype), pair_scratch_struct(dtype)
     k, f = kinematics_functions(dtype), facet_projection_functions(dtype)
     (
-        surface_point, displacement_change, distance_outside, facet_centre, inverse_map, track_point,
+        surface_point, displacement_change, distance_outside, facet_centre, inverse_map, newton_coordinates,
         unit_normal,
     ) = (
         f.surface_point, f.displacement_change, f.distance_outside, f.facet_centre, f.inverse_map,
-        f.track_point, f.unit_normal,
+        f.newton_coordinates, f.unit_normal,
     )  # fmt: skip
     boxes, displacement = broad_phase_kernels(dtype), carrier_functions(dtype).displacement
 
@@ -137,9 +137,17 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
         if slave.anchored:
             f = pair.anchor_facet[world, slave.point] - 1
             corners = mas.corner_count[mas.facet_kind[f]]
-            found = track_point(mas, pair.displacement, world, f, pair.anchor_xi[world, slave.point], slave.motion)
-            if found[3] == f64(0.0):
-                found = inverse_map(mas, pair.displacement, world, f, slave.position, facet_centre(corners))
+            first = pair.anchor_xi[world, slave.point]
+            target = slave.motion
+            found = wp.vec4d()
+            tracked = bool(True)
+            trials = wp.int32(0)
+            while trials < 2 and found[3] == f64(0.0):  # by its motion, else by its position
+                found = newton_coordinates(mas, pair.displacement, world, f, first, target, tracked)
+                first = facet_centre(corners)
+                target = slave.position
+                tracked = False
+                trials += 1
             xi = vec3d(found[0], found[1], found[2])
             o = distance_outside(corners, xi)
             if found[3] != f64(0.0) and o <= out.outside_distance and not has_left(mas, slave, f, xi, o):
@@ -188,14 +196,10 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
         return wp.max(-f64(MAX_EDGE_TANGENT) * xi[2] / mas.side_length[f], f64(0.0))
 
     @wp.func
-    def passed_beside(
-        mas: Masters, scr: ContactScratch, pair: PairScratch, slave: SlavePoint, f: int, xi: vec3d
-    ) -> bool:
-        """True if a point at `xi` passed the surface of a facet, or was below it at the start, beside the facet, or an
-        edge of the facet passed over it."""
+    def passed_beside(mas: Masters, f: int, xi: vec3d, found: wp.vec4d) -> bool:
+        """True if a point at `xi`, at the start of the attempt at `found`, passed the surface of a facet, or was below
+        it then, beside the facet, or an edge of the facet passed over it."""
         corners = mas.corner_count[mas.facet_kind[f]]
-        start = scr.start_position[slave.world, slave.point]
-        found = inverse_map(mas, pair.start_displacement, slave.world, f, start, xi)
         before = vec3d(found[0], found[1], found[2])
         part = f64(0.0)
         if before[2] > f64(0.0):
@@ -220,19 +224,18 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
 
     @wp.func
     def entered_sideways(
-        mas: Masters, scr: ContactScratch, pair: PairScratch, slave: SlavePoint, f: int, xi: vec3d, gap: f64
-    ) -> bool:
-        """True if a point is at a facet now, was beside it at the start of the attempt, and was below its plane by at
-        most the penetration of the bodies' contact: it slid under the edge of a body that has sunk in."""
-        world = slave.world
+        mas: Masters, scr: ContactScratch, pair: PairScratch, slave: SlavePoint, f: int, xi: vec3d, found: wp.vec4d,
+        gap: f64,
+    ) -> bool:  # fmt: skip
+        """True if a point is at a facet now, was beside it at the start of the attempt, at `found`, and was below its
+        plane by at most the penetration of the bodies' contact: it slid under the edge of a body that has sunk in."""
         kind = mas.facet_kind[f]
-        depth = scr.activation_gap[world, slave.point] - gap
+        depth = scr.activation_gap[slave.world, slave.point] - gap
         most = wp.max(f64(MAX_DEPTH_RATIO) * deepest_contact(mas, pair, slave), f64(ENTRY_DEPTH) * mas.element_depth[f])
         if depth > wp.min(most, f64(TUNNEL_LIMIT_RATIO) * mas.depth_limit[f]):
             return False
         if distance_outside(mas.corner_count[kind], xi) > edge_margin(mas, f, xi):
             return False
-        found = inverse_map(mas, pair.start_displacement, world, f, scr.start_position[world, slave.point], xi)
         return found[3] == f64(0.0) or distance_outside(
             mas.corner_count[kind], vec3d(found[0], found[1], found[2])
         ) > f64(0.0)
@@ -249,7 +252,7 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
 
     @wp.func
     def candidate_rank(
-        mas: Masters, scr: ContactScratch, pair: PairScratch, slave: SlavePoint, f: int, xi: vec3d
+        mas: Masters, scr: ContactScratch, pair: PairScratch, slave: SlavePoint, f: int, xi: vec3d, found: wp.vec4d
     ) -> int:
         """Rank of a facet for a point, -1: rejected by depth, by the previous facet, or by the side at the start of the
         attempt. Highest for facets that face the slave's squarely, then for one that the point reached from beside."""
@@ -278,7 +281,7 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
             projection = surface_point(mas, pair.start_displacement, world, f, vec3d(xi[0], xi[1], f64(0.0)))
             before = wp.dot(slave.start_position - projection.position, unit_normal(projection))
             if before < -slave.outside_depth:
-                if rank == 0 or not entered_sideways(mas, scr, pair, slave, f, xi, before):
+                if rank == 0 or not entered_sideways(mas, scr, pair, slave, f, xi, found, before):
                     return -1
                 rank = 5
         return rank
@@ -315,13 +318,16 @@ def facet_candidate_functions(dtype: str) -> KernelSet:
             return out
         if slave.anchored and has_left(mas, slave, f, xi, beyond):
             return out
-        rank = candidate_rank(mas, scr, pair, slave, f, xi)
+        free = not slave.anchored and slave.overlap_limit == f64(0.0)
+        start = wp.vec4d()
+        if free:
+            start = inverse_map(mas, pair.start_displacement, slave.world, f, slave.start_position, xi)
+        rank = candidate_rank(mas, scr, pair, slave, f, xi, start)
         if rank < 0:
             return out
         beside = rank == 5
-        if not beside and beyond > f64(0.0) and not slave.anchored and slave.overlap_limit == f64(0.0):
-            if passed_beside(mas, scr, pair, slave, f, xi):
-                return out
+        if free and not beside and beyond > f64(0.0) and passed_beside(mas, f, xi, start):
+            return out
         out.entered = out.entered or not beside
         o = beyond
         if rank > 1 and beyond <= slack:

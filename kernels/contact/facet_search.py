@@ -174,24 +174,27 @@ def facet_search_kernels(dtype: str, seams: bool = False) -> KernelSet:
         return wp.matrix_from_cols(a, wp.cross(n, a), n)
 
     @wp.func
-    def move_anchor(
+    def update_anchor(
         mas: Masters, facets: Facets, his: History, clock: Clock, scr: ContactScratch, pair: PairScratch,
         v_n: wp.array2d(dtype=vec3), slave: SlavePoint, f: int, xi: vec3d,
     ):  # fmt: skip
-        """Move a point in contact to another facet before a step, and its elastic slip to the axes of that one."""
+        """Set the anchor of a point that has none, or move that of one in contact to another facet before a step, with
+        its elastic slip to the axes of that one."""
         world, point = slave.world, slave.point
         first = pair.anchor_facet[world, point] - 1
         U = pair.start_displacement
-        before = facet_frame(surface_point(mas, U, world, first, pair.anchor_xi[world, point]))
+        before = wp.identity(n=3, dtype=f64)
+        if first >= 0:
+            before = facet_frame(surface_point(mas, U, world, first, pair.anchor_xi[world, point]))
         set_anchor(mas, facets, his, clock, scr, pair, v_n, slave, f, xi)
-        if pair.anchor_facet[world, point] != first + 1:
+        if first >= 0 and pair.anchor_facet[world, point] != first + 1:
             after = facet_frame(surface_point(mas, U, world, f, pair.anchor_xi[world, point]))
             his.spring[world, point] = wp.transpose(after) * (before * his.spring[world, point])
 
     @wp.func
     def set_contact(
-        con: Contacts, mas: Masters, facets: Facets, his: History, clock: Clock, scr: ContactScratch, pair: PairScratch,
-        v_n: wp.array2d(dtype=vec3), slave: SlavePoint, f: int, xi: vec3d,
+        con: Contacts, mas: Masters, his: History, clock: Clock, scr: ContactScratch, pair: PairScratch,
+        slave: SlavePoint, f: int, xi: vec3d,
     ):  # fmt: skip
         """Contact data of a point on a facet: depth now and at the start of the attempt, normal, motion."""
         world = slave.world
@@ -204,8 +207,6 @@ def facet_search_kernels(dtype: str, seams: bool = False) -> KernelSet:
         pair.projection[world, point] = projection.xi
         pair.normal[world, point] = projection.normal
         pair.depth[world, point] = now - (xi[2] * projection.gap_slope + projection.gap_offset)
-        if pair.anchor_facet[world, point] == 0 and slave.overlap_limit == f64(0.0):
-            set_anchor(mas, facets, his, clock, scr, pair, v_n, slave, f, xi)
         motion = slave.displacement - scr.start_displacement[world, point]
         spring = vec3d()
         if pair.anchor_facet[world, point] > 0:
@@ -258,10 +259,10 @@ def facet_search_kernels(dtype: str, seams: bool = False) -> KernelSet:
             if wp.static(seams):
                 if candidate.facet >= 0 and not slave.anchored and overlap_limit == f64(0.0):
                     candidate = level_candidate(mas, pair, slave, candidate)
-        if candidate.facet >= 0 and leaving and slave.anchored:
-            move_anchor(mas, facets, his, clock, scr, pair, v_n, slave, candidate.facet, candidate.xi)
+        if candidate.facet >= 0 and wp.where(slave.anchored, leaving, overlap_limit == f64(0.0)):
+            update_anchor(mas, facets, his, clock, scr, pair, v_n, slave, candidate.facet, candidate.xi)
         if candidate.facet >= 0:
-            set_contact(con, mas, facets, his, clock, scr, pair, v_n, slave, candidate.facet, candidate.xi)
+            set_contact(con, mas, his, clock, scr, pair, slave, candidate.facet, candidate.xi)
             if pair.depth[world, point] > mas.depth_limit[candidate.facet]:
                 pair.facet[world, point] = PENETRATED
         elif candidate.passed_through:
