@@ -279,3 +279,42 @@ def test_shell_resultants():
         assert np.abs(m[inside, 0]) == pytest.approx(0.0025 * arm[inside], rel=2e-3)
         misses.append(np.abs(np.abs(m[:, 0]) - 0.0025 * arm).max() / 0.0025)
     assert misses == pytest.approx([0.125, 0.0625], rel=0.02)
+
+
+def test_statics_write_themselves_and_series_are_read_back(tmp_path):
+    import meshio
+
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    box = b.add_solid(wf.mesh.box((1, 0.2, 0.2), cells=(2, 1, 1), element="T4"), material=LAWS["SVK"], name="box")
+    options = {"section": wf.Rectangle(0.1, 0.1), "normal": (0, 0, 1), "material": LAWS["SVK"], "name": "beam"}
+    beam = b.add_beam([(0, 1, 0), (1, 1, 0)], elements=1, **options)
+    b.clamp(box.nodes("x-"))
+    b.clamp(beam.start, slots="all")
+    b.add_point_load(box.at((1, 0.1, 0.1)), (100.0, 0, 0))
+    b.add_point_load(beam.at((1, 1, 0)), (0, 0, -1.0))
+    writer = wf.VTUWriter(tmp_path / "series", fields=["cauchy", "von_mises"])
+    r = wf.solve_static(b.finalize(device="cpu"), load_steps=2, outputs=[writer], unstable="ignore")
+    for name in ("one.vtu", "one.usdc", "one.png", "one.html"):
+        r.write(tmp_path / name)
+        assert (tmp_path / name).stat().st_size > 500
+    r.write(tmp_path / "two.vtu", fields=["cauchy", "section_force"])
+    mesh = meshio.read(tmp_path / "two.vtu")
+    nodes = len(box.mesh.points)
+    assert mesh.points[:nodes] == pytest.approx(r.positions(box)[0])
+    assert mesh.point_data["cauchy"][:nodes, 0] == pytest.approx(r.field("cauchy.xx", box)[0])
+    assert np.isnan(mesh.point_data["section_force"][:nodes]).all()
+    assert np.isfinite(mesh.point_data["section_force"][nodes:]).all()
+    assert [set(block) for block in mesh.cell_data["body"]] == [{0}, {1}]
+    with pytest.raises(wf.OutputError, match=r"one.docx: the file name must end in one of .*\.html.*\.vtu"):
+        r.write(tmp_path / "one.docx")
+
+    saved = wf.read_results(tmp_path / "series")
+    assert repr(saved) == "SavedResults(box, beam: 3 frames, 1 worlds)"
+    assert saved.time == pytest.approx([0.0, 0.5, 1.0])
+    assert saved.positions("box")[-1] == pytest.approx(r.positions(box), abs=1e-14)
+    assert saved.field("cauchy", "box")[-1] == pytest.approx(r.field("cauchy", box), abs=1e-9)
+    assert saved.fields("beam") == ["displacement", "velocity", "cauchy", "von_mises"]
+    with pytest.raises(wf.ModelError, match="did you mean 'von_mises'"):
+        saved.field("mises", "box")
+    with pytest.raises(wf.ModelError, match="can't be read as a series"):
+        wf.read_results(tmp_path / "none.pvd")

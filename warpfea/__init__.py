@@ -46,6 +46,7 @@ from .outputs.html import HTMLWriter  # noqa: E402
 from .outputs.render import GIFWriter, PNGWriter  # noqa: E402
 from .outputs.usd import USDWriter  # noqa: E402
 from .outputs.vtk import VTUWriter  # noqa: E402
+from .outputs.vtk_reader import read_results  # noqa: E402
 from .simulation.checkpoint import Checkpoint  # noqa: E402
 from .simulation.integrators import EnergyMomentum, GeneralizedAlpha  # noqa: E402
 from .simulation.modes import Buckling, Modes, buckling, modes  # noqa: E402
@@ -57,13 +58,14 @@ from .time_laws import Control, Rotation  # noqa: E402
 
 __all__ = [
     "GROUND", "PD", "SVK", "Body", "Box", "Buckling", "CapacityError", "Capsule", "Checkpoint", "CheckpointError",
-    "Circle", "ConstraintError", "Control", "ConvergenceError", "Cylinder", "Design", "ElementSet", "EnergyMomentum",
-    "Error", "GIFWriter", "GeneralizedAlpha", "HTMLWriter", "HalfSpace", "Jacobi", "Joint", "KelvinVoigt",
-    "MaterialPoint", "MeshError", "MeshWarning", "Model", "ModelBuilder", "ModelError", "ModelWarning", "Modes",
-    "MooneyRivlin", "NeoHookean", "NewtonPCG", "NodeSet", "Observations", "OutputError", "PNGWriter",
-    "PenetrationError", "Rectangle", "Reference", "Rotation", "Section", "Simulation", "Sphere", "StabilityError",
-    "StabilityWarning", "State", "StepReport", "Stop", "StudyOptions", "SurfaceSet", "TriMesh", "Tube", "USDWriter",
-    "VTUWriter", "__version__", "buckling", "fit", "mesh", "modes", "scene", "solve_static", "spline", "study", "sweep",
+    "Circle", "ConstraintError", "Control", "ConvergenceError", "Cylinder", "Design", "ElementSet",
+    "EnergyMomentum", "Error", "GIFWriter", "GeneralizedAlpha", "HTMLWriter", "HalfSpace", "Jacobi", "Joint",
+    "KelvinVoigt", "MaterialPoint", "MeshError", "MeshWarning", "Model", "ModelBuilder", "ModelError",
+    "ModelWarning", "Modes", "MooneyRivlin", "NeoHookean", "NewtonPCG", "NodeSet", "Observations", "OutputError",
+    "PNGWriter", "PenetrationError", "Rectangle", "Reference", "Rotation", "Section", "Simulation", "Sphere",
+    "StabilityError", "StabilityWarning", "State", "StepReport", "Stop", "StudyOptions", "SurfaceSet", "TriMesh",
+    "Tube", "USDWriter", "VTUWriter", "__version__", "buckling", "fit", "mesh", "modes", "read_results", "scene",
+    "solve_static", "spline", "study", "sweep",
 ]  # fmt: skip
 
 

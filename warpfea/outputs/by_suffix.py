@@ -6,6 +6,7 @@ from ..base.writer import register_writer
 from .html import HTMLWriter
 from .render import GIFWriter, PNGWriter
 from .usd import SUFFIXES, USDWriter
+from .vtk import VTUFile
 
 __all__: list[str] = []
 
@@ -24,3 +25,4 @@ register_writer(_colored(USDWriter), *SUFFIXES)
 register_writer(_colored(HTMLWriter), ".html")
 register_writer(_picture(PNGWriter), ".png")
 register_writer(_picture(GIFWriter), ".gif")
+register_writer(lambda path, fields, **options: VTUFile(path, **{"fields": fields} | options), ".vtu")

@@ -13,13 +13,14 @@ import numpy as np
 
 from ..base.errors import OutputError
 from ..base.lazy import meshio
-from ..base.writer import Output, make_folder, write_atomically
+from ..base.writer import Output, check_target, make_folder, write_atomically
 from ..model.surfaces import reference_points
 from ..terms.fields import SYMMETRIC
 from .frames import FrameClock, check_fields, frame_time
 from .obstacles import Obstacles
+from .vtk_reader import read_series
 
-__all__ = ["VTUWriter"]
+__all__ = ["VTUFile", "VTUWriter"]
 
 
 class VTUWriter(Output):
@@ -108,19 +109,12 @@ class VTUWriter(Output):
 
     def _read_series(self, path: pathlib.Path, now: float) -> list[tuple[float, list[str]]]:
         """Times up to `now`, s, and files of a .pvd."""
-        frames: list[tuple[float, list[str]]] = []
         try:
-            for entry in ElementTree.parse(path).getroot().iter("DataSet"):
-                time, file = float(entry.attrib["timestep"]), entry.attrib["file"]
-                if time > now + 1e-9 * max(1.0, abs(now)):
-                    continue
-                if not frames or time != frames[-1][0]:
-                    frames.append((time, []))
-                frames[-1][1].append(file)
+            frames = read_series(path)
         except (OSError, ElementTree.ParseError, KeyError, ValueError) as error:
             self._open = False
             raise OutputError(f"{path}: can't go on with this series ({error}); give another folder") from error
-        return frames
+        return [(time, files) for time, files in frames if time <= now + 1e-9 * max(1.0, abs(now))]
 
     @staticmethod
     def _file_names(given: Sequence[str]) -> list[str]:
@@ -205,6 +199,46 @@ class VTUWriter(Output):
         if self._folder_created and not any(self.folder.iterdir()):
             self.folder.rmdir()
         self._open = False
+
+
+class VTUFile(Output):
+    """Writes one state to `path` (.vtu): all bodies in one file, cell data `body` is their number.
+
+    Args:
+        fields: fields at the nodes, as of VTUWriter; NaN on bodies without them.
+        world: the world written.
+    """
+
+    animates = False
+
+    def __init__(self, path: str | os.PathLike[str], *, fields: Sequence[str] = ("von_mises",), world: int = 0) -> None:
+        self.path = pathlib.Path(path)
+        self.fields = [name for name in dict.fromkeys(fields) if name not in ("displacement", "velocity")]
+        self.world = world
+
+    def open(self, sim: Any) -> None:
+        check_fields(sim, self.fields, scalar=False)
+        self._target = check_target(self.path, (".vtu",))
+        if not 0 <= self.world < sim.model.worlds:
+            raise OutputError(f"{self.path}: world = {self.world!r} must be a number from 0 to {sim.model.worlds - 1}")
+
+    def write(self, sim: Any) -> None:
+        parts = [_frame_data(sim, body, self.fields) for body in sim.model.bodies]
+        points = [part[0][self.world] for part in parts]
+        counts = [len(x) for x in points]
+        first = np.cumsum([0, *counts[:-1]])
+        data = {}
+        for name in dict.fromkeys(name for part in parts for name in part[1]):
+            shape = next(part[1][name].shape[2:] for part in parts if name in part[1])
+            own = [
+                part[1][name][self.world] if name in part[1] else np.full((count, *shape), np.nan)
+                for part, count in zip(parts, counts)
+            ]
+            data[name] = np.concatenate(own)
+        blocks = [(part[2][0], np.asarray(part[2][1]) + k) for part, k in zip(parts, first)]
+        number = [np.full(len(cells), k, dtype=np.int32) for k, (_, cells) in enumerate(blocks)]
+        mesh = meshio.Mesh(np.concatenate(points), blocks, point_data=data, cell_data={"body": number})
+        write_atomically(self._target, lambda path: mesh.write(path, file_format="vtu"))
 
 
 Cells = tuple[str, np.ndarray, dict[str, np.ndarray]]

@@ -6,6 +6,7 @@ Stabilising springs for bodies before contact is established: k (1 - load) M (u 
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -15,7 +16,7 @@ import numpy as np
 from ..base.errors import ModelError
 from ..base.names import check_choice
 from ..base.notebook import drawn_page
-from ..base.writer import Output
+from ..base.writer import Output, writer_for
 from ..model.assembly import element_volumes, require_density
 from ..model.contact_points import effective_modulus
 from ..model.slot_table import check_static_supports
@@ -83,6 +84,21 @@ class StaticResult:
     def _repr_html_(self) -> str:
         known = self.simulation.fields
         return drawn_page(self.simulation, [name for name in ("von_mises", "displacement") if name in known])
+
+    def write(self, path: str | os.PathLike[str], *, fields: Sequence[str] = ("von_mises",), **options: Any) -> None:
+        """Write the equilibrium to one file.
+
+        Args:
+            path: its suffix chooses the writer: .vtu, .usdc, .png, .html, ...
+            fields: fields that are written; pictures show the first.
+            options: of the writer.
+
+        Raises:
+            ModelError, OutputError: see the writer; another suffix.
+        """
+        writer = writer_for(path, list(fields), **options)
+        for call in (writer.open, writer.write, writer.close):
+            call(self.simulation)
 
     def mode(self, body: Any) -> np.ndarray:
         """Unstable mode (B, nodes, 3) of each world, 0 if none; its largest displacement is 1 m.
