@@ -318,3 +318,44 @@ def test_statics_write_themselves_and_series_are_read_back(tmp_path):
         saved.field("mises", "box")
     with pytest.raises(wf.ModelError, match="can't be read as a series"):
         wf.read_results(tmp_path / "none.pvd")
+
+
+@pytest.mark.parametrize("integrator", ["backward_euler", "bdf2", "energy_momentum", "generalized_alpha"])
+def test_acceleration_and_reaction(integrator):
+    b = wf.ModelBuilder(gravity=(0, 0, -9.81))
+    law = LAWS["SVK"]
+    falls = b.add_solid(wf.mesh.box((0.1, 0.1, 0.1), cells=(1, 1, 1), element="T4"), material=law, name="falls")
+    stays = b.add_solid(wf.mesh.box((1, 0.1, 0.1), cells=(3, 1, 1), element="T4"), material=law, name="stays")
+    b.clamp(stays.nodes("x-"))
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-3, integrator=integrator)
+    assert np.isnan(sim.field("reaction", stays)).all()
+    for _ in range(3):
+        sim.step()
+    assert sim.field("acceleration", falls)[0] == pytest.approx(np.tile([0, 0, -9.81], (8, 1)), abs=1e-6)
+    held = sim.field("reaction", stays)[0]
+    assert held.sum(axis=0) == pytest.approx(sim.reaction(stays.nodes("x-"))[0], abs=1e-9)
+    assert np.array_equal(held[:, 2], sim.field("reaction.z", stays)[0])
+    with pytest.raises(wf.ModelError, match="'reaction' has 3 components where a scalar is needed: take a component"):
+        sim.check_field("reaction", scalar=True)
+    with pytest.raises(wf.ModelError, match="is one of nodes: it is not drawn"):
+        sim.skin_field("reaction.z", stays)
+    assert "reaction" not in Results(sim.model, sim.state).fields
+
+
+def test_contact_traction_is_the_pressure_and_friction():
+    b = wf.ModelBuilder(gravity=(0, 0, -9.81))
+    law = wf.SVK(E=1e6, nu=0.0, density=1000.0)
+    mesh = wf.mesh.box((0.2, 0.2, 0.1), cells=(2, 2, 1), element="T4")
+    box = b.add_solid(mesh, material=law, name="box")
+    floor = b.add_collider(wf.HalfSpace((0, 0, 1), 0.0))
+    b.add_contact(box, floor, mu=0.5)
+    b.drive(box.nodes("z+"), displacement=([0, 1], [(0, 0, 0), (1e-4, 0, -1e-4)]))
+    r = wf.solve_static(b.finalize(device="cpu"), load_steps=2, unstable="ignore")
+    traction, pressure = r.field("contact_traction", box)[0], r.field("contact_pressure", box)[0]
+    low = box.mesh.points[:, 2] < 1e-9
+    assert pressure[low].min() > 100.0
+    assert traction[:, 2] == pytest.approx(pressure, abs=1e-9 * pressure.max())
+    assert (traction[~low] == 0.0).all()
+    slope = np.linalg.norm(traction[low, :2], axis=1) / pressure[low]
+    assert (traction[low, 0] < 0.0).all()  # friction holds it back
+    assert 0.1 < slope.max() < 0.5 + 1e-9

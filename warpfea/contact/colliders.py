@@ -281,7 +281,7 @@ class ColliderContact(ContactTerm):
 
     def samples(self, field: str, body: Any, state: State) -> np.ndarray:
         mine = any(contact.body is body for contact in self.tables.contacts)
-        contact_points = obstacle_contact_points(self.tables, body, *evaluate_points(self, state)[:2]) if mine else []
+        contact_points = obstacle_contact_points(self.tables, body, *evaluate_points(self, state)) if mine else []
         return contact_field(field, body, state.worlds, contact_points)
 
     def at_points(self, state: State) -> tuple[np.ndarray, np.ndarray]:

@@ -22,6 +22,7 @@ from ..model.discretisation import Discretisation, element_functions
 from ..model.pairs import monomial_exponents
 from ..model.state import State
 from ..model.surfaces import measure_to_skin
+from ..terms.fields import VECTOR
 from ..terms.term import FieldSpec
 from .collider_tables import ContactTables
 from .tables import TOUCHING_DEPTH_RATIO
@@ -37,6 +38,7 @@ __all__ = [
 CONTACT_FIELDS = {
     "contact_pressure": FieldSpec("contact pressure", "Pa", np.add, np.maximum),
     "gap": FieldSpec("gap", "m", np.fmin, np.fmin),
+    "contact_traction": FieldSpec("contact traction", "Pa", np.add, np.add, components=VECTOR),
 }
 """Fields of both contact terms: pressures add up, the smallest gap counts."""
 AUTO_OVERLAP_RATIOS = np.array([0.05, 0.25])
@@ -88,16 +90,17 @@ class PairEvaluation:
         for k, contact in enumerate(t.contacts):
             points = slice(t.first[k], t.first[k + 1])
             gap, normal, area = self.gap[:, points], self.normal[:, points], t.host[k].area.ravel()
+            force = self.force[:, points]
             if contact.body is body and not contact.one_sided:
                 nearest = np.broadcast_to(nearest_samples(t, k, body), gap.shape)
-                out.append(BodyContactPoints(nearest, np.broadcast_to(area, gap.shape), normal, gap))
+                out.append(BodyContactPoints(nearest, np.broadcast_to(area, gap.shape), normal, gap, force))
             if contact.facets.body is body:
                 X = self._master_positions(points)
                 nearest = np.full(gap.shape, -1)
                 assigned = self.facet[:, points] >= 0
                 nearest[assigned] = nearest_samples(t, k, contact.facets.body, X[assigned])
                 # master area: the loaded part only, without the area beside the slave
-                out.append(BodyContactPoints(nearest, np.where(normal > 0.0, area, 0.0), normal, gap))
+                out.append(BodyContactPoints(nearest, np.where(normal > 0.0, area, 0.0), normal, gap, -force))
         return out
 
     def _master_positions(self, points: slice) -> np.ndarray:
@@ -235,22 +238,25 @@ class BodyContactPoints:
     Attributes:
         nearest: sample of the body nearest to a point, -1: none.
         area: represented area, m^2. normal: elastic normal force, N. gap: m, 1e30 if unknown.
+        force: elastic force on the body, with friction, (..., 3), N.
     """
 
     nearest: np.ndarray
     area: np.ndarray
     normal: np.ndarray
     gap: np.ndarray
+    force: np.ndarray
 
 
 def contact_field(name: str, body: Any, worlds: int, contact_points: list[BodyContactPoints]) -> np.ndarray:
-    """Field "contact_pressure" or "gap" (worlds, nodes x samples) at the samples of each node of a body.
+    """Field "contact_pressure" or "gap" (worlds, nodes x samples), or "contact_traction" (..., 3), of a body.
 
     Every contact point is assigned to the sample closest to it in the reference. Pressure is the elastic normal force
     on a sample's points over their area; several contacts add up. Gap is the minimum over the points, NaN for a sample
     without points.
     """
     nodes = len(body.mesh.points) * body.family.node_samples.shape[1]
+    traction = np.zeros((worlds, nodes, 3))
     pressure, least = np.zeros((worlds, nodes)), np.full((worlds, nodes), np.inf)
     for patch in contact_points:
         for world in range(worlds):
@@ -260,13 +266,18 @@ def contact_field(name: str, body: Any, worlds: int, contact_points: list[BodyCo
                 np.bincount(at, weights=x[world, known], minlength=nodes) for x in (patch.area, patch.normal)
             )
             pressure[world] += np.divide(total, area, out=np.zeros(nodes), where=area > 0.0)
+            sums = np.zeros((nodes, 3))
+            np.add.at(sums, at, patch.force[world, known])
+            traction[world] += sums / np.where(area > 0.0, area, np.inf)[:, None]
             np.minimum.at(least[world], at, patch.gap[world, known])
+    if name == "contact_traction":
+        return traction
     # unassigned points have a gap of 1e30
     return pressure if name == "contact_pressure" else np.where(least < 1e29, least, np.nan)
 
 
 def obstacle_contact_points(
-    t: ContactTables, body: Any, gap: np.ndarray, normal: np.ndarray
+    t: ContactTables, body: Any, gap: np.ndarray, normal: np.ndarray, force: np.ndarray
 ) -> list[BodyContactPoints]:  # fmt: skip
     """Contact points of a body with obstacles, from gaps and elastic normal forces of all points."""
     out = []
@@ -276,7 +287,7 @@ def obstacle_contact_points(
             nearest, area = nearest_samples(t, k, body), t.host[k].area.ravel()
             shape = gap[:, points].shape
             out.append(BodyContactPoints(np.broadcast_to(nearest, shape), np.broadcast_to(area, shape),
-                                         normal[:, points], gap[:, points]))  # fmt: skip
+                                         normal[:, points], gap[:, points], force[:, points]))  # fmt: skip
     return out
 
 

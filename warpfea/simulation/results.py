@@ -24,7 +24,7 @@ from ..model.pairs import FacetOptions
 from ..model.rigid import RigidBody
 from ..model.state import State
 from ..model.surfaces import reference_points
-from ..terms.fields import check_scalar, field_at_nodes, field_at_points, field_inside, find_field
+from ..terms.fields import VECTOR, check_scalar, field_at_nodes, field_at_points, field_inside, find_field
 from ..terms.joint_values import joint_value
 from ..terms.protocols import Touching
 from ..terms.term import FieldSpec
@@ -42,8 +42,21 @@ MAX_NAMED_BODIES = 5
 """Maximum number of bodies named in a message."""
 
 
+RECORDED_FIELDS = {
+    "acceleration": FieldSpec("acceleration", "m/s2", components=VECTOR),
+    "reaction": FieldSpec("reaction", "N", components=VECTOR),
+}
+"""Fields at nodes that need the last step of a simulation."""
+
+
 class Results:
-    """Results of the present state of a model. Nodal results are in the mesh file's order, worlds first."""
+    """Results of the present state of a model. Nodal results are in the mesh file's order, worlds first.
+
+    Attributes:
+        records: of the simulation; None of a state alone.
+    """
+
+    records: Records | None = None
 
     def __init__(self, model: Model, state: State) -> None:
         self.model, self.state = model, state
@@ -126,16 +139,19 @@ class Results:
     @property
     def fields(self) -> dict[str, FieldSpec]:
         """Available fields, by name."""
-        return self.model.terms.fields
+        return self.model.terms.fields | (RECORDED_FIELDS if self.records else {})
 
     def check_field(self, name: str, *, scalar: bool = False) -> None:
         """Raise ModelError, listing the available names, unless `name` is a field, and a scalar where one is needed."""
-        find_field(self.model.terms, name)
+        find_field(self, name)
         if scalar:
-            check_scalar(self.model.terms, name)
+            check_scalar(self, name)
 
     def field_on(self, name: str, body: Body, drawn: Any) -> np.ndarray:
         """Field (B, P), or (B, P, k), at the points of a Skin or Drawing of the body."""
+        find_field(self, name)
+        if name.partition(".")[0] in RECORDED_FIELDS:
+            raise ModelError(f"field {name!r} is one of nodes: it is not drawn")
         return field_at_points(self.model.terms, name, body, self.state, drawn)
 
     def field(self, name: str, body: Body, *, at: str = "nodes", elements: ElementSet | None = None) -> np.ndarray:
@@ -154,6 +170,10 @@ class Results:
         """
         self.check_body(body, "field(name, body)")
         check_choice("field: at", at, ("nodes", "elements", "points"))
+        spec, whole = find_field(self, name), name.partition(".")[0]
+        if self.records and whole in RECORDED_FIELDS and at == "nodes":
+            values = self.records.at_nodes(whole, body)
+            return np.asarray(spec.function(values)) if spec.function else values
         if at != "nodes":
             return field_inside(self.model.terms, name, body, self.state, at)
         if elements is not None and (not isinstance(elements, ElementSet) or elements.body is not body):
@@ -248,6 +268,19 @@ class Records:
             sampler = Sampler(self.model, points, name)
             out = History(lambda: sampler.values(self.state))
         self.histories.append(out)
+        return out
+
+    def at_nodes(self, name: str, body: Body) -> np.ndarray:
+        """A field of RECORDED_FIELDS (B, nodes, 3) at the last accepted step; NaN as for `reaction`."""
+        w, state = self.stepper.work, self.state
+        if name == "reaction":
+            values = w.g.numpy() * (1.0 - self.model.slot_table.free)
+        elif "acceleration" in state.names:
+            values = state.acceleration.numpy()
+        else:  # of the inertia term m M (v - v~)
+            values = w.step.mass_factor.numpy()[:, None, None] * (w.v.numpy() - w.v_tilde.numpy())
+        out = self.results.at_mesh_nodes(body, values.astype(float))
+        out[~self.statistics.stepped_worlds] = np.nan
         return out
 
     def probe(self, name: str) -> ProbeRecord:

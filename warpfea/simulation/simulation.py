@@ -222,7 +222,7 @@ class Simulation:
         self.error = adapt.error if adapt else None
         self.statistics = RunStatistics(self, asynchronous)
         self.results = Results(model, self.state)
-        self.records = Records(self.results, self.stepper, self.statistics)
+        self.records = self.results.records = Records(self.results, self.stepper, self.statistics)
         self.resets = Resets(self)
         if not isinstance(dt, str):
             self.dt = dt

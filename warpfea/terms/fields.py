@@ -246,7 +246,7 @@ def field_at_nodes(terms: Any, name: str, body: Any, state: State, elements: Any
         if spec.of_slots:
             values = body.at_nodes(values)
         elif spec.components:
-            values = values[:, :: body.family.node_samples.shape[1]]
+            values = values.reshape(len(values), nodes, -1, values.shape[2]).mean(axis=2)
     if spec.function:
         values = spec.function(values)
     if spec.of_slots or spec.components:
