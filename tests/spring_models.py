@@ -17,6 +17,9 @@ CENTRE = np.array([0.05, 0.05, 0.05])
 CUBE = wf.mesh.box((0.1, 0.1, 0.1), cells=(1, 1, 1), element="T4")
 
 
+TILTED = np.array([(2.0, 1.0, 2.0), (-2.0, 2.0, 1.0), (-1.0, -2.0, 2.0)]) / 3.0
+
+
 HARD = wf.SVK(E=1e9, nu=0.3, density=1000.0)
 
 
@@ -90,6 +93,8 @@ def linked(law="mixed", dtype="float64", device="cpu"):
     samples = ([0.05, 0.2, 0.26, 0.4], [-3.0, -1.0, 2.0, 4.0])
     b.add_spring(first.surface("z+"), second.nodes("z-"), law=samples, damping=0.3, name="sampled")
     b.add_spring(second.at((0.3, 0.0, 0.0)), (0.35, -0.2, 0.2), law=hardening, name="own")
+    b.add_bushing(first.surface("x-"), second.surface("x-"), stiffness=(30, 50, 20, 0.5, 0.4, 0.2),
+                  damping=(0.3, 0.2, 0.4, 1e-3, 2e-3, 3e-3), axes=TILTED, name="bushing")  # fmt: skip
     if law == "mixed":
         b.add_foundation(first.surface("z-"), stiffness=2e3, damping=20.0, name="bed")
         b.add_point_mass(first.at((0.02, 0.03, 0.04)), 0.5, inertia=1e-3)

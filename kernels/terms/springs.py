@@ -6,6 +6,7 @@ A spring has the force F = dW/dy(y) + F_v(y, dy/dt) along y, and the vectors a, 
     ANGLE    y = atan2(a2.b, a.b), turns counted        of a revolute joint
     TRAVEL   y = a.b                                    of a translational or cylindrical joint
     VECTOR   a itself, W = k a.a / 2                    of a foundation, per area
+    CHORD    a itself, W = k psi(a.a), see chords.py    of a bushing
 
 In a step dy/dt = (y - y~)/(dq/dv), with y~ the coordinate's q~: Phi contains W and the integral of F_v from y~ on, and
 the tangent is symmetric. In a mid-point scheme F is the mean of dW/dy between both ends, dy/dt the mean rate, and both
@@ -24,10 +25,11 @@ from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.structs import IMPACT_DEPTH, IMPACT_FOUND, pattern_struct, topology_struct
 from ..common.types import double_1d, double_2d, double_3d, f64, int_1d, mat33d, precision, vec3d, vec3d_2d
 from .bounded_laws import FRICTION, STOP, bounded_functions
-from .spring_coordinates import ANGLE, LENGTH, TINY, TRAVEL, VECTOR, coordinate_functions
+from .chords import chord_functions
+from .spring_coordinates import ANGLE, CHORD, LENGTH, TINY, TRAVEL, VECTOR, coordinate_functions
 from .spring_laws import OwnForces, law_functions, spring_struct
 
-__all__ = ["ANGLE", "LENGTH", "TRAVEL", "VECTOR", "scratch_struct", "spring_kernels"]
+__all__ = ["ANGLE", "CHORD", "LENGTH", "TRAVEL", "VECTOR", "scratch_struct", "spring_kernels"]
 
 mat33d_2d = wp.array2d(dtype=mat33d)
 
@@ -59,6 +61,7 @@ def spring_kernels(dtype: str, midpoint: bool, own: OwnForces = (), bounded: boo
     T, vec3, sym6, mat33 = p.T, p.vec3, p.sym, p.mat33
     Springs, Scratch, Topology, Pattern = spring_struct(), scratch_struct(), topology_struct(dtype), pattern_struct()
     law, c, more = law_functions(own), coordinate_functions(midpoint), bounded_functions(midpoint)
+    vector = chord_functions(midpoint)
     add_block = add_block_function(dtype)
     suffix = "_bounded" * bounded + "".join(f"_{name}" for name, _ in own)
     module = kernel_module(f"springs_{dtype}{'_midpoint' if midpoint else ''}{suffix}")
@@ -86,7 +89,7 @@ def spring_kernels(dtype: str, midpoint: bool, own: OwnForces = (), bounded: boo
         """y at the start, and y~ = a0 y - a1 y(u_{n-1}), or with accelerations a y + b dy/dt + q_a d2y/dt2."""
         world, item = wp.tid()
         kind = spr.kind[item]
-        if kind == VECTOR:
+        if kind == VECTOR or kind == CHORD:
             return
         near = f64(0.0)
         if kind == ANGLE:
@@ -119,23 +122,20 @@ def spring_kernels(dtype: str, midpoint: bool, own: OwnForces = (), bounded: boo
     def evaluate_vector(
         spr: Springs, u: p.vec3_2d, start: p.vec3_2d, inverse: f64, world: int, item: int, scr: Scratch
     ):
-        """Force, tangent and potential of a VECTOR; `start`: q~, or positions at the start of a mid-point step."""
+        """Force, tangent and potential of a VECTOR or CHORD; `start`: q~, or of a mid-point step the start."""
         stiffness = spr.scale[item] * spr.stiffness[world, spr.spring[item]]
         damping = spr.scale[item] * spr.damping[world, spr.spring[item]] * inverse
         a = spr.reference[item] + vectors(spr, u, world, item)
         b = spr.reference[item] + vectors(spr, start, world, item)
-        at = a
-        slope = stiffness + damping
-        if wp.static(midpoint):
-            at = f64(0.5) * (a + b)
-            slope = f64(0.5) * stiffness + damping
         block = spr.first_block[item]
-        scr.force[world, item] = stiffness * at + damping * (a - b)
-        scr.hessian[world, block] = slope * wp.identity(n=3, dtype=f64)
-        scr.projected[world, block] = scr.hessian[world, block]
-        energy = f64(0.5) * (stiffness * wp.ddot(a, a) + damping * wp.ddot(a - b, a - b))
+        of = vector.plain_force(a[0], b[0], stiffness, damping)
+        if spr.kind[item] == CHORD:
+            of = vector.chord_force(a[0], b[0], stiffness)
+        scr.force[world, item] = wp.matrix_from_rows(of.force, vec3d(), vec3d())
+        scr.hessian[world, block] = of.tangent
+        scr.projected[world, block] = of.projected
         for row in range(3):
-            scr.rows[row, world, item] = energy
+            scr.rows[row, world, item] = wp.where(row == 2, wp.abs(of.energy), of.energy)
 
     @wp.func
     def unbounded(
@@ -196,7 +196,7 @@ def spring_kernels(dtype: str, midpoint: bool, own: OwnForces = (), bounded: boo
         inverse = in_motion / dq_dv[world]
         if wp.static(midpoint):
             inverse = f64(0.5) * inverse
-        if kind == VECTOR:
+        if kind == VECTOR or kind == CHORD:
             evaluate_vector(spr, u, start, inverse, world, item, scr)
             return
         sp = spr.spring[item]
@@ -290,6 +290,10 @@ def spring_kernels(dtype: str, midpoint: bool, own: OwnForces = (), bounded: boo
         if wp.static(midpoint):
             inverse = f64(0.5) * inverse
         V = spr.reference[item] + vectors(spr, u, world, item)
+        if spr.kind[item] == CHORD:
+            rows[0, world, item] = spr.stiffness[world, sp] * vector.chord_energy(wp.length_sq(V[0]))[0]
+            rows[1, world, item] = f64(0.0)
+            return
         if spr.kind[item] == VECTOR:
             moved = vectors(spr, u, world, item) - vectors(spr, start, world, item)
             step = vectors(spr, u, world, item) - vectors(spr, u_n, world, item)

@@ -16,17 +16,19 @@ from ..model.description import Description
 from ..model.discretisation import PointMass
 from ..model.handles import MaterialPoint, NodeSet, SurfaceSet
 from ..model.joints import Joint, Vector, VectorPart
-from ..model.springs import SampledForce, Spring
+from ..model.springs import Bushing, SampledForce, Spring
 from .actuators import make_actuator
 from .attachments import COINCIDENCE_TOL, make_attachment
 from .bodies import unused_name
+from .bushings import bushing_springs
 from .checks import body_of_handle
 
 __all__ = ["SpringMethods"]
 
 
 class SpringMethods:
-    """Base of ModelBuilder: `add_spring`, `add_torsion_spring`, `add_actuator`, `add_foundation`, `add_point_mass`."""
+    """Base of ModelBuilder: `add_spring`, `add_torsion_spring`, `add_actuator`, `add_bushing`, `add_foundation`,
+    `add_point_mass`."""
 
     description: Description
 
@@ -118,6 +120,37 @@ class SpringMethods:
         if joint not in self.description.joints:
             raise ModelError(f"actuator {name!r}: {joint!r} is no joint of this builder")
         return self._add_spring(make_actuator(name, joint, torque))
+
+    def add_bushing(
+        self, first: Any, second: Any, *, stiffness: Any, damping: Any = 0.0, axes: Any = None, name: str | None = None
+    ) -> Bushing:
+        """A bushing between two places: forces and moments of their relative translation and turn, with a potential
+        that is the same from either side.
+
+        It is sum_i k_i (d_i^2 + e_i^2)/4 + sum_i c_i phi_i^2/2: d_i and e_i the relative translation along axis i of
+        the first and of the second end, phi_i the angle between their axes i, c_1 = (k_5 + k_6 - k_4)/2 and so on. A
+        turn t about axis i alone has the energy k_(3 + i) t^2/2.
+
+        Args:
+            first, second: material points (body.at) of solids and rigid parts, or surfaces; wf.GROUND, or a point of
+                it. Translations count from the reference.
+            stiffness, damping: six values along and about the three axes, N/m, N m/rad, N s/m, N m s/rad; or one.
+            axes: (3, 3) rows, orthonormal, right-handed; by default those of the world. They turn with both ends.
+            name: unique name.
+
+        Raises:
+            ModelError: ends without a rotation, or a value out of range. A turn beyond 170 degrees is refused in a
+                step by name.
+        """
+        name = self._spring_name(name, "bushing")
+        what = f"bushing {name!r}"
+        known = (MaterialPoint, NodeSet, SurfaceSet)
+        for end, label in ((first, "first"), (second, "second")):
+            if hasattr(end, "body"):
+                body_of_handle(end, f"{what}: {label}", known, self.description.bodies)
+        springs = bushing_springs(what, name, first, second, stiffness, damping, axes)
+        self.description.springs += springs
+        return Bushing(name, springs)
 
     def add_foundation(
         self, surface: SurfaceSet, *, stiffness: float, damping: float = 0.0, name: str | None = None

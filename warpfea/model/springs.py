@@ -13,7 +13,7 @@ from ..kernels.terms.springs import ANGLE, LENGTH, TRAVEL
 from ..time_laws import TimeLaw
 from .joints import Joint, Vector
 
-__all__ = ["SampledForce", "Spring", "coordinate_gradients", "joint_coordinate"]
+__all__ = ["Bushing", "SampledForce", "Spring", "coordinate_gradients", "joint_coordinate"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +68,7 @@ class Spring:
 
     Attributes:
         name: unique in its model.
-        kind: LENGTH, ANGLE, TRAVEL or VECTOR of kernels/terms/springs.py.
+        kind: LENGTH, ANGLE, TRAVEL, VECTOR or CHORD of kernels/terms/springs.py.
         items: vectors of each coordinate, all of one spring: one, or many points of a foundation.
         scale: (items,) factor on stiffness and damping: 1, or the area of a point, m^2.
         stiffness, damping, rest, max_force, lower_end, upper_end: of all worlds until `Model.set_parameter`.
@@ -119,6 +119,19 @@ class Spring:
     def resists(self) -> bool:
         """True if it resists every motion of its coordinate in statics."""
         return self.stiffness > 0.0 if self.law in (None, FEEDBACK, FRICTION) else not self.bounded
+
+
+@dataclass(eq=False)
+class Bushing:
+    """Handle of a bushing: its springs along axes, between directions of its ends, and dampers of the turn.
+
+    Attributes:
+        name: unique in its model.
+        springs: those of its potential and of its damping.
+    """
+
+    name: str
+    springs: list[Spring] = field(repr=False)
 
 
 def joint_coordinate(joint: Joint) -> tuple[int, tuple[Vector, ...]] | None:

@@ -17,11 +17,12 @@ from ..base.worlds import check_values_per_world, set_rows, values_per_world
 from ..kernels.common.modules import definition_name
 from ..kernels.solvers.newton_control import TERM_ROWS
 from ..kernels.terms.bounded_laws import FRICTION, STOP
+from ..kernels.terms.chords import MAX_TURN
 from ..kernels.terms.spring_laws import LINEAR, OWN, SAMPLED, OwnForces, spring_struct
-from ..kernels.terms.springs import ANGLE, LENGTH, TRAVEL, VECTOR, scratch_struct, spring_kernels
+from ..kernels.terms.springs import ANGLE, CHORD, LENGTH, TRAVEL, VECTOR, scratch_struct, spring_kernels
 from ..model.assembly import grouped_items
 from ..model.springs import SampledForce, Spring, coordinate_gradients
-from .protocols import Impacting, Parametrised, Preconditioned, Tied
+from .protocols import Diagnosed, Impacting, Parametrised, Preconditioned, Tied
 from .term import LOSS, NUMERICAL, STORED, WORK, Column, StepContext, part
 from .time_law_table import TimeLawTable
 
@@ -37,11 +38,13 @@ DEVICE_FIELDS = {
     "lower_end": "lower_end", "upper_end": "upper_end",
 }  # fmt: skip
 """Members of the device struct by those of a Spring."""
-BLOCKS = {LENGTH: 1, VECTOR: 1, TRAVEL: 4, ANGLE: 9}
+NEAR_MAX_TURN = 0.9
+"""Share of the largest turn of a bushing from which a refused step tells of it."""
+BLOCKS = {LENGTH: 1, VECTOR: 1, CHORD: 1, TRAVEL: 4, ANGLE: 9}
 """Blocks of the tangent by coordinate."""
 
 
-class Springs(Tied, Preconditioned, Parametrised, Impacting):
+class Springs(Tied, Preconditioned, Parametrised, Impacting, Diagnosed):
     """Springs of a model: a potential and a viscous force of each coordinate.
 
     Attributes:
@@ -170,6 +173,20 @@ class Springs(Tied, Preconditioned, Parametrised, Impacting):
         if not count:
             return sp.csr_matrix(shape)
         return sp.csr_matrix((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=shape)
+
+    def failure_note(self, ctx: StepContext, world: int) -> str:
+        """Bushings near their largest turn."""
+        u = ctx.work.u.numpy()[world].astype(float)
+        for item in np.flatnonzero(self.kind == CHORD).tolist():
+            own = slice(self.entry_start[item], self.entry_start[item + 1])
+            chord = self.definition["reference"][item, 0] + self.entry_weight[own, 0] @ u[self.entry_slot[own]]
+            turn = 2.0 * np.arcsin(min(0.5 * float(np.linalg.norm(chord)), 1.0))
+            if turn > NEAR_MAX_TURN * MAX_TURN:
+                name = self.springs[self.definition["spring"][item]].name
+                return (
+                    f"; bushing {name!r} is turned by {np.degrees(turn):.0f} degrees: its ends may turn by 170 degrees"
+                )
+        return ""
 
     def incidence(self) -> tuple[np.ndarray, np.ndarray, int]:
         return self.entry_item, self.entry_slot, self.count

@@ -1,0 +1,107 @@
+"""Bushings: closed forms of one turn and of small ones, energy, the largest turn, bad input."""
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+from scipy.spatial.transform import Rotation
+from spring_models import EXACT, TILTED, cube
+
+import warpfea as wf
+
+STIFFNESS = np.array([1e4, 2e4, 3e4, 30.0, 40.0, 50.0])
+
+
+def mounted(axes=None, swapped=False, **options):
+    """A rigid cube of 1 kg on a bushing to the ground at its centre."""
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    part = b.add_rigid(wf.Box((0, 0, 0), (0.1, 0.1, 0.1)), density=1000.0, name="part")
+    ends = [part.at((0, 0, 0)), wf.GROUND]
+    b.add_bushing(*ends[:: -1 if swapped else 1], **{"stiffness": STIFFNESS, "axes": axes, "name": "mount"} | options)
+    return b, part
+
+
+def turn_of(sim, part):
+    return Rotation.from_quat(sim.pose(part)[1][0]).as_rotvec()
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_one_turn(axis):
+    """A dead force on an arm of 1 m: k t = F cos t, up to 1.25 rad, from either side."""
+    lever, force = TILTED[axis - 2], 200.0 * TILTED[axis - 1]
+    stiffness = np.concatenate([np.full(3, 1e7), STIFFNESS[3:]])
+    found = []
+    for swapped in (False, True):
+        b, part = mounted(TILTED, swapped, stiffness=stiffness)
+        b.add_point_load(part.at(lever), force)
+        static = wf.solve_static(b.finalize(device="cpu"), load_steps=4, tol=1e-10)
+        found.append(turn_of(static.simulation, part))
+    exact = brentq(lambda t: STIFFNESS[3 + axis] * t - 200.0 * np.cos(t), 0.0, 1.5)
+    assert np.abs(found[0] - exact * TILTED[axis]).max() < 1e-5
+    assert np.abs(found[1] - found[0]).max() < 1e-10
+
+
+def test_small_motion_and_frequencies():
+    """Six oscillators of a cube on its axes, damped: by the tangent matrices of `wf.modes`."""
+    b, part = mounted()
+    modes = wf.modes(b.finalize(device="cpu"), count=6)
+    inertia = np.concatenate([np.full(3, part.mass), np.diag(part.inertia)])
+    assert np.ravel(modes.frequencies) == pytest.approx(np.sort(np.sqrt(STIFFNESS / inertia)) / (2 * np.pi), rel=1e-6)
+
+
+def test_damped_turn():
+    """theta'' + 2 z w theta' + w^2 theta = 0 about one axis, of 2.5 rad at first, of second order."""
+    J, w, z = 1.0 / 600.0, 40.0, 0.05
+    errors = []
+    for h in (4e-3, 2e-3):
+        b, part = mounted(stiffness=(1e3, 1e3, 1e3, *3 * [J * w**2]), damping=(0, 0, 0, *3 * [2 * z * w * J]))
+        b.set_initial(part, angular_velocity=(0, 0, 100.0))
+        sim = wf.Simulation(b.finalize(device="cpu"), dt=h, integrator="energy_momentum", solver=EXACT)
+        sim.run(0.12)
+        s = w * np.sqrt(1 - z**2)
+        errors.append(turn_of(sim, part)[2] - 100.0 / s * np.exp(-z * w * 0.12) * np.sin(s * 0.12))
+    assert abs(errors[1]) < 2e-2
+    assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.2)
+
+
+def test_energy_and_momentum_of_two_parts():
+    """Free parts that tumble on a bushing keep both, without loss; worlds alike."""
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    parts = [b.add_rigid(wf.Box((0.1 * k, 0, 0), (0.1, 0.1, 0.1)), density=1000.0, name=f"p{k}") for k in range(2)]
+    b.add_bushing(*(part.at((0.05, 0, 0)) for part in parts), stiffness=0.1 * STIFFNESS, axes=TILTED)
+    b.set_initial(parts[0], velocity=(0.1, 0.2, 0.3), angular_velocity=(1, 5, 10))
+    sim = wf.Simulation(b.finalize(device="cpu", worlds=2), dt=2e-3, integrator="energy_momentum", solver=EXACT,
+                        constraint_tol=1e-12)  # fmt: skip
+    first = sim.energies()["kinetic"]
+    sim.step(60)
+    e = sim.energies()
+    assert e["springs"][0] > 1e-2 * first[0]
+    assert e["kinetic"] + e["springs"] == pytest.approx(first, rel=1e-10)
+    u = sim.state.displacement.numpy()
+    assert np.array_equal(u[0], u[1])
+
+
+def test_the_largest_turn():
+    b, part = mounted(stiffness=(1e4, 1e4, 1e4, 0.01, 0.01, 0.01))
+    b.set_initial(part, angular_velocity=(0, 0, 30.0))
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=2e-3, integrator="energy_momentum")
+    with pytest.raises(wf.ConvergenceError, match=r"bushing 'mount' is turned by 1\d\d degrees.* 170 degrees"):
+        sim.run(0.3)
+
+
+def test_bad_input():
+    b, body = cube()
+    P, line = body.at((0.05, 0.05, 0.05)), wf.ModelBuilder()
+    beam = line.add_beam([(0, 0, 0), (1, 0, 0)], elements=1, section=wf.Circle(0.1), normal=(0, 0, 1),
+                         material=wf.SVK(E=1e9, nu=0.3))  # fmt: skip
+    for make, message in (
+        (lambda: b.add_bushing(P, P, stiffness=1.0), "same place"),
+        (lambda: b.add_bushing(wf.GROUND, (0, 0, 0), stiffness=1.0), "neither of its ends"),
+        (lambda: b.add_bushing(P, wf.GROUND, stiffness=(1, 2, 3)), "six values"),
+        (lambda: b.add_bushing(P, wf.GROUND, stiffness=-1.0), "0 or more"),
+        (lambda: b.add_bushing(P, wf.GROUND, stiffness=0.0), "all 0"),
+        (lambda: b.add_bushing(P, wf.GROUND, stiffness=1.0, axes=2 * np.eye(3)), "orthonormal"),
+    ):
+        with pytest.raises(wf.ModelError, match=message):
+            make()
+    with pytest.raises(NotImplementedError, match="weld a rigid part"):
+        line.add_bushing(beam.end, wf.GROUND, stiffness=1.0)
