@@ -35,7 +35,7 @@ def chord_functions(midpoint: bool) -> KernelSet:
         """Force on a vector, its derivative and the positive semi-definite part of it, and the potential."""
 
         force: wp.vec3d
-        tangent: wp.mat33d
+        hessian: wp.mat33d
         projected: wp.mat33d
         energy: wp.float64
 
@@ -46,8 +46,8 @@ def chord_functions(midpoint: bool) -> KernelSet:
         phi = f64(2.0) * wp.asin(f64(0.5) * wp.sqrt(s))
         sine = wp.sin(phi)
         x = phi * phi
-        slope = f64(0.5) + x * (f64(1.0 / 12.0) + x * f64(7.0 / 720.0))
-        bend = f64(1.0 / 12.0) + x * f64(1.0 / 30.0)
+        slope = f64(0.5) + x * (f64(1.0) / f64(12.0) + x * (f64(7.0) / f64(720.0)))
+        bend = f64(1.0) / f64(12.0) + x * f64(1.0) / f64(30.0)
         if phi > f64(SMALL_ANGLE):
             slope = f64(0.5) * phi / sine
             bend = f64(0.25) * (sine - phi * wp.cos(phi)) / (sine * sine * sine)
@@ -63,8 +63,8 @@ def chord_functions(midpoint: bool) -> KernelSet:
             at = f64(0.5) * (a + b)
             slope = f64(0.5) * stiffness + damping
         out.force = stiffness * at + damping * (a - b)
-        out.tangent = slope * wp.identity(n=3, dtype=f64)
-        out.projected = out.tangent
+        out.hessian = slope * wp.identity(n=3, dtype=f64)
+        out.projected = out.hessian
         out.energy = f64(0.5) * (stiffness * wp.length_sq(a) + damping * wp.length_sq(a - b))
         return out
 
@@ -90,11 +90,11 @@ def chord_functions(midpoint: bool) -> KernelSet:
                 slope = (p[0] - chord_energy(start)[0]) / (s - start)
                 bend = f64(2.0) * (p[1] - slope) / (s - start) * a
         out.force = stiffness * slope * along
-        share = f64(2.0)
+        factor = f64(2.0)
         if wp.static(midpoint):
-            share = f64(1.0)
-        out.tangent = stiffness * (share * slope * wp.identity(n=3, dtype=f64) + wp.outer(along, bend))
-        out.projected = wp.max(stiffness, f64(0.0)) * share * slope * wp.identity(n=3, dtype=f64)
+            factor = f64(1.0)
+        out.hessian = stiffness * (factor * slope * wp.identity(n=3, dtype=f64) + wp.outer(along, bend))
+        out.projected = wp.max(stiffness, f64(0.0)) * factor * slope * wp.identity(n=3, dtype=f64)
         return out
 
     return kernel_set(locals())

@@ -128,14 +128,14 @@ def spring_kernels(dtype: str, midpoint: bool, own: OwnForces = (), bounded: boo
         a = spr.reference[item] + vectors(spr, u, world, item)
         b = spr.reference[item] + vectors(spr, start, world, item)
         block = spr.first_block[item]
-        of = vector.plain_force(a[0], b[0], stiffness, damping)
+        found = vector.plain_force(a[0], b[0], stiffness, damping)
         if spr.kind[item] == CHORD:
-            of = vector.chord_force(a[0], b[0], stiffness)
-        scr.force[world, item] = wp.matrix_from_rows(of.force, vec3d(), vec3d())
-        scr.hessian[world, block] = of.tangent
-        scr.projected[world, block] = of.projected
+            found = vector.chord_force(a[0], b[0], stiffness)
+        scr.force[world, item] = wp.matrix_from_rows(found.force, vec3d(), vec3d())
+        scr.hessian[world, block] = found.hessian
+        scr.projected[world, block] = found.projected
         for row in range(3):
-            scr.rows[row, world, item] = wp.where(row == 2, wp.abs(of.energy), of.energy)
+            scr.rows[row, world, item] = wp.where(row == 2, wp.abs(found.energy), found.energy)
 
     @wp.func
     def unbounded(
