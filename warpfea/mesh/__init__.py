@@ -11,8 +11,9 @@ from .convert import linear
 from .generators import box, cylinder, sphere
 from .grids import grid
 from .mesh import Mesh
+from .surface import from_surface
 
 __all__ = [
-    "CELL_TYPES", "FORMATS", "CellType", "Mesh", "box", "check", "cylinder", "from_meshio", "grid", "is_meshio",
-    "linear", "read", "sphere",
+    "CELL_TYPES", "FORMATS", "CellType", "Mesh", "box", "check", "cylinder", "from_meshio", "from_surface", "grid",
+    "is_meshio", "linear", "read", "sphere",
 ]  # fmt: skip

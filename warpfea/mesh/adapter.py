@@ -29,6 +29,7 @@ from .assemble import RawMesh, assemble_mesh
 from .cells import FILE_CELLS, cell_dimension
 from .checks import check
 from .mesh import Mesh, transformation
+from .split import corners_only, split_cells
 
 __all__ = ["FORMATS", "from_meshio", "is_meshio", "read", "read_triangles"]
 
@@ -36,7 +37,10 @@ FORMATS = {".msh": "Gmsh 2.2 and 4.1", ".vtu": "VTK", ".inp": "Abaqus"}
 """Supported mesh files."""
 
 
-def read(path: str | os.PathLike[str], scale: float = 1.0, transform: Any = None, cell_type: str | None = None) -> Mesh:
+def read(
+    path: str | os.PathLike[str], scale: float = 1.0, transform: Any = None, cell_type: str | None = None,
+    corners: bool = False,
+) -> Mesh:  # fmt: skip
     """Read and check a mesh of tetrahedra, hexahedra or quads.
 
     The cells of the highest dimension are the body. Next to solids, surface cells are boundary faces; a file with
@@ -48,6 +52,9 @@ def read(path: str | os.PathLike[str], scale: float = 1.0, transform: Any = None
     scale : metres per unit of the file
     transform : 4x4 matrix or (3x3, 3): X' = A (scale X) + t, in metres; no reflection
     cell_type : "tetra", "tetra10", "hexahedron" or "quad" required cell type
+    corners : read cells of higher order (hexahedron20, hexahedron27, quad8, quad9, tetra10, ...) by their corners
+
+    Prisms and pyramids become tetrahedra that match at shared faces, and hexahedra beside them, too.
 
     Sets
     ----
@@ -82,6 +89,7 @@ def read(path: str | os.PathLike[str], scale: float = 1.0, transform: Any = None
     readers = {".msh": _read_gmsh, ".vtu": _read_vtu, ".inp": abaqus.read_inp}
     with _meshio_errors(label):
         raw = readers[suffix](file)
+        raw = split_cells(corners_only(raw) if corners else raw)
     return check(assemble_mesh(raw, file, cell_type).transformed(transform=affine))
 
 
@@ -123,7 +131,9 @@ def is_meshio(mesh: Any) -> bool:
     return kind.__name__ == "Mesh" and kind.__module__.partition(".")[0] == "meshio"
 
 
-def from_meshio(mesh: Any, scale: float = 1.0, transform: Any = None, cell_type: str | None = None) -> Mesh:
+def from_meshio(
+    mesh: Any, scale: float = 1.0, transform: Any = None, cell_type: str | None = None, corners: bool = False
+) -> Mesh:
     """The mesh of a meshio.Mesh, checked; arguments as of :func:`read`.
 
     Sets
@@ -149,7 +159,7 @@ def from_meshio(mesh: Any, scale: float = 1.0, transform: Any = None, cell_type:
                     raw.groups.append((str(name), k, np.asarray(numbers, dtype=np.int64)))
     for name, nodes in mesh.point_sets.items():
         raw.node_groups[str(name)] = np.unique(np.asarray(nodes, dtype=np.int64))
-    found = assemble_mesh(raw, Path(label), cell_type)
+    found = assemble_mesh(split_cells(corners_only(raw) if corners else raw), Path(label), cell_type)
     return check(replace(found.transformed(transform=affine), name="mesh", path=None))
 
 

@@ -105,7 +105,8 @@ def _body_cell_type(raw: RawMesh, label: str, cell_type: str | None) -> str:
     for kind in solids:
         if kind not in FILE_CELLS:
             raise MeshError(
-                f"{label}: unknown cell type {kind!r} ({cell_counts[kind]} cells); known are {', '.join(FILE_CELLS)}"
+                f"{label}: unknown cell type {kind!r} ({cell_counts[kind]} cells); known are {', '.join(FILE_CELLS)}, "
+                "and wedge and pyramid without cells of higher order; read(..., corners=True) takes their corners"
             )
     if len(solids) > 1:
         what = "solid cells" if "hexahedron" in solids else "tetrahedra"
@@ -114,6 +115,8 @@ def _body_cell_type(raw: RawMesh, label: str, cell_type: str | None) -> str:
         if "quad" in surfaces:
             raise MeshError(f"{label}: holds {held}; a shell needs quads of 4 nodes only: recombine the others")
         hint = ": is this a 2D mesh? A shell needs quads of 4 nodes (recombine)" if surfaces else ""
+        if any(kind.startswith("quad") for kind in surfaces):
+            hint += f"; read(..., corners=True) takes the corners of {surfaces[0]!r}"
         names = dict.fromkeys(name for name, k, _ in raw.groups if cell_dimension(raw.blocks[k][0]) == 2)
         if names and not any(cell_dimension(raw.blocks[k][0]) == 3 for _, k, _ in raw.groups):
             hint += (

@@ -1,0 +1,90 @@
+"""Tetrahedra inside a closed surface, by fTetWild (extra "mesh")."""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..base.errors import MeshError
+from .adapter import read_triangles
+from .arguments import positive_numbers
+from .cells import TET_EDGES
+from .checks import check
+from .mesh import Mesh
+
+__all__ = ["from_surface", "with_mid_nodes"]
+
+MAX_VOLUME_CHANGE = 0.02
+"""Largest relative difference of the volumes of mesh and surface."""
+
+
+def from_surface(
+    surface: Any, *, size: float, element: str = "T10", scale: float = 1.0, tolerance: float = 1e-3, name: str = ""
+) -> Mesh:
+    """Mesh of the inside of a closed surface.
+
+    Parameters
+    ----------
+    surface : STL, OBJ or PLY file, or (points (n, 3), triangles (m, 3)) with normals outward
+    size : length of the edges, m
+    element : "T4", or "T10" with straight edges
+    scale : metres per unit of the file
+    tolerance : largest distance of the mesh from the surface, over the diagonal of its box
+
+    Raises
+    ------
+    MeshError
+        Without the extra "mesh"; an unreadable or open surface; a mesh whose volume differs by more than 2 % from that
+        of the surface.
+    """
+    given = isinstance(surface, (str, os.PathLike))
+    label = str(surface) if given else "from_surface"
+    points, triangles = read_triangles(surface) if given else (np.asarray(part) for part in surface)
+    points = scale * np.asarray(points, dtype=float)
+    (length,) = positive_numbers(f"{label}: size", (size,), 1)
+    if element not in ("T4", "T10"):
+        raise MeshError(f"{label}: element = {element!r} must be 'T4' or 'T10'")
+    x = points[triangles]
+    wanted = float(np.linalg.det(x - x.mean(axis=(0, 1))).sum()) / 6.0
+    vector = np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0])
+    if not np.linalg.norm(vector.sum(axis=0)) < 1e-3 * np.linalg.norm(vector, axis=1).sum():
+        raise MeshError(f"{label}: the surface is open: a mesh of its inside needs a closed one")
+    if not wanted > 0.0:
+        raise MeshError(f"{label}: the surface encloses {wanted:.3g} m^3: its triangles must turn outward")
+    try:
+        import pytetwild
+    except ImportError as error:
+        raise MeshError(
+            f"{label}: a mesh of the inside of a surface needs pytetwild: pip install 'warpfea[mesh]' ({error})"
+        ) from error
+    nodes, cells = pytetwild.tetrahedralize(
+        points, triangles.astype(np.int32), edge_length_abs=float(length), epsilon=tolerance, vtk_ordering=True
+    )
+    mesh = Mesh(np.asarray(nodes), np.asarray(cells), "tetra", name=name or _stem(surface))
+    found = mesh.volume()
+    if abs(found - wanted) > MAX_VOLUME_CHANGE * wanted:
+        raise MeshError(
+            f"{label}: the mesh has {found:.4g} m^3, the surface encloses {wanted:.4g}: it has holes, crosses itself, "
+            f"or is thinner than tolerance = {tolerance:g} of its size"
+        )
+    return check(with_mid_nodes(mesh) if element == "T10" else mesh)
+
+
+def _stem(surface: Any) -> str:
+    return Path(surface).stem if isinstance(surface, (str, os.PathLike)) else "surface"
+
+
+def with_mid_nodes(mesh: Mesh) -> Mesh:
+    """T4 mesh as T10 with straight edges; node sets gain the nodes between two of theirs."""
+    pairs = np.sort(mesh.cells[:, TET_EDGES].reshape(-1, 2), axis=1)
+    edges, number = np.unique(pairs, axis=0, return_inverse=True)
+    first = len(mesh.points)
+    points = np.concatenate([mesh.points, mesh.points[edges].mean(axis=1)])
+    cells = np.hstack([mesh.cells, first + number.reshape(-1, 6)])
+    sets = {
+        key: np.concatenate([nodes, first + np.flatnonzero(np.isin(edges, nodes).all(axis=1))])
+        for key, nodes in mesh.node_sets.items()
+    }
+    return replace(mesh, points=points, cells=cells, cell_type="tetra10", node_sets=sets)
