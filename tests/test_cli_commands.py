@@ -122,9 +122,9 @@ def test_pictures_take_field_view_and_range(folder, capfd, monkeypatch):
     shown = []
     label = animation.draw_labels
 
-    def note(image, time, bar):
+    def note(image, time, bar, *rest):
         shown.append(bar)
-        return label(image, time, bar)
+        return label(image, time, bar, *rest)
 
     monkeypatch.setattr(animation, "draw_labels", note)
     look = ["--field", "displacement", "--range", "-1e-3,2e-3", "--view", "-60,10", "--quiet"]
@@ -143,7 +143,12 @@ def test_pictures_take_field_view_and_range(folder, capfd, monkeypatch):
     assert {"cells", "warp", "simulation"} <= facts.keys()
     assert {(bar[0], bar[1], bar[2]) for bar in shown} == {(-1e-3, 2e-3, "displacement")}
     shown.clear()
-    render = ["render", "a.usdc", "-o", "b.png", "--quiet"]
+    assert run(capfd, "render", "a.usdc", "-o", "b.html", "--quiet")[0] == 0
+    assert '"kind":"support"' in (folder / "b.html").read_text()
+    code, _, err = run(capfd, "render", "a.usdc", "-o", "b.html", "--size", "64x64")
+    assert code == 2
+    assert "--size is for pictures" in err
+    render = ["render", "a.usdc", "-o", "b.png", "--quiet", "--draw", "edges"]
     assert run(capfd, *render)[0] == 0
     assert shown[-1][:3] == (-1e-3, 2e-3, "displacement")
     assert run(capfd, *render, "--field", "von_mises", "--range", "0,5")[0] == 0

@@ -61,3 +61,18 @@ def test_a_static_result_is_a_page(model):
     assert '"static":true' in inner
     assert inner.startswith("<!DOCTYPE html>")
     assert np.isfinite(result.simulation.field("von_mises", model[1].bodies[0])).all()
+
+
+def test_a_model_is_shown_before_a_run(model, tmp_path):
+    from PIL import Image
+
+    model[1].show(tmp_path / "x.html")
+    assert '"support"' in (tmp_path / "x.html").read_text()
+    for name, options in (("x", {}), ("y", {"marks": ()})):
+        model[1].show(tmp_path / f"{name}.png", size=(200, 120), **options)
+    marked, plain = (np.asarray(Image.open(tmp_path / f"{name}.png")).astype(int) for name in "xy")
+    green = [
+        ((image[:, :, 1] > image[:, :, 0] + 60) & (image[:, :, 1] > image[:, :, 2] + 30)).sum()
+        for image in (marked, plain)
+    ]
+    assert green[0] > 3 * green[1]  # of the axis y

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from stub_simulation import FAR, StubSim, drive, left_over, tet_box
 
-from warpfea.base.errors import OutputError
+from warpfea.base.errors import ModelError, OutputError
 from warpfea.outputs.colormap import map_colors
 from warpfea.outputs.normals import smooth_corners
 from warpfea.outputs.raycaster import Camera, Renderer, nice_number
@@ -93,7 +93,7 @@ def test_gif_frames_differ(tmp_path):
 
     path = tmp_path / "o.gif"
     sim = StubSim(worlds=1, dt=0.01, far=(0, 0.5, 0.3))
-    drive(sim, GIFWriter(path, fps=10, size=(200, 120), progress=False), 35)
+    drive(sim, GIFWriter(path, fps=10, speed=1.0, size=(200, 120), progress=False), 35)
     with Image.open(path) as gif:
         assert gif.n_frames == 5
         frames = [np.asarray(f.convert("RGB")).astype(int) for f in ImageSequence.Iterator(gif)]
@@ -174,3 +174,87 @@ def test_smooth_corners_keep_edges():
     assert count == 6 * 9  # each of the six sides has its own normals
     assert len(group) == 3 * len(triangles)
     assert smooth_corners(points, triangles, angle=120.0)[1] == 26
+
+
+# ------------------------------------------------------------------------------------ what is drawn beside
+
+
+def bodies_picture(tmp_path, name="x.png", **options):
+    """Picture of the last of a few states."""
+    from PIL import Image
+
+    path = tmp_path / name
+    drive(StubSim(far=(0.2, 0.5, 0.0), worlds=1), PNGWriter(path, size=(240, 135), **options), 15)
+    return np.asarray(Image.open(path)).astype(int)
+
+
+def changed(a, b, limit=20):
+    """Number of pixels that differ."""
+    return int((np.abs(a - b).max(axis=2) > limit).sum())
+
+
+def test_options_of_pictures_draw_what_they_say(tmp_path):
+    plain = bodies_picture(tmp_path)
+    assert np.ptp(plain[-1, 90:170], axis=0).max() <= 3  # the sky, no invented floor
+    assert changed(plain, bodies_picture(tmp_path, ground=True), 4) > 3000
+    edges = bodies_picture(tmp_path, edges=True)
+    assert changed(plain, edges) > 300
+    assert (edges.sum(axis=2) <= plain.sum(axis=2) + 30).mean() > 0.99  # lines are dark
+    assert 200 < changed(plain, bodies_picture(tmp_path, undeformed=True), 10) < 20000
+    assert changed(plain, bodies_picture(tmp_path, scale=0.0)) > 300
+    for options in ({"axes": True}, {"extremes": True}, {"legend": True}):
+        assert 20 < changed(plain, bodies_picture(tmp_path, **options)) < 2500, options
+    without = bodies_picture(tmp_path, hide=["2nd box"])
+    vivid = [int((np.ptp(image[:, :200], axis=2) > 60).sum()) for image in (plain, without)]
+    assert vivid[1] != vivid[0] > 0
+    half = bodies_picture(tmp_path, cut=("+x", 0.5))
+    assert changed(plain, half) > 300
+    nothing = bodies_picture(tmp_path, cut=("-y", 99.0))
+    assert (np.ptp(nothing[:, :190], axis=2) > 60).sum() == 0
+    near = [int((np.ptp(bodies_picture(tmp_path, zoom=zoom)[:, :190], axis=2) > 60).sum()) for zoom in (0.5, 1.0)]
+    assert near[0] < 0.5 * near[1]
+
+
+def test_camera_follows_and_ranges_are_chosen(tmp_path):
+    followed = bodies_picture(tmp_path, follow="2nd box", field=None)
+    at = bodies_picture(tmp_path, target=(0.35, 0.65, 0.15 - 0.5 * 0.15**2), field=None)
+    assert changed(followed, at) < 60  # the box is at that place
+    from warpfea.outputs.animation import Animation, Frame
+    from warpfea.outputs.look import Look
+
+    values = np.concatenate([np.arange(101.0), [1e9, np.nan]])
+    film = Animation(np.array([[0, 1, 2]]), "Z", np.zeros((103, 3)), parts=[("a", 0, 51), ("b", 51, 52)])
+    film.frames = [Frame(0.0, np.zeros((103, 3)), values)]
+    assert film.color_limits(Look()) == (0.0, 1e9)
+    assert film.color_limits(Look(range_body="a")) == (0.0, 50.0)
+    low, high = film.color_limits(Look(percentile=(10, 90)))
+    assert (low, high) == pytest.approx(tuple(np.percentile(values[:-1], (10, 90))))
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"marks": "support"}, "kinds of marks"),
+        ({"marks": ("suport",)}, "did you mean 'support'"),
+        ({"zoom": 0.0}, "zoom"),
+        ({"cut": ("y", 0.0)}, "cut must be"),
+        ({"percentile": (90, 10)}, "percentile"),
+        ({"target": (0, 0)}, "target"),
+        ({"hide": ["bar "]}, "there are bar, 2nd box"),
+        ({"follow": "bat"}, "there are bar, 2nd box"),
+    ],
+)
+def test_bad_options_of_pictures_are_refused(tmp_path, options, text):
+    with pytest.raises(ModelError, match=text):
+        PNGWriter(tmp_path / "x.png", **options).open(StubSim(worlds=1))
+
+
+def test_gif_chooses_its_speed(tmp_path):
+    from PIL import Image, ImageSequence
+
+    writer = GIFWriter(tmp_path / "x.gif", fps=5, size=(64, 64), max_frames=20, progress=False)
+    drive(StubSim(worlds=1), writer, 45)  # 0.45 s are shown in 3 s
+    with Image.open(tmp_path / "x.gif") as gif:
+        durations = [f.info["duration"] for f in ImageSequence.Iterator(gif)]
+    assert 12 <= len(durations) <= 16
+    assert sum(durations[:-1]) == pytest.approx(3000, abs=120)

@@ -238,3 +238,23 @@ def test_render_usd(tmp_path, usd_run):
     ):
         with pytest.raises(ModelError, match=text):
             render_usd(near, picture, **options)
+
+
+def test_usd_material_reads_the_color_and_the_layer_says_how_it_was_made(tmp_path):
+    from pxr import Usd, UsdShade
+
+    path = tmp_path / "m.usdc"
+    sim = StubSim(worlds=2)
+    drive(sim, USDWriter(path, fps=20, material=True, layer_data={"command": "warpfea run x", "seed": 7}), 5)
+    assert validate_usd(path) == []
+    stage = Usd.Stage.Open(str(path))
+    for mesh in meshes_of(stage):
+        material, _ = UsdShade.MaterialBindingAPI(mesh.GetPrim()).ComputeBoundMaterial()
+        shader = material.ComputeSurfaceSource()[0]
+        assert shader.GetIdAttr().Get() == "UsdPreviewSurface"
+        source = shader.GetInput("diffuseColor").GetConnectedSources()[0][0].source
+        assert UsdShade.Shader(source.GetPrim()).GetInput("varname").Get() == "displayColor"
+    kept = stage.GetRootLayer().customLayerData["warpfea"]
+    assert (kept["command"], kept["seed"]) == ("warpfea run x", "7")
+    assert {"warpfea", "warp", "numpy"} <= set(kept["versions"])
+    assert kept["units"].startswith("SI")

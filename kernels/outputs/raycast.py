@@ -31,6 +31,13 @@ class Scene:
     shadow_map: wp.array2d(dtype=float)  # light (0 .. 1) that reaches the ground
     shadow_map_corner: wp.vec2  # corner of the shadow map
     shadow_cell_size: float  # size of its cells
+    sides: wp.array(
+        dtype=wp.int32
+    )  # [face] bits 1, 2, 4: the side opposite its corner is an edge of an element; or empty
+    ghost: wp.uint64  # id of a wp.Mesh seen through, the undeformed surface
+    has_ghost: int
+    cut: wp.vec4  # direction and place of a section; nothing beyond it is drawn
+    has_cut: int
 
 
 @wp.func
@@ -100,6 +107,44 @@ def shade_surface(scene: Scene, p: wp.vec3, n: wp.vec3, flat: wp.vec3, albedo: w
     return albedo * light + wp.vec3(shine, shine, shine)
 
 
+@wp.func
+def skipped_length(scene: Scene, ray: wp.vec3, reach: float):
+    """Length of a ray from the eye after which nothing is beyond the section."""
+    start = float(0.0)
+    if scene.has_cut == 1:
+        for _ in range(200):
+            hit = wp.mesh_query_ray(scene.mesh, scene.eye + ray * start, ray, reach - start)
+            if not hit.result:
+                break
+            p = scene.eye + ray * (start + hit.t)
+            if p[0] * scene.cut[0] + p[1] * scene.cut[1] + p[2] * scene.cut[2] <= scene.cut[3]:
+                break
+            start += hit.t + 1.0e-5
+    return start
+
+
+@wp.func
+def side_shade(scene: Scene, face: int, p: wp.vec3, distance: float):
+    """Share of black of the edges of elements at a point of a face, lines of about 1.3 pixels."""
+    shade = float(0.0)
+    a = wp.mesh_get_point(scene.mesh, 3 * face)
+    b = wp.mesh_get_point(scene.mesh, 3 * face + 1)
+    c = wp.mesh_get_point(scene.mesh, 3 * face + 2)
+    pixel = distance * wp.length(scene.up) * 2.0 / scene.height_pixels
+    bits = scene.sides[face]
+    for k in range(3):
+        first, second = b, c
+        if k == 1:
+            first, second = c, a
+        if k == 2:
+            first, second = a, b
+        if (bits >> k) & 1 == 1:
+            along = wp.normalize(second - first)
+            d = wp.length(wp.cross(p - first, along)) / pixel
+            shade = wp.max(shade, 0.7 * (1.0 - wp.smoothstep(0.4, 0.9, d)))
+    return shade
+
+
 @wp.kernel
 def cast_rays(scene: Scene, samples: wp.array(dtype=wp.vec2), out: wp.array(dtype=wp.vec3)):
     """Colour (linear light) of each picture position (pixels, y down)."""
@@ -113,9 +158,12 @@ def cast_rays(scene: Scene, samples: wp.array(dtype=wp.vec2), out: wp.array(dtyp
         reach = (scene.ground_height - scene.eye[2]) / ray[2]
         p = scene.eye + ray * reach
         color = shade_ground(scene, p, reach, -ray[2], color)
-    hit = wp.mesh_query_ray(scene.mesh, scene.eye, ray, reach)
+    start = skipped_length(scene, ray, reach)
+    hit = wp.mesh_query_ray(scene.mesh, scene.eye + ray * start, ray, reach - start)
+    depth = reach
     if hit.result:
-        p = scene.eye + ray * hit.t
+        depth = start + hit.t
+        p = scene.eye + ray * depth
         w = 1.0 - hit.u - hit.v
         k = 3 * hit.face
         n = scene.corner_normals[k] * hit.u + scene.corner_normals[k + 1] * hit.v + scene.corner_normals[k + 2] * w
@@ -131,6 +179,13 @@ def cast_rays(scene: Scene, samples: wp.array(dtype=wp.vec2), out: wp.array(dtyp
         if wp.dot(n, flat) < 0.0:
             n = -n
         color = shade_surface(scene, p, n, flat, albedo, ray)
+        if scene.sides.shape[0] > 0:
+            color = color * (1.0 - side_shade(scene, hit.face, p, depth))
+    if scene.has_ghost == 1:
+        before = wp.mesh_query_ray(scene.ghost, scene.eye, ray, depth)
+        if before.result:
+            facing = wp.abs(wp.dot(wp.normalize(before.normal), ray))
+            color = blend(color, wp.vec3(0.30, 0.34, 0.42) * (0.4 + 0.6 * facing), 0.35)
     out[sample] = color
 
 

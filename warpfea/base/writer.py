@@ -66,6 +66,9 @@ def writer_for(path: str | os.PathLike[str], fields: Sequence[str], **options: A
     return WRITERS[suffix](path, fields, **options)
 
 
+VIEWERS: list[Callable[..., None]] = []
+"""Function (model, path, **options) that draws a model at its initial state, once writers are there."""
+
 _counter = itertools.count()
 
 

@@ -191,11 +191,15 @@ def _add_run(commands: Any) -> None:
     finish_command(to, ".run", "run")
 
 
+DRAWN = ("axes", "edges", "undeformed", "extremes", "legend", "ground")
+"""Options of pictures that are drawn or not."""
 PICTURE_OPTIONS = (
     ("--field", None, "NAME", "field in colour: von_mises (default), displacement, J, tresca, pressure, "
      "principal.1, cauchy.xx, contact_pressure, gap, ..., or none"),
     ("--view", number_pair, "AZIMUTH,ELEVATION", "of the camera, degrees"),
     ("--range", color_range, "LOW,HIGH", "of the colours, SI units"),
+    ("--draw", Kind.APPEND, DRAWN, "in pictures also: axes, edges of elements, the undeformed shape, extremes, a "
+     "legend of bodies, a ground at the lowest point"),
 )  # fmt: skip
 
 

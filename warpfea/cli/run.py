@@ -143,6 +143,7 @@ OPTION_OUTPUTS = {
     "field": ("pictures", ("png", "gif", "usd", "html")),
     "range": ("pictures", ("png", "gif", "usd", "html")),
     "view": ("pictures", ("png", "gif", "html")),
+    "draw": ("pictures", ("png", "gif")),
     "png_time": ("a picture", ("png",)),
     "fps": ("animations", ("usd", "vtu", "html")),
     "speed": ("an animation", ("gif",)),
@@ -154,7 +155,7 @@ OPTION_OUTPUTS = {
 def _check_output_options(options: argparse.Namespace) -> None:
     """UsageError for options of missing outputs, and for outputs that can't be extended after --resume."""
     for name, (what, uses) in OPTION_OUTPUTS.items():
-        if getattr(options, name) is not None and not any(getattr(options, use) for use in uses):
+        if getattr(options, name) not in (None, []) and not any(getattr(options, use) for use in uses):
             option, outputs = name.replace("_", "-"), " or ".join(f"--{use}" for use in uses)
             raise UsageError(f"--{option} is for {what}: give {outputs} too")
     for name in ("gif", "html"):
@@ -199,12 +200,17 @@ def make_outputs(options: argparse.Namespace, source: Source, t_end: float) -> l
     picture_options: dict[str, Any] = {"field": field, "color_range": options.range}
     if options.view:
         picture_options["view"] = options.view
+    command = shlex.join(["warpfea", *options.words])
+    drawn: dict[str, Any] = dict.fromkeys(options.draw, True)
     if options.static:
         fps = max(fps, 2.0 * (options.load_steps or 10))  # a frame per load step
     if options.usd:
         from ..outputs.usd import USDWriter
 
-        out.append(USDWriter(options.usd, fps=fps, color=field, color_range=options.range, extend=extend))
+        of_run = {"command": command, "seed": source.parameters.get("seed", "none")}
+        out.append(
+            USDWriter(options.usd, fps=fps, color=field, color_range=options.range, extend=extend, layer_data=of_run)
+        )
     if options.vtu:
         from ..outputs.vtk import VTUWriter
 
@@ -215,17 +221,17 @@ def make_outputs(options: argparse.Namespace, source: Source, t_end: float) -> l
         time = source.scene.picture if options.png_time is None else options.png_time
         if options.static or (time is not None and time > t_end):
             time = None
-        out.append(PNGWriter(options.png, time=time, **picture_options))
+        out.append(PNGWriter(options.png, time=time, **picture_options, **drawn))
     if options.gif:
         from ..outputs.render import GIFWriter
 
         speed = options.speed or (STATIC_SPEED if options.static else source.scene.speed)
-        out.append(GIFWriter(options.gif, speed=speed, progress=show_progress(options), **picture_options))
+        out.append(GIFWriter(options.gif, speed=speed, progress=show_progress(options), **picture_options, **drawn))
     if options.html:
         from ..outputs.html import HTMLWriter
 
         header: dict[str, Any] = {"title": source.label, "parameters": source.parameters}
-        header["command"] = shlex.join(["warpfea", *options.words])
+        header["command"] = command
         header |= {name: value for name, value in picture_options.items() if name != "field"}
         out.append(HTMLWriter(options.html, fps=fps, color=field, **header))
     if options.checkpoint:

@@ -198,11 +198,11 @@ def render(options: argparse.Namespace) -> int:
     suffix = pathlib.Path(options.output).suffix.lower()
     if suffix not in (".png", ".gif", ".html"):
         raise UsageError(f"--output {options.output}: the file name must end in .png, .gif or .html")
-    for name in ("time", "size") if suffix == ".html" else ():
-        if getattr(options, name) is not None:
+    for name in ("time", "size", "draw") if suffix == ".html" else ():
+        if getattr(options, name) not in (None, []):
             raise UsageError(f"--{name} is for pictures; a page shows all times, in the size of its window")
     source = existing_file(options.file)
-    extra: dict[str, Any] = {"color_range": options.range}
+    extra: dict[str, Any] = {"color_range": options.range, **dict.fromkeys(options.draw, True)}
     if options.view:
         extra["view"] = options.view
     with quiet_warp():

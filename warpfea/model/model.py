@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Callable
 from typing import Any
 
@@ -15,6 +16,7 @@ from ..base.errors import ModelError
 from ..base.memory import Memory, convert_memory_errors
 from ..base.names import check_choice
 from ..base.notebook import summary_table
+from ..base.writer import VIEWERS
 from ..kernels.common.types import precision
 from . import assembly
 from .blocks import Block, build_block
@@ -217,6 +219,18 @@ class Model:
             "bytes": self.memory.bytes | {"total": sum(self.memory.bytes.values())},
             "kernels": sorted({b.kernels.module.name.removeprefix("warpfea.kernels.") for b in self.blocks}),
         }
+
+    def show(self, path: str | os.PathLike[str], **options: Any) -> None:
+        """Draw the model at its initial state, with supports, joints, loads and obstacles, before a run.
+
+        Args:
+            path: .png, .html or another file of one writer.
+            options: of that writer, see :class:`warpfea.PNGWriter` and :class:`warpfea.HTMLWriter`.
+
+        Raises:
+            ModelError, OutputError: see the writer.
+        """
+        VIEWERS[0](self, path, **options)
 
     def state(self) -> State:
         """A new State with the initial displacements and velocities of the bodies, and values of controls."""

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from ..base.checks import is_number, number_pair
 from ..base.errors import ModelError, OutputError
+from ..model.surfaces import reference_points
 from .obstacles import Obstacles, clip_to_box
 
 __all__ = ["DrawnSurface", "FrameClock", "check_colors", "check_fields", "field_label", "grid_offsets", "is_static"]
@@ -175,6 +176,31 @@ class DrawnSurface:
     def body_points(self) -> int:
         """Number of `points` of bodies, which come first."""
         return self.worlds * sum(self.point_counts)
+
+    def parts(self) -> list[tuple[str, int, int]]:
+        """(name, first point, number of points of all worlds) of each body and obstacle, in the order of `points`."""
+        names = [body.name for body in self.bodies] + [obstacle.name for obstacle in self.obstacles.all]
+        counts = [self.worlds * count for _, count in self._meshes()]
+        firsts = np.cumsum([0, *counts[:-1]])
+        return [(name, int(first), count) for name, first, count in zip(names, firsts, counts)]
+
+    def edges(self) -> npt.NDArray[np.int64]:
+        """(E, 2) points along the edges of elements of all bodies and worlds."""
+        blocks = [np.zeros((0, 2), dtype=np.int64)]
+        for body, count, (_, first, _) in zip(self.bodies, self.point_counts, self.parts()):
+            of_triangles = body.skin.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+            edges = np.asarray(getattr(body.skin, "edges", of_triangles))
+            blocks += [edges + first + world * count for world in range(self.worlds)]
+        return np.concatenate(blocks)
+
+    def rest_points(self, start: Array) -> Array:
+        """(P, 3) points at rest, m, of all worlds in the order of `points`; where none are known those at the start."""
+        out = start.copy()
+        for body, (_, first, total) in zip(self.bodies, self.parts()):
+            if hasattr(body.skin, "slot_weights"):
+                rest = reference_points(body, body.skin.slot_weights)
+                out[first : first + total] = (rest + self.offsets[:, None, :]).reshape(-1, 3)
+        return out
 
     def plane_squares(self) -> list[int]:
         """First point of each square drawn for a half-space, in the order of `points`."""

@@ -7,9 +7,13 @@ import numpy.typing as npt
 
 from ..model.surfaces import reference_points
 
-__all__ = ["Markers"]
+__all__ = ["KINDS", "MARKED_WORLDS", "Markers"]
 
 Array = npt.NDArray[Any]
+KINDS = ("support", "joint", "load", "probe")
+"""Kinds of marks."""
+MARKED_WORLDS = 16
+"""Pictures and files of more worlds have no marks."""
 SHOWN_POINTS = 24
 """Number of points drawn of a support or a pressure."""
 SHOWN_JOINTS = 100
@@ -76,11 +80,31 @@ class Markers:
         self._points.append((np.asarray(value, dtype=float), slots, np.asarray(weights, dtype=float)))
         self._laws.append(law)
 
-    def points(self, sim: Any) -> Array:
-        """(B, n, 3) current places of the marks of their own, m."""
-        u = sim.state.displacement.numpy() if self.own else np.zeros((int(sim.model.worlds), 0, 3))
+    def points(self, sim: Any, scale: float = 1.0) -> Array:
+        """(B, n, 3) places of the marks of their own, m, with displacements multiplied by `scale`."""
+        u = scale * sim.state.displacement.numpy() if self.own else np.zeros((int(sim.model.worlds), 0, 3))
         places = [X + np.einsum("s,bsk->bk", w, u[:, slots].astype(float)) for X, slots, w in self._points]
         return np.stack(places, axis=1) if places else u
+
+    def kinds(self, worlds: int) -> list[str]:
+        """Kinds of the points of `all_points`."""
+        on = [("load" if k == "pressure" else k, len(points)) for k, _, _, points in self.on_surface]
+        return worlds * [kind for kind, count in on for _ in range(count)] + worlds * [kind for kind, _ in self.own]
+
+    def world_points(self, drawn: list[Array], own: Array) -> Array:
+        """(B, n, 3) points of the marks of each world, from drawn points (B, P, 3) of bodies and `own` (B, m, 3)."""
+        return np.concatenate([drawn[body][:, points] for _, _, body, points in self.on_surface] + [own], axis=1)
+
+    def all_points(self, drawn: Array, firsts: list[int], counts: list[int], own: Array) -> Array:
+        """(n, 3) points of all marks: those on bodies, whose drawn points begin at `firsts` with `counts` for each
+        world, then `own` (B, n, 3)."""
+        rows = [
+            firsts[body] + world * counts[body] + points
+            for world in range(len(own))
+            for _, _, body, points in self.on_surface
+        ]
+        on_bodies = drawn[np.concatenate(rows)] if rows else np.zeros((0, 3))
+        return np.concatenate([on_bodies, own.reshape(-1, 3)])
 
     def vectors(self, time: float, factor: float = 1.0) -> list[Array | None]:
         """Force of each mark of its own at a time (s), times a load factor; None unless samples give it."""

@@ -44,6 +44,15 @@ class Camera:
         right = right / np.linalg.norm(right)
         return forward, right, np.cross(right, forward)
 
+    def project(self, point: Floats, size: tuple[int, int]) -> tuple[float, float]:
+        """Pixel (x, y), y down, of a point (3,) m in a picture of a size."""
+        forward, right, up = self.axes()
+        local = point - self.eye
+        tangent = np.tan(np.radians(0.5 * self.fov)) * max(float(local @ forward), 1e-9 * self.size)
+        x = float(local @ right) / (tangent * size[0] / size[1]) + self.center[0]
+        y = float(local @ up) / tangent + self.center[1]
+        return 0.5 * (x + 1.0) * size[0], 0.5 * (1.0 - y) * size[1]
+
     @classmethod
     def framing(
         cls,
@@ -114,6 +123,9 @@ class Renderer:
             first picture.
         up_axis: "Z" or "Y"; points are rotated so that this axis is up.
         ground: height (m) of the ground along the up axis, None for no ground.
+        edges: (E, 2) points along edges of elements, drawn as lines; None: not drawn.
+        ghost: points (Q, 3) and triangles of a surface that is drawn seen through.
+        cut: (4,) in the frame with z up: nothing with direction . x > place is drawn.
 
     The mesh is built once and refitted when points move. Not usable inside a graph capture.
     """
@@ -125,6 +137,9 @@ class Renderer:
         reference: Floats | None = None,
         up_axis: str = "Z",
         ground: float | None = None,
+        edges: npt.NDArray[np.integer[Any]] | None = None,
+        ghost: tuple[Floats, npt.NDArray[np.integer[Any]]] | None = None,
+        cut: Floats | None = None,
     ) -> None:
         self.triangles = np.ascontiguousarray(triangles, dtype=np.int32)
         if self.triangles.ndim != 2 or self.triangles.shape[1] != 3 or not len(self.triangles):
@@ -134,6 +149,9 @@ class Renderer:
         self._reference = None if reference is None else np.asarray(reference, dtype=np.float64)
         self._normal_groups: tuple[npt.NDArray[np.int64], int] | None = None
         self._mesh: Any = None
+        self._sides = np.zeros(0, dtype=np.int32) if edges is None else side_bits(self.triangles, edges)
+        self._ghost_mesh: Any = None
+        self._ghost, self._cut = ghost, cut
 
     def render(
         self, points: Floats, colors: Floats, camera: Camera | None = None, size: tuple[int, int] = (960, 540)
@@ -160,12 +178,13 @@ class Renderer:
             self._cast_shadow(wp, raycast, scene, unit)
             centers = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1)
             image = self._cast(wp, raycast, scene, centers.reshape(-1, 2).astype(np.float32)).reshape(height, width, 3)
-            edges = edge_pixels(to_srgb(image))
+            shown = to_srgb(image)
+            edges = edge_pixels(shown)
             rows, columns = np.nonzero(edges)
             corners = np.stack([columns, rows], axis=1).astype(np.float32)
             fine = (corners[:, None, :] + _SUBPIXELS).reshape(-1, 2)
-            image[edges] = self._cast(wp, raycast, scene, fine).reshape(-1, len(_SUBPIXELS), 3).mean(axis=1)
-        return np.asarray(np.round(to_srgb(image) * 255.0), dtype=np.uint8)
+            shown[edges] = to_srgb(self._cast(wp, raycast, scene, fine).reshape(-1, len(_SUBPIXELS), 3).mean(axis=1))
+        return np.asarray(np.round(shown * 255.0), dtype=np.uint8)
 
     def _make_scene(
         self, wp: Any, raycast: Any, unit: Floats, colors: Floats, camera: Camera, size: tuple[int, int]
@@ -196,6 +215,7 @@ class Renderer:
         side = 0.55 * up - 0.55 * right - 0.45 * forward + np.array([0.0, 0.0, 0.75])
         self._light = side / np.linalg.norm(side)
         scene.light_direction = wp.vec3(*self._light)
+        self._set_extras(wp, scene, camera)
         scene.has_ground = 0
         if self.ground is not None and camera.eye[2] > self.ground:
             scene.has_ground = 1
@@ -203,6 +223,20 @@ class Renderer:
             scene.grid_spacing = nice_number(0.2 * camera.size) / camera.size
             scene.fade_radius = 2.2
         return scene
+
+    def _set_extras(self, wp: Any, scene: Any, camera: Camera) -> None:
+        """Edges of elements, the surface seen through and the section, in the scene's scale."""
+        scene.sides = wp.array(self._sides, dtype=wp.int32)
+        scene.ghost, scene.has_ghost, scene.has_cut = self._mesh.id, 0, 0
+        if self._ghost is not None:
+            points = (to_z_up(self._ghost[0], self.up_axis) - camera.target) / camera.size
+            triangles = np.ascontiguousarray(self._ghost[1], dtype=np.int32).ravel()
+            corners = wp.array(np.ascontiguousarray(points, dtype=np.float32), dtype=wp.vec3)
+            self._ghost_mesh = wp.Mesh(corners, wp.array(triangles, dtype=wp.int32))
+            scene.ghost, scene.has_ghost = self._ghost_mesh.id, 1
+        if self._cut is not None:
+            place = float(self._cut[3] - self._cut[:3] @ camera.target) / camera.size
+            scene.cut, scene.has_cut = wp.vec4(*map(float, self._cut[:3]), place), 1
 
     def _cast_shadow(self, wp: Any, raycast: Any, scene: Any, unit: Floats, cells: int = 160) -> None:
         """Fill the light map of the ground, over the area of possible shadow."""
@@ -232,6 +266,17 @@ class Renderer:
 
 # 8 rooks: one per row and column of an 8 x 8 raster
 _SUBPIXELS = np.array([[(k + 0.5) / 8, ((5 * k + 2) % 8 + 0.5) / 8] for k in range(8)], dtype=np.float32)
+
+
+def side_bits(triangles: npt.NDArray[np.integer[Any]], edges: npt.NDArray[np.integer[Any]]) -> npt.NDArray[np.int32]:
+    """(T,) bits 1, 2, 4 of triangles: the side opposite that corner is among the edges (E, 2)."""
+    count = int(triangles.max()) + 1
+    known = np.sort(edges, axis=1) @ np.array([count, 1])
+    out = np.zeros(len(triangles), dtype=np.int32)
+    for k in range(3):
+        side = np.sort(triangles[:, [(k + 1) % 3, (k + 2) % 3]].astype(np.int64), axis=1) @ np.array([count, 1])
+        out |= np.isin(side, known).astype(np.int32) << k
+    return out
 
 
 def edge_pixels(image: Floats, limit: float = 0.025) -> npt.NDArray[np.bool_]:

@@ -9,7 +9,9 @@ Layout of a stage (metres, kilograms):
                                     warpfea:edges, pairs of points along edges of elements
     /World/world_0000/<collider>        Xform; translate and orient, per frame of one that moves
     /World/world_0000/<collider>/shape  Mesh in the shape's own axes; customData["warpfea:collider"]: its kind;
-    of a half-space a square /World/Camera /World/Sky /World/Sun
+    of a half-space a square
+    /World/world_0000/marks         Points, guides: supports, joints, loads, probes; customData["warpfea:kinds"]
+    /World/Camera /World/Sky /World/Sun
 
 Points are float32 relative to the body's centre, accurate far from the origin. The time code of a sample is its time
 times `fps`, fractional if no step ended at the frame's time. In statics the time is the load factor, 0 to 1.
@@ -18,8 +20,8 @@ times `fps`, fractional if no step ended at the frame's time. In statics the tim
 import os
 import pathlib
 import shutil
-from collections.abc import Sequence
-from dataclasses import KW_ONLY, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -27,6 +29,7 @@ import numpy.typing as npt
 
 from ..base.errors import ModelError, OutputError
 from ..base.lazy import pxr
+from ..base.provenance import versions
 from ..base.writer import Output, check_target, temporary_path
 from .colormap import map_colors
 from .frames import DrawnSurface, FrameClock, check_colors, check_fields, field_label, frame_time, is_static
@@ -34,6 +37,8 @@ from .normals import vertex_normals
 from .obstacles import unique_names
 from .usd_check import error_text, validate_usd
 from .usd_extend import read_existing
+from .usd_marks import MarkPrims
+from .usd_material import bind_material
 from .usd_obstacles import EDGES, ObstaclePrims, define_mesh
 
 __all__ = ["SCHEMA", "USDWriter", "validate_usd"]
@@ -55,6 +60,9 @@ class USDWriter(Output):
         color: the field shown as display colour (also a primvar), or None for grey.
         color_range: (low, high) of the colours; without it the extremes over the whole run and all worlds.
         spacing: distance of worlds (m); see :class:`warpfea.outputs.frames.DrawnSurface`.
+        material: True to bind a UsdPreviewSurface that reads the display colour, for renderers that show materials
+            alone.
+        layer_data: texts kept as the layer's customLayerData beside versions and units, such as command and seed.
         extend: extend the file of the resumed run, if it exists: same bodies and settings, ending at the current
             time.
 
@@ -74,6 +82,8 @@ class USDWriter(Output):
     color: str | None = "von_mises"
     color_range: tuple[float, float] | None = None
     spacing: float | tuple[float, float] | None = None
+    material: bool = False
+    layer_data: Mapping[str, Any] = field(default_factory=dict)
     extend: bool = False
 
     def __post_init__(self) -> None:
@@ -119,6 +129,7 @@ class USDWriter(Output):
         stage.SetTimeCodesPerSecond(self.fps)
         stage.SetFramesPerSecond(self.fps)
         stage.SetDefaultPrim(pxr.UsdGeom.Xform.Define(stage, "/World").GetPrim())
+        self._marks = MarkPrims(sim, stage, self._surface)
         self._define()
 
     def _names(self) -> list[str]:
@@ -146,6 +157,8 @@ class USDWriter(Output):
         self._obstacles = ObstaclePrims(stage, self._surface, self._names())
         if not self._obstacles.resume():
             raise OutputError(f"{target}: can't go on with this file: it has other colliders; give another file name")
+        self._marks = MarkPrims(sim, stage, self._surface)
+        self._marks.resume()
         for name in ("Camera", "Sky", "Sun"):  # authored for all frames at the end
             stage.RemovePrim(f"/World/{name}")
 
@@ -167,6 +180,9 @@ class USDWriter(Output):
                 meshes.append(_MeshPrim(mesh, xform.AddTranslateOp(pxr.UsdGeom.XformOp.PrecisionDouble), self.fields))
         self._obstacles = ObstaclePrims(self._stage, self._surface, names)
         self._obstacles.define()
+        self._marks.define()
+        if self.material:
+            bind_material(self._stage, [prim.mesh for meshes in self._meshes for prim in meshes])
 
     def write(self, sim: Any) -> None:
         time = frame_time(sim)
@@ -189,6 +205,7 @@ class USDWriter(Output):
                     self._bounding_box = np.minimum(box[0], low + offset), np.maximum(box[1], high + offset)
                 self._unsaved_bytes += points.shape[0] * points.shape[1] * (24 + 4 * len(fields))
             self._obstacles.write(code)
+            self._marks.write(sim, code, [points for points, _ in samples])
             self._time_codes.append(code)
             if self._unsaved_bytes > _SAVE_BYTES and self._target.suffix.lower() != ".usda":
                 self._save()
@@ -264,13 +281,16 @@ class USDWriter(Output):
             for name in self.fields
         }
         stage.GetDefaultPrim().SetCustomDataByKey("warpfea", data)
+        texts = {name: str(value) for name, value in self.layer_data.items()}
+        told = {"versions": versions(), "units": "SI: m, kg, s, N, Pa, J"} | texts
+        stage.GetRootLayer().customLayerData = stage.GetRootLayer().customLayerData | {"warpfea": told}
 
 
 class _MeshPrim:
     """The varying attributes of one body in one world."""
 
     def __init__(self, mesh: Any, translate: Any, fields: Sequence[str]) -> None:
-        self.translate, self.points = translate, mesh.CreatePointsAttr()
+        self.mesh, self.translate, self.points = mesh, translate, mesh.CreatePointsAttr()
         self.normals, self.extent = mesh.CreateNormalsAttr(), mesh.CreateExtentAttr()
         self.color = mesh.CreateDisplayColorPrimvar(pxr.UsdGeom.Tokens.vertex)
         api = pxr.UsdGeom.PrimvarsAPI(mesh)

@@ -1,4 +1,5 @@
-"""The page of a USD file written by `USDWriter`: its bodies, colliders and fields; it holds no records."""
+"""The page of a USD file written by `USDWriter`: its bodies, colliders and fields; it holds no records, and of
+marks their places."""
 
 from typing import Any
 
@@ -8,6 +9,7 @@ import numpy.typing as npt
 from ..base.lazy import pxr
 from .html import MAX_WORLDS
 from .page import Page, PageSurface
+from .usd_marks import read_kinds
 from .usd_obstacles import EDGES
 
 __all__ = ["usd_page"]
@@ -47,6 +49,14 @@ def usd_page(
             groups.setdefault(key, []).append(mesh)
     for meshes in groups.values():
         page.surfaces.append(_surface(meshes, offsets, page.origin, codes, list(fields)))
+    marks = source.marks[: len(prims)]
+    if marks:
+        kinds = read_kinds(marks[:1])
+        page.markers = [
+            {"kind": k, "name": "", "surface": len(page.surfaces), "points": [i]} for i, k in enumerate(kinds)
+        ]
+        first_points, all_points = _moving(marks, offsets, page.origin, codes)
+        page.surfaces.append(PageSurface("marks", "points", first_points, points=all_points))
     page.facts = [("frames", str(len(codes))), ("file", source.path.name)]
     return page
 
@@ -55,16 +65,11 @@ def _surface(meshes: list[Any], offsets: Array, origin: Array, codes: list[float
     """One body or collider in all worlds."""
     prim = meshes[0].GetPrim()
     kind = {None: "body", "HalfSpace": "plane"}.get(prim.GetCustomDataByKey("warpfea:collider"), "collider")
-    frames = []
-    for code in codes:
-        cache = pxr.UsdGeom.XformCache(code)
-        frames.append(np.stack([_points(m, cache, code) - offset - origin for m, offset in zip(meshes, offsets)]))
-    if all((points == frames[0]).all() for points in frames):
-        frames = frames[:1]
+    start, frames = _moving(meshes, offsets, origin, codes)
     triangles = np.asarray(meshes[0].GetFaceVertexIndicesAttr().Get(), dtype=np.int32).reshape(-1, 3)
     edges = np.asarray(prim.GetAttribute(EDGES).Get() if prim.HasAttribute(EDGES) else [])
     name = prim.GetParent().GetDisplayName() or prim.GetParent().GetName()
-    surface = PageSurface(name, kind, frames[0], triangles, edges if len(edges) else None, points=frames)
+    surface = PageSurface(name, kind, start, triangles, edges if len(edges) else None, points=frames)
     for field in fields if kind == "body" else ():
         key = pxr.Tf.MakeValidIdentifier(field)
         primvars = [pxr.UsdGeom.PrimvarsAPI(mesh).GetPrimvar(key) for mesh in meshes]
@@ -72,6 +77,16 @@ def _surface(meshes: list[Any], offsets: Array, origin: Array, codes: list[float
             np.stack([np.asarray(p.Get(code), dtype=np.float32) for p in primvars]) for code in codes
         ]
     return surface
+
+
+def _moving(prims: list[Any], offsets: Array, origin: Array, codes: list[float]) -> tuple[Array, list[Array]]:
+    """Points (W, P, 3) of the first frame, and of all; one frame if they do not move."""
+    frames = []
+    for code in codes:
+        cache = pxr.UsdGeom.XformCache(code)
+        frames.append(np.stack([_points(m, cache, code) - offset - origin for m, offset in zip(prims, offsets)]))
+    still = all((points == frames[0]).all() for points in frames)
+    return frames[0], frames[:1] if still else frames
 
 
 def _points(mesh: Any, cache: Any, code: float) -> Array:
