@@ -226,7 +226,7 @@ def test_version(capfd):
 
 def test_the_module_runs_as_a_program():
     done = subprocess.run(
-        [sys.executable, "-m", "warpfea", "run", "crane"], cwd=HERE.parent, capture_output=True, text=True
+        [sys.executable, "-m", "warpfea", "run", "derrick"], cwd=HERE.parent, capture_output=True, text=True
     )
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.startswith("warpfea: error: there is no scene 'crane'")
+    assert done.stderr.startswith("warpfea: error: there is no scene 'derrick'")

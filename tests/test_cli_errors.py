@@ -56,7 +56,7 @@ BAD = {
     "view without picture": ([*SHORT, "--usd", "o.usdc", "--view", "1,2"], ["--view is for pictures"]),
     "range that falls": ([*SHORT, "--png", "o.png", "--range", "2,1"], ["--range", "'2,1'"]),
     "abbreviated option": (["run", "hook", "--devic", "cpu"], ["--devic"]),
-    "unknown scene": (["run", "crane", *OUT], ["'crane'", "cantilever", "hook", "twist"]),
+    "unknown scene": (["run", "derrick", *OUT], ["'derrick'", "cantilever", "hook", "twist"]),
     "missing file": (["run", "none.py", *OUT], ["none.py", "no such file"]),
     "no scene in file": (["run", "empty.py", *OUT], ["empty.py", "no scene"]),
     "several scenes": (["run", "mine.py", *OUT], ["mine.py", "good", "bursts"]),

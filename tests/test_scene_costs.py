@@ -120,7 +120,7 @@ def test_the_command_compares_with_an_earlier_file(tmp_path, capfd):
     ("words", "named"),
     [
         (["--set", "beside=nowhere.json"], "nowhere.json"),
-        (["--rows", "crane"], "crane"),
+        (["--rows", "derrick"], "derrick"),
         (["--set", "steps=3"], "steps"),
     ],
 )

@@ -15,9 +15,9 @@ from warpfea.builder.scene import Scene, find, load_file, names
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 BUILTIN = [
-    "arch", "ball_on_plate", "beam_over_cylinders", "belt", "block_stack", "bouncing_ball", "brick_floor",
-    "cantilever", "chain", "comb", "crossed_beams", "double_pendulum", "finger_beam_shell", "four_bar", "gears",
-    "gripper", "hook", "hung_plate", "links", "mixed", "overhang", "peg_in_hole", "pendulum", "pile",
+    "arch", "arm", "ball_on_plate", "beam_over_cylinders", "belt", "block_stack", "bouncing_ball", "brick_floor",
+    "cantilever", "chain", "comb", "crane", "crossed_beams", "double_pendulum", "finger_beam_shell", "four_bar",
+    "gears", "gripper", "hook", "hung_plate", "links", "mixed", "overhang", "peg_in_hole", "pendulum", "pile",
     "plate_pendulum", "rollup", "slider_crank", "spin", "tilting_table", "top", "twist",
 ]  # fmt: skip
 
@@ -202,8 +202,8 @@ def test_the_registry_lists_without_importing():
 
 def test_names_and_find():
     assert names() == BUILTIN
-    with pytest.raises(wf.ModelError, match="no scene 'crane'; there are arch, ball_on_plate, beam_over_cylinders"):
-        find("crane")
+    with pytest.raises(wf.ModelError, match="no scene 'derrick'; there are arch, arm, ball_on_plate"):
+        find("derrick")
 
 
 @pytest.mark.parametrize("name", BUILTIN)

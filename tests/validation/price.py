@@ -107,6 +107,9 @@ def _add_bodies(b: wf.ModelBuilder, place: np.ndarray, edge: float, *, pair: boo
     held = b.add_solid(brick, material=_damped(law, "explicit"), element="H3843", name="price held")
     b.drive(held.nodes("x-"), displacement=([0.0, 1e3], [(0, 0, 0), (0, 0, 0)]))
     b.add_joint("spherical", parent=wf.GROUND, child=held.surface("x+"), name="price joint")
+    turned = b.add_solid(free, material=law, name="price turned")
+    b.add_actuator(hinge := b.add_joint("revolute", parent=wf.GROUND, child=turned.surface("z-"), axis=(0, 0, 1)), 0.0)
+    b.add_velocity_constraint("speed", hinge, name="price speed")
 
 
 class _Runner:

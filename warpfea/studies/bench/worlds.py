@@ -4,7 +4,7 @@ Scenes: `pendulum` with 16 elements, h = 2 ms; `slider` (slider_crank), 1 ms; `d
 `rigid`, the same of rigid links; `finger`, a box 0.12 x 0.02 x 0.02 m with 20 x 2 x 2 cells of T10, neo-Hookean, E = 1
 MPa, nu = 0.45, 1100 kg/m^3, eta = 300 Pa s, clamped, with a traction that rises to 2 kPa in 0.1 s, 2 ms; `tets`, the
 same box with 12 x 2 x 2 cells of five T4 under gravity alone, 2 ms; `gripper`, that scene with 64 nodes (T4), mu = 0.6,
-1/240 s: four steps are one of an environment at 60 Hz.
+1/240 s: four steps are one of an environment at 60 Hz; `arm`, 20 ms: one of an environment at 50 Hz.
 
 Three steps are not timed, then ten are; after 100 steps ten again. Steps read nothing back (record=False,
 on_failure="freeze", no ledger). The tip of world 0 is compared with that of one world in float64 with a tolerance of
@@ -46,10 +46,10 @@ WORLD_COUNTS = (1, 64, 1024, 4096, 16384)
 WARM, TIMED, LATER = 3, 10, 100
 RATE_GOALS = {
     "pendulum": 850_000, "slider": 200_000, "double": 100_000, "rigid": 341_000, "finger": 25_000,
-    "tets": 1_638_400, "gripper": 74_400,
+    "tets": 1_638_400, "gripper": 74_400, "arm": 20_000,
 }  # fmt: skip
 """World-steps/s at 4096 worlds; of `tets` 2.5 ms per step, of `gripper` 18 600 steps of environments per second."""
-WHOLE_MOTION_STEPS = {"gripper": 240}
+WHOLE_MOTION_STEPS = {"gripper": 240, "arm": 80}
 """Steps of scenes whose beginning stands for little: the block falls, is gripped and lifted in 1 s."""
 METHOD_TOLS = {"auto": None, "banded": None, "loose": 1e-4, "rough": 1e-2}
 """Methods, and their tolerances; None: the default of the precision."""
@@ -95,6 +95,7 @@ SCENES: dict[str, tuple[Callable[[], ModelBuilder], float]] = {
     "rigid": (lambda: find("double_pendulum")(rigid=True), 4e-3),
     "finger": (lambda: _finger_model(mesh.box((0.12, 0.02, 0.02), cells=(20, 2, 2)), True), 2e-3),
     "gripper": (lambda: find("gripper")(element="T4"), 1.0 / 240.0),
+    "arm": (lambda: find("arm")(), 2e-2),
     "tets": (lambda: _finger_model(five_tet_box((0.12, 0.02, 0.02), (12, 2, 2)), False), 2e-3),
 }
 
