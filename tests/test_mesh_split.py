@@ -1,17 +1,22 @@
 """Meshes in: prisms and pyramids as tetrahedra, corners of cells of higher order, closed surfaces."""
 
 import itertools
+import json
+import pathlib
 import sys
+from types import SimpleNamespace
 
 import meshio
 import numpy as np
 import pytest
+from cli_runs import run
 from mesh_writers import Parts, write
 
 import warpfea as wf
 from warpfea.base.errors import MeshError
 from warpfea.mesh import from_meshio, from_surface, read
 
+HERE = pathlib.Path(__file__).resolve().parent
 BRICK = wf.mesh.box((3, 2, 1), cells=(3, 2, 1), element="H3843")
 
 
@@ -150,3 +155,26 @@ def test_surface_by_the_mesher():
     mesh = from_surface(ball(), size=0.02)
     assert mesh.cell_type == "tetra10"
     assert mesh.volume() == pytest.approx(4 / 3 * np.pi * 0.05**3, rel=0.08)
+
+
+def test_a_surface_runs_from_the_command_line(tmp_path, capfd, monkeypatch):
+    mesh = wf.mesh.box((0.1, 0.02, 0.02), cells=(2, 1, 1), element="T4")
+    triangles = mesh.faces(mesh.boundary())
+    path = tmp_path / "bar.stl"
+    meshio.Mesh(1e3 * mesh.points, [("triangle", triangles)]).write(path)
+    monkeypatch.setitem(
+        sys.modules, "pytetwild", SimpleNamespace(tetrahedralize=lambda *_, **__: (mesh.points, mesh.cells))
+    )
+    words = ["run", str(path), "--material", "svk:E=1e7,nu=0", "--gravity", "0,0,0", "--device", "cpu"]
+    code, _, err = run(capfd, *words)
+    assert code == 2
+    assert "or by --size 2e-3" in err
+    words += ["--scale", "1e-3", "--size", "0.01", "--static", "--load-steps", "1", "--json", "-"]
+    code, out, _ = run(capfd, *words, "--clamp", "x-", "--traction", "x+:1e3,0,0")
+    assert code == 0
+    summary = json.loads(out)
+    assert summary["parameters"]["size"] == 0.01
+    assert summary["probes"]["x+"]["displacement"][0] == pytest.approx(1e-5, rel=1e-3)
+    code, _, err = run(capfd, "run", str(HERE / "data" / "S2_cube.msh"), "--size", "1", "--material", "svk:E=1e7,nu=0")
+    assert code == 2
+    assert "is a mesh already; --size is for surfaces" in err

@@ -168,8 +168,9 @@ def test_section_forces_balance_the_loads_of_a_bent_beam():
     section = wf.Rectangle(0.05, 0.05)
     beam = b.add_beam([(0, 0, 0), (1, 0, 0)], elements=6, section=section, normal=(0, 0, 1), material=law, name="beam")
     b.clamp(beam.start, slots="all")
-    force, moment = np.array([2.0, 3.0, -10.0]), np.array([0.5, -0.8, 0.3])
-    b.add_point_load(beam.at((1, 0, 0)), force)
+    loads = {6: np.array([2.0, 3.0, -10.0]), 3: np.array([0.0, 5.0, 4.0])}  # by node
+    for node, force in loads.items():
+        b.add_point_load(beam.at((node / 6, 0, 0)), force)
     model = b.finalize(device="cpu")
     r = wf.solve_static(model, load_steps=2, tol=1e-12, unstable="ignore")
     x = r.positions(beam)[0]
@@ -177,20 +178,39 @@ def test_section_forces_balance_the_loads_of_a_bent_beam():
     found = r.field("section_force", beam)[0].reshape(-1, 2, 3)
     axes = np.swapaxes(r.node_gradients(beam)[0] @ beam.node_axes, 1, 2)
     t = axes[:, 0] / np.linalg.norm(axes[:, 0], axis=1)[:, None]
-    for node in range(len(x)):
-        arm = x[-1] - x[node]
-        N, T = force @ t[node], np.cross(arm, force) @ t[node]
-        assert found[node, 0, 0] == pytest.approx(N, abs=1e-8 * np.linalg.norm(force))
-        assert found[node, 1, 0] == pytest.approx(T, abs=1e-8 * np.linalg.norm(force))
+    for node in range(7):  # the part after the node; at the end its load
+        beyond = [k for k in loads if k > node or k == node == 6]
+        force = sum(loads[k] for k in beyond)
+        moment = sum(np.cross(x[k] - x[node], loads[k]) for k in beyond)
+        assert found[node, 0, 0] == pytest.approx(force @ t[node], abs=1e-7)
+        assert found[node, 1, 0] == pytest.approx(moment @ t[node], abs=1e-8)
         assert np.linalg.norm(found[node, 0]) == pytest.approx(np.linalg.norm(force), rel=1e-8)
-        assert np.linalg.norm(found[node, 1]) == pytest.approx(np.linalg.norm(np.cross(arm, force)), abs=1e-8)
-    assert np.abs(r.reaction(beam.start)[0] + force).max() < 1e-8
-    assert np.abs(r.reaction_moment(beam.start)[0] + np.cross(x[-1], force)).max() < 1e-8
-    about = r.reaction_moment(beam.start, about=(1, 0, 0))[0]
-    assert np.abs(about + np.cross(x[-1] - (1, 0, 0), force)).max() < 1e-8
+        assert np.linalg.norm(found[node, 1]) == pytest.approx(np.linalg.norm(moment), abs=1e-8)
+    total = sum(loads.values())
+    assert np.abs(r.reaction(beam.start)[0] + total).max() < 1e-8
+    for about in (np.zeros(3), np.array([1.0, 0.0, 0.0])):
+        moment = sum(np.cross(x[k] - about, force) for k, force in loads.items())
+        assert np.abs(r.reaction_moment(beam.start, about=about)[0] + moment).max() < 1e-8
     with pytest.raises(wf.ModelError, match="'shell_force' is one of shells"):
         r.field("shell_force", beam)
-    assert moment is not None
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_fields_on_the_device_are_those_of_the_host(dtype):
+    found = []
+    for device in ("cpu", "cuda:0"):
+        b = wf.ModelBuilder()
+        body = b.add_solid(wf.mesh.box((1, 0.2, 0.2), cells=(3, 1, 1)), material=LAWS["SVK"], name="box")
+        model = b.finalize(device=device, dtype=dtype, worlds=2)
+        state = model.state()
+        u = np.random.default_rng(0).standard_normal((model.slots, 3)) * 1e-3
+        state.displacement.assign(np.tile(u, (2, 1, 1)).astype(dtype))
+        results = Results(model, state)
+        found.append([results.field(name, body) for name in ("cauchy", "first_piola", "J", "strain_energy_density")])
+        found[-1].append(results.skin_field("von_mises", body))
+    for cpu, cuda in zip(*found):
+        assert np.abs(cpu - cuda).max() < (1e-10 if dtype == "float64" else 1e-3) * np.abs(cpu).max()
 
 
 def test_tensors_in_vtu(tmp_path):

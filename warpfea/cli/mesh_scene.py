@@ -19,9 +19,11 @@ from ..builder.scene import Scene, scene
 from .arguments import existing_file, number_tuple
 from .parser import MATERIAL_HINT
 
-__all__ = ["MESH_OPTIONS", "mesh_facts", "mesh_scene", "parse_material"]
+__all__ = ["MESH_OPTIONS", "SURFACE_FORMATS", "mesh_facts", "mesh_scene", "parse_material", "read_mesh"]
 
-MESH_OPTIONS = ("material", "clamp", "traction", "pressure", "gravity", "scale", "up_axis", "quadrature")
+MESH_OPTIONS = ("material", "clamp", "traction", "pressure", "gravity", "scale", "size", "up_axis", "quadrature")
+SURFACE_FORMATS = (".stl", ".obj", ".ply")
+"""Files of surfaces whose inside is meshed."""
 LAW_CLASSES: dict[str, type[materials.Material]] = {
     "svk": materials.SVK,
     "mooney_rivlin": materials.MooneyRivlin,
@@ -42,7 +44,7 @@ def mesh_scene(options: argparse.Namespace) -> tuple[Scene[Any], dict[str, Any]]
     gravity = options.gravity or ((0.0, 0.0, -9.81) if up == "Z" else (0.0, -9.81, 0.0))
 
     def build() -> ModelBuilder:
-        mesh = meshes.read(path, scale=options.scale or 1.0)
+        mesh = read_mesh(path, options)
         b = ModelBuilder(gravity=gravity, up_axis=up)
         body = b.add_solid(mesh, material=_materials(path, mesh, laws), quadrature=options.quadrature)
         for group in options.clamp:
@@ -61,9 +63,22 @@ def mesh_scene(options: argparse.Namespace) -> tuple[Scene[Any], dict[str, Any]]
 
     build.__name__ = path.stem
     build.__doc__ = f"The mesh {path.name}."
-    parameters = {name: getattr(options, name) for name in MESH_OPTIONS if name not in ("gravity", "up_axis", "scale")}
+    parameters = {
+        name: getattr(options, name) for name in MESH_OPTIONS if name not in ("gravity", "up_axis", "scale", "size")
+    }
     parameters |= {"gravity": list(gravity), "up_axis": up, "scale": options.scale or 1.0}
+    parameters |= {"size": options.size} if options.size else {}
     return scene(dt=1e-3, t_end=0.5, speed=0.2)(build), parameters
+
+
+def read_mesh(path: pathlib.Path, options: argparse.Namespace) -> meshes.Mesh:
+    """The mesh of a file, or of the inside of a surface. MeshError."""
+    scale = options.scale or 1.0
+    if path.suffix.lower() in SURFACE_FORMATS:
+        return meshes.from_surface(path, size=options.size, scale=scale)
+    if options.size:
+        raise UsageError(f"--size {options.size:g}: {path} is a mesh already; --size is for surfaces")
+    return meshes.read(path, scale=scale)
 
 
 def mesh_facts(mesh: meshes.Mesh) -> dict[str, Any]:

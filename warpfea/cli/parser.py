@@ -130,6 +130,12 @@ def _add_model_options(to: argparse.ArgumentParser) -> None:
         ("--pressure", Kind.APPEND, "GROUP:p", "follower pressure on a surface, Pa"),
         ("--gravity", vector, "x,y,z", "m/s^2, by default 9.81 downwards"),
         ("--scale", positive_number, "S", "metres per unit of the file, 1e-3 for mm"),
+        (
+            "--size",
+            positive_number,
+            "M",
+            "mesh the inside of a surface (.stl, .obj, .ply) with edges of this length, m",
+        ),
         ("--up-axis", ("Y", "Z"), None, "by default Z"),
         ("--quadrature", None, "RULE", "force rule: tet4, tet5_paper, tet8, tet14 (T10), tet1, tet4 (T4)"),
     )

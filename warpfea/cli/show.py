@@ -5,13 +5,12 @@ import pathlib
 import sys
 from typing import Any
 
-from .. import mesh as meshes
 from ..base.console import format_bytes, format_number, format_table, quiet_warp, to_json, write_json
 from ..base.errors import UsageError
 from ..builder.scene import Scene, find, names
 from . import DONE
 from .arguments import existing_file
-from .mesh_scene import mesh_facts
+from .mesh_scene import mesh_facts, read_mesh
 from .parser import MATERIAL_HINT
 from .run import check_targets
 from .source import find_scene, is_mesh, load_scenes, resolve, show_progress
@@ -57,7 +56,7 @@ def _scene_text(found: Scene[Any]) -> str:
 def info(options: argparse.Namespace) -> int:
     """Run `warpfea info SCENE`."""
     check_targets(options)
-    if is_mesh(options.what) and not options.material:
+    if is_mesh(options) and not options.material:
         return _mesh_info(options)
     source = resolve(options)
     with quiet_warp():
@@ -66,7 +65,7 @@ def info(options: argparse.Namespace) -> int:
         launcher = sim.stepper.launch
         content = {"scene": source.label, "parameters": source.parameters} | sim.info()
         content |= {"bounding_box": model_box(model)}
-        if is_mesh(options.what):
+        if is_mesh(options):
             content["mesh"] = mesh_facts(model.bodies[0].mesh)
         content["bytes"] = sim.bytes()
         content["bytes_per_unknown"] = sum(sim.bytes().values()) / max(content["unknowns"], 1)
@@ -82,7 +81,7 @@ def info(options: argparse.Namespace) -> int:
 
 def _mesh_info(options: argparse.Namespace) -> int:
     """Contents of a mesh file, without a material."""
-    facts = mesh_facts(meshes.read(existing_file(options.what), scale=options.scale or 1.0))
+    facts = mesh_facts(read_mesh(existing_file(options.what), options))
     if options.json:
         write_json(options.json, to_json({"scene": options.what, "mesh": facts}))
     if options.json != "-":

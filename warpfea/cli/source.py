@@ -14,7 +14,7 @@ from ..simulation.simulation import Simulation
 from ..simulation.statics import begin_static
 from ..solvers import SOLVERS
 from .arguments import existing_file
-from .mesh_scene import MESH_OPTIONS, mesh_scene
+from .mesh_scene import MESH_OPTIONS, SURFACE_FORMATS, mesh_scene
 
 __all__ = ["Source", "find_scene", "is_mesh", "load_scenes", "resolve", "show_progress"]
 
@@ -59,9 +59,10 @@ def show_progress(options: argparse.Namespace) -> bool | None:
     return False if options.quiet or options.no_progress else None
 
 
-def is_mesh(what: str) -> bool:
-    """True if SCENE is a mesh file."""
-    return pathlib.Path(what).suffix.lower() in FORMATS
+def is_mesh(options: argparse.Namespace) -> bool:
+    """True if SCENE is a mesh file, or a surface to mesh."""
+    suffix = pathlib.Path(options.what).suffix.lower()
+    return suffix in FORMATS or bool(options.size and suffix in SURFACE_FORMATS)
 
 
 def load_scenes(file: str) -> dict[str, Scene[Any]]:
@@ -89,13 +90,15 @@ def _check_suffix(what: str) -> None:
     text = f"{what}: unsupported file type {suffix}: neither a scene (.py) nor a mesh ({formats})"
     if suffix.lower() in SURFACE_SUFFIXES:
         text += f"; {suffix} describes a surface or a shape, not elements: fill it with tetrahedra, in Gmsh for example"
+        if suffix.lower() in SURFACE_FORMATS:
+            text += ", or by --size 2e-3 (edges of 2 mm)"
     raise UsageError(text)
 
 
 def resolve(options: argparse.Namespace, checkpoint: dict[str, Any] | None = None) -> Source:
     """Scene and options of `run` and `info`; dt, integrator and precision of a checkpoint override the scene's."""
     saved = checkpoint or {}
-    if is_mesh(options.what):
+    if is_mesh(options):
         found, parameters = mesh_scene(options)
         values: dict[str, Any] = {}
     else:

@@ -23,7 +23,7 @@ MAX_VOLUME_CHANGE = 0.02
 def from_surface(
     surface: Any, *, size: float, element: str = "T10", scale: float = 1.0, tolerance: float = 1e-3, name: str = ""
 ) -> Mesh:
-    """Mesh of the inside of a closed surface.
+    """Mesh of the inside of a closed surface. Flat sides on its bounding box are the sets "x-", "x+", ... "z+".
 
     Parameters
     ----------
@@ -69,7 +69,23 @@ def from_surface(
             f"{label}: the mesh has {found:.4g} m^3, the surface encloses {wanted:.4g}: it has holes, crosses itself, "
             f"or is thinner than tolerance = {tolerance:g} of its size"
         )
+    mesh = _with_flat_sides(mesh, tolerance * float(np.linalg.norm(np.ptp(points, axis=0))))
     return check(with_mid_nodes(mesh) if element == "T10" else mesh)
+
+
+def _with_flat_sides(mesh: Mesh, distance: float) -> Mesh:
+    """Surface and node sets "x-", ... "z+" of the faces on the sides of the bounding box, of those that have any."""
+    low, high = mesh.bounding_box()
+    faces = mesh.boundary()
+    nodes = mesh.faces(faces)
+    surfaces = {}
+    for axis, name in enumerate("xyz"):
+        for end, sign in ((low, "-"), (high, "+")):
+            own = (np.abs(mesh.points[nodes, axis] - end[axis]) <= 2.0 * distance).all(axis=1)
+            if own.any():
+                surfaces[name + sign] = faces[own]
+    sets = {name: np.unique(mesh.faces(rows)) for name, rows in surfaces.items()}
+    return replace(mesh, surface_sets=surfaces, node_sets=sets)
 
 
 def _stem(surface: Any) -> str:
