@@ -118,6 +118,10 @@ class DrawnSurface:
             raise OutputError("nothing to draw: no body has a surface")
         start = [self.skin_points(sim, body) for body in self.bodies]
         self.point_counts = [points.shape[1] for points in start]
+        self.rest = [
+            reference_points(body, body.skin.slot_weights) if hasattr(body.skin, "slot_weights") else points[0]
+            for body, points in zip(self.bodies, start)
+        ]
         low = np.min([points.min(axis=(0, 1)) for points in start], axis=0)
         high = np.max([points.max(axis=(0, 1)) for points in start], axis=0)
         self.obstacles = Obstacles(sim, low, high)
@@ -196,10 +200,8 @@ class DrawnSurface:
     def rest_points(self, start: Array) -> Array:
         """(P, 3) points at rest, m, of all worlds in the order of `points`; where none are known those at the start."""
         out = start.copy()
-        for body, (_, first, total) in zip(self.bodies, self.parts()):
-            if hasattr(body.skin, "slot_weights"):
-                rest = reference_points(body, body.skin.slot_weights)
-                out[first : first + total] = (rest + self.offsets[:, None, :]).reshape(-1, 3)
+        for rest, (_, first, total) in zip(self.rest, self.parts()):
+            out[first : first + total] = (rest + self.offsets[:, None, :]).reshape(-1, 3)
         return out
 
     def plane_squares(self) -> list[int]:

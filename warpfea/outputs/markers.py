@@ -14,7 +14,7 @@ KINDS = ("support", "joint", "load", "probe")
 """Kinds of marks."""
 MARKED_WORLDS = 16
 """Pictures and files of more worlds have no marks."""
-SHOWN_POINTS = 24
+SHOWN_POINTS = 12
 """Number of points drawn of a support or a pressure."""
 SHOWN_JOINTS = 100
 """Number of joints drawn of a model."""

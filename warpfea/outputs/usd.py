@@ -33,12 +33,13 @@ from ..base.provenance import versions
 from ..base.writer import Output, check_target, temporary_path
 from .colormap import map_colors
 from .frames import DrawnSurface, FrameClock, check_colors, check_fields, field_label, frame_time, is_static
-from .normals import vertex_normals
+from .normals import smooth_corners
 from .obstacles import unique_names
 from .usd_check import error_text, validate_usd
 from .usd_extend import read_existing
 from .usd_marks import MarkPrims
 from .usd_material import bind_material
+from .usd_normals import MeshNormals
 from .usd_obstacles import EDGES, ObstaclePrims, define_mesh
 
 __all__ = ["SCHEMA", "USDWriter", "validate_usd"]
@@ -60,8 +61,7 @@ class USDWriter(Output):
         color: the field shown as display colour (also a primvar), or None for grey.
         color_range: (low, high) of the colours; without it the extremes over the whole run and all worlds.
         spacing: distance of worlds (m); see :class:`warpfea.outputs.frames.DrawnSurface`.
-        material: True to bind a UsdPreviewSurface that reads the display colour, for renderers that show materials
-            alone.
+        material: bind a UsdPreviewSurface that reads the display colour: Blender shows white without it.
         layer_data: texts kept as the layer's customLayerData beside versions and units, such as command and seed.
         extend: extend the file of the resumed run, if it exists: same bodies and settings, ending at the current
             time.
@@ -82,7 +82,7 @@ class USDWriter(Output):
     color: str | None = "von_mises"
     color_range: tuple[float, float] | None = None
     spacing: float | tuple[float, float] | None = None
-    material: bool = False
+    material: bool = True
     layer_data: Mapping[str, Any] = field(default_factory=dict)
     extend: bool = False
 
@@ -108,6 +108,7 @@ class USDWriter(Output):
         self._field_ranges = {name: (np.inf, -np.inf) for name in self.fields}
         self._bounding_box = (np.full(3, np.inf), np.full(3, -np.inf))
         self._unsaved_bytes = 0
+        self._groups: dict[int, tuple[npt.NDArray[Any], int]] = {}
         self._temporary = temporary_path(target)
         extending = self.extend and target.is_file()
         try:
@@ -136,6 +137,13 @@ class USDWriter(Output):
         """Names of the bodies' prims."""
         return unique_names((), [pxr.Tf.MakeValidIdentifier(body.name) for body in self._surface.bodies])
 
+    def _normals(self, k: int, mesh: Any) -> MeshNormals:
+        """Normals of a mesh of the k-th body; sharp edges are those at rest."""
+        triangles, rest = self._surface.bodies[k].skin.triangles, self._surface.rest[k]
+        if k not in self._groups:
+            self._groups[k] = smooth_corners(rest, triangles)
+        return MeshNormals(mesh, triangles, len(rest), self._groups[k])
+
     def _resume(self, sim: Any, target: pathlib.Path) -> None:
         """Open a copy of the existing file for extension."""
         assert self._temporary is not None
@@ -150,10 +158,11 @@ class USDWriter(Output):
         self._field_ranges = {name: existing.ranges[name] for name in self.fields}
         self._clock.due(existing.time)
         self._meshes: list[list[_MeshPrim]] = []
-        for of_body in paths:
+        for k, of_body in enumerate(paths):
             meshes = [pxr.UsdGeom.Mesh(stage.GetPrimAtPath(path)) for path in of_body]
             moves = [pxr.UsdGeom.Xformable(m.GetPrim().GetParent()).GetOrderedXformOps()[0] for m in meshes]
-            self._meshes.append([_MeshPrim(mesh, move, self.fields) for mesh, move in zip(meshes, moves)])
+            pairs = zip(meshes, moves)
+            self._meshes.append([_MeshPrim(mesh, move, self.fields, self._normals(k, mesh)) for mesh, move in pairs])
         self._obstacles = ObstaclePrims(stage, self._surface, self._names())
         if not self._obstacles.resume():
             raise OutputError(f"{target}: can't go on with this file: it has other colliders; give another file name")
@@ -170,14 +179,15 @@ class USDWriter(Output):
             place = pxr.UsdGeom.Xform.Define(self._stage, f"/World/world_{world:04d}")
             origin = pxr.Gf.Vec3d(*map(float, self._surface.offsets[world]))
             place.AddTranslateOp(pxr.UsdGeom.XformOp.PrecisionDouble).Set(origin)
-            for body, name, meshes in zip(self._surface.bodies, names, self._meshes, strict=True):
+            for k, (body, name, meshes) in enumerate(zip(self._surface.bodies, names, self._meshes, strict=True)):
                 xform = pxr.UsdGeom.Xform.Define(self._stage, place.GetPath().AppendChild(name))
                 xform.GetPrim().SetDisplayName(body.name)
                 mesh = define_mesh(self._stage, xform.GetPath().AppendChild("skin"), body.skin.triangles)
                 edges = np.asarray(getattr(body.skin, "edges", np.zeros((0, 2))), dtype=np.int32)
                 attribute = mesh.GetPrim().CreateAttribute(EDGES, pxr.Sdf.ValueTypeNames.Int2Array, True)
                 attribute.Set(pxr.Vt.Vec2iArray.FromNumpy(np.ascontiguousarray(edges)))
-                meshes.append(_MeshPrim(mesh, xform.AddTranslateOp(pxr.UsdGeom.XformOp.PrecisionDouble), self.fields))
+                translate = xform.AddTranslateOp(pxr.UsdGeom.XformOp.PrecisionDouble)
+                meshes.append(_MeshPrim(mesh, translate, self.fields, self._normals(k, mesh)))
         self._obstacles = ObstaclePrims(self._stage, self._surface, names)
         self._obstacles.define()
         self._marks.define()
@@ -196,10 +206,10 @@ class USDWriter(Output):
                 (self._surface.skin_points(sim, body), {n: self._field_values(sim, n, body) for n in self.fields})
                 for body in self._surface.bodies
             ]  # evaluate all first: a failed frame must leave nothing in the stage
-            for body, meshes, (points, fields) in zip(self._surface.bodies, self._meshes, samples, strict=True):
+            for meshes, (points, fields) in zip(self._meshes, samples, strict=True):
                 for world, mesh in enumerate(meshes):
                     values = {name: field[world] for name, field in fields.items()}
-                    low, high = mesh.write(code, points[world], body.skin.triangles, values)
+                    low, high = mesh.write(code, points[world], values)
                     offset = self._surface.offsets[world]
                     box = self._bounding_box
                     self._bounding_box = np.minimum(box[0], low + offset), np.maximum(box[1], high + offset)
@@ -289,9 +299,9 @@ class USDWriter(Output):
 class _MeshPrim:
     """The varying attributes of one body in one world."""
 
-    def __init__(self, mesh: Any, translate: Any, fields: Sequence[str]) -> None:
+    def __init__(self, mesh: Any, translate: Any, fields: Sequence[str], normals: MeshNormals) -> None:
         self.mesh, self.translate, self.points = mesh, translate, mesh.CreatePointsAttr()
-        self.normals, self.extent = mesh.CreateNormalsAttr(), mesh.CreateExtentAttr()
+        self.normals, self.extent = normals, mesh.CreateExtentAttr()
         self.color = mesh.CreateDisplayColorPrimvar(pxr.UsdGeom.Tokens.vertex)
         api = pxr.UsdGeom.PrimvarsAPI(mesh)
         self.fields = {
@@ -302,7 +312,7 @@ class _MeshPrim:
         }
 
     def write(
-        self, code: float, points: npt.NDArray[Any], triangles: npt.NDArray[Any], values: dict[str, Any]
+        self, code: float, points: npt.NDArray[Any], values: dict[str, Any]
     ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
         """One frame of points (P, 3) and fields (P,); returns the corners of their box in the world."""
         low, high = points.min(axis=0), points.max(axis=0)
@@ -310,7 +320,7 @@ class _MeshPrim:
         local = np.ascontiguousarray(points - center, dtype=np.float32)
         self.translate.Set(pxr.Gf.Vec3d(*map(float, center)), code)
         self.points.Set(pxr.Vt.Vec3fArray.FromNumpy(local), code)
-        self.normals.Set(pxr.Vt.Vec3fArray.FromNumpy(vertex_normals(local.astype(np.float64), triangles)), code)
+        self.normals.write(local.astype(np.float64), code)
         extent = np.stack([local.min(axis=0), local.max(axis=0)])
         self.extent.Set(pxr.Vt.Vec3fArray.FromNumpy(extent), code)
         for name, primvar in self.fields.items():
