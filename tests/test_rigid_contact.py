@@ -1,0 +1,81 @@
+"""Rigid parts at work: stiff ones at rest, a wedge, a gyroscope on a flexible shaft."""
+
+import numpy as np
+import pytest
+import scipy.linalg
+
+import warpfea as wf
+
+GRAVITY = 9.81
+
+
+@pytest.mark.parametrize("height", [0.2, 2.0])
+def test_a_stiff_part_comes_to_rest(height):
+    """A block of 2e11 Pa falls: its weight indents the contact by less than what its position resolves the force to."""
+    b = wf.ModelBuilder()
+    steel = wf.SVK(E=2e11, nu=0.3, density=7850.0)
+    block = b.add_rigid(wf.Box((0, 0, 0), (0.1, 0.1, 0.1)), density=7850.0, material=steel)
+    contact = b.add_contact(block, b.add_collider(wf.HalfSpace((0, 0, 1), -height - 0.05)), mu=0.3)
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-3, integrator="bdf2")
+    sim.run(np.sqrt(2 * height / GRAVITY) + 0.1)
+    assert sim.pose(block)[0][0] == pytest.approx([0, 0, -height], abs=1e-8)
+    force = sim.contact_record(contact).force[0, -20:, 2]
+    assert force.mean() == pytest.approx(block.mass * GRAVITY, rel=1e-3)
+
+
+def test_a_wedge_under_a_block():
+    """Without friction: the wedge's acceleration m g tan(a)/(M + m tan(a)^2) under a block that is guided upright."""
+    slope = 0.4
+    b = wf.ModelBuilder(gravity=(0, 0, -GRAVITY))
+    top, x, z = np.tan(slope), np.cos(slope), np.sin(slope)
+    y = np.repeat([-0.3, 0.3], 3)
+    points = np.column_stack([np.tile([0.0, 1.0, 0.0], 2), y, np.tile([0.0, 0.0, top], 2)])
+    triangles = [(0, 1, 2), (3, 5, 4), (0, 3, 4), (0, 4, 1), (1, 4, 5), (1, 5, 2), (2, 5, 3), (2, 3, 0)]
+    wedge = b.add_rigid(wf.TriMesh(points, triangles), mass=3.0, inertia=(1, 1, 1), com=(0.3, 0, 0.1), name="wedge")
+    axes = np.array([(x, 0, -z), (0, 1, 0), (z, 0, x)])
+    middle = np.array([0.5, 0.0, 0.5 * top]) + 0.05 * axes[2]
+    block = b.add_rigid(wf.Box(middle, (0.2, 0.2, 0.1), axes=axes), mass=2.0, inertia=(0.01, 0.01, 0.01), name="block",
+                        com=middle)  # fmt: skip
+    b.add_joint("translational", parent=wf.GROUND, child=block.at(middle), axis=(0, 0, 1))
+    b.add_contact(wedge, b.add_collider(wf.HalfSpace((0, 0, 1))))
+    pair = b.add_contact(block, wedge)
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=2e-3, integrator="bdf2")
+    speeds = []
+    for _ in range(2):  # past the landing
+        sim.step(30)
+        speeds.append(wedge.affine[0] @ sim.state.velocity.numpy()[0, wedge.slots, 0])
+    exact = 2.0 * GRAVITY * top / (3.0 + 2.0 * top**2)
+    assert speeds[0] - speeds[1] == pytest.approx(exact * 0.06, rel=2e-3)
+    assert sim.contact_record(pair).force[0, -30:, 0].mean() == pytest.approx(3.0 * exact, rel=2e-3)
+
+
+@pytest.mark.slow
+def test_critical_speed_of_a_gyroscope_on_a_flexible_shaft():
+    """At the critical speed a forward whirl has the speed of the spin: det(K - w^2 diag(m, I_d - I_p)) = 0 of an
+    overhung disc, which tilts; without its gyroscopic moment that speed is 7 % lower."""
+    L, r, E = 0.5, 0.01, 2e11
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    shaft = b.add_beam([(0, 0, 0), (L, 0, 0)], elements=3, section=wf.Circle(r), normal=(0, 0, 1),
+                       material=wf.SVK(E=E, nu=0.3, density=1.0))  # fmt: skip
+    b.clamp(shaft.start, slots="position+section")
+    disc = b.add_rigid(wf.Cylinder((L - 0.01, 0, 0), (L + 0.01, 0, 0), 0.15), density=3000.0, name="disc")
+    b.add_joint("revolute", parent=shaft.end, child=disc.at((L, 0, 0)), axis=(1, 0, 0))
+    K = E * np.pi * r**4 / 4 / L**3 * np.array([(12, -6 * L), (-6 * L, 4 * L**2)])
+    polar, across = disc.inertia[0, 0], disc.inertia[1, 1]
+    speeds = scipy.linalg.eigvals(K, np.diag([disc.mass, across - polar])).real
+    critical = np.sqrt(speeds[speeds > 0.0].min())
+    plain = np.sqrt(scipy.linalg.eigvalsh(K, np.diag([disc.mass, across])).min())
+    assert critical > 1.05 * plain
+    b.set_initial(disc, angular_velocity=(critical, 0, 0))
+    pulse = ([0.0, 0.005, 0.01], [(0, 0, 0), (0, 50.0, 0), (0, 0, 0)])
+    b.add_point_load(disc.at((L, 0, 0)), force=pulse)
+    b.add_probe("p", disc.at((L, 0, 0)))
+    h, turns = 2.5e-3, 8
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=h, integrator="energy_momentum")
+    sim.run(0.01 + turns * 2 * np.pi / critical)
+    p = sim.probe("p")
+    late = p.time > 0.01
+    signal, t = p.displacement[0, late, 1] + 1j * p.displacement[0, late, 2], p.time[late]
+    trial = critical * np.linspace(0.8, 1.2, 801)
+    power = np.abs(np.exp(-1j * np.outer(trial, t)) @ (signal * np.hanning(len(t))))
+    assert trial[np.argmax(power)] == pytest.approx(critical, rel=1e-2)
