@@ -1,6 +1,8 @@
 """Tetrahedra inside a closed surface, by fTetWild (extra "mesh")."""
 
+import contextlib
 import os
+import tempfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -59,9 +61,10 @@ def from_surface(
         raise MeshError(
             f"{label}: a mesh of the inside of a surface needs pytetwild: pip install 'warpfea[mesh]' ({error})"
         ) from error
-    nodes, cells = pytetwild.tetrahedralize(
-        points, triangles.astype(np.int32), edge_length_abs=float(length), epsilon=tolerance, vtk_ordering=True
-    )
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):  # the mesher leaves a file there
+        nodes, cells = pytetwild.tetrahedralize(
+            points, triangles.astype(np.int32), edge_length_abs=float(length), epsilon=tolerance, vtk_ordering=True
+        )
     mesh = Mesh(np.asarray(nodes), np.asarray(cells), "tetra", name=name or _stem(surface))
     found = mesh.volume()
     if abs(found - wanted) > MAX_VOLUME_CHANGE * wanted:
