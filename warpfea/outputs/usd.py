@@ -108,7 +108,7 @@ class USDWriter(Output):
         self._field_ranges = {name: (np.inf, -np.inf) for name in self.fields}
         self._bounding_box = (np.full(3, np.inf), np.full(3, -np.inf))
         self._unsaved_bytes = 0
-        self._groups: dict[int, tuple[npt.NDArray[Any], int]] = {}
+        self._normal_groups: dict[int, tuple[npt.NDArray[Any], int]] = {}
         self._temporary = temporary_path(target)
         extending = self.extend and target.is_file()
         try:
@@ -140,9 +140,9 @@ class USDWriter(Output):
     def _normals(self, k: int, mesh: Any) -> MeshNormals:
         """Normals of a mesh of the k-th body; sharp edges are those at rest."""
         triangles, rest = self._surface.bodies[k].skin.triangles, self._surface.rest[k]
-        if k not in self._groups:
-            self._groups[k] = smooth_corners(rest, triangles)
-        return MeshNormals(mesh, triangles, len(rest), self._groups[k])
+        if k not in self._normal_groups:
+            self._normal_groups[k] = smooth_corners(rest, triangles)
+        return MeshNormals(mesh, triangles, len(rest), self._normal_groups[k])
 
     def _resume(self, sim: Any, target: pathlib.Path) -> None:
         """Open a copy of the existing file for extension."""
