@@ -7,6 +7,7 @@ from scipy.optimize import brentq
 from spring_models import oscillator
 
 import warpfea as wf
+from warpfea.outputs import animation
 
 E, RHO = 2e9, 1000.0
 LAW = wf.SVK(E=E, nu=0.0, density=RHO)
@@ -194,7 +195,7 @@ def test_buckling_in_compression_and_none_in_tension(elements):
         wf.buckling(model, state)
 
 
-def test_a_mode_is_written_and_drawn(tmp_path):
+def test_a_mode_is_written_and_drawn(tmp_path, monkeypatch):
     b, body = beam(2)
     b.clamp(body.start, slots="all")
     found = wf.modes(b.finalize(device="cpu"), count=2)
@@ -206,7 +207,13 @@ def test_a_mode_is_written_and_drawn(tmp_path):
     mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/World/world_0000/b/skin"))
     value = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("displacement")
     assert max(value.Get(t).__len__() and max(value.Get(t)) for t in value.GetTimeSamples()) == pytest.approx(0.2, 1e-3)
-    found.write(tmp_path / "mode.png", size=(0.1))
+    labels = []
+    draw = animation.draw_labels
+    monkeypatch.setattr(
+        animation, "draw_labels", lambda image, text, *more: labels.append(text) or draw(image, text, *more)
+    )
+    found.write(tmp_path / "mode.png", mode=2, size=0.1)
+    assert labels == [f"mode 2, {found.frequencies[1]:.3g} Hz"]
     found.write(tmp_path / "mode.html", mode=2, size=0.2)
     assert f"<title>{found.label(2)}</title>" in (tmp_path / "mode.html").read_text()
     assert (tmp_path / "mode.png").stat().st_size > 1000

@@ -55,7 +55,7 @@ class Animation:
         plane_squares: first of the four points of each square drawn for a half-space.
         origin: (3,) m, the frame's. parts: (name, first point, number of points) of bodies and obstacles.
         rest: (P, 3) points at rest; edges: (E, 2) points along edges of elements, of bodies; None: not known.
-        mark_kinds: of the points of marks of frames.
+        mark_kinds: of the points of marks of frames. label: text in place of the time of a frame.
     """
 
     triangles: npt.NDArray[np.integer[Any]]
@@ -72,6 +72,7 @@ class Animation:
     rest: Floats | None = None
     edges: npt.NDArray[Any] | None = None
     mark_kinds: list[str] = field(default_factory=list)
+    label: str = ""
     frames: list[Frame] = field(default_factory=list)
 
     def draw(
@@ -109,7 +110,7 @@ class Animation:
             )
             yield draw_labels(
                 image,
-                f"load {100.0 * frame.time:.4g} %" if self.static else f"t = {frame.time:.{decimals}f} s",
+                self.label or (f"load {100 * frame.time:.4g} %" if self.static else f"t = {frame.time:.{decimals}f} s"),
                 (low, high, self.title, self.units) if barred else None,
                 self._overlay(frame, n, look),
                 self._aimed(camera, frame, look),

@@ -83,6 +83,7 @@ class _PictureWriter(Look, Output):
             units, self.color_range, is_static(sim), self._surface.body_points, self._surface.plane_squares(),
         )  # fmt: skip
         animation.origin, animation.parts, animation.rest = self._origin, self._surface.parts(), self._rest
+        animation.label = getattr(sim, "label", "")
         self.check_names([name for name, _, _ in animation.parts])
         if self.edges:
             animation.edges = self._surface.edges()
