@@ -34,7 +34,7 @@ class View {
     this.data = data;
     this.surfaces = data.surfaces.flatMap((mesh) => data.worlds.map((_, k) => new Surface(bytes, mesh, k, data)));
     this.fields = data.fields.map((field, index) => ({ ...field, index, high: field.low + (NO_VALUE - 1) * field.step }));
-    this.time = 0; // frame, with its fraction
+    this.time = data.static ? data.times.length - 1 : 0; // frame, with its fraction; statics show the full load first
     this.world = data.worlds.length > 1 ? -1 : 0; // -1: all, on their grid
     this.scale = 1;
     this.camera = new Camera(data.up);
@@ -231,7 +231,7 @@ class View {
     const [low, high] = this.range, [factor, units] = scaled(this.field.units, Math.max(Math.abs(low), Math.abs(high)));
     $("legend-title").textContent = this.field.title + (units ? ` (${units})` : "");
     $("ticks").replaceChildren();
-    for (let k = 4; k >= 0; k--) element("li", digits((low + (high - low) * k / 4) / factor, 3), $("ticks"));
+    for (let k = high > low ? 4 : 0; k >= 0; k--) element("li", digits((low + (high - low) * k / 4) / factor, 3), $("ticks"));
   }
 
   // ---- time
