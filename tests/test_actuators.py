@@ -301,3 +301,18 @@ def test_bad_input_is_named() -> None:
     for name, value, text in (("pd.kp", -1.0, "0 or more"), ("hinge.lower", 2.0, "below the upper")):
         with pytest.raises(wf.ModelError, match=text):
             model.set_parameter(name, value)
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("scheme", ["bdf2", "energy_momentum"])
+def test_both_devices_agree(scheme: str, dtype: str) -> None:
+    """Every law at work, in two worlds."""
+    b, hinge = mixed()
+    found = []
+    for device in ("cpu", "cuda:0"):
+        sim = wf.Simulation(b.finalize(device=device, dtype=dtype, worlds=2), dt=5e-3, integrator=scheme)
+        sim.controls["q"][:] = [0.1, -0.2]
+        sim.step(40)
+        found.append([sim.joint_value(hinge), sim.joint_rate(hinge), sim.energies()["actuators"]])
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-5 if dtype == "float64" else 2e-2)

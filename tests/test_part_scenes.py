@@ -47,3 +47,16 @@ def test_the_cranes_motor_turns_its_load():
     e = sim.energies()
     assert abs(e["ledger_residual"][0]) < 1e-3
     assert e["work_joints"][0] > 30.0  # the load swings
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_worlds_of_the_arm_on_the_gpu(dtype):
+    """64 worlds lift the box as one on the CPU."""
+    ends = []
+    for device, worlds in (("cpu", 1), ("cuda:0", 64)):
+        model = find("arm")().finalize(device=device, dtype=dtype, worlds=worlds)
+        sim = wf.Simulation(model, dt=2e-2, integrator="bdf2", solver=wf.NewtonPCG(tol=1e-4))
+        sim.run(1.6)
+        ends.append(sim.probe("box").position[:, -1])
+    assert np.abs(ends[1] - ends[0]).max() < 1e-3

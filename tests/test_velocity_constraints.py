@@ -185,3 +185,17 @@ def test_what_is_refused() -> None:
     for call, text in cases:
         with pytest.raises(wf.ModelError, match=text):
             call()
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("scheme", ["bdf2", "energy_momentum"])
+def test_both_devices_agree(scheme: str, dtype: str) -> None:
+    """A rolling disc and a motor, in two worlds."""
+    b, part, _ = disc(0.2)
+    found = []
+    for device in ("cpu", "cuda:0"):
+        sim = wf.Simulation(b.finalize(device=device, dtype=dtype, worlds=2), dt=5e-3, integrator=scheme)
+        sim.step(40)
+        found.append(sim.pose(part)[0])
+    np.testing.assert_allclose(found[1], found[0], atol=1e-6 if dtype == "float64" else 1e-3)
