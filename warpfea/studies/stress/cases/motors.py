@@ -8,7 +8,7 @@ from ..build import GRAVITY_VECTOR, StepStats, Y, Z, finalize, step
 from ..case import FLOAT32_REFUSAL, Answer, Setting, case
 
 
-def _rotor(inertia: float, rate: float, **options: object) -> tuple[wf.ModelBuilder, wf.Joint]:
+def _wheel(inertia: float, rate: float, **options: object) -> tuple[wf.ModelBuilder, wf.Joint]:
     """A part of so much inertia (kg m^2) about a hinge along z, turning at a rate, rad/s."""
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     part = b.add_rigid(wf.Box((0, 0, 0), (0.2, 0.2, 0.2)), mass=100.0 * inertia, inertia=(inertia,) * 3, name="part")
@@ -17,7 +17,7 @@ def _rotor(inertia: float, rate: float, **options: object) -> tuple[wf.ModelBuil
     return b, joint
 
 
-def _answer(sim: wf.Simulation, stats: StepStats, error: float, bound: float, reference: str) -> Answer:
+def _row_answer(sim: wf.Simulation, stats: StepStats, error: float, bound: float, reference: str) -> Answer:
     newton = stats.newton / sim.statistics.steps
     limits = {"Newton per step": (newton, 20.0 if sim.model.dtype == "float32" else 6.0)}
     return stats.answer(error, bound, reference, lowest_J=None, limits=limits)
@@ -31,7 +31,7 @@ def _answer(sim: wf.Simulation, stats: StepStats, error: float, bound: float, re
 def pd(setting: Setting, value: tuple[float, float, str]) -> Answer:
     """A PD of gain kp on 1 kg m^2 that turns at 1 rad/s, its target held: kinetic and its own energy never grow."""
     kp, h, scheme = value
-    b, joint = _rotor(1.0, 1.0)
+    b, joint = _wheel(1.0, 1.0)
     b.add_actuator(joint, wf.PD(kp, target=wf.Control("q", 1)), name="motor")
     sim, stats = wf.Simulation(finalize(b, setting), dt=h, integrator=scheme), StepStats()
     z = [np.array([1.0, 0.0])]
@@ -42,7 +42,7 @@ def pd(setting: Setting, value: tuple[float, float, str]) -> Answer:
     energy = 0.5 * (states**2).sum(axis=1)
     if scheme == "bdf2":  # its own norm
         energy = 0.25 * ((states[1:] ** 2).sum(axis=1) + ((2.0 * states[1:] - states[:-1]) ** 2).sum(axis=1))
-    return _answer(sim, stats, float(energy.max() / energy[0] - 1.0), 2e-3 if setting.single else 1e-5, "no growth")
+    return _row_answer(sim, stats, float(energy.max() / energy[0] - 1.0), 2e-3 if setting.single else 1e-5, "no growth")
 
 
 @case("stop-speed", "motors", values=[(v, h) for v in (1e-3, 10.0, 1e3) for h in (1e-3, 1e-2)], quick="float64",
@@ -63,15 +63,15 @@ def stop_speed(setting: Setting, value: tuple[float, float]) -> Answer:
         fastest = max(fastest, abs(float(sim.joint_rate(joint)[0])))
         deepest = max(deepest, float(sim.joint_value(joint)[0]) - way)
     over = max(fastest / speed - 1.0, deepest / (speed / np.sqrt(stiffness)) - 1.0)
-    return _answer(sim, stats, over, 0.02, "energy of the impact")
+    return _row_answer(sim, stats, over, 0.02, "energy of the impact")
 
 
 @case("friction-ratio", "motors", values=(1e-6, 1.0, 1e6), quick="float64", refusal=FLOAT32_REFUSAL)
 def friction_ratio(setting: Setting, value: float) -> Answer:
     """A wheel of so much inertia is stopped by friction of 2 N m per kg m^2 from 1 rad/s, and stays at 0.25 rad."""
-    b, joint = _rotor(value, 1.0, friction=2.0 * value)
+    b, joint = _wheel(value, 1.0, friction=2.0 * value)
     sim, stats = step(b, setting, 200, dt=5e-3, integrator="energy_momentum")
-    return _answer(sim, stats, abs(float(sim.joint_value(joint)[0]) / 0.25 - 1.0), 5e-3, "w^2 I / (2 T)")
+    return _row_answer(sim, stats, abs(float(sim.joint_value(joint)[0]) / 0.25 - 1.0), 5e-3, "w^2 I / (2 T)")
 
 
 @case("held-chain", "motors", values=[(n, kp) for n in (3, 12) for kp in (1e3, 1e7)], quick="float64",
@@ -94,4 +94,4 @@ def held_chain(setting: Setting, value: tuple[int, float]) -> Answer:
     middle = 0.5 * (x[1:] + x[:-1])
     torque = np.array([9.81 * np.sum(middle[k:] - x[k]) for k in range(count)])
     error = float(np.abs(kp * count**2 * angle - torque).max() / torque.max())
-    return _answer(sim, stats, error, 2e-2 if setting.single else 1e-4, "weights")
+    return _row_answer(sim, stats, error, 2e-2 if setting.single else 1e-4, "weights")
