@@ -66,8 +66,7 @@ def _damped(law: Any, form: str) -> Any:
 
 def force_in(b: wf.ModelBuilder, missing: list[str]) -> None:
     """Add the features named, as the module says; `missing` as of `Model.info()["left_out"]`."""
-    bodies = list(b.bodies)
-    first = bodies[0]
+    first, *_ = bodies = list(b.bodies)
     reference = np.concatenate([body.mesh.points[body.mesh.used_nodes] for body in bodies])
     low, high = reference.min(axis=0), reference.max(axis=0)
     size = float(np.linalg.norm(high - low))
@@ -105,10 +104,8 @@ def _add_bodies(b: wf.ModelBuilder, place: np.ndarray, edge: float, *, pair: boo
     held = b.add_solid(brick, material=_damped(law, "explicit"), element="H3843", name="price held")
     b.drive(held.nodes("x-"), displacement=([0.0, 1e3], [(0, 0, 0), (0, 0, 0)]))
     b.add_joint("spherical", parent=wf.GROUND, child=held.surface("x+"), name="price joint")
-    hinge = b.add_joint(
-        "revolute", parent=wf.GROUND, child=b.add_solid(free, material=law).surface("z-"), axis=(0, 0, 1)
-    )
-    b.add_actuator(hinge, 0.0)
+    turned = b.add_solid(free, material=law).surface("z-")
+    b.add_actuator(hinge := b.add_joint("revolute", parent=wf.GROUND, child=turned, axis=(0, 0, 1)), 0.0)
     b.add_velocity_constraint("speed", hinge, name="price speed")
 
 
