@@ -24,6 +24,7 @@ def test_rigid_parts_rebound_with_the_restitution_of_their_contact():
     assert all(row["momentum_error"] < 1e-10 for row in FOUND["parts"])
 
 
+@pytest.mark.slow
 def test_the_rows_are_what_is_found_now():
     row = bars(1, 0.0, h=1e-3)
     assert row["measured"] == pytest.approx(0.929, abs=5e-3)

@@ -9,7 +9,8 @@ import warpfea as wf
 from scenes.links import link_mesh
 
 
-@pytest.mark.parametrize("radius", [pytest.param(2e-4, marks=pytest.mark.slow), 1e-3])
+@pytest.mark.slow
+@pytest.mark.parametrize("radius", [2e-4, 1e-3])
 def test_a_needle_lifts_a_plate(radius):
     """Of 1/500 or 1/100 of a facet; it passes at none of two places, and the plate takes up its impulse."""
     for place in ((0.058, 0.044), (0.1, 0.1)):
