@@ -316,7 +316,8 @@ def walled(bottom, top=0.1, on="box", wall="box"):
 
 @pytest.mark.parametrize(("top", "shapes"), [
     (0.1, walled(0.0)), (0.1, walled(1e-6, on="half-space")), (0.02, walled(0.0, 0.02)),
-    *(pytest.param(0.1, walled(bottom), marks=pytest.mark.slow) for bottom in (-1e-6, 1e-6, 1e-5)), pytest.param(0.1, walled(0.0, wall="mesh"), marks=pytest.mark.slow),
+    *(pytest.param(0.1, walled(bottom), marks=pytest.mark.slow) for bottom in (-1e-6, 1e-6, 1e-5)),
+    pytest.param(0.1, walled(0.0, wall="mesh"), marks=pytest.mark.slow),
 ])  # fmt: skip
 def test_a_wall_on_a_floor_holds_as_one_that_reaches_into_it(top, shapes):
     """Before: points at its foot met its lower face, no solution, or 8 cm/s and turned by 0.07 rad/s."""
