@@ -47,6 +47,8 @@ from .outputs.render import GIFWriter, PNGWriter  # noqa: E402
 from .outputs.usd import USDWriter  # noqa: E402
 from .outputs.vtk import VTUWriter  # noqa: E402
 from .outputs.vtk_reader import read_results  # noqa: E402
+from .simulation import loss  # noqa: E402
+from .simulation.adjoint import Adjoint  # noqa: E402
 from .simulation.checkpoint import Checkpoint  # noqa: E402
 from .simulation.integrators import EnergyMomentum, GeneralizedAlpha  # noqa: E402
 from .simulation.modes import Buckling, Modes, buckling, modes  # noqa: E402
@@ -57,15 +59,15 @@ from .solvers import Jacobi, NewtonPCG  # noqa: E402
 from .time_laws import Control, Rotation  # noqa: E402
 
 __all__ = [
-    "GROUND", "PD", "SVK", "Body", "Box", "Buckling", "CapacityError", "Capsule", "Checkpoint", "CheckpointError",
-    "Circle", "ConstraintError", "Control", "ConvergenceError", "Cylinder", "Design", "ElementSet",
+    "GROUND", "PD", "SVK", "Adjoint", "Body", "Box", "Buckling", "CapacityError", "Capsule", "Checkpoint",
+    "CheckpointError", "Circle", "ConstraintError", "Control", "ConvergenceError", "Cylinder", "Design", "ElementSet",
     "EnergyMomentum", "Error", "GIFWriter", "GeneralizedAlpha", "HTMLWriter", "HalfSpace", "Jacobi", "Joint",
-    "KelvinVoigt", "MaterialPoint", "MeshError", "MeshWarning", "Model", "ModelBuilder", "ModelError",
-    "ModelWarning", "Modes", "MooneyRivlin", "NeoHookean", "NewtonPCG", "NodeSet", "Observations", "OutputError",
-    "PNGWriter", "PenetrationError", "Rectangle", "Reference", "Rotation", "Section", "Simulation", "Sphere",
-    "StabilityError", "StabilityWarning", "State", "StepReport", "Stop", "StudyOptions", "SurfaceSet", "TriMesh",
-    "Tube", "USDWriter", "VTUWriter", "__version__", "buckling", "fit", "mesh", "modes", "read_results", "scene",
-    "solve_static", "spline", "study", "sweep",
+    "KelvinVoigt", "MaterialPoint", "MeshError", "MeshWarning", "Model", "ModelBuilder", "ModelError", "ModelWarning",
+    "Modes", "MooneyRivlin", "NeoHookean", "NewtonPCG", "NodeSet", "Observations", "OutputError", "PNGWriter",
+    "PenetrationError", "Rectangle", "Reference", "Rotation", "Section", "Simulation", "Sphere", "StabilityError",
+    "StabilityWarning", "State", "StepReport", "Stop", "StudyOptions", "SurfaceSet", "TriMesh", "Tube", "USDWriter",
+    "VTUWriter", "__version__", "buckling", "fit", "loss", "mesh", "modes", "read_results", "scene", "solve_static",
+    "spline", "study", "sweep",
 ]  # fmt: skip
 
 

@@ -45,6 +45,8 @@ from .outputs.render import GIFWriter as GIFWriter, PNGWriter as PNGWriter
 from .outputs.usd import USDWriter as USDWriter
 from .outputs.vtk import VTUWriter as VTUWriter
 from .outputs.vtk_reader import read_results as read_results
+from .simulation import loss as loss
+from .simulation.adjoint import Adjoint as Adjoint
 from .simulation.checkpoint import Checkpoint as Checkpoint
 from .simulation.integrators import EnergyMomentum as EnergyMomentum, GeneralizedAlpha as GeneralizedAlpha
 from .simulation.modes import Buckling as Buckling, Modes as Modes, buckling as buckling, modes as modes

@@ -146,7 +146,7 @@ def _shear_coupling(
     modes = np.array([np.ones(4), *np.sign(gauss.T), np.sign(np.prod(gauss, axis=1))]) / 4.0
     ends, deviation = 0.5 * np.diag([1.0, 0.0, 1.0]), np.array([-0.5, 1.0, -0.5])
     torsion = section.torsion_ratio_at(*(size[:, 12 * k : 12 * k + 12, 1 + k].mean(axis=1) for k in (0, 1)))
-    out = np.empty((len(at), len(a), 12))
+    out = np.empty((len(at), len(a), 12), dtype=np.result_type(m.E / m.lame[1]))  # complex for derivatives by nu
     for direction in (0, 1):
         rows = slice(12 * direction, 12 * direction + 12)
         height = size[:, rows, 1 + direction].mean(axis=1)

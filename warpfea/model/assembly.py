@@ -231,9 +231,9 @@ def law_and_coefficients(integral: EnergyPart, material: Material) -> tuple[str,
     return law, values
 
 
-def coefficient_rows(values: Sequence[Any], material: Material, worlds: int = 1) -> np.ndarray:
+def coefficient_rows(values: Sequence[Any], material: Material, worlds: int = 1, dtype: Any = float) -> np.ndarray:
     """(worlds, NCOEF) coefficients in device layout, those of the damping last."""
-    rows = np.zeros((worlds, NCOEF))
+    rows = np.zeros((worlds, NCOEF), dtype=dtype)
     for k, value in enumerate(values):
         rows[:, k] = value
     if material.damping:

@@ -24,7 +24,8 @@ from ..kernels.terms.constraints import JOINT_COLUMNS, constraint_kernels, multi
 from ..kernels.terms.velocity_rows import velocity_kernels
 from ..model import assembly
 from .constraint_tables import ConstraintTables
-from .protocols import CachedInputs, Constrained, Preconditioned, Tied, Updated
+from .gradients import Gradient, StepAdjoint
+from .protocols import CachedInputs, Constrained, Differentiable, Preconditioned, Tied, Updated
 from .term import NUMERICAL, WORK, Column, StepContext, part
 from .time_law_table import TimeLawTable
 
@@ -39,7 +40,7 @@ MAX_THREAD_ROWS = 16
 """Maximum rows of a cluster whose matrix one thread inverts; larger ones take a launch per pivot."""
 
 
-class Constraints(Constrained, Updated, Tied, Preconditioned):
+class Constraints(Constrained, Updated, Tied, Preconditioned, Differentiable):
     """Joints, welds and single constraints of a model.
 
     Attributes:
@@ -300,6 +301,15 @@ class Constraints(Constrained, Updated, Tied, Preconditioned):
             (m.worlds, launch.padded(m.slots)),
             [*args, z if into is None else into, w.warp_rows],
         )
+
+    def law_gradient(self, ctx: StepContext, law: int) -> Gradient | None:
+        def add(at: StepAdjoint, out: wp.array) -> None:
+            w = at.ctx.work
+            args = [self.tables.data, w.multipliers, at.mu, at.w, w.step.dq_dv, w.u, law, at.active, at.sums]
+            at.ctx.launch(at.kernels.right_side_sums, self.model.worlds, args)
+            at.accumulate(out, 1.0)
+
+        return add if (self.tables.data.law.numpy() == law).any() else None
 
     # evaluation at a state
 

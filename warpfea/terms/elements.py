@@ -7,18 +7,21 @@ frozen during it among the dead loads.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
+from ..kernels.elements.history_gradient import history_gradient_kernel
 from ..kernels.step.gather import gather_kernels
 from ..kernels.terms.loads import load_kernels
 from .fields import ELEMENT_FIELDS
+from .gradients import Gradient, StepAdjoint, material_gradients
+from .protocols import Differentiable
 from .section_forces import SECTION_FIELDS, section_field
-from .term import EXPLICIT_VISCOUS, Column, StepContext, Term, part
+from .term import EXPLICIT_VISCOUS, Column, StepContext, part
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -32,7 +35,7 @@ MIN_LANE_POINTS = 8
 DAMPING_FORMS = ("incremental", "rate", "explicit")
 
 
-class Elements(Term):
+class Elements(Differentiable):
     """Element blocks of a model. Writes work.contribution and, for energies, work.energy_rows."""
 
     name = "elements"
@@ -63,12 +66,16 @@ class Elements(Term):
     def force(self, ctx: StepContext, active: wp.array) -> None:
         if not ctx.positions_changed:
             return
-        m, w, launch = self.model, ctx.work, ctx.launch
-        for block, kernels in zip(m.blocks, self.kernels(ctx)):
-            lanes = launch.lanes(block.points // 2) if block.points >= MIN_LANE_POINTS and not block.key.tying else 1
-            args = [w.data_of(block), w.stage, active, lanes, w.contribution, w.energy_rows]
-            dim = (w.u.shape[0], launch.padded(block.count * lanes))
-            launch(kernels.internal_force, dim, [*args, w.newton.min_J, w.newton.domain_J])
+        for block, kernels in zip(self.model.blocks, self.kernels(ctx)):
+            self.block_force(ctx, block, kernels, ctx.work.data_of(block), active)
+
+    def block_force(self, ctx: StepContext, block: Any, kernels: Any, data: Any, active: wp.array) -> None:
+        """Forces of a block with other constants `data`."""
+        w, launch = ctx.work, ctx.launch
+        lanes = launch.lanes(block.points // 2) if block.points >= MIN_LANE_POINTS and not block.key.tying else 1
+        args = [data, w.stage, active, lanes, w.contribution, w.energy_rows]
+        dim = (w.u.shape[0], launch.padded(block.count * lanes))
+        launch(kernels.internal_force, dim, [*args, w.newton.min_J, w.newton.domain_J])
 
     def check_inversion(self, ctx: StepContext, active: wp.array) -> None:
         """Flag in newton.inverted the worlds with a point where J > 0 in the state and J <= 0 at the iterate."""
@@ -113,6 +120,32 @@ class Elements(Term):
         """The tangent; viscous forces of motions: Evaluation.viscous_force."""
         return self.model.evaluation.tangent_matrix(state, world), None
 
+    # adjoint
+
+    def not_differentiable(self, ctx: StepContext) -> str | None:
+        forms = {b.key.damping for b in self.model.blocks} - {"incremental", None} if ctx.inertia else set()
+        return f"damping of the form {forms.pop()!r}" if forms else None
+
+    def gradients(self, ctx: StepContext) -> Mapping[str, Callable[[], Gradient]]:
+        return material_gradients(ctx, self)
+
+    def history_kernels(self) -> list[tuple[Any, wp.Kernel]]:
+        """Blocks with strains of the start of the step, and their kernels `history_gradient`."""
+        blocks = [b for b in self.model.blocks if b.key.damping == "incremental"]
+        kind = [(b.key.law, b.slots, b.key.affine, b.key.framed) for b in blocks]
+        return [(b, history_gradient_kernel(self.model.dtype, *key)) for b, key in zip(blocks, kind)]
+
+    def add_history_gradient(self, at: StepAdjoint) -> None:
+        found, w = self.history_kernels() if at.ctx.inertia else [], at.ctx.work
+        if found:
+            w.contribution.zero_()
+        for block, kernel in found:
+            args = [block.data, w.u, at.ctx.state.displacement, at.w, w.step.dq_dv, at.active, w.contribution]
+            at.ctx.launch(kernel, (self.model.worlds, block.count), args)
+        if found:
+            at.gather(at.scratch)
+            at.ctx.launch(at.kernels.add_vector, at.dim, [at.scratch, at.active, at.q_bar])
+
     def samples(self, field: str, body: Any, state: State) -> np.ndarray:
         """Fields of slots and section forces; others are functions of quantities."""
         if field in SECTION_FIELDS:
@@ -120,7 +153,7 @@ class Elements(Term):
         return getattr(state, field).numpy()[:, body.slot_range].astype(float)
 
 
-class Damping(Term):
+class Damping(Differentiable):
     """Damping data at the start of an attempt."""
 
     name = "damping"

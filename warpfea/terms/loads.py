@@ -3,7 +3,7 @@ current position, Eq. (23); follower loads: pressure on faces, and moments."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +20,8 @@ from ..model import assembly
 from ..model.assembly import require_density
 from ..model.description import BodyForce, Moment, Pressure
 from ..time_laws import TimeLaw
-from .protocols import Parametrised, Preconditioned
+from .gradients import Gradient, StepAdjoint, law_weights
+from .protocols import Differentiable, Parametrised, Preconditioned
 from .term import StepContext, Term, part
 from .time_law_table import TimeLawTable, argument_precision
 
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 __all__ = ["BodyForces", "DeadLoads", "FollowerLoads", "FollowerMatrix"]
 
 
-class DeadLoads(Parametrised):
+class DeadLoads(Parametrised, Differentiable):
     """Dead loads: assembled once per attempt into work.dead.
 
     Gravity, [world] on the device, is part of every model; without any load nothing is launched. With a time law of
@@ -142,6 +143,18 @@ class DeadLoads(Parametrised):
 
     def matrices(self, state: State, world: int) -> tuple[None, None]:
         return None, None
+
+    def gradients(self, ctx: StepContext) -> Mapping[str, Callable[[], Gradient]]:
+        def add(at: StepAdjoint, out: wp.array) -> None:
+            args = [self.model.masses.lumped_values, at.ctx.work.step.load_factor, at.w, at.active, at.ctx.work.rows]
+            at.ctx.launch(at.kernels.gravity_rows, at.dim, args)
+            at.add(out)
+
+        return {"gravity": lambda: add} if self.gravity_law is None else {}
+
+    def law_gradient(self, ctx: StepContext, law: int) -> Gradient | None:
+        slot, number, weight = (values[self._definition[1] == law] for values in self._definition)
+        return law_weights(self.model, slot, weight[:, None], lambda at: at.w) if len(number) else None
 
     def parameter_arrays(self) -> dict[str, wp.array]:
         return {} if self.gravity_law is not None else {"gravity": self.gravity}

@@ -19,6 +19,7 @@ from .term import StepContext, Term
 if TYPE_CHECKING:
     from ..base.errors import ConvergenceError
     from ..model.state import State
+    from .gradients import Gradient, StepAdjoint
 
 __all__ = [
     "PROTOCOLS",
@@ -26,6 +27,7 @@ __all__ = [
     "Constrained",
     "Coupled",
     "Diagnosed",
+    "Differentiable",
     "Impacting",
     "Parametrised",
     "Preconditioned",
@@ -266,4 +268,29 @@ class Touching(Impacting):
         raise NotImplementedError
 
 
-PROTOCOLS = (Tied, Updated, Constrained, Preconditioned, Coupled, Parametrised, Diagnosed, Impacting, Touching)
+class Differentiable(Term):
+    """Term with the adjoint of its part of a step of backward Euler or of statics (solvers/adjoint.py): `product` is
+    the exact and symmetric derivative of its force at the end of the step.
+
+    A run of a model with a term that lacks it is not differentiated: the term is refused by name.
+    """
+
+    def not_differentiable(self, ctx: StepContext) -> str | None:
+        """Feature of it without an adjoint, or None."""
+        return None
+
+    def gradients(self, ctx: StepContext) -> Mapping[str, Callable[[], Gradient]]:
+        """By name of a parameter: makes the function that adds -w . dg/dparameter of a step."""
+        return {}
+
+    def law_gradient(self, ctx: StepContext, law: int) -> Gradient | None:
+        """The function that adds the derivative of the loss by the value of a time law; None: not its law."""
+        return None
+
+    def add_history_gradient(self, at: StepAdjoint) -> None:
+        """at.q_bar -= w . dg/dq_n of forces that depend on displacements at the start of the step besides q~."""
+
+
+PROTOCOLS = (
+    Tied, Updated, Constrained, Preconditioned, Coupled, Parametrised, Diagnosed, Impacting, Touching, Differentiable,
+)  # fmt: skip

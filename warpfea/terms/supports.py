@@ -15,6 +15,7 @@ from ..base.errors import ModelError
 from ..kernels.terms.loads import load_kernels
 from ..model.description import Support
 from ..time_laws import TimeLaw
+from .gradients import Gradient, StepAdjoint, law_weights
 from .term import StepContext, part
 from .time_law_table import TimeLawTable
 
@@ -108,6 +109,33 @@ class Supports:
             d = self.rotation_drives
             args = [d.slot, d.law, d.components, d.arm, d.axis, w.time_law_values, w.q_tilde, w.step.dq_dv, active, w.v]
             launch(k.drive_rotation, (B, d.count), args)
+
+    def driven(self) -> np.ndarray:
+        """(slots, 3) 1 on driven components."""
+        out = np.zeros((self.model.slots, 3))
+        if d := self.displacement_drives:
+            out[d.slot.numpy()] += d.law.numpy() >= 0
+        if d := self.rotation_drives:
+            out[d.slot.numpy()] += d.components.numpy() != 0.0
+        return (out > 0.0).astype(float)
+
+    def law_gradients(self, law: int) -> list[Gradient]:
+        """Functions that add the derivative of the loss by the value of a time law."""
+        out = []
+        d, turn = self.displacement_drives, self.rotation_drives
+        if d and (d.law.numpy() == law).any():
+            out.append(law_weights(self.model, d.slot.numpy(), d.law.numpy() == law, lambda at: at.drive_bar))
+
+        def add(at: StepAdjoint, into: wp.array) -> None:
+            assert turn is not None
+            w = at.ctx.work
+            w.rows.zero_()
+            args = [turn.slot, turn.law, law, turn.components, turn.arm, turn.axis, w.time_law_values]
+            at.ctx.launch(at.kernels.rotation_rows, (self.model.worlds, turn.count), [*args, at.drive_bar, at.active,
+                                                                                     w.rows])  # fmt: skip
+            at.add(into)
+
+        return [*out, add] if turn and (turn.law.numpy() == law).any() else out
 
     def modules(self) -> set[wp.Module]:
         """Modules launched by `drive`."""

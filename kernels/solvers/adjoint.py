@@ -1,0 +1,274 @@
+"""Adjoint of a step of backward Euler: H w + J^T mu = v_bar + h q_bar with J w = 0, and the bars of its start.
+
+A bar of a quantity is the derivative of the loss by it, w the multiplier of g = 0, mu/h that of c = 0. With
+H = M/h + h K the bars at the start of the step are v_bar_n = M w/h and q_bar_n = q_bar - K w - J^T mu/h, in terms of
+the residual r of the system (M w/h - v_bar + r)/h: no difference of nearly equal numbers where the stiffness dominates.
+On driven components r/h is the bar of their displacement.
+"""
+
+import functools
+
+import warp as wp
+
+from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
+from ..common.structs import mass_functions, topology_struct
+from ..common.types import double_1d, double_2d, double_3d, f64, int_1d, precision, vec3d, vec3d_1d, vec3d_2d
+from ..terms.constraints import ANGLE, constraint_functions, constraint_struct, multiplier_struct
+
+__all__ = ["adjoint_kernels", "adjoint_struct"]
+
+MAX_REFINEMENTS = 60
+"""Largest number of refinements of a solve; each gains the factor of a linear solve, or of the penalty."""
+MIN_REFINEMENTS = 3
+"""Refinements before a residual that does not fall by half ends a solve: the first multipliers may raise it."""
+
+
+@functools.cache
+def adjoint_struct():
+    """Scalars of the adjoint solve, per world."""
+
+    @wp.struct
+    class AdjointControl:
+        first_norm: wp.array(dtype=wp.float64)  # |right side| in the D^-1 norm
+        norm: wp.array(dtype=wp.float64)  # |r|
+        refinements: wp.array(dtype=wp.int32)
+        residual: wp.array(dtype=wp.float64)  # largest |r| / |right side| of all steps
+        sums: wp.array2d(dtype=wp.float64)  # [3, world]
+        any_active: wp.array(dtype=wp.int32)  # [1]
+        tol: wp.float64
+
+    return AdjointControl
+
+
+@functools.cache
+def adjoint_kernels(dtype: str, constrained: bool) -> KernelSet:
+    """Kernels in one precision; `constrained`: with rows of constraints."""
+    p = precision(dtype)
+    T, vec3 = p.T, p.vec3
+    Control, Topology = adjoint_struct(), topology_struct(dtype)
+    Constraints, Multipliers = constraint_struct(), multiplier_struct()
+    mass_times, functions = mass_functions(dtype).mass_times, constraint_functions(dtype)
+    module = kernel_module(f"adjoint_{dtype}{'_constrained' if constrained else ''}")
+
+    @masked_kernel(module, "active")
+    def right_side(q_bar: p.vec3_2d, v_bar: p.vec3_2d, dq_dv: double_1d, active: int_1d, out: p.vec3_2d, w: p.vec3_2d):
+        """v_bar + h q_bar; w = 0."""
+        world, slot = wp.tid()
+        out[world, slot] = v_bar[world, slot] + T(dq_dv[world]) * q_bar[world, slot]
+        w[world, slot] = vec3()
+
+    @masked_kernel(module, "active")
+    def residual(
+        free: p.vec3_1d, con: Constraints, mul: Multipliers, mu: double_2d, rhs: p.vec3_2d, Hw: p.vec3_2d,
+        diagonal: p.vec3_2d, active: int_1d, gradient: p.vec3_2d, rows: double_3d,
+    ):  # fmt: skip
+        """-r = H w + J^T mu - right side, and r.D^-1 r of the free components."""
+        world, slot = wp.tid()
+        g = Hw[world, slot] - rhs[world, slot]
+        if wp.static(constrained):
+            force = vec3d()
+            for k in range(con.slot_start[slot], con.slot_start[slot + 1]):
+                term = con.slot_term[k]
+                force += (con.slot_weight[k] * mu[world, term / 3]) * mul.gradient[world, term]
+            g += vec3(force)
+        gradient[world, slot] = g
+        s = f64(0.0)
+        for k in range(3):
+            x = f64(free[slot][k]) * f64(g[k])
+            if x != f64(0.0):
+                s += x * x / f64(diagonal[world, slot][k])
+        rows[0, world, slot] = s
+
+    @wp.kernel(module=module)
+    def check_residual(ctl: Control, start: int, active: int_1d):
+        """Continue while |r| exceeds the tolerance and falls by half; `start`: |r| is that of the right side."""
+        world = wp.tid()
+        if active[world] == 0:
+            return
+        norm = wp.sqrt(ctl.sums[0, world])
+        last = ctl.norm[world]
+        ctl.norm[world] = norm
+        if start != 0:
+            ctl.first_norm[world] = norm
+            ctl.refinements[world] = 0
+            last = f64(1.0e300)
+        count = ctl.refinements[world]
+        ctl.refinements[world] = count + 1
+        more = norm > ctl.tol * ctl.first_norm[world] and count < MAX_REFINEMENTS
+        if more and (norm < f64(0.5) * last or count < MIN_REFINEMENTS):
+            wp.atomic_max(ctl.any_active, 0, 1)
+        else:
+            active[world] = 0
+
+    @masked_kernel(module, "active")
+    def note_residual(ctl: Control, active: int_1d):
+        """Record |r| / |right side| of the solution."""
+        world = wp.tid()
+        if ctl.first_norm[world] > f64(0.0):
+            ratio = wp.sqrt(ctl.sums[0, world]) / ctl.first_norm[world]
+            if not (ratio <= ctl.residual[world]):
+                ctl.residual[world] = ratio
+
+    @masked_kernel(module, "active")
+    def add_direction(direction: p.vec3_2d, active: int_1d, w: p.vec3_2d):
+        """w += direction."""
+        world, slot = wp.tid()
+        w[world, slot] = w[world, slot] + direction[world, slot]
+
+    @masked_kernel(module, "active")
+    def update_multipliers(
+        con: Constraints, mul: Multipliers, w: p.vec3_2d, dq_dv: double_1d, active: int_1d, mu: double_2d
+    ):
+        """mu += (dq/dv) rho J w, by which the augmented operator has converged to the bordered one where J w = 0."""
+        world, row = wp.tid()
+        change = functions.directional_derivative(con, mul.gradient, w, world, row)
+        mu[world, row] = mu[world, row] + dq_dv[world] * mul.penalty[world, row] * change
+
+    @masked_kernel(module, "active")
+    def step_back(
+        topo: Topology, driven: p.vec3_1d, w: p.vec3_2d, gradient: p.vec3_2d, mass_factor: double_1d,
+        dq_dv: double_1d, active: int_1d, q_bar: p.vec3_2d, v_bar: p.vec3_2d, drive_bar: p.vec3_2d,
+    ):  # fmt: skip
+        """Bars at the start of the step, and those of driven displacements."""
+        world, slot = wp.tid()
+        scale = T(1.0) / T(dq_dv[world])
+        momentum = T(mass_factor[world]) * mass_times(topo, w, world, slot)
+        r = -gradient[world, slot]
+        prescribed = wp.cw_mul(driven[slot], r)
+        q_bar[world, slot] = scale * (momentum - v_bar[world, slot] + r - prescribed)
+        v_bar[world, slot] = momentum
+        drive_bar[world, slot] = scale * prescribed
+
+    @masked_kernel(module, "active")
+    def add_vector(x: p.vec3_2d, active: int_1d, out: p.vec3_2d):
+        """out += x."""
+        world, slot = wp.tid()
+        out[world, slot] = out[world, slot] + x[world, slot]
+
+    # derivatives by parameters: rows to be summed, and their sums
+
+    @wp.kernel(module=module)
+    def accumulate(sums: double_2d, sign: f64, active: int_1d, out: double_2d):
+        """out[world, k] += sign sums[k, world]."""
+        world, k = wp.tid()
+        if active[world] != 0:
+            out[world, k] = out[world, k] + sign * sums[k, world]
+
+    @masked_kernel(module, "active")
+    def weighted_rows(weight: p.vec3_1d, x: p.vec3_2d, active: int_1d, rows: double_3d):
+        """Components of x times weights of the slots, of the value of a time law."""
+        world, slot = wp.tid()
+        for c in range(3):
+            rows[c, world, slot] = f64(weight[slot][c]) * f64(x[world, slot][c])
+
+    @masked_kernel(module, "active")
+    def gravity_rows(lumped: p.scalar_2d, ramp: double_1d, w: p.vec3_2d, active: int_1d, rows: double_3d):
+        """w times the lumped masses."""
+        world, slot = wp.tid()
+        scale = ramp[world] * f64(lumped[world % lumped.shape[0], slot])
+        for c in range(3):
+            rows[c, world, slot] = scale * f64(w[world, slot][c])
+
+    @masked_kernel(module, "active")
+    def density_rows(
+        topo: Topology, lumped: p.scalar_2d, gravity: vec3d_1d, ramp: double_1d, v: p.vec3_2d, v_tilde: p.vec3_2d,
+        mass_factor: double_1d, w: p.vec3_2d, active: int_1d, rows: double_3d,
+    ):  # fmt: skip
+        """w.(m g - c_M M (v - v~)) with the masses of a density of 1."""
+        world, slot = wp.tid()
+        inertia = mass_times(topo, v, world, slot) - mass_times(topo, v_tilde, world, slot)
+        load = T(ramp[world]) * lumped[world % lumped.shape[0], slot] * vec3(gravity[world])
+        rows[0, world, slot] = f64(wp.dot(w[world, slot], load - T(mass_factor[world]) * inertia))
+
+    @masked_kernel(module, "active")
+    def rotation_rows(
+        slot: int_1d, law: int_1d, chosen: int, components: vec3d_1d, lever_arm: vec3d_1d, axis: vec3d_1d,
+        value: vec3d_2d, drive_bar: p.vec3_2d, active: int_1d, rows: double_3d,
+    ):  # fmt: skip
+        """Bar of the angle of `drive_rotation`."""
+        world, k = wp.tid()
+        if law[k] == chosen:
+            angle = value[world, chosen][0]
+            turn = wp.cross(axis[k], lever_arm[k])
+            change = wp.cos(angle) * turn + wp.sin(angle) * wp.cross(axis[k], turn)
+            bar = vec3d(drive_bar[world, slot[k]])
+            rows[0, world, slot[k]] = wp.dot(wp.cw_mul(components[k], change), bar)
+
+    @masked_kernel(module, "active")
+    def right_side_sums(
+        con: Constraints, mul: Multipliers, mu: double_2d, w: p.vec3_2d, dq_dv: double_1d, u: p.vec3_2d, law: int,
+        active: int_1d, sums: double_2d,
+    ):  # fmt: skip
+        """Bar of the right sides f that follow a law: -(mu/h) dc/df - lambda w.dJ/df, in the order of the rows."""
+        world = wp.tid()
+        total = vec3d()
+        for row in range(con.kind.shape[0]):
+            if con.law[row] == law:
+                scale = mul.signed_scale[world, row]
+                bar = scale * mu[world, row] / dq_dv[world]
+                if con.kind[row] == ANGLE:  # of the direction along = sin f a2 + cos f a
+                    f = mul.target[world, row]
+                    along = wp.cos(f) * (con.reference[3 * row] + functions.term_vector(con, 3 * row, u, world))
+                    along += wp.sin(f) * (
+                        con.reference[3 * row + 2] + functions.term_vector(con, 3 * row + 2, u, world)
+                    )
+                    b = con.reference[3 * row + 1] + functions.term_vector(con, 3 * row + 1, u, world)
+                    change = wp.cos(f) * functions.term_vector(con, 3 * row, w, world)
+                    change += wp.sin(f) * functions.term_vector(con, 3 * row + 2, w, world)
+                    turn = wp.dot(change, b) + wp.dot(along, functions.term_vector(con, 3 * row + 1, w, world))
+                    bar = bar * wp.dot(along, b) + scale * mul.trial_multiplier[world, row] * turn
+                c = con.law_component[row]
+                total[c] = total[c] + bar
+        for c in range(3):
+            sums[c, world] = total[c]
+
+    # probes
+
+    @wp.kernel(module=module)
+    def probe_values(
+        slot: int_1d, weight: p.scalar_1d, offset: vec3d, u: p.vec3_2d, v: p.vec3_2d, step: int,
+        displacement: double_3d, velocity: double_3d, position: double_3d,
+    ):  # fmt: skip
+        """Values of a probe at a step."""
+        world = wp.tid()
+        d = vec3d()
+        s = vec3d()
+        for k in range(slot.shape[0]):
+            d += f64(weight[k]) * vec3d(u[world, slot[k]])
+            s += f64(weight[k]) * vec3d(v[world, slot[k]])
+        for c in range(3):
+            displacement[world, step, c] = d[c]
+            position[world, step, c] = offset[c] + d[c]
+            velocity[world, step, c] = s[c]
+
+    @wp.kernel(module=module)
+    def probe_bars(
+        slot: int_1d, weight: p.scalar_1d, step: int, displacement: double_3d, velocity: double_3d,
+        position: double_3d, q_bar: p.vec3_2d, v_bar: p.vec3_2d,
+    ):  # fmt: skip
+        """Add the bars of a probe at a step to those of its slots, each in the list once."""
+        world, k = wp.tid()
+        s = slot[k]
+        q = vec3d()
+        v = vec3d()
+        for c in range(3):
+            q[c] = displacement[world, step, c] + position[world, step, c]
+            v[c] = velocity[world, step, c]
+        q_bar[world, s] = q_bar[world, s] + weight[k] * vec3(q)
+        v_bar[world, s] = v_bar[world, s] + weight[k] * vec3(v)
+
+    @wp.kernel(module=module)
+    def squared_error(values: double_3d, target: double_3d, scale: f64, loss: double_1d, bar: double_3d):
+        """Sum of scale (value - target)^2 of each world, and its derivative by the values; NaN: no target."""
+        world = wp.tid()
+        total = f64(0.0)
+        for step in range(values.shape[1]):
+            for c in range(3):
+                d = values[world, step, c] - target[world % target.shape[0], step, c]
+                if wp.isnan(d):
+                    d = f64(0.0)
+                total += scale * d * d
+                bar[world, step, c] = f64(2.0) * scale * d
+        loss[world] = total
+
+    return kernel_set(locals())

@@ -1,0 +1,73 @@
+"""Runs whose gradients are compared with differences: all points of the differences are worlds of one run."""
+
+import numpy as np
+
+import warpfea as wf
+
+LENGTHS = (1e-2, 3e-3, 1e-3)
+POINTS = np.array([-2.0, -1.0, 1.0, 2.0])
+WEIGHTS = np.array([1.0, -8.0, 8.0, -1.0]) / 12.0
+SOLVER = wf.NewtonPCG(tol=1e-12)
+LAW = wf.SVK(E=1e6, nu=0.3, density=1000.0)
+TARGET = 0.01
+
+
+def shifts(count):
+    """(1 + count x lengths x 4, count) multiples of the scale of each parameter; world 0 has none."""
+    rows = [np.zeros(count)]
+    for k in range(count):
+        rows += [length * point * np.eye(count)[k] for length in LENGTHS for point in POINTS]
+    return np.array(rows)
+
+
+def best_differences(values, exact):
+    """Smallest relative error of four-point differences of values (worlds,) of `shifts`, per parameter."""
+    table = values[1:].reshape(len(exact), len(LENGTHS), 4)
+    found = (table @ WEIGHTS) / np.array(LENGTHS)
+    return np.abs(found / np.asarray(exact)[:, None] - 1.0).min(axis=1)
+
+
+def linked(kind, worlds=1):
+    """Two bars of T4 on joints, with controls of drives and loads."""
+    b = wf.ModelBuilder(gravity=(0, 0, -9.81))
+    bars = [
+        b.add_solid(
+            wf.mesh.box((0.1, 0.02, 0.02), cells=(2, 1, 1), element="T4"),
+            transform=(np.eye(3), (x, 0, 0)),
+            material=LAW,
+            name=name,
+        )
+        for x, name in ((0.0, "a"), (0.1, "b"))
+    ]
+    first, second = bars
+    pair = {"parent": first.surface("x+"), "child": second.surface("x-"), "anchor": (0.1, 0.01, 0.01)}
+    if kind == "motor":
+        start = {"parent": wf.GROUND, "child": first.surface("x-"), "anchor": (0, 0.01, 0.01), "axis": (0, 1, 0)}
+        b.add_joint("revolute", drive=wf.Control("motor"), **start)
+        b.add_joint("revolute", axis=(0, 1, 0), **pair)
+    elif kind == "loads":
+        b.clamp(first.nodes("x-"))
+        b.add_joint("spherical", **pair)
+        rod = wf.Control("rod", initial=float(np.hypot(0.04, 0.29)))
+        b.add_joint(
+            "distance", parent=wf.GROUND, child=second.at((0.2, 0.01, 0.01)), anchor=(0.2, 0.05, 0.3), drive=rod
+        )
+        b.add_traction(second.surface("x+"), wf.Control("pull", 3))
+        b.add_point_load(first.at((0.1, 0.01, 0.01)), force=wf.Control("pull", 3))
+    else:
+        turn = wf.Rotation(anchor=(0.2, 0.01, 0.01), axis=(1, 0.3, 0), angle=wf.Control("turn"))
+        b.drive(first.nodes("x-"), displacement=wf.Control("shift", 3))
+        b.drive(second.nodes("x+"), rotation=turn)
+        b.add_joint("fixed", **pair)
+    b.add_probe("tip", second.at((0.2, 0.0, 0.02)) if kind != "drives" else second.surface("x-"))
+    return b.finalize(device="cpu", worlds=worlds, many=False)
+
+
+def controls(kind, steps):
+    """Values (steps, size) of the controls of `linked`, and their scales."""
+    ramp, rng = np.linspace(0.0, 1.0, steps)[:, None], np.random.default_rng(0)
+    return {
+        "motor": {"motor": 0.3 * ramp},
+        "loads": {"pull": 50.0 * rng.standard_normal((steps, 3)), "rod": np.hypot(0.04, 0.29) + 0.002 * ramp},
+        "drives": {"shift": 0.01 * ramp * np.ones(3), "turn": 0.4 * ramp},
+    }[kind]

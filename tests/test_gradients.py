@@ -1,0 +1,269 @@
+"""wf.Adjoint: gradients of runs and equilibria against differences and closed forms, what is refused, what it costs."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import floor_term
+import numpy as np
+import parameter_models as models
+import pytest
+import warp as wp
+from gradient_models import LAW, SOLVER, TARGET, best_differences, controls, linked, shifts
+
+import warpfea as wf
+from warpfea.simulation.adjoint import check_simulation, check_terms
+from warpfea.simulation.integrators import INTEGRATORS
+from warpfea.terms.protocols import Differentiable
+
+TOLERANCE = 1e-7
+CASES = {
+    "T4 20": (models.solid("T4"), models.SVK, 20),
+    "T10 5": (models.solid(), models.NEO, 5),
+    "3243 20": (models.beam(), models.SVK, 20),
+    "3443 1": (models.shell(), models.SVK, 1),
+    "3443 20": (models.shell(), models.SVK, 20),
+    "T4 200": (models.solid("T4"), models.RIVLIN, 200),
+}
+SLOW = ("3443 1", "3443 20", "T4 200")
+CASES = [pytest.param(*case, id=name, marks=[pytest.mark.slow] * (name in SLOW)) for name, case in CASES.items()]
+BASE = {"E": 1e6, "nu": 0.3, "eta": 30.0, "density": 1100.0}
+GRAVITY = np.array([0.0, 3.0, -9.81])
+NAMES = [*(f"body.{name}" for name in BASE), "gravity", "initial.velocity", "initial.displacement"]
+
+
+def start(m, scale):
+    """A state with displacements and velocities, those of clamped nodes too, times `scale` (worlds, 2)."""
+    rng, state = np.random.default_rng(1), m.state()
+    for array, size, factor in zip((state.displacement, state.velocity), (1e-4, 1e-2), scale.T):
+        direction = size * rng.standard_normal((m.slots, 3))
+        array.assign(factor[:, None, None] * direction)
+    return state
+
+
+def body_run(add, law, steps, rows, worlds=slice(None)):
+    """Tape of worlds whose parameters differ by `rows` from the base, those of a slice."""
+    rows = rows[worlds]
+    m = models.model(add, models.material(law), len(rows))
+    m.many = False
+    for k, (name, value) in enumerate(BASE.items()):
+        m.set_parameter(f"body.{name}", value * (1.0 + rows[:, k]))
+    m.set_gravity(GRAVITY * (1.0 + rows[:, 4:5]))
+    sim = wf.Simulation(m, start(m, 1.0 + rows[:, 5:]), dt=2e-3, solver=SOLVER)
+    tape = wf.Adjoint(sim, NAMES)
+    tape.run(steps)
+    loss = wf.loss.sum_of_squares(tape.probe("tip"), np.full((steps, 3), TARGET))
+    return m, tape, loss, {name: array.numpy() for name, array in tape.backward(loss).items()}
+
+
+@pytest.mark.parametrize(("add", "law", "steps"), CASES)
+def test_gradients_of_a_body(add, law, steps):
+    rows = shifts(len(BASE) + 3)
+    m, tape, loss, g = body_run(add, law, steps, rows)
+    state = start(m, np.ones((m.worlds, 2)))
+    exact = [g[f"body.{name}"][0] * value for name, value in BASE.items()] + [g["gravity"][0] @ GRAVITY]
+    exact += [np.sum(g[f"initial.{k}"][0] * getattr(state, k).numpy()[0]) for k in ("displacement", "velocity")]
+    chosen = [k for k, value in enumerate(exact) if not (steps == 1 and k in (0, 1))]  # E and nu: of round-off's size
+    errors = best_differences(loss.numpy(), exact)
+    assert (errors[chosen] < TOLERANCE).all(), errors
+    assert (tape.residual < 1e-10).all()
+    _, _, _, alone = body_run(add, law, steps, rows, slice(7, 8))
+    assert all(np.array_equal(alone[name][0], g[name][7]) for name in g)  # the bits of a run of its own
+
+
+@pytest.mark.parametrize("kind", ["motor", "loads", pytest.param("drives", marks=pytest.mark.slow)])
+def test_gradients_of_joints_and_controls(kind):
+    steps = 6
+    given = controls(kind, steps)
+    rng = np.random.default_rng(2)
+    scales = {name: np.abs(values).max() * rng.standard_normal(values.shape) for name, values in given.items()}
+    rows = shifts(2 + len(given))
+    m = linked(kind, len(rows))
+    m.set_parameter("a.E", 1e6 * (1.0 + rows[:, 0]))
+    m.set_parameter("b.density", 1000.0 * (1.0 + rows[:, 1]))
+    sim = wf.Simulation(m, dt=2e-3, solver=SOLVER, constraint_tol=1e-12)
+    tape = wf.Adjoint(sim, ["a.E", "b.density", *given])
+    for step in range(steps):
+        for k, (name, values) in enumerate(given.items()):
+            sim.controls[name][:] = values[step] + rows[:, 2 + k : 3 + k] * scales[name][step]
+        tape.run(1)
+    loss = wf.loss.sum_of_squares(tape.probe("tip").displacement, np.full((1, steps, 3), TARGET))
+    g = {name: array.numpy() for name, array in tape.backward(loss).items()}
+    assert all(g[name].shape == (m.worlds, *values.shape) for name, values in given.items())
+    exact = [1e6 * g["a.E"][0], 1000.0 * g["b.density"][0]]
+    exact += [np.sum(g[name][0] * scales[name]) for name in given]
+    errors = best_differences(loss.numpy(), exact)
+    assert (errors < TOLERANCE).all(), errors
+
+
+def test_free_fall():
+    """d(x)/d(g, v0, q0) of the scheme: x = q0 + n h v0 + h^2 g n (n + 1)/2."""
+    b = wf.ModelBuilder(gravity=(0, 0, -9.81))
+    box = b.add_solid(wf.mesh.box((0.1, 0.02, 0.02), cells=(2, 1, 1), element="T4"), material=LAW, name="box")
+    b.add_probe("tip", box.surface("x+"))
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=2e-3, solver=SOLVER)
+    tape = wf.Adjoint(sim, ["gravity", "initial.velocity", "initial.displacement", "box.density"])
+    n, h = 25, 2e-3
+    tape.run(10)
+    tape.run(n - 10)
+    p = tape.probe("tip")
+    assert p.displacement.numpy() == pytest.approx(sim.probe("tip").displacement, rel=1e-13)
+    assert p.position.numpy() == pytest.approx(sim.probe("tip").position, rel=1e-13)
+    grad = np.zeros((1, n, 3))
+    grad[0, -1, 2] = 1.0
+    p.position.grad.assign(grad)
+    g = {name: array.numpy() for name, array in tape.backward().items()}
+    assert g["gravity"][0] == pytest.approx([0, 0, h * h * n * (n + 1) / 2], rel=1e-12, abs=1e-15)
+    assert g["initial.velocity"][0].sum(axis=0) == pytest.approx([0, 0, n * h], rel=1e-12, abs=1e-13)
+    assert g["initial.displacement"][0].sum(axis=0) == pytest.approx([0, 0, 1], rel=1e-12, abs=1e-12)
+    assert g["box.density"] == pytest.approx(0.0, abs=1e-15)
+    velocity = np.zeros((1, n, 3))
+    velocity[0, -1, 2] = 1.0
+    p.position.grad.zero_()
+    p.velocity.grad.assign(velocity)
+    assert tape.backward()["gravity"].numpy()[0, 2] == pytest.approx(n * h, rel=1e-12)
+
+
+def test_equilibrium():
+    """A cantilever of small deflection: it is proportional to load / E."""
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    beam = b.add_beam([(0, 0, 0), (0.1, 0, 0)], elements=3, section=wf.Rectangle(0.01, 0.02), normal=(0, 0, 1),
+                      material=LAW, name="beam")  # fmt: skip
+    b.clamp(beam.start, slots="all")
+    b.add_point_load(beam.end, force=wf.Control("P", 3, initial=(0, 0, 1e-5)))
+    b.add_probe("tip", beam.end)
+    result = wf.solve_static(b.finalize(device="cpu", worlds=2), load_steps=1, tol=1e-12)
+    tape = wf.Adjoint(result, ["beam.E", "P"])
+    p = tape.probe("tip")
+    tip = p.displacement.numpy()[:, 0, 2]
+    assert tip == pytest.approx(result.probe("tip").displacement[:, -1, 2], rel=1e-13)
+    p.displacement.grad.assign(np.array([[[0, 0, 1.0]], [[0, 0, 2.0]]]))
+    g = tape.backward()
+    assert g["beam.E"].numpy() == pytest.approx(-tip / 1e6 * [1, 2], rel=1e-6)
+    assert g["P"].numpy()[:, 2] == pytest.approx(tip / 1e-5 * [1, 2], rel=1e-6)
+    assert g["P"].shape == (2, 3)
+    with pytest.raises(wf.ModelError, match="no steps"):
+        tape.run(1)
+
+
+class SmoothFloor(floor_term.Floor, Differentiable):
+    """Without slip: a linear spring under the nodes that stay in contact."""
+
+
+def resting(term, worlds=1, **options):
+    b = wf.ModelBuilder(gravity=(0, 0, -9.81))
+    mesh = wf.mesh.box((0.1, 0.1, 0.1), cells=(1, 1, 1), element="T4")
+    box = b.add_solid(mesh, transform=(np.eye(3), (0, 0, -0.01)), material=LAW, name="box")
+    b.add_probe("top", box.surface("z+"))
+    b.add_term(lambda m: term(m, kt=0.0))
+    m = b.finalize(device="cpu", worlds=worlds)
+    return m, wf.Simulation(m, dt=1e-3, solver=SOLVER, **options)
+
+
+def test_a_term_says_whether_it_is_differentiable():
+    _, sim = resting(floor_term.Floor)
+    with pytest.raises(wf.ModelError, match="'floor' has no adjoint"):
+        wf.Adjoint(sim, "gravity")
+    rows = shifts(1)
+    m, sim = resting(SmoothFloor, len(rows))
+    m.set_gravity(GRAVITY * [0, 0, 1] * (1.0 + rows))
+    tape = wf.Adjoint(sim, "gravity")
+    tape.run(5)
+    loss = wf.loss.sum_of_squares(tape.probe("top"), np.zeros((5, 3)))
+    exact = [tape.backward(loss)["gravity"].numpy()[0, 2] * GRAVITY[2]]
+    assert (best_differences(loss.numpy(), exact) < TOLERANCE).all()
+
+
+def bar(change=lambda b, box: None, law=LAW):
+    """A model of one bar of T4."""
+    b = wf.ModelBuilder(gravity=(0, 0, -9.81))
+    box = b.add_solid(wf.mesh.box((0.1, 0.02, 0.02), cells=(2, 1, 1), element="T4"), material=law, name="box")
+    change(b, box)
+    b.add_probe("tip", box.surface("x+"))
+    return b.finalize(device="cpu")
+
+
+def test_terms_and_schemes_without_an_adjoint_are_refused_by_name():
+    def floor(b, box):
+        b.add_contact(box, b.add_collider(wf.HalfSpace(normal=(0, 0, 1), offset=-1.0)), mu=0.5, name="pad")
+
+    ctx = SimpleNamespace(inertia=True)
+    with pytest.raises(wf.ModelError, match=r"contact.* has no adjoint"):
+        check_terms(bar(floor), ctx)
+    with pytest.raises(wf.ModelError, match="'followers' has no adjoint"):
+        check_terms(bar(lambda b, box: b.add_pressure(box.surface("z+"), 1.0)), ctx)
+    damped = bar(law=models.material(form="rate"))
+    with pytest.raises(wf.ModelError, match="damping of the form 'rate'"):
+        check_terms(damped, ctx)
+    check_terms(damped, SimpleNamespace(inertia=False))  # no rates in statics
+    fixed = SimpleNamespace(step_size_control=None)
+    sim = {"integrator": INTEGRATORS["backward_euler"], "stepper": fixed, "t_end": None}
+    sim |= {"model": SimpleNamespace(dtype="float64")}
+    check_simulation(SimpleNamespace(**sim), False)
+    for change, match in {
+        "'bdf2' has no adjoint": {"integrator": INTEGRATORS["bdf2"]},
+        "result of solve_static": {"integrator": INTEGRATORS["static"]},
+        "variable length": {"t_end": np.ones(1)},
+        "float32": {"model": SimpleNamespace(dtype="float32")},
+    }.items():
+        with pytest.raises(wf.ModelError, match=change):
+            check_simulation(SimpleNamespace(**(sim | match)), False)
+
+
+def test_misuse_is_refused(monkeypatch):
+    m = bar()
+    sim = wf.Simulation(m, dt=1e-3)
+    with pytest.raises(wf.ModelError, match=r"'box.F' has no derivative; .*box.E"):
+        wf.Adjoint(sim, "box.F")
+    tape = wf.Adjoint(sim, "gravity")
+    with pytest.raises(wf.ModelError, match="no step"):
+        tape.backward()
+    tape.run(2)
+    with pytest.raises(wf.ModelError, match="shape"):
+        wf.loss.sum_of_squares(tape.probe("tip"), np.zeros((3, 3)))
+    with pytest.raises(wf.ModelError, match="there are: 'tip'"):
+        tape.probe("tap")
+    tape.budget = 1000
+    with pytest.raises(wf.CapacityError, match=r"5 steps of .* exceed 1.0 kB"):
+        tape.run(3)
+    tape.budget = None
+    m.set_gravity((0, 0, 1.0))
+    with pytest.raises(wf.ModelError, match="parameters were set"):
+        tape.backward()
+    sim.reset()
+    tape.run(1)
+    assert tape.steps == 1
+    report = sim.last
+    monkeypatch.setattr(sim, "step", lambda: replace(report, halvings=np.ones(1, int)))
+    with pytest.raises(wf.ModelError, match="was halved"):
+        tape.run(1)
+
+
+def test_failed_worlds():
+    m = linked("motor", 2)
+    sim = wf.Simulation(m, dt=2e-3, on_failure="freeze")
+    tape = wf.Adjoint(sim, ["a.E", "motor"])
+    tape.run(2)
+    sim.freeze([1])
+    loss = wf.loss.sum_of_squares(tape.probe("tip"), np.full((2, 3), TARGET))
+    g = tape.backward(loss)
+    assert np.isfinite(g["a.E"].numpy()[0])
+    assert np.isnan(g["a.E"].numpy()[1])
+    assert np.isnan(g["motor"].numpy()[1]).all()
+
+
+def test_a_run_without_gradients_has_nothing_of_them():
+    m = models.model(models.solid("T4"), models.material())
+    sim = wf.Simulation(m, dt=2e-3)
+    sim.step(2)
+    names = {*sim.stepper.launch.modules, *(module.name for module in sim.stepper.modules()), *sim.bytes()}
+    assert not any("adjoint" in name or "history_gradient" in name for name in names)
+    before = [array.numpy().tobytes() for array in (sim.state.displacement, sim.state.velocity)]
+    other = wf.Simulation(m, dt=2e-3)
+    tape = wf.Adjoint(other, "body.E")
+    tape.run(2)
+    tape.backward(wf.loss.sum_of_squares(tape.probe("tip"), np.zeros((2, 3))))
+    assert before == [array.numpy().tobytes() for array in (other.state.displacement, other.state.velocity)]
+    assert "adjoint w" in tape.stepper.work.bytes
+    assert isinstance(tape.probe("tip").velocity.grad, wp.array)
+    again = [tape.backward()["body.E"].numpy() for _ in range(2)]
+    assert np.array_equal(*again)

@@ -1,0 +1,406 @@
+"""Gradients of a run: the adjoint of each step, backwards from the last, for all worlds at once on the device.
+
+The tape keeps displacements, velocities, joint forces and controls of every step. Going back, a stepper of its own
+linearises each step at its converged state with the code that advanced it; see solvers/adjoint.py for the solve.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from ..base.console import compile_progress_bar, format_bytes, quiet_warp
+from ..base.errors import CapacityError, ConvergenceError, ModelError, ModelWarning
+from ..base.launch import load_modules
+from ..base.memory import convert_memory_errors
+from ..base.names import did_you_mean, listing
+from ..kernels.step.step_control import STATUS
+from ..model.state import MONITOR_ARRAYS, is_solver_history
+from ..solvers import NewtonPCG
+from ..solvers.adjoint import AdjointSolver
+from ..terms.gradients import Gradient, StepAdjoint
+from ..terms.protocols import Differentiable
+from ..terms.time_law_table import control_array
+from .capacity import RESERVED_FRACTION, free_bytes
+from .simulation import Simulation
+from .statics import StaticResult
+from .stepper import Stepper
+
+if TYPE_CHECKING:
+    from ..model.model import Model
+
+__all__ = ["Adjoint", "ProbeArrays", "check_simulation", "check_terms"]
+
+INITIAL = ("initial.displacement", "initial.velocity")
+MAX_RESIDUAL = 1e-6
+"""Largest relative residual of an adjoint solve: beyond, the gradient of a world is refused."""
+MAX_PCG, MAX_WORK = 20_000, 2**30
+"""Iterations of a solve, as in statics, and of a step, no limit."""
+NOT_KEPT = ("ledger", "ledger_time", "status", *MONITOR_ARRAYS)
+"""State arrays that no step depends on."""
+
+
+@dataclass(eq=False)
+class ProbeArrays:
+    """A probe of a tape: displacement, velocity and position, arrays (worlds, steps, 3) with gradients, m and m/s.
+
+    Attributes:
+        slot, weight, offset: its slots, each once, their weights, and its reference position.
+    """
+
+    slot: wp.array
+    weight: wp.array
+    offset: wp.vec3d
+    displacement: wp.array
+    velocity: wp.array
+    position: wp.array
+
+    @property
+    def arrays(self) -> tuple[wp.array, wp.array, wp.array]:
+        """The three arrays."""
+        return self.displacement, self.velocity, self.position
+
+
+class Adjoint:
+    """Tape of a run of backward Euler, or of an equilibrium, and its gradients.
+
+    Args:
+        sim: a Simulation with integrator="backward_euler" and a fixed dt, or a result of `solve_static`.
+        with_respect_to: names of `Model.set_parameter` of materials, "gravity", controls, "initial.displacement" and
+            "initial.velocity".
+        tol: relative residual of the adjoint solves, in the D^-1 norm.
+        budget: largest number of bytes of the steps kept on the device; None: the free memory.
+
+    Attributes:
+        residual: (worlds,) largest relative residual of the adjoint solves of the last `backward`.
+        growth: (worlds,) norm of the right side of the first step over that of the last, of the last `backward`: how
+            much a run amplifies what disturbs its start.
+        steps: number of steps kept.
+
+    Raises:
+        ModelError: an unknown name, or a term, scheme or precision without an adjoint, by name.
+        CapacityError: insufficient device memory.
+    """
+
+    def __init__(
+        self, sim: Simulation | StaticResult, with_respect_to: Sequence[str], *, tol: float = 1e-10,
+        budget: int | None = None,
+    ) -> None:  # fmt: skip
+        self.static = isinstance(sim, StaticResult)
+        self.sim: Simulation = sim.simulation if isinstance(sim, StaticResult) else sim
+        self.model = m = self.sim.model
+        if not (isinstance(tol, float) and 0.0 < tol < 1.0):
+            raise ModelError(f"Adjoint: tol = {tol!r} must lie between 0 and 1")
+        self.names = [with_respect_to] if isinstance(with_respect_to, str) else list(with_respect_to)
+        self.budget = budget
+        check_simulation(self.sim, self.static)
+        check_terms(m, self.sim.stepper.ctx)
+        with convert_memory_errors(f"an adjoint of {m.worlds} worlds", m.device):
+            with quiet_warp(), compile_progress_bar(None) as bar:
+                self._make_solver(tol, bar)
+            self.outputs = {name: self._sources(name) for name in self.names}
+        self.kept: list[dict[str, wp.array]] = []
+        self.probes: dict[str, ProbeArrays] = {}
+        self.steps = 0
+        self.residual = self.growth = np.zeros(m.worlds)
+        self._updates = self.model.terms.parameter_updates
+        if self.static:
+            self.kept = [self._snapshot()]
+            self.kept *= 2
+            self.steps = 1
+
+    def __repr__(self) -> str:
+        return f"Adjoint({self.steps} steps of {self.model.worlds} worlds, with respect to {', '.join(self.names)})"
+
+    def _make_solver(self, tol: float, on_compile: Any) -> None:
+        m, given = self.model, self.sim.solver
+        keys = ("preconditioner", "preconditioner_dtype", "penalty")
+        own = {key: getattr(given, key) for key in keys} if isinstance(given, NewtonPCG) else {}
+        options = NewtonPCG(operator="elements", max_pcg=MAX_PCG, max_work=MAX_WORK, max_halvings=0, **own)
+        self.state = m.state()
+        self.stepper = s = Stepper(
+            m, self.state, self.sim.integrator, options, ledger=False, capture=False,
+            loop={"plan": None, "constraint_tol": 1e300, "inversion": "report"}, on_compile=on_compile,
+        )  # fmt: skip
+        s.predictor = None
+        driven: wp.array = wp.array(m.terms.supports.driven(), dtype=m.types.vec3, device=m.device)
+        self.solver = a = AdjointSolver(s.newton, driven, tol)
+        self.end_velocity = s.work.array("adjoint end velocity", (m.worlds, m.slots), m.types.vec3)
+        self.at = StepAdjoint(
+            s.ctx, a.w, a.mu, a.drive_bar, a.q_bar, a.running, a.kernels, a.control.sums, s.work.z,
+            s.newton.residual.reduce,
+        )  # fmt: skip
+        modules = {module.name: module for module in {*a.modules(), *self._term_modules()}}
+        load_modules(modules, m.device, on_compile)
+
+    def _term_modules(self) -> list[wp.Module]:
+        elements = self.stepper.newton.residual.elements
+        return [kernel.module for _, kernel in elements.history_kernels()] if self.stepper.ctx.inertia else []
+
+    # what is differentiated by
+
+    def _sources(self, name: str) -> list[Callable[[], Gradient]]:
+        """Makers of the functions that add the derivative by a parameter; none for initial values."""
+        ctx, terms, laws = self.stepper.ctx, list(self.model.terms), self.model.terms.time_laws
+        found = [known[name] for term in terms if name in (known := term.gradients(ctx))]
+        if name in INITIAL and not self.static:
+            return found
+        if name in laws.controls:
+            indices = [law for (control, _), law in laws.control_laws.items() if control == name]
+            for law in indices:
+                given = [term.law_gradient(ctx, law) for term in terms]
+                given += self.model.terms.supports.law_gradients(law)
+                found += [lambda gradient=gradient: gradient for gradient in given if gradient is not None]
+        if not found:
+            known = [key for term in terms for key in term.gradients(ctx)]
+            known += [*laws.controls, *(() if self.static else INITIAL)]
+            hint = did_you_mean(name, known) if isinstance(name, str) else ""
+            raise ModelError(f"Adjoint: {name!r} has no derivative; there are: {listing(known)}{hint}")
+        return found
+
+    def _size_of(self, name: str) -> int:
+        """Numbers of a parameter in a world and step."""
+        control = self.model.terms.time_laws.controls.get(name)
+        return control.size if control else 3 if name == "gravity" else 1
+
+    # forward
+
+    def run(self, steps: int) -> None:
+        """Advance the simulation, and keep its steps, after those kept so far unless it was reset since.
+
+        Raises:
+            ModelError: a step that was halved; parameters set since the first step; a static result.
+            ConvergenceError: as `Simulation.step`. CapacityError: more bytes than the budget.
+        """
+        if self.static:
+            raise ModelError("Adjoint: an equilibrium has no steps to run")
+        if self.kept and not np.array_equal(self.kept[-1]["time"].numpy(), self.sim.time):
+            self.kept, self.steps = [], 0
+        self._check_budget(steps)
+        if not self.kept:
+            self._updates = self.model.terms.parameter_updates
+        self._check_parameters()
+        with convert_memory_errors(f"a tape of {steps} steps", self.model.device):
+            if not self.kept:
+                self.kept = [self._snapshot()]
+            for _ in range(steps):
+                controls = self._controls()
+                report = self.sim.step()
+                alive = self.sim.status == STATUS["running"]
+                if (report.halvings[alive] > 0).any():
+                    raise ModelError(
+                        f"Adjoint: the step to t = {float(self.sim.time.max()):g} s was halved, and its parts are not "
+                        "kept: take a smaller dt"
+                    )
+                self.kept[-1] |= controls  # those of the step
+                self.kept.append(self._snapshot())
+                self.steps += 1
+        self.probes.clear()
+
+    def _check_budget(self, steps: int) -> None:
+        free = free_bytes(self.model.device)
+        room = self.budget if self.budget is not None else None if free is None else int((1 - RESERVED_FRACTION) * free)
+        arrays = self.sim.state.bytes
+        size = sum(arrays[name] for name in self._kept_names())
+        kept = self.steps if self.budget is not None else 0
+        if room is not None and (kept + steps + 1) * size > room:
+            raise CapacityError(
+                f"Adjoint: {kept + steps} steps of {format_bytes(size)} exceed {format_bytes(room)}; maximum: "
+                f"{max(room // size - 1, 0)} steps",
+                bytes=(kept + steps + 1) * size, per_world=size // self.model.worlds,
+            )  # fmt: skip
+
+    def _check_parameters(self) -> None:
+        if self.model.terms.parameter_updates != self._updates:
+            raise ModelError("Adjoint: parameters were set after the first step of the tape; reset the simulation")
+
+    def _kept_names(self) -> list[str]:
+        state = self.sim.state
+        return [n for n in state.names if not is_solver_history(n) and n not in NOT_KEPT and n in self.state.names]
+
+    def _snapshot(self) -> dict[str, wp.array]:
+        return {name: wp.clone(getattr(self.sim.state, name)) for name in self._kept_names()}
+
+    def _controls(self) -> dict[str, wp.array]:
+        names = [control_array(name) for name in self.model.terms.time_laws.controls]
+        return {name: wp.clone(getattr(self.sim.state, name)) for name in names}
+
+    def probe(self, name: str) -> ProbeArrays:
+        """Probe of the steps kept; the derivatives of a loss by its arrays are their `.grad`."""
+        known = [p.name for p in self.model.description.probes]
+        if name not in known:
+            raise ModelError(f"probe {name!r} is unknown; there are: {listing(known)}{did_you_mean(name, known)}")
+        if name in self.probes:
+            return self.probes[name]
+        m, given = self.model, self.model.description.probes[known.index(name)]
+        slots, index = np.unique(given.body.slot_offset + given.slots, return_inverse=True)
+        weights = np.bincount(index, weights=given.weights)
+        shape = (m.worlds, self.steps, 3)
+        arrays: list[Any] = [wp.zeros(shape, dtype=wp.float64, device=m.device, requires_grad=True) for _ in range(3)]
+        slot: wp.array = wp.array(slots, dtype=wp.int32, device=m.device)
+        weight: wp.array = wp.array(weights, dtype=m.types.T, device=m.device)
+        out = ProbeArrays(slot, weight, wp.vec3d(*given.X), *arrays)
+        for k in range(self.steps):
+            end = self.kept[k + 1]
+            args = [slot, weight, out.offset, end["displacement"], end["velocity"], k, *arrays]
+            self.stepper.launch(self.solver.kernels.probe_values, m.worlds, args)
+        self.probes[name] = out
+        return out
+
+    # backward
+
+    def backward(self, loss: Any = None) -> dict[str, wp.array]:
+        """Derivatives of a loss, each world's own, by name.
+
+        Args:
+            loss: of `wf.loss`; None: the derivatives by the probes' arrays are in their `.grad`, from the `backward` of
+                Warp's tape or of torch.
+
+        Returns:
+            arrays [world] of constants, [world, 3] of gravity, [world, step, size] of controls (of statics [world,
+                size]), [world, slot] of initial values; NaN in worlds that failed.
+
+        Raises:
+            ModelError: no step, or parameters that changed since.
+            ConvergenceError: a residual above 1e-6, in all worlds that run.
+        """
+        if not self.steps:
+            raise ModelError("Adjoint: no step to go back; run(steps) first")
+        self._check_parameters()
+        m, a = self.model, self.solver
+        if loss is not None:
+            for array in (array for probe in self.probes.values() for array in probe.arrays):
+                array.grad.zero_()
+            loss.backward()
+        sums, series = {name: self._zeros(self._size_of(name)) for name in self.names}, {}
+        for name in (name for name in self.names if name in m.terms.time_laws.controls):
+            series[name] = self._zeros(self.steps, self._size_of(name))
+        self.stepper.set_dt(1.0 if self.static else self.sim._dt if self.sim._dt is not None else self.sim.dt)
+        self.state.status.assign(self.sim.state.status)
+        self.stepper.newton.invalidate(wp.ones(m.worlds, dtype=wp.int32, device=m.device))
+        for array in (a.q_bar, a.v_bar, a.control.residual):
+            array.zero_()
+        graph, last = None, np.zeros(m.worlds)
+        for k in reversed(range(self.steps)):
+            self._add_probes(k)
+            self._load(k)
+            graph = graph or self._capture(sums)
+            for name in series:
+                sums[name].zero_()
+            wp.capture_launch(graph)
+            for name, array in series.items():
+                wp.copy(array[:, k], sums[name])
+            if not last.any():
+                last = a.control.first_norm.numpy().copy()
+        self.growth = a.control.first_norm.numpy() / np.where(last > 0.0, last, np.inf)
+        self.residual = a.control.residual.numpy().copy()
+        failed = self.sim.status != STATUS["running"]
+        self._check_result(~failed)
+        out = sums | series
+        out |= {name: wp.clone(a.q_bar if name == INITIAL[0] else a.v_bar) for name in self.names if name in INITIAL}
+        return {name: self._finished(array, failed) for name, array in out.items()}
+
+    def _zeros(self, *shape: int) -> wp.array:
+        """Zeros [world, ...], float64."""
+        return wp.zeros((self.model.worlds, *shape), dtype=wp.float64, device=self.model.device)
+
+    def _capture(self, sums: dict[str, wp.array]) -> wp.Graph:
+        """Graph of one step back, from the state at its start."""
+        gradients = [(make(), sums[name]) for name, makers in self.outputs.items() for make in makers]
+        with wp.ScopedCapture(device=self.model.device) as recorded:
+            self._linearise()
+            self.solver.solve()
+            for add, out in gradients:
+                add(self.at, out)
+            for term in self.model.terms.having(Differentiable):
+                term.add_history_gradient(self.at)
+        self._gradients = gradients  # owns the arrays of the graph
+        return recorded.graph
+
+    def _finished(self, array: wp.array, failed: np.ndarray) -> wp.array:
+        """A result in its shape, NaN in failed worlds."""
+        if failed.any():
+            host = array.numpy()
+            host[failed] = np.nan
+            array.assign(host)
+        if self.static and array.ndim == 3:
+            return array[:, 0]
+        return array.reshape((len(failed),)) if array.shape == (len(failed), 1) and array.dtype == wp.float64 else array
+
+    def _check_result(self, running: np.ndarray) -> None:
+        worst = np.where(running, self.residual, 0.0)
+        if not (worst <= MAX_RESIDUAL).all():
+            world = int(np.argmax(~(worst <= MAX_RESIDUAL)))
+            raise ConvergenceError(
+                f"Adjoint: the residual of a solve is {worst[world]:.2g} in world {world}: its tangent is singular or "
+                "indefinite",
+                world=world,
+            )
+        largest = float(np.max(self.growth, initial=0.0))
+        if largest * self.solver.control.tol > math.sqrt(MAX_RESIDUAL):
+            warnings.warn(
+                f"Adjoint: the gradient grows by {largest:.2g} over {self.steps} steps: the run amplifies errors of "
+                "its solves as much",
+                ModelWarning,
+                stacklevel=3,
+            )
+
+    def _add_probes(self, k: int) -> None:
+        """Add the derivatives by the probes at the end of a step."""
+        a = self.solver
+        for probe in self.probes.values():
+            grads = [array.grad for array in probe.arrays]
+            dim = (self.model.worlds, len(probe.slot))
+            args = [probe.slot, probe.weight, k, *grads, a.q_bar, a.v_bar]
+            self.stepper.launch(a.kernels.probe_bars, dim, args)
+
+    def _load(self, k: int) -> None:
+        """The state at the start of a step, with the joint forces and velocities at its end."""
+        start, end = self.kept[k], self.kept[k + 1]
+        for name in start:
+            wp.copy(getattr(self.state, name), (end if name == "constraint_force" else start)[name])
+        if self.static:
+            self.end_velocity.zero_()
+            self.state.time.zero_()
+            if "summed_time" in self.state.names:
+                self.state.summed_time.zero_()
+        else:
+            wp.copy(self.end_velocity, end["velocity"])
+
+    def _linearise(self) -> None:
+        """Evaluate the step at its converged end: forces, D, penalties."""
+        s, w = self.stepper, self.stepper.work
+        s.launch(s.kernels.begin_step, self.model.worlds, [w.step, w.newton, w.pcg])
+        s.begin_attempt()
+        wp.copy(w.v, self.end_velocity)
+        s.newton._clear_direction(w.newton.active)
+        s.newton._evaluate_first_iterate(w.newton.active)
+
+
+def check_simulation(sim: Any, static: bool) -> None:
+    """ModelError for a simulation whose steps have no adjoint; `static`: of the result of `solve_static`."""
+    scheme = sim.integrator
+    if scheme.name not in ("backward_euler", "static"):
+        raise ModelError(f"Adjoint: integrator {scheme.name!r} has no adjoint; take 'backward_euler'")
+    if scheme.static != static:
+        raise ModelError("Adjoint: of statics it takes the result of solve_static")
+    if sim.stepper.step_size_control or sim.t_end is not None:
+        raise ModelError("Adjoint: steps of variable length have no adjoint; take a fixed dt, without t_end")
+    if sim.model.dtype != "float64":
+        raise ModelError("Adjoint: float32 can't resolve the residual of an adjoint; take dtype='float64'")
+
+
+def check_terms(model: Model, ctx: Any) -> None:
+    """ModelError naming a term that has no adjoint in the steps of a context."""
+    for term in model.terms:
+        if not isinstance(term, Differentiable):
+            raise ModelError(f"Adjoint: {term.name!r} has no adjoint: its term is not Differentiable")
+        reason = term.not_differentiable(ctx)
+        if reason:
+            raise ModelError(f"Adjoint: {term.name!r} has no adjoint for {reason}")

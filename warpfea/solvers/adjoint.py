@@ -1,0 +1,127 @@
+"""Solution of the adjoint of a step on the device, by the simulation's own operator and preconditioner.
+
+The operator is the exact tangent at the converged state, from the elements: neither a matrix of another iterate nor a
+predicted stress. With constraints its penalties make it the augmented operator A = H + J^T R J, and mu += R J w after
+each solve (Uzawa's method) leads to the bordered system [H J^T; J 0]. Each refinement solves for the residual.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import warp as wp
+
+from ..base.launch import launch_part
+from ..kernels.common.structs import topology_struct
+from ..kernels.solvers.adjoint import adjoint_kernels, adjoint_struct
+from ..kernels.terms.constraints import constraint_struct
+from ..terms.gradients import with_fields
+from ..terms.protocols import Constrained
+from ..terms.term import Term
+
+if TYPE_CHECKING:
+    from .newton import NewtonLoop
+
+__all__ = ["AdjointSolver"]
+
+
+class AdjointSolver:
+    """Adjoint of the step that a Newton loop is linearised at.
+
+    Attributes:
+        q_bar, v_bar: derivatives of the loss by displacements and velocities [world, slot]; `solve` replaces those at
+            the end of a step by those at its start, as far as these do not act through a history.
+        w: multipliers of the residual, m/N of the loss. mu: of the constraint rows, times h.
+        drive_bar: derivatives by driven displacements.
+        control: norms of the residual.
+    """
+
+    def __init__(self, newton: NewtonLoop, driven: wp.array, tol: float) -> None:
+        self.newton, self.driven = newton, driven
+        self.model, self.work, self.launch = newton.model, newton.work, newton.launch
+        m, w = self.model, self.work
+        self.constrained = m.terms.traits.constraint_rows
+        self.kernels = adjoint_kernels(m.dtype, self.constrained)
+        names = ("q_bar", "v_bar", "w", "rhs", "drive_bar")
+        self.q_bar, self.v_bar, self.w, self.rhs, self.drive_bar = (
+            w.array(f"adjoint {name}", (m.worlds, m.slots), m.types.vec3) for name in names
+        )
+        tables = m.terms.find(Constrained).tables if self.constrained else None
+        self.constraint_data: Any = tables.data if tables else constraint_struct()()
+        self.mu = w.array("adjoint mu", (m.worlds, tables.count if tables else 1), wp.float64)
+        self.control: Any = w.struct(adjoint_struct(), m.worlds, sums=(3, m.worlds))
+        self.control.tol = tol
+        self.dim = (m.worlds, m.slots)
+        self.active = wp.zeros(m.worlds, dtype=wp.int32, device=m.device)
+        # prescribed components too: products give their reactions
+        unprescribed: wp.array = wp.zeros(m.slots, dtype=wp.uint8, device=m.device)
+        self.topology = with_fields(topology_struct(m.dtype), m.topology, prescribed_bits=unprescribed)
+        w.newton.solve.fixed_forcing = 1
+        w.newton.solve.forcing.fill_(math.sqrt(tol))
+
+    def modules(self) -> set[wp.Module]:
+        """Modules launched, besides those of the Newton loop."""
+        return {self.kernels.module}
+
+    @property
+    def running(self) -> wp.array:
+        """Flags of the worlds of this step."""
+        return self.work.step.running
+
+    @launch_part("vectors")
+    def solve(self) -> None:
+        """Solve at the linearised step, and step back."""
+        m, w, launch, k = self.model, self.work, self.launch, self.kernels
+        newton, active, step = w.newton, w.newton.active, w.step
+        for flags in (newton.norms.component_converged, newton.floor.estimate_error, newton.solve.predicted_stress):
+            flags.zero_()
+        newton.iterations.fill_(newton.max_iterations)  # factors are checked by products
+        w.pcg.step_iterations.zero_()
+        wp.copy(active, self.running)
+        launch(k.right_side, self.dim, [self.q_bar, self.v_bar, step.dq_dv, active, self.rhs, self.w])
+        self.mu.zero_()
+        w.Hp.zero_()
+        self._check(start=1)
+        wp.capture_while(self.control.any_active, self._refine)
+        wp.copy(active, self.running)
+        if self.constrained:  # the residual is that of the bordered system
+            w.multipliers.penalty.zero_()
+        self._product()
+        self._evaluate_residual()
+        launch(k.note_residual, m.worlds, [self.control, active])
+        args = [m.topology, self.driven, self.w, w.gradient, step.mass_factor, step.dq_dv, active]
+        launch(k.step_back, self.dim, [*args, self.q_bar, self.v_bar, self.drive_bar])
+
+    def _refine(self) -> None:
+        """Add the solution for the residual; worlds leave the flags of the Newton loop as they converge."""
+        w, launch, k, active = self.work, self.launch, self.kernels, self.work.newton.active
+        self.newton.preconditioner.prepare(active)
+        self.newton.pcg.solve(active)
+        self.newton.preconditioner.record_cost()
+        launch(k.add_direction, self.dim, [w.direction, active, self.w])
+        self._product()
+        if self.constrained:
+            args = [self.constraint_data, w.multipliers, self.w, w.step.dq_dv, active, self.mu]
+            launch(k.update_multipliers, self.mu.shape, args)
+        self._check(start=0)
+
+    def _check(self, start: int) -> None:
+        self._evaluate_residual()
+        self.control.any_active.zero_()
+        self.launch(self.kernels.check_residual, self.model.worlds, [self.control, start, self.work.newton.active])
+
+    def _evaluate_residual(self) -> None:
+        m, w, active = self.model, self.work, self.work.newton.active
+        args = [m.topology.free, self.constraint_data, w.multipliers, self.mu, self.rhs, w.Hp, w.diagonal, active]
+        self.launch(self.kernels.residual, self.dim, [*args, w.gradient, w.rows])
+        self.newton.residual.reduce(w.rows, 1, active, self.control.sums)
+
+    def _product(self) -> None:
+        """A w on all components, into work.Hp."""
+        m, w, active, residual = self.model, self.work, self.work.newton.active, self.newton.residual
+        residual.elements.tangent(residual.ctx, self.w, active)
+        m.terms.call(residual.ctx, Term, "product", self.w, active)
+        args = [self.topology, w.contribution, residual.product_terms, self.w, active, self.constraint_data]
+        kernel = residual.gather_kernels.operator_product
+        self.launch(kernel, (m.worlds, self.launch.padded(m.slots)), [*args, w.multipliers, w.Hp, w.warp_rows])

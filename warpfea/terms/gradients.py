@@ -1,0 +1,204 @@
+"""Derivatives of a loss by parameters, -w . dg/dparameter of each step, on the device.
+
+All laws are linear in their device coefficients, viscosity too: the internal force evaluated with the derivatives of
+the coefficients in their place is the derivative of the force, exactly. Derivatives of the coefficients by the
+constants that users give are those of a complex step through the code of the materials.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from ..kernels.common.structs import topology_struct
+from ..kernels.elements.assumed_strain_block import assumed_strain_struct
+from ..kernels.elements.materials import NCOEF
+from ..kernels.elements.points import block_struct
+from ..kernels.solvers.vectors import vector_kernels
+from ..kernels.step.gather import gather_kernels
+from ..materials import DENSITY_CONSTANTS
+from ..model import assembly
+from ..model.blocks import couplings
+
+if TYPE_CHECKING:
+    from ..model.model import Model
+    from .term import StepContext
+
+__all__ = ["Gradient", "StepAdjoint", "law_weights", "material_gradients", "with_fields"]
+
+STEP = 1e-30
+"""Complex step: derivatives are exact to round-off for any small one."""
+
+
+@dataclass(eq=False)
+class StepAdjoint:
+    """Adjoint of a linearised step, as of solvers/adjoint.py.
+
+    Attributes:
+        ctx: at its end; its state is that of the start.
+        w, mu, drive_bar, q_bar, active, kernels: of the solver.
+        sums: [3, world] scratch. scratch: [world, slot].
+        reduce: sums of rows.
+    """
+
+    ctx: StepContext
+    w: wp.array
+    mu: wp.array
+    drive_bar: wp.array
+    q_bar: wp.array
+    active: wp.array
+    kernels: Any
+    sums: wp.array
+    scratch: wp.array
+    reduce: Callable[[wp.array, int, wp.array, wp.array], None]
+
+    @property
+    def dim(self) -> tuple[int, int]:
+        """(worlds, slots)."""
+        return self.ctx.model.worlds, self.ctx.model.slots
+
+    def add(self, out: wp.array, sign: float = 1.0) -> None:
+        """out [world, k] += sign times the sums of the first rows of work.rows."""
+        self.reduce(self.ctx.work.rows, out.shape[1], self.active, self.sums)
+        self.accumulate(out, sign)
+
+    def accumulate(self, out: wp.array, sign: float) -> None:
+        """out [world, k] += sign sums[k, world]."""
+        self.ctx.launch(self.kernels.accumulate, out.shape, [self.sums, wp.float64(sign), self.active, out])
+
+    def gather(self, out: wp.array) -> None:
+        """Contributions of the elements, summed by slot."""
+        m, w = self.ctx.model, self.ctx.work
+        kernel = gather_kernels(m.dtype, self.ctx.traits).gather_force
+        self.ctx.launch(kernel, self.dim, [m.topology, w.contribution, self.active, out])
+
+
+Gradient = Callable[[StepAdjoint, wp.array], None]
+"""Adds the derivatives of a step to an array [world, k], float64."""
+
+
+def with_fields(kind: Any, data: Any, **changes: Any) -> Any:
+    """Copy of a struct with other values of some fields."""
+    out = kind()
+    for name in kind.vars:
+        setattr(out, name, changes.get(name, getattr(data, name)))
+    return out
+
+
+def law_weights(
+    model: Model, slots: np.ndarray, weights: np.ndarray, of: Callable[[StepAdjoint], wp.array]
+) -> Gradient:
+    """Derivative by the value of a law that acts on slots with weights (n, 3) or (n, 1): their sums of a vector."""
+    table = np.zeros((model.slots, 3))
+    np.add.at(table, slots, weights)
+    weight: wp.array = wp.array(table, dtype=model.types.vec3, device=model.device)
+
+    def add(at: StepAdjoint, out: wp.array) -> None:
+        args = [weight, of(at), at.active, at.ctx.work.rows]
+        at.ctx.launch(at.kernels.weighted_rows, at.dim, args)
+        at.add(out)
+
+    return add
+
+
+def material_gradients(ctx: StepContext, elements: Any) -> dict[str, Callable[[], Gradient]]:
+    """Derivatives by the constants of materials, by the names of `Model.set_parameter`."""
+    out: dict[str, Callable[[], Gradient]] = {}
+    parameters = elements.model.parameters
+    known = parameters.setters()
+    for owner, members in parameters.owners().items():
+        for name in (key.rpartition(".")[2] for key in known if key.rpartition(".")[0] == owner):
+            make = density_gradient if name in DENSITY_CONSTANTS else constant_gradient
+            out[f"{owner}.{name}"] = partial(make, ctx, elements, members, name)
+    return out
+
+
+def density_gradient(ctx: StepContext, elements: Any, members: list[Any], name: str) -> Gradient:
+    """Derivative by the density of some materials, of inertia and gravity."""
+    m = elements.model
+    masses = m.masses
+    entries, lumped = np.zeros((1, masses.matrix.nnz)), np.zeros((1, m.slots))
+    for body, k in members:
+        key = m.bodies.index(body), k
+        part, rows = masses.parts[key].matrix, slice(body.slot_offset, body.slot_offset + body.slot_count)
+        entries[0, masses.entry_indices[key]] += part.data
+        lumped[0, rows] += part @ m.slot_table.is_position[rows]
+    arrays: list[wp.array] = [wp.array(values, dtype=m.types.T, device=m.device) for values in (entries, lumped)]
+    topology = with_fields(topology_struct(m.dtype), m.topology, mass_value=arrays[0])
+
+    def add(at: StepAdjoint, out: wp.array) -> None:
+        w = at.ctx.work
+        args = [topology, arrays[1], m.terms.dead_loads.constant_gravity, w.step.load_factor, w.v, w.v_tilde]
+        at.ctx.launch(at.kernels.density_rows, at.dim, [*args, w.step.mass_factor, at.w, at.active, w.rows])
+        at.add(out)
+
+    return add
+
+
+def constant_gradient(ctx: StepContext, elements: Any, members: list[Any], name: str) -> Gradient:
+    """Derivative by a constant of the laws or of the damping of some materials."""
+    m = elements.model
+    worlds = m.parameters.coefficients.shape[0]
+    table = np.zeros((worlds, m.parameters.coefficients.shape[1], NCOEF))
+    chosen = [block for block in m.blocks if any((p.body, p.material) in members for p in block.host_blocks)]
+    for block in chosen:
+        for part in block.host_blocks:
+            if (part.body, part.material) in members:
+                material = _shifted(m.parameters.material_of_worlds(part.body, part.material), name)
+                _, values = assembly.law_and_coefficients(part.key.integral, material)
+                rows = assembly.coefficient_rows(values, material, worlds, complex)
+                table[:, part.coefficient_row] = rows.imag / STEP
+    coefficients: wp.array = wp.array(table, dtype=m.types.T, device=m.device)
+    kernels = dict(zip(map(id, m.blocks), elements.kernels(ctx)))
+    passes = [[(block, {"coefficients": coefficients}) for block in chosen]]
+    tied = [block for block in chosen if block.key.tying and name in block.key.tying.material_constants]
+    passes += [[(block, {"coupling": _coupling_derivative(m, block, members, name)}) for block in tied]] if tied else []
+    dot_terms = vector_kernels(m.dtype, m.terms.traits.has_constraints).dot_terms
+    launches = [
+        [(block, kernels[id(block)], _block_data(m.dtype, block, changes)) for block, changes in row] for row in passes
+    ]
+
+    def add(at: StepAdjoint, out: wp.array) -> None:
+        w = at.ctx.work
+        for row in launches:
+            w.contribution.zero_()
+            for block, kernel, data in row:
+                elements.block_force(at.ctx, block, kernel, data, at.active)
+            at.gather(at.scratch)
+            at.ctx.launch(dot_terms, at.dim, [at.scratch, at.w, at.active, w.rows])
+            at.add(out, -1.0)
+
+    return add
+
+
+def _shifted(material: Any, name: str) -> Any:
+    """The material with a complex step of a constant."""
+    return material.with_constants({name: material.constants[name] + 1j * STEP})
+
+
+def _block_data(dtype: str, block: Any, changes: dict[str, Any]) -> Any:
+    kind = (assumed_strain_struct if block.key.tying else block_struct)(dtype)
+    return with_fields(kind, block.data, **changes)
+
+
+def _coupling_derivative(m: Model, block: Any, members: list[Any], name: str) -> wp.array:
+    """Derivative of the matrices A of a block with assumed strains, in their layout on the device."""
+    worlds = m.worlds if block.couplings_per_world else 1
+    tables = []
+    for part in block.host_blocks:
+        if (part.body, part.material) not in members:
+            tables.append(np.zeros((worlds, len(part.elements), *block.data.coupling.shape[:2])))
+            continue
+        material = m.parameters.material_of_worlds(part.body, part.material)
+        values, of_world = np.unique(np.broadcast_to(material.constants[name], (worlds,)), return_inverse=True)
+        plain = part.body.materials[part.material][1]
+        shifted = [plain.with_constants({name: float(value) + 1j * STEP}) for value in values]
+        tables.append((couplings(part, shifted).imag / STEP)[of_world])
+    table = np.concatenate(tables, axis=1)
+    values = np.moveaxis(table.reshape(-1, *table.shape[2:]), 0, 2)
+    return wp.array(np.ascontiguousarray(values), dtype=m.types.T, device=m.device)
