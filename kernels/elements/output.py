@@ -1,13 +1,16 @@
 """Kernels of table elements for particular scenes or outputs, one module each: history, viscous force, stress,
 deformation gradient."""
 
+import functools
+
 import warp as wp
 
 from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
-from ..common.types import double_1d, double_2d, int_1d
+from ..common.types import double_1d, double_2d, int_1d, precision
 from . import materials
+from .points import point_functions
 
-__all__ = ["output_kernels"]
+__all__ = ["gradient_kernel", "output_kernels"]
 
 
 def output_kernels(fn: KernelSet, name: str) -> KernelSet:
@@ -21,9 +24,8 @@ def output_kernels(fn: KernelSet, name: str) -> KernelSet:
     moving_module = kernel_module(f"{name}_history_moving")
     viscous_module = kernel_module(f"{name}_viscous")
     stress_module = kernel_module(f"{name}_stress")
-    gradient_module = kernel_module(f"{name}_gradient")
     p = fn.types
-    T, vec3, sym6, mat33 = p.T, p.vec3, p.sym, p.mat33
+    T, vec3, sym6 = p.T, p.vec3, p.sym
     t, m, Block, Local = fn.tensors, fn.law, fn.Block, fn.Local
     ETA_INDEX, LAMBDA_V_INDEX = materials.ETA_INDEX, materials.LAMBDA_V_INDEX
 
@@ -100,7 +102,17 @@ def output_kernels(fn: KernelSet, name: str) -> KernelSet:
             stress[world, point, elem] = fn.to_voigt((T(1.0) / J) * (P + P * wp.transpose(G)))
             jacobian[world, point, elem] = J
 
-    @wp.kernel(module=gradient_module)
+    return kernel_set(locals())
+
+
+@functools.cache
+def gradient_kernel(dtype: str, slots: int, affine: bool):
+    """Kernel of F of elements with so many slots, of any law."""
+    p = precision(dtype)
+    fn = point_functions(dtype, "svk", slots, affine, None, False)
+    Block, t, mat33 = fn.Block, fn.tensors, p.mat33
+
+    @wp.kernel(module=kernel_module(f"gradient_{dtype}_{slots}{'_affine' if affine else ''}"))
     def point_gradient(block: Block, u: p.vec3_2d, gradient: wp.array3d(dtype=mat33)):
         """F at the points, Eq. (1), [world, point, elem]."""
         world, elem = wp.tid()
@@ -108,4 +120,4 @@ def output_kernels(fn: KernelSet, name: str) -> KernelSet:
         for point in range(block.shape_gradient.shape[0]):
             gradient[world, point, elem] = t.identity() + fn.field_gradient(block, U, point, elem)
 
-    return kernel_set(locals())
+    return point_gradient

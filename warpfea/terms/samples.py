@@ -21,6 +21,7 @@ import scipy.sparse as sp
 import warp as wp
 
 from ..elements import Rule
+from ..kernels.elements.output import gradient_kernel
 from ..kernels.outputs.fields import field_kernels
 from ..model import assembly
 from ..model.state import State
@@ -125,11 +126,15 @@ class Samples:
     def point_values(self, name: str, block: Any, state: State) -> wp.array:
         """Values [world, point, elem] of a block."""
         m, evaluation = self.model, self.model.evaluation
-        shape, kernels = (m.worlds, block.points, block.count), block.kernels_for(m.dtype, None)
+        shape = (m.worlds, block.points, block.count)
         if name == "gradient":
-            out = evaluation.zeros(shape, m.types.mat33)
-            evaluation.launch(kernels.point_gradient, (m.worlds, block.count), [block.data, state.displacement, out])
+            out, kernel = (
+                evaluation.zeros(shape, m.types.mat33),
+                gradient_kernel(m.dtype, block.slots, block.key.affine),
+            )
+            evaluation.launch(kernel, shape[::2], [block.data, state.displacement, out])
             return out
+        kernels = block.kernels_for(m.dtype, None)
         stress, J = evaluation.zeros(shape, m.types.sym), evaluation.zeros(shape, m.types.T)
         evaluation.launch(kernels.point_stress, (m.worlds, block.count), [block.data, state.displacement, stress, J])
         return stress if name == "stress" else J
