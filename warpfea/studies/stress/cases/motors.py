@@ -1,5 +1,7 @@
 """Stiff controllers, stops, friction, and chains of motors."""
 
+from typing import Any
+
 import numpy as np
 
 import warpfea as wf
@@ -8,7 +10,7 @@ from ..build import GRAVITY_VECTOR, StepStats, Y, Z, finalize, step
 from ..case import FLOAT32_REFUSAL, Answer, Setting, case
 
 
-def _wheel(inertia: float, rate: float, **options: object) -> tuple[wf.ModelBuilder, wf.Joint]:
+def _wheel(inertia: float, rate: float, **options: Any) -> tuple[wf.ModelBuilder, wf.Joint]:
     """A part of so much inertia (kg m^2) about a hinge along z, turning at a rate, rad/s."""
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     part = b.add_rigid(wf.Box((0, 0, 0), (0.2, 0.2, 0.2)), mass=100.0 * inertia, inertia=(inertia,) * 3, name="part")
@@ -80,7 +82,8 @@ def held_chain(setting: Setting, value: tuple[int, float]) -> Answer:
     """Rigid links of 1 kg and 0.1 m in a row, held out by damped motors: their torques are those of the weights."""
     count, kp = value
     b = wf.ModelBuilder(gravity=GRAVITY_VECTOR)
-    parent, joints = wf.GROUND, []
+    parent: Any = wf.GROUND
+    joints = []
     for k in range(count):
         link = b.add_rigid(wf.Box((0.1 * k + 0.05, 0, 0), (0.1, 0.03, 0.03)), mass=1.0, name=f"link {k}")
         at = (0.1 * k, 0.0, 0.0)
