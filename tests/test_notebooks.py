@@ -76,3 +76,22 @@ def test_a_model_is_shown_before_a_run(model, tmp_path):
         for image in (marked, plain)
     ]
     assert green[0] > 3 * green[1]  # of the axis y
+
+
+def test_springs_are_marked_from_end_to_end():
+    from warpfea.outputs.markers import Markers, group_marks
+
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    box = wf.mesh.box((1, 0.2, 0.2), cells=(2, 1, 1))
+    one, two = (b.add_solid(box, material=wf.SVK(E=1e7, nu=0.3, density=1000), name=name) for name in "ab")
+    b.add_spring(one.at((1, 0.2, 0.2)), two.at((0, 0, 0)), stiffness=1.0)
+    b.add_spring((0.0, 0.0, 3.0), one.at((0.5, 0.1, 0.1)), stiffness=1.0)
+    made = b.finalize(device="cpu")
+    sim = wf.Simulation(made, dt=1e-3)
+    marks = Markers(sim, made.bodies)
+    assert group_marks(marks.kinds(1)) == [("spring", [0, 1]), ("spring", [2, 3])]
+    u = sim.state.displacement.numpy()
+    u[0, : one.slot_count, 2] = 0.25  # the first body moves up
+    sim.state.displacement.assign(u)
+    wanted = [(1, 0.2, 0.45), (0, 0, 0), (0, 0, 3), (0.5, 0.1, 0.35)]
+    assert np.abs(marks.points(sim)[0] - wanted).max() < 1e-12

@@ -18,7 +18,7 @@ from ..base.writer import Output, check_target, write_atomically
 from ..model.surfaces import reference_points
 from ..simulation.plots import energy_plot, record_plots, run_warnings
 from .frames import DrawnSurface, FrameClock, check_colors, check_fields, field_label, frame_time, is_static
-from .markers import Markers
+from .markers import Markers, group_marks
 from .page import Page, PageSurface
 from .raycaster import DEFAULT_VIEW, check_view
 
@@ -206,8 +206,9 @@ class HTMLWriter(Output):
         rows = [frame.vectors for frame in self._frames]
         sizes = [float(np.linalg.norm(v)) for row in rows for v in row if v is not None]
         largest = max(sizes, default=0.0) or 1.0
-        for k, (kind, name) in enumerate(self._markers.own):
-            mark = {"kind": kind, "name": name, "surface": last, "points": [k]}
+        for kind, group in group_marks([kind for kind, _ in self._markers.own]):
+            k = group[0]
+            mark = {"kind": kind, "name": self._markers.own[k][1], "surface": last, "points": group}
             if rows[0][k] is not None:
                 mark["vectors"] = [[round(float(x), 4) for x in np.asarray(row[k]) / largest] for row in rows]
             out.append(mark)

@@ -20,7 +20,7 @@ class Look:
 
     Args:
         ground: True draws a ground at the lowest point, False none; None: where a horizontal half-space is.
-        marks: kinds of marks drawn: "support", "joint", "load", "probe"; a file of USD holds none.
+        marks: kinds of marks drawn: "support", "joint", "spring", "load", "probe".
         axes: draw a triad of the axes. edges: draw the edges of elements. undeformed: draw the shape at rest, too, seen
             through.
         scale: factor of the displacements drawn. extremes: write the least and the largest value where they are.
@@ -34,7 +34,7 @@ class Look:
     """
 
     ground: bool | None = None
-    marks: Sequence[str] = ("support", "joint")
+    marks: Sequence[str] = ("support", "joint", "spring")
     axes: bool = False
     edges: bool = False
     undeformed: bool = False

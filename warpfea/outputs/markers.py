@@ -5,13 +5,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..kernels.terms.springs import LENGTH
+from ..model.joints import Vector
 from ..model.surfaces import reference_points
 
-__all__ = ["KINDS", "MARKED_WORLDS", "Markers"]
+__all__ = ["KINDS", "MARKED_WORLDS", "Markers", "group_marks"]
 
 Array = npt.NDArray[Any]
-KINDS = ("support", "joint", "load", "probe")
-"""Kinds of marks."""
+KINDS = ("support", "joint", "spring", "load", "probe")
+"""Kinds of marks; a spring has two points, one after the other."""
 MARKED_WORLDS = 16
 """Pictures and files of more worlds have no marks."""
 SHOWN_POINTS = 12
@@ -54,6 +56,10 @@ class Markers:
         for joint in joints[:SHOWN_JOINTS]:
             slots, weights, _ = joint.anchor.entries()
             self._mark("joint", f"{joint.name} ({joint.kind})", joint.anchor.value, slots, weights)
+        for spring in getattr(description, "springs", ())[:SHOWN_JOINTS]:
+            if spring.kind == LENGTH:
+                for X, slots, weights in _spring_ends(spring.items[0][0]):
+                    self._mark("spring", spring.name, X, slots, weights)
         for load in getattr(description, "dead_loads", ()):
             share = np.abs(np.asarray(load.weights, dtype=float)).reshape(len(load.slots), -1).sum(axis=1)
             share[load.body.slot_kind[load.slots] != 0] = 0.0
@@ -109,6 +115,37 @@ class Markers:
     def vectors(self, time: float, factor: float = 1.0) -> list[Array | None]:
         """Force of each mark of its own at a time (s), times a load factor; None unless samples give it."""
         return [None if law is None else _sampled(law, time, factor) for law in self._laws]
+
+
+def group_marks(kinds: list[str]) -> list[tuple[str, list[int]]]:
+    """Kinds with their points: two of a spring, one of others."""
+    out: list[tuple[str, list[int]]] = []
+    for k, kind in enumerate(kinds):
+        if kind == "spring" and out and out[-1][0] == "spring" and len(out[-1][1]) == 1:
+            out[-1][1].append(k)
+        else:
+            out.append((kind, [k]))
+    return out
+
+
+def _spring_ends(gap: Vector) -> list[tuple[Array, Array, Array]]:
+    """Place at rest, model slots and weights of both ends of a spring along `gap`; an end on the ground has none."""
+    ends: list[tuple[Array, Array, Array] | None] = []
+    for child, sign in ((False, -1.0), (True, 1.0)):
+        parts = [part for part in gap.parts if part.on_child_side == child]
+        places = [
+            sign
+            * part.weights
+            @ (part.body.reference[part.slots] + (part.body.slot_kind[part.slots] == 0)[:, None] * part.body.origin)
+            for part in parts
+        ]
+        slots = [part.body.slot_offset + part.slots for part in parts]
+        weights = [sign * part.weights for part in parts]
+        ends.append((sum(places), np.concatenate(slots), np.concatenate(weights)) if parts else None)
+    first, second = ends
+    none = np.zeros(0, dtype=np.int64), np.zeros(0)
+    first = first or (second[0] - gap.value, *none)  # type: ignore[index]
+    return [first, second or (first[0] + gap.value, *none)]
 
 
 def _sampled(law: Any, time: float, factor: float) -> Array | None:

@@ -18,7 +18,13 @@ BAR_WIDTH = 0.17
 """Width of the colour bar as a fraction of the picture's."""
 # the font has no µ
 _UNIT_PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, "u"), (1e-9, "n"))
-_MARK_COLORS = {"support": (27, 122, 61), "joint": (176, 74, 0), "load": (179, 18, 59), "probe": (35, 39, 46)}
+_MARK_COLORS = {
+    "support": (27, 122, 61),
+    "joint": (176, 74, 0),
+    "spring": (90, 96, 110),
+    "load": (179, 18, 59),
+    "probe": (35, 39, 46),
+}
 _AXIS_COLORS = ((195, 51, 51), (42, 143, 42), (51, 102, 204))
 
 
@@ -40,7 +46,12 @@ class Overlay:
         """Draw onto a picture by PIL."""
         unit = size[1] / 90.0
         font = pillow.ImageFont.load_default(max(9.0, size[1] / 38))
+        springs = [camera.project(point, size) for kind, point in self.marks if kind == "spring"]
+        for first, second in zip(springs[::2], springs[1::2]):
+            draw.line([*first, *second], fill=_MARK_COLORS["spring"], width=max(1, round(0.4 * unit)))
         for kind, point in self.marks:
+            if kind == "spring":
+                continue
             x, y = camera.project(point, size)
             color = _MARK_COLORS[kind]
             if kind == "support":

@@ -328,6 +328,7 @@ class View {
     const draw = {
       support: ([x, y]) => { pen.moveTo(x, y); pen.lineTo(x - 4.5, y + 8); pen.lineTo(x + 4.5, y + 8); pen.closePath(); pen.fill(); },
       joint: ([x, y]) => { pen.arc(x, y, 6, 0, 7); pen.stroke(); pen.moveTo(x + 2, y); pen.arc(x, y, 2, 0, 7); pen.fill(); },
+      spring: ([x, y]) => { pen.arc(x, y, 1.5, 0, 7); pen.fill(); },
       probe: ([x, y]) => { pen.rect(x - 3, y - 3, 6, 6); pen.stroke(); },
       load: ([x, y]) => { pen.arc(x, y, 2.5, 0, 7); pen.fill(); },
     };
@@ -336,7 +337,11 @@ class View {
     pen.globalAlpha = 0.85;
     for (const marker of $("marks").checked ? this.data.markers : []) {
       pen.fillStyle = pen.strokeStyle = color(marker.kind === "probe" ? "ink" : marker.kind);
-      for (const s of this.shown().filter((other) => other.mesh === this.data.surfaces[marker.surface]))
+      for (const s of this.shown().filter((other) => other.mesh === this.data.surfaces[marker.surface])) {
+        if (marker.kind === "spring" && marker.points.length === 2) {
+          const [a, b] = marker.points.map((p) => at(Array.from(s.points.subarray(3 * p, 3 * p + 3))));
+          pen.beginPath(); pen.moveTo(...a); pen.lineTo(...b); pen.stroke();
+        }
         for (const p of marker.points) {
           const point = Array.from(s.points.subarray(3 * p, 3 * p + 3));
           if (dot(point, cut) > cut[3]) continue;
@@ -350,6 +355,7 @@ class View {
             arrow(sum(point, n, 0.35 * length), n.map((x) => -0.35 * length * x));
           }
         }
+      }
     }
     pen.globalAlpha = 1;
     if (this.spot) { const [x, y] = at(this.spot); pen.strokeStyle = color("ink"); pen.beginPath(); pen.arc(x, y, 4, 0, 7); pen.stroke(); }

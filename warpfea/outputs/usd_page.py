@@ -8,6 +8,7 @@ import numpy.typing as npt
 
 from ..base.lazy import pxr
 from .html import MAX_WORLDS
+from .markers import group_marks
 from .page import Page, PageSurface
 from .usd_marks import read_kinds
 from .usd_obstacles import EDGES
@@ -53,7 +54,8 @@ def usd_page(
     if marks:
         kinds = read_kinds(marks[:1])
         page.markers = [
-            {"kind": k, "name": "", "surface": len(page.surfaces), "points": [i]} for i, k in enumerate(kinds)
+            {"kind": kind, "name": "", "surface": len(page.surfaces), "points": points}
+            for kind, points in group_marks(kinds)
         ]
         first_points, all_points = _moving(marks, offsets, page.origin, codes)
         page.surfaces.append(PageSurface("marks", "points", first_points, points=all_points))
