@@ -27,7 +27,7 @@ def best_differences(values, exact):
     return np.abs(found / np.asarray(exact)[:, None] - 1.0).min(axis=1)
 
 
-def linked(kind, worlds=1):
+def linked(kind, worlds=1, device="cpu"):
     """Two bars of T4 on joints, with controls of drives and loads."""
     b = wf.ModelBuilder(gravity=(0, 0, -9.81))
     bars = [
@@ -60,7 +60,7 @@ def linked(kind, worlds=1):
         b.drive(second.nodes("x+"), rotation=turn)
         b.add_joint("fixed", **pair)
     b.add_probe("tip", second.at((0.2, 0.0, 0.02)) if kind != "drives" else second.surface("x-"))
-    return b.finalize(device="cpu", worlds=worlds, many=False)
+    return b.finalize(device=device, worlds=worlds, many=False)
 
 
 def controls(kind, steps):

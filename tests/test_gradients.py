@@ -95,6 +95,22 @@ def test_gradients_of_joints_and_controls(kind):
     assert (errors < TOLERANCE).all(), errors
 
 
+@pytest.mark.cuda
+def test_gradients_on_a_gpu():
+    """Those of the CPU, in worlds with motors of their own."""
+    found = []
+    for device in ("cpu", "cuda:0"):
+        sim = wf.Simulation(linked("motor", 3, device), dt=2e-3, solver=SOLVER, constraint_tol=1e-12)
+        tape = wf.Adjoint(sim, ["a.E", "b.density", "gravity", "motor", "initial.velocity"])
+        for step in range(6):
+            sim.controls["motor"][:] = 0.05 * step * np.arange(1, 4)
+            tape.run(1)
+        loss = wf.loss.sum_of_squares(tape.probe("tip"), np.full((6, 3), TARGET))
+        found.append({name: array.numpy() for name, array in tape.backward(loss).items()})
+    for name, values in found[0].items():
+        assert found[1][name] == pytest.approx(values, rel=1e-7, abs=1e-8 * np.abs(values).max()), name
+
+
 def test_free_fall():
     """d(x)/d(g, v0, q0) of the scheme: x = q0 + n h v0 + h^2 g n (n + 1)/2."""
     b = wf.ModelBuilder(gravity=(0, 0, -9.81))

@@ -120,9 +120,9 @@ class Adjoint:
 
     def _make_solver(self, tol: float, on_compile: Any) -> None:
         m, given = self.model, self.sim.solver
-        keys = ("preconditioner", "preconditioner_dtype", "penalty")
+        keys = ("preconditioner", "preconditioner_dtype", "penalty", "operator")
         own = {key: getattr(given, key) for key in keys} if isinstance(given, NewtonPCG) else {}
-        options = NewtonPCG(operator="elements", max_pcg=MAX_PCG, max_work=MAX_WORK, max_halvings=0, **own)
+        options = NewtonPCG(max_pcg=MAX_PCG, max_work=MAX_WORK, max_halvings=0, **own)
         self.state = m.state()
         self.stepper = s = Stepper(
             m, self.state, self.sim.integrator, options, ledger=False, capture=False,

@@ -1,8 +1,9 @@
 """Solution of the adjoint of a step on the device, by the simulation's own operator and preconditioner.
 
-The operator is the exact tangent at the converged state, from the elements: neither a matrix of another iterate nor a
-predicted stress. With constraints its penalties make it the augmented operator A = H + J^T R J, and mu += R J w after
-each solve (Uzawa's method) leads to the bordered system [H J^T; J 0]. Each refinement solves for the residual.
+The operator is the exact tangent at the converged state, from the elements or their matrix of this step: neither a
+matrix of another iterate nor a predicted stress; residuals are those of products by the elements. With constraints its
+penalties make it the augmented operator A = H + J^T R J, and mu += R J w after each solve (Uzawa's method) leads to the
+bordered system [H J^T; J 0]. Each refinement solves for the residual.
 """
 
 from __future__ import annotations
@@ -80,6 +81,7 @@ class AdjointSolver:
         w.pcg.step_iterations.zero_()
         wp.copy(active, self.running)
         launch(k.right_side, self.dim, [self.q_bar, self.v_bar, step.dq_dv, active, self.rhs, self.w])
+        self.newton.residual.assemble_matrix(active)  # a matrix of the operator is that of this step
         self.mu.zero_()
         w.Hp.zero_()
         self._check(start=1)
