@@ -190,7 +190,7 @@ class Adjoint:
             if not self.kept:
                 self.kept = [self._snapshot()]
             for _ in range(steps):
-                controls = self._controls()
+                given = self._controls() | {"dt": wp.clone(self.sim.stepper.work.step.dt)}
                 report = self.sim.step()
                 alive = self.sim.status == STATUS["running"]
                 if (report.halvings[alive] > 0).any():
@@ -198,7 +198,7 @@ class Adjoint:
                         f"Adjoint: the step to t = {float(self.sim.time.max()):g} s was halved, and its parts are not "
                         "kept: take a smaller dt"
                     )
-                self.kept[-1] |= controls  # those of the step
+                self.kept[-1] |= given  # for the step
                 self.kept.append(self._snapshot())
                 self.steps += 1
         self.probes.clear()
@@ -281,7 +281,7 @@ class Adjoint:
         sums, series = {name: self._zeros(self._size_of(name)) for name in self.names}, {}
         for name in (name for name in self.names if name in m.terms.time_laws.controls):
             series[name] = self._zeros(self.steps, self._size_of(name))
-        self.stepper.set_dt(1.0 if self.static else self.sim._dt if self.sim._dt is not None else self.sim.dt)
+        self.stepper.set_dt(1.0)  # of statics; others follow
         self.state.status.assign(self.sim.state.status)
         self.stepper.newton.invalidate(wp.ones(m.worlds, dtype=wp.int32, device=m.device))
         for array in (a.q_bar, a.v_bar, a.control.residual):
@@ -363,8 +363,9 @@ class Adjoint:
     def _load(self, k: int) -> None:
         """The state at the start of a step, with the joint forces and velocities at its end."""
         start, end = self.kept[k], self.kept[k + 1]
-        for name in start:
-            wp.copy(getattr(self.state, name), (end if name == "constraint_force" else start)[name])
+        for name, array in start.items():
+            into = self.stepper.work.step.dt if name == "dt" else getattr(self.state, name)
+            wp.copy(into, end[name] if name == "constraint_force" else array)
         if self.static:
             self.end_velocity.zero_()
             self.state.time.zero_()
