@@ -1,0 +1,60 @@
+"""Bushings of unlike stiffness, stiff parts that fall, slender tubes."""
+
+import numpy as np
+
+import warpfea as wf
+
+from ..build import GRAVITY_VECTOR, StepStats, finalize, solve, step
+from ..case import FLOAT32_REFUSAL, Answer, Setting, case
+
+
+@case("bushing", "mounts", values=[(k, h) for k in (1e-2, 1e2, 1e8) for h in (1e-3, 1e-2)], quick="float64",
+      refusal=FLOAT32_REFUSAL)  # fmt: skip
+def bushing(setting: Setting, value: tuple[float, float]) -> Answer:
+    """Two free parts of 1 kg tumble on a bushing of k N/m and k/100 N m/rad: their energy is kept."""
+    k, h = value
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    parts = [b.add_rigid(wf.Box((0.1 * n, 0, 0), (0.1,) * 3), mass=1.0, name=f"part {n}") for n in range(2)]
+    b.add_bushing(*(part.at((0.05, 0, 0)) for part in parts), stiffness=k * np.array([1, 2, 3, 0.01, 0.02, 0.03]))
+    b.set_initial(parts[0], velocity=(0.1, 0.2, 0.3), angular_velocity=(1, 2, 3))
+    sim, stats = wf.Simulation(finalize(b, setting), dt=h, integrator="energy_momentum"), StepStats()
+    first = float(sim.energies()["kinetic"][0])
+    stats.step(sim, 50)
+    e = sim.energies()
+    error = abs(float(e["kinetic"][0] + e["springs"][0]) / first - 1.0)
+    return stats.answer(error, 1e-3 if setting.single else 1e-7, "energy", lowest_J=None)
+
+
+@case("fallen-part", "mounts", values=[(1e7, 0.02), (2e11, 0.02), (2e11, 0.5), (2e13, 0.5)], quick="float64",
+      refusal=FLOAT32_REFUSAL)  # fmt: skip
+def fallen_part(setting: Setting, value: tuple[float, float]) -> Answer:
+    """A block of 10 kg falls by h m on a plane and lies on it after 0.5 s, by its place over its side."""
+    E, height = value
+    b = wf.ModelBuilder(gravity=GRAVITY_VECTOR)
+    law = wf.SVK(E=E, nu=0.3, density=1e4)
+    block = b.add_rigid(wf.Box((0, 0, 0), (0.1,) * 3), mass=10.0, material=law, name="block")
+    b.add_contact(block, b.add_collider(wf.HalfSpace((0, 0, 1), -height - 0.05)), mu=0.3)
+    fall = np.sqrt(2.0 * height / -GRAVITY_VECTOR[2])
+    sim, stats = step(b, setting, int((fall + 0.5) / 1e-3), dt=1e-3, integrator="bdf2")
+    error = abs(float(sim.pose(block)[0][0, 2]) + height) / 0.1
+    return stats.answer(error, 1e-3, "rest", lowest_J=None)
+
+
+@case("tube", "mounts", values=[(wall, L) for wall in (1e-3, 0.5, 0.99) for L in (0.2, 20.0)], quick="float64",
+      refusal=FLOAT32_REFUSAL)  # fmt: skip
+def tube(setting: Setting, value: tuple[float, float]) -> Answer:
+    """A tube of 0.1 m with a wall of so many radii, L m long, under a force at its end: F L^3/(3 E I) + F L/(k G A)."""
+    wall, L = value
+    section, E = wf.Tube(0.1, 0.1 * wall), 1e9
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    beam = b.add_beam([(0, 0, 0), (L, 0, 0)], elements=8, section=section, normal=(0, 0, 1),
+                      material=wf.SVK(E=E, nu=0.3))  # fmt: skip
+    b.clamp(beam.start, slots="position+section")
+    inertia = np.pi * (0.1**4 - section.bore**4) / 4.0
+    exact = L**3 / (3.0 * E * inertia) + L / (section.shear * E / 2.6 * section.area)
+    force = 1e-4 * L / exact
+    b.add_point_load(beam.end, (0, 0, force))
+    b.add_probe("tip", beam.end)
+    static = solve(b, setting, load_steps=1)
+    error = abs(static.result.probe("tip").displacement[0, -1, 2] / (force * exact) - 1.0)
+    return static.stats.answer(float(error), 1e-2 if setting.single else 1e-5, "beam theory", lowest_J=None)
