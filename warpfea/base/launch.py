@@ -68,7 +68,7 @@ class Launcher:
         """Launch one thread per item of `dim`; empty launches are skipped. 0: blocks of the module's option."""
         if min([dim] if isinstance(dim, int) else dim) == 0:
             return
-        size = block_dim or kernel.module.options["block_dim"]
+        size = block_dim or kernel.module.options["block_dim"] or 256
         self._launch(wp.launch, kernel, [dim] if isinstance(dim, int) else dim, inputs, size)
 
     def lanes(self, per_row: int) -> int:

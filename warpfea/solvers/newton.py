@@ -313,8 +313,7 @@ class NewtonLoop:
             launch(k.compare_first_iterates, self.model.worlds, [w.newton, 0, better])
             launch(self.vector_kernels.copy_active, self.dim, [w.v, better, w.best_velocity])
         launch(self.vector_kernels.copy_active, self.dim, [w.best_velocity, choose, w.v])
-        # beside contacts, which change as much, an old preconditioner costs 0.2 iterations a solve and no rebuild
-        self._evaluate_first_iterate(choose, rebuild=not self.terms.traits.unilateral)
+        self._evaluate_first_iterate(choose, rebuild=True)
         launch(k.begin_iteration, self.model.worlds, [w.newton, 2])
         self._check_inversion()
 

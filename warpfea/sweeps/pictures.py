@@ -80,12 +80,12 @@ def draw_sheet(result: Any, target: pathlib.Path, designs: Sequence[int], field:
         tile = _Tile(target, field=field, size=PICTURE)
         group.simulate(group.model(1), own, outputs=[tile])
         tiles.append(tile)
-    limits = np.array([tile.drawn.color_limits() for tile in tiles])
+    limits = np.array([tile.drawn.color_limits(tile) for tile in tiles])
     low, high = float(limits[:, 0].min()), float(limits[:, 1].max())
     for place, (index, tile) in enumerate(zip(designs, tiles)):
         tile.drawn.color_range = (low, high) if low < high else None
         x, y = width * (place % columns), height * (place // columns)
-        (image,) = tile.drawn.draw(PICTURE, tile.view, [0], tile.ground)
+        (image,) = tile.drawn.draw(PICTURE, tile.view, [0], tile)
         sheet.paste(pillow.Image.fromarray(image).convert("RGB"), (x, y))
         label = f"{index}: " + ", ".join(f"{name} {result[name][index]:.4g}" for name in result.measures)
         pillow.ImageDraw.Draw(sheet).text((x + 8, y + 8), label, fill="black")
