@@ -41,6 +41,7 @@ from .model.model import Model as Model
 from .model.shapes import Box as Box, Capsule as Capsule, Cylinder as Cylinder, HalfSpace as HalfSpace, Sphere as Sphere
 from .model.state import State as State
 from .model.triangle_mesh import TriMesh as TriMesh
+from .outputs.html import HTMLWriter as HTMLWriter
 from .outputs.render import GIFWriter as GIFWriter, PNGWriter as PNGWriter
 from .outputs.usd import USDWriter as USDWriter
 from .outputs.vtk import VTUWriter as VTUWriter

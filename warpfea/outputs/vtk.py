@@ -29,7 +29,7 @@ class VTUWriter(Output):
     Args:
         folder: the target folder; made if its parent exists. Files of the same names are overwritten.
         every: write each n-th accepted step (the default, with 1). fps: or by time, as USD does. Not both.
-        fields: fields at the mesh nodes, SI units; those with 6 components in ParaView's order XX YY ZZ XY YZ XZ.
+        fields: fields at the mesh nodes, SI units; symmetric tensors in ParaView's order XX YY ZZ XY YZ XZ.
         extend: extend the existing series of the resumed run; its frames after the current time are removed and
             rewritten.
 
