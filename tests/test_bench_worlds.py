@@ -53,6 +53,7 @@ def miss(value, reason):
         "finger-loose-4096",
         "gripper-auto-4096",
         "rigid-auto-4096",
+        "arm-auto-4096",
         miss("slider-loose-4096", "93 000 of 200 000 world-steps/s; 115 000 after 100 steps"),
         miss("double-loose-4096", "52 000 of 100 000 world-steps/s"),
         miss("tets-rough-4096", "5.9 ms per step, 3.5 after 100 steps, of 2.5"),
@@ -86,6 +87,15 @@ def test_a_gripper_is_as_fast_from_its_fall_to_its_lift(rows):
     assert row["world_steps_per_s"] == pytest.approx(4.0 * environments)
     assert row["tip_error"] < 1e-8
     assert row["later_error"] < 1e-8
+
+
+def test_an_arm_lifts_a_box_in_many_worlds(rows):
+    """A step is one of an environment at 50 Hz; the error of time is that of `test_part_scenes.py`."""
+    for dtype, most in (("float64", 1e-5), ("float32", 1e-4)):
+        row = rows["arm-auto-4096", dtype]
+        assert row["world_steps_per_s"] == pytest.approx(4096 / (1e-3 * row["whole_ms"]))
+        assert row["world_steps_per_s"] > 20_000
+        assert max(row["tip_error"], row["later_error"]) < most
 
 
 def test_rigid_links_are_thirty_times_as_fast_as_soft_ones(rows):
