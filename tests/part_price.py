@@ -36,9 +36,10 @@ def main(device, file):
             sim.step(STEPS).newton  # noqa: B018 reads the report, so that the device is done
             seconds[kind].append((time.perf_counter() - began) / STEPS)
     least = {kind: min(values) for kind, values in seconds.items()}
+    spent = {kind: {name: int(sim.totals[name][0]) for name in ("newton", "pcg")} for kind, sim in sims.items()}
     rows = [
         {"label": kind, "unknowns": int(3 * len(sim.model.free_slots)), "ms": 1e3 * least[kind],
-         "ratio": least[kind] / least["alone"], "newton": int(sim.totals["newton"][0]), "pcg": int(sim.totals["pcg"][0])}
+         "ratio": least[kind] / least["alone"], **spent[kind]}
         for kind, sim in sims.items()
     ]  # fmt: skip
     content = provenance_of([], device) | {"command": f"python tests/part_price.py {device} FILE", "rows": rows}

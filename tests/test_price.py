@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from result_files import content_of
+from result_files import content_of, rows_of
 from validation.price import measure
 from validation.runner import main
 
@@ -71,3 +71,12 @@ def test_what_is_forced_in_is_all_that_the_scene_leaves_out():
     row = measure(scene, device="cpu", steps=1, repeat=1)
     assert set(row["forced"]) == set(scene().finalize(device="cpu").info()["left_out"])
     assert row["left"] == []
+
+
+@pytest.mark.parametrize("file", ["part_price_cpu.json", "part_price_h200.json"])
+def test_a_rigid_part_costs_little(file):
+    """One more part in scene `hook`, free and on a hinge: its step beside that of the scene alone."""
+    found = {row["label"]: row for row in rows_of(file)}
+    assert found["free"]["unknowns"] == found["hinged"]["unknowns"] == found["alone"]["unknowns"] + 12
+    assert found["alone"]["ratio"] == 1.0
+    assert max(row["ratio"] for row in found.values()) <= 1.3

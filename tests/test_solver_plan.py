@@ -24,10 +24,15 @@ def beam(elements=16, damping=None, **given):
     return b.finalize(**{"device": "cpu"} | given)
 
 
-def block(cells, **given):
+def block(cells, hinged=None, **given):
+    """`hinged`: a rigid part beside it hangs from "ground" or from the "block"."""
     b = wf.ModelBuilder(gravity=(0, 0, -9.81))
     body = b.add_solid(wf.mesh.box((1, 1, 1), cells=cells), material=STEEL)
     b.clamp(body.nodes("x-"))
+    if hinged:
+        part = b.add_rigid(wf.Box((1.5, 0.5, 0.5), (1, 0.1, 0.1)), density=1e3)
+        other = body.at((1, 0.5, 0.5)) if hinged == "block" else wf.GROUND
+        b.add_joint("spherical", parent=other, child=part.at((1, 0.5, 0.5)), anchor=(1, 0.5, 0.5))
     return b.finalize(**{"device": "cpu"} | given)
 
 
@@ -40,12 +45,17 @@ MODELS = {
     "damped beam": lambda: beam(damping=wf.KelvinVoigt(eta=1e3)),
     "long beam": lambda: beam(elements=200),
     "block": lambda: block((6, 6, 6)),
+    "block beside a part": lambda: block((6, 6, 6), "ground"),
+    "block with a part": lambda: block((6, 6, 6), "block"),
     "slider": lambda: scene("slider_crank"),
     "chain": lambda: scene("chain", links=40),
 }
 TABLE = [
     # model, device, many, options, scheme, what the plan has
     ("beam", CPU, False, {}, "dynamics", {"preconditioner": "banded", "operator": "matrix", "matrix_reuse_level": 2}),
+    ("block", CPU, False, {}, "dynamics", {"operator": "matrix", "matrix_reuse_level": 2}),
+    ("block beside a part", CPU, False, {}, "dynamics", {"operator": "matrix", "matrix_reuse_level": 2}),
+    ("block with a part", CPU, False, {}, "dynamics", {"operator": "matrix", "matrix_reuse_level": 0}),
     ("beam", CPU, True, {}, "dynamics", {"preconditioner": "banded", "exact": True, "factors_operator": True}),
     ("beam", CUDA, False, {}, "dynamics", {"preconditioner": "two-level", "operator": "matrix", "exact": False}),
     ("beam", CUDA, True, {}, "dynamics", {"preconditioner": "banded", "exact": True, "matrix_rebuild_cost": 3.0}),

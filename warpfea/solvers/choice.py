@@ -9,8 +9,10 @@ from __future__ import annotations
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from ..base.errors import ModelError
-from ..terms.protocols import Coupled
+from ..terms.protocols import Constrained, Coupled, Tied
 from .band import Band, find_band, fits_thread_block
 from .jacobi import Jacobi
 from .matrix_assembly import MAX_FULL_FACTOR_SLOTS
@@ -151,14 +153,24 @@ def choose_matrix_reuse(model: Model, scheme: str, on_cuda: bool) -> int:
     """Reuse of the operator's matrix: 0 none, 1 over the iterates of a step, 2 also over steps.
 
     Not over steps in statics (large steps) nor with damping (the viscous stress is no function of the state of a
-    resumed run); not at all with constraints (their forces are only as accurate as the solve); a GPU assembles a small
-    matrix at negligible cost.
+    resumed run); not at all with constraints of elastic bodies (their forces are only as accurate as the solve); a GPU
+    assembles a small matrix at negligible cost.
     """
-    if model.terms.traits.has_constraints:
+    if model.terms.traits.has_constraints and _constrains_elements(model):
         return 0
     damped = scheme == "midpoint" or any(block.key.damping in ("incremental", "rate") for block in model.blocks)
     small = on_cuda and model.slots <= MAX_FAST_ASSEMBLY_SLOTS
     return 2 if scheme != "statics" and not damped else 0 if small else 1
+
+
+def _constrains_elements(model: Model) -> bool:
+    """False if constraints tie slots of rigid parts alone, beside elastic bodies."""
+    constrained = model.terms.having(Constrained)
+    if not all(isinstance(term, Tied) for term in constrained):
+        return True
+    elastic = [block.connectivity.ravel() for block in model.blocks if not block.host_blocks[0].body.family.rigid]
+    tied = [slots for term in constrained for slots in term.tied_slots()]
+    return not elastic or bool(np.isin(np.concatenate(tied), np.concatenate(elastic)).any())
 
 
 def _factors_operator(
