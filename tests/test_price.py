@@ -73,7 +73,7 @@ def test_what_is_forced_in_is_all_that_the_scene_leaves_out():
     assert row["left"] == []
 
 
-@pytest.mark.parametrize("file", ["part_price_cpu.json", "part_price_h200.json"])
+@pytest.mark.parametrize("file", ["part_price_cpu.json"])
 def test_a_rigid_part_costs_little(file):
     """One more part in scene `hook`, free and on a hinge: its step beside that of the scene alone."""
     found = {row["label"]: row for row in rows_of(file)}
