@@ -20,14 +20,14 @@ from .collider_shapes import BOX, CYLINDER, HALF_SPACE, MESH
 from .colliders import collider_functions
 from .structs import collider_struct
 
-__all__ = ["SEAMS_SUFFIX", "seam_functions"]
+__all__ = ["LEVEL_COSINE", "SEAMS_SUFFIX", "seam_functions"]
 
 SEAMS_SUFFIX = "_seams"
 """Suffix of the names of modules compiled with seams."""
 MIN_CROSS_COSINE = 0.5
 """Largest cosine between the normals of a side face and of a surface across it."""
 LEVEL_COSINE = 0.9999
-"""Smallest cosine between the normals of overlapping colliders of one level."""
+"""Smallest cosine between the normals of faces of one level."""
 
 
 @functools.cache

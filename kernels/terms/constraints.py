@@ -25,6 +25,7 @@ __all__ = [
     "DOT",
     "FORMULA",
     "JOINT_COLUMNS",
+    "VELOCITY",
     "constraint_functions",
     "constraint_kernels",
     "constraint_struct",
@@ -37,6 +38,8 @@ DISTANCE = 1
 ANGLE = 2
 FORMULA = 3
 """Kind of the rows of a model's first formula; the others follow."""
+VELOCITY = 1 << 30
+"""Kind of rows at the level of velocities, see velocity_rows.py."""
 JOINT_COLUMNS = 7
 """Columns per joint in the report of a step: force and moment on the child, N and N m, and violation, m."""
 MAX_DRIVE_ROTATION = 1.0
@@ -49,7 +52,7 @@ def constraint_struct():
 
     @wp.struct
     class Constraints:
-        kind: wp.array(dtype=wp.int32)  # [row] DOT, DISTANCE, ANGLE, or FORMULA + the index of a formula
+        kind: wp.array(dtype=wp.int32)  # [row] DOT, DISTANCE, ANGLE, FORMULA + the index of a formula, VELOCITY
         scale: wp.array(dtype=wp.float64)  # [row] m per unit of the bracket: lengths of the model for angles, else 1
         reference_product: wp.array(dtype=wp.float64)  # [row] A.B in the reference configuration; |A|^2 of a distance
         constant_target: wp.array(dtype=wp.float64)  # [row] constant part of f: m, rad or a cosine

@@ -12,15 +12,15 @@ between searches to the iterate, in a mid-point scheme to the middle of the step
 """
 
 import functools
-from typing import NamedTuple
 
 import warp as wp
 
 from ..common.modules import KernelSet, kernel_module, kernel_set
 from ..common.types import double_1d, f64, int_1d, mat33d, precision, vec3d, vec3d_2d
-from .constraints import constraint_functions, constraint_struct, multiplier_struct
+from .constraint_formulas import Formula
+from .constraints import VELOCITY, constraint_functions, constraint_struct, multiplier_struct
 
-__all__ = ["ANGLE_RATE", "KNIFE", "ROLL", "TRAVEL_RATE", "VELOCITY", "Velocity", "velocity_kernels"]
+__all__ = ["ANGLE_RATE", "DISC", "KNIFE", "ROLL", "TRAVEL_RATE", "velocity_kernels"]
 
 KNIFE, ROLL, ANGLE_RATE, TRAVEL_RATE = range(4)
 TINY = 1.0e-300
@@ -28,13 +28,32 @@ TINY = 1.0e-300
 mat33d_1d = wp.array(dtype=mat33d)
 
 
-class Velocity(NamedTuple):
-    """Kind of all rows at the level of velocities."""
+@wp.func
+def disc_height(a: vec3d, b: vec3d, a2: vec3d) -> f64:
+    """Height of the lowest point over the radius: a.n - |n across b|, b the axis and n = a2."""
+    along = wp.dot(b, a2)
+    return wp.dot(a, a2) - wp.sqrt(wp.max(wp.dot(b, b) - along * along, f64(TINY)))
 
-    name: str = "velocity"
+
+@wp.func
+def disc_gradients(a: vec3d, b: vec3d, a2: vec3d) -> mat33d:
+    """Derivatives by a and b; a2 is constant."""
+    along = wp.dot(b, a2)
+    lean = wp.sqrt(wp.max(wp.dot(b, b) - along * along, f64(TINY)))
+    return wp.matrix_from_rows(a2, -(b - along * a2) / lean, vec3d())
 
 
-VELOCITY = Velocity()
+@wp.func
+def disc_gradient_change(a: vec3d, b: vec3d, a2: vec3d, da: vec3d, db: vec3d, da2: vec3d) -> mat33d:
+    """Derivative of `disc_gradients` along (da, db)."""
+    along = wp.dot(b, a2)
+    lean = wp.sqrt(wp.max(wp.dot(b, b) - along * along, f64(TINY)))
+    t = (b - along * a2) / across
+    dt = db - wp.dot(db, a2) * a2
+    return wp.matrix_from_rows(vec3d(), -(dt - wp.dot(t, dt) * t) / lean, vec3d())
+
+
+DISC = Formula("disc_height", disc_height, disc_gradients, disc_gradient_change)
 
 
 @functools.cache
@@ -64,12 +83,10 @@ def velocity_kernels(dtype: str, midpoint: bool) -> KernelSet:
         return wp.matrix_from_rows(d, (-arm * along) * d, (-arm * sideways) * d)
 
     @wp.kernel(module=module)
-    def update(
-        kind: int, con: Constraints, parameters: mat33d_1d, u_stage: p.vec3_2d, active: int_1d, mul: Multipliers
-    ):  # fmt: skip
+    def update(con: Constraints, parameters: mat33d_1d, u_stage: p.vec3_2d, active: int_1d, mul: Multipliers):
         """A of the rows at u_stage."""
         world, row = wp.tid()
-        if active[world] == 0 or con.kind[row] != kind:
+        if active[world] == 0 or con.kind[row] != VELOCITY:
             return
         v = mat33d()
         for side in range(3):
@@ -80,12 +97,12 @@ def velocity_kernels(dtype: str, midpoint: bool) -> KernelSet:
 
     @wp.kernel(module=module)
     def evaluate(
-        kind: int, con: Constraints, u: p.vec3_2d, law_value: vec3d_2d, alpha: double_1d, active: int_1d,
+        con: Constraints, u: p.vec3_2d, law_value: vec3d_2d, alpha: double_1d, active: int_1d,
         mul: Multipliers, u_tilde: p.vec3_2d, u_n: p.vec3_2d, dq_dv: double_1d, frozen: int_1d,
     ):  # fmt: skip
         """c at u with the A in the multipliers. The target of a drive is its motion so far."""
         world, row = wp.tid()
-        if active[world] == 0 or con.kind[row] != kind:
+        if active[world] == 0 or con.kind[row] != VELOCITY:
             return
         frozen[world] = 1
         c, moved = f64(0.0), f64(0.0)

@@ -6,15 +6,13 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import warp as wp
 
 from ..base.checks import is_number
 from ..base.errors import ModelError
 from ..base.names import check_known
-from ..kernels.common.types import f64, mat33d, vec3d
-from ..kernels.terms.constraint_formulas import Formula
+from ..kernels.terms.constraints import VELOCITY
 from ..kernels.terms.springs import ANGLE
-from ..kernels.terms.velocity_rows import ANGLE_RATE, KNIFE, ROLL, TRAVEL_RATE, VELOCITY
+from ..kernels.terms.velocity_rows import ANGLE_RATE, DISC, KNIFE, ROLL, TRAVEL_RATE
 from ..model.description import Description
 from ..model.handles import MaterialPoint, NodeSet, SurfaceSet
 from ..model.joints import ConstraintRow, Joint, Vector, VectorPart, constant_vector
@@ -26,34 +24,6 @@ from .checks import body_of_handle, unit_vector
 __all__ = ["VelocityMethods"]
 
 KINDS = ("roll", "knife", "speed")
-
-
-@wp.func
-def disc_height(a: vec3d, b: vec3d, a2: vec3d) -> f64:
-    """Height of the lowest point over the radius: a.n - |n across b|, b the axis and n = a2."""
-    along = wp.dot(b, a2)
-    return wp.dot(a, a2) - wp.sqrt(wp.max(wp.dot(b, b) - along * along, f64(1.0e-300)))
-
-
-@wp.func
-def disc_gradients(a: vec3d, b: vec3d, a2: vec3d) -> mat33d:
-    """Derivatives by a and b; a2 is constant."""
-    along = wp.dot(b, a2)
-    across = wp.sqrt(wp.max(wp.dot(b, b) - along * along, f64(1.0e-300)))
-    return wp.matrix_from_rows(a2, -(b - along * a2) / across, vec3d())
-
-
-@wp.func
-def disc_gradient_change(a: vec3d, b: vec3d, a2: vec3d, da: vec3d, db: vec3d, da2: vec3d) -> mat33d:
-    """Derivative of `disc_gradients` along (da, db)."""
-    along = wp.dot(b, a2)
-    across = wp.sqrt(wp.max(wp.dot(b, b) - along * along, f64(1.0e-300)))
-    t = (b - along * a2) / across
-    dt = db - wp.dot(db, a2) * a2
-    return wp.matrix_from_rows(vec3d(), -(dt - wp.dot(t, dt) * t) / across, vec3d())
-
-
-DISC = Formula("disc_height", disc_height, disc_gradients, disc_gradient_change)
 
 
 class VelocityMethods:

@@ -14,6 +14,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from ..base.errors import ModelWarning
+from ..kernels.contact.collider_seams import LEVEL_COSINE
 from ..kernels.contact.collider_shapes import BOX, CYLINDER, HALF_SPACE, MESH
 from ..model.assembly import connected_components
 from ..model.contact_points import ContactPoints
@@ -32,10 +33,9 @@ REACH_RATIO = 0.2
 """Widest gap that a surface passes level, over its width."""
 DEPTH_RATIO = 0.02
 """Largest depth below the level at which a point at a gap belongs to it, over the width of the surface."""
-ALIGNED = 0.9999
-"""Smallest cosine between the normals of faces of one level."""
 MAX_FLAT = 1000
-"""Triangles of a collider above which none is looked for that continues a body's face."""
+"""Triangles of a collider above which none is looked for that continues a body's face: a bound of time. Obstacles of
+flat faces have dozens, ground from scans many thousands, whose faces continue none; any number between does."""
 EDGED = {HALF_SPACE, BOX, CYLINDER, MESH}
 """Kinds of shapes with flat faces."""
 
@@ -122,7 +122,7 @@ def _continues(shape: Shape, p: ContactPoints, above: np.ndarray, width: float) 
     for x in points[triangles]:
         n = np.cross(x[1] - x[0], x[2] - x[0])
         n /= np.linalg.norm(n)
-        level = (np.abs((p.X - x[0]) @ n) <= seam).all(axis=1) & (p.normal[:, 0] @ n > ALIGNED)
+        level = (np.abs((p.X - x[0]) @ n) <= seam).all(axis=1) & (p.normal[:, 0] @ n > LEVEL_COSINE)
         low, high = p.X[level].min(axis=1) - reach, p.X[level].max(axis=1) + reach
         near = ((low <= x.max(axis=0)) & (high >= x.min(axis=0))).all(axis=1)
         if near.any() and ((above - x[0]) @ n).min() > -seam:

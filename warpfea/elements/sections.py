@@ -22,7 +22,8 @@ __all__ = ["BeamSection", "Circle", "Rectangle", "Section", "Tube", "section_alo
 SAME_SHAPE = 1e-9
 """Relative difference of two shapes that counts as rounding."""
 MAX_AREA_MISMATCH = 0.05
-"""Largest difference of the areas of an outline without holes and of the weights, over the latter."""
+"""Largest difference of the areas of an outline without holes and of the weights, over the latter. A bound:
+a circle by 12 chords lacks 4.5 %, and a round hole of 5 % takes 0.25 % of the torsion."""
 
 
 class BeamSection:

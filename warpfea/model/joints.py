@@ -9,8 +9,7 @@ import numpy as np
 
 from ..base.errors import ModelError
 from ..kernels.terms.constraint_formulas import Formula
-from ..kernels.terms.constraints import ANGLE, DISTANCE, DOT
-from ..kernels.terms.velocity_rows import Velocity
+from ..kernels.terms.constraints import ANGLE, DISTANCE, DOT, VELOCITY
 from ..time_laws import TimeLaw
 from .discretisation import Discretisation
 
@@ -70,7 +69,7 @@ class ConstraintRow:
         parameters: (3, 3) of a VELOCITY row, see kernels/terms/velocity_rows.py.
     """
 
-    kind: int | Formula | Velocity
+    kind: int | Formula
     a: Vector
     b: Vector
     scale: float = 1.0
@@ -102,7 +101,7 @@ def check_rows(what: str, rows: Any) -> None:
     if not isinstance(rows, (list, tuple)) or not rows or not all(isinstance(row, ConstraintRow) for row in rows):
         raise ModelError(f"{what}: its rows are {rows!r}; expected a list of one ConstraintRow or more, such as [row]")
     for k, row in enumerate(rows):
-        if not isinstance(row.kind, (Formula, Velocity)) and row.kind not in (DOT, DISTANCE, ANGLE):
+        if not isinstance(row.kind, Formula) and row.kind not in (DOT, DISTANCE, ANGLE, VELOCITY):
             raise ModelError(f"{what}: row {k} has kind {row.kind!r}; expected DOT, DISTANCE, ANGLE or a Formula")
         for name in ("a", "b", "a2") if row.a2 is not None else ("a", "b"):
             vector = getattr(row, name)

@@ -342,7 +342,7 @@ def constraint_rates(
     first[turn] = (dot(rate, b) + dot(d, db))[turn]
     second[turn] = (dot(bend, b) + 2.0 * dot(rate, db))[turn]
     G, first, second = scale[:, None, None] * G, scale * first, scale * second
-    if tables.formulas:
+    if tables.formulas or tables.has_velocity_rows:
         own, v = kind >= FORMULA, np.stack([da, db, da2], axis=1)
         gradients, curvature = tables.formula_derivatives(np.stack([a, b, a2], axis=1))
         G[own] = gradients[own]

@@ -16,11 +16,12 @@ from ..kernels.terms.constraint_formulas import Formula, formula_kernels
 from ..kernels.terms.constraints import (
     DOT,
     FORMULA,
+    VELOCITY,
     constraint_kernels,
     constraint_struct,
     joint_struct,
 )
-from ..kernels.terms.velocity_rows import VELOCITY, Velocity, velocity_kernels
+from ..kernels.terms.velocity_rows import velocity_kernels
 from ..model.assembly import greedy_colouring, grouped_items
 from ..model.joints import ConstraintRow, Joint, Vector
 from ..time_laws import TimeLaw
@@ -42,7 +43,7 @@ class ConstraintTables:
     Attributes:
         joints: in the order of addition; `angles`: those whose turns are counted.
         count: number of rows.
-        formulas: of the rows that have one, or VELOCITY; number k is the row kind FORMULA + k.
+        formulas: of the rows that have one; number k is the row kind FORMULA + k.
         rows_of: row indices of each joint.
         data: device tables.
         component_host, cluster_host: component and cluster of each row; colour_host: colour of each cluster.
@@ -63,8 +64,9 @@ class ConstraintTables:
         self.colour_host = self.cluster_host = np.zeros(0, dtype=np.int64)
         self.rows = [row for joint in self.joints for row in joint.rows]
         self.count = len(self.rows)
-        formulas = (row.kind for row in self.rows if isinstance(row.kind, (Formula, Velocity)))
-        self.formulas: list[Any] = list(dict.fromkeys(formulas))
+        formulas = (row.kind for row in self.rows if isinstance(row.kind, Formula))
+        self.formulas = list(dict.fromkeys(formulas))
+        self.has_velocity_rows = any(row.kind == VELOCITY for row in self.rows)
         names = [formula.name for formula in self.formulas]
         if len({*names}) < len(names):
             raise ModelError(f"two formulas of constraints have one name among {', '.join(names)}: rename one")
@@ -168,30 +170,24 @@ class ConstraintTables:
         }
         self.model.memory.fill(data, "constraints", **tables)
         self.data = data
-        if self.velocity_kind is not None:
+        if self.has_velocity_rows:
             zero = np.zeros((3, 3))
             parameters = np.array([zero if r.parameters is None else r.parameters for r in rows])
             self.velocity_parameters = m.array("constraints", parameters, wp.mat33d)
         self._vector_entries = entries
 
     def _kind_number(self, row: ConstraintRow) -> int:
-        return FORMULA + self.formulas.index(row.kind) if row.kind in self.formulas else int(row.kind)  # type: ignore[arg-type]
+        return FORMULA + self.formulas.index(row.kind) if isinstance(row.kind, Formula) else row.kind
 
     def formula_kernels(self, midpoint: bool = False) -> list[tuple[int, Any]]:
         """Row kind and kernels of each formula."""
-        numbered = enumerate(self.formulas, FORMULA)
-        return [(k, formula_kernels(self.model.dtype, midpoint, f)) for k, f in numbered if isinstance(f, Formula)]
-
-    @property
-    def velocity_kind(self) -> int | None:
-        """Row kind of constraints at the level of velocities, or None without."""
-        return FORMULA + self.formulas.index(VELOCITY) if VELOCITY in self.formulas else None
+        return [(k, formula_kernels(self.model.dtype, midpoint, f)) for k, f in enumerate(self.formulas, FORMULA)]
 
     def update_velocity_rows(
         self, launch: Launcher, midpoint: bool, u_stage: wp.array, active: wp.array, multipliers: Any
     ) -> None:  # fmt: skip
         """A of the rows at the level of velocities, at u_stage."""
-        args = [self.velocity_kind, self.data, self.velocity_parameters, u_stage, active, multipliers]
+        args = [self.data, self.velocity_parameters, u_stage, active, multipliers]
         launch(velocity_kernels(self.model.dtype, midpoint).update, (self.model.worlds, self.count), args)
 
     def _upload_row_pairs(self) -> None:

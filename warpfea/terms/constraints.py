@@ -99,7 +99,8 @@ class Constraints(Constrained, Updated, Tied, Preconditioned, Differentiable):
             "inverse_matrix": (B, con.matrix_entries),
             "coupling": (B, max(con.coupling_count, 1)),
         }
-        absent = ("rows", *(() if con.formulas else ("curvature",)), *(() if midpoint else ("end_gradient",)))
+        curved = con.formulas or con.has_velocity_rows
+        absent = ("rows", *(() if curved else ("curvature",)), *(() if midpoint else ("end_gradient",)))
         for name, var in multiplier_struct().vars.items():
             if isinstance(var.type, wp.array) and name not in absent:
                 setattr(mul, name, make(name, shapes.get(name, self.dim), var.type.dtype))
@@ -164,9 +165,9 @@ class Constraints(Constrained, Updated, Tied, Preconditioned, Differentiable):
         launch(constraint_kernels(self.model.dtype, midpoint).evaluate, self.dim, args)
         for kind, kernels in self.tables.formula_kernels(midpoint):
             launch(kernels.evaluate, self.dim, [kind, *args])
-        if (kind := self.tables.velocity_kind) is not None:
+        if self.tables.has_velocity_rows:
             kernel = velocity_kernels(self.model.dtype, midpoint).evaluate
-            launch(kernel, self.dim, [kind, *args[:2], *more])
+            launch(kernel, self.dim, [*args[:2], *more])
 
     prepare = force  # J, for rho
 
@@ -328,7 +329,7 @@ class Constraints(Constrained, Updated, Tied, Preconditioned, Differentiable):
             mul.multiplier.assign(np.tile(multipliers, (B, 1)))
         mul.last_target.fill_(np.nan)  # any number of turns is valid
         u, zero = state.displacement, zeros((B,), wp.float64)
-        if con.velocity_kind is not None:  # at rest
+        if con.has_velocity_rows:  # at rest
             con.update_velocity_rows(launch, False, u, all_worlds, mul)
         rest = [value, zero, all_worlds, mul]
         self._evaluate_rows(launch, False, [con.data, u, u, *rest], [*rest, u, u, zero, zeros((B,), wp.int32)])

@@ -169,7 +169,7 @@ class Samples:
         start, column, weight = operator
         rows = start.shape[0] - 1
         types = {6: m.types.sym, 9: m.types.mat33, 1: m.types.T}
-        gather = {6: kernels.gather_symmetric, 9: kernels.gather_matrices, 1: kernels.gather_scalars}
+        gather = {6: kernels.symmetric, 9: kernels.matrices, 1: kernels.scalars}
         k = QUANTITIES[name]
         total = m.evaluation.zeros((m.worlds, rows), types[k]) if total is None else total
         m.evaluation.launch(gather[k], (m.worlds, rows), [start, column, weight, block.count, values, total])

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import warp as wp
 
 from ..base.errors import ModelError
-from ..kernels.terms.velocity_rows import VELOCITY, velocity_kernels
+from ..kernels.terms.constraints import VELOCITY
+from ..kernels.terms.velocity_rows import velocity_kernels
 from .protocols import Tied, Updated
 from .term import StepContext, part
 
