@@ -281,7 +281,7 @@ def test_bad_input_is_named() -> None:
         (lambda: wf.PD(1.0, kd=np.nan), "kd = nan"),
         (lambda: wf.PD(1.0, limit=0.0), "limit = 0.0"),
         (lambda: b.add_actuator(ball, 1.0), "spherical joint has no angle"),
-        (lambda: b.add_actuator("hinge", 1.0), "no joint of this builder"),
+        (lambda: b.add_actuator("hing", 1.0), "no joint of this builder"),
         (lambda: b.add_actuator(driven, 1.0), "is driven"),
         (lambda: b.add_actuator(hinge, wf.PD(1.0, target=wf.Control("q", 3))), "control 'q' has size 3"),
         (lambda: b.add_joint("revolute", parent=wf.GROUND, child=part.at((0, 0, 0)), axis=(0, 0, 1), friction=-2.0),
@@ -296,9 +296,14 @@ def test_bad_input_is_named() -> None:
     assert len(b.description.joints) == 4
     assert not b.description.springs
     b, _, hinge = rotor(limits=(-1.0, 1.0))
-    b.add_actuator(hinge, wf.PD(1.0), name="pd")
+    b.add_actuator(hinge.name, wf.PD(1.0), name="pd")
+    with pytest.raises(wf.ModelError, match="'hing' is no joint of this builder; did you mean 'hinge'"):
+        b.add_actuator("hing", 1.0)
     model = b.finalize(device="cpu")
-    for name, value, text in (("pd.kp", -1.0, "0 or more"), ("hinge.lower", 2.0, "below the upper")):
+    for name, value, text in (
+        ("pd.kp", -1.0, "set_parameter: pd.kp = -1.0 in world 0 must be 0 or more"),
+        ("hinge.lower", 2.0, "set_parameter: hinge.lower = 2.0 in world 0 must be below the upper"),
+    ):
         with pytest.raises(wf.ModelError, match=text):
             model.set_parameter(name, value)
 

@@ -113,6 +113,10 @@ def test_surfaces_that_enclose_nothing_are_refused_before_anything_is_meshed(tmp
     ):
         with pytest.raises(MeshError, match=text):
             from_surface(given, size=0.02)
+    quads = np.hstack([triangles, triangles[:, :1]])
+    for given in (3, (points,), (points, quads), (points[:, :2], triangles), (points, triangles + 1), (points, [])):
+        with pytest.raises(MeshError, match=r"a surface is a file, or points \(n, 3\) and triangles \(m, 3\)"):
+            from_surface(given, size=0.02)
     with pytest.raises(MeshError, match="element = 'T5' must be"):
         from_surface((points, triangles), size=0.02, element="T5")
     with pytest.raises(MeshError, match="size must be positive"):

@@ -225,6 +225,16 @@ def test_a_mode_is_written_and_drawn(tmp_path, monkeypatch):
         found.write(tmp_path / "mode.docx")
 
 
+def test_modes_of_sections_alone_move_no_node(tmp_path):
+    b, body = beam(1)
+    b.clamp(body.start, slots="all")
+    found = wf.modes(b.finalize(device="cpu"), count=6)
+    largest = np.linalg.norm(found.shape(body), axis=2).max(axis=1)
+    assert largest == pytest.approx([1, 1, 1, 1, 0, 1])
+    with pytest.raises(wf.ModelError, match="mode 5, 204 Hz moves no node"):
+        found.write(tmp_path / "mode.png", mode=5)
+
+
 def test_what_has_no_modes_is_refused():
     def built(make, **options):
         b = wf.ModelBuilder(gravity=(0, 0, 0))

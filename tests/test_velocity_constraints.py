@@ -172,6 +172,8 @@ def test_what_is_refused() -> None:
     b, part = sleigh()
     with pytest.raises(wf.ModelError, match="'knife': statics has no velocities"):
         wf.solve_static(b.finalize(device="cpu"))
+    with pytest.raises(wf.ModelError, match="'knife': modes are motions of positions"):
+        wf.modes(b.finalize(device="cpu"))
     with pytest.raises(wf.ModelError, match="'knife': generalized_alpha"):
         wf.Simulation(b.finalize(device="cpu"), dt=1e-2, integrator="generalized_alpha")
     cases: list[tuple[Any, str]] = [
@@ -181,6 +183,8 @@ def test_what_is_refused() -> None:
         (lambda: b.add_velocity_constraint("roll", part.at((0, 0, 0)), axis=(0, 1, 0), radius=-1.0), "radius = -1.0"),
         (lambda: b.add_velocity_constraint("knife", part.at((0, 0, 0))), "missing axis="),
         (lambda: b.add_velocity_constraint("speed", part), "no joint of this builder"),
+        (lambda: b.add_velocity_constraint("knife", part.at((0, 0, 0)), axis=(0, 1, 0), value=1.0), "is for a speed"),
+        (lambda: b.add_velocity_constraint("knife", part.at((0, 0, 0)), axis=(0, 1, 0), normal=(0, 0, 1)), "no normal"),
     ]
     for call, text in cases:
         with pytest.raises(wf.ModelError, match=text):

@@ -320,8 +320,8 @@ class ModelBuilder(ContactMethods, SpringMethods, VelocityMethods):
             drive: time law: angle (rad) of a revolute joint, child relative to parent, right-handed about the axis,
                 any number of turns; travel (m) of a translational joint, the child along the axis; length (m) of
                 a distance joint. Angle and travel are 0 in the reference.
-            limits: (lower, upper) or a wf.Stop: stops of the angle (turns are counted), or of the travel of translational and
-                cylindrical joints; likewise friction, stiffness and damping.
+            limits: (lower, upper) or a wf.Stop: stops of the angle (turns are counted), or the travel of translational
+                and cylindrical joints; one side may be infinite.
             friction: largest torque (N m) or force (N) of Coulomb friction, which sticks by a spring that slips at
                 1e-4 rad or m.
             stiffness, damping: N m/rad and N m s/rad, or N/m and N s/m, of a spring at rest in the reference.

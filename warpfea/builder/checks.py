@@ -16,11 +16,12 @@ from ..model.assembly import require_density
 from ..model.bodies import Body
 from ..model.description import Description
 from ..model.handles import ElementSet, MaterialPoint, NodeSet, SurfaceSet
+from ..model.joints import Joint
 from ..time_laws import Control, Rotation, TimeLaw, time_law
 
 __all__ = [
     "COMPONENT_INDEX", "assign_materials", "body_of_handle", "check_densities", "checked_rotation", "component_mask",
-    "nodal_vectors", "parse_gravity", "slot_field", "unit_vector", "vector", "warn_implausible",
+    "joint_of", "nodal_vectors", "parse_gravity", "slot_field", "unit_vector", "vector", "warn_implausible",
 ]  # fmt: skip
 
 COMPONENT_INDEX = {"x": 0, "y": 1, "z": 2}
@@ -68,6 +69,15 @@ def body_of_handle(thing: Any, what: str, kinds: tuple[type, ...], bodies: list[
         if len(unused) == len(thing.indices):
             raise ModelError(f"{what}: no element of body {body.name!r} uses node {int(unused[0])}")
     return body
+
+
+def joint_of(thing: Any, what: str, joints: list[Joint]) -> Joint:
+    """A joint by its handle or name. ModelError unless it is one of `joints`; the text begins with `what`."""
+    for joint in joints:
+        if thing is joint or (isinstance(thing, str) and thing == joint.name):
+            return joint
+    hint = did_you_mean(thing, [joint.name for joint in joints]) if isinstance(thing, str) else ""
+    raise ModelError(f"{what}: {thing!r} is no joint of this builder{hint}")
 
 
 def parse_gravity(value: Any) -> tuple[np.ndarray, TimeLaw | None]:

@@ -21,7 +21,7 @@ from .actuators import make_actuator
 from .attachments import COINCIDENCE_TOL, make_attachment
 from .bodies import unused_name
 from .bushings import bushing_springs
-from .checks import body_of_handle
+from .checks import body_of_handle, joint_of
 
 __all__ = ["SpringMethods"]
 
@@ -75,14 +75,14 @@ class SpringMethods:
         return self._add_spring(Spring(name, LENGTH, [(gap,)], **values, between=f"{P.label} and {Q.label}"))
 
     def add_torsion_spring(
-        self, joint: Joint, *, stiffness: float | None = None, damping: float = 0.0, rest: float = 0.0,
+        self, joint: Joint | str, *, stiffness: float | None = None, damping: float = 0.0, rest: float = 0.0,
         law: Any = None, name: str | None = None,
     ) -> Spring:  # fmt: skip
         """A torsion spring and damper about a revolute joint: moment k (angle - rest) + c d(angle)/dt that turns the
         child back; turns are counted.
 
         Args:
-            joint: as `add_joint` returned it; its angle is 0 in the reference.
+            joint: as `add_joint` returned it, or its name; its angle is 0 in the reference.
             stiffness, damping: N m, N m s.
             rest: angle without elastic moment, rad.
             law: in place of stiffness and rest, of angle and rate, N m; see `add_spring`.
@@ -93,8 +93,7 @@ class SpringMethods:
         """
         name = self._spring_name(name, "torsion_spring")
         what = f"spring {name!r}"
-        if joint not in self.description.joints:
-            raise ModelError(f"{what}: {joint!r} is no joint of this builder")
+        joint = joint_of(joint, what, self.description.joints)
         if joint.angle is None:
             raise ModelError(f"{what}: a {joint.kind} joint has no angle, or its handles do not determine it")
         a, a2, b = joint.angle
@@ -103,12 +102,12 @@ class SpringMethods:
             values["rest"] = 1.0
         return self._add_spring(Spring(name, ANGLE, [(a, b, a2)], **values, between=joint.between))
 
-    def add_actuator(self, joint: Joint, torque: Any, *, name: str | None = None) -> Spring:
+    def add_actuator(self, joint: Joint | str, torque: Any, *, name: str | None = None) -> Spring:
         """An actuator that turns the child of a revolute joint about its axis, or pushes that of a translational or
         cylindrical joint along it, and the parent the other way. Several on one joint add up.
 
         Args:
-            joint: as `add_joint` returned it, without drive.
+            joint: as `add_joint` returned it, or its name, without drive.
             torque: time law or Control, N m about the axis or N along it; or wf.PD(kp, kd, target=, limit=), implicit
                 in the step: its rate is that of the integrator.
             name: unique name; of a PD for set_parameter("NAME.kp"), "NAME.kd", "NAME.limit".
@@ -117,8 +116,7 @@ class SpringMethods:
             ModelError: a joint of another kind, or one that is driven.
         """
         name = self._spring_name(name, "actuator")
-        if joint not in self.description.joints:
-            raise ModelError(f"actuator {name!r}: {joint!r} is no joint of this builder")
+        joint = joint_of(joint, f"actuator {name!r}", self.description.joints)
         return self._add_spring(make_actuator(name, joint, torque))
 
     def add_bushing(
@@ -134,7 +132,8 @@ class SpringMethods:
         Args:
             first, second: material points (body.at) of solids and rigid parts, or surfaces; wf.GROUND, or a point of
                 it. Translations count from the reference.
-            stiffness, damping: six values along and about the three axes, N/m, N m/rad, N s/m, N m s/rad; or one.
+            stiffness, damping: six values along and about the three axes, N/m, N m/rad, N s/m, N m s/rad; or one. Where
+                the damping about an axis is above the sum of the other two, turns about those lose more, by sin^2 t.
             axes: (3, 3) rows, orthonormal, right-handed; by default those of the world. They turn with both ends.
             name: unique name.
 

@@ -19,7 +19,7 @@ from ..model.joints import ConstraintRow, Joint, Vector, VectorPart, constant_ve
 from ..model.springs import joint_coordinate
 from ..time_laws import time_law
 from .attachments import Attachment, make_attachment
-from .checks import body_of_handle, unit_vector
+from .checks import body_of_handle, joint_of, unit_vector
 
 __all__ = ["VelocityMethods"]
 
@@ -32,8 +32,8 @@ class VelocityMethods:
     description: Description
 
     def add_velocity_constraint(
-        self, kind: str, of: Any, *, axis: Any = None, radius: float | None = None, normal: Any = (0, 0, 1),
-        value: Any = 0.0, name: str | None = None,
+        self, kind: str, of: Any, *, axis: Any = None, radius: float | None = None, normal: Any = None,
+        value: Any = None, name: str | None = None,
     ) -> Joint:  # fmt: skip
         """Constrain velocities: A(q) v = b at the velocity of the scheme.
 
@@ -42,11 +42,11 @@ class VelocityMethods:
                 at its lowest place is at rest, and its height over the plane is kept in positions, too. "knife": a
                 point does not move along an axis of its body, as a skate or a wheel that may slip forward. "speed": of
                 a joint.
-            of: the centre of the disc, or the point of the knife (body.at); of "speed" the joint.
+            of: the centre of the disc, or the point of the knife (body.at); of "speed" the joint, or its name.
             axis: (3,) of the disc, or the direction without motion, both in the reference.
             radius: of the disc, m.
-            normal: (3,) of the plane, towards the disc.
-            value: of "speed" a time law or Control of the joint's angle (rad/s) or travel (m/s).
+            normal: (3,) of the plane, towards the disc; by default z.
+            value: of "speed" a time law or Control of the joint's angle (rad/s) or travel (m/s), by default 0.
             name: unique name.
 
         Returns:
@@ -63,22 +63,26 @@ class VelocityMethods:
             raise ModelError(f"{what}: {'missing radius=' if radius is None else f'a {kind} has no radius'}")
         if (axis is None) == (kind != "speed"):
             raise ModelError(f"{what}: {'missing axis=' if axis is None else 'a speed has no axis'}")
+        if normal is not None and kind != "roll":
+            raise ModelError(f"{what}: a {kind} has no normal")
+        if value is not None and kind != "speed":
+            raise ModelError(f"{what}: value = {value!r} is for a speed; a {kind} has none")
         if kind == "speed":
-            joint = self._speed(what, name, of, value)
+            joint = self._speed(what, name, of, 0.0 if value is None else value)
         else:
             body_of_handle(of, what, (MaterialPoint, NodeSet, SurfaceSet), self.description.bodies)
             at = make_attachment(of, what, child=True)
             e = unit_vector(axis, f"{what}: axis")
             x = at.position(at.X, what)
-            rows = _roll_rows(what, at, e, radius, unit_vector(normal, f"{what}: normal")) if kind == "roll" else [
+            n = unit_vector((0, 0, 1) if normal is None else normal, f"{what}: normal")
+            rows = _roll_rows(what, at, e, radius, n) if kind == "roll" else [
                 ConstraintRow(VELOCITY, x, at.direction(e, what), parameters=_row_parameters(KNIFE))
             ]  # fmt: skip
             joint = Joint(name, kind, rows, x, at.label)
         return self._record_joint(joint)  # type: ignore[attr-defined,no-any-return]
 
     def _speed(self, what: str, name: str, joint: Any, value: Any) -> Joint:
-        if joint not in self.description.joints:
-            raise ModelError(f"{what}: {joint!r} is no joint of this builder")
+        joint = joint_of(joint, what, self.description.joints)
         found = joint_coordinate(joint)
         if found is None:
             raise ModelError(f"{what}: a {joint.kind} joint has no angle or travel, or its handles do not determine it")

@@ -23,7 +23,7 @@ def beam_family(section: BeamSection) -> Family:
         return BEAM
     data = [section.area_ratio, *(c.corners for c in (*outer, *inner, *ends)), *(c.bulge for c in (*outer, *ends))]
     digest = hashlib.sha256(repr([np.round(x, 12).tolist() for x in data if x is not None]).encode()).hexdigest()
-    name = f"{BEAM.name} section {digest[:8]}"
+    name = f"{BEAM.name} section {digest[:32]}"
     if (known := known_family(name)) is not None:
         return known
     scale = section.area_ratio

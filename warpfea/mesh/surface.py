@@ -44,8 +44,8 @@ def from_surface(
     """
     given = isinstance(surface, (str, os.PathLike))
     label = str(surface) if given else "from_surface"
-    points, triangles = read_triangles(surface) if given else (np.asarray(part) for part in surface)
-    points = scale * np.asarray(points, dtype=float)
+    points, triangles = read_triangles(surface) if given else _arrays(surface)
+    points = scale * points
     (length,) = positive_numbers(f"{label}: size", (size,), 1)
     if element not in ("T4", "T10"):
         raise MeshError(f"{label}: element = {element!r} must be 'T4' or 'T10'")
@@ -75,6 +75,21 @@ def from_surface(
         )
     mesh = _with_flat_sides(mesh, tolerance * float(np.linalg.norm(np.ptp(points, axis=0))))
     return check(with_mid_nodes(mesh) if element == "T10" else mesh)
+
+
+def _arrays(surface: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n, 3) and triangles (m, 3). MeshError for anything else."""
+    try:
+        points, triangles = (np.asarray(part) for part in surface)
+        good = points.shape[1:] == triangles.shape[1:] == (3,) and triangles.dtype.kind in "iu" and len(triangles)
+        if good and triangles.min() >= 0 and triangles.max() < len(points):
+            return points.astype(float), triangles
+        got = f"shapes {points.shape} and {triangles.shape}"
+    except (TypeError, ValueError):
+        got = repr(surface)
+    raise MeshError(
+        f"from_surface: a surface is a file, or points (n, 3) and triangles (m, 3) of their numbers, got {got}"
+    )
 
 
 def _with_flat_sides(mesh: Mesh, distance: float) -> Mesh:

@@ -50,6 +50,8 @@ bound between the round-off of a load that has none and ratios for which linear 
 ZERO = 1e-12
 """phi.K phi over phi.diag(K) phi below which it is round-off: a rigid-body mode. A bound: sums in float64
 leave 1e-15, the softest bending mode of a beam of n elements is about 1 / n^4."""
+AT_REST = 1e-9
+"""Largest displacement of nodes at rest, over gradients times the model's size: bound of round-off."""
 CYCLE_S, CYCLE_FRAMES = 2.0, 60
 """Duration and frames of a cycle drawn."""
 DRAWN_SIZE = 0.1
@@ -70,14 +72,17 @@ class Shapes:
     vectors: np.ndarray
 
     def shape(self, body: Body) -> np.ndarray:
-        """Displacements (count, nodes, 3) of a body; the largest of the model in each mode is 1 m."""
+        """Displacements (count, nodes, 3) of a body; the largest of the model in each mode is 1 m, or all are 0 in
+        one that deforms sections alone."""
         results = Results(self.model, self.state)
         results.check_body(body, "shape")
         return results.at_mesh_nodes(body, self.vectors / self._largest()[:, None, None])
 
     def _largest(self) -> np.ndarray:
-        """Largest displacement of each mode."""
-        return (np.linalg.norm(self.vectors, axis=2) * self.model.slot_table.is_position).max(axis=1)
+        """Largest displacement of each mode, m; infinite where it is round-off beside the gradients times the size."""
+        size, is_position = np.linalg.norm(self.vectors, axis=2), self.model.slot_table.is_position
+        moved, gradients = (size * is_position).max(axis=1), (size * (1.0 - is_position)).max(axis=1)
+        return np.where(moved > AT_REST * self.model.size * gradients, moved, np.inf)
 
     def write(self, path: str | os.PathLike[str], mode: int = 1, *, size: float | None = None, **options: Any) -> None:
         """Write one mode, counted from 1: an animation of a cycle, or a picture of its largest displacement.
@@ -92,6 +97,8 @@ class Shapes:
         """
         if isinstance(mode, bool) or not isinstance(mode, (int, np.integer)) or not 1 <= mode <= len(self.vectors):
             raise ModelError(f"mode = {mode!r} must be a number from 1 to {len(self.vectors)}")
+        if np.isinf(self._largest()[mode - 1]):
+            raise ModelError(f"{self.label(mode)} moves no node: it deforms sections of beams or shells alone")
         writer = writer_for(path, ["displacement"], **options)
         motion = ModeMotion(self.model, self.state.copy())
         motion.label = self.label(mode)
@@ -342,7 +349,7 @@ def _linearise(what: str, model: Model, state: State, count: int, world: int) ->
             )
         stiffness, damping = term.matrices(state, world)
         K = K if stiffness is None else K + stiffness
-        C = C if damping is None else damping
+        C = damping if C is None else C if damping is None else C + damping
     J = sp.csr_matrix((0, len(index)))
     if model.constraints is not None:
         J = model.evaluation.constraint_jacobian(state, world)[:, index]

@@ -14,6 +14,7 @@ on the device, for drawn points by the product of both weights.
 from __future__ import annotations
 
 import itertools
+import weakref
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -36,10 +37,15 @@ QUANTITIES = {"stress": 6, "gradient": 9, "jacobian": 1, "energy": 1, "dissipati
 
 
 class Samples:
-    """Samples of the quantities of a model at a state."""
+    """Samples of the quantities of a model at a state.
+
+    Attributes:
+        operators: weights on the device, as long as those of the points live.
+    """
 
     def __init__(self, model: Model) -> None:
         self.model = model
+        self.operators: dict[tuple[Any, ...], tuple[list[tuple[Any, np.ndarray]], Any]] = {}
 
     def at_samples(
         self, name: str, state: State, body: Any, weights: sp.csr_matrix | None = None, elements: Any = None
@@ -179,10 +185,9 @@ class Samples:
         self, body: Any, blocks: list[Any], weights: Any, elements: Any, *, constant: bool = False
     ) -> list[tuple[Any, np.ndarray]]:
         """Weights of each block as arrays on the device, or of `constant` values in elements as a matrix; rows without
-        an element. Kept for those of all elements."""
-        m, kind = self.model, (constant, *(id(block) for block in blocks))
-        known = m.cache.setdefault(f"samples of {body.name}", {})
-        key = (*kind, id(weights))
+        an element. Those of all elements are kept as long as the weights."""
+        m, known = self.model, self.operators
+        key = (body.name, constant, id(weights), *(id(block) for block in blocks))
         if key in known and elements is None:
             return known[key][0]  # type: ignore[no-any-return]
         matrices, missing = _averages(body, blocks, elements, constant=constant)
@@ -197,7 +202,7 @@ class Samples:
                 arrays = [wp.array(values, dtype=dtype, device=m.device) for values, dtype in parts]
             out.append((arrays, missing))
         if elements is None:
-            known[key] = out, weights  # an id is that of living weights only
+            known[key] = out, None if weights is None else weakref.ref(weights, lambda _: known.pop(key, None))
         return out
 
 

@@ -381,7 +381,7 @@ class Springs(Tied, Preconditioned, Parametrised, Impacting, Diagnosed):
 
     def _set_parameter(self, k: int, name: str, field: str, values: Any, mask: np.ndarray) -> None:
         """Write one value of a spring in the chosen worlds."""
-        what, spring = f"spring {self.springs[k].name!r}", self.springs[k]
+        what, spring = "set_parameter", self.springs[k]
         wanted = values_per_world(what, name, values, self.model.worlds)
         good, bound = np.isfinite(wanted), "finite"
         if field in ("lower_end", "upper_end"):

@@ -50,6 +50,9 @@ class VelocityRows(Updated, Tied):
         name = next(joint.name for joint in joints if any(row.kind == VELOCITY for row in joint.rows))
         return f"velocity constraint {name!r}"
 
+    def matrices(self, state: State, world: int) -> Any:
+        raise ModelError(f"{self._first}: modes are motions of positions; leave it out, or take a joint")
+
     def restraints(self, state: State, component: int) -> Any:
         raise ModelError(f"{self._first}: statics has no velocities; leave it out, or take a constraint of positions")
 
