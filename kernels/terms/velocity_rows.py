@@ -48,7 +48,7 @@ def disc_gradient_change(a: vec3d, b: vec3d, a2: vec3d, da: vec3d, db: vec3d, da
     """Derivative of `disc_gradients` along (da, db)."""
     along = wp.dot(b, a2)
     lean = wp.sqrt(wp.max(wp.dot(b, b) - along * along, f64(TINY)))
-    t = (b - along * a2) / across
+    t = (b - along * a2) / lean
     dt = db - wp.dot(db, a2) * a2
     return wp.matrix_from_rows(vec3d(), -(dt - wp.dot(t, dt) * t) / lean, vec3d())
 
