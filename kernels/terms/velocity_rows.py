@@ -39,18 +39,18 @@ def disc_height(a: vec3d, b: vec3d, a2: vec3d) -> f64:
 def disc_gradients(a: vec3d, b: vec3d, a2: vec3d) -> mat33d:
     """Derivatives by a and b; a2 is constant."""
     along = wp.dot(b, a2)
-    lean = wp.sqrt(wp.max(wp.dot(b, b) - along * along, f64(TINY)))
-    return wp.matrix_from_rows(a2, -(b - along * a2) / lean, vec3d())
+    sideways = wp.sqrt(wp.max(wp.dot(b, b) - along * along, f64(TINY)))
+    return wp.matrix_from_rows(a2, -(b - along * a2) / sideways, vec3d())
 
 
 @wp.func
 def disc_gradient_change(a: vec3d, b: vec3d, a2: vec3d, da: vec3d, db: vec3d, da2: vec3d) -> mat33d:
     """Derivative of `disc_gradients` along (da, db)."""
     along = wp.dot(b, a2)
-    lean = wp.sqrt(wp.max(wp.dot(b, b) - along * along, f64(TINY)))
-    t = (b - along * a2) / lean
+    sideways = wp.sqrt(wp.max(wp.dot(b, b) - along * along, f64(TINY)))
+    t = (b - along * a2) / sideways
     dt = db - wp.dot(db, a2) * a2
-    return wp.matrix_from_rows(vec3d(), -(dt - wp.dot(t, dt) * t) / lean, vec3d())
+    return wp.matrix_from_rows(vec3d(), -(dt - wp.dot(t, dt) * t) / sideways, vec3d())
 
 
 DISC = Formula("disc_height", disc_height, disc_gradients, disc_gradient_change)
