@@ -36,6 +36,8 @@ def cost(feature=None, **simulation):
         b.drive(body.nodes("x+"), rotation=wf.Rotation((0, 0, 0), (1, 0, 0), 0.0))
     if feature == "joint":
         b.add_joint("distance", parent=wf.GROUND, child=body.at((1, 0.1, 0.1)), anchor=(1, 0.1, 2))
+    if feature == "hinge":
+        b.add_joint("revolute", parent=wf.GROUND, child=body.at((1, 0.1, 0.1)), axis=(0, 1, 0))
     if feature == "spring":
         b.add_spring(body.at((1, 0.1, 0.1)), (1, 0.1, 2), stiffness=1.0)
     if feature in ("contact", "friction"):
@@ -112,6 +114,16 @@ def test_a_scene_without_contact_has_nothing_of_it():
     assert "contact" not in touching.info()["left_out"]
     assert more > launches
     assert len(with_kernels - kernels) >= 10
+
+
+def test_turns_are_counted_with_the_multipliers():
+    """Of angles that no drive prescribes: in the launch that stores the multipliers."""
+    launches, kernels, modules, _, _ = cost("joint")
+    turns, with_kernels, with_modules, _, _ = cost("hinge")
+    assert not any("joint_angles" in name for name in modules)
+    assert any("joint_angles" in name for name in with_modules)
+    assert (kernels - with_kernels, with_kernels - kernels) == ({"store_multipliers"}, {"store_with_angles"})
+    assert turns == launches
 
 
 def test_gravity_without_a_law_launches_no_law():

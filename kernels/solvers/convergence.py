@@ -313,8 +313,8 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
             near = True
             settling = True
         if wp.static(traits.unilateral):  # a rigid part at rest on another has no energy to compare a step with
-            drowned = ctl.floor.rounding_ratio[world] <= f64(1.0) and ctl.floor.eps < f64(SINGLE_PRECISION_EPS)
-            settling = settling or drowned
+            below_rounding = ctl.floor.rounding_ratio[world] <= f64(1.0) and ctl.floor.eps < f64(SINGLE_PRECISION_EPS)
+            settling = settling or below_rounding
         near = near and ctl.floor.estimates[world] < MAX_ERROR_ESTIMATES
         still = ctl.norms.residual_reduction[world] > f64(STALL_RATIO) and ctl.solve.operator_reused[world] == 0
         if ctl.norms.ratio[world] <= f64(1.0):

@@ -146,6 +146,12 @@ def constraint_functions(dtype: str) -> KernelSet:
     Constraints, Multipliers = constraint_struct(), multiplier_struct()
 
     @wp.func
+    def store_row(mul: Multipliers, state: double_2d, last_target: double_2d, world: int, row: int):
+        """Store the multiplier and the right side of a row in the state."""
+        state[world, row] = mul.trial_multiplier[world, row]
+        last_target[world, row] = mul.target[world, row]
+
+    @wp.func
     def term_vector(con: Constraints, term: int, x: p.vec3_2d, world: int) -> vec3d:
         """sum_k w_k x_k of a term."""
         s = vec3d()
@@ -369,14 +375,10 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> KernelSet:
         mul.multiplier_change[world, row] = f64(0.0)
 
     @masked_kernel(module, "accepted")
-    def store_multipliers(
-        accepted: int_1d, mul: Multipliers, state: double_2d,
-        last_target: double_2d,
-    ):  # fmt: skip
+    def store_multipliers(accepted: int_1d, mul: Multipliers, state: double_2d, last_target: double_2d):
         """Store the multipliers and right sides of an accepted step in the state."""
         world, row = wp.tid()
-        state[world, row] = mul.trial_multiplier[world, row]
-        last_target[world, row] = mul.target[world, row]
+        functions.store_row(mul, state, last_target, world, row)
 
     @masked_kernel(module, "accepted")
     def work_terms(

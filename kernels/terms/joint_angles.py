@@ -7,6 +7,7 @@ import warp as wp
 
 from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.types import double_1d, double_2d, int_1d, precision, vec3d, vec3d_1d
+from .constraints import constraint_functions, multiplier_struct
 
 __all__ = ["joint_angle_kernels"]
 
@@ -17,6 +18,7 @@ FULL_TURN = 2.0 * math.pi
 def joint_angle_kernels(dtype: str) -> KernelSet:
     """Kernel in one precision of the slots."""
     p = precision(dtype)
+    Multipliers, store_row = multiplier_struct(), constraint_functions(dtype).store_row
     module = kernel_module(f"joint_angles_{dtype}")
 
     @wp.func
@@ -29,13 +31,17 @@ def joint_angle_kernels(dtype: str) -> KernelSet:
             x += weight[i] * vec3d(u[world, slot[i]])
         return x
 
-    @masked_kernel(module, "active")
-    def count_turns(
-        start: int_1d, slot: int_1d, weight: double_1d, reference: vec3d_1d, u: p.vec3_2d, active: int_1d,
-        angle: double_2d,
+    @masked_kernel(module, "accepted")
+    def store_with_angles(
+        accepted: int_1d, mul: Multipliers, state: double_2d, last_target: double_2d, start: int_1d, slot: int_1d,
+        weight: double_1d, reference: vec3d_1d, u: p.vec3_2d, angle: double_2d,
     ):  # fmt: skip
-        """atan2(a2.b, a.b) of the vectors a, a2, b of each joint, in the turn closest to the last angle."""
+        """As `store_multipliers` of constraints.py, and atan2(a2.b, a.b) of the vectors a, a2, b of each joint, in the
+        turn closest to the last angle: the first threads, as a joint has a row or more."""
         world, joint = wp.tid()
+        store_row(mul, state, last_target, world, joint)
+        if joint >= angle.shape[1]:
+            return
         a = current_vector(start, slot, weight, reference, u, world, 3 * joint)
         a2 = current_vector(start, slot, weight, reference, u, world, 3 * joint + 1)
         b = current_vector(start, slot, weight, reference, u, world, 3 * joint + 2)

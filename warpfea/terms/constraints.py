@@ -21,6 +21,7 @@ from ..kernels.solvers.newton_control import TERM_ROWS
 from ..kernels.solvers.reuse import reuse_kernels
 from ..kernels.terms.constraint_blocks import constraint_block_kernels
 from ..kernels.terms.constraints import JOINT_COLUMNS, constraint_kernels, multiplier_struct
+from ..kernels.terms.joint_angles import joint_angle_kernels
 from ..kernels.terms.velocity_rows import velocity_kernels
 from ..model import assembly
 from .constraint_tables import ConstraintTables
@@ -235,8 +236,11 @@ class Constraints(Constrained, Updated, Tied, Preconditioned, Differentiable):
     def commit(self, ctx: StepContext, accepted: wp.array) -> None:
         """Store multipliers, right-hand sides and turns of an accepted substep."""
         args = [accepted, ctx.work.multipliers, ctx.state.constraint_force, ctx.state.constraint_target]
-        ctx.launch(self.integrator_kernels(ctx).store_multipliers, self.dim, args)
-        self.tables.angles.count(ctx, accepted)
+        kernel, angles = self.integrator_kernels(ctx).store_multipliers, self.tables.angles
+        if angles.joints:
+            kernel = joint_angle_kernels(self.model.dtype).store_with_angles
+            args += angles.arguments(ctx)
+        ctx.launch(kernel, self.dim, args)
 
     def report(self, ctx: StepContext) -> None:
         """Report the force and moment on the child and the violation of each joint."""

@@ -46,16 +46,14 @@ class JointAngles:
         if self.joints:
             ctx.state.register("joint_angle", wp.float64, (len(self.joints),))
 
-    def count(self, ctx: StepContext, active: wp.array) -> None:
-        """Count turns to the positions of an accepted step."""
-        if self.joints:
-            args = [*self.tables, ctx.work.u, active, ctx.state.joint_angle]
-            kernel = joint_angle_kernels(self.model.dtype).count_turns
-            ctx.launch(kernel, (self.model.worlds, len(self.joints)), args)
+    def arguments(self, ctx: StepContext) -> list[Any]:
+        """Arguments of `store_with_angles` behind those of `store_multipliers`: it counts turns to the positions of an
+        accepted step."""
+        return [*self.tables, ctx.work.u, ctx.state.joint_angle]
 
     def modules(self) -> set[wp.Module]:
-        """Modules launched by `count`."""
-        return {joint_angle_kernels(self.model.dtype).count_turns.module} if self.joints else set()
+        """Module of that kernel."""
+        return {joint_angle_kernels(self.model.dtype).module} if self.joints else set()
 
 
 def vector_tables(vectors: Sequence[Vector], array: Any) -> list[wp.array]:
