@@ -221,6 +221,8 @@ def test_a_mode_is_written_and_drawn(tmp_path, monkeypatch):
     assert [axis.get_ylabel() for axis in figure.axes] == ["frequency, Hz", "effective mass / mass"]
     with pytest.raises(wf.ModelError, match="mode = 3 must be a number from 1 to 2"):
         found.write(tmp_path / "mode.png", mode=3)
+    with pytest.raises(wf.ModelError, match=r"modes: size = \(320, 240\) must be a positive"):
+        found.write(tmp_path / "mode.png", mode=1, size=(320, 240))
     with pytest.raises(wf.OutputError, match=r"end in one of .*\.usdc"):
         found.write(tmp_path / "mode.docx")
 

@@ -88,6 +88,12 @@ def test_turning_oscillators(scheme, damping):
     assert (e["spring_loss"][0] > 0.05) == (damping > 0)
     if scheme == "energy_momentum":
         assert abs(e["integrator"][0]) < 1e-9
+        (bars,) = [axis for axis in sim.plot().axes if axis.get_title() == "energies now"]
+        shown = dict(
+            zip([label.get_text() for label in bars.get_yticklabels()], [bar.get_width() for bar in bars.patches])
+        )
+        assert shown["springs"] == e["springs"][0]
+        assert shown.get("spring loss", 0.0) == e["spring_loss"][0]
 
 
 def test_a_torsion_spring_counts_turns():

@@ -340,6 +340,8 @@ def test_statics_write_themselves_and_series_are_read_back(tmp_path):
     assert saved.fields("beam") == ["displacement", "velocity", "cauchy", "von_mises"]
     with pytest.raises(wf.ModelError, match="did you mean 'von_mises'"):
         saved.field("mises", "box")
+    with pytest.raises(wf.ModelError, match=r"two\.vtu: is one state, which meshio.read reads"):
+        wf.read_results(tmp_path / "two.vtu")
     with pytest.raises(wf.ModelError, match="can't be read as a series"):
         wf.read_results(tmp_path / "none.pvd")
 

@@ -43,6 +43,8 @@ def read_results(path: str | os.PathLike[str]) -> SavedResults:
         ModelError: no such file, or one that is no series of VTUWriter.
     """
     target = pathlib.Path(path)
+    if target.suffix == ".vtu":
+        raise ModelError(f"{target}: is one state, which meshio.read reads; a series is a .pvd")
     if target.is_dir():
         target = target / f"{target.resolve().name}.pvd"
     try:

@@ -17,6 +17,7 @@ import scipy.linalg
 import scipy.sparse as sp
 from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh, splu
 
+from ..base.checks import check_positive
 from ..base.errors import ModelError
 from ..base.lazy import require_matplotlib
 from ..base.writer import writer_for
@@ -97,6 +98,8 @@ class Shapes:
         """
         if isinstance(mode, bool) or not isinstance(mode, (int, np.integer)) or not 1 <= mode <= len(self.vectors):
             raise ModelError(f"mode = {mode!r} must be a number from 1 to {len(self.vectors)}")
+        if size is not None:
+            check_positive("modes", size=size)
         if np.isinf(self._largest()[mode - 1]):
             raise ModelError(f"{self.label(mode)} moves no node: it deforms sections of beams or shells alone")
         writer = writer_for(path, ["displacement"], **options)
@@ -180,6 +183,7 @@ class Modes(Shapes):
             bottom.bar(number + 0.25 * (axis - 1), share[:, axis], 0.25, label="xyz"[axis])
         bottom.set_ylabel("effective mass / mass")
         bottom.set_xlabel("mode")
+        bottom.xaxis.get_major_locator().set_params(integer=True)
         bottom.legend()
         return figure
 

@@ -18,8 +18,8 @@ PLOTTED = 8
 SAMPLES = 240
 """Largest number of intervals of a curve; of each the least and the largest value are kept."""
 LEDGER = (
-    "kinetic", "strain", "potential", "contact", "work", "viscous", "contact_loss", "friction", "collider_work",
-    "integrator",
+    "kinetic", "strain", "potential", "springs", "contact", "work", "viscous", "spring_loss", "contact_loss",
+    "friction", "collider_work", "integrator",
 )  # fmt: skip
 STEP_LOG = ("time", "newton", "pcg", "halvings")
 """Entries of `RunStatistics.step_log`: the time, s, and the largest count of all worlds of each step."""
@@ -141,6 +141,9 @@ def plot_run(sim: Any, world: int = 0) -> Any:
             axis.step(log[:, 0], column, where="pre", label=name)
     axis.set(title="iterations of each step, most of all worlds", xlabel=when)
     axis.set_yscale("symlog", linthresh=1.0)
+    most = log[:, 1:].max()
+    ticks = [k * 10**n for n in range(9) for k in (1, 2, 5) if k * 10**n <= most]
+    axis.set_yticks([0, *ticks], labels=[f"{tick:g}" for tick in (0, *ticks)])
     axis.legend(fontsize="small")
     for axis in axes:
         axis.remove()

@@ -71,8 +71,8 @@ class Results:
                 else ""
             )
             raise ModelError(
-                f"{what}: expected a body, by the handle that add_solid, add_beam or add_shell returned (of {names}), "
-                f"got {body!r}"
+                f"{what}: expected a body, by the handle that add_solid, add_beam, add_shell or add_rigid returned (of "
+                f"{names}), got {body!r}"
             )
         if body not in self.model.bodies:
             raise ModelError(f"{what}: body {body.name!r} is not of this model")
