@@ -126,6 +126,16 @@ def test_turns_are_counted_with_the_multipliers():
     assert turns == launches
 
 
+def test_plain_springs_have_nothing_of_actuators_and_bushings():
+    """No module with bounded laws or chords, and no array that only these read."""
+    _, _, modules, _, model = cost("spring")
+    names = [name for name in modules if "spring" in name]
+    assert names
+    assert not any(word in name for word in ("bounded", "chords") for name in names)
+    arrays = {name for name in model.terms.parameter_arrays() if name.startswith("springs.")}
+    assert arrays == {"springs.stiffness", "springs.damping", "springs.rest_coordinate"}
+
+
 def test_gravity_without_a_law_launches_no_law():
     _, kernels, modules, _, _ = cost("gravity")
     assert not any("gravity" in name for name in (*modules, *kernels))

@@ -54,16 +54,18 @@ def scratch_struct():
 
 
 @functools.cache
-def spring_kernels(dtype: str, midpoint: bool, own: OwnForces = (), bounded: bool = False) -> KernelSet:
+def spring_kernels(
+    dtype: str, midpoint: bool, own: OwnForces = (), bounded: bool = False, has_chords: bool = False
+) -> KernelSet:  # fmt: skip
     """Kernels of springs in one precision of the slots; `own`: forces given as functions; `bounded`: some have a law of
-    bounded_laws.py."""
+    bounded_laws.py; `has_chords`: some are a CHORD."""
     p = precision(dtype)
     T, vec3, sym6, mat33 = p.T, p.vec3, p.sym, p.mat33
     Springs, Scratch, Topology, Pattern = spring_struct(), scratch_struct(), topology_struct(dtype), pattern_struct()
     law, c, more = law_functions(own), coordinate_functions(midpoint), bounded_functions(midpoint)
-    vector = chord_functions(midpoint)
+    chords = chord_functions(midpoint)
     add_block = add_block_function(dtype)
-    suffix = "_bounded" * bounded + "".join(f"_{name}" for name, _ in own)
+    suffix = "_bounded" * bounded + "_chords" * has_chords + "".join(f"_{name}" for name, _ in own)
     module = kernel_module(f"springs_{dtype}{'_midpoint' if midpoint else ''}{suffix}")
 
     @wp.func
@@ -119,6 +121,14 @@ def spring_kernels(dtype: str, midpoint: bool, own: OwnForces = (), bounded: boo
         scr.reference[world, item] = reference
 
     @wp.func
+    def vector_force(kind: int, a: vec3d, b: vec3d, stiffness: f64, damping: f64) -> chords.VectorForce:
+        """Force of a VECTOR or CHORD, see chords.py."""
+        if wp.static(has_chords):
+            if kind == CHORD:
+                return chords.chord_force(a, b, stiffness)
+        return chords.plain_force(a, b, stiffness, damping)
+
+    @wp.func
     def evaluate_vector(
         spr: Springs, u: p.vec3_2d, start: p.vec3_2d, inverse: f64, world: int, item: int, scr: Scratch
     ):
@@ -128,9 +138,7 @@ def spring_kernels(dtype: str, midpoint: bool, own: OwnForces = (), bounded: boo
         a = spr.reference[item] + vectors(spr, u, world, item)
         b = spr.reference[item] + vectors(spr, start, world, item)
         block = spr.first_block[item]
-        found = vector.plain_force(a[0], b[0], stiffness, damping)
-        if spr.kind[item] == CHORD:
-            found = vector.chord_force(a[0], b[0], stiffness)
+        found = vector_force(spr.kind[item], a[0], b[0], stiffness, damping)
         scr.force[world, item] = wp.matrix_from_rows(found.force, vec3d(), vec3d())
         scr.hessian[world, block] = found.hessian
         scr.projected[world, block] = found.projected
@@ -290,10 +298,11 @@ def spring_kernels(dtype: str, midpoint: bool, own: OwnForces = (), bounded: boo
         if wp.static(midpoint):
             inverse = f64(0.5) * inverse
         V = spr.reference[item] + vectors(spr, u, world, item)
-        if spr.kind[item] == CHORD:
-            rows[0, world, item] = spr.stiffness[world, sp] * vector.chord_energy(wp.length_sq(V[0]))[0]
-            rows[1, world, item] = f64(0.0)
-            return
+        if wp.static(has_chords):
+            if spr.kind[item] == CHORD:
+                rows[0, world, item] = spr.stiffness[world, sp] * chords.chord_energy(wp.length_sq(V[0]))[0]
+                rows[1, world, item] = f64(0.0)
+                return
         if spr.kind[item] == VECTOR:
             moved = vectors(spr, u, world, item) - vectors(spr, start, world, item)
             step = vectors(spr, u, world, item) - vectors(spr, u_n, world, item)

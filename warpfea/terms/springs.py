@@ -71,6 +71,8 @@ class Springs(Tied, Preconditioned, Parametrised, Impacting, Diagnosed):
         self.items = [vectors for spring in self.springs for vectors in spring.items]
         self.count = self.rows = len(self.items)
         self.kind = np.repeat([s.kind for s in self.springs], [len(s.items) for s in self.springs])
+        self.features_used = self.own, self.bounded, bool((self.kind == CHORD).any())
+        self.unused = () if self.bounded else ("anchor", "speed", "max_force", "lower_end", "upper_end", "schedule")
         self.dim = (model.worlds, self.count)
 
     @classmethod
@@ -113,21 +115,25 @@ class Springs(Tied, Preconditioned, Parametrised, Impacting, Diagnosed):
         blocks = np.array([BLOCKS[int(kind)] for kind in self.kind])
         self.block_count = int(blocks.sum())
         per_world = {
-            field: np.tile([getattr(s, name) for s in springs], (m.worlds, 1)) for name, field in DEVICE_FIELDS.items()
-        }
-        self.definition = {
-            "kind": self.kind,
-            "spring": np.repeat(np.arange(len(springs)), [len(s.items) for s in springs]),
-            "scale": np.concatenate([s.scale for s in springs]),
-            "reference": reference,
-            "entry_item": self.entry_item,
-            "entry_slot": self.entry_slot,
-            "entry_weight": self.entry_weight,
-            "law": np.array(codes),
-            "schedule": np.array(schedule),
-            "knot": np.concatenate([np.zeros(1), *(law.knots for law in pieces)]),
-            "coefficients": np.concatenate([np.zeros((1, 4)), *(law.coefficients for law in pieces)]),
-        } | per_world
+            field: np.tile([getattr(s, name) for s in springs], (m.worlds, 1))
+            for name, field in DEVICE_FIELDS.items() if field not in self.unused
+        }  # fmt: skip
+        self.definition = (
+            {
+                "kind": self.kind,
+                "spring": np.repeat(np.arange(len(springs)), [len(s.items) for s in springs]),
+                "scale": np.concatenate([s.scale for s in springs]),
+                "reference": reference,
+                "entry_item": self.entry_item,
+                "entry_slot": self.entry_slot,
+                "entry_weight": self.entry_weight,
+                "law": np.array(codes),
+                "knot": np.concatenate([np.zeros(1), *(law.knots for law in pieces)]),
+                "coefficients": np.concatenate([np.zeros((1, 4)), *(law.coefficients for law in pieces)]),
+            }
+            | per_world
+            | ({"schedule": np.array(schedule)} if self.bounded else {})
+        )
         self.data = spring_struct()()
         m.memory.fill(
             self.data, "springs", **self.definition, entry_start=self.entry_start,
@@ -203,7 +209,7 @@ class Springs(Tied, Preconditioned, Parametrised, Impacting, Diagnosed):
 
     def kernels(self, ctx: StepContext) -> Any:
         """Kernels for the integrator of a simulation."""
-        return spring_kernels(self.model.dtype, ctx.midpoint, self.own, self.bounded)
+        return spring_kernels(self.model.dtype, ctx.midpoint, *self.features_used)
 
     def register(self, ctx: StepContext) -> None:
         if (self.kind == ANGLE).any():
@@ -214,7 +220,7 @@ class Springs(Tied, Preconditioned, Parametrised, Impacting, Diagnosed):
     def allocate(self, work: Workspace, ctx: StepContext) -> None:
         scratch, B = scratch_struct()(), self.model.worlds
         for name, var in scratch_struct().vars.items():
-            if name != "rows":
+            if name not in ("rows", *self.unused):
                 shape = (B, self.block_count if name in ("hessian", "projected") else self.count)
                 setattr(scratch, name, work.array(f"springs {name}", shape, var.type.dtype))
         scratch.rows = work.rows_of(self)
@@ -359,7 +365,7 @@ class Springs(Tied, Preconditioned, Parametrised, Impacting, Diagnosed):
         self.model.cache["springs"] = arrays, len(entry)
 
     def block_modules(self) -> Iterable[wp.Module]:
-        return {spring_kernels(self.model.dtype, False, self.own, self.bounded).module}
+        return {spring_kernels(self.model.dtype, False, *self.features_used).module}
 
     def blocks(
         self, ctx: StepContext, matrix: Any, cached: list[wp.array], dq_dv: wp.array, active: wp.array, out: wp.array,
@@ -368,7 +374,7 @@ class Springs(Tied, Preconditioned, Parametrised, Impacting, Diagnosed):
         (arrays, count), m = self.model.cache["springs"], self.model
         values = cached[0] if projected else ctx.scratch[self.name][0].hessian
         args = [m.topology, matrix.pattern.data, self.data, *arrays, values, dq_dv, active, out]
-        ctx.launch(spring_kernels(m.dtype, False, self.own, self.bounded).add_blocks, (m.worlds, count), args)
+        ctx.launch(spring_kernels(m.dtype, False, *self.features_used).add_blocks, (m.worlds, count), args)
 
     # parameters
 
@@ -396,4 +402,4 @@ class Springs(Tied, Preconditioned, Parametrised, Impacting, Diagnosed):
             set_rows(self.data.stiffness, (mask, k), wanted[mask] / spring.stick)
 
     def parameter_arrays(self) -> dict[str, wp.array]:
-        return {field: getattr(self.data, field) for field in DEVICE_FIELDS.values()}
+        return {field: getattr(self.data, field) for field in DEVICE_FIELDS.values() if field not in self.unused}
