@@ -246,3 +246,59 @@ def test_joints():
         assert record.force.shape == record.moment.shape == (1, 1, 3)
         assert record.violation.shape == (1, 1)
     assert sim.joint_value(elbow).shape == (1,)
+
+
+def test_parts():
+    b = wf.ModelBuilder()
+    p = b.add_rigid(wf.Box((0, 0, 0), (0.1, 0.1, 0.1)), density=7800.0, name="p")
+    q = b.add_rigid(wf.Box((0.5, 0, 0), (0.1, 0.1, 0.1)), mass=2.0, inertia=(0.1, 0.1, 0.1), com=(0.5, 0, 0), name="q")
+    bar = b.add_solid(wf.mesh.box((0.1, 0.1, 0.1), cells=(1, 1, 1), element="T4"), transform=(np.eye(3), (0, 1, 0)),
+                      material=wf.SVK(E=1e6, nu=0.3, density=1000.0))  # fmt: skip
+    hinge = b.add_joint(
+        "revolute", parent=p.at((0.05, 0, 0)), child=q.at((0.05, 0, 0)), axis=(0, 0, 1),
+        limits=wf.Stop(-1.0, 1.0), friction=0.1, stiffness=1.0, damping=0.1,
+    )  # fmt: skip
+    P, Q = p.at((0, 0, 0.05)), q.at((0.5, 0, 0.05))
+    b.add_spring(P, Q, stiffness=10.0, damping=0.0, rest=None, law=None)
+    b.add_torsion_spring(hinge, stiffness=1.0)
+    b.add_bushing(P, wf.GROUND, stiffness=10.0, damping=0.1)
+    b.add_point_mass(bar.surface("y-"), 1.0, inertia=0.0)
+    b.add_actuator(hinge, torque=wf.PD(1.0, 0.1, target=wf.Control("q", 1), limit=None))
+    b.add_foundation(bar.surface("y+"), stiffness=1e3, damping=1.0)
+    b.add_velocity_constraint("speed", b.add_joint("translational", parent=wf.GROUND, child=bar.surface("z-"),
+                                                   axis=(1, 0, 0)))  # fmt: skip
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-3, integrator="bdf2")
+    sim.step()
+    assert [x.shape for x in sim.pose(p)] == [(1, 3), (1, 4)]
+    assert sim.angular_velocity(p).shape == (1, 3)
+    assert sim.joint_rate(hinge).shape == (1,)
+    for section in (
+        wf.Circle(0.1),
+        wf.Tube(0.1, 0.01),
+        wf.Section(np.array([(-0.1, 0.0), (0.1, 0.1), (0, -0.1)]), np.ones(3)),
+    ):
+        assert section
+
+
+def test_results(tmp_path):
+    b = wf.ModelBuilder()
+    body = b.add_solid(wf.mesh.box((1, 0.1, 0.1), cells=(2, 1, 1), element="T4"), name="bar",
+                       material=wf.SVK(E=1e6, nu=0.3, density=1000.0))  # fmt: skip
+    b.clamp(body.nodes("x-"))
+    b.add_point_load(body.at((1, 0.05, 0.05)), force=(-1e-3, 0, 0))
+    model = b.finalize(device="cpu")
+    r = wf.solve_static(model, load_steps=1, unstable="warn", outputs=[wf.VTUWriter(tmp_path / "x")])
+    nodes = len(body.mesh.points)
+    for name, count in (("cauchy", 6), ("first_piola", 9), ("principal", 3)):
+        assert r.field(name, body).shape == (1, nodes, count)
+    r.write(tmp_path / "x.vtu")
+    assert wf.read_results(tmp_path / "x" / "x.pvd").field("von_mises", "bar").shape[2] == nodes
+    assert wf.modes(model, r.state, count=10).frequencies.shape == (10,)
+    assert wf.buckling(model, r.state).factors.shape == (1,)
+    sim = wf.Simulation(model, dt=1e-3, energy_growth="warn", check_overlap=True)
+    history = sim.history("cauchy", body.at((0.5, 0.05, 0.05)))
+    sim.run(2e-3, outputs=[wf.HTMLWriter(tmp_path / "x.html")])
+    assert history.values.shape == (1, 2, 1, 6)
+    assert sim.sample([body.at((0.5, 0.05, 0.05))], "von_mises").shape == (1, 1)
+    assert (tmp_path / "x.html").stat().st_size > 1000
+    assert callable(wf.mesh.from_surface)
