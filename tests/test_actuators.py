@@ -144,6 +144,35 @@ def test_stops_by_default_take_most_of_the_speed() -> None:
     assert stop.stiffness == pytest.approx((2.0 * np.pi / 0.01) ** 2)
 
 
+def test_stops_never_throw_back() -> None:
+    """A critically damped stop returns e^-2 of the speed; steps that do not resolve it return less, and none is refused
+    or books a negative loss, wherever in a step the stop is met."""
+    for h, most, least in ((2e-4, 0.14, 0.13), (1e-3, 0.15, 0.0), (1e-2, 0.05, 0.0)):
+        for speed in (8.7, 9.4, 10.0, 10.6):
+            b, slide = slider(speed, limits=(-10.0, 1.0))
+            sim = run(b, h, "bdf2")
+            losses = [0.0]
+            for _ in range(round(1.0 / speed / h) + max(4, round(6e-3 / h))):
+                sim.step()
+                losses.append(sim.energies()["spring_loss"][0])
+            assert least < -sim.joint_rate(slide)[0] / speed < most, (h, speed)
+            assert min(np.diff(losses)) >= 0.0, (h, speed)
+            assert losses[-1] < speed**2
+
+
+def test_a_load_just_below_the_friction_is_held() -> None:
+    """Friction of 1.01 times a load that acts at once: the joint rests on its stick spring, 1e-4 rad / 1.01, whose
+    damper takes half of the load's work; that of the spring alone, without slip, is no loss."""
+    for scheme in ("bdf2", "energy_momentum"):
+        b, _, hinge = rotor(0.0, (0, -9.81, 0), com=0.5, friction=1.01 * 4.905)
+        sim = run(b, 2e-3, scheme)
+        sim.step(500)
+        assert sim.joint_value(hinge)[0] == pytest.approx(-1e-4 / 1.01, rel=1e-3)
+        assert sim.energies()["spring_loss"][0] == pytest.approx(0.5 * 4.905e-4 / 1.01, rel=0.02)
+        sim.step(100)
+        assert sim.joint_value(hinge)[0] == pytest.approx(-1e-4 / 1.01, rel=1e-4)
+
+
 def test_friction_sticks_and_slips() -> None:
     """A beam under its weight, of 4.905 N m: friction of 10 N m, twice the sudden load, holds it within the stick's
     1e-4 rad, without creep; one of 3 N m is taken from the acceleration. A flywheel stops, and stays."""
@@ -288,6 +317,10 @@ def test_bad_input_is_named() -> None:
          "friction = -2.0"),
         (lambda: b.add_joint("revolute", parent=wf.GROUND, child=part.at((0, 0, 0)), axis=(0, 0, 1), limits=0.3),
          "must be \\(lower, upper\\)"),
+        (lambda: b.add_joint("revolute", parent=wf.GROUND, child=part.at((0, 0, 0)), axis=(0, 0, 1), limits=(0.1, 0.2)),
+         "leave out the reference"),
+        (lambda: b.add_joint("revolute", parent=wf.GROUND, child=part.at((0, 0, 0)), axis=(0, 0, 1), friction=1e300),
+         "friction = 1e\\+300 is too large"),
         (lambda: b.add_joint("spherical", parent=wf.GROUND, child=part.at((0, 0, 0)), damping=1.0), "no angle"),
     ]  # fmt: skip
     for call, text in cases:
@@ -295,14 +328,16 @@ def test_bad_input_is_named() -> None:
             call()
     assert len(b.description.joints) == 4
     assert not b.description.springs
-    b, _, hinge = rotor(limits=(-1.0, 1.0))
-    b.add_actuator(hinge.name, wf.PD(1.0), name="pd")
+    b, _, hinge = rotor(limits=(-1.0, 1.0), friction=1.0)
+    b.add_actuator(hinge.name, wf.PD(1.0, limit=2.0), name="pd")
     with pytest.raises(wf.ModelError, match="'hing' is no joint of this builder; did you mean 'hinge'"):
         b.add_actuator("hing", 1.0)
     model = b.finalize(device="cpu")
     for name, value, text in (
         ("pd.kp", -1.0, "set_parameter: pd.kp = -1.0 in world 0 must be 0 or more"),
         ("hinge.lower", 2.0, "set_parameter: hinge.lower = 2.0 in world 0 must be below the upper"),
+        ("pd.limit", 0.0, "pd.limit = 0.0 in world 0 must be positive"),
+        ("hinge.friction", 1e300, "hinge.friction = 1e\\+300 in world 0 must be 0 to 1e\\+100"),
     ):
         with pytest.raises(wf.ModelError, match=text):
             model.set_parameter(name, value)

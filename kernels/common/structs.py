@@ -8,7 +8,6 @@ from .modules import KernelSet, kernel_set
 from .types import int_1d, precision
 
 __all__ = [
-    "IMPACT_DEPTH",
     "IMPACT_FOUND",
     "IMPACT_REPEATED",
     "balance_struct",
@@ -19,10 +18,6 @@ __all__ = [
 
 IMPACT_FOUND, IMPACT_REPEATED = 1, 2
 """Values of `impact` of the step control: the attempt does not resolve an impact; it is taken again for that reason."""
-IMPACT_DEPTH = 0.1
-"""Depth of a point that was less than half as deep before the step and loses half of its momentum in it, over approach
-speed times step, below which the step does not resolve its impact: BDF2 and generalized-alpha would throw the body
-back."""
 
 
 @functools.cache

@@ -5,7 +5,7 @@ import functools
 import warp as wp
 
 from ..common.modules import KernelSet, kernel_set, masked_kernel
-from ..common.structs import IMPACT_DEPTH, IMPACT_FOUND
+from ..common.structs import IMPACT_FOUND
 from ..common.types import f64, vec3d
 from .assembly import contact_module
 from .friction import friction_functions
@@ -34,6 +34,10 @@ STORED, LOSS, FRICTION, COLLIDER_WORK, INTEGRATOR_WORK = range(5)
 """Columns of the energy increments, J: stored energy (its value), lost to restitution, lost to friction, work of the
 colliders, and the part of the contact's work that is due to the integrator."""
 ENERGY_COLUMNS = 5
+IMPACT_DEPTH = 0.1
+"""Depth of a point that was less than half as deep before the step and loses half of its momentum in it, over approach
+speed times step, below which the step does not resolve its impact: BDF2 and generalized-alpha would throw the body
+back."""
 RECORD_LANES = 32
 """Threads that share the sums over the facets of a contact."""
 SUMMED_ROWS = len(RECORD_NAMES) - 1

@@ -2,8 +2,11 @@
 
     TORQUE    F = -T(t)
     FEEDBACK  F = clamp(k (y - target(t)) + c dy/dt) to +-limit, of a PD controller
-    FRICTION  F = clamp(k (y - anchor) + c dy/dt) to +-limit, y at the end of a step: a slip drags the anchor along
+    FRICTION  F = clamp(k (y - anchor) + c dy/dt) to +-limit, at the end of a step: a slip drags the anchor along
     STOP      F = k p + c dp/dt of the penetration p beyond a bound, which never pulls
+
+The stick spring k of FRICTION is overdamped by c = k * SETTLING_TIME: k alone would let a load applied at once pass the
+limit on its way to twice the place where it rests, and slip.
 
 None falls with y within a step: its integral is a convex part of Phi. In a mid-point scheme k p of a stop is the mean
 (W(y) - W(y0))/(y - y0) of its energy, and a step takes from controller, stop and friction never less than the change
@@ -22,6 +25,8 @@ __all__ = ["FEEDBACK", "FRICTION", "STOP", "TORQUE", "bounded_functions"]
 
 TORQUE, FEEDBACK, FRICTION, STOP = -1, -2, -3, -4
 """Laws; those of springs are 0 and more."""
+SETTLING_TIME = 0.1
+"""Time in which a stuck joint settles on its stick spring, s: the damping over the stiffness."""
 
 
 @functools.cache
@@ -76,6 +81,10 @@ def bounded_functions(midpoint: bool) -> KernelSet:
         if code == TORQUE:
             return wp.vec3d(-value, f64(0.0), -value * y)
         k, c, max_force = spr.stiffness[world, sp], spr.damping[world, sp] * inverse, spr.max_force[world, sp]
+        if code == FRICTION:
+            c = k * f64(SETTLING_TIME) * inverse
+            if wp.static(midpoint):
+                c = f64(2.0) * c
         slope = k + c
         s = c * (y - reference)
         if code == FRICTION:
@@ -121,14 +130,18 @@ def bounded_functions(midpoint: bool) -> KernelSet:
                 if spr.law[sp] == FEEDBACK and wp.abs(force) < spr.max_force[world, sp]:
                     mean -= f64(0.5) * spr.stiffness[world, sp] * (y - y0)
             return wp.vec3d(f64(0.0), f64(0.0), -mean * (y - y0))
-        after = anchor
+        after, slip = anchor, f64(0.0)
         if spr.law[sp] == FRICTION:
             after = dragged(spr, world, sp, y, anchor)
+            slip = after - anchor
         stored = energy(spr, world, sp, y, after)
-        if wp.static(not midpoint):
-            if spr.law[sp] == STOP:
-                elastic_force = spr.stiffness[world, sp] * penetration(spr, world, sp, y)
-                return wp.vec3d(stored, (force - elastic_force) * (y - y0), f64(0.0))
-        return wp.vec3d(stored, force * (y - y0) - stored + energy(spr, world, sp, y0, anchor), f64(0.0))
+        if wp.static(midpoint):
+            return wp.vec3d(stored, force * (y - y0) - stored + energy(spr, world, sp, y0, anchor), f64(0.0))
+        moved, elastic_force = y - y0, spr.stiffness[world, sp] * (y - after)
+        if spr.law[sp] == STOP:
+            p = penetration(spr, world, sp, y)
+            moved, elastic_force = p - penetration(spr, world, sp, y0), spr.stiffness[world, sp] * p
+        loss = force * slip + wp.max((force - elastic_force) * (moved - slip), f64(0.0))
+        return wp.vec3d(stored, loss, f64(0.0))
 
     return kernel_set(locals())

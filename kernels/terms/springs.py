@@ -22,7 +22,7 @@ import warp as wp
 
 from ..common.block_entries import add_block_function
 from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
-from ..common.structs import IMPACT_DEPTH, IMPACT_FOUND, pattern_struct, topology_struct
+from ..common.structs import IMPACT_FOUND, pattern_struct, topology_struct
 from ..common.types import double_1d, double_2d, double_3d, f64, int_1d, mat33d, precision, vec3d, vec3d_2d
 from .bounded_laws import FRICTION, STOP, bounded_functions
 from .chords import chord_functions
@@ -43,7 +43,6 @@ def scratch_struct():
         start: wp.array2d(dtype=wp.float64)  # [world, item] y at the start of the step
         reference: wp.array2d(dtype=wp.float64)  # [world, item] y~
         anchor: wp.array2d(dtype=wp.float64)  # [world, item] of FRICTION at the start of the step
-        speed: wp.array2d(dtype=wp.float64)  # [world, item] dy/dt of STOP at the start of the step
         force: wp.array2d(dtype=wp.mat33d)  # [world, item] derivatives of the potential by the vectors
         product: wp.array2d(dtype=wp.mat33d)  # [world, item] their change along a direction
         hessian: wp.array2d(dtype=wp.mat33d)  # [world, block] derivatives of the force
@@ -88,7 +87,8 @@ def spring_kernels(
         spr: Springs, u: p.vec3_2d, v: p.vec3_2d, earlier: p.vec3_2d, accelerated: int, first: double_1d,
         second: double_1d, turned: double_2d, anchor: double_2d, active: int_1d, scr: Scratch,
     ):  # fmt: skip
-        """y at the start, and y~ = a0 y - a1 y(u_{n-1}), or with accelerations a y + b dy/dt + q_a d2y/dt2."""
+        """y at the start, and y~ = a0 y - a1 y(u_{n-1}), with accelerations y + b dy/dt + q_a d2y/dt2, in a mid-point
+        scheme y, of friction y + b dy/dt."""
         world, item = wp.tid()
         kind = spr.kind[item]
         if kind == VECTOR or kind == CHORD:
@@ -100,12 +100,16 @@ def spring_kernels(
         y = c.coordinate(kind, V, near)
         scr.start[world, item] = y
         if wp.static(bounded):
-            if spr.law[spr.spring[item]] == STOP:
-                scr.speed[world, item] = wp.ddot(c.derivatives(kind, V, y).g, vectors(spr, v, world, item))
             if spr.law[spr.spring[item]] == FRICTION:
                 previous = anchor[world, item]
                 scr.anchor[world, item] = wp.where(wp.isnan(previous), y, previous)
-        if accelerated == 0:
+        if wp.static(midpoint):
+            reference = y
+            if wp.static(bounded):
+                if spr.law[spr.spring[item]] == FRICTION:  # its rate is that at the end of the step
+                    turn = wp.ddot(c.derivatives(kind, V, y).g, vectors(spr, v, world, item))
+                    reference += second[world] * turn
+        elif accelerated == 0:
             reference = first[world] * y
             if second[world] != f64(0.0):
                 before = c.coordinate(kind, spr.reference[item] + vectors(spr, earlier, world, item), y)
@@ -330,24 +334,22 @@ def spring_kernels(
 
     @wp.kernel(module=module)
     def find_impacts(
-        spr: Springs, u: p.vec3_2d, h: double_1d, dq_dv: double_1d, running: int_1d, failed: int_1d, scr: Scratch,
-        impact: int_1d,
+        spr: Springs, u: p.vec3_2d, h: double_1d, running: int_1d, failed: int_1d, scr: Scratch, impact: int_1d
     ):  # fmt: skip
-        """Flag worlds whose converged attempt takes half of the speed of a stop's impact that it does not resolve."""
+        """Flag worlds whose converged attempt changes the penetration of a stop by more than half of it."""
         world, item = wp.tid()
         sp = spr.spring[item]
         if running[world] == 0 or failed[world] != 0 or impact[world] != 0 or spr.law[sp] != STOP:
             return
-        y0, speed = scr.start[world, item], scr.speed[world, item]
-        V = spr.reference[item] + vectors(spr, u, world, item)
-        y = c.coordinate(spr.kind[item], V, y0)
-        depth = more.penetration(spr, world, sp, y)
-        before = more.penetration(spr, world, sp, y0)
-        sudden = wp.abs(depth) > f64(2.0) * wp.abs(before)
-        if sudden and depth * speed > f64(0.0) and wp.abs(depth) < f64(IMPACT_DEPTH) * wp.abs(speed) * h[world]:
-            rate = (y - scr.reference[world, item]) / dq_dv[world]
-            if rate * wp.sign(speed) < f64(0.5) * wp.abs(speed):
-                impact[world] = IMPACT_FOUND
+        if scr.force[world, item] == mat33d():
+            return
+        y0 = scr.start[world, item]
+        y = c.coordinate(spr.kind[item], spr.reference[item] + vectors(spr, u, world, item), y0)
+        before, depth = more.penetration(spr, world, sp, y0), more.penetration(spr, world, sp, y)
+        k = spr.stiffness[world, sp]
+        change = (k + spr.damping[world, sp] / h[world]) * wp.abs(depth - before)
+        if change > f64(0.5) * k * wp.max(wp.abs(depth), wp.abs(before)):
+            impact[world] = IMPACT_FOUND
 
     @masked_kernel(module, "active")
     def store_history(

@@ -17,7 +17,7 @@ from ..kernels.terms.springs import ANGLE
 from ..model.assembly import require_density, rigid_modes
 from ..model.joints import Joint, Vector
 from ..model.masses import body_mass
-from ..model.springs import Spring, coordinate_gradients, joint_coordinate
+from ..model.springs import MAX_FRICTION, Spring, coordinate_gradients, joint_coordinate
 from ..time_laws import TimeLaw, time_law
 
 __all__ = ["PD", "Stop", "joint_springs", "make_actuator"]
@@ -120,6 +120,8 @@ def joint_springs(joint: Joint, limits: Any, friction: Any, stiffness: Any, damp
         out.append(_stop_spring(what, joint, limits))
     if friction is not None:
         _not_negative(what, "friction", friction)
+        if friction > MAX_FRICTION:
+            raise ModelError(f"{what}: friction = {friction!r} is too large; a fixed joint holds at any load")
         kind, vectors = _coordinate(what, joint)
         keys = {f"{joint.name}.friction": "max_force"}
         spring = Spring(f"{joint.name}.friction", kind, [vectors], float(friction) / STICK, between=joint.between)
@@ -155,6 +157,11 @@ def _stop_spring(what: str, joint: Joint, limits: Any) -> Spring:
     kind, vectors = _coordinate(what, joint)
     stiffness, damping = limits.stiffness, limits.damping or 0.0
     if stiffness is None:
+        if not limits.lower <= 0.0 <= limits.upper:
+            raise ModelError(
+                f"{what}: limits ({limits.lower:g}, {limits.upper:g}) leave out the reference, 0, so that the stop "
+                "starts compressed; if this is meant, give wf.Stop(stiffness=)"
+            )
         inertia, rate = _coordinate_inertia(what, joint, kind, vectors), 2.0 * np.pi / STOP_PERIOD
         stiffness = inertia * rate**2
         damping = 2.0 * inertia * rate if limits.damping is None else damping

@@ -13,7 +13,10 @@ from ..kernels.terms.springs import ANGLE, LENGTH, TRAVEL
 from ..time_laws import TimeLaw
 from .joints import Joint, Vector
 
-__all__ = ["Bushing", "SampledForce", "Spring", "coordinate_gradients", "joint_coordinate"]
+__all__ = ["MAX_FRICTION", "Bushing", "SampledForce", "Spring", "coordinate_gradients", "joint_coordinate"]
+
+MAX_FRICTION = 1e100
+"""Largest friction of a joint, N m or N: its energies are finite."""
 
 
 @dataclass(frozen=True, eq=False)

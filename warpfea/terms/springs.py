@@ -16,12 +16,12 @@ from ..base.launch import Launcher
 from ..base.worlds import check_values_per_world, set_rows, values_per_world
 from ..kernels.common.modules import definition_name
 from ..kernels.solvers.newton_control import TERM_ROWS
-from ..kernels.terms.bounded_laws import FRICTION, STOP
+from ..kernels.terms.bounded_laws import FEEDBACK, FRICTION, STOP
 from ..kernels.terms.chords import MAX_TURN
 from ..kernels.terms.spring_laws import LINEAR, OWN, SAMPLED, OwnForces, spring_struct
 from ..kernels.terms.springs import ANGLE, CHORD, LENGTH, TRAVEL, VECTOR, scratch_struct, spring_kernels
 from ..model.assembly import grouped_items
-from ..model.springs import SampledForce, Spring, coordinate_gradients
+from ..model.springs import MAX_FRICTION, SampledForce, Spring, coordinate_gradients
 from .protocols import Diagnosed, Impacting, Parametrised, Preconditioned, Tied
 from .term import LOSS, NUMERICAL, STORED, WORK, Column, StepContext, part
 from .time_law_table import TimeLawTable
@@ -181,7 +181,18 @@ class Springs(Tied, Preconditioned, Parametrised, Impacting, Diagnosed):
         return sp.csr_matrix((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=shape)
 
     def failure_note(self, ctx: StepContext, world: int) -> str:
-        """Bushings near their largest turn."""
+        """Bushings near their largest turn; controllers that pull a joint by more than half a turn."""
+        start, values = ctx.scratch[self.name][0].start, ctx.work.time_law_stage_values
+        for item in np.flatnonzero(self.kind == ANGLE).tolist():
+            k = self.definition["spring"][item]
+            if self.springs[k].law == FEEDBACK and self.springs[k].max_force == np.inf:
+                target = values.numpy()[world, self.definition["schedule"][k], 0]
+                away = abs(target - start.numpy()[world, item])
+                if away > np.pi:
+                    return (
+                        f"; the target of controller {self.springs[k].name!r} is {away:.3g} rad away: give it as a ramp, "
+                        "or the wf.PD a limit="
+                    )
         u = ctx.work.u.numpy()[world].astype(float)
         for item in np.flatnonzero(self.kind == CHORD).tolist():
             own = slice(self.entry_start[item], self.entry_start[item + 1])
@@ -241,7 +252,7 @@ class Springs(Tied, Preconditioned, Parametrised, Impacting, Diagnosed):
     def begin(self, ctx: StepContext, active: wp.array) -> None:
         """Coordinates at the start, from which rates are computed."""
         state, step = ctx.state, ctx.work.step
-        first, second = (step.b, step.q_a) if ctx.accelerated else (step.a0, step.a1)
+        first, second = (step.b, step.q_a) if ctx.accelerated else (step.a0, step.b if ctx.midpoint else step.a1)
         args = [self.data, state.displacement, state.velocity, ctx.u_before, int(ctx.accelerated), first, second]
         args += [*self._history(ctx), active, ctx.scratch[self.name][0]]
         ctx.launch(self.kernels(ctx).begin, self.dim, args)
@@ -286,7 +297,7 @@ class Springs(Tied, Preconditioned, Parametrised, Impacting, Diagnosed):
     @part("springs")
     def find_impacts(self, ctx: StepContext) -> None:
         w = ctx.work
-        args = [self.data, w.u, w.step.h, w.step.dq_dv, w.step.running, w.newton.failed, ctx.scratch[self.name][0]]
+        args = [self.data, w.u, w.step.h, w.step.running, w.newton.failed, ctx.scratch[self.name][0]]
         ctx.launch(self.kernels(ctx).find_impacts, self.dim, [*args, w.step.impact])
 
     @part("springs")
@@ -396,6 +407,9 @@ class Springs(Tied, Preconditioned, Parametrised, Impacting, Diagnosed):
             bound = f"{'below the upper' if field == 'lower_end' else 'above the lower'} end"
         elif field != "rest" or self.kind[self.definition["spring"] == k][0] == LENGTH:
             good, bound = good & (wanted >= 0.0), "finite" if field == "rest" else "0 or more"
+        if field == "max_force":
+            good &= wanted <= MAX_FRICTION if spring.law == FRICTION else wanted > 0.0
+            bound = f"0 to {MAX_FRICTION:g}" if spring.law == FRICTION else "positive"
         check_values_per_world(what, name, wanted, ~mask | good, bound)
         set_rows(getattr(self.data, DEVICE_FIELDS[field]), (mask, k), wanted[mask])
         if spring.law == FRICTION and spring.stick > 0.0:
