@@ -188,12 +188,15 @@ def test_playing_and_turning(page):
 
 def test_without_webgl_a_message(tmp_path, browser):
     path = tmp_path / "x.html"
-    drive(Sim(worlds=1), HTMLWriter(path, fields=[]), 3)
+    sim = Sim(worlds=1)
+    sim.totals, sim.steps = {"rough": np.array([2])}, 3
+    drive(sim, HTMLWriter(path, fields=[]), 3)
     tab = Tab(browser, path, script="HTMLCanvasElement.prototype.getContext = ((get) => function (kind, how) {"
               " return kind === 'webgl2' ? null : get.call(this, kind, how); })"
               "(HTMLCanvasElement.prototype.getContext);")  # fmt: skip
     assert "no WebGL2" in tab.page.locator("#message").inner_text()
     assert not tab.page.locator("#stage").is_visible()
+    assert tab.page.locator("#notes").inner_text() == "the tolerance was not reached in 2 of 3 steps"
 
 
 def test_page_of_a_usd_file(tmp_path, browser):
@@ -274,5 +277,23 @@ def test_committed_pages_open(name, browser):
     tab = Tab(browser, path)
     assert tab("page.data.title") == name
     assert tab("page.view.surfaces.length") >= 1
+    times, canvas = tab("page.data.times"), tab.page.locator("#plots canvas").first
+    width = tab("page.plots.figures[0].canvas.clientWidth")
+    pictures = []
+    for share in (0.25, 0.75):  # a click on a plot sets the time, at which its cursor stands
+        canvas.click(position={"x": 46 + share * (width - 52), "y": 30})
+        shown = np.interp(tab("page.view.time"), range(len(times)), times)
+        start, end = tab("page.plots.span(page.data.plots[0])")
+        assert shown == pytest.approx(start + share * (end - start), abs=2.0 / width * (end - start))
+        pictures.append(canvas.screenshot())
+    assert pictures[0] != pictures[1]
+    tab.page.locator("#picture").focus()
+    for key, state in (("End", len(times) - 1), ("ArrowLeft", len(times) - 2), ("Home", 0), ("ArrowRight", 1)):
+        tab.page.keyboard.press(key)
+        assert tab("page.view.time") == state, key
+    for key, box in (("e", "edges"), ("u", "ghost"), ("m", "marks")):
+        before = tab(f"document.getElementById('{box}').checked")
+        tab.page.keyboard.press(key)
+        assert tab(f"document.getElementById('{box}').checked") != before, key
     assert not tab.errors
     assert not tab.foreign
