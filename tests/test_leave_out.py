@@ -5,6 +5,7 @@ import pytest
 import warp as wp
 
 import warpfea as wf
+from warpfea.kernels.terms.springs import spring_kernels
 
 
 @wp.func
@@ -132,6 +133,7 @@ def test_plain_springs_have_nothing_of_actuators_and_bushings():
     names = [name for name in modules if "spring" in name]
     assert names
     assert not any(word in name for word in ("bounded", "chords") for name in names)
+    assert not hasattr(spring_kernels(model.dtype, midpoint=False), "find_impacts")
     arrays = {name for name in model.terms.parameter_arrays() if name.startswith("springs.")}
     assert arrays == {"springs.stiffness", "springs.damping", "springs.rest_coordinate"}
 

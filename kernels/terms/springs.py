@@ -332,24 +332,26 @@ def spring_kernels(
         rows[0, world, item] = law.energy(spr, world, sp, y)
         rows[1, world, item] = in_motion * viscous_part[0] * (y - y0)
 
-    @wp.kernel(module=module)
-    def find_impacts(
-        spr: Springs, u: p.vec3_2d, h: double_1d, running: int_1d, failed: int_1d, scr: Scratch, impact: int_1d
-    ):  # fmt: skip
-        """Flag worlds whose converged attempt changes the penetration of a stop by more than half of it."""
-        world, item = wp.tid()
-        sp = spr.spring[item]
-        if running[world] == 0 or failed[world] != 0 or impact[world] != 0 or spr.law[sp] != STOP:
-            return
-        if scr.force[world, item] == mat33d():
-            return
-        y0 = scr.start[world, item]
-        y = c.coordinate(spr.kind[item], spr.reference[item] + vectors(spr, u, world, item), y0)
-        before, depth = more.penetration(spr, world, sp, y0), more.penetration(spr, world, sp, y)
-        k = spr.stiffness[world, sp]
-        change = (k + spr.damping[world, sp] / h[world]) * wp.abs(depth - before)
-        if change > f64(0.5) * k * wp.max(wp.abs(depth), wp.abs(before)):
-            impact[world] = IMPACT_FOUND
+    if bounded:
+
+        @wp.kernel(module=module)
+        def find_impacts(
+            spr: Springs, u: p.vec3_2d, h: double_1d, running: int_1d, failed: int_1d, scr: Scratch, impact: int_1d
+        ):  # fmt: skip
+            """Flag worlds whose converged attempt changes the penetration of a stop by more than half of it."""
+            world, item = wp.tid()
+            sp = spr.spring[item]
+            if running[world] == 0 or failed[world] != 0 or impact[world] != 0 or spr.law[sp] != STOP:
+                return
+            if scr.force[world, item] == mat33d():
+                return
+            y0 = scr.start[world, item]
+            y = c.coordinate(spr.kind[item], spr.reference[item] + vectors(spr, u, world, item), y0)
+            before, depth = more.penetration(spr, world, sp, y0), more.penetration(spr, world, sp, y)
+            k = spr.stiffness[world, sp]
+            change = (k + spr.damping[world, sp] / h[world]) * wp.abs(depth - before)
+            if change > f64(0.5) * k * wp.max(wp.abs(depth), wp.abs(before)):
+                impact[world] = IMPACT_FOUND
 
     @masked_kernel(module, "active")
     def store_history(

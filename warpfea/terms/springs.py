@@ -72,7 +72,7 @@ class Springs(Tied, Preconditioned, Parametrised, Impacting, Diagnosed):
         self.count = self.rows = len(self.items)
         self.kind = np.repeat([s.kind for s in self.springs], [len(s.items) for s in self.springs])
         self.features_used = self.own, self.bounded, bool((self.kind == CHORD).any())
-        self.unused = () if self.bounded else ("anchor", "speed", "max_force", "lower_end", "upper_end", "schedule")
+        self.unused = () if self.bounded else ("anchor", "max_force", "lower_end", "upper_end", "schedule")
         self.dim = (model.worlds, self.count)
 
     @classmethod
