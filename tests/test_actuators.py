@@ -211,6 +211,42 @@ def test_undriven_angles_count_turns() -> None:
     np.testing.assert_allclose(seen.update().numpy()[0], got, rtol=1e-12)
 
 
+@pytest.mark.parametrize("scheme", ["backward_euler", "bdf2"])
+def test_a_controlled_part_comes_to_rest_at_whole_turns(scheme: str) -> None:
+    """Displacements, forces and energies vanish; the angle of two turns keeps its round-off."""
+    b, _, hinge = rotor(rate=0.0)
+    b.add_actuator(hinge, wf.PD(1e4, 200.0, target=([0.0, 0.2, 0.3], [0.0, 4 * np.pi, 4 * np.pi])))
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-2, integrator=scheme)
+    sim.run(1.5)
+    np.testing.assert_allclose(sim.joint_value(hinge), 4 * np.pi, rtol=1e-15)
+    assert abs(sim.joint_rate(hinge)[0]) < 1e-12
+
+
+@pytest.mark.parametrize("scheme", ["backward_euler", "bdf2"])
+def test_a_held_part_passes_each_change_of_its_load_on(scheme: str) -> None:
+    """Nothing moves: multipliers alone change from step to step, also where the penalty has balanced the change."""
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    part = b.add_rigid(wf.Box((0, 0, -0.5), (0.1, 0.1, 1)), mass=1.0, name="part")
+    joint = b.add_joint("fixed", parent=wf.GROUND, child=part.at((0, 0, 0)), name="joint")
+    b.add_point_load(part.at((0, 0, -0.5)), wf.Control("F", 3))
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=0.1, integrator=scheme)
+    for step in range(1, 12):
+        sim.controls["F"] = (0, 0, -step / 0.7)
+        sim.step()
+        np.testing.assert_allclose(sim.joint_force(joint)[0, 2], step / 0.7, rtol=1e-6)
+
+
+def test_joint_forces_of_statics_carry_every_load_step() -> None:
+    b = wf.ModelBuilder(gravity=(0, 0, -9.81))
+    part = b.add_rigid(wf.Box((0, 0, -0.5), (0.1, 0.1, 1)), mass=1.0, name="part")
+    joint = b.add_joint("revolute", parent=wf.GROUND, child=part.at((0, 0, 0)), axis=(0, -1, 0), name="joint")
+    b.add_actuator(joint, wf.PD(100.0, 1.0))
+    model = b.finalize(device="cpu")
+    for load_steps in (3, 11):
+        result = wf.solve_static(model, load_steps=load_steps)
+        np.testing.assert_allclose(result.joint_force(joint)[0, 2], 9.81, rtol=1e-8)
+
+
 def test_controllers_hold_in_statics() -> None:
     """The beam hangs down by its weight over kp; a torque alone does not hold it."""
     b, _, hinge = rotor(0.0, (0, -9.81, 0), com=0.5)

@@ -8,7 +8,7 @@ from ..common.types import f64
 from .convergence import convergence_functions
 from .newton_control import Failure, Row, control_struct
 
-__all__ = ["MAX_TRUST_RADIUS", "PHI_NOISE_ROUNDINGS", "line_search_kernels"]
+__all__ = ["MAX_BACKTRACKS", "MAX_TRUST_RADIUS", "PHI_NOISE_ROUNDINGS", "line_search_kernels"]
 
 ARMIJO_FACTOR, WOLFE_FACTOR = 1.0e-4, 0.8
 """Sufficient decrease of Phi, and of |slope|, over the predicted one and over that at the iterate."""
@@ -198,6 +198,19 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> KernelSet:
         return low[0] + part * (high[0] - low[0])
 
     @wp.func
+    def halves_residual(ctl: Control, world: int, norm: f64) -> bool:
+        """True if a trial with residual `norm` halves that of the components that are still iterated."""
+        old, part = ctl.norms.residual_norm[world], ctl.norms.unconverged_norm[world]
+        return norm * norm <= old * old - f64(0.75) * part * part
+
+    @wp.func
+    def only_multipliers_change(ctl: Control, world: int) -> bool:
+        """True if Phi, with its frozen multipliers, is at its minimum within round-off but the residual is not 0: a
+        full step changes the multipliers alone."""
+        noise = f64(2.0 * PHI_NOISE_ROUNDINGS) * ctl.floor.eps * ctl.search.phi_magnitude[world]
+        return ctl.classical_multipliers == 0 and ctl.search.slope[world] <= noise
+
+    @wp.func
     def sufficient_decrease(ctl: Control, world: int, change: f64, slope: f64, norm: f64) -> bool:
         """True if a trial is good: Armijo on the change of Phi above its noise, else the sign of the slope."""
         alpha = ctl.search.alpha[world]
@@ -207,6 +220,8 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> KernelSet:
             * (ctl.search.phi_magnitude[world] + convergence.objective_magnitude(ctl, world))
         )
         good = slope <= f64(WOLFE_FACTOR) * wp.abs(ctl.search.slope[world])
+        if wp.static(traits.has_constraints):  # Phi has the multipliers frozen: at its minimum they still change
+            good = good or (ctl.classical_multipliers == 0 and halves_residual(ctl, world, norm))
         if wp.abs(change) > noise:
             good = change <= f64(ARMIJO_FACTOR) * alpha * ctl.search.slope[world]
         if wp.static(traits.midpoint):

@@ -10,7 +10,7 @@ from ..common.types import f64, int_1d
 from .augmented_lagrangian import outer_loop_kernels
 from .convergence import MAX_ERROR_ESTIMATES, SINGLE_PRECISION_EPS, convergence_functions
 from .frozen_update import frozen_update_kernels
-from .line_search import MAX_TRUST_RADIUS, PHI_NOISE_ROUNDINGS, line_search_kernels
+from .line_search import MAX_BACKTRACKS, MAX_TRUST_RADIUS, PHI_NOISE_ROUNDINGS, line_search_kernels
 from .newton_control import FLOOR_LANES, Failure, Row, control_struct
 from .pcg import pcg_struct
 from .perturbation import SCATTER_FACTOR
@@ -178,6 +178,8 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
                 ctl.search.alpha[world] = f64(0.0)
             elif ctl.nonmonotone.steps[world] > 0:
                 ctl.nonmonotone.restore_best[world] = 1
+            elif wp.static(traits.has_constraints) and searching.only_multipliers_change(ctl, world):
+                ctl.search.trials[world] = MAX_BACKTRACKS  # a single trial
             else:
                 convergence.handle_failed_search(ctl, world, Failure.CURVATURE)
 
@@ -223,8 +225,9 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
         if ctl.floor.estimate_error[world] != 2:
             return
         ctl.floor.estimate_error[world] = 0
+        single = ctl.floor.eps > f64(SINGLE_PRECISION_EPS)
         # this solve cannot give the error either
-        if ctl.solve.pcg_unconverged[world] != 0 and ctl.floor.eps > f64(SINGLE_PRECISION_EPS):
+        if ctl.solve.pcg_unconverged[world] != 0 and single:
             convergence.give_up(ctl, world, Failure.ROUNDOFF)
             return
         largest, whole = f64(0.0), f64(0.0)
@@ -234,6 +237,9 @@ def newton_kernels(traits: Traits = NO_TERMS) -> KernelSet:
                 largest = wp.max(largest, ctl.floor.sums[4, world, part, lane])
         if wp.static(traits.unilateral):  # gaps have position round-off
             largest = wp.max(largest, ctl.model_size)
+        elif wp.static(traits.has_constraints):  # so have angles of joints, whose forces vanish at rest
+            if ctl.is_static == 0 and not single:
+                largest = wp.max(largest, ctl.model_size)
         worst, noise = f64(0.0), f64(0.0)
         for part in range(component_of_part.shape[0]):
             if ctl.norms.component_converged[world, component_of_part[part]] == 0:
