@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import warp as wp
+from warpfea.kernels.terms.springs import spring_kernels
 
 import warpfea as wf
-from warpfea.kernels.terms.springs import spring_kernels
 
 
 @wp.func

@@ -1,7 +1,7 @@
 """Obstacles that move with points of their own, which touch facets of bodies: displacements of these points.
 
-Points of bodies pay a branch: 20 steps of the scene block_stack with 3 blocks of 4^3 cells take 2.10 s of a core with it
-and 2.10 s without, by repeated runs that differ by 2 %. Kernels of their own would be compiled twice.
+Points of bodies pay a branch: 20 steps of the scene block_stack with 3 blocks of 4^3 cells take 2.10 s of a core with
+it and 2.10 s without, by repeated runs that differ by 2 %. Kernels of their own would be compiled twice.
 """
 
 import functools

@@ -190,8 +190,8 @@ class Springs(Tied, Preconditioned, Parametrised, Impacting, Diagnosed):
                 away = abs(target - start.numpy()[world, item])
                 if away > np.pi:
                     return (
-                        f"; the target of controller {self.springs[k].name!r} is {away:.3g} rad away: give it as a ramp, "
-                        "or the wf.PD a limit="
+                        f"; the target of controller {self.springs[k].name!r} is {away:.3g} rad away: give it as a "
+                        "ramp, or the wf.PD a limit="
                     )
         u = ctx.work.u.numpy()[world].astype(float)
         for item in np.flatnonzero(self.kind == CHORD).tolist():
