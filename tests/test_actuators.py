@@ -95,7 +95,11 @@ def test_the_limit_of_a_controller() -> None:
     b.add_actuator(hinge, wf.PD(1e6, 10.0, target=wf.Control("q", 1, initial=3.0), limit=2.0), name="motor")
     sim = run(b, 1e-2, worlds=2)
     sim.model.set_parameter("motor.limit", [2.0, 3.0])
+    assert np.isnan(sim.spring_force("motor")).all()
     sim.run(1.0)
+    np.testing.assert_allclose(sim.spring_force("motor"), [2.0, 3.0], rtol=1e-3)
+    with pytest.raises(wf.ModelError, match="expected a spring of this model"):
+        sim.spring_force("moter")
     np.testing.assert_allclose(sim.joint_value(hinge), [1.0, 1.5], rtol=1e-4)
     np.testing.assert_allclose(sim.joint_rate(hinge), [2.0, 3.0], rtol=2e-4)
     np.testing.assert_allclose(sim.energies()["actuators"], [2.0, 4.5], rtol=1e-4)
@@ -171,6 +175,7 @@ def test_a_load_just_below_the_friction_is_held() -> None:
         assert sim.energies()["spring_loss"][0] == pytest.approx(0.5 * 4.905e-4 / 1.01, rel=0.02)
         sim.step(100)
         assert sim.joint_value(hinge)[0] == pytest.approx(-1e-4 / 1.01, rel=1e-4)
+        assert sim.spring_force("hinge.friction")[0] == pytest.approx(4.905, rel=1e-4)
 
 
 def test_friction_sticks_and_slips() -> None:
@@ -253,10 +258,11 @@ def test_controllers_hold_in_statics() -> None:
     b.add_actuator(hinge, 1.0)
     with pytest.raises(wf.ModelError, match="1 unconstrained"):
         wf.solve_static(b.finalize(device="cpu"))
-    b.add_actuator(hinge, wf.PD(100.0, 5.0, target=wf.Control("q", 1, initial=0.1)))
+    motor = b.add_actuator(hinge, wf.PD(100.0, 5.0, target=wf.Control("q", 1, initial=0.1)))
     static = wf.solve_static(b.finalize(device="cpu"), load_steps=1, tol=1e-12)
     y = static.joint_value(hinge)[0]
     assert 100.0 * (0.1 - y) + 1.0 == pytest.approx(4.905 * np.cos(y), rel=1e-9)
+    assert static.spring_force(motor)[0] == pytest.approx(100.0 * (0.1 - y), rel=1e-9)
 
 
 def mixed() -> tuple[Any, Any]:

@@ -114,6 +114,11 @@ class Spring:
         return isinstance(self.law, int)
 
     @property
+    def scalar(self) -> bool:
+        """True with one coordinate of its own: no foundation, no part of a bushing."""
+        return self.kind in (LENGTH, TRAVEL, ANGLE) and self.keys != {}
+
+    @property
     def acting(self) -> bool:
         """True for an actuator."""
         return self.bounded and self.law >= FEEDBACK

@@ -22,11 +22,13 @@ from ..model.handles import ElementSet, NodeSet
 from ..model.joints import Joint
 from ..model.pairs import FacetOptions
 from ..model.rigid import RigidBody
+from ..model.springs import Spring
 from ..model.state import State
 from ..model.surfaces import reference_points
 from ..terms.fields import VECTOR, check_scalar, field_at_nodes, field_at_points, field_inside, find_field
 from ..terms.joint_values import joint_value
 from ..terms.protocols import Touching
+from ..terms.springs import Springs
 from ..terms.term import FieldSpec
 from .reports import ContactRecord, JointRecord, ProbeRecord
 from .sampling import History, Sampler
@@ -65,11 +67,8 @@ class Results:
         """Raise ModelError unless `body` is the handle of a body of this model; the text begins with `what`."""
         if not isinstance(body, Body):
             names = ", ".join(repr(b.name) for b in self.model.bodies[:MAX_NAMED_BODIES])
-            names += (
-                f" and {len(self.model.bodies) - MAX_NAMED_BODIES} more"
-                if len(self.model.bodies) > MAX_NAMED_BODIES
-                else ""
-            )
+            if len(self.model.bodies) > MAX_NAMED_BODIES:
+                names += f" and {len(self.model.bodies) - MAX_NAMED_BODIES} more"
             raise ModelError(
                 f"{what}: expected a body, by the handle that add_solid, add_beam, add_shell or add_rigid returned (of "
                 f"{names}), got {body!r}"
@@ -338,6 +337,13 @@ class Records:
         """
         self.warn_of_noise()
         return self._of_last_step(self.joint_column(joint))
+
+    def spring_force(self, spring: Spring | str) -> np.ndarray:
+        """Torque (N m) or force (N), (B,), of an actuator, stop, friction or spring on a joint's child at the last
+        accepted step, or tension of a spring between points. NaN as for `reaction`."""
+        term = self.model.terms.find(Springs)
+        known = _find("spring", spring, [s for s in getattr(term, "springs", ()) if s.scalar], "a handle, or a name")
+        return np.where(self.statistics.stepped_worlds, term.scalar_force(self.stepper.ctx, known), np.nan)
 
     def violation(self, joint: Joint | str) -> np.ndarray:
         """Largest violation of a joint's rows in the present state, (B,), m; angles are multiplied by the model's

@@ -135,6 +135,7 @@ class Simulation:
     probe = PartMember("records", Records.probe)
     joint_record = PartMember("records", Records.joint_record)
     joint_force = PartMember("records", Records.joint_force)
+    spring_force = PartMember("records", Records.spring_force)
     joint_value = PartMember("records", Records.joint_value)
     joint_rate = PartMember("records", Records.joint_rate)
     violation = PartMember("records", Records.violation)

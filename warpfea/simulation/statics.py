@@ -68,6 +68,7 @@ class StaticResult:
     reaction = PartMember("simulation", Records.reaction)
     reaction_moment = PartMember("simulation", Records.reaction_moment)
     joint_force = PartMember("simulation", Records.joint_force)
+    spring_force = PartMember("simulation", Records.spring_force)
     joint_value = PartMember("simulation", Records.joint_value)
     contact_force = PartMember("simulation", Records.contact_force)
     contact_record = PartMember("simulation", Records.contact_record)

@@ -180,6 +180,21 @@ class Springs(Tied, Preconditioned, Parametrised, Impacting, Diagnosed):
             return sp.csr_matrix(shape)
         return sp.csr_matrix((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=shape)
 
+    def scalar_force(self, ctx: StepContext, spring: Spring) -> np.ndarray:
+        """Force (worlds,) of a spring with one coordinate: of LENGTH its tension, of others that on the child.
+
+        The derivatives of the potential are those of the last evaluation; with `energy_momentum` they are means over
+        the step, which a turn in the step makes smaller to second order.
+        """
+        item = int(np.flatnonzero(self.definition["spring"] == self.springs.index(spring))[0])
+        own, kind = slice(self.entry_start[item], self.entry_start[item + 1]), int(self.kind[item])
+        u = ctx.state.displacement.numpy()[:, self.entry_slot[own]].astype(float)
+        out = []
+        for x, force in zip(u, ctx.scratch[self.name][0].force.numpy()[:, item]):
+            (g,) = coordinate_gradients(kind, self.definition["reference"][item] + self.entry_weight[own].T @ x)
+            out.append(np.sum(force * g) / np.sum(g * g))
+        return np.array(out) if kind == LENGTH else -np.array(out)
+
     def failure_note(self, ctx: StepContext, world: int) -> str:
         """Bushings near their largest turn; controllers that pull a joint by more than half a turn."""
         start, values = ctx.scratch[self.name][0].start, ctx.work.time_law_stage_values
