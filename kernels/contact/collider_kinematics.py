@@ -134,10 +134,11 @@ def collider_kinematics(dtype: str, meshes: bool, seams: bool = False) -> Kernel
                 level = vec3d(found[0], found[1], found[2])
                 others = col.deepest[world, kc, direction(level)]
                 most = f64(MAX_DEPTH_RATIO) * others
-                if apart and wp.dot(level, inward) > f64(OPPOSING_COSINE):
+                least = f64(OPPOSING_COSINE)  # Warp sets a constant where it first stands: not behind an `and`
+                if apart and wp.dot(level, inward) > least:
                     most = wp.max(most, f64(ENTRY_DEPTH) * facets.element_depth[item])
                 unopposed = wp.dot(level, inward) > -f64(MIN_NORMAL_COSINE)
-                if unopposed and wp.dot(level, way) > f64(OPPOSING_COSINE) and found[3] < f64(0.0):
+                if unopposed and wp.dot(level, way) > least and found[3] < f64(0.0):
                     if -found[3] <= wp.min(most, f64(EDGE_ENTRY_SLOPE) * -d[3]):
                         return side
                     # a blunt edge also meets facets between both sides
