@@ -204,7 +204,7 @@ class TwoLevel(Preconditioner):
         """Rebuild where due, with D and the penalties that follow from D."""
         # factors that follow the operator's matrix reuse D only; beside contacts, which change as much, old inverses of
         # the whole matrix cost fewer iterations than they save (4096 fingers: 0.2 a solve and half of the rebuilds)
-        kept = self.factors_operator or (self.plan.body_modes and self.solved_directly)
+        kept = self.factors_operator or (self.solved_directly and self.model.terms.traits.unilateral)
         whole = rebuild and not (kept and self.plan.on_cuda)
         self.reuse.decide_rebuild(active, all_active=whole)
         self.reuse.rebuild_if_flagged(partial(self._build, penalty=True))
