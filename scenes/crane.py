@@ -36,7 +36,7 @@ def crane(
     b.add_joint("fixed", parent=wf.GROUND, child=mast.at((0, 0, 0)), name="foundation")
     turntable = b.add_rigid(wf.Cylinder(top, top + (0, 0, 0.1), 0.12), density=7850.0, name="turntable")
     bearing = b.add_joint("revolute", parent=mast.at(top), child=turntable.at(top), axis=(0, 0, 1), name="bearing")
-    b.add_velocity_constraint("speed", bearing, value=([0, 0.5, 2.0, 2.5], [0, speed, speed, 0]), name="motor")
+    b.add_velocity_constraint("speed", bearing, value=([0, 0.5, 2.0, 2.5, 3.0], [0, speed, speed, 0, 0]), name="motor")
     steel = wf.SVK(E=2e10, nu=0.3, density=2000.0)
     axis = top + (0, 0, 0.15)
     boom = b.add_beam([axis - (0.6, 0, 0), axis, axis + (reach, 0, 0)], elements=7, section=wf.Rectangle(0.05, 0.07),

@@ -84,7 +84,7 @@ def main():
     out = parser.parse_args().out
     content = provenance_of([], "cpu") | {"command": " ".join(["python", *sys.argv])}
     content["bars"] = [bars(ratio, e) for ratio in (1, 2) for e in (0.0, 1.0)]
-    content["parts"] = [parts(e, h) for e in (0.3, 0.5, 0.8) for h in (1e-4, 2.5e-5)]
+    content["rigid parts"] = [parts(e, h) for e in (0.3, 0.5, 0.8) for h in (1e-4, 2.5e-5)]
     out.write_text(json.dumps(content, indent=1) + "\n")
 
 

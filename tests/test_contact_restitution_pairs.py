@@ -17,11 +17,13 @@ def test_elastic_bars_rebound_by_their_waves(row):
 
 def test_rigid_parts_rebound_with_the_restitution_of_their_contact():
     """Up to an error of first order in the step: 0.04 at a hundredth of the impact."""
-    coarse, fine = ({r["restitution"]: r["measured"] for r in FOUND["parts"] if r["dt"] == dt} for dt in (1e-4, 2.5e-5))
+    coarse, fine = (
+        {r["restitution"]: r["measured"] for r in FOUND["rigid parts"] if r["dt"] == dt} for dt in (1e-4, 2.5e-5)
+    )
     for e, measured in fine.items():
         assert measured == pytest.approx(e, abs=0.04)
         assert abs(measured + (measured - coarse[e]) / 3.0 - e) < 0.01
-    assert all(row["momentum_error"] < 1e-10 for row in FOUND["parts"])
+    assert all(row["momentum_error"] < 1e-10 for row in FOUND["rigid parts"])
 
 
 @pytest.mark.slow

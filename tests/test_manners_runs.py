@@ -207,9 +207,9 @@ def labels(monkeypatch):
     seen = []
     label = animation.draw_labels
 
-    def note(image, time, bar):
+    def note(image, time, *more):
         seen.append(time)
-        return label(image, time, bar)
+        return label(image, time, *more)
 
     monkeypatch.setattr(animation, "draw_labels", note)
     return seen
@@ -414,7 +414,7 @@ def test_the_summary_says_that_rounding_set_the_limit():
         (["--png-time", "0.002"], "--png-time is for a picture: give --png too"),
         (["--png-time", "0.5", "--png", "a.png"], "--png-time 0.5: the run lasts from 0 to t = 0.004 s"),
         (["--every", "5"], "--every is for checkpoints: give --checkpoint too"),
-        (["--fps", "5", "--gif", "a.gif"], "--fps is for animations: give --usd or --vtu too"),
+        (["--fps", "5", "--gif", "a.gif"], "--fps is for animations: give --usd or --vtu or --html too"),
         (["--speed", "5", "--usd", "a.usdc"], "--speed is for an animation: give --gif too"),
         (["--usd", "a.usdc", "--usd", "b.usdc"], "--usd is given twice"),
         (["--t-end", "1e-9"], "--t-end 1e-09: less than"),

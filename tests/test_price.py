@@ -73,7 +73,10 @@ def test_what_is_forced_in_is_all_that_the_scene_leaves_out():
     assert row["left"] == []
 
 
-@pytest.mark.parametrize("file", ["part_price_cpu.json"])
+DEARER = pytest.mark.xfail(strict=True, reason="1.35 free, 1.40 on a hinge: launches of the constraints")
+
+
+@pytest.mark.parametrize("file", ["part_price_cpu.json", pytest.param("part_price_h200.json", marks=DEARER)])
 def test_a_rigid_part_costs_little(file):
     """One more part in scene `hook`, free and on a hinge: its step beside that of the scene alone."""
     found = {row["label"]: row for row in rows_of(file)}

@@ -61,7 +61,9 @@ def test_the_sheet_has_one_scale(tmp_path, monkeypatch):
     """The colours of all its pictures are those of the extremes of all."""
     rows, drawn, draw = [{"gravity.z": g} for g in (-1.0, -4.0)], [], Animation.draw
     result = wf.sweep(BAR, rows, measures={"s": "field.von_mises"}, run={"t_end": 0.01}, engine=Inline(), out=tmp_path)
-    monkeypatch.setattr(Animation, "draw", lambda self, *given: drawn.append(self.color_limits()) or draw(self, *given))
+    monkeypatch.setattr(
+        Animation, "draw", lambda self, *given: drawn.append(self.color_limits(given[-1])) or draw(self, *given)
+    )
     result.sheet(tmp_path / "sheet.png", field="von_mises")
     assert drawn[0] == drawn[1]
     assert drawn[0][1] == pytest.approx(result["s"].max(), rel=1e-5)

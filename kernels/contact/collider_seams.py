@@ -138,8 +138,8 @@ def seam_functions(meshes: bool) -> KernelSet:
             found = from_neighbor(col, world, kc, col.neighbor[e], y, vec3d())
             level = vec3d(found[0], found[1], found[2])
             lift = (lengths[0] - found[3]) * level
-            if found[3] > lengths[0] or found[3] < -lengths[2]:
-                continue
+            if col.neighbor[e] == kc or found[3] > lengths[0] or found[3] < -lengths[2]:
+                continue  # nothing stands on itself
             at = y + lift
             lower = distance(col, kc, at, side_facing(col, kc, at, -level, f64(1.0)))
             if lower[3] > f64(0.0) or lower[3] < f64(-2.0) * lengths[0]:

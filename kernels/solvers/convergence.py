@@ -312,7 +312,9 @@ def convergence_functions(traits: Traits = NO_TERMS) -> KernelSet:
         if is_velocity_roundoff(ctl, world):
             near = True
             settling = True
-        if wp.static(traits.unilateral):  # a rigid part at rest on another has no energy to compare a step with
+        if wp.static(
+            traits.unilateral and traits.has_constraints
+        ):  # a part at rest on another has no energy to compare
             below_rounding = ctl.floor.rounding_ratio[world] <= f64(1.0) and ctl.floor.eps < f64(SINGLE_PRECISION_EPS)
             settling = settling or below_rounding
         near = near and ctl.floor.estimates[world] < MAX_ERROR_ESTIMATES
