@@ -57,8 +57,8 @@ def chain(
         ends = [k * length * along, (k + 1) * length * along]
         link = b.add_beam(ends, elements=1, section=section, normal=across, material=material, name=f"link {k + 1}")
         b.set_initial(link, displacement=prestretch)
-        axis = {"axis": across if k % 2 else y} if joint == "revolute" else {}
-        b.add_joint(joint, parent=previous, child=link.start, name=f"hinge {k + 1}", **axis)
+        axis = (across if k % 2 else y) if joint == "revolute" else None
+        b.add_joint(joint, parent=previous, child=link.start, axis=axis, name=f"hinge {k + 1}")
         previous = link.end
     size = 0.06 * links * length
     cube = wf.mesh.box((size, size, size), cells=(1, 1, 1), origin=(0.0, -0.5 * size, -0.5 * size), name="weight")

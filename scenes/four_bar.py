@@ -66,11 +66,11 @@ def four_bar(
     times = np.linspace(0.0, ramp, 201)
     angle = np.append(0.5 * speed * times**2 / ramp, 1e3 * speed)
     drive = (np.append(times, 1e3 + 0.5 * ramp), angle)
-    hinge = {"axis": (0, -1, 0)}
-    b.add_joint("revolute", parent=wf.GROUND, child=arm.start, drive=drive, name="motor", **hinge)
-    b.add_joint("revolute", parent=arm.end, child=link.start, name="crank pin", **hinge)
-    b.add_joint("revolute", parent=link.end, child=swing.end, name="rocker pin", **hinge)
-    b.add_joint("revolute", parent=wf.GROUND, child=swing.start, name="pivot", **hinge)
+    hinge = (0, -1, 0)
+    b.add_joint("revolute", parent=wf.GROUND, child=arm.start, drive=drive, name="motor", axis=hinge)
+    b.add_joint("revolute", parent=arm.end, child=link.start, name="crank pin", axis=hinge)
+    b.add_joint("revolute", parent=link.end, child=swing.end, name="rocker pin", axis=hinge)
+    b.add_joint("revolute", parent=wf.GROUND, child=swing.start, name="pivot", axis=hinge)
     b.add_probe("middle of coupler", link.at(0.5 * (pin + knee)))
     b.add_probe("rocker", swing.end)
     return b

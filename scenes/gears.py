@@ -58,8 +58,8 @@ def gears(
         times = np.concatenate([np.linspace(0.0, ramp, 9), [ramp + 10.0]])
         turned = speed * np.where(times < ramp, 0.5 * times**2 / ramp, times - 0.5 * ramp)
         drive = (times, turned) if name == "driver" else None
-        axis = {"anchor": (x, 0.0, 0.5 * width), "axis": (0, 0, 1)}
-        b.add_joint("revolute", parent=wf.GROUND, child=hub, drive=drive, name=f"{name} axle", **axis)
+        b.add_joint("revolute", parent=wf.GROUND, child=hub, anchor=(x, 0.0, 0.5 * width), axis=(0, 0, 1), drive=drive,
+                    name=f"{name} axle")  # fmt: skip
         wheels.append(wheel)
     sides = [wheel.surface("side") for wheel in wheels]
     b.add_contact(*sides, mu=mu, restitution=0.2, stiffness=("region", stiffness), name="mesh")

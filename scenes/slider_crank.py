@@ -60,11 +60,11 @@ def slider_crank(
     b.set_initial(arm, velocity=lambda X: speed * np.column_stack([-X[:, 2], 0.0 * X[:, 1], X[:, 0]]))
     b.set_initial(link, velocity=lambda X: turn * np.column_stack([-X[:, 2], 0.0 * X[:, 1], X[:, 0] - reach]))
 
-    hinge = {"axis": (0, -1, 0)}
+    hinge = (0, -1, 0)
     angle = ([0.0, 1e3], [0.0, 1e3 * speed])
-    b.add_joint("revolute", parent=wf.GROUND, child=arm.start, drive=angle, name="motor", **hinge)
-    b.add_joint("revolute", parent=arm.end, child=link.start, name="crank pin", **hinge)
-    b.add_joint("revolute", parent=link.end, child=block.surface("x-"), name="slider pin", **hinge)
+    b.add_joint("revolute", parent=wf.GROUND, child=arm.start, drive=angle, name="motor", axis=hinge)
+    b.add_joint("revolute", parent=arm.end, child=link.start, name="crank pin", axis=hinge)
+    b.add_joint("revolute", parent=link.end, child=block.surface("x-"), name="slider pin", axis=hinge)
     b.add_joint("translational", parent=wf.GROUND, child=block.surface("z-"), axis=(1, 0, 0), name="guide")
     b.add_probe("slider", block.surface("x-"))
     b.add_probe("middle of rod", link.at((crank + 0.5 * rod, 0, 0)))
