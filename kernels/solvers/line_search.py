@@ -207,7 +207,7 @@ def line_search_kernels(traits: Traits, module: wp.Module) -> KernelSet:
     def only_multipliers_change(ctl: Control, world: int) -> bool:
         """True if Phi, with its frozen multipliers, is at its minimum within round-off but the residual is not 0: a
         full step changes the multipliers alone."""
-        noise = f64(2.0 * PHI_NOISE_ROUNDINGS) * ctl.floor.eps * ctl.search.phi_magnitude[world]
+        noise = f64(2.0) * f64(PHI_NOISE_ROUNDINGS) * ctl.floor.eps * ctl.search.phi_magnitude[world]
         return ctl.classical_multipliers == 0 and ctl.search.slope[world] <= noise
 
     @wp.func
