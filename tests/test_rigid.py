@@ -410,8 +410,9 @@ def test_bad_parts_are_named(make: Any, text: str) -> None:
 @pytest.mark.filterwarnings("error")
 def test_small_part_of_steel_is_no_reason_to_warn() -> None:
     b = wf.ModelBuilder()
-    b.add_rigid(wf.Box((0, 0, 0), (1e-2, 1e-3, 1e-3)), density=7850.0)
-    b.finalize(device="cpu")
+    part = b.add_rigid(wf.Box((0, 0, 0), (1e-2, 1e-3, 1e-3)), density=7850.0)
+    assert b.finalize(device="cpu").mass == pytest.approx(7850.0 * 1e-8)
+    assert part.mass == pytest.approx(7850.0 * 1e-8)
 
 
 def test_clamp_of_one_edge_of_a_part_is_refused() -> None:

@@ -1,12 +1,13 @@
 """Episodes of reinforcement learning on the device: ends, run statistics, masked copies, observations."""
 
 import functools
-import math
 
 import warp as wp
 
 from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.types import double_1d, double_2d, f64, int_1d, mat33d, precision, vec3d, vec3d_1d
+from ..terms.joint_angles import joint_vector_function
+from ..terms.spring_coordinates import FULL_TURN
 from .step_control import REPORT_COLUMNS, SAME_TIME_FRACTION, STATUS
 
 __all__ = ["JOINT_VALUE_KINDS", "MOTION_KINDS", "RUN_STATISTICS", "episode_kernels", "observation_kernels"]
@@ -16,7 +17,6 @@ RUN_STATISTICS = ("newton", "pcg", "rough", "floored", "residual", "floor", "vio
 FIRST_MINIMUM_COLUMN = 8
 MOTION_KINDS = {"position": 0, "displacement": 1, "velocity": 2}
 """Kinds of observed vectors."""
-FULL_TURN = 2.0 * math.pi
 JOINT_VALUE_KINDS = {"length": 0, "travel": 1, "angle": 2, "length_rate": 3, "travel_rate": 4, "angle_rate": 5}
 """Kinds of values of joints."""
 
@@ -80,7 +80,7 @@ def episode_kernels() -> KernelSet:
 @functools.cache
 def observation_kernels(dtype: str) -> KernelSet:
     """Kernels in one precision that fill a table [world, column]."""
-    p = precision(dtype)
+    p, joint_vector = precision(dtype), joint_vector_function(dtype)
     T, vec3 = p.T, p.vec3
     module = kernel_module(f"observations_{dtype}")
 
@@ -111,16 +111,6 @@ def observation_kernels(dtype: str) -> KernelSet:
         """Columns of the report of the last step; 0 without a step."""
         world, k = wp.tid()
         out[world, column[k]] = wp.where(stepped[world] != 0, T(report[world, source[k]]), T(0.0))
-
-    @wp.func
-    def joint_vector(
-        start: int_1d, slot: int_1d, weight: double_1d, place: vec3d, x: p.vec3_2d, world: int, k: int
-    ) -> vec3d:  # fmt: skip
-        """Vector of a joint: its reference value, 0 of a rate, plus the sum of w_i x_i."""
-        out = place
-        for i in range(start[k], start[k + 1]):
-            out += weight[i] * vec3d(x[world, slot[i]])
-        return out
 
     @wp.func
     def joint_rate(kind: int, V: mat33d, D: mat33d) -> f64:

@@ -1,17 +1,32 @@
 """Angles of joints that no drive prescribes, with their turns."""
 
 import functools
-import math
 
 import warp as wp
 
 from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.types import double_1d, double_2d, int_1d, precision, vec3d, vec3d_1d
 from .constraints import constraint_functions, multiplier_struct
+from .spring_coordinates import FULL_TURN
 
-__all__ = ["joint_angle_kernels"]
+__all__ = ["joint_angle_kernels", "joint_vector_function"]
 
-FULL_TURN = 2.0 * math.pi
+
+@functools.cache
+def joint_vector_function(dtype: str) -> wp.Function:
+    """Device function of a joint's vector, with slots in one precision."""
+
+    @wp.func
+    def joint_vector(
+        start: int_1d, slot: int_1d, weight: double_1d, place: vec3d, x: precision(dtype).vec3_2d, world: int, k: int
+    ) -> vec3d:  # fmt: skip
+        """Vector k of a joint: its reference value, 0 of a rate, plus the sum of w_i x_i."""
+        out = place
+        for i in range(start[k], start[k + 1]):
+            out += weight[i] * vec3d(x[world, slot[i]])
+        return out
+
+    return joint_vector
 
 
 @functools.cache
@@ -19,17 +34,7 @@ def joint_angle_kernels(dtype: str) -> KernelSet:
     """Kernel in one precision of the slots."""
     p = precision(dtype)
     Multipliers, store_row = multiplier_struct(), constraint_functions(dtype).store_row
-    module = kernel_module(f"joint_angles_{dtype}")
-
-    @wp.func
-    def current_vector(
-        start: int_1d, slot: int_1d, weight: double_1d, reference: vec3d_1d, u: p.vec3_2d, world: int, k: int
-    ) -> vec3d:  # fmt: skip
-        """Vector k: its reference value plus the sum of w_i u_i."""
-        x = reference[k]
-        for i in range(start[k], start[k + 1]):
-            x += weight[i] * vec3d(u[world, slot[i]])
-        return x
+    module, joint_vector = kernel_module(f"joint_angles_{dtype}"), joint_vector_function(dtype)
 
     @masked_kernel(module, "accepted")
     def store_with_angles(
@@ -42,9 +47,9 @@ def joint_angle_kernels(dtype: str) -> KernelSet:
         store_row(mul, state, last_target, world, joint)
         if joint >= angle.shape[1]:
             return
-        a = current_vector(start, slot, weight, reference, u, world, 3 * joint)
-        a2 = current_vector(start, slot, weight, reference, u, world, 3 * joint + 1)
-        b = current_vector(start, slot, weight, reference, u, world, 3 * joint + 2)
+        a = joint_vector(start, slot, weight, reference[3 * joint], u, world, 3 * joint)
+        a2 = joint_vector(start, slot, weight, reference[3 * joint + 1], u, world, 3 * joint + 1)
+        b = joint_vector(start, slot, weight, reference[3 * joint + 2], u, world, 3 * joint + 2)
         x = wp.atan2(wp.dot(a2, b), wp.dot(a, b))
         turn = wp.float64(FULL_TURN)
         angle[world, joint] = x + turn * wp.round((angle[world, joint] - x) / turn)

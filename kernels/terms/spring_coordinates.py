@@ -8,7 +8,7 @@ import warp as wp
 from ..common.modules import KernelSet, kernel_set
 from ..common.types import f64, mat33d, vec3d
 
-__all__ = ["ANGLE", "CHORD", "LENGTH", "TINY", "TRAVEL", "VECTOR", "coordinate_functions"]
+__all__ = ["ANGLE", "CHORD", "FULL_TURN", "LENGTH", "TINY", "TRAVEL", "VECTOR", "coordinate_functions"]
 
 LENGTH, ANGLE, VECTOR, TRAVEL, CHORD = 0, 1, 2, 3, 4
 """Coordinates."""

@@ -19,12 +19,11 @@ from ..common.modules import KernelSet, kernel_module, kernel_set
 from ..common.types import double_1d, f64, int_1d, mat33d, precision, vec3d, vec3d_2d
 from .constraint_formulas import Formula
 from .constraints import VELOCITY, constraint_functions, constraint_struct, multiplier_struct
+from .spring_coordinates import TINY
 
 __all__ = ["ANGLE_RATE", "DISC", "KNIFE", "ROLL", "TRAVEL_RATE", "velocity_kernels"]
 
 KNIFE, ROLL, ANGLE_RATE, TRAVEL_RATE = range(4)
-TINY = 1.0e-300
-"""Divisor where a direction vanishes."""
 mat33d_1d = wp.array(dtype=mat33d)
 
 
