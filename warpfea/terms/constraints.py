@@ -239,7 +239,7 @@ class Constraints(Constrained, Updated, Tied, Preconditioned, Differentiable):
         kernel, angles = self.integrator_kernels(ctx).store_multipliers, self.tables.angles
         if angles.joints:
             kernel = joint_angle_kernels(self.model.dtype).store_with_angles
-            args += angles.arguments(ctx)
+            args += [*angles.tables, ctx.work.u, ctx.state.joint_angle]  # turns to the positions of the step
         ctx.launch(kernel, self.dim, args)
 
     def report(self, ctx: StepContext) -> None:

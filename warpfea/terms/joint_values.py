@@ -46,11 +46,6 @@ class JointAngles:
         if self.joints:
             ctx.state.register("joint_angle", wp.float64, (len(self.joints),))
 
-    def arguments(self, ctx: StepContext) -> list[Any]:
-        """Arguments of `store_with_angles` behind those of `store_multipliers`: it counts turns to the positions of an
-        accepted step."""
-        return [*self.tables, ctx.work.u, ctx.state.joint_angle]
-
     def modules(self) -> set[wp.Module]:
         """Module of that kernel."""
         return {joint_angle_kernels(self.model.dtype).module} if self.joints else set()
