@@ -6,7 +6,6 @@ import pathlib
 import sys
 from types import SimpleNamespace
 
-import meshio
 import numpy as np
 import pytest
 from cli_runs import run
@@ -16,6 +15,7 @@ import warpfea as wf
 from warpfea.base.errors import MeshError
 from warpfea.mesh import from_meshio, from_surface, read
 
+meshio = pytest.importorskip("meshio")
 HERE = pathlib.Path(__file__).resolve().parent
 BRICK = wf.mesh.box((3, 2, 1), cells=(3, 2, 1), element="H3843")
 
