@@ -54,6 +54,11 @@ def linked(kind, worlds=1, device="cpu"):
         )
         b.add_traction(second.surface("x+"), wf.Control("pull", 3))
         b.add_point_load(first.at((0.1, 0.01, 0.01)), force=wf.Control("pull", 3))
+    elif kind == "followers":
+        b.clamp(first.nodes("x-"))
+        b.add_joint("spherical", **pair)
+        b.add_pressure(second.surface("z-"), wf.Control("pressure"))
+        b.add_moment(first.at((0.1, 0.01, 0.01)), wf.Control("moment", 3))
     else:
         turn = wf.Rotation(anchor=(0.2, 0.01, 0.01), axis=(1, 0.3, 0), angle=wf.Control("turn"))
         b.drive(first.nodes("x-"), displacement=wf.Control("shift", 3))
@@ -69,5 +74,6 @@ def controls(kind, steps):
     return {
         "motor": {"motor": 0.3 * ramp},
         "loads": {"pull": 50.0 * rng.standard_normal((steps, 3)), "rod": np.hypot(0.04, 0.29) + 0.002 * ramp},
+        "followers": {"pressure": 500.0 + 500.0 * ramp, "moment": 0.02 * rng.standard_normal((steps, 3))},
         "drives": {"shift": 0.01 * ramp * np.ones(3), "turn": 0.4 * ramp},
     }[kind]

@@ -30,7 +30,7 @@ from ancf_bodies import (
 
 import warpfea as wf
 from warpfea.model import assembly
-from warpfea.terms.loads import FollowerLoads
+from warpfea.terms.follower_loads import FollowerLoads
 
 FLAT = [name for name in BODIES if name not in ("arc", "roof", "ball")]
 SIDES = ("beam", "arc", "plate", "roof", "ENMC", "ball", "H3843")
@@ -103,7 +103,7 @@ def _launched(model, state, what, *fields):
     out = wp.zeros((1, terms.nonpotential_entries), dtype=vec3, device="cpu")
     extra = [wp.array(f[None], dtype=vec3, device="cpu") for f in fields]
     for part in terms.find(FollowerLoads).loads:
-        share = [1.0] if what == "product" else []
+        share = [1.0, (1.0, 1.0)] if what == "product" else []
         args = [part.data, *share, state.displacement, values, active, *extra, out]
         wp.launch(getattr(part, what), dim=(1, part.count), inputs=args, device="cpu")
     force = np.zeros((model.slots, 3))

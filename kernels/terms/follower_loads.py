@@ -1,4 +1,4 @@
-"""Follower loads: pressure on faces, moments, and the symmetric part of their tangents."""
+"""Follower loads: pressure on faces, moments, and their tangents."""
 
 import functools
 
@@ -90,10 +90,11 @@ def pressure_kernels(dtype: str) -> KernelSet:
 
     @masked_kernel(pressure_module, "active")
     def pressure_tangent_product(
-        data: FollowerLoads, midpoint_factor: T, u: p.vec3_2d, value: vec3d_2d, active: int_1d, direction: p.vec3_2d,
-        contribution: p.vec3_2d,
+        data: FollowerLoads, midpoint_factor: T, factors: p.vec2, u: p.vec3_2d, value: vec3d_2d, active: int_1d,
+        direction: p.vec3_2d, contribution: p.vec3_2d,
     ):  # fmt: skip
-        """(K + K^T)/2 d, K = df/dq of the pressure force, d a direction; symmetric on a closed surface at uniform p.
+        """(a K + b K^T)/2 d, (a, b) the factors, K = df/dq of the pressure force, d a direction; K is symmetric on a
+        closed surface at uniform p.
 
         `midpoint_factor`: ratio of the stage's displacement increment to that of the step, 1/2 for midpoint schemes.
         """
@@ -106,9 +107,9 @@ def pressure_kernels(dtype: str) -> KernelSet:
             db = interpolate(data, data.shape_db, direction, world, q, item)
             d = interpolate(data, data.shape, direction, world, q, item)
             w = midpoint_factor * T(-0.5) * T(value[world, data.time_law[item]][0]) * data.weight[q]
-            force = wp.cross(da, b) + wp.cross(a, db)
-            left = wp.cross(b, d)
-            right = wp.cross(d, a)
+            force = factors[0] * (wp.cross(da, b) + wp.cross(a, db))
+            left = factors[1] * wp.cross(b, d)
+            right = factors[1] * wp.cross(d, a)
             for i in range(data.conn.shape[0]):
                 k = data.first_entry + i * data.item_count + item
                 f = (
@@ -227,20 +228,20 @@ def moment_kernels(dtype: str, vectors: int) -> KernelSet:
 
     @masked_kernel(module, "active")
     def moment_tangent_product(
-        data: FollowerLoads, midpoint_factor: T, u: p.vec3_2d, value: vec3d_2d, active: int_1d, direction: p.vec3_2d,
-        contribution: p.vec3_2d,
+        data: FollowerLoads, midpoint_factor: T, factors: p.vec2, u: p.vec3_2d, value: vec3d_2d, active: int_1d,
+        direction: p.vec3_2d, contribution: p.vec3_2d,
     ):  # fmt: skip
-        """(K + K^T)/2 d with K = df/dq, d a direction; `midpoint_factor`: as of `pressure_tangent_product`."""
+        """(a K + b K^T)/2 d with K = df/dq, d a direction; arguments as of `pressure_tangent_product`."""
         world, item = wp.tid()
         m = (midpoint_factor * data.moment_fraction[item]) * vec3(value[world, data.time_law[item]])
         Y = current_vectors(data, u, world, item)
         D = interpolate_vectors(data, direction, world, item)
-        S = T(0.5) * vector_forces_change(Y, D, m)
+        S = T(0.5) * factors[0] * vector_forces_change(Y, D, m)
         for k in range(first, 3):
             for c in range(3):
                 unit = mat33()
                 unit[c, k] = T(1.0)
-                S[c, k] = S[c, k] + T(0.5) * wp.ddot(D, vector_forces_change(Y, unit, m))
+                S[c, k] = S[c, k] + T(0.5) * factors[1] * wp.ddot(D, vector_forces_change(Y, unit, m))
         for i in range(data.conn.shape[0]):
             contribution[world, data.first_entry + i * data.item_count + item] = S * data.vector_coefficients[i, item]
 

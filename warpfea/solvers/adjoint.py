@@ -3,7 +3,8 @@
 The operator is the exact tangent at the converged state, from the elements or their matrix of this step: neither a
 matrix of another iterate nor a predicted stress; residuals are those of products by the elements. With constraints its
 penalties make it the augmented operator A = H + J^T R J, and mu += R J w after each solve (Uzawa's method) leads to the
-bordered system [H J^T; J 0]. Each refinement solves for the residual.
+bordered system [H J^T; J 0]. Each refinement solves for the residual. Where a term's tangent is not symmetric, BiCGStab
+solves with the transposed products of all terms, preconditioned by the symmetric part.
 """
 
 from __future__ import annotations
@@ -14,17 +15,47 @@ from typing import TYPE_CHECKING, Any
 import warp as wp
 
 from ..base.launch import launch_part
-from ..kernels.common.structs import topology_struct
+from ..kernels.common.structs import product_terms_struct, topology_struct
 from ..kernels.solvers.adjoint import adjoint_kernels, adjoint_struct
+from ..kernels.step.gather import gather_kernels
 from ..kernels.terms.constraints import constraint_struct
 from ..terms.gradients import with_fields
-from ..terms.protocols import Constrained
-from ..terms.term import Term
+from ..terms.protocols import Constrained, Differentiable
+from .bicgstab import BiCGStab
 
 if TYPE_CHECKING:
     from .newton import NewtonLoop
+    from .residual import Residual
 
-__all__ = ["AdjointSolver"]
+__all__ = ["AdjointSolver", "ExactOperator"]
+
+
+class ExactOperator:
+    """Products with the exact H, or its transpose, of all terms: the operator of a `PCG` or `BiCGStab`."""
+
+    def __init__(self, residual: Residual, *, transposed: bool) -> None:
+        self.ctx, self.transposed = residual.ctx, transposed
+        self.reduce, self.vector_kernels = residual.reduce, residual.vector_kernels
+        m, w, traits = residual.model, residual.work, residual.ctx.traits
+        self.constraint_data, self.product_terms = residual.constraint_data, residual.product_terms
+        if traits.nonpotential and not traits.tangent:  # forces without a tangent in H have one here
+            side = (m.worlds, m.terms.nonpotential_entries)
+            w.nonpotential_tangent = w.array("adjoint nonpotential tangent", side, m.types.vec3)
+            of = m.terms.nonpotential_topology
+            table = {"contribution_start": of.contribution_start, "contribution_entry": of.contribution_entry}
+            table["contribution"] = w.nonpotential_tangent
+            self.product_terms = with_fields(product_terms_struct(m.dtype), residual.product_terms, **table)
+        self.kernels = gather_kernels(m.dtype, traits._replace(tangent=traits.nonpotential))
+
+    def product(self, p: wp.array, out: wp.array, active: wp.array, topology: Any = None) -> None:
+        """out = H p, on the free components of a topology, by default those of the model."""
+        ctx = self.ctx
+        m, w, launch = ctx.model, ctx.work, ctx.launch
+        for term in m.terms.having(Differentiable):
+            term.exact_product(ctx, p, active, transposed=self.transposed)
+        args = [topology or m.topology, w.contribution, self.product_terms, p, active, self.constraint_data]
+        size = (m.worlds, launch.padded(m.slots))
+        launch(self.kernels.operator_product, size, [*args, w.multipliers, out, w.warp_rows])
 
 
 class AdjointSolver:
@@ -50,6 +81,14 @@ class AdjointSolver:
         )
         tables = m.terms.find(Constrained).tables if self.constrained else None
         self.constraint_data: Any = tables.data if tables else constraint_struct()()
+        self.operator = ExactOperator(newton.residual, transposed=True)
+        self.linear = newton.pcg
+        if not all(term.is_symmetric(newton.ctx) for term in m.terms.having(Differentiable)):
+            # a transposed tangent may resist translations that the tangent does not
+            operator: Any = self.operator
+            self.linear = BiCGStab(m, w, self.launch, operator, newton.preconditioner,
+                max_iterations=w.pcg.max_iterations, max_work=w.pcg.max_work, deflate=False)  # fmt: skip
+            newton.pcg = self.linear
         self.mu = w.array("adjoint mu", (m.worlds, tables.count if tables else 1), wp.float64)
         self.control: Any = w.struct(adjoint_struct(), m.worlds, sums=(3, m.worlds))
         self.control.tol = tol
@@ -63,7 +102,7 @@ class AdjointSolver:
 
     def modules(self) -> set[wp.Module]:
         """Modules launched, besides those of the Newton loop."""
-        return {self.kernels.module}
+        return {self.kernels.module, self.operator.kernels.module} | self.linear.modules()
 
     @property
     def running(self) -> wp.array:
@@ -99,7 +138,7 @@ class AdjointSolver:
         """Add the solution for the residual; worlds leave the flags of the Newton loop as they converge."""
         w, launch, k, active = self.work, self.launch, self.kernels, self.work.newton.active
         self.newton.preconditioner.prepare(active)
-        self.newton.pcg.solve(active)
+        self.linear.solve(active)
         self.newton.preconditioner.record_cost()
         launch(k.add_direction, self.dim, [w.direction, active, self.w])
         self._product()
@@ -121,9 +160,4 @@ class AdjointSolver:
 
     def _product(self) -> None:
         """A w on all components, into work.Hp."""
-        m, w, active, residual = self.model, self.work, self.work.newton.active, self.newton.residual
-        residual.elements.tangent(residual.ctx, self.w, active)
-        m.terms.call(residual.ctx, Term, "product", self.w, active)
-        args = [self.topology, w.contribution, residual.product_terms, self.w, active, self.constraint_data]
-        kernel = residual.gather_kernels.operator_product
-        self.launch(kernel, (m.worlds, self.launch.padded(m.slots)), [*args, w.multipliers, w.Hp, w.warp_rows])
+        self.operator.product(self.w, self.work.Hp, self.work.newton.active, self.topology)

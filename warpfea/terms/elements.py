@@ -126,6 +126,9 @@ class Elements(Differentiable):
         forms = {b.key.damping for b in self.model.blocks} - {"incremental", None} if ctx.inertia else set()
         return f"damping of the form {forms.pop()!r}" if forms else None
 
+    def exact_product(self, ctx: StepContext, p: wp.array, active: wp.array, *, transposed: bool) -> None:
+        self.tangent(ctx, p, active)
+
     def gradients(self, ctx: StepContext) -> Mapping[str, Callable[[], Gradient]]:
         return material_gradients(ctx, self)
 

@@ -269,8 +269,7 @@ class Touching(Impacting):
 
 
 class Differentiable(Term):
-    """Term with the adjoint of its part of a step of backward Euler or of statics (solvers/adjoint.py): `product` is
-    the exact and symmetric derivative of its force at the end of the step.
+    """Term with the adjoint of its part of a step (solvers/adjoint.py).
 
     A run of a model with a term that lacks it is not differentiated: the term is refused by name.
     """
@@ -278,6 +277,21 @@ class Differentiable(Term):
     def not_differentiable(self, ctx: StepContext) -> str | None:
         """Feature of it without an adjoint, or None."""
         return None
+
+    def exact_product(self, ctx: StepContext, p: wp.array, active: wp.array, *, transposed: bool) -> None:
+        """`product` of the exact derivative of the force, or of its transpose, into the same array.
+
+        The default is for terms whose `product` is exact and symmetric. Others override `is_symmetric` too; those
+        without a `product` then write it as if they had one.
+        """
+        self.product(ctx, p, active)
+
+    def is_symmetric(self, ctx: StepContext) -> bool:
+        """True if `product` is the exact derivative of the force, and symmetric.
+
+        A single False makes the solver take `exact_product` of all terms, and BiCGStab.
+        """
+        return True
 
     def gradients(self, ctx: StepContext) -> Mapping[str, Callable[[], Gradient]]:
         """By name of a parameter: makes the function that adds -w . dg/dparameter of a step."""

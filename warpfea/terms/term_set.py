@@ -30,7 +30,8 @@ from .checks import (
 from .constraints import Constraints
 from .elements import Damping, Elements
 from .evaluation import Evaluation
-from .loads import BodyForces, DeadLoads, FollowerLoads
+from .follower_loads import FollowerLoads
+from .loads import BodyForces, DeadLoads
 from .protocols import Constrained, Parametrised, Tied, Touching
 from .springs import Springs
 from .supports import Supports
