@@ -34,6 +34,7 @@ PAGES += [
     ROOT / "warpfea/builder/PARTS.md",
     ROOT / "warpfea/builder/SECTIONS.md",
     ROOT / "warpfea/builder/SPRINGS.md",
+    ROOT / "warpfea/simulation/EXAMPLES.md",
     ROOT / "warpfea/simulation/FIELDS.md",
     ROOT / "warpfea/builder/ACTUATORS.md",
     ROOT / "warpfea/outputs/PAGE.md",

@@ -67,7 +67,7 @@ __all__ = [
     "PenetrationError", "Rectangle", "Reference", "Rotation", "Section", "Simulation", "Sphere", "StabilityError",
     "StabilityWarning", "State", "StepReport", "Stop", "StudyOptions", "SurfaceSet", "TriMesh", "Tube", "USDWriter",
     "VTUWriter", "__version__", "buckling", "fit", "loss", "mesh", "modes", "read_results", "scene", "solve_static",
-    "spline", "study", "sweep",
+    "spline", "study", "sweep", "torch",
 ]  # fmt: skip
 
 
@@ -80,6 +80,8 @@ def __getattr__(name: str) -> object:
         return getattr(_importlib.import_module(f"{__name__}.studies.accuracy"), name)
     if name in ("sweep", "fit", "Design"):
         return getattr(_importlib.import_module(f"{__name__}.sweeps"), name)
+    if name == "torch":
+        return _importlib.import_module(f"{__name__}.simulation.torch")
     raise AttributeError(f"module 'warpfea' has no attribute {name!r}")
 
 

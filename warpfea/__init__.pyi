@@ -47,6 +47,7 @@ from .outputs.usd import USDWriter as USDWriter
 from .outputs.vtk import VTUWriter as VTUWriter
 from .outputs.vtk_reader import read_results as read_results
 from .simulation import loss as loss
+from .simulation import torch as torch
 from .simulation.adjoint import Adjoint as Adjoint
 from .simulation.checkpoint import Checkpoint as Checkpoint
 from .simulation.integrators import EnergyMomentum as EnergyMomentum, GeneralizedAlpha as GeneralizedAlpha

@@ -181,7 +181,7 @@ class Adjoint:
         if self.static:
             raise ModelError("Adjoint: an equilibrium has no steps to run")
         if self.kept and not np.array_equal(self.kept[-1]["time"].numpy(), self.sim.time):
-            self.kept, self.steps = [], 0
+            self.clear()
         self._check_budget(steps)
         if not self.kept:
             self._updates = self.model.terms.parameter_updates
@@ -201,6 +201,11 @@ class Adjoint:
                 self.kept[-1] |= given  # for the step
                 self.kept.append(self._snapshot())
                 self.steps += 1
+        self.probes.clear()
+
+    def clear(self) -> None:
+        """Forget the steps kept."""
+        self.kept, self.steps = [], 0
         self.probes.clear()
 
     def _check_budget(self, steps: int) -> None:
