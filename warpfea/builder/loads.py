@@ -70,7 +70,7 @@ def dead_traction(body: Body, surface: SurfaceSet, traction: Any) -> DeadLoad:
     """See ModelBuilder.add_traction."""
     law = time_law(traction, f"traction on {surface.name or 'faces'!r} of body {body.name!r}")
     slots, weights = surface_weights(surface)
-    return DeadLoad(body, slots, weights, law, "traction")
+    return DeadLoad(body, slots, weights, law, "traction", surface)
 
 
 def follower_pressure(body: Body, surface: SurfaceSet, pressure: Any) -> Pressure:
@@ -123,16 +123,17 @@ def set_initial_state(body: Body, velocity: Any, angular_velocity: Any, displace
 
 def probe_at(name: str, body: Body, where: MaterialPoint | SurfaceSet | NodeSet) -> Probe:
     """See ModelBuilder.add_probe."""
-    where = as_point(where)
+    where, surface, area = as_point(where), None, 1.0
     if isinstance(where, MaterialPoint):
         slots, weights = where.slots, where.weights
     elif isinstance(where, SurfaceSet):
         slots, weights = surface_weights(where)
-        weights = weights / weights[body.slot_kind[slots] == 0].sum()
+        surface, area = where, float(weights[body.slot_kind[slots] == 0].sum())
+        weights = weights / area
     else:
         slots, weights = _node_mean(where)
     X = weights @ (body.reference[slots] + (body.slot_kind[slots] == 0)[:, None] * body.origin)
-    return Probe(name, body, slots, weights, X)
+    return Probe(name, body, slots, weights, X, surface, area)
 
 
 def clamp_support(body: Body, nodes: NodeSet, slots: str, components: str) -> Support:

@@ -37,13 +37,14 @@ RODS = ("distance", "DIST")
 
 @dataclass(eq=False)
 class DeadLoad:
-    """Force weight_i x value(t) on slots; used for point loads and tractions."""
+    """Force weight_i x value(t) on slots; used for point loads and tractions, these with their surface."""
 
     body: Body
     slots: np.ndarray
     weights: np.ndarray
     law: TimeLaw
     name: str
+    surface: SurfaceSet | None = None
 
 
 @dataclass(eq=False)
@@ -93,13 +94,15 @@ class Support:
 
 @dataclass(eq=False)
 class Probe:
-    """A recorded point: sum of weights x slot values."""
+    """A recorded point: sum of weights x slot values. Of a surface these are its integrals over its area, m^2."""
 
     name: str
     body: Body
     slots: np.ndarray
     weights: np.ndarray
     X: np.ndarray
+    surface: SurfaceSet | None = None
+    area: float = 1.0
 
 
 @dataclass(eq=False)

@@ -26,6 +26,7 @@ from ..solvers import NewtonPCG
 from ..solvers.adjoint import AdjointSolver
 from ..terms.gradients import Gradient, StepAdjoint
 from ..terms.protocols import Differentiable
+from ..terms.shape_gradients import MESH, MeshGradient
 from ..terms.time_law_table import control_array
 from .capacity import RESERVED_FRACTION, free_bytes
 from .simulation import Simulation
@@ -72,8 +73,8 @@ class Adjoint:
 
     Args:
         sim: a Simulation with integrator="backward_euler" and a fixed dt, or a result of `solve_static`.
-        with_respect_to: names of `Model.set_parameter` of materials, "gravity", controls, "initial.displacement" and
-            "initial.velocity".
+        with_respect_to: names of `Model.set_parameter` of materials, "gravity", controls, "initial.displacement",
+            "initial.velocity", and "mesh.X", the reference values of all slots.
         tol: relative residual of the adjoint solves, in the D^-1 norm.
         budget: largest number of bytes of the steps kept on the device; None: the free memory.
 
@@ -104,6 +105,7 @@ class Adjoint:
         with convert_memory_errors(f"an adjoint of {m.worlds} worlds", m.device):
             with quiet_warp(), compile_progress_bar(None) as bar:
                 self._make_solver(tol, bar)
+            self.mesh = MeshGradient(self.stepper.ctx) if MESH in self.names else None
             self.outputs = {name: self._sources(name) for name in self.names}
         self.kept: list[dict[str, wp.array]] = []
         self.probes: dict[str, ProbeArrays] = {}
@@ -147,6 +149,8 @@ class Adjoint:
 
     def _sources(self, name: str) -> list[Callable[[], Gradient]]:
         """Makers of the functions that add the derivative by a parameter; none for initial values."""
+        if self.mesh and name == MESH:
+            return self.mesh.makers
         ctx, terms, laws = self.stepper.ctx, list(self.model.terms), self.model.terms.time_laws
         found = [known[name] for term in terms if name in (known := term.gradients(ctx))]
         if name in INITIAL and not self.static:
@@ -159,7 +163,7 @@ class Adjoint:
                 found += [lambda gradient=gradient: gradient for gradient in given if gradient is not None]
         if not found:
             known = [key for term in terms for key in term.gradients(ctx)]
-            known += [*laws.controls, *(() if self.static else INITIAL)]
+            known += [MESH, *laws.controls, *(() if self.static else INITIAL)]
             hint = did_you_mean(name, known) if isinstance(name, str) else ""
             raise ModelError(f"Adjoint: {name!r} has no derivative; there are: {listing(known)}{hint}")
         return found
@@ -269,7 +273,7 @@ class Adjoint:
 
         Returns:
             arrays [world] of constants, [world, 3] of gravity, [world, step, size] of controls (of statics [world,
-                size]), [world, slot] of initial values; NaN in worlds that failed.
+                size]), [world, slot] of initial values and "mesh.X"; NaN in worlds that failed.
 
         Raises:
             ModelError: no step, or parameters that changed since.
@@ -284,6 +288,7 @@ class Adjoint:
                 array.grad.zero_()
             loss.backward()
         sums, series = {name: self._zeros(self._size_of(name)) for name in self.names}, {}
+        sums |= {MESH: self.mesh.zeros()} if self.mesh else {}
         for name in (name for name in self.names if name in m.terms.time_laws.controls):
             series[name] = self._zeros(self.steps, self._size_of(name))
         self.stepper.set_dt(1.0)  # of statics; others follow
@@ -294,6 +299,8 @@ class Adjoint:
         graph, last = None, np.zeros(m.worlds)
         for k in reversed(range(self.steps)):
             self._add_probes(k)
+            if self.mesh:
+                self.mesh.add_probes(self.stepper.launch, self.probes, k, self.kept[k + 1], sums[MESH])
             self._load(k)
             graph = graph or self._capture(sums)
             for name in series:

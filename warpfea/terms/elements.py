@@ -8,6 +8,7 @@ frozen during it among the dead loads.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from .fields import ELEMENT_FIELDS
 from .gradients import Gradient, StepAdjoint, material_gradients
 from .protocols import Differentiable
 from .section_forces import SECTION_FIELDS, section_field
+from .shape_gradients import internal_force_gradient, mass_gradient, not_shaped
 from .term import EXPLICIT_VISCOUS, Column, StepContext, part
 
 if TYPE_CHECKING:
@@ -132,6 +134,11 @@ class Elements(Differentiable):
     def gradients(self, ctx: StepContext) -> Mapping[str, Callable[[], Gradient]]:
         return material_gradients(ctx, self)
 
+    def shape_gradients(self, ctx: StepContext) -> list[Callable[[], Gradient]] | str:
+        moving = ctx.inertia or self.model.terms.dead_loads.has_gravity
+        makers = (internal_force_gradient, mass_gradient) if moving else (internal_force_gradient,)
+        return not_shaped(ctx) or [partial(make, ctx) for make in makers]
+
     def history_kernels(self) -> list[tuple[Any, wp.Kernel]]:
         """Blocks with strains of the start of the step, and their kernels `history_gradient`."""
         blocks = [b for b in self.model.blocks if b.key.damping == "incremental"]
@@ -229,3 +236,7 @@ class Damping(Differentiable):
 
     def matrices(self, state: State, world: int) -> tuple[None, None]:
         return None, None
+
+    def shape_gradients(self, ctx: StepContext) -> list[Callable[[], Gradient]]:
+        """That of the elements."""
+        return []

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,11 +20,13 @@ from ..model.assembly import require_density
 from ..model.description import BodyForce
 from .gradients import Gradient, StepAdjoint, law_weights
 from .protocols import Differentiable, Parametrised
+from .shape_gradients import traction_gradient
 from .term import StepContext, Term, part
 from .time_law_table import TimeLawTable, argument_precision
 
 if TYPE_CHECKING:
     from ..base.launch import Launcher
+    from ..model.handles import SurfaceSet
     from ..model.model import Model
     from ..model.state import State
 
@@ -61,8 +64,10 @@ class DeadLoads(Parametrised, Differentiable):
     def build(self, laws: TimeLawTable) -> None:
         m = self.model
         slots, numbers, weights = [], [], []
+        self.tractions: list[tuple[SurfaceSet, int]] = []
         for load in m.description.dead_loads:
             index = laws.add(load.law)
+            self.tractions += [(load.surface, index)] if load.surface else []
             slots.append(load.body.slot_offset + load.slots)
             numbers.append(np.full(len(load.slots), index))
             weights.append(load.weights)
@@ -152,6 +157,9 @@ class DeadLoads(Parametrised, Differentiable):
     def law_gradient(self, ctx: StepContext, law: int) -> Gradient | None:
         slot, number, weight = (values[self._definition[1] == law] for values in self._definition)
         return law_weights(self.model, slot, weight[:, None], lambda at: at.w) if len(number) else None
+
+    def shape_gradients(self, ctx: StepContext) -> list[Callable[[], Gradient]]:
+        return [partial(traction_gradient, ctx, self.tractions)] if self.tractions else []
 
     def parameter_arrays(self) -> dict[str, wp.array]:
         return {} if self.gravity_law is not None else {"gravity": self.gravity}

@@ -301,6 +301,11 @@ class Differentiable(Term):
         """The function that adds the derivative of the loss by the value of a time law; None: not its law."""
         return None
 
+    def shape_gradients(self, ctx: StepContext) -> list[Callable[[], Gradient]] | str:
+        """Makers of the functions that add -w . dg/dX, X the reference values, to [world, slot]; or why there are
+        none."""
+        return "its derivative by the reference is not written"
+
     def add_history_gradient(self, at: StepAdjoint) -> None:
         """at.q_bar -= w . dg/dq_n of forces that depend on displacements at the start of the step besides q~."""
 

@@ -5,6 +5,7 @@ Prescribed components are no unknowns: no force is applied.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,7 @@ import warp as wp
 
 from ..base.errors import ModelError
 from ..kernels.terms.loads import load_kernels
+from ..kernels.terms.shape_gradients import shape_kernels
 from ..model.description import Support
 from ..time_laws import TimeLaw
 from .gradients import Gradient, StepAdjoint, law_weights
@@ -136,6 +138,22 @@ class Supports:
             at.add(into)
 
         return [*out, add] if turn and (turn.law.numpy() == law).any() else out
+
+    def shape_gradients(self) -> list[Callable[[], Gradient]]:
+        """Makers of the function that adds the derivative by the arms of rotations."""
+        turn = self.rotation_drives
+
+        def make() -> Gradient:
+            kernel = shape_kernels(self.model.dtype).rotation_shape
+
+            def add(at: StepAdjoint, out: wp.array) -> None:
+                assert turn is not None
+                args = [turn.slot, turn.law, turn.components, turn.axis, at.ctx.work.time_law_values, at.drive_bar]
+                at.ctx.launch(kernel, (self.model.worlds, turn.count), [*args, at.active, out])
+
+            return add
+
+        return [make] if turn else []
 
     def modules(self) -> set[wp.Module]:
         """Modules launched by `drive`."""
