@@ -74,13 +74,18 @@ def deflation_kernels(dtype: str) -> KernelSet:
         base = con.matrix_start[con.cluster[row]] + (row - first) * n
         for column in range(n):
             start, end = con.pair_start[base + column], con.pair_start[base + column + 1]
-            mul.inverse_matrix[world, base + column] = delassus_entry(con, mul, world, row, first + column, start, end)
+            value = delassus_entry(con, mul, world, row, first + column, start, end)
+            mul.inverse_matrix[world, base + column] = value
+            if first + column == row and value > f64(0.0) and mul.chain_ratio > f64(0.0):
+                wp.atomic_max(mul.stiffest, world, con.connected_component[row], f64(1.0) / value)
 
     @masked_kernel(module, "active")
     def compute_penalty(con: Constraints, dq_dv: double_1d, active: int_1d, mul: Multipliers):
         """rho = kappa / ((dq/dv) (J D^-1 J^T)_ii), N/m, constant during a step.
 
         kappa is the ratio of rho to the stiffness of the constrained slots: independent of units, of the mesh and of E.
+        With rigid parts it is at least `chain_ratio` times the stiffness of the stiffest row: a light part that carries
+        a heavy one bears that one's forces.
         """
         world, row = wp.tid()
         first, n = cluster_rows(con, con.cluster[row])
@@ -88,6 +93,8 @@ def deflation_kernels(dtype: str) -> KernelSet:
         rho = f64(0.0)
         if own > f64(0.0):
             rho = mul.penalty_ratio / (dq_dv[world] * own)
+            if mul.chain_ratio > f64(0.0):
+                rho = wp.max(rho, mul.chain_ratio * mul.stiffest[world, con.connected_component[row]] / dq_dv[world])
         mul.penalty[world, row] = rho
 
     @wp.func

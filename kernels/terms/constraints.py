@@ -107,6 +107,7 @@ def multiplier_struct():
         curvature: wp.array2d(dtype=wp.mat33d)  # [world, 9 row + 3 side + other] d2c / (d vector d other), by formulas
         rows: wp.array3d(dtype=wp.float64)  # [TERM_ROWS, world, row] of the potential, J
         violation: wp.array2d(dtype=wp.float64)  # [world, component] largest |c|, m
+        stiffest: wp.array2d(dtype=wp.float64)  # [world, component] largest stiffness of rows, 1 / (J D^-1 J^T)_ii
         compliance_block: wp.array2d(dtype=wp.mat33d)  # [world, block] sum w w D^-1 over common slots
         inverse_matrix: wp.array2d(dtype=wp.float64)  # [world, entry] of clusters: (1 / (dq/dv rho) + J D^-1 J^T)^-1
         coupling: wp.array2d(dtype=wp.float64)  # [world, coupling] J D^-1 J^T between clusters
@@ -115,6 +116,7 @@ def multiplier_struct():
         deflation_solution: wp.array2d(dtype=wp.float64)  # inverse matrix times J D^-1 r, by sweeps
         outer_updates: wp.int32  # 1: multipliers change in the outer loop only
         penalty_ratio: wp.float64  # kappa, rho over the stiffness of the constrained slots
+        chain_ratio: wp.float64  # least rho over the stiffness of the stiffest row of a component, or 0
 
     return Multipliers
 
@@ -252,6 +254,7 @@ def constraint_kernels(dtype: str, midpoint: bool = False) -> KernelSet:
         """Reset the largest violations before an evaluation."""
         world, component = wp.tid()
         mul.violation[world, component] = f64(0.0)
+        mul.stiffest[world, component] = f64(0.0)
 
     @wp.kernel(module=module)
     def evaluate(

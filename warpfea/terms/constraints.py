@@ -4,6 +4,7 @@ The classical method solves g(v; lambda) = 0 at fixed lambda, then adds rho c, u
 with every Newton step by rho (c + (dq/dv) J p), the same formula for the constraint linearised at the iterate: Newton's
 method on the pair (v, lambda), with 1/rho on the diagonal that keeps redundant rows solvable. No outer loop is needed,
 and the curvature sum lambda d2c/dq2 is free of rho c. The classical update is `NewtonPCG(multipliers="outer")`.
+Multipliers converge as far as rho exceeds the inertia that they move, which in a chain of rigid parts is its heaviest.
 """
 
 from __future__ import annotations
@@ -37,6 +38,9 @@ if TYPE_CHECKING:
 
 __all__ = ["Constraints"]
 
+CHAIN_SHARE = 0.01
+"""Share of kappa in the least penalty over the stiffness of a chain's stiffest row. With a tenth of it a link that
+carries 1e9 times its mass takes 60 % more iterations, with ten times 20 % less. In float32 no value carries more than a hundred times."""
 MAX_THREAD_ROWS = 16
 """Maximum rows of a cluster whose matrix one thread inverts; larger ones take a launch per pivot."""
 
@@ -95,7 +99,7 @@ class Constraints(Constrained, Updated, Tied, Preconditioned, Differentiable):
         shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("gradient", "end_gradient", "product"), (B, 3 * M))
         shapes |= {
             "curvature": (B, 9 * M),
-            "violation": (B, self.model.components.count),
+            "violation": (B, self.model.components.count), "stiffest": (B, self.model.components.count),
             "compliance_block": (B, max(con.block_count, 1)),
             "inverse_matrix": (B, con.matrix_entries),
             "coupling": (B, max(con.coupling_count, 1)),
@@ -127,6 +131,8 @@ class Constraints(Constrained, Updated, Tied, Preconditioned, Differentiable):
         ctx.work.newton.norms.violation = ctx.work.multipliers.violation
         mul, options = ctx.work.multipliers, ctx.options
         mul.outer_updates, mul.penalty_ratio = int(options.outer_multipliers), options.penalty_ratio
+        chains = self.model.dtype == "float64" and any(body.rigid for body in self.model.bodies)
+        mul.chain_ratio = CHAIN_SHARE * options.penalty_ratio if chains else 0.0
         if options.deflate_constraints:
             self.large = self.tables.clusters_above(MAX_THREAD_ROWS)
 
