@@ -101,6 +101,7 @@ CONSTANTS: dict[str, Constant] = {
     "STALL_ENERGY_ROUNDINGS": Constant(NEWTON_PCG, "eps", 0.0),
     "NOISE_DOMINATED_ROUNDINGS": Constant(NEWTON_PCG, "roundings of the positions", 0.0),
     "VELOCITY_ROUNDINGS": Constant(NEWTON_PCG, "roundings of the velocities", 0.0),
+    "CHAIN_SHARE": Constant(NEWTON_PCG, "kappa", 0.0),
     "GROUP_ROUNDINGS": Constant(NEWTON_PCG, "roundings of the positions", 0.0),
     "MAX_REUSED_BACKTRACKS": Constant(NEWTON_PCG, "halvings", 20),
     "RADIUS_SHRINK": Constant(NEWTON_PCG, "1", 1.0),
