@@ -1,4 +1,4 @@
-"""Derivative of the incremental viscous force by the displacements at the start of the step, transposed."""
+"""Derivative of viscous forces by the past strain of the incremental form, or by the velocities of the rate form."""
 
 import functools
 
@@ -22,22 +22,26 @@ def history_gradient_kernel(dtype: str, law: str, slots: int, affine: bool, fram
 
     @masked_kernel(module, "active")
     def history_gradient(
-        block: Block, u: p.vec3_2d, u_n: p.vec3_2d, w: p.vec3_2d, dq_dv: double_1d, active: int_1d,
-        contribution: p.vec3_2d,
+        block: Block, u: p.vec3_2d, x: p.vec3_2d, scale: double_1d, direction: p.vec3_2d, dq_dv: double_1d,
+        transposed: int, active: int_1d, contribution: p.vec3_2d,
     ):  # fmt: skip
-        """-w.df/du_n of f = F S_vis(E - E_n)/h: the forces of the stress S_vis(sym(F^T dF))/h, dF = grad w, at u_n."""
+        """F S_vis(sym(A^T grad direction)/(dq/dv)), A = scale I + grad x; `transposed`: F and A change places."""
         world, elem = wp.tid()
         c = fn.coefficients(block, world, elem)
-        scale = T(1.0) / T(dq_dv[world])
+        rate = T(1.0) / T(dq_dv[world])
         U = fn.load_slots(block, u, world, elem)
-        past = fn.load_slots(block, u_n, world, elem)
-        W = fn.load_slots(block, w, world, elem)
+        past = fn.load_slots(block, x, world, elem)
+        W = fn.load_slots(block, direction, world, elem)
         f = Local()
         for point in range(block.shape_gradient.shape[0]):
             F = t.identity() + fn.material_gradient(block, U, point, elem)
-            rate = t.sym(wp.transpose(F) * fn.material_gradient(block, W, point, elem))
-            S = t.isotropic_stress(rate, scale * c[LAMBDA_V_INDEX], scale * c[ETA_INDEX])
-            P = S + fn.material_gradient(block, past, point, elem) * S
+            A = T(scale[world]) * t.identity() + fn.material_gradient(block, past, point, elem)
+            if transposed != 0:
+                B = F
+                F = A
+                A = B
+            change = t.sym(wp.transpose(A) * fn.material_gradient(block, W, point, elem))
+            P = F * t.isotropic_stress(change, rate * c[LAMBDA_V_INDEX], rate * c[ETA_INDEX])
             f = fn.add_point_forces(block, f, fn.to_body_axes(block, P, point, elem), point, elem)
         fn.store_forces(block, f, world, elem, contribution)
 

@@ -1,10 +1,4 @@
-"""Adjoint of a step of backward Euler: H w + J^T mu = v_bar + h q_bar with J w = 0, and the bars of its start.
-
-A bar of a quantity is the derivative of the loss by it, w the multiplier of g = 0, mu/h that of c = 0. With
-H = M/h + h K the bars at the start of the step are v_bar_n = M w/h and q_bar_n = q_bar - K w - J^T mu/h, in terms of
-the residual r of the system (M w/h - v_bar + r)/h: no difference of nearly equal numbers where the stiffness dominates.
-On driven components r/h is the bar of their displacement.
-"""
+"""Adjoint of a step: residual and refinements of its solve, and rows of derivatives; see ../step/adjoint.py."""
 
 import functools
 
@@ -49,13 +43,6 @@ def adjoint_kernels(dtype: str, constrained: bool) -> KernelSet:
     Constraints, Multipliers = constraint_struct(), multiplier_struct()
     mass_times, functions = mass_functions(dtype).mass_times, constraint_functions(dtype)
     module = kernel_module(f"adjoint_{dtype}{'_constrained' if constrained else ''}")
-
-    @masked_kernel(module, "active")
-    def right_side(q_bar: p.vec3_2d, v_bar: p.vec3_2d, dq_dv: double_1d, active: int_1d, out: p.vec3_2d, w: p.vec3_2d):
-        """v_bar + h q_bar; w = 0."""
-        world, slot = wp.tid()
-        out[world, slot] = v_bar[world, slot] + T(dq_dv[world]) * q_bar[world, slot]
-        w[world, slot] = vec3()
 
     @masked_kernel(module, "active")
     def residual(
@@ -123,21 +110,6 @@ def adjoint_kernels(dtype: str, constrained: bool) -> KernelSet:
         world, row = wp.tid()
         change = functions.directional_derivative(con, mul.gradient, w, world, row)
         mu[world, row] = mu[world, row] + dq_dv[world] * mul.penalty[world, row] * change
-
-    @masked_kernel(module, "active")
-    def step_back(
-        topo: Topology, driven: p.vec3_1d, w: p.vec3_2d, gradient: p.vec3_2d, mass_factor: double_1d,
-        dq_dv: double_1d, active: int_1d, q_bar: p.vec3_2d, v_bar: p.vec3_2d, drive_bar: p.vec3_2d,
-    ):  # fmt: skip
-        """Bars at the start of the step, and those of driven displacements."""
-        world, slot = wp.tid()
-        scale = T(1.0) / T(dq_dv[world])
-        momentum = T(mass_factor[world]) * mass_times(topo, w, world, slot)
-        r = -gradient[world, slot]
-        prescribed = wp.cw_mul(driven[slot], r)
-        q_bar[world, slot] = scale * (momentum - v_bar[world, slot] + r - prescribed)
-        v_bar[world, slot] = momentum
-        drive_bar[world, slot] = scale * prescribed
 
     @masked_kernel(module, "active")
     def add_vector(x: p.vec3_2d, active: int_1d, out: p.vec3_2d):

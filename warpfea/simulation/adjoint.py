@@ -69,10 +69,10 @@ class ProbeArrays:
 
 
 class Adjoint:
-    """Tape of a run of backward Euler, or of an equilibrium, and its gradients.
+    """Tape of a run, or of an equilibrium, and its gradients.
 
     Args:
-        sim: a Simulation with integrator="backward_euler" and a fixed dt, or a result of `solve_static`.
+        sim: a Simulation with a fixed dt, or a result of `solve_static`.
         with_respect_to: names of `Model.set_parameter` of materials, "gravity", controls, "initial.displacement",
             "initial.velocity", and "mesh.X", the reference values of all slots.
         tol: relative residual of the adjoint solves, in the D^-1 norm.
@@ -132,18 +132,17 @@ class Adjoint:
         )  # fmt: skip
         s.predictor = None
         driven: wp.array = wp.array(m.terms.supports.driven(), dtype=m.types.vec3, device=m.device)
-        self.solver = a = AdjointSolver(s.newton, driven, tol)
+        self.solver = a = AdjointSolver(s.newton, s.integrator, driven, tol)
         self.end_velocity = s.work.array("adjoint end velocity", (m.worlds, m.slots), m.types.vec3)
-        self.at = StepAdjoint(
-            s.ctx, a.w, a.mu, a.drive_bar, a.q_bar, a.running, a.kernels, a.control.sums, s.work.z,
-            s.newton.residual.reduce,
-        )  # fmt: skip
+        self.at = StepAdjoint(s.ctx, a, s.work.z)
         modules = {module.name: module for module in {*a.modules(), *self._term_modules()}}
         load_modules(modules, m.device, on_compile)
 
     def _term_modules(self) -> list[wp.Module]:
         elements = self.stepper.newton.residual.elements
-        return [kernel.module for _, kernel in elements.history_kernels()] if self.stepper.ctx.inertia else []
+        ctx = self.stepper.ctx
+        forms = ("incremental", "rate") if ctx.inertia and not ctx.midpoint else ()
+        return [kernel.module for form in forms for _, kernel in elements.history_kernels(form)]
 
     # what is differentiated by
 
@@ -294,7 +293,7 @@ class Adjoint:
         self.stepper.set_dt(1.0)  # of statics; others follow
         self.state.status.assign(self.sim.state.status)
         self.stepper.newton.invalidate(wp.ones(m.worlds, dtype=wp.int32, device=m.device))
-        for array in (a.q_bar, a.v_bar, a.control.residual):
+        for array in (*a.bars.values(), a.control.residual):
             array.zero_()
         graph, last = None, np.zeros(m.worlds)
         for k in reversed(range(self.steps)):
@@ -399,8 +398,8 @@ class Adjoint:
 def check_simulation(sim: Any, static: bool) -> None:
     """ModelError for a simulation whose steps have no adjoint; `static`: of the result of `solve_static`."""
     scheme = sim.integrator
-    if scheme.name not in ("backward_euler", "static"):
-        raise ModelError(f"Adjoint: integrator {scheme.name!r} has no adjoint; take 'backward_euler'")
+    if scheme.midpoint or scheme.accelerated:
+        raise ModelError(f"Adjoint: integrator {scheme.name!r} has no adjoint; take 'backward_euler' or 'bdf2'")
     if scheme.static != static:
         raise ModelError("Adjoint: of statics it takes the result of solve_static")
     if sim.stepper.step_size_control or sim.t_end is not None:

@@ -10,6 +10,7 @@ solves with the transposed products of all terms, preconditioned by the symmetri
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import warp as wp
@@ -17,6 +18,7 @@ import warp as wp
 from ..base.launch import launch_part
 from ..kernels.common.structs import product_terms_struct, topology_struct
 from ..kernels.solvers.adjoint import adjoint_kernels, adjoint_struct
+from ..kernels.step.adjoint import step_adjoint_kernels
 from ..kernels.step.gather import gather_kernels
 from ..kernels.terms.constraints import constraint_struct
 from ..terms.gradients import with_fields
@@ -62,23 +64,31 @@ class AdjointSolver:
     """Adjoint of the step that a Newton loop is linearised at.
 
     Attributes:
-        q_bar, v_bar: derivatives of the loss by displacements and velocities [world, slot]; `solve` replaces those at
-            the end of a step by those at its start, as far as these do not act through a history.
+        bars: derivatives of the loss by arrays of the state, by their names; `solve` replaces those at the end of a
+            step by those at its start, as far as these do not act through a history. q_bar, v_bar: of displacements and
+            velocities [world, slot].
         w: multipliers of the residual, m/N of the loss. mu: of the constraint rows, times h.
         drive_bar: derivatives by driven displacements.
         control: norms of the residual.
     """
 
-    def __init__(self, newton: NewtonLoop, driven: wp.array, tol: float) -> None:
-        self.newton, self.driven = newton, driven
+    def __init__(self, newton: NewtonLoop, integrator: Any, driven: wp.array, tol: float) -> None:
+        self.newton, self.integrator, self.driven = newton, integrator, driven
         self.model, self.work, self.launch = newton.model, newton.work, newton.launch
         m, w = self.model, self.work
         self.constrained = m.terms.traits.constraint_rows
         self.kernels = adjoint_kernels(m.dtype, self.constrained)
-        names = ("q_bar", "v_bar", "w", "rhs", "drive_bar")
-        self.q_bar, self.v_bar, self.w, self.rhs, self.drive_bar = (
-            w.array(f"adjoint {name}", (m.worlds, m.slots), m.types.vec3) for name in names
-        )
+        self.step_kernels = step_adjoint_kernels(m.dtype, integrator)
+
+        def field(name: str) -> wp.array:
+            return w.array(f"adjoint {name}", (m.worlds, m.slots), m.types.vec3)
+
+        self.w, self.rhs, self.drive_bar = field("w"), field("right side"), field("drive")
+        self.bars = {name: field(name) for name in ("displacement", "velocity")}
+        for name in integrator.history_arrays:
+            self.bars.setdefault(name, field(name))
+        self.q_bar, self.v_bar = self.bars["displacement"], self.bars["velocity"]
+        self.state_bars = [self.q_bar, self.v_bar, *(self.bars[name] for name in integrator.history_arrays)]
         tables = m.terms.find(Constrained).tables if self.constrained else None
         self.constraint_data: Any = tables.data if tables else constraint_struct()()
         self.operator = ExactOperator(newton.residual, transposed=True)
@@ -93,6 +103,7 @@ class AdjointSolver:
         self.control: Any = w.struct(adjoint_struct(), m.worlds, sums=(3, m.worlds))
         self.control.tol = tol
         self.dim = (m.worlds, m.slots)
+        self.scale = w.array("adjoint scale", (m.worlds,), wp.float64)
         self.active = wp.zeros(m.worlds, dtype=wp.int32, device=m.device)
         # prescribed components too: products give their reactions
         unprescribed: wp.array = wp.zeros(m.slots, dtype=wp.uint8, device=m.device)
@@ -102,7 +113,7 @@ class AdjointSolver:
 
     def modules(self) -> set[wp.Module]:
         """Modules launched, besides those of the Newton loop."""
-        return {self.kernels.module, self.operator.kernels.module} | self.linear.modules()
+        return {self.kernels.module, self.step_kernels.module, self.operator.kernels.module} | self.linear.modules()
 
     @property
     def running(self) -> wp.array:
@@ -119,7 +130,7 @@ class AdjointSolver:
         newton.iterations.fill_(newton.max_iterations)  # factors are checked by products
         w.pcg.step_iterations.zero_()
         wp.copy(active, self.running)
-        launch(k.right_side, self.dim, [self.q_bar, self.v_bar, step.dq_dv, active, self.rhs, self.w])
+        launch(self.step_kernels.right_side, self.dim, [step, *self.state_bars, active, self.rhs, self.w])
         self.newton.residual.assemble_matrix(active)  # a matrix of the operator is that of this step
         self.mu.zero_()
         w.Hp.zero_()
@@ -131,8 +142,22 @@ class AdjointSolver:
         self._product()
         self._evaluate_residual()
         launch(k.note_residual, m.worlds, [self.control, active])
-        args = [m.topology, self.driven, self.w, w.gradient, step.mass_factor, step.dq_dv, active]
-        launch(k.step_back, self.dim, [*args, self.q_bar, self.v_bar, self.drive_bar])
+        args = [step, m.topology, self.driven, self.w, w.gradient, active, *self.state_bars, self.drive_bar]
+        launch(self.step_kernels.step_back, self.dim, args)
+
+    def history_fields(self) -> Iterator[tuple[str, wp.array, wp.array]]:
+        """State arrays in the strain rates of incremental damping, each with x and scale of `history_gradient`."""
+        ctx, scheme = self.newton.ctx, self.integrator
+        state, active = ctx.state, self.running
+        parts = (0, 1, 2) if scheme.accelerated else (0, 2) if scheme.multistep else (0,)
+        for part in parts:
+            args = [self.work.step, part, state.displacement, state.velocity, ctx.u_before, active]
+            self.launch(self.step_kernels.history_field, self.dim, [*args, self.work.p, self.scale])
+            yield ("displacement", "velocity", scheme.history_arrays[0])[part], self.work.p, self.scale
+
+    def add_predictor_bar(self, x: wp.array, active: wp.array) -> None:
+        """Add bars x of q~ to those of the state at the start."""
+        self.launch(self.step_kernels.add_predictor, self.dim, [self.work.step, x, active, *self.state_bars])
 
     def _refine(self) -> None:
         """Add the solution for the residual; worlds leave the flags of the Newton loop as they converge."""

@@ -139,22 +139,31 @@ class Elements(Differentiable):
         makers = (internal_force_gradient, mass_gradient) if moving else (internal_force_gradient,)
         return not_shaped(ctx) or [partial(make, ctx) for make in makers]
 
-    def history_kernels(self) -> list[tuple[Any, wp.Kernel]]:
-        """Blocks with strains of the start of the step, and their kernels `history_gradient`."""
-        blocks = [b for b in self.model.blocks if b.key.damping == "incremental"]
+    def history_kernels(self, damping: str) -> list[tuple[Any, wp.Kernel]]:
+        """Blocks with a form of damping, and their kernels `history_gradient`."""
+        blocks = [b for b in self.model.blocks if b.key.damping == damping]
         kind = [(b.key.law, b.slots, b.key.affine, b.key.framed) for b in blocks]
         return [(b, history_gradient_kernel(self.model.dtype, *key)) for b, key in zip(blocks, kind)]
 
     def add_history_gradient(self, at: StepAdjoint) -> None:
-        found, w = self.history_kernels() if at.ctx.inertia else [], at.ctx.work
-        if found:
-            w.contribution.zero_()
+        ctx = at.ctx
+        if not ctx.inertia or ctx.midpoint:
+            return
+        if found := self.history_kernels("incremental"):
+            for name, x, scale in at.history_fields():
+                self._history_force(at, found, x, scale, at.w, transposed=1)
+                at.add_to(name, at.scratch)
+
+    def _history_force(
+        self, at: StepAdjoint, found: list[Any], x: wp.array, scale: wp.array, direction: wp.array, transposed: int
+    ) -> None:
+        """Forces of `history_gradient` into at.scratch."""
+        w = at.ctx.work
+        w.contribution.zero_()
         for block, kernel in found:
-            args = [block.data, w.u, at.ctx.state.displacement, at.w, w.step.dq_dv, at.active, w.contribution]
+            args = [block.data, w.u, x, scale, direction, w.step.dq_dv, transposed, at.active, w.contribution]
             at.ctx.launch(kernel, (self.model.worlds, block.count), args)
-        if found:
-            at.gather(at.scratch)
-            at.ctx.launch(at.kernels.add_vector, at.dim, [at.scratch, at.active, at.q_bar])
+        at.gather(at.scratch)
 
     def samples(self, field: str, body: Any, state: State) -> np.ndarray:
         """Fields of slots and section forces; others are functions of quantities."""

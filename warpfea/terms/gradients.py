@@ -37,25 +37,31 @@ STEP = 1e-30
 
 @dataclass(eq=False)
 class StepAdjoint:
-    """Adjoint of a linearised step, as of solvers/adjoint.py.
+    """Adjoint of a linearised step.
 
     Attributes:
         ctx: at its end; its state is that of the start.
-        w, mu, drive_bar, q_bar, active, kernels: of the solver.
-        sums: [3, world] scratch. scratch: [world, slot].
-        reduce: sums of rows.
+        solver: of solvers/adjoint.py, with w, mu, drive_bar, bars, kernels, `history_fields`, `add_predictor_bar`.
+        scratch: [world, slot].
     """
 
     ctx: StepContext
-    w: wp.array
-    mu: wp.array
-    drive_bar: wp.array
-    q_bar: wp.array
-    active: wp.array
-    kernels: Any
-    sums: wp.array
+    solver: Any
     scratch: wp.array
-    reduce: Callable[[wp.array, int, wp.array, wp.array], None]
+
+    def __getattr__(self, name: str) -> Any:
+        """Attributes of the solver."""
+        return getattr(self.solver, name)
+
+    @property
+    def active(self) -> wp.array:
+        """Flags of the worlds of this step."""
+        return self.solver.running
+
+    @property
+    def sums(self) -> wp.array:
+        """[3, world] scratch."""
+        return self.solver.control.sums
 
     @property
     def dim(self) -> tuple[int, int]:
@@ -64,12 +70,16 @@ class StepAdjoint:
 
     def add(self, out: wp.array, sign: float = 1.0) -> None:
         """out [world, k] += sign times the sums of the first rows of work.rows."""
-        self.reduce(self.ctx.work.rows, out.shape[1], self.active, self.sums)
+        self.solver.newton.residual.reduce(self.ctx.work.rows, out.shape[1], self.active, self.sums)
         self.accumulate(out, sign)
 
     def accumulate(self, out: wp.array, sign: float) -> None:
         """out [world, k] += sign sums[k, world]."""
         self.ctx.launch(self.kernels.accumulate, out.shape, [self.sums, wp.float64(sign), self.active, out])
+
+    def add_to(self, name: str, x: wp.array) -> None:
+        """Bar of a state array += x."""
+        self.ctx.launch(self.kernels.add_vector, self.dim, [x, self.active, self.bars[name]])
 
     def gather(self, out: wp.array) -> None:
         """Contributions of the elements, summed by slot."""

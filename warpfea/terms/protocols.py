@@ -307,7 +307,8 @@ class Differentiable(Term):
         return "its derivative by the reference is not written"
 
     def add_history_gradient(self, at: StepAdjoint) -> None:
-        """at.q_bar -= w . dg/dq_n of forces that depend on displacements at the start of the step besides q~."""
+        """at.bars[name] -= w . dg/dx of forces that depend on arrays x of the state at the start of the step besides
+        q~; called after the solve, with the bars of the start."""
 
 
 PROTOCOLS = (
