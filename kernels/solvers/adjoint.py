@@ -92,7 +92,10 @@ def adjoint_kernels(dtype: str, constrained: bool) -> KernelSet:
         """Record |r| / |right side| of the solution."""
         world = wp.tid()
         if ctl.first_norm[world] > f64(0.0):
-            ratio = wp.sqrt(ctl.sums[0, world]) / ctl.first_norm[world]
+            norm = ctl.norm[world]
+            if wp.static(constrained):
+                norm = wp.sqrt(ctl.sums[0, world])
+            ratio = norm / ctl.first_norm[world]
             if not (ratio <= ctl.residual[world]):
                 ctl.residual[world] = ratio
 

@@ -112,6 +112,9 @@ class Adjoint:
         self.steps = 0
         self.residual = self.growth = np.zeros(m.worlds)
         self._updates = self.model.terms.parameter_updates
+        self._sums = {name: self._zeros(self._size_of(name)) for name in self.names}
+        self._sums |= {MESH: self.mesh.zeros()} if self.mesh else {}
+        self._graph: wp.Graph | None = None  # of a step back, with the derivatives of the coefficients at hand
         if self.static:
             self.kept = [self._snapshot()]
             self.kept *= 2
@@ -133,6 +136,7 @@ class Adjoint:
         s.predictor = None
         driven: wp.array = wp.array(m.terms.supports.driven(), dtype=m.types.vec3, device=m.device)
         self.solver = a = AdjointSolver(s.newton, s.integrator, driven, tol)
+        a.reactions = bool(np.any(m.terms.supports.driven())) or not {INITIAL[0], MESH}.isdisjoint(self.names)
         self.end_velocity = s.work.array("adjoint end velocity", (m.worlds, m.slots), m.types.vec3)
         self.at = StepAdjoint(s.ctx, a, s.work.z)
         modules = {module.name: module for module in {*a.modules(), *self._term_modules()}}
@@ -186,8 +190,8 @@ class Adjoint:
         if self.kept and not np.array_equal(self.kept[-1]["time"].numpy(), self.sim.time):
             self.clear()
         self._check_budget(steps)
-        if not self.kept:
-            self._updates = self.model.terms.parameter_updates
+        if not self.kept and self._updates != self.model.terms.parameter_updates:
+            self._updates, self._graph = self.model.terms.parameter_updates, None
         self._check_parameters()
         with convert_memory_errors(f"a tape of {steps} steps", self.model.device):
             if not self.kept:
@@ -286,8 +290,9 @@ class Adjoint:
             for array in (array for probe in self.probes.values() for array in probe.arrays):
                 array.grad.zero_()
             loss.backward()
-        sums, series = {name: self._zeros(self._size_of(name)) for name in self.names}, {}
-        sums |= {MESH: self.mesh.zeros()} if self.mesh else {}
+        sums, series = self._sums, dict[str, wp.array]()
+        for array in sums.values():
+            array.zero_()
         for name in (name for name in self.names if name in m.terms.time_laws.controls):
             series[name] = self._zeros(self.steps, self._size_of(name))
         self.stepper.set_dt(1.0)  # of statics; others follow
@@ -295,16 +300,15 @@ class Adjoint:
         self.stepper.newton.invalidate(wp.ones(m.worlds, dtype=wp.int32, device=m.device))
         for array in (*a.bars.values(), a.control.residual):
             array.zero_()
-        graph, last = None, np.zeros(m.worlds)
+        last = np.zeros(m.worlds)
+        add_probes = self._probe_commands()
         for k in reversed(range(self.steps)):
-            self._add_probes(k)
-            if self.mesh:
-                self.mesh.add_probes(self.stepper.launch, self.probes, k, self.kept[k + 1], sums[MESH])
+            self._add_probes(add_probes, k)
             self._load(k)
-            graph = graph or self._capture(sums)
+            self._graph = self._graph or self._capture(sums)
             for name in series:
                 sums[name].zero_()
-            wp.capture_launch(graph)
+            wp.capture_launch(self._graph)
             for name, array in series.items():
                 wp.copy(array[:, k], sums[name])
             if not last.any():
@@ -313,7 +317,7 @@ class Adjoint:
         self.residual = a.control.residual.numpy().copy()
         failed = self.sim.status != STATUS["running"]
         self._check_result(~failed)
-        out = sums | series
+        out = {name: series.get(name) or wp.clone(array) for name, array in sums.items()}
         out |= {name: wp.clone(a.q_bar if name == INITIAL[0] else a.v_bar) for name in self.names if name in INITIAL}
         return {name: self._finished(array, failed) for name, array in out.items()}
 
@@ -362,14 +366,22 @@ class Adjoint:
                 stacklevel=3,
             )
 
-    def _add_probes(self, k: int) -> None:
-        """Add the derivatives by the probes at the end of a step."""
-        a = self.solver
+    def _probe_commands(self) -> list[wp.Launch]:
+        """Commands of `_add_probes`; their third argument is the step."""
+        a, commands = self.solver, list[wp.Launch]()
         for probe in self.probes.values():
-            grads = [array.grad for array in probe.arrays]
+            args = [probe.slot, probe.weight, 0, *(array.grad for array in probe.arrays), a.q_bar, a.v_bar]
             dim = (self.model.worlds, len(probe.slot))
-            args = [probe.slot, probe.weight, k, *grads, a.q_bar, a.v_bar]
-            self.stepper.launch(a.kernels.probe_bars, dim, args)
+            commands.append(wp.launch(a.kernels.probe_bars, dim, args, device=self.model.device, record_cmd=True))
+        return commands
+
+    def _add_probes(self, commands: list[wp.Launch], k: int) -> None:
+        """Add the derivatives by the probes at the end of a step."""
+        for command in commands:
+            command.set_param_at_index(2, k)
+            command.launch()
+        if self.mesh:
+            self.mesh.add_probes(self.stepper.launch, self.probes, k, self.kept[k + 1], self._sums[MESH])
 
     def _load(self, k: int) -> None:
         """The state at the start of a step, with the joint forces and velocities at its end."""
@@ -391,8 +403,13 @@ class Adjoint:
         s.launch(s.kernels.begin_step, self.model.worlds, [w.step, w.newton, w.pcg])
         s.begin_attempt()
         wp.copy(w.v, self.end_velocity)
-        s.newton._clear_direction(w.newton.active)
-        s.newton._evaluate_first_iterate(w.newton.active)
+        newton, running = s.newton, w.newton.active
+        newton._clear_direction(running)
+        if any(s.ctx.traits._replace(midpoint=False)):
+            newton._evaluate_first_iterate(running)
+            return
+        newton.residual.update_positions(running)  # forces leave nothing that tangents take
+        newton.preconditioner.start(running)
 
 
 def check_simulation(sim: Any, static: bool) -> None:

@@ -1,7 +1,7 @@
 """Solution of the adjoint of a step on the device, by the simulation's own operator and preconditioner.
 
 The operator is the exact tangent at the converged state, from the elements or their matrix of this step: neither a
-matrix of another iterate nor a predicted stress; residuals are those of products by the elements. With constraints its
+matrix of another iterate nor a predicted stress; residuals are those of products by either. With constraints its
 penalties make it the augmented operator A = H + J^T R J, and mu += R J w after each solve (Uzawa's method) leads to the
 bordered system [H J^T; J 0]. Each refinement solves for the residual. Where a term's tangent is not symmetric, BiCGStab
 solves with the transposed products of all terms, preconditioned by the symmetric part.
@@ -68,7 +68,8 @@ class AdjointSolver:
             step by those at its start, as far as these do not act through a history. q_bar, v_bar: of displacements and
             velocities [world, slot].
         w: multipliers of the residual, m/N of the loss. mu: of the constraint rows, times h.
-        drive_bar: derivatives by driven displacements.
+        drive_bar: derivatives by driven displacements. reactions: False where neither these nor bars of prescribed
+            displacements at the start are wanted.
         control: norms of the residual.
     """
 
@@ -93,7 +94,9 @@ class AdjointSolver:
         self.constraint_data: Any = tables.data if tables else constraint_struct()()
         self.operator = ExactOperator(newton.residual, transposed=True)
         self.linear = newton.pcg
-        if not all(term.is_symmetric(newton.ctx) for term in m.terms.having(Differentiable)):
+        self.reactions = True
+        self.symmetric = all(term.is_symmetric(newton.ctx) for term in m.terms.having(Differentiable))
+        if not self.symmetric:
             # a transposed tangent may resist translations that the tangent does not
             operator: Any = self.operator
             self.linear = BiCGStab(m, w, self.launch, operator, newton.preconditioner,
@@ -109,7 +112,8 @@ class AdjointSolver:
         unprescribed: wp.array = wp.zeros(m.slots, dtype=wp.uint8, device=m.device)
         self.topology = with_fields(topology_struct(m.dtype), m.topology, prescribed_bits=unprescribed)
         w.newton.solve.fixed_forcing = 1
-        w.newton.solve.forcing.fill_(math.sqrt(tol))
+        # with constraints each solve is one of Uzawa's method
+        w.newton.solve.forcing.fill_(math.sqrt(tol) if self.constrained else 0.5 * tol)
 
     def modules(self) -> set[wp.Module]:
         """Modules launched, besides those of the Newton loop."""
@@ -139,8 +143,9 @@ class AdjointSolver:
         wp.copy(active, self.running)
         if self.constrained:  # the residual is that of the bordered system
             w.multipliers.penalty.zero_()
-        self._product()
-        self._evaluate_residual()
+        if self.constrained or self.reactions:
+            self._product(reactions=True)
+            self._evaluate_residual()
         launch(k.note_residual, m.worlds, [self.control, active])
         args = [step, m.topology, self.driven, self.w, w.gradient, active, *self.state_bars, self.drive_bar]
         launch(self.step_kernels.step_back, self.dim, args)
@@ -183,6 +188,9 @@ class AdjointSolver:
         self.launch(self.kernels.residual, self.dim, [*args, w.gradient, w.rows])
         self.newton.residual.reduce(w.rows, 1, active, self.control.sums)
 
-    def _product(self) -> None:
-        """A w on all components, into work.Hp."""
+    def _product(self, *, reactions: bool = False) -> None:
+        """A w into work.Hp, by the matrix of this step where it is exact; `reactions`: on prescribed components too."""
+        if self.symmetric and self.newton.residual.uses_matrix and not reactions:
+            self.newton.residual.product(self.w, self.work.Hp, self.work.newton.active)
+            return
         self.operator.product(self.w, self.work.Hp, self.work.newton.active, self.topology)
