@@ -218,13 +218,15 @@ def test_undriven_angles_count_turns() -> None:
 
 @pytest.mark.parametrize("scheme", ["backward_euler", "bdf2"])
 def test_a_controlled_part_comes_to_rest_at_whole_turns(scheme: str) -> None:
-    """Displacements, forces and energies vanish; the angle of two turns keeps its round-off."""
-    b, _, hinge = rotor(rate=0.0)
-    b.add_actuator(hinge, wf.PD(1e4, 200.0, target=([0.0, 0.2, 0.3], [0.0, 4 * np.pi, 4 * np.pi])))
+    """Displacements, forces and energies vanish; the angle of a hundred turns keeps its round-off,
+    beside a stop there."""
+    whole = 200.0 * np.pi
+    b, _, hinge = rotor(0.0, limits=(-1.0, whole + 1e-3))
+    b.add_actuator(hinge, wf.PD(1e4, 200.0, target=([0.0, 10.0, 11.0], [0.0, whole, whole])))
     sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-2, integrator=scheme)
-    sim.run(1.5)
-    np.testing.assert_allclose(sim.joint_value(hinge), 4 * np.pi, rtol=1e-15)
-    assert abs(sim.joint_rate(hinge)[0]) < 1e-12
+    sim.run(11.0)
+    np.testing.assert_allclose(sim.joint_value(hinge), whole, rtol=1e-15)
+    assert abs(sim.joint_rate(hinge)[0]) < 1e-10
 
 
 @pytest.mark.parametrize("scheme", ["backward_euler", "bdf2"])

@@ -197,12 +197,13 @@ class Springs(Tied, Preconditioned, Parametrised, Impacting, Diagnosed):
 
     def failure_note(self, ctx: StepContext, world: int) -> str:
         """Bushings near their largest turn; controllers that pull a joint by more than half a turn."""
-        start, values = ctx.scratch[self.name][0].start, ctx.work.time_law_stage_values
+        scratch, values = ctx.scratch[self.name][0], ctx.work.time_law_stage_values
+        start = scratch.start.numpy() + scratch.turns.numpy()
         for item in np.flatnonzero(self.kind == ANGLE).tolist():
             k = self.definition["spring"][item]
             if self.springs[k].law == FEEDBACK and self.springs[k].max_force == np.inf:
                 target = values.numpy()[world, self.definition["schedule"][k], 0]
-                away = abs(target - start.numpy()[world, item])
+                away = abs(target - start[world, item])
                 if away > np.pi:
                     return (
                         f"; the target of controller {self.springs[k].name!r} is {away:.3g} rad away: give it as a "
