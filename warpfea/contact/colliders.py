@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import warp as wp
 
 from ..base.errors import ModelError
 from ..base.worlds import set_rows
+from ..kernels.contact.collider_adjoint import collider_adjoint_kernels
 from ..kernels.contact.collider_kinematics import MAX_COLLIDER_ROTATION, pose_kernels
 from ..kernels.contact.collider_mesh import SIDE_TOLERANCE
 from ..kernels.contact.collider_sheets import sheet_kernels
@@ -18,7 +20,9 @@ from ..kernels.contact.structs import collider_struct
 from ..model.contacts import Contact
 from ..model.state import State
 from ..model.triangle_mesh import TriMesh
+from ..terms.gradients import Gradient
 from ..terms.term import StepContext, part
+from .adjoint import DifferentiableContact, together
 from .collider_tables import ContactTables
 from .evaluation import (
     contact_field,
@@ -44,7 +48,7 @@ POSES = {"position": "previous_position", "rotation": "previous_rotation", "angl
 """History of the colliders in the state, and its names in `Colliders`."""
 
 
-class ColliderContact(ContactTerm):
+class ColliderContact(ContactTerm, DifferentiableContact):
     """Contacts of a model with its colliders.
 
     Attributes:
@@ -249,6 +253,35 @@ class ColliderContact(ContactTerm):
         if isinstance(contact.collider.shape, TriMesh):
             numbers["triangles"] = len(contact.collider.shape.triangles)
         return numbers
+
+    # adjoint
+
+    @cached_property
+    def adjoint_kernels(self) -> Any:
+        """Kernels of `DifferentiableContact`."""
+        return collider_adjoint_kernels(self.model.dtype, self.tables.has_meshes, self.tables.own_laws)
+
+    def gradients(self, ctx: StepContext) -> Mapping[str, Callable[[], Gradient]]:
+        def offset(mine: np.ndarray) -> Gradient:
+            a = self.adjoint(ctx)
+            return a.sum_of(mine[None].astype(float), a.data.gap_bar)
+
+        of = self.tables.shapes.of_contact.numpy()
+        colliders = enumerate(self.tables.colliders)
+        offsets = {f"{c.name}.offset": partial(offset, of == k) for k, c in colliders if (of == k).any()}
+        return dict(super().gradients(ctx)) | offsets
+
+    def law_gradient(self, ctx: StepContext, law: int) -> Gradient | None:
+        """Paths: the pose at the end of a step is that at the start of the next one."""
+        shapes, found = self.tables.shapes, []
+        of = shapes.of_contact.numpy()
+        for name, values in (("translation_law", "shift_bar"), ("rotation_law", "turn_bar")):
+            mine = (getattr(shapes, name).numpy() == law)[of].astype(float)
+            if mine.any():
+                factor = mine[None, :, None] * np.ones(3) if values == "shift_bar" else mine[None]
+                a = self.adjoint(ctx)
+                found.append(a.sum_of(factor, getattr(a.data, values), along=False))
+        return together(found) if found else None
 
     # at a state
 

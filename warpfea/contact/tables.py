@@ -33,8 +33,9 @@ if TYPE_CHECKING:
     from ..model.model import Model
 
 __all__ = [
-    "POINT_SUM_LANES", "TOUCHING_DEPTH_RATIO", "WORLD_PARAMETERS", "FacetTables", "check_chosen_values",
-    "clamped_slots", "contact_constants", "hunt_crossley_damping", "normal_damping", "restitution_beta",
+    "MATERIAL_CONSTANTS", "POINT_SUM_LANES", "TOUCHING_DEPTH_RATIO", "WORLD_PARAMETERS", "FacetTables", "bodies_of",
+    "check_chosen_values", "clamped_slots", "contact_constants", "hunt_crossley_damping", "normal_damping",
+    "restitution_beta", "restitution_slopes",
 ]  # fmt: skip
 
 AnyContact = TypeVar("AnyContact", Contact, FacetOptions)
@@ -91,6 +92,16 @@ def hunt_crossley_damping(restitution: float) -> float:
         return 0.0
     # below e of about 0.02 the root is within round-off of 1/e
     return float(brentq(excess, low, high, xtol=1e-15)) if excess(high) < 0.0 else high
+
+
+def restitution_slopes(damping: np.ndarray, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives of `hunt_crossley_damping` and `restitution_beta` by the restitution, from both; NaN at 0."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        log = -math.pi * beta / np.sqrt(1.0 - beta**2)
+        e = np.exp(log)
+        slope = e * damping * (1.0 + damping) / ((1.0 + e) * (1.0 - e - e * damping))
+        of_beta = -(math.pi**2) / e / np.hypot(log, math.pi) ** 3
+    return np.where(e == 1.0, -1.5, np.where(e > 0.0, slope, np.nan)), np.where(e > 0.0, of_beta, np.nan)
 
 
 def compliance(contact: ContactOptions, stiffness: float, area: float, *compliances: float) -> tuple[float, ...]:

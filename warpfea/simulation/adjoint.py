@@ -36,7 +36,7 @@ from .stepper import Stepper
 if TYPE_CHECKING:
     from ..model.model import Model
 
-__all__ = ["Adjoint", "ProbeArrays", "check_simulation", "check_terms"]
+__all__ = ["Adjoint", "Gradients", "ProbeArrays", "check_simulation", "check_terms"]
 
 INITIAL = ("initial.displacement", "initial.velocity")
 MAX_RESIDUAL = 1e-6
@@ -66,6 +66,17 @@ class ProbeArrays:
     def arrays(self) -> tuple[wp.array, wp.array, wp.array]:
         """The three arrays."""
         return self.displacement, self.velocity, self.position
+
+
+class Gradients(dict[str, wp.array]):
+    """Arrays of derivatives by name.
+
+    Attributes:
+        switches: (worlds,) points that came into contact in a step, or left it, began to slip or stuck, summed over the
+            steps: there the derivative is that of one side.
+    """
+
+    switches: np.ndarray
 
 
 class Adjoint:
@@ -138,8 +149,9 @@ class Adjoint:
         self.solver = a = AdjointSolver(s.newton, s.integrator, driven, tol)
         a.reactions = bool(np.any(m.terms.supports.driven())) or not {INITIAL[0], MESH}.isdisjoint(self.names)
         self.end_velocity = s.work.array("adjoint end velocity", (m.worlds, m.slots), m.types.vec3)
-        self.at = StepAdjoint(s.ctx, a, s.work.z)
-        modules = {module.name: module for module in {*a.modules(), *self._term_modules()}}
+        self.at = StepAdjoint(s.ctx, a, s.work.z, wp.zeros(m.worlds, dtype=wp.int32, device=m.device))
+        of_terms = [module for term in m.terms.having(Differentiable) for module in term.prepare_adjoint(self.at)]
+        modules = {module.name: module for module in {*a.modules(), *self._term_modules(), *of_terms}}
         load_modules(modules, m.device, on_compile)
 
     def _term_modules(self) -> list[wp.Module]:
@@ -267,7 +279,7 @@ class Adjoint:
 
     # backward
 
-    def backward(self, loss: Any = None) -> dict[str, wp.array]:
+    def backward(self, loss: Any = None) -> Gradients:
         """Derivatives of a loss, each world's own, by name.
 
         Args:
@@ -277,6 +289,7 @@ class Adjoint:
         Returns:
             arrays [world] of constants, [world, 3] of gravity, [world, step, size] of controls (of statics [world,
                 size]), [world, slot] of initial values and "mesh.X"; NaN in worlds that failed.
+            Their `switches`: how often contact changed, where derivatives are one-sided.
 
         Raises:
             ModelError: no step, or parameters that changed since.
@@ -298,8 +311,10 @@ class Adjoint:
         self.stepper.set_dt(1.0)  # of statics; others follow
         self.state.status.assign(self.sim.state.status)
         self.stepper.newton.invalidate(wp.ones(m.worlds, dtype=wp.int32, device=m.device))
-        for array in (*a.bars.values(), a.control.residual):
+        for array in (*a.bars.values(), a.control.residual, self.at.switches):
             array.zero_()
+        for term in m.terms.having(Differentiable):
+            term.begin_adjoint(self.at)
         last = np.zeros(m.worlds)
         add_probes = self._probe_commands()
         for k in reversed(range(self.steps)):
@@ -319,7 +334,9 @@ class Adjoint:
         self._check_result(~failed)
         out = {name: series.get(name) or wp.clone(array) for name, array in sums.items()}
         out |= {name: wp.clone(a.q_bar if name == INITIAL[0] else a.v_bar) for name in self.names if name in INITIAL}
-        return {name: self._finished(array, failed) for name, array in out.items()}
+        found = Gradients({name: self._finished(array, failed) for name, array in out.items()})
+        found.switches = self.at.switches.numpy()
+        return found
 
     def _zeros(self, *shape: int) -> wp.array:
         """Zeros [world, ...], float64."""
@@ -330,11 +347,13 @@ class Adjoint:
         gradients = [(make(), sums[name]) for name, makers in self.outputs.items() for make in makers]
         with wp.ScopedCapture(device=self.model.device) as recorded:
             self._linearise()
+            for term in self.model.terms.having(Differentiable):
+                term.linearise_adjoint(self.at)
             self.solver.solve()
-            for add, out in gradients:
-                add(self.at, out)
             for term in self.model.terms.having(Differentiable):
                 term.add_history_gradient(self.at)
+            for add, out in gradients:
+                add(self.at, out)
         self._gradients = gradients  # owns the arrays of the graph
         return recorded.graph
 

@@ -43,11 +43,13 @@ class StepAdjoint:
         ctx: at its end; its state is that of the start.
         solver: of solvers/adjoint.py, with w, mu, drive_bar, bars, kernels, `history_fields`, `add_predictor_bar`.
         scratch: [world, slot].
+        switches: [world] counts of points that came into contact or left it, began to slip or stuck.
     """
 
     ctx: StepContext
     solver: Any
     scratch: wp.array
+    switches: wp.array
 
     def __getattr__(self, name: str) -> Any:
         """Attributes of the solver."""

@@ -306,9 +306,20 @@ class Differentiable(Term):
         none."""
         return "its derivative by the reference is not written"
 
+    def prepare_adjoint(self, at: StepAdjoint) -> Iterable[wp.Module]:
+        """Allocate for the adjoint, with at.bars of histories by their names in the state; returns the modules."""
+        return ()
+
+    def begin_adjoint(self, at: StepAdjoint) -> None:
+        """Begin to go back through a run: parameters are known."""
+
+    def linearise_adjoint(self, at: StepAdjoint) -> None:
+        """Evaluate exact products at the end of a step, and add to at.q_bar the bars of its histories, before the
+        solve."""
+
     def add_history_gradient(self, at: StepAdjoint) -> None:
         """at.bars[name] -= w . dg/dx of forces that depend on arrays x of the state at the start of the step besides
-        q~; called after the solve, with the bars of the start."""
+        q~; called after the solve and before `gradients`, with the bars of the start."""
 
 
 PROTOCOLS = (

@@ -1,0 +1,207 @@
+"""Gradients through contact and friction: against differences and closed forms; what is refused, what is counted."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import warp as wp
+from contact_cubes import cube, everywhere
+from gradient_models import LAW, SOLVER, TARGET, best_differences, shifts
+from triangle_meshes import Model
+from warpfea.kernels.contact.collider_adjoint import normal_derivatives
+from warpfea.kernels.contact.colliders import collider_functions
+from warpfea.kernels.contact.structs import collider_struct
+
+import warpfea as wf
+from warpfea.contact.collider_tables import upload_collider_meshes
+from warpfea.contact.tables import hunt_crossley_damping, restitution_beta, restitution_slopes
+from warpfea.simulation.adjoint import check_terms
+
+TOLERANCE = 1e-6  # the bar is 1e-5
+SHARE = 0.1  # of the lengths of differences: beyond, other points stick
+GAP = 2e-5
+TETRAHEDRON = wf.TriMesh([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)], [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)])
+SHAPES = {
+    "sphere": wf.Sphere((0, 0, 0), 0.7),
+    "capsule": wf.Capsule((0, 0, -0.4), (0, 0, 0.4), 0.5),
+    "box": wf.Box((0, 0, 0), (1.0, 0.8, 1.2)),
+    "cylinder": wf.Cylinder((0, 0, -0.4), (0, 0, 0.4), 0.5),
+    "tetrahedron": TETRAHEDRON,
+}
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def normals(
+    col: collider_struct(True), y: wp.array(dtype=wp.vec3d), normal: wp.array(dtype=wp.vec4d),
+    derivative: wp.array(dtype=wp.mat33d),
+):  # fmt: skip
+    i = wp.tid()
+    normal[i] = distance(col, 0, y[i], -1)
+    derivative[i] = normal_derivative(col, 0, y[i], -1)
+
+
+distance, normal_derivative = collider_functions(True).distance, normal_derivatives(True).normal_derivative
+
+
+@pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
+def test_normals_of_colliders_have_their_derivatives(shape):
+    """Against differences, beside faces, edges, corners and rims, outside and inside."""
+    rng = np.random.default_rng(0)
+    y = rng.uniform(-1.0, 1.2, (200, 3))
+    steps = 1e-5 * np.array([-2.0, -1.0, 1.0, 2.0])
+    every = y[:, None, None, :] + steps[:, None, None] * np.eye(3)
+    col = collider_struct(True)()
+    col.mesh = upload_collider_meshes(Model("cpu"), [TETRAHEDRON])
+    col.kind = wp.array([shape.kind], dtype=wp.int32, device="cpu")
+    col.size = wp.array([shape.sizes], dtype=wp.vec3d, device="cpu")
+    at = wp.array(np.concatenate([y, every.reshape(-1, 3)]), dtype=wp.vec3d, device="cpu")
+    n, B = wp.zeros(len(at), dtype=wp.vec4d, device="cpu"), wp.zeros(len(at), dtype=wp.mat33d, device="cpu")
+    wp.launch(normals, len(at), [col, at], [n, B], device="cpu")
+    near = n.numpy()[len(y) :, :3].reshape(len(y), 4, 3, 3)
+    wanted = np.einsum("k,pkjc->pcj", np.array([1.0, -8.0, 8.0, -1.0]) / 12e-5, near)
+    errors = np.abs(B.numpy()[: len(y)] - wanted).max(axis=(1, 2)) / (1.0 + np.abs(wanted).max(axis=(1, 2)))
+    assert (errors < 1e-6).mean() > 0.98  # else a position within 2e-5 of a border of two features
+    assert np.abs(B.numpy()).max() > 0.5 or shape.kind == wf.Box.kind
+
+
+def test_slopes_of_restitution():
+    e = np.array([0.05, 0.3, 0.6, 0.9, 1.0])
+    near = [
+        [np.array([f(x + k * 1e-4) for x in e[:4]]) for k in (-2, -1, 1, 2)]
+        for f in (hunt_crossley_damping, restitution_beta)
+    ]
+    damping, beta = (np.array([f(x) for x in e]) for f in (hunt_crossley_damping, restitution_beta))
+    for found, values in zip(restitution_slopes(damping, beta), near):
+        assert found[:4] == pytest.approx(np.array([1.0, -8.0, 8.0, -1.0]) @ values / 12e-4, rel=1e-7)
+    assert restitution_slopes(damping, beta)[0][4] == -1.5
+    assert np.isnan(restitution_slopes(np.array([-1.0]), np.array([1.0]))).all()
+
+
+def thrown(worlds, shapes, mu):
+    """A soft cube on a floor and beside another obstacle, both on paths of their own."""
+    b = wf.ModelBuilder(gravity=(0, 0, -9.81))
+    mesh = wf.mesh.box((0.1, 0.1, 0.1), cells=(1, 1, 1), element="T4")
+    box = b.add_solid(mesh, material=LAW, name="box")
+    for name, (shape, side) in shapes.items():
+        turn = wf.Rotation(anchor=(0.02, 0.01, -0.03), axis=(0.3, 0.5, 0.8), angle=wf.Control(f"turn {name}"))
+        path = turn if name != "beside" else wf.Control("shift", 3)
+        collider = b.add_collider(shape, name=name, path=path)
+        b.add_contact(box.surface(side), collider, mu=mu, restitution=0.5, name=f"pad {name}", seam=0.0)
+    b.add_probe("top", box.surface("z+"))
+    return b.finalize(device="cpu", worlds=worlds)
+
+
+FLOOR = wf.HalfSpace((0, 0, 1), -GAP), "z-"
+BOX = wf.Box((-0.1 - GAP, 0.05, -0.9), (0.2, 2.0, 2.0)), "x-"
+BALL = wf.Sphere((-0.3 - GAP, 0.053, 0.048), 0.3), "x-"
+RUNS = {
+    "slip and stick": ({"floor": FLOOR, "beside": BOX}, (-0.1, 0.02, -0.1), 8),
+    "round": ({"ball": BALL}, (-0.1, 0.05, 0.02), 6),
+}
+BDF2 = ("round",)
+
+
+def contact_run(kind, rows=None, worlds=slice(None)):
+    """Tape of worlds whose parameters differ by rows; names, values at the base and, as one more, the controls."""
+    shapes, velocity, steps = RUNS[kind]
+    mu = 0.3
+    names = {"box.E": 1e6, "box.nu": 0.3, "box.density": 1000.0, "gravity": np.array([1.0, 0.5, -9.81])}
+    for name in shapes:
+        names |= {f"pad {name}.{key}": value for key, value in {"mu": mu, "stiffness": 1.0, "restitution": 0.5}.items()}
+        names[f"{name}.offset"] = 2e-6
+    controls = {"shift" if name == "beside" else f"turn {name}": 3 if name == "beside" else 1 for name in shapes}
+    rng = np.random.default_rng(0)
+    paths = {name: 1e-5 * np.cumsum(rng.standard_normal((steps, size)), axis=0) for name, size in controls.items()}
+    rows = SHARE * shifts(len(names) + len(paths)) if rows is None else rows
+    mine = rows[worlds]
+    m = thrown(len(mine), shapes, mu)
+    for k, (name, value) in enumerate(names.items()):
+        if name == "gravity":
+            m.set_gravity(value * (1.0 + mine[:, k : k + 1]))
+        else:
+            base = -GAP * (name == "floor.offset") if name.endswith("offset") else value
+            m.set_parameter(name, base + value * mine[:, k])
+    sim = wf.Simulation(m, dt=5e-4, solver=SOLVER, integrator="bdf2" if kind in BDF2 else "backward_euler")
+    sim.state.velocity.assign(np.tile(velocity, (m.worlds, m.slots, 1)))
+    tape = wf.Adjoint(sim, [*names, *paths, "initial.velocity"])
+    slips = []
+    for step in range(steps):
+        for k, (name, values) in enumerate(paths.items(), len(names)):
+            sim.controls[name][:] = values[step] * (1.0 + mine[:, k : k + 1])
+        tape.run(1)
+        slips.append((sim.state.contact_contact_state.numpy()[0] >= 1 << 30).sum())
+    loss = wf.loss.sum_of_squares(tape.probe("top").displacement, np.full((1, steps, 3), TARGET))
+    g = tape.backward(loss)
+    exact = [SHARE * np.sum(g[name].numpy()[0] * value) for name, value in (names | paths).items()]
+    return tape, loss, g, exact, rows, slips
+
+
+@pytest.mark.parametrize("kind", RUNS)
+def test_gradients_through_contact(kind):
+    tape, loss, g, exact, rows, slips = contact_run(kind)
+    errors = best_differences(loss.numpy(), exact)
+    assert (errors < TOLERANCE).all(), errors
+    assert (tape.residual < 1e-10).all()
+    assert slips[0] > 0
+    if kind == "round":
+        return
+    touching = (tape.sim.state.contact_speed.numpy()[0] > 0.0).sum()
+    assert 0 < slips[-1] < touching - 4  # some stick
+    assert g.switches[0] >= touching + slips[0] - slips[-1]
+    _, _, alone, _, _, _ = contact_run(kind, rows, slice(7, 8))
+    assert all(np.array_equal(alone[name].numpy()[0], g[name].numpy()[7]) for name in g)
+    assert alone.switches[0] == g.switches[7]
+
+
+def test_friction_of_a_guided_block():
+    """On its way along x at a fixed depth the normal force N is constant: x = v0 t - mu N h^2 n (n + 1) / (2 m)."""
+    h, n, depth = 1e-3, 10, 2e-4
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    body = cube(b)
+    b.drive(body.nodes(everywhere), displacement=(0, 0, -depth), components="yz")
+    pad = b.add_contact(body.surface("z-"), b.add_collider(wf.HalfSpace((0, 0, 1))), mu=0.3, restitution=1.0,
+                        stiffness=("region", 1e-2), overlap="offset", overlap_time=1e-12, name="pad")  # fmt: skip
+    b.add_probe("face", body.surface("x+"))
+    m = b.finalize(device="cpu")
+    with pytest.warns(wf.ModelWarning, match="initial jump"):
+        sim = wf.Simulation(m, dt=h, solver=SOLVER)
+    sim.state.velocity.assign(np.tile((1.0, 0, 0), (1, m.slots, 1)))
+    tape = wf.Adjoint(sim, ["pad.mu", "pad.stiffness"])
+    tape.run(n)
+    way = sim.contact_force(pad)[0, 2] * h**2 * n * (n + 1) / 2  # the mass is 1 kg
+    grad = np.zeros((1, n, 3))
+    grad[0, -1, 0] = 1.0
+    tape.probe("face").position.grad.assign(grad)
+    g = tape.backward()
+    assert g["pad.mu"].numpy()[0] == pytest.approx(-way, rel=1e-5)  # it shears a little
+    assert g["pad.stiffness"].numpy()[0] == pytest.approx(-0.3 * way / 1e-2, rel=1e-5)
+
+
+def test_sag_of_a_block_on_the_floor():
+    """All compliances are proportional to 1/E, that of contact too: d(sag)/dE = -sag/E where it is small."""
+    b = wf.ModelBuilder(gravity=(0, 0, -1e-5))
+    mesh = wf.mesh.box((0.1, 0.1, 0.1), cells=(1, 1, 1), element="T4")
+    box = b.add_solid(mesh, material=LAW, name="box")
+    b.drive(box.nodes("z+"), displacement=(0, 0, 0), components="xy")
+    b.add_contact(box.surface("z-"), b.add_collider(wf.HalfSpace((0, 0, 1))), mu=0.0, restitution=0.5, name="pad")
+    b.add_probe("top", box.surface("z+"))
+    result = wf.solve_static(b.finalize(device="cpu"), load_steps=1, tol=1e-12, stabilise=True)
+    tape = wf.Adjoint(result, ["box.E", "gravity", "pad.stiffness"])
+    sag = tape.probe("top").displacement.numpy()[0, 0, 2]
+    tape.probe("top").displacement.grad.assign(np.array([[[0, 0, 1.0]]]))
+    g = tape.backward()
+    assert g["box.E"].numpy()[0] == pytest.approx(-sag / 1e6, rel=1e-6)
+    assert g["gravity"].numpy()[0, 2] == pytest.approx(sag / -1e-5, rel=1e-6)
+    assert 0.0 < g["pad.stiffness"].numpy()[0] < abs(sag)
+
+
+def test_features_of_contact_without_an_adjoint_are_refused_by_name():
+    def refused(match, inertia=True, **options):
+        b = wf.ModelBuilder()
+        box = b.add_solid(wf.mesh.box((0.1, 0.1, 0.1), cells=(1, 1, 1), element="T4"), material=LAW)
+        b.add_contact(box, b.add_collider(wf.HalfSpace((0, 0, 1), -1.0)), restitution=0.5, **options)
+        with pytest.raises(wf.ModelError, match=match):
+            check_terms(b.finalize(device="cpu"), SimpleNamespace(inertia=inertia, midpoint=False))
+
+    refused("'contact' has no adjoint for contacts of model='sphere'", model="sphere", radius=0.1)
+    refused("friction in statics", inertia=False, mu=0.3)
