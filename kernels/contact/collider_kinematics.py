@@ -84,7 +84,8 @@ def collider_kinematics(dtype: str, meshes: bool, seams: bool = False) -> Kernel
         kc = col.of_contact[c]
         shift = interpolate(facets, u_n, world, q, item)
         rotation = col.previous_rotation[world, kc]
-        y = wp.transpose(rotation) * (facets.X[q, item] + shift - col.previous_position[world, kc])
+        X = k.position_at(facets, q, k.column(facets, world, item))
+        y = wp.transpose(rotation) * (X + shift - col.previous_position[world, kc])
         in_contact = his.speed[world, rec] > f64(0.0)
         if wp.static(meshes):
             if not in_contact:
@@ -100,6 +101,9 @@ def collider_kinematics(dtype: str, meshes: bool, seams: bool = False) -> Kernel
         if clock.is_static == 0:
             v = material_velocity(col, clock, world, kc, y) - interpolate(facets, v_n, world, q, item)
             speed = wp.dot(rotation * n, v)
+            if k.is_edge(facets, item):  # a rolling point descends initially at twice its mean speed
+                rolled = k.depth_at_start(con, facets, his, scr, world, c, item, point) - scr.start_depth[world, point]
+                speed -= f64(2.0) * rolled / clock.h[world]
         scr.approach_speed[world, point] = k.approach_speed(his, world, rec, speed)
         face = direction(n)
         if in_contact and scr.start_depth[world, point] > col.deepest[world, kc, face]:
@@ -233,7 +237,7 @@ def collider_kinematics(dtype: str, meshes: bool, seams: bool = False) -> Kernel
                                 scr.activation_gap[world, point] - before, d[3])  # fmt: skip
         if change[1] != f64(0.0):
             out.depth = before + change[0] + (activation - scr.activation_gap[world, point])
-        out.previous_depth = k.depth_at_start(con, facets, his, scr, world, c, point)
+        out.previous_depth = k.depth_at_start(con, facets, his, scr, world, c, item, point)
         if level >= 0:  # the depth at the start is the distance from the side face
             out.previous_depth = out.depth + wp.dot(out.normal, t.relative_motion)
         near = out.depth > f64(0.0) or before > f64(0.0)

@@ -287,7 +287,7 @@ def deepest_point_kernels(dtype: str, meshes: bool) -> KernelSet:
         if clock.is_static == 0:
             approach = wp.dot(rotation * n, geometry.material_velocity(col, clock, world, k, y) - v)
             # a rolling contact point descends initially at twice its mean speed
-            rolled = f.depth_at_start(con, facets, his, scr, world, c, point) - scr.start_depth[world, point]
+            rolled = f.depth_at_start(con, facets, his, scr, world, c, item, point) - scr.start_depth[world, point]
             speed = approach - f64(2.0) * rolled / clock.h[world]
         scr.approach_speed[world, point] = f.approach_speed(his, world, rec, speed)
 

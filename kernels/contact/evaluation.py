@@ -59,7 +59,8 @@ def collider_evaluation_kernels(dtype: str, meshes: bool, seams: bool, own: OwnL
         kc = col.of_contact[c]
         point = facets.first_point + item * facets.point_count + q
         shift = k.interpolate(facets, u, world, q, item)
-        y = wp.transpose(col.rotation[world, kc]) * (facets.X[q, item] + shift - col.position[world, kc])
+        X = k.position_at(facets, q, k.column(facets, world, item))
+        y = wp.transpose(col.rotation[world, kc]) * (X + shift - col.position[world, kc])
         now = k.activation_gap(con, his, world, c, point, time[world], col.margin[world, kc])
         g.set_start(col, scr, world, kc, point, y, -1, now)
         scr.start_displacement[world, point] = shift

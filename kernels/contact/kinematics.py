@@ -60,7 +60,7 @@ def kinematics_functions(dtype: str) -> KernelSet:
 
     @wp.func
     def is_edge(facets: Facets, item: int) -> bool:
-        """True for a row of points on sharp edges."""
+        """True for a row of points on sharp edges, or of rolling points."""
         return facets.edge_rows > 0 and facets.edge_row[item] >= 0
 
     @wp.func
@@ -143,7 +143,7 @@ def kinematics_functions(dtype: str) -> KernelSet:
         """Reference position of the active point, m."""
         if facets.tracks_deepest != 0:
             return scr.point_reference[world, facets.contact[item]]
-        return facets.X[point, item]
+        return position_at(facets, point, column(facets, world, item))
 
     @wp.func
     def inward_normal(facets: Facets, scr: ContactScratch, world: int, item: int) -> vec3d:
@@ -224,10 +224,10 @@ def kinematics_functions(dtype: str) -> KernelSet:
 
     @wp.func
     def depth_at_start(
-        con: Contacts, facets: Facets, his: History, scr: ContactScratch, world: int, c: int, point: int
+        con: Contacts, facets: Facets, his: History, scr: ContactScratch, world: int, c: int, item: int, point: int
     ) -> f64:
         """Depth at the start of the step, m; for a moving point in contact, that of the deepest position then."""
-        if facets.tracks_deepest != 0:
+        if facets.tracks_deepest != 0 or is_edge(facets, item):
             rec = history_row(con, c, point)
             if his.speed[world, rec] > f64(0.0):
                 return his.previous_depth[world, rec]

@@ -229,7 +229,7 @@ def contact_ledger_kernels(dtype: str, geometry: str, own: OwnLaws = ()) -> Kern
                     add_to_row(energies, COLLIDER_WORK, world, row, area_fraction * work)
                     add_to_row(energies, INTEGRATOR_WORK, world, row, area_fraction * work)
                     record_point(con, other, facets, scr, world, item, q, t, o, area_fraction)
-                    if facets.tracks_deepest != 0:
+                    if his.previous_depth.shape[0] > 0:
                         his.previous_depth[world, rec] = t.depth
                     if t.depth > f64(0.0):
                         update_history(con, other, his, scr, world, c, point, t, o, inv_h)

@@ -152,10 +152,13 @@ def facet_struct(dtype: str):
         )  # [point] on the unit triangle or square; with the next two: lumped contacts
         lagrange_coefficients: wp.array2d(dtype=wp.float64)  # [point, monomial] Lagrange polynomials of the points
         exponents: wp.array(dtype=wp.vec2i)  # [monomial] exponents
-        edge_rows: wp.int32  # number of rows of points on sharp edges, which move along them
+        edge_rows: wp.int32  # number of rows of points on sharp edges, which move along them, and of rolling points
         edge_row: wp.array(dtype=wp.int32)  # [facet] number among them, or -1
         edge_shape: wp.array3d(dtype=T)  # [point, local, column - facet_count] shape values, see `column`
         edge_X: wp.array2d(dtype=wp.vec3d)  # [point, column - facet_count] reference position, m
+        rolling_axis: wp.array(dtype=wp.vec4d)  # [edge row] axis of a round part, and its radius, m; see rolling.py
+        rolling_end: wp.array2d(dtype=wp.float64)  # [point, edge row] 1, -1: centre of a ball at an end; 0: of a circle
+        rolling_gradient: wp.array2d(dtype=wp.vec3d)  # [local, edge row] of the shape functions, 1/m
 
     return Facets
 

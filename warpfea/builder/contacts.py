@@ -23,6 +23,7 @@ from ..model.handles import SurfaceSet
 from ..model.obstacle_points import ObstacleContact, has_own_points, narrow_width
 from ..model.pairs import PAIR_RULES, FacetOptions, PairContact, slave_and_master
 from ..model.rigid import RigidBody
+from ..model.rolling import ROLLING_SHAPES, RollingContact
 from ..model.segments import SEGMENT_POINTS, SegmentContact, has_segments
 from ..model.shapes import Shape, Sphere
 from ..model.triangle_mesh import TriMesh
@@ -123,13 +124,18 @@ def default_model(thing: Any, other: Any, o: dict[str, Any]) -> dict[str, Any]:
     are."""
     if o["model"] is not None:
         return {}
-    plain = not o["clipping"] and (o["law"], o["treatment"]) == ("default", "implicit") and all(
-        o[name] is None for name in ("stiffness", "radius", "points", "seam")
-    )  # fmt: skip
-    ball = thing.shape if isinstance(thing, RigidBody) else None
-    if plain and isinstance(ball, Sphere) and isinstance(other, Collider) and not isinstance(other.shape, TriMesh):
-        return {"model": "sphere", "radius": ball.radius}
+    if touches_without_facets(thing, other, o, Sphere):
+        return {"model": "sphere", "radius": thing.shape.radius}
     return {"model": "patch"}
+
+
+def touches_without_facets(thing: Any, other: Any, o: dict[str, Any], shapes: Any) -> bool:
+    """True for a whole rigid part of one of the shapes on a collider that is no mesh, by default options."""
+    plain = not o["clipping"] and (o["law"], o["treatment"]) == ("default", "implicit") and all(
+        o[name] is None for name in ("model", "stiffness", "radius", "points", "seam")
+    )  # fmt: skip
+    solid = isinstance(other, Collider) and not isinstance(other.shape, TriMesh)
+    return plain and solid and isinstance(thing, RigidBody) and isinstance(thing.shape, shapes)
 
 
 def make_contact(
@@ -150,6 +156,7 @@ def make_contact(
     surface = outer_surface(thing)
     default = f"{surface.body.name} on {collider.name}"
     name = unused_name(name, default, {c.name for c in d.contacts}, "contact")
+    kind = RollingContact if touches_without_facets(thing, collider, options, ROLLING_SHAPES) else Contact
     options |= default_model(thing, collider, options)
     options.pop("clipping")
     o = _checked_options(f"contact {name!r}", surface, dict(options))
@@ -169,7 +176,7 @@ def make_contact(
                 )
         o["index"] = len(d.contacts_of(FacetOptions))
         return ObstacleContact(surface=surface, collider=collider, name=name, **o)
-    return Contact(surface, collider, name, width=width, index=len(d.contacts_of(Contact)), **o)
+    return kind(surface, collider, name, width=width, index=len(d.contacts_of(Contact)), **o)
 
 
 def make_pair(

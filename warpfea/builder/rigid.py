@@ -14,7 +14,7 @@ from ..materials import SVK, Material
 from ..mesh import Mesh
 from ..mesh.cells import TET_FACES
 from ..model.rigid import RigidBody, surface_moments, volume_moments
-from ..model.shapes import Capsule, Cylinder, HalfSpace, Shape, Sphere
+from ..model.shapes import Capsule, Cylinder, HalfSpace, Shape, Sphere, flat_ends
 from ..model.triangle_mesh import TriMesh
 from .checks import vector
 
@@ -91,11 +91,7 @@ def _deviations(shape: Any, x: np.ndarray) -> np.ndarray:
     center, axes = shape.frame()
     radius, half, _ = shape.sizes
     local = (x - center) @ axes
-    flat = np.zeros(len(x), dtype=bool)
-    if isinstance(shape, Cylinder):
-        flat = np.all(np.abs(np.abs(local[..., 2]) - half) < 1e-9 * half, axis=1) & (
-            np.ptp(local[..., 2], axis=1) < half
-        )
+    flat = flat_ends(shape, x)
     thirds = np.array([[(2.0, 1.0), (1.0, 2.0)]]) / 3.0
     ends = np.stack([local[:, list(side)] for side in TRIANGLE_SIDES], axis=1)
     points = np.einsum("opn,tsnk->tspk", thirds, ends)

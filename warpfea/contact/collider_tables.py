@@ -19,6 +19,7 @@ from ..model import assembly
 from ..model.contact_points import ContactPoints
 from ..model.contacts import Collider, Contact
 from ..model.pairs import FacetOptions
+from ..model.rolling import RollingContact
 from ..model.shapes import HalfSpace, Shape
 from ..model.triangle_mesh import TriMesh
 from ..terms.time_law_table import TimeLawTable
@@ -53,6 +54,30 @@ class ContactTables(FacetTables[Contact]):
     def has_meshes(self) -> bool:
         """True if a collider is a triangle mesh."""
         return any(isinstance(collider.shape, TriMesh) for collider in self.colliders)
+
+    @property
+    def rolls(self) -> bool:
+        return any(isinstance(contact, RollingContact) for contact in self.contacts)
+
+    def _edge_rows(self, chosen: list[int]) -> dict[str, Any]:
+        begin = np.cumsum([0, *(len(self.host[k].conn) for k in chosen)])
+        rolling = [
+            {**self.contacts[k].rolling_rows(self.host[k]), "start": start}
+            for k, start in zip(chosen, begin)
+            if isinstance(self.contacts[k], RollingContact)
+        ]
+        if not rolling:
+            return {}
+        rows = np.concatenate([row["row"] + row["start"] for row in rolling])
+        edge_row, columns, p = np.full(begin[-1], -1), len(rows) * self.model.worlds, self.host[chosen[0]]
+        edge_row[rows] = np.arange(len(rows))
+        tables = {name: np.concatenate([row[name] for row in rolling]) for name in ("rolling_axis", "rolling_end")}
+        gradient = np.concatenate([row["rolling_gradient"] for row in rolling])
+        return {
+            "edge_rows": len(rows), "edge_row": edge_row, "edge_shape": np.zeros((*p.shape.shape[1:], columns)),
+            "edge_X": np.zeros((p.area.shape[1], columns, 3)), "rolling_axis": tables["rolling_axis"],
+            "rolling_end": tables["rolling_end"].T, "rolling_gradient": np.swapaxes(gradient, 0, 1),
+        }  # fmt: skip
 
     @property
     def geometry(self) -> str:

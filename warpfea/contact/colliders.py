@@ -16,6 +16,7 @@ from ..kernels.contact.collider_kinematics import MAX_COLLIDER_ROTATION, pose_ke
 from ..kernels.contact.collider_mesh import SIDE_TOLERANCE
 from ..kernels.contact.collider_sheets import sheet_kernels
 from ..kernels.contact.deepest_point import deepest_point_kernels
+from ..kernels.contact.rolling import rolling_kernels
 from ..kernels.contact.structs import collider_struct
 from ..model.contacts import Contact
 from ..model.state import State
@@ -54,6 +55,7 @@ class ColliderContact(ContactTerm, DifferentiableContact):
     Attributes:
         tables: contacts, colliders and facets on the device.
         deepest_kernels: device code of single-point contacts, see kernels/contact/deepest_point.py; None without.
+        rolling_kernels: the same of points that roll, see kernels/contact/rolling.py.
     """
 
     name = "contact"
@@ -68,6 +70,9 @@ class ColliderContact(ContactTerm, DifferentiableContact):
         self.deepest_kernels: Any = None
         if tables.has_single_point:
             self.deepest_kernels = deepest_point_kernels(model.dtype, tables.has_meshes)
+        self.rolling_kernels: Any = None
+        if tables.rolls:
+            self.rolling_kernels = rolling_kernels(model.dtype, tables.has_meshes, tables.seams is not None)
 
     @classmethod
     def features(cls, model: Model) -> dict[str, bool]:
@@ -94,8 +99,8 @@ class ColliderContact(ContactTerm, DifferentiableContact):
         other.deepest = make("deepest", (*shape, 6), wp.float64)
 
     def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
-        deepest = [self.deepest_kernels.module] if self.deepest_kernels else []
-        return [*super().modules(ctx), self.pose_kernels.module, *deepest]
+        own = [kernels.module for kernels in (self.deepest_kernels, self.rolling_kernels) if kernels]
+        return [*super().modules(ctx), self.pose_kernels.module, *own]
 
     def start(self, ctx: StepContext, active: wp.array) -> None:
         """Collider poses at the state's time, and initial overlaps.
@@ -172,6 +177,28 @@ class ColliderContact(ContactTerm, DifferentiableContact):
     def _find_other(self, ctx: StepContext, active: wp.array, *, fresh: int) -> None:
         if fresh:
             self._choose_deepest(ctx, active, fresh=1)
+        self._place_rolling(ctx, active)
+
+    def _find_accepted(self, ctx: StepContext, accepted: wp.array) -> None:
+        self._place_rolling(ctx, accepted)
+
+    def _place_rolling(self, ctx: StepContext, active: wp.array) -> None:
+        """Points that roll, at work.u."""
+        if self.rolling_kernels:
+            s = ctx.scratch[self.name]
+            self.place_rolling(ctx.launch, s, s["u"], (ctx.state.displacement, ctx.state.velocity), active)
+
+    def place_rolling(
+        self, launch: Launcher, s: dict[str, Any], u: wp.array, state: tuple[wp.array, wp.array], active: wp.array,
+        *, settled: int = 0,
+    ) -> None:  # fmt: skip
+        """Arguments as of `choose_deepest`."""
+        for group in self.tables.groups:
+            if group.data.edge_rows:
+                args = [self.tables.data, s["other"], group.data, s["history"], s["clock"], u, *state, active, settled]
+                launch(
+                    self.rolling_kernels.place_points, group.point_threads(self.model.worlds), [*args, s["attempt"]]
+                )
 
     def _choose_deepest(self, ctx: StepContext, active: wp.array, *, fresh: int) -> None:
         """Select the point of each single-point contact at work.u."""
@@ -304,7 +331,17 @@ class ColliderContact(ContactTerm, DifferentiableContact):
 
     def nodal_force(self, state: State) -> np.ndarray:
         """Elastic nodal forces of all contacts at a state, (worlds, slots, 3), N."""
-        return nodal_force(self.tables, self.at_points(state)[1])
+        force, rolling = self.at_points(state)[1], [group for group in self.tables.groups if group.data.edge_rows]
+        out = nodal_force(self.tables, force)
+        for group in rolling:  # on their circle, not on the axis
+            data, rows = group.data, np.flatnonzero(group.data.edge_row.numpy() >= 0)
+            arm = data.edge_shape.numpy().reshape(data.point_count, -1, len(out), len(rows))
+            arm = arm - data.shape.numpy()[:, :, None, rows]
+            last = data.first_point + group.count * data.point_count
+            at = force[:, data.first_point : last].reshape(len(out), group.count, -1, 3)[:, rows]
+            for world, at_slot in enumerate(np.einsum("plbr,brpk->brlk", arm, at)):
+                np.add.at(out[world], group.conn[rows], at_slot)
+        return out
 
     def poses(self, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
         """As of `Touching`; None without history."""

@@ -164,15 +164,17 @@ def evaluate_points(
     attempt = term.make_scratch(B, lambda _, shape, dtype: at.zeros(shape, dtype))
     attempt.approach_speed.fill_(1.0)
     kernels = collider_evaluation_kernels(m.dtype, t.has_meshes, t.seams is not None, t.own_laws)
+    clock, before = clock_struct()(), (state.displacement,) * 2
+    clock.time, clock.is_static = state.time, 1
+    s = {"history": history, "other": other, "attempt": attempt, "clock": clock}
+    if term.rolling_kernels:
+        term.place_rolling(launch, s, at.u, before, at.all_worlds, settled=1)
     for group in t.groups:
         args = [t.data, other, group.data, history, state.time, state.displacement, attempt]
         launch(kernels.points_at_state, group.point_threads(B), args)
     if term.deepest_kernels:
-        clock = clock_struct()()
-        clock.time, clock.is_static = state.time, 1
-        row_start = m.array("contact", t.row_start, wp.int32)
-        s = {"history": history, "other": other, "attempt": attempt, "clock": clock, "row_start": row_start}
-        before, changed = (state.displacement,) * 2, at.zeros((B,), wp.int32)
+        s["row_start"] = m.array("contact", t.row_start, wp.int32)
+        changed = at.zeros((B,), wp.int32)
         term.choose_deepest(launch, s, state.time, at.u, before, at.all_worlds, changed, fresh=1, settled=1)
     gap, normal = (at.zeros((B, t.points), wp.float64) for _ in range(2))
     force = at.zeros((B, t.points), wp.vec3d)

@@ -246,6 +246,11 @@ class FacetTables(Generic[AnyContact]):
         return any(group.data.tracks_deepest for group in self.groups)
 
     @property
+    def rolls(self) -> bool:
+        """True if points of round rigid parts roll."""
+        return False
+
+    @property
     def explicit(self) -> bool:
         """True if a contact uses the force of the last state."""
         return any(contact.treatment == "explicit" for contact in self.contacts)

@@ -137,7 +137,7 @@ class ContactTerm(Updated, Preconditioned, Parametrised, Diagnosed, Touching):
         """History struct with arrays from make(name, dtype, shape per world)."""
         out = history_struct()()
         for name, var in history_struct().vars.items():
-            if name != "previous_depth" or self.tables.tracks_deepest:
+            if name != "previous_depth" or self.tables.tracks_deepest or self.tables.rolls:
                 shape = () if name in ("overlap_time", "pose_time") else (self.tables.points,)
                 setattr(out, name, make(f"{self.name}_{name}", var.type.dtype, shape))
         return out

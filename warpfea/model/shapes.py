@@ -23,6 +23,7 @@ __all__ = [
     "HalfSpace",
     "Shape",
     "Sphere",
+    "flat_ends",
     "set_checked",
 ]
 
@@ -263,6 +264,15 @@ class Cylinder(_AxisShape):
         radius, half, _ = self.sizes
         profile = np.array([(0.0, -half), (radius, -half), (radius, half), (0.0, half)])
         return _surface_of_revolution(self, profile, _segments(self, resolution))
+
+
+def flat_ends(shape: Shape, x: np.ndarray) -> np.ndarray:
+    """(T,) True for triangles x (T, 3, 3) of the drawn shape, m, on the flat ends of a cylinder."""
+    if not isinstance(shape, Cylinder):
+        return np.zeros(len(x), dtype=bool)
+    center, axes = shape.frame()
+    half, z = shape.sizes[1], (x - center) @ axes[:, 2]
+    return np.asarray(np.all(np.abs(np.abs(z) - half) < 1e-9 * half, axis=1) & (np.ptp(z, axis=1) < half))
 
 
 # checks; each returns the stored value
