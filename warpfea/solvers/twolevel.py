@@ -18,16 +18,18 @@ where T holds inverses of whole bodies; else their rigid body modes are added (r
 
 An odd number of Chebyshev steps keeps C positive for any largest eigenvalue.
 
-With constraints, tiles and coarse matrices contain the penalties. As a constraint may couple slots of several tiles, (D
-+ (dq/dv) J^T rho J)^-1 by Woodbury's identity is added on the constrained slots.
+With constraints, tiles and coarse matrices contain the penalties. If a constraint couples slots of several tiles, (D +
+(dq/dv) J^T rho J)^-1 by Woodbury's identity is added on the constrained slots.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
+import numpy as np
 import warp as wp
 
 from ..base.launch import launch_part
@@ -116,14 +118,26 @@ class TwoLevel(Preconditioner):
         self.body_modes, self.mode_coupling_modules = self._make_body_modes()
         self.one_thread_per_row = 0 if model.device.is_cuda else 1
         self.solved_directly = first.is_dense or band is not None
-        deflates = not self.solved_directly and self.ctx.options.deflate_constraints
+        deflates = self.ctx.options.deflate_constraints and not (self.solved_directly or self._tiles_hold_constraints())
         self.corrections = self.terms.having(Constrained) if deflates else []
+        self.ctx.options = replace(self.ctx.options, deflate_constraints=deflates)
         self.cached_inputs: dict[str, CachedInputs] = {}
         # iteration counts are not comparable; separate key
         name = "preconditioner" if band is None else "preconditioner_banded"
         self.reuse = ReuseRule(model, work, launch, name, plan.rebuild_cost)
         most = max([level.slot_count for level in self.levels[1:]], default=1)
         self.all_free = wp.full(most, 1.0, dtype=model.types.vec3, device=model.device)
+
+    def _tiles_hold_constraints(self) -> bool:
+        """True if the free slots of each constraint lie in one tile, whose inverse contains its penalty (of one part)."""
+        tile, slot_table = self.levels[0].device_data.tile_of_slot.numpy(), self.model.slot_table
+        free = np.any(slot_table.free > 0.0, axis=1)
+        for term in self.terms.having(Constrained):
+            rows, slots, _ = term.incidence()
+            pairs = np.column_stack([rows, tile[slots]])[free[slots]]
+            if len(np.unique(pairs, axis=0)) > len(np.unique(pairs[:, 0])):
+                return False
+        return self.storage_dtype == self.model.dtype
 
     def _make_body_modes(self) -> tuple[RigidBodyModes | None, set[wp.Module]]:
         """Rigid body modes of bodies coupled by terms, and the term modules that they need."""
