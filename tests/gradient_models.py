@@ -73,7 +73,7 @@ def controls(kind, steps):
     ramp, rng = np.linspace(0.0, 1.0, steps)[:, None], np.random.default_rng(0)
     return {
         "motor": {"motor": 0.3 * ramp},
-        "loads": {"pull": 50.0 * rng.standard_normal((steps, 3)), "rod": np.hypot(0.04, 0.29) + 0.002 * ramp},
+        "loads": {"pull": 10.0 * rng.standard_normal((steps, 3)), "rod": np.hypot(0.04, 0.29) + 0.002 * ramp},
         "followers": {"pressure": 500.0 + 500.0 * ramp, "moment": 0.02 * rng.standard_normal((steps, 3))},
         "drives": {"shift": 0.01 * ramp * np.ones(3), "turn": 0.4 * ramp},
     }[kind]

@@ -129,23 +129,32 @@ def _discrete_gradient(dtype: str, second_invariant: bool) -> KernelSet:
         return change
 
     @wp.func
+    def stress_of(E: mat33, c: coef) -> mat33:
+        """S of a strain, Pa."""
+        return t.sym(inverse_cauchy_green(E) * cauchy_green_times_stress(E, c))
+
+    @wp.func
+    def stress_increment(E: mat33, dE: mat33, c: coef) -> mat33:
+        """dS of S(E) along dE, Pa."""
+        Ci = inverse_cauchy_green(E)
+        j1 = jacobian_minus_one(E)
+        Jm = wp.pow(T(1.0) + j1, -two_thirds)
+        change = isochoric.form_change(E, dE, j1, Jm, wp.ddot(Ci, dE), c)
+        return t.sym(Ci * (change - T(2.0) * dE * (Ci * cauchy_green_times_stress(E, c))))
+
+    @wp.func
     def mean_stress(G: mat33, D: mat33, c: coef) -> mat33:
         """The discrete gradient, Pa."""
         E = t.green_lagrange(G) + T(0.5) * wp.transpose(D) * D
         dE = T(2.0) * t.sym(D + wp.transpose(G) * D)
-        S = t.sym(inverse_cauchy_green(E) * cauchy_green_times_stress(E, c))
+        S = stress_of(E, c)
         rest = energy_change(E - T(0.5) * dE, T(2.0) * dE, c) - wp.ddot(S, dE)
         return S + (rest / (wp.ddot(dE, dE) + tiny)) * dE
 
     @wp.func
     def mean_increment(G: mat33, dE: mat33, c: coef) -> mat33:
         """dS of S(E) along dE at the strain of G, Pa."""
-        E = t.green_lagrange(G)
-        Ci = inverse_cauchy_green(E)
-        j1 = jacobian_minus_one(E)
-        Jm = wp.pow(T(1.0) + j1, -two_thirds)
-        change = isochoric.form_change(E, dE, j1, Jm, wp.ddot(Ci, dE), c)
-        return t.sym(Ci * (change - T(2.0) * dE * (Ci * cauchy_green_times_stress(E, c))))
+        return stress_increment(t.green_lagrange(G), dE, c)
 
     @wp.func
     def rest_moduli_increment(dE: mat33, c: coef) -> mat33:

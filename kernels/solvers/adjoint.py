@@ -56,7 +56,7 @@ def adjoint_kernels(dtype: str, constrained: bool) -> KernelSet:
             force = vec3d()
             for k in range(con.slot_start[slot], con.slot_start[slot + 1]):
                 term = con.slot_term[k]
-                force += (con.slot_weight[k] * mu[world, term / 3]) * mul.gradient[world, term]
+                force += (con.slot_weight[k] * mu[world, term / 3]) * mul.end_gradient[world, term]
             g += vec3(force)
         gradient[world, slot] = g
         s = f64(0.0)
@@ -119,6 +119,12 @@ def adjoint_kernels(dtype: str, constrained: bool) -> KernelSet:
         """out += x."""
         world, slot = wp.tid()
         out[world, slot] = out[world, slot] + x[world, slot]
+
+    @masked_kernel(module, "active")
+    def subtract_force(x: p.vec3_2d, dq_dv: double_1d, active: int_1d, out: p.vec3_2d):
+        """out -= x/(dq/dv)."""
+        world, slot = wp.tid()
+        out[world, slot] = out[world, slot] - T(f64(1.0) / dq_dv[world]) * x[world, slot]
 
     # derivatives by parameters: rows to be summed, and their sums
 

@@ -14,6 +14,7 @@ from ..kernels.elements.assumed_strain import assumed_strain_kernels
 from ..kernels.elements.assumed_strain_block import assumed_strain_struct
 from ..kernels.elements.element import element_kernels
 from ..kernels.elements.element_clusters import cluster_size
+from ..kernels.elements.exact_product import exact_product_kernel, tied_exact_product_kernel
 from ..kernels.elements.materials import DEFINED_FOR_ANY_J
 from ..kernels.elements.points import block_struct
 from ..kernels.elements.products import predicted_stress_product
@@ -94,6 +95,15 @@ class Block:
         if k.tying:
             return self.kernels.predicted_stress_product
         return predicted_stress_product(dtype, k.law, self.slots, k.affine, k.framed)
+
+    def exact_product(self, dtype: str, damping: str | None, midpoint: bool, dissipative: bool) -> wp.Kernel:
+        """Kernel of products with the exact tangent or its transpose, where `tangent_product` is not that."""
+        k = self.key
+        if k.tying:
+            kind = (self.slots, self.points, k.tying.width, midpoint, self.couplings_per_world, dissipative)
+            return tied_exact_product_kernel(dtype, *kind)
+        damping = tangent_damping(damping, midpoint=midpoint)
+        return exact_product_kernel(dtype, k.law, self.slots, k.affine, damping, k.framed, midpoint, dissipative)
 
     def with_mass_product(
         self, dtype: str, damping: str | None, midpoint: bool = False, dissipative: bool = False

@@ -158,7 +158,8 @@ class Adjoint:
         elements = self.stepper.newton.residual.elements
         ctx = self.stepper.ctx
         forms = ("incremental", "rate") if ctx.inertia and not ctx.midpoint else ()
-        return [kernel.module for form in forms for _, kernel in elements.history_kernels(form)]
+        own = [kernel for form in forms for _, kernel in elements.history_kernels(form)]
+        return [kernel.module for kernel in own + elements.exact_kernels(ctx)]
 
     # what is differentiated by
 
@@ -434,7 +435,7 @@ class Adjoint:
 def check_simulation(sim: Any, static: bool) -> None:
     """ModelError for a simulation whose steps have no adjoint; `static`: of the result of `solve_static`."""
     scheme = sim.integrator
-    if scheme.midpoint or scheme.accelerated:
+    if scheme.accelerated:
         raise ModelError(f"Adjoint: integrator {scheme.name!r} has no adjoint; take 'backward_euler' or 'bdf2'")
     if scheme.static != static:
         raise ModelError("Adjoint: of statics it takes the result of solve_static")

@@ -49,13 +49,22 @@ class ExactOperator:
             self.product_terms = with_fields(product_terms_struct(m.dtype), residual.product_terms, **table)
         self.kernels = gather_kernels(m.dtype, traits._replace(tangent=traits.nonpotential))
 
-    def product(self, p: wp.array, out: wp.array, active: wp.array, topology: Any = None) -> None:
-        """out = H p, on the free components of a topology, by default those of the model."""
+        self.without_mass = with_fields(product_terms_struct(m.dtype), self.product_terms)
+        self.without_mass.mass_factor = wp.zeros(m.worlds, dtype=wp.float64, device=m.device)
+
+    def product(
+        self, p: wp.array, out: wp.array, active: wp.array, topology: Any = None, *, start: bool = False
+    ) -> None:  # fmt: skip
+        """out = H p, on the free components of a topology, by default those of the model.
+
+        `start`: (dq/dv) K p with the derivative K of the forces of a mid-point scheme by the start of the step.
+        """
         ctx = self.ctx
         m, w, launch = ctx.model, ctx.work, ctx.launch
         for term in m.terms.having(Differentiable):
-            term.exact_product(ctx, p, active, transposed=self.transposed)
-        args = [topology or m.topology, w.contribution, self.product_terms, p, active, self.constraint_data]
+            term.exact_product(ctx, p, active, transposed=self.transposed, start=start)
+        terms = self.without_mass if start else self.product_terms
+        args = [topology or m.topology, w.contribution, terms, p, active, self.constraint_data]
         size = (m.worlds, launch.padded(m.slots))
         launch(self.kernels.operator_product, size, [*args, w.multipliers, out, w.warp_rows])
 
@@ -107,6 +116,7 @@ class AdjointSolver:
         self.control.tol = tol
         self.dim = (m.worlds, m.slots)
         self.scale = w.array("adjoint scale", (m.worlds,), wp.float64)
+        self.ones = wp.ones(m.worlds, dtype=wp.float64, device=m.device)
         self.active = wp.zeros(m.worlds, dtype=wp.int32, device=m.device)
         # prescribed components too: products give their reactions
         unprescribed: wp.array = wp.zeros(m.slots, dtype=wp.uint8, device=m.device)
@@ -149,6 +159,9 @@ class AdjointSolver:
         launch(k.note_residual, m.worlds, [self.control, active])
         args = [step, m.topology, self.driven, self.w, w.gradient, active, *self.state_bars, self.drive_bar]
         launch(self.step_kernels.step_back, self.dim, args)
+        if self.newton.ctx.midpoint:
+            self.operator.product(self.w, w.Hp, active, self.topology, start=True)
+            launch(k.subtract_force, self.dim, [w.Hp, step.dq_dv, active, self.q_bar])
 
     def history_fields(self) -> Iterator[tuple[str, wp.array, wp.array]]:
         """State arrays in the strain rates of incremental damping, each with x and scale of `history_gradient`."""

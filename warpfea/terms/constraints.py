@@ -21,7 +21,8 @@ from ..kernels.solvers.deflation import deflation_kernels
 from ..kernels.solvers.newton_control import TERM_ROWS
 from ..kernels.solvers.reuse import reuse_kernels
 from ..kernels.terms.constraint_blocks import constraint_block_kernels
-from ..kernels.terms.constraints import JOINT_COLUMNS, constraint_kernels, multiplier_struct
+from ..kernels.terms.constraint_products import exact_product_kernel
+from ..kernels.terms.constraints import ANGLE, JOINT_COLUMNS, constraint_kernels, multiplier_struct
 from ..kernels.terms.joint_angles import joint_angle_kernels
 from ..kernels.terms.velocity_rows import velocity_kernels
 from ..model import assembly
@@ -312,6 +313,26 @@ class Constraints(Constrained, Updated, Tied, Preconditioned, Differentiable):
             (m.worlds, launch.padded(m.slots)),
             [*args, z if into is None else into, w.warp_rows],
         )
+
+    def not_differentiable(self, ctx: StepContext) -> str | None:
+        data = self.tables.data
+        if ctx.midpoint and (self.tables.formulas or self.tables.has_velocity_rows):
+            return "formulas and velocity rows with 'energy_momentum'"
+        turned = ((data.kind.numpy() == ANGLE) & (data.law.numpy() >= 0)).any()
+        return "driven angles with 'energy_momentum'" if ctx.midpoint and turned else None
+
+    def is_symmetric(self, ctx: StepContext) -> bool:
+        return not ctx.midpoint
+
+    def exact_product(
+        self, ctx: StepContext, p: wp.array, active: wp.array, *, transposed: bool, start: bool = False
+    ) -> None:  # fmt: skip
+        if not ctx.midpoint:
+            return self.product(ctx, p, active)
+        w = ctx.work
+        args = [self.tables.data, w.multipliers, w.u, w.u_stage, p, w.step.dq_dv, int(start), int(transposed), active]
+        ctx.launch(exact_product_kernel(self.model.dtype), self.dim, args)
+        return None
 
     def law_gradient(self, ctx: StepContext, law: int) -> Gradient | None:
         def add(at: StepAdjoint, out: wp.array) -> None:

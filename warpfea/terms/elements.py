@@ -125,11 +125,28 @@ class Elements(Differentiable):
     # adjoint
 
     def not_differentiable(self, ctx: StepContext) -> str | None:
-        forms = {b.key.damping for b in self.model.blocks} - {"incremental", None} if ctx.inertia else set()
+        forms = {b.key.damping for b in self.model.blocks} & {"explicit"} if ctx.inertia else set()
         return f"damping of the form {forms.pop()!r}" if forms else None
 
-    def exact_product(self, ctx: StepContext, p: wp.array, active: wp.array, *, transposed: bool) -> None:
-        self.tangent(ctx, p, active)
+    def exact_product(
+        self, ctx: StepContext, p: wp.array, active: wp.array, *, transposed: bool, start: bool = False
+    ) -> None:  # fmt: skip
+        kernels = self.exact_kernels(ctx)
+        if not kernels:
+            self.tangent(ctx, p, active)
+        for block, kernel in zip(self.model.blocks, kernels):
+            args = [ctx.work.data_of(block), ctx.work.stage, int(start), int(transposed), active, p]
+            ctx.launch(kernel, (p.shape[0], block.count), [*args, ctx.work.contribution])
+
+    def is_symmetric(self, ctx: StepContext) -> bool:
+        rate = ctx.inertia and any(block.key.damping == "rate" for block in self.model.blocks)
+        return not (ctx.midpoint or rate)
+
+    def exact_kernels(self, ctx: StepContext) -> list[wp.Kernel]:
+        """Kernels `exact_product` of the blocks; none where `tangent` is exact and symmetric."""
+        kind = ctx.midpoint, ctx.dissipation > 0.0
+        blocks = [] if self.is_symmetric(ctx) else self.model.blocks
+        return [block.exact_product(self.model.dtype, block.key.damping, *kind) for block in blocks]
 
     def gradients(self, ctx: StepContext) -> Mapping[str, Callable[[], Gradient]]:
         return material_gradients(ctx, self)
@@ -153,6 +170,9 @@ class Elements(Differentiable):
             for name, x, scale in at.history_fields():
                 self._history_force(at, found, x, scale, at.w, transposed=1)
                 at.add_to(name, at.scratch)
+        if found := self.history_kernels("rate"):
+            self._history_force(at, found, at.ctx.work.u, at.ones, at.w, transposed=1)
+            at.add_predictor_bar(at.scratch, at.active)
 
     def _history_force(
         self, at: StepAdjoint, found: list[Any], x: wp.array, scale: wp.array, direction: wp.array, transposed: int

@@ -107,7 +107,9 @@ class FollowerLoads(Preconditioned, Differentiable):
         """Symmetric tangent of the force times p."""
         self._tangent(ctx, p, active, SYMMETRIC)
 
-    def exact_product(self, ctx: StepContext, p: wp.array, active: wp.array, *, transposed: bool) -> None:
+    def exact_product(
+        self, ctx: StepContext, p: wp.array, active: wp.array, *, transposed: bool, start: bool = False
+    ) -> None:  # fmt: skip
         self._tangent(ctx, p, active, (0.0, 2.0) if transposed else (2.0, 0.0))
 
     def _tangent(self, ctx: StepContext, p: wp.array, active: wp.array, factors: tuple[float, float]) -> None:

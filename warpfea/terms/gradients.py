@@ -172,7 +172,7 @@ def constant_gradient(ctx: StepContext, elements: Any, members: list[Any], name:
     passes += [[(block, {"coupling": _coupling_derivative(m, block, members, name)}) for block in tied]] if tied else []
     dot_terms = vector_kernels(m.dtype, m.terms.traits.has_constraints).dot_terms
     launches = [
-        [(block, kernels[id(block)], _block_data(m.dtype, block, changes)) for block, changes in row] for row in passes
+        [(block, kernels[id(block)], _block_data(ctx, block, changes)) for block, changes in row] for row in passes
     ]
 
     def add(at: StepAdjoint, out: wp.array) -> None:
@@ -193,9 +193,9 @@ def _shifted(material: Any, name: str) -> Any:
     return material.with_constants({name: material.constants[name] + 1j * STEP})
 
 
-def _block_data(dtype: str, block: Any, changes: dict[str, Any]) -> Any:
-    kind = (assumed_strain_struct if block.key.tying else block_struct)(dtype)
-    return with_fields(kind, block.data, **changes)
+def _block_data(ctx: StepContext, block: Any, changes: dict[str, Any]) -> Any:
+    kind = assumed_strain_struct if block.key.tying else block_struct
+    return with_fields(kind(ctx.model.dtype, ctx.dissipation > 0.0), ctx.work.data_of(block), **changes)
 
 
 def _coupling_derivative(m: Model, block: Any, members: list[Any], name: str) -> wp.array:

@@ -278,11 +278,17 @@ class Differentiable(Term):
         """Feature of it without an adjoint, or None."""
         return None
 
-    def exact_product(self, ctx: StepContext, p: wp.array, active: wp.array, *, transposed: bool) -> None:
+    def exact_product(
+        self, ctx: StepContext, p: wp.array, active: wp.array, *, transposed: bool, start: bool = False
+    ) -> None:  # fmt: skip
         """`product` of the exact derivative of the force, or of its transpose, into the same array.
 
         The default is for terms whose `product` is exact and symmetric. Others override `is_symmetric` too; those
         without a `product` then write it as if they had one.
+
+        Args:
+            start: of mid-point schemes, the derivative by the displacements at the start of the step, those at its end
+                fixed. The default is for forces of the mid-point alone.
         """
         self.product(ctx, p, active)
 
