@@ -200,8 +200,9 @@ def test_features_of_contact_without_an_adjoint_are_refused_by_name():
         b = wf.ModelBuilder()
         box = b.add_solid(wf.mesh.box((0.1, 0.1, 0.1), cells=(1, 1, 1), element="T4"), material=LAW)
         b.add_contact(box, b.add_collider(wf.HalfSpace((0, 0, 1), -1.0)), restitution=0.5, **options)
+        ctx = SimpleNamespace(inertia=inertia, midpoint=False, u_before=None, state=SimpleNamespace(displacement=None))
         with pytest.raises(wf.ModelError, match=match):
-            check_terms(b.finalize(device="cpu"), SimpleNamespace(inertia=inertia, midpoint=False))
+            check_terms(b.finalize(device="cpu"), ctx)
 
     refused("'contact' has no adjoint for contacts of model='sphere'", model="sphere", radius=0.1)
     refused("friction in statics", inertia=False, mu=0.3)

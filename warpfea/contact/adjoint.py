@@ -150,6 +150,8 @@ class DifferentiableContact(Differentiable):
 
     def not_differentiable(self, ctx: StepContext) -> str | None:
         t = self.tables
+        if ctx.midpoint or ctx.u_before is not ctx.state.displacement:
+            return "an integrator but 'backward_euler'"
         if t.has_single_point:
             return "contacts of model='sphere'"
         if t.explicit:
@@ -250,7 +252,9 @@ class DifferentiableContact(Differentiable):
     # in a step back
 
     @part()
-    def exact_product(self, ctx: StepContext, p: wp.array, active: wp.array, *, transposed: bool) -> None:
+    def exact_product(
+        self, ctx: StepContext, p: wp.array, active: wp.array, *, transposed: bool, start: bool = False
+    ) -> None:  # fmt: skip
         a, B = self.adjoint(ctx), self.model.worlds
         attempt, lanes = a.scratch["attempt"], ctx.launch.lanes(POINT_SUM_LANES)
         for group in self.tables.groups:
