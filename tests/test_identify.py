@@ -20,6 +20,16 @@ def test_the_committed_search_finds_both(device, worlds):
     assert row["time_s"] > 0.0
 
 
+def test_gradients_find_both_in_few_motions():
+    """The misfit of 65 536 motions, and without noise the constants."""
+    noisy, exact = content_of("identify_gradients_cpu.json")["rows"]
+    assert noisy["misfit"] <= 0.009276
+    assert max(noisy["runs"], noisy["backward_runs"]) <= 30
+    assert max(exact["runs"], exact["backward_runs"]) <= 30
+    assert max(exact["E_error"], exact["eta_error"]) < 1e-6
+    assert (noisy["noise"], exact["noise"]) == (NOISE_RATIO, 0.0)
+
+
 def test_a_small_search_gets_near():
     found = identify(record_tip("cpu"), device="cpu", worlds=8, generations=3)
     assert (found.runs, found.unknowns) == (24, 216)

@@ -411,7 +411,7 @@ def test_a_script_without_a_main_guard_is_told(tmp_path):
 
 
 def test_fit_finds_a_modulus():
-    """Both methods, from a record of the scene itself."""
+    """All methods, from a record of the scene itself."""
     model = sweep_models.bar(E=3e5).finalize(device="cpu")
     sim = wf.Simulation(model, dt=5e-3, integrator="bdf2")
     sim.run(t_end=0.05)
@@ -420,6 +420,11 @@ def test_fit_finds_a_modulus():
     ranges = {"bar.E": {"low": 1e5, "high": 1e6, "log": True}}
     local = wf.fit(sweep_models.bar, ranges, record, method="least_squares", run={"device": "cpu"})
     assert local.values["bar.E"] == pytest.approx(3e5, rel=1e-6)
+    led = wf.fit(sweep_models.bar, ranges, record, method="L-BFGS-B", run={"device": "cpu"})
+    assert led.values["bar.E"] == pytest.approx(3e5, rel=1e-6)
+    assert led.runs == led.backward_runs < 15
+    with pytest.raises(wf.ModelError, match="'E' is a parameter of the scene"):
+        wf.fit(sweep_models.bar, {"E": (1e5, 1e6)}, record, method="L-BFGS-B", run={"device": "cpu"})
     search = wf.fit(sweep_models.bar, ranges, record, worlds=16, generations=4, run={"device": "cpu"})
     assert search.values["bar.E"] == pytest.approx(3e5, rel=0.05)
     assert search.runs == 64

@@ -200,6 +200,7 @@ def add_study(commands: Any) -> None:
         one,
         ("--device", None, None, "cpu, cuda:0, ..."),
         ("--worlds", positive_integer, "N", "candidates at a time (default 64)"),
+        ("--gradients", Kind.FLAG, None, "from a poor start by gradients, with and without noise"),
         ("--quick", Kind.FLAG, None, "a trial: few and small rows, no result"),
         ("--out", None, "PATH", "JSON with command, machine, settings and rows"),
     )

@@ -60,7 +60,7 @@ def rollout(
     if len(lengths) != 1:
         raise ModelError(f"rollout: the number of steps is not clear from the controls: {sorted(lengths)}; give steps=")
     (count,) = lengths
-    shapes = {name: (m.worlds, count, sim.controls[name].shape[1]) for name in controls}
+    shapes: dict[str, tuple[int, ...]] = {name: (m.worlds, count, sim.controls[name].shape[1]) for name in controls}
     shapes |= {name: (m.worlds, 3) if name == "gravity" else (m.worlds,) for name in parameters}
     shapes |= {name: (m.worlds, m.slots, 3) for name in start}
     try:
@@ -72,7 +72,7 @@ def rollout(
     tape = tapes.get((*names, tol)) or tapes.setdefault((*names, tol), Adjoint(sim, names, tol=tol))
 
     def run(names: list[str], tensors: Sequence[Any]) -> None:
-        values = {name: wp.from_torch(x.detach().contiguous()) for name, x in zip(names, tensors)}
+        values: dict[str, Any] = {name: wp.from_torch(x.detach().contiguous()) for name, x in zip(names, tensors)}
         for name in parameters:
             m.set_parameter(name, values[name])
         _reset(sim, state if isinstance(state, State) else None, {name: values[name] for name in start})
@@ -111,7 +111,9 @@ def _function() -> Any:
     """The autograd.Function of a rollout; defined here, so that torch is imported on use."""
     torch = _torch()
 
-    class Rollout(torch.autograd.Function):
+    base: Any = torch.autograd.Function
+
+    class Rollout(base):
         @staticmethod
         def forward(ctx, tape, run, given, names, probes, *tensors):
             run(given, tensors)

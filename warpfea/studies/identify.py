@@ -3,9 +3,12 @@
 A finger of rubber, 0.12 x 0.02 x 0.02 m of T10, is clamped at one end and let go under gravity; its tip is recorded for
 0.24 s with noise of 1 % of the largest deflection. The record comes from a run of four times as many steps with E and
 eta that the search does not know. scipy's differential evolution looks for both, a generation at a time: each candidate
-is a world of one model (`wf.fit`). The misfit is the mean square of the differences of all samples.
+is a world of one model (`wf.fit`). The misfit is the mean square of the differences of all samples. With `--gradients`
+L-BFGS-B looks for both from a poor start, by the gradient of one motion at a time, of that record and of one without
+noise or finer steps, which it must find exactly.
 
-tests/results/identify_cpu.json and identify_h200.json, with 4096 worlds, are the committed results.
+tests/results/identify_cpu.json, identify_h200.json, with 4096 worlds, and identify_gradients_cpu.json are the committed
+results.
 """
 
 import argparse
@@ -30,6 +33,9 @@ NOISE_RATIO = 0.01
 DT, T_END = 2e-3, 0.24
 RECORD_REFINEMENT = 4
 GENERATIONS, WORLDS = 16, 64
+POOR_START = {"finger.E": 3e6, "finger.eta": 3e4}
+GRADIENT_TOL = 1e-9
+"""Tolerance of the steps of a gradient."""
 
 
 @wf.scene(dt=DT, t_end=T_END, integrator="bdf2", tol=1e-6)
@@ -43,17 +49,19 @@ def finger() -> wf.ModelBuilder:
     return b
 
 
-def record_tip(device: Any, t_end: float = T_END, seed: int = 7) -> np.ndarray:
-    """The tip's deflection (steps, 3), m, every `DT`, of the true constants, with noise."""
+def record_tip(
+    device: Any, t_end: float = T_END, seed: int = 7, *, noise: float = NOISE_RATIO,
+    refinement: int = RECORD_REFINEMENT, tol: float = 1e-6,
+) -> np.ndarray:  # fmt: skip
+    """The tip's deflection (steps, 3), m, every `DT`, of the true constants, with noise over the largest."""
     model = finger().finalize(device=device)
     for name, value in TRUE_CONSTANTS.items():
         model.set_parameter(f"finger.{name}", value)
-    how: dict[str, Any] = {"integrator": finger.integrator, "solver": wf.NewtonPCG(tol=finger.tol), "ledger": False}
-    sim = wf.Simulation(model, dt=DT / RECORD_REFINEMENT, **how)
-    sim.step(RECORD_REFINEMENT * round(t_end / DT))
-    samples = sim.probe("tip").displacement[0, RECORD_REFINEMENT - 1 :: RECORD_REFINEMENT]
-    noise = np.random.default_rng(seed).normal(size=samples.shape)
-    return samples + NOISE_RATIO * np.abs(samples).max() * noise
+    how: dict[str, Any] = {"integrator": finger.integrator, "solver": wf.NewtonPCG(tol=tol), "ledger": False}
+    sim = wf.Simulation(model, dt=DT / refinement, **how)
+    sim.step(refinement * round(t_end / DT))
+    samples = sim.probe("tip").displacement[0, refinement - 1 :: refinement]
+    return samples + noise * np.abs(samples).max() * np.random.default_rng(seed).normal(size=samples.shape)
 
 
 @dataclass(frozen=True)
@@ -63,7 +71,8 @@ class Identification:
     Attributes:
         E, eta: Pa, Pa s; E_error, eta_error: over the truth.
         misfit: root of the mean square of the differences, over the largest deflection.
-        runs: motions of a world; time_s: of the search, without compilation.
+        runs: motions of a world; backward_runs: ways back through one, of gradients.
+        time_s: of the search, without compilation.
     """
 
     device: str
@@ -78,14 +87,19 @@ class Identification:
     eta_error: float
     misfit: float
     runs: int
+    backward_runs: int
     setup_s: float
     time_s: float
 
 
 def identify(
-    samples: np.ndarray, *, device: Any, worlds: int = WORLDS, generations: int = GENERATIONS, seed: int = 1
-) -> Identification:
-    """Look for E and eta that give the recorded deflections (steps, 3), m; the worlds are the candidates."""
+    samples: np.ndarray, *, device: Any, worlds: int = WORLDS, generations: int = GENERATIONS, seed: int = 1,
+    gradients: bool = False, noise: float = NOISE_RATIO,
+) -> Identification:  # fmt: skip
+    """Look for E and eta that give the recorded deflections (steps, 3), m.
+
+    The worlds are the candidates, or `gradients` lead from `POOR_START`.
+    """
     times = DT * np.arange(1, len(samples) + 1)
     record = {f"probe.tip.displacement.{axis}": (times, column) for axis, column in zip("xyz", samples.T)}
     ranges = {f"finger.{name}": {"low": a, "high": b, "log": True} for name, (a, b) in SEARCH_BOUNDS.items()}
@@ -93,16 +107,21 @@ def identify(
     began = clock.perf_counter()
     one = {text: (time[:1], column[:1]) for text, (time, column) in record.items()}
     wf.fit(finger, ranges, one, worlds=2, generations=1, run=run | {"t_end": DT})  # compiles
+    how: dict[str, Any] = {"worlds": worlds, "generations": generations, "seed": seed}
+    if gradients:
+        worlds, generations, run = 1, 0, run | {"tol": GRADIENT_TOL}
+        how = {"method": "L-BFGS-B", "start": POOR_START}
+        wf.fit(finger, ranges, one, **how, run=run | {"t_end": DT})  # compiles
     ready = clock.perf_counter()
-    found = wf.fit(finger, ranges, record, worlds=worlds, generations=generations, seed=seed, run=run)
+    found = wf.fit(finger, ranges, record, **how, run=run)
     values = {name: found.values[f"finger.{name}"] for name in TRUE_CONSTANTS}
     errors = {f"{name}_error": abs(value / TRUE_CONSTANTS[name] - 1.0) for name, value in values.items()}
     model = finger().finalize(device=device)
     return Identification(
         device=str(model.device), worlds=worlds, generations=generations, steps=len(samples),
-        unknowns=model.info()["unknowns"], noise=NOISE_RATIO, **values, **errors,
-        misfit=found.misfit / np.abs(samples).max(), runs=found.runs, setup_s=ready - began,
-        time_s=clock.perf_counter() - ready,
+        unknowns=model.info()["unknowns"], noise=noise, **values, **errors,
+        misfit=found.misfit / np.abs(samples).max(), runs=found.runs,
+        backward_runs=found.backward_runs, setup_s=ready - began, time_s=clock.perf_counter() - ready,
     )  # fmt: skip
 
 
@@ -111,12 +130,20 @@ def run(options: argparse.Namespace) -> None:
     if options.out is not None:
         check_target(options.out, (".json",))
     device = find_device(options.device)
-    given = {"worlds": options.worlds or WORLDS, "generations": 3 if options.quick else GENERATIONS}
-    settings = {**given, "truth": TRUE_CONSTANTS, "bounds": SEARCH_BOUNDS, "noise": NOISE_RATIO}
+    given: dict[str, Any] = {"worlds": options.worlds or WORLDS, "generations": 3 if options.quick else GENERATIONS}
+    if options.gradients:
+        given = {}
+    settings = {"start": POOR_START, "tol": GRADIENT_TOL} if options.gradients else dict(given)
+    settings |= {"truth": TRUE_CONSTANTS, "bounds": SEARCH_BOUNDS, "noise": NOISE_RATIO}
     settings |= {"dt": DT, "t_end": T_END}
     with quiet_warp():
         content = {"schema": 1, **provenance_of(options.words, device), "settings": settings}
-        found = asdict(identify(record_tip(device), device=device, **given))
-    print("  ".join(f"{k} {format_number(v) if isinstance(v, float) else v}" for k, v in found.items()), flush=True)
+        found = [identify(record_tip(device), device=device, gradients=options.gradients, **given)]
+        if options.gradients:
+            exact = record_tip(device, noise=0.0, refinement=1, tol=GRADIENT_TOL)
+            found.append(identify(exact, device=device, gradients=True, noise=0.0))
+    rows = [asdict(each) for each in found]
+    for row in rows:
+        print("  ".join(f"{k} {format_number(v) if isinstance(v, float) else v}" for k, v in row.items()), flush=True)
     if options.out is not None:
-        write_json(options.out, to_json(content | {"rows": [found]}))
+        write_json(options.out, to_json(content | {"rows": rows}))

@@ -15,16 +15,15 @@ from ..base.errors import ConvergenceError, ModelError
 from ..base.names import check_choice
 from ..builder.scene import Scene, locate
 from .design import as_range, check_keys
-from .measures import RECORDS, Measure, parse_measures
+from .gradient_fit import DifferentiableCandidate
+from .measures import RECORDS, parse_measures
 from .worker import FAILED_WORLD, Group, Study
 
 __all__ = ["Fit", "fit"]
 
-METHODS = ("differential_evolution", "least_squares")
+METHODS = ("differential_evolution", "least_squares", "L-BFGS-B")
 DIFFERENCE = 1e-4
 """Step of the differences of least_squares, over the ranges of the parameters."""
-REFUSED = 1e15
-"""Residual of a candidate whose run is refused."""
 SAME_TIME = 1e-6
 """Largest distance of a time of the record from a step, over dt."""
 
@@ -36,12 +35,14 @@ class Fit:
     Attributes:
         values: by parameter. misfit: root of the mean square of the residuals.
         residuals: (samples,) of the record, simulation less record over sigma. runs: of the scene in the search.
+        backward_runs: ways back through a run for derivatives.
     """
 
     values: dict[str, float]
     misfit: float
     residuals: np.ndarray
     runs: int
+    backward_runs: int = 0
 
 
 def fit(
@@ -65,30 +66,40 @@ def fit(
             candidates of one model; each value of a parameter of the scene is another model.
         record: (times, values) or (times, values, sigma) by text, such as "probe.tip.displacement.z"; times are those
             of steps, s, of statics load fractions.
-        method: "differential_evolution", of `worlds` candidates over `generations`, or "least_squares" from `start`
-            (default: the middle of the ranges), with differences over worlds.
+        method: "differential_evolution", of `worlds` candidates over `generations`; or from `start` (default: the
+            middle of the ranges) "least_squares", with differences over worlds, or "L-BFGS-B", with gradients by
+            `wf.Adjoint` of components of probes by parameters of the model.
         fixed: parameters of the scene. run: as of `sweep`. seed: of differential_evolution.
         progress: show a bar of the runs; None: if stderr is a terminal.
 
     Raises:
-        ModelError: an unknown name, an empty range, or a time between steps.
+        ModelError: an unknown name, an empty range, a time between steps, or what has no gradient.
         ConvergenceError: the start, or every candidate, is refused.
     """
     check_choice("method", method, METHODS)
     candidates = Candidates(scene, parameters, record, dict(fixed or {}), dict(run or {}))
+    backward_runs = 0
     with progress_bar("fit", "run", None, progress) as candidates.bar:
-        if method == "least_squares":
+        if method == "L-BFGS-B":
+            first = candidates.first_point(start or {})
+            one = DifferentiableCandidate(candidates, first)
+            point = one.search(first)
+            candidates.runs, backward_runs = one.runs, one.backward_runs
+        elif method == "least_squares":
             point = candidates.search_locally(start or {})
         else:
             point = candidates.search_globally(worlds, generations, seed)
         runs, residuals = candidates.runs, candidates.residuals(point[:, None])[0]
     candidates.require("the best candidate", point)
     values = {name: float(column[0]) for name, column in candidates.values(point[:, None]).items()}
-    return Fit(values, float(np.sqrt(np.mean(residuals**2))), residuals, runs)
+    return Fit(values, float(np.sqrt(np.mean(residuals**2))), residuals, runs, backward_runs)
 
 
 class Candidates:
     """Candidates of a fit: points between 0 and 1 of the ranges, and their residuals."""
+
+    refused_residual = 1e15
+    """Residual of a candidate whose run is refused."""
 
     def __init__(self, scene: Any, parameters: Any, record: Any, fixed: dict[str, Any], run: dict[str, Any]) -> None:
         self.scene = locate(scene) if isinstance(scene, str) else scene
@@ -138,23 +149,28 @@ class Candidates:
             self.refused[members] = failed = sim.status == FAILED_WORLD
             if failed.all():  # its records end early
                 continue
-            out[members] = np.hstack([self._difference(text, curve, sim) for text, curve in self.curves.items()])
+            curves = [self.difference(text, c.times(sim)[0], c.series(sim)) for text, c in self.curves.items()]
+            out[members] = np.hstack(curves)
             self.refused[members] |= ~np.isfinite(out[members]).all(axis=1)
-        out[self.refused] = REFUSED
+        out[self.refused] = self.refused_residual
         self.runs += points.shape[1]
         self.least = min(self.least, float((out**2).mean(axis=1).min()) ** 0.5)
         self.bar.set_postfix_str(f"misfit {self.least:.3g}", refresh=False)
         self.bar.update(points.shape[1])
         return out
 
-    def _difference(self, text: str, curve: Measure, sim: Any) -> np.ndarray:
-        """(worlds, samples) simulation less record, over sigma. ModelError for times between steps."""
+    def place(self, text: str, steps: np.ndarray) -> tuple[np.ndarray, Any]:
+        """Indices of the steps of the samples, and sigma. ModelError for times between steps."""
         times, values, *sigma = self.samples[text]
-        steps = curve.times(sim)[0]
         at = np.abs(steps[:, None] - times).argmin(axis=0)
         if times.shape != values.shape or np.abs(steps[at] - times).max() > SAME_TIME * np.diff(steps).min(initial=1.0):
             raise ModelError(f"record.{text}: needs as many times as values, at ends of steps, up to {steps[-1]:g} s")
-        return (curve.series(sim)[:, at] - values) / (sigma[0] if sigma else 1.0)
+        return at, sigma[0] if sigma else 1.0
+
+    def difference(self, text: str, steps: np.ndarray, series: np.ndarray) -> np.ndarray:
+        """(worlds, samples) simulation less record, over sigma."""
+        at, sigma = self.place(text, steps)
+        return (series[:, at] - self.samples[text][1]) / sigma
 
     def search_globally(self, worlds: int, generations: int, seed: int) -> np.ndarray:
         """Best point of differential evolution."""
@@ -171,11 +187,23 @@ class Candidates:
         )  # fmt: skip
         return np.asarray(found.x)
 
+    def first_point(self, start: Mapping[str, float]) -> np.ndarray:
+        """Point of a start; the middle of the ranges of others."""
+        first = np.full(len(self.ranges), 0.5)
+        check_keys("start", start, self.ranges)
+        for k, (name, axis) in enumerate(self.ranges.items()):
+            if name in start:
+                if not axis["low"] <= start[name] <= axis["high"]:
+                    raise ModelError(
+                        f"start.{name} = {start[name]!r} is not in its range, {axis['low']} to {axis['high']}"
+                    )
+                low, at, high = (math.log(v) if axis["log"] else v for v in (axis["low"], start[name], axis["high"]))
+                first[k] = (at - low) / (high - low)
+        return first
+
     def search_locally(self, start: Mapping[str, float]) -> np.ndarray:
         """Best point of least squares."""
         from scipy.optimize import least_squares
-
-        size = len(self.ranges)
 
         def jacobian(x: np.ndarray) -> np.ndarray:
             step = np.where(x < 0.5, DIFFERENCE, -DIFFERENCE)
@@ -186,16 +214,7 @@ class Candidates:
                 self.require("both neighbours of a candidate", x)
             return ((rows[1:] - rows[0]) / step[:, None]).T
 
-        first = np.full(size, 0.5)
-        check_keys("start", start, self.ranges)
-        for k, (name, axis) in enumerate(self.ranges.items()):
-            if name in start:
-                if not axis["low"] <= start[name] <= axis["high"]:
-                    raise ModelError(
-                        f"start.{name} = {start[name]!r} is not in its range, {axis['low']} to {axis['high']}"
-                    )
-                low, at, high = (math.log(v) if axis["log"] else v for v in (axis["low"], start[name], axis["high"]))
-                first[k] = (at - low) / (high - low)
+        first = self.first_point(start)
         self.residuals(first[:, None])
         self.require("the start", first)
         found = least_squares(lambda x: self.residuals(x[:, None])[0], first, jac=jacobian, bounds=(0, 1), gtol=None)

@@ -254,21 +254,29 @@ class Group:
 
     def simulate(self, model: Any, columns: Columns, *, on_failure: str = "raise", outputs: Sequence[Any] = ()) -> Any:
         """The finished simulation of worlds with the values of the columns."""
-        run = {k: v for k, v in self.study.run.items() if k not in ("device", "dtype", "static", "t_end")}
-        state, controls = set_values(model, columns)
         if self.study.run.get("static"):
+            state, controls = set_values(model, columns)
             if controls:
                 raise ModelError(f"{next(iter(controls))}: controls have their initial values in statics")
-            return wf.solve_static(model, state=state, outputs=outputs, **run).simulation
-        scene = self.scene
+            return wf.solve_static(model, state=state, outputs=outputs, **self._options()).simulation
+        sim = self.start(model, columns, on_failure=on_failure)
+        sim.run(self.study.run.get("t_end", self.scene.t_end), outputs=outputs, progress=False)
+        return sim
+
+    def start(self, model: Any, columns: Columns, *, on_failure: str = "raise") -> Any:
+        """The simulation of worlds with the values of the columns, at its start."""
+        state, controls = set_values(model, columns)
+        scene, run = self.scene, self._options()
         solver, tol = run.pop("solver", "newton-pcg"), run.pop("tol", scene.tol)
         run = {"dt": scene.dt, "integrator": scene.integrator, "solver": solver_of(solver, tol)} | run
         record = bool(self.study.series) or any(measure.over_time for measure in self.study.measures.values())
         sim = wf.Simulation(model, state, record=record, on_failure=on_failure, on_compile=_silent, **run)
         for name, values in controls.items():
             sim.controls[name] = values
-        sim.run(self.study.run.get("t_end", scene.t_end), outputs=outputs, progress=False)
         return sim
+
+    def _options(self) -> dict[str, Any]:
+        return {k: v for k, v in self.study.run.items() if k not in ("device", "dtype", "static", "t_end")}
 
 
 def _silent(done: int, total: int, name: str) -> None:
