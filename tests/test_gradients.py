@@ -8,7 +8,7 @@ import numpy as np
 import parameter_models as models
 import pytest
 import warp as wp
-from gradient_models import LAW, SOLVER, TARGET, best_differences, controls, linked, shifts
+from gradient_models import LAW, SOLVER, SPRINGS, TARGET, best_differences, controls, linked, shifts
 
 import warpfea as wf
 from warpfea.simulation.adjoint import check_simulation, check_terms
@@ -344,3 +344,26 @@ def test_a_run_without_gradients_has_nothing_of_them():
     assert isinstance(tape.probe("tip").velocity.grad, wp.array)
     again = [tape.backward()["body.E"].numpy() for _ in range(2)]
     assert np.array_equal(*again)
+
+
+@pytest.mark.parametrize("integrator", ["backward_euler", pytest.param("bdf2", marks=pytest.mark.slow)])
+def test_gradients_of_springs_and_actuators(integrator):
+    """Of joints, an unsaturated controller and one at its limit, a stop that holds, a rod and a foundation."""
+    steps, given, first = 6, controls("springs", 6), integrator == "backward_euler"
+    springs = {name: value for name, value in SPRINGS.items() if first or not name.startswith("knee")}
+    rows = shifts(len(springs) + len(given))
+    m = linked("springs" if first else "springs without a stop", len(rows))
+    for k, (name, value) in enumerate(springs.items()):
+        m.set_parameter(name, value * (1.0 + rows[:, k]))
+    sim = wf.Simulation(m, dt=2e-3, integrator=integrator, solver=SOLVER, constraint_tol=1e-12)
+    tape = wf.Adjoint(sim, [*springs, *given])
+    for step in range(steps):
+        for k, (name, values) in enumerate(given.items(), start=len(springs)):
+            sim.controls[name][:] = values[step] * (1.0 + rows[:, k : k + 1])
+        tape.run(1)
+    loss = wf.loss.sum_of_squares(tape.probe("tip").displacement, np.full((1, steps, 3), TARGET))
+    g = {name: array.numpy() for name, array in tape.backward(loss).items()}
+    exact = [g[name][0] * value for name, value in springs.items()]
+    exact += [np.sum(g[name][0] * values) for name, values in given.items()]
+    errors = dict(zip([*springs, *given], best_differences(loss.numpy(), exact)))
+    assert max(errors.values()) < TOLERANCE, errors

@@ -202,6 +202,24 @@ def spring_kernels(
             return f64(0.0)
         return law_value[world, spr.schedule[sp]][0]
 
+    @wp.func
+    def force_along(
+        spr: Springs, law_value: vec3d_2d, in_motion: f64, inverse: f64, V: mat33d, y: f64, world: int, item: int,
+        scr: Scratch,
+    ) -> vec3d:  # fmt: skip
+        """Force along y of an item, its derivative, and the potential; its size into the rows."""
+        sp, y0 = spr.spring[item], scr.start[world, item]
+        if wp.static(bounded):
+            if spr.law[sp] < 0:
+                value, anchor = scheduled(spr, law_value, world, sp), scr.anchor[world, item]
+                reference, turns = scr.reference[world, item], scr.turns[world, item]
+                out = more.bounded_force(spr, world, sp, turns, y0, y, reference, inverse, anchor, value)
+                # round-off of an angle is that of 1 rad, of a travel that of its vectors
+                size = wp.where(spr.kind[item] == ANGLE, f64(1.0), wp.length(V[0]) * wp.length(V[1])) + wp.abs(y)
+                scr.rows[2, world, item] = wp.abs(out[2]) + wp.abs(out[0]) * size
+                return out
+        return unbounded(spr, world, item, y0, y, inverse, in_motion, scr)
+
     @masked_kernel(module, "active")
     def evaluate(
         spr: Springs, u: p.vec3_2d, start: p.vec3_2d, law_value: vec3d_2d, in_motion: f64, dq_dv: double_1d,
@@ -216,7 +234,6 @@ def spring_kernels(
         if kind == VECTOR or kind == CHORD:
             evaluate_vector(spr, u, start, inverse, world, item, scr)
             return
-        sp = spr.spring[item]
         V = spr.reference[item] + vectors(spr, u, world, item)
         y0 = scr.start[world, item]
         y = c.coordinate(kind, V, y0)
@@ -224,21 +241,7 @@ def spring_kernels(
             d = c.mean_derivatives(kind, spr.reference[item] + vectors(spr, start, world, item), V, y0, y)
         else:
             d = c.derivatives(kind, V, y)
-        spring = vec3d()
-        if wp.static(bounded):
-            if spr.law[sp] < 0:
-                value, anchor = scheduled(spr, law_value, world, sp), scr.anchor[world, item]
-                reference = scr.reference[world, item]
-                turns = scr.turns[world, item]
-                out = more.bounded_force(spr, world, sp, turns, y0, y, reference, inverse, anchor, value)
-                # round-off of an angle is that of 1 rad, of a travel that of its vectors
-                size = wp.where(kind == ANGLE, f64(1.0), wp.length(V[0]) * wp.length(V[1])) + wp.abs(y)
-                scr.rows[2, world, item] = wp.abs(out[2]) + wp.abs(out[0]) * size
-                spring = out
-            else:
-                spring = unbounded(spr, world, item, y0, y, inverse, in_motion, scr)
-        else:
-            spring = unbounded(spr, world, item, y0, y, inverse, in_motion, scr)
+        spring = force_along(spr, law_value, in_motion, inverse, V, y, world, item, scr)
         scr.rows[0, world, item] = spring[2]
         scr.rows[1, world, item] = spring[2]
         store_force(kind, spr.first_block[item], d, spring[0], spring[1], world, item, scr)

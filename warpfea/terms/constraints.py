@@ -100,7 +100,8 @@ class Constraints(Constrained, Updated, Tied, Preconditioned, Differentiable):
         shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("gradient", "end_gradient", "product"), (B, 3 * M))
         shapes |= {
             "curvature": (B, 9 * M),
-            "violation": (B, self.model.components.count), "stiffest": (B, self.model.components.count),
+            "violation": (B, self.model.components.count),
+            "stiffest": (B, self.model.components.count),
             "compliance_block": (B, max(con.block_count, 1)),
             "inverse_matrix": (B, con.matrix_entries),
             "coupling": (B, max(con.coupling_count, 1)),

@@ -7,7 +7,7 @@ constants that users give are those of a complex step through the code of the ma
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
+from ..base.console import quiet_warp
+from ..base.launch import load_modules
 from ..kernels.common.structs import topology_struct
 from ..kernels.elements.assumed_strain_block import assumed_strain_struct
 from ..kernels.elements.materials import NCOEF
@@ -29,7 +31,7 @@ if TYPE_CHECKING:
     from ..model.model import Model
     from .term import StepContext
 
-__all__ = ["Gradient", "StepAdjoint", "law_weights", "material_gradients", "with_fields"]
+__all__ = ["Gradient", "StepAdjoint", "compile_kernels", "law_weights", "material_gradients", "with_fields"]
 
 STEP = 1e-30
 """Complex step: derivatives are exact to round-off for any small one."""
@@ -92,6 +94,12 @@ class StepAdjoint:
 
 Gradient = Callable[[StepAdjoint, wp.array], None]
 """Adds the derivatives of a step to an array [world, k], float64."""
+
+
+def compile_kernels(model: Model, kernels: Iterable[wp.Kernel]) -> None:
+    """Compile kernels before launches are captured."""
+    with quiet_warp():
+        load_modules({kernel.module.name: kernel.module for kernel in kernels}, model.device, None)
 
 
 def with_fields(kind: Any, data: Any, **changes: Any) -> Any:

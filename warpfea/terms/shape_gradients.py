@@ -6,21 +6,19 @@ the sizes of ANCF elements (`Discretisation.frames`) stay.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 
-from ..base.console import quiet_warp
 from ..base.errors import ModelError
-from ..base.launch import load_modules
 from ..kernels.elements.points import block_struct
 from ..kernels.elements.shape_gradient import shape_gradient_kernel, tied_shape_gradient_kernel, tied_shape_struct
 from ..kernels.terms.shape_gradients import shape_kernels
 from ..model import assembly
 from ..model.masses import has_constant_density
-from .gradients import Gradient, StepAdjoint, with_fields
+from .gradients import Gradient, StepAdjoint, compile_kernels, with_fields
 
 if TYPE_CHECKING:
     from ..model.blocks import Block
@@ -54,7 +52,7 @@ class MeshGradient:
             self.makers += found
         self.makers += m.terms.supports.shape_gradients()
         self.kernels = shape_kernels(m.dtype)
-        load(m, [self.kernels.probe_shape])
+        compile_kernels(m, [self.kernels.probe_shape])
         self.reference: wp.array = wp.array(np.tile(m.slot_table.reference, (m.worlds, 1, 1)), dtype=m.types.vec3,
                                             device=m.device)  # fmt: skip
         self.all_worlds = wp.ones(m.worlds, dtype=wp.int32, device=m.device)
@@ -98,12 +96,6 @@ class MeshGradient:
         return self._of_probes[given.name]
 
 
-def load(m: Model, kernels: Iterable[wp.Kernel]) -> None:
-    """Compile kernels before launches are captured."""
-    with quiet_warp():
-        load_modules({kernel.module.name: kernel.module for kernel in kernels}, m.device, None)
-
-
 def not_shaped(ctx: StepContext) -> str:
     """Feature of the elements without a derivative by their reference, or ""."""
     m = ctx.model
@@ -132,7 +124,7 @@ def internal_force_gradient(ctx: StepContext) -> Gradient:
             damping = key.damping if ctx.inertia else None
             kind = (key.law, block.slots, key.affine, damping, key.framed)
             launches.append((block, shape_gradient_kernel(dtype, *kind), None))
-    load(m, [kernel for _, kernel, _ in launches])
+    compile_kernels(m, [kernel for _, kernel, _ in launches])
 
     def add(at: StepAdjoint, out: wp.array) -> None:
         w, u_n, step = at.ctx.work, at.ctx.state.displacement, at.ctx.work.step
@@ -200,7 +192,7 @@ def mass_gradient(ctx: StepContext) -> Gradient:
         if block.key.part == 0:  # one part of the energy represents the element
             launches.append((block, *_mass_tables(m, block)))
     loads = m.terms.dead_loads
-    load(m, [kernels.mass_shape])
+    compile_kernels(m, [kernels.mass_shape])
 
     def add(at: StepAdjoint, out: wp.array) -> None:
         w, step = at.ctx.work, at.ctx.work.step
@@ -250,7 +242,7 @@ def traction_gradient(ctx: StepContext, tractions: list[tuple[SurfaceSet, int]])
         i, j, change = surface_weight_gradients(surface)
         parts.append((i + surface.body.slot_offset, j + surface.body.slot_offset, change, np.full(len(i), law)))
     tables = by_slot(m, *(np.concatenate(column) for column in zip(*parts)))
-    load(m, [kernel])
+    compile_kernels(m, [kernel])
 
     def add(at: StepAdjoint, out: wp.array) -> None:
         args = [*tables, at.ctx.work.time_law_stage_values, at.w, at.active, out]

@@ -23,6 +23,7 @@ from ..kernels.terms.springs import ANGLE, CHORD, LENGTH, TRAVEL, VECTOR, scratc
 from ..model.assembly import grouped_items
 from ..model.springs import MAX_FRICTION, SampledForce, Spring, coordinate_gradients
 from .protocols import Diagnosed, Impacting, Parametrised, Preconditioned, Tied
+from .spring_gradients import DifferentiableSprings
 from .term import LOSS, NUMERICAL, STORED, WORK, Column, StepContext, part
 from .time_law_table import TimeLawTable
 
@@ -44,7 +45,7 @@ BLOCKS = {LENGTH: 1, VECTOR: 1, CHORD: 1, TRAVEL: 4, ANGLE: 9}
 """Blocks of the tangent by coordinate."""
 
 
-class Springs(Tied, Preconditioned, Parametrised, Impacting, Diagnosed):
+class Springs(Tied, Preconditioned, Parametrised, Impacting, Diagnosed, DifferentiableSprings):
     """Springs of a model: a potential and a viscous force of each coordinate.
 
     Attributes:
@@ -57,6 +58,7 @@ class Springs(Tied, Preconditioned, Parametrised, Impacting, Diagnosed):
     columns = (  # the work of actuators also counts among that of internal forces, where nothing stores it
         Column("springs", STORED), Column("spring_loss", LOSS), Column("actuators", WORK), Column("", NUMERICAL)
     )  # fmt: skip
+    device_fields = DEVICE_FIELDS
     parts = {"springs": "springs, dampers, actuators, stops"}
 
     def __init__(self, model: Model) -> None:
@@ -273,7 +275,7 @@ class Springs(Tied, Preconditioned, Parametrised, Impacting, Diagnosed):
         args += [*self._history(ctx), active, ctx.scratch[self.name][0]]
         ctx.launch(self.kernels(ctx).begin, self.dim, args)
 
-    def _start(self, ctx: StepContext) -> tuple[wp.array, list[Any]]:
+    def start_of_step(self, ctx: StepContext) -> tuple[wp.array, list[Any]]:
         """Positions from which a VECTOR has its rate; values of time laws, 0 in statics, and dq/dv."""
         start, w = ctx.state.displacement if ctx.midpoint else ctx.work.q_tilde, ctx.work
         return start, [w.time_law_stage_values, float(ctx.inertia), w.step.dq_dv]
@@ -281,7 +283,7 @@ class Springs(Tied, Preconditioned, Parametrised, Impacting, Diagnosed):
     @part("springs")
     def force(self, ctx: StepContext, active: wp.array) -> None:
         w, k, (scratch, _) = ctx.work, self.kernels(ctx), ctx.scratch[self.name]
-        start, step = self._start(ctx)
+        start, step = self.start_of_step(ctx)
         ctx.launch(k.evaluate, self.dim, [self.data, w.u, start, *step, active, scratch])
         self._scatter(ctx, scratch.force, active, w.pool_force)
 
@@ -305,7 +307,7 @@ class Springs(Tied, Preconditioned, Parametrised, Impacting, Diagnosed):
     @part("springs")
     def energy_increments(self, ctx: StepContext, accepted: wp.array) -> wp.array:
         scratch, rows = ctx.scratch[self.name]
-        start, step = self._start(ctx)
+        start, step = self.start_of_step(ctx)
         args = [self.data, ctx.work.u, start, ctx.state.displacement, *step, accepted, scratch, rows]
         ctx.launch(self.kernels(ctx).energies, self.dim, args)
         return rows

@@ -1,0 +1,149 @@
+"""Adjoint of springs: bars of the start of a step that rates take, derivatives by parameters and targets."""
+
+import functools
+
+import warp as wp
+
+from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
+from ..common.structs import topology_struct
+from ..common.types import double_1d, double_2d, f64, int_1d, mat33d, precision, vec3d, vec3d_2d
+from .bounded_laws import bounded_functions
+from .spring_coordinates import CHORD, VECTOR, coordinate_functions
+from .spring_laws import OwnForces, law_functions, spring_struct
+from .springs import mat33d_2d, scratch_struct, spring_kernels
+
+__all__ = ["parameter_struct", "spring_gradient_kernels"]
+
+STEP = 1e-5
+"""Step of central differences by a parameter, over its size or 1: forces are linear in nearly all, between their kinks,
+and round-off is 1e-11 of the force."""
+
+
+@functools.cache
+def parameter_struct():
+    """A parameter of a spring."""
+
+    @wp.struct
+    class Parameter:
+        column: wp.int32  # of its array: the spring
+        law: wp.int32  # time law that it is in place of the array, or -1
+        first: wp.int32  # items of the spring
+        last: wp.int32
+        in_motion: wp.float64  # 1, or 0 in statics
+
+    return Parameter
+
+
+@functools.cache
+def spring_gradient_kernels(
+    dtype: str, own: OwnForces = (), bounded: bool = False, has_chords: bool = False
+) -> KernelSet:
+    """Kernels of springs at the end of a step; arguments as those of `spring_kernels`."""
+    p = precision(dtype)
+    Springs, Scratch, Topology = spring_struct(), scratch_struct(), topology_struct(dtype)
+    k, law, c = spring_kernels(dtype, False, own, bounded, has_chords), law_functions(own), coordinate_functions(False)
+    more, Parameter = bounded_functions(False), parameter_struct()
+    module = kernel_module(f"{k.module.name.rpartition('.')[2]}_gradients")
+
+    @wp.func
+    def force_slope(
+        spr: Springs, law_value: vec3d_2d, inverse: f64, y: f64, by: wp.vec2d, world: int, item: int, scr: Scratch
+    ) -> f64:  # fmt: skip
+        """Derivative of the force by y~ and the anchor of friction, along `by`."""
+        sp, reference, turns = spr.spring[item], scr.reference[world, item], scr.turns[world, item]
+        if wp.static(bounded):
+            if spr.law[sp] < 0:
+                value, total = k.scheduled(spr, law_value, world, sp), f64(0.0)
+                y0, anchor = scr.start[world, item], scr.anchor[world, item]
+                for side in range(2):
+                    step = f64(STEP) * f64(1 - 2 * side)
+                    out = more.bounded_force(
+                        spr, world, sp, turns, y0, y, reference + step * by[0], inverse, anchor + step * by[1], value
+                    )
+                    total += out[0] / (f64(2.0) * step)
+                return total
+        return -by[0] * inverse * law.viscous_force(spr, world, sp, y + turns, (y - reference) * inverse)[2]
+
+    @masked_kernel(module, "active")
+    def rate_bars(
+        spr: Springs, u: p.vec3_2d, past: p.vec3_2d, law_value: vec3d_2d, factor: double_1d, sign: f64,
+        dq_dv: double_1d, w: p.vec3_2d, active: int_1d, scr: Scratch, out: mat33d_2d,
+    ):  # fmt: skip
+        """Bars of the vectors at a past displacement, of which y~ has the coordinate times a signed factor; of a VECTOR
+        those of q~."""
+        world, item = wp.tid()
+        kind, sp = spr.kind[item], spr.spring[item]
+        inverse = f64(1.0) / dq_dv[world]
+        D = k.vectors(spr, w, world, item)
+        if kind == VECTOR:
+            out[world, item] = (spr.scale[item] * spr.damping[world, sp] * inverse) * D
+            return
+        out[world, item] = mat33d()
+        if kind == CHORD or factor[world] == f64(0.0):
+            return
+        V = spr.reference[item] + k.vectors(spr, u, world, item)
+        y0 = scr.start[world, item]
+        y = c.coordinate(kind, V, y0)
+        slope = force_slope(spr, law_value, inverse, y, wp.vec2d(f64(1.0), f64(0.0)), world, item, scr)
+        bar = -sign * factor[world] * slope * wp.ddot(c.derivatives(kind, V, y).g, D)
+        before = spr.reference[item] + k.vectors(spr, past, world, item)
+        out[world, item] = bar * c.derivatives(kind, before, c.coordinate(kind, before, y0)).g
+
+    @masked_kernel(module, "active")
+    def sum_entries(
+        topo: Topology, spr: Springs, offset: int, of_item: mat33d_2d, kind: int, active: int_1d, out: p.vec3_2d
+    ):
+        """Vectors of the items with their weights at a slot; `kind`: 1 for those of a VECTOR, 0 for the others."""
+        world, slot = wp.tid()
+        total = vec3d()
+        for n in range(topo.pool_start[slot], topo.pool_start[slot + 1]):
+            entry = topo.pool_entry[n] - offset
+            if entry >= 0 and entry < spr.entry_slot.shape[0]:
+                item = spr.entry_item[entry]
+                if wp.where(spr.kind[item] == VECTOR, 1, 0) == kind:
+                    total += spr.entry_weight[entry] * of_item[world, item]
+        out[world, slot] = p.vec3(total)
+
+    @wp.func
+    def power(
+        spr: Springs, u: p.vec3_2d, start: p.vec3_2d, law_value: vec3d_2d, in_motion: f64, dq_dv: f64, w: p.vec3_2d,
+        world: int, item: int, scr: Scratch,
+    ) -> f64:  # fmt: skip
+        """w.f of an item."""
+        kind = spr.kind[item]
+        inverse, D = in_motion / dq_dv, k.vectors(spr, w, world, item)
+        if kind == VECTOR or kind == CHORD:
+            k.evaluate_vector(spr, u, start, inverse, world, item, scr)
+            return wp.ddot(scr.force[world, item], D)
+        V = spr.reference[item] + k.vectors(spr, u, world, item)
+        y = c.coordinate(kind, V, scr.start[world, item])
+        out = k.force_along(spr, law_value, in_motion, inverse, V, y, world, item, scr)
+        return out[0] * wp.ddot(c.derivatives(kind, V, y).g, D)
+
+    @masked_kernel(module, "active")
+    def parameter_gradient(
+        spr: Springs, u: p.vec3_2d, start: p.vec3_2d, law_value: vec3d_2d, dq_dv: double_1d, parameter: double_2d,
+        chosen: Parameter, w: p.vec3_2d, active: int_1d, scr: Scratch, sums: double_2d,
+    ):  # fmt: skip
+        """w.df/dparameter of the items of a spring; an infinite one has no derivative: 0."""
+        world = wp.tid()
+        value = parameter[world, chosen.column]
+        if chosen.law >= 0:
+            value = law_value[world, chosen.law][0]
+        total, width = f64(0.0), f64(1.0)
+        if wp.isfinite(value):
+            step = f64(STEP) * wp.max(wp.abs(value), f64(1.0))
+            width = (value + step) - (value - step)
+            for side in range(3):
+                shifted = value + step * f64(wp.where(side == 2, 0, 1 - 2 * side))
+                if chosen.law >= 0:
+                    law_value[world, chosen.law] = vec3d(shifted, f64(0.0), f64(0.0))
+                else:
+                    parameter[world, chosen.column] = shifted
+                if side < 2:
+                    for item in range(chosen.first, chosen.last):
+                        part = power(spr, u, start, law_value, chosen.in_motion, dq_dv[world], w, world, item, scr)
+                        total += part * f64(1 - 2 * side)
+        sums[0, world] = total / width
+
+    return kernel_set(locals())
