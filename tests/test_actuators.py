@@ -205,6 +205,19 @@ def test_friction_sticks_and_slips() -> None:
     assert abs(e["integrator"][0]) < 1e-9
 
 
+def test_a_shorter_stick_leads_to_coulombs_place() -> None:
+    """On a spring a slide turns round where it leaves 2 F/k of its swing, until k x < F: off by less than the stick."""
+    force, k, speed = 1.0, 50.0, 0.9
+    place = np.hypot(force / k, speed * np.sqrt(2.0 / k)) - force / k
+    while k * abs(place) > force:
+        place = -np.sign(place) * (abs(place) - 2.0 * force / k)
+    for stick in (1e-2, 1e-5):
+        b, slide = slider(speed, friction=wf.Friction(force, stick=stick), stiffness=k)
+        sim = wf.Simulation(b.finalize(device="cpu"), dt=2e-3, integrator="bdf2")
+        sim.run(3.5)
+        assert abs(sim.joint_value(slide)[0] - place) < stick + 1.5e-5, (stick, sim.joint_value(slide), place)
+
+
 def test_undriven_angles_count_turns() -> None:
     b, _, hinge = rotor(20.0, stiffness=0.25, damping=0.0)
     sim = run(b, 5e-3)
@@ -353,6 +366,7 @@ def test_bad_input_is_named() -> None:
         (lambda: wf.PD(-1.0), "kp = -1.0"),
         (lambda: wf.PD(1.0, kd=np.nan), "kd = nan"),
         (lambda: wf.PD(1.0, limit=0.0), "limit = 0.0"),
+        (lambda: wf.Friction(1.0, stick=0.0), "wf.Friction: stick = 0.0 must be a positive number, rad or m"),
         (lambda: b.add_actuator(ball, 1.0), "spherical joint has no angle"),
         (lambda: b.add_actuator("hing", 1.0), "no joint of this builder"),
         (lambda: b.add_actuator(driven, 1.0), "is driven"),

@@ -26,7 +26,7 @@ from .base.errors import (  # noqa: E402
     StabilityWarning,
 )
 from .base.version import __version__  # noqa: E402
-from .builder.actuators import PD, Stop  # noqa: E402
+from .builder.actuators import PD, Friction, Stop  # noqa: E402
 from .builder.beams import spline  # noqa: E402
 from .builder.builder import ModelBuilder  # noqa: E402
 from .builder.joints import GROUND  # noqa: E402
@@ -61,7 +61,7 @@ from .time_laws import Control, Rotation  # noqa: E402
 __all__ = [
     "GROUND", "PD", "SVK", "Adjoint", "Body", "Box", "Buckling", "CapacityError", "Capsule", "Checkpoint",
     "CheckpointError", "Circle", "ConstraintError", "Control", "ConvergenceError", "Cylinder", "Design", "ElementSet",
-    "EnergyMomentum", "Error", "GIFWriter", "GeneralizedAlpha", "HTMLWriter", "HalfSpace", "Jacobi", "Joint",
+    "EnergyMomentum", "Error", "Friction", "GIFWriter", "GeneralizedAlpha", "HTMLWriter", "HalfSpace", "Jacobi", "Joint",
     "KelvinVoigt", "MaterialPoint", "MeshError", "MeshWarning", "Model", "ModelBuilder", "ModelError", "ModelWarning",
     "Modes", "MooneyRivlin", "NeoHookean", "NewtonPCG", "NodeSet", "Observations", "OutputError", "PNGWriter",
     "PenetrationError", "Rectangle", "Reference", "Rotation", "Section", "Simulation", "Sphere", "StabilityError",

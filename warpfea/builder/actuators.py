@@ -20,10 +20,8 @@ from ..model.masses import body_mass
 from ..model.springs import MAX_FRICTION, Spring, coordinate_gradients, joint_coordinate
 from ..time_laws import TimeLaw, time_law
 
-__all__ = ["PD", "Stop", "joint_springs", "make_actuator"]
+__all__ = ["PD", "Friction", "Stop", "joint_springs", "make_actuator"]
 
-STICK = 1e-4
-"""Deflection at which a joint with friction slips, rad or m."""
 STOP_PERIOD = 1e-2
 """Period of the vibration of a joint's bodies on a stop without a given stiffness, s."""
 ACTUATED_KINDS = ("revolute", "translational", "cylindrical")
@@ -87,6 +85,29 @@ class Stop:
             raise ModelError("wf.Stop: stiffness = 0 stops nothing; leave it out for the default")
 
 
+@dataclass(frozen=True)
+class Friction:
+    """Coulomb friction of a joint, whose stick is a spring.
+
+    Args:
+        limit: largest torque or force, N m or N.
+        stick: deflection at which it slips, rad or m: below the angles or travels of interest.
+
+    Raises:
+        ModelError: a negative limit or one beyond any load, or a stick that is not positive.
+    """
+
+    limit: float
+    stick: float = 1e-4
+
+    def __post_init__(self) -> None:
+        _not_negative("wf.Friction", "friction", self.limit)
+        if self.limit > MAX_FRICTION:
+            raise ModelError(f"wf.Friction: friction = {self.limit!r} is too large; a fixed joint holds at any load")
+        if not (is_number(self.stick) and self.stick > 0.0):
+            raise ModelError(f"wf.Friction: stick = {self.stick!r} must be a positive number, rad or m")
+
+
 def _not_negative(what: str, name: str, value: Any) -> None:
     if not (is_number(value) and value >= 0.0):
         raise ModelError(f"{what}: {name} = {value!r} must be a finite number, 0 or more")
@@ -119,13 +140,12 @@ def joint_springs(joint: Joint, limits: Any, friction: Any, stiffness: Any, damp
     if limits is not None:
         out.append(_stop_spring(what, joint, limits))
     if friction is not None:
-        _not_negative(what, "friction", friction)
-        if friction > MAX_FRICTION:
-            raise ModelError(f"{what}: friction = {friction!r} is too large; a fixed joint holds at any load")
+        friction = friction if isinstance(friction, Friction) else Friction(friction)
+        limit, stick = float(friction.limit), float(friction.stick)
         kind, vectors = _coordinate(what, joint)
         keys = {f"{joint.name}.friction": "max_force"}
-        spring = Spring(f"{joint.name}.friction", kind, [vectors], float(friction) / STICK, between=joint.between)
-        out.append(replace(spring, law=FRICTION, max_force=float(friction), stick=STICK, keys=keys))
+        spring = Spring(f"{joint.name}.friction", kind, [vectors], limit / stick, between=joint.between)
+        out.append(replace(spring, law=FRICTION, max_force=limit, stick=stick, keys=keys))
     if stiffness is not None or damping is not None:
         k, c = stiffness or 0.0, damping or 0.0
         keys = {f"{joint.name}.{key}": key for key in ("stiffness", "damping")}

@@ -302,7 +302,7 @@ class ModelBuilder(ContactMethods, SpringMethods, VelocityMethods):
 
     def add_joint(
         self, kind: str, *, parent: Any, child: Any, anchor: Any = None, axis: Any = None, axis2: Any = None,
-        drive: Any = None, limits: Any = None, friction: float | None = None, stiffness: float | None = None,
+        drive: Any = None, limits: Any = None, friction: Any = None, stiffness: float | None = None,
         damping: float | None = None, name: str | None = None,
     ) -> Joint:  # fmt: skip
         """Connect two bodies, or a body and the ground, by a joint.
@@ -323,7 +323,7 @@ class ModelBuilder(ContactMethods, SpringMethods, VelocityMethods):
             limits: (lower, upper) or a wf.Stop: stops of the angle (turns are counted), or the travel of translational
                 and cylindrical joints; one side may be infinite.
             friction: largest torque (N m) or force (N) of Coulomb friction, which sticks by a spring that slips at
-                1e-4 rad or m.
+                1e-4 rad or m, or a wf.Friction with another stick.
             stiffness, damping: N m/rad and N m s/rad, or N/m and N s/m, of a spring at rest in the reference.
             name: unique name, also for set_parameter("NAME.friction"), "NAME.stiffness", "NAME.lower", ...
 
