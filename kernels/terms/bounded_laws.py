@@ -35,23 +35,23 @@ def bounded_functions(midpoint: bool) -> KernelSet:
     Springs = spring_struct()
 
     @wp.func
-    def penetration(spr: Springs, world: int, sp: int, whole: f64, y: f64) -> f64:
+    def penetration(spr: Springs, world: int, sp: int, winding: f64, y: f64) -> f64:
         """Distance beyond the upper bound, or minus that beyond the lower."""
-        over = wp.max(y - (spr.upper_end[world, sp] - whole), f64(0.0))
-        return over + wp.min(y - (spr.lower_end[world, sp] - whole), f64(0.0))
+        over = wp.max(y - (spr.upper_end[world, sp] - winding), f64(0.0))
+        return over + wp.min(y - (spr.lower_end[world, sp] - winding), f64(0.0))
 
     @wp.func
     def stop_force(
-        spr: Springs, world: int, sp: int, whole: f64, y0: f64, y: f64, reference: f64, inverse: f64
+        spr: Springs, world: int, sp: int, winding: f64, y0: f64, y: f64, reference: f64, inverse: f64
     ) -> wp.vec3d:  # fmt: skip
         """Force of a stop, its derivative, and its potential."""
         k, c = spr.stiffness[world, sp], spr.damping[world, sp] * inverse
-        p = penetration(spr, world, sp, whole, y)
+        p = penetration(spr, world, sp, winding, y)
         side = p
         elastic_force = k * p
         slope = f64(k)
         if wp.static(midpoint):
-            p0 = penetration(spr, world, sp, whole, y0)
+            p0 = penetration(spr, world, sp, winding, y0)
             elastic_force = f64(0.5) * k * (p0 + p)
             slope = f64(0.5) * k
             if p * p0 <= f64(0.0) and p != p0:
@@ -59,7 +59,7 @@ def bounded_functions(midpoint: bool) -> KernelSet:
                 slope = (k * p - elastic_force) / (y - y0)
             if p == f64(0.0):
                 side = p0
-        before = penetration(spr, world, sp, whole, reference)
+        before = penetration(spr, world, sp, winding, reference)
         if before * side < f64(0.0):
             before = f64(0.0)
         force = elastic_force + c * (p - before)
@@ -71,17 +71,17 @@ def bounded_functions(midpoint: bool) -> KernelSet:
 
     @wp.func
     def bounded_force(
-        spr: Springs, world: int, sp: int, whole: f64, y0: f64, y: f64, reference: f64, inverse: f64, anchor: f64,
+        spr: Springs, world: int, sp: int, winding: f64, y0: f64, y: f64, reference: f64, inverse: f64, anchor: f64,
         value: f64,
     ) -> wp.vec3d:  # fmt: skip
         """Force, its derivative by y, and its potential, whose derivative it is but in a mid-point scheme.
 
-        `whole`: angle of whole turns that y, y0, `reference` and `anchor` (of FRICTION) lack, so that its round-off is
-        not theirs. The rate is (y - reference) * inverse. `value`: of the time law.
+        `winding`: angle of whole turns that y, y0, `reference` and `anchor` (of FRICTION) lack, so that its round-off
+        is not theirs. The rate is (y - reference) * inverse. `value`: of the time law.
         """
         code = spr.law[sp]
         if code == STOP:
-            return stop_force(spr, world, sp, whole, y0, y, reference, inverse)
+            return stop_force(spr, world, sp, winding, y0, y, reference, inverse)
         if code == TORQUE:
             return wp.vec3d(-value, f64(0.0), -value * y)
         k, c, max_force = spr.stiffness[world, sp], spr.damping[world, sp] * inverse, spr.max_force[world, sp]
@@ -94,10 +94,10 @@ def bounded_functions(midpoint: bool) -> KernelSet:
         if code == FRICTION:
             s += k * (y - anchor)
         elif wp.static(midpoint):
-            s += k * (f64(0.5) * (y0 + y) - (value - whole))
+            s += k * (f64(0.5) * (y0 + y) - (value - winding))
             slope = f64(0.5) * k + c
         else:
-            s += k * (y - (value - whole))
+            s += k * (y - (value - winding))
         if wp.abs(s) > max_force:
             energy = max_force * (wp.abs(s) - f64(0.5) * max_force) / wp.max(slope, f64(1.0e-300))
             return wp.vec3d(wp.clamp(s, -max_force, max_force), f64(0.0), energy)
@@ -113,18 +113,18 @@ def bounded_functions(midpoint: bool) -> KernelSet:
         return y - wp.clamp(y - anchor, -slip_distance, slip_distance)
 
     @wp.func
-    def energy(spr: Springs, world: int, sp: int, whole: f64, y: f64, anchor: f64) -> f64:
+    def energy(spr: Springs, world: int, sp: int, winding: f64, y: f64, anchor: f64) -> f64:
         """Stored energy, J."""
         moved = f64(0.0)
         if spr.law[sp] == STOP:
-            moved = penetration(spr, world, sp, whole, y)
+            moved = penetration(spr, world, sp, winding, y)
         elif spr.law[sp] == FRICTION:
             moved = y - anchor
         return f64(0.5) * spr.stiffness[world, sp] * moved * moved
 
     @wp.func
     def increments(
-        spr: Springs, world: int, sp: int, whole: f64, y0: f64, y: f64, anchor: f64, force: f64
+        spr: Springs, world: int, sp: int, winding: f64, y0: f64, y: f64, anchor: f64, force: f64
     ) -> wp.vec3d:  # fmt: skip
         """Stored energy at y, energy lost in a step from y0, and work of actuators in it.
 
@@ -140,13 +140,13 @@ def bounded_functions(midpoint: bool) -> KernelSet:
         if spr.law[sp] == FRICTION:
             after = dragged(spr, world, sp, y, anchor)
             slip = after - anchor
-        stored = energy(spr, world, sp, whole, y, after)
+        stored = energy(spr, world, sp, winding, y, after)
         if wp.static(midpoint):
-            return wp.vec3d(stored, force * (y - y0) - stored + energy(spr, world, sp, whole, y0, anchor), f64(0.0))
+            return wp.vec3d(stored, force * (y - y0) - stored + energy(spr, world, sp, winding, y0, anchor), f64(0.0))
         moved, elastic_force = y - y0, spr.stiffness[world, sp] * (y - after)
         if spr.law[sp] == STOP:
-            p = penetration(spr, world, sp, whole, y)
-            moved, elastic_force = p - penetration(spr, world, sp, whole, y0), spr.stiffness[world, sp] * p
+            p = penetration(spr, world, sp, winding, y)
+            moved, elastic_force = p - penetration(spr, world, sp, winding, y0), spr.stiffness[world, sp] * p
         loss = force * slip + wp.max((force - elastic_force) * (moved - slip), f64(0.0))
         return wp.vec3d(stored, loss, f64(0.0))
 

@@ -50,7 +50,7 @@ def spring_gradient_kernels(
         spr: Springs, law_value: vec3d_2d, inverse: f64, y: f64, by: wp.vec2d, world: int, item: int, scr: Scratch
     ) -> f64:  # fmt: skip
         """Derivative of the force by y~ and the anchor of friction, along `by`."""
-        sp, reference, whole = spr.spring[item], scr.reference[world, item], scr.whole[world, item]
+        sp, reference, winding = spr.spring[item], scr.reference[world, item], scr.winding[world, item]
         if wp.static(bounded):
             if spr.law[sp] < 0:
                 value, total = k.scheduled(spr, law_value, world, sp), f64(0.0)
@@ -58,11 +58,11 @@ def spring_gradient_kernels(
                 for side in range(2):
                     step = f64(STEP) * f64(1 - 2 * side)
                     out = more.bounded_force(
-                        spr, world, sp, whole, y0, y, reference + step * by[0], inverse, anchor + step * by[1], value
+                        spr, world, sp, winding, y0, y, reference + step * by[0], inverse, anchor + step * by[1], value
                     )
                     total += out[0] / (f64(2.0) * step)
                 return total
-        return -by[0] * inverse * law.viscous_force(spr, world, sp, y + whole, (y - reference) * inverse)[2]
+        return -by[0] * inverse * law.viscous_force(spr, world, sp, y + winding, (y - reference) * inverse)[2]
 
     @masked_kernel(module, "active")
     def rate_bars(

@@ -40,7 +40,7 @@ def scratch_struct():
 
     @wp.struct
     class SpringScratch:
-        whole: wp.array2d(dtype=wp.float64)  # [world, item] angle of whole turns at the start of the step, not in y
+        winding: wp.array2d(dtype=wp.float64)  # [world, item] angle of whole turns at the start of the step, not in y
         start: wp.array2d(dtype=wp.float64)  # [world, item] y at the start of the step
         reference: wp.array2d(dtype=wp.float64)  # [world, item] y~
         anchor: wp.array2d(dtype=wp.float64)  # [world, item] of FRICTION at the start of the step
@@ -94,17 +94,17 @@ def spring_kernels(
         kind = spr.kind[item]
         if kind == VECTOR or kind == CHORD:
             return
-        near, whole = f64(0.0), f64(0.0)
+        near, winding = f64(0.0), f64(0.0)
         if kind == ANGLE:
             near = turned[world, item]
-            whole = f64(FULL_TURN) * wp.round(near / f64(FULL_TURN))
+            winding = f64(FULL_TURN) * wp.round(near / f64(FULL_TURN))
         V = spr.reference[item] + vectors(spr, u, world, item)
-        y = c.coordinate(kind, V, near - whole)
-        scr.whole[world, item] = whole
+        y = c.coordinate(kind, V, near - winding)
+        scr.winding[world, item] = winding
         scr.start[world, item] = y
         if wp.static(bounded):
             if spr.law[spr.spring[item]] == FRICTION:
-                previous = anchor[world, item] - whole
+                previous = anchor[world, item] - winding
                 scr.anchor[world, item] = wp.where(wp.isnan(previous), y, previous)
         if wp.static(midpoint):
             reference = y
@@ -157,12 +157,12 @@ def spring_kernels(
         spr: Springs, world: int, item: int, y0: f64, y: f64, inverse: f64, in_motion: f64, scr: Scratch
     ) -> vec3d:  # fmt: skip
         """Force, its derivative by y, and the potential of a law of spring_laws.py; its size into the rows."""
-        sp, whole = spr.spring[item], scr.whole[world, item]
-        counted = y + whole
-        reference = scr.reference[world, item] + whole
+        sp, winding = spr.spring[item], scr.winding[world, item]
+        counted = y + winding
+        reference = scr.reference[world, item] + winding
         if wp.static(midpoint):
-            elastic_part = law.mean_force(spr, world, sp, y0 + whole, counted)
-            viscous_part = law.viscous_force(spr, world, sp, f64(0.5) * (y0 + y) + whole, (y - y0) * inverse)
+            elastic_part = law.mean_force(spr, world, sp, y0 + winding, counted)
+            viscous_part = law.viscous_force(spr, world, sp, f64(0.5) * (y0 + y) + winding, (y - y0) * inverse)
             viscous_part[1] = f64(0.5) * viscous_part[1]
         else:
             elastic_part = law.elastic_force(spr, world, sp, counted)
@@ -212,8 +212,8 @@ def spring_kernels(
         if wp.static(bounded):
             if spr.law[sp] < 0:
                 value, anchor = scheduled(spr, law_value, world, sp), scr.anchor[world, item]
-                reference, whole = scr.reference[world, item], scr.whole[world, item]
-                out = more.bounded_force(spr, world, sp, whole, y0, y, reference, inverse, anchor, value)
+                reference, winding = scr.reference[world, item], scr.winding[world, item]
+                out = more.bounded_force(spr, world, sp, winding, y0, y, reference, inverse, anchor, value)
                 # round-off of an angle is that of 1 rad, of a travel that of its vectors
                 size = wp.where(spr.kind[item] == ANGLE, f64(1.0), wp.length(V[0]) * wp.length(V[1])) + wp.abs(y)
                 scr.rows[2, world, item] = wp.abs(out[2]) + wp.abs(out[0]) * size
@@ -322,23 +322,23 @@ def spring_kernels(
             rows[0, world, item] = f64(0.5) * spr.scale[item] * spr.stiffness[world, sp] * wp.ddot(V, V)
             rows[1, world, item] = spr.scale[item] * spr.damping[world, sp] * inverse * wp.ddot(moved, step)
             return
-        y0, whole = scr.start[world, item], scr.whole[world, item]
+        y0, winding = scr.start[world, item], scr.winding[world, item]
         y = c.coordinate(spr.kind[item], V, y0)
         if wp.static(bounded):
             if spr.law[sp] < 0:
                 value, anchor = scheduled(spr, law_value, world, sp), scr.anchor[world, item]
                 reference = scr.reference[world, item]
-                force = more.bounded_force(spr, world, sp, whole, y0, y, reference, inverse, anchor, value)[0]
-                change = more.increments(spr, world, sp, whole, y0, y, anchor, force)
+                force = more.bounded_force(spr, world, sp, winding, y0, y, reference, inverse, anchor, value)[0]
+                change = more.increments(spr, world, sp, winding, y0, y, anchor, force)
                 for row in range(3):
                     rows[row, world, item] = change[row]
                 rows[3, world, item] = change[2]
                 return
         if wp.static(midpoint):
-            viscous_part = law.viscous_force(spr, world, sp, f64(0.5) * (y0 + y) + whole, (y - y0) * inverse)
+            viscous_part = law.viscous_force(spr, world, sp, f64(0.5) * (y0 + y) + winding, (y - y0) * inverse)
         else:
-            viscous_part = law.viscous_force(spr, world, sp, y + whole, (y - scr.reference[world, item]) * inverse)
-        rows[0, world, item] = law.energy(spr, world, sp, y + whole)
+            viscous_part = law.viscous_force(spr, world, sp, y + winding, (y - scr.reference[world, item]) * inverse)
+        rows[0, world, item] = law.energy(spr, world, sp, y + winding)
         rows[1, world, item] = in_motion * viscous_part[0] * (y - y0)
 
     if bounded:
@@ -356,8 +356,8 @@ def spring_kernels(
                 return
             y0 = scr.start[world, item]
             y = c.coordinate(spr.kind[item], spr.reference[item] + vectors(spr, u, world, item), y0)
-            whole = scr.whole[world, item]
-            before, depth = more.penetration(spr, world, sp, whole, y0), more.penetration(spr, world, sp, whole, y)
+            winding = scr.winding[world, item]
+            before, depth = more.penetration(spr, world, sp, winding, y0), more.penetration(spr, world, sp, winding, y)
             k = spr.stiffness[world, sp]
             change = (k + spr.damping[world, sp] / h[world]) * wp.abs(depth - before)
             if change > f64(0.5) * k * wp.max(wp.abs(depth), wp.abs(before)):
@@ -372,11 +372,11 @@ def spring_kernels(
         sp = spr.spring[item]
         V = spr.reference[item] + vectors(spr, u, world, item)
         y = c.coordinate(spr.kind[item], V, scr.start[world, item])
-        whole = scr.whole[world, item]
+        winding = scr.winding[world, item]
         if spr.kind[item] == ANGLE:
-            turned[world, item] = y + whole
+            turned[world, item] = y + winding
         if wp.static(bounded):
             if spr.law[sp] == FRICTION:
-                anchor[world, item] = more.dragged(spr, world, sp, y, scr.anchor[world, item]) + whole
+                anchor[world, item] = more.dragged(spr, world, sp, y, scr.anchor[world, item]) + winding
 
     return kernel_set(locals())

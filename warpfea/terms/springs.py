@@ -200,7 +200,7 @@ class Springs(Tied, Preconditioned, Parametrised, Impacting, Diagnosed, Differen
     def failure_note(self, ctx: StepContext, world: int) -> str:
         """Bushings near their largest turn; controllers that pull a joint by more than half a turn."""
         scratch, values = ctx.scratch[self.name][0], ctx.work.time_law_stage_values
-        start = scratch.start.numpy() + scratch.whole.numpy()
+        start = scratch.start.numpy() + scratch.winding.numpy()
         for item in np.flatnonzero(self.kind == ANGLE).tolist():
             k = self.definition["spring"][item]
             if self.springs[k].law == FEEDBACK and self.springs[k].max_force == np.inf:
