@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
-from spring_models import EXACT, TILTED, cube
+from spring_models import EXACT, TILTED, cube, sway
 
 import warpfea as wf
 
@@ -13,7 +14,7 @@ STIFFNESS = np.array([1e4, 2e4, 3e4, 30.0, 40.0, 50.0])
 
 def mounted(axes=None, swapped=False, **options):
     """A rigid cube of 1 kg on a bushing to the ground at its centre."""
-    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    b = wf.ModelBuilder(gravity=options.pop("gravity", (0, 0, 0)))
     part = b.add_rigid(wf.Box((0, 0, 0), (0.1, 0.1, 0.1)), density=1000.0, name="part")
     ends = [part.at((0, 0, 0)), wf.GROUND]
     b.add_bushing(*ends[:: -1 if swapped else 1], **{"stiffness": STIFFNESS, "axes": axes, "name": "mount"} | options)
@@ -48,19 +49,35 @@ def test_small_motion_and_frequencies():
     assert np.ravel(modes.frequencies) == pytest.approx(np.sort(np.sqrt(STIFFNESS / inertia)) / (2 * np.pi), rel=1e-6)
 
 
-def test_damped_turn():
-    """theta'' + 2 z w theta' + w^2 theta = 0 about one axis, of 2.5 rad at first, of second order."""
-    J, w, z = 1.0 / 600.0, 40.0, 0.05
+def test_oscillators():
+    """m x'' + c x' + k x = m 2 sin(17 t) along an axis, J y'' + d y' + w^2 J y = 0 about it, up to 0.7 rad: undamped and
+    damped by values per world, of second order, 1e-4 of the amplitudes at h = 2.5e-4 s; the force of the bushing."""
+    J, w, t_end = 1.0 / 600.0, 40.0, 0.1
+    damping = np.zeros((2, 6))
+    damping[1] = 3.0, 3.0, 3.0, *3 * [0.1 * w * J]
+
+    def rate(t, q, c, d):
+        return [q[1], 2 * np.sin(17 * t) - c * q[1] - w**2 * q[0], q[3], -d / J * q[3] - w**2 * q[2]]
+
+    exact = np.array([solve_ivp(rate, (0, t_end), [0, 1, 0, 28], args=(c[0], c[3]), rtol=1e-11, atol=1e-13).y[:, -1]
+                      for c in damping])  # fmt: skip
     errors = []
-    for h in (4e-3, 2e-3):
-        b, part = mounted(stiffness=(1e3, 1e3, 1e3, *3 * [J * w**2]), damping=(0, 0, 0, *3 * [2 * z * w * J]))
-        b.set_initial(part, angular_velocity=(0, 0, 100.0))
-        sim = wf.Simulation(b.finalize(device="cpu"), dt=h, integrator="energy_momentum", solver=EXACT)
-        sim.run(0.12)
-        s = w * np.sqrt(1 - z**2)
-        errors.append(turn_of(sim, part)[2] - 100.0 / s * np.exp(-z * w * 0.12) * np.sin(s * 0.12))
-    assert abs(errors[1]) < 2e-2
+    for h in (5e-4, 2.5e-4):
+        b, part = mounted(gravity=sway, damping=1.0, stiffness=(w**2, w**2, w**2, *3 * [J * w**2]))
+        b.set_initial(part, velocity=(1, 0, 0), angular_velocity=(28, 0, 0))
+        model = b.finalize(device="cpu", worlds=2)
+        model.set_parameter("mount.damping", damping)
+        sim = wf.Simulation(model, dt=h, integrator="energy_momentum", solver=EXACT)
+        sim.run(t_end)
+        place, quaternion = sim.pose(part)
+        found = np.column_stack([place[:, 0], Rotation.from_quat(quaternion).as_rotvec()[:, 0]])
+        errors.append(np.abs(found - exact[:, ::2]))
+    assert (errors[1] < 1e-4 * np.array([0.025, 0.7])).all(), errors
     assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.2)
+    wrench = sim.spring_force("mount")  # on the ground, the second end
+    assert wrench[0] == pytest.approx([w**2 * found[0, 0], 0, 0, J * w**2 * found[0, 1], 0, 0], rel=2e-2, abs=1e-9)
+    assert wrench[1, 0] == pytest.approx(w**2 * exact[1, 0] + 3 * exact[1, 1], rel=2e-2)
+    assert wrench[1, 3] == pytest.approx(w**2 * J * exact[1, 2] + damping[1, 3] * exact[1, 3], rel=2e-2)
 
 
 def test_energy_and_momentum_of_two_parts():
@@ -114,5 +131,14 @@ def test_bad_input():
     ):
         with pytest.raises(wf.ModelError, match=message):
             make()
+    b.add_bushing(P, wf.GROUND, stiffness=(1, 2, 3, 4, 5, 6), name="m")
+    model = b.finalize(device="cpu", worlds=2)
+    for name, value, message in (
+        ("stiffness", 1.0, r"shape \(\), expected \(6,\) or \(2, 6\)"),
+        ("stiffness", [1, 2, 3, 4, 5, -6], "six values, 0 or more"),
+        ("damping", [0, 0, 0, 1, 0, 0], "0 along and about axes that the bushing was added without"),
+    ):
+        with pytest.raises(wf.ModelError, match=message):
+            model.set_parameter(f"m.{name}", value)
     with pytest.raises(NotImplementedError, match="weld a rigid part"):
         line.add_bushing(beam.end, wf.GROUND, stiffness=1.0)

@@ -11,19 +11,19 @@ from ..base.checks import float_array
 from ..base.errors import ModelError
 from ..kernels.terms.springs import CHORD, TRAVEL
 from ..model.joints import Vector
-from ..model.springs import Spring
+from ..model.springs import Bushing, Spring, bushing_parts
 from .attachments import Attachment, make_attachment
 
-__all__ = ["bushing_springs"]
+__all__ = ["make_bushing"]
 
 ORTHONORMAL = 1e-9
 """Tolerance of orthonormal axes."""
 
 
-def bushing_springs(
+def make_bushing(
     what: str, name: str, first: Any, second: Any, stiffness: Any, damping: Any, axes: Any
-) -> list[Spring]:  # fmt: skip
-    """The springs of a bushing; see ModelBuilder.add_bushing."""
+) -> Bushing:  # fmt: skip
+    """A bushing and its springs; see ModelBuilder.add_bushing."""
     k, c = (_six_values(what, label, values) for label, values in (("stiffness", stiffness), ("damping", damping)))
     if not k.any() and not c.any():
         raise ModelError(f"{what}: stiffness and damping are all 0")
@@ -33,25 +33,18 @@ def bushing_springs(
     P, Q = _ends(what, first, second, e)
     gap = Q.position(Q.X, what) - P.position(P.X, what)
     a, b = ([end.direction(n, what) for n in e] for end in (P, Q))
-    between, out = f"{P.label} and {Q.label}", []
+    between, out = f"{P.label} and {Q.label}", list[Spring]()
 
-    def add(kind: int, items: list[tuple[Vector, ...]], stiffness: float, damping: float = 0.0) -> None:
+    vectors = [*([(gap, x), (gap, y)] for x, y in zip(a, b)), *([(x - y,)] for x, y in zip(a, b))]
+    vectors += [[(x, y)] for x in a for y in b]
+    values = np.stack([bushing_parts(k, damping=False), bushing_parts(c, damping=True)], axis=1)
+    parts = np.flatnonzero(values.any(axis=1)).tolist()
+    for part in parts:
+        kind, items = CHORD if 3 <= part < 6 else TRAVEL, vectors[part]
         rest = float(items[0][0].value @ items[0][1].value) if kind == TRAVEL else 0.0
-        out.append(Spring(name, kind, items, stiffness, damping, rest, np.ones(len(items)), between=between, keys={}))
-
-    for i in range(3):
-        if k[i] or c[i]:
-            add(TRAVEL, [(gap, a[i]), (gap, b[i])], 0.5 * k[i], 0.5 * c[i])
-    for i, chord in enumerate(_by_planes(k[3:])):
-        if chord:
-            add(CHORD, [(a[i] - b[i],)], chord)
-    same = np.maximum(_by_planes(c[3:]), 0.0)
-    for i in range(3):
-        for j in range(3):
-            loss = same[i] if i == j else 0.5 * c[6 - i - j]
-            if loss:
-                add(TRAVEL, [(a[i], b[j])], 0.0, loss)
-    return out
+        more = rest, np.ones(len(items))
+        out.append(Spring(name, kind, items, *map(float, values[part]), *more, between=between, keys={}))
+    return Bushing(name, out, parts, Q.position(Q.X, what))
 
 
 def _ends(what: str, first: Any, second: Any, axes: np.ndarray) -> tuple[Attachment, Attachment]:
@@ -73,11 +66,6 @@ def _ends(what: str, first: Any, second: Any, axes: np.ndarray) -> tuple[Attachm
                 "only: bushings on these are not part of this version; weld a rigid part to it and give a point of that"
             )
     return P, Q
-
-
-def _by_planes(about: np.ndarray) -> np.ndarray:
-    """Weights (3,) of the angles between axes i, whose sums over the two axes that turn about one are `about`."""
-    return np.asarray(0.5 * about.sum() - about)
 
 
 def _six_values(what: str, label: str, values: Any) -> np.ndarray:

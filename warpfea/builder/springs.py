@@ -20,7 +20,7 @@ from ..model.springs import Bushing, SampledForce, Spring
 from .actuators import make_actuator
 from .attachments import COINCIDENCE_TOL, make_attachment
 from .bodies import unused_name
-from .bushings import bushing_springs
+from .bushings import make_bushing
 from .checks import body_of_handle, joint_of
 
 __all__ = ["SpringMethods"]
@@ -135,7 +135,8 @@ class SpringMethods:
             stiffness, damping: six values along and about the three axes, N/m, N m/rad, N s/m, N m s/rad; or one. Where
                 the damping about an axis is above the sum of the other two, turns about those lose more, by sin^2 t.
             axes: (3, 3) rows, orthonormal, right-handed; by default those of the world. They turn with both ends.
-            name: unique name.
+            name: unique name, for set_parameter("NAME.stiffness"), "NAME.damping": six values, or (worlds, 6), of which
+                those may be positive that the built ones have springs for.
 
         Raises:
             ModelError: ends without a rotation, or a value out of range. A turn beyond 170 degrees is refused in a
@@ -147,9 +148,10 @@ class SpringMethods:
         for end, label in ((first, "first"), (second, "second")):
             if hasattr(end, "body"):
                 body_of_handle(end, f"{what}: {label}", known, self.description.bodies)
-        springs = bushing_springs(what, name, first, second, stiffness, damping, axes)
-        self.description.springs += springs
-        return Bushing(name, springs)
+        bushing = make_bushing(what, name, first, second, stiffness, damping, axes)
+        self.description.bushings.append(bushing)
+        self.description.springs += bushing.springs
+        return bushing
 
     def add_foundation(
         self, surface: SurfaceSet, *, stiffness: float, damping: float = 0.0, name: str | None = None

@@ -154,6 +154,8 @@ class DifferentiableContact(Differentiable):
             return "an integrator but 'backward_euler'"
         if t.has_single_point:
             return "contacts of model='sphere'"
+        if t.rolls:
+            return "rigid capsules and cylinders that roll (model='patch' takes points on their facets)"
         if t.explicit:
             return "treatment='explicit'"
         if t.seams is not None:

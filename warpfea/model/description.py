@@ -15,7 +15,7 @@ from .bodies import Body
 from .contacts import Collider, ContactOptions
 from .handles import NodeSet, SurfaceSet
 from .joints import Joint
-from .springs import Spring
+from .springs import Bushing, Spring
 
 __all__ = [
     "BodyForce",
@@ -123,6 +123,7 @@ class Description:
     probes: list[Probe] = field(default_factory=list)
     joints: list[Joint] = field(default_factory=list)
     springs: list[Spring] = field(default_factory=list)
+    bushings: list[Bushing] = field(default_factory=list)
     colliders: list[Collider] = field(default_factory=list)
     contacts: list[Any] = field(default_factory=list)
     gravity: np.ndarray = field(default_factory=lambda: np.zeros(3))

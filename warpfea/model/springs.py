@@ -13,7 +13,9 @@ from ..kernels.terms.springs import ANGLE, LENGTH, TRAVEL
 from ..time_laws import TimeLaw
 from .joints import Joint, Vector
 
-__all__ = ["MAX_FRICTION", "Bushing", "SampledForce", "Spring", "coordinate_gradients", "joint_coordinate"]
+__all__ = [
+    "MAX_FRICTION", "Bushing", "SampledForce", "Spring", "bushing_parts", "coordinate_gradients", "joint_coordinate",
+]  # fmt: skip
 
 MAX_FRICTION = 1e100
 """Largest friction of a joint, N m or N: its energies are finite."""
@@ -136,10 +138,30 @@ class Bushing:
     Attributes:
         name: unique in its model.
         springs: those of its potential and of its damping.
+        parts: number of each in `bushing_parts`.
+        place: position of its second end.
     """
 
     name: str
     springs: list[Spring] = field(repr=False)
+    parts: list[int] = field(repr=False)
+    place: Vector = field(repr=False)
+
+
+def bushing_parts(values: np.ndarray, *, damping: bool) -> np.ndarray:
+    """Stiffness or damping (..., 15) of the springs of bushings, from the values (..., 6) along and about its axes.
+
+    Along the three axes of both ends, chords between the axes, and, damped alone, products of axis i of the first with
+    axis j of the second end.
+    """
+    along, about = 0.5 * values[..., :3], values[..., 3:]
+    by_planes = 0.5 * about.sum(axis=-1, keepdims=True) - about  # of axis i, both others turn about one
+    products = np.zeros((*values.shape[:-1], 9))
+    if damping:
+        i, j = np.divmod(np.arange(9), 3)
+        products = np.where(i == j, np.maximum(by_planes, 0.0)[..., i], 0.5 * about[..., (3 - i - j) % 3])
+        by_planes = np.zeros_like(about)
+    return np.concatenate([along, by_planes, products], axis=-1)
 
 
 def joint_coordinate(joint: Joint) -> tuple[int, tuple[Vector, ...]] | None:

@@ -22,7 +22,7 @@ from ..model.handles import ElementSet, NodeSet
 from ..model.joints import Joint
 from ..model.pairs import FacetOptions
 from ..model.rigid import RigidBody
-from ..model.springs import Spring
+from ..model.springs import Bushing, Spring
 from ..model.state import State
 from ..model.surfaces import reference_points
 from ..terms.fields import VECTOR, check_scalar, field_at_nodes, field_at_points, field_inside, find_field
@@ -42,7 +42,6 @@ __all__ = ["PartMember", "Records", "Results"]
 
 MAX_NAMED_BODIES = 5
 """Maximum number of bodies named in a message."""
-
 
 RECORDED_FIELDS = {
     "acceleration": FieldSpec("acceleration", "m/s2", components=VECTOR),
@@ -317,8 +316,7 @@ class Records:
         self.warned_of_noise = True
         warnings.warn(
             f"joint forces: {floored} of {self.statistics.steps * self.model.worlds} steps ended where float32 rounds "
-            "the stress; forces and moments of joints may be wrong by more than the loads, though positions are right; "
-            "take dtype='float64'",
+            "the stress; forces and moments of joints may be off by more than the loads; take dtype='float64'",
             ModelWarning,
             stacklevel=3,
         )
@@ -338,12 +336,14 @@ class Records:
         self.warn_of_noise()
         return self._of_last_step(self.joint_column(joint))
 
-    def spring_force(self, spring: Spring | str) -> np.ndarray:
-        """Torque (N m) or force (N), (B,), of an actuator, stop, friction or spring on a joint's child at the last
-        accepted step, or tension of a spring between points. NaN as for `reaction`."""
-        term = self.model.terms.find(Springs)
-        known = _find("spring", spring, [s for s in getattr(term, "springs", ()) if s.scalar], "a handle, or a name")
-        return np.where(self.statistics.stepped_worlds, term.scalar_force(self.stepper.ctx, known), np.nan)
+    def spring_force(self, spring: Spring | Bushing | str) -> np.ndarray:
+        """Torque (N m) or force (N), (B,), of an actuator, stop, friction or spring on a joint's child, tension of one
+        between points, force and moment about its second end (B, 6) of a bushing on that end, force (B, 3) of a
+        foundation on its body; at the last accepted step. NaN as for `reaction`."""
+        d, term = self.model.description, self.model.terms.find(Springs)
+        things = [*d.bushings, *(s for s in d.springs if s.keys != {})]
+        force = term.force_of(self.stepper.ctx, _find("spring", spring, things, "a handle, or a name"))
+        return np.where(self.statistics.stepped_worlds, force.T, np.nan).T
 
     def violation(self, joint: Joint | str) -> np.ndarray:
         """Largest violation of a joint's rows in the present state, (B,), m; angles are multiplied by the model's

@@ -21,7 +21,8 @@ from ..kernels.terms.chords import MAX_TURN
 from ..kernels.terms.spring_laws import LINEAR, OWN, SAMPLED, OwnForces, spring_struct
 from ..kernels.terms.springs import ANGLE, CHORD, LENGTH, TRAVEL, VECTOR, scratch_struct, spring_kernels
 from ..model.assembly import grouped_items
-from ..model.springs import MAX_FRICTION, SampledForce, Spring, coordinate_gradients
+from ..model.springs import MAX_FRICTION, Bushing, SampledForce, Spring, coordinate_gradients
+from .bushings import force_of_spring, set_bushing
 from .protocols import Diagnosed, Impacting, Parametrised, Preconditioned, Tied
 from .spring_gradients import DifferentiableSprings
 from .term import LOSS, NUMERICAL, STORED, WORK, Column, StepContext, part
@@ -182,20 +183,9 @@ class Springs(Tied, Preconditioned, Parametrised, Impacting, Diagnosed, Differen
             return sp.csr_matrix(shape)
         return sp.csr_matrix((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=shape)
 
-    def scalar_force(self, ctx: StepContext, spring: Spring) -> np.ndarray:
-        """Force (worlds,) of a spring with one coordinate: of LENGTH its tension, of others that on the child.
-
-        The derivatives of the potential are those of the last evaluation; with `energy_momentum` they are means over
-        the step, which a turn in the step makes smaller to second order.
-        """
-        item = int(np.flatnonzero(self.definition["spring"] == self.springs.index(spring))[0])
-        own, kind = slice(self.entry_start[item], self.entry_start[item + 1]), int(self.kind[item])
-        u = ctx.state.displacement.numpy()[:, self.entry_slot[own]].astype(float)
-        out = []
-        for x, force in zip(u, ctx.scratch[self.name][0].force.numpy()[:, item]):
-            (g,) = coordinate_gradients(kind, self.definition["reference"][item] + self.entry_weight[own].T @ x)
-            out.append(np.sum(force * g) / np.sum(g * g))
-        return np.array(out) if kind == LENGTH else -np.array(out)
+    def force_of(self, ctx: StepContext, handle: Spring | Bushing) -> np.ndarray:
+        """(worlds, ...) see `force_of_spring`."""
+        return force_of_spring(self, ctx, handle)
 
     def failure_note(self, ctx: StepContext, world: int) -> str:
         """Bushings near their largest turn; controllers that pull a joint by more than half a turn."""
@@ -412,7 +402,11 @@ class Springs(Tied, Preconditioned, Parametrised, Impacting, Diagnosed, Differen
             name: partial(self._set_parameter, k, name, field)
             for k, spring in enumerate(self.springs)
             for name, field in spring.parameters.items()
-        }
+        } | {
+            f"{bushing.name}.{field}": partial(set_bushing, self, bushing, field)
+            for bushing in self.model.description.bushings
+            for field in ("stiffness", "damping")
+        }  # fmt: skip
 
     def _set_parameter(self, k: int, name: str, field: str, values: Any, mask: np.ndarray) -> None:
         """Write one value of a spring in the chosen worlds."""
