@@ -367,3 +367,30 @@ def test_gradients_of_springs_and_actuators(integrator):
     exact += [np.sum(g[name][0] * values) for name, values in given.items()]
     errors = dict(zip([*springs, *given], best_differences(loss.numpy(), exact)))
     assert max(errors.values()) < TOLERANCE, errors
+
+
+def test_loads_and_drives_by_name():
+    """Of constants and samples it is the sum of those of a control of the same values over the steps."""
+    sizes, steps = {"t": 3, "P": 3, "p": 1, "m": 3, "d": 3}, 3
+
+    def gradients(value):
+        b = wf.ModelBuilder(gravity=(0, 0, -9.81))
+        box = b.add_solid(wf.mesh.box((0.1, 0.02, 0.02), cells=(2, 1, 1), element="T4"), material=LAW, name="box")
+        b.drive(box.nodes("x-"), displacement=value("d", (0, 0, 0)), name="d")
+        b.add_traction(box.surface("x+"), value("t", (0, 10.0, 30.0)), name="t")
+        b.add_point_load(box.at((0.1, 0.02, 0.02)), value("P", (0, 0, -0.01)), name="P")
+        b.add_pressure(box.surface("z+"), value("p", 20.0), name="p")
+        b.add_moment(box.at((0.05, 0.01, 0.01)), value("m", (0, 1e-4, 0)), name="m")
+        b.add_probe("tip", box.surface("x+"))
+        tape = wf.Adjoint(wf.Simulation(b.finalize(device="cpu"), dt=2e-3, solver=SOLVER), list(sizes))
+        tape.run(steps)
+        g = tape.backward(wf.loss.sum_of_squares(tape.probe("tip"), np.full((steps, 3), TARGET)))
+        return {name: array.numpy()[0] for name, array in g.items()}
+
+    named = gradients(lambda name, value: ([0.0, 1.0], [value, value]) if name == "t" else value)
+    controlled = gradients(lambda name, value: wf.Control(name, sizes[name], value))
+    for name, size in sizes.items():
+        assert named[name].shape == (3,) * (size == 3)
+        assert np.abs(named[name]).max() > 0.0
+        expected = controlled[name].sum(axis=0)
+        assert named[name] == pytest.approx(expected if size == 3 else expected[0], rel=1e-9, abs=1e-20), name

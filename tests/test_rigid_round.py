@@ -93,7 +93,10 @@ def test_cylinders_and_capsules_roll(kind):
 def test_a_body_lies_on_a_part_as_on_a_collider(name):
     """A soft block that is pressed on a held part: force and sinking are those on an obstacle of the same shape, and
     the forces on both sides cancel, with their moments."""
-    shape = {"cylinder": wf.Cylinder((0, -0.2, -0.3), (0, 0.2, -0.3), 0.3), "box": wf.Box((0, 0, -0.1), (0.3, 0.4, 0.2))}
+    shape = {
+        "cylinder": wf.Cylinder((0, -0.2, -0.3), (0, 0.2, -0.3), 0.3),
+        "box": wf.Box((0, 0, -0.1), (0.3, 0.4, 0.2)),
+    }
     found = []
     for moves in (True, False):
         b = wf.ModelBuilder(gravity=(0, 0, 0))

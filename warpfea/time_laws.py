@@ -79,6 +79,7 @@ class TimeLaw:
         control: source of the values, or None.
         ramped: True: in statics the value of a control is multiplied by the load factor.
         name: of the driven quantity, for messages.
+        key: name of a constant added to the values, by which `wf.Adjoint` has derivatives; "" for none.
     """
 
     times: np.ndarray
@@ -88,6 +89,7 @@ class TimeLaw:
     control: Control | None = None
     ramped: bool = True
     name: str = ""
+    key: str = ""
 
 
 def _as_vectors(values: np.ndarray, scalar: bool) -> np.ndarray:
@@ -141,25 +143,29 @@ def _parse_constant(value: Any, what: str, width: tuple[int, ...]) -> tuple[np.n
     return np.zeros(1), values
 
 
-def time_law(value: Any, what: str, *, scalar: bool = False) -> TimeLaw:
+def time_law(value: Any, what: str, *, scalar: bool = False, key: str | None = None) -> TimeLaw:
     """Time law from a user's value.
 
     Args:
         value: number or 3-vector; (times (n,), values (n,) or (n, 3)); a wp.func of t; or a Control; times in s.
         what: name used in errors.
         scalar: a scalar law instead of a vector law.
+        key: see `TimeLaw`.
 
     Raises:
         ModelError: a Python function, a wrong shape, times that do not increase, a value that is not finite, or a
             control of another size.
     """
+    if key is not None and not (isinstance(key, str) and key):
+        raise ModelError(f"{what}: name = {key!r} must be a text")
+    names = {"name": what, "key": key or ""}
     if isinstance(value, Control):
         if value.size != (1 if scalar else 3):
             needed = SIZE_NAMES[1 if scalar else 3]
             raise ModelError(f"{what}: control {value.name!r} has size {value.size}, but {needed} is to be driven")
-        return TimeLaw(np.zeros(0), np.zeros((0, 3)), scalar=scalar, control=value, name=what)
+        return TimeLaw(np.zeros(0), np.zeros((0, 3)), scalar=scalar, control=value, **names)
     if isinstance(value, wp.Function):
-        return TimeLaw(np.zeros(0), np.zeros((0, 3)), value, scalar, name=what)
+        return TimeLaw(np.zeros(0), np.zeros((0, 3)), value, scalar, **names)
     if callable(value):
         name = getattr(value, "__name__", type(value).__name__).replace("<lambda>", "a lambda")
         raise ModelError(
@@ -171,4 +177,4 @@ def time_law(value: Any, what: str, *, scalar: bool = False) -> TimeLaw:
     times, values = parse(value, what, () if scalar else (3,))
     if not (np.all(np.isfinite(times)) and np.all(np.isfinite(values))):
         raise ModelError(f"{what}: {value!r} holds a value that is not finite")
-    return TimeLaw(times, _as_vectors(values, scalar), None, scalar, name=what)
+    return TimeLaw(times, _as_vectors(values, scalar), None, scalar, **names)

@@ -118,14 +118,14 @@ def make_actuator(name: str, joint: Joint, torque: Any) -> Spring:
     what = f"actuator {name!r}"
     kind, vectors = _coordinate(what, joint)
     if isinstance(torque, PD):
-        target = time_law(torque.target, f"{what}: target", scalar=True)
+        target = time_law(torque.target, f"{what}: target", scalar=True, key=f"{name}.target")
         keys = {f"{name}.kp": "stiffness", f"{name}.kd": "damping"}
         keys |= {} if torque.limit is None else {f"{name}.limit": "max_force"}
         return Spring(
             name, kind, [vectors], float(torque.kp), float(torque.kd), law=FEEDBACK, between=joint.between, keys=keys,
             max_force=math.inf if torque.limit is None else float(torque.limit), schedule=_unramped(target),
         )  # fmt: skip
-    law = time_law(torque, f"{what}: torque", scalar=True)
+    law = time_law(torque, f"{what}: torque", scalar=True, key=f"{name}.torque")
     return Spring(name, kind, [vectors], law=TORQUE, between=joint.between, keys={}, schedule=law)
 
 

@@ -217,7 +217,7 @@ class ModelBuilder(ContactMethods, SpringMethods, VelocityMethods):
 
     def drive(
         self, nodes: NodeSet, *, displacement: Any = None, rotation: Rotation | None = None, components: str = "xyz",
-        slots: str | None = None,
+        slots: str | None = None, name: str | None = None,
     ) -> None:  # fmt: skip
         """Prescribe the motion of nodes.
 
@@ -229,21 +229,25 @@ class ModelBuilder(ContactMethods, SpringMethods, VelocityMethods):
             components: prescribed letters of "xyz".
             slots: as for clamp; by default "all" with a rotation, which rotates gradients too, and "position" with a
                 displacement, which clamps the named gradients.
+            name: of the value, for derivatives by it in `wf.Adjoint`.
 
         Raises:
             ModelError: neither or both of displacement and rotation, or a wrong shape.
         """
         body = self._check_owner(nodes, "drive", NodeSet)
-        self.description.supports += loads.drive_supports(body, nodes, displacement, rotation, components, slots)
+        self.description.supports += loads.drive_supports(body, nodes, displacement, rotation, components, slots, name)
 
     # loads
 
-    def add_point_load(self, point: MaterialPoint | NodeSet, force: Any) -> None:
-        """A force (time law, N) at a material point (Eq. 72), or shared equally by the nodes of a set."""
-        body = self._check_owner(point, "add_point_load", MaterialPoint, NodeSet)
-        self.description.dead_loads.append(loads.point_load(body, point, force))
+    def add_point_load(self, point: MaterialPoint | NodeSet, force: Any, *, name: str | None = None) -> None:
+        """A force (time law, N) at a material point (Eq. 72), or shared equally by the nodes of a set.
 
-    def add_moment(self, point: MaterialPoint | NodeSet, moment: Any) -> None:
+        `name`: of the load, here and below, for derivatives by it in `wf.Adjoint`.
+        """
+        body = self._check_owner(point, "add_point_load", MaterialPoint, NodeSet)
+        self.description.dead_loads.append(loads.point_load(body, point, force, name))
+
+    def add_moment(self, point: MaterialPoint | NodeSet, moment: Any, *, name: str | None = None) -> None:
         """A moment about fixed directions (time law (3,), N m), at a material point or shared equally by nodes.
 
         It is work-conjugate to the spin of the section (beams), of the director (shells; the part of the moment
@@ -253,17 +257,17 @@ class ModelBuilder(ContactMethods, SpringMethods, VelocityMethods):
             ModelError: nodes without gradient slots (T4, T10).
         """
         body = self._check_owner(point, "add_moment", MaterialPoint, NodeSet)
-        self.description.moments.append(loads.moment_load(body, point, moment))
+        self.description.moments.append(loads.moment_load(body, point, moment, name))
 
-    def add_traction(self, surface: SurfaceSet, traction: Any) -> None:
+    def add_traction(self, surface: SurfaceSet, traction: Any, *, name: str | None = None) -> None:
         """A dead traction (time law (3,), N per m^2 of the reference area) on faces."""
         body = self._check_owner(surface, "add_traction", SurfaceSet)
-        self.description.dead_loads.append(loads.dead_traction(body, surface, traction))
+        self.description.dead_loads.append(loads.dead_traction(body, surface, traction, name))
 
-    def add_pressure(self, surface: SurfaceSet, pressure: Any) -> None:
+    def add_pressure(self, surface: SurfaceSet, pressure: Any, *, name: str | None = None) -> None:
         """A follower pressure (time law, Pa) against the current outward normal of faces."""
         body = self._check_owner(surface, "add_pressure", SurfaceSet)
-        self.description.pressures.append(loads.follower_pressure(body, surface, pressure))
+        self.description.pressures.append(loads.follower_pressure(body, surface, pressure, name))
 
     def add_body_force(self, field: Any, *, bodies: list[Body] | None = None) -> None:
         """A force per mass b(x, t), N/kg, at the current position (Eq. 23).

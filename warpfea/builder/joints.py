@@ -51,7 +51,7 @@ def make_joint(
     if drive is not None:
         if kind not in DRIVABLE_KINDS:
             raise ModelError(f"{what}: a {kind} joint can't be driven; {', '.join(DRIVABLE_KINDS)} can")
-        law = time_law(drive, f"{what}: drive", scalar=True)
+        law = time_law(drive, f"{what}: drive", scalar=True, key=f"{name}.drive")
     if kind == "distance":
         if axis is not None:
             raise ModelError(f"{what}: a distance joint has no axis")

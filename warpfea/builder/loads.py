@@ -1,5 +1,6 @@
 """Supports, loads, initial states and probes as recorded by a builder; documented at the methods of ModelBuilder."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -29,9 +30,9 @@ __all__ = [
 ]
 
 
-def point_load(body: Body, point: MaterialPoint | NodeSet, force: Any) -> DeadLoad:
+def point_load(body: Body, point: MaterialPoint | NodeSet, force: Any, name: str | None = None) -> DeadLoad:
     """See ModelBuilder.add_point_load."""
-    law = time_law(force, f"point load on {body.name!r}")
+    law = time_law(force, f"point load on {body.name!r}", key=name)
     point = as_point(point)
     if isinstance(point, NodeSet):
         slots, weights = _node_mean(point)
@@ -46,9 +47,9 @@ def _node_mean(nodes: NodeSet) -> tuple[np.ndarray, np.ndarray]:
     return slots, np.full(len(slots), 1.0 / len(slots))
 
 
-def moment_load(body: Body, point: MaterialPoint | NodeSet, moment: Any) -> Moment:
+def moment_load(body: Body, point: MaterialPoint | NodeSet, moment: Any, name: str | None = None) -> Moment:
     """See ModelBuilder.add_moment."""
-    law = time_law(moment, f"moment on {body.name!r}")
+    law = time_law(moment, f"moment on {body.name!r}", key=name)
     point = as_point(point)
     if isinstance(point, MaterialPoint):
         slots, vectors, axes = point.slots[None], (point.gradients @ point.axes)[None], point.axes[None]
@@ -66,16 +67,17 @@ def moment_load(body: Body, point: MaterialPoint | NodeSet, moment: Any) -> Mome
     return Moment(body, slots, vectors, axes, law)
 
 
-def dead_traction(body: Body, surface: SurfaceSet, traction: Any) -> DeadLoad:
+def dead_traction(body: Body, surface: SurfaceSet, traction: Any, name: str | None = None) -> DeadLoad:
     """See ModelBuilder.add_traction."""
-    law = time_law(traction, f"traction on {surface.name or 'faces'!r} of body {body.name!r}")
+    law = time_law(traction, f"traction on {surface.name or 'faces'!r} of body {body.name!r}", key=name)
     slots, weights = surface_weights(surface)
     return DeadLoad(body, slots, weights, law, "traction", surface)
 
 
-def follower_pressure(body: Body, surface: SurfaceSet, pressure: Any) -> Pressure:
+def follower_pressure(body: Body, surface: SurfaceSet, pressure: Any, name: str | None = None) -> Pressure:
     """See ModelBuilder.add_pressure."""
-    law = time_law(pressure, f"pressure on {surface.name or 'faces'!r} of body {body.name!r}", scalar=True)
+    what = f"pressure on {surface.name or 'faces'!r} of body {body.name!r}"
+    law = time_law(pressure, what, scalar=True, key=name)
     if not len(surface):
         raise ModelError(f"pressure on body {body.name!r}: the surface has no faces")
     return Pressure(surface, law)
@@ -145,8 +147,9 @@ def clamp_support(body: Body, nodes: NodeSet, slots: str, components: str) -> Su
 
 
 def drive_supports(
-    body: Body, nodes: NodeSet, displacement: Any, rotation: Any, components: str, slots: str | None
-) -> list[Support]:
+    body: Body, nodes: NodeSet, displacement: Any, rotation: Any, components: str, slots: str | None,
+    name: str | None = None,
+) -> list[Support]:  # fmt: skip
     """Support of the driven components, and one that clamps named gradients with a displacement; see
     ModelBuilder.drive.
     """
@@ -159,7 +162,7 @@ def drive_supports(
         if not isinstance(rotation, Rotation):
             raise ModelError(f"{what}: rotation must be a Rotation(anchor, axis, angle), got {rotation!r}")
         support.rotation = checked_rotation(rotation, what)
-        support.law = support.rotation.angle
+        support.law = replace(support.rotation.angle, key=name or "")
         return [support]
     out = []
     position_mask = np.isin(support.slots, support_slots(nodes, "position"))
@@ -173,7 +176,7 @@ def drive_supports(
         if values.shape != (len(times), len(nodes), 3):
             raise ModelError(f"{what}: values have shape {values.shape}, expected {(len(times), len(nodes), 3)}")
         used = np.flatnonzero(body.node_slot[nodes.indices] >= 0)
-        support.node_laws = [time_law((times, values[:, k]), what) for k in used]
+        support.node_laws = [time_law((times, values[:, k]), what, key=name) for k in used]
     else:
-        support.law = time_law(displacement, f"{what}: displacement")
+        support.law = time_law(displacement, f"{what}: displacement", key=name)
     return [*out, support]

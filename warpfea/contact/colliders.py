@@ -196,9 +196,7 @@ class ColliderContact(ContactTerm, DifferentiableContact):
         for group in self.tables.groups:
             if group.data.edge_rows:
                 args = [self.tables.data, s["other"], group.data, s["history"], s["clock"], u, *state, active, settled]
-                launch(
-                    self.rolling_kernels.place_points, group.point_threads(self.model.worlds), [*args, s["attempt"]]
-                )
+                launch(self.rolling_kernels.place_points, group.point_threads(self.model.worlds), [*args, s["attempt"]])
 
     def _choose_deepest(self, ctx: StepContext, active: wp.array, *, fresh: int) -> None:
         """Select the point of each single-point contact at work.u."""

@@ -171,23 +171,20 @@ class Adjoint:
         found = [known[name] for term in terms if name in (known := term.gradients(ctx))]
         if name in INITIAL and not self.static:
             return found
-        if name in laws.controls:
-            indices = [law for (control, _), law in laws.control_laws.items() if control == name]
-            for law in indices:
-                given = [term.law_gradient(ctx, law) for term in terms]
-                given += self.model.terms.supports.law_gradients(law)
-                found += [lambda gradient=gradient: gradient for gradient in given if gradient is not None]
+        for law in laws.indices_of(name):
+            given = [term.law_gradient(ctx, law) for term in terms]
+            given += self.model.terms.supports.law_gradients(law)
+            found += [lambda gradient=gradient: gradient for gradient in given if gradient is not None]
         if not found:
             known = [key for term in terms for key in term.gradients(ctx)]
-            known += [MESH, *laws.controls, *(() if self.static else INITIAL)]
+            known += [MESH, *laws.names, *(() if self.static else INITIAL)]
             hint = did_you_mean(name, known) if isinstance(name, str) else ""
             raise ModelError(f"Adjoint: {name!r} has no derivative; there are: {listing(known)}{hint}")
         return found
 
     def _size_of(self, name: str) -> int:
         """Numbers of a parameter in a world and step."""
-        control = self.model.terms.time_laws.controls.get(name)
-        return control.size if control else 3 if name == "gravity" else 1
+        return 3 if name == "gravity" else self.model.terms.time_laws.size_of(name)
 
     # forward
 

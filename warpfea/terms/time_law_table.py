@@ -54,6 +54,21 @@ class TimeLawTable:
         self.laws.append(law)
         return len(self.laws) - 1
 
+    @property
+    def names(self) -> list[str]:
+        """Names of controls and of laws with a key."""
+        return [*self.controls, *dict.fromkeys(law.key for law in self.laws if law.key)]
+
+    def indices_of(self, name: str) -> list[int]:
+        """Laws of a control or key."""
+        controls = [law for (control, _), law in self.control_laws.items() if control == name]
+        return controls + [k for k, law in enumerate(self.laws) if law.key == name and law.control is None]
+
+    def size_of(self, name: str) -> int:
+        """Number of components of a control or of the laws with a key; 1 of other names."""
+        keyed = [law for law in self.laws if law.key == name]
+        return self.controls[name].size if name in self.controls else 3 if any(not w.scalar for w in keyed) else 1
+
     def register(self, state: State) -> None:
         """Add missing arrays of control values to a state."""
         for control in self.controls.values():
