@@ -1,6 +1,5 @@
 """wf.Adjoint: gradients of runs and equilibria against differences and closed forms, what is refused, what it costs."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import floor_term
@@ -150,6 +149,13 @@ def test_free_fall():
     assert g["initial.velocity"][0].sum(axis=0) == pytest.approx([0, 0, t[-1]], rel=1e-12, abs=1e-13)
     assert g["initial.displacement"][0].sum(axis=0) == pytest.approx([0, 0, 1], rel=1e-12, abs=1e-12)
     assert g["box.density"] == pytest.approx(0.0, abs=1e-15)
+    adaptive = wf.Simulation(sim.model, dt="auto", error=1e-4, interval=4e-3, solver=SOLVER)
+    parts = wf.Adjoint(adaptive, ["gravity"])
+    parts.run(3)
+    h = np.array([part["dt"].numpy()[0] for part in parts.kept[:-1]])
+    assert len(h) > 3 and h.sum() == pytest.approx(adaptive.time[0], rel=1e-13)
+    parts.probe("tip").displacement.grad.assign([[[0, 0, 0], [0, 0, 0], [0, 0, 1.0]]])
+    assert parts.backward()["gravity"].numpy()[0, 2] == pytest.approx(h @ np.cumsum(h), rel=1e-12)
     velocity = np.zeros((1, n, 3))
     velocity[0, -1, 2] = 1.0
     p.position.grad.zero_()
@@ -279,14 +285,13 @@ def test_terms_and_schemes_without_an_adjoint_are_refused_by_name():
     for change, match in {
         "'generalized_alpha' has no adjoint": {"integrator": INTEGRATORS["generalized_alpha"]},
         "result of solve_static": {"integrator": INTEGRATORS["static"]},
-        "variable length": {"t_end": np.ones(1)},
         "float32": {"model": SimpleNamespace(dtype="float32")},
     }.items():
         with pytest.raises(wf.ModelError, match=change):
             check_simulation(SimpleNamespace(**(sim | match)), False)
 
 
-def test_misuse_is_refused(monkeypatch):
+def test_misuse_is_refused():
     m = bar()
     sim = wf.Simulation(m, dt=1e-3)
     with pytest.raises(wf.ModelError, match=r"'box.F' has no derivative; .*box.E"):
@@ -309,10 +314,34 @@ def test_misuse_is_refused(monkeypatch):
     sim.reset()
     tape.run(1)
     assert tape.steps == 1
-    report = sim.last
-    monkeypatch.setattr(sim, "step", lambda: replace(report, halvings=np.ones(1, int)))
-    with pytest.raises(wf.ModelError, match="was halved"):
-        tape.run(1)
+
+
+def halving(rows, worlds=slice(None)):
+    """Tape of worlds that halve their steps, for lack of iterations; all but the last."""
+    m = models.model(models.solid("T4"), models.material(), len(rows[worlds]))
+    m.many = False
+    m.set_parameter("body.E", 1e6 * (1.0 + rows[worlds, 0]))
+    m.set_gravity(10.0 * GRAVITY * (1.0 + rows[worlds, 1:2]))
+    solver = wf.NewtonPCG(tol=1e-12, max_newton=1)
+    sim = wf.Simulation(m, dt=2e-2, solver=solver)
+    tape = wf.Adjoint(sim, ["body.E", "gravity"])
+    tape.run(4)
+    loss = wf.loss.sum_of_squares(tape.probe("tip"), np.full((4, 3), TARGET))
+    return tape, loss, {name: array.numpy() for name, array in tape.backward(loss).items()}
+
+
+def test_halved_steps_are_differentiated_part_by_part():
+    rows = np.concatenate([shifts(2), [[0.0, -0.99]]])
+    tape, loss, g = halving(rows)
+    assert len(tape.kept) - 1 > tape.steps
+    took = np.array([part["status"].numpy() == 0 for part in tape.kept[:-1]])
+    assert took.sum(axis=0)[-1] == tape.steps < took.sum(axis=0)[0]
+    exact = [1e6 * g["body.E"][0], g["gravity"][0] @ (10.0 * GRAVITY)]
+    errors = best_differences(loss.numpy()[:-1], exact)
+    assert (errors < TOLERANCE).all(), errors
+    for world in (0, len(rows) - 1):
+        _, _, alone = halving(rows, slice(world, world + 1))
+        assert all(np.array_equal(alone[name][0], g[name][world]) for name in g)
 
 
 def test_failed_worlds():

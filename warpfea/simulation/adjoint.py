@@ -9,63 +9,37 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 
-from ..base.console import compile_progress_bar, format_bytes, quiet_warp
-from ..base.errors import CapacityError, ConvergenceError, ModelError, ModelWarning
+from ..base.console import compile_progress_bar, quiet_warp
+from ..base.errors import ConvergenceError, ModelError, ModelWarning
 from ..base.launch import load_modules
 from ..base.memory import convert_memory_errors
 from ..base.names import did_you_mean, listing
 from ..kernels.step.step_control import STATUS
-from ..model.state import MONITOR_ARRAYS, is_solver_history
 from ..solvers import NewtonPCG
 from ..solvers.adjoint import AdjointSolver
 from ..terms.gradients import Gradient, StepAdjoint
 from ..terms.protocols import Differentiable
 from ..terms.shape_gradients import MESH, MeshGradient
-from ..terms.time_law_table import control_array
-from .capacity import RESERVED_FRACTION, free_bytes
 from .simulation import Simulation
 from .statics import StaticResult
 from .stepper import Stepper
+from .tape import Tape
 
 if TYPE_CHECKING:
     from ..model.model import Model
 
-__all__ = ["Adjoint", "Gradients", "ProbeArrays", "check_simulation", "check_terms"]
+__all__ = ["Adjoint", "Gradients", "check_simulation", "check_terms"]
 
 INITIAL = ("initial.displacement", "initial.velocity")
 MAX_RESIDUAL = 1e-6
 """Largest relative residual of an adjoint solve: beyond, the gradient of a world is refused."""
 MAX_PCG, MAX_WORK = 20_000, 2**30
 """Iterations of a solve, as in statics, and of a step, no limit."""
-NOT_KEPT = ("ledger", "ledger_time", "status", *MONITOR_ARRAYS)
-"""State arrays that no step depends on."""
-
-
-@dataclass(eq=False)
-class ProbeArrays:
-    """A probe of a tape: displacement, velocity and position, arrays (worlds, steps, 3) with gradients, m and m/s.
-
-    Attributes:
-        slot, weight, offset: its slots, each once, their weights, and its reference position.
-    """
-
-    slot: wp.array
-    weight: wp.array
-    offset: wp.vec3d
-    displacement: wp.array
-    velocity: wp.array
-    position: wp.array
-
-    @property
-    def arrays(self) -> tuple[wp.array, wp.array, wp.array]:
-        """The three arrays."""
-        return self.displacement, self.velocity, self.position
 
 
 class Gradients(dict[str, wp.array]):
@@ -79,11 +53,11 @@ class Gradients(dict[str, wp.array]):
     switches: np.ndarray
 
 
-class Adjoint:
+class Adjoint(Tape):
     """Tape of a run, or of an equilibrium, and its gradients.
 
     Args:
-        sim: a Simulation with a fixed dt, or a result of `solve_static`.
+        sim: a Simulation, or a result of `solve_static`.
         with_respect_to: names of `Model.set_parameter` of materials, "gravity", controls, "initial.displacement",
             "initial.velocity", and "mesh.X", the reference values of all slots.
         tol: relative residual of the adjoint solves, in the D^-1 norm.
@@ -93,7 +67,7 @@ class Adjoint:
         residual: (worlds,) largest relative residual of the adjoint solves of the last `backward`.
         growth: (worlds,) norm of the right side of the first step over that of the last, of the last `backward`: how
             much a run amplifies what disturbs its start.
-        steps: number of steps kept.
+        steps, kept, ends: as of `Tape`.
 
     Raises:
         ModelError: an unknown name, or a term, scheme or precision without an adjoint, by name.
@@ -105,12 +79,11 @@ class Adjoint:
         budget: int | None = None,
     ) -> None:  # fmt: skip
         self.static = isinstance(sim, StaticResult)
-        self.sim: Simulation = sim.simulation if isinstance(sim, StaticResult) else sim
-        self.model = m = self.sim.model
+        super().__init__(sim.simulation if isinstance(sim, StaticResult) else sim, budget)
+        m = self.model
         if not (isinstance(tol, float) and 0.0 < tol < 1.0):
             raise ModelError(f"Adjoint: tol = {tol!r} must lie between 0 and 1")
         self.names = [with_respect_to] if isinstance(with_respect_to, str) else list(with_respect_to)
-        self.budget = budget
         check_simulation(self.sim, self.static)
         check_terms(m, self.sim.stepper.ctx)
         with convert_memory_errors(f"an adjoint of {m.worlds} worlds", m.device):
@@ -118,18 +91,13 @@ class Adjoint:
                 self._make_solver(tol, bar)
             self.mesh = MeshGradient(self.stepper.ctx) if MESH in self.names else None
             self.outputs = {name: self._sources(name) for name in self.names}
-        self.kept: list[dict[str, wp.array]] = []
-        self.probes: dict[str, ProbeArrays] = {}
-        self.steps = 0
         self.residual = self.growth = np.zeros(m.worlds)
-        self._updates = self.model.terms.parameter_updates
         self._sums = {name: self._zeros(self._size_of(name)) for name in self.names}
         self._sums |= {MESH: self.mesh.zeros()} if self.mesh else {}
-        self._graph: wp.Graph | None = None  # of a step back, with the derivatives of the coefficients at hand
         if self.static:
-            self.kept = [self._snapshot()]
+            self.kept = [self._snapshot() | {"status": wp.clone(self.sim.state.status)}]
             self.kept *= 2
-            self.steps = 1
+            self.ends = [1]
 
     def __repr__(self) -> str:
         return f"Adjoint({self.steps} steps of {self.model.worlds} worlds, with respect to {', '.join(self.names)})"
@@ -186,95 +154,6 @@ class Adjoint:
         """Numbers of a parameter in a world and step."""
         return 3 if name == "gravity" else self.model.terms.time_laws.size_of(name)
 
-    # forward
-
-    def run(self, steps: int) -> None:
-        """Advance the simulation, and keep its steps, after those kept so far unless it was reset since.
-
-        Raises:
-            ModelError: a step that was halved; parameters set since the first step; a static result.
-            ConvergenceError: as `Simulation.step`. CapacityError: more bytes than the budget.
-        """
-        if self.static:
-            raise ModelError("Adjoint: an equilibrium has no steps to run")
-        if self.kept and not np.array_equal(self.kept[-1]["time"].numpy(), self.sim.time):
-            self.clear()
-        self._check_budget(steps)
-        if not self.kept and self._updates != self.model.terms.parameter_updates:
-            self._updates, self._graph = self.model.terms.parameter_updates, None
-        self._check_parameters()
-        with convert_memory_errors(f"a tape of {steps} steps", self.model.device):
-            if not self.kept:
-                self.kept = [self._snapshot()]
-            for _ in range(steps):
-                given = self._controls() | {"dt": wp.clone(self.sim.stepper.work.step.dt)}
-                report = self.sim.step()
-                alive = self.sim.status == STATUS["running"]
-                if (report.halvings[alive] > 0).any():
-                    raise ModelError(
-                        f"Adjoint: the step to t = {float(self.sim.time.max()):g} s was halved, and its parts are not "
-                        "kept: take a smaller dt"
-                    )
-                self.kept[-1] |= given  # for the step
-                self.kept.append(self._snapshot())
-                self.steps += 1
-        self.probes.clear()
-
-    def clear(self) -> None:
-        """Forget the steps kept."""
-        self.kept, self.steps = [], 0
-        self.probes.clear()
-
-    def _check_budget(self, steps: int) -> None:
-        free = free_bytes(self.model.device)
-        room = self.budget if self.budget is not None else None if free is None else int((1 - RESERVED_FRACTION) * free)
-        arrays = self.sim.state.bytes
-        size = sum(arrays[name] for name in self._kept_names())
-        kept = self.steps if self.budget is not None else 0
-        if room is not None and (kept + steps + 1) * size > room:
-            raise CapacityError(
-                f"Adjoint: {kept + steps} steps of {format_bytes(size)} exceed {format_bytes(room)}; maximum: "
-                f"{max(room // size - 1, 0)} steps",
-                bytes=(kept + steps + 1) * size, per_world=size // self.model.worlds,
-            )  # fmt: skip
-
-    def _check_parameters(self) -> None:
-        if self.model.terms.parameter_updates != self._updates:
-            raise ModelError("Adjoint: parameters were set after the first step of the tape; reset the simulation")
-
-    def _kept_names(self) -> list[str]:
-        state = self.sim.state
-        return [n for n in state.names if not is_solver_history(n) and n not in NOT_KEPT and n in self.state.names]
-
-    def _snapshot(self) -> dict[str, wp.array]:
-        return {name: wp.clone(getattr(self.sim.state, name)) for name in self._kept_names()}
-
-    def _controls(self) -> dict[str, wp.array]:
-        names = [control_array(name) for name in self.model.terms.time_laws.controls]
-        return {name: wp.clone(getattr(self.sim.state, name)) for name in names}
-
-    def probe(self, name: str) -> ProbeArrays:
-        """Probe of the steps kept; the derivatives of a loss by its arrays are their `.grad`."""
-        known = [p.name for p in self.model.description.probes]
-        if name not in known:
-            raise ModelError(f"probe {name!r} is unknown; there are: {listing(known)}{did_you_mean(name, known)}")
-        if name in self.probes:
-            return self.probes[name]
-        m, given = self.model, self.model.description.probes[known.index(name)]
-        slots, index = np.unique(given.body.slot_offset + given.slots, return_inverse=True)
-        weights = np.bincount(index, weights=given.weights)
-        shape = (m.worlds, self.steps, 3)
-        arrays: list[Any] = [wp.zeros(shape, dtype=wp.float64, device=m.device, requires_grad=True) for _ in range(3)]
-        slot: wp.array = wp.array(slots, dtype=wp.int32, device=m.device)
-        weight: wp.array = wp.array(weights, dtype=m.types.T, device=m.device)
-        out = ProbeArrays(slot, weight, wp.vec3d(*given.X), *arrays)
-        for k in range(self.steps):
-            end = self.kept[k + 1]
-            args = [slot, weight, out.offset, end["displacement"], end["velocity"], k, *arrays]
-            self.stepper.launch(self.solver.kernels.probe_values, m.worlds, args)
-        self.probes[name] = out
-        return out
-
     # backward
 
     def backward(self, loss: Any = None) -> Gradients:
@@ -297,17 +176,13 @@ class Adjoint:
             raise ModelError("Adjoint: no step to go back; run(steps) first")
         self._check_parameters()
         m, a = self.model, self.solver
-        if loss is not None:
-            for array in (array for probe in self.probes.values() for array in probe.arrays):
-                array.grad.zero_()
-            loss.backward()
+        self._take_loss(loss)
         sums, series = self._sums, dict[str, wp.array]()
         for array in sums.values():
             array.zero_()
         for name in (name for name in self.names if name in m.terms.time_laws.controls):
             series[name] = self._zeros(self.steps, self._size_of(name))
         self.stepper.set_dt(1.0)  # of statics; others follow
-        self.state.status.assign(self.sim.state.status)
         self.stepper.newton.invalidate(wp.ones(m.worlds, dtype=wp.int32, device=m.device))
         for array in (*a.bars.values(), a.control.residual, self.at.switches):
             array.zero_()
@@ -317,11 +192,10 @@ class Adjoint:
         add_probes = self._probe_commands()
         for k in reversed(range(self.steps)):
             self._add_probes(add_probes, k)
-            self._load(k)
-            self._graph = self._graph or self._capture(sums)
             for name in series:
                 sums[name].zero_()
-            wp.capture_launch(self._graph)
+            for part in self.parts(k):
+                self._step_back(part, sums)
             for name, array in series.items():
                 wp.copy(array[:, k], sums[name])
             if not last.any():
@@ -336,9 +210,21 @@ class Adjoint:
         found.switches = self.at.switches.numpy()
         return found
 
+    def _take_loss(self, loss: Any) -> None:
+        """Write the derivatives of a loss by the probes' arrays to their `.grad`."""
+        if loss is not None:
+            for array in (array for probe in self.probes.values() for array in probe.arrays):
+                array.grad.zero_()
+            loss.backward()
+
     def _zeros(self, *shape: int) -> wp.array:
         """Zeros [world, ...], float64."""
         return wp.zeros((self.model.worlds, *shape), dtype=wp.float64, device=self.model.device)
+
+    def _step_back(self, part: int, sums: dict[str, wp.array]) -> None:
+        self._load(part)
+        self._graph = self._graph or self._capture(sums)
+        wp.capture_launch(self._graph)
 
     def _capture(self, sums: dict[str, wp.array]) -> wp.Graph:
         """Graph of one step back, from the state at its start."""
@@ -398,11 +284,11 @@ class Adjoint:
             command.set_param_at_index(2, k)
             command.launch()
         if self.mesh:
-            self.mesh.add_probes(self.stepper.launch, self.probes, k, self.kept[k + 1], self._sums[MESH])
+            self.mesh.add_probes(self.stepper.launch, self.probes, k, self.kept[self.ends[k]], self._sums[MESH])
 
-    def _load(self, k: int) -> None:
-        """The state at the start of a step, with the joint forces and velocities at its end."""
-        start, end = self.kept[k], self.kept[k + 1]
+    def _load(self, part: int) -> None:
+        """The state at the start of a part of a step, with the joint forces and velocities at its end."""
+        start, end = self.kept[part], self.kept[part + 1]
         for name, array in start.items():
             into = self.stepper.work.step.dt if name == "dt" else getattr(self.state, name)
             wp.copy(into, end[name] if name == "constraint_force" else array)
@@ -436,8 +322,6 @@ def check_simulation(sim: Any, static: bool) -> None:
         raise ModelError(f"Adjoint: integrator {scheme.name!r} has no adjoint; take 'backward_euler' or 'bdf2'")
     if scheme.static != static:
         raise ModelError("Adjoint: of statics it takes the result of solve_static")
-    if sim.stepper.step_size_control or sim.t_end is not None:
-        raise ModelError("Adjoint: steps of variable length have no adjoint; take a fixed dt, without t_end")
     if sim.model.dtype != "float64":
         raise ModelError("Adjoint: float32 can't resolve the residual of an adjoint; take dtype='float64'")
 

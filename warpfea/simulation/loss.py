@@ -11,8 +11,8 @@ import warp as wp
 from ..base.errors import ModelError
 from ..base.launch import Launcher
 from ..kernels.solvers.adjoint import adjoint_kernels
-from .adjoint import ProbeArrays
 from .reports import ProbeRecord
+from .tape import ProbeArrays
 
 __all__ = ["Loss", "sum_of_squares"]
 

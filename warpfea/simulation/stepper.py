@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -307,8 +307,8 @@ class Stepper:
 
     # sequence of launches
 
-    def launch_step(self) -> None:
-        """Launch all kernels of a step."""
+    def launch_step(self, attempt: Callable[[], None] | None = None) -> None:
+        """Launch all kernels of a step; `attempt` in place of `take_attempt`."""
         m, w, launch = self.model, self.work, self.launch
         w.any_flag[2:5].zero_()
         if self.episodes.ends is not None:
@@ -318,7 +318,7 @@ class Stepper:
             assert self.backup is not None
             self.backup.copy_rows(launch, w.step.running, self.state)
             self.step_size_control.begin_interval()
-        wp.capture_while(self.running, self._attempt)
+        wp.capture_while(self.running, attempt or self.take_attempt)
         if self.step_size_control:
             self.step_size_control.end_interval()
         self._write_report()
@@ -365,7 +365,8 @@ class Stepper:
             self.terms.supports.drive(self.ctx, w.step.running)
         self.terms.call(self.ctx, Term, "begin", w.step.running)
 
-    def _attempt(self) -> None:
+    def take_attempt(self) -> None:
+        """Attempt a substep, and accept it where it converges."""
         self.begin_attempt()
         self.newton.run()
         if self.step_size_control:
@@ -425,9 +426,7 @@ class Stepper:
 
     def _update_ledger(self) -> None:
         m, w, launch, state = self.model, self.work, self.launch, self.state
-        accepted = w.step.accepted
-        reduce = self.newton.residual.reduce
-        topo = m.topology
+        accepted, reduce, topo = w.step.accepted, self.newton.residual.reduce, m.topology
         args = [w.step, topo, w.balance, m.masses.lumped_values, state.displacement, state.velocity]
         launch(self.kernels.ledger_terms, self.dim, args)
         reduce(w.rows, LEDGER_TERM_ROWS, accepted, w.ledger_sums)

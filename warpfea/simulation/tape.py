@@ -1,0 +1,201 @@
+"""Tape of a run: the states of all accepted parts of its steps, and probes of these.
+
+A step is one part, or the substeps that a halving or dt="auto" makes of it. Worlds that take no part in one keep their
+state in it. Such a step is taken again from its start, part by part.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from ..base.console import format_bytes
+from ..base.errors import CapacityError, ModelError
+from ..base.memory import convert_memory_errors
+from ..base.names import did_you_mean, listing
+from ..base.worlds import device_flags
+from ..kernels.solvers.adjoint import adjoint_kernels
+from ..kernels.step.step_control import STATUS
+from ..model.state import MONITOR_ARRAYS, is_solver_history
+from ..terms.time_law_table import control_array
+from .capacity import RESERVED_FRACTION, free_bytes
+from .simulation import Simulation
+
+__all__ = ["ProbeArrays", "Tape"]
+
+NOT_KEPT = ("ledger", "ledger_time", "status", "adaptive", "adaptive_means", *MONITOR_ARRAYS)
+"""State arrays that no step depends on."""
+
+
+@dataclass(eq=False)
+class ProbeArrays:
+    """A probe of a tape: displacement, velocity and position, arrays (worlds, steps, 3) with gradients, m and m/s.
+
+    Attributes:
+        slot, weight, offset: its slots, each once, their weights, and its reference position.
+    """
+
+    slot: wp.array
+    weight: wp.array
+    offset: wp.vec3d
+    displacement: wp.array
+    velocity: wp.array
+    position: wp.array
+
+    @property
+    def arrays(self) -> tuple[wp.array, wp.array, wp.array]:
+        """The three arrays."""
+        return self.displacement, self.velocity, self.position
+
+
+class Tape:
+    """States of a run.
+
+    Args:
+        sim: a simulation.
+        budget: largest number of bytes of the steps kept on the device; None: the free memory.
+
+    Attributes:
+        steps: number of steps kept.
+        kept: arrays of the state at the start and after each part of a step, and for the part that begins there its
+            controls, the size "dt" in each world, and the "status", running in worlds that take part.
+        ends: index in `kept` of the end of each step.
+    """
+
+    static = False
+
+    def __init__(self, sim: Simulation, budget: int | None) -> None:
+        self.sim, self.model, self.budget = sim, sim.model, budget
+        self.kept: list[dict[str, wp.array]] = []
+        self.ends: list[int] = []
+        self.probes: dict[str, ProbeArrays] = {}
+        self._updates = self.model.terms.parameter_updates
+        self._graph: wp.Graph | None = None  # of a step back, with the derivatives of the coefficients at hand
+
+    @property
+    def steps(self) -> int:
+        """Number of steps kept."""
+        return len(self.ends)
+
+    def parts(self, step: int) -> list[int]:
+        """Indices of the parts of a step, backwards."""
+        first = self.ends[step - 1] if step else 0
+        return list(reversed(range(first, self.ends[step])))
+
+    def run(self, steps: int) -> None:
+        """Advance the simulation, and keep its steps, after those kept so far unless it was reset since.
+
+        Raises:
+            ModelError: parameters set since the first step; a static result.
+            ConvergenceError: as `Simulation.step`. CapacityError: more bytes than the budget.
+        """
+        if self.static:
+            raise ModelError("Adjoint: an equilibrium has no steps to run")
+        if self.kept and not np.array_equal(self.kept[-1]["time"].numpy(), self.sim.time):
+            self.clear()
+        self._check_budget(steps)
+        if not self.kept and self._updates != self.model.terms.parameter_updates:
+            self._updates, self._graph = self.model.terms.parameter_updates, None
+        self._check_parameters()
+        with convert_memory_errors(f"a tape of {steps} steps", self.model.device):
+            if not self.kept:
+                self.kept = [self._snapshot()]
+            for _ in range(steps):
+                controls = self._controls()
+                report, stepper = self.sim.step(), self.sim.stepper
+                running = self.sim.status == STATUS["running"]
+                running &= self.kept[-1]["time"].numpy() != self.sim.time  # others were at their end
+                divided = running & ((report.halvings > 0) | bool(stepper.step_size_control))
+                if divided.any():
+                    self._take_again(divided, running, controls)
+                else:
+                    self._keep(running, controls)
+                self.ends.append(len(self.kept) - 1)
+        self.probes.clear()
+
+    def _keep(self, chosen: np.ndarray, controls: dict[str, wp.array]) -> None:
+        """Keep a part of a step that the chosen worlds have taken."""
+        status = np.where(chosen, STATUS["running"], STATUS["frozen"]).astype(np.int32)
+        self.kept[-1] |= controls  # for the part
+        self.kept[-1]["dt"] = wp.clone(self.sim.stepper.work.step.h)
+        self.kept[-1]["status"] = wp.array(status, dtype=wp.int32, device=self.model.device)
+        self.kept.append(self._snapshot())
+
+    def _take_again(self, divided: np.ndarray, running: np.ndarray, controls: dict[str, wp.array]) -> None:
+        """Take a step again in worlds that divided it, part by part."""
+        s, state, flags = self.sim.stepper, self.sim.state, device_flags(divided, self.model.device)
+        assert s.backup is not None
+        state.copy_rows(s.launch, flags, s.backup, skip=("status",))
+        s.newton.invalidate(flags)
+        others = running & ~divided
+        if others.any():
+            self._keep(others, controls)
+        status = state.status.numpy().copy()
+        state.status.assign(np.where(divided, status, STATUS["frozen"]).astype(np.int32))
+
+        def attempt() -> None:
+            s.take_attempt()
+            accepted = s.work.step.accepted.numpy() != 0
+            if accepted.any():
+                self._keep(accepted, controls)
+
+        s.launch_step(attempt)
+        state.status.assign(status)
+
+    def clear(self) -> None:
+        """Forget the steps kept."""
+        self.kept, self.ends = [], []
+        self.probes.clear()
+
+    def _check_budget(self, steps: int) -> None:
+        free = free_bytes(self.model.device)
+        room = self.budget if self.budget is not None else None if free is None else int((1 - RESERVED_FRACTION) * free)
+        arrays = self.sim.state.bytes
+        size = sum(arrays[name] for name in self._kept_names())
+        kept = self.steps if self.budget is not None else 0
+        if room is not None and (kept + steps + 1) * size > room:
+            raise CapacityError(
+                f"Adjoint: {kept + steps} steps of {format_bytes(size)} exceed {format_bytes(room)}; maximum: "
+                f"{max(room // size - 1, 0)} steps",
+                bytes=(kept + steps + 1) * size, per_world=size // self.model.worlds,
+            )  # fmt: skip
+
+    def _check_parameters(self) -> None:
+        if self.model.terms.parameter_updates != self._updates:
+            raise ModelError("Adjoint: parameters were set after the first step of the tape; reset the simulation")
+
+    def _kept_names(self) -> list[str]:
+        return [name for name in self.sim.state.names if not is_solver_history(name) and name not in NOT_KEPT]
+
+    def _snapshot(self) -> dict[str, wp.array]:
+        return {name: wp.clone(getattr(self.sim.state, name)) for name in self._kept_names()}
+
+    def _controls(self) -> dict[str, wp.array]:
+        names = [control_array(name) for name in self.model.terms.time_laws.controls]
+        return {name: wp.clone(getattr(self.sim.state, name)) for name in names}
+
+    def probe(self, name: str) -> ProbeArrays:
+        """Probe of the steps kept; the derivatives of a loss by its arrays are their `.grad`."""
+        known = [p.name for p in self.model.description.probes]
+        if name not in known:
+            raise ModelError(f"probe {name!r} is unknown; there are: {listing(known)}{did_you_mean(name, known)}")
+        if name in self.probes:
+            return self.probes[name]
+        m, given = self.model, self.model.description.probes[known.index(name)]
+        slots, index = np.unique(given.body.slot_offset + given.slots, return_inverse=True)
+        weights = np.bincount(index, weights=given.weights)
+        shape = (m.worlds, self.steps, 3)
+        arrays: list[Any] = [wp.zeros(shape, dtype=wp.float64, device=m.device, requires_grad=True) for _ in range(3)]
+        slot: wp.array = wp.array(slots, dtype=wp.int32, device=m.device)
+        weight: wp.array = wp.array(weights, dtype=m.types.T, device=m.device)
+        out = ProbeArrays(slot, weight, wp.vec3d(*given.X), *arrays)
+        kernel = adjoint_kernels(m.dtype, m.terms.traits.constraint_rows).probe_values
+        for k, end in enumerate(self.ends):
+            values = self.kept[end]
+            args = [slot, weight, out.offset, values["displacement"], values["velocity"], k, *arrays]
+            self.sim.stepper.launch(kernel, m.worlds, args)
+        self.probes[name] = out
+        return out
