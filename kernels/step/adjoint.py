@@ -43,6 +43,7 @@ def step_adjoint_kernels(dtype: str, scheme: Any) -> KernelSet:
         c = Coefficients()
         if wp.static(accelerated):
             c = coefficients(step.h[world], step.acceleration_step[world], step.scheme_parameter)
+            c.q_a = step.q_a[world]
         else:
             c.a0 = step.a0[world]
             c.a1 = step.a1[world]

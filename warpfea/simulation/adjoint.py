@@ -25,6 +25,7 @@ from ..solvers.adjoint import AdjointSolver
 from ..terms.gradients import Gradient, StepAdjoint
 from ..terms.protocols import Differentiable
 from ..terms.shape_gradients import MESH, MeshGradient
+from .initial_adjoint import check_initial_conditions, step_back_to_initial
 from .simulation import Simulation
 from .statics import StaticResult
 from .stepper import Stepper
@@ -225,6 +226,9 @@ class Adjoint(Tape):
         self._load(part)
         self._graph = self._graph or self._capture(sums)
         wp.capture_launch(self._graph)
+        if part in self.restarts:
+            h = float(np.max(self.sim.dt))
+            step_back_to_initial(self.stepper, self.at, self.restarts[part], h, self._gradients)
 
     def _capture(self, sums: dict[str, wp.array]) -> wp.Graph:
         """Graph of one step back, from the state at its start."""
@@ -318,8 +322,7 @@ class Adjoint(Tape):
 def check_simulation(sim: Any, static: bool) -> None:
     """ModelError for a simulation whose steps have no adjoint; `static`: of the result of `solve_static`."""
     scheme = sim.integrator
-    if scheme.accelerated:
-        raise ModelError(f"Adjoint: integrator {scheme.name!r} has no adjoint; take 'backward_euler' or 'bdf2'")
+    check_initial_conditions(sim.model, scheme)
     if scheme.static != static:
         raise ModelError("Adjoint: of statics it takes the result of solve_static")
     if sim.model.dtype != "float64":

@@ -65,14 +65,34 @@ class ConsistentInitialConditions:
         self._world = 0  # the world being restarted
         check_rho_inf(ctx.model, integrator, self.has_drives)
 
-    def prepare(self, dt: float) -> None:
-        """Restart the worlds that need it, before a step of size dt, s."""
+    def prepare(self, dt: float) -> np.ndarray:
+        """Restart the worlds that need it, before a step of size dt, s; their flags (B,)."""
         state = self.ctx.state
         time, known = state.time.numpy(), state.acceleration_end.numpy()  # type: ignore[attr-defined]
         after_jump, slope_jump = self._discontinuities_at(time, dt)
         flags = (state.status.numpy() == STATUS["running"]) & ((known != time) | slope_jump)  # type: ignore[attr-defined]
         if flags.any():
             self._restart_worlds(flags, time, after_jump, dt)
+        return flags
+
+    def unbalanced_force(self, flags: np.ndarray, dt: float) -> np.ndarray:
+        """Evaluate the forces of the state, just after a jump there, before a step of size dt; (B, slots, 3), N."""
+        return self._unbalanced_force(flags, self._discontinuities_at(self.ctx.state.time.numpy(), dt)[0], dt)
+
+    def free_mass_solver(self) -> Callable[[int, np.ndarray], np.ndarray]:
+        """Function of a world and (slots, 3): M^-1 of it on the free components, 0 on others."""
+        self._forget_old_factors()
+
+        def solve(world: int, force: np.ndarray) -> np.ndarray:
+            self._world = world
+            return self._solve_mass(force)
+
+        return solve
+
+    def _forget_old_factors(self) -> None:
+        if self._parameter_version != self.model.parameters.version:
+            self._parameter_version = self.model.parameters.version
+            self._mass.clear()
 
     def _discontinuities_at(self, time: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
         """Times (B,) just after a jump at the state, else its own; and flags of a kink within the previous step."""
@@ -103,9 +123,7 @@ class ConsistentInitialConditions:
 
     def _restart_worlds(self, flags: np.ndarray, time: np.ndarray, after_jump: np.ndarray, dt: float) -> None:
         state: Any = self.ctx.state
-        if self._parameter_version != self.model.parameters.version:
-            self._parameter_version = self.model.parameters.version
-            self._mass.clear()
+        self._forget_old_factors()
         laws = self._law_derivatives(flags, after_jump, dt)
         u, v = state.displacement.numpy().astype(float), state.velocity.numpy().astype(float)
         before = self._kinetic_energy(v)

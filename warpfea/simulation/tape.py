@@ -63,6 +63,7 @@ class Tape:
         kept: arrays of the state at the start and after each part of a step, and for the part that begins there its
             controls, the size "dt" in each world, and the "status", running in worlds that take part.
         ends: index in `kept` of the end of each step.
+        restarts: by index in `kept`, flags (worlds,) of worlds whose initial accelerations are those of its state.
     """
 
     static = False
@@ -71,6 +72,7 @@ class Tape:
         self.sim, self.model, self.budget = sim, sim.model, budget
         self.kept: list[dict[str, wp.array]] = []
         self.ends: list[int] = []
+        self.restarts: dict[int, np.ndarray] = {}
         self.probes: dict[str, ProbeArrays] = {}
         self._updates = self.model.terms.parameter_updates
         self._graph: wp.Graph | None = None  # of a step back, with the derivatives of the coefficients at hand
@@ -104,6 +106,7 @@ class Tape:
             if not self.kept:
                 self.kept = [self._snapshot()]
             for _ in range(steps):
+                self._prepare()
                 controls = self._controls()
                 report, stepper = self.sim.step(), self.sim.stepper
                 running = self.sim.status == STATUS["running"]
@@ -115,6 +118,14 @@ class Tape:
                     self._keep(running, controls)
                 self.ends.append(len(self.kept) - 1)
         self.probes.clear()
+
+    def _prepare(self) -> None:
+        """Restart accelerations before the step, and keep the state that it begins with."""
+        if (initial := self.sim.stepper.initial_conditions) is not None:
+            flags = initial.prepare(self.sim.dt)
+            if flags.any():
+                self.kept[-1] = self._snapshot()
+                self.restarts[len(self.kept) - 1] = flags
 
     def _keep(self, chosen: np.ndarray, controls: dict[str, wp.array]) -> None:
         """Keep a part of a step that the chosen worlds have taken."""
@@ -147,7 +158,7 @@ class Tape:
 
     def clear(self) -> None:
         """Forget the steps kept."""
-        self.kept, self.ends = [], []
+        self.kept, self.ends, self.restarts = [], [], {}
         self.probes.clear()
 
     def _check_budget(self, steps: int) -> None:
