@@ -21,7 +21,8 @@ from .checks import vector
 __all__ = ["make_rigid"]
 
 TRIANGLE_ROUND_OFF = 1e-9
-"""Largest violation of the triangle inequality of principal inertias, over the largest."""
+"""Largest violation of the triangle inequality of principal inertias, over the largest; half of the inertia of a rod
+about its axis."""
 NOMINAL_PERIOD = 1e-2
 """Time, s, in which a wave would pass the element whose strains are constrained to zero: its stiffness scales the
 system of a part that is held by others, and acts on no motion."""
@@ -132,13 +133,16 @@ def _second_moments(what: str, inertia: Any) -> np.ndarray:
             f"{what}: inertia = {inertia!r} must be a symmetric (3, 3) tensor or its diagonal (3,), kg m^2"
         )
     principal = np.linalg.eigvalsh(J)
-    second = 0.5 * np.trace(J) * np.eye(3) - J
-    if principal[0] <= 0.0 or np.linalg.eigvalsh(second)[0] < -TRIANGLE_ROUND_OFF * principal[2]:
+    squares, axes = np.linalg.eigh(0.5 * np.trace(J) * np.eye(3) - J)
+    least = TRIANGLE_ROUND_OFF * principal[2]
+    if principal[2] <= 0.0 or min(principal[0], squares[0]) < -least:
         raise ModelError(
-            f"{what}: principal inertias {principal.tolist()} kg m^2 must be positive, and none larger than the sum of "
-            "the other two (no mass has those)"
+            f"{what}: principal inertias {principal.tolist()} kg m^2 must be positive, but for one of a rod, and none "
+            "larger than the sum of the other two (no mass has those)"
         )
-    return second
+    if squares[1] < least:  # a rod: without an inertia about its axis nothing would hold its turn
+        squares[:2] = least
+    return np.asarray(axes * squares @ axes.T)
 
 
 def _surface(what: str, shape: Any) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
