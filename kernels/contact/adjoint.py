@@ -17,7 +17,8 @@ from .kinematics import kinematics_functions
 from .law import OwnLaws, law_names
 from .structs import WITH_STIFFNESS, contact_structs
 
-__all__ = ["PARAMETER_ARRAYS", "contact_adjoint_functions", "contact_adjoint_kernels", "contact_adjoint_struct"]
+__all__ = ["PARAMETER_ARRAYS", "contact_adjoint_functions", "contact_adjoint_kernels", "contact_adjoint_struct",
+           "point_bars_struct"]  # fmt: skip
 
 PARAMETER_ARRAYS = ("mu", "mu_static", "damping", "beta", "scale", "normal_stiffness", "tangential_stiffness",
                     "normal_damping", "effective_mass", "compliance")  # fmt: skip
@@ -48,15 +49,12 @@ def contact_adjoint_struct():
 
 
 @functools.cache
-def contact_adjoint_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
-    """Device function `law_bars`."""
-    Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)
-    law, k = friction_functions(dtype, own), kinematics_functions(dtype)
-    ContactAdjoint = contact_adjoint_struct()
+def point_bars_struct():
+    """Bars of the record of a point."""
 
     @wp.struct
     class PointBars:
-        """Bars of the record of a point, and the force and slip of the same point, without its area."""
+        """Bars of the record of a point, and its forces on the residual and slip after the step, without its area."""
 
         normal: vec3d
         depth: f64
@@ -64,8 +62,19 @@ def contact_adjoint_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
         motion: vec3d
         spring: vec3d
         approach_speed: f64
+        normal_force: vec3d
         friction: vec3d
         slip: vec3d
+
+    return PointBars
+
+
+@functools.cache
+def contact_adjoint_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
+    """Device function `law_bars`."""
+    Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)
+    law, k = friction_functions(dtype, own), kinematics_functions(dtype)
+    ContactAdjoint, PointBars = contact_adjoint_struct(), point_bars_struct()
 
     @wp.func
     def law_work(
@@ -107,7 +116,7 @@ def contact_adjoint_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
     ) -> PointBars:  # fmt: skip
         """Gradient of `law_work`; that by the constants is added to the gradient arrays of `con`."""
         adj.approach_bar[world, point] = f64(0.0)
-        _con, _facets, _his, _scr, _w, _p, _i, _d, bar, _h, _n, friction, slip, _s = wp.grad(law_work)(
+        _con, _facets, _his, _scr, _w, _p, _i, _d, bar, _h, pressed, friction, slip, _s = wp.grad(law_work)(
             con, facets, his, scr, world, point, item, other_depth, record, inv_h, normal_way, friction_way, slip_way,
             speed_bar,
         )  # fmt: skip
@@ -118,6 +127,7 @@ def contact_adjoint_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
         out.motion = bar.relative_motion
         out.spring = bar.spring
         out.approach_speed = adj.approach_bar[world, point]
+        out.normal_force = pressed
         out.friction = friction
         out.slip = slip
         return out

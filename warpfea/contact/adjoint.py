@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -20,10 +20,7 @@ from ..terms.protocols import Differentiable
 from ..terms.term import StepContext, part
 from .tables import MATERIAL_CONSTANTS, POINT_SUM_LANES, bodies_of, contact_constants, restitution_slopes
 
-if TYPE_CHECKING:
-    from .term import ContactTerm
-
-__all__ = ["ContactAdjoint", "DifferentiableContact"]
+__all__ = ["ContactAdjoint", "DifferentiableColliders", "DifferentiableContact", "together"]
 
 POINTS, WEIGHTS = (-2.0, -1.0, 1.0, 2.0), (1.0 / 12.0, -2.0 / 3.0, 2.0 / 3.0, -1.0 / 12.0)
 RELATIVE_STEP = 1e-3
@@ -40,7 +37,7 @@ class ContactAdjoint:
         wanted: names of the constants whose derivatives are wanted.
     """
 
-    def __init__(self, term: ContactTerm, at: StepAdjoint) -> None:
+    def __init__(self, term: Any, at: StepAdjoint) -> None:
         t, m, ctx = term.tables, term.model, at.ctx
         self.term, self.tables, self.ctx = term, t, ctx
         self.kernels = contact_adjoint_kernels(m.dtype, t.own_laws)
@@ -48,10 +45,10 @@ class ContactAdjoint:
         self.scratch, size = scratch, (m.worlds, t.points)
         self.data = contact_adjoint_struct()()
         for name, var in contact_adjoint_struct().vars.items():
-            if name not in ("approach_bar", "switches"):
+            if name not in ("approach_bar", "switches", *term.unused_bars):
                 setattr(self.data, name, self._array(name, size, var.type.dtype))
         self.data.switches = at.switches
-        for name in ("spring_bar", "speed_bar", "start_shift_bar", "start_turn_bar"):
+        for name in term.carried_bars:
             at.bars[f"{term.name} {name}"] = getattr(self.data, name)
         speed = with_gradient(scratch["attempt"].approach_speed)
         self.data.approach_bar = speed.grad
@@ -89,14 +86,23 @@ class ContactAdjoint:
         for array in self.wanted.values():
             array.zero_()
 
-    def spread(self, values: wp.array, active: wp.array, out: wp.array) -> None:
-        """out [world, slot] += values of points at their slots."""
-        m, w, launch, k = self.ctx.model, self.ctx.work, self.ctx.launch, self.kernels
-        w.pool_product.zero_()
+    def spread_points(self, values: wp.array, active: wp.array) -> None:
+        """Values of points on the slots of their facets, into the pool of products."""
+        m, pool = self.ctx.model, self.ctx.work.pool_product
         for group in self.tables.groups:
             dim = (m.worlds, group.conn.shape[1], group.count)
-            launch(k.spread_points, dim, [group.data, values, active, w.pool_product])
-        launch(k.add_pool, (m.worlds, m.slots), [m.topology, w.pool_product, active, out])
+            self.ctx.launch(self.kernels.spread_points, dim, [group.data, values, active, pool])
+
+    def add_pool(self, active: wp.array, out: wp.array) -> None:
+        """out [world, slot] += the pool of products."""
+        m, pool = self.ctx.model, self.ctx.work.pool_product
+        self.ctx.launch(self.kernels.add_pool, (m.worlds, m.slots), [m.topology, pool, active, out])
+
+    def spread(self, values: wp.array, active: wp.array, out: wp.array) -> None:
+        """out [world, slot] += values of points at their slots."""
+        self.ctx.work.pool_product.zero_()
+        self.spread_points(values, active)
+        self.add_pool(active, out)
 
     def sum_of(self, factor: np.ndarray, values: wp.array, *, along: bool = True) -> Gradient:
         """Function that adds the sum over contacts of factor (worlds or 1, contacts) times values of their points; of
@@ -129,16 +135,15 @@ def together(parts: list[Gradient]) -> Gradient:
 
 
 class DifferentiableContact(Differentiable):
-    """Adjoint of a contact term.
+    """Adjoint of a contact term but for its geometry: `exact_product`, `linearise_adjoint`, `add_history_gradient`.
 
-    Members of a geometry:
-
-    =====================  =========================================================================================
-    `adjoint_kernels`      its kernels
-    `linearise_points`     Jacobians, and bars of the end of a step through histories
-    `step_back_points`     bars at the start of a step
-    =====================  =========================================================================================
+    Attributes:
+        adjoint_kernels: of the geometry.
+        carried_bars: bars of histories, in `ContactAdjoint.data`; unused_bars: arrays there that it does without.
     """
+
+    carried_bars: tuple[str, ...] = ("spring_bar", "speed_bar")
+    unused_bars: tuple[str, ...] = ()
 
     tables: Any
     adjoint_kernels: Any
@@ -158,7 +163,7 @@ class DifferentiableContact(Differentiable):
             return "rigid capsules and cylinders that roll (model='patch' takes points on their facets)"
         if t.explicit:
             return "treatment='explicit'"
-        if t.seams is not None:
+        if t.seams:
             return "seams (seam=0 leaves them out)"
         if not ctx.inertia and (t.data.mu_static.numpy() > 0.0).any():
             return "friction in statics, which depends on the path"
@@ -168,7 +173,7 @@ class DifferentiableContact(Differentiable):
         return False
 
     def prepare_adjoint(self, at: StepAdjoint) -> Iterable[wp.Module]:
-        adjoint = ContactAdjoint(self, at)  # type: ignore[arg-type]
+        adjoint = ContactAdjoint(self, at)
         at.ctx.scratch[self.name]["adjoint"] = adjoint
         return {adjoint.kernels.module, self.adjoint_kernels.module}
 
@@ -251,7 +256,11 @@ class DifferentiableContact(Differentiable):
         area = self.tables.region_areas[self.tables.number[contact.index]]
         return contact_constants(contact, area, mass, modulus)
 
-    # in a step back
+
+class DifferentiableColliders(DifferentiableContact):
+    """Adjoint of contact with colliders: a Jacobian for each point."""
+
+    carried_bars = ("spring_bar", "speed_bar", "start_shift_bar", "start_turn_bar")
 
     @part()
     def exact_product(

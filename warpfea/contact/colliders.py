@@ -23,7 +23,7 @@ from ..model.state import State
 from ..model.triangle_mesh import TriMesh
 from ..terms.gradients import Gradient
 from ..terms.term import StepContext, part
-from .adjoint import DifferentiableContact, together
+from .adjoint import DifferentiableColliders, together
 from .collider_tables import ContactTables
 from .evaluation import (
     contact_field,
@@ -49,7 +49,7 @@ POSES = {"position": "previous_position", "rotation": "previous_rotation", "angl
 """History of the colliders in the state, and its names in `Colliders`."""
 
 
-class ColliderContact(ContactTerm, DifferentiableContact):
+class ColliderContact(ContactTerm, DifferentiableColliders):
     """Contacts of a model with its colliders.
 
     Attributes:
@@ -283,7 +283,7 @@ class ColliderContact(ContactTerm, DifferentiableContact):
 
     @cached_property
     def adjoint_kernels(self) -> Any:
-        """Kernels of `DifferentiableContact`."""
+        """Kernels of `DifferentiableColliders`."""
         return collider_adjoint_kernels(self.model.dtype, self.tables.has_meshes, self.tables.own_laws)
 
     def gradients(self, ctx: StepContext) -> Mapping[str, Callable[[], Gradient]]:

@@ -32,6 +32,7 @@ from ..model.state import State, view_as_words
 from ..terms.protocols import Coupled, Tied
 from ..terms.term import StepContext, part
 from .evaluation import contact_field, evaluate_pairs, refuse_deep_overlaps, store_overlaps, touching_depth
+from .facet_adjoint import DifferentiableFacets
 from .facet_tables import PairTables
 from .mode_coupling import PairCoarseTerms, PairRigidModes, coupling_entries
 from .tables import POINT_SUM_LANES
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
 __all__ = ["FacetContact"]
 
 
-class FacetContact(ContactTerm, Tied, Coupled):
+class FacetContact(ContactTerm, DifferentiableFacets, Tied, Coupled):
     """Contacts of a model with facets of its bodies: of points of other bodies, and of narrow obstacles.
 
     Attributes:
@@ -257,7 +258,8 @@ class FacetContact(ContactTerm, Tied, Coupled):
                 ctx.launch(k.middle_projections, group.point_threads(worlds), args)
 
     def _list_points(self, ctx: StepContext) -> None:
-        wp.capture_if(ctx.scratch[self.name]["pair"].lists_changed, self._build_point_lists, ctx=ctx)
+        pair = ctx.scratch[self.name]["pair"]
+        wp.capture_if(pair.lists_changed, self._build_point_lists, ctx=ctx, pair=pair)
 
     def _gather_other_forces(self, ctx: StepContext, active: wp.array) -> None:
         s, lanes = ctx.scratch[self.name], ctx.launch.lanes(POINT_SUM_LANES)
@@ -269,10 +271,10 @@ class FacetContact(ContactTerm, Tied, Coupled):
             threads = (self.model.worlds, edges.edge_count, group.conn.shape[1])
             ctx.launch(self.edge_kernels.move_friction, threads, args)
 
-    def _build_point_lists(self, ctx: StepContext) -> None:
-        """Build the point lists of the master facets."""
+    def _build_point_lists(self, ctx: StepContext, pair: Any) -> None:
+        """Build the lists of the points that each master facet is listed for."""
         s, m, t, k = ctx.scratch[self.name], self.model, self.tables, self.point_list_kernels
-        pair, masters = s["pair"], s["masters"]
+        masters = s["masters"]
         ctx.launch(k.clear_lists, m.worlds * t.facets, [pair])
         ctx.launch(k.count_points, (m.worlds, t.points), [masters, pair])
         ctx.launch(k.sum_chunks, pair.chunk_offset.shape, [masters, pair])
