@@ -1,5 +1,6 @@
 """Gradients through contact and friction: against differences and closed forms; what is refused, what is counted."""
 
+from itertools import pairwise
 from types import SimpleNamespace
 
 import numpy as np
@@ -94,16 +95,17 @@ def thrown(worlds, shapes, mu):
 FLOOR = wf.HalfSpace((0, 0, 1), -GAP), "z-"
 BOX = wf.Box((-0.1 - GAP, 0.05, -0.9), (0.2, 2.0, 2.0)), "x-"
 BALL = wf.Sphere((-0.3 - GAP, 0.053, 0.048), 0.3), "x-"
-RUNS = {
-    "slip and stick": ({"floor": FLOOR, "beside": BOX}, (-0.1, 0.02, -0.1), 8),
-    "round": ({"ball": BALL}, (-0.1, 0.05, 0.02), 6),
+LOW = wf.HalfSpace((0, 0, 1), -3.5e-3), "z-"
+RUNS = {  # shapes, velocity, steps, dt, integrator
+    "slip and stick": ({"floor": FLOOR, "beside": BOX}, (-0.1, 0.02, -0.1), 8, 5e-4, "backward_euler"),
+    "round": ({"ball": BALL}, (-0.1, 0.05, 0.02), 6, 5e-4, "backward_euler"),
+    "impact": ({"floor": LOW}, (0.3, 0.1, -0.1), 5, 1e-2, "bdf2"),
 }
-BDF2 = ("round",)
 
 
 def contact_run(kind, rows=None, worlds=slice(None)):
     """Tape of worlds whose parameters differ by rows; names, values at the base and, as one more, the controls."""
-    shapes, velocity, steps = RUNS[kind]
+    shapes, velocity, steps, dt, integrator = RUNS[kind]
     mu = 0.3
     names = {"box.E": 1e6, "box.nu": 0.3, "box.density": 1000.0, "gravity": np.array([1.0, 0.5, -9.81])}
     for name in shapes:
@@ -119,38 +121,92 @@ def contact_run(kind, rows=None, worlds=slice(None)):
         if name == "gravity":
             m.set_gravity(value * (1.0 + mine[:, k : k + 1]))
         else:
-            base = -GAP * (name == "floor.offset") if name.endswith("offset") else value
+            level = shapes["floor"][0].offset if name == "floor.offset" else 0.0
+            base = level if name.endswith("offset") else value
             m.set_parameter(name, base + value * mine[:, k])
-    sim = wf.Simulation(m, dt=5e-4, solver=SOLVER, integrator="bdf2" if kind in BDF2 else "backward_euler")
+    sim = wf.Simulation(m, dt=dt, solver=SOLVER, integrator=integrator)
     sim.state.velocity.assign(np.tile(velocity, (m.worlds, m.slots, 1)))
     tape = wf.Adjoint(sim, [*names, *paths, "initial.velocity"])
-    slips = []
+    slips, impacts = [], []
     for step in range(steps):
         for k, (name, values) in enumerate(paths.items(), len(names)):
             sim.controls[name][:] = values[step] * (1.0 + mine[:, k : k + 1])
         tape.run(1)
         slips.append((sim.state.contact_contact_state.numpy()[0] >= 1 << 30).sum())
+        impacts += [sim.stepper.work.step.impact.numpy()[0]] if integrator == "bdf2" else []
     loss = wf.loss.sum_of_squares(tape.probe("top").displacement, np.full((1, steps, 3), TARGET))
     g = tape.backward(loss)
     exact = [SHARE * np.sum(g[name].numpy()[0] * value) for name, value in (names | paths).items()]
-    return tape, loss, g, exact, rows, slips
+    return tape, loss, g, exact, rows, slips, impacts
 
 
 @pytest.mark.parametrize("kind", RUNS)
 def test_gradients_through_contact(kind):
-    tape, loss, g, exact, rows, slips = contact_run(kind)
+    tape, loss, g, exact, rows, slips, impacts = contact_run(kind)
     errors = best_differences(loss.numpy(), exact)
     assert (errors < TOLERANCE).all(), errors
     assert (tape.residual < 1e-10).all()
-    assert slips[0] > 0
-    if kind == "round":
+    assert max(slips) > 0
+    if kind != "slip and stick":
+        assert any(impacts) == (kind == "impact")  # a step taken again with backward Euler
         return
     touching = (tape.sim.state.contact_speed.numpy()[0] > 0.0).sum()
     assert 0 < slips[-1] < touching - 4  # some stick
     assert g.switches[0] >= touching + slips[0] - slips[-1]
-    _, _, alone, _, _, _ = contact_run(kind, rows, slice(7, 8))
+    _, _, alone, *_ = contact_run(kind, rows, slice(7, 8))
     assert all(np.array_equal(alone[name].numpy()[0], g[name].numpy()[7]) for name in g)
     assert alone.switches[0] == g.switches[7]
+
+
+BODIES = {
+    "slide": ("T4", (10.0, 3.0, -0.1), 10),  # over several facets
+    "stick": ("T10", (0.05, 0.0, -0.1), 4),  # some points
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", BODIES)
+def test_gradients_through_contact_between_bodies(kind):
+    element, velocity, steps = BODIES[kind]
+    names = {"low.E": 1e6, "top.nu": 0.3, "top.density": 1000.0, "gravity": np.array([1.0, 0.5, -9.81])}
+    names |= {"pad.mu": 0.3, "pad.stiffness": 1.0, "pad.restitution": 0.5}
+    rows = SHARE * shifts(len(names) + 1)
+    b = wf.ModelBuilder(gravity=(0, 0, -9.81))
+    mesh = wf.mesh.box((0.3, 0.3, 0.1), cells=(2, 2, 1), element=element)
+    low = b.add_solid(mesh, material=LAW, name="low")
+    mesh = wf.mesh.box((0.1, 0.1, 0.1), cells=(1, 1, 1), element=element)
+    place = (
+        np.array([[np.cos(0.1), -np.sin(0.1), 0], [np.sin(0.1), np.cos(0.1), 0], [0, 0, 1]]),
+        (0.07, 0.06, 0.1 + GAP),
+    )
+    top = b.add_solid(mesh, material=LAW, name="top", transform=place)
+    b.clamp(low.nodes("z-"))
+    b.add_contact(top.surface("z-"), low.surface("z+"), mu=0.3, restitution=0.5, name="pad")
+    b.add_probe("tip", top.surface("z+"))
+    m = b.finalize(device="cpu", worlds=len(rows))
+    for k, (name, value) in enumerate(names.items()):
+        if name == "gravity":
+            m.set_gravity(value * (1.0 + rows[:, k : k + 1]))
+        else:
+            m.set_parameter(name, value * (1.0 + rows[:, k]))
+    sim = wf.Simulation(m, dt=5e-4, solver=SOLVER)
+    start = np.zeros((m.worlds, m.slots, 3))
+    start[:, m.bodies[1].slot_range] = velocity * (1.0 + rows[:, -1:, None])
+    sim.state.velocity.assign(start)
+    tape = wf.Adjoint(sim, [*names, "initial.velocity"])
+    tape.run(steps)
+    loss = wf.loss.sum_of_squares(tape.probe("tip").displacement, np.full((1, steps, 3), TARGET))
+    g = tape.backward(loss)
+    exact = [SHARE * np.sum(g[name].numpy()[0] * value) for name, value in names.items()]
+    exact.append(SHARE * np.sum(g["initial.velocity"].numpy()[0] * start[0]))
+    errors = best_differences(loss.numpy(), exact)
+    assert (errors < TOLERANCE).all(), errors
+    assert (tape.residual < 1e-10).all()
+    facets = [kept["pairs_facet"].numpy()[0] for kept in tape.kept[1:]]
+    changed = sum(((old != new) & (old > 0) & (new > 0)).sum() for old, new in pairwise(facets))
+    assert changed > 10 or kind == "stick"
+    slips = (sim.state.pairs_contact_state.numpy()[0] >= 1 << 30).sum()
+    assert 0 < slips <= (sim.state.pairs_speed.numpy()[0] > 0.0).sum() - 3 * (kind == "stick")
 
 
 def test_friction_of_a_guided_block():
@@ -200,7 +256,7 @@ def test_features_of_contact_without_an_adjoint_are_refused_by_name():
         b = wf.ModelBuilder()
         box = b.add_solid(wf.mesh.box((0.1, 0.1, 0.1), cells=(1, 1, 1), element="T4"), material=LAW)
         b.add_contact(box, b.add_collider(wf.HalfSpace((0, 0, 1), -1.0)), restitution=0.5, **options)
-        ctx = SimpleNamespace(inertia=inertia, midpoint=False, u_before=None, state=SimpleNamespace(displacement=None))
+        ctx = SimpleNamespace(inertia=inertia, midpoint=False, accelerated=False)
         with pytest.raises(wf.ModelError, match=match):
             check_terms(b.finalize(device="cpu"), ctx)
 

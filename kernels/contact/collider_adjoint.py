@@ -146,7 +146,7 @@ def collider_adjoint_kernels(dtype: str, meshes: bool, own: OwnLaws = ()) -> Ker
                 rotation = col.rotation[world, col.of_contact[c]]
                 B = normal_derivative(col, col.of_contact[c], t.local_position, t.feature)
                 B = rotation * B * wp.transpose(rotation)
-                start_depth = k.depth_at_start(con, facets, his, scr, world, c, point)
+                start_depth = k.depth_at_start(con, facets, his, scr, world, c, item, point)
                 for row in range(4):
                     way = vec3d()
                     slip_way = vec3d()

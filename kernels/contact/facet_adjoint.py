@@ -131,9 +131,7 @@ def facet_adjoint_functions(dtype: str) -> KernelSet:
     @wp.func
     def normal_after(t: FacetPoint, c: Curvature, d: wp.vec2d) -> vec3d:
         """Unit normal after a change of coordinates on the surface."""
-        return wp.normalize(
-            wp.cross(t.tangent_a + d[0] * c.aa + d[1] * c.ab, t.tangent_b + d[0] * c.ab + d[1] * c.bb)
-        )
+        return wp.normalize(wp.cross(t.tangent_a + d[0] * c.aa + d[1] * c.ab, t.tangent_b + d[0] * c.ab + d[1] * c.bb))
 
     @wp.func
     def moved(t: FacetPoint, d: vec3d) -> vec3d:
@@ -204,7 +202,7 @@ def facet_adjoint_kernels(dtype: str, own: OwnLaws = ()) -> KernelSet:
     law_bars, is_slipping = a.law_bars, a.is_slipping
     curvature, field_point, shape_jet, geometry_work = c_.curvature, c_.field_point, c_.shape_jet, c_.geometry_work
     project_on_facet = f_.project_on_facet
-    module = kernel_module("_".join(["facet_adjoint", dtype, *law_names(own)]), max_unroll=SHORT_UNROLL)
+    module = kernel_module("_".join(["facet_adjoint", dtype, *law_names(own)]))
 
     @wp.func
     def store(bars: FacetBars, world: int, point: int, i: int, xi: vec3d, t: FacetPoint):
@@ -290,7 +288,10 @@ def facet_adjoint_kernels(dtype: str, own: OwnLaws = ()) -> KernelSet:
                 if lowest > f64(MIN_APPROACH_SPEED):
                     speed_bar = b.approach_speed
                 b.approach_speed = f64(0.0)
-            x, x_n, v_bar, at_base, at_place, at_anchor, at_start_place, at_start_base, at_velocity, _0, _1, _2, _3, _4, _5, _6, _7, turned_bar, _8 = wp.grad(geometry_work)(
+            (
+                x, x_n, v_bar, at_base, at_place, at_anchor, at_start_place, at_start_base, at_velocity, _0, _1, _2, _3,
+                _4, _5, _6, _7, turned_bar, _8,
+            ) = wp.grad(geometry_work)(
                 t.position, scr.start_position[world, point], v,
                 surface_point(mas, pair.displacement, world, f, base), place,
                 surface_point(mas, pair.displacement, world, first, from0), start_place,

@@ -15,17 +15,18 @@ from typing import Any
 import warp as wp
 
 from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
-from ..common.structs import mass_functions, topology_struct
-from ..common.types import double_1d, int_1d, precision
+from ..common.structs import IMPACT_REPEATED, mass_functions, topology_struct
+from ..common.types import double_1d, f64, int_1d, precision
 from .step_control import Coefficients, step_struct
 
 __all__ = ["step_adjoint_kernels"]
 
 
 @functools.cache
-def step_adjoint_kernels(dtype: str, scheme: Any) -> KernelSet:
+def step_adjoint_kernels(dtype: str, scheme: Any, impacts: bool = False) -> KernelSet:
     """Kernels in one precision for a scheme, as of `step_kernels`.
 
+    `impacts`: a step may have been taken again with backward Euler, which changes v_{n-1}, see `accept_state`.
     Bars `q_before`, `v_before` are those of q_{n-1} and v_{n-1} of multistep schemes, of a_n and w_n of schemes with
     accelerations, else those of q_n and v_n, unused.
     """
@@ -35,7 +36,8 @@ def step_adjoint_kernels(dtype: str, scheme: Any) -> KernelSet:
     mass_times = mass_functions(dtype).mass_times
     multistep, takes_velocity, accelerated = scheme.multistep, scheme.takes_velocity, scheme.accelerated
     coefficients = scheme.coefficients
-    module = kernel_module(f"step_adjoint_{dtype}_{scheme.kernel_variant}")
+    impacts = impacts and multistep
+    module = kernel_module(f"step_adjoint_{dtype}_{scheme.kernel_variant}{'_impacts' * impacts}")
 
     @wp.func
     def step_coefficients(step: Step, world: int) -> Coefficients:
@@ -54,13 +56,22 @@ def step_adjoint_kernels(dtype: str, scheme: Any) -> KernelSet:
         return c
 
     @wp.func
+    def stops(step: Step, world: int) -> bool:
+        """True for a step that was taken again with backward Euler."""
+        if wp.static(impacts):
+            return step.impact[world] == IMPACT_REPEATED
+        return False
+
+    @wp.func
     def velocity_bar(
-        c: Coefficients, v_bar: p.vec3_2d, q_before: p.vec3_2d, v_before: p.vec3_2d, world: int, slot: int
+        step: Step, c: Coefficients, v_bar: p.vec3_2d, q_before: p.vec3_2d, v_before: p.vec3_2d, world: int, slot: int
     ) -> vec3:
         """V."""
         V = v_bar[world, slot]
         if wp.static(accelerated):
             V += T(c.a_v) * q_before[world, slot] + T(c.mass_factor) * v_before[world, slot]
+        if stops(step, world):
+            V += v_before[world, slot]
         return V
 
     @wp.func
@@ -85,7 +96,7 @@ def step_adjoint_kernels(dtype: str, scheme: Any) -> KernelSet:
         """V + d q_bar; w = 0."""
         world, slot = wp.tid()
         c = step_coefficients(step, world)
-        V = velocity_bar(c, v_bar, q_before, v_before, world, slot)
+        V = velocity_bar(step, c, v_bar, q_before, v_before, world, slot)
         out[world, slot] = V + T(c.dq_dv) * q_bar[world, slot]
         w[world, slot] = vec3()
 
@@ -99,7 +110,7 @@ def step_adjoint_kernels(dtype: str, scheme: Any) -> KernelSet:
         c = step_coefficients(step, world)
         scale = T(1.0) / T(c.dq_dv)
         momentum = T(c.mass_factor) * mass_times(topo, w, world, slot)
-        V = velocity_bar(c, v_bar, q_before, v_before, world, slot)
+        V = velocity_bar(step, c, v_bar, q_before, v_before, world, slot)
         r = -gradient[world, slot]
         held = r - wp.cw_mul(topo.free[slot], r)
         drive = wp.cw_mul(driven[slot], r)
@@ -107,10 +118,16 @@ def step_adjoint_kernels(dtype: str, scheme: Any) -> KernelSet:
         q_start = scale * (held - drive)
         v_start = vec3()
         if wp.static(multistep):
+            remembered = v_before[world, slot]
             q_start += q_before[world, slot]
-            v_start += v_before[world, slot]
             q_before[world, slot] = vec3()
             v_before[world, slot] = -T(c.a1) * v_tilde
+            if stops(step, world):
+                previous = step.acceleration_step[world]
+                ratio = wp.where(previous > f64(0.0), step.h[world] / wp.max(previous, f64(1.0e-300)), f64(0.0))
+                remembered = T(-ratio) * remembered
+                v_before[world, slot] = v_before[world, slot] - remembered
+            v_start += remembered
         if wp.static(accelerated):
             a_bar = q_before[world, slot]
             v_tilde -= T(c.mass_factor) * v_before[world, slot]

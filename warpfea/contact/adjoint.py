@@ -155,8 +155,8 @@ class DifferentiableContact(Differentiable):
 
     def not_differentiable(self, ctx: StepContext) -> str | None:
         t = self.tables
-        if ctx.midpoint or ctx.u_before is not ctx.state.displacement:
-            return "an integrator but 'backward_euler'"
+        if ctx.midpoint or ctx.accelerated:
+            return "mid-point schemes and schemes with accelerations"
         if t.has_single_point:
             return "contacts of model='sphere'"
         if t.rolls:

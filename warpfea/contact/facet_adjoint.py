@@ -82,7 +82,9 @@ class DifferentiableFacets(DifferentiableContact):
             ctx.launch(kernel, (self.model.worlds, self.tables.other_entries), args)
 
     @part()
-    def exact_product(self, ctx: StepContext, p: wp.array, active: wp.array, *, transposed: bool) -> None:
+    def exact_product(
+        self, ctx: StepContext, p: wp.array, active: wp.array, *, transposed: bool, start: bool = False
+    ) -> None:  # fmt: skip
         if not transposed:
             raise ModelError(f"Adjoint: {self.name!r} has no products of forward sensitivities")
         a = self.adjoint(ctx)

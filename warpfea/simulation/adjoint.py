@@ -118,6 +118,7 @@ class Adjoint(Tape):
         self.solver = a = AdjointSolver(s.newton, s.integrator, driven, tol)
         a.reactions = bool(np.any(m.terms.supports.driven())) or not {INITIAL[0], MESH}.isdisjoint(self.names)
         self.end_velocity = s.work.array("adjoint end velocity", (m.worlds, m.slots), m.types.vec3)
+        self.impact = wp.zeros(m.worlds, dtype=wp.int32, device=m.device) if s.impact_terms else None
         self.at = StepAdjoint(s.ctx, a, s.work.z, wp.zeros(m.worlds, dtype=wp.int32, device=m.device))
         of_terms = [module for term in m.terms.having(Differentiable) for module in term.prepare_adjoint(self.at)]
         modules = {module.name: module for module in {*a.modules(), *self._term_modules(), *of_terms}}
@@ -294,7 +295,7 @@ class Adjoint(Tape):
         """The state at the start of a part of a step, with the joint forces and velocities at its end."""
         start, end = self.kept[part], self.kept[part + 1]
         for name, array in start.items():
-            into = self.stepper.work.step.dt if name == "dt" else getattr(self.state, name)
+            into = {"dt": self.stepper.work.step.dt, "impact": self.impact}.get(name) or getattr(self.state, name)
             wp.copy(into, end[name] if name == "constraint_force" else array)
         if self.static:
             self.end_velocity.zero_()
@@ -308,6 +309,8 @@ class Adjoint(Tape):
         """Evaluate the step at its converged end: forces, D, penalties."""
         s, w = self.stepper, self.stepper.work
         s.launch(s.kernels.begin_step, self.model.worlds, [w.step, w.newton, w.pcg])
+        if self.impact:  # which steps were taken again with backward Euler
+            wp.copy(w.step.impact, self.impact)
         s.begin_attempt()
         wp.copy(w.v, self.end_velocity)
         newton, running = s.newton, w.newton.active

@@ -132,6 +132,8 @@ class Tape:
         status = np.where(chosen, STATUS["running"], STATUS["frozen"]).astype(np.int32)
         self.kept[-1] |= controls  # for the part
         self.kept[-1]["dt"] = wp.clone(self.sim.stepper.work.step.h)
+        if self.sim.stepper.impact_terms:  # those taken again with backward Euler
+            self.kept[-1]["impact"] = wp.clone(self.sim.stepper.work.step.impact)
         self.kept[-1]["status"] = wp.array(status, dtype=wp.int32, device=self.model.device)
         self.kept.append(self._snapshot())
 

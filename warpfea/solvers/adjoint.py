@@ -88,7 +88,7 @@ class AdjointSolver:
         m, w = self.model, self.work
         self.constrained = m.terms.traits.constraint_rows
         self.kernels = adjoint_kernels(m.dtype, self.constrained)
-        self.step_kernels = step_adjoint_kernels(m.dtype, integrator)
+        self.step_kernels = step_adjoint_kernels(m.dtype, integrator, newton.ctx.traits.impacts)
 
         def field(name: str) -> wp.array:
             return w.array(f"adjoint {name}", (m.worlds, m.slots), m.types.vec3)
