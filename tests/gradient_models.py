@@ -56,6 +56,12 @@ def linked(kind, worlds=1, device="cpu"):
         end = second.at((0.2, 0.01, 0.01))
         b.add_spring((0.25, 0.01, 0.1), end, stiffness=20.0, damping=0.1, rest=0.08, name="s")
         b.add_foundation(first.surface("z-"), stiffness=2e4, damping=30.0, name="bed")
+    elif kind == "friction":
+        start = {"parent": wf.GROUND, "child": first.surface("x-"), "anchor": (0, 0.01, 0.01), "axis": (0, 1, 0)}
+        b.add_joint("revolute", **start, friction=0.05, name="hip")
+        b.add_joint("revolute", axis=(0, 1, 0), **pair, friction=1e-3, name="knee")
+        b.add_bushing(second.surface("x+"), wf.GROUND, name="mount", stiffness=(20, 30, 10, 0.02, 0.03, 0.04),
+                      damping=(0.1, 0.2, 0.3, 1e-3, 1.2e-3, 1.5e-3))  # fmt: skip
     elif kind == "loads":
         b.clamp(first.nodes("x-"))
         b.add_joint("spherical", **pair)
@@ -85,6 +91,13 @@ SPRINGS = {
     "s.rest": 0.08, "bed.stiffness": 2e4, "bed.damping": 30.0,
 }  # fmt: skip
 """Parameters of `linked("springs")`."""
+
+
+FRICTION = {
+    "hip.friction": 0.05, "knee.friction": 1e-3, "mount.stiffness": np.array((20, 30, 10, 0.02, 0.03, 0.04)),
+    "mount.damping": np.array((0.1, 0.2, 0.3, 1e-3, 1.2e-3, 1.5e-3)),
+}  # fmt: skip
+"""Parameters of `linked("friction")`: one joint sticks, the other slips."""
 
 
 def controls(kind, steps):

@@ -7,7 +7,7 @@ import warp as wp
 from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.structs import topology_struct
 from ..common.types import double_1d, double_2d, f64, int_1d, mat33d, precision, vec3d, vec3d_2d
-from .bounded_laws import bounded_functions
+from .bounded_laws import FRICTION, STOP, bounded_functions
 from .spring_coordinates import CHORD, VECTOR, coordinate_functions
 from .spring_laws import OwnForces, law_functions, spring_struct
 from .springs import mat33d_2d, scratch_struct, spring_kernels
@@ -30,6 +30,7 @@ def parameter_struct():
         first: wp.int32  # items of the spring
         last: wp.int32
         in_motion: wp.float64  # 1, or 0 in statics
+        stiffness: wp.float64  # change of the stiffness by the parameter besides, of FRICTION
 
     return Parameter
 
@@ -53,15 +54,17 @@ def spring_gradient_kernels(
         sp, reference, winding = spr.spring[item], scr.reference[world, item], scr.winding[world, item]
         if wp.static(bounded):
             if spr.law[sp] < 0:
-                value, total = k.scheduled(spr, law_value, world, sp), f64(0.0)
+                value, stiffness = k.scheduled(spr, law_value, world, sp), spr.stiffness[world, sp]
                 y0, anchor = scr.start[world, item], scr.anchor[world, item]
-                for side in range(2):
-                    step = f64(STEP) * f64(1 - 2 * side)
-                    out = more.bounded_force(
-                        spr, world, sp, winding, y0, y, reference + step * by[0], inverse, anchor + step * by[1], value
-                    )
-                    total += out[0] / (f64(2.0) * step)
-                return total
+                slope = more.bounded_force(spr, world, sp, winding, y0, y, reference, inverse, anchor, value)[1]
+                if slope == f64(0.0):
+                    return f64(0.0)
+                rate = slope - stiffness
+                if spr.law[sp] == STOP:
+                    p = more.penetration(spr, world, sp, winding, y)
+                    if p * more.penetration(spr, world, sp, winding, reference) <= f64(0.0):
+                        rate = f64(0.0)
+                return -by[0] * rate - by[1] * stiffness
         return -by[0] * inverse * law.viscous_force(spr, world, sp, y + winding, (y - reference) * inverse)[2]
 
     @masked_kernel(module, "active")
@@ -88,6 +91,46 @@ def spring_gradient_kernels(
         bar = -sign * factor[world] * slope * wp.ddot(c.derivatives(kind, V, y).g, D)
         before = spr.reference[item] + k.vectors(spr, past, world, item)
         out[world, item] = bar * c.derivatives(kind, before, c.coordinate(kind, before, y0)).g
+
+    if bounded:
+
+        @masked_kernel(module, "active")
+        def end_anchors(
+            spr: Springs, u: p.vec3_2d, anchor_bar: double_2d, active: int_1d, scr: Scratch, out: mat33d_2d
+        ):
+            """Bars of the vectors at the end of a step by anchors that slip along; those of the start for the others."""
+            world, item = wp.tid()
+            out[world, item] = mat33d()
+            sp = spr.spring[item]
+            if spr.law[sp] != FRICTION:
+                return
+            V = spr.reference[item] + k.vectors(spr, u, world, item)
+            y = c.coordinate(spr.kind[item], V, scr.start[world, item])
+            if spr.stiffness[world, sp] * wp.abs(y - scr.anchor[world, item]) >= spr.max_force[world, sp]:
+                out[world, item] = anchor_bar[world, item] * c.derivatives(spr.kind[item], V, y).g
+                anchor_bar[world, item] = f64(0.0)
+
+        @masked_kernel(module, "active")
+        def start_anchors(
+            spr: Springs, u: p.vec3_2d, u_n: p.vec3_2d, law_value: vec3d_2d, anchor: double_2d, dq_dv: double_1d,
+            w: p.vec3_2d, active: int_1d, scr: Scratch, anchor_bar: double_2d, out: mat33d_2d,
+        ):  # fmt: skip
+            """Bars of anchors at the start, and of the vectors there by those that begin at y."""
+            world, item = wp.tid()
+            out[world, item] = mat33d()
+            kind = spr.kind[item]
+            if spr.law[spr.spring[item]] != FRICTION:
+                return
+            V = spr.reference[item] + k.vectors(spr, u, world, item)
+            y0 = scr.start[world, item]
+            y = c.coordinate(kind, V, y0)
+            by = wp.vec2d(f64(0.0), f64(1.0))
+            slope = force_slope(spr, law_value, f64(1.0) / dq_dv[world], y, by, world, item, scr)
+            work = slope * wp.ddot(c.derivatives(kind, V, y).g, k.vectors(spr, w, world, item))
+            anchor_bar[world, item] = anchor_bar[world, item] - work
+            if wp.isnan(anchor[world, item]):
+                V0 = spr.reference[item] + k.vectors(spr, u_n, world, item)
+                out[world, item] = anchor_bar[world, item] * c.derivatives(kind, V0, y0).g
 
     @masked_kernel(module, "active")
     def sum_entries(
@@ -130,6 +173,7 @@ def spring_gradient_kernels(
         value = parameter[world, chosen.column]
         if chosen.law >= 0:
             value = law_value[world, chosen.law][0]
+        stiffness = spr.stiffness[world, chosen.column]
         total, width = f64(0.0), f64(1.0)
         if wp.isfinite(value):
             step = f64(STEP) * wp.max(wp.abs(value), f64(1.0))
@@ -140,6 +184,8 @@ def spring_gradient_kernels(
                     law_value[world, chosen.law] = vec3d(shifted, f64(0.0), f64(0.0))
                 else:
                     parameter[world, chosen.column] = shifted
+                    if chosen.stiffness != f64(0.0):
+                        spr.stiffness[world, chosen.column] = stiffness + chosen.stiffness * (shifted - value)
                 if side < 2:
                     for item in range(chosen.first, chosen.last):
                         part = power(spr, u, start, law_value, chosen.in_motion, dq_dv[world], w, world, item, scr)

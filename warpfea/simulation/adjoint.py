@@ -154,7 +154,8 @@ class Adjoint(Tape):
 
     def _size_of(self, name: str) -> int:
         """Numbers of a parameter in a world and step."""
-        return 3 if name == "gravity" else self.model.terms.time_laws.size_of(name)
+        bushings = [f"{b.name}.{field}" for b in self.model.description.bushings for field in ("stiffness", "damping")]
+        return 6 if name in bushings else 3 if name == "gravity" else self.model.terms.time_laws.size_of(name)
 
     # backward
 

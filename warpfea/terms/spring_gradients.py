@@ -9,17 +9,22 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
+from ..base.errors import ModelError
 from ..kernels.terms.bounded_laws import FRICTION
 from ..kernels.terms.spring_coordinates import CHORD, VECTOR
 from ..kernels.terms.spring_gradients import parameter_struct, spring_gradient_kernels
+from ..model.springs import bushing_parts
 from .gradients import Gradient, StepAdjoint, compile_kernels
 from .protocols import Differentiable
 from .term import StepContext, part
 
 if TYPE_CHECKING:
-    from ..model.springs import Spring
+    from ..model.springs import Bushing, Spring
 
 __all__ = ["DifferentiableSprings"]
+
+ANCHOR = "spring_anchor"
+"""State array of the anchors of friction."""
 
 
 class DifferentiableSprings(Differentiable):
@@ -40,7 +45,12 @@ class DifferentiableSprings(Differentiable):
             return "springs of lengths and angles in steps of generalized_alpha or energy_momentum"
         if self.impacts and "previous_displacement" in ctx.state.names:
             return "stops in steps of bdf2, which takes impacts by other steps"
-        return "friction of joints" if any(spring.law == FRICTION for spring in self.springs) else None
+        return "friction of joints in statics" if self.has_friction and not ctx.inertia else None
+
+    @property
+    def has_friction(self) -> bool:
+        """True with friction of joints."""
+        return any(spring.law == FRICTION for spring in self.springs)
 
     @property
     def gradient_kernels(self) -> Any:
@@ -52,22 +62,46 @@ class DifferentiableSprings(Differentiable):
             name: partial(self._parameter_gradient, ctx, k, field)
             for k, spring in enumerate(self.springs)
             for name, field in spring.parameters.items()
+        } | {
+            f"{bushing.name}.{field}": partial(self._bushing_gradient, ctx, bushing, field)
+            for bushing in self.model.description.bushings
+            for field in ("stiffness", "damping")
         }
 
-    def _parameter_gradient(self, ctx: StepContext, k: int, field: str, law: int = -1) -> Gradient:
+    def _bushing_gradient(self, ctx: StepContext, bushing: Bushing, field: str) -> Gradient:
+        """By the six values of a bushing; 0 of those whose springs were left out."""
+        slopes = bushing_parts(np.eye(6), damping=field == "damping").T
+        if field == "damping":  # products of an axis with itself are clipped from below
+            slopes[6::4] = bushing_parts(np.eye(6), damping=False).T[3:6]
+        k = [self.springs.index(spring) for spring in bushing.springs]
+        found = [(self._parameter_gradient(ctx, n, field), slopes[part]) for n, part in zip(k, bushing.parts)]
+        values = getattr(self.data, self.device_fields[field]).numpy()[:, k]
+        if field == "damping" and any(p in (6, 10, 14) and not values[:, n].all() for n, p in enumerate(bushing.parts)):
+            raise ModelError(f"Adjoint: {bushing.name!r} is damped about one axis by no more than about the two others")
+
+        def add(at: StepAdjoint, out: wp.array) -> None:
+            for gradient, slope in found:
+                for n in np.flatnonzero(slope):
+                    gradient(at, out[:, n : n + 1], float(slope[n]))
+
+        return add
+
+    def _parameter_gradient(self, ctx: StepContext, k: int, field: str, law: int = -1) -> Callable[..., None]:
         """By a parameter of spring k, or by its time law."""
         kernel, chosen = self.gradient_kernels.parameter_gradient, parameter_struct()()
         items = np.flatnonzero(self.definition["spring"] == k)
         chosen.first, chosen.last = int(items[0]), int(items[-1]) + 1
         chosen.column, chosen.law, chosen.in_motion = k, law, float(ctx.inertia)
+        if self.springs[k].law == FRICTION and self.springs[k].stick > 0.0:
+            chosen.stiffness = 1.0 / self.springs[k].stick
         array = getattr(self.data, self.device_fields[field])
         compile_kernels(self.model, [kernel])
 
-        def add(at: StepAdjoint, out: wp.array) -> None:
+        def add(at: StepAdjoint, out: wp.array, factor: float = 1.0) -> None:
             w, (start, _) = at.ctx.work, self.start_of_step(at.ctx)
             args = [self.data, w.u, start, w.time_law_stage_values, w.step.dq_dv, array, chosen, at.w, at.active]
             at.ctx.launch(kernel, self.model.worlds, [*args, at.ctx.scratch[self.name][0], at.sums])
-            at.accumulate(out, -1.0)
+            at.accumulate(out, -factor)
 
         return add
 
@@ -82,8 +116,23 @@ class DifferentiableSprings(Differentiable):
         return add if parts else None
 
     def prepare_adjoint(self, at: StepAdjoint) -> Iterable[wp.Module]:
-        """Modules of `add_history_gradient`."""
+        if self.has_friction:
+            at.bars[ANCHOR] = at.ctx.work.array(f"adjoint {ANCHOR}", (self.model.worlds, self.count), wp.float64)
         return {self.gradient_kernels.module} if at.ctx.inertia else set()
+
+    @part("springs")
+    def linearise_adjoint(self, at: StepAdjoint) -> None:
+        if self.has_friction:
+            scratch = at.ctx.scratch[self.name][0]
+            args = [self.data, at.ctx.work.u, at.bars[ANCHOR], at.active, scratch, scratch.product]
+            at.ctx.launch(self.gradient_kernels.end_anchors, (self.model.worlds, self.count), args)
+            self._sum_entries(at, 0)
+            at.add_to("displacement", at.scratch)
+
+    def _sum_entries(self, at: StepAdjoint, vector: int) -> None:
+        """Bars of the items at their slots, into at.scratch; `vector`: those of VECTOR, or of the others."""
+        args = [self.model.topology, self.data, self.offset, at.ctx.scratch[self.name][0].product, vector, at.active]
+        at.ctx.launch(self.gradient_kernels.sum_entries, at.dim, [*args, at.scratch])
 
     @part("springs")
     def add_history_gradient(self, at: StepAdjoint) -> None:
@@ -99,9 +148,14 @@ class DifferentiableSprings(Differentiable):
             args = [self.data, w.u, u, w.time_law_stage_values, factor, sign, w.step.dq_dv, at.w, at.active, scratch]
             ctx.launch(k.rate_bars, (m.worlds, self.count), [*args, scratch.product])
             for vector in (0, 1) if n == 0 else (0,):
-                args = [m.topology, self.data, self.offset, scratch.product, vector, at.active, at.scratch]
-                ctx.launch(k.sum_entries, at.dim, args)
+                self._sum_entries(at, vector)
                 if vector:
                     at.add_predictor_bar(at.scratch, at.active)
                 else:
                     at.add_to(name, at.scratch)
+        if self.has_friction:
+            args = [self.data, w.u, ctx.state.displacement, w.time_law_stage_values, getattr(ctx.state, ANCHOR)]
+            args += [w.step.dq_dv, at.w, at.active, scratch, at.bars[ANCHOR], scratch.product]
+            ctx.launch(k.start_anchors, (m.worlds, self.count), args)
+            self._sum_entries(at, 0)
+            at.add_to("displacement", at.scratch)
