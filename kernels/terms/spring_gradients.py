@@ -129,8 +129,8 @@ def spring_gradient_kernels(
             work = slope * wp.ddot(c.derivatives(kind, V, y).g, k.vectors(spr, w, world, item))
             anchor_bar[world, item] = anchor_bar[world, item] - work
             if wp.isnan(anchor[world, item]):
-                V0 = spr.reference[item] + k.vectors(spr, u_n, world, item)
-                out[world, item] = anchor_bar[world, item] * c.derivatives(kind, V0, y0).g
+                before = spr.reference[item] + k.vectors(spr, u_n, world, item)
+                out[world, item] = anchor_bar[world, item] * c.derivatives(kind, before, y0).g
 
     @masked_kernel(module, "active")
     def sum_entries(
