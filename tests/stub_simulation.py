@@ -101,11 +101,11 @@ class StubSim:
             return np.linalg.norm(self.displacements(body), axis=2)
         return 1e6 * (body.mesh.points[:, 0] - body.mesh.points[:, 0].min() + self.time[:, None])
 
-    def skin_points(self, body):
-        return self.positions(body)[:, body.skin.nodes]
+    def skin_points(self, body, worlds=None):
+        return self.positions(body)[slice(None) if worlds is None else worlds][:, body.skin.nodes]
 
-    def skin_field(self, name, body):
-        return self.field(name, body)[:, body.skin.nodes]
+    def skin_field(self, name, body, worlds=None):
+        return self.field(name, body)[slice(None) if worlds is None else worlds][:, body.skin.nodes]
 
 
 def drive(sim, writer, steps, watch=None):

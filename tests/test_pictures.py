@@ -10,7 +10,7 @@ import pytest
 from stub_simulation import FAR, StubSim, drive, left_over, tet_box
 
 from warpfea.base.errors import ModelError, OutputError
-from warpfea.outputs.colormap import map_colors
+from warpfea.outputs.colormap import map_colors, to_linear
 from warpfea.outputs.normals import smooth_corners
 from warpfea.outputs.raycaster import Camera, Renderer, nice_number
 from warpfea.outputs.render import GIFWriter, PNGWriter
@@ -215,6 +215,91 @@ def test_options_of_pictures_draw_what_they_say(tmp_path):
     assert near[0] < 0.5 * near[1]
 
 
+def square(height, low=0.0, high=1.0):
+    """Points and triangles of a horizontal square, seen from above."""
+    points = np.array([[low, low, height], [high, low, height], [high, high, height], [low, high, height]])
+    return points, np.array([[0, 1, 2], [0, 2, 3]])
+
+
+def test_transparent_surfaces_blend_in_their_order():
+    """Behind a square of opacity 0.3 the light is 0.3 of its own and 0.7 of that behind, whichever comes first."""
+    (low, triangles), (high, _) = square(0.0), square(0.5, 0.25, 0.75)
+    points, both = np.concatenate([low, high]), np.concatenate([triangles, triangles + 4])
+    colors = np.repeat([[0.8, 0.2, 0.2], [0.2, 0.3, 0.9]], 4, axis=0)
+    camera = Camera.framing(points, view=(0, 89), aspect=1.0)
+
+    def cast(rows, opacity=None, **options):
+        renderer = Renderer(both[rows], opacity=opacity, **options)
+        return to_linear(renderer.render(points, colors, camera, (64, 64)) / 255.0)[24:40, 24:40]
+
+    below, above, solid = cast([0, 1]), cast([2, 3]), cast([0, 1, 2, 3])
+    seen = cast([0, 1, 2, 3], np.array([1.0, 1.0, 0.3, 0.3]))
+    assert np.abs(above - below).max() > 0.2
+    assert np.abs(seen - (0.3 * above + 0.7 * below)).max() < 0.006
+    assert np.abs(seen - cast([3, 2, 1, 0], np.array([0.3, 0.3, 1.0, 1.0]))).max() < 1e-6
+    assert (cast([0, 1, 2, 3], np.ones(4)) == solid).all()
+    assert np.abs(cast([0, 1, 2, 3], np.array([1.0, 1.0, 0.0, 0.0])) - below).max() < 1e-6  # nor a shadow
+
+
+def test_obstacles_with_a_grid():
+    """Dark lines at round coordinates of the surface, that move with it."""
+    points, triangles = square(0.0)
+    camera = Camera.framing(points, view=(0, 90), aspect=1.0)
+    step = 0.5 * nice_number(0.2 * camera.size)
+    colors = np.full((4, 3), 0.6)
+    for shift in (0.0, 0.3 * step):
+        moved = points + np.array([0.0, shift, 0.0])
+        row = int(camera.project(np.array([0.5 + 0.5 * step, 0.5, 0.0]), (200, 200))[1])  # between lines
+        pictures = [
+            Renderer(triangles, reference=points, gridded=mask)
+            .render(moved, colors, camera, (200, 200))[row, :, 0]
+            .astype(int)
+            for mask in (None, np.ones(2, dtype=bool))
+        ]
+        lines = [
+            camera.project(np.array([0.5, k * step + shift, 0.0]), (200, 200))[0] for k in range(round(1 / step) + 1)
+        ]
+        dark = np.flatnonzero(pictures[0] - pictures[1] > 12)
+        assert len(lines) >= 4
+        assert max(np.abs(np.array(lines)[:, None] - dark - 0.5).min(axis=0)) < 2.0  # no other
+        assert max(np.abs(np.array(lines[1:-1])[:, None] - dark - 0.5).min(axis=1)) < 2.0  # every one
+
+
+def test_the_low_end_of_a_map_shows_form():
+    """Lightness (CIELAB) over a box of the lowest value."""
+    points, _, triangles = tet_box((1, 1, 1), (2, 2, 2))
+    images, spread = {}, {}
+    for name in ("viridis", "coolwarm"):
+        colors = map_colors(np.zeros(len(points)), 0.0, 1.0, name)
+        images[name] = to_linear(Renderer(triangles).render(points, colors, size=(96, 96)) / 255.0)
+    inside = np.abs(images["coolwarm"] - images["viridis"]).max(axis=2) > 0.01
+    assert inside.sum() > 500
+    for name, image in images.items():
+        light = 116.0 * np.cbrt(image[inside] @ (0.2126, 0.7152, 0.0722)) - 16.0
+        spread[name] = np.ptp(np.percentile(light, (5, 95)))
+    assert spread["coolwarm"] > 10.0 > spread["viridis"] > 0.0, spread
+
+
+def test_bodies_seen_through_and_rigid_parts(tmp_path):
+    plain = bodies_picture(tmp_path)
+    through = bodies_picture(tmp_path, opacity={"bar": 0.4})
+    assert changed(plain, through, 8) > 1000
+    assert (bodies_picture(tmp_path, opacity={"bar": 0.0}) == bodies_picture(tmp_path, hide=["bar"])).mean() > 0.6
+    assert changed(plain, bodies_picture(tmp_path, colors="coolwarm")) > 1000
+    grey = bodies_picture(tmp_path, field=None)
+    sim = StubSim(far=(0.2, 0.5, 0.0), worlds=1)
+    for body in sim.bodies:
+        body.rigid = True
+    path = tmp_path / "rigid.png"
+    drive(sim, PNGWriter(path, size=(240, 135)), 15)
+    from PIL import Image
+
+    rigid = np.asarray(Image.open(path)).astype(int)
+    assert (np.ptp(grey[:, :190], axis=2) > 40).sum() == 0
+    hues = [((rigid[..., a] - rigid[..., b])[:, :190] > 25).sum() for a, b in ((0, 2), (2, 0))]
+    assert min(hues) > 300  # the bar is blue, the box brown, and there is no bar of colours
+
+
 def test_camera_follows_and_ranges_are_chosen(tmp_path):
     followed = bodies_picture(tmp_path, follow="2nd box", field=None)
     at = bodies_picture(tmp_path, target=(0.35, 0.65, 0.15 - 0.5 * 0.15**2), field=None)
@@ -238,6 +323,9 @@ def test_camera_follows_and_ranges_are_chosen(tmp_path):
         ({"marks": ("suport",)}, "did you mean 'support'"),
         ({"zoom": 0.0}, "zoom"),
         ({"cut": ("y", 0.0)}, "cut must be"),
+        ({"opacity": {"bar": 1.5}}, "opacity of 'bar'"),
+        ({"opacity": {"bat": 0.5}}, "there are bar, 2nd box"),
+        ({"colors": "virides"}, "did you mean 'viridis'"),
         ({"percentile": (90, 10)}, "percentile"),
         ({"target": (0, 0)}, "target"),
         ({"hide": ["bar "]}, "there are bar, 2nd box"),

@@ -7,6 +7,11 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 4})
 
+MAX_LAYERS = wp.constant(200)
+"""Bound of the surfaces that a ray goes through: cut away, or transparent."""
+GRID = wp.constant(8)
+"""Bit of `Scene.sides`."""
+
 
 @wp.struct
 class Scene:
@@ -31,9 +36,11 @@ class Scene:
     shadow_map: wp.array2d(dtype=float)  # light (0 .. 1) that reaches the ground
     shadow_map_corner: wp.vec2  # corner of the shadow map
     shadow_cell_size: float  # size of its cells
-    sides: wp.array(
-        dtype=wp.int32
-    )  # [face] bits 1, 2, 4: the side opposite its corner is an edge of an element; or empty
+    blocker: wp.uint64  # id of a wp.Mesh: the opaque surfaces, which cast shadows
+    opacity: wp.array(dtype=float)  # [face] 0 .. 1; or empty, all opaque
+    reference: wp.array(dtype=wp.vec3)  # [vertex] coordinates of the grids on surfaces; or empty
+    # [face] bits 1, 2, 4: the side opposite its corner is an edge of an element; bit 8: drawn with a grid; or empty
+    sides: wp.array(dtype=wp.int32)
     ghost: wp.uint64  # id of a wp.Mesh seen through, the undeformed surface
     has_ghost: int
     cut: wp.vec4  # direction and place of a section; nothing beyond it is drawn
@@ -97,7 +104,7 @@ def shade_surface(scene: Scene, p: wp.vec3, n: wp.vec3, flat: wp.vec3, albedo: w
     """Colour of a surface at p: light of sky and ground, a key light with shadow, a head light, a small highlight."""
     key = wp.max(wp.dot(n, scene.light_direction), 0.0)
     if key > 0.0:
-        if wp.mesh_query_ray_anyhit(scene.mesh, p + flat * 1.0e-3, scene.light_direction, 10.0):
+        if wp.mesh_query_ray_anyhit(scene.blocker, p + flat * 1.0e-3, scene.light_direction, 10.0):
             key = 0.15 * key
     head = wp.max(-wp.dot(n, ray), 0.0)
     sky = 0.5 + 0.5 * n[2]
@@ -105,22 +112,6 @@ def shade_surface(scene: Scene, p: wp.vec3, n: wp.vec3, flat: wp.vec3, albedo: w
     shine = 0.07 * wp.pow(wp.max(wp.dot(n, half), 0.0), 40.0) * wp.min(key * 4.0, 1.0)
     light = 0.24 + 0.18 * sky + 0.46 * key + 0.26 * head
     return albedo * light + wp.vec3(shine, shine, shine)
-
-
-@wp.func
-def skipped_length(scene: Scene, ray: wp.vec3, reach: float):
-    """Length of a ray from the eye after which nothing is beyond the section."""
-    start = float(0.0)
-    if scene.has_cut == 1:
-        for _ in range(200):
-            hit = wp.mesh_query_ray(scene.mesh, scene.eye + ray * start, ray, reach - start)
-            if not hit.result:
-                break
-            p = scene.eye + ray * (start + hit.t)
-            if p[0] * scene.cut[0] + p[1] * scene.cut[1] + p[2] * scene.cut[2] <= scene.cut[3]:
-                break
-            start += hit.t + 1.0e-5
-    return start
 
 
 @wp.func
@@ -145,6 +136,50 @@ def side_shade(scene: Scene, face: int, p: wp.vec3, distance: float):
     return shade
 
 
+@wp.func
+def grid_shade(scene: Scene, hit: wp.MeshQueryRay, distance: float, facing: float):
+    """Share of black of a grid fixed to a surface: lines at round coordinates of its reference points."""
+    k, w = 3 * hit.face, 1.0 - hit.u - hit.v
+    a = scene.reference[wp.mesh_get_index(scene.mesh, k)]
+    b = scene.reference[wp.mesh_get_index(scene.mesh, k + 1)]
+    c = scene.reference[wp.mesh_get_index(scene.mesh, k + 2)]
+    at = a * hit.u + b * hit.v + c * w
+    n = wp.cross(b - a, c - a)
+    x, y = at[1], at[2]  # the coordinates along the face
+    if wp.abs(n[1]) > wp.abs(n[0]) and wp.abs(n[1]) >= wp.abs(n[2]):
+        x, y = at[0], at[2]
+    if wp.abs(n[2]) > wp.abs(n[0]) and wp.abs(n[2]) > wp.abs(n[1]):
+        x, y = at[0], at[1]
+    pixel = distance * wp.length(scene.up) * 2.0 / scene.height_pixels
+    footprint = pixel / wp.max(facing, 0.1)
+    step = 0.5 * scene.grid_spacing
+    return 0.45 * wp.max(line_coverage(x, step, 0.6 * pixel, footprint), line_coverage(y, step, 0.6 * pixel, footprint))
+
+
+@wp.func
+def surface_color(scene: Scene, hit: wp.MeshQueryRay, p: wp.vec3, distance: float, ray: wp.vec3):
+    """Colour of the surface that a ray meets at p, with its lines."""
+    k, w = 3 * hit.face, 1.0 - hit.u - hit.v
+    n = scene.corner_normals[k] * hit.u + scene.corner_normals[k + 1] * hit.v + scene.corner_normals[k + 2] * w
+    albedo = (
+        scene.colors[wp.mesh_get_index(scene.mesh, k)] * hit.u
+        + scene.colors[wp.mesh_get_index(scene.mesh, k + 1)] * hit.v
+        + scene.colors[wp.mesh_get_index(scene.mesh, k + 2)] * w
+    )
+    n = wp.normalize(n)
+    flat = wp.normalize(hit.normal)
+    if wp.dot(flat, ray) > 0.0:
+        flat = -flat
+    if wp.dot(n, flat) < 0.0:
+        n = -n
+    color = shade_surface(scene, p, n, flat, albedo, ray)
+    if scene.sides.shape[0] > 0:
+        color = color * (1.0 - side_shade(scene, hit.face, p, distance))
+        if scene.sides[hit.face] & GRID != 0:
+            color = color * (1.0 - grid_shade(scene, hit, distance, -wp.dot(flat, ray)))
+    return color
+
+
 @wp.kernel
 def cast_rays(scene: Scene, samples: wp.array(dtype=wp.vec2), out: wp.array(dtype=wp.vec3)):
     """Colour (linear light) of each picture position (pixels, y down)."""
@@ -158,29 +193,25 @@ def cast_rays(scene: Scene, samples: wp.array(dtype=wp.vec2), out: wp.array(dtyp
         reach = (scene.ground_height - scene.eye[2]) / ray[2]
         p = scene.eye + ray * reach
         color = shade_ground(scene, p, reach, -ray[2], color)
-    start = skipped_length(scene, ray, reach)
-    hit = wp.mesh_query_ray(scene.mesh, scene.eye + ray * start, ray, reach - start)
-    depth = reach
-    if hit.result:
-        depth = start + hit.t
-        p = scene.eye + ray * depth
-        w = 1.0 - hit.u - hit.v
-        k = 3 * hit.face
-        n = scene.corner_normals[k] * hit.u + scene.corner_normals[k + 1] * hit.v + scene.corner_normals[k + 2] * w
-        albedo = (
-            scene.colors[wp.mesh_get_index(scene.mesh, k)] * hit.u
-            + scene.colors[wp.mesh_get_index(scene.mesh, k + 1)] * hit.v
-            + scene.colors[wp.mesh_get_index(scene.mesh, k + 2)] * w
-        )
-        n = wp.normalize(n)
-        flat = wp.normalize(hit.normal)
-        if wp.dot(flat, ray) > 0.0:
-            flat = -flat
-        if wp.dot(n, flat) < 0.0:
-            n = -n
-        color = shade_surface(scene, p, n, flat, albedo, ray)
-        if scene.sides.shape[0] > 0:
-            color = color * (1.0 - side_shade(scene, hit.face, p, depth))
+    behind = float(1.0)  # share of the light from behind the surfaces met so far
+    seen = wp.vec3(0.0, 0.0, 0.0)
+    depth = float(reach)
+    start = float(0.0)
+    for _ in range(MAX_LAYERS):
+        hit = wp.mesh_query_ray(scene.mesh, scene.eye + ray * start, ray, reach - start)
+        if not hit.result or behind < 0.01:
+            break
+        start += hit.t
+        p = scene.eye + ray * start
+        if scene.has_cut == 0 or p[0] * scene.cut[0] + p[1] * scene.cut[1] + p[2] * scene.cut[2] <= scene.cut[3]:
+            share = behind
+            if scene.opacity.shape[0] > 0:
+                share = behind * scene.opacity[hit.face]
+            seen += share * surface_color(scene, hit, p, start, ray)
+            behind -= share
+            depth = wp.min(depth, start)
+        start += 1.0e-5
+    color = seen + behind * color
     if scene.has_ghost == 1:
         before = wp.mesh_query_ray(scene.ghost, scene.eye, ray, depth)
         if before.result:
@@ -198,6 +229,6 @@ def cast_shadow(scene: Scene, lights: wp.array(dtype=wp.vec3), shadow: wp.array2
     start = wp.vec3(x, y, scene.ground_height)
     seen = float(0.0)
     for k in range(lights.shape[0]):
-        if not wp.mesh_query_ray_anyhit(scene.mesh, start, lights[k], 20.0):
+        if not wp.mesh_query_ray_anyhit(scene.blocker, start, lights[k], 20.0):
             seen += 1.0
     shadow[i, j] = seen / float(lights.shape[0])

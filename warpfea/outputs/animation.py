@@ -1,5 +1,6 @@
 """Frames of a run and their rendering: camera, colour bar, time label, palette of an animation."""
 
+import functools
 import pathlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -56,6 +57,7 @@ class Animation:
         origin: (3,) m, the frame's. parts: (name, first point, number of points) of bodies and obstacles.
         rest: (P, 3) points at rest; edges: (E, 2) points along edges of elements, of bodies; None: not known.
         mark_kinds: of the points of marks of frames. label: text in place of the time of a frame.
+        by_body: each body has its colour where there is no field.
     """
 
     triangles: npt.NDArray[np.integer[Any]]
@@ -73,6 +75,7 @@ class Animation:
     edges: npt.NDArray[Any] | None = None
     mark_kinds: list[str] = field(default_factory=list)
     label: str = ""
+    by_body: bool = False
     frames: list[Frame] = field(default_factory=list)
 
     def draw(
@@ -98,7 +101,7 @@ class Animation:
             triangles.reshape(-1, 3), reference=self.start_points[used], up_axis=self.up_axis, ground=height,
             edges=self._used_edges(used) if look.edges else None,
             ghost=self._rest_surface(hidden) if look.undeformed else None,
-            cut=self._cut(look) if look.cut else None,
+            cut=self._cut(look) if look.cut else None, **self._surface_options(look, n, shown),
         )  # fmt: skip
         for k in chosen:
             frame = self.frames[k]
@@ -111,7 +114,7 @@ class Animation:
             yield draw_labels(
                 image,
                 self.label or (f"load {100 * frame.time:.4g} %" if self.static else f"t = {frame.time:.{decimals}f} s"),
-                (low, high, self.title, self.units) if barred else None,
+                (low, high, self.title, self.units, look.colors) if barred else None,
                 self._overlay(frame, n, look),
                 self._aimed(camera, frame, look),
             )
@@ -121,6 +124,18 @@ class Animation:
         out = np.zeros(len(self.start_points), dtype=bool)
         for name, first, count in self.parts:
             out[first : first + count] |= name in names
+        return out
+
+    def _surface_options(self, look: Look, n: int, shown: npt.NDArray[np.bool_]) -> dict[str, Any]:
+        """Opacity and grids of the triangles drawn; empty without."""
+        first, out = self.triangles[shown][:, 0], {}
+        if look.opacity:
+            opacity = np.ones(len(self.start_points))
+            for name, value in look.opacity.items():
+                opacity[self._points_of([name])] = value
+            out["opacity"] = opacity[first]
+        if look.collider_grid:
+            out["gridded"] = first >= n
         return out
 
     def _swept(self, hidden: npt.NDArray[np.bool_]) -> Floats:
@@ -140,8 +155,8 @@ class Animation:
         colors[:n] = _BODY_COLOR
         if frame.values is not None:
             finite = np.isfinite(frame.values)
-            colors[:n][finite] = map_colors(frame.values[finite], low, high)
-        elif look.legend:
+            colors[:n][finite] = map_colors(frame.values[finite], low, high, look.colors)
+        elif look.legend or self.by_body:
             for k, (_, first, count) in enumerate(self.parts):
                 if first < n:
                     colors[first : first + count] = _LEGEND_COLORS[k % len(_LEGEND_COLORS)]
@@ -275,13 +290,15 @@ class Animation:
         """Draw all frames, with one palette made from five of them."""
         count = len(self.frames)
         palette_frames = sorted({round(k) for k in np.linspace(0, count - 1, min(5, count))})
-        palette = make_palette(list(self.draw(size, view, palette_frames, look)), self.frames[0].values is not None)
+        some = dict(zip(palette_frames, self.draw(size, view, palette_frames, look)))
+        palette = make_palette(list(some.values()), self.frames[0].values is not None, look.colors)
+        others = self.draw(size, view, [k for k in range(count) if k not in some], look)
         clock = np.round(np.array([frame.time for frame in self.frames]) / speed * 100.0)
         durations = [int(d) for d in np.maximum(np.diff(clock), 2.0) * 10.0] + [int(1000 * _LAST_FRAME_SECONDS)]
         with progress_bar("drawing", "frame", count, progress) as bar:
             pictures = []
-            for image in self.draw(size, view, list(range(count)), look):
-                pictures.append(to_palette(image, palette))
+            for k in range(count):
+                pictures.append(to_palette(some[k] if k in some else next(others), palette))
                 bar.update()
 
         def save(path: pathlib.Path) -> None:
@@ -290,13 +307,13 @@ class Animation:
         write_atomically(target, save)
 
 
-def make_palette(images: list[Image], barred: bool) -> Any:
+def make_palette(images: list[Image], barred: bool, name: str = "viridis") -> Any:
     """A PIL picture holding 256 colours for all `images`.
 
     With a colour bar 64 of them are the colour map. Vivid pixels (bodies) and dull ones (ground, sky) are
     quantised separately, since the latter are numerous and smooth and would take nearly all entries.
     """
-    colors = np.round(255 * map_colors(np.linspace(0, 1, 64 if barred else 0), 0, 1)).astype(np.uint8)
+    colors = np.round(255 * map_colors(np.linspace(0, 1, 64 if barred else 0), 0, 1, name)).astype(np.uint8)
     pixels = np.concatenate([image[::2, ::2].reshape(-1, 3) for image in images])
     vivid = np.max(pixels, axis=1).astype(int) - np.min(pixels, axis=1) > 40
     room = {False: 64, True: 128} if barred else {False: 256}
@@ -311,12 +328,17 @@ def make_palette(images: list[Image], barred: bool) -> Any:
     return palette
 
 
-def to_palette(image: Image, palette: Any) -> Any:
-    """Picture in the palette's colours, with ordered dithering: no banding, static pattern."""
+@functools.lru_cache(maxsize=4)
+def _dither(height: int, width: int) -> npt.NDArray[np.int16]:
+    """(height, width, 1) thresholds of -4 to 4 in squares of 8 x 8 pixels."""
     pattern = np.zeros((1, 1))
     for _ in range(3):
         pattern = np.block([[4 * pattern, 4 * pattern + 2], [4 * pattern + 3, 4 * pattern + 1]])
-    height, width = image.shape[:2]
-    tiles = np.tile((pattern / 63.0 - 0.5) * 8.0, (height // 8 + 1, width // 8 + 1))[:height, :width, None]
-    spread = np.clip(np.round(image + tiles), 0, 255).astype(np.uint8)
+    steps = np.round((pattern / 63.0 - 0.5) * 8.0).astype(np.int16)
+    return np.tile(steps, (height // 8 + 1, width // 8 + 1))[:height, :width, None]
+
+
+def to_palette(image: Image, palette: Any) -> Any:
+    """Picture in the palette's colours, with ordered dithering: no banding, static pattern."""
+    spread = np.clip(image + _dither(*image.shape[:2]), 0, 255).astype(np.uint8)
     return pillow.Image.fromarray(spread).quantize(palette=palette, dither=pillow.Image.Dither.NONE)

@@ -1,9 +1,11 @@
 """Colour maps and the conversions between display (sRGB) and linear colours."""
 
+import functools
+
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["COLOR_TABLE", "hex_tables", "map_colors", "to_linear", "to_srgb"]
+__all__ = ["COLOR_TABLE", "color_table", "hex_tables", "map_colors", "to_linear", "to_srgb"]
 
 # 33 sRGB entries from dark violet over teal to yellow. The hues are those of the viridis family; the entries
 # were re-spaced so that CIELAB lightness rises by 1.9 to 2.8 per entry and the OKLab distance of neighbours
@@ -13,10 +15,6 @@ _HEX_COLORS = (
     "31688e 2d718f 2a798f 27818e 23898d 20918c 1e988b 20a088 21a884 25af80 33b67a "
     "45bd72 55c369 64c95f 73cf55 86d449 9ad93b aedd2f c1e127 d5e420 e9e61e fde725"
 )
-COLOR_TABLE: npt.NDArray[np.float64] = np.array(
-    [[int(entry[k : k + 2], 16) / 255.0 for k in (0, 2, 4)] for entry in _HEX_COLORS.split()]
-)
-"""(33, 3) sRGB components in [0, 1]."""
 # cividis: Nunez, Anderton and Renslow 2018; coolwarm: Moreland 2009; by their usual tables
 _OTHER_HEX_COLORS = {
     "cividis": (
@@ -37,6 +35,17 @@ def hex_tables() -> dict[str, str]:
     return {"viridis": _HEX_COLORS, **_OTHER_HEX_COLORS}
 
 
+@functools.cache
+def color_table(name: str) -> npt.NDArray[np.float64]:
+    """(33, 3) sRGB components of a map of `hex_tables`."""
+    entries = hex_tables()[name].split()
+    return np.array([[int(entry[k : k + 2], 16) / 255.0 for k in (0, 2, 4)] for entry in entries])
+
+
+COLOR_TABLE = color_table("viridis")
+"""(33, 3) sRGB components in [0, 1]."""
+
+
 def to_linear(srgb: npt.ArrayLike) -> npt.NDArray[np.float64]:
     """Linear light of sRGB components in [0, 1], any shape."""
     c = np.asarray(srgb, dtype=np.float64)
@@ -49,8 +58,10 @@ def to_srgb(linear: npt.ArrayLike) -> npt.NDArray[np.float64]:
     return np.where(c <= 0.0031308, c * 12.92, 1.055 * c ** (1.0 / 2.4) - 0.055)
 
 
-def map_colors(values: npt.ArrayLike, low: float, high: float, *, linear: bool = False) -> npt.NDArray[np.float32]:
-    """Colours (..., 3) of scalars (...): `low` and below is dark violet, `high` and above yellow.
+def map_colors(
+    values: npt.ArrayLike, low: float, high: float, name: str = "viridis", *, linear: bool = False
+) -> npt.NDArray[np.float32]:
+    """Colours (..., 3) of scalars (...) by a map: of viridis `low` and below is dark violet, `high` and above yellow.
 
     An empty range (low = high) gives the lowest colour, a non-finite value mid grey. The table is interpolated in
     sRGB; `linear=True` returns linear light, as required by USD's displayColor.
@@ -59,9 +70,10 @@ def map_colors(values: npt.ArrayLike, low: float, high: float, *, linear: bool =
     finite = np.isfinite(v)
     span = float(high) - float(low)
     t = (np.where(finite, v, low) - low) / span if span > 0.0 else np.zeros_like(v)
-    t = np.clip(t, 0.0, 1.0) * (len(COLOR_TABLE) - 1)
-    index = np.minimum(t.astype(np.intp), len(COLOR_TABLE) - 2)
+    table = color_table(name)
+    t = np.clip(t, 0.0, 1.0) * (len(table) - 1)
+    index = np.minimum(t.astype(np.intp), len(table) - 2)
     weight = (t - index)[..., None]
-    rgb = COLOR_TABLE[index] * (1.0 - weight) + COLOR_TABLE[index + 1] * weight
+    rgb = table[index] * (1.0 - weight) + table[index + 1] * weight
     rgb = np.where(finite[..., None], rgb, 0.5)
     return np.asarray(to_linear(rgb) if linear else rgb, dtype=np.float32)

@@ -1,9 +1,9 @@
 """Common parts of output writers: protocol, frame times, file replacement, drawn surface.
 
 A writer receives the simulation and reads `time` (B,), of statics `load` (B,), `dt`, `model.bodies`,
-`model.worlds`, `model.description.up_axis`, `fields` by name, `skin_points(body)` (B, P, 3), `skin_field(name, body)`
-(B, P) and, for nodal formats, `positions`, `displacements`, `velocities` and `field`. Bodies without a skin are not
-drawn.
+`model.worlds`, `model.description.up_axis`, `fields` by name, `skin_points(body, worlds)` (B, P, 3) and
+`skin_field(name, body, worlds)` (B, P) of all worlds (None) or of those numbers and, for nodal formats, `positions`,
+`displacements`, `velocities` and `field`. Bodies without a skin are not drawn.
 """
 
 from collections.abc import Sequence
@@ -152,11 +152,13 @@ class DrawnSurface:
         return 1.25 * float(size[0]), 1.25 * float(size[1 if self.up_axis == "Z" else 2])
 
     @staticmethod
-    def skin_points(sim: Any, body: Any) -> npt.NDArray[np.float64]:
-        """(B, P, 3) current surface points (m) without the grid offsets; OutputError for non-finite ones."""
-        points = np.asarray(sim.skin_points(body), dtype=np.float64)
+    def skin_points(sim: Any, body: Any, worlds: Sequence[int] | None = None) -> npt.NDArray[np.float64]:
+        """(B, P, 3) current surface points (m), of all worlds or some, without the grid offsets; OutputError for
+        non-finite ones."""
+        points = np.asarray(sim.skin_points(body, worlds), dtype=np.float64)
         if not np.isfinite(points).all():
-            world = int(np.argmin(np.isfinite(points).all(axis=(1, 2))))
+            first = int(np.argmin(np.isfinite(points).all(axis=(1, 2))))
+            world = first if worlds is None else worlds[first]
             raise OutputError(
                 f"body {body.name!r}, world {world}: positions are not finite at t = {frame_time(sim):g} s"
             )

@@ -99,7 +99,7 @@ class HTMLWriter(Output):
         self._clock = FrameClock(self.fps)
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
         for body in self._surface.bodies:
-            points = self._surface.skin_points(sim, body)[worlds]
+            points = self._surface.skin_points(sim, body, worlds)
             low, high = np.minimum(low, points.min(axis=(0, 1))), np.maximum(high, points.max(axis=(0, 1)))
         self._origin = 0.5 * (low + high)
         self._frames = []
@@ -111,11 +111,12 @@ class HTMLWriter(Output):
     def _append(self, sim: Any) -> None:
         assert self._frames is not None
         bodies, worlds, time = self._surface.bodies, self._worlds, frame_time(sim)
-        blocks = [self._surface.skin_points(sim, body) for body in bodies] + self._surface.obstacles.points()
-        blocks.append(self._markers.points(sim))
-        points = [np.asarray(block[worlds] - self._origin, dtype=np.float32) for block in blocks]
+        blocks = [self._surface.skin_points(sim, body, worlds) for body in bodies]
+        blocks += [points[worlds] for points in self._surface.obstacles.points()]
+        blocks.append(self._markers.points(sim, worlds=worlds))
+        points = [np.asarray(block - self._origin, dtype=np.float32) for block in blocks]
         values = {
-            name: [np.asarray(sim.skin_field(name, body)[worlds], dtype=np.float32) for body in bodies]
+            name: [np.asarray(sim.skin_field(name, body, worlds), dtype=np.float32) for body in bodies]
             for name in self._names
         }
         energies = {} if is_static(sim) or not _has_ledger(sim) else sim.energies()
@@ -182,7 +183,8 @@ class HTMLWriter(Output):
             if hasattr(body.skin, "slot_weights"):
                 reference = reference_points(body, body.skin.slot_weights)
                 rest = np.broadcast_to(reference - self._origin, first.shape)
-                nodes = cKDTree(body.mesh.points).query(reference)[1]
+                drawn = np.unique(body.skin.node_weights.indices // body.family.node_samples.shape[1])
+                nodes = drawn[cKDTree(body.mesh.points[drawn]).query(reference)[1]]
             surface = PageSurface(body.name, "body", rest, body.skin.triangles, edges, nodes)
             surface.values = {name: [frame.values[name][k] for frame in frames] for name in self._names}
             out.append(surface)

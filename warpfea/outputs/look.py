@@ -1,7 +1,7 @@
 """Options of pictures: what is drawn beside the surfaces, and from where."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -9,6 +9,7 @@ import numpy as np
 from ..base.checks import is_number, number_pair
 from ..base.errors import ModelError
 from ..base.names import check_known
+from .colormap import hex_tables
 from .markers import KINDS
 
 __all__ = ["Look"]
@@ -25,7 +26,9 @@ class Look:
             through.
         scale: factor of the displacements drawn. extremes: write the least and the largest value where they are.
         legend: write the names of bodies; without a field each has its colour.
-        hide: names of bodies and colliders that are not drawn.
+        hide: names of bodies and colliders that are not drawn. opacity: of some by name, 0 to 1, such as {"case": 0.3}.
+        collider_grid: draw colliders with a grid that moves with them.
+        colors: colour map: "viridis", "cividis", or "coolwarm", whose low end is light enough to show form.
         target: (x, y, z) in the middle of the picture, m; zoom: 2 is twice as near. follow: name of a body kept in the
             middle.
         cut: ("+y", 0.01) leaves out what lies beyond y = 0.01 m, "-y" what lies before.
@@ -42,6 +45,9 @@ class Look:
     extremes: bool = False
     legend: bool = False
     hide: Sequence[str] = ()
+    opacity: Mapping[str, float] = field(default_factory=dict)
+    collider_grid: bool = False
+    colors: str = "viridis"
     target: tuple[float, float, float] | None = None
     zoom: float = 1.0
     follow: str | None = None
@@ -57,6 +63,10 @@ class Look:
                 raise ModelError(f"{name} must be a finite number{' above 0' * (name == 'zoom')}, got {value!r}")
         if isinstance(self.marks, str):
             raise ModelError(f"marks must be kinds of marks, such as ('support',), got {self.marks!r}")
+        check_known("colors", self.colors, hex_tables())
+        for name, value in self.opacity.items():
+            if not (is_number(value) and 0.0 <= value <= 1.0):
+                raise ModelError(f"opacity of {name!r} must be a number from 0 to 1, got {value!r}")
         for kind in self.marks:
             check_known("marks", kind, KINDS)
         if self.target is not None and (np.shape(self.target) != (3,) or not np.isfinite(self.target).all()):
@@ -85,6 +95,7 @@ class Look:
         """ModelError for a body or collider that there is not."""
         for option, wanted in (
             ("hide", tuple(self.hide)),
+            ("opacity", tuple(self.opacity)),
             ("follow", (self.follow,)),
             ("range_body", (self.range_body,)),
         ):

@@ -1,9 +1,11 @@
 """Marks of supports, joints, loads and probes: where they are drawn, and which way a load acts."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import scipy.sparse as sp
 
 from ..kernels.terms.springs import LENGTH
 from ..model.joints import Vector
@@ -38,6 +40,7 @@ class Markers:
         self.on_surface: list[tuple[str, str, int, Array]] = []
         self.own: list[tuple[str, str]] = []
         self._points: list[tuple[Array, Array, Array]] = []  # value at rest, slots, weights
+        self._weights: sp.csr_matrix | None = None
         self._laws: list[Any] = []
         drawn = {id(body): k for k, body in enumerate(bodies)}
         for support in getattr(description, "supports", ()):
@@ -86,11 +89,15 @@ class Markers:
         self._points.append((np.asarray(value, dtype=float), slots, np.asarray(weights, dtype=float)))
         self._laws.append(law)
 
-    def points(self, sim: Any, scale: float = 1.0) -> Array:
-        """(B, n, 3) places of the marks of their own, m, with displacements multiplied by `scale`."""
-        u = scale * sim.state.displacement.numpy() if self.own else np.zeros((int(sim.model.worlds), 0, 3))
-        places = [X + np.einsum("s,bsk->bk", w, u[:, slots].astype(float)) for X, slots, w in self._points]
-        return np.stack(places, axis=1) if places else u
+    def points(self, sim: Any, scale: float = 1.0, worlds: Sequence[int] | None = None) -> Array:
+        """(B, n, 3) places of the marks of their own, m, with displacements multiplied by `scale`, in all worlds or
+        some."""
+        if not self.own:
+            return np.zeros((int(sim.model.worlds) if worlds is None else len(worlds), 0, 3))
+        if self._weights is None:
+            self._weights = weight_rows([pair[1:] for pair in self._points], int(sim.model.slots))
+        sums = sim.model.terms.evaluation.samples.slot_sums(sim.state.displacement, self._weights, worlds)
+        return np.stack([X for X, _, _ in self._points]) + scale * sums
 
     def kinds(self, worlds: int) -> list[str]:
         """Kinds of the points of `all_points`."""
@@ -115,6 +122,13 @@ class Markers:
     def vectors(self, time: float, factor: float = 1.0) -> list[Array | None]:
         """Force of each mark of its own at a time (s), times a load factor; None unless samples give it."""
         return [None if law is None else _sampled(law, time, factor) for law in self._laws]
+
+
+def weight_rows(rows: list[tuple[Array, Array]], width: int) -> sp.csr_matrix:
+    """Sparse (n, width) of the columns and weights of each row."""
+    start = np.cumsum([0, *(len(columns) for columns, _ in rows)])
+    columns, weights = (np.concatenate(part) for part in zip(*rows))
+    return sp.csr_matrix((weights, columns, start), shape=(len(rows), width))
 
 
 def group_marks(kinds: list[str]) -> list[tuple[str, list[int]]]:

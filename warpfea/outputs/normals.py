@@ -4,30 +4,44 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import scipy.sparse as sp
 
-__all__ = ["scatter_rows", "smooth_corners", "unit_rows", "vertex_normals"]
+__all__ = ["CornerNormals", "smooth_corners", "unit_rows", "vertex_normals"]
 
 Array = npt.NDArray[Any]
 
 
+class CornerNormals:
+    """Unit normals of groups of corners of triangles, area-weighted; (0, 0, 1) for groups without a triangle.
+
+    Args:
+        triangles: (T, 3). group: (3 T,) of each corner, such as its point. count: number of groups.
+    """
+
+    def __init__(self, triangles: Array, group: Array, count: int) -> None:
+        self.corners = np.ascontiguousarray(np.asarray(triangles, dtype=np.int64).T)
+        number = len(triangles)
+        entries = np.ones(3 * number), (group, np.repeat(np.arange(number), 3))
+        self.sums = sp.csr_matrix(entries, shape=(count, number))
+
+    def at(self, points: Array) -> npt.NDArray[np.float32]:
+        """(count, 3) normals for points (P, 3)."""
+        a, b, c = (np.stack([axis[corner] for axis in np.ascontiguousarray(points.T)]) for corner in self.corners)
+        u, v = b - a, c - a
+        area = np.stack([u[i] * v[j] - u[j] * v[i] for i, j in ((1, 2), (2, 0), (0, 1))], axis=1)
+        return unit_rows(self.sums @ area)
+
+
 def vertex_normals(points: Array, triangles: Array) -> npt.NDArray[np.float32]:
     """(P, 3) unit normals, area-weighted over the triangles of each point; (0, 0, 1) for points without."""
-    points = points - points.mean(axis=0)
-    corner = [points[triangles[:, k]] for k in range(3)]
-    area = np.cross(corner[1] - corner[0], corner[2] - corner[0])
-    return unit_rows(scatter_rows(triangles.ravel(), np.repeat(area, 3, axis=0), len(points)))
-
-
-def scatter_rows(index: Array, rows: Array, count: int) -> npt.NDArray[np.float64]:
-    """(count, 3) sums of `rows` (n, 3) that share an index, in a fixed order."""
-    return np.stack([np.bincount(index, weights=rows[:, k], minlength=count) for k in range(3)], axis=1)
+    return CornerNormals(triangles, triangles.ravel(), len(points)).at(points - points.mean(axis=0))
 
 
 def unit_rows(rows: Array) -> npt.NDArray[np.float32]:
     """(n, 3) rows scaled to length one; a zero row becomes (0, 0, 1)."""
     scale = float(np.abs(rows).max(initial=0.0)) or 1.0
     rows = rows / scale
-    length = np.linalg.norm(rows, axis=1, keepdims=True)
+    length = np.sqrt(np.einsum("nk,nk->n", rows, rows))[:, None]
     good = length > 1e-20
     return np.asarray(np.where(good, rows / np.where(good, length, 1.0), (0.0, 0.0, 1.0)), dtype=np.float32)
 

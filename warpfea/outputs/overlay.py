@@ -83,11 +83,11 @@ class Overlay:
 def draw_labels(
     image: Image,
     time: str,
-    bar: tuple[float, float, str, str] | None,
+    bar: tuple[float, float, str, str, str] | None,
     overlay: Overlay | None = None,
     camera: Camera | None = None,
 ) -> Image:
-    """Write the time, and a colour bar for (low, high, title, units), onto a picture; before them the overlay."""
+    """Write the time, and a colour bar for (low, high, title, units, map), onto a picture; before them the overlay."""
     height, width = image.shape[:2]
     picture = pillow.Image.fromarray(image)
     draw = pillow.ImageDraw.Draw(picture)
@@ -99,11 +99,11 @@ def draw_labels(
     draw.text((0.025 * width, height - 1.6 * line), time, fill=_TEXT_COLOR, font=font)
     if bar is None:
         return np.asarray(picture)
-    low, high, title, units = bar
+    low, high, title, units, colors = bar
     factor, prefix = unit_prefix(max(abs(low), abs(high)), units)
     left, right = round(width * (1.0 - 0.75 * BAR_WIDTH)), round(width * (1.0 - 0.61 * BAR_WIDTH))
     top, bottom = round(0.26 * height), round(0.80 * height)
-    ramp = map_colors(np.linspace(1.0, 0.0, bottom - top), 0.0, 1.0 if high > low else 0.0)
+    ramp = map_colors(np.linspace(1.0, 0.0, bottom - top), 0.0, 1.0 if high > low else 0.0, colors)
     strip = np.broadcast_to(np.round(255 * ramp)[:, None, :], (bottom - top, right - left, 3)).astype(np.uint8)
     picture.paste(pillow.Image.fromarray(np.ascontiguousarray(strip)), (left, top))
     draw.rectangle((left - 1, top - 1, right, bottom), outline=_TEXT_COLOR)

@@ -13,6 +13,7 @@ Displacements have a range of their own: small ones are shown as well, multiplie
 """
 
 import base64
+import concurrent.futures
 import html
 import importlib.resources
 import json
@@ -31,6 +32,8 @@ __all__ = ["MOVE_LEVELS", "NO_VALUE", "REST_LEVELS", "Page", "PageSurface"]
 Array = npt.NDArray[Any]
 MOVE_LEVELS, REST_LEVELS = (1 << 14) - 1, (1 << 16) - 1
 SCRIPTS = ("page_scene.js", "page_plots.js", "page_view.js")
+WINDOW, PIECE = 1 << 15, 1 << 19
+"""Bytes that deflate looks back, and of a piece that one thread compresses."""
 NO_VALUE = 255
 """Code of NaN; finite values are 0 .. 254."""
 
@@ -86,20 +89,32 @@ class _Block:
 
     def add_smooth(self, table: Array, width: int) -> list[int]:
         """Append a table whose rows follow each other in time, in the order with the smaller differences."""
-        signed = table.astype(np.int32)
-        size = [
-            np.abs(np.diff(signed, n=order, axis=0)).mean() if len(table) > order else np.inf for order in (0, 1, 2)
-        ]
+        some = table[:, :: max(1, table.shape[1] // 4096)].astype(np.int32)
+        size = [np.abs(np.diff(some, n=order, axis=0)).mean() if len(table) > order else np.inf for order in (0, 1, 2)]
         return self.add(table, width, int(np.argmin(size)) if len(table) > 2 else len(table) - 1)
 
     def text(self) -> str:
         """The block, deflated, in base64."""
-        return base64.b64encode(zlib.compress(b"".join(self.parts), 9)).decode()
+        return base64.b64encode(deflate(b"".join(self.parts))).decode()
+
+
+def deflate(data: bytes) -> bytes:
+    """A zlib stream of the data, its pieces compressed side by side, each with the end of the one before known."""
+
+    def piece(first: int) -> bytes:
+        before = data[max(first - WINDOW, 0) : first]
+        packer = zlib.compressobj(9, zlib.DEFLATED, -15, zdict=before) if before else zlib.compressobj(9, wbits=-15)
+        last = first + PIECE >= len(data)
+        return packer.compress(data[first : first + PIECE]) + packer.flush(zlib.Z_FINISH if last else zlib.Z_SYNC_FLUSH)
+
+    with concurrent.futures.ThreadPoolExecutor() as pool:
+        packed = b"".join(pool.map(piece, range(0, max(len(data), 1), PIECE)))
+    return b"\x78\xda" + packed + zlib.adler32(data).to_bytes(4, "big")
 
 
 def quantise(values: Array, low: float, step: float, levels: int) -> Array:
-    """Nearest of the codes 0 .. levels of low + code x step."""
-    return np.clip(np.round((values - low) / (step or 1.0)), 0, levels).astype(np.int64)
+    """Nearest of the codes 0 .. levels of low + code x step; levels of 16 bits at most."""
+    return np.clip(np.rint((values - low) / (step or 1.0)), 0, levels).astype(np.uint16)
 
 
 @dataclass(eq=False)
@@ -194,17 +209,20 @@ class Page:
             low = rest.min(axis=0)
             step = float(np.ptp(rest, axis=0).max()) / REST_LEVELS
             code = quantise(rest, low, step, REST_LEVELS)
-            moves = np.stack([points[world] for points in surface.points]) - (low + step * code)
-            least = moves.min(axis=(0, 1))
-            quantum = float((moves.max(axis=(0, 1)) - least).max()) / MOVE_LEVELS
-            moves = quantise(moves, least, quantum, MOVE_LEVELS).transpose(0, 2, 1).reshape(len(moves), -1)
+            base = low + step * code
+            moves = [(points[world] - base).astype(np.float32).T for points in surface.points]  # each fits a cache
+            least = np.min([move.min(axis=1) for move in moves], axis=0).astype(np.float64)
+            quantum = float(np.max([move.max(axis=1) - least for move in moves])) / MOVE_LEVELS
+            table = np.stack([quantise(move, least[:, None], quantum, MOVE_LEVELS).ravel() for move in moves])
             packed = {"low": low.tolist(), "step": step, "rest": block.add(code.T.reshape(-1, 1), 2, 1)}
-            packed |= {"least": least.tolist(), "quantum": quantum, "moves": block.add_smooth(moves, 2), "values": []}
+            packed |= {"least": least.tolist(), "quantum": quantum, "moves": block.add_smooth(table, 2), "values": []}
             for name, pair in ranges.items() if surface.values else ():
-                values = np.stack([v[world] for v in surface.values[name]])
-                finite = np.isfinite(values)
                 step = (pair[1] - pair[0]) / (NO_VALUE - 1)
-                code = quantise(np.where(finite, values, pair[0]), pair[0], step, NO_VALUE - 1)
-                packed["values"].append(block.add_smooth(np.where(finite, code, NO_VALUE), 1))
+                rows = []
+                for values in (v[world] for v in surface.values[name]):
+                    finite = np.isfinite(values)
+                    code = quantise(np.where(finite, values, pair[0]), pair[0], step, NO_VALUE - 1)
+                    rows.append(np.where(finite, code, NO_VALUE))
+                packed["values"].append(block.add_smooth(np.stack(rows), 1))
             out["worlds"].append(packed)
         return out

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import concurrent.futures
+import functools
+import os
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +15,7 @@ from ..base.checks import number_pair
 from ..base.console import quiet_warp
 from ..base.errors import ModelError, OutputError
 from .colormap import to_linear, to_srgb
-from .normals import scatter_rows, smooth_corners, unit_rows
+from .normals import CornerNormals, smooth_corners, unit_rows
 
 __all__ = ["DEFAULT_VIEW", "Camera", "Renderer", "check_view", "nice_number", "to_z_up"]
 
@@ -37,6 +40,10 @@ class Camera:
 
     def axes(self) -> tuple[Floats, Floats, Floats]:
         """Unit vectors forward, right, up."""
+        return self._axes
+
+    @functools.cached_property
+    def _axes(self) -> tuple[Floats, Floats, Floats]:
         forward = (self.target - self.eye) / np.linalg.norm(self.target - self.eye)
         right = np.cross(forward, (0.0, 0.0, 1.0))
         if np.linalg.norm(right) < 1e-6:
@@ -126,6 +133,8 @@ class Renderer:
         edges: (E, 2) points along edges of elements, drawn as lines; None: not drawn.
         ghost: points (Q, 3) and triangles of a surface that is drawn seen through.
         cut: (4,) in the frame with z up: nothing with direction . x > place is drawn.
+        opacity: (T,) of triangles, 0 to 1; None: all opaque. Transparent ones cast no shadow.
+        gridded: (T,) mask of triangles drawn with a grid that is fixed to the reference.
 
     The mesh is built once and refitted when points move. Not usable inside a graph capture.
     """
@@ -140,6 +149,8 @@ class Renderer:
         edges: npt.NDArray[np.integer[Any]] | None = None,
         ghost: tuple[Floats, npt.NDArray[np.integer[Any]]] | None = None,
         cut: Floats | None = None,
+        opacity: Floats | None = None,
+        gridded: npt.NDArray[np.bool_] | None = None,
     ) -> None:
         self.triangles = np.ascontiguousarray(triangles, dtype=np.int32)
         if self.triangles.ndim != 2 or self.triangles.shape[1] != 3 or not len(self.triangles):
@@ -147,9 +158,16 @@ class Renderer:
         self.up_axis = up_axis
         self.ground = ground
         self._reference = None if reference is None else np.asarray(reference, dtype=np.float64)
-        self._normal_groups: tuple[npt.NDArray[np.int64], int] | None = None
+        self._normals: tuple[npt.NDArray[np.int64], CornerNormals] | None = None
         self._mesh: Any = None
+        self._seen: tuple[float, ...] = ()
+        self._backdrop: Image | None = None
+        self._shadow_corners = np.zeros((0, 3))
         self._sides = np.zeros(0, dtype=np.int32) if edges is None else side_bits(self.triangles, edges)
+        if gridded is not None:
+            bits = np.where(gridded, 8, 0).astype(np.int32)
+            self._sides = bits | self._sides if len(self._sides) else bits
+        self._opacity = np.zeros(0) if opacity is None else np.asarray(opacity)
         self._ghost_mesh: Any = None
         self._ghost, self._cut = ghost, cut
 
@@ -169,37 +187,76 @@ class Renderer:
             raise OutputError("points must be finite, as many as colours, and as many as triangles refer to")
         width, height = size
         camera = camera or Camera.framing(points, aspect=width / height)
-        if self._normal_groups is None:
+        if self._normals is None:
             base = points if self._reference is None else to_z_up(self._reference, self.up_axis)
-            self._normal_groups = smooth_corners(base, self.triangles)
+            group, count = smooth_corners(base, self.triangles)
+            self._normals = group, CornerNormals(self.triangles, group, count)
         unit = (points - camera.target) / camera.size
         with quiet_warp(), wp.ScopedDevice("cpu"):
             scene = self._make_scene(wp, raycast, unit, np.asarray(colors), camera, size)
             self._cast_shadow(wp, raycast, scene, unit)
-            centers = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1)
-            image = self._cast(wp, raycast, scene, centers.reshape(-1, 2).astype(np.float32)).reshape(height, width, 3)
-            shown = to_srgb(image)
-            edges = edge_pixels(shown)
-            rows, columns = np.nonzero(edges)
-            corners = np.stack([columns, rows], axis=1).astype(np.float32)
-            fine = (corners[:, None, :] + _SUBPIXELS).reshape(-1, 2)
-            shown[edges] = to_srgb(self._cast(wp, raycast, scene, fine).reshape(-1, len(_SUBPIXELS), 3).mean(axis=1))
-        return np.asarray(np.round(shown * 255.0), dtype=np.uint8)
+            if scene.has_ground:
+                low = np.array(scene.shadow_map_corner)
+                high = low + scene.shadow_cell_size * np.array(scene.shadow_map.shape)
+                corners = [(x, y, scene.ground_height) for x in (low[0], high[0]) for y in (low[1], high[1])]
+                self._shadow_corners = camera.target + camera.size * np.array(corners)
+            every = slice(0, height), slice(0, width)
+            seen = (*camera.eye, *camera.target, *camera.center, camera.fov, *size)
+            if seen != self._seen:
+                self._seen, self._backdrop = seen, None
+                return self._picture(wp, raycast, scene, size, every)
+            # the camera stands still: what is far from surfaces and their shadow is drawn once
+            if self._backdrop is None:
+                mesh, shadow, nothing = scene.mesh, scene.shadow_map, wp.array(np.full((3, 3), 1e6), dtype=wp.vec3)
+                empty = wp.Mesh(nothing, wp.array([0, 1, 2], dtype=wp.int32))
+                scene.mesh, scene.shadow_map = empty.id, wp.ones((1, 1), dtype=float)
+                self._backdrop = self._picture(wp, raycast, scene, size, every)
+                scene.mesh, scene.shadow_map = mesh, shadow
+            shown = self._backdrop.copy()
+            rows, columns = self._near(points, camera, size)
+            within = self._picture(wp, raycast, scene, size, (rows, columns))
+            inner = [
+                slice(s.start + (s.start > 0), s.stop - (s.stop < n)) for s, n in zip((rows, columns), (height, width))
+            ]
+            shown[inner[0], inner[1]] = within[
+                inner[0].start - rows.start : inner[0].stop - rows.start,
+                inner[1].start - columns.start : inner[1].stop - columns.start,
+            ]
+            return shown
+
+    @staticmethod
+    def _picture(wp: Any, raycast: Any, scene: Any, size: tuple[int, int], part: tuple[slice, slice]) -> Image:
+        """Rows and columns of a picture, with more rays where neighbours differ."""
+        centers = pixel_centers(size).reshape(size[1], size[0], 2)[part]
+        shown = to_bytes(cast_samples(wp, raycast, scene, centers.reshape(-1, 2))).reshape(*centers.shape[:2], 3)
+        edges = edge_pixels(shown)
+        fine = cast_samples(wp, raycast, scene, (centers[edges][:, None] - np.float32(0.5) + _SUBPIXELS).reshape(-1, 2))
+        shown[edges] = to_bytes(fine.reshape(-1, len(_SUBPIXELS), 3).mean(axis=1))
+        return shown
+
+    def _near(self, points: Floats, camera: Camera, size: tuple[int, int]) -> tuple[slice, slice]:
+        """Rows and columns of the pixels in which surfaces and their shadow may be, and their neighbours."""
+        forward, right, up = camera.axes()
+        local = (np.concatenate([points, self._shadow_corners]) - camera.eye) @ np.stack([right, up, forward], axis=1)
+        if self._ghost is not None or local[:, 2].min() <= 0.0:
+            return slice(0, size[1]), slice(0, size[0])
+        tangent = np.tan(np.radians(0.5 * camera.fov)) * np.array([size[0] / size[1], -1.0])
+        place = (0.5 + 0.5 * (local[:, :2] / local[:, 2:] / tangent + np.array(camera.center) * (1.0, -1.0))) * size
+        low, high = np.clip([place.min(axis=0) - 3.0, place.max(axis=0) + 4.0], 0.0, size).astype(int)
+        return slice(int(low[1]), int(high[1])), slice(int(low[0]), int(high[0]))
 
     def _make_scene(
         self, wp: Any, raycast: Any, unit: Floats, colors: Floats, camera: Camera, size: tuple[int, int]
     ) -> Any:
-        assert self._normal_groups is not None
+        assert self._normals is not None
         points = np.ascontiguousarray(unit, dtype=np.float32)
         if self._mesh is None or len(self._mesh.points) != len(points):
             self._mesh = wp.Mesh(wp.array(points, dtype=wp.vec3), wp.array(self.triangles.ravel(), dtype=wp.int32))
         else:
             self._mesh.points.assign(points)
             self._mesh.refit()
-        corner = unit[self.triangles]
-        area = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-        group, count = self._normal_groups
-        normals = unit_rows(scatter_rows(group, np.repeat(area, 3, axis=0), count))[group]
+        group, rows = self._normals
+        normals = rows.at(unit)[group]
         forward, right, up = camera.axes()
         tangent = np.tan(np.radians(0.5 * camera.fov))
         scene = raycast.Scene()
@@ -215,18 +272,28 @@ class Renderer:
         side = 0.55 * up - 0.55 * right - 0.45 * forward + np.array([0.0, 0.0, 0.75])
         self._light = side / np.linalg.norm(side)
         scene.light_direction = wp.vec3(*self._light)
+        scene.grid_spacing = nice_number(0.2 * camera.size) / camera.size
         self._set_extras(wp, scene, camera)
         scene.has_ground = 0
         if self.ground is not None and camera.eye[2] > self.ground:
             scene.has_ground = 1
             scene.ground_height = float((self.ground - camera.target[2]) / camera.size) - 2e-3
-            scene.grid_spacing = nice_number(0.2 * camera.size) / camera.size
             scene.fade_radius = 2.2
         return scene
 
     def _set_extras(self, wp: Any, scene: Any, camera: Camera) -> None:
         """Edges of elements, the surface seen through and the section, in the scene's scale."""
         scene.sides = wp.array(self._sides, dtype=wp.int32)
+        scene.opacity, scene.blocker = wp.array(self._opacity, dtype=float), self._mesh.id
+        if len(self._opacity):
+            opaque = self.triangles[self._opacity == 1.0]
+            if not len(opaque):
+                opaque = self.triangles[:1, [0, 0, 0]]
+            self._blocker = wp.Mesh(self._mesh.points, wp.array(opaque.ravel(), dtype=wp.int32))
+            scene.blocker = self._blocker.id
+        if self._reference is not None:
+            points = to_z_up(self._reference, self.up_axis) / camera.size
+            scene.reference = wp.array(np.ascontiguousarray(points, dtype=np.float32), dtype=wp.vec3)
         scene.ghost, scene.has_ghost, scene.has_cut = self._mesh.id, 0, 0
         if self._ghost is not None:
             points = (to_z_up(self._ghost[0], self.up_axis) - camera.target) / camera.size
@@ -238,13 +305,13 @@ class Renderer:
             place = float(self._cut[3] - self._cut[:3] @ camera.target) / camera.size
             scene.cut, scene.has_cut = wp.vec4(*map(float, self._cut[:3]), place), 1
 
-    def _cast_shadow(self, wp: Any, raycast: Any, scene: Any, unit: Floats, cells: int = 160) -> None:
+    def _cast_shadow(self, wp: Any, raycast: Any, scene: Any, unit: Floats, cells: int = 112) -> None:
         """Fill the light map of the ground, over the area of possible shadow."""
         scene.shadow_map = wp.ones((1, 1), dtype=float)
         scene.shadow_cell_size = 1.0
         if not scene.has_ground:
             return
-        lights = cone_directions(self._light, 0.14, 40)
+        lights = cone_directions(self._light, 0.14, 24)
         lights = lights[lights[:, 2] > 0.05]
         fall = np.maximum(unit[:, 2] - scene.ground_height, 0.0)[:, None, None]
         spots = unit[:, None, :2] - fall * (lights[:, :2] / lights[:, 2:])[None, ::4]
@@ -252,16 +319,38 @@ class Renderer:
         cell = float(max((high - low).max(), 1e-6)) / (cells - 4)
         shape = np.ceil((high - low) / cell).astype(int) + 4
         scene.shadow_map_corner, scene.shadow_cell_size = wp.vec2(*(low - 2 * cell)), cell
-        shadow = wp.empty(tuple(map(int, shape)), dtype=float)
-        wp.launch(raycast.cast_shadow, shadow.shape, [scene, wp.array(lights, dtype=wp.vec3), shadow])
-        scene.shadow_map = shadow
+        parts = [(wp.array(part, dtype=wp.vec3), wp.empty(tuple(map(int, shape)), dtype=float))
+                 for part in np.array_split(lights, min(os.cpu_count() or 1, 8))]  # fmt: skip
 
-    @staticmethod
-    def _cast(wp: Any, raycast: Any, scene: Any, samples: Floats) -> npt.NDArray[np.float32]:
-        out = wp.empty(len(samples), dtype=wp.vec3)
-        if len(samples):
-            wp.launch(raycast.cast_rays, len(samples), [scene, wp.array(samples, dtype=wp.vec2), out])
-        return out.numpy()
+        def launch(part: Any, shadow: Any) -> None:
+            wp.launch(raycast.cast_shadow, shadow.shape, [scene, part, shadow], device="cpu")
+
+        launch(parts[0][0][:0], parts[0][1])  # loads the kernel, see `cast_samples`
+        with concurrent.futures.ThreadPoolExecutor(len(parts)) as pool:
+            list(pool.map(launch, *zip(*parts)))
+        mean = sum(len(part) * shadow.numpy() for part, shadow in parts) / len(lights)
+        scene.shadow_map = wp.array(mean, dtype=float)
+
+
+def cast_samples(wp: Any, raycast: Any, scene: Any, samples: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """Colours (n, 3), linear light, of places (n, 2) of the picture, cast in as many threads as there are cores."""
+    places, out = wp.array(samples, dtype=wp.vec2), wp.empty(len(samples), dtype=wp.vec3)
+
+    def launch(first: int, last: int) -> None:
+        if last > first:
+            wp.launch(raycast.cast_rays, last - first, [scene, places[first:last], out[first:last]], device="cpu")
+
+    launch(0, min(1, len(samples)))  # loads the kernel, which threads must not do at once
+    ends = np.linspace(1, len(samples), 1 + min(os.cpu_count() or 1, 1 + len(samples) // 4096)).astype(int).tolist()
+    with concurrent.futures.ThreadPoolExecutor(len(ends)) as pool:
+        list(pool.map(launch, ends[:-1], ends[1:]))
+    return np.asarray(out.numpy())
+
+
+@functools.lru_cache(maxsize=4)
+def pixel_centers(size: tuple[int, int]) -> npt.NDArray[np.float32]:
+    """(width x height, 2) middles of the pixels of a picture, row by row."""
+    return np.stack(np.meshgrid(*(np.arange(n, dtype=np.float32) + 0.5 for n in size)), axis=-1).reshape(-1, 2)
 
 
 # 8 rooks: one per row and column of an 8 x 8 raster
@@ -279,10 +368,21 @@ def side_bits(triangles: npt.NDArray[np.integer[Any]], edges: npt.NDArray[np.int
     return out
 
 
-def edge_pixels(image: Floats, limit: float = 0.025) -> npt.NDArray[np.bool_]:
-    """(height, width) pixels of an sRGB picture that differ from a neighbour, for supersampling."""
+def to_bytes(linear: npt.NDArray[np.float32]) -> Image:
+    """sRGB components, 0 to 255, of linear light, by a table: the nearest ones, or in shades near black one off."""
+    table = _byte_table()
+    return table[(np.clip(linear, 0.0, 1.0) * np.float32(len(table) - 1) + np.float32(0.5)).astype(np.uint16)]
+
+
+@functools.cache
+def _byte_table() -> Image:
+    return np.round(255.0 * to_srgb(np.arange(1 << 16) / 65535.0)).astype(np.uint8)
+
+
+def edge_pixels(image: Image, limit: int = 6) -> npt.NDArray[np.bool_]:
+    """(height, width) pixels of an sRGB picture that differ from a neighbour by more than a limit, of 255."""
     edges = np.zeros(image.shape[:2], dtype=bool)
-    for channel in np.moveaxis(image, 2, 0):  # reductions over an axis of length three are slow in numpy
+    for channel in np.moveaxis(image.astype(np.int16), 2, 0):  # over an axis of length three numpy is slow
         down = np.abs(np.diff(channel, axis=0)) > limit
         across = np.abs(np.diff(channel, axis=1)) > limit
         edges[1:] |= down

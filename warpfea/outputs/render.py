@@ -77,13 +77,15 @@ class _PictureWriter(Look, Output):
         self._origin = 0.5 * (body_points.min(axis=0) + body_points.max(axis=0))
         rest = self._surface.rest_points(start)
         self._rest = np.asarray(rest - self._origin, dtype=np.float32)
-        title, units = field_label(sim, self.field) if self.field else ("", "")
+        rigid = all(getattr(body, "rigid", False) for body in self._surface.bodies)
+        self._shown = None if rigid and self.field == "von_mises" else self.field  # rigid parts have no stress
+        title, units = field_label(sim, self._shown) if self._shown else ("", "")
         animation = self._animation = Animation(
             self._surface.triangles(), self._surface.up_axis, np.asarray(start - self._origin, dtype=np.float32), title,
             units, self.color_range, is_static(sim), self._surface.body_points, self._surface.plane_squares(),
         )  # fmt: skip
         animation.origin, animation.parts, animation.rest = self._origin, self._surface.parts(), self._rest
-        animation.label = getattr(sim, "label", "")
+        animation.label, animation.by_body = getattr(sim, "label", ""), rigid
         self.check_names([name for name, _, _ in animation.parts])
         if self.edges:
             animation.edges = self._surface.edges()
@@ -101,7 +103,7 @@ class _PictureWriter(Look, Output):
             own = self._markers.points(sim, self.scale) + self._surface.offsets[:, None, :] - self._origin
             firsts = [first for _, first, _ in self._animation.parts]
             marks = self._markers.all_points(points, firsts, self._surface.point_counts, own)
-        return Frame(frame_time(sim), points, self._surface.values(sim, self.field) if self.field else None, marks)
+        return Frame(frame_time(sim), points, self._surface.values(sim, self._shown) if self._shown else None, marks)
 
     def abort(self) -> None:
         """Discard the frames; nothing is on disk before `close`."""
@@ -118,8 +120,8 @@ class PNGWriter(_PictureWriter):
         view: (azimuth, elevation) of the camera, degrees.
         color_range: (low, high) of the colours, by default the extremes of the drawn values.
         spacing: distance of neighbouring worlds (m), one number or (x, y).
-        ground, marks, axes, edges, undeformed, scale, extremes, legend, hide, target, zoom, follow, cut, percentile,
-        range_body: see :class:`warpfea.outputs.look.Look`.
+        ground, marks, axes, edges, undeformed, scale, extremes, legend, hide, opacity, collider_grid, colors, target,
+        zoom, follow, cut, percentile, range_body: see :class:`warpfea.outputs.look.Look`.
 
     ModelError: a bad size, view or field. OutputError: a bad colour range, a bad suffix or folder (at `open`), a file
     that can't be written (at `close`).

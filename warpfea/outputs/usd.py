@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..base.background import Background
 from ..base.errors import ModelError, OutputError
 from ..base.lazy import pxr
 from ..base.provenance import versions
@@ -96,6 +97,7 @@ class USDWriter(Output):
         self.fields = list(dict.fromkeys([*self.fields, *([self.color] if self.color else [])]))
         self.color_range = check_colors(self.color_range)
         self._stage: Any = None
+        self._background = Background()
         self._temporary: pathlib.Path | None = None
 
     def open(self, sim: Any) -> None:
@@ -206,21 +208,26 @@ class USDWriter(Output):
                 (self._surface.skin_points(sim, body), {n: self._field_values(sim, n, body) for n in self.fields})
                 for body in self._surface.bodies
             ]  # evaluate all first: a failed frame must leave nothing in the stage
-            for meshes, (points, fields) in zip(self._meshes, samples, strict=True):
-                for world, mesh in enumerate(meshes):
-                    values = {name: field[world] for name, field in fields.items()}
-                    low, high = mesh.write(code, points[world], values)
-                    offset = self._surface.offsets[world]
-                    box = self._bounding_box
-                    self._bounding_box = np.minimum(box[0], low + offset), np.maximum(box[1], high + offset)
-                self._unsaved_bytes += points.shape[0] * points.shape[1] * (24 + 4 * len(fields))
-            self._obstacles.write(code)
-            self._marks.write(sim, code, [points for points, _ in samples])
+            poses, marks = self._obstacles.poses(), self._marks.points(sim, [points for points, _ in samples])
             self._time_codes.append(code)
-            if self._unsaved_bytes > _SAVE_BYTES and self._target.suffix.lower() != ".usda":
-                self._save()
+            self._background.call(self._set_frame, code, samples, poses, marks)
         except pxr.Tf.ErrorException as error:
             raise OutputError(f"{self._target}: can't be written ({error_text(error)})") from error
+
+    def _set_frame(self, code: float, samples: list[Any], poses: Any, marks: Any) -> None:
+        """Set the values of a frame, in the thread that writes."""
+        for meshes, (points, fields) in zip(self._meshes, samples, strict=True):
+            for world, mesh in enumerate(meshes):
+                values = {name: field[world] for name, field in fields.items()}
+                low, high = mesh.write(code, points[world], values)
+                offset = self._surface.offsets[world]
+                box = self._bounding_box
+                self._bounding_box = np.minimum(box[0], low + offset), np.maximum(box[1], high + offset)
+            self._unsaved_bytes += points.shape[0] * points.shape[1] * (24 + 4 * len(fields))
+        self._obstacles.write(code, poses)
+        self._marks.write(code, marks)
+        if self._unsaved_bytes > _SAVE_BYTES and self._target.suffix.lower() != ".usda":
+            self._save()
 
     def _field_values(self, sim: Any, name: str, body: Any) -> npt.NDArray[np.float32]:
         values = np.ascontiguousarray(sim.skin_field(name, body), dtype=np.float32)
@@ -243,6 +250,7 @@ class USDWriter(Output):
             time = frame_time(sim)
             if time > self._clock.last:
                 self._write_frame(sim, time)
+            self._background.finish()
             self._write_metadata(sim)
             self._save()
             self._stage, self._meshes = None, []
@@ -261,6 +269,7 @@ class USDWriter(Output):
             stale.Reload(True)
 
     def abort(self) -> None:
+        self._background.stop()
         self._stage, self._meshes = None, []
         if self._temporary is not None:
             self._temporary.unlink(missing_ok=True)

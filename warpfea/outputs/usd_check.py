@@ -62,6 +62,7 @@ def _mesh_problems(stage: Any, prim: Any, max_samples: int) -> list[str]:
         if p.GetInterpolation() == pxr.UsdGeom.Tokens.vertex and p.HasValue()
     }
     corners = pxr.UsdGeom.PrimvarsAPI(mesh).GetPrimvar("normals")  # of faces' corners, where edges are sharp
+    groups = np.asarray(corners.GetIndices() if corners else (), dtype=np.int64)
     codes = np.asarray(mesh.GetPointsAttr().GetTimeSamples() or (0.0,))
     if len(codes) > 1 and not (stage.GetStartTimeCode() <= codes[0] and codes[-1] <= stage.GetEndTimeCode()):
         problems.append("samples lie outside the stage's time span")
@@ -75,8 +76,8 @@ def _mesh_problems(stage: Any, prim: Any, max_samples: int) -> list[str]:
             problems.append(f"face indices out of range {at}: {len(points)} points")
         source = corners if corners else mesh.GetNormalsAttr()
         normals = np.asarray(source.Get(code) or (), dtype=np.float64).reshape(-1, 3)
-        wanted = 1 + int(max(corners.GetIndices(), default=-1)) if corners else len(points)
-        if len(normals) != wanted or (corners and len(corners.GetIndices()) != len(indices)):
+        wanted = 1 + int(groups.max(initial=-1)) if corners else len(points)
+        if len(normals) != wanted or (corners and len(groups) != len(indices)):
             problems.append(f"{len(normals)} normals for {wanted} {'groups' if corners else 'points'} {at}")
         elif np.abs(np.linalg.norm(normals, axis=1) - 1.0).max(initial=0.0) > 1e-5:
             problems.append(f"normals are not of length one {at}")

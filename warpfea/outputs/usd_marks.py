@@ -36,12 +36,13 @@ class MarkPrims:
         found = [self.stage.GetPrimAtPath(f"/World/world_{world:04d}/{NAME}") for world in range(self.worlds)]
         self._prims = [pxr.UsdGeom.Points(prim) for prim in found] if all(found) else []
 
-    def write(self, sim: Any, code: float, drawn: list[Array]) -> None:
-        """One frame; `drawn`: points (B, P, 3) of the bodies."""
-        if not self._prims:
-            return
-        points = self.markers.world_points(drawn, self.markers.points(sim)).astype(np.float32)
-        for prim, rows in zip(self._prims, points):
+    def points(self, sim: Any, drawn: list[Array]) -> Array | None:
+        """Points (B, n, 3) of the marks of a frame; `drawn`: points (B, P, 3) of the bodies. None without prims."""
+        return self.markers.world_points(drawn, self.markers.points(sim)).astype(np.float32) if self._prims else None
+
+    def write(self, code: float, points: Array | None) -> None:
+        """One frame of the points."""
+        for prim, rows in zip(self._prims, () if points is None else points):
             prim.GetPointsAttr().Set(pxr.Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(rows)), code)
             extent = np.stack([rows.min(axis=0), rows.max(axis=0)])
             prim.CreateExtentAttr().Set(pxr.Vt.Vec3fArray.FromNumpy(extent), code)

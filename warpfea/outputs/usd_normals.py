@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.lazy import pxr
-from .normals import scatter_rows, unit_rows, vertex_normals
+from .normals import CornerNormals
 
 __all__ = ["MeshNormals"]
 
@@ -25,28 +25,24 @@ class MeshNormals:
     """
 
     def __init__(self, mesh: Any, triangles: Array, count: int, groups: tuple[Array, int]) -> None:
-        self.triangles = np.asarray(triangles, dtype=np.int64)
         self.attribute, self.primvar = None, pxr.UsdGeom.PrimvarsAPI(mesh).GetPrimvar(NAME)
         if self.primvar and self.primvar.IsIndexed():
             self.group = np.asarray(self.primvar.GetIndices(), dtype=np.int64)
         elif mesh.GetNormalsAttr().HasAuthoredValue():
-            self.group, self.attribute = np.zeros(0, dtype=np.int64), mesh.GetNormalsAttr()
+            self.group, self.attribute = np.ravel(triangles), mesh.GetNormalsAttr()
         else:
             self.group = groups[0]
             if groups[1] == count:
-                self.attribute = mesh.CreateNormalsAttr()
+                self.group, self.attribute = np.ravel(triangles), mesh.CreateNormalsAttr()
             else:
                 kind = pxr.Sdf.ValueTypeNames.Normal3fArray
                 api = pxr.UsdGeom.PrimvarsAPI(mesh)
                 self.primvar = api.CreatePrimvar(NAME, kind, pxr.UsdGeom.Tokens.faceVarying)
                 self.primvar.SetIndices(pxr.Vt.IntArray.FromNumpy(self.group.astype(np.int32)))
+        size = count if self.attribute is not None else int(self.group.max()) + 1
+        self.normals = CornerNormals(triangles, self.group, size)
 
     def write(self, points: Array, code: float) -> None:
         """One frame of points (P, 3), float64."""
-        if self.attribute is not None:
-            self.attribute.Set(pxr.Vt.Vec3fArray.FromNumpy(vertex_normals(points, self.triangles)), code)
-            return
-        corner = points[self.triangles]
-        area = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-        rows = scatter_rows(self.group, np.repeat(area, 3, axis=0), int(self.group.max()) + 1)
-        self.primvar.Set(pxr.Vt.Vec3fArray.FromNumpy(unit_rows(rows)), code)
+        target = self.primvar if self.attribute is None else self.attribute
+        target.Set(pxr.Vt.Vec3fArray.FromNumpy(self.normals.at(points)), code)

@@ -63,7 +63,8 @@ class ObstaclePrims:
                 ops.append((xform.AddTranslateOp(double), xform.AddOrientOp(double)))
                 self._define_mesh(obstacle, world, self._prim_path(world, name) + "/shape")
             self._transform_ops.append(ops)
-        self._set_transforms(lambda obstacle: not obstacle.moves)
+        if self.obstacles.all:
+            self._set_transforms(lambda obstacle: not obstacle.moves, self.obstacles.poses())
 
     def _define_mesh(self, obstacle: Any, world: int, path: str) -> None:
         points = np.asarray(obstacle.points[world], dtype=np.float32)
@@ -89,14 +90,17 @@ class ObstaclePrims:
             self._transform_ops.append([(pair[0], pair[1]) for pair in ops])
         return True
 
-    def write(self, code: float) -> None:
-        """Current transforms of moving obstacles."""
-        self._set_transforms(lambda obstacle: obstacle.moves, code)
+    def poses(self) -> Any:
+        """Current positions and rotations; None where no obstacle moves."""
+        return self.obstacles.poses() if any(obstacle.moves for obstacle in self.obstacles.all) else None
 
-    def _set_transforms(self, chosen: Any, *code: float) -> None:
-        if not any(map(chosen, self.obstacles.all)):
-            return
-        position, rotation = self.obstacles.poses()
+    def write(self, code: float, poses: Any) -> None:
+        """Transforms of moving obstacles at their `poses`."""
+        if poses is not None:
+            self._set_transforms(lambda obstacle: obstacle.moves, poses, code)
+
+    def _set_transforms(self, chosen: Any, poses: Any, *code: float) -> None:
+        position, rotation = poses
         for k, obstacle in enumerate(self.obstacles.all):
             for world, (translate, orient) in enumerate(self._transform_ops[k] if chosen(obstacle) else ()):
                 translate.Set(pxr.Gf.Vec3d(*map(float, position[world, k])), *code)

@@ -115,18 +115,18 @@ class Results:
         if not isinstance(part, RigidBody):
             raise ModelError(f"{what}: body {part.name!r} is flexible; positions and velocities give its motion")
 
-    def point_positions(self, body: Body, weights: Any) -> np.ndarray:
-        """Current positions (B, P, 3), m, of material points given by sparse weights (P, slots of the body)."""
-        u = self.state.displacement.numpy()[:, body.slot_range].astype(float)
-        return reference_points(body, weights) + np.stack([weights @ row for row in u])
+    def point_positions(self, body: Body, weights: Any, worlds: Sequence[int] | None = None) -> np.ndarray:
+        """Positions (B, P, 3), m, of points given by sparse weights (P, slots of the body), in all worlds or some."""
+        sums = self.model.terms.evaluation.samples.slot_sums
+        return reference_points(body, weights) + sums(self.state.displacement, weights, worlds, body.slot_offset)
 
-    def skin_points(self, body: Body) -> np.ndarray:
-        """Points (B, skin points, 3), m, of the drawn surface."""
-        return self.point_positions(body, body.skin.slot_weights)
+    def skin_points(self, body: Body, worlds: Sequence[int] | None = None) -> np.ndarray:
+        """Points (B, skin points, 3), m, of the drawn surface, in all worlds or some."""
+        return self.point_positions(body, body.skin.slot_weights, worlds)
 
-    def skin_field(self, name: str, body: Body) -> np.ndarray:
-        """Scalar field (B, skin points) at the drawn surface."""
-        return self.field_on(name, body, body.skin)
+    def skin_field(self, name: str, body: Body, worlds: Sequence[int] | None = None) -> np.ndarray:
+        """Scalar field (B, skin points) at the drawn surface, in all worlds or some."""
+        return self.field_on(name, body, body.skin, worlds)
 
     def collider_poses(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
         """Collider poses: positions (B, K, 3), m, rotations (B, K, 3, 3) with the shape's axes in the world as columns,
@@ -145,12 +145,12 @@ class Results:
         if scalar:
             check_scalar(self, name)
 
-    def field_on(self, name: str, body: Body, drawn: Any) -> np.ndarray:
-        """Field (B, P), or (B, P, k), at the points of a Skin or Drawing of the body."""
+    def field_on(self, name: str, body: Body, drawn: Any, worlds: Sequence[int] | None = None) -> np.ndarray:
+        """Field (B, P), or (B, P, k), at the points of a Skin or Drawing of the body, in all worlds or some."""
         find_field(self, name)
         if name.partition(".")[0] in RECORDED_FIELDS:
             raise ModelError(f"field {name!r} is one of nodes: it is not drawn")
-        return field_at_points(self.model.terms, name, body, self.state, drawn)
+        return field_at_points(self.model.terms, name, body, self.state, drawn, worlds)
 
     def field(self, name: str, body: Body, *, at: str = "nodes", elements: ElementSet | None = None) -> np.ndarray:
         """A field at the nodes of a body, (B, nodes), or (B, nodes, k) with components, listed by `fields`.

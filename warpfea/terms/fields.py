@@ -7,6 +7,7 @@ sampled first; others are evaluated by `samples` of their term.
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -220,9 +221,10 @@ def _sample_field(terms: Any, name: str, body: Any, state: State) -> np.ndarray:
     return functools.reduce(spec.join, found) if spec.join else found[0]
 
 
-def _quantities(terms: Any, spec: FieldSpec, body: Any, state: State, weights: Any, elements: Any = None) -> np.ndarray:
+def _quantities(terms: Any, spec: FieldSpec, body: Any, state: State, *options: Any) -> np.ndarray:
+    """Quantities of a field side by side; `options` of `at_samples`."""
     samples = terms.evaluation.samples
-    return np.concatenate([samples.at_samples(q, state, body, weights, elements) for q in spec.quantities], axis=2)
+    return np.concatenate([samples.at_samples(q, state, body, *options) for q in spec.quantities], axis=2)
 
 
 def field_at_nodes(terms: Any, name: str, body: Any, state: State, elements: Any = None) -> np.ndarray:
@@ -255,13 +257,21 @@ def field_at_nodes(terms: Any, name: str, body: Any, state: State, elements: Any
     return np.asarray(spec.node_reduction.reduce(values, axis=2) if spec.node_reduction else values[:, :, 0])
 
 
-def field_at_points(terms: Any, name: str, body: Any, state: State, drawn: Any) -> np.ndarray:
-    """Values (worlds, points) or (worlds, points, k) of a field at the points of a Skin or Drawing of the body."""
+def field_at_points(
+    terms: Any, name: str, body: Any, state: State, drawn: Any, worlds: Sequence[int] | None = None
+) -> np.ndarray:
+    """Values (worlds, points) or (worlds, points, k) of a field at the points of a Skin or Drawing of the body.
+
+    Args:
+        worlds: numbers of the worlds wanted, by default all.
+    """
     spec = find_field(terms, name)
+    chosen = slice(None) if worlds is None else list(worlds)
     if spec.quantities:
-        values = _quantities(terms, spec, body, state, drawn.node_weights)
+        count = None if worlds is None else 1 + max(worlds)
+        values = _quantities(terms, spec, body, state, drawn.node_weights, None, count)[chosen]
     else:
-        values = _sample_field(terms, name, body, state)
+        values = _sample_field(terms, name, body, state)[chosen]
         weights = drawn.slot_weights if spec.of_slots else drawn.node_weights
         values = np.stack([weights @ row for row in values])
     return spec.function(values) if spec.function else values

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import itertools
 import weakref
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -45,26 +46,34 @@ class Samples:
 
     def __init__(self, model: Model) -> None:
         self.model = model
-        self.operators: dict[tuple[Any, ...], tuple[list[tuple[Any, np.ndarray]], Any]] = {}
+        self.operators: dict[tuple[Any, ...], tuple[Any, Any]] = {}
 
     def at_samples(
-        self, name: str, state: State, body: Any, weights: sp.csr_matrix | None = None, elements: Any = None
+        self,
+        name: str,
+        state: State,
+        body: Any,
+        weights: sp.csr_matrix | None = None,
+        elements: Any = None,
+        worlds: int | None = None,
     ) -> np.ndarray:
         """Values (worlds, n, k) of a quantity at the samples of all mesh nodes, or of their weighted sums (n, samples).
 
         Args:
             elements: indices of the elements that count, by default all; nodes of no other have NaN.
+            worlds: so many of the first worlds, by default all.
         """
         m = self.model
+        worlds = worlds or m.worlds
         rows = len(body.mesh.points) * body.family.node_samples.shape[1] if weights is None else weights.shape[0]
         if body.rigid:
-            return self._of_rigid_part(name, state, body, rows)
-        out = np.zeros((m.worlds, rows, QUANTITIES[name]))
+            return self._of_rigid_part(name, state, body, rows)[:worlds]
+        out = np.zeros((worlds, rows, QUANTITIES[name]))
         missing = np.zeros(rows, dtype=bool)
         if name in ("energy", "dissipation"):
             for block, values in self._element_means(name, state, body):
                 operator, missing = self._operators(body, [block], weights, elements, constant=True)[0]
-                for world in range(m.worlds):
+                for world in range(worlds):
                     out[world, :, 0] += operator @ values[world]
         else:
             for group in self.groups(body, every_part=name == "stress"):
@@ -72,7 +81,8 @@ class Samples:
                 total = None
                 for block, (operator, without) in zip(group, operators):
                     missing = without
-                    total = self._gather(name, self.point_values(name, block, state), block, operator, total)
+                    at_points = self.point_values(name, block, state, worlds)
+                    total = self._gather(name, at_points, block, operator, total)
                 assert total is not None
                 out += total.numpy().reshape(out.shape)
         if elements is not None:
@@ -116,6 +126,24 @@ class Samples:
                 total[:, members] = np.einsum("eq,beqk->bek", weight, values[:, members, : block.points])
         return total
 
+    def slot_sums(
+        self, values: wp.array, weights: sp.csr_matrix, worlds: Sequence[int] | None = None, offset: int = 0
+    ) -> np.ndarray:
+        """Sums (worlds, n, 3) of slot vectors by weights (n, slots), of all worlds or some; no other slots or worlds
+        leave the device.
+
+        Args:
+            offset: slot of the first column, of a body its own.
+        """
+        known, key = self.operators, ("slots", id(weights))
+        if key not in known:
+            slots = np.unique(weights.indices)
+            at: Any = wp.array(slots + offset, dtype=wp.int32, device=values.device)
+            known[key] = (at, weights[:, slots]), weakref.ref(weights, lambda _: known.pop(key, None))
+        at, weights = known[key][0]
+        rows: Any = None if worlds is None else wp.array(list(worlds), dtype=wp.int32, device=values.device)
+        return np.stack([weights @ row for row in wp.indexedarray(values, [rows, at]).numpy().astype(float)])
+
     # quadrature points
 
     def groups(self, body: Any, *, every_part: bool) -> list[list[Any]]:
@@ -129,10 +157,10 @@ class Samples:
                 groups.setdefault((block.key.part, at.key.integral.name), []).append(at)
         return list(groups.values())
 
-    def point_values(self, name: str, block: Any, state: State) -> wp.array:
-        """Values [world, point, elem] of a block."""
+    def point_values(self, name: str, block: Any, state: State, worlds: int | None = None) -> wp.array:
+        """Values [world, point, elem] of a block, of so many of the first worlds."""
         m, evaluation = self.model, self.model.evaluation
-        shape = (m.worlds, block.points, block.count)
+        shape = (worlds or m.worlds, block.points, block.count)
         if name == "gradient":
             out, kernel = (
                 evaluation.zeros(shape, m.types.mat33),
@@ -142,7 +170,7 @@ class Samples:
             return out
         kernels = block.kernels_for(m.dtype, None)
         stress, J = evaluation.zeros(shape, m.types.sym), evaluation.zeros(shape, m.types.T)
-        evaluation.launch(kernels.point_stress, (m.worlds, block.count), [block.data, state.displacement, stress, J])
+        evaluation.launch(kernels.point_stress, shape[::2], [block.data, state.displacement, stress, J])
         return stress if name == "stress" else J
 
     def _element_means(self, name: str, state: State, body: Any) -> list[tuple[Any, np.ndarray]]:
@@ -176,9 +204,9 @@ class Samples:
         rows = start.shape[0] - 1
         types = {6: m.types.sym, 9: m.types.mat33, 1: m.types.T}
         gather = {6: kernels.symmetric, 9: kernels.matrices, 1: kernels.scalars}
-        k = QUANTITIES[name]
-        total = m.evaluation.zeros((m.worlds, rows), types[k]) if total is None else total
-        m.evaluation.launch(gather[k], (m.worlds, rows), [start, column, weight, block.count, values, total])
+        k, shape = QUANTITIES[name], (values.shape[0], rows)
+        total = m.evaluation.zeros(shape, types[k]) if total is None else total
+        m.evaluation.launch(gather[k], shape, [start, column, weight, block.count, values, total])
         return total
 
     def _operators(
@@ -190,7 +218,7 @@ class Samples:
         key = (body.name, constant, id(weights), *(id(block) for block in blocks))
         if key in known and elements is None:
             return known[key][0]  # type: ignore[no-any-return]
-        matrices, missing = _averages(body, blocks, elements, constant=constant)
+        matrices, missing = _averages(body, blocks, elements, weights, constant=constant)
         if weights is not None:
             matrices = [(weights @ matrix).tocsr() for matrix in matrices]
             missing = np.asarray(abs(weights) @ missing).astype(bool)
@@ -216,33 +244,50 @@ def _members(block: Any, body: Any) -> list[tuple[slice, np.ndarray]]:
     return out
 
 
-def _averages(body: Any, blocks: list[Any], elements: Any, *, constant: bool) -> tuple[list[sp.csr_matrix], np.ndarray]:
-    """Weights (samples of nodes, points x elements) of each block; samples without an element."""
+def _averages(
+    body: Any, blocks: list[Any], elements: Any, weights: Any = None, *, constant: bool
+) -> tuple[list[sp.csr_matrix], np.ndarray]:
+    """Weights (samples of nodes, points x elements) of each block; samples without an element.
+
+    Of the samples, those that the columns of `weights` (n, samples) need, a skin's being few; by default all.
+    """
     family = body.family
     samples = family.node_samples.shape[1]
     rows = len(body.mesh.points) * samples
     volumes = assembly.element_volumes(body)
     if elements is not None:
         volumes = np.where(np.isin(np.arange(len(volumes)), elements), volumes, 0.0)
-    at = (body.mesh.cells[:, :, None] * samples + np.arange(samples)).reshape(len(volumes), -1)
-    total = np.zeros((len(body.materials), rows))
-    np.add.at(total, (body.material_of[:, None], at), volumes[:, None])
+    used = np.full(rows, weights is None)
+    if weights is not None:
+        used[weights.indices] = True
+    nodes = np.asarray(used.reshape(-1, samples).any(axis=1))
+    near = np.flatnonzero(nodes[body.mesh.cells].any(axis=1))
+    rank = np.empty(len(volumes), dtype=np.int64)
+    rank[near] = np.arange(len(near))
+    volumes, material_of = volumes[near], body.material_of[near]
+    at = (body.mesh.cells[near][:, :, None] * samples + np.arange(samples)).reshape(len(near), -1)
+    key = material_of[:, None] * rows + at
+    total = np.bincount(key.ravel(), np.repeat(volumes, at.shape[1]), len(body.materials) * rows).reshape(-1, rows)
     material = np.argmax(total > 0.0, axis=0)
     size = total[material, np.arange(rows)]
-    share = np.where(material[at] == body.material_of[:, None], volumes[:, None], 0.0)
+    share = np.where((material[at] == material_of[:, None]) & used[at], volumes[:, None], 0.0)
     share /= np.where(size > 0.0, size, 1.0)[at]
     out = []
     for block in blocks:
         fit = np.ones((at.shape[1], 1)) if constant else _fit(block.key.rule, family.node_samples.reshape(-1, 3))
         points, parts = fit.shape[1], []
         for own, members in _members(block, body):
-            weight = share[members][:, :, None] * fit
-            column = np.arange(points) * block.count + np.arange(own.start, own.stop)[:, None]
-            row = np.broadcast_to(at[members][:, :, None], weight.shape)
-            parts.append((weight.ravel(), row.ravel(), np.broadcast_to(column[:, None], weight.shape).ravel()))
+            here = np.isin(members, near)
+            nodes = rank[members[here]]
+            element, sample = np.nonzero(share[nodes])
+            value = share[nodes][element, sample][:, None] * fit[sample]
+            column = np.arange(points) * block.count + np.arange(own.start, own.stop)[here][element][:, None]
+            row = np.broadcast_to(at[nodes][element, sample][:, None], value.shape)
+            parts.append((value.ravel(), row.ravel(), column.ravel()))
         value, row, column = (np.concatenate(part) for part in zip(*parts))
-        used = value != 0.0
-        out.append(sp.csr_matrix((value[used], (row[used], column[used])), shape=(rows, points * block.count)))
+        used_entries = value != 0.0
+        entries = value[used_entries], (row[used_entries], column[used_entries])
+        out.append(sp.csr_matrix(entries, shape=(rows, points * block.count)))
     return out, size == 0.0
 
 
