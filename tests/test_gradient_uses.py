@@ -1,7 +1,11 @@
 """Uses of gradients: their cost, and the examples of warpfea/simulation/EXAMPLES.md."""
 
+import numpy as np
 import pytest
+from gradient_models import linked
 from result_files import RESULTS, content_of
+
+import warpfea as wf
 
 MAX_RATIO = 1.0  # of symmetric operators; 2.5 of others
 FILES = [
@@ -28,3 +32,47 @@ def test_a_step_back_costs_no_more_than_one_forward(device, worlds):
         assert rows[name]["recomputed"] == 0
     grip = rows["gripper"]
     assert "contact" in grip["refused"] if "refused" in grip else grip["ratio"] <= 2.5
+
+
+def run_with(budget=None, folder=None, steps=30):
+    """A tape of a bar on two joints, whose motor moves in every step, in two worlds, and its gradients."""
+    sim = wf.Simulation(linked("motor", 2), dt=2e-3)
+    tape = wf.Adjoint(sim, ["a.E", "gravity", "motor", "initial.velocity"], budget=budget, folder=folder)
+    for k in range(steps):
+        sim.controls["motor"][:] = [[0.002 * k], [0.001 * k]]
+        tape.run(1)
+    loss = wf.loss.sum_of_squares(tape.probe("tip"), np.zeros((steps, 3)))
+    return tape, {name: array.numpy() for name, array in tape.backward(loss).items()}
+
+
+def test_steps_computed_again_or_on_disk_give_the_same_bits(tmp_path):
+    tape, exact = run_with()
+    size, whole = tape.bytes()["step"], tape.kept.whole
+    assert tape.bytes()["states"] == 31 * size
+    assert tape.recomputed == 0
+    budget = 4 * whole + 4 * size
+    again, g = run_with(budget)
+    assert 15 < again.recomputed < 150
+    assert again.bytes()["states"] + again.bytes()["checkpoints"] <= budget + whole
+    disk, h = run_with(4 * size, tmp_path)
+    assert disk.recomputed == 0
+    assert disk.bytes()["states"] <= 5 * size
+    assert len(list(tmp_path.rglob("*.npz"))) > 20
+    for name, values in exact.items():
+        assert np.array_equal(g[name], values), name
+        assert np.array_equal(h[name], values), name
+    before = again.recomputed
+    state = again.sim.state.displacement.numpy().copy()
+    assert np.array_equal(again.backward()["a.E"].numpy(), exact["a.E"])
+    assert again.recomputed > before
+    assert np.array_equal(state, again.sim.state.displacement.numpy())
+    assert np.array_equal(state, tape.sim.state.displacement.numpy())
+    again.sim.step(3)
+    tape.sim.step(3)  # the simulation goes on as if nothing had been computed again
+    assert np.array_equal(again.sim.state.displacement.numpy(), tape.sim.state.displacement.numpy())
+    assert (again.sim.totals["newton"] == tape.sim.totals["newton"]).all()
+    disk.clear()
+    del disk
+    assert not list(tmp_path.rglob("*.npz"))
+    with pytest.raises(wf.CapacityError, match="computed again"):
+        run_with(3 * size)

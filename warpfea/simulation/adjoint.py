@@ -7,6 +7,7 @@ linearises each step at its converged state with the code that advanced it; see 
 from __future__ import annotations
 
 import math
+import os
 import warnings
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
@@ -62,13 +63,13 @@ class Adjoint(Tape):
         with_respect_to: names of `Model.set_parameter` of materials, "gravity", controls, "initial.displacement",
             "initial.velocity", and "mesh.X", the reference values of all slots.
         tol: relative residual of the adjoint solves, in the D^-1 norm.
-        budget: largest number of bytes of the steps kept on the device; None: the free memory.
+        budget, folder: as of `Tape`.
 
     Attributes:
         residual: (worlds,) largest relative residual of the adjoint solves of the last `backward`.
         growth: (worlds,) norm of the right side of the first step over that of the last, of the last `backward`: how
             much a run amplifies what disturbs its start.
-        steps, kept, ends: as of `Tape`.
+        steps, kept, ends, recomputed: as of `Tape`.
 
     Raises:
         ModelError: an unknown name, or a term, scheme or precision without an adjoint, by name.
@@ -77,10 +78,10 @@ class Adjoint(Tape):
 
     def __init__(
         self, sim: Simulation | StaticResult, with_respect_to: Sequence[str], *, tol: float = 1e-10,
-        budget: int | None = None,
+        budget: int | None = None, folder: str | os.PathLike[str] | None = None,
     ) -> None:  # fmt: skip
         self.static = isinstance(sim, StaticResult)
-        super().__init__(sim.simulation if isinstance(sim, StaticResult) else sim, budget)
+        super().__init__(sim.simulation if isinstance(sim, StaticResult) else sim, budget, folder)
         m = self.model
         if not (isinstance(tol, float) and 0.0 < tol < 1.0):
             raise ModelError(f"Adjoint: tol = {tol!r} must lie between 0 and 1")
@@ -96,8 +97,7 @@ class Adjoint(Tape):
         self._sums = {name: self._zeros(self._size_of(name)) for name in self.names}
         self._sums |= {MESH: self.mesh.zeros()} if self.mesh else {}
         if self.static:
-            self.kept = [self._snapshot() | {"status": wp.clone(self.sim.state.status)}]
-            self.kept *= 2
+            self.kept += 2 * [self._snapshot() | {"status": wp.clone(self.sim.state.status)}]
             self.ends = [1]
 
     def __repr__(self) -> str:
@@ -130,6 +130,13 @@ class Adjoint(Tape):
         forms = ("incremental", "rate") if ctx.inertia and not ctx.midpoint else ()
         own = [kernel for form in forms for _, kernel in elements.history_kernels(form)]
         return [kernel.module for kernel in own + elements.exact_kernels(ctx)]
+
+    def bytes(self) -> dict[str, int]:
+        """Bytes on the device: of the state of a "step", of the "states" at hand, of whole states among them
+        ("checkpoints"), and of the "solver"."""
+        kept, count = self.kept, sum("displacement" in state for state in list.__iter__(self.kept))
+        out = {"step": kept.size, "states": count * kept.size, "checkpoints": len(kept.checkpoints) * kept.whole}
+        return out | {"solver": sum(self.stepper.bytes().values())}
 
     # what is differentiated by
 

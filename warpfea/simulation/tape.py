@@ -6,14 +6,14 @@ state in it. Such a step is taken again from its start, part by part.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from ..base.console import format_bytes
-from ..base.errors import CapacityError, ModelError
+from ..base.errors import ModelError
 from ..base.memory import convert_memory_errors
 from ..base.names import did_you_mean, listing
 from ..base.worlds import device_flags
@@ -21,7 +21,7 @@ from ..kernels.solvers.adjoint import adjoint_kernels
 from ..kernels.step.step_control import STATUS
 from ..model.state import MONITOR_ARRAYS, is_solver_history
 from ..terms.time_law_table import control_array
-from .capacity import RESERVED_FRACTION, free_bytes
+from .kept_states import KeptStates
 from .simulation import Simulation
 
 __all__ = ["ProbeArrays", "Tape"]
@@ -56,7 +56,8 @@ class Tape:
 
     Args:
         sim: a simulation.
-        budget: largest number of bytes of the steps kept on the device; None: the free memory.
+        budget: bytes of the states kept on the device, besides one whole state; others are computed again on the way
+            back, or with a `folder` are in its files. None: all are kept.
 
     Attributes:
         steps: number of steps kept.
@@ -68,12 +69,12 @@ class Tape:
 
     static = False
 
-    def __init__(self, sim: Simulation, budget: int | None) -> None:
-        self.sim, self.model, self.budget = sim, sim.model, budget
-        self.kept: list[dict[str, wp.array]] = []
-        self.ends: list[int] = []
-        self.restarts: dict[int, np.ndarray] = {}
+    def __init__(
+        self, sim: Simulation, budget: int | None = None, folder: str | os.PathLike[str] | None = None
+    ) -> None:
+        self.sim, self.model, self.budget, self.folder = sim, sim.model, budget, folder
         self.probes: dict[str, ProbeArrays] = {}
+        self.clear()
         self._updates = self.model.terms.parameter_updates
         self._graph: wp.Graph | None = None  # of a step back, with the derivatives of the coefficients at hand
 
@@ -98,16 +99,17 @@ class Tape:
             raise ModelError("Adjoint: an equilibrium has no steps to run")
         if self.kept and not np.array_equal(self.kept[-1]["time"].numpy(), self.sim.time):
             self.clear()
-        self._check_budget(steps)
+        self.kept.expect(steps)
         if not self.kept and self._updates != self.model.terms.parameter_updates:
             self._updates, self._graph = self.model.terms.parameter_updates, None
         self._check_parameters()
         with convert_memory_errors(f"a tape of {steps} steps", self.model.device):
             if not self.kept:
-                self.kept = [self._snapshot()]
+                self.kept.append(self._snapshot())
             for _ in range(steps):
                 self._prepare()
                 controls = self._controls()
+                self.kept.begin_step()
                 report, stepper = self.sim.step(), self.sim.stepper
                 running = self.sim.status == STATUS["running"]
                 running &= self.kept[-1]["time"].numpy() != self.sim.time  # others were at their end
@@ -117,6 +119,9 @@ class Tape:
                 else:
                     self._keep(running, controls)
                 self.ends.append(len(self.kept) - 1)
+                self.kept.end_step()
+                if self.budget is not None:
+                    self._record_probes()
         self.probes.clear()
 
     def _prepare(self) -> None:
@@ -160,21 +165,16 @@ class Tape:
 
     def clear(self) -> None:
         """Forget the steps kept."""
-        self.kept, self.ends, self.restarts = [], [], {}
+        self.kept = KeptStates(self.sim, self._kept_names(), self.budget, self.folder)
+        self.ends: list[int] = []
+        self.restarts: dict[int, np.ndarray] = {}
+        self._recorded: dict[str, list[ProbeArrays]] = {}
         self.probes.clear()
 
-    def _check_budget(self, steps: int) -> None:
-        free = free_bytes(self.model.device)
-        room = self.budget if self.budget is not None else None if free is None else int((1 - RESERVED_FRACTION) * free)
-        arrays = self.sim.state.bytes
-        size = sum(arrays[name] for name in self._kept_names())
-        kept = self.steps if self.budget is not None else 0
-        if room is not None and (kept + steps + 1) * size > room:
-            raise CapacityError(
-                f"Adjoint: {kept + steps} steps of {format_bytes(size)} exceed {format_bytes(room)}; maximum: "
-                f"{max(room // size - 1, 0)} steps",
-                bytes=(kept + steps + 1) * size, per_world=size // self.model.worlds,
-            )  # fmt: skip
+    @property
+    def recomputed(self) -> int:
+        """Number of steps computed again."""
+        return self.kept.recomputed
 
     def _check_parameters(self) -> None:
         if self.model.terms.parameter_updates != self._updates:
@@ -195,20 +195,36 @@ class Tape:
         known = [p.name for p in self.model.description.probes]
         if name not in known:
             raise ModelError(f"probe {name!r} is unknown; there are: {listing(known)}{did_you_mean(name, known)}")
-        if name in self.probes:
-            return self.probes[name]
-        m, given = self.model, self.model.description.probes[known.index(name)]
+        if name not in self.probes:
+            out = self.probes[name] = self._empty_probe(name, self.steps)
+            for k, end in enumerate(self.ends):
+                if self.budget is None:
+                    self._evaluate_probe(out, k, self.kept[end])
+                else:
+                    for array, value in zip(out.arrays, self._recorded[name][k].arrays):
+                        wp.copy(array[:, k], value[:, 0])
+        return self.probes[name]
+
+    def _empty_probe(self, name: str, steps: int) -> ProbeArrays:
+        m = self.model
+        (given,) = [probe for probe in m.description.probes if probe.name == name]
         slots, index = np.unique(given.body.slot_offset + given.slots, return_inverse=True)
         weights = np.bincount(index, weights=given.weights)
-        shape = (m.worlds, self.steps, 3)
-        arrays: list[Any] = [wp.zeros(shape, dtype=wp.float64, device=m.device, requires_grad=True) for _ in range(3)]
+        new = {"dtype": wp.float64, "device": m.device, "requires_grad": True}
+        arrays: list[Any] = [wp.zeros((m.worlds, steps, 3), **new) for _ in range(3)]
         slot: wp.array = wp.array(slots, dtype=wp.int32, device=m.device)
         weight: wp.array = wp.array(weights, dtype=m.types.T, device=m.device)
-        out = ProbeArrays(slot, weight, wp.vec3d(*given.X), *arrays)
+        return ProbeArrays(slot, weight, wp.vec3d(*given.X), *arrays)
+
+    def _evaluate_probe(self, out: ProbeArrays, k: int, end: dict[str, wp.array]) -> None:
+        m = self.model
         kernel = adjoint_kernels(m.dtype, m.terms.traits.constraint_rows).probe_values
-        for k, end in enumerate(self.ends):
-            values = self.kept[end]
-            args = [slot, weight, out.offset, values["displacement"], values["velocity"], k, *arrays]
-            self.sim.stepper.launch(kernel, m.worlds, args)
-        self.probes[name] = out
-        return out
+        args = [out.slot, out.weight, out.offset, end["displacement"], end["velocity"], k, *out.arrays]
+        self.sim.stepper.launch(kernel, m.worlds, args)
+
+    def _record_probes(self) -> None:
+        """Keep the values of all probes at the last step, whose state may not stay."""
+        for probe in self.model.description.probes:
+            out = self._empty_probe(probe.name, 1)
+            self._evaluate_probe(out, 0, self.kept[-1])
+            self._recorded.setdefault(probe.name, []).append(out)
