@@ -30,6 +30,7 @@ from .checks import body_of_handle, check_densities, parse_gravity, warn_implaus
 from .contact_methods import ContactMethods
 from .joints import make_constraint, make_joint
 from .rigid import make_rigid
+from .skins import SkinMethods
 from .springs import SpringMethods
 from .velocity_constraints import VelocityMethods
 from .welds import make_weld
@@ -37,7 +38,7 @@ from .welds import make_weld
 __all__ = ["ModelBuilder"]
 
 
-class ModelBuilder(ContactMethods, SpringMethods, VelocityMethods):
+class ModelBuilder(ContactMethods, SkinMethods, SpringMethods, VelocityMethods):
     """Collects bodies, supports and loads; `finalize` makes a Model.
 
     Args:

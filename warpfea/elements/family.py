@@ -73,6 +73,13 @@ class ParentDomain:
         """(3,) parent coordinates of the middle."""
         return np.full(3, 0.25) if self.low is None else 0.5 * (np.array(self.low) + np.array(self.high))
 
+    @property
+    def sides(self) -> tuple[np.ndarray, np.ndarray]:
+        """Inner normals (m, 3) and bounds (m,) of the sides: normal . xi >= bound inside."""
+        if self.low is None:
+            return np.vstack([np.eye(3), -np.ones(3)]), np.array([0.0, 0.0, 0.0, -1.0])
+        return np.vstack([np.eye(3), -np.eye(3)]), np.concatenate([self.low, -np.array(self.high)])
+
     def outside_distance(self, xi: np.ndarray) -> np.ndarray:
         """Outside distance of points (..., 3), (...,) in parent units; 0 inside."""
         if self.low is None:

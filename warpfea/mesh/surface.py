@@ -16,7 +16,7 @@ from .cells import TET_EDGES
 from .checks import check
 from .mesh import Mesh
 
-__all__ = ["from_surface", "with_mid_nodes"]
+__all__ = ["from_surface", "surface_arrays", "with_flat_sides", "with_mid_nodes"]
 
 MAX_VOLUME_CHANGE = 0.02
 """Largest relative difference of the volumes of mesh and surface. A bound: the default tolerance is 1 % of the volume
@@ -42,9 +42,8 @@ def from_surface(
         Without the extra "mesh"; an unreadable or open surface; a mesh whose volume differs by more than 2 % from that
         of the surface.
     """
-    given = isinstance(surface, (str, os.PathLike))
-    label = str(surface) if given else "from_surface"
-    points, triangles = read_triangles(surface) if given else _arrays(surface)
+    label = str(surface) if isinstance(surface, (str, os.PathLike)) else "from_surface"
+    points, triangles = surface_arrays(surface, "from_surface")
     points = scale * points
     (length,) = positive_numbers(f"{label}: size", (size,), 1)
     if element not in ("T4", "T10"):
@@ -73,12 +72,14 @@ def from_surface(
             f"{label}: the mesh has {found:.4g} m^3, the surface encloses {wanted:.4g}: it has holes, crosses itself, "
             f"or is thinner than tolerance = {tolerance:g} of its size"
         )
-    mesh = _with_flat_sides(mesh, tolerance * float(np.linalg.norm(np.ptp(points, axis=0))))
+    mesh = with_flat_sides(mesh, tolerance * float(np.linalg.norm(np.ptp(points, axis=0))))
     return check(with_mid_nodes(mesh) if element == "T10" else mesh)
 
 
-def _arrays(surface: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 3) and triangles (m, 3). MeshError for anything else."""
+def surface_arrays(surface: Any, what: str) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n, 3) and triangles (m, 3) of a file or a pair of them. MeshError for anything else."""
+    if isinstance(surface, (str, os.PathLike)):
+        return read_triangles(surface)
     try:
         points, triangles = (np.asarray(part) for part in surface)
         good = points.shape[1:] == triangles.shape[1:] == (3,) and triangles.dtype.kind in "iu" and len(triangles)
@@ -87,12 +88,10 @@ def _arrays(surface: Any) -> tuple[np.ndarray, np.ndarray]:
         got = f"shapes {points.shape} and {triangles.shape}"
     except (TypeError, ValueError):
         got = repr(surface)
-    raise MeshError(
-        f"from_surface: a surface is a file, or points (n, 3) and triangles (m, 3) of their numbers, got {got}"
-    )
+    raise MeshError(f"{what}: a surface is a file, or points (n, 3) and triangles (m, 3) of their numbers, got {got}")
 
 
-def _with_flat_sides(mesh: Mesh, distance: float) -> Mesh:
+def with_flat_sides(mesh: Mesh, distance: float) -> Mesh:
     """Surface and node sets "x-", ... "z+" of the faces on the sides of the bounding box, of those that have any."""
     low, high = mesh.bounding_box()
     faces = mesh.boundary()

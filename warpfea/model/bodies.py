@@ -12,7 +12,8 @@ import numpy as np
 from ..base.errors import ModelError
 from . import surfaces
 from .assembly import orthonormal
-from .discretisation import Discretisation, element_functions
+from .discretisation import Discretisation
+from .embedding import embedded_skin, parent_coordinates, shape_at_own_points
 from .handles import ElementSet, MaterialPoint, NodeSet, SurfaceSet
 
 __all__ = ["Body", "locate", "point_coordinates"]
@@ -69,6 +70,12 @@ class Body(Discretisation):
         """Drawn surface."""
         return surfaces.make_skin(self)
 
+    def render_skin(
+        self, points: np.ndarray, triangles: np.ndarray, distance: float | None, what: str
+    ) -> surfaces.Skin:
+        """A surface (n, 3), (m, 3) that follows the body; see `embedded_skin`."""
+        return embedded_skin(self, points, triangles, distance, what)
+
     @cached_property
     def drawing(self) -> surfaces.Drawing:
         """Drawn cells."""
@@ -99,26 +106,11 @@ def locate(body: Discretisation, X: Any, slack: float = 1e-9) -> MaterialPoint:
         ModelError: X is not three finite numbers, or lies outside of the body.
     """
     x = point_coordinates(body, X)
-    parent = body.family.parent
     near, size = _nearby_elements(body, x)
     best = (np.inf, -1, np.zeros(3))
     if len(near):
-        E = (
-            body.reference[body.connectivity[near]]
-            + (body.slot_kind[body.connectivity[near]] == 0)[:, :, None] * body.origin
-        )
-        xi = np.tile(parent.center, (len(near), 1))
-        for _ in range(20):
-            s, ds = _shape_at_own_points(body, near, xi)
-            residual = np.einsum("es,esk->ek", s, E) - x
-            J = np.einsum("esk,esl->ekl", E, ds)
-            step = np.linalg.solve(J, residual[:, :, None])[:, :, 0]
-            last, xi = xi, np.clip(xi - step, -2.0, 3.0)
-            if np.abs(xi - last).max() < 1e-14:
-                break
-        s, _ = _shape_at_own_points(body, near, xi)
-        miss = np.linalg.norm(np.einsum("es,esk->ek", s, E) - x, axis=1) / size
-        outside_distance = parent.outside_distance(xi) + miss
+        xi, miss = parent_coordinates(body, near, np.tile(x, (len(near), 1)))
+        outside_distance = body.family.parent.outside_distance(xi) + miss / size
         k = int(np.argmin(outside_distance))
         best = (float(outside_distance[k]), int(near[k]), xi[k])
     if best[0] > max(slack, 1e-12 * float(np.abs(x).max()) / size):
@@ -132,20 +124,11 @@ def locate(body: Discretisation, X: Any, slack: float = 1e-9) -> MaterialPoint:
 
 def material_point_at(body: Discretisation, element: int, xi: np.ndarray, X: np.ndarray) -> MaterialPoint:
     """The material point at parent coordinates xi (3,) of an element."""
-    s, ds = _shape_at_own_points(body, np.array([element]), xi[None])
+    s, ds = shape_at_own_points(body, np.array([element]), xi[None])
     conn = body.connectivity[element]
     J0 = body.reference[conn].T @ ds[0]
     axes = np.eye(3) if body.family.solid else orthonormal(J0)
     return MaterialPoint(body, conn, s[0].copy(), X, ds[0] @ np.linalg.inv(J0), axes, element, xi)
-
-
-def _shape_at_own_points(body: Discretisation, elements: np.ndarray, xi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Functions (E, S), (E, S, 3) of each element at its own point (E, 3)."""
-    s, ds = element_functions(body, elements[:1], xi)
-    if s.shape[0] == 1 and body.frames is None:
-        return s[0], ds[0]
-    parts = [element_functions(body, elements[k : k + 1], xi[k : k + 1]) for k in range(len(elements))]
-    return np.stack([p[0][0, 0] for p in parts]), np.stack([p[1][0, 0] for p in parts])
 
 
 def _nearby_elements(body: Discretisation, x: np.ndarray) -> tuple[np.ndarray, float]:

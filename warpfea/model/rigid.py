@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
+from scipy.spatial import cKDTree
 
 from ..kernels.terms.constraints import DOT
 from . import assembly
@@ -15,6 +16,7 @@ from .bodies import Body, point_coordinates
 from .handles import MaterialPoint, NodeSet, SurfaceSet
 from .joints import ConstraintRow, Joint, Vector, VectorPart
 from .shapes import Box, Capsule, Cylinder, Shape, Sphere
+from .surfaces import Skin
 
 __all__ = ["RigidBody", "surface_moments", "volume_moments"]
 
@@ -136,6 +138,15 @@ class RigidBody(Body):
         corners = self.mesh.points[handle.nodes[:, :3]]
         area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
         return self.point(area @ corners.mean(axis=1) / area.sum())
+
+    def render_skin(self, points: np.ndarray, triangles: np.ndarray, distance: float | None, what: str) -> Skin:
+        """Any surface; fields are those of the next node of the part's own."""
+        weights = np.column_stack([np.ones(len(points)), points - self.com]) @ self.affine
+        nodes = self.surface_nodes[cKDTree(self.mesh.points[self.surface_nodes]).query(points)[1]]
+        fields = sp.csr_matrix(
+            (np.ones(len(nodes)), (np.arange(len(nodes)), nodes)), (len(nodes), len(self.mesh.points))
+        )
+        return Skin(triangles, sp.csr_matrix(weights), fields, np.zeros((0, 2), dtype=np.int64))
 
     def rotation_of(self, values: np.ndarray) -> np.ndarray:
         """(..., 3, 3) gradient of slot values (..., 4, 3): A - I of displacements, dA/dt of velocities."""

@@ -20,6 +20,7 @@ __all__ = [
     "make_skin",
     "measure_to_skin",
     "reference_points",
+    "sparse_weights",
 ]
 
 
@@ -195,12 +196,13 @@ class _PointMerger:
         nodes = len(self.body.mesh.points) * self.body.family.node_samples.shape[1]
         return (
             rank[inverse.ravel()],
-            _sparse_weights(w, slots, self.body.slot_count),
-            _sparse_weights(samples, at, nodes),
+            sparse_weights(w, slots, self.body.slot_count),
+            sparse_weights(samples, at, nodes),
         )
 
 
-def _sparse_weights(values: np.ndarray, columns: np.ndarray, width: int) -> sp.csr_matrix:
+def sparse_weights(values: np.ndarray, columns: np.ndarray, width: int) -> sp.csr_matrix:
+    """Matrix (rows, width) of values (rows, n) in columns (rows, n), without round-off."""
     values = np.where(np.abs(values) < 1e-14, 0.0, values)
     rows = np.repeat(np.arange(len(values)), values.shape[1])
     out = sp.csr_matrix((values.ravel(), (rows, columns.ravel())), shape=(len(values), width))

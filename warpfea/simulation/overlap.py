@@ -21,7 +21,7 @@ from ..kernels.contact.crossings import crossing_kernel
 from ..model.bodies import Body
 from ..model.contacts import Collider
 from ..model.shapes import HALF_SPACE
-from ..model.surfaces import reference_points
+from ..model.surfaces import make_skin, reference_points
 
 __all__ = ["Crossing", "OverlapCheck"]
 
@@ -86,13 +86,14 @@ class _Side:
 
 def _body_side(body: Body) -> _Side:
     """Skin of a body."""
-    weights, slots = body.skin.slot_weights, body.slot_range
+    skin = make_skin(body)  # the faces of its elements, whatever is drawn
+    weights, slots = skin.slot_weights, body.slot_range
     X = reference_points(body, weights)
 
     def points(u: np.ndarray, poses: Any) -> np.ndarray:
         return X + np.stack([weights @ row for row in u[:, slots]])
 
-    return _Side(body, points, X, body.skin.triangles)
+    return _Side(body, points, X, skin.triangles)
 
 
 def _collider_side(collider: Collider, k: int) -> _Side:
