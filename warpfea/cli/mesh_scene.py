@@ -72,12 +72,14 @@ def mesh_scene(options: argparse.Namespace) -> tuple[Scene[Any], dict[str, Any]]
 
 
 def read_mesh(path: pathlib.Path, options: argparse.Namespace) -> meshes.Mesh:
-    """The mesh of a file, or of the inside of a surface. MeshError."""
+    """The mesh of a file, of the inside of a surface, or of a shape. MeshError."""
     scale = options.scale or 1.0
     if path.suffix.lower() in SURFACE_FORMATS:
         return meshes.from_surface(path, size=options.size, scale=scale)
+    if path.suffix.lower() in meshes.CAD_FORMATS:
+        return meshes.from_cad(path, size=options.size, scale=scale)
     if options.size:
-        raise UsageError(f"--size {options.size:g}: {path} is a mesh already; --size is for surfaces")
+        raise UsageError(f"--size {options.size:g}: {path} is a mesh already; --size is for surfaces and shapes")
     return meshes.read(path, scale=scale)
 
 

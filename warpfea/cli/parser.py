@@ -134,7 +134,7 @@ def _add_model_options(to: argparse.ArgumentParser) -> None:
             "--size",
             positive_number,
             "M",
-            "mesh the inside of a surface (.stl, .obj, .ply) with edges of this length, m",
+            "mesh a surface (.stl, .obj, .ply) or shape (.step, .iges, .brep, .geo) with edges of this length, m",
         ),
         ("--up-axis", ("Y", "Z"), None, "by default Z"),
         ("--quadrature", None, "RULE", "force rule: tet4, tet5_paper, tet8, tet14 (T10), tet1, tet4 (T4)"),

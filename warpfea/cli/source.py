@@ -8,7 +8,7 @@ from typing import Any
 from ..base.console import compile_progress_bar
 from ..base.errors import UsageError
 from ..builder.scene import Scene, load_file, locate, split_name
-from ..mesh import FORMATS
+from ..mesh import CAD_FORMATS, FORMATS
 from ..model.model import Model
 from ..simulation.simulation import Simulation
 from ..simulation.statics import begin_static
@@ -18,8 +18,8 @@ from .mesh_scene import MESH_OPTIONS, SURFACE_FORMATS, mesh_scene
 
 __all__ = ["Source", "find_scene", "is_mesh", "load_scenes", "resolve", "show_progress"]
 
-SURFACE_SUFFIXES = (".stl", ".obj", ".ply", ".off", ".step", ".stp", ".iges", ".igs", ".brep", ".geo", ".3mf")
-"""Formats of surfaces and shapes, without elements."""
+SURFACE_SUFFIXES = (*SURFACE_FORMATS, ".off", ".3mf")
+"""Formats of surfaces, without elements."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,9 +60,9 @@ def show_progress(options: argparse.Namespace) -> bool | None:
 
 
 def is_mesh(options: argparse.Namespace) -> bool:
-    """True if SCENE is a mesh file, or a surface to mesh."""
+    """True if SCENE is a mesh file, or a surface or shape to mesh."""
     suffix = pathlib.Path(options.what).suffix.lower()
-    return suffix in FORMATS or bool(options.size and suffix in SURFACE_FORMATS)
+    return suffix in FORMATS or suffix in CAD_FORMATS or bool(options.size and suffix in SURFACE_FORMATS)
 
 
 def load_scenes(file: str) -> dict[str, Scene[Any]]:
@@ -89,7 +89,7 @@ def _check_suffix(what: str) -> None:
     formats = ", ".join(f"{end} ({name})" for end, name in FORMATS.items())
     text = f"{what}: unsupported file type {suffix}: neither a scene (.py) nor a mesh ({formats})"
     if suffix.lower() in SURFACE_SUFFIXES:
-        text += f"; {suffix} describes a surface or a shape, not elements: fill it with tetrahedra, in Gmsh for example"
+        text += f"; {suffix} describes a surface, not elements: fill it with tetrahedra, in Gmsh for example"
         if suffix.lower() in SURFACE_FORMATS:
             text += ", or by --size 2e-3 (edges of 2 mm)"
     raise UsageError(text)

@@ -85,7 +85,10 @@ def read(
         raise MeshError(f"{label}: no such mesh file")
     suffix = file.suffix.lower()
     if suffix not in FORMATS or not file.is_file():
-        raise MeshError(f"{label}: unknown mesh format {suffix!r}, known are {', '.join(FORMATS)}")
+        raise MeshError(
+            f"{label}: unknown mesh format {suffix!r}, known are {', '.join(FORMATS)}; wf.mesh.from_surface "
+            "meshes STL, OBJ and PLY, wf.mesh.from_cad STEP, IGES, BREP and .geo"
+        )
     readers = {".msh": _read_gmsh, ".vtu": _read_vtu, ".inp": abaqus.read_inp}
     with _meshio_errors(label):
         raw = readers[suffix](file)

@@ -1,8 +1,11 @@
 """Tetrahedra inside a closed surface, by fTetWild (extra "mesh")."""
 
 import contextlib
+import importlib.util
 import os
+import sys
 import tempfile
+import types
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -55,12 +58,7 @@ def from_surface(
         raise MeshError(f"{label}: the surface is open: a mesh of its inside needs a closed one")
     if not wanted > 0.0:
         raise MeshError(f"{label}: the surface encloses {wanted:.3g} m^3: its triangles must turn outward")
-    try:
-        import pytetwild
-    except ImportError as error:
-        raise MeshError(
-            f"{label}: a mesh of the inside of a surface needs pytetwild: pip install 'warpfea[mesh]' ({error})"
-        ) from error
+    pytetwild = _mesher(label)
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):  # the mesher leaves a file there
         nodes, cells = pytetwild.tetrahedralize(
             points, triangles.astype(np.int32), edge_length_abs=float(length), epsilon=tolerance, vtk_ordering=True
@@ -74,6 +72,22 @@ def from_surface(
         )
     mesh = with_flat_sides(mesh, tolerance * float(np.linalg.norm(np.ptp(points, axis=0))))
     return check(with_mid_nodes(mesh) if element == "T10" else mesh)
+
+
+def _mesher(label: str) -> Any:
+    """pytetwild. It imports pyvista, 600 MB with VTK, for a method of its own meshes: an empty module does instead."""
+    stands_in = "pyvista" not in sys.modules and importlib.util.find_spec("pyvista") is None
+    try:
+        if stands_in:
+            sys.modules["pyvista"] = types.ModuleType("pyvista")
+        return importlib.import_module("pytetwild")
+    except ImportError as error:
+        raise MeshError(
+            f"{label}: a mesh of the inside of a surface needs pytetwild: pip install 'warpfea[mesh]' ({error})"
+        ) from error
+    finally:
+        if stands_in:
+            del sys.modules["pyvista"]
 
 
 def surface_arrays(surface: Any, what: str) -> tuple[np.ndarray, np.ndarray]:
