@@ -101,6 +101,14 @@ def test_node_sets_follow_the_corners(tmp_path):
     assert (mesh.points[mesh.node_sets["x-"], 0] == 0.0).all()
 
 
+def test_meshes_of_the_fork_of_meshio_are_taken():
+    kind = type("Mesh", (meshio.Mesh,), {"__module__": "meshlane._mesh"})
+    points = np.vstack([np.zeros(3), np.eye(3)])
+    assert from_meshio(kind(points, [("tetra", [[0, 1, 2, 3]])])).volume() == pytest.approx(1 / 6)
+    with pytest.raises(MeshError, match=r"expected a meshio\.Mesh"):
+        from_meshio(type("Mesh", (), {})())
+
+
 def ball(cells=3):
     mesh = wf.mesh.sphere(0.05, cells=2 * cells, element="T4")
     return mesh.points, mesh.faces(mesh.boundary())

@@ -37,6 +37,7 @@ PAGES += [
     ROOT / "warpfea/simulation/EXAMPLES.md",
     ROOT / "warpfea/simulation/FIELDS.md",
     ROOT / "warpfea/builder/ACTUATORS.md",
+    ROOT / "warpfea/mesh/MESHES.md",
     ROOT / "warpfea/outputs/PAGE.md",
     ROOT / "warpfea/simulation/GRADIENTS.md",
     ROOT / "warpfea/simulation/LEARNING.md",

@@ -1,4 +1,4 @@
-"""Reading of mesh files, the only module that uses meshio.
+"""Reading of mesh files by meshio, by which `outputs` writes VTU files, too; meshlane, its fork, was measured (MESHES.md).
 
 Workarounds for defects of meshio 5.3.5. Gmsh: sets are built from the tags, keyed by (dimension, tag),
 because its `cell_sets` are empty for MSH 2.2, lack unnamed groups, keep one of two groups that share a name,
@@ -129,9 +129,9 @@ def read_triangles(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray
 
 
 def is_meshio(mesh: Any) -> bool:
-    """True for a meshio.Mesh; meshio itself is not imported."""
+    """True for a meshio.Mesh, or one of its fork meshlane; neither is imported."""
     kind = type(mesh)
-    return kind.__name__ == "Mesh" and kind.__module__.partition(".")[0] == "meshio"
+    return kind.__name__ == "Mesh" and kind.__module__.partition(".")[0] in ("meshio", "meshlane")
 
 
 def from_meshio(

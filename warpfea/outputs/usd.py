@@ -62,7 +62,8 @@ class USDWriter(Output):
         color: the field shown as display colour (also a primvar), or None for grey.
         color_range: (low, high) of the colours; without it the extremes over the whole run and all worlds.
         spacing: distance of worlds (m); see :class:`warpfea.outputs.frames.DrawnSurface`.
-        material: bind a UsdPreviewSurface that reads the display colour: Blender shows white without it.
+        material: bind a UsdPreviewSurface that reads the display colour: Blender shows white without it
+            (tests/results/blender_material.json).
         layer_data: texts kept as the layer's customLayerData beside versions and units, such as command and seed.
         extend: extend the file of the resumed run, if it exists: same bodies and settings, ending at the current
             time.

@@ -1,11 +1,12 @@
 """VTU series for ParaView: a file per frame, body and world, and a .pvd index with their times."""
 
 import functools
+import json
 import os
 import pathlib
 import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 from xml.sax.saxutils import quoteattr
 
@@ -18,7 +19,7 @@ from ..model.surfaces import reference_points
 from ..terms.fields import SYMMETRIC
 from .frames import FrameClock, check_fields, frame_time
 from .obstacles import Obstacles
-from .vtk_reader import read_series
+from .vtk_reader import read_series, symmetric_fields
 
 __all__ = ["VTUFile", "VTUWriter"]
 
@@ -29,7 +30,8 @@ class VTUWriter(Output):
     Args:
         folder: the target folder; made if its parent exists. Files of the same names are overwritten.
         every: write each n-th accepted step (the default, with 1). fps: or by time, as USD does. Not both.
-        fields: fields at the mesh nodes, SI units; symmetric tensors in ParaView's order XX YY ZZ XY YZ XZ.
+        fields: fields at the mesh nodes, SI units; symmetric tensors, which the .pvd lists, in ParaView's order XX YY
+            ZZ XY YZ XZ.
         extend: extend the existing series of the resumed run; its frames after the current time are removed and
             rewritten.
 
@@ -80,6 +82,8 @@ class VTUWriter(Output):
         self._folder_created = not self.folder.exists()
         make_folder(self.folder)
         self._open = True
+        kinds = {name: sim.fields[name].components for name in self.fields if name in sim.fields}
+        self._symmetric = {name for name, components in kinds.items() if components == SYMMETRIC}
         self._clock = None if self.fps is None else FrameClock(self.fps)
         self._write_calls = 0
         self._last_time = -np.inf
@@ -99,6 +103,7 @@ class VTUWriter(Output):
     def _resume(self, now: float) -> None:
         """Extend the frames of the series up to the time `now`, s."""
         self._frames = self._read_series(self.series, now)
+        self._symmetric |= symmetric_fields(self.series)
         if self.collider_series.is_file():
             self._colliders = self._read_series(self.collider_series, now)
         self._kept_frames = self._indexed_frames = len(self._frames)
@@ -167,7 +172,7 @@ class VTUWriter(Output):
         return files
 
     def _write_series(self) -> None:
-        _write_pvd(self.series, self._frames)
+        _write_pvd(self.series, self._frames, self._symmetric)
         if self._colliders:
             _write_pvd(self.collider_series, self._colliders)
         self._indexed_frames = len(self._frames)
@@ -278,9 +283,10 @@ def _in_vtk_order(sim: Any, field: str, values: np.ndarray) -> np.ndarray:
     return values[..., [0, 1, 2, 5, 3, 4]] if spec and spec.components == SYMMETRIC else values
 
 
-def _write_pvd(target: pathlib.Path, frames: list[tuple[float, list[str]]]) -> None:
-    """Index of a series: files of each time, s."""
-    lines = ['<?xml version="1.0"?>', '<VTKFile type="Collection" version="0.1">', "<Collection>"]
+def _write_pvd(target: pathlib.Path, frames: list[tuple[float, list[str]]], symmetric: Iterable[str] = ()) -> None:
+    """Index of a series: files of each time, s, and names of the symmetric tensors."""
+    names = f" symmetric={quoteattr(json.dumps(sorted(symmetric)))}" if symmetric else ""
+    lines = ['<?xml version="1.0"?>', '<VTKFile type="Collection" version="0.1">', f"<Collection{names}>"]
     for time, files in frames:
         lines += [
             f'<DataSet timestep="{time!r}" group="" part="{part}" file={quoteattr(file)}/>'

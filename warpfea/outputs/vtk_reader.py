@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import pathlib
 import re
@@ -16,7 +17,7 @@ from ..base.lazy import meshio
 from ..base.names import check_known
 from ..terms.fields import ELEMENT_FIELDS, SYMMETRIC
 
-__all__ = ["SavedResults", "read_results", "read_series"]
+__all__ = ["SavedResults", "read_results", "read_series", "symmetric_fields"]
 
 FILE = re.compile(r"(.*)_(\d{4})_\d{6}\.vtu")
 """Body, world and frame of a file."""
@@ -31,6 +32,11 @@ def read_series(path: pathlib.Path) -> list[tuple[float, list[str]]]:
             frames.append((time, []))
         frames[-1][1].append(file)
     return frames
+
+
+def symmetric_fields(path: pathlib.Path) -> set[str]:
+    """Names of the symmetric tensors that a .pvd lists."""
+    return set(json.loads(next(ElementTree.parse(path).getroot().iter("Collection")).get("symmetric", "[]")))
 
 
 def read_results(path: str | os.PathLike[str]) -> SavedResults:
@@ -53,7 +59,8 @@ def read_results(path: str | os.PathLike[str]) -> SavedResults:
         raise ModelError(f"{target}: can't be read as a series ({error})") from error
     if not frames or not all(FILE.fullmatch(file) for _, files in frames for file in files):
         raise ModelError(f"{target}: is no series of VTUWriter")
-    return SavedResults(target, frames)
+    of_elements = {name for name, spec in ELEMENT_FIELDS.items() if spec.components == SYMMETRIC}
+    return SavedResults(target, frames, symmetric_fields(target) | of_elements)
 
 
 class SavedResults:
@@ -65,8 +72,8 @@ class SavedResults:
         worlds: number of worlds.
     """
 
-    def __init__(self, path: pathlib.Path, frames: list[tuple[float, list[str]]]) -> None:
-        self._folder, self._frames = path.parent, [files for _, files in frames]
+    def __init__(self, path: pathlib.Path, frames: list[tuple[float, list[str]]], symmetric: set[str]) -> None:
+        self._folder, self._frames, self._symmetric = path.parent, [files for _, files in frames], symmetric
         self.time = np.array([time for time, _ in frames])
         found = [FILE.fullmatch(file) for file in self._frames[0]]
         self.bodies = list(dict.fromkeys(str(match[1]) for match in found if match))
@@ -101,5 +108,4 @@ class SavedResults:
         """A field (frames, worlds, nodes), or (frames, worlds, nodes, k); symmetric tensors as xx yy zz yz xz xy."""
         check_known("field", name, self.fields(body))
         values = np.array([[mesh.point_data[name] for mesh in worlds] for worlds in self._meshes(body)])
-        spec = ELEMENT_FIELDS.get(name)
-        return values[..., [0, 1, 2, 4, 5, 3]] if spec and spec.components == SYMMETRIC else values
+        return values[..., [0, 1, 2, 4, 5, 3]] if name in self._symmetric else values
