@@ -1,4 +1,4 @@
-"""Reading of mesh files by meshio, by which `outputs` writes VTU files, too; meshlane, its fork, was measured (MESHES.md).
+"""Reading of mesh files by meshio, by which `outputs` writes VTU files, too; its fork was measured (MESHES.md).
 
 Workarounds for defects of meshio 5.3.5. Gmsh: sets are built from the tags, keyed by (dimension, tag),
 because its `cell_sets` are empty for MSH 2.2, lack unnamed groups, keep one of two groups that share a name,

@@ -21,7 +21,7 @@ CAD_FORMATS = {".step": "STEP", ".stp": "STEP", ".iges": "IGES", ".igs": "IGES",
 """Supported files of shapes."""
 ELEMENTS = {"T4": (3, 1), "T10": (3, 2), "quad": (2, 1)}
 """Dimension and order of what Gmsh meshes."""
-FLAT = 1e-9
+SIDE_TOL = 1e-9
 """Distance of nodes from a flat side over the size of a part."""
 
 
@@ -72,13 +72,13 @@ def from_cad(
             raise MeshError(str(error).replace(str(target), str(file))) from None
     if grouped or quads:
         return mesh
-    flat = with_flat_sides(mesh, FLAT * max(mesh.bounding_box()[1] - mesh.bounding_box()[0]))
+    flat = with_flat_sides(mesh, SIDE_TOL * max(mesh.bounding_box()[1] - mesh.bounding_box()[0]))
     return replace(flat, surface_sets=mesh.surface_sets | flat.surface_sets, node_sets=mesh.node_sets | flat.node_sets)
 
 
 @contextlib.contextmanager
 def _printing_to_stderr() -> Iterator[None]:
-    """What compiled code prints goes to stderr: stdout may be a file of results."""
+    """Send what compiled code prints to stderr: stdout may hold results."""
     sys.stdout.flush()
     own = os.dup(1)
     os.dup2(2, 1)

@@ -11,8 +11,8 @@ from .surfaces import Skin, sparse_weights
 
 __all__ = ["embedded_skin", "parent_coordinates", "shape_at_own_points"]
 
-CHUNK = 20000
-"""Pairs of a point and an element at once, which bounds the memory."""
+PAIRS_AT_ONCE = 20000
+"""Points, each with its element, at once: bounds the memory."""
 ROUND_OFF = 1e-9
 """Distance over the size of an element up to which a point counts as inside."""
 NEWTON_STEPS, SWEEPS = 4, 60
@@ -76,8 +76,8 @@ def _nearest(body: Discretisation, x: np.ndarray, margin: float) -> tuple[np.nda
     inside = ((low[elements] - margin <= x[points]) & (x[points] <= high[elements] + margin)).all(axis=1)
     elements, points = elements[inside], points[inside]
     xi, off = np.zeros((len(points), 3)), np.zeros(len(points))
-    for first in range(0, len(points), CHUNK):
-        own = slice(first, first + CHUNK)
+    for first in range(0, len(points), PAIRS_AT_ONCE):
+        own = slice(first, first + PAIRS_AT_ONCE)
         xi[own], off[own] = _within(body, elements[own], x[points[own]], nearest=margin > ROUND_OFF * size)
     order = np.lexsort((elements, off, points))
     chosen, at = np.unique(points[order], return_index=True)
