@@ -45,12 +45,12 @@ def linked(kind, worlds=1, device="cpu"):
         start = {"parent": wf.GROUND, "child": first.surface("x-"), "anchor": (0, 0.01, 0.01), "axis": (0, 1, 0)}
         b.add_joint("revolute", drive=wf.Control("motor"), **start)
         b.add_joint("revolute", axis=(0, 1, 0), **pair)
-    elif kind in ("springs", "springs without a stop"):
+    elif kind == "springs":
         start = {"parent": wf.GROUND, "child": first.surface("x-"), "anchor": (0, 0.01, 0.01), "axis": (0, 1, 0)}
         b.add_joint("revolute", **start, stiffness=0.3, damping=2e-3, name="hip")
         b.add_actuator("hip", wf.PD(kp=0.5, kd=5e-3, target=wf.Control("aim"), limit=10.0), name="servo")
         stop = wf.Stop(-1.0, -0.02, stiffness=2.0, damping=3e-3)
-        b.add_joint("revolute", axis=(0, 1, 0), **pair, limits=stop if kind == "springs" else None, name="knee")
+        b.add_joint("revolute", axis=(0, 1, 0), **pair, limits=stop, name="knee")
         b.add_actuator("knee", wf.Control("torque"), name="motor")
         b.add_actuator("knee", wf.PD(kp=1.0, kd=0.01, target=1.0, limit=0.03), name="weak")
         end = second.at((0.2, 0.01, 0.01))
@@ -85,21 +85,6 @@ def linked(kind, worlds=1, device="cpu"):
     return b.finalize(device=device, worlds=worlds, many=False)
 
 
-SPRINGS = {
-    "hip.stiffness": 0.3, "hip.damping": 2e-3, "servo.kp": 0.5, "servo.kd": 5e-3, "knee.stop_stiffness": 2.0,
-    "knee.stop_damping": 3e-3, "knee.upper": -0.02, "weak.limit": 0.03, "s.stiffness": 20.0, "s.damping": 0.1,
-    "s.rest": 0.08, "bed.stiffness": 2e4, "bed.damping": 30.0,
-}  # fmt: skip
-"""Parameters of `linked("springs")`."""
-
-
-FRICTION = {
-    "hip.friction": 0.05, "knee.friction": 1e-3, "mount.stiffness": np.array((20, 30, 10, 0.02, 0.03, 0.04)),
-    "mount.damping": np.array((0.1, 0.2, 0.3, 1e-3, 1.2e-3, 1.5e-3)),
-}  # fmt: skip
-"""Parameters of `linked("friction")`: one joint sticks, the other slips."""
-
-
 def controls(kind, steps):
     """Values (steps, size) of the controls of `linked`, and their scales."""
     ramp, rng = np.linspace(0.0, 1.0, steps)[:, None], np.random.default_rng(0)
@@ -109,4 +94,4 @@ def controls(kind, steps):
         "springs": {"aim": 0.1 * ramp + 0.05, "torque": 0.002 * rng.standard_normal((steps, 1))},
         "followers": {"pressure": 500.0 + 500.0 * ramp, "moment": 0.02 * rng.standard_normal((steps, 3))},
         "drives": {"shift": 0.01 * ramp * np.ones(3), "turn": 0.4 * ramp},
-    }[kind]
+    }.get(kind, {})

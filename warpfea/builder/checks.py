@@ -58,7 +58,9 @@ def body_of_handle(thing: Any, what: str, kinds: tuple[type, ...], bodies: list[
         hint = f"; write body.nodes({thing!r}) or body.surface({thing!r})" if isinstance(thing, str) else ""
         raise ModelError(f"{what}: expected a handle of a body, {wanted}, got {thing!r}{hint}")
     if not isinstance(thing, kinds):
-        raise ModelError(f"{what}: expected {wanted} of body {body.name!r}, got {HANDLE_NAMES[type(thing)]}")
+        raise ModelError(
+            f"{what}: expected {wanted} of body {body.name!r}, got {HANDLE_NAMES.get(type(thing), HANDLE_NAMES[Body])}"
+        )
     if body not in bodies:
         raise ModelError(f"{what}: body {body.name!r} belongs to another builder")
     if isinstance(thing, (NodeSet, SurfaceSet)) and len(thing) == 0:

@@ -43,8 +43,6 @@ class DifferentiableSprings(Differentiable):
     def not_differentiable(self, ctx: StepContext) -> str | None:
         if ctx.midpoint or (ctx.accelerated and not np.isin(self.kind, (VECTOR, CHORD)).all()):
             return "springs of lengths and angles in steps of generalized_alpha or energy_momentum"
-        if self.impacts and "previous_displacement" in ctx.state.names:
-            return "stops in steps of bdf2, which takes impacts by other steps"
         return "friction of joints in statics" if self.has_friction and not ctx.inertia else None
 
     @property
