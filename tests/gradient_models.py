@@ -27,14 +27,14 @@ def best_differences(values, exact):
     return np.abs(found / np.asarray(exact)[:, None] - 1.0).min(axis=1)
 
 
-def linked(kind, worlds=1, device="cpu"):
+def linked(kind, worlds=1, device="cpu", law=LAW):
     """Two bars of T4 on joints, with controls of drives and loads."""
     b = wf.ModelBuilder(gravity=(0, 0, -9.81))
     bars = [
         b.add_solid(
             wf.mesh.box((0.1, 0.02, 0.02), cells=(2, 1, 1), element="T4"),
             transform=(np.eye(3), (x, 0, 0)),
-            material=LAW,
+            material=law,
             name=name,
         )
         for x, name in ((0.0, "a"), (0.1, "b"))

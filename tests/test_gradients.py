@@ -110,6 +110,43 @@ def test_gradients_of_joints_and_controls(kind, scheme):
     assert (errors < TOLERANCE).all(), errors
 
 
+FORWARD = [("followers", "backward_euler"), ("drives", "bdf2"), ("loads", "energy_momentum")]
+
+
+@pytest.mark.parametrize(
+    ("kind", "scheme"), [pytest.param(*case, marks=[pytest.mark.slow] * (case[1] != "bdf2")) for case in FORWARD]
+)
+def test_forward_sensitivities_are_the_transpose(kind, scheme):
+    """<w, J v> = <J^T w, v>; J v beside differences along v."""
+    steps, rng, law = 5, np.random.default_rng(5), models.material(form="rate" if kind == "drives" else "incremental")
+    given = controls(kind, steps)
+    given.pop("turn", None)
+    given.pop("rod", None)
+    names = ["a.E", "b.eta", "b.density", "gravity", "initial.velocity", "initial.displacement", *given]
+    for tol, bar in ((1e-14, 1e-12), (1e-10, 1e-8)):
+        m = linked(kind, 2, law=law)
+        sim = wf.Simulation(m, dt=2e-3, integrator=scheme, solver=SOLVER, constraint_tol=1e-12)
+        tape = wf.Adjoint(sim, names, tol=tol)
+        for step in range(steps):
+            for name, values in given.items():
+                sim.controls[name][:] = values[step]
+            tape.run(1)
+        p = tape.probe("tip")
+        bars = [rng.standard_normal(array.shape) for array in p.arrays]
+        for array, values in zip(p.arrays, bars):
+            array.grad.assign(values)
+        g = {name: array.numpy().copy() for name, array in tape.backward().items()}
+        v = {name: rng.standard_normal(g[name].shape) / np.abs(g[name]).max() for name in g}
+        change = tape.forward(v)["tip"]
+        left = sum(np.sum(w * array.numpy(), axis=(1, 2)) for w, array in zip(bars, change.arrays))
+        right = sum(np.sum((g[name] * v[name]).reshape(2, -1), axis=1) for name in g)
+        size = sum(np.sum(np.abs(g[name] * v[name]).reshape(2, -1), axis=1) for name in g)
+        assert (np.abs(left - right) < bar * size).all(), (left, right, size)
+        assert (np.abs(right) > 1e-3 * size).all()
+    with pytest.raises(wf.ModelError, match="'box.E' is none of the tape's"):
+        tape.forward({"box.E": 1.0})
+
+
 @pytest.mark.cuda
 def test_gradients_on_a_gpu():
     """Those of the CPU, in worlds with motors of their own."""

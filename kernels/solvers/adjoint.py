@@ -143,23 +143,36 @@ def adjoint_kernels(dtype: str, constrained: bool) -> KernelSet:
             rows[c, world, slot] = f64(weight[slot][c]) * f64(x[world, slot][c])
 
     @masked_kernel(module, "active")
-    def gravity_rows(lumped: p.scalar_2d, ramp: double_1d, w: p.vec3_2d, active: int_1d, rows: double_3d):
-        """w times the lumped masses."""
+    def gravity_force(lumped: p.scalar_2d, ramp: double_1d, component: int, active: int_1d, out: p.vec3_2d):
+        """Lumped masses along an axis."""
         world, slot = wp.tid()
-        scale = ramp[world] * f64(lumped[world % lumped.shape[0], slot])
-        for c in range(3):
-            rows[c, world, slot] = scale * f64(w[world, slot][c])
+        f = vec3()
+        f[component] = T(ramp[world]) * lumped[world % lumped.shape[0], slot]
+        out[world, slot] = f
 
     @masked_kernel(module, "active")
-    def density_rows(
+    def density_force(
         topo: Topology, lumped: p.scalar_2d, gravity: vec3d_1d, ramp: double_1d, v: p.vec3_2d, v_tilde: p.vec3_2d,
-        mass_factor: double_1d, w: p.vec3_2d, active: int_1d, rows: double_3d,
+        mass_factor: double_1d, active: int_1d, out: p.vec3_2d,
     ):  # fmt: skip
-        """w.(m g - c_M M (v - v~)) with the masses of a density of 1."""
+        """m g - c_M M (v - v~) with the masses of a density of 1."""
         world, slot = wp.tid()
         inertia = mass_times(topo, v, world, slot) - mass_times(topo, v_tilde, world, slot)
         load = T(ramp[world]) * lumped[world % lumped.shape[0], slot] * vec3(gravity[world])
-        rows[0, world, slot] = f64(wp.dot(w[world, slot], load - T(mass_factor[world]) * inertia))
+        out[world, slot] = load - T(mass_factor[world]) * inertia
+
+    @masked_kernel(module, "active")
+    def weighted_change(weight: p.vec3_1d, change: double_2d, active: int_1d, out: p.vec3_2d):
+        """out += weights of the slots times the components of a change."""
+        world, slot = wp.tid()
+        for c in range(change.shape[1]):
+            out[world, slot][c] += weight[slot][c] * T(change[world, c])
+
+    @masked_kernel(module, "active")
+    def scaled_change(x: p.vec3_2d, change: double_2d, component: int, sign: f64, active: int_1d, out: p.vec3_2d):
+        """out += sign times a component of a change times x."""
+        world, slot = wp.tid()
+        out[world, slot] = out[world, slot] + T(sign * change[world, component]) * x[world, slot]
 
     @masked_kernel(module, "active")
     def rotation_rows(

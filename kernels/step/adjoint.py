@@ -150,6 +150,60 @@ def step_adjoint_kernels(dtype: str, scheme: Any, impacts: bool = False) -> Kern
         c = step_coefficients(step, world)
         add_predictor_bar(c, x[world, slot], q_bar, v_bar, q_before, v_before, world, slot)
 
+    # forward: changes of the state along a direction
+
+    @masked_kernel(module, "active")
+    def predict_change(
+        step: Step, driven: p.vec3_1d, free: p.vec3_1d, q: p.vec3_2d, v: p.vec3_2d, q_before: p.vec3_2d,
+        v_before: p.vec3_2d, drive: p.vec3_2d, active: int_1d, q_tilde: p.vec3_2d, v_tilde: p.vec3_2d, x: p.vec3_2d,
+        w: p.vec3_2d,
+    ):  # fmt: skip
+        """Changes of q~ and v~, x = dq~/d + dv~, and w = (change of the position)/d of prescribed components."""
+        world, slot = wp.tid()
+        c = step_coefficients(step, world)
+        dq = T(c.a0) * q[world, slot]
+        dv = vec3()
+        if wp.static(not scheme.static):
+            dv = T(c.a0) * v[world, slot]
+        if wp.static(takes_velocity):
+            dq += T(c.b) * v[world, slot]
+        if wp.static(multistep):
+            dq -= T(c.a1) * q_before[world, slot]
+            dv -= T(c.a1) * v_before[world, slot]
+        if wp.static(accelerated):
+            dq += T(c.q_a) * q_before[world, slot]
+            dv += T(c.v_a) * q_before[world, slot] + T(c.v_w) * v_before[world, slot]
+        scale = T(1.0) / T(c.dq_dv)
+        q_tilde[world, slot] = dq
+        v_tilde[world, slot] = dv
+        x[world, slot] = scale * dq + dv
+        held = q[world, slot] - wp.cw_mul(free[slot] + driven[slot], q[world, slot])
+        w[world, slot] = scale * (held + wp.cw_mul(driven[slot], drive[world, slot]))
+
+    @masked_kernel(module, "active")
+    def change_side(step: Step, topo: Topology, x: p.vec3_2d, force: p.vec3_2d, active: int_1d, out: p.vec3_2d):
+        """m M x + force: the right side of H w + J^T mu."""
+        world, slot = wp.tid()
+        out[world, slot] = T(step.mass_factor[world]) * mass_times(topo, x, world, slot) + force[world, slot]
+
+    @masked_kernel(module, "active")
+    def change_state(
+        step: Step, w: p.vec3_2d, q_tilde: p.vec3_2d, v_tilde: p.vec3_2d, active: int_1d, q: p.vec3_2d, v: p.vec3_2d,
+        q_before: p.vec3_2d, v_before: p.vec3_2d,
+    ):  # fmt: skip
+        """Changes of the state at the end from w = (change of the position)/d and those at the start."""
+        world, slot = wp.tid()
+        c = step_coefficients(step, world)
+        dv = w[world, slot] - (T(1.0) / T(c.dq_dv)) * q_tilde[world, slot]
+        if wp.static(multistep):
+            q_before[world, slot] = q[world, slot]
+            v_before[world, slot] = v[world, slot]
+        if wp.static(accelerated):
+            q_before[world, slot] = T(c.a_v) * (dv - v[world, slot]) - T(c.a_a) * q_before[world, slot]
+            v_before[world, slot] = T(c.mass_factor) * (dv - v_tilde[world, slot])
+        q[world, slot] = T(c.dq_dv) * w[world, slot]
+        v[world, slot] = dv
+
     @masked_kernel(module, "active")
     def history_field(
         step: Step, part: int, q: p.vec3_2d, v: p.vec3_2d, before: p.vec3_2d, active: int_1d, x: p.vec3_2d,

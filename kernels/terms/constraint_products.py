@@ -6,7 +6,7 @@ import warp as wp
 
 from ..common.modules import kernel_module, masked_kernel
 from ..common.types import double_1d, f64, int_1d, precision, vec3d
-from .constraints import ANGLE, DISTANCE, constraint_functions, constraint_kernels, constraint_struct, multiplier_struct
+from .constraints import DISTANCE, constraint_functions, constraint_kernels, constraint_struct, multiplier_struct
 
 __all__ = ["exact_product_kernel"]
 

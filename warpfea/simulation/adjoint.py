@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import os
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,10 +27,11 @@ from ..terms.gradients import Gradient, StepAdjoint
 from ..terms.protocols import Differentiable
 from ..terms.shape_gradients import MESH, MeshGradient
 from .initial_adjoint import check_initial_conditions, step_back_to_initial
+from .sensitivities import Forward
 from .simulation import Simulation
 from .statics import StaticResult
 from .stepper import Stepper
-from .tape import Tape
+from .tape import ProbeArrays, Tape
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -94,6 +95,7 @@ class Adjoint(Tape):
             self.mesh = MeshGradient(self.stepper.ctx) if MESH in self.names else None
             self.outputs = {name: self._sources(name) for name in self.names}
         self.residual = self.growth = np.zeros(m.worlds)
+        self._forward: Forward | None = None
         self._sums = {name: self._zeros(self._size_of(name)) for name in self.names}
         self._sums |= {MESH: self.mesh.zeros()} if self.mesh else {}
         if self.static:
@@ -182,22 +184,14 @@ class Adjoint(Tape):
             ModelError: no step, or parameters that changed since.
             ConvergenceError: a residual above 1e-6, in all worlds that run.
         """
-        if not self.steps:
-            raise ModelError("Adjoint: no step to go back; run(steps) first")
-        self._check_parameters()
         m, a = self.model, self.solver
+        self.begin()
         self._take_loss(loss)
         sums, series = self._sums, dict[str, wp.array]()
         for array in sums.values():
             array.zero_()
         for name in (name for name in self.names if name in m.terms.time_laws.controls):
             series[name] = self._zeros(self.steps, self._size_of(name))
-        self.stepper.set_dt(1.0)  # of statics; others follow
-        self.stepper.newton.invalidate(wp.ones(m.worlds, dtype=wp.int32, device=m.device))
-        for array in (*a.bars.values(), a.control.residual, self.at.switches):
-            array.zero_()
-        for term in m.terms.having(Differentiable):
-            term.begin_adjoint(self.at)
         last = np.zeros(m.worlds)
         add_probes = self._probe_commands()
         for k in reversed(range(self.steps)):
@@ -211,13 +205,41 @@ class Adjoint(Tape):
             if not last.any():
                 last = a.control.first_norm.numpy().copy()
         self.growth = a.control.first_norm.numpy() / np.where(last > 0.0, last, np.inf)
-        self.residual = a.control.residual.numpy().copy()
-        failed = self.sim.status != STATUS["running"]
-        self._check_result(~failed)
+        failed = self._check_result()
         out = {name: series.get(name) or wp.clone(array) for name, array in sums.items()}
         out |= {name: wp.clone(a.q_bar if name == INITIAL[0] else a.v_bar) for name in self.names if name in INITIAL}
         found = Gradients({name: self._finished(array, failed) for name, array in out.items()})
         found.switches = self.at.switches.numpy()
+        return found
+
+    def begin(self) -> None:
+        """Begin to go through the steps kept; ModelError without any, or after a change of parameters."""
+        if not self.steps:
+            raise ModelError("Adjoint: no step to go back; run(steps) first")
+        self._check_parameters()
+        m, a = self.model, self.solver
+        self.stepper.set_dt(1.0)  # of statics; others follow
+        self.stepper.newton.invalidate(wp.ones(m.worlds, dtype=wp.int32, device=m.device))
+        for array in (*a.bars.values(), a.control.residual, self.at.switches):
+            array.zero_()
+        for term in m.terms.having(Differentiable):
+            term.begin_adjoint(self.at)
+
+    def forward(self, direction: Mapping[str, Any]) -> dict[str, ProbeArrays]:
+        """Changes of the probes along a change of the parameters of the tape, to first order: J times it.
+
+        Args:
+            direction: changes by name, in the shapes of the results of `backward`, or what broadcasts to them; others
+                are 0.
+
+        Raises:
+            ModelError: an unknown name, or a parameter, term or scheme without sensitivities, by name.
+            ConvergenceError: a residual above 1e-6, in all worlds that run.
+        """
+        if self._forward is None or self._forward.updates != self._updates:
+            self._forward = Forward(self)
+        found = self._forward.run(direction)
+        self._check_result()
         return found
 
     def _take_loss(self, loss: Any) -> None:
@@ -232,7 +254,7 @@ class Adjoint(Tape):
         return wp.zeros((self.model.worlds, *shape), dtype=wp.float64, device=self.model.device)
 
     def _step_back(self, part: int, sums: dict[str, wp.array]) -> None:
-        self._load(part)
+        self.load(part)
         self._graph = self._graph or self._capture(sums)
         wp.capture_launch(self._graph)
         if part in self.restarts:
@@ -243,7 +265,7 @@ class Adjoint(Tape):
         """Graph of one step back, from the state at its start."""
         gradients = [(make(), sums[name]) for name, makers in self.outputs.items() for make in makers]
         with wp.ScopedCapture(device=self.model.device) as recorded:
-            self._linearise()
+            self.linearise()
             for term in self.model.terms.having(Differentiable):
                 term.linearise_adjoint(self.at)
             self.solver.solve()
@@ -264,8 +286,11 @@ class Adjoint(Tape):
             return array[:, 0]
         return array.reshape((len(failed),)) if array.shape == (len(failed), 1) and array.dtype == wp.float64 else array
 
-    def _check_result(self, running: np.ndarray) -> None:
-        worst = np.where(running, self.residual, 0.0)
+    def _check_result(self) -> np.ndarray:
+        """Flags of the worlds that failed; ConvergenceError for a residual in others."""
+        self.residual = self.solver.control.residual.numpy().copy()
+        failed = self.sim.status != STATUS["running"]
+        worst = np.where(failed, 0.0, self.residual)
         if not (worst <= MAX_RESIDUAL).all():
             world = int(np.argmax(~(worst <= MAX_RESIDUAL)))
             raise ConvergenceError(
@@ -281,6 +306,7 @@ class Adjoint(Tape):
                 ModelWarning,
                 stacklevel=3,
             )
+        return failed
 
     def _probe_commands(self) -> list[wp.Launch]:
         """Commands of `_add_probes`; their third argument is the step."""
@@ -299,7 +325,7 @@ class Adjoint(Tape):
         if self.mesh:
             self.mesh.add_probes(self.stepper.launch, self.probes, k, self.kept[self.ends[k]], self._sums[MESH])
 
-    def _load(self, part: int) -> None:
+    def load(self, part: int) -> None:
         """The state at the start of a part of a step, with the joint forces and velocities at its end."""
         start, end = self.kept[part], self.kept[part + 1]
         for name, array in start.items():
@@ -313,7 +339,7 @@ class Adjoint(Tape):
         else:
             wp.copy(self.end_velocity, end["velocity"])
 
-    def _linearise(self) -> None:
+    def linearise(self) -> None:
         """Evaluate the step at its converged end: forces, D, penalties."""
         s, w = self.stepper, self.stepper.work
         s.launch(s.kernels.begin_step, self.model.worlds, [w.step, w.newton, w.pcg])

@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import warp as wp
 
 from ..base.errors import ModelError
 from ..base.worlds import set_rows

@@ -10,7 +10,7 @@ solves with the transposed products of all terms, preconditioned by the symmetri
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import warp as wp
@@ -20,7 +20,7 @@ from ..kernels.common.structs import product_terms_struct, topology_struct
 from ..kernels.solvers.adjoint import adjoint_kernels, adjoint_struct
 from ..kernels.step.adjoint import step_adjoint_kernels
 from ..kernels.step.gather import gather_kernels
-from ..kernels.terms.constraints import constraint_struct
+from ..kernels.terms.constraints import constraint_struct, multiplier_struct
 from ..terms.gradients import with_fields
 from ..terms.protocols import Constrained, Differentiable
 from .bicgstab import BiCGStab
@@ -104,6 +104,7 @@ class AdjointSolver:
         self.operator = ExactOperator(newton.residual, transposed=True)
         self.linear = newton.pcg
         self.reactions = True
+        self.force: Any = None  # of `step_forward`
         self.symmetric = all(term.is_symmetric(newton.ctx) for term in m.terms.having(Differentiable))
         if not self.symmetric:
             # a transposed tangent may resist translations that the tangent does not
@@ -138,16 +139,67 @@ class AdjointSolver:
     def solve(self) -> None:
         """Solve at the linearised step, and step back."""
         m, w, launch, k = self.model, self.work, self.launch, self.kernels
-        newton, active, step = w.newton, w.newton.active, w.step
+        active, step = self.running, w.step
+        self._transpose(True)
+        launch(self.step_kernels.right_side, self.dim, [step, *self.state_bars, active, self.rhs, self.w])
+        w.Hp.zero_()
+        self._solve_system()
+        args = [step, m.topology, self.driven, self.w, w.gradient, active, *self.state_bars, self.drive_bar]
+        launch(self.step_kernels.step_back, self.dim, args)
+        if self.newton.ctx.midpoint:
+            self.operator.product(self.w, w.Hp, active, self.topology, start=True)
+            launch(k.subtract_force, self.dim, [w.Hp, step.dq_dv, active, self.q_bar])
+
+    @launch_part("vectors")
+    def step_forward(self, parameters: Callable[[], None], histories: Callable[[], None]) -> None:
+        """Change of the state of the linearised step along a direction, of which the bars hold that of its start.
+
+        `parameters` and `histories` add forces to `force`, and the former the change of driven positions to `drive`.
+        """
+        m, w, launch, k, step = self.model, self.work, self.launch, self.step_kernels, self.work.step
+        active = self.running
+        self._transpose(False)
+        for array in (self.force, self.drive):
+            array.zero_()
+        parameters()
+        args = [step, self.driven, m.topology.free, *self.state_bars, self.drive, active]
+        launch(k.predict_change, self.dim, [*args, self.q_tilde, self.v_tilde, self.predicted, self.w])
+        if self.newton.ctx.midpoint:
+            self.operator.product(self.q_bar, w.Hp, active, self.topology, start=True)
+            launch(self.kernels.subtract_force, self.dim, [w.Hp, step.dq_dv, active, self.force])
+        histories()
+        launch(k.change_side, self.dim, [step, m.topology, self.predicted, self.force, active, self.rhs])
+        self.operator.product(self.w, w.Hp, active, self.topology)
+        self._solve_system()
+        launch(k.change_state, self.dim, [step, self.w, self.q_tilde, self.v_tilde, active, *self.state_bars])
+
+    def prepare_forward(self) -> None:
+        """Allocate for `step_forward`."""
+        if self.force is None:
+            names = ("force", "predictor q", "predictor v", "predicted")
+            arrays = (self.work.array(f"adjoint {name}", self.dim, self.model.types.vec3) for name in names)
+            self.force, self.q_tilde, self.v_tilde, self.predicted = arrays
+            self.drive = self.drive_bar
+
+    def _transpose(self, transposed: bool) -> None:
+        """Take the operator and the rows of constraints, or their transposes."""
+        mul = self.work.multipliers
+        self.operator.transposed, self.multipliers = transposed, mul
+        if not transposed and self.newton.ctx.midpoint:
+            swapped = {"gradient": mul.end_gradient, "end_gradient": mul.gradient}
+            self.multipliers = with_fields(multiplier_struct(), mul, **swapped)
+
+    def _solve_system(self) -> None:
+        """Solve for w from the right side, at w and its product work.Hp."""
+        m, w, launch = self.model, self.work, self.launch
+        newton, active = w.newton, w.newton.active
         for flags in (newton.norms.component_converged, newton.floor.estimate_error, newton.solve.predicted_stress):
             flags.zero_()
         newton.iterations.fill_(newton.max_iterations)  # factors are checked by products
         w.pcg.step_iterations.zero_()
         wp.copy(active, self.running)
-        launch(self.step_kernels.right_side, self.dim, [step, *self.state_bars, active, self.rhs, self.w])
         self.newton.residual.assemble_matrix(active)  # a matrix of the operator is that of this step
         self.mu.zero_()
-        w.Hp.zero_()
         self._check(start=1)
         wp.capture_while(self.control.any_active, self._refine)
         wp.copy(active, self.running)
@@ -156,12 +208,7 @@ class AdjointSolver:
         if self.constrained or self.reactions:
             self._product(reactions=True)
             self._evaluate_residual()
-        launch(k.note_residual, m.worlds, [self.control, active])
-        args = [step, m.topology, self.driven, self.w, w.gradient, active, *self.state_bars, self.drive_bar]
-        launch(self.step_kernels.step_back, self.dim, args)
-        if self.newton.ctx.midpoint:
-            self.operator.product(self.w, w.Hp, active, self.topology, start=True)
-            launch(k.subtract_force, self.dim, [w.Hp, step.dq_dv, active, self.q_bar])
+        launch(self.kernels.note_residual, m.worlds, [self.control, active])
 
     def history_fields(self) -> Iterator[tuple[str, wp.array, wp.array]]:
         """State arrays in the strain rates of incremental damping, each with x and scale of `history_gradient`."""
@@ -186,7 +233,7 @@ class AdjointSolver:
         launch(k.add_direction, self.dim, [w.direction, active, self.w])
         self._product()
         if self.constrained:
-            args = [self.constraint_data, w.multipliers, self.w, w.step.dq_dv, active, self.mu]
+            args = [self.constraint_data, self.multipliers, self.w, w.step.dq_dv, active, self.mu]
             launch(k.update_multipliers, self.mu.shape, args)
         self._check(start=0)
 
@@ -197,13 +244,13 @@ class AdjointSolver:
 
     def _evaluate_residual(self) -> None:
         m, w, active = self.model, self.work, self.work.newton.active
-        args = [m.topology.free, self.constraint_data, w.multipliers, self.mu, self.rhs, w.Hp, w.diagonal, active]
+        args = [m.topology.free, self.constraint_data, self.multipliers, self.mu, self.rhs, w.Hp, w.diagonal, active]
         self.launch(self.kernels.residual, self.dim, [*args, w.gradient, w.rows])
         self.newton.residual.reduce(w.rows, 1, active, self.control.sums)
 
     def _product(self, *, reactions: bool = False) -> None:
         """A w into work.Hp, by the matrix of this step where it is exact; `reactions`: on prescribed components too."""
-        if self.symmetric and self.newton.residual.uses_matrix and not reactions:
+        if self.symmetric and self.newton.residual.uses_matrix and not reactions and self.operator.transposed:
             self.newton.residual.product(self.w, self.work.Hp, self.work.newton.active)
             return
         self.operator.product(self.w, self.work.Hp, self.work.newton.active, self.topology)

@@ -174,6 +174,18 @@ class Elements(Differentiable):
             self._history_force(at, found, at.ctx.work.u, at.ones, at.w, transposed=1)
             at.add_predictor_bar(at.scratch, at.active)
 
+    def add_history_change(self, at: StepAdjoint) -> None:
+        ctx = at.ctx
+        if not ctx.inertia or ctx.midpoint:
+            return
+        if found := self.history_kernels("incremental"):
+            for name, x, scale in at.history_fields():
+                self._history_force(at, found, x, scale, at.bars[name], transposed=0)
+                ctx.launch(at.kernels.add_vector, at.dim, [at.scratch, at.active, at.force])
+        if found := self.history_kernels("rate"):
+            self._history_force(at, found, ctx.work.u, at.ones, at.q_tilde, transposed=0)
+            ctx.launch(at.kernels.add_vector, at.dim, [at.scratch, at.active, at.force])
+
     def _history_force(
         self, at: StepAdjoint, found: list[Any], x: wp.array, scale: wp.array, direction: wp.array, transposed: int
     ) -> None:

@@ -10,13 +10,12 @@ import numpy as np
 import warp as wp
 
 from ..kernels.solvers.direct import direct_kernels, follower_pattern_struct
-from ..kernels.solvers.vectors import vector_kernels
 from ..kernels.step.gather import gather_kernels
 from ..kernels.terms.follower_loads import follower_struct, moment_kernels, pressure_kernels
 from ..model import assembly
 from ..model.description import Moment, Pressure
 from ..time_laws import TimeLaw
-from .gradients import Gradient, StepAdjoint
+from .gradients import ForceGradient, Gradient, StepAdjoint
 from .protocols import Differentiable, Preconditioned
 from .term import StepContext
 from .time_law_table import TimeLawTable
@@ -123,7 +122,7 @@ class FollowerLoads(Preconditioned, Differentiable):
 
     def law_gradient(self, ctx: StepContext, law: int) -> Gradient | None:
         """w.df/dvalue: the forces are linear in the components of the value."""
-        m, kernel = self.model, vector_kernels(self.model.dtype, self.model.terms.traits.has_constraints).dot_terms
+        m = self.model
         loads = [load for load in self.loads if (load.data.time_law.numpy() == law).any()]
         units = np.zeros((3, *ctx.work.time_law_values.shape, 3))
         for c in range(3):
@@ -131,19 +130,16 @@ class FollowerLoads(Preconditioned, Differentiable):
         values: list[wp.array] = [wp.array(table, dtype=wp.vec3d, device=m.device) for table in units]
         gather = gather_kernels(m.dtype, ctx.traits).gather_force
 
-        def add(at: StepAdjoint, out: wp.array) -> None:
+        def force(at: StepAdjoint, k: int) -> None:
             w = at.ctx.work
-            for c in range(out.shape[1]):
-                w.nonpotential_contribution.zero_()
-                for load in loads:
-                    args = [load.data, w.u_stage, values[c], at.active, w.nonpotential_contribution]
-                    at.ctx.launch(load.force, (m.worlds, load.count), args)
-                args = [m.terms.nonpotential_topology, w.nonpotential_contribution, at.active, at.scratch]
-                at.ctx.launch(gather, at.dim, args)
-                at.ctx.launch(kernel, at.dim, [at.scratch, at.w, at.active, w.rows])
-                at.add(out[:, c : c + 1])
+            w.nonpotential_contribution.zero_()
+            for load in loads:
+                args = [load.data, w.u_stage, values[k], at.active, w.nonpotential_contribution]
+                at.ctx.launch(load.force, (m.worlds, load.count), args)
+            args = [m.terms.nonpotential_topology, w.nonpotential_contribution, at.active, at.scratch]
+            at.ctx.launch(gather, at.dim, args)
 
-        return add if loads else None
+        return ForceGradient(force) if loads else None
 
     def allocate_blocks(self, ctx: StepContext, matrix: Any, *, projected: bool) -> None:
         if not projected:

@@ -31,7 +31,16 @@ if TYPE_CHECKING:
     from ..model.model import Model
     from .term import StepContext
 
-__all__ = ["Gradient", "StepAdjoint", "compile_kernels", "law_weights", "material_gradients", "with_fields"]
+__all__ = [
+    "ForceGradient",
+    "Gradient",
+    "StepAdjoint",
+    "WeightGradient",
+    "compile_kernels",
+    "law_weights",
+    "material_gradients",
+    "with_fields",
+]
 
 STEP = 1e-30
 """Complex step: derivatives are exact to round-off for any small one."""
@@ -43,7 +52,8 @@ class StepAdjoint:
 
     Attributes:
         ctx: at its end; its state is that of the start.
-        solver: of solvers/adjoint.py, with w, mu, drive_bar, bars, kernels, `history_fields`, `add_predictor_bar`.
+        solver: of solvers/adjoint.py, with w, mu, drive_bar, bars, kernels, `history_fields`, `add_predictor_bar`; of
+            changes along a direction, in place of bars, with force, drive, q_tilde.
         scratch: [world, slot].
         switches: [world] counts of points that came into contact or left it, began to slip or stuck.
     """
@@ -110,20 +120,60 @@ def with_fields(kind: Any, data: Any, **changes: Any) -> Any:
     return out
 
 
-def law_weights(
-    model: Model, slots: np.ndarray, weights: np.ndarray, of: Callable[[StepAdjoint], wp.array]
-) -> Gradient:
-    """Derivative by the value of a law that acts on slots with weights (n, 3) or (n, 1): their sums of a vector."""
-    table = np.zeros((model.slots, 3))
-    np.add.at(table, slots, weights)
-    weight: wp.array = wp.array(table, dtype=model.types.vec3, device=model.device)
+@dataclass(eq=False)
+class ForceGradient:
+    """Derivative by a parameter of k components, from the change of the balance of forces along each.
 
-    def add(at: StepAdjoint, out: wp.array) -> None:
-        args = [weight, of(at), at.active, at.ctx.work.rows]
+    Attributes:
+        force: writes -dg/dparameter, or its negative, by a component to at.scratch. sign: 1.0, or -1.0.
+    """
+
+    force: Callable[[StepAdjoint, int], None]
+    sign: float = 1.0
+
+    def __call__(self, at: StepAdjoint, out: wp.array) -> None:
+        m = at.ctx.model
+        dot_terms = vector_kernels(m.dtype, m.terms.traits.has_constraints).dot_terms
+        for k in range(out.shape[1]):
+            self.force(at, k)
+            at.ctx.launch(dot_terms, at.dim, [at.scratch, at.w, at.active, at.ctx.work.rows])
+            at.add(out[:, k : k + 1], self.sign)
+
+    def change(self, at: StepAdjoint, change: wp.array) -> None:
+        """Add the force of a change [world, k] of the parameter to at.force."""
+        for k in range(change.shape[1]):
+            self.force(at, k)
+            args = [at.scratch, change, k, wp.float64(self.sign), at.active, at.force]
+            at.ctx.launch(at.kernels.scaled_change, at.dim, args)
+
+
+@dataclass(eq=False)
+class WeightGradient:
+    """Derivative by the value of a law that acts on the slots with weights: their sums of a vector.
+
+    Attributes:
+        weight: [slot]. prescribed: on positions, else on forces.
+    """
+
+    weight: wp.array
+    prescribed: bool
+
+    def __call__(self, at: StepAdjoint, out: wp.array) -> None:
+        args = [self.weight, at.drive_bar if self.prescribed else at.w, at.active, at.ctx.work.rows]
         at.ctx.launch(at.kernels.weighted_rows, at.dim, args)
         at.add(out)
 
-    return add
+    def change(self, at: StepAdjoint, change: wp.array) -> None:
+        """Add the effect of a change [world, k] of the value to at.force or at.drive."""
+        into = at.drive if self.prescribed else at.force
+        at.ctx.launch(at.kernels.weighted_change, at.dim, [self.weight, change, at.active, into])
+
+
+def law_weights(model: Model, slots: np.ndarray, weights: np.ndarray, *, prescribed: bool = False) -> WeightGradient:
+    """Derivative by the value of a law that acts on slots with weights (n, 3) or (n, 1)."""
+    table = np.zeros((model.slots, 3))
+    np.add.at(table, slots, weights)
+    return WeightGradient(wp.array(table, dtype=model.types.vec3, device=model.device), prescribed)
 
 
 def material_gradients(ctx: StepContext, elements: Any) -> dict[str, Callable[[], Gradient]]:
@@ -151,13 +201,12 @@ def density_gradient(ctx: StepContext, elements: Any, members: list[Any], name: 
     arrays: list[wp.array] = [wp.array(values, dtype=m.types.T, device=m.device) for values in (entries, lumped)]
     topology = with_fields(topology_struct(m.dtype), m.topology, mass_value=arrays[0])
 
-    def add(at: StepAdjoint, out: wp.array) -> None:
+    def force(at: StepAdjoint, k: int) -> None:
         w = at.ctx.work
         args = [topology, arrays[1], m.terms.dead_loads.constant_gravity, w.step.load_factor, w.v, w.v_tilde]
-        at.ctx.launch(at.kernels.density_rows, at.dim, [*args, w.step.mass_factor, at.w, at.active, w.rows])
-        at.add(out)
+        at.ctx.launch(at.kernels.density_force, at.dim, [*args, w.step.mass_factor, at.active, at.scratch])
 
-    return add
+    return ForceGradient(force)
 
 
 def constant_gradient(ctx: StepContext, elements: Any, members: list[Any], name: str) -> Gradient:
@@ -178,22 +227,21 @@ def constant_gradient(ctx: StepContext, elements: Any, members: list[Any], name:
     passes = [[(block, {"coefficients": coefficients}) for block in chosen]]
     tied = [block for block in chosen if block.key.tying and name in block.key.tying.material_constants]
     passes += [[(block, {"coupling": _coupling_derivative(m, block, members, name)}) for block in tied]] if tied else []
-    dot_terms = vector_kernels(m.dtype, m.terms.traits.has_constraints).dot_terms
     launches = [
         [(block, kernels[id(block)], _block_data(ctx, block, changes)) for block, changes in row] for row in passes
     ]
 
-    def add(at: StepAdjoint, out: wp.array) -> None:
+    def force(at: StepAdjoint, k: int) -> None:
         w = at.ctx.work
-        for row in launches:
+        for number, row in enumerate(launches):
             w.contribution.zero_()
             for block, kernel, data in row:
                 elements.block_force(at.ctx, block, kernel, data, at.active)
-            at.gather(at.scratch)
-            at.ctx.launch(dot_terms, at.dim, [at.scratch, at.w, at.active, w.rows])
-            at.add(out, -1.0)
+            at.gather(at.scratch if number == 0 else w.Hp)
+        if len(launches) > 1:
+            at.ctx.launch(at.kernels.add_vector, at.dim, [w.Hp, at.active, at.scratch])
 
-    return add
+    return ForceGradient(force, -1.0)
 
 
 def _shifted(material: Any, name: str) -> Any:

@@ -18,7 +18,7 @@ from ..kernels.terms.loads import body_force_kernel, load_kernels
 from ..model import assembly
 from ..model.assembly import require_density
 from ..model.description import BodyForce
-from .gradients import Gradient, StepAdjoint, law_weights
+from .gradients import ForceGradient, Gradient, StepAdjoint, law_weights
 from .protocols import Differentiable, Parametrised
 from .shape_gradients import traction_gradient
 from .term import StepContext, Term, part
@@ -147,16 +147,15 @@ class DeadLoads(Parametrised, Differentiable):
         return None, None
 
     def gradients(self, ctx: StepContext) -> Mapping[str, Callable[[], Gradient]]:
-        def add(at: StepAdjoint, out: wp.array) -> None:
-            args = [self.model.masses.lumped_values, at.ctx.work.step.load_factor, at.w, at.active, at.ctx.work.rows]
-            at.ctx.launch(at.kernels.gravity_rows, at.dim, args)
-            at.add(out)
+        def force(at: StepAdjoint, k: int) -> None:
+            args = [self.model.masses.lumped_values, at.ctx.work.step.load_factor, k, at.active, at.scratch]
+            at.ctx.launch(at.kernels.gravity_force, at.dim, args)
 
-        return {"gravity": lambda: add} if self.gravity_law is None else {}
+        return {"gravity": lambda: ForceGradient(force)} if self.gravity_law is None else {}
 
     def law_gradient(self, ctx: StepContext, law: int) -> Gradient | None:
         slot, number, weight = (values[self._definition[1] == law] for values in self._definition)
-        return law_weights(self.model, slot, weight[:, None], lambda at: at.w) if len(number) else None
+        return law_weights(self.model, slot, weight[:, None]) if len(number) else None
 
     def shape_gradients(self, ctx: StepContext) -> list[Callable[[], Gradient]]:
         return [partial(traction_gradient, ctx, self.tractions)] if self.tractions else []

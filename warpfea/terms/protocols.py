@@ -327,6 +327,9 @@ class Differentiable(Term):
         """at.bars[name] -= w . dg/dx of forces that depend on arrays x of the state at the start of the step besides
         q~; called after the solve and before `gradients`, with the bars of the start."""
 
+    def add_history_change(self, at: StepAdjoint) -> None:
+        """at.force -= dg/dx along the changes at.bars[name] of the arrays of `add_history_gradient`, forwards."""
+
 
 PROTOCOLS = (
     Tied, Updated, Constrained, Preconditioned, Coupled, Parametrised, Diagnosed, Impacting, Touching, Differentiable,

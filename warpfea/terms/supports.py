@@ -123,10 +123,10 @@ class Supports:
 
     def law_gradients(self, law: int) -> list[Gradient]:
         """Functions that add the derivative of the loss by the value of a time law."""
-        out = []
+        out = list[Gradient]()
         d, turn = self.displacement_drives, self.rotation_drives
         if d and (d.law.numpy() == law).any():
-            out.append(law_weights(self.model, d.slot.numpy(), d.law.numpy() == law, lambda at: at.drive_bar))
+            out.append(law_weights(self.model, d.slot.numpy(), d.law.numpy() == law, prescribed=True))
 
         def add(at: StepAdjoint, into: wp.array) -> None:
             assert turn is not None
