@@ -152,6 +152,7 @@ CONSTANTS: dict[str, Constant] = {
     "REACH_RATIO": Constant(CONTACT, "widths of the surface", 0.0, "contact"),
     "DEPTH_RATIO": Constant(CONTACT, "widths of the surface", 0.0, "contact"),
     "MIN_CROSS_COSINE": Constant(CONTACT, "1", 1.0, "contact"),
+    "RIGID_DAMPING": Constant(CONTACT, "critical damping", 1.0, "contact"),
     "IMPACT_SPEED": Constant(CONTACT, "m/s", 0.0, "contact"),
     "IMPACT_DEPTH": Constant(CONTACT, "ways of a step", 0.0, "contact"),
     "BORDER_TOLERANCE": Constant(CONTACT, "sides of a facet", 0.0, "contact"),

@@ -23,6 +23,24 @@ def test_a_stiff_part_comes_to_rest(height):
     assert force.mean() == pytest.approx(block.mass * GRAVITY, rel=1e-3)
 
 
+@pytest.mark.parametrize("scheme", ["backward_euler", "bdf2", "generalized_alpha"])
+def test_restitution_0_returns_nothing(scheme):
+    """Rigid parts stop, at steps that resolve the wave through them and at steps twenty times as long; no step is
+    refused for energy that an integrator adds."""
+    shapes = {"ball": wf.Sphere((0, 0, 0.06), 0.05), "box": wf.Box((0, 0, 0.06), (0.1, 0.1, 0.1))}
+    for shape, h, speed in (("ball", 1e-4, 10.0), ("box", 5e-4, 1.0), ("ball", 2e-3, 10.0), ("box", 5e-4, 10.0)):
+        b = wf.ModelBuilder()
+        part = b.add_rigid(shapes[shape], mass=1.0)
+        b.add_contact(part, b.add_collider(wf.HalfSpace(normal=(0, 0, 1))))
+        b.set_initial(part, velocity=(0, 0, -speed))
+        sim = wf.Simulation(b.finalize(device="cpu"), dt=h, integrator=scheme)
+        returned = []
+        for _ in range(round(0.01 / speed / h) + 30):
+            sim.step()
+            returned.append(float(sim.velocities(part)[0, :, 2].max()))
+        assert max(returned) < 0.025 * speed, (shape, h, speed, max(returned))
+
+
 def test_a_wedge_under_a_block():
     """Without friction: the wedge's acceleration m g tan(a)/(M + m tan(a)^2) under a block that is guided upright."""
     slope = 0.4

@@ -87,7 +87,7 @@ def friction_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
         con: Contacts, scr: ContactScratch, world: int, c: int, point: int, ratio: f64, inv_h: f64
     ) -> f64:  # fmt: skip
         """Damping per depth of the normal law: chi/h, or gamma_n/h; with restitution 0 minus the critical damping of
-        the effective mass over h, at points that have come faster than `IMPACT_SPEED`."""
+        the effective mass over h, of rigid parts `RIGID_DAMPING` times it, at points that have come faster than `IMPACT_SPEED`."""
         if inv_h == f64(0.0):
             return f64(0.0)
         if has_trait(con, c, SPEED_DAMPING):
@@ -97,7 +97,8 @@ def friction_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
             if speed <= f64(IMPACT_SPEED):
                 return f64(0.0)
             mass = world_value(con.effective_mass, world, c)
-            return f64(-2.0) * inv_h * wp.sqrt(normal_stiffness(con, world, c, ratio) * mass)
+            critical = f64(2.0) * inv_h * wp.sqrt(normal_stiffness(con, world, c, ratio) * mass)
+            return con.damping[world, c] * critical
         damping = world_value(con.normal_damping, world, c)
         return con.beta[world, c] * wp.sqrt(con.scale[world, c] * ratio) * damping * inv_h
 

@@ -183,6 +183,12 @@ def contact_ledger_kernels(dtype: str, geometry: str, own: OwnLaws = ()) -> Kern
             if scr.activity[world, point] == WITH_STIFFNESS:
                 t = g.evaluate(con, other, facets, his, scr, world, q, item, point, u, clock.new_time[world])
                 speed = scr.approach_speed[world, point]
+                rate = law.normal_damping_rate(con, scr, world, c, point, t.stiffness_ratio, inv_h)
+                if con.damping[world, c] < f64(-1.0) and rate < f64(0.0) and t.state == IN_REACH:
+                    stiffness = law.normal_stiffness(con, world, c, t.stiffness_ratio)
+                    before, now = wp.max(t.previous_depth, f64(0.0)), wp.max(t.depth, f64(0.0))
+                    if (stiffness - rate) * wp.abs(now - before) > f64(0.1) * stiffness * wp.max(now, before):
+                        impact[world] = IMPACT_FOUND
                 sudden = t.depth > f64(2.0) * t.previous_depth and t.depth * inv_h < f64(IMPACT_DEPTH) * speed
                 if t.state == IN_REACH and t.depth > f64(0.0) and sudden:
                     momentum = world_value(con.effective_mass, world, c) * speed

@@ -43,6 +43,8 @@ DEFAULT_SMOOTHING = (1e-3, 1e-4)
 """Default eps, N, and v_eps, m/s, of the smooth law."""
 WORLD_PARAMETERS = {"mu": "mu", "mu_static": "mu_static", "restitution": "damping", "stiffness": "scale"}
 """Contact parameters of Model.set_parameter and their arrays; the restitution also sets `beta`."""
+RIGID_DAMPING = 5.0
+"""Damping of rigid parts with restitution 0 over the critical one: 1 % of the speed is returned, 13.5 % with 1."""
 MATERIAL_CONSTANTS = ("normal_stiffness", "tangential_stiffness", "normal_damping", "effective_mass", "compliance")
 """Contact constants derived from the bodies' materials."""
 TOUCHING_DEPTH_RATIO = 1e-9
@@ -102,6 +104,12 @@ def restitution_slopes(damping: np.ndarray, beta: np.ndarray) -> tuple[np.ndarra
         slope = e * damping * (1.0 + damping) / ((1.0 + e) * (1.0 - e - e * damping))
         of_beta = -(math.pi**2) / e / np.hypot(log, math.pi) ** 3
     return np.where(e == 1.0, -1.5, np.where(e > 0.0, slope, np.nan)), np.where(e > 0.0, of_beta, np.nan)
+
+
+def speed_damping(contact: ContactOptions, restitution: float) -> float:
+    """chi v_i of the default law; of restitution 0 minus the damping over the critical one."""
+    rigid = not any(surface.body.elastic for surface in contact.surfaces)
+    return hunt_crossley_damping(restitution) * (RIGID_DAMPING if rigid and restitution == 0.0 else 1.0)
 
 
 def compliance(contact: ContactOptions, stiffness: float, area: float, *compliances: float) -> tuple[float, ...]:
@@ -338,7 +346,7 @@ class FacetTables(Generic[AnyContact]):
             check((wanted >= LAWS[contact.law].least_restitution) & (wanted <= 1.0))
             wanted = np.where(mask, wanted, 1.0)
             set_rows(data.beta, (mask, k), [restitution_beta(float(e)) for e in wanted[mask]])
-            wanted = np.array([hunt_crossley_damping(float(e)) for e in wanted])
+            wanted = np.array([speed_damping(contact, float(e)) for e in wanted])
         else:
             check(wanted > 0.0)
         set_rows(getattr(data, WORLD_PARAMETERS[name]), (mask, k), wanted[mask])
@@ -393,7 +401,7 @@ class FacetTables(Generic[AnyContact]):
         per_world = {
             "mu": [c.mu for c in C],
             "mu_static": [c.mu_static for c in C],
-            "damping": [hunt_crossley_damping(c.restitution) for c in C],
+            "damping": [speed_damping(c, c.restitution) for c in C],
             "beta": [restitution_beta(c.restitution) for c in C],
             "scale": [c.stiffness for c in C],
         }
