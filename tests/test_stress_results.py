@@ -21,7 +21,7 @@ FILES = {
     "mounts_cpu.json": "cpu",
 }  # fmt: skip
 MOTORS = ("pd", "stop-speed", "friction-ratio", "held-chain")
-MOUNTS = ("bushing", "fallen-part", "tube")
+MOUNTS = ("bushing", "fallen-part", "tube", "wheel", "fallen-roller")
 OWN_FILES = {"first-scenes": "first_scenes_cpu.json"} | dict.fromkeys(MOTORS, "motors_cpu.json")
 OWN_FILES |= dict.fromkeys(MOUNTS, "mounts_cpu.json")
 """Cases whose rows, of minutes each or not yet run on the H200, are in files of their own."""

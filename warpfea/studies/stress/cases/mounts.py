@@ -1,10 +1,10 @@
-"""Bushings of unlike stiffness, stiff parts that fall, slender tubes."""
+"""Bushings of unlike stiffness, stiff parts that fall, slender tubes, wheels."""
 
 import numpy as np
 
 import warpfea as wf
 
-from ..build import GRAVITY_VECTOR, StepStats, finalize, solve, step
+from ..build import GRAVITY_VECTOR, StepStats, Y, finalize, solve, step
 from ..case import FLOAT32_REFUSAL, Answer, Setting, case
 
 
@@ -58,3 +58,43 @@ def tube(setting: Setting, value: tuple[float, float]) -> Answer:
     static = solve(b, setting, load_steps=1)
     error = abs(static.result.probe("tip").displacement[0, -1, 2] / (force * exact) - 1.0)
     return static.stats.answer(float(error), 1e-2 if setting.single else 1e-5, "beam theory", lowest_J=None)
+
+
+@case("wheel", "mounts", values=[(v, turn, scheme) for v in (1e-3, 1.0, 1e3) for turn, scheme in
+                                 ((0.02, "energy_momentum"), (0.2, "bdf2"))],
+      quick="float64", refusal=FLOAT32_REFUSAL)  # fmt: skip
+def wheel(setting: Setting, value: tuple[float, float, str]) -> Answer:
+    """A wheel of 1 m rolls at v m/s by a turn per step, rad, beside a part that is turned as fast: it keeps its line and
+    height, and neither gains energy."""
+    v, turn, scheme = value
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    part = b.add_rigid(wf.Cylinder((0, -0.1, 1), (0, 0.1, 1), 1.0), mass=1.0, inertia=(0.3, 0.5, 0.3), name="wheel")
+    b.add_velocity_constraint("roll", part.at((0, 0, 1)), axis=Y, radius=1.0)
+    driven = b.add_rigid(wf.Box((0, 3, 0), (0.2, 0.2, 0.2)), mass=1.0, inertia=(1.0, 1.0, 1.0), name="driven")
+    hinge = b.add_joint("revolute", parent=wf.GROUND, child=driven.at((0, 3, 0)), axis=Y, name="hinge")
+    b.add_velocity_constraint("speed", hinge, value=v)
+    for body, speed in ((part, v), (driven, 0.0)):
+        b.set_initial(body, velocity=(speed, 0, 0), angular_velocity=(0, v, 0))
+    sim, stats = step(b, setting, 60, dt=turn / v, integrator=scheme)
+    place = sim.pose(part)[0][0] - (0, 0, 1)
+    gained = float(sim.energies()["kinetic"][0]) / (1.25 * v**2) - 1.0
+    error = max(abs(float(place[1])), abs(float(place[2])), gained)
+    return stats.answer(error, 1e-3 if setting.single else 1e-7, "its line and energy", lowest_J=None)
+
+
+@case("fallen-roller", "mounts", values=[("cylinder", 0.0), ("cylinder", 1e-9), ("cylinder", 0.7), ("capsule", 1e-3)],
+      quick="float64", refusal=FLOAT32_REFUSAL)  # fmt: skip
+def fallen_roller(setting: Setting, value: tuple[str, float]) -> Answer:
+    """A cylinder on its face, or a capsule on its end, tilted by so many rad, 0.1 m above a plane: its lowest point lies
+    on it after 1.2 s, on a flat end or on its side."""
+    kind, tilt = value
+    radius, half = 0.1, 0.15
+    axis = np.array([np.sin(tilt), 0.0, np.cos(tilt)])
+    shape = {"cylinder": wf.Cylinder, "capsule": wf.Capsule}[kind](-half * axis, half * axis, radius)
+    b = wf.ModelBuilder(gravity=GRAVITY_VECTOR)
+    part = b.add_rigid(shape, density=1e3, name=kind)
+    b.add_contact(part, b.add_collider(wf.HalfSpace((0, 0, 1), -half - 2.0 * radius)), mu=0.5)
+    sim, stats = step(b, setting, 600, dt=2e-3, integrator="backward_euler")
+    lowest = float(sim.positions(part)[0][:, 2].min()) + half + 2.0 * radius
+    # of what is drawn, whose facets are as far within the surface
+    return stats.answer(abs(lowest) / radius, 1e-2, "on the plane", lowest_J=None)
