@@ -89,6 +89,47 @@ def test_cylinders_and_capsules_roll(kind):
     assert moment == pytest.approx([0, -RADIUS * force.sum(axis=0)[0], 0], abs=1e-6 * weight)
 
 
+def thrown(worlds=1, dtype="float64", device="cpu"):
+    """A cylinder that slides, and then rolls."""
+    b = wf.ModelBuilder()
+    part = b.add_rigid(ROLLERS[wf.Cylinder], density=1000.0, name="part")
+    b.add_contact(part, b.add_collider(wf.HalfSpace((0, 0, 1))), mu=0.3, name="floor")
+    b.set_initial(part, velocity=(0.5, 0.1, 0))
+    return b.finalize(device=device, worlds=worlds, dtype=dtype), part
+
+
+def test_rolling_worlds_are_equal_to_lone_runs_and_checkpoints_go_on(tmp_path):
+    mu, (model, part) = [0.3, 0.05], thrown(2)
+    model.set_parameter("floor.mu", mu)
+    sim = wf.Simulation(model, dt=2e-3)
+    sim.run(0.04, outputs=[wf.Checkpoint(tmp_path / "c.npz", every=10)])
+    sim.step(10)
+    for world in range(2):
+        alone, _ = thrown()
+        alone.set_parameter("floor.mu", mu[world])
+        one = wf.Simulation(alone, dt=2e-3)
+        one.step(30)
+        np.testing.assert_array_equal(one.state.displacement.numpy()[0], sim.state.displacement.numpy()[world])
+    again = wf.Simulation(model, dt=2e-3)
+    again.resume(tmp_path / "c.npz")
+    again.step(10)
+    np.testing.assert_array_equal(again.positions(part), sim.positions(part))
+
+
+@pytest.mark.parametrize(
+    ("device", "dtype"),
+    [("cpu", "float32"), *(pytest.param("cuda", x, marks=pytest.mark.cuda) for x in ("float64", "float32"))],
+)
+def test_devices_and_precisions_agree(device, dtype):
+    ends = []
+    for where, precision in (("cpu", "float64"), (device, dtype)):
+        model, part = thrown(dtype=precision, device=where)
+        sim = wf.Simulation(model, dt=2e-3)
+        sim.step(60)
+        ends.append(sim.positions(part))
+    np.testing.assert_allclose(ends[1], ends[0], atol=1e-8 if dtype == "float64" else 1e-4)
+
+
 @pytest.mark.parametrize("name", ["cylinder", "box"])
 def test_a_body_lies_on_a_part_as_on_a_collider(name):
     """A soft block that is pressed on a held part: force and sinking are those on an obstacle of the same shape, and

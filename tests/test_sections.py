@@ -18,7 +18,7 @@ ROUND = pytest.mark.parametrize(
 )
 
 
-def cantilever(section, force=(0, 0, 0), moment=(0, 0, 0), elements=8, integration="tied"):
+def cantilever(section, force=(0, 0, 0), moment=(0, 0, 0), elements=8, integration="tied", **options):
     """Displacement and gradients at the tip, and the model of a cantilever along x."""
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     beam = b.add_beam([(0, 0, 0), (L, 0, 0)], elements=elements, section=section, normal=(0, 0, 1), material=LAW,
@@ -28,7 +28,7 @@ def cantilever(section, force=(0, 0, 0), moment=(0, 0, 0), elements=8, integrati
         b.add_point_load(beam.end, force)
     if any(moment):
         b.add_moment(beam.end, moment)
-    model = b.finalize(device="cpu")
+    model = b.finalize(**{"device": "cpu"} | options)
     tip = wf.solve_static(model, load_steps=1).state.displacement.numpy()[0, beam.slots[-4:]]
     return tip, model
 
@@ -49,6 +49,19 @@ def test_cantilever_torsion_and_frequencies(section, bore):
     free = model.free_slots.ravel()
     squares = scipy.linalg.eigh(K[np.ix_(free, free)], M[np.ix_(free, free)], eigvals_only=True, subset_by_index=[0, 1])
     assert np.sqrt(squares) == pytest.approx(1.875104**2 * np.sqrt(E * I / (RHO * A)) / L**2, rel=1e-2)
+
+
+@pytest.mark.parametrize("device", [pytest.param(name, marks=getattr(pytest.mark, mark))
+                                    for name, mark in (("cpu", "slow"), ("cuda", "cuda"))])  # fmt: skip
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_devices_and_precisions(device, dtype):
+    """A tube, and a circle that tapers, bent and twisted."""
+    for section in (TUBE, (wf.Circle(0.04), wf.Circle(0.02))):
+        for load in ({"force": (0, 0, -1)}, {"moment": (1, 0, 0)}):
+            expected = cantilever(section, **load)[0]
+            found = cantilever(section, **load, device=device, dtype=dtype)[0]
+            bound = 1e-9 if dtype == "float64" else 1e-3
+            assert np.abs(found - expected).max() < bound * np.abs(expected).max()
 
 
 @pytest.mark.parametrize("integration", ["split", "full"])

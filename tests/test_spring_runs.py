@@ -47,23 +47,28 @@ def test_stiff_springs_converge():
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_parameters_per_world(dtype):
     """A world with its own values is bit-equal to a run of its own; bad values are named."""
-    values = {"stiffness": [100.0, 400.0, 50.0], "damping": [0.0, 2.0, 1.0], "rest": [0.03, 0.05, 0.02]}
+    values = {"s.stiffness": [100.0, 400.0, 50.0], "s.damping": [0.0, 2.0, 1.0], "s.rest": [0.03, 0.05, 0.02]}
+    if dtype == "float64":
+        six = np.arange(18.0).reshape(3, 6)
+        values |= {"m.stiffness": 10.0 * six, "m.damping": 0.1 * six}
 
     def model(worlds):
         b, body = cube()
         b.add_spring((0.0, 0.05, 0.05), body.at(CENTRE), stiffness=1.0, name="s")
+        if dtype == "float64":
+            b.add_bushing(body.at(CENTRE), wf.GROUND, stiffness=1.0, damping=1.0, name="m")
         b.set_initial(body, velocity=(0.1, 1.0, 0.2))
         return b.finalize(device="cpu", dtype=dtype, worlds=worlds)
 
     many = model(3)
     for name, of_world in values.items():
-        many.set_parameter(f"s.{name}", of_world)
+        many.set_parameter(name, of_world)
     sim = wf.Simulation(many, dt=2e-3)
     sim.step(20)
     for world in range(3):
         own = model(1)
         for name, of_world in values.items():
-            own.set_parameter(f"s.{name}", of_world[world])
+            own.set_parameter(name, of_world[world])
         one = wf.Simulation(own, dt=2e-3)
         one.step(20)
         np.testing.assert_array_equal(sim.state.displacement.numpy()[world], one.state.displacement.numpy()[0])
