@@ -7,7 +7,7 @@ import warp as wp
 from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.types import double_1d, double_2d, f64, int_1d, mat33d, precision, vec3d, vec3d_1d
 from ..terms.joint_angles import joint_vector_function
-from ..terms.spring_coordinates import FULL_TURN
+from ..terms.spring_coordinates import ANGLE, LENGTH, TRAVEL, coordinate_functions
 from .step_control import REPORT_COLUMNS, SAME_TIME_FRACTION, STATUS
 
 __all__ = ["JOINT_VALUE_KINDS", "MOTION_KINDS", "RUN_STATISTICS", "episode_kernels", "observation_kernels"]
@@ -17,8 +17,10 @@ RUN_STATISTICS = ("newton", "pcg", "rough", "floored", "residual", "floor", "vio
 FIRST_MINIMUM_COLUMN = 8
 MOTION_KINDS = {"position": 0, "displacement": 1, "velocity": 2}
 """Kinds of observed vectors."""
-JOINT_VALUE_KINDS = {"length": 0, "travel": 1, "angle": 2, "length_rate": 3, "travel_rate": 4, "angle_rate": 5}
-"""Kinds of values of joints."""
+RATE = 8
+JOINT_VALUE_KINDS = {"length": LENGTH, "travel": TRAVEL, "angle": ANGLE}
+JOINT_VALUE_KINDS |= {f"{name}_rate": RATE + kind for name, kind in JOINT_VALUE_KINDS.items()}
+"""Kinds of values of joints: coordinates of ../terms/spring_coordinates.py, and their rates."""
 
 
 @functools.cache
@@ -81,6 +83,7 @@ def episode_kernels() -> KernelSet:
 def observation_kernels(dtype: str) -> KernelSet:
     """Kernels in one precision that fill a table [world, column]."""
     p, joint_vector = precision(dtype), joint_vector_function(dtype)
+    coordinates = coordinate_functions(False)
     T, vec3 = p.T, p.vec3
     module = kernel_module(f"observations_{dtype}")
 
@@ -112,18 +115,6 @@ def observation_kernels(dtype: str) -> KernelSet:
         world, k = wp.tid()
         out[world, column[k]] = wp.where(stepped[world] != 0, T(report[world, source[k]]), T(0.0))
 
-    @wp.func
-    def joint_rate(kind: int, V: mat33d, D: mat33d) -> f64:
-        """Rate of a length, travel or angle of vectors V that change by D."""
-        if kind == wp.static(JOINT_VALUE_KINDS["travel_rate"]):
-            return wp.dot(D[0], V[1]) + wp.dot(V[0], D[1])
-        if kind == wp.static(JOINT_VALUE_KINDS["angle_rate"]):
-            c, s = wp.dot(V[2], V[0]), wp.dot(V[2], V[1])
-            dc = wp.dot(D[2], V[0]) + wp.dot(V[2], D[0])
-            ds = wp.dot(D[2], V[1]) + wp.dot(V[2], D[1])
-            return (c * ds - s * dc) / (c * c + s * s)
-        return wp.dot(V[0], D[0]) / wp.length(V[0])
-
     @wp.kernel(module=module)
     def joint_values(
         start: int_1d, slot: int_1d, weight: double_1d, place: vec3d_1d, kind: int_1d, source: int_1d, column: int_1d,
@@ -136,20 +127,15 @@ def observation_kernels(dtype: str) -> KernelSet:
         for side in range(3):
             V[side] = joint_vector(start, slot, weight, place[3 * k + side], u, world, 3 * k + side)
             D[side] = joint_vector(start, slot, weight, vec3d(), v, world, 3 * k + side)
-        x = wp.length(V[0])
-        if kind[k] == wp.static(JOINT_VALUE_KINDS["travel"]):
-            x = wp.dot(V[0], V[1])
-        elif kind[k] == wp.static(JOINT_VALUE_KINDS["angle"]):
-            x = wp.atan2(wp.dot(V[2], V[1]), wp.dot(V[2], V[0]))
-            near = x
-            if source[k] >= 0 and not wp.isnan(target[world, source[k]]):
-                near = target[world, source[k]]
-            elif source[k] < -1:
-                near = turns[world, -2 - source[k]]
-            turn = f64(wp.static(FULL_TURN))
-            x += turn * wp.round((near - x) / turn)
-        elif kind[k] >= wp.static(JOINT_VALUE_KINDS["length_rate"]):
-            x = joint_rate(kind[k], V, D)
+        of = kind[k] % RATE
+        near = f64(0.0)
+        if source[k] >= 0 and not wp.isnan(target[world, source[k]]):
+            near = target[world, source[k]]
+        elif source[k] < -1:
+            near = turns[world, -2 - source[k]]
+        x = coordinates.coordinate(of, V, near)
+        if kind[k] >= RATE:
+            x = wp.ddot(coordinates.derivatives(of, V, x).g, D)
         out[world, column[k]] = T(x)
 
     @wp.kernel(module=module)

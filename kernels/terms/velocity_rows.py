@@ -19,7 +19,7 @@ from ..common.modules import KernelSet, kernel_module, kernel_set
 from ..common.types import double_1d, f64, int_1d, mat33d, precision, vec3d, vec3d_2d
 from .constraint_formulas import Formula
 from .constraints import VELOCITY, constraint_functions, constraint_struct, multiplier_struct
-from .spring_coordinates import TINY
+from .spring_coordinates import ANGLE, TINY, TRAVEL, coordinate_functions
 
 __all__ = ["ANGLE_RATE", "DISC", "KNIFE", "ROLL", "TRAVEL_RATE", "velocity_kernels"]
 
@@ -60,22 +60,20 @@ def velocity_kernels(dtype: str, midpoint: bool) -> KernelSet:
     """Kernels of the rows in one precision of the slots."""
     p = precision(dtype)
     Constraints, Multipliers = constraint_struct(), multiplier_struct()
-    functions = constraint_functions(dtype)
+    functions, coordinates = constraint_functions(dtype), coordinate_functions(False)
     module = kernel_module(f"velocity_rows_{dtype}{'_midpoint' if midpoint else ''}")
 
     @wp.func
     def coefficients(parameters: mat33d, v: mat33d) -> mat33d:
         """A on the changes of the vectors, as rows. `parameters`: normal, direction in it, and (r, form, 0)."""
-        a, b, a2 = v[0], v[1], v[2]
+        b, a2 = v[1], v[2]
         form = int(parameters[2, 1])
         if form == KNIFE:
             return wp.matrix_from_rows(b / wp.max(wp.length(b), f64(TINY)), vec3d(), vec3d())
         if form == TRAVEL_RATE:
-            return wp.matrix_from_rows(b, a, vec3d())
+            return coordinates.derivatives(TRAVEL, v, f64(0.0)).g
         if form == ANGLE_RATE:
-            c, s = wp.dot(a, b), wp.dot(a2, b)
-            inverse = f64(1.0) / wp.max(c * c + s * s, f64(TINY))
-            return inverse * wp.matrix_from_rows(-s * b, c * a2 - s * a, c * b)
+            return coordinates.derivatives(ANGLE, v, coordinates.coordinate(ANGLE, v, f64(0.0))).g
         along, sideways = wp.dot(parameters[0], b), wp.dot(parameters[0], a2)
         arm = parameters[2, 0] / wp.max(wp.sqrt(along * along + sideways * sideways), f64(TINY))
         d = parameters[1]

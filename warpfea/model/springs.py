@@ -14,7 +14,8 @@ from ..time_laws import TimeLaw
 from .joints import Joint, Vector
 
 __all__ = [
-    "MAX_FRICTION", "Bushing", "SampledForce", "Spring", "bushing_parts", "coordinate_gradients", "joint_coordinate",
+    "MAX_FRICTION", "Bushing", "SampledForce", "Spring", "bushing_parts", "coordinate_gradients", "coordinate_value",
+    "joint_coordinate",
 ]  # fmt: skip
 
 MAX_FRICTION = 1e100
@@ -174,6 +175,13 @@ def joint_coordinate(joint: Joint) -> tuple[int, tuple[Vector, ...]] | None:
     return None
 
 
+def coordinate_value(kind: int, v: np.ndarray) -> float:
+    """LENGTH, TRAVEL or ANGLE (within half a turn) of the vectors v (3, 3)."""
+    if kind == ANGLE:
+        return float(np.arctan2(v[2] @ v[1], v[0] @ v[1]))
+    return float(v[0] @ v[1] if kind == TRAVEL else np.linalg.norm(v[0]))
+
+
 def coordinate_gradients(kind: int, v: np.ndarray) -> list[np.ndarray]:
     """Derivatives (3, 3) of a coordinate, or of the components of a VECTOR, by the vectors v (3, 3), as rows."""
     if kind == TRAVEL:
@@ -183,5 +191,5 @@ def coordinate_gradients(kind: int, v: np.ndarray) -> list[np.ndarray]:
         zero = np.zeros(3)
         return [np.stack([e, zero, zero]) for e in ([n] if kind == LENGTH else np.eye(3))]
     a, b, a2 = v
-    y, radius = np.arctan2(a2 @ b, a @ b), np.hypot(a2 @ b, a @ b)
+    y, radius = coordinate_value(ANGLE, v), np.hypot(a2 @ b, a @ b)
     return [np.stack([-np.sin(y) * b, np.cos(y) * a2 - np.sin(y) * a, np.cos(y) * b]) / radius]

@@ -14,7 +14,7 @@ from ..kernels.terms.joint_angles import joint_angle_kernels
 from ..kernels.terms.springs import ANGLE as ANGLE_COORDINATE
 from ..kernels.terms.springs import LENGTH, TRAVEL
 from ..model.joints import Joint, Vector
-from ..model.springs import coordinate_gradients
+from ..model.springs import coordinate_gradients, coordinate_value
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -38,7 +38,7 @@ class JointAngles:
 
     def upload(self) -> None:
         """Tables on the device."""
-        vectors = [v for joint in self.joints for v in joint.angle or ()]
+        vectors = [v for joint in self.joints for v in coordinate_vectors(joint)["angle"]]
         self.tables = vector_tables(vectors, lambda values, dtype: self.model.array("constraints", values, dtype))
 
     def register(self, ctx: StepContext) -> None:
@@ -63,9 +63,9 @@ def vector_tables(vectors: Sequence[Vector], array: Any) -> list[wp.array]:
 
 
 def coordinate_vectors(joint: Joint) -> dict[str, list[Vector]]:
-    """Vectors of a joint that define its "angle" (three), "travel" (two) and "length" (one), if any."""
+    """Vectors of a joint that define its "angle" (a, b, a2), "travel" (two) and "length" (one), if any."""
     length = [joint.rows[0].a] if joint.rows[0].kind == DISTANCE else []
-    has = {"angle": list(joint.angle or ()), "travel": list(joint.travel or ()), "length": length}
+    has = {"angle": [joint.angle[k] for k in (0, 2, 1)] if joint.angle else [], "travel": list(joint.travel or ()), "length": length}
     return {name: vectors for name, vectors in has.items() if vectors}
 
 
@@ -93,25 +93,15 @@ def joint_value(tables: Any, joint: Joint, what: str | None, state: Any, *, rate
         source = -2 - source
         turns = state.joint_angle.numpy() if "joint_angle" in state.names else np.zeros((state.worlds, source + 1))
     entries = [vector.entries() for vector in has[what]]
-    out = []
+    kind, out = {"angle": ANGLE_COORDINATE, "travel": TRAVEL, "length": LENGTH}[what], []
     for world, (u, v) in enumerate(zip(state.displacement.numpy(), state.velocity.numpy())):
-        vectors = [x.value + w @ u[slots].astype(float) for x, (slots, w, _) in zip(has[what], entries)]
+        vectors = np.array([x.value + w @ u[slots].astype(float) for x, (slots, w, _) in zip(has[what], entries)])
         if rate:
-            if what == "angle":
-                vectors, of = [vectors[0], vectors[2], vectors[1]], [entries[0], entries[2], entries[1]]
-            else:
-                of = entries
-            kind = {"angle": ANGLE_COORDINATE, "travel": TRAVEL, "length": LENGTH}[what]
-            gradient = coordinate_gradients(kind, np.array(vectors))[0]
-            out.append(sum(g @ (w @ v[slots].astype(float)) for g, (slots, w, _) in zip(gradient, of)))
-        elif what == "length":
-            out.append(np.linalg.norm(vectors[0]))
-        elif what == "travel":
-            out.append(vectors[0] @ vectors[1])
-        else:
-            a, a2, b = vectors
-            angle = np.arctan2(b @ a2, b @ a)
-            if source >= 0:
-                angle += 2.0 * np.pi * np.round((turns[world, source] - angle) / (2.0 * np.pi))
-            out.append(angle)
+            gradient = coordinate_gradients(kind, vectors)[0]
+            out.append(sum(g @ (w @ v[slots].astype(float)) for g, (slots, w, _) in zip(gradient, entries)))
+            continue
+        value = coordinate_value(kind, vectors)
+        if source >= 0 and what == "angle":
+            value += 2.0 * np.pi * np.round((turns[world, source] - value) / (2.0 * np.pi))
+        out.append(value)
     return np.array(out, dtype=float)
