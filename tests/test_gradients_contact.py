@@ -78,32 +78,36 @@ def test_slopes_of_restitution():
     assert np.isnan(restitution_slopes(np.array([-1.0]), np.array([1.0]))).all()
 
 
-def thrown(worlds, shapes, mu):
+def thrown(worlds, shapes, mu, seam=None, device="cpu"):
     """A soft cube on a floor and beside another obstacle, both on paths of their own."""
     b = wf.ModelBuilder(gravity=(0, 0, -9.81))
     mesh = wf.mesh.box((0.1, 0.1, 0.1), cells=(1, 1, 1), element="T4")
     box = b.add_solid(mesh, material=LAW, name="box")
     for name, (shape, side) in shapes.items():
         turn = wf.Rotation(anchor=(0.02, 0.01, -0.03), axis=(0.3, 0.5, 0.8), angle=wf.Control(f"turn {name}"))
-        path = turn if name != "beside" else wf.Control("shift", 3)
+        path = turn if name in TURNING else wf.Control(f"shift {name}", 3) if seam == 0.0 else None
         collider = b.add_collider(shape, name=name, path=path)
-        b.add_contact(box.surface(side), collider, mu=mu, restitution=0.5, name=f"pad {name}", seam=0.0)
+        b.add_contact(box.surface(side), collider, mu=mu, restitution=0.5, name=f"pad {name}", seam=seam)
     b.add_probe("top", box.surface("z+"))
-    return b.finalize(device="cpu", worlds=worlds)
+    return b.finalize(device=device, worlds=worlds)
 
 
 FLOOR = wf.HalfSpace((0, 0, 1), -GAP), "z-"
 BOX = wf.Box((-0.1 - GAP, 0.05, -0.9), (0.2, 2.0, 2.0)), "x-"
 BALL = wf.Sphere((-0.3 - GAP, 0.053, 0.048), 0.3), "x-"
 LOW = wf.HalfSpace((0, 0, 1), -3.5e-3), "z-"
+GROUND = wf.Box((0.4, 0, -0.25 - GAP), (2.0, 2.0, 0.5)), "z-"
+WALL = wf.Box((-0.1 - GAP, 0.05, 0.15 - GAP), (0.2, 1.0, 0.3)), "x-"
+TURNING = ("floor", "ball")
 RUNS = {  # shapes, velocity, steps, dt, integrator
     "slip and stick": ({"floor": FLOOR, "beside": BOX}, (-0.1, 0.02, -0.1), 8, 5e-4, "backward_euler"),
     "round": ({"ball": BALL}, (-0.1, 0.05, 0.02), 6, 5e-4, "backward_euler"),
+    "seam": ({"ground": GROUND, "beside": WALL}, (-0.1, 0.02, -0.1), 8, 5e-4, "backward_euler"),
     "impact": ({"floor": LOW}, (0.3, 0.1, -0.1), 5, 1e-2, "bdf2"),
 }
 
 
-def contact_run(kind, rows=None, worlds=slice(None)):
+def contact_run(kind, rows=None, worlds=slice(None), device="cpu"):
     """Tape of worlds whose parameters differ by rows; names, values at the base and, as one more, the controls."""
     shapes, velocity, steps, dt, integrator = RUNS[kind]
     mu = 0.3
@@ -111,12 +115,13 @@ def contact_run(kind, rows=None, worlds=slice(None)):
     for name in shapes:
         names |= {f"pad {name}.{key}": value for key, value in {"mu": mu, "stiffness": 1.0, "restitution": 0.5}.items()}
         names[f"{name}.offset"] = 2e-6
-    controls = {"shift" if name == "beside" else f"turn {name}": 3 if name == "beside" else 1 for name in shapes}
+    controls = {f"turn {name}" if name in TURNING else f"shift {name}": 1 if name in TURNING else 3 for name in shapes}
+    controls = {} if kind == "seam" else controls  # obstacles with paths of their own have none
     rng = np.random.default_rng(0)
     paths = {name: 1e-5 * np.cumsum(rng.standard_normal((steps, size)), axis=0) for name, size in controls.items()}
     rows = SHARE * shifts(len(names) + len(paths)) if rows is None else rows
     mine = rows[worlds]
-    m = thrown(len(mine), shapes, mu)
+    m = thrown(len(mine), shapes, mu, None if kind == "seam" else 0.0, device)
     for k, (name, value) in enumerate(names.items()):
         if name == "gravity":
             m.set_gravity(value * (1.0 + mine[:, k : k + 1]))
@@ -140,7 +145,7 @@ def contact_run(kind, rows=None, worlds=slice(None)):
     return tape, loss, g, exact, rows, slips, impacts
 
 
-@pytest.mark.parametrize("kind", RUNS)
+@pytest.mark.parametrize("kind", [pytest.param(kind, marks=[pytest.mark.slow] * (kind == "seam")) for kind in RUNS])
 def test_gradients_through_contact(kind):
     tape, loss, g, exact, rows, slips, impacts = contact_run(kind)
     errors = best_differences(loss.numpy(), exact)
@@ -149,6 +154,7 @@ def test_gradients_through_contact(kind):
     assert max(slips) > 0
     if kind != "slip and stick":
         assert any(impacts) == (kind == "impact")  # a step taken again with backward Euler
+        assert (tape.model.terms.contacts[0].tables.seams is not None) == (kind == "seam")
         return
     touching = (tape.sim.state.contact_speed.numpy()[0] > 0.0).sum()
     assert 0 < slips[-1] < touching - 4  # some stick
@@ -164,26 +170,21 @@ BODIES = {
 }
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", BODIES)
-def test_gradients_through_contact_between_bodies(kind):
+def body_run(kind, rows, device="cpu"):
+    """Tape of a cube on a slab in worlds whose parameters differ by rows; the derivatives by these."""
     element, velocity, steps = BODIES[kind]
     names = {"low.E": 1e6, "top.nu": 0.3, "top.density": 1000.0, "gravity": np.array([1.0, 0.5, -9.81])}
     names |= {"pad.mu": 0.3, "pad.stiffness": 1.0, "pad.restitution": 0.5}
-    rows = SHARE * shifts(len(names) + 1)
     b = wf.ModelBuilder(gravity=(0, 0, -9.81))
     mesh = wf.mesh.box((0.3, 0.3, 0.1), cells=(2, 2, 1), element=element)
     low = b.add_solid(mesh, material=LAW, name="low")
     mesh = wf.mesh.box((0.1, 0.1, 0.1), cells=(1, 1, 1), element=element)
-    place = (
-        np.array([[np.cos(0.1), -np.sin(0.1), 0], [np.sin(0.1), np.cos(0.1), 0], [0, 0, 1]]),
-        (0.07, 0.06, 0.1 + GAP),
-    )
-    top = b.add_solid(mesh, material=LAW, name="top", transform=place)
+    turn = np.array([[np.cos(0.1), -np.sin(0.1), 0], [np.sin(0.1), np.cos(0.1), 0], [0, 0, 1]])
+    top = b.add_solid(mesh, material=LAW, name="top", transform=(turn, (0.07, 0.06, 0.1 + GAP)))
     b.clamp(low.nodes("z-"))
     b.add_contact(top.surface("z-"), low.surface("z+"), mu=0.3, restitution=0.5, name="pad")
     b.add_probe("tip", top.surface("z+"))
-    m = b.finalize(device="cpu", worlds=len(rows))
+    m = b.finalize(device=device, worlds=len(rows))
     for k, (name, value) in enumerate(names.items()):
         if name == "gravity":
             m.set_gravity(value * (1.0 + rows[:, k : k + 1]))
@@ -197,16 +198,65 @@ def test_gradients_through_contact_between_bodies(kind):
     tape.run(steps)
     loss = wf.loss.sum_of_squares(tape.probe("tip").displacement, np.full((1, steps, 3), TARGET))
     g = tape.backward(loss)
-    exact = [SHARE * np.sum(g[name].numpy()[0] * value) for name, value in names.items()]
-    exact.append(SHARE * np.sum(g["initial.velocity"].numpy()[0] * start[0]))
-    errors = best_differences(loss.numpy(), exact)
+    exact = [np.sum(g[name].numpy()[0] * value) for name, value in names.items()]
+    return tape, loss, g, [*exact, np.sum(g["initial.velocity"].numpy()[0] * start[0])]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", BODIES)
+def test_gradients_through_contact_between_bodies(kind):
+    tape, loss, _, exact = body_run(kind, SHARE * shifts(8))
+    errors = best_differences(loss.numpy(), SHARE * np.array(exact))
     assert (errors < TOLERANCE).all(), errors
     assert (tape.residual < 1e-10).all()
     facets = [kept["pairs_facet"].numpy()[0] for kept in tape.kept[1:]]
     changed = sum(((old != new) & (old > 0) & (new > 0)).sum() for old, new in pairwise(facets))
     assert changed > 10 or kind == "stick"
-    slips = (sim.state.pairs_contact_state.numpy()[0] >= 1 << 30).sum()
-    assert 0 < slips <= (sim.state.pairs_speed.numpy()[0] > 0.0).sum() - 3 * (kind == "stick")
+    state = tape.sim.state
+    slips = (state.pairs_contact_state.numpy()[0] >= 1 << 30).sum()
+    assert 0 < slips <= (state.pairs_speed.numpy()[0] > 0.0).sum() - 3 * (kind == "stick")
+
+
+@pytest.mark.cuda
+def test_gradients_through_contact_on_a_gpu():
+    """Those of the CPU."""
+    rows = np.zeros((3, 14))
+    rows[:, 0] = 0.0, 1e-3, 2e-3
+    found = [contact_run("slip and stick", rows, device=device) for device in ("cpu", "cuda:0")]
+    for name, values in found[0][2].items():
+        host = values.numpy()
+        assert found[1][2][name].numpy() == pytest.approx(host, rel=1e-7, abs=1e-8 * np.abs(host).max()), name
+    assert np.array_equal(found[0][2].switches, found[1][2].switches)
+    found = [body_run("stick", SHARE * shifts(8)[:3], device) for device in ("cpu", "cuda:0")]
+    for name, values in found[0][2].items():
+        host = values.numpy()
+        assert found[1][2][name].numpy() == pytest.approx(host, rel=1e-7, abs=1e-8 * np.abs(host).max()), name
+
+
+def test_rebound():
+    """A stiff cube rebounds with v = -e v0: the law makes the velocities of the scheme proportional to v0."""
+    v0, n, h = 0.5, 100, 1e-4
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    body = cube(b, origin=(0, 0, 1e-9))
+    b.drive(body.nodes(everywhere), displacement=(0, 0, 0), components="xy")
+    b.add_contact(body.surface("z-"), b.add_collider(wf.HalfSpace((0, 0, 1))), restitution=0.6,
+                  stiffness=("region", 1e-2), name="pad")  # fmt: skip
+    b.add_probe("top", body.surface("z+"))
+    m = b.finalize(device="cpu")
+    sim = wf.Simulation(m, dt=h, solver=SOLVER, integrator="bdf2")
+    sim.state.velocity.assign(np.tile((0, 0, -v0), (1, m.slots, 1)))
+    tape = wf.Adjoint(sim, ["pad.restitution", "initial.velocity"])
+    tape.run(n)
+    probe, grad = tape.probe("top"), np.zeros((1, n, 3))
+    grad[0, -1, 2] = 1.0
+    probe.velocity.grad.assign(grad)
+    g = tape.backward()
+    v = probe.velocity.numpy()[0, -1, 2]
+    assert g["initial.velocity"].numpy()[0, :, 2].sum() == pytest.approx(-v / v0, rel=1e-6)
+    assert v == pytest.approx(0.6 * v0, rel=1e-2)
+    assert g["pad.restitution"].numpy()[0] == pytest.approx(v0, rel=1e-2)
+    touching = (m.terms.contacts[0].tables.area_fractions[0] > 0.0).sum()
+    assert g.switches[0] == 2 * touching  # each comes into contact and leaves it
 
 
 def test_friction_of_a_guided_block():
@@ -224,6 +274,8 @@ def test_friction_of_a_guided_block():
     sim.state.velocity.assign(np.tile((1.0, 0, 0), (1, m.slots, 1)))
     tape = wf.Adjoint(sim, ["pad.mu", "pad.stiffness"])
     tape.run(n)
+    without = {*sim.stepper.launch.modules, *(module.name for module in sim.stepper.modules()), *sim.bytes()}
+    assert not any("adjoint" in name for name in without)
     way = sim.contact_force(pad)[0, 2] * h**2 * n * (n + 1) / 2  # the mass is 1 kg
     grad = np.zeros((1, n, 3))
     grad[0, -1, 0] = 1.0

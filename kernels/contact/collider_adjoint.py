@@ -14,6 +14,7 @@ from ..common.types import f64, int_1d, mat33d, precision, vec3d, vec3d_2d
 from .adjoint import contact_adjoint_functions, contact_adjoint_struct
 from .collider_kinematics import collider_kinematics
 from .collider_mesh import FLAT
+from .collider_seams import SEAMS_SUFFIX
 from .collider_shapes import BOX, CAPSULE, CYLINDER, HALF_SPACE, LATERAL_SIDE, MESH, SPHERE
 from .colliders import MESH_SUFFIX, collider_functions
 from .kinematics import kinematics_functions
@@ -92,18 +93,18 @@ def normal_derivatives(meshes: bool) -> KernelSet:
 
 
 @functools.cache
-def collider_adjoint_kernels(dtype: str, meshes: bool, own: OwnLaws = ()) -> KernelSet:
+def collider_adjoint_kernels(dtype: str, meshes: bool, seams: bool, own: OwnLaws = ()) -> KernelSet:
     """Kernels; arguments as of `contact_kernels`, `law`: the contacts' constants with the points as contacts."""
     p = precision(dtype)
     Contacts, Facets, History, ContactScratch, Clock, PointContact = contact_structs(dtype)
     Colliders, ContactAdjoint = collider_struct(meshes), contact_adjoint_struct()
-    g, k = collider_kinematics(dtype, meshes), kinematics_functions(dtype)
+    g, k = collider_kinematics(dtype, meshes, seams), kinematics_functions(dtype)
     a = contact_adjoint_functions(dtype, own)
     PointBars, law_bars, is_slipping = a.PointBars, a.law_bars, a.is_slipping
     normal_derivative = normal_derivatives(meshes).normal_derivative
     stored_side = collider_functions(meshes).stored_side
     name = "_".join(["collider_adjoint", dtype, *law_names(own)])
-    module = kernel_module(f"{name}{MESH_SUFFIX * meshes}", max_unroll=SHORT_UNROLL)
+    module = kernel_module(f"{name}{MESH_SUFFIX * meshes}{SEAMS_SUFFIX * seams}", max_unroll=SHORT_UNROLL, block_dim=64)
 
     @wp.func
     def world_axes(col: Colliders, con: Contacts, c: int, rotation: mat33d) -> mat33d:

@@ -10,7 +10,7 @@ import functools
 
 import warp as wp
 
-from ..common.modules import SHORT_UNROLL, KernelSet, kernel_module, kernel_set, masked_kernel
+from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.types import f64, int_1d, precision, vec3d, vec3d_2d
 from .adjoint import contact_adjoint_functions, contact_adjoint_struct, point_bars_struct
 from .facet_kinematics import facet_kinematics
@@ -202,7 +202,7 @@ def facet_adjoint_kernels(dtype: str, own: OwnLaws = ()) -> KernelSet:
     law_bars, is_slipping = a.law_bars, a.is_slipping
     curvature, field_point, shape_jet, geometry_work = c_.curvature, c_.field_point, c_.shape_jet, c_.geometry_work
     project_on_facet = f_.project_on_facet
-    module = kernel_module("_".join(["facet_adjoint", dtype, *law_names(own)]))
+    module = kernel_module("_".join(["facet_adjoint", dtype, *law_names(own)]), block_dim=64)
 
     @wp.func
     def store(bars: FacetBars, world: int, point: int, i: int, xi: vec3d, t: FacetPoint):

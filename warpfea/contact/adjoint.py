@@ -163,8 +163,6 @@ class DifferentiableContact(Differentiable):
             return "rigid capsules and cylinders that roll (model='patch' takes points on their facets)"
         if t.explicit:
             return "treatment='explicit'"
-        if t.seams:
-            return "seams (seam=0 leaves them out)"
         if not ctx.inertia and (t.data.mu_static.numpy() > 0.0).any():
             return "friction in statics, which depends on the path"
         return None

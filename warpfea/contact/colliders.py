@@ -284,7 +284,8 @@ class ColliderContact(ContactTerm, DifferentiableColliders):
     @cached_property
     def adjoint_kernels(self) -> Any:
         """Kernels of `DifferentiableColliders`."""
-        return collider_adjoint_kernels(self.model.dtype, self.tables.has_meshes, self.tables.own_laws)
+        t = self.tables
+        return collider_adjoint_kernels(self.model.dtype, t.has_meshes, t.seams is not None, t.own_laws)
 
     def gradients(self, ctx: StepContext) -> Mapping[str, Callable[[], Gradient]]:
         def offset(mine: np.ndarray) -> Gradient:
