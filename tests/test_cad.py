@@ -155,3 +155,10 @@ def test_a_damaged_file_is_refused_and_gmsh_left(gmsh, tmp_path):
     with pytest.raises(MeshError, match=r"part\.step: (can't be meshed by Gmsh|holds no closed solids)"):
         wf.mesh.from_cad(tmp_path / "part.step", size=1.0)
     assert not gmsh.isInitialized()
+    gmsh.initialize(readConfigFiles=False, interruptible=False)
+    try:
+        with pytest.raises(MeshError, match=r"Gmsh is in use in this process; call gmsh\.finalize"):
+            wf.mesh.from_cad(tmp_path / "part.step", size=1.0)
+        assert gmsh.isInitialized()
+    finally:
+        gmsh.finalize()

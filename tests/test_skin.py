@@ -133,6 +133,7 @@ def test_outputs_draw_the_skin_and_nothing_else_changes(tmp_path):
         assert all(file.stat().st_size > 0 for file in files)
     assert len(drawn[0]) == len(points)
     assert np.array_equal(drawn[1].reshape(-1, 3), triangles)
+    assert len(body.face_skin.triangles) == 48  # what a check of overlaps takes
     assert facts[0] == facts[1]
     assert np.array_equal(*states)
     assert (tmp_path / "True.png").read_bytes() != (tmp_path / "False.png").read_bytes()

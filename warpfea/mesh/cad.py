@@ -95,6 +95,8 @@ def _write_mesh(file: Path, target: Path, dimension: int, options: dict[str, Any
         import gmsh
     except (ImportError, OSError) as error:  # OSError: a library of the system
         raise MeshError(f"{file}: a mesh of a CAD file needs gmsh: pip install 'warpfea[cad]' ({error})") from error
+    if gmsh.isInitialized():
+        raise MeshError(f"{file}: Gmsh is in use in this process; call gmsh.finalize() first")
     suffix = file.suffix.lower()
     gmsh.initialize(readConfigFiles=False, interruptible=False)
     try:

@@ -66,9 +66,14 @@ class Body(Discretisation):
         return self.nodes(name)
 
     @cached_property
-    def skin(self) -> surfaces.Skin:
-        """Drawn surface."""
+    def face_skin(self) -> surfaces.Skin:
+        """The faces of the elements."""
         return surfaces.make_skin(self)
+
+    @cached_property
+    def skin(self) -> surfaces.Skin:
+        """Drawn surface, by default the faces of the elements."""
+        return self.face_skin
 
     def render_skin(
         self, points: np.ndarray, triangles: np.ndarray, distance: float | None, what: str

@@ -21,7 +21,7 @@ from ..kernels.contact.crossings import crossing_kernel
 from ..model.bodies import Body
 from ..model.contacts import Collider
 from ..model.shapes import HALF_SPACE
-from ..model.surfaces import make_skin, reference_points
+from ..model.surfaces import reference_points
 
 __all__ = ["Crossing", "OverlapCheck"]
 
@@ -86,7 +86,7 @@ class _Side:
 
 def _body_side(body: Body) -> _Side:
     """Skin of a body."""
-    skin = make_skin(body)  # the faces of its elements, whatever is drawn
+    skin = body.face_skin  # whatever is drawn
     weights, slots = skin.slot_weights, body.slot_range
     X = reference_points(body, weights)
 
