@@ -24,13 +24,13 @@ def moved(body, shift, seed=3):
     return direction
 
 
-def solid(b, shift, element, bulge):
+def solid(b, shift, element, bulge, form="incremental"):
     """A bar of T4 or T10 by the nodes of its mesh, turned at one end."""
     mesh = wf.mesh.box((0.1, 0.02, 0.02), cells=(3, 1, 1), element=element)
     x = mesh.points + bulge * np.sin(np.pi * mesh.points[:, :1] / 0.1) * [0.0, 0.0, 1.0]
     direction = 0.01 * np.random.default_rng(3).standard_normal(x.shape)
     mesh = replace(mesh, points=x + shift * direction, node_sets={"x-": mesh.nodes("x-")})
-    law = models.material(models.SVK if element == "T4" else models.NEO)
+    law = models.material(models.SVK if element == "T4" else models.NEO, form=form)
     body = b.add_solid(mesh, material=law, name="body")
     turn = wf.Rotation(anchor=(0, 0, 0), axis=(0.2, 1, 0), angle=([0.0, 1.0], [0.0, 30.0]))
     b.drive(body.nodes("x-"), rotation=turn)
@@ -64,22 +64,25 @@ def cases():
 
     slow = pytest.mark.slow
     return [
-        pytest.param(lambda b, shift: solid(b, shift, "T4", 0.0), id="T4"),
-        pytest.param(lambda b, shift: solid(b, shift, "T10", 0.003), id="curved T10", marks=slow),
-        pytest.param(beam, id="3243"),
-        pytest.param(shell, id="3443", marks=slow),
-        pytest.param(ancf, id="H3843", marks=slow),
+        pytest.param(lambda b, shift: solid(b, shift, "T4", 0.0), "backward_euler", id="T4"),
+        pytest.param(lambda b, shift: solid(b, shift, "T4", 0.0, "rate"), "bdf2", id="T4 rate", marks=slow),
+        pytest.param(lambda b, shift: solid(b, shift, "T10", 0.003), "backward_euler", id="curved T10", marks=slow),
+        pytest.param(beam, "backward_euler", id="3243"),
+        pytest.param(beam, "bdf2", id="3243 bdf2", marks=slow),
+        pytest.param(beam, "generalized_alpha", id="3243 generalized_alpha", marks=slow),
+        pytest.param(shell, "backward_euler", id="3443", marks=slow),
+        pytest.param(ancf, "backward_euler", id="H3843", marks=slow),
     ]
 
 
-def run(make, shift, mode="gradient", steps=STEPS):
+def run(make, shift, mode="gradient", scheme="backward_euler", steps=STEPS):
     """Loss of a run or an equilibrium of a changed body; with `mode` the derivatives and the direction too."""
     b = wf.ModelBuilder(gravity=(0.0, 3.0, -9.81))
     body, end, direction = make(b, shift)
     b.add_traction(end, ((0.0, 1.0), ((0.0, 0.0, 0.0), (3e6, 2e6, -5e6))))
     b.add_probe("tip", end)
     m = b.finalize(device="cpu", many=False)
-    tape = wf.Adjoint(wf.Simulation(m, dt=2e-3, solver=SOLVER), "mesh.X")
+    tape = wf.Adjoint(wf.Simulation(m, dt=2e-3, integrator=scheme, solver=SOLVER), "mesh.X")
     tape.run(steps)
     probe = tape.probe("tip")
     loss = probe_loss(probe)
@@ -99,11 +102,11 @@ def probe_loss(probe):
     return total
 
 
-@pytest.mark.parametrize("make", cases())
-def test_gradient_by_the_reference(make):
-    _, g, direction = run(make, 0.0)
+@pytest.mark.parametrize(("make", "scheme"), cases())
+def test_gradient_by_the_reference(make, scheme):
+    _, g, direction = run(make, 0.0, scheme=scheme)
     exact = np.sum(g * direction)
-    losses = np.array([run(make, LENGTH * point, "loss") for point in POINTS])
+    losses = np.array([run(make, LENGTH * point, "loss", scheme) for point in POINTS])
     assert losses @ WEIGHTS / LENGTH == pytest.approx(exact, rel=1e-7)
 
 
@@ -141,5 +144,5 @@ def test_terms_without_a_derivative_are_refused_by_name():
     with pytest.raises(wf.ModelError, match=r"nu of beams and shells .* differs between worlds"):
         MeshGradient(ctx)
     ctx.model, ctx.midpoint = models.varied(models.solid("T4")), True
-    with pytest.raises(wf.ModelError, match="'elements': it takes backward_euler"):
+    with pytest.raises(wf.ModelError, match="'elements': steps of energy_momentum"):
         MeshGradient(ctx)

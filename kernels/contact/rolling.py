@@ -35,7 +35,9 @@ def rolling_kernels(dtype: str, meshes: bool, seams: bool) -> KernelSet:
     Colliders = collider_struct(meshes)
     k, distance = kinematics_functions(dtype), collider_functions(meshes).distance
     begin_point = collider_kinematics(dtype, meshes, seams).begin_point
-    module = kernel_module(f"contact_rolling_{dtype}{MESH_SUFFIX * meshes}{SEAMS_SUFFIX * seams}", max_unroll=SHORT_UNROLL)
+    module = kernel_module(
+        f"contact_rolling_{dtype}{MESH_SUFFIX * meshes}{SEAMS_SUFFIX * seams}", max_unroll=SHORT_UNROLL
+    )
 
     @wp.func
     def arm(facets: Facets, row: int, q: int, way: vec3d) -> vec3d:

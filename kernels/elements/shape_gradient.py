@@ -10,13 +10,13 @@ import functools
 
 import warp as wp
 
-from ..common.modules import kernel_module, kernel_set, masked_kernel
+from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.types import double_1d, int_1d, precision
 from .assumed_strain_block import assumed_shear_functions, assumed_strain_struct, coupling_entry_function
 from .element_slots import iterate_struct, slot_access_functions
 from .points import point_functions
 
-__all__ = ["shape_gradient_kernel", "tied_shape_gradient_kernel", "tied_shape_struct"]
+__all__ = ["shape_gradient_kernels", "tied_shape_gradient_kernel", "tied_shape_struct"]
 
 
 @functools.cache
@@ -43,56 +43,75 @@ def turn_functions(dtype: str, framed: bool):
 
 
 @functools.cache
-def shape_gradient_kernel(
+def shape_gradient_kernels(
     dtype: str, law: str, slots: int, affine: bool, damping: str | None, framed: bool
-) -> wp.Kernel:  # fmt: skip
-    """Kernel `shape_gradient` of one kind of element block; arguments as those of `element_kernels`."""
+) -> KernelSet:  # fmt: skip
+    """Kernels of one kind of element block; arguments as those of `element_kernels`."""
     fn, turn = point_functions(dtype, law, slots, affine, damping, framed), turn_functions(dtype, framed)
     p, t, m, Block, Local = fn.types, fn.tensors, fn.law, fn.Block, fn.Local
-    T, mat33, Iterate = p.T, p.mat33, iterate_struct(dtype)
+    T, mat33, Iterate, coef = p.T, p.mat33, iterate_struct(dtype), fn.coef
     ETA_INDEX, LAMBDA_V_INDEX, viscous = fn.ETA_INDEX, fn.LAMBDA_V_INDEX, fn.viscous
     form = "affine" if affine else "framed" if framed else "table"
     module = kernel_module(f"element_{dtype}_{law}_{slots}_{form}_{damping}_shape_gradient")
 
+    @wp.func
+    def viscous_part(S: mat33, G: mat33, Fdot: mat33, D: mat33, c: coef, dq: T) -> mat33:
+        """M of D : (F S) with the viscous stress S, whose past strains are fixed."""
+        F = t.identity() + G
+        dS = t.isotropic_stress(t.sym(wp.transpose(F) * D), c[LAMBDA_V_INDEX], c[ETA_INDEX])
+        P = F * S
+        M = wp.ddot(P, D) * t.identity() + turn.gradient_part(D, P)
+        if wp.static(damping == "rate"):
+            return M + turn.gradient_part(G, D * S + Fdot * dS) + turn.gradient_part(Fdot, F * dS)
+        return M + turn.gradient_part(G, D * S + (T(1.0) / dq) * F * dS)
+
     @masked_kernel(module, "active")
-    def shape_gradient(
-        block: Block, iterate: Iterate, u_n: p.vec3_2d, u_before: p.vec3_2d, a0: double_1d, a1: double_1d,
-        w: p.vec3_2d, active: int_1d, contribution: p.vec3_2d,
-    ):  # fmt: skip
-        """-w.df/dX, with the strains a0 E(u_n) - a1 E(u_before) of incremental damping."""
+    def shape_gradient(block: Block, iterate: Iterate, w: p.vec3_2d, active: int_1d, contribution: p.vec3_2d):
+        """-w.df/dX, with the past strains of incremental damping fixed."""
         world, elem = wp.tid()
         c = fn.coefficients(block, world, elem)
         dq = T(iterate.dq_dv[world])
         U = fn.load_slots(block, iterate.u, world, elem)
+        V = fn.load_velocities(block, iterate.v, world, elem)
         W = fn.load_slots(block, w, world, elem)
         f = Local()
         for point in range(block.shape_gradient.shape[0]):
             G = fn.material_gradient(block, U, point, elem)
             D = fn.material_gradient(block, W, point, elem)
             P = m.stress(G, c)
-            dP = m.increment(G, D, c)
-            M = mat33()
+            M = wp.ddot(P, D) * t.identity() + turn.gradient_part(D, P)
+            M += turn.gradient_part(G, m.increment(G, D, c))
             if wp.static(viscous):
-                rate = fn.strain_rate(block, G, mat33(), iterate.history, dq, world, point, elem)
-                S = t.isotropic_stress(rate, c[LAMBDA_V_INDEX], c[ETA_INDEX])
-                F = t.identity() + G
-                dS = t.isotropic_stress(t.sym(wp.transpose(F) * D), c[LAMBDA_V_INDEX] / dq, c[ETA_INDEX] / dq)
-                P += F * S
-                dP += D * S + F * dS
-                past = fn.load_slots(block, u_n, world, elem)
-                for k in range(2):
-                    factor = -T(a0[world])
-                    if k == 1:
-                        factor = T(a1[world])
-                        past = fn.load_slots(block, u_before, world, elem)
-                    if factor != T(0.0):
-                        H = fn.material_gradient(block, past, point, elem)
-                        M += turn.gradient_part(H, factor * (dS + H * dS))
-            M += wp.ddot(P, D) * t.identity() + turn.gradient_part(G, dP) + turn.gradient_part(D, P)
+                Fdot = fn.velocity_gradient(block, V, point, elem)
+                S = fn.viscous_stress(block, G, Fdot, iterate.history, c, dq, world, point, elem)
+                M += viscous_part(S, G, Fdot, D, c, dq)
             f = fn.add_point_forces(block, f, fn.to_body_axes(block, -M, point, elem), point, elem)
         fn.store_forces(block, f, world, elem, contribution)
 
-    return shape_gradient
+    @masked_kernel(module, "active")
+    def history_shape(
+        block: Block, u: p.vec3_2d, y: p.vec3_2d, x: p.vec3_2d, scale: double_1d, w: p.vec3_2d, dq_dv: double_1d,
+        active: int_1d, contribution: p.vec3_2d,
+    ):  # fmt: skip
+        """-w.df/dX through a past strain whose change is sym((scale I + grad x)^T grad dy)."""
+        world, elem = wp.tid()
+        c = fn.coefficients(block, world, elem)
+        rate = T(1.0) / T(dq_dv[world])
+        U = fn.load_slots(block, u, world, elem)
+        W = fn.load_slots(block, w, world, elem)
+        Y = fn.load_slots(block, y, world, elem)
+        X = fn.load_slots(block, x, world, elem)
+        f = Local()
+        for point in range(block.shape_gradient.shape[0]):
+            F = t.identity() + fn.material_gradient(block, U, point, elem)
+            change = t.sym(wp.transpose(F) * fn.material_gradient(block, W, point, elem))
+            dS = t.isotropic_stress(change, rate * c[LAMBDA_V_INDEX], rate * c[ETA_INDEX])
+            A = T(scale[world]) * t.identity() + fn.material_gradient(block, X, point, elem)
+            M = turn.gradient_part(fn.material_gradient(block, Y, point, elem), A * dS)
+            f = fn.add_point_forces(block, f, fn.to_body_axes(block, M, point, elem), point, elem)
+        fn.store_forces(block, f, world, elem, contribution)
+
+    return kernel_set(locals())
 
 
 @functools.cache

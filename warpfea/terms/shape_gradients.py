@@ -14,7 +14,7 @@ import warp as wp
 
 from ..base.errors import ModelError
 from ..kernels.elements.points import block_struct
-from ..kernels.elements.shape_gradient import shape_gradient_kernel, tied_shape_gradient_kernel, tied_shape_struct
+from ..kernels.elements.shape_gradient import shape_gradient_kernels, tied_shape_gradient_kernel, tied_shape_struct
 from ..kernels.terms.shape_gradients import shape_kernels
 from ..model import assembly
 from ..model.masses import has_constant_density
@@ -99,10 +99,8 @@ class MeshGradient:
 def not_shaped(ctx: StepContext) -> str:
     """Feature of the elements without a derivative by their reference, or ""."""
     m = ctx.model
-    if ctx.midpoint or ctx.accelerated:
-        return "it takes backward_euler, bdf2 or statics"
-    if any(b.key.damping not in ("incremental", None) for b in m.blocks) and ctx.inertia:
-        return "damping is differentiated in the form 'incremental'"
+    if ctx.midpoint:
+        return "steps of energy_momentum"
     if any(b.couplings_per_world for b in m.blocks):
         return "nu of beams and shells with remedies against locking differs between worlds"
     if any(not has_constant_density(law) and callable(law.density) for body in m.bodies for _, law in body.materials):
@@ -114,29 +112,42 @@ def not_shaped(ctx: StepContext) -> str:
 
 def internal_force_gradient(ctx: StepContext) -> Gradient:
     """Of the internal force."""
-    m, launches = ctx.model, []
+    m, points, ties = ctx.model, [], []
     for block in m.blocks:
         key, dtype = block.key, m.dtype
         if key.tying:
             kernel = tied_shape_gradient_kernel(dtype, block.slots, block.points, key.tying.width, key.framed)
-            launches.append((block, kernel, tied_shape(m, block)))
+            ties.append((block, kernel, tied_shape(m, block)))
         else:
             damping = key.damping if ctx.inertia else None
             kind = (key.law, block.slots, key.affine, damping, key.framed)
-            launches.append((block, shape_gradient_kernel(dtype, *kind), None))
-    compile_kernels(m, [kernel for _, kernel, _ in launches])
+            points.append((block, shape_gradient_kernels(dtype, *kind)))
+    compile_kernels(m, [*(k.shape_gradient for _, k in points), *(kernel for _, kernel, _ in ties)])
+    past = [(b, k) for b, k in points if b.key.damping == "incremental" and ctx.inertia]
 
     def add(at: StepAdjoint, out: wp.array) -> None:
-        w, u_n, step = at.ctx.work, at.ctx.state.displacement, at.ctx.work.step
+        w, launch = at.ctx.work, at.ctx.launch
         w.contribution.zero_()
-        for block, kernel, shape in launches:
-            args = [block.data, w.stage, u_n, at.ctx.u_before, step.a0, step.a1]
-            args = [block.data, shape, w.u] if shape is not None else args
-            at.ctx.launch(kernel, (m.worlds, block.count), [*args, at.w, at.active, w.contribution])
-        at.gather(at.scratch)
-        at.ctx.launch(at.kernels.add_vector, at.dim, [at.scratch, at.active, out])
+        for block, k in points:
+            args = [block.data, w.stage, at.w, at.active, w.contribution]
+            launch(k.shape_gradient, (m.worlds, block.count), args)
+        for block, kernel, shape in ties:
+            launch(kernel, (m.worlds, block.count), [block.data, shape, w.u, at.w, at.active, w.contribution])
+        collect(at, out)
+        for name, x, scale in at.history_fields() if past else ():
+            w.contribution.zero_()
+            for block, k in past:
+                args = [block.data, w.u, getattr(at.ctx.state, name), x, scale, at.w, w.step.dq_dv, at.active]
+                launch(k.history_shape, (m.worlds, block.count), [*args, w.contribution])
+            collect(at, out)
 
     return add
+
+
+def collect(at: StepAdjoint, out: wp.array) -> None:
+    """out += contributions of the elements."""
+    at.gather(at.scratch)
+    at.ctx.launch(at.kernels.add_vector, at.dim, [at.scratch, at.active, out])
 
 
 def tied_shape(m: Model, block: Block) -> Any:
@@ -203,8 +214,7 @@ def mass_gradient(ctx: StepContext) -> Gradient:
         for block, data, density in launches:
             args = [data, density, at.scratch, at.w, at.active, w.contribution]
             at.ctx.launch(kernels.mass_shape, (m.worlds, block.count), args)
-        at.gather(at.scratch)
-        at.ctx.launch(at.kernels.add_vector, at.dim, [at.scratch, at.active, out])
+        collect(at, out)
 
     return add
 
