@@ -112,17 +112,17 @@ def not_shaped(ctx: StepContext) -> str:
 
 def internal_force_gradient(ctx: StepContext) -> Gradient:
     """Of the internal force."""
-    m, points, ties = ctx.model, [], []
+    m, points, tied = ctx.model, [], []
     for block in m.blocks:
         key, dtype = block.key, m.dtype
         if key.tying:
             kernel = tied_shape_gradient_kernel(dtype, block.slots, block.points, key.tying.width, key.framed)
-            ties.append((block, kernel, tied_shape(m, block)))
+            tied.append((block, kernel, tied_shape(m, block)))
         else:
             damping = key.damping if ctx.inertia else None
             kind = (key.law, block.slots, key.affine, damping, key.framed)
             points.append((block, shape_gradient_kernels(dtype, *kind)))
-    compile_kernels(m, [*(k.shape_gradient for _, k in points), *(kernel for _, kernel, _ in ties)])
+    compile_kernels(m, [*(k.shape_gradient for _, k in points), *(kernel for _, kernel, _ in tied)])
     past = [(b, k) for b, k in points if b.key.damping == "incremental" and ctx.inertia]
 
     def add(at: StepAdjoint, out: wp.array) -> None:
@@ -131,7 +131,7 @@ def internal_force_gradient(ctx: StepContext) -> Gradient:
         for block, k in points:
             args = [block.data, w.stage, at.w, at.active, w.contribution]
             launch(k.shape_gradient, (m.worlds, block.count), args)
-        for block, kernel, shape in ties:
+        for block, kernel, shape in tied:
             launch(kernel, (m.worlds, block.count), [block.data, shape, w.u, at.w, at.active, w.contribution])
         collect(at, out)
         for name, x, scale in at.history_fields() if past else ():
@@ -175,7 +175,7 @@ def tied_shape(m: Model, block: Block) -> Any:
 
 
 def _coupling_gradients(host: Any, members: np.ndarray, ds: np.ndarray, J: np.ndarray) -> np.ndarray:
-    """(E, ties, width, S, 3) derivatives of the couplings A by the reference values, by differences."""
+    """(E, tied, width, S, 3) derivatives of the couplings A by the reference values, by differences."""
     part, body = host.key.integral, host.body
     tying, rule, material = part.tying, part.rule, body.materials[host.material][1]
     _, ds_rule, J_rule, _ = assembly.shape_and_jacobian(body, members, rule.points)
