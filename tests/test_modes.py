@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import warp as wp
 from scipy.integrate import solve_bvp
 from scipy.optimize import brentq
 from spring_models import oscillator
@@ -43,6 +44,23 @@ def test_cantilever_and_its_effective_mass():
     moved = every.effective_mass.sum(axis=0)[:3]
     assert 0.95 * mass < moved.min()
     assert moved.max() < mass
+
+
+def test_welded_beams_vibrate_as_one():
+    """Two halves of the cantilever, tied by a weld; without it the second is free."""
+    b, first = beam(4, curve=((0, 0, 0), (0.5, 0, 0)))
+    section, curve = wf.Rectangle(WIDTH, HEIGHT), ((0.5, 0, 0), (1, 0, 0))
+    second = b.add_beam(curve, elements=4, section=section, normal=(0, 0, 1), material=LAW, name="c")
+    b.clamp(first.start, slots="all")
+    assert wf.modes(b.finalize(device="cpu"), count=8).rigid_body_modes == 6
+    b.weld(second.start, first)
+    found = wf.modes(b.finalize(device="cpu"), count=4)
+    assert found.rigid_body_modes == 0
+    expected = [bending(k, h) for k in (1.8751041, 4.6940911) for h in (HEIGHT, WIDTH)]
+    assert found.frequencies == pytest.approx(expected, rel=3e-3)
+    ends = [found.shape(body)[:, node] for body, node in ((first, -1), (second, 0))]
+    assert ends[0] == pytest.approx(ends[1], abs=1e-6)  # the halves move together
+    assert np.abs(found.shape(second)[0, -1, 2]) == pytest.approx(1.0, abs=1e-6)
 
 
 def test_free_beam_by_both_methods_has_six_rigid_body_modes():
@@ -237,6 +255,12 @@ def test_modes_of_sections_alone_move_no_node(tmp_path):
         found.write(tmp_path / "mode.png", mode=5)
 
 
+@wp.func
+def swirl(x: wp.vec3d, t: wp.float64):
+    """A force field for `add_body_force`."""
+    return wp.vec3d(-x[1], x[0], t)
+
+
 def test_what_has_no_modes_is_refused():
     def built(make, **options):
         b = wf.ModelBuilder(gravity=(0, 0, 0))
@@ -248,6 +272,7 @@ def test_what_has_no_modes_is_refused():
     for make, options, text in (
         (lambda b, body: None, {"density": None}, "modes.*density"),
         (lambda b, body: b.add_pressure(body.surface("z+"), 1e3), {}, "stiffness of 'followers' is not known"),
+        (lambda b, body: b.add_body_force(swirl), {}, "stiffness of 'body forces' is not known .*force fields"),
         (lambda b, body: None, {"dtype": "float32"}, "float32 can't resolve the stiffness"),
     ):
         with pytest.raises(wf.ModelError, match=text):

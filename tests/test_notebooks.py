@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import warpfea as wf
+from warpfea.simulation.plots import record_plots
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +52,27 @@ def test_tables_and_plot_of_a_run(model):
     assert counts["newton"].sum() == sim.totals["newton"].sum()
     with pytest.raises(wf.ModelError, match="world = 1"):
         sim.plot(1)
+
+
+def test_angles_of_joints_are_plotted():
+    """On the figure and on the page, once their history is recorded."""
+    b = wf.ModelBuilder()
+    part = b.add_rigid(wf.Box((0.1, 0, 0), (0.1, 0.01, 0.01)), density=1e3, name="part")
+    hinge = b.add_joint("revolute", parent=wf.GROUND, child=part.at((0, 0, 0)), axis=(0, 1, 0), name="hinge")
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-2)
+    angle = sim.history("angle", "hinge")
+    with pytest.raises(wf.ModelError, match="travel"):
+        sim.history("travel", hinge)
+    found = []
+    for _ in range(5):
+        sim.step()
+        found.append(sim.joint_value(hinge)[0])
+    assert angle.values[0] == pytest.approx(found, rel=1e-12)
+    assert found[-1] > 0.01
+    axis = next(axis for axis in sim.plot().axes if axis.get_title() == "joint hinge: angle")
+    assert axis.get_ylabel() == "rad"
+    assert axis.lines[0].get_ydata() == pytest.approx(found, rel=1e-5)
+    assert [plot["names"] for plot in record_plots(sim, [0]) if plot["units"] == "rad"] == [["angle"]]
 
 
 def test_a_static_result_is_a_page(model):

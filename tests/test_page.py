@@ -213,6 +213,17 @@ def test_page_of_a_usd_file(tmp_path, browser):
     wanted = sim.skin_points(sim.bodies[0])[1] + shift
     assert np.abs(np.reshape(got, (-1, 3)) - wanted).max() < 1e-4
     assert tab("document.documentElement.scrollWidth") <= 390  # a phone needs no scrolling sideways
+    # no point of any frame is under the bar of colours
+    reach = tab("""(() => { const v = page.view, out = [];
+      for (let k = 0; k < page.data.times.length; k++) for (const s of v.surfaces) {
+        s.move(k, 0, 1);
+        for (let p = 0; p < s.count; p++)
+          out.push(v.camera.project(Array.from(s.points.subarray(3 * p, 3 * p + 3)), v.aspect())[0]);
+      } return [Math.min(...out), Math.max(...out)]; })()""")
+    bar = tab("""(() => { const box = (id) => document.getElementById(id).getBoundingClientRect();
+      return (box("legend").left - box("picture").left) / box("picture").width * 2 - 1; })()""")
+    assert -1.0 < reach[0] < -0.6
+    assert bar - 0.3 < reach[1] < bar
     dark = tab("getComputedStyle(document.body).backgroundColor")
     assert max(map(int, dark[4:-1].split(","))) < 60
 
@@ -268,6 +279,89 @@ def test_result_file():
         assert row["overlap"] >= 0.98, row["scene"]
         assert row["difference"] <= 0.05, row["scene"]
         assert row["errors"] == row["requests"] == 0
+
+
+def marked(tab, kind):
+    """Pixels of the overlay in the colour of a kind of marks, over the picture of the tab."""
+    return tab(
+        """(kind) => { const c = document.getElementById("overlay"), d = c.getContext("2d");
+      const pixels = d.getImageData(0, 0, c.width, c.height).data;
+      const text = getComputedStyle(document.documentElement).getPropertyValue(`--${kind}`).trim();
+      const wanted = [1, 3, 5].map((k) => parseInt(text.slice(k, k + 2), 16));
+      let count = 0;
+      for (let i = 0; i < pixels.length; i += 4)
+        if (pixels[i + 3] > 150 && wanted.every((x, k) => Math.abs(pixels[i + k] - x) < 12)) count++;
+      return count; }""",
+        kind,
+    )
+
+
+def test_colliders_marks_and_the_runs_warnings_are_drawn(tmp_path, browser):
+    """Supports, a joint, a load and a spring in their colours, grey colliders, worlds on a grid and alone; warnings."""
+    b = wf.ModelBuilder()
+    law = wf.SVK(E=1e7, nu=0.3, density=1e3)
+    bar = b.add_solid(wf.mesh.box((1, 0.2, 0.2), cells=(2, 1, 1)), material=law, name="bar")
+    part = b.add_rigid(wf.Box((1.2, 0.1, 0.1), (0.2, 0.2, 0.2)), density=1e3, name="part")
+    b.clamp(bar.nodes("x-"))
+    b.add_joint("spherical", parent=bar.at((1, 0.1, 0.1)), child=part.at((1, 0.1, 0.1)))
+    b.add_point_load(bar.at((0.5, 0.1, 0.2)), force=(0, 0, -50.0))
+    b.add_spring((1.2, 0.1, 0.8), part.at((1.2, 0.1, 0.3)), stiffness=100.0)
+    b.add_contact(bar, b.add_collider(wf.Sphere((0.5, 0.1, -0.7), 0.3), name="ball"))
+    model = b.finalize(worlds=3, device="cpu")
+    path = tmp_path / "x.html"
+    sim = wf.Simulation(model, dt=1e-3)
+    sim.totals["rough"][:] = 2  # as of steps that ended above the tolerance
+    sim.run(
+        2e-3, outputs=[HTMLWriter(path, fps=1000.0, color=None, fields=["displacement"], worlds=[0, 2])], progress=False
+    )
+    tab = Tab(browser, path)
+    tab("page.view.draw()")
+    assert tab.page.locator("#notes").inner_text().startswith("the tolerance was not reached in")
+    kinds = ("support", "joint", "load", "spring")
+    grid = {kind: marked(tab, kind) for kind in kinds}
+    assert min(grid.values()) > 15, grid
+    colors = picture(tab)
+    alone = "page.view.shown = () => page.view.surfaces.filter((s) => s.kind === 'collider')"
+    tab(f"{{ {alone}; page.view.draw(); }}")
+    balls = picture(tab)
+    tab("{ page.view.shown = () => []; page.view.draw(); }")
+    empty = picture(tab)
+    tab("{ delete page.view.shown; page.view.draw(); }")
+    ball = np.abs(balls - empty).max(axis=2) > 12
+    assert ball.sum() > 500
+    assert np.ptp(balls[ball], axis=1).max() < 40  # grey
+    columns = np.flatnonzero(ball.any(axis=0))
+    assert (np.diff(columns) > 20).sum() == 1  # two of them, side by side: the worlds' grid
+    assert (np.abs(colors - empty).max(axis=2) > 12).sum() > 3 * ball.sum() / 2
+    tab.page.locator("#picture").press("m")
+    assert max(marked(tab, kind) for kind in kinds) == 0
+    tab.page.locator("#picture").press("m")
+    tab.page.select_option("#world", "1")  # one world, larger
+    assert min(marked(tab, kind) for kind in kinds) > 15
+    tab(f"{{ {alone}.filter((s) => s.world === 1); page.view.draw(); }}")
+    one = np.abs(picture(tab) - empty).max(axis=2) > 12
+    assert (np.diff(np.flatnonzero(one.any(axis=0))) > 20).sum() == 0
+    tab("{ delete page.view.shown; page.view.draw(); }")
+    for key, angles in (("1", [-90, 0]), ("2", [0, 0]), ("3", [-90, 89.9])):
+        tab.page.locator("#picture").press(key)
+        assert tab("[page.view.camera.azimuth, page.view.camera.elevation]") == angles
+    before = tab("page.view.camera.distance")
+    tab("page.view.camera.distance *= 2")
+    tab.page.locator("#picture").press("f")
+    assert tab("page.view.camera.distance") == pytest.approx(before)
+    tab.page.locator("#picture").press(" ")
+    assert tab("page.view.playing")
+    assert not tab.errors
+
+
+def test_a_field_of_one_value_is_not_shown_first(tmp_path):
+    """A ball in flight has no stress: its page begins with the displacement."""
+    sim = Sim(worlds=1)
+    sim.field = lambda name, body: np.zeros((1, len(body.mesh.points))) + sim.time[:, None] * (name == "displacement")
+    drive(sim, HTMLWriter(tmp_path / "x.html", fps=50.0), 5)
+    text = (tmp_path / "x.html").read_text()
+    head = json.loads(text.split('type="application/json">')[1].split("</script>")[0])
+    assert head["fields"][head["color"]]["name"] == "displacement"
 
 
 @pytest.mark.parametrize("name", ["hook", "four_bar"])

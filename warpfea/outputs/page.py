@@ -158,7 +158,7 @@ class Page:
             "fields": [{"name": name, "title": label[0], "units": label[1], "low": ranges[name][0],
                         "step": (ranges[name][1] - ranges[name][0]) / (NO_VALUE - 1)}
                        for name, label in self.fields.items()],
-            "color": list(self.fields).index(self.color) if self.color else -1, "range": self.color_range,
+            "color": self._first_shown(ranges), "range": self.color_range,
             "view": self.view, "maps": hex_tables(), "markers": self.markers, "plots": self.plots,
             "surfaces": [self._pack(block, surface, ranges) for surface in self.surfaces],
             "facts": self.facts, "warnings": self.warnings,
@@ -173,6 +173,14 @@ class Page:
         }  # fmt: skip
         pieces = (folder / "page.html").read_text("utf-8").split("@@")
         return "".join(parts[piece] if k % 2 else piece for k, piece in enumerate(pieces))
+
+    def _first_shown(self, ranges: dict[str, tuple[float, float]]) -> int:
+        """Number of the field shown first: `color`, or where all of its values are one the first that has more."""
+        if self.color is None:
+            return -1
+        order = [self.color] if self.color_range else [self.color, *self.fields]
+        shown = next((name for name in order if ranges[name][0] < ranges[name][1]), self.color)
+        return list(self.fields).index(shown)
 
     def _range(self, name: str) -> tuple[float, float]:
         """Extremes of a field over all frames, worlds and bodies; (0, 0) without a finite value."""

@@ -136,13 +136,13 @@ class Camera {
     return unit(sum(ray, up, (y - this.center[1]) * t[1]));
   }
 
-  // shows all points (a list of vectors) with a margin around them
-  fit(points, aspect, margin) {
+  // shows all points (a list of vectors) within shares of the width and the height around the center
+  fit(points, aspect, shares) {
     const low = [0, 1, 2].map((c) => points.reduce((m, p) => Math.min(m, p[c]), Infinity));
     const high = [0, 1, 2].map((c) => points.reduce((m, p) => Math.max(m, p[c]), -Infinity));
     const middle = low.map((x, c) => 0.5 * (x + high[c]));
     this.size = Math.max(0.5 * Math.hypot(...sum(high, low, -1)), 1e-9);
-    const { back, right, up } = this.axes(), t = this.tangents(aspect).map((x) => x * (1 - margin));
+    const { back, right, up } = this.axes(), t = this.tangents(aspect).map((x, k) => x * shares[k]);
     let distance = 1.02 * this.size;
     this.target = middle;
     for (const [axis, slope] of [[right, t[0]], [up, t[1]]]) {
@@ -211,7 +211,7 @@ void main() {
   if (u_grid > 0.0) {
     vec2 place = u_sky.z > 0.5 ? v_point.xy : v_point.xz;
     float fine = 0.45 * lines(place, u_grid, 0.2), strong = 0.7 * lines(place, 5.0 * u_grid, 0.5);
-    albedo = mix(albedo, vec3(0.5, 0.53, 0.58), max(fine, strong));
+    albedo = mix(albedo, min(vec3(0.5, 0.53, 0.58), 3.0 * albedo), max(fine, strong));
     float r = length(v_point) / u_fade;
     alpha *= exp(-r * r * r);
   }

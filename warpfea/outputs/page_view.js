@@ -2,7 +2,8 @@
 
 const $ = (id) => document.getElementById(id);
 const PREFIXES = [[1e9, "G"], [1e6, "M"], [1e3, "k"], [1, ""], [1e-3, "m"], [1e-6, "\u00b5"], [1e-9, "n"]];
-const COLLIDER = [0.6, 0.6, 0.61], PLANE = [0.8, 0.81, 0.83];
+const COLLIDER = [0.6, 0.6, 0.61], PLANE = { light: [0.8, 0.81, 0.83], dark: [0.27, 0.29, 0.32] };
+const DARK = matchMedia("(prefers-color-scheme: dark)");
 
 function element(kind, text = "", parent = null) {
   const out = document.createElement(kind);
@@ -84,15 +85,14 @@ class View {
     redraw("low", () => this.readRange());
     redraw("high", () => this.readRange());
     redraw("scale", (e) => { this.scale = Number.isFinite(+e.value) ? +e.value : 1; });
-    redraw("cut", () => {});
     redraw("depth", () => {}, "input");
-    for (const id of ["edges", "ghost", "marks"]) redraw(id, () => {});
+    for (const id of ["cut", "edges", "ghost", "marks"]) redraw(id, () => {});
     redraw("frame", (e) => { this.pause(); this.time = +e.value; }, "input");
     $("auto").onclick = () => { this.setField(this.field?.index ?? -1); this.draw(); };
     $("fit").onclick = () => { this.fit(); this.draw(); };
     $("play").onclick = () => (this.playing ? this.pause() : this.play());
     new ResizeObserver(() => { this.resize(); this.draw(); }).observe($("stage"));
-    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { this.draw(); this.plot?.(); });
+    DARK.addEventListener("change", () => { this.draw(); this.plot?.(); });
     document.addEventListener("keydown", (event) => this.key(event));
     this.bindPointer($("picture"));
   }
@@ -185,7 +185,9 @@ class View {
           points.push([0, 1, 2].map((c) => clamp(s.points[3 * i + c], low[c] - wide, high[c] + wide)));
       }
     this.box = [low, high];
-    this.camera.fit(points, this.aspect(), 0.14);
+    const bar = this.field ? ($("legend").offsetWidth + 20) / $("stage").clientWidth : 0.07; // beside the colour bar
+    this.camera.center = [0.07 - bar, 0];
+    this.camera.fit(points, this.aspect(), [0.93 - bar, 0.86]);
   }
 
   aspect() { return $("picture").width / $("picture").height; }
@@ -302,7 +304,7 @@ class View {
         this.painter.draw(s, "rest", { alpha: 0.22, plain: [0.5, 0.55, 0.62] });
       }
     const grid = nice(0.2 * this.camera.size);
-    for (const s of shown.filter((other) => other.kind === "plane")) this.painter.draw(s, "now", { plain: PLANE, grid });
+    for (const s of shown.filter((other) => other.kind === "plane")) this.painter.draw(s, "now", { plain: DARK.matches ? PLANE.dark : PLANE.light, grid });
     $("frame").value = this.time;
     const now = this.seconds(), { data } = this;
     $("clock").textContent = data.static ? `load ${digits(100 * now)} %` : `t = ${digits(now)} s`;

@@ -29,7 +29,7 @@ NO_MOMENT = 1e-6
 
 
 def record_plots(sim: Any, worlds: Sequence[int]) -> list[dict[str, Any]]:
-    """Plots of the histories of probes, joints and contacts of some worlds."""
+    """Plots of the records of probes, joints and contacts of some worlds, and of the histories of joints."""
     description, out = sim.model.description, []
     for probe in getattr(description, "probes", ())[:PLOTTED]:
         record = sim.probe(probe.name)
@@ -42,6 +42,11 @@ def record_plots(sim: Any, worlds: Sequence[int]) -> list[dict[str, Any]]:
         force = float(np.abs(joint_record.force).max(initial=0.0))
         if np.abs(joint_record.moment).max(initial=0.0) > NO_MOMENT * size * force:
             out.append(_plot(f"joint {joint.name}: moment", "N m", XYZ, joint_record.time, joint_record.moment, worlds))
+    for history in (h for h in sim.records.histories if h.label):
+        values = history.values[:, :, None] if len(history.time) else np.zeros((sim.model.worlds, 0, 1))
+        out.append(
+            _plot(history.label, history.units, (history.label.rpartition(" ")[2],), history.time, values, worlds)
+        )
     for contact in getattr(description, "contacts", ())[:PLOTTED]:
         c = sim.contact_record(contact)
         size = np.linalg.norm(c.force, axis=2)

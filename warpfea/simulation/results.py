@@ -31,7 +31,7 @@ from ..terms.protocols import Touching
 from ..terms.springs import Springs
 from ..terms.term import FieldSpec
 from .reports import ContactRecord, JointRecord, ProbeRecord
-from .sampling import History, Sampler
+from .sampling import History, Sampler, joint_history
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -42,7 +42,6 @@ __all__ = ["PartMember", "Records", "Results"]
 
 MAX_NAMED_BODIES = 5
 """Maximum number of bodies named in a message."""
-
 RECORDED_FIELDS = {
     "acceleration": FieldSpec("acceleration", "m/s2", components=VECTOR),
     "reaction": FieldSpec("reaction", "N", components=VECTOR),
@@ -80,8 +79,7 @@ class Results:
         return body.at_nodes(values[:, body.slot_range])
 
     def displacements(self, body: Body) -> np.ndarray:
-        """Nodal displacements (B, nodes, 3), m, in the mesh file's node order. ModelError for a body of another
-        model."""
+        """Nodal displacements (B, nodes, 3), m, in the mesh file's order. ModelError for a body of another model."""
         self.check_body(body, "displacements")
         return self.at_mesh_nodes(body, self.state.displacement.numpy())
 
@@ -255,13 +253,15 @@ class Records:
         return rows, of_nodes
 
     def history(self, name: str, points: Any) -> History:
-        """Record a field at material points or nodes after each further step, as `sample`; or "reaction", force and
-        moment about the origin (6) of the supports on nodes."""
+        """Record a field at material points or nodes after each further step, as `sample`; "reaction", force and moment
+        about the origin (6) of the supports on nodes; or "angle", "travel", "length" of a joint, plotted by `plot`."""
         if self.statistics.asynchronous:
             raise ModelError("history: the simulation was made with record=False")
         if name == "reaction":
             self._reactions(points, "position")
             out = History(lambda: np.concatenate([self.reaction(points), self.reaction_moment(points)], axis=1))
+        elif name in ("angle", "travel", "length"):
+            out = joint_history(self, name, points)
         else:
             sampler = Sampler(self.model, points, name)
             out = History(lambda: sampler.values(self.state))

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from ..model.model import Model
     from ..model.state import State
 
-__all__ = ["History", "Sampler"]
+__all__ = ["History", "Sampler", "joint_history"]
 
 
 class PointWeights:
@@ -80,14 +80,17 @@ class Sampler:
 
 
 class History:
-    """Record of a field at points, or of a reaction, after each step since it was made.
+    """Record of a field at points, of a reaction, or of a joint, after each step since it was made.
 
     Attributes:
+        label, units: of what is plotted; empty for fields and reactions.
         time: (steps,) s, of the most advanced world.
-        values: (worlds, steps, points) or (worlds, steps, points, k); of a reaction (worlds, steps, 6).
+        values: (worlds, steps, points) or (worlds, steps, points, k); of a reaction (worlds, steps, 6), of a joint
+            (worlds, steps).
     """
 
-    def __init__(self, take: Any) -> None:
+    def __init__(self, take: Any, label: str = "", units: str = "") -> None:
+        self.label, self.units = label, units
         self._take, self._time, self._values = take, list[float](), list[np.ndarray]()
 
     @property
@@ -107,3 +110,10 @@ class History:
         """Add the present values."""
         self._time.append(float(np.max(sim.time)))
         self._values.append(self._take())
+
+
+def joint_history(records: Any, name: str, joint: Any) -> History:
+    """History of the "angle", "travel" or "length" of a joint. ModelError for one that has none."""
+    records.joint_value(joint, name)
+    label = f"joint {records.find_joint(joint).name}: {name}"
+    return History(lambda: records.joint_value(joint, name), label, "rad" if name == "angle" else "m")
