@@ -189,7 +189,9 @@ class Page:
             finite = values[np.isfinite(values)]
             if finite.size:
                 low, high = min(low, float(finite.min())), max(high, float(finite.max()))
-        return (low, high) if low <= high else (0.0, 0.0)
+        if low > high:
+            return 0.0, 0.0
+        return (0.0 if 0.0 < low < 1e-9 * high else low), high  # round-off is no end of a range
 
     def _pack(self, block: _Block, surface: PageSurface, ranges: dict[str, tuple[float, float]]) -> dict[str, Any]:
         """Header of a surface; its arrays are appended to the block."""
