@@ -68,6 +68,9 @@ def test_units_and_sides(gmsh, tmp_path, end):
     assert mesh.volume() == pytest.approx(6e-6, rel=1e-12)
     assert {"solid_1", "face_1", "face_6", "x-", "z+"} <= {*mesh.element_sets, *mesh.surface_sets}
     assert np.allclose(mesh.points[mesh.nodes("x+"), 0], 0.03)
+    if end == "step":
+        path.write_text(path.read_text().replace("SI_UNIT(.MILLI.,.METRE.)", "SI_UNIT(.CENTI.,.METRE.)"))
+        assert wf.mesh.from_cad(path, size=0.1, element="T4").volume() == pytest.approx(6e-3, rel=1e-12)
     edges = mesh.points[mesh.cells[:, [0, 1]]]
     assert np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1).max() < 0.02
 

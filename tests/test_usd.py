@@ -247,7 +247,7 @@ def test_usd_material_reads_the_color_and_the_layer_says_how_it_was_made(tmp_pat
 
     path = tmp_path / "m.usdc"
     sim = StubSim(worlds=2)
-    drive(sim, USDWriter(path, fps=20, material=True, layer_data={"command": "warpfea run x", "seed": 7}), 5)
+    drive(sim, USDWriter(path, fps=20, layer_data={"command": "warpfea run x", "seed": 7}), 5)
     assert validate_usd(path) == []
     stage = Usd.Stage.Open(str(path))
     for mesh in meshes_of(stage):
