@@ -6,6 +6,7 @@ import re
 import numpy as np
 import pytest
 from gradient_models import SOLVER, controls, linked
+from gripper_learning import learn
 
 import warpfea as wf
 
@@ -79,3 +80,10 @@ def test_the_page():
     exec(re.search(r"```py\n(import torch.*?)```", text, re.DOTALL)[1], names)
     first = wf.torch.rollout(names["sim"], {"pull": 0.0 * names["pull"]})["tip"].displacement[0, -1].norm()
     assert names["loss"] < 0.9 * first
+
+
+def test_a_gripper_learns():
+    """Its loss falls tenfold, by far."""
+    losses, height = learn("cpu", WORLDS)
+    assert losses[-1] < 0.1 * losses[0]
+    assert len(set(height)) == WORLDS
