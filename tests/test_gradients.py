@@ -287,6 +287,29 @@ def check_gravity(m, sim, rows, steps):
     errors = best_differences(loss.numpy(), exact)
     assert (errors < TOLERANCE).all(), errors
     assert (tape.residual < 1e-10).all()
+    return tape
+
+
+@wp.func
+def whirl(x: wp.vec3d, t: wp.float64) -> wp.vec3d:
+    """A field across and along the position, that grows with it."""
+    return wp.float64(900.0) * wp.vec3d(x[1] + x[2] * x[2], wp.sin(x[0]), wp.float64(2.0) * t - x[1] * x[2])
+
+
+@pytest.mark.parametrize("scheme", ["bdf2", pytest.param("energy_momentum", marks=pytest.mark.slow)])
+def test_a_field_of_forces(scheme):
+    rows = shifts(1)
+    b = wf.ModelBuilder(gravity=(0, 0, -9.81))
+    box = b.add_solid(wf.mesh.box((0.1, 0.02, 0.02), cells=(2, 1, 1), element="T4"), material=LAW, name="box")
+    b.clamp(box.nodes("x-"))
+    b.add_body_force(whirl)
+    b.add_probe("top", box.surface("x+"))
+    m = b.finalize(device="cpu", worlds=len(rows), many=False)
+    sim = wf.Simulation(m, dt=2e-3, integrator=scheme, solver=SOLVER)
+    tape = check_gravity(m, sim, rows, 10)
+    change = tape.forward({"gravity": [0.0, 0.0, 1.0]})["top"].displacement.numpy()[0]
+    bars = tape.probe("top").displacement.grad.numpy()[0]
+    assert np.sum(bars * change) == pytest.approx(tape.backward()["gravity"].numpy()[0, 2], rel=1e-8)
 
 
 def test_an_unsymmetric_term_is_solved_with_its_transpose():

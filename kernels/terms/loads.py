@@ -8,7 +8,7 @@ from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.types import double_1d, double_2d, double_3d, f64, int_1d, precision, vec3d_1d, vec3d_2d
 from ..elements.points import block_struct
 
-__all__ = ["body_force_kernel", "load_kernels", "time_law_kernel", "time_law_struct"]
+__all__ = ["body_force_kernel", "body_force_product_kernel", "load_kernels", "time_law_kernel", "time_law_struct"]
 
 
 @functools.cache
@@ -204,6 +204,63 @@ def body_force_kernel(function: wp.Function, dtype: str, take_dtype: str):
                 contribution[world, e] = contribution[world, e] + block.shape[q, i, column] * f
 
     return wp.Kernel(func=add_body_force, module=_unique_module("field", function, dtype, take_dtype))
+
+
+@functools.lru_cache(maxsize=256)
+def body_force_product_kernel(function: wp.Function, dtype: str, take_dtype: str):
+    """Kernel of the derivative of `body_force_kernel` along a direction, or its transpose, by that of the field."""
+    p = precision(dtype)
+    T, vec3 = p.T, p.vec3
+    take = precision(take_dtype)
+    A, avec3 = take.T, take.vec3
+    Block = block_struct(dtype)
+
+    @wp.func
+    def field_work(d: avec3, x: avec3, t: A) -> A:
+        """d.b(x, t), whose derivative by x is (db/dx)^T d."""
+        return wp.dot(d, avec3(function(x, t)))
+
+    def add_body_force_product(
+        block: Block, members: wp.array(dtype=wp.int32), reference: wp.array(dtype=vec3), origin: wp.vec3d, factor: T,
+        u: wp.array2d(dtype=vec3), time: wp.array(dtype=f64), ramp: wp.array(dtype=f64),
+        direction: wp.array2d(dtype=vec3), transposed: int, active: wp.array(dtype=wp.int32), offset: int,
+        contribution: wp.array2d(dtype=vec3),
+    ):  # fmt: skip
+        """Factor times sum_q rho w s_i (db/dr) d(r_q) of one element, d the direction; `transposed`: (db/dr)^T."""
+        world, k = wp.tid()
+        if active[world] == 0:
+            return
+        elem = members[k]
+        column = elem % block.shape.shape[2]
+        count = members.shape[0]
+        slots = block.conn.shape[0]
+        for i in range(slots):
+            contribution[world, offset + i * count + k] = vec3()
+        t = A(time[world])
+        for q in range(block.mass_weight.shape[0]):
+            r = vec3()
+            d = vec3()
+            for i in range(slots):
+                s = block.conn[i, elem]
+                r += block.shape[q, i, column] * (reference[s] + u[world, s])
+                d += block.shape[q, i, column] * direction[world, s]
+            x = avec3(origin + wp.vec3d(r))
+            g = avec3()
+            if transposed != 0:
+                _d, g, _t = wp.grad(field_work)(avec3(d), x, t)
+            else:
+                for c in range(3):
+                    unit = avec3()
+                    unit[c] = A(1.0)
+                    _e, row, _s = wp.grad(field_work)(unit, x, t)
+                    g[c] = wp.dot(row, avec3(d))
+            f = (factor * T(ramp[world]) * block.mass_weight[q, elem]) * vec3(g)
+            for i in range(slots):
+                e = offset + i * count + k
+                contribution[world, e] = contribution[world, e] + block.shape[q, i, column] * f
+
+    module = _unique_module("field_product", function, dtype, take_dtype)
+    return wp.Kernel(func=add_body_force_product, module=module)
 
 
 _functions_by_key: dict[str, list[wp.Function]] = {}

@@ -14,14 +14,14 @@ import warp as wp
 from .. import elements as families
 from ..base.errors import ModelError
 from ..base.worlds import check_values_per_world, values_per_world
-from ..kernels.terms.loads import body_force_kernel, load_kernels
+from ..kernels.terms.loads import body_force_kernel, body_force_product_kernel, load_kernels
 from ..model import assembly
 from ..model.assembly import require_density
 from ..model.description import BodyForce
 from .gradients import ForceGradient, Gradient, StepAdjoint, law_weights
 from .protocols import Differentiable, Parametrised
 from .shape_gradients import traction_gradient
-from .term import StepContext, Term, part
+from .term import StepContext, part
 from .time_law_table import TimeLawTable, argument_precision
 
 if TYPE_CHECKING:
@@ -177,6 +177,7 @@ class BodyForceBlock:
         block: element block. members: indices (count,) of the body's elements in it.
         origin: position of the body's reference origin, m.
         offset: first entry of the block in the term's own pool entries. count: number of elements.
+        function: the user's field.
     """
 
     kernel: Any
@@ -185,10 +186,16 @@ class BodyForceBlock:
     origin: Any
     offset: int
     count: int
+    function: wp.Function
+
+    def product(self, dtype: str) -> wp.Kernel:
+        """Device code of the force's derivative."""
+        return body_force_product_kernel(self.function, dtype, argument_precision(self.function, dtype))
 
 
-class BodyForces(Term):
-    """Body force fields, non-potential in general: their force is frozen during a line search."""
+class BodyForces(Differentiable):
+    """Body force fields, non-potential in general: their force is frozen during a line search, and H lacks their
+    derivative."""
 
     name = "body forces"
     potential = False
@@ -229,6 +236,7 @@ class BodyForces(Term):
                     origin=wp.vec3d(*host.body.origin),
                     offset=0,
                     count=len(members),
+                    function=force.function,
                 )
                 out.append((field, host.conn + host.body.slot_offset))
         return out
@@ -268,6 +276,29 @@ class BodyForces(Term):
                 w.nonpotential_contribution,
             ]
             ctx.launch(field.kernel, (m.worlds, field.count), args)
+
+    def exact_product(
+        self, ctx: StepContext, p: wp.array, active: wp.array, *, transposed: bool, start: bool = False
+    ) -> None:  # fmt: skip
+        m, w = self.model, ctx.work
+        for field in self.block_forces:
+            args = [field.block.data, field.members, m.slot_table.reference_array, field.origin, ctx.midpoint_factor]
+            args += [
+                w.u_stage,
+                w.stage_time,
+                w.step.load_factor,
+                p,
+                int(transposed),
+                active,
+                self.offset + field.offset,
+            ]
+            ctx.launch(field.product(m.dtype), (m.worlds, field.count), [*args, w.nonpotential_tangent])
+
+    def is_symmetric(self, ctx: StepContext) -> bool:
+        return False
+
+    def prepare_adjoint(self, at: StepAdjoint) -> Iterable[wp.Module]:
+        return {field.product(self.model.dtype).module for field in self.block_forces}
 
     def hash(self, h: Any) -> None:
         for force in self.model.description.body_forces:
