@@ -44,15 +44,16 @@ def damped(worlds):
     return m
 
 
-def force_field(worlds=1):
-    @wp.func
-    def swirl(x: wp.vec3d, t: wp.float64) -> wp.vec3d:
-        return wp.vec3d(-x[1], x[0], wp.float64(0.0))
+@wp.func
+def swirl(x: wp.vec3d, t: wp.float64) -> wp.vec3d:
+    return wp.float64(1e3) * wp.vec3d(-x[1], x[0] * x[0], wp.sin(wp.float64(9.0) * x[1]))
 
-    b = wf.ModelBuilder(gravity=(0, 0, 0))
-    models.solid("T4")(b, models.material())
+
+def force_field(worlds, density=1100.0):
+    b = wf.ModelBuilder(gravity=(0, 0, -9.81))
+    models.solid("T4")(b, models.material(density=density))
     b.add_body_force(swirl)
-    return b.finalize(device="cpu", worlds=worlds)
+    return b.finalize(device="cpu", worlds=worlds, many=False)
 
 
 def velocity_rows(worlds=1):
@@ -74,9 +75,10 @@ MODELS = {
     "damped": (damped, (Elements, DeadLoads, Damping)),
     "springs": (of_kind("springs"), (Springs, Constraints)),
     "friction": (of_kind("friction"), (Springs,)),
+    "field": (force_field, (BodyForces,)),
     "followers": (of_kind("followers"), (FollowerLoads,)),
 }
-REFUSED = {BodyForces: force_field, VelocityRows: velocity_rows}
+REFUSED = {VelocityRows: velocity_rows}
 ELSEWHERE = {ColliderContact, FacetContact}  # test_gradients_contact.py
 CASES = [(kind, "backward_euler") for kind in MODELS] + [("springs", "bdf2"), ("friction", "bdf2")]
 SLOW = [("springs", "bdf2"), ("friction", "bdf2")]
@@ -117,6 +119,7 @@ def test_derivatives_of_terms(kind, scheme):
     assert all(any(isinstance(term, one) for term in lone.terms) for one in kinds)
     ctx = wf.Simulation(lone, dt=2e-3).stepper.ctx
     names = list(dict.fromkeys(name for term in lone.terms for name in term.gradients(ctx)))
+    names = [name for name in names if kind != "field" or name != "body.density"]  # not of each world
     sizes = {"velocity": 1e-2} if lone.constraints else {"velocity": 1e-2, "displacement": 1e-4}
     every = [*names, *given, *(f"initial.{array}" for array in sizes)]
     rows = shifts(len(every))
@@ -145,3 +148,15 @@ def test_derivatives_of_terms(kind, scheme):
     bounds = TOLERANCE * np.abs(exact) + ROUND_OFF * values[0]
     wrong = {n: (float(e), float(x)) for n, e, b, x in zip(every, errors, bounds, exact) if not e <= b}
     assert not wrong
+
+
+def test_density_under_a_force_per_mass():
+    def run(factor):
+        m = force_field(1, 1100.0 * factor)
+        tape = wf.Adjoint(wf.Simulation(m, dt=2e-3, solver=SOLVER), "body.density")
+        tape.run(STEPS)
+        return tape, wf.loss.sum_of_squares(tape.probe("tip").displacement, np.zeros((1, STEPS, 3)))
+
+    tape, loss = run(1.0)
+    values = np.array([run(1.0 + 1e-2 * k)[1].numpy()[0] for k in (-2.0, -1.0, 1.0, 2.0)])
+    assert tape.backward(loss)["body.density"].numpy()[0] * 1100.0 == pytest.approx(values @ WEIGHTS / 1e-2, rel=1e-7)

@@ -14,7 +14,9 @@ import warp as wp
 from .. import elements as families
 from ..base.errors import ModelError
 from ..base.worlds import check_values_per_world, values_per_world
+from ..kernels.step.gather import gather_kernels
 from ..kernels.terms.loads import body_force_kernel, body_force_product_kernel, load_kernels
+from ..materials import DENSITY_CONSTANTS
 from ..model import assembly
 from ..model.assembly import require_density
 from ..model.description import BodyForce
@@ -177,7 +179,7 @@ class BodyForceBlock:
         block: element block. members: indices (count,) of the body's elements in it.
         origin: position of the body's reference origin, m.
         offset: first entry of the block in the term's own pool entries. count: number of elements.
-        function: the user's field.
+        function: the user's field. host: the elements of the body, of one material.
     """
 
     kernel: Any
@@ -187,6 +189,7 @@ class BodyForceBlock:
     offset: int
     count: int
     function: wp.Function
+    host: Any
 
     def product(self, dtype: str) -> wp.Kernel:
         """Device code of the force's derivative."""
@@ -237,6 +240,7 @@ class BodyForces(Differentiable):
                     offset=0,
                     count=len(members),
                     function=force.function,
+                    host=host,
                 )
                 out.append((field, host.conn + host.body.slot_offset))
         return out
@@ -264,17 +268,13 @@ class BodyForces(Differentiable):
         return {field.kernel.module for field in self.block_forces}
 
     def force(self, ctx: StepContext, active: wp.array) -> None:
+        self._launch_forces(ctx, active, self.block_forces)
+
+    def _launch_forces(self, ctx: StepContext, active: wp.array, fields: list[BodyForceBlock]) -> None:
         m, w = self.model, ctx.work
-        for field in self.block_forces:
-            args = [field.block.data, field.members, m.slot_table.reference_array, field.origin]
-            args += [
-                w.u_stage,
-                w.stage_time,
-                w.step.load_factor,
-                active,
-                self.offset + field.offset,
-                w.nonpotential_contribution,
-            ]
+        for field in fields:
+            args = [field.block.data, field.members, m.slot_table.reference_array, field.origin, w.u_stage]
+            args += [w.stage_time, w.step.load_factor, active, self.offset + field.offset, w.nonpotential_contribution]
             ctx.launch(field.kernel, (m.worlds, field.count), args)
 
     def exact_product(
@@ -303,3 +303,34 @@ class BodyForces(Differentiable):
     def hash(self, h: Any) -> None:
         for force in self.model.description.body_forces:
             h.update(force.function.key.encode())
+
+    def gradients(self, ctx: StepContext) -> Mapping[str, Callable[[], Gradient]]:
+        """By densities: the forces are per mass."""
+        out = {}
+        for owner, members in self.model.parameters.owners().items():
+            fields = [f for f in self.block_forces if (f.host.body, f.host.material) in members]
+            for name in DENSITY_CONSTANTS if fields else ():
+                values = {body.materials[k][1].constants.get(name) for body, k in members}
+                if values != {None}:
+                    make = partial(self._density_gradient, ctx, f"{owner}.{name}", fields, values)
+                    out[f"{owner}.{name}"] = make
+        return out
+
+    def _density_gradient(
+        self, ctx: StepContext, name: str, fields: list[BodyForceBlock], values: set[Any]
+    ) -> Gradient:
+        if len(values) > 1:
+            raise ModelError(
+                f"Adjoint: {name!r} has several values, and a force per mass acts on it: take one material"
+            )
+        m = self.model
+        gather = gather_kernels(m.dtype, ctx.traits).gather_force
+
+        def force(at: StepAdjoint, _: int) -> None:
+            w = at.ctx.work
+            w.nonpotential_contribution.zero_()
+            self._launch_forces(at.ctx, at.active, fields)
+            args = [m.terms.nonpotential_topology, w.nonpotential_contribution, at.active, at.scratch]
+            at.ctx.launch(gather, at.dim, args)
+
+        return ForceGradient(force, 1.0 / values.pop())

@@ -175,7 +175,7 @@ def tied_shape(m: Model, block: Block) -> Any:
 
 
 def _coupling_gradients(host: Any, members: np.ndarray, ds: np.ndarray, J: np.ndarray) -> np.ndarray:
-    """(E, tied, width, S, 3) derivatives of the couplings A by the reference values, by differences."""
+    """(E, ties, width, S, 3) derivatives of the couplings A by the reference values, by differences."""
     part, body = host.key.integral, host.body
     tying, rule, material = part.tying, part.rule, body.materials[host.material][1]
     _, ds_rule, J_rule, _ = assembly.shape_and_jacobian(body, members, rule.points)
