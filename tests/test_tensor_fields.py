@@ -209,7 +209,8 @@ def test_fields_on_the_device_are_those_of_the_host(dtype):
         state.displacement.assign(np.tile(u, (2, 1, 1)).astype(dtype))
         results = Results(model, state)
         found.append([results.field(name, body) for name in ("cauchy", "first_piola", "J", "strain_energy_density")])
-        found[-1].append(results.skin_field("von_mises", body))
+        found[-1] += [results.skin_field("von_mises", body), results.skin_field("von_mises", body, [1])]
+        found[-1] += [results.skin_points(body), results.skin_points(body, [1])]
     for cpu, cuda in zip(*found):
         assert np.abs(cpu - cuda).max() < (1e-10 if dtype == "float64" else 1e-3) * np.abs(cpu).max()
 

@@ -341,7 +341,7 @@ def cast_samples(wp: Any, raycast: Any, scene: Any, samples: npt.NDArray[np.floa
             wp.launch(raycast.cast_rays, last - first, [scene, places[first:last], out[first:last]], device="cpu")
 
     launch(0, min(1, len(samples)))  # loads the kernel, which threads must not do at once
-    ends = np.linspace(1, len(samples), 1 + min(os.cpu_count() or 1, 1 + len(samples) // 4096)).astype(int).tolist()
+    ends = np.linspace(1, len(samples), 1 + min(os.cpu_count() or 1, 8, 1 + len(samples) // 4096)).astype(int).tolist()
     with concurrent.futures.ThreadPoolExecutor(len(ends)) as pool:
         list(pool.map(launch, ends[:-1], ends[1:]))
     return np.asarray(out.numpy())
