@@ -41,6 +41,18 @@ def test_restitution_0_returns_nothing(scheme):
         assert max(returned) < 0.025 * speed, (shape, h, speed, max(returned))
 
 
+def test_a_speck_far_from_its_place_is_refused_for_round_off():
+    """1e-9 m long, after a fall of 3 m its positions are known to a millionth of that; parts answer to their names."""
+    b = wf.ModelBuilder()
+    b.set_initial(b.add_rigid(wf.Box((0, 0, 0), (1e-9, 1e-9, 1e-9)), density=1e3, name="speck"),
+                  angular_velocity=(0, 0, 1))  # fmt: skip
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-2, integrator="energy_momentum")
+    np.testing.assert_allclose(sim.angular_velocity("speck"), [[0, 0, 1]])
+    with pytest.raises(wf.ConstraintError, match="round-off of positions .* m from the reference is larger"):
+        sim.run(2.0)
+    assert sim.pose("speck")[0][0, 2] < -1.0
+
+
 def test_a_wedge_under_a_block():
     """Without friction: the wedge's acceleration m g tan(a)/(M + m tan(a)^2) under a block that is guided upright."""
     slope = 0.4

@@ -87,7 +87,8 @@ def friction_functions(dtype: str, own: OwnLaws = ()) -> KernelSet:
         con: Contacts, scr: ContactScratch, world: int, c: int, point: int, ratio: f64, inv_h: f64
     ) -> f64:  # fmt: skip
         """Damping per depth of the normal law: chi/h, or gamma_n/h; with restitution 0 minus the critical damping of
-        the effective mass over h, of rigid parts `RIGID_DAMPING` times it, at points that have come faster than `IMPACT_SPEED`."""
+        the effective mass over h, of rigid parts `RIGID_DAMPING` times it, at points that have come faster than
+        `IMPACT_SPEED`."""
         if inv_h == f64(0.0):
             return f64(0.0)
         if has_trait(con, c, SPEED_DAMPING):

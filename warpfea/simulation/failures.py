@@ -171,10 +171,14 @@ def _constraint_error(sim: Any, world: int, time: float, halvings: int) -> Const
     names, values = _violated_joints(sim.model, sim.stepper.work.multipliers.constraint_value.numpy()[world], tol)
     listed = ", ".join(f"{name!r} by {value:.3g} m" for name, value in zip(names[:4], values[:4]))
     few = "" if isinstance(sim.solver, NewtonPCG) else ", or Jacobi's iterations are too few"
+    away = float(np.abs(sim.stepper.work.u.numpy()[world]).max())
+    why = "conflicting with each other or with supports, or not reachable"
+    if tol < np.finfo(sim.model.dtype).eps * away:
+        why = f"the round-off of positions {away:.3g} m from the reference is larger: give constraint_tol="
     return ConstraintError(
         f"{_step_text(sim, time, world)}: constraints could not be satisfied in world {world} after "
-        f"{halvings} halvings: {listed}{', ...' if len(names) > 4 else ''}; conflicting with each other or with "
-        f"supports, or not reachable (tolerance {tol:.3g} m){few}{discontinuous_drives_text(sim, world)}",
+        f"{halvings} halvings: {listed}{', ...' if len(names) > 4 else ''}; {why} (tolerance {tol:.3g} m)"
+        f"{few}{discontinuous_drives_text(sim, world)}",
         joints=names, violations=values, time=time, world=world, state=sim.state,
     )  # fmt: skip
 

@@ -93,25 +93,25 @@ class Results:
         self.check_body(body, "velocities")
         return self.at_mesh_nodes(body, self.state.velocity.numpy())
 
-    def pose(self, part: RigidBody) -> tuple[np.ndarray, np.ndarray]:
-        """Position of the centre of mass (B, 3), m, and rotation from the reference as quaternions (B, 4), x y z w."""
-        self.check_rigid(part, "pose")
+    def pose(self, part: RigidBody | str) -> tuple[np.ndarray, np.ndarray]:
+        """Centre of mass (B, 3), m, rotation from the reference, quaternions (B, 4), x y z w; of a handle or name."""
+        part = self.rigid_part(part, "pose")
         u = self.state.displacement.numpy()[:, part.slots].astype(float)
-        A = np.eye(3) + part.rotation_of(u)
-        return part.com + part.affine[0] @ u, Rotation.from_matrix(A).as_quat()
+        return part.com + part.affine[0] @ u, Rotation.from_matrix(np.eye(3) + part.rotation_of(u)).as_quat()
 
-    def angular_velocity(self, part: RigidBody) -> np.ndarray:
+    def angular_velocity(self, part: RigidBody | str) -> np.ndarray:
         """Angular velocity (B, 3), rad/s, in the axes of the scene, from dA/dt A^T (Paper I, Eqs. (12)-(14))."""
-        self.check_rigid(part, "angular_velocity")
+        part = self.rigid_part(part, "angular_velocity")
         u, v = (x.numpy()[:, part.slots].astype(float) for x in (self.state.displacement, self.state.velocity))
         spin = part.rotation_of(v) @ np.swapaxes(np.eye(3) + part.rotation_of(u), 1, 2)
         return 0.5 * np.stack([spin[:, i, j] - spin[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))], axis=1)
 
-    def check_rigid(self, part: Any, what: str) -> None:
-        """Raise ModelError unless `part` is a rigid part of this model; the text begins with `what`."""
-        self.check_body(part, what)
+    def rigid_part(self, part: Any, what: str) -> RigidBody:
+        """The rigid part of this model of a handle or a name; the text of a ModelError begins with `what`."""
+        self.check_body(part := next((body for body in self.model.bodies if body.name == part), part), what)
         if not isinstance(part, RigidBody):
             raise ModelError(f"{what}: body {part.name!r} is flexible; positions and velocities give its motion")
+        return part
 
     def point_positions(self, body: Body, weights: Any, worlds: Sequence[int] | None = None) -> np.ndarray:
         """Positions (B, P, 3), m, of points given by sparse weights (P, slots of the body), in all worlds or some."""
