@@ -169,6 +169,7 @@ CONSTANTS: dict[str, Constant] = {
     "PASSING_DISTANCE": Constant(CONTACT, "sides of a facet", 1.0e300, "contact"),
     "UNSEEN_RATIO": Constant(CONTACT, "penetrations", 0.0, "contact"),
     "EDGE_MARGIN": Constant(CONTACT, "rad", 0.0, "contact"),
+    "LEVEL_SINE": Constant(CONTACT, "1", 1.0e-6, "contact"),
     "ENTRY_DEPTH": Constant(CONTACT, "depths of elements", 0.0, "contact"),
     "BESIDE_DEPTH": Constant(CONTACT, "depths of elements", 0.0, "contact"),
     "EDGE_ENTRY_SLOPE": Constant(CONTACT, "1", 1.0e300, "contact"),

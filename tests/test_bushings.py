@@ -50,8 +50,8 @@ def test_small_motion_and_frequencies():
 
 
 def test_oscillators():
-    """m x'' + c x' + k x = m 2 sin(17 t) along an axis, J y'' + d y' + w^2 J y = 0 about it, up to 0.7 rad: undamped and
-    damped by values per world, of second order, 1e-4 of the amplitudes at h = 2.5e-4 s; the force of the bushing."""
+    """m x'' + c x' + k x = m 2 sin(17 t) along an axis, J y'' + d y' + w^2 J y = 0 about it, up to 0.7 rad: undamped
+    and damped by values per world, of second order, 1e-4 of the amplitudes at h = 2.5e-4 s; its force."""
     J, w, t_end = 1.0 / 600.0, 40.0, 0.1
     damping = np.zeros((2, 6))
     damping[1] = 3.0, 3.0, 3.0, *3 * [0.1 * w * J]

@@ -438,7 +438,6 @@ def test_observed_axes_and_centre_are_those_of_the_pose() -> None:
         (lambda b: b.add_rigid(wf.Box((0, 0, 0), (1, 1, 1)), mass=-1.0), "mass = -1.0 must be a positive"),
         (lambda b: b.add_rigid(wf.Box((0, 0, 0), (1, 1, 1)), mass=1.0, inertia=(1, 1, 3)), "none larger than the sum"),
         (lambda b: b.add_rigid(wf.Box((0, 0, 0), (1, 1, 1)), mass=1.0, inertia=(0, 0, 0)), "must be positive"),
-        (lambda b: b.add_rigid(wf.Box((0, 0, 0), (1, 1, 1)), mass=1.0, inertia=(0, 1, 1.1)), "none larger than the sum"),
         (lambda b: b.add_rigid(wf.Box((0, 0, 0), (1, 1, 1)), mass=1.0, inertia=1.0), "must be a symmetric"),
         (lambda b: b.add_rigid(wf.Box((0, 0, 0), (1, 1, 1)), mass=1.0, com=(0, 0, 0.1)), "give inertia= about it"),
         (lambda b: b.add_rigid("part.stl", mass=1.0), "expected a wf.Box"),

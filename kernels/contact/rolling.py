@@ -1,5 +1,5 @@
-"""Points of round rigid parts on obstacles, which roll: each lies on a circle, or a ball, about a place on the axis, where
-that is closest to the obstacle.
+"""Points of round rigid parts on obstacles, which roll: each lies on a circle, or a ball, about a place on the axis,
+where that is closest to the obstacle.
 
 Its depth is stationary along the circle, so that the force at the fixed material point there is the derivative of the
 elastic energy. Friction acts on the motion of that point, which changes along the circle by the square of the turn in a
@@ -21,9 +21,9 @@ from .structs import collider_struct, contact_structs
 __all__ = ["rolling_kernels"]
 
 LEVEL_SINE = 0.1
-"""Sine of the angle of an end face with the obstacle below which the point of its rim moves towards its centre: on a face
-that lies flat no point of the rim is the closest, and a point that moves fast is not in the tangent. Below it the points
-on the face, whose corners are there within 1e-3 of the radius as near, bear the load."""
+"""Sine of the angle of an end face with the obstacle below which the point of its rim moves towards its centre: on a
+face that lies flat no point of the rim is the closest, and a point that moves fast is not in the tangent. Below it the
+points on the face, whose corners are there within 1e-3 of the radius as near, bear the load."""
 
 
 @functools.cache
@@ -35,9 +35,8 @@ def rolling_kernels(dtype: str, meshes: bool, seams: bool) -> KernelSet:
     Colliders = collider_struct(meshes)
     k, distance = kinematics_functions(dtype), collider_functions(meshes).distance
     begin_point = collider_kinematics(dtype, meshes, seams).begin_point
-    module = kernel_module(
-        f"contact_rolling_{dtype}{MESH_SUFFIX * meshes}{SEAMS_SUFFIX * seams}", max_unroll=SHORT_UNROLL
-    )
+    suffix = MESH_SUFFIX * meshes + SEAMS_SUFFIX * seams
+    module = kernel_module(f"contact_rolling_{dtype}{suffix}", max_unroll=SHORT_UNROLL)
 
     @wp.func
     def arm(facets: Facets, row: int, q: int, way: vec3d) -> vec3d:

@@ -83,7 +83,7 @@ def episode_kernels() -> KernelSet:
 def observation_kernels(dtype: str) -> KernelSet:
     """Kernels in one precision that fill a table [world, column]."""
     p, joint_vector = precision(dtype), joint_vector_function(dtype)
-    coordinates = coordinate_functions(False)
+    of_joint = coordinate_functions(False)
     T, vec3 = p.T, p.vec3
     module = kernel_module(f"observations_{dtype}")
 
@@ -133,9 +133,9 @@ def observation_kernels(dtype: str) -> KernelSet:
             near = target[world, source[k]]
         elif source[k] < -1:
             near = turns[world, -2 - source[k]]
-        x = coordinates.coordinate(of, V, near)
+        x = of_joint.coordinate(of, V, near)
         if kind[k] >= RATE:
-            x = wp.ddot(coordinates.derivatives(of, V, x).g, D)
+            x = wp.ddot(of_joint.derivatives(of, V, x).g, D)
         out[world, column[k]] = T(x)
 
     @wp.kernel(module=module)

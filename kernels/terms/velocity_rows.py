@@ -60,7 +60,7 @@ def velocity_kernels(dtype: str, midpoint: bool) -> KernelSet:
     """Kernels of the rows in one precision of the slots."""
     p = precision(dtype)
     Constraints, Multipliers = constraint_struct(), multiplier_struct()
-    functions, coordinates = constraint_functions(dtype), coordinate_functions(False)
+    functions, of_joint = constraint_functions(dtype), coordinate_functions(False)
     module = kernel_module(f"velocity_rows_{dtype}{'_midpoint' if midpoint else ''}")
 
     @wp.func
@@ -71,9 +71,9 @@ def velocity_kernels(dtype: str, midpoint: bool) -> KernelSet:
         if form == KNIFE:
             return wp.matrix_from_rows(b / wp.max(wp.length(b), f64(TINY)), vec3d(), vec3d())
         if form == TRAVEL_RATE:
-            return coordinates.derivatives(TRAVEL, v, f64(0.0)).g
+            return of_joint.derivatives(TRAVEL, v, f64(0.0)).g
         if form == ANGLE_RATE:
-            return coordinates.derivatives(ANGLE, v, coordinates.coordinate(ANGLE, v, f64(0.0))).g
+            return of_joint.derivatives(ANGLE, v, of_joint.coordinate(ANGLE, v, f64(0.0))).g
         along, sideways = wp.dot(parameters[0], b), wp.dot(parameters[0], a2)
         arm = parameters[2, 0] / wp.max(wp.sqrt(along * along + sideways * sideways), f64(TINY))
         d = parameters[1]

@@ -35,15 +35,17 @@ def make_bushing(
     a, b = ([end.direction(n, what) for n in e] for end in (P, Q))
     between, out = f"{P.label} and {Q.label}", list[Spring]()
 
-    vectors = [*([(gap, x), (gap, y)] for x, y in zip(a, b)), *([(x - y,)] for x, y in zip(a, b))]
+    vectors: list[list[tuple[Vector, ...]]] = [[(gap, x), (gap, y)] for x, y in zip(a, b)]
+    vectors += [[(x - y,)] for x, y in zip(a, b)]
     vectors += [[(x, y)] for x in a for y in b]
     values = np.stack([bushing_parts(k, damping=False), bushing_parts(c, damping=True)], axis=1)
     parts = np.flatnonzero(values.any(axis=1)).tolist()
     for part in parts:
         kind, items = CHORD if 3 <= part < 6 else TRAVEL, vectors[part]
         rest = float(items[0][0].value @ items[0][1].value) if kind == TRAVEL else 0.0
-        more = rest, np.ones(len(items))
-        out.append(Spring(name, kind, items, *map(float, values[part]), *more, between=between, keys={}))
+        stiffness, damping = map(float, values[part])
+        scale = np.ones(len(items))
+        out.append(Spring(name, kind, items, stiffness, damping, rest, scale, between=between, keys={}))
     return Bushing(name, out, parts, Q.position(Q.X, what))
 
 

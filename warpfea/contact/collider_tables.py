@@ -62,9 +62,9 @@ class ContactTables(FacetTables[Contact]):
     def _edge_rows(self, chosen: list[int]) -> dict[str, Any]:
         begin = np.cumsum([0, *(len(self.host[k].conn) for k in chosen)])
         rolling = [
-            {**self.contacts[k].rolling_rows(self.host[k]), "start": start}
+            {**contact.rolling_rows(self.host[k]), "start": start}
             for k, start in zip(chosen, begin)
-            if isinstance(self.contacts[k], RollingContact)
+            if isinstance(contact := self.contacts[k], RollingContact)
         ]
         if not rolling:
             return {}

@@ -32,7 +32,7 @@ class RollingContact(Contact):
     @cached_property
     def places(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Places on the axis (N, 3), m; 1 and -1 (N,) at the balls of the ends, else 0; areas (N,), m^2."""
-        shape = self.body.shape
+        shape = self._shape
         center, axes = shape.frame()
         radius, half, _ = shape.sizes
         count = min(math.ceil(4.0 * half / radius) + 1, MAX_PLACES)
@@ -48,11 +48,17 @@ class RollingContact(Contact):
     @property
     def axis(self) -> np.ndarray:
         """(4,) direction of the axis, and the radius, m."""
-        return np.append(self.body.shape.frame()[1][:, 2], self.body.shape.sizes[0])
+        return np.append(self._shape.frame()[1][:, 2], self._shape.sizes[0])
+
+    @property
+    def _shape(self) -> Any:
+        body: Any = self.body
+        return body.shape
 
     def slave_points(self) -> tuple[ContactPoints, Any]:
         """Points of the flat ends, then rows of the places on the axis."""
-        body, faces = self.body, self.body.boundary
+        body: Any = self.body
+        faces = body.boundary
         flat = flat_ends(body.shape, body.mesh.points[body.mesh.cells[faces[:, 0], :3]])
         ends = contact_points(SurfaceSet(body, faces[flat] if flat.any() else faces[:1]), self.points)
         X, _, share = self.places
@@ -61,15 +67,16 @@ class RollingContact(Contact):
         place = np.minimum(np.arange(rows * width), len(X) - 1).reshape(rows, width)
         area = np.where(np.arange(rows * width) < len(X), share[place.ravel()], 0.0).reshape(rows, width)
         shape = np.stack([body.point(x).weights for x in X])[place]
-        parts = [(getattr(ends, name)[:first], new) for name, new in {
+        added = {
             "conn": np.tile(np.arange(4), (rows, 1)), "shape": shape, "area": area, "X": X[place],
             "normal": np.zeros((rows, width, 3)), "faces": faces[np.zeros(rows, dtype=int)],
-        }.items()]  # fmt: skip
-        points = ContactPoints(*map(np.concatenate, parts), np.zeros(first + rows, dtype=int))
-        return points, 1.0
+        }  # fmt: skip
+        both = {name: np.concatenate([getattr(ends, name)[:first], new]) for name, new in added.items()}
+        return ContactPoints(**both, rows=np.zeros(first + rows, dtype=int)), 1.0
 
     def rolling_rows(self, points: ContactPoints) -> dict[str, np.ndarray]:
         """Row numbers of the places on the axis, and what `kernels/contact/rolling.py` needs of each row."""
+        body: Any = self.body
         X, end, _ = self.places
         width = points.area.shape[1]
         rows = -(-len(X) // width)
@@ -77,5 +84,5 @@ class RollingContact(Contact):
             "row": len(points.conn) - rows + np.arange(rows),
             "rolling_axis": np.tile(self.axis, (rows, 1)),
             "rolling_end": np.pad(end, (0, rows * width - len(X))).reshape(rows, width),
-            "rolling_gradient": np.tile(self.body.affine[1:].T, (rows, 1, 1)),
+            "rolling_gradient": np.tile(body.affine[1:].T, (rows, 1, 1)),
         }

@@ -129,7 +129,7 @@ class TwoLevel(Preconditioner):
         self.all_free = wp.full(most, 1.0, dtype=model.types.vec3, device=model.device)
 
     def _tiles_hold_constraints(self) -> bool:
-        """True if the free slots of each constraint lie in one tile, whose inverse contains its penalty (of one part)."""
+        """True if the free slots of each constraint lie in one tile, whose inverse contains its penalty."""
         tile, slot_table = self.levels[0].device_data.tile_of_slot.numpy(), self.model.slot_table
         free = np.any(slot_table.free > 0.0, axis=1)
         for term in self.terms.having(Constrained):

@@ -15,7 +15,8 @@ __all__ = ["force_of_spring", "set_bushing"]
 
 
 def force_of_spring(term: Any, ctx: StepContext, handle: Spring | Bushing) -> np.ndarray:
-    """(worlds, ...) force, by the term `Springs`, of springs with one coordinate a number: of LENGTH its tension, of others that on the child.
+    """(worlds, ...) force, by the term `Springs`; of springs with one coordinate a number: of LENGTH its tension, of
+    others that on the child.
 
     The derivatives of the potential are those of the last evaluation; with `energy_momentum` they are means over the
     step, which a turn in the step makes smaller to second order.

@@ -65,7 +65,8 @@ def vector_tables(vectors: Sequence[Vector], array: Any) -> list[wp.array]:
 def coordinate_vectors(joint: Joint) -> dict[str, list[Vector]]:
     """Vectors of a joint that define its "angle" (a, b, a2), "travel" (two) and "length" (one), if any."""
     length = [joint.rows[0].a] if joint.rows[0].kind == DISTANCE else []
-    has = {"angle": [joint.angle[k] for k in (0, 2, 1)] if joint.angle else [], "travel": list(joint.travel or ()), "length": length}
+    angle = [joint.angle[k] for k in (0, 2, 1)] if joint.angle else []
+    has = {"angle": angle, "travel": list(joint.travel or ()), "length": length}
     return {name: vectors for name, vectors in has.items() if vectors}
 
 

@@ -398,15 +398,16 @@ class Springs(Tied, Preconditioned, Parametrised, Impacting, Diagnosed, Differen
     # parameters
 
     def parameters(self) -> dict[str, Callable[[Any, np.ndarray], None]]:
-        return {
-            name: partial(self._set_parameter, k, name, field)
-            for k, spring in enumerate(self.springs)
-            for name, field in spring.parameters.items()
-        } | {
+        of_bushings: dict[str, Callable[[Any, np.ndarray], None]] = {
             f"{bushing.name}.{field}": partial(set_bushing, self, bushing, field)
             for bushing in self.model.description.bushings
             for field in ("stiffness", "damping")
-        }  # fmt: skip
+        }
+        return of_bushings | {
+            name: partial(self._set_parameter, k, name, field)
+            for k, spring in enumerate(self.springs)
+            for name, field in spring.parameters.items()
+        }
 
     def _set_parameter(self, k: int, name: str, field: str, values: Any, mask: np.ndarray) -> None:
         """Write one value of a spring in the chosen worlds."""

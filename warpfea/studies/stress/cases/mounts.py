@@ -64,8 +64,8 @@ def tube(setting: Setting, value: tuple[float, float]) -> Answer:
                                  ((0.02, "energy_momentum"), (0.2, "bdf2"))],
       quick="float64", refusal=FLOAT32_REFUSAL)  # fmt: skip
 def wheel(setting: Setting, value: tuple[float, float, str]) -> Answer:
-    """A wheel of 1 m rolls at v m/s by a turn per step, rad, beside a part that is turned as fast: it keeps its line and
-    height, and neither gains energy."""
+    """A wheel of 1 m rolls at v m/s by a turn per step, rad, beside a part that is turned as fast: it keeps its line
+    and height, and neither gains energy."""
     v, turn, scheme = value
     b = wf.ModelBuilder(gravity=(0, 0, 0))
     part = b.add_rigid(wf.Cylinder((0, -0.1, 1), (0, 0.1, 1), 1.0), mass=1.0, inertia=(0.3, 0.5, 0.3), name="wheel")
@@ -77,16 +77,16 @@ def wheel(setting: Setting, value: tuple[float, float, str]) -> Answer:
         b.set_initial(body, velocity=(speed, 0, 0), angular_velocity=(0, v, 0))
     sim, stats = step(b, setting, 60, dt=turn / v, integrator=scheme)
     place = sim.pose(part)[0][0] - (0, 0, 1)
-    gained = float(sim.energies()["kinetic"][0]) / (1.25 * v**2) - 1.0
-    error = max(abs(float(place[1])), abs(float(place[2])), gained)
+    energy_gain = float(sim.energies()["kinetic"][0]) / (1.25 * v**2) - 1.0
+    error = max(abs(float(place[1])), abs(float(place[2])), energy_gain)
     return stats.answer(error, 1e-3 if setting.single else 1e-7, "its line and energy", lowest_J=None)
 
 
 @case("fallen-roller", "mounts", values=[("cylinder", 0.0), ("cylinder", 1e-9), ("cylinder", 0.7), ("capsule", 1e-3)],
       quick="float64", refusal=FLOAT32_REFUSAL)  # fmt: skip
 def fallen_roller(setting: Setting, value: tuple[str, float]) -> Answer:
-    """A cylinder on its face, or a capsule on its end, tilted by so many rad, 0.1 m above a plane: its lowest point lies
-    on it after 1.2 s, on a flat end or on its side."""
+    """A cylinder on its face, or a capsule on its end, tilted by so many rad, 0.1 m above a plane: its lowest point
+    lies on it after 1.2 s, on a flat end or on its side."""
     kind, tilt = value
     radius, half = 0.1, 0.15
     axis = np.array([np.sin(tilt), 0.0, np.cos(tilt)])
