@@ -423,6 +423,7 @@ def test_fit_finds_a_modulus():
     led = wf.fit(sweep_models.bar, ranges, record, method="L-BFGS-B", run={"device": "cpu"})
     assert led.values["bar.E"] == pytest.approx(3e5, rel=1e-6)
     assert led.runs == led.backward_runs < 15
+    assert 0 < local.backward_runs < 8
     with pytest.raises(wf.ModelError, match="'E' is a parameter of the scene"):
         wf.fit(sweep_models.bar, {"E": (1e5, 1e6)}, record, method="L-BFGS-B", run={"device": "cpu"})
     search = wf.fit(sweep_models.bar, ranges, record, worlds=16, generations=4, run={"device": "cpu"})
@@ -430,6 +431,7 @@ def test_fit_finds_a_modulus():
     assert search.runs == 64
     built = wf.fit(sweep_models.bar, {"E": (1e5, 1e6)}, record, method="least_squares", run={"device": "cpu"})
     assert built.values["E"] == pytest.approx(3e5, rel=1e-6)
+    assert built.backward_runs == 0  # differences
     with pytest.raises(wf.ModelError, match="needs as many times as values, at ends of steps"):
         wf.fit(BAR, ranges, {"probe.tip.displacement.z": ([0.0123], [0.0])}, worlds=2, generations=1)
 

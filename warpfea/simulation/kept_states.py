@@ -134,14 +134,15 @@ class KeptStates(list[dict[str, wp.array]]):
                 self._compute(i)
         return item
 
-    def _set(self, i: int, state: dict[str, wp.array]) -> None:
+    def _bring_back(self, i: int, state: dict[str, wp.array]) -> None:
         super().__getitem__(i).update(state)
         self.at_hand.append(i)
 
     def _read(self, i: int) -> None:
         specs, device = self.sim.state.specs, self.sim.model.device
         with np.load(self._file(i)) as data:
-            self._set(i, {name: wp.array(data[name], dtype=specs[name].dtype, device=device) for name in self.names})
+            state = {name: wp.array(data[name], dtype=specs[name].dtype, device=device) for name in self.names}
+        self._bring_back(i, state)
 
     def _compute(self, i: int) -> None:
         """Compute the states up to i again, from the whole one before them."""
@@ -155,7 +156,7 @@ class KeptStates(list[dict[str, wp.array]]):
             if stepper.initial_conditions is not None:
                 stepper.initial_conditions.prepare(self.dt[k])
             if k > last - max(self._room - 2, 1) and self.names[0] not in item:
-                self._set(self.starts[k], {name: wp.clone(getattr(sim.state, name)) for name in self.names})
+                self._bring_back(self.starts[k], {name: wp.clone(getattr(sim.state, name)) for name in self.names})
             if k < last:
                 for name in self.controls:
                     wp.copy(getattr(sim.state, name), item[name])

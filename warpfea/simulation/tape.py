@@ -168,7 +168,7 @@ class Tape:
         self.kept = KeptStates(self.sim, self._kept_names(), self.budget, self.folder)
         self.ends: list[int] = []
         self.restarts: dict[int, np.ndarray] = {}
-        self._recorded: dict[str, list[ProbeArrays]] = {}
+        self._probe_values: dict[str, list[ProbeArrays]] = {}
         self.probes.clear()
 
     @property
@@ -201,7 +201,7 @@ class Tape:
                 if self.budget is None:
                     self._evaluate_probe(out, k, self.kept[end])
                 else:
-                    for array, value in zip(out.arrays, self._recorded[name][k].arrays):
+                    for array, value in zip(out.arrays, self._probe_values[name][k].arrays):
                         wp.copy(array[:, k], value[:, 0])
         return self.probes[name]
 
@@ -227,4 +227,4 @@ class Tape:
         for probe in self.model.description.probes:
             out = self._empty_probe(probe.name, 1)
             self._evaluate_probe(out, 0, self.kept[-1])
-            self._recorded.setdefault(probe.name, []).append(out)
+            self._probe_values.setdefault(probe.name, []).append(out)

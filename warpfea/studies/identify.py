@@ -4,8 +4,8 @@ A finger of rubber, 0.12 x 0.02 x 0.02 m of T10, is clamped at one end and let g
 0.24 s with noise of 1 % of the largest deflection. The record comes from a run of four times as many steps with E and
 eta that the search does not know. scipy's differential evolution looks for both, a generation at a time: each candidate
 is a world of one model (`wf.fit`). The misfit is the mean square of the differences of all samples. With `--gradients`
-L-BFGS-B looks for both from a poor start, by the gradient of one motion at a time, of that record and of one without
-noise or finer steps, which it must find exactly.
+least squares with the derivatives of one motion at a time look for both from a poor start, of that record and of one
+without noise or finer steps, which they must find exactly.
 
 tests/results/identify_cpu.json, identify_h200.json, with 4096 worlds, and identify_gradients_cpu.json are the committed
 results.
@@ -71,7 +71,7 @@ class Identification:
     Attributes:
         E, eta: Pa, Pa s; E_error, eta_error: over the truth.
         misfit: root of the mean square of the differences, over the largest deflection.
-        runs: motions of a world; backward_runs: ways back through one, of gradients.
+        runs: motions of a world; backward_runs: Jacobians of one.
         time_s: of the search, without compilation.
     """
 
@@ -110,7 +110,7 @@ def identify(
     how: dict[str, Any] = {"worlds": worlds, "generations": generations, "seed": seed}
     if gradients:
         worlds, generations, run = 1, 0, run | {"tol": GRADIENT_TOL}
-        how = {"method": "L-BFGS-B", "start": POOR_START}
+        how = {"method": "least_squares", "start": POOR_START}
         wf.fit(finger, ranges, one, **how, run=run | {"t_end": DT})  # compiles
     ready = clock.perf_counter()
     found = wf.fit(finger, ranges, record, **how, run=run)

@@ -35,7 +35,7 @@ class Fit:
     Attributes:
         values: by parameter. misfit: root of the mean square of the residuals.
         residuals: (samples,) of the record, simulation less record over sigma. runs: of the scene in the search.
-        backward_runs: ways back through a run for derivatives.
+        backward_runs: gradients or Jacobians of a run.
     """
 
     values: dict[str, float]
@@ -67,8 +67,9 @@ def fit(
         record: (times, values) or (times, values, sigma) by text, such as "probe.tip.displacement.z"; times are those
             of steps, s, of statics load fractions.
         method: "differential_evolution", of `worlds` candidates over `generations`; or from `start` (default: the
-            middle of the ranges) "least_squares", with differences over worlds, or "L-BFGS-B", with gradients by
-            `wf.Adjoint` of components of probes by parameters of the model.
+            middle of the ranges) "least_squares", or "L-BFGS-B", the better one of many parameters. Derivatives of
+            components of probes by parameters of the model are those of `wf.Adjoint`; others are differences over
+            worlds, which "L-BFGS-B" refuses.
         fixed: parameters of the scene. run: as of `sweep`. seed: of differential_evolution.
         progress: show a bar of the runs; None: if stderr is a terminal.
 
@@ -80,11 +81,10 @@ def fit(
     candidates = Candidates(scene, parameters, record, dict(fixed or {}), dict(run or {}))
     backward_runs = 0
     with progress_bar("fit", "run", None, progress) as candidates.bar:
-        if method == "L-BFGS-B":
-            first = candidates.first_point(start or {})
-            one = DifferentiableCandidate(candidates, first)
-            point = one.search(first)
-            candidates.runs, backward_runs = one.runs, one.backward_runs
+        one = None if method == "differential_evolution" else candidates.differentiable(method, start or {})
+        if one:
+            point = one.search(candidates.first_point(start or {}), method)
+            backward_runs = one.backward_runs
         elif method == "least_squares":
             point = candidates.search_locally(start or {})
         else:
@@ -153,11 +153,24 @@ class Candidates:
             out[members] = np.hstack(curves)
             self.refused[members] |= ~np.isfinite(out[members]).all(axis=1)
         out[self.refused] = self.refused_residual
-        self.runs += points.shape[1]
-        self.least = min(self.least, float((out**2).mean(axis=1).min()) ** 0.5)
-        self.bar.set_postfix_str(f"misfit {self.least:.3g}", refresh=False)
-        self.bar.update(points.shape[1])
+        self.count(out)
         return out
+
+    def count(self, residuals: np.ndarray) -> None:
+        """Count runs, and show their progress, by residuals (runs, samples)."""
+        self.runs += len(residuals)
+        self.least = min(self.least, float((residuals**2).mean(axis=1).min()) ** 0.5)
+        self.bar.set_postfix_str(f"misfit {self.least:.3g}", refresh=False)
+        self.bar.update(len(residuals))
+
+    def differentiable(self, method: str, start: Mapping[str, float]) -> DifferentiableCandidate | None:
+        """Candidates with derivatives; None where "least_squares" takes differences instead. ModelError."""
+        try:
+            return DifferentiableCandidate(self, self.first_point(start))
+        except ModelError:
+            if method == "L-BFGS-B":
+                raise
+        return None
 
     def place(self, text: str, steps: np.ndarray) -> tuple[np.ndarray, Any]:
         """Indices of the steps of the samples, and sigma. ModelError for times between steps."""

@@ -27,7 +27,7 @@ class DifferentiableCandidate:
     """Residuals of a point of the ranges and their derivatives.
 
     Attributes:
-        runs, backward_runs: motions, and ways back through one.
+        backward_runs: gradients or Jacobians of a motion.
 
     Raises:
         ModelError: parameters of the scene, records other than components of probes, statics, steps of variable
@@ -36,7 +36,7 @@ class DifferentiableCandidate:
 
     def __init__(self, candidates: Candidates, point: np.ndarray) -> None:
         self.candidates, study = candidates, candidates.study
-        self.runs = self.backward_runs = 0
+        self.backward_runs = 0
         own = [name for name in candidates.ranges if name in candidates.scene.parameters]
         if own:
             raise ModelError(f"fit: {own[0]!r} is a parameter of the scene, without derivatives")
@@ -65,13 +65,14 @@ class DifferentiableCandidate:
             self.model.set_parameter(name, values)
         self.sim.reset()
         self.tape.clear()
-        self.point, self.runs = point.copy(), self.runs + 1
+        self.point = point.copy()
         size = sum(values.size for _, values, *_ in self.candidates.samples.values())
         try:
             with quiet_warp():
                 self.tape.run(self.steps)
         except ConvergenceError:
             self.refused, self._residuals = True, np.full(size, self.candidates.refused_residual)
+            self.candidates.count(self._residuals[None])
             return self._residuals
         self.refused, parts = False, []
         for text, curve in self.candidates.curves.items():
@@ -80,6 +81,7 @@ class DifferentiableCandidate:
             ]
             parts.append(self.candidates.difference(text, self.times, series)[0])
         self._residuals = np.concatenate(parts)
+        self.candidates.count(self._residuals[None])
         return self._residuals
 
     def gradient(self, point: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -101,6 +103,22 @@ class DifferentiableCandidate:
         g = self.tape.backward()
         return np.array([g[name].numpy()[0] for name in self.candidates.ranges]) * self._slopes(point)
 
+    def jacobian(self, point: np.ndarray) -> np.ndarray:
+        """(samples, parameters) derivatives of the residuals by the point, by forward sensitivities."""
+        rows = np.zeros((len(point), len(self.residuals(point))))
+        if self.refused:
+            return rows.T
+        self.backward_runs += 1
+        for k, (name, slope) in enumerate(zip(self.candidates.ranges, self._slopes(point))):
+            change = self.tape.forward({name: slope})
+            parts = []
+            for text, curve in self.candidates.curves.items():
+                at, sigma = self.candidates.place(text, self.times)
+                values = getattr(change[curve.name], curve.quantity).numpy()[0]
+                parts.append(values[at, COMPONENTS.index(curve.component)] / sigma)
+            rows[k] = np.concatenate(parts)
+        return rows.T
+
     def _slopes(self, point: np.ndarray) -> np.ndarray:
         """Derivatives of the values of the parameters by the point."""
         out = []
@@ -109,13 +127,16 @@ class DifferentiableCandidate:
             out.append(value * math.log(high / low) if axis["log"] else high - low)
         return np.array(out)
 
-    def search(self, first: np.ndarray) -> np.ndarray:
-        """Best point from a first one, by L-BFGS-B on the mean square of the residuals."""
-        from scipy.optimize import minimize
+    def search(self, first: np.ndarray, method: str) -> np.ndarray:
+        """Best point from a first one, by "least_squares", or L-BFGS-B on the mean square of the residuals."""
+        from scipy.optimize import least_squares, minimize
 
-        scale = np.mean(self.residuals(first) ** 2)
-        if self.refused or scale == 0.0:
-            return first
+        start = self.residuals(first)
+        self.candidates.refused = np.array([self.refused])
+        self.candidates.require("the start", first)
+        if method == "least_squares":
+            return np.asarray(least_squares(self.residuals, first, jac=self.jacobian, bounds=(0, 1), gtol=None).x)
+        scale = np.mean(start**2) or 1.0
 
         def misfit(x: np.ndarray) -> tuple[float, np.ndarray]:
             r = self.residuals(x)
