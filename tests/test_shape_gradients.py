@@ -69,8 +69,10 @@ def cases():
         pytest.param(lambda b, shift: solid(b, shift, "T10", 0.003), "backward_euler", id="curved T10", marks=slow),
         pytest.param(beam, "backward_euler", id="3243"),
         pytest.param(beam, "bdf2", id="3243 bdf2", marks=slow),
+        pytest.param(beam, "energy_momentum", id="3243 energy_momentum", marks=slow),
         pytest.param(beam, "generalized_alpha", id="3243 generalized_alpha", marks=slow),
         pytest.param(shell, "backward_euler", id="3443", marks=slow),
+        pytest.param(shell, "energy_momentum", id="3443 energy_momentum", marks=slow),
         pytest.param(ancf, "backward_euler", id="H3843", marks=slow),
     ]
 
@@ -136,13 +138,13 @@ def test_thickness_of_a_cantilever():
 
 
 def test_terms_without_a_derivative_are_refused_by_name():
-    ctx = SimpleNamespace(inertia=True, midpoint=False, accelerated=False)
+    ctx = SimpleNamespace(inertia=True, midpoint=False, dissipation=0.0)
     ctx.model = linked("motor")
     with pytest.raises(wf.ModelError, match=r"'mesh.X' has no derivative with 'constraints'"):
         MeshGradient(ctx)
     ctx.model = models.varied(models.beam())
     with pytest.raises(wf.ModelError, match=r"nu of beams and shells .* differs between worlds"):
         MeshGradient(ctx)
-    ctx.model, ctx.midpoint = models.varied(models.solid("T4")), True
-    with pytest.raises(wf.ModelError, match="'elements': steps of energy_momentum"):
+    ctx.model, ctx.midpoint = models.model(models.solid("T4"), models.material(models.NEO)), True
+    with pytest.raises(wf.ModelError, match="'elements': steps of energy_momentum but"):
         MeshGradient(ctx)

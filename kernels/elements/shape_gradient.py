@@ -14,6 +14,7 @@ from ..common.modules import KernelSet, kernel_module, kernel_set, masked_kernel
 from ..common.types import double_1d, int_1d, precision
 from .assumed_strain_block import assumed_shear_functions, assumed_strain_struct, coupling_entry_function
 from .element_slots import iterate_struct, slot_access_functions
+from .matrix import scheme_suffix
 from .points import point_functions
 
 __all__ = ["shape_gradient_kernels", "tied_shape_gradient_kernel", "tied_shape_struct"]
@@ -44,21 +45,25 @@ def turn_functions(dtype: str, framed: bool):
 
 @functools.cache
 def shape_gradient_kernels(
-    dtype: str, law: str, slots: int, affine: bool, damping: str | None, framed: bool
+    dtype: str, law: str, slots: int, affine: bool, damping: str | None, framed: bool, midpoint: bool = False
 ) -> KernelSet:  # fmt: skip
-    """Kernels of one kind of element block; arguments as those of `element_kernels`."""
-    fn, turn = point_functions(dtype, law, slots, affine, damping, framed), turn_functions(dtype, framed)
+    """Kernels of one kind of element block; arguments as those of `element_kernels`. `midpoint`: of stresses linear in
+    the strain."""
+    fn, turn = point_functions(dtype, law, slots, affine, damping, framed, midpoint), turn_functions(dtype, framed)
     p, t, m, Block, Local = fn.types, fn.tensors, fn.law, fn.Block, fn.Local
     T, mat33, Iterate, coef = p.T, p.mat33, iterate_struct(dtype), fn.coef
     ETA_INDEX, LAMBDA_V_INDEX, viscous = fn.ETA_INDEX, fn.LAMBDA_V_INDEX, fn.viscous
     form = "affine" if affine else "framed" if framed else "table"
-    module = kernel_module(f"element_{dtype}_{law}_{slots}_{form}_{damping}_shape_gradient")
+    scheme = scheme_suffix(midpoint, dissipative=False)
+    module = kernel_module(f"element_{dtype}_{law}_{slots}_{form}_{damping}{scheme}_shape_gradient")
 
     @wp.func
     def viscous_part(S: mat33, G: mat33, Fdot: mat33, D: mat33, c: coef, dq: T) -> mat33:
         """M of D : (F S) with the viscous stress S, whose past strains are fixed."""
         F = t.identity() + G
         dS = t.isotropic_stress(t.sym(wp.transpose(F) * D), c[LAMBDA_V_INDEX], c[ETA_INDEX])
+        if wp.static(midpoint):
+            dS = (T(1.0) / dq) * dS
         P = F * S
         M = wp.ddot(P, D) * t.identity() + turn.gradient_part(D, P)
         if wp.static(damping == "rate"):
@@ -78,11 +83,19 @@ def shape_gradient_kernels(
         for point in range(block.shape_gradient.shape[0]):
             G = fn.material_gradient(block, U, point, elem)
             D = fn.material_gradient(block, W, point, elem)
-            P = m.stress(G, c)
-            M = wp.ddot(P, D) * t.identity() + turn.gradient_part(D, P)
-            M += turn.gradient_part(G, m.increment(G, D, c))
+            Fdot = fn.velocity_gradient(block, V, point, elem)
+            M = mat33()
+            if wp.static(midpoint):
+                F = t.identity() + G
+                mean = fn.midpoint_stress(block, G, Fdot, c)
+                dS = m.pk2_stress(t.sym(wp.transpose(F) * D), c)
+                M = wp.ddot(F * mean, D) * t.identity() + turn.gradient_part(D, F * mean)
+                M += turn.gradient_part(G, D * mean + F * dS) + turn.gradient_part(Fdot, Fdot * dS)
+            else:
+                P = m.stress(G, c)
+                M = wp.ddot(P, D) * t.identity() + turn.gradient_part(D, P)
+                M += turn.gradient_part(G, m.increment(G, D, c))
             if wp.static(viscous):
-                Fdot = fn.velocity_gradient(block, V, point, elem)
                 S = fn.viscous_stress(block, G, Fdot, iterate.history, c, dq, world, point, elem)
                 M += viscous_part(S, G, Fdot, D, c, dq)
             f = fn.add_point_forces(block, f, fn.to_body_axes(block, -M, point, elem), point, elem)
@@ -130,7 +143,9 @@ def tied_shape_struct(dtype: str):
 
 
 @functools.cache
-def tied_shape_gradient_kernel(dtype: str, slots: int, ties: int, width: int, framed: bool) -> wp.Kernel:
+def tied_shape_gradient_kernel(
+    dtype: str, slots: int, ties: int, width: int, framed: bool, midpoint: bool = False
+) -> wp.Kernel:  # fmt: skip
     """Kernel `tied_shape_gradient` of elements with assumed strains; arguments as those of `assumed_strain_kernels`."""
     p, Block, Shape = precision(dtype), assumed_strain_struct(dtype, False), tied_shape_struct(dtype)
     T, vec3, mat33 = p.T, p.vec3, p.mat33
@@ -139,7 +154,8 @@ def tied_shape_gradient_kernel(dtype: str, slots: int, ties: int, width: int, fr
     load_slots, _, store_forces = slot_access_functions(dtype, slots, Block)
     Local, Ties, derivative = shears.Local, shears.Ties, shears.directional_derivative
     NS, NT, W = slots, ties, width
-    module = kernel_module(f"tied_{dtype}_{slots}_{ties}_{width}_{'framed_' * framed}shape_gradient")
+    scheme = scheme_suffix(midpoint, dissipative=False)
+    module = kernel_module(f"tied_{dtype}_{slots}_{ties}_{width}{scheme}_{'framed_' * framed}shape_gradient")
 
     @wp.func
     def axis(A: mat33, k: int) -> vec3:
@@ -157,7 +173,7 @@ def tied_shape_gradient_kernel(dtype: str, slots: int, ties: int, width: int, fr
 
     @masked_kernel(module, "active")
     def tied_shape_gradient(
-        block: Block, shape: Shape, u: p.vec3_2d, w: p.vec3_2d, active: int_1d, contribution: p.vec3_2d
+        block: Block, shape: Shape, u: p.vec3_2d, v: p.vec3_2d, w: p.vec3_2d, active: int_1d, contribution: p.vec3_2d
     ):
         """-w.df/dX of w.f = mu e.A de, de = x_a.w_b + x_b.w_a."""
         world, elem = wp.tid()
@@ -165,6 +181,10 @@ def tied_shape_gradient_kernel(dtype: str, slots: int, ties: int, width: int, fr
         U = load_slots(block, u, world, elem)
         D = load_slots(block, w, world, elem)
         x1, x2, e = shears.kinematics(block, U, elem)
+        V = Local()
+        if wp.static(midpoint):
+            V = load_slots(block, v, world, elem)
+            e = shears.step_shears(block, x1, x2, V, e, elem)
         de = Ties()
         for t in range(NT):
             de[t] = wp.dot(x1[t], derivative(block.derivative_b, D, t, elem)) + wp.dot(
@@ -191,6 +211,13 @@ def tied_shape_gradient_kernel(dtype: str, slots: int, ties: int, width: int, fr
                     Z += wp.outer(D[i], h)
                 M = side_part(A, Y, Z, shape.pair[t, 0], ds * x2[t] + s * w_b, s * x2[t], bar_a)
                 M += side_part(A, Y, Z, shape.pair[t, 1], ds * x1[t] + s * w_a, s * x1[t], bar_b)
+                if wp.static(midpoint):
+                    Y = mat33()
+                    for i in range(NS):
+                        Y += wp.outer(V[i], wp.transpose(A) * shape.shape_gradient[t, i, elem])
+                    v_a, v_b = derivative(block.derivative_a, V, t, elem), derivative(block.derivative_b, V, t, elem)
+                    M += side_part(A, Y, mat33(), shape.pair[t, 0], ds * v_b, vec3(), vec3())
+                    M += side_part(A, Y, mat33(), shape.pair[t, 1], ds * v_a, vec3(), vec3())
                 M = A * M * wp.transpose(A)
                 for i in range(NS):
                     f[i] = f[i] - M * shape.shape_gradient[t, i, elem]

@@ -23,7 +23,7 @@ from ..materials import Material
 from . import assembly
 from .assembly import HostBlock, element_chunks, orthonormal, shape_and_jacobian, shape_gradients
 
-__all__ = ["Block", "build_block", "couplings", "output_block", "output_rows"]
+__all__ = ["Block", "build_block", "couplings", "output_block", "output_rows", "tangent_damping"]
 
 
 @dataclass(eq=False)

@@ -13,10 +13,12 @@ import numpy as np
 import warp as wp
 
 from ..base.errors import ModelError
+from ..kernels.elements.materials import DEFINED_FOR_ANY_J
 from ..kernels.elements.points import block_struct
 from ..kernels.elements.shape_gradient import shape_gradient_kernels, tied_shape_gradient_kernel, tied_shape_struct
 from ..kernels.terms.shape_gradients import shape_kernels
 from ..model import assembly
+from ..model.blocks import tangent_damping
 from ..model.masses import has_constant_density
 from .gradients import Gradient, StepAdjoint, compile_kernels, with_fields
 
@@ -99,8 +101,8 @@ class MeshGradient:
 def not_shaped(ctx: StepContext) -> str:
     """Feature of the elements without a derivative by their reference, or ""."""
     m = ctx.model
-    if ctx.midpoint:
-        return "steps of energy_momentum"
+    if ctx.midpoint and (ctx.dissipation or any(b.key.law not in DEFINED_FOR_ANY_J for b in m.blocks)):
+        return "steps of energy_momentum but of stresses linear in the strain"
     if any(b.couplings_per_world for b in m.blocks):
         return "nu of beams and shells with remedies against locking differs between worlds"
     if any(not has_constant_density(law) and callable(law.density) for body in m.bodies for _, law in body.materials):
@@ -116,14 +118,16 @@ def internal_force_gradient(ctx: StepContext) -> Gradient:
     for block in m.blocks:
         key, dtype = block.key, m.dtype
         if key.tying:
-            kernel = tied_shape_gradient_kernel(dtype, block.slots, block.points, key.tying.width, key.framed)
+            kernel = tied_shape_gradient_kernel(
+                dtype, block.slots, block.points, key.tying.width, key.framed, ctx.midpoint
+            )
             tied.append((block, kernel, tied_shape(m, block)))
         else:
-            damping = key.damping if ctx.inertia else None
-            kind = (key.law, block.slots, key.affine, damping, key.framed)
+            damping = tangent_damping(key.damping, midpoint=ctx.midpoint) if ctx.inertia else None
+            kind = (key.law, block.slots, key.affine, damping, key.framed, ctx.midpoint)
             points.append((block, shape_gradient_kernels(dtype, *kind)))
     compile_kernels(m, [*(k.shape_gradient for _, k in points), *(kernel for _, kernel, _ in tied)])
-    past = [(b, k) for b, k in points if b.key.damping == "incremental" and ctx.inertia]
+    past = [(b, k) for b, k in points if b.key.damping == "incremental" and ctx.inertia and not ctx.midpoint]
 
     def add(at: StepAdjoint, out: wp.array) -> None:
         w, launch = at.ctx.work, at.ctx.launch
@@ -132,7 +136,11 @@ def internal_force_gradient(ctx: StepContext) -> Gradient:
             args = [block.data, w.stage, at.w, at.active, w.contribution]
             launch(k.shape_gradient, (m.worlds, block.count), args)
         for block, kernel, shape in tied:
-            launch(kernel, (m.worlds, block.count), [block.data, shape, w.u, at.w, at.active, w.contribution])
+            launch(
+                kernel,
+                (m.worlds, block.count),
+                [block.data, shape, w.u_stage, w.v_stage, at.w, at.active, w.contribution],
+            )
         collect(at, out)
         for name, x, scale in at.history_fields() if past else ():
             w.contribution.zero_()
