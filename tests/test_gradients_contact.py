@@ -21,6 +21,7 @@ from warpfea.simulation.adjoint import check_terms
 TOLERANCE = 1e-6  # the bar is 1e-5
 SHARE = 0.1  # of the lengths of differences: beyond, other points stick
 GAP = 2e-5
+FAR = wf.HalfSpace((0, 0, 1), -1.0)
 TETRAHEDRON = wf.TriMesh([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)], [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)])
 SHAPES = {
     "sphere": wf.Sphere((0, 0, 0), 0.7),
@@ -205,7 +206,7 @@ def body_run(kind, rows, device="cpu"):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", BODIES)
 def test_gradients_through_contact_between_bodies(kind):
-    tape, loss, _, exact = body_run(kind, SHARE * shifts(8))
+    tape, loss, g, exact = body_run(kind, SHARE * shifts(8))
     errors = best_differences(loss.numpy(), SHARE * np.array(exact))
     assert (errors < TOLERANCE).all(), errors
     assert (tape.residual < 1e-10).all()
@@ -215,6 +216,9 @@ def test_gradients_through_contact_between_bodies(kind):
     state = tape.sim.state
     slips = (state.pairs_contact_state.numpy()[0] >= 1 << 30).sum()
     assert 0 < slips <= (state.pairs_speed.numpy()[0] > 0.0).sum() - 3 * (kind == "stick")
+    if kind == "slide":
+        _, _, alone, _ = body_run(kind, SHARE * shifts(8)[7:8])
+        assert all(np.array_equal(alone[name].numpy()[0], g[name].numpy()[7]) for name in g)
 
 
 @pytest.mark.cuda
@@ -304,13 +308,22 @@ def test_sag_of_a_block_on_the_floor():
 
 
 def test_features_of_contact_without_an_adjoint_are_refused_by_name():
-    def refused(match, inertia=True, **options):
+    def refused(match, inertia=True, accelerated=False, obstacle=FAR, path=None, **options):
         b = wf.ModelBuilder()
         box = b.add_solid(wf.mesh.box((0.1, 0.1, 0.1), cells=(1, 1, 1), element="T4"), material=LAW)
-        b.add_contact(box, b.add_collider(wf.HalfSpace((0, 0, 1), -1.0)), restitution=0.5, **options)
-        ctx = SimpleNamespace(inertia=inertia, midpoint=False, accelerated=False)
+        b.add_contact(box, b.add_collider(obstacle, path=path), restitution=0.5, **options)
+        ctx = SimpleNamespace(inertia=inertia, midpoint=False, accelerated=accelerated)
         with pytest.raises(wf.ModelError, match=match):
             check_terms(b.finalize(device="cpu"), ctx)
 
     refused("'contact' has no adjoint for contacts of model='sphere'", model="sphere", radius=0.1)
+    refused("schemes with accelerations", accelerated=True)
     refused("friction in statics", inertia=False, mu=0.3)
+    refused("treatment='explicit'", law="paper", treatment="explicit")
+    needle = wf.Box((0.03, 0.04, -1.0), (1e-3, 1e-3, 0.1))
+    refused("'pairs' has no adjoint for obstacles .* that move", obstacle=needle, path=wf.Control("needle", 3))
+    b = wf.ModelBuilder()
+    two = [cube(b, name, origin=(0, 0, 0.2 * k)) for k, name in enumerate("ab")]
+    b.add_contact(*two, restitution=0.5)
+    with pytest.raises(wf.ModelError, match="'pairs' has no adjoint for sharp edges"):
+        check_terms(b.finalize(device="cpu"), SimpleNamespace(inertia=True, midpoint=False, accelerated=False))

@@ -182,17 +182,23 @@ class DifferentiableContact(Differentiable):
 
     def gradients(self, ctx: StepContext) -> Mapping[str, Callable[[], Gradient]]:
         out: dict[str, Callable[[], Gradient]] = {}
+        owner_of = {id(c.edges): c for c in self.model.description.contacts if c.edges is not None}
+        found: dict[str, list[int]] = {}
         for k, contact in enumerate(self.tables.contacts):
+            for of in (contact, owner_of.get(id(contact))):  # values of a contact are those of its edges, too
+                if of is not None:
+                    found.setdefault(of.name, []).append(k)
+        for owner, members in found.items():
             for name in ("mu", "mu_static", "restitution", "stiffness"):
-                out[f"{contact.name}.{name}"] = partial(self._law_gradient, ctx, k, name)
+                out[f"{owner}.{name}"] = partial(self._law_gradients, ctx, members, name)
         parameters = self.model.parameters
         known = parameters.setters()
-        for owner, members in parameters.owners().items():
-            mine = {id(body) for body, _ in members}
-            of = [k for k, c in enumerate(self.tables.contacts) if mine & {id(body) for body in bodies_of(c)}]
+        for owner, parts in parameters.owners().items():
+            mine = {id(body) for body, _ in parts}
+            touched = [k for k, c in enumerate(self.tables.contacts) if mine & {id(body) for body in bodies_of(c)}]
             for name in (key.rpartition(".")[2] for key in known if key.rpartition(".")[0] == owner):
-                if of:
-                    out[f"{owner}.{name}"] = partial(self._material_gradient, ctx, of, members, name)
+                if touched:
+                    out[f"{owner}.{name}"] = partial(self._material_gradient, ctx, touched, parts, name)
         return out
 
     def _factors(self, columns: dict[int, Any]) -> np.ndarray:
@@ -201,6 +207,10 @@ class DifferentiableContact(Differentiable):
         for k, values in columns.items():
             out[:, k] = values
         return out
+
+    def _law_gradients(self, ctx: StepContext, of: list[int], name: str) -> Gradient:
+        """Derivative by a parameter of some contacts."""
+        return together([self._law_gradient(ctx, k, name) for k in of])
 
     def _law_gradient(self, ctx: StepContext, k: int, name: str) -> Gradient:
         """Derivative by a parameter of a contact."""

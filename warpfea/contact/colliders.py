@@ -292,9 +292,9 @@ class ColliderContact(ContactTerm, DifferentiableColliders):
             a = self.adjoint(ctx)
             return a.sum_of(mine[None].astype(float), a.data.gap_bar)
 
-        of = self.tables.shapes.of_contact.numpy()
-        colliders = enumerate(self.tables.colliders)
-        offsets = {f"{c.name}.offset": partial(offset, of == k) for k, c in colliders if (of == k).any()}
+        of, known = self.tables.shapes.of_contact.numpy(), self.tables.parameters()
+        names = [f"{collider.name}.offset" for collider in self.tables.colliders]
+        offsets = {name: partial(offset, of == k) for k, name in enumerate(names) if name in known and (of == k).any()}
         return dict(super().gradients(ctx)) | offsets
 
     def law_gradient(self, ctx: StepContext, law: int) -> Gradient | None:

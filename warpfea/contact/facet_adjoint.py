@@ -34,7 +34,7 @@ class DifferentiableFacets(DifferentiableContact):
     def not_differentiable(self, ctx: StepContext) -> str | None:
         t = self.tables
         if t.edge_groups:
-            return "sharp edges of bodies in contact (edges=False leaves them out)"
+            return "sharp edges of both bodies (surfaces without them, or stiffness='region', leave them out)"
         if t.carriers:
             return "obstacles with points of their own that move"
         return super().not_differentiable(ctx)
