@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import json
 import re
 
 import numpy as np
@@ -98,6 +99,16 @@ def test_a_model_is_shown_before_a_run(model, tmp_path):
         for image in (marked, plain)
     ]
     assert green[0] > 3 * green[1]  # of the axis y
+    b = wf.ModelBuilder(gravity=(0, 0, 0))
+    body = b.add_solid(wf.mesh.box((1, 0.2, 0.2), cells=(2, 1, 1)), material=wf.SVK(E=1e7, nu=0.3, density=1e3))
+    b.add_contact(body, b.add_collider(wf.Sphere((0.5, 0.1, -0.4), 0.3), path=[1e-9, 0, 0.1], name="ball"))
+    b.finalize(device="cpu").show(tmp_path / "ball.html")  # obstacles too, at their places at the start
+    head = (tmp_path / "ball.html").read_text().split('type="application/json">')[1].split("</script>")[0]
+    page = json.loads(head)
+    ball = next(surface for surface in page["surfaces"] if surface["name"] == "ball")
+    place = ball["worlds"][0]
+    low = np.array(place["low"]) + place["least"] + page["origin"]
+    assert low[2] == pytest.approx(-0.6, abs=1e-3)
 
 
 def test_springs_are_marked_from_end_to_end():

@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 
 from ..base.errors import ModelError
+from ..base.launch import Launcher
 from ..base.worlds import set_rows, values_per_world
 from ..kernels.contact.collider_mesh import mesh_struct
 from ..kernels.contact.collider_seams import SEAMS_SUFFIX
@@ -28,15 +29,24 @@ from .tables import WORLD_PARAMETERS, FacetTables, check_chosen_values, clamped_
 
 if TYPE_CHECKING:
     from ..model.model import Model
+    from ..model.state import State
 
-__all__ = ["ContactTables", "facet_pattern_entries", "upload_collider_meshes"]
+__all__ = ["ContactTables", "facet_pattern_entries", "poses_by_laws", "upload_collider_meshes"]
+
+
+def poses_by_laws(model: Model, laws: Sequence[tuple[Collider, int]], state: State) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (worlds, K, 3), m, and axes (worlds, K, 3, 3) of colliders at a state by their time laws (-1: none)."""
+    value = model.terms.time_laws.values_at_state(Launcher(model.device), state)[0].numpy()
+    found = [collider.poses(value[:, law]) for collider, law in laws]
+    position, rotation = (np.stack(parts, axis=1) for parts in zip(*found))
+    return position, rotation
 
 
 class ContactTables(FacetTables[Contact]):
     """Contacts with colliders of a model, and the colliders.
 
     Attributes:
-        colliders: descriptions. shapes: on the device, without poses.
+        colliders: descriptions. shapes: on the device, without poses. collider_laws: with the numbers of their laws.
         seams: neighbours of the contacts, None if no contact has one.
         clamped_point_counts: number of points per contact excluded because all their slots are clamped.
     """
@@ -136,7 +146,7 @@ class ContactTables(FacetTables[Contact]):
         m, K = self.model, self.colliders
         out = collider_struct(self.has_meshes)()
         frames = [k.shape.frame() for k in K]
-        tables = {
+        tables: dict[str, Any] = {
             "of_contact": [K.index(c.collider) for c in self.contacts],
             "margin": np.zeros((m.worlds, len(K))),
             "kind": [k.shape.kind for k in K],
@@ -148,6 +158,8 @@ class ContactTables(FacetTables[Contact]):
             "rotation_anchor": [k.rotation.anchor if k.rotation else np.zeros(3) for k in K],
             "rotation_axis": [k.rotation.axis if k.rotation else (0.0, 0.0, 1.0) for k in K],
         }
+        laws_of = zip(tables["translation_law"], tables["rotation_law"])
+        self.collider_laws = [(k, max(pair)) for k, pair in zip(K, laws_of)]
         m.memory.fill(out, "contact", **tables | (vars(self.seams) if self.seams else {}))
         if self.has_meshes:
             out.mesh = upload_collider_meshes(m, [k.shape for k in K])

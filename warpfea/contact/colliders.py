@@ -24,7 +24,7 @@ from ..model.triangle_mesh import TriMesh
 from ..terms.gradients import Gradient
 from ..terms.term import StepContext, part
 from .adjoint import DifferentiableColliders, together
-from .collider_tables import ContactTables
+from .collider_tables import ContactTables, poses_by_laws
 from .evaluation import (
     contact_field,
     evaluate_points,
@@ -343,10 +343,11 @@ class ColliderContact(ContactTerm, DifferentiableColliders):
         return out
 
     def poses(self, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """As of `Touching`; None without history."""
+        """As of `Touching`; of a state without history, before a run, by the time laws."""
+        margin = self.tables.shapes.margin.numpy()
         if "contact_position" not in state.specs:
-            return None
-        return state.contact_position.numpy(), state.contact_rotation.numpy(), self.tables.shapes.margin.numpy()  # type: ignore[attr-defined]
+            return *poses_by_laws(self.model, self.tables.collider_laws, state), margin
+        return state.contact_position.numpy(), state.contact_rotation.numpy(), margin  # type: ignore[attr-defined]
 
     def samples(self, field: str, body: Any, state: State) -> np.ndarray:
         mine = any(contact.body is body for contact in self.tables.contacts)

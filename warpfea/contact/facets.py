@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from ..base.launch import Launcher
 from ..base.worlds import device_flags, set_rows
 from ..kernels.common.state import state_kernels
 from ..kernels.contact.assembly import block_kernels
@@ -31,6 +30,7 @@ from ..model.pairs import FacetOptions
 from ..model.state import State, view_as_words
 from ..terms.protocols import Coupled, Tied
 from ..terms.term import StepContext, part
+from .collider_tables import poses_by_laws
 from .evaluation import contact_field, evaluate_pairs, refuse_deep_overlaps, store_overlaps, touching_depth
 from .facet_adjoint import DifferentiableFacets
 from .facet_tables import PairTables
@@ -422,9 +422,7 @@ class FacetContact(ContactTerm, DifferentiableFacets, Tied, Coupled):
         laws = self.tables.collider_laws
         if not laws:
             return None
-        value = self.model.terms.time_laws.values_at_state(Launcher(self.model.device), state)[0].numpy()
-        found = [collider.poses(value[:, law]) for collider, law in laws]
-        position, rotation = (np.stack(parts, axis=1) for parts in zip(*found))
+        position, rotation = poses_by_laws(self.model, laws, state)
         return position, rotation, np.zeros(position.shape[:2])
 
     def samples(self, field: str, body: Any, state: State) -> np.ndarray:
