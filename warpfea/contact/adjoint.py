@@ -58,6 +58,7 @@ class ContactAdjoint:
         for name, var in contact_struct().vars.items():
             shape = (t.points,) if var.type.ndim == 1 else size
             setattr(self.constants, name, self._array(name, shape, var.type.dtype))
+        self.updates = (-1, -1)
         self.wanted: dict[str, wp.array] = {}
         self.differentiated = with_fields(contact_struct(), self.constants)
         self.first: wp.array = wp.array(t.first, dtype=wp.int32, device=m.device)
@@ -66,7 +67,11 @@ class ContactAdjoint:
         return self.ctx.work.array(f"{self.term.name} adjoint {name}", shape, dtype)
 
     def begin(self) -> None:
-        """Copy the constants of the laws to the points."""
+        """Copy the constants of the laws to the points, if they have changed."""
+        updates = self.ctx.model.terms.parameter_updates, self.ctx.model.parameters.version
+        if self.updates == updates:
+            return
+        self.updates = updates
         for name in contact_struct().vars:
             values = getattr(self.tables.data, name).numpy()
             into = getattr(self.constants, name)
