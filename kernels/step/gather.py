@@ -39,7 +39,7 @@ REACTION_FRACTION = wp.constant(wp.float64(1.0e-6))
 
 @functools.cache
 def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> KernelSet:
-    """Kernels over slots; traits used: "nonpotential", "tangent", "pooled", "constraint_rows" and "midpoint"."""
+    """Kernels over slots; traits used: all that suffix the name of their module."""
     p = precision(dtype)
     T, vec3, mat33, sym6 = p.T, p.vec3, p.mat33, p.sym
     Topology = topology_struct(dtype)
@@ -49,7 +49,7 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> KernelSet:
     lane_sum, store_sum = lane_functions(dtype).lane_sum, lane_functions(dtype).store_sum
     free_inverse, entry_sum = inverse_function(dtype), entry_sum_function(dtype)
     mass_entry, mass_times = mass_functions(dtype).mass_entry, mass_functions(dtype).mass_times
-    name = f"{dtype}{traits.suffix('nonpotential', 'tangent', 'pooled', 'constraint_rows', 'midpoint')}"
+    name = f"{dtype}{traits.suffix('nonpotential', 'tangent', 'pooled', 'constraint_rows', 'midpoint', 'unilateral')}"
     module = kernel_module(f"gather_{name}", max_unroll=SHORT_UNROLL)
     matrix_module = kernel_module(f"matrix_product_{name}", max_unroll=SHORT_UNROLL)
 
@@ -160,8 +160,14 @@ def gather_kernels(dtype: str, traits: Traits = NO_TERMS) -> KernelSet:
             for k in range(3):
                 magnitude[k] = magnitude[k] + T(wp.abs(constraint_force[0][k]))
         if wp.static(traits.pooled):  # opposing contact forces on a body cancel: each sets a scale by itself
+            largest = vec3(wp.abs(of_pool[0]), wp.abs(of_pool[1]), wp.abs(of_pool[2]))
+            if wp.static(not traits.unilateral):  # so do a joint's friction and what it holds
+                for entry in range(topo.pool_start[slot], topo.pool_start[slot + 1]):
+                    one = balance.pool_force[world, topo.pool_entry[entry]]
+                    for k in range(3):
+                        largest[k] = wp.max(largest[k], wp.abs(one[k]))
             for k in range(3):
-                magnitude[k] = magnitude[k] + wp.abs(of_pool[k])
+                magnitude[k] = magnitude[k] + largest[k]
         balance.inertia[world, slot] = a
         balance.internal[world, slot] = f
         balance.g[world, slot] = residual_force
