@@ -70,10 +70,10 @@ def spring_gradient_kernels(
     @masked_kernel(module, "active")
     def rate_bars(
         spr: Springs, u: p.vec3_2d, past: p.vec3_2d, law_value: vec3d_2d, factor: double_1d, sign: f64,
-        dq_dv: double_1d, w: p.vec3_2d, active: int_1d, scr: Scratch, out: mat33d_2d,
+        dq_dv: double_1d, w: p.vec3_2d, forwards: int, active: int_1d, scr: Scratch, out: mat33d_2d,
     ):  # fmt: skip
         """Bars of the vectors at a past displacement, of which y~ has the coordinate times a signed factor; of a VECTOR
-        those of q~."""
+        those of q~. `forwards`: forces by changes w in place of bars."""
         world, item = wp.tid()
         kind, sp = spr.kind[item], spr.spring[item]
         inverse = f64(1.0) / dq_dv[world]
@@ -88,9 +88,12 @@ def spring_gradient_kernels(
         y0 = scr.start[world, item]
         y = c.coordinate(kind, V, y0)
         slope = force_slope(spr, law_value, inverse, y, wp.vec2d(f64(1.0), f64(0.0)), world, item, scr)
-        bar = -sign * factor[world] * slope * wp.ddot(c.derivatives(kind, V, y).g, D)
         before = spr.reference[item] + k.vectors(spr, past, world, item)
-        out[world, item] = bar * c.derivatives(kind, before, c.coordinate(kind, before, y0)).g
+        end, start = c.derivatives(kind, V, y).g, c.derivatives(kind, before, c.coordinate(kind, before, y0)).g
+        if forwards == 0:
+            out[world, item] = (-sign * factor[world] * slope * wp.ddot(end, D)) * start
+        else:
+            out[world, item] = (-sign * factor[world] * slope * wp.ddot(start, D)) * end
 
     if bounded:
 
@@ -98,7 +101,7 @@ def spring_gradient_kernels(
         def end_anchors(
             spr: Springs, u: p.vec3_2d, anchor_bar: double_2d, active: int_1d, scr: Scratch, out: mat33d_2d
         ):
-            """Bars of the vectors at the end of a step by anchors that slip along; those of the start for the others."""
+            """Bars of the vectors at the end of a step by anchors that slip along; these no longer act at its start."""
             world, item = wp.tid()
             out[world, item] = mat33d()
             sp = spr.spring[item]
@@ -136,48 +139,39 @@ def spring_gradient_kernels(
     def sum_entries(
         topo: Topology, spr: Springs, offset: int, of_item: mat33d_2d, kind: int, active: int_1d, out: p.vec3_2d
     ):
-        """Vectors of the items with their weights at a slot; `kind`: 1 for those of a VECTOR, 0 for the others."""
+        """Vectors of the items with their weights at a slot; `kind`: 1: of a VECTOR, 0: of the others, -1: of all."""
         world, slot = wp.tid()
         total = vec3d()
         for n in range(topo.pool_start[slot], topo.pool_start[slot + 1]):
             entry = topo.pool_entry[n] - offset
             if entry >= 0 and entry < spr.entry_slot.shape[0]:
                 item = spr.entry_item[entry]
-                if wp.where(spr.kind[item] == VECTOR, 1, 0) == kind:
+                if kind < 0 or wp.where(spr.kind[item] == VECTOR, 1, 0) == kind:
                     total += spr.entry_weight[entry] * of_item[world, item]
         out[world, slot] = p.vec3(total)
 
-    @wp.func
-    def power(
-        spr: Springs, u: p.vec3_2d, start: p.vec3_2d, law_value: vec3d_2d, in_motion: f64, dq_dv: f64, w: p.vec3_2d,
-        world: int, item: int, scr: Scratch,
-    ) -> f64:  # fmt: skip
-        """w.f of an item."""
-        kind = spr.kind[item]
-        inverse, D = in_motion / dq_dv, k.vectors(spr, w, world, item)
-        if kind == VECTOR or kind == CHORD:
-            k.evaluate_vector(spr, u, start, inverse, world, item, scr)
-            return wp.ddot(scr.force[world, item], D)
-        V = spr.reference[item] + k.vectors(spr, u, world, item)
-        y = c.coordinate(kind, V, scr.start[world, item])
-        out = k.force_along(spr, law_value, in_motion, inverse, V, y, world, item, scr)
-        return out[0] * wp.ddot(c.derivatives(kind, V, y).g, D)
-
     @masked_kernel(module, "active")
-    def parameter_gradient(
+    def parameter_force(
         spr: Springs, u: p.vec3_2d, start: p.vec3_2d, law_value: vec3d_2d, dq_dv: double_1d, parameter: double_2d,
-        chosen: Parameter, w: p.vec3_2d, active: int_1d, scr: Scratch, sums: double_2d,
+        chosen: Parameter, factor: f64, active: int_1d, scr: Scratch, out: mat33d_2d,
     ):  # fmt: skip
-        """w.df/dparameter of the items of a spring; an infinite one has no derivative: 0."""
+        """out += factor times df/dparameter of the items of a spring; of an infinite one 0."""
         world = wp.tid()
         value = parameter[world, chosen.column]
         if chosen.law >= 0:
             value = law_value[world, chosen.law][0]
-        stiffness = spr.stiffness[world, chosen.column]
-        total, width = f64(0.0), f64(1.0)
-        if wp.isfinite(value):
-            step = f64(STEP) * wp.max(wp.abs(value), f64(1.0))
-            width = (value + step) - (value - step)
+        if not wp.isfinite(value):
+            return
+        stiffness = f64(spr.stiffness[world, chosen.column])  # a value: unpacked it would be read anew
+        inverse = chosen.in_motion / dq_dv[world]
+        step = f64(STEP) * wp.max(wp.abs(value), f64(1.0))
+        scale = factor / ((value + step) - (value - step))
+        for item in range(chosen.first, chosen.last):
+            kind, along, force = spr.kind[item], f64(0.0), mat33d()
+            V = spr.reference[item] + k.vectors(spr, u, world, item)
+            y = f64(0.0)
+            if kind != VECTOR and kind != CHORD:
+                y = c.coordinate(kind, V, scr.start[world, item])
             for side in range(3):
                 shifted = value + step * f64(wp.where(side == 2, 0, 1 - 2 * side))
                 if chosen.law >= 0:
@@ -187,9 +181,15 @@ def spring_gradient_kernels(
                     if chosen.stiffness != f64(0.0):
                         spr.stiffness[world, chosen.column] = stiffness + chosen.stiffness * (shifted - value)
                 if side < 2:
-                    for item in range(chosen.first, chosen.last):
-                        part = power(spr, u, start, law_value, chosen.in_motion, dq_dv[world], w, world, item, scr)
-                        total += part * f64(1 - 2 * side)
-        sums[0, world] = total / width
+                    sign = f64(1 - 2 * side)
+                    if kind == VECTOR or kind == CHORD:
+                        k.evaluate_vector(spr, u, start, inverse, world, item, scr)
+                        force += sign * scr.force[world, item]
+                    else:
+                        more_along = k.force_along(spr, law_value, chosen.in_motion, inverse, V, y, world, item, scr)
+                        along += sign * more_along[0]
+            if kind != VECTOR and kind != CHORD:
+                force = along * c.derivatives(kind, V, y).g
+            out[world, item] = out[world, item] + scale * force
 
     return kernel_set(locals())

@@ -14,7 +14,7 @@ from ..kernels.terms.bounded_laws import FRICTION
 from ..kernels.terms.spring_coordinates import CHORD, VECTOR
 from ..kernels.terms.spring_gradients import parameter_struct, spring_gradient_kernels
 from ..model.springs import bushing_parts
-from .gradients import Gradient, StepAdjoint, compile_kernels
+from .gradients import ForceGradient, Gradient, StepAdjoint, compile_kernels
 from .protocols import Differentiable
 from .term import StepContext, part
 
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = ["DifferentiableSprings"]
 
+PAST = ("displacement", "previous_displacement")
 ANCHOR = "spring_anchor"
 """State array of the anchors of friction."""
 
@@ -57,7 +58,7 @@ class DifferentiableSprings(Differentiable):
 
     def gradients(self, ctx: StepContext) -> Mapping[str, Callable[[], Gradient]]:
         return {
-            name: partial(self._parameter_gradient, ctx, k, field)
+            name: partial(self._parameter_gradient, ctx, field, [(k, np.ones(1))])
             for k, spring in enumerate(self.springs)
             for name, field in spring.parameters.items()
         } | {
@@ -72,46 +73,41 @@ class DifferentiableSprings(Differentiable):
         if field == "damping":  # products of an axis with itself are clipped from below
             slopes[6::4] = bushing_parts(np.eye(6), damping=False).T[3:6]
         k = [self.springs.index(spring) for spring in bushing.springs]
-        found = [(self._parameter_gradient(ctx, n, field), slopes[part]) for n, part in zip(k, bushing.parts)]
         values = getattr(self.data, self.device_fields[field]).numpy()[:, k]
         if field == "damping" and any(p in (6, 10, 14) and not values[:, n].all() for n, p in enumerate(bushing.parts)):
             raise ModelError(f"Adjoint: {bushing.name!r} is damped about one axis by no more than about the two others")
+        return self._parameter_gradient(ctx, field, [(n, slopes[part]) for n, part in zip(k, bushing.parts)])
 
-        def add(at: StepAdjoint, out: wp.array) -> None:
-            for gradient, slope in found:
-                for n in np.flatnonzero(slope):
-                    gradient(at, out[:, n : n + 1], float(slope[n]))
-
-        return add
-
-    def _parameter_gradient(self, ctx: StepContext, k: int, field: str, law: int = -1) -> Callable[..., None]:
-        """By a parameter of spring k, or by its time law."""
-        kernel, chosen = self.gradient_kernels.parameter_gradient, parameter_struct()()
-        items = np.flatnonzero(self.definition["spring"] == k)
-        chosen.first, chosen.last = int(items[0]), int(items[-1]) + 1
-        chosen.column, chosen.law, chosen.in_motion = k, law, float(ctx.inertia)
-        if self.springs[k].law == FRICTION and self.springs[k].stick > 0.0:
-            chosen.stiffness = 1.0 / self.springs[k].stick
+    def _parameter_gradient(
+        self, ctx: StepContext, field: str, springs: list[tuple[int, np.ndarray]], law: int = -1
+    ) -> Gradient:
+        """By a field of springs, each times factors by component, or by a time law of theirs."""
+        kernel, chosen = self.gradient_kernels.parameter_force, []
+        for k, factors in springs:
+            items, one = np.flatnonzero(self.definition["spring"] == k), parameter_struct()()
+            one.first, one.last = int(items[0]), int(items[-1]) + 1
+            one.column, one.law, one.in_motion = k, law, float(ctx.inertia)
+            if self.springs[k].law == FRICTION and self.springs[k].stick > 0.0:
+                one.stiffness = 1.0 / self.springs[k].stick
+            chosen.append((one, factors))
         array = getattr(self.data, self.device_fields[field])
         compile_kernels(self.model, [kernel])
 
-        def add(at: StepAdjoint, out: wp.array, factor: float = 1.0) -> None:
-            w, (start, _) = at.ctx.work, self.start_of_step(at.ctx)
-            args = [self.data, w.u, start, w.time_law_stage_values, w.step.dq_dv, array, chosen, at.w, at.active]
-            at.ctx.launch(kernel, self.model.worlds, [*args, at.ctx.scratch[self.name][0], at.sums])
-            at.accumulate(out, -factor)
+        def force(at: StepAdjoint, component: int) -> None:
+            w, (start, _), scratch = at.ctx.work, self.start_of_step(at.ctx), at.ctx.scratch[self.name][0]
+            scratch.product.zero_()
+            for one, factors in chosen:
+                if factors[component]:
+                    args = [self.data, w.u, start, w.time_law_stage_values, w.step.dq_dv, array, one]
+                    args += [float(factors[component]), at.active, scratch, scratch.product]
+                    at.ctx.launch(kernel, self.model.worlds, args)
+            self._sum_entries(at, -1)
 
-        return add
+        return ForceGradient(force, -1.0)
 
     def law_gradient(self, ctx: StepContext, law: int) -> Gradient | None:
-        found = np.flatnonzero(self.definition.get("schedule", np.zeros(0)) == law)
-        parts = [self._parameter_gradient(ctx, int(k), "stiffness", law) for k in found]
-
-        def add(at: StepAdjoint, out: wp.array) -> None:
-            for each in parts:
-                each(at, out)
-
-        return add if parts else None
+        found = np.flatnonzero(self.definition.get("schedule", np.zeros(0)) == law).tolist()
+        return self._parameter_gradient(ctx, "stiffness", [(k, np.ones(1)) for k in found], law) if found else None
 
     def prepare_adjoint(self, at: StepAdjoint) -> Iterable[wp.Module]:
         if self.has_friction:
@@ -132,25 +128,42 @@ class DifferentiableSprings(Differentiable):
         args = [self.model.topology, self.data, self.offset, at.ctx.scratch[self.name][0].product, vector, at.active]
         at.ctx.launch(self.gradient_kernels.sum_entries, at.dim, [*args, at.scratch])
 
+    def _rate_bars(self, at: StepAdjoint, n: int, direction: wp.array, forwards: int) -> None:
+        """Bars, or forces, by the displacements (n = 0: at the start, 1: before) in y~ = a0 y(u_n) - a1 y(u_{n-1})."""
+        ctx, w, scratch = at.ctx, at.ctx.work, at.ctx.scratch[self.name][0]
+        past, factor, sign = ((ctx.state.displacement, w.step.a0, 1.0), (ctx.u_before, w.step.a1, -1.0))[n]
+        args = [self.data, w.u, past, w.time_law_stage_values, factor, sign, w.step.dq_dv, direction, forwards]
+        args += [at.active, scratch, scratch.product]
+        ctx.launch(self.gradient_kernels.rate_bars, (self.model.worlds, self.count), args)
+
+    @part("springs")
+    def add_history_change(self, at: StepAdjoint) -> None:
+        if self.has_friction or (self.impacts and at.integrator.multistep):
+            what = "friction of joints has" if self.has_friction else "stops in steps of bdf2 have"
+            raise ModelError(f"Adjoint.forward: {what} no sensitivities; take backward()")
+        if at.ctx.inertia:
+            add = [at.scratch, at.active, at.force]
+            for n, name in enumerate(PAST[: 1 + at.integrator.multistep]):
+                self._rate_bars(at, n, at.bars[name], 1)
+                self._sum_entries(at, 0)
+                at.ctx.launch(at.kernels.add_vector, at.dim, add)
+            self._rate_bars(at, 0, at.q_tilde, 1)
+            self._sum_entries(at, 1)
+            at.ctx.launch(at.kernels.add_vector, at.dim, add)
+
     @part("springs")
     def add_history_gradient(self, at: StepAdjoint) -> None:
-        """Bars of q~ by rates of vectors, and of past displacements by y~ = a0 y(u_n) - a1 y(u_{n-1})."""
         ctx = at.ctx
         if not ctx.inertia:
             return
         m, w, k, scratch = self.model, ctx.work, self.gradient_kernels, ctx.scratch[self.name][0]
-        past = [("displacement", ctx.state.displacement, w.step.a0, 1.0)]
-        if at.integrator.multistep:
-            past.append(("previous_displacement", ctx.u_before, w.step.a1, -1.0))
-        for n, (name, u, factor, sign) in enumerate(past):
-            args = [self.data, w.u, u, w.time_law_stage_values, factor, sign, w.step.dq_dv, at.w, at.active, scratch]
-            ctx.launch(k.rate_bars, (m.worlds, self.count), [*args, scratch.product])
-            for vector in (0, 1) if n == 0 else (0,):
-                self._sum_entries(at, vector)
-                if vector:
-                    at.add_predictor_bar(at.scratch, at.active)
-                else:
-                    at.add_to(name, at.scratch)
+        for n, name in enumerate(PAST[: 1 + at.integrator.multistep]):
+            self._rate_bars(at, n, at.w, 0)
+            self._sum_entries(at, 0)
+            at.add_to(name, at.scratch)
+            if n == 0:  # bars of q~ by rates of vectors
+                self._sum_entries(at, 1)
+                at.add_predictor_bar(at.scratch, at.active)
         if self.has_friction:
             args = [self.data, w.u, ctx.state.displacement, w.time_law_stage_values, getattr(ctx.state, ANCHOR)]
             args += [w.step.dq_dv, at.w, at.active, scratch, at.bars[ANCHOR], scratch.product]
