@@ -207,7 +207,8 @@ class Renderer:
                 return self._picture(wp, raycast, scene, size, every)
             # the camera stands still: what is far from surfaces and their shadow is drawn once
             if self._backdrop is None:
-                mesh, shadow, nothing = scene.mesh, scene.shadow_map, wp.array(np.full((3, 3), 1e6), dtype=wp.vec3)
+                mesh, shadow = scene.mesh, scene.shadow_map
+                nothing: Any = wp.array(np.full((3, 3), 1e6), dtype=wp.vec3)
                 empty = wp.Mesh(nothing, wp.array([0, 1, 2], dtype=wp.int32))
                 scene.mesh, scene.shadow_map = empty.id, wp.ones((1, 1), dtype=float)
                 self._backdrop = self._picture(wp, raycast, scene, size, every)
