@@ -79,16 +79,14 @@ def test_slopes_of_restitution():
     assert np.isnan(restitution_slopes(np.array([-1.0]), np.array([1.0]))).all()
 
 
-def thrown(worlds, shapes, mu, seam=None, device="cpu"):
-    """A soft cube on a floor and beside another obstacle, both on paths of their own."""
+def thrown(worlds, shapes, paths, device="cpu", **options):
+    """A soft cube that touches obstacles, on paths by their names."""
     b = wf.ModelBuilder(gravity=(0, 0, -9.81))
     mesh = wf.mesh.box((0.1, 0.1, 0.1), cells=(1, 1, 1), element="T4")
     box = b.add_solid(mesh, material=LAW, name="box")
     for name, (shape, side) in shapes.items():
-        turn = wf.Rotation(anchor=(0.02, 0.01, -0.03), axis=(0.3, 0.5, 0.8), angle=wf.Control(f"turn {name}"))
-        path = turn if name in TURNING else wf.Control(f"shift {name}", 3) if seam == 0.0 else None
-        collider = b.add_collider(shape, name=name, path=path)
-        b.add_contact(box.surface(side), collider, mu=mu, restitution=0.5, name=f"pad {name}", seam=seam)
+        collider = b.add_collider(shape, name=name, path=paths.get(name))
+        b.add_contact(box.surface(side), collider, mu=0.3, restitution=0.5, name=f"pad {name}", **options)
     b.add_probe("top", box.surface("z+"))
     return b.finalize(device=device, worlds=worlds)
 
@@ -104,6 +102,7 @@ RUNS = {  # shapes, velocity, steps, dt, integrator
     "slip and stick": ({"floor": FLOOR, "beside": BOX}, (-0.1, 0.02, -0.1), 8, 5e-4, "backward_euler"),
     "round": ({"ball": BALL}, (-0.1, 0.05, 0.02), 6, 5e-4, "backward_euler"),
     "seam": ({"ground": GROUND, "beside": WALL}, (-0.1, 0.02, -0.1), 8, 5e-4, "backward_euler"),
+    "halved": ({"floor": FLOOR}, (0.3, 0.1, -0.1), 3, 1e-3, "backward_euler"),
     "impact": ({"floor": LOW}, (0.3, 0.1, -0.1), 5, 1e-2, "bdf2"),
 }
 
@@ -111,18 +110,26 @@ RUNS = {  # shapes, velocity, steps, dt, integrator
 def contact_run(kind, rows=None, worlds=slice(None), device="cpu"):
     """Tape of worlds whose parameters differ by rows; names, values at the base and, as one more, the controls."""
     shapes, velocity, steps, dt, integrator = RUNS[kind]
-    mu = 0.3
     names = {"box.E": 1e6, "box.nu": 0.3, "box.density": 1000.0, "gravity": np.array([1.0, 0.5, -9.81])}
     for name in shapes:
-        names |= {f"pad {name}.{key}": value for key, value in {"mu": mu, "stiffness": 1.0, "restitution": 0.5}.items()}
+        names |= {
+            f"pad {name}.{key}": value for key, value in {"mu": 0.3, "stiffness": 1.0, "restitution": 0.5}.items()
+        }
         names[f"{name}.offset"] = 2e-6
-    controls = {f"turn {name}" if name in TURNING else f"shift {name}": 1 if name in TURNING else 3 for name in shapes}
-    controls = {} if kind == "seam" else controls  # obstacles with paths of their own have none
+    turning = {"anchor": (0.02, 0.01, -0.03), "axis": (0.3, 0.5, 0.8)}
+    laws, controls = {}, {}
+    if kind == "halved":  # by more than a radian in a step
+        laws["floor"] = wf.Rotation(anchor=(0.03, 0.04, 0), axis=(0, 0, 1), angle=([0, 1], [0, 1500]))
+    elif kind != "seam":  # obstacles with paths of their own have none
+        controls = {name: (f"turn {name}", 1) if name in TURNING else (f"shift {name}", 3) for name in shapes}
+        for name, (control, size) in controls.items():
+            law = wf.Control(control, size)
+            laws[name] = wf.Rotation(**turning, angle=law) if size == 1 else law
     rng = np.random.default_rng(0)
-    paths = {name: 1e-5 * np.cumsum(rng.standard_normal((steps, size)), axis=0) for name, size in controls.items()}
+    paths = {name: 1e-5 * np.cumsum(rng.standard_normal((steps, size)), axis=0) for name, size in controls.values()}
     rows = SHARE * shifts(len(names) + len(paths)) if rows is None else rows
     mine = rows[worlds]
-    m = thrown(len(mine), shapes, mu, None if kind == "seam" else 0.0, device)
+    m = thrown(len(mine), shapes, laws, device, seam=None if kind == "seam" else 0.0)
     for k, (name, value) in enumerate(names.items()):
         if name == "gravity":
             m.set_gravity(value * (1.0 + mine[:, k : k + 1]))
@@ -154,6 +161,7 @@ def test_gradients_through_contact(kind):
     assert (tape.residual < 1e-10).all()
     assert max(slips) > 0
     if kind != "slip and stick":
+        assert len(tape.kept) == (2 if kind == "halved" else 1) * tape.steps + 1
         assert any(impacts) == (kind == "impact")  # a step taken again with backward Euler
         assert (tape.model.terms.contacts[0].tables.seams is not None) == (kind == "seam")
         return
