@@ -119,9 +119,10 @@ def test_renderer_far_from_the_origin():
     assert (np.abs(images[0] - images[1]).max(axis=2) > 8).mean() < 0.002
     bent = points + np.array([0, 0, 0.3]) * (points[:, :1] ** 2)
     camera = Camera.framing(points, aspect=240 / 135)
-    refitted = renderer_pictures(Renderer(triangles, reference=points), [points, bent], colors, camera)[1]
-    anew = renderer_pictures(Renderer(triangles, reference=points), [bent], colors, camera)[0]
-    assert (refitted == anew).all()
+    for ground in (None, -0.1):  # what stands still is kept, and is that of a new picture
+        renderers = [Renderer(triangles, reference=points, ground=ground) for _ in range(2)]
+        refitted = renderer_pictures(renderers[0], [points, points, bent], colors, camera)[2]
+        assert (refitted == renderer_pictures(renderers[1], [bent], colors, camera)[0]).all()
     with pytest.raises(OutputError, match="finite"):
         Renderer(triangles).render(points * np.nan, colors)
 
