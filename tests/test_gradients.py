@@ -75,14 +75,15 @@ def test_gradients_of_a_body(add, law, steps, scheme):
     assert all(np.array_equal(alone[name][0], g[name][7]) for name in g)  # the bits of a run of its own
 
 
+SLOW_SCHEMES = ("energy_momentum", "generalized_alpha")
 LINKED = [("motor", "backward_euler"), ("motor", "bdf2"), ("loads", "backward_euler"), ("loads", "energy_momentum")]
-LINKED += [("drives", "bdf2")]
+LINKED += [("drives", "bdf2"), ("motor", "generalized_alpha"), ("loads", "generalized_alpha")]
 
 
 @pytest.mark.parametrize(
     ("kind", "scheme"),
     [
-        pytest.param(*case, marks=[pytest.mark.slow] * (case[0] == "drives" or case[1] == "energy_momentum"))
+        pytest.param(*case, marks=[pytest.mark.slow] * (case[0] == "drives" or case[1] in SLOW_SCHEMES))
         for case in LINKED
     ],
 )
@@ -106,6 +107,31 @@ def test_gradients_of_joints_and_controls(kind, scheme):
     assert all(g[name].shape == (m.worlds, *values.shape) for name, values in given.items())
     exact = [1e6 * g["a.E"][0], 1000.0 * g["b.density"][0]]
     exact += [np.sum(g[name][0] * scales[name]) for name in given]
+    errors = best_differences(loss.numpy(), exact)
+    assert (errors < TOLERANCE).all(), errors
+
+
+@pytest.mark.slow
+def test_initial_accelerations_of_moving_joints():
+    """Velocities that the joints correct, jerk and densities; displacements of slots that no joint ties."""
+    rows, rng = shifts(4), np.random.default_rng(4)
+    m = linked("motor", len(rows))
+    m.set_parameter("a.E", 1e6 * (1.0 + rows[:, 0]))
+    m.set_parameter("b.density", 1000.0 * (1.0 + rows[:, 1]))
+    X = m.slot_table.reference + np.concatenate([np.tile(b.origin, (b.slot_count, 1)) for b in m.bodies])
+    d = {"displacement": 1e-5 * rng.standard_normal((m.slots, 3))}
+    d["displacement"][m.constraints.slot_host] = 0.0
+    d["velocity"] = np.cross((0.3, 4.0, 0.2), X) + 0.02 * rng.standard_normal((m.slots, 3))
+    state = m.state()
+    for k, (name, values) in enumerate(d.items(), start=2):
+        getattr(state, name).assign((1.0 + rows[:, k])[:, None, None] * values)
+    sim = wf.Simulation(m, state, dt=2e-3, integrator="generalized_alpha", solver=SOLVER, constraint_tol=1e-13)
+    tape = wf.Adjoint(sim, ["a.E", "b.density", *(f"initial.{name}" for name in d)])
+    tape.run(5)
+    loss = wf.loss.sum_of_squares(tape.probe("tip").displacement, np.full((1, 5, 3), TARGET))
+    g = {name: array.numpy() for name, array in tape.backward(loss).items()}
+    exact = [1e6 * g["a.E"][0], 1000.0 * g["b.density"][0]]
+    exact += [np.sum(g[f"initial.{name}"][0] * values) for name, values in d.items()]
     errors = best_differences(loss.numpy(), exact)
     assert (errors < TOLERANCE).all(), errors
 
@@ -342,8 +368,11 @@ def test_terms_and_schemes_without_an_adjoint_are_refused_by_name():
     sim = {"integrator": INTEGRATORS["backward_euler"], "stepper": fixed, "t_end": None}
     sim |= {"model": SimpleNamespace(dtype="float64")}
     check_simulation(SimpleNamespace(**sim), False)
+    tables = SimpleNamespace(formulas=["gear"], has_velocity_rows=False)
+    terms = SimpleNamespace(having=lambda protocol: [SimpleNamespace(tables=tables)])
+    formula = SimpleNamespace(dtype="float64", terms=terms)
     for change, match in {
-        "have no adjoint with joints": {"integrator": INTEGRATORS["generalized_alpha"], "model": linked("motor")},
+        "no adjoint with formulas": {"integrator": INTEGRATORS["generalized_alpha"], "model": formula},
         "result of solve_static": {"integrator": INTEGRATORS["static"]},
         "float32": {"model": SimpleNamespace(dtype="float32")},
     }.items():

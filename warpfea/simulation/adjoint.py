@@ -26,7 +26,7 @@ from ..solvers.adjoint import AdjointSolver
 from ..terms.gradients import Gradient, StepAdjoint
 from ..terms.protocols import Differentiable
 from ..terms.shape_gradients import MESH, MeshGradient
-from .initial_adjoint import check_initial_conditions, step_back_to_initial
+from .initial_adjoint import check_initial_conditions, check_names, step_back_to_initial
 from .sensitivities import Forward
 from .simulation import Simulation
 from .statics import StaticResult
@@ -94,6 +94,7 @@ class Adjoint(Tape):
                 self._make_solver(tol, bar)
             self.mesh = MeshGradient(self.stepper.ctx) if MESH in self.names else None
             self.outputs = {name: self._sources(name) for name in self.names}
+        check_names(self.stepper.initial_conditions, self.names)
         self.residual = self.growth = np.zeros(m.worlds)
         self._forward: Forward | None = None
         self._sums = {name: self._zeros(self._size_of(name)) for name in self.names}
@@ -259,7 +260,7 @@ class Adjoint(Tape):
         wp.capture_launch(self._graph)
         if part in self.restarts:
             h = float(np.max(self.sim.dt))
-            step_back_to_initial(self.stepper, self.at, self.restarts[part], h, self._gradients)
+            step_back_to_initial(self.stepper, self.at, self.restarts[part], h, self._gradients, sums)
 
     def _capture(self, sums: dict[str, wp.array]) -> wp.Graph:
         """Graph of one step back, from the state at its start."""

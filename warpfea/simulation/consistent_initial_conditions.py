@@ -75,19 +75,18 @@ class ConsistentInitialConditions:
             self._restart_worlds(flags, time, after_jump, dt)
         return flags
 
+    def law_derivatives(self, flags: np.ndarray, dt: float) -> np.ndarray:
+        """Values of the time laws just after a jump at the state, and their three rates, (4, B, laws, 3)."""
+        return self._law_derivatives(flags, self._discontinuities_at(self.ctx.state.time.numpy(), dt)[0], dt)
+
     def unbalanced_force(self, flags: np.ndarray, dt: float) -> np.ndarray:
         """Evaluate the forces of the state, just after a jump there, before a step of size dt; (B, slots, 3), N."""
         return self._unbalanced_force(flags, self._discontinuities_at(self.ctx.state.time.numpy(), dt)[0], dt)
 
-    def free_mass_solver(self) -> Callable[[int, np.ndarray], np.ndarray]:
-        """Function of a world and (slots, 3): M^-1 of it on the free components, 0 on others."""
+    def begin_world(self, world: int) -> None:
+        """Choose the world that is solved for."""
         self._forget_old_factors()
-
-        def solve(world: int, force: np.ndarray) -> np.ndarray:
-            self._world = world
-            return self._solve_mass(force)
-
-        return solve
+        self._world = world
 
     def _forget_old_factors(self) -> None:
         if self._parameter_version != self.model.parameters.version:
@@ -111,10 +110,10 @@ class ConsistentInitialConditions:
         laws = self.model.terms.time_laws.laws
         steep = np.concatenate([np.zeros((0, 2)), *(jump_intervals(law, dt) for law in laws)])
         # accelerations stay continuous across force kinks
-        bent = [kink_times(law, dt) for number, law in enumerate(laws) if number in self._drive_law_numbers()]
+        bent = [kink_times(law, dt) for number, law in enumerate(laws) if number in self.drive_law_numbers()]
         return np.concatenate([steep[:, 0], *bent]), steep.T
 
-    def _drive_law_numbers(self) -> set[int]:
+    def drive_law_numbers(self) -> set[int]:
         """Indices of the laws that prescribe positions."""
         terms = self.model.terms
         tables = [terms.supports.displacement_drives, terms.supports.rotation_drives]
@@ -211,7 +210,7 @@ class ConsistentInitialConditions:
 
     # supports and constraints
 
-    def _constraint_rows(self, u: np.ndarray, v: np.ndarray, laws: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray]:
+    def constraint_rows(self, u: np.ndarray, v: np.ndarray, laws: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray]:
         """J (rows, 3 slots), c' and c'' without J w (rows,); None and no rows without constraints."""
         tables = self.model.constraints
         if tables is None:
@@ -219,7 +218,7 @@ class ConsistentInitialConditions:
         gradients, first, second = constraint_rates(tables, u, v, laws)
         return tables.expand_jacobian(gradients), first, second
 
-    def _prescribed_rates(self, laws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def prescribed_rates(self, laws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Velocities and accelerations (slots, 3) of prescribed components, 0 for others."""
         rate, acceleration = np.zeros((2, self.model.slots, 3))
         supports = self.model.terms.supports
@@ -244,16 +243,16 @@ class ConsistentInitialConditions:
 
     def _velocity_correction(self, u: np.ndarray, v: np.ndarray, laws: np.ndarray) -> np.ndarray:
         """Velocity correction dv, m/s; zero if consistent."""
-        jump = self._prescribed_rates(laws)[0] - np.where(self.model.slot_table.free == 0.0, v, 0.0)
-        J, first, _ = self._constraint_rows(u, v, laws)
+        jump = self.prescribed_rates(laws)[0] - np.where(self.model.slot_table.free == 0.0, v, 0.0)
+        J, first, _ = self.constraint_rows(u, v, laws)
         if J is None and not jump.any():
             return jump
         return self._solve_saddle_point(np.zeros_like(v), jump, J, -first)
 
     def _acceleration(self, g: np.ndarray, u: np.ndarray, v: np.ndarray, laws: np.ndarray) -> np.ndarray:
         """Acceleration w, m/s^2."""
-        J, _, second = self._constraint_rows(u, v, laws)
-        return self._solve_saddle_point(-g, self._prescribed_rates(laws)[1], J, -second)
+        J, _, second = self.constraint_rows(u, v, laws)
+        return self._solve_saddle_point(-g, self.prescribed_rates(laws)[1], J, -second)
 
     def _jerk(self, u: np.ndarray, v: np.ndarray, laws: np.ndarray, w: np.ndarray, s: float) -> np.ndarray:
         """Jerk dw/dt, m/s^3, prescribed by supports and constraints, by differences over -s .. s.
@@ -262,32 +261,41 @@ class ConsistentInitialConditions:
         """
         if self.model.constraints is None and not self.has_drives:
             return np.zeros_like(w)
+        return self.solve_jerk(u, v, laws, w, s)[0]
+
+    def solve_jerk(
+        self, u: np.ndarray, v: np.ndarray, laws: np.ndarray, w: np.ndarray, s: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Jerk, and its multipliers."""
         prescribed, constraint_rhs = np.zeros_like(w), None
         for sign in (-0.5 / s, 0.5 / s):
             x = np.copysign(s, sign)
             taylor = [[1.0, x, x**2 / 2.0, x**3 / 6.0], [0.0, 1.0, x, x**2 / 2.0], [0.0, 0.0, 1.0, x]]
             there = np.tensordot(taylor, laws, 1)
-            prescribed += sign * self._prescribed_rates(there)[1]
+            prescribed += sign * self.prescribed_rates(there)[1]
             if self.model.constraints is not None:
-                J, _, second = self._constraint_rows(u + x * v + 0.5 * x**2 * w, v + x * w, there)
+                J, _, second = self.constraint_rows(u + x * v + 0.5 * x**2 * w, v + x * w, there)
                 constraint_rhs = (0.0 if constraint_rhs is None else constraint_rhs) - sign * (second + J @ w.ravel())
-        rows = self._constraint_rows(u, v, laws)[0]
-        return self._solve_saddle_point(np.zeros_like(w), prescribed, rows, constraint_rhs)
+        rows = self.constraint_rows(u, v, laws)[0]
+        return self.solve_saddle_point(np.zeros_like(w), prescribed, rows, constraint_rhs)
 
-    def _solve_saddle_point(
+    def _solve_saddle_point(self, *args: Any) -> np.ndarray:
+        return self.solve_saddle_point(*args)[0]
+
+    def solve_saddle_point(
         self, force: np.ndarray, prescribed: np.ndarray, J: Any = None, constraint_rhs: Any = None
-    ) -> np.ndarray:
-        """Solve M x + J^T m = force on free components, x = prescribed on others, J x = constraint_rhs; (slots, 3)."""
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """x and m of M x + J^T m = force on free components, x = prescribed on others, J x = constraint_rhs."""
         m = self.model
         x = self._solve_mass(force - m.masses.world_matrix(self._world) @ prescribed) + prescribed
         if J is None:
-            return x
+            return x, np.zeros(0)
         free = m.slot_table.free.ravel() != 0.0
         columns = (J.toarray() * free).reshape(-1, m.slots, 3)
         inverse = np.array([self._solve_mass(row).ravel() for row in columns])  # rows of J M^-1
         matrix = J @ inverse.T
         multipliers = np.linalg.lstsq(matrix, J @ x.ravel() - constraint_rhs, rcond=RANK_TOL)[0]
-        return x - (multipliers @ inverse).reshape(x.shape)
+        return x - (multipliers @ inverse).reshape(x.shape), multipliers
 
     def _solve_mass(self, force: np.ndarray) -> np.ndarray:
         """M^-1 force on the free components, 0 on others."""
@@ -327,26 +335,47 @@ def constraint_rates(
 
     u, v: (slots, 3); laws: (3 or 4, laws, 3), values, rates and second rates. See kernels/terms/constraints.py.
     """
+    moved, speed = (vectors_of(tables, field) for field in (u, v))
+    return rates_of_vectors(tables, moved, speed, right_sides(tables, laws))
+
+
+def vectors_of(tables: Any, field: np.ndarray) -> np.ndarray:
+    """Vectors (3 rows, 3) of the rows' terms of a field (slots, 3)."""
+    out = np.zeros((3 * tables.count, 3))
+    np.add.at(out, tables.term_host, tables.weight_host[:, None] * field[tables.slot_host])
+    return out
+
+
+def right_sides(tables: Any, laws: np.ndarray) -> np.ndarray:
+    """Right sides of the rows and their first two rates, (3, rows)."""
+    out = np.zeros((3, tables.count))
+    out[0] = tables.data.constant_target.numpy()
+    law, component = tables.data.law.numpy(), tables.data.law_component.numpy()
+    on = law >= 0
+    for k in range(3):
+        out[k, on] += laws[k][law[on], component[on]]
+    return out
+
+
+def rates_of_vectors(
+    tables: Any, moved: np.ndarray, speed: np.ndarray, targets: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """`constraint_rates` from the vectors of displacements and velocities and the right sides; real or complex."""
     count = tables.count
-    moved, speed = np.zeros((2, 3 * count, 3))
-    for out, field in ((moved, u), (speed, v)):
-        np.add.at(out, tables.term_host, tables.weight_host[:, None] * field[tables.slot_host])
     a, b, a2 = (tables.reference_host + moved).reshape(count, 3, 3).swapaxes(0, 1)
     da, db, da2 = speed.reshape(count, 3, 3).swapaxes(0, 1)
     kind, scale = tables.data.kind.numpy(), tables.scale_host
-    f, df, ddf = tables.data.constant_target.numpy().copy(), np.zeros(count), np.zeros(count)
-    law, component = tables.data.law.numpy(), tables.data.law_component.numpy()
-    on = law >= 0
-    f[on] += laws[0][law[on], component[on]]
-    df[on], ddf[on] = (laws[k][law[on], component[on]] for k in (1, 2))
+    f, df, ddf = targets
+    kind_of_numbers = np.result_type(moved, speed, targets)
 
     def dot(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         return np.sum(x * y, axis=1)
 
-    G = np.stack([b, a, np.zeros_like(a)], axis=1)
-    first, second = dot(da, b) + dot(a, db) - df, 2.0 * dot(da, db) - ddf
+    G = np.stack([b, a, np.zeros_like(a)], axis=1).astype(kind_of_numbers)
+    first, second = (dot(da, b) + dot(a, db) - df).astype(kind_of_numbers), 2.0 * dot(da, db) - ddf
+    second = second.astype(kind_of_numbers)
     far = kind == DISTANCE
-    size = np.where(far, np.linalg.norm(a, axis=1), 1.0)
+    size = np.where(far, np.sqrt(dot(a, a)), 1.0)
     n = a / size[:, None]
     G[far] = np.stack([n, 0 * a, 0 * a], axis=1)[far]
     first[far] = (dot(n, da) - df)[far]

@@ -1,11 +1,16 @@
-"""Adjoint of the initial accelerations of generalized-alpha, without joints and drives: M w_0 = f - f_int(q_0, v_0).
+"""Adjoint of the initial accelerations of generalized-alpha, on the host as they are: three solves with M and J,
 
-It is that of a step: with multipliers x of M x = a_bar + w_bar on the free components the bars of q_0 and v_0 change by
--x . d(f_int - f), and those of parameters likewise. The step is that of the rates of strain at the state, with b = -h.
+    M dv + J^T l = 0, J dv = -c',    M w + J^T m = f - f_int, J w = -c'',    M k + J^T n = 0, J k = R,
+
+for the correction of velocities, accelerations and the jerk k, with R the rate of -c'' - J w by differences, and
+a_0 = w + e k, v_0 = v + dv + l k. Each has multipliers (y, z) of its own, M y + J^T z = bar, J y = 0, and adds
+-y.(dJ^T m + dM x) - z.(dJ x - dr). The rows' part is differentiated by a complex step in the vectors of their terms. Of
+f - f_int it is the adjoint of a step with the strain rates of the state, b = -h.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,54 +18,221 @@ import numpy as np
 from ..base.errors import ModelError
 from ..base.worlds import set_rows
 from ..terms.protocols import Constrained, Differentiable
+from .consistent_initial_conditions import rates_of_vectors, right_sides, vectors_of
 
 if TYPE_CHECKING:
+    import warp as wp
+
     from ..model.model import Model
     from ..terms.gradients import StepAdjoint
     from .stepper import Stepper
 
-__all__ = ["check_initial_conditions", "step_back_to_initial"]
+__all__ = ["check_initial_conditions", "check_names", "step_back_to_initial"]
+
+STEP = 1e-30
+"""Complex step."""
+
+
+def check_names(initial: Any, names: Iterable[str]) -> None:
+    """ModelError for a drive that is no control: its rates are accelerations too."""
+    laws = initial.model.terms.time_laws if initial else None
+    for name in names if initial else ():
+        if name in laws.names and name not in laws.controls and {*laws.indices_of(name)} & initial.drive_law_numbers():
+            raise ModelError(f"Adjoint: {name!r} has no derivative with generalized_alpha: give it as a wf.Control")
 
 
 def check_initial_conditions(model: Model, scheme: Any) -> None:
-    """ModelError for joints and drives, whose accelerations follow from rates of their positions."""
-    if scheme.accelerated and (model.terms.supports.in_use or model.terms.having(Constrained)):
-        raise ModelError(
-            f"Adjoint: the initial accelerations of {scheme.name!r} have no adjoint with joints and drives; take "
-            "'backward_euler', 'bdf2' or 'energy_momentum'"
-        )
+    """ModelError for constraints whose rates are not known by the vectors of their terms."""
+    for term in model.terms.having(Constrained) if scheme.accelerated else ():
+        if term.tables.formulas or term.tables.has_velocity_rows:
+            raise ModelError(
+                f"Adjoint: the initial accelerations of {scheme.name!r} have no adjoint with formulas and velocity rows"
+            )
 
 
-def step_back_to_initial(stepper: Stepper, at: StepAdjoint, flags: np.ndarray, h: float, gradients: Any) -> None:
-    """Pass the bars of accelerations in the flagged worlds (worlds,) to those of the state and of parameters.
+class RowsOfWorld:
+    """Bars of the rows' vectors in one world.
 
-    The stepper has the state with these accelerations, h is the size of its step, s.
+    Attributes:
+        vectors: of u, v before, v corrected, and w, with their bars; targets: right sides and their rates.
     """
-    s, w, solver, state = stepper, stepper.work, at.solver, stepper.state
-    start = s.initial_conditions
-    assert start is not None
-    mass = start.free_mass_solver()
+
+    def __init__(self, tables: Any, fields: list[np.ndarray], laws: np.ndarray, s: float) -> None:
+        self.tables, self.laws, self.s = tables, laws, s
+        self.vectors = [vectors_of(tables, field) for field in fields]
+        self.bars = [np.zeros_like(vector) for vector in self.vectors]
+        self.target_bar = np.zeros(tables.count)
+
+    def _along(self, G: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """J x of each row."""
+        return np.einsum("rsc,rsc->r", G, x.reshape(-1, 3, 3))
+
+    def add(self, work: Callable[..., np.ndarray]) -> None:
+        """Add the derivatives of a sum of rows, work(u, v, v1, w, shift of the right sides), by the vectors."""
+        for number, bar in enumerate(self.bars):
+            for k in range(9):
+                near = [vector.astype(complex) for vector in self.vectors]
+                near[number].reshape(-1, 9)[:, k] += 1j * STEP
+                bar.reshape(-1, 9)[:, k] += work(*near, 0.0).imag / STEP
+        self.target_bar += work(*self.vectors, 1j * STEP).imag / STEP
+
+    def solve_work(self, y: np.ndarray, z: np.ndarray, x: np.ndarray, m: np.ndarray, right: Any) -> None:
+        """Add -y.J^T m - z.J x + z.right of a solve; right(u, v, v1, w, targets)."""
+        Y, X = (vectors_of(self.tables, field) for field in (y, x))
+
+        def work(*given: Any) -> np.ndarray:
+            *vectors, shift = given
+            targets = right_sides(self.tables, self.laws) + np.array([[1.0], [0.0], [0.0]]) * shift
+            G, _, _ = rates_of_vectors(self.tables, vectors[0], vectors[1], targets)
+            return -m * self._along(G, Y) - z * self._along(G, X) + z * right(*vectors, shift)
+
+        self.add(work)
+
+    def rates(self, u: np.ndarray, v: np.ndarray, shift: Any, x: float = 0.0) -> tuple[np.ndarray, ...]:
+        """`rates_of_vectors` with the right sides after a time x."""
+        taylor = [[1.0, x, x**2 / 2.0, x**3 / 6.0], [0.0, 1.0, x, x**2 / 2.0], [0.0, 0.0, 1.0, x]]
+        targets = right_sides(self.tables, np.tensordot(taylor, self.laws, 1)) + np.array([[1.0], [0.0], [0.0]]) * shift
+        return rates_of_vectors(self.tables, u, v, targets)
+
+    def velocity_side(self, u: Any, v: Any, v1: Any, w: Any, shift: Any) -> np.ndarray:
+        """-c'."""
+        return -self.rates(u, v, shift)[1]
+
+    def acceleration_side(self, u: Any, v: Any, v1: Any, w: Any, shift: Any) -> np.ndarray:
+        """-c''."""
+        return -self.rates(u, v1, shift)[2]
+
+    def jerk_side(self, u: Any, v: Any, v1: Any, w: Any, shift: Any) -> np.ndarray:
+        """R."""
+        out = 0.0
+        for x in (-self.s, self.s):
+            G, _, second = self.rates(u + x * v1 + 0.5 * x**2 * w, v1 + x * w, shift, x)
+            out = out - np.sign(x) * 0.5 / self.s * (second + self._along(G, w))
+        return out
+
+    def slots(self, number: int, count: int) -> np.ndarray:
+        """Bar of a field (slots, 3)."""
+        out, t = np.zeros((count, 3)), self.tables
+        np.add.at(out, t.slot_host, t.weight_host[:, None] * self.bars[number][t.term_host])
+        return out
+
+
+def step_back_to_initial(
+    stepper: Stepper, at: StepAdjoint, restart: tuple[np.ndarray, np.ndarray], h: float, gradients: Any,
+    sums: Mapping[str, wp.array],
+) -> None:  # fmt: skip
+    """Pass the bars of accelerations in the flagged worlds to those of the state before, and of parameters.
+
+    Args:
+        stepper: has the state with these accelerations; h: the size of its step, s.
+        restart: flags (worlds,), and velocities before (worlds, slots, 3).
+        gradients: functions of the parameters with their sums; sums: by name.
+    """
+    s, w, solver, state, m = stepper, stepper.work, at.solver, stepper.state, stepper.model
+    start: Any = s.initial_conditions
+    flags, before = restart
+    chosen, count, tables = np.flatnonzero(flags).tolist(), m.slots, m.constraints
+    u, acceleration = state.displacement.numpy().copy(), state.acceleration.numpy().copy()  # type: ignore[attr-defined]
+    q_bar, v_bar = solver.q_bar.numpy().copy(), solver.v_bar.numpy().copy()
     bars = [solver.bars[name] for name in s.integrator.history_arrays]
-    total = sum(bar.numpy() for bar in bars)
-    x = np.zeros_like(total)
-    for world in np.flatnonzero(flags).tolist():
-        x[world] = mass(world, total[world])
-    start.unbalanced_force(flags, h)
-    set_rows(w.v_tilde, flags, (state.velocity.numpy() - h * state.acceleration.numpy())[flags])  # type: ignore[attr-defined]
-    for array, values in ((solver.w, x), *((bar, 0.0 * x) for bar in bars)):
+    a_bar, w_bar = (bar.numpy().copy() for bar in bars)
+    early = (s.integrator.parameter - 1.0) / (s.integrator.parameter + 1.0)
+    late = 1.0 / 6.0 - 1.0 / (s.integrator.parameter + 1.0) ** 2 - 0.5 * early
+    laws = start.law_derivatives(flags, h)
+    corrected, zero = before.copy(), np.zeros((count, 3))
+    x, rows, fixed = np.zeros_like(u), {}, m.slot_table.free == 0.0
+    first, jerk = np.zeros_like(u), np.zeros_like(u)
+    jerk_bars = np.zeros_like(u)
+    multipliers = {}
+    for world in chosen:
+        start.begin_world(world)
+        own = laws[:, world]
+        J, rate, _ = start.constraint_rows(u[world], before[world], own)
+        jump = start.prescribed_rates(own)[0] - np.where(fixed, before[world], 0.0)
+        first[world], m1 = start.solve_saddle_point(zero, jump, J, -rate)
+        corrected[world] += first[world]
+        multipliers[world] = J, m1
+    set_rows(state.velocity, flags, corrected[flags])
+    g = start.unbalanced_force(flags, h)
+    for world in chosen:
+        start.begin_world(world)
+        own, J = laws[:, world], multipliers[world][0]
+        total = w_bar[world] + a_bar[world]
+        if J is None:
+            x[world] = start.solve_saddle_point(total, zero)[0]
+            continue
+        motion = u[world], corrected[world], own
+        second = start.constraint_rows(*motion)[2]
+        m2 = start.solve_saddle_point(-g[world], start.prescribed_rates(own)[1], J, -second)[1]
+        jerk[world], m3 = start.solve_jerk(*motion, acceleration[world], 0.25 * h)
+        r = rows[world] = RowsOfWorld(tables, [u[world], before[world], corrected[world], acceleration[world]], own,
+                                      0.25 * h)  # fmt: skip
+        none = np.zeros(tables.count)
+        y, z = start.solve_saddle_point(early * h * a_bar[world] + late * h**2 * v_bar[world], zero, J, none)
+        jerk_bars[world] = y
+        r.solve_work(y, z, jerk[world], m3, r.jerk_side)
+        x[world], z = start.solve_saddle_point(total + r.slots(3, count), zero, J, none)
+        r.solve_work(x[world], z, acceleration[world], m2, r.acceleration_side)
+        v_bar[world] += r.slots(2, count)
+    # forces of the state, with its corrected velocities
+    set_rows(w.v_tilde, flags, (corrected - h * acceleration)[flags])
+    for array, values in ((solver.w, x), (solver.v_bar, v_bar), *((bar, np.zeros_like(x)) for bar in bars)):
         set_rows(array, flags, values[flags])
     w.step.running.assign(flags.astype(np.int32))
     solver.mu.zero_()
     solver.drive_bar.zero_()
+    solver._transpose(True)
+    if solver.constrained:
+        w.multipliers.penalty.zero_()
     solver.operator.product(solver.w, w.Hp, at.active, solver.topology, start=True)
     s.launch(solver.kernels.subtract_force, solver.dim, [w.Hp, w.step.dq_dv, at.active, solver.q_bar])
-    for term in s.model.terms.having(Differentiable):
+    for term in m.terms.having(Differentiable):
         term.add_history_gradient(at)
-    # prescribed components were stopped before, by an impulse on the free ones
-    free, v_bar = s.model.slot_table.free, solver.v_bar.numpy().copy()
-    for world in np.flatnonzero(flags).tolist():
-        impulse = s.model.masses.world_matrix(world) @ mass(world, v_bar[world])
-        v_bar[world] = np.where(free > 0.0, v_bar[world], impulse)
-    set_rows(solver.v_bar, flags, v_bar[flags])
     for add, out in gradients:
         add(at, out)
+    q_bar, v_bar = solver.q_bar.numpy().copy(), solver.v_bar.numpy().copy()
+    first_bars = np.zeros_like(u)
+    for world in chosen:
+        start.begin_world(world)
+        J, m1 = multipliers[world]
+        mass, target = m.masses.world_matrix(world), v_bar[world]
+        y, z = start.solve_saddle_point(target, zero, J, np.zeros(len(m1)))
+        first_bars[world] = y
+        impulse = mass @ y  # prescribed components were stopped by one on the others
+        if J is not None:
+            impulse = impulse + (J.T @ z).reshape(count, 3)
+            r = rows[world]
+            r.solve_work(y, z, first[world], m1, r.velocity_side)
+            q_bar[world] += r.slots(0, count)
+            v_bar[world] = target + r.slots(1, count)
+        v_bar[world] += np.where(fixed, impulse - target, 0.0)
+    for array, values in ((solver.q_bar, q_bar), (solver.v_bar, v_bar)):
+        set_rows(array, flags, values[flags])
+    _add_inertia(s, at, flags, h, gradients, ((first, first_bars), (jerk, jerk_bars)))
+    _add_targets(m, rows, sums)
+
+
+def _add_inertia(s: Stepper, at: StepAdjoint, flags: np.ndarray, h: float, gradients: Any, solves: Any) -> None:
+    """Add -y . dM x of solves (x, y) to the derivatives by densities."""
+    w = s.work
+    w.step.load_factor.fill_(0.0)
+    for x, y in solves:
+        if not x.any():
+            continue
+        set_rows(w.v, flags, h * x[flags])
+        set_rows(w.v_tilde, flags, 0.0 * x[flags])
+        set_rows(at.solver.w, flags, y[flags])
+        for add, out in gradients:
+            if getattr(add, "inertia", False):
+                add(at, out)
+
+
+def _add_targets(m: Model, rows: Mapping[int, RowsOfWorld], sums: Mapping[str, wp.array]) -> None:
+    """Add the bars of right sides that follow controls."""
+    for (name, *_), law in m.terms.time_laws.control_laws.items():
+        if name in sums and rows:
+            values = sums[name].numpy().copy()
+            for world, r in rows.items():
+                for row in np.flatnonzero(r.tables.data.law.numpy() == law):
+                    values[world, r.tables.data.law_component.numpy()[row]] += r.target_bar[row]
+            sums[name].assign(values)

@@ -64,7 +64,8 @@ class Tape:
         kept: arrays of the state at the start and after each part of a step, and for the part that begins there its
             controls, the size "dt" in each world, and the "status", running in worlds that take part.
         ends: index in `kept` of the end of each step.
-        restarts: by index in `kept`, flags (worlds,) of worlds whose initial accelerations are those of its state.
+        restarts: by index in `kept`, flags (worlds,) of worlds whose initial accelerations are those of its state, and
+            the velocities (worlds, slots, 3) before.
     """
 
     static = False
@@ -127,10 +128,11 @@ class Tape:
     def _prepare(self) -> None:
         """Restart accelerations before the step, and keep the state that it begins with."""
         if (initial := self.sim.stepper.initial_conditions) is not None:
+            before = self.kept[-1]["velocity"].numpy().copy()
             flags = initial.prepare(self.sim.dt)
             if flags.any():
                 self.kept[-1] = self._snapshot()
-                self.restarts[len(self.kept) - 1] = flags
+                self.restarts[len(self.kept) - 1] = flags, before
 
     def _keep(self, chosen: np.ndarray, controls: dict[str, wp.array]) -> None:
         """Keep a part of a step that the chosen worlds have taken."""
@@ -167,7 +169,7 @@ class Tape:
         """Forget the steps kept."""
         self.kept = KeptStates(self.sim, self._kept_names(), self.budget, self.folder)
         self.ends: list[int] = []
-        self.restarts: dict[int, np.ndarray] = {}
+        self.restarts: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         self._probe_values: dict[str, list[ProbeArrays]] = {}
         self.probes.clear()
 

@@ -126,10 +126,12 @@ class ForceGradient:
 
     Attributes:
         force: writes -dg/dparameter, or its negative, by a component to at.scratch. sign: 1.0, or -1.0.
+        inertia: by the mass, too.
     """
 
     force: Callable[[StepAdjoint, int], None]
     sign: float = 1.0
+    inertia: bool = False
 
     def __call__(self, at: StepAdjoint, out: wp.array) -> None:
         m = at.ctx.model
@@ -206,7 +208,7 @@ def density_gradient(ctx: StepContext, elements: Any, members: list[Any], name: 
         args = [topology, arrays[1], m.terms.dead_loads.constant_gravity, w.step.load_factor, w.v, w.v_tilde]
         at.ctx.launch(at.kernels.density_force, at.dim, [*args, w.step.mass_factor, at.active, at.scratch])
 
-    return ForceGradient(force)
+    return ForceGradient(force, inertia=True)
 
 
 def constant_gradient(ctx: StepContext, elements: Any, members: list[Any], name: str) -> Gradient:
