@@ -149,7 +149,7 @@ def test_derivatives_of_terms(kind, scheme):
     wrong = {n: (float(e), float(x)) for n, e, b, x in zip(every, errors, bounds, exact) if not e <= b}
     assert not wrong
     if (kind, scheme) in SLOW or kind == "friction":
-        with pytest.raises(wf.ModelError, match="friction of joints has no|stops in steps of bdf2 have no"):
+        with pytest.raises(wf.ModelError, match=r"friction of joints has no|stops in steps of bdf2 have no"):
             tape.forward({})
         return
     v = {

@@ -61,7 +61,7 @@ class Adjoint(Tape):
 
     Args:
         sim: a Simulation, or a result of `solve_static`.
-        with_respect_to: names of `Model.set_parameter` of materials, "gravity", controls, "initial.displacement",
+        with_respect_to: names of `Model.set_parameter`, "gravity", controls, loads and drives, "initial.displacement",
             "initial.velocity", and "mesh.X", the reference values of all slots.
         tol: relative residual of the adjoint solves, in the D^-1 norm.
         budget, folder: as of `Tape`.
