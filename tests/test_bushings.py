@@ -105,7 +105,7 @@ def test_energy_and_momentum_of_two_parts():
     assert last[0] + stored == pytest.approx(first[0], rel=1e-10)
     for before, after in zip(first[1:], last[1:]):
         assert np.linalg.norm(before, axis=1).min() > 5e-3
-        assert np.abs(after - before).max() < 1e-10 * np.abs(before).max()
+        assert np.abs(after - before).max() < 1e-12 * np.abs(before).max()
 
 
 def test_the_largest_turn():
