@@ -51,9 +51,11 @@ def test_cantilever_torsion_and_frequencies(section, bore):
     assert np.sqrt(squares) == pytest.approx(1.875104**2 * np.sqrt(E * I / (RHO * A)) / L**2, rel=1e-2)
 
 
-@pytest.mark.parametrize("device", [pytest.param(name, marks=getattr(pytest.mark, mark))
-                                    for name, mark in (("cpu", "slow"), ("cuda", "cuda"))])  # fmt: skip
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize(
+    ("device", "dtype"),
+    [pytest.param("cpu", "float32", marks=pytest.mark.slow),
+     *(pytest.param("cuda", dtype, marks=pytest.mark.cuda) for dtype in ("float64", "float32"))],
+)  # fmt: skip
 def test_devices_and_precisions(device, dtype):
     """A tube, and a circle that tapers, bent and twisted."""
     for section in (TUBE, (wf.Circle(0.04), wf.Circle(0.02))):

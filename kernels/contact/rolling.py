@@ -3,7 +3,8 @@ where that is closest to the obstacle.
 
 Its depth is stationary along the circle, so that the force at the fixed material point there is the derivative of the
 elastic energy. Friction acts on the motion of that point, which changes along the circle by the square of the turn in a
-step.
+step. In mid-point schemes it is the point that is closest in the middle of the turn, on a circle that is as deep at both
+ends as the surface: the normal force does no work as the part rolls. It is then frozen with the friction limits.
 """
 
 import functools
@@ -52,11 +53,11 @@ def rolling_kernels(dtype: str, meshes: bool, seams: bool) -> KernelSet:
     @masked_kernel(module, "active")
     def place_points(
         con: Contacts, col: Colliders, facets: Facets, his: History, clock: Clock, u: wp.array2d(dtype=vec3d),
-        u_n: wp.array2d(dtype=vec3), v_n: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), settled: int,
-        scr: ContactScratch,
+        u_n: wp.array2d(dtype=vec3), v_n: wp.array2d(dtype=vec3), active: wp.array(dtype=wp.int32), middle: f64,
+        settled: int, scr: ContactScratch,
     ):  # fmt: skip
         """Rolling points at displacements u: their reference positions, shape values, and start of the attempt;
-        `settled`: at a state."""
+        `middle`: share of the start in the turn; `settled`: at a state."""
         world, item, q = wp.tid()
         if not k.is_edge(facets, item) or facets.area_fraction[q, item] == f64(0.0):
             return
@@ -65,10 +66,16 @@ def rolling_kernels(dtype: str, meshes: bool, seams: bool) -> KernelSet:
         x = facets.X[q, item] + k.interpolate_at(facets, u, world, q, item, item)
         d = distance(col, kc, wp.transpose(col.rotation[world, kc]) * (x - col.position[world, kc]), -1)
         n = col.rotation[world, kc] * vec3d(d[0], d[1], d[2])
-        way = -n  # turned back with the part
+        way, back = -n, vec3d()  # turned back with the part; and its change to the start
         for i in range(facets.conn.shape[0]):
-            way -= wp.dot(n, u[world, facets.conn[i, item]]) * facets.rolling_gradient[i, row]
+            slot = facets.conn[i, item]
+            way -= wp.dot(n, u[world, slot]) * facets.rolling_gradient[i, row]
+            back -= wp.dot(n, vec3d(u_n[world, slot]) - u[world, slot]) * facets.rolling_gradient[i, row]
         reach = arm(facets, row, q, way)
+        if middle > f64(0.0):  # in the middle of the turn, as deep at both ends as the surface there
+            low = wp.dot(reach, way)
+            reach = arm(facets, row, q, way + middle * back)
+            reach *= wp.min(low / wp.max(wp.dot(reach, way), f64(1.0e-300)), f64(2.0))
         at = k.column(facets, world, item) - facets.facet_count
         facets.edge_X[q, at] = facets.X[q, item] + reach
         for i in range(facets.conn.shape[0]):

@@ -177,26 +177,30 @@ class ColliderContact(ContactTerm, DifferentiableColliders):
     def _find_other(self, ctx: StepContext, active: wp.array, *, fresh: int) -> None:
         if fresh:
             self._choose_deepest(ctx, active, fresh=1)
-        self._place_rolling(ctx, active)
+        if fresh or not ctx.midpoint:
+            self._place_rolling(ctx, active)
 
     def _find_accepted(self, ctx: StepContext, accepted: wp.array) -> None:
-        self._place_rolling(ctx, accepted)
+        if not ctx.midpoint:
+            self._place_rolling(ctx, accepted)
 
     def _place_rolling(self, ctx: StepContext, active: wp.array) -> None:
         """Points that roll, at work.u."""
         if self.rolling_kernels:
             s = ctx.scratch[self.name]
-            self.place_rolling(ctx.launch, s, s["u"], (ctx.state.displacement, ctx.state.velocity), active)
+            state = (ctx.state.displacement, ctx.state.velocity)
+            self.place_rolling(ctx.launch, s, s["u"], state, active, middle=0.5 * ctx.midpoint)
 
     def place_rolling(
         self, launch: Launcher, s: dict[str, Any], u: wp.array, state: tuple[wp.array, wp.array], active: wp.array,
-        *, settled: int = 0,
+        *, middle: float = 0.0, settled: int = 0,
     ) -> None:  # fmt: skip
-        """Arguments as of `choose_deepest`."""
+        """Arguments as of `choose_deepest`; middle: see kernels/contact/rolling.py."""
         for group in self.tables.groups:
             if group.data.edge_rows:
-                args = [self.tables.data, s["other"], group.data, s["history"], s["clock"], u, *state, active, settled]
-                launch(self.rolling_kernels.place_points, group.point_threads(self.model.worlds), [*args, s["attempt"]])
+                args = [self.tables.data, s["other"], group.data, s["history"], s["clock"], u, *state, active]
+                args += [middle, settled, s["attempt"]]
+                launch(self.rolling_kernels.place_points, group.point_threads(self.model.worlds), args)
 
     def _choose_deepest(self, ctx: StepContext, active: wp.array, *, fresh: int) -> None:
         """Select the point of each single-point contact at work.u."""
@@ -240,6 +244,8 @@ class ColliderContact(ContactTerm, DifferentiableColliders):
     def update_frozen(self, ctx: StepContext, flags: wp.array) -> None:
         super().update_frozen(ctx, flags)
         self._choose_deepest(ctx, flags, fresh=0)
+        if ctx.midpoint:
+            self._place_rolling(ctx, flags)
 
     @property
     def weights(self) -> np.ndarray:
