@@ -3,8 +3,8 @@ where that is closest to the obstacle.
 
 Its depth is stationary along the circle, so that the force at the fixed material point there is the derivative of the
 elastic energy. Friction acts on the motion of that point, which changes along the circle by the square of the turn in a
-step. In mid-point schemes it is the point that is closest in the middle of the turn, on a circle that is as deep at both
-ends as the surface: the normal force does no work as the part rolls. It is then frozen with the friction limits.
+step. In mid-point schemes it is the point that is closest in the middle of the turn, on a circle that is as deep at
+both ends as the surface: the normal force does no work as the part rolls. It is then frozen with the friction limits.
 """
 
 import functools
