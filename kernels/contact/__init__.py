@@ -10,6 +10,7 @@ Kinematics: own side of a point (kinematics.py), of obstacles that move (carrier
 Law: normal force (law.py); friction (friction.py).
 Assembly: forces, products, blocks of any geometry (assembly.py).
 Ledger: history, energies, records of any geometry (ledger.py).
+Adjoint: laws (adjoint.py); the geometry of the other side (collider_adjoint.py, facet_adjoint.py).
 At a state: evaluation.py. float32: double_displacements.py. Preconditioner: coupling.py, coarse_terms.py,
     rigid_modes.py. Setup: thickness.py, collider_sheets.py. Bodies without contact: crossings.py.
 

@@ -17,12 +17,7 @@ from .kinematics import kinematics_functions
 from .law import OwnLaws, law_names
 from .structs import WITH_STIFFNESS, contact_structs
 
-__all__ = ["PARAMETER_ARRAYS", "contact_adjoint_functions", "contact_adjoint_kernels", "contact_adjoint_struct",
-           "point_bars_struct"]  # fmt: skip
-
-PARAMETER_ARRAYS = ("mu", "mu_static", "damping", "beta", "scale", "normal_stiffness", "tangential_stiffness",
-                    "normal_damping", "effective_mass", "compliance")  # fmt: skip
-"""Constants of laws, of `Contacts`, that have derivatives."""
+__all__ = ["contact_adjoint_functions", "contact_adjoint_kernels", "contact_adjoint_struct", "point_bars_struct"]
 
 
 @functools.cache

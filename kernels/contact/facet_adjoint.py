@@ -48,7 +48,7 @@ def facet_adjoint_functions(dtype: str) -> KernelSet:
     Masters, FacetField = master_struct(dtype), facet_field_struct()
     vec3 = precision(dtype).vec3
     f_ = facet_projection_functions(dtype)
-    FacetPoint, power, local_components, surface_point = f_.FacetPoint, f_.power, f_.local_components, f_.surface_point
+    FacetPoint, power, local_components = f_.FacetPoint, f_.power, f_.local_components
     PointBars = point_bars_struct()
 
     @wp.struct
