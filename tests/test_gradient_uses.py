@@ -32,6 +32,19 @@ def test_a_step_back_costs_no_more_than_one_forward(device, worlds):
         assert row["recomputed"] == 0
 
 
+def test_gradients_beside_other_software():
+    """The same derivative as torch-fem on a cube, in less time; a thrown block beside its own differences."""
+    rows = {(row["label"], row["of"]): row for row in content_of("gradient_peers_cpu.json")["rows"]}
+    ours, theirs = rows["cube", "warpfea"], rows["cube", "torch-fem"]
+    assert ours["value"] == pytest.approx(theirs["value"], rel=1e-10)
+    assert ours["derivative"] == pytest.approx(theirs["derivative"], rel=1e-10)
+    assert max(ours["error"], theirs["error"]) < 1e-6
+    assert ours["forward_s"] + ours["backward_s"] < theirs["forward_s"] + theirs["backward_s"]
+    ours, theirs = rows["soft body", "warpfea"], rows["soft body", "newton"]
+    assert ours["error"] < max(theirs["error"])  # with points that come into contact, neither is smooth
+    assert ours["forward_s"] + ours["backward_s"] < theirs["forward_s"] + theirs["backward_s"]
+
+
 @pytest.mark.xfail(not (RESULTS / "gripper_learning_h200.json").exists(), reason="not run yet", strict=True)
 def test_a_gripper_learns_in_256_worlds():
     (row,) = content_of("gripper_learning_h200.json", "python tests/gripper_learning.py cuda")["rows"]
