@@ -167,10 +167,10 @@ def tied_exact_product_kernel(
 
     @wp.func
     def exact_force(
-        block: Block, U: Local, dU: Local, V: Local, history: p.sym_2d, dq: T, end: T, transposed: int, world: int,
-        elem: int,
+        block: Block, U: Local, P: Local, V: Local, history: p.sym_2d, dq: T, end: T, transposed: int,
+        world: int, elem: int,
     ) -> Local:  # fmt: skip
-        """Forces of an element for a change dU of its slots."""
+        """Those for a change P of the slots, of mid-point schemes."""
         x1, x2, e = kinematics(block, U, elem)
         s = tying_stresses(block, step_shears(block, x1, x2, V, e, elem), world, elem)
         share = T(0.5)
@@ -183,8 +183,8 @@ def tied_exact_product_kernel(
             if transposed != 0:
                 a, d = x1[t], x2[t]
             de[t] = share * (
-                wp.dot(a, derivative(block.derivative_b, dU, t, elem))
-                + wp.dot(d, derivative(block.derivative_a, dU, t, elem))
+                wp.dot(a, derivative(block.derivative_b, P, t, elem))
+                + wp.dot(d, derivative(block.derivative_a, P, t, elem))
             )
         ds = tying_stresses(block, de, world, elem)
         f = Local()
@@ -192,19 +192,19 @@ def tied_exact_product_kernel(
             a, d = x1[t], x2[t]
             if transposed != 0:
                 a, d = y1[t], y2[t]
-            da = ds[t] * a + (T(0.5) * s[t]) * derivative(block.derivative_a, dU, t, elem)
-            dd = ds[t] * d + (T(0.5) * s[t]) * derivative(block.derivative_b, dU, t, elem)
+            da = ds[t] * a + (T(0.5) * s[t]) * derivative(block.derivative_a, P, t, elem)
+            dd = ds[t] * d + (T(0.5) * s[t]) * derivative(block.derivative_b, P, t, elem)
             for i in range(NS):
                 f[i] = f[i] + block.derivative_a[t, i, elem] * dd + block.derivative_b[t, i, elem] * da
         return f
 
     @wp.func
     def symmetric_force(
-        block: Block, U: Local, dU: Local, V: Local, history: p.sym_2d, dq: T, end: T, transposed: int, world: int,
+        block: Block, U: Local, P: Local, V: Local, history: p.sym_2d, dq: T, _end: T, _transposed: int, world: int,
         elem: int,
     ) -> Local:  # fmt: skip
         """Those of other schemes."""
-        return fn.tangent_force(block, U, dU, V, history, dq, 0, world, elem)
+        return fn.tangent_force(block, U, P, V, history, dq, 0, world, elem)
 
     return _exact_kernel(fn, kernel_module(f"{fn.name}_exact"), exact_force if midpoint else symmetric_force)
 

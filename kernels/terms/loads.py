@@ -230,13 +230,13 @@ def body_force_product_kernel(function: wp.Function, dtype: str, take_dtype: str
         world, k = wp.tid()
         if active[world] == 0:
             return
-        elem = members[k]
-        column = elem % block.shape.shape[2]
+        t = A(time[world])
         count = members.shape[0]
         slots = block.conn.shape[0]
+        elem = members[k]
+        column = elem % block.shape.shape[2]
         for i in range(slots):
             contribution[world, offset + i * count + k] = vec3()
-        t = A(time[world])
         for q in range(block.mass_weight.shape[0]):
             r = vec3()
             d = vec3()

@@ -35,8 +35,10 @@ STEP = 1e-30
 
 def check_names(initial: Any, names: Iterable[str]) -> None:
     """ModelError for a drive that is no control: its rates are accelerations too."""
-    laws = initial.model.terms.time_laws if initial else None
-    for name in names if initial else ():
+    if initial is None:
+        return
+    laws = initial.model.terms.time_laws
+    for name in names:
         if name in laws.names and name not in laws.controls and {*laws.indices_of(name)} & initial.drive_law_numbers():
             raise ModelError(f"Adjoint: {name!r} has no derivative with generalized_alpha: give it as a wf.Control")
 
@@ -104,7 +106,7 @@ class RowsOfWorld:
 
     def jerk_side(self, u: Any, v: Any, v1: Any, w: Any, shift: Any) -> np.ndarray:
         """R."""
-        out = 0.0
+        out = np.zeros(1)
         for x in (-self.s, self.s):
             G, _, second = self.rates(u + x * v1 + 0.5 * x**2 * w, v1 + x * w, shift, x)
             out = out - np.sign(x) * 0.5 / self.s * (second + self._along(G, w))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -13,9 +13,6 @@ from ..base.names import listing
 from ..terms.checks import overrides
 from ..terms.protocols import Differentiable
 from .tape import ProbeArrays
-
-if TYPE_CHECKING:
-    from .adjoint import Adjoint
 
 __all__ = ["Forward"]
 
@@ -27,7 +24,7 @@ class Forward:
         ModelError: a parameter, term or scheme without one, by name.
     """
 
-    def __init__(self, tape: Adjoint) -> None:
+    def __init__(self, tape: Any) -> None:
         self.tape, self.model, self.solver = tape, tape.model, tape.solver
         if tape.stepper.integrator.accelerated:
             raise ModelError("Adjoint.forward: 'generalized_alpha' has no sensitivities of its initial accelerations")
@@ -39,7 +36,9 @@ class Forward:
             if past and not overrides(term, own):
                 raise ModelError(f"Adjoint.forward: {term.name!r} has no sensitivities of its histories")
         self.solver.prepare_forward()
-        self.gradients = {name: [make() for make in makers] for name, makers in tape.outputs.items()}
+        self.gradients: dict[str, list[Any]] = {
+            name: [make() for make in makers] for name, makers in tape.outputs.items()
+        }
         for name, found in self.gradients.items():
             if not all(hasattr(gradient, "change") for gradient in found):
                 raise ModelError(f"Adjoint.forward: {name!r} has no sensitivity; take backward()")
