@@ -81,7 +81,7 @@ MODELS = {
 REFUSED = {VelocityRows: velocity_rows}
 ELSEWHERE = {ColliderContact, FacetContact}  # test_gradients_contact.py
 CASES = [(kind, "backward_euler") for kind in MODELS] + [("springs", "bdf2"), ("friction", "bdf2")]
-SLOW = [("springs", "bdf2"), ("friction", "bdf2")]
+SLOW = [("springs", "bdf2"), ("friction", "bdf2"), ("friction", "backward_euler")]
 
 
 def test_every_kind_of_term_is_here():
