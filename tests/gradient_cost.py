@@ -18,7 +18,7 @@ from scenes.pendulum import pendulum
 from warpfea.base.provenance import provenance_of
 from warpfea.studies.identify import finger
 
-STEPS, ROUNDS = 100, 5
+STEPS, ROUNDS = {"cpu": 100, "cuda": 60}, {"cpu": 5, "cuda": 2}
 SCENES = {
     "pendulum": (pendulum, ["beam.E", "beam.density", "gravity"], "tip", 2e6),
     "finger": (finger, ["finger.E", "finger.eta", "gravity"], "tip", 1e6),
@@ -36,6 +36,8 @@ def timed(call, device):
 
 def row(name, device, worlds):
     scene, names, probe, modulus = SCENES[name]
+    kind = device.partition(":")[0]
+    steps = STEPS[kind]
     began = time.perf_counter()
     m = scene().finalize(device=device, worlds=worlds)
     m.set_parameter(names[0], modulus * np.linspace(1.0, 1.1, worlds))
@@ -45,26 +47,26 @@ def row(name, device, worlds):
         tape = wf.Adjoint(sim, names)
     except wf.ModelError as error:
         return {"label": name, "refused": str(error)}
-    tape.run(STEPS)
+    tape.run(steps)
     p = tape.probe(probe)
-    loss = wf.loss.sum_of_squares(p, np.zeros((STEPS, 3)))
+    loss = wf.loss.sum_of_squares(p, np.zeros((steps, 3)))
     tape.backward(loss)
     compile_s = time.perf_counter() - began
     forward, back, kept = [], [], []
-    for _ in range(ROUNDS):
+    for _ in range(ROUNDS[kind]):
         sim.reset()
         newton = sim.totals["newton"].sum()
-        forward.append(timed(lambda: sim.step(STEPS), device))
+        forward.append(timed(lambda: sim.step(steps), device))
         newton = sim.totals["newton"].sum() - newton
         sim.reset()
         tape.clear()
-        kept.append(timed(lambda: tape.run(STEPS), device))
-        loss = wf.loss.sum_of_squares(tape.probe(probe), np.zeros((STEPS, 3)))
+        kept.append(timed(lambda: tape.run(steps), device))
+        loss = wf.loss.sum_of_squares(tape.probe(probe), np.zeros((steps, 3)))
         back.append(timed(functools.partial(tape.backward, loss), device))
-    ms = {key: 1e3 * min(values) / STEPS for key, values in (("forward", forward), ("kept", kept), ("backward", back))}
+    ms = {key: 1e3 * min(values) / steps for key, values in (("forward", forward), ("kept", kept), ("backward", back))}
     return {
-        "label": name, "worlds": worlds, "unknowns": int(3 * len(m.free_slots)), "steps": STEPS, "dt": scene.dt,
-        "tol": scene.tol, "parameters": names, "setup_s": compile_s, "newton": float(newton / STEPS / worlds),
+        "label": name, "worlds": worlds, "unknowns": int(3 * len(m.free_slots)), "steps": steps, "dt": scene.dt,
+        "tol": scene.tol, "parameters": names, "setup_s": compile_s, "newton": float(newton / steps / worlds),
         "forward_ms": ms["forward"], "recorded_ms": ms["kept"], "backward_ms": ms["backward"],
         "ratio": ms["backward"] / ms["forward"], "recomputed": 0,
     }  # fmt: skip
@@ -75,7 +77,7 @@ def main(device, file, worlds=None):
     began = time.perf_counter()
     rows = [row(name, device, count) for name in SCENES]
     content = provenance_of([], device) | {"command": f"python tests/gradient_cost.py {device} FILE", "rows": rows}
-    content["settings"] = {"rounds": ROUNDS, "seconds": time.perf_counter() - began}
+    content["settings"] = {"rounds": ROUNDS[device.partition(":")[0]], "seconds": time.perf_counter() - began}
     pathlib.Path(file).write_text(json.dumps(content, indent=2) + "\n")
     print(json.dumps(rows, indent=1))
 
