@@ -82,6 +82,7 @@ def test_the_page():
     assert names["loss"] < 0.9 * first
 
 
+@pytest.mark.slow
 def test_a_gripper_learns():
     """Its loss falls tenfold, by far."""
     losses, height = learn("cpu", WORLDS)
