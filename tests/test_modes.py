@@ -285,5 +285,11 @@ def test_what_has_no_modes_is_refused():
         wf.modes(touching, state)
     with pytest.raises(wf.ModelError, match="count = 0 must be"):
         wf.modes(touching, count=0)
+    with pytest.raises(wf.ModelError, match="shift = 'a' must be a frequency"):
+        wf.modes(touching, shift="a")
+    state.displacement.fill_(np.nan)
+    for find in (wf.modes, wf.buckling):
+        with pytest.raises(wf.ModelError, match="positions of world 0 are not finite"):
+            find(touching, state)
     with pytest.raises(wf.ModelError, match="world = 1 must be a number from 0 to 0"):
         wf.modes(touching, world=1)

@@ -257,8 +257,15 @@ def test_frames_are_thinned_and_refused(tmp_path):
     assert head["worlds"] == [2]
     assert head["surfaces"][0]["worlds"][0]["moves"][1] == len(head["times"])
     assert head["fields"][0]["step"] == pytest.approx(1.4e6 / (NO_VALUE - 1), rel=1e-3)
-    with pytest.raises(wf.OutputError, match="worlds 0 to 2"):
-        HTMLWriter(tmp_path / "y.html", worlds=[3]).open(sim)
+    for worlds in ([3], [-1], [0.5], [1, 1], [], 0, "1"):
+        with pytest.raises(wf.OutputError, match="worlds 0 to 2, each once"):
+            HTMLWriter(tmp_path / "y.html", worlds=worlds).open(sim)
+    for options in ({"title": 3}, {"parameters": [("E", 1)]}):
+        with pytest.raises(wf.ModelError, match="title must be a text and parameters a dictionary"):
+            HTMLWriter(tmp_path / "y.html", **options)
+    told = {"a": np.zeros(2), "b": [], "c": None, "d": 1.5}
+    drive(sim, HTMLWriter(tmp_path / "y.html", fields=[], parameters=told), 3)  # arrays, too
+    assert "a = [0. 0.], d = 1.5" in (tmp_path / "y.html").read_text()
     with pytest.raises(wf.OutputError, match=r"end in \.html"):
         HTMLWriter(tmp_path / "y.pdf").open(sim)
     with pytest.raises(wf.ModelError, match="max_frames"):

@@ -216,6 +216,24 @@ def test_options_of_pictures_draw_what_they_say(tmp_path):
     assert near[0] < 0.5 * near[1]
 
 
+def test_long_names_and_extremes_at_the_border_stay_in_the_picture(tmp_path, monkeypatch):
+    from PIL import Image, ImageDraw
+
+    from warpfea.outputs.overlay import Overlay
+
+    sim = StubSim(far=(0.2, 0.5, 0.0), worlds=1)
+    sim.bodies[0].name, told = "n" * 300, []
+    draw = Overlay.draw
+    monkeypatch.setattr(Overlay, "draw", lambda self, *more: told.append(self) or draw(self, *more))
+    drive(sim, PNGWriter(tmp_path / "x.png", size=(240, 135), legend=True), 3)
+    assert sorted(len(text) for text, _, _ in told[0].texts) == [7, 40]
+    camera = Camera.framing(np.eye(3), view=(0, 0), aspect=1.0)
+    corner = next(p for p in np.linspace((0, -9, 0), (0, 9, 0), 999) if 60 < camera.project(p, (64, 64))[0] < 63)
+    image = Image.new("RGB", (200, 64))
+    draw(Overlay(texts=[("max 1 Pa", corner, True)]), ImageDraw.Draw(image), camera, (64, 64))
+    assert not np.asarray(image)[:, 65:].any()
+
+
 def square(height, low=0.0, high=1.0):
     """Points and triangles of a horizontal square, seen from above."""
     points = np.array([[low, low, height], [high, low, height], [high, high, height], [low, high, height]])
@@ -324,6 +342,13 @@ def test_camera_follows_and_ranges_are_chosen(tmp_path):
         ({"marks": ("suport",)}, "did you mean 'support'"),
         ({"zoom": 0.0}, "zoom"),
         ({"cut": ("y", 0.0)}, "cut must be"),
+        ({"cut": ("+y", np.nan)}, "cut must be"),
+        ({"marks": None}, "kinds of marks"),
+        ({"opacity": 0.3}, "numbers by name"),
+        ({"hide": "bar"}, "hide must be names"),
+        ({"hide": ["2nd box", "bar"]}, "hide leaves nothing to draw of bar, 2nd box"),
+        ({"time": np.nan}, "time must be a finite"),
+        ({"time": "1 s"}, "time must be a finite"),
         ({"opacity": {"bar": 1.5}}, "opacity of 'bar'"),
         ({"opacity": {"bat": 0.5}}, "there are bar, 2nd box"),
         ({"colors": "virides"}, "did you mean 'viridis'"),

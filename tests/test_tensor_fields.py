@@ -143,14 +143,21 @@ def test_what_is_unknown_or_no_scalar_says_what_there_is(tmp_path):
         ("cauchi", r"'cauchi' is unknown.*did you mean 'cauchy'"),
         ("cauchy.yx", r"'cauchy' has cauchy.xx, cauchy.yy.*did you mean"),
         ("J.x", "'J' has no components, as it is a scalar"),
+        ("cauchy.", r"'cauchy\.' is unknown; 'cauchy' has cauchy.xx"),
+        (["J"], r"\['J'\] is unknown"),
         ("section_force", "'section_force' is one of beams; body 'bar' has element T4"),
     ):
         with pytest.raises(wf.ModelError, match=text):
             results.field(name, body)
     with pytest.raises(wf.ModelError, match="field 'displacement' is one of nodes: leave out at='points'"):
         results.field("displacement", body, at="points")
+    with pytest.raises(wf.ModelError, match="elements= chooses what counts at nodes"):
+        results.field("J", body, at="elements", elements=body.elements("hard"))
     with pytest.raises(wf.ModelError, match="expected material points"):
         results.sample((0, 0, 0), "J")
+    for count in (-1, 0, 2.5, None):
+        with pytest.raises(wf.ModelError, match=f"count = {count} must be a whole number"):
+            body.line((0, 0.1, 0.1), (1, 0.1, 0.1), count)
     sim = wf.Simulation(model, dt=1e-3)
     text = (
         "'cauchy' has 6 components where a scalar is needed: take von_mises, tresca, pressure, principal.1, or a comp"
@@ -348,6 +355,9 @@ def test_statics_write_themselves_and_series_are_read_back(tmp_path, monkeypatch
         wf.read_results(tmp_path / "two.vtu")
     with pytest.raises(wf.ModelError, match="can't be read as a series"):
         wf.read_results(tmp_path / "none.pvd")
+    (tmp_path / "series" / "box_0000_000001.vtu").write_text("<VTKFile")
+    with pytest.raises(wf.MeshError, match=r"box_0000_000001\.vtu: can't be read, the file is damaged"):
+        wf.read_results(tmp_path / "series").positions("box")
 
 
 @pytest.mark.parametrize("integrator", ["backward_euler", "bdf2", "energy_momentum", "generalized_alpha"])
@@ -358,6 +368,10 @@ def test_acceleration_and_reaction(integrator):
     stays = b.add_solid(wf.mesh.box((1, 0.1, 0.1), cells=(3, 1, 1), element="T4"), material=law, name="stays")
     b.clamp(stays.nodes("x-"))
     sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-3, integrator=integrator)
+    nodes = stays.nodes("x-")
+    pulled, sped = sim.history("reaction.z", nodes), sim.history("acceleration", nodes)
+    with pytest.raises(wf.ModelError, match=r"'acceleration' is one of nodes: take body\.nodes"):
+        sim.history("acceleration", stays.at((0.5, 0.05, 0.05)))
     assert np.isnan(sim.field("reaction", stays)).all()
     for _ in range(3):
         sim.step()
@@ -365,6 +379,9 @@ def test_acceleration_and_reaction(integrator):
     held = sim.field("reaction", stays)[0]
     assert held.sum(axis=0) == pytest.approx(sim.reaction(stays.nodes("x-"))[0], abs=1e-9)
     assert np.array_equal(held[:, 2], sim.field("reaction.z", stays)[0])
+    assert np.array_equal(pulled.values[0, -1], held[nodes.indices, 2])
+    assert np.array_equal(sped.values[:, -1], sim.sample(nodes, "acceleration"))
+    assert sped.values.shape == (1, 3, len(nodes), 3)
     with pytest.raises(wf.ModelError, match="'reaction' has 3 components where a scalar is needed: take a component"):
         sim.check_field("reaction", scalar=True)
     with pytest.raises(wf.ModelError, match="is one of nodes: it is not drawn"):

@@ -59,6 +59,27 @@ def test_some_worlds_are_those_of_all():
     assert np.ptp(sim.skin_field("von_mises", bar), axis=0).max() > 0.0
 
 
+def test_two_outputs_of_one_file_and_names_too_long_for_it(tmp_path, monkeypatch):
+    """The second would replace the first; a folder's name may be left out; a long name is cut in file names."""
+    monkeypatch.chdir(tmp_path)
+    b = wf.ModelBuilder()
+    law = wf.SVK(E=1e7, nu=0.3, density=1e3)
+    for name in ("x" * 300, "x" * 200):
+        b.add_solid(wf.mesh.box((1, 0.2, 0.2), cells=(2, 1, 1)), material=law, name=name)
+    sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-3)
+    kinds = {"a.html": wf.HTMLWriter, "a.usdc": wf.USDWriter, "a": wf.VTUWriter, "a.npz": wf.Checkpoint}
+    for name, make in kinds.items():
+        with pytest.raises(wf.OutputError, match=r"a[.a-z]*: two outputs write to it"):
+            sim.run(1e-3, outputs=[make(name), make(tmp_path / name)])
+        assert not (tmp_path / name).exists()
+    sim.run(1e-3, outputs=[wf.VTUWriter("")])
+    assert wf.read_results(tmp_path).bodies == ["x" * 100, "x" * 100 + "-"]
+    for make in (wf.HTMLWriter, wf.USDWriter, wf.VTUWriter):
+        for fields in (None, "J", [3]):
+            with pytest.raises(wf.ModelError, match="fields must be names of fields"):
+                make(tmp_path / "a", fields=fields)
+
+
 @pytest.mark.xfail(strict=True, reason="to be measured on the H200")
 def test_price_of_writers():
     """600 steps of 883k unknowns with the von Mises stress at 60 frames, in a page or in USD: 1.2 of those without."""

@@ -48,7 +48,7 @@ def did_you_mean(name: object, known: Iterable[object]) -> str:
 
 def check_known(what: str, name: Any, known: Collection[Any]) -> None:
     """ModelError for a name that is not among the known ones, which it lists; `what`: its kind."""
-    if name not in known:
+    if name not in list(known):  # a name that can't be hashed, too
         raise ModelError(f"{what} {name!r} is unknown; there are {', '.join(known)}{did_you_mean(name, known)}")
 
 

@@ -10,8 +10,8 @@ from .errors import OutputError
 from .renamed import check_members
 
 __all__ = [
-    "Output", "check_folder", "check_target", "make_folder", "register_writer", "temporary_path", "write_atomically",
-    "writer_for",
+    "Output", "check_distinct", "check_folder", "check_target", "make_folder", "register_writer", "temporary_path",
+    "write_atomically", "writer_for",
 ]  # fmt: skip
 
 
@@ -81,6 +81,15 @@ def check_target(path: str | os.PathLike[str], suffixes: Sequence[str]) -> pathl
         raise OutputError(f"{target}: is a folder, not a file")
     check_folder(target.parent, target)
     return target
+
+
+def check_distinct(outputs: Sequence[Any]) -> None:
+    """OutputError for two outputs to one file or folder, of which the last would be left."""
+    targets = [getattr(out, "path", None) or getattr(out, "folder", None) for out in outputs]
+    paths = [pathlib.Path(target).resolve() for target in targets if isinstance(target, (str, os.PathLike))]
+    for k, path in enumerate(paths):
+        if path in paths[:k]:
+            raise OutputError(f"{path}: two outputs write to it; give each its own")
 
 
 def check_folder(folder: pathlib.Path, target: pathlib.Path) -> None:

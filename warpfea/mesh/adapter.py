@@ -90,7 +90,7 @@ def read(
             "meshes STL, OBJ and PLY, wf.mesh.from_cad STEP, IGES, BREP and .geo"
         )
     readers = {".msh": _read_gmsh, ".vtu": _read_vtu, ".inp": abaqus.read_inp}
-    with _meshio_errors(label):
+    with meshio_errors(label):
         raw = readers[suffix](file)
         raw = split_cells(corners_only(raw) if corners else raw)
     return check(assemble_mesh(raw, file, cell_type).transformed(transform=affine))
@@ -115,7 +115,7 @@ def read_triangles(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray
     file = Path(path)
     if not file.is_file():
         raise MeshError(f"{file}: no such mesh file")
-    with _meshio_errors(str(file)):
+    with meshio_errors(str(file)):
         mesh = meshio.read(file)
     halves = {"triangle": ([0, 1, 2],), "quad": ([0, 1, 2], [0, 2, 3])}
     parts = [block.data[:, half] for block in mesh.cells for half in halves.get(block.type, ())]
@@ -167,7 +167,7 @@ def from_meshio(
 
 
 @contextlib.contextmanager
-def _meshio_errors(label: str) -> Iterator[io.StringIO]:
+def meshio_errors(label: str) -> Iterator[io.StringIO]:
     """Suppress printing, warnings and exits of meshio; its errors become a MeshError naming the file."""
     said = io.StringIO()
     try:
@@ -291,7 +291,7 @@ def _entity_groups(body: bytes, is_ascii: bool, size: int) -> dict[tuple[int, in
 def _read_vtu(file: Path) -> RawMesh:
     if file.read_bytes().count(b"<Piece") > 1:
         raise MeshError("a VTU file of several pieces is not supported: merge them")
-    with _meshio_errors(str(file)) as said:
+    with meshio_errors(str(file)) as said:
         mesh = meshio.read(file, file_format="vtu")
     skipped = re.search(r"cannot handle \(type (\d+)\)", " ".join(said.getvalue().split()))
     if skipped:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ..base.checks import is_count
 from ..base.errors import ModelError
 from . import surfaces
 from .assembly import orthonormal
@@ -47,9 +48,11 @@ class Body(Discretisation):
 
     def line(self, start: Any, end: Any, count: int = 50) -> list[MaterialPoint]:
         """Material points evenly spaced on a straight line from start to end (3,), m, in the reference. ModelError for
-        points outside the body."""
+        points outside the body, or no count of at least 1."""
+        if not (is_count(count) and count >= 1):
+            raise ModelError(f"line: count = {count!r} must be a whole number of points, at least 1")
         a, b = point_coordinates(self, start), point_coordinates(self, end)
-        return [self.at(a + t * (b - a)) for t in np.linspace(0.0, 1.0, count)]
+        return [self.at(a + t * (b - a)) for t in np.linspace(0.0, 1.0, int(count))]
 
     @property
     def start(self) -> NodeSet:

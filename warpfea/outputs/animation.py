@@ -29,6 +29,8 @@ _LEGEND_COLORS = (
 REAL_TIME = (2.0, 20.0)
 AUTOMATIC_SECONDS = 3.0
 """Run times, s, of which an animation without a speed is shown in real time; else it takes the second."""
+MAX_NAME = 40
+"""Longest name of a body in a picture; longer ones are cut."""
 _LAST_FRAME_SECONDS = 0.6  # duration of the last frame, s
 
 
@@ -206,7 +208,8 @@ class Animation:
         if look.legend:
             for name, first, count in self.parts:
                 if first < n and name not in look.hide:
-                    out.texts.append((name, points[first : first + count].mean(axis=0), False))
+                    short = name if len(name) <= MAX_NAME else f"{name[: MAX_NAME - 3]}..."
+                    out.texts.append((short, points[first : first + count].mean(axis=0), False))
         if look.extremes and frame.values is not None and np.isfinite(frame.values).any():
             for what, find in (("min", np.nanargmin), ("max", np.nanargmax)):
                 k = int(find(frame.values))

@@ -26,7 +26,7 @@ def _picture(kind: Any) -> Any:
 
 
 register_writer(_colored(USDWriter), *SUFFIXES)
-register_writer(_colored(HTMLWriter), ".html")
+register_writer(_colored(HTMLWriter), ".html", ".htm")
 register_writer(_picture(PNGWriter), ".png")
 register_writer(_picture(GIFWriter), ".gif")
 register_writer(lambda path, fields, **options: VTUFile(path, **{"fields": fields} | options), ".vtu")

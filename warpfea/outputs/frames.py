@@ -6,7 +6,7 @@ A writer receives the simulation and reads `time` (B,), of statics `load` (B,), 
 `displacements`, `velocities` and `field`. Bodies without a skin are not drawn.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,10 @@ from ..base.errors import ModelError, OutputError
 from ..model.surfaces import reference_points
 from .obstacles import Obstacles, clip_to_box
 
-__all__ = ["DrawnSurface", "FrameClock", "check_colors", "check_fields", "field_label", "grid_offsets", "is_static"]
+__all__ = [
+    "DrawnSurface", "FrameClock", "check_colors", "check_fields", "field_label", "field_names", "grid_offsets",
+    "is_static",
+]  # fmt: skip
 
 Array = npt.NDArray[Any]
 
@@ -27,6 +30,16 @@ def field_label(sim: Any, name: str) -> tuple[str, str]:
     whole, _, part = name.partition(".")
     spec = sim.fields.get(whole)
     return (f"{spec.title} {part}".rstrip(), spec.units) if spec else (name.replace("_", " "), "")
+
+
+def field_names(fields: Any, color: Any = None) -> list[str]:
+    """Names of the fields of a writer, each once, the shown one too. ModelError for anything else."""
+    names = list(fields) if isinstance(fields, Iterable) and not isinstance(fields, str) else [None]
+    if not all(isinstance(name, str) for name in names):
+        raise ModelError(f"fields must be names of fields, such as ('von_mises',), got {fields!r}")
+    if not isinstance(color, (str, type(None))):
+        raise ModelError(f"color must be the name of a field, or None for grey, got {color!r}")
+    return list(dict.fromkeys([*names, *([color] if color else [])]))
 
 
 def frame_time(sim: Any) -> float:

@@ -17,7 +17,16 @@ from ..base.provenance import versions
 from ..base.writer import Output, check_target, write_atomically
 from ..model.surfaces import reference_points
 from ..simulation.plots import energy_plot, record_plots, run_warnings
-from .frames import DrawnSurface, FrameClock, check_colors, check_fields, field_label, frame_time, is_static
+from .frames import (
+    DrawnSurface,
+    FrameClock,
+    check_colors,
+    check_fields,
+    field_label,
+    field_names,
+    frame_time,
+    is_static,
+)
 from .markers import Markers, group_marks
 from .page import Page, PageSurface
 from .raycaster import DEFAULT_VIEW, check_view
@@ -76,13 +85,14 @@ class HTMLWriter(Output):
         self.path = pathlib.Path(self.path)
         self.rate = FrameClock(self.fps).fps
         self.view, self.color_range = check_view(self.view), check_colors(self.color_range)
-        if isinstance(self.fields, str) or not all(isinstance(name, str) for name in self.fields):
-            raise ModelError(f"fields must be names of fields, such as ('von_mises',), got {self.fields!r}")
-        if not isinstance(self.color, (str, type(None))):
-            raise ModelError(f"color must be the name of a field, or None for grey, got {self.color!r}")
+        names = field_names(self.fields, self.color)
+        if not isinstance(self.title, (str, type(None))) or not isinstance(self.parameters, Mapping):
+            raise ModelError(
+                f"title must be a text and parameters a dictionary, got {self.title!r} and {self.parameters!r}"
+            )
         if not (is_count(self.max_frames) and self.max_frames >= 2):
             raise ModelError(f"max_frames must be at least 2, got {self.max_frames!r}")
-        self._names = list(dict.fromkeys([*([self.color] if self.color else []), *self.fields]))
+        self._names = sorted(names, key=lambda name: name != self.color)
         self._frames: list[_Snapshot] | None = None
 
     def open(self, sim: Any) -> None:
@@ -90,10 +100,14 @@ class HTMLWriter(Output):
         self._target = check_target(self.path, (".html", ".htm"))
         check_fields(sim, self._names)
         count = int(sim.model.worlds)
-        worlds = list(range(min(count, 16)) if self.worlds is None else map(int, self.worlds))
-        if not 0 < len(worlds) <= MAX_WORLDS or min(worlds) < 0 or max(worlds) >= count:
-            raise OutputError(f"worlds: a page shows 1 to {MAX_WORLDS} of the worlds 0 to {count - 1}, got {worlds}")
-        self._worlds = worlds
+        given: Any = range(min(count, 16)) if self.worlds is None else self.worlds
+        worlds = list(given) if np.iterable(given) else []
+        whole = all(is_count(w) and 0 <= w < count for w in worlds) and len(set(worlds)) == len(worlds)
+        if not (whole and 0 < len(worlds) <= MAX_WORLDS):
+            raise OutputError(
+                f"worlds: a page shows 1 to {MAX_WORLDS} of the worlds 0 to {count - 1}, each once, got {given!r}"
+            )
+        self._worlds = worlds = [int(w) for w in worlds]
         self._surface = DrawnSurface(sim, self.spacing)
         self._markers = Markers(sim, self._surface.bodies)
         self._clock = FrameClock(self.fps)
@@ -152,8 +166,8 @@ class HTMLWriter(Output):
         """The page of the frames so far."""
         assert self._frames
         frames = self._frames
-        kept = [(name, value) for name, value in self.parameters.items() if value not in (None, "", [])]
-        pairs = [(name, format_number(v, 6) if isinstance(v, float) else str(v)) for name, v in kept]
+        texts = [(name, format_number(v, 6) if isinstance(v, float) else str(v)) for name, v in self.parameters.items()]
+        pairs = [(str(name), text) for name, text in texts if text not in ("None", "", "[]")]
         page = Page(
             self.title or getattr(sim, "label", "") or pathlib.Path(self.path).stem,
             ", ".join(f"{name} = {value}" for name, value in pairs),
@@ -166,9 +180,9 @@ class HTMLWriter(Output):
         page.plots = record_plots(sim, self._worlds) if recorded else []
         page.plots += energy_plot(page.times, [frame.energies for frame in frames if frame.energies], self._worlds)
         page.warnings = run_warnings(sim)
-        texts = {"simulation": repr(sim) if recorded else "", "command": self.command or ""}
-        texts |= dict(pairs) | versions()
-        page.facts = [(name, text) for name, text in texts.items() if text]
+        facts = {"simulation": repr(sim) if recorded else "", "command": str(self.command or "")}
+        facts |= dict(pairs) | versions()
+        page.facts = [(name, text) for name, text in facts.items() if text]
         return page
 
     def _surfaces(self) -> list[PageSurface]:

@@ -1,6 +1,6 @@
 """Options of pictures: what is drawn beside the surfaces, and from where."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -61,14 +61,8 @@ class Look:
             value = getattr(self, name)
             if not (is_number(value) and (value > 0 or name == "scale")):
                 raise ModelError(f"{name} must be a finite number{' above 0' * (name == 'zoom')}, got {value!r}")
-        if isinstance(self.marks, str):
-            raise ModelError(f"marks must be kinds of marks, such as ('support',), got {self.marks!r}")
+        self._check_lists()
         check_known("colors", self.colors, hex_tables())
-        for name, value in self.opacity.items():
-            if not (is_number(value) and 0.0 <= value <= 1.0):
-                raise ModelError(f"opacity of {name!r} must be a number from 0 to 1, got {value!r}")
-        for kind in self.marks:
-            check_known("marks", kind, KINDS)
         if self.target is not None and (np.shape(self.target) != (3,) or not np.isfinite(self.target).all()):
             raise ModelError(f"target must be three finite numbers, got {self.target!r}")
         if self.percentile is not None:
@@ -78,6 +72,20 @@ class Look:
         if self.cut is not None:
             self.cut_plane()
 
+    def _check_lists(self) -> None:
+        """ModelError for marks, hidden names or opacities that are none."""
+        for name, what in (("marks", "kinds of marks, such as ('support',)"), ("hide", "names, such as ['case']")):
+            given = getattr(self, name)
+            if isinstance(given, str) or not isinstance(given, Iterable):
+                raise ModelError(f"{name} must be {what}, got {given!r}")
+        if not isinstance(self.opacity, Mapping):
+            raise ModelError(f"opacity must be numbers by name, such as {{'case': 0.3}}, got {self.opacity!r}")
+        for name, value in self.opacity.items():
+            if not (is_number(value) and 0.0 <= value <= 1.0):
+                raise ModelError(f"opacity of {name!r} must be a number from 0 to 1, got {value!r}")
+        for kind in self.marks:
+            check_known("marks", kind, KINDS)
+
     def cut_plane(self) -> Any:
         """(4,) direction and place of the section; x beyond it, direction . x > place, is left out."""
         assert self.cut is not None
@@ -86,9 +94,11 @@ class Look:
             sign, axis = tuple(side)
             plane = np.zeros(4)
             plane["xyz".index(axis)] = {"+": 1.0, "-": -1.0}[sign]
+            plane[3] = float(place) * plane[:3].sum()
         except (TypeError, ValueError, KeyError, IndexError):
-            raise ModelError(f"cut must be a side and a place such as ('+y', 0.01), got {self.cut!r}") from None
-        plane[3] = float(place) * plane[:3].sum()
+            plane = np.full(4, np.nan)
+        if not np.isfinite(plane).all():
+            raise ModelError(f"cut must be a side and a place such as ('+y', 0.01), got {self.cut!r}")
         return plane
 
     def check_names(self, names: Sequence[str]) -> None:
@@ -102,3 +112,5 @@ class Look:
             for name in wanted:
                 if name is not None:
                     check_known(option, name, names)
+        if set(names) <= set(self.hide):
+            raise ModelError(f"hide leaves nothing to draw of {', '.join(names)}")

@@ -68,8 +68,10 @@ class Overlay:
                 draw.ellipse(
                     (x - unit, y - unit, x + unit, y + unit), outline=_TEXT_COLOR, width=max(1, round(0.25 * unit))
                 )
-            place = (x + 1.4 * unit if ring else x, y)
-            draw.text(place, text, fill=_TEXT_COLOR, font=font, anchor="lm" if ring else "mm", stroke_width=2,
+            beyond = x + 1.4 * unit + draw.textlength(text, font=font) > size[0]  # then to the left of its point
+            shift, anchor = (-1.4 * unit, "rm") if beyond else (1.4 * unit, "lm")
+            place, anchor = ((x + shift, y), anchor) if ring else ((x, y), "mm")
+            draw.text(place, text, fill=_TEXT_COLOR, font=font, anchor=anchor, stroke_width=2,
                       stroke_fill=(240, 242, 244))  # fmt: skip
         if self.axes is not None:
             _, right, up = camera.axes()

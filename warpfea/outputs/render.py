@@ -133,6 +133,8 @@ class PNGWriter(_PictureWriter):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.time is not None and not is_number(self.time):
+            raise ModelError(f"time must be a finite number of seconds, or None for the last state, got {self.time!r}")
         self.output_times = () if self.time is None else (self.time,)
 
     def write(self, sim: Any) -> None:

@@ -28,12 +28,21 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.background import Background
-from ..base.errors import ModelError, OutputError
+from ..base.errors import OutputError
 from ..base.lazy import pxr
 from ..base.provenance import versions
 from ..base.writer import Output, check_target, temporary_path
 from .colormap import map_colors
-from .frames import DrawnSurface, FrameClock, check_colors, check_fields, field_label, frame_time, is_static
+from .frames import (
+    DrawnSurface,
+    FrameClock,
+    check_colors,
+    check_fields,
+    field_label,
+    field_names,
+    frame_time,
+    is_static,
+)
 from .normals import smooth_corners
 from .obstacles import unique_names
 from .usd_check import error_text, validate_usd
@@ -91,11 +100,7 @@ class USDWriter(Output):
     def __post_init__(self) -> None:
         self.path = pathlib.Path(self.path)
         self.fps = self.rate = FrameClock(self.fps).fps
-        if isinstance(self.fields, str) or not all(isinstance(name, str) for name in self.fields):
-            raise ModelError(f"fields must be names of fields, such as ('von_mises',), got {self.fields!r}")
-        if not isinstance(self.color, (str, type(None))):
-            raise ModelError(f"color must be the name of a field, or None for grey, got {self.color!r}")
-        self.fields = list(dict.fromkeys([*self.fields, *([self.color] if self.color else [])]))
+        self.fields = field_names(self.fields, self.color)
         self.color_range = check_colors(self.color_range)
         self._stage: Any = None
         self._background = Background()

@@ -12,16 +12,20 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
+from ..base.checks import is_count
 from ..base.errors import OutputError
 from ..base.lazy import meshio
 from ..base.writer import Output, check_target, make_folder, write_atomically
 from ..model.surfaces import reference_points
 from ..terms.fields import SYMMETRIC
-from .frames import FrameClock, check_fields, frame_time
+from .frames import FrameClock, check_fields, field_names, frame_time
 from .obstacles import Obstacles
 from .vtk_reader import read_series, symmetric_fields
 
 __all__ = ["VTUFile", "VTUWriter"]
+
+MAX_NAME = 100
+"""Largest length of a body's name in file names, which file systems bound at 255 with the rest."""
 
 
 class VTUWriter(Output):
@@ -60,22 +64,22 @@ class VTUWriter(Output):
             raise OutputError("VTUWriter takes every= or fps=, not both")
         if every is not None and (int(every) != every or every < 1):
             raise OutputError(f"every must be a whole number of steps, at least 1, got {every!r}")
-        self.folder = pathlib.Path(folder)
+        self.folder = pathlib.Path(folder).resolve()  # "" and "." have a name, too
         self.every = int(every or 1)
         self.fps = self.rate = None if fps is None else FrameClock(fps).fps
-        self.fields = [name for name in dict.fromkeys(fields) if name not in ("displacement", "velocity")]
+        self.fields = [name for name in field_names(fields) if name not in ("displacement", "velocity")]
         self.extend = extend
         self._open = False
 
     @property
     def series(self) -> pathlib.Path:
         """The .pvd file."""
-        return self.folder / f"{self.folder.resolve().name}.pvd"
+        return self.folder / f"{self.folder.name}.pvd"
 
     @property
     def collider_series(self) -> pathlib.Path:
         """The .pvd file of the colliders, if any."""
-        return self.folder / f"{self.folder.resolve().name}_colliders.pvd"
+        return self.folder / f"{self.folder.name}_colliders.pvd"
 
     def open(self, sim: Any) -> None:
         check_fields(sim, self.fields, scalar=False)
@@ -123,10 +127,10 @@ class VTUWriter(Output):
 
     @staticmethod
     def _file_names(given: Sequence[str]) -> list[str]:
-        """Names valid in file names, still unique."""
+        """Names valid in file names, cut to MAX_NAME, still unique."""
         names: list[str] = []
         for text in given:
-            name = re.sub(r"[^A-Za-z0-9.-]", "_", text).strip(".") or "body"
+            name = re.sub(r"[^A-Za-z0-9.-]", "_", text[:MAX_NAME]).strip(".") or "body"
             while name.lower() in (other.lower() for other in names):
                 name += "-"
             names.append(name)
@@ -218,13 +222,13 @@ class VTUFile(Output):
 
     def __init__(self, path: str | os.PathLike[str], *, fields: Sequence[str] = ("von_mises",), world: int = 0) -> None:
         self.path = pathlib.Path(path)
-        self.fields = [name for name in dict.fromkeys(fields) if name not in ("displacement", "velocity")]
+        self.fields = [name for name in field_names(fields) if name not in ("displacement", "velocity")]
         self.world = world
 
     def open(self, sim: Any) -> None:
         check_fields(sim, self.fields, scalar=False)
         self._target = check_target(self.path, (".vtu",))
-        if not 0 <= self.world < sim.model.worlds:
+        if not (is_count(self.world) and 0 <= self.world < sim.model.worlds):
             raise OutputError(f"{self.path}: world = {self.world!r} must be a number from 0 to {sim.model.worlds - 1}")
 
     def write(self, sim: Any) -> None:

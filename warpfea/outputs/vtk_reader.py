@@ -15,6 +15,7 @@ import numpy as np
 from ..base.errors import ModelError
 from ..base.lazy import meshio
 from ..base.names import check_known
+from ..mesh.adapter import meshio_errors
 from ..terms.fields import ELEMENT_FIELDS, SYMMETRIC
 
 __all__ = ["SavedResults", "read_results", "read_series", "symmetric_fields"]
@@ -46,7 +47,8 @@ def read_results(path: str | os.PathLike[str]) -> SavedResults:
         path: its .pvd file; or a folder with one of its name.
 
     Raises:
-        ModelError: no such file, or one that is no series of VTUWriter.
+        ModelError: no such file, or one that is no series of VTUWriter. MeshError, when they are asked for: a file of
+            the series that is missing or damaged.
     """
     target = pathlib.Path(path)
     if target.suffix == ".vtu":
@@ -91,10 +93,12 @@ class SavedResults:
         check_known("body", body, self.bodies)
         if body not in self._cached:
             k = self.bodies.index(body) * self.worlds
-            self._cached[body] = [
-                [meshio.read(self._folder / file) for file in files[k : k + self.worlds]] for files in self._frames
-            ]
+            self._cached[body] = [[self._read(file) for file in files[k : k + self.worlds]] for files in self._frames]
         return self._cached[body]
+
+    def _read(self, file: str) -> Any:
+        with meshio_errors(str(self._folder / file)):
+            return meshio.read(self._folder / file)
 
     def positions(self, body: str) -> np.ndarray:
         """Positions (frames, worlds, nodes, 3), m."""

@@ -17,7 +17,7 @@ import scipy.linalg
 import scipy.sparse as sp
 from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh, splu
 
-from ..base.checks import check_positive
+from ..base.checks import check_positive, is_number
 from ..base.errors import ModelError
 from ..base.lazy import require_matplotlib
 from ..base.writer import writer_for
@@ -224,7 +224,7 @@ def modes(
     """
     check_model(model)
     require_density(model.bodies, "modes")
-    if shift is not None and not (np.isfinite(shift) and shift >= 0.0):
+    if shift is not None and not (is_number(shift) and shift >= 0.0):
         raise ModelError(f"modes: shift = {shift!r} must be a frequency, Hz, 0 or more")
     state = model.state() if state is None else state
     system = _linearise("modes", model, state, count, world)
@@ -336,6 +336,8 @@ def _linearise(what: str, model: Model, state: State, count: int, world: int) ->
         raise ModelError(f"{what}: world = {world!r} must be a number from 0 to {model.worlds - 1}")
     if model.dtype != "float64":
         raise ModelError(f"{what}: float32 can't resolve the stiffness; take finalize(dtype='float64')")
+    if not np.isfinite(state.displacement.numpy()[world]).all():
+        raise ModelError(f"{what}: positions of world {world} are not finite in this state")
     index = np.flatnonzero(model.free_slots.ravel())
     if not len(index):
         raise ModelError(f"{what}: every component of every node is prescribed")

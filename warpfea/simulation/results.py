@@ -25,13 +25,13 @@ from ..model.rigid import RigidBody
 from ..model.springs import Bushing, Spring
 from ..model.state import State
 from ..model.surfaces import reference_points
-from ..terms.fields import VECTOR, check_scalar, field_at_nodes, field_at_points, field_inside, find_field
+from ..terms.fields import check_scalar, field_at_nodes, field_at_points, field_inside, find_field
 from ..terms.joint_values import joint_value
 from ..terms.protocols import Touching
 from ..terms.springs import Springs
 from ..terms.term import FieldSpec
 from .reports import ContactRecord, JointRecord, ProbeRecord
-from .sampling import History, Sampler, joint_history
+from .sampling import RECORDED_FIELDS, History, joint_history, sampler
 
 if TYPE_CHECKING:
     from ..model.model import Model
@@ -42,11 +42,6 @@ __all__ = ["PartMember", "Records", "Results"]
 
 MAX_NAMED_BODIES = 5
 """Maximum number of bodies named in a message."""
-RECORDED_FIELDS = {
-    "acceleration": FieldSpec("acceleration", "m/s2", components=VECTOR),
-    "reaction": FieldSpec("reaction", "N", components=VECTOR),
-}
-"""Fields at nodes that need the last step of a simulation."""
 
 
 class Results:
@@ -170,6 +165,8 @@ class Results:
         if self.records and whole in RECORDED_FIELDS and at == "nodes":
             values = self.records.at_nodes(whole, body)
             return np.asarray(spec.function(values)) if spec.function else values
+        if elements is not None and at != "nodes":
+            raise ModelError(f"field: elements= chooses what counts at nodes; take rows {elements!r} of at={at!r}")
         if at != "nodes":
             return field_inside(self.model.terms, name, body, self.state, at)
         if elements is not None and (not isinstance(elements, ElementSet) or elements.body is not body):
@@ -179,8 +176,8 @@ class Results:
 
     def sample(self, points: Any, name: str) -> np.ndarray:
         """A field (B, P), or (B, P, k), at material points: one, or several as `body.at` and `body.line` give them, or
-        nodes of a body."""
-        return Sampler(self.model, points, name).values(self.state)
+        nodes of a body, which "acceleration" and "reaction" take alone."""
+        return sampler(self, points, name)()
 
     def node_gradients(self, body: Body) -> np.ndarray:
         """Deformation gradient F (B, nodes, 3, 3) at the nodes of a body with gradient slots; NaN at others.
@@ -263,8 +260,7 @@ class Records:
         elif name in ("angle", "travel", "length"):
             out = joint_history(self, name, points)
         else:
-            sampler = Sampler(self.model, points, name)
-            out = History(lambda: sampler.values(self.state))
+            out = History(sampler(self.results, points, name))
         self.histories.append(out)
         return out
 

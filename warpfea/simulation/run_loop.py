@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ..base.writer import check_distinct
 from ..kernels.step.step_control import STATUS
 
 __all__ = ["interruptible", "run_steps", "step_bar"]
@@ -29,6 +30,7 @@ def run_steps(
     Raises:
         KeyboardInterrupt: Ctrl-C with steps left; outputs are closed.
     """
+    check_distinct(outputs)
     opened: list[Any] = []
     cut = False
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -9,13 +10,20 @@ import scipy.sparse as sp
 
 from ..base.errors import ModelError
 from ..model.handles import MaterialPoint, NodeSet
-from ..terms.fields import field_at_nodes, field_at_points, find_field
+from ..terms.fields import VECTOR, field_at_nodes, field_at_points, find_field
+from ..terms.term import FieldSpec
 
 if TYPE_CHECKING:
     from ..model.model import Model
     from ..model.state import State
 
-__all__ = ["History", "Sampler", "joint_history"]
+__all__ = ["RECORDED_FIELDS", "History", "Sampler", "joint_history", "sampler"]
+
+RECORDED_FIELDS = {
+    "acceleration": FieldSpec("acceleration", "m/s2", components=VECTOR),
+    "reaction": FieldSpec("reaction", "N", components=VECTOR),
+}
+"""Fields at nodes that need the last step of a simulation."""
 
 
 class PointWeights:
@@ -77,6 +85,17 @@ class Sampler:
         for own, values in found:
             out[:, own] = values
         return out
+
+
+def sampler(results: Any, points: Any, name: str) -> Callable[[], np.ndarray]:
+    """Function of nothing that takes a field at points. ModelError as Sampler, or for points where nodes are needed."""
+    if results.records and isinstance(name, str) and name.partition(".")[0] in RECORDED_FIELDS:
+        find_field(results, name)
+        if not isinstance(points, NodeSet):
+            raise ModelError(f"field {name!r} is one of nodes: take body.nodes, not {points!r}")
+        return lambda: np.asarray(results.field(name, points.body)[:, points.indices])
+    of_points = Sampler(results.model, points, name)
+    return lambda: of_points.values(results.state)
 
 
 class History:

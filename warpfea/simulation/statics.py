@@ -97,7 +97,7 @@ class StaticResult:
         Raises:
             ModelError, OutputError: see the writer; another suffix.
         """
-        writer = writer_for(path, list(fields), **options)
+        writer = writer_for(path, [fields] if isinstance(fields, str) else fields, **options)
         for call in (writer.open, writer.write, writer.close):
             call(self.simulation)
 

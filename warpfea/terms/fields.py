@@ -165,10 +165,10 @@ ELEMENT_FIELDS = {
 def find_field(terms: Any, name: Any) -> FieldSpec:
     """Specification of a field, or of a component of it, "cauchy.xx". Raises ModelError, listing the available names,
     for an unknown one."""
-    whole, _, part = name.partition(".") if isinstance(name, str) else (name, "", "")
+    whole, dot, part = name.partition(".") if isinstance(name, str) else (name, "", "")
     check_known("field", whole, terms.fields)
     spec: FieldSpec = terms.fields[whole]
-    if not part:
+    if not dot:
         return spec
     if part not in spec.components:
         known = [f"{whole}.{c}" for c in spec.components] or ["no components, as it is a scalar"]
