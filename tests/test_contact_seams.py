@@ -143,7 +143,16 @@ SEAMS |= {
     "a fine body before": (slabs(0.002, sides=((16, 12, 1), (8, 6, 1)), element="ENMC"), {}),
     "body of two parts": (one_slab(slabs(0.002)), {}),
 }
-FAST = ("flat", "mesh of two parts", "low wall", "bodies", "bodies, gap", "body of two parts")
+SEAMS |= {
+    f"{kind}, {how}": ([*first[:1], *second[1:]], {})
+    for how, gap in (("flat", 0.0), ("gap", 0.002), ("overlap", -0.01))
+    for kind, first, second in (("box behind", slabs(gap), boxes(gap)), ("box before", boxes(gap), slabs(gap)))
+}
+SEAMS |= {
+    "body in a half-space": ([wf.HalfSpace((0, 0, 1)), slabs()[1]], {}),
+}
+FAST = ("flat", "mesh of two parts", "low wall", "bodies", "bodies, gap", "body of two parts", "box behind, gap",
+        "box before, gap")  # fmt: skip
 
 
 @pytest.mark.parametrize("name", [n if n in FAST else pytest.param(n, marks=pytest.mark.slow) for n in SEAMS])
@@ -165,19 +174,33 @@ def test_a_block_slides_over_a_seam_of_bodies_in_both_precisions(device, dtype):
     assert np.abs(out.spin).max() < 1e-3
 
 
-@pytest.mark.parametrize(
-    ("gap", "reverse"),
-    [(0.0, False), *(pytest.param(*x, marks=pytest.mark.slow) for x in ((0.0, True), (0.002, True)))],
-)
-def test_a_block_slides_between_a_body_and_a_rigid_part(gap, reverse):
-    """In place of a collider at the level of a body, with which 0.36 m/s and 13 rad/s are left: the model says so."""
-    shapes = [slabs(gap)[0], boxes(gap)[1]] if not reverse else [boxes(gap)[0], slabs(gap)[1]]
-    out = sliding(shapes, part=True)
+@pytest.mark.slow
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_block_slides_from_a_body_onto_a_box_in_float32(device):
+    out = sliding(SEAMS["box behind, gap"][0], E=1e7, dtype="float32", device=device)
+    assert out.velocity == pytest.approx([SPEED, 0.0, 0.0], abs=5e-6)
+    assert np.abs(out.spin).max() < 1e-3
+
+
+@pytest.mark.slow
+def test_a_block_slides_from_a_body_onto_a_rigid_part():
+    out = sliding(SEAMS["box behind, gap"][0], part=True)
     assert out.velocity == pytest.approx([SPEED, 0.0, 0.0], abs=1e-9)
     assert np.abs(out.spin).max() < 1e-9
-    if gap == 0.0 and not reverse:
-        with pytest.warns(wf.ModelWarning, match="'block' touches collider 'floor 1' and body 'floor 0', .* part"):
-            sliding(shapes, 0)
+
+
+def test_a_body_that_sinks_leaves_a_real_step():
+    """Level with the box as built, driven 1 mm lower before the block is there: its front stays behind the box."""
+    sink = ([0, 0.008, 1], [(0, 0, 0), (0, 0, -1e-3), (0, 0, -1e-3)])
+    out = sliding(SEAMS["box behind, flat"][0], 40, E=1e9, paths=[sink, None])
+    assert out.edge[:, :, 0].max() < 1e-4
+    assert out.velocity[0] < 0.9 * SPEED
+
+
+def test_a_seam_with_a_collider_that_moves_is_warned_of():
+    """0.36 m/s and 13 rad/s would be left."""
+    with pytest.warns(wf.ModelWarning, match="'block' touches collider 'floor 1', which moves, and body 'floor 0'"):
+        sliding(SEAMS["box behind, flat"][0], 0, paths=[None, CONVEYOR])
 
 
 def test_a_block_slides_onto_a_body_that_came_near_it_later():
@@ -300,6 +323,22 @@ def test_bodies_without_seams_cost_nothing():
         assert bool(term.tables.seams) == seams
         assert len(term.tables.surfaces) == len(shapes)
         assert term.search_kernels.module.name.endswith("_seams") == seams
+
+
+def test_a_body_and_a_collider_apart_cost_nothing():
+    """At another level, or beyond the reach of a seam, no level faces and no levels."""
+    for gap, rise, seam in ((0.0, 0.0, True), (0.1, 0.0, False), (0.0, 1e-3, False)):
+        b = wf.ModelBuilder()
+        block = b.add_solid(wf.mesh.box((SIDE,) * 3, cells=(1, 1, 1), origin=(-0.1, 0, max(rise, 0.0))),
+                            material=wf.SVK(E=1e6, nu=0.3, density=1e3))  # fmt: skip
+        for k, shape in enumerate((slabs()[0], boxes(gap, rise)[1])):
+            b.add_contact(block, added(b, shape, f"floor {k}"))
+        terms = b.finalize(device="cpu").terms
+        facets, colliders = terms.find(FacetContact), terms.find(ColliderContact)
+        assert bool(facets.tables.mixed) == bool(facets.tables.seams) == seam
+        assert colliders.tables.geometry == "colliders" + "_seams" * seam
+        assert len(facets.tables.surfaces) == 1 + seam
+        assert facets.search_kernels.module.name.endswith("_seams") == seam
 
 
 def test_bad_seams_are_refused():

@@ -4,7 +4,7 @@ Broad phase: boxes of master facets (broad_phase.py), and of a mesh (collider_me
 Search: facet of a point (facet_search.py, facet_candidates.py, point_lists.py); edges that cross (edges.py); deepest
     position of a single-point contact (deepest_point.py); points of round parts that roll (rolling.py).
 Projection: on a facet (projection.py); distance from a shape, and the side (colliders.py, collider_shapes.py); seams
-    between shapes (collider_seams.py).
+    between shapes (collider_seams.py), between bodies, and of both (facet_seams.py).
 Kinematics: own side of a point (kinematics.py), of obstacles that move (carriers.py); the geometry of the other side
     fills the record `PointContact` (structs.py): collider_kinematics.py, facet_kinematics.py.
 Law: normal force (law.py); friction (friction.py).

@@ -168,9 +168,9 @@ def collider_kinematics(dtype: str, meshes: bool, seams: bool = False) -> Kernel
         if wp.static(seams):
             start = scr.start_position[world, point]
             if level == -1:
-                level = entered_level(col, world, c, start, y, d, side, swept)
+                level = entered_level(col, world, c, point, start, y, d, side, swept)
             if level < 0:
-                found = foot(col, world, c, start, y, d[3], side)
+                found = foot(col, world, c, point, start, y, d[3], side)
                 if found[3] >= f64(0.0):
                     return found
         return wp.vec4d(f64(0.0), f64(0.0), f64(0.0), f64(level))

@@ -2,12 +2,13 @@
 
 A point that enters a collider by a side face would take its normal, although a neighbour's surface at the same level
 ends there. The neighbours of a contact are the colliders of its body's other contacts, and its own one if that is a
-mesh of several parts; `warpfea/contact/seams.py` lists them. A side face is hidden where a neighbour begins within
-`reach` in front of it, its surface there is across the face, at most `depth` above the point, and the collider's own
-surface is within `seam` of that level: the point takes the collider's surface. At the foot of a real step a higher
-neighbour must not count: the edge of a body that the step holds would gain and lose the support below it within a step
-of time, which has no solution. Where colliders of one level overlap, the higher one acts, or the first of those within
-`seam`. The lower face of a collider that stands on a neighbour is hidden too: points there meet its sides.
+mesh of several parts; `warpfea/contact/seams.py` lists them; -1 stands for a flexible body at the level, whose surface
+each point has from the start of the step. A side face is hidden where a neighbour begins within `reach` in front of it,
+its surface there is across the face, at most `depth` above the point, and the collider's own surface is within `seam`
+of that level: the point takes the collider's surface. At the foot of a real step a higher neighbour must not count: the
+edge of a body that the step holds would gain and lose the support below it within a step of time, which has no
+solution. Where colliders of one level overlap, the higher one acts, or the first of those within `seam`. The lower face
+of a collider that stands on a neighbour is hidden too: points there meet its sides.
 """
 
 import functools
@@ -37,9 +38,16 @@ def seam_functions(meshes: bool) -> KernelSet:
     distance, side_facing, height_beside = g.distance, g.side_facing, g.height_beside
 
     @wp.func
-    def from_neighbor(col: Colliders, world: int, kc: int, b: int, y: vec3d, way: vec3d) -> wp.vec4d:
+    def from_neighbor(
+        col: Colliders, world: int, kc: int, point: int, b: int, start: vec3d, y: vec3d, way: vec3d
+    ) -> wp.vec4d:  # fmt: skip
         """Normal and signed distance of collider b at a position, within it of the side along `way`, if that is not 0;
-        all in the frame of collider kc."""
+        all in the frame of collider kc. b = -1: of the body beside it, for a point from `start`."""
+        if b < 0:
+            level = col.body_level[world, point]
+            up = wp.transpose(col.rotation[world, kc]) * vec3d(level[0], level[1], level[2])
+            height = wp.where(wp.length_sq(up) > f64(0.0), level[3] + wp.dot(up, y - start), f64(1.0e30))
+            return wp.vec4d(up[0], up[1], up[2], height)
         R = wp.transpose(col.rotation[world, kc]) * col.rotation[world, b]
         x = col.rotation[world, kc] * y + col.position[world, kc]
         place = wp.transpose(col.rotation[world, b]) * (x - col.position[world, b])
@@ -50,7 +58,7 @@ def seam_functions(meshes: bool) -> KernelSet:
         return wp.vec4d(n[0], n[1], n[2], found[3])
 
     @wp.func
-    def level_sheet_side(col: Colliders, world: int, c: int, start: vec3d, y: vec3d, side: int) -> int:
+    def level_sheet_side(col: Colliders, world: int, c: int, point: int, start: vec3d, y: vec3d, side: int) -> int:
         """Side of a sheet below which a point comes from beside it, from a neighbour at the same level; -1: none.
 
         Args:
@@ -65,7 +73,8 @@ def seam_functions(meshes: bool) -> KernelSet:
         n = vec3d(d[0], d[1], d[2])
         sign = wp.where(side == -3, f64(1.0), f64(-1.0))
         for e in range(col.neighbor_start[c], col.neighbor_start[c + 1]):
-            found = from_neighbor(col, world, kc, col.neighbor[e], y - lengths[1] * wp.normalize(y - start), vec3d())
+            at = y - lengths[1] * wp.normalize(y - start)
+            found = from_neighbor(col, world, kc, point, col.neighbor[e], start, at, vec3d())
             across = wp.abs(wp.dot(vec3d(found[0], found[1], found[2]), n)) > f64(MIN_CROSS_COSINE)
             if across and d[3] <= wp.min(wp.abs(found[3]) + lengths[0], lengths[2]):
                 return side_facing(col, kc, y, -sign * n, sign)
@@ -90,7 +99,7 @@ def seam_functions(meshes: bool) -> KernelSet:
         for e in range(col.neighbor_start[c], col.neighbor_start[c + 1]):
             b = col.neighbor[e]
             if col.neighbor_shares[e] != 0:
-                found = from_neighbor(col, world, kc, b, y, n)
+                found = from_neighbor(col, world, kc, 0, b, y, y, n)
                 first = found[3] < gap - seam or (found[3] <= gap + seam and b < kc)
                 first = first and found[3] >= gap - lengths[2]  # not the top of a wall
                 if first and found[3] < f64(0.0) and wp.dot(vec3d(found[0], found[1], found[2]), n) > f64(LEVEL_COSINE):
@@ -98,10 +107,13 @@ def seam_functions(meshes: bool) -> KernelSet:
         return False
 
     @wp.func
-    def level_side(col: Colliders, world: int, c: int, y: vec3d, n: vec3d, gap: f64) -> int:
+    def level_side(
+        col: Colliders, world: int, c: int, point: int, start: vec3d, y: vec3d, n: vec3d, gap: f64
+    ) -> int:  # fmt: skip
         """Side of a contact's collider at the level of a neighbour that hides a side face; -1: it is not hidden.
 
         Args:
+            start: as of `entered_level`.
             y: position in the collider's frame, behind a face of unit normal n by -`gap`, m.
         """
         kc = col.of_contact[c]
@@ -109,7 +121,8 @@ def seam_functions(meshes: bool) -> KernelSet:
             return -1
         lengths = col.seam_lengths[c]
         for e in range(col.neighbor_start[c], col.neighbor_start[c + 1]):
-            found = from_neighbor(col, world, kc, col.neighbor[e], y + (lengths[1] - gap) * n, vec3d())
+            at = y + (lengths[1] - gap) * n
+            found = from_neighbor(col, world, kc, point, col.neighbor[e], start, at, vec3d())
             level = vec3d(found[0], found[1], found[2])
             within = found[3] <= lengths[0] and found[3] >= -lengths[2]
             if within and wp.abs(wp.dot(level, n)) < f64(MIN_CROSS_COSINE):
@@ -120,7 +133,9 @@ def seam_functions(meshes: bool) -> KernelSet:
         return -1
 
     @wp.func
-    def foot(col: Colliders, world: int, c: int, start: vec3d, y: vec3d, gap: f64, side: int) -> wp.vec4d:
+    def foot(
+        col: Colliders, world: int, c: int, point: int, start: vec3d, y: vec3d, gap: f64, side: int
+    ) -> wp.vec4d:  # fmt: skip
         """Shift of a point at the foot of a contact's collider that stands on a neighbour, within `seam` of its level,
         to `seam` above that, m, and the side that it meets there, as its lower face is hidden; -1: none.
 
@@ -135,7 +150,7 @@ def seam_functions(meshes: bool) -> KernelSet:
         if not solid or gap > lengths[0]:
             return wp.vec4d(f64(0.0), f64(0.0), f64(0.0), f64(-1.0))
         for e in range(col.neighbor_start[c], col.neighbor_start[c + 1]):
-            found = from_neighbor(col, world, kc, col.neighbor[e], y, vec3d())
+            found = from_neighbor(col, world, kc, point, col.neighbor[e], start, y, vec3d())
             level = vec3d(found[0], found[1], found[2])
             lift = (lengths[0] - found[3]) * level
             if col.neighbor[e] == kc or found[3] > lengths[0] or found[3] < -lengths[2]:
@@ -152,7 +167,7 @@ def seam_functions(meshes: bool) -> KernelSet:
 
     @wp.func
     def entered_level(
-        col: Colliders, world: int, c: int, start: vec3d, y: vec3d, d: wp.vec4d, side: int, swept: int
+        col: Colliders, world: int, c: int, point: int, start: vec3d, y: vec3d, d: wp.vec4d, side: int, swept: int
     ) -> int:  # fmt: skip
         """Side at the level of a neighbour for a point that enters a contact's collider; -1: none.
 
@@ -161,10 +176,10 @@ def seam_functions(meshes: bool) -> KernelSet:
             d: normal and gap at y. side, swept: of the collider at the start, see `stored_side`, and at y.
         """
         if d[3] < f64(0.0) and swept != -2 and (swept != side or side < 0):
-            return level_side(col, world, c, y, vec3d(d[0], d[1], d[2]), d[3])
+            return level_side(col, world, c, point, start, y, vec3d(d[0], d[1], d[2]), d[3])
         if wp.static(meshes):
             if d[3] >= f64(0.0) and swept == -1:
-                return level_sheet_side(col, world, c, start, y, side)
+                return level_sheet_side(col, world, c, point, start, y, side)
         return -1
 
     return kernel_set(locals())

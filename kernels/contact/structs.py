@@ -268,9 +268,11 @@ def collider_struct(meshes: bool):
         deepest: wp.array3d(dtype=wp.float64)  # [world, collider, 6] largest depth of points by sides that face along
         # -x, x, -y, y, -z, z of its axes, at the start of the attempt, m
         neighbor_start: wp.array(dtype=wp.int32)  # [contact + 1] its first neighbour; with the next three: seams
-        neighbor: wp.array(dtype=wp.int32)  # collider
+        neighbor: wp.array(dtype=wp.int32)  # collider; -1: flexible bodies
         neighbor_shares: wp.array(dtype=wp.int32)  # 1: the body's contact with it has the same points
         seam_lengths: wp.array(dtype=wp.vec3d)  # [contact] seam, reach, depth, see collider_seams.py, m
+        body_level: wp.array2d(dtype=wp.vec4d)  # [world, point] normal of the neighbouring body's surface, and height
+        # above it at the start of the attempt, m; 0: none
 
     if meshes:
         Colliders.__annotations__["mesh"] = mesh_struct()

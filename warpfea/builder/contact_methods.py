@@ -67,9 +67,10 @@ class ContactMethods:
             overlap: initial overlap: "refuse"; "offset": stored, decaying in `overlap_time`, s (statics: load factor);
                 "auto": stored and said up to 5 % of the smallest edge of a face and 25 % of the depth of an element.
             seam: largest difference of level, m, at which the body passes from one of its colliders to the next, fixed
-                to it, or from one other body to the next, as over one surface, also over a gap of up to a fifth of the
-                surface's width; None: a thousandth of the width, the second largest edge of the surface's bounding box.
-                More is a step with a side face. 0 or above, not for obstacles narrower than the facets.
+                to it, or from one other body to the next, or to a collider at rest level with it as built, as over one
+                surface, also over a gap of up to a fifth of the surface's width; None: a thousandth of the width, the
+                second largest edge of the surface's bounding box. More is a step with a side face. 0 or above, not for
+                obstacles narrower than the facets.
             clipping: True: sharp edges of an obstacle bear on the surface within its facets, too, by points of their
                 own at most half a facet apart (overhangs, table edges, knife edges), which cost as a contact between
                 bodies; not of moving colliders. Facets of bodies that begin near each other cut each other: a

@@ -24,7 +24,7 @@ from ..model.rolling import RollingContact
 from ..model.shapes import HalfSpace, Shape
 from ..model.triangle_mesh import TriMesh
 from ..terms.time_law_table import TimeLawTable
-from .seams import seam_tables
+from .seams import mixed_seams, seam_tables
 from .tables import WORLD_PARAMETERS, FacetTables, check_chosen_values, clamped_slots
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ class ContactTables(FacetTables[Contact]):
 
     Attributes:
         colliders: descriptions. shapes: on the device, without poses. collider_laws: with the numbers of their laws.
-        seams: neighbours of the contacts, None if no contact has one.
+        seams: neighbours of the contacts, None if no contact has one. mixed: seams with bodies.
         clamped_point_counts: number of points per contact excluded because all their slots are clamped.
     """
 
@@ -57,7 +57,8 @@ class ContactTables(FacetTables[Contact]):
         self.stored_sides = len(self.colliders)
         self.clamped = clamped_slots(model)
         self.clamped_point_counts: list[int] = []
-        self.seams = seam_tables(self.contacts, [p.X.reshape(-1, 3) for p in self.host])
+        self.mixed = model.cache.setdefault("mixed seams", mixed_seams(model.description))
+        self.seams = seam_tables(self.contacts, [p.X.reshape(-1, 3) for p in self.host], self.mixed)
         self.area_fractions = [self._area_fraction(*row) for row in zip(self.contacts, self.host, self.region_areas)]
 
     @property

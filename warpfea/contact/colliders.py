@@ -34,7 +34,6 @@ from .evaluation import (
     store_overlaps,
     touching_depth,
 )
-from .seams import warn_of_mixed_seams
 from .term import ContactTerm, contact_columns
 
 if TYPE_CHECKING:
@@ -64,7 +63,6 @@ class ColliderContact(ContactTerm, DifferentiableColliders):
 
     def __init__(self, model: Model) -> None:
         tables = ContactTables(model)
-        warn_of_mixed_seams(model.description)
         super().__init__(model, tables, tables.geometry)
         self.pose_kernels = pose_kernels(tables.has_meshes)
         self.deepest_kernels: Any = None
@@ -97,6 +95,8 @@ class ColliderContact(ContactTerm, DifferentiableColliders):
         for name in ("position", "rotation", "translation", "rotation_change", "angle"):
             setattr(other, name, make(name, shape, struct.vars[name].type.dtype))
         other.deepest = make("deepest", (*shape, 6), wp.float64)
+        if self.tables.mixed:
+            other.body_level = make("body_level", (self.model.worlds, self.tables.points), wp.vec4d)
 
     def modules(self, ctx: StepContext) -> Iterable[wp.Module]:
         own = [kernels.module for kernels in (self.deepest_kernels, self.rolling_kernels) if kernels]

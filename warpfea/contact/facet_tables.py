@@ -23,7 +23,7 @@ from ..model.pairs import (
     master_facets,
     monomial_exponents,
 )
-from .seams import facet_seam_tables
+from .seams import LevelFacets, MixedSeam, facet_seam_tables
 from .tables import TOUCHING_DEPTH_RATIO, WORLD_PARAMETERS, FacetTables, clamped_slots
 
 if TYPE_CHECKING:
@@ -48,7 +48,8 @@ class PairTables(FacetTables[FacetOptions]):
 
     Attributes:
         surfaces, masters: distinct master surfaces, and those of seams, and their facets; master_of: master surface of
-            each contact. seams: neighbours of the contacts, empty if there are none.
+            each contact. seams: neighbours of the contacts, empty if there are none. mixed: those with colliders,
+            whose level faces are among the surfaces.
         facets: number of master facets. bodies: bodies in a pair.
         collider_laws: all colliders with the numbers of their time laws, if poses follow from these alone.
         carriers: obstacles that move with points on them; carrier_laws: numbers of their time laws.
@@ -57,10 +58,13 @@ class PairTables(FacetTables[FacetOptions]):
 
     def __init__(self, model: Model) -> None:
         super().__init__(model, model.description.contacts_of(FacetOptions))
-        self.surfaces: list[SurfaceSet] = []
-        self.master_of = [self._number(contact.facets) for contact in self.contacts]
-        self.seams = facet_seam_tables(self.contacts, self._number)
-        self.masters: list[MasterFacets] = [master_facets(surface) for surface in self.surfaces]
+        self.surfaces: list[Any] = []
+        self.master_of = [self.number_of(contact.facets) for contact in self.contacts]
+        self.mixed: list[MixedSeam] = model.cache.get("mixed seams", [])
+        self.seams = facet_seam_tables(self.contacts, self.number_of, self.mixed)
+        self.masters: list[MasterFacets] = [
+            s.facets() if isinstance(s, LevelFacets) else master_facets(s) for s in self.surfaces
+        ]
         self._check_clamped()
         self.area_fractions = [f * p.area / area for f, p, area in zip(self.factors, self.host, self.region_areas)]
         self.edges = [contact.sharp_edges() for contact in self.contacts]
@@ -73,7 +77,7 @@ class PairTables(FacetTables[FacetOptions]):
         moving = [c.sides[1] for c in self.contacts if c.grounded and c.sides[1].moves]
         self.carriers: list[Collider] = list(dict.fromkeys(moving))
 
-    def _number(self, surface: SurfaceSet) -> int:
+    def number_of(self, surface: SurfaceSet | LevelFacets) -> int:
         """Number of a surface among those with facets."""
         for k, other in enumerate(self.surfaces):
             if other.body is surface.body and np.array_equal(other.faces, surface.faces):
@@ -246,7 +250,9 @@ class PairTables(FacetTables[FacetOptions]):
                 "exponents": power,
                 "hull_coefficients": hull,
                 "depth_limit": concatenated("depth_limit"),
-                "element_depth": np.concatenate([element_depths(s) for s in self.surfaces]),
+                "element_depth": np.concatenate(
+                    [np.ones(len(s.faces)) if isinstance(s, LevelFacets) else element_depths(s) for s in self.surfaces]
+                ),
                 "side_length": concatenated("size"),
                 "surface": np.repeat(np.arange(len(counts)), counts),
                 "half_angle": np.concatenate([mas.half_angle for mas in all_of], axis=1),

@@ -30,7 +30,9 @@ from ..model.pairs import FacetOptions
 from ..model.state import State, view_as_words
 from ..terms.protocols import Coupled, Tied
 from ..terms.term import StepContext, part
+from .body_levels import BodyLevels
 from .collider_tables import poses_by_laws
+from .colliders import ColliderContact
 from .evaluation import contact_field, evaluate_pairs, refuse_deep_overlaps, store_overlaps, touching_depth
 from .facet_adjoint import DifferentiableFacets
 from .facet_tables import PairTables
@@ -121,6 +123,9 @@ class FacetContact(ContactTerm, DifferentiableFacets, Tied, Coupled):
         s["tree"] = self._build_tree(s["pair"])
         s["masters"] = self.tables.master_data(s["tree"].id)
         s["other"].masters, s["other"].scratch = s["masters"], s["pair"]
+        if self.tables.mixed:
+            colliders = self.model.terms.find(ColliderContact)
+            s["levels"] = BodyLevels(ctx, s, self.tables, ctx.scratch[colliders.name], colliders.tables)
 
     def _build_tree(self, pair: Any) -> wp.Bvh:
         """Bounding volume hierarchy of the facets in the reference; one group per world and surface."""
@@ -152,6 +157,7 @@ class FacetContact(ContactTerm, DifferentiableFacets, Tied, Coupled):
         own += [edge_record_kernels()] if self._edge_columns is not None else []
         own += [self.edge_kernels] if self.tables.edge_groups else []
         own += [carrier_kernels(self.model.dtype)] if self.tables.carriers else []
+        own += [ctx.scratch[self.name]["levels"].kernels] if self.tables.mixed else []
         return [*super().modules(ctx), *(kernels.module for kernels in own)]
 
     def start(self, ctx: StepContext, active: wp.array) -> None:
@@ -203,6 +209,8 @@ class FacetContact(ContactTerm, DifferentiableFacets, Tied, Coupled):
         dim = (self.model.worlds, self.tables.facets, s["masters"].max_monomials)
         args = [s["masters"], state.displacement, state.velocity, active, s["pair"]]
         ctx.launch(self.search_kernels.initial_coefficients, dim, args)
+        if self.tables.mixed:
+            s["levels"].find(active)
         for group, edges in self.tables.edge_groups:
             args = [self.tables.data, s["masters"], edges, group.data, s["history"], s["other"].history, s["clock"]]
             args += [state.displacement, active, s["attempt"], s["pair"]]

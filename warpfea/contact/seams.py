@@ -17,15 +17,14 @@ from ..base.errors import ModelWarning
 from ..kernels.contact.collider_seams import LEVEL_COSINE
 from ..kernels.contact.collider_shapes import BOX, CYLINDER, HALF_SPACE, MESH
 from ..model.assembly import connected_components
-from ..model.contact_points import ContactPoints
 from ..model.contacts import Collider, Contact
 from ..model.description import Description
 from ..model.handles import SurfaceSet
-from ..model.pairs import FacetOptions, pair_points
+from ..model.pairs import FacetOptions, MasterFacets, facet_point_areas, pair_points
 from ..model.shapes import HalfSpace, Shape
 from ..model.triangle_mesh import TriMesh
 
-__all__ = ["SEAM_RATIO", "SeamTables", "facet_seam_tables", "seam_tables", "warn_of_mixed_seams"]
+__all__ = ["SEAM_RATIO", "LevelFacets", "MixedSeam", "SeamTables", "facet_seam_tables", "mixed_seams", "seam_tables"]
 
 SEAM_RATIO = 1e-3
 """Default `seam` over the width of a surface: the second largest edge of its bounding box."""
@@ -46,7 +45,7 @@ class SeamTables:
 
     Attributes:
         neighbor_start: (contacts + 1,) first neighbour of each contact.
-        neighbor: colliders. neighbor_shares: 1 where the body's contact with it has the same points.
+        neighbor: colliders, -1: bodies. neighbor_shares: 1 where the body's contact with it has the same points.
         seam_lengths: (contacts, 3) `seam`, reach and depth, m.
     """
 
@@ -56,14 +55,57 @@ class SeamTables:
     seam_lengths: np.ndarray
 
 
-def seam_tables(contacts: Sequence[Contact], surfaces: Sequence[np.ndarray]) -> SeamTables | None:
+@dataclass(frozen=True, eq=False)
+class LevelFacets:
+    """Triangles of an obstacle that continue a surface of a body, as facets without slots.
+
+    Attributes:
+        body: that body. faces: (T, 9) corners, m. normal: of all. width: of the body that slides on both, m.
+    """
+
+    body: Any
+    faces: np.ndarray
+    normal: np.ndarray
+    width: float
+
+    def facets(self) -> MasterFacets:
+        """As polynomials 1, b, a of the coordinates a, b; their size enlarges no box."""
+        x, count = self.faces.reshape(-1, 3, 3), len(self.faces)
+        n, none = np.zeros_like(x), np.zeros((count, 3, 1))
+        n[:, 0] = self.normal
+        X = np.stack([x[:, 0], x[:, 2] - x[:, 0], x[:, 1] - x[:, 0]], axis=1)
+        depth = np.full(count, 2.0 * DEPTH_RATIO * self.width)
+        conn = np.zeros((count, 1), dtype=np.int64)
+        return MasterFacets(conn, none, none, X, n, 3, 1, np.zeros(count), depth, np.zeros((4, count)))
+
+
+@dataclass(frozen=True, eq=False)
+class MixedSeam:
+    """A collider and a body at one level, both touched by another body.
+
+    Attributes:
+        contact: of that one with the collider. surface: of the body at the level. level: of the collider.
+        reach: widest gap, m and over the side of the body's facets.
+    """
+
+    contact: Contact
+    surface: SurfaceSet
+    level: LevelFacets
+    reach: tuple[float, float]
+
+
+def seam_tables(
+    contacts: Sequence[Contact], surfaces: Sequence[np.ndarray], mixed: Sequence[MixedSeam]
+) -> SeamTables | None:
     """Neighbours of the contacts; None if none has any.
 
     Args:
         surfaces: (n, 3) points of each contact, m.
     """
+    beside = [seam.contact for seam in mixed if seam.contact.collider.shape.kind != HALF_SPACE]
     width = np.array([np.sort(np.ptp(X, axis=0))[1] for X in surfaces])
     found = [_neighbors(contact, contacts, REACH_RATIO * w) for contact, w in zip(contacts, width)]
+    found = [rows + [(-1, 0)] * (contact in beside) for rows, contact in zip(found, contacts)]
     if not any(found):
         return None
     lengths = width[:, None] * (SEAM_RATIO, REACH_RATIO, DEPTH_RATIO)
@@ -88,46 +130,60 @@ def _neighbors(contact: Contact, contacts: Sequence[Contact], reach: float) -> l
     return list(out.items())
 
 
-def warn_of_mixed_seams(description: Description) -> None:
-    """Warn of a body above a collider and another body whose faces are at one level: it would meet their side faces.
+def mixed_seams(description: Description) -> list[MixedSeam]:
+    """Bodies above a collider and another body whose faces are at one level.
 
     Warns:
-        ModelWarning: names all three.
+        ModelWarning: a collider that moves: what slides meets a side face.
     """
     pairs = [c for c in description.contacts_of(FacetOptions) if not c.grounded]
+    out = []
     for contact in description.contacts_of(Contact):
         body, collider = contact.body, contact.collider
-        near = [s for c in pairs if body in c.sides for s in c.surfaces if s.body is not body]
+        near = {_key(s): s for c in pairs if body in c.sides for s in c.surfaces if s.body is not body}
         if not near or collider.shape.kind not in EDGED:
             continue
         X = pair_points(contact.surface).X.reshape(-1, 3)
-        for surface in near:
-            if _continues(collider.shape, pair_points(surface), X, float(np.sort(np.ptp(X, axis=0))[1])):
-                warnings.warn(
-                    f"body {body.name!r} touches collider {collider.name!r} and body {surface.body.name!r}, which are "
-                    "at one level: what slides from one to the other meets a side face; make the collider a rigid "
-                    "part, b.add_rigid(shape, ...) with its nodes clamped: seams of parts and bodies are passed",
-                    ModelWarning,
-                    stacklevel=2,
-                )
+        width = float(np.sort(np.ptp(X, axis=0))[1])
+        for surface in near.values():
+            seam = SEAM_RATIO * width if contact.seam is None else contact.seam
+            level = _continued(collider.shape, surface, X, width, seam)
+            if level is None:
+                continue
+            if not collider.moves:
+                size = math.sqrt(facet_point_areas(surface).sum(axis=1).min())
+                reach = REACH_RATIO * width
+                out.append(MixedSeam(contact, surface, level, (reach, reach / size)))
+                continue
+            warnings.warn(
+                f"body {body.name!r} touches collider {collider.name!r}, which moves, and body {surface.body.name!r}, "
+                "which are at one level: what slides from one to the other meets a side face; make the collider a "
+                "rigid part, b.add_rigid(shape, ...) with its nodes driven: seams of parts and bodies are passed",
+                ModelWarning,
+                stacklevel=2,
+            )
+    return out
 
 
-def _continues(shape: Shape, p: ContactPoints, above: np.ndarray, width: float) -> bool:
-    """True if facets of a body are in the plane of a flat face of a shape, near it, and all points `above` on it."""
+def _continued(shape: Shape, surface: SurfaceSet, above: np.ndarray, width: float, seam: float) -> LevelFacets | None:
+    """The flat face of a shape that facets of a body continue, near it, with all points `above` on it, or None."""
+    p = pair_points(surface)
     size = float(np.ptp(p.X.reshape(-1, 3), axis=0).max())
     points, triangles = shape.mesh(size=4.0 * size, around=p.X[0, 0]) if isinstance(shape, HalfSpace) else shape.mesh()
-    reach, seam = REACH_RATIO * width, SEAM_RATIO * width
+    reach = REACH_RATIO * width
     if len(triangles) > MAX_FLAT or not _boxes_are_near(points, p.X.reshape(-1, 3), reach):
-        return False
-    for x in points[triangles]:
-        n = np.cross(x[1] - x[0], x[2] - x[0])
-        n /= np.linalg.norm(n)
+        return None
+    corners = points[triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    for x, n in zip(corners, normals):
         level = (np.abs((p.X - x[0]) @ n) <= seam).all(axis=1) & (p.normal[:, 0] @ n > LEVEL_COSINE)
         low, high = p.X[level].min(axis=1) - reach, p.X[level].max(axis=1) + reach
         near = ((low <= x.max(axis=0)) & (high >= x.min(axis=0))).all(axis=1)
         if near.any() and ((above - x[0]) @ n).min() > -seam:
-            return True
-    return False
+            flush = (np.abs((corners - x[0]) @ n) <= seam).all(axis=1) & (normals @ n > LEVEL_COSINE)
+            return LevelFacets(surface.body, corners[flush].reshape(-1, 9), n, width)
+    return None
 
 
 def _same_path(a: Collider, b: Collider) -> bool:
@@ -161,14 +217,16 @@ def _boxes_are_near(p: np.ndarray, q: np.ndarray, reach: float) -> bool:
     return bool(np.all(p.min(axis=0) <= q.max(axis=0) + reach) and np.all(q.min(axis=0) <= p.max(axis=0) + reach))
 
 
-def facet_seam_tables(contacts: Sequence[FacetOptions], number: Callable[[SurfaceSet], int]) -> dict[str, np.ndarray]:
+def facet_seam_tables(
+    contacts: Sequence[FacetOptions], number: Callable[[Any], int], mixed: Sequence[MixedSeam]
+) -> dict[str, np.ndarray]:
     """Neighbours of both sides of contacts between bodies, as fields of `master_struct`; empty if none has any.
 
     Neighbours of a side are surfaces near it that the body of the other side touches, too, at any distance where the
-    contact has a `seam`, and the parts of its own.
+    contact has a `seam`, and the parts of its own; of a side that a collider continues that one's level faces.
 
     Args:
-        number: number of a surface, which then has facets.
+        number: number of a surface or of level facets, which then has facets.
     """
     touched: dict[int, dict[Any, SurfaceSet]] = {}
     for contact in contacts:
@@ -184,21 +242,22 @@ def facet_seam_tables(contacts: Sequence[FacetOptions], number: Callable[[Surfac
             points[key] = np.stack([X.min(axis=0), X.max(axis=0)])
         return points[key]
 
-    rows: list[list[SurfaceSet]] = []
+    rows: list[list[Any]] = []
     lengths = np.zeros((2 * len(contacts), 3))
     for contact in contacts:
         for side, other in ((contact.surfaces[k], contact.surfaces[-1 - k]) for k in (-1, 0)):
             near: list[SurfaceSet] = []
             if not contact.grounded:
                 near = [s for key, s in touched[other.body.index].items() if key != _key(side) or _has_parts(s)]
-            if near:
+            continued = [m.level for m in mixed if m.contact.body is other.body and _key(m.surface) == _key(side)]
+            if near or continued:
                 width = float(np.sort(np.ptp(box(other), axis=0))[1])
                 lengths[len(rows)] = width * np.array((SEAM_RATIO, REACH_RATIO, DEPTH_RATIO))
                 reach = math.inf if contact.seam is not None else REACH_RATIO * width
                 near = [s for s in near if _boxes_are_near(box(s), box(side), reach)]
             if contact.seam is not None:
                 lengths[len(rows), 0] = contact.seam
-            rows.append([s for s in near if max(_corners(s), _corners(side)) == 1])
+            rows.append([*(s for s in near if max(_corners(s), _corners(side)) == 1), *continued])
     if not any(rows):
         return {}
     sides = [contact.surfaces[k] for contact in contacts for k in (-1, 0)]

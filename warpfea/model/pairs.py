@@ -27,6 +27,7 @@ __all__ = [
     "FacetOptions",
     "MasterFacets",
     "PairContact",
+    "facet_point_areas",
     "master_facets",
     "pair_points",
     "slave_and_master",
