@@ -11,6 +11,7 @@ import warpfea as wf
 from warpfea.outputs.frames import DrawnSurface
 from warpfea.outputs.obstacles import Obstacles
 from warpfea.outputs.render import render_usd
+from warpfea.simulation.results import Results
 
 DEPTH = 1e-3
 RUBBER = wf.SVK(E=1e6, nu=0.3, density=1000.0)
@@ -77,6 +78,9 @@ def test_bodies_and_models_without_contact():
     sim.step()
     assert not sim.field("contact_pressure", free).any()
     assert np.isnan(sim.field("gap", free)).all()
+    part = b.add_rigid(wf.Box((6, 0, 0), (1, 1, 1)), density=1e3)
+    with pytest.raises(wf.ModelError, match="field 'gap' of rigid part 'rigid' is one of its nodes"):
+        Results(model := b.finalize(device="cpu"), model.state()).sample(part.at((6, 0, 0)), "gap")
     b = wf.ModelBuilder()
     b.add_solid(wf.mesh.box((1, 1, 1), cells=(1, 1, 1)), material=RUBBER)
     sim = wf.Simulation(b.finalize(device="cpu"), dt=1e-3)

@@ -123,11 +123,14 @@ def test_surfaces_that_enclose_nothing_are_refused_before_anything_is_meshed(tmp
         with pytest.raises(MeshError, match=text):
             from_surface(given, size=0.02)
     quads = np.hstack([triangles, triangles[:, :1]])
-    for given in (3, (points,), (points, quads), (points[:, :2], triangles), (points, triangles + 1), (points, [])):
+    bad = np.where(points > 0.04, np.nan, points)
+    for given in (3, (points,), (points, quads), (points[:, :2], triangles), (points, triangles + 1), (bad, triangles)):
         with pytest.raises(MeshError, match=r"a surface is a file, or points \(n, 3\) and triangles \(m, 3\)"):
             from_surface(given, size=0.02)
     with pytest.raises(MeshError, match="element = 'T5' must be"):
         from_surface((points, triangles), size=0.02, element="T5")
+    with pytest.raises(MeshError, match=r"size = 20 m is more than the whole surface, 0\.17"):
+        from_surface((points, triangles), size=20.0)
     with pytest.raises(MeshError, match="size must be positive"):
         from_surface((points, triangles), size=0.0)
     monkeypatch.setitem(sys.modules, "pytetwild", None)
@@ -143,8 +146,10 @@ class Mesher:
 
     def tetrahedralize(self, points, triangles, *, edge_length_abs, epsilon, vtk_ordering):
         assert vtk_ordering  # else volumes are negative
-        mesh = wf.mesh.sphere(0.05 * self.factor, cells=6, element="T4")
-        return mesh.points, mesh.cells
+        mesh = wf.mesh.sphere(0.5 * self.factor, cells=6, element="T4")
+        assert np.linalg.norm(np.ptp(points, axis=0)) == pytest.approx(1.0)  # whatever the unit
+        assert edge_length_abs == pytest.approx(0.2 * np.ptp(points[:, 0]))
+        return np.ptp(points[:, 0]) * mesh.points, mesh.cells
 
 
 def test_the_volume_of_the_mesh_is_that_of_the_surface(tmp_path, monkeypatch):
@@ -178,9 +183,8 @@ def test_a_surface_runs_from_the_command_line(tmp_path, capfd, monkeypatch):
     triangles = mesh.faces(mesh.boundary())
     path = tmp_path / "bar.stl"
     meshio.Mesh(1e3 * mesh.points, [("triangle", triangles)]).write(path)
-    monkeypatch.setitem(
-        sys.modules, "pytetwild", SimpleNamespace(tetrahedralize=lambda *_, **__: (mesh.points, mesh.cells))
-    )
+    unit = mesh.points / np.linalg.norm(np.ptp(mesh.points, axis=0))
+    monkeypatch.setitem(sys.modules, "pytetwild", SimpleNamespace(tetrahedralize=lambda *_, **__: (unit, mesh.cells)))
     words = ["run", str(path), "--material", "svk:E=1e7,nu=0", "--gravity", "0,0,0", "--device", "cpu"]
     code, _, err = run(capfd, *words)
     assert code == 2

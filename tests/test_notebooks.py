@@ -51,8 +51,9 @@ def test_tables_and_plot_of_a_run(model):
     assert z == pytest.approx(sim.probe("tip").displacement[0, :, 2], rel=1e-5)
     counts = {line.get_label(): line.get_ydata() for line in figure.axes[2].lines}
     assert counts["newton"].sum() == sim.totals["newton"].sum()
-    with pytest.raises(wf.ModelError, match="world = 1"):
-        sim.plot(1)
+    for world in (1, -1, 0.5, None):
+        with pytest.raises(wf.ModelError, match=f"world = {world} must"):
+            sim.plot(world)
 
 
 def test_angles_of_joints_are_plotted():

@@ -331,6 +331,10 @@ def test_statics_write_themselves_and_series_are_read_back(tmp_path, monkeypatch
     for name in ("one.vtu", "one.usdc", "one.png", "one.html"):
         r.write(tmp_path / name)
         assert (tmp_path / name).stat().st_size > 500
+    assert np.isnan(r.simulation.skin_field("section_force.N", box)).all()  # drawn grey
+    for name in ("beam.html", "beam.usdc", "beam.png", "beam.vtu"):
+        r.write(tmp_path / name, fields="section_force.N")
+    assert np.isnan(meshio.read(tmp_path / "beam.vtu").point_data["section_force.N"][: len(box.mesh.points)]).all()
     r.write(tmp_path / "two.vtu", fields=["cauchy", "section_force"])
     mesh = meshio.read(tmp_path / "two.vtu")
     nodes = len(box.mesh.points)

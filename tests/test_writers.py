@@ -1,5 +1,6 @@
 """Writers beside a run: their thread, the worlds that they show, their price."""
 
+import functools
 import threading
 
 import numpy as np
@@ -56,6 +57,10 @@ def test_some_worlds_are_those_of_all():
         for name in ("von_mises", "displacement", "strain_energy_density"):
             assert (sim.skin_field(name, bar, chosen) == sim.skin_field(name, bar)[chosen]).all(), name
     assert [values.shape[0] for values in launched] == [3, 4, 2, 4]
+    for chosen in ([4], [-1], [0.5], [], 0):
+        for take in (sim.skin_points, functools.partial(sim.skin_field, "von_mises")):
+            with pytest.raises(wf.ModelError, match="must be numbers from 0 to 3"):
+                take(bar, chosen)
     assert np.ptp(sim.skin_field("von_mises", bar), axis=0).max() > 0.0
 
 

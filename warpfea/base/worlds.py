@@ -5,9 +5,13 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from .checks import is_count
 from .errors import ModelError
 
-__all__ = ["check_values_per_world", "device_flags", "set_rows", "to_host", "values_per_world", "worlds_mask"]
+__all__ = [
+    "check_values_per_world", "device_flags", "set_rows", "to_host", "values_per_world", "world_numbers",
+    "worlds_mask",
+]  # fmt: skip
 
 
 def to_host(values: Any) -> np.ndarray:
@@ -51,6 +55,16 @@ def worlds_mask(what: str, mask: Any, worlds: int) -> np.ndarray:
         f"{what}: mask = {mask!r} must be ({worlds},) of True and False, one per world, or world indices "
         f"from 0 to {worlds - 1}"
     )
+
+
+def world_numbers(numbers: Any, worlds: int) -> list[int] | None:
+    """Numbers of chosen worlds; None, for all, stays. ModelError for one that there is not, or none."""
+    if numbers is None:
+        return None
+    chosen = list(numbers) if np.iterable(numbers) else []
+    if not (chosen and all(is_count(k) and 0 <= k < worlds for k in chosen)):
+        raise ModelError(f"worlds = {numbers!r} must be numbers from 0 to {worlds - 1}")
+    return [int(k) for k in chosen]
 
 
 def values_per_world(what: str, name: str, values: Any, worlds: int, row: tuple[int, ...] = ()) -> np.ndarray:

@@ -120,8 +120,8 @@ def read_triangles(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray
     halves = {"triangle": ([0, 1, 2],), "quad": ([0, 1, 2], [0, 2, 3])}
     parts = [block.data[:, half] for block in mesh.cells for half in halves.get(block.type, ())]
     if not sum(map(len, parts)):
-        found = ", ".join(sorted({block.type for block in mesh.cells})) or "no cells"
-        raise MeshError(f"{file}: has no triangles, but {found}")
+        found = ", ".join(sorted({block.type for block in mesh.cells}))
+        raise MeshError(f"{file}: has no triangles{', but ' if found else ''}{found}")
     points = np.asarray(mesh.points, dtype=float)
     if points.shape[1] == 2:
         points = np.column_stack([points, np.zeros(len(points))])

@@ -93,9 +93,11 @@ def _write_mesh(file: Path, target: Path, dimension: int, options: dict[str, Any
     """Mesh of a CAD file as .msh; True if the file has physical groups. MeshError."""
     try:
         import gmsh
-    except (ImportError, OSError) as error:  # OSError: a library of the system
+
+        running = gmsh.isInitialized()
+    except (ImportError, OSError, AttributeError) as error:  # a library of the system, or Gmsh's own, is missing
         raise MeshError(f"{file}: a mesh of a CAD file needs gmsh: pip install 'warpfea[cad]' ({error})") from error
-    if gmsh.isInitialized():
+    if running:
         raise MeshError(f"{file}: Gmsh is in use in this process; call gmsh.finalize() first")
     suffix = file.suffix.lower()
     gmsh.initialize(readConfigFiles=False, interruptible=False)

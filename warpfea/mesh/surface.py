@@ -51,6 +51,9 @@ def from_surface(
     (length,) = positive_numbers(f"{label}: size", (size,), 1)
     if element not in ("T4", "T10"):
         raise MeshError(f"{label}: element = {element!r} must be 'T4' or 'T10'")
+    diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
+    if length > diagonal:
+        raise MeshError(f"{label}: size = {length:g} m is more than the whole surface, {diagonal:.3g} m, has")
     x = points[triangles]
     wanted = float(np.linalg.det(x - x.mean(axis=(0, 1))).sum()) / 6.0
     vector = np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0])
@@ -61,16 +64,17 @@ def from_surface(
     pytetwild = _mesher(label)
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):  # the mesher leaves a file there
         nodes, cells = pytetwild.tetrahedralize(
-            points, triangles.astype(np.int32), edge_length_abs=float(length), epsilon=tolerance, vtk_ordering=True
-        )
-    mesh = Mesh(np.asarray(nodes), np.asarray(cells), "tetra", name=name or _stem(surface))
+            points / diagonal, triangles.astype(np.int32), edge_length_abs=length / diagonal, epsilon=tolerance,
+            vtk_ordering=True,
+        )  # fmt: skip
+    mesh = Mesh(diagonal * np.asarray(nodes), np.asarray(cells), "tetra", name=name or _stem(surface))
     found = mesh.volume()
     if abs(found - wanted) > MAX_VOLUME_CHANGE * wanted:
         raise MeshError(
             f"{label}: the mesh has {found:.4g} m^3, the surface encloses {wanted:.4g}: it has holes, crosses itself, "
             f"or is thinner than tolerance = {tolerance:g} of its size"
         )
-    mesh = with_flat_sides(mesh, tolerance * float(np.linalg.norm(np.ptp(points, axis=0))))
+    mesh = with_flat_sides(mesh, tolerance * diagonal)
     return check(with_mid_nodes(mesh) if element == "T10" else mesh)
 
 
@@ -93,13 +97,16 @@ def _mesher(label: str) -> Any:
 def surface_arrays(surface: Any, what: str) -> tuple[np.ndarray, np.ndarray]:
     """Points (n, 3) and triangles (m, 3) of a file or a pair of them. MeshError for anything else."""
     if isinstance(surface, (str, os.PathLike)):
-        return read_triangles(surface)
+        points, triangles = read_triangles(surface)
+        if not np.isfinite(points).all():
+            raise MeshError(f"{surface}: has points that are not finite")
+        return points, triangles
     try:
         points, triangles = (np.asarray(part) for part in surface)
         good = points.shape[1:] == triangles.shape[1:] == (3,) and triangles.dtype.kind in "iu" and len(triangles)
-        if good and triangles.min() >= 0 and triangles.max() < len(points):
+        if good and triangles.min() >= 0 and triangles.max() < len(points) and np.isfinite(points).all():
             return points.astype(float), triangles
-        got = f"shapes {points.shape} and {triangles.shape}"
+        got = f"shapes {points.shape} and {triangles.shape}{', not all finite' if good else ''}"
     except (TypeError, ValueError):
         got = repr(surface)
     raise MeshError(f"{what}: a surface is a file, or points (n, 3) and triangles (m, 3) of their numbers, got {got}")

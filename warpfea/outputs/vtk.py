@@ -259,7 +259,7 @@ def _frame_data(sim: Any, body: Any, fields: Sequence[str]) -> tuple[np.ndarray,
     T4 and T10 are written as their mesh; other elements as drawn cells, with section and thickness.
     """
     mesh = body.mesh
-    kinds = {field: getattr(sim.fields.get(field), "cell_type", "") for field in fields}
+    kinds = {field: getattr(sim.fields.get(field.partition(".")[0]), "cell_type", "") for field in fields}
     fields = [field for field in fields if kinds[field] in ("", mesh.cell_type)]
     family = getattr(body, "family", None)
     if family is None or not family.has_gradients:

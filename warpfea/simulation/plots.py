@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..base.checks import is_count
 from ..base.errors import ModelError
 from ..base.lazy import require_matplotlib
 
@@ -119,7 +120,7 @@ def plot_run(sim: Any, world: int = 0) -> Any:
 
     ModelError: no such world, or no step was taken. OutputError without matplotlib.
     """
-    if not 0 <= world < sim.model.worlds:
+    if not (is_count(world) and 0 <= world < sim.model.worlds):
         raise ModelError(f"plot: world = {world!r} must lie between 0 and {sim.model.worlds - 1}")
     log = np.array(sim.statistics.step_log, dtype=float).reshape(-1, len(STEP_LOG))
     if not len(log):

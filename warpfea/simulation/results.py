@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from ..base.errors import ModelError, ModelWarning
 from ..base.names import check_choice, did_you_mean, listing
+from ..base.worlds import world_numbers
 from ..kernels.contact.structs import RECORD_NAMES
 from ..kernels.step.step_control import REPORT_COLUMNS
 from ..kernels.terms.constraints import JOINT_COLUMNS
@@ -25,7 +26,7 @@ from ..model.rigid import RigidBody
 from ..model.springs import Bushing, Spring
 from ..model.state import State
 from ..model.surfaces import reference_points
-from ..terms.fields import check_scalar, field_at_nodes, field_at_points, field_inside, find_field
+from ..terms.fields import check_scalar, field_at_nodes, field_drawn, field_inside, find_field
 from ..terms.joint_values import joint_value
 from ..terms.protocols import Touching
 from ..terms.springs import Springs
@@ -110,22 +111,23 @@ class Results:
 
     def point_positions(self, body: Body, weights: Any, worlds: Sequence[int] | None = None) -> np.ndarray:
         """Positions (B, P, 3), m, of points given by sparse weights (P, slots of the body), in all worlds or some."""
-        sums = self.model.terms.evaluation.samples.slot_sums
+        sums, worlds = self.model.terms.evaluation.samples.slot_sums, world_numbers(worlds, self.model.worlds)
         return reference_points(body, weights) + sums(self.state.displacement, weights, worlds, body.slot_offset)
 
     def skin_points(self, body: Body, worlds: Sequence[int] | None = None) -> np.ndarray:
         """Points (B, skin points, 3), m, of the drawn surface, in all worlds or some."""
+        self.check_body(body, "skin_points")
         return self.point_positions(body, body.skin.slot_weights, worlds)
 
     def skin_field(self, name: str, body: Body, worlds: Sequence[int] | None = None) -> np.ndarray:
         """Scalar field (B, skin points) at the drawn surface, in all worlds or some."""
+        self.check_body(body, "skin_field")
         return self.field_on(name, body, body.skin, worlds)
 
     def collider_poses(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
         """Collider poses: positions (B, K, 3), m, rotations (B, K, 3, 3) with the shape's axes in the world as columns,
         and surface offsets (B, K), m; None for a model without contact."""
-        found = (term.poses(self.state) for term in self.model.terms.contacts)
-        return next((poses for poses in found if poses), None)
+        return next((poses for term in self.model.terms.contacts if (poses := term.poses(self.state))), None)
 
     @property
     def fields(self) -> dict[str, FieldSpec]:
@@ -143,7 +145,8 @@ class Results:
         find_field(self, name)
         if name.partition(".")[0] in RECORDED_FIELDS:
             raise ModelError(f"field {name!r} is one of nodes: it is not drawn")
-        return field_at_points(self.model.terms, name, body, self.state, drawn, worlds)
+        worlds = world_numbers(worlds, self.model.worlds)
+        return field_drawn(self.model.terms, name, body, self.state, drawn, worlds)
 
     def field(self, name: str, body: Body, *, at: str = "nodes", elements: ElementSet | None = None) -> np.ndarray:
         """A field at the nodes of a body, (B, nodes), or (B, nodes, k) with components, listed by `fields`.

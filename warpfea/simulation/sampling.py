@@ -60,7 +60,7 @@ class Sampler:
 
     def __init__(self, model: Model, points: Any, name: str) -> None:
         self.model, self.name = model, name
-        find_field(model.terms, name)
+        spec = find_field(model.terms, name)
         self.nodes = points if isinstance(points, NodeSet) else None
         self.count = len(points) if isinstance(points, (list, tuple, NodeSet)) else 1
         given = [points] if isinstance(points, MaterialPoint) else points
@@ -70,6 +70,8 @@ class Sampler:
         for body in [self.nodes.body] if self.nodes is not None else [p.body for p in known]:
             if body not in model.bodies:
                 raise ModelError(f"a point of body {body.name!r}, which is not of this model")
+            if body.rigid and self.nodes is None and not (spec.quantities or spec.of_slots or spec.cell_type):
+                raise ModelError(f"field {name!r} of rigid part {body.name!r} is one of its nodes: take body.nodes")
         self.groups = []
         for body in {id(p.body): p.body for p in known}.values():
             own = [k for k, p in enumerate(known) if p.body is body]

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ELEMENT_FIELDS", "MATRIX", "SYMMETRIC", "VECTOR", "check_scalar", "field_at_nodes", "field_at_points",
-    "field_inside", "find_field", "matrix", "von_mises",
+    "field_drawn", "field_inside", "find_field", "matrix", "von_mises",
 ]  # fmt: skip
 
 VECTOR = ("x", "y", "z")
@@ -275,6 +275,17 @@ def field_at_points(
         weights = drawn.slot_weights if spec.of_slots else drawn.node_weights
         values = np.stack([weights @ row for row in values])
     return spec.function(values) if spec.function else values
+
+
+def field_drawn(
+    terms: Any, name: str, body: Any, state: State, drawn: Any, worlds: Sequence[int] | None = None
+) -> np.ndarray:
+    """As `field_at_points`; NaN on bodies of elements that lack the field, such as section forces on solids."""
+    spec = find_field(terms, name)
+    if spec.cell_type in ("", body.mesh.cell_type):
+        return field_at_points(terms, name, body, state, drawn, worlds)
+    shape = terms.model.worlds if worlds is None else len(worlds), drawn.slot_weights.shape[0]
+    return np.full((*shape, *([len(spec.components)] if spec.components else [])), np.nan)
 
 
 def field_inside(terms: Any, name: str, body: Any, state: State, at: str) -> np.ndarray:
