@@ -74,10 +74,7 @@ def test_what_is_forced_in_is_all_that_the_scene_leaves_out():
     assert row["left"] == []
 
 
-DEARER = pytest.mark.xfail(strict=True, reason="1.35 free, 1.40 on a hinge, with four launches a product more than now")
-
-
-@pytest.mark.parametrize("file", ["part_price_cpu.json", pytest.param("part_price_h200.json", marks=DEARER)])
+@pytest.mark.parametrize("file", ["part_price_cpu.json", "part_price_h200.json"])
 def test_a_rigid_part_costs_little(file):
     """One more part in scene `hook`, free and on a hinge: its step beside that of the scene alone."""
     found = {row["label"]: row for row in rows_of(file)}
